@@ -1,0 +1,47 @@
+// The safeguards of an update: regularisation tau [kg], saturation c [m], relaxation omega [-]. Each stands with its
+// derivative, because the reverse sweep differentiates what was executed, safeguards included (paper, section 4).
+#pragma once
+
+#include "vec.h"
+
+namespace diffvbd {
+
+template <class T>
+struct StepParameters {
+  T time_step;       // h [s]
+  T regularization;  // tau [kg], 0 when absent
+  T relaxation;      // omega [-], 1 when absent
+  T saturation;      // c [m]
+  T saturation_eps;  // added to |d_raw| + c
+  T filter_eta;      // largest fraction of a gap that one move may close
+  bool saturates;    // whether c is given: asked once for a vertex, never inside its star
+};
+
+// d = s d_raw with s = c / (|d_raw| + c + eps): |d| < c, and d = d_raw to first order near 0.
+template <class R, class T>
+DIFFVBD_FN Vec3<R> saturate(const Vec3<R>& d_raw, const StepParameters<T>& q) {
+  const R r = square_root(dot(d_raw, d_raw));
+  return (R(q.saturation) / (r + R(q.saturation) + R(q.saturation_eps))) * d_raw;
+}
+
+// d_bar -> d_raw_bar:  s d_bar - (d . d_bar) d / (c |d_raw|), the second term 0 at d_raw = 0.
+template <class R, class T>
+DIFFVBD_FN Vec3<R> saturate_vjp(const Vec3<R>& d_raw, const Vec3<R>& d_bar, const StepParameters<T>& q) {
+  const R r = square_root(dot(d_raw, d_raw));
+  const R s = R(q.saturation) / (r + R(q.saturation) + R(q.saturation_eps));
+  const R safe = select(R(0) < r, r, R(1));
+  // (d . d_bar) d / (c r) = s^2 (u . d_bar) d_raw / c with the unit vector u: no square of a huge step is formed.
+  const R along = dot((R(1) / safe) * d_raw, d_bar);
+  return s * d_bar - (s * s * along / R(q.saturation)) * d_raw;
+}
+
+// Step filter against a plane: the largest alpha <= 1 that closes at most eta of the gap d > 0 when the move changes
+// the gap by `change`.
+template <class R, class T>
+DIFFVBD_FN R filter_fraction(const R& gap, const R& change, const StepParameters<T>& q) {
+  const auto closing = change < R(0);
+  const R alpha = R(q.filter_eta) * gap / select(closing, -change, R(1));
+  return select(closing, select(alpha < R(1), alpha, R(1)), R(1));
+}
+
+}  // namespace diffvbd

@@ -1,0 +1,129 @@
+// Three-vectors and symmetric 3x3 matrices over any scalar R: double, float, Dual, or a pack of SIMD lanes.
+#pragma once
+
+#include <cmath>
+
+#if defined(__CUDACC__)
+#define DIFFVBD_FN __host__ __device__ __forceinline__
+#define DIFFVBD_COLD __host__ __device__ __noinline__
+#else
+#define DIFFVBD_FN inline __attribute__((always_inline))
+#define DIFFVBD_COLD __attribute__((noinline))
+#endif
+
+namespace diffvbd {
+
+// The branch-free vocabulary of the headers: packs of lanes and Dual overload it.
+DIFFVBD_FN double select(bool condition, double a, double b) { return condition ? a : b; }
+DIFFVBD_FN float select(bool condition, float a, float b) { return condition ? a : b; }
+DIFFVBD_FN bool any(bool condition) { return condition; }
+DIFFVBD_FN double square_root(double a) { return std::sqrt(a); }
+DIFFVBD_FN float square_root(float a) { return std::sqrt(a); }
+DIFFVBD_FN double natural_log(double a) { return std::log(a); }
+DIFFVBD_FN float natural_log(float a) { return std::log(a); }
+
+template <class R>
+DIFFVBD_FN R absolute(const R& a) {
+  return select(a < R(0), -a, a);
+}
+
+template <class R>
+struct Vec3 {
+  R x, y, z;
+};
+
+template <class R>
+DIFFVBD_FN Vec3<R> operator+(const Vec3<R>& a, const Vec3<R>& b) {
+  return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+template <class R>
+DIFFVBD_FN Vec3<R> operator-(const Vec3<R>& a, const Vec3<R>& b) {
+  return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+template <class R>
+DIFFVBD_FN Vec3<R> operator-(const Vec3<R>& a) {
+  return {-a.x, -a.y, -a.z};
+}
+template <class R>
+DIFFVBD_FN Vec3<R> operator*(const R& s, const Vec3<R>& a) {
+  return {s * a.x, s * a.y, s * a.z};
+}
+template <class R>
+DIFFVBD_FN void operator+=(Vec3<R>& a, const Vec3<R>& b) {
+  a.x = a.x + b.x;
+  a.y = a.y + b.y;
+  a.z = a.z + b.z;
+}
+template <class R>
+DIFFVBD_FN void operator-=(Vec3<R>& a, const Vec3<R>& b) {
+  a.x = a.x - b.x;
+  a.y = a.y - b.y;
+  a.z = a.z - b.z;
+}
+template <class R>
+DIFFVBD_FN R dot(const Vec3<R>& a, const Vec3<R>& b) {
+  return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+template <class R>
+DIFFVBD_FN Vec3<R> cross(const Vec3<R>& a, const Vec3<R>& b) {
+  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+template <class R>
+DIFFVBD_FN Vec3<R> zero3() {
+  return {R(0), R(0), R(0)};
+}
+
+template <class R>
+struct Sym3 {
+  R xx, xy, xz, yy, yz, zz;
+};
+
+template <class R>
+DIFFVBD_FN Sym3<R> diagonal(const R& s) {
+  return {s, R(0), R(0), s, R(0), s};
+}
+template <class R>
+DIFFVBD_FN Sym3<R> operator*(const R& s, const Sym3<R>& a) {
+  return {s * a.xx, s * a.xy, s * a.xz, s * a.yy, s * a.yz, s * a.zz};
+}
+template <class R>
+DIFFVBD_FN Vec3<R> operator*(const Sym3<R>& a, const Vec3<R>& b) {
+  return {a.xx * b.x + a.xy * b.y + a.xz * b.z, a.xy * b.x + a.yy * b.y + a.yz * b.z,
+          a.xz * b.x + a.yz * b.y + a.zz * b.z};
+}
+template <class R>
+DIFFVBD_FN void add_diagonal(Sym3<R>& a, const R& s) {
+  a.xx = a.xx + s;
+  a.yy = a.yy + s;
+  a.zz = a.zz + s;
+}
+// a += s v v^T
+template <class R>
+DIFFVBD_FN void add_outer(Sym3<R>& a, const R& s, const Vec3<R>& v) {
+  const Vec3<R> w = s * v;
+  a.xx = a.xx + w.x * v.x;
+  a.xy = a.xy + w.x * v.y;
+  a.xz = a.xz + w.x * v.z;
+  a.yy = a.yy + w.y * v.y;
+  a.yz = a.yz + w.y * v.z;
+  a.zz = a.zz + w.z * v.z;
+}
+
+// Solves A u = b by L D L^T: backward stable on the positive definite blocks of a sweep, where an adjugate would lose
+// the digits that the stiffest direction takes.
+template <class R>
+DIFFVBD_FN Vec3<R> solve(const Sym3<R>& a, const Vec3<R>& b) {
+  const R inv1 = R(1) / a.xx;
+  const R l21 = a.xy * inv1;
+  const R l31 = a.xz * inv1;
+  const R inv2 = R(1) / (a.yy - l21 * a.xy);
+  const R t = a.yz - l21 * a.xz;
+  const R l32 = t * inv2;
+  const R inv3 = R(1) / (a.zz - l31 * a.xz - l32 * t);
+  const R u2 = b.y - l21 * b.x;
+  const R u3 = (b.z - l31 * b.x - l32 * u2) * inv3;
+  const R v2 = u2 * inv2 - l32 * u3;
+  return {b.x * inv1 - l21 * v2 - l31 * u3, v2, u3};
+}
+
+}  // namespace diffvbd

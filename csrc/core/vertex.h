@@ -1,0 +1,134 @@
+// The algorithm: one block update of Vertex Block Descent (paper, eqs. 2-3) and its exact transpose (eqs. 13-17).
+// Loops, memory and launches belong to cpu/ and cuda/; a Star gives this file the incident tets of one vertex.
+#pragma once
+
+#include "../energies/energies.h"
+#include "safeguards.h"
+#include "views.h"
+
+namespace diffvbd {
+
+// Everything one block update reads besides its star.
+template <class R>
+struct Block {
+  VertexState<R> state;
+  Vec3<R> y;  // predictor [m]
+  R mass;     // [kg]
+  R data[kMaxEnergyData];
+  int data_offset[kVertexEnergies], data_count[kVertexEnergies];
+};
+
+template <class R>
+struct System {
+  Vec3<R> g;
+  Sym3<R> H;
+};
+
+template <class R>
+struct Update {
+  Vec3<R> d_raw;  // Newton step before the safeguards
+  Vec3<R> step;   // relaxed and saturated, before the step filter
+  R alpha;        // step filter
+};
+
+template <class Set, class R, class T, class Star>
+DIFFVBD_FN System<R> assemble(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
+  const R h2 = R(q.time_step) * R(q.time_step);
+  System<R> out{b.mass * (b.state.x - b.y), diagonal(b.mass + R(q.regularization))};
+  if constexpr (Set::elastic) {
+    Vec3<R> g = zero3<R>();
+    R h_diagonal = R(0);
+    Sym3<R> h_outer = diagonal(R(0));
+    for (int e = 0; e < star.size(); ++e) {
+      Set::Elastic::block(star.pair(e), b.state.x, g, h_diagonal, h_outer);
+    }
+    out.g += h2 * g;
+    add_diagonal(h_outer, h_diagonal);
+    const Sym3<R> scaled = h2 * h_outer;
+    out.H = {out.H.xx + scaled.xx, scaled.xy, scaled.xz, out.H.yy + scaled.yy, scaled.yz, out.H.zz + scaled.zz};
+  }
+  Set::for_each([&](auto energy, int k) {
+    using E = decltype(energy);
+    E::block(b.state, b.data + b.data_offset[k], b.data_count[k], out.g, out.H);
+  });
+  return out;
+}
+
+// From the Newton step to the executed one.
+template <class Set, class R, class T>
+DIFFVBD_FN Update<R> safeguarded(const Block<R>& b, const Vec3<R>& d_raw, const StepParameters<T>& q) {
+  Update<R> out{d_raw, d_raw, R(1)};
+  if (q.saturates) out.step = saturate(d_raw, q);
+  out.step = R(q.relaxation) * out.step;
+  Set::for_each([&](auto energy, int k) {
+    using E = decltype(energy);
+    if constexpr (E::has_filter) {
+      const R alpha = E::filter(b.state, b.data + b.data_offset[k], b.data_count[k], out.step, q);
+      out.alpha = select(alpha < out.alpha, alpha, out.alpha);
+    }
+  });
+  return out;
+}
+
+template <class Set, class R>
+DIFFVBD_FN Vec3<R> moved(const Vec3<R>& x, const Update<R>& u) {
+  if constexpr (Set::filters) return x + u.alpha * u.step;
+  return x + u.step;
+}
+
+// Adjoints of what one update read, except those of its star, which go through star.add().
+template <class R>
+struct BlockAdjoint {
+  Vec3<R> x, y, x_prev;
+  R mass;
+};
+
+// Transpose of one block update. `b` holds the state before it, `x_bar` the adjoint of the position after it.
+// add_data(i, value) receives the adjoint of b.data[i]; it is called only if `wants_data`.
+template <class Set, int wanted, class R, class T, class Star, class AddData>
+DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, const Update<R>& u, const Sym3<R>& H,
+                                          const Vec3<R>& x_bar, const StepParameters<T>& q, bool wants_data,
+                                          AddData&& add_data) {
+  const R h = R(q.time_step), minus_h2 = -(h * h);
+  BlockAdjoint<R> out{x_bar, zero3<R>(), zero3<R>(), R(0)};
+  Vec3<R> step_bar = x_bar;
+  R alpha_bar = R(0);
+  if constexpr (Set::filters) {
+    alpha_bar = dot(u.step, x_bar);
+    step_bar = u.alpha * x_bar;
+    Set::for_each([&](auto energy, int k) {
+      using E = decltype(energy);
+      if constexpr (E::has_filter) {
+        E::filter_vjp(b.state, b.data + b.data_offset[k], b.data_count[k], u.step, q, u.alpha, alpha_bar, out.x,
+                      step_bar);
+      }
+    });
+  }
+  Vec3<R> z = R(q.relaxation) * step_bar;
+  if (q.saturates) z = saturate_vjp(u.d_raw, z, q);
+  const Vec3<R> p = solve(H, z);
+
+  out.y = b.mass * p;
+  out.x -= out.y;
+  out.mass = -(dot(b.state.x - b.y, p) + dot(u.d_raw, p));
+  if constexpr (Set::elastic) {
+    for (int e = 0; e < star.size(); ++e) {
+      const auto pair = Set::Elastic::template block_vjp<wanted>(star.pair(e), b.state.x, u.d_raw, p, minus_h2);
+      out.x += pair.xi;
+      star.template add<wanted>(e, pair);
+    }
+  }
+  Set::for_each([&](auto energy, int k) {
+    using E = decltype(energy);
+    const R* data = b.data + b.data_offset[k];
+    vertex_energy_vjp<E>(b.state, data, b.data_count[k], p, u.d_raw, out.x, out.x_prev);
+    if (wants_data) {
+      R data_bar[kMaxEnergyData];
+      vertex_energy_data_vjp<E>(b.state, data, b.data_count[k], p, u.d_raw, u.step, q, alpha_bar, data_bar);
+      for (int i = 0; i < b.data_count[k]; ++i) add_data(b.data_offset[k] + i, data_bar[i]);
+    }
+  });
+  return out;
+}
+
+}  // namespace diffvbd

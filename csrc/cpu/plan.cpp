@@ -1,0 +1,244 @@
+#include "plan.h"
+
+#include <algorithm>
+#include <array>
+#include <limits>
+#include <stdexcept>
+
+namespace diffvbd {
+
+Stars build_stars(const int64_t* tets, int64_t num_tets, int64_t num_vertices) {
+  Stars out;
+  out.ptr.assign(num_vertices + 1, 0);
+  for (int64_t i = 0; i < 4 * num_tets; ++i) ++out.ptr[tets[i] + 1];
+  for (int64_t v = 0; v < num_vertices; ++v) out.ptr[v + 1] += out.ptr[v];
+  out.entry.resize(4 * num_tets);
+  std::vector<int64_t> at(out.ptr.begin(), out.ptr.end() - 1);
+  for (int64_t i = 0; i < 4 * num_tets; ++i) out.entry[at[tets[i]]++] = static_cast<int32_t>(i);
+  return out;
+}
+
+namespace {
+
+// Active neighbours of each active vertex, without repetition: entries [3 ptr[v], 3 ptr[v] + degree[v]).
+struct Adjacency {
+  std::vector<int32_t> neighbor, degree;
+};
+
+Adjacency build_adjacency(const int64_t* tets, const Stars& stars, const uint8_t* active) {
+  const int64_t n = static_cast<int64_t>(stars.ptr.size()) - 1;
+  Adjacency out{std::vector<int32_t>(3 * stars.entry.size()), std::vector<int32_t>(n, 0)};
+  for (int64_t v = 0; v < n; ++v) {
+    if (!active[v]) continue;
+    int32_t* const begin = out.neighbor.data() + 3 * stars.ptr[v];
+    int32_t* end = begin;
+    for (int64_t e = stars.ptr[v]; e < stars.ptr[v + 1]; ++e) {
+      const int64_t* tet = tets + (stars.entry[e] & ~3);
+      for (int a = 0; a < 4; ++a) {
+        if (tet[a] != v && active[tet[a]]) *end++ = static_cast<int32_t>(tet[a]);
+      }
+    }
+    std::sort(begin, end);
+    out.degree[v] = static_cast<int32_t>(std::unique(begin, end) - begin);
+  }
+  return out;
+}
+
+// Vertices in the order of removal when always one of least remaining degree is removed (Matula and Beck 1983), O(V + E).
+std::vector<int32_t> removal_order(const Stars& stars, const Adjacency& graph, const uint8_t* active) {
+  const int64_t n = static_cast<int64_t>(graph.degree.size());
+  std::vector<int32_t> degree = graph.degree, sorted, place(n, -1);
+  int32_t largest = 0;
+  int64_t count = 0;
+  for (int64_t v = 0; v < n; ++v) {
+    if (active[v]) largest = std::max(largest, degree[v]), ++count;
+  }
+  std::vector<int32_t> bin(largest + 2, 0);
+  for (int64_t v = 0; v < n; ++v) {
+    if (active[v]) ++bin[degree[v] + 1];
+  }
+  for (int32_t d = 0; d <= largest; ++d) bin[d + 1] += bin[d];
+  sorted.resize(count);
+  std::vector<int32_t> at(bin.begin(), bin.end());
+  for (int64_t v = 0; v < n; ++v) {
+    if (active[v]) sorted[place[v] = at[degree[v]]++] = static_cast<int32_t>(v);
+  }
+  for (int64_t i = 0; i < count; ++i) {
+    const int32_t v = sorted[i];
+    const int32_t* neighbor = graph.neighbor.data() + 3 * stars.ptr[v];
+    for (int32_t e = 0; e < graph.degree[v]; ++e) {
+      const int32_t u = neighbor[e];
+      if (degree[u] <= degree[v]) continue;
+      // swap u with the first vertex of its bin, then let the bin begin after it
+      const int32_t first = std::max(bin[degree[u]], static_cast<int32_t>(i + 1)), w = sorted[first];
+      std::swap(sorted[place[u]], sorted[first]);
+      std::swap(place[u], place[w]);
+      bin[degree[u]] = first + 1;
+      --degree[u];
+    }
+  }
+  return sorted;
+}
+
+uint64_t spread_bits(uint64_t a) {
+  a &= 0x1fffff;
+  a = (a | a << 32) & 0x1f00000000ffffull;
+  a = (a | a << 16) & 0x1f0000ff0000ffull;
+  a = (a | a << 8) & 0x100f00f00f00f00full;
+  a = (a | a << 4) & 0x10c30c30c30c30c3ull;
+  return (a | a << 2) & 0x1249249249249249ull;
+}
+
+std::vector<int32_t> morton_order(const double* points, int64_t n) {
+  std::array<double, 3> low, scale;
+  for (int c = 0; c < 3; ++c) {
+    double a = std::numeric_limits<double>::infinity(), b = -a;
+    for (int64_t v = 0; v < n; ++v) a = std::min(a, points[3 * v + c]), b = std::max(b, points[3 * v + c]);
+    low[c] = a;
+    scale[c] = b > a ? 2097151.0 / (b - a) : 0.0;
+  }
+  std::vector<std::pair<uint64_t, int32_t>> keys(n);
+  for (int64_t v = 0; v < n; ++v) {
+    uint64_t key = 0;
+    for (int c = 0; c < 3; ++c) {
+      key |= spread_bits(static_cast<uint64_t>((points[3 * v + c] - low[c]) * scale[c])) << c;
+    }
+    keys[v] = {key, static_cast<int32_t>(v)};
+  }
+  std::sort(keys.begin(), keys.end());
+  std::vector<int32_t> out(n);
+  for (int64_t i = 0; i < n; ++i) out[i] = keys[i].second;
+  return out;
+}
+
+}  // namespace
+
+std::vector<int32_t> color_vertices(const int64_t* tets, const Stars& stars, const uint8_t* active, int* colors) {
+  const Adjacency graph = build_adjacency(tets, stars, active);
+  const std::vector<int32_t> order = removal_order(stars, graph, active);
+  std::vector<int32_t> color(graph.degree.size(), -1), taken_by;
+  for (auto it = order.rbegin(); it != order.rend(); ++it) {
+    const int32_t v = *it;
+    const int32_t* neighbor = graph.neighbor.data() + 3 * stars.ptr[v];
+    for (int32_t e = 0; e < graph.degree[v]; ++e) {
+      if (color[neighbor[e]] >= 0) taken_by[color[neighbor[e]]] = v;
+    }
+    int32_t c = 0;
+    while (c < static_cast<int32_t>(taken_by.size()) && taken_by[c] == v) ++c;
+    if (c == static_cast<int32_t>(taken_by.size())) taken_by.push_back(-1);
+    color[v] = c;
+  }
+  *colors = static_cast<int>(taken_by.size());
+  return color;
+}
+
+std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64_t num_tets, const Stars& stars,
+                                const std::vector<int32_t>& color, int colors) {
+  const int64_t n = static_cast<int64_t>(color.size());
+  const auto valence = [&](int32_t v) { return static_cast<int32_t>(stars.ptr[v + 1] - stars.ptr[v]); };
+  // Morton order keeps the neighbours of a block near each other in memory; inside a window, sorting by valence lets the
+  // lanes of a block have stars of like length.
+  constexpr int64_t kWindow = 64 * kLanes;
+  std::vector<std::vector<int32_t>> members(colors + 1);
+  for (const int32_t v : morton_order(points, n)) members[color[v] < 0 ? colors : color[v]].push_back(v);
+  int64_t blocks = 0, slots = 0, active = 0;
+  for (int c = 0; c <= colors; ++c) {
+    auto& list = members[c];
+    const int64_t size = static_cast<int64_t>(list.size());
+    for (int64_t a = 0; a < size; a += kWindow) {
+      std::stable_sort(list.begin() + a, list.begin() + std::min(size, a + kWindow),
+                       [&](int32_t u, int32_t w) { return valence(u) > valence(w); });
+    }
+    blocks += (size + kLanes - 1) / kLanes;
+    for (int64_t a = 0; a < size; a += kLanes) {
+      int32_t most = 0;
+      for (int64_t l = a; l < std::min(size, a + kLanes); ++l) most = std::max(most, valence(list[l]));
+      slots += most;
+    }
+    if (c < colors) active += size;
+  }
+  if (slots * kLanes > std::numeric_limits<int32_t>::max()) {
+    throw std::invalid_argument("mesh: too large, expected at most 2^31 (vertex, tet) pairs");
+  }
+  const std::array<int64_t, 7> sizes = {colors + 1,      blocks + 1,         blocks + 1,        blocks * kLanes,
+                                        slots * kLanes, slots * 3 * kLanes, slots * 3 * kLanes};
+  int64_t total = kPlanHeader;
+  for (const int64_t s : sizes) total += s;
+  std::vector<int32_t> out(total);
+  const int64_t header[6] = {n, num_tets, active, colors, blocks, slots};
+  std::copy(header, header + 6, out.begin());
+  const Plan plan = view_plan(out.data());
+  const auto writable = [](const int32_t* p) { return const_cast<int32_t*>(p); };
+
+  std::vector<int32_t> position(n);
+  std::vector<int32_t> pair_position(4 * num_tets);
+  int32_t block = 0, slot = 0, rank = 0;
+  for (int c = 0; c <= colors; ++c) {
+    writable(plan.color_block)[std::min(c, colors)] = block;
+    const auto& list = members[c];
+    const int64_t size = static_cast<int64_t>(list.size());
+    for (int64_t a = 0; a < size; a += kLanes, ++block) {
+      writable(plan.block_slot)[block] = slot;
+      writable(plan.block_rank)[block] = rank;
+      int32_t most = 0;
+      for (int l = 0; l < kLanes; ++l) {
+        const int32_t v = a + l < size ? list[a + l] : -1;
+        writable(plan.order)[block * kLanes + l] = v;
+        if (v < 0) continue;
+        ++rank;
+        position[v] = block * kLanes + l;
+        most = std::max(most, valence(v));
+        for (int32_t e = 0; e < valence(v); ++e) {
+          pair_position[stars.entry[stars.ptr[v] + e]] = (slot + e) * kLanes + l;
+        }
+      }
+      slot += most;
+    }
+  }
+  writable(plan.block_slot)[blocks] = slot;
+  writable(plan.block_rank)[blocks] = rank;
+
+  for (int32_t b = 0; b < blocks; ++b) {
+    for (int l = 0; l < kLanes; ++l) {
+      const int32_t v = plan.order[b * kLanes + l], size = v < 0 ? 0 : valence(v);
+      for (int32_t s = plan.block_slot[b], e = 0; s < plan.block_slot[b + 1]; ++s, ++e) {
+        const bool real = e < size;
+        const int32_t entry = real ? stars.entry[stars.ptr[v] + e] : 0;
+        writable(plan.pair)[s * static_cast<int64_t>(kLanes) + l] = entry;
+        for (int a = 0; a < 3; ++a) {
+          const int64_t at = (s * int64_t{3} + a) * kLanes + l;
+          const int32_t other = (entry & ~3) + kOthers[entry & 3][a];
+          writable(plan.neighbors)[at] = real ? position[tets[other]] : b * kLanes + l;
+          writable(plan.targets)[at] = real ? pair_position[other] : s * kLanes + l;
+        }
+      }
+    }
+  }
+  return out;
+}
+
+Plan view_plan(const int32_t* buffer) {
+  Plan p{};
+  p.num_vertices = buffer[0];
+  p.num_tets = buffer[1];
+  p.num_active = buffer[2];
+  p.colors = buffer[3];
+  p.blocks = buffer[4];
+  p.slots = buffer[5];
+  const int32_t* at = buffer + kPlanHeader;
+  const auto take = [&](int64_t size) {
+    const int32_t* here = at;
+    at += size;
+    return here;
+  };
+  p.color_block = take(p.colors + 1);
+  p.block_slot = take(p.blocks + 1);
+  p.block_rank = take(p.blocks + 1);
+  p.order = take(int64_t{p.blocks} * kLanes);
+  p.pair = take(int64_t{p.slots} * kLanes);
+  p.neighbors = take(int64_t{p.slots} * 3 * kLanes);
+  p.targets = take(int64_t{p.slots} * 3 * kLanes);
+  return p;
+}
+
+}  // namespace diffvbd

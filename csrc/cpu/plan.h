@@ -1,0 +1,32 @@
+// Sweep order of a mesh: stars, coloring, blocks. Built once for a Model, stored in one int32 buffer.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "../core/views.h"
+
+namespace diffvbd {
+
+// vertex -> incident tets: entries 4 tet + local index, ascending
+struct Stars {
+  std::vector<int64_t> ptr;    // [V + 1]
+  std::vector<int32_t> entry;  // [4 T]
+};
+
+Stars build_stars(const int64_t* tets, int64_t num_tets, int64_t num_vertices);
+
+// Smallest-last greedy coloring of the vertices with active[v] (others get -1): no two that share a tet share a color.
+std::vector<int32_t> color_vertices(const int64_t* tets, const Stars& stars, const uint8_t* active, int* colors);
+
+// The plan as one buffer (see views.h): a header of sizes, then its arrays.
+std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64_t num_tets, const Stars& stars,
+                                const std::vector<int32_t>& color, int colors);
+
+constexpr int kPlanHeader = 8;
+Plan view_plan(const int32_t* buffer);
+
+// The other three vertices of a tet in the order (j, k, l) that makes (j, i, k, l) an even permutation.
+constexpr int kOthers[4][3] = {{1, 3, 2}, {0, 2, 3}, {1, 0, 3}, {2, 0, 1}};
+
+}  // namespace diffvbd

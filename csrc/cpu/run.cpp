@@ -1,0 +1,361 @@
+#include "run.h"
+
+#include <torch/csrc/stable/ops.h>
+
+#include <algorithm>
+#include <cmath>
+#include <sstream>
+#include <stdexcept>
+#include <vector>
+
+namespace diffvbd {
+namespace {
+
+// A parallel region costs microseconds: colors below this many blocks stay serial.
+constexpr int64_t kSerialBlocks = 48;
+
+// position of the stiffness weight k_ab in a tet's row of `rest`
+constexpr int kWeight[4][4] = {{-1, 0, 1, 2}, {0, -1, 3, 4}, {1, 3, -1, 5}, {2, 4, 5, -1}};
+constexpr int kRestScalars = 7;
+
+bool is_padding(const Plan& plan, int64_t slot, int64_t block, int lane) {
+  return plan.neighbors[slot * 3 * kLanes + lane] == block * kLanes + lane;
+}
+
+// Vertex whose values fill a lane: a phantom copies lane 0 of its block, so that it never meets an undefined state.
+int32_t source(const Plan& plan, int64_t block, int lane) {
+  const int32_t v = plan.order[block * kLanes + lane];
+  return v < 0 ? plan.order[block * kLanes] : v;
+}
+
+template <class T>
+void pack_vertices(const Plan& plan, const T* user, T* lanes) {
+  for (int64_t b = 0; b < plan.blocks; ++b) {
+    for (int l = 0; l < kLanes; ++l) {
+      const T* a = user + 3 * static_cast<int64_t>(source(plan, b, l));
+      for (int c = 0; c < 3; ++c) lanes[(b * 3 + c) * kLanes + l] = a[c];
+    }
+  }
+}
+template <class T>
+void unpack_vertices(const Plan& plan, const T* lanes, T* user) {
+  for (int64_t b = 0; b < plan.blocks; ++b) {
+    for (int l = 0; l < kLanes; ++l) {
+      const int32_t v = plan.order[b * kLanes + l];
+      if (v < 0) continue;
+      for (int c = 0; c < 3; ++c) user[3 * static_cast<int64_t>(v) + c] = lanes[(b * 3 + c) * kLanes + l];
+    }
+  }
+}
+template <class T>
+void pack_rows(const Plan& plan, const T* user, T* rows, bool phantoms) {
+  for (int64_t i = 0; i < int64_t{plan.blocks} * kLanes; ++i) {
+    const int32_t v = phantoms ? source(plan, i / kLanes, i % kLanes) : plan.order[i];
+    for (int c = 0; c < 3; ++c) rows[4 * i + c] = v < 0 ? T(0) : user[3 * static_cast<int64_t>(v) + c];
+  }
+}
+template <class T>
+void unpack_rows(const Plan& plan, const T* rows, T* user) {
+  for (int64_t i = 0; i < int64_t{plan.blocks} * kLanes; ++i) {
+    const int32_t v = plan.order[i];
+    if (v < 0) continue;
+    for (int c = 0; c < 3; ++c) user[3 * static_cast<int64_t>(v) + c] = rows[4 * i + c];
+  }
+}
+
+// The arrays of one scene in sweep order.
+template <class T>
+struct Scene {
+  Buffer<T> x, y, x_prev, origin, mass;
+  SceneView<T> view{};
+  int64_t data_size;
+
+  Scene(const Plan& plan, const StepInputs<T>& in, int64_t scene, const T* positions)
+      : x(size_t(plan.blocks) * kLanes * 4), y(size_t(plan.blocks) * 3 * kLanes), mass(size_t(plan.blocks) * kLanes) {
+    const bool lagged = any_x_prev(in.energies, VertexEnergies{});
+    pack_rows(plan, positions, x.get(), true);
+    pack_vertices(plan, in.y.data + scene * in.y.scene, y.get());
+    const T* m = in.mass.data + scene * in.mass.scene;
+    for (int64_t i = 0; i < int64_t{plan.blocks} * kLanes; ++i) mass.get()[i] = m[source(plan, i / kLanes, i % kLanes)];
+    if (lagged) {
+      x_prev = Buffer<T>(size_t(plan.blocks) * 3 * kLanes);
+      pack_vertices(plan, in.x_prev.data + scene * in.x_prev.scene, x_prev.get());
+      if (in.origin.data) {
+        origin = Buffer<T>(size_t(plan.blocks) * 3 * kLanes);
+        pack_vertices(plan, in.origin.data + scene * in.origin.scene, origin.get());
+      }
+    }
+    view.x = x.get();
+    view.y = y.get();
+    view.x_prev = x_prev.get();
+    view.origin = origin.get();
+    view.mass = mass.get();
+    view.mu = {in.mu.data + scene * in.mu.scene, 0, in.mu.item};
+    view.lam = {in.lam.data + scene * in.lam.scene, 0, in.lam.item};
+    view.rest = in.rest.data + scene * in.rest.scene;
+    view.data = in.data.data + scene * in.data.scene;
+    int64_t start = 0;
+    for (int k = 0; k < kVertexEnergies; ++k) {
+      view.data_start[k] = start;
+      view.data_count[k] = in.data_count[k];
+      start += int64_t{in.data_count[k]} * (is_per_vertex(k, VertexEnergies{}) ? plan.num_vertices : 1);
+    }
+    data_size = start;
+  }
+};
+
+template <class F>
+void for_scenes(int64_t scenes, const F& f) {
+  if (scenes >= static_cast<int64_t>(torch::stable::get_num_threads())) {
+    torch::stable::parallel_for(0, scenes, 1, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) f(i);
+    });
+  } else {
+    for (int64_t i = 0; i < scenes; ++i) f(i);
+  }
+}
+template <class F>
+void for_blocks(int64_t begin, int64_t end, const F& f) {
+  if (end - begin < kSerialBlocks) return f(begin, end);
+  torch::stable::parallel_for(begin, end, kSerialBlocks / 2, f);
+}
+
+template <class T>
+void look_for_nonfinite(const Plan& plan, const SceneView<T>& s, int64_t step, int sweep, int color, int64_t scene) {
+  for (int64_t i = int64_t{plan.color_block[color]} * kLanes; i < int64_t{plan.color_block[color + 1]} * kLanes; ++i) {
+    const T* x = s.x + 4 * i;
+    if (plan.order[i] < 0 || (std::isfinite(x[0]) && std::isfinite(x[1]) && std::isfinite(x[2]))) continue;
+    std::ostringstream out;
+    out << "non-finite position after step " << step << ", sweep " << sweep << ", color " << color << ", vertex "
+        << plan.order[i] << ", scene " << scene << ": (" << x[0] << ", " << x[1] << ", " << x[2] << ")";
+    throw std::runtime_error(out.str());
+  }
+}
+
+template <class T>
+void check(const char* name, const char* expected, const char* item, const Batched<const T>& t, int64_t scenes,
+           int64_t items, bool (*bad)(T, T), const Batched<const T>* other = nullptr) {
+  const int64_t distinct = t.scene != 0 || (other && other->scene != 0) ? scenes : std::min<int64_t>(scenes, 1);
+  const int64_t count = t.item != 0 || (other && other->item != 0) ? items : std::min<int64_t>(items, 1);
+  for (int64_t b = 0; b < distinct; ++b) {
+    for (int64_t i = 0; i < count; ++i) {
+      const T value = t.data[b * t.scene + i * t.item];
+      const T second = other ? other->data[b * other->scene + i * other->item] : T(0);
+      if (!bad(value, second)) continue;
+      std::ostringstream out;
+      out << name << ": expected " << expected << ", got " << value;
+      if (other) out << " with mu " << second;
+      out << " at " << item << " " << i << " of scene " << b;
+      throw std::invalid_argument(out.str());
+    }
+  }
+}
+
+template <class T>
+void check_vectors(const char* name, const Batched<const T>& t, int64_t scenes, int64_t vertices) {
+  const int64_t distinct = t.scene == 0 ? std::min<int64_t>(scenes, 1) : scenes;
+  for (int64_t b = 0; b < distinct; ++b) {
+    for (int64_t i = 0; i < 3 * vertices; ++i) {
+      const T value = t.data[b * t.scene + i];
+      if (std::isfinite(value)) continue;
+      std::ostringstream out;
+      out << name << ": expected finite values, got " << value << " at vertex " << i / 3 << " of scene " << b;
+      throw std::invalid_argument(out.str());
+    }
+  }
+}
+
+// The step filter needs a positive gap to start from.
+template <class T>
+void check_above_planes(const Plan& plan, const StepInputs<T>& in) {
+  for (int64_t b = 0; b < in.scenes; ++b) {
+    const T* planes = in.data.data + b * in.data.scene;
+    for (int k = 0; k < in.data_count[0]; k += FloorBarrier::stride) {
+      std::ostringstream below;
+      int64_t found = 0;
+      for (int64_t i = 0; i < int64_t{plan.color_block[plan.colors]} * kLanes; ++i) {
+        const int32_t v = plan.order[i];
+        if (v < 0) continue;
+        const auto at = [&](const Batched<const T>& t) {
+          const T* a = t.data + b * t.scene + 3 * int64_t{v};
+          return Vec3<T>{a[0], a[1], a[2]};
+        };
+        VertexState<T> state{at(in.x_prev), zero3<T>(), zero3<T>(), T(0)};
+        if (in.origin.data) state.origin = at(in.origin);
+        const FloorBarrier::Plane<T> plane(planes + k, state);
+        if (T(0) < plane.gap(state.x)) continue;
+        if (++found <= 5) below << (found > 1 ? ", " : "") << v;
+      }
+      if (found == 0) continue;
+      std::ostringstream out;
+      out << "x: expected every unpinned vertex above floor plane " << k / FloorBarrier::stride << ", got " << found
+          << " on or below it in scene " << b << ": vertices " << below.str() << (found > 5 ? ", ..." : "");
+      throw std::invalid_argument(out.str());
+    }
+  }
+}
+
+}  // namespace
+
+template <class T>
+void check_values(const Plan& plan, const StepInputs<T>& in) {
+  const int64_t n = plan.num_vertices;
+  check_vectors("x", in.x_prev, in.scenes, n);
+  check_vectors("predictor (x, v, force, gravity, prescribed)", in.y, in.scenes, n);
+  check_vectors("start (x, v, force, gravity, prescribed)", in.x_start, in.scenes, n);
+  if (in.energies & (kExactBlock | kPaperBlock)) {
+    check<T>("mu", "finite values >= 0 Pa", "tet", in.mu, in.scenes, plan.num_tets,
+             [](T a, T) { return !(a >= 0 && std::isfinite(a)); });
+    if (in.energies & kExactBlock) {
+      check<T>("lam", "finite values with mu + lam >= 0 Pa", "tet", in.lam, in.scenes, plan.num_tets,
+               [](T a, T mu) { return !(a + mu >= 0 && std::isfinite(a)); }, &in.mu);
+    } else {
+      check<T>("lam", "finite values >= 0 Pa with block=\"paper\"", "tet", in.lam, in.scenes, plan.num_tets,
+               [](T a, T) { return !(a >= 0 && std::isfinite(a)); });
+    }
+  }
+  // What a sweep does not move needs no mass: an isolated vertex has none.
+  for (int64_t b = 0; b < (in.mass.scene == 0 ? std::min<int64_t>(in.scenes, 1) : in.scenes); ++b) {
+    for (int64_t i = 0; i < int64_t{plan.color_block[plan.colors]} * kLanes; ++i) {
+      const int32_t v = plan.order[i];
+      if (v < 0) continue;
+      const T m = in.mass.data[b * in.mass.scene + v];
+      if (m > 0 && std::isfinite(m)) continue;
+      std::ostringstream out;
+      out << "density or rest_points: expected a finite mass > 0 kg, got " << m << " at vertex " << v << " of scene " << b;
+      throw std::invalid_argument(out.str());
+    }
+  }
+  if (filters(in.energies)) check_above_planes(plan, in);
+}
+
+template <class T>
+void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape) {
+  const auto kernel = forward_kernel<T>(in.energies);
+  const int64_t tape_size =
+      int64_t{in.sweeps} * tape_rows(in.tape_policy, filters(in.energies)) * plan.num_active;
+  for_scenes(in.scenes, [&](int64_t b) {
+    Scene<T> scene(plan, in, b, in.x_start.data + b * in.x_start.scene);
+    scene.view.tape = tape + b * tape_size;
+    for (int k = 0; k < in.sweeps; ++k) {
+      for (int c = 0; c < plan.colors; ++c) {
+        for_blocks(plan.color_block[c], plan.color_block[c + 1], [&](int64_t begin, int64_t end) {
+          kernel(plan, scene.view, in.parameters, k, in.tape_policy, begin, end);
+        });
+        if (in.debug_step >= 0) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
+      }
+    }
+    unpack_rows(plan, scene.view.x, x + b * 3 * int64_t{plan.num_vertices});
+  });
+}
+
+template <class T>
+void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T* x_bar, const T* tape,
+                 const StepAdjoints<T>& out) {
+  const int wanted = (out.mu ? kMaterial : 0) | (out.rest ? kMaterial | kRest : 0);
+  const auto kernel = reverse_kernel<T>(in.energies, wanted);
+  const int64_t tape_size =
+      int64_t{in.sweeps} * tape_rows(in.tape_policy, filters(in.energies)) * plan.num_active;
+  const int64_t n = plan.num_vertices, tets = plan.num_tets, lanes = int64_t{plan.blocks} * kLanes;
+  const int64_t pairs = int64_t{plan.slots} * kLanes;
+  for_scenes(in.scenes, [&](int64_t b) {
+    Scene<T> scene(plan, in, b, x + b * 3 * n);
+    SceneView<T>& s = scene.view;
+    s.tape = const_cast<T*>(tape) + b * tape_size;
+    const Buffer<T> x_rows(4 * lanes), y_bar(3 * lanes, true), mass_bar(lanes, true), rows(4 * pairs, true);
+    const Buffer<T> x_prev_bar(s.x_prev ? 3 * lanes : 0, true), mu_bar(wanted & kMaterial ? pairs : 0, true),
+        lam_bar(wanted & kMaterial ? pairs : 0, true), rest_bar(wanted & kRest ? 4 * pairs : 0, true),
+        data_bar(out.data ? kMaxEnergyData * lanes : 0, true);
+    pack_rows(plan, x_bar + b * 3 * n, x_rows.get(), false);
+    s.x_bar = x_rows.get();
+    s.y_bar = y_bar.get();
+    s.x_prev_bar = x_prev_bar.get();
+    s.mass_bar = mass_bar.get();
+    s.rows = rows.get();
+    s.mu_bar = mu_bar.get();
+    s.lam_bar = lam_bar.get();
+    s.rest_bar = rest_bar.get();
+    s.data_bar = data_bar.get();
+
+    for (int k = in.sweeps - 1; k >= 0; --k) {
+      for (int c = plan.colors - 1; c >= 0; --c) {
+        for_blocks(plan.color_block[c], plan.color_block[c + 1], [&](int64_t begin, int64_t end) {
+          kernel(plan, s, in.parameters, k, in.tape_policy, begin, end);
+        });
+      }
+    }
+    // Rows not yet taken belong to every vertex, pinned ones too.
+    for (int64_t block = 0; block < plan.blocks; ++block) {
+      store_rows(s.x_bar, block, load_rows(s.x_bar, block) + LaneStar<T>(plan, s, block).take_rows());
+    }
+    unpack_rows(plan, s.x_bar, out.x_start + b * 3 * n);
+    unpack_vertices(plan, s.y_bar, out.y + b * 3 * n);
+    if (s.x_prev) unpack_vertices(plan, s.x_prev_bar, out.x_prev + b * 3 * n);
+    if (out.mass) {
+      for (int64_t i = 0; i < lanes; ++i) {
+        if (plan.order[i] >= 0) out.mass[b * n + plan.order[i]] = s.mass_bar[i];
+      }
+    }
+    // Each tet's four pairs are added in the order of the slots, whatever the number of threads.
+    for (int64_t block = 0; wanted && block < plan.blocks; ++block) {
+      for (int64_t slot = plan.block_slot[block]; slot < plan.block_slot[block + 1]; ++slot) {
+        for (int l = 0; l < kLanes; ++l) {
+          if (is_padding(plan, slot, block, l)) continue;
+          const int64_t pair = slot * kLanes + l;
+          const int64_t tet = plan.pair[pair] >> 2;
+          const int local = plan.pair[pair] & 3;
+          if (out.mu) out.mu[b * tets + tet] += s.mu_bar[pair];
+          if (out.lam) out.lam[b * tets + tet] += s.lam_bar[pair];
+          if (!out.rest) continue;
+          T* row = out.rest + (b * tets + tet) * kRestScalars;
+          const T* bar = s.rest_bar + slot * 4 * kLanes + l;
+          for (int a = 0; a < 3; ++a) row[kWeight[local][kOthers[local][a]]] += bar[a * kLanes];
+          row[6] += bar[3 * kLanes];
+        }
+      }
+    }
+    if (out.data) {
+      T* data = out.data + b * scene.data_size;
+      int row = 0;
+      for (int e = 0; e < kVertexEnergies; ++e) {
+        const bool per_vertex = is_per_vertex(e, VertexEnergies{});
+        for (int i = 0; i < s.data_count[e]; ++i, ++row) {
+          for (int64_t at = 0; at < lanes; ++at) {
+            const int32_t v = plan.order[at];
+            if (v < 0) continue;
+            data[s.data_start[e] + (per_vertex ? int64_t{v} * s.data_count[e] : 0) + i] += s.data_bar[row * lanes + at];
+          }
+        }
+      }
+    }
+  });
+}
+
+template <class T>
+void pack_rest(const Plan& plan, const T* rest, T* packed) {
+  for (int64_t block = 0; block < plan.blocks; ++block) {
+    for (int64_t slot = plan.block_slot[block]; slot < plan.block_slot[block + 1]; ++slot) {
+      for (int l = 0; l < kLanes; ++l) {
+        T* out = packed + slot * 4 * kLanes + l;
+        const bool padding = is_padding(plan, slot, block, l);
+        const int32_t pair = plan.pair[slot * kLanes + l];
+        const T* row = rest + int64_t{pair >> 2} * kRestScalars;
+        const int local = pair & 3;
+        for (int a = 0; a < 3; ++a) out[a * kLanes] = padding ? T(0) : row[kWeight[local][kOthers[local][a]]];
+        out[3 * kLanes] = padding ? T(0) : row[6];
+      }
+    }
+  }
+}
+
+#define DIFFVBD_INSTANTIATE(T)                                                                              \
+  template void check_values<T>(const Plan&, const StepInputs<T>&);                                         \
+  template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*);                                  \
+  template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*,             \
+                               const StepAdjoints<T>&);                                                     \
+  template void pack_rest<T>(const Plan&, const T*, T*);
+DIFFVBD_INSTANTIATE(float)
+DIFFVBD_INSTANTIATE(double)
+#undef DIFFVBD_INSTANTIATE
+
+}  // namespace diffvbd

@@ -1,0 +1,48 @@
+// A whole step of sweeps over a batch of scenes: the arrays as the user keeps them, and the loops over scenes and colors.
+#pragma once
+
+#include "plan.h"
+#include "sweep.h"
+
+namespace diffvbd {
+
+// Inputs in the user's numbering; `scene` strides are 0 where scenes share a tensor.
+template <class T>
+struct StepInputs {
+  int64_t scenes;
+  Batched<const T> x_start, x_prev, y, origin;  // [B, V, 3]; origin may be null
+  Batched<const T> mu, lam;                     // [B, T], also item stride 0 for one value
+  Batched<const T> mass;                        // [B, V]
+  Batched<const T> rest;                        // [B, slots, 4, kLanes]
+  Batched<const T> data;                        // [B, N]
+  int energies;                                 // mask, see energies.h
+  int data_count[kVertexEnergies];              // scalars per scene, or per vertex, of each energy
+  StepParameters<T> parameters;
+  int sweeps, tape_policy;
+  int64_t debug_step;  // step number to name when a position is not finite; -1: do not look
+};
+
+template <class T>
+struct StepAdjoints {
+  T *x_start, *x_prev, *y;           // [B, V, 3]
+  T *mu, *lam, *mass, *rest, *data;  // [B, T], [B, T], [B, V], [B, T, 7], [B, N]; null where not wanted
+};
+
+// The values that a step cannot work with raise std::invalid_argument naming the argument.
+template <class T>
+void check_values(const Plan& plan, const StepInputs<T>& in);
+
+// x [B, V, 3], tape [B, sweeps, tape_rows, active]
+template <class T>
+void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape);
+
+// x is what run_forward returned, x_bar its adjoint; both [B, V, 3]
+template <class T>
+void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T* x_bar, const T* tape,
+                 const StepAdjoints<T>& out);
+
+// [T, 7] -> [slots, 4, kLanes]: k01 k02 k03 k12 k13 k23 c6 of each tet, as its four vertices see them
+template <class T>
+void pack_rest(const Plan& plan, const T* rest, T* packed);
+
+}  // namespace diffvbd

@@ -1,0 +1,232 @@
+// One scene in sweep order, and the loads that turn its arrays into the algorithm's blocks and stars.
+#pragma once
+
+#include <cstdlib>
+#include <memory>
+#include <new>
+
+#include "../core/vertex.h"
+#include "lanes.h"
+
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && !defined(DIFFVBD_NO_CLONES)
+// flatten: each clone must inline the whole algorithm, or its callees would stay at the baseline instruction set
+#define DIFFVBD_HOT __attribute__((target_clones("default", "arch=x86-64-v3", "arch=x86-64-v4"), flatten))
+#else
+#define DIFFVBD_HOT __attribute__((flatten))
+#endif
+
+namespace diffvbd {
+
+enum TapePolicy { kNoTape = 0, kCompactTape = 1, kFullTape = 2 };
+
+// Scalars per active vertex and sweep. Full: d_raw and H. Compact: the old position. A scene with a step filter keeps the
+// old position in a full tape too: a gap must come back to the bit, and an undo by subtraction is an ulp off at times.
+inline int tape_rows(int policy, bool filters) {
+  return policy == kFullTape ? (filters ? 12 : 9) : policy == kCompactTape ? 3 : 0;
+}
+
+template <class T>
+class Buffer {
+ public:
+  Buffer() = default;
+  explicit Buffer(size_t size, bool zeroed = false) {
+    const size_t bytes = (size * sizeof(T) + 63) / 64 * 64;
+    if (bytes == 0) return;
+    data_.reset(static_cast<T*>(std::aligned_alloc(64, bytes)));
+    if (!data_) throw std::bad_alloc();
+    if (zeroed) std::memset(data_.get(), 0, bytes);
+  }
+  T* get() const { return data_.get(); }
+
+ private:
+  struct Free {
+    void operator()(T* p) const { std::free(p); }
+  };
+  std::unique_ptr<T[], Free> data_;
+};
+
+// A tensor with a scene dimension: stride 0 where the scenes share it.
+template <class T>
+struct Batched {
+  T* data = nullptr;
+  int64_t scene = 0, item = 1;
+};
+
+template <class T>
+struct SceneView {
+  T* x;             // [blocks kLanes, 4]  positions, rows of one cache half-line, so that a gather touches one line
+  const T* y;       // [blocks, 3, kLanes]
+  const T* x_prev;  // [blocks, 3, kLanes] or null
+  const T* origin;  // [blocks, 3, kLanes] or null
+  const T* mass;    // [blocks, kLanes]
+  Batched<const T> mu, lam;
+  const T* rest;  // [slots, 4, kLanes]  k_ij, k_ik, k_il, c6
+  const T* data;  // energies: per-scene ones (count), per-vertex ones (vertices, stride), in the order of the list
+  int64_t data_start[kVertexEnergies];
+  int data_count[kVertexEnergies];
+  T* tape;  // [sweeps, rows, active]
+
+  // reverse only
+  T* x_bar;      // [blocks kLanes, 4]
+  T* y_bar;      // [blocks, 3, kLanes]
+  T* x_prev_bar; // [blocks, 3, kLanes] or null
+  T* mass_bar;   // [blocks, kLanes]
+  T* rows;       // [slots kLanes, 4]  what other vertices of a pair's tet have added for its own vertex
+  T* mu_bar;     // [slots, kLanes] or null
+  T* lam_bar;    // [slots, kLanes] or null
+  T* rest_bar;   // [slots, 4, kLanes] or null
+  T* data_bar;   // [kMaxEnergyData, blocks kLanes] or null
+};
+
+template <class T>
+DIFFVBD_FN Vec3<Lanes<T>> load3(const T* p, int64_t block) {
+  const T* a = p + block * 3 * kLanes;
+  return {Lanes<T>::load(a), Lanes<T>::load(a + kLanes), Lanes<T>::load(a + 2 * kLanes)};
+}
+template <class T>
+DIFFVBD_FN void add3(T* p, int64_t block, const Vec3<Lanes<T>>& v) {
+  T* a = p + block * 3 * kLanes;
+  (Lanes<T>::load(a) + v.x).store(a);
+  (Lanes<T>::load(a + kLanes) + v.y).store(a + kLanes);
+  (Lanes<T>::load(a + 2 * kLanes) + v.z).store(a + 2 * kLanes);
+}
+// rows of four scalars <-> lanes
+template <class T, class Index>
+DIFFVBD_FN Vec3<Lanes<T>> gather3(const T* rows, const Index& index) {
+  Vec3<Lanes<T>> out;
+  for (int l = 0; l < kLanes; ++l) {
+    const T* a = rows + 4 * static_cast<int64_t>(index(l));
+    out.x.v[l] = a[0];
+    out.y.v[l] = a[1];
+    out.z.v[l] = a[2];
+  }
+  return out;
+}
+template <class T>
+DIFFVBD_FN Vec3<Lanes<T>> load_rows(const T* rows, int64_t block) {
+  return gather3(rows, [&](int l) { return block * kLanes + l; });
+}
+template <class T>
+DIFFVBD_FN void store_rows(T* rows, int64_t block, const Vec3<Lanes<T>>& v) {
+  T* a = rows + block * kLanes * 4;
+  for (int l = 0; l < kLanes; ++l) {
+    a[4 * l] = v.x.v[l];
+    a[4 * l + 1] = v.y.v[l];
+    a[4 * l + 2] = v.z.v[l];
+  }
+}
+
+// The incident tets of the kLanes vertices of a block.
+template <class T>
+struct LaneStar {
+  const Plan& plan;
+  const SceneView<T>& s;
+  int64_t first;
+  int count;
+
+  DIFFVBD_FN LaneStar(const Plan& p, const SceneView<T>& scene, int64_t block)
+      : plan(p), s(scene), first(p.block_slot[block]), count(p.block_slot[block + 1] - p.block_slot[block]) {}
+  DIFFVBD_FN int size() const { return count; }
+
+  DIFFVBD_FN Lanes<T> material(const Batched<const T>& m, const int32_t* pair) const {
+    Lanes<T> out;
+    for (int l = 0; l < kLanes; ++l) out.v[l] = m.data[(pair[l] >> 2) * m.item];
+    return out;
+  }
+  DIFFVBD_FN TetPair<Lanes<T>> pair(int e) const {
+    const int64_t slot = first + e;
+    const int32_t* j = plan.neighbors + slot * 3 * kLanes;
+    const int32_t* id = plan.pair + slot * kLanes;
+    const T* r = s.rest + slot * 4 * kLanes;
+    TetPair<Lanes<T>> out;
+    out.xj = gather3(s.x, [&](int l) { return j[l]; });
+    out.xk = gather3(s.x, [&](int l) { return j[kLanes + l]; });
+    out.xl = gather3(s.x, [&](int l) { return j[2 * kLanes + l]; });
+    out.k_ij = Lanes<T>::load(r);
+    out.k_ik = Lanes<T>::load(r + kLanes);
+    out.k_il = Lanes<T>::load(r + 2 * kLanes);
+    out.c6 = Lanes<T>::load(r + 3 * kLanes);
+    out.mu = material(s.mu, id);
+    out.lam = material(s.lam, id);
+    return out;
+  }
+
+  // Vertices of a color share no tet, so each row below has one writer per color. Padding adds zeros to its own row.
+  DIFFVBD_FN void scatter(const int32_t* target, const Vec3<Lanes<T>>& v) const {
+    for (int l = 0; l < kLanes; ++l) {
+      T* a = s.rows + 4 * static_cast<int64_t>(target[l]);
+      a[0] += v.x.v[l];
+      a[1] += v.y.v[l];
+      a[2] += v.z.v[l];
+    }
+  }
+  DIFFVBD_FN static void accumulate(T* p, const Lanes<T>& v) { (Lanes<T>::load(p) + v).store(p); }
+
+  template <int wanted>
+  DIFFVBD_FN void add(int e, const TetPairAdjoint<Lanes<T>>& a) const {
+    const int64_t slot = first + e;
+    const int32_t* target = plan.targets + slot * 3 * kLanes;
+    scatter(target, a.xj);
+    scatter(target + kLanes, a.xk);
+    scatter(target + 2 * kLanes, a.xl);
+    if constexpr ((wanted & kMaterial) != 0) {
+      accumulate(s.mu_bar + slot * kLanes, a.mu);
+      accumulate(s.lam_bar + slot * kLanes, a.lam);
+    }
+    if constexpr ((wanted & kRest) != 0) {
+      T* r = s.rest_bar + slot * 4 * kLanes;
+      accumulate(r, a.k_ij);
+      accumulate(r + kLanes, a.k_ik);
+      accumulate(r + 2 * kLanes, a.k_il);
+      accumulate(r + 3 * kLanes, a.c6);
+    }
+  }
+  // x_bar of the block's own vertices, as far as other vertices' updates have contributed; clears what it takes
+  DIFFVBD_FN Vec3<Lanes<T>> take_rows() const {
+    Vec3<Lanes<T>> sum = zero3<Lanes<T>>();
+    for (int e = 0; e < count; ++e) {
+      sum += load_rows(s.rows, first + e);
+      std::memset(s.rows + (first + e) * kLanes * 4, 0, kLanes * 4 * sizeof(T));
+    }
+    return sum;
+  }
+};
+
+template <class Set, class T>
+DIFFVBD_FN Block<Lanes<T>> load_block(const Plan& plan, const SceneView<T>& s, int64_t block,
+                                      const StepParameters<T>& q) {
+  using R = Lanes<T>;
+  Block<R> out;
+  out.state.x = load_rows(s.x, block);
+  out.state.x_prev = zero3<R>();
+  out.state.origin = zero3<R>();
+  if constexpr (Set::reads_x_prev) {
+    out.state.x_prev = load3(s.x_prev, block);
+    if (s.origin) out.state.origin = load3(s.origin, block);
+  }
+  out.state.h = R(q.time_step);
+  out.y = load3(s.y, block);
+  out.mass = R::load(s.mass + block * kLanes);
+  int offset = 0;
+  Set::for_each([&](auto energy, int k) {
+    using E = decltype(energy);
+    out.data_offset[k] = offset;
+    out.data_count[k] = E::per_vertex ? E::stride : s.data_count[k];
+    const T* data = s.data + s.data_start[k];
+    for (int i = 0; i < out.data_count[k]; ++i) {
+      R& value = out.data[offset + i];
+      if constexpr (E::per_vertex) {
+        for (int l = 0; l < kLanes; ++l) {
+          const int32_t vertex = plan.order[block * kLanes + l];
+          value.v[l] = vertex < 0 ? T(0) : data[static_cast<int64_t>(vertex) * E::stride + i];
+        }
+      } else {
+        value = R(data[i]);
+      }
+    }
+    offset += out.data_count[k];
+  });
+  return out;
+}
+
+}  // namespace diffvbd

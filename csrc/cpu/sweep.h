@@ -1,0 +1,32 @@
+// The two hot loops of the CPU backend, chosen by a scene's energies.
+#pragma once
+
+#include <utility>
+
+#include "scene.h"
+
+namespace diffvbd {
+
+// One color (blocks [begin, end)) of one sweep; `tape` is the policy.
+template <class T>
+using ForwardKernel = void (*)(const Plan&, const SceneView<T>&, const StepParameters<T>&, int sweep, int tape,
+                               int64_t begin, int64_t end);
+template <class T>
+using ReverseKernel = void (*)(const Plan&, const SceneView<T>&, const StepParameters<T>&, int sweep, int tape,
+                               int64_t begin, int64_t end);
+
+template <class T>
+ForwardKernel<T> forward_kernel(int energies);
+template <class T>
+ReverseKernel<T> reverse_kernel(int energies, int wanted);
+
+constexpr int kElasticVariants = 3;  // none, exact, paper
+constexpr int kEnergySets = kElasticVariants << kVertexEnergies;
+
+// The variants are numbered (elastic, set of vertex energies): mask of the n-th, and back.
+constexpr int energy_mask(int n) { return n % kElasticVariants + (n / kElasticVariants) * 4; }
+constexpr int energy_index(int mask) { return (mask & 3) + (mask >> 2) * kElasticVariants; }
+
+inline bool filters(int mask) { return any_filter(mask, VertexEnergies{}); }
+
+}  // namespace diffvbd

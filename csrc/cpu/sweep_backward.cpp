@@ -1,0 +1,75 @@
+#include "sweep.h"
+
+namespace diffvbd {
+namespace {
+
+template <class T, int mask, int wanted>
+DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const StepParameters<T>& q, int sweep, int tape,
+                               int64_t begin, int64_t end) {
+  using R = Lanes<T>;
+  using Set = EnergySet<mask>;
+  const int rows = tape_rows(tape, Set::filters);
+  for (int64_t block = begin; block < end; ++block) {
+    const int count = plan.block_rank[block + 1] - plan.block_rank[block];
+    const T* at = s.tape + static_cast<int64_t>(sweep) * rows * plan.num_active + plan.block_rank[block];
+    const auto get = [&] {
+      const R value = R::load(at, count);
+      at += plan.num_active;
+      return value;
+    };
+    const LaneStar<T> star(plan, s, block);
+    Block<R> b = load_block<Set>(plan, s, block, q);
+    if (tape == kCompactTape || Set::filters) b.state.x = {get(), get(), get()};
+    Vec3<R> d_raw;
+    Sym3<R> H;
+    if (tape == kFullTape) {
+      d_raw = {get(), get(), get()};
+      H = {get(), get(), get(), get(), get(), get()};
+      // a phantom lane has no tape: the unit block keeps it at zero
+      if (count < kLanes) {
+        for (int l = count; l < kLanes; ++l) H.xx.v[l] = H.yy.v[l] = H.zz.v[l] = T(1);
+      }
+    } else {
+      const System<R> system = assemble<Set>(b, star, q);
+      d_raw = -solve(system.H, system.g);
+      H = system.H;
+    }
+    const Update<R> u = safeguarded<Set>(b, d_raw, q);
+    if (tape == kFullTape && !Set::filters) b.state.x -= u.step;
+    store_rows(s.x, block, b.state.x);
+
+    const Vec3<R> x_bar = load_rows(s.x_bar, block) + star.take_rows();
+    const BlockAdjoint<R> out = reverse_vertex<Set, wanted>(
+        b, star, u, H, x_bar, q, s.data_bar != nullptr, [&](int i, const R& value) {
+          LaneStar<T>::accumulate(s.data_bar + (static_cast<int64_t>(i) * plan.blocks + block) * kLanes, value);
+        });
+    store_rows(s.x_bar, block, out.x);
+    add3(s.y_bar, block, out.y);
+    LaneStar<T>::accumulate(s.mass_bar + block * kLanes, out.mass);
+    if constexpr (Set::reads_x_prev) add3(s.x_prev_bar, block, out.x_prev);
+  }
+}
+
+// Without tets there is nothing but the state to differentiate: one variant serves every wish.
+constexpr int useful(int mask, int wanted) { return (mask & 3) == 0 ? kState : wanted; }
+
+template <class T, int... n>
+ReverseKernel<T> pick(int index, int wanted, std::integer_sequence<int, n...>) {
+  static constexpr ReverseKernel<T> table[3][kEnergySets] = {
+      {reverse_color<T, energy_mask(n), kState>...},
+      {reverse_color<T, energy_mask(n), useful(energy_mask(n), kMaterial)>...},
+      {reverse_color<T, energy_mask(n), useful(energy_mask(n), kMaterial | kRest)>...}};
+  return table[(wanted & kRest) ? 2 : (wanted & kMaterial) ? 1 : 0][index];
+}
+
+}  // namespace
+
+template <class T>
+ReverseKernel<T> reverse_kernel(int energies, int wanted) {
+  return pick<T>(energy_index(energies), wanted, std::make_integer_sequence<int, kEnergySets>{});
+}
+
+template ReverseKernel<float> reverse_kernel<float>(int, int);
+template ReverseKernel<double> reverse_kernel<double>(int, int);
+
+}  // namespace diffvbd

@@ -1,0 +1,50 @@
+#include "sweep.h"
+
+namespace diffvbd {
+namespace {
+
+template <class T, int mask>
+DIFFVBD_HOT void forward_color(const Plan& plan, const SceneView<T>& s, const StepParameters<T>& q, int sweep, int tape,
+                               int64_t begin, int64_t end) {
+  using R = Lanes<T>;
+  using Set = EnergySet<mask>;
+  const int rows = tape_rows(tape, Set::filters);
+  for (int64_t block = begin; block < end; ++block) {
+    const Block<R> b = load_block<Set>(plan, s, block, q);
+    const System<R> system = assemble<Set>(b, LaneStar<T>(plan, s, block), q);
+    const Update<R> u = safeguarded<Set>(b, -solve(system.H, system.g), q);
+    store_rows(s.x, block, moved<Set>(b.state.x, u));
+    if (tape == kNoTape) continue;
+    const int count = plan.block_rank[block + 1] - plan.block_rank[block];
+    T* at = s.tape + static_cast<int64_t>(sweep) * rows * plan.num_active + plan.block_rank[block];
+    const auto put = [&](const R& value) {
+      value.store(at, count);
+      at += plan.num_active;
+    };
+    if (tape == kCompactTape || Set::filters) {
+      put(b.state.x.x), put(b.state.x.y), put(b.state.x.z);
+    }
+    if (tape == kFullTape) {
+      put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
+      put(system.H.xx), put(system.H.xy), put(system.H.xz), put(system.H.yy), put(system.H.yz), put(system.H.zz);
+    }
+  }
+}
+
+template <class T, int... n>
+ForwardKernel<T> pick(int index, std::integer_sequence<int, n...>) {
+  static constexpr ForwardKernel<T> table[kEnergySets] = {forward_color<T, energy_mask(n)>...};
+  return table[index];
+}
+
+}  // namespace
+
+template <class T>
+ForwardKernel<T> forward_kernel(int energies) {
+  return pick<T>(energy_index(energies), std::make_integer_sequence<int, kEnergySets>{});
+}
+
+template ForwardKernel<float> forward_kernel<float>(int);
+template ForwardKernel<double> forward_kernel<double>(int);
+
+}  // namespace diffvbd

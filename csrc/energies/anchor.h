@@ -1,0 +1,22 @@
+// A spring from a vertex to a point: k / 2 |x - a|^2. It brings only its block(); its adjoint is derived by Dual.
+#pragma once
+
+#include "../core/views.h"
+
+namespace diffvbd {
+
+struct Anchor {
+  static constexpr bool per_vertex = true;  // data of each vertex: (stiffness [N/m], point [m])
+  static constexpr int stride = 4;
+  static constexpr bool has_filter = false;
+  static constexpr bool reads_x_prev = false;
+
+  template <class R>
+  DIFFVBD_FN static void block(const VertexState<R>& s, const R* data, int, Vec3<R>& g, Sym3<R>& H) {
+    const R k = s.h * s.h * data[0];
+    g += k * (s.x - Vec3<R>{data[1], data[2], data[3]});
+    add_diagonal(H, k);
+  }
+};
+
+}  // namespace diffvbd

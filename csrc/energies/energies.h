@@ -1,0 +1,134 @@
+// THE list of energies. A scene's energies form a mask; each mask is a compiled variant, so an absent energy costs no
+// instruction. An energy of one vertex is a struct with stride, per_vertex, has_filter, reads_x_prev and block(); with a
+// block_vjp() too it is hot, without one Dual derives its adjoint.
+#pragma once
+
+#include <type_traits>
+
+#include "../core/dual.h"
+#include "anchor.h"
+#include "floor_barrier.h"
+#include "stable_neo_hookean.h"
+
+namespace diffvbd {
+
+template <class... E>
+struct EnergyList {};
+
+// bits 0 and 1 of a mask: the elastic block; bit 2 + k: the k-th energy of this list
+using VertexEnergies = EnergyList<FloorBarrier, Anchor>;
+constexpr int kVertexEnergies = 2;
+enum ElasticBits { kExactBlock = 1, kPaperBlock = 2 };
+constexpr int kMaxEnergyData = 64;  // scalars that the energies of one vertex may read
+
+template <class... E>
+constexpr bool is_per_vertex(int k, EnergyList<E...>) {
+  const bool flags[] = {E::per_vertex...};
+  return flags[k];
+}
+template <class... E>
+constexpr bool any_filter(int mask, EnergyList<E...>) {
+  int k = 2;
+  return ((((mask >> k++) & 1) && E::has_filter) || ...);
+}
+template <class... E>
+constexpr bool any_x_prev(int mask, EnergyList<E...>) {
+  int k = 2;
+  return ((((mask >> k++) & 1) && E::reads_x_prev) || ...);
+}
+
+template <int mask>
+struct EnergySet {
+  static constexpr bool elastic = (mask & (kExactBlock | kPaperBlock)) != 0;
+  using Elastic = StableNeoHookean<(mask & kExactBlock) != 0>;
+
+  // calls f(energy, its position in the list) for each energy of one vertex that is present
+  template <class F>
+  DIFFVBD_FN static void for_each(F&& f) {
+    visit<0>(f, VertexEnergies{});
+  }
+  static constexpr bool filters = any_filter(mask, VertexEnergies{});
+  static constexpr bool reads_x_prev = any_x_prev(mask, VertexEnergies{});
+
+ private:
+  template <int k, class F>
+  DIFFVBD_FN static void visit(F&, EnergyList<>) {}
+  template <int k, class F, class E, class... Rest>
+  DIFFVBD_FN static void visit(F& f, EnergyList<E, Rest...>) {
+    if constexpr ((mask >> (2 + k)) & 1) f(E{}, k);
+    visit<k + 1>(f, EnergyList<Rest...>{});
+  }
+};
+
+template <class E, class = void>
+struct has_block_vjp : std::false_type {};
+template <class E>
+struct has_block_vjp<E, std::void_t<decltype(&E::template block_vjp<double>)>> : std::true_type {};
+
+// Adjoint of phi = p . (g + H d_raw) for one energy, by one Dual evaluation for each input. Kept out of line: it is
+// shared by all variants and seldom wanted.
+template <class E, class R>
+struct DualAdjoint {
+  const VertexState<R>& s;
+  const R* data;
+  int count;
+  const Vec3<R>&p, &d_raw;
+
+  R derivative(const VertexState<Dual<R>>& state, const Dual<R>* values) const {
+    Vec3<Dual<R>> g = zero3<Dual<R>>();
+    Sym3<Dual<R>> H = diagonal(Dual<R>(0));
+    E::block(state, values, count, g, H);
+    return dot(constant(p), g + H * constant(d_raw)).derivative;
+  }
+  VertexState<Dual<R>> lifted() const {
+    return {constant(s.x), constant(s.x_prev), constant(s.origin), Dual<R>(s.h)};
+  }
+  void lift(Dual<R>* values) const {
+    for (int i = 0; i < count; ++i) values[i] = Dual<R>(data[i]);
+  }
+  DIFFVBD_COLD void subtract_from(Vec3<R>& bar, Vec3<Dual<R>> VertexState<Dual<R>>::*which) const {
+    Dual<R> values[kMaxEnergyData];
+    lift(values);
+    R* out[3] = {&bar.x, &bar.y, &bar.z};
+    for (int c = 0; c < 3; ++c) {
+      VertexState<Dual<R>> state = lifted();
+      Vec3<Dual<R>>& v = state.*which;
+      (c == 0 ? v.x : c == 1 ? v.y : v.z).derivative = R(1);
+      *out[c] = *out[c] - derivative(state, values);
+    }
+  }
+};
+
+// x_bar, x_prev_bar -= d phi / d(x, x_prev)
+template <class E, class R>
+DIFFVBD_FN void vertex_energy_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
+                                  const Vec3<R>& d_raw, Vec3<R>& x_bar, Vec3<R>& x_prev_bar) {
+  if constexpr (has_block_vjp<E>::value) {
+    E::block_vjp(s, data, count, p, d_raw, x_bar, x_prev_bar);
+  } else {
+    const DualAdjoint<E, R> adjoint{s, data, count, p, d_raw};
+    adjoint.subtract_from(x_bar, &VertexState<Dual<R>>::x);
+    if constexpr (E::reads_x_prev) adjoint.subtract_from(x_prev_bar, &VertexState<Dual<R>>::x_prev);
+  }
+}
+
+// data_bar[i] = alpha_bar d alpha / d data_i - d phi / d data_i
+template <class E, class R, class T>
+DIFFVBD_COLD void vertex_energy_data_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
+                                         const Vec3<R>& d_raw, const Vec3<R>& step, const StepParameters<T>& q,
+                                         const R& alpha_bar, R* data_bar) {
+  const DualAdjoint<E, R> adjoint{s, data, count, p, d_raw};
+  Dual<R> values[kMaxEnergyData];
+  adjoint.lift(values);
+  const VertexState<Dual<R>> state = adjoint.lifted();
+  for (int i = 0; i < count; ++i) {
+    values[i].derivative = R(1);
+    data_bar[i] = -adjoint.derivative(state, values);
+    if constexpr (E::has_filter) {
+      data_bar[i] = data_bar[i] + alpha_bar * E::filter(state, values, count, constant(step), q).derivative;
+    }
+    values[i].derivative = R(0);
+  }
+}
+
+}  // namespace diffvbd

@@ -1,0 +1,130 @@
+// IPC log barrier against planes (Li et al. 2020), with the paper's lagged damping of approaching motion, and the step
+// filter that keeps every executed position strictly above every plane (method.md, section 5).
+#pragma once
+
+#include <limits>
+
+#include "../core/safeguards.h"
+#include "../core/views.h"
+
+namespace diffvbd {
+
+// log-barrier b(d) = -kappa (d - dhat)^2 log(d / dhat) and its derivatives, zero for d >= dhat
+template <class R>
+struct LogBarrier {
+  R first, second, third;
+  DIFFVBD_FN LogBarrier(const R& d, const R& dhat, const R& kappa) {
+    const auto active = d < dhat;
+    const R safe = select(active, d, dhat), gap = safe - dhat, inv = R(1) / safe;
+    const R log_ratio = natural_log(safe / dhat), ratio = gap * inv;
+    first = select(active, -kappa * (R(2) * gap * log_ratio + gap * ratio), R(0));
+    second = select(active, -kappa * (R(2) * log_ratio + R(4) * ratio - ratio * ratio), R(0));
+    third = select(active, -kappa * inv * (R(6) - R(6) * ratio + R(2) * ratio * ratio), R(0));
+  }
+};
+
+struct FloorBarrier {
+  static constexpr bool per_vertex = false;  // data: `planes` x (n_x, n_y, n_z, height, kappa, dhat, damping)
+  static constexpr int stride = 7;
+  static constexpr bool has_filter = true;
+  static constexpr bool reads_x_prev = true;
+
+  template <class R>
+  struct Plane {
+    Vec3<R> n;
+    R height, kappa, dhat, damping;
+    DIFFVBD_FN Plane(const R* a, const VertexState<R>& s)
+        : n{a[0], a[1], a[2]}, height(a[3] - dot(n, s.origin)), kappa(a[4]), dhat(a[5]), damping(a[6]) {}
+    DIFFVBD_FN R gap(const Vec3<R>& x) const { return dot(n, x) - height; }
+    // below this the sign of a computed gap is not safe: a few roundings of its terms
+    template <class T>
+    DIFFVBD_FN R guard(const Vec3<R>& x) const {
+      return R(8 * std::numeric_limits<T>::epsilon()) *
+             (absolute(n.x * x.x) + absolute(n.y * x.y) + absolute(n.z * x.z) + absolute(height));
+    }
+  };
+
+  template <class R>
+  DIFFVBD_FN static void block(const VertexState<R>& s, const R* data, int count, Vec3<R>& g, Sym3<R>& H) {
+    for (int k = 0; k < count; k += stride) {
+      const Plane<R> plane(data + k, s);
+      const R d = plane.gap(s.x), h2 = s.h * s.h;
+      if (any(d < plane.dhat)) {
+        const LogBarrier<R> b(d, plane.dhat, plane.kappa);
+        g += h2 * b.first * plane.n;
+        add_outer(H, h2 * b.second, plane.n);
+      }
+      const R approach = dot(plane.n, s.x - s.x_prev);
+      const auto near = plane.gap(s.x_prev) < plane.dhat;
+      const R c = select(near, select(approach < R(0), plane.damping * s.h, R(0)), R(0));
+      g += c * approach * plane.n;
+      add_outer(H, c, plane.n);
+    }
+  }
+
+  // adjoint of p . (g + H d_raw), negated, toward x and x_prev; toward the data Dual serves
+  template <class R>
+  DIFFVBD_FN static void block_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
+                                   const Vec3<R>& d_raw, Vec3<R>& x_bar, Vec3<R>& x_prev_bar) {
+    for (int k = 0; k < count; k += stride) {
+      const Plane<R> plane(data + k, s);
+      const R n_p = dot(plane.n, p), n_d = dot(plane.n, d_raw), d = plane.gap(s.x), h2 = s.h * s.h;
+      if (any(d < plane.dhat)) {
+        const LogBarrier<R> b(d, plane.dhat, plane.kappa);
+        x_bar -= h2 * (b.second * n_p + b.third * n_d * n_p) * plane.n;
+      }
+      const R approach = dot(plane.n, s.x - s.x_prev);
+      const auto near = plane.gap(s.x_prev) < plane.dhat;
+      const R c = select(near, select(approach < R(0), plane.damping * s.h, R(0)), R(0));
+      const Vec3<R> pull = c * n_p * plane.n;
+      x_bar -= pull;
+      x_prev_bar += pull;
+    }
+  }
+
+  // Index-free part of the filter: the binding fraction, and the plane that set it (its offset in data, -1: none).
+  template <class R, class T>
+  DIFFVBD_FN static R filter(const VertexState<R>& s, const R* data, int count, const Vec3<R>& step,
+                             const StepParameters<T>& q) {
+    R alpha = R(1);
+    for (int k = 0; k < count; k += stride) {
+      const Plane<R> plane(data + k, s);
+      const R a = filter_fraction(plane.gap(s.x), dot(plane.n, step), q);
+      alpha = select(a < alpha, a, alpha);
+    }
+    // Rounding must not undo the filter: a vertex whose new gap cannot be told from zero stays where it is.
+    const Vec3<R> x_new = s.x + alpha * step;
+    for (int k = 0; k < count; k += stride) {
+      const Plane<R> plane(data + k, s);
+      alpha = select(plane.template guard<T>(s.x) < plane.gap(x_new), alpha, R(0));
+    }
+    return alpha;
+  }
+
+  // alpha_bar -> adjoints of x and step, for the alpha that filter() returned
+  template <class R, class T>
+  DIFFVBD_FN static void filter_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& step,
+                                    const StepParameters<T>& q, const R& alpha, const R& alpha_bar, Vec3<R>& x_bar,
+                                    Vec3<R>& step_bar) {
+    R binding = R(1);
+    Vec3<R> dx = zero3<R>(), dstep = zero3<R>();
+    for (int k = 0; k < count; k += stride) {
+      const Plane<R> plane(data + k, s);
+      const R change = dot(plane.n, step);
+      const R a = filter_fraction(plane.gap(s.x), change, q);
+      const auto binds = a < binding;
+      const R rate = R(1) / select(binds, -change, R(1));
+      const R by_x = select(binds, R(q.filter_eta) * rate, R(0)), by_step = select(binds, a * rate, R(0));
+      dx = {select(binds, by_x * plane.n.x, dx.x), select(binds, by_x * plane.n.y, dx.y),
+            select(binds, by_x * plane.n.z, dx.z)};
+      dstep = {select(binds, by_step * plane.n.x, dstep.x), select(binds, by_step * plane.n.y, dstep.y),
+               select(binds, by_step * plane.n.z, dstep.z)};
+      binding = select(binds, a, binding);
+    }
+    const R live = select(R(0) < alpha, alpha_bar, R(0));
+    x_bar += live * dx;
+    step_bar += live * dstep;
+  }
+};
+
+}  // namespace diffvbd

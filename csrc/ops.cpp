@@ -1,0 +1,26 @@
+// Schemas of all operators, CPU and CUDA. The shapes are those of views.h and cpu/run.h; a leading size of 1 means that
+// the scenes share a tensor, a last size of 1 in mu and lam that all tets do.
+#include <torch/csrc/stable/library.h>
+
+STABLE_TORCH_LIBRARY(diffvbd, m) {
+  // numbers: time_step, regularization, relaxation, saturation (< 0: none), saturation_eps, filter_eta
+  // sizes: active vertices, tets, slots of the plan
+  // data_count: scalars per scene, or per vertex, of each energy of one vertex
+  m.def(
+      "sweep(Tensor x_start, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, "
+      "Tensor energy_data, Tensor origin, Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, "
+      "int sweeps, int tape_policy, int debug_step, bool checked) -> (Tensor x, Tensor tape)");
+  // wants: material, mass, rest, energy_data
+  m.def(
+      "sweep_backward(Tensor x_bar, Tensor x, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, "
+      "Tensor energy_data, Tensor origin, Tensor tape, Tensor plan, int[] sizes, int energies, int[] data_count, "
+      "float[] numbers, int sweeps, int tape_policy, bool[] wants) -> (Tensor x_start, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, "
+      "Tensor mass, Tensor rest, Tensor energy_data)");
+  m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");
+  m.def(
+      "build_plan(Tensor points, Tensor tets, Tensor active) -> (Tensor plan, Tensor color_ptr, Tensor color_vertices, "
+      "Tensor star_ptr, Tensor star)");
+  m.def("tet_gather(Tensor values, Tensor tets) -> Tensor");
+  m.def("star_sum(Tensor values, Tensor star_ptr, Tensor star) -> Tensor");
+  m.def("row_sum(Tensor values) -> Tensor");
+}

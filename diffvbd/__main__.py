@@ -1,0 +1,6 @@
+"""`python -m diffvbd`."""
+
+from diffvbd.cli import main
+
+if __name__ == "__main__":
+    raise SystemExit(main())

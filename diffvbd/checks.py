@@ -1,0 +1,57 @@
+"""Checks of arguments: every failure names the argument, what was expected and what came."""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import Any, NoReturn
+
+import torch
+from torch import Tensor
+
+
+def fail(name: str, expected: str, got: Any) -> NoReturn:
+    raise ValueError(f"{name}: expected {expected}, got {got}")
+
+
+def check_tensor(name: str, value: Any, like: Tensor, what: str = "a tensor") -> Tensor:
+    """``value`` as a tensor of like's dtype and device; python numbers are converted, other tensors must match."""
+    if not isinstance(value, Tensor):
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            return torch.full((), float(value), dtype=like.dtype, device=like.device)
+        raise TypeError(f"{name}: expected {what}, got {type(value).__name__}")
+    if value.dtype != like.dtype:
+        raise TypeError(f"{name}: expected dtype {like.dtype} (the Model's), got {value.dtype}")
+    if value.device != like.device:
+        raise ValueError(f"{name}: expected device {like.device} (the Model's), got {value.device}")
+    return value
+
+
+def check_broadcast(name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Raises unless value broadcasts to shape."""
+    ok = value.dim() <= len(shape) and all(
+        a in (1, b) for a, b in zip(reversed(value.shape), reversed(shape), strict=False)
+    )
+    if not ok:
+        fail(name, f"a shape that broadcasts to {list(shape)}", f"shape {list(value.shape)}")
+    return value
+
+
+def check_count(name: str, value: Any, minimum: int = 0) -> int:
+    if isinstance(value, bool):
+        raise TypeError(f"{name}: expected an integer, got bool")
+    try:
+        value = operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name}: expected an integer, got {type(value).__name__} {value!r}") from None
+    if value < minimum:
+        fail(name, f"an integer >= {minimum}", value)
+    return value
+
+
+def check_positive(name: str, value: Any, unit: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+    if not (math.isfinite(value) and value > 0):
+        fail(name, f"a finite number > 0 {unit}", value)
+    return float(value)

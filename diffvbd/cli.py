@@ -1,0 +1,225 @@
+"""The command line: `diffvbd` or `python -m diffvbd`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import diffvbd as dv
+from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
+from diffvbd.tasks.runner import versions
+from diffvbd.tasks.scene import Array, Observation, Scene
+
+DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Units: m, kg, s, Pa; y points up."
+EXAMPLES = """examples:
+  diffvbd run beam-mu                              identify a beam's shear modulus: log, table and picture in runs/
+  diffvbd run beam-mu --quick                      the same on a small beam, in seconds
+  diffvbd simulate part.msh --out part.pvd --pin x- --young 1e5 --poisson 0.3
+                                                   hang a part by its left side and open part.pvd in ParaView
+  diffvbd simulate part.msh --out drop.pvd --floor -0.5 --velocity 1 0 0
+                                                   throw it on a floor
+  diffvbd simulate part.msh --out part.pvd --pin x- --mu 4e4 --lam 6e4 --save-target target.npz
+  diffvbd identify part.msh target.npz --start 1e4 1e4
+                                                   recover (mu, lam) from the observed motion
+
+`diffvbd COMMAND --help` explains each command. Errors are one line, with exit status 2. An interrupted `run` or
+`identify` continues where it stopped when the same command is given again.
+"""
+TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here replaces the file's value):
+  x          observed positions [m], shape [N, V, 3], or [V, 3] for one final shape
+  steps      time steps after which each was observed, shape [N]; default 0, 1, 2, ...
+  x0, v0     initial positions [m] and velocities [m/s], shape [V, 3]; default: the mesh, at rest
+  pinned     vertices that are held, bool, shape [V]; default none
+  time_step [s], sweeps, density [kg/m^3], gravity [m/s^2], floor [m], kappa, dhat [m]
+  mu, lam    the true material [Pa], if known: only used to report the error
+`diffvbd simulate --save-target TARGET.npz` writes such a file.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status: 0, 2 after an error, 130 after an interruption."""
+    options = _parser().parse_args(arguments)
+    try:
+        options.command(options)
+    except KeyboardInterrupt:
+        print("\ninterrupted; `run` and `identify` continue when the same command is given again", file=sys.stderr)
+        return 130
+    except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
+        print(f"diffvbd: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("diffvbd", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=raw)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    run = commands.add_parser("run", help="run one of the shipped inverse problems", description=_task_list())
+    run.formatter_class = raw
+    run.add_argument("name", choices=sorted(TASKS), metavar="NAME", help="a task that `diffvbd list` names")
+    run.add_argument("--quick", action="store_true", help="a small version that takes seconds")
+    _add_run_options(run, "runs/NAME")
+    run.set_defaults(command=_run)
+
+    listing = commands.add_parser("list", help="list the shipped inverse problems")
+    listing.set_defaults(command=lambda options: print(_task_list()))
+
+    simulate = commands.add_parser("simulate", help="simulate a mesh and write a series for ParaView")
+    simulate.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra (.msh, .vtu, .vtk, ...)")
+    simulate.add_argument("--out", type=Path, required=True, metavar="PART.pvd", help="the series to write")
+    simulate.add_argument("--steps", type=int, default=100, help="time steps (default 100)")
+    simulate.add_argument("--stride", type=int, default=1, help="write every n-th frame (default 1)")
+    simulate.add_argument("--device", default="cpu", help="torch device (default cpu)")
+    simulate.add_argument("--save-target", type=Path, metavar="FILE.npz", help="also write what `identify` reads")
+    material = simulate.add_argument_group("material (default: mu = lam = 1e5 Pa)")
+    for name, text in (("mu", "shear modulus [Pa]"), ("lam", "first Lame parameter [Pa]")):
+        material.add_argument(f"--{name}", type=float, help=text)
+    material.add_argument("--young", type=float, help="Young's modulus [Pa], together with --poisson")
+    material.add_argument("--poisson", type=float, help="Poisson's ratio, below 0.5")
+    _add_scene_options(simulate)
+    simulate.add_argument("--velocity", type=float, nargs=3, metavar=("VX", "VY", "VZ"), help="initial velocity [m/s]")
+    simulate.set_defaults(command=_simulate)
+
+    identification = commands.add_parser(
+        "identify", help="recover mu and lam from observed shapes", epilog=TARGET_KEYS, formatter_class=raw
+    )
+    identification.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra")
+    identification.add_argument("target", type=Path, metavar="TARGET.npz", help="the observation, see below")
+    identification.add_argument(
+        "--start", type=float, nargs=2, default=(1e5, 1e5), metavar=("MU", "LAM"), help="first guess [Pa] (default 1e5)"
+    )
+    identification.add_argument("--fixed-lam", action="store_true", help="keep lam at its first guess")
+    identification.add_argument("--iterations", type=int, default=100, help="at most so many (default 100)")
+    identification.add_argument("--learning-rate", type=float, default=0.15, help="of Adam (default 0.15)")
+    identification.add_argument("--steps", type=int, help="time steps that led to the shape, if x is one shape")
+    _add_scene_options(identification)
+    _add_run_options(identification, "runs/identify")
+    identification.set_defaults(command=_identify)
+
+    info = commands.add_parser("info", help="show versions, devices and the compiled libraries")
+    info.set_defaults(command=_info)
+    return parser
+
+
+def _add_run_options(parser: argparse.ArgumentParser, directory: str) -> None:
+    parser.add_argument("--device", default="cpu", help="torch device (default cpu)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of torch's generators (default 0)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help=f"for log and picture (default {directory})")
+
+
+def _add_scene_options(parser: argparse.ArgumentParser) -> None:
+    # No defaults: identify must know which options were given, and Scene has the defaults.
+    scene = parser.add_argument_group("scene")
+    scene.add_argument("--time-step", type=float, help=f"[s] (default {Scene.time_step:.4g})")
+    scene.add_argument("--sweeps", type=int, help=f"sweeps per step (default {Scene.sweeps})")
+    scene.add_argument("--density", type=float, help=f"[kg/m^3] (default {Scene.density:g})")
+    scene.add_argument("--gravity", type=float, nargs=3, metavar=("GX", "GY", "GZ"), help="[m/s^2] (default 0 -9.81 0)")
+    scene.add_argument("--floor", type=float, metavar="HEIGHT", help="height of a floor [m] (default: none)")
+    scene.add_argument("--kappa", type=float, help=f"stiffness of the floor's barrier (default {Scene.kappa:g})")
+    scene.add_argument("--dhat", type=float, help=f"distance where the barrier begins [m] (default {Scene.dhat:g})")
+    scene.add_argument(
+        "--pin",
+        action="append",
+        metavar="SIDE[:FRACTION]",
+        help="hold the vertices at a side of the bounding box: x-, x+, y-, y+, z- or z+; up to this fraction of its "
+        "extent (default 0.001), for example y+:0.05 for a round body; may be repeated",
+    )
+
+
+def _run(options: argparse.Namespace) -> None:
+    out = options.out or Path("runs") / options.name
+    settings = Settings(out, options.device, options.seed, options.quick)
+    _solve(TASKS[options.name].build(settings), settings)
+
+
+def _solve(problem: Problem, settings: Settings) -> None:
+    start = problem.estimates()
+    result = solve(problem, settings)
+    print(table(problem, start, result))
+    print("wrote " + ", ".join(str(path) for path in result.files))
+
+
+def _simulate(options: argparse.Namespace) -> None:
+    mesh = dv.mesh.load(options.mesh)
+    if options.stride < 1:
+        raise ValueError(f"--stride: expected at least 1, got {options.stride}")
+    mu, lam = _material(options)
+    v0 = np.broadcast_to(np.asarray(options.velocity or (0.0, 0.0, 0.0)), mesh.points.shape)
+    given = _given_scene_options(options, mesh)
+    pinned = given.pop("pinned", np.zeros(mesh.num_vertices, dtype=bool))
+    scene = Scene(mesh, mesh.points, np.where(pinned[:, None], 0.0, v0), pinned, **given)
+    with torch.no_grad():
+        motion = scene.simulate(scene.model(options.device), mu, lam, options.steps, save=options.stride, progress=True)
+    frames, steps = motion.x.cpu().numpy(), np.asarray(motion.steps)
+    dv.mesh.write_series(options.out, mesh, frames, steps * scene.time_step)
+    print(f"wrote {options.out} ({len(steps)} frames of {mesh.num_vertices} vertices)")
+    if options.save_target:
+        Observation(scene, frames, steps, {"mu": mu, "lam": lam}).save(options.save_target)
+        print(f"wrote {options.save_target}")
+
+
+def _identify(options: argparse.Namespace) -> None:
+    mesh = dv.mesh.load(options.mesh)
+    given = _given_scene_options(options, mesh) | {"steps": options.steps}
+    observation = Observation.load(options.target, mesh, **given)
+    settings = Settings(options.out or Path("runs/identify"), options.device, options.seed)
+    start = (options.start[0], options.start[1])
+    problem = identify.problem(
+        observation, settings, start, options.fixed_lam, options.iterations, options.learning_rate
+    )
+    _solve(problem, settings)
+
+
+def _info(options: argparse.Namespace) -> None:
+    rows = versions()
+    rows["cuda"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "no device"
+    package = Path(__file__).parent
+    rows["compiled"] = ", ".join(sorted(path.name for path in package.glob("_C*"))) or "nothing"
+    rows["package"] = str(package)
+    for name, value in rows.items():
+        print(f"{name:10} {value}")
+
+
+def _task_list() -> str:
+    return "\n".join(f"{name:14} {task.summary}" for name, task in sorted(TASKS.items()))
+
+
+def _material(options: argparse.Namespace) -> tuple[float, float]:
+    """mu and lam [Pa] from either pair of options."""
+    young, poisson = options.young, options.poisson
+    if young is None and poisson is None:
+        return (1e5 if options.mu is None else options.mu), (1e5 if options.lam is None else options.lam)
+    if young is None or poisson is None or options.mu is not None or options.lam is not None:
+        raise ValueError("material: give --mu and --lam, or --young and --poisson")
+    if not -1.0 < poisson < 0.5:
+        raise ValueError(f"--poisson: expected a value between -1 and 0.5, got {poisson}")
+    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+
+
+def _given_scene_options(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
+    names = ("time_step", "sweeps", "density", "gravity", "floor", "kappa", "dhat")
+    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    if options.pin:
+        given["pinned"] = np.logical_or.reduce([_side(mesh.points, text) for text in options.pin])
+    return given
+
+
+def _side(points: Array, text: str) -> np.ndarray:
+    """Mask [V] of the vertices at a side of the bounding box, written as in --pin."""
+    side, _, fraction = text.partition(":")
+    try:
+        share = float(fraction or "0.001")
+    except ValueError:
+        share = -1.0
+    if len(side) != 2 or side[0] not in "xyz" or side[1] not in "-+" or not 0.0 <= share <= 1.0:
+        raise ValueError(f"--pin: expected x-, x+, y-, y+, z- or z+, with or without :FRACTION in 0..1, got {text!r}")
+    along = points[:, "xyz".index(side[0])]
+    low, high = along.min(), along.max()
+    # The relative position decides, so rounding cannot leave out vertices that lie exactly in the side.
+    position = (along - low) / (high - low) if side[1] == "-" else (high - along) / (high - low)
+    return position <= share

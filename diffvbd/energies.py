@@ -1,0 +1,235 @@
+"""Energies of a scene: one dataclass for each header in csrc/energies.
+
+A Model's tuple of energies selects the compiled variant; what is absent costs nothing. The numbers of an energy are
+constants of the Model unless a step overrides them through ``parameters={"floor_barrier.kappa": tensor}``, in which
+case they are differentiable.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from .checks import fail
+from .safeguards import filter_against_planes
+
+EXACT_BLOCK, PAPER_BLOCK = 1, 2  # bits of the elastic block in a scene's mask
+MAX_PLANES = 8
+
+
+def _number(name: str, value: float, *, minimum: float = 0.0, strict: bool = False) -> float:
+    if isinstance(value, Tensor) and value.numel() == 1:
+        value = value.detach().item()
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+    if not math.isfinite(value) or value < minimum or (strict and value == minimum):
+        raise ValueError(f"{name}: expected a finite number {'>' if strict else '>='} {minimum:g}, got {value}")
+    return float(value)
+
+
+@dataclass(frozen=True, eq=False)
+class StableNeoHookean:
+    """Stable Neo-Hookean tets, P = mu F + (lb (J - 1) - mu) cof F with lb = mu + lam.
+
+    Args:
+        block: ``"exact"`` uses the exact 3x3 block of a vertex (lam + mu along dJ/dx_i): with it every update minimises
+            the incremental potential in its vertex. ``"paper"`` uses lam there, the paper's choice, which
+            guarantees descent only where lam >= mu.
+
+    Source: Smith, de Goes, Kim (2018); paper, appendix on closed forms; docs/method.md, section 2.
+    """
+
+    name: ClassVar[str] = "stable_neo_hookean"
+    block: str = "exact"
+
+    def __post_init__(self) -> None:
+        if self.block not in ("exact", "paper"):
+            fail("block", '"exact" or "paper"', self.block)
+
+    @property
+    def bit(self) -> int:
+        return EXACT_BLOCK if self.block == "exact" else PAPER_BLOCK
+
+
+class VertexEnergy:
+    """An energy of one vertex at a time. Subclasses are dataclasses; see docs/extending.md."""
+
+    name: ClassVar[str]
+    bit: ClassVar[int]  # 4 << position in the list of csrc/energies/energies.h
+    per_vertex: ClassVar[bool]
+    parameters: ClassVar[dict[str, int]]  # differentiable parameters and their number of own dimensions
+
+    def detached(self) -> VertexEnergy:
+        """A copy whose tensors are detached constants."""
+        changes = {k: v.detach().clone() for k, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, **changes) if changes else self  # type: ignore[type-var]
+
+    def count(self) -> int:
+        """Scalars of data per scene, or per vertex."""
+        raise NotImplementedError
+
+    def check(self, num_vertices: int) -> None:
+        """Raises ValueError where the energy does not fit a mesh."""
+
+    def constants(self, rest_points: Tensor) -> dict[str, Tensor]:
+        """The parameters as tensors of rest_points' dtype and device."""
+        raise NotImplementedError
+
+    def pack(self, values: dict[str, Tensor], origin: Tensor | None) -> Tensor:
+        """Parameters with a leading scene dimension [1 | B, ...] -> data [1 | B, n] as the kernels read it."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class FloorBarrier(VertexEnergy):
+    """IPC log barrier above planes: b(d) = -kappa (d - dhat)^2 log(d / dhat) for a gap 0 < d < dhat.
+
+    No executed sweep lets an unpinned vertex reach a plane: the predictor and every update pass a step filter.
+
+    Args:
+        height: Height of the plane along its normal [m], or one for each plane.
+        normal: Normal (normalised), or a sequence of normals: several planes are one energy.
+        kappa: Barrier stiffness [N/m].
+        dhat: Activation distance [m].
+        damping: Damping of approaching motion while the vertex started the step closer than dhat [N s/m].
+
+    Differentiable as ``floor_barrier.kappa``, ``.dhat``, ``.damping`` (scalars), ``.height`` [planes] and ``.normal``
+    [planes, 3].
+
+    Source: Li et al. (2020); paper, appendix on contact; docs/method.md, section 5.
+    """
+
+    name: ClassVar[str] = "floor_barrier"
+    bit: ClassVar[int] = 4
+    per_vertex: ClassVar[bool] = False
+    parameters: ClassVar[dict[str, int]] = {"normal": 2, "height": 1, "kappa": 0, "dhat": 0, "damping": 0}
+
+    height: float | Sequence[float] = 0.0
+    normal: Sequence[float] | Sequence[Sequence[float]] = (0.0, 1.0, 0.0)
+    kappa: float = 400.0
+    dhat: float = 0.02
+    damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        normal = torch.as_tensor(self.normal, dtype=torch.float64).detach()
+        height = torch.as_tensor(self.height, dtype=torch.float64).detach().reshape(-1)
+        normal = normal[None] if normal.dim() == 1 else normal
+        if normal.dim() != 2 or normal.shape[-1] != 3 or normal.shape[0] == 0:
+            fail("normal", "3 numbers, or a sequence of such triples", f"shape {tuple(normal.shape)}")
+        if not bool(torch.isfinite(normal).all()) or bool((normal.norm(dim=-1) == 0).any()):
+            fail("normal", "finite vectors that are not zero", self.normal)
+        if not bool(torch.isfinite(height).all()):
+            fail("height", "finite numbers", self.height)
+        if height.shape[0] not in (1, normal.shape[0]):
+            if normal.shape[0] != 1:
+                fail("height", f"one value, or one for each of {normal.shape[0]} planes", f"{height.shape[0]} values")
+            normal = normal.expand(height.shape[0], 3)
+        if normal.shape[0] > MAX_PLANES:
+            fail("normal", f"at most {MAX_PLANES} planes", f"{normal.shape[0]}")
+        object.__setattr__(self, "normal", tuple(map(tuple, normal.tolist())))
+        object.__setattr__(self, "height", tuple(height.expand(normal.shape[0]).tolist()))
+        object.__setattr__(self, "kappa", _number("kappa", self.kappa))
+        object.__setattr__(self, "dhat", _number("dhat", self.dhat, strict=True))
+        object.__setattr__(self, "damping", _number("damping", self.damping))
+
+    @property
+    def planes(self) -> int:
+        return len(self.normal)
+
+    def count(self) -> int:
+        return 7 * self.planes
+
+    def constants(self, rest_points: Tensor) -> dict[str, Tensor]:
+        return {k: torch.as_tensor(getattr(self, k)).to(rest_points) for k in self.parameters}
+
+    def pack(self, values: dict[str, Tensor], origin: Tensor | None) -> Tensor:
+        normal = values["normal"]
+        normal = normal / (normal * normal).sum(-1, keepdim=True).sqrt()
+        scenes = max(v.shape[0] for v in values.values())
+        shape = (scenes, self.planes)
+        columns = [values["height"].expand(shape)]
+        columns += [values[k][:, None].expand(shape) for k in ("kappa", "dhat", "damping")]
+        return torch.cat([normal.expand(*shape, 3), torch.stack(columns, -1)], -1).reshape(scenes, -1)
+
+    def filter(self, x: Tensor, step: Tensor, data: Tensor, origin: Tensor | None) -> Tensor:
+        """x + alpha step for the packed ``data`` of this energy, see safeguards.filter_against_planes."""
+        planes = data.reshape(data.shape[0], self.planes, 7)
+        return filter_against_planes(x, step, planes[..., :3], planes[..., 3], origin)
+
+
+@dataclass(frozen=True, eq=False)
+class Anchor(VertexEnergy):
+    """A spring from vertices to points: k / 2 |x_i - a_i|^2.
+
+    Args:
+        stiffness: k [N/m], a number or one for each vertex, shape [V].
+        points: a [m], shape [V, 3]; None anchors at the rest points.
+        vertices: Which vertices, a bool mask [V] or indices; None anchors all.
+
+    Differentiable as ``anchor.stiffness`` (scalar or [V]) and ``anchor.points`` [V, 3].
+    """
+
+    name: ClassVar[str] = "anchor"
+    bit: ClassVar[int] = 8
+    per_vertex: ClassVar[bool] = True
+    parameters: ClassVar[dict[str, int]] = {"stiffness": 1, "points": 2}
+
+    stiffness: float | Tensor = 1.0
+    points: Tensor | None = None
+    vertices: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        for field in ("points", "vertices"):
+            value = getattr(self, field)
+            if value is not None and not isinstance(value, Tensor):
+                object.__setattr__(self, field, torch.as_tensor(value))
+        if not isinstance(self.stiffness, Tensor):
+            object.__setattr__(self, "stiffness", torch.as_tensor(self.stiffness, dtype=torch.float64))
+        stiffness = torch.as_tensor(self.stiffness).detach()
+        if not bool((torch.isfinite(stiffness) & (stiffness >= 0)).all()):
+            fail("stiffness", "finite numbers >= 0", self.stiffness)
+
+    def count(self) -> int:
+        return 4
+
+    def check(self, num_vertices: int) -> None:
+        stiffness = torch.as_tensor(self.stiffness)
+        if stiffness.dim() > 0 and stiffness.shape != (num_vertices,):
+            fail("stiffness", f"a number or shape [{num_vertices}]", f"shape {list(stiffness.shape)}")
+        if self.points is not None and self.points.shape != (num_vertices, 3):
+            fail("points", f"shape [{num_vertices}, 3]", f"shape {list(self.points.shape)}")
+        self._mask(num_vertices)
+
+    def _mask(self, num_vertices: int) -> Tensor:
+        if self.vertices is None:
+            return torch.ones(num_vertices, dtype=torch.bool)
+        if self.vertices.dtype == torch.bool:
+            if self.vertices.shape != (num_vertices,):
+                fail("vertices", f"a mask of shape [{num_vertices}] or indices", f"shape {list(self.vertices.shape)}")
+            return self.vertices
+        index = self.vertices.to(torch.int64).reshape(-1)
+        if index.numel() and (int(index.min()) < 0 or int(index.max()) >= num_vertices):
+            fail("vertices", f"indices in [0, {num_vertices})", f"{int(index.min())}..{int(index.max())}")
+        return torch.zeros(num_vertices, dtype=torch.bool).index_fill(0, index.cpu(), True)
+
+    def constants(self, rest_points: Tensor) -> dict[str, Tensor]:
+        points = rest_points if self.points is None else self.points.to(rest_points)
+        mask = self._mask(rest_points.shape[0]).to(rest_points)
+        return {"stiffness": torch.as_tensor(self.stiffness).to(rest_points).expand(len(mask)) * mask, "points": points}
+
+    def pack(self, values: dict[str, Tensor], origin: Tensor | None) -> Tensor:
+        points = values["points"] if origin is None else values["points"] - origin
+        stiffness = values["stiffness"]
+        scenes = max(points.shape[0], stiffness.shape[0])
+        n = points.shape[1]
+        stiffness = stiffness.expand(scenes, n) * self._mask(n).to(points)
+        return torch.cat([stiffness[..., None], points.expand(scenes, n, 3)], -1).reshape(scenes, -1)
+
+
+Energy = StableNeoHookean | VertexEnergy
+VERTEX_ENERGIES: tuple[type[VertexEnergy], ...] = (FloorBarrier, Anchor)  # order of csrc/energies/energies.h

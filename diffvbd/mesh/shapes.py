@@ -1,0 +1,237 @@
+"""Procedural bodies on structured grids, and thin shells made by thickening a triangle surface.
+
+Lengths are in metres and y points up. Boxes start at the origin; round shapes are centred on the y axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from diffvbd.mesh.tet_mesh import FloatArray, IntArray, TetMesh, float_array, int_array
+
+Split = Literal["kuhn", "five"]
+
+# Corner k of a cell lies at ((k >> 2) & 1, (k >> 1) & 1, k & 1). Kuhn: one tet per order of walking the axes from
+# corner 0 to corner 7. Five: one regular tet and four corners; odd cells are mirrored so that faces match.
+_KUHN = np.array([[0, 4, 6, 7], [0, 6, 2, 7], [0, 2, 3, 7], [0, 3, 1, 7], [0, 1, 5, 7], [0, 5, 4, 7]])
+_FIVE_EVEN = np.array([[0, 6, 5, 3], [4, 0, 6, 5], [2, 0, 6, 3], [1, 0, 5, 3], [7, 6, 5, 3]])
+_FIVE_ODD = 7 - _FIVE_EVEN
+
+
+def count(name: str, value: Any, least: int) -> int:
+    """`value` as an int of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise TypeError(f"{name}: expected an integer, got {value!r}")
+    if value < least:
+        raise ValueError(f"{name}: expected at least {least}, got {value}")
+    return int(value)
+
+
+def positive(name: str, value: Any) -> float:
+    """`value` as a positive, finite float."""
+    number = float(float_array(name, value, ()))
+    if number <= 0:
+        raise ValueError(f"{name}: expected a positive length, got {number:.6g}")
+    return number
+
+
+def _lengths(name: str, values: Any, dimensions: int) -> FloatArray:
+    numbers = float_array(name, values, (dimensions,))
+    if (numbers <= 0).any():
+        raise ValueError(f"{name}: expected positive lengths, got {numbers.tolist()}")
+    return numbers
+
+
+def box(n: int | Sequence[int] = 2, size: float | Sequence[float] = 1.0, split: Split = "kuhn") -> TetMesh:
+    """Box with one corner at the origin.
+
+    Args:
+        n: Vertices per axis, at least 2: one number or (nx, ny, nz). Vertex (i, j, k) has index (i ny + j) nz + k.
+        size: Edge lengths [m]: one number or (x, y, z).
+        split: "kuhn" cuts each cell into 6 equal tets, all cells alike; "five" into 5, mirrored from cell to cell.
+
+    Raises:
+        TypeError, ValueError: a count that is no integer or below 2, a size that is not positive, an unknown split.
+    """
+    counts = [count("n", k, 2) for k in (n if isinstance(n, (Sequence, np.ndarray)) else (n, n, n))]
+    if len(counts) != 3:
+        raise ValueError(f"n: expected one number or three, got {len(counts)}")
+    lengths = _lengths("size", size if np.ndim(size) else [size] * 3, 3)
+    if split not in ("kuhn", "five"):
+        raise ValueError(f'split: expected "kuhn" or "five", got {split!r}')
+    axes = [np.linspace(0.0, extent, k) for extent, k in zip(lengths, counts, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = np.stack(np.meshgrid(*(np.arange(k - 1) for k in counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    strides = np.array([counts[1] * counts[2], counts[2], 1])
+    corner = np.arange(8)
+    offsets = np.stack([(corner >> 2) & 1, (corner >> 1) & 1, corner & 1], axis=1) @ strides
+    corners = (cells @ strides)[:, None] + offsets
+    if split == "kuhn":
+        tets = corners[:, _KUHN]
+    else:
+        odd = (cells.sum(axis=1) % 2 == 1)[:, None, None]
+        tets = np.where(odd, corners[:, _FIVE_ODD], corners[:, _FIVE_EVEN])
+    return TetMesh(points, tets.reshape(-1, 4), orient=True)
+
+
+def beam(
+    nx: int = 21, ny: int = 7, nz: int = 7, size: Sequence[float] = (0.5, 0.2, 0.2), split: Split = "kuhn"
+) -> TetMesh:
+    """Beam along x: a box of nx, ny, nz vertices per axis. Arguments and errors as for `box`."""
+    return box((nx, ny, nz), size, split)
+
+
+def cube(n: int = 2, size: float = 1.0, split: Split = "kuhn") -> TetMesh:
+    """Cube with n vertices per axis; `cube()` has 8 vertices and 6 tets. Arguments and errors as for `box`."""
+    return box(count("n", n, 2), positive("size", size), split)
+
+
+def shell(points: Any, triangles: Any, thickness: float) -> TetMesh:
+    """Thin shell: a triangle surface thickened by half of `thickness` to either side, each prism cut into 3 tets.
+
+    The vertices of the negative side keep their index; those of the positive side follow, in the same order.
+
+    Args:
+        points: Middle surface [m], shape [P, 3].
+        triangles: Vertex indices, shape [F, 3], wound alike. Prisms follow the averaged vertex normals.
+        thickness: Distance between the two layers [m], small against the radius of curvature.
+
+    Raises:
+        TypeError, ValueError: bad shape, dtype or index, or a thickness that inverts prisms.
+    """
+    middle = float_array("points", points, (None, 3))
+    faces = int_array("triangles", triangles, (None, 3))
+    half = positive("thickness", thickness) / 2
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(middle)):
+        raise ValueError(
+            f"triangles: expected vertex indices from 0 to {len(middle) - 1}, got {faces.min()}..{faces.max()}"
+        )
+    a, b, c = (middle[faces[:, k]] for k in range(3))
+    normals = np.zeros_like(middle)
+    face_normals = np.cross(b - a, c - a)
+    for k in range(3):
+        np.add.at(normals, faces[:, k], face_normals)
+    norms = np.linalg.norm(normals, axis=1, keepdims=True)
+    if (norms == 0).any():
+        raise ValueError("triangles: expected a normal at every vertex, got vertices without triangles or folded ones")
+    offset = half * normals / norms
+    layers = np.concatenate([middle - offset, middle + offset])
+    # Sorting each triangle makes the diagonal of a side wall depend on its two vertices alone, so that both
+    # prisms at a wall agree, and rules out the cyclic arrangement that no three tets can fill.
+    low = np.sort(faces, axis=1)
+    high = low + len(middle)
+    tets = np.concatenate([low, high], axis=1)[:, [[0, 1, 2, 5], [0, 1, 5, 4], [0, 3, 4, 5]]]
+    # An odd permutation mirrors its prism. Undoing that here, not by the sign of the volume, lets TetMesh see
+    # prisms that the thickness has turned inside out.
+    rotated = low[:, None] == np.stack([faces, np.roll(faces, 1, axis=1), np.roll(faces, 2, axis=1)], axis=1)
+    odd = ~rotated.all(axis=2).any(axis=1)
+    tets[odd] = tets[odd][:, :, [0, 1, 3, 2]]
+    return TetMesh(layers, tets.reshape(-1, 4))
+
+
+def _grid_triangles(rows: int, columns: int, wrap: bool = False) -> IntArray:
+    """Two triangles per cell of a rows x columns vertex grid, diagonals alternating; `wrap` closes the columns."""
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(rows - 1), np.arange(columns - (not wrap)), indexing="ij"))
+    a, b = i * columns + j, (i + 1) * columns + j
+    d, c = i * columns + (j + 1) % columns, (i + 1) * columns + (j + 1) % columns
+    even = ((i + j) % 2 == 0)[:, None, None]
+    one = np.stack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)], axis=1)
+    other = np.stack([np.stack([a, b, d], 1), np.stack([b, c, d], 1)], axis=1)
+    return np.where(even, one, other).reshape(-1, 3)
+
+
+def sheet(nx: int = 22, ny: int = 11, size: Sequence[float] = (0.6, 0.6), thickness: float = 0.01) -> TetMesh:
+    """Flat cloth or flag: a thin 3-tet shell of 2 nx ny vertices in the xz plane, normal along y.
+
+    The lower layer comes first; vertex (i, j) of a layer has index i ny + j.
+
+    Args:
+        nx, ny: Vertices along x and along z, at least 2.
+        size: Extent along x and z [m]; one corner is at the origin.
+        thickness: Extent along y [m], from -thickness/2 to +thickness/2.
+
+    Raises:
+        TypeError, ValueError: a count below 2, a size or thickness that is not positive.
+    """
+    columns, rows = count("nx", nx, 2), count("ny", ny, 2)
+    extent = _lengths("size", size, 2)
+    x, z = np.meshgrid(np.linspace(0, extent[0], columns), np.linspace(0, extent[1], rows), indexing="ij")
+    points = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+    # x cross z is -y: exchange two vertices so that the positive side is up.
+    return shell(points, _grid_triangles(columns, rows)[:, [0, 2, 1]], thickness)
+
+
+def disk(radius: float = 0.42, thickness: float = 0.06, resolution: int = 6) -> TetMesh:
+    """Flat round disk, normal along y, centred at the origin: a 3-tet shell of concentric rings.
+
+    Args:
+        radius: [m].  thickness: Extent along y [m].
+        resolution: Number of rings, at least 1; a layer has 1 + 3 r (r + 1) vertices.
+
+    Raises:
+        TypeError, ValueError: lengths that are not positive, resolution below 1.
+    """
+    radius, rings = positive("radius", radius), count("resolution", resolution, 1)
+    ring = np.repeat(np.arange(1, rings + 1), 6 * np.arange(1, rings + 1))
+    first = 1 + 3 * np.arange(rings + 1) * (np.arange(rings + 1) - 1)  # index of the first vertex of ring k
+    first[0] = 0
+    angle = 2 * np.pi * (np.arange(len(ring)) + 1 - first[ring]) / (6 * ring)
+    ring_radius = radius * ring / rings
+    points = np.zeros((1 + len(ring), 3))
+    points[1:, 0], points[1:, 2] = ring_radius * np.cos(angle), -ring_radius * np.sin(angle)
+    triangles = []
+    for k in range(1, rings + 1):
+        sector, step = (m.ravel() for m in np.meshgrid(np.arange(6), np.arange(k), indexing="ij"))
+
+        def outer(s: IntArray, j: IntArray, k: int = k) -> IntArray:
+            return first[k] + (s * k + j) % (6 * k)
+
+        def inner(s: IntArray, j: IntArray, k: int = k) -> IntArray:
+            return first[k - 1] + (s * (k - 1) + j) % max(6 * (k - 1), 1)
+
+        triangles.append(np.stack([inner(sector, step), outer(sector, step), outer(sector, step + 1)], axis=1))
+        s, j = sector[step < k - 1], step[step < k - 1]
+        triangles.append(np.stack([inner(s, j), outer(s, j + 1), inner(s, j + 1)], axis=1))
+    return shell(points, np.concatenate(triangles), thickness)
+
+
+def dress(
+    segments: int = 20,
+    rings: int = 15,
+    thickness: float = 0.01,
+    neck_height: float = 1.45,
+    hem_height: float = 0.65,
+    scale: float = 1.0,
+) -> TetMesh:
+    """Sleeveless A-line dress about the y axis, open at neck and hem: a 3-tet shell of 2 segments rings vertices.
+
+    The default has 600 vertices; `dress(22, 21)` has 924. Vertex (i, j) of a layer, ring i counted from the neck, has
+    index i segments + j; the inner layer comes first.
+
+    Args:
+        segments: Vertices around, at least 4.  rings: Vertices from neck to hem, at least 4.
+        thickness: Distance between the layers [m].
+        neck_height, hem_height: Height of the openings [m].
+        scale: Factor on all radii; at 1 the neck has radius 0.11 m, the waist 0.16 m, the hem 0.36 m.
+
+    Raises:
+        TypeError, ValueError: counts below 4, lengths that are not positive, the hem not below the neck.
+    """
+    around, down = count("segments", segments, 4), count("rings", rings, 4)
+    neck, hem = float(float_array("neck_height", neck_height, ())), float(float_array("hem_height", hem_height, ()))
+    if hem >= neck:
+        raise ValueError(f"hem_height: expected less than neck_height = {neck:.6g}, got {hem:.6g}")
+    # (radius, height) from the neck over the shoulders to the waist and the hem, in fractions of the drop.
+    outline_radius = positive("scale", scale) * np.array([0.11, 0.19, 0.2, 0.16, 0.2, 0.36])
+    outline_height = neck - (neck - hem) * np.array([0.0, 0.05, 0.16, 0.42, 0.56, 1.0])
+    travelled = np.concatenate([[0], np.cumsum(np.hypot(np.diff(outline_radius), np.diff(outline_height)))])
+    at = np.linspace(0, travelled[-1], down)
+    radius, height = np.interp(at, travelled, outline_radius), np.interp(at, travelled, outline_height)
+    angle = 2 * np.pi * np.arange(around) / around
+    x, z = np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))
+    y = np.repeat(height[:, None], around, axis=1)
+    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    return shell(points, _grid_triangles(down, around, wrap=True)[:, [0, 2, 1]], thickness)

@@ -1,0 +1,256 @@
+"""Model: everything that does not change while a scene is simulated."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from . import ops
+from .checks import check_positive, fail
+from .energies import VERTEX_ENERGIES, Energy, FloorBarrier, StableNeoHookean, VertexEnergy
+from .mesh import TetMesh
+from .metric import lumped_mass, rest_metric
+from .safeguards import FILTER_ETA, SATURATION_EPS
+
+PAPER_SATURATION = 0.1  # [m]
+PAPER_REGULARIZATION = 1e-6  # [kg]
+
+
+class Model:
+    """A mesh with its masses, pins, energies and safeguards, colored and laid out for the sweeps.
+
+    A Model holds detached constants; what is differentiated is an argument of :func:`diffvbd.step`.
+
+    Args:
+        mesh: Tetrahedra with positive rest volume.
+        density: [kg/m^3], a number or one for each tet, shape [T].
+        pinned: Vertices that sweeps do not move: a bool mask [V] or indices.
+        energies: At most one of each kind.
+        saturation: c [m]: every update d is shortened to c d / (|d| + c). None: off.
+        regularization: tau [kg], added to the diagonal of every block. 0: off.
+        relaxation: omega, 0 < omega < 2, multiplies every update. Above 1 it needs fewer sweeps; use it with the exact
+            block or with saturation (docs/numerics.md).
+        dtype: torch.float64 or torch.float32.
+        device: Where the tensors live.
+
+    Attributes (torch tensors in the user's numbering):
+        rest_points [V, 3] [m]; tets [T, 4]; density [T]; mass [V] [kg]; pinned [V] bool; surface [F, 3];
+        color_vertices [active]: the vertices in sweep order, color c being
+        ``color_vertices[color_ptr[c]:color_ptr[c + 1]]``; color_ptr [colors + 1].
+
+    Raises:
+        ValueError, TypeError: naming the argument, what was expected and what came.
+    """
+
+    def __init__(
+        self,
+        mesh: TetMesh,
+        density: float | Tensor = 1000.0,
+        pinned: Any = None,
+        energies: Sequence[Energy] = (StableNeoHookean(),),
+        saturation: float | None = None,
+        regularization: float = 0.0,
+        relaxation: float = 1.0,
+        *,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        if not isinstance(mesh, TetMesh):
+            raise TypeError(f"mesh: expected a diffvbd.TetMesh, got {type(mesh).__name__}")
+        if dtype not in (torch.float64, torch.float32):
+            raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
+        self.mesh = mesh
+        self.saturation = None if saturation is None else check_positive("saturation", saturation, "m")
+        self.regularization = float(regularization)
+        if not (math.isfinite(self.regularization) and self.regularization >= 0):
+            fail("regularization", "a finite number >= 0 kg", regularization)
+        self.relaxation = check_positive("relaxation", relaxation, "")
+        if self.relaxation >= 2:
+            fail("relaxation", "a number in (0, 2): from 2 on the updates raise the potential", relaxation)
+        self.energies = _checked_energies(energies, mesh.num_vertices)
+
+        points = torch.from_numpy(mesh.points.copy())
+        tets = torch.from_numpy(mesh.tets.copy())
+        mask = _mask(pinned, mesh.num_vertices)
+        touched = torch.zeros(mesh.num_vertices, dtype=torch.bool)
+        touched[tets.reshape(-1)] = True
+        loose = (~touched & ~mask).nonzero().reshape(-1)
+        if loose.numel():
+            shown = ", ".join(map(str, loose[:5].tolist())) + (", ..." if loose.numel() > 5 else "")
+            fail("mesh", "every vertex in a tet, or pinned", f"{loose.numel()} isolated vertices: {shown}")
+        self.density = _per_tet_density(density, mesh.num_tets)
+        self.pinned = mask
+        self._plan, self.color_ptr, self.color_vertices, star_ptr, star = ops.build_plan(points, tets, ~mask)
+        self._topology = (tets, star_ptr, star)
+        self._sizes = (int(self._plan[2]), mesh.num_tets, int(self._plan[5]))
+        body = torch.from_numpy(mesh.body.copy())
+        self._first_of_body = _first_of_body(body)
+        self._measure(points)
+        self._place(dtype, torch.device(device))
+
+    def _measure(self, points: Tensor) -> None:
+        """Everything that follows from the rest positions, in float64."""
+        rest, volume = rest_metric(ops.tet_gather(points[None], *self._topology))
+        self.rest_points = points
+        self.mass = lumped_mass(self.density[None], volume, *self._topology)[0]
+        self._packed_rest = ops.pack_rest(rest, self._plan, self._sizes)
+        data = [e.pack(self._parameters(e, points), None) for e in self.vertex_energies]
+        self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
+
+    def _parameters(self, energy: VertexEnergy, rest_points: Tensor) -> dict[str, Tensor]:
+        return {name: value[None] for name, value in energy.constants(rest_points).items()}
+
+    def _place(self, dtype: torch.dtype, device: torch.device) -> None:
+        self.dtype, self.device = dtype, device
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                setattr(self, name, value.to(device, dtype) if value.is_floating_point() else value.to(device))
+        self._topology = tuple(t.to(device) for t in self._topology)
+
+    @classmethod
+    def paper(cls, mesh: TetMesh, **options: Any) -> Model:
+        """The paper's preset: block="paper", saturation 0.1 m, regularization 1e-6 kg.
+
+        Both constants are absolute: 0.1 m is 33 edges of a 3 mm cube and 1e-6 kg is 0.15-0.44 of such a cube's vertex, so
+        the preset does not suit small bodies (docs/numerics.md).
+        """
+        energies = tuple(options.pop("energies", ()))
+        energies = (StableNeoHookean("paper"), *(e for e in energies if not isinstance(e, StableNeoHookean)))
+        options = {"saturation": PAPER_SATURATION, "regularization": PAPER_REGULARIZATION, **options}
+        return cls(mesh, energies=energies, **options)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Model:
+        """A new Model on another device or of another dtype (float64 or float32); this one is untouched."""
+        dtype = dtype or self.dtype
+        if dtype not in (torch.float64, torch.float32):
+            raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
+        out = copy.copy(self)
+        out._place(torch.float64, torch.device("cpu"))
+        # from the mesh's own float64 positions, so that a way through float32 loses nothing
+        out._measure(torch.from_numpy(self.mesh.points.copy()))
+        out._place(dtype, torch.device(device) if device is not None else self.device)
+        return out
+
+    @property
+    def tets(self) -> Tensor:
+        """Vertices of each tet, shape [T, 4]."""
+        return self._topology[0]
+
+    @property
+    def surface(self) -> Tensor:
+        """Outward triangles of the boundary, shape [F, 3]."""
+        return torch.from_numpy(self.mesh.surface.copy()).to(self.device)
+
+    @property
+    def num_vertices(self) -> int:
+        return self.mesh.num_vertices
+
+    @property
+    def num_tets(self) -> int:
+        return self.mesh.num_tets
+
+    @property
+    def num_active(self) -> int:
+        """Vertices that sweeps move."""
+        return self._sizes[0]
+
+    @property
+    def num_colors(self) -> int:
+        return self.color_ptr.shape[0] - 1
+
+    @property
+    def vertex_energies(self) -> tuple[VertexEnergy, ...]:
+        """The energies of single vertices, in the order in which kernels and data keep them."""
+        present = [e for e in self.energies if isinstance(e, VertexEnergy)]
+        return tuple(sorted(present, key=lambda e: e.bit))
+
+    @property
+    def energy_mask(self) -> int:
+        return sum(e.bit for e in self.energies)
+
+    @property
+    def floor(self) -> FloorBarrier | None:
+        return next((e for e in self.energies if isinstance(e, FloorBarrier)), None)
+
+    def settings(self, time_step: float, sweeps: int) -> ops.SweepSettings:
+        """What the kernels execute for this Model besides its tensors."""
+        present = {type(e): e for e in self.vertex_energies}
+        counts = tuple(present[kind].count() if kind in present else 0 for kind in VERTEX_ENERGIES)
+        saturation = -1.0 if self.saturation is None else self.saturation
+        numbers = (time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS, FILTER_ETA)
+        return ops.SweepSettings(self._sizes, self.energy_mask, counts, numbers, sweeps)
+
+    def memory(self, **options: Any) -> dict[str, int]:
+        """Predicted bytes of a step or rollout of this Model; see :func:`diffvbd.memory.predict`."""
+        from .memory import predict
+
+        return predict(self, **options)
+
+    def __repr__(self) -> str:
+        safeguards = [f"relaxation={self.relaxation:g}"] if self.relaxation != 1 else []
+        safeguards += [f"saturation={self.saturation:g} m"] if self.saturation is not None else []
+        safeguards += [f"regularization={self.regularization:g} kg"] if self.regularization else []
+        return (
+            f"Model({self.num_vertices} vertices, {self.num_tets} tets, {int(self.pinned.sum())} pinned, "
+            f"{self.num_colors} colors, mass {float(self.mass.sum()):.4g} kg, "
+            f"energies=({', '.join(map(repr, self.energies))})"
+            f"{''.join(', ' + s for s in safeguards)}, {self.dtype}, {self.device})"
+        )
+
+
+def _checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
+    if isinstance(energies, (StableNeoHookean, VertexEnergy)):
+        energies = (energies,)
+    kinds = (StableNeoHookean, *VERTEX_ENERGIES)
+    out: list[Energy] = []
+    for energy in energies:
+        if not isinstance(energy, kinds):
+            names = ", ".join(k.__name__ for k in kinds)
+            raise TypeError(f"energies: expected instances of {names}, got {type(energy).__name__}")
+        if any(type(energy) is type(other) for other in out):
+            fail("energies", f"one {type(energy).__name__} (several planes are one FloorBarrier)", "two")
+        if isinstance(energy, VertexEnergy):
+            energy.check(num_vertices)
+            energy = energy.detached()
+        out.append(energy)
+    return tuple(out)
+
+
+def _mask(pinned: Any, num_vertices: int) -> Tensor:
+    if pinned is None:
+        return torch.zeros(num_vertices, dtype=torch.bool)
+    pinned = torch.as_tensor(pinned).detach().cpu()
+    if pinned.dtype == torch.bool:
+        if pinned.shape != (num_vertices,):
+            fail("pinned", f"a mask of shape [{num_vertices}] or indices", f"a mask of shape {list(pinned.shape)}")
+        return pinned.clone()
+    if pinned.numel() and pinned.is_floating_point():
+        raise TypeError(f"pinned: expected a bool mask or integer indices, got dtype {pinned.dtype}")
+    index = pinned.to(torch.int64).reshape(-1)
+    if index.numel() and (int(index.min()) < 0 or int(index.max()) >= num_vertices):
+        fail("pinned", f"indices in [0, {num_vertices})", f"{int(index.min())}..{int(index.max())}")
+    return torch.zeros(num_vertices, dtype=torch.bool).index_fill(0, index, True)
+
+
+def _per_tet_density(density: Any, num_tets: int) -> Tensor:
+    if isinstance(density, bool) or not (isinstance(density, (int, float)) or hasattr(density, "__array__")):
+        raise TypeError(f"density: expected a number or shape [{num_tets}], got {type(density).__name__}")
+    density = torch.as_tensor(density).detach().cpu().to(torch.float64)
+    if density.shape not in ((), (1,), (num_tets,)):
+        fail("density", f"a number or shape [{num_tets}]", f"shape {list(density.shape)}")
+    if not bool((torch.isfinite(density) & (density > 0)).all()):
+        fail("density", "finite numbers > 0 kg/m^3", float(density.reshape(-1)[~(density.reshape(-1) > 0)][:1].sum()))
+    return density.expand(num_tets).clone()
+
+
+def _first_of_body(body: Tensor) -> Tensor:
+    """For each vertex the first vertex of its body: the origin that float32 computes about."""
+    labels, inverse = torch.unique(body, return_inverse=True)
+    order = torch.arange(body.shape[0])
+    first = torch.full((labels.shape[0],), body.shape[0]).scatter_reduce(0, inverse, order, "amin")
+    return first[inverse]

@@ -1,0 +1,10 @@
+"""The executed step in plain torch: slow, readable, differentiated by autograd.
+
+It is the oracle of the exactness tests and the unrolled opponent in benchmarks. It works from deformation gradients,
+not from the pair scalars of the compiled sweep, and imports nothing compiled, so the two agree only if both are right.
+"""
+
+from .potential import incremental_potential, residual
+from .sweep import Trajectory, rollout, step
+
+__all__ = ["Trajectory", "incremental_potential", "residual", "rollout", "step"]

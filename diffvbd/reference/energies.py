@@ -1,0 +1,207 @@
+"""Reference formulas, one class per energy, and the registry `ENERGIES` that names them.
+
+An energy class is built once per run from (its dataclass, Scene) and offers
+
+* `block(k, x, x_prev)` -> [..., 9, n]: h^2 times gradient (3 rows) and Hessian block (xx, xy, xz, yy, yz, zz) of the n
+  vertices of color k, at the state x [..., 3, V], lagged terms at x_prev;
+* `energy(x, x_prev)` -> [...]: the matching h^2-scaled energy of the whole body (unpinned vertices only);
+* optionally `limit(x, step)` -> [..., n]: the largest admissible fraction of `step` [..., 3, n] from x [..., 3, n].
+
+Vertex energies take what is per vertex from the full vectors by color.
+"""
+
+import re
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .layout import Color, add_at, cross, dot, outer6, take
+from .scene import Scene
+
+ETA = 0.9  # a filtered step closes at most this fraction of a gap
+GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
+
+
+class StableNeoHookean:
+    """psi = mu/2 (|F|^2 - 3) - mu (J - 1) + lb/2 (J - 1)^2, lb = mu + lam: P = mu F + (lb (J - 1) - mu) cof F.
+
+    The usual form lb/2 (J - 1 - mu/lb)^2 differs by the constant mu^2 / (2 lb), which does not exist at lb = 0.
+    """
+
+    def __init__(self, energy: Any, scene: Scene) -> None:
+        self.scene = scene
+        exact = energy.block == "exact"
+        weight = scene.time_step**2 * scene.volume
+        lb = scene.mu + scene.lam
+        per_tet = torch.stack(torch.broadcast_tensors(weight * scene.mu, weight * lb, weight * scene.lam), -2)
+        self.colors = [self._pairs(color, scene.shape_gradients, per_tet, exact) for color in scene.layout.colors]
+
+    @staticmethod
+    def _pairs(color: Color, gradients: Tensor, per_tet: Tensor, exact: bool) -> tuple:
+        """Constants of a color's pairs: columns of Dm^-1 as rows of length P, grad N of the vertex, weights, and the
+        part mu |grad N|^2 I of the block, which no state changes."""
+        inverse = gradients[..., 1:, :, :][..., color.tet]
+        own = gradients.movedim(-3, -1)[..., color.tet, color.local]
+        w_mu, w_lb, w_lam = (w.unsqueeze(-2) for w in per_tet[..., color.tet].unbind(-2))
+        diagonal = w_mu * dot(own, own).unsqueeze(-2)
+        no = torch.zeros_like(diagonal)
+        constant = torch.cat((no, no, no, diagonal, no, no, diagonal, no, diagonal), -2)
+        constant = add_at(constant.new_zeros(9, color.vertices.numel()), color.owner, constant)
+        rows = [row.split(1, -2) for row in inverse.unbind(-3)]
+        return rows, own.split(1, -2), w_mu, w_lb, w_lb if exact else w_lam, constant
+
+    def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
+        color = self.scene.layout.colors[k]
+        (rb, rc, rd), own, w_mu, w_lb, w_lh, constant = self.colors[k]
+        a, b, c, d = take(x, color.corners).unflatten(-1, (4, -1)).unbind(-2)
+        f = _columns((b - a, c - a, d - a), (rb, rc, rd))
+        cof = cross(f[1], f[2]), cross(f[2], f[0]), cross(f[0], f[1])
+        det = dot(f[0], cof[0]).unsqueeze(-2)
+        q = _combine(cof, own)
+        gradient = w_mu * _combine(f, own) + (w_lb * (det - 1) - w_mu) * q
+        return add_at(constant, color.owner, torch.cat((gradient, w_lh * outer6(q)), -2))
+
+    def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+        s = self.scene
+        a, b, c, d = (x[..., corner] for corner in s.layout.tets)
+        f = _columns((b - a, c - a, d - a), [g.split(1, -2) for g in s.shape_gradients.unbind(-3)[1:]])
+        strain = dot(f[0], cross(f[1], f[2])) - 1
+        norm = sum(dot(column, column) for column in f)
+        psi = s.mu * ((norm - 3) / 2 - strain) + (s.mu + s.lam) / 2 * strain**2
+        return s.time_step**2 * (s.volume * psi).sum(-1)
+
+
+def _combine(vectors: Any, weights: Any) -> Tensor:
+    """v0 w0 + v1 w1 + v2 w2 with vectors [..., 3, P] and weights [..., 1, P]."""
+    total = torch.addcmul(vectors[0] * weights[0], vectors[1], weights[1])
+    return torch.addcmul(total, vectors[2], weights[2])
+
+
+def _columns(edges: Any, rows: Any) -> list[Tensor]:
+    """Columns of F = Ds Dm^-1 from the columns of Ds and the rows of Dm^-1."""
+    return [_combine(edges, [row[c] for row in rows]) for c in range(3)]
+
+
+class FloorBarrier:
+    """b(d) = -kappa (d - dhat)^2 log(d / dhat) for 0 < d < dhat, per plane d = n.x - height; damping of approach."""
+
+    def __init__(self, energy: Any, scene: Scene) -> None:
+        self.scene = scene
+        kappa, dhat, damping, height, normal = (
+            scene.parameter("floor_barrier", energy, name) for name in ("kappa", "dhat", "damping", "height", "normal")
+        )
+        # Shapes against gaps [..., planes, n]; a scene dimension of a parameter stays in front.
+        self.kappa, self.dhat, self.damping = (p[..., None, None] for p in (kappa, dhat, damping))
+        self.height = torch.atleast_1d(height)[..., None]
+        normal = torch.atleast_2d(normal)
+        self.normal = (normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True))[..., None]
+        self.outer = outer6(self.normal)
+        self.damped = "floor_barrier.damping" in scene.parameters or bool((damping != 0).any())
+
+    def _gap(self, x: Tensor) -> Tensor:
+        return dot(self.normal, x.unsqueeze(-3)) - self.height
+
+    def _approach(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
+        """Normal travel since x_prev [..., planes, n], and where it is damped."""
+        travel = dot(self.normal, (x - x_prev).unsqueeze(-3))
+        return travel, (self._gap(x_prev) < self.dhat) & (travel < 0)
+
+    def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
+        vertices = self.scene.layout.colors[k].vertices
+        x = take(x, vertices)
+        h = self.scene.time_step
+        gap = self._gap(x)
+        active = (gap > 0) & (gap < self.dhat)
+        d = torch.where(active, gap, 1.0)  # the unused branch must stay finite for autograd
+        log, past = torch.log(d / self.dhat), d - self.dhat
+        first = torch.where(active, -self.kappa * (2 * past * log + past**2 / d), 0.0)
+        second = torch.where(active, -self.kappa * (2 * log + 4 * past / d - (past / d) ** 2), 0.0)
+        first, second = h**2 * first, h**2 * second
+        if self.damped:
+            travel, damped = self._approach(x, take(x_prev, vertices))
+            first = first + torch.where(damped, self.damping * h * travel, 0.0)
+            second = second + torch.where(damped, self.damping * h, 0.0)
+        gradient = (first.unsqueeze(-2) * self.normal).sum(-3)
+        return torch.cat((gradient, (second.unsqueeze(-2) * self.outer).sum(-3)), -2)
+
+    def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+        h = self.scene.time_step
+        free = ~self.scene.model.pinned
+        gap = self._gap(x[..., free])
+        active = gap < self.dhat
+        d = torch.where(active, gap, 1.0)
+        total = h**2 * torch.where(active, -self.kappa * (d - self.dhat) ** 2 * torch.log(d / self.dhat), 0.0)
+        total = torch.where(gap > 0, total, torch.inf)
+        if self.damped:
+            travel, damped = self._approach(x[..., free], x_prev[..., free])
+            total = total + torch.where(damped, self.damping * h / 2 * travel**2, 0.0)
+        return total.sum((-2, -1))
+
+    def limit(self, x: Tensor, step: Tensor) -> Tensor:
+        gap, travel = self._gap(x), dot(self.normal, step.unsqueeze(-3))
+        bites = (travel < 0) & (ETA * gap < -travel)
+        fraction = torch.where(bites, ETA * gap / torch.where(bites, -travel, 1.0), 1.0)
+        fraction = fraction.min(-2).values
+        # Rounding may still close a gap of few ulps; such a vertex stays where it is.
+        with torch.no_grad():
+            size = (self.normal * x.unsqueeze(-3)).abs().sum(-2) + self.height.abs()
+            after = self._gap(x + fraction.unsqueeze(-2) * step)
+            closed = (after <= GUARD * torch.finfo(x.dtype).eps * size).any(-2)
+        return torch.where(closed, 0.0, fraction)
+
+    def check_start(self, x: Tensor) -> None:
+        below = ((self._gap(x) <= 0).any(-2) & ~self.scene.model.pinned).nonzero()
+        if below.numel():
+            raise ValueError(f"x: expected every unpinned vertex above the floor, got a gap <= 0 at {below.tolist()}")
+
+
+class Anchor:
+    """k/2 |x_i - point_i|^2 on chosen vertices."""
+
+    def __init__(self, energy: Any, scene: Scene) -> None:
+        self.scene = scene
+        stiffness = scene.parameter("anchor", energy, "stiffness")
+        count = scene.rest_points.shape[-1]
+        chosen = torch.ones(count, dtype=torch.bool, device=scene.like.device)
+        if energy.vertices is not None:
+            index = torch.as_tensor(energy.vertices, device=scene.like.device)
+            chosen = torch.zeros_like(chosen)
+            chosen[index] = True
+        chosen = chosen & ~scene.model.pinned
+        self.stiffness = torch.where(chosen, stiffness, 0.0)  # [..., V]
+        points = scene.parameters.get("anchor.points", energy.points)
+        # Without points a vertex hangs on its constant rest position: a differentiated rest shape does not move it.
+        points = scene.model.rest_points if points is None else points
+        self.points = scene.tensor(points).transpose(-1, -2)
+
+    def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
+        vertices = self.scene.layout.colors[k].vertices
+        offset = x[..., vertices] - self.points[..., vertices]
+        diagonal = self.scene.time_step**2 * self.stiffness[..., vertices].unsqueeze(-2)
+        gradient = diagonal * offset
+        diagonal = diagonal.expand_as(gradient[..., :1, :])
+        no = torch.zeros_like(diagonal)
+        return torch.cat((gradient, diagonal, no, no, diagonal, no, diagonal), -2)
+
+    def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+        offset = x - self.points
+        return self.scene.time_step**2 / 2 * (self.stiffness * dot(offset, offset)).sum(-1)
+
+
+ENERGIES: dict[str, type] = {
+    "stable_neo_hookean": StableNeoHookean,
+    "floor_barrier": FloorBarrier,
+    "anchor": Anchor,
+}
+
+
+def build_energies(scene: Scene) -> list[Any]:
+    """The reference formulas of a model's energies, looked up by `energy.name` or the snake-case class name."""
+    built = []
+    for energy in scene.model.energies:
+        kind = getattr(energy, "name", None) or re.sub(r"(?<!^)(?=[A-Z])", "_", type(energy).__name__).lower()
+        if kind not in ENERGIES:
+            raise ValueError(f"energies: no reference formula for {kind!r}; known are {sorted(ENERGIES)}")
+        built.append(ENERGIES[kind](energy, scene))
+    return built

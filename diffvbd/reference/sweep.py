@@ -1,0 +1,180 @@
+"""One step and a rollout: predictor, colored block descent, velocity (paper, algorithm of the forward step)."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .energies import build_energies
+from .layout import build_layout, dot, put, solve6, take
+from .scene import Scene, build_scene
+
+SATURATION_EPS = 1e-12  # [m] keeps s finite at a zero step
+
+
+class Trajectory(NamedTuple):
+    """Frames of a rollout, the initial state first. x [m], v [m/s], each [steps + 1, ..., V, 3]."""
+
+    x: Tensor
+    v: Tensor
+
+
+def step(
+    model: Any,
+    x: Tensor,
+    v: Tensor,
+    *,
+    mu: Any,
+    lam: Any,
+    time_step: float,
+    sweeps: int,
+    force: Tensor | None = None,
+    gravity: Any = (0.0, -9.81, 0.0),
+    prescribed: Tensor | None = None,
+    rest_points: Tensor | None = None,
+    density: Any = None,
+    parameters: dict[str, Any] | None = None,
+    tet_order: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """One time step; every tensor argument is differentiable by autograd.
+
+    x, v: positions [m] and velocities [m/s], [..., V, 3]; leading dimensions are scenes. mu, lam [Pa] broadcast to
+    x.shape[:-2] + (T,). force [N], gravity [m/s^2], prescribed, rest_points [m] broadcast to x's shape; density
+    [kg/m^3] to [..., T]. tet_order: permutation [T] of the tets that changes only the order of summation.
+    Raises ValueError when an unpinned vertex starts below a floor plane. Returns (x', v').
+    """
+    advance = _stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, tet_order)
+    return advance(x, v, force, gravity, prescribed)
+
+
+def rollout(
+    model: Any,
+    x: Tensor,
+    v: Tensor,
+    *,
+    steps: int,
+    mu: Any,
+    lam: Any,
+    time_step: float,
+    sweeps: int,
+    force: Tensor | None = None,
+    gravity: Any = (0.0, -9.81, 0.0),
+    prescribed: Tensor | None = None,
+    rest_points: Tensor | None = None,
+    density: Any = None,
+    parameters: dict[str, Any] | None = None,
+    tet_order: Tensor | None = None,
+    force_per_step: Tensor | Sequence[Tensor] | None = None,
+    prescribed_per_step: Tensor | Sequence[Tensor] | None = None,
+) -> Trajectory:
+    """`steps` steps with everything constant in time, except `force_per_step` and `prescribed_per_step`, whose first
+    dimension is the step and which replace `force` and `prescribed`. Other arguments as in `step`."""
+    advance = _stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, tet_order)
+    xs, vs = [x], [v]
+    for n in range(steps):
+        f = force if force_per_step is None else force_per_step[n]
+        held = prescribed if prescribed_per_step is None else prescribed_per_step[n]
+        x, v = advance(x, v, f, gravity, held)
+        xs.append(x)
+        vs.append(v)
+    return Trajectory(torch.stack(xs), torch.stack(vs))
+
+
+def _stepper(
+    model: Any,
+    like: Tensor,
+    mu: Any,
+    lam: Any,
+    time_step: float,
+    sweeps: int,
+    rest_points: Tensor | None,
+    density: Any,
+    parameters: dict[str, Any] | None,
+    tet_order: Tensor | None,
+) -> Callable[..., tuple[Tensor, Tensor]]:
+    """Do what is common to all steps of a run, and return the function that makes one."""
+    scene = build_scene(
+        model,
+        build_layout(model, tet_order),
+        like,
+        mu=mu,
+        lam=lam,
+        time_step=time_step,
+        rest_points=rest_points,
+        density=density,
+        parameters=parameters,
+    )
+    energies = build_energies(scene)
+    inertia = [scene.mass[..., color.vertices].unsqueeze(-2) for color in scene.layout.colors]
+
+    def advance(x: Tensor, v: Tensor, force: Any, gravity: Any, prescribed: Any) -> tuple[Tensor, Tensor]:
+        y = _predictor(scene, x, v, force, gravity, prescribed)
+        x_prev, y = x.transpose(-1, -2).contiguous(), y.transpose(-1, -2).contiguous()
+        state = _start(scene, energies, x_prev, y)
+        targets = [take(y, color.vertices) for color in scene.layout.colors]
+        for _ in range(sweeps):
+            for k, color in enumerate(scene.layout.colors):
+                if color.vertices.numel():
+                    state = _update_color(scene, energies, k, inertia[k], targets[k], state, x_prev)
+        x_new = state.transpose(-1, -2).contiguous()
+        return x_new, (x_new - x) / time_step
+
+    return advance
+
+
+def _predictor(scene: Scene, x: Tensor, v: Tensor, force: Any, gravity: Any, prescribed: Any) -> Tensor:
+    h, pinned = scene.time_step, scene.model.pinned
+    acceleration = scene.tensor(gravity)
+    if force is not None:
+        # A pinned vertex may have no mass; its predictor is overwritten below.
+        mass = torch.where(pinned & (scene.mass == 0), 1.0, scene.mass)
+        acceleration = acceleration + scene.tensor(force) / mass.unsqueeze(-1)
+    y = x + h * v + h**2 * acceleration
+    return torch.where(pinned.unsqueeze(-1), x if prescribed is None else scene.tensor(prescribed), y)
+
+
+def _start(scene: Scene, energies: list[Any], x: Tensor, y: Tensor) -> Tensor:
+    """Start of the sweep: y, or with contact filters as far from x towards y as they allow."""
+    if not any(hasattr(energy, "limit") for energy in energies):
+        return y
+    for energy in energies:
+        if hasattr(energy, "check_start"):
+            energy.check_start(x.detach())
+    start = x + _limit(energies, x, y - x).unsqueeze(-2) * (y - x)
+    return torch.where(scene.model.pinned, y, start)
+
+
+def _limit(energies: list[Any], x: Tensor, step: Tensor) -> Tensor:
+    limits = [energy.limit(x, step) for energy in energies if hasattr(energy, "limit")]
+    return torch.stack(torch.broadcast_tensors(*limits)).min(0).values if len(limits) > 1 else limits[0]
+
+
+def _update_color(
+    scene: Scene, energies: list[Any], k: int, mass: Tensor, y: Tensor, state: Tensor, x_prev: Tensor
+) -> Tensor:
+    """Newton update of all vertices of color k: H d = -g, saturate, relax, filter, write."""
+    model, vertices = scene.model, scene.layout.colors[k].vertices
+    x = take(state, vertices)
+    diagonal = (mass + model.regularization).expand_as(x[..., :1, :])
+    no = torch.zeros_like(diagonal)
+    system = torch.cat((mass * (x - y), diagonal, no, no, diagonal, no, diagonal), -2)
+    for energy in energies:
+        system = system + energy.block(k, state, x_prev)
+    gradient, hessian = system.split((3, 6), -2)
+    update = -solve6(hessian, gradient)
+    if model.saturation is not None:
+        update = update * _saturation(update, model.saturation).unsqueeze(-2)
+    if model.relaxation != 1.0:
+        update = model.relaxation * update
+    if any(hasattr(energy, "limit") for energy in energies):
+        update = update * _limit(energies, x, update).unsqueeze(-2)
+    return put(state, vertices, x + update)
+
+
+def _saturation(update: Tensor, limit: float) -> Tensor:
+    """s = c / (|d| + c + eps); the derivative of |d| at 0 is taken as 0."""
+    square = dot(update, update)
+    moves = square > 0
+    length = torch.where(moves, torch.where(moves, square, 1.0).sqrt(), 0.0)
+    return limit / (length + limit + SATURATION_EPS)

@@ -1,0 +1,141 @@
+"""The shipped inverse problems find what they look for, with the gradient they claim, and survive an interruption."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from diffvbd import losses
+from diffvbd.tasks import TASKS, Settings, beam_mu, solve, table
+
+
+def quick(name: str, out: Path) -> tuple:
+    settings = Settings(out, quick=True)
+    return TASKS[name].build(settings), settings
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_quick_run_recovers_the_material(name: str, tmp_path: Path) -> None:
+    problem, settings = quick(name, tmp_path)
+    start = problem.estimates()
+    result = solve(problem, settings)
+    assert result.best["loss"] < 1e-4 * result.history[0]["loss"]
+    for quantity, error in result.errors.items():
+        assert error < 0.02 < abs(start[quantity] / problem.truth[quantity] - 1)
+    assert problem.estimates() == result.estimates
+    assert f"{result.estimates['mu']:.6g}" in table(problem, start, result)
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_gradient_at_the_start_matches_central_differences(name: str, tmp_path: Path) -> None:
+    problem, _ = quick(name, tmp_path)
+    problem.loss().backward()
+    # Truncation falls with the square of the step, rounding grows with its inverse: about 1e-9 at 1e-5.
+    step = 1e-5
+    for parameter in problem.parameters.values():
+        flat = parameter.detach().view(-1)
+        gradient = parameter.grad.view(-1)
+        for k in range(len(flat)):
+            values = []
+            for sign in (1, -1):
+                flat[k] += sign * step
+                values.append(problem.loss().item())
+                flat[k] -= sign * step
+            difference = (values[0] - values[1]) / (2 * step)
+            assert gradient[k].item() != 0.0
+            assert gradient[k].item() == pytest.approx(difference, rel=1e-6)
+
+
+def test_log_and_picture_are_written(tmp_path: Path) -> None:
+    problem, settings = quick("beam-mu", tmp_path)
+    result = solve(problem, settings)
+    log = json.loads((tmp_path / "log.json").read_text())
+    assert {"diffvbd", "torch", "numpy", "python"} <= set(log["versions"])
+    assert log["settings"]["seed"] == 0
+    assert log["history"] == result.history
+    assert set(log["history"][0]) == {"iteration", "loss", "gradient_norm", "mu", "seconds"}
+    assert log["best"]["loss"] == min(row["loss"] for row in log["history"])
+    if pytest.importorskip("matplotlib"):
+        assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+    assert not (tmp_path / "state.pt").exists()
+
+
+class Interrupted(Exception):
+    pass
+
+
+def test_an_interrupted_run_continues_with_the_same_numbers(tmp_path: Path) -> None:
+    problem, settings = quick("beam-mu", tmp_path / "whole")
+    problem.picture = None
+    whole = solve(problem, settings)
+
+    problem, settings = quick("beam-mu", tmp_path / "parts")
+    problem.picture = None
+    loss, evaluations = problem.loss, 0
+
+    def failing() -> torch.Tensor:
+        nonlocal evaluations
+        evaluations += 1
+        if evaluations == 8:
+            raise Interrupted
+        return loss()
+
+    problem.loss = failing
+    with pytest.raises(Interrupted):
+        solve(problem, settings)
+    problem, settings = quick("beam-mu", tmp_path / "parts")
+    problem.picture = None
+    parts = solve(problem, settings)
+    without_time = [
+        [{key: value for key, value in row.items() if key != "seconds"} for row in result.history]
+        for result in (whole, parts)
+    ]
+    assert without_time[0] == without_time[1]
+
+
+def test_a_state_of_other_settings_is_not_continued(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    problem, settings = quick("beam-mu", tmp_path)
+    loss, problem.picture = problem.loss, None
+    evaluations = iter(range(3))
+    problem.loss = lambda: (next(evaluations), loss())[1]
+    with pytest.raises(StopIteration):
+        solve(problem, settings)
+    problem, _ = quick("beam-mu", tmp_path)
+    problem.iterations, problem.picture = 2, None
+    assert len(solve(problem, Settings(tmp_path, seed=1, quick=True)).history) == 2
+    assert "starting anew" in capsys.readouterr().err
+
+
+def test_a_loss_that_is_not_finite_is_reported(tmp_path: Path) -> None:
+    problem, settings = quick("beam-mu", tmp_path)
+    (parameter,) = problem.parameters.values()
+    problem.loss = lambda: parameter * float("nan")
+    with pytest.raises(ArithmeticError, match="beam-mu: the loss or its gradient is not finite"):
+        solve(problem, settings)
+
+
+def test_twist_turns_the_free_end_and_keeps_the_clamped_one() -> None:
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.0, 2.0], [4.0, 0.0, 0.0], [4.0, 2.0, 2.0]], dtype=torch.float64)
+    turned = beam_mu.twisted(points, torch.pi)
+    expected = points[[0, 1, 3, 2]].clone()
+    expected[2:, 0] = 4.0
+    torch.testing.assert_close(turned, expected, rtol=0, atol=1e-14)
+
+
+def test_huber_is_quadratic_then_linear_with_a_finite_gradient() -> None:
+    x = torch.tensor([[0.0, 0.0, 0.0], [0.3, 0.0, 0.4], [3.0, 4.0, 0.0]], dtype=torch.float64, requires_grad=True)
+    loss = losses.huber(x, torch.zeros(3, dtype=torch.float64), delta=1.0)
+    assert loss.item() == pytest.approx((0.0 + 0.125 + 4.5) / 3)
+    loss.backward()
+    expected = torch.tensor([[0.0, 0.0, 0.0], [0.3, 0.0, 0.4], [0.6, 0.8, 0.0]], dtype=torch.float64) / 3
+    torch.testing.assert_close(x.grad, expected)
+    with pytest.raises(ValueError, match="delta: expected a positive distance, got 0"):
+        losses.huber(x, x, 0.0)
+
+
+def test_center_of_mass_weighs_by_mass() -> None:
+    x = torch.tensor([[[0.0, 0.0, 0.0], [4.0, 0.0, 8.0]]], dtype=torch.float64)
+    center = losses.center_of_mass(x, torch.tensor([3.0, 1.0], dtype=torch.float64))
+    assert center.tolist() == [[1.0, 0.0, 2.0]]
+    assert losses.vertex_distance(center, torch.zeros(3)).item() == 5.0
