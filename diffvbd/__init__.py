@@ -5,11 +5,34 @@ import os as _os
 # Idle threads that spin make a parallel region cost milliseconds on a busy machine; only the first import decides.
 _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from . import mesh  # noqa: E402
-from .adjoints import ReverseSweep  # noqa: E402
-from .energies import Anchor, FloorBarrier, StableNeoHookean  # noqa: E402
-from .mesh import TetMesh  # noqa: E402
-from .model import Model  # noqa: E402
-from .step import debug_checks, step  # noqa: E402
+from . import mesh
+from .adjoints import ReverseSweep
+from .energies import Anchor, FloorBarrier, StableNeoHookean
+from .gradcheck import check_gradients
+from .mesh import TetMesh
+from .model import Model
+from .rollout import Trajectory, per_step, rollout
+from .schedule import Binomial
+from .step import debug_checks, step
+from .tape import step_backward, step_forward
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Anchor",
+    "Binomial",
+    "FloorBarrier",
+    "Model",
+    "ReverseSweep",
+    "StableNeoHookean",
+    "TetMesh",
+    "Trajectory",
+    "check_gradients",
+    "debug_checks",
+    "mesh",
+    "per_step",
+    "rollout",
+    "step",
+    "step_backward",
+    "step_forward",
+]

@@ -104,7 +104,9 @@ def check_state(model: Model, x: Tensor, v: Tensor) -> tuple[int, ...]:
         raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
     for name, value in (("x", x), ("v", v)):
         if not isinstance(value, Tensor):
-            raise TypeError(f"{name}: expected a tensor of shape [..., {model.num_vertices}, 3], got {type(value).__name__}")
+            raise TypeError(
+                f"{name}: expected a tensor of shape [..., {model.num_vertices}, 3], got {type(value).__name__}"
+            )
         check_tensor(name, value, model.mass)
         if value.dim() < 2 or value.shape[-2:] != (model.num_vertices, 3):
             fail(name, f"shape [..., {model.num_vertices}, 3]", f"shape {list(value.shape)}")

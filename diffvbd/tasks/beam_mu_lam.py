@@ -32,7 +32,7 @@ SWEEPS = 15
 
 
 def problem(settings: Settings) -> Problem:
-    vertices, steps, iterations = ((6, 3, 3), 30, 25) if settings.quick else ((21, 7, 7), 100, 76)
+    vertices, steps, iterations = ((6, 3, 3), 30, 60) if settings.quick else ((21, 7, 7), 100, 76)
     mesh = dv.mesh.beam(*vertices, size=SIZE)
     clamped = mesh.points[:, 0] < mesh.points[:, 0].min() + 1e-9
     model = dv.Model(mesh, density=DENSITY, pinned=clamped).to(settings.device)
@@ -66,8 +66,7 @@ def problem(settings: Settings) -> Problem:
         estimates=lambda: dict(zip(("mu", "lam"), log_material.exp().tolist(), strict=True)),
         truth=TRUTH,
         iterations=iterations,
-        optimizer=lambda p: torch.optim.Adam(p, lr=0.15, betas=(0.7, 0.9)),
-        schedule=lambda optimizer: torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations),
+        learning_rate=0.15,
         tolerance=1e-10,
         protocol={
             "vertices": vertices,

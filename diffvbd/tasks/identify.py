@@ -61,8 +61,7 @@ def problem(
         estimates=lambda: {"mu": log_mu.exp().item(), "lam": log_lam.exp().item()},
         truth=observation.truth,
         iterations=iterations,
-        optimizer=lambda p: torch.optim.Adam(p, lr=learning_rate, betas=(0.7, 0.9)),
-        schedule=lambda optimizer: torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations),
+        learning_rate=learning_rate,
         tolerance=1e-9,
         protocol={
             "start": list(start),

@@ -47,8 +47,8 @@ class Problem:
         loss: Scalar loss at the present parameters.
         estimates: The quantities to report, from the present parameters.
         iterations: Most loss evaluations.
-        optimizer: Makes the optimiser.
-        schedule: Makes its learning-rate schedule; None keeps the rate.
+        learning_rate: First rate of Adam; it falls to 0 along a cosine.
+        optimizer: Makes another optimiser, whose step needs no closure; it keeps its rate.
         tolerance: The run ends once the loss is below this fraction of the first loss.
         truth: Known values of some estimates, for the table.
         protocol: Numbers that define the problem, for the log.
@@ -60,8 +60,8 @@ class Problem:
     loss: Callable[[], Tensor]
     estimates: Callable[[], Row]
     iterations: int
-    optimizer: Callable[[Iterable[Tensor]], torch.optim.Optimizer]
-    schedule: Callable[[torch.optim.Optimizer], torch.optim.lr_scheduler.LRScheduler] | None = None
+    learning_rate: float = 0.15
+    optimizer: Callable[[Iterable[Tensor]], torch.optim.Optimizer] | None = None
     tolerance: float = 0.0
     truth: Row = field(default_factory=dict)
     protocol: dict[str, Any] = field(default_factory=dict)
@@ -95,8 +95,13 @@ def solve(problem: Problem, settings: Settings) -> Result:
     torch.manual_seed(settings.seed)
     settings.out.mkdir(parents=True, exist_ok=True)
     parameters = list(problem.parameters.values())
-    optimizer = problem.optimizer(parameters)
-    schedule = problem.schedule(optimizer) if problem.schedule else None
+    if problem.optimizer:
+        optimizer, schedule = problem.optimizer(parameters), None
+    else:
+        # A few parameters and gradients without noise need no long average, and overshoot less without it. Losses in
+        # m^2 can be tiny: the default eps would exceed their gradients.
+        optimizer = torch.optim.Adam(parameters, problem.learning_rate, betas=(0.7, 0.9), eps=1e-20)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, problem.iterations)
     run = _Run(problem, settings, optimizer, schedule)
     run.resume()
     progress = Progress(problem.name, problem.iterations, done=len(run.history))

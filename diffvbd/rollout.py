@@ -1,0 +1,181 @@
+"""Many steps, with checkpointing: what backpropagation through time keeps is chosen, not suffered."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from .adjoints import ReverseSweep
+from .checks import check_count, fail
+from .model import Model
+from .schedule import Binomial, Segment, choose_schedule, run_segments
+from .step import GRAVITY, advance, check_state, prepare
+
+_STATIC = ("mu", "lam", "rest_points", "density")  # enter through prepare(); the others through advance()
+
+
+@dataclass(frozen=True)
+class PerStep:
+    """A value that changes from step to step, see :func:`per_step`."""
+
+    values: Tensor
+
+
+def per_step(values: Tensor) -> PerStep:
+    """Marks a tensor whose leading dimension counts the steps of a rollout, shape [steps, ...]."""
+    if not isinstance(values, Tensor) or values.dim() == 0:
+        raise TypeError(f"values: expected a tensor of shape [steps, ...], got {type(values).__name__}")
+    return PerStep(values)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Saved states of a rollout.
+
+    Attributes:
+        x, v: Positions [m] and velocities [m/s] of the saved frames, shape [frames, ..., V, 3].
+        steps: Step number of each frame (0: the initial state); the last frame is the final state.
+        observations: What ``observe`` returned, stacked over steps (a tensor, or a tuple or dict of them), or None.
+    """
+
+    x: Tensor
+    v: Tensor
+    steps: list[int]
+    observations: Any = None
+
+
+def rollout(
+    model: Model,
+    x: Tensor,
+    v: Tensor,
+    *,
+    steps: int,
+    mu: Any,
+    lam: Any,
+    time_step: float,
+    sweeps: int,
+    force: Any = None,
+    gravity: Any = GRAVITY,
+    prescribed: Any = None,
+    rest_points: Any = None,
+    density: Any = None,
+    parameters: dict[str, Any] | None = None,
+    adjoint: ReverseSweep | None = None,
+    checkpoint_every: int | Binomial | Literal["auto"] | None = "auto",
+    save: Literal["all", "last"] | int = "all",
+    observe: Callable[[Tensor, Tensor, int], Any] | None = None,
+    progress: bool = False,
+) -> Trajectory:
+    """Runs ``steps`` steps; the gradient is that of calling :func:`diffvbd.step` in a loop.
+
+    Args:
+        model, x, v, time_step, sweeps, adjoint: As in :func:`diffvbd.step`.
+        steps: Number of steps >= 0.
+        mu, lam, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in time; or wrapped
+            in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step. A callable may close
+            over tensors and modules that require grad: they get gradients under every schedule. It must be
+            deterministic, because a checkpointed segment calls it again in the backward.
+        checkpoint_every: Between checkpoints of n steps only states are kept, and the segment is run again in the
+            backward: n keeps steps / n states and the tapes of n steps. ``None`` keeps all tapes.
+            :class:`diffvbd.Binomial` keeps a given number of states and one tape. ``"auto"`` keeps all tapes while
+            they fit diffvbd.schedule.TAPE_BUDGET, else takes n near sqrt(steps). See ``model.memory``.
+        save: Which frames the trajectory holds: ``"all"`` (steps + 1 frames, from the initial state), every n-th and
+            the last, or only the ``"last"``.
+        observe: Called after each step as observe(x, v, step) with step = 1 ... steps; its results (a tensor, or a
+            tuple, list or dict of tensors) are stacked and differentiable, so that long rollouts need not keep frames.
+        progress: Print progress to stderr.
+
+    Raises:
+        ValueError, TypeError: As step; also where a per_step value has another number of steps.
+    """
+    steps = check_count("steps", steps)
+    if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
+        fail("save", '"all", "last" or an integer > 0', repr(save))
+    lead = check_state(model, x, v)
+    options = {"mu": mu, "lam": lam, "rest_points": rest_points, "density": density, "force": force,
+               "gravity": gravity, "prescribed": prescribed}  # fmt: skip
+    named = {f'parameters["{k}"]': value for k, value in (parameters or {}).items()}
+    for name, value in {**options, **named}.items():
+        if isinstance(value, PerStep) and value.values.shape[0] != steps:
+            fail(name, f"{steps} steps in per_step", f"shape {list(value.values.shape)}")
+
+    static = {k: options[k] for k in _STATIC} | {"parameters": parameters}
+    changes = any(_changes(value) for value in (*(options[k] for k in _STATIC), *named.values()))
+    fixed = None if changes else prepare(model, lead, time_step=time_step, sweeps=sweeps, **static)
+
+    def one_step(k: int, x: Tensor, v: Tensor, adjoint: ReverseSweep) -> tuple[Tensor, Tensor]:
+        prepared = fixed
+        if prepared is None:
+            now = {name: _at(options[name], k, x, v) for name in _STATIC}
+            now["parameters"] = {name: _at(value, k, x, v) for name, value in (parameters or {}).items()}
+            prepared = prepare(model, lead, time_step=time_step, sweeps=sweeps, **now)
+        given = {name: _at(options[name], k, x, v) for name in ("force", "gravity", "prescribed")}
+        return advance(model, x, v, prepared, adjoint=adjoint, index=k, **given)
+
+    scenes = x.numel() // max(1, 3 * model.num_vertices)
+    every, adjoint = choose_schedule(checkpoint_every, adjoint or ReverseSweep(), model, scenes, steps, sweeps)
+    bar = _Progress(steps) if progress else None
+
+    def segment(first: int, end: int, x: Tensor, v: Tensor) -> Segment:
+        frames, observed = [], []
+        for k in range(first, end):
+            x, v = one_step(k, x, v, adjoint)
+            if save == "all" or k + 1 == steps or (save != "last" and (k + 1) % save == 0):
+                frames.append((k + 1, x, v))
+            if observe is not None:
+                observed.append(observe(x, v, k + 1))
+            if bar is not None:
+                bar.show(k + 1)
+        return Segment(x, v, frames, observed)
+
+    start = [] if save == "last" and steps > 0 else [(0, x, v)]
+    done = run_segments(segment, steps, x, v, every if torch.is_grad_enabled() else None)
+    frames = start + done.frames
+    return Trajectory(
+        x=torch.stack([f[1] for f in frames]),
+        v=torch.stack([f[2] for f in frames]),
+        steps=[f[0] for f in frames],
+        observations=_stacked(done.observed),
+    )
+
+
+def _changes(value: Any) -> bool:
+    return isinstance(value, PerStep) or (callable(value) and not isinstance(value, Tensor))
+
+
+def _at(value: Any, k: int, x: Tensor, v: Tensor) -> Any:
+    if isinstance(value, PerStep):
+        return value.values[k]
+    return value(k, x, v) if _changes(value) else value
+
+
+def _stacked(observed: list[Any]) -> Any:
+    if not observed or observed[0] is None:
+        return None
+    first = observed[0]
+    if isinstance(first, dict):
+        return {k: _stacked([o[k] for o in observed]) for k in first}
+    if isinstance(first, (tuple, list)):
+        return tuple(_stacked([o[i] for o in observed]) for i in range(len(first)))
+    if not isinstance(first, Tensor):
+        raise TypeError(f"observe: expected tensors, or tuples or dicts of them, got {type(first).__name__}")
+    return torch.stack(observed)
+
+
+class _Progress:
+    """A line on stderr. Steps that a backward runs again are not counted twice."""
+
+    def __init__(self, steps: int) -> None:
+        self.steps, self.shown = steps, 0
+
+    def show(self, k: int) -> None:
+        if k <= self.shown:
+            return
+        self.shown = k
+        end = "\n" if k == self.steps else ""
+        print(f"\rstep {k}/{self.steps}", end=end, file=sys.stderr, flush=True)
