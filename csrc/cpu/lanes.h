@@ -7,6 +7,12 @@
 
 #include "../core/views.h"
 
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_shufflevector)
+#define DIFFVBD_SHUFFLES 1
+#endif
+#endif
+
 namespace diffvbd {
 
 template <class T>
@@ -88,6 +94,70 @@ DIFFVBD_FN Lanes<T> natural_log(const Lanes<T>& a) {
   Lanes<T> r;
   for (int l = 0; l < kLanes; ++l) r.v[l] = std::log(a.v[l]);
   return r;
+}
+
+// --- rows of four scalars (x, y, z, unused) <-> lanes ----------------------------------------------------------------
+// A row is one load; a network of shuffles then turns kLanes rows into three packs, where single scalars would be
+// inserted one by one.
+
+template <class T>
+struct Row {
+  typedef T Vector __attribute__((vector_size(4 * sizeof(T))));
+  Vector v;
+  DIFFVBD_FN static Row load(const T* p) {
+    Row a;
+    std::memcpy(&a.v, p, sizeof a.v);
+    return a;
+  }
+  DIFFVBD_FN void store(T* p) const { std::memcpy(p, &v, sizeof v); }
+};
+
+template <class T>
+DIFFVBD_FN Vec3<Lanes<T>> to_lanes(const Row<T>* r) {
+  Vec3<Lanes<T>> out;
+#if DIFFVBD_SHUFFLES
+  typename Row<T>::Vector x[2], y[2], z[2];
+  for (int half = 0; half < 2; ++half) {
+    const auto *a = r + 4 * half, *b = a + 1, *c = a + 2, *d = a + 3;
+    const auto ab_xz = __builtin_shufflevector(a->v, b->v, 0, 4, 2, 6), ab_y = __builtin_shufflevector(a->v, b->v, 1, 5, 3, 7);
+    const auto cd_xz = __builtin_shufflevector(c->v, d->v, 0, 4, 2, 6), cd_y = __builtin_shufflevector(c->v, d->v, 1, 5, 3, 7);
+    x[half] = __builtin_shufflevector(ab_xz, cd_xz, 0, 1, 4, 5);
+    y[half] = __builtin_shufflevector(ab_y, cd_y, 0, 1, 4, 5);
+    z[half] = __builtin_shufflevector(ab_xz, cd_xz, 2, 3, 6, 7);
+  }
+  out.x.v = __builtin_shufflevector(x[0], x[1], 0, 1, 2, 3, 4, 5, 6, 7);
+  out.y.v = __builtin_shufflevector(y[0], y[1], 0, 1, 2, 3, 4, 5, 6, 7);
+  out.z.v = __builtin_shufflevector(z[0], z[1], 0, 1, 2, 3, 4, 5, 6, 7);
+#else
+  for (int l = 0; l < kLanes; ++l) {
+    out.x.v[l] = r[l].v[0];
+    out.y.v[l] = r[l].v[1];
+    out.z.v[l] = r[l].v[2];
+  }
+#endif
+  return out;
+}
+
+template <class T>
+DIFFVBD_FN void to_rows(const Vec3<Lanes<T>>& v, Row<T>* r) {
+#if DIFFVBD_SHUFFLES
+  const typename Row<T>::Vector zero = {};
+  const auto spread = [&](auto x, auto y, auto z, Row<T>* out) {
+    const auto xy_even = __builtin_shufflevector(x, y, 0, 4, 2, 6), xy_odd = __builtin_shufflevector(x, y, 1, 5, 3, 7);
+    const auto z_even = __builtin_shufflevector(z, zero, 0, 4, 2, 6), z_odd = __builtin_shufflevector(z, zero, 1, 5, 3, 7);
+    out[0].v = __builtin_shufflevector(xy_even, z_even, 0, 1, 4, 5);
+    out[1].v = __builtin_shufflevector(xy_odd, z_odd, 0, 1, 4, 5);
+    out[2].v = __builtin_shufflevector(xy_even, z_even, 2, 3, 6, 7);
+    out[3].v = __builtin_shufflevector(xy_odd, z_odd, 2, 3, 6, 7);
+  };
+  const auto &x = v.x.v, &y = v.y.v, &z = v.z.v;
+  spread(__builtin_shufflevector(x, x, 0, 1, 2, 3), __builtin_shufflevector(y, y, 0, 1, 2, 3),
+         __builtin_shufflevector(z, z, 0, 1, 2, 3), r);
+  spread(__builtin_shufflevector(x, x, 4, 5, 6, 7), __builtin_shufflevector(y, y, 4, 5, 6, 7),
+         __builtin_shufflevector(z, z, 4, 5, 6, 7), r + 4);
+#else
+  for (int l = 0; l < kLanes; ++l) r[l].v = typename Row<T>::Vector{v.x.v[l], v.y.v[l], v.z.v[l], T(0)};
+#endif
 }
 
 }  // namespace diffvbd

@@ -18,24 +18,16 @@ Stars build_stars(const int64_t* tets, int64_t num_tets, int64_t num_vertices) {
   return out;
 }
 
-namespace {
-
-// Active neighbours of each active vertex, without repetition: entries [3 ptr[v], 3 ptr[v] + degree[v]).
-struct Adjacency {
-  std::vector<int32_t> neighbor, degree;
-};
-
-Adjacency build_adjacency(const int64_t* tets, const Stars& stars, const uint8_t* active) {
+Adjacency build_adjacency(const int64_t* tets, const Stars& stars) {
   const int64_t n = static_cast<int64_t>(stars.ptr.size()) - 1;
   Adjacency out{std::vector<int32_t>(3 * stars.entry.size()), std::vector<int32_t>(n, 0)};
   for (int64_t v = 0; v < n; ++v) {
-    if (!active[v]) continue;
     int32_t* const begin = out.neighbor.data() + 3 * stars.ptr[v];
     int32_t* end = begin;
     for (int64_t e = stars.ptr[v]; e < stars.ptr[v + 1]; ++e) {
       const int64_t* tet = tets + (stars.entry[e] & ~3);
       for (int a = 0; a < 4; ++a) {
-        if (tet[a] != v && active[tet[a]]) *end++ = static_cast<int32_t>(tet[a]);
+        if (tet[a] != v) *end++ = static_cast<int32_t>(tet[a]);
       }
     }
     std::sort(begin, end);
@@ -44,14 +36,20 @@ Adjacency build_adjacency(const int64_t* tets, const Stars& stars, const uint8_t
   return out;
 }
 
+namespace {
+
 // Vertices in the order of removal when always one of least remaining degree is removed (Matula and Beck 1983), O(V + E).
 std::vector<int32_t> removal_order(const Stars& stars, const Adjacency& graph, const uint8_t* active) {
   const int64_t n = static_cast<int64_t>(graph.degree.size());
-  std::vector<int32_t> degree = graph.degree, sorted, place(n, -1);
+  std::vector<int32_t> degree(n, 0), sorted, place(n, -1);
   int32_t largest = 0;
   int64_t count = 0;
   for (int64_t v = 0; v < n; ++v) {
-    if (active[v]) largest = std::max(largest, degree[v]), ++count;
+    if (!active[v]) continue;
+    const int32_t* neighbor = graph.neighbor.data() + 3 * stars.ptr[v];
+    for (int32_t e = 0; e < graph.degree[v]; ++e) degree[v] += active[neighbor[e]] != 0;
+    largest = std::max(largest, degree[v]);
+    ++count;
   }
   std::vector<int32_t> bin(largest + 2, 0);
   for (int64_t v = 0; v < n; ++v) {
@@ -68,7 +66,7 @@ std::vector<int32_t> removal_order(const Stars& stars, const Adjacency& graph, c
     const int32_t* neighbor = graph.neighbor.data() + 3 * stars.ptr[v];
     for (int32_t e = 0; e < graph.degree[v]; ++e) {
       const int32_t u = neighbor[e];
-      if (degree[u] <= degree[v]) continue;
+      if (!active[u] || degree[u] <= degree[v]) continue;
       // swap u with the first vertex of its bin, then let the bin begin after it
       const int32_t first = std::max(bin[degree[u]], static_cast<int32_t>(i + 1)), w = sorted[first];
       std::swap(sorted[place[u]], sorted[first]);
@@ -113,8 +111,7 @@ std::vector<int32_t> morton_order(const double* points, int64_t n) {
 
 }  // namespace
 
-std::vector<int32_t> color_vertices(const int64_t* tets, const Stars& stars, const uint8_t* active, int* colors) {
-  const Adjacency graph = build_adjacency(tets, stars, active);
+std::vector<int32_t> color_vertices(const Stars& stars, const Adjacency& graph, const uint8_t* active, int* colors) {
   const std::vector<int32_t> order = removal_order(stars, graph, active);
   std::vector<int32_t> color(graph.degree.size(), -1), taken_by;
   for (auto it = order.rbegin(); it != order.rend(); ++it) {
@@ -133,15 +130,20 @@ std::vector<int32_t> color_vertices(const int64_t* tets, const Stars& stars, con
 }
 
 std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64_t num_tets, const Stars& stars,
-                                const std::vector<int32_t>& color, int colors) {
+                                const Adjacency& graph, const std::vector<int32_t>& color, int colors) {
   const int64_t n = static_cast<int64_t>(color.size());
+  const auto neighbors_of = [&](int32_t v) { return graph.neighbor.data() + 3 * stars.ptr[v]; };
+  std::vector<int32_t> active_degree(n, 0);
+  for (int64_t v = 0; v < n; ++v) {
+    for (int32_t e = 0; e < graph.degree[v]; ++e) active_degree[v] += color[neighbors_of(v)[e]] >= 0;
+  }
   const auto valence = [&](int32_t v) { return static_cast<int32_t>(stars.ptr[v + 1] - stars.ptr[v]); };
   // Morton order keeps the neighbours of a block near each other in memory; inside a window, sorting by valence lets the
   // lanes of a block have stars of like length.
   constexpr int64_t kWindow = 64 * kLanes;
   std::vector<std::vector<int32_t>> members(colors + 1);
   for (const int32_t v : morton_order(points, n)) members[color[v] < 0 ? colors : color[v]].push_back(v);
-  int64_t blocks = 0, slots = 0, active = 0;
+  int64_t blocks = 0, slots = 0, active = 0, edge_slots = 0, incoming_slots = 0;
   for (int c = 0; c <= colors; ++c) {
     auto& list = members[c];
     const int64_t size = static_cast<int64_t>(list.size());
@@ -151,36 +153,44 @@ std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64
     }
     blocks += (size + kLanes - 1) / kLanes;
     for (int64_t a = 0; a < size; a += kLanes) {
-      int32_t most = 0;
-      for (int64_t l = a; l < std::min(size, a + kLanes); ++l) most = std::max(most, valence(list[l]));
+      int32_t most = 0, edges = 0, incoming = 0;
+      for (int64_t l = a; l < std::min(size, a + kLanes); ++l) {
+        most = std::max(most, valence(list[l]));
+        incoming = std::max(incoming, active_degree[list[l]]);
+        if (c < colors) edges = std::max(edges, graph.degree[list[l]]);
+      }
       slots += most;
+      edge_slots += edges;
+      incoming_slots += incoming;
     }
     if (c < colors) active += size;
   }
-  if (slots * kLanes > std::numeric_limits<int32_t>::max()) {
+  if (std::max(slots, edge_slots + 1) * kLanes > std::numeric_limits<int32_t>::max()) {
     throw std::invalid_argument("mesh: too large, expected at most 2^31 (vertex, tet) pairs");
   }
-  const std::array<int64_t, 7> sizes = {colors + 1,      blocks + 1,         blocks + 1,        blocks * kLanes,
-                                        slots * kLanes, slots * 3 * kLanes, slots * 3 * kLanes};
+  const std::array<int64_t, 10> sizes = {colors + 1,      blocks + 1,         blocks + 1,         blocks + 1,
+                                         blocks + 1,      blocks * kLanes,    slots * kLanes,     slots * 3 * kLanes,
+                                         slots * 3 * kLanes, incoming_slots * kLanes};
   int64_t total = kPlanHeader;
   for (const int64_t s : sizes) total += s;
   std::vector<int32_t> out(total);
-  const int64_t header[6] = {n, num_tets, active, colors, blocks, slots};
-  std::copy(header, header + 6, out.begin());
+  const int64_t header[8] = {n, num_tets, active, colors, blocks, slots, edge_slots, incoming_slots};
+  std::copy(header, header + 8, out.begin());
   const Plan plan = view_plan(out.data());
   const auto writable = [](const int32_t* p) { return const_cast<int32_t*>(p); };
 
   std::vector<int32_t> position(n);
-  std::vector<int32_t> pair_position(4 * num_tets);
-  int32_t block = 0, slot = 0, rank = 0;
+  int32_t block = 0, slot = 0, rank = 0, edge = 0, incoming = 0;
   for (int c = 0; c <= colors; ++c) {
-    writable(plan.color_block)[std::min(c, colors)] = block;
+    writable(plan.color_block)[c] = block;
     const auto& list = members[c];
     const int64_t size = static_cast<int64_t>(list.size());
     for (int64_t a = 0; a < size; a += kLanes, ++block) {
       writable(plan.block_slot)[block] = slot;
       writable(plan.block_rank)[block] = rank;
-      int32_t most = 0;
+      writable(plan.block_edge)[block] = edge;
+      writable(plan.block_incoming)[block] = incoming;
+      int32_t most = 0, edges = 0, arriving = 0;
       for (int l = 0; l < kLanes; ++l) {
         const int32_t v = a + l < size ? list[a + l] : -1;
         writable(plan.order)[block * kLanes + l] = v;
@@ -188,16 +198,24 @@ std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64
         ++rank;
         position[v] = block * kLanes + l;
         most = std::max(most, valence(v));
-        for (int32_t e = 0; e < valence(v); ++e) {
-          pair_position[stars.entry[stars.ptr[v] + e]] = (slot + e) * kLanes + l;
-        }
+        arriving = std::max(arriving, active_degree[v]);
+        if (c < colors) edges = std::max(edges, graph.degree[v]);
       }
       slot += most;
+      edge += edges;
+      incoming += arriving;
     }
   }
   writable(plan.block_slot)[blocks] = slot;
   writable(plan.block_rank)[blocks] = rank;
+  writable(plan.block_edge)[blocks] = edge;
+  writable(plan.block_incoming)[blocks] = incoming;
 
+  // which of v's edges leads to u
+  const auto edge_to = [&](int32_t v, int32_t u) {
+    const int32_t* first = neighbors_of(v);
+    return static_cast<int32_t>(std::lower_bound(first, first + graph.degree[v], u) - first);
+  };
   for (int32_t b = 0; b < blocks; ++b) {
     for (int l = 0; l < kLanes; ++l) {
       const int32_t v = plan.order[b * kLanes + l], size = v < 0 ? 0 : valence(v);
@@ -207,10 +225,21 @@ std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64
         writable(plan.pair)[s * static_cast<int64_t>(kLanes) + l] = entry;
         for (int a = 0; a < 3; ++a) {
           const int64_t at = (s * int64_t{3} + a) * kLanes + l;
-          const int32_t other = (entry & ~3) + kOthers[entry & 3][a];
-          writable(plan.neighbors)[at] = real ? position[tets[other]] : b * kLanes + l;
-          writable(plan.targets)[at] = real ? pair_position[other] : s * kLanes + l;
+          const int32_t other = static_cast<int32_t>(tets[(entry & ~3) + kOthers[entry & 3][a]]);
+          writable(plan.neighbors)[at] = real ? position[other] : b * kLanes + l;
+          writable(plan.edge)[at] = real ? edge_to(v, other) : 0;
         }
+      }
+      int64_t at = int64_t{plan.block_incoming[b]} * kLanes + l;
+      for (int32_t e = 0; v >= 0 && e < graph.degree[v]; ++e) {
+        const int32_t u = neighbors_of(v)[e];
+        if (color[u] < 0) continue;
+        const int32_t row = plan.block_edge[position[u] / kLanes] + edge_to(u, v);
+        writable(plan.incoming)[at] = row * kLanes + position[u] % kLanes;
+        at += kLanes;
+      }
+      for (; at < int64_t{plan.block_incoming[b + 1]} * kLanes; at += kLanes) {
+        writable(plan.incoming)[at] = plan.edge_slots * kLanes;
       }
     }
   }
@@ -225,6 +254,8 @@ Plan view_plan(const int32_t* buffer) {
   p.colors = buffer[3];
   p.blocks = buffer[4];
   p.slots = buffer[5];
+  p.edge_slots = buffer[6];
+  p.incoming_slots = buffer[7];
   const int32_t* at = buffer + kPlanHeader;
   const auto take = [&](int64_t size) {
     const int32_t* here = at;
@@ -234,10 +265,13 @@ Plan view_plan(const int32_t* buffer) {
   p.color_block = take(p.colors + 1);
   p.block_slot = take(p.blocks + 1);
   p.block_rank = take(p.blocks + 1);
+  p.block_edge = take(p.blocks + 1);
+  p.block_incoming = take(p.blocks + 1);
   p.order = take(int64_t{p.blocks} * kLanes);
   p.pair = take(int64_t{p.slots} * kLanes);
   p.neighbors = take(int64_t{p.slots} * 3 * kLanes);
-  p.targets = take(int64_t{p.slots} * 3 * kLanes);
+  p.edge = take(int64_t{p.slots} * 3 * kLanes);
+  p.incoming = take(int64_t{p.incoming_slots} * kLanes);
   return p;
 }
 

@@ -16,12 +16,19 @@ struct Stars {
 
 Stars build_stars(const int64_t* tets, int64_t num_tets, int64_t num_vertices);
 
+// Neighbours of each vertex, ascending and without repetition: neighbor[3 stars.ptr[v] + e], e < degree[v].
+struct Adjacency {
+  std::vector<int32_t> neighbor, degree;
+};
+
+Adjacency build_adjacency(const int64_t* tets, const Stars& stars);
+
 // Smallest-last greedy coloring of the vertices with active[v] (others get -1): no two that share a tet share a color.
-std::vector<int32_t> color_vertices(const int64_t* tets, const Stars& stars, const uint8_t* active, int* colors);
+std::vector<int32_t> color_vertices(const Stars& stars, const Adjacency& graph, const uint8_t* active, int* colors);
 
 // The plan as one buffer (see views.h): a header of sizes, then its arrays.
 std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64_t num_tets, const Stars& stars,
-                                const std::vector<int32_t>& color, int colors);
+                                const Adjacency& graph, const std::vector<int32_t>& color, int colors);
 
 constexpr int kPlanHeader = 8;
 Plan view_plan(const int32_t* buffer);

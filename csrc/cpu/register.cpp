@@ -182,9 +182,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> build_plan(const Tensor& poin
   const int64_t* tet = data<const int64_t>(tets);
   const diffvbd::Stars stars = diffvbd::build_stars(tet, t, v);
   int colors = 0;
-  const std::vector<int32_t> color = diffvbd::color_vertices(tet, stars, data<const uint8_t>(active), &colors);
+  const diffvbd::Adjacency graph = diffvbd::build_adjacency(tet, stars);
+  const std::vector<int32_t> color = diffvbd::color_vertices(stars, graph, data<const uint8_t>(active), &colors);
   const std::vector<int32_t> buffer =
-      diffvbd::build_plan(data<const double>(points), tet, t, stars, color, colors);
+      diffvbd::build_plan(data<const double>(points), tet, t, stars, graph, color, colors);
   const diffvbd::Plan plan = diffvbd::view_plan(buffer.data());
 
   Tensor plan_out = torch::stable::empty({static_cast<int64_t>(buffer.size())}, ScalarType::Int);

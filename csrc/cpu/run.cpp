@@ -120,6 +120,23 @@ void for_blocks(int64_t begin, int64_t end, const F& f) {
   torch::stable::parallel_for(begin, end, kSerialBlocks / 2, f);
 }
 
+// After the first executed sweep is reversed: what the updates of lower colors have added since a vertex's last turn.
+template <class T>
+void collect_last(const Plan& plan, const T* rows, T* x_bar) {
+  for (int c = 1; c < plan.colors; ++c) {
+    const int32_t lower = plan.block_edge[plan.color_block[c]] * kLanes;  // rows of lower colors come before
+    for (int64_t block = plan.color_block[c]; block < plan.color_block[c + 1]; ++block) {
+      for (int64_t e = plan.block_incoming[block]; e < plan.block_incoming[block + 1]; ++e) {
+        for (int l = 0; l < kLanes; ++l) {
+          const int64_t row = plan.incoming[e * kLanes + l];
+          if (row >= lower) continue;
+          for (int i = 0; i < 3; ++i) x_bar[4 * (block * kLanes + l) + i] += rows[4 * row + i];
+        }
+      }
+    }
+  }
+}
+
 template <class T>
 void look_for_nonfinite(const Plan& plan, const SceneView<T>& s, int64_t step, int sweep, int color, int64_t scene) {
   for (int64_t i = int64_t{plan.color_block[color]} * kLanes; i < int64_t{plan.color_block[color + 1]} * kLanes; ++i) {
@@ -262,7 +279,8 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     Scene<T> scene(plan, in, b, x + b * 3 * n);
     SceneView<T>& s = scene.view;
     s.tape = const_cast<T*>(tape) + b * tape_size;
-    const Buffer<T> x_rows(4 * lanes), y_bar(3 * lanes, true), mass_bar(lanes, true), rows(4 * pairs, true);
+    const Buffer<T> x_rows(4 * lanes), y_bar(3 * lanes, true), mass_bar(lanes, true),
+        rows(4 * (int64_t{plan.edge_slots} * kLanes + 1), true);
     const Buffer<T> x_prev_bar(s.x_prev ? 3 * lanes : 0, true), mu_bar(wanted & kMaterial ? pairs : 0, true),
         lam_bar(wanted & kMaterial ? pairs : 0, true), rest_bar(wanted & kRest ? 4 * pairs : 0, true),
         data_bar(out.data ? kMaxEnergyData * lanes : 0, true);
@@ -277,17 +295,19 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     s.rest_bar = rest_bar.get();
     s.data_bar = data_bar.get();
 
+    const int64_t inactive = plan.color_block[plan.colors];
     for (int k = in.sweeps - 1; k >= 0; --k) {
       for (int c = plan.colors - 1; c >= 0; --c) {
         for_blocks(plan.color_block[c], plan.color_block[c + 1], [&](int64_t begin, int64_t end) {
           kernel(plan, s, in.parameters, k, in.tape_policy, begin, end);
         });
       }
+      // Pinned vertices have no turn of their own: they collect after each sweep, before the rows are overwritten.
+      for (int64_t block = inactive; block < plan.blocks; ++block) {
+        store_rows(s.x_bar, block, load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block));
+      }
     }
-    // Rows not yet taken belong to every vertex, pinned ones too.
-    for (int64_t block = 0; block < plan.blocks; ++block) {
-      store_rows(s.x_bar, block, load_rows(s.x_bar, block) + LaneStar<T>(plan, s, block).take_rows());
-    }
+    collect_last(plan, s.rows, s.x_bar);
     unpack_rows(plan, s.x_bar, out.x_start + b * 3 * n);
     unpack_vertices(plan, s.y_bar, out.y + b * 3 * n);
     if (s.x_prev) unpack_vertices(plan, s.x_prev_bar, out.x_prev + b * 3 * n);

@@ -71,7 +71,7 @@ struct SceneView {
   T* y_bar;      // [blocks, 3, kLanes]
   T* x_prev_bar; // [blocks, 3, kLanes] or null
   T* mass_bar;   // [blocks, kLanes]
-  T* rows;       // [slots kLanes, 4]  what other vertices of a pair's tet have added for its own vertex
+  T* rows;       // [edge_slots kLanes + 1, 4]  what the latest reversed update of a vertex adds to a neighbour
   T* mu_bar;     // [slots, kLanes] or null
   T* lam_bar;    // [slots, kLanes] or null
   T* rest_bar;   // [slots, 4, kLanes] or null
@@ -90,30 +90,23 @@ DIFFVBD_FN void add3(T* p, int64_t block, const Vec3<Lanes<T>>& v) {
   (Lanes<T>::load(a + kLanes) + v.y).store(a + kLanes);
   (Lanes<T>::load(a + 2 * kLanes) + v.z).store(a + 2 * kLanes);
 }
-// rows of four scalars <-> lanes
-template <class T, class Index>
-DIFFVBD_FN Vec3<Lanes<T>> gather3(const T* rows, const Index& index) {
-  Vec3<Lanes<T>> out;
-  for (int l = 0; l < kLanes; ++l) {
-    const T* a = rows + 4 * static_cast<int64_t>(index(l));
-    out.x.v[l] = a[0];
-    out.y.v[l] = a[1];
-    out.z.v[l] = a[2];
-  }
-  return out;
+template <class T>
+DIFFVBD_FN Vec3<Lanes<T>> gather3(const T* rows, const int32_t* index) {
+  Row<T> r[kLanes];
+  for (int l = 0; l < kLanes; ++l) r[l] = Row<T>::load(rows + 4 * static_cast<int64_t>(index[l]));
+  return to_lanes(r);
 }
 template <class T>
 DIFFVBD_FN Vec3<Lanes<T>> load_rows(const T* rows, int64_t block) {
-  return gather3(rows, [&](int l) { return block * kLanes + l; });
+  Row<T> r[kLanes];
+  for (int l = 0; l < kLanes; ++l) r[l] = Row<T>::load(rows + 4 * (block * kLanes + l));
+  return to_lanes(r);
 }
 template <class T>
 DIFFVBD_FN void store_rows(T* rows, int64_t block, const Vec3<Lanes<T>>& v) {
-  T* a = rows + block * kLanes * 4;
-  for (int l = 0; l < kLanes; ++l) {
-    a[4 * l] = v.x.v[l];
-    a[4 * l + 1] = v.y.v[l];
-    a[4 * l + 2] = v.z.v[l];
-  }
+  Row<T> r[kLanes];
+  to_rows(v, r);
+  for (int l = 0; l < kLanes; ++l) r[l].store(rows + 4 * (block * kLanes + l));
 }
 
 // The incident tets of the kLanes vertices of a block.
@@ -123,9 +116,14 @@ struct LaneStar {
   const SceneView<T>& s;
   int64_t first;
   int count;
+  T* edges;  // [edges of the block, kLanes, 4], reverse only
 
-  DIFFVBD_FN LaneStar(const Plan& p, const SceneView<T>& scene, int64_t block)
-      : plan(p), s(scene), first(p.block_slot[block]), count(p.block_slot[block + 1] - p.block_slot[block]) {}
+  DIFFVBD_FN LaneStar(const Plan& p, const SceneView<T>& scene, int64_t block, T* edge_rows = nullptr)
+      : plan(p),
+        s(scene),
+        first(p.block_slot[block]),
+        count(p.block_slot[block + 1] - p.block_slot[block]),
+        edges(edge_rows) {}
   DIFFVBD_FN int size() const { return count; }
 
   DIFFVBD_FN Lanes<T> material(const Batched<const T>& m, const int32_t* pair) const {
@@ -139,9 +137,9 @@ struct LaneStar {
     const int32_t* id = plan.pair + slot * kLanes;
     const T* r = s.rest + slot * 4 * kLanes;
     TetPair<Lanes<T>> out;
-    out.xj = gather3(s.x, [&](int l) { return j[l]; });
-    out.xk = gather3(s.x, [&](int l) { return j[kLanes + l]; });
-    out.xl = gather3(s.x, [&](int l) { return j[2 * kLanes + l]; });
+    out.xj = gather3(s.x, j);
+    out.xk = gather3(s.x, j + kLanes);
+    out.xl = gather3(s.x, j + 2 * kLanes);
     out.k_ij = Lanes<T>::load(r);
     out.k_ik = Lanes<T>::load(r + kLanes);
     out.k_il = Lanes<T>::load(r + 2 * kLanes);
@@ -151,13 +149,15 @@ struct LaneStar {
     return out;
   }
 
-  // Vertices of a color share no tet, so each row below has one writer per color. Padding adds zeros to its own row.
-  DIFFVBD_FN void scatter(const int32_t* target, const Vec3<Lanes<T>>& v) const {
+  // Adds to the rows of the edges to one neighbour of each lane. The tets of a vertex share neighbours, so a row is
+  // summed in the nearest cache and leaves it once; it has one writer, the lane's vertex.
+  DIFFVBD_FN void scatter(const int32_t* edge, const Vec3<Lanes<T>>& v) const {
+    Row<T> r[kLanes];
+    to_rows(v, r);
     for (int l = 0; l < kLanes; ++l) {
-      T* a = s.rows + 4 * static_cast<int64_t>(target[l]);
-      a[0] += v.x.v[l];
-      a[1] += v.y.v[l];
-      a[2] += v.z.v[l];
+      T* a = edges + 4 * (kLanes * edge[l] + l);
+      r[l].v += Row<T>::load(a).v;
+      r[l].store(a);
     }
   }
   DIFFVBD_FN static void accumulate(T* p, const Lanes<T>& v) { (Lanes<T>::load(p) + v).store(p); }
@@ -165,10 +165,10 @@ struct LaneStar {
   template <int wanted>
   DIFFVBD_FN void add(int e, const TetPairAdjoint<Lanes<T>>& a) const {
     const int64_t slot = first + e;
-    const int32_t* target = plan.targets + slot * 3 * kLanes;
-    scatter(target, a.xj);
-    scatter(target + kLanes, a.xk);
-    scatter(target + 2 * kLanes, a.xl);
+    const int32_t* edge = plan.edge + slot * 3 * kLanes;
+    scatter(edge, a.xj);
+    scatter(edge + kLanes, a.xk);
+    scatter(edge + 2 * kLanes, a.xl);
     if constexpr ((wanted & kMaterial) != 0) {
       accumulate(s.mu_bar + slot * kLanes, a.mu);
       accumulate(s.lam_bar + slot * kLanes, a.lam);
@@ -181,16 +181,29 @@ struct LaneStar {
       accumulate(r + 3 * kLanes, a.c6);
     }
   }
-  // x_bar of the block's own vertices, as far as other vertices' updates have contributed; clears what it takes
-  DIFFVBD_FN Vec3<Lanes<T>> take_rows() const {
-    Vec3<Lanes<T>> sum = zero3<Lanes<T>>();
-    for (int e = 0; e < count; ++e) {
-      sum += load_rows(s.rows, first + e);
-      std::memset(s.rows + (first + e) * kLanes * 4, 0, kLanes * 4 * sizeof(T));
-    }
-    return sum;
-  }
 };
+
+// What the neighbours' updates have added to the block's vertices since their last turn (reverse). Every neighbour is
+// updated once between two turns and rewrites its rows, so nothing is left over.
+template <class T>
+DIFFVBD_FN Vec3<Lanes<T>> pull_rows(const Plan& plan, const T* rows, int64_t block) {
+  Row<T> sum[kLanes] = {};
+  for (int64_t e = plan.block_incoming[block]; e < plan.block_incoming[block + 1]; ++e) {
+    for (int l = 0; l < kLanes; ++l) {
+      sum[l].v += Row<T>::load(rows + 4 * static_cast<int64_t>(plan.incoming[e * kLanes + l])).v;
+    }
+  }
+  return to_lanes(sum);
+}
+
+// Zeroes and returns the rows that the block's own updates are about to write.
+template <class T>
+DIFFVBD_FN T* fresh_rows(const Plan& plan, T* rows, int64_t block) {
+  const int64_t first = plan.block_edge[block], count = plan.block_edge[block + 1] - first;
+  T* out = rows + first * kLanes * 4;
+  std::memset(out, 0, static_cast<size_t>(count) * kLanes * 4 * sizeof(T));
+  return out;
+}
 
 template <class Set, class T>
 DIFFVBD_FN Block<Lanes<T>> load_block(const Plan& plan, const SceneView<T>& s, int64_t block,

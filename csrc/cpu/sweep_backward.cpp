@@ -17,7 +17,7 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
       at += plan.num_active;
       return value;
     };
-    const LaneStar<T> star(plan, s, block);
+    const LaneStar<T> star(plan, s, block, fresh_rows(plan, s.rows, block));
     Block<R> b = load_block<Set>(plan, s, block, q);
     if (tape == kCompactTape || Set::filters) b.state.x = {get(), get(), get()};
     Vec3<R> d_raw;
@@ -38,7 +38,7 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
     if (tape == kFullTape && !Set::filters) b.state.x -= u.step;
     store_rows(s.x, block, b.state.x);
 
-    const Vec3<R> x_bar = load_rows(s.x_bar, block) + star.take_rows();
+    const Vec3<R> x_bar = load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block);
     const BlockAdjoint<R> out = reverse_vertex<Set, wanted>(
         b, star, u, H, x_bar, q, s.data_bar != nullptr, [&](int i, const R& value) {
           LaneStar<T>::accumulate(s.data_bar + (static_cast<int64_t>(i) * plan.blocks + block) * kLanes, value);
