@@ -145,16 +145,19 @@ def _solve(problem: Problem, settings: Settings) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    mesh = dv.mesh.load(options.mesh)
+    if options.out.suffix != ".pvd" or not options.out.parent.is_dir():
+        raise ValueError(f"--out: expected a name that ends in .pvd in an existing directory, got {options.out}")
     if options.stride < 1:
         raise ValueError(f"--stride: expected at least 1, got {options.stride}")
+    mesh = dv.mesh.load(options.mesh)
     mu, lam = _material(options)
     v0 = np.broadcast_to(np.asarray(options.velocity or (0.0, 0.0, 0.0)), mesh.points.shape)
     given = _given_scene_options(options, mesh)
     pinned = given.pop("pinned", np.zeros(mesh.num_vertices, dtype=bool))
     scene = Scene(mesh, mesh.points, np.where(pinned[:, None], 0.0, v0), pinned, **given)
     with torch.no_grad():
-        motion = scene.simulate(scene.model(options.device), mu, lam, options.steps, save=options.stride, progress=True)
+        model, progress = scene.model(options.device), sys.stderr.isatty()
+        motion = scene.simulate(model, mu, lam, options.steps, save=options.stride, progress=progress)
     frames, steps = motion.x.cpu().numpy(), np.asarray(motion.steps)
     dv.mesh.write_series(options.out, mesh, frames, steps * scene.time_step)
     print(f"wrote {options.out} ({len(steps)} frames of {mesh.num_vertices} vertices)")

@@ -38,46 +38,6 @@ Adjacency build_adjacency(const int64_t* tets, const Stars& stars) {
 
 namespace {
 
-// Vertices in the order of removal when always one of least remaining degree is removed (Matula and Beck 1983), O(V + E).
-std::vector<int32_t> removal_order(const Stars& stars, const Adjacency& graph, const uint8_t* active) {
-  const int64_t n = static_cast<int64_t>(graph.degree.size());
-  std::vector<int32_t> degree(n, 0), sorted, place(n, -1);
-  int32_t largest = 0;
-  int64_t count = 0;
-  for (int64_t v = 0; v < n; ++v) {
-    if (!active[v]) continue;
-    const int32_t* neighbor = graph.neighbor.data() + 3 * stars.ptr[v];
-    for (int32_t e = 0; e < graph.degree[v]; ++e) degree[v] += active[neighbor[e]] != 0;
-    largest = std::max(largest, degree[v]);
-    ++count;
-  }
-  std::vector<int32_t> bin(largest + 2, 0);
-  for (int64_t v = 0; v < n; ++v) {
-    if (active[v]) ++bin[degree[v] + 1];
-  }
-  for (int32_t d = 0; d <= largest; ++d) bin[d + 1] += bin[d];
-  sorted.resize(count);
-  std::vector<int32_t> at(bin.begin(), bin.end());
-  for (int64_t v = 0; v < n; ++v) {
-    if (active[v]) sorted[place[v] = at[degree[v]]++] = static_cast<int32_t>(v);
-  }
-  for (int64_t i = 0; i < count; ++i) {
-    const int32_t v = sorted[i];
-    const int32_t* neighbor = graph.neighbor.data() + 3 * stars.ptr[v];
-    for (int32_t e = 0; e < graph.degree[v]; ++e) {
-      const int32_t u = neighbor[e];
-      if (!active[u] || degree[u] <= degree[v]) continue;
-      // swap u with the first vertex of its bin, then let the bin begin after it
-      const int32_t first = std::max(bin[degree[u]], static_cast<int32_t>(i + 1)), w = sorted[first];
-      std::swap(sorted[place[u]], sorted[first]);
-      std::swap(place[u], place[w]);
-      bin[degree[u]] = first + 1;
-      --degree[u];
-    }
-  }
-  return sorted;
-}
-
 uint64_t spread_bits(uint64_t a) {
   a &= 0x1fffff;
   a = (a | a << 32) & 0x1f00000000ffffull;
@@ -111,21 +71,43 @@ std::vector<int32_t> morton_order(const double* points, int64_t n) {
 
 }  // namespace
 
+// One stack of vertices per saturation (number of colors among the neighbours). A vertex is pushed again whenever its
+// saturation grows; entries that were overtaken are skipped, so the whole takes O(V + E). Of equal saturation the latest
+// comes first: the coloring advances as a front, which finds the 4 colors of regular grids.
 std::vector<int32_t> color_vertices(const Stars& stars, const Adjacency& graph, const uint8_t* active, int* colors) {
-  const std::vector<int32_t> order = removal_order(stars, graph, active);
-  std::vector<int32_t> color(graph.degree.size(), -1), taken_by;
-  for (auto it = order.rbegin(); it != order.rend(); ++it) {
-    const int32_t v = *it;
-    const int32_t* neighbor = graph.neighbor.data() + 3 * stars.ptr[v];
-    for (int32_t e = 0; e < graph.degree[v]; ++e) {
-      if (color[neighbor[e]] >= 0) taken_by[color[neighbor[e]]] = v;
+  const int64_t n = static_cast<int64_t>(graph.degree.size());
+  const int32_t largest = n == 0 ? 0 : *std::max_element(graph.degree.begin(), graph.degree.end());
+  const int64_t words = largest / 64 + 1;  // a vertex never needs more than its degree + 1 colors
+  std::vector<uint64_t> seen(n * words, 0);
+  std::vector<int32_t> color(n, -1), saturation(n, 0);
+  std::vector<std::vector<int32_t>> stacks(largest + 2);
+  int32_t top = 0;
+  *colors = 0;
+  for (int64_t start = 0; start < n; ++start) {
+    if (!active[start] || color[start] >= 0) continue;
+    stacks[0].push_back(static_cast<int32_t>(start));
+    for (;;) {
+      while (top > 0 && stacks[top].empty()) --top;
+      if (stacks[top].empty()) break;
+      const int32_t v = stacks[top].back();
+      stacks[top].pop_back();
+      if (color[v] >= 0 || saturation[v] != top) continue;
+      int32_t c = 0;
+      while (seen[v * words + c / 64] >> (c % 64) & 1) ++c;
+      color[v] = c;
+      *colors = std::max(*colors, c + 1);
+      const int32_t* neighbor = graph.neighbor.data() + 3 * stars.ptr[v];
+      for (int32_t e = 0; e < graph.degree[v]; ++e) {
+        const int32_t u = neighbor[e];
+        uint64_t& word = seen[u * words + c / 64];
+        const uint64_t bit = uint64_t{1} << (c % 64);
+        if (!active[u] || color[u] >= 0 || (word & bit) != 0) continue;
+        word |= bit;
+        top = std::max(top, ++saturation[u]);
+        stacks[saturation[u]].push_back(u);
+      }
     }
-    int32_t c = 0;
-    while (c < static_cast<int32_t>(taken_by.size()) && taken_by[c] == v) ++c;
-    if (c == static_cast<int32_t>(taken_by.size())) taken_by.push_back(-1);
-    color[v] = c;
   }
-  *colors = static_cast<int>(taken_by.size());
   return color;
 }
 

@@ -55,7 +55,7 @@ class Scene:
         self, model: dv.Model, mu: Tensor | float, lam: Tensor | float, steps: int, **options: Any
     ) -> dv.Trajectory:
         """Roll out from (x0, v0); mu and lam in [Pa]; options as in `diffvbd.rollout`."""
-        x, v = (torch.as_tensor(a, dtype=model.dtype, device=model.device) for a in (self.x0, self.v0))
+        x, v = (torch.tensor(a, dtype=model.dtype, device=model.device) for a in (self.x0, self.v0))
         return dv.rollout(
             model,
             x,
@@ -93,8 +93,9 @@ class Observation:
         values |= {"time_step": s.time_step, "sweeps": s.sweeps, "density": s.density, "gravity": s.gravity}
         if s.floor is not None:
             values |= {"floor": s.floor, "kappa": s.kappa, "dhat": s.dhat}
+        values |= self.truth
         with open(path, "wb") as file:
-            np.savez_compressed(file, **values, **self.truth)
+            np.savez_compressed(file, **values)
 
     @classmethod
     def load(cls, path: str | Path, mesh: dv.TetMesh, **overrides: Any) -> "Observation":
