@@ -22,7 +22,8 @@ CPU_SOURCES = [
     "csrc/cpu/plan.cpp",
     "csrc/cpu/register.cpp",
     "csrc/cpu/run.cpp",
-    "csrc/cpu/sweep_backward.cpp",
+    "csrc/cpu/sweep_backward_double.cpp",
+    "csrc/cpu/sweep_backward_float.cpp",
     "csrc/cpu/sweep_forward.cpp",
 ]
 

@@ -12,9 +12,11 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "int sweeps, int tape_policy, int debug_step, bool checked) -> (Tensor x, Tensor tape)");
   // wants: material, mass, rest, energy_data
   m.def(
-      "sweep_backward(Tensor x_bar, Tensor x, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, "
+      "sweep_backward(Tensor x_bar, Tensor x, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor "
+      "rest, "
       "Tensor energy_data, Tensor origin, Tensor tape, Tensor plan, int[] sizes, int energies, int[] data_count, "
-      "float[] numbers, int sweeps, int tape_policy, bool[] wants) -> (Tensor x_start, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, "
+      "float[] numbers, int sweeps, int tape_policy, bool[] wants) -> (Tensor x_start, Tensor x_prev, Tensor y, Tensor "
+      "mu, Tensor lam, "
       "Tensor mass, Tensor rest, Tensor energy_data)");
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");
   m.def(

@@ -1,4 +1,4 @@
-"""diffvbd: differentiable soft-body simulation by Vertex Block Descent, with the exact adjoint of the executed solver."""
+"""diffvbd: differentiable soft-body simulation by Vertex Block Descent, by the exact adjoint of the executed solver."""
 
 import os as _os
 

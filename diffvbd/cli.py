@@ -95,7 +95,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     identification.add_argument("--fixed-lam", action="store_true", help="keep lam at its first guess")
     identification.add_argument("--iterations", type=int, default=100, help="at most so many (default 100)")
-    identification.add_argument("--learning-rate", type=float, default=0.15, help="of Adam (default 0.15)")
     identification.add_argument("--steps", type=int, help="time steps that led to the shape, if x is one shape")
     _add_scene_options(identification)
     _add_run_options(identification, "runs/identify")
@@ -172,9 +171,7 @@ def _identify(options: argparse.Namespace) -> None:
     observation = Observation.load(options.target, mesh, **given)
     settings = Settings(options.out or Path("runs/identify"), options.device, options.seed)
     start = (options.start[0], options.start[1])
-    problem = identify.problem(
-        observation, settings, start, options.fixed_lam, options.iterations, options.learning_rate
-    )
+    problem = identify.problem(observation, settings, start, options.fixed_lam, options.iterations)
     _solve(problem, settings)
 
 

@@ -46,11 +46,14 @@ def check_gradients(
 
     Args:
         loss: Any scalar function of tensors, typically a few steps and a sum.
-        arguments: float64 tensors by name.
+        arguments: float64 tensors by name, of any shape.
         relative_steps: Steps relative to the size of the argument (1 where it is zero).
         tolerance: Largest error |adjoint - difference| / max(|adjoint|, |difference|) that counts as agreement.
         seed: Of the directions.
         verbose: Print the table.
+
+    Returns:
+        A :class:`GradientCheck`; ``ok`` says whether every argument agrees within the tolerance.
 
     Raises:
         ValueError: If an argument is not float64 or the loss is not a scalar.

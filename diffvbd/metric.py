@@ -10,7 +10,7 @@ from torch import Tensor
 
 from . import ops
 
-_Vector = tuple[Tensor, Tensor, Tensor]
+_Vector = tuple[Tensor, ...]  # three components
 
 
 def _cross(a: _Vector, b: _Vector) -> _Vector:

@@ -116,8 +116,8 @@ class Model:
     def paper(cls, mesh: TetMesh, **options: Any) -> Model:
         """The paper's preset: block="paper", saturation 0.1 m, regularization 1e-6 kg.
 
-        Both constants are absolute: 0.1 m is 33 edges of a 3 mm cube and 1e-6 kg is 0.15-0.44 of such a cube's vertex, so
-        the preset does not suit small bodies (docs/numerics.md).
+        Both constants are absolute: 0.1 m is 33 edges of a 3 mm cube, and 1e-6 kg is 0.15-0.44 of the mass of such a
+        cube's vertex, so the preset does not suit small bodies (docs/numerics.md).
         """
         energies = tuple(options.pop("energies", ()))
         energies = (StableNeoHookean("paper"), *(e for e in energies if not isinstance(e, StableNeoHookean)))
@@ -161,6 +161,7 @@ class Model:
 
     @property
     def num_colors(self) -> int:
+        """Groups of vertices that a sweep updates one after another."""
         return self.color_ptr.shape[0] - 1
 
     @property
@@ -171,10 +172,12 @@ class Model:
 
     @property
     def energy_mask(self) -> int:
+        """The energies as bits, in the order of csrc/energies/energies.h."""
         return sum(e.bit for e in self.energies)
 
     @property
     def floor(self) -> FloorBarrier | None:
+        """The floor barrier, if the Model has one."""
         return next((e for e in self.energies if isinstance(e, FloorBarrier)), None)
 
     def settings(self, time_step: float, sweeps: int) -> ops.SweepSettings:

@@ -4,6 +4,7 @@ Raw operators are private and functional. Each differentiable one is an autograd
 torch.func and torch.compile; the backward is a second Function, whose own backward raises.
 """
 
+# pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
 import sysconfig
@@ -279,9 +280,9 @@ class _Sweep(Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-        tensors = args[: _TENSORS + 1]
+        tensors: tuple[Any, ...] = args[: _TENSORS + 1]
         scenes = _scenes(tensors, in_dims)
-        folded = [
+        folded: list[Any] = [
             t if t is None or t.numel() == 0 else _fold(t, d, info.batch_size, scenes)
             for t, d in zip(tensors, in_dims, strict=False)
         ]
@@ -319,11 +320,11 @@ class _SweepBackward(Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         x_bar, *saved, settings, tape_policy, needs = args
-        tensors = (x_bar, *saved[: _TENSORS + 1])
+        tensors: tuple[Any, ...] = (x_bar, *saved[: _TENSORS + 1])
         scenes = _scenes(tensors, in_dims)
         size = info.batch_size
 
-        def fold(t: Tensor | None, d: int | None) -> Tensor | None:
+        def fold(t: Tensor | None, d: int | None) -> Any:
             return t if t is None or t.numel() == 0 else _fold(t, d, size, scenes)
 
         folded = [fold(t, d) for t, d in zip(tensors, in_dims, strict=False)]

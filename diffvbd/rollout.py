@@ -77,8 +77,8 @@ def rollout(
         model, x, v, time_step, sweeps, adjoint: As in :func:`diffvbd.step`.
         steps: Number of steps >= 0.
         mu, lam, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in time; or wrapped
-            in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step. A callable may close
-            over tensors and modules that require grad: they get gradients under every schedule. It must be
+            in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step. A callable may
+            close over tensors and modules that require grad: they get gradients under every schedule. It must be
             deterministic, because a checkpointed segment calls it again in the backward.
         checkpoint_every: Between checkpoints of n steps only states are kept, and the segment is run again in the
             backward: n keeps steps / n states and the tapes of n steps. ``None`` keeps all tapes.
@@ -104,14 +104,14 @@ def rollout(
         if isinstance(value, PerStep) and value.values.shape[0] != steps:
             fail(name, f"{steps} steps in per_step", f"shape {list(value.values.shape)}")
 
-    static = {k: options[k] for k in _STATIC} | {"parameters": parameters}
+    static: dict[str, Any] = {k: options[k] for k in _STATIC} | {"parameters": parameters}
     changes = any(_changes(value) for value in (*(options[k] for k in _STATIC), *named.values()))
     fixed = None if changes else prepare(model, lead, time_step=time_step, sweeps=sweeps, **static)
 
     def one_step(k: int, x: Tensor, v: Tensor, adjoint: ReverseSweep) -> tuple[Tensor, Tensor]:
         prepared = fixed
         if prepared is None:
-            now = {name: _at(options[name], k, x, v) for name in _STATIC}
+            now: dict[str, Any] = {name: _at(options[name], k, x, v) for name in _STATIC}
             now["parameters"] = {name: _at(value, k, x, v) for name, value in (parameters or {}).items()}
             prepared = prepare(model, lead, time_step=time_step, sweeps=sweeps, **now)
         given = {name: _at(options[name], k, x, v) for name in ("force", "gravity", "prescribed")}

@@ -236,12 +236,26 @@ def advance(
     scalars = flat[0] * prepared.settings.sweeps * model.num_active
     policy = adjoint.policy(scalars, x.element_size(), model.energy_mask) if differentiated else ops.NO_TAPE
     empty = x.new_empty((0,))
-    end = ops.sweep(*tensors, empty if origin is None else origin, model._packed_rest, model._plan, prepared.settings,
-                    tape_policy=policy, debug_step=index if _debug.get() else -1)  # fmt: skip
+    try:
+        end = ops.sweep(*tensors, empty if origin is None else origin, model._packed_rest, model._plan,
+                        prepared.settings, tape_policy=policy, debug_step=index if _debug.get() else -1)  # fmt: skip
+    except ValueError as error:
+        _name_argument(error, {"x": x, "v": v, "force": force, "gravity": gravity, "prescribed": prescribed})
+        raise
     velocity = (end - start) / h
     if origin is not None:
         end = end + origin
     return end.reshape(shape), velocity.reshape(shape)
+
+
+def _name_argument(error: ValueError, arguments: dict[str, Any]) -> None:
+    """Raises an error that names the argument, where the operator could name only what was made of several."""
+    if not str(error).startswith(("predictor", "start")):
+        return
+    for name, value in arguments.items():
+        if isinstance(value, Tensor) and not bool(torch.isfinite(value).all()):
+            where = (~torch.isfinite(value)).nonzero()[0].tolist()
+            raise ValueError(f"{name}: expected finite values, got {float(value[tuple(where)])} at {where}") from None
 
 
 def _broadcastable(name: str, value: Any, x: Tensor) -> Tensor:

@@ -24,7 +24,17 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "spread_factor": (10.0, "how far the compiled gradient may lie beyond two references that differ in tet order"),
     "headline_spread": (1e-13, "scenes better conditioned than this enter the headline table"),
     "headline": (5e-15, "what the headline table aims at: a few ulps per pair, averaged over a star"),
+    "headline_median": (
+        2e-14,
+        "measured 1.1e-14: material gradients lose 1 / strain (1e-2) to cancellation",
+    ),
+    "headline_worst": (1e-12, "measured 4e-13; slivers and gaps amplify a rounding that permuted tets do not show"),
     "dual": (1e-14, "hand-written adjoint of one energy block against forward-mode scalars: no sweep amplifies it"),
+    "dual_rounded": (
+        1e-11,
+        "the same adjoint in double: J - 1 and a gap lose what the state has lost",
+    ),
+    "solve_residual": (1e-15, "L D L^T of a 3x3 block against |A| |u| + |b|: 4 ulps whatever the conditioning"),
     "free_fall": (1e-13, "closed form; rounding of x + h v + h^2 g over the steps"),
     "block_residual": (1e-12, "residual right after its exact update, relative to the sum of its terms' magnitudes"),
     "closed_form": (1e-9, "converged sweeps against a formula: sweeps stop at that residual, not rounding"),
@@ -171,8 +181,8 @@ CASES: dict[str, Case] = {
     "violent": Case(speed=60),  # neighbors fly apart by an edge length and more: nearly every tet inverts
     # The next three are limited by conditioning on purpose: rounding decides many digits, and spread says how many.
     "tiny_strain": Case(jitter=1e-9, speed=1e-8, gravity=(0.0, 0.0, 0.0), force=0.0),
-    "huge_strain": Case(speed=6e3),
-    "huge_saturated": Case(speed=6e3, saturation=0.1),
+    "huge_strain": Case(speed=2e3),
+    "huge_saturated": Case(speed=2e3, saturation=0.1),
     "floor_inactive": Case(floor={"height": -10.0}),
     "floor_active": Case(floor=_NEAR, pinned=False),
     "floor_damped": Case(floor=_NEAR | {"damping": 50.0}, pinned=False, fall=0.5),

@@ -119,8 +119,10 @@ DIFFVBD_FN Vec3<Lanes<T>> to_lanes(const Row<T>* r) {
   typename Row<T>::Vector x[2], y[2], z[2];
   for (int half = 0; half < 2; ++half) {
     const auto *a = r + 4 * half, *b = a + 1, *c = a + 2, *d = a + 3;
-    const auto ab_xz = __builtin_shufflevector(a->v, b->v, 0, 4, 2, 6), ab_y = __builtin_shufflevector(a->v, b->v, 1, 5, 3, 7);
-    const auto cd_xz = __builtin_shufflevector(c->v, d->v, 0, 4, 2, 6), cd_y = __builtin_shufflevector(c->v, d->v, 1, 5, 3, 7);
+    const auto ab_xz = __builtin_shufflevector(a->v, b->v, 0, 4, 2, 6),
+               ab_y = __builtin_shufflevector(a->v, b->v, 1, 5, 3, 7);
+    const auto cd_xz = __builtin_shufflevector(c->v, d->v, 0, 4, 2, 6),
+               cd_y = __builtin_shufflevector(c->v, d->v, 1, 5, 3, 7);
     x[half] = __builtin_shufflevector(ab_xz, cd_xz, 0, 1, 4, 5);
     y[half] = __builtin_shufflevector(ab_y, cd_y, 0, 1, 4, 5);
     z[half] = __builtin_shufflevector(ab_xz, cd_xz, 2, 3, 6, 7);
@@ -144,7 +146,8 @@ DIFFVBD_FN void to_rows(const Vec3<Lanes<T>>& v, Row<T>* r) {
   const typename Row<T>::Vector zero = {};
   const auto spread = [&](auto x, auto y, auto z, Row<T>* out) {
     const auto xy_even = __builtin_shufflevector(x, y, 0, 4, 2, 6), xy_odd = __builtin_shufflevector(x, y, 1, 5, 3, 7);
-    const auto z_even = __builtin_shufflevector(z, zero, 0, 4, 2, 6), z_odd = __builtin_shufflevector(z, zero, 1, 5, 3, 7);
+    const auto z_even = __builtin_shufflevector(z, zero, 0, 4, 2, 6),
+               z_odd = __builtin_shufflevector(z, zero, 1, 5, 3, 7);
     out[0].v = __builtin_shufflevector(xy_even, z_even, 0, 1, 4, 5);
     out[1].v = __builtin_shufflevector(xy_odd, z_odd, 0, 1, 4, 5);
     out[2].v = __builtin_shufflevector(xy_even, z_even, 2, 3, 6, 7);

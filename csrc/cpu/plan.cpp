@@ -72,8 +72,8 @@ std::vector<int32_t> morton_order(const double* points, int64_t n) {
 }  // namespace
 
 // One stack of vertices per saturation (number of colors among the neighbours). A vertex is pushed again whenever its
-// saturation grows; entries that were overtaken are skipped, so the whole takes O(V + E). Of equal saturation the latest
-// comes first: the coloring advances as a front, which finds the 4 colors of regular grids.
+// saturation grows; entries that were overtaken are skipped, so the whole takes O(V + E). Of equal saturation the
+// latest comes first: the coloring advances as a front, which finds the 4 colors of regular grids.
 std::vector<int32_t> color_vertices(const Stars& stars, const Adjacency& graph, const uint8_t* active, int* colors) {
   const int64_t n = static_cast<int64_t>(graph.degree.size());
   const int32_t largest = n == 0 ? 0 : *std::max_element(graph.degree.begin(), graph.degree.end());
@@ -120,8 +120,8 @@ std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64
     for (int32_t e = 0; e < graph.degree[v]; ++e) active_degree[v] += color[neighbors_of(v)[e]] >= 0;
   }
   const auto valence = [&](int32_t v) { return static_cast<int32_t>(stars.ptr[v + 1] - stars.ptr[v]); };
-  // Morton order keeps the neighbours of a block near each other in memory; inside a window, sorting by valence lets the
-  // lanes of a block have stars of like length.
+  // Morton order keeps the neighbours of a block near each other in memory; inside a window, sorting by valence lets
+  // the lanes of a block have stars of like length.
   constexpr int64_t kWindow = 64 * kLanes;
   std::vector<std::vector<int32_t>> members(colors + 1);
   for (const int32_t v : morton_order(points, n)) members[color[v] < 0 ? colors : color[v]].push_back(v);
@@ -150,9 +150,9 @@ std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64
   if (std::max(slots, edge_slots + 1) * kLanes > std::numeric_limits<int32_t>::max()) {
     throw std::invalid_argument("mesh: too large, expected at most 2^31 (vertex, tet) pairs");
   }
-  const std::array<int64_t, 10> sizes = {colors + 1,      blocks + 1,         blocks + 1,         blocks + 1,
-                                         blocks + 1,      blocks * kLanes,    slots * kLanes,     slots * 3 * kLanes,
-                                         slots * 3 * kLanes, incoming_slots * kLanes};
+  const std::array<int64_t, 10> sizes = {
+      colors + 1,      blocks + 1,     blocks + 1,         blocks + 1,         blocks + 1,
+      blocks * kLanes, slots * kLanes, slots * 3 * kLanes, slots * 3 * kLanes, incoming_slots * kLanes};
   int64_t total = kPlanHeader;
   for (const int64_t s : sizes) total += s;
   std::vector<int32_t> out(total);

@@ -23,7 +23,8 @@ struct Adjacency {
 
 Adjacency build_adjacency(const int64_t* tets, const Stars& stars);
 
-// Greedy coloring by saturation (after DSATUR, Brelaz 1979) of the vertices with active[v] (others get -1): no two that share a tet share a color.
+// Greedy coloring by saturation (after DSATUR, Brelaz 1979) of the vertices with active[v] (others get -1): no two that
+// share a tet share a color.
 std::vector<int32_t> color_vertices(const Stars& stars, const Adjacency& graph, const uint8_t* active, int* colors);
 
 // The plan as one buffer (see views.h): a header of sizes, then its arrays.

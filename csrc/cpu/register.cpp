@@ -60,8 +60,8 @@ template <class T>
 diffvbd::StepInputs<T> inputs(const diffvbd::Plan& plan, const Tensor& x_start, const Tensor& x_prev, const Tensor& y,
                               const Tensor& mu, const Tensor& lam, const Tensor& mass, const Tensor& rest,
                               const Tensor& energy_data, const Tensor& origin, int64_t energies,
-                              const std::vector<int64_t>& data_count, const std::vector<double>& numbers, int64_t sweeps,
-                              int64_t tape_policy, int64_t debug_step) {
+                              const std::vector<int64_t>& data_count, const std::vector<double>& numbers,
+                              int64_t sweeps, int64_t tape_policy, int64_t debug_step) {
   require(x_start.dim() == 3 && x_start.size(1) == plan.num_vertices && x_start.size(2) == 3,
           "diffvbd::sweep: expected x of shape [scenes, vertices, 3]");
   require(numbers.size() == 6 && data_count.size() == diffvbd::kVertexEnergies, "diffvbd::sweep: bad parameter lists");
@@ -87,8 +87,12 @@ diffvbd::StepInputs<T> inputs(const diffvbd::Plan& plan, const Tensor& x_start, 
   require(scalars <= diffvbd::kMaxEnergyData, "energies: too many planes, expected at most 8 in one floor");
   in.data = batched<T>(energy_data, x_start, b, total);
   in.energies = static_cast<int>(energies);
-  in.parameters = {static_cast<T>(numbers[0]), static_cast<T>(numbers[1]), static_cast<T>(numbers[2]),
-                   static_cast<T>(numbers[3]), static_cast<T>(numbers[4]), static_cast<T>(numbers[5]),
+  in.parameters = {static_cast<T>(numbers[0]),
+                   static_cast<T>(numbers[1]),
+                   static_cast<T>(numbers[2]),
+                   static_cast<T>(numbers[3]),
+                   static_cast<T>(numbers[4]),
+                   static_cast<T>(numbers[5]),
                    numbers[3] >= 0};
   in.sweeps = static_cast<int>(sweeps);
   in.tape_policy = static_cast<int>(tape_policy);
@@ -101,10 +105,9 @@ Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes) { return tor
 
 std::tuple<Tensor, Tensor> sweep(const Tensor& x_start, const Tensor& x_prev, const Tensor& y, const Tensor& mu,
                                  const Tensor& lam, const Tensor& mass, const Tensor& rest, const Tensor& energy_data,
-                                 const Tensor& origin, const Tensor& plan_buffer,
-    std::vector<int64_t> sizes, int64_t energies,
-                                 std::vector<int64_t> data_count, std::vector<double> numbers, int64_t sweeps,
-                                 int64_t tape_policy, int64_t debug_step, bool checked) {
+                                 const Tensor& origin, const Tensor& plan_buffer, std::vector<int64_t> sizes,
+                                 int64_t energies, std::vector<int64_t> data_count, std::vector<double> numbers,
+                                 int64_t sweeps, int64_t tape_policy, int64_t debug_step, bool checked) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
   return dispatch_float(x_start, [&](auto scalar) {
     using T = decltype(scalar);
@@ -122,9 +125,8 @@ std::tuple<Tensor, Tensor> sweep(const Tensor& x_start, const Tensor& x_prev, co
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> sweep_backward(
     const Tensor& x_bar, const Tensor& x, const Tensor& x_prev, const Tensor& y, const Tensor& mu, const Tensor& lam,
     const Tensor& mass, const Tensor& rest, const Tensor& energy_data, const Tensor& origin, const Tensor& tape,
-    const Tensor& plan_buffer,
-    std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count, std::vector<double> numbers,
-    int64_t sweeps, int64_t tape_policy, std::vector<bool> wants) {
+    const Tensor& plan_buffer, std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
+    std::vector<double> numbers, int64_t sweeps, int64_t tape_policy, std::vector<bool> wants) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
   require(wants.size() == 4 && tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: bad arguments");
   return dispatch_float(x, [&](auto scalar) {

@@ -12,7 +12,7 @@ namespace diffvbd {
 namespace {
 
 // A parallel region costs microseconds: colors below this many blocks stay serial.
-constexpr int64_t kSerialBlocks = 48;
+constexpr int64_t kSerialBlocks = 16;
 
 // position of the stiffness weight k_ab in a tet's row of `rest`
 constexpr int kWeight[4][4] = {{-1, 0, 1, 2}, {0, -1, 3, 4}, {1, 3, -1, 5}, {2, 4, 5, -1}};
@@ -143,7 +143,7 @@ void look_for_nonfinite(const Plan& plan, const SceneView<T>& s, int64_t step, i
     const T* x = s.x + 4 * i;
     if (plan.order[i] < 0 || (std::isfinite(x[0]) && std::isfinite(x[1]) && std::isfinite(x[2]))) continue;
     std::ostringstream out;
-    out << "non-finite position after step " << step << ", sweep " << sweep << ", color " << color << ", vertex "
+    out << "non-finite position in step " << step << ", sweep " << sweep << ", color " << color << ", vertex "
         << plan.order[i] << ", scene " << scene << ": (" << x[0] << ", " << x[1] << ", " << x[2] << ")";
     throw std::runtime_error(out.str());
   }
@@ -178,6 +178,30 @@ void check_vectors(const char* name, const Batched<const T>& t, int64_t scenes, 
       std::ostringstream out;
       out << name << ": expected finite values, got " << value << " at vertex " << i / 3 << " of scene " << b;
       throw std::invalid_argument(out.str());
+    }
+  }
+}
+
+template <class T>
+void check_energy_data(const Plan& plan, const StepInputs<T>& in) {
+  for (int64_t b = 0; b < (in.data.scene == 0 ? std::min<int64_t>(in.scenes, 1) : in.scenes); ++b) {
+    const T* at = in.data.data + b * in.data.scene;
+    for (int k = 0; k < kVertexEnergies; ++k) {
+      const int64_t size = int64_t{in.data_count[k]} * (is_per_vertex(k, VertexEnergies{}) ? plan.num_vertices : 1);
+      const int stride = data_stride(k, VertexEnergies{});
+      for (int64_t i = 0; i < size; i += stride) {
+        const char* message = invalid_data(k, at + i, VertexEnergies{});
+        for (int64_t c = i; !message && c < i + stride; ++c) {
+          if (!std::isfinite(at[c])) message = "parameters: expected finite values";
+        }
+        if (!message) continue;
+        std::ostringstream out;
+        out << message << ", got (";
+        for (int64_t c = i; c < i + stride; ++c) out << (c > i ? ", " : "") << at[c];
+        out << ") in record " << i / stride << " of scene " << b;
+        throw std::invalid_argument(out.str());
+      }
+      at += size;
     }
   }
 }
@@ -224,8 +248,9 @@ void check_values(const Plan& plan, const StepInputs<T>& in) {
     check<T>("mu", "finite values >= 0 Pa", "tet", in.mu, in.scenes, plan.num_tets,
              [](T a, T) { return !(a >= 0 && std::isfinite(a)); });
     if (in.energies & kExactBlock) {
-      check<T>("lam", "finite values with mu + lam >= 0 Pa", "tet", in.lam, in.scenes, plan.num_tets,
-               [](T a, T mu) { return !(a + mu >= 0 && std::isfinite(a)); }, &in.mu);
+      check<T>(
+          "lam", "finite values with mu + lam >= 0 Pa", "tet", in.lam, in.scenes, plan.num_tets,
+          [](T a, T mu) { return !(a + mu >= 0 && std::isfinite(a)); }, &in.mu);
     } else {
       check<T>("lam", "finite values >= 0 Pa with block=\"paper\"", "tet", in.lam, in.scenes, plan.num_tets,
                [](T a, T) { return !(a >= 0 && std::isfinite(a)); });
@@ -239,18 +264,19 @@ void check_values(const Plan& plan, const StepInputs<T>& in) {
       const T m = in.mass.data[b * in.mass.scene + v];
       if (m > 0 && std::isfinite(m)) continue;
       std::ostringstream out;
-      out << "density or rest_points: expected a finite mass > 0 kg, got " << m << " at vertex " << v << " of scene " << b;
+      out << "density or rest_points: expected a finite mass > 0 kg, got " << m << " at vertex " << v << " of scene "
+          << b;
       throw std::invalid_argument(out.str());
     }
   }
+  check_energy_data(plan, in);
   if (filters(in.energies)) check_above_planes(plan, in);
 }
 
 template <class T>
 void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape) {
   const auto kernel = forward_kernel<T>(in.energies);
-  const int64_t tape_size =
-      int64_t{in.sweeps} * tape_rows(in.tape_policy, filters(in.energies)) * plan.num_active;
+  const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, filters(in.energies)) * plan.num_active;
   for_scenes(in.scenes, [&](int64_t b) {
     Scene<T> scene(plan, in, b, in.x_start.data + b * in.x_start.scene);
     scene.view.tape = tape + b * tape_size;
@@ -271,8 +297,7 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
                  const StepAdjoints<T>& out) {
   const int wanted = (out.mu ? kMaterial : 0) | (out.rest ? kMaterial | kRest : 0);
   const auto kernel = reverse_kernel<T>(in.energies, wanted);
-  const int64_t tape_size =
-      int64_t{in.sweeps} * tape_rows(in.tape_policy, filters(in.energies)) * plan.num_active;
+  const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, filters(in.energies)) * plan.num_active;
   const int64_t n = plan.num_vertices, tets = plan.num_tets, lanes = int64_t{plan.blocks} * kLanes;
   const int64_t pairs = int64_t{plan.slots} * kLanes;
   for_scenes(in.scenes, [&](int64_t b) {
@@ -298,9 +323,8 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     const int64_t inactive = plan.color_block[plan.colors];
     for (int k = in.sweeps - 1; k >= 0; --k) {
       for (int c = plan.colors - 1; c >= 0; --c) {
-        for_blocks(plan.color_block[c], plan.color_block[c + 1], [&](int64_t begin, int64_t end) {
-          kernel(plan, s, in.parameters, k, in.tape_policy, begin, end);
-        });
+        for_blocks(plan.color_block[c], plan.color_block[c + 1],
+                   [&](int64_t begin, int64_t end) { kernel(plan, s, in.parameters, k, in.tape_policy, begin, end); });
       }
       // Pinned vertices have no turn of their own: they collect after each sweep, before the rows are overwritten.
       for (int64_t block = inactive; block < plan.blocks; ++block) {
@@ -353,6 +377,13 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
 
 template <class T>
 void pack_rest(const Plan& plan, const T* rest, T* packed) {
+  for (int64_t t = 0; t < plan.num_tets; ++t) {
+    const T c6 = rest[t * kRestScalars + 6];
+    if (c6 > 0 && std::isfinite(c6)) continue;
+    std::ostringstream out;
+    out << "rest_points: expected tets of positive volume, got " << 1 / (6 * c6) << " m^3 at tet " << t;
+    throw std::invalid_argument(out.str());
+  }
   for (int64_t block = 0; block < plan.blocks; ++block) {
     for (int64_t slot = plan.block_slot[block]; slot < plan.block_slot[block + 1]; ++slot) {
       for (int l = 0; l < kLanes; ++l) {
@@ -368,11 +399,11 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
   }
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                              \
-  template void check_values<T>(const Plan&, const StepInputs<T>&);                                         \
-  template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*);                                  \
-  template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*,             \
-                               const StepAdjoints<T>&);                                                     \
+#define DIFFVBD_INSTANTIATE(T)                                                                  \
+  template void check_values<T>(const Plan&, const StepInputs<T>&);                             \
+  template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*);                      \
+  template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*, \
+                               const StepAdjoints<T>&);                                         \
   template void pack_rest<T>(const Plan&, const T*, T*);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

@@ -1,4 +1,5 @@
-// A whole step of sweeps over a batch of scenes: the arrays as the user keeps them, and the loops over scenes and colors.
+// A whole step of sweeps over a batch of scenes: the arrays as the user keeps them, and the loops over scenes and
+// colors.
 #pragma once
 
 #include "plan.h"

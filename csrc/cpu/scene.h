@@ -19,8 +19,9 @@ namespace diffvbd {
 
 enum TapePolicy { kNoTape = 0, kCompactTape = 1, kFullTape = 2 };
 
-// Scalars per active vertex and sweep. Full: d_raw and H. Compact: the old position. A scene with a step filter keeps the
-// old position in a full tape too: a gap must come back to the bit, and an undo by subtraction is an ulp off at times.
+// Scalars per active vertex and sweep. Full: d_raw and H. Compact: the old position. A scene with a step filter keeps
+// the old position in a full tape too: a gap must come back to the bit, and an undo by subtraction is an ulp off at
+// times.
 inline int tape_rows(int policy, bool filters) {
   return policy == kFullTape ? (filters ? 12 : 9) : policy == kCompactTape ? 3 : 0;
 }
@@ -67,15 +68,15 @@ struct SceneView {
   T* tape;  // [sweeps, rows, active]
 
   // reverse only
-  T* x_bar;      // [blocks kLanes, 4]
-  T* y_bar;      // [blocks, 3, kLanes]
-  T* x_prev_bar; // [blocks, 3, kLanes] or null
-  T* mass_bar;   // [blocks, kLanes]
-  T* rows;       // [edge_slots kLanes + 1, 4]  what the latest reversed update of a vertex adds to a neighbour
-  T* mu_bar;     // [slots, kLanes] or null
-  T* lam_bar;    // [slots, kLanes] or null
-  T* rest_bar;   // [slots, 4, kLanes] or null
-  T* data_bar;   // [kMaxEnergyData, blocks kLanes] or null
+  T* x_bar;       // [blocks kLanes, 4]
+  T* y_bar;       // [blocks, 3, kLanes]
+  T* x_prev_bar;  // [blocks, 3, kLanes] or null
+  T* mass_bar;    // [blocks, kLanes]
+  T* rows;        // [edge_slots kLanes + 1, 4]  what the latest reversed update of a vertex adds to a neighbour
+  T* mu_bar;      // [slots, kLanes] or null
+  T* lam_bar;     // [slots, kLanes] or null
+  T* rest_bar;    // [slots, 4, kLanes] or null
+  T* data_bar;    // [kMaxEnergyData, blocks kLanes] or null
 };
 
 template <class T>

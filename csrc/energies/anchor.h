@@ -11,6 +11,11 @@ struct Anchor {
   static constexpr bool has_filter = false;
   static constexpr bool reads_x_prev = false;
 
+  template <class T>
+  static const char* invalid(const T* a) {
+    return a[0] >= 0 ? nullptr : "anchor.stiffness: expected >= 0 N/m";
+  }
+
   template <class R>
   DIFFVBD_FN static void block(const VertexState<R>& s, const R* data, int, Vec3<R>& g, Sym3<R>& H) {
     const R k = s.h * s.h * data[0];

@@ -1,6 +1,6 @@
 // THE list of energies. A scene's energies form a mask; each mask is a compiled variant, so an absent energy costs no
-// instruction. An energy of one vertex is a struct with stride, per_vertex, has_filter, reads_x_prev and block(); with a
-// block_vjp() too it is hot, without one Dual derives its adjoint.
+// instruction. An energy of one vertex is a struct with stride, per_vertex, has_filter, reads_x_prev and block(); with
+// a block_vjp() too it is hot, without one Dual derives its adjoint.
 #pragma once
 
 #include <type_traits>
@@ -25,6 +25,17 @@ template <class... E>
 constexpr bool is_per_vertex(int k, EnergyList<E...>) {
   const bool flags[] = {E::per_vertex...};
   return flags[k];
+}
+// what is wrong with one record of the k-th energy's data, or null
+template <class T, class... E>
+const char* invalid_data(int k, const T* record, EnergyList<E...>) {
+  const char* (*const checks[])(const T*) = {&E::template invalid<T>...};
+  return checks[k](record);
+}
+template <class... E>
+constexpr int data_stride(int k, EnergyList<E...>) {
+  const int strides[] = {E::stride...};
+  return strides[k];
 }
 template <class... E>
 constexpr bool any_filter(int mask, EnergyList<E...>) {
@@ -80,13 +91,11 @@ struct DualAdjoint {
     E::block(state, values, count, g, H);
     return dot(constant(p), g + H * constant(d_raw)).derivative;
   }
-  VertexState<Dual<R>> lifted() const {
-    return {constant(s.x), constant(s.x_prev), constant(s.origin), Dual<R>(s.h)};
-  }
+  VertexState<Dual<R>> lifted() const { return {constant(s.x), constant(s.x_prev), constant(s.origin), Dual<R>(s.h)}; }
   void lift(Dual<R>* values) const {
     for (int i = 0; i < count; ++i) values[i] = Dual<R>(data[i]);
   }
-  DIFFVBD_COLD void subtract_from(Vec3<R>& bar, Vec3<Dual<R>> VertexState<Dual<R>>::*which) const {
+  DIFFVBD_COLD void subtract_from(Vec3<R>& bar, Vec3<Dual<R>> VertexState<Dual<R>>::* which) const {
     Dual<R> values[kMaxEnergyData];
     lift(values);
     R* out[3] = {&bar.x, &bar.y, &bar.z};

@@ -29,6 +29,15 @@ struct FloorBarrier {
   static constexpr bool has_filter = true;
   static constexpr bool reads_x_prev = true;
 
+  // what is wrong with the data of one plane, or null
+  template <class T>
+  static const char* invalid(const T* a) {
+    if (!(a[4] >= 0)) return "floor_barrier.kappa: expected >= 0 N/m";
+    if (!(a[5] > 0)) return "floor_barrier.dhat: expected > 0 m";
+    if (!(a[6] >= 0)) return "floor_barrier.damping: expected >= 0 N s/m";
+    return nullptr;
+  }
+
   template <class R>
   struct Plane {
     Vec3<R> n;

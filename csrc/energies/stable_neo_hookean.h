@@ -1,7 +1,8 @@
 // Stable Neo-Hookean tets (Smith et al. 2018; paper, eq. 18): P = mu F + (lb (J - 1) - mu) cof F, lb = mu + lam.
 //
 // Seen from one vertex i of a tet (i, j, k, l), J is affine in x_i, so the energy is exactly quadratic in x_i and F is
-// never needed. With n = (x_k - x_j) x (x_l - x_j), c6 = 1 / (6 V) and the stiffness weights k_ij = V grad N_i . grad N_j:
+// never needed. With n = (x_k - x_j) x (x_l - x_j), c6 = 1 / (6 V) and the stiffness weights k_ij = V grad N_i . grad
+// N_j:
 //     J = c6 n . (x_i - x_j),   V F grad N_i = sum_j k_ij (x_j - x_i),   V dJ/dx_i = n / 6.
 // Every sum below still lacks the factor h^2, which the vertex applies once.
 #pragma once

@@ -9,8 +9,8 @@ so both parameters matter: the Hessian of the loss in (mu, lam) has a condition 
 initial twist of 60 degrees keeps the volume, hardly sees lam, and has about 500.
 
 Other choices as in beam-mu: no gravity (a beam this soft would not carry itself), density 1000 kg/m^3, the exact block
-(mu > lam, where the paper's block does not guarantee descent), K = 15, mean squared vertex distance over all frames. The
-run ends when the loss is 1e-10 of the first one, or after 76 iterations.
+(mu > lam, where the paper's block does not guarantee descent), K = 15, mean squared vertex distance over all frames.
+The run ends when the loss is 1e-10 of the first one, or after 76 iterations.
 """
 
 import math

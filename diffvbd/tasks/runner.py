@@ -48,7 +48,7 @@ class Problem:
         estimates: The quantities to report, from the present parameters.
         iterations: Most loss evaluations.
         learning_rate: First rate of Adam; it falls to 0 along a cosine.
-        optimizer: Makes another optimiser, whose step needs no closure; it keeps its rate.
+        optimizer: Makes another optimiser; it keeps its rate.
         tolerance: The run ends once the loss is below this fraction of the first loss.
         truth: Known values of some estimates, for the table.
         protocol: Numbers that define the problem, for the log.
@@ -83,8 +83,8 @@ class Result:
 def solve(problem: Problem, settings: Settings) -> Result:
     """Minimise the loss; the parameters of the lowest loss win.
 
-    After every iteration the whole state is on disk, so the same call continues an interrupted run with the very
-    numbers the uninterrupted one would have had. A state of other settings or of another protocol is ignored.
+    After every step of the optimiser the whole state is on disk, so the same call continues an interrupted run with the
+    very numbers the uninterrupted one would have had. A state of other settings or of another protocol is ignored.
 
     Returns:
         The result; log.json and picture.png (where matplotlib is installed) are in settings.out.
@@ -106,7 +106,8 @@ def solve(problem: Problem, settings: Settings) -> Result:
     run.resume()
     progress = Progress(problem.name, problem.iterations, done=len(run.history))
     begun = time.perf_counter() - (run.history[-1]["seconds"] if run.history else 0.0)
-    while len(run.history) < problem.iterations and not run.converged:
+
+    def evaluate() -> Tensor:
         optimizer.zero_grad()
         loss = problem.loss()
         loss.backward()
@@ -115,13 +116,26 @@ def solve(problem: Problem, settings: Settings) -> Result:
         if not (math.isfinite(row["loss"]) and math.isfinite(row["gradient_norm"])):
             raise ArithmeticError(f"{problem.name}: the loss or its gradient is not finite: {_summary(row)}")
         run.record(row)
-        optimizer.step()
-        if schedule:
-            schedule.step()
-        run.save()
         progress.show(row)
+        if run.ended:
+            raise _Ended
+        return loss
+
+    try:
+        while not run.ended:
+            # A step of an optimiser with a line search evaluates more than once.
+            optimizer.step(evaluate)
+            if schedule:
+                schedule.step()
+            run.save()
+    except _Ended:
+        pass
     progress.close()
     return run.finish()
+
+
+class _Ended(Exception):
+    """Leaves an optimiser's step at the last evaluation."""
 
 
 class _Run:
@@ -145,6 +159,10 @@ class _Run:
     @property
     def converged(self) -> bool:
         return bool(self.history) and self.history[-1]["loss"] <= self.problem.tolerance * self.history[0]["loss"]
+
+    @property
+    def ended(self) -> bool:
+        return self.converged or len(self.history) >= self.problem.iterations
 
     def record(self, row: Row) -> None:
         self.history.append(row)

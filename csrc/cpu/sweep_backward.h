@@ -1,3 +1,6 @@
+// The transposed sweeps. Instantiated in one file for each scalar, so that the build can run them side by side.
+#pragma once
+
 #include "sweep.h"
 
 namespace diffvbd {
@@ -39,8 +42,8 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
     store_rows(s.x, block, b.state.x);
 
     const Vec3<R> x_bar = load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block);
-    const BlockAdjoint<R> out = reverse_vertex<Set, wanted>(
-        b, star, u, H, x_bar, q, s.data_bar != nullptr, [&](int i, const R& value) {
+    const BlockAdjoint<R> out =
+        reverse_vertex<Set, wanted>(b, star, u, H, x_bar, q, s.data_bar != nullptr, [&](int i, const R& value) {
           LaneStar<T>::accumulate(s.data_bar + (static_cast<int64_t>(i) * plan.blocks + block) * kLanes, value);
         });
     store_rows(s.x_bar, block, out.x);
@@ -68,8 +71,5 @@ template <class T>
 ReverseKernel<T> reverse_kernel(int energies, int wanted) {
   return pick<T>(energy_index(energies), wanted, std::make_integer_sequence<int, kEnergySets>{});
 }
-
-template ReverseKernel<float> reverse_kernel<float>(int, int);
-template ReverseKernel<double> reverse_kernel<double>(int, int);
 
 }  // namespace diffvbd

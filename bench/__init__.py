@@ -1,0 +1,1 @@
+"""Measurements: cases as data, one runner (`python -m bench`), results as JSON in bench/results."""

@@ -1,0 +1,259 @@
+"""Speed and memory of the CPU backend: throughput, scaling, unrolled autograd, Model building, what a scene pays.
+
+Times are the least of several repetitions, wall clock, of the public interface, predictor and checks included.
+"""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import resource
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from bench.common import markdown_table
+from diffvbd import reference
+
+
+def run(quick: bool) -> dict[str, Any]:
+    threads = torch.get_num_threads()
+    try:
+        return {
+            "throughput": throughput(5 if quick else 11, 20, quick),
+            "scaling": scaling(9 if quick else 31, threads, quick),
+            "unrolled": unrolled(quick),
+            "building": building(quick),
+            "requirements": requirements(5 if quick else 11, quick),
+        }
+    finally:
+        torch.set_num_threads(threads)
+
+
+def least(function: Callable[[], float], repetitions: int) -> float:
+    """The least of what a function returns; garbage of one run does not count in the next."""
+    best = float("inf")
+    for _ in range(repetitions):
+        gc.collect()
+        best = min(best, function())
+    return best
+
+
+def clamped_cube(
+    n: int, dtype: torch.dtype = torch.float64, energies: tuple = (), **options: Any
+) -> tuple[dv.Model, Tensor]:
+    """The peers' scene (docs/performance.md): unit cube, five tets a cell, one face pinned; slightly off rest."""
+    mesh = dv.mesh.cube(n, split="five")
+    model = dv.Model(mesh, pinned=torch.from_numpy(mesh.points[:, 1] < 1e-9), dtype=dtype,
+                     energies=(dv.StableNeoHookean(), *energies), **options)  # fmt: skip
+    noise = torch.randn(model.rest_points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return model, model.rest_points + (1e-3 * noise).to(dtype)
+
+
+def time_step(
+    model: dv.Model, x: Tensor, sweeps: int, wants: tuple[str, ...], tape: str = "full"
+) -> tuple[float, float]:
+    """Seconds of the forward and of the backward of one step."""
+    leaf = {
+        "state": {"x": x.clone(), "v": torch.zeros_like(x)},
+        "material": {k: torch.full((model.num_tets,), 1e5, dtype=x.dtype) for k in ("mu", "lam")},
+        "rest": {"rest_points": model.rest_points.clone()},
+    }
+    given: dict[str, Any] = {"x": x, "v": torch.zeros_like(x), "mu": 1e5, "lam": 1e5}
+    for group in wants:
+        given.update({k: t.requires_grad_() for k, t in leaf[group].items()})
+    start = time.perf_counter()
+    x_end, v_end = dv.step(model, given.pop("x"), given.pop("v"), time_step=5e-3, sweeps=sweeps,
+                           adjoint=dv.ReverseSweep(tape), **given)  # type: ignore[arg-type]  # fmt: skip
+    middle = time.perf_counter()
+    if wants:
+        (x_end.sum() + v_end.sum()).backward()
+    return middle - start, time.perf_counter() - middle
+
+
+def throughput(n: int, sweeps: int, quick: bool) -> list[dict[str, Any]]:
+    torch.set_num_threads(1)
+    repetitions = 3 if quick else 15
+    material = ("state", "material")
+    rows = []
+    targets = {
+        ("forward", torch.float64): 8.0,
+        ("forward", torch.float32): 12.0,
+        ("reverse, full tape", torch.float64): 3.5,
+    }
+    for dtype in (torch.float64, torch.float32):
+        model, x = clamped_cube(n, dtype)
+        updates = model.num_active * sweeps / 1e6
+        seconds = {
+            "forward": least(lambda m=model, a=x: time_step(m, a, sweeps, ())[0], repetitions),
+            "forward with full tape": least(lambda m=model, a=x: time_step(m, a, sweeps, material)[0], repetitions),
+            "reverse, full tape": least(lambda m=model, a=x: time_step(m, a, sweeps, material)[1], repetitions),
+            "reverse, compact tape": least(
+                lambda m=model, a=x: time_step(m, a, sweeps, material, "compact")[1], repetitions
+            ),
+        }
+        for name, value in seconds.items():
+            rows.append({
+                "name": f"{model.num_vertices} v / {model.num_tets} t, K = {sweeps}, 1 core, {name}, {str(dtype)[6:]}",
+                "unit": "M vertex updates/s",
+                "value": updates / value,
+                "target": targets.get((name, dtype)),
+                "ms_per_step": value * 1e3,
+            })  # fmt: skip
+    return rows
+
+
+def scaling(n: int, threads: int, quick: bool) -> list[dict[str, Any]]:
+    model, x = clamped_cube(n)
+    sweeps, repetitions = 10, 2 if quick else 7
+    seconds: dict[int, tuple[float, float]] = {}
+    for count in (1, threads):
+        torch.set_num_threads(count)
+        forward = least(lambda: time_step(model, x, sweeps, ())[0], repetitions)
+        reverse = least(lambda: time_step(model, x, sweeps, ("state", "material"))[1], repetitions)
+        seconds[count] = (forward, reverse)
+    rows = []
+    for i, part in enumerate(("forward", "reverse, full tape")):
+        one, all_ = seconds[1][i], seconds[threads][i]
+        name = f"{model.num_vertices} v, K = {sweeps}, float64, {part}"
+        rows.append({"name": f"{name}, one core", "unit": "M vertex updates/s", "target": None,
+                     "value": model.num_active * sweeps / one / 1e6, "ms_per_step": one * 1e3})  # fmt: skip
+        rows.append({"name": f"{name}, {threads} cores against one", "unit": "times faster", "target": 1.7,
+                     "value": one / all_, "ms_per_step": all_ * 1e3})  # fmt: skip
+    return rows
+
+
+def _beam_rollout(route: str, steps: int) -> tuple[float, float]:
+    """Seconds of forward + backward, and growth of the peak resident memory [bytes], in a process of its own."""
+    mesh = dv.mesh.beam(21, 7, 7, size=(0.5, 0.2, 0.2))
+    model = dv.Model(mesh, pinned=torch.from_numpy(mesh.points[:, 0] < 1e-9))
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+
+    def once(steps: int) -> None:
+        mu = torch.tensor(1e5, dtype=torch.float64, requires_grad=True)
+        given: dict[str, Any] = {"steps": steps, "mu": mu, "lam": 1e6, "time_step": 2e-3, "sweeps": 15}
+        end = (reference if route == "unrolled" else dv).rollout(model, x, v, **given).x[-1]
+        end.square().sum().backward()
+        assert mu.grad is not None and mu.grad != 0
+
+    once(1)  # libraries, thread pool and allocator are warm
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    seconds = []
+    for repetition in range(1 if route == "unrolled" else 5):
+        start = time.perf_counter()
+        once(steps)
+        seconds.append(time.perf_counter() - start)
+        if repetition == 0:
+            growth = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
+    return min(seconds), float(growth)
+
+
+def unrolled(quick: bool) -> list[dict[str, Any]]:
+    steps = 2 if quick else 10
+    results = {}
+    for route in ("reverse sweep", "unrolled"):
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            results[route] = pool.apply(_beam_rollout, (route, steps))
+    name = f"1,029-vertex beam, K = 15, {steps} steps, forward + backward"
+    (ours, ours_bytes), (theirs, theirs_bytes) = results["reverse sweep"], results["unrolled"]
+    return [
+        {"name": f"{name}: reverse sweep", "unit": "ms", "value": ours * 1e3, "target": None},
+        {"name": f"{name}: unrolled autograd", "unit": "ms", "value": theirs * 1e3, "target": None},
+        {"name": f"{name}: less time", "unit": "times", "value": theirs / ours, "target": 80.0},
+        {
+            "name": f"{name}: reverse sweep, growth of peak memory",
+            "unit": "MB",
+            "value": ours_bytes / 1e6,
+            "target": None,
+        },
+        {"name": f"{name}: unrolled, growth of peak memory", "unit": "MB", "value": theirs_bytes / 1e6, "target": None},
+        {"name": f"{name}: less memory", "unit": "times", "value": theirs_bytes / max(ours_bytes, 1.0), "target": 70.0},
+    ]
+
+
+def building(quick: bool) -> list[dict[str, Any]]:
+    rows = []
+    for n in (10, 20) if quick else (15, 30, 59):
+        mesh = dv.mesh.beam(n, n, n, size=(1.0, 1.0, 1.0))
+        start = time.perf_counter()
+        model = dv.Model(mesh)
+        rows.append(_built(f"grid, {mesh.num_vertices} v / {mesh.num_tets} t", model, start, 2.0 if n == 59 else None))
+    cube = dv.mesh.cube(size=0.003)
+    for count in (1_000,) if quick else (10_000, 100_000, 1_000_000):
+        i = np.arange(count)
+        offsets = np.stack([i % 100, i // 100 % 100, i // 10_000], -1) * 0.01
+        mesh = dv.mesh.replicate(cube, offsets)
+        start = time.perf_counter()
+        model = dv.Model(mesh)
+        rows.append(
+            _built(f"{count} cubes joined, {mesh.num_vertices} v", model, start, 40.0 if count == 1_000_000 else None)
+        )
+        del mesh, model
+    return rows
+
+
+def _built(name: str, model: dv.Model, start: float, target: float | None) -> dict[str, Any]:
+    seconds = time.perf_counter() - start
+    return {"name": f"Model of {name}", "unit": "s", "value": seconds, "target": target, "colors": model.num_colors}
+
+
+def requirements(n: int, quick: bool) -> list[dict[str, Any]]:
+    """What a scene pays for what it requires: bytes kept for the backward, and time, of one step."""
+    torch.set_num_threads(1)
+    sweeps, repetitions = 10, 2 if quick else 9
+    floor = dv.FloorBarrier(height=-0.01)
+    rows = []
+    for label, energies, options in (
+        ("elastic", (), {}),
+        ("elastic + floor", (floor,), {}),
+        ("elastic + floor + anchors", (floor, dv.Anchor(10.0)), {}),
+        ("elastic, saturated and relaxed", (), {"saturation": 0.1, "relaxation": 1.5}),
+    ):
+        model, x = clamped_cube(n, energies=energies, **options)
+        for wants in ((), ("state",), ("state", "material"), ("state", "material", "rest")):
+            forward = least(lambda m=model, a=x, w=wants: time_step(m, a, sweeps, w)[0], repetitions)
+            backward = (
+                least(lambda m=model, a=x, w=wants: time_step(m, a, sweeps, w)[1], repetitions) if wants else None
+            )
+            rows.append({
+                "name": f"{label}, gradients: {' + '.join(wants) or 'none'}",
+                "forward_ms": forward * 1e3,
+                "backward_ms": None if backward is None else backward * 1e3,
+                "kept_bytes": kept_bytes(model, x, sweeps, wants),
+            })  # fmt: skip
+    return rows
+
+
+def kept_bytes(model: dv.Model, x: Tensor, sweeps: int, wants: tuple[str, ...]) -> int:
+    """Bytes of distinct storages that one step keeps for its backward, the Model's own and the arguments left out."""
+    own = {
+        t.untyped_storage().data_ptr() for t in (*vars(model).values(), *model._topology, x) if isinstance(t, Tensor)
+    }
+    kept: dict[int, int] = {}
+
+    def pack(t: Tensor) -> Tensor:
+        if t.untyped_storage().data_ptr() not in own:
+            kept[t.untyped_storage().data_ptr()] = t.untyped_storage().nbytes()
+        return t
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
+        time_step(model, x, sweeps, wants)
+    return sum(kept.values())
+
+
+def markdown(results: dict[str, Any]) -> str:
+    rows = [r for part in ("throughput", "scaling", "unrolled", "building") for r in results[part]]
+    text = markdown_table(
+        ("what", "measured", "target", "unit"), [(r["name"], f"{r['value']:.3g}", r["target"], r["unit"]) for r in rows]
+    )
+    cells = [
+        (r["name"], f"{r['forward_ms']:.2f}", "-" if r["backward_ms"] is None else f"{r['backward_ms']:.2f}",
+         f"{r['kept_bytes'] / 1e6:.2f}")
+        for r in results["requirements"]
+    ]  # fmt: skip
+    return text + "\n" + markdown_table(("one step, K = 10", "forward [ms]", "backward [ms]", "kept [MB]"), cells)

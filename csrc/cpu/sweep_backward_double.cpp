@@ -1,0 +1,5 @@
+#include "sweep_backward.h"
+
+namespace diffvbd {
+template ReverseKernel<double> reverse_kernel<double>(int, int);
+}  // namespace diffvbd
