@@ -19,6 +19,7 @@ except ImportError:
 
 CPU_SOURCES = [
     "csrc/ops.cpp",
+    "csrc/cpu/checks.cpp",
     "csrc/cpu/plan.cpp",
     "csrc/cpu/register.cpp",
     "csrc/cpu/run.cpp",

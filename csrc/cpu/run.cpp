@@ -149,129 +149,7 @@ void look_for_nonfinite(const Plan& plan, const SceneView<T>& s, int64_t step, i
   }
 }
 
-template <class T>
-void check(const char* name, const char* expected, const char* item, const Batched<const T>& t, int64_t scenes,
-           int64_t items, bool (*bad)(T, T), const Batched<const T>* other = nullptr) {
-  const int64_t distinct = t.scene != 0 || (other && other->scene != 0) ? scenes : std::min<int64_t>(scenes, 1);
-  const int64_t count = t.item != 0 || (other && other->item != 0) ? items : std::min<int64_t>(items, 1);
-  for (int64_t b = 0; b < distinct; ++b) {
-    for (int64_t i = 0; i < count; ++i) {
-      const T value = t.data[b * t.scene + i * t.item];
-      const T second = other ? other->data[b * other->scene + i * other->item] : T(0);
-      if (!bad(value, second)) continue;
-      std::ostringstream out;
-      out << name << ": expected " << expected << ", got " << value;
-      if (other) out << " with mu " << second;
-      out << " at " << item << " " << i << " of scene " << b;
-      throw std::invalid_argument(out.str());
-    }
-  }
-}
-
-template <class T>
-void check_vectors(const char* name, const Batched<const T>& t, int64_t scenes, int64_t vertices) {
-  const int64_t distinct = t.scene == 0 ? std::min<int64_t>(scenes, 1) : scenes;
-  for (int64_t b = 0; b < distinct; ++b) {
-    for (int64_t i = 0; i < 3 * vertices; ++i) {
-      const T value = t.data[b * t.scene + i];
-      if (std::isfinite(value)) continue;
-      std::ostringstream out;
-      out << name << ": expected finite values, got " << value << " at vertex " << i / 3 << " of scene " << b;
-      throw std::invalid_argument(out.str());
-    }
-  }
-}
-
-template <class T>
-void check_energy_data(const Plan& plan, const StepInputs<T>& in) {
-  for (int64_t b = 0; b < (in.data.scene == 0 ? std::min<int64_t>(in.scenes, 1) : in.scenes); ++b) {
-    const T* at = in.data.data + b * in.data.scene;
-    for (int k = 0; k < kVertexEnergies; ++k) {
-      const int64_t size = int64_t{in.data_count[k]} * (is_per_vertex(k, VertexEnergies{}) ? plan.num_vertices : 1);
-      const int stride = data_stride(k, VertexEnergies{});
-      for (int64_t i = 0; i < size; i += stride) {
-        const char* message = invalid_data(k, at + i, VertexEnergies{});
-        for (int64_t c = i; !message && c < i + stride; ++c) {
-          if (!std::isfinite(at[c])) message = "parameters: expected finite values";
-        }
-        if (!message) continue;
-        std::ostringstream out;
-        out << message << ", got (";
-        for (int64_t c = i; c < i + stride; ++c) out << (c > i ? ", " : "") << at[c];
-        out << ") in record " << i / stride << " of scene " << b;
-        throw std::invalid_argument(out.str());
-      }
-      at += size;
-    }
-  }
-}
-
-// The step filter needs a positive gap to start from.
-template <class T>
-void check_above_planes(const Plan& plan, const StepInputs<T>& in) {
-  for (int64_t b = 0; b < in.scenes; ++b) {
-    const T* planes = in.data.data + b * in.data.scene;
-    for (int k = 0; k < in.data_count[0]; k += FloorBarrier::stride) {
-      std::ostringstream below;
-      int64_t found = 0;
-      for (int64_t i = 0; i < int64_t{plan.color_block[plan.colors]} * kLanes; ++i) {
-        const int32_t v = plan.order[i];
-        if (v < 0) continue;
-        const auto at = [&](const Batched<const T>& t) {
-          const T* a = t.data + b * t.scene + 3 * int64_t{v};
-          return Vec3<T>{a[0], a[1], a[2]};
-        };
-        VertexState<T> state{at(in.x_prev), zero3<T>(), zero3<T>(), T(0)};
-        if (in.origin.data) state.origin = at(in.origin);
-        const FloorBarrier::Plane<T> plane(planes + k, state);
-        if (T(0) < plane.gap(state.x)) continue;
-        if (++found <= 5) below << (found > 1 ? ", " : "") << v;
-      }
-      if (found == 0) continue;
-      std::ostringstream out;
-      out << "x: expected every unpinned vertex above floor plane " << k / FloorBarrier::stride << ", got " << found
-          << " on or below it in scene " << b << ": vertices " << below.str() << (found > 5 ? ", ..." : "");
-      throw std::invalid_argument(out.str());
-    }
-  }
-}
-
 }  // namespace
-
-template <class T>
-void check_values(const Plan& plan, const StepInputs<T>& in) {
-  const int64_t n = plan.num_vertices;
-  check_vectors("x", in.x_prev, in.scenes, n);
-  check_vectors("predictor (x, v, force, gravity, prescribed)", in.y, in.scenes, n);
-  check_vectors("start (x, v, force, gravity, prescribed)", in.x_start, in.scenes, n);
-  if (in.energies & (kExactBlock | kPaperBlock)) {
-    check<T>("mu", "finite values >= 0 Pa", "tet", in.mu, in.scenes, plan.num_tets,
-             [](T a, T) { return !(a >= 0 && std::isfinite(a)); });
-    if (in.energies & kExactBlock) {
-      check<T>(
-          "lam", "finite values with mu + lam >= 0 Pa", "tet", in.lam, in.scenes, plan.num_tets,
-          [](T a, T mu) { return !(a + mu >= 0 && std::isfinite(a)); }, &in.mu);
-    } else {
-      check<T>("lam", "finite values >= 0 Pa with block=\"paper\"", "tet", in.lam, in.scenes, plan.num_tets,
-               [](T a, T) { return !(a >= 0 && std::isfinite(a)); });
-    }
-  }
-  // What a sweep does not move needs no mass: an isolated vertex has none.
-  for (int64_t b = 0; b < (in.mass.scene == 0 ? std::min<int64_t>(in.scenes, 1) : in.scenes); ++b) {
-    for (int64_t i = 0; i < int64_t{plan.color_block[plan.colors]} * kLanes; ++i) {
-      const int32_t v = plan.order[i];
-      if (v < 0) continue;
-      const T m = in.mass.data[b * in.mass.scene + v];
-      if (m > 0 && std::isfinite(m)) continue;
-      std::ostringstream out;
-      out << "density or rest_points: expected a finite mass > 0 kg, got " << m << " at vertex " << v << " of scene "
-          << b;
-      throw std::invalid_argument(out.str());
-    }
-  }
-  check_energy_data(plan, in);
-  if (filters(in.energies)) check_above_planes(plan, in);
-}
 
 template <class T>
 void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape) {
@@ -400,7 +278,6 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
 }
 
 #define DIFFVBD_INSTANTIATE(T)                                                                  \
-  template void check_values<T>(const Plan&, const StepInputs<T>&);                             \
   template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*);                      \
   template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*, \
                                const StepAdjoints<T>&);                                         \
