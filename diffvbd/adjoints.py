@@ -22,7 +22,7 @@ class ReverseSweep:
             ``"recompute"`` nothing; the backward runs the step again;
             ``"auto"`` full while a step's full tape fits 256 MiB, compact beyond.
 
-    Source: paper, section 3; docs/method.md, sections 3 and 4.
+    Source: paper, section 3; docs/method.md, sections 3 and 7.
     """
 
     tape: Literal["auto", "full", "compact", "recompute"] = "auto"

@@ -91,7 +91,12 @@ def _parser() -> argparse.ArgumentParser:
     identification.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra")
     identification.add_argument("target", type=Path, metavar="TARGET.npz", help="the observation, see below")
     identification.add_argument(
-        "--start", type=float, nargs=2, default=(1e5, 1e5), metavar=("MU", "LAM"), help="first guess [Pa] (default 1e5)"
+        "--start",
+        type=float,
+        nargs=2,
+        default=(1e5, 1e5),
+        metavar=("MU", "LAM"),
+        help="first guess [Pa], right to a factor 1e4 (default 1e5)",
     )
     identification.add_argument("--fixed-lam", action="store_true", help="keep lam at its first guess")
     identification.add_argument("--iterations", type=int, default=100, help="at most so many (default 100)")

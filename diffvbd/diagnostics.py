@@ -164,7 +164,7 @@ def collapse_stretch(mu: Tensor, lam: Tensor) -> Tensor:
         mu, lam: [Pa], broadcast together.
 
     Returns:
-        s* [-] of that shape: 0 at mu = 0, 0.378 at mu = lam, 0.544 at lam = 0.
+        s* [-] of that shape: 0 at mu = 0, 0.343 at mu = lam, 0.544 at lam = 0.
     """
     total = mu + lam
     ratio = torch.where(total > 0, mu / torch.where(total > 0, total, torch.ones_like(total)), torch.zeros_like(total))

@@ -101,7 +101,7 @@ class FloorBarrier(VertexEnergy):
     Differentiable as ``floor_barrier.kappa``, ``.dhat``, ``.damping`` (scalars), ``.height`` [planes] and ``.normal``
     [planes, 3].
 
-    Source: Li et al. (2020); paper, appendix on contact; docs/method.md, section 5.
+    Source: Li et al. (2020); paper, appendix on implementation details; docs/method.md, section 6.
     """
 
     name: ClassVar[str] = "floor_barrier"
@@ -145,7 +145,10 @@ class FloorBarrier(VertexEnergy):
         return 7 * self.planes
 
     def constants(self, rest_points: Tensor) -> dict[str, Tensor]:
-        return {k: torch.as_tensor(getattr(self, k)).to(rest_points) for k in self.parameters}
+        return {
+            k: torch.as_tensor(getattr(self, k), dtype=rest_points.dtype, device=rest_points.device)
+            for k in self.parameters
+        }
 
     def pack(self, values: dict[str, Tensor], origin: Tensor | None) -> Tensor:
         normal = values["normal"]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 SATURATION_EPS = 1e-12  # [m], keeps |d| + c + eps away from 0 (paper, appendix on safeguards)
-FILTER_ETA = 0.9  # largest fraction of a gap that one move may close (method.md, section 5)
+FILTER_ETA = 0.9  # largest fraction of a gap that one move may close (method.md, section 6)
 GUARD_ULPS = 8  # a computed gap below this many roundings of its terms has no safe sign
 
 

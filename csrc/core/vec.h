@@ -110,16 +110,19 @@ DIFFVBD_FN void add_outer(Sym3<R>& a, const R& s, const Vec3<R>& v) {
 }
 
 // Solves A u = b by L D L^T: backward stable on the positive definite blocks of a sweep, where an adjugate would lose
-// the digits that the stiffest direction takes.
+// the digits that the stiffest direction takes. `least` > 0 is a lower bound of A's eigenvalues, hence of every pivot:
+// it changes nothing but a pivot that rounding has destroyed.
 template <class R>
-DIFFVBD_FN Vec3<R> solve(const Sym3<R>& a, const Vec3<R>& b) {
+DIFFVBD_FN Vec3<R> solve(const Sym3<R>& a, const Vec3<R>& b, const R& least) {
   const R inv1 = R(1) / a.xx;
   const R l21 = a.xy * inv1;
   const R l31 = a.xz * inv1;
-  const R inv2 = R(1) / (a.yy - l21 * a.xy);
+  const R pivot2 = a.yy - l21 * a.xy;
+  const R inv2 = R(1) / select(least < pivot2, pivot2, least);
   const R t = a.yz - l21 * a.xz;
   const R l32 = t * inv2;
-  const R inv3 = R(1) / (a.zz - l31 * a.xz - l32 * t);
+  const R pivot3 = a.zz - l31 * a.xz - l32 * t;
+  const R inv3 = R(1) / select(least < pivot3, pivot3, least);
   const R u2 = b.y - l21 * b.x;
   const R u3 = (b.z - l31 * b.x - l32 * u2) * inv3;
   const R v2 = u2 * inv2 - l32 * u3;

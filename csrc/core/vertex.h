@@ -31,10 +31,16 @@ struct Update {
   R alpha;        // step filter
 };
 
+// Energies only add semidefinite parts to the mass.
+template <class R, class T>
+DIFFVBD_FN R least_eigenvalue(const Block<R>& b, const StepParameters<T>& q) {
+  return b.mass + R(q.regularization);
+}
+
 template <class Set, class R, class T, class Star>
 DIFFVBD_FN System<R> assemble(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
   const R h2 = R(q.time_step) * R(q.time_step);
-  System<R> out{b.mass * (b.state.x - b.y), diagonal(b.mass + R(q.regularization))};
+  System<R> out{b.mass * (b.state.x - b.y), diagonal(least_eigenvalue(b, q))};
   if constexpr (Set::elastic) {
     Vec3<R> g = zero3<R>();
     R h_diagonal = R(0);
@@ -52,6 +58,11 @@ DIFFVBD_FN System<R> assemble(const Block<R>& b, const Star& star, const StepPar
     E::block(b.state, b.data + b.data_offset[k], b.data_count[k], out.g, out.H);
   });
   return out;
+}
+
+template <class R, class T>
+DIFFVBD_FN Vec3<R> newton_step(const Block<R>& b, const System<R>& system, const StepParameters<T>& q) {
+  return -solve(system.H, system.g, least_eigenvalue(b, q));
 }
 
 // From the Newton step to the executed one.
@@ -106,7 +117,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   }
   Vec3<R> z = R(q.relaxation) * step_bar;
   if (q.saturates) z = saturate_vjp(u.d_raw, z, q);
-  const Vec3<R> p = solve(H, z);
+  const Vec3<R> p = solve(H, z, least_eigenvalue(b, q));
 
   out.y = b.mass * p;
   out.x -= out.y;

@@ -34,7 +34,7 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
       }
     } else {
       const System<R> system = assemble<Set>(b, star, q);
-      d_raw = -solve(system.H, system.g);
+      d_raw = newton_step(b, system, q);
       H = system.H;
     }
     const Update<R> u = safeguarded<Set>(b, d_raw, q);

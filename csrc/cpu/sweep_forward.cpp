@@ -12,7 +12,7 @@ DIFFVBD_HOT void forward_color(const Plan& plan, const SceneView<T>& s, const St
   for (int64_t block = begin; block < end; ++block) {
     const Block<R> b = load_block<Set>(plan, s, block, q);
     const System<R> system = assemble<Set>(b, LaneStar<T>(plan, s, block), q);
-    const Update<R> u = safeguarded<Set>(b, -solve(system.H, system.g), q);
+    const Update<R> u = safeguarded<Set>(b, newton_step(b, system, q), q);
     store_rows(s.x, block, moved<Set>(b.state.x, u));
     if (tape == kNoTape) continue;
     const int count = plan.block_rank[block + 1] - plan.block_rank[block];

@@ -5,6 +5,7 @@ a quasi-Newton method does not.
 """
 
 import hashlib
+import math
 from pathlib import Path
 
 import torch
@@ -14,6 +15,8 @@ from diffvbd.tasks.runner import Problem, Row, Settings
 from diffvbd.tasks.scene import Observation
 
 WOLFE = "strong_wolfe"
+# Line searches try wild steps: the material stays within this factor of the first guess, or its inverse.
+RANGE = 1e4
 
 
 def problem(
@@ -28,7 +31,7 @@ def problem(
     Args:
         observation: What was seen, and the scene it was seen in.
         settings: Device, seed, directory.
-        start: mu and lam [Pa] to start from.
+        start: First guess of mu and lam [Pa]; the result is within a factor RANGE of it.
         fixed_lam: Keep lam at its start value.
         iterations: Most evaluations of the loss.
 
@@ -39,18 +42,20 @@ def problem(
         raise ValueError(f"start: expected positive mu and lam, got {start}")
     scene = observation.scene
     model = scene.model(settings.device)
-    target = torch.as_tensor(observation.x, dtype=model.dtype, device=model.device)
+    target = torch.tensor(observation.x, dtype=model.dtype, device=model.device)
     observed = observation.steps.tolist()
     first = torch.tensor(start, dtype=model.dtype, device=model.device)
     free = 1 if fixed_lam else 2
-    logarithms = first[:free].log().requires_grad_()
-    still = torch.as_tensor(scene.x0, dtype=model.dtype, device=model.device)
+    exponents = torch.zeros(free, dtype=model.dtype, device=model.device, requires_grad=True)
+    still = torch.tensor(scene.x0, dtype=model.dtype, device=model.device)
     scale = losses.vertex_distance(target, still).item()
     if scale == 0.0:
         raise ValueError("observation: expected shapes that differ from the initial one, got none")
 
     def material() -> torch.Tensor:
-        return torch.cat([logarithms.exp(), first[free:]])
+        limit = math.log(RANGE)
+        factors = (limit * (exponents / limit).tanh()).exp()
+        return torch.cat([factors * first[:free], first[free:]])
 
     def simulate(mu: torch.Tensor, lam: torch.Tensor) -> torch.Tensor:
         return scene.simulate(model, mu, lam, observed[-1]).x[observed]
@@ -65,7 +70,7 @@ def problem(
 
     return Problem(
         name="identify",
-        parameters={"log_material": logarithms},
+        parameters={"exponents": exponents},
         loss=lambda: losses.vertex_distance(simulate(*material()), target) / scale,
         estimates=lambda: dict(zip(("mu", "lam"), material().tolist(), strict=True)),
         truth=observation.truth,
@@ -74,6 +79,7 @@ def problem(
             p, max_iter=5, tolerance_grad=0, tolerance_change=0, line_search_fn=WOLFE
         ),
         tolerance=1e-12,
+        gradient_tolerance=1e-7,
         protocol={
             "start": list(start),
             "fixed_lam": fixed_lam,

@@ -49,7 +49,8 @@ class Problem:
         iterations: Most loss evaluations.
         learning_rate: First rate of Adam; it falls to 0 along a cosine.
         optimizer: Makes another optimiser; it keeps its rate.
-        tolerance: The run ends once the loss is below this fraction of the first loss.
+        tolerance: The run ends once the loss is at most this fraction of the first loss.
+        gradient_tolerance: It also ends once the norm of the gradient is at most this fraction of the first one.
         truth: Known values of some estimates, for the table.
         protocol: Numbers that define the problem, for the log.
         picture: Draws the result, given a path and the history; needs matplotlib.
@@ -63,6 +64,7 @@ class Problem:
     learning_rate: float = 0.15
     optimizer: Callable[[Iterable[Tensor]], torch.optim.Optimizer] | None = None
     tolerance: float = 0.0
+    gradient_tolerance: float = 0.0
     truth: Row = field(default_factory=dict)
     protocol: dict[str, Any] = field(default_factory=dict)
     picture: Callable[[Path, list[Row]], object] | None = None
@@ -107,7 +109,7 @@ def solve(problem: Problem, settings: Settings) -> Result:
     progress = Progress(problem.name, problem.iterations, done=len(run.history))
     begun = time.perf_counter() - (run.history[-1]["seconds"] if run.history else 0.0)
 
-    def evaluate() -> Tensor:
+    def evaluate() -> float:
         optimizer.zero_grad()
         loss = problem.loss()
         loss.backward()
@@ -119,7 +121,7 @@ def solve(problem: Problem, settings: Settings) -> Result:
         progress.show(row)
         if run.ended:
             raise _Ended
-        return loss
+        return row["loss"]
 
     try:
         while not run.ended:
@@ -158,7 +160,13 @@ class _Run:
 
     @property
     def converged(self) -> bool:
-        return bool(self.history) and self.history[-1]["loss"] <= self.problem.tolerance * self.history[0]["loss"]
+        if not self.history:
+            return False
+        first, last, problem = self.history[0], self.history[-1], self.problem
+        return (
+            last["loss"] <= problem.tolerance * first["loss"]
+            or last["gradient_norm"] <= problem.gradient_tolerance * first["gradient_norm"]
+        )
 
     @property
     def ended(self) -> bool:
