@@ -6,16 +6,14 @@ Environment:
 
 import os
 import sys
+from glob import glob
 
 from setuptools import setup
 
 try:
     from torch.utils.cpp_extension import BuildExtension, CppExtension
 except ImportError:
-    sys.exit(
-        "diffvbd: torch is not importable here.\n"
-        "Install torch first, then: pip install --no-build-isolation ."
-    )
+    sys.exit("diffvbd: torch is not importable here.\nInstall torch first, then: pip install --no-build-isolation .")
 
 CPU_SOURCES = [
     "csrc/ops.cpp",
@@ -41,6 +39,7 @@ setup(
             define_macros=[("TORCH_TARGET_VERSION", "0x020b000000000000")],
             extra_compile_args=FLAGS,
             extra_link_args=["-s"],
+            depends=sorted(glob("csrc/**/*.h", recursive=True)),
             py_limited_api=True,
         )
     ],

@@ -96,7 +96,7 @@ class FloorBarrier(VertexEnergy):
         normal: Normal (normalised), or a sequence of normals: several planes are one energy.
         kappa: Barrier stiffness [N/m].
         dhat: Activation distance [m].
-        damping: Damping of approaching motion while the vertex started the step closer than dhat [N s/m].
+        damping: Damping of approaching motion of a vertex that started the step closer than dhat [N s/m].
 
     Differentiable as ``floor_barrier.kappa``, ``.dhat``, ``.damping`` (scalars), ``.height`` [planes] and ``.normal``
     [planes, 3].

@@ -247,7 +247,8 @@ def _per_tet_density(density: Any, num_tets: int) -> Tensor:
     if density.shape not in ((), (1,), (num_tets,)):
         fail("density", f"a number or shape [{num_tets}]", f"shape {list(density.shape)}")
     if not bool((torch.isfinite(density) & (density > 0)).all()):
-        fail("density", "finite numbers > 0 kg/m^3", float(density.reshape(-1)[~(density.reshape(-1) > 0)][:1].sum()))
+        wrong = density.reshape(-1)[~(torch.isfinite(density) & (density > 0)).reshape(-1)]
+        fail("density", "finite numbers > 0 kg/m^3", float(wrong[0]))
     return density.expand(num_tets).clone()
 
 

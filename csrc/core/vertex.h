@@ -1,4 +1,4 @@
-// The algorithm: one block update of Vertex Block Descent (paper, eqs. 2-3) and its exact transpose (eqs. 13-17).
+// The algorithm: one block update of Vertex Block Descent (paper, eqs. 2-3) and its exact transpose (eqs. 7-12).
 // Loops, memory and launches belong to cpu/ and cuda/; a Star gives this file the incident tets of one vertex.
 #pragma once
 

@@ -84,7 +84,8 @@ diffvbd::StepInputs<T> inputs(const diffvbd::Plan& plan, const Tensor& x_start, 
     scalars += data_count[k];
     total += data_count[k] * (per_vertex ? plan.num_vertices : 1);
   }
-  require(scalars <= diffvbd::kMaxEnergyData, "energies: too many planes, expected at most 8 in one floor");
+  require(scalars <= diffvbd::kMaxEnergyData,
+          "energies: expected at most 64 scalars of data (7 a plane, 4 for anchors)");
   in.data = batched<T>(energy_data, x_start, b, total);
   in.energies = static_cast<int>(energies);
   in.parameters = {static_cast<T>(numbers[0]),

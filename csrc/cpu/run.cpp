@@ -80,10 +80,10 @@ struct Scene {
     if (lagged) {
       x_prev = Buffer<T>(size_t(plan.blocks) * 3 * kLanes);
       pack_vertices(plan, in.x_prev.data + scene * in.x_prev.scene, x_prev.get());
-      if (in.origin.data) {
-        origin = Buffer<T>(size_t(plan.blocks) * 3 * kLanes);
-        pack_vertices(plan, in.origin.data + scene * in.origin.scene, origin.get());
-      }
+    }
+    if (in.origin.data) {
+      origin = Buffer<T>(size_t(plan.blocks) * 3 * kLanes);
+      pack_vertices(plan, in.origin.data + scene * in.origin.scene, origin.get());
     }
     view.x = x.get();
     view.y = y.get();

@@ -214,8 +214,8 @@ DIFFVBD_FN Block<Lanes<T>> load_block(const Plan& plan, const SceneView<T>& s, i
   out.state.x = load_rows(s.x, block);
   out.state.x_prev = zero3<R>();
   out.state.origin = zero3<R>();
-  if constexpr (Set::reads_x_prev) {
-    out.state.x_prev = load3(s.x_prev, block);
+  if constexpr (Set::reads_x_prev) out.state.x_prev = load3(s.x_prev, block);
+  if constexpr (Set::of_vertices) {
     if (s.origin) out.state.origin = load3(s.origin, block);
   }
   out.state.h = R(q.time_step);

@@ -13,11 +13,13 @@
 namespace diffvbd {
 
 template <class... E>
-struct EnergyList {};
+struct EnergyList {
+  static constexpr int size = sizeof...(E);
+};
 
 // bits 0 and 1 of a mask: the elastic block; bit 2 + k: the k-th energy of this list
 using VertexEnergies = EnergyList<FloorBarrier, Anchor>;
-constexpr int kVertexEnergies = 2;
+constexpr int kVertexEnergies = VertexEnergies::size;
 enum ElasticBits { kExactBlock = 1, kPaperBlock = 2 };
 constexpr int kMaxEnergyData = 64;  // scalars that the energies of one vertex may read
 
@@ -50,6 +52,7 @@ constexpr bool any_x_prev(int mask, EnergyList<E...>) {
 
 template <int mask>
 struct EnergySet {
+  static constexpr bool of_vertices = (mask >> 2) != 0;
   static constexpr bool elastic = (mask & (kExactBlock | kPaperBlock)) != 0;
   using Elastic = StableNeoHookean<(mask & kExactBlock) != 0>;
 

@@ -1,5 +1,5 @@
 // IPC log barrier against planes (Li et al. 2020), with the paper's lagged damping of approaching motion, and the step
-// filter that keeps every executed position strictly above every plane (method.md, section 5).
+// filter that keeps every executed position strictly above every plane (docs/method.md, section 6).
 #pragma once
 
 #include <limits>

@@ -1,4 +1,5 @@
-// Stable Neo-Hookean tets (Smith et al. 2018; paper, eq. 18): P = mu F + (lb (J - 1) - mu) cof F, lb = mu + lam.
+// Stable Neo-Hookean tets (Smith et al. 2018; paper, appendix on closed forms): P = mu F + (lb (J - 1) - mu) cof F, lb
+// = mu + lam.
 //
 // Seen from one vertex i of a tet (i, j, k, l), J is affine in x_i, so the energy is exactly quadratic in x_i and F is
 // never needed. With n = (x_k - x_j) x (x_l - x_j), c6 = 1 / (6 V) and the stiffness weights k_ij = V grad N_i . grad
@@ -47,7 +48,7 @@ struct StableNeoHookean {
     add_outer(h_outer, sixth * e.c6 * (Exact ? lb : e.lam), n);
   }
 
-  // The adjoint of p . (g + H d_raw) times -h^2 (method.md, section 3; paper, eqs. 13-17). With the exact block
+  // The adjoint of p . (g + H d_raw) times -h^2 (method.md, section 3; paper, eqs. 7-12, 14-15). With the exact block
   // g + H d_raw is g at x_i + d_raw, so the Hessian tangent is had by evaluating there and dropping d_raw.
   template <int wanted, class R>
   DIFFVBD_FN static TetPairAdjoint<R> block_vjp(const TetPair<R>& e, const Vec3<R>& xi, const Vec3<R>& d_raw,
