@@ -9,37 +9,43 @@ ARGS ?=
 
 # Idle OpenMP threads sleep instead of spinning; read when torch is loaded, so it is set here.
 export OMP_WAIT_POLICY ?= PASSIVE
+# The build finds ninja through PATH only; without it the sources compile one after another.
+export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 ENVIRONMENT := $(VENV)/environment.stamp
-BUILD := $(VENV)/build.stamp
-NATIVE := $(shell find csrc -type f -name '*.h' -o -type f -name '*.cpp' -o -type f -name '*.cu')
+NATIVE := diffvbd/_C.abi3.so
+SOURCES := $(shell find csrc -type f -name '*.h' -o -type f -name '*.cpp' -o -type f -name '*.cu')
 
 .PHONY: run build test lint clean distclean
 
-run: $(BUILD)
+run: build
 	$(BIN)/python -m diffvbd run beam-mu $(ARGS)
 
-build: $(BUILD)
+build: $(ENVIRONMENT) $(NATIVE)
 
-test: $(BUILD)
+test: build
 	$(BIN)/python -m pytest $(ARGS)
 
-lint: $(BUILD)
+lint: $(ENVIRONMENT)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
-	$(BIN)/clang-format --dry-run -Werror $(NATIVE)
+	$(BIN)/clang-format --dry-run -Werror $(SOURCES)
 
-$(ENVIRONMENT): .ci/bootstrap.py
+$(ENVIRONMENT): .ci/bootstrap.py pyproject.toml
 	$(PYTHON) .ci/bootstrap.py $(VENV)
+	@echo "building diffvbd and installing its tools (minutes)"
+	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation -e ".[dev]"
 	@touch $@
 
-$(BUILD): $(ENVIRONMENT) pyproject.toml setup.py $(NATIVE)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e ".[dev]"
+# pip has just built it in a new environment. Later this recompiles only what an edit concerns (--force: setuptools
+# itself looks at no header; ninja does).
+$(NATIVE): $(SOURCES) setup.py | $(ENVIRONMENT)
+	$(BIN)/python setup.py --quiet build_ext --inplace --force
 	@touch $@
 
 clean:
-	rm -rf build diffvbd/*.so *.egg-info .pytest_cache .ruff_cache .hypothesis $(BUILD)
+	rm -rf build diffvbd/*.so *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find diffvbd tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean

@@ -78,7 +78,7 @@ def install_torch(python: Path) -> None:
 
 
 def pip(python: Path, *requirements: str, check: bool = True) -> bool:
-    command = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *requirements]
+    command = [python, "-m", "pip", "install", "-qq", "--disable-pip-version-check", *requirements]
     output = None if check else subprocess.DEVNULL
     done = subprocess.run(command, stdout=output, stderr=output)
     if check and done.returncode != 0:

@@ -46,6 +46,7 @@ class Extreme:
     steps: int = 1
     state: str = "jitter"
     jitter: float = 0.05  # of a cell
+    stretch: float = 1.0  # of the far scattered state
     speed: float = 0.1  # [size/s]
     pinned: bool = True
     block: str = "exact"
@@ -96,11 +97,14 @@ def _cases() -> list[Extreme]:
     for thin in (1e-3, 1e-6, 1e-9):
         add("slivers", f"layer of {thin:g}", mesh="layer", sliver=thin, quick=thin == 1e-6)
         add("slivers", f"flat tet of {thin:g}", mesh="sliver", sliver=thin, pinned=False, quick=thin == 1e-6)
-    for state in ("mirrored", "flat", "line", "point", "half", "scattered", "far scattered"):
+    for state in ("mirrored", "flat", "line", "point", "half", "scattered"):
         for block in ("exact", "paper"):
             safe = {"saturation": 0.1, "regularization": 1e-6} if block == "paper" else {}
             add("inverted, collapsed", f"{state}, {block}", state=state, block=block, quick=block == "exact", **safe)
         add("inverted, collapsed", f"{state}, free", state=state, pinned=False, sweeps=20)
+    for stretch in (10.0, 1e2, 1e3, 1e4, 1e5, 1e6):
+        for k in (1, 20):
+            add("huge strain", f"{stretch:g}, K = {k}", state="far scattered", stretch=stretch, sweeps=k, pinned=False)
     for k in (0, 1, 20, 100, 1000):
         add("sweeps", f"K = {k}", sweeps=k, cells=1 if k == 1000 else 2, mu=1e7, lam=1e7, quick=k <= 20)
     for omega in (0.1, 1.5, 1.7, 1.9, 1.99):
@@ -204,7 +208,7 @@ def _state(case: Extreme, points: Tensor, noise: Tensor) -> Tensor:
         "point": torch.zeros_like(points),
         "half": 0.3 * points,
         "scattered": points + 2 * case.size * noise,
-        "far scattered": 1e6 * case.size * noise,
+        "far scattered": case.stretch * case.size * noise,
     }[case.state]
 
 
@@ -219,10 +223,13 @@ def check(case: Extreme) -> dict[str, Any]:
     expected = testing.reference_result(model, inputs, case.sweeps, case.steps)
     spread = testing.spread(model, inputs, case.sweeps, case.steps, expected)
     got = testing.evaluate(run, inputs)
-    rounded = testing.reference_result(model, _rounded(inputs), case.sweeps, case.steps)
     errors = {k: testing.relative_error(got[k], expected[k]) for k in got if k.startswith("grad_")}
-    condition = {k: testing.relative_error(rounded[k], expected[k]) for k in errors}
     margin = {k: errors[k] / testing.bar(spread[k]) for k in errors}
+    condition = dict.fromkeys(errors, 0.0)
+    # one perturbation underestimates the worst by chance: beyond the bar more are tried
+    for seed in range(1 if max(margin.values()) <= 1 else 8):
+        rounded = testing.reference_result(model, _rounded(inputs, seed), case.sweeps, case.steps)
+        condition = {k: max(c, testing.relative_error(rounded[k], expected[k])) for k, c in condition.items()}
     beyond = {k: errors[k] / max(testing.bar(spread[k]), 10 * condition[k]) for k in errors}
     worst = max(margin, key=lambda k: margin[k] if math.isfinite(margin[k]) else math.inf)
     return {
@@ -241,9 +248,9 @@ def check(case: Extreme) -> dict[str, Any]:
     }
 
 
-def _rounded(inputs: dict[str, Any]) -> dict[str, Any]:
+def _rounded(inputs: dict[str, Any], seed: int) -> dict[str, Any]:
     """Inputs whose entries have moved up or down by one rounding of the largest entry of their tensor."""
-    rng = testing.generator("rounded")
+    rng = testing.generator("rounded", seed)
     signs = {
         k: torch.from_numpy(rng.choice([-1.0, 1.0], tuple(t.shape))) for k, t in inputs.items() if torch.is_tensor(t)
     }
@@ -326,10 +333,15 @@ def run(quick: bool) -> dict[str, Any]:
     }
 
 
-def within(row: dict[str, Any]) -> bool:
-    """Whether a row keeps every promise that holds for its case."""
-    explained = row["error_over_bar"] <= 1 or row["error_over_condition"] <= 1 or row["condition"] > NO_DIGITS
-    return row["finite"] and explained and (row["rise"] <= RISE or not row["must_descend"])
+def verdict(row: dict[str, Any]) -> str:
+    """One of "ok", "conditioning" (beyond the bar but not beyond that), "no digits" (nothing to compare), "fault"."""
+    if row["condition"] > NO_DIGITS:
+        return "no digits"
+    if not row["finite"] or (row["must_descend"] and row["rise"] > RISE):
+        return "fault"
+    if row["error_over_bar"] <= 1:
+        return "ok"
+    return "conditioning" if row["error_over_condition"] <= 1 else "fault"
 
 
 def markdown(results: dict[str, Any]) -> str:
@@ -345,7 +357,7 @@ def markdown(results: dict[str, Any]) -> str:
                 f"{sum(r['finite'] for r in group)}/{len(group)}",
                 f"{sum(r['rise'] <= RISE for r in promised)}/{len(promised)}",
                 f"{sum(r['error_over_bar'] <= 1 for r in group)}/{len(group)}",
-                sum(not within(r) for r in group),
+                sum(verdict(r) == "fault" for r in group),
                 float(np.median([r["gradient_error"] for r in group])),
                 max(r["gradient_error"] for r in group),
                 max(r["condition"] for r in group),
@@ -363,9 +375,11 @@ def markdown(results: dict[str, Any]) -> str:
         table = markdown_table((*names, *also), [[r[k] for k in (*columns, *also)] for r in chosen])
         return f"\n## {title}\n\n" + table
 
-    text += listed("Faults", [r for r in rows if not within(r)], ("finite", "rise", "error_over_bar"))
-    beyond = [r for r in rows if within(r) and r["error_over_bar"] > 1]
+    text += listed("Faults", [r for r in rows if verdict(r) == "fault"], ("finite", "rise", "error_over_bar"))
+    beyond = [r for r in rows if verdict(r) == "conditioning"]
     text += listed("Beyond the bar, within the conditioning", beyond, ("error_over_bar",))
+    lost = [r for r in rows if verdict(r) == "no digits"]
+    text += listed("No digits left in double precision", lost, ("finite", "rise", "error_over_bar"))
     text += listed("Worst conditioned", sorted(rows, key=lambda r: -r["condition"])[:12])
     risen = [r for r in rows if r["rise"] > RISE]
     text += listed("Potential rose (not promised for the paper's block and floors)", risen, ("rise", "block"))

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import torch
+
 from . import ops
 from .adjoints import ReverseSweep
 from .checks import check_count
 from .model import Model
-from .schedule import Binomial, choose_schedule
+from .schedule import Binomial, _left, choose_schedule
 
 LANES = 8  # kLanes of csrc/core/views.h
 
@@ -39,8 +41,10 @@ def predict(
             tape: of one step, scenes x sweeps x active vertices x 72 (full), 24 (compact) or 0 bytes in float64;
             step: what one step keeps for its backward, tape included;
             kept: the largest amount kept at once: all steps without checkpoints; states plus the steps of one segment
-                with checkpoints every n; states plus one step with Binomial;
-            scratch: of one backward step;
+                with checkpoints every n; states plus one step with Binomial. The state of the random number generator,
+                5 kB, is kept with every checkpoint (with Binomial: with every step). ``rest`` adds the graph of the
+                rest metric, once (297 B per tet), for rest_points that the scenes share;
+            scratch: of one backward step, in scenes that run side by side on as many threads;
             total: kept + scratch.
     """
     item = model.mass.element_size()
@@ -54,18 +58,31 @@ def predict(
     per_step = 2 * state + tape_bytes
     if model.floor is not None:
         per_step += 2 * state + scenes * model.num_vertices * model.floor.planes * (4 * item + 2)
+    frames = {"last": 1, "all": steps + 1}.get(save) or steps // save + 2
+    generator = torch.get_rng_state().numel()
     if schedule is None:
         kept = steps * per_step
     elif isinstance(schedule, Binomial):
-        kept = 2 * state * min(schedule.snapshots + 1, steps) + per_step
+        kept = 2 * state * min(schedule.snapshots + 1, steps) + per_step + max(0, steps - 1) * generator
+        # A part that runs again saves its frames again, inside parts that have done so.
+        part = steps if frames > 1 else 1
+        while part > 1:
+            part = _left(part, schedule.snapshots)
+            kept += 2 * state * (part * frames // (steps + 1))
     else:
-        kept = 2 * state * math.ceil(steps / schedule) + min(schedule, steps) * per_step
-    frames = {"last": 1, "all": steps + 1}.get(save) or steps // save + 2
+        segments = math.ceil(steps / schedule)
+        kept = segments * (2 * state + generator) + min(schedule, steps) * per_step
     kept += 2 * state * frames
+    if rest:
+        kept += (37 * model.num_tets + model.num_vertices) * item
 
-    slots = model._sizes[2] * LANES
-    columns = 4 + (2 if material or rest else 0) + (4 if rest else 0)
-    scratch = scenes * (slots * columns + model.num_vertices * 20) * item
+    blocks, slots, edge_slots = (LANES * n for n in model._plan[4:7].tolist())
+    # packed state and its adjoints, rows along edges, one row per (vertex, tet) pair of what is differentiated
+    work = blocks * (22 if model.floor else 16) + 4 * edge_slots
+    work += slots * ((2 if material or rest else 0) + (4 if rest else 0))
+    threads = torch.get_num_threads()
+    outputs = 12 * model.num_vertices + model.num_tets * ((2 if material else 0) + (7 if rest else 0))
+    scratch = (work * (threads if scenes >= threads else 1) + outputs * scenes) * item
     if policy == ops.NO_TAPE:
         scratch += scalars * ops.tape_rows(ops.FULL_TAPE, model.energy_mask) * item
     tensors = [t for t in vars(model).values() if hasattr(t, "element_size")] + list(model._topology)

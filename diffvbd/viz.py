@@ -93,15 +93,16 @@ def draw(axes: Any, points: Any, surface: NDArray[np.int64], color: str, bounds:
 
 def _course(figure: Any, history: Sequence[Mapping[str, float]], truth: Mapping[str, float]) -> None:
     iterations = np.arange(len(history))
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    upper.semilogy(iterations, [row["loss"] for row in history], color="#333333")
-    upper.set_ylabel("loss [m$^2$]")
-    for name, true in truth.items():
-        lower.semilogy(iterations, [abs(row[name] / true - 1) for row in history], label=name)
-    lower.set(xlabel="iteration", ylabel="relative error")
+    charts = figure.subplots(2 if truth else 1, 1, sharex=True, squeeze=False)[:, 0]
+    charts[0].semilogy(iterations, [row["loss"] for row in history], color="#333333")
+    charts[0].set_ylabel("loss")
+    charts[-1].set_xlabel("iteration")
     if truth:
-        lower.legend(frameon=False)
-    for axes in (upper, lower):
+        for name, true in truth.items():
+            charts[1].semilogy(iterations, [abs(row[name] / true - 1) for row in history], label=name)
+        charts[1].set_ylabel("relative error")
+        charts[1].legend(frameon=False)
+    for axes in charts:
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
     figure.subplots_adjust(left=0.2, right=0.96, bottom=0.1, top=0.95, hspace=0.12)

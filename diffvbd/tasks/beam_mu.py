@@ -1,4 +1,4 @@
-"""Identify the shear modulus of a beam from its motion (paper, section 4.4 and appendix "Task protocols").
+"""Identify the shear modulus of a beam from its motion (paper, section 6.5 and appendix "Task protocols").
 
 A cantilever of 0.5 x 0.2 x 0.2 m and 1,029 vertices is clamped at x = 0, twisted about its axis (the angle grows
 linearly to 180 degrees at the free end) and released from rest. Given are the vertex positions of 100 steps of 2 ms,

@@ -1,4 +1,4 @@
-"""Identify both Lame parameters of a soft beam from its motion (paper, section 4.4 and appendix "Task protocols").
+"""Identify both Lame parameters of a soft beam from its motion (paper, section 6.5 and appendix "Task protocols").
 
 The cantilever of beam-mu, at rest, receives a 60 degree angular kick. Given are the vertex positions of 100 steps of
 2 ms, simulated with (mu, lam) = (800, 400) Pa; Adam moves the logarithms of both from (300, 150) Pa.

@@ -1,0 +1,110 @@
+"""Documentation is true: its examples run, its quotes stand in the sources, its links lead somewhere."""
+
+import importlib
+import inspect
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import diffvbd as dv
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+# How a docstring states the shape of an array: "shape [...]", a bracket of sizes, or by reference to another function.
+SHAPE = re.compile(r"shape|\[[^\]]*\b(V|T|F|P|N|B|3)\b[^\]]*\]|[Aa]s in ")
+ARRAYS = {"points", "tets", "body", "triangles", "surface", "offsets", "frames", "low", "high", "pinned", "density"}
+
+pages = pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+
+
+def fences(page: Path) -> list[tuple[str, str]]:
+    """Info string and content of each fenced block."""
+    return [(info.strip(), text) for info, text in FENCE.findall(page.read_text(encoding="utf-8"))]
+
+
+def slug(heading: str) -> str:
+    """The anchor that GitHub gives a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+@pages
+def test_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"__name__": "__docs__"}
+    for info, text in fences(page):
+        if info == "python":
+            exec(compile(text, str(page), "exec"), names)
+    if page.name == "README.md":
+        assert names["log_mu"].exp().item() == pytest.approx(1.5e5, rel=1e-3)
+
+
+@pages
+def test_quotes_stand_in_the_sources(page: Path) -> None:
+    for info, text in fences(page):
+        source = re.search(r"from=(\S+)", info)
+        if source is None:
+            continue
+        content = (ROOT / source[1]).read_text(encoding="utf-8")
+        at = 0
+        for piece in text.split("\n...\n"):
+            found = content.find(piece.strip("\n"), at)
+            assert found >= 0, f"{page.name} quotes what {source[1]} does not say:\n{piece}"
+            at = found
+
+
+@pages
+def test_links_lead_somewhere(page: Path) -> None:
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = page.parent / path if path else page
+        assert file.exists(), f"{page.name} links to {target}"
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in map(slug, headings), f"{page.name} links to {target}"
+
+
+@pytest.mark.parametrize(
+    ("prefix", "module", "name"),
+    [("dv", dv, n) for n in dv.__all__ if n != "mesh"] + [("dv.mesh", dv.mesh, n) for n in dv.mesh.__all__],
+)
+def test_public_names_are_documented(prefix: str, module: Any, name: str) -> None:
+    value = getattr(module, name)
+    doc = inspect.getdoc(value)
+    assert doc, f"{prefix}.{name} has no docstring"
+    overview = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    assert re.search(rf"\b{re.escape(prefix)}\.{name}\b", overview), f"docs/api.md does not mention {prefix}.{name}"
+    parameters = inspect.signature(value).parameters
+    takes_arrays = any("Tensor" in str(p.annotation) or key in ARRAYS for key, p in parameters.items())
+    assert not takes_arrays or SHAPE.search(doc), f"{prefix}.{name} takes arrays; its docstring states no shape"
+
+
+@pytest.mark.parametrize("kind", [dv.Model, dv.TetMesh], ids=lambda kind: kind.__name__)
+def test_public_methods_are_documented(kind: type) -> None:
+    own = {name: value for name, value in vars(kind).items() if not name.startswith("_")}
+    obvious = {"num_vertices", "num_tets", "num_colors"}
+    bare = [
+        name
+        for name, value in own.items()
+        if name not in obvious and (callable(value) or isinstance(value, (property, classmethod))) and not value.__doc__
+    ]
+    assert not bare, f"{kind.__name__}: no docstring on {bare}"
+
+
+def test_report_writes_figures_between_its_markers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))  # bench is a folder of the repository and no part of the package
+    report, cpu = importlib.import_module("bench.report"), importlib.import_module("bench.cpu")
+    assert report.section(tmp_path) == report.EMPTY
+    monkeypatch.setattr(cpu, "markdown", lambda results: f"| forward | {results['forward']} |\n")
+    (tmp_path / "cpu.json").write_text(json.dumps({"environment": {"cpu": "some"}, "results": {"forward": 8.25}}))
+    (tmp_path / "other.json").write_text("{}")
+    text = report.section(tmp_path)
+    assert text.startswith("some, ") and "| forward | 8.25 |" in text
+    once = report.filled(report.PAGE.read_text(encoding="utf-8"), text)
+    assert text in once and report.filled(once, text) == once

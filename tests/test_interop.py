@@ -1,0 +1,461 @@
+"""The step inside torch's own machinery: compile, func, checkpoint, autocast, copies, opcheck, gradcheck, and what raises."""
+
+import copy
+import io
+import pickle
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+from torch.utils.checkpoint import checkpoint
+
+import diffvbd as dv
+from diffvbd import ops
+from diffvbd.testing import relative_error
+
+Arguments = dict[str, Tensor]
+STEP = {"time_step": 0.3, "sweeps": 2}
+PARAMETERS = ("floor_barrier.kappa", "floor_barrier.dhat", "floor_barrier.damping", "floor_barrier.height",
+              "floor_barrier.normal", "anchor.stiffness", "anchor.points")  # fmt: skip
+ARGUMENTS = ("x", "v", "mu", "lam", "force", "gravity", "prescribed", "rest_points", "density", *PARAMETERS)
+
+
+def small_model(dtype: torch.dtype = torch.float64, **options: Any) -> dv.Model:
+    """One cube of six tets in units where every quantity is near 1, so that no gradient hides below a tolerance."""
+    mesh = dv.mesh.cube()
+    floor = dv.FloorBarrier(height=-0.2, normal=(0.1, 1.0, 0.0), kappa=2.0, dhat=0.5, damping=0.5)
+    options = {"energies": (dv.StableNeoHookean(), floor, dv.Anchor(0.7)), **options}
+    return dv.Model(mesh, density=2.0, pinned=[0, 1], dtype=dtype, **options)
+
+
+def small_inputs(model: dv.Model, seed: int = 0) -> Arguments:
+    generator = torch.Generator().manual_seed(seed)
+
+    def noise(*shape: int, size: float) -> Tensor:
+        return (size * (2 * torch.rand(*shape, dtype=torch.float64, generator=generator) - 1)).to(model.dtype)
+
+    n, tets = model.num_vertices, model.num_tets
+    x = model.rest_points + noise(n, 3, size=0.1)
+    return {
+        "x": x,
+        "v": noise(n, 3, size=0.3) - torch.tensor([0.0, 0.5, 0.0], dtype=model.dtype),
+        "mu": 3.0 + noise(tets, size=0.5),
+        "lam": 2.0 + noise(tets, size=0.5),
+        "force": noise(n, 3, size=0.3),
+        "gravity": torch.tensor([0.1, -1.0, 0.2], dtype=model.dtype),
+        "prescribed": x + noise(n, 3, size=0.1),
+        "rest_points": model.rest_points + noise(n, 3, size=0.05),
+        "density": 2.0 + noise(tets, size=0.5),
+        "floor_barrier.kappa": torch.tensor(2.0, dtype=model.dtype),
+        "floor_barrier.dhat": torch.tensor(0.5, dtype=model.dtype),
+        "floor_barrier.damping": torch.tensor(0.5, dtype=model.dtype),
+        "floor_barrier.height": torch.tensor([-0.2], dtype=model.dtype),
+        "floor_barrier.normal": torch.tensor([[0.1, 1.0, 0.0]], dtype=model.dtype),
+        "anchor.stiffness": 0.7 + noise(n, size=0.2),
+        "anchor.points": model.rest_points + noise(n, 3, size=0.1),
+    }
+
+
+def run_step(model: dv.Model, arguments: Arguments, **options: Any) -> tuple[Tensor, Tensor]:
+    given = {k: t for k, t in arguments.items() if k not in PARAMETERS}
+    parameters = {k: t for k, t in arguments.items() if k in PARAMETERS}
+    return dv.step(model, given.pop("x"), given.pop("v"), **given, parameters=parameters, **{**STEP, **options})
+
+
+def scalar(x: Tensor, v: Tensor) -> Tensor:
+    weights = torch.linspace(0.5, 1.5, x.shape[-1] * x.shape[-2], dtype=x.dtype).reshape(x.shape[-2:])
+    return (weights * (x * x + 0.3 * v * v)).sum()
+
+
+def loss(model: dv.Model, arguments: Arguments, **options: Any) -> Tensor:
+    return scalar(*run_step(model, arguments, **options))
+
+
+def gradients(model: dv.Model, arguments: Arguments, **options: Any) -> Arguments:
+    leaves = {k: t.clone().requires_grad_() for k, t in arguments.items()}
+    return dict(zip(leaves, torch.autograd.grad(loss(model, leaves, **options), list(leaves.values())), strict=True))
+
+
+def assert_same(actual: Arguments, expected: Arguments, limit: float = 1e-13) -> None:
+    assert actual.keys() == expected.keys()
+    for name in expected:
+        assert expected[name].abs().max() > 1e-6, f"{name}: the gradient is zero, so nothing is compared"
+        assert relative_error(actual[name], expected[name]) <= limit, name
+
+
+# --- gradcheck ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ARGUMENTS)
+def test_gradcheck_of_every_argument(name: str) -> None:
+    model = small_model()
+    fixed = small_inputs(model)
+
+    def run(value: Tensor) -> tuple[Tensor, Tensor]:
+        return run_step(model, fixed | {name: value})
+
+    value = fixed[name].clone().requires_grad_()
+    (jacobian,) = torch.autograd.grad(scalar(*run(value)), value)
+    assert jacobian.abs().max() > 1e-3
+    assert torch.autograd.gradcheck(run, (value,), atol=1e-7, rtol=1e-5, check_batched_grad=True)
+
+
+def test_gradcheck_of_material_and_state_together_without_vertex_energies() -> None:
+    model = small_model(energies=(dv.StableNeoHookean("paper"),), saturation=0.2, regularization=0.1, relaxation=1.3)
+    fixed = small_inputs(model)
+    values = tuple(fixed[k].clone().requires_grad_() for k in ("x", "v", "mu", "lam"))
+
+    def run(x: Tensor, v: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
+        return dv.step(model, x, v, mu=mu, lam=lam, **STEP)
+
+    assert torch.autograd.gradcheck(run, values, atol=1e-7, rtol=1e-5, check_batched_grad=True)
+
+
+# --- torch.compile -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def fresh_compiler() -> None:
+    torch._dynamo.reset()
+
+
+def compiled_gradients(backend: str, names: tuple[str, ...], plain: bool) -> None:
+    model = small_model(energies=(dv.StableNeoHookean(),)) if plain else small_model()
+    arguments = {k: t for k, t in small_inputs(model).items() if k in names}
+    expected = gradients(model, arguments)
+    run = torch.compile(lambda a: loss(model, a), fullgraph=True, backend=backend)
+    leaves = {k: t.clone().requires_grad_() for k, t in arguments.items()}
+    value = run(leaves)
+    actual = dict(zip(leaves, torch.autograd.grad(value, list(leaves.values())), strict=True))
+    assert relative_error(value, loss(model, arguments)) <= 1e-14
+    assert_same(actual, expected)
+
+
+def test_compile_of_a_plain_step(fresh_compiler: None) -> None:
+    compiled_gradients("aot_eager", ("x", "v", "mu", "lam"), plain=True)
+
+
+def test_compile_of_a_step_with_every_argument(fresh_compiler: None) -> None:
+    compiled_gradients("aot_eager", ARGUMENTS, plain=False)
+
+
+@pytest.mark.slow
+def test_compile_with_inductor(fresh_compiler: None) -> None:
+    compiled_gradients("inductor", ARGUMENTS, plain=False)
+
+
+def test_compile_of_a_step_without_gradients(fresh_compiler: None) -> None:
+    model = small_model()
+    arguments = small_inputs(model)
+    with torch.no_grad():
+        x, v = torch.compile(lambda a: run_step(model, a), fullgraph=True, backend="aot_eager")(arguments)
+    expected = run_step(model, arguments)
+    assert torch.equal(x, expected[0]) and torch.equal(v, expected[1])
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_compile_of_one_tensor_as_two_arguments(fresh_compiler: None, batched: bool) -> None:
+    model = small_model(energies=(dv.StableNeoHookean(),))
+    inputs = small_inputs(model)
+    x, v = (inputs[k].expand(2, -1, -1).contiguous() if batched else inputs[k] for k in ("x", "v"))
+    modulus = inputs["mu"][None] if batched else inputs["mu"]
+
+    def run(modulus: Tensor) -> Tensor:
+        return scalar(*dv.step(model, x, v, mu=modulus, lam=modulus, **STEP))
+
+    grads = []
+    for function in (run, torch.compile(run, fullgraph=True, backend="aot_eager")):
+        leaf = modulus.clone().requires_grad_()
+        grads += torch.autograd.grad(function(leaf), leaf)
+    assert grads[0].abs().max() > 1e-3
+    assert relative_error(grads[1], grads[0]) <= 1e-14
+
+
+@pytest.mark.parametrize("every", [None, 2])
+def test_compile_of_a_rollout(fresh_compiler: None, every: Any) -> None:
+    model = small_model()
+    inputs = small_inputs(model)
+
+    def run(v: Tensor, mu: Tensor, force: Tensor) -> Tensor:
+        trajectory = dv.rollout(model, inputs["x"], v, steps=3, mu=mu, lam=2.0, force=dv.per_step(force),
+                                checkpoint_every=every, **STEP)  # fmt: skip
+        return scalar(trajectory.x[-1], trajectory.v[-1]) + trajectory.x.square().sum()
+
+    values = {"v": inputs["v"], "mu": inputs["mu"], "force": torch.stack([k * inputs["force"] for k in (1, 2, 3)])}
+    results = []
+    for function in (run, torch.compile(run, fullgraph=True, backend="aot_eager")):
+        leaves = {k: t.clone().requires_grad_() for k, t in values.items()}
+        results.append(dict(zip(values, torch.autograd.grad(function(**leaves), list(leaves.values())), strict=True)))
+    assert_same(results[1], results[0])
+
+
+# --- torch.func --------------------------------------------------------------------------------------------------------
+
+
+def members(inputs: Arguments, name: str, count: int = 3) -> Tensor:
+    """`count` different values of one argument, stacked."""
+    generator = torch.Generator().manual_seed(1)
+    shape = (count, *inputs[name].shape)
+    return inputs[name] + 0.1 * torch.rand(shape, dtype=inputs[name].dtype, generator=generator)
+
+
+def test_func_grad_equals_autograd() -> None:
+    model = small_model()
+    inputs = small_inputs(model)
+    assert_same(torch.func.grad(lambda a: loss(model, a))(inputs), gradients(model, inputs), 0.0)
+
+
+@pytest.mark.parametrize("name", ARGUMENTS)
+def test_vmap_and_its_gradients_over_each_argument(name: str) -> None:
+    model = small_model()
+    inputs = small_inputs(model)
+    batch = members(inputs, name)
+
+    def one(value: Tensor) -> Tensor:
+        return loss(model, inputs | {name: value})
+
+    values = torch.func.vmap(one)(batch)
+    expected = torch.stack([one(value) for value in batch])
+    assert expected.std() > 1e-6
+    assert relative_error(values, expected) <= 1e-14
+    slopes = torch.stack([torch.func.grad(one)(value) for value in batch])
+    assert slopes.abs().max() > 1e-3
+    assert relative_error(torch.func.vmap(torch.func.grad(one))(batch), slopes) <= 1e-13
+    assert relative_error(torch.func.grad(lambda b: torch.func.vmap(one)(b).sum())(batch), slopes) <= 1e-13
+
+
+def test_vmap_over_several_arguments_and_gradient_of_a_shared_one() -> None:
+    model = small_model()
+    inputs = small_inputs(model)
+    x, mu = members(inputs, "x"), members(inputs, "mu")
+
+    def one(x: Tensor, mu: Tensor, lam: Tensor, gravity: Tensor) -> Tensor:
+        return loss(model, inputs | {"x": x, "mu": mu, "lam": lam, "gravity": gravity})
+
+    shared = (inputs["lam"], inputs["gravity"])
+
+    def total(*values: Tensor) -> Tensor:
+        return torch.func.vmap(one, in_dims=(0, 0, None, None))(*values).sum()
+
+    def looped(x: Tensor, mu: Tensor, *rest: Tensor) -> Tensor:
+        return torch.stack([one(a, b, *rest) for a, b in zip(x, mu, strict=True)]).sum()
+
+    actual = torch.func.grad(total, argnums=(0, 1, 2, 3))(x, mu, *shared)
+    expected = torch.func.grad(looped, argnums=(0, 1, 2, 3))(x, mu, *shared)
+    for a, b in zip(actual, expected, strict=True):
+        assert b.abs().max() > 1e-3
+        assert relative_error(a, b) <= 1e-13
+    # vmap of grad: each member its own gradient of what it shares
+    each = torch.func.vmap(torch.func.grad(one, argnums=2), in_dims=(0, 0, None, None))(x, mu, *shared)
+    single = torch.stack([torch.func.grad(one, argnums=2)(a, b, *shared) for a, b in zip(x, mu, strict=True)])
+    assert relative_error(each, single) <= 1e-13
+
+
+def test_vmap_over_a_batch_of_scenes_and_other_dimensions() -> None:
+    model = small_model()
+    inputs = small_inputs(model)
+    x = torch.stack([members(inputs, "x", 2), members(inputs, "x", 2) + 0.05, members(inputs, "x", 2) - 0.05], 1)
+    v = inputs["v"].expand(2, -1, -1)
+    plain = {k: t for k, t in inputs.items() if k not in ("x", "v")}
+
+    def run(x: Tensor) -> tuple[Tensor, Tensor]:
+        return run_step(model, plain | {"x": x, "v": v})
+
+    actual = torch.func.vmap(run, in_dims=1, out_dims=1)(x)  # members in dimension 1, scenes in dimension 0
+    for k in range(2):
+        assert torch.equal(actual[k], torch.stack([run(x[:, n])[k] for n in range(3)], 1))
+    slope = torch.func.vmap(torch.func.grad(lambda x: scalar(*run(x))), in_dims=1, out_dims=1)(x)
+    expected = torch.stack([torch.func.grad(lambda x: scalar(*run(x)))(x[:, n]) for n in range(3)], 1)
+    assert relative_error(slope, expected) <= 1e-13
+
+
+def test_nested_vmap() -> None:
+    model = small_model()
+    inputs = small_inputs(model)
+    x, mu = members(inputs, "x", 2), members(inputs, "mu", 3)
+
+    def one(x: Tensor, mu: Tensor) -> Tensor:
+        return torch.func.grad(lambda m: loss(model, inputs | {"x": x, "mu": m}))(mu)
+
+    inner = torch.func.vmap(one, in_dims=(None, 0))
+    actual = torch.func.vmap(inner, in_dims=(0, None))(x, mu)
+    expected = torch.stack([torch.stack([one(a, b) for b in mu]) for a in x])
+    assert relative_error(actual, expected) <= 1e-13
+
+
+@pytest.mark.parametrize("name", ["x", "mu", "rest_points", "floor_barrier.kappa"])
+def test_jacrev_and_batched_gradients_equal_one_row_at_a_time(name: str) -> None:
+    model = small_model()
+    inputs = small_inputs(model)
+
+    def run(value: Tensor) -> Tensor:
+        return run_step(model, inputs | {name: value})[0]
+
+    leaf = inputs[name].clone().requires_grad_()
+    out = run(leaf)
+    rows = torch.eye(out.numel(), dtype=out.dtype).reshape(-1, *out.shape)
+    expected = torch.stack([torch.autograd.grad(out, leaf, row, retain_graph=True)[0] for row in rows])
+    (batched,) = torch.autograd.grad(out, leaf, rows, is_grads_batched=True)
+    assert expected.abs().max() > 1e-3
+    assert relative_error(batched, expected) <= 1e-13
+    jacobian = torch.func.jacrev(run)(inputs[name])
+    assert relative_error(jacobian.reshape(expected.shape), expected) <= 1e-13
+
+
+# --- checkpoint, autocast, copies --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reentrant", [False, True])
+def test_checkpoint(reentrant: bool) -> None:
+    model = small_model()
+    inputs = small_inputs(model)
+    leaves = {k: t.clone().requires_grad_() for k, t in inputs.items()}
+    names = list(leaves)
+
+    def run(*values: Tensor) -> tuple[Tensor, Tensor]:
+        return run_step(model, dict(zip(names, values, strict=True)))
+
+    scalar(*checkpoint(run, *leaves.values(), use_reentrant=reentrant)).backward()
+    assert_same({k: t.grad for k, t in leaves.items()}, gradients(model, inputs), 0.0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_autocast_changes_nothing(dtype: torch.dtype) -> None:
+    model = small_model(dtype)
+    inputs = small_inputs(model)
+    expected = run_step(model, inputs)
+    slopes = gradients(model, inputs)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        actual = run_step(model, inputs)
+        cast = gradients(model, inputs)
+        rebuilt = small_model(dtype)
+    assert actual[0].dtype == dtype
+    assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
+    assert_same(cast, slopes, 0.0)
+    assert torch.equal(rebuilt.mass, model.mass)
+
+
+def saved_and_loaded(model: dv.Model) -> dv.Model:
+    buffer = io.BytesIO()
+    torch.save(model, buffer)
+    return torch.load(io.BytesIO(buffer.getvalue()), weights_only=False)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m)), saved_and_loaded])
+def test_copies_of_a_model_compute_the_same(copied: Any) -> None:
+    model = small_model(saturation=0.3, relaxation=1.2)
+    inputs = small_inputs(model)
+    twin = copied(model)
+    assert twin is not model and twin.mass.data_ptr() != model.mass.data_ptr()
+    assert repr(twin) == repr(model)
+    for a, b in zip(run_step(twin, inputs), run_step(model, inputs), strict=True):
+        assert torch.equal(a, b)
+    assert_same(gradients(twin, inputs), gradients(model, inputs), 0.0)
+
+
+def test_model_of_tensors_that_require_grad_survives_two_backwards_and_copies() -> None:
+    mesh = dv.mesh.cube()
+    density = torch.full((mesh.num_tets,), 2.0, dtype=torch.float64, requires_grad=True)
+    stiffness = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
+    kappa = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    points = torch.from_numpy(mesh.points.copy()).requires_grad_()
+    # Each is the result of an operation: a kept graph would fail in the second backward and in deepcopy.
+    energies = (
+        dv.StableNeoHookean(),
+        dv.FloorBarrier(height=-0.2, kappa=kappa * 1, dhat=0.5),
+        dv.Anchor(stiffness * 1, points * 1),
+    )
+    model = dv.Model(dv.TetMesh(points * 1, mesh.tets), density=density * 1, pinned=[0], energies=energies)
+    twin = pickle.loads(pickle.dumps(copy.deepcopy(model)))
+    assert repr(twin) == repr(model)
+    x = (model.rest_points + 0.01).requires_grad_()
+    slopes = []
+    for _ in range(2):
+        out = dv.step(model, x, torch.zeros_like(x), mu=3.0, lam=2.0, **STEP)
+        slopes += torch.autograd.grad(scalar(*out), x)
+    assert torch.equal(slopes[0], slopes[1])
+    assert all(t.grad is None for t in (density, stiffness, kappa, points))
+
+
+# --- raw operators -----------------------------------------------------------------------------------------------------
+
+
+def raw_arguments(policy: int) -> dict[str, tuple[Any, ...]]:
+    """Arguments of every raw operator, in the order of its schema."""
+    model = small_model()
+    inputs = small_inputs(model)
+    settings = model.settings(0.3, 2)
+    tensors = (inputs["x"][None], inputs["x"][None], (inputs["x"] + 0.1 * inputs["v"])[None], inputs["mu"][None],
+               inputs["lam"][None], model.mass[None], model._packed_rest, model._energy_data, torch.empty(0).double())  # fmt: skip
+    sweep = (*tensors, model._plan, *settings, policy, -1, True)
+    x, tape = torch.ops.diffvbd.sweep(*sweep)
+    tets, star_ptr, star = model._topology
+    points = model.rest_points[None].contiguous()
+    corners = torch.ops.diffvbd.tet_gather(points, tets)
+    arguments = {
+        "sweep": sweep,
+        "pack_rest": (torch.rand(1, model.num_tets, 7).double(), model._plan, model._sizes),
+        "tet_gather": (points, tets),
+        "star_sum": (corners, star_ptr, star),
+        "row_sum": (inputs["x"],),
+    }
+    if policy != ops.NO_TAPE:
+        wants = [True, True, True, True]
+        arguments["sweep_backward"] = (torch.ones_like(x), x, *tensors[1:], tape, model._plan, *settings, policy, wants)
+    return arguments
+
+
+@pytest.mark.parametrize("policy", [ops.NO_TAPE, ops.COMPACT_TAPE, ops.FULL_TAPE])
+def test_opcheck_of_the_raw_operators(policy: int) -> None:
+    for name, arguments in raw_arguments(policy).items():
+        torch.library.opcheck(getattr(torch.ops.diffvbd, name).default, arguments)
+
+
+def test_raw_operators_refuse_to_be_differentiated() -> None:
+    for name, arguments in raw_arguments(ops.FULL_TAPE).items():
+        first = arguments[0].clone().requires_grad_()
+        out = getattr(torch.ops.diffvbd, name)(first, *arguments[1:])
+        out = out[0] if isinstance(out, (tuple, list)) else out
+        with pytest.raises(NotImplementedError, match="call diffvbd.step"):
+            out.sum().backward()
+
+
+# --- what cannot be differentiated says so -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["x", "mu", "rest_points", "anchor.points"])
+def test_second_order_raises(name: str) -> None:
+    model = small_model()
+    inputs = small_inputs(model)
+
+    def one(value: Tensor) -> Tensor:
+        return loss(model, inputs | {name: value})
+
+    leaf = inputs[name].clone().requires_grad_()
+    (slope,) = torch.autograd.grad(one(leaf), leaf, create_graph=True)
+    with pytest.raises(NotImplementedError, match="second derivatives"):
+        torch.autograd.grad(slope.sum(), leaf)
+    with pytest.raises(NotImplementedError, match="second derivatives"):
+        torch.func.jacrev(torch.func.grad(one))(inputs[name])
+    with pytest.raises((NotImplementedError, RuntimeError), match="(?i)second derivatives|forward.mode|jvp"):
+        torch.func.hessian(one)(inputs[name])
+    with pytest.raises(NotImplementedError, match="second derivatives"):
+        torch.autograd.functional.hessian(one, inputs[name])
+
+
+@pytest.mark.parametrize("name", ["x", "v", "mu", "rest_points", "density", "gravity", "floor_barrier.kappa"])
+def test_forward_mode_raises(name: str) -> None:
+    model = small_model()
+    inputs = small_inputs(model)
+    tangent = torch.ones_like(inputs[name])
+
+    def one(value: Tensor) -> Tensor:
+        return loss(model, inputs | {name: value})
+
+    with pytest.raises((NotImplementedError, RuntimeError), match="(?i)forward.mode|jvp|forward AD"):
+        torch.func.jvp(one, (inputs[name],), (tangent,))
+    with forward_ad.dual_level():
+        with pytest.raises((NotImplementedError, RuntimeError), match="(?i)forward.mode|jvp|forward AD"):
+            one(forward_ad.make_dual(inputs[name], tangent))

@@ -1,0 +1,414 @@
+"""The step's arguments: broadcasting, shapes of gradients, what leaves no tape, tapes without autograd, float32, floors."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd.testing import build_scene, evaluate, relative_error, tolerance
+
+STEP = {"time_step": 1 / 60, "sweeps": 3}
+GROUND = {"height": -0.06, "kappa": 2e4, "dhat": 0.1, "damping": 20.0}
+
+
+def beam_model(**options: Any) -> dv.Model:
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(**GROUND), dv.Anchor(50.0))
+    return dv.Model(dv.mesh.box((3, 2, 2)), **{"pinned": [0, 1], "energies": energies, **options})
+
+
+def uniform(*shape: int, low: float = 0.5, high: float = 1.5) -> Tensor:
+    generator = torch.Generator().manual_seed(math.prod(shape) + 10 * len(shape))
+    return low + (high - low) * torch.rand(shape, dtype=torch.float64, generator=generator)
+
+
+def state(model: dv.Model, *lead: int) -> tuple[Tensor, Tensor]:
+    shape = (*lead, model.num_vertices, 3)
+    return model.rest_points + uniform(*shape, low=-0.03, high=0.03), uniform(*shape, low=-1.0, high=0.5)
+
+
+def total(x: Tensor, v: Tensor) -> Tensor:
+    weights = uniform(*x.shape)
+    return (weights * (x.square() + 0.01 * v.square())).sum()
+
+
+# Name of an argument, its own shape (letters: V vertices, T tets) and its size.
+OWN = {
+    "mu": ("T", 1e4),
+    "lam": ("T", 1e4),
+    "density": ("T", 1e3),
+    "force": ("V3", 5.0),
+    "gravity": ("13", 5.0),
+    "prescribed": ("V3", 0.1),
+    "rest_points": ("V3", 0.05),
+    "floor_barrier.kappa": ("", 2e4),
+    "floor_barrier.dhat": ("", 0.1),
+    "floor_barrier.damping": ("", 20.0),
+    "floor_barrier.height": ("1", -0.06),
+    "floor_barrier.normal": ("13", 1.0),
+    "anchor.stiffness": ("V", 50.0),
+    "anchor.points": ("V3", 0.1),
+}
+
+
+def own_shape(model: dv.Model, name: str) -> tuple[int, ...]:
+    sizes = {"V": model.num_vertices, "T": model.num_tets}
+    return tuple(sizes.get(letter) or int(letter) for letter in OWN[name][0])
+
+
+def value_of(model: dv.Model, name: str, shape: tuple[int, ...]) -> Tensor:
+    value = OWN[name][1] * uniform(*shape)
+    if name in ("prescribed", "rest_points", "anchor.points") and shape[-2:] == (model.num_vertices, 3):
+        value = value + model.rest_points
+    if name == "floor_barrier.normal":
+        value = 0.1 * value + torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    return value
+
+
+def broadcast_cases() -> list[tuple[str, tuple[int, ...], str]]:
+    """(argument, leading shape of x, shape of the value, in which 'own' stands for the argument's own shape)."""
+    cases = []
+    for name in OWN:
+        cases += [(name, (), "own"), (name, (3,), "own"), (name, (3,), "3,own"), (name, (2, 3), "2,3,own")]
+        cases += [(name, (2, 3), "3,own"), (name, (2, 3), "2,1,own"), (name, (1,), "own"), (name, (3,), "1,own")]
+        if name in ("mu", "lam", "density"):
+            cases += [(name, (3,), "3,1"), (name, (2, 3), "2,1,1"), (name, (3,), ""), (name, (2, 3), "1")]
+    return cases
+
+
+@pytest.mark.parametrize(("name", "lead", "spec"), broadcast_cases())
+def test_broadcasting_equals_a_loop_over_scenes(name: str, lead: tuple[int, ...], spec: str) -> None:
+    model = beam_model()
+    own = own_shape(model, name)
+    shape = tuple(n for part in spec.split(",") if part for n in (own if part == "own" else (int(part),)))
+    value = value_of(model, name, shape).requires_grad_()
+    # the value that each scene sees, by torch's own broadcasting
+    full = value.expand((*lead, *(own if spec.endswith("own") else (model.num_tets,))))
+    x, v = state(model, *lead)
+
+    def run(x: Tensor, v: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+        options: dict[str, Any] = {"mu": 1e4, "lam": 2e4}
+        options |= {"parameters": {name: value}} if "." in name else {name: value}
+        return dv.step(model, x, v, **options, **STEP)
+
+    actual = run(x, v, value)
+    scenes = list(np.ndindex(*lead))
+    expected = [run(x[i], v[i], full[i]) for i in scenes]
+    for k in range(2):
+        assert actual[k].shape == x.shape
+        assert torch.equal(actual[k], torch.stack([e[k] for e in expected]).reshape(x.shape))
+    (slope,) = torch.autograd.grad(total(*actual), value)
+    looped = total(*(torch.stack([e[k] for e in expected]).reshape(x.shape) for k in range(2)))
+    (expected_slope,) = torch.autograd.grad(looped, value)
+    assert slope.shape == value.shape
+    assert expected_slope.abs().max() > 0
+    assert relative_error(slope, expected_slope) <= 1e-12
+
+
+def test_python_numbers_mean_constant_tensors() -> None:
+    model = beam_model()
+    x, v = state(model, 2)
+    tensors = {k: torch.tensor(a, dtype=torch.float64) for k, a in (("mu", 1e4), ("lam", 2e4), ("density", 900.0))}
+    numbers = {k: t.item() for k, t in tensors.items()}
+    kappa = {"floor_barrier.kappa": 1e4}
+    actual = dv.step(model, x, v, **numbers, gravity=[0, -5, 1], parameters=kappa, **STEP)
+    kappa = {"floor_barrier.kappa": torch.tensor(1e4, dtype=torch.float64)}
+    gravity = torch.tensor([0.0, -5.0, 1.0], dtype=torch.float64)
+    expected = dv.step(model, x, v, **tensors, gravity=gravity, parameters=kappa, **STEP)
+    assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
+
+
+def test_defaults_are_the_models_own_values() -> None:
+    mesh = dv.mesh.box((3, 2, 2))
+    model = dv.Model(mesh, density=700.0, pinned=[0], energies=(dv.StableNeoHookean(), dv.FloorBarrier(**GROUND)))
+    x, v = state(model)
+    plain = dv.step(model, x, v, mu=1e4, lam=2e4, **STEP)
+    spelled = dv.step(model, x, v, mu=1e4, lam=2e4, force=torch.zeros_like(x), gravity=(0.0, -9.81, 0.0), prescribed=x,
+                      rest_points=model.rest_points, density=700.0, parameters={"floor_barrier.kappa": 2e4}, **STEP)  # fmt: skip
+    for a, b in zip(spelled, plain, strict=True):
+        assert relative_error(a, b) <= 1e-13
+    # `prescribed` is read only where pinned
+    moved = dv.step(model, x, v, mu=1e4, lam=2e4, prescribed=torch.where(model.pinned[:, None], x + 0.01, 1e9), **STEP)
+    assert torch.equal(moved[0][0], x[0] + 0.01)
+    assert torch.isfinite(moved[0]).all() and (moved[0][1:] - plain[0][1:]).abs().max() > 1e-6
+
+
+def test_inputs_are_untouched_and_steps_repeat() -> None:
+    scene = build_scene("floor_damped")
+    model, inputs = scene.model(), scene.inputs()
+    flat = {k: t for k, t in inputs.items() if isinstance(t, Tensor)} | inputs["parameters"]
+    constants = {k: t.clone() for k, t in vars(model).items() if isinstance(t, Tensor)}
+    before = {k: t.clone() for k, t in flat.items()}
+    results = [evaluate(lambda **o: dv.step(model, sweeps=4, **o), inputs) for _ in range(2)]
+    assert all(torch.equal(flat[k], before[k]) for k in flat)
+    assert all(torch.equal(getattr(model, k), constants[k]) for k in constants)
+    assert results[0].keys() == results[1].keys()
+    assert all(torch.equal(results[0][k], results[1][k]) for k in results[0])
+
+
+# --- what requires no grad leaves no tape ------------------------------------------------------------------------------
+
+
+def saved_bytes(run: Any, model: dv.Model | None = None) -> int:
+    """Bytes of the storages that autograd keeps, without those of the Model."""
+    storages: dict[int, int] = {}
+    kept = []
+    own = [t for t in vars(model).values() if isinstance(t, Tensor)] if model is not None else []
+
+    def pack(t: Tensor) -> Tensor:
+        kept.append(t)
+        storages[t.untyped_storage().data_ptr()] = t.untyped_storage().nbytes()
+        return t
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
+        kept.append(run())
+    for t in own:
+        storages.pop(t.untyped_storage().data_ptr(), None)
+    return sum(storages.values())
+
+
+def test_without_grad_nothing_is_saved() -> None:
+    model = beam_model()
+    x, v = state(model)
+    assert saved_bytes(lambda: dv.step(model, x, v, mu=1e4, lam=2e4, density=900.0, **STEP)) == 0
+    mu = torch.tensor(1e4, dtype=torch.float64, requires_grad=True)
+    with torch.no_grad():
+        assert saved_bytes(lambda: dv.step(model, x, v, mu=mu, lam=2e4, **STEP)) == 0
+    step = dv.step(model, x, v, mu=1e4, lam=2e4, **STEP)
+    assert not step[0].requires_grad and not step[1].requires_grad
+
+
+def test_a_tape_exists_only_for_steps_that_need_one() -> None:
+    """Velocity alone: the tape; with recompute: no tape; through the last of two steps only: one tape."""
+    model = beam_model(energies=(dv.StableNeoHookean(),))
+    x, v = state(model)
+    leaf = v.clone().requires_grad_()
+    sweeps = 20
+    full = sweeps * model.num_active * 72
+
+    def run(first: Tensor, second: Tensor, tape: str) -> Tensor:
+        adjoint = dv.ReverseSweep(tape)
+        state = (x, first)
+        for velocity in (first, second):
+            state = dv.step(model, state[0], velocity, mu=1e4, lam=2e4, time_step=0.01, sweeps=sweeps, adjoint=adjoint)
+        return state[0]
+
+    once = saved_bytes(lambda: run(v, leaf, "full"), model)
+    twice = saved_bytes(lambda: run(leaf, leaf, "full"), model)
+    nothing = saved_bytes(lambda: run(leaf, leaf, "recompute"), model)
+    assert full <= once < 1.5 * full
+    assert 2 * full <= twice < 2.5 * full
+    assert nothing < 0.5 * full
+
+
+# --- tapes without autograd --------------------------------------------------------------------------------------------
+
+
+def leaves_of(inputs: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The inputs with every tensor a fresh leaf, and those leaves by name."""
+    flat = {k: t for k, t in inputs.items() if isinstance(t, Tensor)} | inputs.get("parameters", {})
+    leaves = {k: t.clone().requires_grad_() for k, t in flat.items()}
+    call = {k: leaves.get(k, value) for k, value in inputs.items()}
+    if "parameters" in inputs:
+        call["parameters"] = {k: leaves[k] for k in inputs["parameters"]}
+    return call, leaves
+
+
+@pytest.mark.parametrize("case", ["plain", "paper", "floor_damped", "anchored", "batch"])
+def test_step_forward_and_backward_equal_autograd(case: str) -> None:
+    scene = build_scene(case)
+    model, inputs = scene.model(), scene.inputs()
+    call, leaves = leaves_of(inputs)
+    out = dv.step(model, sweeps=3, **call)
+    grad_x, grad_v = (uniform(*t.shape, low=-1.0, high=1.0) for t in out)
+    expected = torch.autograd.grad(out, list(leaves.values()), (grad_x, grad_v), allow_unused=True, retain_graph=True)
+    of_x = torch.autograd.grad(out[0], list(leaves.values()), grad_x, allow_unused=True)
+    with torch.no_grad():
+        x, v, tape = dv.step_forward(model, sweeps=3, wrt=tuple(leaves), **inputs)
+        assert torch.equal(x, out[0]) and torch.equal(v, out[1])
+        assert not x.requires_grad and not v.requires_grad
+        for _ in range(2):
+            grads = dv.step_backward(tape, grad_x, grad_v)
+            assert list(grads) == list(leaves)
+            for (name, leaf), slope in zip(leaves.items(), expected, strict=True):
+                assert grads[name].shape == leaf.shape
+                assert torch.equal(grads[name], torch.zeros_like(leaf) if slope is None else slope), name
+        for name, slope in zip(leaves, of_x, strict=True):
+            assert slope is None or torch.equal(dv.step_backward(tape, grad_x)[name], slope), name
+    assert sum(float(g.abs().max()) > 0 for g in grads.values()) >= 5
+    assert all(not t.requires_grad for t in inputs.values() if isinstance(t, Tensor))
+
+
+def test_step_forward_keeps_a_tape_for_wrt_only() -> None:
+    model = beam_model(energies=(dv.StableNeoHookean(),))
+    x, v = state(model)
+    _, _, tape = dv.step_forward(model, x, v, mu=1e4, lam=2e4, **STEP)
+    assert set(dv.step_backward(tape, torch.ones_like(x))) == {"x", "v"}
+    _, _, tape = dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=("mu", "rest_points", "density"), **STEP)
+    grads = dv.step_backward(tape, torch.ones_like(x))
+    assert {k: tuple(t.shape) for k, t in grads.items()} == {
+        "mu": (), "rest_points": (model.num_vertices, 3), "density": (model.num_tets,)}  # fmt: skip
+    assert all(t.abs().max() > 0 for t in grads.values())
+    zero = dv.step_backward(tape)
+    assert all(torch.equal(zero[k], torch.zeros_like(t)) for k, t in grads.items())
+    assert saved_bytes(lambda: dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=(), **STEP)) == 0
+    with pytest.raises(ValueError, match="grad_x.*got"):
+        dv.step_backward(tape, torch.ones(2, 3, dtype=torch.float64))
+    with pytest.raises((ValueError, TypeError), match="wrt.*force"):
+        dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=("force",), **STEP)
+    with pytest.raises((ValueError, TypeError), match="wrt.*stiffness"):
+        dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=("stiffness",), **STEP)
+
+
+# --- check_gradients ---------------------------------------------------------------------------------------------------
+
+
+class WrongBackward(torch.autograd.Function):
+    """The identity with a gradient that is 1 % too large."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor) -> Tensor:
+        return value.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        return 1.01 * grads[0]
+
+
+def test_check_gradients_tells_right_from_wrong(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = build_scene("anchored")
+    model, inputs = scene.model(), scene.inputs()
+    arguments = {k: inputs[k] for k in ("x", "v", "mu", "lam", "force", "rest_points", "density")}
+    rest = {k: value for k, value in inputs.items() if k not in arguments}
+
+    def loss(**given: Tensor) -> Tensor:
+        return total(*dv.step(model, **given, **rest, sweeps=3))
+
+    right = dv.check_gradients(loss, arguments)
+    assert right.ok, str(right)
+    assert [row[0] for row in right.rows] == list(arguments)
+    assert all(row[1] > 0 for row in right.rows)
+    assert "mu" in capsys.readouterr().out
+    wrong = dv.check_gradients(lambda **a: loss(**(a | {"mu": WrongBackward.apply(a["mu"])})), arguments, verbose=False)
+    assert not wrong.ok
+    assert [row[0] for row in wrong.rows if row[4] > wrong.tolerance] == ["mu"]
+    assert capsys.readouterr().out == "" and "above tolerance" in str(wrong)
+    with pytest.raises(ValueError, match="x.*float32"):
+        dv.check_gradients(loss, {"x": arguments["x"].float()})
+    with pytest.raises(ValueError, match="loss.*scalar"):
+        dv.check_gradients(lambda x: x, {"x": arguments["x"]})
+
+
+# --- float32 -----------------------------------------------------------------------------------------------------------
+
+
+def single(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: single(v) for k, v in value.items()}
+    return value.float() if isinstance(value, Tensor) else value
+
+
+@pytest.mark.parametrize("case", ["plain", "paper", "floor_damped", "floor_corner", "anchored", "batch"])
+def test_float32_is_near_float64(case: str) -> None:
+    scene = build_scene(case)
+    model, inputs = scene.model(), single(scene.inputs())
+    expected = evaluate(
+        lambda **o: dv.step(model, sweeps=3, **o),
+        {
+            k: {n: t.double() for n, t in a.items()} if isinstance(a, dict) else a.double() if isinstance(a, Tensor) else a
+            for k, a in inputs.items()
+        },
+    )
+    actual = evaluate(lambda **o: dv.step(model.to(dtype=torch.float32), sweeps=3, **o), inputs)
+    for name, value in expected.items():
+        assert actual[name].dtype == torch.float32
+        limit = tolerance("float32_gradient" if name.startswith("grad_") else "float32_forward")
+        if name == "v":  # a difference of positions over h: as exact as they are
+            scale = float(expected["x"].abs().max()) / inputs["time_step"] + float(value.abs().max())
+            assert float((actual[name] - value).abs().max()) <= limit * scale
+        else:
+            assert relative_error(actual[name], value) <= limit, name
+
+
+@pytest.mark.parametrize("distance", [10.0, 1000.0])
+def test_float32_far_from_the_origin(distance: float) -> None:
+    """Coordinates relative to each body: the step itself loses nothing, only the stored positions are coarse."""
+    near = dv.mesh.box((3, 2, 2))
+    offset = torch.tensor([distance, 0.0, -distance])
+    options = {"mu": 1e4, "lam": 2e4, **STEP}
+    moves, slopes = [], []
+    for mesh, shift in ((near, torch.zeros(3)), (near.translate(offset.tolist()), offset)):
+        model = dv.Model(mesh, pinned=[0, 1], dtype=torch.float32)
+        # multiples of 2^-10: exact in float32 a kilometre away too
+        x = torch.round((near_rest(near) + uniform(12, 3, low=-0.03, high=0.03)) * 1024) / 1024
+        x = (x.float() + shift).requires_grad_()
+        v = uniform(12, 3, low=-1.0, high=1.0).float()
+        out = dv.step(model, x, v, **options)
+        moves.append(out[1].detach())
+        slopes += torch.autograd.grad((out[1] * uniform(12, 3).float()).sum(), x)
+    assert relative_error(moves[1], moves[0]) <= tolerance("float32_forward")
+    assert relative_error(slopes[1], slopes[0]) <= tolerance("float32_gradient")
+
+
+def near_rest(mesh: dv.TetMesh) -> Tensor:
+    return torch.from_numpy(mesh.points.copy())
+
+
+def test_float32_of_joined_bodies_far_apart() -> None:
+    near = dv.mesh.cube()
+    pair = dv.mesh.join([near, near.translate([4096.0, 0.0, 0.0])])
+    x = (near_rest(pair) + 0.0).float()
+    v = uniform(8, 3, low=-1.0, high=1.0).float().repeat(2, 1)
+    model = dv.Model(pair, dtype=torch.float32)
+    out = dv.step(model, x, v, mu=1e4, lam=2e4, **STEP)
+    assert relative_error(out[1][8:], out[1][:8]) <= tolerance("float32_forward")
+    exact = dv.step(dv.Model(near), near_rest(near), v[:8].double(), mu=1e4, lam=2e4, **STEP)
+    assert relative_error(out[1][8:], exact[1]) <= tolerance("float32_forward")
+
+
+# --- vertex energies end to end ----------------------------------------------------------------------------------------
+
+
+def test_anchor_pulls_chosen_vertices_to_their_points() -> None:
+    """A free vertex without elastic energy is a damped spring: implicit Euler has a closed form."""
+    mesh = dv.mesh.cube()
+    points = near_rest(mesh) + 0.1
+    k, h = 30.0, 0.02
+    model = dv.Model(mesh, density=6.0, energies=(dv.Anchor(k, points=points, vertices=[2, 5]),))
+    x, v = state(model)
+    new, speed = dv.step(model, x, v, mu=0.0, lam=0.0, time_step=h, sweeps=1, gravity=(0.0, 0.0, 0.0))
+    m = model.mass[:, None]
+    y = x + h * v
+    chosen = torch.zeros(8, 1, dtype=torch.bool).index_fill(0, torch.tensor([2, 5]), True)
+    expected = torch.where(chosen, (m * y + h * h * k * points) / (m + h * h * k), y)
+    assert relative_error(new, expected) <= 1e-14
+    assert relative_error(speed, (expected - x) / h) <= 1e-12
+    by_mask = dv.Model(mesh, density=6.0, energies=(dv.Anchor(k, points=points, vertices=chosen[:, 0]),))
+    assert torch.equal(dv.step(by_mask, x, v, mu=0.0, lam=0.0, time_step=h, sweeps=1, gravity=(0, 0, 0))[0], new)
+    stiffness = torch.full((8,), k, dtype=torch.float64, requires_grad=True)
+    options = {"mu": 0.0, "lam": 0.0, "time_step": h, "sweeps": 1, "gravity": (0.0, 0.0, 0.0)}
+    out = dv.step(model, x, v, parameters={"anchor.stiffness": stiffness}, **options)
+    (slope,) = torch.autograd.grad(out[0].sum(), stiffness)
+    formula = (h * h * m * (points - y) / (m + h * h * k) ** 2).sum(-1) * chosen[:, 0]
+    assert relative_error(slope, formula) <= 1e-12
+
+
+def test_several_planes_keep_a_body_in_a_corner() -> None:
+    mesh = dv.mesh.cube(3, 0.2)
+    floor = dv.FloorBarrier(height=(0.0, 0.0), normal=((0.0, 2.0, 0.0), (1.0, 1.0, 0.0)), kappa=1e3, dhat=0.05)
+    model = dv.Model(mesh.translate([0.1, 0.1, 0.0]), energies=(dv.StableNeoHookean(), floor))
+    x, v = model.rest_points, torch.tensor([-30.0, -30.0, 0.0], dtype=torch.float64).expand(model.num_vertices, 3)
+    closest = []
+    for _ in range(20):
+        x, v = dv.step(model, x, v, mu=1e4, lam=1e4, time_step=0.01, sweeps=3)
+        closest.append(torch.stack([x[:, 1].min(), ((x[:, 0] + x[:, 1]) / math.sqrt(2)).min()]))
+    gaps = torch.stack(closest)
+    assert (gaps > 0).all()
+    assert (gaps.min(0).values < 0.05).all()  # both planes were met
+    one = dv.Model(mesh.translate([0.1, 0.1, 0.0]), energies=(dv.StableNeoHookean(), dv.FloorBarrier(kappa=1e3)))
+    x, v = one.rest_points, torch.tensor([-30.0, -30.0, 0.0], dtype=torch.float64).expand(one.num_vertices, 3)
+    x, _ = dv.step(one, x, v, mu=1e4, lam=1e4, time_step=0.01, sweeps=3)
+    assert (x[:, 0] + x[:, 1]).min() < 0  # without the second plane the body crosses it
