@@ -117,6 +117,7 @@ def _add_run_options(parser: argparse.ArgumentParser, directory: str) -> None:
 
 
 def _add_scene_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--scale", type=float, default=1.0, help="metres per unit of the file, 0.001 for mm (default 1)")
     # No defaults: identify must know which options were given, and Scene has the defaults.
     scene = parser.add_argument_group("scene")
     scene.add_argument("--time-step", type=float, help=f"[s] (default {Scene.time_step:.4g})")
@@ -148,12 +149,19 @@ def _solve(problem: Problem, settings: Settings) -> None:
     print("wrote " + ", ".join(str(path) for path in result.files))
 
 
+def _mesh(options: argparse.Namespace) -> dv.TetMesh:
+    mesh = dv.mesh.load(options.mesh)
+    if not (np.isfinite(options.scale) and options.scale > 0):
+        raise ValueError(f"--scale: expected a number > 0, got {options.scale}")
+    return mesh if options.scale == 1 else mesh.transform(options.scale * np.eye(3))
+
+
 def _simulate(options: argparse.Namespace) -> None:
     if options.out.suffix != ".pvd" or not options.out.parent.is_dir():
         raise ValueError(f"--out: expected a name that ends in .pvd in an existing directory, got {options.out}")
     if options.stride < 1:
         raise ValueError(f"--stride: expected at least 1, got {options.stride}")
-    mesh = dv.mesh.load(options.mesh)
+    mesh = _mesh(options)
     mu, lam = _material(options)
     v0 = np.broadcast_to(np.asarray(options.velocity or (0.0, 0.0, 0.0)), mesh.points.shape)
     given = _given_scene_options(options, mesh)
@@ -171,7 +179,7 @@ def _simulate(options: argparse.Namespace) -> None:
 
 
 def _identify(options: argparse.Namespace) -> None:
-    mesh = dv.mesh.load(options.mesh)
+    mesh = _mesh(options)
     given = _given_scene_options(options, mesh) | {"steps": options.steps}
     observation = Observation.load(options.target, mesh, **given)
     settings = Settings(options.out or Path("runs/identify"), options.device, options.seed)

@@ -20,7 +20,7 @@ from .step import GRAVITY, check_state
 SATURATION_TOO_LARGE = 1.0  # c over the mean edge: one update may then turn a tet inside out
 SATURATION_TOO_SMALL = 0.01  # c over the mean edge: 20 sweeps no longer reach a large deformation
 REGULARIZATION_SHARE = 0.1  # tau over the mass of the lightest vertex: convergence slows
-RESOLUTION = 1e-5  # rounding of a position over the shortest edge; a gradient's error is 10 to 20 times that
+RESOLUTION = 1e-5  # rounding of a position over the shortest edge; a gradient's error is 6 to 22 times that
 LARGE_STRAIN = 100.0  # Green strain; a gradient keeps 11 digits there and loses them with a power of the strain
 UNBALANCED = 0.01  # left-over force over the forces of the step; at 0.014 a hanging bar rests 1.5 to 11 % off
 STABLE_RELAXATION = 1.7  # beyond it some rollouts grow, although every step descends

@@ -43,7 +43,8 @@ def predict(
             kept: the largest amount kept at once: all steps without checkpoints; states plus the steps of one segment
                 with checkpoints every n; states plus one step with Binomial. The state of the random number generator,
                 5 kB, is kept with every checkpoint (with Binomial: with every step). ``rest`` adds the graph of the
-                rest metric, once (297 B per tet), for rest_points that the scenes share;
+                rest metric, once (297 B per tet), for rest_points that the scenes share. Binomial with frames saved:
+                an upper estimate;
             scratch: of one backward step, in scenes that run side by side on as many threads;
             total: kept + scratch.
     """
@@ -58,6 +59,8 @@ def predict(
     per_step = 2 * state + tape_bytes
     if model.floor is not None:
         per_step += 2 * state + scenes * model.num_vertices * model.floor.planes * (4 * item + 2)
+    if save not in ("all", "last"):
+        save = check_count("save", save, 1)
     frames = {"last": 1, "all": steps + 1}.get(save) or steps // save + 2
     generator = torch.get_rng_state().numel()
     if schedule is None:

@@ -168,14 +168,16 @@ def _stacked(observed: list[Any]) -> Any:
 
 
 class _Progress:
-    """A line on stderr. Steps that a backward runs again are not counted twice."""
+    """One line on a terminal, ten in a log. Steps that a backward runs again are not counted twice."""
 
     def __init__(self, steps: int) -> None:
-        self.steps, self.shown = steps, 0
+        self.steps, self.shown, self.terminal = steps, 0, sys.stderr.isatty()
 
     def show(self, k: int) -> None:
         if k <= self.shown:
             return
-        self.shown = k
-        end = "\n" if k == self.steps else ""
-        print(f"\rstep {k}/{self.steps}", end=end, file=sys.stderr, flush=True)
+        last, self.shown = self.shown, k
+        if self.terminal:
+            print(f"\rstep {k}/{self.steps}", end="\n" if k == self.steps else "", file=sys.stderr, flush=True)
+        elif 10 * k // self.steps > 10 * last // self.steps:
+            print(f"step {k}/{self.steps}", file=sys.stderr, flush=True)

@@ -39,6 +39,8 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "block_residual": (1e-12, "residual right after its exact update, relative to the sum of its terms' magnitudes"),
     "closed_form": (1e-9, "converged sweeps against a formula: sweeps stop at that residual, not rounding"),
     "one_vertex": (1e-13, "one free vertex is solved by one sweep; rounding of the recurrence"),
+    "property_factor": (100.0, "two samples of rounding in a scene of a few tets: ten times what spread_factor allows"),
+    "property_subset": (1e-12, "the same sweeps in a leaner variant; a given rest shape rounds its metric anew"),
     "invariance": (1e-12, "rotation and translation change every rounding in the sweep"),
     "momentum": (1e-12, "converged step, relative to sum m |v|; sweeps stop at rounding level"),
     "finite_difference": (1e-6, "central differences in float64: error h^2 + eps/h is about 1e-10, times curvature"),

@@ -79,8 +79,9 @@ def test_bytes_of_one_step(tape: str, floor: bool, scenes: int, wanted: str) -> 
     predicted = model.memory(sweeps=SWEEPS, scenes=scenes, tape=tape, rest=wanted == "rest_points")
     graph = model.memory(sweeps=SWEEPS, rest=True)["kept"] - model.memory(sweeps=SWEEPS)["kept"]
     # the filter's intermediates are saved only for a start that requires grad
-    if floor and tape == "recompute" and wanted != "v":
-        assert measured <= predicted["step"] + graph
+    if floor and wanted != "v":
+        assert measured <= (1 + tolerance("memory")) * (predicted["step"] + graph)
+        assert measured >= predicted["tape"]
         return
     assert_near(predicted["step"] + (graph if wanted == "rest_points" else 0), measured)
 
@@ -105,9 +106,9 @@ def test_the_tape_is_what_the_documentation_says(tape: str, scalars: int, dtype:
 
 def test_auto_chooses_by_size() -> None:
     model = beam_model()
-    small, large = (model.memory(sweeps=sweeps, tape="auto") for sweeps in (20, 10_000))
+    small, large = (model.memory(sweeps=sweeps, tape="auto") for sweeps in (20, 60_000))
     assert small["tape"] == 20 * model.num_active * 72
-    assert large["tape"] == 10_000 * model.num_active * 24
+    assert large["tape"] == 60_000 * model.num_active * 24
     long = model.memory(sweeps=20, steps=100_000)
     assert long["kept"] < 0.05 * model.memory(sweeps=20, steps=100_000, checkpoint_every=None)["kept"]
 
@@ -124,7 +125,7 @@ ROLLOUTS = [
     ("compact", 12, 4, "all"),
     ("compact", 40, dv.Binomial(4), "last"),
     ("recompute", 12, None, "all"),
-    ("recompute", 12, 4, "last"),
+    ("recompute", 40, 10, "last"),
 ]
 
 
@@ -140,14 +141,20 @@ def test_bytes_of_a_rollout(tape: str, steps: int, schedule: Any, save: Any) -> 
         return dv.rollout(model, x, v, steps=steps, checkpoint_every=schedule, save=save, **options)
 
     def backward(*given: Any) -> None:
-        torch.autograd.grad(forward(*given).x.sum(), (v, mu))
+        trajectory = forward(*given)
+        torch.autograd.grad(trajectory.x.sum(), (v, mu))
 
     # what the backward of a step needs in passing is measured on one step and taken off
-    passing = allocated_bytes(lambda: backward(1, None, "last"))[1] - allocated_bytes(lambda: forward(1, None, "last"))[0]
+    passing = (
+        allocated_bytes(lambda: backward(1, None, "last"))[1] - allocated_bytes(lambda: forward(1, None, "last"))[0]
+    )
     held, _ = allocated_bytes(forward)
     peak = allocated_bytes(backward)[1]
     predicted = model.memory(sweeps=SWEEPS, steps=steps, tape=tape, checkpoint_every=schedule, save=save)
-    assert_near(predicted["kept"], peak - passing)
+    if isinstance(schedule, dv.Binomial) and save != "last":  # an upper estimate, see its documentation
+        assert 0.7 * predicted["kept"] <= peak - passing <= predicted["kept"]
+    else:
+        assert_near(predicted["kept"], peak - passing)
     assert peak <= (1 + tolerance("memory")) * predicted["total"]
     if schedule is None:
         assert_near(predicted["kept"], held)

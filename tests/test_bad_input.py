@@ -1,0 +1,370 @@
+"""Bad input: a ValueError or TypeError that names the argument and says what came; inputs stay untouched."""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+
+NAN, INF = float("nan"), float("inf")
+MESH = dv.mesh.cube()  # 8 vertices, 6 tets
+STEP = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 1}
+
+
+def doubles(*values: Any) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def model_of(kind: str = "exact") -> dv.Model:
+    energies = (dv.StableNeoHookean(kind), dv.FloorBarrier(height=-0.5), dv.Anchor(1.0))
+    return dv.Model(MESH, pinned=[0], energies=energies)
+
+
+def spoiled(value: float, *where: int) -> Tensor:
+    """Positions with one bad entry."""
+    out = torch.from_numpy(MESH.points.copy())
+    out[where] = value
+    return out
+
+
+def ones(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.ones(shape, dtype=dtype)
+
+
+def raises(run: Callable[[], Any], name: str, got: str) -> None:
+    """run() raises ValueError or TypeError whose message names the argument first and contains what came."""
+    with pytest.raises((ValueError, TypeError)) as error:
+        run()
+    assert type(error.value) in (ValueError, TypeError)
+    message = str(error.value)
+    assert re.match(rf"[\w ,.\"\[\]()]*{re.escape(name)}", message), message
+    assert "expected" in message and re.search(got, message), message
+
+
+# --- arguments of a step ----------------------------------------------------------------------------------------------
+
+ARGUMENTS: list[tuple[str, Any, str]] = [
+    # shape
+    ("x", ones(5, 3), r"\[5, 3\]"),
+    ("x", ones(3), r"\[3\]"),
+    ("x", ones(8, 2), r"\[8, 2\]"),
+    ("v", ones(5, 3), r"\[5, 3\]"),
+    ("v", ones(1, 8, 3), r"\[1, 8, 3\]"),
+    ("mu", ones(5), r"\[5\]"),
+    ("mu", ones(2, 6), r"\[2, 6\]"),
+    ("lam", ones(6, 1), r"\[6, 1\]"),
+    ("density", ones(8), r"\[8\]"),
+    ("force", ones(8, 2), r"\[8, 2\]"),
+    ("force", ones(2, 8, 3), r"\[2, 8, 3\]"),
+    ("gravity", ones(2), r"\[2\]"),
+    ("gravity", (0.0, 1.0), "2 numbers"),
+    ("prescribed", ones(3, 3), r"\[3, 3\]"),
+    ("rest_points", ones(4, 3), r"\[4, 3\]"),
+    ("floor_barrier.height", ones(3), r"\[3\]"),
+    ("floor_barrier.kappa", ones(2), r"\[2\]"),
+    ("anchor.stiffness", ones(7), r"\[7\]"),
+    ("anchor.points", ones(7, 3), r"\[7, 3\]"),
+    # dtype
+    *((name, ones(8, 3, dtype=torch.float32), "float32") for name in ("x", "v", "force", "prescribed", "rest_points")),
+    ("x", ones(8, 3, dtype=torch.int64), "int64"),
+    ("x", ones(8, 3, dtype=torch.complex128), "complex128"),
+    ("mu", ones(6, dtype=torch.float32), "float32"),
+    ("lam", ones(dtype=torch.int64), "int64"),
+    ("density", ones(dtype=torch.float16), "float16"),
+    ("gravity", ones(3, dtype=torch.float32), "float32"),
+    ("anchor.stiffness", ones(dtype=torch.float32), "float32"),
+    # device
+    *((name, ones(8, 3).to("meta"), "meta") for name in ("x", "v", "force", "gravity", "prescribed", "rest_points")),
+    *((name, ones(6).to("meta"), "meta") for name in ("mu", "lam", "density")),
+    ("anchor.points", ones(8, 3).to("meta"), "meta"),
+    # type
+    ("x", [[0.0, 0.0, 0.0]] * 8, "list"),
+    ("x", np.zeros((8, 3)), "ndarray"),
+    ("v", None, "None"),
+    ("mu", "soft", "str"),
+    ("mu", None, "None"),
+    ("mu", True, "bool"),
+    ("mu", [1e4] * 6, "list"),
+    ("lam", np.full(6, 1e4), "ndarray"),
+    ("density", "heavy", "str"),
+    ("force", [1.0, 2.0, 3.0], "list"),
+    ("gravity", "off", "str|off"),
+    ("gravity", -9.81, "float|9.81"),
+    ("gravity", None, "None"),
+    ("prescribed", "here", "str"),
+    ("rest_points", MESH, "TetMesh"),
+    ("floor_barrier.kappa", "stiff", "str"),
+    ("floor_barrier.kappa", None, "None"),
+    ("parameters", [("floor_barrier.kappa", 1.0)], "list"),
+    ("adjoint", "full", "str|full"),
+    # not finite
+    *((name, spoiled(bad, 3, 1), str(bad)) for name in ("x", "v", "force") for bad in (NAN, INF)),
+    ("x", spoiled(NAN, 0, 0), "nan"),
+    ("gravity", (0.0, NAN, 0.0), "nan"),
+    ("gravity", doubles(0.0, INF, 0.0), "inf"),
+    ("prescribed", spoiled(NAN, 0, 2), "nan"),
+    ("rest_points", spoiled(NAN, 5, 0), "nan"),
+    ("rest_points", spoiled(INF, 5, 0), "nan|inf"),
+    *((name, bad, str(bad)) for name in ("mu", "lam", "density") for bad in (NAN, INF)),
+    *((f"floor_barrier.{name}", NAN, "nan") for name in ("kappa", "dhat", "damping")),
+    ("parameters", {"floor_barrier.height": doubles(NAN)}, "nan"),
+    ("parameters", {"floor_barrier.normal": doubles([0.0, NAN, 0.0])}, "nan"),
+    ("parameters", {"floor_barrier.normal": doubles([0.0, 0.0, 0.0])}, "nan|0"),
+    ("anchor.stiffness", NAN, "nan"),
+    ("parameters", {"anchor.points": spoiled(NAN, 3, 1)}, "nan"),
+    # range
+    ("mu", -1.0, "-1"),
+    ("mu", doubles(1.0, 1.0, 1.0, -2.5, 1.0, 1.0), "-2.5.*tet 3"),
+    ("lam", -2e4, "-20000.*mu 10000"),
+    ("lam", doubles(1.0, -1e4 - 1, 1.0, 1.0, 1.0, 1.0), "-10001.*tet 1"),
+    ("density", -5.0, "-"),
+    ("density", 0.0, "0"),
+    ("density", doubles(1e3, 1e3, -100.0, 1e3, 1e3, 1e3), "-100"),
+    ("floor_barrier.kappa", -1.0, "-1"),
+    ("floor_barrier.dhat", 0.0, "0"),
+    ("floor_barrier.dhat", -1.0, "-1"),
+    ("floor_barrier.damping", -1.0, "-1"),
+    ("anchor.stiffness", -1.0, "-1"),
+    ("parameters", {"floor.kappa": 1.0}, "floor.kappa"),
+    ("parameters", {"kappa": 1.0}, "kappa"),
+    # rest shapes that are no shapes
+    ("rest_points", torch.from_numpy(MESH.points * [-1.0, 1.0, 1.0]), r"-0\.16.* tet 0"),
+    ("rest_points", torch.from_numpy(MESH.points * [1.0, 1.0, 0.0]), "0 m"),
+    ("rest_points", spoiled(-1.0, 7), "-.*tet 0"),
+    # counts and sizes
+    ("time_step", 0, "0"),
+    ("time_step", -0.1, "-0.1"),
+    ("time_step", NAN, "nan"),
+    ("time_step", INF, "inf"),
+    ("time_step", True, "bool"),
+    ("time_step", "fast", "str"),
+    ("time_step", None, "None"),
+    ("sweeps", -1, "-1"),
+    ("sweeps", 1.5, "1.5"),
+    ("sweeps", 2.0, "2.0"),
+    ("sweeps", True, "bool"),
+    ("sweeps", "3", "'3'"),
+    ("sweeps", None, "None"),
+]
+
+
+def step_with(model: dv.Model, name: str, value: Any, lead: tuple[int, ...] = (), **options: Any) -> Any:
+    x = torch.from_numpy(MESH.points.copy()).repeat(*lead, 1, 1)
+    given: dict[str, Any] = {"x": x, "v": torch.zeros_like(x), **STEP, **options}
+    given |= {"parameters": {name: value}} if "." in name else {name: value}
+    return dv.step(model, **given)
+
+
+@pytest.mark.parametrize(("name", "value", "got"), ARGUMENTS, ids=lambda a: str(a)[:24].replace("\n", " "))
+def test_bad_argument_of_a_step(name: str, value: Any, got: str) -> None:
+    model = model_of()
+    before = value.clone() if isinstance(value, Tensor) and value.device.type == "cpu" else None
+    raises(lambda: step_with(model, name, value), name, got)
+    if before is not None:
+        assert torch.equal(value.nan_to_num(), before.nan_to_num())
+    step_with(model, "mu", 1e4)  # the Model still works
+
+
+@pytest.mark.parametrize("name", ["x", "v", "mu", "force", "gravity", "rest_points", "density"])
+def test_the_same_in_a_rollout(name: str) -> None:
+    bad = {"mu": -1.0, "density": -1.0, "gravity": (0.0, NAN, 0.0)}.get(name, spoiled(NAN, 3, 1))
+    x = torch.from_numpy(MESH.points.copy())
+    given = {"x": x, "v": torch.zeros_like(x), **STEP, name: bad}
+    raises(lambda: dv.rollout(model_of(), steps=2, **given), name, "nan|-")
+    given[name] = dv.per_step(torch.stack([torch.full_like(x[0], NAN)] * 2)) if name == "gravity" else given[name]
+    raises(lambda: dv.rollout(model_of(), steps=2, **given), name, "nan|-")
+
+
+def test_negative_lam_is_legal_where_its_block_allows_it() -> None:
+    assert torch.isfinite(step_with(model_of("exact"), "lam", -9e3)[0]).all()
+    raises(lambda: step_with(model_of("paper"), "lam", -1.0), "lam", "-1")
+    for kind in ("exact", "paper"):
+        assert torch.isfinite(step_with(model_of(kind), "mu", 0.0)[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"), [("mu", (3, 1)), ("lam", (3, 6)), ("density", (3, 1)), ("force", (3, 8, 3)),
+                        ("gravity", (3, 1, 3)), ("rest_points", (3, 8, 3)), ("anchor.points", (3, 8, 3))],
+)  # fmt: skip
+def test_mismatched_batch(name: str, shape: tuple[int, ...]) -> None:
+    raises(lambda: step_with(model_of(), name, ones(*shape), lead=(2,)), name, re.escape(str(list(shape))))
+
+
+def test_a_value_check_names_the_scene() -> None:
+    raises(lambda: step_with(model_of(), "mu", doubles([1.0], [-1.0]), lead=(2,)), "mu", "-1 at tet 0 of scene 1")
+    second = torch.stack([spoiled(0.0, 0, 0), spoiled(NAN, 3, 1)])
+    raises(lambda: step_with(model_of(), "x", second, v=torch.zeros_like(second)), "x", "vertex 3 of scene 1")
+
+
+def test_starting_below_a_plane_names_vertices() -> None:
+    below = spoiled(-0.6, 5, 1)
+    below[2, 1] = -0.5  # on the plane
+    below[0, 1] = -3.0  # pinned: legal
+    raises(lambda: step_with(model_of(), "x", below), "x", r"2 on or below.*\b(2, 5|5, 2)$")
+    below[[2, 5], 1] = 0.0
+    assert torch.isfinite(step_with(model_of(), "x", below)[0]).all()
+
+
+def test_values_that_are_not_read_are_not_checked() -> None:
+    model = model_of()
+    prescribed = torch.where(model.pinned[:, None], model.rest_points, NAN).requires_grad_()
+    x, _ = step_with(model, "prescribed", prescribed)
+    assert torch.isfinite(x).all()
+    (slope,) = torch.autograd.grad(x.sum(), prescribed)
+    assert torch.isfinite(slope).all()
+    assert (slope[model.pinned] != 0).all() and (slope[~model.pinned] == 0).all()
+
+
+def test_a_model_of_another_class_or_mesh() -> None:
+    raises(lambda: step_with(MESH, "mu", 1.0), "model", "TetMesh")
+    other = dv.Model(dv.mesh.cube(3))
+    raises(lambda: step_with(other, "mu", 1.0), "x", r"\[8, 3\]")
+
+
+# --- building ---------------------------------------------------------------------------------------------------------
+
+LOOSE = dv.TetMesh(np.concatenate([MESH.points, np.ones((2, 3)) * 3]), MESH.tets)
+
+MODELS: list[tuple[str, dict[str, Any], str]] = [
+    ("mesh", {"mesh": "beam.msh"}, "str"),
+    ("mesh", {"mesh": (MESH.points, MESH.tets)}, "tuple"),
+    ("mesh", {"mesh": LOOSE}, "2 isolated vertices: 8, 9"),
+    ("mesh", {"mesh": LOOSE, "pinned": [8]}, "1 isolated vertices: 9"),
+    *(("density", {"density": bad}, str(bad)) for bad in (-1.0, 0.0, NAN, INF)),
+    ("density", {"density": doubles(1.0, 1.0, -3.0, 1.0, 1.0, 1.0)}, "-3"),
+    ("density", {"density": doubles(1.0, 1.0, 1.0, 1.0, INF, 1.0)}, "inf"),
+    ("density", {"density": ones(8)}, r"\[8\]"),
+    ("density", {"density": "steel"}, "str"),
+    ("density", {"density": True}, "bool"),
+    ("density", {"density": None}, "None"),
+    ("pinned", {"pinned": [8]}, "8"),
+    ("pinned", {"pinned": [0, -1]}, "-1"),
+    ("pinned", {"pinned": [0.5]}, "float"),
+    ("pinned", {"pinned": torch.zeros(7, dtype=torch.bool)}, r"\[7\]"),
+    ("pinned", {"pinned": "left"}, "str|left"),
+    ("saturation", {"saturation": 0.0}, "0"),
+    ("saturation", {"saturation": -0.1}, "-0.1"),
+    ("saturation", {"saturation": NAN}, "nan"),
+    ("saturation", {"saturation": "some"}, "str"),
+    ("saturation", {"saturation": True}, "bool"),
+    ("regularization", {"regularization": -1e-6}, "-1e-06"),
+    ("regularization", {"regularization": NAN}, "nan"),
+    ("regularization", {"regularization": "some"}, "str|some"),
+    ("regularization", {"regularization": None}, "None"),
+    ("relaxation", {"relaxation": 0.0}, "0"),
+    ("relaxation", {"relaxation": 2.0}, "2"),
+    ("relaxation", {"relaxation": -1.0}, "-1"),
+    ("relaxation", {"relaxation": NAN}, "nan"),
+    ("relaxation", {"relaxation": None}, "None"),
+    ("energies", {"energies": ("neo",)}, "str"),
+    ("energies", {"energies": (dv.StableNeoHookean,)}, "type"),
+    ("energies", {"energies": None}, "None"),
+    ("energies", {"energies": (dv.StableNeoHookean(), dv.StableNeoHookean("paper"))}, "two"),
+    ("energies", {"energies": (dv.FloorBarrier(), dv.FloorBarrier(1.0))}, "two"),
+    ("dtype", {"dtype": torch.float16}, "float16"),
+    ("dtype", {"dtype": "float32"}, "float32"),
+]
+
+
+@pytest.mark.parametrize(("name", "options", "got"), MODELS, ids=lambda a: str(a)[:30].replace("\n", " "))
+def test_bad_argument_of_a_model(name: str, options: dict[str, Any], got: str) -> None:
+    raises(lambda: dv.Model(**{"mesh": MESH, **options}), name, got)
+
+
+ENERGIES: list[tuple[str, Callable[[], Any], str]] = [
+    ("block", lambda: dv.StableNeoHookean("best"), "best"),
+    *((n, lambda n=n: dv.FloorBarrier(**{n: -1.0}), "-1") for n in ("kappa", "dhat", "damping")),
+    *((n, lambda n=n: dv.FloorBarrier(**{n: NAN}), "nan") for n in ("kappa", "dhat", "damping", "height")),
+    *((n, lambda n=n: dv.FloorBarrier(**{n: True}), "bool|True") for n in ("kappa", "dhat", "damping")),
+    *((n, lambda n=n: dv.FloorBarrier(**{n: None}), "None") for n in ("kappa", "dhat", "damping", "height", "normal")),
+    ("dhat", lambda: dv.FloorBarrier(dhat=0.0), "0"),
+    ("normal", lambda: dv.FloorBarrier(normal=(0.0, 0.0, 0.0)), "0"),
+    ("normal", lambda: dv.FloorBarrier(normal=(0.0, NAN, 0.0)), "nan"),
+    ("normal", lambda: dv.FloorBarrier(normal=(0.0, 1.0)), "2"),
+    ("normal", lambda: dv.FloorBarrier(normal=[(0, 1, 0)] * 9), "9"),
+    ("height", lambda: dv.FloorBarrier(height=(0.0, 1.0), normal=[(0, 1, 0)] * 3), "2 values"),
+    ("stiffness", lambda: dv.Anchor(-1.0), "-1"),
+    ("stiffness", lambda: dv.Anchor(NAN), "nan"),
+    ("stiffness", lambda: dv.Anchor(None), "None"),
+    ("stiffness", lambda: dv.Model(MESH, energies=(dv.Anchor(ones(7)),)), r"\[7\]"),
+    ("points", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, points=ones(7, 3)),)), r"\[7, 3\]"),
+    ("points", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, points=spoiled(NAN, 2, 2)),)), "nan"),
+    ("vertices", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, vertices=[9]),)), "9"),
+    ("vertices", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, vertices=[0.5]),)), "float"),
+    ("vertices", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, vertices=torch.zeros(7, dtype=torch.bool)),)), "7"),
+    ("tape", lambda: dv.ReverseSweep("half"), "half"),
+    ("dtype", lambda: dv.Model(MESH).to(dtype=torch.int64), "int64"),
+    ("sweeps", lambda: dv.Model(MESH).memory(sweeps=-1), "-1"),
+    ("steps", lambda: dv.Model(MESH).memory(sweeps=1, steps=1.5), "1.5"),
+    ("scenes", lambda: dv.Model(MESH).memory(sweeps=1, scenes=True), "bool"),
+    ("save", lambda: dv.Model(MESH).memory(sweeps=1, save="most"), "most"),
+    ("save", lambda: dv.Model(MESH).memory(sweeps=1, save=0), "0"),
+]
+
+
+@pytest.mark.parametrize(("name", "build", "got"), ENERGIES, ids=lambda a: a if isinstance(a, str) else "")
+def test_bad_parameter_of_an_energy_or_option(name: str, build: Callable[[], Any], got: str) -> None:
+    raises(build, name, got)
+
+
+@pytest.mark.parametrize(
+    ("name", "points", "tets", "got"),
+    [("tets", MESH.points, MESH.tets[:, [1, 0, 2, 3]], "inverted 6 tets"),
+     ("tets", MESH.points * [1, 1, 0], MESH.tets, "zero volume in 6 tets"),
+     ("tets", MESH.points, MESH.tets + 1, "8"),
+     ("tets", MESH.points, MESH.tets - 1, "-1"),
+     ("tets", MESH.points, MESH.tets.astype(float), "float64"),
+     ("points", np.where(MESH.points == 1, NAN, MESH.points), MESH.tets, "NaN")],
+)  # fmt: skip
+def test_bad_mesh(name: str, points: Any, tets: Any, got: str) -> None:
+    raises(lambda: dv.TetMesh(points, tets), name, got)
+
+
+# --- debug_checks -----------------------------------------------------------------------------------------------------
+
+HUGE = {"mu": 1e305, "lam": 1e308, "time_step": 1.0}
+
+
+@pytest.mark.parametrize("lead", [(), (1,), (2,), (5,)])
+def test_debug_checks_say_where_a_position_ceased_to_be_finite(lead: tuple[int, ...]) -> None:
+    model = model_of()
+    x = model.rest_points.repeat(*lead, 1, 1)
+    force = torch.zeros_like(x)
+    force.reshape(-1, 8, 3)[-1] = 1e150  # the last scene only
+    options = HUGE | {"sweeps": 3, "force": force}
+    if lead:
+        for name in ("mu", "lam"):
+            options[name] = torch.full((*lead, 1), 1e4, dtype=torch.float64)
+            options[name][-1] = HUGE[name]
+    with dv.debug_checks():
+        with pytest.raises(RuntimeError) as error:
+            dv.step(model, x, torch.zeros_like(x), **options)
+    scene = lead[-1] - 1 if lead else 0
+    assert re.search(rf"step 0, sweep \d+, color \d+, vertex \d+, scene {scene}\b", str(error.value)), str(error.value)
+    x, _ = dv.step(model, x, torch.zeros_like(x), **options)  # off again
+    assert not torch.isfinite(x).all()
+
+
+def test_debug_checks_count_the_steps_of_a_rollout() -> None:
+    model = model_of()
+    x = model.rest_points
+    options = STEP | {"time_step": 1.0, "sweeps": 2, "force": torch.full_like(x, 1e3)}
+    options["mu"] = lambda k, x, v: 1e308 if k == 2 else 1e4
+    with dv.debug_checks(), pytest.raises(RuntimeError, match=r"step 2, sweep 0, color \d+, vertex \d+"):
+        dv.rollout(model, x, torch.zeros_like(x), steps=4, **options)
+    with dv.debug_checks(), dv.debug_checks(False):
+        assert len(dv.rollout(model, x, torch.zeros_like(x), steps=3, **options).steps) == 4
+
+
+def test_debug_checks_change_nothing_in_a_sound_step() -> None:
+    model = model_of()
+    x = model.rest_points + 0.01
+    expected = dv.step(model, x, torch.zeros_like(x), **STEP)
+    with dv.debug_checks():
+        actual = dv.step(model, x, torch.zeros_like(x), **STEP)
+    assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
