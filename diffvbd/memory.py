@@ -59,9 +59,10 @@ def predict(
     per_step = 2 * state + tape_bytes
     if model.floor is not None:
         per_step += 2 * state + scenes * model.num_vertices * model.floor.planes * (4 * item + 2)
-    if save not in ("all", "last"):
-        save = check_count("save", save, 1)
-    frames = {"last": 1, "all": steps + 1}.get(save) or steps // save + 2
+    if save in ("all", "last"):
+        frames = steps + 1 if save == "all" else 1
+    else:
+        frames = steps // check_count("save", save, 1) + 2
     generator = torch.get_rng_state().numel()
     if schedule is None:
         kept = steps * per_step

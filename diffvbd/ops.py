@@ -7,6 +7,7 @@ torch.func and torch.compile; the backward is a second Function, whose own backw
 # pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
+import inspect
 import sysconfig
 from collections.abc import Sequence
 from pathlib import Path
@@ -350,6 +351,11 @@ class _SweepBackward(Function):
         return result, (0,) * len(result)
 
     jvp = staticmethod(_no_forward_mode)
+
+
+# apply() asks for the signature of forward at every call: ready-made, it costs nothing.
+for _function in (_RowSum, _Broadcast, _TetGather, _StarSum, _Sweep, _SweepBackward):
+    _function.forward.__signature__ = inspect.signature(_function.forward)  # type: ignore[attr-defined]
 
 
 def _member_sum(values: Tensor) -> Tensor:

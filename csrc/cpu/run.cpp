@@ -66,7 +66,7 @@ void unpack_rows(const Plan& plan, const T* rows, T* user) {
 // The arrays of one scene in sweep order.
 template <class T>
 struct Scene {
-  Buffer<T> x, y, x_prev, origin, mass;
+  Buffer<T> x, y, x_prev, origin, mass, material;
   SceneView<T> view{};
   int64_t data_size;
 
@@ -90,8 +90,16 @@ struct Scene {
     view.x_prev = x_prev.get();
     view.origin = origin.get();
     view.mass = mass.get();
-    view.mu = {in.mu.data + scene * in.mu.scene, 0, in.mu.item};
-    view.lam = {in.lam.data + scene * in.lam.scene, 0, in.lam.item};
+    if (in.energies & (kExactBlock | kPaperBlock)) {
+      material = Buffer<T>(size_t(plan.slots) * 2 * kLanes);
+      const T *mu = in.mu.data + scene * in.mu.scene, *lam = in.lam.data + scene * in.lam.scene;
+      for (int64_t i = 0; i < int64_t{plan.slots} * kLanes; ++i) {
+        const int64_t tet = plan.pair[i] >> 2, at = i / kLanes * 2 * kLanes + i % kLanes;
+        material.get()[at] = mu[tet * in.mu.item];
+        material.get()[at + kLanes] = lam[tet * in.lam.item];
+      }
+      view.material = material.get();
+    }
     view.rest = in.rest.data + scene * in.rest.scene;
     view.data = in.data.data + scene * in.data.scene;
     int64_t start = 0;

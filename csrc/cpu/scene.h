@@ -55,14 +55,14 @@ struct Batched {
 
 template <class T>
 struct SceneView {
-  T* x;             // [blocks kLanes, 4]  positions, rows of one cache half-line, so that a gather touches one line
-  const T* y;       // [blocks, 3, kLanes]
-  const T* x_prev;  // [blocks, 3, kLanes] or null
-  const T* origin;  // [blocks, 3, kLanes] or null
-  const T* mass;    // [blocks, kLanes]
-  Batched<const T> mu, lam;
-  const T* rest;  // [slots, 4, kLanes]  k_ij, k_ik, k_il, c6
-  const T* data;  // energies: per-scene ones (count), per-vertex ones (vertices, stride), in the order of the list
+  T* x;               // [blocks kLanes, 4]  positions, rows of one cache half-line, so that a gather touches one line
+  const T* y;         // [blocks, 3, kLanes]
+  const T* x_prev;    // [blocks, 3, kLanes] or null
+  const T* origin;    // [blocks, 3, kLanes] or null
+  const T* mass;      // [blocks, kLanes]
+  const T* material;  // [slots, 2, kLanes]  mu, lam: gathered once a step, read in every sweep
+  const T* rest;      // [slots, 4, kLanes]  k_ij, k_ik, k_il, c6
+  const T* data;      // energies: per-scene ones (count), per-vertex ones (vertices, stride), in the order of the list
   int64_t data_start[kVertexEnergies];
   int data_count[kVertexEnergies];
   T* tape;  // [sweeps, rows, active]
@@ -127,16 +127,11 @@ struct LaneStar {
         edges(edge_rows) {}
   DIFFVBD_FN int size() const { return count; }
 
-  DIFFVBD_FN Lanes<T> material(const Batched<const T>& m, const int32_t* pair) const {
-    Lanes<T> out;
-    for (int l = 0; l < kLanes; ++l) out.v[l] = m.data[(pair[l] >> 2) * m.item];
-    return out;
-  }
   DIFFVBD_FN TetPair<Lanes<T>> pair(int e) const {
     const int64_t slot = first + e;
     const int32_t* j = plan.neighbors + slot * 3 * kLanes;
-    const int32_t* id = plan.pair + slot * kLanes;
     const T* r = s.rest + slot * 4 * kLanes;
+    const T* m = s.material + slot * 2 * kLanes;
     TetPair<Lanes<T>> out;
     out.xj = gather3(s.x, j);
     out.xk = gather3(s.x, j + kLanes);
@@ -145,8 +140,8 @@ struct LaneStar {
     out.k_ik = Lanes<T>::load(r + kLanes);
     out.k_il = Lanes<T>::load(r + 2 * kLanes);
     out.c6 = Lanes<T>::load(r + 3 * kLanes);
-    out.mu = material(s.mu, id);
-    out.lam = material(s.lam, id);
+    out.mu = Lanes<T>::load(m);
+    out.lam = Lanes<T>::load(m + kLanes);
     return out;
   }
 
