@@ -23,6 +23,6 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "build_plan(Tensor points, Tensor tets, Tensor active) -> (Tensor plan, Tensor color_ptr, Tensor color_vertices, "
       "Tensor star_ptr, Tensor star)");
   m.def("tet_gather(Tensor values, Tensor tets) -> Tensor");
-  m.def("star_sum(Tensor values, Tensor star_ptr, Tensor star) -> Tensor");
+  m.def("star_sum(Tensor values, Tensor star_ptr, Tensor star, bool positive) -> Tensor");
   m.def("row_sum(Tensor values) -> Tensor");
 }

@@ -7,28 +7,33 @@ _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from . import mesh
 from .adjoints import ReverseSweep
+from .diagnostics import Diagnosis, diagnose
 from .energies import Anchor, FloorBarrier, StableNeoHookean
-from .gradcheck import check_gradients
+from .gradcheck import GradientCheck, check_gradients
 from .mesh import TetMesh
 from .model import Model
 from .rollout import Trajectory, per_step, rollout
 from .schedule import Binomial
 from .step import debug_checks, step
-from .tape import step_backward, step_forward
+from .tape import Tape, step_backward, step_forward
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Anchor",
     "Binomial",
+    "Diagnosis",
     "FloorBarrier",
+    "GradientCheck",
     "Model",
     "ReverseSweep",
     "StableNeoHookean",
+    "Tape",
     "TetMesh",
     "Trajectory",
     "check_gradients",
     "debug_checks",
+    "diagnose",
     "mesh",
     "per_step",
     "rollout",

@@ -20,7 +20,8 @@ class ReverseSweep:
             ``"full"`` 72 bytes, raw update and block (96 with a floor, whose gaps must come back to the bit);
             ``"compact"`` 24 bytes, the old position; blocks are assembled again;
             ``"recompute"`` nothing; the backward runs the step again;
-            ``"auto"`` full while a step's full tape fits 256 MiB, compact beyond.
+            ``"auto"`` full while a step's full tape fits 256 MiB, compact beyond; a rollout that keeps all its tapes
+            decides by their sum against 2 GiB.
 
     Source: paper, section 3; docs/method.md, sections 3 and 7.
     """

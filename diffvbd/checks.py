@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 import operator
 from typing import Any, NoReturn
 
@@ -49,9 +50,19 @@ def check_count(name: str, value: Any, minimum: int = 0) -> int:
     return value
 
 
-def check_positive(name: str, value: Any, unit: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+def check_number(name: str, value: Any) -> float:
+    """A finite number >= 0."""
+    if isinstance(value, Tensor) and value.numel() == 1:
+        value = value.detach().item()
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
-    if not (math.isfinite(value) and value > 0):
-        fail(name, f"a finite number > 0 {unit}", value)
+    if not (math.isfinite(value) and value >= 0):
+        fail(name, "a finite number >= 0", value)
+    return float(value)
+
+
+def check_positive(name: str, value: Any, unit: str = "") -> float:
+    """A finite number > 0, its unit for the message."""
+    if check_number(name, value) == 0:
+        fail(name, f"a finite number > 0 {unit}".rstrip(), value)
     return float(value)

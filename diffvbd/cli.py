@@ -117,7 +117,9 @@ def _add_run_options(parser: argparse.ArgumentParser, directory: str) -> None:
 
 
 def _add_scene_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scale", type=float, default=1.0, help="metres per unit of the file, 0.001 for mm (default 1)")
+    parser.add_argument(
+        "--scale", type=float, default=1.0, help="metres per unit of the file, 0.001 for mm (default 1)"
+    )
     # No defaults: identify must know which options were given, and Scene has the defaults.
     scene = parser.add_argument_group("scene")
     scene.add_argument("--time-step", type=float, help=f"[s] (default {Scene.time_step:.4g})")

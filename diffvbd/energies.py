@@ -7,29 +7,29 @@ case they are differentiable.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from .checks import fail
+from .checks import check_number, check_positive, fail
 from .safeguards import filter_against_planes
 
 EXACT_BLOCK, PAPER_BLOCK = 1, 2  # bits of the elastic block in a scene's mask
 MAX_PLANES = 8
 
 
-def _number(name: str, value: float, *, minimum: float = 0.0, strict: bool = False) -> float:
-    if isinstance(value, Tensor) and value.numel() == 1:
-        value = value.detach().item()
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
-    if not math.isfinite(value) or value < minimum or (strict and value == minimum):
-        raise ValueError(f"{name}: expected a finite number {'>' if strict else '>='} {minimum:g}, got {value}")
-    return float(value)
+def _numbers(name: str, value: Any) -> Tensor:
+    """Finite numbers as a detached float64 tensor."""
+    try:
+        out = torch.as_tensor(value, dtype=torch.float64).detach()
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"{name}: expected numbers, got {value!r}") from None
+    if not bool(torch.isfinite(out).all()):
+        fail(name, "finite numbers", value)
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,15 +116,12 @@ class FloorBarrier(VertexEnergy):
     damping: float = 0.0
 
     def __post_init__(self) -> None:
-        normal = torch.as_tensor(self.normal, dtype=torch.float64).detach()
-        height = torch.as_tensor(self.height, dtype=torch.float64).detach().reshape(-1)
+        normal, height = _numbers("normal", self.normal), _numbers("height", self.height).reshape(-1)
         normal = normal[None] if normal.dim() == 1 else normal
         if normal.dim() != 2 or normal.shape[-1] != 3 or normal.shape[0] == 0:
             fail("normal", "3 numbers, or a sequence of such triples", f"shape {tuple(normal.shape)}")
-        if not bool(torch.isfinite(normal).all()) or bool((normal.norm(dim=-1) == 0).any()):
-            fail("normal", "finite vectors that are not zero", self.normal)
-        if not bool(torch.isfinite(height).all()):
-            fail("height", "finite numbers", self.height)
+        if bool((normal.norm(dim=-1) == 0).any()):
+            fail("normal", "vectors that are not zero", self.normal)
         if height.shape[0] not in (1, normal.shape[0]):
             if normal.shape[0] != 1:
                 fail("height", f"one value, or one for each of {normal.shape[0]} planes", f"{height.shape[0]} values")
@@ -133,9 +130,9 @@ class FloorBarrier(VertexEnergy):
             fail("normal", f"at most {MAX_PLANES} planes", f"{normal.shape[0]}")
         object.__setattr__(self, "normal", tuple(map(tuple, normal.tolist())))
         object.__setattr__(self, "height", tuple(height.expand(normal.shape[0]).tolist()))
-        object.__setattr__(self, "kappa", _number("kappa", self.kappa))
-        object.__setattr__(self, "dhat", _number("dhat", self.dhat, strict=True))
-        object.__setattr__(self, "damping", _number("damping", self.damping))
+        object.__setattr__(self, "kappa", check_number("kappa", self.kappa))
+        object.__setattr__(self, "dhat", check_positive("dhat", self.dhat, "m"))
+        object.__setattr__(self, "damping", check_number("damping", self.damping))
 
     @property
     def planes(self) -> int:
@@ -187,15 +184,16 @@ class Anchor(VertexEnergy):
     vertices: Tensor | None = None
 
     def __post_init__(self) -> None:
-        for field in ("points", "vertices"):
-            value = getattr(self, field)
-            if value is not None and not isinstance(value, Tensor):
-                object.__setattr__(self, field, torch.as_tensor(value))
-        if not isinstance(self.stiffness, Tensor):
-            object.__setattr__(self, "stiffness", torch.as_tensor(self.stiffness, dtype=torch.float64))
-        stiffness = torch.as_tensor(self.stiffness).detach()
-        if not bool((torch.isfinite(stiffness) & (stiffness >= 0)).all()):
-            fail("stiffness", "finite numbers >= 0", self.stiffness)
+        if self.vertices is not None:
+            vertices = torch.as_tensor(self.vertices)
+            if vertices.is_floating_point():
+                raise TypeError(f"vertices: expected a bool mask or integer indices, got dtype {vertices.dtype}")
+            object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "stiffness", _numbers("stiffness", self.stiffness))
+        if bool((torch.as_tensor(self.stiffness) < 0).any()):
+            fail("stiffness", "numbers >= 0 N/m", self.stiffness)
+        if self.points is not None:
+            object.__setattr__(self, "points", _numbers("points", self.points))
 
     def count(self) -> int:
         return 4

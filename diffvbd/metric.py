@@ -49,4 +49,4 @@ def rest_metric(corners: Tensor) -> tuple[Tensor, Tensor]:
 def lumped_mass(density: Tensor, volume: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor) -> Tensor:
     """m_i = sum over incident tets of density V / 4 [kg]; density, volume [B, T] -> [B, V]."""
     quarter = (0.25 * density * volume)[..., None, None]
-    return ops.star_sum(quarter.expand(*quarter.shape[:2], 4, 1), tets, star_ptr, star)[..., 0]
+    return ops.star_sum(quarter.expand(*quarter.shape[:2], 4, 1), tets, star_ptr, star, positive=True)[..., 0]

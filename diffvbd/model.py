@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from . import ops
-from .checks import check_positive, fail
+from .checks import check_number, check_positive, fail
 from .energies import VERTEX_ENERGIES, Energy, FloorBarrier, StableNeoHookean, VertexEnergy
 from .mesh import TetMesh
 from .metric import lumped_mass, rest_metric
@@ -66,13 +65,18 @@ class Model:
             raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
         self.mesh = mesh
         self.saturation = None if saturation is None else check_positive("saturation", saturation, "m")
-        self.regularization = float(regularization)
-        if not (math.isfinite(self.regularization) and self.regularization >= 0):
-            fail("regularization", "a finite number >= 0 kg", regularization)
+        self.regularization = check_number("regularization", regularization)
         self.relaxation = check_positive("relaxation", relaxation, "")
         if self.relaxation >= 2:
             fail("relaxation", "a number in (0, 2): from 2 on the updates raise the potential", relaxation)
         self.energies = _checked_energies(energies, mesh.num_vertices)
+        # the energies of single vertices, in the order in which kernels and data keep them
+        present = [e for e in self.energies if isinstance(e, VertexEnergy)]
+        self.vertex_energies: tuple[VertexEnergy, ...] = tuple(sorted(present, key=lambda e: e.bit))
+        self.energy_mask = sum(e.bit for e in self.energies)
+        kinds = {type(e): e for e in self.vertex_energies}
+        self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
+        self.floor = next((e for e in self.energies if isinstance(e, FloorBarrier)), None)
 
         points = torch.from_numpy(mesh.points.copy())
         tets = torch.from_numpy(mesh.tets.copy())
@@ -164,29 +168,11 @@ class Model:
         """Groups of vertices that a sweep updates one after another."""
         return self.color_ptr.shape[0] - 1
 
-    @property
-    def vertex_energies(self) -> tuple[VertexEnergy, ...]:
-        """The energies of single vertices, in the order in which kernels and data keep them."""
-        present = [e for e in self.energies if isinstance(e, VertexEnergy)]
-        return tuple(sorted(present, key=lambda e: e.bit))
-
-    @property
-    def energy_mask(self) -> int:
-        """The energies as bits, in the order of csrc/energies/energies.h."""
-        return sum(e.bit for e in self.energies)
-
-    @property
-    def floor(self) -> FloorBarrier | None:
-        """The floor barrier, if the Model has one."""
-        return next((e for e in self.energies if isinstance(e, FloorBarrier)), None)
-
     def settings(self, time_step: float, sweeps: int) -> ops.SweepSettings:
         """What the kernels execute for this Model besides its tensors."""
-        present = {type(e): e for e in self.vertex_energies}
-        counts = tuple(present[kind].count() if kind in present else 0 for kind in VERTEX_ENERGIES)
         saturation = -1.0 if self.saturation is None else self.saturation
         numbers = (time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS, FILTER_ETA)
-        return ops.SweepSettings(self._sizes, self.energy_mask, counts, numbers, sweeps)
+        return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps)
 
     def memory(self, **options: Any) -> dict[str, int]:
         """Predicted bytes of a step or rollout of this Model; see :func:`diffvbd.memory.predict`."""
@@ -211,6 +197,8 @@ def _checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
         energies = (energies,)
     kinds = (StableNeoHookean, *VERTEX_ENERGIES)
     out: list[Energy] = []
+    if not isinstance(energies, (tuple, list)):
+        raise TypeError(f"energies: expected a sequence of energies, got {type(energies).__name__}")
     for energy in energies:
         if not isinstance(energy, kinds):
             names = ", ".join(k.__name__ for k in kinds)
@@ -227,7 +215,10 @@ def _checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
 def _mask(pinned: Any, num_vertices: int) -> Tensor:
     if pinned is None:
         return torch.zeros(num_vertices, dtype=torch.bool)
-    pinned = torch.as_tensor(pinned).detach().cpu()
+    try:
+        pinned = torch.as_tensor(pinned).detach().cpu()
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"pinned: expected a bool mask or integer indices, got {type(pinned).__name__}") from None
     if pinned.dtype == torch.bool:
         if pinned.shape != (num_vertices,):
             fail("pinned", f"a mask of shape [{num_vertices}] or indices", f"a mask of shape {list(pinned.shape)}")

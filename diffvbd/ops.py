@@ -8,6 +8,7 @@ torch.func and torch.compile; the backward is a second Function, whose own backw
 from __future__ import annotations
 
 import inspect
+import math
 import sysconfig
 from collections.abc import Sequence
 from pathlib import Path
@@ -85,7 +86,7 @@ def _(values, tets):
 
 
 @torch.library.register_fake("diffvbd::star_sum")
-def _(values, star_ptr, star):
+def _(values, star_ptr, star, positive):
     return values.new_empty((values.shape[0], star_ptr.shape[0] - 1, values.shape[3]))
 
 
@@ -100,10 +101,6 @@ def _raw_backward(ctx: Any, *grads: Tensor) -> NoReturn:
 
 for _name in ("sweep", "sweep_backward", "pack_rest", "tet_gather", "star_sum", "row_sum"):
     torch.library.register_autograd(f"diffvbd::{_name}", _raw_backward)
-
-
-def _no_forward_mode(ctx: Any, *tangents: Tensor) -> NoReturn:
-    raise NotImplementedError("diffvbd: forward-mode differentiation (jvp) is not supported; use reverse mode")
 
 
 # --- fixed-order reductions -------------------------------------------------------------------------------------------
@@ -139,8 +136,6 @@ class _RowSum(Function):
         values = values.movedim(in_dims[0], 0)
         return _RowSum.apply(values.flatten(0, 1)).unflatten(0, values.shape[:2]), 0
 
-    jvp = staticmethod(_no_forward_mode)
-
 
 def _sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
     """Sums the dimensions in which ``shape`` has 1 (same number of dimensions), in a fixed order."""
@@ -148,8 +143,8 @@ def _sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
     if not reduced:
         return tensor
     kept = [d for d in range(tensor.dim()) if d not in reduced]
-    rows = tensor.permute(*kept, *reduced).flatten(len(kept)) if kept else tensor.reshape(1, -1)
-    return _RowSum.apply(rows.reshape(-1, rows.shape[-1])).reshape(shape)
+    columns = math.prod([tensor.shape[d] for d in reduced])
+    return _RowSum.apply(tensor.permute(*kept, *reduced).reshape(-1, columns)).reshape(shape)
 
 
 class _Broadcast(Function):
@@ -170,8 +165,6 @@ class _Broadcast(Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, tensor: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, int]:
         return _Broadcast.apply(tensor.movedim(in_dims[0], 0), (info.batch_size, *shape)), 0
-
-    jvp = staticmethod(_no_forward_mode)
 
 
 def broadcast(tensor: Tensor, shape: Sequence[int]) -> Tensor:
@@ -195,35 +188,31 @@ class _TetGather(Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:
-        return _StarSum.apply(grads[0], *ctx.mesh), None, None, None
+        return _StarSum.apply(grads[0], *ctx.mesh, False), None, None, None
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, values: Tensor, *mesh: Tensor) -> tuple[Tensor, int]:
         values = values.movedim(in_dims[0], 0)
         return _TetGather.apply(values.flatten(0, 1), *mesh).unflatten(0, values.shape[:2]), 0
 
-    jvp = staticmethod(_no_forward_mode)
-
 
 class _StarSum(Function):
     @staticmethod
-    def forward(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor) -> Tensor:
-        return _ops.star_sum(values.contiguous(), star_ptr, star)
+    def forward(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor, positive: bool) -> Tensor:
+        return _ops.star_sum(values.contiguous(), star_ptr, star, positive)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        ctx.mesh = inputs[1:]
+        ctx.mesh = inputs[1:4]
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:
-        return _TetGather.apply(grads[0], *ctx.mesh), None, None, None
+        return _TetGather.apply(grads[0], *ctx.mesh), None, None, None, None
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple, values: Tensor, *mesh: Tensor) -> tuple[Tensor, int]:
+    def vmap(info: Any, in_dims: tuple, values: Tensor, *mesh: Any) -> tuple[Tensor, int]:
         values = values.movedim(in_dims[0], 0)
         return _StarSum.apply(values.flatten(0, 1), *mesh).unflatten(0, values.shape[:2]), 0
-
-    jvp = staticmethod(_no_forward_mode)
 
 
 def tet_gather(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor) -> Tensor:
@@ -231,9 +220,12 @@ def tet_gather(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor) -> 
     return _TetGather.apply(values, tets, star_ptr, star)
 
 
-def star_sum(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor) -> Tensor:
-    """Corner values [B, T, 4, C] -> sums over the tets of each vertex [B, V, C], in the order of the tets."""
-    return _StarSum.apply(values, tets, star_ptr, star)
+def star_sum(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor, *, positive: bool = False) -> Tensor:
+    """Corner values [B, T, 4, C] -> sums over the tets of each vertex [B, V, C], in the order of the tets.
+
+    With ``positive`` the values are masses: one that is not finite and > 0 raises ValueError.
+    """
+    return _StarSum.apply(values, tets, star_ptr, star, positive)
 
 
 def build_plan(points: Tensor, tets: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -292,8 +284,6 @@ class _Sweep(Function):
         x, tape = _Sweep.apply(*folded, *args[_TENSORS + 1 :])
         return (x.unflatten(0, (-1, scenes)), tape.unflatten(0, (-1, scenes))), (0, 0)
 
-    jvp = staticmethod(_no_forward_mode)
-
 
 class _SweepBackward(Function):
     @staticmethod
@@ -331,7 +321,7 @@ class _SweepBackward(Function):
         folded = [fold(t, d) for t, d in zip(tensors, in_dims, strict=False)]
         packed_rest, plan, x, tape = saved[_TENSORS + 1 :]
         x, tape = (
-            t if t.numel() == 0 else t.expand(size * scenes, *t.shape[1:])
+            t if t.numel() == 0 else t.expand(size * scenes, *t.shape[1:]).contiguous()
             for t in (fold(t, d) for t, d in zip((x, tape), in_dims[_TENSORS + 4 :], strict=False))
         )
         full = (size * scenes, *x_bar.shape[-2:])
@@ -349,8 +339,6 @@ class _SweepBackward(Function):
             for o, n in zip(out, shapes, strict=True)
         )
         return result, (0,) * len(result)
-
-    jvp = staticmethod(_no_forward_mode)
 
 
 # apply() asks for the signature of forward at every call: ready-made, it costs nothing.
@@ -383,6 +371,10 @@ def sweep(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, packed_r
         tape_policy: What is kept for the backward; NO_TAPE runs the step again there.
     """
     tensors = (x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin)
-    tensors = tuple(t if t is None else t.contiguous() for t in tensors)
-    x, _ = _Sweep.apply(*tensors, packed_rest, plan, settings, tape_policy, debug_step, checked)
+    distinct: list[Tensor | None] = []
+    for t in tensors:
+        t = t if t is None else t.contiguous()
+        # torch.compile refuses one tensor in two places
+        distinct.append(t.view_as(t) if t is not None and any(t is other for other in distinct) else t)
+    x, _ = _Sweep.apply(*distinct, packed_rest, plan, settings, tape_policy, debug_step, checked)
     return x

@@ -99,6 +99,8 @@ def rollout(
     lead = check_state(model, x, v)
     options = {"mu": mu, "lam": lam, "rest_points": rest_points, "density": density, "force": force,
                "gravity": gravity, "prescribed": prescribed}  # fmt: skip
+    if parameters is not None and not isinstance(parameters, dict):
+        raise TypeError(f"parameters: expected a dict of tensors by name, got {type(parameters).__name__}")
     named = {f'parameters["{k}"]': value for k, value in (parameters or {}).items()}
     for name, value in {**options, **named}.items():
         if isinstance(value, PerStep) and value.values.shape[0] != steps:

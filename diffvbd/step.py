@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator, Sequence
-from contextvars import ContextVar
 from typing import Any, NamedTuple
 
 import torch
@@ -19,7 +18,7 @@ from .model import Model
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
 
-_debug: ContextVar[bool] = ContextVar("diffvbd_debug", default=False)
+_debug = False  # a plain global: torch.compile guards it
 
 
 @contextlib.contextmanager
@@ -28,11 +27,12 @@ def debug_checks(enabled: bool = True) -> Iterator[None]:
 
     Off (the default) it costs nothing.
     """
-    token = _debug.set(enabled)
+    global _debug
+    before, _debug = _debug, enabled
     try:
         yield
     finally:
-        _debug.reset(token)
+        _debug = before
 
 
 class Prepared(NamedTuple):
@@ -153,9 +153,18 @@ def prepare(
         if density is None:
             density = model.density[None]
         shape = (max(density.shape[0], volume.shape[0]), model.num_tets)
-        mass = lumped_mass(ops.broadcast(density, shape), ops.broadcast(volume, shape), *model._topology)
-    known = {f"{e.name}.{k}": (e, k, own) for e in model.vertex_energies for k, own in e.parameters.items()}
+        try:
+            mass = lumped_mass(ops.broadcast(density, shape), ops.broadcast(volume, shape), *model._topology)
+        except ValueError:
+            _name_value("density", "finite numbers > 0 kg/m^3", density, density > 0)
+            _name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0)
+            raise
     given: dict[str, Tensor] = {}
+    if parameters is not None and not isinstance(parameters, dict):
+        raise TypeError(f"parameters: expected a dict of tensors by name, got {type(parameters).__name__}")
+    known = {}
+    if parameters:
+        known = {f"{e.name}.{k}": (e, k, own) for e in model.vertex_energies for k, own in e.parameters.items()}
     for name, value in (parameters or {}).items():
         if name not in known:
             fail("parameters", f"names among {sorted(known)}", repr(name))
@@ -182,8 +191,10 @@ def _energy_data(model: Model, prepared: Prepared, origin: Tensor | None) -> Ten
         values.update({k: prepared.parameters[f"{energy.name}.{k}"] for k in values
                        if f"{energy.name}.{k}" in prepared.parameters})  # fmt: skip
         packed.append(energy.pack(values, origin))
-    scenes = max((p.shape[0] for p in packed), default=1)
-    return torch.cat([ops.broadcast(p, (scenes, p.shape[1])) for p in packed], -1) if packed else model._energy_data
+    if not packed:
+        return model._energy_data
+    scenes = max([p.shape[0] for p in packed])
+    return torch.cat([ops.broadcast(p, (scenes, p.shape[1])) for p in packed], -1)
 
 
 def advance(
@@ -202,9 +213,7 @@ def advance(
     h = prepared.settings.numbers[0]
     shape, flat = x.shape, (math.prod(x.shape[:-2]), *x.shape[-2:])
     if not isinstance(gravity, Tensor):
-        if len(gravity) != 3:
-            fail("gravity", "3 numbers or a tensor", f"{len(gravity)} numbers")
-        gravity = torch.tensor([float(a) for a in gravity], dtype=x.dtype, device=x.device)
+        gravity = _three_numbers("gravity", gravity, x)
     acceleration = ops.broadcast(_broadcastable("gravity", gravity, x), shape).reshape(flat)
     start, velocity = x.reshape(flat), v.reshape(flat)
     if force is not None:
@@ -230,7 +239,9 @@ def advance(
         filtered = model.floor.filter(start, y - start, data[:, :count], origin)
         x_start = torch.where(model.pinned[:, None], y, filtered)
 
-    adjoint = adjoint or ReverseSweep()
+    adjoint = ReverseSweep() if adjoint is None else adjoint
+    if not isinstance(adjoint, ReverseSweep):
+        raise TypeError(f"adjoint: expected a diffvbd.ReverseSweep, got {type(adjoint).__name__}")
     tensors = (x_start, start, y, prepared.mu, prepared.lam, prepared.mass, prepared.rest, data)
     differentiated = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     scalars = flat[0] * prepared.settings.sweeps * model.num_active
@@ -238,7 +249,7 @@ def advance(
     empty = x.new_empty((0,))
     try:
         end = ops.sweep(*tensors, empty if origin is None else origin, model._packed_rest, model._plan,
-                        prepared.settings, tape_policy=policy, debug_step=index if _debug.get() else -1)  # fmt: skip
+                        prepared.settings, tape_policy=policy, debug_step=index if _debug else -1)  # fmt: skip
     except ValueError as error:
         _name_argument(error, {"x": x, "v": v, "force": force, "gravity": gravity, "prescribed": prescribed})
         raise
@@ -253,9 +264,23 @@ def _name_argument(error: ValueError, arguments: dict[str, Any]) -> None:
     if not str(error).startswith(("predictor", "start")):
         return
     for name, value in arguments.items():
-        if isinstance(value, Tensor) and not bool(torch.isfinite(value).all()):
-            where = (~torch.isfinite(value)).nonzero()[0].tolist()
-            raise ValueError(f"{name}: expected finite values, got {float(value[tuple(where)])} at {where}") from None
+        if isinstance(value, Tensor):
+            _name_value(name, "finite values", value, torch.isfinite(value))
+
+
+def _name_value(name: str, expected: str, value: Tensor, good: Tensor) -> None:
+    good = good & torch.isfinite(value)
+    if not bool(good.all()):
+        where = (~good).nonzero()[0].tolist()
+        raise ValueError(f"{name}: expected {expected}, got {float(value[tuple(where)]):g} at {where}") from None
+
+
+def _three_numbers(name: str, value: Any, like: Tensor) -> Tensor:
+    if not isinstance(value, (tuple, list)) or not all(isinstance(a, (int, float)) for a in value):
+        raise TypeError(f"{name}: expected 3 numbers or a tensor, got {value!r}")
+    if len(value) != 3:
+        fail(name, "3 numbers or a tensor", f"{len(value)} numbers")
+    return torch.tensor([float(a) for a in value], dtype=like.dtype, device=like.device)
 
 
 def _broadcastable(name: str, value: Any, x: Tensor) -> Tensor:

@@ -257,7 +257,7 @@ def raw_arguments(policy: int) -> dict[str, tuple[Any, ...]]:
         "sweep": sweep,
         "pack_rest": (torch.rand(1, model.num_tets, 7).double(), model._plan, model._sizes),
         "tet_gather": (points, tets),
-        "star_sum": (corners, star_ptr, star),
+        "star_sum": (corners, star_ptr, star, False),
         "row_sum": (inputs["x"],),
     }
     if policy != ops.NO_TAPE:

@@ -133,6 +133,20 @@ void check_values(const Plan& plan, const StepInputs<T>& in) {
   if (filters(in.energies)) check_above_planes(plan, in);
 }
 
+template <class T>
+void check_masses(const T* shares, int64_t scenes, int64_t tets, int64_t stride) {
+  for (int64_t i = 0; i < scenes * tets; ++i) {
+    const T mass = 4 * shares[i * stride];
+    if (mass > 0 && std::isfinite(mass)) continue;
+    std::ostringstream out;
+    out << "density or rest_points: expected density > 0 kg/m^3 and positive volume, got a mass of " << mass
+        << " kg at tet " << i % tets << " of scene " << i / tets;
+    throw std::invalid_argument(out.str());
+  }
+}
+
+template void check_masses<float>(const float*, int64_t, int64_t, int64_t);
+template void check_masses<double>(const double*, int64_t, int64_t, int64_t);
 template void check_values<float>(const Plan&, const StepInputs<float>&);
 template void check_values<double>(const Plan&, const StepInputs<double>&);
 

@@ -220,12 +220,13 @@ Tensor tet_gather(const Tensor& values, const Tensor& tets) {
   });
 }
 
-Tensor star_sum(const Tensor& values, const Tensor& star_ptr, const Tensor& star) {
+Tensor star_sum(const Tensor& values, const Tensor& star_ptr, const Tensor& star, bool positive) {
   require(values.dim() == 4 && values.is_contiguous() && star.scalar_type() == ScalarType::Int,
           "diffvbd::star_sum: expected values [scenes, tets, 4, C]");
   return dispatch_float(values, [&](auto scalar) {
     using T = decltype(scalar);
     const int64_t b = values.size(0), n = values.size(1) * 4, c = values.size(3), v = star_ptr.size(0) - 1;
+    if (positive) diffvbd::check_masses(data<const T>(values), b, values.size(1), 4 * c);
     Tensor out = empty(values, {b, v, c});
     for (int64_t i = 0; i < b; ++i) {
       diffvbd::sum_segments(data<const T>(values) + i * n * c, data<const int64_t>(star_ptr), data<const int32_t>(star),

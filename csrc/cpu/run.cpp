@@ -113,8 +113,8 @@ struct Scene {
 };
 
 template <class F>
-void for_scenes(int64_t scenes, const F& f) {
-  if (scenes >= static_cast<int64_t>(torch::stable::get_num_threads())) {
+void for_scenes(int64_t scenes, bool parallel, const F& f) {
+  if (parallel && scenes >= static_cast<int64_t>(torch::stable::get_num_threads())) {
     torch::stable::parallel_for(0, scenes, 1, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) f(i);
     });
@@ -163,7 +163,9 @@ template <class T>
 void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape) {
   const auto kernel = forward_kernel<T>(in.energies);
   const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, filters(in.energies)) * plan.num_active;
-  for_scenes(in.scenes, [&](int64_t b) {
+  // a message thrown inside a parallel region would be lost
+  const bool looks = in.debug_step >= 0;
+  for_scenes(in.scenes, !looks, [&](int64_t b) {
     Scene<T> scene(plan, in, b, in.x_start.data + b * in.x_start.scene);
     scene.view.tape = tape + b * tape_size;
     for (int k = 0; k < in.sweeps; ++k) {
@@ -171,7 +173,7 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape) {
         for_blocks(plan.color_block[c], plan.color_block[c + 1], [&](int64_t begin, int64_t end) {
           kernel(plan, scene.view, in.parameters, k, in.tape_policy, begin, end);
         });
-        if (in.debug_step >= 0) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
+        if (looks) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
       }
     }
     unpack_rows(plan, scene.view.x, x + b * 3 * int64_t{plan.num_vertices});
@@ -186,7 +188,7 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
   const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, filters(in.energies)) * plan.num_active;
   const int64_t n = plan.num_vertices, tets = plan.num_tets, lanes = int64_t{plan.blocks} * kLanes;
   const int64_t pairs = int64_t{plan.slots} * kLanes;
-  for_scenes(in.scenes, [&](int64_t b) {
+  for_scenes(in.scenes, true, [&](int64_t b) {
     Scene<T> scene(plan, in, b, x + b * 3 * n);
     SceneView<T>& s = scene.view;
     s.tape = const_cast<T*>(tape) + b * tape_size;

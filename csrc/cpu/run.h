@@ -33,6 +33,10 @@ struct StepAdjoints {
 template <class T>
 void check_values(const Plan& plan, const StepInputs<T>& in);
 
+// shares [B, T, stride] of the tets' masses in their corners: finite and > 0
+template <class T>
+void check_masses(const T* shares, int64_t scenes, int64_t tets, int64_t stride);
+
 // x [B, V, 3], tape [B, sweeps, tape_rows, active]
 template <class T>
 void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape);
