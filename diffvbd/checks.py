@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import numbers
 import operator
 from typing import Any, NoReturn
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -54,7 +54,7 @@ def check_number(name: str, value: Any) -> float:
     """A finite number >= 0."""
     if isinstance(value, Tensor) and value.numel() == 1:
         value = value.detach().item()
-    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
     if not (math.isfinite(value) and value >= 0):
         fail(name, "a finite number >= 0", value)

@@ -143,8 +143,8 @@ def _sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
     if not reduced:
         return tensor
     kept = [d for d in range(tensor.dim()) if d not in reduced]
-    columns = math.prod([tensor.shape[d] for d in reduced])
-    return _RowSum.apply(tensor.permute(*kept, *reduced).reshape(-1, columns)).reshape(shape)
+    rows, columns = (math.prod([tensor.shape[d] for d in dims]) for dims in (kept, reduced))
+    return _RowSum.apply(tensor.permute(*kept, *reduced).reshape(rows, columns)).reshape(shape)
 
 
 class _Broadcast(Function):
@@ -318,7 +318,7 @@ class _SweepBackward(Function):
         def fold(t: Tensor | None, d: int | None) -> Any:
             return t if t is None or t.numel() == 0 else _fold(t, d, size, scenes)
 
-        folded = [fold(t, d) for t, d in zip(tensors, in_dims, strict=False)]
+        folded: list[Any] = [fold(t, d) for t, d in zip(tensors, in_dims, strict=False)]
         packed_rest, plan, x, tape = saved[_TENSORS + 1 :]
         x, tape = (
             t if t.numel() == 0 else t.expand(size * scenes, *t.shape[1:]).contiguous()
@@ -341,7 +341,7 @@ class _SweepBackward(Function):
         return result, (0,) * len(result)
 
 
-# apply() asks for the signature of forward at every call: ready-made, it costs nothing.
+# apply() asks for the signature of forward at every call: ready-made, it costs less.
 for _function in (_RowSum, _Broadcast, _TetGather, _StarSum, _Sweep, _SweepBackward):
     _function.forward.__signature__ = inspect.signature(_function.forward)  # type: ignore[attr-defined]
 

@@ -22,6 +22,7 @@ struct VertexState {
 // tets is padded by pairs of itself. The reverse sends what an update adds to a neighbour along edges: a row for each
 // ordered pair (active vertex, neighbour), written by the vertex, read by the neighbour when its own turn comes.
 constexpr int kLanes = 8;
+constexpr int kRow = 4;  // scalars in a row: x, y, z and one unused; indices come multiplied by it
 
 struct Plan {
   int32_t num_vertices, num_tets, num_active, colors, blocks, slots;
@@ -33,10 +34,11 @@ struct Plan {
   const int32_t* block_incoming;  // [blocks + 1]  first incoming slot of each block
   const int32_t* order;           // [blocks, kLanes]  vertex in the user's numbering, -1 for a phantom
   const int32_t* pair;            // [slots, kLanes]  4 tet + local index
-  const int32_t* neighbors;       // [slots, 3, kLanes]  positions of the pair's j, k, l
-  const int32_t* edge;            // [slots, 3, kLanes]  which edge of the lane's vertex leads to j, k, l
-  const int32_t* incoming;  // [incoming_slots, kLanes]  rows (edge slot kLanes + lane) that end in the lane's vertex;
-                            // padding names the row after the last, which stays zero
+  const int32_t* neighbors;       // [slots, 3, kLanes]  positions of the pair's j, k, l, times kRow
+  const int32_t* edge;            // [slots, 3, kLanes]  the row, among those of its block, of the edge to
+                                  // j, k, l, times kRow
+  const int32_t* incoming;  // [incoming_slots, kLanes]  rows (edge slot kLanes + lane) that end in the lane's vertex,
+                            // times kRow; padding names the row after the last, which stays zero
 };
 
 }  // namespace diffvbd

@@ -147,7 +147,7 @@ std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64
     }
     if (c < colors) active += size;
   }
-  if (std::max(slots, edge_slots + 1) * kLanes > std::numeric_limits<int32_t>::max()) {
+  if (std::max(slots, (edge_slots + 1) * kRow) * kLanes > std::numeric_limits<int32_t>::max()) {
     throw std::invalid_argument("mesh: too large, expected at most 2^31 (vertex, tet) pairs");
   }
   const std::array<int64_t, 10> sizes = {
@@ -208,8 +208,8 @@ std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64
         for (int a = 0; a < 3; ++a) {
           const int64_t at = (s * int64_t{3} + a) * kLanes + l;
           const int32_t other = static_cast<int32_t>(tets[(entry & ~3) + kOthers[entry & 3][a]]);
-          writable(plan.neighbors)[at] = real ? position[other] : b * kLanes + l;
-          writable(plan.edge)[at] = real ? edge_to(v, other) : 0;
+          writable(plan.neighbors)[at] = kRow * (real ? position[other] : b * kLanes + l);
+          writable(plan.edge)[at] = kRow * ((real ? edge_to(v, other) : 0) * kLanes + l);
         }
       }
       int64_t at = int64_t{plan.block_incoming[b]} * kLanes + l;
@@ -217,11 +217,11 @@ std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64
         const int32_t u = neighbors_of(v)[e];
         if (color[u] < 0) continue;
         const int32_t row = plan.block_edge[position[u] / kLanes] + edge_to(u, v);
-        writable(plan.incoming)[at] = row * kLanes + position[u] % kLanes;
+        writable(plan.incoming)[at] = kRow * (row * kLanes + position[u] % kLanes);
         at += kLanes;
       }
       for (; at < int64_t{plan.block_incoming[b + 1]} * kLanes; at += kLanes) {
-        writable(plan.incoming)[at] = plan.edge_slots * kLanes;
+        writable(plan.incoming)[at] = kRow * plan.edge_slots * kLanes;
       }
     }
   }

@@ -19,7 +19,7 @@ constexpr int kWeight[4][4] = {{-1, 0, 1, 2}, {0, -1, 3, 4}, {1, 3, -1, 5}, {2, 
 constexpr int kRestScalars = 7;
 
 bool is_padding(const Plan& plan, int64_t slot, int64_t block, int lane) {
-  return plan.neighbors[slot * 3 * kLanes + lane] == block * kLanes + lane;
+  return plan.neighbors[slot * 3 * kLanes + lane] == kRow * (block * kLanes + lane);
 }
 
 // Vertex whose values fill a lane: a phantom copies lane 0 of its block, so that it never meets an undefined state.
@@ -132,13 +132,13 @@ void for_blocks(int64_t begin, int64_t end, const F& f) {
 template <class T>
 void collect_last(const Plan& plan, const T* rows, T* x_bar) {
   for (int c = 1; c < plan.colors; ++c) {
-    const int32_t lower = plan.block_edge[plan.color_block[c]] * kLanes;  // rows of lower colors come before
+    const int32_t lower = kRow * plan.block_edge[plan.color_block[c]] * kLanes;  // rows of lower colors come before
     for (int64_t block = plan.color_block[c]; block < plan.color_block[c + 1]; ++block) {
       for (int64_t e = plan.block_incoming[block]; e < plan.block_incoming[block + 1]; ++e) {
         for (int l = 0; l < kLanes; ++l) {
           const int64_t row = plan.incoming[e * kLanes + l];
           if (row >= lower) continue;
-          for (int i = 0; i < 3; ++i) x_bar[4 * (block * kLanes + l) + i] += rows[4 * row + i];
+          for (int i = 0; i < 3; ++i) x_bar[4 * (block * kLanes + l) + i] += rows[row + i];
         }
       }
     }

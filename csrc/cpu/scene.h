@@ -94,7 +94,7 @@ DIFFVBD_FN void add3(T* p, int64_t block, const Vec3<Lanes<T>>& v) {
 template <class T>
 DIFFVBD_FN Vec3<Lanes<T>> gather3(const T* rows, const int32_t* index) {
   Row<T> r[kLanes];
-  for (int l = 0; l < kLanes; ++l) r[l] = Row<T>::load(rows + 4 * static_cast<int64_t>(index[l]));
+  for (int l = 0; l < kLanes; ++l) r[l] = Row<T>::load(rows + index[l]);
   return to_lanes(r);
 }
 template <class T>
@@ -151,7 +151,7 @@ struct LaneStar {
     Row<T> r[kLanes];
     to_rows(v, r);
     for (int l = 0; l < kLanes; ++l) {
-      T* a = edges + 4 * (kLanes * edge[l] + l);
+      T* a = edges + edge[l];
       r[l].v += Row<T>::load(a).v;
       r[l].store(a);
     }
@@ -186,7 +186,7 @@ DIFFVBD_FN Vec3<Lanes<T>> pull_rows(const Plan& plan, const T* rows, int64_t blo
   Row<T> sum[kLanes] = {};
   for (int64_t e = plan.block_incoming[block]; e < plan.block_incoming[block + 1]; ++e) {
     for (int l = 0; l < kLanes; ++l) {
-      sum[l].v += Row<T>::load(rows + 4 * static_cast<int64_t>(plan.incoming[e * kLanes + l])).v;
+      sum[l].v += Row<T>::load(rows + plan.incoming[e * kLanes + l]).v;
     }
   }
   return to_lanes(sum);
