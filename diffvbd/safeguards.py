@@ -39,7 +39,8 @@ def filter_against_planes(x: Tensor, step: Tensor, normal: Tensor, height: Tenso
     with torch.no_grad():
         moved = x + alpha[..., None] * step
         new_gap = (n * moved[:, :, None]).sum(-1) - local_height
-        guard = (n * x[:, :, None]).abs().sum(-1) + local_height.abs()
+        world = x if origin is None else x + origin
+        guard = (n * world[:, :, None]).abs().sum(-1) + height[:, None].abs()
         safe = (new_gap > GUARD_ULPS * torch.finfo(x.dtype).eps * guard).all(-1)
     alpha = torch.where(safe, alpha, torch.zeros_like(alpha))
     return x + alpha[..., None] * step

@@ -18,7 +18,10 @@ _ARGUMENTS = ("x", "v", "mu", "lam", "force", "gravity", "prescribed", "rest_poi
 
 @dataclass(frozen=True)
 class Tape:
-    """What :func:`step_backward` needs of one step; opaque."""
+    """What :func:`step_backward` needs of one step; opaque.
+
+    Holds the arguments of ``wrt`` and the step's x', v' [m, m/s], shape [..., V, 3], with their graph.
+    """
 
     inputs: dict[str, Tensor]
     outputs: tuple[Tensor, Tensor]

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cmath>
+#include <limits>
 
 #if defined(__CUDACC__)
 #define DIFFVBD_FN __host__ __device__ __forceinline__
@@ -109,51 +110,28 @@ DIFFVBD_FN void add_outer(Sym3<R>& a, const R& s, const Vec3<R>& v) {
   a.zz = a.zz + w.z * v.z;
 }
 
-template <class M, class R>
-DIFFVBD_FN void swap_if(const M& condition, R& a, R& b) {
-  const R first = select(condition, b, a);
-  b = select(condition, a, b);
-  a = first;
-}
-
-// Solves A u = b by L D L^T with the largest pivot first: backward stable on the positive definite blocks of a sweep,
-// where an adjugate would lose the digits that the stiffest direction takes. `least` > 0 is a lower bound of A's
-// eigenvalues, hence of every pivot. Where A's conditioning leaves a pivot nothing but rounding, the bound stands in for
-// it, so that |u| <= O(|b| / least) whatever A; elsewhere both clamps are idle.
-template <class R>
-DIFFVBD_FN Vec3<R> solve(Sym3<R> a, Vec3<R> b, const R& least) {
-  const auto y_first = a.xx < a.yy;
-  swap_if(y_first, a.xx, a.yy);
-  swap_if(y_first, a.xz, a.yz);
-  swap_if(y_first, b.x, b.y);
-  const auto z_first = a.xx < a.zz;
-  swap_if(z_first, a.xx, a.zz);
-  swap_if(z_first, a.xy, a.yz);
-  swap_if(z_first, b.x, b.z);
-
+// Solves A u = b by L D L^T: backward stable on the positive definite blocks of a sweep, where an adjugate would lose
+// the digits that the stiffest direction takes. `least` > 0 is a lower bound of A's eigenvalues, hence of every pivot.
+// Where A's conditioning leaves a pivot nothing but rounding, that bound or the rounding itself stands in for it, and
+// the step stays of the size of the stiff one; elsewhere both bounds are idle. T is the precision of R.
+template <class T, class R>
+DIFFVBD_FN Vec3<R> solve(const Sym3<R>& a, const Vec3<R>& b, const R& least) {
+  const auto pivot = [&](const R& computed, const R& diagonal) {
+    const R rounding = R(4 * std::numeric_limits<T>::epsilon()) * diagonal;
+    const R bound = select(least < rounding, rounding, least);
+    return select(bound < computed, computed, bound);
+  };
   const R inv1 = R(1) / a.xx;
-  R l2 = a.xy * inv1, l3 = a.xz * inv1;
-  R pivot2 = a.yy - l2 * a.xy, pivot3 = a.zz - l3 * a.xz;
-  const R cross_term = a.yz - l2 * a.xz;
-  R b2 = b.y - l2 * b.x, b3 = b.z - l3 * b.x;
-  const auto last_first = pivot2 < pivot3;
-  swap_if(last_first, pivot2, pivot3);
-  swap_if(last_first, l2, l3);
-  swap_if(last_first, b2, b3);
-
-  pivot2 = select(least < pivot2, pivot2, least);
-  const R off = select(pivot2 < cross_term, pivot2, select(cross_term < -pivot2, -pivot2, cross_term));
-  const R inv2 = R(1) / pivot2;
-  const R l32 = off * inv2;
-  pivot3 = pivot3 - l32 * off;
-  pivot3 = select(least < pivot3, pivot3, least);
-  R u3 = (b3 - l32 * b2) / pivot3;
-  R u2 = b2 * inv2 - l32 * u3;
-  Vec3<R> u{b.x * inv1 - l2 * u2 - l3 * u3, u2, u3};
-  swap_if(last_first, u.y, u.z);
-  swap_if(z_first, u.x, u.z);
-  swap_if(y_first, u.x, u.y);
-  return u;
+  const R l21 = a.xy * inv1;
+  const R l31 = a.xz * inv1;
+  const R inv2 = R(1) / pivot(a.yy - l21 * a.xy, a.yy);
+  const R t = a.yz - l21 * a.xz;
+  const R l32 = t * inv2;
+  const R inv3 = R(1) / pivot(a.zz - l31 * a.xz - l32 * t, a.zz);
+  const R u2 = b.y - l21 * b.x;
+  const R u3 = (b.z - l31 * b.x - l32 * u2) * inv3;
+  const R v2 = u2 * inv2 - l32 * u3;
+  return {b.x * inv1 - l21 * v2 - l31 * u3, v2, u3};
 }
 
 }  // namespace diffvbd

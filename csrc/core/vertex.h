@@ -62,7 +62,7 @@ DIFFVBD_FN System<R> assemble(const Block<R>& b, const Star& star, const StepPar
 
 template <class R, class T>
 DIFFVBD_FN Vec3<R> newton_step(const Block<R>& b, const System<R>& system, const StepParameters<T>& q) {
-  return -solve(system.H, system.g, least_eigenvalue(b, q));
+  return -solve<T>(system.H, system.g, least_eigenvalue(b, q));
 }
 
 // From the Newton step to the executed one.
@@ -117,7 +117,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   }
   Vec3<R> z = R(q.relaxation) * step_bar;
   if (q.saturates) z = saturate_vjp(u.d_raw, z, q);
-  const Vec3<R> p = solve(H, z, least_eigenvalue(b, q));
+  const Vec3<R> p = solve<T>(H, z, least_eigenvalue(b, q));
 
   out.y = b.mass * p;
   out.x -= out.y;

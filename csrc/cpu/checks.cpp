@@ -3,6 +3,7 @@
 #include <cmath>
 #include <sstream>
 #include <stdexcept>
+#include <vector>
 
 #include "run.h"
 
@@ -72,8 +73,7 @@ void check_above_planes(const Plan& plan, const StepInputs<T>& in) {
   for (int64_t b = 0; b < in.scenes; ++b) {
     const T* planes = in.data.data + b * in.data.scene;
     for (int k = 0; k < in.data_count[0]; k += FloorBarrier::stride) {
-      std::ostringstream below;
-      int64_t found = 0;
+      std::vector<int32_t> below;
       for (int64_t i = 0; i < int64_t{plan.color_block[plan.colors]} * kLanes; ++i) {
         const int32_t v = plan.order[i];
         if (v < 0) continue;
@@ -85,12 +85,15 @@ void check_above_planes(const Plan& plan, const StepInputs<T>& in) {
         if (in.origin.data) state.origin = at(in.origin);
         const FloorBarrier::Plane<T> plane(planes + k, state);
         if (T(0) < plane.gap(state.x)) continue;
-        if (++found <= 5) below << (found > 1 ? ", " : "") << v;
+        below.push_back(v);
       }
-      if (found == 0) continue;
+      if (below.empty()) continue;
+      std::sort(below.begin(), below.end());
       std::ostringstream out;
-      out << "x: expected every unpinned vertex above floor plane " << k / FloorBarrier::stride << ", got " << found
-          << " on or below it in scene " << b << ": vertices " << below.str() << (found > 5 ? ", ..." : "");
+      out << "x: expected every unpinned vertex above floor plane " << k / FloorBarrier::stride << ", got "
+          << below.size() << " on or below it in scene " << b << ": vertices ";
+      for (size_t i = 0; i < std::min<size_t>(below.size(), 5); ++i) out << (i > 0 ? ", " : "") << below[i];
+      if (below.size() > 5) out << ", ...";
       throw std::invalid_argument(out.str());
     }
   }

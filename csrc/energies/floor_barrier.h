@@ -45,11 +45,13 @@ struct FloorBarrier {
     DIFFVBD_FN Plane(const R* a, const VertexState<R>& s)
         : n{a[0], a[1], a[2]}, height(a[3] - dot(n, s.origin)), kappa(a[4]), dhat(a[5]), damping(a[6]) {}
     DIFFVBD_FN R gap(const Vec3<R>& x) const { return dot(n, x) - height; }
-    // below this the sign of a computed gap is not safe: a few roundings of its terms
+    // below this the sign of a gap is not safe: a few roundings of its terms, and of the position once it is no longer
+    // relative to the origin
     template <class T>
-    DIFFVBD_FN R guard(const Vec3<R>& x) const {
+    DIFFVBD_FN R guard(const VertexState<R>& s) const {
+      const Vec3<R> x = s.x + s.origin;
       return R(8 * std::numeric_limits<T>::epsilon()) *
-             (absolute(n.x * x.x) + absolute(n.y * x.y) + absolute(n.z * x.z) + absolute(height));
+             (absolute(n.x * x.x) + absolute(n.y * x.y) + absolute(n.z * x.z) + absolute(height + dot(n, s.origin)));
     }
   };
 
@@ -105,7 +107,7 @@ struct FloorBarrier {
     const Vec3<R> x_new = s.x + alpha * step;
     for (int k = 0; k < count; k += stride) {
       const Plane<R> plane(data + k, s);
-      alpha = select(plane.template guard<T>(s.x) < plane.gap(x_new), alpha, R(0));
+      alpha = select(plane.template guard<T>(s) < plane.gap(x_new), alpha, R(0));
     }
     return alpha;
   }
