@@ -1,18 +1,19 @@
 #include "run.h"
 
-#include <torch/csrc/stable/ops.h>
-
 #include <algorithm>
 #include <cmath>
 #include <sstream>
 #include <stdexcept>
 #include <vector>
 
+#include "team.h"
+
 namespace diffvbd {
 namespace {
 
-// A parallel region costs microseconds: colors below this many blocks stay serial.
-constexpr int64_t kSerialBlocks = 16;
+// Below this many blocks in all colors and sweeps of a step, gathering a team costs more than it saves; below this many
+// in an average color, its barriers do.
+constexpr int64_t kTeamBlocks = 512, kTeamColor = 8;
 
 // position of the stiffness weight k_ab in a tet's row of `rest`
 constexpr int kWeight[4][4] = {{-1, 0, 1, 2}, {0, -1, 3, 4}, {1, 3, -1, 5}, {2, 4, 5, -1}};
@@ -122,10 +123,10 @@ void for_scenes(int64_t scenes, bool parallel, const F& f) {
     for (int64_t i = 0; i < scenes; ++i) f(i);
   }
 }
-template <class F>
-void for_blocks(int64_t begin, int64_t end, const F& f) {
-  if (end - begin < kSerialBlocks) return f(begin, end);
-  torch::stable::parallel_for(begin, end, kSerialBlocks / 2, f);
+int64_t team_size(const Plan& plan, int64_t scenes, int sweeps) {
+  const int64_t threads = torch::stable::get_num_threads(), blocks = plan.color_block[plan.colors];
+  if (scenes >= threads || blocks * sweeps < kTeamBlocks || blocks < kTeamColor * plan.colors) return 1;
+  return threads;
 }
 
 // After the first executed sweep is reversed: what the updates of lower colors have added since a vertex's last turn.
@@ -168,14 +169,17 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape) {
   for_scenes(in.scenes, !looks, [&](int64_t b) {
     Scene<T> scene(plan, in, b, in.x_start.data + b * in.x_start.scene);
     scene.view.tape = tape + b * tape_size;
-    for (int k = 0; k < in.sweeps; ++k) {
-      for (int c = 0; c < plan.colors; ++c) {
-        for_blocks(plan.color_block[c], plan.color_block[c + 1], [&](int64_t begin, int64_t end) {
-          kernel(plan, scene.view, in.parameters, k, in.tape_policy, begin, end);
-        });
-        if (looks) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
+    Team::run(looks ? 1 : team_size(plan, in.scenes, in.sweeps), [&](Team::Member member) {
+      for (int k = 0; k < in.sweeps; ++k) {
+        for (int c = 0; c < plan.colors; ++c) {
+          member.each(plan.color_block[c], plan.color_block[c + 1], [&](int64_t begin, int64_t end) {
+            kernel(plan, scene.view, in.parameters, k, in.tape_policy, begin, end);
+          });
+          member.barrier();
+          if (looks) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
+        }
       }
-    }
+    });
     unpack_rows(plan, scene.view.x, x + b * 3 * int64_t{plan.num_vertices});
   });
 }
@@ -208,17 +212,23 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     s.rest_bar = rest_bar.get();
     s.data_bar = data_bar.get();
 
-    const int64_t inactive = plan.color_block[plan.colors];
-    for (int k = in.sweeps - 1; k >= 0; --k) {
-      for (int c = plan.colors - 1; c >= 0; --c) {
-        for_blocks(plan.color_block[c], plan.color_block[c + 1],
-                   [&](int64_t begin, int64_t end) { kernel(plan, s, in.parameters, k, in.tape_policy, begin, end); });
+    Team::run(team_size(plan, in.scenes, in.sweeps), [&](Team::Member member) {
+      for (int k = in.sweeps - 1; k >= 0; --k) {
+        for (int c = plan.colors - 1; c >= 0; --c) {
+          member.each(plan.color_block[c], plan.color_block[c + 1], [&](int64_t begin, int64_t end) {
+            kernel(plan, s, in.parameters, k, in.tape_policy, begin, end);
+          });
+          member.barrier();
+        }
+        // Pinned vertices have no turn of their own: they collect after each sweep, before the rows are overwritten.
+        member.each(plan.color_block[plan.colors], plan.blocks, [&](int64_t begin, int64_t end) {
+          for (int64_t block = begin; block < end; ++block) {
+            store_rows(s.x_bar, block, load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block));
+          }
+        });
+        member.barrier();
       }
-      // Pinned vertices have no turn of their own: they collect after each sweep, before the rows are overwritten.
-      for (int64_t block = inactive; block < plan.blocks; ++block) {
-        store_rows(s.x_bar, block, load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block));
-      }
-    }
+    });
     collect_last(plan, s.rows, s.x_bar);
     unpack_rows(plan, s.x_bar, out.x_start + b * 3 * n);
     unpack_vertices(plan, s.y_bar, out.y + b * 3 * n);
