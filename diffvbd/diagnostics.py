@@ -13,17 +13,15 @@ from torch.linalg import cross
 
 from . import reference
 from .checks import check_positive, fail
-from .model import Model
+from .model import HEAVY_REGULARIZATION, STABLE_RELAXATION, Model
 from .step import GRAVITY, check_state
 
 # Limits with their measurements in docs/numerics.md
 SATURATION_TOO_LARGE = 1.0  # c over the mean edge: one update may then turn a tet inside out
 SATURATION_TOO_SMALL = 0.01  # c over the mean edge: 20 sweeps no longer reach a large deformation
-REGULARIZATION_SHARE = 0.1  # tau over the mass of the lightest vertex: convergence slows
 RESOLUTION = 1e-5  # rounding of a position over the shortest edge; a gradient's error is 6 to 22 times that
 LARGE_STRAIN = 100.0  # Green strain; a gradient keeps 11 digits there and loses them with a power of the strain
 UNBALANCED = 0.01  # left-over force over the forces of the step; at 0.014 a hanging bar rests 1.5 to 11 % off
-STABLE_RELAXATION = 1.7  # beyond it some rollouts grow, although every step descends
 
 
 @dataclass(frozen=True)
@@ -286,7 +284,7 @@ def _setting_messages(model: Model, mu: Tensor, lam: Tensor, edge: Tensor) -> li
         if ratio < SATURATION_TOO_SMALL:
             out.append(f"saturation {model.saturation:g} m is {ratio:.3g} mean edges: sweeps move by that little")
     lightest = float(model.mass[model.color_vertices].min())
-    if model.regularization > REGULARIZATION_SHARE * lightest:
+    if model.regularization > HEAVY_REGULARIZATION * lightest:
         out.append(f"regularization {model.regularization:g} kg is {model.regularization / lightest:.3g} of the "
                    "lightest vertex: it slows every update")  # fmt: skip
     return out

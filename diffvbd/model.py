@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,6 +19,8 @@ from .safeguards import FILTER_ETA, SATURATION_EPS
 
 PAPER_SATURATION = 0.1  # [m]
 PAPER_REGULARIZATION = 1e-6  # [kg]
+STABLE_RELAXATION = 1.7  # largest omega that never grew in the rollouts of docs/numerics.md
+HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
 
 
 class Model:
@@ -95,7 +98,22 @@ class Model:
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = _first_of_body(body)
         self._measure(points)
+        self._warn()
         self._place(dtype, torch.device(device))
+
+    def _warn(self) -> None:
+        """Warns of safeguards outside the range in which they were found to help (docs/numerics.md)."""
+        if self.relaxation > STABLE_RELAXATION:
+            _warn(f"relaxation: rollouts were seen to gain energy above {STABLE_RELAXATION}, got {self.relaxation:g}")
+        paper = any(isinstance(e, StableNeoHookean) and e.block == "paper" for e in self.energies)
+        if paper and self.relaxation > 1 and self.saturation is None:
+            _warn('relaxation: block="paper" with relaxation > 1 and no saturation may diverge')
+        active = self.mass[~self.pinned]
+        if active.numel() and self.regularization > HEAVY_REGULARIZATION * float(active.min()):
+            _warn(
+                f"regularization: {self.regularization:g} kg is {self.regularization / float(active.min()):.2g} of the "
+                "lightest vertex; the sweeps converge that much more slowly"
+            )
 
     def _measure(self, points: Tensor) -> None:
         """Everything that follows from the rest positions, in float64."""
@@ -190,6 +208,10 @@ class Model:
             f"energies=({', '.join(map(repr, self.energies))})"
             f"{''.join(', ' + s for s in safeguards)}, {self.dtype}, {self.device})"
         )
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, UserWarning, stacklevel=4)
 
 
 def _checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:

@@ -297,7 +297,7 @@ class _SweepBackward(Function):
             x, tape = _ops.sweep(x_start, *inputs, plan, *settings, tape_policy, -1, False)
         wants = (needs[3] or needs[4], needs[5], needs[6], needs[7])
         bars = _ops.sweep_backward(x_bar.contiguous(), x, *inputs, tape, plan, *settings, tape_policy, wants)
-        given = (x_start, x_prev, y, mu, lam, mass, rest, energy_data)
+        given: tuple[Any, ...] = (x_start, x_prev, y, mu, lam, mass, rest, energy_data)
         return tuple(_sum_to(bar, t.shape) for bar, t, need in zip(bars, given, needs, strict=True) if need)
 
     @staticmethod
@@ -326,7 +326,7 @@ class _SweepBackward(Function):
         )
         full = (size * scenes, *x_bar.shape[-2:])
         # shared inputs get a gradient for each member of the batch: give every differentiated one its own scenes
-        spread = [t.expand(size * scenes, *t.shape[1:]).contiguous() if t is not None and need else t
+        spread: list[Any] = [t.expand(size * scenes, *t.shape[1:]).contiguous() if t is not None and need else t
                   for t, need in zip(folded[1 : _TENSORS + 1], needs, strict=True)]  # fmt: skip
         spread[:3] = [t.expand(full).contiguous() for t in spread[:3]]
         out = _SweepBackward.apply(folded[0].expand(full), *spread, folded[-1], packed_rest, plan, x, tape, settings,

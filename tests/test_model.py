@@ -2,6 +2,7 @@
 
 import heapq
 import itertools
+import warnings
 from typing import Any
 
 import numpy as np
@@ -266,3 +267,17 @@ def test_a_model_without_elastic_energy_falls_freely() -> None:
     x, _ = dv.step(model, model.rest_points, v, mu=0.0, lam=0.0, time_step=0.1, sweeps=3)
     expected = model.rest_points + 0.1 * v + 0.01 * torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64)
     assert relative_error(x, expected) <= 1e-15
+
+
+def test_safeguards_out_of_scale_warn() -> None:
+    small = dv.mesh.cube(size=0.003)
+    with pytest.warns(UserWarning, match="regularization: 1e-06 kg is 0.44"):
+        dv.Model.paper(small)
+    with pytest.warns(UserWarning, match="relaxation: .* got 1.9"):
+        dv.Model(small, relaxation=1.9)
+    with pytest.warns(UserWarning, match="may diverge"):
+        dv.Model(small, energies=(dv.StableNeoHookean("paper"),), relaxation=1.6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dv.Model.paper(dv.mesh.cube())
+        dv.Model(small, relaxation=1.6)
