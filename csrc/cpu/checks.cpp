@@ -1,10 +1,10 @@
 // Values that a step cannot work with, found before any work is done.
 #include <algorithm>
 #include <cmath>
-#include <sstream>
 #include <stdexcept>
 #include <vector>
 
+#include "message.h"
 #include "run.h"
 
 namespace diffvbd {
@@ -20,11 +20,11 @@ void check(const char* name, const char* expected, const char* item, const Batch
       const T value = t.data[b * t.scene + i * t.item];
       const T second = other ? other->data[b * other->scene + i * other->item] : T(0);
       if (!bad(value, second)) continue;
-      std::ostringstream out;
+      Message out;
       out << name << ": expected " << expected << ", got " << value;
       if (other) out << " with mu " << second;
       out << " at " << item << " " << i << " of scene " << b;
-      throw std::invalid_argument(out.str());
+      throw std::invalid_argument(out.text);
     }
   }
 }
@@ -36,9 +36,9 @@ void check_vectors(const char* name, const Batched<const T>& t, int64_t scenes, 
     for (int64_t i = 0; i < 3 * vertices; ++i) {
       const T value = t.data[b * t.scene + i];
       if (std::isfinite(value)) continue;
-      std::ostringstream out;
+      Message out;
       out << name << ": expected finite values, got " << value << " at vertex " << i / 3 << " of scene " << b;
-      throw std::invalid_argument(out.str());
+      throw std::invalid_argument(out.text);
     }
   }
 }
@@ -56,11 +56,11 @@ void check_energy_data(const Plan& plan, const StepInputs<T>& in) {
           if (!std::isfinite(at[c])) message = "parameters: expected finite values";
         }
         if (!message) continue;
-        std::ostringstream out;
+        Message out;
         out << message << ", got (";
         for (int64_t c = i; c < i + stride; ++c) out << (c > i ? ", " : "") << at[c];
         out << ") in record " << i / stride << " of scene " << b;
-        throw std::invalid_argument(out.str());
+        throw std::invalid_argument(out.text);
       }
       at += size;
     }
@@ -89,12 +89,12 @@ void check_above_planes(const Plan& plan, const StepInputs<T>& in) {
       }
       if (below.empty()) continue;
       std::sort(below.begin(), below.end());
-      std::ostringstream out;
+      Message out;
       out << "x: expected every unpinned vertex above floor plane " << k / FloorBarrier::stride << ", got "
           << below.size() << " on or below it in scene " << b << ": vertices ";
       for (size_t i = 0; i < std::min<size_t>(below.size(), 5); ++i) out << (i > 0 ? ", " : "") << below[i];
       if (below.size() > 5) out << ", ...";
-      throw std::invalid_argument(out.str());
+      throw std::invalid_argument(out.text);
     }
   }
 }
@@ -126,10 +126,10 @@ void check_values(const Plan& plan, const StepInputs<T>& in) {
       if (v < 0) continue;
       const T m = in.mass.data[b * in.mass.scene + v];
       if (m > 0 && std::isfinite(m)) continue;
-      std::ostringstream out;
+      Message out;
       out << "density or rest_points: expected a finite mass > 0 kg, got " << m << " at vertex " << v << " of scene "
           << b;
-      throw std::invalid_argument(out.str());
+      throw std::invalid_argument(out.text);
     }
   }
   check_energy_data(plan, in);
@@ -141,10 +141,10 @@ void check_masses(const T* shares, int64_t scenes, int64_t tets, int64_t stride)
   for (int64_t i = 0; i < scenes * tets; ++i) {
     const T mass = 4 * shares[i * stride];
     if (mass > 0 && std::isfinite(mass)) continue;
-    std::ostringstream out;
+    Message out;
     out << "density or rest_points: expected density > 0 kg/m^3 and positive volume, got a mass of " << mass
         << " kg at tet " << i % tets << " of scene " << i / tets;
-    throw std::invalid_argument(out.str());
+    throw std::invalid_argument(out.text);
   }
 }
 

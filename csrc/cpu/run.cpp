@@ -2,10 +2,10 @@
 
 #include <algorithm>
 #include <cmath>
-#include <sstream>
 #include <stdexcept>
 #include <vector>
 
+#include "message.h"
 #include "team.h"
 
 namespace diffvbd {
@@ -151,10 +151,10 @@ void look_for_nonfinite(const Plan& plan, const SceneView<T>& s, int64_t step, i
   for (int64_t i = int64_t{plan.color_block[color]} * kLanes; i < int64_t{plan.color_block[color + 1]} * kLanes; ++i) {
     const T* x = s.x + 4 * i;
     if (plan.order[i] < 0 || (std::isfinite(x[0]) && std::isfinite(x[1]) && std::isfinite(x[2]))) continue;
-    std::ostringstream out;
+    Message out;
     out << "non-finite position in step " << step << ", sweep " << sweep << ", color " << color << ", vertex "
         << plan.order[i] << ", scene " << scene << ": (" << x[0] << ", " << x[1] << ", " << x[2] << ")";
-    throw std::runtime_error(out.str());
+    throw std::runtime_error(out.text);
   }
 }
 
@@ -278,9 +278,9 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
   for (int64_t t = 0; t < plan.num_tets; ++t) {
     const T c6 = rest[t * kRestScalars + 6];
     if (c6 > 0 && std::isfinite(c6)) continue;
-    std::ostringstream out;
+    Message out;
     out << "rest_points: expected tets of positive volume, got " << 1 / (6 * c6) << " m^3 at tet " << t;
-    throw std::invalid_argument(out.str());
+    throw std::invalid_argument(out.text);
   }
   for (int64_t block = 0; block < plan.blocks; ++block) {
     for (int64_t slot = plan.block_slot[block]; slot < plan.block_slot[block + 1]; ++slot) {
