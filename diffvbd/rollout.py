@@ -106,15 +106,19 @@ def rollout(
         if isinstance(value, PerStep) and value.values.shape[0] != steps:
             fail(name, f"{steps} steps in per_step", f"shape {list(value.values.shape)}")
 
+    # What a checkpointed segment reads again must not change in between: lists and dicts are copied. unbind, not
+    # indexing: the backward of values[k] would fill a tensor of all steps at every step.
+    options = {name: _frozen(value) for name, value in options.items()}
+    parameters = {k: _frozen(value) for k, value in (parameters or {}).items()}
     static: dict[str, Any] = {k: options[k] for k in _STATIC} | {"parameters": parameters}
-    changes = any(_changes(value) for value in (*(options[k] for k in _STATIC), *named.values()))
+    changes = any(_changes(value) for value in (*(options[k] for k in _STATIC), *parameters.values()))
     fixed = None if changes else prepare(model, lead, time_step=time_step, sweeps=sweeps, **static)
 
     def one_step(k: int, x: Tensor, v: Tensor, adjoint: ReverseSweep) -> tuple[Tensor, Tensor]:
         prepared = fixed
         if prepared is None:
             now: dict[str, Any] = {name: _at(options[name], k, x, v) for name in _STATIC}
-            now["parameters"] = {name: _at(value, k, x, v) for name, value in (parameters or {}).items()}
+            now["parameters"] = {name: _at(value, k, x, v) for name, value in parameters.items()}
             prepared = prepare(model, lead, time_step=time_step, sweeps=sweeps, **now)
         given = {name: _at(options[name], k, x, v) for name in ("force", "gravity", "prescribed")}
         return advance(model, x, v, prepared, adjoint=adjoint, index=k, **given)
@@ -146,13 +150,23 @@ def rollout(
     )
 
 
+class _Steps(tuple):
+    """The tensors of a per_step value, one for each step."""
+
+
+def _frozen(value: Any) -> Any:
+    if isinstance(value, PerStep):
+        return _Steps(value.values.unbind(0))
+    return tuple(value) if isinstance(value, list) else value
+
+
 def _changes(value: Any) -> bool:
-    return isinstance(value, PerStep) or (callable(value) and not isinstance(value, Tensor))
+    return isinstance(value, _Steps) or (callable(value) and not isinstance(value, Tensor))
 
 
 def _at(value: Any, k: int, x: Tensor, v: Tensor) -> Any:
-    if isinstance(value, PerStep):
-        return value.values[k]
+    if isinstance(value, _Steps):
+        return value[k]
     return value(k, x, v) if _changes(value) else value
 
 

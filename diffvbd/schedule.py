@@ -15,6 +15,7 @@ from .adjoints import ReverseSweep
 from .checks import check_count, fail
 from .model import Model
 
+MAX_REPEATS = 64  # of a step under Binomial: each is a nested checkpoint, and a run of the step
 TAPE_BUDGET = 2 * 2**30  # bytes of tape that "auto" lets a rollout keep
 
 
@@ -54,6 +55,12 @@ def choose_schedule(
     sweeps: int,
 ) -> tuple[int | Binomial | None, ReverseSweep]:
     """Resolves ``"auto"`` for schedule and tape from the bytes they would keep."""
+    if isinstance(checkpoint_every, Binomial):
+        snapshots = checkpoint_every.snapshots
+        while _repeats(steps, snapshots) > MAX_REPEATS:
+            snapshots += 1
+        if snapshots > checkpoint_every.snapshots:
+            fail("checkpoint_every", f"Binomial of at least {snapshots} snapshots for {steps} steps", checkpoint_every)
     if checkpoint_every is None or isinstance(checkpoint_every, Binomial):
         return checkpoint_every, adjoint
     if checkpoint_every != "auto":
@@ -102,8 +109,14 @@ def _left(length: int, snapshots: int) -> int:
     """Steps before the first snapshot, so that both parts repeat their steps as rarely as can be."""
     if snapshots == 0:
         return length - 1
+    repeats = _repeats(length, snapshots)
+    most = math.comb(snapshots + repeats - 1, repeats - 1)
+    return max(1, min(most, length - 1))
+
+
+def _repeats(length: int, snapshots: int) -> int:
+    """How often a step is run again at most."""
     repeats = 1
     while math.comb(snapshots + repeats, repeats) < length:
         repeats += 1
-    most = math.comb(snapshots + repeats - 1, repeats - 1)
-    return max(1, min(most, length - 1))
+    return repeats

@@ -25,7 +25,7 @@ SOURCE = Path(__file__).with_name("headers.cpp")
 
 
 @pytest.fixture(scope="module")
-def headers(request: pytest.FixtureRequest) -> Any:
+def headers(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """headers.cpp as a module; built once for each state of the headers."""
     compiler = os.environ.get("CXX") or shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
@@ -34,7 +34,9 @@ def headers(request: pytest.FixtureRequest) -> Any:
 
     sources = [SOURCE, *sorted((ROOT / "csrc").rglob("*.h"))]
     digest = hashlib.sha256(b"".join(p.read_bytes() for p in sources)).hexdigest()[:16]
-    target = request.config.cache.mkdir("headers") / digest / f"headers{sysconfig.get_config_var('EXT_SUFFIX')}"
+    cache = getattr(request.config, "cache", None)  # pytest may run without its cache
+    folder = tmp_path_factory.mktemp("headers") if cache is None else cache.mkdir("headers")
+    target = folder / digest / f"headers{sysconfig.get_config_var('EXT_SUFFIX')}"
     if not target.exists():
         target.parent.mkdir(exist_ok=True)
         built = target.with_suffix(f".{os.getpid()}")
