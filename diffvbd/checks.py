@@ -38,7 +38,7 @@ def check_broadcast(name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
     return value
 
 
-def check_count(name: str, value: Any, minimum: int = 0) -> int:
+def check_count(name: str, value: Any, minimum: int = 0, maximum: int | None = None) -> int:
     if isinstance(value, bool):
         raise TypeError(f"{name}: expected an integer, got bool")
     try:
@@ -47,13 +47,19 @@ def check_count(name: str, value: Any, minimum: int = 0) -> int:
         raise TypeError(f"{name}: expected an integer, got {type(value).__name__} {value!r}") from None
     if value < minimum:
         fail(name, f"an integer >= {minimum}", value)
+    if maximum is not None and value > maximum:
+        fail(name, f"an integer <= {maximum}", value)
     return value
 
 
 def check_number(name: str, value: Any) -> float:
     """A finite number >= 0."""
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise TypeError(
+            f"{name}: expected a number, got a tensor that requires grad; {name} is not differentiable here"
+        )
     if isinstance(value, Tensor) and value.numel() == 1:
-        value = value.detach().item()
+        value = value.item()
     if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
     if not (math.isfinite(value) and value >= 0):

@@ -174,7 +174,19 @@ def _simulate(options: argparse.Namespace) -> None:
         motion = scene.simulate(model, mu, lam, options.steps, save=options.stride, progress=progress)
     frames, steps = motion.x.cpu().numpy(), np.asarray(motion.steps)
     dv.mesh.write_series(options.out, mesh, frames, steps * scene.time_step)
-    print(f"wrote {options.out} ({len(steps)} frames of {mesh.num_vertices} vertices)")
+    held = int(pinned.sum())
+    print(f"wrote {options.out} ({len(steps)} frames of {mesh.num_vertices} vertices, {held} pinned)")
+    if options.pin and held < 3:
+        print(
+            f"warning: --pin holds {held} vertices; a fraction takes more, for example --pin x-:0.05", file=sys.stderr
+        )
+    if len(steps) > 1 and options.stride == 1:
+        previous = (motion.x[-2], motion.v[-2])
+        found = dv.diagnose(
+            model, motion.x[-1], mu=mu, lam=lam, time_step=scene.time_step, previous=previous, warn=False
+        )
+        for message in found.messages:
+            print(f"warning: {message}", file=sys.stderr)
     if options.save_target:
         Observation(scene, frames, steps, {"mu": mu, "lam": lam}).save(options.save_target)
         print(f"wrote {options.save_target}")

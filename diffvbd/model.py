@@ -103,6 +103,8 @@ class Model:
 
     def _warn(self) -> None:
         """Warns of safeguards outside the range in which they were found to help (docs/numerics.md)."""
+        if not any(isinstance(e, StableNeoHookean) for e in self.energies) and self.mesh.num_tets:
+            _warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
         if self.relaxation > STABLE_RELAXATION:
             _warn(f"relaxation: rollouts were seen to gain energy above {STABLE_RELAXATION}, got {self.relaxation:g}")
         paper = any(isinstance(e, StableNeoHookean) and e.block == "paper" for e in self.energies)
@@ -128,6 +130,8 @@ class Model:
         return {name: value[None] for name, value in energy.constants(rest_points).items()}
 
     def _place(self, dtype: torch.dtype, device: torch.device) -> None:
+        if device.type == "cuda":
+            fail("device", '"cpu": this version has no CUDA backend', repr(str(device)))
         self.dtype, self.device = dtype, device
         for name, value in vars(self).items():
             if isinstance(value, Tensor):

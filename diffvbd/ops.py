@@ -30,7 +30,10 @@ def _load() -> None:
         if path.exists():
             torch.ops.load_library(str(path))
             return
-    raise ImportError("diffvbd is not built: run `pip install --no-build-isolation -e .` in its source folder")
+    raise ImportError(
+        "diffvbd is not built here: run `pip install --no-build-isolation -e .` in this folder, or, if it is installed "
+        "elsewhere, leave this folder, whose sources hide the installed package"
+    )
 
 
 _load()

@@ -127,7 +127,17 @@ def rollout(
     every, adjoint = choose_schedule(checkpoint_every, adjoint or ReverseSweep(), model, scenes, steps, sweeps)
     bar = _Progress(steps) if progress else None
 
+    # A segment that runs again reads these anew: autograd cannot see that they were changed in between.
+    read = {**options, **{f'parameters["{k}"]': value for k, value in parameters.items()}}
+    versions: list[tuple[str, Tensor, int]] = []
+    if every is not None and not torch.compiler.is_compiling():
+        found = [(name, t) for name, value in read.items() for t in _tensors(value)]
+        versions = [(name, t, t._version) for name, t in found if not t.is_inference()]
+
     def segment(first: int, end: int, x: Tensor, v: Tensor) -> Segment:
+        for name, tensor, version in versions:
+            if tensor._version != version:
+                raise RuntimeError(f"{name}: changed in place between the rollout and its backward")
         frames, observed = [], []
         for k in range(first, end):
             x, v = one_step(k, x, v, adjoint)
@@ -152,6 +162,10 @@ def rollout(
 
 class _Steps(tuple):
     """The tensors of a per_step value, one for each step."""
+
+
+def _tensors(value: Any) -> list[Tensor]:
+    return [value] if isinstance(value, Tensor) else list(value) if isinstance(value, _Steps) else []
 
 
 def _frozen(value: Any) -> Any:

@@ -18,6 +18,8 @@ from .model import Model
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
 
+MAX_SWEEPS = 2**31 - 1
+
 _debug = False  # a plain global: torch.compile guards it
 
 
@@ -140,7 +142,9 @@ def prepare(
 ) -> Prepared:
     """Checks and shapes everything of a step that does not depend on the state."""
     like, tets = model.mass, (model.num_tets,)
-    settings = model.settings(check_positive("time_step", time_step, "s"), check_count("sweeps", sweeps))
+    settings = model.settings(
+        check_positive("time_step", time_step, "s"), check_count("sweeps", sweeps, maximum=MAX_SWEEPS)
+    )
     rest, mass = None, model.mass[None]
     if density is not None:
         density = _scenes_first("density", density, like, lead, tets)
@@ -218,6 +222,8 @@ def advance(
     start, velocity = x.reshape(flat), v.reshape(flat)
     if force is not None:
         total = ops.broadcast(_broadcastable("force", force, x), shape).reshape(flat)
+        # A pinned vertex is moved by no force, whatever stands there.
+        total = torch.where(model.pinned[:, None], torch.zeros_like(total), total)
         weight = ops.broadcast(prepared.mass, (flat[0], flat[1]))[..., None]
         # A vertex without mass is isolated and pinned: no force moves it.
         acceleration = acceleration + total / torch.where(weight > 0, weight, torch.ones_like(weight))

@@ -312,3 +312,41 @@ def test_binomial_runs_steps_as_rarely_as_promised(steps: int, snapshots: int) -
     repeats = next(t for t in range(steps + 1) if comb(snapshots + t, t) >= steps)
     assert max(runs) <= 1 + repeats
     assert sum(runs) > steps
+
+
+@pytest.mark.parametrize("schedule", [2, dv.Binomial(2)])
+@pytest.mark.parametrize("name", ["mu", "lam", "force", "gravity", "prescribed", "floor_barrier.kappa"])
+def test_changing_an_argument_before_a_checkpointed_backward_raises(name: str, schedule: Any) -> None:
+    scene = build_scene("floor_damped")
+    model, inputs = scene.model(), scene.inputs()
+    call, _ = leaves_of(inputs)
+    options = {k: value for k, value in call.items() if k not in ("x", "v")}
+    end = dv.rollout(model, call["x"], call["v"], steps=4, sweeps=1, checkpoint_every=schedule, **options).x[-1]
+    changed = call["parameters"][name] if "." in name else call[name]
+    with torch.no_grad():
+        changed.mul_(2)
+    with pytest.raises(RuntimeError, match="changed in place|modified by an inplace operation"):
+        end.sum().backward()
+
+
+def test_a_force_on_a_pinned_vertex_reaches_nothing() -> None:
+    mesh = dv.mesh.cube(2)
+    model = dv.Model(mesh, pinned=[0])
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    force = torch.zeros_like(x)
+    force[0] = float("nan")
+    density = torch.tensor(1e3, dtype=x.dtype, requires_grad=True)
+    rest = model.rest_points.clone().requires_grad_()
+    options = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 2, "density": density, "rest_points": rest}
+    end = dv.step(model, x, v, force=force, **options)[0]
+    grads = torch.autograd.grad(end.square().sum(), (density, rest))
+    clean = dv.step(model, x, v, force=torch.zeros_like(x), **options)[0]
+    for grad, expected in zip(grads, torch.autograd.grad(clean.square().sum(), (density, rest)), strict=True):
+        assert torch.equal(grad, expected) and bool(expected.any())
+
+
+def test_what_is_not_differentiated_raises() -> None:
+    model = dv.Model(dv.mesh.cube(2))
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    with pytest.raises(TypeError, match="time_step: .*not differentiable"):
+        dv.step(model, x, v, mu=1.0, lam=1.0, time_step=torch.tensor(0.01, requires_grad=True), sweeps=1)

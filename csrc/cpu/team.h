@@ -53,7 +53,7 @@ class Team {
   }
 
  private:
-  static constexpr int kSpins = 4096;
+  static constexpr int kSpins = 512;
   static constexpr std::chrono::microseconds kPatience{300};
   enum Decision { kUndecided, kTogether, kAlone };
 
