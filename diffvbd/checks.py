@@ -54,12 +54,8 @@ def check_count(name: str, value: Any, minimum: int = 0, maximum: int | None = N
 
 def check_number(name: str, value: Any) -> float:
     """A finite number >= 0."""
-    if isinstance(value, Tensor) and value.requires_grad:
-        raise TypeError(
-            f"{name}: expected a number, got a tensor that requires grad; {name} is not differentiable here"
-        )
     if isinstance(value, Tensor) and value.numel() == 1:
-        value = value.item()
+        value = value.detach().item()
     if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
     if not (math.isfinite(value) and value >= 0):
