@@ -142,6 +142,8 @@ def prepare(
 ) -> Prepared:
     """Checks and shapes everything of a step that does not depend on the state."""
     like, tets = model.mass, (model.num_tets,)
+    if isinstance(time_step, Tensor) and time_step.requires_grad:
+        raise TypeError("time_step: expected a number, got a tensor that requires grad: it is not differentiable")
     settings = model.settings(
         check_positive("time_step", time_step, "s"), check_count("sweeps", sweeps, maximum=MAX_SWEEPS)
     )
