@@ -18,6 +18,7 @@ except ImportError:
 CPU_SOURCES = [
     "csrc/ops.cpp",
     "csrc/cpu/checks.cpp",
+    "csrc/cpu/layout.cpp",
     "csrc/cpu/plan.cpp",
     "csrc/cpu/register.cpp",
     "csrc/cpu/run.cpp",

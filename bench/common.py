@@ -22,10 +22,13 @@ RESULTS = Path(__file__).parent / "results"
 
 def environment(device: str = "cpu") -> dict[str, Any]:
     """Machine and versions of a run. Names only: no host, user or path."""
-    commit = _git("rev-parse", "HEAD")
+    # a copy of the tree without its history is told by this variable what it is a copy of
+    commit = _git("rev-parse", "HEAD") or os.environ.get("DIFFVBD_COMMIT")
     status = _git("status", "--porcelain")
+    gpu = {} if device == "cpu" else {"driver": driver(), "cuda": torch.version.cuda}
     return {
         "device": device if device == "cpu" else torch.cuda.get_device_name(device),
+        **gpu,
         "cpu": cpu_name(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
@@ -49,24 +52,40 @@ def cpu_name() -> str:
     return platform.processor() or platform.machine()
 
 
+def driver() -> str | None:
+    """Version of the NVIDIA driver."""
+    lines = _output("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
+    return lines.splitlines()[0].strip() if lines else None
+
+
 def _git(*arguments: str) -> str | None:
     """Output of a git command in the repository, or None outside of one."""
+    return _output("git", *arguments)
+
+
+def _output(*command: str) -> str | None:
     try:
-        done = subprocess.run(
-            ["git", *arguments], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
-        )
+        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
     return done.stdout.strip()
 
 
-def write(name: str, results: dict[str, Any], out: Path = RESULTS, *, quick: bool = False, text: str = "") -> Path:
+def write(
+    name: str,
+    results: dict[str, Any],
+    out: Path = RESULTS,
+    *,
+    quick: bool = False,
+    text: str = "",
+    device: str = "cpu",
+) -> Path:
     """Writes NAME.json (environment and results) and, given a text, NAME.md; returns the JSON's path.
 
     NaN and Inf, which JSON does not have, become strings.
     """
     out.mkdir(parents=True, exist_ok=True)
-    content = {"name": name, "quick": quick, "environment": environment(), "results": results}
+    content = {"name": name, "quick": quick, "environment": environment(device), "results": results}
     path = out / f"{name}.json"
     path.write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n")
     if text:

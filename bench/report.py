@@ -1,4 +1,4 @@
-"""`python -m bench.report` writes the figures of bench/results/cpu.json into docs/performance.md."""
+"""`python -m bench.report` writes the figures of bench/results into docs/performance.md."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bench.common import RESULTS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "performance.md"
-BENCHMARKS = ("cpu",)  # whose figures the page shows, in this order
+BENCHMARKS = ("cpu", "gpu")  # whose figures the page shows, in this order
 BEGIN, END = "<!-- figures: begin, written by python -m bench.report -->", "<!-- figures: end -->"
 EMPTY = "No figures yet: run `python -m bench cpu`, then `python -m bench.report`.\n"
 
@@ -48,7 +48,9 @@ def machine(environment: dict[str, Any]) -> str:
     """One line on where and with what a benchmark ran."""
     known = {key: value for key, value in environment.items() if value is not None}
     where = f"{known.get('cpu', 'unknown processor')}, {known.get('cores', '?')} cores"
-    versions = ", ".join(f"{key} {known[key]}" for key in ("python", "torch", "diffvbd") if key in known)
+    if known.get("device", "cpu") != "cpu":
+        where = f"{known['device']}, driver {known.get('driver', 'unknown')}"
+    versions = ", ".join(f"{key} {known[key]}" for key in ("python", "torch", "cuda", "diffvbd") if key in known)
     return f"{where}; {versions}; {known.get('date', 'no date')}."
 
 

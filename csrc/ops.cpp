@@ -4,24 +4,35 @@
 
 STABLE_TORCH_LIBRARY(diffvbd, m) {
   // numbers: time_step, regularization, relaxation, saturation (< 0: none), saturation_eps, filter_eta
-  // sizes: active vertices, tets, slots of the plan
+  // sizes: active vertices, tets, slots of the plan; on CUDA also what follows in HostPlan (cuda/step.h)
   // data_count: scalars per scene, or per vertex, of each energy of one vertex
+  // launch: on CUDA the regime and the threads per vertex, else empty
   m.def(
       "sweep(Tensor x_start, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, "
       "Tensor energy_data, Tensor origin, Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, "
-      "int sweeps, int tape_policy, int debug_step, bool checked) -> (Tensor x, Tensor tape)");
+      "int sweeps, int[] launch, int tape_policy, int debug_step, bool checked) -> (Tensor x, Tensor tape)");
   // wants: material, mass, rest, energy_data
   m.def(
       "sweep_backward(Tensor x_bar, Tensor x, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor "
-      "rest, "
-      "Tensor energy_data, Tensor origin, Tensor tape, Tensor plan, int[] sizes, int energies, int[] data_count, "
-      "float[] numbers, int sweeps, int tape_policy, bool[] wants) -> (Tensor x_start, Tensor x_prev, Tensor y, Tensor "
-      "mu, Tensor lam, "
-      "Tensor mass, Tensor rest, Tensor energy_data)");
+      "rest, Tensor energy_data, Tensor origin, Tensor tape, Tensor plan, int[] sizes, int energies, int[] data_count, "
+      "float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> (Tensor x_start, Tensor x_prev, "
+      "Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, Tensor energy_data)");
+  // CUDA only: predictor and velocity in the same launches, for scenes whose only energy is that of the tets. `held` is
+  // where pinned vertices go, or empty.
+  m.def(
+      "fused_step(Tensor x, Tensor v, Tensor acceleration, Tensor held, Tensor mu, Tensor lam, Tensor mass, Tensor "
+      "rest, Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, int sweeps, int[] launch, int "
+      "tape_policy) -> (Tensor x, Tensor v, Tensor tape)");
+  // x_bar, v_bar: empty where there is none; wants: x, v, acceleration, held, material, mass, rest
+  m.def(
+      "fused_step_backward(Tensor x_bar, Tensor v_bar, Tensor x_end, Tensor x, Tensor v, Tensor acceleration, Tensor "
+      "held, Tensor mu, Tensor lam, Tensor mass, Tensor rest, Tensor tape, Tensor plan, int[] sizes, int energies, "
+      "int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> (Tensor x, "
+      "Tensor v, Tensor acceleration, Tensor held, Tensor mu, Tensor lam, Tensor mass, Tensor rest)");
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");
   m.def(
-      "build_plan(Tensor points, Tensor tets, Tensor active) -> (Tensor plan, Tensor color_ptr, Tensor color_vertices, "
-      "Tensor star_ptr, Tensor star)");
+      "build_plan(Tensor points, Tensor tets, Tensor active, int lanes) -> (Tensor plan, Tensor color_ptr, Tensor "
+      "color_vertices, Tensor star_ptr, Tensor star)");
   m.def("tet_gather(Tensor values, Tensor tets) -> Tensor");
   m.def("star_sum(Tensor values, Tensor star_ptr, Tensor star, bool positive) -> Tensor");
   m.def("row_sum(Tensor values) -> Tensor");

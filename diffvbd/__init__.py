@@ -12,6 +12,7 @@ from .energies import Anchor, FloorBarrier, StableNeoHookean
 from .gradcheck import GradientCheck, check_gradients
 from .mesh import TetMesh
 from .model import Model
+from .regimes import regime
 from .rollout import Trajectory, per_step, rollout
 from .schedule import Binomial
 from .step import debug_checks, step
@@ -36,6 +37,7 @@ __all__ = [
     "diagnose",
     "mesh",
     "per_step",
+    "regime",
     "rollout",
     "step",
     "step_backward",

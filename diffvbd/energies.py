@@ -76,6 +76,10 @@ class VertexEnergy:
     def check(self, num_vertices: int) -> None:
         """Raises ValueError where the energy does not fit a mesh."""
 
+    def placed(self, num_vertices: int, device: torch.device) -> VertexEnergy:
+        """A copy whose tensors lie on a device, so that a step copies nothing from the host."""
+        return self
+
     def constants(self, rest_points: Tensor) -> dict[str, Tensor]:
         """The parameters as tensors of rest_points' dtype and device."""
         raise NotImplementedError
@@ -205,6 +209,10 @@ class Anchor(VertexEnergy):
         if self.points is not None and self.points.shape != (num_vertices, 3):
             fail("points", f"shape [{num_vertices}, 3]", f"shape {list(self.points.shape)}")
         self._mask(num_vertices)
+
+    def placed(self, num_vertices: int, device: torch.device) -> VertexEnergy:
+        tensors = {k: v.to(device) for k, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, **{**tensors, "vertices": self._mask(num_vertices).to(device)})
 
     def _mask(self, num_vertices: int) -> Tensor:
         if self.vertices is None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from . import ops
 from .adjoints import ReverseSweep
@@ -13,7 +16,46 @@ from .checks import check_count
 from .model import Model
 from .schedule import Binomial, _left, choose_schedule
 
-LANES = 8  # kLanes of csrc/core/views.h
+
+@contextlib.contextmanager
+def out_of_memory_named(model: Model, x: Tensor, settings: ops.SweepSettings, policy: int) -> Iterator[None]:
+    """Says of a step that does not fit a CUDA device how much it wanted and which tape would fit."""
+    if not x.is_cuda:
+        yield
+        return
+    try:
+        yield
+    except (torch.OutOfMemoryError, RuntimeError) as error:
+        free, _ = torch.cuda.mem_get_info(x.device)
+        free += torch.cuda.memory_reserved(x.device) - torch.cuda.memory_allocated(x.device)
+        scalars = x.shape[0] * settings.sweeps * model.num_active * x.element_size()
+        base = 2 * x.numel() * x.element_size() + _cuda_scratch(model, x.shape[0], reverse=False)
+        wanted = {name: base + scalars * ops.tape_rows(code, model.energy_mask) for name, code in _POLICIES.items()}
+        chosen = next(name for name, code in _POLICIES.items() if code == policy)
+        if wanted[chosen] <= free and not isinstance(error, torch.OutOfMemoryError):
+            raise
+        fits = [f'"{name}" ({bytes_wanted} bytes)' for name, bytes_wanted in wanted.items() if bytes_wanted <= free]
+        advice = f"ReverseSweep(tape=...) that fits: {', '.join(fits)}" if fits else "no tape policy fits: fewer scenes"
+        raise torch.OutOfMemoryError(
+            f'CUDA out of memory: a step with tape="{chosen}" wanted {wanted[chosen]} bytes, {free} are free; {advice}'
+        ) from error
+
+
+_POLICIES = {"full": ops.FULL_TAPE, "compact": ops.COMPACT_TAPE, "recompute": ops.NO_TAPE}
+WORKSPACE_BUDGET = 2 << 30  # bytes; twin of kWorkspaceBudget in csrc/ops_cuda.cpp
+
+
+def _cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = True, rest: bool = False) -> int:
+    """Bytes of workspace of one step on CUDA, as carved in csrc/cuda/run.cuh (a material per tet)."""
+    _, _, slots, _, _, blocks, edge_slots, *_ = model._sizes
+    lanes = ops.LANES["cuda"]
+    positions, pairs = blocks * lanes, slots * lanes
+    one = 8 * positions + (6 * positions if model.floor else 0) + 2 * pairs
+    if reverse:
+        one += 4 * (edge_slots * lanes + 1) + 8 * positions
+        one += (2 * pairs if material or rest else 0) + (4 * pairs if rest else 0)
+    one *= model.mass.element_size()
+    return one * min(scenes, max(1, WORKSPACE_BUDGET // max(1, one)))
 
 
 def predict(
@@ -80,13 +122,11 @@ def predict(
     if rest:
         kept += (37 * model.num_tets + model.num_vertices) * item
 
-    blocks, slots, edge_slots = (LANES * n for n in model._plan[4:7].tolist())
-    # packed state and its adjoints, rows along edges, one row per (vertex, tet) pair of what is differentiated
-    work = blocks * (22 if model.floor else 16) + 4 * edge_slots
-    work += slots * ((2 if material or rest else 0) + (4 if rest else 0))
-    threads = torch.get_num_threads()
     outputs = 12 * model.num_vertices + model.num_tets * ((2 if material else 0) + (7 if rest else 0))
-    scratch = (work * (threads if scenes >= threads else 1) + outputs * scenes) * item
+    if model.device.type == "cuda":
+        scratch = _cuda_scratch(model, scenes, reverse=True, material=material, rest=rest) + outputs * scenes * item
+    else:
+        scratch = _cpu_scratch(model, scenes, material, rest) + outputs * scenes * item
     if policy == ops.NO_TAPE:
         scratch += scalars * ops.tape_rows(ops.FULL_TAPE, model.energy_mask) * item
     tensors = [t for t in vars(model).values() if hasattr(t, "element_size")] + list(model._topology)
@@ -98,3 +138,12 @@ def predict(
         "scratch": scratch,
         "total": kept + scratch,
     }
+
+
+def _cpu_scratch(model: Model, scenes: int, material: bool, rest: bool) -> int:
+    blocks, slots, edge_slots = (ops.LANES["cpu"] * n for n in model._plan[4:7].tolist())
+    # packed state and its adjoints, rows along edges, one row per (vertex, tet) pair of what is differentiated
+    work = blocks * (22 if model.floor else 16) + 4 * edge_slots
+    work += slots * ((2 if material or rest else 0) + (4 if rest else 0))
+    threads = torch.get_num_threads()
+    return work * (threads if scenes >= threads else 1) * model.mass.element_size()

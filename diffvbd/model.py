@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import ops
+from . import native, ops
 from .checks import check_number, check_positive, fail
 from .energies import VERTEX_ENERGIES, Energy, FloorBarrier, StableNeoHookean, VertexEnergy
 from .mesh import TetMesh
@@ -67,19 +67,16 @@ class Model:
         if dtype not in (torch.float64, torch.float32):
             raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
         self.mesh = mesh
+        self._twin: Model | None = None
         self.saturation = None if saturation is None else check_positive("saturation", saturation, "m")
         self.regularization = check_number("regularization", regularization)
         self.relaxation = check_positive("relaxation", relaxation, "")
         if self.relaxation >= 2:
             fail("relaxation", "a number in (0, 2): from 2 on the updates raise the potential", relaxation)
-        self.energies = _checked_energies(energies, mesh.num_vertices)
-        # the energies of single vertices, in the order in which kernels and data keep them
-        present = [e for e in self.energies if isinstance(e, VertexEnergy)]
-        self.vertex_energies: tuple[VertexEnergy, ...] = tuple(sorted(present, key=lambda e: e.bit))
+        self._set_energies(_checked_energies(energies, mesh.num_vertices))
         self.energy_mask = sum(e.bit for e in self.energies)
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
-        self.floor = next((e for e in self.energies if isinstance(e, FloorBarrier)), None)
 
         points = torch.from_numpy(mesh.points.copy())
         tets = torch.from_numpy(mesh.tets.copy())
@@ -92,14 +89,27 @@ class Model:
             fail("mesh", "every vertex in a tet, or pinned", f"{loose.numel()} isolated vertices: {shown}")
         self.density = _per_tet_density(density, mesh.num_tets)
         self.pinned = mask
-        self._plan, self.color_ptr, self.color_vertices, star_ptr, star = ops.build_plan(points, tets, ~mask)
-        self._topology = (tets, star_ptr, star)
-        self._sizes = (int(self._plan[2]), mesh.num_tets, int(self._plan[5]))
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = _first_of_body(body)
+        device = _checked_device(device)
+        self._arrange(points, tets, device)
         self._measure(points)
         self._warn()
-        self._place(dtype, torch.device(device))
+        self._place(dtype, device)
+
+    def _set_energies(self, energies: tuple[Energy, ...]) -> None:
+        self.energies = energies
+        # the energies of single vertices, in the order in which kernels and data keep them
+        present = [e for e in energies if isinstance(e, VertexEnergy)]
+        self.vertex_energies: tuple[VertexEnergy, ...] = tuple(sorted(present, key=lambda e: e.bit))
+        self.floor = next((e for e in energies if isinstance(e, FloorBarrier)), None)
+        self._constants: dict[str, dict[str, Tensor]] = {}
+
+    def constants(self, energy: VertexEnergy) -> dict[str, Tensor]:
+        """The parameters of one of the Model's energies, as tensors of its dtype and device."""
+        if energy.name not in self._constants:
+            self._constants[energy.name] = energy.constants(self.rest_points)
+        return self._constants[energy.name]
 
     def _warn(self) -> None:
         """Warns of safeguards outside the range in which they were found to help (docs/numerics.md)."""
@@ -117,12 +127,19 @@ class Model:
                 "lightest vertex; the sweeps converge that much more slowly"
             )
 
+    def _arrange(self, points: Tensor, tets: Tensor, device: torch.device) -> None:
+        """The order of the sweeps, in the form that a device wants; everything still on the CPU."""
+        plan = ops.build_plan(points, tets, ~self.pinned, ops.LANES[device.type])
+        self._plan, self.color_ptr, self.color_vertices, star_ptr, star = plan
+        self._topology = (tets, star_ptr, star)
+        self._sizes = ops.plan_sizes(self._plan, device.type)
+
     def _measure(self, points: Tensor) -> None:
         """Everything that follows from the rest positions, in float64."""
         rest, volume = rest_metric(ops.tet_gather(points[None], *self._topology))
         self.rest_points = points
         self.mass = lumped_mass(self.density[None], volume, *self._topology)[0]
-        self._packed_rest = ops.pack_rest(rest, self._plan, self._sizes)
+        self._rest = rest
         data = [e.pack(self._parameters(e, points), None) for e in self.vertex_energies]
         self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
 
@@ -130,13 +147,18 @@ class Model:
         return {name: value[None] for name, value in energy.constants(rest_points).items()}
 
     def _place(self, dtype: torch.dtype, device: torch.device) -> None:
-        if device.type == "cuda":
-            fail("device", '"cpu": this version has no CUDA backend', repr(str(device)))
         self.dtype, self.device = dtype, device
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
                 setattr(self, name, value.to(device, dtype) if value.is_floating_point() else value.to(device))
         self._topology = tuple(t.to(device) for t in self._topology)
+        placed = [e.placed(self.num_vertices, device) if isinstance(e, VertexEnergy) else e for e in self.energies]
+        self._set_energies(tuple(placed))
+        if hasattr(self, "_rest"):
+            self._packed_rest = ops.pack_rest(self._rest, self._plan, self._sizes)
+            del self._rest
+        for energy in self.vertex_energies:
+            self.constants(energy)
 
     @classmethod
     def paper(cls, mesh: TetMesh, **options: Any) -> Model:
@@ -155,12 +177,23 @@ class Model:
         dtype = dtype or self.dtype
         if dtype not in (torch.float64, torch.float32):
             raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
+        device = self.device if device is None else _checked_device(device)
         out = copy.copy(self)
+        out._twin = None
         out._place(torch.float64, torch.device("cpu"))
         # from the mesh's own float64 positions, so that a way through float32 loses nothing
-        out._measure(torch.from_numpy(self.mesh.points.copy()))
-        out._place(dtype, torch.device(device) if device is not None else self.device)
+        points = torch.from_numpy(self.mesh.points.copy())
+        if device.type != self.device.type:
+            out._arrange(points, out.tets, device)
+        out._measure(points)
+        out._place(dtype, device)
         return out
+
+    def _on_cpu(self) -> Model:
+        """The same Model on the CPU, made once: what debug_checks() asks about a step on CUDA."""
+        if self._twin is None:
+            self._twin = self.to("cpu")
+        return self._twin
 
     @property
     def tets(self) -> Tensor:
@@ -191,7 +224,7 @@ class Model:
         return self.color_ptr.shape[0] - 1
 
     def settings(self, time_step: float, sweeps: int) -> ops.SweepSettings:
-        """What the kernels execute for this Model besides its tensors."""
+        """What the kernels execute for this Model besides its tensors; on CUDA a regime is still to be chosen."""
         saturation = -1.0 if self.saturation is None else self.saturation
         numbers = (time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS, FILTER_ETA)
         return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps)
@@ -212,6 +245,17 @@ class Model:
             f"energies=({', '.join(map(repr, self.energies))})"
             f"{''.join(', ' + s for s in safeguards)}, {self.dtype}, {self.device})"
         )
+
+
+def _checked_device(device: torch.device | str) -> torch.device:
+    device = torch.device(device)
+    if device.type not in ops.LANES:
+        fail("device", '"cpu" or "cuda"', repr(str(device)))
+    if device.type == "cuda":
+        native.require_cuda()
+        if device.index is None:
+            device = torch.device("cuda", torch.cuda.current_device())
+    return device
 
 
 def _warn(message: str) -> None:

@@ -1,7 +1,7 @@
-"""The compiled operators and their autograd functions: the only file that names torch.ops.diffvbd.
+"""The compiled operators, and the autograd functions of gathers and sums: the only file that names torch.ops.diffvbd.
 
 Raw operators are private and functional. Each differentiable one is an autograd.Function in the form that also serves
-torch.func and torch.compile; the backward is a second Function, whose own backward raises.
+torch.func and torch.compile; the sweep's stand in sweeps.py.
 """
 
 # pyright: reportIncompatibleMethodOverride=false
@@ -9,49 +9,52 @@ from __future__ import annotations
 
 import inspect
 import math
-import sysconfig
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import torch
 from torch import Tensor
 from torch.autograd import Function
 
+from . import native
+
 NO_TAPE, COMPACT_TAPE, FULL_TAPE = 0, 1, 2
 REST_SCALARS = 7  # k01 k02 k03 k12 k13 k23 c6 of a tet
 _FILTERING = 4  # mask of the energies with a step filter (FloorBarrier)
 
 
-def _load() -> None:
-    folder = Path(__file__).parent
-    for suffix in (".abi3.so", sysconfig.get_config_var("EXT_SUFFIX") or ".so"):
-        path = folder / f"_C{suffix}"
-        if path.exists():
-            torch.ops.load_library(str(path))
-            return
-    raise ImportError(
-        "diffvbd is not built here: run `pip install --no-build-isolation -e .` in this folder, or, if it is installed "
-        "elsewhere, leave this folder, whose sources hide the installed package"
-    )
-
-
-_load()
-_ops = torch.ops.diffvbd
+native.load()
+raw = torch.ops.diffvbd
 
 
 class SweepSettings(NamedTuple):
     """What a sweep executes besides its tensors, in the order of csrc/ops.cpp."""
 
-    sizes: tuple[int, int, int]  # active vertices, tets, slots of the plan
+    sizes: tuple[int, ...]  # active vertices, tets, slots of the plan; more on CUDA, see plan_sizes
     energies: int  # mask
     data_count: tuple[int, ...]  # scalars per scene, or per vertex, of each energy of one vertex
     numbers: tuple[float, ...]  # time_step, regularization, relaxation, saturation, saturation_eps, filter_eta
     sweeps: int
+    launch: tuple[int, ...] = ()  # on CUDA: regime and threads per vertex, see regimes.py
+
+
+LANES = {"cpu": 8, "cuda": 32}  # vertices of a block of the plan; twins of kLanes and kSlice in csrc/core/views.h
+
+
+def plan_sizes(plan: Tensor, device: str) -> tuple[int, ...]:
+    """What the host must know of a plan that is still on the CPU; the order is that of csrc/ops_cuda.cpp."""
+    vertices, tets, active, colors, blocks, slots, edge_slots, incoming_slots = plan[:8].tolist()
+    if device == "cpu":
+        return active, tets, slots
+    first = 8 + colors + 1 + 2 * (blocks + 1)
+    edges = plan[first : first + blocks + 1]
+    degree = int(edges.diff().max()) if blocks else 0
+    return (active, tets, slots, vertices, colors, blocks, edge_slots, incoming_slots, degree,
+            *plan[8 : 8 + colors + 1].tolist())  # fmt: skip
 
 
 def tape_rows(policy: int, energies: int) -> int:
-    """Scalars of tape per active vertex and sweep; twin of tape_rows in csrc/cpu/scene.h."""
+    """Scalars of tape per active vertex and sweep; twin of tape_rows in csrc/core/views.h."""
     return {NO_TAPE: 0, COMPACT_TAPE: 3, FULL_TAPE: 12 if energies & _FILTERING else 9}[policy]
 
 
@@ -60,27 +63,48 @@ def tape_rows(policy: int, energies: int) -> int:
 
 @torch.library.register_fake("diffvbd::sweep")
 def _(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, plan, sizes, energies, data_count, numbers, sweeps,
-      tape_policy, debug_step, checked):  # fmt: skip
+      launch, tape_policy, debug_step, checked):  # fmt: skip
     rows = tape_rows(tape_policy, energies)
     return torch.empty_like(x_start), x_start.new_empty((x_start.shape[0], sweeps, rows, sizes[0]))
 
 
+def _materials(mu: Tensor, lam: Tensor, num_tets: int) -> int:
+    """Length of the adjoints of mu and lam: CUDA sums what a scene shares."""
+    return 1 if mu.is_cuda and mu.shape[-1] == 1 and lam.shape[-1] == 1 else num_tets
+
+
 @torch.library.register_fake("diffvbd::sweep_backward")
 def _(x_bar, x, x_prev, y, mu, lam, mass, rest, energy_data, origin, tape, plan, sizes, energies, data_count, numbers,
-      sweeps, tape_policy, wants):  # fmt: skip
-    b, v = x.shape[:2]
+      sweeps, launch, tape_policy, wants):  # fmt: skip
+    (b, v), materials = x.shape[:2], _materials(mu, lam, sizes[1])
 
     def wanted(flag: bool, *shape: int) -> Tensor:
         return x.new_empty((b, *shape) if flag else (0,))
 
-    return (*(torch.empty_like(x) for _ in range(3)), wanted(wants[0], sizes[1]), wanted(wants[0], sizes[1]),
+    return (*(torch.empty_like(x) for _ in range(3)), wanted(wants[0], materials), wanted(wants[0], materials),
             wanted(wants[1], v), wanted(wants[2], sizes[1], REST_SCALARS),
             wanted(wants[3], energy_data.shape[-1]))  # fmt: skip
 
 
+@torch.library.register_fake("diffvbd::fused_step")
+def _(x, v, acceleration, held, mu, lam, mass, rest, plan, sizes, energies, data_count, numbers, sweeps, launch,
+      tape_policy):  # fmt: skip
+    rows = tape_rows(tape_policy, energies)
+    return torch.empty_like(x), torch.empty_like(x), x.new_empty((x.shape[0], sweeps, rows, sizes[0]))
+
+
+@torch.library.register_fake("diffvbd::fused_step_backward")
+def _(x_bar, v_bar, x_end, x, v, acceleration, held, mu, lam, mass, rest, tape, plan, sizes, energies, data_count,
+      numbers, sweeps, launch, tape_policy, wants):  # fmt: skip
+    b, materials = x.shape[0], _materials(mu, lam, sizes[1])
+    shapes = [x.shape] * 4 + [(b, materials)] * 2 + [(b, x.shape[1]), (b, sizes[1], REST_SCALARS)]
+    flags = [*wants[:5], wants[4], *wants[5:]]
+    return tuple(x.new_empty(shape if flag else (0,)) for flag, shape in zip(flags, shapes, strict=True))
+
+
 @torch.library.register_fake("diffvbd::pack_rest")
 def _(rest, plan, sizes):
-    return rest.new_empty((rest.shape[0], sizes[2], 4, 8))
+    return rest.new_empty((rest.shape[0], sizes[2], 4, LANES[rest.device.type]))
 
 
 @torch.library.register_fake("diffvbd::tet_gather")
@@ -102,14 +126,23 @@ def _raw_backward(ctx: Any, *grads: Tensor) -> NoReturn:
     raise NotImplementedError("diffvbd: the raw operators are not differentiable; call diffvbd.step")
 
 
-for _name in ("sweep", "sweep_backward", "pack_rest", "tet_gather", "star_sum", "row_sum"):
+for _name in (
+    "sweep",
+    "sweep_backward",
+    "fused_step",
+    "fused_step_backward",
+    "pack_rest",
+    "tet_gather",
+    "star_sum",
+    "row_sum",
+):
     torch.library.register_autograd(f"diffvbd::{_name}", _raw_backward)
 
 
 # --- fixed-order reductions -------------------------------------------------------------------------------------------
 
 
-def _fold(tensor: Tensor, dim: int | None, size: int, scenes: int) -> Tensor:
+def fold_scenes(tensor: Tensor, dim: int | None, size: int, scenes: int) -> Tensor:
     """[1 | B, ...] with a vmapped dimension of ``size`` -> [1 | size B, ...], for functions with a scene dimension."""
     if dim is None:
         if tensor.shape[0] == 1:
@@ -124,7 +157,7 @@ class _RowSum(Function):
 
     @staticmethod
     def forward(values: Tensor) -> Tensor:
-        return _ops.row_sum(values.contiguous())
+        return raw.row_sum(values.contiguous())
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
@@ -140,7 +173,7 @@ class _RowSum(Function):
         return _RowSum.apply(values.flatten(0, 1)).unflatten(0, values.shape[:2]), 0
 
 
-def _sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
+def sum_to(tensor: Tensor, shape: Sequence[int]) -> Tensor:
     """Sums the dimensions in which ``shape`` has 1 (same number of dimensions), in a fixed order."""
     reduced = [d for d, n in enumerate(shape) if n == 1 and tensor.shape[d] != 1]
     if not reduced:
@@ -163,7 +196,7 @@ class _Broadcast(Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:
-        return _sum_to(grads[0], ctx.shape), None
+        return sum_to(grads[0], ctx.shape), None
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, tensor: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, int]:
@@ -183,7 +216,7 @@ def broadcast(tensor: Tensor, shape: Sequence[int]) -> Tensor:
 class _TetGather(Function):
     @staticmethod
     def forward(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor) -> Tensor:
-        return _ops.tet_gather(values.contiguous(), tets)
+        return raw.tet_gather(values.contiguous(), tets)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
@@ -202,7 +235,7 @@ class _TetGather(Function):
 class _StarSum(Function):
     @staticmethod
     def forward(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor, positive: bool) -> Tensor:
-        return _ops.star_sum(values.contiguous(), star_ptr, star, positive)
+        return raw.star_sum(values.contiguous(), star_ptr, star, positive)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
@@ -231,153 +264,22 @@ def star_sum(values: Tensor, tets: Tensor, star_ptr: Tensor, star: Tensor, *, po
     return _StarSum.apply(values, tets, star_ptr, star, positive)
 
 
-def build_plan(points: Tensor, tets: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Plan, color_ptr, color_vertices, star_ptr and star of a mesh, see csrc/cpu/plan.h."""
-    return _ops.build_plan(points, tets, active)
+def build_plan(
+    points: Tensor, tets: Tensor, active: Tensor, lanes: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Plan, color_ptr, color_vertices, star_ptr and star of a mesh, see csrc/cpu/plan.h; lanes: of :data:`LANES`."""
+    return raw.build_plan(points, tets, active, lanes)
 
 
-def pack_rest(rest: Tensor, plan: Tensor, sizes: tuple[int, int, int]) -> Tensor:
-    """Rest scalars of the tets [B, T, 7] -> as their vertices see them [B, slots, 4, 8]. Not differentiable."""
-    return _ops.pack_rest(rest.contiguous(), plan, sizes)
+def pack_rest(rest: Tensor, plan: Tensor, sizes: tuple[int, ...]) -> Tensor:
+    """Rest scalars of the tets [B, T, 7] -> as their vertices see them [B, slots, 4, lanes]. Not differentiable."""
+    return raw.pack_rest(rest.contiguous(), plan, sizes)
 
 
-# --- the sweep --------------------------------------------------------------------------------------------------------
-
-_TENSORS = 8  # x_start, x_prev, y, mu, lam, mass, rest, energy_data: the differentiable inputs, all [1 | B, ...]
-
-
-class _Sweep(Function):
-    """K sweeps of block updates and, as its backward, the same sweeps transposed in reverse order."""
-
-    @staticmethod
-    def forward(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, packed_rest, plan, settings, tape_policy,
-                debug_step, checked):  # fmt: skip
-        if rest is not None:
-            packed_rest = pack_rest(rest, plan, settings.sizes)
-        return _ops.sweep(x_start, x_prev, y, mu, lam, mass, packed_rest, energy_data, origin, plan, *settings,
-                          tape_policy, debug_step, checked)  # fmt: skip
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
-        *tensors, origin, packed_rest, plan, settings, tape_policy, _, _ = inputs
-        ctx.save_for_backward(*tensors, origin, packed_rest, plan, *output)
-        ctx.settings, ctx.tape_policy = settings, tape_policy
-        ctx.mark_non_differentiable(output[1])
-        ctx.set_materialize_grads(False)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple:
-        if grads[0] is None:
-            return (None,) * (_TENSORS + 7)
-        needs = ctx.needs_input_grad[:_TENSORS]
-        out = _SweepBackward.apply(grads[0], *ctx.saved_tensors, ctx.settings, ctx.tape_policy, needs)
-        out = iter(out if isinstance(out, tuple) else (out,))
-        return tuple(next(out) if need else None for need in needs) + (None,) * 7
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-        tensors: tuple[Any, ...] = args[: _TENSORS + 1]
-        scenes = _scenes(tensors, in_dims)
-        folded: list[Any] = [
-            t if t is None or t.numel() == 0 else _fold(t, d, info.batch_size, scenes)
-            for t, d in zip(tensors, in_dims, strict=False)
-        ]
-        full = (info.batch_size * scenes, *folded[0].shape[1:])
-        folded[:3] = [t.expand(full).contiguous() for t in folded[:3]]
-        x, tape = _Sweep.apply(*folded, *args[_TENSORS + 1 :])
-        return (x.unflatten(0, (-1, scenes)), tape.unflatten(0, (-1, scenes))), (0, 0)
+def ready_signature(*functions: type[Function]) -> None:
+    """apply() asks for the signature of forward at every call: ready-made, it costs less."""
+    for function in functions:
+        function.forward.__signature__ = inspect.signature(function.forward)  # type: ignore[attr-defined]
 
 
-class _SweepBackward(Function):
-    @staticmethod
-    def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, packed_rest, plan, x, tape,
-                settings, tape_policy, needs):  # fmt: skip
-        if rest is not None:
-            packed_rest = pack_rest(rest, plan, settings.sizes)
-        inputs = (x_prev, y, mu, lam, mass, packed_rest, energy_data, origin)
-        if tape_policy == NO_TAPE:
-            tape_policy = FULL_TAPE
-            x, tape = _ops.sweep(x_start, *inputs, plan, *settings, tape_policy, -1, False)
-        wants = (needs[3] or needs[4], needs[5], needs[6], needs[7])
-        bars = _ops.sweep_backward(x_bar.contiguous(), x, *inputs, tape, plan, *settings, tape_policy, wants)
-        given: tuple[Any, ...] = (x_start, x_prev, y, mu, lam, mass, rest, energy_data)
-        return tuple(_sum_to(bar, t.shape) for bar, t, need in zip(bars, given, needs, strict=True) if need)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        ctx.count = len(inputs)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> NoReturn:
-        raise NotImplementedError("diffvbd: second derivatives of a step are not supported (create_graph, hessian)")
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        x_bar, *saved, settings, tape_policy, needs = args
-        tensors: tuple[Any, ...] = (x_bar, *saved[: _TENSORS + 1])
-        scenes = _scenes(tensors, in_dims)
-        size = info.batch_size
-
-        def fold(t: Tensor | None, d: int | None) -> Any:
-            return t if t is None or t.numel() == 0 else _fold(t, d, size, scenes)
-
-        folded: list[Any] = [fold(t, d) for t, d in zip(tensors, in_dims, strict=False)]
-        packed_rest, plan, x, tape = saved[_TENSORS + 1 :]
-        x, tape = (
-            t if t.numel() == 0 else t.expand(size * scenes, *t.shape[1:]).contiguous()
-            for t in (fold(t, d) for t, d in zip((x, tape), in_dims[_TENSORS + 4 :], strict=False))
-        )
-        full = (size * scenes, *x_bar.shape[-2:])
-        # shared inputs get a gradient for each member of the batch: give every differentiated one its own scenes
-        spread: list[Any] = [t.expand(size * scenes, *t.shape[1:]).contiguous() if t is not None and need else t
-                  for t, need in zip(folded[1 : _TENSORS + 1], needs, strict=True)]  # fmt: skip
-        spread[:3] = [t.expand(full).contiguous() for t in spread[:3]]
-        out = _SweepBackward.apply(folded[0].expand(full), *spread, folded[-1], packed_rest, plan, x, tape, settings,
-                                   tape_policy, needs)  # fmt: skip
-        out = out if isinstance(out, tuple) else (out,)
-        shapes = [t.shape[0] if d is None else t.movedim(d, 0).shape[1]
-                  for t, d, need in zip(saved[:_TENSORS], in_dims[1:], needs, strict=False) if need]  # fmt: skip
-        result = tuple(
-            o.unflatten(0, (size, scenes)) if n == scenes else _member_sum(o.unflatten(0, (size, scenes)))
-            for o, n in zip(out, shapes, strict=True)
-        )
-        return result, (0,) * len(result)
-
-
-# apply() asks for the signature of forward at every call: ready-made, it costs less.
-for _function in (_RowSum, _Broadcast, _TetGather, _StarSum, _Sweep, _SweepBackward):
-    _function.forward.__signature__ = inspect.signature(_function.forward)  # type: ignore[attr-defined]
-
-
-def _member_sum(values: Tensor) -> Tensor:
-    """[N, B, ...] -> [N, 1, ...]: what the scenes of each member add to an input that they share."""
-    return _sum_to(values, (values.shape[0], 1, *values.shape[2:]))
-
-
-def _scenes(tensors: Sequence[Tensor | None], in_dims: tuple) -> int:
-    sizes = [1]
-    for t, d in zip(tensors, in_dims, strict=False):
-        if t is not None and t.numel() > 0:
-            sizes.append((t if d is None else t.movedim(d, 0)[0]).shape[0])
-    return max(sizes)
-
-
-def sweep(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, packed_rest, plan, settings: SweepSettings, *,
-          tape_policy: int, debug_step: int = -1, checked: bool = True) -> Tensor:  # fmt: skip
-    """Positions after the sweeps, [B, V, 3], differentiable in the first eight tensors.
-
-    Args:
-        x_start, x_prev, y: Start of the sweep, start of the step, predictor [m], [B, V, 3].
-        mu, lam: [1 | B, 1 | T] [Pa]; mass: [1 | B, V] [kg].
-        rest: [1 | B, T, 7], or None for the Model's own ``packed_rest`` [1, slots, 4, 8].
-        energy_data: [1 | B, n], see VertexEnergy.pack; origin: [B, V, 3] or empty.
-        tape_policy: What is kept for the backward; NO_TAPE runs the step again there.
-    """
-    tensors = (x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin)
-    distinct: list[Tensor | None] = []
-    for t in tensors:
-        t = t if t is None else t.contiguous()
-        # torch.compile refuses one tensor in two places
-        distinct.append(t.view_as(t) if t is not None and any(t is other for other in distinct) else t)
-    x, _ = _Sweep.apply(*distinct, packed_rest, plan, settings, tape_policy, debug_step, checked)
-    return x
+ready_signature(_RowSum, _Broadcast, _TetGather, _StarSum)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
@@ -92,7 +93,9 @@ def run_segments(run: Run, steps: int, x: Tensor, v: Tensor, every: int | Binomi
 
 def _again(run: Callable[..., Segment], *args: Any) -> Segment:
     # The non-reentrant form: gradients reach what a callable closes over, and checkpoints nest.
-    return checkpoint(run, *args, use_reentrant=False)  # type: ignore[return-value]
+    # A graph's capture admits no look at the state of the random number generator; what is replayed draws none.
+    capturing = torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
+    return checkpoint(run, *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
 
 
 def _binomial(run: Run, first: int, end: int, x: Tensor, v: Tensor, snapshots: int) -> Segment:

@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from . import ops
+from . import ops, regimes
 from .adjoints import ReverseSweep
 from .checks import check_broadcast, check_count, check_positive, check_tensor, fail
+from .memory import out_of_memory_named
 from .metric import lumped_mass, rest_metric
 from .model import Model
+from .sweeps import fused_step, sweep
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
 
@@ -175,7 +177,7 @@ def prepare(
         if name not in known:
             fail("parameters", f"names among {sorted(known)}", repr(name))
         energy, key, own = known[name]
-        shape = tuple(energy.constants(model.rest_points)[key].shape)[:own]
+        shape = tuple(model.constants(energy)[key].shape)[:own]
         given[name] = _scenes_first(name, value, like, lead, shape)
     return Prepared(
         mu=_scenes_first("mu", mu, like, lead, tets),
@@ -193,7 +195,7 @@ def _energy_data(model: Model, prepared: Prepared, origin: Tensor | None) -> Ten
         return model._energy_data
     packed = []
     for energy in model.vertex_energies:
-        values = {k: v[None] for k, v in energy.constants(model.rest_points).items()}
+        values = {k: v[None] for k, v in model.constants(energy).items()}
         values.update({k: prepared.parameters[f"{energy.name}.{k}"] for k in values
                        if f"{energy.name}.{k}" in prepared.parameters})  # fmt: skip
         packed.append(energy.pack(values, origin))
@@ -220,8 +222,18 @@ def advance(
     shape, flat = x.shape, (math.prod(x.shape[:-2]), *x.shape[-2:])
     if not isinstance(gravity, Tensor):
         gravity = _three_numbers("gravity", gravity, x)
-    acceleration = ops.broadcast(_broadcastable("gravity", gravity, x), shape).reshape(flat)
+    gravity = _broadcastable("gravity", gravity, x)
     start, velocity = x.reshape(flat), v.reshape(flat)
+    adjoint = ReverseSweep() if adjoint is None else adjoint
+    if not isinstance(adjoint, ReverseSweep):
+        raise TypeError(f"adjoint: expected a diffvbd.ReverseSweep, got {type(adjoint).__name__}")
+    if x.is_cuda:
+        launch = regimes.choose(model.num_vertices, model.num_colors, flat[0])
+        prepared = prepared._replace(settings=prepared.settings._replace(launch=launch))
+        if _fuses(model, force, gravity):
+            held = None if prescribed is None else _broadcastable("prescribed", prescribed, x)
+            return _fused(model, start, velocity, gravity, held, prepared, adjoint, shape)
+    acceleration = ops.broadcast(gravity, shape).reshape(flat)
     if force is not None:
         total = ops.broadcast(_broadcastable("force", force, x), shape).reshape(flat)
         # A pinned vertex is moved by no force, whatever stands there.
@@ -247,17 +259,15 @@ def advance(
         filtered = model.floor.filter(start, y - start, data[:, :count], origin)
         x_start = torch.where(model.pinned[:, None], y, filtered)
 
-    adjoint = ReverseSweep() if adjoint is None else adjoint
-    if not isinstance(adjoint, ReverseSweep):
-        raise TypeError(f"adjoint: expected a diffvbd.ReverseSweep, got {type(adjoint).__name__}")
     tensors = (x_start, start, y, prepared.mu, prepared.lam, prepared.mass, prepared.rest, data)
-    differentiated = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
-    scalars = flat[0] * prepared.settings.sweeps * model.num_active
-    policy = adjoint.policy(scalars, x.element_size(), model.energy_mask) if differentiated else ops.NO_TAPE
-    empty = x.new_empty((0,))
+    policy = _tape_policy(model, tensors, prepared.settings, adjoint)
+    tensors = (*tensors, x.new_empty((0,)) if origin is None else origin)
     try:
-        end = ops.sweep(*tensors, empty if origin is None else origin, model._packed_rest, model._plan,
-                        prepared.settings, tape_policy=policy, debug_step=index if _debug else -1)  # fmt: skip
+        if _debug and x.is_cuda:
+            _check_on_cpu(model, tensors, prepared.settings, index)
+        with out_of_memory_named(model, tensors[0], prepared.settings, policy):
+            end = sweep(*tensors, model._packed_rest, model._plan, prepared.settings, tape_policy=policy,
+                        debug_step=index if _debug else -1)  # fmt: skip
     except ValueError as error:
         _name_argument(error, {"x": x, "v": v, "force": force, "gravity": gravity, "prescribed": prescribed})
         raise
@@ -265,6 +275,53 @@ def advance(
     if origin is not None:
         end = end + origin
     return end.reshape(shape), velocity.reshape(shape)
+
+
+def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
+    """Whether one operator can do the whole step on CUDA. Forces, vertex energies, float32's local origin, function
+    transforms and checks take the parts."""
+    simple = force is None and not model.vertex_energies and model.dtype == torch.float64
+    if not simple or _debug or torch.compiler.is_compiling() or gravity.dim() > 1:
+        return False
+    return torch._C._functorch.peek_interpreter_stack() is None
+
+
+def _fused(
+    model: Model,
+    x: Tensor,
+    v: Tensor,
+    gravity: Tensor,
+    held: Tensor | None,
+    prepared: Prepared,
+    adjoint: ReverseSweep,
+    shape: torch.Size,
+) -> tuple[Tensor, Tensor]:
+    held = x.new_empty((0,)) if held is None else ops.broadcast(held, shape).reshape(x.shape)
+    acceleration = ops.broadcast(gravity, (1, 1, 3))
+    tensors = (x, v, acceleration, held, prepared.mu, prepared.lam, prepared.mass, prepared.rest)
+    policy = _tape_policy(model, tensors, prepared.settings, adjoint)
+    with out_of_memory_named(model, x, prepared.settings, policy):
+        x_end, v_end = fused_step(*tensors, model._packed_rest, model._plan, prepared.settings, tape_policy=policy)
+    return x_end.reshape(shape), v_end.reshape(shape)
+
+
+def _tape_policy(
+    model: Model, tensors: Sequence[Tensor | None], settings: ops.SweepSettings, adjoint: ReverseSweep
+) -> int:
+    if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)):
+        return ops.NO_TAPE
+    x = tensors[0]
+    assert x is not None
+    return adjoint.policy(x.shape[0] * settings.sweeps * model.num_active, x.element_size(), model.energy_mask)
+
+
+def _check_on_cpu(model: Model, tensors: tuple, settings: ops.SweepSettings, index: int) -> None:
+    """debug_checks() on CUDA: the CPU repeats the step and names what is wrong with it."""
+    twin = model._on_cpu()
+    settings = settings._replace(sizes=twin._sizes, launch=())
+    with torch.no_grad():
+        here = [t if t is None else t.detach().cpu() for t in tensors]
+        sweep(*here, twin._packed_rest, twin._plan, settings, tape_policy=ops.NO_TAPE, debug_step=index)
 
 
 def _name_argument(error: ValueError, arguments: dict[str, Any]) -> None:
@@ -288,7 +345,9 @@ def _three_numbers(name: str, value: Any, like: Tensor) -> Tensor:
         raise TypeError(f"{name}: expected 3 numbers or a tensor, got {value!r}")
     if len(value) != 3:
         fail(name, "3 numbers or a tensor", f"{len(value)} numbers")
-    return torch.tensor([float(a) for a in value], dtype=like.dtype, device=like.device)
+    if like.is_cuda:  # kernels fill it: a copy from the host would wait for the device and break a graph's capture
+        return torch.stack([torch.full((), float(a), dtype=like.dtype, device=like.device) for a in value])
+    return torch.tensor([float(a) for a in value], dtype=like.dtype)
 
 
 def _broadcastable(name: str, value: Any, x: Tensor) -> Tensor:

@@ -218,7 +218,7 @@ class Scene:
             built.append(Anchor(self.case.anchor))
         return tuple(built)
 
-    def model(self) -> Any:
+    def model(self, device: str = "cpu") -> Any:
         """A `diffvbd.Model` of the scene, float64."""
         from diffvbd.mesh import TetMesh
         from diffvbd.model import Model
@@ -231,9 +231,10 @@ class Scene:
             saturation=self.case.saturation,
             regularization=self.case.regularization,
             relaxation=self.case.relaxation,
+            device=device,
         )
 
-    def inputs(self, dtype: torch.dtype = torch.float64) -> dict[str, Any]:
+    def inputs(self, dtype: torch.dtype = torch.float64, device: str = "cpu") -> dict[str, Any]:
         """Fresh tensors for every differentiable argument of `step` (and `time_step`), parameters as a dict."""
         tensors: dict[str, Any] = {name: torch.tensor(a, dtype=dtype) for name, a in self.arrays.items()}
         parameters: dict[str, Any] = {}
@@ -247,7 +248,7 @@ class Scene:
             parameters["anchor.points"] = torch.tensor(self.points, dtype=dtype)
         if parameters:
             tensors["parameters"] = parameters
-        return tensors | {"time_step": self.case.time_step}
+        return on_device(tensors, device) | {"time_step": self.case.time_step}
 
 
 def build_scene(case: str, kind: str = "structured", size: str = "small") -> Scene:
@@ -286,9 +287,19 @@ def scenes(
         yield build_scene(case, kind, size)
 
 
+def on_device(values: Any, device: torch.device | str) -> Any:
+    """Every tensor of a nested dict on another device; what is there already is not copied."""
+    if isinstance(values, dict):
+        return {name: on_device(value, device) for name, value in values.items()}
+    return values.to(device) if isinstance(values, Tensor) else values
+
+
 def relative_error(value: Tensor | np.ndarray, expected: Tensor | np.ndarray) -> float:
-    """max |value - expected| / max |expected|; 0 for two zeros, inf for a non-zero against zero, nan passes through."""
-    value, expected = (torch.as_tensor(a).detach().to(torch.float64) for a in (value, expected))
+    """max |value - expected| / max |expected|; 0 for two zeros, inf for a non-zero against zero, nan passes through.
+
+    Compared on the CPU, wherever the two are.
+    """
+    value, expected = (torch.as_tensor(a).detach().to("cpu", torch.float64) for a in (value, expected))
     if value.shape != expected.shape:
         raise ValueError(f"value: expected shape {tuple(expected.shape)}, got {tuple(value.shape)}")
     if expected.numel() == 0:

@@ -99,8 +99,11 @@ Values vertex_vjp(const Values& in) {
   Vec3<R> x_bar = zero3<R>(), x_prev_bar = zero3<R>();
   vertex_energy_vjp<E>(s, &a[kVertexInputs], count, p, d_raw, x_bar, x_prev_bar);
   R data_bar[kMaxEnergyData];
-  vertex_energy_data_vjp<E>(s, &a[kVertexInputs], count, p, d_raw, vec(&a[15]), parameters_of<R>(in[18], 1), a[19],
-                            data_bar);
+  const auto q = parameters_of<R>(in[18], 1);
+  Update<R> u{d_raw, vec(&a[15]), R(1)};
+  if constexpr (E::has_filter) u.alpha = E::filter(s, &a[kVertexInputs], count, u.step, q);
+  vertex_energy_data_vjp<E>(s, &a[kVertexInputs], count, p, u, q, a[19],
+                            [&](int i, const R& value) { data_bar[i] = value; });
   Values out;
   put(out, x_bar), put(out, x_prev_bar);
   for (int i = 0; i < count; ++i) out.push_back(static_cast<double>(data_bar[i]));
@@ -143,10 +146,12 @@ Values vertex_dual(const Values& in) {
   const std::vector<Long> a = cast<Long>(in);
   const VertexState<Long> s = state_of(a);
   const Vec3<Long> p = vec(&a[9]), d_raw = vec(&a[12]);
-  const DualAdjoint<E, Long> adjoint{s, &a[kVertexInputs], static_cast<int>(a.size()) - kVertexInputs, p, d_raw};
   Vec3<Long> x_bar = zero3<Long>(), x_prev_bar = zero3<Long>();
-  adjoint.subtract_from(x_bar, &VertexState<Dual<Long>>::x);
-  adjoint.subtract_from(x_prev_bar, &VertexState<Dual<Long>>::x_prev);
+  for (size_t k = kVertexInputs; k < a.size(); k += E::stride) {
+    const DualAdjoint<E, Long> adjoint{s, &a[k], p, d_raw};
+    adjoint.subtract_from(x_bar, &VertexState<Dual<Long>>::x);
+    adjoint.subtract_from(x_prev_bar, &VertexState<Dual<Long>>::x_prev);
+  }
   Values out;
   put(out, x_bar), put(out, x_prev_bar);
   return out;

@@ -1,4 +1,8 @@
-"""Bad input: a ValueError or TypeError that names the argument and says what came; inputs stay untouched."""
+"""Bad input: a ValueError or TypeError that names the argument and says what came; inputs stay untouched.
+
+Shapes, types and devices are checked always. Values are read on CUDA only inside debug_checks(), because a look at one
+waits for the device: `value_checks` opens it there.
+"""
 
 import re
 from collections.abc import Callable
@@ -10,6 +14,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd.testing import on_device
 
 NAN, INF = float("nan"), float("inf")
 MESH = dv.mesh.cube()  # 8 vertices, 6 tets
@@ -20,9 +25,9 @@ def doubles(*values: Any) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def model_of(kind: str = "exact") -> dv.Model:
+def model_of(device: str, kind: str = "exact") -> dv.Model:
     energies = (dv.StableNeoHookean(kind), dv.FloorBarrier(height=-0.5), dv.Anchor(1.0))
-    return dv.Model(MESH, pinned=[0], energies=energies)
+    return dv.Model(MESH, pinned=[0], energies=energies, device=device)
 
 
 def spoiled(value: float, *where: int) -> Tensor:
@@ -154,15 +159,17 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
 
 
 def step_with(model: dv.Model, name: str, value: Any, lead: tuple[int, ...] = (), **options: Any) -> Any:
-    x = torch.from_numpy(MESH.points.copy()).repeat(*lead, 1, 1)
+    device = model.device if isinstance(model, dv.Model) else "cpu"
+    x = torch.from_numpy(MESH.points.copy()).repeat(*lead, 1, 1).to(device)
     given: dict[str, Any] = {"x": x, "v": torch.zeros_like(x), **STEP, **options}
+    value = value if getattr(value, "is_meta", False) else on_device(value, device)
     given |= {"parameters": {name: value}} if "." in name else {name: value}
     return dv.step(model, **given)
 
 
 @pytest.mark.parametrize(("name", "value", "got"), ARGUMENTS, ids=lambda a: str(a)[:24].replace("\n", " "))
-def test_bad_argument_of_a_step(name: str, value: Any, got: str) -> None:
-    model = model_of()
+def test_bad_argument_of_a_step(device: str, value_checks: None, name: str, value: Any, got: str) -> None:
+    model = model_of(device)
     before = value.clone() if isinstance(value, Tensor) and value.device.type == "cpu" else None
     raises(lambda: step_with(model, name, value), name, got)
     if before is not None:
@@ -171,47 +178,51 @@ def test_bad_argument_of_a_step(name: str, value: Any, got: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["x", "v", "mu", "force", "gravity", "rest_points", "density"])
-def test_the_same_in_a_rollout(name: str) -> None:
+def test_the_same_in_a_rollout(device: str, value_checks: None, name: str) -> None:
     bad = {"mu": -1.0, "density": -1.0, "gravity": (0.0, NAN, 0.0)}.get(name, spoiled(NAN, 3, 1))
-    x = torch.from_numpy(MESH.points.copy())
-    given = {"x": x, "v": torch.zeros_like(x), **STEP, name: bad}
-    raises(lambda: dv.rollout(model_of(), steps=2, **given), name, "nan|-")
+    x = torch.from_numpy(MESH.points.copy()).to(device)
+    given = {"x": x, "v": torch.zeros_like(x), **STEP, name: on_device(bad, device)}
+    raises(lambda: dv.rollout(model_of(device), steps=2, **given), name, "nan|-")
     given[name] = dv.per_step(torch.stack([torch.full_like(x[0], NAN)] * 2)) if name == "gravity" else given[name]
-    raises(lambda: dv.rollout(model_of(), steps=2, **given), name, "nan|-")
+    raises(lambda: dv.rollout(model_of(device), steps=2, **given), name, "nan|-")
 
 
-def test_negative_lam_is_legal_where_its_block_allows_it() -> None:
-    assert torch.isfinite(step_with(model_of("exact"), "lam", -9e3)[0]).all()
-    raises(lambda: step_with(model_of("paper"), "lam", -1.0), "lam", "-1")
+def test_negative_lam_is_legal_where_its_block_allows_it(device: str, value_checks: None) -> None:
+    assert torch.isfinite(step_with(model_of(device, "exact"), "lam", -9e3)[0]).all()
+    raises(lambda: step_with(model_of(device, "paper"), "lam", -1.0), "lam", "-1")
     for kind in ("exact", "paper"):
-        assert torch.isfinite(step_with(model_of(kind), "mu", 0.0)[0]).all()
+        assert torch.isfinite(step_with(model_of(device, kind), "mu", 0.0)[0]).all()
 
 
 @pytest.mark.parametrize(
     ("name", "shape"), [("mu", (3, 1)), ("lam", (3, 6)), ("density", (3, 1)), ("force", (3, 8, 3)),
                         ("gravity", (3, 1, 3)), ("rest_points", (3, 8, 3)), ("anchor.points", (3, 8, 3))],
 )  # fmt: skip
-def test_mismatched_batch(name: str, shape: tuple[int, ...]) -> None:
-    raises(lambda: step_with(model_of(), name, ones(*shape), lead=(2,)), name, re.escape(str(list(shape))))
+def test_mismatched_batch(device: str, name: str, shape: tuple[int, ...]) -> None:
+    raises(lambda: step_with(model_of(device), name, ones(*shape), lead=(2,)), name, re.escape(str(list(shape))))
 
 
-def test_a_value_check_names_the_scene() -> None:
-    raises(lambda: step_with(model_of(), "mu", doubles([1.0], [-1.0]), lead=(2,)), "mu", "-1 at tet 0 of scene 1")
+def test_a_value_check_names_the_scene(device: str, value_checks: None) -> None:
+    raises(lambda: step_with(model_of(device), "mu", doubles([1.0], [-1.0]), lead=(2,)), "mu", "-1 at tet 0 of scene 1")
     second = torch.stack([spoiled(0.0, 0, 0), spoiled(NAN, 3, 1)])
-    raises(lambda: step_with(model_of(), "x", second, v=torch.zeros_like(second)), "x", "vertex 3 of scene 1")
+    raises(
+        lambda: step_with(model_of(device), "x", second, v=torch.zeros_like(second, device=device)),
+        "x",
+        "vertex 3 of scene 1",
+    )
 
 
-def test_starting_below_a_plane_names_vertices() -> None:
+def test_starting_below_a_plane_names_vertices(device: str, value_checks: None) -> None:
     below = spoiled(-0.6, 5, 1)
     below[2, 1] = -0.5  # on the plane
     below[0, 1] = -3.0  # pinned: legal
-    raises(lambda: step_with(model_of(), "x", below), "x", r"2 on or below.*\b(2, 5|5, 2)$")
+    raises(lambda: step_with(model_of(device), "x", below), "x", r"2 on or below.*\b(2, 5|5, 2)$")
     below[[2, 5], 1] = 0.0
-    assert torch.isfinite(step_with(model_of(), "x", below)[0]).all()
+    assert torch.isfinite(step_with(model_of(device), "x", below)[0]).all()
 
 
-def test_values_that_are_not_read_are_not_checked() -> None:
-    model = model_of()
+def test_values_that_are_not_read_are_not_checked(device: str, value_checks: None) -> None:
+    model = model_of(device)
     prescribed = torch.where(model.pinned[:, None], model.rest_points, NAN).requires_grad_()
     x, _ = step_with(model, "prescribed", prescribed)
     assert torch.isfinite(x).all()
@@ -331,15 +342,15 @@ HUGE = {"mu": 1e305, "lam": 1e308, "time_step": 1.0}
 
 
 @pytest.mark.parametrize("lead", [(), (1,), (2,), (5,)])
-def test_debug_checks_say_where_a_position_ceased_to_be_finite(lead: tuple[int, ...]) -> None:
-    model = model_of()
+def test_debug_checks_say_where_a_position_ceased_to_be_finite(device: str, lead: tuple[int, ...]) -> None:
+    model = model_of(device)
     x = model.rest_points.repeat(*lead, 1, 1)
     force = torch.zeros_like(x)
     force.reshape(-1, 8, 3)[-1] = 1e150  # the last scene only
     options = HUGE | {"sweeps": 3, "force": force}
     if lead:
         for name in ("mu", "lam"):
-            options[name] = torch.full((*lead, 1), 1e4, dtype=torch.float64)
+            options[name] = torch.full((*lead, 1), 1e4, dtype=torch.float64, device=device)
             options[name][-1] = HUGE[name]
     with dv.debug_checks():
         with pytest.raises(RuntimeError) as error:
@@ -350,8 +361,8 @@ def test_debug_checks_say_where_a_position_ceased_to_be_finite(lead: tuple[int, 
     assert not torch.isfinite(x).all()
 
 
-def test_debug_checks_count_the_steps_of_a_rollout() -> None:
-    model = model_of()
+def test_debug_checks_count_the_steps_of_a_rollout(device: str) -> None:
+    model = model_of(device)
     x = model.rest_points
     options = STEP | {"time_step": 1.0, "sweeps": 2, "force": torch.full_like(x, 1e3)}
     options["mu"] = lambda k, x, v: 1e308 if k == 2 else 1e4
@@ -361,8 +372,8 @@ def test_debug_checks_count_the_steps_of_a_rollout() -> None:
         assert len(dv.rollout(model, x, torch.zeros_like(x), steps=3, **options).steps) == 4
 
 
-def test_debug_checks_change_nothing_in_a_sound_step() -> None:
-    model = model_of()
+def test_debug_checks_change_nothing_in_a_sound_step(device: str) -> None:
+    model = model_of(device)
     x = model.rest_points + 0.01
     expected = dv.step(model, x, torch.zeros_like(x), **STEP)
     with dv.debug_checks():

@@ -2,10 +2,13 @@
 
 For every scene the forward comes first, then each gradient. The bar of a gradient is max(1e-12, 10 x spread), where
 spread is the disagreement of two references that differ only in rounding (`diffvbd.testing.spread`; where that sample
-is too kind, `diffvbd.testing.sensitivity`). A table of the worst scene of each case is printed at the end.
+is too kind, `diffvbd.testing.sensitivity`). A table of the worst scene of each case and device is printed at the end.
+The references always run on the CPU, once for all devices.
 """
 
+import contextlib
 import functools
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,7 +50,7 @@ MEASURED: dict[tuple, Measurement] = {}
 
 
 def compiled_result(model: Any, inputs: dict, sweeps: int, steps: int, tape: str) -> dict[str, Tensor]:
-    """`testing.evaluate` of the package's own step or rollout."""
+    """`testing.evaluate` of the package's own step or rollout, on the CPU whatever the model's device."""
     adjoint = dv.ReverseSweep(tape=tape)
 
     def run(**options: Any) -> tuple[Tensor, Tensor]:
@@ -56,7 +59,7 @@ def compiled_result(model: Any, inputs: dict, sweeps: int, steps: int, tape: str
         end = dv.rollout(model, steps=steps, sweeps=sweeps, adjoint=adjoint, save="last", **options)
         return end.x[-1], end.v[-1]
 
-    return evaluate(run, inputs)
+    return testing.on_device(evaluate(run, inputs), "cpu")
 
 
 def forward_bar(spreads: dict[str, float]) -> float:
@@ -64,12 +67,37 @@ def forward_bar(spreads: dict[str, float]) -> float:
 
 
 @functools.cache
-def measure(case: str, kind: str, size: str, sweeps: int, steps: int) -> Measurement:
+def expectation(case: str, kind: str, size: str, sweeps: int, steps: int) -> tuple[dict[str, Tensor], dict[str, float]]:
+    """Result and spreads of the reference."""
     scene = build_scene(case, kind, size)
     model, inputs = scene.model(), scene.inputs()
     expected = testing.reference_result(model, inputs, sweeps, steps)
-    spreads = testing.spread(model, inputs, sweeps, steps, expected)
-    results = [compiled_result(model, inputs, sweeps, steps, tape) for tape in TAPES]
+    return expected, testing.spread(model, inputs, sweeps, steps, expected)
+
+
+@functools.cache
+def sensitivities(case: str, kind: str, size: str, sweeps: int, steps: int) -> dict[str, float]:
+    """How far an ulp in the inputs moves the reference."""
+    scene = build_scene(case, kind, size)
+    expected, _ = expectation(case, kind, size, sweeps, steps)
+    return testing.sensitivity(scene.model(), scene.inputs(), sweeps, steps, expected)
+
+
+def forced(regime: str | None) -> contextlib.AbstractContextManager:
+    """The CUDA regime in which everything inside runs; None: the package chooses."""
+    return contextlib.nullcontext() if regime is None else dv.regime(regime)
+
+
+@functools.cache
+def measure(place: str, case: str, kind: str, size: str, sweeps: int, steps: int) -> Measurement:
+    """Errors on a device, or, for a place like "cuda block", in one of its regimes."""
+    row = (case, kind, size, sweeps, steps)
+    scene = build_scene(case, kind, size)
+    expected, spreads = expectation(*row)
+    device, _, regime = place.partition(" ")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    with forced(regime or None):
+        results = [compiled_result(model, inputs, sweeps, steps, tape) for tape in TAPES]
     full, _, recompute = results
     assert all(torch.equal(full[name], recompute[name]) for name in full), "recompute must repeat full to the bit"
     zeros = frozenset(name for name in expected if not any(r[name].any() for r in (expected, *results)))
@@ -77,11 +105,11 @@ def measure(case: str, kind: str, size: str, sweeps: int, steps: int) -> Measure
     bars = {name: testing.bar(spreads[name]) for name in expected} | {"x": forward_bar(spreads)}
     if any(errors[name] > bars[name] for name in expected if name != "v"):
         # one permutation is one sample: ask also what an ulp in the inputs does to this scene
-        moved = testing.sensitivity(model, inputs, sweeps, steps, expected)
+        moved = sensitivities(*row)
         spreads = {name: max(spreads[name], moved[name]) for name in expected}
     scale = float(expected["x"].abs().max()) / scene.case.time_step
     velocity = max(float((r["v"] - expected["v"]).abs().max()) for r in results) / scale
-    MEASURED[case, kind, size, sweeps, steps] = result = Measurement(errors, spreads, zeros, velocity)
+    MEASURED[(place, *row)] = result = Measurement(errors, spreads, zeros, velocity)
     return result
 
 
@@ -95,8 +123,8 @@ def may_vanish(case: str, name: str, sweeps: int) -> bool:
     return (name == "grad_prescribed" and not c.pinned) or (case == "floor_inactive" and "floor_barrier" in name)
 
 
-def check(case: str, kind: str, size: str, sweeps: int, steps: int) -> None:
-    m = measure(case, kind, size, sweeps, steps)
+def check(place: str, case: str, kind: str, size: str, sweeps: int, steps: int) -> None:
+    m = measure(place, case, kind, size, sweeps, steps)
     forward = forward_bar(m.spreads)
     assert m.errors["x"] <= forward, f"x: {m.errors['x']:.1e} > {forward:.1e}"
     assert m.velocity_error <= forward, f"v: {m.velocity_error:.1e} > {forward:.1e}"
@@ -118,15 +146,16 @@ def table(request: pytest.FixtureRequest):
     terminal, capture = manager.getplugin("terminalreporter"), manager.getplugin("capturemanager")
     if terminal is None or not MEASURED:
         return
-    lines = [f"{'worst scene of a case':<36}{'K':>3}{'steps':>6}  {'gradient':<22}{'error':>9}{'spread':>9}{'bar':>9}"]
-    for case in CASES:
-        rows = [(key, m) for key, m in MEASURED.items() if key[0] == case]
+    titles = f"{'worst scene of a case':<36}{'K':>3}{'steps':>6}  {'device':<11}"
+    lines = [f"{titles}{'gradient':<22}{'error':>9}{'spread':>9}{'bar':>9}"]
+    for place, case in itertools.product(sorted({key[0] for key in MEASURED}), CASES):
+        rows = [(key, m) for key, m in MEASURED.items() if key[:2] == (place, case)]
         if not rows:
             continue
         key, m = max(rows, key=lambda row: row[1].errors[row[1].worst] / testing.bar(row[1].spreads[row[1].worst]))
         name = m.worst
         lines.append(
-            f"{'-'.join(key[:3]):<36}{key[3]:>3}{key[4]:>6}  {name[5:]:<22}{m.errors[name]:>9.1e}"
+            f"{'-'.join(key[1:4]):<36}{key[4]:>3}{key[5]:>6}  {place:<11}{name[5:]:<22}{m.errors[name]:>9.1e}"
             f"{m.spreads[name]:>9.1e}{testing.bar(m.spreads[name]):>9.1e}"
         )
     with capture.global_and_fixture_disabled():
@@ -153,8 +182,8 @@ DEFAULT = pairwise()
 
 
 @pytest.mark.parametrize(("case", "kind", "size", "sweeps", "steps"), DEFAULT)
-def test_step_and_rollout(case: str, kind: str, size: str, sweeps: int, steps: int) -> None:
-    check(case, kind, size, sweeps, steps)
+def test_step_and_rollout(device: str, case: str, kind: str, size: str, sweeps: int, steps: int) -> None:
+    check(device, case, kind, size, sweeps, steps)
 
 
 @pytest.mark.slow
@@ -163,23 +192,23 @@ def test_step_and_rollout(case: str, kind: str, size: str, sweeps: int, steps: i
 @pytest.mark.parametrize("size", ("small", "medium"))
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("case", CASES)
-def test_full_product(case: str, kind: str, size: str, sweeps: int, steps: int) -> None:
-    check(case, kind, size, sweeps, steps)
+def test_full_product(device: str, case: str, kind: str, size: str, sweeps: int, steps: int) -> None:
+    check(device, case, kind, size, sweeps, steps)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sweeps", (1, 5))
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("case", CASES)
-def test_full_product_large(case: str, kind: str, sweeps: int) -> None:
-    check(case, kind, "large", sweeps, 1)
+def test_full_product_large(device: str, case: str, kind: str, sweeps: int) -> None:
+    check(device, case, kind, "large", sweeps, 1)
 
 
-def test_headline() -> None:
+def test_headline(device: str) -> None:
     """Scenes that rounding leaves alone (spread <= 1e-13): the worst gradient of each, and the typical one."""
     errors = {}
     for row in DEFAULT:
-        m = measure(*row)
+        m = measure(device, *row)
         if row[3] > 0 and m.spread <= tolerance("headline_spread"):
             errors[row] = max(m.errors[name] for name in m.gradients)
     ordered = sorted(errors.values())
@@ -204,10 +233,9 @@ BATCHED = {  # shapes of each argument over scenes [2, 3]; V vertices, T tets, P
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("sweeps", (1, 3))
-@pytest.mark.parametrize("shapes", BATCHED)
-def test_every_shape_of_every_argument(shapes: str, sweeps: int) -> None:
-    """Values shared by scenes, or by tets, or of each: the gradient has the argument's own shape and the right sum."""
+@functools.cache
+def scene_of_shapes(shapes: str, sweeps: int) -> tuple[dv.Model, dict[str, Any], dict[str, Tensor]]:
+    """Model, inputs and the reference's result of six scenes whose arguments have the shapes of an entry of BATCHED."""
     scene = build_scene("anchored", "random", "small")
     planes = ((0.0, 1.0, 0.0), (-0.6, 0.8, 0.0))
     floor = dv.FloorBarrier(height=(-0.06, -0.7), normal=planes, kappa=2e4, dhat=0.1, damping=20.0)
@@ -235,8 +263,13 @@ def test_every_shape_of_every_argument(shapes: str, sweeps: int) -> None:
     for name, shape in BATCHED[shapes].items():
         place = inputs["parameters"] if "." in name else inputs
         place[name] = shaped((parameters if "." in name else base)[name].double(), shape)
-    expected = testing.reference_result(model, inputs, sweeps)
-    result = compiled_result(model, inputs, sweeps, 1, "full")
+    return model, inputs, testing.reference_result(model, inputs, sweeps)
+
+
+def check_shapes(device: str, shapes: str, sweeps: int, regime: str | None = None) -> None:
+    model, inputs, expected = scene_of_shapes(shapes, sweeps)
+    with forced(regime):
+        result = compiled_result(model.to(device), testing.on_device(inputs, device), sweeps, 1, "full")
     assert relative_error(result["x"], expected["x"]) <= tolerance("forward")
     for name in expected:
         assert result[name].any(), name
@@ -244,7 +277,14 @@ def test_every_shape_of_every_argument(shapes: str, sweeps: int) -> None:
             assert relative_error(result[name], expected[name]) <= tolerance("adjoint"), name
 
 
-def test_values_per_step() -> None:
+@pytest.mark.parametrize("sweeps", (1, 3))
+@pytest.mark.parametrize("shapes", BATCHED)
+def test_every_shape_of_every_argument(device: str, shapes: str, sweeps: int) -> None:
+    """Values shared by scenes, or by tets, or of each: the gradient has the argument's own shape and the right sum."""
+    check_shapes(device, shapes, sweeps)
+
+
+def test_values_per_step(device: str) -> None:
     """Forces and prescribed positions that change from step to step."""
     scene = build_scene("plain", "delaunay", "small")
     model, inputs = scene.model(), scene.inputs()
@@ -258,11 +298,13 @@ def test_values_per_step() -> None:
         return end.x[-1], end.v[-1]
 
     def of_package(force: Tensor, held: Tensor, **options: Any) -> tuple[Tensor, Tensor]:
-        end = dv.rollout(model, steps=steps, sweeps=2, force=dv.per_step(force), prescribed=dv.per_step(held),
+        end = dv.rollout(there, steps=steps, sweeps=2, force=dv.per_step(force), prescribed=dv.per_step(held),
                          checkpoint_every=2, **options)  # fmt: skip
         return end.x[-1], end.v[-1]
 
-    expected, result = evaluate(of_reference, inputs), evaluate(of_package, inputs)
+    there = model.to(device)
+    expected = evaluate(of_reference, inputs)
+    result = evaluate(of_package, testing.on_device(inputs, device))
     assert relative_error(result["x"], expected["x"]) <= tolerance("forward")
     for name in (n for n in expected if n.startswith("grad_")):
         assert result[name].any(), name
@@ -270,10 +312,10 @@ def test_values_per_step() -> None:
     assert all(result["grad_force"][k].any() and result["grad_held"][k].any() for k in range(steps))
 
 
-def test_constants_equal_parameters() -> None:
+def test_constants_equal_parameters(device: str) -> None:
     """The numbers of a Model's energies and the same numbers given as parameters are the same to the bit."""
     scene = build_scene("anchored", "random", "small")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     given = dv.step(model, sweeps=2, **inputs)
     constant = dv.step(model, sweeps=2, **{name: value for name, value in inputs.items() if name != "parameters"})
     assert torch.equal(given[0], constant[0]) and torch.equal(given[1], constant[1])

@@ -24,8 +24,8 @@ from diffvbd.testing import relative_error
 
 
 @pytest.mark.parametrize("name", ARGUMENTS)
-def test_gradcheck_of_every_argument(name: str) -> None:
-    model = small_model()
+def test_gradcheck_of_every_argument(device: str, name: str) -> None:
+    model = small_model(device)
     fixed = small_inputs(model)
 
     def run(value: Tensor) -> tuple[Tensor, Tensor]:
@@ -37,8 +37,10 @@ def test_gradcheck_of_every_argument(name: str) -> None:
     assert torch.autograd.gradcheck(run, (value,), atol=1e-7, rtol=1e-5, check_batched_grad=True)
 
 
-def test_gradcheck_of_material_and_state_together_without_vertex_energies() -> None:
-    model = small_model(energies=(dv.StableNeoHookean("paper"),), saturation=0.2, regularization=0.1, relaxation=1.3)
+def test_gradcheck_of_material_and_state_together_without_vertex_energies(device: str) -> None:
+    model = small_model(
+        device, energies=(dv.StableNeoHookean("paper"),), saturation=0.2, regularization=0.1, relaxation=1.3
+    )
     fixed = small_inputs(model)
     values = tuple(fixed[k].clone().requires_grad_() for k in ("x", "v", "mu", "lam"))
 
@@ -55,18 +57,18 @@ def members(inputs: Arguments, name: str, count: int = 3) -> Tensor:
     """`count` different values of one argument, stacked."""
     generator = torch.Generator().manual_seed(1)
     shape = (count, *inputs[name].shape)
-    return inputs[name] + 0.1 * torch.rand(shape, dtype=inputs[name].dtype, generator=generator)
+    return inputs[name] + 0.1 * torch.rand(shape, dtype=inputs[name].dtype, generator=generator).to(inputs[name])
 
 
-def test_func_grad_equals_autograd() -> None:
-    model = small_model()
+def test_func_grad_equals_autograd(device: str) -> None:
+    model = small_model(device)
     inputs = small_inputs(model)
     assert_same(torch.func.grad(lambda a: loss(model, a))(inputs), gradients(model, inputs), 0.0)
 
 
 @pytest.mark.parametrize("name", ARGUMENTS)
-def test_vmap_and_its_gradients_over_each_argument(name: str) -> None:
-    model = small_model()
+def test_vmap_and_its_gradients_over_each_argument(device: str, one_regime: None, name: str) -> None:
+    model = small_model(device)
     inputs = small_inputs(model)
     batch = members(inputs, name)
 
@@ -83,8 +85,8 @@ def test_vmap_and_its_gradients_over_each_argument(name: str) -> None:
     assert relative_error(torch.func.grad(lambda b: torch.func.vmap(one)(b).sum())(batch), slopes) <= 1e-13
 
 
-def test_vmap_over_several_arguments_and_gradient_of_a_shared_one() -> None:
-    model = small_model()
+def test_vmap_over_several_arguments_and_gradient_of_a_shared_one(device: str) -> None:
+    model = small_model(device)
     inputs = small_inputs(model)
     x, mu = members(inputs, "x"), members(inputs, "mu")
 
@@ -110,8 +112,8 @@ def test_vmap_over_several_arguments_and_gradient_of_a_shared_one() -> None:
     assert relative_error(each, single) <= 1e-13
 
 
-def test_vmap_over_a_batch_of_scenes_and_other_dimensions() -> None:
-    model = small_model()
+def test_vmap_over_a_batch_of_scenes_and_other_dimensions(device: str, one_regime: None) -> None:
+    model = small_model(device)
     inputs = small_inputs(model)
     x = torch.stack([members(inputs, "x", 2), members(inputs, "x", 2) + 0.05, members(inputs, "x", 2) - 0.05], 1)
     v = inputs["v"].expand(2, -1, -1)
@@ -128,8 +130,8 @@ def test_vmap_over_a_batch_of_scenes_and_other_dimensions() -> None:
     assert relative_error(slope, expected) <= 1e-13
 
 
-def test_nested_vmap() -> None:
-    model = small_model()
+def test_nested_vmap(device: str) -> None:
+    model = small_model(device)
     inputs = small_inputs(model)
     x, mu = members(inputs, "x", 2), members(inputs, "mu", 3)
 
@@ -143,8 +145,8 @@ def test_nested_vmap() -> None:
 
 
 @pytest.mark.parametrize("name", ["x", "mu", "rest_points", "floor_barrier.kappa"])
-def test_jacrev_and_batched_gradients_equal_one_row_at_a_time(name: str) -> None:
-    model = small_model()
+def test_jacrev_and_batched_gradients_equal_one_row_at_a_time(device: str, name: str) -> None:
+    model = small_model(device)
     inputs = small_inputs(model)
 
     def run(value: Tensor) -> Tensor:
@@ -152,7 +154,7 @@ def test_jacrev_and_batched_gradients_equal_one_row_at_a_time(name: str) -> None
 
     leaf = inputs[name].clone().requires_grad_()
     out = run(leaf)
-    rows = torch.eye(out.numel(), dtype=out.dtype).reshape(-1, *out.shape)
+    rows = torch.eye(out.numel(), dtype=out.dtype, device=device).reshape(-1, *out.shape)
     expected = torch.stack([torch.autograd.grad(out, leaf, row, retain_graph=True)[0] for row in rows])
     (batched,) = torch.autograd.grad(out, leaf, rows, is_grads_batched=True)
     assert expected.abs().max() > 1e-3
@@ -165,8 +167,8 @@ def test_jacrev_and_batched_gradients_equal_one_row_at_a_time(name: str) -> None
 
 
 @pytest.mark.parametrize("name", ["x", "mu", "rest_points", "anchor.points"])
-def test_second_order_raises(name: str) -> None:
-    model = small_model()
+def test_second_order_raises(device: str, name: str) -> None:
+    model = small_model(device)
     inputs = small_inputs(model)
 
     def one(value: Tensor) -> Tensor:
@@ -185,8 +187,8 @@ def test_second_order_raises(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["x", "v", "mu", "rest_points", "density", "gravity", "floor_barrier.kappa"])
-def test_forward_mode_raises(name: str) -> None:
-    model = small_model()
+def test_forward_mode_raises(device: str, name: str) -> None:
+    model = small_model(device)
     inputs = small_inputs(model)
     tangent = torch.ones_like(inputs[name])
 

@@ -21,37 +21,40 @@ PARAMETERS = ("floor_barrier.kappa", "floor_barrier.dhat", "floor_barrier.dampin
 ARGUMENTS = ("x", "v", "mu", "lam", "force", "gravity", "prescribed", "rest_points", "density", *PARAMETERS)
 
 
-def small_model(dtype: torch.dtype = torch.float64, **options: Any) -> dv.Model:
+def small_model(device: str, dtype: torch.dtype = torch.float64, **options: Any) -> dv.Model:
     """One cube of six tets in units where every quantity is near 1, so that no gradient hides below a tolerance."""
     mesh = dv.mesh.cube()
     floor = dv.FloorBarrier(height=-0.2, normal=(0.1, 1.0, 0.0), kappa=2.0, dhat=0.5, damping=0.5)
     options = {"energies": (dv.StableNeoHookean(), floor, dv.Anchor(0.7)), **options}
-    return dv.Model(mesh, density=2.0, pinned=[0, 1], dtype=dtype, **options)
+    return dv.Model(mesh, density=2.0, pinned=[0, 1], dtype=dtype, device=device, **options)
 
 
 def small_inputs(model: dv.Model, seed: int = 0) -> Arguments:
     generator = torch.Generator().manual_seed(seed)
 
     def noise(*shape: int, size: float) -> Tensor:
-        return (size * (2 * torch.rand(*shape, dtype=torch.float64, generator=generator) - 1)).to(model.dtype)
+        return (size * (2 * torch.rand(*shape, dtype=torch.float64, generator=generator) - 1)).to(model.mass)
+
+    def given(values: Any) -> Tensor:
+        return torch.tensor(values, dtype=model.dtype, device=model.device)
 
     n, tets = model.num_vertices, model.num_tets
     x = model.rest_points + noise(n, 3, size=0.1)
     return {
         "x": x,
-        "v": noise(n, 3, size=0.3) - torch.tensor([0.0, 0.5, 0.0], dtype=model.dtype),
+        "v": noise(n, 3, size=0.3) - given([0.0, 0.5, 0.0]),
         "mu": 3.0 + noise(tets, size=0.5),
         "lam": 2.0 + noise(tets, size=0.5),
         "force": noise(n, 3, size=0.3),
-        "gravity": torch.tensor([0.1, -1.0, 0.2], dtype=model.dtype),
+        "gravity": given([0.1, -1.0, 0.2]),
         "prescribed": x + noise(n, 3, size=0.1),
         "rest_points": model.rest_points + noise(n, 3, size=0.05),
         "density": 2.0 + noise(tets, size=0.5),
-        "floor_barrier.kappa": torch.tensor(2.0, dtype=model.dtype),
-        "floor_barrier.dhat": torch.tensor(0.5, dtype=model.dtype),
-        "floor_barrier.damping": torch.tensor(0.5, dtype=model.dtype),
-        "floor_barrier.height": torch.tensor([-0.2], dtype=model.dtype),
-        "floor_barrier.normal": torch.tensor([[0.1, 1.0, 0.0]], dtype=model.dtype),
+        "floor_barrier.kappa": given(2.0),
+        "floor_barrier.dhat": given(0.5),
+        "floor_barrier.damping": given(0.5),
+        "floor_barrier.height": given([-0.2]),
+        "floor_barrier.normal": given([[0.1, 1.0, 0.0]]),
         "anchor.stiffness": 0.7 + noise(n, size=0.2),
         "anchor.points": model.rest_points + noise(n, 3, size=0.1),
     }
@@ -64,7 +67,7 @@ def run_step(model: dv.Model, arguments: Arguments, **options: Any) -> tuple[Ten
 
 
 def scalar(x: Tensor, v: Tensor) -> Tensor:
-    weights = torch.linspace(0.5, 1.5, x.shape[-1] * x.shape[-2], dtype=x.dtype).reshape(x.shape[-2:])
+    weights = torch.linspace(0.5, 1.5, x.shape[-1] * x.shape[-2], dtype=x.dtype, device=x.device).reshape(x.shape[-2:])
     return (weights * (x * x + 0.3 * v * v)).sum()
 
 
@@ -92,8 +95,8 @@ def fresh_compiler() -> None:
     torch._dynamo.reset()
 
 
-def compiled_gradients(backend: str, names: tuple[str, ...], plain: bool) -> None:
-    model = small_model(energies=(dv.StableNeoHookean(),)) if plain else small_model()
+def compiled_gradients(device: str, backend: str, names: tuple[str, ...], plain: bool) -> None:
+    model = small_model(device, energies=(dv.StableNeoHookean(),)) if plain else small_model(device)
     arguments = {k: t for k, t in small_inputs(model).items() if k in names}
     expected = gradients(model, arguments)
     run = torch.compile(lambda a: loss(model, a), fullgraph=True, backend=backend)
@@ -104,21 +107,21 @@ def compiled_gradients(backend: str, names: tuple[str, ...], plain: bool) -> Non
     assert_same(actual, expected)
 
 
-def test_compile_of_a_plain_step(fresh_compiler: None) -> None:
-    compiled_gradients("aot_eager", ("x", "v", "mu", "lam"), plain=True)
+def test_compile_of_a_plain_step(device: str, fresh_compiler: None) -> None:
+    compiled_gradients(device, "aot_eager", ("x", "v", "mu", "lam"), plain=True)
 
 
-def test_compile_of_a_step_with_every_argument(fresh_compiler: None) -> None:
-    compiled_gradients("aot_eager", ARGUMENTS, plain=False)
+def test_compile_of_a_step_with_every_argument(device: str, fresh_compiler: None) -> None:
+    compiled_gradients(device, "aot_eager", ARGUMENTS, plain=False)
 
 
 @pytest.mark.slow
-def test_compile_with_inductor(fresh_compiler: None) -> None:
-    compiled_gradients("inductor", ARGUMENTS, plain=False)
+def test_compile_with_inductor(device: str, fresh_compiler: None) -> None:
+    compiled_gradients(device, "inductor", ARGUMENTS, plain=False)
 
 
-def test_compile_of_a_step_without_gradients(fresh_compiler: None) -> None:
-    model = small_model()
+def test_compile_of_a_step_without_gradients(device: str, fresh_compiler: None) -> None:
+    model = small_model(device)
     arguments = small_inputs(model)
     with torch.no_grad():
         x, v = torch.compile(lambda a: run_step(model, a), fullgraph=True, backend="aot_eager")(arguments)
@@ -127,8 +130,8 @@ def test_compile_of_a_step_without_gradients(fresh_compiler: None) -> None:
 
 
 @pytest.mark.parametrize("batched", [False, True])
-def test_compile_of_one_tensor_as_two_arguments(fresh_compiler: None, batched: bool) -> None:
-    model = small_model(energies=(dv.StableNeoHookean(),))
+def test_compile_of_one_tensor_as_two_arguments(device: str, fresh_compiler: None, batched: bool) -> None:
+    model = small_model(device, energies=(dv.StableNeoHookean(),))
     inputs = small_inputs(model)
     x, v = (inputs[k].expand(2, -1, -1).contiguous() if batched else inputs[k] for k in ("x", "v"))
     modulus = inputs["mu"][None] if batched else inputs["mu"]
@@ -145,8 +148,8 @@ def test_compile_of_one_tensor_as_two_arguments(fresh_compiler: None, batched: b
 
 
 @pytest.mark.parametrize("every", [None, 2])
-def test_compile_of_a_rollout(fresh_compiler: None, every: Any) -> None:
-    model = small_model()
+def test_compile_of_a_rollout(device: str, fresh_compiler: None, every: Any) -> None:
+    model = small_model(device)
     inputs = small_inputs(model)
 
     def run(v: Tensor, mu: Tensor, force: Tensor) -> Tensor:
@@ -166,8 +169,8 @@ def test_compile_of_a_rollout(fresh_compiler: None, every: Any) -> None:
 
 
 @pytest.mark.parametrize("reentrant", [False, True])
-def test_checkpoint(reentrant: bool) -> None:
-    model = small_model()
+def test_checkpoint(device: str, reentrant: bool) -> None:
+    model = small_model(device)
     inputs = small_inputs(model)
     leaves = {k: t.clone().requires_grad_() for k, t in inputs.items()}
     names = list(leaves)
@@ -180,15 +183,15 @@ def test_checkpoint(reentrant: bool) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_autocast_changes_nothing(dtype: torch.dtype) -> None:
-    model = small_model(dtype)
+def test_autocast_changes_nothing(device: str, dtype: torch.dtype) -> None:
+    model = small_model(device, dtype)
     inputs = small_inputs(model)
     expected = run_step(model, inputs)
     slopes = gradients(model, inputs)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
+    with torch.autocast(device, dtype=torch.bfloat16):
         actual = run_step(model, inputs)
         cast = gradients(model, inputs)
-        rebuilt = small_model(dtype)
+        rebuilt = small_model(device, dtype)
     assert actual[0].dtype == dtype
     assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
     assert_same(cast, slopes, 0.0)
@@ -202,8 +205,8 @@ def saved_and_loaded(model: dv.Model) -> dv.Model:
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m)), saved_and_loaded])
-def test_copies_of_a_model_compute_the_same(copied: Any) -> None:
-    model = small_model(saturation=0.3, relaxation=1.2)
+def test_copies_of_a_model_compute_the_same(device: str, copied: Any) -> None:
+    model = small_model(device, saturation=0.3, relaxation=1.2)
     inputs = small_inputs(model)
     twin = copied(model)
     assert twin is not model and twin.mass.data_ptr() != model.mass.data_ptr()
@@ -213,7 +216,7 @@ def test_copies_of_a_model_compute_the_same(copied: Any) -> None:
     assert_same(gradients(twin, inputs), gradients(model, inputs), 0.0)
 
 
-def test_model_of_tensors_that_require_grad_survives_two_backwards_and_copies() -> None:
+def test_model_of_tensors_that_require_grad_survives_two_backwards_and_copies(device: str) -> None:
     mesh = dv.mesh.cube()
     density = torch.full((mesh.num_tets,), 2.0, dtype=torch.float64, requires_grad=True)
     stiffness = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
@@ -225,7 +228,9 @@ def test_model_of_tensors_that_require_grad_survives_two_backwards_and_copies() 
         dv.FloorBarrier(height=-0.2, kappa=kappa * 1, dhat=0.5),
         dv.Anchor(stiffness * 1, points * 1),
     )
-    model = dv.Model(dv.TetMesh(points * 1, mesh.tets), density=density * 1, pinned=[0], energies=energies)
+    model = dv.Model(
+        dv.TetMesh(points * 1, mesh.tets), density=density * 1, pinned=[0], energies=energies, device=device
+    )
     twin = pickle.loads(pickle.dumps(copy.deepcopy(model)))
     assert repr(twin) == repr(model)
     x = (model.rest_points + 0.01).requires_grad_()
@@ -240,9 +245,9 @@ def test_model_of_tensors_that_require_grad_survives_two_backwards_and_copies() 
 # --- raw operators ----------------------------------------------------------------------------------------------------
 
 
-def raw_arguments(policy: int) -> dict[str, tuple[Any, ...]]:
+def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
     """Arguments of every raw operator, in the order of its schema."""
-    model = small_model()
+    model = small_model(device)
     inputs = small_inputs(model)
     settings = model.settings(0.3, 2)
     x, y = inputs["x"][None], (inputs["x"] + 0.1 * inputs["v"])[None]
@@ -255,7 +260,7 @@ def raw_arguments(policy: int) -> dict[str, tuple[Any, ...]]:
     corners = torch.ops.diffvbd.tet_gather(points, tets)
     arguments = {
         "sweep": sweep,
-        "pack_rest": (torch.rand(1, model.num_tets, 7).double(), model._plan, model._sizes),
+        "pack_rest": (torch.rand(1, model.num_tets, 7).to(x), model._plan, model._sizes),
         "tet_gather": (points, tets),
         "star_sum": (corners, star_ptr, star, False),
         "row_sum": (inputs["x"],),
@@ -267,13 +272,13 @@ def raw_arguments(policy: int) -> dict[str, tuple[Any, ...]]:
 
 
 @pytest.mark.parametrize("policy", [ops.NO_TAPE, ops.COMPACT_TAPE, ops.FULL_TAPE])
-def test_opcheck_of_the_raw_operators(policy: int) -> None:
-    for name, arguments in raw_arguments(policy).items():
+def test_opcheck_of_the_raw_operators(device: str, policy: int) -> None:
+    for name, arguments in raw_arguments(device, policy).items():
         torch.library.opcheck(getattr(torch.ops.diffvbd, name).default, arguments)
 
 
-def test_raw_operators_refuse_to_be_differentiated() -> None:
-    for name, arguments in raw_arguments(ops.FULL_TAPE).items():
+def test_raw_operators_refuse_to_be_differentiated(device: str) -> None:
+    for name, arguments in raw_arguments(device, ops.FULL_TAPE).items():
         first = arguments[0].clone().requires_grad_()
         out = getattr(torch.ops.diffvbd, name)(first, *arguments[1:])
         out = out[0] if isinstance(out, (tuple, list)) else out

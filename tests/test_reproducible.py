@@ -1,4 +1,7 @@
-"""Claim: results are bitwise equal run to run, for any number of threads, and alone or in a batch."""
+"""Claim: results are bitwise equal run to run, for any number of threads, and alone or in a batch.
+
+Of CUDA see also test_cuda_regimes.py.
+"""
 
 from collections.abc import Iterator
 from typing import Any
@@ -70,11 +73,11 @@ def test_any_number_of_threads(large: tuple, tape: str, threads: None) -> None:
 
 
 @pytest.mark.parametrize("kind", ("random", "delaunay"))
-def test_batch_equals_single_scenes(kind: str, threads: None) -> None:
+def test_batch_equals_single_scenes(device: str, one_regime: None, kind: str, threads: None) -> None:
     """Fewer scenes than threads and more: the loop over blocks is parallel, or that over scenes."""
     scene = build_scene("batch", kind, "medium")
-    model, inputs = scene.model(), scene.inputs()
-    weights = torch.as_tensor(generator("weights").standard_normal(tuple(inputs["x"].shape)))
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    weights = torch.as_tensor(generator("weights").standard_normal(tuple(inputs["x"].shape)), device=device)
     names = ("x", "v", "mu", "lam", "force", "prescribed")
 
     def run(i: Any) -> tuple[Tensor, ...]:
@@ -84,7 +87,7 @@ def test_batch_equals_single_scenes(kind: str, threads: None) -> None:
         return x.detach(), v.detach(), *torch.autograd.grad((weights[i] * (x + 0.01 * v)).sum(), leaves)
 
     singles = [run(i) for i in range(3)]
-    for count in (1, 2, 4):
+    for count in (1, 2, 4) if device == "cpu" else (1,):
         torch.set_num_threads(count)
         batched = run(slice(None))
         for i, single in enumerate(singles):
@@ -93,7 +96,7 @@ def test_batch_equals_single_scenes(kind: str, threads: None) -> None:
 
 
 @pytest.mark.parametrize("kind", testing.KINDS)
-def test_numbering_of_vertices_is_the_users(kind: str) -> None:
+def test_numbering_of_vertices_is_the_users(device: str, kind: str) -> None:
     """A renumbered mesh gives renumbered results. Colors follow the numbers, and with them the order of the updates, so
     a finite step is compared with a reference in the same order, and converged steps with each other."""
     scene = build_scene("plain", kind, "small")
@@ -102,16 +105,18 @@ def test_numbering_of_vertices_is_the_users(kind: str) -> None:
     model, inputs = scene.model(), scene.inputs()
     renumbered = dv.Model(dv.TetMesh(scene.points[back], rank[scene.tets]), pinned=scene.pinned[back],
                           density=model.density)  # fmt: skip
+    ours, theirs = model.to(device), renumbered.to(device)
     moved = dict(inputs)
     for name in ("x", "v", "force", "prescribed", "rest_points"):
         moved[name] = inputs[name][back]
     assert relative_error(renumbered.mass[rank], model.mass) <= 1e-15
     expected = testing.reference_result(renumbered, moved, 2)
-    small = result(renumbered, moved, 2)
+    small = result(theirs, testing.on_device(moved, device), 2)
     assert relative_error(small["x"], expected["x"]) <= tolerance("forward")
     weights = torch.as_tensor(generator("weights").standard_normal(tuple(inputs["x"].shape)))
     ends = []
-    for m, given, w in ((model, inputs, weights), (renumbered, moved, weights[back])):
+    for m, given, w in ((ours, inputs, weights), (theirs, moved, weights[back])):
+        given, w = testing.on_device(given, device), w.to(device)
         leaves = {name: a.clone().requires_grad_() for name, a in given.items() if name != "time_step"}
         x, _ = dv.step(m, sweeps=3000, time_step=given["time_step"], **leaves)
         gradients = torch.autograd.grad((w * x).sum(), list(leaves.values()))
@@ -123,19 +128,19 @@ def test_numbering_of_vertices_is_the_users(kind: str) -> None:
 
 
 @pytest.mark.parametrize("case", ("plain", "paper", "saturated", "inverted", "floor_damped", "anchored"))
-def test_dot_product(case: str) -> None:
+def test_dot_product(device: str, case: str) -> None:
     """<J v, w> = <v, J^T w>, J v by central differences of the whole step in all arguments at once."""
     scene = build_scene(case, "delaunay", "small")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     time_step, parameters = inputs.pop("time_step"), inputs.pop("parameters", {})
     flat = inputs | parameters
     rng = generator("dot", case)
     # relative directions for material and parameters, absolute ones for positions: each moves the result
     directions = {
-        name: torch.as_tensor(rng.standard_normal(tuple(a.shape))) * (1.0 if a.dim() == 2 else a.abs())
+        name: torch.as_tensor(rng.standard_normal(tuple(a.shape)), device=device) * (1.0 if a.dim() == 2 else a.abs())
         for name, a in flat.items()
     }
-    w = [torch.as_tensor(rng.standard_normal(tuple(flat["x"].shape))) for _ in range(2)]
+    w = [torch.as_tensor(rng.standard_normal(tuple(flat["x"].shape)), device=device) for _ in range(2)]
 
     def run(values: dict[str, Tensor]) -> Tensor:
         given = {k: values[k] for k in inputs}

@@ -24,7 +24,7 @@ def leaves_of(inputs: dict[str, Any]) -> tuple[dict[str, Any], list[Tensor]]:
 
 
 def loss_of_frames(x: Tensor, v: Tensor) -> Tensor:
-    weights = torch.linspace(1, 2, x.numel(), dtype=x.dtype).reshape(x.shape)
+    weights = torch.linspace(1, 2, x.numel(), dtype=x.dtype, device=x.device).reshape(x.shape)
     return (weights * x.square()).sum() + 0.01 * (weights * v).sum()
 
 
@@ -39,9 +39,9 @@ def looped(model: dv.Model, call: dict[str, Any], steps: int = STEPS) -> tuple[T
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_rollout_is_a_loop_of_steps_under_every_schedule(case: str) -> None:
+def test_rollout_is_a_loop_of_steps_under_every_schedule(device: str, case: str) -> None:
     scene = build_scene(case)
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     call, leaves = leaves_of(inputs)
     expected = looped(model, call)
     slopes = torch.autograd.grad(loss_of_frames(*expected), leaves, allow_unused=True)
@@ -63,9 +63,9 @@ def test_rollout_is_a_loop_of_steps_under_every_schedule(case: str) -> None:
 
 
 @pytest.mark.parametrize("tape", ["full", "compact", "recompute"])
-def test_tapes_under_checkpoints(tape: str) -> None:
+def test_tapes_under_checkpoints(device: str, tape: str) -> None:
     scene = build_scene("floor_filtered")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     results = []
     for adjoint, schedule in ((dv.ReverseSweep("full"), None), (dv.ReverseSweep(tape), 3)):
         call, leaves = leaves_of(inputs)
@@ -74,9 +74,9 @@ def test_tapes_under_checkpoints(tape: str) -> None:
     assert all(a is None or relative_error(a, b) <= 1e-12 for a, b in zip(*results, strict=True))
 
 
-def test_no_grad_rollouts_save_nothing() -> None:
+def test_no_grad_rollouts_save_nothing(device: str) -> None:
     scene = build_scene("plain")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     expected = looped(model, inputs)
     for schedule in (None, 2, dv.Binomial(2)):
         trajectory = dv.rollout(model, **inputs, steps=STEPS, sweeps=SWEEPS, checkpoint_every=schedule)
@@ -86,13 +86,13 @@ def test_no_grad_rollouts_save_nothing() -> None:
 # --- callables and per_step -------------------------------------------------------------------------------------------
 
 
-def controlled(schedule: Any, every_argument: bool) -> list[Tensor]:
+def controlled(device: str, schedule: Any, every_argument: bool) -> list[Tensor]:
     """Gradients of a network that a force (and a stiffness) close over."""
     scene = build_scene("floor_active")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     torch.manual_seed(0)
-    network = torch.nn.Sequential(torch.nn.Linear(7, 5), torch.nn.Tanh(), torch.nn.Linear(5, 3)).double()
-    scale = torch.tensor(1.1, dtype=torch.float64, requires_grad=True)
+    network = torch.nn.Sequential(torch.nn.Linear(7, 5), torch.nn.Tanh(), torch.nn.Linear(5, 3)).double().to(device)
+    scale = torch.tensor(1.1, dtype=torch.float64, device=device, requires_grad=True)
 
     def force(k: int, x: Tensor, v: Tensor) -> Tensor:
         clock = torch.full_like(x[..., :1], float(k))
@@ -108,16 +108,18 @@ def controlled(schedule: Any, every_argument: bool) -> list[Tensor]:
 
 
 @pytest.mark.parametrize("every_argument", [False, True])
-def test_callables_that_close_over_a_network_get_gradients_under_every_schedule(every_argument: bool) -> None:
-    expected = controlled(None, every_argument)
+def test_callables_that_close_over_a_network_get_gradients_under_every_schedule(
+    device: str, every_argument: bool
+) -> None:
+    expected = controlled(device, None, every_argument)
     assert all(g.abs().max() > 0 for g in expected)
     for schedule in (1, 3, dv.Binomial(1), dv.Binomial(3)):
-        for a, b in zip(controlled(schedule, every_argument), expected, strict=True):
+        for a, b in zip(controlled(device, schedule, every_argument), expected, strict=True):
             assert relative_error(a, b) <= 1e-12
 
 
 def values_per_step(name: str, value: Tensor) -> Tensor:
-    factors = 1 + 0.05 * torch.arange(STEPS, dtype=value.dtype)
+    factors = 1 + 0.05 * torch.arange(STEPS, dtype=value.dtype, device=value.device)
     return value * factors.reshape(-1, *[1] * value.dim())
 
 
@@ -127,9 +129,9 @@ def values_per_step(name: str, value: Tensor) -> Tensor:
      "floor_barrier.height", "anchor.stiffness", "anchor.points"],
 )  # fmt: skip
 @pytest.mark.parametrize("schedule", [None, 3])
-def test_per_step_and_callables_of_every_argument(name: str, schedule: Any) -> None:
+def test_per_step_and_callables_of_every_argument(device: str, name: str, schedule: Any) -> None:
     scene = build_scene("anchored")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     base = inputs["parameters"][name] if "." in name else inputs[name]
 
     def given(value: Any) -> dict[str, Any]:
@@ -182,9 +184,9 @@ def test_per_step_wants_a_tensor_with_a_leading_dimension(value: Any) -> None:
     [("all", [0, 1, 2, 3, 4, 5, 6, 7]), ("last", [7]), (1, [0, 1, 2, 3, 4, 5, 6, 7]), (3, [0, 3, 6, 7]), (7, [0, 7]),
      (9, [0, 7])],
 )  # fmt: skip
-def test_save_modes(save: Any, kept: list[int], schedule: Any) -> None:
+def test_save_modes(device: str, save: Any, kept: list[int], schedule: Any) -> None:
     scene = build_scene("batch")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     frames = looped(model, inputs)
     call, leaves = leaves_of(inputs)
     trajectory = dv.rollout(model, **call, steps=STEPS, sweeps=SWEEPS, save=save, checkpoint_every=schedule)
@@ -194,9 +196,9 @@ def test_save_modes(save: Any, kept: list[int], schedule: Any) -> None:
 
 
 @pytest.mark.parametrize("schedule", [None, 3, dv.Binomial(2)])
-def test_observations_are_stacked_and_differentiable(schedule: Any) -> None:
+def test_observations_are_stacked_and_differentiable(device: str, schedule: Any) -> None:
     scene = build_scene("plain")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     frames = looped(model, inputs)
     tip = frames[0][1:, -1]
     observers = {
@@ -230,9 +232,9 @@ def test_observing_something_else_raises() -> None:
         dv.rollout(scene.model(), **scene.inputs(), steps=2, sweeps=1, observe=lambda x, v, k: float(k))
 
 
-def test_zero_steps_return_the_initial_state() -> None:
+def test_zero_steps_return_the_initial_state(device: str) -> None:
     scene = build_scene("batch")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     for save in ("all", "last", 2):
         for schedule in (None, "auto", 2, dv.Binomial(1)):
             call, leaves = leaves_of(inputs)
@@ -256,9 +258,9 @@ def test_progress_goes_to_stderr_and_counts_each_step_once(capsys: pytest.Captur
     assert capsys.readouterr().err == ""
 
 
-def test_inputs_are_untouched() -> None:
+def test_inputs_are_untouched(device: str) -> None:
     scene = build_scene("anchored")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     before = {k: t.clone() for k, t in inputs.items() if isinstance(t, Tensor)}
     for _ in range(2):
         trajectory = dv.rollout(model, **inputs, steps=3, sweeps=2)
@@ -316,9 +318,9 @@ def test_binomial_runs_steps_as_rarely_as_promised(steps: int, snapshots: int) -
 
 @pytest.mark.parametrize("schedule", [2, dv.Binomial(2)])
 @pytest.mark.parametrize("name", ["mu", "lam", "force", "gravity", "prescribed", "floor_barrier.kappa"])
-def test_changing_an_argument_before_a_checkpointed_backward_raises(name: str, schedule: Any) -> None:
+def test_changing_an_argument_before_a_checkpointed_backward_raises(device: str, name: str, schedule: Any) -> None:
     scene = build_scene("floor_damped")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     call, _ = leaves_of(inputs)
     options = {k: value for k, value in call.items() if k not in ("x", "v")}
     end = dv.rollout(model, call["x"], call["v"], steps=4, sweeps=1, checkpoint_every=schedule, **options).x[-1]
@@ -329,13 +331,13 @@ def test_changing_an_argument_before_a_checkpointed_backward_raises(name: str, s
         end.sum().backward()
 
 
-def test_a_force_on_a_pinned_vertex_reaches_nothing() -> None:
+def test_a_force_on_a_pinned_vertex_reaches_nothing(device: str) -> None:
     mesh = dv.mesh.cube(2)
-    model = dv.Model(mesh, pinned=[0])
+    model = dv.Model(mesh, pinned=[0], device=device)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     force = torch.zeros_like(x)
     force[0] = float("nan")
-    density = torch.tensor(1e3, dtype=x.dtype, requires_grad=True)
+    density = torch.tensor(1e3, dtype=x.dtype, device=device, requires_grad=True)
     rest = model.rest_points.clone().requires_grad_()
     options = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 2, "density": density, "rest_points": rest}
     end = dv.step(model, x, v, force=force, **options)[0]

@@ -15,9 +15,9 @@ STEP = {"time_step": 1 / 60, "sweeps": 3}
 GROUND = {"height": -0.06, "kappa": 2e4, "dhat": 0.1, "damping": 20.0}
 
 
-def beam_model(**options: Any) -> dv.Model:
+def beam_model(device: str, **options: Any) -> dv.Model:
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(**GROUND), dv.Anchor(50.0))
-    return dv.Model(dv.mesh.box((3, 2, 2)), **{"pinned": [0, 1], "energies": energies, **options})
+    return dv.Model(dv.mesh.box((3, 2, 2)), **{"pinned": [0, 1], "energies": energies, **options}, device=device)
 
 
 def uniform(*shape: int, low: float = 0.5, high: float = 1.5) -> Tensor:
@@ -27,11 +27,12 @@ def uniform(*shape: int, low: float = 0.5, high: float = 1.5) -> Tensor:
 
 def state(model: dv.Model, *lead: int) -> tuple[Tensor, Tensor]:
     shape = (*lead, model.num_vertices, 3)
-    return model.rest_points + uniform(*shape, low=-0.03, high=0.03), uniform(*shape, low=-1.0, high=0.5)
+    x, v = uniform(*shape, low=-0.03, high=0.03), uniform(*shape, low=-1.0, high=0.5)
+    return model.rest_points + x.to(model.device), v.to(model.device)
 
 
 def total(x: Tensor, v: Tensor) -> Tensor:
-    weights = uniform(*x.shape)
+    weights = uniform(*x.shape).to(x.device)
     return (weights * (x.square() + 0.01 * v.square())).sum()
 
 
@@ -60,11 +61,11 @@ def own_shape(model: dv.Model, name: str) -> tuple[int, ...]:
 
 
 def value_of(model: dv.Model, name: str, shape: tuple[int, ...]) -> Tensor:
-    value = OWN[name][1] * uniform(*shape)
+    value = OWN[name][1] * uniform(*shape).to(model.device)
     if name in ("prescribed", "rest_points", "anchor.points") and shape[-2:] == (model.num_vertices, 3):
         value = value + model.rest_points
     if name == "floor_barrier.normal":
-        value = 0.1 * value + torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+        value = 0.1 * value + torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64, device=model.device)
     return value
 
 
@@ -80,8 +81,10 @@ def broadcast_cases() -> list[tuple[str, tuple[int, ...], str]]:
 
 
 @pytest.mark.parametrize(("name", "lead", "spec"), broadcast_cases())
-def test_broadcasting_equals_a_loop_over_scenes(name: str, lead: tuple[int, ...], spec: str) -> None:
-    model = beam_model()
+def test_broadcasting_equals_a_loop_over_scenes(
+    device: str, one_regime: None, name: str, lead: tuple[int, ...], spec: str
+) -> None:
+    model = beam_model(device)
     own = own_shape(model, name)
     shape = tuple(n for part in spec.split(",") if part for n in (own if part == "own" else (int(part),)))
     value = value_of(model, name, shape).requires_grad_()
@@ -108,22 +111,23 @@ def test_broadcasting_equals_a_loop_over_scenes(name: str, lead: tuple[int, ...]
     assert relative_error(slope, expected_slope) <= 1e-12
 
 
-def test_python_numbers_mean_constant_tensors() -> None:
-    model = beam_model()
+def test_python_numbers_mean_constant_tensors(device: str) -> None:
+    model = beam_model(device)
     x, v = state(model, 2)
-    tensors = {k: torch.tensor(a, dtype=torch.float64) for k, a in (("mu", 1e4), ("lam", 2e4), ("density", 900.0))}
-    numbers = {k: t.item() for k, t in tensors.items()}
+    numbers = {"mu": 1e4, "lam": 2e4, "density": 900.0}
+    tensors = {k: torch.tensor(a, dtype=torch.float64, device=device) for k, a in numbers.items()}
     kappa = {"floor_barrier.kappa": 1e4}
     actual = dv.step(model, x, v, **numbers, gravity=[0, -5, 1], parameters=kappa, **STEP)
-    kappa = {"floor_barrier.kappa": torch.tensor(1e4, dtype=torch.float64)}
-    gravity = torch.tensor([0.0, -5.0, 1.0], dtype=torch.float64)
+    kappa = {"floor_barrier.kappa": torch.tensor(1e4, dtype=torch.float64, device=device)}
+    gravity = torch.tensor([0.0, -5.0, 1.0], dtype=torch.float64, device=device)
     expected = dv.step(model, x, v, **tensors, gravity=gravity, parameters=kappa, **STEP)
     assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
 
 
-def test_defaults_are_the_models_own_values() -> None:
+def test_defaults_are_the_models_own_values(device: str) -> None:
     mesh = dv.mesh.box((3, 2, 2))
-    model = dv.Model(mesh, density=700.0, pinned=[0], energies=(dv.StableNeoHookean(), dv.FloorBarrier(**GROUND)))
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(**GROUND))
+    model = dv.Model(mesh, density=700.0, pinned=[0], energies=energies, device=device)
     x, v = state(model)
     plain = dv.step(model, x, v, mu=1e4, lam=2e4, **STEP)
     options = {"force": torch.zeros_like(x), "gravity": (0.0, -9.81, 0.0), "prescribed": x, "density": 700.0}
@@ -137,21 +141,21 @@ def test_defaults_are_the_models_own_values() -> None:
     assert torch.isfinite(moved[0]).all() and (moved[0][1:] - plain[0][1:]).abs().max() > 1e-6
 
 
-def test_strided_inputs_mean_their_values() -> None:
-    model = beam_model()
+def test_strided_inputs_mean_their_values(device: str) -> None:
+    model = beam_model(device)
     x, v = state(model, 2)
     strided = [torch.stack([t, t + 1e9], -1)[..., 0] for t in (x, v)]
     strided[1] = v.transpose(0, 1).contiguous().transpose(0, 1)
-    mu = torch.stack([1e4 * uniform(model.num_tets), -uniform(model.num_tets)], -1)
+    mu = torch.stack([1e4 * uniform(model.num_tets), -uniform(model.num_tets)], -1).to(device)
     assert not any(t.is_contiguous() for t in (*strided, mu[:, 0]))
     actual = dv.step(model, *strided, mu=mu[:, 0], lam=2e4, force=strided[1], **STEP)
     expected = dv.step(model, x, v, mu=mu[:, 0].contiguous(), lam=2e4, force=v, **STEP)
     assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
 
 
-def test_inputs_are_untouched_and_steps_repeat() -> None:
+def test_inputs_are_untouched_and_steps_repeat(device: str) -> None:
     scene = build_scene("floor_damped")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     flat = {k: t for k, t in inputs.items() if isinstance(t, Tensor)} | inputs["parameters"]
     constants = {k: t.clone() for k, t in vars(model).items() if isinstance(t, Tensor)}
     before = {k: t.clone() for k, t in flat.items()}
@@ -183,20 +187,20 @@ def saved_bytes(run: Any, model: dv.Model | None = None) -> int:
     return sum(storages.values())
 
 
-def test_without_grad_nothing_is_saved() -> None:
-    model = beam_model()
+def test_without_grad_nothing_is_saved(device: str) -> None:
+    model = beam_model(device)
     x, v = state(model)
     assert saved_bytes(lambda: dv.step(model, x, v, mu=1e4, lam=2e4, density=900.0, **STEP)) == 0
-    mu = torch.tensor(1e4, dtype=torch.float64, requires_grad=True)
+    mu = torch.tensor(1e4, dtype=torch.float64, device=device, requires_grad=True)
     with torch.no_grad():
         assert saved_bytes(lambda: dv.step(model, x, v, mu=mu, lam=2e4, **STEP)) == 0
     step = dv.step(model, x, v, mu=1e4, lam=2e4, **STEP)
     assert not step[0].requires_grad and not step[1].requires_grad
 
 
-def test_a_tape_exists_only_for_steps_that_need_one() -> None:
+def test_a_tape_exists_only_for_steps_that_need_one(device: str) -> None:
     """Velocity alone: the tape; with recompute: no tape; through the last of two steps only: one tape."""
-    model = beam_model(energies=(dv.StableNeoHookean(),))
+    model = beam_model(device, energies=(dv.StableNeoHookean(),))
     x, v = state(model)
     leaf = v.clone().requires_grad_()
     sweeps = 20
@@ -231,12 +235,12 @@ def leaves_of(inputs: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]
 
 
 @pytest.mark.parametrize("case", ["plain", "paper", "floor_damped", "anchored", "batch"])
-def test_step_forward_and_backward_equal_autograd(case: str) -> None:
+def test_step_forward_and_backward_equal_autograd(device: str, case: str) -> None:
     scene = build_scene(case)
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     call, leaves = leaves_of(inputs)
     out = dv.step(model, sweeps=3, **call)
-    grad_x, grad_v = (uniform(*t.shape, low=-1.0, high=1.0) for t in out)
+    grad_x, grad_v = (uniform(*t.shape, low=-1.0, high=1.0).to(device) for t in out)
     expected = torch.autograd.grad(out, list(leaves.values()), (grad_x, grad_v), allow_unused=True, retain_graph=True)
     of_x = torch.autograd.grad(out[0], list(leaves.values()), grad_x, allow_unused=True)
     with torch.no_grad():
@@ -255,8 +259,8 @@ def test_step_forward_and_backward_equal_autograd(case: str) -> None:
     assert all(not t.requires_grad for t in inputs.values() if isinstance(t, Tensor))
 
 
-def test_step_forward_keeps_a_tape_for_wrt_only() -> None:
-    model = beam_model(energies=(dv.StableNeoHookean(),))
+def test_step_forward_keeps_a_tape_for_wrt_only(device: str) -> None:
+    model = beam_model(device, energies=(dv.StableNeoHookean(),))
     x, v = state(model)
     _, _, tape = dv.step_forward(model, x, v, mu=1e4, lam=2e4, **STEP)
     assert set(dv.step_backward(tape, torch.ones_like(x))) == {"x", "v"}
@@ -269,7 +273,7 @@ def test_step_forward_keeps_a_tape_for_wrt_only() -> None:
     assert all(torch.equal(zero[k], torch.zeros_like(t)) for k, t in grads.items())
     assert saved_bytes(lambda: dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=(), **STEP)) == 0
     with pytest.raises(ValueError, match="grad_x.*got"):
-        dv.step_backward(tape, torch.ones(2, 3, dtype=torch.float64))
+        dv.step_backward(tape, torch.ones(2, 3, dtype=torch.float64, device=device))
     with pytest.raises((ValueError, TypeError), match="wrt.*force"):
         dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=("force",), **STEP)
     with pytest.raises((ValueError, TypeError), match="wrt.*stiffness"):
@@ -291,9 +295,9 @@ class WrongBackward(torch.autograd.Function):
         return 1.01 * grads[0]
 
 
-def test_check_gradients_tells_right_from_wrong(capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_gradients_tells_right_from_wrong(device: str, capsys: pytest.CaptureFixture[str]) -> None:
     scene = build_scene("anchored")
-    model, inputs = scene.model(), scene.inputs()
+    model, inputs = scene.model(device), scene.inputs(device=device)
     arguments = {k: inputs[k] for k in ("x", "v", "mu", "lam", "force", "rest_points", "density")}
     rest = {k: value for k, value in inputs.items() if k not in arguments}
 
@@ -318,23 +322,24 @@ def test_check_gradients_tells_right_from_wrong(capsys: pytest.CaptureFixture[st
 # --- vertex energies end to end ---------------------------------------------------------------------------------------
 
 
-def test_anchor_pulls_chosen_vertices_to_their_points() -> None:
+def test_anchor_pulls_chosen_vertices_to_their_points(device: str) -> None:
     """A free vertex without elastic energy is a damped spring: implicit Euler has a closed form."""
     mesh = dv.mesh.cube()
     points = torch.from_numpy(mesh.points.copy()) + 0.1
     k, h = 30.0, 0.02
-    model = dv.Model(mesh, density=6.0, energies=(dv.Anchor(k, points=points, vertices=[2, 5]),))
+    model = dv.Model(mesh, density=6.0, energies=(dv.Anchor(k, points=points, vertices=[2, 5]),), device=device)
     x, v = state(model)
     new, speed = dv.step(model, x, v, mu=0.0, lam=0.0, time_step=h, sweeps=1, gravity=(0.0, 0.0, 0.0))
     m = model.mass[:, None]
     y = x + h * v
     chosen = torch.zeros(8, 1, dtype=torch.bool).index_fill(0, torch.tensor([2, 5]), True)
+    chosen, points = chosen.to(device), points.to(device)
     expected = torch.where(chosen, (m * y + h * h * k * points) / (m + h * h * k), y)
     assert relative_error(new, expected) <= 1e-14
     assert relative_error(speed, (expected - x) / h) <= 1e-12
-    by_mask = dv.Model(mesh, density=6.0, energies=(dv.Anchor(k, points=points, vertices=chosen[:, 0]),))
+    by_mask = dv.Model(mesh, density=6.0, energies=(dv.Anchor(k, points=points, vertices=chosen[:, 0]),), device=device)
     assert torch.equal(dv.step(by_mask, x, v, mu=0.0, lam=0.0, time_step=h, sweeps=1, gravity=(0, 0, 0))[0], new)
-    stiffness = torch.full((8,), k, dtype=torch.float64, requires_grad=True)
+    stiffness = torch.full((8,), k, dtype=torch.float64, device=device, requires_grad=True)
     options = {"mu": 0.0, "lam": 0.0, "time_step": h, "sweeps": 1, "gravity": (0.0, 0.0, 0.0)}
     out = dv.step(model, x, v, parameters={"anchor.stiffness": stiffness}, **options)
     (slope,) = torch.autograd.grad(out[0].sum(), stiffness)
@@ -342,11 +347,12 @@ def test_anchor_pulls_chosen_vertices_to_their_points() -> None:
     assert relative_error(slope, formula) <= 1e-12
 
 
-def test_several_planes_keep_a_body_in_a_corner() -> None:
+def test_several_planes_keep_a_body_in_a_corner(device: str) -> None:
     mesh = dv.mesh.cube(3, 0.2)
     floor = dv.FloorBarrier(height=(0.0, 0.0), normal=((0.0, 2.0, 0.0), (1.0, 1.0, 0.0)), kappa=1e3, dhat=0.05)
-    model = dv.Model(mesh.translate([0.1, 0.1, 0.0]), energies=(dv.StableNeoHookean(), floor))
-    x, v = model.rest_points, torch.tensor([-30.0, -30.0, 0.0], dtype=torch.float64).expand(model.num_vertices, 3)
+    model = dv.Model(mesh.translate([0.1, 0.1, 0.0]), energies=(dv.StableNeoHookean(), floor), device=device)
+    thrown = torch.tensor([-30.0, -30.0, 0.0], dtype=torch.float64, device=device)
+    x, v = model.rest_points, thrown.expand(model.num_vertices, 3)
     closest = []
     for _ in range(20):
         x, v = dv.step(model, x, v, mu=1e4, lam=1e4, time_step=0.01, sweeps=3)
@@ -354,7 +360,8 @@ def test_several_planes_keep_a_body_in_a_corner() -> None:
     gaps = torch.stack(closest)
     assert (gaps > 0).all()
     assert (gaps.min(0).values < 0.05).all()  # both planes were met
-    one = dv.Model(mesh.translate([0.1, 0.1, 0.0]), energies=(dv.StableNeoHookean(), dv.FloorBarrier(kappa=1e3)))
-    x, v = one.rest_points, torch.tensor([-30.0, -30.0, 0.0], dtype=torch.float64).expand(one.num_vertices, 3)
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(kappa=1e3))
+    one = dv.Model(mesh.translate([0.1, 0.1, 0.0]), energies=energies, device=device)
+    x, v = one.rest_points, thrown.expand(one.num_vertices, 3)
     x, _ = dv.step(one, x, v, mu=1e4, lam=1e4, time_step=0.01, sweeps=3)
     assert (x[:, 0] + x[:, 1]).min() < 0  # without the second plane the body crosses it

@@ -1,5 +1,6 @@
 // The algorithm: one block update of Vertex Block Descent (paper, eqs. 2-3) and its exact transpose (eqs. 7-12).
-// Loops, memory and launches belong to cpu/ and cuda/; a Star gives this file the incident tets of one vertex.
+// Loops, memory and launches belong to cpu/ and cuda/; a Star gives this file the incident tets of one vertex, and where
+// several threads share them, total() sums over the threads.
 #pragma once
 
 #include "../energies/energies.h"
@@ -14,21 +15,14 @@ struct Block {
   VertexState<R> state;
   Vec3<R> y;  // predictor [m]
   R mass;     // [kg]
-  R data[kMaxEnergyData];
-  int data_offset[kVertexEnergies], data_count[kVertexEnergies];
+  const R* data[kVertexEnergies];  // of each energy that is present
+  int data_count[kVertexEnergies];
 };
 
 template <class R>
 struct System {
   Vec3<R> g;
   Sym3<R> H;
-};
-
-template <class R>
-struct Update {
-  Vec3<R> d_raw;  // Newton step before the safeguards
-  Vec3<R> step;   // relaxed and saturated, before the step filter
-  R alpha;        // step filter
 };
 
 // Energies only add semidefinite parts to the mass.
@@ -48,6 +42,7 @@ DIFFVBD_FN System<R> assemble(const Block<R>& b, const Star& star, const StepPar
     for (int e = 0; e < star.size(); ++e) {
       Set::Elastic::block(star.pair(e), b.state.x, g, h_diagonal, h_outer);
     }
+    star.total(g, h_diagonal, h_outer);
     out.g += h2 * g;
     add_diagonal(h_outer, h_diagonal);
     const Sym3<R> scaled = h2 * h_outer;
@@ -55,7 +50,7 @@ DIFFVBD_FN System<R> assemble(const Block<R>& b, const Star& star, const StepPar
   }
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
-    E::block(b.state, b.data + b.data_offset[k], b.data_count[k], out.g, out.H);
+    E::block(b.state, b.data[k], b.data_count[k], out.g, out.H);
   });
   return out;
 }
@@ -74,7 +69,7 @@ DIFFVBD_FN Update<R> safeguarded(const Block<R>& b, const Vec3<R>& d_raw, const 
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
     if constexpr (E::has_filter) {
-      const R alpha = E::filter(b.state, b.data + b.data_offset[k], b.data_count[k], out.step, q);
+      const R alpha = E::filter(b.state, b.data[k], b.data_count[k], out.step, q);
       out.alpha = select(alpha < out.alpha, alpha, out.alpha);
     }
   });
@@ -95,7 +90,7 @@ struct BlockAdjoint {
 };
 
 // Transpose of one block update. `b` holds the state before it, `x_bar` the adjoint of the position after it.
-// add_data(i, value) receives the adjoint of b.data[i]; it is called only if `wants_data`.
+// add_data(k, i, value) receives the adjoint of b.data[k][i]; it is called only if `wants_data`.
 template <class Set, int wanted, class R, class T, class Star, class AddData>
 DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, const Update<R>& u, const Sym3<R>& H,
                                           const Vec3<R>& x_bar, const StepParameters<T>& q, bool wants_data,
@@ -110,7 +105,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
     Set::for_each([&](auto energy, int k) {
       using E = decltype(energy);
       if constexpr (E::has_filter) {
-        E::filter_vjp(b.state, b.data + b.data_offset[k], b.data_count[k], u.step, q, u.alpha, alpha_bar, out.x,
+        E::filter_vjp(b.state, b.data[k], b.data_count[k], u.step, q, u.alpha, alpha_bar, out.x,
                       step_bar);
       }
     });
@@ -123,20 +118,22 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   out.x -= out.y;
   out.mass = -(dot(b.state.x - b.y, p) + dot(u.d_raw, p));
   if constexpr (Set::elastic) {
+    Vec3<R> own = zero3<R>();
     for (int e = 0; e < star.size(); ++e) {
       const auto pair = Set::Elastic::template block_vjp<wanted>(star.pair(e), b.state.x, u.d_raw, p, minus_h2);
-      out.x += pair.xi;
+      own += pair.xi;
       star.template add<wanted>(e, pair);
     }
+    star.total(own);
+    out.x += own;
   }
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
-    const R* data = b.data + b.data_offset[k];
+    const R* data = b.data[k];
     vertex_energy_vjp<E>(b.state, data, b.data_count[k], p, u.d_raw, out.x, out.x_prev);
     if (wants_data) {
-      R data_bar[kMaxEnergyData];
-      vertex_energy_data_vjp<E>(b.state, data, b.data_count[k], p, u.d_raw, u.step, q, alpha_bar, data_bar);
-      for (int i = 0; i < b.data_count[k]; ++i) add_data(b.data_offset[k] + i, data_bar[i]);
+      vertex_energy_data_vjp<E>(b.state, data, b.data_count[k], p, u, q, alpha_bar,
+                                [&](int i, const R& value) { add_data(k, i, value); });
     }
   });
   return out;

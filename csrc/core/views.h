@@ -16,6 +16,35 @@ struct VertexState {
   R h;             // time step [s]
 };
 
+// A tensor with a scene dimension: stride 0 where the scenes share it, item stride 0 where its items do.
+template <class T>
+struct Batched {
+  T* data = nullptr;
+  int64_t scene = 0, item = 1;
+};
+
+enum TapePolicy { kNoTape = 0, kCompactTape = 1, kFullTape = 2 };
+
+// Scalars per active vertex and sweep. Full: d_raw and H. Compact: the old position. A scene with a step filter keeps
+// the old position in a full tape too: a gap must come back to the bit, and an undo by subtraction is an ulp off at
+// times.
+DIFFVBD_FN constexpr int tape_rows(int policy, bool filters) {
+  return policy == kFullTape ? (filters ? 12 : 9) : policy == kCompactTape ? 3 : 0;
+}
+
+// The other three vertices of a tet, a = 0, 1, 2, in the order (j, k, l) that makes (j, i, k, l) an even permutation.
+DIFFVBD_FN constexpr int other_corner(int i, int a) {
+  constexpr int others[4][3] = {{1, 3, 2}, {0, 2, 3}, {1, 0, 3}, {2, 0, 1}};
+  return others[i][a];
+}
+
+// The rest scalars of a tet: k01 k02 k03 k12 k13 k23 c6; where the stiffness weight k_ab stands among them.
+constexpr int kRestScalars = 7;
+DIFFVBD_FN constexpr int weight_index(int a, int b) {
+  constexpr int first[4] = {0, 3, 5, 0};
+  return a < b ? first[a] + b - a - 1 : first[b] + a - b - 1;
+}
+
 // Index data of one mesh in sweep order, all int32. Vertices of a color lie side by side, in blocks of `kLanes`; the
 // last block of a color is filled with phantom vertices. Inactive vertices (pinned, isolated) fill the blocks after the
 // last color. A position is block kLanes + lane. A slot is one incident tet for each lane of a block; a lane with fewer
@@ -40,5 +69,32 @@ struct Plan {
   const int32_t* incoming;  // [incoming_slots, kLanes]  rows (edge slot kLanes + lane) that end in the lane's vertex,
                             // times kRow; padding names the row after the last, which stays zero
 };
+
+// The same for CUDA: blocks of kSlice vertices, one warp wide. A vertex's neighbours are listed once; its pairs name
+// them by their place in that list, so that a pair costs one word of indices.
+constexpr int kSlice = 32;
+constexpr int kLocalBits = 10;  // of each of j, k, l in `local`
+constexpr int kMaxDegree = (1 << kLocalBits) - 1;
+
+struct GroupPlan {
+  int32_t num_vertices, num_tets, num_active, colors, blocks, slots;
+  int32_t edge_slots, incoming_slots;
+  const int32_t* color_block;     // [colors + 1]
+  const int32_t* block_slot;      // [blocks + 1]
+  const int32_t* block_rank;      // [blocks + 1]
+  const int32_t* block_edge;      // [blocks + 1]
+  const int32_t* block_incoming;  // [blocks + 1]
+  const int32_t* order;           // [blocks, kSlice]  vertex in the user's numbering, -1 for a phantom
+  const int32_t* pair;            // [slots, kSlice]  4 tet + local index, -1 for padding
+  const int32_t* local;           // [slots, kSlice]  j + (k << kLocalBits) + (l << 2 kLocalBits) in the edge list
+  const int32_t* adjacent;        // [edge_slots, kSlice]  position of the neighbour; padding names the vertex itself
+  const int32_t* incoming;        // [incoming_slots, kSlice]  edges (slot kSlice + lane) that end in the lane's vertex;
+                                  // padding names the edge after the last, whose row stays zero
+  const int32_t* tet_pair;        // [tets, 4]  pair (slot kSlice + lane) of each corner, -1 if it is not active
+  // Meshes of at most kSmallMesh vertices only: the sweep as one list, in the user's numbering.
+  const int32_t* visit;       // [active, 2]  vertex + (its pairs << kLocalBits), its first pair
+  const int32_t* visit_pair;  // [4 tets, 4]  j, k, l as in `local`, tet, pair (slot kSlice + lane), corner
+};
+constexpr int kSmallMesh = 64;
 
 }  // namespace diffvbd

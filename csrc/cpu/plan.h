@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "../core/views.h"
+#include "../core/plan_views.h"
 
 namespace diffvbd {
 
@@ -27,14 +27,10 @@ Adjacency build_adjacency(const int64_t* tets, const Stars& stars);
 // share a tet share a color.
 std::vector<int32_t> color_vertices(const Stars& stars, const Adjacency& graph, const uint8_t* active, int* colors);
 
-// The plan as one buffer (see views.h): a header of sizes, then its arrays.
+// The plan as one buffer (core/plan_views.h), for this backend and for CUDA.
 std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64_t num_tets, const Stars& stars,
                                 const Adjacency& graph, const std::vector<int32_t>& color, int colors);
-
-constexpr int kPlanHeader = 8;
-Plan view_plan(const int32_t* buffer);
-
-// The other three vertices of a tet in the order (j, k, l) that makes (j, i, k, l) an even permutation.
-constexpr int kOthers[4][3] = {{1, 3, 2}, {0, 2, 3}, {1, 0, 3}, {2, 0, 1}};
+std::vector<int32_t> build_group_plan(const double* points, const int64_t* tets, int64_t num_tets, const Stars& stars,
+                                      const Adjacency& graph, const std::vector<int32_t>& color, int colors);
 
 }  // namespace diffvbd

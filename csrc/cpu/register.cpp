@@ -1,51 +1,20 @@
 // CPU implementations of the operators: tensors in, raw pointers on.
 #include <torch/csrc/stable/library.h>
-#include <torch/csrc/stable/ops.h>
-#include <torch/csrc/stable/tensor.h>
-#include <torch/headeronly/core/ScalarType.h>
 
-#include <array>
 #include <limits>
-#include <stdexcept>
 #include <tuple>
 #include <vector>
 
+#include "../arguments.h"
 #include "reductions.h"
 #include "run.h"
 
 namespace {
 
-using diffvbd::Batched;
+using diffvbd::Batched, diffvbd::batched, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::require,
+    diffvbd::zeros;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
-
-void require(bool condition, const char* message) {
-  if (!condition) throw std::invalid_argument(message);
-}
-
-template <class F>
-auto dispatch_float(const Tensor& t, F&& f) {
-  require(t.scalar_type() == ScalarType::Double || t.scalar_type() == ScalarType::Float,
-          "diffvbd: expected float64 or float32 tensors");
-  return t.scalar_type() == ScalarType::Double ? f(double{}) : f(float{});
-}
-
-template <class T>
-T* data(const Tensor& t) {
-  return static_cast<T*>(t.data_ptr());
-}
-
-// [1 | B, ...] contiguous -> pointer and strides; a missing (empty) tensor gives null
-template <class T>
-Batched<const T> batched(const Tensor& t, const Tensor& like, int64_t scenes, int64_t items) {
-  if (t.numel() == 0) return {};
-  require(t.is_cpu() && t.is_contiguous() && t.scalar_type() == like.scalar_type(),
-          "diffvbd::sweep: expected contiguous CPU tensors of one dtype");
-  require(t.size(0) == 1 || t.size(0) == scenes, "diffvbd::sweep: a scene dimension is neither 1 nor that of x");
-  const int64_t per_scene = t.numel() / t.size(0);
-  require(per_scene == items || (per_scene == 1 && t.dim() == 2), "diffvbd::sweep: a tensor has the wrong size");
-  return {data<const T>(t), t.size(0) == 1 ? 0 : per_scene, per_scene == items ? 1 : 0};
-}
 
 diffvbd::Plan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes) {
   require(buffer.scalar_type() == ScalarType::Int && buffer.is_contiguous() && buffer.numel() >= diffvbd::kPlanHeader,
@@ -64,8 +33,6 @@ diffvbd::StepInputs<T> inputs(const diffvbd::Plan& plan, const Tensor& x_start, 
                               int64_t sweeps, int64_t tape_policy, int64_t debug_step) {
   require(x_start.dim() == 3 && x_start.size(1) == plan.num_vertices && x_start.size(2) == 3,
           "diffvbd::sweep: expected x of shape [scenes, vertices, 3]");
-  require(numbers.size() == 6 && data_count.size() == diffvbd::kVertexEnergies, "diffvbd::sweep: bad parameter lists");
-  require(sweeps >= 0 && sweeps <= std::numeric_limits<int32_t>::max(), "sweeps: expected an integer >= 0");
   const int64_t b = x_start.size(0), v3 = int64_t{plan.num_vertices} * 3;
   diffvbd::StepInputs<T> in{};
   in.scenes = b;
@@ -77,38 +44,22 @@ diffvbd::StepInputs<T> inputs(const diffvbd::Plan& plan, const Tensor& x_start, 
   in.lam = batched<T>(lam, x_start, b, plan.num_tets);
   in.mass = batched<T>(mass, x_start, b, plan.num_vertices);
   in.rest = batched<T>(rest, x_start, b, int64_t{plan.slots} * 4 * diffvbd::kLanes);
-  int64_t total = 0, scalars = 0;
-  for (int k = 0; k < diffvbd::kVertexEnergies; ++k) {
-    const bool per_vertex = diffvbd::is_per_vertex(k, diffvbd::VertexEnergies{});
-    in.data_count[k] = static_cast<int>(data_count[k]);
-    scalars += data_count[k];
-    total += data_count[k] * (per_vertex ? plan.num_vertices : 1);
-  }
-  require(scalars <= diffvbd::kMaxEnergyData,
-          "energies: expected at most 64 scalars of data (7 a plane, 4 for anchors)");
-  in.data = batched<T>(energy_data, x_start, b, total);
+  in.data = batched<T>(energy_data, x_start, b, diffvbd::energy_data_size(data_count, plan.num_vertices));
+  for (int k = 0; k < diffvbd::kVertexEnergies; ++k) in.data_count[k] = static_cast<int>(data_count[k]);
   in.energies = static_cast<int>(energies);
-  in.parameters = {static_cast<T>(numbers[0]),
-                   static_cast<T>(numbers[1]),
-                   static_cast<T>(numbers[2]),
-                   static_cast<T>(numbers[3]),
-                   static_cast<T>(numbers[4]),
-                   static_cast<T>(numbers[5]),
-                   numbers[3] >= 0};
-  in.sweeps = static_cast<int>(sweeps);
+  in.parameters = diffvbd::step_parameters<T>(numbers);
+  in.sweeps = diffvbd::count_of(sweeps);
   in.tape_policy = static_cast<int>(tape_policy);
   in.debug_step = debug_step;
   return in;
 }
 
-Tensor zeros(const Tensor& like, const std::vector<int64_t>& sizes) { return torch::stable::new_zeros(like, sizes); }
-Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes) { return torch::stable::new_empty(like, sizes); }
-
 std::tuple<Tensor, Tensor> sweep(const Tensor& x_start, const Tensor& x_prev, const Tensor& y, const Tensor& mu,
                                  const Tensor& lam, const Tensor& mass, const Tensor& rest, const Tensor& energy_data,
                                  const Tensor& origin, const Tensor& plan_buffer, std::vector<int64_t> sizes,
                                  int64_t energies, std::vector<int64_t> data_count, std::vector<double> numbers,
-                                 int64_t sweeps, int64_t tape_policy, int64_t debug_step, bool checked) {
+                                 int64_t sweeps, std::vector<int64_t> /*launch*/, int64_t tape_policy,
+                                 int64_t debug_step, bool checked) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
   return dispatch_float(x_start, [&](auto scalar) {
     using T = decltype(scalar);
@@ -127,7 +78,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> sweep
     const Tensor& x_bar, const Tensor& x, const Tensor& x_prev, const Tensor& y, const Tensor& mu, const Tensor& lam,
     const Tensor& mass, const Tensor& rest, const Tensor& energy_data, const Tensor& origin, const Tensor& tape,
     const Tensor& plan_buffer, std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
-    std::vector<double> numbers, int64_t sweeps, int64_t tape_policy, std::vector<bool> wants) {
+    std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> /*launch*/, int64_t tape_policy,
+    std::vector<bool> wants) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
   require(wants.size() == 4 && tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: bad arguments");
   return dispatch_float(x, [&](auto scalar) {
@@ -144,10 +96,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> sweep
     Tensor x_start_bar = empty(x, {b, v, 3}), x_prev_bar = zeros(x, {b, v, 3}), y_bar = empty(x, {b, v, 3});
     Tensor mu_bar = material ? zeros(x, {b, t}) : none, lam_bar = material ? zeros(x, {b, t}) : none;
     Tensor mass_bar = of_mass ? zeros(x, {b, v}) : none, rest_bar = of_rest ? zeros(x, {b, t, 7}) : none;
-    int64_t size = 0;
-    for (int k = 0; k < diffvbd::kVertexEnergies; ++k) {
-      size += data_count[k] * (diffvbd::is_per_vertex(k, diffvbd::VertexEnergies{}) ? v : 1);
-    }
+    const int64_t size = diffvbd::energy_data_size(data_count, v);
     Tensor data_bar = of_data ? zeros(x, {b, size}) : none;
     const auto wanted = [&](bool flag, const Tensor& a) { return flag ? data<T>(a) : nullptr; };
     const diffvbd::StepAdjoints<T> out{data<T>(x_start_bar),      data<T>(x_prev_bar),       data<T>(y_bar),
@@ -174,7 +123,7 @@ Tensor pack_rest(const Tensor& rest, const Tensor& plan_buffer, std::vector<int6
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> build_plan(const Tensor& points, const Tensor& tets,
-                                                              const Tensor& active) {
+                                                              const Tensor& active, int64_t lanes) {
   require(points.scalar_type() == ScalarType::Double && tets.scalar_type() == ScalarType::Long &&
               active.scalar_type() == ScalarType::Bool && points.is_contiguous() && tets.is_contiguous() &&
               active.is_contiguous() && points.size(0) == active.size(0),
@@ -187,16 +136,18 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> build_plan(const Tensor& poin
   int colors = 0;
   const diffvbd::Adjacency graph = diffvbd::build_adjacency(tet, stars);
   const std::vector<int32_t> color = diffvbd::color_vertices(stars, graph, data<const uint8_t>(active), &colors);
-  const std::vector<int32_t> buffer =
-      diffvbd::build_plan(data<const double>(points), tet, t, stars, graph, color, colors);
-  const diffvbd::Plan plan = diffvbd::view_plan(buffer.data());
+  require(lanes == diffvbd::kLanes || lanes == diffvbd::kSlice, "diffvbd::build_plan: expected 8 or 32 lanes");
+  const auto build = lanes == diffvbd::kLanes ? diffvbd::build_plan : diffvbd::build_group_plan;
+  const std::vector<int32_t> buffer = build(data<const double>(points), tet, t, stars, graph, color, colors);
+  diffvbd::Plan plan{};
+  diffvbd::PlanReader(buffer.data(), buffer.data()).blocks(plan, static_cast<int>(lanes));
 
   Tensor plan_out = torch::stable::empty({static_cast<int64_t>(buffer.size())}, ScalarType::Int);
   std::copy(buffer.begin(), buffer.end(), data<int32_t>(plan_out));
   Tensor color_ptr = empty(tets, {colors + 1}), members = empty(tets, {plan.num_active});
   for (int c = 0; c <= colors; ++c) data<int64_t>(color_ptr)[c] = plan.block_rank[plan.color_block[c]];
   int64_t n = 0;
-  for (int64_t i = 0; i < int64_t{plan.color_block[colors]} * diffvbd::kLanes; ++i) {
+  for (int64_t i = 0; i < plan.color_block[colors] * lanes; ++i) {
     if (plan.order[i] >= 0) data<int64_t>(members)[n++] = plan.order[i];
   }
   Tensor star_ptr = empty(tets, {v + 1}), star = torch::stable::empty({4 * t}, ScalarType::Int);

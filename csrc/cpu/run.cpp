@@ -15,10 +15,6 @@ namespace {
 // in an average color, its barriers do.
 constexpr int64_t kTeamBlocks = 512, kTeamColor = 8;
 
-// position of the stiffness weight k_ab in a tet's row of `rest`
-constexpr int kWeight[4][4] = {{-1, 0, 1, 2}, {0, -1, 3, 4}, {1, 3, -1, 5}, {2, 4, 5, -1}};
-constexpr int kRestScalars = 7;
-
 bool is_padding(const Plan& plan, int64_t slot, int64_t block, int lane) {
   return plan.neighbors[slot * 3 * kLanes + lane] == kRow * (block * kLanes + lane);
 }
@@ -251,7 +247,7 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
           if (!out.rest) continue;
           T* row = out.rest + (b * tets + tet) * kRestScalars;
           const T* bar = s.rest_bar + slot * 4 * kLanes + l;
-          for (int a = 0; a < 3; ++a) row[kWeight[local][kOthers[local][a]]] += bar[a * kLanes];
+          for (int a = 0; a < 3; ++a) row[weight_index(local, other_corner(local, a))] += bar[a * kLanes];
           row[6] += bar[3 * kLanes];
         }
       }
@@ -290,7 +286,7 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
         const int32_t pair = plan.pair[slot * kLanes + l];
         const T* row = rest + int64_t{pair >> 2} * kRestScalars;
         const int local = pair & 3;
-        for (int a = 0; a < 3; ++a) out[a * kLanes] = padding ? T(0) : row[kWeight[local][kOthers[local][a]]];
+        for (int a = 0; a < 3; ++a) out[a * kLanes] = padding ? T(0) : row[weight_index(local, other_corner(local, a))];
         out[3 * kLanes] = padding ? T(0) : row[6];
       }
     }

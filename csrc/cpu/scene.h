@@ -17,15 +17,6 @@
 
 namespace diffvbd {
 
-enum TapePolicy { kNoTape = 0, kCompactTape = 1, kFullTape = 2 };
-
-// Scalars per active vertex and sweep. Full: d_raw and H. Compact: the old position. A scene with a step filter keeps
-// the old position in a full tape too: a gap must come back to the bit, and an undo by subtraction is an ulp off at
-// times.
-inline int tape_rows(int policy, bool filters) {
-  return policy == kFullTape ? (filters ? 12 : 9) : policy == kCompactTape ? 3 : 0;
-}
-
 template <class T>
 class Buffer {
  public:
@@ -44,13 +35,6 @@ class Buffer {
     void operator()(T* p) const { std::free(p); }
   };
   std::unique_ptr<T[], Free> data_;
-};
-
-// A tensor with a scene dimension: stride 0 where the scenes share it.
-template <class T>
-struct Batched {
-  T* data = nullptr;
-  int64_t scene = 0, item = 1;
 };
 
 template <class T>
@@ -126,6 +110,8 @@ struct LaneStar {
         count(p.block_slot[block + 1] - p.block_slot[block]),
         edges(edge_rows) {}
   DIFFVBD_FN int size() const { return count; }
+  template <class... R>
+  DIFFVBD_FN void total(R&...) const {}  // one lane visits the whole star
 
   DIFFVBD_FN TetPair<Lanes<T>> pair(int e) const {
     const int64_t slot = first + e;
@@ -201,9 +187,10 @@ DIFFVBD_FN T* fresh_rows(const Plan& plan, T* rows, int64_t block) {
   return out;
 }
 
+// `values` holds the energies' data for as long as the block is used.
 template <class Set, class T>
 DIFFVBD_FN Block<Lanes<T>> load_block(const Plan& plan, const SceneView<T>& s, int64_t block,
-                                      const StepParameters<T>& q) {
+                                      const StepParameters<T>& q, Lanes<T>* values) {
   using R = Lanes<T>;
   Block<R> out;
   out.state.x = load_rows(s.x, block);
@@ -216,14 +203,13 @@ DIFFVBD_FN Block<Lanes<T>> load_block(const Plan& plan, const SceneView<T>& s, i
   out.state.h = R(q.time_step);
   out.y = load3(s.y, block);
   out.mass = R::load(s.mass + block * kLanes);
-  int offset = 0;
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
-    out.data_offset[k] = offset;
+    out.data[k] = values;
     out.data_count[k] = E::per_vertex ? E::stride : s.data_count[k];
     const T* data = s.data + s.data_start[k];
     for (int i = 0; i < out.data_count[k]; ++i) {
-      R& value = out.data[offset + i];
+      R& value = *values++;
       if constexpr (E::per_vertex) {
         for (int l = 0; l < kLanes; ++l) {
           const int32_t vertex = plan.order[block * kLanes + l];
@@ -233,7 +219,6 @@ DIFFVBD_FN Block<Lanes<T>> load_block(const Plan& plan, const SceneView<T>& s, i
         value = R(data[i]);
       }
     }
-    offset += out.data_count[k];
   });
   return out;
 }

@@ -21,7 +21,8 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
       return value;
     };
     const LaneStar<T> star(plan, s, block, fresh_rows(plan, s.rows, block));
-    Block<R> b = load_block<Set>(plan, s, block, q);
+    R values[kMaxEnergyData];
+    Block<R> b = load_block<Set>(plan, s, block, q, values);
     if (tape == kCompactTape || Set::filters) b.state.x = {get(), get(), get()};
     Vec3<R> d_raw;
     Sym3<R> H;
@@ -43,8 +44,9 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
 
     const Vec3<R> x_bar = load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block);
     const BlockAdjoint<R> out =
-        reverse_vertex<Set, wanted>(b, star, u, H, x_bar, q, s.data_bar != nullptr, [&](int i, const R& value) {
-          LaneStar<T>::accumulate(s.data_bar + (static_cast<int64_t>(i) * plan.blocks + block) * kLanes, value);
+        reverse_vertex<Set, wanted>(b, star, u, H, x_bar, q, s.data_bar != nullptr, [&](int k, int i, const R& value) {
+          const int64_t row = b.data[k] - values + i;
+          LaneStar<T>::accumulate(s.data_bar + (row * plan.blocks + block) * kLanes, value);
         });
     store_rows(s.x_bar, block, out.x);
     add3(s.y_bar, block, out.y);

@@ -10,7 +10,8 @@ DIFFVBD_HOT void forward_color(const Plan& plan, const SceneView<T>& s, const St
   using Set = EnergySet<mask>;
   const int rows = tape_rows(tape, Set::filters);
   for (int64_t block = begin; block < end; ++block) {
-    const Block<R> b = load_block<Set>(plan, s, block, q);
+    R values[kMaxEnergyData];
+    const Block<R> b = load_block<Set>(plan, s, block, q, values);
     const System<R> system = assemble<Set>(b, LaneStar<T>(plan, s, block), q);
     const Update<R> u = safeguarded<Set>(b, newton_step(b, system, q), q);
     store_rows(s.x, block, moved<Set>(b.state.x, u));

@@ -6,6 +6,8 @@
 #include <type_traits>
 
 #include "../core/dual.h"
+#include "../core/safeguards.h"
+#include "../core/views.h"
 #include "anchor.h"
 #include "floor_barrier.h"
 #include "stable_neo_hookean.h"
@@ -22,6 +24,14 @@ using VertexEnergies = EnergyList<FloorBarrier, Anchor>;
 constexpr int kVertexEnergies = VertexEnergies::size;
 enum ElasticBits { kExactBlock = 1, kPaperBlock = 2 };
 constexpr int kMaxEnergyData = 64;  // scalars that the energies of one vertex may read
+
+// One block update, from the Newton step to the executed one.
+template <class R>
+struct Update {
+  Vec3<R> d_raw;  // Newton step before the safeguards
+  Vec3<R> step;   // relaxed and saturated, before the step filter
+  R alpha;        // step filter
+};
 
 template <class... E>
 constexpr bool is_per_vertex(int k, EnergyList<E...>) {
@@ -79,27 +89,28 @@ struct has_block_vjp : std::false_type {};
 template <class E>
 struct has_block_vjp<E, std::void_t<decltype(&E::template block_vjp<double>)>> : std::true_type {};
 
-// Adjoint of phi = p . (g + H d_raw) for one energy, by one Dual evaluation for each input. Kept out of line: it is
-// shared by all variants and seldom wanted.
+// Adjoint of phi = p . (g + H d_raw) for one record of an energy's data, by one Dual evaluation for each input. The
+// records of an energy only add up. Kept out of line: it is shared by all variants and seldom wanted.
 template <class E, class R>
 struct DualAdjoint {
   const VertexState<R>& s;
-  const R* data;
-  int count;
+  const R* record;
   const Vec3<R>&p, &d_raw;
 
-  R derivative(const VertexState<Dual<R>>& state, const Dual<R>* values) const {
+  DIFFVBD_FN R derivative(const VertexState<Dual<R>>& state, const Dual<R>* values) const {
     Vec3<Dual<R>> g = zero3<Dual<R>>();
     Sym3<Dual<R>> H = diagonal(Dual<R>(0));
-    E::block(state, values, count, g, H);
+    E::block(state, values, E::stride, g, H);
     return dot(constant(p), g + H * constant(d_raw)).derivative;
   }
-  VertexState<Dual<R>> lifted() const { return {constant(s.x), constant(s.x_prev), constant(s.origin), Dual<R>(s.h)}; }
-  void lift(Dual<R>* values) const {
-    for (int i = 0; i < count; ++i) values[i] = Dual<R>(data[i]);
+  DIFFVBD_FN VertexState<Dual<R>> lifted() const {
+    return {constant(s.x), constant(s.x_prev), constant(s.origin), Dual<R>(s.h)};
+  }
+  DIFFVBD_FN void lift(Dual<R>* values) const {
+    for (int i = 0; i < E::stride; ++i) values[i] = Dual<R>(record[i]);
   }
   DIFFVBD_COLD void subtract_from(Vec3<R>& bar, Vec3<Dual<R>> VertexState<Dual<R>>::* which) const {
-    Dual<R> values[kMaxEnergyData];
+    Dual<R> values[E::stride];
     lift(values);
     R* out[3] = {&bar.x, &bar.y, &bar.z};
     for (int c = 0; c < 3; ++c) {
@@ -118,28 +129,52 @@ DIFFVBD_FN void vertex_energy_vjp(const VertexState<R>& s, const R* data, int co
   if constexpr (has_block_vjp<E>::value) {
     E::block_vjp(s, data, count, p, d_raw, x_bar, x_prev_bar);
   } else {
-    const DualAdjoint<E, R> adjoint{s, data, count, p, d_raw};
-    adjoint.subtract_from(x_bar, &VertexState<Dual<R>>::x);
-    if constexpr (E::reads_x_prev) adjoint.subtract_from(x_prev_bar, &VertexState<Dual<R>>::x_prev);
+    for (int k = 0; k < count; k += E::stride) {
+      const DualAdjoint<E, R> adjoint{s, data + k, p, d_raw};
+      adjoint.subtract_from(x_bar, &VertexState<Dual<R>>::x);
+      if constexpr (E::reads_x_prev) adjoint.subtract_from(x_prev_bar, &VertexState<Dual<R>>::x_prev);
+    }
   }
 }
 
-// data_bar[i] = alpha_bar d alpha / d data_i - d phi / d data_i
+// data_bar[i] = alpha_bar d alpha / d data_i - d phi / d data_i for one record; binds = 1 if it set alpha, else 0
 template <class E, class R, class T>
-DIFFVBD_COLD void vertex_energy_data_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
-                                         const Vec3<R>& d_raw, const Vec3<R>& step, const StepParameters<T>& q,
-                                         const R& alpha_bar, R* data_bar) {
-  const DualAdjoint<E, R> adjoint{s, data, count, p, d_raw};
-  Dual<R> values[kMaxEnergyData];
+DIFFVBD_COLD void record_vjp(const VertexState<R>& s, const R* record, const Vec3<R>& p, const Vec3<R>& d_raw,
+                             const Vec3<R>& step, const StepParameters<T>& q, const R& binds, const R& alpha_bar,
+                             R* data_bar) {
+  const DualAdjoint<E, R> adjoint{s, record, p, d_raw};
+  Dual<R> values[E::stride];
   adjoint.lift(values);
   const VertexState<Dual<R>> state = adjoint.lifted();
-  for (int i = 0; i < count; ++i) {
+  for (int i = 0; i < E::stride; ++i) {
     values[i].derivative = R(1);
     data_bar[i] = -adjoint.derivative(state, values);
     if constexpr (E::has_filter) {
-      data_bar[i] = data_bar[i] + alpha_bar * E::filter(state, values, count, constant(step), q).derivative;
+      const R rate = E::filter(state, values, E::stride, constant(step), q).derivative;
+      data_bar[i] = data_bar[i] + select(R(0) < binds, alpha_bar * rate, R(0));
     }
     values[i].derivative = R(0);
+  }
+}
+
+// Calls add(i, data_bar[i]) for all data of one energy.
+template <class E, class R, class T, class Add>
+DIFFVBD_FN void vertex_energy_data_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
+                                       const Update<R>& u, const StepParameters<T>& q, const R& alpha_bar, Add&& add) {
+  R alpha = R(1);
+  for (int k = 0; k < count; k += E::stride) {
+    R data_bar[E::stride];
+    if constexpr (E::has_filter) {
+      // The record that set alpha is the first of the smallest fraction; a vertex that was held (0) follows no datum.
+      const R own = E::fraction(s, data + k, u.step, q);
+      const R same = select(own < u.alpha, R(0), select(u.alpha < own, R(0), R(1)));
+      const R binds = select(own < alpha, same, R(0));
+      alpha = select(own < alpha, own, alpha);
+      record_vjp<E>(s, data + k, p, u.d_raw, u.step, q, binds, alpha_bar, data_bar);
+    } else {
+      record_vjp<E>(s, data + k, p, u.d_raw, u.step, q, R(0), alpha_bar, data_bar);
+    }
+    for (int i = 0; i < E::stride; ++i) add(k + i, data_bar[i]);
   }
 }
 

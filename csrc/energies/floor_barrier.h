@@ -93,14 +93,21 @@ struct FloorBarrier {
     }
   }
 
-  // Index-free part of the filter: the binding fraction, and the plane that set it (its offset in data, -1: none).
+  // The largest fraction of the step that one plane admits.
+  template <class R, class T>
+  DIFFVBD_FN static R fraction(const VertexState<R>& s, const R* record, const Vec3<R>& step,
+                               const StepParameters<T>& q) {
+    const Plane<R> plane(record, s);
+    return filter_fraction(plane.gap(s.x), dot(plane.n, step), q);
+  }
+
+  // The fraction of the step that all planes admit.
   template <class R, class T>
   DIFFVBD_FN static R filter(const VertexState<R>& s, const R* data, int count, const Vec3<R>& step,
                              const StepParameters<T>& q) {
     R alpha = R(1);
     for (int k = 0; k < count; k += stride) {
-      const Plane<R> plane(data + k, s);
-      const R a = filter_fraction(plane.gap(s.x), dot(plane.n, step), q);
+      const R a = fraction(s, data + k, step, q);
       alpha = select(a < alpha, a, alpha);
     }
     // Rounding must not undo the filter: a vertex whose new gap cannot be told from zero stays where it is.

@@ -1,0 +1,252 @@
+"""What the GPU benchmark measures with: CUDA graphs timed by events, copy rate, peak memory, bytes that must move."""
+
+from __future__ import annotations
+
+import gc
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+
+STEP = 5e-3  # [s]
+MODULUS = 1e5  # [Pa], mu and lam
+TAPE_SCALARS = {None: 0, "recompute": 0, "compact": 3, "full": 9}  # per vertex and sweep
+Work = Callable[[], Any]
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Card:
+    """Where to measure. On the CPU nothing is captured and the wall clock is read: that only tries the script out."""
+
+    device: torch.device
+    quick: bool
+
+    @property
+    def cuda(self) -> bool:
+        return self.device.type == "cuda"
+
+    def sync(self) -> None:
+        if self.cuda:
+            torch.cuda.synchronize(self.device)
+
+    def tidy(self) -> None:
+        gc.collect()
+        if self.cuda:
+            torch.cuda.synchronize(self.device)
+            torch.cuda.empty_cache()
+
+    def allocated(self) -> int:
+        return torch.cuda.memory_allocated(self.device) if self.cuda else 0
+
+    def copy_rate(self) -> float:
+        """Bytes per second that a large copy within the device's memory reads and writes together."""
+        size = 2**24 if self.quick else 2**31
+        source = torch.zeros(size, dtype=torch.uint8, device=self.device)
+        target = torch.empty_like(source)
+        spans = self._spans(lambda: target.copy_(source), 25)[5:]
+        return 2 * size / statistics.median(spans)
+
+    def eager(self, work: Work, repetitions: int = 5) -> float:
+        """Median seconds of `work`, called anew each time, after a first call that does not count."""
+        return statistics.median(self._spans(work, 1 + (2 if self.quick else repetitions))[1:])
+
+    def graph(self, work: Work, replays: int = 20, budget: float | None = None) -> float | None:
+        """Median seconds of replays of `work`, captured in one CUDA graph; None on the CPU.
+
+        Captures after two calls on a side stream, as torch asks for. A budget [s] replays slow work less often.
+        """
+        if not self.cuda:
+            return None
+        with torch.cuda.device(self.device):
+            side = torch.cuda.Stream()
+            side.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(side):
+                for _ in range(2):
+                    work()
+            torch.cuda.current_stream().wait_stream(side)
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph):
+                kept = work()  # holds what the graph writes, tapes included, as a user's code would
+            first = self._spans(graph.replay, 2)[1]
+            if budget is not None:
+                replays = max(3, min(replays, int(budget / first)))
+            spans = self._spans(graph.replay, 3 if self.quick else replays)
+            del kept, graph
+        return statistics.median(spans)
+
+    def _spans(self, work: Work, count: int) -> list[float]:
+        """Seconds of each of several calls; on CUDA by events, so that the host's share shows only where it is late."""
+        if not self.cuda:
+            out = []
+            for _ in range(count):
+                start = time.perf_counter()
+                work()
+                out.append(time.perf_counter() - start)
+            return out
+        with torch.cuda.device(self.device):
+            events = [
+                (torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)) for _ in range(count)
+            ]
+            for start, end in events:
+                start.record()
+                work()
+                end.record()
+            torch.cuda.synchronize()
+        return [start.elapsed_time(end) / 1e3 for start, end in events]
+
+    def peak(self, work: Work) -> int | None:
+        """Growth of torch's peak of allocated bytes over one call; None on the CPU."""
+        if not self.cuda:
+            work()
+            return None
+        self.tidy()
+        before = self.allocated()
+        torch.cuda.reset_peak_memory_stats(self.device)
+        work()
+        torch.cuda.synchronize(self.device)
+        return torch.cuda.max_memory_allocated(self.device) - before
+
+
+def attempt(card: Card, rows: list[Row], about: Row, measure: Callable[[], Row | list[Row]]) -> None:
+    """Appends what `measure` returns, each row with `about`; an error becomes a row, so that the others still come."""
+    try:
+        got = measure()
+        rows.extend({**about, **row} for row in (got if isinstance(got, list) else [got]))
+    except Exception as error:
+        lines = str(error).strip().splitlines()
+        rows.append({**about, "error": f"{type(error).__name__}: {lines[0] if lines else ''}"[:300]})
+    try:
+        card.tidy()
+    except RuntimeError:
+        pass  # a broken context: the rows that follow will say so themselves
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A Model and the tensors of a step, which stay where they are, as a graph wants them."""
+
+    model: dv.Model
+    x: Tensor
+    v: Tensor
+    mu: Tensor
+    lam: Tensor
+
+    @property
+    def leaves(self) -> tuple[Tensor, ...]:
+        return self.x, self.v, self.mu, self.lam
+
+    @property
+    def bytes(self) -> int:
+        return sum(t.numel() * t.element_size() for t in self.leaves)
+
+    def requiring(self, *names: str) -> Scene:
+        """The same scene with tensors of its own, of which those named require grad (mu and lam are "material")."""
+        names = tuple(n for name in names for n in (("mu", "lam") if name == "material" else (name,)))
+        return Scene(self.model, *(getattr(self, k).detach().clone().requires_grad_(k in names)
+                                   for k in ("x", "v", "mu", "lam")))  # fmt: skip
+
+
+def model_of(mesh: dv.TetMesh, card: Card, dtype: torch.dtype = torch.float64, pinned: bool = True) -> dv.Model:
+    """A Model at 1000 kg/m^3, held by the face at y = 0."""
+    mask = torch.from_numpy(mesh.points[:, 1] < 1e-9) if pinned else None
+    return dv.Model(mesh, pinned=mask, dtype=dtype, device=card.device)
+
+
+def scene_of(model: dv.Model, scenes: int | None = None, material: str = "scalar", noise: float = 1e-3) -> Scene:
+    """A Model slightly off rest, in one scene or a batch; material: "scalar", "per tet" or "per scene"."""
+    like = model.rest_points
+    lead = () if scenes is None else (scenes,)
+    shape = {"scalar": (), "per tet": (model.num_tets,), "per scene": (*lead, 1)}[material]
+    generator = torch.Generator(like.device).manual_seed(0)
+    off = torch.randn((*lead, *like.shape), generator=generator, dtype=like.dtype, device=like.device)
+    x = off.mul_(noise).add_(like)
+    modulus = torch.full(shape, MODULUS, dtype=like.dtype, device=like.device)
+    return Scene(model, x, torch.zeros_like(x), modulus, modulus.clone())
+
+
+def forward(scene: Scene, sweeps: int, steps: int, tape: Any = "auto") -> Work:
+    """Steps of the public interface; with a tape where a tensor of the scene requires grad."""
+
+    def work() -> tuple[Tensor, Tensor]:
+        x, v = scene.x, scene.v
+        for _ in range(steps):
+            x, v = dv.step(scene.model, x, v, mu=scene.mu, lam=scene.lam, time_step=STEP, sweeps=sweeps,
+                           adjoint=dv.ReverseSweep(tape))  # fmt: skip
+        return x, v
+
+    return work
+
+
+def forward_reverse(scene: Scene, sweeps: int, steps: int, tape: Any = "auto") -> Work:
+    """The same steps and the gradients of the sum of final positions and velocities."""
+    run = forward(scene, sweeps, steps, tape)
+    ones = torch.ones_like(scene.x)
+    wanted = [t for t in scene.leaves if t.requires_grad]
+    return lambda: torch.autograd.grad(run(), wanted, (ones, ones))
+
+
+# --- bytes ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Sizes that traffic is proportional to: vertices, those that sweeps move, their (vertex, tet) pairs and edges."""
+
+    vertices: int
+    active: int
+    pairs: int
+    edges: int  # directed, from active vertices: the sum of their degrees
+
+    @classmethod
+    def of(cls, model: dv.Model) -> Counts:
+        tets, active = model.mesh.tets, ~model.pinned.cpu().numpy()
+        ends = tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
+        ends = np.sort(ends, axis=1)
+        key = np.unique(ends[:, 0] * model.num_vertices + ends[:, 1])
+        low, high = np.divmod(key, model.num_vertices)
+        return cls(model.num_vertices, int(active.sum()), int(active[tets].sum()),
+                   int(active[low].sum() + active[high].sum()))  # fmt: skip
+
+
+def sweep_traffic(
+    counts: Counts, sweeps: int, item: int, *, per_tet: bool, tape: str | None = None, reverse: bool = False
+) -> tuple[int, int]:
+    """Bytes that a step must move where a mesh does not fit the caches: (through memory, neighbours through L2).
+
+    A pair: four rest scalars, packed local indices, and two moduli if given per tet. A vertex: its row read and written
+    (four scalars), y, mass, tape, and four bytes for each neighbour's index. The neighbours' rows come from L2 and are
+    stated apart. Reverse: the same with the tape read; a row written and one read along each edge; four scalars for
+    each pair where moduli are per tet; 19 scalars of adjoints for each vertex. A step reads x, v and writes x', v'.
+    """
+    pair = 4 * item + 4 + (2 * item if per_tet else 0)
+    vertex = (8 + 3 + 1 + TAPE_SCALARS[tape]) * item
+    through = counts.pairs * pair + counts.active * vertex + 4 * counts.edges
+    if reverse:
+        through += counts.edges * 8 * item + counts.active * 19 * item + (counts.pairs * 4 * item if per_tet else 0)
+    return sweeps * through + 12 * item * counts.vertices, sweeps * counts.edges * 4 * item
+
+
+def resident_traffic(vertices: int, item: int, reverse: bool = False) -> int:
+    """Bytes of a step whose sweeps stay on chip: reads x, v, writes x', v'; its reverse reads x, v and two adjoints."""
+    return (18 if reverse else 12) * item * vertices
+
+
+def rated(row: Row, seconds: float | None, moved: int, rate: float) -> Row:
+    """A row with its bytes, the time that they need at the copy rate, and the fraction of that rate achieved."""
+    return {**row, "bytes": moved, "floor_ms": 1e3 * moved / rate,
+            "fraction": None if seconds is None else moved / seconds / rate}  # fmt: skip
+
+
+def milliseconds(seconds: float | None, steps: int = 1) -> float | None:
+    return None if seconds is None else 1e3 * seconds / steps

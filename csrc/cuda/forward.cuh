@@ -1,0 +1,62 @@
+// The sweeps, one instantiation for each set of energies and number of threads per vertex.
+#pragma once
+
+#include <utility>
+
+#include "group.cuh"
+
+namespace diffvbd::cuda {
+namespace {
+
+template <class T, int mask, int lanes>
+__global__ void __launch_bounds__(kMaxThreads) sweep_forward(const __grid_constant__ StepView<T> s,
+                                                          const __grid_constant__ Range range) {
+  using Set = EnergySet<mask>;
+  const int rows = tape_rows(s.tape_policy, Set::filters);
+  T* const shared = memory_of_warp<T, lanes>(s, false);
+  each_color<T, lanes>(s, range, false, [&](int64_t scene, int sweep, int, int block, int part) {
+    const Place<lanes> at(scene, block, part);
+    GroupStar<T, lanes> star(s, at, shared);
+    if constexpr (Set::elastic) star.fetch_neighbours();
+    const Block<T> b = load_block<Set>(s, at);
+    const System<T> system = assemble<Set>(b, star, s.parameters);
+    const Update<T> u = safeguarded<Set>(b, newton_step(b, system, s.parameters), s.parameters);
+    const int64_t position = static_cast<int64_t>(block) * kSlice + at.v;
+    if (at.lane == 0) store_row(s.w.x, scene * s.positions + position, moved<Set>(b.state.x, u));
+    const int rank = __ldg(s.plan.block_rank + block) + at.v;
+    if (s.tape_policy != kNoTape && at.lane == 0 && rank < __ldg(s.plan.block_rank + block + 1)) {
+      T* to = s.tape + (scene * s.sweeps + sweep) * rows * s.plan.num_active + rank;
+      const auto put = [&](const T& value) {
+        *to = value;
+        to += s.plan.num_active;
+      };
+      if (s.tape_policy == kCompactTape || Set::filters) put(b.state.x.x), put(b.state.x.y), put(b.state.x.z);
+      if (s.tape_policy == kFullTape) {
+        put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
+        put(system.H.xx), put(system.H.xy), put(system.H.xz), put(system.H.yy), put(system.H.yz), put(system.H.zz);
+      }
+    }
+    __syncwarp();
+  });
+}
+
+template <class T, int lanes, int... n>
+SweepKernel<T> pick_forward(int index, std::integer_sequence<int, n...>) {
+  static constexpr SweepKernel<T> table[kEnergySets] = {sweep_forward<T, energy_mask(n), lanes>...};
+  return table[index];
+}
+
+}  // namespace
+
+template <class T>
+SweepKernel<T> forward_kernel(int energies, int lanes) {
+  constexpr auto sets = std::make_integer_sequence<int, kEnergySets>{};
+  const int index = energy_index(energies);
+  return lanes == kFewLanes    ? pick_forward<T, kFewLanes>(index, sets)
+         : lanes == kManyLanes ? pick_forward<T, kManyLanes>(index, sets)
+                               : pick_forward<T, kSpillLanes>(index, sets);
+}
+
+}  // namespace diffvbd::cuda
+
+#define DIFFVBD_INSTANTIATE_FORWARD(T) template diffvbd::cuda::SweepKernel<T> diffvbd::cuda::forward_kernel<T>(int, int);

@@ -1,0 +1,3 @@
+#include "forward.cuh"
+
+DIFFVBD_INSTANTIATE_FORWARD(double)

@@ -1,0 +1,204 @@
+// What surrounds the sweeps: from the user's arrays to sweep order and back, once a step, one thread per vertex or tet.
+#pragma once
+
+#include "group.cuh"
+
+namespace diffvbd::cuda {
+namespace {
+
+constexpr int kFrameThreads = 256;
+
+template <class T>
+__device__ __forceinline__ Vec3<T> load_user(const Batched<const T>& t, int64_t scene, int64_t vertex) {
+  const T* a = t.data + scene * t.scene + 3 * t.item * vertex;
+  return {a[0], a[1], a[2]};
+}
+template <class T>
+__device__ __forceinline__ void store_user(T* p, int64_t index, const Vec3<T>& a) {
+  p += 3 * index;
+  p[0] = a.x;
+  p[1] = a.y;
+  p[2] = a.z;
+}
+template <class T>
+__device__ __forceinline__ void store3(T* p, int64_t block, int v, const Vec3<T>& b) {
+  T* a = p + block * 3 * kSlice + v;
+  a[0] = b.x;
+  a[kSlice] = b.y;
+  a[2 * kSlice] = b.z;
+}
+
+// y = x + h v + h^2 a; a pinned vertex goes where it is held
+template <class T>
+__device__ __forceinline__ Vec3<T> predict(const StepInputs<T>& in, int64_t scene, int64_t vertex, bool pinned) {
+  const Vec3<T> x = load_user(in.x_prev, scene, vertex);
+  if (pinned) return in.held.data ? load_user(in.held, scene, vertex) : x;
+  const T h = in.parameters.time_step;
+  const Vec3<T> v = load_user(in.v, scene, vertex), a = load_user(in.acceleration, scene, vertex);
+  return x + h * v + (h * h) * a;
+}
+
+// Fills a chunk's arrays in sweep order. Forward: x is where the sweeps start. Reverse: x is where they ended (`ends`),
+// and x_bar comes with it.
+template <class T>
+__global__ void load_vertices(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
+                              int64_t base, const T* ends, const T* x_bar, const T* v_bar) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i >= s.scenes * s.positions) return;
+  const int64_t local = i / s.positions, scene = base + local, position = i - local * s.positions;
+  const int64_t block = position / kSlice;
+  const int v = static_cast<int>(position % kSlice);
+  int64_t vertex = __ldg(s.plan.order + position);
+  const bool phantom = vertex < 0;  // it copies the first vertex of its block, so that it never meets an undefined state
+  if (phantom) vertex = __ldg(s.plan.order + block * kSlice);
+  const bool pinned = block >= __ldg(s.plan.color_block + s.plan.colors);
+  const int64_t vectors = local * s.positions * 3;
+  const Vec3<T> y = in.fused ? predict(in, scene, vertex, pinned) : load_user(in.y, scene, vertex);
+  store3(s.w.y + vectors, block, v, y);
+  const int64_t own = scene * s.plan.num_vertices + vertex;
+  if (ends) {
+    store_row(s.w.x, i, Vec3<T>{ends[3 * own], ends[3 * own + 1], ends[3 * own + 2]});
+    Vec3<T> bar = zero3<T>();
+    if (x_bar) bar += Vec3<T>{x_bar[3 * own], x_bar[3 * own + 1], x_bar[3 * own + 2]};
+    if (v_bar) {
+      const T rate = T(1) / in.parameters.time_step;
+      bar += rate * Vec3<T>{v_bar[3 * own], v_bar[3 * own + 1], v_bar[3 * own + 2]};
+    }
+    store_row(s.w.x_bar, i, phantom ? zero3<T>() : bar);
+  } else {
+    store_row(s.w.x, i, in.fused ? y : load_user(in.x_start, scene, vertex));
+  }
+  if (s.w.x_prev) store3(s.w.x_prev + vectors, block, v, load_user(in.x_prev, scene, vertex));
+  if (s.w.origin) store3(s.w.origin + vectors, block, v, load_user(in.origin, scene, vertex));
+  if (local == 0 || in.mass.scene != 0) {
+    s.w.mass[(in.mass.scene != 0 ? local : 0) * s.positions + position] = in.mass.data[scene * in.mass.scene + vertex];
+  }
+}
+
+template <class T>
+__global__ void store_vertices(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
+                               int64_t base, T* x, T* velocity) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i >= s.scenes * s.positions) return;
+  const int64_t local = i / s.positions, scene = base + local;
+  const int64_t vertex = __ldg(s.plan.order + (i - local * s.positions));
+  if (vertex < 0) return;
+  const Vec3<T> end = load_row(s.w.x, i);
+  const int64_t own = scene * s.plan.num_vertices + vertex;
+  store_user(x, own, end);
+  if (velocity) store_user(velocity, own, (T(1) / in.parameters.time_step) * (end - load_user(in.x_prev, scene, vertex)));
+}
+
+// The pairs' copies of a material that differs from tet to tet.
+template <class T>
+__global__ void load_material(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
+                              int64_t base, int64_t scenes) {
+  const int64_t pairs = static_cast<int64_t>(s.plan.slots) * kSlice;
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i >= scenes * pairs) return;
+  const int64_t local = i / pairs, scene = base + local;
+  const int64_t tet = max(0, __ldg(s.plan.pair + (i - local * pairs))) >> 2;
+  s.w.material[2 * i] = in.mu.data[scene * in.mu.scene + tet * in.mu.item];
+  s.w.material[2 * i + 1] = in.lam.data[scene * in.lam.scene + tet * in.lam.item];
+}
+
+// What the updates of lower colors have added since a vertex's last turn in the first executed sweep.
+template <class T>
+__device__ __forceinline__ Vec3<T> rows_of_lower_colors(const StepView<T>& s, int64_t scene, int block, int v) {
+  int color = 0;
+  while (block >= __ldg(s.plan.color_block + color + 1)) ++color;
+  const int64_t below = static_cast<int64_t>(__ldg(s.plan.block_edge + __ldg(s.plan.color_block + color))) * kSlice;
+  Place<1> at(scene, block, 0);
+  at.v = v;
+  return pull_rows(s, at, below);
+}
+
+template <class T>
+__global__ void store_adjoints(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
+                               int64_t base, const __grid_constant__ StepAdjoints<T> out) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i >= s.scenes * s.positions) return;
+  const int64_t local = i / s.positions, scene = base + local, position = i - local * s.positions;
+  const int64_t vertex = __ldg(s.plan.order + position);
+  if (vertex < 0) return;
+  const int block = static_cast<int>(position / kSlice), v = static_cast<int>(position % kSlice);
+  const bool pinned = block >= __ldg(s.plan.color_block + s.plan.colors);
+  const int64_t own = scene * s.plan.num_vertices + vertex, vectors = local * s.positions * 3;
+  Vec3<T> start = load_row(s.w.x_bar, i);
+  if (!pinned && s.sweeps > 0) start += rows_of_lower_colors(s, local, block, v);
+  const Vec3<T> y = load3(s.w.y_bar + vectors, block, v);
+  if (out.mass) out.mass[own] = s.w.mass_bar[i];
+  if (!in.fused) {
+    store_user(out.x_start, own, start);
+    store_user(out.y, own, y);
+    store_user(out.x_prev, own, s.w.x_prev_bar ? load3(s.w.x_prev_bar + vectors, block, v) : zero3<T>());
+  } else {
+    const T h = in.parameters.time_step;
+    const Vec3<T> all = start + y, none = zero3<T>();
+    const bool held = pinned && in.held.data != nullptr;
+    Vec3<T> x = held ? none : all;
+    if (out.v_bar) x -= (T(1) / h) * Vec3<T>{out.v_bar[3 * own], out.v_bar[3 * own + 1], out.v_bar[3 * own + 2]};
+    if (out.x) store_user(out.x, own, x);
+    if (out.v) store_user(out.v, own, pinned ? none : h * all);
+    if (out.acceleration) store_user(out.acceleration, own, pinned ? none : (h * h) * all);
+    if (out.held) store_user(out.held, own, held ? all : none);
+  }
+  for (int k = 0; out.data && k < kVertexEnergies; ++k) {
+    if (is_per_vertex(k, VertexEnergies{})) {
+      T* to = out.data + scene * in.data_size + s.data_start[k] + vertex * s.data_count[k];
+      for (int c = 0; c < s.data_count[k]; ++c) {
+        to[c] = s.w.data_bar[(local * s.data_scalars + s.data_row[k] + c) * s.positions + position];
+      }
+    }
+  }
+}
+
+// A tet's four pairs, added in the order of its corners.
+template <class T>
+__global__ void store_tets(const __grid_constant__ StepView<T> s, int64_t base,
+                           const __grid_constant__ StepAdjoints<T> out, bool material) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i >= s.scenes * s.plan.num_tets) return;
+  const int64_t local = i / s.plan.num_tets, scene = base + local, tet = i - local * s.plan.num_tets;
+  const int64_t pairs = static_cast<int64_t>(s.plan.slots) * kSlice, to = scene * s.plan.num_tets + tet;
+  T mu = T(0), lam = T(0), rest[kRestScalars] = {};
+#pragma unroll
+  for (int a = 0; a < 4; ++a) {
+    const int64_t at = __ldg(s.plan.tet_pair + 4 * tet + a);
+    if (at < 0) continue;
+    if (material) {
+      const T* m = s.w.material_bar + (local * pairs + at) * 2;
+      mu += m[0];
+      lam += m[1];
+    }
+    if (out.rest) {
+      const T* r = s.w.rest_bar + (local * pairs + at) * 4;
+#pragma unroll
+      for (int b = 0; b < 3; ++b) rest[weight_index(a, other_corner(a, b))] += r[b];
+      rest[6] += r[3];
+    }
+  }
+  if (material) {
+    out.mu[to] = mu;
+    out.lam[to] = lam;
+  }
+  for (int k = 0; out.rest && k < kRestScalars; ++k) out.rest[to * kRestScalars + k] = rest[k];
+}
+
+// out[r] = sum over i of values[r stride + i step], i < count: one block for a row, in an order fixed by the count
+template <class T>
+__global__ void sum_rows(const T* values, int64_t stride, int64_t step, int64_t count, T* out, int64_t out_stride) {
+  __shared__ T part[kFrameThreads];
+  const T* row = values + static_cast<int64_t>(blockIdx.x) * stride;
+  T sum = T(0);
+  for (int64_t i = threadIdx.x; i < count; i += kFrameThreads) sum += row[i * step];
+  part[threadIdx.x] = sum;
+  for (int half = kFrameThreads / 2; half > 0; half /= 2) {
+    __syncthreads();
+    if (threadIdx.x < half) part[threadIdx.x] += part[threadIdx.x + half];
+  }
+  if (threadIdx.x == 0) out[blockIdx.x * out_stride] = part[0];
+}
+
+}  // namespace
+}  // namespace diffvbd::cuda

@@ -1,0 +1,103 @@
+// The transposed sweeps, one instantiation for each set of energies, wish and number of threads per vertex.
+#pragma once
+
+#include <utility>
+
+#include "group.cuh"
+
+namespace diffvbd::cuda {
+namespace {
+
+template <class T, int mask, int wanted, int lanes>
+__global__ void __launch_bounds__(kMaxThreads) sweep_reverse(const __grid_constant__ StepView<T> s,
+                                                          const __grid_constant__ Range range) {
+  using Set = EnergySet<mask>;
+  const int rows = tape_rows(s.tape_policy, Set::filters);
+  T* const shared = memory_of_warp<T, lanes>(s, true);
+  const int64_t every_row = static_cast<int64_t>(s.plan.edge_slots) * kSlice;
+  each_color<T, lanes>(s, range, true, [&](int64_t scene, int turn, int color, int block, int part) {
+    const Place<lanes> at(scene, block, part);
+    const int64_t position = static_cast<int64_t>(block) * kSlice + at.v, row = scene * s.positions + position;
+    const Vec3<T> x_bar = load_row(s.w.x_bar, row) + pull_rows(s, at, every_row);
+    if (color == s.plan.colors) {  // pinned: it only collects, before the rows are overwritten
+      if (at.lane == 0) store_row(s.w.x_bar, row, x_bar);
+      return;
+    }
+    GroupStar<T, lanes> star(s, at, shared);
+    Block<T> b = load_block<Set>(s, at);
+    if constexpr (Set::elastic) {
+      star.fetch_neighbours();
+      star.clear_sums(shared);
+    }
+    const int rank = __ldg(s.plan.block_rank + block) + at.v;
+    const bool real = rank < __ldg(s.plan.block_rank + block + 1);
+    const T* from = s.tape + (scene * s.sweeps + (s.sweeps - 1 - turn)) * rows * s.plan.num_active + (real ? rank : 0);
+    const auto get = [&] {
+      const T value = __ldg(from);
+      from += s.plan.num_active;
+      return value;
+    };
+    if (s.tape_policy == kCompactTape || Set::filters) b.state.x = {get(), get(), get()};
+    Vec3<T> d_raw;
+    Sym3<T> H;
+    if (s.tape_policy == kFullTape) {
+      d_raw = {get(), get(), get()};
+      H = {get(), get(), get(), get(), get(), get()};
+    } else {
+      const System<T> system = assemble<Set>(b, star, s.parameters);
+      d_raw = newton_step(b, system, s.parameters);
+      H = system.H;
+    }
+    const Update<T> u = safeguarded<Set>(b, d_raw, s.parameters);
+    if (s.tape_policy == kFullTape && !Set::filters) b.state.x -= u.step;
+    const bool writes = at.lane == 0 && real;
+    const BlockAdjoint<T> out = reverse_vertex<Set, wanted>(
+        b, star, u, H, x_bar, s.parameters, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
+          if (writes) s.w.data_bar[(scene * s.data_scalars + s.data_row[k] + i) * s.positions + position] += value;
+        });
+    if constexpr (Set::elastic) {
+      star.send_rows();
+      if constexpr ((wanted & kMaterial) != 0) {
+        if (s.one_material) {
+          star.total(star.material_bar[0], star.material_bar[1]);
+          T* m = s.w.material_bar + row * 2;
+          if (writes) m[0] += star.material_bar[0], m[1] += star.material_bar[1];
+        }
+      }
+    }
+    if (writes) {
+      store_row(s.w.x, row, b.state.x);
+      store_row(s.w.x_bar, row, out.x);
+      add3(s.w.y_bar + scene * s.positions * 3, block, at.v, out.y);
+      if (s.w.mass_bar) s.w.mass_bar[row] += out.mass;
+      if constexpr (Set::reads_x_prev) add3(s.w.x_prev_bar + scene * s.positions * 3, block, at.v, out.x_prev);
+    }
+    __syncwarp();
+  });
+}
+
+// Without tets there is nothing but the state to differentiate: one variant serves every wish.
+constexpr int useful(int mask, int wanted) { return (mask & 3) == 0 ? kState : wanted; }
+
+template <class T, int wanted, int lanes, int... n>
+SweepKernel<T> pick_reverse(int index, std::integer_sequence<int, n...>) {
+  static constexpr SweepKernel<T> table[kEnergySets] = {
+      sweep_reverse<T, energy_mask(n), useful(energy_mask(n), wanted), lanes>...};
+  return table[index];
+}
+
+}  // namespace
+
+template <class T, int wanted>
+SweepKernel<T> reverse_kernel(int energies, int lanes) {
+  constexpr auto sets = std::make_integer_sequence<int, kEnergySets>{};
+  const int index = energy_index(energies);
+  return lanes == kFewLanes    ? pick_reverse<T, wanted, kFewLanes>(index, sets)
+         : lanes == kManyLanes ? pick_reverse<T, wanted, kManyLanes>(index, sets)
+                               : pick_reverse<T, wanted, kSpillLanes>(index, sets);
+}
+
+}  // namespace diffvbd::cuda
+
+#define DIFFVBD_INSTANTIATE_REVERSE(T, wanted) \
+  template diffvbd::cuda::SweepKernel<T> diffvbd::cuda::reverse_kernel<T, (wanted)>(int, int);

@@ -1,0 +1,3 @@
+#include "reverse.cuh"
+
+DIFFVBD_INSTANTIATE_REVERSE(double, diffvbd::kMaterial | diffvbd::kRest)

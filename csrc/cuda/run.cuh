@@ -1,0 +1,285 @@
+// Host side of a step: carves the workspace, launches. Included once for each scalar.
+#pragma once
+
+#include <algorithm>
+
+#include "frame.cuh"
+#include "scene_kernels.h"
+
+namespace diffvbd::cuda {
+namespace {
+
+constexpr int kWarpsPerBlock = 4;  // of the grid and color regimes
+constexpr size_t kBarrierBytes = 256;
+
+// Threads per vertex that the shared memory of a block allows.
+template <class T>
+int possible_lanes(const HostPlan& host, const Choice& choice, bool reverse) {
+  return shared_scalars(host.degree, choice.lanes, reverse) * sizeof(T) <= choice.shared ? choice.lanes : kSpillLanes;
+}
+
+// Hands out the parts of a workspace; without one it only counts.
+template <class T>
+struct Carver {
+  T* base;
+  int64_t used = 0;
+  T* operator()(bool wanted, int64_t scalars) {
+    if (!wanted) return nullptr;
+    T* here = base + used;
+    used += (scalars + 3) / 4 * 4;  // rows stay aligned
+    return here;
+  }
+};
+
+// Arrays that start from zero come first. Returns their scalars through `zeroed`.
+template <class T>
+Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints, const Choice& choice,
+                   Carver<T>& take, int64_t* zeroed, T** spill) {
+  const GroupPlan& plan = host.plan;
+  const int64_t n = choice.chunk, positions = int64_t{plan.blocks} * kSlice, pairs = int64_t{plan.slots} * kSlice;
+  const bool elastic = (in.energies & 3) != 0, reverse = adjoints != nullptr;
+  const bool lagged = any_x_prev(in.energies, VertexEnergies{}), one = in.mu.item == 0 && in.lam.item == 0;
+  int scalars = 0;
+  for (int k = 0; k < kVertexEnergies; ++k) scalars += in.data_count[k];
+  Workspace<T> w{};
+  w.rows = take(reverse, n * (int64_t{plan.edge_slots} * kSlice + 1) * kRow);
+  w.y_bar = take(reverse, n * 3 * positions);
+  w.x_prev_bar = take(reverse && lagged, n * 3 * positions);
+  w.mass_bar = take(reverse && adjoints->mass, n * positions);
+  w.material_bar = take(elastic && (choice.wanted & kMaterial), n * 2 * (one ? positions : pairs));
+  w.rest_bar = take(elastic && (choice.wanted & kRest), n * 4 * pairs);
+  w.data_bar = take(reverse && adjoints->data, n * scalars * positions);
+  *zeroed = take.used;
+  w.x = take(true, n * kRow * positions);
+  w.x_bar = take(reverse, n * kRow * positions);
+  w.y = take(true, n * 3 * positions);
+  w.x_prev = take(lagged, n * 3 * positions);
+  w.origin = take(in.origin.data != nullptr, n * 3 * positions);
+  w.mass = take(true, (in.mass.scene != 0 ? n : 1) * positions);
+  const bool shared_material = in.mu.scene == 0 && in.lam.scene == 0;
+  w.material = take(elastic && !one, (shared_material ? 1 : n) * 2 * pairs);
+  *spill = nullptr;
+  if (possible_lanes<T>(host, choice, reverse) == kSpillLanes) {
+    const int64_t warps = int64_t{choice.multiprocessors} * kWarpsPerBlock;
+    *spill = take(true, warps * shared_scalars(host.degree, kSpillLanes, reverse));
+  }
+  return w;
+}
+
+template <class T>
+struct Runner {
+  const HostPlan& host;
+  const StepInputs<T>& in;
+  const Choice& choice;
+  cudaStream_t stream;
+  unsigned* barrier;
+  StepView<T> s{};
+  int64_t zeroed = 0;
+  T* first = nullptr;
+  bool material_is_shared;
+
+  Runner(const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints, const Choice& choice,
+         void* workspace, cudaStream_t stream)
+      : host(host), in(in), choice(choice), stream(stream), barrier(static_cast<unsigned*>(workspace)) {
+    first = reinterpret_cast<T*>(static_cast<char*>(workspace) + kBarrierBytes);
+    Carver<T> take{first};
+    s.w = carve(host, in, adjoints, choice, take, &zeroed, &s.spill);
+    s.plan = host.plan;
+    s.positions = int64_t{host.plan.blocks} * kSlice;
+    s.degree = host.degree;
+    s.parameters = in.parameters;
+    s.sweeps = in.sweeps;
+    s.tape_policy = in.tape_policy;
+    s.one_material = in.mu.item == 0 && in.lam.item == 0;
+    s.mass = {s.w.mass, in.mass.scene != 0 ? s.positions : 0, 1};
+    material_is_shared = in.mu.scene == 0 && in.lam.scene == 0;
+    s.material_scene = material_is_shared ? 0 : int64_t{host.plan.slots} * kSlice * 2;
+    int64_t start = 0;
+    for (int k = 0; k < kVertexEnergies; ++k) {
+      s.data_start[k] = start;
+      s.data_count[k] = in.data_count[k];
+      s.data_row[k] = s.data_scalars;
+      s.data_scalars += in.data_count[k];
+      start += int64_t{in.data_count[k]} * (is_per_vertex(k, VertexEnergies{}) ? host.plan.num_vertices : 1);
+    }
+  }
+
+  // the scenes [base, base + count) of the batch
+  void choose(int64_t base, int64_t count, T* tape) {
+    const auto at = [&](const Batched<const T>& t) {
+      return Batched<const T>{t.data + base * t.scene, t.scene, t.item};
+    };
+    s.scenes = count;
+    s.rest = at(in.rest);
+    s.mu = at(in.mu);
+    s.lam = at(in.lam);
+    s.data = at(in.data);
+    const int rows = tape_rows(in.tape_policy, any_filter(in.energies, VertexEnergies{}));
+    s.tape = tape + base * in.sweeps * rows * host.plan.num_active;
+  }
+
+  template <class... P, class... A>
+  cudaError_t per_item(void (*kernel)(P...), int64_t items, A... arguments) {
+    if (items == 0) return cudaSuccess;
+    void* pointers[] = {&arguments...};
+    const unsigned blocks = static_cast<unsigned>((items + kFrameThreads - 1) / kFrameThreads);
+    return cudaLaunchKernel(reinterpret_cast<const void*>(kernel), dim3(blocks), dim3(kFrameThreads), pointers, 0,
+                            stream);
+  }
+
+  cudaError_t load(int64_t base, const T* ends, const T* x_bar, const T* v_bar) {
+    if (s.w.material && (base == 0 || !material_is_shared)) {
+      const int64_t scenes = material_is_shared ? 1 : s.scenes;
+      const int64_t items = scenes * host.plan.slots * kSlice;
+      if (auto error = per_item(load_material<T>, items, in, s, base, scenes)) return error;
+    }
+    return per_item(load_vertices<T>, s.scenes * s.positions, in, s, base, ends, x_bar, v_bar);
+  }
+
+  int64_t blocks_of(int color) const {
+    const int64_t end = color < host.plan.colors ? host.color_block[color + 1] : host.plan.blocks;
+    return end - host.color_block[color];
+  }
+
+  cudaError_t sweep(SweepKernel<T> kernel, int lanes, bool backward) {
+    const GroupPlan& plan = host.plan;
+    const bool pinned = backward && plan.blocks > host.color_block[plan.colors];
+    const int colors = plan.colors + (pinned ? 1 : 0);
+    if (in.sweeps == 0 || colors == 0) return cudaSuccess;
+    int64_t most = 1;
+    for (int c = 0; c < colors; ++c) most = std::max(most, blocks_of(c) * lanes);
+    const bool own = choice.regime == kBlock, spills = lanes == kSpillLanes;
+    const size_t shared_of_warp = spills ? 0 : shared_scalars(host.degree, lanes, backward) * sizeof(T);
+    int64_t warps = own && !spills ? std::min<int64_t>(kMaxThreads / kSlice, most) : kWarpsPerBlock;
+    if (shared_of_warp > 0) warps = std::min<int64_t>(warps, choice.shared / shared_of_warp);
+    const size_t shared = shared_of_warp * warps;
+    const void* function = reinterpret_cast<const void*>(kernel);
+    if (shared > 48 * 1024) {
+      const auto attribute = cudaFuncAttributeMaxDynamicSharedMemorySize;
+      if (auto error = cudaFuncSetAttribute(function, attribute, static_cast<int>(shared))) return error;
+    }
+    const dim3 threads(static_cast<unsigned>(warps * kSlice));
+    Range range{choice.regime, 0, in.sweeps, 0, colors, barrier};
+    void* arguments[] = {&s, &range};
+    // with spilled stars no more blocks than have memory of their own
+    const auto blocks_for = [&](int64_t parts) {
+      const int64_t needed = own ? s.scenes : (parts * s.scenes + warps - 1) / warps;
+      return spills ? std::min<int64_t>(needed, choice.multiprocessors) : needed;
+    };
+    const auto launch = [&](int64_t blocks) {
+      return cudaLaunchKernel(function, dim3(static_cast<unsigned>(blocks)), threads, arguments, shared, stream);
+    };
+    if (own) return launch(blocks_for(most));
+    if (choice.regime == kGrid) {
+      int resident = 0;
+      const int size = static_cast<int>(threads.x);
+      if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, function, size, shared)) return error;
+      const int64_t blocks = std::min<int64_t>(int64_t{resident} * choice.multiprocessors, blocks_for(most));
+      if (auto error = cudaMemsetAsync(barrier, 0, kBarrierBytes, stream)) return error;
+      return cudaLaunchCooperativeKernel(function, dim3(static_cast<unsigned>(blocks)), threads, arguments, shared,
+                                         stream);
+    }
+    for (int k = 0; k < in.sweeps; ++k) {
+      for (int c = 0; c < colors; ++c) {
+        range.first_sweep = k, range.end_sweep = k + 1;
+        range.first_color = c, range.end_color = c + 1;
+        const int color = backward && c < plan.colors ? plan.colors - 1 - c : c;
+        if (blocks_of(color) == 0) continue;
+        if (auto error = launch(blocks_for(blocks_of(color) * lanes))) return error;
+      }
+    }
+    return cudaSuccess;
+  }
+
+  cudaError_t store(int64_t base, const StepAdjoints<T>& out) {
+    if (auto error = per_item(store_adjoints<T>, s.scenes * s.positions, in, s, base, out)) return error;
+    const bool material = out.mu != nullptr, per_tet = material && !s.one_material;
+    if (per_tet || s.w.rest_bar) {
+      const int64_t items = s.scenes * host.plan.num_tets;
+      if (auto error = per_item(store_tets<T>, items, s, base, out, per_tet)) return error;
+    }
+    if (material && s.one_material) {
+      if (auto error = sum(s.w.material_bar, 2 * s.positions, 2, s.scenes, out.mu + base, 1)) return error;
+      if (auto error = sum(s.w.material_bar + 1, 2 * s.positions, 2, s.scenes, out.lam + base, 1)) return error;
+    }
+    for (int k = 0; out.data && k < kVertexEnergies; ++k) {
+      if (is_per_vertex(k, VertexEnergies{})) continue;
+      for (int i = 0; i < s.data_count[k]; ++i) {
+        T* to = out.data + base * in.data_size + s.data_start[k] + i;
+        const T* from = s.w.data_bar + (s.data_row[k] + i) * s.positions;
+        if (auto error = sum(from, s.data_scalars * s.positions, 1, s.scenes, to, in.data_size)) return error;
+      }
+    }
+    return cudaSuccess;
+  }
+
+  cudaError_t sum(const T* values, int64_t stride, int64_t step, int64_t rows, T* out, int64_t out_stride) {
+    int64_t count = s.positions;
+    void* arguments[] = {&values, &stride, &step, &count, &out, &out_stride};
+    const auto kernel = reinterpret_cast<const void*>(sum_rows<T>);
+    return cudaLaunchKernel(kernel, dim3(static_cast<unsigned>(rows)), dim3(kFrameThreads), arguments, 0, stream);
+  }
+};
+
+template <class T>
+SweepKernel<T> reverse_kernel_for(int energies, int wanted, int lanes) {
+  if (wanted & kRest) return reverse_kernel<T, kMaterial | kRest>(energies, lanes);
+  if (wanted & kMaterial) return reverse_kernel<T, kMaterial>(energies, lanes);
+  return reverse_kernel<T, kState>(energies, lanes);
+}
+
+}  // namespace
+
+template <class T>
+size_t workspace_bytes(const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints,
+                       const Choice& choice) {
+  Carver<T> take{nullptr};
+  int64_t zeroed = 0;
+  T* spill = nullptr;
+  carve(host, in, adjoints, choice, take, &zeroed, &spill);
+  return kBarrierBytes + take.used * sizeof(T);
+}
+
+template <class T>
+cudaError_t run_forward(const HostPlan& host, const StepInputs<T>& in, const StepOutputs<T>& out, const Choice& choice,
+                        void* workspace, cudaStream_t stream) {
+  if (in.scenes == 0 || host.plan.num_vertices == 0) return cudaSuccess;
+  if (choice.regime == kThread) return run_scene_forward(host, in, out, choice, stream);
+  Runner<T> run(host, in, nullptr, choice, workspace, stream);
+  const int lanes = possible_lanes<T>(host, choice, false);
+  for (int64_t base = 0; base < in.scenes; base += choice.chunk) {
+    run.choose(base, std::min(choice.chunk, in.scenes - base), out.tape);
+    if (auto error = run.load(base, nullptr, nullptr, nullptr)) return error;
+    if (auto error = run.sweep(forward_kernel<T>(in.energies, lanes), lanes, false)) return error;
+    const int64_t items = run.s.scenes * run.s.positions;
+    if (auto error = run.per_item(store_vertices<T>, items, in, run.s, base, out.x, out.v)) return error;
+  }
+  return cudaSuccess;
+}
+
+template <class T>
+cudaError_t run_reverse(const HostPlan& host, const StepInputs<T>& in, const T* ends, const T* tape,
+                        const StepAdjoints<T>& out, const Choice& choice, void* workspace, cudaStream_t stream) {
+  if (in.scenes == 0 || host.plan.num_vertices == 0) return cudaSuccess;
+  if (choice.regime == kThread) return run_scene_reverse(host, in, ends, tape, out, choice, stream);
+  Runner<T> run(host, in, &out, choice, workspace, stream);
+  const int lanes = possible_lanes<T>(host, choice, true);
+  for (int64_t base = 0; base < in.scenes; base += choice.chunk) {
+    run.choose(base, std::min(choice.chunk, in.scenes - base), const_cast<T*>(tape));
+    if (auto error = cudaMemsetAsync(run.first, 0, run.zeroed * sizeof(T), stream)) return error;
+    if (auto error = run.load(base, ends, out.x_bar, out.v_bar)) return error;
+    if (auto error = run.sweep(reverse_kernel_for<T>(in.energies, choice.wanted, lanes), lanes, true)) return error;
+    if (auto error = run.store(base, out)) return error;
+  }
+  return cudaSuccess;
+}
+
+}  // namespace diffvbd::cuda
+
+#define DIFFVBD_INSTANTIATE_RUN(T)                                                                                    \
+  template size_t diffvbd::cuda::workspace_bytes<T>(const HostPlan&, const StepInputs<T>&, const StepAdjoints<T>*,    \
+                                                    const Choice&);                                                  \
+  template cudaError_t diffvbd::cuda::run_forward<T>(const HostPlan&, const StepInputs<T>&, const StepOutputs<T>&,    \
+                                                     const Choice&, void*, cudaStream_t);                            \
+  template cudaError_t diffvbd::cuda::run_reverse<T>(const HostPlan&, const StepInputs<T>&, const T*, const T*,       \
+                                                     const StepAdjoints<T>&, const Choice&, void*, cudaStream_t);

@@ -1,0 +1,3 @@
+#include "run.cuh"
+
+DIFFVBD_INSTANTIATE_RUN(double)

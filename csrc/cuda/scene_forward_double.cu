@@ -1,0 +1,3 @@
+#include "scene_forward.cuh"
+
+DIFFVBD_INSTANTIATE_SCENE_FORWARD(double)

@@ -1,0 +1,15 @@
+// A whole scene per thread: many small meshes (see scene_forward.cuh).
+#pragma once
+
+#include "step.h"
+
+namespace diffvbd::cuda {
+
+template <class T>
+cudaError_t run_scene_forward(const HostPlan& host, const StepInputs<T>& in, const StepOutputs<T>& out,
+                              const Choice& choice, cudaStream_t stream);
+template <class T>
+cudaError_t run_scene_reverse(const HostPlan& host, const StepInputs<T>& in, const T* ends, const T* tape,
+                              const StepAdjoints<T>& out, const Choice& choice, cudaStream_t stream);
+
+}  // namespace diffvbd::cuda

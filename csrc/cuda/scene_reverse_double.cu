@@ -1,0 +1,3 @@
+#include "scene_reverse.cuh"
+
+DIFFVBD_INSTANTIATE_SCENE_REVERSE(double)

@@ -1,0 +1,145 @@
+// What passes between ops_cuda.cpp and the kernels: plain structs, launchers. No torch here, and no CUDA either but the
+// stream.
+#pragma once
+
+#include <cuda_runtime_api.h>
+
+#include "../core/plan_views.h"
+#include "../energies/energies.h"
+
+namespace diffvbd::cuda {
+
+// How the sweeps of a step are spread over the device (docs/performance.md).
+enum Regime {
+  kThread = 1,  // a scene per thread, a step per launch
+  kBlock = 2,   // a scene per thread block, a step per launch
+  kGrid = 3,    // all scenes by one cooperative grid, a step per launch
+  kColor = 4,   // all scenes, a launch per color
+};
+
+// A step in the user's numbering.
+template <class T>
+struct StepInputs {
+  int64_t scenes;
+  Batched<const T> x_start, x_prev, y, origin;  // [B, V, 3]; origin may be null
+  Batched<const T> mu, lam;                     // [B, T] or one value for a scene (item 0)
+  Batched<const T> mass;                        // [B, V]
+  Batched<const T> rest;                        // [B, slots, 4 / pack, kSlice, pack], see pack_rest
+  Batched<const T> data;                        // [B, N]
+  int energies;                                 // mask, see energies.h
+  int data_count[kVertexEnergies];
+  int64_t data_size;  // N
+  StepParameters<T> parameters;
+  int sweeps, tape_policy;
+  // A fused step has these in place of x_start and y, which are then the predictor (pinned vertices: `held`, or where
+  // x_prev has them), and returns velocities.
+  bool fused;
+  Batched<const T> v, acceleration, held;  // [B, V, 3]; acceleration also [B, 1, 3] (item 0); held may be null
+};
+
+template <class T>
+struct StepOutputs {
+  T *x, *v;  // [B, V, 3]; v only of a fused step
+  T* tape;   // [B, sweeps, rows, active] in all; a scene per thread keeps scenes last
+};
+
+template <class T>
+struct StepAdjoints {
+  const T *x_bar, *v_bar;            // of the outputs; v_bar only of a fused step, either may be null there
+  T *x_start, *x_prev, *y;           // [B, V, 3]
+  T *mu, *lam, *mass, *rest, *data;  // [B, 1 | T], [B, 1 | T], [B, V], [B, T, 7], [B, N]; null where not wanted
+  T *x, *v, *acceleration, *held;    // of a fused step, null where not wanted
+};
+
+// Where the kernels work, for one chunk of scenes in sweep order. Sizes are per scene.
+template <class T>
+struct Workspace {
+  T *x, *x_bar, *rows;                     // [positions, 4], [positions, 4], [edge_slots kSlice + 1, 4]
+  T *y, *x_prev, *origin, *y_bar, *x_prev_bar;  // [blocks, 3, kSlice]
+  T *mass, *mass_bar;                      // [positions]
+  T *material, *material_bar;              // [slots, kSlice, 2]; the bar [positions, 2] if a scene has one material
+  T *rest_bar;                             // [slots, kSlice, 4]
+  T *data_bar;                             // [scalars, positions]
+};
+
+// Everything a sweep's kernels read and write; a chunk of scenes.
+template <class T>
+struct StepView {
+  GroupPlan plan;
+  int64_t scenes, positions;
+  int degree;  // largest number of neighbours
+  StepParameters<T> parameters;
+  int sweeps, tape_policy;
+  bool one_material;  // mu and lam below; else w.material
+  Batched<const T> mass, rest, mu, lam, data;
+  int64_t material_scene;
+  int64_t data_start[kVertexEnergies];
+  int data_count[kVertexEnergies], data_row[kVertexEnergies];
+  int data_scalars;
+  Workspace<T> w;
+  T* spill;  // [warps, shared_scalars] for kSpillLanes
+  T* tape;
+};
+
+constexpr int kMaxThreads = 256;  // of a block of the sweep kernels
+
+// The part of a step that one launch executes: sweeps [first_sweep, end_sweep) in the order of execution (the reverse
+// counts down), and of each the colors [first_color, end_color); colors.. `plan.colors` stands for what is pinned.
+struct Range {
+  int regime;
+  int first_sweep, end_sweep, first_color, end_color;
+  unsigned* barrier;  // kGrid: zeroed before the launch
+};
+
+template <class T>
+using SweepKernel = void (*)(StepView<T>, Range);
+
+// Threads that share a vertex: few where there are vertices enough to fill the device, many to finish a small color
+// soon.
+constexpr int kFewLanes = 2, kManyLanes = 8;
+// A star too large for shared memory takes a whole warp and works in device memory.
+constexpr int kSpillLanes = kSlice;
+
+// The kernels of a scene's energies for `lanes` threads per vertex.
+template <class T>
+SweepKernel<T> forward_kernel(int energies, int lanes);
+template <class T, int wanted>
+SweepKernel<T> reverse_kernel(int energies, int lanes);
+
+// scalars of shared memory that a warp needs
+DIFFVBD_FN constexpr int shared_scalars(int degree, int lanes, bool reverse) {
+  return degree * 3 * (kSlice / lanes + (reverse ? kSlice : 0));
+}
+
+constexpr int kElasticVariants = 3;  // none, exact, paper
+constexpr int kEnergySets = kElasticVariants << kVertexEnergies;
+constexpr int energy_mask(int n) { return n % kElasticVariants + (n / kElasticVariants) * 4; }
+constexpr int energy_index(int mask) { return (mask & 3) + (mask >> 2) * kElasticVariants; }
+
+// A plan with what the host must know of it.
+struct HostPlan {
+  GroupPlan plan;              // arrays on the device
+  const int64_t* color_block;  // [colors + 1] on the host
+  int degree;                  // largest number of neighbours of an active vertex
+};
+
+// How a step is to run.
+struct Choice {
+  int regime, lanes, wanted;
+  int64_t chunk;  // scenes that are worked on at once
+  int multiprocessors;
+  size_t shared;  // bytes of shared memory that a block can have
+};
+
+template <class T>
+size_t workspace_bytes(const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints,
+                       const Choice& choice);
+template <class T>
+cudaError_t run_forward(const HostPlan& host, const StepInputs<T>& in, const StepOutputs<T>& out, const Choice& choice,
+                        void* workspace, cudaStream_t stream);
+// `ends` is the x that run_forward returned.
+template <class T>
+cudaError_t run_reverse(const HostPlan& host, const StepInputs<T>& in, const T* ends, const T* tape,
+                        const StepAdjoints<T>& out, const Choice& choice, void* workspace, cudaStream_t stream);
+
+}  // namespace diffvbd::cuda

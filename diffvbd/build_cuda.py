@@ -1,0 +1,62 @@
+"""How the CUDA object is compiled. setup.py reads this file; DIFFVBD_JIT=1 runs a copy of it beside a copy of csrc.
+
+It must not import the package, which does not load before it is built.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from glob import glob
+from typing import Any
+
+import torch
+from torch.utils.cpp_extension import CUDA_HOME, BuildExtension, CUDAExtension
+
+_CXX = ["-O3", "-g0", "-fvisibility=hidden", "-Wno-psabi", "-Wno-ignored-attributes"]
+# The kernels see no torch header, so their C++ standard is ours to choose.
+_NVCC = ["-O3", "-std=c++17", "--expt-relaxed-constexpr", "-Xcompiler", "-fvisibility=hidden"]
+
+
+def has_compiler() -> bool:
+    """A torch with CUDA and an nvcc. Whether there is a device says nothing: wheels are built without one."""
+    return bool(torch.version.cuda and CUDA_HOME and os.path.exists(os.path.join(CUDA_HOME, "bin", "nvcc")))
+
+
+def architectures() -> str:
+    """TORCH_CUDA_ARCH_LIST; or what the visible devices are; or, where there is none, what a wheel should run on."""
+    listed = os.environ.get("TORCH_CUDA_ARCH_LIST")
+    if listed and listed != "native":
+        return listed
+    if torch.cuda.is_available():
+        found = sorted({torch.cuda.get_device_capability(i) for i in range(torch.cuda.device_count())})
+        return " ".join(f"{major}.{minor}" for major, minor in found) + "+PTX"
+    cuda = tuple(int(part) for part in (torch.version.cuda or "0.0").split(".")[:2])
+    return "8.0 9.0 10.0 12.0+PTX" if cuda >= (12, 8) else "8.0 9.0+PTX"
+
+
+def extension() -> Any:
+    """diffvbd._C_cuda of the csrc in the current folder; chooses the architectures for the build of this process."""
+    os.environ["TORCH_CUDA_ARCH_LIST"] = architectures()  # without a device torch itself would not know any
+    return CUDAExtension(
+        "diffvbd._C_cuda",
+        ["csrc/ops_cuda.cpp", *sorted(glob("csrc/cuda/*.cu"))],
+        define_macros=[("TORCH_TARGET_VERSION", "0x020b000000000000"), ("USE_CUDA", None)],
+        extra_compile_args={"cxx": _CXX, "nvcc": _NVCC},
+        extra_link_args=["-s"],
+        depends=sorted(path for end in ("h", "cuh") for path in glob(f"csrc/**/*.{end}", recursive=True)),
+        py_limited_api=True,
+    )
+
+
+if __name__ == "__main__":
+    from setuptools import setup
+
+    if not has_compiler():
+        sys.exit(f"no nvcc for CUDA {torch.version.cuda} (CUDA_HOME is {CUDA_HOME}): install one, or set CUDA_HOME")
+    setup(
+        name="diffvbd",
+        ext_modules=[extension()],
+        cmdclass={"build_ext": BuildExtension},
+        script_args=["build_ext", "--build-lib", "lib", "--build-temp", "temp"],
+    )

@@ -1,0 +1,68 @@
+"""How the sweeps of a step are spread over a CUDA device: four regimes, chosen by the size of the work."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Literal
+
+from .checks import fail
+
+Regime = Literal["thread", "block", "grid", "color"]
+
+# twins of Regime, kFewLanes and kManyLanes in csrc/cuda/step.h, of kSmallMesh in csrc/core/views.h
+THREAD, BLOCK, GRID, COLOR = 1, 2, 3, 4
+CODES: dict[str, int] = {"thread": THREAD, "block": BLOCK, "grid": GRID, "color": COLOR}
+FEW_LANES, MANY_LANES = 2, 8
+SMALL_MESH = 64
+
+# Where one regime overtakes another, measured on an H100 (docs/performance.md).
+THREAD_VERTICES = 32  # above, a scene's positions leave too little shared memory for a scene per thread
+THREAD_SCENES = 4096  # below, a scene per thread leaves most of the device idle
+BLOCK_SCENES = 64  # below, a scene per block does
+BLOCK_VERTICES = 512  # of a single mesh: above, one multiprocessor takes longer than the barriers of many
+GRID_VERTICES = 60_000  # vertices of all scenes: above, launches cost less than a cooperative grid's barriers
+MANY_LANES_VERTICES = 8_000  # vertices of all scenes in a color: above, few lanes fill the device
+
+_forced: str | None = None
+
+
+@contextlib.contextmanager
+def regime(name: Regime | None) -> Iterator[None]:
+    """Inside, steps on CUDA run in the named regime; None: chosen by size (the default). For measuring.
+
+    Args:
+        name: ``"thread"``: a scene per thread (meshes of at most 64 vertices); ``"block"``: a scene per thread block, a
+            step per launch; ``"grid"``: all scenes by one cooperative grid, a step per launch; ``"color"``: a launch
+            per color. Each is reproducible to the bit; they differ from each other by rounding. No effect on the CPU.
+
+    Raises:
+        ValueError: For another name; in a step, where the regime cannot run the scene.
+    """
+    if name is not None and name not in CODES:
+        fail("regime", f"one of {sorted(CODES)} or None", repr(name))
+    global _forced
+    before, _forced = _forced, name
+    try:
+        yield
+    finally:
+        _forced = before
+
+
+def choose(vertices: int, colors: int, scenes: int) -> tuple[int, int]:
+    """Regime and threads per vertex of a step, for SweepSettings.launch."""
+    code = CODES[_forced] if _forced else _automatic(vertices, scenes)
+    if code == THREAD and vertices > SMALL_MESH:
+        fail("regime", f"a mesh of at most {SMALL_MESH} vertices for a scene per thread", f"{vertices} vertices")
+    at_once = vertices * (1 if code == BLOCK else scenes) / max(1, colors)
+    if code == BLOCK and scenes >= 2 * BLOCK_SCENES:
+        at_once *= 8  # other blocks fill the multiprocessor
+    return code, FEW_LANES if at_once > MANY_LANES_VERTICES else MANY_LANES
+
+
+def _automatic(vertices: int, scenes: int) -> int:
+    if vertices <= THREAD_VERTICES and scenes >= THREAD_SCENES:
+        return THREAD
+    if scenes >= BLOCK_SCENES or vertices * scenes <= BLOCK_VERTICES:
+        return BLOCK
+    return GRID if vertices * scenes <= GRID_VERTICES else COLOR

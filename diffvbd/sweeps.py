@@ -1,0 +1,231 @@
+"""The sweeps of a step as autograd functions: forward, and the same sweeps transposed as its backward."""
+
+# pyright: reportIncompatibleMethodOverride=false
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from torch import Tensor
+from torch.autograd import Function
+
+from . import ops
+from .regimes import THREAD
+
+
+def repeated_policy(settings: ops.SweepSettings) -> int:
+    """The tape of a step that is run again in the backward: what is quickest to write and read."""
+    return ops.COMPACT_TAPE if settings.launch[:1] == (THREAD,) else ops.FULL_TAPE
+
+
+def _no_second_derivative() -> NoReturn:
+    raise NotImplementedError("diffvbd: second derivatives of a step are not supported (create_graph, hessian)")
+
+
+_TENSORS = 8  # x_start, x_prev, y, mu, lam, mass, rest, energy_data: the differentiable inputs, all [1 | B, ...]
+
+
+class _Sweep(Function):
+    """K sweeps of block updates and, as its backward, the same sweeps transposed in reverse order."""
+
+    @staticmethod
+    def forward(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, packed_rest, plan, settings, tape_policy,
+                debug_step, checked):  # fmt: skip
+        if rest is not None:
+            packed_rest = ops.pack_rest(rest, plan, settings.sizes)
+        return ops.raw.sweep(x_start, x_prev, y, mu, lam, mass, packed_rest, energy_data, origin, plan, *settings,
+                          tape_policy, debug_step, checked)  # fmt: skip
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
+        *tensors, origin, packed_rest, plan, settings, tape_policy, _, _ = inputs
+        ctx.save_for_backward(*tensors, origin, packed_rest, plan, *output)
+        ctx.settings, ctx.tape_policy = settings, tape_policy
+        ctx.mark_non_differentiable(output[1])
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        if grads[0] is None:
+            return (None,) * (_TENSORS + 7)
+        needs = ctx.needs_input_grad[:_TENSORS]
+        out = _SweepBackward.apply(grads[0], *ctx.saved_tensors, ctx.settings, ctx.tape_policy, needs)
+        out = iter(out if isinstance(out, tuple) else (out,))
+        return tuple(next(out) if need else None for need in needs) + (None,) * 7
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
+        tensors: tuple[Any, ...] = args[: _TENSORS + 1]
+        scenes = _scenes(tensors, in_dims)
+        folded: list[Any] = [
+            t if t is None or t.numel() == 0 else ops.fold_scenes(t, d, info.batch_size, scenes)
+            for t, d in zip(tensors, in_dims, strict=False)
+        ]
+        full = (info.batch_size * scenes, *folded[0].shape[1:])
+        folded[:3] = [t.expand(full).contiguous() for t in folded[:3]]
+        x, tape = _Sweep.apply(*folded, *args[_TENSORS + 1 :])
+        return (x.unflatten(0, (-1, scenes)), tape.unflatten(0, (-1, scenes))), (0, 0)
+
+
+class _SweepBackward(Function):
+    @staticmethod
+    def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, packed_rest, plan, x, tape,
+                settings, tape_policy, needs):  # fmt: skip
+        if rest is not None:
+            packed_rest = ops.pack_rest(rest, plan, settings.sizes)
+        inputs = (x_prev, y, mu, lam, mass, packed_rest, energy_data, origin)
+        if tape_policy == ops.NO_TAPE:
+            tape_policy = repeated_policy(settings)
+            x, tape = ops.raw.sweep(x_start, *inputs, plan, *settings, tape_policy, -1, False)
+        wants = (needs[3] or needs[4], needs[5], needs[6], needs[7])
+        bars = ops.raw.sweep_backward(x_bar.contiguous(), x, *inputs, tape, plan, *settings, tape_policy, wants)
+        given: tuple[Any, ...] = (x_start, x_prev, y, mu, lam, mass, rest, energy_data)
+        return tuple(ops.sum_to(bar, t.shape) for bar, t, need in zip(bars, given, needs, strict=True) if need)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
+        ctx.count = len(inputs)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> NoReturn:
+        _no_second_derivative()
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        x_bar, *saved, settings, tape_policy, needs = args
+        tensors: tuple[Any, ...] = (x_bar, *saved[: _TENSORS + 1])
+        scenes = _scenes(tensors, in_dims)
+        size = info.batch_size
+
+        def fold(t: Tensor | None, d: int | None) -> Any:
+            return t if t is None or t.numel() == 0 else ops.fold_scenes(t, d, size, scenes)
+
+        folded: list[Any] = [fold(t, d) for t, d in zip(tensors, in_dims, strict=False)]
+        packed_rest, plan, x, tape = saved[_TENSORS + 1 :]
+        x, tape = (
+            t if t.numel() == 0 else t.expand(size * scenes, *t.shape[1:]).contiguous()
+            for t in (fold(t, d) for t, d in zip((x, tape), in_dims[_TENSORS + 4 :], strict=False))
+        )
+        full = (size * scenes, *x_bar.shape[-2:])
+        # shared inputs get a gradient for each member of the batch: give every differentiated one its own scenes
+        spread: list[Any] = [t.expand(size * scenes, *t.shape[1:]).contiguous() if t is not None and need else t
+                  for t, need in zip(folded[1 : _TENSORS + 1], needs, strict=True)]  # fmt: skip
+        spread[:3] = [t.expand(full).contiguous() for t in spread[:3]]
+        out = _SweepBackward.apply(folded[0].expand(full), *spread, folded[-1], packed_rest, plan, x, tape, settings,
+                                   tape_policy, needs)  # fmt: skip
+        out = out if isinstance(out, tuple) else (out,)
+        shapes = [t.shape[0] if d is None else t.movedim(d, 0).shape[1]
+                  for t, d, need in zip(saved[:_TENSORS], in_dims[1:], needs, strict=False) if need]  # fmt: skip
+        result = tuple(
+            o.unflatten(0, (size, scenes)) if n == scenes else _member_sum(o.unflatten(0, (size, scenes)))
+            for o, n in zip(out, shapes, strict=True)
+        )
+        return result, (0,) * len(result)
+
+
+def _member_sum(values: Tensor) -> Tensor:
+    """[N, B, ...] -> [N, 1, ...]: what the scenes of each member add to an input that they share."""
+    return ops.sum_to(values, (values.shape[0], 1, *values.shape[2:]))
+
+
+def _scenes(tensors: Sequence[Tensor | None], in_dims: tuple) -> int:
+    sizes = [1]
+    for t, d in zip(tensors, in_dims, strict=False):
+        if t is not None and t.numel() > 0:
+            sizes.append((t if d is None else t.movedim(d, 0)[0]).shape[0])
+    return max(sizes)
+
+
+def sweep(
+    x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, packed_rest, plan, settings: ops.SweepSettings, *,
+    tape_policy: int, debug_step: int = -1, checked: bool = True,
+) -> Tensor:  # fmt: skip
+    """Positions after the sweeps, [B, V, 3], differentiable in the first eight tensors.
+
+    Args:
+        x_start, x_prev, y: Start of the sweep, start of the step, predictor [m], [B, V, 3].
+        mu, lam: [1 | B, 1 | T] [Pa]; mass: [1 | B, V] [kg].
+        rest: [1 | B, T, 7], or None for the Model's own ``packed_rest`` [1, slots, 4, lanes].
+        energy_data: [1 | B, n], see VertexEnergy.pack; origin: [B, V, 3] or empty.
+        tape_policy: What is kept for the backward; ops.NO_TAPE runs the step again there.
+    """
+    tensors = (x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin)
+    distinct: list[Tensor | None] = []
+    for t in tensors:
+        t = t if t is None else t.contiguous()
+        # torch.compile refuses one tensor in two places
+        distinct.append(t.view_as(t) if t is not None and any(t is other for other in distinct) else t)
+    x, _ = _Sweep.apply(*distinct, packed_rest, plan, settings, tape_policy, debug_step, checked)
+    return x
+
+
+class _FusedStep(Function):
+    """A whole step on CUDA: predictor, sweeps, velocity. Not for torch.func, which has the parts."""
+
+    @staticmethod
+    def forward(x, v, acceleration, held, mu, lam, mass, rest, packed_rest, plan, settings, tape_policy):
+        if rest is not None:
+            packed_rest = ops.pack_rest(rest, plan, settings.sizes)
+        return ops.raw.fused_step(x, v, acceleration, held, mu, lam, mass, packed_rest, plan, *settings, tape_policy)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
+        *tensors, settings, tape_policy = inputs
+        ctx.save_for_backward(*tensors, output[0], output[2])
+        ctx.settings, ctx.tape_policy = settings, tape_policy
+        ctx.mark_non_differentiable(output[2])
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        if grads[0] is None and grads[1] is None:
+            return (None,) * (_TENSORS + 4)
+        needs = ctx.needs_input_grad[:_TENSORS]
+        out = _FusedBackward.apply(*grads[:2], *ctx.saved_tensors, ctx.settings, ctx.tape_policy, needs)
+        out = iter(out if isinstance(out, tuple) else (out,))
+        return tuple(next(out) if need else None for need in needs) + (None,) * 4
+
+
+class _FusedBackward(Function):
+    @staticmethod
+    def forward(x_bar, v_bar, x, v, acceleration, held, mu, lam, mass, rest, packed_rest, plan, x_end, tape, settings,
+                tape_policy, needs):  # fmt: skip
+        if rest is not None:
+            packed_rest = ops.pack_rest(rest, plan, settings.sizes)
+        inputs = (x, v, acceleration, held, mu, lam, mass, packed_rest)
+        if tape_policy == ops.NO_TAPE:
+            tape_policy = repeated_policy(settings)
+            x_end, _, tape = ops.raw.fused_step(*inputs, plan, *settings, tape_policy)
+        bars = [x.new_empty((0,)) if bar is None else bar.contiguous() for bar in (x_bar, v_bar)]
+        wants = (*needs[:4], needs[4] or needs[5], *needs[6:])
+        out = ops.raw.fused_step_backward(*bars, x_end, *inputs, tape, plan, *settings, tape_policy, wants)
+        given: tuple[Any, ...] = (x, v, acceleration, held, mu, lam, mass, rest)
+        return tuple(ops.sum_to(bar, t.shape) for bar, t, need in zip(out, given, needs, strict=True) if need)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
+        ctx.count = len(inputs)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> NoReturn:
+        _no_second_derivative()
+
+
+def fused_step(x, v, acceleration, held, mu, lam, mass, rest, packed_rest, plan, settings: ops.SweepSettings, *,
+               tape_policy: int) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Positions and velocities after a step on CUDA whose only energy is that of the tets, [B, V, 3].
+
+    Args:
+        x, v: State [m, m/s], [B, V, 3]; acceleration: [1 | B, 1 | V, 3] [m/s^2].
+        held: Where pinned vertices go [m], [1 | B, V, 3], or empty: they stay.
+        mu, lam, mass, rest, packed_rest, tape_policy: As in :func:`sweep`.
+    """
+    tensors = [t if t is None else t.contiguous() for t in (x, v, acceleration, held, mu, lam, mass, rest)]
+    distinct = [
+        t.view_as(t) if t is not None and any(t is u for u in tensors[:i]) else t for i, t in enumerate(tensors)
+    ]
+    x_end, v_end, _ = _FusedStep.apply(*distinct, packed_rest, plan, settings, tape_policy)
+    return x_end, v_end
+
+
+ops.ready_signature(_Sweep, _SweepBackward, _FusedStep, _FusedBackward)
