@@ -14,7 +14,7 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 ENVIRONMENT := $(VENV)/environment.stamp
 NATIVE := diffvbd/_C.abi3.so
-SOURCES := $(shell find csrc -type f -name '*.h' -o -type f -name '*.cpp' -o -type f -name '*.cu')
+SOURCES := $(shell find csrc -type f -name '*.h' -o -type f -name '*.cpp' -o -type f -name '*.cu*')
 
 .PHONY: run build test lint clean distclean
 
@@ -40,7 +40,7 @@ $(ENVIRONMENT): .ci/bootstrap.py pyproject.toml
 
 # pip has just built it in a new environment. Later this recompiles only what an edit concerns (--force: setuptools
 # itself looks at no header; ninja does).
-$(NATIVE): $(SOURCES) setup.py | $(ENVIRONMENT)
+$(NATIVE): $(SOURCES) setup.py diffvbd/build_cuda.py | $(ENVIRONMENT)
 	$(BIN)/python setup.py --quiet build_ext --inplace --force
 	@touch $@
 

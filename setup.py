@@ -2,13 +2,20 @@
 
 Environment:
     DIFFVBD_NO_CLONES=1  compile the CPU kernels for the baseline instruction set only (quicker builds, slower kernels)
+    DIFFVBD_NO_CUDA=1    leave the CUDA object out; without it, it is built where torch has CUDA and nvcc is found
+    TORCH_CUDA_ARCH_LIST what the CUDA object runs on (default: the visible devices, or 8.0 9.0 10.0 12.0+PTX)
+    CUDA_HOME, MAX_JOBS  read by torch
 """
 
 import os
+import runpy
+import shutil
 import sys
 from glob import glob
+from pathlib import Path
 
 from setuptools import setup
+from setuptools.command.build_py import build_py
 
 try:
     from torch.utils.cpp_extension import BuildExtension, CppExtension
@@ -32,18 +39,39 @@ FLAGS = ["-O3", "-g0", "-fno-math-errno", "-ffp-contract=off", "-Wno-psabi", "-W
 if os.environ.get("DIFFVBD_NO_CLONES"):
     FLAGS += ["-DDIFFVBD_NO_CLONES"]
 
+
+class BuildPy(build_py):
+    """Ships csrc inside the package, where DIFFVBD_JIT=1 finds what it compiles, and in the sdist."""
+
+    def run(self):
+        super().run()
+        if not self.editable_mode:
+            target = Path(self.build_lib, "diffvbd", "csrc")
+            shutil.rmtree(target, ignore_errors=True)  # of an earlier build, with files that are gone since
+            shutil.copytree("csrc", target)
+
+    def get_source_files(self):
+        return super().get_source_files() + [p for p in glob("csrc/**/*", recursive=True) if os.path.isfile(p)]
+
+
+extensions = [
+    CppExtension(
+        "diffvbd._C",
+        CPU_SOURCES,
+        define_macros=[("TORCH_TARGET_VERSION", "0x020b000000000000")],
+        extra_compile_args=FLAGS,
+        extra_link_args=["-s"],
+        depends=sorted(glob("csrc/**/*.h", recursive=True)),
+        py_limited_api=True,
+    )
+]
+# Run, not imported: the package does not load before it is built.
+cuda = runpy.run_path("diffvbd/build_cuda.py")
+if cuda["has_compiler"]() and not os.environ.get("DIFFVBD_NO_CUDA"):
+    extensions.append(cuda["extension"]())
+
 setup(
-    ext_modules=[
-        CppExtension(
-            "diffvbd._C",
-            CPU_SOURCES,
-            define_macros=[("TORCH_TARGET_VERSION", "0x020b000000000000")],
-            extra_compile_args=FLAGS,
-            extra_link_args=["-s"],
-            depends=sorted(glob("csrc/**/*.h", recursive=True)),
-            py_limited_api=True,
-        )
-    ],
-    cmdclass={"build_ext": BuildExtension},
+    ext_modules=extensions,
+    cmdclass={"build_ext": BuildExtension, "build_py": BuildPy},
     options={"bdist_wheel": {"py_limited_api": "cp310"}},
 )

@@ -21,7 +21,7 @@ using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
 
 constexpr int64_t kWorkspaceBudget = int64_t{2} << 30;  // bytes; a batch that needs more is worked on in chunks
-constexpr int kHostSizes = 9;  // active, tets, slots, vertices, colors, blocks, edge_slots, incoming_slots, degree
+constexpr int kHostSizes = diffvbd::kPlanHeader;  // a plan's header, but active, tets and slots come first
 
 void check(cudaError_t error, const char* what) {
   if (error == cudaSuccess) return;
@@ -40,11 +40,11 @@ cuda::HostPlan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes) 
   require(buffer.scalar_type() == ScalarType::Int && buffer.is_contiguous() && buffer.is_cuda() &&
               sizes.size() > kHostSizes && static_cast<int64_t>(sizes.size()) == kHostSizes + sizes[4] + 1,
           "diffvbd: expected a plan made for CUDA by build_plan, and its sizes");
-  const int order[] = {3, 1, 0, 4, 5, 2, 6, 7};
+  const int order[diffvbd::kPlanHeader] = {3, 1, 0, 4, 5, 2, 6, 7, 8, 9, 10};
   int32_t header[diffvbd::kPlanHeader];
   for (int i = 0; i < diffvbd::kPlanHeader; ++i) header[i] = static_cast<int32_t>(sizes[order[i]]);
   return {diffvbd::view_group_plan(header, data<const int32_t>(buffer)), sizes.data() + kHostSizes,
-          static_cast<int>(sizes[8])};
+          static_cast<int>(sizes[9]), static_cast<int>(sizes[10])};
 }
 
 // What all four sweep operators have in common.
@@ -75,7 +75,7 @@ cuda::StepInputs<T> inputs(const cuda::HostPlan& host, const Tensor& x, const Te
 // The regime and threads per vertex that Python chose, and what the device adds.
 cuda::Choice choose(const Tensor& x, const std::vector<int64_t>& launch, int wanted) {
   require(launch.size() == 2 && launch[0] >= cuda::kThread && launch[0] <= cuda::kColor &&
-              (launch[1] == cuda::kFewLanes || launch[1] == cuda::kManyLanes),
+              (launch[1] == cuda::kFewLanes || launch[1] == cuda::kSomeLanes || launch[1] == cuda::kManyLanes),
           "diffvbd: bad launch");
   cuda::Choice out{};
   out.regime = static_cast<int>(launch[0]);

@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 
 _FOLDER = Path(__file__).parent
+_COMMAND = "pip install --no-build-isolation -e ."  # in a checkout
 _cuda = False
 _why_not = ""  # what the loader said of a CUDA object that is there and does not load
 
@@ -28,8 +29,8 @@ def load() -> None:
     path = _built("_C")
     if path is None:
         raise ImportError(
-            "diffvbd is not built here: run `pip install --no-build-isolation -e .` in this folder, or, if it is "
-            "installed elsewhere, leave this folder, whose sources hide the installed package"
+            f"diffvbd is not built here: run `{_COMMAND}` in this folder, or, if it is installed elsewhere, leave this "
+            "folder, whose sources hide the installed package"
         )
     torch.ops.load_library(str(path))
     path = _built("_C_cuda")
@@ -37,7 +38,7 @@ def load() -> None:
         try:
             _load_cuda(path)
         except OSError as error:  # made for another torch or CUDA: the CPU must go on working
-            _why_not = " ".join(str(error).split())
+            _why_not = " ".join(str(error.__cause__ or error).split())
 
 
 def has_cuda() -> bool:
@@ -55,13 +56,13 @@ def require_cuda() -> None:
         return
     if not torch.version.cuda:
         raise RuntimeError(
-            f"diffvbd: torch {torch.__version__} has no CUDA: install a CUDA build of torch, then run `{_command()}`"
+            f"diffvbd: torch {torch.__version__} has no CUDA: install a CUDA build of torch, then run `{_COMMAND}`"
         )
     if os.environ.get("DIFFVBD_JIT", "0") not in ("", "0"):
         _load_cuda(jit_build())
         return
     state = f"has a CUDA object that does not load ({_why_not})" if _why_not else "was built without CUDA"
-    raise RuntimeError(f"diffvbd {state}: run `{_command()}` where nvcc is, or set DIFFVBD_JIT=1 to compile at first use")
+    raise RuntimeError(f"diffvbd {state}: run `{_COMMAND}` in its sources where nvcc is, or set DIFFVBD_JIT=1")
 
 
 def jit_build() -> Path:
@@ -132,13 +133,7 @@ def _sources() -> Path:
     for path in (_FOLDER / "csrc", _FOLDER.parent / "csrc"):
         if (path / "ops_cuda.cpp").exists():
             return path
-    raise RuntimeError(f"diffvbd: DIFFVBD_JIT=1 finds no sources beside {_FOLDER}: run `{_command()}`")
-
-
-def _command() -> str:
-    if (_FOLDER.parent / "setup.py").exists():
-        return "pip install --no-build-isolation -e ."
-    return "pip install --no-build-isolation --no-deps --force-reinstall --no-binary diffvbd diffvbd"
+    raise RuntimeError(f"diffvbd: DIFFVBD_JIT=1 finds no sources beside {_FOLDER}: run `{_COMMAND}`")
 
 
 def _built(name: str) -> Path | None:

@@ -41,16 +41,16 @@ class SweepSettings(NamedTuple):
 LANES = {"cpu": 8, "cuda": 32}  # vertices of a block of the plan; twins of kLanes and kSlice in csrc/core/views.h
 
 
+PLAN_HEADER = 11  # twin of kPlanHeader in csrc/core/plan_views.h
+
+
 def plan_sizes(plan: Tensor, device: str) -> tuple[int, ...]:
     """What the host must know of a plan that is still on the CPU; the order is that of csrc/ops_cuda.cpp."""
-    vertices, tets, active, colors, blocks, slots, edge_slots, incoming_slots = plan[:8].tolist()
+    header = plan[:PLAN_HEADER].tolist()
+    vertices, tets, active, colors, blocks, slots, *rest = header
     if device == "cpu":
         return active, tets, slots
-    first = 8 + colors + 1 + 2 * (blocks + 1)
-    edges = plan[first : first + blocks + 1]
-    degree = int(edges.diff().max()) if blocks else 0
-    return (active, tets, slots, vertices, colors, blocks, edge_slots, incoming_slots, degree,
-            *plan[8 : 8 + colors + 1].tolist())  # fmt: skip
+    return (active, tets, slots, vertices, colors, blocks, *rest, *plan[PLAN_HEADER : PLAN_HEADER + colors + 1].tolist())
 
 
 def tape_rows(policy: int, energies: int) -> int:

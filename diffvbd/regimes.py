@@ -10,19 +10,20 @@ from .checks import fail
 
 Regime = Literal["thread", "block", "grid", "color"]
 
-# twins of Regime, kFewLanes and kManyLanes in csrc/cuda/step.h, of kSmallMesh in csrc/core/views.h
+# twins of Regime, kFewLanes, kSomeLanes and kManyLanes in csrc/cuda/step.h, of kSmallMesh in csrc/core/views.h
 THREAD, BLOCK, GRID, COLOR = 1, 2, 3, 4
 CODES: dict[str, int] = {"thread": THREAD, "block": BLOCK, "grid": GRID, "color": COLOR}
-FEW_LANES, MANY_LANES = 2, 8
+FEW_LANES, SOME_LANES, MANY_LANES = 2, 8, 32
 SMALL_MESH = 64
 
 # Where one regime overtakes another, measured on an H100 (docs/performance.md).
 THREAD_VERTICES = 32  # above, a scene's positions leave too little shared memory for a scene per thread
 THREAD_SCENES = 4096  # below, a scene per thread leaves most of the device idle
 BLOCK_SCENES = 64  # below, a scene per block does
-BLOCK_VERTICES = 512  # of a single mesh: above, one multiprocessor takes longer than the barriers of many
-GRID_VERTICES = 60_000  # vertices of all scenes: above, launches cost less than a cooperative grid's barriers
-MANY_LANES_VERTICES = 8_000  # vertices of all scenes in a color: above, few lanes fill the device
+BLOCK_VERTICES = 160  # of a single mesh: above, one multiprocessor takes longer than the barriers of several
+GRID_VERTICES = 100_000  # vertices of all scenes: above, launches cost less than a cooperative grid's barriers
+MANY_LANES_VERTICES = 1_500  # vertices of all scenes in a color up to which a warp each still finds room
+SOME_LANES_VERTICES = 8_000  # the same for a quarter of a warp
 
 _forced: str | None = None
 
@@ -54,10 +55,12 @@ def choose(vertices: int, colors: int, scenes: int) -> tuple[int, int]:
     code = CODES[_forced] if _forced else _automatic(vertices, scenes)
     if code == THREAD and vertices > SMALL_MESH:
         fail("regime", f"a mesh of at most {SMALL_MESH} vertices for a scene per thread", f"{vertices} vertices")
-    at_once = vertices * (1 if code == BLOCK else scenes) / max(1, colors)
-    if code == BLOCK and scenes >= 2 * BLOCK_SCENES:
-        at_once *= 8  # other blocks fill the multiprocessor
-    return code, FEW_LANES if at_once > MANY_LANES_VERTICES else MANY_LANES
+    if code == BLOCK:  # scenes enough fill a multiprocessor; one alone wants its threads
+        return code, SOME_LANES if scenes < BLOCK_SCENES else FEW_LANES
+    at_once = vertices * scenes / max(1, colors)
+    if at_once <= MANY_LANES_VERTICES:
+        return code, MANY_LANES
+    return code, SOME_LANES if at_once <= SOME_LANES_VERTICES else FEW_LANES
 
 
 def _automatic(vertices: int, scenes: int) -> int:

@@ -212,7 +212,8 @@ Values saturated(const Values& d_raw, double c) {
 }
 Values solve_of(const Values& a, const Values& b, double least) {
   Values out;
-  put(out, solve<double>(Sym3<double>{a[0], a[1], a[2], a[3], a[4], a[5]}, vec(b.data()), least));
+  const Sym3<double> matrix{a[0], a[1], a[2], a[3], a[4], a[5]};
+  put(out, solve(factor<double>(matrix, least), vec(b.data())));
   return out;
 }
 

@@ -5,7 +5,9 @@
 
 namespace diffvbd {
 
-constexpr int kPlanHeader = 8;  // vertices, tets, active, colors, blocks, slots, edge_slots, incoming_slots
+// vertices, tets, active, colors, blocks, slots, edge_slots, incoming_slots, and of the plan for CUDA entry_slots, the
+// largest number of neighbours and of pairs of an active vertex
+constexpr int kPlanHeader = 11;
 
 class PlanReader {
  public:
@@ -60,6 +62,8 @@ inline GroupPlan view_group_plan(const int32_t* sizes, const int32_t* buffer) {
   p.local = read.take(int64_t{p.slots} * kSlice);
   p.adjacent = read.take(int64_t{p.edge_slots} * kSlice);
   p.incoming = read.take(int64_t{p.incoming_slots} * kSlice);
+  p.edge_entry = read.take(int64_t{p.edge_slots} + 1);
+  p.entry = read.take(int64_t{sizes[8]} * kSlice);
   p.tet_pair = read.take(4 * int64_t{p.num_tets});
   if (p.num_vertices <= kSmallMesh) {
     p.visit = read.take(2 * int64_t{p.num_active});

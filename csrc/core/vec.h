@@ -110,28 +110,40 @@ DIFFVBD_FN void add_outer(Sym3<R>& a, const R& s, const Vec3<R>& v) {
   a.zz = a.zz + w.z * v.z;
 }
 
-// Solves A u = b by L D L^T: backward stable on the positive definite blocks of a sweep, where an adjugate would lose
-// the digits that the stiffest direction takes. `least` > 0 is a lower bound of A's eigenvalues, hence of every pivot.
-// Where A's conditioning leaves a pivot nothing but rounding, that bound or the rounding itself stands in for it, and
-// the step stays of the size of the stiff one; elsewhere both bounds are idle. T is the precision of R.
+// L D L^T of a symmetric matrix, with the inverse pivots: solving with it divides no more.
+template <class R>
+struct Factor {
+  R l21, l31, l32, inv1, inv2, inv3;
+};
+
+// Backward stable on the positive definite blocks of a sweep, where an adjugate would lose the digits that the stiffest
+// direction takes. `least` > 0 is a lower bound of A's eigenvalues, hence of every pivot. Where A's conditioning leaves
+// a pivot nothing but rounding, that bound or the rounding itself stands in for it, and the step stays of the size of
+// the stiff one; elsewhere both bounds are idle. T is the precision of R.
 template <class T, class R>
-DIFFVBD_FN Vec3<R> solve(const Sym3<R>& a, const Vec3<R>& b, const R& least) {
+DIFFVBD_FN Factor<R> factor(const Sym3<R>& a, const R& least) {
   const auto pivot = [&](const R& computed, const R& diagonal) {
     const R rounding = R(4 * std::numeric_limits<T>::epsilon()) * diagonal;
     const R bound = select(least < rounding, rounding, least);
     return select(bound < computed, computed, bound);
   };
-  const R inv1 = R(1) / a.xx;
-  const R l21 = a.xy * inv1;
-  const R l31 = a.xz * inv1;
-  const R inv2 = R(1) / pivot(a.yy - l21 * a.xy, a.yy);
-  const R t = a.yz - l21 * a.xz;
-  const R l32 = t * inv2;
-  const R inv3 = R(1) / pivot(a.zz - l31 * a.xz - l32 * t, a.zz);
-  const R u2 = b.y - l21 * b.x;
-  const R u3 = (b.z - l31 * b.x - l32 * u2) * inv3;
-  const R v2 = u2 * inv2 - l32 * u3;
-  return {b.x * inv1 - l21 * v2 - l31 * u3, v2, u3};
+  Factor<R> f;
+  f.inv1 = R(1) / a.xx;
+  f.l21 = a.xy * f.inv1;
+  f.l31 = a.xz * f.inv1;
+  f.inv2 = R(1) / pivot(a.yy - f.l21 * a.xy, a.yy);
+  const R t = a.yz - f.l21 * a.xz;
+  f.l32 = t * f.inv2;
+  f.inv3 = R(1) / pivot(a.zz - f.l31 * a.xz - f.l32 * t, a.zz);
+  return f;
+}
+
+template <class R>
+DIFFVBD_FN Vec3<R> solve(const Factor<R>& f, const Vec3<R>& b) {
+  const R u2 = b.y - f.l21 * b.x;
+  const R u3 = (b.z - f.l31 * b.x - f.l32 * u2) * f.inv3;
+  const R v2 = u2 * f.inv2 - f.l32 * u3;
+  return {b.x * f.inv1 - f.l21 * v2 - f.l31 * u3, v2, u3};
 }
 
 }  // namespace diffvbd

@@ -56,8 +56,13 @@ DIFFVBD_FN System<R> assemble(const Block<R>& b, const Star& star, const StepPar
 }
 
 template <class R, class T>
-DIFFVBD_FN Vec3<R> newton_step(const Block<R>& b, const System<R>& system, const StepParameters<T>& q) {
-  return -solve<T>(system.H, system.g, least_eigenvalue(b, q));
+DIFFVBD_FN Factor<R> factored(const Block<R>& b, const System<R>& system, const StepParameters<T>& q) {
+  return factor<T>(system.H, least_eigenvalue(b, q));
+}
+
+template <class R>
+DIFFVBD_FN Vec3<R> newton_step(const System<R>& system, const Factor<R>& H) {
+  return -solve(H, system.g);
 }
 
 // From the Newton step to the executed one.
@@ -92,7 +97,7 @@ struct BlockAdjoint {
 // Transpose of one block update. `b` holds the state before it, `x_bar` the adjoint of the position after it.
 // add_data(k, i, value) receives the adjoint of b.data[k][i]; it is called only if `wants_data`.
 template <class Set, int wanted, class R, class T, class Star, class AddData>
-DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, const Update<R>& u, const Sym3<R>& H,
+DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, const Update<R>& u, const Factor<R>& H,
                                           const Vec3<R>& x_bar, const StepParameters<T>& q, bool wants_data,
                                           AddData&& add_data) {
   const R h = R(q.time_step), minus_h2 = -(h * h);
@@ -112,7 +117,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   }
   Vec3<R> z = R(q.relaxation) * step_bar;
   if (q.saturates) z = saturate_vjp(u.d_raw, z, q);
-  const Vec3<R> p = solve<T>(H, z, least_eigenvalue(b, q));
+  const Vec3<R> p = solve(H, z);
 
   out.y = b.mass * p;
   out.x -= out.y;

@@ -111,7 +111,7 @@ Layout lay_out(const double* points, const Stars& stars, const Adjacency& graph,
 // Header and blocks, which both plans share; `extra` scalars follow.
 std::vector<int32_t> start_buffer(const Layout& layout, int64_t vertices, int64_t tets, int64_t extra) {
   std::vector<int32_t> out = {static_cast<int32_t>(vertices), static_cast<int32_t>(tets), layout.active,
-                              layout.colors, layout.blocks, layout.slots, layout.edge_slots, layout.incoming_slots};
+                              layout.colors, layout.blocks, layout.slots, layout.edge_slots, layout.incoming_slots, 0, 0, 0};
   for (const auto* list : {&layout.color_block, &layout.block_slot, &layout.block_rank, &layout.block_edge,
                            &layout.block_incoming, &layout.order}) {
     out.insert(out.end(), list->begin(), list->end());
@@ -171,6 +171,45 @@ struct Mesh {
   }
 };
 
+// Which corners of which pairs of its vertex lead along each edge (see GroupPlan).
+struct Entries {
+  std::vector<int32_t> first, entry;
+};
+
+Entries list_entries(const Mesh& mesh, const Layout& layout) {
+  Entries out;
+  std::vector<std::vector<int32_t>> found;  // [edges of the block, kSlice]
+  for (int32_t b = 0; b < layout.blocks; ++b) {
+    const int32_t edges = layout.block_edge[b + 1] - layout.block_edge[b];
+    found.assign(static_cast<size_t>(edges) * kSlice, {});
+    for (int l = 0; l < kSlice && edges > 0; ++l) {
+      const int32_t v = layout.order[int64_t{b} * kSlice + l];
+      if (v < 0) continue;
+      for (int64_t e = mesh.stars.ptr[v]; e < mesh.stars.ptr[v + 1]; ++e) {
+        const int32_t pair = mesh.stars.entry[e], number = static_cast<int32_t>(e - mesh.stars.ptr[v]);
+        for (int a = 0; a < 3; ++a) {
+          const int64_t other = mesh.tets[(pair & ~3) + other_corner(pair & 3, a)];
+          found[mesh.edge_to(v, static_cast<int32_t>(other)) * size_t{kSlice} + l].push_back(3 * number + a);
+        }
+      }
+    }
+    const int32_t none = 3 * (layout.block_slot[b + 1] - layout.block_slot[b]);
+    for (int32_t a = 0; a < edges; ++a) {
+      out.first.push_back(static_cast<int32_t>(out.entry.size() / kSlice));
+      size_t most = 0;
+      for (int l = 0; l < kSlice; ++l) most = std::max(most, found[a * size_t{kSlice} + l].size());
+      for (size_t i = 0; i < most; ++i) {
+        for (int l = 0; l < kSlice; ++l) {
+          const auto& list = found[a * size_t{kSlice} + l];
+          out.entry.push_back(i < list.size() ? list[i] : none);
+        }
+      }
+    }
+  }
+  out.first.push_back(static_cast<int32_t>(out.entry.size() / kSlice));
+  return out;
+}
+
 }  // namespace
 
 std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64_t num_tets, const Stars& stars,
@@ -196,17 +235,28 @@ std::vector<int32_t> build_plan(const double* points, const int64_t* tets, int64
 
 std::vector<int32_t> build_group_plan(const double* points, const int64_t* tets, int64_t num_tets, const Stars& stars,
                                       const Adjacency& graph, const std::vector<int32_t>& color, int colors) {
-  const Layout layout = lay_out(points, stars, graph, color, colors, kSlice);
+  Layout layout = lay_out(points, stars, graph, color, colors, kSlice);
+  ++layout.slots;  // one of padding alone, for threads that have no pair left
   if (layout.degree > kMaxDegree) {
     throw std::invalid_argument("mesh: expected at most 1023 neighbours of a vertex on CUDA");
   }
   const Mesh mesh{tets, stars, graph, color};
   const bool small = color.size() <= kSmallMesh;
+  const Entries entries = list_entries(mesh, layout);
   const int64_t extra = (int64_t{layout.slots} * 2 + layout.edge_slots + layout.incoming_slots) * kSlice +
-                        4 * num_tets + (small ? 2 * layout.active + 16 * num_tets : 0);
+                        static_cast<int64_t>(entries.first.size() + entries.entry.size()) + 4 * num_tets +
+                        (small ? 2 * layout.active + 16 * num_tets : 0);
   std::vector<int32_t> out = start_buffer(layout, static_cast<int64_t>(color.size()), num_tets, extra);
+  out[8] = static_cast<int32_t>(entries.entry.size() / kSlice);
+  out[9] = layout.degree;
+  for (int32_t b = 0; b < layout.color_block[colors]; ++b) {
+    out[10] = std::max(out[10], layout.block_slot[b + 1] - layout.block_slot[b]);
+  }
   const GroupPlan plan = view_group_plan(out.data(), out.data());
+  std::copy(entries.first.begin(), entries.first.end(), writable(plan.edge_entry));
+  std::copy(entries.entry.begin(), entries.entry.end(), writable(plan.entry));
   std::fill_n(writable(plan.tet_pair), 4 * num_tets, -1);
+  std::fill_n(writable(plan.pair) + (layout.slots - 1) * int64_t{kSlice}, kSlice, -1);
   mesh.each_pair(layout, [&](int32_t s, int l, int32_t, int32_t v, int32_t entry) {
     const int64_t at = s * int64_t{kSlice} + l;
     writable(plan.pair)[at] = entry;

@@ -23,23 +23,20 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
     const LaneStar<T> star(plan, s, block, fresh_rows(plan, s.rows, block));
     R values[kMaxEnergyData];
     Block<R> b = load_block<Set>(plan, s, block, q, values);
-    if (tape == kCompactTape || Set::filters) b.state.x = {get(), get(), get()};
+    if (Set::filters) b.state.x = {get(), get(), get()};
     Vec3<R> d_raw;
-    Sym3<R> H;
+    Factor<R> H;
+    if (tape == kFullTape || !Set::filters) d_raw = {get(), get(), get()};
     if (tape == kFullTape) {
-      d_raw = {get(), get(), get()};
       H = {get(), get(), get(), get(), get(), get()};
-      // a phantom lane has no tape: the unit block keeps it at zero
-      if (count < kLanes) {
-        for (int l = count; l < kLanes; ++l) H.xx.v[l] = H.yy.v[l] = H.zz.v[l] = T(1);
-      }
     } else {
+      // H of a scene without filters depends on the neighbours alone
       const System<R> system = assemble<Set>(b, star, q);
-      d_raw = newton_step(b, system, q);
-      H = system.H;
+      H = factored(b, system, q);
+      if (Set::filters) d_raw = newton_step(system, H);
     }
     const Update<R> u = safeguarded<Set>(b, d_raw, q);
-    if (tape == kFullTape && !Set::filters) b.state.x -= u.step;
+    if (!Set::filters) b.state.x -= u.step;
     store_rows(s.x, block, b.state.x);
 
     const Vec3<R> x_bar = load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block);

@@ -13,7 +13,8 @@ DIFFVBD_HOT void forward_color(const Plan& plan, const SceneView<T>& s, const St
     R values[kMaxEnergyData];
     const Block<R> b = load_block<Set>(plan, s, block, q, values);
     const System<R> system = assemble<Set>(b, LaneStar<T>(plan, s, block), q);
-    const Update<R> u = safeguarded<Set>(b, newton_step(b, system, q), q);
+    const Factor<R> H = factored(b, system, q);
+    const Update<R> u = safeguarded<Set>(b, newton_step(system, H), q);
     store_rows(s.x, block, moved<Set>(b.state.x, u));
     if (tape == kNoTape) continue;
     const int count = plan.block_rank[block + 1] - plan.block_rank[block];
@@ -22,12 +23,10 @@ DIFFVBD_HOT void forward_color(const Plan& plan, const SceneView<T>& s, const St
       value.store(at, count);
       at += plan.num_active;
     };
-    if (tape == kCompactTape || Set::filters) {
-      put(b.state.x.x), put(b.state.x.y), put(b.state.x.z);
-    }
+    if (Set::filters) put(b.state.x.x), put(b.state.x.y), put(b.state.x.z);
+    if (tape == kFullTape || !Set::filters) put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
     if (tape == kFullTape) {
-      put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
-      put(system.H.xx), put(system.H.xy), put(system.H.xz), put(system.H.yy), put(system.H.yz), put(system.H.zz);
+      put(H.l21), put(H.l31), put(H.l32), put(H.inv1), put(H.inv2), put(H.inv3);
     }
   }
 }

@@ -14,26 +14,28 @@ __global__ void __launch_bounds__(kMaxThreads) sweep_forward(const __grid_consta
   using Set = EnergySet<mask>;
   const int rows = tape_rows(s.tape_policy, Set::filters);
   T* const shared = memory_of_warp<T, lanes>(s, false);
-  each_color<T, lanes>(s, range, false, [&](int64_t scene, int sweep, int, int block, int part) {
+  each_color<T, lanes>(s, range, false, [&](int64_t scene, int sweep, int block, int part) {
     const Place<lanes> at(scene, block, part);
+    const int rank = __ldg(s.plan.block_rank + block) + at.v, end_rank = __ldg(s.plan.block_rank + block + 1);
+    if (rank - at.group >= end_rank) return;  // the whole warp: phantoms alone
     GroupStar<T, lanes> star(s, at, shared);
     if constexpr (Set::elastic) star.fetch_neighbours();
     const Block<T> b = load_block<Set>(s, at);
     const System<T> system = assemble<Set>(b, star, s.parameters);
-    const Update<T> u = safeguarded<Set>(b, newton_step(b, system, s.parameters), s.parameters);
+    const Factor<T> H = factored(b, system, s.parameters);
+    const Update<T> u = safeguarded<Set>(b, newton_step(system, H), s.parameters);
     const int64_t position = static_cast<int64_t>(block) * kSlice + at.v;
     if (at.lane == 0) store_row(s.w.x, scene * s.positions + position, moved<Set>(b.state.x, u));
-    const int rank = __ldg(s.plan.block_rank + block) + at.v;
-    if (s.tape_policy != kNoTape && at.lane == 0 && rank < __ldg(s.plan.block_rank + block + 1)) {
+    if (s.tape_policy != kNoTape && at.lane == 0 && rank < end_rank) {
       T* to = s.tape + (scene * s.sweeps + sweep) * rows * s.plan.num_active + rank;
       const auto put = [&](const T& value) {
         *to = value;
         to += s.plan.num_active;
       };
-      if (s.tape_policy == kCompactTape || Set::filters) put(b.state.x.x), put(b.state.x.y), put(b.state.x.z);
+      if (Set::filters) put(b.state.x.x), put(b.state.x.y), put(b.state.x.z);
+      if (s.tape_policy == kFullTape || !Set::filters) put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
       if (s.tape_policy == kFullTape) {
-        put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
-        put(system.H.xx), put(system.H.xy), put(system.H.xz), put(system.H.yy), put(system.H.yz), put(system.H.zz);
+        put(H.l21), put(H.l31), put(H.l32), put(H.inv1), put(H.inv2), put(H.inv3);
       }
     }
     __syncwarp();
@@ -52,9 +54,16 @@ template <class T>
 SweepKernel<T> forward_kernel(int energies, int lanes) {
   constexpr auto sets = std::make_integer_sequence<int, kEnergySets>{};
   const int index = energy_index(energies);
-  return lanes == kFewLanes    ? pick_forward<T, kFewLanes>(index, sets)
-         : lanes == kManyLanes ? pick_forward<T, kManyLanes>(index, sets)
-                               : pick_forward<T, kSpillLanes>(index, sets);
+  switch (lanes) {
+    case kFewLanes:
+      return pick_forward<T, kFewLanes>(index, sets);
+    case kSomeLanes:
+      return pick_forward<T, kSomeLanes>(index, sets);
+    case kManyLanes:
+      return pick_forward<T, kManyLanes>(index, sets);
+    default:
+      return pick_forward<T, kSpillLanes>(index, sets);
+  }
 }
 
 }  // namespace diffvbd::cuda

@@ -20,14 +20,6 @@ __device__ __forceinline__ void store_user(T* p, int64_t index, const Vec3<T>& a
   p[1] = a.y;
   p[2] = a.z;
 }
-template <class T>
-__device__ __forceinline__ void store3(T* p, int64_t block, int v, const Vec3<T>& b) {
-  T* a = p + block * 3 * kSlice + v;
-  a[0] = b.x;
-  a[kSlice] = b.y;
-  a[2 * kSlice] = b.z;
-}
-
 // y = x + h v + h^2 a; a pinned vertex goes where it is held
 template <class T>
 __device__ __forceinline__ Vec3<T> predict(const StepInputs<T>& in, int64_t scene, int64_t vertex, bool pinned) {
@@ -102,15 +94,16 @@ __global__ void load_material(const __grid_constant__ StepInputs<T> in, const __
   s.w.material[2 * i + 1] = in.lam.data[scene * in.lam.scene + tet * in.lam.item];
 }
 
-// What the updates of lower colors have added since a vertex's last turn in the first executed sweep.
+// What is left in the rows after the last reversed update: of lower colors for a vertex that has had its turn, everything
+// for what is pinned.
 template <class T>
-__device__ __forceinline__ Vec3<T> rows_of_lower_colors(const StepView<T>& s, int64_t scene, int block, int v) {
-  int color = 0;
-  while (block >= __ldg(s.plan.color_block + color + 1)) ++color;
-  const int64_t below = static_cast<int64_t>(__ldg(s.plan.block_edge + __ldg(s.plan.color_block + color))) * kSlice;
+__device__ __forceinline__ Vec3<T> rows_left(const StepView<T>& s, int64_t scene, int block, int v, bool pinned) {
   Place<1> at(scene, block, 0);
   at.v = v;
-  return pull_rows(s, at, below);
+  if (pinned) return pull_rows<true>(s, at);
+  int color = 0;
+  while (block >= __ldg(s.plan.color_block + color + 1)) ++color;
+  return pull_rows<false>(s, at, __ldg(s.plan.block_edge + __ldg(s.plan.color_block + color)) * kSlice);
 }
 
 template <class T>
@@ -125,7 +118,7 @@ __global__ void store_adjoints(const __grid_constant__ StepInputs<T> in, const _
   const bool pinned = block >= __ldg(s.plan.color_block + s.plan.colors);
   const int64_t own = scene * s.plan.num_vertices + vertex, vectors = local * s.positions * 3;
   Vec3<T> start = load_row(s.w.x_bar, i);
-  if (!pinned && s.sweeps > 0) start += rows_of_lower_colors(s, local, block, v);
+  if (s.sweeps > 0) start += rows_left(s, local, block, v, pinned);
   const Vec3<T> y = load3(s.w.y_bar + vectors, block, v);
   if (out.mass) out.mass[own] = s.w.mass_bar[i];
   if (!in.fused) {

@@ -13,10 +13,12 @@ struct alignas(16) Pack {
   T v[size];
 };
 
-// Values that other multiprocessors write during the launch come from the L2 cache.
+// Values that other multiprocessors may write during the launch come from the L2 cache; a block that has its scene to
+// itself (`own`) can use the nearer one.
 template <class T>
-__device__ __forceinline__ Pack<T> load_shared_state(const T* p) {
-  const float4 a = __ldcg(reinterpret_cast<const float4*>(p));
+__device__ __forceinline__ Pack<T> load_state(const T* p, bool own) {
+  const float4* from = reinterpret_cast<const float4*>(p);
+  const float4 a = own ? *from : __ldcg(from);
   return reinterpret_cast<const Pack<T>&>(a);
 }
 template <class T>
@@ -31,13 +33,13 @@ __device__ __forceinline__ void store(T* p, const Pack<T>& a) {
 
 // rows of x, y, z and one unused
 template <class T>
-__device__ __forceinline__ Vec3<T> load_row(const T* rows, int64_t row) {
+__device__ __forceinline__ Vec3<T> load_row(const T* rows, int64_t row, bool own = false) {
   const T* p = rows + kRow * row;
-  const Pack<T> a = load_shared_state(p);
+  const Pack<T> a = load_state(p, own);
   if constexpr (Pack<T>::size == 4) {
     return {a.v[0], a.v[1], a.v[2]};
   } else {
-    return {a.v[0], a.v[1], load_shared_state(p + 2).v[0]};
+    return {a.v[0], a.v[1], load_state(p + 2, own).v[0]};
   }
 }
 template <class T>
@@ -57,20 +59,26 @@ __device__ __forceinline__ Vec3<T> load3(const T* p, int block, int v) {
   return {__ldg(a), __ldg(a + kSlice), __ldg(a + 2 * kSlice)};
 }
 template <class T>
-__device__ __forceinline__ void add3(T* p, int block, int v, const Vec3<T>& b) {
+__device__ __forceinline__ void store3(T* p, int block, int v, const Vec3<T>& b) {
   T* a = p + static_cast<int64_t>(block) * 3 * kSlice + v;
-  a[0] += b.x;
-  a[kSlice] += b.y;
-  a[2 * kSlice] += b.z;
+  a[0] = b.x;
+  a[kSlice] = b.y;
+  a[2 * kSlice] = b.z;
+}
+// one that this thread alone writes, so that it may change during the launch
+template <class T>
+__device__ __forceinline__ Vec3<T> load_own3(const T* p, int block, int v) {
+  const T* a = p + static_cast<int64_t>(block) * 3 * kSlice + v;
+  return {a[0], a[kSlice], a[2 * kSlice]};
 }
 
 constexpr unsigned kWholeWarp = 0xffffffffu;
 
 // Where a thread stands: vertex `v` of a block, and which of the `lanes` threads of that vertex it is. Neighbouring
 // threads have neighbouring vertices, so that their loads lie side by side.
-template <int lanes>
+template <int lanes_>
 struct Place {
-  static constexpr int groups = kSlice / lanes;  // vertices of a warp
+  static constexpr int lanes = threads_of(lanes_), groups = kSlice / lanes;  // vertices of a warp
   int64_t scene;
   int block, v, group, lane;
   __device__ __forceinline__ Place(int64_t scene, int block, int part)
@@ -96,21 +104,23 @@ struct Place {
 template <class T, int lanes>
 __device__ __forceinline__ T* memory_of_warp(const StepView<T>& s, bool reverse) {
   extern __shared__ __align__(16) unsigned char memory[];
-  const int warp = threadIdx.x / kSlice, size = shared_scalars(s.degree, lanes, reverse);
+  const int warp = threadIdx.x / kSlice, size = shared_scalars(s.degree, s.valence, lanes, reverse);
   if constexpr (lanes == kSpillLanes) return s.spill + (blockIdx.x * (blockDim.x / kSlice) + warp) * static_cast<int64_t>(size);
   return reinterpret_cast<T*>(memory) + warp * size;
 }
 
 // The incident tets of a group's vertex. `near` holds the neighbours' positions, [degree, 3, groups] in the warp's own
-// shared memory; `sums` what a reversed update adds to them, [degree, 3, kSlice], each thread its own.
-template <class T, int lanes>
+// shared memory; `sums` what a reversed update adds to them: [degree, 3, kSlice], each thread its own, or of each corner
+// of each pair [3 valence + 1, 3, groups].
+template <class T, int lanes_>
 struct GroupStar {
-  using P = Place<lanes>;
+  static constexpr int lanes = threads_of(lanes_);
+  static constexpr bool gather = gathers(lanes_);
+  using P = Place<lanes_>;
   const StepView<T>& s;
   const P& at;
   T *near, *sums;
   int first, count, first_edge, degree;
-  T mu, lam;  // of a scene with one material
 
   __device__ __forceinline__ GroupStar(const StepView<T>& s, const P& at, T* shared)
       : s(s), at(at), near(shared + at.group) {
@@ -118,61 +128,97 @@ struct GroupStar {
     count = __ldg(s.plan.block_slot + at.block + 1) - first;
     first_edge = __ldg(s.plan.block_edge + at.block);
     degree = __ldg(s.plan.block_edge + at.block + 1) - first_edge;
-    mu = lam = T(0);
     if (s.one_material) {
-      mu = __ldg(s.mu.data + at.scene * s.mu.scene);
-      lam = __ldg(s.lam.data + at.scene * s.lam.scene);
+      next.mu = __ldg(s.mu.data + at.scene * s.mu.scene);
+      next.lam = __ldg(s.lam.data + at.scene * s.lam.scene);
     }
+    fetch(0);
   }
 
+  // Several loads are under way at once: what is beyond the last neighbour repeats it, and is not stored.
   __device__ __forceinline__ void fetch_neighbours() {
+    constexpr int batch = lanes >= 32 ? 1 : lanes >= 8 ? 3 : 4;
     const T* x = s.w.x + at.scene * s.positions * kRow;
-#pragma unroll 4
-    for (int a = at.lane; a < degree; a += lanes) {
-      const Vec3<T> n = load_row(x, __ldg(s.plan.adjacent + static_cast<int64_t>(first_edge + a) * kSlice + at.v));
-      T* to = near + a * 3 * P::groups;
-      to[0] = n.x;
-      to[P::groups] = n.y;
-      to[2 * P::groups] = n.z;
+    const int32_t* adjacent = s.plan.adjacent + static_cast<int64_t>(first_edge) * kSlice + at.v;
+    for (int start = at.lane; start < degree; start += batch * lanes) {
+      int32_t index[batch];
+      Vec3<T> n[batch];
+#pragma unroll
+      for (int u = 0; u < batch; ++u) index[u] = __ldg(adjacent + min(start + u * lanes, degree - 1) * kSlice);
+#pragma unroll
+      for (int u = 0; u < batch; ++u) n[u] = load_row(x, index[u], s.own);
+#pragma unroll
+      for (int u = 0; u < batch; ++u) {
+        if (start + u * lanes >= degree) continue;
+        T* to = near + (start + u * lanes) * 3 * P::groups;
+        to[0] = n[u].x;
+        to[P::groups] = n[u].y;
+        to[2 * P::groups] = n[u].z;
+      }
     }
     __syncwarp();
   }
   __device__ __forceinline__ void clear_sums(T* shared) {
-    sums = shared + s.degree * 3 * P::groups + threadIdx.x % kSlice;
-    for (int a = 0; a < 3 * degree; ++a) sums[a * kSlice] = T(0);
+    if constexpr (gather) {
+      sums = shared + s.degree * 3 * P::groups + at.group;
+      if (at.lane < 3) sums[(9 * count + at.lane) * P::groups] = T(0);  // what padding adds
+    } else {
+      sums = shared + s.degree * 3 * P::groups + threadIdx.x % kSlice;
+      for (int a = 0; a < 3 * degree; ++a) sums[a * kSlice] = T(0);
+    }
   }
 
   __device__ __forceinline__ int size() const { return (count + lanes - 1) / lanes; }
+  __device__ __forceinline__ bool real(int e) const { return e * lanes + at.lane < count; }
+  // a thread without a pair left takes the slot of padding
   __device__ __forceinline__ int64_t slot(int e) const {
-    return static_cast<int64_t>(first + min(e * lanes + at.lane, count - 1)) * kSlice;
+    const int own = e * lanes + at.lane;
+    return static_cast<int64_t>(own < count ? first + own : s.plan.slots - 1) * kSlice;
   }
-  __device__ __forceinline__ bool real(int e) const { return lanes == 1 || e * lanes + at.lane < count; }
+
+  // What a pair reads of the mesh; always loaded one pair ahead.
+  struct Record {
+    int where;
+    T k_ij, k_ik, k_il, c6, mu, lam;
+  };
+  mutable Record next;
+  mutable int where;      // of the pair at work
+  bool repeats = false;  // whether the star is visited once more
+  __device__ __forceinline__ void fetch(int e) const {
+    const int64_t base = slot(e);
+    next.where = __ldg(s.plan.local + base + at.v);
+    const T* rest = s.rest.data + at.scene * s.rest.scene + base * 4;
+    if constexpr (Pack<T>::size == 4) {
+      const Pack<T> r = load_constant(rest + at.v * 4);
+      next.k_ij = r.v[0], next.k_ik = r.v[1], next.k_il = r.v[2], next.c6 = r.v[3];
+    } else {
+      const Pack<T> r = load_constant(rest + at.v * 2), q = load_constant(rest + 2 * kSlice + at.v * 2);
+      next.k_ij = r.v[0], next.k_ik = r.v[1], next.k_il = q.v[0], next.c6 = q.v[1];
+    }
+    if (!s.one_material) {
+      const T* m = s.w.material + at.scene * s.material_scene + (base + at.v) * 2;
+      next.mu = __ldg(m), next.lam = __ldg(m + 1);
+    }
+  }
   __device__ __forceinline__ Vec3<T> neighbour(int a) const {
     const T* from = near + a * 3 * P::groups;
     return {from[0], from[P::groups], from[2 * P::groups]};
   }
 
   __device__ __forceinline__ TetPair<T> pair(int e) const {
-    const int64_t base = slot(e);
-    const int where = __ldg(s.plan.local + base + at.v);
+    const Record now = next;
+    if (e + 1 < size()) {
+      fetch(e + 1);
+    } else if (repeats) {
+      fetch(0);
+    }
+    where = now.where;
     TetPair<T> out;
     out.xj = neighbour(where & kMaxDegree);
     out.xk = neighbour(where >> kLocalBits & kMaxDegree);
     out.xl = neighbour(where >> 2 * kLocalBits);
-    const T* rest = s.rest.data + at.scene * s.rest.scene + base * 4;
-    if constexpr (Pack<T>::size == 4) {
-      const Pack<T> r = load_constant(rest + at.v * 4);
-      out.k_ij = r.v[0], out.k_ik = r.v[1], out.k_il = r.v[2], out.c6 = r.v[3];
-    } else {
-      const Pack<T> r = load_constant(rest + at.v * 2), q = load_constant(rest + 2 * kSlice + at.v * 2);
-      out.k_ij = r.v[0], out.k_ik = r.v[1], out.k_il = q.v[0], out.c6 = q.v[1];
-    }
-    out.mu = mu, out.lam = lam;
-    if (!s.one_material) {
-      const T* m = s.w.material + at.scene * s.material_scene + (base + at.v) * 2;
-      out.mu = __ldg(m), out.lam = __ldg(m + 1);
-    }
-    if (!real(e)) out.k_ij = out.k_ik = out.k_il = out.c6 = T(0), out.mu = out.lam = T(0);
+    out.k_ij = now.k_ij, out.k_ik = now.k_ik, out.k_il = now.k_il, out.c6 = now.c6;
+    out.mu = now.mu, out.lam = now.lam;
     return out;
   }
   template <class... R>
@@ -180,19 +226,27 @@ struct GroupStar {
     if constexpr (lanes > 1) (P::sum(values), ...);
   }
 
-  __device__ __forceinline__ void send(int a, const Vec3<T>& v) const {
-    T* to = sums + a * 3 * kSlice;
-    to[0] += v.x;
-    to[kSlice] += v.y;
-    to[2 * kSlice] += v.z;
+  __device__ __forceinline__ void send(int e, int corner, int neighbour, const Vec3<T>& v) const {
+    if constexpr (gather) {
+      const int own = e * lanes + at.lane;
+      if (own >= count) return;
+      T* to = sums + (3 * own + corner) * 3 * P::groups;
+      to[0] = v.x;
+      to[P::groups] = v.y;
+      to[2 * P::groups] = v.z;
+    } else {
+      T* to = sums + neighbour * 3 * kSlice;
+      to[0] += v.x;
+      to[kSlice] += v.y;
+      to[2 * kSlice] += v.z;
+    }
   }
   template <int wanted>
   __device__ __forceinline__ void add(int e, const TetPairAdjoint<T>& a) const {
     const int64_t base = slot(e);
-    const int where = __ldg(s.plan.local + base + at.v);
-    send(where & kMaxDegree, a.xj);
-    send(where >> kLocalBits & kMaxDegree, a.xk);
-    send(where >> 2 * kLocalBits, a.xl);
+    send(e, 0, where & kMaxDegree, a.xj);
+    send(e, 1, where >> kLocalBits & kMaxDegree, a.xk);
+    send(e, 2, where >> 2 * kLocalBits, a.xl);
     if constexpr ((wanted & kMaterial) != 0) {
       if (s.one_material) {
         material_bar[0] += a.mu;
@@ -215,35 +269,61 @@ struct GroupStar {
   }
   mutable T material_bar[2] = {T(0), T(0)};
 
-  // Writes the rows of the vertex's edges: the sums of its threads, in their order.
-  __device__ __forceinline__ void send_rows() const {
+  // Writes the rows of the vertex's edges: the sums of its threads, in their order. What is pinned has no turn of its own:
+  // rows that lead to it add up over the sweeps.
+  __device__ __forceinline__ void send_rows(int pinned) const {
     __syncwarp();
     T* rows = s.w.rows + at.scene * (static_cast<int64_t>(s.plan.edge_slots) * kSlice + 1) * kRow;
-    const T* from = sums - at.lane * P::groups;
     for (int a = at.lane; a < degree; a += lanes) {
+      const int64_t edge = static_cast<int64_t>(first_edge + a) * kSlice + at.v;
+      const bool adds = __ldg(s.plan.adjacent + edge) >= pinned;
       Vec3<T> sum = zero3<T>();
+      if constexpr (gather) {
+        const int end = __ldg(s.plan.edge_entry + first_edge + a + 1);
+#pragma unroll 4
+        for (int i = __ldg(s.plan.edge_entry + first_edge + a); i < end; ++i) {
+          const T* p = sums + __ldg(s.plan.entry + static_cast<int64_t>(i) * kSlice + at.v) * 3 * P::groups;
+          sum += Vec3<T>{p[0], p[P::groups], p[2 * P::groups]};
+        }
+      } else {
+        const T* from = sums - at.lane * P::groups + a * 3 * kSlice;
 #pragma unroll
-      for (int l = 0; l < lanes; ++l) {
-        const T* p = from + a * 3 * kSlice + l * P::groups;
-        sum += Vec3<T>{p[0], p[kSlice], p[2 * kSlice]};
+        for (int l = 0; l < lanes; ++l) {
+          const T* p = from + l * P::groups;
+          sum += Vec3<T>{p[0], p[kSlice], p[2 * kSlice]};
+        }
       }
-      store_row(rows, static_cast<int64_t>(first_edge + a) * kSlice + at.v, sum);
+      if (adds) sum += load_row(rows, edge);
+      store_row(rows, edge, sum);
     }
   }
 };
 
-// What the neighbours' updates have added to a vertex since its last turn (as in cpu/scene.h).
-template <class T, int lanes>
-__device__ __forceinline__ Vec3<T> pull_rows(const StepView<T>& s, const Place<lanes>& at, int64_t below) {
-  const T* rows = s.w.rows + at.scene * (static_cast<int64_t>(s.plan.edge_slots) * kSlice + 1) * kRow;
+// What the neighbours' updates have added to a vertex since its last turn (as in cpu/scene.h); of all rows, or of those
+// below a bound.
+template <bool all, class T, int lanes_>
+__device__ __forceinline__ Vec3<T> pull_rows(const StepView<T>& s, const Place<lanes_>& at, int below = 0) {
+  constexpr int lanes = threads_of(lanes_);
+  constexpr int batch = lanes >= 32 ? 1 : lanes >= 8 ? 3 : 4;
+  const int none = s.plan.edge_slots * kSlice;  // the row that stays zero
+  const T* rows = s.w.rows + at.scene * (static_cast<int64_t>(none) + 1) * kRow;
   Vec3<T> sum = zero3<T>();
   const int end = __ldg(s.plan.block_incoming + at.block + 1);
-#pragma unroll 4
-  for (int e = __ldg(s.plan.block_incoming + at.block) + at.lane; e < end; e += lanes) {
-    const int row = __ldg(s.plan.incoming + static_cast<int64_t>(e) * kSlice + at.v);
-    if (row < below) sum += load_row(rows, row);
+  for (int start = __ldg(s.plan.block_incoming + at.block) + at.lane; start < end; start += batch * lanes) {
+    int row[batch];
+    Vec3<T> part[batch];
+#pragma unroll
+    for (int u = 0; u < batch; ++u) {
+      const int e = start + u * lanes;
+      row[u] = e < end ? __ldg(s.plan.incoming + static_cast<int64_t>(e) * kSlice + at.v) : none;
+      if (!all && row[u] >= below) row[u] = none;
+    }
+#pragma unroll
+    for (int u = 0; u < batch; ++u) part[u] = load_row(rows, row[u]);
+#pragma unroll
+    for (int u = 0; u < batch; ++u) sum += part[u];
   }
-  Place<lanes>::sum(sum);
+  if constexpr (lanes > 1) Place<lanes_>::sum(sum);
   return sum;
 }
 
@@ -252,7 +332,7 @@ __device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const Place
   Block<T> out;
   const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
   const int64_t vectors = at.scene * s.positions * 3;
-  out.state.x = load_row(s.w.x, at.scene * s.positions + position);
+  out.state.x = load_row(s.w.x, at.scene * s.positions + position, s.own);
   out.state.x_prev = zero3<T>();
   out.state.origin = zero3<T>();
   if constexpr (Set::reads_x_prev) out.state.x_prev = load3(s.w.x_prev + vectors, at.block, at.v);
@@ -274,23 +354,26 @@ __device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const Place
   return out;
 }
 
-// All threads of a cooperative launch wait for each other; `turn` counts the meetings.
+// All threads of a cooperative launch wait for each other; `turn` counts the meetings. The arrival releases what the block
+// wrote; no acquire follows, which would empty the L1 cache of the mesh's data too: what other blocks write is read
+// from the L2 cache alone (load_state).
 __device__ __forceinline__ void grid_barrier(unsigned* counter, unsigned& turn) {
   __syncthreads();
   turn += gridDim.x;
   if (threadIdx.x == 0) {
-    __threadfence();
-    atomicAdd(counter, 1u);
-    while (*reinterpret_cast<volatile unsigned*>(counter) < turn) {
-    }
-    __threadfence();
+    asm volatile("red.release.gpu.global.add.u32 [%0], 1;" ::"l"(counter) : "memory");
+    unsigned seen;
+    do {
+      asm volatile("ld.relaxed.gpu.global.u32 %0, [%1];" : "=r"(seen) : "l"(counter) : "memory");
+    } while (seen < turn);
   }
   __syncthreads();
 }
 
 // Calls visit(scene, block, part) for the warps' share of each color, with barriers between colors.
-template <class T, int lanes, class Visit>
+template <class T, int lanes_, class Visit>
 __device__ __forceinline__ void each_color(const StepView<T>& s, const Range& range, bool backward, Visit&& visit) {
+  constexpr int lanes = threads_of(lanes_);
   const bool own = range.regime == kBlock;
   const int64_t scenes_at_once = own ? 1 : s.scenes;
   const unsigned warp = threadIdx.x / kSlice, warps_of_block = blockDim.x / kSlice;
@@ -300,14 +383,12 @@ __device__ __forceinline__ void each_color(const StepView<T>& s, const Range& ra
   for (int64_t own_scene = own ? blockIdx.x : 0; own_scene < (own ? s.scenes : 1); own_scene += gridDim.x) {
     for (int k = range.first_sweep; k < range.end_sweep; ++k) {
       for (int c = range.first_color; c < range.end_color; ++c) {
-        // the reverse meets what is pinned (color `colors`) after the last color, at the end of each sweep
-        const int color = backward && c < s.plan.colors ? s.plan.colors - 1 - c : c;
-        const int begin = __ldg(s.plan.color_block + color);
-        const int end = color < s.plan.colors ? __ldg(s.plan.color_block + color + 1) : s.plan.blocks;
+        const int color = backward ? s.plan.colors - 1 - c : c;
+        const int begin = __ldg(s.plan.color_block + color), end = __ldg(s.plan.color_block + color + 1);
         const unsigned parts = static_cast<unsigned>(end - begin) * lanes;
         for (unsigned i = first; i < parts * static_cast<unsigned>(scenes_at_once); i += stride) {
           const unsigned scene = scenes_at_once == 1 ? 0 : i / parts, part = i - scene * parts;
-          visit(own_scene + scene, k, color, begin + static_cast<int>(part / lanes), static_cast<int>(part % lanes));
+          visit(own_scene + scene, k, begin + static_cast<int>(part / lanes), static_cast<int>(part % lanes));
         }
         if (own) {
           __syncthreads();

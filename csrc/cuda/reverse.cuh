@@ -8,55 +8,57 @@
 namespace diffvbd::cuda {
 namespace {
 
+constexpr int kReverseRegisters = 168;  // three warps of each scheduler fit
+
 template <class T, int mask, int wanted, int lanes>
-__global__ void __launch_bounds__(kMaxThreads) sweep_reverse(const __grid_constant__ StepView<T> s,
+__global__ void __maxnreg__(kReverseRegisters) sweep_reverse(const __grid_constant__ StepView<T> s,
                                                           const __grid_constant__ Range range) {
   using Set = EnergySet<mask>;
   const int rows = tape_rows(s.tape_policy, Set::filters);
   T* const shared = memory_of_warp<T, lanes>(s, true);
-  const int64_t every_row = static_cast<int64_t>(s.plan.edge_slots) * kSlice;
-  each_color<T, lanes>(s, range, true, [&](int64_t scene, int turn, int color, int block, int part) {
+  each_color<T, lanes>(s, range, true, [&](int64_t scene, int turn, int block, int part) {
     const Place<lanes> at(scene, block, part);
     const int64_t position = static_cast<int64_t>(block) * kSlice + at.v, row = scene * s.positions + position;
-    const Vec3<T> x_bar = load_row(s.w.x_bar, row) + pull_rows(s, at, every_row);
-    if (color == s.plan.colors) {  // pinned: it only collects, before the rows are overwritten
-      if (at.lane == 0) store_row(s.w.x_bar, row, x_bar);
-      return;
-    }
-    GroupStar<T, lanes> star(s, at, shared);
-    Block<T> b = load_block<Set>(s, at);
-    if constexpr (Set::elastic) {
-      star.fetch_neighbours();
-      star.clear_sums(shared);
-    }
+    // What the tape and the accumulators hold is asked for first: it comes from farthest away.
     const int rank = __ldg(s.plan.block_rank + block) + at.v;
-    const bool real = rank < __ldg(s.plan.block_rank + block + 1);
+    const int end_rank = __ldg(s.plan.block_rank + block + 1);
+    if (rank - at.group >= end_rank) return;  // the whole warp: phantoms alone
+    const bool real = rank < end_rank, full = s.tape_policy == kFullTape;
     const T* from = s.tape + (scene * s.sweeps + (s.sweeps - 1 - turn)) * rows * s.plan.num_active + (real ? rank : 0);
     const auto get = [&] {
       const T value = __ldg(from);
       from += s.plan.num_active;
       return value;
     };
-    if (s.tape_policy == kCompactTape || Set::filters) b.state.x = {get(), get(), get()};
-    Vec3<T> d_raw;
-    Sym3<T> H;
-    if (s.tape_policy == kFullTape) {
-      d_raw = {get(), get(), get()};
-      H = {get(), get(), get(), get(), get(), get()};
-    } else {
+    Vec3<T> x_old, d_raw;
+    Factor<T> H;
+    if (Set::filters) x_old = {get(), get(), get()};
+    if (full || !Set::filters) d_raw = {get(), get(), get()};
+    if (full) H = {get(), get(), get(), get(), get(), get()};
+    const Vec3<T> y_bar = load_own3(s.w.y_bar + scene * s.positions * 3, block, at.v);
+    GroupStar<T, lanes> star(s, at, shared);
+    star.repeats = !full;
+    Block<T> b = load_block<Set>(s, at);
+    if (Set::filters) b.state.x = x_old;
+    if constexpr (Set::elastic) star.clear_sums(shared);
+    const Vec3<T> x_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
+    if constexpr (Set::elastic) star.fetch_neighbours();
+    if (!full) {
+      // H of a scene without filters depends on the neighbours alone
       const System<T> system = assemble<Set>(b, star, s.parameters);
-      d_raw = newton_step(b, system, s.parameters);
-      H = system.H;
+      H = factored(b, system, s.parameters);
+      if (Set::filters) d_raw = newton_step(system, H);
+      star.repeats = false;
     }
     const Update<T> u = safeguarded<Set>(b, d_raw, s.parameters);
-    if (s.tape_policy == kFullTape && !Set::filters) b.state.x -= u.step;
+    if (!Set::filters) b.state.x -= u.step;
     const bool writes = at.lane == 0 && real;
     const BlockAdjoint<T> out = reverse_vertex<Set, wanted>(
         b, star, u, H, x_bar, s.parameters, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
           if (writes) s.w.data_bar[(scene * s.data_scalars + s.data_row[k] + i) * s.positions + position] += value;
         });
     if constexpr (Set::elastic) {
-      star.send_rows();
+      star.send_rows(__ldg(s.plan.color_block + s.plan.colors) * kSlice);
       if constexpr ((wanted & kMaterial) != 0) {
         if (s.one_material) {
           star.total(star.material_bar[0], star.material_bar[1]);
@@ -68,9 +70,12 @@ __global__ void __launch_bounds__(kMaxThreads) sweep_reverse(const __grid_consta
     if (writes) {
       store_row(s.w.x, row, b.state.x);
       store_row(s.w.x_bar, row, out.x);
-      add3(s.w.y_bar + scene * s.positions * 3, block, at.v, out.y);
+      store3(s.w.y_bar + scene * s.positions * 3, block, at.v, y_bar + out.y);
       if (s.w.mass_bar) s.w.mass_bar[row] += out.mass;
-      if constexpr (Set::reads_x_prev) add3(s.w.x_prev_bar + scene * s.positions * 3, block, at.v, out.x_prev);
+      if constexpr (Set::reads_x_prev) {
+        T* to = s.w.x_prev_bar + scene * s.positions * 3;
+        store3(to, block, at.v, load_own3(to, block, at.v) + out.x_prev);
+      }
     }
     __syncwarp();
   });
@@ -92,9 +97,16 @@ template <class T, int wanted>
 SweepKernel<T> reverse_kernel(int energies, int lanes) {
   constexpr auto sets = std::make_integer_sequence<int, kEnergySets>{};
   const int index = energy_index(energies);
-  return lanes == kFewLanes    ? pick_reverse<T, wanted, kFewLanes>(index, sets)
-         : lanes == kManyLanes ? pick_reverse<T, wanted, kManyLanes>(index, sets)
-                               : pick_reverse<T, wanted, kSpillLanes>(index, sets);
+  switch (lanes) {
+    case kFewLanes:
+      return pick_reverse<T, wanted, kFewLanes>(index, sets);
+    case kSomeLanes:
+      return pick_reverse<T, wanted, kSomeLanes>(index, sets);
+    case kManyLanes:
+      return pick_reverse<T, wanted, kManyLanes>(index, sets);
+    default:
+      return pick_reverse<T, wanted, kSpillLanes>(index, sets);
+  }
 }
 
 }  // namespace diffvbd::cuda

@@ -15,7 +15,7 @@ constexpr size_t kBarrierBytes = 256;
 // Threads per vertex that the shared memory of a block allows.
 template <class T>
 int possible_lanes(const HostPlan& host, const Choice& choice, bool reverse) {
-  return shared_scalars(host.degree, choice.lanes, reverse) * sizeof(T) <= choice.shared ? choice.lanes : kSpillLanes;
+  return shared_scalars(host.degree, host.valence, choice.lanes, reverse) * sizeof(T) <= choice.shared ? choice.lanes : kSpillLanes;
 }
 
 // Hands out the parts of a workspace; without one it only counts.
@@ -61,7 +61,7 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   *spill = nullptr;
   if (possible_lanes<T>(host, choice, reverse) == kSpillLanes) {
     const int64_t warps = int64_t{choice.multiprocessors} * kWarpsPerBlock;
-    *spill = take(true, warps * shared_scalars(host.degree, kSpillLanes, reverse));
+    *spill = take(true, warps * shared_scalars(host.degree, host.valence, kSpillLanes, reverse));
   }
   return w;
 }
@@ -87,6 +87,8 @@ struct Runner {
     s.plan = host.plan;
     s.positions = int64_t{host.plan.blocks} * kSlice;
     s.degree = host.degree;
+    s.valence = host.valence;
+    s.own = choice.regime == kBlock;
     s.parameters = in.parameters;
     s.sweeps = in.sweeps;
     s.tape_policy = in.tape_policy;
@@ -137,19 +139,17 @@ struct Runner {
   }
 
   int64_t blocks_of(int color) const {
-    const int64_t end = color < host.plan.colors ? host.color_block[color + 1] : host.plan.blocks;
-    return end - host.color_block[color];
+    return host.color_block[color + 1] - host.color_block[color];
   }
 
   cudaError_t sweep(SweepKernel<T> kernel, int lanes, bool backward) {
     const GroupPlan& plan = host.plan;
-    const bool pinned = backward && plan.blocks > host.color_block[plan.colors];
-    const int colors = plan.colors + (pinned ? 1 : 0);
+    const int colors = plan.colors;
     if (in.sweeps == 0 || colors == 0) return cudaSuccess;
     int64_t most = 1;
-    for (int c = 0; c < colors; ++c) most = std::max(most, blocks_of(c) * lanes);
+    for (int c = 0; c < colors; ++c) most = std::max(most, blocks_of(c) * threads_of(lanes));
     const bool own = choice.regime == kBlock, spills = lanes == kSpillLanes;
-    const size_t shared_of_warp = spills ? 0 : shared_scalars(host.degree, lanes, backward) * sizeof(T);
+    const size_t shared_of_warp = spills ? 0 : shared_scalars(host.degree, host.valence, lanes, backward) * sizeof(T);
     int64_t warps = own && !spills ? std::min<int64_t>(kMaxThreads / kSlice, most) : kWarpsPerBlock;
     if (shared_of_warp > 0) warps = std::min<int64_t>(warps, choice.shared / shared_of_warp);
     const size_t shared = shared_of_warp * warps;
@@ -183,9 +183,9 @@ struct Runner {
       for (int c = 0; c < colors; ++c) {
         range.first_sweep = k, range.end_sweep = k + 1;
         range.first_color = c, range.end_color = c + 1;
-        const int color = backward && c < plan.colors ? plan.colors - 1 - c : c;
+        const int color = backward ? colors - 1 - c : c;
         if (blocks_of(color) == 0) continue;
-        if (auto error = launch(blocks_for(blocks_of(color) * lanes))) return error;
+        if (auto error = launch(blocks_for(blocks_of(color) * threads_of(lanes)))) return error;
       }
     }
     return cudaSuccess;

@@ -17,32 +17,35 @@ constexpr int kColumn = kSlice + 1;  // distance of a column's entries: one more
 // What the threads of a block share: the list of visits, and the rest scalars unless scenes have their own.
 template <class T>
 struct Visits {
-  const int32_t *visit, *pair;  // as in GroupPlan
-  const T* rest;                // [pairs, 4] or null
-  uint64_t active;              // mask of the vertices that sweeps move
+  const int2* visit;  // vertex + (its pairs << kLocalBits), its first pair
+  const int4* pair;   // offsets of j, k, l in a column; tet
+  const T* rest;      // [pairs, 4]
+  uint64_t active;    // mask of the vertices that sweeps move
 
-  // rounded, so that the pairs' rows are aligned
-  DIFFVBD_FN static size_t visit_ints(const GroupPlan& plan) { return (2 * static_cast<size_t>(plan.num_active) + 3) / 4 * 4; }
-  DIFFVBD_FN static size_t ints(const GroupPlan& plan) {
-    return visit_ints(plan) + 16 * static_cast<size_t>(plan.num_tets);
+  // int32 of the visits, rounded so that the pairs' rows are aligned
+  DIFFVBD_FN static int visit_ints(const GroupPlan& plan) { return (2 * plan.num_active + 3) / 4 * 4; }
+  DIFFVBD_FN static size_t bytes(const GroupPlan& plan) {
+    return 4 * (static_cast<size_t>(visit_ints(plan)) + 16 * static_cast<size_t>(plan.num_tets)) +
+           16 * sizeof(T) * static_cast<size_t>(plan.num_tets);
   }
   __device__ __forceinline__ Visits(const StepInputs<T>& in, const GroupPlan& plan, unsigned char* memory) {
     int32_t* to = reinterpret_cast<int32_t*>(memory);
-    const int visits = static_cast<int>(visit_ints(plan)), pairs = 16 * plan.num_tets;
+    int4* pairs = reinterpret_cast<int4*>(to + visit_ints(plan));
+    T* own = reinterpret_cast<T*>(pairs + 4 * plan.num_tets);
     for (int i = threadIdx.x; i < 2 * plan.num_active; i += blockDim.x) to[i] = __ldg(plan.visit + i);
-    for (int i = threadIdx.x; i < pairs; i += blockDim.x) to[visits + i] = __ldg(plan.visit_pair + i);
-    visit = to;
-    pair = to + visits;
-    __syncthreads();
-    rest = nullptr;
-    if (in.rest.scene == 0 && in.rest.data) {
-      T* own = reinterpret_cast<T*>(to + ints(plan));
-      for (int i = threadIdx.x; i < 4 * plan.num_tets; i += blockDim.x) load_rest(in.rest.data, pair[4 * i + 2], own + 4 * i);
-      rest = own;
+    for (int i = threadIdx.x; i < 4 * plan.num_tets; i += blockDim.x) {
+      const int32_t* row = plan.visit_pair + 4 * i;
+      const int where = __ldg(row);
+      pairs[i] = {3 * kColumn * (where & kMaxDegree), 3 * kColumn * (where >> kLocalBits & kMaxDegree),
+                  3 * kColumn * (where >> 2 * kLocalBits), __ldg(row + 1)};
+      if (in.rest.scene == 0 && in.rest.data) load_rest(in.rest.data, __ldg(row + 2), own + 4 * i);
     }
-    active = 0;
-    for (int r = 0; r < plan.num_active; ++r) active |= uint64_t{1} << (visit[2 * r] & kMaxDegree);
+    visit = reinterpret_cast<const int2*>(to);
+    pair = pairs;
+    rest = own;
     __syncthreads();
+    active = 0;
+    for (int r = 0; r < plan.num_active; ++r) active |= uint64_t{1} << (visit[r].x & kMaxDegree);
   }
   // Pairs of inactive corners stand in no list: their entries are zero and are never read.
   __device__ __forceinline__ static void load_rest(const T* packed, int pair, T* to) {
@@ -67,88 +70,125 @@ __device__ __forceinline__ void set_column3(T* column, int vertex, const Vec3<T>
   a[2 * kColumn] = v.z;
 }
 
-// Calls visit(element of [scenes, 3 V], place in a tile) for what a warp's scenes own of an array, side by side.
-template <class F>
-__device__ __forceinline__ void each_element(int64_t base, int64_t scenes, int size, F&& visit) {
+// For what a warp's scenes own of an array [scenes, 3 V], side by side in memory: load(element) for several elements at
+// once, then keep(element, place in a tile, value) for each.
+template <class Load, class Keep>
+__device__ __forceinline__ void each_element(int64_t base, int64_t scenes, int size, Load&& load, Keep&& keep) {
+  constexpr int batch = 8;
   const int count = static_cast<int>(min(static_cast<int64_t>(kSlice), scenes - base)) * size;
-  int item = threadIdx.x % kSlice, scene = 0;
-  for (int g = item; g < count; g += kSlice, item += kSlice) {
-    while (item >= size) item -= size, ++scene;
-    visit(base * size + g, item * kColumn + scene);
+  const int lane = threadIdx.x % kSlice;
+  int item = lane, scene = 0;
+  for (int start = lane; start < count; start += batch * kSlice) {
+    decltype(load(base)) values[batch];
+#pragma unroll
+    for (int u = 0; u < batch; ++u) {
+      const int g = start + u * kSlice;
+      if (g < count) values[u] = load(base * size + g);
+    }
+#pragma unroll
+    for (int u = 0; u < batch; ++u, item += kSlice) {
+      const int g = start + u * kSlice;
+      if (g >= count) continue;
+      while (item >= size) item -= size, ++scene;
+      keep(base * size + g, item * kColumn + scene, values[u]);
+    }
   }
 }
 
-// The incident tets of one vertex in 32 scenes. x_bar is null in the forward.
 template <class T>
+struct Pair {
+  T first, second;
+};
+
+// The incident tets of one vertex in 32 scenes. `common`: all scenes share their rest shape, and all tets of a scene
+// their material. x_bar is null in the forward.
+template <class T, bool common>
 struct SceneStar {
   const StepInputs<T>& in;
   const StepAdjoints<T>* out;
+  const GroupPlan& plan;
   const Visits<T>& list;
   const T* x;
   T* x_bar;
   int64_t scene;
-  int first, count, num_tets;
+  int first, count;
   T mu, lam;
 
+  __device__ __forceinline__ SceneStar(const StepInputs<T>& in, const StepAdjoints<T>* out, const GroupPlan& plan,
+                                       const Visits<T>& list, const T* x, T* x_bar, int64_t scene)
+      : in(in), out(out), plan(plan), list(list), x(x), x_bar(x_bar), scene(scene), mu(T(0)), lam(T(0)) {
+    if (in.mu.data && in.mu.item == 0) mu = __ldg(in.mu.data + scene * in.mu.scene);
+    if (in.lam.data && in.lam.item == 0) lam = __ldg(in.lam.data + scene * in.lam.scene);
+  }
+  __device__ __forceinline__ int go_to(int rank) {
+    const int2 v = list.visit[rank];
+    count = v.x >> kLocalBits;
+    first = v.y;
+    return v.x & kMaxDegree;
+  }
   __device__ __forceinline__ int size() const { return count; }
   template <class... R>
   __device__ __forceinline__ void total(R&...) const {}
-  __device__ __forceinline__ int4 entry(int e) const {
-    return reinterpret_cast<const int4*>(list.pair)[first + e];
+  __device__ __forceinline__ Vec3<T> at(int offset) const {
+    const T* a = x + offset;
+    return {a[0], a[kColumn], a[2 * kColumn]};
   }
   __device__ __forceinline__ TetPair<T> pair(int e) const {
-    const int4 row = entry(e);
+    const int4 row = list.pair[first + e];
     TetPair<T> p;
-    p.xj = column3(x, row.x & kMaxDegree);
-    p.xk = column3(x, row.x >> kLocalBits & kMaxDegree);
-    p.xl = column3(x, row.x >> 2 * kLocalBits);
+    p.xj = at(row.x);
+    p.xk = at(row.y);
+    p.xl = at(row.z);
+    p.mu = mu;
+    p.lam = lam;
+    const Pack<T>* shared = reinterpret_cast<const Pack<T>*>(list.rest + 4 * (first + e));
     T rest[4];
-    if (list.rest) {
-      const T* from = list.rest + 4 * (first + e);
 #pragma unroll
-      for (int a = 0; a < 4; ++a) rest[a] = from[a];
-    } else {
-      Visits<T>::load_rest(in.rest.data + scene * in.rest.scene, row.z, rest);
+    for (int a = 0; a < 4; ++a) rest[a] = shared[a / Pack<T>::size].v[a % Pack<T>::size];
+    if constexpr (!common) {
+      if (in.rest.scene != 0) {
+        const int pair = __ldg(plan.visit_pair + 4 * (first + e) + 2);
+        Visits<T>::load_rest(in.rest.data + scene * in.rest.scene, pair, rest);
+      }
+      if (in.mu.item != 0) p.mu = __ldg(in.mu.data + scene * in.mu.scene + row.w);
+      if (in.lam.item != 0) p.lam = __ldg(in.lam.data + scene * in.lam.scene + row.w);
     }
     p.k_ij = rest[0], p.k_ik = rest[1], p.k_il = rest[2], p.c6 = rest[3];
-    p.mu = in.mu.item == 0 ? mu : __ldg(in.mu.data + scene * in.mu.scene + row.y);
-    p.lam = in.lam.item == 0 ? lam : __ldg(in.lam.data + scene * in.lam.scene + row.y);
     return p;
   }
-  __device__ __forceinline__ void send(int vertex, const Vec3<T>& v) const {
-    T* to = x_bar + 3 * vertex * kColumn;
+  __device__ __forceinline__ void send(int offset, const Vec3<T>& v) const {
+    T* to = x_bar + offset;
     to[0] += v.x;
     to[kColumn] += v.y;
     to[2 * kColumn] += v.z;
   }
   template <int wanted>
   __device__ __forceinline__ void add(int e, const TetPairAdjoint<T>& a) const {
-    const int4 row = entry(e);
-    send(row.x & kMaxDegree, a.xj);
-    send(row.x >> kLocalBits & kMaxDegree, a.xk);
-    send(row.x >> 2 * kLocalBits, a.xl);
+    const int4 row = list.pair[first + e];
+    send(row.x, a.xj);
+    send(row.y, a.xk);
+    send(row.z, a.xl);
     if constexpr ((wanted & kMaterial) != 0) {
       mu_bar += a.mu;
       lam_bar += a.lam;
-      if (real && out->mu && (in.mu.item != 0 || in.lam.item != 0)) {
-        out->mu[scene * num_tets + row.y] += a.mu;
-        out->lam[scene * num_tets + row.y] += a.lam;
+      if (!common && out->mu && (in.mu.item != 0 || in.lam.item != 0)) {
+        out->mu[scene * plan.num_tets + row.w] += a.mu;
+        out->lam[scene * plan.num_tets + row.w] += a.lam;
       }
     }
     if constexpr ((wanted & kRest) != 0) {
-      if (real) {
-        T* r = out->rest + (scene * num_tets + row.y) * kRestScalars;
-        r[weight_index(row.w, other_corner(row.w, 0))] += a.k_ij;
-        r[weight_index(row.w, other_corner(row.w, 1))] += a.k_ik;
-        r[weight_index(row.w, other_corner(row.w, 2))] += a.k_il;
-        r[kRestScalars - 1] += a.c6;
-      }
+      const int own = __ldg(plan.visit_pair + 4 * (first + e) + 3);
+      T* r = out->rest + (scene * plan.num_tets + row.w) * kRestScalars;
+      r[weight_index(own, other_corner(own, 0))] += a.k_ij;
+      r[weight_index(own, other_corner(own, 1))] += a.k_ik;
+      r[weight_index(own, other_corner(own, 2))] += a.k_il;
+      r[kRestScalars - 1] += a.c6;
     }
   }
   mutable T mu_bar = T(0), lam_bar = T(0);
-  bool real = true;  // threads after the last scene repeat it, and write nothing
 };
 
+// y is null where nothing depends on it.
 template <class Set, class T>
 __device__ __forceinline__ Block<T> load_scene_block(const StepInputs<T>& in, const GroupPlan& plan,
                                                      const int64_t* data_start, int64_t scene, int vertex, const T* x,
@@ -166,7 +206,7 @@ __device__ __forceinline__ Block<T> load_scene_block(const StepInputs<T>& in, co
     if (in.origin.data) b.state.origin = user(in.origin);
   }
   b.state.h = in.parameters.time_step;
-  b.y = column3(y, vertex);
+  b.y = y ? column3(y, vertex) : zero3<T>();
   b.mass = __ldg(in.mass.data + scene * in.mass.scene + vertex);
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
@@ -188,60 +228,79 @@ __device__ __forceinline__ void data_starts(const StepInputs<T>& in, const Group
   }
 }
 
-// A warp's tiles hold x and y, in the reverse x_bar and y_bar too.
+// A warp's tiles, one for each array of positions that it works on.
 template <class T>
-__device__ __forceinline__ T* tiles_of_warp(const StepInputs<T>& in, const GroupPlan& plan, unsigned char* memory,
-                                            int tiles) {
-  T* all = reinterpret_cast<T*>(reinterpret_cast<int32_t*>(memory) + Visits<T>::ints(plan)) +
-           (in.rest.scene == 0 ? 16 * plan.num_tets : 0);
+__device__ __forceinline__ T* tiles_of_warp(const GroupPlan& plan, unsigned char* memory, int tiles) {
+  T* all = reinterpret_cast<T*>(memory + Visits<T>::bytes(plan));
   return all + threadIdx.x / kSlice * tiles * 3 * plan.num_vertices * kColumn;
 }
 
-// Fills the tiles of y and, in the forward, of where the sweeps start.
+// Fills the tiles of y and of where the sweeps start; either may be null.
 template <class T>
 __device__ __forceinline__ void load_start(const StepInputs<T>& in, const GroupPlan& plan, const Visits<T>& list,
                                            int64_t base, T* x, T* y) {
   const int size = 3 * plan.num_vertices;
   if (!in.fused) {
-    each_element(base, in.scenes, size, [&](int64_t from, int to) {
-      if (x) x[to] = in.x_start.data[from];
-      y[to] = in.y.data[from];
-    });
+    each_element(
+        base, in.scenes, size,
+        [&](int64_t from) {
+          return Pair<T>{x ? __ldg(in.x_start.data + from) : T(0), __ldg(in.y.data + from)};
+        },
+        [&](int64_t, int to, const Pair<T>& value) {
+          if (x) x[to] = value.first;
+          if (y) y[to] = value.second;
+        });
     return;
   }
   const T h = in.parameters.time_step;
-  each_element(base, in.scenes, size, [&](int64_t from, int to) {
-    const int item = to / kColumn, vertex = item / 3;
-    const int64_t scene = base + to % kColumn;
-    T value = in.x_prev.data[from];
-    if (list.moves(vertex)) {
-      const T a = in.acceleration.data[scene * in.acceleration.scene + (in.acceleration.item ? item : item % 3)];
-      value = value + h * in.v.data[from] + (h * h) * a;
-    } else if (in.held.data) {
-      value = in.held.data[scene * in.held.scene + item];
-    }
-    y[to] = value;
-    if (x) x[to] = value;
-  });
+  each_element(
+      base, in.scenes, size,
+      [&](int64_t from) { return Pair<T>{__ldg(in.x_prev.data + from), __ldg(in.v.data + from)}; },
+      [&](int64_t, int to, const Pair<T>& state) {
+        const int item = to / kColumn;
+        const int64_t scene = base + to % kColumn;
+        T value = state.first;
+        if (list.moves(item / 3)) {
+          const T* a = in.acceleration.data + scene * in.acceleration.scene;
+          value = value + h * state.second + (h * h) * __ldg(a + (in.acceleration.item ? item : item % 3));
+        } else if (in.held.data) {
+          value = in.held.data[scene * in.held.scene + item];
+        }
+        if (y) y[to] = value;
+        if (x) x[to] = value;
+      });
 }
 
 // One launch: as many blocks as the device holds, each going on until all scenes are done.
+template <class T>
+bool is_common(const StepInputs<T>& in) {
+  return in.rest.scene == 0 && in.mu.item == 0 && in.lam.item == 0;
+}
+
 template <class T, class K>
 cudaError_t launch_scenes(K kernel, void** arguments, const StepInputs<T>& in, const GroupPlan& plan, int tiles,
                           const Choice& choice, cudaStream_t stream) {
   const void* function = reinterpret_cast<const void*>(kernel);
-  const size_t common = 4 * Visits<T>::ints(plan) + (in.rest.scene == 0 ? 16 * sizeof(T) * plan.num_tets : 0);
+  const size_t common = Visits<T>::bytes(plan);
   const size_t of_warp = sizeof(T) * tiles * 3 * plan.num_vertices * kColumn;
   if (common + of_warp > choice.shared) return cudaErrorInvalidConfiguration;
-  const auto warps = std::min<size_t>(kMaxSceneThreads / kSlice, (choice.shared - common) / of_warp);
-  const size_t shared = common + warps * of_warp;
-  const int threads = static_cast<int>(warps) * kSlice;
-  if (shared > 48 * 1024) {
-    const auto attribute = cudaFuncAttributeMaxDynamicSharedMemorySize;
-    if (auto error = cudaFuncSetAttribute(function, attribute, static_cast<int>(shared))) return error;
+  // the block size that keeps most warps on a multiprocessor
+  int threads = 0, resident = 0;
+  size_t shared = 0;
+  for (int warps = 1; warps <= kMaxSceneThreads / kSlice; ++warps) {
+    const size_t bytes = common + warps * of_warp;
+    if (bytes > choice.shared) break;
+    if (bytes > 48 * 1024) {
+      const auto attribute = cudaFuncAttributeMaxDynamicSharedMemorySize;
+      if (auto error = cudaFuncSetAttribute(function, attribute, static_cast<int>(bytes))) return error;
+    }
+    int blocks = 0;
+    if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&blocks, function, warps * kSlice, bytes)) {
+      return error;
+    }
+    if (blocks * warps * kSlice < resident * threads) continue;
+    threads = warps * kSlice, resident = blocks, shared = bytes;
   }
-  int resident = 0;
-  if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, function, threads, shared)) return error;
   const int64_t needed = (in.scenes + threads - 1) / threads;
   const auto blocks = std::min<int64_t>(needed, int64_t{std::max(1, resident)} * choice.multiprocessors);
   return cudaLaunchKernel(function, dim3(static_cast<unsigned>(blocks)), dim3(threads), arguments, shared, stream);

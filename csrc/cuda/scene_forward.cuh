@@ -6,37 +6,33 @@
 namespace diffvbd::cuda {
 namespace {
 
-template <class T, int mask>
-__global__ void __launch_bounds__(kMaxSceneThreads) scene_forward(const __grid_constant__ StepInputs<T> in,
-                                                               const __grid_constant__ StepOutputs<T> out,
-                                                               const __grid_constant__ GroupPlan plan) {
+template <class T, int mask, bool common>
+__global__ void __launch_bounds__(kMaxSceneThreads, 4) scene_forward(const __grid_constant__ StepInputs<T> in,
+                                                                  const __grid_constant__ StepOutputs<T> out,
+                                                                  const __grid_constant__ GroupPlan plan) {
   using Set = EnergySet<mask>;
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
   const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice, rows = tape_rows(in.tape_policy, Set::filters);
-  T* const tile = tiles_of_warp(in, plan, memory, 2);
-  T *const x = tile + lane, *const y = x + size * kColumn;
+  T *const x_tile = tiles_of_warp<T>(plan, memory, 2), *const y_tile = x_tile + size * kColumn;
+  T *const x = x_tile + lane, *const y = y_tile + lane;
   int64_t start[kVertexEnergies];
   data_starts(in, plan, start);
   const int64_t stride = static_cast<int64_t>(gridDim.x) * blockDim.x;
-  for (int64_t base = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x / kSlice * kSlice;
-       base < in.scenes; base += stride) {
-    load_start(in, plan, list, base, tile, tile + size * kColumn);
+  for (int64_t base = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x / kSlice * kSlice; base < in.scenes;
+       base += stride) {
+    load_start(in, plan, list, base, x_tile, y_tile);
     __syncwarp();
-    const bool real = base + lane < in.scenes;
-    const int64_t scene = real ? base + lane : base;
-    if (real) {
-      SceneStar<T> star{in, nullptr, list, x, nullptr, scene, 0, 0, plan.num_tets, T(0), T(0)};
-      if (Set::elastic && in.mu.item == 0) star.mu = __ldg(in.mu.data + scene * in.mu.scene);
-      if (Set::elastic && in.lam.item == 0) star.lam = __ldg(in.lam.data + scene * in.lam.scene);
+    const int64_t scene = base + lane;
+    if (scene < in.scenes) {
+      SceneStar<T, common> star(in, nullptr, plan, list, x, nullptr, scene);
       for (int k = 0; k < in.sweeps; ++k) {
         for (int r = 0; r < plan.num_active; ++r) {
-          const int vertex = list.visit[2 * r] & kMaxDegree;
-          star.count = list.visit[2 * r] >> kLocalBits;
-          star.first = list.visit[2 * r + 1];
+          const int vertex = star.go_to(r);
           const Block<T> b = load_scene_block<Set>(in, plan, start, scene, vertex, x, y);
           const System<T> system = assemble<Set>(b, star, in.parameters);
-          const Update<T> u = safeguarded<Set>(b, newton_step(b, system, in.parameters), in.parameters);
+          const Factor<T> H = factored(b, system, in.parameters);
+          const Update<T> u = safeguarded<Set>(b, newton_step(system, H), in.parameters);
           set_column3(x, vertex, moved<Set>(b.state.x, u));
           if (in.tape_policy == kNoTape) continue;
           T* to = out.tape + ((static_cast<int64_t>(k) * rows) * plan.num_active + r) * in.scenes + scene;
@@ -44,21 +40,24 @@ __global__ void __launch_bounds__(kMaxSceneThreads) scene_forward(const __grid_c
             *to = value;
             to += plan.num_active * in.scenes;
           };
-          if (in.tape_policy == kCompactTape || Set::filters) put(b.state.x.x), put(b.state.x.y), put(b.state.x.z);
-          if (in.tape_policy == kFullTape) {
-            put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
-            put(system.H.xx), put(system.H.xy), put(system.H.xz);
-            put(system.H.yy), put(system.H.yz), put(system.H.zz);
+          const bool full = in.tape_policy == kFullTape;
+          if (Set::filters) put(b.state.x.x), put(b.state.x.y), put(b.state.x.z);
+          if (full || !Set::filters) put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
+          if (full) {
+            put(H.l21), put(H.l31), put(H.l32);
+            put(H.inv1), put(H.inv2), put(H.inv3);
           }
         }
       }
     }
     __syncwarp();
     const T rate = T(1) / in.parameters.time_step;
-    each_element(base, in.scenes, size, [&](int64_t to, int from) {
-      out.x[to] = tile[from];
-      if (out.v) out.v[to] = rate * (tile[from] - in.x_prev.data[to]);
-    });
+    each_element(
+        base, in.scenes, size, [&](int64_t from) { return out.v ? __ldg(in.x_prev.data + from) : T(0); },
+        [&](int64_t to, int from, const T& before) {
+          out.x[to] = x_tile[from];
+          if (out.v) out.v[to] = rate * (x_tile[from] - before);
+        });
     __syncwarp();
   }
 }
@@ -66,9 +65,9 @@ __global__ void __launch_bounds__(kMaxSceneThreads) scene_forward(const __grid_c
 template <class T>
 using SceneForward = void (*)(StepInputs<T>, StepOutputs<T>, GroupPlan);
 
-template <class T, int... n>
+template <class T, bool common, int... n>
 SceneForward<T> pick_scene_forward(int index, std::integer_sequence<int, n...>) {
-  static constexpr SceneForward<T> table[kEnergySets] = {scene_forward<T, energy_mask(n)>...};
+  static constexpr SceneForward<T> table[kEnergySets] = {scene_forward<T, energy_mask(n), common>...};
   return table[index];
 }
 
@@ -78,8 +77,9 @@ template <class T>
 cudaError_t run_scene_forward(const HostPlan& host, const StepInputs<T>& in, const StepOutputs<T>& out,
                               const Choice& choice, cudaStream_t stream) {
   if (host.plan.num_vertices > kSmallMesh) return cudaErrorInvalidConfiguration;
-  const auto kernel =
-      pick_scene_forward<T>(energy_index(in.energies), std::make_integer_sequence<int, kEnergySets>{});
+  constexpr auto sets = std::make_integer_sequence<int, kEnergySets>{};
+  const int index = energy_index(in.energies);
+  const auto kernel = is_common(in) ? pick_scene_forward<T, true>(index, sets) : pick_scene_forward<T, false>(index, sets);
   StepInputs<T> inputs = in;
   StepOutputs<T> outputs = out;
   GroupPlan plan = host.plan;

@@ -6,64 +6,87 @@
 namespace diffvbd::cuda {
 namespace {
 
-template <class T, int mask, int wanted>
-__global__ void __launch_bounds__(kMaxSceneThreads) scene_reverse(const __grid_constant__ StepInputs<T> in,
-                                                               const T* ends, const T* tape,
-                                                               const __grid_constant__ StepAdjoints<T> out,
-                                                               const __grid_constant__ GroupPlan plan) {
+// The predictor matters to what a tape does not hold, and to the masses: only then has it a tile.
+template <class T>
+DIFFVBD_FN bool reads_y(const StepAdjoints<T>& out, int policy, bool filters) {
+  return out.mass != nullptr || (filters && policy != kFullTape);
+}
+
+template <class T, int mask, int wanted, bool common>
+__global__ void __launch_bounds__(kMaxSceneThreads, 3) scene_reverse(const __grid_constant__ StepInputs<T> in,
+                                                                  const T* ends, const T* tape,
+                                                                  const __grid_constant__ StepAdjoints<T> out,
+                                                                  const __grid_constant__ GroupPlan plan) {
   using Set = EnergySet<mask>;
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
   const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice, rows = tape_rows(in.tape_policy, Set::filters);
-  T* const tile = tiles_of_warp(in, plan, memory, 4);
-  T *const y_tile = tile + size * kColumn, *const bar_tile = y_tile + size * kColumn,
-           *const y_bar_tile = bar_tile + size * kColumn;
-  T *const x = tile + lane, *const y = y_tile + lane, *const x_bar = bar_tile + lane, *const y_bar = y_bar_tile + lane;
+  const bool needs_y = reads_y(out, in.tape_policy, Set::filters), full = in.tape_policy == kFullTape;
+  T* const x_tile = tiles_of_warp<T>(plan, memory, needs_y ? 4 : 3);
+  T *const bar_tile = x_tile + size * kColumn, *const y_bar_tile = bar_tile + size * kColumn;
+  T* const y_tile = needs_y ? y_bar_tile + size * kColumn : nullptr;
+  T *const x = x_tile + lane, *const x_bar = bar_tile + lane, *const y_bar = y_bar_tile + lane;
+  const T* const y = needs_y ? y_tile + lane : nullptr;
   int64_t start[kVertexEnergies];
   data_starts(in, plan, start);
   const T h = in.parameters.time_step, rate = T(1) / h;
   const int64_t stride = static_cast<int64_t>(gridDim.x) * blockDim.x;
-  for (int64_t base = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x / kSlice * kSlice;
-       base < in.scenes; base += stride) {
-    load_start(in, plan, list, base, static_cast<T*>(nullptr), y_tile);
-    each_element(base, in.scenes, size, [&](int64_t from, int to) {
-      tile[to] = ends[from];
-      T bar = out.x_bar ? out.x_bar[from] : T(0);
-      if (out.v_bar) bar += rate * out.v_bar[from];
-      bar_tile[to] = bar;
-      y_bar_tile[to] = T(0);
-    });
+  for (int64_t base = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x / kSlice * kSlice; base < in.scenes;
+       base += stride) {
+    if (needs_y) load_start(in, plan, list, base, static_cast<T*>(nullptr), y_tile);
+    each_element(
+        base, in.scenes, size,
+        [&](int64_t from) {
+          T bar = out.x_bar ? __ldg(out.x_bar + from) : T(0);
+          if (out.v_bar) bar += rate * __ldg(out.v_bar + from);
+          return Pair<T>{__ldg(ends + from), bar};
+        },
+        [&](int64_t, int to, const Pair<T>& value) {
+          x_tile[to] = value.first;
+          bar_tile[to] = value.second;
+          y_bar_tile[to] = T(0);
+        });
     __syncwarp();
-    if (base + lane < in.scenes) {
-      const int64_t scene = base + lane;
-      SceneStar<T> star{in, &out, list, x, x_bar, scene, 0, 0, plan.num_tets, T(0), T(0)};
-      if (Set::elastic && in.mu.item == 0) star.mu = __ldg(in.mu.data + scene * in.mu.scene);
-      if (Set::elastic && in.lam.item == 0) star.lam = __ldg(in.lam.data + scene * in.lam.scene);
+    const int64_t scene = base + lane;
+    if (scene < in.scenes) {
+      SceneStar<T, common> star(in, &out, plan, list, x, x_bar, scene);
+      // what a visit reads of the tape is on its way during the visit before it
+      struct TapeRow {
+        Vec3<T> x_old, d_raw;
+        Factor<T> H;
+      };
+      const auto read = [&](int k, int r) {
+        const T* from = tape + ((static_cast<int64_t>(k) * rows) * plan.num_active + r) * in.scenes + scene;
+        const auto get = [&] {
+          const T value = __ldg(from);
+          from += plan.num_active * in.scenes;
+          return value;
+        };
+        TapeRow row;
+        if (Set::filters) row.x_old = {get(), get(), get()};
+        if (full || !Set::filters) row.d_raw = {get(), get(), get()};
+        if (full) row.H = {get(), get(), get(), get(), get(), get()};
+        return row;
+      };
+      TapeRow next;
+      if (in.sweeps > 0 && plan.num_active > 0) next = read(in.sweeps - 1, plan.num_active - 1);
       for (int k = in.sweeps - 1; k >= 0; --k) {
         for (int r = plan.num_active - 1; r >= 0; --r) {
-          const int vertex = list.visit[2 * r] & kMaxDegree;
-          star.count = list.visit[2 * r] >> kLocalBits;
-          star.first = list.visit[2 * r + 1];
+          const int vertex = star.go_to(r);
+          const TapeRow now = next;
+          if (r > 0 || k > 0) next = read(r > 0 ? k : k - 1, r > 0 ? r - 1 : plan.num_active - 1);
           Block<T> b = load_scene_block<Set>(in, plan, start, scene, vertex, x, y);
-          const T* from = tape + ((static_cast<int64_t>(k) * rows) * plan.num_active + r) * in.scenes + scene;
-          const auto get = [&] {
-            const T value = __ldg(from);
-            from += plan.num_active * in.scenes;
-            return value;
-          };
-          if (in.tape_policy == kCompactTape || Set::filters) b.state.x = {get(), get(), get()};
-          Vec3<T> d_raw;
-          Sym3<T> H;
-          if (in.tape_policy == kFullTape) {
-            d_raw = {get(), get(), get()};
-            H = {get(), get(), get(), get(), get(), get()};
-          } else {
+          if (Set::filters) b.state.x = now.x_old;
+          Vec3<T> d_raw = now.d_raw;
+          Factor<T> H = now.H;
+          if (!full) {
+            // H of a scene without filters depends on the neighbours alone
             const System<T> system = assemble<Set>(b, star, in.parameters);
-            d_raw = newton_step(b, system, in.parameters);
-            H = system.H;
+            H = factored(b, system, in.parameters);
+            if (Set::filters) d_raw = newton_step(system, H);
           }
           const Update<T> u = safeguarded<Set>(b, d_raw, in.parameters);
-          if (in.tape_policy == kFullTape && !Set::filters) b.state.x -= u.step;
+          if (!Set::filters) b.state.x -= u.step;
           set_column3(x, vertex, b.state.x);
           const BlockAdjoint<T> bar = reverse_vertex<Set, wanted>(
               b, star, u, H, column3(x_bar, vertex), in.parameters, out.data != nullptr,
@@ -89,20 +112,22 @@ __global__ void __launch_bounds__(kMaxSceneThreads) scene_reverse(const __grid_c
       }
     }
     __syncwarp();
-    each_element(base, in.scenes, size, [&](int64_t to, int from) {
-      const T begin = bar_tile[from], moved_y = y_bar_tile[from];
-      if (!in.fused) {
-        out.x_start[to] = begin;
-        out.y[to] = moved_y;
-        return;
-      }
-      const bool pinned = !list.moves(from / kColumn / 3), held = pinned && in.held.data != nullptr;
-      const T all = begin + moved_y;
-      if (out.x) out.x[to] = (held ? T(0) : all) - (out.v_bar ? rate * out.v_bar[to] : T(0));
-      if (out.v) out.v[to] = pinned ? T(0) : h * all;
-      if (out.acceleration) out.acceleration[to] = pinned ? T(0) : h * h * all;
-      if (out.held) out.held[to] = held ? all : T(0);
-    });
+    each_element(
+        base, in.scenes, size, [&](int64_t to) { return out.v_bar ? rate * __ldg(out.v_bar + to) : T(0); },
+        [&](int64_t to, int from, const T& of_velocity) {
+          const T begin = bar_tile[from], moved_y = y_bar_tile[from];
+          if (!in.fused) {
+            out.x_start[to] = begin;
+            out.y[to] = moved_y;
+            return;
+          }
+          const bool pinned = !list.moves(from / kColumn / 3), held = pinned && in.held.data != nullptr;
+          const T all = begin + moved_y;
+          if (out.x) out.x[to] = (held ? T(0) : all) - of_velocity;
+          if (out.v) out.v[to] = pinned ? T(0) : h * all;
+          if (out.acceleration) out.acceleration[to] = pinned ? T(0) : h * h * all;
+          if (out.held) out.held[to] = held ? all : T(0);
+        });
     __syncwarp();
   }
 }
@@ -112,11 +137,20 @@ using SceneReverse = void (*)(StepInputs<T>, const T*, const T*, StepAdjoints<T>
 
 constexpr int useful(int mask, int wanted) { return (mask & 3) == 0 ? kState : wanted; }
 
-template <class T, int wanted, int... n>
+template <class T, int wanted, bool common, int... n>
 SceneReverse<T> pick_scene_reverse(int index, std::integer_sequence<int, n...>) {
   static constexpr SceneReverse<T> table[kEnergySets] = {
-      scene_reverse<T, energy_mask(n), useful(energy_mask(n), wanted)>...};
+      scene_reverse<T, energy_mask(n), useful(energy_mask(n), wanted), common>...};
   return table[index];
+}
+template <class T, bool common>
+SceneReverse<T> pick_scene_reverse(int energies, int wanted) {
+  constexpr auto sets = std::make_integer_sequence<int, kEnergySets>{};
+  const int index = energy_index(energies);
+  // rest shapes that are differentiated are no common ones, or cost too much memory traffic for it to matter
+  if (wanted & kRest) return pick_scene_reverse<T, kMaterial | kRest, false>(index, sets);
+  if (wanted & kMaterial) return pick_scene_reverse<T, kMaterial, common>(index, sets);
+  return pick_scene_reverse<T, kState, common>(index, sets);
 }
 
 }  // namespace
@@ -136,16 +170,14 @@ cudaError_t run_scene_reverse(const HostPlan& host, const StepInputs<T>& in, con
   if (auto error = clear(per_tet ? out.lam : nullptr, plan.num_tets)) return error;
   if (auto error = clear(out.rest, int64_t{plan.num_tets} * kRestScalars)) return error;
   if (auto error = clear(out.data, in.data_size)) return error;
-  constexpr auto sets = std::make_integer_sequence<int, kEnergySets>{};
-  const int index = energy_index(in.energies);
-  const auto kernel = choice.wanted & kRest       ? pick_scene_reverse<T, kMaterial | kRest>(index, sets)
-                      : choice.wanted & kMaterial ? pick_scene_reverse<T, kMaterial>(index, sets)
-                                                  : pick_scene_reverse<T, kState>(index, sets);
+  const auto kernel = is_common(in) ? pick_scene_reverse<T, true>(in.energies, choice.wanted)
+                                    : pick_scene_reverse<T, false>(in.energies, choice.wanted);
+  const int tiles = reads_y(out, in.tape_policy, any_filter(in.energies, VertexEnergies{})) ? 4 : 3;
   StepInputs<T> inputs = in;
   StepAdjoints<T> adjoints = out;
   GroupPlan list = plan;
   void* arguments[] = {&inputs, &ends, &tape, &adjoints, &list};
-  return launch_scenes(kernel, arguments, in, plan, 4, choice, stream);
+  return launch_scenes(kernel, arguments, in, plan, tiles, choice, stream);
 }
 
 }  // namespace diffvbd::cuda

@@ -67,10 +67,11 @@ template <class T>
 struct StepView {
   GroupPlan plan;
   int64_t scenes, positions;
-  int degree;  // largest number of neighbours
+  int degree, valence;  // largest number of neighbours and of pairs
   StepParameters<T> parameters;
   int sweeps, tape_policy;
   bool one_material;  // mu and lam below; else w.material
+  bool own;           // whether a block has its scene to itself
   Batched<const T> mass, rest, mu, lam, data;
   int64_t material_scene;
   int64_t data_start[kVertexEnergies];
@@ -84,7 +85,7 @@ struct StepView {
 constexpr int kMaxThreads = 256;  // of a block of the sweep kernels
 
 // The part of a step that one launch executes: sweeps [first_sweep, end_sweep) in the order of execution (the reverse
-// counts down), and of each the colors [first_color, end_color); colors.. `plan.colors` stands for what is pinned.
+// counts down), and of each the colors [first_color, end_color).
 struct Range {
   int regime;
   int first_sweep, end_sweep, first_color, end_color;
@@ -95,10 +96,12 @@ template <class T>
 using SweepKernel = void (*)(StepView<T>, Range);
 
 // Threads that share a vertex: few where there are vertices enough to fill the device, many to finish a small color
-// soon.
-constexpr int kFewLanes = 2, kManyLanes = 8;
-// A star too large for shared memory takes a whole warp and works in device memory.
-constexpr int kSpillLanes = kSlice;
+// soon. The last is for stars too large for shared memory: a whole warp, working in device memory.
+constexpr int kFewLanes = 2, kSomeLanes = 8, kManyLanes = 32, kSpillLanes = 64;
+DIFFVBD_FN constexpr int threads_of(int lanes) { return lanes == kSpillLanes ? kSlice : lanes; }
+// Few threads each add up their own share of what a reversed update sends to a neighbour; more of them leave single
+// contributions, which are then gathered edge by edge.
+DIFFVBD_FN constexpr bool gathers(int lanes) { return lanes > kFewLanes; }
 
 // The kernels of a scene's energies for `lanes` threads per vertex.
 template <class T>
@@ -106,9 +109,11 @@ SweepKernel<T> forward_kernel(int energies, int lanes);
 template <class T, int wanted>
 SweepKernel<T> reverse_kernel(int energies, int lanes);
 
-// scalars of shared memory that a warp needs
-DIFFVBD_FN constexpr int shared_scalars(int degree, int lanes, bool reverse) {
-  return degree * 3 * (kSlice / lanes + (reverse ? kSlice : 0));
+// scalars of shared memory that a warp needs, for stars of up to `degree` neighbours and `valence` pairs
+DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int lanes, bool reverse) {
+  const int groups = kSlice / threads_of(lanes);
+  const int contributions = gathers(lanes) ? 3 * (3 * valence + 1) : 3 * degree * lanes;
+  return groups * (3 * degree + (reverse ? contributions : 0));
 }
 
 constexpr int kElasticVariants = 3;  // none, exact, paper
@@ -120,7 +125,7 @@ constexpr int energy_index(int mask) { return (mask & 3) + (mask >> 2) * kElasti
 struct HostPlan {
   GroupPlan plan;              // arrays on the device
   const int64_t* color_block;  // [colors + 1] on the host
-  int degree;                  // largest number of neighbours of an active vertex
+  int degree, valence;         // largest number of neighbours and of pairs of an active vertex
 };
 
 // How a step is to run.

@@ -1,0 +1,297 @@
+"""CUDA sources compile for every architecture without a device; the object is found, or compiled once and cached."""
+
+import ast
+import functools
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+import torch
+from torch.utils import cpp_extension
+
+from diffvbd import build_cuda, native
+
+ROOT = Path(__file__).parents[1]
+CSRC = ROOT / "csrc"
+KERNELS = sorted(CSRC.glob("cuda/*.cu"))
+ARCHITECTURES = ("80", "90", "100", "120")
+BUILT = "lib/diffvbd/_C_cuda.abi3.so"  # where setuptools leaves the object
+
+needs_csrc = pytest.mark.skipif(not CSRC.exists(), reason="the C++ sources are not here")
+
+
+@functools.cache
+def nvcc() -> str | None:
+    beside = Path(os.environ.get("CUDA_HOME") or cpp_extension.CUDA_HOME or "", "bin", "nvcc")
+    return str(beside) if beside.exists() else shutil.which("nvcc")
+
+
+needs_nvcc = pytest.mark.skipif(nvcc() is None, reason="no nvcc in CUDA_HOME or PATH")
+
+
+def failures(jobs: list[tuple[Path, list[str]]], folder: Path) -> dict[str, str]:
+    """Runs nvcc on each source with its arguments; two at a time, because each takes up to a gigabyte."""
+
+    def run(job: tuple[Path, list[str]]) -> tuple[str, str]:
+        source, arguments = job
+        name = " ".join([source.name, *(a for a in arguments if a.startswith("-arch"))])
+        to = folder / f"{name.replace(' ', '')}.o"
+        done = subprocess.run(
+            [str(nvcc()), *arguments, "-c", str(source), "-o", str(to)], capture_output=True, text=True
+        )
+        return name, "" if done.returncode == 0 and to.exists() else done.stderr + done.stdout
+
+    with ThreadPoolExecutor(2) as pool:
+        return {name: output for name, output in pool.map(run, jobs) if output}
+
+
+def compile_for(kernels: list[Path], architectures: list[str], folder: Path) -> None:
+    known = subprocess.run([str(nvcc()), "--list-gpu-code"], capture_output=True, text=True).stdout.split()
+    missing = {f"sm_{a}" for a in architectures} - set(known)
+    if missing:
+        pytest.skip(f"this nvcc is too old for {', '.join(sorted(missing))}")
+    flags = [*build_cuda.NVCC_FLAGS, "-Xcompiler", "-fPIC"]
+    jobs = [(k, [*flags, f"-arch=sm_{a}"]) for k, a in zip(kernels, architectures, strict=True)]
+    failed = failures(jobs, folder)
+    assert not failed, "\n".join(f"{name}:\n{output}" for name, output in failed.items())
+
+
+# --- the sources ------------------------------------------------------------------------------------------------------
+
+
+@needs_csrc
+def test_kernels_include_no_torch() -> None:
+    """That is why they compile in seconds, with any torch, and here."""
+    paths = [p for p in (CSRC / "cuda").rglob("*") if p.suffix in (".cu", ".cuh", ".h")]
+    assert len(KERNELS) >= 1 and len(paths) > len(KERNELS)
+    for path in paths:
+        included = re.findall(r'^\s*#\s*include\s*[<"]([^>"]+)[>"]', path.read_text(encoding="utf-8"), re.MULTILINE)
+        assert not [name for name in included if re.match(r"torch|ATen|c10|Python\.h", name)], path
+
+
+@needs_csrc
+def test_every_source_is_in_one_object() -> None:
+    (cpu,) = [
+        ast.literal_eval(node.value)
+        for node in ast.parse((ROOT / "setup.py").read_text(encoding="utf-8")).body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "CPU_SOURCES"
+    ]
+    sources = {p.relative_to(ROOT).as_posix() for p in CSRC.rglob("*") if p.suffix in (".cpp", ".cu")}
+    cuda = {"csrc/ops_cuda.cpp", *(p.relative_to(ROOT).as_posix() for p in KERNELS)}
+    assert len(cpu) == len(set(cpu)) and set(cpu) | cuda == sources and not set(cpu) & cuda
+
+
+@needs_csrc
+def test_the_extension_has_all_sources_and_headers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cpp_extension, "CUDA_HOME", "/cuda")
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
+    monkeypatch.chdir(ROOT)
+    extension = build_cuda.extension()
+    assert extension.sources == ["csrc/ops_cuda.cpp", *(p.relative_to(ROOT).as_posix() for p in KERNELS)]
+    headers = {p.relative_to(ROOT).as_posix() for p in CSRC.rglob("*") if p.suffix in (".h", ".cuh")}
+    assert set(extension.depends) == headers
+    assert "cudart" in extension.libraries and "torch_python" not in extension.libraries
+    # torch adds no architectures of its own where a flag looks as if it named one
+    assert not [flag for flags in extension.extra_compile_args.values() for flag in flags if "arch" in flag]
+
+
+def test_architectures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6;9.0a")
+    assert build_cuda.architectures() == "8.6;9.0a"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda i: [(9, 0), (8, 0), (9, 0)][i])
+    for unset in ("", "native"):
+        monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", unset)
+        assert build_cuda.architectures() == "8.0 9.0+PTX"
+    monkeypatch.delenv("TORCH_CUDA_ARCH_LIST")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    assert build_cuda.architectures() == "8.0 9.0 10.0 12.0+PTX"
+    monkeypatch.setattr(torch.version, "cuda", "12.6")  # its nvcc knows no Blackwell
+    assert build_cuda.architectures() == "8.0 9.0+PTX"
+
+
+@needs_csrc
+@needs_nvcc
+def test_kernels_compile(tmp_path: Path) -> None:
+    """To machine code, as ptxas alone finds what does not fit the hardware; the architectures take turns."""
+    turns = [ARCHITECTURES[i % len(ARCHITECTURES)] for i in range(len(KERNELS))]
+    compile_for(KERNELS, turns, tmp_path)
+
+
+@pytest.mark.slow
+@needs_csrc
+@needs_nvcc
+def test_kernels_compile_for_every_architecture(tmp_path: Path) -> None:
+    compile_for([k for k in KERNELS for _ in ARCHITECTURES], [*ARCHITECTURES] * len(KERNELS), tmp_path)
+
+
+@needs_csrc
+@needs_nvcc
+def test_the_binding_compiles(tmp_path: Path) -> None:
+    """Against the torch that is here: the headers of its stable interface do not depend on CUDA."""
+    include = [argument for path in cpp_extension.include_paths() for argument in ("-isystem", path)]
+    macros = ["-DUSE_CUDA", "-DTORCH_TARGET_VERSION=0x020b000000000000"]
+    failed = failures([(CSRC / "ops_cuda.cpp", ["-std=c++20", "-O0", *macros, *include])], tmp_path)
+    assert not failed, failed
+
+
+# --- without an object ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_object(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A torch with CUDA, as far as the loader sees, and no CUDA object."""
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(native, "_cuda", False)
+    monkeypatch.setattr(native, "_why_not", "")
+    monkeypatch.delenv("DIFFVBD_JIT", raising=False)
+
+
+def message() -> str:
+    with pytest.raises(RuntimeError) as caught:
+        native.require_cuda()
+    return str(caught.value)
+
+
+@pytest.mark.usefixtures("no_object")
+def test_the_error_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    for text in (message(), (monkeypatch.setenv("DIFFVBD_JIT", "0"), message())[1]):
+        assert "pip install --no-build-isolation" in text and "DIFFVBD_JIT=1" in text and "\n" not in text
+    monkeypatch.setattr(torch.version, "cuda", None)
+    monkeypatch.setenv("DIFFVBD_JIT", "1")  # no compiler helps a torch without CUDA
+    text = message()
+    assert "pip install --no-build-isolation" in text and torch.__version__ in text and "\n" not in text
+    assert not native.has_cuda()
+
+
+@pytest.mark.usefixtures("no_object")
+def test_an_object_that_does_not_load_is_reported_when_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken, find = tmp_path / "_C_cuda.abi3.so", native._built
+    broken.write_bytes(b"for another CUDA")
+    monkeypatch.setattr(native, "_built", lambda name: broken if name == "_C_cuda" else find(name))
+    native.load()
+    assert not native.has_cuda()
+    text = message()
+    assert "does not load" in text and broken.name in text and "pip install" in text and "\n" not in text
+
+
+# --- DIFFVBD_JIT=1 ----------------------------------------------------------------------------------------------------
+
+# Stands for the compiler: leaves a trace of each run and its number as the object; what it does besides, `mode` tells.
+FAKE = f"""
+import os, pathlib, sys, time
+here = pathlib.Path(os.environ["FAKE"])
+assert pathlib.Path("csrc/ops_cuda.cpp").exists()
+with open(here / "runs", "a") as runs:
+    print(os.getpid(), file=runs)
+mode = (here / "mode").read_text()
+built = pathlib.Path("{BUILT}")
+built.parent.mkdir(parents=True)
+built.write_text("half")
+if mode == "hang":
+    (here / "hanging").touch()
+    time.sleep(600)
+if mode == "fail":
+    sys.exit("step.h(7): error: no such thing")
+time.sleep(0.2)
+built.write_text(f"object {{len((here / 'runs').read_text().split())}}")
+"""
+
+
+class Fake:
+    """A package of its own, with sources and the fake compiler."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.package, self.cache = folder, folder / "package", folder / "cache"
+        (self.package / "csrc" / "cuda").mkdir(parents=True)
+        (self.package / "csrc" / "ops_cuda.cpp").write_text("// nothing")
+        (self.package / "build_cuda.py").write_text(FAKE)
+        self.mode("build")
+
+    def mode(self, name: str) -> None:
+        (self.folder / "mode").write_text(name)
+
+    def runs(self) -> list[int]:
+        path = self.folder / "runs"
+        return [int(pid) for pid in path.read_text().split()] if path.exists() else []
+
+
+@pytest.fixture
+def fake(tmp_path: Path, no_object: None, monkeypatch: pytest.MonkeyPatch) -> Fake:
+    fake = Fake(tmp_path)
+    monkeypatch.setattr(native, "_FOLDER", fake.package)
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(fake.cache))
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
+    monkeypatch.setenv("FAKE", str(tmp_path))
+    monkeypatch.setenv("DIFFVBD_JIT", "1")
+    return fake
+
+
+def test_jit_compiles_once_for_what_it_depends_on(fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
+    with ThreadPoolExecutor(4) as pool:  # whoever comes second waits
+        paths = {future.result() for future in [pool.submit(native.jit_build) for _ in range(4)]}
+    (first,) = paths
+    assert first.read_text() == "object 1" and fake.cache in first.parents
+    assert native.jit_build() == first and len(fake.runs()) == 1
+    assert {p.name for p in first.parent.iterdir()} == {first.name, "lock"}
+
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0")
+    assert native.jit_build() != first
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
+    monkeypatch.setattr(torch.version, "cuda", "13.1")
+    assert native.jit_build() != first
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    (fake.package / "csrc" / "cuda" / "step.h").write_text("// new")
+    assert native.jit_build() != first
+    (fake.package / "csrc" / "cuda" / "step.h").unlink()
+    assert native.jit_build() == first and len(fake.runs()) == 4
+
+
+def test_jit_survives_a_killed_build(fake: Fake) -> None:
+    fake.mode("hang")
+    program = f"from pathlib import Path; from diffvbd import native; import torch; torch.version.cuda = '13.0'; \
+native._FOLDER = Path({str(fake.package)!r}); native.jit_build()"
+    victim = subprocess.Popen([sys.executable, "-c", program], cwd=ROOT, stderr=subprocess.DEVNULL)
+    try:
+        while not (fake.folder / "hanging").exists():
+            assert victim.poll() is None
+            time.sleep(0.01)
+        victim.kill()  # its compiler lives on, as it does where only the process is killed
+        victim.wait()
+        fake.mode("build")
+        built = native.jit_build()
+    finally:
+        victim.kill()
+        for pid in fake.runs()[:1]:
+            os.kill(pid, signal.SIGKILL)
+    assert built.read_text() == "object 2"
+    assert {p.name for p in built.parent.iterdir()} == {built.name, "lock"}
+
+
+def test_jit_failure_says_why_and_can_be_repaired(fake: Fake) -> None:
+    fake.mode("fail")
+    assert "step.h(7): error" in message() and not list(fake.cache.rglob("*.so"))
+    fake.mode("build")
+    assert native.jit_build().read_text() == "object 2"
+
+
+def test_require_cuda_loads_what_it_compiled(fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded = []
+    monkeypatch.setattr(torch.ops, "load_library", loaded.append)
+    native.require_cuda()
+    native.require_cuda()
+    assert native.has_cuda() and loaded == [str(native.jit_build())] and len(fake.runs()) == 1
+
+
+def test_jit_says_that_sources_are_missing(fake: Fake) -> None:
+    shutil.rmtree(fake.package / "csrc")
+    assert "no sources" in message() and "pip install" in message()
