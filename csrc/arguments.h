@@ -32,13 +32,6 @@ T* data(const Tensor& t) {
   return static_cast<T*>(t.data_ptr());
 }
 
-inline Tensor zeros(const Tensor& like, const std::vector<int64_t>& sizes) {
-  return torch::stable::new_zeros(like, sizes);
-}
-inline Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes) {
-  return torch::stable::new_empty(like, sizes);
-}
-
 // [1 | B, ...] contiguous -> pointer and strides; a missing (empty) tensor gives null. `items` scalars for a scene, or
 // one group of `own` that all share.
 template <class T>

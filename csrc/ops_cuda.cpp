@@ -15,18 +15,40 @@
 namespace {
 
 namespace cuda = diffvbd::cuda;
-using diffvbd::batched, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::require;
+using diffvbd::batched, diffvbd::data, diffvbd::dispatch_float, diffvbd::require;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
 
 constexpr int64_t kWorkspaceBudget = int64_t{2} << 30;  // bytes; a batch that needs more is worked on in chunks
-constexpr int kHostSizes = diffvbd::kPlanHeader;  // a plan's header, but active, tets and slots come first
+constexpr int kHostSizes = diffvbd::kPlanHeader;        // a plan's header, but active, tets and slots come first
 
 void check(cudaError_t error, const char* what) {
   if (error == cudaSuccess) return;
+  if (error == cudaErrorInvalidConfiguration) {
+    cudaGetLastError();
+    throw std::invalid_argument("regime: this mesh does not fit the shared memory of a thread block of this device");
+  }
   cudaGetLastError();  // an error that does not poison the context must not come up again in somebody else's call
   throw std::runtime_error(std::string("diffvbd: ") + what + " failed: " + cudaGetErrorString(error));
+}
+
+// Through torch's C interface, whose failure is a number: its C++ wrapper formats a message with streams, which two
+// copies of the standard library in one process do not survive.
+Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes) {
+  std::vector<int64_t> strides(sizes.size(), 1);
+  for (size_t i = sizes.size(); i-- > 1;) strides[i - 1] = strides[i] * std::max<int64_t>(1, sizes[i]);
+  const bool wide = like.scalar_type() == ScalarType::Double;
+  AtenTensorHandle handle = nullptr;
+  const auto status = aoti_torch_empty_strided(static_cast<int64_t>(sizes.size()), sizes.data(), strides.data(),
+                                               wide ? aoti_torch_dtype_float64() : aoti_torch_dtype_float32(),
+                                               aoti_torch_device_type_cuda(), like.get_device_index(), &handle);
+  if (status != AOTI_TORCH_SUCCESS) {
+    int64_t bytes = wide ? 8 : 4;
+    for (const int64_t n : sizes) bytes *= n;
+    throw std::runtime_error("diffvbd: CUDA out of memory, wanted " + std::to_string(bytes) + " bytes more");
+  }
+  return Tensor(handle);
 }
 
 cudaStream_t current_stream(const Tensor& t) {
@@ -73,13 +95,13 @@ cuda::StepInputs<T> inputs(const cuda::HostPlan& host, const Tensor& x, const Te
 }
 
 // The regime and threads per vertex that Python chose, and what the device adds.
-cuda::Choice choose(const Tensor& x, const std::vector<int64_t>& launch, int wanted) {
-  require(launch.size() == 2 && launch[0] >= cuda::kThread && launch[0] <= cuda::kColor &&
-              (launch[1] == cuda::kFewLanes || launch[1] == cuda::kSomeLanes || launch[1] == cuda::kManyLanes),
-          "diffvbd: bad launch");
+cuda::Choice choose(const Tensor& x, const std::vector<int64_t>& launch, bool reverse, int wanted = 0) {
+  require(launch.size() == 3 && launch[0] >= cuda::kThread && launch[0] <= cuda::kColor, "diffvbd: bad launch");
+  const int64_t lanes = launch[reverse ? 2 : 1];
+  require(lanes == cuda::kFewLanes || lanes == cuda::kSomeLanes || lanes == cuda::kManyLanes, "diffvbd: bad launch");
   cuda::Choice out{};
   out.regime = static_cast<int>(launch[0]);
-  out.lanes = static_cast<int>(launch[1]);
+  out.lanes = static_cast<int>(lanes);
   out.wanted = wanted;
   int shared = 0;
   const int device = x.get_device_index();
@@ -134,7 +156,7 @@ std::tuple<Tensor, Tensor> sweep(const Tensor& x_start, const Tensor& x_prev, co
     in.y = batched<T>(y, x_start, in.scenes, v3);
     in.origin = batched<T>(origin, x_start, in.scenes, v3);
     in.data = batched<T>(energy_data, x_start, in.scenes, in.data_size);
-    cuda::Choice choice = choose(x_start, launch, 0);
+    cuda::Choice choice = choose(x_start, launch, false);
     Tensor x = empty(x_start, {in.scenes, host.plan.num_vertices, 3}), tape = empty(x_start, tape_shape(host, in));
     const Tensor work = workspace<T>(x_start, host, in, nullptr, choice);
     check(cuda::run_forward<T>(host, in, {data<T>(x), nullptr, data<T>(tape)}, choice, work.data_ptr(),
@@ -167,7 +189,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> sweep
     const bool elastic = (energies & (diffvbd::kExactBlock | diffvbd::kPaperBlock)) != 0;
     const int64_t materials = in.mu.item == 0 && in.lam.item == 0 ? 1 : t;
     const auto wanted = [&](bool flag, const std::vector<int64_t>& shape, bool zeroed) {
-      return !flag ? empty(x, {0}) : zeroed ? diffvbd::zeros(x, shape) : empty(x, shape);
+      Tensor out = empty(x, flag ? shape : std::vector<int64_t>{0});
+      if (flag && zeroed)
+        check(cudaMemsetAsync(out.data_ptr(), 0, out.numel() * sizeof(T), current_stream(x)), "memset");
+      return out;
     };
     Tensor x_start_bar = empty(x, {b, v, 3}), x_prev_bar = empty(x, {b, v, 3}), y_bar = empty(x, {b, v, 3});
     Tensor mu_bar = wanted(material, {b, materials}, !elastic), lam_bar = wanted(material, {b, materials}, !elastic);
@@ -181,7 +206,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> sweep
     out.mass = pointer(of_mass, mass_bar), out.rest = pointer(of_rest && elastic, rest_bar);
     out.data = pointer(of_data && in.data_size > 0, data_bar);
     const int kinds = (out.mu ? diffvbd::kMaterial : 0) | (out.rest ? diffvbd::kMaterial | diffvbd::kRest : 0);
-    cuda::Choice choice = choose(x, launch, kinds);
+    cuda::Choice choice = choose(x, launch, true, kinds);
     const Tensor work = workspace<T>(x, host, in, &out, choice);
     check(cuda::run_reverse<T>(host, in, data<const T>(x), data<const T>(tape), out, choice, work.data_ptr(),
                                current_stream(x)),
@@ -215,7 +240,7 @@ std::tuple<Tensor, Tensor, Tensor> fused_step(const Tensor& x, const Tensor& v, 
     using T = decltype(scalar);
     auto in = inputs<T>(host, x, mu, lam, mass, rest, energies, data_count, numbers, sweeps, tape_policy);
     set_state(in, x, v, acceleration, held);
-    cuda::Choice choice = choose(x, launch, 0);
+    cuda::Choice choice = choose(x, launch, false);
     Tensor x_end = empty(x, {in.scenes, host.plan.num_vertices, 3}), v_end = empty(x, {in.scenes, x.size(1), 3});
     Tensor tape = empty(x, tape_shape(host, in));
     const Tensor work = workspace<T>(x, host, in, nullptr, choice);
@@ -248,7 +273,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> fused
     const bool elastic = energies != 0;
     const int64_t materials = in.mu.item == 0 && in.lam.item == 0 ? 1 : t;
     const auto wanted = [&](bool flag, const std::vector<int64_t>& shape, bool zeroed) {
-      return !flag ? empty(x, {0}) : zeroed ? diffvbd::zeros(x, shape) : empty(x, shape);
+      Tensor out = empty(x, flag ? shape : std::vector<int64_t>{0});
+      if (flag && zeroed)
+        check(cudaMemsetAsync(out.data_ptr(), 0, out.numel() * sizeof(T), current_stream(x)), "memset");
+      return out;
     };
     const auto pointer = [&](bool flag, const Tensor& a) { return flag ? data<T>(a) : nullptr; };
     const std::vector<int64_t> state = {b, n, 3};
@@ -264,7 +292,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> fused
     out.mu = pointer(wants[4] && elastic, mu_bar), out.lam = pointer(wants[4] && elastic, lam_bar);
     out.mass = pointer(wants[5], mass_bar), out.rest = pointer(wants[6] && elastic, rest_bar);
     const int kinds = (out.mu ? diffvbd::kMaterial : 0) | (out.rest ? diffvbd::kMaterial | diffvbd::kRest : 0);
-    cuda::Choice choice = choose(x, launch, kinds);
+    cuda::Choice choice = choose(x, launch, true, kinds);
     const Tensor work = workspace<T>(x, host, in, &out, choice);
     check(cuda::run_reverse<T>(host, in, data<const T>(x_end), data<const T>(tape), out, choice, work.data_ptr(),
                                current_stream(x)),
@@ -325,9 +353,9 @@ Tensor row_sum(const Tensor& values) {
     using T = decltype(scalar);
     const int64_t rows = values.size(0), columns = values.size(1);
     Tensor out = empty(values, {rows}), partial = empty(values, {cuda::partial_sums(rows, columns)});
-    check(cuda::sum_rows<T>(data<const T>(values), rows, columns, data<T>(partial), data<T>(out),
-                            current_stream(values)),
-          "row_sum");
+    check(
+        cuda::sum_rows<T>(data<const T>(values), rows, columns, data<T>(partial), data<T>(out), current_stream(values)),
+        "row_sum");
     return out;
   });
 }

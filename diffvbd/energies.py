@@ -199,6 +199,16 @@ class Anchor(VertexEnergy):
         if self.points is not None:
             object.__setattr__(self, "points", _numbers("points", self.points))
 
+    def __repr__(self) -> str:
+        """One line: tensors by their shapes."""
+        shown = []
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                one = repr(value.item()) if value.dim() == 0 else str(list(value.shape))
+                value = f"{int(value.sum())} of {value.numel()}" if value.dtype == torch.bool else one
+            shown.append(f"{name}={value}")
+        return f"Anchor({', '.join(shown)})"
+
     def count(self) -> int:
         return 4
 

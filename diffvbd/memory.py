@@ -25,15 +25,15 @@ def out_of_memory_named(model: Model, x: Tensor, settings: ops.SweepSettings, po
         return
     try:
         yield
-    except (torch.OutOfMemoryError, RuntimeError) as error:
+    except RuntimeError as error:
+        if "out of memory" not in str(error):
+            raise
         free, _ = torch.cuda.mem_get_info(x.device)
         free += torch.cuda.memory_reserved(x.device) - torch.cuda.memory_allocated(x.device)
         scalars = x.shape[0] * settings.sweeps * model.num_active * x.element_size()
         base = 2 * x.numel() * x.element_size() + _cuda_scratch(model, x.shape[0], reverse=False)
         wanted = {name: base + scalars * ops.tape_rows(code, model.energy_mask) for name, code in _POLICIES.items()}
         chosen = next(name for name, code in _POLICIES.items() if code == policy)
-        if wanted[chosen] <= free and not isinstance(error, torch.OutOfMemoryError):
-            raise
         fits = [f'"{name}" ({bytes_wanted} bytes)' for name, bytes_wanted in wanted.items() if bytes_wanted <= free]
         advice = f"ReverseSweep(tape=...) that fits: {', '.join(fits)}" if fits else "no tape policy fits: fewer scenes"
         raise torch.OutOfMemoryError(

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import native, ops
+from . import native, ops, regimes
 from .checks import check_number, check_positive, fail
 from .energies import VERTEX_ENERGIES, Energy, FloorBarrier, StableNeoHookean, VertexEnergy
 from .mesh import TetMesh
@@ -223,11 +223,13 @@ class Model:
         """Groups of vertices that a sweep updates one after another."""
         return self.color_ptr.shape[0] - 1
 
-    def settings(self, time_step: float, sweeps: int) -> ops.SweepSettings:
-        """What the kernels execute for this Model besides its tensors; on CUDA a regime is still to be chosen."""
+    def settings(self, time_step: float, sweeps: int, scenes: int = 1) -> ops.SweepSettings:
+        """What the kernels execute for this Model besides its tensors; ``scenes`` chooses the regime on CUDA."""
         saturation = -1.0 if self.saturation is None else self.saturation
         numbers = (time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS, FILTER_ETA)
-        return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps)
+        cuda = self.device.type == "cuda"
+        launch = regimes.choose(self.num_vertices, self.num_colors, scenes) if cuda else ()
+        return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps, launch)
 
     def memory(self, **options: Any) -> dict[str, int]:
         """Predicted bytes of a step or rollout of this Model; see :func:`diffvbd.memory.predict`."""

@@ -35,7 +35,7 @@ class SweepSettings(NamedTuple):
     data_count: tuple[int, ...]  # scalars per scene, or per vertex, of each energy of one vertex
     numbers: tuple[float, ...]  # time_step, regularization, relaxation, saturation, saturation_eps, filter_eta
     sweeps: int
-    launch: tuple[int, ...] = ()  # on CUDA: regime and threads per vertex, see regimes.py
+    launch: tuple[int, ...] = ()  # on CUDA: regime and threads per vertex of sweeps and reverse, see regimes.py
 
 
 LANES = {"cpu": 8, "cuda": 32}  # vertices of a block of the plan; twins of kLanes and kSlice in csrc/core/views.h
@@ -50,7 +50,16 @@ def plan_sizes(plan: Tensor, device: str) -> tuple[int, ...]:
     vertices, tets, active, colors, blocks, slots, *rest = header
     if device == "cpu":
         return active, tets, slots
-    return (active, tets, slots, vertices, colors, blocks, *rest, *plan[PLAN_HEADER : PLAN_HEADER + colors + 1].tolist())
+    return (
+        active,
+        tets,
+        slots,
+        vertices,
+        colors,
+        blocks,
+        *rest,
+        *plan[PLAN_HEADER : PLAN_HEADER + colors + 1].tolist(),
+    )
 
 
 def tape_rows(policy: int, energies: int) -> int:

@@ -17,13 +17,13 @@ FEW_LANES, SOME_LANES, MANY_LANES = 2, 8, 32
 SMALL_MESH = 64
 
 # Where one regime overtakes another, measured on an H100 (docs/performance.md).
-THREAD_VERTICES = 32  # above, a scene's positions leave too little shared memory for a scene per thread
+THREAD_VERTICES = 16  # above, a scene's positions leave too little shared memory for a scene per thread
 THREAD_SCENES = 4096  # below, a scene per thread leaves most of the device idle
 BLOCK_SCENES = 64  # below, a scene per block does
-BLOCK_VERTICES = 160  # of a single mesh: above, one multiprocessor takes longer than the barriers of several
 GRID_VERTICES = 100_000  # vertices of all scenes: above, launches cost less than a cooperative grid's barriers
-MANY_LANES_VERTICES = 1_500  # vertices of all scenes in a color up to which a warp each still finds room
-SOME_LANES_VERTICES = 8_000  # the same for a quarter of a warp
+# Vertices of all scenes in a color up to which that many threads of each find room, in the sweeps and in their reverse.
+MANY_LANES_VERTICES = 1_500
+SOME_LANES_VERTICES = (16_000, 4_000)
 
 _forced: str | None = None
 
@@ -50,22 +50,23 @@ def regime(name: Regime | None) -> Iterator[None]:
         _forced = before
 
 
-def choose(vertices: int, colors: int, scenes: int) -> tuple[int, int]:
-    """Regime and threads per vertex of a step, for SweepSettings.launch."""
+def choose(vertices: int, colors: int, scenes: int) -> tuple[int, int, int]:
+    """Regime, and threads per vertex of the sweeps and of their reverse, for SweepSettings.launch."""
     code = CODES[_forced] if _forced else _automatic(vertices, scenes)
     if code == THREAD and vertices > SMALL_MESH:
         fail("regime", f"a mesh of at most {SMALL_MESH} vertices for a scene per thread", f"{vertices} vertices")
     if code == BLOCK:  # scenes enough fill a multiprocessor; one alone wants its threads
-        return code, SOME_LANES if scenes < BLOCK_SCENES else FEW_LANES
+        lanes = SOME_LANES if scenes < BLOCK_SCENES else FEW_LANES
+        return code, lanes, lanes
     at_once = vertices * scenes / max(1, colors)
     if at_once <= MANY_LANES_VERTICES:
-        return code, MANY_LANES
-    return code, SOME_LANES if at_once <= SOME_LANES_VERTICES else FEW_LANES
+        return code, MANY_LANES, MANY_LANES
+    return code, *(SOME_LANES if at_once <= limit else FEW_LANES for limit in SOME_LANES_VERTICES)
 
 
 def _automatic(vertices: int, scenes: int) -> int:
     if vertices <= THREAD_VERTICES and scenes >= THREAD_SCENES:
         return THREAD
-    if scenes >= BLOCK_SCENES or vertices * scenes <= BLOCK_VERTICES:
+    if scenes >= BLOCK_SCENES:
         return BLOCK
     return GRID if vertices * scenes <= GRID_VERTICES else COLOR

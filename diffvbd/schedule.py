@@ -94,7 +94,9 @@ def run_segments(run: Run, steps: int, x: Tensor, v: Tensor, every: int | Binomi
 def _again(run: Callable[..., Segment], *args: Any) -> Segment:
     # The non-reentrant form: gradients reach what a callable closes over, and checkpoints nest.
     # A graph's capture admits no look at the state of the random number generator; what is replayed draws none.
-    capturing = torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
+    capturing = (
+        not torch.compiler.is_compiling() and torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
+    )
     return checkpoint(run, *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
 
 

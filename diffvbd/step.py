@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from . import ops, regimes
+from . import ops
 from .adjoints import ReverseSweep
 from .checks import check_broadcast, check_count, check_positive, check_tensor, fail
 from .memory import out_of_memory_named
@@ -29,7 +29,8 @@ _debug = False  # a plain global: torch.compile guards it
 def debug_checks(enabled: bool = True) -> Iterator[None]:
     """Inside, a position that is not finite raises RuntimeError naming step, sweep, color, vertex and scene.
 
-    Off (the default) it costs nothing.
+    Off (the default) it costs nothing. On CUDA the CPU repeats each step to find out, and values that a step cannot work
+    with raise only here, because looking at them waits for the device.
     """
     global _debug
     before, _debug = _debug, enabled
@@ -147,7 +148,9 @@ def prepare(
     if isinstance(time_step, Tensor) and time_step.requires_grad:
         raise TypeError("time_step: expected a number, got a tensor that requires grad: it is not differentiable")
     settings = model.settings(
-        check_positive("time_step", time_step, "s"), check_count("sweeps", sweeps, maximum=MAX_SWEEPS)
+        check_positive("time_step", time_step, "s"),
+        check_count("sweeps", sweeps, maximum=MAX_SWEEPS),
+        math.prod(lead),
     )
     rest, mass = None, model.mass[None]
     if density is not None:
@@ -161,6 +164,9 @@ def prepare(
         if density is None:
             density = model.density[None]
         shape = (max(density.shape[0], volume.shape[0]), model.num_tets)
+        if _debug and model.device.type == "cuda":  # where star_sum does not look
+            _name_value("density", "finite numbers > 0 kg/m^3", density, density > 0)
+            _name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0)
         try:
             mass = lumped_mass(ops.broadcast(density, shape), ops.broadcast(volume, shape), *model._topology)
         except ValueError:
@@ -227,12 +233,9 @@ def advance(
     adjoint = ReverseSweep() if adjoint is None else adjoint
     if not isinstance(adjoint, ReverseSweep):
         raise TypeError(f"adjoint: expected a diffvbd.ReverseSweep, got {type(adjoint).__name__}")
-    if x.is_cuda:
-        launch = regimes.choose(model.num_vertices, model.num_colors, flat[0])
-        prepared = prepared._replace(settings=prepared.settings._replace(launch=launch))
-        if _fuses(model, force, gravity):
-            held = None if prescribed is None else _broadcastable("prescribed", prescribed, x)
-            return _fused(model, start, velocity, gravity, held, prepared, adjoint, shape)
+    if x.is_cuda and _fuses(model, force, gravity):
+        held = None if prescribed is None else _broadcastable("prescribed", prescribed, x)
+        return _fused(model, start, velocity, gravity, held, prepared, adjoint, shape)
     acceleration = ops.broadcast(gravity, shape).reshape(flat)
     if force is not None:
         total = ops.broadcast(_broadcastable("force", force, x), shape).reshape(flat)
@@ -259,13 +262,13 @@ def advance(
         filtered = model.floor.filter(start, y - start, data[:, :count], origin)
         x_start = torch.where(model.pinned[:, None], y, filtered)
 
-    tensors = (x_start, start, y, prepared.mu, prepared.lam, prepared.mass, prepared.rest, data)
-    policy = _tape_policy(model, tensors, prepared.settings, adjoint)
-    tensors = (*tensors, x.new_empty((0,)) if origin is None else origin)
+    differentiable = (x_start, start, y, prepared.mu, prepared.lam, prepared.mass, prepared.rest, data)
+    policy = _tape_policy(model, differentiable, prepared.settings, adjoint)
+    tensors = (*differentiable, x.new_empty((0,)) if origin is None else origin)
     try:
         if _debug and x.is_cuda:
             _check_on_cpu(model, tensors, prepared.settings, index)
-        with out_of_memory_named(model, tensors[0], prepared.settings, policy):
+        with out_of_memory_named(model, x_start, prepared.settings, policy):
             end = sweep(*tensors, model._packed_rest, model._plan, prepared.settings, tape_policy=policy,
                         debug_step=index if _debug else -1)  # fmt: skip
     except ValueError as error:
@@ -283,7 +286,7 @@ def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
     simple = force is None and not model.vertex_energies and model.dtype == torch.float64
     if not simple or _debug or torch.compiler.is_compiling() or gravity.dim() > 1:
         return False
-    return torch._C._functorch.peek_interpreter_stack() is None
+    return torch._C._functorch.peek_interpreter_stack() is None  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _fused(
@@ -315,13 +318,14 @@ def _tape_policy(
     return adjoint.policy(x.shape[0] * settings.sweeps * model.num_active, x.element_size(), model.energy_mask)
 
 
-def _check_on_cpu(model: Model, tensors: tuple, settings: ops.SweepSettings, index: int) -> None:
+def _check_on_cpu(model: Model, tensors: Sequence[Any], settings: ops.SweepSettings, index: int) -> None:
     """debug_checks() on CUDA: the CPU repeats the step and names what is wrong with it."""
     twin = model._on_cpu()
     settings = settings._replace(sizes=twin._sizes, launch=())
     with torch.no_grad():
-        here = [t if t is None else t.detach().cpu() for t in tensors]
-        sweep(*here, twin._packed_rest, twin._plan, settings, tape_policy=ops.NO_TAPE, debug_step=index)
+        here: list[Any] = [t if t is None else t.detach().cpu() for t in tensors]
+        repeated: Any = sweep
+        repeated(*here, twin._packed_rest, twin._plan, settings, tape_policy=ops.NO_TAPE, debug_step=index)
 
 
 def _name_argument(error: ValueError, arguments: dict[str, Any]) -> None:

@@ -3,9 +3,11 @@
 # pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
 
+import torch
 from torch import Tensor
 from torch.autograd import Function
 
@@ -16,6 +18,20 @@ from .regimes import THREAD
 def repeated_policy(settings: ops.SweepSettings) -> int:
     """The tape of a step that is run again in the backward: what is quickest to write and read."""
     return ops.COMPACT_TAPE if settings.launch[:1] == (THREAD,) else ops.FULL_TAPE
+
+
+@contextlib.contextmanager
+def _backward_memory() -> Iterator[None]:
+    """Says what to change where a backward does not fit a CUDA device."""
+    try:
+        yield
+    except RuntimeError as error:
+        if "out of memory" not in str(error):
+            raise
+        raise torch.OutOfMemoryError(
+            f"CUDA out of memory in the backward of a step ({error}): use fewer scenes, a smaller tape "
+            '(ReverseSweep(tape="compact"), then "recompute") or more checkpoints'
+        ) from error
 
 
 def _no_second_derivative() -> NoReturn:
@@ -71,14 +87,15 @@ class _SweepBackward(Function):
     @staticmethod
     def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, packed_rest, plan, x, tape,
                 settings, tape_policy, needs):  # fmt: skip
-        if rest is not None:
-            packed_rest = ops.pack_rest(rest, plan, settings.sizes)
-        inputs = (x_prev, y, mu, lam, mass, packed_rest, energy_data, origin)
-        if tape_policy == ops.NO_TAPE:
-            tape_policy = repeated_policy(settings)
-            x, tape = ops.raw.sweep(x_start, *inputs, plan, *settings, tape_policy, -1, False)
-        wants = (needs[3] or needs[4], needs[5], needs[6], needs[7])
-        bars = ops.raw.sweep_backward(x_bar.contiguous(), x, *inputs, tape, plan, *settings, tape_policy, wants)
+        with _backward_memory():
+            if rest is not None:
+                packed_rest = ops.pack_rest(rest, plan, settings.sizes)
+            inputs = (x_prev, y, mu, lam, mass, packed_rest, energy_data, origin)
+            if tape_policy == ops.NO_TAPE:
+                tape_policy = repeated_policy(settings)
+                x, tape = ops.raw.sweep(x_start, *inputs, plan, *settings, tape_policy, -1, False)
+            wants = (needs[3] or needs[4], needs[5], needs[6], needs[7])
+            bars = ops.raw.sweep_backward(x_bar.contiguous(), x, *inputs, tape, plan, *settings, tape_policy, wants)
         given: tuple[Any, ...] = (x_start, x_prev, y, mu, lam, mass, rest, energy_data)
         return tuple(ops.sum_to(bar, t.shape) for bar, t, need in zip(bars, given, needs, strict=True) if need)
 
@@ -190,15 +207,16 @@ class _FusedBackward(Function):
     @staticmethod
     def forward(x_bar, v_bar, x, v, acceleration, held, mu, lam, mass, rest, packed_rest, plan, x_end, tape, settings,
                 tape_policy, needs):  # fmt: skip
-        if rest is not None:
-            packed_rest = ops.pack_rest(rest, plan, settings.sizes)
-        inputs = (x, v, acceleration, held, mu, lam, mass, packed_rest)
-        if tape_policy == ops.NO_TAPE:
-            tape_policy = repeated_policy(settings)
-            x_end, _, tape = ops.raw.fused_step(*inputs, plan, *settings, tape_policy)
-        bars = [x.new_empty((0,)) if bar is None else bar.contiguous() for bar in (x_bar, v_bar)]
-        wants = (*needs[:4], needs[4] or needs[5], *needs[6:])
-        out = ops.raw.fused_step_backward(*bars, x_end, *inputs, tape, plan, *settings, tape_policy, wants)
+        with _backward_memory():
+            if rest is not None:
+                packed_rest = ops.pack_rest(rest, plan, settings.sizes)
+            inputs = (x, v, acceleration, held, mu, lam, mass, packed_rest)
+            if tape_policy == ops.NO_TAPE:
+                tape_policy = repeated_policy(settings)
+                x_end, _, tape = ops.raw.fused_step(*inputs, plan, *settings, tape_policy)
+            bars = [x.new_empty((0,)) if bar is None else bar.contiguous() for bar in (x_bar, v_bar)]
+            wants = (*needs[:4], needs[4] or needs[5], *needs[6:])
+            out = ops.raw.fused_step_backward(*bars, x_end, *inputs, tape, plan, *settings, tape_policy, wants)
         given: tuple[Any, ...] = (x, v, acceleration, held, mu, lam, mass, rest)
         return tuple(ops.sum_to(bar, t.shape) for bar, t, need in zip(out, given, needs, strict=True) if need)
 

@@ -83,7 +83,7 @@ def device(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def one_regime(device: str) -> Iterator[None]:
     """For comparisons to the bit between calls of different size, whose regimes may differ: all in the one that runs
-    any scene."""
+    any scene. They must also be so small that a warp works on each vertex (regimes.MANY_LANES_VERTICES)."""
     import diffvbd as dv
 
     with dv.regime("color") if device == "cuda" else contextlib.nullcontext():

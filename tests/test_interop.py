@@ -249,7 +249,8 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
     """Arguments of every raw operator, in the order of its schema."""
     model = small_model(device)
     inputs = small_inputs(model)
-    settings = model.settings(0.3, 2)
+    settings = model.settings(0.3, 2, scenes=1)  # sizes, energies, data_count, numbers, sweeps, launch
+    assert len(settings.launch) == (3 if device == "cuda" else 0)
     x, y = inputs["x"][None], (inputs["x"] + 0.1 * inputs["v"])[None]
     tensors = (x, x, y, inputs["mu"][None], inputs["lam"][None], model.mass[None], model._packed_rest,
                model._energy_data, x.new_empty(0))  # fmt: skip
@@ -268,6 +269,22 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
     if policy != ops.NO_TAPE:
         wants = [True, True, True, True]
         arguments["sweep_backward"] = (torch.ones_like(x), x, *tensors[1:], tape, model._plan, *settings, policy, wants)
+    return arguments | (fused_arguments(policy) if device == "cuda" else {})
+
+
+def fused_arguments(policy: int) -> dict[str, tuple[Any, ...]]:
+    """The same of the operators that only CUDA has; their only energy is that of the tets."""
+    model = small_model("cuda", energies=(dv.StableNeoHookean(),))
+    inputs = {name: value[None] for name, value in small_inputs(model).items()}
+    state = (inputs["x"], inputs["v"], inputs["force"], inputs["prescribed"])  # a force is as good an acceleration
+    tensors = (*state, inputs["mu"], inputs["lam"], model.mass[None], model._packed_rest)
+    settings = model.settings(0.3, 2, scenes=1)
+    step = (*tensors, model._plan, *settings, policy)
+    x, v, tape = torch.ops.diffvbd.fused_step(*step)
+    arguments: dict[str, tuple[Any, ...]] = {"fused_step": step}
+    if policy != ops.NO_TAPE:
+        bars, wants = (torch.ones_like(x), torch.ones_like(v)), [True] * 7
+        arguments["fused_step_backward"] = (*bars, x, *tensors, tape, model._plan, *settings, policy, wants)
     return arguments
 
 
@@ -275,6 +292,14 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
 def test_opcheck_of_the_raw_operators(device: str, policy: int) -> None:
     for name, arguments in raw_arguments(device, policy).items():
         torch.library.opcheck(getattr(torch.ops.diffvbd, name).default, arguments)
+
+
+@pytest.mark.parametrize("lanes", ops.LANES.values(), ids=ops.LANES)
+def test_opcheck_of_the_plan(lanes: int) -> None:
+    """It is built on the CPU, for either device, and has no shapes without execution: they follow from the colors."""
+    model = small_model("cpu")
+    arguments = (model.rest_points, model.tets, ~model.pinned, lanes)
+    torch.library.opcheck(torch.ops.diffvbd.build_plan.default, arguments, test_utils="test_schema")
 
 
 def test_raw_operators_refuse_to_be_differentiated(device: str) -> None:

@@ -5,9 +5,10 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 
 import diffvbd as dv
-from diffvbd import energies, memory, ops, reference, safeguards
+from diffvbd import energies, memory, ops, reference, regimes, safeguards
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "diffvbd"
@@ -70,7 +71,12 @@ def test_mesh_and_ops_stand_alone() -> None:
             assert all(i.startswith("diffvbd.mesh") for i in inside), module
             assert not any(i.split(".")[0] == "torch" for i in imports), module
         if module == "ops":
+            assert inside == {"diffvbd.native"}
+        if module == "native":  # what it asks for when it compiles, inside a function
+            assert inside <= {"diffvbd.__version__", "diffvbd.build_cuda.architectures"}
+        if module == "build_cuda":
             assert not inside
+    assert layer_users("native") == {"ops", "model"}
 
 
 def test_reference_is_independent_of_what_it_checks() -> None:
@@ -109,31 +115,47 @@ def test_optional_packages_are_imported_where_they_are_used() -> None:
 
 
 def test_only_ops_names_the_compiled_operators() -> None:
-    pattern = re.compile(r"torch\.ops\b|torch\.library\b|\bdiffvbd::|\bload_library\b")
-    using = {path.name for path in PACKAGE.rglob("*.py") if pattern.search(path.read_text(encoding="utf-8"))}
-    assert using == {"ops.py"}
+    """One file loads the objects, one names what is in them, one runs the sweeps."""
+
+    def naming(pattern: str) -> set[str]:
+        texts = {module_of(path): path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")}
+        return {module for module, text in texts.items() if re.search(pattern, text)}
+
+    assert naming(r"\bload_library\b") == {"native"}
+    assert naming(r"torch\.ops\b(?!\.load_library\b)|torch\.library\b|\bdiffvbd::") == {"ops"}
+    assert naming(r"\bops\.raw\b") == {"sweeps"}
+    assert not [m for m, imports in PYTHON.items() if "diffvbd.ops.raw" in imports or "torch.ops" in imports]
 
 
 # --- C++ --------------------------------------------------------------------------------------------------------------
 
 
+CPP = (".h", ".cpp", ".cu", ".cuh")
+TORCH = r"torch|ATen|c10|Python\.h"
+
+
 def sources(folder: str) -> list[Path]:
-    return sorted(p for p in (CSRC / folder).rglob("*") if p.suffix in (".h", ".cpp", ".cu", ".cuh"))
+    return sorted(p for p in (CSRC / folder).rglob("*") if p.suffix in CPP)
 
 
 def includes(path: Path) -> list[str]:
     return re.findall(r'^\s*#\s*include\s*[<"]([^>"]+)[>"]', path.read_text(encoding="utf-8"), re.MULTILINE)
 
 
+def code_of(path: Path) -> str:
+    """Text without comments."""
+    return re.sub(r"//[^\n]*", "", path.read_text(encoding="utf-8"))
+
+
+def targets(path: Path) -> set[str]:
+    """Files of csrc that a file includes, relative to csrc."""
+    found = [(path.parent / name).resolve() for name in includes(path)]
+    return {t.relative_to(CSRC.resolve()).as_posix() for t in found if CSRC.resolve() in t.parents and t.exists()}
+
+
 def layer_includes(folder: str) -> set[str]:
-    """Layers of csrc whose headers a layer includes."""
-    found = set()
-    for path in sources(folder):
-        for name in includes(path):
-            target = (path.parent / name).resolve()
-            if CSRC.resolve() in target.parents:
-                found.add(target.relative_to(CSRC.resolve()).parts[0])
-    return found - {folder}
+    """Layers of csrc, or files beside them, whose headers a layer includes."""
+    return {target.split("/")[0] for path in sources(folder) for target in targets(path)} - {folder}
 
 
 @needs_csrc
@@ -144,7 +166,7 @@ def test_core_and_energies_know_no_torch() -> None:
         for path in paths:
             assert path.suffix == ".h", path
             text = path.read_text(encoding="utf-8")
-            assert not any(re.match(r"torch|ATen|c10|Python\.h|cuda", name) for name in includes(path)), path
+            assert not any(re.match(rf"{TORCH}|cuda", name) for name in includes(path)), path
             assert "torch::" not in text and "at::" not in text, path
 
 
@@ -154,8 +176,24 @@ def test_cpp_layers_include_only_what_lies_below() -> None:
     # vertex.h alone knows the list of energies: it is the algorithm that runs them
     assert layer_includes("core") <= {"energies"}
     assert [p.name for p in sources("core") if any("energies/" in name for name in includes(p))] == ["vertex.h"]
-    assert layer_includes("cpu") == {"core"}
-    assert layer_includes("cuda") <= {"core"}
+    kernels = {"core", "energies"}
+    assert "core" in layer_includes("cpu") <= kernels | {"arguments.h"}
+    assert "core" in layer_includes("cuda") <= kernels
+    assert {t.split("/")[0] for t in targets(CSRC / "arguments.h")} <= kernels
+    assert {t.split("/")[0] for t in targets(CSRC / "ops_cuda.cpp")} <= {*kernels, "arguments.h", "cuda"}
+    assert not targets(CSRC / "ops.cpp")
+
+
+@needs_csrc
+def test_tensors_end_where_the_operators_are_registered() -> None:
+    """Everything behind works on raw pointers; of torch the CPU's loops know the thread pool, CUDA's nothing."""
+    users = {p.relative_to(CSRC).as_posix() for p in sources(".") if "arguments.h" in targets(p)}
+    assert users == {"cpu/register.cpp", "ops_cuda.cpp"}
+    tensors = {p.relative_to(CSRC).as_posix() for p in sources(".") if re.search(r"\bTensor\b", code_of(p))}
+    assert tensors == {*users, "arguments.h", "ops.cpp"}
+    for path in sources("cuda"):
+        assert path.suffix in (".cu", ".cuh", ".h"), path
+        assert not any(re.match(TORCH, name) for name in includes(path)), path
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -163,7 +201,7 @@ def test_cpp_layers_include_only_what_lies_below() -> None:
 
 def test_files_are_short() -> None:
     folders = [f for f in (PACKAGE, CSRC, ROOT / "tests", ROOT / "bench") if f.exists()]
-    paths = [p for f in folders for p in f.rglob("*") if p.suffix in (".py", ".h", ".cpp", ".cu")]
+    paths = [p for f in folders for p in f.rglob("*") if p.suffix in (".py", *CPP)]
     assert len(paths) > 40
     lengths = {str(p.relative_to(ROOT)): len(p.read_text(encoding="utf-8").splitlines()) for p in paths}
     assert not {name: n for name, n in lengths.items() if n > 400}
@@ -173,14 +211,20 @@ def test_files_are_short() -> None:
 
 
 def constant(path: str, name: str) -> int:
-    (value,) = re.findall(rf"constexpr int {name} = (\d+);", (CSRC / path).read_text(encoding="utf-8"))
-    return int(value)
+    """Value of `constexpr int ..., name = n, ...;`, where n may be written as `int64_t{a} << b`."""
+    statements = re.findall(r"constexpr int(?:64_t)? ([^;]*);", code_of(CSRC / path))
+    (value,) = [v for s in statements for v in re.findall(rf"\b{name} = ([^,]+)", s)]
+    parsed = re.fullmatch(r"(?:int64_t\{(\d+)\}|(\d+))(?: << (\d+))?", value.strip())
+    assert parsed, f"{name} = {value}"
+    return int(parsed[1] or parsed[2]) << int(parsed[3] or 0)
 
 
 @needs_csrc
 def test_constants_agree_across_languages() -> None:
-    assert memory.LANES == constant("core/views.h", "kLanes")
-    assert ops.REST_SCALARS == constant("cpu/run.cpp", "kRestScalars")
+    assert ops.LANES == {"cpu": constant("core/views.h", "kLanes"), "cuda": constant("core/views.h", "kSlice")}
+    assert ops.REST_SCALARS == constant("core/views.h", "kRestScalars")
+    assert ops.PLAN_HEADER == constant("core/plan_views.h", "kPlanHeader")
+    assert memory.WORKSPACE_BUDGET == constant("ops_cuda.cpp", "kWorkspaceBudget")
     floor, anchor = (CSRC / "energies" / f"{name}.h" for name in ("floor_barrier", "anchor"))
     strides = [int(re.findall(r"stride = (\d+);", p.read_text(encoding="utf-8"))[0]) for p in (floor, anchor)]
     assert dv.FloorBarrier(normal=[(0, 1, 0)] * 3).count() == 3 * strides[0]
@@ -191,17 +235,32 @@ def test_constants_agree_across_languages() -> None:
 
 
 @needs_csrc
+def test_regimes_and_plans_agree() -> None:
+    (listed,) = re.findall(r"enum Regime \{([^}]*)\}", code_of(CSRC / "cuda" / "step.h"))
+    codes = {name.lower(): int(number) for name, number in re.findall(r"\bk(\w+) = (\d+)", listed)}
+    assert codes == regimes.CODES
+    lanes = [constant("cuda/step.h", f"k{name}Lanes") for name in ("Few", "Some", "Many")]
+    assert lanes == [regimes.FEW_LANES, regimes.SOME_LANES, regimes.MANY_LANES]
+    assert regimes.SMALL_MESH == constant("core/views.h", "kSmallMesh") >= regimes.THREAD_VERTICES
+    # the host gets a plan's header in an order of its own, with active vertices, tets and slots first
+    (order,) = re.findall(r"order\[diffvbd::kPlanHeader\] = \{([^}]*)\}", code_of(CSRC / "ops_cuda.cpp"))
+    sizes = ops.plan_sizes(torch.arange(100), "cuda")
+    assert [sizes[int(n)] for n in order.split(",")] == list(range(ops.PLAN_HEADER))
+    colors = 3  # both the place of the number of colors in the header and, in this plan, that number
+    assert list(sizes[ops.PLAN_HEADER :]) == [ops.PLAN_HEADER + n for n in range(colors + 1)]
+
+
+@needs_csrc
 def test_safeguard_constants_exist_once() -> None:
     """They reach the kernels as arguments; no header repeats them."""
-    text = "".join(p.read_text(encoding="utf-8") for f in ("core", "energies", "cpu") for p in sources(f))
-    code = re.sub(r"//[^\n]*", "", text)
+    code = "".join(code_of(p) for p in sources("."))
     assert safeguards.FILTER_ETA == 0.9 and not re.search(r"\b0\.9\b", code)
     assert safeguards.SATURATION_EPS == 1e-12 and not re.search(r"\b1e-0?12\b", code)
 
 
 @needs_csrc
 def test_tape_rows_and_policies_agree() -> None:
-    text = (CSRC / "cpu" / "scene.h").read_text(encoding="utf-8")
+    text = (CSRC / "core" / "views.h").read_text(encoding="utf-8")
     (policies,) = re.findall(r"enum TapePolicy \{([^}]*)\}", text)
     values = {name: int(number) for name, number in re.findall(r"(\w+) = (\d+)", policies)}
     assert values == {"kNoTape": ops.NO_TAPE, "kCompactTape": ops.COMPACT_TAPE, "kFullTape": ops.FULL_TAPE}

@@ -136,12 +136,23 @@ def test_repr_says_what_it_is() -> None:
                      relaxation=1.5)  # fmt: skip
     text = repr(model)
     for part in ("45 vertices", "96 tets", "2 pinned", f"{model.num_colors} colors", "20 kg", "StableNeoHookean",
-                 "FloorBarrier", "damping=3.0", "Anchor", "saturation=0.25 m", "regularization=0.001 kg",
-                 "relaxation=1.5", "float64", "cpu"):  # fmt: skip
+                 "FloorBarrier", "damping=3.0", "Anchor", "stiffness=2.0", "saturation=0.25 m",
+                 "regularization=0.001 kg", "relaxation=1.5", "float64", "cpu"):  # fmt: skip
         assert part in text, part
     assert "\n" not in text and len(text) < 700
     plain = repr(dv.Model(dv.mesh.cube(), dtype=torch.float32))
     assert "float32" in plain and "saturation" not in plain and "relaxation" not in plain
+
+
+def test_repr_shows_no_tensors() -> None:
+    stiffness, points = torch.rand(45), torch.rand(45, 3)
+    anchor = dv.Anchor(stiffness, points, vertices=[1, 4, 7])
+    text = repr(dv.Model(dv.mesh.beam(5, 3, 3), energies=(dv.StableNeoHookean(), anchor)))
+    for shown in (text, repr(anchor)):
+        assert "stiffness=[45]" in shown and "points=[45, 3]" in shown
+        assert "tensor" not in shown and "\n" not in shown and len(shown) < 700
+    assert "vertices=3 of 45" in text and "vertices=[3]" in repr(anchor)
+    assert repr(dv.Anchor(2.5)) == "Anchor(stiffness=2.5, points=None, vertices=None)"
 
 
 def test_surface_and_geometry_are_the_meshes() -> None:
@@ -200,11 +211,15 @@ def test_to_returns_a_new_model_and_keeps_the_old() -> None:
         assert torch.equal(t, tensors_of(single)[name]), name
 
 
-def test_to_another_device() -> None:
+def test_a_device_without_kernels_raises() -> None:
+    """Moves to CUDA are in test_cuda_device.py."""
     model = dv.Model(dv.mesh.cube())
-    moved = model.to("meta")
-    assert moved.device.type == "meta" and all(t.device.type == "meta" for t in tensors_of(moved).values())
-    assert all(t.device.type == "cpu" for t in tensors_of(model).values())
+    for device in ("meta", torch.device("meta"), "xpu:1"):
+        with pytest.raises(ValueError, match=r"device: .*cpu.*cuda.*, got '(meta|xpu:1)'"):
+            model.to(device)
+        with pytest.raises(ValueError, match="device: "):
+            dv.Model(dv.mesh.cube(), device=device)
+    assert model.device.type == "cpu" and all(t.device.type == "cpu" for t in tensors_of(model).values())
 
 
 # --- degenerate models ------------------------------------------------------------------------------------------------

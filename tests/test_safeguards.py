@@ -11,6 +11,7 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import ops, reference
 from diffvbd.safeguards import FILTER_ETA
+from diffvbd.sweeps import sweep
 from diffvbd.testing import build_scene, generator, on_device, relative_error, structured, tolerance
 
 # --- the step filter -------------------------------------------------------------------------------------------------
@@ -190,17 +191,17 @@ def test_an_update_forgets_where_its_vertex_was(device: str) -> None:
     first = model.color_vertices[: int(model.color_ptr[1])]
     y = predictor(model, inputs)[None]
 
-    def sweep(start: Tensor, sweeps: int) -> Tensor:
+    def swept(start: Tensor, sweeps: int) -> Tensor:
         arguments = (start, start.detach(), y, inputs["mu"][None], inputs["lam"][None], model.mass[None], None)
-        return ops.sweep(*arguments, model._energy_data, y.new_empty(0), model._packed_rest, model._plan,
-                         model.settings(inputs["time_step"], sweeps), tape_policy=ops.FULL_TAPE)  # fmt: skip
+        return sweep(*arguments, model._energy_data, y.new_empty(0), model._packed_rest, model._plan,
+                     model.settings(inputs["time_step"], sweeps), tape_policy=ops.FULL_TAPE)  # fmt: skip
 
     other = y.clone()
     other[:, first] += 3.0 * torch.as_tensor(generator("other").standard_normal((1, len(first), 3)), device=device)
-    assert relative_error(sweep(other, 1), sweep(y, 1)) <= tolerance("forward")
+    assert relative_error(swept(other, 1), swept(y, 1)) <= tolerance("forward")
     start = other.clone().requires_grad_()
     weights = torch.as_tensor(generator("weights").standard_normal(tuple(y.shape)), device=device)
-    (gradient,) = torch.autograd.grad((weights * sweep(start, 2)).sum(), start)
+    (gradient,) = torch.autograd.grad((weights * swept(start, 2)).sum(), start)
     elsewhere = torch.ones(model.num_vertices, dtype=torch.bool, device=device).index_fill(0, first, False)
     own, others = gradient[:, first], gradient[:, elsewhere]
     assert float(others.abs().max()) > 0.1

@@ -1,6 +1,6 @@
 // The algorithm: one block update of Vertex Block Descent (paper, eqs. 2-3) and its exact transpose (eqs. 7-12).
-// Loops, memory and launches belong to cpu/ and cuda/; a Star gives this file the incident tets of one vertex, and where
-// several threads share them, total() sums over the threads.
+// Loops, memory and launches belong to cpu/ and cuda/; a Star gives this file the incident tets of one vertex, and
+// where several threads share them, total() sums over the threads.
 #pragma once
 
 #include "../energies/energies.h"
@@ -13,8 +13,8 @@ namespace diffvbd {
 template <class R>
 struct Block {
   VertexState<R> state;
-  Vec3<R> y;  // predictor [m]
-  R mass;     // [kg]
+  Vec3<R> y;                       // predictor [m]
+  R mass;                          // [kg]
   const R* data[kVertexEnergies];  // of each energy that is present
   int data_count[kVertexEnergies];
 };
@@ -110,8 +110,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
     Set::for_each([&](auto energy, int k) {
       using E = decltype(energy);
       if constexpr (E::has_filter) {
-        E::filter_vjp(b.state, b.data[k], b.data_count[k], u.step, q, u.alpha, alpha_bar, out.x,
-                      step_bar);
+        E::filter_vjp(b.state, b.data[k], b.data_count[k], u.step, q, u.alpha, alpha_bar, out.x, step_bar);
       }
     });
   }

@@ -25,9 +25,9 @@ struct Batched {
 
 enum TapePolicy { kNoTape = 0, kCompactTape = 1, kFullTape = 2 };
 
-// Scalars per active vertex and sweep. Full: d_raw and the factored H. Compact: d_raw. A scene with a step filter keeps the old
-// position, in a compact tape instead of d_raw: a gap must come back to the bit, and an undo by subtraction is an ulp
-// off at times.
+// Scalars per active vertex and sweep. Full: d_raw and the factored H. Compact: d_raw. A scene with a step filter keeps
+// the old position, in a compact tape instead of d_raw: a gap must come back to the bit, and an undo by subtraction is
+// an ulp off at times.
 DIFFVBD_FN constexpr int tape_rows(int policy, bool filters) {
   return policy == kFullTape ? (filters ? 12 : 9) : policy == kCompactTape ? 3 : 0;
 }
@@ -89,11 +89,11 @@ struct GroupPlan {
   const int32_t* local;           // [slots, kSlice]  j + (k << kLocalBits) + (l << 2 kLocalBits) in the edge list
   const int32_t* adjacent;        // [edge_slots, kSlice]  position of the neighbour; padding names the vertex itself
   const int32_t* edge_entry;      // [edge_slots + 1]  first entry slot of each edge slot
-  const int32_t* entry;           // [entry_slots, kSlice]  what adds up to an edge: 3 e + a for corner a of pair e of the
-                                  // vertex; padding names the corner after the last of the block, which stays zero
-  const int32_t* incoming;        // [incoming_slots, kSlice]  edges (slot kSlice + lane) that end in the lane's vertex;
-                                  // padding names the edge after the last, whose row stays zero
-  const int32_t* tet_pair;        // [tets, 4]  pair (slot kSlice + lane) of each corner, -1 if it is not active
+  const int32_t* entry;     // [entry_slots, kSlice]  what adds up to an edge: 3 e + a for corner a of pair e of the
+                            // vertex; padding names the corner after the last of the block, which stays zero
+  const int32_t* incoming;  // [incoming_slots, kSlice]  edges (slot kSlice + lane) that end in the lane's vertex;
+                            // padding names the edge after the last, whose row stays zero
+  const int32_t* tet_pair;  // [tets, 4]  pair (slot kSlice + lane) of each corner, -1 if it is not active
   // Meshes of at most kSmallMesh vertices only: the sweep as one list, in the user's numbering.
   const int32_t* visit;       // [active, 2]  vertex + (its pairs << kLocalBits), its first pair
   const int32_t* visit_pair;  // [4 tets, 4]  j, k, l as in `local`, tet, pair (slot kSlice + lane), corner

@@ -110,8 +110,17 @@ Layout lay_out(const double* points, const Stars& stars, const Adjacency& graph,
 
 // Header and blocks, which both plans share; `extra` scalars follow.
 std::vector<int32_t> start_buffer(const Layout& layout, int64_t vertices, int64_t tets, int64_t extra) {
-  std::vector<int32_t> out = {static_cast<int32_t>(vertices), static_cast<int32_t>(tets), layout.active,
-                              layout.colors, layout.blocks, layout.slots, layout.edge_slots, layout.incoming_slots, 0, 0, 0};
+  std::vector<int32_t> out = {static_cast<int32_t>(vertices),
+                              static_cast<int32_t>(tets),
+                              layout.active,
+                              layout.colors,
+                              layout.blocks,
+                              layout.slots,
+                              layout.edge_slots,
+                              layout.incoming_slots,
+                              0,
+                              0,
+                              0};
   for (const auto* list : {&layout.color_block, &layout.block_slot, &layout.block_rank, &layout.block_edge,
                            &layout.block_incoming, &layout.order}) {
     out.insert(out.end(), list->begin(), list->end());

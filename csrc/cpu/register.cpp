@@ -11,10 +11,12 @@
 
 namespace {
 
-using diffvbd::Batched, diffvbd::batched, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::require,
-    diffvbd::zeros;
+using diffvbd::Batched, diffvbd::batched, diffvbd::data, diffvbd::dispatch_float, diffvbd::require;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
+
+Tensor zeros(const Tensor& like, const std::vector<int64_t>& sizes) { return torch::stable::new_zeros(like, sizes); }
+Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes) { return torch::stable::new_empty(like, sizes); }
 
 diffvbd::Plan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes) {
   require(buffer.scalar_type() == ScalarType::Int && buffer.is_contiguous() && buffer.numel() >= diffvbd::kPlanHeader,

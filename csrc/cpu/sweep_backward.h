@@ -26,17 +26,20 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
     if (Set::filters) b.state.x = {get(), get(), get()};
     Vec3<R> d_raw;
     Factor<R> H;
+    Update<R> u;
     if (tape == kFullTape || !Set::filters) d_raw = {get(), get(), get()};
+    if constexpr (!Set::filters) {
+      u = safeguarded<Set>(b, d_raw, q);
+      b.state.x -= u.step;
+    }
     if (tape == kFullTape) {
       H = {get(), get(), get(), get(), get(), get()};
     } else {
-      // H of a scene without filters depends on the neighbours alone
       const System<R> system = assemble<Set>(b, star, q);
       H = factored(b, system, q);
       if (Set::filters) d_raw = newton_step(system, H);
     }
-    const Update<R> u = safeguarded<Set>(b, d_raw, q);
-    if (!Set::filters) b.state.x -= u.step;
+    if constexpr (Set::filters) u = safeguarded<Set>(b, d_raw, q);
     store_rows(s.x, block, b.state.x);
 
     const Vec3<R> x_bar = load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block);

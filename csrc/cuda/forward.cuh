@@ -3,14 +3,14 @@
 
 #include <utility>
 
-#include "group.cuh"
+#include "schedule.cuh"
 
 namespace diffvbd::cuda {
 namespace {
 
 template <class T, int mask, int lanes>
-__global__ void __launch_bounds__(kMaxThreads) sweep_forward(const __grid_constant__ StepView<T> s,
-                                                          const __grid_constant__ Range range) {
+__global__ void __launch_bounds__(kMaxThreads)
+    sweep_forward(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range) {
   using Set = EnergySet<mask>;
   const int rows = tape_rows(s.tape_policy, Set::filters);
   T* const shared = memory_of_warp<T, lanes>(s, false);
@@ -68,4 +68,5 @@ SweepKernel<T> forward_kernel(int energies, int lanes) {
 
 }  // namespace diffvbd::cuda
 
-#define DIFFVBD_INSTANTIATE_FORWARD(T) template diffvbd::cuda::SweepKernel<T> diffvbd::cuda::forward_kernel<T>(int, int);
+#define DIFFVBD_INSTANTIATE_FORWARD(T) \
+  template diffvbd::cuda::SweepKernel<T> diffvbd::cuda::forward_kernel<T>(int, int);

@@ -34,14 +34,16 @@ __device__ __forceinline__ Vec3<T> predict(const StepInputs<T>& in, int64_t scen
 // and x_bar comes with it.
 template <class T>
 __global__ void load_vertices(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepView<T> s,
-                              int64_t base, const T* ends, const T* x_bar, const T* v_bar) {
+                              int64_t base, const T* ends, const T* x_bar, const T* v_bar, unsigned* barrier) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i == 0) *barrier = 0;  // of the cooperative grid that comes next
   if (i >= s.scenes * s.positions) return;
   const int64_t local = i / s.positions, scene = base + local, position = i - local * s.positions;
   const int64_t block = position / kSlice;
   const int v = static_cast<int>(position % kSlice);
   int64_t vertex = __ldg(s.plan.order + position);
-  const bool phantom = vertex < 0;  // it copies the first vertex of its block, so that it never meets an undefined state
+  const bool phantom =
+      vertex < 0;  // it copies the first vertex of its block, so that it never meets an undefined state
   if (phantom) vertex = __ldg(s.plan.order + block * kSlice);
   const bool pinned = block >= __ldg(s.plan.color_block + s.plan.colors);
   const int64_t vectors = local * s.positions * 3;
@@ -78,7 +80,8 @@ __global__ void store_vertices(const __grid_constant__ StepInputs<T> in, const _
   const Vec3<T> end = load_row(s.w.x, i);
   const int64_t own = scene * s.plan.num_vertices + vertex;
   store_user(x, own, end);
-  if (velocity) store_user(velocity, own, (T(1) / in.parameters.time_step) * (end - load_user(in.x_prev, scene, vertex)));
+  if (velocity)
+    store_user(velocity, own, (T(1) / in.parameters.time_step) * (end - load_user(in.x_prev, scene, vertex)));
 }
 
 // The pairs' copies of a material that differs from tet to tet.
@@ -94,8 +97,8 @@ __global__ void load_material(const __grid_constant__ StepInputs<T> in, const __
   s.w.material[2 * i + 1] = in.lam.data[scene * in.lam.scene + tet * in.lam.item];
 }
 
-// What is left in the rows after the last reversed update: of lower colors for a vertex that has had its turn, everything
-// for what is pinned.
+// What is left in the rows after the last reversed update: of lower colors for a vertex that has had its turn,
+// everything for what is pinned.
 template <class T>
 __device__ __forceinline__ Vec3<T> rows_left(const StepView<T>& s, int64_t scene, int block, int v, bool pinned) {
   Place<1> at(scene, block, 0);

@@ -105,13 +105,14 @@ template <class T, int lanes>
 __device__ __forceinline__ T* memory_of_warp(const StepView<T>& s, bool reverse) {
   extern __shared__ __align__(16) unsigned char memory[];
   const int warp = threadIdx.x / kSlice, size = shared_scalars(s.degree, s.valence, lanes, reverse);
-  if constexpr (lanes == kSpillLanes) return s.spill + (blockIdx.x * (blockDim.x / kSlice) + warp) * static_cast<int64_t>(size);
+  if constexpr (lanes == kSpillLanes)
+    return s.spill + (blockIdx.x * (blockDim.x / kSlice) + warp) * static_cast<int64_t>(size);
   return reinterpret_cast<T*>(memory) + warp * size;
 }
 
 // The incident tets of a group's vertex. `near` holds the neighbours' positions, [degree, 3, groups] in the warp's own
-// shared memory; `sums` what a reversed update adds to them: [degree, 3, kSlice], each thread its own, or of each corner
-// of each pair [3 valence + 1, 3, groups].
+// shared memory; `sums` what a reversed update adds to them, [degree, 3, kSlice], each thread its own, or to each
+// corner of each pair, [3 valence + 1, 3, groups].
 template <class T, int lanes_>
 struct GroupStar {
   static constexpr int lanes = threads_of(lanes_);
@@ -182,7 +183,7 @@ struct GroupStar {
     T k_ij, k_ik, k_il, c6, mu, lam;
   };
   mutable Record next;
-  mutable int where;      // of the pair at work
+  mutable int where;     // of the pair at work
   bool repeats = false;  // whether the star is visited once more
   __device__ __forceinline__ void fetch(int e) const {
     const int64_t base = slot(e);
@@ -226,27 +227,29 @@ struct GroupStar {
     if constexpr (lanes > 1) (P::sum(values), ...);
   }
 
-  __device__ __forceinline__ void send(int e, int corner, int neighbour, const Vec3<T>& v) const {
-    if constexpr (gather) {
-      const int own = e * lanes + at.lane;
-      if (own >= count) return;
-      T* to = sums + (3 * own + corner) * 3 * P::groups;
-      to[0] = v.x;
-      to[P::groups] = v.y;
-      to[2 * P::groups] = v.z;
-    } else {
-      T* to = sums + neighbour * 3 * kSlice;
-      to[0] += v.x;
-      to[kSlice] += v.y;
-      to[2 * kSlice] += v.z;
-    }
+  __device__ __forceinline__ void put(int row, const Vec3<T>& v) const {
+    T* to = sums + row * 3 * P::groups;
+    to[0] = v.x;
+    to[P::groups] = v.y;
+    to[2 * P::groups] = v.z;
+  }
+  __device__ __forceinline__ void send(int neighbour, const Vec3<T>& v) const {
+    T* to = sums + neighbour * 3 * kSlice;
+    to[0] += v.x;
+    to[kSlice] += v.y;
+    to[2 * kSlice] += v.z;
   }
   template <int wanted>
   __device__ __forceinline__ void add(int e, const TetPairAdjoint<T>& a) const {
     const int64_t base = slot(e);
-    send(e, 0, where & kMaxDegree, a.xj);
-    send(e, 1, where >> kLocalBits & kMaxDegree, a.xk);
-    send(e, 2, where >> 2 * kLocalBits, a.xl);
+    if constexpr (gather) {
+      const int row = 3 * (e * lanes + at.lane);
+      if (real(e)) put(row, a.xj), put(row + 1, a.xk), put(row + 2, a.xl);
+    } else {
+      send(where & kMaxDegree, a.xj);
+      send(where >> kLocalBits & kMaxDegree, a.xk);
+      send(where >> 2 * kLocalBits, a.xl);
+    }
     if constexpr ((wanted & kMaterial) != 0) {
       if (s.one_material) {
         material_bar[0] += a.mu;
@@ -269,8 +272,8 @@ struct GroupStar {
   }
   mutable T material_bar[2] = {T(0), T(0)};
 
-  // Writes the rows of the vertex's edges: the sums of its threads, in their order. What is pinned has no turn of its own:
-  // rows that lead to it add up over the sweeps.
+  // Writes the rows of the vertex's edges: the sums of its threads, in their order. What is pinned has no turn of its
+  // own: rows that lead to it add up over the sweeps.
   __device__ __forceinline__ void send_rows(int pinned) const {
     __syncwarp();
     T* rows = s.w.rows + at.scene * (static_cast<int64_t>(s.plan.edge_slots) * kSlice + 1) * kRow;
@@ -352,52 +355,6 @@ __device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const Place
     });
   }
   return out;
-}
-
-// All threads of a cooperative launch wait for each other; `turn` counts the meetings. The arrival releases what the block
-// wrote; no acquire follows, which would empty the L1 cache of the mesh's data too: what other blocks write is read
-// from the L2 cache alone (load_state).
-__device__ __forceinline__ void grid_barrier(unsigned* counter, unsigned& turn) {
-  __syncthreads();
-  turn += gridDim.x;
-  if (threadIdx.x == 0) {
-    asm volatile("red.release.gpu.global.add.u32 [%0], 1;" ::"l"(counter) : "memory");
-    unsigned seen;
-    do {
-      asm volatile("ld.relaxed.gpu.global.u32 %0, [%1];" : "=r"(seen) : "l"(counter) : "memory");
-    } while (seen < turn);
-  }
-  __syncthreads();
-}
-
-// Calls visit(scene, block, part) for the warps' share of each color, with barriers between colors.
-template <class T, int lanes_, class Visit>
-__device__ __forceinline__ void each_color(const StepView<T>& s, const Range& range, bool backward, Visit&& visit) {
-  constexpr int lanes = threads_of(lanes_);
-  const bool own = range.regime == kBlock;
-  const int64_t scenes_at_once = own ? 1 : s.scenes;
-  const unsigned warp = threadIdx.x / kSlice, warps_of_block = blockDim.x / kSlice;
-  const unsigned first = own ? warp : blockIdx.x * warps_of_block + warp;
-  const unsigned stride = own ? warps_of_block : gridDim.x * warps_of_block;
-  unsigned turn = 0;
-  for (int64_t own_scene = own ? blockIdx.x : 0; own_scene < (own ? s.scenes : 1); own_scene += gridDim.x) {
-    for (int k = range.first_sweep; k < range.end_sweep; ++k) {
-      for (int c = range.first_color; c < range.end_color; ++c) {
-        const int color = backward ? s.plan.colors - 1 - c : c;
-        const int begin = __ldg(s.plan.color_block + color), end = __ldg(s.plan.color_block + color + 1);
-        const unsigned parts = static_cast<unsigned>(end - begin) * lanes;
-        for (unsigned i = first; i < parts * static_cast<unsigned>(scenes_at_once); i += stride) {
-          const unsigned scene = scenes_at_once == 1 ? 0 : i / parts, part = i - scene * parts;
-          visit(own_scene + scene, k, begin + static_cast<int>(part / lanes), static_cast<int>(part % lanes));
-        }
-        if (own) {
-          __syncthreads();
-        } else if (range.regime == kGrid) {
-          grid_barrier(range.barrier, turn);
-        }
-      }
-    }
-  }
 }
 
 }  // namespace diffvbd::cuda

@@ -4,8 +4,8 @@ namespace diffvbd::cuda {
 namespace {
 
 constexpr int kItemThreads = 256;
-constexpr int64_t kShortRow = 32;   // a row of at most this many columns is summed by one thread
-constexpr int64_t kChunk = 4096;    // a longer one by blocks of threads, each this many columns
+constexpr int64_t kShortRow = 32;  // a row of at most this many columns is summed by one thread
+constexpr int64_t kChunk = 4096;   // a longer one by blocks of threads, each this many columns
 
 unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kItemThreads - 1) / kItemThreads); }
 
@@ -90,7 +90,8 @@ template <class T>
 cudaError_t gather_rows(const T* values, const int64_t* index, int64_t scenes, int64_t vertices, int64_t n, int64_t c,
                         T* out, cudaStream_t stream) {
   const int64_t items = scenes * n * c;
-  if (items > 0) gather_kernel<<<blocks_for(items), kItemThreads, 0, stream>>>(values, index, scenes, vertices, n, c, out);
+  if (items > 0)
+    gather_kernel<<<blocks_for(items), kItemThreads, 0, stream>>>(values, index, scenes, vertices, n, c, out);
   return cudaGetLastError();
 }
 
@@ -122,12 +123,11 @@ cudaError_t sum_rows(const T* values, int64_t rows, int64_t columns, T* partial,
   return chunks == 1 ? cudaSuccess : sum_rows(sums, rows, chunks, partial + rows * chunks, out, stream);
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                       \
-  template cudaError_t pack_rest<T>(const GroupPlan&, int64_t, const T*, T*, cudaStream_t);                          \
-  template cudaError_t gather_rows<T>(const T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, T*,              \
-                                      cudaStream_t);                                                                 \
-  template cudaError_t sum_segments<T>(const T*, const int64_t*, const int32_t*, int64_t, int64_t, int64_t, int64_t, \
-                                       T*, cudaStream_t);                                                            \
+#define DIFFVBD_INSTANTIATE(T)                                                                                         \
+  template cudaError_t pack_rest<T>(const GroupPlan&, int64_t, const T*, T*, cudaStream_t);                            \
+  template cudaError_t gather_rows<T>(const T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, T*, cudaStream_t); \
+  template cudaError_t sum_segments<T>(const T*, const int64_t*, const int32_t*, int64_t, int64_t, int64_t, int64_t,   \
+                                       T*, cudaStream_t);                                                              \
   template cudaError_t sum_rows<T>(const T*, int64_t, int64_t, T*, T*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

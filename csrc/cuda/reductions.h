@@ -20,7 +20,8 @@ template <class T>
 cudaError_t sum_segments(const T* values, const int64_t* ptr, const int32_t* entry, int64_t scenes, int64_t n,
                          int64_t segments, int64_t c, T* out, cudaStream_t stream);
 
-// values [rows, columns] -> [rows], in an order that depends on the shape alone. `partial` holds partial_sums() scalars.
+// values [rows, columns] -> [rows], in an order that depends on the shape alone. `partial` holds partial_sums()
+// scalars.
 int64_t partial_sums(int64_t rows, int64_t columns);
 template <class T>
 cudaError_t sum_rows(const T* values, int64_t rows, int64_t columns, T* partial, T* out, cudaStream_t stream);

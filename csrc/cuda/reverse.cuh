@@ -3,7 +3,7 @@
 
 #include <utility>
 
-#include "group.cuh"
+#include "schedule.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -11,8 +11,8 @@ namespace {
 constexpr int kReverseRegisters = 168;  // three warps of each scheduler fit
 
 template <class T, int mask, int wanted, int lanes>
-__global__ void __maxnreg__(kReverseRegisters) sweep_reverse(const __grid_constant__ StepView<T> s,
-                                                          const __grid_constant__ Range range) {
+__global__ void __maxnreg__(kReverseRegisters)
+    sweep_reverse(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range) {
   using Set = EnergySet<mask>;
   const int rows = tape_rows(s.tape_policy, Set::filters);
   T* const shared = memory_of_warp<T, lanes>(s, true);
@@ -43,15 +43,18 @@ __global__ void __maxnreg__(kReverseRegisters) sweep_reverse(const __grid_consta
     if constexpr (Set::elastic) star.clear_sums(shared);
     const Vec3<T> x_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
     if constexpr (Set::elastic) star.fetch_neighbours();
+    Update<T> u;
+    if constexpr (!Set::filters) {
+      u = safeguarded<Set>(b, d_raw, s.parameters);
+      b.state.x -= u.step;
+    }
     if (!full) {
-      // H of a scene without filters depends on the neighbours alone
       const System<T> system = assemble<Set>(b, star, s.parameters);
       H = factored(b, system, s.parameters);
       if (Set::filters) d_raw = newton_step(system, H);
       star.repeats = false;
     }
-    const Update<T> u = safeguarded<Set>(b, d_raw, s.parameters);
-    if (!Set::filters) b.state.x -= u.step;
+    if constexpr (Set::filters) u = safeguarded<Set>(b, d_raw, s.parameters);
     const bool writes = at.lane == 0 && real;
     const BlockAdjoint<T> out = reverse_vertex<Set, wanted>(
         b, star, u, H, x_bar, s.parameters, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {

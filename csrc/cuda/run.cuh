@@ -11,11 +11,11 @@ namespace {
 
 constexpr int kWarpsPerBlock = 4;  // of the grid and color regimes
 constexpr size_t kBarrierBytes = 256;
-
 // Threads per vertex that the shared memory of a block allows.
 template <class T>
 int possible_lanes(const HostPlan& host, const Choice& choice, bool reverse) {
-  return shared_scalars(host.degree, host.valence, choice.lanes, reverse) * sizeof(T) <= choice.shared ? choice.lanes : kSpillLanes;
+  return shared_scalars(host.degree, host.valence, choice.lanes, reverse) * sizeof(T) <= choice.shared ? choice.lanes
+                                                                                                       : kSpillLanes;
 }
 
 // Hands out the parts of a workspace; without one it only counts.
@@ -135,12 +135,10 @@ struct Runner {
       const int64_t items = scenes * host.plan.slots * kSlice;
       if (auto error = per_item(load_material<T>, items, in, s, base, scenes)) return error;
     }
-    return per_item(load_vertices<T>, s.scenes * s.positions, in, s, base, ends, x_bar, v_bar);
+    return per_item(load_vertices<T>, s.scenes * s.positions, in, s, base, ends, x_bar, v_bar, barrier);
   }
 
-  int64_t blocks_of(int color) const {
-    return host.color_block[color + 1] - host.color_block[color];
-  }
+  int64_t blocks_of(int color) const { return host.color_block[color + 1] - host.color_block[color]; }
 
   cudaError_t sweep(SweepKernel<T> kernel, int lanes, bool backward) {
     const GroupPlan& plan = host.plan;
@@ -175,7 +173,6 @@ struct Runner {
       const int size = static_cast<int>(threads.x);
       if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, function, size, shared)) return error;
       const int64_t blocks = std::min<int64_t>(int64_t{resident} * choice.multiprocessors, blocks_for(most));
-      if (auto error = cudaMemsetAsync(barrier, 0, kBarrierBytes, stream)) return error;
       return cudaLaunchCooperativeKernel(function, dim3(static_cast<unsigned>(blocks)), threads, arguments, shared,
                                          stream);
     }
@@ -276,10 +273,10 @@ cudaError_t run_reverse(const HostPlan& host, const StepInputs<T>& in, const T* 
 
 }  // namespace diffvbd::cuda
 
-#define DIFFVBD_INSTANTIATE_RUN(T)                                                                                    \
-  template size_t diffvbd::cuda::workspace_bytes<T>(const HostPlan&, const StepInputs<T>&, const StepAdjoints<T>*,    \
-                                                    const Choice&);                                                  \
-  template cudaError_t diffvbd::cuda::run_forward<T>(const HostPlan&, const StepInputs<T>&, const StepOutputs<T>&,    \
-                                                     const Choice&, void*, cudaStream_t);                            \
-  template cudaError_t diffvbd::cuda::run_reverse<T>(const HostPlan&, const StepInputs<T>&, const T*, const T*,       \
+#define DIFFVBD_INSTANTIATE_RUN(T)                                                                                 \
+  template size_t diffvbd::cuda::workspace_bytes<T>(const HostPlan&, const StepInputs<T>&, const StepAdjoints<T>*, \
+                                                    const Choice&);                                                \
+  template cudaError_t diffvbd::cuda::run_forward<T>(const HostPlan&, const StepInputs<T>&, const StepOutputs<T>&, \
+                                                     const Choice&, void*, cudaStream_t);                          \
+  template cudaError_t diffvbd::cuda::run_reverse<T>(const HostPlan&, const StepInputs<T>&, const T*, const T*,    \
                                                      const StepAdjoints<T>&, const Choice&, void*, cudaStream_t);

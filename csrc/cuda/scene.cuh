@@ -243,9 +243,7 @@ __device__ __forceinline__ void load_start(const StepInputs<T>& in, const GroupP
   if (!in.fused) {
     each_element(
         base, in.scenes, size,
-        [&](int64_t from) {
-          return Pair<T>{x ? __ldg(in.x_start.data + from) : T(0), __ldg(in.y.data + from)};
-        },
+        [&](int64_t from) { return Pair<T>{x ? __ldg(in.x_start.data + from) : T(0), __ldg(in.y.data + from)}; },
         [&](int64_t, int to, const Pair<T>& value) {
           if (x) x[to] = value.first;
           if (y) y[to] = value.second;

@@ -7,9 +7,9 @@ namespace diffvbd::cuda {
 namespace {
 
 template <class T, int mask, bool common>
-__global__ void __launch_bounds__(kMaxSceneThreads, 4) scene_forward(const __grid_constant__ StepInputs<T> in,
-                                                                  const __grid_constant__ StepOutputs<T> out,
-                                                                  const __grid_constant__ GroupPlan plan) {
+__global__ void __launch_bounds__(kMaxSceneThreads, 4)
+    scene_forward(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepOutputs<T> out,
+                  const __grid_constant__ GroupPlan plan) {
   using Set = EnergySet<mask>;
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
@@ -79,7 +79,8 @@ cudaError_t run_scene_forward(const HostPlan& host, const StepInputs<T>& in, con
   if (host.plan.num_vertices > kSmallMesh) return cudaErrorInvalidConfiguration;
   constexpr auto sets = std::make_integer_sequence<int, kEnergySets>{};
   const int index = energy_index(in.energies);
-  const auto kernel = is_common(in) ? pick_scene_forward<T, true>(index, sets) : pick_scene_forward<T, false>(index, sets);
+  const auto kernel =
+      is_common(in) ? pick_scene_forward<T, true>(index, sets) : pick_scene_forward<T, false>(index, sets);
   StepInputs<T> inputs = in;
   StepOutputs<T> outputs = out;
   GroupPlan plan = host.plan;
@@ -89,6 +90,6 @@ cudaError_t run_scene_forward(const HostPlan& host, const StepInputs<T>& in, con
 
 }  // namespace diffvbd::cuda
 
-#define DIFFVBD_INSTANTIATE_SCENE_FORWARD(T)                                                                     \
-  template cudaError_t diffvbd::cuda::run_scene_forward<T>(const HostPlan&, const StepInputs<T>&,                \
+#define DIFFVBD_INSTANTIATE_SCENE_FORWARD(T)                                                      \
+  template cudaError_t diffvbd::cuda::run_scene_forward<T>(const HostPlan&, const StepInputs<T>&, \
                                                            const StepOutputs<T>&, const Choice&, cudaStream_t);

@@ -13,10 +13,9 @@ DIFFVBD_FN bool reads_y(const StepAdjoints<T>& out, int policy, bool filters) {
 }
 
 template <class T, int mask, int wanted, bool common>
-__global__ void __launch_bounds__(kMaxSceneThreads, 3) scene_reverse(const __grid_constant__ StepInputs<T> in,
-                                                                  const T* ends, const T* tape,
-                                                                  const __grid_constant__ StepAdjoints<T> out,
-                                                                  const __grid_constant__ GroupPlan plan) {
+__global__ void __launch_bounds__(kMaxSceneThreads, 3)
+    scene_reverse(const __grid_constant__ StepInputs<T> in, const T* ends, const T* tape,
+                  const __grid_constant__ StepAdjoints<T> out, const __grid_constant__ GroupPlan plan) {
   using Set = EnergySet<mask>;
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
@@ -79,14 +78,17 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3) scene_reverse(const __gri
           if (Set::filters) b.state.x = now.x_old;
           Vec3<T> d_raw = now.d_raw;
           Factor<T> H = now.H;
+          Update<T> u;
+          if constexpr (!Set::filters) {
+            u = safeguarded<Set>(b, d_raw, in.parameters);
+            b.state.x -= u.step;
+          }
           if (!full) {
-            // H of a scene without filters depends on the neighbours alone
             const System<T> system = assemble<Set>(b, star, in.parameters);
             H = factored(b, system, in.parameters);
             if (Set::filters) d_raw = newton_step(system, H);
           }
-          const Update<T> u = safeguarded<Set>(b, d_raw, in.parameters);
-          if (!Set::filters) b.state.x -= u.step;
+          if constexpr (Set::filters) u = safeguarded<Set>(b, d_raw, in.parameters);
           set_column3(x, vertex, b.state.x);
           const BlockAdjoint<T> bar = reverse_vertex<Set, wanted>(
               b, star, u, H, column3(x_bar, vertex), in.parameters, out.data != nullptr,
@@ -182,7 +184,6 @@ cudaError_t run_scene_reverse(const HostPlan& host, const StepInputs<T>& in, con
 
 }  // namespace diffvbd::cuda
 
-#define DIFFVBD_INSTANTIATE_SCENE_REVERSE(T)                                                                        \
-  template cudaError_t diffvbd::cuda::run_scene_reverse<T>(const HostPlan&, const StepInputs<T>&, const T*,         \
-                                                           const T*, const StepAdjoints<T>&, const Choice&,        \
-                                                           cudaStream_t);
+#define DIFFVBD_INSTANTIATE_SCENE_REVERSE(T)                                                                          \
+  template cudaError_t diffvbd::cuda::run_scene_reverse<T>(const HostPlan&, const StepInputs<T>&, const T*, const T*, \
+                                                           const StepAdjoints<T>&, const Choice&, cudaStream_t);

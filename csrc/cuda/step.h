@@ -54,12 +54,12 @@ struct StepAdjoints {
 // Where the kernels work, for one chunk of scenes in sweep order. Sizes are per scene.
 template <class T>
 struct Workspace {
-  T *x, *x_bar, *rows;                     // [positions, 4], [positions, 4], [edge_slots kSlice + 1, 4]
+  T *x, *x_bar, *rows;                          // [positions, 4], [positions, 4], [edge_slots kSlice + 1, 4]
   T *y, *x_prev, *origin, *y_bar, *x_prev_bar;  // [blocks, 3, kSlice]
-  T *mass, *mass_bar;                      // [positions]
-  T *material, *material_bar;              // [slots, kSlice, 2]; the bar [positions, 2] if a scene has one material
-  T *rest_bar;                             // [slots, kSlice, 4]
-  T *data_bar;                             // [scalars, positions]
+  T *mass, *mass_bar;                           // [positions]
+  T *material, *material_bar;  // [slots, kSlice, 2]; the bar [positions, 2] if a scene has one material
+  T* rest_bar;                 // [slots, kSlice, 4]
+  T* data_bar;                 // [scalars, positions]
 };
 
 // Everything a sweep's kernels read and write; a chunk of scenes.
@@ -89,7 +89,7 @@ constexpr int kMaxThreads = 256;  // of a block of the sweep kernels
 struct Range {
   int regime;
   int first_sweep, end_sweep, first_color, end_color;
-  unsigned* barrier;  // kGrid: zeroed before the launch
+  unsigned* barrier;  // kGrid: zero before the launch
 };
 
 template <class T>

@@ -1,0 +1,54 @@
+// Who visits which vertices when: the loops over sweeps and colors inside a launch, and the barriers between colors.
+#pragma once
+
+#include "group.cuh"
+
+namespace diffvbd::cuda {
+
+// All threads of a cooperative launch wait for each other; `turn` counts the meetings. The arrival releases what the
+// block wrote; no acquire follows, which would empty the L1 cache of the mesh's data too: what other blocks write is
+// read from the L2 cache alone (load_state).
+__device__ __forceinline__ void grid_barrier(unsigned* counter, unsigned& turn) {
+  __syncthreads();
+  turn += gridDim.x;
+  if (threadIdx.x == 0) {
+    asm volatile("red.release.gpu.global.add.u32 [%0], 1;" ::"l"(counter) : "memory");
+    unsigned seen;
+    do {
+      asm volatile("ld.relaxed.gpu.global.u32 %0, [%1];" : "=r"(seen) : "l"(counter) : "memory");
+    } while (seen < turn);
+  }
+  __syncthreads();
+}
+
+// Calls visit(scene, block, part) for the warps' share of each color, with barriers between colors.
+template <class T, int lanes_, class Visit>
+__device__ __forceinline__ void each_color(const StepView<T>& s, const Range& range, bool backward, Visit&& visit) {
+  constexpr int lanes = threads_of(lanes_);
+  const bool own = range.regime == kBlock;
+  const int64_t scenes_at_once = own ? 1 : s.scenes;
+  const unsigned warp = threadIdx.x / kSlice, warps_of_block = blockDim.x / kSlice;
+  const unsigned first = own ? warp : blockIdx.x * warps_of_block + warp;
+  const unsigned stride = own ? warps_of_block : gridDim.x * warps_of_block;
+  unsigned turn = 0;
+  for (int64_t own_scene = own ? blockIdx.x : 0; own_scene < (own ? s.scenes : 1); own_scene += gridDim.x) {
+    for (int k = range.first_sweep; k < range.end_sweep; ++k) {
+      for (int c = range.first_color; c < range.end_color; ++c) {
+        const int color = backward ? s.plan.colors - 1 - c : c;
+        const int begin = __ldg(s.plan.color_block + color), end = __ldg(s.plan.color_block + color + 1);
+        const unsigned parts = static_cast<unsigned>(end - begin) * lanes;
+        for (unsigned i = first; i < parts * static_cast<unsigned>(scenes_at_once); i += stride) {
+          const unsigned scene = scenes_at_once == 1 ? 0 : i / parts, part = i - scene * parts;
+          visit(own_scene + scene, k, begin + static_cast<int>(part / lanes), static_cast<int>(part % lanes));
+        }
+        if (own) {
+          __syncthreads();
+        } else if (range.regime == kGrid) {
+          grid_barrier(range.barrier, turn);
+        }
+      }
+    }
+  }
+}
+
+}  // namespace diffvbd::cuda
