@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "performance.md"
 BENCHMARKS = ("cpu", "gpu")  # whose figures the page shows, in this order
 BEGIN, END = "<!-- figures: begin, written by python -m bench.report -->", "<!-- figures: end -->"
-EMPTY = "No figures yet: run `python -m bench cpu`, then `python -m bench.report`.\n"
+EMPTY = "No figures yet: run `python -m bench cpu` or `python -m bench gpu`, then `python -m bench.report`.\n"
 
 
 def main() -> int:

@@ -61,7 +61,8 @@ def choose(vertices: int, colors: int, scenes: int) -> tuple[int, int, int]:
     at_once = vertices * scenes / max(1, colors)
     if at_once <= MANY_LANES_VERTICES:
         return code, MANY_LANES, MANY_LANES
-    return code, *(SOME_LANES if at_once <= limit else FEW_LANES for limit in SOME_LANES_VERTICES)
+    forward, reverse = (SOME_LANES if at_once <= limit else FEW_LANES for limit in SOME_LANES_VERTICES)
+    return code, forward, reverse
 
 
 def _automatic(vertices: int, scenes: int) -> int:

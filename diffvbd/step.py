@@ -29,8 +29,8 @@ _debug = False  # a plain global: torch.compile guards it
 def debug_checks(enabled: bool = True) -> Iterator[None]:
     """Inside, a position that is not finite raises RuntimeError naming step, sweep, color, vertex and scene.
 
-    Off (the default) it costs nothing. On CUDA the CPU repeats each step to find out, and values that a step cannot work
-    with raise only here, because looking at them waits for the device.
+    Off (the default) it costs nothing. On CUDA the CPU repeats each step to find out, and values that a step cannot
+    work with raise only here, because looking at them waits for the device.
     """
     global _debug
     before, _debug = _debug, enabled

@@ -12,12 +12,6 @@ from torch import Tensor
 from torch.autograd import Function
 
 from . import ops
-from .regimes import THREAD
-
-
-def repeated_policy(settings: ops.SweepSettings) -> int:
-    """The tape of a step that is run again in the backward: what is quickest to write and read."""
-    return ops.COMPACT_TAPE if settings.launch[:1] == (THREAD,) else ops.FULL_TAPE
 
 
 @contextlib.contextmanager
@@ -92,7 +86,7 @@ class _SweepBackward(Function):
                 packed_rest = ops.pack_rest(rest, plan, settings.sizes)
             inputs = (x_prev, y, mu, lam, mass, packed_rest, energy_data, origin)
             if tape_policy == ops.NO_TAPE:
-                tape_policy = repeated_policy(settings)
+                tape_policy = ops.FULL_TAPE
                 x, tape = ops.raw.sweep(x_start, *inputs, plan, *settings, tape_policy, -1, False)
             wants = (needs[3] or needs[4], needs[5], needs[6], needs[7])
             bars = ops.raw.sweep_backward(x_bar.contiguous(), x, *inputs, tape, plan, *settings, tape_policy, wants)
@@ -212,7 +206,7 @@ class _FusedBackward(Function):
                 packed_rest = ops.pack_rest(rest, plan, settings.sizes)
             inputs = (x, v, acceleration, held, mu, lam, mass, packed_rest)
             if tape_policy == ops.NO_TAPE:
-                tape_policy = repeated_policy(settings)
+                tape_policy = ops.FULL_TAPE
                 x_end, _, tape = ops.raw.fused_step(*inputs, plan, *settings, tape_policy)
             bars = [x.new_empty((0,)) if bar is None else bar.contiguous() for bar in (x_bar, v_bar)]
             wants = (*needs[:4], needs[4] or needs[5], *needs[6:])

@@ -19,8 +19,8 @@ __global__ void __launch_bounds__(kMaxThreads)
     const int rank = __ldg(s.plan.block_rank + block) + at.v, end_rank = __ldg(s.plan.block_rank + block + 1);
     if (rank - at.group >= end_rank) return;  // the whole warp: phantoms alone
     GroupStar<T, lanes> star(s, at, shared);
-    if constexpr (Set::elastic) star.fetch_neighbours();
-    const Block<T> b = load_block<Set>(s, at);
+    if constexpr (Set::elastic) star.fetch_neighbours(s.own);
+    const Block<T> b = load_block<Set>(s, at, s.own);
     const System<T> system = assemble<Set>(b, star, s.parameters);
     const Factor<T> H = factored(b, system, s.parameters);
     const Update<T> u = safeguarded<Set>(b, newton_step(system, H), s.parameters);

@@ -137,7 +137,7 @@ struct GroupStar {
   }
 
   // Several loads are under way at once: what is beyond the last neighbour repeats it, and is not stored.
-  __device__ __forceinline__ void fetch_neighbours() {
+  __device__ __forceinline__ void fetch_neighbours(bool own) {
     constexpr int batch = lanes >= 32 ? 1 : lanes >= 8 ? 3 : 4;
     const T* x = s.w.x + at.scene * s.positions * kRow;
     const int32_t* adjacent = s.plan.adjacent + static_cast<int64_t>(first_edge) * kSlice + at.v;
@@ -147,7 +147,7 @@ struct GroupStar {
 #pragma unroll
       for (int u = 0; u < batch; ++u) index[u] = __ldg(adjacent + min(start + u * lanes, degree - 1) * kSlice);
 #pragma unroll
-      for (int u = 0; u < batch; ++u) n[u] = load_row(x, index[u], s.own);
+      for (int u = 0; u < batch; ++u) n[u] = load_row(x, index[u], own);
 #pragma unroll
       for (int u = 0; u < batch; ++u) {
         if (start + u * lanes >= degree) continue;
@@ -331,11 +331,11 @@ __device__ __forceinline__ Vec3<T> pull_rows(const StepView<T>& s, const Place<l
 }
 
 template <class Set, class T, int lanes>
-__device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const Place<lanes>& at) {
+__device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const Place<lanes>& at, bool own) {
   Block<T> out;
   const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
   const int64_t vectors = at.scene * s.positions * 3;
-  out.state.x = load_row(s.w.x, at.scene * s.positions + position, s.own);
+  out.state.x = load_row(s.w.x, at.scene * s.positions + position, own);
   out.state.x_prev = zero3<T>();
   out.state.origin = zero3<T>();
   if constexpr (Set::reads_x_prev) out.state.x_prev = load3(s.w.x_prev + vectors, at.block, at.v);

@@ -38,11 +38,11 @@ __global__ void __maxnreg__(kReverseRegisters)
     const Vec3<T> y_bar = load_own3(s.w.y_bar + scene * s.positions * 3, block, at.v);
     GroupStar<T, lanes> star(s, at, shared);
     star.repeats = !full;
-    Block<T> b = load_block<Set>(s, at);
+    Block<T> b = load_block<Set>(s, at, false);
     if (Set::filters) b.state.x = x_old;
     if constexpr (Set::elastic) star.clear_sums(shared);
     const Vec3<T> x_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
-    if constexpr (Set::elastic) star.fetch_neighbours();
+    if constexpr (Set::elastic) star.fetch_neighbours(false);
     Update<T> u;
     if constexpr (!Set::filters) {
       u = safeguarded<Set>(b, d_raw, s.parameters);
