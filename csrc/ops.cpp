@@ -4,9 +4,9 @@
 
 STABLE_TORCH_LIBRARY(diffvbd, m) {
   // numbers: time_step, regularization, relaxation, saturation (< 0: none), saturation_eps, filter_eta
-  // sizes: active vertices, tets, slots of the plan; on CUDA also what follows in HostPlan (cuda/step.h)
-  // data_count: scalars per scene, or per vertex, of each energy of one vertex
-  // launch: on CUDA the regime and the threads per vertex of the sweeps and of their reverse, else empty
+  // sizes: active vertices, tets, slots of the plan; on CUDA also the rest of its header and color_block (plan_sizes in
+  // ops.py) data_count: scalars per scene, or per vertex, of each energy of one vertex launch: on CUDA the regime and
+  // the threads per vertex of the sweeps and of their reverse, else empty
   m.def(
       "sweep(Tensor x_start, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, "
       "Tensor energy_data, Tensor origin, Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, "

@@ -44,6 +44,8 @@ Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes) {
                                                wide ? aoti_torch_dtype_float64() : aoti_torch_dtype_float32(),
                                                aoti_torch_device_type_cuda(), like.get_device_index(), &handle);
   if (status != AOTI_TORCH_SUCCESS) {
+    const cudaError_t last = cudaPeekAtLastError();
+    if (last != cudaSuccess && last != cudaErrorMemoryAllocation) check(last, "an allocation");
     int64_t bytes = wide ? 8 : 4;
     for (const int64_t n : sizes) bytes *= n;
     throw std::runtime_error("diffvbd: CUDA out of memory, wanted " + std::to_string(bytes) + " bytes more");
@@ -85,7 +87,8 @@ cuda::StepInputs<T> inputs(const cuda::HostPlan& host, const Tensor& x, const Te
   in.lam = batched<T>(lam, x, b, plan.num_tets);
   in.mass = batched<T>(mass, x, b, plan.num_vertices);
   in.rest = batched<T>(rest, x, b, int64_t{plan.slots} * 4 * diffvbd::kSlice);
-  in.energies = static_cast<int>(energies);
+  constexpr int elastic = diffvbd::kExactBlock | diffvbd::kPaperBlock;
+  in.energies = static_cast<int>(plan.num_tets > 0 ? energies : energies & ~elastic);
   in.data_size = diffvbd::energy_data_size(data_count, plan.num_vertices);
   for (int k = 0; k < diffvbd::kVertexEnergies; ++k) in.data_count[k] = static_cast<int>(data_count[k]);
   in.parameters = diffvbd::step_parameters<T>(numbers);
@@ -126,17 +129,23 @@ Tensor workspace(const Tensor& x, const cuda::HostPlan& host, const cuda::StepIn
   return empty(x, {(bytes + static_cast<int64_t>(sizeof(T)) - 1) / static_cast<int64_t>(sizeof(T))});
 }
 
+// Scenes first, but last where each thread has a scene: who mixes up the two is told so by the shape.
 template <class T>
-std::vector<int64_t> tape_shape(const cuda::HostPlan& host, const cuda::StepInputs<T>& in) {
-  const int rows = diffvbd::tape_rows(in.tape_policy, any_filter(in.energies, diffvbd::VertexEnergies{}));
-  return {in.scenes, in.sweeps, rows, host.plan.num_active};
+std::vector<int64_t> tape_shape(const cuda::HostPlan& host, const cuda::StepInputs<T>& in,
+                                const std::vector<int64_t>& launch) {
+  const int64_t rows = diffvbd::tape_rows(in.tape_policy, any_filter(in.energies, diffvbd::VertexEnergies{}));
+  const int64_t active = host.plan.num_active;
+  if (launch[0] == cuda::kThread) return {in.sweeps, rows, active, in.scenes};
+  return {in.scenes, in.sweeps, rows, active};
 }
 
 template <class T>
-void check_tape(const Tensor& tape, const cuda::HostPlan& host, const cuda::StepInputs<T>& in) {
-  int64_t size = 1;
-  for (const int64_t n : tape_shape(host, in)) size *= n;
-  require(tape.is_contiguous() && tape.numel() == size, "diffvbd: the tape does not belong to this step");
+void check_tape(const Tensor& tape, const cuda::HostPlan& host, const cuda::StepInputs<T>& in,
+                const std::vector<int64_t>& launch) {
+  const std::vector<int64_t> shape = tape_shape(host, in, launch);
+  bool same = tape.is_contiguous() && tape.dim() == 4;
+  for (int i = 0; same && i < 4; ++i) same = tape.size(i) == shape[i];
+  require(same, "diffvbd: the tape does not belong to this step");
 }
 
 std::tuple<Tensor, Tensor> sweep(const Tensor& x_start, const Tensor& x_prev, const Tensor& y, const Tensor& mu,
@@ -157,7 +166,8 @@ std::tuple<Tensor, Tensor> sweep(const Tensor& x_start, const Tensor& x_prev, co
     in.origin = batched<T>(origin, x_start, in.scenes, v3);
     in.data = batched<T>(energy_data, x_start, in.scenes, in.data_size);
     cuda::Choice choice = choose(x_start, launch, false);
-    Tensor x = empty(x_start, {in.scenes, host.plan.num_vertices, 3}), tape = empty(x_start, tape_shape(host, in));
+    Tensor x = empty(x_start, {in.scenes, host.plan.num_vertices, 3}),
+           tape = empty(x_start, tape_shape(host, in, launch));
     const Tensor work = workspace<T>(x_start, host, in, nullptr, choice);
     check(cuda::run_forward<T>(host, in, {data<T>(x), nullptr, data<T>(tape)}, choice, work.data_ptr(),
                                current_stream(x_start)),
@@ -184,9 +194,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> sweep
     in.origin = batched<T>(origin, x, b, v3);
     in.data = batched<T>(energy_data, x, b, in.data_size);
     require(x_bar.is_contiguous() && x_bar.numel() == x.numel(), "diffvbd::sweep_backward: x_bar must be like x");
-    check_tape(tape, host, in);
+    check_tape(tape, host, in, launch);
     const bool material = wants[0], of_mass = wants[1], of_rest = wants[2], of_data = wants[3];
-    const bool elastic = (energies & (diffvbd::kExactBlock | diffvbd::kPaperBlock)) != 0;
+    const bool elastic = (in.energies & (diffvbd::kExactBlock | diffvbd::kPaperBlock)) != 0;
     const int64_t materials = in.mu.item == 0 && in.lam.item == 0 ? 1 : t;
     const auto wanted = [&](bool flag, const std::vector<int64_t>& shape, bool zeroed) {
       Tensor out = empty(x, flag ? shape : std::vector<int64_t>{0});
@@ -242,7 +252,7 @@ std::tuple<Tensor, Tensor, Tensor> fused_step(const Tensor& x, const Tensor& v, 
     set_state(in, x, v, acceleration, held);
     cuda::Choice choice = choose(x, launch, false);
     Tensor x_end = empty(x, {in.scenes, host.plan.num_vertices, 3}), v_end = empty(x, {in.scenes, x.size(1), 3});
-    Tensor tape = empty(x, tape_shape(host, in));
+    Tensor tape = empty(x, tape_shape(host, in, launch));
     const Tensor work = workspace<T>(x, host, in, nullptr, choice);
     check(cuda::run_forward<T>(host, in, {data<T>(x_end), data<T>(v_end), data<T>(tape)}, choice, work.data_ptr(),
                                current_stream(x)),
@@ -268,9 +278,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> fused
       require(bar->numel() == 0 || (bar->is_contiguous() && bar->numel() == x.numel()),
               "diffvbd::fused_step_backward: expected adjoints like x");
     }
-    check_tape(tape, host, in);
+    check_tape(tape, host, in, launch);
     const int64_t b = in.scenes, n = host.plan.num_vertices, t = host.plan.num_tets;
-    const bool elastic = energies != 0;
+    const bool elastic = in.energies != 0;
     const int64_t materials = in.mu.item == 0 && in.lam.item == 0 ? 1 : t;
     const auto wanted = [&](bool flag, const std::vector<int64_t>& shape, bool zeroed) {
       Tensor out = empty(x, flag ? shape : std::vector<int64_t>{0});

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import ops
+from . import ops, regimes
 from .adjoints import ReverseSweep
 from .checks import check_count
 from .model import Model
@@ -47,10 +47,13 @@ WORKSPACE_BUDGET = 2 << 30  # bytes; twin of kWorkspaceBudget in csrc/ops_cuda.c
 
 def _cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = True, rest: bool = False) -> int:
     """Bytes of workspace of one step on CUDA, as carved in csrc/cuda/run.cuh (a material per tet)."""
+    if regimes.choose(model.num_vertices, model.num_colors, scenes)[0] == regimes.THREAD:
+        return 0
     _, _, slots, _, _, blocks, edge_slots, *_ = model._sizes
     lanes = ops.LANES["cuda"]
     positions, pairs = blocks * lanes, slots * lanes
     one = 8 * positions + (6 * positions if model.floor else 0) + 2 * pairs
+    one += 3 * positions if model.dtype == torch.float32 else 0  # local origins
     if reverse:
         one += 4 * (edge_slots * lanes + 1) + 8 * positions
         one += (2 * pairs if material or rest else 0) + (4 * pairs if rest else 0)

@@ -189,6 +189,14 @@ class Model:
         out._place(dtype, device)
         return out
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Unpickles, also where torch.load(map_location=...) has moved the tensors to another device."""
+        self.__dict__.update(state)
+        self._twin = None
+        actual = _checked_device(self.mass.device)
+        if actual != self.device:
+            self.__dict__.update(self.to(actual).__dict__)
+
     def _on_cpu(self) -> Model:
         """The same Model on the CPU, made once: what debug_checks() asks about a step on CUDA."""
         if self._twin is None:

@@ -67,14 +67,23 @@ def tape_rows(policy: int, energies: int) -> int:
     return {NO_TAPE: 0, COMPACT_TAPE: 3, FULL_TAPE: 12 if energies & _FILTERING else 9}[policy]
 
 
+def _tape_shape(
+    x: Tensor, sizes: Sequence[int], energies: int, sweeps: int, launch: Sequence[int], policy: int
+) -> list:
+    """Scenes first, but last where each thread has a scene: who mixes up the two is told so by the shape."""
+    shape = [sweeps, tape_rows(policy, energies), sizes[0]]
+    return [*shape, x.shape[0]] if tuple(launch[:1]) == (1,) else [x.shape[0], *shape]
+
+
 # --- raw operators: shapes without execution, no autograd -------------------------------------------------------------
 
 
 @torch.library.register_fake("diffvbd::sweep")
 def _(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, plan, sizes, energies, data_count, numbers, sweeps,
       launch, tape_policy, debug_step, checked):  # fmt: skip
-    rows = tape_rows(tape_policy, energies)
-    return torch.empty_like(x_start), x_start.new_empty((x_start.shape[0], sweeps, rows, sizes[0]))
+    return torch.empty_like(x_start), x_start.new_empty(
+        _tape_shape(x_start, sizes, energies, sweeps, launch, tape_policy)
+    )
 
 
 def _materials(mu: Tensor, lam: Tensor, num_tets: int) -> int:
@@ -98,8 +107,8 @@ def _(x_bar, x, x_prev, y, mu, lam, mass, rest, energy_data, origin, tape, plan,
 @torch.library.register_fake("diffvbd::fused_step")
 def _(x, v, acceleration, held, mu, lam, mass, rest, plan, sizes, energies, data_count, numbers, sweeps, launch,
       tape_policy):  # fmt: skip
-    rows = tape_rows(tape_policy, energies)
-    return torch.empty_like(x), torch.empty_like(x), x.new_empty((x.shape[0], sweeps, rows, sizes[0]))
+    shape = _tape_shape(x, sizes, energies, sweeps, launch, tape_policy)
+    return torch.empty_like(x), torch.empty_like(x), x.new_empty(shape)
 
 
 @torch.library.register_fake("diffvbd::fused_step_backward")

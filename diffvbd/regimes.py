@@ -20,6 +20,7 @@ SMALL_MESH = 64
 THREAD_VERTICES = 16  # above, a scene's positions leave too little shared memory for a scene per thread
 THREAD_SCENES = 4096  # below, a scene per thread leaves most of the device idle
 BLOCK_SCENES = 64  # below, a scene per block does
+BLOCK_VERTICES = 20_000  # above, the workspace holds too few scenes at once for a scene per block
 GRID_VERTICES = 100_000  # vertices of all scenes: above, launches cost less than a cooperative grid's barriers
 # Vertices of all scenes in a color up to which that many threads of each find room, in the sweeps and in their reverse.
 MANY_LANES_VERTICES = 1_500
@@ -68,6 +69,6 @@ def choose(vertices: int, colors: int, scenes: int) -> tuple[int, int, int]:
 def _automatic(vertices: int, scenes: int) -> int:
     if vertices <= THREAD_VERTICES and scenes >= THREAD_SCENES:
         return THREAD
-    if scenes >= BLOCK_SCENES:
+    if scenes >= BLOCK_SCENES and vertices <= BLOCK_VERTICES:
         return BLOCK
     return GRID if vertices * scenes <= GRID_VERTICES else COLOR

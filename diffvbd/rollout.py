@@ -14,7 +14,7 @@ from .adjoints import ReverseSweep
 from .checks import check_count, fail
 from .model import Model
 from .schedule import Binomial, Segment, choose_schedule, run_segments
-from .step import GRAVITY, advance, check_state, prepare
+from .step import GRAVITY, advance, check_state, prepare, step_settings
 
 _STATIC = ("mu", "lam", "rest_points", "density")  # enter through prepare(); the others through advance()
 
@@ -112,14 +112,17 @@ def rollout(
     parameters = {k: _frozen(value) for k, value in (parameters or {}).items()}
     static: dict[str, Any] = {k: options[k] for k in _STATIC} | {"parameters": parameters}
     changes = any(_changes(value) for value in (*(options[k] for k in _STATIC), *parameters.values()))
-    fixed = None if changes else prepare(model, lead, time_step=time_step, sweeps=sweeps, **static)
+    # once: what a checkpoint runs again must run as it did, whatever dv.regime says by then
+    settings = step_settings(model, lead, time_step, sweeps)
+    chosen: dict[str, Any] = {"time_step": time_step, "sweeps": sweeps, "settings": settings}
+    fixed = None if changes else prepare(model, lead, **chosen, **static)
 
     def one_step(k: int, x: Tensor, v: Tensor, adjoint: ReverseSweep) -> tuple[Tensor, Tensor]:
         prepared = fixed
         if prepared is None:
             now: dict[str, Any] = {name: _at(options[name], k, x, v) for name in _STATIC}
             now["parameters"] = {name: _at(value, k, x, v) for name, value in parameters.items()}
-            prepared = prepare(model, lead, time_step=time_step, sweeps=sweeps, **now)
+            prepared = prepare(model, lead, **chosen, **now)
         given = {name: _at(options[name], k, x, v) for name in ("force", "gravity", "prescribed")}
         return advance(model, x, v, prepared, adjoint=adjoint, index=k, **given)
 

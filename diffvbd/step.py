@@ -131,6 +131,17 @@ def _scenes_first(name: str, value: Any, like: Tensor, lead: tuple[int, ...], ow
     return ops.broadcast(value, (*lead, *rest)).reshape(-1, *rest)
 
 
+def step_settings(model: Model, lead: tuple[int, ...], time_step: Any, sweeps: Any) -> ops.SweepSettings:
+    """What is executed for scenes of shape ``lead``, the regime on CUDA included."""
+    if isinstance(time_step, Tensor) and time_step.requires_grad:
+        raise TypeError("time_step: expected a number, got a tensor that requires grad: it is not differentiable")
+    return model.settings(
+        check_positive("time_step", time_step, "s"),
+        check_count("sweeps", sweeps, maximum=MAX_SWEEPS),
+        math.prod(lead),
+    )
+
+
 def prepare(
     model: Model,
     lead: tuple[int, ...],
@@ -142,16 +153,12 @@ def prepare(
     rest_points: Tensor | None,
     density: float | Tensor | None,
     parameters: dict[str, Any] | None,
+    settings: ops.SweepSettings | None = None,
 ) -> Prepared:
-    """Checks and shapes everything of a step that does not depend on the state."""
+    """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
     like, tets = model.mass, (model.num_tets,)
-    if isinstance(time_step, Tensor) and time_step.requires_grad:
-        raise TypeError("time_step: expected a number, got a tensor that requires grad: it is not differentiable")
-    settings = model.settings(
-        check_positive("time_step", time_step, "s"),
-        check_count("sweeps", sweeps, maximum=MAX_SWEEPS),
-        math.prod(lead),
-    )
+    if settings is None:
+        settings = step_settings(model, lead, time_step, sweeps)
     rest, mass = None, model.mass[None]
     if density is not None:
         density = _scenes_first("density", density, like, lead, tets)

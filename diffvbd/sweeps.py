@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from . import ops
+from .regimes import BLOCK, FEW_LANES, THREAD
 
 
 @contextlib.contextmanager
@@ -26,6 +27,11 @@ def _backward_memory() -> Iterator[None]:
             f"CUDA out of memory in the backward of a step ({error}): use fewer scenes, a smaller tape "
             '(ReverseSweep(tape="compact"), then "recompute") or more checkpoints'
         ) from error
+
+
+def _scenes_first(settings: ops.SweepSettings) -> ops.SweepSettings:
+    """The same sweeps with a tape that can be split and repeated by scenes, for vmap."""
+    return settings._replace(launch=(BLOCK, FEW_LANES, FEW_LANES)) if settings.launch[:1] == (THREAD,) else settings
 
 
 def _no_second_derivative() -> NoReturn:
@@ -73,7 +79,8 @@ class _Sweep(Function):
         ]
         full = (info.batch_size * scenes, *folded[0].shape[1:])
         folded[:3] = [t.expand(full).contiguous() for t in folded[:3]]
-        x, tape = _Sweep.apply(*folded, *args[_TENSORS + 1 :])
+        packed_rest, plan, settings, *rest = args[_TENSORS + 1 :]
+        x, tape = _Sweep.apply(*folded, packed_rest, plan, _scenes_first(settings), *rest)
         return (x.unflatten(0, (-1, scenes)), tape.unflatten(0, (-1, scenes))), (0, 0)
 
 
@@ -104,6 +111,8 @@ class _SweepBackward(Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         x_bar, *saved, settings, tape_policy, needs = args
+        if settings.launch[:1] == (THREAD,):  # its tape has scenes last: run again, with one that does not
+            settings, tape_policy = _scenes_first(settings), ops.NO_TAPE
         tensors: tuple[Any, ...] = (x_bar, *saved[: _TENSORS + 1])
         scenes = _scenes(tensors, in_dims)
         size = info.batch_size
@@ -221,6 +230,18 @@ class _FusedBackward(Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> NoReturn:
         _no_second_derivative()
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        """Several adjoints of one step, one after another (the forward is no fused step under vmap)."""
+        members = []
+        for i in range(info.batch_size):
+            own = [a.select(d, i) if isinstance(a, Tensor) and d is not None else a
+                   for a, d in zip(args, in_dims, strict=True)]  # fmt: skip
+            out = _FusedBackward.apply(*own)
+            members.append(out if isinstance(out, tuple) else (out,))
+        stacked = tuple(torch.stack(parts) for parts in zip(*members, strict=True))
+        return stacked, (0,) * len(stacked)
 
 
 def fused_step(x, v, acceleration, held, mu, lam, mass, rest, packed_rest, plan, settings: ops.SweepSettings, *,

@@ -87,6 +87,49 @@ DIFFVBD_FN Vec3<R> moved(const Vec3<R>& x, const Update<R>& u) {
   return x + u.step;
 }
 
+// What a tape keeps of one update: the step filter needs the old position, a compact tape leaves H (and with a filter
+// d_raw) to be assembled again.
+template <class R>
+struct Recalled {
+  Vec3<R> x_old, d_raw;
+  Factor<R> H;
+};
+
+// The update that was executed. Puts b.state.x back to where it was before it, and completes what the tape left out.
+template <class Set, class R, class T, class Star>
+DIFFVBD_FN Update<R> replayed(Block<R>& b, const Star& star, Recalled<R>& r, bool full, const StepParameters<T>& q) {
+  Update<R> u;
+  if constexpr (Set::filters) {
+    b.state.x = r.x_old;
+  } else {
+    u = safeguarded<Set>(b, r.d_raw, q);
+    b.state.x -= u.step;
+  }
+  if (!full) {
+    const System<R> system = assemble<Set>(b, star, q);
+    r.H = factored(b, system, q);
+    if (Set::filters) r.d_raw = newton_step(system, r.H);
+  }
+  if constexpr (Set::filters) u = safeguarded<Set>(b, r.d_raw, q);
+  return u;
+}
+
+// Calls get() for each scalar that a tape keeps of one update, in the order in which the forward put them.
+template <class Set, class R, class Get>
+DIFFVBD_FN Recalled<R> recall(bool full, Get&& get) {
+  Recalled<R> r{};
+  if (Set::filters) r.x_old = {get(), get(), get()};
+  if (full || !Set::filters) r.d_raw = {get(), get(), get()};
+  if (full) r.H = {get(), get(), get(), get(), get(), get()};
+  return r;
+}
+template <class Set, class R, class Put>
+DIFFVBD_FN void record(bool full, const Block<R>& before, const Update<R>& u, const Factor<R>& H, Put&& put) {
+  if (Set::filters) put(before.state.x.x), put(before.state.x.y), put(before.state.x.z);
+  if (full || !Set::filters) put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
+  if (full) put(H.l21), put(H.l31), put(H.l32), put(H.inv1), put(H.inv2), put(H.inv3);
+}
+
 // Adjoints of what one update read, except those of its star, which go through star.add().
 template <class R>
 struct BlockAdjoint {

@@ -23,28 +23,13 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
     const LaneStar<T> star(plan, s, block, fresh_rows(plan, s.rows, block));
     R values[kMaxEnergyData];
     Block<R> b = load_block<Set>(plan, s, block, q, values);
-    if (Set::filters) b.state.x = {get(), get(), get()};
-    Vec3<R> d_raw;
-    Factor<R> H;
-    Update<R> u;
-    if (tape == kFullTape || !Set::filters) d_raw = {get(), get(), get()};
-    if constexpr (!Set::filters) {
-      u = safeguarded<Set>(b, d_raw, q);
-      b.state.x -= u.step;
-    }
-    if (tape == kFullTape) {
-      H = {get(), get(), get(), get(), get(), get()};
-    } else {
-      const System<R> system = assemble<Set>(b, star, q);
-      H = factored(b, system, q);
-      if (Set::filters) d_raw = newton_step(system, H);
-    }
-    if constexpr (Set::filters) u = safeguarded<Set>(b, d_raw, q);
+    Recalled<R> r = recall<Set, R>(tape == kFullTape, get);
+    const Update<R> u = replayed<Set>(b, star, r, tape == kFullTape, q);
     store_rows(s.x, block, b.state.x);
 
     const Vec3<R> x_bar = load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block);
-    const BlockAdjoint<R> out =
-        reverse_vertex<Set, wanted>(b, star, u, H, x_bar, q, s.data_bar != nullptr, [&](int k, int i, const R& value) {
+    const BlockAdjoint<R> out = reverse_vertex<Set, wanted>(
+        b, star, u, r.H, x_bar, q, s.data_bar != nullptr, [&](int k, int i, const R& value) {
           const int64_t row = b.data[k] - values + i;
           LaneStar<T>::accumulate(s.data_bar + (row * plan.blocks + block) * kLanes, value);
         });

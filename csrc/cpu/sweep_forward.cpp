@@ -23,11 +23,7 @@ DIFFVBD_HOT void forward_color(const Plan& plan, const SceneView<T>& s, const St
       value.store(at, count);
       at += plan.num_active;
     };
-    if (Set::filters) put(b.state.x.x), put(b.state.x.y), put(b.state.x.z);
-    if (tape == kFullTape || !Set::filters) put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
-    if (tape == kFullTape) {
-      put(H.l21), put(H.l31), put(H.l32), put(H.inv1), put(H.inv2), put(H.inv3);
-    }
+    record<Set>(tape == kFullTape, b, u, H, put);
   }
 }
 

@@ -32,11 +32,7 @@ __global__ void __launch_bounds__(kMaxThreads)
         *to = value;
         to += s.plan.num_active;
       };
-      if (Set::filters) put(b.state.x.x), put(b.state.x.y), put(b.state.x.z);
-      if (s.tape_policy == kFullTape || !Set::filters) put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
-      if (s.tape_policy == kFullTape) {
-        put(H.l21), put(H.l31), put(H.l32), put(H.inv1), put(H.inv2), put(H.inv3);
-      }
+      record<Set>(s.tape_policy == kFullTape, b, u, H, put);
     }
     __syncwarp();
   });

@@ -30,34 +30,19 @@ __global__ void __maxnreg__(kReverseRegisters)
       from += s.plan.num_active;
       return value;
     };
-    Vec3<T> x_old, d_raw;
-    Factor<T> H;
-    if (Set::filters) x_old = {get(), get(), get()};
-    if (full || !Set::filters) d_raw = {get(), get(), get()};
-    if (full) H = {get(), get(), get(), get(), get(), get()};
+    Recalled<T> r = recall<Set, T>(full, get);
     const Vec3<T> y_bar = load_own3(s.w.y_bar + scene * s.positions * 3, block, at.v);
     GroupStar<T, lanes> star(s, at, shared);
     star.repeats = !full;
     Block<T> b = load_block<Set>(s, at, false);
-    if (Set::filters) b.state.x = x_old;
     if constexpr (Set::elastic) star.clear_sums(shared);
     const Vec3<T> x_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
     if constexpr (Set::elastic) star.fetch_neighbours(false);
-    Update<T> u;
-    if constexpr (!Set::filters) {
-      u = safeguarded<Set>(b, d_raw, s.parameters);
-      b.state.x -= u.step;
-    }
-    if (!full) {
-      const System<T> system = assemble<Set>(b, star, s.parameters);
-      H = factored(b, system, s.parameters);
-      if (Set::filters) d_raw = newton_step(system, H);
-      star.repeats = false;
-    }
-    if constexpr (Set::filters) u = safeguarded<Set>(b, d_raw, s.parameters);
+    const Update<T> u = replayed<Set>(b, star, r, full, s.parameters);
+    star.repeats = false;
     const bool writes = at.lane == 0 && real;
     const BlockAdjoint<T> out = reverse_vertex<Set, wanted>(
-        b, star, u, H, x_bar, s.parameters, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
+        b, star, u, r.H, x_bar, s.parameters, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
           if (writes) s.w.data_bar[(scene * s.data_scalars + s.data_row[k] + i) * s.positions + position] += value;
         });
     if constexpr (Set::elastic) {

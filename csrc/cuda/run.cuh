@@ -11,11 +11,15 @@ namespace {
 
 constexpr int kWarpsPerBlock = 4;  // of the grid and color regimes
 constexpr size_t kBarrierBytes = 256;
-// Threads per vertex that the shared memory of a block allows.
+// Threads per vertex: those chosen, or so many more that shared memory holds the stars of several warps.
 template <class T>
 int possible_lanes(const HostPlan& host, const Choice& choice, bool reverse) {
-  return shared_scalars(host.degree, host.valence, choice.lanes, reverse) * sizeof(T) <= choice.shared ? choice.lanes
-                                                                                                       : kSpillLanes;
+  constexpr size_t warps = 6;  // fewer leave a multiprocessor waiting for memory
+  const auto needed = [&](int lanes) { return shared_scalars(host.degree, host.valence, lanes, reverse) * sizeof(T); };
+  for (const int lanes : {kFewLanes, kSomeLanes, kManyLanes}) {
+    if (lanes >= choice.lanes && needed(lanes) * warps <= choice.shared) return lanes;
+  }
+  return needed(kManyLanes) <= choice.shared ? kManyLanes : kSpillLanes;
 }
 
 // Hands out the parts of a workspace; without one it only counts.
@@ -154,7 +158,8 @@ struct Runner {
     const void* function = reinterpret_cast<const void*>(kernel);
     if (shared > 48 * 1024) {
       const auto attribute = cudaFuncAttributeMaxDynamicSharedMemorySize;
-      if (auto error = cudaFuncSetAttribute(function, attribute, static_cast<int>(shared))) return error;
+      // the same limit always: another thread may be about to launch the same kernel
+      if (auto error = cudaFuncSetAttribute(function, attribute, static_cast<int>(choice.shared))) return error;
     }
     const dim3 threads(static_cast<unsigned>(warps * kSlice));
     Range range{choice.regime, 0, in.sweeps, 0, colors, barrier};

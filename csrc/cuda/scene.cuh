@@ -269,12 +269,12 @@ __device__ __forceinline__ void load_start(const StepInputs<T>& in, const GroupP
       });
 }
 
-// One launch: as many blocks as the device holds, each going on until all scenes are done.
 template <class T>
 bool is_common(const StepInputs<T>& in) {
   return in.rest.scene == 0 && in.mu.item == 0 && in.lam.item == 0;
 }
 
+// One launch: as many blocks as the device holds, each going on until all scenes are done.
 template <class T, class K>
 cudaError_t launch_scenes(K kernel, void** arguments, const StepInputs<T>& in, const GroupPlan& plan, int tiles,
                           const Choice& choice, cudaStream_t stream) {
@@ -290,7 +290,7 @@ cudaError_t launch_scenes(K kernel, void** arguments, const StepInputs<T>& in, c
     if (bytes > choice.shared) break;
     if (bytes > 48 * 1024) {
       const auto attribute = cudaFuncAttributeMaxDynamicSharedMemorySize;
-      if (auto error = cudaFuncSetAttribute(function, attribute, static_cast<int>(bytes))) return error;
+      if (auto error = cudaFuncSetAttribute(function, attribute, static_cast<int>(choice.shared))) return error;
     }
     int blocks = 0;
     if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&blocks, function, warps * kSlice, bytes)) {

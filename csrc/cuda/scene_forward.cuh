@@ -40,13 +40,7 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
             *to = value;
             to += plan.num_active * in.scenes;
           };
-          const bool full = in.tape_policy == kFullTape;
-          if (Set::filters) put(b.state.x.x), put(b.state.x.y), put(b.state.x.z);
-          if (full || !Set::filters) put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
-          if (full) {
-            put(H.l21), put(H.l31), put(H.l32);
-            put(H.inv1), put(H.inv2), put(H.inv3);
-          }
+          record<Set>(in.tape_policy == kFullTape, b, u, H, put);
         }
       }
     }

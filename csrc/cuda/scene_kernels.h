@@ -1,4 +1,4 @@
-// A whole scene per thread: many small meshes (see scene_forward.cuh).
+// A whole scene per thread: many small meshes (see scene.cuh).
 #pragma once
 
 #include "step.h"

@@ -50,10 +50,6 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
     if (scene < in.scenes) {
       SceneStar<T, common> star(in, &out, plan, list, x, x_bar, scene);
       // what a visit reads of the tape is on its way during the visit before it
-      struct TapeRow {
-        Vec3<T> x_old, d_raw;
-        Factor<T> H;
-      };
       const auto read = [&](int k, int r) {
         const T* from = tape + ((static_cast<int64_t>(k) * rows) * plan.num_active + r) * in.scenes + scene;
         const auto get = [&] {
@@ -61,37 +57,20 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
           from += plan.num_active * in.scenes;
           return value;
         };
-        TapeRow row;
-        if (Set::filters) row.x_old = {get(), get(), get()};
-        if (full || !Set::filters) row.d_raw = {get(), get(), get()};
-        if (full) row.H = {get(), get(), get(), get(), get(), get()};
-        return row;
+        return recall<Set, T>(full, get);
       };
-      TapeRow next;
+      Recalled<T> next{};
       if (in.sweeps > 0 && plan.num_active > 0) next = read(in.sweeps - 1, plan.num_active - 1);
       for (int k = in.sweeps - 1; k >= 0; --k) {
         for (int r = plan.num_active - 1; r >= 0; --r) {
           const int vertex = star.go_to(r);
-          const TapeRow now = next;
+          Recalled<T> now = next;
           if (r > 0 || k > 0) next = read(r > 0 ? k : k - 1, r > 0 ? r - 1 : plan.num_active - 1);
           Block<T> b = load_scene_block<Set>(in, plan, start, scene, vertex, x, y);
-          if (Set::filters) b.state.x = now.x_old;
-          Vec3<T> d_raw = now.d_raw;
-          Factor<T> H = now.H;
-          Update<T> u;
-          if constexpr (!Set::filters) {
-            u = safeguarded<Set>(b, d_raw, in.parameters);
-            b.state.x -= u.step;
-          }
-          if (!full) {
-            const System<T> system = assemble<Set>(b, star, in.parameters);
-            H = factored(b, system, in.parameters);
-            if (Set::filters) d_raw = newton_step(system, H);
-          }
-          if constexpr (Set::filters) u = safeguarded<Set>(b, d_raw, in.parameters);
+          const Update<T> u = replayed<Set>(b, star, now, full, in.parameters);
           set_column3(x, vertex, b.state.x);
           const BlockAdjoint<T> bar = reverse_vertex<Set, wanted>(
-              b, star, u, H, column3(x_bar, vertex), in.parameters, out.data != nullptr,
+              b, star, u, now.H, column3(x_bar, vertex), in.parameters, out.data != nullptr,
               [&](int e, int i, const T& value) {
                 const bool own = is_per_vertex(e, VertexEnergies{});
                 const int64_t place = start[e] + (own ? static_cast<int64_t>(vertex) * in.data_count[e] : 0) + i;

@@ -16,7 +16,7 @@ __device__ __forceinline__ void grid_barrier(unsigned* counter, unsigned& turn) 
     unsigned seen;
     do {
       asm volatile("ld.relaxed.gpu.global.u32 %0, [%1];" : "=r"(seen) : "l"(counter) : "memory");
-    } while (seen < turn);
+    } while (static_cast<int>(seen - turn) < 0);
   }
   __syncthreads();
 }
