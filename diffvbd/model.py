@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -178,7 +177,8 @@ class Model:
         if dtype not in (torch.float64, torch.float32):
             raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
         device = self.device if device is None else _checked_device(device)
-        out = copy.copy(self)
+        out = object.__new__(type(self))
+        out.__dict__.update(self.__dict__)
         out._twin = None
         out._place(torch.float64, torch.device("cpu"))
         # from the mesh's own float64 positions, so that a way through float32 loses nothing

@@ -112,7 +112,7 @@ class _SweepBackward(Function):
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         x_bar, *saved, settings, tape_policy, needs = args
         if settings.launch[:1] == (THREAD,):  # its tape has scenes last: run again, with one that does not
-            settings, tape_policy = _scenes_first(settings), ops.NO_TAPE
+            settings, tape_policy, saved[-1] = _scenes_first(settings), ops.NO_TAPE, x_bar.new_empty((0,))
         tensors: tuple[Any, ...] = (x_bar, *saved[: _TENSORS + 1])
         scenes = _scenes(tensors, in_dims)
         size = info.batch_size
