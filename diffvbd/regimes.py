@@ -37,11 +37,12 @@ def regime(name: Regime | None) -> Iterator[None]:
         name: ``"thread"``: a scene per thread (meshes of at most 64 vertices); ``"block"``: a scene per thread block, a
             step per launch; ``"grid"``: all scenes by one cooperative grid, a step per launch; ``"color"``: a launch
             per color. Each is reproducible to the bit; they differ from each other by rounding. No effect on the CPU.
+            The setting is of the process: threads share it.
 
     Raises:
         ValueError: For another name; in a step, where the regime cannot run the scene.
     """
-    if name is not None and name not in CODES:
+    if name is not None and not (isinstance(name, str) and name in CODES):
         fail("regime", f"one of {sorted(CODES)} or None", repr(name))
     global _forced
     before, _forced = _forced, name

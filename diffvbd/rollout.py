@@ -14,7 +14,7 @@ from .adjoints import ReverseSweep
 from .checks import check_count, fail
 from .model import Model
 from .schedule import Binomial, Segment, choose_schedule, run_segments
-from .step import GRAVITY, advance, check_state, prepare, step_settings
+from .step import GRAVITY, advance, check_adjoint, check_state, prepare, step_settings
 
 _STATIC = ("mu", "lam", "rest_points", "density")  # enter through prepare(); the others through advance()
 
@@ -127,7 +127,7 @@ def rollout(
         return advance(model, x, v, prepared, adjoint=adjoint, index=k, **given)
 
     scenes = x.numel() // max(1, 3 * model.num_vertices)
-    every, adjoint = choose_schedule(checkpoint_every, adjoint or ReverseSweep(), model, scenes, steps, sweeps)
+    every, adjoint = choose_schedule(checkpoint_every, check_adjoint(adjoint), model, scenes, steps, sweeps)
     bar = _Progress(steps) if progress else None
 
     # A segment that runs again reads these anew: autograd cannot see that they were changed in between.

@@ -40,6 +40,14 @@ def debug_checks(enabled: bool = True) -> Iterator[None]:
         _debug = before
 
 
+def check_adjoint(adjoint: Any) -> ReverseSweep:
+    if adjoint is None:
+        return ReverseSweep()
+    if not isinstance(adjoint, ReverseSweep):
+        raise TypeError(f"adjoint: expected a diffvbd.ReverseSweep, got {type(adjoint).__name__}")
+    return adjoint
+
+
 class Prepared(NamedTuple):
     """Arguments of a step that do not depend on x and v, in the shapes of the operator (scenes first)."""
 
@@ -237,9 +245,7 @@ def advance(
         gravity = _three_numbers("gravity", gravity, x)
     gravity = _broadcastable("gravity", gravity, x)
     start, velocity = x.reshape(flat), v.reshape(flat)
-    adjoint = ReverseSweep() if adjoint is None else adjoint
-    if not isinstance(adjoint, ReverseSweep):
-        raise TypeError(f"adjoint: expected a diffvbd.ReverseSweep, got {type(adjoint).__name__}")
+    adjoint = check_adjoint(adjoint)
     if x.is_cuda and _fuses(model, force, gravity):
         held = None if prescribed is None else _broadcastable("prescribed", prescribed, x)
         return _fused(model, start, velocity, gravity, held, prepared, adjoint, shape)
@@ -358,7 +364,7 @@ def _three_numbers(name: str, value: Any, like: Tensor) -> Tensor:
         fail(name, "3 numbers or a tensor", f"{len(value)} numbers")
     if like.is_cuda:  # kernels fill it: a copy from the host would wait for the device and break a graph's capture
         return torch.stack([torch.full((), float(a), dtype=like.dtype, device=like.device) for a in value])
-    return torch.tensor([float(a) for a in value], dtype=like.dtype)
+    return torch.tensor([float(a) for a in value], dtype=like.dtype, device=like.device)
 
 
 def _broadcastable(name: str, value: Any, x: Tensor) -> Tensor:

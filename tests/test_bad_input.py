@@ -379,3 +379,17 @@ def test_debug_checks_change_nothing_in_a_sound_step(device: str) -> None:
     with dv.debug_checks():
         actual = dv.step(model, x, torch.zeros_like(x), **STEP)
     assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
+
+
+@pytest.mark.parametrize("adjoint", ["full", {}, 0, dv.ReverseSweep])
+def test_a_rollout_refuses_what_is_no_adjoint(adjoint: Any) -> None:
+    model = dv.Model(dv.mesh.cube())
+    x = model.rest_points
+    with pytest.raises(TypeError, match="adjoint: expected a diffvbd.ReverseSweep, got"):
+        dv.rollout(model, x, 0 * x, steps=2, mu=1e4, lam=1e4, time_step=0.01, sweeps=1, adjoint=adjoint)
+
+
+@pytest.mark.parametrize("name", ["bogus", 3, ["grid"], {}])
+def test_an_unknown_regime(name: Any) -> None:
+    with pytest.raises(ValueError, match="regime: expected one of"), dv.regime(name):
+        pass
