@@ -41,6 +41,7 @@ class SweepSettings(NamedTuple):
 LANES = {"cpu": 8, "cuda": 32}  # vertices of a block of the plan; twins of kLanes and kSlice in csrc/core/views.h
 
 
+THREAD = 1  # the regime whose tape has scenes last; twin of kThread in csrc/cuda/step.h
 PLAN_HEADER = 11  # twin of kPlanHeader in csrc/core/plan_views.h
 
 
@@ -72,7 +73,7 @@ def _tape_shape(
 ) -> list:
     """Scenes first, but last where each thread has a scene: who mixes up the two is told so by the shape."""
     shape = [sweeps, tape_rows(policy, energies), sizes[0]]
-    return [*shape, x.shape[0]] if tuple(launch[:1]) == (1,) else [x.shape[0], *shape]
+    return [*shape, x.shape[0]] if tuple(launch[:1]) == (THREAD,) else [x.shape[0], *shape]
 
 
 # --- raw operators: shapes without execution, no autograd -------------------------------------------------------------

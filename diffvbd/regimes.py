@@ -7,16 +7,17 @@ from collections.abc import Iterator
 from typing import Literal
 
 from .checks import fail
+from .ops import THREAD
 
 Regime = Literal["thread", "block", "grid", "color"]
 
 # twins of Regime, kFewLanes, kSomeLanes and kManyLanes in csrc/cuda/step.h, of kSmallMesh in csrc/core/views.h
-THREAD, BLOCK, GRID, COLOR = 1, 2, 3, 4
+BLOCK, GRID, COLOR = 2, 3, 4
 CODES: dict[str, int] = {"thread": THREAD, "block": BLOCK, "grid": GRID, "color": COLOR}
 FEW_LANES, SOME_LANES, MANY_LANES = 2, 8, 32
 SMALL_MESH = 64
 
-# Where one regime overtakes another, measured on an H100 (docs/performance.md).
+# Where one regime overtakes another, from first measurements on an H100; docs/performance.md shows where they are off.
 THREAD_VERTICES = 16  # above, a scene's positions leave too little shared memory for a scene per thread
 THREAD_SCENES = 4096  # below, a scene per thread leaves most of the device idle
 BLOCK_SCENES = 64  # below, a scene per block does

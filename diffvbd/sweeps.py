@@ -66,8 +66,7 @@ class _Sweep(Function):
             return (None,) * (_TENSORS + 7)
         needs = ctx.needs_input_grad[:_TENSORS]
         out = _SweepBackward.apply(grads[0], *ctx.saved_tensors, ctx.settings, ctx.tape_policy, needs)
-        out = iter(out if isinstance(out, tuple) else (out,))
-        return tuple(next(out) if need else None for need in needs) + (None,) * 7
+        return _of_inputs(out, needs, 7)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
@@ -156,6 +155,21 @@ def _scenes(tensors: Sequence[Tensor | None], in_dims: tuple) -> int:
     return max(sizes)
 
 
+def _distinct(*tensors: Tensor | None) -> list[Tensor | None]:
+    """Contiguous, and none of them twice, which torch.compile refuses."""
+    out: list[Tensor | None] = []
+    for t in tensors:
+        t = t if t is None else t.contiguous()
+        out.append(t.view_as(t) if t is not None and any(t is other for other in out) else t)
+    return out
+
+
+def _of_inputs(out: Any, needs: Sequence[bool], others: int) -> tuple:
+    """Gradients of what needs one, in the order of a forward's arguments, of which ``others`` more follow."""
+    given = iter(out if isinstance(out, tuple) else (out,))
+    return tuple(next(given) if need else None for need in needs) + (None,) * others
+
+
 def sweep(
     x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, packed_rest, plan, settings: ops.SweepSettings, *,
     tape_policy: int, debug_step: int = -1, checked: bool = True,
@@ -169,13 +183,8 @@ def sweep(
         energy_data: [1 | B, n], see VertexEnergy.pack; origin: [B, V, 3] or empty.
         tape_policy: What is kept for the backward; ops.NO_TAPE runs the step again there.
     """
-    tensors = (x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin)
-    distinct: list[Tensor | None] = []
-    for t in tensors:
-        t = t if t is None else t.contiguous()
-        # torch.compile refuses one tensor in two places
-        distinct.append(t.view_as(t) if t is not None and any(t is other for other in distinct) else t)
-    x, _ = _Sweep.apply(*distinct, packed_rest, plan, settings, tape_policy, debug_step, checked)
+    tensors = _distinct(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin)
+    x, _ = _Sweep.apply(*tensors, packed_rest, plan, settings, tape_policy, debug_step, checked)
     return x
 
 
@@ -202,8 +211,7 @@ class _FusedStep(Function):
             return (None,) * (_TENSORS + 4)
         needs = ctx.needs_input_grad[:_TENSORS]
         out = _FusedBackward.apply(*grads[:2], *ctx.saved_tensors, ctx.settings, ctx.tape_policy, needs)
-        out = iter(out if isinstance(out, tuple) else (out,))
-        return tuple(next(out) if need else None for need in needs) + (None,) * 4
+        return _of_inputs(out, needs, 4)
 
 
 class _FusedBackward(Function):
@@ -253,11 +261,8 @@ def fused_step(x, v, acceleration, held, mu, lam, mass, rest, packed_rest, plan,
         held: Where pinned vertices go [m], [1 | B, V, 3], or empty: they stay.
         mu, lam, mass, rest, packed_rest, tape_policy: As in :func:`sweep`.
     """
-    tensors = [t if t is None else t.contiguous() for t in (x, v, acceleration, held, mu, lam, mass, rest)]
-    distinct = [
-        t.view_as(t) if t is not None and any(t is u for u in tensors[:i]) else t for i, t in enumerate(tensors)
-    ]
-    x_end, v_end, _ = _FusedStep.apply(*distinct, packed_rest, plan, settings, tape_policy)
+    tensors = _distinct(x, v, acceleration, held, mu, lam, mass, rest)
+    x_end, v_end, _ = _FusedStep.apply(*tensors, packed_rest, plan, settings, tape_policy)
     return x_end, v_end
 
 
