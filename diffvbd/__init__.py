@@ -6,7 +6,8 @@ import os as _os
 _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from . import mesh
-from .adjoints import ReverseSweep
+from .adjoints import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
+from .debug import debug_checks
 from .diagnostics import Diagnosis, diagnose
 from .energies import Anchor, FloorBarrier, StableNeoHookean
 from .gradcheck import GradientCheck, check_gradients
@@ -15,7 +16,8 @@ from .model import Model
 from .regimes import regime
 from .rollout import Trajectory, per_step, rollout
 from .schedule import Binomial
-from .step import debug_checks, step
+from .solve import Solution, solve
+from .step import step
 from .tape import Tape, step_backward, step_forward
 
 __version__ = "0.1.0"
@@ -25,13 +27,17 @@ __all__ = [
     "Binomial",
     "Diagnosis",
     "FloorBarrier",
+    "GlobalAdjoint",
     "GradientCheck",
+    "LinearSolve",
     "Model",
     "ReverseSweep",
+    "Solution",
     "StableNeoHookean",
     "Tape",
     "TetMesh",
     "Trajectory",
+    "Unrolled",
     "check_gradients",
     "debug_checks",
     "diagnose",
@@ -39,6 +45,7 @@ __all__ = [
     "per_step",
     "regime",
     "rollout",
+    "solve",
     "step",
     "step_backward",
     "step_forward",

@@ -88,6 +88,13 @@ class VertexEnergy:
         """Parameters with a leading scene dimension [1 | B, ...] -> data [1 | B, n] as the kernels read it."""
         raise NotImplementedError
 
+    def gradient(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
+        """h^2 dE/dx [kg m] of every vertex, from the packed ``data``; what GlobalAdjoint differentiates.
+
+        x, x_prev: State and start of the step [m], relative to origin where there is one, [B, V, 3].
+        """
+        raise NotImplementedError
+
 
 @dataclass(frozen=True, eq=False)
 class FloorBarrier(VertexEnergy):
@@ -159,6 +166,23 @@ class FloorBarrier(VertexEnergy):
         columns = [values["height"].expand(shape)]
         columns += [values[k][:, None].expand(shape) for k in ("kappa", "dhat", "damping")]
         return torch.cat([normal.expand(*shape, 3), torch.stack(columns, -1)], -1).reshape(scenes, -1)
+
+    def gradient(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
+        planes = data.reshape(data.shape[0], 1, self.planes, 7)
+        normal, (height, kappa, dhat, damping) = planes[..., :3], planes[..., 3:].unbind(-1)
+        if origin is not None:
+            height = height - (normal * origin[:, :, None]).sum(-1)
+
+        def gap_of(x: Tensor) -> Tensor:
+            return (normal * x[:, :, None]).sum(-1) - height  # [B, V, P]
+
+        gap, travel = gap_of(x), (normal * (x - x_prev)[:, :, None]).sum(-1)
+        touches = (gap > 0) & (gap < dhat)
+        d = torch.where(touches, gap, dhat)
+        first = -kappa * (2 * (d - dhat) * torch.log(d / dhat) + (d - dhat) ** 2 / d)
+        damped = (gap_of(x_prev) < dhat) & (travel < 0)
+        size = h * h * first + h * torch.where(damped, damping * travel, torch.zeros_like(travel))
+        return (size[..., None] * normal).sum(-2)
 
     def filter(self, x: Tensor, step: Tensor, data: Tensor, origin: Tensor | None) -> Tensor:
         """x + alpha step for the packed ``data`` of this energy, see safeguards.filter_against_planes."""
@@ -248,6 +272,10 @@ class Anchor(VertexEnergy):
         n = points.shape[1]
         stiffness = stiffness.expand(scenes, n) * self._mask(n).to(points)
         return torch.cat([stiffness[..., None], points.expand(scenes, n, 3)], -1).reshape(scenes, -1)
+
+    def gradient(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
+        stiffness, points = data.reshape(data.shape[0], -1, 4).split((1, 3), -1)
+        return h * h * stiffness * (x - points)
 
 
 Energy = StableNeoHookean | VertexEnergy

@@ -96,6 +96,7 @@ def predict(
     item = model.mass.element_size()
     steps, scenes = check_count("steps", steps), check_count("scenes", scenes)
     schedule, adjoint = choose_schedule(checkpoint_every, ReverseSweep(tape), model, scenes, steps, sweeps)  # type: ignore[arg-type]
+    assert isinstance(adjoint, ReverseSweep)
     scalars = scenes * sweeps * model.num_active
     policy = adjoint.policy(scalars, item, model.energy_mask)
     tape_bytes = scalars * ops.tape_rows(policy, model.energy_mask) * item

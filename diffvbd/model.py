@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -66,7 +66,7 @@ class Model:
         if dtype not in (torch.float64, torch.float32):
             raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
         self.mesh = mesh
-        self._twin: Model | None = None
+        self._derived: dict[str, Any] = {}
         self.saturation = None if saturation is None else check_positive("saturation", saturation, "m")
         self.regularization = check_number("regularization", regularization)
         self.relaxation = check_positive("relaxation", relaxation, "")
@@ -179,7 +179,7 @@ class Model:
         device = self.device if device is None else _checked_device(device)
         out = object.__new__(type(self))
         out.__dict__.update(self.__dict__)
-        out._twin = None
+        out._derived = {}
         out._place(torch.float64, torch.device("cpu"))
         # from the mesh's own float64 positions, so that a way through float32 loses nothing
         points = torch.from_numpy(self.mesh.points.copy())
@@ -189,19 +189,26 @@ class Model:
         out._place(dtype, device)
         return out
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_derived": {}}
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Unpickles, also where torch.load(map_location=...) has moved the tensors to another device."""
         self.__dict__.update(state)
-        self._twin = None
+        self._derived = {}
         actual = _checked_device(self.mass.device)
         if actual != self.device:
             self.__dict__.update(self.to(actual).__dict__)
 
     def _on_cpu(self) -> Model:
-        """The same Model on the CPU, made once: what debug_checks() asks about a step on CUDA."""
-        if self._twin is None:
-            self._twin = self.to("cpu")
-        return self._twin
+        """The same Model on the CPU: what debug_checks() asks about a step on CUDA."""
+        return self.derived("on_cpu", lambda: self.to("cpu"))
+
+    def derived(self, name: str, build: Callable[[], Any]) -> Any:
+        """Something that follows from the Model alone, built at its first use and kept."""
+        if name not in self._derived:
+            self._derived[name] = build()
+        return self._derived[name]
 
     @property
     def tets(self) -> Tensor:

@@ -10,11 +10,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from .adjoints import ReverseSweep
+from .adjoints import Adjoint, check_adjoint
+from .arguments import GRAVITY, check_state, prepare, step_settings
 from .checks import check_count, fail
 from .model import Model
 from .schedule import Binomial, Segment, choose_schedule, run_segments
-from .step import GRAVITY, advance, check_adjoint, check_state, prepare, step_settings
+from .step import advance
 
 _STATIC = ("mu", "lam", "rest_points", "density")  # enter through prepare(); the others through advance()
 
@@ -65,7 +66,7 @@ def rollout(
     rest_points: Any = None,
     density: Any = None,
     parameters: dict[str, Any] | None = None,
-    adjoint: ReverseSweep | None = None,
+    adjoint: Adjoint | None = None,
     checkpoint_every: int | Binomial | Literal["auto"] | None = "auto",
     save: Literal["all", "last"] | int = "all",
     observe: Callable[[Tensor, Tensor, int], Any] | None = None,
@@ -96,7 +97,7 @@ def rollout(
     steps = check_count("steps", steps)
     if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
         fail("save", '"all", "last" or an integer > 0', repr(save))
-    lead = check_state(model, x, v)
+    lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
     options = {"mu": mu, "lam": lam, "rest_points": rest_points, "density": density, "force": force,
                "gravity": gravity, "prescribed": prescribed}  # fmt: skip
     if parameters is not None and not isinstance(parameters, dict):
@@ -114,10 +115,10 @@ def rollout(
     changes = any(_changes(value) for value in (*(options[k] for k in _STATIC), *parameters.values()))
     # once: what a checkpoint runs again must run as it did, whatever dv.regime says by then
     settings = step_settings(model, lead, time_step, sweeps)
-    chosen: dict[str, Any] = {"time_step": time_step, "sweeps": sweeps, "settings": settings}
+    chosen: dict[str, Any] = {"time_step": time_step, "sweeps": sweeps, "adjoint": adjoint, "settings": settings}
     fixed = None if changes else prepare(model, lead, **chosen, **static)
 
-    def one_step(k: int, x: Tensor, v: Tensor, adjoint: ReverseSweep) -> tuple[Tensor, Tensor]:
+    def one_step(k: int, x: Tensor, v: Tensor, adjoint: Adjoint) -> tuple[Tensor, Tensor]:
         prepared = fixed
         if prepared is None:
             now: dict[str, Any] = {name: _at(options[name], k, x, v) for name in _STATIC}
@@ -127,7 +128,7 @@ def rollout(
         return advance(model, x, v, prepared, adjoint=adjoint, index=k, **given)
 
     scenes = x.numel() // max(1, 3 * model.num_vertices)
-    every, adjoint = choose_schedule(checkpoint_every, check_adjoint(adjoint), model, scenes, steps, sweeps)
+    every, adjoint = choose_schedule(checkpoint_every, adjoint, model, scenes, steps, sweeps)
     bar = _Progress(steps) if progress else None
 
     # A segment that runs again reads these anew: autograd cannot see that they were changed in between.

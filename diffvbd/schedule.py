@@ -12,12 +12,13 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from . import ops
-from .adjoints import ReverseSweep
+from .adjoints import Adjoint, ReverseSweep, Unrolled
 from .checks import check_count, fail
 from .model import Model
 
 MAX_REPEATS = 64  # of a step under Binomial: each is a nested checkpoint, and a run of the step
 TAPE_BUDGET = 2 * 2**30  # bytes of tape that "auto" lets a rollout keep
+UNROLLED_SCALARS = 540  # that autograd keeps per active vertex and sweep; measured on a structured beam (bench/cpu.py)
 
 
 @dataclass(frozen=True)
@@ -49,12 +50,12 @@ Run = Callable[[int, int, Tensor, Tensor], Segment]
 
 def choose_schedule(
     checkpoint_every: int | Binomial | Literal["auto"] | None,
-    adjoint: ReverseSweep,
+    adjoint: Adjoint,
     model: Model,
     scenes: int,
     steps: int,
     sweeps: int,
-) -> tuple[int | Binomial | None, ReverseSweep]:
+) -> tuple[int | Binomial | None, Adjoint]:
     """Resolves ``"auto"`` for schedule and tape from the bytes they would keep."""
     if isinstance(checkpoint_every, Binomial):
         snapshots = checkpoint_every.snapshots
@@ -69,6 +70,9 @@ def choose_schedule(
             fail("checkpoint_every", '"auto", None, an integer > 0 or Binomial(snapshots)', repr(checkpoint_every))
         return check_count("checkpoint_every", checkpoint_every, 1), adjoint
     row = scenes * check_count("sweeps", sweeps) * model.num_active * model.mass.element_size()
+    if not isinstance(adjoint, ReverseSweep):  # a step of GlobalAdjoint keeps a few states and no tape
+        kept = UNROLLED_SCALARS * row if isinstance(adjoint, Unrolled) else 0
+        return None if steps * kept <= TAPE_BUDGET else max(1, math.isqrt(steps)), adjoint
     candidates = ("full", "compact") if adjoint.tape == "auto" else (adjoint.tape,)
     for tape in candidates:
         if steps * row * ops.tape_rows(ReverseSweep(tape).policy(0, 0, 0), model.energy_mask) <= TAPE_BUDGET:

@@ -34,7 +34,7 @@ def _scenes_first(settings: ops.SweepSettings) -> ops.SweepSettings:
     return settings._replace(launch=(BLOCK, FEW_LANES, FEW_LANES)) if settings.launch[:1] == (THREAD,) else settings
 
 
-def _no_second_derivative() -> NoReturn:
+def no_second_derivative() -> NoReturn:
     raise NotImplementedError("diffvbd: second derivatives of a step are not supported (create_graph, hessian)")
 
 
@@ -66,7 +66,7 @@ class _Sweep(Function):
             return (None,) * (_TENSORS + 7)
         needs = ctx.needs_input_grad[:_TENSORS]
         out = _SweepBackward.apply(grads[0], *ctx.saved_tensors, ctx.settings, ctx.tape_policy, needs)
-        return _of_inputs(out, needs, 7)
+        return of_inputs(out, needs, 7)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
@@ -105,7 +105,7 @@ class _SweepBackward(Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> NoReturn:
-        _no_second_derivative()
+        no_second_derivative()
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
@@ -164,10 +164,14 @@ def _distinct(*tensors: Tensor | None) -> list[Tensor | None]:
     return out
 
 
-def _of_inputs(out: Any, needs: Sequence[bool], others: int) -> tuple:
+def of_inputs(out: Any, needs: Sequence[bool], others: int) -> tuple:
     """Gradients of what needs one, in the order of a forward's arguments, of which ``others`` more follow."""
     given = iter(out if isinstance(out, tuple) else (out,))
     return tuple(next(given) if need else None for need in needs) + (None,) * others
+
+
+# x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin: the first arguments of sweep()
+SweepTensors = tuple[Any, Any, Any, Any, Any, Any, Any, Any, Any]
 
 
 def sweep(
@@ -211,7 +215,7 @@ class _FusedStep(Function):
             return (None,) * (_TENSORS + 4)
         needs = ctx.needs_input_grad[:_TENSORS]
         out = _FusedBackward.apply(*grads[:2], *ctx.saved_tensors, ctx.settings, ctx.tape_policy, needs)
-        return _of_inputs(out, needs, 4)
+        return of_inputs(out, needs, 4)
 
 
 class _FusedBackward(Function):
@@ -237,7 +241,7 @@ class _FusedBackward(Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> NoReturn:
-        _no_second_derivative()
+        no_second_derivative()
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:

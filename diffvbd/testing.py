@@ -47,6 +47,10 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "dot_product": (1e-12, "<J v, w> = <v, J^T w>: two exact derivatives, rounding only"),
     "float32_forward": (1e-5, "float32 near the origin: eps is 1.2e-7, times conditioning of the sweep"),
     "float32_gradient": (1e-4, "float32 near the origin: 1e-6 to 1e-5 measured, with room for stiff scenes"),
+    "hessian": (1e-13, "first and second derivatives of one potential by two formulas: rounding of F and of the edges"),
+    "conjugate_gradients": (1e-11, "a relative residual of 1e-13 times a condition number of 225"),
+    "global_routes": (1e-10, "assembled against matrix-free, both solved to 1e-13: conditioning of the Hessian times that"),
+    "global_converged": (1e-9, "300 sweeps leave a residual near rounding, which the Hessian's conditioning amplifies"),
     "memory": (0.1, "predicted against measured bytes: allocator granularity and small buffers"),
 }
 

@@ -385,7 +385,7 @@ def test_debug_checks_change_nothing_in_a_sound_step(device: str) -> None:
 def test_a_rollout_refuses_what_is_no_adjoint(adjoint: Any) -> None:
     model = dv.Model(dv.mesh.cube())
     x = model.rest_points
-    with pytest.raises(TypeError, match="adjoint: expected a diffvbd.ReverseSweep, got"):
+    with pytest.raises(TypeError, match="adjoint: expected a diffvbd.ReverseSweep, Unrolled or GlobalAdjoint, got"):
         dv.rollout(model, x, 0 * x, steps=2, mu=1e4, lam=1e4, time_step=0.01, sweeps=1, adjoint=adjoint)
 
 

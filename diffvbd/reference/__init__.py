@@ -4,7 +4,8 @@ It is the oracle of the exactness tests and the unrolled opponent in benchmarks.
 not from the pair scalars of the compiled sweep, and imports nothing compiled, so the two agree only if both are right.
 """
 
+from .layout import build_layout
 from .potential import incremental_potential, residual
-from .sweep import Trajectory, rollout, step
+from .sweep import Trajectory, rollout, step, stepper
 
-__all__ = ["Trajectory", "incremental_potential", "residual", "rollout", "step"]
+__all__ = ["Trajectory", "build_layout", "incremental_potential", "residual", "rollout", "step", "stepper"]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from .energies import build_energies
-from .layout import build_layout, dot, put, solve6, take
+from .layout import Layout, build_layout, dot, put, solve6, take
 from .scene import Scene, build_scene
 
 SATURATION_EPS = 1e-12  # [m] keeps s finite at a zero step
@@ -44,7 +44,8 @@ def step(
     [kg/m^3] to [..., T]. tet_order: permutation [T] of the tets that changes only the order of summation.
     Raises ValueError when an unpinned vertex starts below a floor plane. Returns (x', v').
     """
-    advance = _stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, tet_order)
+    layout = build_layout(model, tet_order)
+    advance = stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
     return advance(x, v, force, gravity, prescribed)
 
 
@@ -70,7 +71,8 @@ def rollout(
 ) -> Trajectory:
     """`steps` steps with everything constant in time, except `force_per_step` and `prescribed_per_step`, whose first
     dimension is the step and which replace `force` and `prescribed`. Other arguments as in `step`."""
-    advance = _stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, tet_order)
+    layout = build_layout(model, tet_order)
+    advance = stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
     xs, vs = [x], [v]
     for n in range(steps):
         f = force if force_per_step is None else force_per_step[n]
@@ -81,7 +83,7 @@ def rollout(
     return Trajectory(torch.stack(xs), torch.stack(vs))
 
 
-def _stepper(
+def stepper(
     model: Any,
     like: Tensor,
     mu: Any,
@@ -91,12 +93,13 @@ def _stepper(
     rest_points: Tensor | None,
     density: Any,
     parameters: dict[str, Any] | None,
-    tet_order: Tensor | None,
+    layout: Layout,
 ) -> Callable[..., tuple[Tensor, Tensor]]:
-    """Do what is common to all steps of a run, and return the function that makes one."""
+    """Do what is common to all steps of a run, and return the function (x, v, force, gravity, prescribed) -> (x', v')
+    that makes one. Arguments as in `step`; like decides dtype and device; layout is the model's `build_layout`."""
     scene = build_scene(
         model,
-        build_layout(model, tet_order),
+        layout,
         like,
         mu=mu,
         lam=lam,

@@ -1,0 +1,177 @@
+"""Arguments of a step: checked, and in the shapes of the operator. Everything here happens before any work."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from . import ops, reference
+from .adjoints import Adjoint, Unrolled
+from .checks import check_broadcast, check_count, check_positive, check_tensor, fail
+from .debug import checking
+from .metric import lumped_mass, rest_metric
+from .model import Model
+
+GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
+
+MAX_SWEEPS = 2**31 - 1
+
+
+class Prepared(NamedTuple):
+    """Arguments of a step that do not depend on x and v, in the shapes of the operator (scenes first)."""
+
+    mu: Tensor  # [1 | B, 1 | T]
+    lam: Tensor  # [1 | B, 1 | T]
+    mass: Tensor  # [1 | B, V]
+    rest: Tensor | None  # [1 | B, T, 7]; None: the Model's
+    parameters: dict[str, Tensor]  # differentiable energy parameters, [1 | B, ...]
+    settings: ops.SweepSettings
+    unrolled: Callable[..., tuple[Tensor, Tensor]] | None = None  # the reference's step, where autograd unrolls it
+
+
+def check_state(model: Model, x: Tensor, v: Tensor) -> tuple[int, ...]:
+    """Raises where x or v does not fit the Model; returns the leading (scene) shape."""
+    if not isinstance(model, Model):
+        raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
+    for name, value in (("x", x), ("v", v)):
+        if not isinstance(value, Tensor):
+            raise TypeError(
+                f"{name}: expected a tensor of shape [..., {model.num_vertices}, 3], got {type(value).__name__}"
+            )
+        check_tensor(name, value, model.mass)
+        if value.dim() < 2 or value.shape[-2:] != (model.num_vertices, 3):
+            fail(name, f"shape [..., {model.num_vertices}, 3]", f"shape {list(value.shape)}")
+    if v.shape != x.shape:
+        fail("v", f"x's shape {list(x.shape)}", f"shape {list(v.shape)}")
+    return tuple(x.shape[:-2])
+
+
+def _scenes_first(name: str, value: Any, like: Tensor, lead: tuple[int, ...], own: tuple[int, ...]) -> Tensor:
+    """A value that broadcasts to lead + own, as [1 | B, ...] with as many further dimensions as own."""
+    value = check_broadcast(name, check_tensor(name, value, like), lead + own)
+    shape = (1,) * (len(lead) + len(own) - value.dim()) + tuple(value.shape)
+    scenes, rest = shape[: len(lead)], shape[len(lead) :]
+    value = value.reshape(shape)
+    if math.prod(scenes) == 1:
+        return value.reshape(1, *rest)
+    return ops.broadcast(value, (*lead, *rest)).reshape(-1, *rest)
+
+
+def step_settings(model: Model, lead: tuple[int, ...], time_step: Any, sweeps: Any) -> ops.SweepSettings:
+    """What is executed for scenes of shape ``lead``, the regime on CUDA included."""
+    if isinstance(time_step, Tensor) and time_step.requires_grad:
+        raise TypeError("time_step: expected a number, got a tensor that requires grad: it is not differentiable")
+    return model.settings(
+        check_positive("time_step", time_step, "s"),
+        check_count("sweeps", sweeps, maximum=MAX_SWEEPS),
+        math.prod(lead),
+    )
+
+
+def prepare(
+    model: Model,
+    lead: tuple[int, ...],
+    *,
+    mu: float | Tensor,
+    lam: float | Tensor,
+    time_step: float,
+    sweeps: int,
+    rest_points: Tensor | None,
+    density: float | Tensor | None,
+    parameters: dict[str, Any] | None,
+    adjoint: Adjoint | None = None,
+    settings: ops.SweepSettings | None = None,
+) -> Prepared:
+    """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
+    like, tets = model.mass, (model.num_tets,)
+    if settings is None:
+        settings = step_settings(model, lead, time_step, sweeps)
+    rest, mass, given_density = None, model.mass[None], density
+    if density is not None:
+        density = _scenes_first("density", density, like, lead, tets)
+    if rest_points is not None or density is not None:
+        points = model.rest_points if rest_points is None else rest_points
+        points = _scenes_first("rest_points", points, like, lead, (model.num_vertices, 3))
+        points = ops.broadcast(points, (points.shape[0], model.num_vertices, 3))
+        metric, volume = rest_metric(ops.tet_gather(points, *model._topology))
+        rest = None if rest_points is None else metric
+        if density is None:
+            density = model.density[None]
+        shape = (max(density.shape[0], volume.shape[0]), model.num_tets)
+        if checking() and model.device.type == "cuda":  # where star_sum does not look
+            name_value("density", "finite numbers > 0 kg/m^3", density, density > 0)
+            name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0)
+        try:
+            mass = lumped_mass(ops.broadcast(density, shape), ops.broadcast(volume, shape), *model._topology)
+        except ValueError:
+            name_value("density", "finite numbers > 0 kg/m^3", density, density > 0)
+            name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0)
+            raise
+    given: dict[str, Tensor] = {}
+    if parameters is not None and not isinstance(parameters, dict):
+        raise TypeError(f"parameters: expected a dict of tensors by name, got {type(parameters).__name__}")
+    known = {}
+    if parameters:
+        known = {f"{e.name}.{k}": (e, k, own) for e in model.vertex_energies for k, own in e.parameters.items()}
+    for name, value in (parameters or {}).items():
+        if name not in known:
+            fail("parameters", f"names among {sorted(known)}", repr(name))
+        energy, key, own = known[name]
+        shape = tuple(model.constants(energy)[key].shape)[:own]
+        given[name] = _scenes_first(name, value, like, lead, shape)
+    materials = [_scenes_first(name, value, like, lead, tets) for name, value in (("mu", mu), ("lam", lam))]
+    unrolled = None
+    if isinstance(adjoint, Unrolled):
+        layout = model.derived("layout", lambda: reference.build_layout(model))
+        h, count = settings.numbers[0], settings.sweeps
+        unrolled = reference.stepper(model, like, mu, lam, h, count, rest_points, given_density, parameters, layout)
+    return Prepared(
+        mu=materials[0],
+        lam=materials[1],
+        mass=mass,
+        rest=rest,
+        parameters=given,
+        settings=settings,
+        unrolled=unrolled,
+    )
+
+
+def name_argument(error: ValueError, arguments: dict[str, Any]) -> None:
+    """Raises an error that names the argument, where the operator could name only what was made of several."""
+    if not str(error).startswith(("predictor", "start")):
+        return
+    for name, value in arguments.items():
+        if isinstance(value, Tensor):
+            name_value(name, "finite values", value, torch.isfinite(value))
+
+
+def name_value(name: str, expected: str, value: Tensor, good: Tensor) -> None:
+    good = good & torch.isfinite(value)
+    if not bool(good.all()):
+        where = (~good).nonzero()[0].tolist()
+        raise ValueError(f"{name}: expected {expected}, got {float(value[tuple(where)]):g} at {where}") from None
+
+
+def acceleration_of(gravity: Any, like: Tensor) -> Tensor:
+    """The argument ``gravity`` as a tensor."""
+    if not isinstance(gravity, Tensor):
+        gravity = _three_numbers("gravity", gravity, like)
+    return broadcastable("gravity", gravity, like)
+
+
+def _three_numbers(name: str, value: Any, like: Tensor) -> Tensor:
+    if not isinstance(value, (tuple, list)) or not all(isinstance(a, (int, float)) for a in value):
+        raise TypeError(f"{name}: expected 3 numbers or a tensor, got {value!r}")
+    if len(value) != 3:
+        fail(name, "3 numbers or a tensor", f"{len(value)} numbers")
+    if like.is_cuda:  # kernels fill it: a copy from the host would wait for the device and break a graph's capture
+        return torch.stack([torch.full((), float(a), dtype=like.dtype, device=like.device) for a in value])
+    return torch.tensor([float(a) for a in value], dtype=like.dtype, device=like.device)
+
+
+def broadcastable(name: str, value: Any, x: Tensor) -> Tensor:
+    return check_broadcast(name, check_tensor(name, value, x), tuple(x.shape))

@@ -1,0 +1,45 @@
+"""debug_checks(): the switch, and what it costs only where it is on."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+
+from . import ops
+from .model import Model
+from .sweeps import sweep
+
+_debug = False  # a plain global: torch.compile guards it
+
+
+@contextlib.contextmanager
+def debug_checks(enabled: bool = True) -> Iterator[None]:
+    """Inside, a position that is not finite raises RuntimeError naming step, sweep, color, vertex and scene.
+
+    Off (the default) it costs nothing. On CUDA the CPU repeats each step to find out, and values that a step cannot
+    work with raise only here, because looking at them waits for the device.
+    """
+    global _debug
+    before, _debug = _debug, enabled
+    try:
+        yield
+    finally:
+        _debug = before
+
+
+def checking() -> bool:
+    """Whether debug_checks() is on."""
+    return _debug
+
+
+def check_on_cpu(model: Model, tensors: Sequence[Any], settings: ops.SweepSettings, index: int) -> None:
+    """The CPU repeats a step and names what is wrong with it."""
+    twin = model._on_cpu()
+    settings = settings._replace(sizes=twin._sizes, launch=())
+    with torch.no_grad():
+        here: list[Any] = [t if t is None else t.detach().cpu() for t in tensors]
+        repeated: Any = sweep
+        repeated(*here, twin._packed_rest, twin._plan, settings, tape_policy=ops.NO_TAPE, debug_step=index)

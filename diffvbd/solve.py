@@ -1,0 +1,144 @@
+"""A converged step: sweeps until the residual meets a tolerance, for which GlobalAdjoint is the right derivative."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from .adjoints import Adjoint, GlobalAdjoint, check_adjoint
+from .arguments import GRAVITY, acceleration_of, check_state, prepare
+from .checks import check_count, check_positive, fail
+from .global_adjoint import global_sweep
+from .incremental import IncrementalPotential
+from .model import Model
+from .step import advance, begin, swept
+
+ROUNDINGS = 0.125  # of block times position, below which a residual counts as zero; sweeps stall at 0.03 to 0.08
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of :func:`solve`.
+
+    Attributes:
+        x, v: Positions [m] and velocities [m/s] after the step, shape [..., V, 3].
+        sweeps: Executed sweeps.
+        residual: Left-over force over the forces of the step [-], the largest over scenes.
+        converged: Whether that meets the tolerance.
+    """
+
+    x: Tensor
+    v: Tensor
+    sweeps: int
+    residual: float
+    converged: bool
+
+
+def solve(
+    model: Model,
+    x: Tensor,
+    v: Tensor,
+    *,
+    mu: float | Tensor,
+    lam: float | Tensor,
+    time_step: float,
+    tolerance: float = 1e-8,
+    max_sweeps: int = 10_000,
+    check_every: int = 10,
+    on_failure: Literal["raise", "warn"] = "raise",
+    force: Tensor | None = None,
+    gravity: Sequence[float] | Tensor = GRAVITY,
+    prescribed: Tensor | None = None,
+    rest_points: Tensor | None = None,
+    density: float | Tensor | None = None,
+    parameters: dict[str, Any] | None = None,
+    adjoint: Adjoint | None = None,
+) -> Solution:
+    """One implicit Euler step, swept until it has converged in every scene.
+
+    The residual is |M (x - y) + h^2 dE/dx| over |M (x - y)| + |h^2 dE/dx|, 2-norms over the vertices that are not
+    pinned: the part of the step's forces that is not balanced. What rounding alone leaves counts as zero.
+
+    Args:
+        model, x, v, mu, lam, time_step, force, gravity, prescribed, rest_points, density, parameters: As in
+            :func:`diffvbd.step`; x, v of shape [..., V, 3].
+        tolerance: Residual > 0 at which the sweeps end. A gradient of GlobalAdjoint is off by about as much, times the
+            conditioning of the step.
+        max_sweeps: Number of sweeps after which to give up.
+        check_every: Sweeps between two looks at the residual; each takes about as long as a sweep or two, and on CUDA
+            waits for the device.
+        on_failure: ``"raise"`` a RuntimeError, or ``"warn"`` and go on, where max_sweeps do not meet the tolerance.
+        adjoint: None: GlobalAdjoint(), which sees a converged state and no sweeps. ReverseSweep() or Unrolled() run
+            the same sweeps again and differentiate them.
+
+    Returns:
+        A :class:`Solution`.
+
+    Raises:
+        ValueError, TypeError: As :func:`diffvbd.step`.
+        RuntimeError: Where the sweeps do not converge.
+
+    Source: paper, eq. 1; docs/adjoints.md.
+    """
+    lead, adjoint = check_state(model, x, v), GlobalAdjoint() if adjoint is None else check_adjoint(adjoint)
+    tolerance = check_positive("tolerance", tolerance)
+    max_sweeps, check_every = check_count("max_sweeps", max_sweeps), check_count("check_every", check_every, 1)
+    if on_failure not in ("raise", "warn"):
+        fail("on_failure", '"raise" or "warn"', repr(on_failure))
+    options: dict[str, Any] = {"mu": mu, "lam": lam, "time_step": time_step, "rest_points": rest_points,
+                               "density": density, "parameters": parameters}  # fmt: skip
+    prepared = prepare(model, lead, sweeps=0, **options)
+    settings = prepared.settings
+    loads: dict[str, Any] = {"force": force, "gravity": gravity, "prescribed": prescribed}
+    begun = begin(model, x, v, prepared, force, acceleration_of(gravity, x), prescribed)
+
+    with torch.no_grad():
+        frozen = begun.detached()
+        end, count = frozen.x_start, 0
+        residual = _residual(model, end, frozen.tensors(prepared), time_step)
+        while residual > tolerance and count < max_sweeps:
+            some = min(check_every, max_sweeps - count)
+            part = prepared._replace(settings=settings._replace(sweeps=some))
+            end = swept(model, frozen._replace(x_start=end), part, {"x": x, "v": v, **loads})
+            count += some
+            residual = _residual(model, end, frozen.tensors(prepared), time_step)
+    if not residual <= tolerance:
+        text = (
+            f"solve: expected a residual of at most {tolerance:g}, got {residual:.3g} after {count} sweeps; take more "
+            "(max_sweeps), a smaller time step, or relaxation between 1.5 and 1.7"
+        )
+        if on_failure == "raise":
+            raise RuntimeError(text)
+        warnings.warn(text, RuntimeWarning, stacklevel=2)
+
+    if isinstance(adjoint, GlobalAdjoint):
+        # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph
+        begun = begun._replace(x_start=torch.where(model.pinned[:, None], begun.x_start, end))
+        x_end, v_end = begun.finish(global_sweep(model, begun.tensors(prepared), settings, adjoint), time_step)
+    else:
+        again = prepare(model, lead, sweeps=count, adjoint=adjoint, **options)
+        x_end, v_end = advance(model, x, v, again, adjoint=adjoint, **loads)
+    return Solution(x_end.reshape(x.shape), v_end.reshape(x.shape), count, residual, residual <= tolerance)
+
+
+def _residual(model: Model, x: Tensor, tensors: tuple[Any, ...], time_step: float) -> float:
+    """The largest residual over scenes."""
+    if not x.numel():
+        return 0.0
+    at = IncrementalPotential(model, x, tensors, time_step)
+    inertia, forces = at.free * at.inertia(), at.free * at.forces()
+    left, scale = _norm(inertia + forces), _norm(inertia) + _norm(forces)
+    # each term of the gradient is a block times a position, known to a rounding of the largest
+    stiffness = at.free * at.diagonal().diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+    rounding = ROUNDINGS * torch.finfo(x.dtype).eps * x.abs().amax((-2, -1)) * _norm(stiffness)
+    ratio = torch.where(left > rounding, left / scale, torch.zeros_like(left))
+    return float(torch.nan_to_num(ratio, nan=torch.inf).max())
+
+
+def _norm(a: Tensor) -> Tensor:
+    return a.square().sum((-2, -1)).sqrt()
