@@ -93,7 +93,7 @@ class VertexEnergy:
 
         x, x_prev: State and start of the step [m], relative to origin where there is one, [B, V, 3].
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no gradient() for GlobalAdjoint and solve")
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,12 +17,13 @@ CODES: dict[str, int] = {"thread": THREAD, "block": BLOCK, "grid": GRID, "color"
 FEW_LANES, SOME_LANES, MANY_LANES = 2, 8, 32
 SMALL_MESH = 64
 
-# Where one regime overtakes another, from first measurements on an H100; docs/performance.md shows where they are off.
-THREAD_VERTICES = 16  # above, a scene's positions leave too little shared memory for a scene per thread
+# Where one regime overtakes another on an H100: the table "regimes" of docs/performance.md.
 THREAD_SCENES = 4096  # below, a scene per thread leaves most of the device idle
-BLOCK_SCENES = 64  # below, a scene per block does
-BLOCK_VERTICES = 20_000  # above, the workspace holds too few scenes at once for a scene per block
-GRID_VERTICES = 100_000  # vertices of all scenes: above, launches cost less than a cooperative grid's barriers
+TINY_VERTICES = 32  # up to here a scene per thread or, of fewer scenes, per block beats whatever spreads a scene out
+BLOCK_SCENES = 256  # of larger scenes: below, a scene per block leaves multiprocessors idle
+BLOCK_VERTICES = 1_000  # above, a block has too few threads for a scene
+GRID_VERTICES = 50_000  # vertices of all scenes: above, launches cost less than a cooperative grid's barriers
+MANY_SCENES = 64  # of a scene per block: from here on they fill a multiprocessor with few threads per vertex
 # Vertices of all scenes in a color up to which that many threads of each find room, in the sweeps and in their reverse.
 MANY_LANES_VERTICES = 1_500
 SOME_LANES_VERTICES = (16_000, 4_000)
@@ -59,7 +60,7 @@ def choose(vertices: int, colors: int, scenes: int) -> tuple[int, int, int]:
     if code == THREAD and vertices > SMALL_MESH:
         fail("regime", f"a mesh of at most {SMALL_MESH} vertices for a scene per thread", f"{vertices} vertices")
     if code == BLOCK:  # scenes enough fill a multiprocessor; one alone wants its threads
-        lanes = SOME_LANES if scenes < BLOCK_SCENES else FEW_LANES
+        lanes = SOME_LANES if scenes < MANY_SCENES else FEW_LANES
         return code, lanes, lanes
     at_once = vertices * scenes / max(1, colors)
     if at_once <= MANY_LANES_VERTICES:
@@ -69,8 +70,8 @@ def choose(vertices: int, colors: int, scenes: int) -> tuple[int, int, int]:
 
 
 def _automatic(vertices: int, scenes: int) -> int:
-    if vertices <= THREAD_VERTICES and scenes >= THREAD_SCENES:
-        return THREAD
-    if scenes >= BLOCK_SCENES and vertices <= BLOCK_VERTICES:
+    if vertices <= TINY_VERTICES:
+        return THREAD if scenes >= THREAD_SCENES else BLOCK
+    if vertices <= BLOCK_VERTICES and scenes >= BLOCK_SCENES:
         return BLOCK
     return GRID if vertices * scenes <= GRID_VERTICES else COLOR

@@ -241,7 +241,7 @@ def test_regimes_and_plans_agree() -> None:
     assert codes == regimes.CODES
     lanes = [constant("cuda/step.h", f"k{name}Lanes") for name in ("Few", "Some", "Many")]
     assert lanes == [regimes.FEW_LANES, regimes.SOME_LANES, regimes.MANY_LANES]
-    assert regimes.SMALL_MESH == constant("core/views.h", "kSmallMesh") >= regimes.THREAD_VERTICES
+    assert regimes.SMALL_MESH == constant("core/views.h", "kSmallMesh") >= regimes.TINY_VERTICES
     # the host gets a plan's header in an order of its own, with active vertices, tets and slots first
     (order,) = re.findall(r"order\[diffvbd::kPlanHeader\] = \{([^}]*)\}", code_of(CSRC / "ops_cuda.cpp"))
     sizes = ops.plan_sizes(torch.arange(100), "cuda")
