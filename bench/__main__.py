@@ -1,7 +1,8 @@
-"""`python -m bench NAME [--quick] [--out DIR]`, `python -m bench list`.
+"""`python -m bench NAME [--quick] [--device D] [--out DIR]`; NAME may also be list, all or report.
 
 A benchmark is a module of this package with a function run(quick) that returns a dict, and optionally markdown(results)
-that turns it into text. A run that also takes `device`, `only` or `out` gets them from the command line.
+that turns it into text. A run that also takes `device`, `only` or `out` gets them from the command line. Results go to
+NAME.json and NAME.md, of a run on CUDA to NAME-cuda.json and NAME-cuda.md; `report` makes docs/results.md of all.
 """
 
 from __future__ import annotations
@@ -11,11 +12,16 @@ import importlib
 import inspect
 import pkgutil
 import sys
+import traceback
 from pathlib import Path
 from types import ModuleType
 
+import torch
+
 import bench
-from bench import common
+from bench import common, report
+
+PAPER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's own measurements, in its order
 
 
 def benchmarks() -> dict[str, ModuleType]:
@@ -26,36 +32,82 @@ def benchmarks() -> dict[str, ModuleType]:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench", description="Runs a benchmark and writes its results.")
-    parser.add_argument("name", help="a benchmark, or list")
+    parser.add_argument("name", help="a benchmark; all: the paper's, then the others; report: docs/results.md; list")
     parser.add_argument("--quick", action="store_true", help="a few small cases; written only where --out says")
-    parser.add_argument("--out", type=Path, help="folder of the results (default: bench/results)")
+    parser.add_argument("--out", type=Path, help="folder of the results (default: bench/results); report reads it, too")
     parser.add_argument("--device", help="where to measure, if the benchmark lets one choose: cuda, cuda:1, cpu")
-    parser.add_argument("--only", help="some groups of the benchmark, if it has any: NAME,...")
+    parser.add_argument("--only", help="some groups of the benchmark, if it has any, or some of all: NAME,...")
     options = parser.parse_args(arguments)
+    if options.name == "report":
+        return report.main(options.out)
+    if options.device and torch.device(options.device).type == "cuda" and not torch.cuda.is_available():
+        parser.error(f"--device: expected a device of this machine, got {options.device}, and torch sees no CUDA here")
     known = benchmarks()
     if options.name == "list":
         for name, module in known.items():
             print(f"{name:<12} {(module.__doc__ or '').splitlines()[0]}")
         return 0
+    if options.name == "all":
+        return run_all(parser, options, known)
     if options.name not in known:
-        parser.error(f"name: expected one of {', '.join(known)}, or list, got {options.name}")
-    module = known[options.name]
-    out = options.out or (None if options.quick else common.RESULTS)
-    accepted = inspect.signature(module.run).parameters
-    chosen = {key: getattr(options, key) for key in ("device", "only") if getattr(options, key) is not None}
-    for key in chosen:
-        if key not in accepted:
+        parser.error(f"name: expected one of {', '.join(known)}, all, report or list, got {options.name}")
+    accepted = inspect.signature(known[options.name].run).parameters
+    for key in ("device", "only"):
+        if getattr(options, key) is not None and key not in accepted:
             parser.error(f"--{key}: {options.name} has no such option")
-    if "out" in accepted:
-        chosen["out"] = out
-    results = module.run(options.quick, **chosen)
+    run_one(options.name, known[options.name], options, options.only)
+    return 0
+
+
+def run_one(name: str, module: ModuleType, options: argparse.Namespace, only: str | None = None) -> None:
+    out = options.out or (None if options.quick else common.RESULTS)
+    given = {"device": options.device, "only": only, "out": out}
+    accepted = inspect.signature(module.run).parameters
+    results = module.run(options.quick, **{k: v for k, v in given.items() if v is not None and k in accepted})
     text = module.markdown(results) if hasattr(module, "markdown") else ""
     print(text)
     if out is not None:
-        device = options.device or getattr(module, "DEVICE", "cpu")
-        path = common.write(options.name, results, out, quick=options.quick, text=text, device=device)
+        home = getattr(module, "DEVICE", "cpu")
+        device = options.device or home
+        path = common.write(name, results, out, quick=options.quick, text=text, device=device,
+                            suffix=common.device_suffix(device, home))  # fmt: skip
         print(f"wrote {path}", file=sys.stderr)
-    return 0
+
+
+def run_all(parser: argparse.ArgumentParser, options: argparse.Namespace, known: dict[str, ModuleType]) -> int:
+    """The paper's measurements, then the others that the device allows. One that fails does not keep back the next."""
+    names = [name for name in PAPER if name in known] + [name for name in known if name not in PAPER]
+    if options.only is not None:
+        chosen = [name.strip() for name in options.only.split(",")]
+        if unknown := [name for name in chosen if name not in known]:
+            parser.error(f"--only: expected names among {', '.join(names)}, got {', '.join(unknown)}")
+        names = [name for name in names if name in chosen]
+    failed = []
+    for name in names:
+        if reason := _why_not(known[name], options.device):
+            print(f"{name}: left out, {reason}", file=sys.stderr)
+            continue
+        print(f"# {name}\n", flush=True)
+        try:
+            run_one(name, known[name], options)
+        except Exception:
+            traceback.print_exc()
+            failed.append(name)
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _why_not(module: ModuleType, device: str | None) -> str:
+    """Why `all` leaves a benchmark out, or an empty string."""
+    home = getattr(module, "DEVICE", "cpu")
+    if home != "cpu" and not torch.cuda.is_available():
+        return "it needs a CUDA device"
+    takes_device = "device" in inspect.signature(module.run).parameters
+    wanted = torch.device(device or home).type
+    if wanted != home and (not takes_device or home != "cpu"):
+        return f"it does not measure on {wanted}"
+    return ""
 
 
 if __name__ == "__main__":

@@ -1,27 +1,50 @@
-"""`python -m bench.report` writes the figures of bench/results into docs/performance.md."""
+"""`python -m bench report`: every result of bench/results as docs/results.md, and figures into docs/performance.md."""
 
 from __future__ import annotations
 
 import importlib
+import inspect
 import json
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
-from bench.common import RESULTS
+from bench import plots
+from bench.common import RESULTS, markdown_table
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "performance.md"
-BENCHMARKS = ("cpu", "gpu")  # whose figures the page shows, in this order
-BEGIN, END = "<!-- figures: begin, written by python -m bench.report -->", "<!-- figures: end -->"
-EMPTY = "No figures yet: run `python -m bench cpu` or `python -m bench gpu`, then `python -m bench.report`.\n"
+RESULTS_PAGE = ROOT / "docs" / "results.md"
+BENCHMARKS = ("cpu", "gpu")  # whose figures docs/performance.md shows, in this order
+ORDER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's come first, the others by name
+BEGIN, END = "<!-- figures: begin, written by python -m bench report -->", "<!-- figures: end -->"
+EMPTY = "No figures yet: run `python -m bench cpu` or `python -m bench gpu`, then `python -m bench report`.\n"
+
+INTRODUCTION = """\
+# Results
+
+Every measurement of `bench/`, written by `python -m bench report` from the JSON files in `bench/results`; no figure
+here was typed. `python -m bench NAME` makes one again, `python -m bench all` all of them; `--device cuda` measures on a
+GPU, `--quick` tries a script out in seconds. Where the paper states a figure for the same thing, it stands beside ours;
+its scenes, meshes and machines are others, as the text of each table says.
+"""
 
 
-def main() -> int:
+def main(out: Path | None = None) -> int:
+    """Fills both pages; with a folder, makes results.md there of the results in it and leaves docs alone."""
+    if out is not None:
+        page = out / "results.md"
+        page.write_text(results_page(out, out / "images"), encoding="utf-8")
+        print(f"wrote {page}")
+        return 0
+    RESULTS_PAGE.write_text(results_page(RESULTS, ROOT / "docs" / "images"), encoding="utf-8")
     PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), section(RESULTS)), encoding="utf-8")
-    print(f"wrote {PAGE.relative_to(ROOT)}")
+    for page in (RESULTS_PAGE, PAGE):
+        print(f"wrote {page.relative_to(ROOT)}")
     return 0
+
+
+# --- docs/performance.md ----------------------------------------------------------------------------------------------
 
 
 def filled(page: str, text: str) -> str:
@@ -47,12 +70,82 @@ def section(results: Path) -> str:
 def machine(environment: dict[str, Any]) -> str:
     """One line on where and with what a benchmark ran."""
     known = {key: value for key, value in environment.items() if value is not None}
-    where = f"{known.get('cpu', 'unknown processor')}, {known.get('cores', '?')} cores"
+    where = f"{place(environment)}, {known.get('cores', '?')} cores"
     if known.get("device", "cpu") != "cpu":
         where = f"{known['device']}, driver {known.get('driver', 'unknown')}"
     versions = ", ".join(f"{key} {known[key]}" for key in ("python", "torch", "cuda", "diffvbd") if key in known)
     return f"{where}; {versions}; {known.get('date', 'no date')}."
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def place(environment: dict[str, Any]) -> str:
+    """The GPU of a run, or its processor."""
+    device = environment.get("device") or "cpu"
+    return (environment.get("cpu") or "unknown processor") if device == "cpu" else device
+
+
+def commit(environment: dict[str, Any]) -> str:
+    known = environment.get("commit")
+    return "unknown" if not known else known[:10] + (" with changes" if environment.get("dirty") else "")
+
+
+# --- docs/results.md --------------------------------------------------------------------------------------------------
+
+
+def results_page(results: Path, images: Path) -> str:
+    """The page of all results in a folder; its plots are written to `images`, a folder beside the page."""
+    found = harvest(results)
+    header = ("benchmark", "on", "torch", "date", "commit", "run")
+    rows = []
+    for name, stem, content in found:
+        e = content["environment"]
+        run = "quick" if content.get("quick") else "full"
+        rows.append((f"[{stem}](#{name})", place(e), e.get("torch"), e.get("date"), commit(e), run))
+    parts = [INTRODUCTION, markdown_table(header, rows)] if rows else [INTRODUCTION, EMPTY]
+    for name in dict.fromkeys(name for name, _, _ in found):
+        module = importlib.import_module(f"bench.{name}")
+        parts.append(f"## {name}\n\n{inspect.cleandoc(module.__doc__ or '')}\n")
+        for _, stem, content in (entry for entry in found if entry[0] == name):
+            e = content["environment"]
+            parts.append(f"### {stem}, on {place(e)}\n\n{machine(e)} Commit {commit(e)}.\n")
+            if name in BENCHMARKS:
+                parts.append("Its tables stand in [performance.md](performance.md#figures).\n")
+                continue
+            try:
+                if plots.draw(name, content["results"], images / f"results_{stem}.png"):
+                    parts.append(f"![{plots.CAPTIONS[name]}]({images.name}/results_{stem}.png)\n")
+                tables = module.markdown(content["results"])
+            except (KeyError, TypeError) as error:
+                raise ValueError(f"{stem}.json: expected results of the present bench.{name}, got older ones; run it "
+                                 "again") from error  # fmt: skip
+            # the page has three levels of its own above those of a benchmark
+            parts.append(re.sub(r"^#", "###", tables, flags=re.MULTILINE))
+    parts.append(tasks(results / "tasks"))
+    return "\n".join(part for part in parts if part).rstrip() + "\n"
+
+
+def harvest(results: Path) -> list[tuple[str, str, dict[str, Any]]]:
+    """(benchmark, file without its ending, content) of each result, the paper's first, the CPU's before a GPU's."""
+    found = []
+    for path in sorted(results.glob("*.json")):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        name = content.get("name")
+        if name and "results" in content and (Path(__file__).parent / f"{name}.py").exists():
+            found.append((name, path.stem, content))
+    return sorted(found, key=lambda entry: (ORDER.index(entry[0]) if entry[0] in ORDER else len(ORDER), *entry[:2]))
+
+
+def tasks(folder: Path) -> str:
+    """What runs of the inverse problems (`python -m diffvbd run`) have left in a folder."""
+    rows = []
+    for path in sorted(folder.glob("*.json")):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        errors = ", ".join(f"{name} {value:.2g}" for name, value in content.get("relative_error", {}).items())
+        best, versions = content.get("best", {}), content.get("versions", {})
+        rows.append((content.get("task", path.stem), content.get("converged"), errors, best.get("iteration"),
+                     best.get("seconds"), content.get("settings", {}).get("device"), versions.get("torch"),
+                     versions.get("diffvbd")))  # fmt: skip
+    if not rows:
+        return ""
+    header = ("task", "converged", "relative error", "best iteration", "seconds until then", "device", "torch",
+              "diffvbd")  # fmt: skip
+    return "## tasks\n\nInverse problems, `python -m diffvbd run NAME`.\n\n" + markdown_table(header, rows)

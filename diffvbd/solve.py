@@ -136,7 +136,7 @@ def _residual(model: Model, x: Tensor, tensors: tuple[Any, ...], time_step: floa
     # each term of the gradient is a block times a position, known to a rounding of the largest
     stiffness = at.free * at.diagonal().diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
     rounding = ROUNDINGS * torch.finfo(x.dtype).eps * x.abs().amax((-2, -1)) * _norm(stiffness)
-    ratio = torch.where(left > rounding, left / scale, torch.zeros_like(left))
+    ratio = torch.where(left <= rounding, torch.zeros_like(left), left / scale)
     return float(torch.nan_to_num(ratio, nan=torch.inf).max())
 
 

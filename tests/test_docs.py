@@ -108,3 +108,14 @@ def test_report_writes_figures_between_its_markers(tmp_path: Path, monkeypatch: 
     assert text.startswith("some, ") and "| forward | 8.25 |" in text
     once = report.filled(report.PAGE.read_text(encoding="utf-8"), text)
     assert text in once and report.filled(once, text) == once
+
+
+def test_results_page_is_made_of_the_results_that_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    report = importlib.import_module("bench.report")
+    page = report.RESULTS_PAGE.read_text(encoding="utf-8")
+    found = report.harvest(report.RESULTS)
+    assert found
+    for _, stem, content in found:
+        date = content["environment"]["date"]
+        assert f"### {stem}, on " in page and date in page, f"{stem}.json is newer: run `python -m bench report`"

@@ -1,0 +1,107 @@
+"""Plots of results, for docs/results.md. They need matplotlib."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+CAPTIONS = {
+    "exactness": "Gradient error over the number of sweeps, by route",
+    "cost": "Iterations and time of the backward over stiffness, by route",
+    "ablation": "Gradient error without each exactness term, over mesh refinement",
+    "fd": "Error of the gradients over the step of the difference",
+}
+LABELS = {"reverse sweep": ("o", "C0"), "global, assembled": ("s", "C1"), "global, matrix-free": ("x", "C2"),
+          "reverse sweep, full tape": ("o", "C0"), "unrolled autograd": ("d", "C3")}  # fmt: skip
+
+
+def draw(name: str, results: dict[str, Any], path: Path) -> bool:
+    """Writes the plot of a benchmark's results as PNG; False if it has none, or matplotlib is not installed."""
+    if name not in FIGURES:
+        return False
+    try:
+        from matplotlib.figure import Figure
+        from PIL import Image  # matplotlib needs it, too
+    except ImportError:
+        return False
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    FIGURES[name](figure, results)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=100)
+    # lines and letters need few colors; the file stays in the repository
+    Image.open(drawn).convert("RGB").quantize(64).save(path, optimize=True)
+    return True
+
+
+def exactness(figure: Any, results: dict[str, Any]) -> None:
+    axes = figure.subplots(1, 2, sharey=True)
+    for ax, (name, rows) in zip(axes, results["scenes"].items(), strict=True):
+        sweeps = [row["sweeps"] for row in rows]
+        for route in rows[0]["routes"]:
+            marker, color = LABELS[route]
+            ax.loglog(sweeps, [row["routes"][route]["error"] for row in rows], marker=marker, color=color, label=route)
+        ax.loglog(sweeps, [row["relative_residual"] for row in rows], "k:", label="residual, relative")
+        ax.set(title=f"{name} scene", xlabel="sweeps K", xticks=sweeps, xticklabels=sweeps)
+        ax.minorticks_off()
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("gradient error")
+    axes[0].legend(fontsize="small")
+
+
+def cost(figure: Any, results: dict[str, Any]) -> None:
+    rows = results["stiffness"]
+    moduli = [row["modulus"] for row in rows]
+    left, right = figure.subplots(1, 2)
+    for route in rows[0]["routes"]:
+        marker, color = LABELS[route]
+        entries = [row["routes"][route] for row in rows]
+        right.loglog(moduli, [e["backward_ms"] for e in entries], marker=marker, color=color, label=route)
+        if "iterations" in entries[0]:
+            left.loglog(moduli, [e["iterations"] for e in entries], marker=marker, color=color, label=route)
+    left.set(xlabel="mu = lam [Pa]", ylabel="iterations of the longest solve")
+    right.set(xlabel="mu = lam [Pa]", ylabel="backward [ms]")
+    for ax in (left, right):
+        ax.grid(alpha=0.3)
+    figure.legend(*right.get_legend_handles_labels(), fontsize="small", loc="outside right center")
+
+
+def ablation(figure: Any, results: dict[str, Any]) -> None:
+    rows = results["rows"]
+    depths = sorted({row["sweeps"] for row in rows})
+    all_axes = figure.subplots(1, len(depths), sharey=True, squeeze=False)[0]
+    for ax, sweeps in zip(all_axes, depths, strict=True):
+        for name in dict.fromkeys(row["variant"] for row in rows):
+            chosen = [row for row in rows if row["variant"] == name and row["sweeps"] == sweeps]
+            ax.loglog([r["vertices"] for r in chosen], [r["error"] for r in chosen], marker=".", label=name)
+        sizes = sorted({row["vertices"] for row in rows})
+        ax.set(title=f"K = {sweeps}", xlabel="vertices")
+        ax.set_xticks(sizes, labels=[str(n) for n in sizes])
+        ax.minorticks_off()
+        ax.grid(alpha=0.3)
+    all_axes[0].set_ylabel("gradient error")
+    figure.legend(*all_axes[0].get_legend_handles_labels(), fontsize="small", loc="outside right center")
+
+
+def finite_differences(figure: Any, results: dict[str, Any]) -> None:
+    from bench.fd import BAR, STEPS
+
+    ax = figure.subplots()
+    for row in results["checks"]:
+        if "errors" in row:
+            worst = [max(values) for values in zip(*row["errors"].values(), strict=True)]
+            ax.loglog(STEPS, worst, marker=".", label=row["name"])
+    ax.axhline(BAR, color="k", linestyle=":")
+    ax.set(xlabel="relative step of the difference", ylabel="error of the worst argument")
+    ax.grid(alpha=0.3)
+    figure.legend(fontsize="small", loc="outside right center")
+
+
+FIGURES: dict[str, Callable[[Any, dict[str, Any]], None]] = {
+    "exactness": exactness,
+    "ablation": ablation,
+    "cost": cost,
+    "fd": finite_differences,
+}
