@@ -5,7 +5,7 @@ import os as _os
 # Idle threads that spin make a parallel region cost milliseconds on a busy machine; only the first import decides.
 _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from . import mesh
+from . import mesh, solvers
 from .adjoints import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
 from .debug import debug_checks
 from .diagnostics import Diagnosis, diagnose
@@ -46,6 +46,7 @@ __all__ = [
     "regime",
     "rollout",
     "solve",
+    "solvers",
     "step",
     "step_backward",
     "step_forward",

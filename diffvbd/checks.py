@@ -15,16 +15,16 @@ def fail(name: str, expected: str, got: Any) -> NoReturn:
     raise ValueError(f"{name}: expected {expected}, got {got}")
 
 
-def check_tensor(name: str, value: Any, like: Tensor, what: str = "a tensor") -> Tensor:
+def check_tensor(name: str, value: Any, like: Tensor, what: str = "a tensor", owner: str = "the Model's") -> Tensor:
     """``value`` as a tensor of like's dtype and device; python numbers are converted, other tensors must match."""
     if not isinstance(value, Tensor):
         if isinstance(value, (int, float)) and not isinstance(value, bool):
             return torch.full((), float(value), dtype=like.dtype, device=like.device)
         raise TypeError(f"{name}: expected {what}, got {type(value).__name__}")
     if value.dtype != like.dtype:
-        raise TypeError(f"{name}: expected dtype {like.dtype} (the Model's), got {value.dtype}")
+        raise TypeError(f"{name}: expected dtype {like.dtype} ({owner}), got {value.dtype}")
     if value.device != like.device:
-        raise ValueError(f"{name}: expected device {like.device} (the Model's), got {value.device}")
+        raise ValueError(f"{name}: expected device {like.device} ({owner}), got {value.device}")
     return value
 
 
@@ -68,3 +68,23 @@ def check_positive(name: str, value: Any, unit: str = "") -> float:
     if check_number(name, value) == 0:
         fail(name, f"a finite number > 0 {unit}".rstrip(), value)
     return float(value)
+
+
+def vertex_mask(pinned: Any, num_vertices: int) -> Tensor:
+    """``pinned``, a bool mask or indices, as a bool mask [V] on the CPU."""
+    if pinned is None:
+        return torch.zeros(num_vertices, dtype=torch.bool)
+    try:
+        pinned = torch.as_tensor(pinned).detach().cpu()
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"pinned: expected a bool mask or integer indices, got {type(pinned).__name__}") from None
+    if pinned.dtype == torch.bool:
+        if pinned.shape != (num_vertices,):
+            fail("pinned", f"a mask of shape [{num_vertices}] or indices", f"a mask of shape {list(pinned.shape)}")
+        return pinned.clone()
+    if pinned.numel() and pinned.is_floating_point():
+        raise TypeError(f"pinned: expected a bool mask or integer indices, got dtype {pinned.dtype}")
+    index = pinned.to(torch.int64).reshape(-1)
+    if index.numel() and (int(index.min()) < 0 or int(index.max()) >= num_vertices):
+        fail("pinned", f"indices in [0, {num_vertices})", f"{int(index.min())}..{int(index.max())}")
+    return torch.zeros(num_vertices, dtype=torch.bool).index_fill(0, index, True)

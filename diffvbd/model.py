@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from . import native, ops, regimes
-from .checks import check_number, check_positive, fail
+from .checks import check_number, check_positive, fail, vertex_mask
 from .energies import VERTEX_ENERGIES, Energy, FloorBarrier, StableNeoHookean, VertexEnergy
 from .mesh import TetMesh
 from .metric import lumped_mass, rest_metric
@@ -79,7 +79,7 @@ class Model:
 
         points = torch.from_numpy(mesh.points.copy())
         tets = torch.from_numpy(mesh.tets.copy())
-        mask = _mask(pinned, mesh.num_vertices)
+        mask = vertex_mask(pinned, mesh.num_vertices)
         touched = torch.zeros(mesh.num_vertices, dtype=torch.bool)
         touched[tets.reshape(-1)] = True
         loose = (~touched & ~mask).nonzero().reshape(-1)
@@ -297,25 +297,6 @@ def _checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
             energy = energy.detached()
         out.append(energy)
     return tuple(out)
-
-
-def _mask(pinned: Any, num_vertices: int) -> Tensor:
-    if pinned is None:
-        return torch.zeros(num_vertices, dtype=torch.bool)
-    try:
-        pinned = torch.as_tensor(pinned).detach().cpu()
-    except (TypeError, ValueError, RuntimeError):
-        raise TypeError(f"pinned: expected a bool mask or integer indices, got {type(pinned).__name__}") from None
-    if pinned.dtype == torch.bool:
-        if pinned.shape != (num_vertices,):
-            fail("pinned", f"a mask of shape [{num_vertices}] or indices", f"a mask of shape {list(pinned.shape)}")
-        return pinned.clone()
-    if pinned.numel() and pinned.is_floating_point():
-        raise TypeError(f"pinned: expected a bool mask or integer indices, got dtype {pinned.dtype}")
-    index = pinned.to(torch.int64).reshape(-1)
-    if index.numel() and (int(index.min()) < 0 or int(index.max()) >= num_vertices):
-        fail("pinned", f"indices in [0, {num_vertices})", f"{int(index.min())}..{int(index.max())}")
-    return torch.zeros(num_vertices, dtype=torch.bool).index_fill(0, index, True)
 
 
 def _per_tet_density(density: Any, num_tets: int) -> Tensor:

@@ -205,7 +205,7 @@ BAD = [
     ({"tolerance": float("nan")}, ValueError, "tolerance: expected a finite number >= 0, got nan"),
     ({"max_iterations": 0}, ValueError, "max_iterations: expected an integer >= 1, got 0"),
     ({"max_iterations": 2.5}, TypeError, "max_iterations: expected an integer, got float"),
-    ({"on_failure": "ignore"}, ValueError, "on_failure: expected \"raise\" or \"warn\", got 'ignore'"),
+    ({"on_failure": "ignore"}, ValueError, 'on_failure: expected "raise" or "warn", got \'ignore\''),
     ({"report": 3}, TypeError, "report: expected a function of a LinearSolve, got int"),
 ]
 

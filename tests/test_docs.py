@@ -72,7 +72,9 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize(
     ("prefix", "module", "name"),
-    [("dv", dv, n) for n in dv.__all__ if n != "mesh"] + [("dv.mesh", dv.mesh, n) for n in dv.mesh.__all__],
+    [("dv", dv, n) for n in dv.__all__ if n not in ("mesh", "solvers")]
+    + [("dv.mesh", dv.mesh, n) for n in dv.mesh.__all__]
+    + [("dv.solvers", dv.solvers, n) for n in dv.solvers.__all__],
 )
 def test_public_names_are_documented(prefix: str, module: Any, name: str) -> None:
     value = getattr(module, name)

@@ -123,6 +123,8 @@ def test_bad_arguments_are_named(options: dict, error: type, message: str) -> No
 
 def test_float32(device: str) -> None:
     scene = build_scene("floor_damped", "delaunay")
-    single = dv.solve(scene.model(device).to(dtype=torch.float32), tolerance=1e-4, **scene.inputs(torch.float32, device))
+    single = dv.solve(
+        scene.model(device).to(dtype=torch.float32), tolerance=1e-4, **scene.inputs(torch.float32, device)
+    )
     double = dv.solve(scene.model(), **scene.inputs())
     assert relative_error(single.x, double.x) <= tolerance("float32_forward") and single.x.dtype == torch.float32

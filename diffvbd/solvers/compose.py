@@ -1,0 +1,297 @@
+"""Any sequence of block updates as one differentiable function: forward as written, backward in reverse."""
+
+# pyright: reportIncompatibleMethodOverride=false
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NoReturn
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from .. import ops
+from ..checks import check_count, fail
+
+Rows = Tensor | slice | None
+Tensors = tuple[Tensor, ...]
+Bars = tuple[Tensor | None, ...]
+
+
+class BlockUpdate:
+    """One update of a block: reads the whole state, writes only its own rows.
+
+    Subclasses set ``rows`` and write ``update``; a hand-derived ``vjp`` replaces the automatic one.
+
+    Attributes:
+        rows: For each state tensor the rows that the update writes: distinct indices [n] (int64), a slice, or None
+            where it writes nothing.
+        dim: The dimension that rows count along: -2 for states [..., rows, components], -1 for vectors [..., rows].
+
+    Source: paper, eq. 6.
+    """
+
+    rows: tuple[Rows, ...]
+    dim: int = -2
+
+    def update(self, state: Tensors, parameters: Tensors) -> Bars:
+        """New rows of each state tensor [..., n, c], None where ``rows`` is None. Its arguments stay as they are."""
+        raise NotImplementedError
+
+    def vjp(self, state: Tensors, rows_bar: Bars, parameters: Tensors) -> tuple[Bars, Bars]:
+        """Transposed derivative of :meth:`update`, the default by torch autograd through this one update.
+
+        Args:
+            state: The state before the update.
+            rows_bar: Adjoints of the new rows, as ``update`` returns them.
+            parameters: Those that want a gradient have ``requires_grad``.
+
+        Returns:
+            What the update adds to the adjoint of each state tensor (that tensor's shape, None for zero), and of each
+            parameter (a shape that sums to the parameter's, None for zero).
+        """
+        with torch.enable_grad():
+            state = tuple(t.detach().requires_grad_() for t in state)
+            parameters = tuple(p.detach().requires_grad_(p.requires_grad) for p in parameters)
+            new = _tuple(self.update(state, parameters))
+        made = [(rows, bar) for rows, bar in zip(new, rows_bar, strict=True) if rows is not None and rows.requires_grad]
+        inputs = [t for t in (*state, *parameters) if t.requires_grad]
+        if not made:
+            return (None,) * len(state), (None,) * len(parameters)
+        rows, bars = zip(*made, strict=True)
+        found = iter(torch.autograd.grad(rows, inputs, bars, allow_unused=True))
+        out = [next(found) if t.requires_grad else None for t in (*state, *parameters)]
+        return tuple(out[: len(state)]), tuple(out[len(state) :])
+
+
+class Update(BlockUpdate):
+    """A block update of plain functions.
+
+    Args:
+        function: ``function(state, parameters)`` returns the new rows of each state tensor, as a tuple like state; a
+            single tensor stands for a tuple of one.
+        rows: Rows per state tensor, indices of shape [n] or a slice, see :class:`BlockUpdate`; one that is no tuple stands
+            for a tuple of one.
+        dim: -2 or -1.
+        vjp: ``vjp(state, rows_bar, parameters)``; None: torch autograd.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Tensors, Tensors], Any],
+        rows: Rows | tuple[Rows, ...],
+        dim: int = -2,
+        vjp: Callable[[Tensors, Bars, Tensors], tuple[Bars, Bars]] | None = None,
+    ) -> None:
+        self.function, self.rows, self.dim, self.hand_written = function, _tuple(rows), dim, vjp
+
+    def update(self, state: Tensors, parameters: Tensors) -> Bars:
+        return self.function(state, parameters)
+
+    def vjp(self, state: Tensors, rows_bar: Bars, parameters: Tensors) -> tuple[Bars, Bars]:
+        if self.hand_written is None:
+            return super().vjp(state, rows_bar, parameters)
+        return self.hand_written(state, rows_bar, parameters)
+
+
+class Solver:
+    """The composition of block updates, one sweep after another; see :func:`compose`."""
+
+    def __init__(self, updates: Iterable[BlockUpdate]) -> None:
+        self.updates = tuple(updates)
+        reach: dict[tuple[int, int], int] = {}  # (state tensor, dim) -> rows that it must have
+        for n, update in enumerate(self.updates):
+            _check_update(n, update)
+            if len(update.rows) != len(self.updates[0].rows):
+                fail(f"updates[{n}].rows", f"{len(self.updates[0].rows)} entries, as updates[0] has", len(update.rows))
+            for k, rows in enumerate(update.rows):
+                if isinstance(rows, Tensor) and rows.numel():
+                    reach[k, update.dim] = max(reach.get((k, update.dim), 0), int(rows.max()) + 1)
+        self._reach = reach
+
+    def __call__(
+        self, state: Tensor | Sequence[Tensor], parameters: Tensor | Sequence[Tensor] = (), *, sweeps: int
+    ) -> Any:
+        """The state after ``sweeps`` sweeps; differentiable in state and parameters.
+
+        Args:
+            state: A tensor or a tuple of floating tensors, [..., n, c] or [..., n]; never written to.
+            parameters: A tensor or a tuple of tensors that every update is given. They may broadcast over the leading
+                dimensions of the state: their gradients are summed to their shapes.
+            sweeps: K >= 0; 0 returns a copy of the state.
+
+        Returns:
+            The structure of state.
+
+        Raises:
+            ValueError, TypeError: Naming the argument, or the update whose rows or adjoints do not fit.
+            NotImplementedError: In the backward, for second derivatives.
+        """
+        single = isinstance(state, Tensor)
+        tensors, given = _tensors("state", state), _tensors("parameters", parameters)
+        sweeps = check_count("sweeps", sweeps)
+        if self.updates and len(tensors) != len(self.updates[0].rows):
+            fail("state", f"{len(self.updates[0].rows)} tensors, as the updates write", len(tensors))
+        for (k, dim), rows in self._reach.items():
+            if tensors[k].dim() < -dim or tensors[k].shape[dim] < rows:
+                fail(f"state[{k}]", f"at least {rows} rows in dimension {dim}", f"shape {list(tensors[k].shape)}")
+        record = torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors, *given))
+        out = _Sweeps.apply(self.updates * sweeps, record, len(tensors), *tensors, *given)
+        return out[0] if single else out
+
+
+def compose(updates: Iterable[BlockUpdate]) -> Solver:
+    """The solver that runs ``updates`` in order, sweep by sweep, with the exact adjoint of what it executes.
+
+    Raises TypeError or ValueError for what is no :class:`BlockUpdate` or has unusable rows.
+
+    Source: paper, Theorem 1; docs/solvers.md.
+    """
+    return Solver(updates)
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+def _tuple(value: Any) -> tuple:
+    return tuple(value) if isinstance(value, (tuple, list)) else (value,)
+
+
+def _at(rows: Tensor | slice, dim: int) -> tuple:
+    return (..., rows, *(slice(None),) * (-1 - dim))
+
+
+def _read(update: BlockUpdate, tensors: Sequence[Tensor]) -> list[Tensor | None]:
+    """Copies of an update's rows."""
+    pairs = zip(update.rows, tensors, strict=True)
+    return [None if rows is None else t[_at(rows, update.dim)].clone() for rows, t in pairs]
+
+
+def _write(update: BlockUpdate, tensors: Sequence[Tensor], values: Sequence[Tensor | None]) -> None:
+    for rows, t, value in zip(update.rows, tensors, values, strict=True):
+        if rows is not None and value is not None:
+            t[_at(rows, update.dim)] = value
+
+
+def _updated(update: BlockUpdate, state: Sequence[Tensor], parameters: Tensors) -> Bars:
+    """New rows of an update, once they fit what they replace."""
+    tensors = [t for t in (*state, *parameters) if not t.is_inference()]
+    versions = [t._version for t in tensors]
+    new = _tuple(update.update(tuple(state), parameters))
+    if versions != [t._version for t in tensors]:
+        raise ValueError(f"update of {_name(update)}: expected new rows as its result, got arguments written in place")
+    if len(new) != len(state):
+        fail(f"update of {_name(update)}", f"{len(state)} tensors of rows (None where it writes none)", len(new))
+    for k, (value, rows, t) in enumerate(zip(new, update.rows, state, strict=True)):
+        if (value is None) != (rows is None):
+            fail(f"update of {_name(update)}", f"{'None' if rows is None else 'rows'} for state[{k}]", value)
+        if value is None or rows is None:
+            continue
+        shape = list(t.shape)
+        count = rows.numel() if isinstance(rows, Tensor) else len(range(*rows.indices(shape[update.dim])))
+        shape[update.dim] = count
+        if not isinstance(value, Tensor) or list(value.shape) != shape or value.dtype != t.dtype:
+            got = f"{value.dtype}, shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            fail(f"update of {_name(update)}", f"{t.dtype}, shape {shape} for the rows of state[{k}]", got)
+    return new
+
+
+def _add(update: BlockUpdate, what: str, total: list, found: Any, like: Sequence[Tensor]) -> None:
+    """Adds adjoints to ``total``, in the order of the calls; a parameter's are summed to its shape."""
+    found = _tuple(found)
+    if len(found) != len(total):
+        fail(f"vjp of {_name(update)}", f"{len(total)} adjoints of {what}", len(found))
+    for k, (bar, t) in enumerate(zip(found, like, strict=True)):
+        if bar is None or (what == "parameters" and not t.requires_grad):
+            continue
+        lead = bar.dim() - t.dim()
+        fits = lead >= 0 and all(n in (1, m) for n, m in zip(t.shape, bar.shape[lead:], strict=True))
+        if not fits or bar.dtype != t.dtype or (what == "state" and bar.shape != t.shape):
+            fail(f"vjp of {_name(update)}", f"{t.dtype}, shape {list(t.shape)} for {what}[{k}]",
+                 f"{bar.dtype}, shape {list(bar.shape)}")  # fmt: skip
+        bar = ops.sum_to(bar, (1,) * lead + tuple(t.shape)).reshape(t.shape)
+        total[k] = bar if total[k] is None else total[k] + bar
+
+
+# --- checks -----------------------------------------------------------------------------------------------------------
+
+
+def _name(update: BlockUpdate) -> str:
+    return type(update).__name__
+
+
+def _tensors(name: str, value: Any) -> Tensors:
+    value = _tuple(value)
+    for k, t in enumerate(value):
+        if not isinstance(t, Tensor):
+            raise TypeError(f"{name}[{k}]: expected a tensor, got {type(t).__name__}")
+        if name == "state" and not t.is_floating_point():
+            raise TypeError(f"state[{k}]: expected a floating dtype, got {t.dtype}")
+    return value
+
+
+def _check_update(n: int, update: Any) -> None:
+    """What can be said of rows before there is a state."""
+    if not isinstance(update, BlockUpdate):
+        raise TypeError(f"updates[{n}]: expected a BlockUpdate, such as Update(...), got {type(update).__name__}")
+    if update.dim not in (-1, -2):
+        fail(f"updates[{n}].dim", "-1 or -2", update.dim)
+    if not isinstance(update.rows, tuple):
+        raise TypeError(f"updates[{n}].rows: expected a tuple (per state tensor), got {type(update.rows).__name__}")
+    for rows in update.rows:
+        if isinstance(rows, Tensor):
+            if rows.dtype != torch.int64 or rows.dim() != 1:
+                fail(f"updates[{n}].rows", "int64 indices of shape [n]", f"{rows.dtype} of shape {list(rows.shape)}")
+            if rows.unique().numel() != rows.numel() or bool((rows < 0).any()):
+                fail(f"updates[{n}].rows", "distinct indices >= 0", rows.tolist())
+        elif rows is not None and not isinstance(rows, slice):
+            raise TypeError(f"updates[{n}].rows: expected indices, a slice or None, got {type(rows).__name__}")
+
+
+# --- the two directions -----------------------------------------------------------------------------------------------
+
+
+class _Sweeps(Function):
+    """The executed updates, S = S_n ... S_2 S_1; on the tape only the rows that each of them replaced."""
+
+    @staticmethod
+    def forward(ctx: Any, updates: tuple[BlockUpdate, ...], record: bool, count: int, *tensors: Tensor) -> Tensors:
+        state, parameters = [t.clone() for t in tensors[:count]], tensors[count:]
+        tape = []
+        for update in updates:
+            new = _updated(update, state, parameters)
+            tape += _read(update, state) if record else []
+            _write(update, state, new)
+        ctx.save_for_backward(*state, *parameters, *tape)
+        ctx.updates, ctx.count, ctx.given = updates, count, len(parameters)
+        return tuple(state)
+
+    @staticmethod
+    def backward(ctx: Any, *state_bar: Tensor) -> tuple:
+        bars = _ReversedSweeps.apply(ctx.updates, ctx.count, ctx.given, *state_bar, *ctx.saved_tensors)
+        needs = ctx.needs_input_grad[3:]
+        return (None, None, None, *(bar if need else None for bar, need in zip(bars, needs, strict=True)))
+
+
+class _ReversedSweeps(Function):
+    """(dS)^T = (dS_1)^T ... (dS_n)^T: each factor is the vjp of one update at the state that it saw."""
+
+    @staticmethod
+    def forward(ctx: Any, updates: tuple[BlockUpdate, ...], count: int, given: int, *tensors: Tensor) -> Bars:
+        state_bar, state = ([t.clone() for t in part] for part in (tensors[:count], tensors[count : 2 * count]))
+        parameters, tape = tensors[2 * count : 2 * count + given], list(tensors[2 * count + given :])
+        parameter_bar: list[Tensor | None] = [None] * given
+        for update in reversed(updates):
+            _write(update, state, tape[-count:])  # the state before the update, to the bit
+            del tape[-count:]
+            rows_bar = _read(update, state_bar)
+            # The old rows matter only through what the update made of them, which its vjp returns.
+            _write(update, state_bar, [None if bar is None else torch.zeros_like(bar) for bar in rows_bar])
+            to_state, to_parameters = update.vjp(tuple(state), tuple(rows_bar), parameters)
+            _add(update, "state", state_bar, to_state, state)
+            _add(update, "parameters", parameter_bar, to_parameters, parameters)
+        return (*state_bar, *parameter_bar)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> NoReturn:
+        raise NotImplementedError("diffvbd.solvers: second derivatives are not supported (create_graph, hessian)")

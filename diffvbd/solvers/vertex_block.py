@@ -1,0 +1,253 @@
+"""Vertex Block Descent as a composition of block updates: one color of a Model is one update. Plain torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..checks import check_positive, fail
+from ..energies import StableNeoHookean
+from ..metric import rest_metric
+from ..model import Model
+from ..safeguards import SATURATION_EPS
+from .compose import Bars, BlockUpdate, Solver, Tensors, compose
+from .sums import FixedSum, placed
+
+# (j, k, l) such that (j, i, k, l) is an even permutation of the corners, for i = 0, 1, 2, 3
+_OTHERS = torch.tensor([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]])
+_EDGES = {(0, 1): 0, (0, 2): 1, (0, 3): 2, (1, 2): 3, (1, 3): 4, (2, 3): 5}  # columns of rest_metric
+_COLUMNS = torch.tensor([[_EDGES[min(i, a), max(i, a)] for a in o] for i, o in enumerate(_OTHERS.tolist())])
+
+
+@dataclass(frozen=True)
+class Block:
+    """Gradient and Hessian block of the n vertices of a color, and what their P (vertex, tet) pairs were made of.
+
+    Source: docs/method.md, section 2; a tet seen from its vertex i, whose other vertices are j, k, l.
+    """
+
+    offset: Tensor  # x_i - y_i [..., n, 3]
+    gradient: Tensor  # g [..., n, 3]
+    hessian: Tensor  # H [..., n, 3, 3]
+    mu: Tensor  # of each pair [..., P, 1]; lb = lam + mu, lh: what stands along n in the block
+    lb: Tensor
+    lh: Tensor
+    normal: Tensor  # n = (x_k - x_j) x (x_l - x_j) [..., P, 3]
+    spoke: Tensor  # D = x_i - x_j
+    edge_k: Tensor  # x_k - x_j
+    edge_l: Tensor  # x_l - x_j
+    stretch: Tensor  # V F grad N_i = sum over a of k_ia (x_a - x_i)
+    det: Tensor  # J [..., P, 1]
+
+
+@dataclass
+class PairBars:
+    """Gradient of phi = p . (g + H d_raw) per (vertex, tet) pair, without h^2; None stands for zero."""
+
+    own: Tensor  # with respect to x_i [..., P, 3]
+    normal: Tensor  # n
+    stretch: Tensor | None  # V F grad N_i
+    mu: Tensor  # [..., P, 1]
+    lam: Tensor
+
+
+class VertexBlock(BlockUpdate):
+    """Newton update of all vertices of one color, with the hand-derived adjoint of the paper.
+
+    State: (x,), positions [m], [..., V, 3]. Parameters: (y, mu, lam, mass): predictor [m] [..., V, 3], Lame parameters
+    [Pa] that broadcast to [..., T], masses [kg] that broadcast to [..., V].
+
+    ``saturation_vjp``, ``gradient_tangent`` and ``hessian_tangent`` are the three parts of the adjoint, each a method
+    of its own so that a subclass can leave one out.
+
+    Source: paper, eqs. 2-3 and 7-13; docs/method.md, sections 2, 3 and 5.
+    """
+
+    def __init__(self, model: Model, time_step: float, vertices: Tensor) -> None:
+        energy = elastic_energy(model)
+        self.rows, self.factor = (vertices,), check_positive("time_step", time_step, "s") ** 2
+        self.exact = energy.block == "exact"
+        self.relaxation, self.saturation = model.relaxation, model.saturation
+        self.regularization = model.regularization
+        self.num_vertices, self.num_tets = model.num_vertices, model.num_tets
+        self._pairs(model, vertices)
+
+    def _pairs(self, model: Model, vertices: Tensor) -> None:
+        device = vertices.device
+        position = torch.full((model.num_vertices,), -1, dtype=torch.int64, device=device)
+        position[vertices] = torch.arange(vertices.numel(), device=device)
+        self.tet, local = (position[model.tets] >= 0).nonzero(as_tuple=True)
+        corners = model.tets[self.tet]
+        self.i = corners.gather(1, local[:, None])[:, 0]
+        self.j, self.k, self.l = corners.gather(1, _OTHERS.to(device)[local]).unbind(1)
+        rest = rest_metric(model.rest_points[corners][None])[0][0]
+        self.weights = rest.gather(1, _COLUMNS.to(device)[local])  # k_ij, k_ik, k_il [P, 3]
+        self.k_ii = -self.weights.sum(1, keepdim=True)
+        self.c6 = rest[:, 6:]
+        self.owner = position[self.i]
+        self.to_block = FixedSum(self.owner, vertices.numel())
+        self.to_vertices = FixedSum(torch.cat((self.i, self.j, self.k, self.l)), model.num_vertices)
+        self.to_tets = FixedSum(self.tet, model.num_tets)
+
+    def assemble(self, x: Tensor, y: Tensor, mu: Tensor, lam: Tensor, mass: Tensor) -> Block:
+        """Gradient and block of every vertex of the color at the state x."""
+        mu, lam = (m.expand(*m.shape[:-1], self.num_tets)[..., self.tet, None] for m in (mu, lam))
+        lb = lam + mu
+        lh = lb if self.exact else lam
+        xi, xj, xk, xl = (x[..., index, :] for index in (self.i, self.j, self.k, self.l))
+        edge_k, edge_l, spoke = xk - xj, xl - xj, xi - xj
+        normal = torch.linalg.cross(edge_k, edge_l)
+        det = self.c6 * _dot(normal, spoke)
+        w_j, w_k, w_l = self.weights.split(1, 1)
+        stretch = w_j * (xj - xi) + w_k * (xk - xi) + w_l * (xl - xi)
+        gradient = mu * stretch + (lb * (det - 1) - mu) / 6 * normal
+        eye = torch.eye(3, dtype=x.dtype, device=x.device)
+        block = (mu * self.k_ii)[..., None] * eye + (lh * self.c6 / 6)[..., None] * _outer(normal, normal)
+        (rows,) = self.rows
+        assert isinstance(rows, Tensor)
+        m = mass.expand(*mass.shape[:-1], self.num_vertices)[..., rows, None]
+        offset = x[..., rows, :] - y[..., rows, :]
+        gradient = m * offset + self.factor * self.to_block(gradient)
+        block = self.factor * self.to_block(block.flatten(-2)).unflatten(-1, (3, 3))
+        block = (m + self.regularization)[..., None] * eye + block
+        return Block(offset, gradient, block, mu, lb, lh, normal, spoke, edge_k, edge_l, stretch, det)
+
+    def update(self, state: Tensors, parameters: Tensors) -> Bars:
+        (x,) = state
+        block = self.assemble(x, *_shaped(parameters))
+        raw = -_solve(block.hessian, block.gradient)
+        return (x[..., self.rows[0], :] + self.relaxation * self.saturated(raw),)
+
+    def saturated(self, raw: Tensor) -> Tensor:
+        """s d_raw with s = c / (|d_raw| + c + eps)."""
+        return raw if self.saturation is None else _scale(raw, self.saturation) * raw
+
+    def vjp(self, state: Tensors, rows_bar: Bars, parameters: Tensors) -> tuple[Bars, Bars]:
+        (x,), (out_bar,) = state, rows_bar
+        assert out_bar is not None
+        y, mu, lam, mass = _shaped(parameters)
+        block = self.assemble(x, y, mu, lam, mass)
+        raw = -_solve(block.hessian, block.gradient)
+        p = _solve(block.hessian, self.saturation_vjp(self.relaxation * out_bar, raw))
+        pairs = self.elastic_tangent(block, p[..., self.owner, :], raw[..., self.owner, :])
+
+        (rows,) = self.rows
+        assert isinstance(rows, Tensor)
+        m = mass.expand(*mass.shape[:-1], self.num_vertices)[..., rows, None]
+        inertia = placed(m * p, rows, self.num_vertices)
+        x_bar = placed(out_bar, rows, self.num_vertices) - inertia - self.factor * self.scatter(block, pairs)
+        mass_bar = placed(-_dot(block.offset + raw, p)[..., 0], rows, self.num_vertices, dim=-1)
+        mu_bar, lam_bar = (-self.factor * self.to_tets(bar)[..., 0] for bar in (pairs.mu, pairs.lam))
+        return (x_bar,), (inertia, mu_bar, lam_bar, mass_bar)
+
+    def saturation_vjp(self, z: Tensor, raw: Tensor) -> Tensor:
+        """Adjoint of d_raw from that of the saturated update (paper, eq. 13)."""
+        if self.saturation is None:
+            return z
+        s = _scale(raw, self.saturation)
+        length = torch.linalg.vector_norm(raw, dim=-1, keepdim=True)
+        direction = torch.where(length > 0, raw / torch.where(length > 0, length, 1.0), 0.0)
+        return s * z - s**2 / self.saturation * _dot(raw, z) * direction
+
+    def elastic_tangent(self, b: Block, p: Tensor, raw: Tensor) -> PairBars:
+        """Both tangents of the tets' part of phi; p and d_raw per pair."""
+        first, second = self.gradient_tangent(b, p), self.hessian_tangent(b, p, raw)
+        return PairBars(
+            first.own + second.own,
+            first.normal + second.normal,
+            first.stretch,
+            first.mu + second.mu,
+            first.lam + second.lam,
+        )
+
+    def gradient_tangent(self, b: Block, p: Tensor) -> PairBars:
+        """From p . g with n and x_i independent (stage 1 of the paper)."""
+        np = _dot(b.normal, p)
+        volume = b.lb * self.c6 / 6 * np
+        return PairBars(
+            own=volume * b.normal,
+            normal=((b.lb * (b.det - 1) - b.mu) / 6) * p + volume * b.spoke,
+            stretch=b.mu * p,
+            mu=_dot(b.stretch, p) + (b.det - 2) / 6 * np,
+            lam=(b.det - 1) / 6 * np,
+        )
+
+    def hessian_tangent(self, b: Block, p: Tensor, raw: Tensor) -> PairBars:
+        """From p . H d_raw (stage 2): the block depends on the state through n only."""
+        np, nd = _dot(b.normal, p), _dot(b.normal, raw)
+        along = self.c6 / 6 * np * nd
+        return PairBars(
+            own=torch.zeros_like(p),
+            normal=b.lh * self.c6 / 6 * (nd * p + np * raw),
+            stretch=None,
+            mu=self.k_ii * _dot(raw, p) + (along if self.exact else 0.0),
+            lam=along,
+        )
+
+    def scatter(self, b: Block, pairs: PairBars) -> Tensor:
+        """Gradient of phi with respect to the positions of all vertices, [..., V, 3]."""
+        to_k = torch.linalg.cross(b.edge_l, pairs.normal)
+        to_l = torch.linalg.cross(pairs.normal, b.edge_k)
+        to_i = pairs.own
+        # phi depends on differences of positions only: what the four vertices get sums to zero
+        to_j = -(to_i + to_k + to_l)
+        if pairs.stretch is not None:
+            w_j, w_k, w_l = self.weights.split(1, 1)
+            to_i, to_j = to_i + self.k_ii * pairs.stretch, to_j + w_j * pairs.stretch
+            to_k, to_l = to_k + w_k * pairs.stretch, to_l + w_l * pairs.stretch
+        return self.to_vertices(torch.cat((to_i, to_j, to_k, to_l), -2))
+
+
+def vertex_block_descent(model: Model, time_step: float, update: type[VertexBlock] = VertexBlock) -> Solver:
+    """The sweep of :func:`diffvbd.step` as a composition of its colors.
+
+    ``solver((x,), (y, mu, lam, mass), sweeps=K)`` equals the sweep that a step executes between predictor and velocity;
+    shapes and units in :class:`VertexBlock`. For study and for comparison: it is many times slower than ``step``.
+
+    Args:
+        model: A Model whose only energy is StableNeoHookean, on any device.
+        time_step: h [s] > 0.
+        update: A subclass of VertexBlock to use in its place.
+
+    Raises:
+        ValueError: model has energies of single vertices, or none of tets.
+    """
+    elastic_energy(model)
+    bounds = model.color_ptr.tolist()
+    colors = (model.color_vertices[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True))
+    return compose(update(model, time_step, vertices) for vertices in colors)
+
+
+def elastic_energy(model: Model) -> StableNeoHookean:
+    """The one energy that VertexBlock knows; raises where there are others."""
+    if not isinstance(model, Model):
+        raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
+    energies = model.energies
+    if len(energies) != 1 or not isinstance(energies[0], StableNeoHookean):
+        names = [type(e).__name__ for e in energies]
+        fail("model", "a StableNeoHookean as its only energy", f"{names or 'none'}")
+    return energies[0]
+
+
+def _shaped(parameters: Tensors) -> Tensors:
+    """y, mu, lam, mass; numbers for all tets or vertices as tensors of one entry."""
+    y, *scalars = parameters
+    return (y, *(s[None] if s.dim() == 0 else s for s in scalars))
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return (a * b).sum(-1, keepdim=True)
+
+
+def _outer(a: Tensor, b: Tensor) -> Tensor:
+    return a[..., :, None] * b[..., None, :]
+
+
+def _solve(matrix: Tensor, rhs: Tensor) -> Tensor:
+    return torch.linalg.solve(matrix, rhs[..., None])[..., 0]
+
+
+def _scale(raw: Tensor, limit: float) -> Tensor:
+    return limit / (torch.linalg.vector_norm(raw, dim=-1, keepdim=True) + limit + SATURATION_EPS)
