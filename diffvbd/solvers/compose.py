@@ -70,7 +70,7 @@ class Update(BlockUpdate):
     Args:
         function: ``function(state, parameters)`` returns the new rows of each state tensor, as a tuple like state; a
             single tensor stands for a tuple of one.
-        rows: Rows per state tensor, indices of shape [n] or a slice, see :class:`BlockUpdate`; one that is no tuple stands
+        rows: Rows per state tensor, indices of shape [n] or a slice, see :class:`BlockUpdate`; what is no tuple stands
             for a tuple of one.
         dim: -2 or -1.
         vjp: ``vjp(state, rows_bar, parameters)``; None: torch autograd.
