@@ -45,9 +45,9 @@ class ReverseSweep:
 class Unrolled:
     """torch.autograd through the executed colored sweep in plain torch (``diffvbd.reference``).
 
-    Exact for every number of sweeps, as ReverseSweep is, at some 50 times its time and memory: for checking a gradient,
-    or for a formula that is not compiled yet. Not recommended otherwise. The forward is plain torch too: it agrees with
-    the compiled one to rounding, not to the bit, and looks at values only inside ``debug_checks()``.
+    Exact for every number of sweeps, as ReverseSweep is, at a hundred times its time and tens of times its memory: for
+    checking a gradient, or for a formula that is not compiled yet. Not recommended otherwise. The forward is plain
+    torch too: it agrees with the compiled one to rounding, not to the bit.
     """
 
 
@@ -71,27 +71,29 @@ class GlobalAdjoint:
     """The adjoint of the equation, not of the solver: one linear system per step with the Hessian of the incremental
     potential at the executed end state, solved by preconditioned conjugate gradients (3x3 blocks of vertices).
 
-    Right where the sweeps have converged, as after :func:`diffvbd.solve`, and wrong by the part that has not (tens
-    of percent after one sweep). Keeps no tape: memory does not grow with the sweeps. Not recommended for steps of few
+    Right where the sweeps have converged, as after :func:`diffvbd.solve`; before, wrong in size and even in sign. Keeps
+    no tape: memory does not grow with the sweeps. Not recommended for steps of few
     sweeps. Its backward waits for the device, so that it cannot be captured in a CUDA graph, and is not available to
     ``torch.func``.
 
     Args:
         assembled: Store the Hessian as a sparse matrix of 3V x 3V; else multiply with it matrix-free, tet by tet.
-        tolerance: Relative residual at which a scene's solve ends, > 0.
+        tolerance: Relative residual |b - A w| / |b| at which a scene's solve ends, in (0, 1); None: 1e-10 in float64,
+            1e-5 in float32. An ill-conditioned system may not get there: then the solve fails.
         max_iterations: Of conjugate gradients; None: ten times the unknowns of a scene, at most 10,000.
         on_failure: ``"raise"`` a RuntimeError, or ``"warn"`` and go on, where a solve does not meet the tolerance.
         report: Called with a :class:`diffvbd.LinearSolve` after each backward of a step, e.g. ``solves.append``.
 
     Raises:
-        RuntimeError: In the backward, for a solve that fails, and while a CUDA graph is captured.
+        RuntimeError: In the backward, for a solve that fails, for adjoints that are not finite, and while a CUDA graph
+            is captured.
         NotImplementedError: In the backward, for second derivatives.
 
     Source: paper, eq. 5 (right) and section 6.3; docs/adjoints.md.
     """
 
     assembled: bool = True
-    tolerance: float = 1e-10
+    tolerance: float | None = None
     max_iterations: int | None = None
     on_failure: Literal["raise", "warn"] = "raise"
     report: Callable[[LinearSolve], object] | None = None
@@ -99,7 +101,8 @@ class GlobalAdjoint:
     def __post_init__(self) -> None:
         if not isinstance(self.assembled, bool):
             raise TypeError(f"assembled: expected a bool, got {type(self.assembled).__name__}")
-        check_positive("tolerance", self.tolerance)
+        if self.tolerance is not None and check_positive("tolerance", self.tolerance) >= 1:
+            fail("tolerance", "a number in (0, 1)", self.tolerance)
         if self.max_iterations is not None:
             check_count("max_iterations", self.max_iterations, 1)
         if self.on_failure not in ("raise", "warn"):

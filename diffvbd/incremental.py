@@ -20,8 +20,11 @@ from torch import Tensor
 from . import ops
 from .metric import rest_metric
 from .model import Model
+from .sweeps import SweepTensors
 
-_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners of k_ab, the first six rest scalars
+PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners (a, b) of k_ab, the first six rest scalars
+# a, b and the other two corners c, d, in the order in which det(x_a - x_d, x_b - x_d, x_c - x_d) > 0
+_OF_PAIRS = torch.tensor([(0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2), (1, 2, 0, 3), (1, 3, 2, 0), (2, 3, 0, 1)]).T
 
 
 def _rolled(vectors: Tensor, by: int) -> Tensor:
@@ -39,32 +42,33 @@ class IncrementalPotential:
     Per tet, arrays are [3 edges, 3 components, B, T]: rows of whole meshes, which elementwise operations want.
     """
 
-    def __init__(self, model: Model, x: Tensor, tensors: Sequence[Any], time_step: float) -> None:
-        """tensors: the arguments of sweeps.sweep, of which the first (the start of the sweep) does not enter."""
-        _, self.x_prev, self.y, mu, lam, mass, rest, self.data, origin = tensors
+    def __init__(self, model: Model, x: Tensor, tensors: SweepTensors, time_step: float) -> None:
+        """tensors: of the step; where its sweeps start does not enter."""
         self.model, self.x, self.h = model, x, time_step
-        self.mu, self.lam, self.mass = mu, lam, mass[..., None]
-        self.origin = origin if origin.numel() else None
+        self.x_prev, self.y, self.data = tensors.x_prev, tensors.y, tensors.energy_data
+        self.mu, self.lam, self.mass = tensors.mu, tensors.lam, tensors.mass[..., None]
+        self.origin = tensors.origin if tensors.origin.numel() else None
+        rest = tensors.rest
         self.rest = model.derived("rest", lambda: _metric(model)) if rest is None else rest  # [1 | B, T, 7]
         self.free = (~model.pinned)[:, None].to(x.dtype)
 
-        k = dict(zip(_PAIRS, self.rest[..., :6].unbind(-1), strict=True))
+        k = dict(zip(PAIRS, self.rest[..., :6].unbind(-1), strict=True))
         k |= {(b, a): value for (a, b), value in k.items()}
         k |= {(i, i): -(k[i, 0] + k[i, a] + k[i, b]) for i, a, b in ((1, 2, 3), (2, 3, 1), (3, 1, 2))}
         h2 = time_step * time_step
         rows = [torch.stack([k[i, j] for j in (1, 2, 3)]) for i in (1, 2, 3)]
-        self._shear = (h2 * mu) * torch.stack(rows)  # h^2 mu S, [3, 3, 1 | B, T]
+        self._shear = (h2 * self.mu) * torch.stack(rows)  # h^2 mu S, [3, 3, 1 | B, T]
         self.edges = self._edges_of(x)
         self._next, self._last = _rolled(self.edges, 1), _rolled(self.edges, 2)
         self.normals = _cross(self._next, self._last)  # of det = e_1.(e_2 x e_3) with respect to e_i
         self.c6 = self.rest[..., 6]
         self.ratio = self.c6 * (self.edges[0] * self.normals[0]).sum(0)  # J [B, T]
-        total = mu + lam
-        self._pressure = (h2 / 6) * (total * (self.ratio - 1) - mu)
+        total = self.mu + self.lam
+        self._pressure = (h2 / 6) * (total * (self.ratio - 1) - self.mu)
         self._bulk = (h2 / 6) * total * self.c6
 
     def _edges_of(self, x: Tensor) -> Tensor:
-        corners = ops.tet_gather(x, *self.model._topology).permute(2, 3, 0, 1)
+        corners = ops.tet_gather(x, *self.model._topology).permute(2, 3, 0, 1).contiguous()
         return corners[1:] - corners[:1]
 
     def _summed(self, per_edge: Tensor) -> Tensor:
@@ -73,7 +77,9 @@ class IncrementalPotential:
         return ops.star_sum(corners.permute(2, 3, 0, 1), *self.model._topology)
 
     def _sheared(self, edges: Tensor) -> Tensor:
-        return (self._shear[:, :, None] * edges[None]).sum(1)
+        first, second, third = self._shear[:, :, None].unbind(1)
+        out = torch.addcmul(first * edges[0], second, edges[1])
+        return torch.addcmul(out, third, edges[2])
 
     def forces(self) -> Tensor:
         """h^2 dE/dx [kg m], [B, V, 3]."""
@@ -101,10 +107,13 @@ class IncrementalPotential:
         if not self.model.vertex_energies:
             return None
         if not hasattr(self, "_blocks"):
-            with torch.enable_grad():
-                x = self.x.detach().requires_grad_()
-                pairs = self._vertex_energies(self.data.detach())
-                total = sum(e.gradient(x, self.x_prev.detach(), data, self.h, self.origin) for e, data in pairs)
+            with torch.inference_mode(False), torch.enable_grad():
+                # clones: what was made in inference mode cannot be differentiated
+                x, x_prev, data = (t.detach().clone() for t in (self.x, self.x_prev, self.data))
+                x.requires_grad_()
+                origin = None if self.origin is None else self.origin.detach().clone()
+                pairs = self._vertex_energies(data)
+                total = sum(e.gradient(x, x_prev, part, self.h, origin) for e, part in pairs)
                 assert isinstance(total, Tensor)
                 columns = [torch.autograd.grad(total[..., c].sum(), x, retain_graph=True)[0] for c in range(3)]
             self._blocks = torch.stack(columns, -1) * self.free[..., None]
@@ -112,36 +121,35 @@ class IncrementalPotential:
 
     def diagonal(self) -> Tensor:
         """The 3x3 blocks on the diagonal, [B, V, 3, 3]: positive definite wherever mu >= 0 and mu + lam >= 0."""
-        shear = torch.stack([self._shear[i, i] for i in range(3)])
-        shear = torch.cat([self._shear.sum((0, 1))[None], shear])  # [4, 1 | B, T]
-        normals = torch.cat([-self.normals.sum(0, keepdim=True), self.normals])
-        eye = torch.eye(3, dtype=shear.dtype, device=shear.device)[..., None, None]
-        blocks = shear[:, None, None] * eye + self._bulk * normals[:, :, None] * normals[:, None]  # [4, 3, 3, B, T]
-        return self._with_inertia(ops.star_sum(blocks.permute(3, 4, 0, 1, 2).flatten(-2), *self.model._topology))
-
-    def _with_inertia(self, blocks: Tensor) -> Tensor:
-        """[B, V, 9] of the tets -> [B, V, 3, 3] of everything."""
-        eye = torch.eye(3, dtype=blocks.dtype, device=blocks.device)
-        blocks = blocks.unflatten(-1, (3, 3)) + self.mass[..., None] * eye
+        shear = torch.cat([self._shear.sum((0, 1))[None], self._shear.diagonal().movedim(-1, 0)])  # [4, 1 | B, T]
+        normals = self._corner_normals()
+        eye = torch.eye(3, dtype=shear.dtype, device=shear.device)
+        blocks = self._bulk * normals[:, :, None] * normals[:, None] + shear[:, None, None] * eye[..., None, None]
+        total = ops.star_sum(blocks.permute(3, 4, 0, 1, 2).flatten(-2), *self.model._topology).unflatten(-1, (3, 3))
+        total = total + self.mass[..., None] * eye
         own = self.vertex_blocks()
-        return blocks if own is None else blocks + own
+        return total if own is None else total + own
 
-    def tet_blocks(self) -> Tensor:
-        """Hessians of the tets, [B, T, 4, 4, 3, 3]."""
-        size = self.edges.shape[2:]
-        eye = torch.eye(3, dtype=self.x.dtype, device=self.x.device)[..., None, None]
-        inner = self._shear[:, :, None, None] * eye + self._bulk * (
-            self.normals[:, None, :, None] * self.normals[None, :, None, :]
-        )
-        inner = inner.expand(3, 3, 3, 3, *size).clone()
-        for i in range(3):  # n_i = e_(i+1) x e_(i+2)
-            after, last = (i + 1) % 3, (i + 2) % 3
-            inner[i, after] -= self._pressure * _skew(self.edges[last])
-            inner[i, last] += self._pressure * _skew(self.edges[after])
-        first = -inner.sum(0, keepdim=True)
-        rows = torch.cat([first, inner])  # [4, 3, 3, 3, B, T]
-        full = torch.cat([-rows.sum(1, keepdim=True), rows], 1)
-        return full.permute(4, 5, 0, 1, 2, 3)
+    def edge_blocks(self) -> Tensor:
+        """Blocks off the diagonal of the tets' Hessians: of the corners (a, b) of PAIRS, then of (b, a),
+        [B, T, 12, 9]."""
+        corners = torch.cat([torch.zeros_like(self.edges[:1]), self.edges])
+        normals = self._corner_normals()
+        a, b, c, d = _OF_PAIRS.to(self.x.device)
+        # n_a = dV6/dx_a changes with x_b by arm x dx_b, the arm being the edge between the other two corners
+        arm = self._pressure * (corners[c] - corners[d])  # [6, 3, B, T]
+        blocks = self._bulk * normals[a][:, :, None] * normals[b][:, None]  # [6, 3, 3, B, T]
+        for k, i, j in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
+            blocks[:, i, j] += arm[:, k]
+            blocks[:, j, i] -= arm[:, k]
+        rest = self.rest[..., :6].movedim(-1, 0)
+        blocks.diagonal(dim1=1, dim2=2).add_(((self.h * self.h) * self.mu * rest)[..., None])
+        blocks = blocks.permute(3, 4, 0, 1, 2)
+        return torch.cat([blocks, blocks.transpose(-1, -2)], 2).flatten(-2)
+
+    def _corner_normals(self) -> Tensor:
+        """Derivatives of six volumes with respect to the four corners, [4, 3, B, T]."""
+        return torch.cat([-self.normals.sum(0, keepdim=True), self.normals])
 
     def dependence(self, w: Tensor, wants: Sequence[bool]) -> list[Tensor | None]:
         """Gradient of -w . dG/dx, with w fixed and zero where pinned, with respect to the arguments of the sweep.
@@ -158,7 +166,7 @@ class IncrementalPotential:
             out[5] = -(w * (self.x - self.y)).sum(-1)
         if wants[3] or wants[6]:
             corners = [torch.cat([torch.zeros_like(a[:1]), a]) for a in (self.edges, f)]
-            stretch = [((corners[0][a] - corners[0][b]) * (corners[1][a] - corners[1][b])).sum(0) for a, b in _PAIRS]
+            stretch = [((corners[0][a] - corners[0][b]) * (corners[1][a] - corners[1][b])).sum(0) for a, b in PAIRS]
             k = self.rest[..., :6].unbind(-1)
             if wants[3]:
                 sheared = sum(scalar * s for scalar, s in zip(k, stretch, strict=True))
@@ -184,13 +192,6 @@ class IncrementalPotential:
         energies = self.model.vertex_energies
         sizes = [e.count() * (self.model.num_vertices if e.per_vertex else 1) for e in energies]
         return list(zip(energies, data.split(sizes, -1), strict=True)) if energies else []
-
-
-def _skew(a: Tensor) -> Tensor:
-    """[3, ...] -> the matrix [3, 3, ...] of b -> a x b."""
-    x, y, z = a
-    no = torch.zeros_like(x)
-    return torch.stack([torch.stack([no, -z, y]), torch.stack([z, no, -x]), torch.stack([-y, x, no])])
 
 
 def _metric(model: Model) -> Tensor:

@@ -207,7 +207,8 @@ class Model:
     def derived(self, name: str, build: Callable[[], Any]) -> Any:
         """Something that follows from the Model alone, built at its first use and kept."""
         if name not in self._derived:
-            self._derived[name] = build()
+            with torch.inference_mode(False), torch.no_grad():  # later steps may be differentiated
+                self._derived[name] = build()
         return self._derived[name]
 
     @property

@@ -61,7 +61,7 @@ def step(
 
     Raises:
         ValueError, TypeError: Naming the argument, what was expected and what came, before any work.
-        NotImplementedError: In the backward, for second derivatives and forward mode.
+        NotImplementedError: In the backward, for second derivatives and forward mode (which Unrolled has).
 
     Source: paper, eqs. 1-3 and section 3; docs/method.md.
     """
@@ -103,8 +103,8 @@ class Begun(NamedTuple):
     def tensors(self, prepared: Prepared) -> SweepTensors:
         """The arguments of sweeps.sweep."""
         origin = self.y.new_empty((0,)) if self.origin is None else self.origin
-        return (self.x_start, self.x_prev, self.y, prepared.mu, prepared.lam, prepared.mass, prepared.rest, self.data,
-                origin)  # fmt: skip
+        return SweepTensors(self.x_start, self.x_prev, self.y, prepared.mu, prepared.lam, prepared.mass, prepared.rest,
+                            self.data, origin)  # fmt: skip
 
     def finish(self, end: Tensor, h: float) -> tuple[Tensor, Tensor]:
         """Positions and velocities after the step whose sweeps ended at ``end``."""
@@ -165,17 +165,16 @@ def advance(
     if isinstance(adjoint, ReverseSweep) and x.is_cuda and _fuses(model, force, gravity):
         held = None if prescribed is None else broadcastable("prescribed", prescribed, x)
         return _fused(model, x, v, gravity, held, prepared, adjoint)
-    unrolled = prepared.unrolled
-    if unrolled is None or checking():
-        begun = begin(model, x, v, prepared, force, gravity, prescribed)
-        given = {"x": x, "v": v, "force": force, "gravity": gravity, "prescribed": prescribed}
-        x_end, v_end = begun.finish(swept(model, begun, prepared, given, adjoint, index), prepared.settings.numbers[0])
-        if unrolled is None:
-            return x_end.reshape(x.shape), v_end.reshape(x.shape)
-    for name, value in (("force", force), ("prescribed", prescribed)):
-        if value is not None:
-            broadcastable(name, value, x)
-    return unrolled(x, v, force, gravity, prescribed)
+    begun = begin(model, x, v, prepared, force, gravity, prescribed)
+    given = {"x": x, "v": v, "force": force, "gravity": gravity, "prescribed": prescribed}
+    if prepared.unrolled is not None:
+        with torch.no_grad():  # for what it raises: the values are looked at even by no sweep
+            count = prepared.settings.sweeps if checking() else 0
+            looked_at = prepared._replace(settings=prepared.settings._replace(sweeps=count))
+            swept(model, begun.detached(), looked_at, given, index=index)
+        return prepared.unrolled(x, v, force, gravity, prescribed)
+    x_end, v_end = begun.finish(swept(model, begun, prepared, given, adjoint, index), prepared.settings.numbers[0])
+    return x_end.reshape(x.shape), v_end.reshape(x.shape)
 
 
 def swept(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import torch
 from torch import Tensor
@@ -170,8 +170,18 @@ def of_inputs(out: Any, needs: Sequence[bool], others: int) -> tuple:
     return tuple(next(given) if need else None for need in needs) + (None,) * others
 
 
-# x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin: the first arguments of sweep()
-SweepTensors = tuple[Any, Any, Any, Any, Any, Any, Any, Any, Any]
+class SweepTensors(NamedTuple):
+    """The first arguments of :func:`sweep`, with their shapes there."""
+
+    x_start: Tensor
+    x_prev: Tensor
+    y: Tensor
+    mu: Tensor
+    lam: Tensor
+    mass: Tensor
+    rest: Tensor | None
+    energy_data: Tensor
+    origin: Tensor
 
 
 def sweep(

@@ -23,7 +23,7 @@ def test_the_residual_meets_the_tolerance(device: str, case: str, goal: float) -
     """Measured by the reference's potential."""
     model, inputs = scene_on(device, case)
     done = dv.solve(model, tolerance=goal, check_every=5, **inputs)
-    assert done.converged and done.sweeps > 0 and done.sweeps % 5 == 0
+    assert done.converged and done.sweeps >= 5
     x, v, h = inputs["x"], inputs["v"], inputs["time_step"]
     mass = torch.where(model.mass > 0, model.mass, 1.0)[:, None]
     y = x + h * v + h * h * (inputs["gravity"] + inputs["force"] / mass)
@@ -33,8 +33,7 @@ def test_the_residual_meets_the_tolerance(device: str, case: str, goal: float) -
     scale = inertia.flatten(-2).norm(dim=-1) + (left - inertia).flatten(-2).norm(dim=-1)
     residual = float((left.flatten(-2).norm(dim=-1) / scale).max())
     assert residual <= goal
-    if done.residual > 0:  # not lost in rounding
-        assert done.residual == pytest.approx(residual, rel=1e-2)
+    assert done.residual == pytest.approx(residual, rel=1e-2, abs=1e-13)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -84,7 +83,7 @@ def test_a_body_at_rest_or_in_free_fall_needs_no_sweep(device: str) -> None:
     for height in (0.0, 1e3):
         x = model.rest_points + height
         done = dv.solve(model, x, torch.ones_like(x), mu=1e5, lam=1e5, time_step=0.01)
-        assert (done.sweeps, done.residual) == (0, 0.0)
+        assert done.sweeps == 0 and done.converged
 
 
 def test_not_converging_is_never_silent(device: str) -> None:
@@ -97,6 +96,14 @@ def test_not_converging_is_never_silent(device: str) -> None:
     assert not done.converged and done.sweeps == 7 and done.residual > 1e-9
 
 
+def test_what_overflows_has_not_converged(device: str) -> None:
+    """Neither its forces nor what rounding leaves of them are numbers."""
+    model = dv.Model(dv.mesh.cube(3), device=device)
+    x = 1.1 * model.rest_points
+    with pytest.raises((RuntimeError, ValueError), match="got inf|mu: expected"):
+        dv.solve(model, x, 0 * x, mu=1e300, lam=1e300, time_step=0.01, max_sweeps=5)
+
+
 def test_positions_that_are_not_finite_are_told(device: str) -> None:
     model, inputs = scene_on(device, "plain")
     inputs["x"][-1, 0] = torch.nan
@@ -106,6 +113,7 @@ def test_positions_that_are_not_finite_are_told(device: str) -> None:
 
 BAD = [
     ({"tolerance": 0.0}, ValueError, "tolerance: expected a finite number > 0"),
+    ({"tolerance": 1.0}, ValueError, r"tolerance: expected a number in \(0, 1\), got 1.0"),
     ({"tolerance": "1e-3"}, TypeError, "tolerance: expected a number, got str"),
     ({"max_sweeps": -1}, ValueError, "max_sweeps: expected an integer >= 0"),
     ({"check_every": 0}, ValueError, "check_every: expected an integer >= 1"),
