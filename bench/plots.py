@@ -16,6 +16,8 @@ CAPTIONS = {
 LABELS = {"reverse sweep": ("o", "C0"), "global, assembled": ("s", "C1"), "global, matrix-free": ("x", "C2"),
           "reverse sweep, full tape": ("o", "C0"), "unrolled autograd": ("d", "C3")}  # fmt: skip
 
+NO_ERROR = 1e-17  # where an error of zero is drawn
+
 
 def draw(name: str, results: dict[str, Any], path: Path) -> bool:
     """Writes the plot of a benchmark's results as PNG; False if it has none, or matplotlib is not installed."""
@@ -42,7 +44,10 @@ def exactness(figure: Any, results: dict[str, Any]) -> None:
         sweeps = [row["sweeps"] for row in rows]
         for route in rows[0]["routes"]:
             marker, color = LABELS[route]
-            ax.loglog(sweeps, [row["routes"][route]["error"] for row in rows], marker=marker, color=color, label=route)
+            # no error at all has no place on a logarithmic axis
+            errors = [max(row["routes"][route]["error"], NO_ERROR) for row in rows]
+            label = f"{route} (0)" if max(errors) == NO_ERROR else route
+            ax.loglog(sweeps, errors, marker=marker, color=color, label=label)
         ax.loglog(sweeps, [row["relative_residual"] for row in rows], "k:", label="residual, relative")
         ax.set(title=f"{name} scene", xlabel="sweeps K", xticks=sweeps, xticklabels=sweeps)
         ax.minorticks_off()

@@ -112,12 +112,13 @@ def test_report_writes_figures_between_its_markers(tmp_path: Path, monkeypatch: 
     assert text in once and report.filled(once, text) == once
 
 
-def test_results_page_is_made_of_the_results_that_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_page_shows_the_results_that_are_there_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT))
     report = importlib.import_module("bench.report")
     page = report.RESULTS_PAGE.read_text(encoding="utf-8")
-    found = report.harvest(report.RESULTS)
-    assert found
-    for _, stem, content in found:
-        date = content["environment"]["date"]
-        assert f"### {stem}, on " in page and date in page, f"{stem}.json is newer: run `python -m bench report`"
+    found = {stem: content for _, stem, content in report.harvest(report.RESULTS)}
+    shown = re.findall(r"^### (\S+), on ", page, re.MULTILINE)
+    assert found and len(shown) == len(set(shown))
+    assert set(shown) == set(found), "not made of bench/results: run `python -m bench report`"
+    for stem, content in found.items():
+        assert content["environment"]["date"] in page, f"{stem}.json is newer: run `python -m bench report`"

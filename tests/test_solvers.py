@@ -78,14 +78,13 @@ def check(solver: Any, inputs: dict[str, Any], sweeps: int, steps: int = 1) -> d
     given = on_device(inputs, solver.mass.device)
     found = on_device(evaluate(repeated(solver.step, steps, sweeps=sweeps), given), "cpu")
     assert relative_error(found["x"], expected["x"]) <= tolerance("forward")
+    # a velocity is a difference of positions over h, and so is its error
+    error = (found["v"] - expected["v"]).abs().max() * H / expected["x"].abs().max()
+    assert float(error) <= tolerance("forward") and found["v"].any()
+    bar = tolerance("other_solvers")
     for name in found:
         if name.startswith("grad_"):
             error = relative_error(found[name], expected[name])
-            bar = (
-                tolerance("other_solvers_strain")
-                if "tet_stiffness" in inputs and name in ("grad_tet_stiffness", "grad_mass")
-                else tolerance("other_solvers")
-            )
             assert error <= bar, f"{name}: {error:.1e} > {bar:.0e}"
             assert found[name].any(), f"{name} is zero"
             assert found[name].shape == inputs[name[5:]].shape
@@ -104,12 +103,13 @@ def test_xpbd(size: str, sweeps: int, steps: int, device: str) -> None:
     check(solver, inputs_of(mesh, XPBD.from_mesh(mesh)), sweeps, steps)
 
 
-@pytest.mark.parametrize(("size", "sweeps"), [("small", 5), ("medium", 1)])
-def test_xpbd_one_constraint_after_another(size: str, sweeps: int) -> None:
+@pytest.mark.parametrize("sweeps", [1, 5, 20])
+@pytest.mark.parametrize("size", ["small", "medium"])
+def test_xpbd_one_constraint_after_another(size: str, sweeps: int, device: str) -> None:
     mesh = mesh_of(size)
-    solver = XPBD.from_mesh(mesh, pinned=held(mesh), order="sequential")
+    solver = XPBD.from_mesh(mesh, pinned=held(mesh), order="sequential", device=device)
     assert all(group.numel() == 1 for group in solver.groups)
-    check(solver, inputs_of(mesh, solver), sweeps)
+    check(solver, inputs_of(mesh, XPBD.from_mesh(mesh)), sweeps)
 
 
 @pytest.mark.parametrize("steps", [1, 3])
@@ -128,10 +128,10 @@ class Frozen(DistanceProjection):
 
     def vjp(self, state: tuple, rows_bar: tuple, parameters: tuple) -> tuple:
         (x_bar, to_multipliers), to_parameters = super().vjp(state, rows_bar, parameters)
-        direction, inverse, wa, wb, *_, change = self._project(state, parameters)
+        p = self.project(state, parameters)
         a_bar, b_bar = rows_bar[0].split(self.a.numel(), -2)
-        turned = change * (wa * a_bar - wb * b_bar)
-        turned = (turned - (direction * turned).sum(-1, keepdim=True) * direction) * inverse
+        turned = p.change * (p.wa * a_bar - p.wb * b_bar)
+        turned = (turned - (p.direction * turned).sum(-1, keepdim=True) * p.direction) * p.inverse
         x_bar = x_bar.index_add(-2, self.both, torch.cat((-turned, turned), -2))
         return (x_bar, to_multipliers), to_parameters
 
@@ -323,12 +323,12 @@ def test_free_fall_is_exact(kind: str) -> None:
 
 def test_xpbd_without_compliance_keeps_lengths() -> None:
     """A chain that swings from its first particle: the more sweeps, the less it stretches."""
-    points = torch.zeros(9, 3, dtype=torch.float64)
-    points[:, 0] = torch.linspace(0, 1, 9)
-    chain = XPBD(points, [[k, k + 1] for k in range(8)], 0.1, pinned=[0])
+    points = torch.zeros(6, 3, dtype=torch.float64)
+    points[:, 0] = torch.linspace(0, 1, 6)
+    chain = XPBD(points, [[k, k + 1] for k in range(5)], 0.1, pinned=[0])
     assert chain.rest_length is not None and len(chain.groups) == 2
     stretched = []
-    for sweeps in (5, 50, 500, 3000):
+    for sweeps in (2, 20, 200, 1000):
         x, v = points, torch.zeros_like(points)
         for _ in range(3):
             x, v = chain.step(x, v, stiffness=float("inf"), time_step=H, sweeps=sweeps)
@@ -381,19 +381,3 @@ def test_projective_dynamics_converges_to_the_minimum_of_its_energy() -> None:
         unknown.copy_(found[free])
     (left,) = torch.autograd.grad(energy(), unknown)
     assert float(left.abs().max()) <= tolerance("block_residual") * float(inertia.abs().max())
-
-
-def test_a_factor_serves_many_steps() -> None:
-    mesh = mesh_of("small")
-    solver = ProjectiveDynamics.from_mesh(mesh, pinned=held(mesh), springs=True)
-    inputs = inputs_of(mesh, solver)
-    constant = ("time_step", "stiffness", "tet_stiffness", "mass")
-
-    def reusing(x: Tensor, v: Tensor, **given: Any) -> tuple[Tensor, Tensor]:
-        factor = solver.factor(**{name: given.pop(name) for name in constant})
-        assert not factor.lower.requires_grad
-        return repeated(solver.step, 3, sweeps=2, factor=factor)(x, v, **given)
-
-    found, expected = (evaluate(run, inputs) for run in (reusing, repeated(solver.step, 3, sweeps=2)))
-    assert all(torch.equal(found[n], expected[n]) for n in ("x", "v"))
-    assert all(relative_error(found[n], expected[n]) <= tolerance("other_solvers") and found[n].any() for n in found)

@@ -200,6 +200,46 @@ def test_function_with_its_own_vjp_and_one_tensor() -> None:
     assert_equal(results[1], results[0])
 
 
+@pytest.mark.parametrize("vjp", [None, "by hand"])
+def test_rows_that_are_views_of_the_state(vjp: Any) -> None:
+    """What an update returns is what the state was before it, however the rows are written."""
+
+    def exchange(state: tuple, parameters: tuple) -> tuple:
+        return state[1][..., :2, :], state[0][..., :2, :]
+
+    def exchange_vjp(state: tuple, rows_bar: tuple, parameters: tuple) -> tuple:
+        bars = [torch.zeros_like(t) for t in state]
+        bars[0][..., :2, :], bars[1][..., :2, :] = rows_bar[1], rows_bar[0]
+        return tuple(bars), ()
+
+    def exchanged(x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.cat((z[:2], x[2:])), torch.cat((x[:2], z[2:]))
+
+    update = Update(exchange, (slice(2), slice(2)), vjp=exchange_vjp if vjp else None)
+    inputs = {"x": rand(3, 3), "z": rand(3, 3, key="z")}
+    found = gradients(lambda x, z: compose([update])((x, z), sweeps=1), inputs)
+    assert_equal(found, gradients(exchanged, inputs), bar=0.0)
+    twice = gradients(lambda x, z: compose([update])((x, z), sweeps=2), inputs)
+    assert_equal(twice, gradients(lambda x, z: (x + 0, z + 0), inputs), bar=0.0)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: x[..., 1:4, :],  # overlaps the rows that it is written to
+        lambda x: x[..., :3, :].flip(-2),
+        lambda x: x[..., :1, :].expand(3, 3),  # overlaps itself
+        lambda x: x[..., :3, :].mT,
+    ],
+    ids=["shifted", "flipped", "expanded", "transposed"],
+)
+def test_rows_that_overlap_what_they_replace(function: Any) -> None:
+    inputs = {"x": rand(4, 3)}
+    solver = compose([Update(lambda state, parameters: function(state[0]), slice(3))])
+    found = gradients(lambda x: solver(x, sweeps=1), inputs)
+    assert_equal(found, gradients(lambda x: torch.cat((function(x), x[3:])), inputs), bar=tolerance("composed"))
+
+
 # --- tape, copies, refusals -------------------------------------------------------------------------------------------
 
 
@@ -284,6 +324,11 @@ BAD: list[tuple[str, Any, str]] = [
     ("shape", lambda: compose([Update(same, slice(2))])(X, sweeps=1), r"expected .*\[2, 3\].*got .*\[1, 3\]"),
     ("dtype", lambda: compose([Update(lambda s, p: same(s, p).float(), slice(1))])(X, sweeps=1), "got torch.float32"),
     ("in place", lambda: compose([Update(lambda s, p: s[0][:1].add_(1), slice(1))])(X, sweeps=1), "written in place"),
+    ("one update", lambda: compose(Update(same, slice(1))), "updates: expected a sequence of BlockUpdate, got Update"),
+    ("no rows", lambda: compose([BlockUpdate()]), r"updates\[0\].rows: expected a tuple .*, got NoneType"),
+    ("function", lambda: Update(3, slice(1)), "function: expected a function, got int"),
+    ("vjp", lambda: Update(same, slice(1), vjp=True), "vjp: expected a function, got bool"),
+    ("a number", lambda: compose([])(X, 0.5, sweeps=1), r"parameters\[0\]: expected a tensor, got float"),
     ("none", lambda: compose([Update(lambda s, p: (None,), slice(1))])(X, sweeps=1), r"rows for state\[0\], got None"),
 ]  # fmt: skip
 
@@ -301,12 +346,13 @@ def test_bad_input(case: str, run: Any, message: str) -> None:
         (((torch.ones(1, 3),), ()), r"vjp of Update: expected torch.float64, shape \[4, 3\] for state\[0\]"),
         (((), ()), "vjp of Update: expected 1 adjoints of state, got 0"),
         (((None,), (None,)), "vjp of Update: expected 0 adjoints of parameters, got 1"),
+        (((0.0,), ()), r"vjp of Update: expected a tensor or None for state\[0\], got float"),
     ],
 )
 def test_a_vjp_of_the_wrong_shape_is_named(bars: Any, message: str) -> None:
     x = X.clone().requires_grad_()
     out = compose([Update(same, slice(1), vjp=lambda *_: bars)])(x, sweeps=1)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, TypeError), match=message):
         out.sum().backward()
 
 

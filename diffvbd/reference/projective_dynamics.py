@@ -60,11 +60,13 @@ def step(
         unit = d / torch.linalg.vector_norm(d, dim=-1, keepdim=True)
         f = torch.einsum("...vc,tdv->...tcd", position, gradient)
         rotation = polar(f)
-        b = mass.unsqueeze(-1) * y
-        b = b + h**2 * torch.einsum("cv,...c,...cd->...vd", difference, stiffness * rest_length, unit)
-        b = b + h**2 * torch.einsum("tdv,...t,...tcd->...vc", gradient, weight, rotation)
-        # Solved for the change, which is small: the position itself would carry the error of the whole solve.
-        change = torch.linalg.solve(system, (b - a @ position)[..., free, :])
+        # A residual of small differences, solved for the change: b - A x would subtract two large numbers, and the
+        # position itself would carry the error of the whole solve.
+        pull = stiffness.unsqueeze(-1) * (rest_length.unsqueeze(-1) * unit - d)
+        residual = mass.unsqueeze(-1) * (y - position)
+        residual = residual + h**2 * torch.einsum("cv,...cd->...vd", difference, pull)
+        residual = residual + h**2 * torch.einsum("tdv,...t,...tcd->...vc", gradient, weight, rotation - f)
+        change = torch.linalg.solve(system, residual[..., free, :])
         position = position.index_add(-2, free, change)
     return position, (position - x) / h
 

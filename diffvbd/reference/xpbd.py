@@ -40,22 +40,22 @@ def step(
     push = torch.zeros_like(x) if force is None else force
     moved = x + h * (v + h * (gravity + push / mass.unsqueeze(-1)))
     position = torch.where(pinned.unsqueeze(-1), x if prescribed is None else prescribed, moved)
-    multiplier = [x.new_zeros(*x.shape[:-2], len(group)) for group in groups]
-    inverse_mass = (~pinned) / mass
+    multiplier = [x.new_zeros(*x.shape[:-2], len(group), 1) for group in groups]
+    inverse_mass = ((~pinned) / mass).unsqueeze(-1)
+    parts = []
+    for group in groups:
+        first, second = edges[group].unbind(1)
+        softness, length = 1 / (stiffness[..., group, None] * h**2), rest_length[..., group, None]
+        parts.append((first, second, inverse_mass[..., first, :], inverse_mass[..., second, :], softness, length))
     for _ in range(sweeps):
-        for n, group in enumerate(groups):
-            first, second = edges[group, 0], edges[group, 1]
+        for n, (first, second, w_first, w_second, softness, length) in enumerate(parts):
             between = position[..., first, :] - position[..., second, :]
-            square = (between * between).sum(-1)
-            apart = square > 0  # where particles meet, direction and derivatives are taken as 0
-            distance = torch.where(apart, torch.where(apart, square, 1.0).sqrt(), 0.0)
-            unit = torch.where(apart, 1 / torch.where(apart, distance, 1.0), 0.0).unsqueeze(-1) * between
-            w_first, w_second = inverse_mass[..., first], inverse_mass[..., second]
-            softness = 1 / (stiffness[..., group] * h**2)
-            violation = distance - rest_length[..., group] + softness * multiplier[n]
-            added = -violation / (w_first + w_second + softness)
+            distance = torch.linalg.vector_norm(between, dim=-1, keepdim=True)
+            apart = distance > 0  # where particles meet, direction and derivatives are taken as 0
+            unit = torch.where(apart, between / torch.where(apart, distance, 1.0), 0.0)
+            added = (length - distance - softness * multiplier[n]) / (w_first + w_second + softness)
             multiplier[n] = multiplier[n] + added
-            impulse = unit * added.unsqueeze(-1)
-            position = position.index_add(-2, first, w_first.unsqueeze(-1) * impulse)
-            position = position.index_add(-2, second, -w_second.unsqueeze(-1) * impulse)
+            impulse = added * unit
+            position = position.index_add(-2, first, w_first * impulse)
+            position = position.index_add(-2, second, -w_second * impulse)
     return position, (position - x) / h

@@ -35,7 +35,10 @@ class BlockUpdate:
     dim: int = -2
 
     def update(self, state: Tensors, parameters: Tensors) -> Bars:
-        """New rows of each state tensor [..., n, c], None where ``rows`` is None. Its arguments stay as they are."""
+        """New rows of each state tensor [..., n, c] or [..., n], None where ``rows`` is None.
+
+        Its arguments stay as they are; what it returns may be a view of them.
+        """
         raise NotImplementedError
 
     def vjp(self, state: Tensors, rows_bar: Bars, parameters: Tensors) -> tuple[Bars, Bars]:
@@ -50,10 +53,12 @@ class BlockUpdate:
             What the update adds to the adjoint of each state tensor (that tensor's shape, None for zero), and of each
             parameter (a shape that sums to the parameter's, None for zero).
         """
+        # Leaves of a graph of their own: whoever calls this has its graph already, and only one block is in this one.
         with torch.enable_grad():
             state = tuple(t.detach().requires_grad_() for t in state)
             parameters = tuple(p.detach().requires_grad_(p.requires_grad) for p in parameters)
             new = _tuple(self.update(state, parameters))
+        # Rows that come from neither state nor parameters have no graph, and autograd would refuse them.
         made = [(rows, bar) for rows, bar in zip(new, rows_bar, strict=True) if rows is not None and rows.requires_grad]
         inputs = [t for t in (*state, *parameters) if t.requires_grad]
         if not made:
@@ -74,6 +79,9 @@ class Update(BlockUpdate):
             for a tuple of one.
         dim: -2 or -1.
         vjp: ``vjp(state, rows_bar, parameters)``; None: torch autograd.
+
+    Raises:
+        TypeError: function or vjp cannot be called.
     """
 
     def __init__(
@@ -83,6 +91,9 @@ class Update(BlockUpdate):
         dim: int = -2,
         vjp: Callable[[Tensors, Bars, Tensors], tuple[Bars, Bars]] | None = None,
     ) -> None:
+        for name, value in (("function", function), ("vjp", vjp)):
+            if not callable(value) and not (name == "vjp" and value is None):
+                raise TypeError(f"{name}: expected a function, got {type(value).__name__}")
         self.function, self.rows, self.dim, self.hand_written = function, _tuple(rows), dim, vjp
 
     def update(self, state: Tensors, parameters: Tensors) -> Bars:
@@ -98,7 +109,10 @@ class Solver:
     """The composition of block updates, one sweep after another; see :func:`compose`."""
 
     def __init__(self, updates: Iterable[BlockUpdate]) -> None:
+        if not isinstance(updates, Iterable):
+            raise TypeError(f"updates: expected a sequence of BlockUpdate, got {type(updates).__name__}")
         self.updates = tuple(updates)
+        # Rows are looked at here, once: on CUDA a look waits for the device, and there is a call for each step.
         reach: dict[tuple[int, int], int] = {}  # (state tensor, dim) -> rows that it must have
         for n, update in enumerate(self.updates):
             _check_update(n, update)
@@ -135,6 +149,7 @@ class Solver:
         for (k, dim), rows in self._reach.items():
             if tensors[k].dim() < -dim or tensors[k].shape[dim] < rows:
                 fail(f"state[{k}]", f"at least {rows} rows in dimension {dim}", f"shape {list(tensors[k].shape)}")
+        # Without a gradient to come there is no tape, however many sweeps.
         record = torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors, *given))
         out = _Sweeps.apply(self.updates * sweeps, record, len(tensors), *tensors, *given)
         return out[0] if single else out
@@ -143,7 +158,11 @@ class Solver:
 def compose(updates: Iterable[BlockUpdate]) -> Solver:
     """The solver that runs ``updates`` in order, sweep by sweep, with the exact adjoint of what it executes.
 
-    Raises TypeError or ValueError for what is no :class:`BlockUpdate` or has unusable rows.
+    Args:
+        updates: The block updates of one sweep. Their rows are read here; on CUDA this waits for the device.
+
+    Raises:
+        TypeError, ValueError: For what is no :class:`BlockUpdate` or has unusable rows.
 
     Source: paper, Theorem 1; docs/solvers.md.
     """
@@ -163,8 +182,11 @@ def _at(rows: Tensor | slice, dim: int) -> tuple:
 
 def _read(update: BlockUpdate, tensors: Sequence[Tensor]) -> list[Tensor | None]:
     """Copies of an update's rows."""
-    pairs = zip(update.rows, tensors, strict=True)
-    return [None if rows is None else t[_at(rows, update.dim)].clone() for rows, t in pairs]
+    found: list[Tensor | None] = []
+    for rows, t in zip(update.rows, tensors, strict=True):
+        here = None if rows is None else t[_at(rows, update.dim)]
+        found.append(here.clone() if here is not None and isinstance(rows, slice) else here)  # indexing has copied
+    return found
 
 
 def _write(update: BlockUpdate, tensors: Sequence[Tensor], values: Sequence[Tensor | None]) -> None:
@@ -174,7 +196,8 @@ def _write(update: BlockUpdate, tensors: Sequence[Tensor], values: Sequence[Tens
 
 
 def _updated(update: BlockUpdate, state: Sequence[Tensor], parameters: Tensors) -> Bars:
-    """New rows of an update, once they fit what they replace."""
+    """New rows of an update, once they fit what they replace, in memory of their own."""
+    # Only versions tell an update in place; inference tensors have none, and then nothing can be said.
     tensors = [t for t in (*state, *parameters) if not t.is_inference()]
     versions = [t._version for t in tensors]
     new = _tuple(update.update(tuple(state), parameters))
@@ -193,12 +216,22 @@ def _updated(update: BlockUpdate, state: Sequence[Tensor], parameters: Tensors) 
         if not isinstance(value, Tensor) or list(value.shape) != shape or value.dtype != t.dtype:
             got = f"{value.dtype}, shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             fail(f"update of {_name(update)}", f"{t.dtype}, shape {shape} for the rows of state[{k}]", got)
-    return new
+    # Rows of several tensors are written one after another, so a view of the state would see what stands before it.
+    return tuple(None if value is None else value.clone() if _shares(value, state) else value for value in new)
+
+
+def _shares(value: Tensor, state: Sequence[Tensor]) -> bool:
+    """Whether a value lies in the memory of a state tensor."""
+    return any(value.untyped_storage().data_ptr() == t.untyped_storage().data_ptr() for t in state)
 
 
 def _add(update: BlockUpdate, what: str, total: list, found: Any, like: Sequence[Tensor]) -> None:
     """Adds adjoints to ``total``, in the order of the calls; a parameter's are summed to its shape."""
     found = _tuple(found)
+    for k, bar in enumerate(found):
+        if bar is not None and not isinstance(bar, Tensor):
+            raise TypeError(f"vjp of {_name(update)}: expected a tensor or None for {what}[{k}], "
+                            f"got {type(bar).__name__}")  # fmt: skip
     if len(found) != len(total):
         fail(f"vjp of {_name(update)}", f"{len(total)} adjoints of {what}", len(found))
     for k, (bar, t) in enumerate(zip(found, like, strict=True)):
@@ -209,6 +242,7 @@ def _add(update: BlockUpdate, what: str, total: list, found: Any, like: Sequence
         if not fits or bar.dtype != t.dtype or (what == "state" and bar.shape != t.shape):
             fail(f"vjp of {_name(update)}", f"{t.dtype}, shape {list(t.shape)} for {what}[{k}]",
                  f"{bar.dtype}, shape {list(bar.shape)}")  # fmt: skip
+        # Summed in a fixed order, unlike torch's own sum on CUDA: equal runs have equal gradients, to the bit.
         bar = ops.sum_to(bar, (1,) * lead + tuple(t.shape)).reshape(t.shape)
         total[k] = bar if total[k] is None else total[k] + bar
 
@@ -236,12 +270,14 @@ def _check_update(n: int, update: Any) -> None:
         raise TypeError(f"updates[{n}]: expected a BlockUpdate, such as Update(...), got {type(update).__name__}")
     if update.dim not in (-1, -2):
         fail(f"updates[{n}].dim", "-1 or -2", update.dim)
-    if not isinstance(update.rows, tuple):
-        raise TypeError(f"updates[{n}].rows: expected a tuple (per state tensor), got {type(update.rows).__name__}")
-    for rows in update.rows:
+    given = getattr(update, "rows", None)
+    if not isinstance(given, tuple):
+        raise TypeError(f"updates[{n}].rows: expected a tuple (per state tensor), got {type(given).__name__}")
+    for rows in given:
         if isinstance(rows, Tensor):
             if rows.dtype != torch.int64 or rows.dim() != 1:
                 fail(f"updates[{n}].rows", "int64 indices of shape [n]", f"{rows.dtype} of shape {list(rows.shape)}")
+            # Of two writes to one row the tape would keep what was there before both, the state only one of them.
             if rows.unique().numel() != rows.numel() or bool((rows < 0).any()):
                 fail(f"updates[{n}].rows", "distinct indices >= 0", rows.tolist())
         elif rows is not None and not isinstance(rows, slice):
@@ -256,18 +292,21 @@ class _Sweeps(Function):
 
     @staticmethod
     def forward(ctx: Any, updates: tuple[BlockUpdate, ...], record: bool, count: int, *tensors: Tensor) -> Tensors:
+        # A copy, which updates are written into: what the caller gave stays, as autograd and the caller expect.
         state, parameters = [t.clone() for t in tensors[:count]], tensors[count:]
         tape = []
         for update in updates:
             new = _updated(update, state, parameters)
             tape += _read(update, state) if record else []
             _write(update, state, new)
+        # All of it through autograd, which then sees whether a parameter was changed in place before the backward.
         ctx.save_for_backward(*state, *parameters, *tape)
         ctx.updates, ctx.count, ctx.given = updates, count, len(parameters)
         return tuple(state)
 
     @staticmethod
     def backward(ctx: Any, *state_bar: Tensor) -> tuple:
+        # A Function of its own, so that a second derivative raises; made of torch operations it would be a silent zero.
         bars = _ReversedSweeps.apply(ctx.updates, ctx.count, ctx.given, *state_bar, *ctx.saved_tensors)
         needs = ctx.needs_input_grad[3:]
         return (None, None, None, *(bar if need else None for bar, need in zip(bars, needs, strict=True)))

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..arguments import GRAVITY
+from ..arguments import GRAVITY, acceleration_of
 from ..checks import check_broadcast, check_positive, check_tensor, fail, vertex_mask
 from ..mesh import TetMesh
 
@@ -23,6 +23,12 @@ class ParticleSolver:
         mass: [kg], a number or shape [V], > 0 where not pinned; the value that a step uses unless it is given another.
         pinned: Particles that nothing but ``prescribed`` moves: a bool mask [V] or indices.
         dtype, device: Of the solver's constants, and of what its steps take.
+
+    Attributes:
+        num_points: V. rest_points [m]: [V, 3] or None. mass [kg]: [V]. pinned: bool [V].
+
+    Raises:
+        ValueError, TypeError: naming the argument, what was expected and what came.
     """
 
     def __init__(
@@ -79,10 +85,12 @@ class ParticleSolver:
         masses = self.mass if mass is None else self.per("mass", mass, x, self.num_points)
         if mass is not None and not masses.is_cuda:  # on CUDA a look would wait for the device
             self._check_mass(masses.detach())
-        acceleration = self.like("gravity", _vector("gravity", gravity, x), x)
+        acceleration = self.like("gravity", gravity if isinstance(gravity, Tensor) else acceleration_of(gravity, x), x)
         if force is not None:
+            # Pinned particles may have no mass: neither 0 / 0 nor its NaN may reach a gradient.
             force = torch.where(pinned, 0.0, self.like("force", force, x))
             acceleration = acceleration + force / torch.where(self.pinned, 1.0, masses)[..., None]
+        # The predictor is also where sweeps start; pinned particles keep the place that they have in it.
         held = x if prescribed is None else self.like("prescribed", prescribed, x)
         return torch.where(pinned, held, x + h * v + (h * h) * acceleration), masses
 
@@ -98,7 +106,7 @@ class ParticleSolver:
         """A value that broadcasts to x.shape[:-2] + (count,), as [..., count]; ``least``: "> 0", ">= 0" or no check."""
         value = check_broadcast(name, self.tensor(name, value), (*x.shape[:-2], count))
         value = value.reshape(1) if value.dim() == 0 else value
-        if least and not value.is_cuda:
+        if least and not value.is_cuda:  # on CUDA a look would wait for the device
             wrong = ~((value > 0) if least == "> 0" else (value >= 0))
             if bool(wrong.any()):
                 fail(name, f"numbers {least}", float(value.detach()[wrong][0]))
@@ -124,7 +132,7 @@ def checked_edges(edges: Any, num_points: int, device: torch.device | str) -> Te
         out = torch.as_tensor(edges).to(device)
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"edges: expected pairs of indices, got {type(edges).__name__}") from None
-    if out.numel() == 0:
+    if out.numel() == 0:  # an empty list has neither two columns nor an integer dtype
         return torch.zeros((0, 2), dtype=torch.int64, device=device)
     if out.is_floating_point() or out.dtype == torch.bool:
         raise TypeError(f"edges: expected integers, got {out.dtype}")
@@ -152,19 +160,6 @@ def checked_mesh(mesh: Any) -> TetMesh:
     if not isinstance(mesh, TetMesh):
         raise TypeError(f"mesh: expected a diffvbd.TetMesh, got {type(mesh).__name__}")
     return mesh
-
-
-def _vector(name: str, value: Any, like: Tensor) -> Tensor:
-    """Three numbers as a tensor; a tensor as it is."""
-    if isinstance(value, Tensor):
-        return value
-    try:
-        out = torch.tensor(value, dtype=like.dtype, device=like.device)
-    except (TypeError, ValueError, RuntimeError):
-        raise TypeError(f"{name}: expected 3 numbers or a tensor, got {value!r}") from None
-    if out.shape != (3,):
-        fail(name, "3 numbers or a tensor", value)
-    return out
 
 
 __all__ = ["GRAVITY", "ParticleSolver", "checked_edges", "checked_mesh", "mesh_edges", "mesh_mass", "numbers"]

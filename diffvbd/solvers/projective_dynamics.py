@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..checks import check_positive, fail
 from ..mesh import TetMesh
-from .compose import Bars, BlockUpdate, Tensors, compose
+from .compose import Bars, BlockUpdate, Solver, Tensors, compose
 from .particles import GRAVITY, ParticleSolver, checked_edges, checked_mesh, mesh_edges, mesh_mass
 from .projections import Springs, Tets
 from .sums import placed
@@ -19,13 +19,39 @@ from .sums import placed
 MAX_FREE = 4096  # free particles of one dense factor: 128 MiB in float64
 
 
-@dataclass(frozen=True)
+class Given(NamedTuple):
+    """A tensor that a factor was made of, and what it was at that time."""
+
+    name: str
+    tensor: Tensor
+    version: int | None  # None: an inference tensor, of which torch counts none
+    values: Tensor
+
+    def moved(self) -> bool:
+        """Whether it was changed in place since. Fused optimizers, ``.data`` and inference tensors leave the version
+        as it was; values tell on the CPU, on CUDA a look at them would wait for the device."""
+        if self.version is not None and self.tensor._version != self.version:
+            return True
+        now = self.tensor.detach()
+        return not now.is_cuda and not torch.allclose(now, self.values, rtol=0, atol=0, equal_nan=True)
+
+
+@dataclass(frozen=True, eq=False)
 class Factor:
     """The factored matrix of a :class:`ProjectiveDynamics` and what it was made of: made once, used in every step.
 
+    A step raises once a tensor that was given to ``factor`` has been changed in place, as an optimizer does: the matrix
+    is that of the old values. Where that cannot be told (on CUDA, for a change that torch does not count) the step is
+    that of the old values throughout, and so is its gradient.
+
     Attributes:
-        lower: Cholesky factor of the matrix of the free particles, shape [..., n, n], detached.
-        time_step: h [s]; stiffness, tet_stiffness, mass: as given to ``factor``, broadcast; gradients reach them.
+        lower: Cholesky factor of the matrix of the n free particles [kg], shape [..., n, n], detached.
+        time_step: h [s].
+        stiffness: Of the springs [N/m], [..., C]; tet_stiffness: of the tets [Pa], [..., T]; mass: [kg], [..., V].
+            Copies of what was given to ``factor``, broadcast; gradients reach what was given.
+        network: What made the factor, and alone can step with it.
+        solver: The iteration with this matrix, see :class:`LocalGlobal` for its state and parameters.
+        given: The tensors that were given, to tell whether they have changed.
     """
 
     lower: Tensor
@@ -33,6 +59,15 @@ class Factor:
     stiffness: Tensor
     tet_stiffness: Tensor
     mass: Tensor
+    network: ProjectiveDynamics
+    solver: Solver
+    given: tuple[Given, ...]
+
+    def check(self) -> None:
+        """Raises ValueError where a tensor has changed since it was factored."""
+        for one in self.given:
+            if one.moved():
+                fail(one.name, "the values that were factored", "a tensor changed in place since; factor again")
 
 
 class LocalGlobal(BlockUpdate):
@@ -46,15 +81,21 @@ class LocalGlobal(BlockUpdate):
 
     on the free particles: paper eq. 3 with one block and a block Hessian that does not depend on the state.
 
+    Args:
+        network: Whose springs and tets these are.
+        lower: Cholesky factor of A [kg] for the free particles, shape [..., n, n].
+        time_step: h [s].
+
     Source: Bouaziz et al., "Projective Dynamics", ACM TOG 33(4), 2014; paper, appendix on other block solvers.
     """
 
-    def __init__(self, solver: ProjectiveDynamics, factor: Factor) -> None:
-        self.free, self.springs, self.tets = solver.free, solver.springs, solver.tets
-        self.lower, self.scale = factor.lower, factor.time_step**2
+    def __init__(self, network: ProjectiveDynamics, lower: Tensor, time_step: float) -> None:
+        self.lower, self.scale = lower, time_step**2
+        self.free, self.springs, self.tets = network.free, network.springs, network.tets
         self.rows = (self.free,)
 
     def _forces(self, x: Tensor, y: Tensor, mass: Tensor, k: Tensor, length: Tensor, w: Tensor) -> Tensor:
+        # As differences S x - P(S x), which are strains: S^T w S x alone would cancel against S^T w P(S x).
         d, f = self.springs.measure(x), self.tets.measure(x)
         out = self.springs.transpose(k[..., None] * (d - self.springs.project(d, length)))
         out = out + self.tets.transpose(w[..., None, None] * (f - self.tets.project(f)))
@@ -75,6 +116,7 @@ class LocalGlobal(BlockUpdate):
         y, mass, k, length, stiffness = parameters
         assert out_bar is not None
         size = x.shape[-2]
+        # Made again and not kept: the tape holds the old rows only, and one more solve with a factor is cheap.
         (rows,) = self.update(state, parameters)
         assert rows is not None
         new = x.clone()
@@ -82,6 +124,7 @@ class LocalGlobal(BlockUpdate):
         p = placed(_solve(self.lower, out_bar), self.free, size)
 
         d, p_d = self.springs.measure(x), self.springs.measure(p)
+        # A changes with the weights, too: by A x' = b they multiply S x' - P(S x), of the new and of the old state.
         stretch = self.springs.measure(new) - self.springs.project(d, length)
         k_bar = -self.scale * (p_d * stretch).sum(-1)
         d_bar, length_bar = self.springs.project_vjp(d, length, self.scale * k[..., None] * p_d)
@@ -109,6 +152,11 @@ class ProjectiveDynamics(ParticleSolver):
         tets: The corners of each tet, integers [T, 4], of positive volume at ``points``; None: no tets.
         pinned: A bool mask [V] or indices.
         dtype, device: torch.float64 or torch.float32; where the constants live.
+
+    Attributes:
+        edges: int64 [C, 2]. rest_length: Distances of the rest positions [m], [C]; None without such.
+        springs, tets: The two kinds of constraints, see :class:`.projections.Springs` and :class:`.projections.Tets`.
+        free: Indices of the particles that are not pinned, int64 [n].
 
     Raises:
         ValueError, TypeError: naming the argument; more than ``MAX_FREE`` free particles, because the factor is dense.
@@ -140,6 +188,7 @@ class ProjectiveDynamics(ParticleSolver):
         if tets is not None:
             if self.rest_points is None:
                 fail("points", "rest positions, because there are tets", "a number of particles")
+            # A mesh checks the corners and that no volume is zero or negative, where F and w would be worthless.
             rest = self.rest_points.cpu()
             mesh = TetMesh(rest, tets)
             corners = torch.from_numpy(mesh.tets.copy())
@@ -156,7 +205,12 @@ class ProjectiveDynamics(ParticleSolver):
         tets: bool = True,
         **options: Any,
     ) -> ProjectiveDynamics:
-        """Springs along the edges of a mesh, its tets, or both; density [kg/m^3], lumped; options: dtype, device."""
+        """Springs along the edges of a mesh, its tets, or both; density [kg/m^3], lumped; options: dtype, device.
+
+        Raises:
+            TypeError: mesh is no TetMesh, or density or pinned of a wrong type.
+            ValueError: density is not > 0, pinned or an option does not fit, or too many particles are free.
+        """
         mesh = checked_mesh(mesh)
         edges = mesh_edges(mesh) if springs else None
         corners = mesh.tets if tets else None
@@ -170,32 +224,52 @@ class ProjectiveDynamics(ParticleSolver):
         tet_stiffness: float | Tensor | None = None,
         mass: float | Tensor | None = None,
     ) -> Factor:
-        """Factors the constant matrix; arguments as in :meth:`step`, which then takes ``factor`` in their place.
+        """Factors the constant matrix; :meth:`step` takes the factor in place of these arguments.
 
-        Values per scene ([..., C], [..., T] or [..., V] with leading dimensions) make a factor per scene.
+        Values per scene (with leading dimensions) make a factor per scene.
+
+        Args:
+            time_step: h [s] > 0.
+            stiffness: k [N/m] >= 0, a number or shape [..., C]; None without springs.
+            tet_stiffness: [Pa] >= 0, a number or shape [..., T]; None without tets.
+            mass: [kg] > 0 where not pinned, a number or shape [..., V]; None: the solver's.
+
+        Raises:
+            ValueError: An argument is missing, given without such constraints, of a wrong shape or (looked at on the
+                CPU only) out of its range.
+            TypeError: An argument is no number, or a tensor of another dtype than the solver's.
+            torch.linalg.LinAlgError: The matrix is not positive definite, which needs values that were not looked at.
         """
         h = check_positive("time_step", time_step, "s")
         given = (("stiffness", stiffness, self.edges.shape[0], ">= 0"),
                  ("tet_stiffness", tet_stiffness, self.tets.nodes.shape[0], ">= 0"),
                  ("mass", self.mass if mass is None else mass, self.num_points, ""))  # fmt: skip
-        values = []
-        for name, value, count, least in given:
-            if value is None and count:
+        values, tensors = [], []
+        for name, original, count, least in given:
+            if original is None and count:
                 fail(name, "a value (the solver has such constraints)", None)
-            if value is not None and not count and name != "mass":
-                fail(name, "None (the solver has no such constraints)", value)
-            value = self.tensor(name, 0.0 if value is None else value)
+            if original is not None and not count and name != "mass":
+                fail(name, "None (the solver has no such constraints)", original)
+            value = self.tensor(name, 0.0 if original is None else original)
             if value.dim() and value.shape[-1] not in (1, count):
                 fail(name, f"a shape that broadcasts to [..., {count}]", f"shape {list(value.shape)}")
-            values.append(self.per(name, value, value.new_empty((*value.shape[:-1], 1, 3)), count, least))
+            # A copy, so that no step can mix the matrix of these values with later ones; gradients pass through it.
+            kept = value.clone()
+            if isinstance(original, Tensor):
+                version = None if original.is_inference() else original._version
+                tensors.append(Given(name, original, version, kept.detach()))
+            values.append(self.per(name, kept, value.new_empty((*value.shape[:-1], 1, 3)), count, least))
         k, stiff, masses = values
         if mass is not None and not masses.is_cuda:
             self._check_mass(masses.detach())
+        # No graph: the vjp of an iteration has the derivative of the matrix, and never forms that of its factor.
         with torch.no_grad():
             matrix = h * h * (self.springs.matrix(k) + self.tets.matrix(stiff * self.tets.volume))
             matrix = matrix[..., self.free[:, None], self.free] + torch.diag_embed(masses[..., self.free])
             lower = torch.linalg.cholesky(matrix)
-        return Factor(lower, h, k, stiff, masses)
+        # Here and not in each step: compose looks at the rows, for which it waits on CUDA.
+        solver = compose([LocalGlobal(self, lower, h)])
+        return Factor(lower, h, k, stiff, masses, self, solver, tuple(tensors))
 
     def step(
         self,
@@ -233,7 +307,8 @@ class ProjectiveDynamics(ParticleSolver):
             Positions and velocities after the step, shape of x.
 
         Raises:
-            ValueError, TypeError: Naming the argument; values are looked at on the CPU only.
+            ValueError, TypeError: Naming the argument; values are looked at on the CPU only. ValueError also for a
+                factor of values that have been changed in place since.
             NotImplementedError: In the backward, for second derivatives.
         """
         own = {"time_step": time_step, "stiffness": stiffness, "tet_stiffness": tet_stiffness, "mass": mass}
@@ -245,8 +320,12 @@ class ProjectiveDynamics(ParticleSolver):
             raise TypeError(f"factor: expected what ProjectiveDynamics.factor returns, got {type(factor).__name__}")
         elif given := [name for name, value in own.items() if value is not None]:
             fail(given[0], "None, because factor has it", own[given[0]])
+        elif factor.network is not self:
+            fail("factor", "one that this solver has made", "one of another solver")
+        factor.check()
         h, count = factor.time_step, self.edges.shape[0]
         y, masses = self.begin(x, v, mass=factor.mass, time_step=h, force=force, gravity=gravity, prescribed=prescribed)
+        # A factor of one scene serves a batch; one per scene must fit the batch that it meets here.
         k = self.per("stiffness", factor.stiffness, x, count)
         stiff = self.per("tet_stiffness", factor.tet_stiffness, x, self.tets.nodes.shape[0])
         if rest_length is None:
@@ -254,8 +333,7 @@ class ProjectiveDynamics(ParticleSolver):
                 fail("rest_length", "a value, because the solver was made without rest positions", None)
             rest_length = x.new_zeros(0) if self.rest_length is None else self.rest_length
         lengths = self.per("rest_length", rest_length, x, count, ">= 0")
-        solver = compose([LocalGlobal(self, factor)])
-        (end,) = solver((y,), (y, masses, k, lengths, stiff), sweeps=sweeps)
+        (end,) = factor.solver((y,), (y, masses, k, lengths, stiff), sweeps=sweeps)
         return end, (end - x) / h
 
 
@@ -263,5 +341,6 @@ def _solve(lower: Tensor, rhs: Tensor) -> Tensor:
     """A^-1 rhs for rhs [..., n, 3]; scenes that share a factor are columns of one solve."""
     if lower.dim() > 2:
         return torch.cholesky_solve(rhs, lower)
+    # By hand, because broadcasting would copy the factor for each scene.
     columns = rhs.movedim(-2, 0)
     return torch.cholesky_solve(columns.flatten(1), lower).reshape(columns.shape).movedim(0, -2)

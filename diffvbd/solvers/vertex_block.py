@@ -75,10 +75,13 @@ class VertexBlock(BlockUpdate):
         self._pairs(model, vertices)
 
     def _pairs(self, model: Model, vertices: Tensor) -> None:
+        """Indices and rest scalars of the pairs of a vertex of this color and a tet around it."""
         device = vertices.device
         position = torch.full((model.num_vertices,), -1, dtype=torch.int64, device=device)
         position[vertices] = torch.arange(vertices.numel(), device=device)
+        # No tet has two vertices of one color, so a tet makes one pair at most.
         self.tet, local = (position[model.tets] >= 0).nonzero(as_tuple=True)
+        # The other corners in an order that makes J positive at rest from each of the four vertices.
         corners = model.tets[self.tet]
         self.i = corners.gather(1, local[:, None])[:, 0]
         self.j, self.k, self.l = corners.gather(1, _OTHERS.to(device)[local]).unbind(1)
@@ -92,7 +95,7 @@ class VertexBlock(BlockUpdate):
         self.to_tets = FixedSum(self.tet, model.num_tets)
 
     def assemble(self, x: Tensor, y: Tensor, mu: Tensor, lam: Tensor, mass: Tensor) -> Block:
-        """Gradient and block of every vertex of the color at the state x."""
+        """Gradient [N s^2] and block [kg] of every vertex of the color at the state x; arguments as in the class."""
         mu, lam = (m.expand(*m.shape[:-1], self.num_tets)[..., self.tet, None] for m in (mu, lam))
         lb = lam + mu
         lh = lb if self.exact else lam
@@ -103,6 +106,7 @@ class VertexBlock(BlockUpdate):
         w_j, w_k, w_l = self.weights.split(1, 1)
         stretch = w_j * (xj - xi) + w_k * (xk - xi) + w_l * (xl - xi)
         gradient = mu * stretch + (lb * (det - 1) - mu) / 6 * normal
+        # J is linear in x_i, so the exact block of a tet has no term with its second derivative.
         eye = torch.eye(3, dtype=x.dtype, device=x.device)
         block = (mu * self.k_ii)[..., None] * eye + (lh * self.c6 / 6)[..., None] * _outer(normal, normal)
         (rows,) = self.rows
@@ -111,6 +115,7 @@ class VertexBlock(BlockUpdate):
         offset = x[..., rows, :] - y[..., rows, :]
         gradient = m * offset + self.factor * self.to_block(gradient)
         block = self.factor * self.to_block(block.flatten(-2)).unflatten(-1, (3, 3))
+        # Regularization stands in the block only: it shortens the update, and does not move its fixed point.
         block = (m + self.regularization)[..., None] * eye + block
         return Block(offset, gradient, block, mu, lb, lh, normal, spoke, edge_k, edge_l, stretch, det)
 
@@ -143,10 +148,11 @@ class VertexBlock(BlockUpdate):
         return (x_bar,), (inertia, mu_bar, lam_bar, mass_bar)
 
     def saturation_vjp(self, z: Tensor, raw: Tensor) -> Tensor:
-        """Adjoint of d_raw from that of the saturated update (paper, eq. 13)."""
+        """Adjoint of d_raw [..., n, 3] from that of the saturated update (paper, eq. 13)."""
         if self.saturation is None:
             return z
         s = _scale(raw, self.saturation)
+        # s changes with the length of d_raw; at length 0, where that has no derivative, the factor d_raw is 0
         length = torch.linalg.vector_norm(raw, dim=-1, keepdim=True)
         direction = torch.where(length > 0, raw / torch.where(length > 0, length, 1.0), 0.0)
         return s * z - s**2 / self.saturation * _dot(raw, z) * direction
@@ -212,7 +218,8 @@ def vertex_block_descent(model: Model, time_step: float, update: type[VertexBloc
         update: A subclass of VertexBlock to use in its place.
 
     Raises:
-        ValueError: model has energies of single vertices, or none of tets.
+        TypeError: model is no Model, or time_step no number.
+        ValueError: model has other energies than one StableNeoHookean, or time_step is not > 0.
     """
     elastic_energy(model)
     bounds = model.color_ptr.tolist()

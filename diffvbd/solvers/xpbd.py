@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +12,21 @@ from ..checks import check_positive, fail
 from ..mesh import TetMesh
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
 from .particles import GRAVITY, ParticleSolver, checked_edges, checked_mesh, mesh_edges, mesh_mass
+from .projections import direction_of
 from .sums import placed
+
+
+class Projection(NamedTuple):
+    """What an update of n constraints makes of the state; both of its directions start from it."""
+
+    direction: Tensor  # n [..., n, 3]
+    inverse: Tensor  # 1 / |xa - xb| [1/m] [..., n, 1]
+    wa: Tensor  # inverse masses [1/kg] [..., n, 1]
+    wb: Tensor
+    a: Tensor  # compliance over h^2 [1/kg] [..., n, 1]
+    scale: Tensor  # 1 / (wa + wb + a) [kg]
+    before: Tensor  # multipliers [kg m] [..., n, 1]
+    change: Tensor  # dlam
 
 
 class DistanceProjection(BlockUpdate):
@@ -26,6 +40,10 @@ class DistanceProjection(BlockUpdate):
 
     Where xa = xb there is no direction: n and the derivative of the length are 0, so that only the multiplier changes.
 
+    Args:
+        edges: The particles a and b of all constraints, int64 [C, 2].
+        constraints: Indices [n] of those to project.
+
     Source: Macklin, Mueller, Chentanez, "XPBD", Motion in Games, 2016; paper, appendix on other block solvers.
     """
 
@@ -35,28 +53,25 @@ class DistanceProjection(BlockUpdate):
         self.both = torch.cat((self.a, self.b))
         self.rows = (self.both, constraints)
 
-    def _project(self, state: Tensors, parameters: Tensors) -> tuple[Tensor, ...]:
+    def project(self, state: Tensors, parameters: Tensors) -> Projection:
+        """The projection at a state; arguments as those of ``update``."""
         x, multipliers = state
         weight, compliance, rest_length = parameters
-        apart = x[..., self.a, :] - x[..., self.b, :]
-        length = torch.linalg.vector_norm(apart, dim=-1, keepdim=True)
-        inverse = torch.where(length > 0, 1 / torch.where(length > 0, length, 1.0), 0.0)
-        direction = apart * inverse
+        direction, inverse, length = direction_of(x[..., self.a, :] - x[..., self.b, :])
         wa, wb = weight[..., self.a, None], weight[..., self.b, None]
         a = compliance[..., self.constraints, None]
         gap = length - rest_length[..., self.constraints, None]
         scale = 1 / (wa + wb + a)
         before = multipliers[..., self.constraints, :]
-        change = -(gap + a * before) * scale
-        return direction, inverse, wa, wb, a, scale, before, change
+        return Projection(direction, inverse, wa, wb, a, scale, before, -(gap + a * before) * scale)
 
     def update(self, state: Tensors, parameters: Tensors) -> Bars:
-        direction, _, wa, wb, _, _, before, change = self._project(state, parameters)
-        move = torch.cat((wa * change * direction, -wb * change * direction), -2)
-        return state[0][..., self.both, :] + move, before + change
+        p = self.project(state, parameters)
+        move = torch.cat((p.wa * p.change * p.direction, -p.wb * p.change * p.direction), -2)
+        return state[0][..., self.both, :] + move, p.before + p.change
 
     def vjp(self, state: Tensors, rows_bar: Bars, parameters: Tensors) -> tuple[Bars, Bars]:
-        direction, inverse, wa, wb, a, scale, before, change = self._project(state, parameters)
+        direction, inverse, wa, wb, a, scale, before, change = self.project(state, parameters)
         x_bar, after_bar = rows_bar
         assert x_bar is not None and after_bar is not None
         a_bar, b_bar = x_bar.split(self.a.numel(), -2)
@@ -64,14 +79,16 @@ class DistanceProjection(BlockUpdate):
         change_bar = wa * along_a - wb * along_b + after_bar
         per_scale = change_bar * scale  # minus the adjoint of the gap
 
-        # Of the direction only what is across it matters: its length is fixed.
+        # Of the adjoint of the direction only what is across it matters: the direction has length 1.
         direction_bar = change * (wa * a_bar - wb * b_bar)
         across = direction_bar - _dot(direction, direction_bar) * direction
         apart_bar = across * inverse - per_scale * direction
         points, constraints = state[0].shape[-2], state[1].shape[-2]
         to_x = placed(torch.cat((a_bar + apart_bar, b_bar - apart_bar), -2), self.both, points)
         to_multipliers = placed(after_bar - a * per_scale, self.constraints, constraints)
-        w_bar = torch.cat((along_a * change - per_scale * change, -along_b * change - per_scale * change), -2)
+        # A weight moves its particle, and makes the correction smaller, for both particles, through scale.
+        w_bar = torch.cat(((along_a - per_scale) * change, -(along_b + per_scale) * change), -2)
+        # d dlam / da = -(lam + dlam) scale: by the numerator and by scale at once
         compliance_bar = -per_scale * (before + change)
         return (to_x, to_multipliers), (
             placed(w_bar[..., 0], self.both, points, dim=-1),
@@ -94,8 +111,10 @@ class XPBD(ParticleSolver):
         dtype, device: torch.float64 or torch.float32; where the constants live.
 
     Attributes:
-        edges [C, 2]; rest_length [C] [m] or None; groups: the constraints of each update, in order; solver: their
-        composition.
+        edges: int64 [C, 2].
+        rest_length: Distances of the rest positions [m], [C]; None without such.
+        groups: The constraints of each update, int64 [n], in order.
+        solver: Their composition, see :func:`compose`; state and parameters as in :class:`DistanceProjection`.
 
     Raises:
         ValueError, TypeError: naming the argument, what was expected and what came.
@@ -120,6 +139,7 @@ class XPBD(ParticleSolver):
         if self.rest_points is not None:
             ends = self.rest_points[self.edges]
             self.rest_length = torch.linalg.vector_norm(ends[:, 0] - ends[:, 1], dim=-1)
+        # Two pinned particles have no weight between them: with infinite stiffness, too, scale would be 1 / 0.
         kept = (~self.pinned[self.edges].all(1)).nonzero()[:, 0]
         listed = [[c] for c in kept.tolist()] if order == "sequential" else _colors(self.edges.tolist(), kept.tolist())
         self.groups = [torch.tensor(group, dtype=torch.int64, device=device) for group in listed]
@@ -129,7 +149,12 @@ class XPBD(ParticleSolver):
     def from_mesh(
         cls, mesh: TetMesh, density: float = 1000.0, pinned: Any = None, order: str = "colored", **options: Any
     ) -> XPBD:
-        """A constraint for each edge of a mesh, masses lumped from its density [kg/m^3]; options: dtype, device."""
+        """A constraint for each edge of a mesh, masses lumped from its density [kg/m^3]; options: dtype, device.
+
+        Raises:
+            TypeError: mesh is no TetMesh, or density or pinned of a wrong type.
+            ValueError: density is not > 0, or pinned, order or an option does not fit.
+        """
         mesh = checked_mesh(mesh)
         return cls(mesh.points, mesh_edges(mesh), mesh_mass(mesh, density), pinned, order, **options)
 
@@ -175,6 +200,7 @@ class XPBD(ParticleSolver):
             fail("rest_length", "a value, because the solver was made without rest positions", None)
         lengths = self.per("rest_length", self.rest_length if rest_length is None else rest_length, x, count, ">= 0")
         compliance = 1 / (self.per("stiffness", stiffness, x, count, "> 0") * (h * h))
+        # Pinned particles may have any mass, even 0: chosen before the division, so that no NaN reaches a gradient.
         weight = torch.where(self.pinned, 0.0, 1 / torch.where(self.pinned, 1.0, masses))
         multipliers = y.new_zeros((*x.shape[:-2], count, 1))
         end, _ = self.solver((y, multipliers), (weight, compliance, lengths), sweeps=sweeps)
