@@ -265,7 +265,7 @@ def kept_bytes(model: dv.Model, x: Tensor, sweeps: int, wants: tuple[str, ...]) 
     def pack(t: Tensor) -> Tensor:
         if t.untyped_storage().data_ptr() not in own:
             kept[t.untyped_storage().data_ptr()] = t.untyped_storage().nbytes()
-        return t
+        return t.detach()  # an output that keeps itself would never be freed
 
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
         time_step(model, x, sweeps, wants)

@@ -1,8 +1,11 @@
-"""Claim: what XPBD and projective dynamics cannot work with raises ValueError or TypeError that names the argument."""
+"""Claim: what XPBD and projective dynamics cannot work with raises ValueError or TypeError that names the argument.
+
+Values are looked at on the CPU."""
 
 import re
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,6 +14,9 @@ from diffvbd.solvers import XPBD, ProjectiveDynamics
 
 MESH = dv.mesh.cube()  # 8 vertices, 6 tets, 19 edges
 X = torch.from_numpy(MESH.points.copy())
+NAN = torch.where(torch.arange(8)[:, None] == 2, torch.nan, X)
+INF = float("inf")
+LEAF = torch.tensor(0.01, dtype=torch.float64, requires_grad=True)
 GIVEN = {"x": X, "v": torch.zeros_like(X), "time_step": 0.01, "sweeps": 1, "stiffness": 1e3}
 
 
@@ -34,9 +40,30 @@ BAD: list[tuple[Any, str]] = [
     *[(lambda s=s: s(prescribed=[0.0]), "prescribed: expected a tensor, got list") for s in (xpbd, pd)],
     *[(lambda s=s: s(mass=0.0), "mass: expected finite numbers > 0 kg where not pinned, got 0.0") for s in (xpbd, pd)],
     *[(lambda s=s: s(stiffness=X), r"stiffness: expected a shape that broadcasts to \[.*19\]") for s in (xpbd, pd)],
-    *[(lambda s=s: s(rest_length=-1.0), "rest_length: expected numbers >= 0, got -1.0") for s in (xpbd, pd)],
+    *[(lambda s=s: s(rest_length=-1.0), "rest_length: expected finite numbers >= 0, got -1.0") for s in (xpbd, pd)],
+    *[(lambda s=s, n=n: s(**{n: NAN}), rf"{n}: expected finite values, got nan at \[2, 0\]")
+      for s in (xpbd, pd) for n in ("x", "v", "force", "gravity")],
+    *[(lambda k=k, o=o: k.from_mesh(MESH, pinned=[2]).step(**(GIVEN | o), prescribed=NAN), "prescribed: .*finite")
+      for k, o in ((XPBD, {}), (ProjectiveDynamics, {"stiffness": None, "tet_stiffness": 1e4}))],
+    *[(lambda s=s: s(gravity=(0.0, INF, 0.0)), r"gravity: expected finite .* inf at \[0, 1\]") for s in (xpbd, pd)],
+    *[(lambda s=s: s(v=X + 1e307, time_step=1e3, force=X), "x, v, force, mass, time_step: expected a finite predictor")
+      for s in (xpbd, pd)],
+    *[(lambda s=s: s(rest_length=INF), "rest_length: expected finite numbers >= 0, got inf") for s in (xpbd, pd)],
+    *[(lambda s=s: s(stiffness=float("nan")), "stiffness: expected .*numbers >.* got nan") for s in (xpbd, pd)],
+    *[(lambda s=s: s(time_step=LEAF), "time_step: expected a number, got a tensor that requires") for s in (xpbd, pd)],
+    *[(lambda s=s, h=h: s(time_step=h), f"time_step: .* whose square lies between .*, got {h}".replace("+", r"\+"))
+      for s in (xpbd, pd) for h in (1e-170, 1e170)],
+    (lambda: xpbd(stiffness=1e-305, time_step=1e-3), "stiffness: expected numbers for which the compliance .* finite"),
+    (lambda: pd(stiffness=INF), "stiffness: expected finite numbers >= 0, got inf"),
+    (lambda: pd(tet_stiffness=INF), "tet_stiffness: expected finite numbers >= 0, got inf"),
+    (lambda: ProjectiveDynamics(X, 1e-9, [[0, 1]]).factor(time_step=0.01, stiffness=1e25),
+     "stiffness, mass, time_step: expected masses of the scale .*torch.float64., got 1e.25, 1e-09, 0.01"),
+    (lambda: pd(stiffness=1e308, time_step=1e3), "stiffness, tet_stiffness, mass, time_step: expected masses"),
+    *[(lambda k=k: k.from_mesh(MESH, device="tpu"), 'device: expected "cpu" or "cuda", got \'tpu\'')
+      for k in (XPBD, ProjectiveDynamics)],
+    (lambda: XPBD.from_mesh(MESH, device="meta"), 'device: expected "cpu" or "cuda", got \'meta\''),
     (lambda: xpbd(stiffness=0.0), "stiffness: expected numbers > 0, got 0.0"),
-    (lambda: pd(stiffness=-1.0), "stiffness: expected numbers >= 0, got -1.0"),
+    (lambda: pd(stiffness=-1.0), "stiffness: expected finite numbers >= 0, got -1.0"),
     (lambda: pd(tet_stiffness=None), r"tet_stiffness: expected a value \(the solver has such constraints\), got None"),
     (lambda: pd(time_step=None), "time_step: expected a number of seconds, or a factor, got None"),
     (lambda: pd(factor=FACTOR), "time_step: expected None, because factor has it, got 0.01"),
@@ -66,3 +93,30 @@ def test_bad_input(run: Any, message: str) -> None:
     with pytest.raises((ValueError, TypeError)) as error:
         run()
     assert re.match(message, str(error.value)), error.value
+
+
+def test_what_is_not_used_may_be_anything() -> None:
+    """A free particle's prescribed position, a pinned one's force; and infinite stiffness is no bad value."""
+    solver = XPBD.from_mesh(MESH, pinned=[2])
+    given = GIVEN | {"stiffness": INF}
+    found = solver.step(**given, force=NAN, prescribed=torch.where(solver.pinned[:, None], X, torch.nan))
+    expected = solver.step(**given, force=X)
+    assert all(torch.equal(*pair) and pair[0].any() for pair in zip(found, expected, strict=True))
+
+
+def test_a_number_of_points_of_numpy() -> None:
+    for solver in (XPBD(np.int64(8), [[0, 1]], 2.0), ProjectiveDynamics(np.int64(8), 2.0)):
+        assert solver.num_points == 8 and type(solver.num_points) is int and solver.rest_points is None
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_cuda_where_there_is_none() -> None:
+    for kind in (XPBD, ProjectiveDynamics):
+        with pytest.raises(RuntimeError, match="^diffvbd: .*CUDA"):
+            kind.from_mesh(MESH, device="cuda")
+
+
+def test_constants_are_detached() -> None:
+    mass = torch.full((8,), 2.0, dtype=torch.float64, requires_grad=True)
+    for solver in (XPBD(X.clone().requires_grad_(), [[0, 1]], mass), ProjectiveDynamics(X, mass, [[0, 1]])):
+        assert not solver.mass.requires_grad and solver.rest_points is not None and not solver.rest_points.requires_grad

@@ -146,3 +146,50 @@ def test_other_energies_are_refused() -> None:
         solvers.vertex_block_descent(mesh, 0.01)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="time_step: expected a finite number > 0 s, got 0"):
         vertex_block_descent(dv.Model(mesh), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"x": torch.zeros(7, 3).double()}, r"x: expected shape \[..., 8, 3\], got shape \[7, 3\]"),
+        ({"x": torch.zeros(8, 3)}, "x: expected dtype torch.float64 .the Model's., got torch.float32"),
+        ({"y": torch.zeros(1, 3).double()}, r"y: expected shape \[..., 8, 3\], got shape \[1, 3\]"),
+        ({"y": torch.zeros(2, 8, 3).double()}, r"y: expected a shape that broadcasts to \[8, 3\]"),
+        ({"mu": torch.ones(5).double()}, r"mu: expected a shape that broadcasts to \[6\], got shape \[5\]"),
+        ({"lam": torch.ones(2, 6).double()}, r"lam: expected a shape that broadcasts to \[6\]"),
+        ({"mass": torch.ones(6).double()}, r"mass: expected a shape that broadcasts to \[8\]"),
+        ({"x": torch.full((8, 3), torch.nan).double()}, "x: expected finite values, got nan"),
+        ({"y": torch.full((8, 3), torch.inf).double()}, "y: expected finite values, got inf"),
+        ({"mu": torch.tensor(-1.0).double()}, "mu: expected finite numbers >= 0 Pa, got -1"),
+        ({"mu": torch.tensor(torch.inf).double()}, "mu: expected finite numbers >= 0 Pa, got inf"),
+        ({"lam": torch.tensor(torch.nan).double()}, "lam: expected finite values, got nan"),
+        ({"lam": torch.full((6,), -9e2).double()}, r"lam: expected mu \+ lam >= 0 Pa, got -100 at \[0\]"),
+        ({"mass": torch.zeros(8).double()}, r"mass: expected finite numbers > 0 kg where not pinned, got 0 at \[1\]"),
+    ],
+)
+def test_bad_arguments_of_the_composed_sweep_are_named(changes: dict[str, Tensor], message: str) -> None:
+    mesh = dv.mesh.cube()
+    model = dv.Model(mesh, pinned=[0])
+    x = torch.from_numpy(mesh.points.copy())
+    given = {"x": x, "y": x - 0.01, "mu": torch.tensor(8e2).double(), "lam": torch.tensor(-4e2).double()}
+    given |= {"mass": model.mass}
+
+    def run(x: Tensor, *parameters: Tensor) -> Tensor:
+        return vertex_block_descent(model, 0.01)(x, parameters, sweeps=1)
+
+    assert not torch.equal(run(*given.values()), x)
+    with pytest.raises((ValueError, TypeError), match=message):
+        run(*(given | changes).values())
+
+
+def test_the_number_of_arguments_and_the_time_step() -> None:
+    model = dv.Model(dv.mesh.cube())
+    x = model.rest_points
+    with pytest.raises(ValueError, match="parameters: expected 4 tensors .y, mu, lam, mass., got 1"):
+        vertex_block_descent(model, 0.01)(x, x, sweeps=1)
+    with pytest.raises(ValueError, match="state: expected 1 tensor .x., got 2"):
+        vertex_block_descent(model, 0.01)((x, x), (), sweeps=1)
+    with pytest.raises(TypeError, match="time_step: expected a number, got a tensor that requires grad"):
+        vertex_block_descent(model, torch.tensor(0.01, requires_grad=True))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="time_step: expected a number of seconds whose square lies between"):
+        vertex_block_descent(model, 1e200)

@@ -12,6 +12,7 @@ from torch.autograd import Function
 
 from .. import ops
 from ..checks import check_count, fail
+from ..debug import checking
 
 Rows = Tensor | slice | None
 Tensors = tuple[Tensor, ...]
@@ -21,7 +22,9 @@ Bars = tuple[Tensor | None, ...]
 class BlockUpdate:
     """One update of a block: reads the whole state, writes only its own rows.
 
-    Subclasses set ``rows`` and write ``update``; a hand-derived ``vjp`` replaces the automatic one.
+    Subclasses set ``rows`` and write ``update``; a hand-derived ``vjp`` replaces the automatic one. Both are pure and
+    deterministic functions of their arguments: the backward puts the old rows back and takes it that the same update
+    made the new ones. Inside :func:`diffvbd.debug_checks` the backward repeats each update to see that it did.
 
     Attributes:
         rows: For each state tensor the rows that the update writes: distinct indices [n] (int64), a slice, or None
@@ -37,12 +40,15 @@ class BlockUpdate:
     def update(self, state: Tensors, parameters: Tensors) -> Bars:
         """New rows of each state tensor [..., n, c] or [..., n], None where ``rows`` is None.
 
-        Its arguments stay as they are; what it returns may be a view of them.
+        Its arguments stay as they are; what it returns may be a view of them. Whatever wants a gradient is among them:
+        rows that require grad through another tensor raise RuntimeError.
         """
         raise NotImplementedError
 
     def vjp(self, state: Tensors, rows_bar: Bars, parameters: Tensors) -> tuple[Bars, Bars]:
         """Transposed derivative of :meth:`update`, the default by torch autograd through this one update.
+
+        Its arguments stay as they are.
 
         Args:
             state: The state before the update.
@@ -114,14 +120,19 @@ class Solver:
         self.updates = tuple(updates)
         # Rows are looked at here, once: on CUDA a look waits for the device, and there is a call for each step.
         reach: dict[tuple[int, int], int] = {}  # (state tensor, dim) -> rows that it must have
+        slices: dict[tuple, tuple[int, int, int, slice]] = {}  # the first update of each slice of a state tensor
         for n, update in enumerate(self.updates):
             _check_update(n, update)
             if len(update.rows) != len(self.updates[0].rows):
                 fail(f"updates[{n}].rows", f"{len(self.updates[0].rows)} entries, as updates[0] has", len(update.rows))
             for k, rows in enumerate(update.rows):
-                if isinstance(rows, Tensor) and rows.numel():
-                    reach[k, update.dim] = max(reach.get((k, update.dim), 0), int(rows.max()) + 1)
-        self._reach = reach
+                if rows is None:
+                    continue
+                least = int(rows.max()) + 1 if isinstance(rows, Tensor) and rows.numel() else 0
+                reach[k, update.dim] = max(reach.get((k, update.dim), 0), least)
+                if isinstance(rows, slice):
+                    slices.setdefault((k, update.dim, rows.start, rows.stop, rows.step), (n, k, update.dim, rows))
+        self._reach, self._slices = reach, tuple(slices.values())
 
     def __call__(
         self, state: Tensor | Sequence[Tensor], parameters: Tensor | Sequence[Tensor] = (), *, sweeps: int
@@ -139,6 +150,8 @@ class Solver:
 
         Raises:
             ValueError, TypeError: Naming the argument, or the update whose rows or adjoints do not fit.
+            RuntimeError: An update uses a tensor that requires grad and is neither state nor parameter. In a backward
+                inside :func:`diffvbd.debug_checks`: an update makes other rows when it is repeated.
             NotImplementedError: In the backward, for second derivatives.
         """
         single = isinstance(state, Tensor)
@@ -147,11 +160,16 @@ class Solver:
         if self.updates and len(tensors) != len(self.updates[0].rows):
             fail("state", f"{len(self.updates[0].rows)} tensors, as the updates write", len(tensors))
         for (k, dim), rows in self._reach.items():
-            if tensors[k].dim() < -dim or tensors[k].shape[dim] < rows:
-                fail(f"state[{k}]", f"at least {rows} rows in dimension {dim}", f"shape {list(tensors[k].shape)}")
-        # Without a gradient to come there is no tape, however many sweeps.
-        record = torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors, *given))
-        out = _Sweeps.apply(self.updates * sweeps, record, len(tensors), *tensors, *given)
+            shape = list(tensors[k].shape)
+            if len(shape) < -dim:
+                fail(f"state[{k}]", f"at least {-dim} dimensions (updates have dim={dim})", f"shape {shape}")
+            if shape[dim] < rows:
+                fail(f"state[{k}]", f"at least {rows} rows in dimension {dim}", f"shape {shape}")
+        for n, k, dim, rows in self._slices:
+            size = tensors[k].shape[dim]
+            if size and not range(*rows.indices(size)):
+                fail(f"updates[{n}].rows", f"some of the {size} rows of state[{k}] in dimension {dim}", rows)
+        out = _Sweeps.apply(self.updates * sweeps, torch.is_grad_enabled(), len(tensors), *tensors, *given)
         return out[0] if single else out
 
 
@@ -195,13 +213,18 @@ def _write(update: BlockUpdate, tensors: Sequence[Tensor], values: Sequence[Tens
             t[_at(rows, update.dim)] = value
 
 
-def _updated(update: BlockUpdate, state: Sequence[Tensor], parameters: Tensors) -> Bars:
+def _versions(tensors: Iterable[Tensor | None]) -> list[int]:
+    """What tells of a write in place. Inference tensors have no version, and then nothing can be said."""
+    return [t._version for t in tensors if t is not None and not t.is_inference()]
+
+
+def _updated(update: BlockUpdate, state: Sequence[Tensor], parameters: Tensors, recording: bool = False) -> Bars:
     """New rows of an update, once they fit what they replace, in memory of their own."""
-    # Only versions tell an update in place; inference tensors have none, and then nothing can be said.
-    tensors = [t for t in (*state, *parameters) if not t.is_inference()]
-    versions = [t._version for t in tensors]
-    new = _tuple(update.update(tuple(state), parameters))
-    if versions != [t._version for t in tensors]:
+    versions = _versions((*state, *parameters))
+    # State and parameters are detached then, so that rows require grad through what the update closes over.
+    with torch.set_grad_enabled(recording):
+        new = _tuple(update.update(tuple(state), parameters))
+    if versions != _versions((*state, *parameters)):
         raise ValueError(f"update of {_name(update)}: expected new rows as its result, got arguments written in place")
     if len(new) != len(state):
         fail(f"update of {_name(update)}", f"{len(state)} tensors of rows (None where it writes none)", len(new))
@@ -216,6 +239,10 @@ def _updated(update: BlockUpdate, state: Sequence[Tensor], parameters: Tensors) 
         if not isinstance(value, Tensor) or list(value.shape) != shape or value.dtype != t.dtype:
             got = f"{value.dtype}, shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             fail(f"update of {_name(update)}", f"{t.dtype}, shape {shape} for the rows of state[{k}]", got)
+        if recording and value.requires_grad:
+            raise RuntimeError(f"update of {_name(update)}: expected rows of state and parameters alone, got rows that "
+                               "require grad through another tensor; give it through parameters, or detach it"
+                               )  # fmt: skip
     # Rows of several tensors are written one after another, so a view of the state would see what stands before it.
     return tuple(None if value is None else value.clone() if _shares(value, state) else value for value in new)
 
@@ -223,6 +250,28 @@ def _updated(update: BlockUpdate, state: Sequence[Tensor], parameters: Tensors) 
 def _shares(value: Tensor, state: Sequence[Tensor]) -> bool:
     """Whether a value lies in the memory of a state tensor."""
     return any(value.untyped_storage().data_ptr() == t.untyped_storage().data_ptr() for t in state)
+
+
+def _restore(update: BlockUpdate, state: list[Tensor], old: Sequence[Tensor | None], parameters: Tensors) -> None:
+    """Puts the old rows back; under debug_checks() sees that the update makes of them what it has made."""
+    made = _read(update, state) if checking() else None
+    _write(update, state, old)
+    if made is None:
+        return
+    for one, two in zip(made, _updated(update, state, parameters), strict=True):
+        if one is not None and two is not None and not torch.allclose(one, two, rtol=0, atol=0, equal_nan=True):
+            raise RuntimeError(f"update of {_name(update)}: expected the rows that it made in the forward, got others "
+                               "from the same state and parameters; updates must be pure and deterministic"
+                               )  # fmt: skip
+
+
+def _transposed(update: BlockUpdate, state: Sequence[Tensor], rows_bar: Bars, parameters: Tensors) -> tuple[Bars, Bars]:
+    """The vjp of an update, which must leave its arguments as they are."""
+    versions = _versions((*state, *rows_bar, *parameters))
+    found = update.vjp(tuple(state), rows_bar, parameters)
+    if versions != _versions((*state, *rows_bar, *parameters)):
+        raise ValueError(f"vjp of {_name(update)}: expected adjoints as its result, got arguments written in place")
+    return found
 
 
 def _add(update: BlockUpdate, what: str, total: list, found: Any, like: Sequence[Tensor]) -> None:
@@ -280,7 +329,10 @@ def _check_update(n: int, update: Any) -> None:
             # Of two writes to one row the tape would keep what was there before both, the state only one of them.
             if rows.unique().numel() != rows.numel() or bool((rows < 0).any()):
                 fail(f"updates[{n}].rows", "distinct indices >= 0", rows.tolist())
-        elif rows is not None and not isinstance(rows, slice):
+        elif isinstance(rows, slice):
+            if rows.step is not None and not (isinstance(rows.step, int) and rows.step > 0):
+                fail(f"updates[{n}].rows", "a slice with a step > 0", rows)
+        elif rows is not None:
             raise TypeError(f"updates[{n}].rows: expected indices, a slice or None, got {type(rows).__name__}")
 
 
@@ -291,13 +343,14 @@ class _Sweeps(Function):
     """The executed updates, S = S_n ... S_2 S_1; on the tape only the rows that each of them replaced."""
 
     @staticmethod
-    def forward(ctx: Any, updates: tuple[BlockUpdate, ...], record: bool, count: int, *tensors: Tensor) -> Tensors:
+    def forward(ctx: Any, updates: tuple[BlockUpdate, ...], recording: bool, count: int, *tensors: Tensor) -> Tensors:
         # A copy, which updates are written into: what the caller gave stays, as autograd and the caller expect.
         state, parameters = [t.clone() for t in tensors[:count]], tensors[count:]
-        tape = []
+        # Without a gradient to come there is no tape, however many sweeps.
+        tape, keep, detached = [], recording and any(ctx.needs_input_grad), tuple(p.detach() for p in parameters)
         for update in updates:
-            new = _updated(update, state, parameters)
-            tape += _read(update, state) if record else []
+            new = _updated(update, state, detached, recording)
+            tape += _read(update, state) if keep else []
             _write(update, state, new)
         # All of it through autograd, which then sees whether a parameter was changed in place before the backward.
         ctx.save_for_backward(*state, *parameters, *tape)
@@ -321,12 +374,12 @@ class _ReversedSweeps(Function):
         parameters, tape = tensors[2 * count : 2 * count + given], list(tensors[2 * count + given :])
         parameter_bar: list[Tensor | None] = [None] * given
         for update in reversed(updates):
-            _write(update, state, tape[-count:])  # the state before the update, to the bit
+            _restore(update, state, tape[-count:], parameters)  # the state before the update, to the bit
             del tape[-count:]
             rows_bar = _read(update, state_bar)
             # The old rows matter only through what the update made of them, which its vjp returns.
             _write(update, state_bar, [None if bar is None else torch.zeros_like(bar) for bar in rows_bar])
-            to_state, to_parameters = update.vjp(tuple(state), tuple(rows_bar), parameters)
+            to_state, to_parameters = _transposed(update, state, tuple(rows_bar), parameters)
             _add(update, "state", state_bar, to_state, state)
             _add(update, "parameters", parameter_bar, to_parameters, parameters)
         return (*state_bar, *parameter_bar)

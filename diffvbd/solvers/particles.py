@@ -10,13 +10,16 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..arguments import GRAVITY, acceleration_of
+from ..arguments import GRAVITY, acceleration_of, name_value
 from ..checks import check_broadcast, check_positive, check_tensor, fail, vertex_mask
 from ..mesh import TetMesh
+from ..model import _checked_device
 
 
 class ParticleSolver:
     """Particles: rest positions (if known), masses and pins.
+
+    What is given here are detached constants; what is differentiated is an argument of a step.
 
     Args:
         points: Rest positions [m], shape [V, 3], or the number of particles V.
@@ -42,15 +45,16 @@ class ParticleSolver:
     ) -> None:
         if dtype not in (torch.float64, torch.float32):
             raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
+        device = checked_device(device)
         self.rest_points: Tensor | None = None
-        if isinstance(points, bool) or not isinstance(points, int):
+        if isinstance(points, bool) or not isinstance(points, (int, np.integer)):
             self.rest_points = numbers("points", points, dtype, device)
             if self.rest_points.dim() != 2 or self.rest_points.shape[1] != 3:
                 fail("points", "shape [V, 3], or a number of particles", f"shape {list(self.rest_points.shape)}")
             points = self.rest_points.shape[0]
         if points < 0:
             fail("points", "shape [V, 3], or a number of particles >= 0", points)
-        self.num_points: int = points
+        points = self.num_points = int(points)
         self.pinned = vertex_mask(pinned, points).to(device)
         mass = numbers("mass", mass, dtype, device)
         if mass.shape not in ((), (points,)):
@@ -81,18 +85,24 @@ class ParticleSolver:
                 fail(name, f"shape [..., {self.num_points}, 3]", f"shape {list(value.shape)}")
         if v.shape != x.shape:
             fail("v", f"x's shape {list(x.shape)}", f"shape {list(v.shape)}")
-        h, pinned = check_positive("time_step", time_step, "s"), self.pinned[:, None]
+        h, pinned = checked_time_step(time_step, self.mass.dtype), self.pinned[:, None]
         masses = self.mass if mass is None else self.per("mass", mass, x, self.num_points)
         if mass is not None and not masses.is_cuda:  # on CUDA a look would wait for the device
             self._check_mass(masses.detach())
-        acceleration = self.like("gravity", gravity if isinstance(gravity, Tensor) else acceleration_of(gravity, x), x)
+        gravity = self.like("gravity", gravity if isinstance(gravity, Tensor) else acceleration_of(gravity, x), x)
+        acceleration = gravity
         if force is not None:
             # Pinned particles may have no mass: neither 0 / 0 nor its NaN may reach a gradient.
             force = torch.where(pinned, 0.0, self.like("force", force, x))
             acceleration = acceleration + force / torch.where(self.pinned, 1.0, masses)[..., None]
         # The predictor is also where sweeps start; pinned particles keep the place that they have in it.
         held = x if prescribed is None else self.like("prescribed", prescribed, x)
-        return torch.where(pinned, held, x + h * v + (h * h) * acceleration), masses
+        y = torch.where(pinned, held, x + h * v + (h * h) * acceleration)
+        # One look at what they make tells whether to look at each: values that are not used may be NaN.
+        if not y.is_cuda and not (all_finite(y) and all_finite(x)):
+            check_finite(x=x, v=v, gravity=gravity, force=force, prescribed=prescribed)
+            fail("x, v, force, mass, time_step", "a finite predictor x + h v + h^2 (gravity + force / m)", "NaN or Inf")
+        return y, masses
 
     def tensor(self, name: str, value: Any) -> Tensor:
         """``value`` as a tensor of the solver's dtype and device; numbers are converted, other tensors must match."""
@@ -103,14 +113,47 @@ class ParticleSolver:
         return ops.broadcast(check_broadcast(name, self.tensor(name, value), tuple(x.shape)), x.shape)
 
     def per(self, name: str, value: Any, x: Tensor, count: int, least: str = "") -> Tensor:
-        """A value that broadcasts to x.shape[:-2] + (count,), as [..., count]; ``least``: "> 0", ">= 0" or no check."""
+        """A value that broadcasts to x.shape[:-2] + (count,), as [..., count].
+
+        ``least``: "> 0" (and perhaps inf), ">= 0" (and finite), or no check.
+        """
         value = check_broadcast(name, self.tensor(name, value), (*x.shape[:-2], count))
         value = value.reshape(1) if value.dim() == 0 else value
         if least and not value.is_cuda:  # on CUDA a look would wait for the device
-            wrong = ~((value > 0) if least == "> 0" else (value >= 0))
+            wrong = ~((value > 0) if least == "> 0" else (value >= 0) & torch.isfinite(value))
             if bool(wrong.any()):
-                fail(name, f"numbers {least}", float(value.detach()[wrong][0]))
+                fail(name, f"{'' if least == '> 0' else 'finite '}numbers {least}", float(value.detach()[wrong][0]))
         return ops.broadcast(value, (*value.shape[:-1], count))
+
+
+def checked_device(device: Any) -> torch.device:
+    """As a Model's; raises ValueError for a name that torch does not know."""
+    try:
+        device = torch.device(device)
+    except (RuntimeError, TypeError):
+        fail("device", '"cpu" or "cuda"', repr(device))
+    return _checked_device(device)
+
+
+def checked_time_step(time_step: Any, dtype: torch.dtype) -> float:
+    """h [s] > 0, with an h^2 that dtype can hold."""
+    if isinstance(time_step, Tensor) and time_step.requires_grad:
+        raise TypeError("time_step: expected a number, got a tensor that requires grad: it is not differentiable")
+    h, limits = check_positive("time_step", time_step, "s"), torch.finfo(dtype)
+    if not limits.tiny <= h * h <= limits.max:
+        fail("time_step", f"a number of seconds whose square lies between {limits.tiny:.1e} and {limits.max:.1e}", h)
+    return h
+
+
+def all_finite(value: Tensor) -> bool:
+    return bool(torch.isfinite(value).all())
+
+
+def check_finite(**values: Any) -> None:
+    """Raises ValueError for the first tensor that is not finite."""
+    for name, value in values.items():
+        if isinstance(value, Tensor):
+            name_value(name, "finite values", value.detach(), torch.isfinite(value))
 
 
 def numbers(name: str, value: Any, dtype: torch.dtype, device: torch.device | str) -> Tensor:
@@ -151,7 +194,7 @@ def mesh_edges(mesh: TetMesh) -> np.ndarray:
 
 
 def mesh_mass(mesh: TetMesh, density: float) -> np.ndarray:
-    """Lumped masses m_i = sum of density V / 4 over the tets of a vertex [kg], shape [V]."""
+    """Lumped masses m_i = sum of density V / 4 over the tets of a vertex [kg], shape [V]; constants."""
     quarter = np.repeat(check_positive("density", density, "kg/m^3") * mesh.volume / 4, 4)
     return np.bincount(mesh.tets.reshape(-1), quarter, minlength=mesh.num_vertices)
 
@@ -162,4 +205,15 @@ def checked_mesh(mesh: Any) -> TetMesh:
     return mesh
 
 
-__all__ = ["GRAVITY", "ParticleSolver", "checked_edges", "checked_mesh", "mesh_edges", "mesh_mass", "numbers"]
+__all__ = [
+    "GRAVITY",
+    "ParticleSolver",
+    "all_finite",
+    "check_finite",
+    "checked_edges",
+    "checked_mesh",
+    "checked_time_step",
+    "mesh_edges",
+    "mesh_mass",
+    "numbers",
+]

@@ -4,15 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import torch
 from torch import Tensor
 
-from ..checks import check_positive, fail
+from ..checks import fail
 from ..mesh import TetMesh
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
-from .particles import GRAVITY, ParticleSolver, checked_edges, checked_mesh, mesh_edges, mesh_mass
+from .particles import (
+    GRAVITY,
+    ParticleSolver,
+    all_finite,
+    checked_edges,
+    checked_mesh,
+    checked_time_step,
+    mesh_edges,
+    mesh_mass,
+)
 from .projections import Springs, Tets
 from .sums import placed
 
@@ -145,6 +154,8 @@ class LocalGlobal(BlockUpdate):
 class ProjectiveDynamics(ParticleSolver):
     """Particles with springs and tets, solved by K local-global iterations per step.
 
+    What is given here are detached constants; what is differentiated is an argument of :meth:`step` or :meth:`factor`.
+
     Args:
         points: Rest positions [m], shape [V, 3]; the number of particles V is enough without tets.
         mass: [kg], a number or shape [V], > 0 where not pinned.
@@ -207,6 +218,8 @@ class ProjectiveDynamics(ParticleSolver):
     ) -> ProjectiveDynamics:
         """Springs along the edges of a mesh, its tets, or both; density [kg/m^3], lumped; options: dtype, device.
 
+        Points and density are constants; give ``mass`` to :meth:`step` for its gradient.
+
         Raises:
             TypeError: mesh is no TetMesh, or density or pinned of a wrong type.
             ValueError: density is not > 0, pinned or an option does not fit, or too many particles are free.
@@ -229,18 +242,18 @@ class ProjectiveDynamics(ParticleSolver):
         Values per scene (with leading dimensions) make a factor per scene.
 
         Args:
-            time_step: h [s] > 0.
+            time_step: h [s] > 0, not differentiable.
             stiffness: k [N/m] >= 0, a number or shape [..., C]; None without springs.
             tet_stiffness: [Pa] >= 0, a number or shape [..., T]; None without tets.
             mass: [kg] > 0 where not pinned, a number or shape [..., V]; None: the solver's.
 
         Raises:
             ValueError: An argument is missing, given without such constraints, of a wrong shape or (looked at on the
-                CPU only) out of its range.
+                CPU only) out of its range; or the matrix is not positive definite, because masses are lost in the
+                rounding of h^2 times stiffness.
             TypeError: An argument is no number, or a tensor of another dtype than the solver's.
-            torch.linalg.LinAlgError: The matrix is not positive definite, which needs values that were not looked at.
         """
-        h = check_positive("time_step", time_step, "s")
+        h = checked_time_step(time_step, self.mass.dtype)
         given = (("stiffness", stiffness, self.edges.shape[0], ">= 0"),
                  ("tet_stiffness", tet_stiffness, self.tets.nodes.shape[0], ">= 0"),
                  ("mass", self.mass if mass is None else mass, self.num_points, ""))  # fmt: skip
@@ -266,10 +279,19 @@ class ProjectiveDynamics(ParticleSolver):
         with torch.no_grad():
             matrix = h * h * (self.springs.matrix(k) + self.tets.matrix(stiff * self.tets.volume))
             matrix = matrix[..., self.free[:, None], self.free] + torch.diag_embed(masses[..., self.free])
-            lower = torch.linalg.cholesky(matrix)
+            lower, failed = torch.linalg.cholesky_ex(matrix)
+            if bool(failed.any()) or not (lower.is_cuda or all_finite(lower)):
+                self._fail_scale(h, k, stiff, masses)
         # Here and not in each step: compose looks at the rows, for which it waits on CUDA.
         solver = compose([LocalGlobal(self, lower, h)])
         return Factor(lower, h, k, stiff, masses, self, solver, tuple(tensors))
+
+    def _fail_scale(self, h: float, k: Tensor, stiff: Tensor, masses: Tensor) -> NoReturn:
+        """Names the arguments of a matrix that is not positive definite in its dtype."""
+        stiffest = [(n, float(t.max())) for n, t in (("stiffness", k), ("tet_stiffness", stiff)) if t.numel()]
+        names, got = zip(*stiffest, ("mass", float(masses[..., self.free].min())), ("time_step", h), strict=True)
+        fail(", ".join(names), f"masses of the scale of h^2 times stiffness (a positive definite matrix in {k.dtype})",
+             ", ".join(f"{value:g}" for value in got))  # fmt: skip
 
     def step(
         self,
@@ -294,7 +316,7 @@ class ProjectiveDynamics(ParticleSolver):
             sweeps: K >= 0.
             factor: What :meth:`factor` made of time_step, stiffness, tet_stiffness and mass, which are then not given
                 here. None: they are, and this step factors the matrix.
-            time_step: h [s] > 0.
+            time_step: h [s] > 0, not differentiable.
             stiffness: k [N/m] >= 0 of the springs, broadcasts to x.shape[:-2] + (C,).
             tet_stiffness: [Pa] >= 0; weight over volume of the tets, broadcasts to x.shape[:-2] + (T,).
             rest_length: L [m] >= 0, broadcasts to x.shape[:-2] + (C,); None: the distances of the rest positions.

@@ -7,7 +7,12 @@ from torch import Tensor
 
 
 class FixedSum:
-    """Adds values [..., m, c] up at ``index`` [m] -> [..., size, c], each row in the order of ``index``."""
+    """Adds values [..., m, c] up at ``index`` [m] -> [..., size, c], each row in the order of ``index``.
+
+    By a table of each row's values, which keeps the order on CUDA, too. It has ``size`` times the largest number of
+    values of one row, and a call gathers as many values: little for meshes, but for a star of 3000 springs the table
+    has 72 MB, and each call gathers 216 MB in float64.
+    """
 
     def __init__(self, index: Tensor, size: int) -> None:
         order = torch.argsort(index, stable=True)

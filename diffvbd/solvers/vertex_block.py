@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..checks import check_positive, fail
+from ..arguments import name_value
+from ..checks import check_broadcast, check_tensor, fail
 from ..energies import StableNeoHookean
 from ..metric import rest_metric
 from ..model import Model
 from ..safeguards import SATURATION_EPS
-from .compose import Bars, BlockUpdate, Solver, Tensors, compose
+from .compose import Bars, BlockUpdate, Solver, Tensors, _tensors
+from .particles import check_finite, checked_time_step
 from .sums import FixedSum, placed
 
 # (j, k, l) such that (j, i, k, l) is an even permutation of the corners, for i = 0, 1, 2, 3
@@ -67,7 +71,7 @@ class VertexBlock(BlockUpdate):
 
     def __init__(self, model: Model, time_step: float, vertices: Tensor) -> None:
         energy = elastic_energy(model)
-        self.rows, self.factor = (vertices,), check_positive("time_step", time_step, "s") ** 2
+        self.rows, self.factor = (vertices,), checked_time_step(time_step, model.mass.dtype) ** 2
         self.exact = energy.block == "exact"
         self.relaxation, self.saturation = model.relaxation, model.saturation
         self.regularization = model.regularization
@@ -214,17 +218,60 @@ def vertex_block_descent(model: Model, time_step: float, update: type[VertexBloc
 
     Args:
         model: A Model whose only energy is StableNeoHookean, on any device.
-        time_step: h [s] > 0.
+        time_step: h [s] > 0, not differentiable.
         update: A subclass of VertexBlock to use in its place.
 
     Raises:
         TypeError: model is no Model, or time_step no number.
         ValueError: model has other energies than one StableNeoHookean, or time_step is not > 0.
+            In the solver's call, naming them: state or parameters of other shapes, or (looked at on the CPU only) not
+            finite, mu < 0, mu + lam < 0, or a mass that is not > 0 where the Model is not pinned.
     """
     elastic_energy(model)
+    time_step = checked_time_step(time_step, model.mass.dtype)
     bounds = model.color_ptr.tolist()
     colors = (model.color_vertices[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True))
-    return compose(update(model, time_step, vertices) for vertices in colors)
+    return _ColorSolver(model, (update(model, time_step, vertices) for vertices in colors))
+
+
+class _ColorSolver(Solver):
+    """Looks at its arguments once for all colors and sweeps."""
+
+    def __init__(self, model: Model, updates: Iterable[BlockUpdate]) -> None:
+        super().__init__(updates)
+        self.model = model
+
+    def __call__(
+        self, state: Tensor | Sequence[Tensor], parameters: Tensor | Sequence[Tensor] = (), *, sweeps: int
+    ) -> Any:
+        model, tensors, given = self.model, _tensors("state", state), _tensors("parameters", parameters)
+        if len(tensors) != 1:
+            fail("state", "1 tensor (x)", len(tensors))
+        if len(given) != 4:
+            fail("parameters", "4 tensors (y, mu, lam, mass)", len(given))
+        x = check_tensor("x", tensors[0], model.mass)
+        own = (model.num_vertices, 3)
+        if x.dim() < 2 or x.shape[-2:] != own:
+            fail("x", f"shape [..., {own[0]}, 3]", f"shape {list(x.shape)}")
+        lead = tuple(x.shape[:-2])
+        shapes = {"y": own, "mu": (model.num_tets,), "lam": (model.num_tets,), "mass": own[:1]}
+        for (name, shape), value in zip(shapes.items(), given, strict=True):
+            check_broadcast(name, check_tensor(name, value, model.mass), (*lead, *shape))
+        if given[0].shape[-2:] != own:
+            fail("y", f"shape [..., {own[0]}, 3]", f"shape {list(given[0].shape)}")
+        if not x.is_cuda:  # on CUDA a look would wait for the device
+            _check_values(model, x.detach(), *(t.detach() for t in given))
+        return super().__call__(state, given, sweeps=sweeps)
+
+
+def _check_values(model: Model, x: Tensor, y: Tensor, mu: Tensor, lam: Tensor, mass: Tensor) -> None:
+    check_finite(x=x, y=y, lam=lam)
+    name_value("mu", "finite numbers >= 0 Pa", mu, mu >= 0)
+    name_value("lam", "mu + lam >= 0 Pa", mu + lam, mu + lam >= 0)
+    # The block of a vertex without mass may be singular; those that are pinned have none.
+    mass = mass.expand(*mass.shape[:-1], model.num_vertices)
+    used = torch.where(model.pinned, 1.0, mass)
+    name_value("mass", "finite numbers > 0 kg where not pinned", used, used > 0)
 
 
 def elastic_energy(model: Model) -> StableNeoHookean:

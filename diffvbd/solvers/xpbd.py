@@ -8,10 +8,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import check_positive, fail
+from ..checks import fail
 from ..mesh import TetMesh
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
-from .particles import GRAVITY, ParticleSolver, checked_edges, checked_mesh, mesh_edges, mesh_mass
+from .particles import (
+    GRAVITY,
+    ParticleSolver,
+    all_finite,
+    checked_edges,
+    checked_mesh,
+    checked_time_step,
+    mesh_edges,
+    mesh_mass,
+)
 from .projections import direction_of
 from .sums import placed
 
@@ -100,6 +109,8 @@ class DistanceProjection(BlockUpdate):
 class XPBD(ParticleSolver):
     """Particles and distance constraints, solved by K sweeps of projections per step.
 
+    What is given here are detached constants; what is differentiated is an argument of :meth:`step`.
+
     Args:
         points: Rest positions [m], shape [V, 3], or the number of particles V (steps then need ``rest_length``).
         edges: The two particles of each constraint, integers [C, 2]. Those between two pinned particles are left out
@@ -151,6 +162,8 @@ class XPBD(ParticleSolver):
     ) -> XPBD:
         """A constraint for each edge of a mesh, masses lumped from its density [kg/m^3]; options: dtype, device.
 
+        Points and density are constants; give ``mass`` to :meth:`step` for its gradient.
+
         Raises:
             TypeError: mesh is no TetMesh, or density or pinned of a wrong type.
             ValueError: density is not > 0, or pinned, order or an option does not fit.
@@ -179,7 +192,7 @@ class XPBD(ParticleSolver):
             stiffness: k [N/m] > 0, broadcasts to x.shape[:-2] + (C,); inf is a constraint without compliance.
             rest_length: L [m] >= 0, likewise; None: the distances of the rest positions.
             mass: [kg], broadcasts to x.shape[:-2] + (V,); None: the solver's.
-            time_step: h [s] > 0.
+            time_step: h [s] > 0, not differentiable.
             sweeps: K >= 0.
             force: External forces [N], broadcasts to x.shape.
             gravity: Acceleration [m/s^2], 3 numbers, or a tensor that broadcasts to x.shape.
@@ -195,11 +208,13 @@ class XPBD(ParticleSolver):
         y, masses = self.begin(
             x, v, mass=mass, time_step=time_step, force=force, gravity=gravity, prescribed=prescribed
         )
-        h, count = check_positive("time_step", time_step, "s"), self.edges.shape[0]
+        h, count = checked_time_step(time_step, self.mass.dtype), self.edges.shape[0]
         if rest_length is None and self.rest_length is None:
             fail("rest_length", "a value, because the solver was made without rest positions", None)
         lengths = self.per("rest_length", self.rest_length if rest_length is None else rest_length, x, count, ">= 0")
         compliance = 1 / (self.per("stiffness", stiffness, x, count, "> 0") * (h * h))
+        if not compliance.is_cuda and not all_finite(compliance):
+            fail("stiffness", "numbers for which the compliance 1 / (k h^2) is finite", "NaN or Inf")
         # Pinned particles may have any mass, even 0: chosen before the division, so that no NaN reaches a gradient.
         weight = torch.where(self.pinned, 0.0, 1 / torch.where(self.pinned, 1.0, masses))
         multipliers = y.new_zeros((*x.shape[:-2], count, 1))
