@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
+from bench import paper
 from bench.common import markdown_table
 from diffvbd import testing
 from diffvbd.solvers import VertexBlock, vertex_block_descent
@@ -60,14 +61,6 @@ VARIANTS: dict[str, type[VertexBlock]] = {
     "validity gate det F > 0.5": ValidityGate,
 }
 STEP = "full adjoint, diffvbd.step"
-# Table "Ablation" of the paper, K = 1
-PAPER = {
-    "full adjoint": {26: 4.2e-16, 115: 5.1e-16, 631: 9.1e-16},
-    STEP: {26: 4.2e-16, 115: 5.1e-16, 631: 9.1e-16},
-    "no saturation Jacobian": {26: 7.7e-2, 115: 1.6e-1, 631: 2.6e-1},
-    "no Hessian tangent": {26: 2.9e-4, 115: 8.2e-3, 631: 1.1e-1},
-    "validity gate det F > 0.5": {26: 4.2e-16, 115: 8.2e-3, 631: 1.2e-1},
-}
 
 
 def run(quick: bool, *, device: str = "cpu") -> dict[str, Any]:
@@ -181,8 +174,8 @@ def markdown(results: dict[str, Any]) -> str:
     depths = sorted({r["sweeps"] for r in rows})
 
     def cells(name: str, sweeps: int) -> list[Any]:
-        paper = PAPER[name] if sweeps == 1 else {}
-        return [f"{error[name, n, sweeps]:.1e}" + (f" (paper {paper[n]:.1e})" if n in paper else "") for n in sizes]
+        theirs = paper.ABLATION[name] if sweeps == 1 else {}
+        return [f"{error[name, n, sweeps]:.1e}" + (f" (paper {theirs[n]:.1e})" if n in theirs else "") for n in sizes]
 
     header = [f"{n} vertices" for n in sizes]
     parts = ["## Gradient error at K = 1: the larger of x0 and v0, against autograd through the executed sweep\n",

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
+from bench import paper
 from bench.ablation import forward_error, mesh_of
 from bench.common import markdown_table
 from diffvbd import testing
@@ -32,17 +33,6 @@ SOLVERS: dict[str, Callable[..., Any]] = {
     "XPBD, by colors": XPBD.from_mesh,
     "PD, springs": functools.partial(ProjectiveDynamics.from_mesh, springs=True, tets=False),
     "PD, tets": ProjectiveDynamics.from_mesh,
-}
-# Table of the appendix "The construction on other block solvers"; by vertices, then K
-PAPER = {
-    "XPBD, one constraint after another": {
-        26: {1: 3.9e-16, 5: 4.8e-16, 20: 7.0e-16},
-        115: {1: 6.2e-16, 5: 6.0e-16, 20: 5.0e-16},
-    },
-    "PD, springs": {
-        26: {1: 9.3e-16, 5: 9.7e-16, 20: 9.7e-16},
-        115: {1: 2.5e-15, 5: 5.9e-15, 20: 1.1e-14},
-    },
 }
 
 
@@ -117,8 +107,8 @@ def markdown(results: dict[str, Any]) -> str:
     by = {(r["solver"], r["vertices"], r["sweeps"]): r for r in rows}
 
     def error(name: str, vertices: int, sweeps: int) -> str:
-        paper = PAPER.get(name, {}).get(vertices, {}).get(sweeps)
-        return f"{by[name, vertices, sweeps]['error']:.1e}" + ("" if paper is None else f" (paper {paper:.1e})")
+        theirs = paper.GENERALITY.get(name, {}).get(vertices, {}).get(sweeps)
+        return f"{by[name, vertices, sweeps]['error']:.1e}" + ("" if theirs is None else f" (paper {theirs:.1e})")
 
     def worst(name: str, vertices: int, sweeps: int) -> str:
         row = by[name, vertices, sweeps]

@@ -27,7 +27,6 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "invariance": (1e-12, "rotation and translation change every rounding in the sweep"),
     "momentum": (1e-12, "converged step, relative to sum m |v|; sweeps stop at rounding level"),
     "finite_difference": (1e-6, "central differences in float64: error h^2 + eps/h is about 1e-10, times curvature"),
-    "dot_product": (1e-12, "<J v, w> = <v, J^T w>: two exact derivatives, rounding only"),
     "float32_forward": (1e-5, "float32 near the origin: eps is 1.2e-7, times conditioning of the sweep"),
     "float32_gradient": (1e-4, "float32 near the origin: 1e-6 to 1e-5 measured, with room for stiff scenes"),
     "hessian": (1e-13, "first and second derivatives of one potential by two formulas: rounding of F and of the edges"),
