@@ -29,6 +29,30 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "held, Tensor mu, Tensor lam, Tensor mass, Tensor rest, Tensor tape, Tensor plan, int[] sizes, int energies, "
       "int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> (Tensor x, "
       "Tensor v, Tensor acceleration, Tensor held, Tensor mu, Tensor lam, Tensor mass, Tensor rest)");
+  // The same with contact, of pairs made by contact_detect: see contact_arguments.h and contact/passes.h for the shapes.
+  // cut [scenes, vertices]: 1 where a bound has held back an update.
+  m.def(
+      "contact_sweep(Tensor x_start, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, "
+      "Tensor energy_data, Tensor origin, Tensor bounds, Tensor collider, Tensor collider_prev, Tensor kappa, Tensor "
+      "pairs, Tensor constants, Tensor ptr, Tensor entry, Tensor lag, Tensor lag_pairs, Tensor lag_ptr, Tensor "
+      "lag_entry, Tensor floor_lag, float friction_eps, Tensor plan, int[] sizes, int energies, int[] data_count, "
+      "float[] numbers, int sweeps, int[] launch, int tape_policy, int debug_step, bool checked) -> (Tensor x, Tensor "
+      "tape, Tensor cut)");
+  m.def(
+      "contact_sweep_backward(Tensor x_bar, Tensor x, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, "
+      "Tensor rest, Tensor energy_data, Tensor origin, Tensor bounds, Tensor collider, Tensor collider_prev, Tensor "
+      "kappa, Tensor pairs, Tensor constants, Tensor ptr, Tensor entry, Tensor lag, Tensor lag_pairs, Tensor lag_ptr, "
+      "Tensor lag_entry, Tensor floor_lag, float friction_eps, Tensor tape, Tensor plan, int[] sizes, int energies, "
+      "int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> (Tensor x_start, "
+      "Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, Tensor energy_data, Tensor bounds, "
+      "Tensor collider, Tensor collider_prev, Tensor kappa, Tensor lag, Tensor floor_lag)");
+  // Normal force, 1 where active, normal and weights of each pair [pairs, 9], and the adjoint of x, collider and kappa
+  m.def(
+      "contact_lag(Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor constants, Tensor ptr, Tensor "
+      "entry) -> Tensor");
+  m.def(
+      "contact_lag_backward(Tensor bar, Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor "
+      "constants, Tensor ptr, Tensor entry) -> (Tensor x, Tensor collider, Tensor kappa)");
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");
   m.def(
       "build_plan(Tensor points, Tensor tets, Tensor active, int lanes) -> (Tensor plan, Tensor color_ptr, Tensor "
@@ -36,4 +60,19 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   m.def("tet_gather(Tensor values, Tensor tets) -> Tensor");
   m.def("star_sum(Tensor values, Tensor star_ptr, Tensor star, bool positive) -> Tensor");
   m.def("row_sum(Tensor values) -> Tensor");
+  // results as in contact/candidates.h; mesh_bodies: body labels from there on are colliders
+  m.def(
+      "contact_detect(Tensor x, Tensor origin, Tensor collider, Tensor collider_next, Tensor rest, Tensor radius, "
+      "Tensor triangles, Tensor edges, Tensor points, Tensor planes, Tensor body, Tensor held, int mesh_bodies, bool "
+      "self_contact, bool between_bodies, float dhat, float reach, float cap, float gamma, int capacity) -> (Tensor "
+      "pairs, Tensor constants, Tensor ptr, Tensor entry, Tensor near_corners, Tensor near_values, Tensor counts, "
+      "Tensor smallest)");
+  m.def(
+      "contact_islands(Tensor x, Tensor origin, Tensor move, Tensor mass, Tensor collider, Tensor collider_next, "
+      "Tensor planes, Tensor body, Tensor body_order, Tensor body_ptr, Tensor held, Tensor radius, int mesh_bodies, "
+      "float cap, float dhat) -> Tensor");
+  m.def("segment_sum(Tensor values, Tensor order, Tensor ptr) -> Tensor");
+  // points [B, N, 3]; pairs [max_pairs, 3] int32: (scene, i, j), then rows of -1; count [1] int64: how many there are,
+  // or -1 where a point is not finite
+  m.def("neighbor_pairs(Tensor points, float radius, int max_pairs) -> (Tensor pairs, Tensor count)");
 }

@@ -1,152 +1,24 @@
 // CUDA implementations of the operators: tensors in, raw pointers on, on the tensors' device and its current stream.
-#include <torch/csrc/inductor/aoti_torch/c/shim.h>
 #include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
 #include <algorithm>
-#include <string>
 #include <tuple>
 #include <vector>
 
 #include "arguments.h"
+#include "binding_sweep_cuda.h"
 #include "cuda/reductions.h"
-#include "cuda/step.h"
 
 namespace {
 
 namespace cuda = diffvbd::cuda;
+using cuda::check, cuda::check_tape, cuda::choose, cuda::current_stream, cuda::empty, cuda::inputs, cuda::plan_of;
+using cuda::tape_shape, cuda::wishes, cuda::workspace;
 using diffvbd::batched, diffvbd::data, diffvbd::dispatch_float, diffvbd::require;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
-
-constexpr int64_t kWorkspaceBudget = int64_t{2} << 30;  // bytes; a batch that needs more is worked on in chunks
-constexpr int kHostSizes = diffvbd::kPlanHeader;        // a plan's header, but active, tets and slots come first
-
-void check(cudaError_t error, const char* what) {
-  if (error == cudaSuccess) return;
-  if (error == cudaErrorInvalidConfiguration) {
-    cudaGetLastError();
-    throw std::invalid_argument("regime: this mesh does not fit the shared memory of a thread block of this device");
-  }
-  cudaGetLastError();  // an error that does not poison the context must not come up again in somebody else's call
-  throw std::runtime_error(std::string("diffvbd: ") + what + " failed: " + cudaGetErrorString(error));
-}
-
-// Through torch's C interface, whose failure is a number: its C++ wrapper formats a message with streams, which two
-// copies of the standard library in one process do not survive.
-Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes) {
-  std::vector<int64_t> strides(sizes.size(), 1);
-  for (size_t i = sizes.size(); i-- > 1;) strides[i - 1] = strides[i] * std::max<int64_t>(1, sizes[i]);
-  const bool wide = like.scalar_type() == ScalarType::Double;
-  AtenTensorHandle handle = nullptr;
-  const auto status = aoti_torch_empty_strided(static_cast<int64_t>(sizes.size()), sizes.data(), strides.data(),
-                                               wide ? aoti_torch_dtype_float64() : aoti_torch_dtype_float32(),
-                                               aoti_torch_device_type_cuda(), like.get_device_index(), &handle);
-  if (status != AOTI_TORCH_SUCCESS) {
-    const cudaError_t last = cudaPeekAtLastError();
-    if (last != cudaSuccess && last != cudaErrorMemoryAllocation) check(last, "an allocation");
-    int64_t bytes = wide ? 8 : 4;
-    for (const int64_t n : sizes) bytes *= n;
-    throw std::runtime_error("diffvbd: CUDA out of memory, wanted " + std::to_string(bytes) + " bytes more");
-  }
-  return Tensor(handle);
-}
-
-cudaStream_t current_stream(const Tensor& t) {
-  void* stream = nullptr;
-  require(aoti_torch_get_current_cuda_stream(t.get_device_index(), &stream) == AOTI_TORCH_SUCCESS,
-          "diffvbd: no current CUDA stream");
-  return static_cast<cudaStream_t>(stream);
-}
-
-cuda::HostPlan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes) {
-  require(buffer.scalar_type() == ScalarType::Int && buffer.is_contiguous() && buffer.is_cuda() &&
-              sizes.size() > kHostSizes && static_cast<int64_t>(sizes.size()) == kHostSizes + sizes[4] + 1,
-          "diffvbd: expected a plan made for CUDA by build_plan, and its sizes");
-  const int order[diffvbd::kPlanHeader] = {3, 1, 0, 4, 5, 2, 6, 7, 8, 9, 10};
-  int32_t header[diffvbd::kPlanHeader];
-  for (int i = 0; i < diffvbd::kPlanHeader; ++i) header[i] = static_cast<int32_t>(sizes[order[i]]);
-  return {diffvbd::view_group_plan(header, data<const int32_t>(buffer)), sizes.data() + kHostSizes,
-          static_cast<int>(sizes[9]), static_cast<int>(sizes[10])};
-}
-
-// What all four sweep operators have in common.
-template <class T>
-cuda::StepInputs<T> inputs(const cuda::HostPlan& host, const Tensor& x, const Tensor& mu, const Tensor& lam,
-                           const Tensor& mass, const Tensor& rest, int64_t energies,
-                           const std::vector<int64_t>& data_count, const std::vector<double>& numbers, int64_t sweeps,
-                           int64_t tape_policy) {
-  const diffvbd::GroupPlan& plan = host.plan;
-  require(x.dim() == 3 && x.size(1) == plan.num_vertices && x.size(2) == 3,
-          "diffvbd::sweep: expected x of shape [scenes, vertices, 3]");
-  const int64_t b = x.size(0);
-  cuda::StepInputs<T> in{};
-  in.scenes = b;
-  in.mu = batched<T>(mu, x, b, plan.num_tets);
-  in.lam = batched<T>(lam, x, b, plan.num_tets);
-  in.mass = batched<T>(mass, x, b, plan.num_vertices);
-  in.rest = batched<T>(rest, x, b, int64_t{plan.slots} * 4 * diffvbd::kSlice);
-  constexpr int elastic = diffvbd::kExactBlock | diffvbd::kPaperBlock;
-  in.energies = static_cast<int>(plan.num_tets > 0 ? energies : energies & ~elastic);
-  in.data_size = diffvbd::energy_data_size(data_count, plan.num_vertices);
-  for (int k = 0; k < diffvbd::kVertexEnergies; ++k) in.data_count[k] = static_cast<int>(data_count[k]);
-  in.parameters = diffvbd::step_parameters<T>(numbers);
-  in.sweeps = diffvbd::count_of(sweeps);
-  in.tape_policy = static_cast<int>(tape_policy);
-  return in;
-}
-
-// The regime and threads per vertex that Python chose, and what the device adds.
-cuda::Choice choose(const Tensor& x, const std::vector<int64_t>& launch, bool reverse, int wanted = 0) {
-  require(launch.size() == 3 && launch[0] >= cuda::kThread && launch[0] <= cuda::kColor, "diffvbd: bad launch");
-  const int64_t lanes = launch[reverse ? 2 : 1];
-  require(lanes == cuda::kFewLanes || lanes == cuda::kSomeLanes || lanes == cuda::kManyLanes, "diffvbd: bad launch");
-  cuda::Choice out{};
-  out.regime = static_cast<int>(launch[0]);
-  out.lanes = static_cast<int>(lanes);
-  out.wanted = wanted;
-  int shared = 0;
-  const int device = x.get_device_index();
-  check(cudaDeviceGetAttribute(&out.multiprocessors, cudaDevAttrMultiProcessorCount, device), "a device query");
-  check(cudaDeviceGetAttribute(&shared, cudaDevAttrMaxSharedMemoryPerBlockOptin, device), "a device query");
-  out.shared = shared;
-  return out;
-}
-
-// Memory for the kernels, and the number of scenes that it serves at once. Chunks of a whole number of waves.
-template <class T>
-Tensor workspace(const Tensor& x, const cuda::HostPlan& host, const cuda::StepInputs<T>& in,
-                 const cuda::StepAdjoints<T>* adjoints, cuda::Choice& choice) {
-  if (choice.regime == cuda::kThread) return empty(x, {0});
-  choice.chunk = 1;
-  const int64_t one = static_cast<int64_t>(cuda::workspace_bytes(host, in, adjoints, choice));
-  const int64_t wave = choice.multiprocessors;
-  choice.chunk = std::max<int64_t>(1, kWorkspaceBudget / one);
-  if (choice.chunk > wave) choice.chunk -= choice.chunk % wave;
-  choice.chunk = std::min(choice.chunk, std::max<int64_t>(1, in.scenes));
-  const auto bytes = static_cast<int64_t>(cuda::workspace_bytes(host, in, adjoints, choice));
-  return empty(x, {(bytes + static_cast<int64_t>(sizeof(T)) - 1) / static_cast<int64_t>(sizeof(T))});
-}
-
-// Scenes first, but last where each thread has a scene: who mixes up the two is told so by the shape.
-template <class T>
-std::vector<int64_t> tape_shape(const cuda::HostPlan& host, const cuda::StepInputs<T>& in,
-                                const std::vector<int64_t>& launch) {
-  const int64_t rows = diffvbd::tape_rows(in.tape_policy, any_filter(in.energies, diffvbd::VertexEnergies{}));
-  const int64_t active = host.plan.num_active;
-  if (launch[0] == cuda::kThread) return {in.sweeps, rows, active, in.scenes};
-  return {in.scenes, in.sweeps, rows, active};
-}
-
-template <class T>
-void check_tape(const Tensor& tape, const cuda::HostPlan& host, const cuda::StepInputs<T>& in,
-                const std::vector<int64_t>& launch) {
-  const std::vector<int64_t> shape = tape_shape(host, in, launch);
-  bool same = tape.is_contiguous() && tape.dim() == 4;
-  for (int i = 0; same && i < 4; ++i) same = tape.size(i) == shape[i];
-  require(same, "diffvbd: the tape does not belong to this step");
-}
 
 std::tuple<Tensor, Tensor> sweep(const Tensor& x_start, const Tensor& x_prev, const Tensor& y, const Tensor& mu,
                                  const Tensor& lam, const Tensor& mass, const Tensor& rest, const Tensor& energy_data,
@@ -184,44 +56,24 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> sweep
     std::vector<bool> wants) {
   const DeviceGuard guard(x.get_device_index());
   const cuda::HostPlan host = plan_of(plan, sizes);
-  require(wants.size() == 4 && tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: bad arguments");
+  require(tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: bad arguments");
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     auto in = inputs<T>(host, x, mu, lam, mass, rest, energies, data_count, numbers, sweeps, tape_policy);
-    const int64_t b = in.scenes, v = host.plan.num_vertices, t = host.plan.num_tets, v3 = v * 3;
+    const int64_t b = in.scenes, v3 = int64_t{host.plan.num_vertices} * 3;
     in.x_prev = batched<T>(x_prev, x, b, v3);
     in.y = batched<T>(y, x, b, v3);
     in.origin = batched<T>(origin, x, b, v3);
     in.data = batched<T>(energy_data, x, b, in.data_size);
-    require(x_bar.is_contiguous() && x_bar.numel() == x.numel(), "diffvbd::sweep_backward: x_bar must be like x");
     check_tape(tape, host, in, launch);
-    const bool material = wants[0], of_mass = wants[1], of_rest = wants[2], of_data = wants[3];
-    const bool elastic = (in.energies & (diffvbd::kExactBlock | diffvbd::kPaperBlock)) != 0;
-    const int64_t materials = in.mu.item == 0 && in.lam.item == 0 ? 1 : t;
-    const auto wanted = [&](bool flag, const std::vector<int64_t>& shape, bool zeroed) {
-      Tensor out = empty(x, flag ? shape : std::vector<int64_t>{0});
-      if (flag && zeroed)
-        check(cudaMemsetAsync(out.data_ptr(), 0, out.numel() * sizeof(T), current_stream(x)), "memset");
-      return out;
-    };
-    Tensor x_start_bar = empty(x, {b, v, 3}), x_prev_bar = empty(x, {b, v, 3}), y_bar = empty(x, {b, v, 3});
-    Tensor mu_bar = wanted(material, {b, materials}, !elastic), lam_bar = wanted(material, {b, materials}, !elastic);
-    Tensor mass_bar = wanted(of_mass, {b, v}, false), rest_bar = wanted(of_rest, {b, t, 7}, !elastic);
-    Tensor data_bar = wanted(of_data, {b, in.data_size}, false);
-    const auto pointer = [&](bool flag, const Tensor& a) { return flag ? data<T>(a) : nullptr; };
-    cuda::StepAdjoints<T> out{};
-    out.x_bar = data<const T>(x_bar);
-    out.x_start = data<T>(x_start_bar), out.x_prev = data<T>(x_prev_bar), out.y = data<T>(y_bar);
-    out.mu = pointer(material && elastic, mu_bar), out.lam = pointer(material && elastic, lam_bar);
-    out.mass = pointer(of_mass, mass_bar), out.rest = pointer(of_rest && elastic, rest_bar);
-    out.data = pointer(of_data && in.data_size > 0, data_bar);
-    const int kinds = (out.mu ? diffvbd::kMaterial : 0) | (out.rest ? diffvbd::kMaterial | diffvbd::kRest : 0);
-    cuda::Choice choice = choose(x, launch, true, kinds);
+    const cuda::Bars<T> bars(x, in, host, wants);
+    cuda::StepAdjoints<T> out = bars.pointers(x_bar);
+    cuda::Choice choice = choose(x, launch, true, wishes(out));
     const Tensor work = workspace<T>(x, host, in, &out, choice);
     check(cuda::run_reverse<T>(host, in, data<const T>(x), data<const T>(tape), out, choice, work.data_ptr(),
                                current_stream(x)),
           "the reverse sweep");
-    return std::make_tuple(x_start_bar, x_prev_bar, y_bar, mu_bar, lam_bar, mass_bar, rest_bar, data_bar);
+    return bars.tensors();
   });
 }
 
@@ -301,8 +153,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> fused
     out.acceleration = pointer(wants[2], a_in), out.held = pointer(wants[3], held_in);
     out.mu = pointer(wants[4] && elastic, mu_bar), out.lam = pointer(wants[4] && elastic, lam_bar);
     out.mass = pointer(wants[5], mass_bar), out.rest = pointer(wants[6] && elastic, rest_bar);
-    const int kinds = (out.mu ? diffvbd::kMaterial : 0) | (out.rest ? diffvbd::kMaterial | diffvbd::kRest : 0);
-    cuda::Choice choice = choose(x, launch, true, kinds);
+    cuda::Choice choice = choose(x, launch, true, wishes(out));
     const Tensor work = workspace<T>(x, host, in, &out, choice);
     check(cuda::run_reverse<T>(host, in, data<const T>(x_end), data<const T>(tape), out, choice, work.data_ptr(),
                                current_stream(x)),

@@ -5,7 +5,7 @@ import os as _os
 # Idle threads that spin make a parallel region cost milliseconds on a busy machine; only the first import decides.
 _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from . import mesh, solvers
+from . import colliders, contact, mesh, solvers
 from .adjoints import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
 from .debug import debug_checks
 from .diagnostics import Diagnosis, diagnose
@@ -13,6 +13,7 @@ from .energies import Anchor, FloorBarrier, StableNeoHookean
 from .gradcheck import GradientCheck, check_gradients
 from .mesh import TetMesh
 from .model import Model
+from .pair_barrier import Friction, PairBarrier
 from .regimes import regime
 from .rollout import Trajectory, per_step, rollout
 from .schedule import Binomial
@@ -27,10 +28,12 @@ __all__ = [
     "Binomial",
     "Diagnosis",
     "FloorBarrier",
+    "Friction",
     "GlobalAdjoint",
     "GradientCheck",
     "LinearSolve",
     "Model",
+    "PairBarrier",
     "ReverseSweep",
     "Solution",
     "StableNeoHookean",
@@ -39,6 +42,8 @@ __all__ = [
     "Trajectory",
     "Unrolled",
     "check_gradients",
+    "colliders",
+    "contact",
     "debug_checks",
     "diagnose",
     "mesh",

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from . import ops, reference
-from .adjoints import Adjoint, Unrolled
+from .adjoints import Adjoint, ReverseSweep, Unrolled
 from .checks import check_broadcast, check_count, check_positive, check_tensor, fail
 from .debug import checking
 from .metric import lumped_mass, rest_metric
@@ -116,7 +116,7 @@ def prepare(
         raise TypeError(f"parameters: expected a dict of tensors by name, got {type(parameters).__name__}")
     known = {}
     if parameters:
-        known = {f"{e.name}.{k}": (e, k, own) for e in model.vertex_energies for k, own in e.parameters.items()}
+        known = {f"{e.name}.{k}": (e, k, own) for e in model.parametric_energies for k, own in e.parameters.items()}
     for name, value in (parameters or {}).items():
         if name not in known:
             fail("parameters", f"names among {sorted(known)}", repr(name))
@@ -124,6 +124,8 @@ def prepare(
         shape = tuple(model.constants(energy)[key].shape)[:own]
         given[name] = _scenes_first(name, value, like, lead, shape)
     materials = [_scenes_first(name, value, like, lead, tets) for name, value in (("mu", mu), ("lam", lam))]
+    if model.touches and not isinstance(adjoint, ReverseSweep | None):
+        raise NotImplementedError(f"adjoint: contact is differentiated by ReverseSweep, got {type(adjoint).__name__}")
     unrolled = None
     if isinstance(adjoint, Unrolled):
         layout = model.derived("layout", lambda: reference.build_layout(model))
@@ -138,6 +140,26 @@ def prepare(
         settings=settings,
         unrolled=unrolled,
     )
+
+
+def collider_state(model: Model, x: Tensor, end: Any, start: Any) -> tuple[Tensor, Tensor] | None:
+    """Corner points of the colliders at the start and at the end of a step [B, Vc, 3]; one tensor where they rest. None
+    for a Model without contact."""
+    count = model.collider_points.shape[0]
+    lead = tuple(x.shape[:-2])
+    flat = (math.prod(lead), count, 3)
+    given = {}
+    for name, value in (("colliders", end), ("colliders_before", start)):
+        if value is None:
+            continue
+        if count == 0:
+            fail(name, "a Model with colliders", "one without")
+        value = check_broadcast(name, check_tensor(name, value, x), (*lead, count, 3))
+        given[name] = ops.broadcast(value, (*lead, count, 3)).reshape(flat)
+    if not model.touches:
+        return None
+    after = given.get("colliders", model.collider_points.expand(flat).contiguous())
+    return given.get("colliders_before", after), after
 
 
 def name_argument(error: ValueError, arguments: dict[str, Any]) -> None:

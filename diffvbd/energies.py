@@ -96,6 +96,12 @@ class VertexEnergy:
         raise NotImplementedError(f"{type(self).__name__} has no gradient() for GlobalAdjoint and solve")
 
 
+def _barrier_slope(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
+    """b'(gap) [N] of the log barrier; 0 where a gap is not in (0, dhat)."""
+    d = torch.where((gap > 0) & (gap < dhat), gap, dhat)
+    return -kappa * (2 * (d - dhat) * torch.log(d / dhat) + (d - dhat) ** 2 / d)
+
+
 @dataclass(frozen=True, eq=False)
 class FloorBarrier(VertexEnergy):
     """IPC log barrier above planes: b(d) = -kappa (d - dhat)^2 log(d / dhat) for a gap 0 < d < dhat.
@@ -176,13 +182,20 @@ class FloorBarrier(VertexEnergy):
         def gap_of(x: Tensor) -> Tensor:
             return (normal * x[:, :, None]).sum(-1) - height  # [B, V, P]
 
-        gap, travel = gap_of(x), (normal * (x - x_prev)[:, :, None]).sum(-1)
-        touches = (gap > 0) & (gap < dhat)
-        d = torch.where(touches, gap, dhat)
-        first = -kappa * (2 * (d - dhat) * torch.log(d / dhat) + (d - dhat) ** 2 / d)
+        travel = (normal * (x - x_prev)[:, :, None]).sum(-1)
+        first = _barrier_slope(gap_of(x), kappa, dhat)
         damped = (gap_of(x_prev) < dhat) & (travel < 0)
         size = h * h * first + h * torch.where(damped, damping * travel, torch.zeros_like(travel))
         return (size[..., None] * normal).sum(-2)
+
+    def normal_force(self, x: Tensor, data: Tensor, origin: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Force of each plane on each vertex [N], [B, V, planes], and the unit normals [1 | B, planes, 3]."""
+        planes = data.reshape(data.shape[0], self.planes, 7)
+        normal, (height, kappa, dhat, _) = planes[..., :3], planes[:, None, :, 3:].unbind(-1)
+        if origin is not None:
+            height = height - (normal[:, None] * origin[:, :, None]).sum(-1)
+        gap = (normal[:, None] * x[:, :, None]).sum(-1) - height
+        return -_barrier_slope(gap, kappa, dhat), normal
 
     def filter(self, x: Tensor, step: Tensor, data: Tensor, origin: Tensor | None) -> Tensor:
         """x + alpha step for the packed ``data`` of this energy, see safeguards.filter_against_planes."""
@@ -278,5 +291,4 @@ class Anchor(VertexEnergy):
         return h * h * stiffness * (x - points)
 
 
-Energy = StableNeoHookean | VertexEnergy
 VERTEX_ENERGIES: tuple[type[VertexEnergy], ...] = (FloorBarrier, Anchor)  # order of csrc/energies/energies.h

@@ -6,15 +6,21 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from . import native, ops, regimes
 from .checks import check_number, check_positive, fail, vertex_mask
-from .energies import VERTEX_ENERGIES, Energy, FloorBarrier, StableNeoHookean, VertexEnergy
+from .colliders import Collider
+from .contact_surface import ContactSurface, build_surface, check_colliders
+from .energies import VERTEX_ENERGIES, FloorBarrier, StableNeoHookean, VertexEnergy
 from .mesh import TetMesh
 from .metric import lumped_mass, rest_metric
+from .pair_barrier import CONTACT, Friction, PairBarrier
 from .safeguards import FILTER_ETA, SATURATION_EPS
+
+Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction
 
 PAPER_SATURATION = 0.1  # [m]
 PAPER_REGULARIZATION = 1e-6  # [kg]
@@ -36,13 +42,16 @@ class Model:
         regularization: tau [kg], added to the diagonal of every block. 0: off.
         relaxation: omega, 0 < omega < 2, multiplies every update. Above 1 it needs fewer sweeps; use it with the exact
             block or with saturation (docs/numerics.md).
+        colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier among the
+            energies.
         dtype: torch.float64 or torch.float32.
         device: Where the tensors live.
 
     Attributes (torch tensors in the user's numbering):
         rest_points [V, 3] [m]; tets [T, 4]; density [T]; mass [V] [kg]; pinned [V] bool; surface [F, 3];
         color_vertices [active]: the vertices in sweep order, color c being
-        ``color_vertices[color_ptr[c]:color_ptr[c + 1]]``; color_ptr [colors + 1].
+        ``color_vertices[color_ptr[c]:color_ptr[c + 1]]``; color_ptr [colors + 1]; collider_points [Vc, 3]: where the
+        colliders' corner points are unless a step is told otherwise, those of collider k being ``collider_rows[k]``.
 
     Raises:
         ValueError, TypeError: naming the argument, what was expected and what came.
@@ -57,6 +66,7 @@ class Model:
         saturation: float | None = None,
         regularization: float = 0.0,
         relaxation: float = 1.0,
+        colliders: Sequence[Collider] = (),
         *,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
@@ -73,7 +83,9 @@ class Model:
         if self.relaxation >= 2:
             fail("relaxation", "a number in (0, 2): from 2 on the updates raise the potential", relaxation)
         self._set_energies(_checked_energies(energies, mesh.num_vertices))
-        self.energy_mask = sum(e.bit for e in self.energies)
+        self.energy_mask = 0
+        for energy in self.energies:
+            self.energy_mask |= energy.bit
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
 
@@ -90,6 +102,7 @@ class Model:
         self.pinned = mask
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = _first_of_body(body)
+        self.surface_of_contact = self._build_surface(check_colliders(colliders))
         device = _checked_device(device)
         self._arrange(points, tets, device)
         self._measure(points)
@@ -102,9 +115,71 @@ class Model:
         present = [e for e in energies if isinstance(e, VertexEnergy)]
         self.vertex_energies: tuple[VertexEnergy, ...] = tuple(sorted(present, key=lambda e: e.bit))
         self.floor = next((e for e in energies if isinstance(e, FloorBarrier)), None)
+        self.contact = next((e for e in energies if isinstance(e, PairBarrier)), None)
+        self.friction = next((e for e in energies if isinstance(e, Friction)), None)
         self._constants: dict[str, dict[str, Tensor]] = {}
 
-    def constants(self, energy: VertexEnergy) -> dict[str, Tensor]:
+    def _build_surface(self, colliders: tuple[Collider, ...]) -> ContactSurface | None:
+        self.colliders = colliders
+        if self.contact is None:
+            if colliders:
+                fail("colliders", "a PairBarrier among the energies, which they act through", "none")
+            if self.friction is not None and self.floor is None:
+                fail("energies", "a FloorBarrier or a PairBarrier for Friction to act on", "none")
+            return None
+        return build_surface(self.mesh, self.pinned, self.contact, colliders)
+
+    @property
+    def touches(self) -> bool:
+        """Whether steps go through contact: pairs or friction."""
+        return bool(self.energy_mask & CONTACT)
+
+    @property
+    def collider_points(self) -> Tensor:
+        """Corner points of the colliders [m], shape [Vc, 3]."""
+        surface = self.surface_of_contact
+        return self.mass.new_zeros((0, 3)) if surface is None else surface.collider_points
+
+    @property
+    def collider_rows(self) -> tuple[slice, ...]:
+        """Rows of collider_points of each collider."""
+        return () if self.surface_of_contact is None else self.surface_of_contact.rows
+
+    @property
+    def body(self) -> Tensor:
+        """Body of each vertex, counted from 0, int64 [V]."""
+        if self.surface_of_contact is None:
+            labels = np.unique(self.mesh.body, return_inverse=True)[1].reshape(-1)
+            return torch.from_numpy(labels).to(self.device)
+        return self.surface_of_contact.body[: self.num_vertices].to(torch.int64)
+
+    @property
+    def plane_points(self) -> Tensor:
+        """Which rows of collider_points span planes, bool [Vc]."""
+        surface = self.surface_of_contact
+        return self.pinned.new_zeros((0,)) if surface is None else surface.plane_points[self.num_vertices :]
+
+    @property
+    def collider_radius(self) -> Tensor:
+        """How far the surface of a collider lies outside its corner points [m], shape [Vc]."""
+        surface = self.surface_of_contact
+        return self.mass.new_zeros((0,)) if surface is None else surface.radius[self.num_vertices :]
+
+    @property
+    def contact_numbers(self) -> tuple[float, float, float]:
+        """Search distance [m], largest bound [m] and gamma of the PairBarrier."""
+        surface, barrier = self.surface_of_contact, self.contact
+        if surface is None or barrier is None:
+            fail("model", "a PairBarrier among its energies", "none")
+        return surface.reach, surface.cap, barrier.gamma
+
+    @property
+    def parametric_energies(self) -> tuple[VertexEnergy | PairBarrier | Friction, ...]:
+        """The energies whose numbers a step may override through ``parameters``."""
+        contact = [e for e in (self.contact, self.friction) if e is not None]
+        return (*self.vertex_energies, *contact)
+
+    def constants(self, energy: VertexEnergy | PairBarrier | Friction) -> dict[str, Tensor]:
         """The parameters of one of the Model's energies, as tensors of its dtype and device."""
         if energy.name not in self._constants:
             self._constants[energy.name] = energy.constants(self.rest_points)
@@ -156,7 +231,9 @@ class Model:
         if hasattr(self, "_rest"):
             self._packed_rest = ops.pack_rest(self._rest, self._plan, self._sizes)
             del self._rest
-        for energy in self.vertex_energies:
+        if self.surface_of_contact is not None:
+            self.surface_of_contact = self.surface_of_contact.to(device, dtype)
+        for energy in self.parametric_energies:
             self.constants(energy)
 
     @classmethod
@@ -183,6 +260,7 @@ class Model:
         out._place(torch.float64, torch.device("cpu"))
         # from the mesh's own float64 positions, so that a way through float32 loses nothing
         points = torch.from_numpy(self.mesh.points.copy())
+        out.surface_of_contact = out._build_surface(self.colliders)
         if device.type != self.device.type:
             out._arrange(points, out.tets, device)
         out._measure(points)
@@ -244,7 +322,7 @@ class Model:
         saturation = -1.0 if self.saturation is None else self.saturation
         numbers = (time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS, FILTER_ETA)
         cuda = self.device.type == "cuda"
-        launch = regimes.choose(self.num_vertices, self.num_colors, scenes) if cuda else ()
+        launch = regimes.choose(self.num_vertices, self.num_colors, scenes, contact=self.touches) if cuda else ()
         return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps, launch)
 
     def memory(self, **options: Any) -> dict[str, int]:
@@ -261,6 +339,7 @@ class Model:
             f"Model({self.num_vertices} vertices, {self.num_tets} tets, {int(self.pinned.sum())} pinned, "
             f"{self.num_colors} colors, mass {float(self.mass.sum()):.4g} kg, "
             f"energies=({', '.join(map(repr, self.energies))})"
+            f"{f', {len(self.colliders)} colliders' if self.colliders else ''}"
             f"{''.join(', ' + s for s in safeguards)}, {self.dtype}, {self.device})"
         )
 
@@ -281,9 +360,9 @@ def _warn(message: str) -> None:
 
 
 def _checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
-    if isinstance(energies, (StableNeoHookean, VertexEnergy)):
+    kinds = (StableNeoHookean, *VERTEX_ENERGIES, PairBarrier, Friction)
+    if isinstance(energies, kinds):
         energies = (energies,)
-    kinds = (StableNeoHookean, *VERTEX_ENERGIES)
     out: list[Energy] = []
     if not isinstance(energies, (tuple, list)):
         raise TypeError(f"energies: expected a sequence of energies, got {type(energies).__name__}")

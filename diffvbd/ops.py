@@ -20,7 +20,7 @@ from . import native
 
 NO_TAPE, COMPACT_TAPE, FULL_TAPE = 0, 1, 2
 REST_SCALARS = 7  # k01 k02 k03 k12 k13 k23 c6 of a tet
-_FILTERING = 4  # mask of the energies with a step filter (FloorBarrier)
+_KEEPS_POSITIONS = 4 | 16  # mask of FloorBarrier and contact; twin of keeps_positions in csrc/energies/energies.h
 
 
 native.load()
@@ -65,10 +65,10 @@ def plan_sizes(plan: Tensor, device: str) -> tuple[int, ...]:
 
 def tape_rows(policy: int, energies: int) -> int:
     """Scalars of tape per active vertex and sweep; twin of tape_rows in csrc/core/views.h."""
-    return {NO_TAPE: 0, COMPACT_TAPE: 3, FULL_TAPE: 12 if energies & _FILTERING else 9}[policy]
+    return {NO_TAPE: 0, COMPACT_TAPE: 3, FULL_TAPE: 12 if energies & _KEEPS_POSITIONS else 9}[policy]
 
 
-def _tape_shape(
+def tape_shape(
     x: Tensor, sizes: Sequence[int], energies: int, sweeps: int, launch: Sequence[int], policy: int
 ) -> list:
     """Scenes first, but last where each thread has a scene: who mixes up the two is told so by the shape."""
@@ -83,7 +83,7 @@ def _tape_shape(
 def _(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, plan, sizes, energies, data_count, numbers, sweeps,
       launch, tape_policy, debug_step, checked):  # fmt: skip
     return torch.empty_like(x_start), x_start.new_empty(
-        _tape_shape(x_start, sizes, energies, sweeps, launch, tape_policy)
+        tape_shape(x_start, sizes, energies, sweeps, launch, tape_policy)
     )
 
 
@@ -95,6 +95,12 @@ def _materials(mu: Tensor, lam: Tensor, num_tets: int) -> int:
 @torch.library.register_fake("diffvbd::sweep_backward")
 def _(x_bar, x, x_prev, y, mu, lam, mass, rest, energy_data, origin, tape, plan, sizes, energies, data_count, numbers,
       sweeps, launch, tape_policy, wants):  # fmt: skip
+    return sweep_adjoints(x, mu, lam, energy_data, sizes, wants)
+
+
+def sweep_adjoints(x: Tensor, mu: Tensor, lam: Tensor, energy_data: Tensor, sizes: Sequence[int], wants: Sequence[bool]
+                   ) -> tuple[Tensor, ...]:  # fmt: skip
+    """Empty tensors in the shapes of a sweep's adjoints."""
     (b, v), materials = x.shape[:2], _materials(mu, lam, sizes[1])
 
     def wanted(flag: bool, *shape: int) -> Tensor:
@@ -108,7 +114,7 @@ def _(x_bar, x, x_prev, y, mu, lam, mass, rest, energy_data, origin, tape, plan,
 @torch.library.register_fake("diffvbd::fused_step")
 def _(x, v, acceleration, held, mu, lam, mass, rest, plan, sizes, energies, data_count, numbers, sweeps, launch,
       tape_policy):  # fmt: skip
-    shape = _tape_shape(x, sizes, energies, sweeps, launch, tape_policy)
+    shape = tape_shape(x, sizes, energies, sweeps, launch, tape_policy)
     return torch.empty_like(x), torch.empty_like(x), x.new_empty(shape)
 
 
@@ -141,7 +147,7 @@ def _(values):
     return values.new_empty((values.shape[0],))
 
 
-def _raw_backward(ctx: Any, *grads: Tensor) -> NoReturn:
+def raw_backward(ctx: Any, *grads: Tensor) -> NoReturn:
     raise NotImplementedError("diffvbd: the raw operators are not differentiable; call diffvbd.step")
 
 
@@ -155,7 +161,7 @@ for _name in (
     "star_sum",
     "row_sum",
 ):
-    torch.library.register_autograd(f"diffvbd::{_name}", _raw_backward)
+    torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)
 
 
 # --- fixed-order reductions -------------------------------------------------------------------------------------------

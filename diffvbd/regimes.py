@@ -54,8 +54,11 @@ def regime(name: Regime | None) -> Iterator[None]:
         _forced = before
 
 
-def choose(vertices: int, colors: int, scenes: int) -> tuple[int, int, int]:
-    """Regime, and threads per vertex of the sweeps and of their reverse, for SweepSettings.launch."""
+def choose(vertices: int, colors: int, scenes: int, *, contact: bool = False) -> tuple[int, int, int]:
+    """Regime, and threads per vertex of the sweeps and of their reverse, for SweepSettings.launch. Pairs are summed
+    between the launches of colors: a scene with contact has one regime."""
+    if contact:
+        return COLOR, SOME_LANES, SOME_LANES
     code = CODES[_forced] if _forced else _automatic(vertices, scenes)
     if code == THREAD and vertices > SMALL_MESH:
         fail("regime", f"a mesh of at most {SMALL_MESH} vertices for a scene per thread", f"{vertices} vertices")

@@ -63,6 +63,7 @@ def rollout(
     force: Any = None,
     gravity: Any = GRAVITY,
     prescribed: Any = None,
+    colliders: Any = None,
     rest_points: Any = None,
     density: Any = None,
     parameters: dict[str, Any] | None = None,
@@ -77,6 +78,8 @@ def rollout(
     Args:
         model, x, v, time_step, sweeps, adjoint: As in :func:`diffvbd.step`.
         steps: Number of steps >= 0.
+        colliders: Corner points of the Model's colliders [m]: constant, they rest there; in :func:`per_step`, where they
+            are at the end of each step, starting from the Model's collider_points.
         mu, lam, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in time; or wrapped
             in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step. A callable may
             close over tensors and modules that require grad: they get gradients under every schedule. It must be
@@ -99,7 +102,9 @@ def rollout(
         fail("save", '"all", "last" or an integer > 0', repr(save))
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
     options = {"mu": mu, "lam": lam, "rest_points": rest_points, "density": density, "force": force,
-               "gravity": gravity, "prescribed": prescribed}  # fmt: skip
+               "gravity": gravity, "prescribed": prescribed, "colliders": colliders}  # fmt: skip
+    if _changes(colliders) and not isinstance(colliders, PerStep):
+        raise TypeError("colliders: expected a tensor or per_step, got a callable: a step needs where they come from")
     if parameters is not None and not isinstance(parameters, dict):
         raise TypeError(f"parameters: expected a dict of tensors by name, got {type(parameters).__name__}")
     named = {f'parameters["{k}"]': value for k, value in (parameters or {}).items()}
@@ -124,7 +129,9 @@ def rollout(
             now: dict[str, Any] = {name: _at(options[name], k, x, v) for name in _STATIC}
             now["parameters"] = {name: _at(value, k, x, v) for name, value in parameters.items()}
             prepared = prepare(model, lead, **chosen, **now)
-        given = {name: _at(options[name], k, x, v) for name in ("force", "gravity", "prescribed")}
+        given = {name: _at(options[name], k, x, v) for name in ("force", "gravity", "prescribed", "colliders")}
+        if isinstance(options["colliders"], _Steps):
+            given["colliders_before"] = options["colliders"][k - 1] if k else model.collider_points
         return advance(model, x, v, prepared, adjoint=adjoint, index=k, **given)
 
     scenes = x.numel() // max(1, 3 * model.num_vertices)

@@ -88,6 +88,8 @@ def solve(
     Source: paper, eq. 1; docs/adjoints.md.
     """
     lead, adjoint = check_state(model, x, v), GlobalAdjoint() if adjoint is None else check_adjoint(adjoint)
+    if model.touches:
+        raise NotImplementedError("model: solve() has no contact or friction; take steps of many sweeps instead")
     if check_positive("tolerance", tolerance) >= 1:
         fail("tolerance", "a number in (0, 1)", tolerance)
     max_sweeps, check_every = check_count("max_sweeps", max_sweeps), check_count("check_every", check_every, 1)

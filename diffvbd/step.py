@@ -11,7 +11,17 @@ from torch import Tensor
 
 from . import ops
 from .adjoints import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
-from .arguments import GRAVITY, Prepared, acceleration_of, broadcastable, check_state, name_argument, prepare
+from .arguments import (
+    GRAVITY,
+    Prepared,
+    acceleration_of,
+    broadcastable,
+    check_state,
+    collider_state,
+    name_argument,
+    prepare,
+)
+from .contact_step import run_contact
 from .debug import check_on_cpu, checking
 from .global_adjoint import global_sweep
 from .memory import out_of_memory_named
@@ -31,6 +41,8 @@ def step(
     force: Tensor | None = None,
     gravity: Sequence[float] | Tensor = GRAVITY,
     prescribed: Tensor | None = None,
+    colliders: Tensor | None = None,
+    colliders_before: Tensor | None = None,
     rest_points: Tensor | None = None,
     density: float | Tensor | None = None,
     parameters: dict[str, Any] | None = None,
@@ -50,6 +62,9 @@ def step(
         gravity: Acceleration [m/s^2], 3 numbers, or a tensor that broadcasts to x.shape.
         prescribed: Positions of pinned vertices at the end of the step [m], broadcasts to x.shape; read only where
             pinned. None holds them where x has them.
+        colliders: Corner points of the Model's colliders at the end of the step [m], broadcasts to
+            x.shape[:-2] + (Vc, 3). None: the Model's collider_points.
+        colliders_before: The same at the start of the step, where they move. None: they rest.
         rest_points: Rest positions [m], broadcasts to x.shape; None: the Model's. Enter through rest metric and mass.
         density: [kg/m^3], broadcasts to x.shape[:-2] + (T,); None: the Model's.
         parameters: Energy parameters by name, as {"floor_barrier.kappa": tensor}; each broadcasts to
@@ -60,7 +75,9 @@ def step(
         Positions and velocities after the step, shape of x. Inputs are untouched.
 
     Raises:
-        ValueError, TypeError: Naming the argument, what was expected and what came, before any work.
+        ValueError, TypeError: Naming the argument, what was expected and what came, before any work. With contact also
+            for surfaces that touch at the start, and for prescribed motion above the bounds.
+        RuntimeError: Where more pairs are near than the PairBarrier has capacity for.
         NotImplementedError: In the backward, for second derivatives and forward mode (which Unrolled has).
 
     Source: paper, eqs. 1-3 and section 3; docs/method.md.
@@ -68,7 +85,8 @@ def step(
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
     prepared = prepare(model, lead, mu=mu, lam=lam, time_step=time_step, sweeps=sweeps, rest_points=rest_points,
                        density=density, parameters=parameters, adjoint=adjoint)  # fmt: skip
-    return advance(model, x, v, prepared, force=force, gravity=gravity, prescribed=prescribed, adjoint=adjoint)
+    return advance(model, x, v, prepared, force=force, gravity=gravity, prescribed=prescribed, colliders=colliders,
+                   colliders_before=colliders_before, adjoint=adjoint)  # fmt: skip
 
 
 def _energy_data(model: Model, prepared: Prepared, origin: Tensor | None) -> Tensor:
@@ -140,7 +158,7 @@ def begin(
     y = torch.where(model.pinned[:, None], held, y)
     data = _energy_data(model, prepared, origin)
     x_start = y
-    if model.floor is not None:
+    if model.floor is not None and not model.touches:  # contact moves from the state to y in parts
         count = model.floor.count()
         filtered = model.floor.filter(start, y - start, data[:, :count], origin)
         x_start = torch.where(model.pinned[:, None], y, filtered)
@@ -157,23 +175,28 @@ def advance(
     gravity: Sequence[float] | Tensor,
     prescribed: Tensor | None,
     adjoint: Adjoint | None,
+    colliders: Tensor | None = None,
+    colliders_before: Tensor | None = None,
     index: int = 0,
 ) -> tuple[Tensor, Tensor]:
     """The step itself; ``index`` is its number in a rollout, for debug_checks()."""
     adjoint = check_adjoint(adjoint)
     gravity = acceleration_of(gravity, x)
+    where = collider_state(model, x, colliders, colliders_before)
     if isinstance(adjoint, ReverseSweep) and x.is_cuda and _fuses(model, force, gravity):
         held = None if prescribed is None else broadcastable("prescribed", prescribed, x)
         return _fused(model, x, v, gravity, held, prepared, adjoint)
     begun = begin(model, x, v, prepared, force, gravity, prescribed)
-    given = {"x": x, "v": v, "force": force, "gravity": gravity, "prescribed": prescribed}
+    given = {"x": x, "v": v, "force": force, "gravity": gravity, "prescribed": prescribed, "colliders": colliders,
+             "colliders_before": colliders_before}  # fmt: skip
     if prepared.unrolled is not None:
         with torch.no_grad():  # for what it raises: the values are looked at even by no sweep
             count = prepared.settings.sweeps if checking() else 0
             looked_at = prepared._replace(settings=prepared.settings._replace(sweeps=count))
             swept(model, begun.detached(), looked_at, given, index=index)
         return prepared.unrolled(x, v, force, gravity, prescribed)
-    x_end, v_end = begun.finish(swept(model, begun, prepared, given, adjoint, index), prepared.settings.numbers[0])
+    x_end = swept(model, begun, prepared, given, adjoint, index, where)
+    x_end, v_end = begun.finish(x_end, prepared.settings.numbers[0])
     return x_end.reshape(x.shape), v_end.reshape(x.shape)
 
 
@@ -184,12 +207,18 @@ def swept(
     given: dict[str, Any],
     adjoint: Adjoint | None = None,
     index: int = 0,
+    colliders: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
-    """Positions after the sweeps, with the backward of an adjoint route. ``given``: arguments that errors may name."""
+    """Positions after the sweeps, with the backward of an adjoint route. ``given``: arguments that errors may name;
+    ``colliders``: where they are at the start and at the end, of a Model with contact."""
     tensors, settings, adjoint = begun.tensors(prepared), prepared.settings, check_adjoint(adjoint)
-    policy = _tape_policy(model, tensors, settings, adjoint)
+    more = (*(colliders or ()), *prepared.parameters.values())
+    policy = _tape_policy(model, (*tensors, *more), settings, adjoint)
     debug_step = index if checking() else -1
     try:
+        if colliders is not None:
+            with out_of_memory_named(model, begun.x_start, settings, policy):
+                return run_contact(model, begun, prepared, *colliders, policy, debug_step)
         if checking() and begun.y.is_cuda:
             check_on_cpu(model, tensors, settings, index)
         with out_of_memory_named(model, begun.x_start, settings, policy):
@@ -204,7 +233,7 @@ def swept(
 def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
     """Whether one operator can do the whole step on CUDA. Forces, vertex energies, float32's local origin, function
     transforms and checks take the parts."""
-    simple = force is None and not model.vertex_energies and model.dtype == torch.float64
+    simple = force is None and not model.vertex_energies and not model.touches and model.dtype == torch.float64
     if not simple or checking() or torch.compiler.is_compiling() or gravity.dim() > 1:
         return False
     return torch._C._functorch.peek_interpreter_stack() is None  # pyright: ignore[reportAttributeAccessIssue]

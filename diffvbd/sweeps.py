@@ -16,7 +16,7 @@ from .regimes import BLOCK, FEW_LANES, THREAD
 
 
 @contextlib.contextmanager
-def _backward_memory() -> Iterator[None]:
+def backward_memory() -> Iterator[None]:
     """Says what to change where a backward does not fit a CUDA device."""
     try:
         yield
@@ -87,7 +87,7 @@ class _SweepBackward(Function):
     @staticmethod
     def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, packed_rest, plan, x, tape,
                 settings, tape_policy, needs):  # fmt: skip
-        with _backward_memory():
+        with backward_memory():
             if rest is not None:
                 packed_rest = ops.pack_rest(rest, plan, settings.sizes)
             inputs = (x_prev, y, mu, lam, mass, packed_rest, energy_data, origin)
@@ -155,7 +155,7 @@ def _scenes(tensors: Sequence[Tensor | None], in_dims: tuple) -> int:
     return max(sizes)
 
 
-def _distinct(*tensors: Tensor | None) -> list[Tensor | None]:
+def distinct(*tensors: Tensor | None) -> list[Tensor | None]:
     """Contiguous, and none of them twice, which torch.compile refuses."""
     out: list[Tensor | None] = []
     for t in tensors:
@@ -197,7 +197,7 @@ def sweep(
         energy_data: [1 | B, n], see VertexEnergy.pack; origin: [B, V, 3] or empty.
         tape_policy: What is kept for the backward; ops.NO_TAPE runs the step again there.
     """
-    tensors = _distinct(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin)
+    tensors = distinct(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin)
     x, _ = _Sweep.apply(*tensors, packed_rest, plan, settings, tape_policy, debug_step, checked)
     return x
 
@@ -232,7 +232,7 @@ class _FusedBackward(Function):
     @staticmethod
     def forward(x_bar, v_bar, x, v, acceleration, held, mu, lam, mass, rest, packed_rest, plan, x_end, tape, settings,
                 tape_policy, needs):  # fmt: skip
-        with _backward_memory():
+        with backward_memory():
             if rest is not None:
                 packed_rest = ops.pack_rest(rest, plan, settings.sizes)
             inputs = (x, v, acceleration, held, mu, lam, mass, packed_rest)
@@ -275,7 +275,7 @@ def fused_step(x, v, acceleration, held, mu, lam, mass, rest, packed_rest, plan,
         held: Where pinned vertices go [m], [1 | B, V, 3], or empty: they stay.
         mu, lam, mass, rest, packed_rest, tape_policy: As in :func:`sweep`.
     """
-    tensors = _distinct(x, v, acceleration, held, mu, lam, mass, rest)
+    tensors = distinct(x, v, acceleration, held, mu, lam, mass, rest)
     x_end, v_end, _ = _FusedStep.apply(*tensors, packed_rest, plan, settings, tape_policy)
     return x_end, v_end
 

@@ -13,7 +13,8 @@ from .checks import fail
 from .model import Model
 from .step import step
 
-_ARGUMENTS = ("x", "v", "mu", "lam", "force", "gravity", "prescribed", "rest_points", "density")
+_ARGUMENTS = ("x", "v", "mu", "lam", "force", "gravity", "prescribed", "rest_points", "density", "colliders",
+              "colliders_before")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ def step_forward(
     Args:
         model, x, v, options: As in :func:`diffvbd.step`; works under torch.no_grad() too.
         wrt: Names of the arguments to differentiate: x, v, mu, lam, force, gravity, prescribed, rest_points, density,
-            or a name in ``parameters``. Only these leave a tape.
+            colliders, colliders_before, or a name in ``parameters``. Only these leave a tape.
 
     Returns:
         Positions, velocities (both detached) and the tape.

@@ -21,6 +21,7 @@ from diffvbd import build_cuda, native
 ROOT = Path(__file__).parents[1]
 CSRC = ROOT / "csrc"
 KERNELS = sorted(CSRC.glob("cuda/*.cu"))
+BINDINGS = sorted(CSRC.glob("ops*cuda.cpp"))
 ARCHITECTURES = ("80", "90", "100", "120")
 LIMIT = 120  # [s] for what takes one on an idle machine: a hang, not slowness
 BUILT = "lib/diffvbd/_C_cuda.abi3.so"  # where setuptools leaves the object
@@ -96,7 +97,7 @@ def test_every_source_is_in_one_object() -> None:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "CPU_SOURCES"
     ]
     sources = {p.relative_to(ROOT).as_posix() for p in CSRC.rglob("*") if p.suffix in (".cpp", ".cu")}
-    cuda = {"csrc/ops_cuda.cpp", *(p.relative_to(ROOT).as_posix() for p in KERNELS)}
+    cuda = {p.relative_to(ROOT).as_posix() for p in (*BINDINGS, *KERNELS)}
     assert len(cpu) == len(set(cpu)) and set(cpu) | cuda == sources and not set(cpu) & cuda
 
 
@@ -106,7 +107,7 @@ def test_the_extension_has_all_sources_and_headers(monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "9.0")
     monkeypatch.chdir(ROOT)
     extension = build_cuda.extension()
-    assert extension.sources == ["csrc/ops_cuda.cpp", *(p.relative_to(ROOT).as_posix() for p in KERNELS)]
+    assert extension.sources == [p.relative_to(ROOT).as_posix() for p in (*BINDINGS, *KERNELS)]
     headers = {p.relative_to(ROOT).as_posix() for p in CSRC.rglob("*") if p.suffix in (".h", ".cuh")}
     assert set(extension.depends) == headers
     assert "cudart" in extension.libraries and "torch_python" not in extension.libraries
@@ -156,7 +157,7 @@ def test_the_binding_compiles(tmp_path: Path) -> None:
     """Against the torch that is here: the headers of its stable interface do not depend on CUDA."""
     include = [argument for path in cpp_extension.include_paths() for argument in ("-isystem", path)]
     macros = ["-DUSE_CUDA", "-DTORCH_TARGET_VERSION=0x020b000000000000"]
-    failed = failures([(CSRC / "ops_cuda.cpp", ["-std=c++20", "-O0", *macros, *include])], tmp_path)
+    failed = failures([(path, ["-std=c++20", "-O0", *macros, *include]) for path in BINDINGS], tmp_path)
     assert not failed, failed
 
 

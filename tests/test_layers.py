@@ -122,8 +122,8 @@ def test_only_ops_names_the_compiled_operators() -> None:
         return {module for module, text in texts.items() if re.search(pattern, text)}
 
     assert naming(r"\bload_library\b") == {"native"}
-    assert naming(r"torch\.ops\b(?!\.load_library\b)|torch\.library\b|\bdiffvbd::") == {"ops"}
-    assert naming(r"\bops\.raw\b") == {"sweeps"}
+    assert naming(r"torch\.ops\b(?!\.load_library\b)|torch\.library\b|\bdiffvbd::") == {"ops", "ops_neighbors"}
+    assert naming(r"\bops\.raw\b") == {"ops_neighbors", "sweeps"}
     assert not [m for m, imports in PYTHON.items() if "diffvbd.ops.raw" in imports or "torch.ops" in imports]
 
 
@@ -177,10 +177,12 @@ def test_cpp_layers_include_only_what_lies_below() -> None:
     assert layer_includes("core") <= {"energies"}
     assert [p.name for p in sources("core") if any("energies/" in name for name in includes(p))] == ["vertex.h"]
     kernels = {"core", "energies"}
-    assert "core" in layer_includes("cpu") <= kernels | {"arguments.h"}
+    assert "core" in layer_includes("cpu") <= kernels | {"arguments.h", "arguments_neighbors.h"}
     assert "core" in layer_includes("cuda") <= kernels
     assert {t.split("/")[0] for t in targets(CSRC / "arguments.h")} <= kernels
-    assert {t.split("/")[0] for t in targets(CSRC / "ops_cuda.cpp")} <= {*kernels, "arguments.h", "cuda"}
+    bindings, shared = sorted(CSRC.glob("ops*cuda.cpp")), {"arguments.h", "arguments_neighbors.h", "binding_cuda.h"}
+    for path in bindings:
+        assert "cuda" in {t.split("/")[0] for t in targets(path)} <= {*kernels, *shared, "cuda"}
     assert not targets(CSRC / "ops.cpp")
 
 
@@ -188,7 +190,8 @@ def test_cpp_layers_include_only_what_lies_below() -> None:
 def test_tensors_end_where_the_operators_are_registered() -> None:
     """Everything behind works on raw pointers; of torch the CPU's loops know the thread pool, CUDA's nothing."""
     users = {p.relative_to(CSRC).as_posix() for p in sources(".") if "arguments.h" in targets(p)}
-    assert users == {"cpu/register.cpp", "ops_cuda.cpp"}
+    assert users == {"arguments_neighbors.h", "binding_cuda.h", "cpu/register.cpp", "ops_cuda.cpp"}
+    users |= {"cpu/register_neighbors.cpp", "ops_neighbors_cuda.cpp"}  # by way of arguments_neighbors.h
     tensors = {p.relative_to(CSRC).as_posix() for p in sources(".") if re.search(r"\bTensor\b", code_of(p))}
     assert tensors == {*users, "arguments.h", "ops.cpp"}
     for path in sources("cuda"):

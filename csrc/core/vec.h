@@ -98,6 +98,10 @@ DIFFVBD_FN void add_diagonal(Sym3<R>& a, const R& s) {
   a.yy = a.yy + s;
   a.zz = a.zz + s;
 }
+template <class R>
+DIFFVBD_FN void operator+=(Sym3<R>& a, const Sym3<R>& b) {
+  a = {a.xx + b.xx, a.xy + b.xy, a.xz + b.xz, a.yy + b.yy, a.yz + b.yz, a.zz + b.zz};
+}
 // a += s v v^T
 template <class R>
 DIFFVBD_FN void add_outer(Sym3<R>& a, const R& s, const Vec3<R>& v) {

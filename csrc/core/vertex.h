@@ -4,6 +4,7 @@
 #pragma once
 
 #include "../energies/energies.h"
+#include "bounds.h"
 #include "safeguards.h"
 #include "views.h"
 
@@ -17,6 +18,7 @@ struct Block {
   R mass;                          // [kg]
   const R* data[kVertexEnergies];  // of each energy that is present
   int data_count[kVertexEnergies];
+  ContactTerm<R> contact;  // where the set has contact
 };
 
 template <class R>
@@ -52,6 +54,10 @@ DIFFVBD_FN System<R> assemble(const Block<R>& b, const Star& star, const StepPar
     using E = decltype(energy);
     E::block(b.state, b.data[k], b.data_count[k], out.g, out.H);
   });
+  if constexpr (Set::contact) {
+    out.g += b.contact.g;
+    out.H += b.contact.H;
+  }
   return out;
 }
 
@@ -65,12 +71,17 @@ DIFFVBD_FN Vec3<R> newton_step(const System<R>& system, const Factor<R>& H) {
   return -solve(H, system.g);
 }
 
+// Saturated, then relaxed.
+template <class R, class T>
+DIFFVBD_FN Vec3<R> relaxed(const Vec3<R>& d_raw, const StepParameters<T>& q) {
+  return R(q.relaxation) * (q.saturates ? saturate(d_raw, q) : d_raw);
+}
+
 // From the Newton step to the executed one.
 template <class Set, class R, class T>
 DIFFVBD_FN Update<R> safeguarded(const Block<R>& b, const Vec3<R>& d_raw, const StepParameters<T>& q) {
-  Update<R> out{d_raw, d_raw, R(1)};
-  if (q.saturates) out.step = saturate(d_raw, q);
-  out.step = R(q.relaxation) * out.step;
+  Update<R> out{d_raw, relaxed(d_raw, q), R(1)};
+  if constexpr (Set::contact) out.step = bounded(b.state.x, out.step, b.contact.bound);
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
     if constexpr (E::has_filter) {
@@ -87,8 +98,8 @@ DIFFVBD_FN Vec3<R> moved(const Vec3<R>& x, const Update<R>& u) {
   return x + u.step;
 }
 
-// What a tape keeps of one update: the step filter needs the old position, a compact tape leaves H (and with a filter
-// d_raw) to be assembled again.
+// What a tape keeps of one update: step filters and contact need the old position, a compact tape leaves H (and with
+// them d_raw) to be assembled again.
 template <class R>
 struct Recalled {
   Vec3<R> x_old, d_raw;
@@ -99,7 +110,7 @@ struct Recalled {
 template <class Set, class R, class T, class Star>
 DIFFVBD_FN Update<R> replayed(Block<R>& b, const Star& star, Recalled<R>& r, bool full, const StepParameters<T>& q) {
   Update<R> u;
-  if constexpr (Set::filters) {
+  if constexpr (Set::keeps_positions) {
     b.state.x = r.x_old;
   } else {
     u = safeguarded<Set>(b, r.d_raw, q);
@@ -108,9 +119,9 @@ DIFFVBD_FN Update<R> replayed(Block<R>& b, const Star& star, Recalled<R>& r, boo
   if (!full) {
     const System<R> system = assemble<Set>(b, star, q);
     r.H = factored(b, system, q);
-    if (Set::filters) r.d_raw = newton_step(system, r.H);
+    if (Set::keeps_positions) r.d_raw = newton_step(system, r.H);
   }
-  if constexpr (Set::filters) u = safeguarded<Set>(b, r.d_raw, q);
+  if constexpr (Set::keeps_positions) u = safeguarded<Set>(b, r.d_raw, q);
   return u;
 }
 
@@ -118,15 +129,15 @@ DIFFVBD_FN Update<R> replayed(Block<R>& b, const Star& star, Recalled<R>& r, boo
 template <class Set, class R, class Get>
 DIFFVBD_FN Recalled<R> recall(bool full, Get&& get) {
   Recalled<R> r{};
-  if (Set::filters) r.x_old = {get(), get(), get()};
-  if (full || !Set::filters) r.d_raw = {get(), get(), get()};
+  if (Set::keeps_positions) r.x_old = {get(), get(), get()};
+  if (full || !Set::keeps_positions) r.d_raw = {get(), get(), get()};
   if (full) r.H = {get(), get(), get(), get(), get(), get()};
   return r;
 }
 template <class Set, class R, class Put>
 DIFFVBD_FN void record(bool full, const Block<R>& before, const Update<R>& u, const Factor<R>& H, Put&& put) {
-  if (Set::filters) put(before.state.x.x), put(before.state.x.y), put(before.state.x.z);
-  if (full || !Set::filters) put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
+  if (Set::keeps_positions) put(before.state.x.x), put(before.state.x.y), put(before.state.x.z);
+  if (full || !Set::keeps_positions) put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
   if (full) put(H.l21), put(H.l31), put(H.l32), put(H.inv1), put(H.inv2), put(H.inv3);
 }
 
@@ -135,6 +146,8 @@ template <class R>
 struct BlockAdjoint {
   Vec3<R> x, y, x_prev;
   R mass;
+  Vec3<R> p;       // H^-1 of what reaches the Newton step: what the adjoint of pairs starts from
+  Bound<R> bound;  // where the set has contact
 };
 
 // Transpose of one block update. `b` holds the state before it, `x_bar` the adjoint of the position after it.
@@ -144,7 +157,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
                                           const Vec3<R>& x_bar, const StepParameters<T>& q, bool wants_data,
                                           AddData&& add_data) {
   const R h = R(q.time_step), minus_h2 = -(h * h);
-  BlockAdjoint<R> out{x_bar, zero3<R>(), zero3<R>(), R(0)};
+  BlockAdjoint<R> out{x_bar, zero3<R>(), zero3<R>(), R(0), zero3<R>(), {zero3<R>(), R(0)}};
   Vec3<R> step_bar = x_bar;
   R alpha_bar = R(0);
   if constexpr (Set::filters) {
@@ -157,9 +170,13 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
       }
     });
   }
+  if constexpr (Set::contact) {
+    bounded_vjp(b.state.x, relaxed(u.d_raw, q), b.contact.bound, step_bar, out.x, out.bound);
+  }
   Vec3<R> z = R(q.relaxation) * step_bar;
   if (q.saturates) z = saturate_vjp(u.d_raw, z, q);
   const Vec3<R> p = solve(H, z);
+  out.p = p;
 
   out.y = b.mass * p;
   out.x -= out.y;

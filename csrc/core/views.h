@@ -25,11 +25,11 @@ struct Batched {
 
 enum TapePolicy { kNoTape = 0, kCompactTape = 1, kFullTape = 2 };
 
-// Scalars per active vertex and sweep. Full: d_raw and the factored H. Compact: d_raw. A scene with a step filter keeps
-// the old position, in a compact tape instead of d_raw: a gap must come back to the bit, and an undo by subtraction is
-// an ulp off at times.
-DIFFVBD_FN constexpr int tape_rows(int policy, bool filters) {
-  return policy == kFullTape ? (filters ? 12 : 9) : policy == kCompactTape ? 3 : 0;
+// Scalars per active vertex and sweep. Full: d_raw and the factored H. Compact: d_raw. A scene with a step filter or
+// contact keeps the old position, in a compact tape instead of d_raw: a gap must come back to the bit, and an undo by
+// subtraction is an ulp off at times.
+DIFFVBD_FN constexpr int tape_rows(int policy, bool keeps_positions) {
+  return policy == kFullTape ? (keeps_positions ? 12 : 9) : policy == kCompactTape ? 3 : 0;
 }
 
 // The other three vertices of a tet, a = 0, 1, 2, in the order (j, k, l) that makes (j, i, k, l) an even permutation.

@@ -133,7 +133,7 @@ void check_values(const Plan& plan, const StepInputs<T>& in) {
     }
   }
   check_energy_data(plan, in);
-  if (filters(in.energies)) check_above_planes(plan, in);
+  if (any_filter(in.energies, VertexEnergies{})) check_above_planes(plan, in);
 }
 
 template <class T>

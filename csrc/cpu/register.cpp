@@ -5,56 +5,15 @@
 #include <tuple>
 #include <vector>
 
-#include "../arguments.h"
+#include "binding.h"
 #include "reductions.h"
-#include "run.h"
 
 namespace {
 
-using diffvbd::Batched, diffvbd::batched, diffvbd::data, diffvbd::dispatch_float, diffvbd::require;
+using diffvbd::Bars, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::inputs, diffvbd::plan_of;
+using diffvbd::require;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
-
-Tensor zeros(const Tensor& like, const std::vector<int64_t>& sizes) { return torch::stable::new_zeros(like, sizes); }
-Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes) { return torch::stable::new_empty(like, sizes); }
-
-diffvbd::Plan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes) {
-  require(buffer.scalar_type() == ScalarType::Int && buffer.is_contiguous() && buffer.numel() >= diffvbd::kPlanHeader,
-          "diffvbd: expected a plan made by build_plan");
-  const diffvbd::Plan plan = diffvbd::view_plan(data<const int32_t>(buffer));
-  require(sizes.size() == 3 && sizes[0] == plan.num_active && sizes[1] == plan.num_tets && sizes[2] == plan.slots,
-          "diffvbd: the sizes are not those of the plan");
-  return plan;
-}
-
-template <class T>
-diffvbd::StepInputs<T> inputs(const diffvbd::Plan& plan, const Tensor& x_start, const Tensor& x_prev, const Tensor& y,
-                              const Tensor& mu, const Tensor& lam, const Tensor& mass, const Tensor& rest,
-                              const Tensor& energy_data, const Tensor& origin, int64_t energies,
-                              const std::vector<int64_t>& data_count, const std::vector<double>& numbers,
-                              int64_t sweeps, int64_t tape_policy, int64_t debug_step) {
-  require(x_start.dim() == 3 && x_start.size(1) == plan.num_vertices && x_start.size(2) == 3,
-          "diffvbd::sweep: expected x of shape [scenes, vertices, 3]");
-  const int64_t b = x_start.size(0), v3 = int64_t{plan.num_vertices} * 3;
-  diffvbd::StepInputs<T> in{};
-  in.scenes = b;
-  in.x_start = batched<T>(x_start, x_start, b, v3);
-  in.x_prev = batched<T>(x_prev, x_start, b, v3);
-  in.y = batched<T>(y, x_start, b, v3);
-  in.origin = batched<T>(origin, x_start, b, v3);
-  in.mu = batched<T>(mu, x_start, b, plan.num_tets);
-  in.lam = batched<T>(lam, x_start, b, plan.num_tets);
-  in.mass = batched<T>(mass, x_start, b, plan.num_vertices);
-  in.rest = batched<T>(rest, x_start, b, int64_t{plan.slots} * 4 * diffvbd::kLanes);
-  in.data = batched<T>(energy_data, x_start, b, diffvbd::energy_data_size(data_count, plan.num_vertices));
-  for (int k = 0; k < diffvbd::kVertexEnergies; ++k) in.data_count[k] = static_cast<int>(data_count[k]);
-  in.energies = static_cast<int>(energies);
-  in.parameters = diffvbd::step_parameters<T>(numbers);
-  in.sweeps = diffvbd::count_of(sweeps);
-  in.tape_policy = static_cast<int>(tape_policy);
-  in.debug_step = debug_step;
-  return in;
-}
 
 std::tuple<Tensor, Tensor> sweep(const Tensor& x_start, const Tensor& x_prev, const Tensor& y, const Tensor& mu,
                                  const Tensor& lam, const Tensor& mass, const Tensor& rest, const Tensor& energy_data,
@@ -69,8 +28,7 @@ std::tuple<Tensor, Tensor> sweep(const Tensor& x_start, const Tensor& x_prev, co
                               numbers, sweeps, tape_policy, debug_step);
     if (checked) diffvbd::check_values(plan, in);
     Tensor x = empty(x_start, {in.scenes, plan.num_vertices, 3});
-    const int rows = diffvbd::tape_rows(in.tape_policy, diffvbd::filters(in.energies));
-    Tensor tape = empty(x_start, {in.scenes, sweeps, rows, plan.num_active});
+    Tensor tape = empty(x_start, diffvbd::tape_shape(plan, in));
     diffvbd::run_forward<T>(plan, in, data<T>(x), data<T>(tape));
     return std::make_tuple(x, tape);
   });
@@ -83,29 +41,16 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> sweep
     std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> /*launch*/, int64_t tape_policy,
     std::vector<bool> wants) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
-  require(wants.size() == 4 && tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: bad arguments");
+  require(tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: bad arguments");
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = inputs<T>(plan, x, x_prev, y, mu, lam, mass, rest, energy_data, origin, energies, data_count,
                               numbers, sweeps, tape_policy, -1);
     require(x_bar.is_contiguous() && x_bar.numel() == x.numel(), "diffvbd::sweep_backward: x_bar must be like x");
-    const int64_t b = in.scenes, v = plan.num_vertices, t = plan.num_tets;
-    const int rows = diffvbd::tape_rows(in.tape_policy, diffvbd::filters(in.energies));
-    require(tape.is_contiguous() && tape.numel() == b * sweeps * rows * plan.num_active,
-            "diffvbd::sweep_backward: the tape does not belong to this step");
-    const bool material = wants[0], of_mass = wants[1], of_rest = wants[2], of_data = wants[3];
-    const Tensor none = empty(x, {0});
-    Tensor x_start_bar = empty(x, {b, v, 3}), x_prev_bar = zeros(x, {b, v, 3}), y_bar = empty(x, {b, v, 3});
-    Tensor mu_bar = material ? zeros(x, {b, t}) : none, lam_bar = material ? zeros(x, {b, t}) : none;
-    Tensor mass_bar = of_mass ? zeros(x, {b, v}) : none, rest_bar = of_rest ? zeros(x, {b, t, 7}) : none;
-    const int64_t size = diffvbd::energy_data_size(data_count, v);
-    Tensor data_bar = of_data ? zeros(x, {b, size}) : none;
-    const auto wanted = [&](bool flag, const Tensor& a) { return flag ? data<T>(a) : nullptr; };
-    const diffvbd::StepAdjoints<T> out{data<T>(x_start_bar),      data<T>(x_prev_bar),       data<T>(y_bar),
-                                       wanted(material, mu_bar),  wanted(material, lam_bar), wanted(of_mass, mass_bar),
-                                       wanted(of_rest, rest_bar), wanted(of_data, data_bar)};
-    diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), out);
-    return std::make_tuple(x_start_bar, x_prev_bar, y_bar, mu_bar, lam_bar, mass_bar, rest_bar, data_bar);
+    diffvbd::check_tape(tape, plan, in);
+    const Bars bars(x, plan, data_count, wants);
+    diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), bars.pointers<T>());
+    return bars.tensors();
   });
 }
 

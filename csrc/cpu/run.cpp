@@ -2,9 +2,11 @@
 
 #include <algorithm>
 #include <cmath>
+#include <optional>
 #include <stdexcept>
 #include <vector>
 
+#include "contact.h"
 #include "message.h"
 #include "team.h"
 
@@ -64,6 +66,7 @@ void unpack_rows(const Plan& plan, const T* rows, T* user) {
 template <class T>
 struct Scene {
   Buffer<T> x, y, x_prev, origin, mass, material;
+  Buffer<T> contact, cut;
   SceneView<T> view{};
   int64_t data_size;
 
@@ -97,6 +100,12 @@ struct Scene {
       }
       view.material = material.get();
     }
+    if (in.contact) {
+      contact = Buffer<T>(size_t(plan.blocks) * kContactScalars * kLanes);
+      cut = Buffer<T>(size_t(plan.blocks) * kLanes, true);
+      view.contact = contact.get();
+      view.cut = cut.get();
+    }
     view.rest = in.rest.data + scene * in.rest.scene;
     view.data = in.data.data + scene * in.data.scene;
     int64_t start = 0;
@@ -108,6 +117,15 @@ struct Scene {
     data_size = start;
   }
 };
+
+// Where each vertex stands in sweep order: asked for by contact, whose pairs name vertices.
+std::vector<int32_t> positions_of(const Plan& plan) {
+  std::vector<int32_t> out(plan.num_vertices);
+  for (int32_t at = 0; at < plan.blocks * kLanes; ++at) {
+    if (plan.order[at] >= 0) out[plan.order[at]] = at;
+  }
+  return out;
+}
 
 template <class F>
 void for_scenes(int64_t scenes, bool parallel, const F& f) {
@@ -157,18 +175,28 @@ void look_for_nonfinite(const Plan& plan, const SceneView<T>& s, int64_t step, i
 }  // namespace
 
 template <class T>
-void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape) {
+void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* cut) {
   const auto kernel = forward_kernel<T>(in.energies);
-  const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, filters(in.energies)) * plan.num_active;
+  const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
+  const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
   // a message thrown inside a parallel region would be lost
   const bool looks = in.debug_step >= 0;
   for_scenes(in.scenes, !looks, [&](int64_t b) {
     Scene<T> scene(plan, in, b, in.x_start.data + b * in.x_start.scene);
     scene.view.tape = tape + b * tape_size;
+    std::optional<ContactScene<T>> contact;
+    if (in.contact) {
+      contact.emplace(plan, *in.contact, position.data(), b, scene.view, in.parameters.time_step, nullptr);
+    }
     Team::run(looks ? 1 : team_size(plan, in.scenes, in.sweeps), [&](Team::Member member) {
       for (int k = 0; k < in.sweeps; ++k) {
         for (int c = 0; c < plan.colors; ++c) {
-          member.each(plan.color_block[c], plan.color_block[c + 1], [&](int64_t begin, int64_t end) {
+          const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
+          if (contact) {
+            member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
+            member.barrier();
+          }
+          member.each(first, last, [&](int64_t begin, int64_t end) {
             kernel(plan, scene.view, in.parameters, k, in.tape_policy, begin, end);
           });
           member.barrier();
@@ -177,6 +205,7 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape) {
       }
     });
     unpack_rows(plan, scene.view.x, x + b * 3 * int64_t{plan.num_vertices});
+    if (contact) contact->store_cut(cut + b * plan.num_vertices);
   });
 }
 
@@ -185,9 +214,10 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
                  const StepAdjoints<T>& out) {
   const int wanted = (out.mu ? kMaterial : 0) | (out.rest ? kMaterial | kRest : 0);
   const auto kernel = reverse_kernel<T>(in.energies, wanted);
-  const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, filters(in.energies)) * plan.num_active;
+  const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
   const int64_t n = plan.num_vertices, tets = plan.num_tets, lanes = int64_t{plan.blocks} * kLanes;
   const int64_t pairs = int64_t{plan.slots} * kLanes;
+  const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
   for_scenes(in.scenes, true, [&](int64_t b) {
     Scene<T> scene(plan, in, b, x + b * 3 * n);
     SceneView<T>& s = scene.view;
@@ -207,14 +237,36 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     s.lam_bar = lam_bar.get();
     s.rest_bar = rest_bar.get();
     s.data_bar = data_bar.get();
+    const Buffer<T> turn(in.contact ? 6 * lanes : 0), bound_bar(in.contact ? 4 * lanes : 0, true);
+    s.turn = turn.get();
+    s.bound_bar = bound_bar.get();
+    std::optional<ContactScene<T>> contact;
+    if (in.contact) {
+      contact.emplace(plan, *in.contact, position.data(), b, s, in.parameters.time_step, out.contact);
+    }
 
     Team::run(team_size(plan, in.scenes, in.sweeps), [&](Team::Member member) {
       for (int k = in.sweeps - 1; k >= 0; --k) {
         for (int c = plan.colors - 1; c >= 0; --c) {
-          member.each(plan.color_block[c], plan.color_block[c + 1], [&](int64_t begin, int64_t end) {
+          const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
+          if (contact) {
+            member.each(first, last, [&](int64_t begin, int64_t end) {
+              contact->prepare(k, in.tape_policy, begin, end);
+            });
+            member.barrier();
+            if (in.tape_policy != kFullTape) {
+              member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
+              member.barrier();
+            }
+          }
+          member.each(first, last, [&](int64_t begin, int64_t end) {
             kernel(plan, s, in.parameters, k, in.tape_policy, begin, end);
           });
           member.barrier();
+          if (contact) {
+            member.each(first, last, [&](int64_t begin, int64_t end) { contact->reverse(begin, end); });
+            member.barrier();
+          }
         }
         // Pinned vertices have no turn of their own: they collect after each sweep, before the rows are overwritten.
         member.each(plan.color_block[plan.colors], plan.blocks, [&](int64_t begin, int64_t end) {
@@ -226,6 +278,10 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
       }
     });
     collect_last(plan, s.rows, s.x_bar);
+    if (contact) {
+      contact->finish(out.collider + b * 3 * (in.contact->corners - n));
+      contact->store_bounds(out.bounds + b * 4 * n);
+    }
     unpack_rows(plan, s.x_bar, out.x_start + b * 3 * n);
     unpack_vertices(plan, s.y_bar, out.y + b * 3 * n);
     if (s.x_prev) unpack_vertices(plan, s.x_prev_bar, out.x_prev + b * 3 * n);
@@ -294,7 +350,7 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
 }
 
 #define DIFFVBD_INSTANTIATE(T)                                                                  \
-  template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*);                      \
+  template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*, uint8_t*);                    \
   template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*, \
                                const StepAdjoints<T>&);                                         \
   template void pack_rest<T>(const Plan&, const T*, T*);

@@ -2,6 +2,7 @@
 // colors.
 #pragma once
 
+#include "../contact/passes.h"
 #include "plan.h"
 #include "sweep.h"
 
@@ -20,6 +21,7 @@ struct StepInputs {
   int data_count[kVertexEnergies];              // scalars per scene, or per vertex, of each energy
   StepParameters<T> parameters;
   int sweeps, tape_policy;
+  const contact::ContactInputs<T>* contact;  // null without contact
   int64_t debug_step;  // step number to name when a position is not finite; -1: do not look
 };
 
@@ -27,6 +29,8 @@ template <class T>
 struct StepAdjoints {
   T *x_start, *x_prev, *y;           // [B, V, 3]
   T *mu, *lam, *mass, *rest, *data;  // [B, T], [B, T], [B, V], [B, T, 7], [B, N]; null where not wanted
+  const contact::ContactAdjoints<T>* contact;  // with contact
+  T *bounds, *collider;                        // [B, V, 4], [B, Vc, 3] with contact
 };
 
 // The values that a step cannot work with raise std::invalid_argument naming the argument.
@@ -37,9 +41,9 @@ void check_values(const Plan& plan, const StepInputs<T>& in);
 template <class T>
 void check_masses(const T* shares, int64_t scenes, int64_t tets, int64_t stride);
 
-// x [B, V, 3], tape [B, sweeps, tape_rows, active]
+// x [B, V, 3], tape [B, sweeps, tape_rows, active], cut [B, V] with contact: where a bound has held back
 template <class T>
-void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape);
+void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* cut = nullptr);
 
 // x is what run_forward returned, x_bar its adjoint; both [B, V, 3]
 template <class T>

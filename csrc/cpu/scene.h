@@ -49,7 +49,9 @@ struct SceneView {
   const T* data;      // energies: per-scene ones (count), per-vertex ones (vertices, stride), in the order of the list
   int64_t data_start[kVertexEnergies];
   int data_count[kVertexEnergies];
-  T* tape;  // [sweeps, rows, active]
+  T* tape;     // [sweeps, rows, active]
+  T* contact;  // [blocks, kContactScalars, kLanes] or null: what contact adds to the blocks, and the bounds
+  T* cut;      // [blocks, kLanes]: > 0 where a bound has changed an update; or null
 
   // reverse only
   T* x_bar;       // [blocks kLanes, 4]
@@ -61,6 +63,8 @@ struct SceneView {
   T* lam_bar;     // [slots, kLanes] or null
   T* rest_bar;    // [slots, 4, kLanes] or null
   T* data_bar;    // [kMaxEnergyData, blocks kLanes] or null
+  T* turn;        // [blocks, 6, kLanes]: p and d_raw of the latest reversed update; or null
+  T* bound_bar;   // [blocks, 4, kLanes] or null
 };
 
 template <class T>
@@ -220,6 +224,18 @@ DIFFVBD_FN Block<Lanes<T>> load_block(const Plan& plan, const SceneView<T>& s, i
       }
     }
   });
+  if constexpr (Set::contact) {
+    const T* at = s.contact + block * kContactScalars * kLanes;
+    const auto get = [&] {
+      const R value = R::load(at);
+      at += kLanes;
+      return value;
+    };
+    ContactTerm<R>& c = out.contact;
+    c.g = {get(), get(), get()};
+    c.H = {get(), get(), get(), get(), get(), get()};
+    c.bound = {{get(), get(), get()}, get()};
+  }
   return out;
 }
 

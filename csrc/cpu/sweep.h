@@ -21,12 +21,11 @@ template <class T>
 ReverseKernel<T> reverse_kernel(int energies, int wanted);
 
 constexpr int kElasticVariants = 3;  // none, exact, paper
-constexpr int kEnergySets = kElasticVariants << kVertexEnergies;
+constexpr int kEnergySets = kElasticVariants << (kVertexEnergies + 1);  // and contact
 
 // The variants are numbered (elastic, set of vertex energies): mask of the n-th, and back.
 constexpr int energy_mask(int n) { return n % kElasticVariants + (n / kElasticVariants) * 4; }
 constexpr int energy_index(int mask) { return (mask & 3) + (mask >> 2) * kElasticVariants; }
 
-inline bool filters(int mask) { return any_filter(mask, VertexEnergies{}); }
 
 }  // namespace diffvbd

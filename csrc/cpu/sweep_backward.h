@@ -11,7 +11,7 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
                                int64_t begin, int64_t end) {
   using R = Lanes<T>;
   using Set = EnergySet<mask>;
-  const int rows = tape_rows(tape, Set::filters);
+  const int rows = tape_rows(tape, Set::keeps_positions);
   for (int64_t block = begin; block < end; ++block) {
     const int count = plan.block_rank[block + 1] - plan.block_rank[block];
     const T* at = s.tape + static_cast<int64_t>(sweep) * rows * plan.num_active + plan.block_rank[block];
@@ -37,6 +37,12 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
     add3(s.y_bar, block, out.y);
     LaneStar<T>::accumulate(s.mass_bar + block * kLanes, out.mass);
     if constexpr (Set::reads_x_prev) add3(s.x_prev_bar, block, out.x_prev);
+    if constexpr (Set::contact) {
+      const R values[] = {out.p.x, out.p.y, out.p.z, u.d_raw.x, u.d_raw.y, u.d_raw.z};
+      for (int i = 0; i < 6; ++i) values[i].store(s.turn + (block * 6 + i) * kLanes);
+      const R bars[] = {out.bound.center.x, out.bound.center.y, out.bound.center.z, out.bound.radius};
+      for (int i = 0; i < 4; ++i) LaneStar<T>::accumulate(s.bound_bar + (block * 4 + i) * kLanes, bars[i]);
+    }
   }
 }
 

@@ -8,7 +8,7 @@ DIFFVBD_HOT void forward_color(const Plan& plan, const SceneView<T>& s, const St
                                int64_t begin, int64_t end) {
   using R = Lanes<T>;
   using Set = EnergySet<mask>;
-  const int rows = tape_rows(tape, Set::filters);
+  const int rows = tape_rows(tape, Set::keeps_positions);
   for (int64_t block = begin; block < end; ++block) {
     R values[kMaxEnergyData];
     const Block<R> b = load_block<Set>(plan, s, block, q, values);
@@ -16,6 +16,9 @@ DIFFVBD_HOT void forward_color(const Plan& plan, const SceneView<T>& s, const St
     const Factor<R> H = factored(b, system, q);
     const Update<R> u = safeguarded<Set>(b, newton_step(system, H), q);
     store_rows(s.x, block, moved<Set>(b.state.x, u));
+    if constexpr (Set::contact) {
+      LaneStar<T>::accumulate(s.cut + block * kLanes, is_cut(b.state.x, relaxed(u.d_raw, q), b.contact.bound));
+    }
     if (tape == kNoTape) continue;
     const int count = plan.block_rank[block + 1] - plan.block_rank[block];
     T* at = s.tape + static_cast<int64_t>(sweep) * rows * plan.num_active + plan.block_rank[block];

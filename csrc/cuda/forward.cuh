@@ -12,7 +12,7 @@ template <class T, int mask, int lanes>
 __global__ void __launch_bounds__(kMaxThreads)
     sweep_forward(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range) {
   using Set = EnergySet<mask>;
-  const int rows = tape_rows(s.tape_policy, Set::filters);
+  const int rows = tape_rows(s.tape_policy, Set::keeps_positions);
   T* const shared = memory_of_warp<T, lanes>(s, false);
   each_color<T, lanes>(s, range, false, [&](int64_t scene, int sweep, int block, int part) {
     const Place<lanes> at(scene, block, part);
@@ -26,6 +26,12 @@ __global__ void __launch_bounds__(kMaxThreads)
     const Update<T> u = safeguarded<Set>(b, newton_step(system, H), s.parameters);
     const int64_t position = static_cast<int64_t>(block) * kSlice + at.v;
     if (at.lane == 0) store_row(s.w.x, scene * s.positions + position, moved<Set>(b.state.x, u));
+    if constexpr (Set::contact) {
+      if (at.lane == 0 && rank < end_rank &&
+          is_cut(b.state.x, relaxed(u.d_raw, s.parameters), b.contact.bound) > T(0)) {
+        s.cut[(s.base + scene) * s.plan.num_vertices + __ldg(s.plan.order + position)] = 1;
+      }
+    }
     if (s.tape_policy != kNoTape && at.lane == 0 && rank < end_rank) {
       T* to = s.tape + (scene * s.sweeps + sweep) * rows * s.plan.num_active + rank;
       const auto put = [&](const T& value) {
@@ -38,9 +44,15 @@ __global__ void __launch_bounds__(kMaxThreads)
   });
 }
 
+template <class T, int mask, int lanes>
+constexpr SweepKernel<T> forward_variant() {
+  if constexpr (is_built(mask, lanes)) return sweep_forward<T, mask, lanes>;
+  return nullptr;
+}
+
 template <class T, int lanes, int... n>
 SweepKernel<T> pick_forward(int index, std::integer_sequence<int, n...>) {
-  static constexpr SweepKernel<T> table[kEnergySets] = {sweep_forward<T, energy_mask(n), lanes>...};
+  static constexpr SweepKernel<T> table[kEnergySets] = {forward_variant<T, energy_mask(n), lanes>()...};
   return table[index];
 }
 

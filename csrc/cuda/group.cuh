@@ -354,6 +354,12 @@ __device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const Place
       out.data[k] = data + s.data_start[k] + (E::per_vertex ? static_cast<int64_t>(vertex) * E::stride : 0);
     });
   }
+  if constexpr (Set::contact) {
+    const T* a = s.w.contact + (at.scene * s.positions + position) * kContactRecord;
+    out.contact = {{a[0], a[1], a[2]},
+                   {a[3], a[4], a[5], a[6], a[7], a[8]},
+                   {{a[9], a[10], a[11]}, a[12]}};
+  }
   return out;
 }
 

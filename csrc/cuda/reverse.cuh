@@ -14,7 +14,7 @@ template <class T, int mask, int wanted, int lanes>
 __global__ void __maxnreg__(kReverseRegisters)
     sweep_reverse(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range) {
   using Set = EnergySet<mask>;
-  const int rows = tape_rows(s.tape_policy, Set::filters);
+  const int rows = tape_rows(s.tape_policy, Set::keeps_positions);
   T* const shared = memory_of_warp<T, lanes>(s, true);
   each_color<T, lanes>(s, range, true, [&](int64_t scene, int turn, int block, int part) {
     const Place<lanes> at(scene, block, part);
@@ -64,6 +64,14 @@ __global__ void __maxnreg__(kReverseRegisters)
         T* to = s.w.x_prev_bar + scene * s.positions * 3;
         store3(to, block, at.v, load_own3(to, block, at.v) + out.x_prev);
       }
+      if constexpr (Set::contact) {
+        T* turn = s.w.turn + 6 * row;
+        turn[0] = out.p.x, turn[1] = out.p.y, turn[2] = out.p.z;
+        turn[3] = u.d_raw.x, turn[4] = u.d_raw.y, turn[5] = u.d_raw.z;
+        T* bound = s.w.bound_bar + 4 * row;
+        contact::add_at(bound, out.bound.center);
+        bound[3] += out.bound.radius;
+      }
     }
     __syncwarp();
   });
@@ -72,10 +80,15 @@ __global__ void __maxnreg__(kReverseRegisters)
 // Without tets there is nothing but the state to differentiate: one variant serves every wish.
 constexpr int useful(int mask, int wanted) { return (mask & 3) == 0 ? kState : wanted; }
 
+template <class T, int mask, int wanted, int lanes>
+constexpr SweepKernel<T> reverse_variant() {
+  if constexpr (is_built(mask, lanes)) return sweep_reverse<T, mask, useful(mask, wanted), lanes>;
+  return nullptr;
+}
+
 template <class T, int wanted, int lanes, int... n>
 SweepKernel<T> pick_reverse(int index, std::integer_sequence<int, n...>) {
-  static constexpr SweepKernel<T> table[kEnergySets] = {
-      sweep_reverse<T, energy_mask(n), useful(energy_mask(n), wanted), lanes>...};
+  static constexpr SweepKernel<T> table[kEnergySets] = {reverse_variant<T, energy_mask(n), wanted, lanes>()...};
   return table[index];
 }
 

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 
+#include "contact.h"
 #include "frame.cuh"
 #include "scene_kernels.h"
 
@@ -18,6 +19,7 @@ int possible_lanes(const HostPlan& host, const Choice& choice, bool reverse) {
   const auto needed = [&](int lanes) { return shared_scalars(host.degree, host.valence, lanes, reverse) * sizeof(T); };
   for (const int lanes : {kFewLanes, kSomeLanes, kManyLanes}) {
     if (lanes >= choice.lanes && needed(lanes) * warps <= choice.shared) return lanes;
+    if (choice.contact && lanes == kSomeLanes) return needed(lanes) <= choice.shared ? lanes : kSpillLanes;
   }
   return needed(kManyLanes) <= choice.shared ? kManyLanes : kSpillLanes;
 }
@@ -53,6 +55,7 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   w.material_bar = take(elastic && (choice.wanted & kMaterial), n * 2 * (one ? positions : pairs));
   w.rest_bar = take(elastic && (choice.wanted & kRest), n * 4 * pairs);
   w.data_bar = take(reverse && adjoints->data, n * scalars * positions);
+  w.bound_bar = take(reverse && in.contact, n * 4 * positions);
   *zeroed = take.used;
   w.x = take(true, n * kRow * positions);
   w.x_bar = take(reverse, n * kRow * positions);
@@ -62,6 +65,9 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   w.mass = take(true, (in.mass.scene != 0 ? n : 1) * positions);
   const bool shared_material = in.mu.scene == 0 && in.lam.scene == 0;
   w.material = take(elastic && !one, (shared_material ? 1 : n) * 2 * pairs);
+  w.contact = take(in.contact != nullptr, n * kContactRecord * positions);
+  w.turn = take(reverse && in.contact, n * 6 * positions);
+  w.position = reinterpret_cast<int32_t*>(take(in.contact != nullptr, plan.num_vertices));
   *spill = nullptr;
   if (possible_lanes<T>(host, choice, reverse) == kSpillLanes) {
     const int64_t warps = int64_t{choice.multiprocessors} * kWarpsPerBlock;
@@ -74,6 +80,7 @@ template <class T>
 struct Runner {
   const HostPlan& host;
   const StepInputs<T>& in;
+  const StepAdjoints<T>* adjoints;
   const Choice& choice;
   cudaStream_t stream;
   unsigned* barrier;
@@ -84,7 +91,7 @@ struct Runner {
 
   Runner(const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints, const Choice& choice,
          void* workspace, cudaStream_t stream)
-      : host(host), in(in), choice(choice), stream(stream), barrier(static_cast<unsigned*>(workspace)) {
+      : host(host), in(in), adjoints(adjoints), choice(choice), stream(stream), barrier(static_cast<unsigned*>(workspace)) {
     first = reinterpret_cast<T*>(static_cast<char*>(workspace) + kBarrierBytes);
     Carver<T> take{first};
     s.w = carve(host, in, adjoints, choice, take, &zeroed, &s.spill);
@@ -116,11 +123,12 @@ struct Runner {
       return Batched<const T>{t.data + base * t.scene, t.scene, t.item};
     };
     s.scenes = count;
+    s.base = base;
     s.rest = at(in.rest);
     s.mu = at(in.mu);
     s.lam = at(in.lam);
     s.data = at(in.data);
-    const int rows = tape_rows(in.tape_policy, any_filter(in.energies, VertexEnergies{}));
+    const int rows = tape_rows(in.tape_policy, keeps_positions(in.energies));
     s.tape = tape + base * in.sweeps * rows * host.plan.num_active;
   }
 
@@ -139,8 +147,13 @@ struct Runner {
       const int64_t items = scenes * host.plan.slots * kSlice;
       if (auto error = per_item(load_material<T>, items, in, s, base, scenes)) return error;
     }
-    return per_item(load_vertices<T>, s.scenes * s.positions, in, s, base, ends, x_bar, v_bar, barrier);
+    if (auto error = per_item(load_vertices<T>, s.scenes * s.positions, in, s, base, ends, x_bar, v_bar, barrier)) {
+      return error;
+    }
+    return in.contact ? passes().load() : cudaSuccess;
   }
+
+  ContactPasses<T> passes() const { return {s, *in.contact, adjoints, stream}; }
 
   int64_t blocks_of(int color) const { return host.color_block[color + 1] - host.color_block[color]; }
 
@@ -187,13 +200,26 @@ struct Runner {
         range.first_color = c, range.end_color = c + 1;
         const int color = backward ? colors - 1 - c : c;
         if (blocks_of(color) == 0) continue;
+        const int64_t begin = host.color_block[color], end = host.color_block[color + 1];
+        if (in.contact && backward) {
+          if (auto error = passes().prepare(in.sweeps - 1 - k, begin, end)) return error;
+        }
+        if (in.contact && !(backward && in.tape_policy == kFullTape)) {
+          if (auto error = passes().assemble(begin, end)) return error;
+        }
         if (auto error = launch(blocks_for(blocks_of(color) * threads_of(lanes)))) return error;
+        if (in.contact && backward) {
+          if (auto error = passes().reverse(begin, end)) return error;
+        }
       }
     }
     return cudaSuccess;
   }
 
   cudaError_t store(int64_t base, const StepAdjoints<T>& out) {
+    if (in.contact) {
+      if (auto error = passes().collect()) return error;
+    }
     if (auto error = per_item(store_adjoints<T>, s.scenes * s.positions, in, s, base, out)) return error;
     const bool material = out.mu != nullptr, per_tet = material && !s.one_material;
     if (per_tet || s.w.rest_bar) {
@@ -212,7 +238,7 @@ struct Runner {
         if (auto error = sum(from, s.data_scalars * s.positions, 1, s.scenes, to, in.data_size)) return error;
       }
     }
-    return cudaSuccess;
+    return in.contact ? passes().store() : cudaSuccess;
   }
 
   cudaError_t sum(const T* values, int64_t stride, int64_t step, int64_t rows, T* out, int64_t out_stride) {
@@ -248,6 +274,7 @@ cudaError_t run_forward(const HostPlan& host, const StepInputs<T>& in, const Ste
   if (in.scenes == 0 || host.plan.num_vertices == 0) return cudaSuccess;
   if (choice.regime == kThread) return run_scene_forward(host, in, out, choice, stream);
   Runner<T> run(host, in, nullptr, choice, workspace, stream);
+  run.s.cut = out.cut;
   const int lanes = possible_lanes<T>(host, choice, false);
   for (int64_t base = 0; base < in.scenes; base += choice.chunk) {
     run.choose(base, std::min(choice.chunk, in.scenes - base), out.tape);

@@ -13,7 +13,7 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
   using Set = EnergySet<mask>;
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
-  const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice, rows = tape_rows(in.tape_policy, Set::filters);
+  const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice, rows = tape_rows(in.tape_policy, Set::keeps_positions);
   T *const x_tile = tiles_of_warp<T>(plan, memory, 2), *const y_tile = x_tile + size * kColumn;
   T *const x = x_tile + lane, *const y = y_tile + lane;
   int64_t start[kVertexEnergies];
@@ -61,7 +61,7 @@ using SceneForward = void (*)(StepInputs<T>, StepOutputs<T>, GroupPlan);
 
 template <class T, bool common, int... n>
 SceneForward<T> pick_scene_forward(int index, std::integer_sequence<int, n...>) {
-  static constexpr SceneForward<T> table[kEnergySets] = {scene_forward<T, energy_mask(n), common>...};
+  static constexpr SceneForward<T> table[kFreeSets] = {scene_forward<T, energy_mask(n), common>...};
   return table[index];
 }
 
@@ -71,7 +71,7 @@ template <class T>
 cudaError_t run_scene_forward(const HostPlan& host, const StepInputs<T>& in, const StepOutputs<T>& out,
                               const Choice& choice, cudaStream_t stream) {
   if (host.plan.num_vertices > kSmallMesh) return cudaErrorInvalidConfiguration;
-  constexpr auto sets = std::make_integer_sequence<int, kEnergySets>{};
+  constexpr auto sets = std::make_integer_sequence<int, kFreeSets>{};
   const int index = energy_index(in.energies);
   const auto kernel =
       is_common(in) ? pick_scene_forward<T, true>(index, sets) : pick_scene_forward<T, false>(index, sets);

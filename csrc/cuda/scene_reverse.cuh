@@ -19,7 +19,7 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
   using Set = EnergySet<mask>;
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
-  const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice, rows = tape_rows(in.tape_policy, Set::filters);
+  const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice, rows = tape_rows(in.tape_policy, Set::keeps_positions);
   const bool needs_y = reads_y(out, in.tape_policy, Set::filters), full = in.tape_policy == kFullTape;
   T* const x_tile = tiles_of_warp<T>(plan, memory, needs_y ? 4 : 3);
   T *const bar_tile = x_tile + size * kColumn, *const y_bar_tile = bar_tile + size * kColumn;
@@ -120,13 +120,13 @@ constexpr int useful(int mask, int wanted) { return (mask & 3) == 0 ? kState : w
 
 template <class T, int wanted, bool common, int... n>
 SceneReverse<T> pick_scene_reverse(int index, std::integer_sequence<int, n...>) {
-  static constexpr SceneReverse<T> table[kEnergySets] = {
+  static constexpr SceneReverse<T> table[kFreeSets] = {
       scene_reverse<T, energy_mask(n), useful(energy_mask(n), wanted), common>...};
   return table[index];
 }
 template <class T, bool common>
 SceneReverse<T> pick_scene_reverse(int energies, int wanted) {
-  constexpr auto sets = std::make_integer_sequence<int, kEnergySets>{};
+  constexpr auto sets = std::make_integer_sequence<int, kFreeSets>{};
   const int index = energy_index(energies);
   // rest shapes that are differentiated are no common ones, or cost too much memory traffic for it to matter
   if (wanted & kRest) return pick_scene_reverse<T, kMaterial | kRest, false>(index, sets);

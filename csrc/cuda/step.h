@@ -4,6 +4,7 @@
 
 #include <cuda_runtime_api.h>
 
+#include "../contact/passes.h"
 #include "../core/plan_views.h"
 #include "../energies/energies.h"
 
@@ -35,12 +36,14 @@ struct StepInputs {
   // x_prev has them), and returns velocities.
   bool fused;
   Batched<const T> v, acceleration, held;  // [B, V, 3]; acceleration also [B, 1, 3] (item 0); held may be null
+  const contact::ContactInputs<T>* contact;  // on the host; null without contact
 };
 
 template <class T>
 struct StepOutputs {
   T *x, *v;  // [B, V, 3]; v only of a fused step
   T* tape;   // [B, sweeps, rows, active] in all; a scene per thread keeps scenes last
+  uint8_t* cut;  // [B, V], zero: where a bound has held back; with contact
 };
 
 template <class T>
@@ -49,6 +52,8 @@ struct StepAdjoints {
   T *x_start, *x_prev, *y;           // [B, V, 3]
   T *mu, *lam, *mass, *rest, *data;  // [B, 1 | T], [B, 1 | T], [B, V], [B, T, 7], [B, N]; null where not wanted
   T *x, *v, *acceleration, *held;    // of a fused step, null where not wanted
+  const contact::ContactAdjoints<T>* contact;  // on the host; with contact
+  T *bounds, *collider, *collider_prev, *kappa;  // [B, V, 4], [B, Vc, 3], [B, Vc, 3], [B] with contact
 };
 
 // Where the kernels work, for one chunk of scenes in sweep order. Sizes are per scene.
@@ -60,13 +65,18 @@ struct Workspace {
   T *material, *material_bar;  // [slots, kSlice, 2]; the bar [positions, 2] if a scene has one material
   T* rest_bar;                 // [slots, kSlice, 4]
   T* data_bar;                 // [scalars, positions]
+  T* contact;                  // [positions, kContactRecord]: the pairs' part of the block, and the bound
+  T *turn, *bound_bar;         // [positions, 6]: p and d_raw of the latest reversed update; [positions, 4]
+  int32_t* position;           // [V] with contact: where a vertex stands in sweep order
 };
+constexpr int kContactRecord = 16;
 
 // Everything a sweep's kernels read and write; a chunk of scenes.
 template <class T>
 struct StepView {
   GroupPlan plan;
   int64_t scenes, positions;
+  int64_t base;  // the first scene of the chunk
   int degree, valence;  // largest number of neighbours and of pairs
   StepParameters<T> parameters;
   int sweeps, tape_policy;
@@ -78,6 +88,7 @@ struct StepView {
   int data_count[kVertexEnergies], data_row[kVertexEnergies];
   int data_scalars;
   Workspace<T> w;
+  uint8_t* cut;  // [B, V] with contact, forward
   T* spill;  // [warps, shared_scalars] for kSpillLanes
   T* tape;
 };
@@ -117,9 +128,15 @@ DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int lanes, bool
 }
 
 constexpr int kElasticVariants = 3;  // none, exact, paper
-constexpr int kEnergySets = kElasticVariants << kVertexEnergies;
+constexpr int kFreeSets = kElasticVariants << kVertexEnergies;  // without contact
+constexpr int kEnergySets = kElasticVariants << (kVertexEnergies + 1);  // and contact
 constexpr int energy_mask(int n) { return n % kElasticVariants + (n / kElasticVariants) * 4; }
 constexpr int energy_index(int mask) { return (mask & 3) + (mask >> 2) * kElasticVariants; }
+
+// Contact launches color by color, with one number of threads per vertex or, for the largest stars, the spill variant.
+constexpr bool is_built(int mask, int lanes) {
+  return (mask & kContact) == 0 || lanes == kSomeLanes || lanes == kSpillLanes;
+}
 
 // A plan with what the host must know of it.
 struct HostPlan {
@@ -131,6 +148,7 @@ struct HostPlan {
 // How a step is to run.
 struct Choice {
   int regime, lanes, wanted;
+  bool contact;
   int64_t chunk;  // scenes that are worked on at once
   int multiprocessors;
   size_t shared;  // bytes of shared memory that a block can have

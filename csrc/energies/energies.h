@@ -19,10 +19,11 @@ struct EnergyList {
   static constexpr int size = sizeof...(E);
 };
 
-// bits 0 and 1 of a mask: the elastic block; bit 2 + k: the k-th energy of this list
+// bits 0 and 1 of a mask: the elastic block; bit 2 + k: the k-th energy of this list; the bit after them: contact
 using VertexEnergies = EnergyList<FloorBarrier, Anchor>;
 constexpr int kVertexEnergies = VertexEnergies::size;
 enum ElasticBits { kExactBlock = 1, kPaperBlock = 2 };
+constexpr int kContact = 4 << kVertexEnergies;
 constexpr int kMaxEnergyData = 64;  // scalars that the energies of one vertex may read
 
 // One block update, from the Newton step to the executed one.
@@ -54,6 +55,8 @@ constexpr bool any_filter(int mask, EnergyList<E...>) {
   int k = 2;
   return ((((mask >> k++) & 1) && E::has_filter) || ...);
 }
+// Whether a vertex must come back to its old position exactly in the reverse: gaps depend on it to the bit.
+constexpr bool keeps_positions(int mask) { return (mask & kContact) != 0 || any_filter(mask, VertexEnergies{}); }
 template <class... E>
 constexpr bool any_x_prev(int mask, EnergyList<E...>) {
   int k = 2;
@@ -62,7 +65,8 @@ constexpr bool any_x_prev(int mask, EnergyList<E...>) {
 
 template <int mask>
 struct EnergySet {
-  static constexpr bool of_vertices = (mask >> 2) != 0;
+  static constexpr bool contact = (mask & kContact) != 0;
+  static constexpr bool of_vertices = ((mask & ~kContact) >> 2) != 0;
   static constexpr bool elastic = (mask & (kExactBlock | kPaperBlock)) != 0;
   using Elastic = StableNeoHookean<(mask & kExactBlock) != 0>;
 
@@ -72,6 +76,7 @@ struct EnergySet {
     visit<0>(f, VertexEnergies{});
   }
   static constexpr bool filters = any_filter(mask, VertexEnergies{});
+  static constexpr bool keeps_positions = diffvbd::keeps_positions(mask);
   static constexpr bool reads_x_prev = any_x_prev(mask, VertexEnergies{});
 
  private:

@@ -6,22 +6,9 @@
 
 #include "../core/safeguards.h"
 #include "../core/views.h"
+#include "log_barrier.h"
 
 namespace diffvbd {
-
-// log-barrier b(d) = -kappa (d - dhat)^2 log(d / dhat) and its derivatives, zero for d >= dhat
-template <class R>
-struct LogBarrier {
-  R first, second, third;
-  DIFFVBD_FN LogBarrier(const R& d, const R& dhat, const R& kappa) {
-    const auto active = d < dhat;
-    const R safe = select(active, d, dhat), gap = safe - dhat, inv = R(1) / safe;
-    const R log_ratio = natural_log(safe / dhat), ratio = gap * inv;
-    first = select(active, -kappa * (R(2) * gap * log_ratio + gap * ratio), R(0));
-    second = select(active, -kappa * (R(2) * log_ratio + R(4) * ratio - ratio * ratio), R(0));
-    third = select(active, -kappa * inv * (R(6) - R(6) * ratio + R(2) * ratio * ratio), R(0));
-  }
-};
 
 struct FloorBarrier {
   static constexpr bool per_vertex = false;  // data: `planes` x (n_x, n_y, n_z, height, kappa, dhat, damping)

@@ -4,8 +4,21 @@ It is the oracle of the exactness tests and the unrolled opponent in benchmarks.
 not from the pair scalars of the compiled sweep, and imports nothing compiled, so the two agree only if both are right.
 """
 
+from .contact import Part, contact_step
+from .intersections import intersections
 from .layout import build_layout
 from .potential import incremental_potential, residual
 from .sweep import Trajectory, rollout, step, stepper
 
-__all__ = ["Trajectory", "build_layout", "incremental_potential", "residual", "rollout", "step", "stepper"]
+__all__ = [
+    "Part",
+    "Trajectory",
+    "build_layout",
+    "contact_step",
+    "incremental_potential",
+    "intersections",
+    "residual",
+    "rollout",
+    "step",
+    "stepper",
+]

@@ -196,10 +196,13 @@ ENERGIES: dict[str, type] = {
 }
 
 
-def build_energies(scene: Scene) -> list[Any]:
-    """The reference formulas of a model's energies, looked up by `energy.name` or the snake-case class name."""
+def build_energies(scene: Scene, elsewhere: tuple[str, ...] = ()) -> list[Any]:
+    """The reference formulas of a model's energies, looked up by `energy.name` or the snake-case class name; those
+    named in `elsewhere` are the caller's."""
     built = []
     for energy in scene.model.energies:
+        if getattr(energy, "name", None) in elsewhere:
+            continue
         kind = getattr(energy, "name", None) or re.sub(r"(?<!^)(?=[A-Z])", "_", type(energy).__name__).lower()
         if kind not in ENERGIES:
             raise ValueError(f"energies: no reference formula for {kind!r}; known are {sorted(ENERGIES)}")

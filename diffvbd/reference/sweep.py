@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from .energies import build_energies
+from .friction import floor_friction
 from .layout import Layout, build_layout, dot, put, solve6, take
 from .scene import Scene, build_scene
 
@@ -108,25 +109,27 @@ def stepper(
         density=density,
         parameters=parameters,
     )
-    energies = build_energies(scene)
-    inertia = [scene.mass[..., color.vertices].unsqueeze(-2) for color in scene.layout.colors]
+    energies = build_energies(scene, elsewhere=("friction",))
+    energies += floor_friction(scene, energies)
+    masses = color_masses(scene)
 
     def advance(x: Tensor, v: Tensor, force: Any, gravity: Any, prescribed: Any) -> tuple[Tensor, Tensor]:
-        y = _predictor(scene, x, v, force, gravity, prescribed)
+        y = predictor(scene, x, v, force, gravity, prescribed)
         x_prev, y = x.transpose(-1, -2).contiguous(), y.transpose(-1, -2).contiguous()
-        state = _start(scene, energies, x_prev, y)
-        targets = [take(y, color.vertices) for color in scene.layout.colors]
-        for _ in range(sweeps):
-            for k, color in enumerate(scene.layout.colors):
-                if color.vertices.numel():
-                    state = _update_color(scene, energies, k, inertia[k], targets[k], state, x_prev)
+        check_start(energies, x_prev)
+        state = run_sweeps(scene, energies, masses, y, _start(scene, energies, x_prev, y), x_prev, sweeps)
         x_new = state.transpose(-1, -2).contiguous()
         return x_new, (x_new - x) / time_step
 
     return advance
 
 
-def _predictor(scene: Scene, x: Tensor, v: Tensor, force: Any, gravity: Any, prescribed: Any) -> Tensor:
+def color_masses(scene: Scene) -> list[Tensor]:
+    """Masses of the vertices of each color, [..., 1, n]."""
+    return [scene.mass[..., color.vertices].unsqueeze(-2) for color in scene.layout.colors]
+
+
+def predictor(scene: Scene, x: Tensor, v: Tensor, force: Any, gravity: Any, prescribed: Any) -> Tensor:
     h, pinned = scene.time_step, scene.model.pinned
     acceleration = scene.tensor(gravity)
     if force is not None:
@@ -137,26 +140,63 @@ def _predictor(scene: Scene, x: Tensor, v: Tensor, force: Any, gravity: Any, pre
     return torch.where(pinned.unsqueeze(-1), x if prescribed is None else scene.tensor(prescribed), y)
 
 
-def _start(scene: Scene, energies: list[Any], x: Tensor, y: Tensor) -> Tensor:
-    """Start of the sweep: y, or with contact filters as far from x towards y as they allow."""
-    if not any(hasattr(energy, "limit") for energy in energies):
-        return y
+def check_start(energies: list[Any], x: Tensor) -> None:
+    """Raises ValueError where a filter has no admissible step from x [..., 3, V]."""
     for energy in energies:
         if hasattr(energy, "check_start"):
             energy.check_start(x.detach())
-    start = x + _limit(energies, x, y - x).unsqueeze(-2) * (y - x)
-    return torch.where(scene.model.pinned, y, start)
 
 
-def _limit(energies: list[Any], x: Tensor, step: Tensor) -> Tensor:
+def _start(scene: Scene, energies: list[Any], x: Tensor, y: Tensor) -> Tensor:
+    """Start of the sweep: y, or with filters as far from x towards y as they allow."""
+    if not any(hasattr(energy, "limit") for energy in energies):
+        return y
+    return torch.where(scene.model.pinned, y, x + filtered(energies, x, y - x))
+
+
+def filtered(energies: list[Any], x: Tensor, step: Tensor) -> Tensor:
+    """As much of a step [..., 3, n] from x [..., 3, n] as every filter allows."""
     limits = [energy.limit(x, step) for energy in energies if hasattr(energy, "limit")]
-    return torch.stack(torch.broadcast_tensors(*limits)).min(0).values if len(limits) > 1 else limits[0]
+    if not limits:
+        return step
+    least = torch.stack(torch.broadcast_tensors(*limits)).min(0).values if len(limits) > 1 else limits[0]
+    return step * least.unsqueeze(-2)
+
+
+def run_sweeps(
+    scene: Scene,
+    energies: list[Any],
+    masses: list[Tensor],
+    y: Tensor,
+    state: Tensor,
+    x_prev: Tensor,
+    sweeps: int,
+    cut: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None,
+) -> Tensor:
+    """The state [..., 3, V] after `sweeps` sweeps of all colors toward the predictor y [..., 3, V].
+
+    masses: `color_masses`. x_prev: start of the step, for lagged terms. cut(x, update, vertices): what a bound on the
+    motion leaves of the update [..., 3, n] of some vertices at x [..., 3, n].
+    """
+    targets = [take(y, color.vertices) for color in scene.layout.colors]
+    for _ in range(sweeps):
+        for k, color in enumerate(scene.layout.colors):
+            if color.vertices.numel():
+                state = _update_color(scene, energies, k, masses[k], targets[k], state, x_prev, cut)
+    return state
 
 
 def _update_color(
-    scene: Scene, energies: list[Any], k: int, mass: Tensor, y: Tensor, state: Tensor, x_prev: Tensor
+    scene: Scene,
+    energies: list[Any],
+    k: int,
+    mass: Tensor,
+    y: Tensor,
+    state: Tensor,
+    x_prev: Tensor,
+    cut: Callable[[Tensor, Tensor, Tensor], Tensor] | None,
 ) -> Tensor:
-    """Newton update of all vertices of color k: H d = -g, saturate, relax, filter, write."""
+    """Newton update of all vertices of color k: H d = -g, saturate, relax, cut, filter, write."""
     model, vertices = scene.model, scene.layout.colors[k].vertices
     x = take(state, vertices)
     diagonal = (mass + model.regularization).expand_as(x[..., :1, :])
@@ -170,9 +210,9 @@ def _update_color(
         update = update * _saturation(update, model.saturation).unsqueeze(-2)
     if model.relaxation != 1.0:
         update = model.relaxation * update
-    if any(hasattr(energy, "limit") for energy in energies):
-        update = update * _limit(energies, x, update).unsqueeze(-2)
-    return put(state, vertices, x + update)
+    if cut is not None:
+        update = cut(x, update, vertices)
+    return put(state, vertices, x + filtered(energies, x, update))
 
 
 def _saturation(update: Tensor, limit: float) -> Tensor:

@@ -1,0 +1,288 @@
+// Which pairs of primitives detection considers, and what it says of one: corners, gap, constants, key. Shared by the
+// search on CPU and CUDA, which differ in how they walk the trees (tree.h).
+#pragma once
+
+#include "geometry.h"
+#include "tree.h"
+
+namespace diffvbd::contact {
+
+// Part of the rest distance that a pair of one body keeps as the reach of its barrier, and the length, relative to the
+// pair's longest edge at rest, up to which the two sides count as one place of the material.
+constexpr double kRestPart = 0.9, kSamePlace = 1e-9;
+// Squared sine below which edges are mollified (Li et al. 2020), with the lengths at rest.
+constexpr double kMollified = 1e-3;
+
+// Surfaces of all scenes and what is known of their corner points: `vertices` of the mesh, then those of colliders.
+template <class T>
+struct Surfaces {
+  const T *x, *origin;                // [B, V, 3]; origin may be null
+  const T *collider, *collider_next;  // [B, Vc, 3]  at detection, and where planes are evaluated
+  const T *rest, *radius;             // [N, 3], [N]
+  const int32_t *triangles, *edges, *points, *planes, *body;
+  const bool* held;
+  int64_t scenes;
+  int32_t vertices, corners, num_triangles, num_edges, num_points, num_planes;
+  int32_t mesh_bodies;  // labels from here on are colliders
+  bool self_contact, between_bodies;
+  T dhat, reach, cap, gamma;
+
+  DIFFVBD_FN int64_t key_base() const {
+    const int32_t a = num_triangles < num_edges ? num_edges : num_triangles;
+    const int32_t b = num_points < num_planes ? num_planes : num_points;
+    return int64_t{a < b ? b : a} + 1;
+  }
+  // Keys of pairs are below this.
+  DIFFVBD_FN uint64_t keys() const { return static_cast<uint64_t>(scenes * 3 * key_base() * key_base()); }
+  // All colliders are one group: no two of them make a pair.
+  DIFFVBD_FN int32_t group(int32_t corner) const {
+    return body[corner] < mesh_bodies ? body[corner] : mesh_bodies;
+  }
+  // Whether no primitive of group a makes a pair with one of group b. False where b is kMixed.
+  DIFFVBD_FN bool ignores(int32_t a, int32_t b) const {
+    if (a == b) return a == mesh_bodies || !self_contact;
+    return a < mesh_bodies && b >= 0 && b < mesh_bodies && !between_bodies;
+  }
+};
+
+// What a detection returns; N corner points a scene. Unused rows of pairs and entries of `entry` are -1.
+constexpr int kPairRow = 6, kConstants = 3, kNearRow = 5, kNearValues = 8, kCounts = 4;
+template <class T>
+struct Detected {
+  int64_t capacity;
+  int32_t* pairs;         // [capacity, 6]  corner points, kind, scene
+  T* constants;           // [capacity, 3]  dhat, offset, threshold
+  int32_t *ptr, *entry;   // [B N + 1], [4 capacity]  pairs of each corner point: 4 pair + local corner
+  int32_t* near_corners;  // [B, N, 5]  of the near pair, and its kind; or itself and -1
+  T* near_values;         // [B, N, 8]  weights, normal, gap
+  int64_t* counts;        // [4]  pairs that the list needs, pairs that touch, first key of those or -1, 0
+  T* smallest;            // [B]  smallest gap [m]
+};
+
+template <class T>
+DIFFVBD_FN Vec3<T> point_at(const T* p, int64_t i) {
+  return {p[3 * i], p[3 * i + 1], p[3 * i + 2]};
+}
+
+// A corner point of a scene, at x + o.
+template <class T>
+struct Place {
+  Vec3<T> x, o;
+};
+
+template <class T>
+DIFFVBD_FN Place<T> place(const Surfaces<T>& in, const T* collider, int64_t scene, int32_t i) {
+  if (i >= in.vertices) {
+    return {point_at(collider, scene * (in.corners - in.vertices) + i - in.vertices), zero3<T>()};
+  }
+  const int64_t row = scene * in.vertices + i;
+  return {point_at(in.x, row), in.origin == nullptr ? zero3<T>() : point_at(in.origin, row)};
+}
+
+// --- boxes ------------------------------------------------------------------------------------------------------------
+
+// The point that boxes of a scene are relative to: its first surface point, wherever that is finite.
+template <class T>
+DIFFVBD_FN Place<T> reference_point(const Surfaces<T>& in, int64_t scene) {
+  if (in.num_points == 0) return {zero3<T>(), zero3<T>()};
+  const Place<T> p = place(in, in.collider, scene, in.points[0]);
+  const T sum = p.x.x + p.x.y + p.x.z + p.o.x + p.o.y + p.o.z;
+  return sum - sum == T(0) ? p : Place<T>{zero3<T>(), zero3<T>()};
+}
+
+// Box of one corner point, empty where it is not finite; it covers what single precision and the differences round.
+template <class T>
+DIFFVBD_FN Box corner_box(const Surfaces<T>& in, int64_t scene, int32_t i, const Place<T>& reference) {
+  const Place<T> p = place(in, in.collider, scene, i);
+  const Vec3<T> a = p.x - reference.x, b = p.o - reference.o;
+  const Vec3<float> at{static_cast<float>(a.x + b.x), static_cast<float>(a.y + b.y), static_cast<float>(a.z + b.z)};
+  const auto slack = [](T u, T v) { return 0x1p-20F * static_cast<float>(absolute(u) + absolute(v)); };
+  const Vec3<float> s{slack(a.x, b.x), slack(a.y, b.y), slack(a.z, b.z)};
+  const float sum = s.x + s.y + s.z;
+  if (!(sum - sum == 0.0F)) return empty_box();
+  return {at - s, in.group(i), at + s, -1};
+}
+
+// Box of a primitive with n corners, grown by its radius; empty where a corner is not finite.
+template <class T>
+DIFFVBD_FN Box primitive_box(const Surfaces<T>& in, int64_t scene, const int32_t* v, int n, int32_t item,
+                             const Place<T>& reference) {
+  Box out = empty_box();
+  for (int k = 0; k < n; ++k) {
+    const Box corner = corner_box(in, scene, v[k], reference);
+    if (is_empty(corner)) return corner;
+    out = hull(out, corner);
+  }
+  grow(out, static_cast<float>(in.radius[v[0]]) * (1.0F + 0x1p-20F));
+  out.group = in.group(v[0]);  // all corners are of one body
+  out.item = item;
+  return out;
+}
+
+// Squared distance of boxes up to which the primitives may be closer than the reach.
+template <class T>
+DIFFVBD_FN float squared_reach(const Surfaces<T>& in) {
+  const float reach = static_cast<float>(in.reach) * (1.0F + 0x1p-20F);
+  return reach * reach * (1.0F + 0x1p-20F);
+}
+
+// --- pairs ------------------------------------------------------------------------------------------------------------
+
+struct Candidate {
+  int64_t scene;
+  int32_t kind, a, b;  // a point and a triangle, two edges a < b, a point and a plane
+  int32_t v[4];        // corner points
+  DIFFVBD_FN int second() const { return kind == kEdgeEdge ? 2 : 1; }  // first corner of the second side
+};
+
+template <class T>
+DIFFVBD_FN Candidate candidate(const Surfaces<T>& in, int64_t scene, int kind, int32_t a, int32_t b) {
+  if (kind == kEdgeEdge) {
+    const int32_t i = a < b ? a : b, j = a < b ? b : a;
+    const int32_t *e = in.edges + int64_t{2} * i, *f = in.edges + int64_t{2} * j;
+    return {scene, kind, i, j, {e[0], e[1], f[0], f[1]}};
+  }
+  const int32_t* t = (kind == kPointTriangle ? in.triangles : in.planes) + int64_t{3} * b;
+  return {scene, kind, a, b, {in.points[a], t[0], t[1], t[2]}};
+}
+
+template <class T>
+DIFFVBD_FN uint64_t key_of(const Surfaces<T>& in, const Candidate& c) {
+  const auto m = static_cast<uint64_t>(in.key_base());
+  return (static_cast<uint64_t>(c.scene * 3 + c.kind) * m + static_cast<uint64_t>(c.a)) * m +
+         static_cast<uint64_t>(c.b);
+}
+
+template <class T>
+DIFFVBD_FN Candidate candidate_of_key(const Surfaces<T>& in, uint64_t key) {
+  const auto m = static_cast<uint64_t>(in.key_base());
+  const uint64_t rows = key / m, row = rows / m;
+  return candidate(in, static_cast<int64_t>(row / 3), static_cast<int>(row % 3), static_cast<int32_t>(rows % m),
+                   static_cast<int32_t>(key % m));
+}
+
+// Whether the rules admit the pair, but for the distance at rest of two sides of one body.
+template <class T>
+DIFFVBD_FN bool is_considered(const Surfaces<T>& in, const Candidate& c) {
+  const int second = c.second();
+  bool held = in.held[c.v[0]];
+  if (c.kind != kPointPlane) {
+    for (int i = 0; i < second; ++i) {
+      for (int j = second; j < 4; ++j) {
+        if (c.v[i] == c.v[j]) return false;
+      }
+    }
+    for (int k = 1; k < 4; ++k) held = held && in.held[c.v[k]];
+  }
+  return !held && !in.ignores(in.group(c.v[0]), in.group(c.v[second]));
+}
+
+// Corner positions relative to the first corner.
+template <class T>
+DIFFVBD_FN Corners<T> corners_of(const Surfaces<T>& in, const Candidate& c) {
+  const Place<T> first = place(in, in.collider, c.scene, c.v[0]);
+  Corners<T> out;
+  out.x[0] = zero3<T>();
+  for (int k = 1; k < 4; ++k) {
+    const Place<T> p = place(in, c.kind == kPointPlane ? in.collider_next : in.collider, c.scene, c.v[k]);
+    out.x[k] = (p.x - first.x) + (p.o - first.o);
+  }
+  return out;
+}
+template <class T>
+DIFFVBD_FN Corners<T> corners_at_rest(const Surfaces<T>& in, const Candidate& c) {
+  const Vec3<T> first = point_at(in.rest, c.v[0]);
+  Corners<T> out;
+  for (int k = 0; k < 4; ++k) out.x[k] = point_at(in.rest, c.v[k]) - first;
+  return out;
+}
+
+// The distance alone. Not inlined: the searches for near pairs and for the list must get the same bits, and a device
+// compiler may round an inlined copy differently in each.
+template <class T>
+DIFFVBD_COLD T separation(int kind, const Corners<T>& c) {
+  return distance(kind, c).d;
+}
+
+template <class T>
+struct Constants {
+  T dhat, offset, threshold;  // reach of the barrier and sum of the radii [m], of the mollifier [m^4]
+  bool admitted;              // false for two sides of one body that are one place of the material
+};
+
+template <class T>
+DIFFVBD_FN T offset_of(const Surfaces<T>& in, const Candidate& c) {
+  return in.radius[c.v[0]] + in.radius[c.v[c.second()]];
+}
+
+template <class T>
+DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) {
+  const int second = c.second();
+  Constants<T> out{in.dhat, offset_of(in, c), T(0), true};
+  const bool one_body = c.kind != kPointPlane && in.body[c.v[0]] == in.body[c.v[second]];
+  if (!one_body && c.kind != kEdgeEdge) return out;
+  const Corners<T> rest = corners_at_rest(in, c);
+  const auto squared_length = [&](int i, int j) {
+    const Vec3<T> edge = rest.x[j] - rest.x[i];
+    return dot(edge, edge);
+  };
+  const T e = c.kind == kEdgeEdge ? squared_length(0, 1) : squared_length(1, 2), f = squared_length(2, 3);
+  if (c.kind == kEdgeEdge) out.threshold = T(kMollified) * e * f;
+  if (!one_body) return out;
+  T longest = e < f ? f : e;
+  if (c.kind == kPointTriangle && longest < squared_length(1, 3)) longest = squared_length(1, 3);
+  const T at_rest = separation(c.kind, rest);
+  out.admitted = at_rest > T(kSamePlace) * square_root(longest);
+  if (at_rest < in.dhat) out.dhat = T(kRestPart) * at_rest;
+  return out;
+}
+
+// How far a corner point with this near gap may move before its pairs must be found again.
+template <class T>
+DIFFVBD_FN T bound_of(const Surfaces<T>& in, T near_gap) {
+  const T bound = in.gamma * (T(0) < near_gap ? near_gap : T(0));
+  return bound < in.cap ? bound : in.cap;
+}
+
+// Whether a pair may become active while its sides move by at most a and b [m].
+template <class T>
+DIFFVBD_FN bool is_listed(T gap, T a, T b, T dhat) {
+  return gap - a - b < dhat;
+}
+
+// --- results ----------------------------------------------------------------------------------------------------------
+
+constexpr uint64_t kNoKey = ~uint64_t{0};  // of no pair
+
+// Rows of near_corners and near_values of corner point i.
+template <class T>
+DIFFVBD_FN void store_near_pair(const Surfaces<T>& in, int32_t i, uint64_t key, int32_t* corners, T* values) {
+  if (key == kNoKey) {
+    for (int k = 0; k < kNearRow; ++k) corners[k] = k < 4 ? i : -1;
+    for (int k = 0; k < kNearValues; ++k) values[k] = k == kNearValues - 1 ? in.reach : T(0);
+    return;
+  }
+  const Candidate c = candidate_of_key(in, key);
+  const Distance<T> at = distance(c.kind, corners_of(in, c));
+  for (int k = 0; k < 4; ++k) corners[k] = c.v[k], values[k] = at.w[k];
+  corners[4] = c.kind;
+  values[4] = at.n.x, values[5] = at.n.y, values[6] = at.n.z;
+  values[7] = at.d - offset_of(in, c);
+}
+
+// Rows of pairs and constants of a listed pair.
+template <class T>
+DIFFVBD_FN void store_listed_pair(const Surfaces<T>& in, uint64_t key, int32_t* pair, T* constants) {
+  if (key == kNoKey) {
+    for (int k = 0; k < kPairRow; ++k) pair[k] = -1;
+    for (int k = 0; k < kConstants; ++k) constants[k] = T(0);
+    return;
+  }
+  const Candidate c = candidate_of_key(in, key);
+  for (int k = 0; k < 4; ++k) pair[k] = c.v[k];
+  pair[4] = c.kind, pair[5] = static_cast<int32_t>(c.scene);
+  const Constants<T> a = constants_of(in, c);
+  constants[0] = a.dhat, constants[1] = a.offset, constants[2] = a.threshold;
+}
+
+}  // namespace diffvbd::contact

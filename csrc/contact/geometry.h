@@ -1,0 +1,180 @@
+// Distance of a pair of primitives, its gradient, and the mollifier of almost parallel edges (Li et al. 2020). A pair
+// has four corners; by the envelope theorem the gradient of the distance toward corner k is w_k n, with the weights w
+// of the closest points (they sum to 0) and the unit vector n between them, whatever features are closest. Scalars may
+// be Dual: the features are chosen by values, so that a derivative is that of the executed branch.
+#pragma once
+
+#include "../core/dual.h"
+
+namespace diffvbd::contact {
+
+// What the corners are: point and triangle, edge and edge, or point and the plane of a triangle that has no end.
+enum Kind { kPointTriangle = 0, kEdgeEdge = 1, kPointPlane = 2 };
+
+// Corner positions [m], relative to a point of the pair.
+template <class R>
+struct Corners {
+  Vec3<R> x[4];
+};
+
+template <class R>
+struct Distance {
+  R d;        // [m] > 0; signed for a plane
+  R w[4];     // weights of the corners
+  Vec3<R> n;  // from the second primitive to the first
+};
+
+template <class R>
+DIFFVBD_FN R clamped(const R& t) {
+  return select(t < R(0), R(0), select(R(1) < t, R(1), t));
+}
+
+// Parameter of the point of the segment from a to b that is closest to p. A segment without length gives a.
+template <class R>
+DIFFVBD_FN R closest_on_segment(const Vec3<R>& p, const Vec3<R>& a, const Vec3<R>& b) {
+  const Vec3<R> ab = b - a;
+  const R length2 = dot(ab, ab);
+  const auto degenerate = !(R(0) < length2);
+  return degenerate ? R(0) : clamped(dot(p - a, ab) / length2);
+}
+
+template <class R>
+DIFFVBD_FN Vec3<R> weighted(const R* w, const Corners<R>& c) {
+  return w[0] * c.x[0] + w[1] * c.x[1] + w[2] * c.x[2] + w[3] * c.x[3];
+}
+
+// Unit vector and distance from the weights alone.
+template <class R>
+DIFFVBD_FN void measure_along(Distance<R>& out, const Corners<R>& c) {
+  const Vec3<R> r = weighted(out.w, c);
+  out.d = square_root(dot(r, r));
+  out.n = (R(1) / out.d) * r;
+}
+
+// The same where the closest points lie inside a face or inside both edges: along the common normal, whose direction
+// does not lose digits as the gap closes.
+template <class R>
+DIFFVBD_FN void measure_across(Distance<R>& out, const Corners<R>& c, const Vec3<R>& normal, const R& size2) {
+  const R scale = R(1) / square_root(size2);
+  const R along = scale * dot(normal, weighted(out.w, c));
+  const R sign = select(along < R(0), R(-1), R(1));
+  out.d = sign * along;
+  out.n = (sign * scale) * normal;
+}
+
+// Keeps the closer of a candidate and what was found before.
+template <class R>
+DIFFVBD_FN void keep_closer(Distance<R>& best, R& best2, const Corners<R>& c, const R& w0, const R& w1, const R& w2,
+                            const R& w3) {
+  const R w[4] = {w0, w1, w2, w3};
+  const Vec3<R> r = weighted(w, c);
+  const R r2 = dot(r, r);
+  if (r2 < best2) {
+    best2 = r2;
+    for (int k = 0; k < 4; ++k) best.w[k] = w[k];
+  }
+}
+
+// Below this squared sine two directions count as parallel.
+DIFFVBD_FN constexpr double parallel() { return 1e-16; }
+
+// corners: the point, then the triangle
+template <class R>
+DIFFVBD_FN Distance<R> point_triangle(const Corners<R>& c) {
+  const Vec3<R>&p = c.x[0], &a = c.x[1], &b = c.x[2], &e = c.x[3];
+  const Vec3<R> ab = b - a, ac = e - a, ap = p - a, normal = cross(ab, ac);
+  const R size2 = dot(normal, normal), bound = dot(ab, ab) * dot(ac, ac);
+  Distance<R> out{};
+  if (R(parallel()) * bound < size2) {
+    const R inverse = R(1) / size2;
+    const R v = inverse * dot(cross(ap, ac), normal), w = inverse * dot(cross(ab, ap), normal), u = R(1) - v - w;
+    if (R(0) < u && R(0) < v && R(0) < w) {
+      out.w[0] = R(1), out.w[1] = -u, out.w[2] = -v, out.w[3] = -w;
+      measure_across(out, c, normal, size2);
+      return out;
+    }
+  }
+  R best2 = R(std::numeric_limits<float>::infinity());
+  const R s = closest_on_segment(p, a, b), t = closest_on_segment(p, b, e), q = closest_on_segment(p, e, a);
+  keep_closer(out, best2, c, R(1), s - R(1), -s, R(0));
+  keep_closer(out, best2, c, R(1), R(0), t - R(1), -t);
+  keep_closer(out, best2, c, R(1), -q, R(0), q - R(1));
+  measure_along(out, c);
+  return out;
+}
+
+// corners: the ends of the first edge, then of the second
+template <class R>
+DIFFVBD_FN Distance<R> edge_edge(const Corners<R>& c) {
+  const Vec3<R> u = c.x[1] - c.x[0], v = c.x[3] - c.x[2], r = c.x[0] - c.x[2], normal = cross(u, v);
+  const R size2 = dot(normal, normal), bound = dot(u, u) * dot(v, v);
+  Distance<R> out{};
+  if (R(parallel()) * bound < size2) {
+    const R inverse = R(1) / size2;
+    const R s = inverse * dot(cross(v, r), normal), t = inverse * dot(cross(u, r), normal);
+    if (R(0) < s && s < R(1) && R(0) < t && t < R(1)) {
+      out.w[0] = R(1) - s, out.w[1] = s, out.w[2] = t - R(1), out.w[3] = -t;
+      measure_across(out, c, normal, size2);
+      return out;
+    }
+  }
+  R best2 = R(std::numeric_limits<float>::infinity());
+  const R a = closest_on_segment(c.x[0], c.x[2], c.x[3]), b = closest_on_segment(c.x[1], c.x[2], c.x[3]);
+  const R d = closest_on_segment(c.x[2], c.x[0], c.x[1]), e = closest_on_segment(c.x[3], c.x[0], c.x[1]);
+  keep_closer(out, best2, c, R(1), R(0), a - R(1), -a);
+  keep_closer(out, best2, c, R(0), R(1), b - R(1), -b);
+  keep_closer(out, best2, c, R(1) - d, d, R(-1), R(0));
+  keep_closer(out, best2, c, R(1) - e, e, R(0), R(-1));
+  measure_along(out, c);
+  return out;
+}
+
+// corners: the point, then three points of the plane, counterclockwise seen from the side that is free
+template <class R>
+DIFFVBD_FN Distance<R> point_plane(const Corners<R>& c) {
+  const Vec3<R> ab = c.x[2] - c.x[1], ac = c.x[3] - c.x[1], ap = c.x[0] - c.x[1], normal = cross(ab, ac);
+  const R size2 = dot(normal, normal), scale = R(1) / square_root(size2), inverse = R(1) / size2;
+  const R v = inverse * dot(cross(ap, ac), normal), w = inverse * dot(cross(ab, ap), normal);
+  Distance<R> out{};
+  out.w[0] = R(1), out.w[1] = v + w - R(1), out.w[2] = -v, out.w[3] = -w;
+  out.n = scale * normal;
+  out.d = dot(out.n, ap);
+  return out;
+}
+
+template <class R>
+DIFFVBD_FN Distance<R> distance(int kind, const Corners<R>& c) {
+  return kind == kPointTriangle ? point_triangle(c) : kind == kEdgeEdge ? edge_edge(c) : point_plane(c);
+}
+
+// e(s) = s (2 - s) of s = |u x v|^2 / threshold below 1, else 1, with u and v along the edges: it takes the kink out of
+// the distance of edges that become parallel. Gradients toward the corners.
+template <class R>
+struct Mollifier {
+  R e;
+  Vec3<R> gradient[4];
+};
+
+// s of two edges; the threshold is 1e-3 |u|^2 |v|^2 at rest
+template <class R>
+DIFFVBD_FN R squared_cross(const Corners<R>& c) {
+  const Vec3<R> n = cross(c.x[1] - c.x[0], c.x[3] - c.x[2]);
+  return dot(n, n);
+}
+
+template <class R, class T>
+DIFFVBD_FN Mollifier<R> mollifier(const Corners<R>& c, const T& threshold) {
+  const Vec3<R> u = c.x[1] - c.x[0], v = c.x[3] - c.x[2], n = cross(u, v);
+  const R inverse = R(1) / R(threshold), s = inverse * dot(n, n);
+  const R rate = R(2) * inverse * (R(2) - R(2) * s);  // e' times the 2 of the derivative of |n|^2
+  const Vec3<R> by_u = rate * cross(v, n), by_v = rate * cross(n, u);
+  return {s * (R(2) - s), {-by_u, by_u, -by_v, by_v}};
+}
+
+// Whether a pair of edges is close enough to parallel for its mollifier to differ from 1. threshold 0: no mollifier.
+template <class R, class T>
+DIFFVBD_FN bool is_mollified(int kind, const Corners<R>& c, const T& threshold) {
+  return kind == kEdgeEdge && squared_cross(c) < R(threshold);
+}
+
+}  // namespace diffvbd::contact

@@ -1,0 +1,167 @@
+// What one pair adds to the block of one of its corners, and the adjoint of exactly that (docs/method.md, section 12).
+// Barrier: gradient of e b(gap) and the part e b'' grad_gap grad_gap^T of its Hessian. Lagged terms: damping of approach
+// and smoothed friction, about a normal, weights and a normal force of the start of the step.
+#pragma once
+
+#include "../energies/log_barrier.h"
+#include "geometry.h"
+
+namespace diffvbd::contact {
+
+// Constants of a listed pair.
+template <class T>
+struct PairConstants {
+  T dhat, offset, threshold;  // [m], radii that the gap is less than the distance [m], of the mollifier [m^4]
+  DIFFVBD_FN explicit PairConstants(const T* a) : dhat(a[0]), offset(a[1]), threshold(a[2]) {}
+};
+
+// Adds the barrier's part of the block of corner i.
+template <class T>
+DIFFVBD_FN void add_barrier(int kind, const Corners<T>& c, int i, const PairConstants<T>& a, T kappa, T h2, Vec3<T>& g,
+                            Sym3<T>& H) {
+  const Distance<T> at = distance(kind, c);
+  const T gap = at.d - a.offset;
+  if (!(gap < a.dhat)) return;
+  const LogBarrier<T> b(gap, a.dhat, h2 * kappa);
+  T e = T(1);
+  if (is_mollified(kind, c, a.threshold)) {
+    const Mollifier<T> m = mollifier(c, a.threshold);
+    e = m.e;
+    g += b.value * m.gradient[i];
+  }
+  const T w = at.w[i];
+  g += (e * b.first * w) * at.n;
+  add_outer(H, e * b.second * w * w, at.n);
+}
+
+// Adjoint of phi = p . (g + H d_raw) of corner i, negated: what the corners and kappa receive.
+template <class T>
+struct PairAdjoint {
+  Vec3<T> x[4];
+  T kappa;
+};
+
+// The Hessians of gap and mollifier are needed only times vectors that sit at corner i: one Dual evaluation each.
+template <class T>
+DIFFVBD_FN Corners<Dual<T>> moved_along(const Corners<T>& c, int i, const Vec3<T>& z) {
+  Corners<Dual<T>> out;
+  for (int k = 0; k < 4; ++k) {
+    const T on = k == i ? T(1) : T(0);
+    out.x[k] = {Dual<T>(c.x[k].x, on * z.x), Dual<T>(c.x[k].y, on * z.y), Dual<T>(c.x[k].z, on * z.z)};
+  }
+  return out;
+}
+template <class T>
+DIFFVBD_FN Vec3<T> derivative(const Vec3<Dual<T>>& a) {
+  return {a.x.derivative, a.y.derivative, a.z.derivative};
+}
+
+// Returns whether the pair is active; if not, it receives nothing.
+template <class T>
+DIFFVBD_FN bool reverse_barrier(int kind, const Corners<T>& c, int i, const PairConstants<T>& a, T kappa, T h2,
+                                const Vec3<T>& p, const Vec3<T>& d_raw, PairAdjoint<T>& out) {
+  const Distance<T> at = distance(kind, c);
+  const T gap = at.d - a.offset;
+  if (!(gap < a.dhat)) return false;
+  const LogBarrier<T> b(gap, a.dhat, h2);  // kappa scales everything: it comes last
+  const T s = at.w[i] * dot(at.n, p), t = at.w[i] * dot(at.n, d_raw);
+  T e = T(1), phi = T(0), by_gap = T(0);
+  const bool mollified = is_mollified(kind, c, a.threshold);
+  Mollifier<T> m{};
+  if (mollified) {
+    m = mollifier(c, a.threshold);
+    e = m.e;
+    const T toward = dot(m.gradient[i], p);
+    phi = b.value * toward;
+    by_gap = b.first * toward;
+  }
+  const T by_e = b.first * s + b.second * s * t;
+  phi = phi + e * by_e;
+  by_gap = by_gap + e * (b.second * s + b.third * s * t);
+  const Vec3<T> z = (e * (b.first + b.second * t)) * p + (e * b.second * s) * d_raw;
+  const Distance<Dual<T>> turned = distance(kind, moved_along(c, i, z));
+  for (int k = 0; k < 4; ++k) {
+    const Vec3<Dual<T>> row = turned.w[k] * turned.n;
+    out.x[k] = (-kappa) * ((by_gap * at.w[k]) * at.n + derivative(row));
+  }
+  if (mollified) {
+    const Mollifier<Dual<T>> curved = mollifier(moved_along(c, i, b.value * p), a.threshold);
+    for (int k = 0; k < 4; ++k) out.x[k] -= kappa * (by_e * m.gradient[k] + derivative(curved.gradient[k]));
+  }
+  out.kappa = -phi;
+  return true;
+}
+
+// A pair as it was at the start of the step, in the order in which tensors keep it.
+constexpr int kLagScalars = 9;
+template <class T>
+struct Lag {
+  T friction;  // coefficient times normal force [N]
+  T damping;   // [N s/m], 0 where the pair was not active
+  Vec3<T> n;
+  T w[4];
+  Lag() = default;
+  DIFFVBD_FN explicit Lag(const T* a)
+      : friction(a[0]), damping(a[1]), n{a[2], a[3], a[4]}, w{a[5], a[6], a[7], a[8]} {}
+  DIFFVBD_FN bool active() const { return friction != T(0) || damping != T(0); }
+};
+
+// f1(|u|) / |u| of the friction potential of Li et al. (2020), smooth below eps [m], and its derivative over |u|
+template <class T>
+struct FrictionRate {
+  T value, curvature;
+  DIFFVBD_FN FrictionRate(T length, T eps) {
+    const bool sticks = length < eps;
+    value = sticks ? (T(2) - length / eps) / eps : T(1) / length;
+    const T slope = sticks ? -T(1) / (eps * eps) : -value * value;
+    curvature = length > T(0) ? slope / length : T(0);
+  }
+};
+
+// Adds the lagged part of the block of corner i; m [m] is the relative motion since the start of the step.
+template <class T>
+DIFFVBD_FN void add_lagged(const Lag<T>& a, int i, const Vec3<T>& m, T h, T eps, Vec3<T>& g, Sym3<T>& H) {
+  const T w = a.w[i], along = dot(a.n, m);
+  if (along < T(0)) {
+    const T c = h * a.damping * w;
+    g += (c * along) * a.n;
+    add_outer(H, c * w, a.n);
+  }
+  if (a.friction != T(0)) {
+    const Vec3<T> u = m - along * a.n;
+    const FrictionRate<T> f(square_root(dot(u, u)), eps);
+    const T size = h * h * a.friction * f.value * w;
+    g += size * u;
+    add_diagonal(H, size * w);
+    add_outer(H, -size * w, a.n);
+  }
+}
+
+// Adjoint of phi = p . (g + H d_raw) of corner i, negated: toward m, and toward the lag at fixed m (a.w[k] also moves m).
+template <class T>
+DIFFVBD_FN Vec3<T> reverse_lagged(const Lag<T>& a, int i, const Vec3<T>& m, T h, T eps, const Vec3<T>& p,
+                                  const Vec3<T>& d_raw, Lag<T>& bar) {
+  const T w = a.w[i], along = dot(a.n, m), n_p = dot(a.n, p), n_d = dot(a.n, d_raw);
+  const Vec3<T> crossed = n_d * p + n_p * d_raw;
+  Vec3<T> m_bar = zero3<T>();
+  bar.friction = bar.damping = T(0);
+  bar.n = zero3<T>();
+  for (int k = 0; k < 4; ++k) bar.w[k] = T(0);
+  if (along < T(0)) {
+    const T c = h * a.damping;
+    m_bar -= (c * w * n_p) * a.n;
+    bar.n -= (c * w) * (n_p * m + along * p + w * crossed);
+    bar.w[i] = bar.w[i] - c * (along * n_p + T(2) * w * n_p * n_d);
+    bar.damping = -h * w * (along * n_p + w * n_p * n_d);
+  }
+  const Vec3<T> u = m - along * a.n, p_t = p - n_p * a.n;
+  const FrictionRate<T> f(square_root(dot(u, u)), eps);
+  const T size = h * h * a.friction * w, slid = dot(u, p), pushed = dot(p_t, d_raw), both = slid + w * pushed;
+  m_bar -= size * ((both * f.curvature) * u + f.value * p_t);
+  bar.n += size * ((both * f.curvature * along) * u + f.value * (along * p + n_p * m + w * crossed));
+  bar.w[i] = bar.w[i] - h * h * a.friction * f.value * (slid + T(2) * w * pushed);
+  bar.friction = -h * h * w * f.value * both;
+  return m_bar;
+}
+
+}  // namespace diffvbd::contact

@@ -1,0 +1,203 @@
+// The passes over a color that contact needs besides the block updates: sum the pairs of a vertex, take their adjoint,
+// collect what pairs have sent to a corner. A vertex may share pairs with others of its color, so all of a color read the
+// state before any moves, and in the reverse all p are known before anything is added (docs/method.md, section 12).
+#pragma once
+
+#include "../core/views.h"
+#include "pairs.h"
+
+namespace diffvbd::contact {
+
+// Pairs of all scenes, sorted by scene; `corners` corner points a scene: its vertices, then those of colliders.
+struct PairList {
+  const int32_t* pairs = nullptr;  // [pairs, 6]  four corner points, kind, scene
+  const int32_t* ptr = nullptr;    // [scenes corners + 1]
+  const int32_t* entry = nullptr;  // [4 pairs]  4 pair + corner, for each corner point in ascending order
+};
+constexpr int kPairIntegers = 6, kPairConstants = 3, kFloorLag = 4;
+
+template <class T>
+struct ContactInputs {
+  int64_t corners = 0;
+  int32_t num_vertices = 0;
+  PairList listed, lagged;                   // of the last detection; of the first one of the step
+  const T* constants = nullptr;              // [pairs, 3]  of the listed
+  const T* lag = nullptr;                    // [pairs, kLagScalars]  of the lagged
+  Batched<const T> kappa;                    // [B]
+  Batched<const T> bounds;                   // [B, V, 4]  center, radius
+  Batched<const T> collider, collider_prev;  // [B, Vc, 3]  during the sweeps; at the start of the step
+  Batched<const T> floor_lag;                // [B, V, planes, 4]  coefficient times normal force, normal
+  int planes = 0;
+  Batched<const T> x_prev, origin;  // [B, V, 3]; origin may be null
+  T friction_eps = T(0);            // motion in a step below which friction is smoothed [m]
+};
+
+// Where pairs leave what they add; zero at first. Slot 4 pair + i belongs to corner i, its only writer.
+template <class T>
+struct ContactAdjoints {
+  T *rows = nullptr, *lag_rows = nullptr;  // [4 pairs, 4, 3]  toward each corner
+  T* kappa = nullptr;                      // [4 pairs]
+  T* lag = nullptr;                        // [4 pairs, kLagScalars]
+  T* floor_lag = nullptr;                  // [B, V, planes, 4]
+  T* prev = nullptr;                       // [B, corners, 3]  toward the start of the step
+};
+
+template <class T>
+DIFFVBD_FN Vec3<T> vector_at(const T* p) {
+  return {p[0], p[1], p[2]};
+}
+template <class T>
+DIFFVBD_FN void add_at(T* p, const Vec3<T>& v) {
+  p[0] += v.x;
+  p[1] += v.y;
+  p[2] += v.z;
+}
+
+// The corner points of one scene; x(v) of a vertex is the backend's.
+template <class T, class Positions>
+struct Source {
+  const ContactInputs<T>& in;
+  int64_t scene;
+  const Positions& positions;
+
+  DIFFVBD_FN Vec3<T> x(int v) const {
+    return v < in.num_vertices ? positions(v)
+                               : vector_at(in.collider.data + scene * in.collider.scene + 3 * (v - in.num_vertices));
+  }
+  DIFFVBD_FN Vec3<T> x_prev(int v) const {
+    return vector_at(v < in.num_vertices
+                         ? in.x_prev.data + scene * in.x_prev.scene + int64_t{3} * v
+                         : in.collider_prev.data + scene * in.collider_prev.scene + 3 * (v - in.num_vertices));
+  }
+  DIFFVBD_FN Vec3<T> origin(int v) const {
+    if (in.origin.data == nullptr || v >= in.num_vertices) return zero3<T>();
+    return vector_at(in.origin.data + scene * in.origin.scene + int64_t{3} * v);
+  }
+  DIFFVBD_FN Corners<T> corners(const int32_t* pair) const {
+    const Vec3<T> x0 = x(pair[0]), o0 = origin(pair[0]);
+    Corners<T> out;
+    out.x[0] = zero3<T>();
+    for (int k = 1; k < 4; ++k) out.x[k] = (x(pair[k]) - x0) + (origin(pair[k]) - o0);
+    return out;
+  }
+  DIFFVBD_FN Vec3<T> motion(const int32_t* pair, const Lag<T>& a) const {
+    Vec3<T> m = zero3<T>();
+    for (int k = 0; k < 4; ++k) {
+      if (a.w[k] != T(0)) m += a.w[k] * (x(pair[k]) - x_prev(pair[k]));
+    }
+    return m;
+  }
+};
+
+// Sums the pairs of vertex v, every `stride`-th from `first` on, into g and H.
+template <class T, class Positions>
+DIFFVBD_FN void add_pairs(const Source<T, Positions>& s, int v, int first, int stride, T h, Vec3<T>& g, Sym3<T>& H) {
+  const ContactInputs<T>& in = s.in;
+  const int64_t row = s.scene * in.corners + v;
+  const T kappa = in.kappa.data[s.scene * in.kappa.scene];
+  for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
+    const int entry = in.listed.entry[e], pair = entry >> 2;
+    const int32_t* record = in.listed.pairs + int64_t{kPairIntegers} * pair;
+    const PairConstants<T> constants(in.constants + int64_t{kPairConstants} * pair);
+    add_barrier(record[4], s.corners(record), entry & 3, constants, kappa, h * h, g, H);
+  }
+  if (in.lag) {
+    for (int e = in.lagged.ptr[row] + first; e < in.lagged.ptr[row + 1]; e += stride) {
+      const int entry = in.lagged.entry[e], pair = entry >> 2;
+      const Lag<T> lag(in.lag + int64_t{kLagScalars} * pair);
+      if (!lag.active()) continue;
+      const int32_t* record = in.lagged.pairs + int64_t{kPairIntegers} * pair;
+      add_lagged(lag, entry & 3, s.motion(record, lag), h, in.friction_eps, g, H);
+    }
+  }
+  for (int k = first; k < in.planes; k += stride) {
+    const Lag<T> lag = floor_lag(s, v, k);
+    if (lag.active()) add_lagged(lag, 0, s.x(v) - s.x_prev(v), h, in.friction_eps, g, H);
+  }
+}
+
+// Friction on a floor plane: the vertex alone, about the plane's normal.
+template <class T, class Positions>
+DIFFVBD_FN Lag<T> floor_lag(const Source<T, Positions>& s, int v, int plane) {
+  const T* a = s.in.floor_lag.data + s.scene * s.in.floor_lag.scene + (int64_t{v} * s.in.planes + plane) * kFloorLag;
+  Lag<T> out;
+  out.friction = a[0], out.damping = T(0);
+  out.n = {a[1], a[2], a[3]};
+  for (int k = 0; k < 4; ++k) out.w[k] = k == 0 ? T(1) : T(0);
+  return out;
+}
+
+// The adjoint of what add_pairs summed: into the slots of the pairs, and toward v itself where it is alone.
+template <class T, class Positions>
+DIFFVBD_FN void reverse_pairs(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int v, int first,
+                              int stride, T h, const Vec3<T>& p, const Vec3<T>& d_raw, Vec3<T>& own) {
+  const ContactInputs<T>& in = s.in;
+  const int64_t row = s.scene * in.corners + v;
+  const T kappa = in.kappa.data[s.scene * in.kappa.scene];
+  for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
+    const int64_t entry = in.listed.entry[e], pair = entry >> 2;
+    const int32_t* record = in.listed.pairs + kPairIntegers * pair;
+    const PairConstants<T> constants(in.constants + kPairConstants * pair);
+    PairAdjoint<T> bar;
+    if (!reverse_barrier(record[4], s.corners(record), static_cast<int>(entry & 3), constants, kappa, h * h, p, d_raw,
+                         bar)) {
+      continue;
+    }
+    for (int k = 0; k < 4; ++k) add_at(out.rows + 12 * entry + 3 * k, bar.x[k]);
+    out.kappa[entry] += bar.kappa;
+  }
+  if (in.lag) {
+    for (int e = in.lagged.ptr[row] + first; e < in.lagged.ptr[row + 1]; e += stride) {
+      const int64_t entry = in.lagged.entry[e], pair = entry >> 2;
+      const Lag<T> lag(in.lag + kLagScalars * pair);
+      const int32_t* record = in.lagged.pairs + kPairIntegers * pair;
+      const Vec3<T> m = s.motion(record, lag);
+      Lag<T> bar;
+      const Vec3<T> m_bar = reverse_lagged(lag, static_cast<int>(entry & 3), m, h, in.friction_eps, p, d_raw, bar);
+      T* to = out.lag + kLagScalars * entry;
+      to[0] += bar.friction;
+      to[1] += bar.damping;
+      add_at(to + 2, bar.n);
+      for (int k = 0; k < 4; ++k) {
+        to[5 + k] += bar.w[k] + dot(m_bar, s.x(record[k]) - s.x_prev(record[k]));
+        add_at(out.lag_rows + 12 * entry + 3 * k, lag.w[k] * m_bar);
+      }
+    }
+  }
+  for (int k = first; k < in.planes; k += stride) {
+    Lag<T> bar;
+    const Vec3<T> m_bar =
+        reverse_lagged(floor_lag(s, v, k), 0, s.x(v) - s.x_prev(v), h, in.friction_eps, p, d_raw, bar);
+    T* to = out.floor_lag + ((s.scene * in.num_vertices + v) * in.planes + k) * kFloorLag;
+    to[0] += bar.friction;
+    add_at(to + 1, bar.n);
+    own += m_bar;
+  }
+}
+
+template <class T>
+DIFFVBD_FN void take(T* rows, const PairList& list, int64_t row, int first, int stride, Vec3<T>& sum) {
+  for (int e = list.ptr[row] + first; e < list.ptr[row + 1]; e += stride) {
+    const int64_t entry = list.entry[e], pair = entry >> 2, k = entry & 3;
+    for (int i = 0; i < 4; ++i) {
+      T* from = rows + (16 * pair + 4 * i + k) * 3;
+      sum += vector_at(from);
+      from[0] = from[1] = from[2] = T(0);
+    }
+  }
+}
+// Takes out of the slots what pairs have sent to corner point v since it was last asked for: `now` receives what belongs
+// to the state, `prev` what belongs to the start of the step.
+template <class T>
+DIFFVBD_FN void take_pairs(const ContactInputs<T>& in, const ContactAdjoints<T>& out, int64_t scene, int v, int first,
+                           int stride, Vec3<T>& now, Vec3<T>& prev) {
+  const int64_t row = scene * in.corners + v;
+  take(out.rows, in.listed, row, first, stride, now);
+  if (!in.lag) return;
+  Vec3<T> moved = zero3<T>();
+  take(out.lag_rows, in.lagged, row, first, stride, moved);
+  now += moved;
+  prev -= moved;
+}
+
+}  // namespace diffvbd::contact

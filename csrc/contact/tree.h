@@ -1,0 +1,110 @@
+// Bounding-volume trees of detection. A tree is implicit: leaves sorted along the Morton curve and padded to a power of
+// two, node i over nodes 2i and 2i + 1, leaf k at node leaves + k. Boxes are single precision whatever the scalar of a
+// scene, relative to a point of the scene and rounded outward, so that they only ever find too much.
+#pragma once
+
+#include <cstdint>
+#include <limits>
+
+#include "../core/vec.h"
+
+namespace diffvbd::contact {
+
+// Whose primitives a node holds: a mesh body, `mesh_bodies` for any collider, several of them, or none.
+constexpr int32_t kMixed = -1, kNobody = -2;
+
+struct alignas(16) Box {
+  Vec3<float> lo;
+  int32_t group;
+  Vec3<float> hi;
+  int32_t item;  // of a leaf: index of the primitive
+};
+
+// Meets nothing; what padding and primitives that are not finite have.
+DIFFVBD_FN Box empty_box() {
+  const float far = std::numeric_limits<float>::infinity();
+  return {{far, far, far}, kNobody, {-far, -far, -far}, -1};
+}
+DIFFVBD_FN bool is_empty(const Box& a) { return !(a.lo.x <= a.hi.x); }
+
+DIFFVBD_FN float lesser(float a, float b) { return a < b ? a : b; }
+DIFFVBD_FN float greater(float a, float b) { return a < b ? b : a; }
+
+DIFFVBD_FN Box hull(const Box& a, const Box& b) {
+  const int32_t group = a.group == kNobody || a.group == b.group ? b.group : b.group == kNobody ? a.group : kMixed;
+  return {{lesser(a.lo.x, b.lo.x), lesser(a.lo.y, b.lo.y), lesser(a.lo.z, b.lo.z)},
+          group,
+          {greater(a.hi.x, b.hi.x), greater(a.hi.y, b.hi.y), greater(a.hi.z, b.hi.z)},
+          -1};
+}
+
+DIFFVBD_FN void grow(Box& a, float r) {
+  a.lo = a.lo - Vec3<float>{r, r, r};
+  a.hi += Vec3<float>{r, r, r};
+}
+
+// Squared distance of two boxes [m^2].
+DIFFVBD_FN float distance2(const Box& a, const Box& b) {
+  const auto apart = [](float a_lo, float a_hi, float b_lo, float b_hi) {
+    return greater(greater(a_lo - b_hi, b_lo - a_hi), 0.0F);
+  };
+  const float x = apart(a.lo.x, a.hi.x, b.lo.x, b.hi.x), y = apart(a.lo.y, a.hi.y, b.lo.y, b.hi.y);
+  const float z = apart(a.lo.z, a.hi.z, b.lo.z, b.hi.z);
+  return x * x + y * y + z * z;
+}
+
+// Every third bit of the result is one of the lowest 21 of x.
+DIFFVBD_FN uint64_t spread_bits(uint64_t x) {
+  x = (x | x << 32) & 0x001f00000000ffff;
+  x = (x | x << 16) & 0x001f0000ff0000ff;
+  x = (x | x << 8) & 0x100f00f00f00f00f;
+  x = (x | x << 4) & 0x10c30c30c30c30c3;
+  return (x | x << 2) & 0x1249249249249249;
+}
+
+constexpr int kMostAxisBits = 16;
+
+// Place of a box's center in the bounds of its scene along the Morton curve, axis_bits <= 21 for each axis.
+DIFFVBD_FN uint64_t morton_code(const Box& a, const Box& bounds, int axis_bits) {
+  if (is_empty(a)) return 0;
+  const float cells = static_cast<float>(1 << axis_bits);
+  const auto cell = [&](float lo, float hi, float from, float to) {
+    const float at = (0.5F * (lo + hi) - from) / (to - from) * cells;  // not a number where the bounds have no length
+    return at > 0.0F ? static_cast<uint64_t>(lesser(at, cells - 1.0F)) : uint64_t{0};
+  };
+  const uint64_t x = cell(a.lo.x, a.hi.x, bounds.lo.x, bounds.hi.x);
+  const uint64_t y = cell(a.lo.y, a.hi.y, bounds.lo.y, bounds.hi.y);
+  const uint64_t z = cell(a.lo.z, a.hi.z, bounds.lo.z, bounds.hi.z);
+  return spread_bits(x) << 2 | spread_bits(y) << 1 | spread_bits(z);
+}
+
+// Power of two that holds n leaves.
+inline int32_t padded_leaves(int64_t n) {
+  int32_t leaves = 1;
+  while (leaves < n) leaves *= 2;
+  return leaves;
+}
+
+constexpr int32_t kRoot = 1;  // also the node after the last one
+
+// The node that a traversal from left to right visits after the subtree of node i.
+DIFFVBD_FN int32_t next_node(int32_t i) {
+  while (i & 1) i /= 2;
+  return i + 1;
+}
+
+// The first leaf node at or after node i, in a traversal, that is not further from the query than `reach`, or kRoot;
+// `skips(group)` says which nodes are of no interest.
+template <class Skips>
+DIFFVBD_FN int32_t find_leaf(const Box* nodes, int32_t leaves, int32_t i, const Box& query, float reach2,
+                             const Skips& skips) {
+  do {
+    const Box node = nodes[i];
+    const bool hit = distance2(node, query) <= reach2 && !skips(node.group);
+    if (hit && i >= leaves) return i;
+    i = hit ? 2 * i : next_node(i);
+  } while (i != kRoot);
+  return kRoot;
+}
+
+}  // namespace diffvbd::contact

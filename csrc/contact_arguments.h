@@ -1,0 +1,58 @@
+// The tensors of contact, as the operators of all backends take them.
+#pragma once
+
+#include "arguments.h"
+#include "contact/passes.h"
+
+namespace diffvbd {
+
+// In the order of csrc/ops.cpp. Empty: collider where there is none, lag and the lists after it where nothing is lagged,
+// floor_lag without friction on a floor.
+struct ContactTensors {
+  const Tensor &bounds, &collider, &collider_prev, &kappa, &pairs, &constants, &ptr, &entry;
+  const Tensor &lag, &lag_pairs, &lag_ptr, &lag_entry, &floor_lag;
+};
+
+inline contact::PairList pair_list(const Tensor& pairs, const Tensor& ptr, const Tensor& entry, int64_t scenes,
+                                   int64_t corners) {
+  const auto good = [](const Tensor& t) { return t.scalar_type() == ScalarType::Int && t.is_contiguous(); };
+  require(good(pairs) && good(ptr) && good(entry) && ptr.numel() == scenes * corners + 1 &&
+              pairs.numel() % contact::kPairIntegers == 0 && 4 * (pairs.numel() / contact::kPairIntegers) == entry.numel(),
+          "diffvbd: expected pairs made by contact_detect for this batch");
+  return {data<const int32_t>(pairs), data<const int32_t>(ptr), data<const int32_t>(entry)};
+}
+
+template <class T>
+contact::ContactInputs<T> contact_inputs(const ContactTensors& t, const Tensor& x, const Batched<const T>& x_prev,
+                                         const Batched<const T>& origin, double friction_eps) {
+  const int64_t b = x.size(0), v = x.size(1), colliders = t.collider.numel() ? t.collider.size(1) : 0;
+  contact::ContactInputs<T> in{};
+  in.num_vertices = static_cast<int32_t>(v);
+  in.corners = v + colliders;
+  in.listed = pair_list(t.pairs, t.ptr, t.entry, b, in.corners);
+  require(t.constants.is_contiguous() && t.constants.scalar_type() == x.scalar_type() &&
+              2 * t.constants.numel() == t.pairs.numel(),
+          "diffvbd: expected the constants of the pairs");
+  in.constants = data<const T>(t.constants);
+  if (t.lag.numel() > 0) {
+    in.lagged = pair_list(t.lag_pairs, t.lag_ptr, t.lag_entry, b, in.corners);
+    require(t.lag.is_contiguous() && t.lag.scalar_type() == x.scalar_type() &&
+                t.lag.numel() * contact::kPairIntegers == t.lag_pairs.numel() * contact::kLagScalars,
+            "diffvbd: expected the lag of the pairs");
+    in.lag = data<const T>(t.lag);
+  }
+  in.kappa = batched<T>(t.kappa, x, b, 1);
+  in.bounds = batched<T>(t.bounds, x, b, 4 * v);
+  in.collider = batched<T>(t.collider, x, b, 3 * colliders);
+  in.collider_prev = batched<T>(t.collider_prev, x, b, 3 * colliders);
+  if (t.floor_lag.numel() > 0) {
+    in.planes = static_cast<int>(t.floor_lag.numel() / t.floor_lag.size(0) / (v * contact::kFloorLag));
+    in.floor_lag = batched<T>(t.floor_lag, x, b, v * in.planes * contact::kFloorLag);
+  }
+  in.x_prev = x_prev;
+  in.origin = origin;
+  in.friction_eps = static_cast<T>(friction_eps);
+  return in;
+}
+
+}  // namespace diffvbd

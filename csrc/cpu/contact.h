@@ -1,0 +1,50 @@
+// Contact on the CPU: the passes of contact/passes.h over the blocks of a color.
+#pragma once
+
+#include "../contact/passes.h"
+#include "scene.h"
+
+namespace diffvbd {
+
+// One scene's part of a step with contact.
+template <class T>
+class ContactScene {
+ public:
+  // `reverse`: null in the forward. The records of `s` must be allocated.
+  ContactScene(const Plan& plan, const contact::ContactInputs<T>& in, const int32_t* position, int64_t scene,
+               SceneView<T>& s, T time_step, const contact::ContactAdjoints<T>* reverse);
+
+  // The pairs' part of the blocks [begin, end).
+  void assemble(int64_t begin, int64_t end) const;
+  // Reverse, before a color's turn: its vertices go back to the positions before their update, which `tape` names, and
+  // collect what pairs have sent them since their last turn.
+  void prepare(int sweep, int tape_policy, int64_t begin, int64_t end) const;
+  // Reverse, after the turn: the adjoint of assemble().
+  void reverse(int64_t begin, int64_t end) const;
+  // After the last turn: what is left for vertices, into the rows of x_bar, and for colliders [Vc, 3].
+  void finish(T* collider_bar) const;
+  // Adjoint of the bounds [V, 4], and which vertices a bound has held back [V].
+  void store_bounds(T* bounds_bar) const;
+  void store_cut(uint8_t* cut) const;
+
+ private:
+  struct Positions {
+    const T* rows;
+    const int32_t* position;
+    Vec3<T> operator()(int v) const { return contact::vector_at(rows + int64_t{4} * position[v]); }
+  };
+  template <class F>
+  void each_vertex(int64_t begin, int64_t end, const F& f) const;
+  T* record(int64_t block, int lane, int scalar) const;
+
+  const Plan& plan_;
+  const contact::ContactInputs<T>& in_;
+  const contact::ContactAdjoints<T>* reverse_;
+  const int64_t scene_;
+  SceneView<T>& s_;
+  const T h_;
+  const Positions positions_;
+  const contact::Source<T, Positions> source_;
+};
+
+}  // namespace diffvbd

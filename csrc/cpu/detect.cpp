@@ -1,0 +1,319 @@
+#include "detect.h"
+
+#include <torch/csrc/stable/ops.h>
+
+#include <algorithm>
+#include <array>
+#include <atomic>
+#include <cmath>
+#include <mutex>
+#include <utility>
+#include <vector>
+
+namespace diffvbd {
+namespace {
+
+using namespace contact;
+
+constexpr int64_t kChunk = 256;                    // queries of one piece of work
+constexpr int kDigitBits = 12, kShortSort = 2048;  // up to this many items a comparison sort is quicker
+
+struct Keyed {
+  uint64_t key;
+  int32_t item;
+};
+uint64_t key_of(const Keyed& a) { return a.key; }
+uint64_t key_of(uint64_t a) { return a; }
+bool operator<(const Keyed& a, const Keyed& b) { return a.key != b.key ? a.key < b.key : a.item < b.item; }
+
+// Stable sort by keys below 2^bits; the items of equal keys must come in ascending order.
+template <class Item>
+void sort_by_key(std::vector<Item>& items, std::vector<Item>& other, int bits) {
+  if (items.size() <= kShortSort) return std::sort(items.begin(), items.end());
+  other.resize(items.size());
+  for (int shift = 0; shift < bits; shift += kDigitBits) {
+    std::array<size_t, (size_t{1} << kDigitBits) + 1> start{};
+    const auto digit = [&](const Item& a) { return key_of(a) >> shift & ((size_t{1} << kDigitBits) - 1); };
+    for (const Item& a : items) ++start[digit(a) + 1];
+    for (size_t d = 1; d < start.size(); ++d) start[d] += start[d - 1];
+    for (const Item& a : items) other[start[digit(a)]++] = a;
+    items.swap(other);
+  }
+}
+
+int bits_of(uint64_t below) {
+  int bits = 0;
+  while (bits < 64 && below >> bits != 0) ++bits;
+  return bits;
+}
+
+// f(i) for all i < n; within a parallel region, one thread does it all.
+template <class F>
+void in_chunks(int64_t n, const F& f) {
+  torch::stable::parallel_for(0, n, kChunk, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) f(i);
+  });
+}
+
+struct Tree {
+  int32_t leaves = 1;
+  std::vector<Box> boxes, nodes;       // of the primitives in their order, and the tree's
+  std::vector<Keyed> codes, scratch;
+
+  void build() {
+    const auto n = static_cast<int64_t>(boxes.size());
+    Box bounds = empty_box();
+    for (const Box& box : boxes) bounds = hull(bounds, box);
+    codes.resize(n);
+    in_chunks(n, [&](int64_t i) {
+      codes[i] = {morton_code(boxes[i], bounds, kMostAxisBits), static_cast<int32_t>(i)};
+    });
+    sort_by_key(codes, scratch, 3 * kMostAxisBits);
+    leaves = padded_leaves(n);
+    nodes.assign(int64_t{2} * leaves, empty_box());
+    for (int64_t k = 0; k < n; ++k) nodes[leaves + k] = boxes[codes[k].item];
+    for (int32_t i = leaves - 1; i >= kRoot; --i) nodes[i] = hull(nodes[2 * i], nodes[2 * i + 1]);
+  }
+};
+
+// The near pair of a corner point: the smallest gap, then the smallest key.
+template <class T>
+struct Near {
+  std::atomic<T> gap;
+  uint64_t key;
+};
+
+// What a piece of the search finds.
+template <class T>
+struct Finds {
+  struct Pair {
+    uint64_t key;
+    T gap, dhat;
+  };
+  std::vector<Pair> pairs;  // that the list may need
+  int64_t touching = 0;
+  uint64_t first_touching = kNoKey;
+};
+
+std::array<std::mutex, 256> locks;  // of near pairs; a lock is taken only where one improves
+
+// Detection in one scene after the other, with the same memory.
+template <class T>
+class SceneDetection {
+ public:
+  explicit SceneDetection(const Surfaces<T>& in) : in_(in), near_(in.corners), reach2_(squared_reach(in)) {}
+
+  void run(int64_t scene) {
+    scene_ = scene;
+    for (Near<T>& near : near_) near.gap.store(in_.reach, std::memory_order_relaxed), near.key = kNoKey;
+    build_trees();
+    const int64_t point_chunks = (in_.num_points + kChunk - 1) / kChunk;
+    const int64_t edge_chunks = (in_.num_edges + kChunk - 1) / kChunk;
+    finds_.resize(point_chunks + edge_chunks);
+    torch::stable::parallel_for(0, point_chunks + edge_chunks, 1, [&](int64_t begin, int64_t end) {
+      for (int64_t c = begin; c < end; ++c) {
+        Finds<T>& finds = finds_[c];
+        finds.pairs.clear(), finds.touching = 0, finds.first_touching = kNoKey;
+        const bool points = c < point_chunks;
+        const int64_t first = (points ? c : c - point_chunks) * kChunk;
+        const int64_t last = std::min<int64_t>(first + kChunk, points ? in_.num_points : in_.num_edges);
+        for (int64_t q = first; q < last; ++q) {
+          points ? search_point(static_cast<int32_t>(q), finds) : search_edge(static_cast<int32_t>(q), finds);
+        }
+      }
+    });
+    select();
+  }
+
+  const std::vector<uint64_t>& listed() const { return listed_; }
+  int64_t touching() const { return touching_; }
+  uint64_t first_touching() const { return first_touching_; }
+
+  void store_near(const Detected<T>& out) const {
+    const int64_t row = scene_ * in_.corners;
+    in_chunks(in_.corners, [&](int64_t i) {
+      store_near_pair(in_, static_cast<int32_t>(i), near_[i].key, out.near_corners + kNearRow * (row + i),
+                      out.near_values + kNearValues * (row + i));
+    });
+    T smallest = in_.reach;
+    for (const Near<T>& near : near_) smallest = std::min(smallest, near.gap.load(std::memory_order_relaxed));
+    out.smallest[scene_] = smallest;
+  }
+
+ private:
+  void build_trees() {
+    const Place<T> reference = reference_point(in_, scene_);
+    triangles_.boxes.resize(in_.num_triangles), edges_.boxes.resize(in_.num_edges), points_.resize(in_.num_points);
+    in_chunks(in_.num_triangles, [&](int64_t i) {
+      triangles_.boxes[i] = primitive_box(in_, scene_, in_.triangles + 3 * i, 3, static_cast<int32_t>(i), reference);
+    });
+    in_chunks(in_.num_edges, [&](int64_t i) {
+      edges_.boxes[i] = primitive_box(in_, scene_, in_.edges + 2 * i, 2, static_cast<int32_t>(i), reference);
+    });
+    in_chunks(in_.num_points, [&](int64_t i) {
+      points_[i] = primitive_box(in_, scene_, in_.points + i, 1, static_cast<int32_t>(i), reference);
+    });
+    triangles_.build();
+    edges_.build();
+  }
+
+  // A point that is not finite meets nothing: it counts as touching, so that nobody takes the scene for a good one.
+  void search_point(int32_t i, Finds<T>& finds) {
+    const Box& query = points_[i];
+    if (is_empty(query)) {
+      ++finds.touching;
+      return;
+    }
+    const auto skips = [&](int32_t group) { return in_.ignores(query.group, group); };
+    const Box* nodes = triangles_.nodes.data();
+    int32_t node = find_leaf(nodes, triangles_.leaves, kRoot, query, reach2_, skips);
+    for (; node != kRoot; node = resume(triangles_, node, query, skips)) {
+      examine(candidate(in_, scene_, kPointTriangle, i, nodes[node].item), finds);
+    }
+    if (query.group == in_.mesh_bodies) return;
+    for (int32_t p = 0; p < in_.num_planes; ++p) examine(candidate(in_, scene_, kPointPlane, i, p), finds);
+  }
+
+  // Each pair once: an edge looks for those to the right of it in the tree.
+  void search_edge(int32_t leaf, Finds<T>& finds) {
+    const Box* nodes = edges_.nodes.data();
+    const Box query = nodes[edges_.leaves + leaf];
+    if (is_empty(query)) return;
+    const auto skips = [&](int32_t group) { return in_.ignores(query.group, group); };
+    int32_t node = resume(edges_, edges_.leaves + leaf, query, skips);
+    for (; node != kRoot; node = resume(edges_, node, query, skips)) {
+      examine(candidate(in_, scene_, kEdgeEdge, query.item, nodes[node].item), finds);
+    }
+  }
+
+  template <class Skips>
+  int32_t resume(const Tree& tree, int32_t node, const Box& query, const Skips& skips) const {
+    node = next_node(node);
+    return node == kRoot ? node : find_leaf(tree.nodes.data(), tree.leaves, node, query, reach2_, skips);
+  }
+
+  void examine(const Candidate& c, Finds<T>& finds) {
+    if (!is_considered(in_, c)) return;
+    const T gap = separation(c.kind, corners_of(in_, c)) - offset_of(in_, c);
+    if (gap >= in_.reach) return;
+    const Constants<T> constants = constants_of(in_, c);
+    if (!constants.admitted) return;
+    const uint64_t key = contact::key_of(in_, c);
+    if (!(gap > T(0))) ++finds.touching, finds.first_touching = std::min(finds.first_touching, key);
+    if (std::isnan(gap)) return;
+    for (const int32_t v : c.v) offer(near_[v], v, gap, key);
+    // No corner is nearer to anything than this pair at most: what fails now cannot be listed.
+    const T most = bound_of(in_, gap);
+    if (is_listed(gap, most, c.kind == kPointPlane ? T(0) : most, constants.dhat)) {
+      finds.pairs.push_back({key, gap, constants.dhat});
+    }
+  }
+
+  static void offer(Near<T>& near, int32_t v, T gap, uint64_t key) {
+    if (gap > near.gap.load(std::memory_order_relaxed)) return;
+    const std::lock_guard<std::mutex> lock(locks[v % locks.size()]);
+    const T old = near.gap.load(std::memory_order_relaxed);
+    if (gap > old || (gap == old && key >= near.key)) return;
+    near.gap.store(gap, std::memory_order_relaxed), near.key = key;
+  }
+
+  T bound(const Candidate& c, int from, int to) const {
+    T most = T(0);
+    for (int k = from; k < to; ++k) {
+      most = std::max(most, bound_of(in_, near_[c.v[k]].gap.load(std::memory_order_relaxed)));
+    }
+    return most;
+  }
+
+  // The list, sorted, now that all near gaps are known.
+  void select() {
+    torch::stable::parallel_for(0, static_cast<int64_t>(finds_.size()), 1, [&](int64_t begin, int64_t end) {
+      for (int64_t f = begin; f < end; ++f) {
+        auto& pairs = finds_[f].pairs;
+        const auto needless = [&](const typename Finds<T>::Pair& pair) {
+          const Candidate c = candidate_of_key(in_, pair.key);
+          const T a = bound(c, 0, c.second()), b = c.kind == kPointPlane ? T(0) : bound(c, c.second(), 4);
+          return !is_listed(pair.gap, a, b, pair.dhat);
+        };
+        pairs.erase(std::remove_if(pairs.begin(), pairs.end(), needless), pairs.end());
+      }
+    });
+    listed_.clear(), touching_ = 0, first_touching_ = kNoKey;
+    for (const Finds<T>& finds : finds_) {
+      touching_ += finds.touching, first_touching_ = std::min(first_touching_, finds.first_touching);
+      for (const auto& pair : finds.pairs) listed_.push_back(pair.key);
+    }
+    sort_by_key(listed_, scratch_, bits_of(in_.keys()));
+  }
+
+  const Surfaces<T>& in_;
+  int64_t scene_ = 0;
+  Tree triangles_, edges_;
+  std::vector<Box> points_;
+  std::vector<Near<T>> near_;
+  std::vector<Finds<T>> finds_;
+  std::vector<uint64_t> listed_, scratch_;
+  int64_t touching_ = 0;
+  uint64_t first_touching_ = kNoKey;
+  const float reach2_;
+};
+
+// ptr and entry: a stable counting sort of the pairs' corners.
+template <class T>
+void store_entries(const Surfaces<T>& in, int64_t rows, const Detected<T>& out) {
+  const int64_t corner_points = in.scenes * in.corners;
+  const auto point_of = [&](int64_t e) {
+    const int32_t* pair = out.pairs + e / 4 * kPairRow;
+    return pair[kPairRow - 1] * int64_t{in.corners} + pair[e % 4];
+  };
+  std::fill(out.ptr, out.ptr + corner_points + 1, 0);
+  for (int64_t e = 0; e < 4 * rows; ++e) ++out.ptr[point_of(e) + 1];
+  for (int64_t i = 0; i < corner_points; ++i) out.ptr[i + 1] += out.ptr[i];
+  std::vector<int32_t> next(out.ptr, out.ptr + corner_points);
+  for (int64_t e = 0; e < 4 * rows; ++e) out.entry[next[point_of(e)]++] = static_cast<int32_t>(e);
+  std::fill(out.entry + 4 * rows, out.entry + 4 * out.capacity, -1);
+}
+
+}  // namespace
+
+template <class T>
+void detect(const Surfaces<T>& in, const Detected<T>& out) {
+  std::vector<std::vector<uint64_t>> lists(in.scenes);
+  std::vector<int64_t> touching(in.scenes);
+  std::vector<uint64_t> first_touching(in.scenes);
+  const auto detect_scenes = [&](int64_t begin, int64_t end) {
+    SceneDetection<T> detection(in);
+    for (int64_t b = begin; b < end; ++b) {
+      detection.run(b);
+      detection.store_near(out);
+      lists[b] = detection.listed();
+      touching[b] = detection.touching(), first_touching[b] = detection.first_touching();
+    }
+  };
+  // With few scenes, threads share each.
+  if (in.scenes < torch::stable::get_num_threads()) {
+    detect_scenes(0, in.scenes);
+  } else {
+    torch::stable::parallel_for(0, in.scenes, 1, detect_scenes);
+  }
+
+  std::vector<uint64_t> keys;
+  int64_t touches = 0;
+  uint64_t first = kNoKey;
+  for (int64_t b = 0; b < in.scenes; ++b) {
+    keys.insert(keys.end(), lists[b].begin(), lists[b].end());
+    touches += touching[b], first = std::min(first, first_touching[b]);
+  }
+  const auto needed = static_cast<int64_t>(keys.size()), rows = std::min(needed, out.capacity);
+  in_chunks(out.capacity, [&](int64_t i) {
+    store_listed_pair(in, i < rows ? keys[i] : kNoKey, out.pairs + kPairRow * i, out.constants + kConstants * i);
+  });
+  store_entries(in, rows, out);
+  out.counts[0] = needed, out.counts[1] = touches;
+  out.counts[2] = first == kNoKey ? -1 : static_cast<int64_t>(first), out.counts[3] = 0;
+}
+
+template void detect<float>(const Surfaces<float>&, const Detected<float>&);
+template void detect<double>(const Surfaces<double>&, const Detected<double>&);
+
+}  // namespace diffvbd

@@ -1,0 +1,363 @@
+// Kernels of contact: kShare threads for each vertex of a color, for each corner point, or a thread for each pair.
+#pragma once
+
+#include "../contact/lag.h"
+#include "contact.h"
+#include "group.cuh"
+
+namespace diffvbd::cuda {
+namespace {
+
+using contact::ContactAdjoints;
+using contact::ContactInputs;
+
+constexpr int kShare = 8, kContactThreads = 128;
+
+template <class T>
+struct SweepRows {
+  const T* rows;
+  const int32_t* position;
+  __device__ __forceinline__ Vec3<T> operator()(int v) const {
+    return load_row(rows, __ldg(position + v));
+  }
+};
+template <class T>
+struct UserRows {
+  const T* x;
+  __device__ __forceinline__ Vec3<T> operator()(int v) const { return contact::vector_at(x + int64_t{3} * v); }
+};
+
+template <class T>
+__device__ __forceinline__ void sum_share(T& a) {
+#pragma unroll
+  for (int offset = kShare / 2; offset > 0; offset /= 2) a += __shfl_xor_sync(kWholeWarp, a, offset);
+}
+template <class T>
+__device__ __forceinline__ void sum_share(Vec3<T>& a) {
+  sum_share(a.x), sum_share(a.y), sum_share(a.z);
+}
+template <class T>
+__device__ __forceinline__ void sum_share(Sym3<T>& a) {
+  sum_share(a.xx), sum_share(a.xy), sum_share(a.xz), sum_share(a.yy), sum_share(a.yz), sum_share(a.zz);
+}
+
+// Which of kShare threads of which vertex of the blocks [begin, end) a thread is.
+template <class T>
+struct Member {
+  int lane, vertex = -1;  // -1: a phantom, or beyond the end
+  int64_t local = 0, scene = 0, position = 0;
+  bool touches = false;
+  __device__ __forceinline__ Member(const StepView<T>& s, const ContactInputs<T>& in, int64_t begin, int64_t end) {
+    const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x, item = i / kShare;
+    const int64_t size = (end - begin) * kSlice;
+    lane = static_cast<int>(i % kShare);
+    local = item / size;
+    if (local >= s.scenes) return;
+    position = begin * kSlice + (item - local * size);
+    scene = s.base + local;
+    vertex = __ldg(s.plan.order + position);
+    if (vertex < 0) return;
+    const int64_t row = scene * in.corners + vertex;
+    touches = __ldg(in.listed.ptr + row) < __ldg(in.listed.ptr + row + 1) || in.planes > 0 ||
+              (in.lag && __ldg(in.lagged.ptr + row) < __ldg(in.lagged.ptr + row + 1));
+  }
+  __device__ __forceinline__ int64_t row(const StepView<T>& s) const { return local * s.positions + position; }
+  __device__ __forceinline__ SweepRows<T> rows(const StepView<T>& s) const {
+    return {s.w.x + local * s.positions * kRow, s.w.position};
+  }
+};
+
+template <class T>
+__global__ void load_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i >= s.scenes * s.positions) return;
+  const int64_t local = i / s.positions, position = i - local * s.positions;
+  const int own = __ldg(s.plan.order + position);
+  const int vertex = own < 0 ? __ldg(s.plan.order + position / kSlice * kSlice) : own;
+  if (local == 0 && own >= 0) s.w.position[own] = static_cast<int32_t>(position);
+  const T* bound = in.bounds.data + (s.base + local) * in.bounds.scene + int64_t{4} * max(0, vertex);
+  T* record = s.w.contact + i * kContactRecord;
+  for (int k = 0; k < kContactScalars; ++k) record[k] = k < 9 || vertex < 0 ? T(0) : bound[k - 9];
+}
+
+template <class T>
+__global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
+                                 int64_t begin, int64_t end) {
+  const Member<T> at(s, in, begin, end);
+  if (!__any_sync(kWholeWarp, at.touches)) return;
+  Vec3<T> g = zero3<T>();
+  Sym3<T> H = diagonal(T(0));
+  if (at.touches) {
+    const SweepRows<T> rows = at.rows(s);
+    const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
+    contact::add_pairs(source, at.vertex, at.lane, kShare, s.parameters.time_step, g, H);
+  }
+  sum_share(g), sum_share(H);
+  if (!at.touches || at.lane != 0) return;
+  const T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
+  for (int k = 0; k < 9; ++k) s.w.contact[at.row(s) * kContactRecord + k] = values[k];
+}
+
+template <class T>
+__device__ __forceinline__ void add_row(T* rows, int64_t row, const Vec3<T>& a) {
+  contact::add_at(rows + kRow * row, a);
+}
+
+template <class T>
+__global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
+                                const __grid_constant__ ContactAdjoints<T> slots, int sweep, int rows_of_tape,
+                                int64_t begin, int64_t end) {
+  const Member<T> at(s, in, begin, end);
+  if (at.vertex >= 0 && at.lane == 0) {
+    const int64_t active = s.plan.num_active;
+    const int rank = __ldg(s.plan.block_rank + at.position / kSlice) + static_cast<int>(at.position % kSlice);
+    const T* from = s.tape + (at.local * s.sweeps + sweep) * rows_of_tape * active + rank;
+    store_row(s.w.x, at.row(s), Vec3<T>{from[0], from[active], from[2 * active]});
+  }
+  if (!__any_sync(kWholeWarp, at.touches)) return;
+  Vec3<T> now = zero3<T>(), prev = zero3<T>();
+  if (at.touches) contact::take_pairs(in, slots, at.scene, at.vertex, at.lane, kShare, now, prev);
+  sum_share(now), sum_share(prev);
+  if (!at.touches || at.lane != 0) return;
+  add_row(s.w.x_bar, at.row(s), now);
+  contact::add_at(slots.prev + 3 * (at.scene * in.corners + at.vertex), prev);
+}
+
+template <class T>
+__global__ void reverse_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
+                                const __grid_constant__ ContactAdjoints<T> slots, int64_t begin, int64_t end) {
+  const Member<T> at(s, in, begin, end);
+  if (!__any_sync(kWholeWarp, at.touches)) return;
+  Vec3<T> own = zero3<T>();
+  if (at.touches) {
+    const T* turn = s.w.turn + 6 * at.row(s);
+    const SweepRows<T> rows = at.rows(s);
+    const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
+    contact::reverse_pairs(source, slots, at.vertex, at.lane, kShare, s.parameters.time_step,
+                           contact::vector_at(turn), contact::vector_at(turn + 3), own);
+  }
+  if (in.planes == 0) return;
+  sum_share(own);
+  if (!at.touches || at.lane != 0) return;
+  add_row(s.w.x_bar, at.row(s), own);
+  contact::add_at(slots.prev + 3 * (at.scene * in.corners + at.vertex), -own);
+}
+
+template <class T>
+__global__ void collect_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
+                                const __grid_constant__ ContactAdjoints<T> slots, T* collider_bar) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x, item = i / kShare;
+  const int64_t local = item / in.corners, corner = item - local * in.corners, scene = s.base + local;
+  const bool there = local < s.scenes;
+  Vec3<T> now = zero3<T>(), prev = zero3<T>();
+  if (there) {
+    contact::take_pairs(in, slots, scene, static_cast<int>(corner), static_cast<int>(i % kShare), kShare, now, prev);
+  }
+  sum_share(now), sum_share(prev);
+  if (!there || i % kShare != 0) return;
+  if (corner < in.num_vertices) {
+    add_row(s.w.x_bar, local * s.positions + s.w.position[corner], now);
+  } else {
+    T* to = collider_bar + 3 * (scene * (in.corners - in.num_vertices) + corner - in.num_vertices);
+    to[0] = now.x, to[1] = now.y, to[2] = now.z;
+  }
+  contact::add_at(slots.prev + 3 * (scene * in.corners + corner), prev);
+}
+
+template <class T>
+__global__ void store_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
+                              const __grid_constant__ StepAdjoints<T> out, const T* prev) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  const int64_t local = i / in.corners, corner = i - local * in.corners, scene = s.base + local;
+  if (local >= s.scenes) return;
+  const Vec3<T> own = contact::vector_at(prev + 3 * (scene * in.corners + corner));
+  if (corner >= in.num_vertices) {
+    T* to = out.collider_prev + 3 * (scene * (in.corners - in.num_vertices) + corner - in.num_vertices);
+    to[0] = own.x, to[1] = own.y, to[2] = own.z;
+    return;
+  }
+  contact::add_at(out.x_prev + 3 * (scene * in.num_vertices + corner), own);
+  const T* bar = s.w.bound_bar + 4 * (local * s.positions + s.w.position[corner]);
+  for (int k = 0; k < 4; ++k) out.bounds[4 * (scene * in.num_vertices + corner) + k] = bar[k];
+}
+
+// kappa of each scene: one block, in an order fixed by the number of pairs
+template <class T>
+__global__ void sum_kappa(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
+                          const T* slots, T* kappa_bar) {
+  __shared__ T part[kContactThreads];
+  const int64_t scene = s.base + blockIdx.x;
+  T sum = T(0);
+  for (int64_t i = in.listed.ptr[scene * in.corners] + static_cast<int64_t>(threadIdx.x);
+       i < in.listed.ptr[(scene + 1) * in.corners]; i += kContactThreads) {
+    sum += slots[i];
+  }
+  part[threadIdx.x] = sum;
+  for (int half = kContactThreads / 2; half > 0; half /= 2) {
+    __syncthreads();
+    if (threadIdx.x < half) part[threadIdx.x] += part[threadIdx.x + half];
+  }
+  if (threadIdx.x == 0) kappa_bar[scene] = part[0];
+}
+
+template <class T>
+__global__ void sum_lag_slots(const T* slots, int64_t items, T* lag) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i >= items) return;
+  const int64_t pair = i / contact::kLagScalars, scalar = i - pair * contact::kLagScalars;
+  T sum = T(0);
+  for (int k = 0; k < 4; ++k) sum += slots[(4 * pair + k) * contact::kLagScalars + scalar];
+  lag[i] = sum;
+}
+
+// A pair that is in the list, with what its lag depends on.
+template <class T>
+struct LagPair {
+  const int32_t* record;
+  contact::PairConstants<T> constants;
+  T kappa;
+  contact::Corners<T> corners;
+  __device__ __forceinline__ LagPair(const ContactInputs<T>& in, const T* x, int64_t pair)
+      : record(in.listed.pairs + contact::kPairIntegers * pair),
+        constants(in.constants + contact::kPairConstants * pair),
+        kappa(in.kappa.data[record[5] * in.kappa.scene]) {
+    const UserRows<T> rows{x + static_cast<int64_t>(record[5]) * 3 * in.num_vertices};
+    corners = contact::Source<T, UserRows<T>>{in, record[5], rows}.corners(record);
+  }
+};
+
+template <class T>
+__global__ void lag_forward(const __grid_constant__ ContactInputs<T> in, const T* x, int64_t scenes, int64_t pairs,
+                            T* values) {
+  const int64_t pair = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (pair >= pairs) return;
+  T* to = values + contact::kLagScalars * pair;
+  if (4 * pair >= in.listed.ptr[scenes * in.corners]) {
+    for (int k = 0; k < contact::kLagScalars; ++k) to[k] = T(0);
+    return;
+  }
+  const LagPair<T> at(in, x, pair);
+  contact::store_lag(contact::lag_state(at.record[4], at.corners, at.constants, at.kappa), to);
+}
+
+template <class T>
+__global__ void lag_reverse(const __grid_constant__ ContactInputs<T> in, const T* x, int64_t scenes, int64_t pairs,
+                            const T* bar, T* slots) {
+  const int64_t pair = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (pair >= pairs || 4 * pair >= in.listed.ptr[scenes * in.corners]) return;
+  const LagPair<T> at(in, x, pair);
+  contact::PairAdjoint<T> out;
+  contact::reverse_lag(at.record[4], at.corners, at.constants, at.kappa, bar + contact::kLagScalars * pair, out);
+  for (int k = 0; k < 4; ++k) {
+    T* to = slots + 4 * (4 * pair + k);
+    to[0] = out.x[k].x, to[1] = out.x[k].y, to[2] = out.x[k].z, to[3] = k == 0 ? out.kappa : T(0);
+  }
+}
+
+// By corner point: what its pairs' corners have received.
+template <class T>
+__global__ void lag_collect(const __grid_constant__ ContactInputs<T> in, int64_t scenes, const T* slots, T* x_bar,
+                            T* collider_bar) {
+  const int64_t row = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (row >= scenes * in.corners) return;
+  Vec3<T> sum = zero3<T>();
+  for (int e = in.listed.ptr[row]; e < in.listed.ptr[row + 1]; ++e) {
+    sum += contact::vector_at(slots + int64_t{4} * in.listed.entry[e]);
+  }
+  const int64_t scene = row / in.corners, corner = row - scene * in.corners, colliders = in.corners - in.num_vertices;
+  T* to = corner < in.num_vertices ? x_bar + 3 * (scene * in.num_vertices + corner)
+                                   : collider_bar + 3 * (scene * colliders + corner - in.num_vertices);
+  to[0] = sum.x, to[1] = sum.y, to[2] = sum.z;
+}
+
+template <class T>
+__global__ void lag_kappa(const __grid_constant__ ContactInputs<T> in, const T* slots, T* kappa_bar) {
+  __shared__ T part[kContactThreads];
+  const int64_t scene = blockIdx.x;
+  T sum = T(0);
+  for (int64_t i = in.listed.ptr[scene * in.corners] + static_cast<int64_t>(threadIdx.x);
+       i < in.listed.ptr[(scene + 1) * in.corners]; i += kContactThreads) {
+    sum += slots[4 * i + 3];
+  }
+  part[threadIdx.x] = sum;
+  for (int half = kContactThreads / 2; half > 0; half /= 2) {
+    __syncthreads();
+    if (threadIdx.x < half) part[threadIdx.x] += part[threadIdx.x + half];
+  }
+  if (threadIdx.x == 0) kappa_bar[scene] = part[0];
+}
+
+template <class... P, class... A>
+cudaError_t launch_contact(void (*kernel)(P...), int64_t items, cudaStream_t stream, A... arguments) {
+  if (items == 0) return cudaSuccess;
+  void* pointers[] = {&arguments...};
+  const unsigned blocks = static_cast<unsigned>((items + kContactThreads - 1) / kContactThreads);
+  return cudaLaunchKernel(reinterpret_cast<const void*>(kernel), dim3(blocks), dim3(kContactThreads), pointers, 0,
+                          stream);
+}
+
+}  // namespace
+
+template <class T>
+cudaError_t ContactPasses<T>::load() const {
+  return launch_contact(load_contact<T>, s.scenes * s.positions, stream, s, in);
+}
+template <class T>
+cudaError_t ContactPasses<T>::assemble(int64_t begin, int64_t end) const {
+  return launch_contact(assemble_contact<T>, s.scenes * (end - begin) * kSlice * kShare, stream, s, in, begin, end);
+}
+template <class T>
+cudaError_t ContactPasses<T>::prepare(int sweep, int64_t begin, int64_t end) const {
+  return launch_contact(prepare_contact<T>, s.scenes * (end - begin) * kSlice * kShare, stream, s, in, *out->contact,
+                        sweep, tape_rows(s.tape_policy, true), begin, end);
+}
+template <class T>
+cudaError_t ContactPasses<T>::reverse(int64_t begin, int64_t end) const {
+  return launch_contact(reverse_contact<T>, s.scenes * (end - begin) * kSlice * kShare, stream, s, in, *out->contact,
+                        begin, end);
+}
+template <class T>
+cudaError_t ContactPasses<T>::collect() const {
+  return launch_contact(collect_contact<T>, s.scenes * in.corners * kShare, stream, s, in, *out->contact,
+                        out->collider);
+}
+template <class T>
+cudaError_t ContactPasses<T>::store() const {
+  const T *prev = out->contact->prev, *slots = out->contact->kappa;
+  if (auto error = launch_contact(store_contact<T>, s.scenes * in.corners, stream, s, in, *out, prev)) return error;
+  return launch_contact(sum_kappa<T>, s.scenes * kContactThreads, stream, s, in, slots, out->kappa);
+}
+
+template <class T>
+cudaError_t sum_lag(const ContactAdjoints<T>& slots, int64_t pairs, T* lag, cudaStream_t stream) {
+  const int64_t items = pairs * contact::kLagScalars;
+  const T* from = slots.lag;
+  return launch_contact(sum_lag_slots<T>, items, stream, from, items, lag);
+}
+
+template <class T>
+cudaError_t pair_lag(const ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs, T* values,
+                     cudaStream_t stream) {
+  return launch_contact(lag_forward<T>, pairs, stream, in, x, scenes, pairs, values);
+}
+
+template <class T>
+cudaError_t pair_lag_backward(const ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs, const T* bar,
+                              T* slots, T* x_bar, T* collider_bar, T* kappa_bar, cudaStream_t stream) {
+  if (auto error = launch_contact(lag_reverse<T>, pairs, stream, in, x, scenes, pairs, bar, slots)) return error;
+  const T* from = slots;
+  if (auto error = launch_contact(lag_collect<T>, scenes * in.corners, stream, in, scenes, from, x_bar, collider_bar))
+    return error;
+  return launch_contact(lag_kappa<T>, scenes * kContactThreads, stream, in, from, kappa_bar);
+}
+
+}  // namespace diffvbd::cuda
+
+#define DIFFVBD_INSTANTIATE_CONTACT(T)                                                                                \
+  template struct diffvbd::cuda::ContactPasses<T>;                                                                    \
+  template cudaError_t diffvbd::cuda::sum_lag<T>(const diffvbd::contact::ContactAdjoints<T>&, int64_t, T*,            \
+                                                 cudaStream_t);                                                       \
+  template cudaError_t diffvbd::cuda::pair_lag<T>(const diffvbd::contact::ContactInputs<T>&, const T*, int64_t,       \
+                                                  int64_t, T*, cudaStream_t);                                         \
+  template cudaError_t diffvbd::cuda::pair_lag_backward<T>(const diffvbd::contact::ContactInputs<T>&, const T*,       \
+                                                           int64_t, int64_t, const T*, T*, T*, T*, T*, cudaStream_t);

@@ -1,0 +1,3 @@
+#include "contact.cuh"
+
+DIFFVBD_INSTANTIATE_CONTACT(double)

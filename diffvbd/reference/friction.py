@@ -1,0 +1,64 @@
+"""Smoothed Coulomb friction with the normal force and the normal of the start of the step (Li et al. 2020)."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .distance import log_barrier
+from .energies import FloorBarrier
+from .layout import dot, outer6, take
+from .scene import Scene
+
+
+def smoothed(slip: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    """f0(|u|) [m] of slips u [..., 3, n] and f = f0'(|u|) / |u| [1/m]: quadratic below `reach`, Coulomb's |u| above."""
+    square = dot(slip, slip)
+    moves = square > 0
+    length = torch.where(moves, torch.where(moves, square, 1.0).sqrt(), 0.0)  # its derivative at 0 is taken as 0
+    slow = length < reach
+    potential = torch.where(slow, length**2 / reach - length**3 / (3 * reach**2) + reach / 3, length)
+    return potential, torch.where(slow, (2 - length / reach) / reach, 1 / torch.where(slow, 1.0, length))
+
+
+def tangential6(normal: Tensor) -> Tensor:
+    """Upper triangle of I - n n^T: [..., 3, n] -> [..., 6, n]."""
+    return normal.new_tensor([1, 0, 0, 1, 0, 1])[:, None] - outer6(normal)
+
+
+class FloorFriction:
+    """mu_f lambda f0(|u|) per plane: lambda the barrier's force at x_prev, u the slip since x_prev."""
+
+    def __init__(self, scene: Scene, floor: FloorBarrier) -> None:
+        friction = scene.model.friction
+        self.scene, self.floor = scene, floor
+        self.coefficient = scene.parameter("friction", friction, "coefficient")[..., None, None]
+        self.reach = scene.time_step * friction.velocity
+
+    def _terms(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
+        """h^2 times the friction that full slip meets [..., planes, n], and the slip [..., planes, 3, n]."""
+        floor, x_prev = self.floor, x_prev.unsqueeze(-3)
+        gap = dot(floor.normal, x_prev) - floor.height
+        _, first, _ = log_barrier(gap, floor.kappa, floor.dhat)
+        travel = x.unsqueeze(-3) - x_prev
+        slip = travel - floor.normal * dot(floor.normal, travel).unsqueeze(-2)
+        return -(self.scene.time_step**2) * self.coefficient * first, slip
+
+    def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
+        vertices = self.scene.layout.colors[k].vertices
+        weight, slip = self._terms(take(x, vertices), take(x_prev, vertices))
+        weight = (weight * smoothed(slip, self.reach)[1]).unsqueeze(-2)
+        across = tangential6(self.floor.normal)
+        return torch.cat(((weight * slip).sum(-3), (weight * across).sum(-3)), -2)
+
+    def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+        free = ~self.scene.model.pinned
+        weight, slip = self._terms(x[..., free], x_prev[..., free])
+        return (weight * smoothed(slip, self.reach)[0]).sum((-2, -1))
+
+
+def floor_friction(scene: Scene, energies: list[Any]) -> list[FloorFriction]:
+    """The friction of the floor among `energies`, where the model has both."""
+    if getattr(scene.model, "friction", None) is None:
+        return []
+    return [FloorFriction(scene, energy) for energy in energies if isinstance(energy, FloorBarrier)]

@@ -1,0 +1,203 @@
+"""Scenes with contact, and the two executions of a rollout that the tests compare: compiled, and autograd through the
+reference with the detections of the compiled one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import colliders, mesh
+from diffvbd.reference import contact as reference
+from diffvbd.testing import generator
+
+GRAVITY = (0.3, -9.81, 0.2)
+
+
+@dataclass
+class Scene:
+    """A Model with contact and everything that a step is differentiated in; tensors of float64 on the CPU."""
+
+    model: dv.Model
+    x: Tensor
+    v: Tensor
+    time_step: float = 1 / 100
+    inputs: dict[str, Any] = field(default_factory=dict)  # mu, lam, force, prescribed, colliders, ...
+    parameters: dict[str, Tensor] = field(default_factory=dict)
+
+    def leaves(self) -> dict[str, Tensor]:
+        """Fresh differentiable copies of all inputs, parameters by their names."""
+        given = {"x": self.x, "v": self.v, **self.inputs, **self.parameters}
+        return {name: value.detach().clone().requires_grad_() for name, value in given.items()}
+
+
+def noise(*key: Any, shape: Sequence[int], size: float) -> Tensor:
+    return torch.from_numpy(generator("contact", *key).normal(scale=size, size=tuple(shape)))
+
+
+def boxes(*offsets: tuple[float, float, float], points: Any = 3, size: Any = 0.2) -> mesh.TetMesh:
+    return mesh.join([mesh.box(points, size).translate(offset) for offset in offsets])
+
+
+def build(name: str, tets: mesh.TetMesh, energies: Sequence[Any], speed: float = 0.1, **options: Any) -> Scene:
+    """Bodies slightly out of shape, moving a little, of soft material that differs from tet to tet."""
+    batch = options.pop("batch", ())
+    scene_options = {k: options.pop(k) for k in ("time_step",) if k in options}
+    jitter = options.pop("jitter", 2e-3)
+    model = dv.Model(tets, energies=(dv.StableNeoHookean(), *energies), **options)
+    shape = (*batch, model.num_vertices, 3)
+    x = torch.from_numpy(tets.points.copy()) + noise(name, "x", shape=shape, size=jitter)
+    v = noise(name, "v", shape=shape, size=speed)
+    tet_shape = (*batch, model.num_tets)
+    inputs = {
+        "mu": 2e4 * torch.exp(noise(name, "mu", shape=tet_shape, size=0.2)),
+        "lam": 4e4 * torch.exp(noise(name, "lam", shape=tet_shape, size=0.2)),
+        "force": noise(name, "force", shape=shape, size=0.5),
+        "density": 1000 * torch.exp(noise(name, "density", shape=tet_shape, size=0.1)),
+    }
+    constants = {f"{e.name}.{k}": v for e in model.parametric_energies for k, v in model.constants(e).items()}
+    wanted = ("pair_barrier.kappa", "pair_barrier.damping", "friction.coefficient", "floor_barrier.kappa",
+              "floor_barrier.height")  # fmt: skip
+    parameters = {k: v.clone() for k, v in constants.items() if k in wanted}
+    return Scene(model, x, v, inputs=inputs, parameters=parameters, **scene_options)
+
+
+def stacked() -> Scene:
+    """A box that has landed on a box on the floor, a little turned: faces, edges and corners touch."""
+    energies = (dv.FloorBarrier(height=-0.015, kappa=3e4, dhat=0.02, damping=2.0),
+                dv.PairBarrier(kappa=3e4, dhat=0.02, damping=3.0), dv.Friction(0.4, 0.05))  # fmt: skip
+    scene = build("stacked", boxes((0, 0, 0), (0.03, 0.213, 0.02)), energies, jitter=3e-3)
+    scene.v[27:] += torch.tensor([0.4, -0.8, 0.2])
+    return scene
+
+
+def crossed() -> Scene:
+    """Two beams that cross like the sticks of a fire: edges meet edges, inside a bounded motion."""
+    tets = mesh.join([mesh.box((5, 2, 2), (0.4, 0.08, 0.08)),
+                      mesh.box((2, 2, 5), (0.08, 0.08, 0.4)).translate((0.163, 0.094, -0.157))])  # fmt: skip
+    scene = build("crossed", tets, (dv.PairBarrier(kappa=1e4, dhat=0.03, damping=1.0), dv.Friction(0.3, 0.1)),
+                  jitter=4e-3)  # fmt: skip
+    scene.v[:, 1] += torch.where(scene.model.body == 0, 1.5, -1.5)
+    return scene
+
+
+def fast() -> Scene:
+    """Two boxes at 12 m/s against each other, with spin: bounds hold most vertices back."""
+    scene = build("fast", boxes((0, 0, 0), (0.05, 0.23, 0.03)), (dv.PairBarrier(kappa=1e4, dhat=0.02, detections=3),
+                                                                dv.Friction(0.2, 0.1)))  # fmt: skip
+    turning = torch.linalg.cross(scene.x - scene.x.mean(0), torch.tensor([[3.0, 9.0, -5.0]], dtype=torch.float64), dim=-1)
+    scene.v += turning
+    scene.v[27:, 1] -= 12.0
+    scene.v[:27, 1] += 12.0
+    return scene
+
+
+def folded() -> Scene:
+    """A thin strip folded over itself: self-contact, and pairs that are closer than dhat at rest."""
+    tets = mesh.box((9, 2, 3), (0.8, 0.02, 0.2))
+    scene = build("folded", tets, (dv.PairBarrier(kappa=5e3, dhat=0.03, damping=0.5),), jitter=0.0)
+    points = scene.x.clone()
+    radius, bend = 0.02, torch.pi
+    along = points[:, 0] - 0.4
+    angle = (along / radius).clamp(0, bend)
+    beyond = (along - bend * radius).clamp(min=0)
+    height = points[:, 1] + radius - 0.01
+    turned_x = 0.4 + torch.where(along > 0, height.new_tensor(0.0), along) + (radius + 0.01) * torch.sin(angle) - beyond
+    middle = 0.02
+    offset = points[:, 1] - 0.01
+    turned_y = middle - (middle - offset) * torch.cos(angle)
+    scene.x = torch.stack([turned_x, turned_y, points[:, 2]], 1) + noise("folded", shape=points.shape, size=5e-4)
+    return scene
+
+
+def obstacles() -> Scene:
+    """A box among a sphere, a capsule, a wedge and a plane, all moving; some vertices are prescribed."""
+    wedge = colliders.Obstacle([[-0.02, 0.1, 0.24], [0.22, 0.1, 0.24], [0.1, 0.32, 0.25]], [[0, 1, 2]])
+    things = (colliders.Sphere((0.1, -0.061, 0.1), 0.05), colliders.Capsule((0.31, 0.0, 0.0), (0.31, 0.2, 0.1), 0.1),
+              wedge, colliders.Plane((0, 0, -0.012), (0.02, 0.03, 1.0)))  # fmt: skip
+    barrier = dv.PairBarrier(kappa=2e4, dhat=0.03, self_contact=False, damping=2.0)
+    scene = build("obstacles", boxes((0, 0, 0)), (barrier, dv.Friction(0.5, 0.05)), colliders=things, pinned=[8, 17],
+                  jitter=1e-3)  # fmt: skip
+    points = scene.model.collider_points
+    scene.inputs["colliders_before"] = points + noise("obstacles", "before", shape=points.shape, size=2e-4)
+    moved = noise("obstacles", "move", shape=points.shape, size=5e-4)
+    scene.inputs["colliders"] = scene.inputs["colliders_before"] + moved
+    scene.inputs["prescribed"] = scene.x + noise("obstacles", "held", shape=scene.x.shape, size=5e-4)
+    return scene
+
+
+def batched() -> Scene:
+    """Three scenes of two boxes, each with its own material and parameters."""
+    scene = build("batched", boxes((0, 0, 0), (0.04, 0.212, -0.03), points=2), (
+        dv.FloorBarrier(height=-0.012, kappa=2e4, dhat=0.02), dv.PairBarrier(kappa=2e4, dhat=0.02, damping=1.0),
+        dv.Friction(0.3, 0.05)), batch=(3,), jitter=4e-3)  # fmt: skip
+    for name in ("pair_barrier.kappa", "pair_barrier.damping", "friction.coefficient"):
+        scene.parameters[name] = scene.parameters[name] * torch.tensor([0.8, 1.0, 1.3], dtype=torch.float64)
+    return scene
+
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    f.__name__: f for f in (stacked, crossed, fast, folded, obstacles, batched)
+}
+
+
+def part_of(detection: Any) -> reference.Part:
+    """Index data of a detection as the reference takes it."""
+    count = int(detection.counts[0])
+    return reference.Part(detection.listed.pairs[:count].cpu().long(), detection.listed.constants[:count].cpu(),
+                          detection.near_corners.cpu().long(), detection.island.cpu().long())  # fmt: skip
+
+
+def split(leaves: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Arguments of a step, and its parameters."""
+    parameters = {k: v for k, v in leaves.items() if "." in k}
+    return {k: v for k, v in leaves.items() if "." not in k}, parameters
+
+
+def objective(x: Tensor, v: Tensor) -> Tensor:
+    """A sum that weighs every component of the end state differently."""
+    weights = [noise("objective", name, shape=x.shape, size=1.0).to(x) for name in ("x", "v")]
+    return (weights[0] * x).sum() + 1e-2 * (weights[1] * v).sum()
+
+
+def compiled(scene: Scene, steps: int, sweeps: int, tape: str = "full", model: dv.Model | None = None
+             ) -> tuple[dict[str, Tensor], list[reference.Part]]:  # fmt: skip
+    """End state and gradients of the package's steps, and the detections of all of them."""
+    model = scene.model if model is None else model
+    leaves = {k: v.detach().to(model.device, model.dtype).requires_grad_() for k, v in scene.leaves().items()}
+    options, parameters = split(leaves)
+    x, v = options.pop("x"), options.pop("v")
+    with dv.contact.record() as found:
+        for _ in range(steps):
+            x, v = dv.step(model, x, v, time_step=scene.time_step, sweeps=sweeps, gravity=GRAVITY, parameters=parameters,
+                           adjoint=dv.ReverseSweep(tape=tape), **options)  # fmt: skip
+    return _result(x, v, leaves), [part_of(d) for d in found]
+
+
+def unrolled(scene: Scene, steps: int, sweeps: int, parts: list[reference.Part], seed: int | None = None
+             ) -> dict[str, Tensor]:  # fmt: skip
+    """The same by autograd through the reference; ``seed`` permutes pairs and tets, which changes rounding alone."""
+    leaves = scene.leaves()
+    options, parameters = split(leaves)
+    x, v = options.pop("x"), options.pop("v")
+    count = len(parts) // steps
+    for n in range(steps):
+        own = parts[n * count : (n + 1) * count]
+        order = tets = None
+        if seed is not None:
+            rng = generator("order", seed)
+            order = [torch.from_numpy(rng.permutation(len(p.pairs))) for p in own]
+            tets = torch.from_numpy(rng.permutation(scene.model.num_tets))
+        x, v = reference.contact_step(scene.model, x, v, time_step=scene.time_step, sweeps=sweeps, gravity=GRAVITY,
+                                      parameters=parameters, parts=own, order=order, tet_order=tets, **options)  # fmt: skip
+    return _result(x, v, leaves)
+
+
+def _result(x: Tensor, v: Tensor, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+    grads = torch.autograd.grad(objective(x, v), list(leaves.values()), allow_unused=True, materialize_grads=True)
+    out = {"x": x, "v": v, **{f"grad_{k}": g for k, g in zip(leaves, grads, strict=True)}}
+    return {k: t.detach().cpu() for k, t in out.items()}
