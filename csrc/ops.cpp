@@ -29,7 +29,7 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "held, Tensor mu, Tensor lam, Tensor mass, Tensor rest, Tensor tape, Tensor plan, int[] sizes, int energies, "
       "int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> (Tensor x, "
       "Tensor v, Tensor acceleration, Tensor held, Tensor mu, Tensor lam, Tensor mass, Tensor rest)");
-  // The same with contact, of pairs made by contact_detect: see contact_arguments.h and contact/passes.h for the shapes.
+  // The same with contact, of pairs made by contact_detect: see arguments_contact.h and contact/passes.h for the shapes.
   // cut [scenes, vertices]: 1 where a bound has held back an update.
   m.def(
       "contact_sweep(Tensor x_start, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, "
@@ -46,6 +46,10 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> (Tensor x_start, "
       "Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, Tensor energy_data, Tensor bounds, "
       "Tensor collider, Tensor collider_prev, Tensor kappa, Tensor lag, Tensor floor_lag)");
+  // The lowest vertex above each plane of a floor, of the island that a body is in; planes as in the data of FloorBarrier
+  m.def(
+      "contact_lowest(Tensor x, Tensor origin, Tensor planes, Tensor body_order, Tensor body_ptr, Tensor island) -> "
+      "Tensor");
   // Normal force, 1 where active, normal and weights of each pair [pairs, 9], and the adjoint of x, collider and kappa
   m.def(
       "contact_lag(Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor constants, Tensor ptr, Tensor "

@@ -5,8 +5,9 @@
 #include <vector>
 
 #include "binding_sweep_cuda.h"
-#include "contact_arguments.h"
+#include "arguments_contact.h"
 #include "cuda/contact.h"
+#include "cuda/lowest.h"
 
 namespace {
 
@@ -181,6 +182,21 @@ std::tuple<Tensor, Tensor, Tensor> contact_lag_backward(const Tensor& bar, const
   });
 }
 
+Tensor contact_lowest(const Tensor& x, const Tensor& origin, const Tensor& planes, const Tensor& body_order,
+                      const Tensor& body_ptr, const Tensor& island) {
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::lowest_inputs<T>(x, origin, planes, body_order, body_ptr, island);
+    const std::vector<int64_t> shape{in.scenes, in.bodies, in.num_planes};
+    const Tensor own = empty(x, shape, ScalarType::Int);
+    Tensor out = empty(x, shape, ScalarType::Int);
+    check(cuda::lowest_vertices<T>(in, data<int32_t>(own), data<int32_t>(out), current_stream(x)),
+          "the search for the lowest vertices");
+    return out;
+  });
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
@@ -188,4 +204,5 @@ STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_sweep_backward", TORCH_BOX(&contact_sweep_backward));
   m.impl("contact_lag", TORCH_BOX(&contact_lag));
   m.impl("contact_lag_backward", TORCH_BOX(&contact_lag_backward));
+  m.impl("contact_lowest", TORCH_BOX(&contact_lowest));
 }

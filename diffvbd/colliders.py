@@ -135,4 +135,4 @@ def unique_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.unique(np.sort(pairs, 1), axis=0)
 
 
-__all__ = ["Capsule", "Collider", "Obstacle", "Plane", "Sphere"]
+__all__ = ["Capsule", "Obstacle", "Plane", "Sphere"]

@@ -30,6 +30,7 @@ class Detection(NamedTuple):
     counts: Tensor
     smallest: Tensor
     island: Tensor
+    lowest: Tensor  # of a Model with a floor, else empty
 
 
 class Outcome(NamedTuple):
@@ -72,6 +73,7 @@ class ContactStep:
         self.tensors = begun.tensors(prepared)
         self.origin = self.tensors.origin
         self.surface, self.barrier = model.surface_of_contact, model.contact
+        self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()]
         self.parts = 1 if self.barrier is None else self.barrier.detections
         like = begun.x_prev
         self.kappa = self._parameter("pair_barrier.kappa", like.new_zeros((1,)))
@@ -90,10 +92,10 @@ class ContactStep:
 
     def _floor_lag(self) -> Tensor:
         """Friction coefficient times normal force of the floor's planes, and their normals, at the start."""
-        floor, x, data = self.model.floor, self.begun.x_prev, self.begun.data
-        if floor is None or self.model.friction is None:
+        floor, x = self.model.floor, self.begun.x_prev
+        if floor is None or self.floor_data is None or self.model.friction is None:
             return x.new_zeros((0,))
-        force, normal = floor.normal_force(x, data[:, : floor.count()], self.begun.origin)
+        force, normal = floor.normal_force(x, self.floor_data, self.begun.origin)
         size = self._parameter("friction.coefficient", x)[:, None, None] * force
         normal = broadcast(normal[:, None], (*size.shape, 3))
         return torch.cat([size[..., None], normal], -1)
@@ -142,8 +144,9 @@ class ContactStep:
                 counts.append(torch.cat([detection.counts[:3], above]))
             center, radius = bounds[..., :3], bounds[..., 3]
             target, outside = project(x, remaining, center, radius)
-            if model.floor is not None:
-                target = model.floor.filter(x, target - x, begun.data[:, : model.floor.count()], begun.origin)
+            if model.floor is not None and self.floor_data is not None:
+                # from the center: with it and the target, all between them lies inside the bound
+                target = model.floor.filter(center, target - center, self.floor_data, begun.origin)
             target = torch.where(pinned, begun.x_prev + then * held, target)
             cut |= outside & ~model.pinned
             remaining = remaining - (target - x)
@@ -157,7 +160,7 @@ class ContactStep:
         return x
 
     def _free(self, x: Tensor) -> Tensor:
-        return torch.cat([x.detach(), torch.full_like(x[..., :1], FREE)], -1)
+        return torch.cat([x, torch.full_like(x[..., :1], FREE)], -1)
 
     def _sweep(self, x: Tensor, bounds: Tensor, collider: Tensor, listed: Pairs, settings: SweepSettings, policy: int,
                debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
@@ -178,7 +181,10 @@ class ContactStep:
             island = search.islands(
                 x, self.origin, remaining.detach(), self.tensors.mass.detach(), was, now, surface, barrier.dhat
             )
-        detection = Detection(Pairs(*index), corners, values, counts, smallest, island)
+            lowest = island.new_empty((0,))
+            if self.floor_data is not None:
+                lowest = search.lowest(x, self.origin, self.floor_data.detach(), island, surface)
+        detection = Detection(Pairs(*index), corners, values, counts, smallest, island, lowest)
         for record in recorders:
             record.append(detection)
         return detection
@@ -194,7 +200,11 @@ class ContactStep:
             absolute = torch.cat([absolute, was], 1).abs().sum(-1)
             guard = GUARD_ULPS * torch.finfo(x.dtype).eps * absolute
         radius = (barrier.gamma * (gap - guard).clamp(min=0)).clamp(max=surface.cap)
-        center = x + search.island_translation(remaining, self.tensors.mass, detection.island, surface)
+        floor = None
+        if self.floor_data is not None:
+            floor = search.Floor(self.floor_data, detection.lowest.to(torch.int64))
+        center = x + search.island_translation(remaining, self.tensors.mass, detection.island, surface, x, self.origin,
+                                               floor)  # fmt: skip
         with torch.no_grad():
             moves = torch.cat([held, now - was], 1).square().sum(-1).sqrt()
             above = (moves > radius) & surface.held & ~surface.plane_points

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from . import ops
-from .ops import raw
 
+
+PLANE_SCALARS = 7  # twin of kPlaneScalars in csrc/contact/lowest.h
 LAG_SCALARS = 9  # twin of kLagScalars in csrc/contact/pairs.h
 
 
@@ -17,7 +18,7 @@ def sweep(tensors: Sequence[Tensor], contact: Sequence[Tensor], friction_eps: fl
           settings: ops.SweepSettings, tape_policy: int, debug_step: int, checked: bool
           ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """x [B, V, 3], tape, and where a bound has held back, uint8 [B, V]; arguments in the order of csrc/ops.cpp."""
-    return raw.contact_sweep(*tensors, *contact, friction_eps, plan, *settings, tape_policy, debug_step, checked)
+    return ops.raw.contact_sweep(*tensors, *contact, friction_eps, plan, *settings, tape_policy, debug_step, checked)
 
 
 def sweep_backward(x_bar: Tensor, tensors: Sequence[Tensor], contact: Sequence[Tensor], friction_eps: float,
@@ -25,7 +26,7 @@ def sweep_backward(x_bar: Tensor, tensors: Sequence[Tensor], contact: Sequence[T
                    ) -> tuple[Tensor, ...]:  # fmt: skip
     """Adjoints of x_start, x_prev, y, mu, lam, mass, rest, energy_data, bounds, collider, collider_prev, kappa, lag,
     floor_lag."""
-    return raw.contact_sweep_backward(
+    return ops.raw.contact_sweep_backward(
         x_bar, *tensors, *contact, friction_eps, tape, plan, *settings, tape_policy, list(wants)
     )
 
@@ -33,13 +34,19 @@ def sweep_backward(x_bar: Tensor, tensors: Sequence[Tensor], contact: Sequence[T
 def lag(x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor, pairs: Tensor, constants: Tensor, ptr: Tensor,
         entry: Tensor) -> Tensor:  # fmt: skip
     """Normal force, activity, normal and weights of each pair, [pairs, 9]."""
-    return raw.contact_lag(x, origin, collider, kappa, pairs, constants, ptr, entry)
+    return ops.raw.contact_lag(x, origin, collider, kappa, pairs, constants, ptr, entry)
 
 
 def lag_backward(bar: Tensor, x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor, pairs: Tensor,
                  constants: Tensor, ptr: Tensor, entry: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Adjoints of x [B, V, 3], collider [B, Vc, 3] and kappa [B]."""
-    return raw.contact_lag_backward(bar, x, origin, collider, kappa, pairs, constants, ptr, entry)
+    return ops.raw.contact_lag_backward(bar, x, origin, collider, kappa, pairs, constants, ptr, entry)
+
+
+def lowest(x: Tensor, origin: Tensor, planes: Tensor, body_order: Tensor, body_ptr: Tensor, island: Tensor
+           ) -> Tensor:  # fmt: skip
+    """Lowest vertex above each plane, of the island that each body is in, [B, bodies, planes] int32."""
+    return ops.raw.contact_lowest(x, origin, planes, body_order, body_ptr, island)
 
 
 @torch.library.register_fake("diffvbd::contact_sweep")
@@ -71,5 +78,10 @@ def _(bar, x, origin, collider, kappa, pairs, constants, ptr, entry):
     return torch.empty_like(x), x.new_empty((x.shape[0], colliders, 3)), x.new_empty((x.shape[0],))
 
 
-for _name in ("contact_sweep", "contact_sweep_backward", "contact_lag", "contact_lag_backward"):
+@torch.library.register_fake("diffvbd::contact_lowest")
+def _(x, origin, planes, body_order, body_ptr, island):
+    return x.new_empty((*island.shape, planes.shape[-1] // PLANE_SCALARS), dtype=torch.int32)
+
+
+for _name in ("contact_sweep", "contact_sweep_backward", "contact_lag", "contact_lag_backward", "contact_lowest"):
     torch.library.register_autograd(f"diffvbd::{_name}", ops.raw_backward)

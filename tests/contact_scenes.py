@@ -148,8 +148,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
 def part_of(detection: Any) -> reference.Part:
     """Index data of a detection as the reference takes it."""
     count = int(detection.counts[0])
+    lowest = detection.lowest.cpu().long() if detection.lowest.numel() else None
     return reference.Part(detection.listed.pairs[:count].cpu().long(), detection.listed.constants[:count].cpu(),
-                          detection.near_corners.cpu().long(), detection.island.cpu().long())  # fmt: skip
+                          detection.near_corners.cpu().long(), detection.island.cpu().long(), lowest)  # fmt: skip
 
 
 def split(leaves: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

@@ -122,8 +122,10 @@ def test_only_ops_names_the_compiled_operators() -> None:
         return {module for module, text in texts.items() if re.search(pattern, text)}
 
     assert naming(r"\bload_library\b") == {"native"}
-    assert naming(r"torch\.ops\b(?!\.load_library\b)|torch\.library\b|\bdiffvbd::") == {"ops", "ops_neighbors"}
-    assert naming(r"\bops\.raw\b") == {"ops_neighbors", "sweeps"}
+    assert naming(r"torch\.ops\b(?!\.load_library\b)|torch\.library\b|\bdiffvbd::") == {
+        "ops", "ops_contact", "ops_contact_sweep", "ops_neighbors"
+    }  # fmt: skip
+    assert naming(r"\bops\.raw\b") == {"ops_contact_sweep", "ops_neighbors", "sweeps"}
     assert not [m for m, imports in PYTHON.items() if "diffvbd.ops.raw" in imports or "torch.ops" in imports]
 
 
@@ -159,8 +161,8 @@ def layer_includes(folder: str) -> set[str]:
 
 
 @needs_csrc
-def test_core_and_energies_know_no_torch() -> None:
-    for folder in ("core", "energies"):
+def test_shared_headers_know_no_torch() -> None:
+    for folder in ("core", "energies", "contact"):
         paths = sources(folder)
         assert len(paths) >= 4
         for path in paths:
@@ -176,24 +178,25 @@ def test_cpp_layers_include_only_what_lies_below() -> None:
     # vertex.h alone knows the list of energies: it is the algorithm that runs them
     assert layer_includes("core") <= {"energies"}
     assert [p.name for p in sources("core") if any("energies/" in name for name in includes(p))] == ["vertex.h"]
-    kernels = {"core", "energies"}
-    assert "core" in layer_includes("cpu") <= kernels | {"arguments.h", "arguments_neighbors.h"}
-    assert "core" in layer_includes("cuda") <= kernels
-    assert {t.split("/")[0] for t in targets(CSRC / "arguments.h")} <= kernels
-    bindings, shared = sorted(CSRC.glob("ops*cuda.cpp")), {"arguments.h", "arguments_neighbors.h", "binding_cuda.h"}
-    for path in bindings:
-        assert "cuda" in {t.split("/")[0] for t in targets(path)} <= {*kernels, *shared, "cuda"}
+    shared = {"core", "energies", "contact"}
+    assert layer_includes("contact") <= {"core", "energies"}
+    tensors = {p.name for p in CSRC.glob("arguments*.h")}
+    assert "core" in layer_includes("cpu") <= shared | tensors
+    assert "core" in layer_includes("cuda") <= shared
+    for path in CSRC.glob("arguments*.h"):
+        assert {t.split("/")[0] for t in targets(path)} <= shared | tensors
+    for path in CSRC.glob("ops*cuda.cpp"):
+        known = {t.split("/")[0] for t in targets(path)}
+        assert "cuda" in known <= {*shared, *tensors, "cuda", "binding_cuda.h", "binding_sweep_cuda.h"}
     assert not targets(CSRC / "ops.cpp")
 
 
 @needs_csrc
 def test_tensors_end_where_the_operators_are_registered() -> None:
     """Everything behind works on raw pointers; of torch the CPU's loops know the thread pool, CUDA's nothing."""
-    users = {p.relative_to(CSRC).as_posix() for p in sources(".") if "arguments.h" in targets(p)}
-    assert users == {"arguments_neighbors.h", "binding_cuda.h", "cpu/register.cpp", "ops_cuda.cpp"}
-    users |= {"cpu/register_neighbors.cpp", "ops_neighbors_cuda.cpp"}  # by way of arguments_neighbors.h
-    tensors = {p.relative_to(CSRC).as_posix() for p in sources(".") if re.search(r"\bTensor\b", code_of(p))}
-    assert tensors == {*users, "arguments.h", "ops.cpp"}
+    registrations = {p for p in sources(".") if re.match(r"ops|register|arguments|binding", p.name)}
+    assert len(registrations) >= 12
+    assert {p for p in sources(".") if re.search(r"\bTensor\b", code_of(p))} <= registrations
     for path in sources("cuda"):
         assert path.suffix in (".cu", ".cuh", ".h"), path
         assert not any(re.match(TORCH, name) for name in includes(path)), path
@@ -227,7 +230,7 @@ def test_constants_agree_across_languages() -> None:
     assert ops.LANES == {"cpu": constant("core/views.h", "kLanes"), "cuda": constant("core/views.h", "kSlice")}
     assert ops.REST_SCALARS == constant("core/views.h", "kRestScalars")
     assert ops.PLAN_HEADER == constant("core/plan_views.h", "kPlanHeader")
-    assert memory.WORKSPACE_BUDGET == constant("ops_cuda.cpp", "kWorkspaceBudget")
+    assert memory.WORKSPACE_BUDGET == constant("binding_sweep_cuda.h", "kWorkspaceBudget")
     floor, anchor = (CSRC / "energies" / f"{name}.h" for name in ("floor_barrier", "anchor"))
     strides = [int(re.findall(r"stride = (\d+);", p.read_text(encoding="utf-8"))[0]) for p in (floor, anchor)]
     assert dv.FloorBarrier(normal=[(0, 1, 0)] * 3).count() == 3 * strides[0]
@@ -246,7 +249,7 @@ def test_regimes_and_plans_agree() -> None:
     assert lanes == [regimes.FEW_LANES, regimes.SOME_LANES, regimes.MANY_LANES]
     assert regimes.SMALL_MESH == constant("core/views.h", "kSmallMesh") >= regimes.TINY_VERTICES
     # the host gets a plan's header in an order of its own, with active vertices, tets and slots first
-    (order,) = re.findall(r"order\[diffvbd::kPlanHeader\] = \{([^}]*)\}", code_of(CSRC / "ops_cuda.cpp"))
+    (order,) = re.findall(r"order\[kPlanHeader\] = \{([^}]*)\}", code_of(CSRC / "binding_sweep_cuda.h"))
     sizes = ops.plan_sizes(torch.arange(100), "cuda")
     assert [sizes[int(n)] for n in order.split(",")] == list(range(ops.PLAN_HEADER))
     colors = 3  # both the place of the number of colors in the header and, in this plan, that number
@@ -256,7 +259,7 @@ def test_regimes_and_plans_agree() -> None:
 @needs_csrc
 def test_safeguard_constants_exist_once() -> None:
     """They reach the kernels as arguments; no header repeats them."""
-    code = "".join(code_of(p) for p in sources("."))
+    code = "".join(code_of(p) for p in sources(".")).replace("kRestPart = 0.9", "")  # of another quantity
     assert safeguards.FILTER_ETA == 0.9 and not re.search(r"\b0\.9\b", code)
     assert safeguards.SATURATION_EPS == 1e-12 and not re.search(r"\b1e-0?12\b", code)
 
@@ -267,11 +270,12 @@ def test_tape_rows_and_policies_agree() -> None:
     (policies,) = re.findall(r"enum TapePolicy \{([^}]*)\}", text)
     values = {name: int(number) for name, number in re.findall(r"(\w+) = (\d+)", policies)}
     assert values == {"kNoTape": ops.NO_TAPE, "kCompactTape": ops.COMPACT_TAPE, "kFullTape": ops.FULL_TAPE}
-    pattern = r"policy == kFullTape \? \(filters \? (\d+) : (\d+)\) : policy == kCompactTape \? (\d+)"
+    pattern = r"policy == kFullTape \? \(keeps_positions \? (\d+) : (\d+)\) : policy == kCompactTape \? (\d+)"
     (rows,) = re.findall(pattern, text)
     floor = dv.FloorBarrier.bit
-    kinds = ((ops.FULL_TAPE, floor), (ops.FULL_TAPE, 0), (ops.COMPACT_TAPE, floor))
-    assert [int(n) for n in rows] == [ops.tape_rows(*kind) for kind in kinds]
+    for bit in (floor, dv.PairBarrier.bit):
+        kinds = ((ops.FULL_TAPE, bit), (ops.FULL_TAPE, 0), (ops.COMPACT_TAPE, bit))
+        assert [int(n) for n in rows] == [ops.tape_rows(*kind) for kind in kinds]
     assert ops.tape_rows(ops.NO_TAPE, floor) == 0
 
 
@@ -281,6 +285,7 @@ def test_the_list_of_energies_is_the_same_everywhere() -> None:
     (listed,) = re.findall(r"using VertexEnergies = EnergyList<([^>]*)>", text)
     assert listed.split(", ") == [kind.__name__ for kind in energies.VERTEX_ENERGIES]
     assert [kind.bit for kind in energies.VERTEX_ENERGIES] == [4 << k for k in range(len(energies.VERTEX_ENERGIES))]
+    assert dv.PairBarrier.bit == dv.Friction.bit == 4 << len(energies.VERTEX_ENERGIES)
     (elastic,) = re.findall(r"kExactBlock = (\d+), kPaperBlock = (\d+)", text)
     assert [int(n) for n in elastic] == [dv.StableNeoHookean(block).bit for block in ("exact", "paper")]
     for kind in (dv.StableNeoHookean, *energies.VERTEX_ENERGIES):

@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "../contact/lag.h"
-#include "../contact_arguments.h"
+#include "../arguments_contact.h"
 #include "binding.h"
 
 namespace {
@@ -177,6 +177,31 @@ std::tuple<Tensor, Tensor, Tensor> contact_lag_backward(const Tensor& bar, const
   });
 }
 
+Tensor contact_lowest(const Tensor& x, const Tensor& origin, const Tensor& planes, const Tensor& body_order,
+                      const Tensor& body_ptr, const Tensor& island) {
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::lowest_inputs<T>(x, origin, planes, body_order, body_ptr, island);
+    Tensor out = torch::stable::empty({in.scenes, in.bodies, in.num_planes}, ScalarType::Int);
+    std::vector<int32_t> own(out.numel());
+    const auto each = [&](auto&& f) {
+      int64_t i = 0;
+      for (int64_t b = 0; b < in.scenes; ++b) {
+        for (int32_t body = 0; body < in.bodies; ++body) {
+          for (int32_t plane = 0; plane < in.num_planes; ++plane) f(i++, b, body, plane);
+        }
+      }
+    };
+    each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
+      own[i] = contact::lowest_of_body(in, b, body, plane, 0, 1).vertex;
+    });
+    each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
+      data<int32_t>(out)[i] = contact::lowest_of_island(in, own.data(), b, body, plane);
+    });
+    return out;
+  });
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
@@ -184,4 +209,5 @@ STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
   m.impl("contact_sweep_backward", TORCH_BOX(&contact_sweep_backward));
   m.impl("contact_lag", TORCH_BOX(&contact_lag));
   m.impl("contact_lag_backward", TORCH_BOX(&contact_lag_backward));
+  m.impl("contact_lowest", TORCH_BOX(&contact_lowest));
 }

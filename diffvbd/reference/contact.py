@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from .distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
-from .energies import build_energies
+from .energies import FloorBarrier, build_energies
 from .friction import floor_friction, smoothed, tangential6
 from .layout import build_layout, dot, outer6, take
 from .scene import Scene, build_scene
@@ -29,6 +29,7 @@ class Part(NamedTuple):
     constants: Tensor  # [Q, 3]: dhat of the pair [m], sum of radii [m], threshold of the mollifier [m^4]
     near_corners: Tensor  # [B, N, 5] int64: four corners and kind of the nearest pair of a corner point; -1: none
     island: Tensor  # [B, bodies] int64: label of the island of a body; -1: it is not translated
+    lowest: Tensor | None = None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
 
 
 class Pairs:
@@ -171,13 +172,18 @@ class Bounds:
     [B, Vc, 3] as the detection saw them.
     """
 
-    def __init__(self, scene: Scene, part: Part, x: Tensor, wanted: Tensor, colliders: Tensor) -> None:
+    def __init__(
+        self, scene: Scene, part: Part, x: Tensor, wanted: Tensor, colliders: Tensor, floor: FloorBarrier | None
+    ) -> None:
         points = corner_points(x, colliders)
         x_rows = points[:, : x.shape[-1]]
         bound = self._bound(scene.model, part, points, x_rows)
         self.radius = bound.reshape(x.shape[:-2] + bound.shape[-1:])
         rows = wanted.transpose(-1, -2).reshape(x_rows.shape)
-        self.center = x + self._translation(scene, part, rows).transpose(-1, -2).reshape(x.shape)
+        u = self._translation(scene, part, rows).transpose(-1, -2).reshape(x.shape)
+        if floor is not None and part.lowest is not None:
+            u = self._above(floor, u, x, part.lowest[:, scene.model.body].reshape(*x.shape[:-2], x.shape[-1], -1))
+        self.center = x + u
 
     @staticmethod
     def _bound(model: Any, part: Part, points: Tensor, x: Tensor) -> Tensor:
@@ -207,6 +213,20 @@ class Bounds:
         sums = columns.new_zeros(len(label), part.island.shape[1], 4).scatter_add(1, index, columns).gather(1, index)
         total = torch.where(moves, sums[..., 3], 1.0)
         return torch.where(moves[..., None], sums[..., :3] / total[..., None], 0.0)
+
+    @staticmethod
+    def _above(floor: FloorBarrier, u: Tensor, x: Tensor, lowest: Tensor) -> Tensor:
+        """u [..., 3, V] that goes down at most until the lowest vertex [..., V, planes] comes within dhat of a plane."""
+        lead, count = x.shape[:-2], x.shape[-1]
+        gap = floor.gap(x)  # [..., planes, V]
+        room = (gap.gather(-1, lowest.transpose(-1, -2)) - floor.dhat).clamp(min=0)
+        normal = floor.normal.expand(*lead, *floor.normal.shape[-3:]).expand(*lead, -1, 3, count)
+        for plane in range(room.shape[-2]):
+            n = normal[..., plane, :, :]
+            u = u + (-dot(n, u) - room[..., plane, :]).clamp(min=0).unsqueeze(-2) * n
+        down = -dot(normal, u.unsqueeze(-3))
+        safe = (down <= room * (1 + 1e-6) + torch.finfo(x.dtype).eps).all(-2)
+        return torch.where(safe.unsqueeze(-2), u, 0.0)
 
     def cut(self, x: Tensor, step: Tensor, vertices: Tensor) -> Tensor:
         """The step [..., 3, n] of some vertices from x [..., 3, n], ended at the closest point of the bound's ball."""
@@ -267,6 +287,7 @@ def contact_step(
     )
     energies = build_energies(scene, elsewhere=("pair_barrier", "friction"))
     energies += floor_friction(scene, energies)
+    floor = next((energy for energy in energies if isinstance(energy, FloorBarrier)), None)
     masses = color_masses(scene)
     end = _collider_rows(scene, model.collider_points if colliders is None else colliders)
     begin = end if colliders_before is None else _collider_rows(scene, colliders_before)
@@ -281,8 +302,11 @@ def contact_step(
     state, wanted = x_prev, y - x_prev
     for r, part in enumerate(parts):
         before, now = (begin + (n / count) * (end - begin) for n in (r, r + 1))
-        bounds = Bounds(scene, part, state, wanted, torch.where(planes, now, before))
-        moved = state + filtered(energies, state, bounds.cut(state, wanted, every))
+        bounds = Bounds(scene, part, state, wanted, torch.where(planes, now, before), floor)
+        target = state + bounds.cut(state, wanted, every)
+        moved = target
+        if floor is not None:  # from the center: all between it and the target lies in the ball
+            moved = bounds.center + filtered(energies, bounds.center, target - bounds.center)
         moved = torch.where(model.pinned, x_prev + ((r + 1) / count) * (y - x_prev), moved)
         wanted = wanted - (moved - state)
         forces = [PairBarrier(scene, listed[r], now), LaggedPairForces(scene, listed[0], start, now)]

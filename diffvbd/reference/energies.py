@@ -99,19 +99,19 @@ class FloorBarrier:
         self.outer = outer6(self.normal)
         self.damped = "floor_barrier.damping" in scene.parameters or bool((damping != 0).any())
 
-    def _gap(self, x: Tensor) -> Tensor:
+    def gap(self, x: Tensor) -> Tensor:
         return dot(self.normal, x.unsqueeze(-3)) - self.height
 
     def _approach(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
         """Normal travel since x_prev [..., planes, n], and where it is damped."""
         travel = dot(self.normal, (x - x_prev).unsqueeze(-3))
-        return travel, (self._gap(x_prev) < self.dhat) & (travel < 0)
+        return travel, (self.gap(x_prev) < self.dhat) & (travel < 0)
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         vertices = self.scene.layout.colors[k].vertices
         x = take(x, vertices)
         h = self.scene.time_step
-        gap = self._gap(x)
+        gap = self.gap(x)
         active = (gap > 0) & (gap < self.dhat)
         d = torch.where(active, gap, 1.0)  # the unused branch must stay finite for autograd
         log, past = torch.log(d / self.dhat), d - self.dhat
@@ -128,7 +128,7 @@ class FloorBarrier:
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
         h = self.scene.time_step
         free = ~self.scene.model.pinned
-        gap = self._gap(x[..., free])
+        gap = self.gap(x[..., free])
         active = gap < self.dhat
         d = torch.where(active, gap, 1.0)
         total = h**2 * torch.where(active, -self.kappa * (d - self.dhat) ** 2 * torch.log(d / self.dhat), 0.0)
@@ -139,19 +139,19 @@ class FloorBarrier:
         return total.sum((-2, -1))
 
     def limit(self, x: Tensor, step: Tensor) -> Tensor:
-        gap, travel = self._gap(x), dot(self.normal, step.unsqueeze(-3))
+        gap, travel = self.gap(x), dot(self.normal, step.unsqueeze(-3))
         bites = (travel < 0) & (ETA * gap < -travel)
         fraction = torch.where(bites, ETA * gap / torch.where(bites, -travel, 1.0), 1.0)
         fraction = fraction.min(-2).values
         # Rounding may still close a gap of few ulps; such a vertex stays where it is.
         with torch.no_grad():
             size = (self.normal * x.unsqueeze(-3)).abs().sum(-2) + self.height.abs()
-            after = self._gap(x + fraction.unsqueeze(-2) * step)
+            after = self.gap(x + fraction.unsqueeze(-2) * step)
             closed = (after <= GUARD * torch.finfo(x.dtype).eps * size).any(-2)
         return torch.where(closed, 0.0, fraction)
 
     def check_start(self, x: Tensor) -> None:
-        below = ((self._gap(x) <= 0).any(-2) & ~self.scene.model.pinned).nonzero()
+        below = ((self.gap(x) <= 0).any(-2) & ~self.scene.model.pinned).nonzero()
         if below.numel():
             raise ValueError(f"x: expected every unpinned vertex above the floor, got a gap <= 0 at {below.tolist()}")
 

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "arguments.h"
+#include "contact/lowest.h"
 #include "contact/passes.h"
 
 namespace diffvbd {
@@ -52,6 +53,30 @@ contact::ContactInputs<T> contact_inputs(const ContactTensors& t, const Tensor& 
   in.x_prev = x_prev;
   in.origin = origin;
   in.friction_eps = static_cast<T>(friction_eps);
+  return in;
+}
+
+template <class T>
+contact::LowestInputs<T> lowest_inputs(const Tensor& x, const Tensor& origin, const Tensor& planes,
+                                       const Tensor& body_order, const Tensor& body_ptr, const Tensor& island) {
+  const int64_t b = x.size(0), v = x.size(1), bodies = body_ptr.numel() - 1;
+  const auto good = [](const Tensor& t) { return t.scalar_type() == ScalarType::Int && t.is_contiguous(); };
+  require(good(body_order) && good(body_ptr) && good(island) && body_order.numel() == v &&
+              island.numel() == b * bodies && x.is_contiguous() && planes.numel() > 0,
+          "diffvbd::contact_lowest: bad arguments");
+  contact::LowestInputs<T> in{};
+  const int64_t scalars = planes.numel() / planes.size(0);
+  in.x = data<const T>(x);
+  in.origin = batched<T>(origin, x, b, 3 * v).data;
+  in.planes = data<const T>(planes);
+  in.plane_scene = batched<T>(planes, x, b, scalars).scene;
+  in.body_order = data<const int32_t>(body_order);
+  in.body_ptr = data<const int32_t>(body_ptr);
+  in.island = data<const int32_t>(island);
+  in.scenes = b;
+  in.vertices = static_cast<int32_t>(v);
+  in.bodies = static_cast<int32_t>(bodies);
+  in.num_planes = static_cast<int32_t>(scalars / contact::kPlaneScalars);
   return in;
 }
 
