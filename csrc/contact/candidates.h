@@ -38,10 +38,11 @@ struct Surfaces {
   DIFFVBD_FN int32_t group(int32_t corner) const {
     return body[corner] < mesh_bodies ? body[corner] : mesh_bodies;
   }
-  // Whether no primitive of group a makes a pair with one of group b. False where b is kMixed.
+  // Whether no primitive of group a makes a pair with one of group b.
   DIFFVBD_FN bool ignores(int32_t a, int32_t b) const {
+    if (a < 0 || b < 0) return false;
     if (a == b) return a == mesh_bodies || !self_contact;
-    return a < mesh_bodies && b >= 0 && b < mesh_bodies && !between_bodies;
+    return a < mesh_bodies && b < mesh_bodies && !between_bodies;
   }
 };
 
@@ -108,11 +109,13 @@ template <class T>
 DIFFVBD_FN Box primitive_box(const Surfaces<T>& in, int64_t scene, const int32_t* v, int n, int32_t item,
                              const Place<T>& reference) {
   Box out = empty_box();
+  bool finite = true;
   for (int k = 0; k < n; ++k) {
     const Box corner = corner_box(in, scene, v[k], reference);
-    if (is_empty(corner)) return corner;
+    finite = finite && !is_empty(corner);
     out = hull(out, corner);
   }
+  if (!finite) out = empty_box();
   grow(out, static_cast<float>(in.radius[v[0]]) * (1.0F + 0x1p-20F));
   out.group = in.group(v[0]);  // all corners are of one body
   out.item = item;

@@ -15,7 +15,8 @@ namespace {
 
 using namespace contact;
 
-constexpr int64_t kChunk = 256;                    // queries of one piece of work
+constexpr int64_t kChunk = 256;                    // items of one piece of work
+constexpr int32_t kGroup = 8;                      // neighbors in a tree that look for pairs together
 constexpr int kDigitBits = 12, kShortSort = 2048;  // up to this many items a comparison sort is quicker
 
 struct Keyed {
@@ -56,24 +57,24 @@ void in_chunks(int64_t n, const F& f) {
 }
 
 struct Tree {
-  int32_t leaves = 1;
-  std::vector<Box> boxes, nodes;       // of the primitives in their order, and the tree's
+  int32_t leaves = kGroup;
+  std::vector<Box> boxes, nodes;  // of the primitives in their order, and the tree's
   std::vector<Keyed> codes, scratch;
 
-  void build() {
+  // `bounds` cover all boxes that are not empty.
+  void build(const Box& bounds) {
     const auto n = static_cast<int64_t>(boxes.size());
-    Box bounds = empty_box();
-    for (const Box& box : boxes) bounds = hull(bounds, box);
     codes.resize(n);
     in_chunks(n, [&](int64_t i) {
       codes[i] = {morton_code(boxes[i], bounds, kMostAxisBits), static_cast<int32_t>(i)};
     });
     sort_by_key(codes, scratch, 3 * kMostAxisBits);
-    leaves = padded_leaves(n);
-    nodes.assign(int64_t{2} * leaves, empty_box());
-    for (int64_t k = 0; k < n; ++k) nodes[leaves + k] = boxes[codes[k].item];
+    leaves = std::max(kGroup, padded_leaves(n));
+    nodes.resize(int64_t{2} * leaves);
+    in_chunks(leaves, [&](int64_t k) { nodes[leaves + k] = k < n ? boxes[codes[k].item] : empty_box(); });
     for (int32_t i = leaves - 1; i >= kRoot; --i) nodes[i] = hull(nodes[2 * i], nodes[2 * i + 1]);
   }
+  int32_t groups() const { return leaves / kGroup; }
 };
 
 // The near pair of a corner point: the smallest gap, then the smallest key.
@@ -95,6 +96,12 @@ struct Finds {
   uint64_t first_touching = kNoKey;
 };
 
+// A leaf near a group.
+struct Met {
+  Box box;
+  int32_t node;
+};
+
 std::array<std::mutex, 256> locks;  // of near pairs; a lock is taken only where one improves
 
 // Detection in one scene after the other, with the same memory.
@@ -107,18 +114,20 @@ class SceneDetection {
     scene_ = scene;
     for (Near<T>& near : near_) near.gap.store(in_.reach, std::memory_order_relaxed), near.key = kNoKey;
     build_trees();
-    const int64_t point_chunks = (in_.num_points + kChunk - 1) / kChunk;
-    const int64_t edge_chunks = (in_.num_edges + kChunk - 1) / kChunk;
+    constexpr int32_t each = kChunk / kGroup;
+    const int32_t point_chunks = (points_.groups() + each - 1) / each, edge_chunks = (edges_.groups() + each - 1) / each;
     finds_.resize(point_chunks + edge_chunks);
     torch::stable::parallel_for(0, point_chunks + edge_chunks, 1, [&](int64_t begin, int64_t end) {
+      std::vector<Met> met;
       for (int64_t c = begin; c < end; ++c) {
         Finds<T>& finds = finds_[c];
         finds.pairs.clear(), finds.touching = 0, finds.first_touching = kNoKey;
         const bool points = c < point_chunks;
-        const int64_t first = (points ? c : c - point_chunks) * kChunk;
-        const int64_t last = std::min<int64_t>(first + kChunk, points ? in_.num_points : in_.num_edges);
-        for (int64_t q = first; q < last; ++q) {
-          points ? search_point(static_cast<int32_t>(q), finds) : search_edge(static_cast<int32_t>(q), finds);
+        const auto first = static_cast<int32_t>((points ? c : c - point_chunks) * each);
+        const int32_t last = std::min(first + each, points ? points_.groups() : edges_.groups());
+        for (int32_t g = first; g < last; ++g) {
+          points ? search<kPointTriangle>(points_, triangles_, g, met, finds)
+                 : search<kEdgeEdge>(edges_, edges_, g, met, finds);
         }
       }
     });
@@ -143,70 +152,70 @@ class SceneDetection {
  private:
   void build_trees() {
     const Place<T> reference = reference_point(in_, scene_);
-    triangles_.boxes.resize(in_.num_triangles), edges_.boxes.resize(in_.num_edges), points_.resize(in_.num_points);
-    in_chunks(in_.num_triangles, [&](int64_t i) {
-      triangles_.boxes[i] = primitive_box(in_, scene_, in_.triangles + 3 * i, 3, static_cast<int32_t>(i), reference);
-    });
-    in_chunks(in_.num_edges, [&](int64_t i) {
-      edges_.boxes[i] = primitive_box(in_, scene_, in_.edges + 2 * i, 2, static_cast<int32_t>(i), reference);
-    });
-    in_chunks(in_.num_points, [&](int64_t i) {
-      points_[i] = primitive_box(in_, scene_, in_.points + i, 1, static_cast<int32_t>(i), reference);
-    });
-    triangles_.build();
-    edges_.build();
+    Box bounds = empty_box();
+    const auto fill = [&](Tree& tree, const int32_t* items, int64_t count, int corners) {
+      tree.boxes.resize(count);
+      in_chunks(count, [&](int64_t i) {
+        tree.boxes[i] = primitive_box(in_, scene_, items + corners * i, corners, static_cast<int32_t>(i), reference);
+      });
+      for (const Box& box : tree.boxes) bounds = hull(bounds, box);
+    };
+    fill(triangles_, in_.triangles, in_.num_triangles, 3);
+    fill(edges_, in_.edges, in_.num_edges, 2);
+    fill(points_, in_.points, in_.num_points, 1);
+    for (Tree* tree : {&triangles_, &edges_, &points_}) tree->build(bounds);
+  }
+
+  // Pairs of the primitives of group g of `tree`; of an edge, those with edges to the right of it: each pair once.
+  template <int kind>
+  void search(const Tree& tree, const Tree& others, int32_t g, std::vector<Met>& met, Finds<T>& finds) {
+    const int32_t home = tree.groups() + g;
+    const Box &around = tree.nodes[home], *nodes = others.nodes.data();
+    met.clear();
+    if (!is_empty(around)) {
+      const auto skips = [&](int32_t group) { return in_.ignores(around.group, group); };
+      each_leaf(nodes, others.leaves, kind == kEdgeEdge ? home : kRoot, kRoot, around, reach2_, skips, [&](int32_t i) {
+        met.push_back({nodes[i], i});
+        return true;
+      });
+    }
+    for (int32_t leaf = home * kGroup; leaf < (home + 1) * kGroup; ++leaf) {
+      const Box& own = tree.nodes[leaf];
+      if (!is_empty(own)) {
+        for (const Met& other : met) {
+          if ((kind == kEdgeEdge && other.node <= leaf) || !(distance2(other.box, own) <= reach2_)) continue;
+          examine(candidate(in_, scene_, kind, own.item, other.box.item), finds);
+        }
+      }
+      if (kind == kPointTriangle) search_planes(own, finds);
+    }
   }
 
   // A point that is not finite meets nothing: it counts as touching, so that nobody takes the scene for a good one.
-  void search_point(int32_t i, Finds<T>& finds) {
-    const Box& query = points_[i];
-    if (is_empty(query)) {
+  void search_planes(const Box& point, Finds<T>& finds) {
+    if (point.item < 0) return;
+    if (is_empty(point)) {
       ++finds.touching;
-      return;
+    } else if (point.group != in_.mesh_bodies) {
+      for (int32_t p = 0; p < in_.num_planes; ++p) examine(candidate(in_, scene_, kPointPlane, point.item, p), finds);
     }
-    const auto skips = [&](int32_t group) { return in_.ignores(query.group, group); };
-    const Box* nodes = triangles_.nodes.data();
-    int32_t node = find_leaf(nodes, triangles_.leaves, kRoot, query, reach2_, skips);
-    for (; node != kRoot; node = resume(triangles_, node, query, skips)) {
-      examine(candidate(in_, scene_, kPointTriangle, i, nodes[node].item), finds);
-    }
-    if (query.group == in_.mesh_bodies) return;
-    for (int32_t p = 0; p < in_.num_planes; ++p) examine(candidate(in_, scene_, kPointPlane, i, p), finds);
-  }
-
-  // Each pair once: an edge looks for those to the right of it in the tree.
-  void search_edge(int32_t leaf, Finds<T>& finds) {
-    const Box* nodes = edges_.nodes.data();
-    const Box query = nodes[edges_.leaves + leaf];
-    if (is_empty(query)) return;
-    const auto skips = [&](int32_t group) { return in_.ignores(query.group, group); };
-    int32_t node = resume(edges_, edges_.leaves + leaf, query, skips);
-    for (; node != kRoot; node = resume(edges_, node, query, skips)) {
-      examine(candidate(in_, scene_, kEdgeEdge, query.item, nodes[node].item), finds);
-    }
-  }
-
-  template <class Skips>
-  int32_t resume(const Tree& tree, int32_t node, const Box& query, const Skips& skips) const {
-    node = next_node(node);
-    return node == kRoot ? node : find_leaf(tree.nodes.data(), tree.leaves, node, query, reach2_, skips);
   }
 
   void examine(const Candidate& c, Finds<T>& finds) {
     if (!is_considered(in_, c)) return;
     const T gap = separation(c.kind, corners_of(in_, c)) - offset_of(in_, c);
     if (gap >= in_.reach) return;
+    // Near gaps only fall while the search goes on: what the list does not need now it never will.
+    const T a = bound(c, 0, c.second(), gap), b = c.kind == kPointPlane ? T(0) : bound(c, c.second(), 4, gap);
+    const auto improves = [&](int32_t v) { return gap <= near_[v].gap.load(std::memory_order_relaxed); };
+    if (gap > T(0) && !is_listed(gap, a, b, in_.dhat) && std::none_of(c.v, c.v + 4, improves)) return;
     const Constants<T> constants = constants_of(in_, c);
     if (!constants.admitted) return;
     const uint64_t key = contact::key_of(in_, c);
     if (!(gap > T(0))) ++finds.touching, finds.first_touching = std::min(finds.first_touching, key);
     if (std::isnan(gap)) return;
     for (const int32_t v : c.v) offer(near_[v], v, gap, key);
-    // No corner is nearer to anything than this pair at most: what fails now cannot be listed.
-    const T most = bound_of(in_, gap);
-    if (is_listed(gap, most, c.kind == kPointPlane ? T(0) : most, constants.dhat)) {
-      finds.pairs.push_back({key, gap, constants.dhat});
-    }
+    if (is_listed(gap, a, b, constants.dhat)) finds.pairs.push_back({key, gap, constants.dhat});
   }
 
   static void offer(Near<T>& near, int32_t v, T gap, uint64_t key) {
@@ -217,12 +226,11 @@ class SceneDetection {
     near.gap.store(gap, std::memory_order_relaxed), near.key = key;
   }
 
-  T bound(const Candidate& c, int from, int to) const {
+  // How far the corners from..to may move, given that there is a pair with this gap.
+  T bound(const Candidate& c, int from, int to, T gap) const {
     T most = T(0);
-    for (int k = from; k < to; ++k) {
-      most = std::max(most, bound_of(in_, near_[c.v[k]].gap.load(std::memory_order_relaxed)));
-    }
-    return most;
+    for (int k = from; k < to; ++k) most = std::max(most, near_[c.v[k]].gap.load(std::memory_order_relaxed));
+    return bound_of(in_, std::min(most, gap));
   }
 
   // The list, sorted, now that all near gaps are known.
@@ -232,7 +240,8 @@ class SceneDetection {
         auto& pairs = finds_[f].pairs;
         const auto needless = [&](const typename Finds<T>::Pair& pair) {
           const Candidate c = candidate_of_key(in_, pair.key);
-          const T a = bound(c, 0, c.second()), b = c.kind == kPointPlane ? T(0) : bound(c, c.second(), 4);
+          const T a = bound(c, 0, c.second(), pair.gap);
+          const T b = c.kind == kPointPlane ? T(0) : bound(c, c.second(), 4, pair.gap);
           return !is_listed(pair.gap, a, b, pair.dhat);
         };
         pairs.erase(std::remove_if(pairs.begin(), pairs.end(), needless), pairs.end());
@@ -248,8 +257,7 @@ class SceneDetection {
 
   const Surfaces<T>& in_;
   int64_t scene_ = 0;
-  Tree triangles_, edges_;
-  std::vector<Box> points_;
+  Tree triangles_, edges_, points_;
   std::vector<Near<T>> near_;
   std::vector<Finds<T>> finds_;
   std::vector<uint64_t> listed_, scratch_;

@@ -1,0 +1,266 @@
+#include "islands.h"
+
+#include <cstring>
+#include <type_traits>
+
+#include "ordered.cuh"
+
+namespace diffvbd::cuda {
+namespace {
+
+using namespace contact;
+
+constexpr int kThreads = 256;
+constexpr int kWarp = 32, kLongSegment = 512;  // threads for a sum of fewer terms on average; above, kThreads
+constexpr int32_t kTile = 32;                  // bodies that one thread compares with one
+constexpr size_t kAlignment = 256;
+
+unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kThreads - 1) / kThreads); }
+int threads_for(int64_t items, int64_t segments) { return items > kLongSegment * segments ? kThreads : kWarp; }
+
+__device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; }
+
+// Views of the workspace; without memory, its size.
+template <class T>
+struct Workspace {
+  BodySum<T>*bodies, *islands;  // [B, bodies]; of islands, at their smallest body
+  Bounds<T>* boxes;             // [B, bodies] swept
+  int32_t* label;               // [B, bodies] toward the smallest body of the island
+  int32_t* unsettled;           // [B]
+  Ordered<T> (*colliders)[6];   // [B, Vc] boxes of collider objects, as ordered bits
+  int32_t* objects;             // how many of those there are
+  size_t bytes = 0;
+
+  Workspace(const IslandInputs<T>& in, void* memory) {
+    auto* at = static_cast<unsigned char*>(memory);
+    const auto take = [&](auto*& pointer, int64_t items) {
+      pointer = reinterpret_cast<std::remove_reference_t<decltype(pointer)>>(at + bytes);
+      bytes += (items * sizeof(*pointer) + kAlignment - 1) / kAlignment * kAlignment;
+    };
+    const int64_t n = in.scenes * in.mesh_bodies;
+    take(bodies, n), take(islands, n), take(boxes, n), take(label, n), take(unsettled, in.scenes);
+    take(colliders, in.scenes * in.colliders()), take(objects, 1);
+  }
+};
+
+template <class T>
+__global__ void start_kernel(const IslandInputs<T> in, Workspace<T> work) {
+  const int64_t i = own_item();
+  if (i < in.scenes * in.mesh_bodies) work.label[i] = static_cast<int32_t>(i % in.mesh_bodies);
+  if (i < in.scenes) work.unsettled[i] = 0;
+  if (i < in.scenes * in.colliders()) {
+    const T far = std::numeric_limits<T>::infinity();
+    for (int k = 0; k < 6; ++k) work.colliders[i][k] = ordered(k < 3 ? far : -far);
+  }
+  if (i == 0) *work.objects = 0;
+}
+
+template <class T>
+__global__ void colliders_kernel(const IslandInputs<T> in, Workspace<T> work) {
+  const int64_t i = own_item();
+  if (i >= in.scenes * in.colliders()) return;
+  const int64_t scene = i / in.colliders();
+  const auto j = static_cast<int32_t>(i - scene * in.colliders());
+  const int32_t object = in.body[in.vertices + j] - in.mesh_bodies;
+  raise(work.objects, object + 1);
+  const Bounds<T> box = collider_bounds(in, scene, j);
+  Ordered<T>* bits = work.colliders[scene * in.colliders() + object];
+  lower(bits, ordered(box.lo.x)), lower(bits + 1, ordered(box.lo.y)), lower(bits + 2, ordered(box.lo.z));
+  raise(bits + 3, ordered(box.hi.x)), raise(bits + 4, ordered(box.hi.y)), raise(bits + 5, ordered(box.hi.z));
+}
+
+// The points of a plane span it; they bound nothing.
+template <class T>
+__global__ void planes_kernel(const IslandInputs<T> in, Workspace<T> work) {
+  const int64_t i = own_item();
+  if (i >= in.scenes * in.num_planes) return;
+  const int64_t scene = i / in.num_planes;
+  const int32_t object = in.body[in.planes[3 * (i - scene * in.num_planes)]] - in.mesh_bodies;
+  const T far = std::numeric_limits<T>::infinity();
+  for (int k = 0; k < 6; ++k) work.colliders[scene * in.colliders() + object][k] = ordered(k < 3 ? far : -far);
+}
+
+// Sum of what the threads of a block have, at thread 0, always in the same order.
+template <class Term, class Add>
+__device__ Term block_sum(Term own, Term* part, const Add& add) {
+  const unsigned t = threadIdx.x;
+  part[t] = own;
+  for (unsigned half = blockDim.x / 2; half > 0; half /= 2) {
+    __syncthreads();
+    if (t < half) add(part[t], part[t + half]);
+  }
+  __syncthreads();
+  return part[0];
+}
+
+// A block for each body.
+template <class T>
+__global__ void bodies_sync_kernel(const IslandInputs<T> in, Workspace<T> work) {
+  __shared__ BodySum<T> part[kThreads];
+  const int64_t scene = blockIdx.x / in.mesh_bodies;
+  const auto body = static_cast<int32_t>(blockIdx.x - scene * in.mesh_bodies);
+  BodySum<T> own = nothing<T>();
+  for (int32_t k = in.body_ptr[body] + static_cast<int32_t>(threadIdx.x); k < in.body_ptr[body + 1];
+       k += static_cast<int32_t>(blockDim.x)) {
+    own.add(vertex_share(in, scene, in.body_order[k]));
+  }
+  const BodySum<T> sum = block_sum(own, part, [](BodySum<T>& a, const BodySum<T>& b) { a.add(b); });
+  if (threadIdx.x == 0) work.bodies[blockIdx.x] = sum;
+}
+
+// A block for each island, those of other bodies have nothing to do.
+template <class T>
+__global__ void islands_sync_kernel(const IslandInputs<T> in, Workspace<T> work) {
+  __shared__ BodySum<T> part[kThreads];
+  const int64_t first = blockIdx.x / in.mesh_bodies * in.mesh_bodies;
+  const auto body = static_cast<int32_t>(blockIdx.x - first);
+  if (work.label[blockIdx.x] != body) return;
+  BodySum<T> own = nothing<T>();
+  for (auto k = static_cast<int32_t>(threadIdx.x); k < in.mesh_bodies; k += static_cast<int32_t>(blockDim.x)) {
+    if (work.label[first + k] == body) own.add(work.bodies[first + k]);
+  }
+  const BodySum<T> sum = block_sum(own, part, [](BodySum<T>& a, const BodySum<T>& b) { a.add(b); });
+  if (threadIdx.x == 0) work.islands[blockIdx.x] = sum;
+}
+
+// What bodies sweep, and which of them must stay from now on.
+template <class T>
+__global__ void sweep_kernel(const IslandInputs<T> in, Workspace<T> work) {
+  const int64_t i = own_item();
+  if (i >= in.scenes * in.mesh_bodies) return;
+  const int64_t scene = i / in.mesh_bodies, first = scene * in.mesh_bodies;
+  const Bounds<T> box = swept(work.bodies[i].bounds, translation(work.islands[first + work.label[i]]), in.margin);
+  work.boxes[i] = box;
+  bool blocked = false;
+  for (int32_t object = 0; object < *work.objects && !blocked; ++object) {
+    const Ordered<T>* bits = work.colliders[scene * in.colliders() + object];
+    const auto at = [&](int k) { return value_of<T>(bits[k]); };
+    blocked = overlap(box, Bounds<T>{{at(0), at(1), at(2)}, {at(3), at(4), at(5)}});
+  }
+  for (int32_t l = 0; l < in.num_planes && !blocked; ++l) blocked = reaches_plane(in, scene, l, box);
+  if (blocked) work.bodies[i].blocked = true;
+}
+
+__device__ int32_t root_of(const int32_t* label, int32_t i) {
+  const volatile int32_t* parent = label;
+  while (parent[i] != i) i = parent[i];
+  return i;
+}
+
+// Hangs the larger of two roots under the smaller; whoever comes first, in the end each island's root is its smallest.
+__device__ void unite(int32_t* label, int32_t a, int32_t b) {
+  for (;;) {
+    a = root_of(label, a), b = root_of(label, b);
+    if (a == b) return;
+    const int32_t low = a < b ? a : b, high = a < b ? b : a;
+    const int32_t before = atomicMin(label + high, low);
+    if (before == high) return;
+    a = before, b = low;
+  }
+}
+
+// A thread for each body and each tile of others: joins their islands, or says in the end that they would have to be.
+template <class T>
+__global__ void join_kernel(const IslandInputs<T> in, Workspace<T> work, bool joins) {
+  const int32_t n = in.mesh_bodies;
+  const int64_t tiles = (n + kTile - 1) / kTile, item = own_item();
+  if (item >= in.scenes * tiles * n) return;
+  const int64_t row = item / n, scene = row / tiles, first = scene * n;
+  const auto i = static_cast<int32_t>(item - row * n), tile = static_cast<int32_t>(row - scene * tiles) * kTile;
+  const Bounds<T> box = work.boxes[first + i];
+  int32_t* label = work.label + first;
+  for (int32_t j = tile > i ? tile : i + 1; j < n && j < tile + kTile; ++j) {
+    if (!overlap(box, work.boxes[first + j]) || root_of(label, i) == root_of(label, j)) continue;
+    if (joins) {
+      unite(label, i, j);
+    } else {
+      work.unsettled[scene] = 1;
+    }
+  }
+}
+
+template <class T>
+__global__ void label_kernel(const IslandInputs<T> in, Workspace<T> work) {
+  const int64_t i = own_item();
+  if (i >= in.scenes * in.mesh_bodies) return;
+  const int64_t scene = i / in.mesh_bodies, first = scene * in.mesh_bodies;
+  work.label[i] = work.unsettled[scene] ? 0 : root_of(work.label + first, static_cast<int32_t>(i - first));
+}
+
+template <class T>
+__global__ void finish_kernel(const IslandInputs<T> in, Workspace<T> work, int32_t* island) {
+  const int64_t i = own_item();
+  if (i >= in.scenes * in.mesh_bodies) return;
+  const int64_t first = i / in.mesh_bodies * in.mesh_bodies;
+  island[i] = work.islands[first + work.label[i]].blocked ? -1 : work.label[i];
+}
+
+template <class T>
+__global__ void segments_sync_kernel(const T* values, const int32_t* order, const int32_t* ptr, int64_t items,
+                                     int64_t segments, int64_t c, T* out) {
+  __shared__ T part[kThreads];
+  const int64_t scene = blockIdx.x / segments, s = blockIdx.x - scene * segments;
+  for (int64_t k = 0; k < c; ++k) {
+    T own = T(0);
+    for (int64_t e = ptr[s] + int64_t{threadIdx.x}; e < ptr[s + 1]; e += blockDim.x) {
+      own += values[(scene * items + order[e]) * c + k];
+    }
+    const T sum = block_sum(own, part, [](T& a, const T& b) { a += b; });
+    if (threadIdx.x == 0) out[blockIdx.x * c + k] = sum;
+    __syncthreads();
+  }
+}
+
+}  // namespace
+
+template <class T>
+size_t islands_workspace_bytes(const IslandInputs<T>& in) {
+  return Workspace<T>(in, nullptr).bytes;
+}
+
+template <class T>
+cudaError_t find_islands(const IslandInputs<T>& in, int32_t* island, void* memory, cudaStream_t stream) {
+  const Workspace<T> work(in, memory);
+  const int64_t n = in.scenes * in.mesh_bodies, points = in.scenes * in.colliders();
+  if (n == 0) return cudaSuccess;
+  const auto blocks = static_cast<unsigned>(n);
+  start_kernel<<<blocks_for(n > points ? n : points), kThreads, 0, stream>>>(in, work);
+  if (points > 0) colliders_kernel<<<blocks_for(points), kThreads, 0, stream>>>(in, work);
+  if (in.num_planes > 0) planes_kernel<<<blocks_for(in.scenes * in.num_planes), kThreads, 0, stream>>>(in, work);
+  const int threads = threads_for(in.vertices, in.mesh_bodies);
+  bodies_sync_kernel<<<blocks, threads, 0, stream>>>(in, work);
+  const int64_t comparisons = n * ((in.mesh_bodies + kTile - 1) / kTile);
+  // One round more than the joins: it finds out whether they have settled, and if not makes one island of the scene.
+  for (int round = 0; round <= kJoins; ++round) {
+    islands_sync_kernel<<<blocks, kWarp, 0, stream>>>(in, work);
+    sweep_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work);
+    join_kernel<<<blocks_for(comparisons), kThreads, 0, stream>>>(in, work, round < kJoins);
+    label_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work);
+  }
+  islands_sync_kernel<<<blocks, kWarp, 0, stream>>>(in, work);
+  sweep_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work);
+  islands_sync_kernel<<<blocks, kWarp, 0, stream>>>(in, work);
+  finish_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work, island);
+  return cudaGetLastError();
+}
+
+template <class T>
+cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
+                        int64_t segments, int64_t c, T* out, cudaStream_t stream) {
+  if (scenes * segments * c == 0) return cudaSuccess;
+  const auto blocks = static_cast<unsigned>(scenes * segments);
+  const int threads = threads_for(items, segments);
+  segments_sync_kernel<<<blocks, threads, 0, stream>>>(values, order, ptr, items, segments, c, out);
+  return cudaGetLastError();
+}
+
+#define DIFFVBD_INSTANTIATE(T)                                                                                     \
+  template size_t islands_workspace_bytes<T>(const IslandInputs<T>&);                                              \
+  template cudaError_t find_islands<T>(const IslandInputs<T>&, int32_t*, void*, cudaStream_t);                     \
+  template cudaError_t segment_sum<T>(const T*, const int32_t*, const int32_t*, int64_t, int64_t, int64_t, int64_t, \
+                                      T*, cudaStream_t);
+DIFFVBD_INSTANTIATE(float)
+DIFFVBD_INSTANTIATE(double)
+#undef DIFFVBD_INSTANTIATE
+
+}  // namespace diffvbd::cuda

@@ -1,0 +1,26 @@
+// Islands of bodies in contact, and sums over segments, on the device; the twin of cpu/islands.h.
+#pragma once
+
+#include <cuda_runtime.h>
+
+#include <cstddef>
+
+#include "../contact/islands.h"
+
+namespace diffvbd::cuda {
+
+// Bytes of memory that find_islands works in.
+template <class T>
+size_t islands_workspace_bytes(const contact::IslandInputs<T>& in);
+
+// island [B, mesh_bodies]
+template <class T>
+cudaError_t find_islands(const contact::IslandInputs<T>& in, int32_t* island, void* workspace, cudaStream_t stream);
+
+// values [B, items, c] -> [B, segments, c]: sums of the rows order[ptr[s]..ptr[s + 1]) in an order that depends on the
+// shapes alone
+template <class T>
+cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
+                        int64_t segments, int64_t c, T* out, cudaStream_t stream);
+
+}  // namespace diffvbd::cuda
