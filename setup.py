@@ -33,6 +33,7 @@ CPU_SOURCES = [
     "csrc/cpu/plan.cpp",
     "csrc/cpu/register.cpp",
     "csrc/cpu/register_contact.cpp",
+    "csrc/cpu/register_contact_start.cpp",
     "csrc/cpu/register_contact_sweep.cpp",
     "csrc/cpu/register_neighbors.cpp",
     "csrc/cpu/run.cpp",

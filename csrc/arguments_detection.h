@@ -38,7 +38,8 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
   require_positions(x);
   const int64_t b = x.size(0), v = x.size(1), n = body.numel();
   const ScalarType real = x.scalar_type();
-  require(v <= n && mesh_bodies >= 0, "contact_detect: expected body of shape [N], N >= vertices, and mesh_bodies >= 0");
+  require(v <= n && mesh_bodies >= 0,
+          "contact_detect: expected body of shape [N], N >= vertices, and mesh_bodies >= 0");
   if (origin.numel() > 0) {
     require_shape(origin, x, real, {b, v, 3}, "contact_detect: expected origin like x, or empty");
   }
@@ -60,7 +61,8 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
   out.body = indices(body, {n}, "contact_detect: expected body [N] int32");
   require_shape(held, x, ScalarType::Bool, {n}, "contact_detect: expected held [N] bool");
   require_countable(b * n + 1, "contact_detect: too large, expected at most 2^31 corner points in all scenes");
-  require(std::isfinite(reach) && reach >= 0 && std::isfinite(dhat), "contact_detect: expected finite dhat and reach >= 0");
+  require(std::isfinite(reach) && reach >= 0 && std::isfinite(dhat),
+          "contact_detect: expected finite dhat and reach >= 0");
   out.x = data<const T>(x), out.origin = origin.numel() > 0 ? data<const T>(origin) : nullptr;
   out.collider = data<const T>(collider), out.collider_next = data<const T>(collider_next);
   out.rest = data<const T>(rest), out.radius = data<const T>(radius), out.held = data<const bool>(held);
@@ -87,7 +89,7 @@ contact::IslandInputs<T> island_inputs(const Tensor& x, const Tensor& origin, co
                                        const Tensor& collider, const Tensor& collider_next, const Tensor& planes,
                                        const Tensor& body, const Tensor& body_order, const Tensor& body_ptr,
                                        const Tensor& held, const Tensor& radius, int64_t mesh_bodies, double cap,
-                                       double dhat) {
+                                       double dhat, bool any_direction) {
   require_positions(x);
   const int64_t b = x.size(0), v = x.size(1), n = body.numel();
   const ScalarType real = x.scalar_type();
@@ -119,6 +121,7 @@ contact::IslandInputs<T> island_inputs(const Tensor& x, const Tensor& origin, co
   out.scenes = b, out.vertices = static_cast<int32_t>(v), out.corners = static_cast<int32_t>(n);
   out.num_planes = static_cast<int32_t>(planes.size(0)), out.mesh_bodies = static_cast<int32_t>(mesh_bodies);
   out.margin = static_cast<T>(cap + dhat / 2);
+  out.any_direction = any_direction;
   return out;
 }
 

@@ -50,6 +50,25 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   m.def(
       "contact_lowest(Tensor x, Tensor origin, Tensor planes, Tensor body_order, Tensor body_ptr, Tensor island) -> "
       "Tensor");
+  // Translation of each body's island [scenes, bodies, 3], see contact/translation.h; without a floor planes and lowest
+  // are empty. The adjoint: of move, mass, x and planes.
+  m.def(
+      "contact_translation(Tensor move, Tensor mass, Tensor x, Tensor origin, Tensor planes, Tensor held, Tensor body, "
+      "Tensor body_order, Tensor body_ptr, Tensor island, Tensor lowest) -> Tensor");
+  m.def(
+      "contact_translation_backward(Tensor u_bar, Tensor move, Tensor mass, Tensor x, Tensor origin, Tensor planes, "
+      "Tensor held, Tensor body, Tensor body_order, Tensor body_ptr, Tensor island, Tensor lowest) -> (Tensor move, "
+      "Tensor mass, Tensor x, Tensor planes)");
+  // Bounds, start, what is left to go, and 1 where a bound has cut, see contact/start.h. The adjoint: of x, move, goal, u
+  // (for each vertex), the gap of near, and planes (for each vertex).
+  m.def(
+      "contact_start(Tensor x, Tensor move, Tensor goal, Tensor u, Tensor near, Tensor origin, Tensor planes, Tensor "
+      "held, Tensor body, float gamma, float cap, float filter_eta) -> (Tensor bounds, Tensor start, Tensor move, "
+      "Tensor outside)");
+  m.def(
+      "contact_start_backward(Tensor bounds_bar, Tensor start_bar, Tensor move_bar, Tensor x, Tensor move, Tensor goal, "
+      "Tensor u, Tensor near, Tensor origin, Tensor planes, Tensor held, Tensor body, float gamma, float cap, float "
+      "filter_eta, bool wants_planes) -> (Tensor x, Tensor move, Tensor goal, Tensor u, Tensor gap, Tensor planes)");
   // Normal force, 1 where active, normal and weights of each pair [pairs, 9], and the adjoint of x, collider and kappa
   m.def(
       "contact_lag(Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor constants, Tensor ptr, Tensor "
@@ -74,7 +93,7 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   m.def(
       "contact_islands(Tensor x, Tensor origin, Tensor move, Tensor mass, Tensor collider, Tensor collider_next, "
       "Tensor planes, Tensor body, Tensor body_order, Tensor body_ptr, Tensor held, Tensor radius, int mesh_bodies, "
-      "float cap, float dhat) -> Tensor");
+      "float cap, float dhat, bool any_direction) -> Tensor");
   m.def("segment_sum(Tensor values, Tensor order, Tensor ptr) -> Tensor");
   // points [B, N, 3]; pairs [max_pairs, 3] int32: (scene, i, j), then rows of -1; count [1] int64: how many there are,
   // or -1 where a point is not finite

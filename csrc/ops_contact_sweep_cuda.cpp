@@ -45,8 +45,7 @@ cuda::StepInputs<T> inputs(const cuda::HostPlan& host, const Tensor& x, const Te
 
 cuda::Choice choose(const Tensor& x, const std::vector<int64_t>& launch, bool reverse, int wanted = 0) {
   cuda::Choice out = cuda::choose(x, launch, reverse, wanted);
-  require(out.regime == cuda::kColor && out.lanes == cuda::kSomeLanes, "diffvbd::contact_sweep: bad launch");
-  out.contact = true;
+  require(out.regime == cuda::kColor && out.lanes != cuda::kFewLanes, "diffvbd::contact_sweep: bad launch");
   return out;
 }
 

@@ -123,6 +123,8 @@ def prepare(
         energy, key, own = known[name]
         shape = tuple(model.constants(energy)[key].shape)[:own]
         given[name] = _scenes_first(name, value, like, lead, shape)
+        if energy in (model.contact, model.friction) and (checking() or not like.is_cuda):
+            name_value(name, "finite numbers >= 0", given[name], given[name] >= 0)
     materials = [_scenes_first(name, value, like, lead, tets) for name, value in (("mu", mu), ("lam", lam))]
     if model.touches and not isinstance(adjoint, ReverseSweep | None):
         raise NotImplementedError(f"adjoint: contact is differentiated by ReverseSweep, got {type(adjoint).__name__}")

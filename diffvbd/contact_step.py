@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from . import detection as search
+from .contact_start import start_part
 from .contact_sweeps import ContactTensors, Pairs, contact_sweep, pair_lag
 from .model import Model
 from .ops import SweepSettings, broadcast
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from .arguments import Prepared
     from .step import Begun
 
-GUARD_ULPS = 32  # of a position: gaps are not trusted to less
 FREE = 1e15  # [m] radius of a bound that binds nothing
 
 
@@ -38,7 +38,7 @@ class Outcome(NamedTuple):
 
     counts: Tensor  # [R, 4] int64: pairs needed, touching pairs, 0, corner points moved above their bound
     capacity: int  # pairs of all scenes
-    cut: Tensor  # [B, V] bool
+    cut: list[Tensor]  # [B, V] uint8, of each start and of each part's sweeps
     smallest: Tensor  # [R, B] [m]
 
 
@@ -51,29 +51,21 @@ def sweeps_of_parts(sweeps: int, parts: int) -> list[int]:
     return [sweeps // parts + (1 if r < sweeps % parts else 0) for r in range(parts)]
 
 
-def project(x: Tensor, step: Tensor, center: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
-    """x + step, moved to the closest point of a ball where it leaves it, and where it did; twin of core/bounds.h.
-
-    Args:
-        x, step, center: [B, V, 3] [m].  radius: [B, V] [m].
-    """
-    m = x + step - center
-    square = (m * m).sum(-1)
-    outside = square.detach().sqrt() > radius.detach()
-    length = torch.where(outside, square, torch.ones_like(square)).sqrt()
-    return torch.where(outside[..., None], center + (radius / length)[..., None] * m, x + step), outside
-
-
 class ContactStep:
     """What the parts of one step share."""
 
-    def __init__(self, model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor) -> None:
-        self.model, self.begun, self.prepared = model, begun, prepared
+    def __init__(self, model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor,
+                 prescribed: bool) -> None:  # fmt: skip
+        begun = begun._replace(x_prev=begun.x_prev.contiguous(), y=begun.y.contiguous())
+        self.model, self.begun, self.prepared, self.prescribed = model, begun, prepared, prescribed
+        self.x_prev = begun.x_prev
         self.colliders, self.before = colliders, before  # [B, Vc, 3] at the end and at the start of the step
         self.tensors = begun.tensors(prepared)
         self.origin = self.tensors.origin
         self.surface, self.barrier = model.surface_of_contact, model.contact
         self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()]
+        oblique = model.floor is not None and any(sum(a != 0 for a in n) > 1 for n in model.floor.normal)
+        self.any_direction = oblique or "floor_barrier.normal" in prepared.parameters
         self.parts = 1 if self.barrier is None else self.barrier.detections
         like = begun.x_prev
         self.kappa = self._parameter("pair_barrier.kappa", like.new_zeros((1,)))
@@ -86,9 +78,9 @@ class ContactStep:
         """A parameter [1 | B]."""
         if name in self.prepared.parameters:
             return self.prepared.parameters[name]
-        energy, key = name.split(".")
-        known = self.model._constants.get(energy)
-        return default if known is None else known[key][None]
+        owner, key = name.split(".")
+        energy = next((e for e in self.model.parametric_energies if e.name == owner), None)
+        return default if energy is None else self.model.constants(energy)[key][None]
 
     def _floor_lag(self) -> Tensor:
         """Friction coefficient times normal force of the floor's planes, and their normals, at the start."""
@@ -122,45 +114,39 @@ class ContactStep:
     def run(self, policy: int, debug_step: int) -> Tensor:
         """Positions after all parts [B, V, 3]; raises where detection did not hold."""
         begun, settings, model = self.begun, self.prepared.settings, self.model
-        x, held = begun.x_prev, begun.y - begun.x_prev
-        remaining = held
-        pinned = model.pinned[:, None]
-        cut = torch.zeros(x.shape[:2], dtype=torch.bool, device=x.device)
+        barrier, surface = self.barrier, self.surface
+        if barrier is None or surface is None:  # friction on a floor alone
+            x = begun.x_start
+            bounds = torch.cat([x, torch.full_like(x[..., :1], FREE)], -1)
+            none = no_pairs(x, x.shape[0] * x.shape[1])
+            return self._sweep(x, bounds, self.colliders, none, settings, policy, debug_step)[0]
+        x, held = self.x_prev, begun.y - self.x_prev
+        move = held
+        cut: list[Tensor] = []
         found: list[Detection] = []
         counts: list[Tensor] = []
         for r, sweeps in enumerate(sweeps_of_parts(settings.sweeps, self.parts)):
-            done, then = r / self.parts, (r + 1) / self.parts
-            moving = self.colliders is not self.before
-            was = self.before + done * (self.colliders - self.before) if moving else self.before
-            now = self.before + then * (self.colliders - self.before) if moving else self.before
-            bounds, listed = self._free(x), no_pairs(x, x.shape[0] * x.shape[1])
-            if self.barrier is not None:
-                detection = self._detect(x, was, now, remaining)
-                found.append(detection)
-                listed = detection.listed
-                if r == 0:
-                    self._set_lag(listed, was)
-                bounds, above = self._bounds(x, was, now, remaining, detection, held / self.parts)
-                counts.append(torch.cat([detection.counts[:3], above]))
-            center, radius = bounds[..., :3], bounds[..., 3]
-            target, outside = project(x, remaining, center, radius)
-            if model.floor is not None and self.floor_data is not None:
-                # from the center: with it and the target, all between them lies inside the bound
-                target = model.floor.filter(center, target - center, self.floor_data, begun.origin)
-            target = torch.where(pinned, begun.x_prev + then * held, target)
-            cut |= outside & ~model.pinned
-            remaining = remaining - (target - x)
-            x = target
+            was, now = (self._colliders_at(n / self.parts) for n in (r, r + 1))
+            goal = begun.y if r + 1 == self.parts else self.x_prev + ((r + 1) / self.parts) * held
+            detection = self._detect(x, was, now, move)
+            found.append(detection)
+            counts.append(torch.cat([detection.counts[:3], self._above(held, was, now, detection)]))
+            if r == 0:
+                self._set_lag(detection.listed, was)
+            start = start_part(x, move, goal, self.tensors.mass, was, now, self.floor_data, self.origin, detection, surface,
+                               barrier.gamma)  # fmt: skip
+            x, move = start.x, start.move
+            cut.append(start.outside)
             if sweeps:
                 part = settings._replace(sweeps=sweeps)
-                x, held_back = self._sweep(x, bounds, now, listed, part, policy, debug_step)
-                cut |= held_back.bool()
-        if self.barrier is not None:
-            x = self._judged(x, found, torch.stack(counts), cut)
-        return x
+                x, held_back = self._sweep(x, start.bounds, now, detection.listed, part, policy, debug_step)
+                cut.append(held_back)
+        return self._judged(x, found, torch.stack(counts), cut)
 
-    def _free(self, x: Tensor) -> Tensor:
-        return torch.cat([x, torch.full_like(x[..., :1], FREE)], -1)
+    def _colliders_at(self, share: float) -> Tensor:
+        if self.colliders is self.before:
+            return self.before
+        return self.before + share * (self.colliders - self.before)
 
     def _sweep(self, x: Tensor, bounds: Tensor, collider: Tensor, listed: Pairs, settings: SweepSettings, policy: int,
                debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
@@ -179,7 +165,8 @@ class ContactStep:
                 x, self.origin, was, now, surface, barrier, capacity
             )
             island = search.islands(
-                x, self.origin, remaining.detach(), self.tensors.mass.detach(), was, now, surface, barrier.dhat
+                x, self.origin, remaining.detach(), self.tensors.mass.detach(), was, now, surface, barrier.dhat,
+                self.any_direction,
             )
             lowest = island.new_empty((0,))
             if self.floor_data is not None:
@@ -189,52 +176,28 @@ class ContactStep:
             record.append(detection)
         return detection
 
-    def _bounds(self, x: Tensor, was: Tensor, now: Tensor, remaining: Tensor, detection: Detection, held: Tensor
-                ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Center and radius of every vertex's bound [B, V, 4]; how many corner points were moved above theirs, [1]."""
+    def _above(self, held: Tensor, was: Tensor, now: Tensor, detection: Detection) -> Tensor:
+        """How many pinned vertices and collider points this part moves above their bound, int64 [1]."""
         surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
-        gap = self._near_gap(x, was, now, detection)
+        if not self.prescribed and was is now:
+            return detection.counts[3:]  # a zero: nothing that is held moves
         with torch.no_grad():
-            absolute = x if self.origin.numel() == 0 else x + self.origin
-            absolute = torch.cat([absolute, was], 1).abs().sum(-1)
-            guard = GUARD_ULPS * torch.finfo(x.dtype).eps * absolute
-        radius = (barrier.gamma * (gap - guard).clamp(min=0)).clamp(max=surface.cap)
-        floor = None
-        if self.floor_data is not None:
-            floor = search.Floor(self.floor_data, detection.lowest.to(torch.int64))
-        center = x + search.island_translation(remaining, self.tensors.mass, detection.island, surface, x, self.origin,
-                                               floor)  # fmt: skip
-        with torch.no_grad():
-            moves = torch.cat([held, now - was], 1).square().sum(-1).sqrt()
+            radius = (barrier.gamma * detection.near_values[..., 7]).clamp(0, surface.cap)
+            moves = torch.cat([held / self.parts, now - was], 1).square().sum(-1).sqrt()
             above = (moves > radius) & surface.held & ~surface.plane_points
-        return torch.cat([center, radius[:, : x.shape[1], None]], -1), above.sum().reshape(1)
+            return above.sum().reshape(1)
 
-    def _near_gap(self, x: Tensor, was: Tensor, now: Tensor, detection: Detection) -> Tensor:
-        """Smallest gap of each corner point [B, N]. By the envelope theorem its derivative is that of the distance with
-        weights and normal held, so that the value can stay the one detection found."""
-        values = detection.near_values
-        gap = values[..., 7]
-        if not (torch.is_grad_enabled() and any(t.requires_grad for t in (x, was, now))):
-            return gap
-        surface = self.surface
-        assert surface is not None
-        where = torch.where(surface.plane_points[x.shape[1] :, None], now, was)
-        points = torch.cat([x, where], 1)
-        scene = torch.arange(x.shape[0], device=x.device)[:, None, None]
-        corners = points[scene, detection.near_corners[..., :4].to(torch.int64)]
-        along = (values[..., :4, None] * values[..., None, 4:7] * corners).sum((-2, -1))
-        return gap + (along - along.detach())
-
-    def _judged(self, x: Tensor, found: list[Detection], counts: Tensor, cut: Tensor) -> Tensor:
+    def _judged(self, x: Tensor, found: list[Detection], counts: Tensor, cut: list[Tensor]) -> Tensor:
         surface = self.surface
         assert surface is not None
         capacity = surface.capacity * x.shape[0]
         smallest = torch.stack([d.smallest for d in found])
         outcomes[self.model] = Outcome(counts, capacity, cut, smallest)
         if torch.compiler.is_compiling() or (x.is_cuda and torch.cuda.is_current_stream_capturing()):
-            good = (counts[:, 0] <= capacity).all() & (counts[:, 1] == 0).all() & (counts[:, 3] == 0).all()
-            return torch.where(good, x, torch.full_like(x, torch.nan))
+            good = (counts[:, :2] <= torch.stack([counts.new_full((), capacity), counts.new_zeros(())])).all()
+            good = good & (counts[:, 3] == 0).all()
+            return torch.where(good, x, torch.nan)
         for r, (needed, touching, pair, above) in enumerate(counts.tolist()):
             if needed > capacity:
                 each = -(-needed // x.shape[0])
@@ -243,9 +206,13 @@ class ContactStep:
                     f"({surface.capacity} per scene): use diffvbd.contact.reserve(model, {2 * each})"
                 )
             if touching:
+                finite = all(bool(torch.isfinite(t).all()) for t in (self.x_prev, self.colliders, self.before, x))
+                if not finite:  # which argument, finds arguments.name_argument
+                    raise ValueError("start (x, v, force, gravity, prescribed, colliders): expected finite values")
+                scene, corners = surface.corners_of(pair)
                 raise ValueError(
                     f"x: expected surfaces that do not touch, got {touching} pairs without a gap in part {r} of the "
-                    f"step, {self._described(found[r], pair)}"
+                    f"step, one of the corner points {corners} in scene {scene}"
                 )
             if above:
                 raise ValueError(
@@ -254,15 +221,6 @@ class ContactStep:
                 )
         return x
 
-    def _described(self, detection: Detection, _: int) -> str:
-        """The corner points of a pair without a gap, for an error."""
-        bad = ~(detection.near_values[..., 7] > 0)
-        where = bad.nonzero()
-        if where.numel() == 0:
-            return "too many to name"
-        scene, point = where[0].tolist()
-        return f"one at corners {detection.near_corners[scene, point, :4].tolist()} of scene {scene}"
-
 
 def no_pairs(like: Tensor, corners: int) -> Pairs:
     """An empty list for so many corner points of all scenes."""
@@ -270,7 +228,12 @@ def no_pairs(like: Tensor, corners: int) -> Pairs:
     return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, 3)), none, none[:0])
 
 
-def run_contact(model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor, policy: int,
-                debug_step: int) -> Tensor:  # fmt: skip
-    """Positions after the sweeps of a step with contact; colliders [B, Vc, 3] at its start and at its end [m]."""
-    return ContactStep(model, begun, prepared, before, colliders).run(policy, debug_step)
+def run_contact(model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor, prescribed: bool,
+                policy: int, debug_step: int) -> Tensor:  # fmt: skip
+    """Positions after the sweeps of a step with contact.
+
+    Args:
+        before, colliders: Where the colliders are at its start and at its end, [B, Vc, 3] [m]; one tensor if they rest.
+        prescribed: Whether pinned vertices are moved.
+    """
+    return ContactStep(model, begun, prepared, before, colliders, prescribed).run(policy, debug_step)

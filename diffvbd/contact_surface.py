@@ -43,6 +43,16 @@ class ContactSurface:
     def collider_points(self) -> Tensor:
         return self.rest[self.body_order.shape[0] :]
 
+    def corners_of(self, key: int) -> tuple[int, list[int]]:
+        """Scene and corner points of a pair by its key in contact_detect's counts."""
+        count = 1 + max(t.shape[0] for t in (self.triangles, self.edges, self.points, self.planes))
+        key, second = divmod(key, count)
+        key, first = divmod(key, count)
+        scene, kind = divmod(key, 3)
+        sides = ((self.points, self.triangles), (self.edges, self.edges), (self.points, self.planes))[kind]
+        corners = [side[row].reshape(-1).tolist() for side, row in zip(sides, (first, second), strict=True)]
+        return scene, corners[0] + corners[1]
+
     def to(self, device: torch.device, dtype: torch.dtype) -> ContactSurface:
         changes: dict[str, Any] = {}
         for field in fields(self):

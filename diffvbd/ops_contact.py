@@ -7,21 +7,20 @@ contiguous and on one device.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, NoReturn
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from . import ops  # noqa: F401  loads what is named here
+from . import ops
 
-_raw = torch.ops.diffvbd
 PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS = 6, 3, 5, 8, 4  # twins of those in csrc/contact/candidates.h
 
 
 class Detection(NamedTuple):
     """Pairs of primitives that are, or may come, closer than the barrier's reach."""
 
-    pairs: Tensor  # [capacity, 6]  four corner points, kind (0 point-triangle, 1 edge-edge, 2 point-plane), scene; or -1
+    pairs: Tensor  # [capacity, 6]  corner points, kind (0 point-triangle, 1 edge-edge, 2 point-plane), scene; or -1
     constants: Tensor  # [capacity, 3]  reach of the barrier [m], sum of the radii [m], mollifier threshold [m^4]
     ptr: Tensor  # [B N + 1]  pairs of corner point i of scene b: entry[ptr[b N + i] : ptr[b N + i + 1]],
     entry: Tensor  # [4 capacity]  each 4 pair + local corner, in ascending order
@@ -37,8 +36,8 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
                    gamma: float, capacity: int) -> Detection:  # fmt: skip
     """Near pair of every corner point, and the pairs that may come within reach of the barrier before the next call.
 
-    A corner point may move by ``min(gamma gap, cap)``, gap being that of its near pair. Pairs are considered up to a gap
-    of ``reach``; one is listed if its gap, less the bounds of its two sides, is below the barrier's reach, which is
+    A corner point may move by ``min(gamma gap, cap)``, gap being that of its near pair. Pairs are considered up to a
+    gap of ``reach``; one is listed if its gap, less the bounds of its two sides, is below the barrier's reach, which is
     ``dhat`` or, for two sides of one body that are closer at rest, 0.9 times their distance at rest. Two colliders make
     no pair, nor do four held corner points, nor two sides of one body that are one place at rest.
 
@@ -60,7 +59,7 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         ValueError: A tensor with the wrong shape, dtype or device; too large a scene.
     """
     return Detection(
-        *_raw.contact_detect(
+        *ops.raw.contact_detect(
             x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies,
             self_contact, between_bodies, dhat, reach, cap, gamma, capacity,
         )
@@ -69,23 +68,24 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
 
 def contact_islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, collider: Tensor, collider_next: Tensor,
                     planes: Tensor, body: Tensor, body_order: Tensor, body_ptr: Tensor, held: Tensor, radius: Tensor,
-                    mesh_bodies: int, cap: float, dhat: float) -> Tensor:  # fmt: skip
+                    mesh_bodies: int, cap: float, dhat: float, any_direction: bool = False) -> Tensor:  # fmt: skip
     """Smallest body of the island of bodies in contact that each body is in [B, NB] int32, or -1.
 
     An island moves by the mass-weighted mean of ``move`` over its vertices that are not held. Bodies whose boxes, swept
-    by that and grown by ``cap + dhat / 2``, overlap are of one island. -1: the island holds a held vertex or may reach a
-    collider, and must stay. Not differentiable; results repeat to the bit.
+    by that and grown by ``cap + dhat / 2``, overlap are of one island. -1: the island holds a held vertex or may reach
+    a collider, and must stay. Not differentiable; results repeat to the bit.
 
     Args:
         x, origin, collider, collider_next, planes, body, held, radius, cap, dhat: As for :func:`contact_detect`.
         move, mass: [B, V, 3] where each vertex wants to go [m], [1 | B, V] [kg].
+        any_direction: Whether a floor may turn a translation into any direction, by which it does not become longer.
         body_order, body_ptr: [V] vertices sorted by body, [NB + 1] the first of each body.
 
     Raises:
         ValueError: A tensor with the wrong shape, dtype or device.
     """
-    return _raw.contact_islands(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr,
-                                held, radius, mesh_bodies, cap, dhat)  # fmt: skip
+    return ops.raw.contact_islands(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr,
+                                held, radius, mesh_bodies, cap, dhat, any_direction)  # fmt: skip
 
 
 def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
@@ -98,7 +98,7 @@ def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
     Raises:
         ValueError: A tensor with the wrong shape, dtype or device.
     """
-    return _raw.segment_sum(values, order, ptr)
+    return ops.raw.segment_sum(values, order, ptr)
 
 
 # --- shapes without execution, no autograd ----------------------------------------------------------------------------
@@ -119,7 +119,7 @@ def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points
 
 @torch.library.register_fake("diffvbd::contact_islands")
 def _(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr, held, radius, mesh_bodies,
-      cap, dhat):  # fmt: skip
+      cap, dhat, any_direction):  # fmt: skip
     return x.new_empty((x.shape[0], mesh_bodies), dtype=torch.int32)
 
 
@@ -128,9 +128,5 @@ def _(values, order, ptr):
     return values.new_empty((values.shape[0], ptr.shape[0] - 1, values.shape[2]))
 
 
-def _raw_backward(ctx: Any, *grads: Tensor) -> NoReturn:
-    raise NotImplementedError("diffvbd: the raw operators are not differentiable; call diffvbd.step")
-
-
 for _name in ("contact_detect", "contact_islands", "segment_sum"):
-    torch.library.register_autograd(f"diffvbd::{_name}", _raw_backward)
+    torch.library.register_autograd(f"diffvbd::{_name}", ops.raw_backward)

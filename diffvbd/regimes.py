@@ -57,15 +57,16 @@ def regime(name: Regime | None) -> Iterator[None]:
 def choose(vertices: int, colors: int, scenes: int, *, contact: bool = False) -> tuple[int, int, int]:
     """Regime, and threads per vertex of the sweeps and of their reverse, for SweepSettings.launch. Pairs are summed
     between the launches of colors: a scene with contact has one regime."""
+    at_once = vertices * scenes / max(1, colors)
     if contact:
-        return COLOR, SOME_LANES, SOME_LANES
+        lanes = MANY_LANES if at_once <= MANY_LANES_VERTICES else SOME_LANES
+        return COLOR, lanes, lanes
     code = CODES[_forced] if _forced else _automatic(vertices, scenes)
     if code == THREAD and vertices > SMALL_MESH:
         fail("regime", f"a mesh of at most {SMALL_MESH} vertices for a scene per thread", f"{vertices} vertices")
     if code == BLOCK:  # scenes enough fill a multiprocessor; one alone wants its threads
         lanes = SOME_LANES if scenes < MANY_SCENES else FEW_LANES
         return code, lanes, lanes
-    at_once = vertices * scenes / max(1, colors)
     if at_once <= MANY_LANES_VERTICES:
         return code, MANY_LANES, MANY_LANES
     forward, reverse = (SOME_LANES if at_once <= limit else FEW_LANES for limit in SOME_LANES_VERTICES)

@@ -158,7 +158,7 @@ def begin(
     y = torch.where(model.pinned[:, None], held, y)
     data = _energy_data(model, prepared, origin)
     x_start = y
-    if model.floor is not None and not model.touches:  # contact moves from the state to y in parts
+    if model.floor is not None and model.contact is None:  # with pairs the state moves to y in parts
         count = model.floor.count()
         filtered = model.floor.filter(start, y - start, data[:, :count], origin)
         x_start = torch.where(model.pinned[:, None], y, filtered)
@@ -218,7 +218,8 @@ def swept(
     try:
         if colliders is not None:
             with out_of_memory_named(model, begun.x_start, settings, policy):
-                return run_contact(model, begun, prepared, *colliders, policy, debug_step)
+                moves = given.get("prescribed") is not None
+                return run_contact(model, begun, prepared, *colliders, moves, policy, debug_step)
         if checking() and begun.y.is_cuda:
             check_on_cpu(model, tensors, settings, index)
         with out_of_memory_named(model, begun.x_start, settings, policy):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from contact_scenes import (
+from detection_scenes import (
     POINT_PLANE,
     Pairs,
     Scene,

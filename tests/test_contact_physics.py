@@ -1,5 +1,5 @@
-"""Claim: converged sweeps with contact are mechanics: bodies rest where the barrier carries them, pairs push equally and
-oppositely, and a collision keeps what it must. Sweeps are converged on purpose; K is stated with each test."""
+"""Claim: converged sweeps with contact are mechanics: bodies rest where the barrier carries them, pairs push equally
+and oppositely, and a collision keeps what it must. Sweeps are converged on purpose; K is stated with each test."""
 
 import math
 from typing import Any

@@ -17,17 +17,28 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd.mesh import TetMesh, join
 from diffvbd.reference.contact import Part
+from diffvbd.reference.distance import distance
 from diffvbd.testing import relative_error, tolerance
 
 
-def two_tets() -> Scene:
-    """A corner above a triangle, a little off the middle: four colors for two bodies."""
+def corner_above(*corners: tuple[float, float, float]) -> Scene:
+    """Tets that stand on a corner above the face of another one, 6 mm from it."""
     lower = TetMesh([[0, 0, 0], [0.3, 0, 0.02], [0.02, 0, 0.3], [0.1, -0.25, 0.1]], [[0, 1, 2, 3]], orient=True)
-    upper = TetMesh([[0.1, 0.006, 0.09], [0.3, 0.25, 0.1], [0.0, 0.3, 0.3], [-0.1, 0.25, 0.0]], [[0, 1, 2, 3]], orient=True)
-    scene = build("two_tets", join([lower, upper]), (dv.PairBarrier(1e4, 0.02, damping=1.0, detections=1),
-                                                    dv.Friction(0.3, 0.05)), jitter=5e-4)  # fmt: skip
+    upper = TetMesh([[0, 0.006, 0], [0.02, 0.12, 0.01], [-0.01, 0.13, 0.02], [-0.01, 0.12, -0.02]], [[0, 1, 2, 3]],
+                    orient=True)  # fmt: skip
+    energies = (dv.PairBarrier(1e4, 0.02, damping=1.0, detections=1), dv.Friction(0.3, 0.05))
+    scene = build(f"above {corners}", join([lower, *(upper.translate(c) for c in corners)]), energies, jitter=5e-4)
     scene.v[4:, 1] -= 0.5
     return scene
+
+
+def two_tets() -> Scene:
+    return corner_above((0.1, 0.0, 0.09))
+
+
+def two_on_one() -> Scene:
+    """Both upper corners have one color, and meet the corners of one triangle."""
+    return corner_above((0.13, 0.0, 0.05), (0.06, 0.0, 0.13))
 
 
 def twins() -> Scene:
@@ -47,7 +58,7 @@ def folded() -> Scene:
     return contact_scenes.folded()
 
 
-SCENES: dict[str, Callable[[], Scene]] = {f.__name__: f for f in (two_tets, twins, batch_of_stacks, folded)}
+SCENES: dict[str, Callable[[], Scene]] = {f.__name__: f for f in (two_tets, two_on_one, twins, batch_of_stacks, folded)}
 
 
 def colors(model: dv.Model) -> Tensor:
@@ -62,8 +73,6 @@ def colors(model: dv.Model) -> Tensor:
 def met(model: dv.Model, part: Part, x: Tensor) -> tuple[int, int]:
     """How often listed pairs hold two vertices of one color, and how many third vertices see two vertices of one color
     through different pairs; pairs farther apart than dhat do nothing and do not count."""
-    from diffvbd.reference.distance import distance
-
     color, inside, third = colors(model), 0, 0
     points = torch.cat([x, model.collider_points.expand(len(x), -1, -1)], 1)
     corners = points[part.pairs[:, 5:6], part.pairs[:, :4]]
@@ -83,23 +92,23 @@ def met(model: dv.Model, part: Part, x: Tensor) -> tuple[int, int]:
     return inside, third
 
 
-@pytest.mark.parametrize("sweeps", (1, 2, 7))
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(("name", "sweeps"), [("two_tets", 1), ("two_on_one", 1), ("two_on_one", 5), ("twins", 1),
+                                              ("twins", 5), ("batch_of_stacks", 2), ("folded", 2)])  # fmt: skip
 def test_the_color_moves_as_one(device: str, name: str, sweeps: int) -> None:
-    scene, steps = SCENES[name](), 2
+    scene, steps = SCENES[name](), 1 if name == "folded" else 2
     model = scene.model.to(device)
     _, parts = compiled(scene, steps, sweeps)
     expected = unrolled(scene, steps, sweeps, parts)
-    permuted = [unrolled(scene, steps, sweeps, parts, seed) for seed in (1, 2)]
+    permuted = unrolled(scene, steps, sweeps, parts, seed=1)
     start = scene.x.reshape(-1, *scene.x.shape[-2:])
     inside, third = met(scene.model, parts[0], start)
-    assert inside > 0 and third > 0, (inside, third)
+    assert inside > 0 and (third > 0 or name == "two_tets"), (inside, third)
     for tape in ("full", "recompute"):
         result, found = compiled(scene, steps, sweeps, tape, model)
         assert [len(p.pairs) for p in found] == [len(p.pairs) for p in parts]
         assert result.keys() == expected.keys()
         for key, value in result.items():
-            spread = max(relative_error(p[key], expected[key]) for p in permuted)
+            spread = relative_error(permuted[key], expected[key])
             floor = tolerance("contact_adjoint") if key.startswith("grad") else tolerance("contact_forward")
             error = relative_error(value, expected[key])
             assert error <= max(floor, tolerance("spread_factor") * spread), (key, error, spread)
@@ -107,7 +116,7 @@ def test_the_color_moves_as_one(device: str, name: str, sweeps: int) -> None:
                 assert value.any()
 
 
-@pytest.mark.parametrize("name", ("two_tets", "twins"))
+@pytest.mark.parametrize("name", ("two_on_one", "twins"))
 def test_the_order_inside_a_color_does_not_matter(name: str) -> None:
     """Another numbering of the vertices, the same colors: the same step but for rounding. An update that saw its
     neighbor's new place would depend on who comes first."""
@@ -118,8 +127,7 @@ def test_the_order_inside_a_color_does_not_matter(name: str) -> None:
     for first, end in itertools.pairwise(model.color_ptr.tolist()):
         own = model.color_vertices[first:end].cpu().sort().values
         rank[own] = own.flip(0)
-    if name == "twins":  # body by body, so that only the vertices of one color change places
-        assert not torch.equal(rank, torch.arange(count))
+    assert not torch.equal(rank, torch.arange(count))
     mesh = TetMesh(model.mesh.points[rank.argsort().numpy()], rank[model.tets.cpu()].numpy(),
                    body=model.mesh.body[rank.argsort().numpy()])  # fmt: skip
     other = Scene(dv.Model(mesh, energies=model.energies), scene.x[rank.argsort()], scene.v[rank.argsort()],

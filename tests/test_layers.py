@@ -123,9 +123,11 @@ def test_only_ops_names_the_compiled_operators() -> None:
 
     assert naming(r"\bload_library\b") == {"native"}
     assert naming(r"torch\.ops\b(?!\.load_library\b)|torch\.library\b|\bdiffvbd::") == {
-        "ops", "ops_contact", "ops_contact_sweep", "ops_neighbors"
+        "ops", "ops_contact", "ops_contact_start", "ops_contact_sweep", "ops_neighbors"
     }  # fmt: skip
-    assert naming(r"\bops\.raw\b") == {"ops_contact_sweep", "ops_neighbors", "sweeps"}
+    assert naming(r"\bops\.raw\b") == {
+        "ops_contact", "ops_contact_start", "ops_contact_sweep", "ops_neighbors", "sweeps"
+    }  # fmt: skip
     assert not [m for m, imports in PYTHON.items() if "diffvbd.ops.raw" in imports or "torch.ops" in imports]
 
 

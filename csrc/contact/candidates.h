@@ -35,9 +35,7 @@ struct Surfaces {
   // Keys of pairs are below this.
   DIFFVBD_FN uint64_t keys() const { return static_cast<uint64_t>(scenes * 3 * key_base() * key_base()); }
   // All colliders are one group: no two of them make a pair.
-  DIFFVBD_FN int32_t group(int32_t corner) const {
-    return body[corner] < mesh_bodies ? body[corner] : mesh_bodies;
-  }
+  DIFFVBD_FN int32_t group(int32_t corner) const { return body[corner] < mesh_bodies ? body[corner] : mesh_bodies; }
   // Whether no primitive of group a makes a pair with one of group b.
   DIFFVBD_FN bool ignores(int32_t a, int32_t b) const {
     if (a < 0 || b < 0) return false;
@@ -80,7 +78,8 @@ DIFFVBD_FN Place<T> place(const Surfaces<T>& in, const T* collider, int64_t scen
   return {point_at(in.x, row), in.origin == nullptr ? zero3<T>() : point_at(in.origin, row)};
 }
 
-// --- boxes ------------------------------------------------------------------------------------------------------------
+// --- boxes
+// ------------------------------------------------------------------------------------------------------------
 
 // The point that boxes of a scene are relative to: its first surface point, wherever that is finite.
 template <class T>
@@ -129,7 +128,8 @@ DIFFVBD_FN float squared_reach(const Surfaces<T>& in) {
   return reach * reach * (1.0F + 0x1p-20F);
 }
 
-// --- pairs ------------------------------------------------------------------------------------------------------------
+// --- pairs
+// ------------------------------------------------------------------------------------------------------------
 
 struct Candidate {
   int64_t scene;
@@ -253,7 +253,8 @@ DIFFVBD_FN bool is_listed(T gap, T a, T b, T dhat) {
   return gap - a - b < dhat;
 }
 
-// --- results ----------------------------------------------------------------------------------------------------------
+// --- results
+// ----------------------------------------------------------------------------------------------------------
 
 constexpr uint64_t kNoKey = ~uint64_t{0};  // of no pair
 

@@ -13,15 +13,16 @@ constexpr int kJoins = 4;  // rounds of joining before all bodies of a scene bec
 // `vertices` of the mesh, sorted by body in body_order; corner points from there on are those of colliders.
 template <class T>
 struct IslandInputs {
-  const T *x, *origin, *move;                      // [B, V, 3]; origin may be null
-  const T* mass;                                   // [1 | B, V]
-  const T *collider, *collider_next, *radius;      // [B, Vc, 3] twice, [N]
-  const int32_t *planes, *body;                    // [L, 3], [N]
-  const int32_t *body_order, *body_ptr;            // [V], [mesh_bodies + 1]
-  const bool* held;                                // [N]
-  int64_t scenes, mass_scene;                      // stride of scenes in mass
+  const T *x, *origin, *move;                  // [B, V, 3]; origin may be null
+  const T* mass;                               // [1 | B, V]
+  const T *collider, *collider_next, *radius;  // [B, Vc, 3] twice, [N]
+  const int32_t *planes, *body;                // [L, 3], [N]
+  const int32_t *body_order, *body_ptr;        // [V], [mesh_bodies + 1]
+  const bool* held;                            // [N]
+  int64_t scenes, mass_scene;                  // stride of scenes in mass
   int32_t vertices, corners, num_planes, mesh_bodies;
   T margin;  // what each vertex may move beside the translation, and half the reach of the barrier [m]
+  bool any_direction;  // a floor may turn the translation, which does not become longer by it
 
   DIFFVBD_FN int32_t colliders() const { return corners - vertices; }  // points, and so at most as many objects
 };
@@ -99,10 +100,11 @@ DIFFVBD_FN Vec3<T> translation(const BodySum<T>& island) {
 
 // What a body may reach while its island moves by u.
 template <class T>
-DIFFVBD_FN Bounds<T> swept(const Bounds<T>& body, const Vec3<T>& u, T margin) {
+DIFFVBD_FN Bounds<T> swept(const IslandInputs<T>& in, const Bounds<T>& body, const Vec3<T>& u) {
+  const T r = in.any_direction ? in.margin + square_root(dot(u, u)) : in.margin;
   Bounds<T> out = body, end{body.lo + u, body.hi + u};
-  include(out, end);
-  const Vec3<T> m{margin, margin, margin};
+  if (!in.any_direction) include(out, end);
+  const Vec3<T> m{r, r, r};
   return {out.lo - m, out.hi + m};
 }
 

@@ -107,6 +107,7 @@ struct Lag {
 };
 
 // f1(|u|) / |u| of the friction potential of Li et al. (2020), smooth below eps [m], and its derivative over |u|
+constexpr double kRestingMotion = 1e-6;  // of eps
 template <class T>
 struct FrictionRate {
   T value, curvature;
@@ -114,7 +115,8 @@ struct FrictionRate {
     const bool sticks = length < eps;
     value = sticks ? (T(2) - length / eps) / eps : T(1) / length;
     const T slope = sticks ? -T(1) / (eps * eps) : -value * value;
-    curvature = length > T(0) ? slope / length : T(0);
+    // At rest value has a kink; below what rounding makes of zero its slope is taken as that of both sides together.
+    curvature = T(kRestingMotion) * eps < length ? slope / length : T(0);
   }
 };
 

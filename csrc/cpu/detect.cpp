@@ -65,9 +65,8 @@ struct Tree {
   void build(const Box& bounds) {
     const auto n = static_cast<int64_t>(boxes.size());
     codes.resize(n);
-    in_chunks(n, [&](int64_t i) {
-      codes[i] = {morton_code(boxes[i], bounds, kMostAxisBits), static_cast<int32_t>(i)};
-    });
+    in_chunks(n,
+              [&](int64_t i) { codes[i] = {morton_code(boxes[i], bounds, kMostAxisBits), static_cast<int32_t>(i)}; });
     sort_by_key(codes, scratch, 3 * kMostAxisBits);
     leaves = std::max(kGroup, padded_leaves(n));
     nodes.resize(int64_t{2} * leaves);
@@ -115,7 +114,8 @@ class SceneDetection {
     for (Near<T>& near : near_) near.gap.store(in_.reach, std::memory_order_relaxed), near.key = kNoKey;
     build_trees();
     constexpr int32_t each = kChunk / kGroup;
-    const int32_t point_chunks = (points_.groups() + each - 1) / each, edge_chunks = (edges_.groups() + each - 1) / each;
+    const int32_t point_chunks = (points_.groups() + each - 1) / each,
+                  edge_chunks = (edges_.groups() + each - 1) / each;
     finds_.resize(point_chunks + edge_chunks);
     torch::stable::parallel_for(0, point_chunks + edge_chunks, 1, [&](int64_t begin, int64_t end) {
       std::vector<Met> met;

@@ -65,7 +65,7 @@ class SceneIslands {
     std::fill(islands_.begin(), islands_.end(), nothing<T>());
     for (int32_t i = 0; i < in_.mesh_bodies; ++i) islands_[label_[i]].add(bodies_[i]);
     for (int32_t i = 0; i < in_.mesh_bodies; ++i) {
-      box_[i] = swept(bodies_[i].bounds, translation(islands_[label_[i]]), in_.margin);
+      box_[i] = swept(in_, bodies_[i].bounds, translation(islands_[label_[i]]));
     }
     for (int32_t i = 0; i < in_.mesh_bodies; ++i) {
       bool blocked = false;
@@ -81,9 +81,8 @@ class SceneIslands {
     for (int32_t i = 0; i < in_.mesh_bodies; ++i) {
       if (box_[i].lo.x <= box_[i].hi.x) sorted_.push_back(i);
     }
-    std::sort(sorted_.begin(), sorted_.end(), [&](int32_t i, int32_t j) {
-      return box_[i].lo.x != box_[j].lo.x ? box_[i].lo.x < box_[j].lo.x : i < j;
-    });
+    std::sort(sorted_.begin(), sorted_.end(),
+              [&](int32_t i, int32_t j) { return box_[i].lo.x != box_[j].lo.x ? box_[i].lo.x < box_[j].lo.x : i < j; });
     bool joined = false;
     for (auto i = sorted_.begin(); i != sorted_.end(); ++i) {
       for (auto j = i + 1; j != sorted_.end() && box_[*j].lo.x <= box_[*i].hi.x; ++j) {
@@ -146,8 +145,8 @@ void segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int6
   });
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                        \
-  template void find_islands<T>(const IslandInputs<T>&, int32_t*);    \
+#define DIFFVBD_INSTANTIATE(T)                                     \
+  template void find_islands<T>(const IslandInputs<T>&, int32_t*); \
   template void segment_sum<T>(const T*, const int32_t*, const int32_t*, int64_t, int64_t, int64_t, int64_t, T*);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

@@ -25,18 +25,19 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> conta
   diffvbd::require_capacity(capacity);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points,
-                                            planes, body, held, mesh_bodies, self_contact, between_bodies, dhat, reach,
-                                            cap, gamma);
+    const auto in =
+        diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes,
+                                body, held, mesh_bodies, self_contact, between_bodies, dhat, reach, cap, gamma);
     const int64_t b = in.scenes, n = in.corners;
     Tensor pairs = integers({capacity, diffvbd::contact::kPairRow});
     Tensor constants = empty(x, {capacity, diffvbd::contact::kConstants});
-    Tensor ptr = integers({b * n + 1}), entry = integers({4 * capacity}), near_corners = integers({b, n, diffvbd::contact::kNearRow});
+    Tensor ptr = integers({b * n + 1}), entry = integers({4 * capacity}),
+           near_corners = integers({b, n, diffvbd::contact::kNearRow});
     Tensor near_values = empty(x, {b, n, diffvbd::contact::kNearValues}), smallest = empty(x, {b});
     Tensor counts = torch::stable::empty({diffvbd::contact::kCounts}, ScalarType::Long);
-    diffvbd::detect<T>(in, {capacity, data<int32_t>(pairs), data<T>(constants), data<int32_t>(ptr),
-                            data<int32_t>(entry), data<int32_t>(near_corners), data<T>(near_values),
-                            data<int64_t>(counts), data<T>(smallest)});
+    diffvbd::detect<T>(in,
+                       {capacity, data<int32_t>(pairs), data<T>(constants), data<int32_t>(ptr), data<int32_t>(entry),
+                        data<int32_t>(near_corners), data<T>(near_values), data<int64_t>(counts), data<T>(smallest)});
     return std::make_tuple(pairs, constants, ptr, entry, near_corners, near_values, counts, smallest);
   });
 }
@@ -44,11 +45,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> conta
 Tensor contact_islands(const Tensor& x, const Tensor& origin, const Tensor& move, const Tensor& mass,
                        const Tensor& collider, const Tensor& collider_next, const Tensor& planes, const Tensor& body,
                        const Tensor& body_order, const Tensor& body_ptr, const Tensor& held, const Tensor& radius,
-                       int64_t mesh_bodies, double cap, double dhat) {
+                       int64_t mesh_bodies, double cap, double dhat, bool any_direction) {
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::island_inputs<T>(x, origin, move, mass, collider, collider_next, planes, body, body_order,
-                                              body_ptr, held, radius, mesh_bodies, cap, dhat);
+                                              body_ptr, held, radius, mesh_bodies, cap, dhat, any_direction);
     Tensor island = integers({in.scenes, in.mesh_bodies});
     diffvbd::find_islands<T>(in, data<int32_t>(island));
     return island;

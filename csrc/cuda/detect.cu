@@ -1,7 +1,6 @@
-#include "detect.h"
-
 #include <type_traits>
 
+#include "detect.h"
 #include "tree.cuh"
 
 namespace diffvbd::cuda {
@@ -10,9 +9,9 @@ namespace {
 using namespace contact;
 
 constexpr size_t kAlignment = 256;
-constexpr int kMostHits = 192;         // leaves that one thread looks at for a query; a block takes over from there
-constexpr int kHeavyBlocks = 512;      // that share the queries with more
-constexpr int32_t kSubtrees = 4096;    // parts of a tree that the threads of such a block share
+constexpr int kMostHits = 192;       // leaves that one thread looks at for a query; a block takes over from there
+constexpr int kHeavyBlocks = 512;    // that share the queries with more
+constexpr int32_t kSubtrees = 4096;  // parts of a tree that the threads of such a block share
 
 // A query whose search goes on at `node`.
 struct Heavy {
@@ -24,11 +23,11 @@ struct Heavy {
 template <class T>
 struct Workspace {
   Forest forest{};
-  Ordered<T>* near_gap;           // [B N]
-  unsigned long long* near_key;   // [B N]
-  Ordered<T>* smallest;           // [B]
-  unsigned long long* listed;     // number of pairs that the list needs
-  unsigned long long* touching;   // number of pairs that touch, and the first key of those
+  Ordered<T>* near_gap;                    // [B N]
+  unsigned long long* near_key;            // [B N]
+  Ordered<T>* smallest;                    // [B]
+  unsigned long long* listed;              // number of pairs that the list needs
+  unsigned long long* touching;            // number of pairs that touch, and the first key of those
   unsigned long long *keys, *sorted_keys;  // [capacity]
   uint32_t *points, *sorted_points;        // [4 capacity] corner points of the list's pairs
   int32_t* entries;                        // [4 capacity]
@@ -86,7 +85,8 @@ __global__ void start_kernel(const Surfaces<T> in, Workspace<T> work, int64_t ca
   }
 }
 
-// --- search -----------------------------------------------------------------------------------------------------------
+// --- search
+// -----------------------------------------------------------------------------------------------------------
 
 // One of two searches: for the near gaps of all corner points, and, when they are known, for the near pairs and the
 // list.
@@ -119,9 +119,9 @@ struct Search {
     const unsigned together = __activemask(), lane = threadIdx.x % 32;
     const int leader = __ffs(static_cast<int>(together)) - 1;
     unsigned long long first = 0;
-    if (static_cast<int>(lane) == leader) first = atomicAdd(work.listed, static_cast<unsigned long long>(__popc(together)));
-    const unsigned long long place =
-        __shfl_sync(together, first, leader) + __popc(together & ((1U << lane) - 1));
+    if (static_cast<int>(lane) == leader)
+      first = atomicAdd(work.listed, static_cast<unsigned long long>(__popc(together)));
+    const unsigned long long place = __shfl_sync(together, first, leader) + __popc(together & ((1U << lane) - 1));
     if (place < static_cast<unsigned long long>(capacity)) work.keys[place] = key;
   }
 
@@ -235,7 +235,8 @@ __global__ void heavy_kernel(const Surfaces<T> in, Workspace<T> work, int64_t ca
   }
 }
 
-// --- results ----------------------------------------------------------------------------------------------------------
+// --- results
+// ----------------------------------------------------------------------------------------------------------
 
 // Rows of the list; the corner points of its pairs to be sorted.
 template <class T>
@@ -316,9 +317,9 @@ cudaError_t detect(const Surfaces<T>& in, const Detected<T>& out, void* memory, 
       return error;
     list_kernel<<<blocks_for(capacity), kThreads, 0, stream>>>(in, work, out);
     bytes = work.sort_bytes;
-    if (auto error = cub::DeviceRadixSort::SortPairs(work.sort, bytes, work.points, work.sorted_points, work.entries,
-                                                     out.entry, 4 * capacity, 0,
-                                                     bits_of(static_cast<uint64_t>(rows)), stream))
+    if (auto error =
+            cub::DeviceRadixSort::SortPairs(work.sort, bytes, work.points, work.sorted_points, work.entries, out.entry,
+                                            4 * capacity, 0, bits_of(static_cast<uint64_t>(rows)), stream))
       return error;
   }
   corner_kernel<<<blocks_for(rows + 1), kThreads, 0, stream>>>(in, work, out);
@@ -326,8 +327,8 @@ cudaError_t detect(const Surfaces<T>& in, const Detected<T>& out, void* memory, 
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                     \
-  template size_t detect_workspace_bytes<T>(const Surfaces<T>&, int64_t);                          \
+#define DIFFVBD_INSTANTIATE(T)                                            \
+  template size_t detect_workspace_bytes<T>(const Surfaces<T>&, int64_t); \
   template cudaError_t detect<T>(const Surfaces<T>&, const Detected<T>&, void*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

@@ -1,8 +1,7 @@
-#include "islands.h"
-
 #include <cstring>
 #include <type_traits>
 
+#include "islands.h"
 #include "ordered.cuh"
 
 namespace diffvbd::cuda {
@@ -129,7 +128,7 @@ __global__ void sweep_kernel(const IslandInputs<T> in, Workspace<T> work) {
   const int64_t i = own_item();
   if (i >= in.scenes * in.mesh_bodies) return;
   const int64_t scene = i / in.mesh_bodies, first = scene * in.mesh_bodies;
-  const Bounds<T> box = swept(work.bodies[i].bounds, translation(work.islands[first + work.label[i]]), in.margin);
+  const Bounds<T> box = swept(in, work.bodies[i].bounds, translation(work.islands[first + work.label[i]]));
   work.boxes[i] = box;
   bool blocked = false;
   for (int32_t object = 0; object < *work.objects && !blocked; ++object) {
@@ -254,9 +253,9 @@ cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* pt
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                     \
-  template size_t islands_workspace_bytes<T>(const IslandInputs<T>&);                                              \
-  template cudaError_t find_islands<T>(const IslandInputs<T>&, int32_t*, void*, cudaStream_t);                     \
+#define DIFFVBD_INSTANTIATE(T)                                                                                      \
+  template size_t islands_workspace_bytes<T>(const IslandInputs<T>&);                                               \
+  template cudaError_t find_islands<T>(const IslandInputs<T>&, int32_t*, void*, cudaStream_t);                      \
   template cudaError_t segment_sum<T>(const T*, const int32_t*, const int32_t*, int64_t, int64_t, int64_t, int64_t, \
                                       T*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)

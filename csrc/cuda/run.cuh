@@ -19,7 +19,6 @@ int possible_lanes(const HostPlan& host, const Choice& choice, bool reverse) {
   const auto needed = [&](int lanes) { return shared_scalars(host.degree, host.valence, lanes, reverse) * sizeof(T); };
   for (const int lanes : {kFewLanes, kSomeLanes, kManyLanes}) {
     if (lanes >= choice.lanes && needed(lanes) * warps <= choice.shared) return lanes;
-    if (choice.contact && lanes == kSomeLanes) return needed(lanes) <= choice.shared ? lanes : kSpillLanes;
   }
   return needed(kManyLanes) <= choice.shared ? kManyLanes : kSpillLanes;
 }

@@ -133,10 +133,8 @@ constexpr int kEnergySets = kElasticVariants << (kVertexEnergies + 1);  // and c
 constexpr int energy_mask(int n) { return n % kElasticVariants + (n / kElasticVariants) * 4; }
 constexpr int energy_index(int mask) { return (mask & 3) + (mask >> 2) * kElasticVariants; }
 
-// Contact launches color by color, with one number of threads per vertex or, for the largest stars, the spill variant.
-constexpr bool is_built(int mask, int lanes) {
-  return (mask & kContact) == 0 || lanes == kSomeLanes || lanes == kSpillLanes;
-}
+// Contact launches color by color, where few threads per vertex gain little: one variant less to build.
+constexpr bool is_built(int mask, int lanes) { return (mask & kContact) == 0 || lanes != kFewLanes; }
 
 // A plan with what the host must know of it.
 struct HostPlan {
@@ -148,7 +146,6 @@ struct HostPlan {
 // How a step is to run.
 struct Choice {
   int regime, lanes, wanted;
-  bool contact;
   int64_t chunk;  // scenes that are worked on at once
   int multiprocessors;
   size_t shared;  // bytes of shared memory that a block can have

@@ -74,8 +74,10 @@ __global__ void bounds_kernel(const contact::Surfaces<T> in, Forest forest) {
 
 __device__ __forceinline__ contact::Box bounds_of(const Forest& forest, int64_t scene) {
   const unsigned* b = forest.bounds[scene];
-  return {{value_of<float>(b[0]), value_of<float>(b[1]), value_of<float>(b[2])}, contact::kMixed,
-          {value_of<float>(b[3]), value_of<float>(b[4]), value_of<float>(b[5])}, -1};
+  return {{value_of<float>(b[0]), value_of<float>(b[1]), value_of<float>(b[2])},
+          contact::kMixed,
+          {value_of<float>(b[3]), value_of<float>(b[4]), value_of<float>(b[5])},
+          -1};
 }
 
 template <class T>
@@ -104,8 +106,8 @@ __global__ void leaves_kernel(const contact::Surfaces<T> in, Forest forest, int 
   forest.tree(kind, scene)[leaves + leaf] = box;
 }
 
-// The nodes over a level of `width` nodes in each tree, `steps` levels up: a block works on what 2 kThreads nodes of the
-// level, maybe of several trees, come to.
+// The nodes over a level of `width` nodes in each tree, `steps` levels up: a block works on what 2 kThreads nodes of
+// the level, maybe of several trees, come to.
 static __global__ void fold_kernel(Forest forest, int kind, int32_t width, int steps) {
   __shared__ contact::Box part[kThreads];
   const int t = static_cast<int>(threadIdx.x);

@@ -11,11 +11,15 @@ from .layout import dot, outer6, take
 from .scene import Scene
 
 
+RESTING = 1e-6  # of the motion below which friction is smoothed
+
+
 def smoothed(slip: Tensor, reach: float) -> tuple[Tensor, Tensor]:
     """f0(|u|) [m] of slips u [..., 3, n] and f = f0'(|u|) / |u| [1/m]: quadratic below `reach`, Coulomb's |u| above."""
     square = dot(slip, slip)
-    moves = square > 0
-    length = torch.where(moves, torch.where(moves, square, 1.0).sqrt(), 0.0)  # its derivative at 0 is taken as 0
+    moves = square > (RESTING * reach) ** 2
+    # |u| has a kink at 0: where only rounding moves, its derivative is taken as 0
+    length = torch.where(moves, torch.where(moves, square, 1.0).sqrt(), square.detach().sqrt())
     slow = length < reach
     potential = torch.where(slow, length**2 / reach - length**3 / (3 * reach**2) + reach / 3, length)
     return potential, torch.where(slow, (2 - length / reach) / reach, 1 / torch.where(slow, 1.0, length))

@@ -1,0 +1,118 @@
+// CUDA implementations of the operators of the start of a part.
+#include <torch/csrc/stable/accelerator.h>
+#include <torch/csrc/stable/library.h>
+
+#include <tuple>
+#include <vector>
+
+#include "arguments_contact_start.h"
+#include "binding_cuda.h"
+#include "cuda/start.h"
+
+namespace {
+
+namespace contact = diffvbd::contact;
+namespace cuda = diffvbd::cuda;
+using cuda::check, cuda::current_stream, cuda::empty;
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::StartTensors, diffvbd::TranslationTensors;
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+using torch::stable::accelerator::DeviceGuard;
+
+template <class T>
+Tensor zeros(const Tensor& like, const std::vector<int64_t>& sizes) {
+  Tensor out = empty(like, sizes);
+  if (out.numel()) check(cudaMemsetAsync(out.data_ptr(), 0, out.numel() * sizeof(T), current_stream(like)), "memset");
+  return out;
+}
+
+Tensor contact_translation(const Tensor& move, const Tensor& mass, const Tensor& x, const Tensor& origin,
+                           const Tensor& planes, const Tensor& held, const Tensor& body, const Tensor& body_order,
+                           const Tensor& body_ptr, const Tensor& island, const Tensor& lowest) {
+  const DeviceGuard guard(x.get_device_index());
+  const TranslationTensors given{move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest};
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::translation_inputs<T>(given);
+    Tensor out = empty(x, {in.scenes, in.bodies, 3});
+    const Tensor sums = empty(x, {in.scenes, in.bodies, 4});
+    check(cuda::translation<T>(in, data<T>(sums), data<T>(out), current_stream(x)), "the translation of islands");
+    return out;
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> contact_translation_backward(
+    const Tensor& u_bar, const Tensor& move, const Tensor& mass, const Tensor& x, const Tensor& origin,
+    const Tensor& planes, const Tensor& held, const Tensor& body, const Tensor& body_order, const Tensor& body_ptr,
+    const Tensor& island, const Tensor& lowest) {
+  const DeviceGuard guard(x.get_device_index());
+  const TranslationTensors given{move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest};
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::translation_inputs<T>(given);
+    const int64_t b = in.scenes, v = in.vertices, scalars = int64_t{in.floor.num_planes} * contact::kPlaneScalars;
+    Tensor move_bar = empty(x, {b, v, 3}), mass_bar = empty(x, {b, v}), x_bar = zeros<T>(x, {b, v, 3});
+    Tensor planes_bar = empty(x, {b, scalars});
+    const Tensor sums = empty(x, {b, in.bodies, 4}), zeroed = zeros<T>(x, {b, in.bodies, 6 + scalars});
+    check(cuda::translation_backward<T>(in, data<const T>(u_bar), data<T>(sums), data<T>(zeroed), data<T>(move_bar),
+                                        data<T>(mass_bar), data<T>(x_bar), data<T>(planes_bar), current_stream(x)),
+          "the translation of islands");
+    return std::make_tuple(move_bar, mass_bar, x_bar, planes_bar);
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> contact_start(const Tensor& x, const Tensor& move, const Tensor& goal,
+                                                         const Tensor& u, const Tensor& near, const Tensor& origin,
+                                                         const Tensor& planes, const Tensor& held, const Tensor& body,
+                                                         double gamma, double cap, double filter_eta) {
+  const DeviceGuard guard(x.get_device_index());
+  const StartTensors given{x, move, goal, u, near, origin, planes, held, body};
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::start_inputs<T>(given, gamma, cap, filter_eta);
+    const int64_t b = in.scenes, v = in.vertices;
+    Tensor bounds = empty(x, {b, v, 4}), start = empty(x, {b, v, 3}), left = empty(x, {b, v, 3});
+    Tensor outside = empty(x, {b, v}, ScalarType::Byte);
+    check(cuda::start<T>(in, {data<T>(bounds), data<T>(start), data<T>(left), data<uint8_t>(outside)},
+                         current_stream(x)),
+          "the start of a part");
+    return std::make_tuple(bounds, start, left, outside);
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_start_backward(
+    const Tensor& bounds_bar, const Tensor& start_bar, const Tensor& left_bar, const Tensor& x, const Tensor& move,
+    const Tensor& goal, const Tensor& u, const Tensor& near, const Tensor& origin, const Tensor& planes,
+    const Tensor& held, const Tensor& body, double gamma, double cap, double filter_eta, bool wants_planes) {
+  const DeviceGuard guard(x.get_device_index());
+  const StartTensors given{x, move, goal, u, near, origin, planes, held, body};
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::start_inputs<T>(given, gamma, cap, filter_eta);
+    const int64_t b = in.scenes, v = in.vertices;
+    const std::vector<int64_t> vectors{b, v, 3};
+    Tensor x_bar = empty(x, vectors), move_bar = empty(x, vectors), goal_bar = empty(x, vectors);
+    Tensor u_bar = empty(x, vectors), gap_bar = empty(x, {b, v});
+    Tensor planes_bar = empty(x, {b, v, wants_planes ? int64_t{in.floor_scalars} : 0});
+    const contact::StartAdjoints<T> a{data<const T>(bounds_bar),
+                                      data<const T>(start_bar),
+                                      data<const T>(left_bar),
+                                      data<T>(x_bar),
+                                      data<T>(move_bar),
+                                      data<T>(goal_bar),
+                                      data<T>(u_bar),
+                                      data<T>(gap_bar),
+                                      planes_bar.numel() ? data<T>(planes_bar) : nullptr};
+    check(cuda::start_backward<T>(in, a, current_stream(x)), "the start of a part");
+    return std::make_tuple(x_bar, move_bar, goal_bar, u_bar, gap_bar, planes_bar);
+  });
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
+  m.impl("contact_translation", TORCH_BOX(&contact_translation));
+  m.impl("contact_translation_backward", TORCH_BOX(&contact_translation_backward));
+  m.impl("contact_start", TORCH_BOX(&contact_start));
+  m.impl("contact_start_backward", TORCH_BOX(&contact_start_backward));
+}
