@@ -10,7 +10,7 @@ from torch import Tensor
 
 from . import detection as search
 from .contact_start import start_part
-from .contact_sweeps import ContactTensors, Pairs, contact_sweep, pair_lag
+from .contact_sweeps import ContactTensors, Pairs, contact_sweep, no_transforms, pair_lag
 from .model import Model
 from .ops import SweepSettings, broadcast
 
@@ -59,7 +59,9 @@ class ContactStep:
         begun = begun._replace(x_prev=begun.x_prev.contiguous(), y=begun.y.contiguous())
         self.model, self.begun, self.prepared, self.prescribed = model, begun, prepared, prescribed
         self.x_prev = begun.x_prev
-        self.colliders, self.before = colliders, before  # [B, Vc, 3] at the end and at the start of the step
+        # [B, Vc, 3] at the end and at the start of the step: one tensor if they rest
+        self.before = before.contiguous()
+        self.colliders = self.before if colliders is before else colliders.contiguous()
         self.tensors = begun.tensors(prepared)
         self.origin = self.tensors.origin
         self.surface, self.barrier = model.surface_of_contact, model.contact
@@ -131,6 +133,9 @@ class ContactStep:
             detection = self._detect(x, was, now, move)
             found.append(detection)
             counts.append(torch.cat([detection.counts[:3], self._above(held, was, now, detection)]))
+            if not x.is_cuda and not torch.compiler.is_compiling():  # reading is free: before any work
+                self._record(found, counts, cut)
+                self._check(r, counts[-1].tolist(), x.shape[0])
             if r == 0:
                 self._set_lag(detection.listed, was)
             start = start_part(x, move, goal, self.tensors.mass, was, now, self.floor_data, self.origin, detection, surface,
@@ -141,7 +146,7 @@ class ContactStep:
                 part = settings._replace(sweeps=sweeps)
                 x, held_back = self._sweep(x, start.bounds, now, detection.listed, part, policy, debug_step)
                 cut.append(held_back)
-        return self._judged(x, found, torch.stack(counts), cut)
+        return self._judged(x, found, counts, cut)
 
     def _colliders_at(self, share: float) -> Tensor:
         if self.colliders is self.before:
@@ -188,38 +193,51 @@ class ContactStep:
             above = (moves > radius) & surface.held & ~surface.plane_points
             return above.sum().reshape(1)
 
-    def _judged(self, x: Tensor, found: list[Detection], counts: Tensor, cut: list[Tensor]) -> Tensor:
+    def _record(self, found: list[Detection], counts: list[Tensor], cut: list[Tensor]) -> None:
         surface = self.surface
         assert surface is not None
-        capacity = surface.capacity * x.shape[0]
+        capacity = surface.capacity * self.x_prev.shape[0]
         smallest = torch.stack([d.smallest for d in found])
-        outcomes[self.model] = Outcome(counts, capacity, cut, smallest)
+        outcomes[self.model] = Outcome(torch.stack(counts), capacity, cut, smallest)
+
+    def _judged(self, x: Tensor, found: list[Detection], counts: list[Tensor], cut: list[Tensor]) -> Tensor:
+        """x, or NaN where a captured or compiled step, which cannot raise, must not be trusted."""
+        self._record(found, counts, cut)
+        outcome = outcomes[self.model]
+        table, capacity = outcome.counts, outcome.capacity
         if torch.compiler.is_compiling() or (x.is_cuda and torch.cuda.is_current_stream_capturing()):
-            good = (counts[:, :2] <= torch.stack([counts.new_full((), capacity), counts.new_zeros(())])).all()
-            good = good & (counts[:, 3] == 0).all()
+            good = (table[:, :2] <= torch.stack([table.new_full((), capacity), table.new_zeros(())])).all()
+            good = good & (table[:, 3] == 0).all()
             return torch.where(good, x, torch.nan)
-        for r, (needed, touching, pair, above) in enumerate(counts.tolist()):
-            if needed > capacity:
-                each = -(-needed // x.shape[0])
-                raise RuntimeError(
-                    f"pair_barrier.capacity: {needed} pairs in part {r} of the step do not fit {capacity} "
-                    f"({surface.capacity} per scene): use diffvbd.contact.reserve(model, {2 * each})"
-                )
-            if touching:
-                finite = all(bool(torch.isfinite(t).all()) for t in (self.x_prev, self.colliders, self.before, x))
-                if not finite:  # which argument, finds arguments.name_argument
-                    raise ValueError("start (x, v, force, gravity, prescribed, colliders): expected finite values")
-                scene, corners = surface.corners_of(pair)
-                raise ValueError(
-                    f"x: expected surfaces that do not touch, got {touching} pairs without a gap in part {r} of the "
-                    f"step, one of the corner points {corners} in scene {scene}"
-                )
-            if above:
-                raise ValueError(
-                    f"prescribed or colliders: expected motion below the bounds of contact, got {above} points moved "
-                    f"farther in part {r} of {self.parts}: use a smaller time_step or more detections"
-                )
+        if x.is_cuda:
+            for r, row in enumerate(table.tolist()):
+                self._check(r, row, x.shape[0])
         return x
+
+    def _check(self, r: int, counts: list[int], scenes: int) -> None:
+        """Raises where a detection found more than fits, surfaces that touch, or motion above a bound."""
+        surface = self.surface
+        assert surface is not None
+        needed, touching, pair, above = counts
+        if needed > surface.capacity * scenes:
+            raise RuntimeError(
+                f"pair_barrier.capacity: {needed} pairs in part {r} of the step do not fit {surface.capacity * scenes} "
+                f"({surface.capacity} per scene): use diffvbd.contact.reserve(model, {2 * -(-needed // scenes)})"
+            )
+        if touching:
+            finite = all(bool(torch.isfinite(t).all()) for t in (self.x_prev, self.begun.y, self.colliders, self.before))
+            if not finite:  # which argument, finds arguments.name_argument
+                raise ValueError("start (x, v, force, gravity, prescribed, colliders): expected finite values")
+            scene, corners = surface.corners_of(pair)
+            raise ValueError(
+                f"x: expected surfaces that do not touch, got {touching} pairs without a gap in part {r} of the step, "
+                f"one of the corner points {corners} in scene {scene}"
+            )
+        if above:
+            raise ValueError(
+                f"prescribed or colliders: expected motion below the bounds of contact, got {above} points moved "
+                f"farther in part {r} of {self.parts}: use a smaller time_step or more detections"
+            )
 
 
 def no_pairs(like: Tensor, corners: int) -> Pairs:
@@ -236,4 +254,6 @@ def run_contact(model: Model, begun: Begun, prepared: Prepared, before: Tensor, 
         before, colliders: Where the colliders are at its start and at its end, [B, Vc, 3] [m]; one tensor if they rest.
         prescribed: Whether pinned vertices are moved.
     """
+    if torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore[reportAttributeAccessIssue]
+        no_transforms()
     return ContactStep(model, begun, prepared, before, colliders, prescribed).run(policy, debug_step)

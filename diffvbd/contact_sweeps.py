@@ -36,7 +36,7 @@ _SWEEP, _CONTACT = 8, 6  # differentiable inputs: SweepTensors without the origi
 
 
 def no_transforms(*_: Any) -> NoReturn:
-    raise NotImplementedError("diffvbd: torch.func transforms (vmap) of a step with contact are not supported")
+    raise NotImplementedError("diffvbd: torch.func transforms of a step with contact are not supported")
 
 
 def _flat(bounds: Tensor, collider: Tensor, collider_prev: Tensor, kappa: Tensor, listed: Pairs, lag: Tensor,

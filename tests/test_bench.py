@@ -140,6 +140,22 @@ def test_quick_run_bears_out_the_claims(name: str, quick: Callable[[str], dict[s
     CLAIMS[name](content["results"])
 
 
+def test_nothing_crosses_and_a_fall_stays_free(quick: Callable[[str], dict[str, Any]], folder: Path) -> None:
+    results = quick("contact")["results"]
+    rows = {row["group"]: row for row in results["rows"]}
+    assert {"50 m/s", "sheet", "free fall"} <= set(rows)
+    for row in results["rows"]:
+        assert row["done"] == row["steps"] and row["error"] is None, row["name"]
+        assert row["intersections"] == row["nonfinite"] == 0 and row["smallest_gap_over_dhat"] > 0, row["name"]
+    assert rows["50 m/s"]["pairs"] > 0 and rows["50 m/s"]["cut_max"] > 0 and rows["free fall"]["cut_max"] == 0
+    assert "check every" in (folder / "contact.md").read_text()
+    cost = results["cost"]
+    assert cost["contact_operators"]["without"] == [] != cost["contact_operators"]["with"]
+    assert cost["rows"][0]["pairs"] == 0 < cost["crowd"]["pairs"]
+    pairs = [row["pairs"] for row in cost["rows"]]
+    assert pairs == sorted(set(pairs))
+
+
 def test_report_shows_every_result(quick: Callable[[str], dict[str, Any]], folder: Path) -> None:
     pytest.importorskip("matplotlib")
     content = quick("fd")

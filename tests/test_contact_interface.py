@@ -81,7 +81,6 @@ def test_a_copy_does_the_same(way: str) -> None:
     assert dv.contact.status(other) == dv.contact.status(model)
 
 
-@pytest.mark.xfail(strict=True, reason="detection wants contiguous positions")
 def test_strides_do_not_matter(device: str) -> None:
     model = two_boxes(device, things=[ball()])
     x, points = model.rest_points, model.collider_points

@@ -196,7 +196,7 @@ def test_segment_sum(device: str, sizes: list[int], dtype: torch.dtype) -> None:
 def test_opcheck_and_bad_input(device: str) -> None:
     s = cubes((0, 0, 0), (1.001, 0, 0), colliders=(sphere((5, 0, 0), 1),))
     good = arguments(s, np.zeros(s.x.shape), np.ones((1, s.x.shape[1])), device)
-    torch.library.opcheck(torch.ops.diffvbd.contact_islands.default, good)
+    torch.library.opcheck(torch.ops.diffvbd.contact_islands.default, (*good, False))
     order, ptr = good[8], good[9]
     torch.library.opcheck(torch.ops.diffvbd.segment_sum.default, (good[0], order, ptr))
     for place in (0, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11):

@@ -177,7 +177,11 @@ def test_gradient_of_the_sliding_distance(support: str) -> None:
         assert float(gradient) == pytest.approx(expected, rel=tolerance("sliding"))
         eps = 1e-4
         with torch.no_grad():
-            difference = float(run(coefficient + eps) - run(coefficient - eps)) / (2 * eps)
+            if value > 0:
+                difference = float(run(coefficient + eps) - run(coefficient - eps)) / (2 * eps)
+            else:  # from one side, in second order: a coefficient is not negative
+                there = [float(run(coefficient + k * eps)) for k in range(3)]
+                difference = (-3 * there[0] + 4 * there[1] - there[2]) / (2 * eps)
         assert float(gradient) == pytest.approx(difference, rel=tolerance("finite_difference"))
 
 
@@ -209,7 +213,6 @@ def test_friction_at_rest_has_finite_gradients(support: str) -> None:
     assert (gradients[1][feet, 0] > 0).all() and (gradients[1][feet, 0] < 0.5 * 0.01).all()  # stuck, not free
 
 
-@pytest.mark.xfail(strict=True, reason="the adjoint takes a direction of slip from rounding")
 def test_gradient_without_slip_is_that_of_the_reference() -> None:
     """Where |u| is zero but for rounding, the kink of the smoothed force has no direction."""
     tets = join([box(2, 0.2), box(2, 0.2).translate((0.02, 0.208, 0.03))])
