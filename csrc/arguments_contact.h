@@ -7,8 +7,8 @@
 
 namespace diffvbd {
 
-// In the order of csrc/ops.cpp. Empty: collider where there is none, lag and the lists after it where nothing is lagged,
-// floor_lag without friction on a floor.
+// In the order of csrc/ops.cpp. Empty: collider where there is none, lag and the lists after it where nothing is
+// lagged, floor_lag without friction on a floor.
 struct ContactTensors {
   const Tensor &bounds, &collider, &collider_prev, &kappa, &pairs, &constants, &ptr, &entry;
   const Tensor &lag, &lag_pairs, &lag_ptr, &lag_entry, &floor_lag;
@@ -18,7 +18,8 @@ inline contact::PairList pair_list(const Tensor& pairs, const Tensor& ptr, const
                                    int64_t corners) {
   const auto good = [](const Tensor& t) { return t.scalar_type() == ScalarType::Int && t.is_contiguous(); };
   require(good(pairs) && good(ptr) && good(entry) && ptr.numel() == scenes * corners + 1 &&
-              pairs.numel() % contact::kPairIntegers == 0 && 4 * (pairs.numel() / contact::kPairIntegers) == entry.numel(),
+              pairs.numel() % contact::kPairIntegers == 0 &&
+              4 * (pairs.numel() / contact::kPairIntegers) == entry.numel(),
           "diffvbd: expected pairs made by contact_detect for this batch");
   return {data<const int32_t>(pairs), data<const int32_t>(ptr), data<const int32_t>(entry)};
 }

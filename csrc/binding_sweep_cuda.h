@@ -13,7 +13,7 @@ namespace diffvbd::cuda {
 using torch::stable::accelerator::DeviceGuard;
 
 constexpr int64_t kWorkspaceBudget = int64_t{2} << 30;  // bytes; a batch that needs more is worked on in chunks
-constexpr int kHostSizes = kPlanHeader;        // a plan's header, but active, tets and slots come first
+constexpr int kHostSizes = kPlanHeader;                 // a plan's header, but active, tets and slots come first
 
 inline HostPlan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes) {
   require(buffer.scalar_type() == ScalarType::Int && buffer.is_contiguous() && buffer.is_cuda() &&
@@ -22,16 +22,15 @@ inline HostPlan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes)
   const int order[kPlanHeader] = {3, 1, 0, 4, 5, 2, 6, 7, 8, 9, 10};
   int32_t header[kPlanHeader];
   for (int i = 0; i < kPlanHeader; ++i) header[i] = static_cast<int32_t>(sizes[order[i]]);
-  return {view_group_plan(header, data<const int32_t>(buffer)), sizes.data() + kHostSizes,
-          static_cast<int>(sizes[9]), static_cast<int>(sizes[10])};
+  return {view_group_plan(header, data<const int32_t>(buffer)), sizes.data() + kHostSizes, static_cast<int>(sizes[9]),
+          static_cast<int>(sizes[10])};
 }
 
 // What all four sweep operators have in common.
 template <class T>
-StepInputs<T> inputs(const HostPlan& host, const Tensor& x, const Tensor& mu, const Tensor& lam,
-                           const Tensor& mass, const Tensor& rest, int64_t energies,
-                           const std::vector<int64_t>& data_count, const std::vector<double>& numbers, int64_t sweeps,
-                           int64_t tape_policy) {
+StepInputs<T> inputs(const HostPlan& host, const Tensor& x, const Tensor& mu, const Tensor& lam, const Tensor& mass,
+                     const Tensor& rest, int64_t energies, const std::vector<int64_t>& data_count,
+                     const std::vector<double>& numbers, int64_t sweeps, int64_t tape_policy) {
   const GroupPlan& plan = host.plan;
   require(x.dim() == 3 && x.size(1) == plan.num_vertices && x.size(2) == 3,
           "diffvbd::sweep: expected x of shape [scenes, vertices, 3]");
@@ -71,8 +70,8 @@ inline Choice choose(const Tensor& x, const std::vector<int64_t>& launch, bool r
 
 // Memory for the kernels, and the number of scenes that it serves at once. Chunks of a whole number of waves.
 template <class T>
-Tensor workspace(const Tensor& x, const HostPlan& host, const StepInputs<T>& in,
-                 const StepAdjoints<T>* adjoints, Choice& choice) {
+Tensor workspace(const Tensor& x, const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints,
+                 Choice& choice) {
   if (choice.regime == kThread) return empty(x, {0});
   choice.chunk = 1;
   const int64_t one = static_cast<int64_t>(workspace_bytes(host, in, adjoints, choice));
@@ -86,8 +85,7 @@ Tensor workspace(const Tensor& x, const HostPlan& host, const StepInputs<T>& in,
 
 // Scenes first, but last where each thread has a scene: who mixes up the two is told so by the shape.
 template <class T>
-std::vector<int64_t> tape_shape(const HostPlan& host, const StepInputs<T>& in,
-                                const std::vector<int64_t>& launch) {
+std::vector<int64_t> tape_shape(const HostPlan& host, const StepInputs<T>& in, const std::vector<int64_t>& launch) {
   const int64_t rows = tape_rows(in.tape_policy, keeps_positions(in.energies));
   const int64_t active = host.plan.num_active;
   if (launch[0] == kThread) return {in.sweeps, rows, active, in.scenes};
@@ -95,8 +93,7 @@ std::vector<int64_t> tape_shape(const HostPlan& host, const StepInputs<T>& in,
 }
 
 template <class T>
-void check_tape(const Tensor& tape, const HostPlan& host, const StepInputs<T>& in,
-                const std::vector<int64_t>& launch) {
+void check_tape(const Tensor& tape, const HostPlan& host, const StepInputs<T>& in, const std::vector<int64_t>& launch) {
   const std::vector<int64_t> shape = tape_shape(host, in, launch);
   bool same = tape.is_contiguous() && tape.dim() == 4;
   for (int i = 0; same && i < 4; ++i) same = tape.size(i) == shape[i];
@@ -127,8 +124,7 @@ struct Bars {
   }
   // Null: not wanted, or nothing to write.
   StepAdjoints<T> pointers(const Tensor& x_bar) const {
-    require(x_bar.is_contiguous() && x_bar.numel() == x_start.numel(),
-            "diffvbd::sweep_backward: x_bar must be like x");
+    require(x_bar.is_contiguous() && x_bar.numel() == x_start.numel(), "diffvbd::sweep_backward: x_bar must be like x");
     const auto of = [](bool flag, const Tensor& a) { return flag && a.numel() ? diffvbd::data<T>(a) : nullptr; };
     StepAdjoints<T> out{};
     out.x_bar = diffvbd::data<const T>(x_bar);

@@ -29,8 +29,8 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "held, Tensor mu, Tensor lam, Tensor mass, Tensor rest, Tensor tape, Tensor plan, int[] sizes, int energies, "
       "int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> (Tensor x, "
       "Tensor v, Tensor acceleration, Tensor held, Tensor mu, Tensor lam, Tensor mass, Tensor rest)");
-  // The same with contact, of pairs made by contact_detect: see arguments_contact.h and contact/passes.h for the shapes.
-  // cut [scenes, vertices]: 1 where a bound has held back an update.
+  // The same with contact, of pairs made by contact_detect: see arguments_contact.h and contact/passes.h for the
+  // shapes. cut [scenes, vertices]: 1 where a bound has held back an update.
   m.def(
       "contact_sweep(Tensor x_start, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, "
       "Tensor energy_data, Tensor origin, Tensor bounds, Tensor collider, Tensor collider_prev, Tensor kappa, Tensor "
@@ -46,7 +46,8 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> (Tensor x_start, "
       "Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, Tensor energy_data, Tensor bounds, "
       "Tensor collider, Tensor collider_prev, Tensor kappa, Tensor lag, Tensor floor_lag)");
-  // The lowest vertex above each plane of a floor, of the island that a body is in; planes as in the data of FloorBarrier
+  // The lowest vertex above each plane of a floor, of the island that a body is in; planes as in the data of
+  // FloorBarrier
   m.def(
       "contact_lowest(Tensor x, Tensor origin, Tensor planes, Tensor body_order, Tensor body_ptr, Tensor island) -> "
       "Tensor");
@@ -59,19 +60,21 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "contact_translation_backward(Tensor u_bar, Tensor move, Tensor mass, Tensor x, Tensor origin, Tensor planes, "
       "Tensor held, Tensor body, Tensor body_order, Tensor body_ptr, Tensor island, Tensor lowest) -> (Tensor move, "
       "Tensor mass, Tensor x, Tensor planes)");
-  // Bounds, start, what is left to go, and 1 where a bound has cut, see contact/start.h. The adjoint: of x, move, goal, u
-  // (for each vertex), the gap of near, and planes (for each vertex).
+  // Bounds, start, what is left to go, and 1 where a bound has cut, see contact/start.h. The adjoint: of x, move, goal,
+  // u (for each vertex), the gap of near, and planes (for each vertex).
   m.def(
       "contact_start(Tensor x, Tensor move, Tensor goal, Tensor u, Tensor near, Tensor origin, Tensor planes, Tensor "
       "held, Tensor body, float gamma, float cap, float filter_eta) -> (Tensor bounds, Tensor start, Tensor move, "
       "Tensor outside)");
   m.def(
-      "contact_start_backward(Tensor bounds_bar, Tensor start_bar, Tensor move_bar, Tensor x, Tensor move, Tensor goal, "
+      "contact_start_backward(Tensor bounds_bar, Tensor start_bar, Tensor move_bar, Tensor x, Tensor move, Tensor "
+      "goal, "
       "Tensor u, Tensor near, Tensor origin, Tensor planes, Tensor held, Tensor body, float gamma, float cap, float "
       "filter_eta, bool wants_planes) -> (Tensor x, Tensor move, Tensor goal, Tensor u, Tensor gap, Tensor planes)");
   // Normal force, 1 where active, normal and weights of each pair [pairs, 9], and the adjoint of x, collider and kappa
   m.def(
-      "contact_lag(Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor constants, Tensor ptr, Tensor "
+      "contact_lag(Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor constants, Tensor ptr, "
+      "Tensor "
       "entry) -> Tensor");
   m.def(
       "contact_lag_backward(Tensor bar, Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor "

@@ -73,9 +73,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_start(const Tensor& x, const 
     const int64_t b = in.scenes, v = in.vertices;
     Tensor bounds = empty(x, {b, v, 4}), start = empty(x, {b, v, 3}), left = empty(x, {b, v, 3});
     Tensor outside = empty(x, {b, v}, ScalarType::Byte);
-    check(cuda::start<T>(in, {data<T>(bounds), data<T>(start), data<T>(left), data<uint8_t>(outside)},
-                         current_stream(x)),
-          "the start of a part");
+    check(
+        cuda::start<T>(in, {data<T>(bounds), data<T>(start), data<T>(left), data<uint8_t>(outside)}, current_stream(x)),
+        "the start of a part");
     return std::make_tuple(bounds, start, left, outside);
   });
 }

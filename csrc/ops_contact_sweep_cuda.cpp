@@ -4,8 +4,8 @@
 #include <tuple>
 #include <vector>
 
-#include "binding_sweep_cuda.h"
 #include "arguments_contact.h"
+#include "binding_sweep_cuda.h"
 #include "cuda/contact.h"
 #include "cuda/lowest.h"
 
@@ -84,15 +84,17 @@ std::tuple<Tensor, Tensor, Tensor> contact_sweep(
 using FourteenTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
                                    Tensor, Tensor, Tensor, Tensor>;
 
-FourteenTensors contact_sweep_backward(
-    const Tensor& x_bar, const Tensor& x, const Tensor& x_prev, const Tensor& y, const Tensor& mu, const Tensor& lam,
-    const Tensor& mass, const Tensor& rest, const Tensor& energy_data, const Tensor& origin, const Tensor& bounds,
-    const Tensor& collider, const Tensor& collider_prev, const Tensor& kappa, const Tensor& pairs,
-    const Tensor& constants, const Tensor& ptr, const Tensor& entry, const Tensor& lag, const Tensor& lag_pairs,
-    const Tensor& lag_ptr, const Tensor& lag_entry, const Tensor& floor_lag, double friction_eps, const Tensor& tape,
-    const Tensor& plan, std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
-    std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch, int64_t tape_policy,
-    std::vector<bool> wants) {
+FourteenTensors contact_sweep_backward(const Tensor& x_bar, const Tensor& x, const Tensor& x_prev, const Tensor& y,
+                                       const Tensor& mu, const Tensor& lam, const Tensor& mass, const Tensor& rest,
+                                       const Tensor& energy_data, const Tensor& origin, const Tensor& bounds,
+                                       const Tensor& collider, const Tensor& collider_prev, const Tensor& kappa,
+                                       const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
+                                       const Tensor& entry, const Tensor& lag, const Tensor& lag_pairs,
+                                       const Tensor& lag_ptr, const Tensor& lag_entry, const Tensor& floor_lag,
+                                       double friction_eps, const Tensor& tape, const Tensor& plan,
+                                       std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
+                                       std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
+                                       int64_t tape_policy, std::vector<bool> wants) {
   const DeviceGuard guard(x.get_device_index());
   const cuda::HostPlan host = cuda::plan_of(plan, sizes);
   const ContactTensors given{bounds, collider, collider_prev, kappa,   pairs,     constants, ptr,
@@ -128,16 +130,16 @@ FourteenTensors contact_sweep_backward(
     check(cuda::run_reverse<T>(host, in, data<const T>(x), data<const T>(tape), out, choice, work.data_ptr(), stream),
           "the reverse sweep");
     check(cuda::sum_lag<T>(slots, lagged, data<T>(lag_bar), stream), "the reverse sweep");
-    return std::tuple_cat(bars.tensors(), std::make_tuple(bounds_bar, collider_bar, collider_prev_bar, kappa_bar,
-                                                          lag_bar, floor_bar));
+    return std::tuple_cat(bars.tensors(),
+                          std::make_tuple(bounds_bar, collider_bar, collider_prev_bar, kappa_bar, lag_bar, floor_bar));
   });
 }
 
 // The arrays of contact_lag: corner points and pairs.
 template <class T>
-contact::ContactInputs<T> lag_inputs(const Tensor& x, const Tensor& origin, const Tensor& collider,
-                                     const Tensor& kappa, const Tensor& pairs, const Tensor& constants,
-                                     const Tensor& ptr, const Tensor& entry) {
+contact::ContactInputs<T> lag_inputs(const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& kappa,
+                                     const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
+                                     const Tensor& entry) {
   contact::ContactInputs<T> in{};
   const int64_t b = x.size(0), v = x.size(1), colliders = collider.numel() ? collider.size(1) : 0;
   in.num_vertices = static_cast<int32_t>(v);

@@ -63,6 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     run.formatter_class = raw
     run.add_argument("name", choices=sorted(TASKS), metavar="NAME", help="a task that `diffvbd list` names")
     run.add_argument("--quick", action="store_true", help="a small version that takes seconds")
+    run.add_argument("--radius", type=float, help="radius of the disks of cover-the-spot [m] (default 0.42)")
     _add_run_options(run, "runs/NAME")
     run.set_defaults(command=_run)
 
@@ -141,7 +142,11 @@ def _add_scene_options(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> None:
     out = options.out or Path("runs") / options.name
     settings = Settings(out, options.device, options.seed, options.quick)
-    _solve(TASKS[options.name].build(settings), settings)
+    task = TASKS[options.name]
+    given = {} if options.radius is None else {"radius": options.radius}
+    if not given.keys() <= set(task.numbers):
+        raise ValueError(f"--radius: {options.name} has none")
+    _solve(task.build(settings, **given), settings)
 
 
 def _solve(problem: Problem, settings: Settings) -> None:

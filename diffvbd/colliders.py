@@ -1,8 +1,8 @@
 """Obstacles that soft bodies touch and do not move: planes, spheres, capsules, triangle meshes.
 
 A collider stands in ``Model(colliders=[...])`` and meets the bodies through the Model's PairBarrier. Its corner points
-are rows of ``model.collider_points`` (:attr:`Model.collider_rows` says which); a step that is given other points moves it,
-and differentiates toward them.
+are rows of ``model.collider_points`` (:attr:`Model.collider_rows` says which); a step that is given other points moves
+it, and differentiates toward them.
 """
 
 from __future__ import annotations

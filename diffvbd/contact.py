@@ -24,7 +24,7 @@ class Status:
 
     Attributes:
         pairs: The most pairs of one detection, of all scenes.
-        capacity: Pairs that fit, of all scenes; with more, an eager step has raised and a captured one has returned NaN.
+        capacity: Pairs that fit, of all scenes; with more, an eager step has raised, a captured one returned NaN.
         touching: Pairs without a gap that detections found (the step has raised or returned NaN).
         above_bounds: Prescribed vertices and collider points moved above their bound (likewise).
         cut: Vertices whose motion a bound has cut: they lost velocity that no force took, [scenes].

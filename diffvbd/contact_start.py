@@ -11,7 +11,6 @@ from torch.autograd import Function
 
 from . import ops, ops_contact, ops_contact_start
 from .contact_surface import ContactSurface
-from .contact_sweeps import no_transforms
 from .safeguards import FILTER_ETA
 from .sweeps import no_second_derivative
 
@@ -24,8 +23,8 @@ class Start(NamedTuple):
 
 
 class _NearGap(Function):
-    """Smallest gap of each vertex [B, V]. The value is the one detection found; by the envelope theorem its derivative is
-    that of the distance with weights and normal held."""
+    """Smallest gap of each vertex [B, V]. The value is the one detection found; by the envelope theorem its derivative
+    is that of the distance with weights and normal held."""
 
     @staticmethod
     def forward(x: Tensor, was: Tensor, now: Tensor, corners: Tensor, values: Tensor, plane_points: Tensor) -> Tensor:
@@ -53,8 +52,6 @@ class _NearGap(Function):
         now_bar = colliders.masked_fill(~of_plane, 0.0) if needs[2] else None
         return x_bar, was_bar, now_bar, None, None, None
 
-    vmap = staticmethod(no_transforms)
-
 
 class _Translation(Function):
     """Translation of each body's island [B, bodies, 3]."""
@@ -74,8 +71,6 @@ class _Translation(Function):
         out = _TranslationBackward.apply(grads[0].contiguous(), move, mass, x, origin, planes, ctx.index)
         return (*(ops.sum_to(bar, t.shape) for bar, t in zip(out, (move, mass, x, planes), strict=True)), None, None)
 
-    vmap = staticmethod(no_transforms)
-
 
 class _Last(Function):
     """A backward that has no derivative of its own."""
@@ -87,8 +82,6 @@ class _Last(Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
         no_second_derivative()
-
-    vmap = staticmethod(no_transforms)
 
 
 class _TranslationBackward(_Last):
@@ -118,15 +111,13 @@ class _Start(Function):
         out = _StartBackward.apply(*bars, *ctx.saved_tensors, ctx.surface, ctx.gamma, ctx.needs_input_grad[5])
         return (*out[:5], out[5] if ctx.needs_input_grad[5] else None, None, None, None, None)
 
-    vmap = staticmethod(no_transforms)
-
 
 class _StartBackward(_Last):
     @staticmethod
     def forward(bounds_bar, start_bar, left_bar, x, move, goal, u, near, origin, planes, surface, gamma, wants_planes):
         x_bar, move_bar, goal_bar, u_bar, gap_bar, planes_bar = ops_contact_start.start_backward(
-            (bounds_bar, start_bar, left_bar), x, move, goal, u, near, origin, planes, surface.held, surface.body, gamma,
-            surface.cap, FILTER_ETA, wants_planes,
+            (bounds_bar, start_bar, left_bar), x, move, goal, u, near, origin, planes, surface.held, surface.body,
+            gamma, surface.cap, FILTER_ETA, wants_planes,
         )  # fmt: skip
         u_bar = ops_contact.segment_sum(u_bar, surface.body_order, surface.body_ptr)
         if wants_planes:
@@ -137,7 +128,7 @@ class _StartBackward(_Last):
 
 def start_part(x: Tensor, move: Tensor, goal: Tensor, mass: Tensor, was: Tensor, now: Tensor, planes: Tensor | None,
                origin: Tensor, detection: Any, surface: ContactSurface, gamma: float) -> Start:  # fmt: skip
-    """Bounds until the next detection, and every vertex moved as far toward where it wants to go as bound and floor let it.
+    """Bounds until the next detection, and every vertex as far toward where it wants to go as bound and floor let it.
 
     Args:
         x, move: [B, V, 3] [m], state and wanted motion; goal: where pinned vertices are put [m].

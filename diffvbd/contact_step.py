@@ -66,7 +66,8 @@ class ContactStep:
         self.origin = self.tensors.origin
         self.surface, self.barrier = model.surface_of_contact, model.contact
         self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()]
-        oblique = model.floor is not None and any(sum(a != 0 for a in n) > 1 for n in model.floor.normal)
+        floor = model.floor
+        oblique = floor is not None and bool(((torch.as_tensor(floor.normal) != 0).sum(-1) > 1).any())
         self.any_direction = oblique or "floor_barrier.normal" in prepared.parameters
         self.parts = 1 if self.barrier is None else self.barrier.detections
         like = begun.x_prev
@@ -115,7 +116,7 @@ class ContactStep:
 
     def run(self, policy: int, debug_step: int) -> Tensor:
         """Positions after all parts [B, V, 3]; raises where detection did not hold."""
-        begun, settings, model = self.begun, self.prepared.settings, self.model
+        begun, settings = self.begun, self.prepared.settings
         barrier, surface = self.barrier, self.surface
         if barrier is None or surface is None:  # friction on a floor alone
             x = begun.x_start
@@ -138,8 +139,8 @@ class ContactStep:
                 self._check(r, counts[-1].tolist(), x.shape[0])
             if r == 0:
                 self._set_lag(detection.listed, was)
-            start = start_part(x, move, goal, self.tensors.mass, was, now, self.floor_data, self.origin, detection, surface,
-                               barrier.gamma)  # fmt: skip
+            start = start_part(x, move, goal, self.tensors.mass, was, now, self.floor_data, self.origin, detection,
+                               surface, barrier.gamma)  # fmt: skip
             x, move = start.x, start.move
             cut.append(start.outside)
             if sweeps:
@@ -170,7 +171,14 @@ class ContactStep:
                 x, self.origin, was, now, surface, barrier, capacity
             )
             island = search.islands(
-                x, self.origin, remaining.detach(), self.tensors.mass.detach(), was, now, surface, barrier.dhat,
+                x,
+                self.origin,
+                remaining.detach(),
+                self.tensors.mass.detach(),
+                was,
+                now,
+                surface,
+                barrier.dhat,
                 self.any_direction,
             )
             lowest = island.new_empty((0,))
@@ -225,7 +233,9 @@ class ContactStep:
                 f"({surface.capacity} per scene): use diffvbd.contact.reserve(model, {2 * -(-needed // scenes)})"
             )
         if touching:
-            finite = all(bool(torch.isfinite(t).all()) for t in (self.x_prev, self.begun.y, self.colliders, self.before))
+            finite = all(
+                bool(torch.isfinite(t).all()) for t in (self.x_prev, self.begun.y, self.colliders, self.before)
+            )
             if not finite:  # which argument, finds arguments.name_argument
                 raise ValueError("start (x, v, force, gravity, prescribed, colliders): expected finite values")
             scene, corners = surface.corners_of(pair)

@@ -35,7 +35,7 @@ class ContactTensors(NamedTuple):
 _SWEEP, _CONTACT = 8, 6  # differentiable inputs: SweepTensors without the origin, ContactTensors
 
 
-def no_transforms(*_: Any) -> NoReturn:
+def no_transforms() -> NoReturn:
     raise NotImplementedError("diffvbd: torch.func transforms of a step with contact are not supported")
 
 
@@ -75,13 +75,11 @@ class _ContactSweep(Function):
         out = _ContactBackward.apply(grads[0], *ctx.saved_tensors, *ctx.rest, needs)
         return of_inputs(out, needs, 10)
 
-    vmap = staticmethod(no_transforms)
-
 
 class _ContactBackward(Function):
     @staticmethod
-    def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, bounds, collider, collider_prev, kappa, lag,
-                floor_lag, origin, packed_rest, plan, x, tape, listed, lagged, friction_eps, settings, tape_policy,
+    def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, bounds, collider, collider_prev, kappa,
+                lag, floor_lag, origin, packed_rest, plan, x, tape, listed, lagged, friction_eps, settings, tape_policy,
                 needs):  # fmt: skip
         with backward_memory():
             if rest is not None:
@@ -90,8 +88,8 @@ class _ContactBackward(Function):
             contact = _flat(bounds, collider, collider_prev, kappa, listed, lag, lagged, floor_lag)
             if tape_policy == ops.NO_TAPE:
                 tape_policy = ops.FULL_TAPE
-                x, tape, _ = ops_contact_sweep.sweep((x_start, *inputs), contact, friction_eps, plan, settings, tape_policy,
-                                               -1, False)  # fmt: skip
+                x, tape, _ = ops_contact_sweep.sweep((x_start, *inputs), contact, friction_eps, plan, settings,
+                                                     tape_policy, -1, False)  # fmt: skip
             wants = (needs[3] or needs[4], needs[5], needs[6], needs[7])
             bars = ops_contact_sweep.sweep_backward(x_bar.contiguous(), (x, *inputs), contact, friction_eps, tape, plan,
                                               settings, tape_policy, wants)  # fmt: skip
@@ -107,8 +105,6 @@ class _ContactBackward(Function):
     def backward(ctx: Any, *grads: Tensor) -> NoReturn:
         no_second_derivative()
 
-    vmap = staticmethod(no_transforms)
-
 
 def contact_sweep(tensors: SweepTensors, contact: ContactTensors, listed: Pairs, lagged: Pairs, friction_eps: float,
                   packed_rest: Tensor, plan: Tensor, settings: ops.SweepSettings, *, tape_policy: int,
@@ -117,7 +113,7 @@ def contact_sweep(tensors: SweepTensors, contact: ContactTensors, listed: Pairs,
 
     Args:
         tensors, packed_rest, plan, settings, tape_policy, debug_step: As sweeps.sweep.
-        contact: Differentiable, see ContactTensors.  listed, lagged: Pairs that repel, and those that ``lag`` belongs to.
+        contact: Differentiable, see ContactTensors.  listed, lagged: Pairs that repel, and those of ``lag``.
         friction_eps: Motion within the step below which friction is smoothed [m].
     """
     *swept, origin = tensors
@@ -146,11 +142,9 @@ class _Lag(Function):
         given = (x, collider, kappa)
         return (*(ops.sum_to(b, t.shape) for b, t in zip(bars, given, strict=True)), None, None)
 
-    vmap = staticmethod(no_transforms)
-
 
 def pair_lag(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed: Pairs) -> Tensor:
-    """[pairs, 9]: normal force [N], 1 where closer than dhat, normal (3), weights (4); differentiable in the first three.
+    """[pairs, 9]: normal force [N], 1 where closer than dhat, normal (3), weights (4); differentiable in three.
 
     Args:
         x: [B, V, 3] [m].  collider: [B, Vc, 3] [m].  kappa: [1 | B] [N/m].  origin: [B, V, 3] or empty.

@@ -68,9 +68,7 @@ def tape_rows(policy: int, energies: int) -> int:
     return {NO_TAPE: 0, COMPACT_TAPE: 3, FULL_TAPE: 12 if energies & _KEEPS_POSITIONS else 9}[policy]
 
 
-def tape_shape(
-    x: Tensor, sizes: Sequence[int], energies: int, sweeps: int, launch: Sequence[int], policy: int
-) -> list:
+def tape_shape(x: Tensor, sizes: Sequence[int], energies: int, sweeps: int, launch: Sequence[int], policy: int) -> list:
     """Scenes first, but last where each thread has a scene: who mixes up the two is told so by the shape."""
     shape = [sweeps, tape_rows(policy, energies), sizes[0]]
     return [*shape, x.shape[0]] if tuple(launch[:1]) == (THREAD,) else [x.shape[0], *shape]

@@ -13,9 +13,7 @@ from . import ops
 def translation(move: Tensor, mass: Tensor, x: Tensor, origin: Tensor, planes: Tensor, held: Tensor, body: Tensor,
                 body_order: Tensor, body_ptr: Tensor, island: Tensor, lowest: Tensor) -> Tensor:  # fmt: skip
     """Translation of each body's island [B, bodies, 3]; arguments in the order of csrc/ops.cpp."""
-    return ops.raw.contact_translation(
-        move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest
-    )
+    return ops.raw.contact_translation(move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest)
 
 
 def translation_backward(u_bar: Tensor, move: Tensor, mass: Tensor, x: Tensor, origin: Tensor, planes: Tensor,

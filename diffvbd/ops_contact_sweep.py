@@ -9,7 +9,6 @@ from torch import Tensor
 
 from . import ops
 
-
 PLANE_SCALARS = 7  # twin of kPlaneScalars in csrc/contact/lowest.h
 LAG_SCALARS = 9  # twin of kLagScalars in csrc/contact/pairs.h
 
@@ -63,7 +62,14 @@ def _(x_bar, x, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, col
       data_count, numbers, sweeps, launch, tape_policy, wants):  # fmt: skip
     (b, v), planes = x.shape[:2], floor_lag.numel() // max(1, floor_lag.shape[0] * 4 * x.shape[1])
     colliders = collider.shape[1] if collider.numel() else 0
-    shapes = [(b, v, 4), (b, colliders, 3), (b, colliders, 3), (b,), (lag_pairs.shape[0], LAG_SCALARS), (b, v, planes, 4)]
+    shapes = [
+        (b, v, 4),
+        (b, colliders, 3),
+        (b, colliders, 3),
+        (b,),
+        (lag_pairs.shape[0], LAG_SCALARS),
+        (b, v, planes, 4),
+    ]
     return (*ops.sweep_adjoints(x, mu, lam, energy_data, sizes, wants), *(x.new_empty(s) for s in shapes))
 
 

@@ -20,13 +20,13 @@ def _scalars(energy: PairBarrier | Friction, like: Tensor) -> dict[str, Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class PairBarrier:
-    """IPC log barrier b(d) = -kappa (d - dhat)^2 log(d / dhat) between the surfaces of a Model's bodies and its colliders.
+    """IPC log barrier b(d) = -kappa (d - dhat)^2 log(d / dhat) between surfaces of a Model's bodies and its colliders.
 
     Every pair of a point and a triangle and of two edges counts once, with d their distance, whatever features are
     closest; edges that become parallel are mollified. From a start without intersections no executed sweep lets two
     surfaces cross, at any speed and any number of sweeps: between two detections a vertex moves by at most ``gamma``
-    times its smallest gap, relative to a common translation of the bodies that are near each other. What a bound cuts off
-    is lost as velocity (see :func:`diffvbd.contact.status`).
+    times its smallest gap, relative to a common translation of the bodies that are near each other. What a bound cuts
+    off is lost as velocity (see :func:`diffvbd.contact.status`).
 
     Args:
         kappa: Barrier stiffness [N/m].
@@ -34,8 +34,8 @@ class PairBarrier:
         self_contact: Pairs within a body.
         between_bodies: Pairs of different bodies. Pairs with colliders always count.
         damping: Damping of approaching motion of pairs that started the step closer than dhat [N s/m].
-        detections: R >= 1: how often pairs are searched and bounds renewed within a step. Sweeps, prescribed vertices and
-            moving colliders advance in R parts.
+        detections: R >= 1: how often pairs are searched and bounds renewed within a step. Sweeps, prescribed vertices
+            and moving colliders advance in R parts.
         reach: Distance up to which pairs are searched [m] > dhat; it caps the motion between two detections at
             min(gamma reach, (reach - dhat) / 2). None: the larger of 2 dhat and half the mean edge of the surface.
         gamma: In (0, 0.5).

@@ -78,8 +78,8 @@ def rollout(
     Args:
         model, x, v, time_step, sweeps, adjoint: As in :func:`diffvbd.step`.
         steps: Number of steps >= 0.
-        colliders: Corner points of the Model's colliders [m]: constant, they rest there; in :func:`per_step`, where they
-            are at the end of each step, starting from the Model's collider_points.
+        colliders: Corner points of the Model's colliders [m]: constant, they rest there; in :func:`per_step`, where
+            they are at the end of each step, starting from the Model's collider_points.
         mu, lam, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in time; or wrapped
             in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step. A callable may
             close over tensors and modules that require grad: they get gradients under every schedule. It must be

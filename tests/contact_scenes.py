@@ -89,7 +89,9 @@ def fast() -> Scene:
     """Two boxes at 12 m/s against each other, with spin: bounds hold most vertices back."""
     scene = build("fast", boxes((0, 0, 0), (0.05, 0.23, 0.03)), (dv.PairBarrier(kappa=1e4, dhat=0.02, detections=3),
                                                                 dv.Friction(0.2, 0.1)))  # fmt: skip
-    turning = torch.linalg.cross(scene.x - scene.x.mean(0), torch.tensor([[3.0, 9.0, -5.0]], dtype=torch.float64), dim=-1)
+    turning = torch.linalg.cross(
+        scene.x - scene.x.mean(0), torch.tensor([[3.0, 9.0, -5.0]], dtype=torch.float64), dim=-1
+    )
     scene.v += turning
     scene.v[27:, 1] -= 12.0
     scene.v[:27, 1] += 12.0
@@ -140,9 +142,7 @@ def batched() -> Scene:
     return scene
 
 
-SCENES: dict[str, Callable[[], Scene]] = {
-    f.__name__: f for f in (stacked, crossed, fast, folded, obstacles, batched)
-}
+SCENES: dict[str, Callable[[], Scene]] = {f.__name__: f for f in (stacked, crossed, fast, folded, obstacles, batched)}
 
 
 def part_of(detection: Any) -> reference.Part:
@@ -174,8 +174,8 @@ def compiled(scene: Scene, steps: int, sweeps: int, tape: str = "full", model: d
     x, v = options.pop("x"), options.pop("v")
     with dv.contact.record() as found:
         for _ in range(steps):
-            x, v = dv.step(model, x, v, time_step=scene.time_step, sweeps=sweeps, gravity=GRAVITY, parameters=parameters,
-                           adjoint=dv.ReverseSweep(tape=tape), **options)  # fmt: skip
+            x, v = dv.step(model, x, v, time_step=scene.time_step, sweeps=sweeps, gravity=GRAVITY,
+                           parameters=parameters, adjoint=dv.ReverseSweep(tape=tape), **options)  # fmt: skip
     return _result(x, v, leaves), [part_of(d) for d in found]
 
 
@@ -194,7 +194,8 @@ def unrolled(scene: Scene, steps: int, sweeps: int, parts: list[reference.Part],
             order = [torch.from_numpy(rng.permutation(len(p.pairs))) for p in own]
             tets = torch.from_numpy(rng.permutation(scene.model.num_tets))
         x, v = reference.contact_step(scene.model, x, v, time_step=scene.time_step, sweeps=sweeps, gravity=GRAVITY,
-                                      parameters=parameters, parts=own, order=order, tet_order=tets, **options)  # fmt: skip
+                                      parameters=parameters, parts=own, order=order, tet_order=tets,
+                                      **options)  # fmt: skip
     return _result(x, v, leaves)
 
 

@@ -1,8 +1,8 @@
 """Claim: a step with contact and its reverse equal autograd through an independent execution of the same step.
 
 The detections of the compiled step give the reference its indices; everything else the reference computes for itself.
-The bar of a gradient is max(1e-11, 10 x spread), the spread being the disagreement of two references that differ only in
-the order of pairs and tets.
+The bar of a gradient is max(1e-11, 10 x spread), the spread being the disagreement of two references that differ only
+in the order of pairs and tets.
 """
 
 import functools
@@ -105,7 +105,9 @@ def test_the_scenes_meet_every_kind_of_contact() -> None:
 @pytest.mark.parametrize("name", ["stacked", "crossed", "obstacles"])
 def test_central_differences_over_fifty_steps(name: str) -> None:
     scene = scene_of(name)
-    static = {k: v for k, v in scene.inputs.items() if k not in ("colliders", "colliders_before", "force", "prescribed")}
+    static = {
+        k: v for k, v in scene.inputs.items() if k not in ("colliders", "colliders_before", "force", "prescribed")
+    }
     start, velocity = scene.x, 0.2 * scene.v
     weights = noise("differences", name, shape=start.shape, size=1.0)
     direction = noise("direction", name, shape=start.shape, size=1.0)

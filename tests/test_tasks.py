@@ -9,13 +9,15 @@ import torch
 from diffvbd import losses
 from diffvbd.tasks import TASKS, Settings, beam_mu, solve, table
 
+MATERIAL = sorted(name for name in TASKS if name.startswith("beam"))
+
 
 def quick(name: str, out: Path) -> tuple:
     settings = Settings(out, quick=True)
     return TASKS[name].build(settings), settings
 
 
-@pytest.mark.parametrize("name", sorted(TASKS))
+@pytest.mark.parametrize("name", MATERIAL)
 def test_quick_run_recovers_the_material(name: str, tmp_path: Path) -> None:
     problem, settings = quick(name, tmp_path)
     start = problem.estimates()
@@ -27,7 +29,7 @@ def test_quick_run_recovers_the_material(name: str, tmp_path: Path) -> None:
     assert f"{result.estimates['mu']:.6g}" in table(problem, start, result)
 
 
-@pytest.mark.parametrize("name", sorted(TASKS))
+@pytest.mark.parametrize("name", MATERIAL)
 def test_gradient_at_the_start_matches_central_differences(name: str, tmp_path: Path) -> None:
     problem, _ = quick(name, tmp_path)
     problem.loss().backward()

@@ -21,7 +21,7 @@ struct IslandInputs {
   const bool* held;                            // [N]
   int64_t scenes, mass_scene;                  // stride of scenes in mass
   int32_t vertices, corners, num_planes, mesh_bodies;
-  T margin;  // what each vertex may move beside the translation, and half the reach of the barrier [m]
+  T margin;            // what each vertex may move beside the translation, and half the reach of the barrier [m]
   bool any_direction;  // a floor may turn the translation, which does not become longer by it
 
   DIFFVBD_FN int32_t colliders() const { return corners - vertices; }  // points, and so at most as many objects

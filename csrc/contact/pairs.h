@@ -1,6 +1,6 @@
 // What one pair adds to the block of one of its corners, and the adjoint of exactly that (docs/method.md, section 12).
-// Barrier: gradient of e b(gap) and the part e b'' grad_gap grad_gap^T of its Hessian. Lagged terms: damping of approach
-// and smoothed friction, about a normal, weights and a normal force of the start of the step.
+// Barrier: gradient of e b(gap) and the part e b'' grad_gap grad_gap^T of its Hessian. Lagged terms: damping of
+// approach and smoothed friction, about a normal, weights and a normal force of the start of the step.
 #pragma once
 
 #include "../energies/log_barrier.h"
@@ -101,8 +101,7 @@ struct Lag {
   Vec3<T> n;
   T w[4];
   Lag() = default;
-  DIFFVBD_FN explicit Lag(const T* a)
-      : friction(a[0]), damping(a[1]), n{a[2], a[3], a[4]}, w{a[5], a[6], a[7], a[8]} {}
+  DIFFVBD_FN explicit Lag(const T* a) : friction(a[0]), damping(a[1]), n{a[2], a[3], a[4]}, w{a[5], a[6], a[7], a[8]} {}
   DIFFVBD_FN bool active() const { return friction != T(0) || damping != T(0); }
 };
 
@@ -139,7 +138,8 @@ DIFFVBD_FN void add_lagged(const Lag<T>& a, int i, const Vec3<T>& m, T h, T eps,
   }
 }
 
-// Adjoint of phi = p . (g + H d_raw) of corner i, negated: toward m, and toward the lag at fixed m (a.w[k] also moves m).
+// Adjoint of phi = p . (g + H d_raw) of corner i, negated: toward m, and toward the lag at fixed m (a.w[k] also moves
+// m).
 template <class T>
 DIFFVBD_FN Vec3<T> reverse_lagged(const Lag<T>& a, int i, const Vec3<T>& m, T h, T eps, const Vec3<T>& p,
                                   const Vec3<T>& d_raw, Lag<T>& bar) {

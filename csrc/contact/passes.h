@@ -1,6 +1,6 @@
 // The passes over a color that contact needs besides the block updates: sum the pairs of a vertex, take their adjoint,
-// collect what pairs have sent to a corner. A vertex may share pairs with others of its color, so all of a color read the
-// state before any moves, and in the reverse all p are known before anything is added (docs/method.md, section 12).
+// collect what pairs have sent to a corner. A vertex may share pairs with others of its color, so all of a color read
+// the state before any moves, and in the reverse all p are known before anything is added (docs/method.md, section 12).
 #pragma once
 
 #include "../core/views.h"
@@ -186,8 +186,8 @@ DIFFVBD_FN void take(T* rows, const PairList& list, int64_t row, int first, int 
     }
   }
 }
-// Takes out of the slots what pairs have sent to corner point v since it was last asked for: `now` receives what belongs
-// to the state, `prev` what belongs to the start of the step.
+// Takes out of the slots what pairs have sent to corner point v since it was last asked for: `now` receives what
+// belongs to the state, `prev` what belongs to the start of the step.
 template <class T>
 DIFFVBD_FN void take_pairs(const ContactInputs<T>& in, const ContactAdjoints<T>& out, int64_t scene, int v, int first,
                            int stride, Vec3<T>& now, Vec3<T>& prev) {

@@ -1,5 +1,5 @@
-// Where a part of a step starts: the bound of each vertex, and the vertex moved as far toward its goal as bound and floor
-// let it; with the adjoint.
+// Where a part of a step starts: the bound of each vertex, and the vertex moved as far toward its goal as bound and
+// floor let it; with the adjoint.
 #pragma once
 
 #include "../core/bounds.h"
@@ -13,13 +13,13 @@ constexpr int kGuardUlps = 32;
 
 template <class T>
 struct StartInputs {
-  const T *x, *move;                  // [B, V, 3]  at the detection; where each vertex wants to go from there
-  const T* goal;                      // [B, V, 3]  where pinned vertices are put
-  const T* u;                         // [B, bodies, 3]
-  const T* near;                      // [B, corners, kNearValues]
-  Batched<const T> origin, floor;     // [B, V, 3], [1 | B, data of the planes]; either may be null
-  const bool* pinned;                 // [V]
-  const int32_t* body;                // [V]
+  const T *x, *move;               // [B, V, 3]  at the detection; where each vertex wants to go from there
+  const T* goal;                   // [B, V, 3]  where pinned vertices are put
+  const T* u;                      // [B, bodies, 3]
+  const T* near;                   // [B, corners, kNearValues]
+  Batched<const T> origin, floor;  // [B, V, 3], [1 | B, data of the planes]; either may be null
+  const bool* pinned;              // [V]
+  const int32_t* body;             // [V]
   int64_t scenes, corners;
   int32_t vertices, bodies, floor_scalars;
   T gamma, cap;
@@ -31,7 +31,8 @@ struct StartInputs {
   DIFFVBD_FN Vec3<T> local_origin(int64_t scene, int32_t v) const {
     return origin.data ? vector_at(origin.data + scene * origin.scene + 3 * int64_t{v}) : zero3<T>();
   }
-  // Share of the smallest gap that is the vertex's to move; a gap is not trusted to less than some roundings of a position.
+  // Share of the smallest gap that is the vertex's to move; a gap is not trusted to less than some roundings of a
+  // position.
   DIFFVBD_FN T share(int64_t scene, int32_t v) const {
     const Vec3<T> o = local_origin(scene, v), p = at(x, scene, v) + o;
     const T guard = T(kGuardUlps) * std::numeric_limits<T>::epsilon() * (absolute(p.x) + absolute(p.y) + absolute(p.z));

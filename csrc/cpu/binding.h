@@ -9,8 +9,12 @@
 
 namespace diffvbd {
 
-inline Tensor zeros(const Tensor& like, const std::vector<int64_t>& sizes) { return torch::stable::new_zeros(like, sizes); }
-inline Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes) { return torch::stable::new_empty(like, sizes); }
+inline Tensor zeros(const Tensor& like, const std::vector<int64_t>& sizes) {
+  return torch::stable::new_zeros(like, sizes);
+}
+inline Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes) {
+  return torch::stable::new_empty(like, sizes);
+}
 
 inline Plan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes) {
   require(buffer.scalar_type() == ScalarType::Int && buffer.is_contiguous() && buffer.numel() >= kPlanHeader,
@@ -22,11 +26,10 @@ inline Plan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes) {
 }
 
 template <class T>
-StepInputs<T> inputs(const Plan& plan, const Tensor& x_start, const Tensor& x_prev, const Tensor& y,
-                              const Tensor& mu, const Tensor& lam, const Tensor& mass, const Tensor& rest,
-                              const Tensor& energy_data, const Tensor& origin, int64_t energies,
-                              const std::vector<int64_t>& data_count, const std::vector<double>& numbers,
-                              int64_t sweeps, int64_t tape_policy, int64_t debug_step) {
+StepInputs<T> inputs(const Plan& plan, const Tensor& x_start, const Tensor& x_prev, const Tensor& y, const Tensor& mu,
+                     const Tensor& lam, const Tensor& mass, const Tensor& rest, const Tensor& energy_data,
+                     const Tensor& origin, int64_t energies, const std::vector<int64_t>& data_count,
+                     const std::vector<double>& numbers, int64_t sweeps, int64_t tape_policy, int64_t debug_step) {
   require(x_start.dim() == 3 && x_start.size(1) == plan.num_vertices && x_start.size(2) == 3,
           "diffvbd::sweep: expected x of shape [scenes, vertices, 3]");
   const int64_t b = x_start.size(0), v3 = int64_t{plan.num_vertices} * 3;
@@ -50,7 +53,6 @@ StepInputs<T> inputs(const Plan& plan, const Tensor& x_start, const Tensor& x_pr
   return in;
 }
 
-
 template <class T>
 std::vector<int64_t> tape_shape(const Plan& plan, const StepInputs<T>& in) {
   return {in.scenes, in.sweeps, tape_rows(in.tape_policy, keeps_positions(in.energies)), plan.num_active};
@@ -70,7 +72,9 @@ struct Bars {
   Bars(const Tensor& x, const Plan& plan, const std::vector<int64_t>& data_count, const std::vector<bool>& wants) {
     require(wants.size() == 4, "diffvbd: expected 4 wishes");
     const int64_t b = x.size(0), v = plan.num_vertices, t = plan.num_tets;
-    const auto wanted = [&](int i, std::vector<int64_t> shape) { return zeros(x, wants[i] ? shape : std::vector<int64_t>{0}); };
+    const auto wanted = [&](int i, std::vector<int64_t> shape) {
+      return zeros(x, wants[i] ? shape : std::vector<int64_t>{0});
+    };
     x_start = empty(x, {b, v, 3}), x_prev = zeros(x, {b, v, 3}), y = empty(x, {b, v, 3});
     mu = wanted(0, {b, t}), lam = wanted(0, {b, t});
     mass = wanted(1, {b, v}), rest = wanted(2, {b, t, kRestScalars});

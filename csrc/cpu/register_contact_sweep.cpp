@@ -4,8 +4,8 @@
 #include <tuple>
 #include <vector>
 
-#include "../contact/lag.h"
 #include "../arguments_contact.h"
+#include "../contact/lag.h"
 #include "binding.h"
 
 namespace {
@@ -46,15 +46,17 @@ std::tuple<Tensor, Tensor, Tensor> contact_sweep(
 using FourteenTensors = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
                                    Tensor, Tensor, Tensor, Tensor>;
 
-FourteenTensors contact_sweep_backward(
-    const Tensor& x_bar, const Tensor& x, const Tensor& x_prev, const Tensor& y, const Tensor& mu, const Tensor& lam,
-    const Tensor& mass, const Tensor& rest, const Tensor& energy_data, const Tensor& origin, const Tensor& bounds,
-    const Tensor& collider, const Tensor& collider_prev, const Tensor& kappa, const Tensor& pairs,
-    const Tensor& constants, const Tensor& ptr, const Tensor& entry, const Tensor& lag, const Tensor& lag_pairs,
-    const Tensor& lag_ptr, const Tensor& lag_entry, const Tensor& floor_lag, double friction_eps, const Tensor& tape,
-    const Tensor& plan_buffer, std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
-    std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> /*launch*/, int64_t tape_policy,
-    std::vector<bool> wants) {
+FourteenTensors contact_sweep_backward(const Tensor& x_bar, const Tensor& x, const Tensor& x_prev, const Tensor& y,
+                                       const Tensor& mu, const Tensor& lam, const Tensor& mass, const Tensor& rest,
+                                       const Tensor& energy_data, const Tensor& origin, const Tensor& bounds,
+                                       const Tensor& collider, const Tensor& collider_prev, const Tensor& kappa,
+                                       const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
+                                       const Tensor& entry, const Tensor& lag, const Tensor& lag_pairs,
+                                       const Tensor& lag_ptr, const Tensor& lag_entry, const Tensor& floor_lag,
+                                       double friction_eps, const Tensor& tape, const Tensor& plan_buffer,
+                                       std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
+                                       std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> /*launch*/,
+                                       int64_t tape_policy, std::vector<bool> wants) {
   const diffvbd::Plan plan = diffvbd::plan_of(plan_buffer, sizes);
   const ContactTensors given{bounds, collider, collider_prev, kappa,   pairs,     constants, ptr,
                              entry,  lag,      lag_pairs,     lag_ptr, lag_entry, floor_lag};
@@ -98,8 +100,8 @@ FourteenTensors contact_sweep_backward(
                          : data<T>(collider_prev_bar) + 3 * (scene * (corners - v) + corner - v);
       contact::add_at(to, contact::vector_at(prev.get() + 3 * at));
     }
-    return std::tuple_cat(bars.tensors(), std::make_tuple(bounds_bar, collider_bar, collider_prev_bar, kappa_bar,
-                                                          lag_bar, floor_bar));
+    return std::tuple_cat(bars.tensors(),
+                          std::make_tuple(bounds_bar, collider_bar, collider_prev_bar, kappa_bar, lag_bar, floor_bar));
   });
 }
 

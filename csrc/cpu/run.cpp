@@ -177,7 +177,8 @@ void look_for_nonfinite(const Plan& plan, const SceneView<T>& s, int64_t step, i
 template <class T>
 void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* cut) {
   const auto kernel = forward_kernel<T>(in.energies);
-  const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
+  const int64_t tape_size =
+      int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
   const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
   // a message thrown inside a parallel region would be lost
   const bool looks = in.debug_step >= 0;
@@ -214,7 +215,8 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
                  const StepAdjoints<T>& out) {
   const int wanted = (out.mu ? kMaterial : 0) | (out.rest ? kMaterial | kRest : 0);
   const auto kernel = reverse_kernel<T>(in.energies, wanted);
-  const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
+  const int64_t tape_size =
+      int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
   const int64_t n = plan.num_vertices, tets = plan.num_tets, lanes = int64_t{plan.blocks} * kLanes;
   const int64_t pairs = int64_t{plan.slots} * kLanes;
   const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
@@ -250,9 +252,8 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
         for (int c = plan.colors - 1; c >= 0; --c) {
           const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
           if (contact) {
-            member.each(first, last, [&](int64_t begin, int64_t end) {
-              contact->prepare(k, in.tape_policy, begin, end);
-            });
+            member.each(first, last,
+                        [&](int64_t begin, int64_t end) { contact->prepare(k, in.tape_policy, begin, end); });
             member.barrier();
             if (in.tape_policy != kFullTape) {
               member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
@@ -350,7 +351,7 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
 }
 
 #define DIFFVBD_INSTANTIATE(T)                                                                  \
-  template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*, uint8_t*);                    \
+  template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*, uint8_t*);            \
   template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*, \
                                const StepAdjoints<T>&);                                         \
   template void pack_rest<T>(const Plan&, const T*, T*);

@@ -22,13 +22,13 @@ struct StepInputs {
   StepParameters<T> parameters;
   int sweeps, tape_policy;
   const contact::ContactInputs<T>* contact;  // null without contact
-  int64_t debug_step;  // step number to name when a position is not finite; -1: do not look
+  int64_t debug_step;                        // step number to name when a position is not finite; -1: do not look
 };
 
 template <class T>
 struct StepAdjoints {
-  T *x_start, *x_prev, *y;           // [B, V, 3]
-  T *mu, *lam, *mass, *rest, *data;  // [B, T], [B, T], [B, V], [B, T, 7], [B, N]; null where not wanted
+  T *x_start, *x_prev, *y;                     // [B, V, 3]
+  T *mu, *lam, *mass, *rest, *data;            // [B, T], [B, T], [B, V], [B, T, 7], [B, N]; null where not wanted
   const contact::ContactAdjoints<T>* contact;  // with contact
   T *bounds, *collider;                        // [B, V, 4], [B, Vc, 3] with contact
 };

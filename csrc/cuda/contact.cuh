@@ -17,9 +17,7 @@ template <class T>
 struct SweepRows {
   const T* rows;
   const int32_t* position;
-  __device__ __forceinline__ Vec3<T> operator()(int v) const {
-    return load_row(rows, __ldg(position + v));
-  }
+  __device__ __forceinline__ Vec3<T> operator()(int v) const { return load_row(rows, __ldg(position + v)); }
 };
 template <class T>
 struct UserRows {
@@ -133,8 +131,8 @@ __global__ void reverse_contact(const __grid_constant__ StepView<T> s, const __g
     const T* turn = s.w.turn + 6 * at.row(s);
     const SweepRows<T> rows = at.rows(s);
     const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
-    contact::reverse_pairs(source, slots, at.vertex, at.lane, kShare, s.parameters.time_step,
-                           contact::vector_at(turn), contact::vector_at(turn + 3), own);
+    contact::reverse_pairs(source, slots, at.vertex, at.lane, kShare, s.parameters.time_step, contact::vector_at(turn),
+                           contact::vector_at(turn + 3), own);
   }
   if (in.planes == 0) return;
   sum_share(own);
@@ -353,11 +351,11 @@ cudaError_t pair_lag_backward(const ContactInputs<T>& in, const T* x, int64_t sc
 
 }  // namespace diffvbd::cuda
 
-#define DIFFVBD_INSTANTIATE_CONTACT(T)                                                                                \
-  template struct diffvbd::cuda::ContactPasses<T>;                                                                    \
-  template cudaError_t diffvbd::cuda::sum_lag<T>(const diffvbd::contact::ContactAdjoints<T>&, int64_t, T*,            \
-                                                 cudaStream_t);                                                       \
-  template cudaError_t diffvbd::cuda::pair_lag<T>(const diffvbd::contact::ContactInputs<T>&, const T*, int64_t,       \
-                                                  int64_t, T*, cudaStream_t);                                         \
-  template cudaError_t diffvbd::cuda::pair_lag_backward<T>(const diffvbd::contact::ContactInputs<T>&, const T*,       \
+#define DIFFVBD_INSTANTIATE_CONTACT(T)                                                                          \
+  template struct diffvbd::cuda::ContactPasses<T>;                                                              \
+  template cudaError_t diffvbd::cuda::sum_lag<T>(const diffvbd::contact::ContactAdjoints<T>&, int64_t, T*,      \
+                                                 cudaStream_t);                                                 \
+  template cudaError_t diffvbd::cuda::pair_lag<T>(const diffvbd::contact::ContactInputs<T>&, const T*, int64_t, \
+                                                  int64_t, T*, cudaStream_t);                                   \
+  template cudaError_t diffvbd::cuda::pair_lag_backward<T>(const diffvbd::contact::ContactInputs<T>&, const T*, \
                                                            int64_t, int64_t, const T*, T*, T*, T*, T*, cudaStream_t);

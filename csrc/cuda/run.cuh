@@ -90,7 +90,12 @@ struct Runner {
 
   Runner(const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints, const Choice& choice,
          void* workspace, cudaStream_t stream)
-      : host(host), in(in), adjoints(adjoints), choice(choice), stream(stream), barrier(static_cast<unsigned*>(workspace)) {
+      : host(host),
+        in(in),
+        adjoints(adjoints),
+        choice(choice),
+        stream(stream),
+        barrier(static_cast<unsigned*>(workspace)) {
     first = reinterpret_cast<T*>(static_cast<char*>(workspace) + kBarrierBytes);
     Carver<T> take{first};
     s.w = carve(host, in, adjoints, choice, take, &zeroed, &s.spill);

@@ -13,7 +13,8 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
   using Set = EnergySet<mask>;
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
-  const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice, rows = tape_rows(in.tape_policy, Set::keeps_positions);
+  const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice,
+            rows = tape_rows(in.tape_policy, Set::keeps_positions);
   T *const x_tile = tiles_of_warp<T>(plan, memory, 2), *const y_tile = x_tile + size * kColumn;
   T *const x = x_tile + lane, *const y = y_tile + lane;
   int64_t start[kVertexEnergies];

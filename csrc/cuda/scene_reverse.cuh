@@ -19,7 +19,8 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
   using Set = EnergySet<mask>;
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
-  const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice, rows = tape_rows(in.tape_policy, Set::keeps_positions);
+  const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice,
+            rows = tape_rows(in.tape_policy, Set::keeps_positions);
   const bool needs_y = reads_y(out, in.tape_policy, Set::filters), full = in.tape_policy == kFullTape;
   T* const x_tile = tiles_of_warp<T>(plan, memory, needs_y ? 4 : 3);
   T *const bar_tile = x_tile + size * kColumn, *const y_bar_tile = bar_tile + size * kColumn;

@@ -32,8 +32,8 @@ __global__ void translate(const __grid_constant__ contact::TranslationInputs<T> 
 }
 
 template <class T>
-__global__ void reverse_islands(const __grid_constant__ contact::TranslationInputs<T> in, const T* sums,
-                                const T* u_bar, T* rate, T* mean, T* x_bar, T* planes_slots) {
+__global__ void reverse_islands(const __grid_constant__ contact::TranslationInputs<T> in, const T* sums, const T* u_bar,
+                                T* rate, T* mean, T* x_bar, T* planes_slots) {
   const int64_t row = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (row >= in.scenes * in.bodies) return;
   contact::reverse_island(in, sums, u_bar, row / in.bodies, static_cast<int32_t>(row % in.bodies), rate, mean, x_bar,
@@ -41,8 +41,8 @@ __global__ void reverse_islands(const __grid_constant__ contact::TranslationInpu
 }
 
 template <class T>
-__global__ void reverse_vertices(const __grid_constant__ contact::TranslationInputs<T> in, const T* rate,
-                                 const T* mean, T* move_bar, T* mass_bar) {
+__global__ void reverse_vertices(const __grid_constant__ contact::TranslationInputs<T> in, const T* rate, const T* mean,
+                                 T* move_bar, T* mass_bar) {
   const int64_t row = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (row >= in.scenes * in.vertices) return;
   contact::reverse_vertex_share(in, rate, mean, row / in.vertices, static_cast<int32_t>(row % in.vertices), move_bar,
@@ -110,19 +110,18 @@ cudaError_t start(const contact::StartInputs<T>& in, const contact::StartOutputs
 }
 
 template <class T>
-cudaError_t start_backward(const contact::StartInputs<T>& in, const contact::StartAdjoints<T>& a,
-                           cudaStream_t stream) {
+cudaError_t start_backward(const contact::StartInputs<T>& in, const contact::StartAdjoints<T>& a, cudaStream_t stream) {
   if (in.scenes * in.vertices == 0) return cudaSuccess;
   reverse_starts<<<blocks_for(in.scenes * in.vertices), kThreads, 0, stream>>>(in, a);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                      \
-  template cudaError_t translation<T>(const contact::TranslationInputs<T>&, T*, T*, cudaStream_t);                  \
-  template cudaError_t translation_backward<T>(const contact::TranslationInputs<T>&, const T*, T*, T*, T*, T*, T*,  \
-                                               T*, cudaStream_t);                                                   \
-  template cudaError_t start<T>(const contact::StartInputs<T>&, const contact::StartOutputs<T>&, cudaStream_t);     \
-  template cudaError_t start_backward<T>(const contact::StartInputs<T>&, const contact::StartAdjoints<T>&,          \
+#define DIFFVBD_INSTANTIATE(T)                                                                                         \
+  template cudaError_t translation<T>(const contact::TranslationInputs<T>&, T*, T*, cudaStream_t);                     \
+  template cudaError_t translation_backward<T>(const contact::TranslationInputs<T>&, const T*, T*, T*, T*, T*, T*, T*, \
+                                               cudaStream_t);                                                          \
+  template cudaError_t start<T>(const contact::StartInputs<T>&, const contact::StartOutputs<T>&, cudaStream_t);        \
+  template cudaError_t start_backward<T>(const contact::StartInputs<T>&, const contact::StartAdjoints<T>&,             \
                                          cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

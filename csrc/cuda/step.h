@@ -35,14 +35,14 @@ struct StepInputs {
   // A fused step has these in place of x_start and y, which are then the predictor (pinned vertices: `held`, or where
   // x_prev has them), and returns velocities.
   bool fused;
-  Batched<const T> v, acceleration, held;  // [B, V, 3]; acceleration also [B, 1, 3] (item 0); held may be null
+  Batched<const T> v, acceleration, held;    // [B, V, 3]; acceleration also [B, 1, 3] (item 0); held may be null
   const contact::ContactInputs<T>* contact;  // on the host; null without contact
 };
 
 template <class T>
 struct StepOutputs {
-  T *x, *v;  // [B, V, 3]; v only of a fused step
-  T* tape;   // [B, sweeps, rows, active] in all; a scene per thread keeps scenes last
+  T *x, *v;      // [B, V, 3]; v only of a fused step
+  T* tape;       // [B, sweeps, rows, active] in all; a scene per thread keeps scenes last
   uint8_t* cut;  // [B, V], zero: where a bound has held back; with contact
 };
 
@@ -52,7 +52,7 @@ struct StepAdjoints {
   T *x_start, *x_prev, *y;           // [B, V, 3]
   T *mu, *lam, *mass, *rest, *data;  // [B, 1 | T], [B, 1 | T], [B, V], [B, T, 7], [B, N]; null where not wanted
   T *x, *v, *acceleration, *held;    // of a fused step, null where not wanted
-  const contact::ContactAdjoints<T>* contact;  // on the host; with contact
+  const contact::ContactAdjoints<T>* contact;    // on the host; with contact
   T *bounds, *collider, *collider_prev, *kappa;  // [B, V, 4], [B, Vc, 3], [B, Vc, 3], [B] with contact
 };
 
@@ -76,7 +76,7 @@ template <class T>
 struct StepView {
   GroupPlan plan;
   int64_t scenes, positions;
-  int64_t base;  // the first scene of the chunk
+  int64_t base;         // the first scene of the chunk
   int degree, valence;  // largest number of neighbours and of pairs
   StepParameters<T> parameters;
   int sweeps, tape_policy;
@@ -89,7 +89,7 @@ struct StepView {
   int data_scalars;
   Workspace<T> w;
   uint8_t* cut;  // [B, V] with contact, forward
-  T* spill;  // [warps, shared_scalars] for kSpillLanes
+  T* spill;      // [warps, shared_scalars] for kSpillLanes
   T* tape;
 };
 
@@ -127,8 +127,8 @@ DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int lanes, bool
   return groups * (3 * degree + (reverse ? contributions : 0));
 }
 
-constexpr int kElasticVariants = 3;  // none, exact, paper
-constexpr int kFreeSets = kElasticVariants << kVertexEnergies;  // without contact
+constexpr int kElasticVariants = 3;                                     // none, exact, paper
+constexpr int kFreeSets = kElasticVariants << kVertexEnergies;          // without contact
 constexpr int kEnergySets = kElasticVariants << (kVertexEnergies + 1);  // and contact
 constexpr int energy_mask(int n) { return n % kElasticVariants + (n / kElasticVariants) * 4; }
 constexpr int energy_index(int mask) { return (mask & 3) + (mask >> 2) * kElasticVariants; }

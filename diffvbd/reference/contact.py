@@ -216,7 +216,7 @@ class Bounds:
 
     @staticmethod
     def _above(floor: FloorBarrier, u: Tensor, x: Tensor, lowest: Tensor) -> Tensor:
-        """u [..., 3, V] that goes down at most until the lowest vertex [..., V, planes] comes within dhat of a plane."""
+        """u [..., 3, V], down at most until the lowest vertex [..., V, planes] comes within dhat of a plane."""
         lead, count = x.shape[:-2], x.shape[-1]
         gap = floor.gap(x)  # [..., planes, V]
         room = (gap.gather(-1, lowest.transpose(-1, -2)) - floor.dhat).clamp(min=0)

@@ -10,7 +10,6 @@ from .energies import FloorBarrier
 from .layout import dot, outer6, take
 from .scene import Scene
 
-
 RESTING = 1e-6  # of the motion below which friction is smoothed
 
 

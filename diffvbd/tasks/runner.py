@@ -54,6 +54,11 @@ class Problem:
         truth: Known values of some estimates, for the table.
         protocol: Numbers that define the problem, for the log.
         picture: Draws the result, given a path and the history; needs matplotlib.
+        before: Called with the number of each iteration before its loss, to change tensors that the loss reads.
+        criterion: Key of the history by whose lowest value the best iteration is chosen, and by the loss among equals;
+            for losses that change on the way.
+        capturable: On a CUDA device loss and gradient may be captured in one CUDA graph, which is replayed: the loss
+            reads nothing but tensors that stay where they are, and never waits for the device.
     """
 
     name: str
@@ -68,11 +73,14 @@ class Problem:
     truth: Row = field(default_factory=dict)
     protocol: dict[str, Any] = field(default_factory=dict)
     picture: Callable[[Path, list[Row]], object] | None = None
+    before: Callable[[int], object] | None = None
+    criterion: str = "loss"
+    capturable: bool = False
 
 
 @dataclass
 class Result:
-    """What `solve` found: the row of the history with the lowest loss, and every row."""
+    """What `solve` found: the best row of the history, and every row."""
 
     best: Row
     history: list[Row]
@@ -83,7 +91,7 @@ class Result:
 
 
 def solve(problem: Problem, settings: Settings) -> Result:
-    """Minimise the loss; the parameters of the lowest loss win.
+    """Minimise the loss; the parameters with the lowest criterion, by default the loss, win.
 
     After every step of the optimiser the whole state is on disk, so the same call continues an interrupted run with the
     very numbers the uninterrupted one would have had. A state of other settings or of another protocol is ignored.
@@ -109,10 +117,21 @@ def solve(problem: Problem, settings: Settings) -> Result:
     progress = Progress(problem.name, problem.iterations, done=len(run.history))
     begun = time.perf_counter() - (run.history[-1]["seconds"] if run.history else 0.0)
 
-    def evaluate() -> float:
+    def gradient() -> Tensor:
         optimizer.zero_grad()
         loss = problem.loss()
         loss.backward()
+        return loss.detach()
+
+    if problem.capturable and torch.device(settings.device).type == "cuda":
+        if problem.before:
+            problem.before(len(run.history))
+        gradient = _captured(gradient)
+
+    def evaluate() -> float:
+        if problem.before:
+            problem.before(len(run.history))
+        loss = gradient()
         row = {"iteration": float(len(run.history)), "loss": loss.item(), "gradient_norm": _norm(parameters)}
         row |= problem.estimates() | {"seconds": time.perf_counter() - begun}
         if not (math.isfinite(row["loss"]) and math.isfinite(row["gradient_norm"])):
@@ -134,6 +153,26 @@ def solve(problem: Problem, settings: Settings) -> Result:
         pass
     progress.close()
     return run.finish()
+
+
+def _captured(run: Callable[[], Tensor], warm: int = 2) -> Callable[[], Tensor]:
+    """`run` as a CUDA graph: the same work on the same memory, results and gradients included. The optimiser stays
+    outside: its few launches cost nothing beside a rollout, and so any optimiser will do."""
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(warm):  # libraries load, autograd makes its buffers
+            run()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        result = run()
+
+    def replay() -> Tensor:
+        graph.replay()
+        return result
+
+    return replay
 
 
 class _Ended(Exception):
@@ -174,9 +213,12 @@ class _Run:
 
     def record(self, row: Row) -> None:
         self.history.append(row)
-        if not self.best_parameters or row["loss"] < self.history[self.best]["loss"]:
+        if not self.best_parameters or self._merit(row) < self._merit(self.history[self.best]):
             self.best = len(self.history) - 1
             self.best_parameters = {name: p.detach().clone() for name, p in self.problem.parameters.items()}
+
+    def _merit(self, row: Row) -> tuple[float, float]:
+        return row[self.problem.criterion], row["loss"]
 
     def save(self) -> None:
         state = {
