@@ -22,7 +22,9 @@ FREE = 1e15  # [m] radius of a bound that binds nothing
 
 
 class Detection(NamedTuple):
-    """One search: index data, and values that the step differentiates anew. Shapes: detection.detect."""
+    """One search: which pairs are listed (``listed.pairs`` [capacity, 6]: four corner points, kind, scene), the nearest
+    pair of each corner point (``near_corners`` [B, N, 5], ``near_values`` [B, N, 8]: weights, normal, gap [m]) and which
+    bodies move together (``island`` [B, bodies]). Index data; the step differentiates the values anew."""
 
     listed: Pairs
     near_corners: Tensor
