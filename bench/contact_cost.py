@@ -63,7 +63,7 @@ def searching(model: dv.Model) -> Callable[[], Any]:
 
     def work() -> list[Any]:
         return [(detection.detect(x, none, points, points, surface, barrier, surface.capacity),
-                 detection.islands(x, none, move, mass, points, points, surface, barrier.dhat))
+                 detection.islands(x, none, move, mass, points, points, surface, barrier.dhat, False))
                 for _ in range(DETECTIONS)]  # fmt: skip
 
     return work

@@ -18,8 +18,7 @@ inline contact::PairList pair_list(const Tensor& pairs, const Tensor& ptr, const
                                    int64_t corners) {
   const auto good = [](const Tensor& t) { return t.scalar_type() == ScalarType::Int && t.is_contiguous(); };
   require(good(pairs) && good(ptr) && good(entry) && ptr.numel() == scenes * corners + 1 &&
-              pairs.numel() % contact::kPairIntegers == 0 &&
-              4 * (pairs.numel() / contact::kPairIntegers) == entry.numel(),
+              pairs.numel() % contact::kPairRow == 0 && 4 * (pairs.numel() / contact::kPairRow) == entry.numel(),
           "diffvbd: expected pairs made by contact_detect for this batch");
   return {data<const int32_t>(pairs), data<const int32_t>(ptr), data<const int32_t>(entry)};
 }
@@ -27,7 +26,7 @@ inline contact::PairList pair_list(const Tensor& pairs, const Tensor& ptr, const
 template <class T>
 contact::ContactInputs<T> contact_inputs(const ContactTensors& t, const Tensor& x, const Batched<const T>& x_prev,
                                          const Batched<const T>& origin, double friction_eps) {
-  const int64_t b = x.size(0), v = x.size(1), colliders = t.collider.numel() ? t.collider.size(1) : 0;
+  const int64_t b = x.size(0), v = x.size(1), colliders = t.collider.dim() == 3 ? t.collider.size(1) : 0;
   contact::ContactInputs<T> in{};
   in.num_vertices = static_cast<int32_t>(v);
   in.corners = v + colliders;
@@ -39,7 +38,7 @@ contact::ContactInputs<T> contact_inputs(const ContactTensors& t, const Tensor& 
   if (t.lag.numel() > 0) {
     in.lagged = pair_list(t.lag_pairs, t.lag_ptr, t.lag_entry, b, in.corners);
     require(t.lag.is_contiguous() && t.lag.scalar_type() == x.scalar_type() &&
-                t.lag.numel() * contact::kPairIntegers == t.lag_pairs.numel() * contact::kLagScalars,
+                t.lag.numel() * contact::kPairRow == t.lag_pairs.numel() * contact::kLagScalars,
             "diffvbd: expected the lag of the pairs");
     in.lag = data<const T>(t.lag);
   }

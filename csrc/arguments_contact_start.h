@@ -79,7 +79,7 @@ contact::StartInputs<T> start_inputs(const StartTensors& t, double gamma, double
   in.gamma = static_cast<T>(gamma);
   in.cap = static_cast<T>(cap);
   in.parameters.filter_eta = static_cast<T>(filter_eta);
-  in.parameters.time_step = T(1);
+  in.parameters.time_step = T(1);  // a filter does not read it
   return in;
 }
 

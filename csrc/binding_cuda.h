@@ -72,4 +72,11 @@ inline cudaStream_t current_stream(const Tensor& t) {
   return static_cast<cudaStream_t>(stream);
 }
 
+inline Tensor zeros(const Tensor& like, const std::vector<int64_t>& sizes) {
+  Tensor out = empty(like, sizes);
+  const size_t bytes = out.numel() * (like.scalar_type() == ScalarType::Double ? sizeof(double) : sizeof(float));
+  if (bytes > 0) check(cudaMemsetAsync(out.data_ptr(), 0, bytes, current_stream(like)), "memset");
+  return out;
+}
+
 }  // namespace diffvbd::cuda

@@ -112,10 +112,8 @@ struct Bars {
     elastic = (in.energies & (kExactBlock | kPaperBlock)) != 0;
     const int64_t materials = in.mu.item == 0 && in.lam.item == 0 ? 1 : t;
     const auto wanted = [&](int i, const std::vector<int64_t>& shape, bool zeroed) {
-      Tensor out = empty(x, wants[i] ? shape : std::vector<int64_t>{0});
-      if (wants[i] && zeroed)
-        check(cudaMemsetAsync(out.data_ptr(), 0, out.numel() * sizeof(T), current_stream(x)), "memset");
-      return out;
+      const std::vector<int64_t> sizes = wants[i] ? shape : std::vector<int64_t>{0};
+      return zeroed ? zeros(x, sizes) : empty(x, sizes);
     };
     x_start = empty(x, {b, v, 3}), x_prev = empty(x, {b, v, 3}), y = empty(x, {b, v, 3});
     mu = wanted(0, {b, materials}, !elastic), lam = wanted(0, {b, materials}, !elastic);

@@ -13,18 +13,11 @@ namespace {
 
 namespace contact = diffvbd::contact;
 namespace cuda = diffvbd::cuda;
-using cuda::check, cuda::current_stream, cuda::empty;
+using cuda::check, cuda::current_stream, cuda::empty, cuda::zeros;
 using diffvbd::data, diffvbd::dispatch_float, diffvbd::StartTensors, diffvbd::TranslationTensors;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
-
-template <class T>
-Tensor zeros(const Tensor& like, const std::vector<int64_t>& sizes) {
-  Tensor out = empty(like, sizes);
-  if (out.numel()) check(cudaMemsetAsync(out.data_ptr(), 0, out.numel() * sizeof(T), current_stream(like)), "memset");
-  return out;
-}
 
 Tensor contact_translation(const Tensor& move, const Tensor& mass, const Tensor& x, const Tensor& origin,
                            const Tensor& planes, const Tensor& held, const Tensor& body, const Tensor& body_order,
@@ -51,9 +44,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_translation_backward(
     using T = decltype(scalar);
     const auto in = diffvbd::translation_inputs<T>(given);
     const int64_t b = in.scenes, v = in.vertices, scalars = int64_t{in.floor.num_planes} * contact::kPlaneScalars;
-    Tensor move_bar = empty(x, {b, v, 3}), mass_bar = empty(x, {b, v}), x_bar = zeros<T>(x, {b, v, 3});
-    Tensor planes_bar = empty(x, {b, scalars});
-    const Tensor sums = empty(x, {b, in.bodies, 4}), zeroed = zeros<T>(x, {b, in.bodies, 6 + scalars});
+    Tensor move_bar = empty(x, {b, v, 3}), mass_bar = empty(x, {b, v}), x_bar = zeros(x, {b, v, 3});
+    Tensor planes_bar = zeros(x, {b, scalars});
+    const Tensor sums = empty(x, {b, in.bodies, 4}), zeroed = zeros(x, {b, in.bodies, 6 + scalars});
     check(cuda::translation_backward<T>(in, data<const T>(u_bar), data<T>(sums), data<T>(zeroed), data<T>(move_bar),
                                         data<T>(mass_bar), data<T>(x_bar), data<T>(planes_bar), current_stream(x)),
           "the translation of islands");

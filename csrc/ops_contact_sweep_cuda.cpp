@@ -13,17 +13,10 @@ namespace {
 
 namespace contact = diffvbd::contact;
 namespace cuda = diffvbd::cuda;
-using cuda::check, cuda::current_stream, cuda::DeviceGuard, cuda::empty;
+using cuda::check, cuda::current_stream, cuda::DeviceGuard, cuda::empty, cuda::zeros;
 using diffvbd::ContactTensors, diffvbd::batched, diffvbd::data, diffvbd::dispatch_float, diffvbd::require;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
-
-template <class T>
-Tensor zeros(const Tensor& like, const std::vector<int64_t>& sizes) {
-  Tensor out = empty(like, sizes);
-  if (out.numel()) check(cudaMemsetAsync(out.data_ptr(), 0, out.numel() * sizeof(T), current_stream(like)), "memset");
-  return out;
-}
 
 // The step's own inputs; x is where the sweeps start or, in the reverse, end.
 template <class T>
@@ -109,15 +102,14 @@ FourteenTensors contact_sweep_backward(const Tensor& x_bar, const Tensor& x, con
     in.contact = &pairs_in;
     const int64_t b = in.scenes, v = host.plan.num_vertices, corners = pairs_in.corners;
     const int64_t listed = pairs.size(0), lagged = pairs_in.lag ? lag_pairs.size(0) : 0;
-    const Tensor rows = zeros<T>(x, {listed, 48}), lag_rows = zeros<T>(x, {lagged, 48}),
-                 kappa_slots = zeros<T>(x, {listed, 4}), prev = zeros<T>(x, {b, corners, 3}),
-                 lag_slots = zeros<T>(x, {lagged, 4 * contact::kLagScalars});
-    Tensor floor_bar = zeros<T>(x, {b, v, pairs_in.planes, contact::kFloorLag});
+    const Tensor rows = zeros(x, {listed, 48}), lag_rows = zeros(x, {lagged, 48}), kappa_slots = zeros(x, {listed, 4}),
+                 prev = zeros(x, {b, corners, 3}), lag_slots = zeros(x, {lagged, 4 * contact::kLagScalars});
+    Tensor floor_bar = zeros(x, {b, v, pairs_in.planes, contact::kFloorLag});
     const contact::ContactAdjoints<T> slots{data<T>(rows),      data<T>(lag_rows),  data<T>(kappa_slots),
                                             data<T>(lag_slots), data<T>(floor_bar), data<T>(prev)};
     // Without a vertex nothing runs that would write them.
-    Tensor bounds_bar = zeros<T>(x, {b, v, 4}), collider_bar = zeros<T>(x, {b, corners - v, 3}),
-           collider_prev_bar = zeros<T>(x, {b, corners - v, 3}), kappa_bar = zeros<T>(x, {b}),
+    Tensor bounds_bar = zeros(x, {b, v, 4}), collider_bar = zeros(x, {b, corners - v, 3}),
+           collider_prev_bar = zeros(x, {b, corners - v, 3}), kappa_bar = zeros(x, {b}),
            lag_bar = empty(x, {lagged, contact::kLagScalars});
     const cuda::Bars<T> bars(x, in, host, wants);
     cuda::StepAdjoints<T> out = bars.pointers(x_bar);
@@ -141,7 +133,7 @@ contact::ContactInputs<T> lag_inputs(const Tensor& x, const Tensor& origin, cons
                                      const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
                                      const Tensor& entry) {
   contact::ContactInputs<T> in{};
-  const int64_t b = x.size(0), v = x.size(1), colliders = collider.numel() ? collider.size(1) : 0;
+  const int64_t b = x.size(0), v = x.size(1), colliders = collider.dim() == 3 ? collider.size(1) : 0;
   in.num_vertices = static_cast<int32_t>(v);
   in.corners = v + colliders;
   in.collider = batched<T>(collider, x, b, 3 * colliders);

@@ -57,9 +57,10 @@ class Plane:
 
     def corners(self) -> Corners:
         point, normal = float_array("point", self.point, (3,)), float_array("normal", self.normal, (3,))
-        size = np.linalg.norm(normal)
-        if not size > 0:
+        if not np.abs(normal).max() > 0:
             fail("normal", "a vector that is not zero", self.normal)
+        normal /= np.abs(normal).max()
+        size = np.linalg.norm(normal)
         first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
         first /= np.linalg.norm(first)
         second = np.cross(normal / size, first)

@@ -44,7 +44,8 @@ class Status:
 
 
 def status(model: Model) -> Status:
-    """How the latest step of ``model`` went, in a replayed CUDA graph that of the replay. Waits for the device.
+    """How the latest step of ``model`` went, in a replayed CUDA graph that of the replay; a backward with checkpoints
+    runs steps again, and counts. Waits for the device.
 
     Raises:
         ValueError: If the Model has taken no step with contact yet.
@@ -81,18 +82,20 @@ def reserve(model: Model, pairs: int) -> None:
     model.surface_of_contact = replace(surface, capacity=pairs)
     barrier = replace(model.contact, capacity=pairs)
     model._set_energies(tuple(barrier if e is model.contact else e for e in model.energies))
+    for energy in model.parametric_energies:  # here, so that a step that is captured copies nothing from the host
+        model.constants(energy)
 
 
 @contextlib.contextmanager
 def record() -> Iterator[list[Detection]]:
-    """Inside, the detections of all steps are appended to the list that it gives: which pairs were near, for looking at
-    and for comparing with ``diffvbd.reference.contact_step``."""
+    """Inside, the detections of all steps (those that a checkpointed backward runs again, too) are appended to the list
+    that it gives: which pairs were near, for looking at and for comparing with ``diffvbd.reference.contact_step``."""
     found: list[Detection] = []
     recorders.append(found)
     try:
         yield found
     finally:
-        recorders.remove(found)
+        recorders[:] = [record for record in recorders if record is not found]
 
 
 def intersections(model: Model, x: Tensor) -> Tensor:

@@ -43,8 +43,10 @@ class _NearGap(Function):
         count, points = corners.shape[:2]
         scene = torch.arange(count, device=corners.device)[:, None, None] * points
         index = (corners[:, : ctx.vertices, :4].to(torch.int64) + scene).reshape(-1)
-        sums = values.new_zeros((count * points, 3)).index_put_((index,), rows.reshape(-1, 3), accumulate=True)
-        sums = sums.reshape(count, points, 3)
+        # in float64, which torch adds one after another; float32 it adds by atomics on the CPU
+        sums = values.new_zeros((count * points, 3), dtype=torch.float64)
+        sums = sums.index_put_((index,), rows.reshape(-1, 3).double(), accumulate=True)
+        sums = sums.to(values.dtype).reshape(count, points, 3)
         x_bar, colliders = sums[:, : ctx.vertices], sums[:, ctx.vertices :]
         of_plane = plane_points[ctx.vertices :, None]
         needs = ctx.needs_input_grad
@@ -137,7 +139,7 @@ def start_part(x: Tensor, move: Tensor, goal: Tensor, mass: Tensor, was: Tensor,
         origin: [B, V, 3] or empty.  detection: of contact_step.  gamma: Share of a gap.
     """
     none = x.new_empty((0,))
-    floor = none if planes is None else planes.contiguous()
+    floor = none if planes is None else planes
     index = (surface.held, surface.body, surface.body_order, surface.body_ptr, detection.island, detection.lowest)
     gap = _NearGap.apply(x, was, now, detection.near_corners, detection.near_values, surface.plane_points)
     u = _Translation.apply(move, mass.contiguous(), x, floor, origin, index)

@@ -10,9 +10,12 @@ from torch import Tensor
 
 from . import detection as search
 from .contact_start import start_part
-from .contact_sweeps import ContactTensors, Pairs, contact_sweep, no_transforms, pair_lag
+from .contact_surface import LEAST_CAPACITY
+from .contact_sweeps import ContactTensors, Pairs, contact_sweep, no_transforms, of_scene, pair_lag
+from .debug import checking
 from .model import Model
 from .ops import SweepSettings, broadcast
+from .reference.intersections import intersections
 
 if TYPE_CHECKING:
     from .arguments import Prepared
@@ -23,7 +26,7 @@ FREE = 1e15  # [m] radius of a bound that binds nothing
 
 class Detection(NamedTuple):
     """One search: which pairs are listed (``listed.pairs`` [capacity, 6]: four corner points, kind, scene), the nearest
-    pair of each corner point (``near_corners`` [B, N, 5], ``near_values`` [B, N, 8]: weights, normal, gap [m]) and which
+    pair of each corner point (``near_corners`` [B, N, 5], ``near_values`` [B, N, 8]: weights, normal, gap [m]), which
     bodies move together (``island`` [B, bodies]). Index data; the step differentiates the values anew."""
 
     listed: Pairs
@@ -34,11 +37,19 @@ class Detection(NamedTuple):
     island: Tensor
     lowest: Tensor  # of a Model with a floor, else empty
 
+    def trimmed(self) -> Detection:
+        """Without the rows that no pair fills; reads the count."""
+        n, (pairs, constants, ptr, entry) = int(self.counts[0]), self.listed
+        listed = Pairs(pairs[:n].clone(), constants[:n].clone(), ptr, entry[: 4 * n].clone())
+        return self._replace(listed=listed)
+
 
 class Outcome(NamedTuple):
     """What the latest step of a Model has met, on its device; read by diffvbd.contact.status."""
 
-    counts: Tensor  # [R, 4] int64: pairs needed, touching pairs, 0, corner points moved above their bound
+    counts: (
+        Tensor  # [R, 4] int64: pairs needed, touching pairs, key of one or -1, corner points moved above their bound
+    )
     capacity: int  # pairs of all scenes
     cut: list[Tensor]  # [B, V] uint8, of each start and of each part's sweeps
     smallest: Tensor  # [R, B] [m]
@@ -67,7 +78,7 @@ class ContactStep:
         self.tensors = begun.tensors(prepared)
         self.origin = self.tensors.origin
         self.surface, self.barrier = model.surface_of_contact, model.contact
-        self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()]
+        self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()].contiguous()
         floor = model.floor
         oblique = floor is not None and bool(((torch.as_tensor(floor.normal) != 0).sum(-1) > 1).any())
         self.any_direction = oblique or "floor_barrier.normal" in prepared.parameters
@@ -105,10 +116,9 @@ class ContactStep:
             return
         state = pair_lag(self.begun.x_prev, collider, self.kappa, self.origin, listed)
         force, active, rest = state.split((1, 1, 7), -1)
-        scene = listed.pairs[:, 5].clamp(min=0).to(torch.int64)
 
         def of_pair(value: Tensor) -> Tensor:
-            return broadcast(value[:, None], force.shape) if value.shape[0] == 1 else value[scene][:, None]
+            return broadcast(value[:, None], force.shape) if value.shape[0] == 1 else of_scene(value, listed)[:, None]
 
         zero = force.new_zeros((1,))
         coefficient = self._parameter("friction.coefficient", zero)
@@ -125,6 +135,8 @@ class ContactStep:
             bounds = torch.cat([x, torch.full_like(x[..., :1], FREE)], -1)
             none = no_pairs(x, x.shape[0] * x.shape[1])
             return self._sweep(x, bounds, self.colliders, none, settings, policy, debug_step)[0]
+        if checking():
+            self._look_for_intersections()
         x, held = self.x_prev, begun.y - self.x_prev
         move = held
         cut: list[Tensor] = []
@@ -138,7 +150,8 @@ class ContactStep:
             counts.append(torch.cat([detection.counts[:3], self._above(held, was, now, detection)]))
             if not x.is_cuda and not torch.compiler.is_compiling():  # reading is free: before any work
                 self._record(found, counts, cut)
-                self._check(r, counts[-1].tolist(), x.shape[0])
+                self._check(r, counts[-1].tolist())
+                detection = found[-1] = detection.trimmed()
             if r == 0:
                 self._set_lag(detection.listed, was)
             start = start_part(x, move, goal, self.tensors.mass, was, now, self.floor_data, self.origin, detection,
@@ -150,6 +163,22 @@ class ContactStep:
                 x, held_back = self._sweep(x, start.bounds, now, detection.listed, part, policy, debug_step)
                 cut.append(held_back)
         return self._judged(x, found, counts, cut)
+
+    def _look_for_intersections(self) -> None:
+        """Distances do not show that surfaces pass through each other: debug_checks() compares edges with triangles."""
+        surface = self.surface
+        assert surface is not None
+        absolute = self.x_prev if self.origin.numel() == 0 else self.x_prev + self.origin
+        points = torch.cat([absolute, self.before], 1).detach().double()
+        for scene, at in enumerate(points):
+            found = intersections(at, surface.triangles, surface.edges)
+            if len(found):
+                edge, triangle = found[0].tolist()
+                raise ValueError(
+                    f"x: expected surfaces that do not intersect, got {len(found)} edges through triangles, one of the "
+                    f"corner points {surface.edges[edge].tolist()} and {surface.triangles[triangle].tolist()} in scene "
+                    f"{scene}"
+                )
 
     def _colliders_at(self, share: float) -> Tensor:
         if self.colliders is self.before:
@@ -168,9 +197,8 @@ class ContactStep:
         assert surface is not None and barrier is not None
         with torch.no_grad():
             x, was, now = x.detach(), was.detach(), now.detach()
-            capacity = surface.capacity * x.shape[0]
             *index, corners, values, counts, smallest = search.detect(
-                x, self.origin, was, now, surface, barrier, capacity
+                x, self.origin, was, now, surface, barrier, self.capacity
             )
             island = search.islands(
                 x,
@@ -204,11 +232,8 @@ class ContactStep:
             return above.sum().reshape(1)
 
     def _record(self, found: list[Detection], counts: list[Tensor], cut: list[Tensor]) -> None:
-        surface = self.surface
-        assert surface is not None
-        capacity = surface.capacity * self.x_prev.shape[0]
         smallest = torch.stack([d.smallest for d in found])
-        outcomes[self.model] = Outcome(torch.stack(counts), capacity, cut, smallest)
+        outcomes[self.model] = Outcome(torch.stack(counts), self.capacity, cut, smallest)
 
     def _judged(self, x: Tensor, found: list[Detection], counts: list[Tensor], cut: list[Tensor]) -> Tensor:
         """x, or NaN where a captured or compiled step, which cannot raise, must not be trusted."""
@@ -221,18 +246,27 @@ class ContactStep:
             return torch.where(good, x, torch.nan)
         if x.is_cuda:
             for r, row in enumerate(table.tolist()):
-                self._check(r, row, x.shape[0])
+                self._check(r, row)
         return x
 
-    def _check(self, r: int, counts: list[int], scenes: int) -> None:
+    @property
+    def capacity(self) -> int:
+        """Pairs of all scenes that fit."""
+        surface, barrier, scenes = self.surface, self.barrier, self.x_prev.shape[0]
+        assert surface is not None and barrier is not None
+        return max(surface.capacity * scenes, 0 if barrier.capacity is not None else LEAST_CAPACITY)
+
+    def _check(self, r: int, counts: list[int]) -> None:
         """Raises where a detection found more than fits, surfaces that touch, or motion above a bound."""
         surface = self.surface
         assert surface is not None
         needed, touching, pair, above = counts
-        if needed > surface.capacity * scenes:
+        scenes = self.x_prev.shape[0]
+        if needed > self.capacity:
             raise RuntimeError(
-                f"pair_barrier.capacity: {needed} pairs in part {r} of the step do not fit {surface.capacity * scenes} "
-                f"({surface.capacity} per scene): use diffvbd.contact.reserve(model, {2 * -(-needed // scenes)})"
+                f"pair_barrier.capacity: {needed} pairs in part {r} of the step do not fit {self.capacity} "
+                f"({-(-self.capacity // scenes)} per scene): "
+                f"use diffvbd.contact.reserve(model, {2 * -(-needed // scenes)})"
             )
         if touching:
             finite = all(
@@ -240,15 +274,23 @@ class ContactStep:
             )
             if not finite:  # which argument, finds arguments.name_argument
                 raise ValueError("start (x, v, force, gravity, prescribed, colliders): expected finite values")
+            if pair < 0:
+                raise RuntimeError(
+                    f"x: positions became non-finite before part {r} of the step: look with diffvbd.debug_checks(), "
+                    "use a smaller time_step or softer materials"
+                )
             scene, corners = surface.corners_of(pair)
+            vertices = self.x_prev.shape[1]
+            named = "x or colliders" if any(corner >= vertices for corner in corners) else "x"
             raise ValueError(
-                f"x: expected surfaces that do not touch, got {touching} pairs without a gap in part {r} of the step, "
-                f"one of the corner points {corners} in scene {scene}"
+                f"{named}: expected surfaces that do not touch, got {touching} pairs without a gap in part {r} of the "
+                f"step, one of the corner points {corners} in scene {scene}"
             )
         if above:
             raise ValueError(
                 f"prescribed or colliders: expected motion below the bounds of contact, got {above} points moved "
-                f"farther in part {r} of {self.parts}: use a smaller time_step or more detections"
+                f"farther in part {r} of {self.parts}: use a larger reach (now {surface.reach:g} m, which allows "
+                f"{surface.cap:g} m a part), more detections or a smaller time_step"
             )
 
 

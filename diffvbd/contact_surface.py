@@ -15,7 +15,7 @@ from .mesh import TetMesh
 from .pair_barrier import PairBarrier
 
 REACH_PER_EDGE = 0.5  # most pairs of a body at rest are farther apart, so that they cost nothing
-CAPACITY_PER_VERTEX, LEAST_CAPACITY = 8, 4096
+CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class ContactSurface:
     rows: tuple[slice, ...]  # of each collider in collider_points
     reach: float  # [m]
     cap: float  # [m] largest bound
-    capacity: int  # pairs, per scene
+    capacity: int  # pairs, per scene; all scenes together have room for LEAST_CAPACITY at least
 
     @property
     def collider_points(self) -> Tensor:
@@ -109,7 +109,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         rows=tuple(rows),
         reach=reach,
         cap=min(barrier.gamma * reach, (reach - barrier.dhat) / 2),
-        capacity=barrier.capacity or max(LEAST_CAPACITY, CAPACITY_PER_VERTEX * len(points[0])),
+        capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
     )
 
 

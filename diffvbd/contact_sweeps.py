@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, NoReturn
 
+import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from . import ops, ops_contact_sweep
+from . import ops, ops_contact, ops_contact_sweep
 from .sweeps import SweepTensors, backward_memory, distinct, no_second_derivative, of_inputs
 
 
@@ -143,6 +144,30 @@ class _Lag(Function):
         return (*(ops.sum_to(b, t.shape) for b, t in zip(bars, given, strict=True)), None, None)
 
 
+class _OfScene(Function):
+    """A value of each scene [B] for each pair of a list [pairs]."""
+
+    @staticmethod
+    def forward(value: Tensor, listed: Pairs) -> Tensor:
+        return value[listed.pairs[:, 5].clamp(min=0).to(torch.int64)]
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        ctx.scenes, ctx.listed = inputs[0].shape[0], inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        ptr = ctx.listed.ptr  # pairs are sorted by scene, with four entries each
+        first = (ptr[:: (ptr.shape[0] - 1) // ctx.scenes] // 4).contiguous()
+        order = torch.arange(grads[0].shape[0], dtype=torch.int32, device=ptr.device)
+        return ops_contact.segment_sum(grads[0][None, :, None].contiguous(), order, first)[0, :, 0], None
+
+
+def of_scene(value: Tensor, listed: Pairs) -> Tensor:
+    """value [B], one for each scene, for each pair [pairs]; its gradient is summed in a fixed order."""
+    return _OfScene.apply(value, listed)
+
+
 def pair_lag(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed: Pairs) -> Tensor:
     """[pairs, 9]: normal force [N], 1 where closer than dhat, normal (3), weights (4); differentiable in three.
 
@@ -152,4 +177,4 @@ def pair_lag(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed:
     return _Lag.apply(x.contiguous(), collider.contiguous(), kappa.contiguous(), origin, listed)
 
 
-ops.ready_signature(_ContactSweep, _ContactBackward, _Lag)
+ops.ready_signature(_ContactSweep, _ContactBackward, _Lag, _OfScene)

@@ -136,9 +136,9 @@ class Model:
 
     @property
     def collider_points(self) -> Tensor:
-        """Corner points of the colliders [m], shape [Vc, 3]."""
+        """Corner points of the colliders [m], shape [Vc, 3]; a copy."""
         surface = self.surface_of_contact
-        return self.mass.new_zeros((0, 3)) if surface is None else surface.collider_points
+        return self.mass.new_zeros((0, 3)) if surface is None else surface.collider_points.clone()
 
     @property
     def collider_rows(self) -> tuple[slice, ...]:

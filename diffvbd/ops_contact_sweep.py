@@ -61,7 +61,7 @@ def _(x_bar, x, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, col
       constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, friction_eps, tape, plan, sizes, energies,
       data_count, numbers, sweeps, launch, tape_policy, wants):  # fmt: skip
     (b, v), planes = x.shape[:2], floor_lag.numel() // max(1, floor_lag.shape[0] * 4 * x.shape[1])
-    colliders = collider.shape[1] if collider.numel() else 0
+    colliders = collider.shape[1] if collider.dim() == 3 else 0
     shapes = [
         (b, v, 4),
         (b, colliders, 3),
@@ -80,7 +80,7 @@ def _(x, origin, collider, kappa, pairs, constants, ptr, entry):
 
 @torch.library.register_fake("diffvbd::contact_lag_backward")
 def _(bar, x, origin, collider, kappa, pairs, constants, ptr, entry):
-    colliders = collider.shape[1] if collider.numel() else 0
+    colliders = collider.shape[1] if collider.dim() == 3 else 0
     return torch.empty_like(x), x.new_empty((x.shape[0], colliders, 3)), x.new_empty((x.shape[0],))
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from .checks import check_count, check_number, check_positive, fail
 
 CONTACT = 16  # bit of a scene's mask; twin of kContact in csrc/energies/energies.h
+MOST_REACH = 1e6  # [m]; its square must be a number in float32
 GAMMA = 0.45  # share of its smallest gap that a vertex may move between two detections; two sides leave a tenth
 
 
@@ -26,7 +27,8 @@ class PairBarrier:
     closest; edges that become parallel are mollified. From a start without intersections no executed sweep lets two
     surfaces cross, at any speed and any number of sweeps: between two detections a vertex moves by at most ``gamma``
     times its smallest gap, relative to a common translation of the bodies that are near each other. What a bound cuts
-    off is lost as velocity (see :func:`diffvbd.contact.status`).
+    off is lost as velocity (see :func:`diffvbd.contact.status`). Two places of one body that coincide at rest (a crack,
+    doubled vertices) are never a pair: they may pass through each other.
 
     Args:
         kappa: Barrier stiffness [N/m].
@@ -39,7 +41,7 @@ class PairBarrier:
         reach: Distance up to which pairs are searched [m] > dhat; it caps the motion between two detections at
             min(gamma reach, (reach - dhat) / 2). None: the larger of 2 dhat and half the mean edge of the surface.
         gamma: In (0, 0.5).
-        capacity: Pairs that fit, per scene. None: 8 for each vertex of the surface, at least 4096.
+        capacity: Pairs that fit, per scene on average. None: 16 for each vertex of the surface, at least 8192 in all.
 
     Differentiable as ``pair_barrier.kappa`` and ``pair_barrier.damping`` (scalars).
 
@@ -74,6 +76,9 @@ class PairBarrier:
         check_count("detections", self.detections, 1, 1000)
         if self.reach is not None and check_positive("reach", self.reach, "m") <= self.dhat:
             fail("reach", f"more than dhat = {self.dhat:g} m", self.reach)
+        for name, length in (("dhat", self.dhat), ("reach", self.reach or 0.0)):
+            if length > MOST_REACH:
+                fail(name, f"at most {MOST_REACH:g} m", length)
         if check_positive("gamma", self.gamma) >= 0.5:
             fail("gamma", "a number in (0, 0.5): two sides may both move", self.gamma)
         if self.capacity is not None:

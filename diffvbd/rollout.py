@@ -64,6 +64,7 @@ def rollout(
     gravity: Any = GRAVITY,
     prescribed: Any = None,
     colliders: Any = None,
+    colliders_before: Tensor | None = None,
     rest_points: Any = None,
     density: Any = None,
     parameters: dict[str, Any] | None = None,
@@ -79,7 +80,8 @@ def rollout(
         model, x, v, time_step, sweeps, adjoint: As in :func:`diffvbd.step`.
         steps: Number of steps >= 0.
         colliders: Corner points of the Model's colliders [m]: constant, they rest there; in :func:`per_step`, where
-            they are at the end of each step, starting from the Model's collider_points.
+            they are at the end of each step.
+        colliders_before: Where per_step colliders are at the start; None: the Model's collider_points.
         mu, lam, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in time; or wrapped
             in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step. A callable may
             close over tensors and modules that require grad: they get gradients under every schedule. It must be
@@ -105,6 +107,8 @@ def rollout(
                "gravity": gravity, "prescribed": prescribed, "colliders": colliders}  # fmt: skip
     if _changes(colliders) and not isinstance(colliders, PerStep):
         raise TypeError("colliders: expected a tensor or per_step, got a callable: a step needs where they come from")
+    if colliders_before is not None and not isinstance(colliders, PerStep):
+        raise TypeError("colliders_before: expected it beside per_step colliders, which it is the start of")
     if parameters is not None and not isinstance(parameters, dict):
         raise TypeError(f"parameters: expected a dict of tensors by name, got {type(parameters).__name__}")
     named = {f'parameters["{k}"]': value for k, value in (parameters or {}).items()}
@@ -131,7 +135,8 @@ def rollout(
             prepared = prepare(model, lead, **chosen, **now)
         given = {name: _at(options[name], k, x, v) for name in ("force", "gravity", "prescribed", "colliders")}
         if isinstance(options["colliders"], _Steps):
-            given["colliders_before"] = options["colliders"][k - 1] if k else model.collider_points
+            first = model.collider_points if colliders_before is None else colliders_before
+            given["colliders_before"] = options["colliders"][k - 1] if k else first
         return advance(model, x, v, prepared, adjoint=adjoint, index=k, **given)
 
     scenes = x.numel() // max(1, 3 * model.num_vertices)

@@ -183,11 +183,11 @@ def test_parts_move_what_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
         assert torch.equal(rest[0], x.mT)
         return sweeps(scene, energies, masses, y, state, *rest)
 
-    def look(self: Any, scene: Any, part: Any, state: Tensor, wanted: Tensor, colliders: Tensor) -> None:
+    def look(self: Any, scene: Any, part: Any, state: Tensor, wanted: Tensor, colliders: Tensor, floor: Any) -> None:
         before, now = (begin + n / 3 * (end - begin) for n in (len(seen), len(seen) + 1))
         seen.append(part)
         assert torch.equal(colliders[:, :3], before[:, :3]) and torch.equal(colliders[:, 3:], now[:, 3:])
-        bounds(self, scene, part, state, wanted, colliders)
+        bounds(self, scene, part, state, wanted, colliders, floor)
 
     monkeypatch.setattr(contact, "run_sweeps", run_sweeps)
     monkeypatch.setattr(contact.Bounds, "__init__", look)

@@ -123,9 +123,10 @@ struct FrictionRate {
 template <class T>
 DIFFVBD_FN void add_lagged(const Lag<T>& a, int i, const Vec3<T>& m, T h, T eps, Vec3<T>& g, Sym3<T>& H) {
   const T w = a.w[i], along = dot(a.n, m);
-  if (along < T(0)) {
+  if (a.damping != T(0)) {
+    // the block damps both directions, the force approach alone: what rests must not depend on the sign of a rounding
     const T c = h * a.damping * w;
-    g += (c * along) * a.n;
+    if (along < T(0)) g += (c * along) * a.n;
     add_outer(H, c * w, a.n);
   }
   if (a.friction != T(0)) {
@@ -149,13 +150,14 @@ DIFFVBD_FN Vec3<T> reverse_lagged(const Lag<T>& a, int i, const Vec3<T>& m, T h,
   bar.friction = bar.damping = T(0);
   bar.n = zero3<T>();
   for (int k = 0; k < 4; ++k) bar.w[k] = T(0);
+  const T c = h * a.damping, approach = along < T(0) ? along : T(0);
+  bar.n -= (c * w * w) * crossed;
   if (along < T(0)) {
-    const T c = h * a.damping;
     m_bar -= (c * w * n_p) * a.n;
-    bar.n -= (c * w) * (n_p * m + along * p + w * crossed);
-    bar.w[i] = bar.w[i] - c * (along * n_p + T(2) * w * n_p * n_d);
-    bar.damping = -h * w * (along * n_p + w * n_p * n_d);
+    bar.n -= (c * w) * (n_p * m + along * p);
   }
+  bar.w[i] = bar.w[i] - c * (approach * n_p + T(2) * w * n_p * n_d);
+  bar.damping = -h * w * (approach * n_p + w * n_p * n_d);
   const Vec3<T> u = m - along * a.n, p_t = p - n_p * a.n;
   const FrictionRate<T> f(square_root(dot(u, u)), eps);
   const T size = h * h * a.friction * w, slid = dot(u, p), pushed = dot(p_t, d_raw), both = slid + w * pushed;

@@ -4,6 +4,7 @@
 #pragma once
 
 #include "../core/views.h"
+#include "candidates.h"
 #include "pairs.h"
 
 namespace diffvbd::contact {
@@ -14,7 +15,7 @@ struct PairList {
   const int32_t* ptr = nullptr;    // [scenes corners + 1]
   const int32_t* entry = nullptr;  // [4 pairs]  4 pair + corner, for each corner point in ascending order
 };
-constexpr int kPairIntegers = 6, kPairConstants = 3, kFloorLag = 4;
+constexpr int kFloorLag = 4;
 
 template <class T>
 struct ContactInputs {
@@ -97,8 +98,8 @@ DIFFVBD_FN void add_pairs(const Source<T, Positions>& s, int v, int first, int s
   const T kappa = in.kappa.data[s.scene * in.kappa.scene];
   for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
     const int entry = in.listed.entry[e], pair = entry >> 2;
-    const int32_t* record = in.listed.pairs + int64_t{kPairIntegers} * pair;
-    const PairConstants<T> constants(in.constants + int64_t{kPairConstants} * pair);
+    const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
+    const PairConstants<T> constants(in.constants + int64_t{kConstants} * pair);
     add_barrier(record[4], s.corners(record), entry & 3, constants, kappa, h * h, g, H);
   }
   if (in.lag) {
@@ -106,7 +107,7 @@ DIFFVBD_FN void add_pairs(const Source<T, Positions>& s, int v, int first, int s
       const int entry = in.lagged.entry[e], pair = entry >> 2;
       const Lag<T> lag(in.lag + int64_t{kLagScalars} * pair);
       if (!lag.active()) continue;
-      const int32_t* record = in.lagged.pairs + int64_t{kPairIntegers} * pair;
+      const int32_t* record = in.lagged.pairs + int64_t{kPairRow} * pair;
       add_lagged(lag, entry & 3, s.motion(record, lag), h, in.friction_eps, g, H);
     }
   }
@@ -136,8 +137,8 @@ DIFFVBD_FN void reverse_pairs(const Source<T, Positions>& s, const ContactAdjoin
   const T kappa = in.kappa.data[s.scene * in.kappa.scene];
   for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
     const int64_t entry = in.listed.entry[e], pair = entry >> 2;
-    const int32_t* record = in.listed.pairs + kPairIntegers * pair;
-    const PairConstants<T> constants(in.constants + kPairConstants * pair);
+    const int32_t* record = in.listed.pairs + kPairRow * pair;
+    const PairConstants<T> constants(in.constants + kConstants * pair);
     PairAdjoint<T> bar;
     if (!reverse_barrier(record[4], s.corners(record), static_cast<int>(entry & 3), constants, kappa, h * h, p, d_raw,
                          bar)) {
@@ -150,7 +151,7 @@ DIFFVBD_FN void reverse_pairs(const Source<T, Positions>& s, const ContactAdjoin
     for (int e = in.lagged.ptr[row] + first; e < in.lagged.ptr[row + 1]; e += stride) {
       const int64_t entry = in.lagged.entry[e], pair = entry >> 2;
       const Lag<T> lag(in.lag + kLagScalars * pair);
-      const int32_t* record = in.lagged.pairs + kPairIntegers * pair;
+      const int32_t* record = in.lagged.pairs + kPairRow * pair;
       const Vec3<T> m = s.motion(record, lag);
       Lag<T> bar;
       const Vec3<T> m_bar = reverse_lagged(lag, static_cast<int>(entry & 3), m, h, in.friction_eps, p, d_raw, bar);

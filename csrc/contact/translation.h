@@ -87,7 +87,7 @@ struct Room {
 // u held above the planes; `before` receives u before each plane. Where planes at an angle leave no way, u is 0: false.
 template <class T>
 DIFFVBD_FN bool hold_above(const TranslationInputs<T>& in, int64_t scene, int32_t body, Vec3<T>& u, Vec3<T>* before) {
-  const T eps = std::numeric_limits<T>::epsilon();
+  const T slack = T(8) * std::numeric_limits<T>::epsilon() * square_root(dot(u, u));
   const int32_t planes = in.floor.num_planes;
   for (int32_t k = 0; k < planes; ++k) {
     const Room<T> room(in, scene, body, k);
@@ -97,7 +97,7 @@ DIFFVBD_FN bool hold_above(const TranslationInputs<T>& in, int64_t scene, int32_
   }
   for (int32_t k = 0; k < planes; ++k) {
     const Room<T> room(in, scene, body, k);
-    if (room.value * (T(1) + T(1e-6)) + eps < -dot(room.n, u)) {
+    if (room.value * (T(1) + T(1e-6)) + slack < -dot(room.n, u)) {
       u = zero3<T>();
       return false;
     }

@@ -1,6 +1,7 @@
 // CPU implementations of the operators of the start of a part.
 #include <torch/csrc/stable/library.h>
 
+#include <algorithm>
 #include <tuple>
 #include <vector>
 
@@ -47,8 +48,13 @@ Tensor contact_translation(const Tensor& move, const Tensor& mass, const Tensor&
     Tensor out = empty(x, {in.scenes, in.bodies, 3});
     const diffvbd::Buffer<T> sums = body_sums(in);
     for (int64_t row = 0; row < in.scenes * in.bodies; ++row) {
-      const auto u = contact::translation_of(in, sums.get(), row / in.bodies, static_cast<int32_t>(row % in.bodies));
+      const int64_t scene = row / in.bodies, body = row % in.bodies, first = in.island[row];
       T* to = data<T>(out) + 3 * row;
+      if (first >= 0 && first < body) {  // that of its island's first body
+        std::copy_n(data<T>(out) + 3 * (scene * in.bodies + first), 3, to);
+        continue;
+      }
+      const auto u = contact::translation_of(in, sums.get(), scene, static_cast<int32_t>(body));
       to[0] = u.x, to[1] = u.y, to[2] = u.z;
     }
     return out;

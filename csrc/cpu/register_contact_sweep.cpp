@@ -79,7 +79,7 @@ FourteenTensors contact_sweep_backward(const Tensor& x_bar, const Tensor& x, con
                                       lag_slots.get(), data<T>(floor_bar), prev.get()};
     Tensor bounds_bar = empty(x, {b, v, 4}), collider_bar = zeros(x, {b, corners - v, 3}),
            collider_prev_bar = zeros(x, {b, corners - v, 3}), kappa_bar = zeros(x, {b}),
-           lag_bar = zeros(x, {lag_pairs.numel() / contact::kPairIntegers, contact::kLagScalars});
+           lag_bar = zeros(x, {lag_pairs.numel() / contact::kPairRow, contact::kLagScalars});
     const Bars bars(x, plan, data_count, wants);
     diffvbd::StepAdjoints<T> out = bars.pointers<T>();
     out.contact = &slots;
@@ -88,7 +88,7 @@ FourteenTensors contact_sweep_backward(const Tensor& x_bar, const Tensor& x, con
     diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), out);
 
     for (int64_t entry = 0; entry < 4 * listed; ++entry) {
-      data<T>(kappa_bar)[pairs_in.listed.pairs[contact::kPairIntegers * (entry / 4) + 5]] += kappa_slots.get()[entry];
+      data<T>(kappa_bar)[pairs_in.listed.pairs[contact::kPairRow * (entry / 4) + 5]] += kappa_slots.get()[entry];
     }
     for (int64_t i = 0; i < 4 * lagged * contact::kLagScalars; ++i) {
       const int64_t entry = i / contact::kLagScalars, scalar = i % contact::kLagScalars;
@@ -115,7 +115,7 @@ struct UserPositions {
 template <class T>
 contact::ContactInputs<T> lag_inputs(const Tensor& x, const Tensor& origin, const Tensor& collider) {
   contact::ContactInputs<T> in{};
-  const int64_t b = x.size(0), v = x.size(1), colliders = collider.numel() ? collider.size(1) : 0;
+  const int64_t b = x.size(0), v = x.size(1), colliders = collider.dim() == 3 ? collider.size(1) : 0;
   in.num_vertices = static_cast<int32_t>(v);
   in.corners = v + colliders;
   in.collider = diffvbd::batched<T>(collider, x, b, 3 * colliders);
@@ -130,10 +130,10 @@ void each_pair(const Tensor& x, const Tensor& origin, const Tensor& collider, co
   const auto in = lag_inputs<T>(x, origin, collider);
   const auto stiffness = diffvbd::batched<T>(kappa, x, x.size(0), 1);
   for (int64_t pair = 0; pair < count; ++pair) {
-    const int32_t* record = data<const int32_t>(pairs) + contact::kPairIntegers * pair;
+    const int32_t* record = data<const int32_t>(pairs) + contact::kPairRow * pair;
     const UserPositions<T> positions{data<const T>(x) + int64_t{record[5]} * 3 * in.num_vertices};
     const contact::Source<T, UserPositions<T>> source{in, record[5], positions};
-    const contact::PairConstants<T> a(data<const T>(constants) + contact::kPairConstants * pair);
+    const contact::PairConstants<T> a(data<const T>(constants) + contact::kConstants * pair);
     f(pair, record, source.corners(record), a, stiffness.data[record[5] * stiffness.scene]);
   }
 }
@@ -159,7 +159,7 @@ std::tuple<Tensor, Tensor, Tensor> contact_lag_backward(const Tensor& bar, const
                                                         const Tensor& /*entry*/) {
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const int64_t b = x.size(0), v = x.size(1), colliders = collider.numel() ? collider.size(1) : 0;
+    const int64_t b = x.size(0), v = x.size(1), colliders = collider.dim() == 3 ? collider.size(1) : 0;
     Tensor x_bar = zeros(x, {b, v, 3}), collider_bar = zeros(x, {b, colliders, 3}), kappa_bar = zeros(x, {b});
     const int64_t count = data<const int32_t>(ptr)[ptr.numel() - 1] / 4;
     each_pair<T>(x, origin, collider, kappa, pairs, constants, count,
@@ -198,7 +198,10 @@ Tensor contact_lowest(const Tensor& x, const Tensor& origin, const Tensor& plane
       own[i] = contact::lowest_of_body(in, b, body, plane, 0, 1).vertex;
     });
     each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
-      data<int32_t>(out)[i] = contact::lowest_of_island(in, own.data(), b, body, plane);
+      const int32_t first = in.island[b * in.bodies + body];
+      int32_t* to = data<int32_t>(out);
+      to[i] = first >= 0 && first < body ? to[i - int64_t{body - first} * in.num_planes]  // that of its first body
+                                         : contact::lowest_of_island(in, own.data(), b, body, plane);
     });
     return out;
   });

@@ -179,23 +179,23 @@ __global__ void store_contact(const __grid_constant__ StepView<T> s, const __gri
   for (int k = 0; k < 4; ++k) out.bounds[4 * (scene * in.num_vertices + corner) + k] = bar[k];
 }
 
-// kappa of each scene: one block, in an order fixed by the number of pairs
+// One scalar of the slots of each scene's pairs, one block a scene, in an order fixed by the number of pairs.
 template <class T>
-__global__ void sum_kappa(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
-                          const T* slots, T* kappa_bar) {
+__global__ void sum_by_scene(const __grid_constant__ ContactInputs<T> in, int64_t base, const T* slots, int stride,
+                             T* out) {
   __shared__ T part[kContactThreads];
-  const int64_t scene = s.base + blockIdx.x;
+  const int64_t scene = base + blockIdx.x;
   T sum = T(0);
   for (int64_t i = in.listed.ptr[scene * in.corners] + static_cast<int64_t>(threadIdx.x);
        i < in.listed.ptr[(scene + 1) * in.corners]; i += kContactThreads) {
-    sum += slots[i];
+    sum += slots[i * stride];
   }
   part[threadIdx.x] = sum;
   for (int half = kContactThreads / 2; half > 0; half /= 2) {
     __syncthreads();
     if (threadIdx.x < half) part[threadIdx.x] += part[threadIdx.x + half];
   }
-  if (threadIdx.x == 0) kappa_bar[scene] = part[0];
+  if (threadIdx.x == 0) out[scene] = part[0];
 }
 
 template <class T>
@@ -216,8 +216,8 @@ struct LagPair {
   T kappa;
   contact::Corners<T> corners;
   __device__ __forceinline__ LagPair(const ContactInputs<T>& in, const T* x, int64_t pair)
-      : record(in.listed.pairs + contact::kPairIntegers * pair),
-        constants(in.constants + contact::kPairConstants * pair),
+      : record(in.listed.pairs + contact::kPairRow * pair),
+        constants(in.constants + contact::kConstants * pair),
         kappa(in.kappa.data[record[5] * in.kappa.scene]) {
     const UserRows<T> rows{x + static_cast<int64_t>(record[5]) * 3 * in.num_vertices};
     corners = contact::Source<T, UserRows<T>>{in, record[5], rows}.corners(record);
@@ -268,23 +268,6 @@ __global__ void lag_collect(const __grid_constant__ ContactInputs<T> in, int64_t
   to[0] = sum.x, to[1] = sum.y, to[2] = sum.z;
 }
 
-template <class T>
-__global__ void lag_kappa(const __grid_constant__ ContactInputs<T> in, const T* slots, T* kappa_bar) {
-  __shared__ T part[kContactThreads];
-  const int64_t scene = blockIdx.x;
-  T sum = T(0);
-  for (int64_t i = in.listed.ptr[scene * in.corners] + static_cast<int64_t>(threadIdx.x);
-       i < in.listed.ptr[(scene + 1) * in.corners]; i += kContactThreads) {
-    sum += slots[4 * i + 3];
-  }
-  part[threadIdx.x] = sum;
-  for (int half = kContactThreads / 2; half > 0; half /= 2) {
-    __syncthreads();
-    if (threadIdx.x < half) part[threadIdx.x] += part[threadIdx.x + half];
-  }
-  if (threadIdx.x == 0) kappa_bar[scene] = part[0];
-}
-
 template <class... P, class... A>
 cudaError_t launch_contact(void (*kernel)(P...), int64_t items, cudaStream_t stream, A... arguments) {
   if (items == 0) return cudaSuccess;
@@ -323,7 +306,7 @@ template <class T>
 cudaError_t ContactPasses<T>::store() const {
   const T *prev = out->contact->prev, *slots = out->contact->kappa;
   if (auto error = launch_contact(store_contact<T>, s.scenes * in.corners, stream, s, in, *out, prev)) return error;
-  return launch_contact(sum_kappa<T>, s.scenes * kContactThreads, stream, s, in, slots, out->kappa);
+  return launch_contact(sum_by_scene<T>, s.scenes * kContactThreads, stream, in, s.base, slots, 1, out->kappa);
 }
 
 template <class T>
@@ -346,7 +329,7 @@ cudaError_t pair_lag_backward(const ContactInputs<T>& in, const T* x, int64_t sc
   const T* from = slots;
   if (auto error = launch_contact(lag_collect<T>, scenes * in.corners, stream, in, scenes, from, x_bar, collider_bar))
     return error;
-  return launch_contact(lag_kappa<T>, scenes * kContactThreads, stream, in, from, kappa_bar);
+  return launch_contact(sum_by_scene<T>, scenes * kContactThreads, stream, in, int64_t{0}, from + 3, 4, kappa_bar);
 }
 
 }  // namespace diffvbd::cuda

@@ -12,7 +12,7 @@ namespace diffvbd::cuda {
 template <class T>
 cudaError_t translation(const contact::TranslationInputs<T>& in, T* sums, T* u, cudaStream_t stream);
 
-// `zeroed` [B bodies (3 + 3 + planes)]: rate, mean, adjoints of the planes by island. x_bar is zero at first.
+// `zeroed` [B bodies (3 + 3 + 7 planes)]: rate, mean, adjoints of the planes by island. x_bar is zero at first.
 template <class T>
 cudaError_t translation_backward(const contact::TranslationInputs<T>& in, const T* u_bar, T* sums, T* zeroed,
                                  T* move_bar, T* mass_bar, T* x_bar, T* planes_bar, cudaStream_t stream);

@@ -149,7 +149,7 @@ class LaggedPairForces:
         along, slip, weights = self._travel(x, pair)
         own = self.slope[pair, local].T
         rate = self.h * self.damping[pair]
-        columns = torch.cat((rate * along * own, torch.where(along < 0, rate, 0.0) * outer6(own)))
+        columns = torch.cat((rate * along * own, torch.where(self.near[pair], rate, 0.0) * outer6(own)))
         if self.largest is not None:
             weight = weights[entry, local]
             size = self.h**2 * self.largest[pair] * smoothed(slip, self.reach)[1]
@@ -173,7 +173,7 @@ class Bounds:
     """
 
     def __init__(
-        self, scene: Scene, part: Part, x: Tensor, wanted: Tensor, colliders: Tensor, floor: FloorBarrier | None
+        self, scene: Scene, part: Part, x: Tensor, wanted: Tensor, colliders: Tensor, floor: FloorBarrier | None = None
     ) -> None:
         points = corner_points(x, colliders)
         x_rows = points[:, : x.shape[-1]]
@@ -221,11 +221,12 @@ class Bounds:
         gap = floor.gap(x)  # [..., planes, V]
         room = (gap.gather(-1, lowest.transpose(-1, -2)) - floor.dhat).clamp(min=0)
         normal = floor.normal.expand(*lead, *floor.normal.shape[-3:]).expand(*lead, -1, 3, count)
+        slack = 8 * torch.finfo(x.dtype).eps * dot(u, u).detach().sqrt().unsqueeze(-2)
         for plane in range(room.shape[-2]):
             n = normal[..., plane, :, :]
             u = u + (-dot(n, u) - room[..., plane, :]).clamp(min=0).unsqueeze(-2) * n
         down = -dot(normal, u.unsqueeze(-3))
-        safe = (down <= room * (1 + 1e-6) + torch.finfo(x.dtype).eps).all(-2)
+        safe = (down <= room * (1 + 1e-6) + slack).all(-2)
         return torch.where(safe.unsqueeze(-2), u, 0.0)
 
     def cut(self, x: Tensor, step: Tensor, vertices: Tensor) -> Tensor:

@@ -262,7 +262,12 @@ class _Run:
         errors = {name: abs(estimates[name] / true - 1) for name, true in problem.truth.items()}
         best = self.history[self.best]
         log = self.write_log(
-            converged=self.converged, best=best, estimates=estimates, truth=problem.truth, relative_error=errors
+            converged=self.converged,
+            best=best,
+            parameters={name: p.tolist() for name, p in problem.parameters.items()},
+            estimates=estimates,
+            truth=problem.truth,
+            relative_error=errors,
         )
         result = Result(best, self.history, estimates, errors, self.converged, [log])
         if problem.picture:
