@@ -169,9 +169,12 @@ class ContactStep:
         surface = self.surface
         assert surface is not None
         absolute = self.x_prev if self.origin.numel() == 0 else self.x_prev + self.origin
-        points = torch.cat([absolute, self.before], 1).detach().double()
+        points = torch.cat([absolute, self.before], 1).detach().double().cpu()
+        triangles, edges = surface.triangles.cpu(), surface.edges.cpu()
         for scene, at in enumerate(points):
-            found = intersections(at, surface.triangles, surface.edges)
+            if not bool(torch.isfinite(at).all()):
+                continue  # named elsewhere
+            found = intersections(at, triangles, edges)
             if len(found):
                 edge, triangle = found[0].tolist()
                 raise ValueError(

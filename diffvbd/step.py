@@ -216,8 +216,6 @@ def swept(
     policy = _tape_policy(model, (*tensors, *more), settings, adjoint)
     debug_step = index if checking() else -1
     try:
-        if colliders is not None and checking() and begun.y.is_cuda:
-            raise NotImplementedError("debug_checks: not for contact on CUDA; run the step on the CPU")
         if colliders is not None:
             with out_of_memory_named(model, begun.x_start, settings, policy):
                 moves = given.get("prescribed") is not None
