@@ -11,7 +11,7 @@ import torch
 
 import diffvbd as dv
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
-from diffvbd.tasks.runner import versions
+from diffvbd.tasks.progress import versions
 from diffvbd.tasks.scene import Array, Observation, Scene
 
 DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Units: m, kg, s, Pa; y points up."
@@ -63,8 +63,9 @@ def _parser() -> argparse.ArgumentParser:
     run.formatter_class = raw
     run.add_argument("name", choices=sorted(TASKS), metavar="NAME", help="a task that `diffvbd list` names")
     run.add_argument("--quick", action="store_true", help="a small version that takes seconds")
-    run.add_argument("--radius", type=float, help="radius of the disks of cover-the-spot [m] (default 0.42)")
     _add_run_options(run, "runs/NAME")
+    for name, (kind, texts) in sorted(_task_options().items()):
+        run.add_argument(f"--{name}", type=kind, help="; ".join(texts))
     run.set_defaults(command=_run)
 
     listing = commands.add_parser("list", help="list the shipped inverse problems")
@@ -143,9 +144,11 @@ def _run(options: argparse.Namespace) -> None:
     out = options.out or Path("runs") / options.name
     settings = Settings(out, options.device, options.seed, options.quick)
     task = TASKS[options.name]
-    given = {} if options.radius is None else {"radius": options.radius}
-    if not given.keys() <= set(task.numbers):
-        raise ValueError(f"--radius: {options.name} has none")
+    chosen = {name: getattr(options, name.replace("-", "_")) for name in _task_options()}
+    given = {name: value for name, value in chosen.items() if value is not None}
+    if unknown := sorted(given.keys() - task.options.keys()):
+        raise ValueError(f"--{unknown[0]}: {options.name} has no such option")
+    given = {name.replace("-", "_"): value for name, value in given.items()}
     _solve(task.build(settings, **given), settings)
 
 
@@ -215,6 +218,15 @@ def _info(options: argparse.Namespace) -> None:
     rows["package"] = str(package)
     for name, value in rows.items():
         print(f"{name:10} {value}")
+
+
+def _task_options() -> dict[str, tuple[Any, list[str]]]:
+    """Options of single tasks: type, and what each says about it."""
+    found: dict[str, tuple[Any, list[str]]] = {}
+    for task_name, task in sorted(TASKS.items()):
+        for name, option in task.options.items():
+            found.setdefault(name, (option.kind, []))[1].append(f"{task_name}: {option.help}")
+    return found
 
 
 def _task_list() -> str:

@@ -3,9 +3,9 @@
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
+from task_checks import check_fall, check_gradient
 
 import diffvbd as dv
 from diffvbd.cli import main
@@ -16,34 +16,15 @@ DISK = dv.mesh.disk(0.42, 0.06, 6)
 
 
 def test_quick_run_covers_more(tmp_path: Path) -> None:
-    settings = Settings(tmp_path, quick=True)
-    problem = cover_the_spot.problem(settings)
-    problem.iterations, problem.picture = 12, None
-    start = problem.estimates()["uncovered"]
-    assert start > 0.2
-    result = solve(problem, settings)
-    assert result.best["loss"] < 0.7 * result.history[0]["loss"]
-    assert result.estimates["uncovered"] < 0.7 * start
+    result = check_fall("cover-the-spot", tmp_path, factor=0.7, iterations=12)
+    assert result.history[0]["uncovered"] > 0.2
+    assert result.estimates["uncovered"] < 0.7 * result.history[0]["uncovered"]
     assert result.estimates["uncovered"] == min(row["uncovered"] for row in result.history)
-    assert problem.estimates() == result.estimates
 
 
 def test_gradient_matches_central_differences(tmp_path: Path) -> None:
-    problem = cover_the_spot.problem(Settings(tmp_path, quick=True))
-    problem.loss().backward()
-    rng = np.random.default_rng(0)
-    for parameter in problem.parameters.values():
-        direction = torch.from_numpy(rng.normal(size=(3, 3)))
-        values = []
-        for sign in (1, -1):
-            with torch.no_grad():
-                parameter += sign * 1e-6 * direction
-                values.append(problem.loss().item())
-                parameter -= sign * 1e-6 * direction
-        expected = (values[0] - values[1]) / 2e-6
-        assert abs(expected) > 1e-3
-        # bounds, saturation and the nearest line of an outline have kinks; differences step over some
-        assert (parameter.grad * direction).sum().item() == pytest.approx(expected, rel=1e-4)
+    # bounds, saturation and the nearest line of an outline have kinks; differences step over some
+    check_gradient("cover-the-spot", tmp_path, step=1e-6, rel=1e-4)
 
 
 def test_radius_decides_whether_there_is_a_solution(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -54,7 +35,7 @@ def test_radius_decides_whether_there_is_a_solution(tmp_path: Path, capsys: pyte
     assert main(["run", "cover-the-spot", "--radius", "0.38", "--out", str(tmp_path)]) == 2
     assert "got 0.38" in capsys.readouterr().err
     assert main(["run", "beam-mu", "--radius", "0.4", "--out", str(tmp_path)]) == 2
-    assert "--radius: beam-mu has none" in capsys.readouterr().err
+    assert "--radius: beam-mu has no such option" in capsys.readouterr().err
 
 
 def test_uncovered_share_is_an_area() -> None:
@@ -97,7 +78,8 @@ def test_captured_run_has_the_numbers_of_an_eager_one(tmp_path: Path) -> None:
     for capturable in (True, False):
         settings = Settings(tmp_path / str(capturable), device="cuda", quick=True)
         problem = cover_the_spot.problem(settings)
-        problem.iterations, problem.picture, problem.capturable = 5, None, capturable
+        (stage,), problem.picture = problem.stages, None
+        stage.iterations, stage.capturable = 5, capturable
         history = solve(problem, settings).history
         histories.append([{key: value for key, value in row.items() if key != "seconds"} for row in history])
     assert histories[0] == histories[1]

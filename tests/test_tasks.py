@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from task_checks import check_gradient
 
 from diffvbd import losses
 from diffvbd.tasks import TASKS, Settings, beam_mu, solve, table
@@ -31,22 +32,8 @@ def test_quick_run_recovers_the_material(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", MATERIAL)
 def test_gradient_at_the_start_matches_central_differences(name: str, tmp_path: Path) -> None:
-    problem, _ = quick(name, tmp_path)
-    problem.loss().backward()
     # Truncation falls with the square of the step, rounding grows with its inverse: about 1e-9 at 1e-5.
-    step = 1e-5
-    for parameter in problem.parameters.values():
-        flat = parameter.detach().view(-1)
-        gradient = parameter.grad.view(-1)
-        for k in range(len(flat)):
-            values = []
-            for sign in (1, -1):
-                flat[k] += sign * step
-                values.append(problem.loss().item())
-                flat[k] -= sign * step
-            difference = (values[0] - values[1]) / (2 * step)
-            assert gradient[k].item() != 0.0
-            assert gradient[k].item() == pytest.approx(difference, rel=1e-6)
+    check_gradient(name, tmp_path, step=1e-5, rel=1e-6)
 
 
 def test_log_and_picture_are_written(tmp_path: Path) -> None:
@@ -74,7 +61,7 @@ def test_an_interrupted_run_continues_with_the_same_numbers(tmp_path: Path) -> N
 
     problem, settings = quick("beam-mu", tmp_path / "parts")
     problem.picture = None
-    loss, evaluations = problem.loss, 0
+    loss, evaluations = problem.stages[0].loss, 0
 
     def failing() -> torch.Tensor:
         nonlocal evaluations
@@ -83,7 +70,7 @@ def test_an_interrupted_run_continues_with_the_same_numbers(tmp_path: Path) -> N
             raise Interrupted
         return loss()
 
-    problem.loss = failing
+    problem.stages[0].loss = failing
     with pytest.raises(Interrupted):
         solve(problem, settings)
     problem, settings = quick("beam-mu", tmp_path / "parts")
@@ -98,13 +85,13 @@ def test_an_interrupted_run_continues_with_the_same_numbers(tmp_path: Path) -> N
 
 def test_a_state_of_other_settings_is_not_continued(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     problem, settings = quick("beam-mu", tmp_path)
-    loss, problem.picture = problem.loss, None
+    loss, problem.picture = problem.stages[0].loss, None
     evaluations = iter(range(3))
-    problem.loss = lambda: (next(evaluations), loss())[1]
+    problem.stages[0].loss = lambda: (next(evaluations), loss())[1]
     with pytest.raises(StopIteration):
         solve(problem, settings)
     problem, _ = quick("beam-mu", tmp_path)
-    problem.iterations, problem.picture = 2, None
+    problem.stages[0].iterations, problem.picture = 2, None
     assert len(solve(problem, Settings(tmp_path, seed=1, quick=True)).history) == 2
     assert "starting anew" in capsys.readouterr().err
 
@@ -112,7 +99,7 @@ def test_a_state_of_other_settings_is_not_continued(tmp_path: Path, capsys: pyte
 def test_a_loss_that_is_not_finite_is_reported(tmp_path: Path) -> None:
     problem, settings = quick("beam-mu", tmp_path)
     (parameter,) = problem.parameters.values()
-    problem.loss = lambda: parameter * float("nan")
+    problem.stages[0].loss = lambda: parameter * float("nan")
     with pytest.raises(ArithmeticError, match="beam-mu: the loss or its gradient is not finite"):
         solve(problem, settings)
 

@@ -18,7 +18,8 @@ import torch
 
 import diffvbd as dv
 from diffvbd import losses, viz
-from diffvbd.tasks.runner import Problem, Row, Settings
+from diffvbd.tasks.progress import Row
+from diffvbd.tasks.runner import Problem, Settings, Stage
 
 TRUE_MU = 1.0e6  # [Pa]
 START_MU = 1.0e5
@@ -60,12 +61,16 @@ def problem(settings: Settings) -> Problem:
     return Problem(
         name="beam-mu",
         parameters={"log_mu": log_mu},
-        loss=lambda: losses.vertex_distance(simulate(log_mu.exp()), target),
+        stages=[
+            Stage(
+                loss=lambda: losses.vertex_distance(simulate(log_mu.exp()), target),
+                iterations=iterations,
+                learning_rate=0.2,
+                tolerance=1e-9,
+            )
+        ],
         estimates=lambda: {"mu": log_mu.exp().item()},
         truth={"mu": TRUE_MU},
-        iterations=iterations,
-        learning_rate=0.2,
-        tolerance=1e-9,
         protocol={
             "vertices": vertices,
             "steps": steps,

@@ -20,7 +20,8 @@ import torch
 
 import diffvbd as dv
 from diffvbd import losses, viz
-from diffvbd.tasks.runner import Problem, Row, Settings
+from diffvbd.tasks.progress import Row
+from diffvbd.tasks.runner import Problem, Settings, Stage
 
 TRUTH = {"mu": 800.0, "lam": 400.0}  # [Pa]
 START = (300.0, 150.0)
@@ -62,12 +63,16 @@ def problem(settings: Settings) -> Problem:
     return Problem(
         name="beam-mu-lam",
         parameters={"log_material": log_material},
-        loss=lambda: losses.vertex_distance(simulate(*log_material.exp()), target),
+        stages=[
+            Stage(
+                loss=lambda: losses.vertex_distance(simulate(*log_material.exp()), target),
+                iterations=iterations,
+                learning_rate=0.15,
+                tolerance=1e-10,
+            )
+        ],
         estimates=lambda: dict(zip(("mu", "lam"), log_material.exp().tolist(), strict=True)),
         truth=TRUTH,
-        iterations=iterations,
-        learning_rate=0.15,
-        tolerance=1e-10,
         protocol={
             "vertices": vertices,
             "steps": steps,

@@ -25,7 +25,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import viz
-from diffvbd.tasks.runner import Problem, Row, Settings
+from diffvbd.tasks.progress import Row
+from diffvbd.tasks.runner import Problem, Settings, Stage
 
 TARGET_RADIUS = 0.45  # R [m]
 RADIUS = 0.42  # r [m]
@@ -122,10 +123,17 @@ def problem(settings: Settings, radius: float = RADIUS) -> Problem:
     return Problem(
         name="cover-the-spot",
         parameters={"velocity": velocity, "offset": offset},
-        loss=loss,
+        stages=[
+            Stage(
+                loss=loss,
+                iterations=iterations,
+                learning_rate=0.03,
+                before=anneal,
+                criterion="uncovered",
+                capturable=True,
+            )
+        ],
         estimates=estimates,
-        iterations=iterations,
-        learning_rate=0.03,
         protocol={
             "radius": radius,
             "target_radius": TARGET_RADIUS,
@@ -147,9 +155,6 @@ def problem(settings: Settings, radius: float = RADIUS) -> Problem:
             "sharpness": SHARPNESS,
         },
         picture=picture,
-        before=anneal,
-        criterion="uncovered",
-        capturable=True,
     )
 
 

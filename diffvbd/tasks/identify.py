@@ -11,7 +11,8 @@ from pathlib import Path
 import torch
 
 from diffvbd import losses, viz
-from diffvbd.tasks.runner import Problem, Row, Settings
+from diffvbd.tasks.progress import Row
+from diffvbd.tasks.runner import Problem, Settings, Stage
 from diffvbd.tasks.scene import Observation
 
 WOLFE = "strong_wolfe"
@@ -71,15 +72,19 @@ def problem(
     return Problem(
         name="identify",
         parameters={"exponents": exponents},
-        loss=lambda: losses.vertex_distance(simulate(*material()), target) / scale,
+        stages=[
+            Stage(
+                loss=lambda: losses.vertex_distance(simulate(*material()), target) / scale,
+                iterations=iterations,
+                tolerance=1e-12,
+                gradient_tolerance=1e-7,
+                optimizer=lambda p: torch.optim.LBFGS(
+                    p, max_iter=5, tolerance_grad=0, tolerance_change=0, line_search_fn=WOLFE
+                ),
+            )
+        ],
         estimates=lambda: dict(zip(("mu", "lam"), material().tolist(), strict=True)),
         truth=observation.truth,
-        iterations=iterations,
-        optimizer=lambda p: torch.optim.LBFGS(
-            p, max_iter=5, tolerance_grad=0, tolerance_change=0, line_search_fn=WOLFE
-        ),
-        tolerance=1e-12,
-        gradient_tolerance=1e-7,
         protocol={
             "start": list(start),
             "fixed_lam": fixed_lam,

@@ -1,23 +1,21 @@
-"""The optimiser loop that every task shares: progress, log, resume, and a table at the end."""
+"""The optimiser loop that every task shares: stages, log, resume, pictures."""
 
 import json
 import math
 import os
-import platform
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-import diffvbd as dv
+from diffvbd.tasks.progress import Progress, Row, summary, table_of, versions
 
-Row = dict[str, float]
+LISTED = 1000  # numbers of a parameter that log.json lists; larger ones go to parameters.pt
 
 
 @dataclass(frozen=True)
@@ -25,10 +23,11 @@ class Settings:
     """What the user chooses about a run.
 
     Attributes:
-        out: Directory for log.json, picture.png and state.pt (which exists only while a run is unfinished).
+        out: Directory for log.json, picture.png, animation.gif, parameters.pt (if there are more than LISTED numbers)
+            and state.pt (which exists only while a run is unfinished).
         device: A torch device.
         seed: Seed of torch's generators.
-        quick: Ask the task for a small version that runs in seconds.
+        quick: Ask the task for a small version that runs in seconds; it leaves the animation out.
     """
 
     out: Path
@@ -38,49 +37,72 @@ class Settings:
 
 
 @dataclass
+class Stage:
+    """One minimisation. A problem has one, or several that follow each other.
+
+    Attributes:
+        loss: Scalar loss at the present parameters.
+        iterations: Most loss evaluations.
+        learning_rate: First rate of Adam; it falls to 0 along a cosine.
+        optimizer: Makes another optimiser; it keeps its rate.
+        moves: Names of the parameters that it moves; default: all of the problem's.
+        tolerance: The stage ends once the loss is at most this fraction of its first loss.
+        gradient_tolerance: It also ends once the norm of the gradient is at most this fraction of the first one.
+        before: Called with the number of each iteration of the stage before its loss, to change tensors that it reads.
+        criterion: Key of the history by whose lowest value the best iteration is chosen, and by the loss among equals;
+            for losses that change on the way.
+        clip: Longest gradient, over all parameters together; longer ones are scaled down to it. None: no limit.
+        capturable: On a CUDA device loss and gradient may be captured in one CUDA graph, which is replayed: the loss
+            reads nothing but tensors that stay where they are, and never waits for the device.
+        name: For the log.
+    """
+
+    loss: Callable[[], Tensor]
+    iterations: int
+    learning_rate: float = 0.15
+    optimizer: Callable[[Iterable[Tensor]], torch.optim.Optimizer] | None = None
+    moves: Sequence[str] | None = None
+    tolerance: float = 0.0
+    gradient_tolerance: float = 0.0
+    before: Callable[[int], object] | None = None
+    criterion: str = "loss"
+    clip: float | None = None
+    capturable: bool = False
+    name: str = ""
+
+
+@dataclass
 class Problem:
     """An inverse problem.
 
     Attributes:
         name: Name of the task.
-        parameters: Leaf tensors that the optimiser moves; `solve` leaves the best ones in them.
-        loss: Scalar loss at the present parameters.
+        parameters: Leaf tensors that the optimisers move; `solve` leaves the best ones in them.
+        stages: What is minimised, one after another, each from the best parameters of the one before.
         estimates: The quantities to report, from the present parameters.
-        iterations: Most loss evaluations.
-        learning_rate: First rate of Adam; it falls to 0 along a cosine.
-        optimizer: Makes another optimiser; it keeps its rate.
-        tolerance: The run ends once the loss is at most this fraction of the first loss.
-        gradient_tolerance: It also ends once the norm of the gradient is at most this fraction of the first one.
         truth: Known values of some estimates, for the table.
+        units: Units of estimates, for tables.
         protocol: Numbers that define the problem, for the log.
+        findings: Called once with the history at the end; what it returns is logged as "findings".
         picture: Draws the result, given a path and the history; needs matplotlib.
-        before: Called with the number of each iteration before its loss, to change tensors that the loss reads.
-        criterion: Key of the history by whose lowest value the best iteration is chosen, and by the loss among equals;
-            for losses that change on the way.
-        capturable: On a CUDA device loss and gradient may be captured in one CUDA graph, which is replayed: the loss
-            reads nothing but tensors that stay where they are, and never waits for the device.
+        animation: Writes the motion as a .gif, given a path; needs matplotlib.
     """
 
     name: str
     parameters: dict[str, Tensor]
-    loss: Callable[[], Tensor]
+    stages: Sequence[Stage]
     estimates: Callable[[], Row]
-    iterations: int
-    learning_rate: float = 0.15
-    optimizer: Callable[[Iterable[Tensor]], torch.optim.Optimizer] | None = None
-    tolerance: float = 0.0
-    gradient_tolerance: float = 0.0
     truth: Row = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
     protocol: dict[str, Any] = field(default_factory=dict)
+    findings: Callable[[list[Row]], dict[str, Any]] | None = None
     picture: Callable[[Path, list[Row]], object] | None = None
-    before: Callable[[int], object] | None = None
-    criterion: str = "loss"
-    capturable: bool = False
+    animation: Callable[[Path], object] | None = None
 
 
 @dataclass
 class Result:
-    """What `solve` found: the best row of the history, and every row."""
+    """What `solve` found: the best row of the last stage, and every row."""
 
     best: Row
     history: list[Row]
@@ -88,71 +110,84 @@ class Result:
     errors: Row
     converged: bool
     files: list[Path]
+    findings: dict[str, Any] = field(default_factory=dict)
 
 
 def solve(problem: Problem, settings: Settings) -> Result:
-    """Minimise the loss; the parameters with the lowest criterion, by default the loss, win.
+    """Minimise the losses of all stages; of each stage the parameters with the lowest criterion win.
 
-    After every step of the optimiser the whole state is on disk, so the same call continues an interrupted run with the
+    After every step of an optimiser the whole state is on disk, so the same call continues an interrupted run with the
     very numbers the uninterrupted one would have had. A state of other settings or of another protocol is ignored.
 
     Returns:
-        The result; log.json and picture.png (where matplotlib is installed) are in settings.out.
+        The result; log.json, picture.png and animation.gif (where matplotlib is installed) are in settings.out.
 
     Raises:
         ArithmeticError: the loss or a gradient is not finite.
     """
     torch.manual_seed(settings.seed)
     settings.out.mkdir(parents=True, exist_ok=True)
-    parameters = list(problem.parameters.values())
-    if problem.optimizer:
-        optimizer, schedule = problem.optimizer(parameters), None
-    else:
-        # A few parameters and gradients without noise need no long average, and overshoot less without it. Losses in
-        # m^2 can be tiny: the default eps would exceed their gradients.
-        optimizer = torch.optim.Adam(parameters, problem.learning_rate, betas=(0.7, 0.9), eps=1e-20)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, problem.iterations)
-    run = _Run(problem, settings, optimizer, schedule)
+    run = _Run(problem, settings)
     run.resume()
-    progress = Progress(problem.name, problem.iterations, done=len(run.history))
+    progress = Progress(problem.name, sum(stage.iterations for stage in problem.stages), done=len(run.history))
     begun = time.perf_counter() - (run.history[-1]["seconds"] if run.history else 0.0)
+    while run.at < len(problem.stages):
+        _minimise(run, progress, begun)
+        run.next_stage()
+    progress.close()
+    return run.finish()
 
-    def gradient() -> Tensor:
-        optimizer.zero_grad()
-        loss = problem.loss()
-        loss.backward()
-        return loss.detach()
 
-    if problem.capturable and torch.device(settings.device).type == "cuda":
-        if problem.before:
-            problem.before(len(run.history))
-        gradient = _captured(gradient)
+def _minimise(run: "_Run", progress: Progress, begun: float) -> None:
+    """The run's present stage, from where it stands to its end."""
+    problem, stage, parameters = run.problem, run.stage, run.moved
+    gradient = _gradient(run)
 
     def evaluate() -> float:
-        if problem.before:
-            problem.before(len(run.history))
+        if stage.before:
+            stage.before(len(run.rows))
         loss = gradient()
         row = {"iteration": float(len(run.history)), "loss": loss.item(), "gradient_norm": _norm(parameters)}
+        if len(problem.stages) > 1:
+            row["stage"] = float(run.at)
         row |= problem.estimates() | {"seconds": time.perf_counter() - begun}
         if not (math.isfinite(row["loss"]) and math.isfinite(row["gradient_norm"])):
-            raise ArithmeticError(f"{problem.name}: the loss or its gradient is not finite: {_summary(row)}")
+            raise ArithmeticError(f"{problem.name}: the loss or its gradient is not finite: {summary(row)}")
+        if stage.clip is not None:
+            torch.nn.utils.clip_grad_norm_(parameters, stage.clip)
         run.record(row)
         progress.show(row)
-        if run.ended:
+        if run.stage_ended:
             raise _Ended
         return row["loss"]
 
     try:
-        while not run.ended:
+        while not run.stage_ended:
             # A step of an optimiser with a line search evaluates more than once.
-            optimizer.step(evaluate)
-            if schedule:
-                schedule.step()
+            run.optimizer.step(evaluate)
+            if run.schedule:
+                run.schedule.step()
             run.save()
     except _Ended:
         pass
-    progress.close()
-    return run.finish()
+
+
+def _gradient(run: "_Run") -> Callable[[], Tensor]:
+    """Loss of the present stage, whose gradient it leaves in the parameters."""
+    stage = run.stage
+
+    def gradient() -> Tensor:
+        for parameter in run.problem.parameters.values():
+            parameter.grad = None
+        loss = stage.loss()
+        loss.backward(inputs=run.moved)
+        return loss.detach()
+
+    if not (stage.capturable and torch.device(run.settings.device).type == "cuda"):
+        return gradient
+    if stage.before:
+        stage.before(len(run.rows))
+    return _captured(gradient)
 
 
 def _captured(run: Callable[[], Tensor], warm: int = 2) -> Callable[[], Tensor]:
@@ -180,36 +215,56 @@ class _Ended(Exception):
 
 
 class _Run:
-    """History, best parameters and their files."""
+    """The stage that a run has reached, its optimiser, history and best parameters, and their files."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        settings: Settings,
-        optimizer: torch.optim.Optimizer,
-        schedule: torch.optim.lr_scheduler.LRScheduler | None,
-    ) -> None:
-        self.problem, self.settings, self.optimizer, self.schedule = problem, settings, optimizer, schedule
+    def __init__(self, problem: Problem, settings: Settings) -> None:
+        self.problem, self.settings = problem, settings
         self.history: list[Row] = []
-        self.best = 0
-        self.best_parameters: dict[str, Tensor] = {}
         self.state = settings.out / "state.pt"
         choices = {key: value for key, value in asdict(settings).items() if key != "out"}
         self.identity = {"task": problem.name, "settings": choices, "protocol": problem.protocol}
+        self._enter(0)
+
+    def _enter(self, stage: int) -> None:
+        self.at, self.first, self.best = stage, len(self.history), len(self.history)
+        self.best_parameters: dict[str, Tensor] = {}
+        if stage >= len(self.problem.stages):
+            return
+        if self.stage.optimizer:
+            self.optimizer, self.schedule = self.stage.optimizer(self.moved), None
+        else:
+            # A few parameters and gradients without noise need no long average, and overshoot less without it. Losses
+            # in m^2 can be tiny: the default eps would exceed their gradients.
+            self.optimizer = torch.optim.Adam(self.moved, self.stage.learning_rate, betas=(0.7, 0.9), eps=1e-20)
+            self.schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self.optimizer, self.stage.iterations)
+
+    @property
+    def stage(self) -> Stage:
+        return self.problem.stages[self.at]
+
+    @property
+    def moved(self) -> list[Tensor]:
+        names = self.problem.parameters if self.stage.moves is None else self.stage.moves
+        return [self.problem.parameters[name] for name in names]
+
+    @property
+    def rows(self) -> list[Row]:
+        """Of the present stage."""
+        return self.history[self.first :]
 
     @property
     def converged(self) -> bool:
-        if not self.history:
+        if not self.rows:
             return False
-        first, last, problem = self.history[0], self.history[-1], self.problem
+        first, last, stage = self.rows[0], self.rows[-1], self.stage
         return (
-            last["loss"] <= problem.tolerance * first["loss"]
-            or last["gradient_norm"] <= problem.gradient_tolerance * first["gradient_norm"]
+            last["loss"] <= stage.tolerance * first["loss"]
+            or last["gradient_norm"] <= stage.gradient_tolerance * first["gradient_norm"]
         )
 
     @property
-    def ended(self) -> bool:
-        return self.converged or len(self.history) >= self.problem.iterations
+    def stage_ended(self) -> bool:
+        return self.converged or len(self.rows) >= self.stage.iterations
 
     def record(self, row: Row) -> None:
         self.history.append(row)
@@ -218,13 +273,20 @@ class _Run:
             self.best_parameters = {name: p.detach().clone() for name, p in self.problem.parameters.items()}
 
     def _merit(self, row: Row) -> tuple[float, float]:
-        return row[self.problem.criterion], row["loss"]
+        return row[self.stage.criterion], row["loss"]
+
+    def next_stage(self) -> None:
+        _assign(self.problem.parameters, self.best_parameters)
+        self.last_best, self.last_converged = self.best, self.converged
+        self._enter(self.at + 1)
+        if self.at < len(self.problem.stages):
+            self.save()
 
     def save(self) -> None:
         state = {
             "identity": json.dumps(self.identity),
             "history": self.history,
-            "best": self.best,
+            "stage": (self.at, self.first, self.best),
             "best_parameters": self.best_parameters,
             "parameters": {name: p.detach() for name, p in self.problem.parameters.items()},
             "optimizer": self.optimizer.state_dict(),
@@ -241,7 +303,10 @@ class _Run:
         if state["identity"] != json.dumps(self.identity):
             print(f"{self.state} belongs to other settings; starting anew", file=sys.stderr)
             return
-        self.history, self.best, self.best_parameters = state["history"], state["best"], state["best_parameters"]
+        self.history = state["history"]
+        self._enter(state["stage"][0])
+        _, self.first, self.best = state["stage"]
+        self.best_parameters = state["best_parameters"]
         _assign(self.problem.parameters, state["parameters"])
         self.optimizer.load_state_dict(state["optimizer"])
         if self.schedule:
@@ -250,106 +315,60 @@ class _Run:
         print(f"continuing after {len(self.history)} iterations", file=sys.stderr)
 
     def write_log(self, **result: Any) -> Path:
-        content = self.identity | {"versions": versions(), **result, "history": self.history}
+        stages = [stage.name for stage in self.problem.stages]
+        content = self.identity | {"stages": stages, "versions": versions(self.settings.device), **result}
         log = self.settings.out / "log.json"
-        _replace(log, lambda path: path.write_text(json.dumps(content, indent=1) + "\n"))
+        text = json.dumps(content | {"history": self.history}, indent=1)
+        _replace(log, lambda path: path.write_text(text + "\n"))
         return log
 
     def finish(self) -> Result:
         problem = self.problem
-        _assign(problem.parameters, self.best_parameters)
         estimates = problem.estimates()
         errors = {name: abs(estimates[name] / true - 1) for name, true in problem.truth.items()}
-        best = self.history[self.best]
+        best = self.history[self.last_best]
+        findings = problem.findings(self.history) if problem.findings else {}
+        listed = {name: p.tolist() for name, p in problem.parameters.items() if p.numel() <= LISTED}
         log = self.write_log(
-            converged=self.converged,
+            converged=self.last_converged,
             best=best,
-            parameters={name: p.tolist() for name, p in problem.parameters.items()},
+            parameters=listed,
             estimates=estimates,
             truth=problem.truth,
+            units=problem.units,
             relative_error=errors,
+            findings=findings,
         )
-        result = Result(best, self.history, estimates, errors, self.converged, [log])
-        if problem.picture:
-            picture = self.settings.out / "picture.png"
-            try:
-                problem.picture(picture, self.history)
-                result.files.append(picture)
-            except ImportError as missing:
-                print(f"no picture: {missing}", file=sys.stderr)
+        result = Result(best, self.history, estimates, errors, self.last_converged, [log], findings)
+        if listed.keys() != problem.parameters.keys():
+            path = self.settings.out / "parameters.pt"
+            _replace(path, lambda new: torch.save({k: p.detach().cpu() for k, p in problem.parameters.items()}, new))
+            result.files.append(path)
+        self._draw(result)
         self.state.unlink(missing_ok=True)
         return result
 
-
-class Progress:
-    """A bar that redraws itself on a terminal, and about ten plain lines elsewhere (a log file, a pipe)."""
-
-    def __init__(self, name: str, total: int, done: int = 0) -> None:
-        self.name, self.total, self.done, self.before = name, total, done, done
-        self.terminal = sys.stderr.isatty()
-        self.begun = time.perf_counter()
-        self.last: Row | None = None
-        self.printed = True
-
-    def show(self, row: Row) -> None:
-        self.done += 1
-        self.last = row
-        self.printed = self.terminal or self.done == 1 or self.done % max(1, self.total // 10) == 0
-        if self.printed:
-            self._print()
-
-    def _print(self) -> None:
-        assert self.last is not None
-        left = (time.perf_counter() - self.begun) / (self.done - self.before) * (self.total - self.done)
-        filled = 20 * self.done // self.total
-        text = f"{self.name} [{'#' * filled}{'.' * (20 - filled)}] {self.done}/{self.total}  {_summary(self.last)}"
-        text += f"  {left:.0f} s left"
-        if self.terminal:
-            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
-        else:
-            print(text, file=sys.stderr, flush=True)
-
-    def close(self) -> None:
-        if not self.printed:
-            self._print()
-        if self.terminal:
-            print(file=sys.stderr)
+    def _draw(self, result: Result) -> None:
+        out, problem = self.settings.out, self.problem
+        try:
+            if problem.picture:
+                problem.picture(out / "picture.png", self.history)
+                result.files.append(out / "picture.png")
+            if problem.animation and not self.settings.quick:
+                problem.animation(out / "animation.gif")
+                result.files.append(out / "animation.gif")
+        except ImportError as missing:
+            print(f"no picture: {missing}", file=sys.stderr)
 
 
 def table(problem: Problem, start: Mapping[str, float], result: Result) -> str:
-    """Start, true and recovered values as aligned text."""
-    rows = [("parameter", "start", "true", "recovered", "relative error")]
-    for name, value in result.estimates.items():
-        true = f"{problem.truth[name]:.6g}" if name in problem.truth else "-"
-        error = f"{100 * result.errors[name]:.2g} %" if name in result.errors else "-"
-        rows.append((name, f"{start[name]:.6g}", true, f"{value:.6g}", error))
-    widths = [max(len(row[k]) for row in rows) for k in range(5)]
-    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
-    lines.insert(1, "  ".join("-" * width for width in widths))
+    """Start, true and recovered values as aligned text, and how the run ended."""
     seconds, first = result.history[-1]["seconds"], result.history[0]["loss"]
     how = "converged" if result.converged else "stopped"
-    lines.append(
-        f"{how} after {len(result.history)} iterations in {seconds:.0f} s; "
+    return table_of(start, result.estimates, problem.truth, result.errors) + (
+        f"\n{how} after {len(result.history)} iterations in {seconds:.0f} s; "
         f"loss {first:.3g} -> {result.best['loss']:.3g} (lowest at iteration {result.best['iteration']:.0f})"
     )
-    return "\n".join(lines)
-
-
-def versions() -> dict[str, str]:
-    """Versions of what can change a result."""
-    return {
-        "diffvbd": dv.__version__,
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "threads": str(torch.get_num_threads()),
-    }
-
-
-def _summary(row: Row) -> str:
-    short = {"loss": "loss", "gradient_norm": "|grad|"}
-    return "  ".join(f"{short.get(k, k)} {v:.4g}" for k, v in row.items() if k not in ("iteration", "seconds"))
 
 
 def _norm(parameters: list[Tensor]) -> float:

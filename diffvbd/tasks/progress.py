@@ -1,0 +1,80 @@
+"""What a run shows: progress while it goes on, a table at its end, and the versions that it depended on."""
+
+import platform
+import sys
+import time
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+import diffvbd as dv
+
+Row = dict[str, float]
+
+
+class Progress:
+    """A bar that redraws itself on a terminal, and about ten plain lines elsewhere (a log file, a pipe)."""
+
+    def __init__(self, name: str, total: int, done: int = 0) -> None:
+        self.name, self.total, self.done, self.before = name, total, done, done
+        self.terminal = sys.stderr.isatty()
+        self.begun = time.perf_counter()
+        self.last: Row | None = None
+        self.printed = True
+
+    def show(self, row: Row) -> None:
+        self.done += 1
+        self.last = row
+        self.printed = self.terminal or self.done == 1 or self.done % max(1, self.total // 10) == 0
+        if self.printed:
+            self._print()
+
+    def _print(self) -> None:
+        assert self.last is not None
+        left = (time.perf_counter() - self.begun) / (self.done - self.before) * (self.total - self.done)
+        filled = 20 * self.done // self.total
+        text = f"{self.name} [{'#' * filled}{'.' * (20 - filled)}] {self.done}/{self.total}  {summary(self.last)}"
+        text += f"  {left:.0f} s left"
+        if self.terminal:
+            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+        else:
+            print(text, file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        if not self.printed:
+            self._print()
+        if self.terminal:
+            print(file=sys.stderr)
+
+
+def table_of(start: Mapping[str, float], estimates: Row, truth: Row, errors: Row) -> str:
+    """Start, true and recovered values as aligned text."""
+    rows = [("parameter", "start", "true", "recovered", "relative error")]
+    for name, value in estimates.items():
+        true = f"{truth[name]:.6g}" if name in truth else "-"
+        error = f"{100 * errors[name]:.2g} %" if name in errors else "-"
+        rows.append((name, f"{start[name]:.6g}", true, f"{value:.6g}", error))
+    widths = [max(len(row[k]) for row in rows) for k in range(5)]
+    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(lines)
+
+
+def versions(device: str = "cpu") -> dict[str, str]:
+    """Versions of what can change a result, and the machine."""
+    return {
+        "diffvbd": dv.__version__,
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "threads": str(torch.get_num_threads()),
+        "device": torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else platform.machine(),
+    }
+
+
+def summary(row: Row) -> str:
+    """A row of the history in one line."""
+    short = {"loss": "loss", "gradient_norm": "|grad|"}
+    return "  ".join(f"{short.get(k, k)} {v:.4g}" for k, v in row.items() if k not in ("iteration", "seconds"))

@@ -1,0 +1,8 @@
+"""Pictures of soft bodies. Needs matplotlib (extra [viz]), imported only when something is drawn."""
+
+from diffvbd.viz.animation import animation
+from diffvbd.viz.comparison import comparison
+from diffvbd.viz.drawing import Scenery, box, capsule, draw, floor
+from diffvbd.viz.landing import landing
+
+__all__ = ["Scenery", "animation", "box", "capsule", "comparison", "draw", "floor", "landing"]
