@@ -1,8 +1,9 @@
-"""`python -m bench NAME [--quick] [--device D] [--out DIR]`; NAME may also be list, all or report.
+"""`python -m bench NAME [--quick] [--device D] [--out DIR]`; NAME may also be list, all, tasks or report.
 
 A benchmark is a module of this package with a function run(quick) that returns a dict, and optionally markdown(results)
 that turns it into text. A run that also takes `device`, `only` or `out` gets them from the command line. Results go to
-NAME.json and NAME.md, of a run on CUDA to NAME-cuda.json and NAME-cuda.md; `report` makes docs/results.md of all.
+NAME.json and NAME.md, of a run on CUDA to NAME-cuda.json and NAME-cuda.md; `report` makes docs/results.md of all,
+and docs/tasks.md of the logs of inverse problems, which `tasks` runs.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from types import ModuleType
 import torch
 
 import bench
-from bench import common, report
+from bench import common, report, tasks
 
 PAPER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's own measurements, in its order
 
@@ -32,16 +33,22 @@ def benchmarks() -> dict[str, ModuleType]:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench", description="Runs a benchmark and writes its results.")
-    parser.add_argument("name", help="a benchmark; all: the paper's, then the others; report: docs/results.md; list")
+    parser.add_argument("name", help="a benchmark; all: the paper's, then the others; tasks, report, list")
     parser.add_argument("--quick", action="store_true", help="a few small cases; written only where --out says")
     parser.add_argument("--out", type=Path, help="folder of the results (default: bench/results); report reads it, too")
     parser.add_argument("--device", help="where to measure, if the benchmark lets one choose: cuda, cuda:1, cpu")
     parser.add_argument("--only", help="some groups of the benchmark, if it has any, or some of all: NAME,...")
+    parser.add_argument("--seeds", default="0", help="of the inverse problems that `tasks` runs: N,... (default 0)")
+    parser.add_argument("--options", default="", help="of the inverse problems that `tasks` runs: bodies=10000,...")
     options = parser.parse_args(arguments)
     if options.name == "report":
         return report.main(options.out)
     if options.device and torch.device(options.device).type == "cuda" and not torch.cuda.is_available():
         parser.error(f"--device: expected a device of this machine, got {options.device}, and torch sees no CUDA here")
+    if options.name == "tasks":
+        return tasks.main(
+            options.only, options.device or "cpu", options.seeds, options.options, options.out, options.quick
+        )
     known = benchmarks()
     if options.name == "list":
         for name, module in known.items():
@@ -50,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.name == "all":
         return run_all(parser, options, known)
     if options.name not in known:
-        parser.error(f"name: expected one of {', '.join(known)}, all, report or list, got {options.name}")
+        parser.error(f"name: expected one of {', '.join(known)}, all, tasks, report or list, got {options.name}")
     accepted = inspect.signature(known[options.name].run).parameters
     for key in ("device", "only"):
         if getattr(options, key) is not None and key not in accepted:

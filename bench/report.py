@@ -1,4 +1,5 @@
-"""`python -m bench report`: every result of bench/results as docs/results.md, and figures into docs/performance.md."""
+"""`python -m bench report`: every result of bench/results as docs/results.md, logs of inverse problems as
+docs/tasks.md, and figures into docs/performance.md."""
 
 from __future__ import annotations
 
@@ -9,12 +10,13 @@ import re
 from pathlib import Path
 from typing import Any
 
-from bench import plots
+from bench import plots, tasks
 from bench.common import RESULTS, markdown_table
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "performance.md"
 RESULTS_PAGE = ROOT / "docs" / "results.md"
+TASKS_PAGE = ROOT / "docs" / "tasks.md"
 BENCHMARKS = ("cpu", "gpu")  # whose figures docs/performance.md shows, in this order
 ORDER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's come first, the others by name
 BEGIN, END = "<!-- figures: begin, written by python -m bench report -->", "<!-- figures: end -->"
@@ -31,15 +33,16 @@ its scenes, meshes and machines are others, as the text of each table says.
 
 
 def main(out: Path | None = None) -> int:
-    """Fills both pages; with a folder, makes results.md there of the results in it and leaves docs alone."""
+    """Fills the pages; with a folder, makes results.md there of the results in it and leaves docs alone."""
     if out is not None:
         page = out / "results.md"
         page.write_text(results_page(out, out / "images"), encoding="utf-8")
         print(f"wrote {page}")
         return 0
     RESULTS_PAGE.write_text(results_page(RESULTS, ROOT / "docs" / "images"), encoding="utf-8")
+    TASKS_PAGE.write_text(tasks.page(RESULTS / "tasks", tasks.IMAGES, ROOT / "docs"), encoding="utf-8")
     PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), section(RESULTS)), encoding="utf-8")
-    for page in (RESULTS_PAGE, PAGE):
+    for page in (RESULTS_PAGE, TASKS_PAGE, PAGE):
         print(f"wrote {page.relative_to(ROOT)}")
     return 0
 
@@ -119,7 +122,6 @@ def results_page(results: Path, images: Path) -> str:
                                  "again") from error  # fmt: skip
             # the page has three levels of its own above those of a benchmark
             parts.append(re.sub(r"^#", "###", tables, flags=re.MULTILINE))
-    parts.append(tasks(results / "tasks"))
     return "\n".join(part for part in parts if part).rstrip() + "\n"
 
 
@@ -132,20 +134,3 @@ def harvest(results: Path) -> list[tuple[str, str, dict[str, Any]]]:
         if name and "results" in content and (Path(__file__).parent / f"{name}.py").exists():
             found.append((name, path.stem, content))
     return sorted(found, key=lambda entry: (ORDER.index(entry[0]) if entry[0] in ORDER else len(ORDER), *entry[:2]))
-
-
-def tasks(folder: Path) -> str:
-    """What runs of the inverse problems (`python -m diffvbd run`) have left in a folder."""
-    rows = []
-    for path in sorted(folder.glob("*.json")):
-        content = json.loads(path.read_text(encoding="utf-8"))
-        errors = ", ".join(f"{name} {value:.2g}" for name, value in content.get("relative_error", {}).items())
-        best, versions = content.get("best", {}), content.get("versions", {})
-        rows.append((content.get("task", path.stem), content.get("converged"), errors, best.get("iteration"),
-                     best.get("seconds"), content.get("settings", {}).get("device"), versions.get("torch"),
-                     versions.get("diffvbd")))  # fmt: skip
-    if not rows:
-        return ""
-    header = ("task", "converged", "relative error", "best iteration", "seconds until then", "device", "torch",
-              "diffvbd")  # fmt: skip
-    return "## tasks\n\nInverse problems, `python -m diffvbd run NAME`.\n\n" + markdown_table(header, rows)

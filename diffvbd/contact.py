@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from .checks import check_count, fail
-from .contact_penalty import center_of_mass_penalty
+from .contact_penalty import Bodies, center_of_mass_penalty
 from .contact_step import Detection, outcomes, recorders
 from .model import Model
 from .reference.intersections import intersections as _intersections
 
-__all__ = ["Detection", "Status", "center_of_mass_penalty", "intersections", "record", "reserve", "status"]
+__all__ = ["Bodies", "Detection", "Status", "center_of_mass_penalty", "intersections", "record", "reserve", "status"]
 
 
 @dataclass(frozen=True)

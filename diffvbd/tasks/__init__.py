@@ -4,7 +4,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from diffvbd.tasks import beam_mu, beam_mu_lam, cover_the_spot
+from diffvbd.tasks import (
+    beam_mu,
+    beam_mu_lam,
+    bunny_bounce,
+    cape_mu,
+    cape_wind,
+    cover_the_spot,
+    cube_bounce,
+    dress_size,
+    flag_wind,
+    million_cubes,
+)
 from diffvbd.tasks.runner import Problem, Result, Settings, Stage, solve, table
 
 
@@ -28,10 +39,29 @@ class Task:
 TASKS = {
     "beam-mu": Task("shear modulus of a beam that is twisted by half a turn and released", beam_mu.problem),
     "beam-mu-lam": Task("both Lame parameters of a soft beam that is kicked sideways", beam_mu_lam.problem),
+    "bunny-bounce": Task("throw a bunny that meets a target after its bounce", bunny_bounce.problem),
+    "cape-mu": Task("shear modulus of a cloth from how far its center sags", cape_mu.problem),
+    "cape-wind": Task("constant wind that a cape hung in, from its final shape", cape_wind.problem),
     "cover-the-spot": Task(
         "throw three soft disks that cover a round target",
         cover_the_spot.problem,
         {"radius": Option(float, "radius of the disks [m] (default 0.42)")},
+    ),
+    "cube-bounce": Task(
+        "throw a cube that meets a target after its bounce",
+        cube_bounce.problem,
+        {"sweeps": Option(int, "sweeps per step (default 20)")},
+    ),
+    "dress-size": Task("size of a dress from the height of its hem", dress_size.problem),
+    "flag-wind": Task("wind in eight windows that moves a flag as observed", flag_wind.problem),
+    "million-cubes": Task(
+        "launch a million small cubes that meet in a ring at one moment",
+        million_cubes.problem,
+        {
+            "bodies": Option(int, "number of cubes (default 1000000)"),
+            "steps": Option(int, "steps of a rollout, at least 120 (default 240)"),
+            "iterations": Option(int, "of each of the two stages (default 60)"),
+        },
     ),
 }
 

@@ -1,8 +1,22 @@
 """Pictures of soft bodies. Needs matplotlib (extra [viz]), imported only when something is drawn."""
 
 from diffvbd.viz.animation import animation
+from diffvbd.viz.cloud import cloud, cloud_animation
 from diffvbd.viz.comparison import comparison
 from diffvbd.viz.drawing import Scenery, box, capsule, draw, floor
 from diffvbd.viz.landing import landing
+from diffvbd.viz.paths import paths
 
-__all__ = ["Scenery", "animation", "box", "capsule", "comparison", "draw", "floor", "landing"]
+__all__ = [
+    "Scenery",
+    "animation",
+    "box",
+    "capsule",
+    "cloud",
+    "cloud_animation",
+    "comparison",
+    "draw",
+    "floor",
+    "landing",
+    "paths",
+]

@@ -1,0 +1,152 @@
+"""`python -m bench tasks [--only NAME,...] [--device D] [--seeds 0,1,2] [--options bodies=10000]`.
+
+Runs inverse problems and keeps their logs, each with the machine it ran on, as results/tasks/NAME.json, with device,
+options and seed added where they are others; picture and animation of seed 0 go to docs/images/tasks. `python -m bench
+report` makes docs/tasks.md of them.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from bench.common import RESULTS, device_suffix, environment, markdown_table
+from bench.paper import TASKS as PAPER
+from diffvbd.tasks import TASKS, Settings, solve
+
+IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images" / "tasks"
+PICTURES = {"picture.png": ".png", "animation.gif": ".gif"}
+
+
+def main(only: str | None, device: str, seeds: str, options: str, out: Path | None, quick: bool) -> int:
+    """Runs tasks; one that was interrupted goes on where it stopped."""
+    names = list(PAPER) if only is None else [name.strip() for name in only.split(",")]
+    if unknown := sorted(set(names) - set(TASKS)):
+        print(f"--only: expected names among {', '.join(TASKS)}, got {', '.join(unknown)}", file=sys.stderr)
+        return 2
+    if quick and out is None:
+        print("--out: expected a folder: quick runs are no results", file=sys.stderr)
+        return 2
+    given = dict(text.split("=") for text in options.split(",") if text)
+    logs, images = (RESULTS / "tasks", IMAGES) if out is None else (out, out)
+    for name in names:
+        for seed in (int(s) for s in seeds.split(",")):
+            stem = "-".join([name + device_suffix(device), *(k + v for k, v in given.items())])
+            stem += f"-seed{seed}" if seed else ""
+            folder = Path(tempfile.gettempdir()) / f"diffvbd-{stem}"
+            settings = Settings(folder, device, seed, quick)
+            chosen = {key: TASKS[name].options[key].kind(value) for key, value in given.items()}
+            solve(TASKS[name].build(settings, **chosen), settings)
+            log = {"environment": environment(device), "options": chosen}
+            log |= json.loads((folder / "log.json").read_text(encoding="utf-8"))
+            logs.mkdir(parents=True, exist_ok=True)
+            (logs / f"{stem}.json").write_text(json.dumps(log, indent=1) + "\n", encoding="utf-8")
+            if not (seed or chosen):
+                keep_pictures(folder, name, images, device)
+            print(f"wrote {logs / stem}.json", file=sys.stderr)
+            shutil.rmtree(folder)
+    return 0
+
+
+def keep_pictures(folder: Path, name: str, images: Path, device: str) -> None:
+    images.mkdir(parents=True, exist_ok=True)
+    for file, ending in PICTURES.items():
+        target = images / f"{name.replace('-', '_')}{ending}"
+        # where a task runs on both, the picture is that of the CPU
+        if (folder / file).exists() and (device == "cpu" or not target.exists()):
+            shutil.copyfile(folder / file, target)
+
+
+# --- docs/tasks.md ----------------------------------------------------------------------------------------------------
+
+INTRODUCTION = """\
+# Inverse problems
+
+`diffvbd run NAME` runs one; each is a short module in `diffvbd/tasks/`, written on the public interface alone, and
+its docstring, repeated here, states the protocol. Figures in the tables come from the logs in `bench/results/tasks`,
+which `python -m bench tasks` writes and `python -m bench report` turns into this page; those of the paper stand in
+`bench/paper.py`.
+
+Times are those of the optimisation, without pictures. Runs are repeatable: on one device the same seed gives the same
+numbers, bit by bit.
+"""
+
+
+def page(folder: Path, images: Path, root: Path) -> str:
+    """The page of all logs in a folder, with pictures from `images`, which lie below the page's folder `root`."""
+    logs = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))}
+    header = ("task", "variables", "the paper", "iterations", "ours", "iterations", "CPU [s]", "GPU [s]", "bar met")
+    rows, parts = [], []
+    for name in PAPER:
+        runs = {key: log for key, log in logs.items() if log["task"] == name}
+        if not runs:
+            continue
+        main_run = runs.get(name) or runs.get(f"{name}-cuda") or next(iter(runs.values()))
+        bars, paper = PAPER[name].bars, PAPER[name]
+        met = [figure(run, key) <= bar for run in runs.values() if not run["options"] for key, bar in bars.items()]
+        rows.append((f"[{name}](#{name})", paper.variables, paper.outcome, paper.iterations, outcome(main_run),
+                     len(main_run["history"]), seconds(runs.get(name)), seconds(runs.get(f"{name}-cuda")),
+                     all(met) if met else None))  # fmt: skip
+        parts.append(section(name, runs, main_run, images, root))
+    return "\n".join([INTRODUCTION, markdown_table(header, rows), *parts]).rstrip() + "\n"
+
+
+def section(name: str, runs: dict[str, Any], main_run: dict[str, Any], images: Path, root: Path) -> str:
+    """One task: what it is, its picture, and a row for each run."""
+    text = [f"## {name}\n", (sys.modules[TASKS[name].build.__module__].__doc__ or "").strip() + "\n"]
+    for ending in PICTURES.values():
+        picture = images / f"{name.replace('-', '_')}{ending}"
+        if picture.exists():
+            text.append(f"![{TASKS[name].summary}]({picture.relative_to(root).as_posix()})\n")
+    rows = []
+    for run in runs.values():
+        options = ", ".join(f"{key} {value}" for key, value in run["options"].items())
+        e, first = run["environment"], run["history"][0]
+        where = e["device"] if e["device"] != "cpu" else f"{e['cpu']}, {e['threads']} threads"
+        commit = (e["commit"] or "unknown")[:10]
+        rows.append((where, options or "-", run["settings"]["seed"], len(run["history"]), first["loss"],
+                     run["best"]["loss"], outcome(run), seconds(run), e["torch"], e["date"], commit))  # fmt: skip
+    header = ("on", "options", "seed", "iterations", "first loss", "best loss", "result", "seconds", "torch", "date",
+              "commit")  # fmt: skip
+    text.append(markdown_table(header, rows))
+    found = [(key, plain(value)) for key, value in main_run["findings"].items() if not isinstance(value, (list, dict))]
+    if found:
+        text.append(markdown_table(("finding", "value"), found))
+    return "\n".join(text)
+
+
+def seconds(run: dict[str, Any] | None) -> float | None:
+    return None if run is None else run["history"][-1]["seconds"]
+
+
+def figure(run: dict[str, Any], key: str) -> float:
+    """A number of a log: the loss, a relative error, an estimate or a finding."""
+    if key == "loss":
+        return run["best"]["loss"]
+    for kind in ("relative_error", "estimates", "findings"):
+        if key in run[kind]:
+            return run[kind][key]
+    raise KeyError(f"{run['task']}: no {key} in its log")
+
+
+def outcome(run: dict[str, Any]) -> str:
+    """Errors of what has a true value in per cent, or else the figures that the bars are about."""
+    keys = list(PAPER[run["task"]].bars) or list(run["relative_error"]) or list(run["estimates"])
+    shown = []
+    for key in keys:
+        value = figure(run, key)
+        if key in run["relative_error"]:
+            shown.append(f"{key} {100 * value:.2g} %")
+        else:
+            first = run["history"][0].get(key)
+            came = f"{first:.3g} -> " if isinstance(first, float) else ""
+            shown.append(f"{key.replace('_', ' ')} {came}{value:.3g} {run['units'].get(key, '')}".rstrip())
+    return ", ".join(shown)
+
+
+def plain(value: Any) -> Any:
+    return f"{value:.4g}" if isinstance(value, float) else value

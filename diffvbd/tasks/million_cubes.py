@@ -1,0 +1,230 @@
+"""Launch a million soft cubes so that each is at its place in a formation at one moment (paper, section "Scale").
+
+Cubes of 3 mm (8 vertices and 6 tets each) lie in layers on a launch pad, let go from a squeeze by a tenth of their
+height. Each has a place in a ring that stands 1.77 m above the pad, the height of a throw whose apex is reached after
+0.6 s. Adam moves four numbers per body, its initial velocity and, through a sigmoid, its shear modulus, by the gradient
+through 240 steps of 5 ms with K = 5 sweeps; only states between every five steps are kept. The loss is the sum of
+Huber losses of the distances between centers of mass and places at t = 0.6 s. The first stage has no contact; in the
+second, bodies push each other away by a penalty between centers of mass (`diffvbd.contact.center_of_mass_penalty`), and
+the gradient goes through every push.
+
+Choices the paper leaves open: density 1000 kg/m^3, lam = 1e4 Pa, mu in 1e3 .. 1e5 Pa; Huber's delta 1 m; the limit of 5
+is on the gradient of each body. Pad and ring have a place every 8 mm. Bodies and places are matched in the order of x,
+then z, then y, each place mixed by a seed with its next few: mixed among all, bodies would meet everywhere on the way.
+Bodies overlap below 5.2 mm, the diagonal of a cube, and are pushed with 3e-3 N/m of overlap. That is soft: bodies that
+fly side by side and touch drift apart exponentially, at 0.1 N/m their gradients reach 1e6 and lead nowhere. The first
+guess is 3 m/s upwards for all. Steps after t = 0.6 s do not change the loss; the paper rolls them out, so it is the
+default (option `steps`). The center of mass of a free body does not depend on its material, except through what K = 5
+sweeps leave unsolved: the gradient of mu is that of the executed solver, and small. float32, because a million bodies
+fill some ten GB; the quick version uses float64.
+"""
+
+import math
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import losses, viz
+from diffvbd.tasks.progress import Row
+from diffvbd.tasks.runner import Problem, Settings, Stage
+
+EDGE = 3e-3  # [m]
+SQUEEZE = 0.9  # height at the start, of the height at rest
+DENSITY = 1000.0  # [kg/m^3]
+LAM, MU = 1e4, (1e3, 1e5)  # [Pa]; the range of mu
+TIME_STEP, SWEEPS, STEPS = 5e-3, 5, 240  # [s]
+TARGET_STEP = 120  # t = 0.6 s
+CHECKPOINT_EVERY = 5
+HUBER = 1.0  # delta [m]
+CLIP = 5.0  # longest gradient of a body
+PAD, RING = 8e-3, 8e-3  # spacing of places [m]
+LAYERS = 16
+HEIGHT = 1.77  # of the middle of the ring [m]
+RADIUS, STIFFNESS = math.sqrt(3) * EDGE, 3e-3  # [m], [N/m]
+GROUP = 64  # most bodies in a scene on the CPU
+PAIRS = 4  # room for pairs, for each body
+MIXED = 8  # bodies whose places are mixed
+LAUNCH = 3.0  # first guess, upwards [m/s]
+STAGES = ("without contact", "with contact")
+ITERATIONS, RATES = (60, 60), (0.5, 0.02)  # of the stages
+
+
+def problem(settings: Settings, bodies: int = 1_000_000, steps: int = STEPS, iterations: int | None = None) -> Problem:
+    """The task.
+
+    Args:
+        settings: As of every task.
+        bodies: Number of cubes.
+        steps: Steps of a rollout, at least 120.
+        iterations: Of each stage; default ITERATIONS.
+
+    Raises:
+        ValueError: no bodies or iterations, or a rollout that ends before t = 0.6 s.
+    """
+    target_step, height, launch, dtype, counts = TARGET_STEP, HEIGHT, LAUNCH, torch.float32, ITERATIONS
+    if settings.quick:
+        bodies, steps, target_step, height, launch = min(bodies, 64), 24, 20, 0.05, 0.6
+        dtype, counts = torch.float64, (15, 10)
+    if bodies < 1:
+        raise ValueError(f"bodies: expected at least 1, got {bodies}")
+    if steps < target_step:
+        raise ValueError(f"steps: expected at least {target_step}, which are 0.6 s, got {steps}")
+    if iterations is not None:
+        if iterations < 1:
+            raise ValueError(f"iterations: expected at least 1, got {iterations}")
+        counts = (iterations, iterations)
+
+    place = matched(ring(bodies, height), np.random.default_rng(settings.seed))
+    cube = dv.mesh.cube(2, EDGE).translate((-EDGE / 2,) * 3)
+    # a GPU has one thread sweep a whole cube; a CPU sweeps eight vertices of a color at once, and wants more cubes
+    group = 1 if torch.device(settings.device).type == "cuda" else math.gcd(bodies, GROUP)
+    scenes = (bodies // group, group * cube.num_vertices, 3)
+    model = dv.Model(dv.mesh.replicate(cube, np.zeros((group, 3))), density=DENSITY, dtype=dtype).to(settings.device)
+    like = {"dtype": dtype, "device": model.device}
+    target, pad = torch.as_tensor(place, **like), torch.as_tensor(launch_pad(bodies), **like)
+    corners, mass = (each[: cube.num_vertices] for each in (model.rest_points, model.mass))
+    x = (pad[:, None] + torch.tensor([1.0, SQUEEZE, 1.0], **like) * corners).reshape(scenes)
+    # all bodies see each other: to the penalty they are one scene
+    labels = torch.arange(bodies, device=model.device).repeat_interleave(cube.num_vertices)
+    together = dv.contact.Bodies(labels, mass.repeat(bodies))
+
+    velocity = torch.tensor([0.0, launch, 0.0], **like).repeat(bodies, 1).requires_grad_()
+    material = torch.zeros(bodies, **like, requires_grad=True)
+    seen = torch.full((bodies, 4), torch.nan, **like)  # the parameters that led to the errors
+    error = torch.full((bodies,), torch.nan, **like)  # distances of centers of mass from their places [m]
+    contact, pairs = False, PAIRS * bodies + 64
+    # a body that bounces off many others has a huge gradient, which a limit for all together would make all others pay
+    velocity.register_hook(lambda g: g * (CLIP / g.norm(dim=1, keepdim=True)).clamp(max=1.0))
+
+    def push(step: int, x: Tensor, v: Tensor) -> Tensor:
+        return dv.contact.center_of_mass_penalty(x.flatten(0, 1), together, RADIUS, STIFFNESS, max_pairs=pairs).view_as(
+            x
+        )
+
+    def simulate(save: int) -> Tensor:
+        """Centers of mass [m] of every n-th frame, shape [frames, bodies, 3]."""
+        mu = MU[0] + (MU[1] - MU[0]) * material.sigmoid()
+        motion = dv.rollout(
+            model,
+            x,
+            velocity[:, None].expand(-1, cube.num_vertices, -1).reshape(scenes),
+            steps=steps,
+            mu=mu.view(-1, group, 1).expand(-1, -1, cube.num_tets).flatten(1),
+            lam=LAM,
+            time_step=TIME_STEP,
+            sweeps=SWEEPS,
+            force=push if contact else None,
+            save=save,
+            checkpoint_every=CHECKPOINT_EVERY,
+        )
+        return losses.center_of_mass(motion.x.view(-1, bodies, cube.num_vertices, 3), mass)
+
+    def loss() -> Tensor:
+        arrived = simulate(save=target_step)[1]
+        with torch.no_grad():
+            seen.copy_(torch.cat([velocity, material[:, None]], 1))
+            error.copy_((arrived - target).norm(dim=1))
+        return bodies * losses.huber(arrived, target, HUBER)
+
+    def begin(iteration: int, touching: bool) -> None:
+        nonlocal contact
+        contact = touching
+
+    @torch.no_grad()
+    def estimates() -> Row:
+        if not torch.equal(seen, torch.cat([velocity, material[:, None]], 1)):
+            loss()
+        return {"mean_error": error.mean().item()}
+
+    def findings(history: list[Row]) -> dict[str, float]:
+        found = {
+            f"mean_error_{name}": min(row["mean_error"] for row in history if row["stage"] == stage)
+            for stage, name in enumerate(("without_contact", "with_contact"))
+        }
+        times = np.array([row["seconds"] for row in history])
+        found["seconds_per_iteration"] = float(np.median(np.diff(times)[-counts[1] // 2 :]))  # with contact
+        if torch.device(settings.device).type == "cuda":
+            found["peak_memory_gb"] = torch.cuda.max_memory_allocated(settings.device) / 1e9
+        return found
+
+    @torch.no_grad()
+    def frames(every: int) -> Tensor:
+        return simulate(save=every)
+
+    def picture(path: Path, history: list[Row]) -> None:
+        every = target_step // 4
+        viz.cloud(path, frames(every)[: 6 if steps > target_step else 5], every * TIME_STEP, history, "mean_error")
+
+    def animation(path: Path) -> None:
+        viz.cloud_animation(path, frames(every=4), 4 * TIME_STEP)
+
+    return Problem(
+        name="million-cubes",
+        parameters={"velocity": velocity, "material": material},
+        stages=[
+            Stage(
+                loss=loss,
+                iterations=count,
+                learning_rate=rate,
+                before=partial(begin, touching=touching),
+                criterion="mean_error",
+                capturable=True,
+                name=name,
+            )
+            for name, count, rate, touching in zip(STAGES, counts, RATES, (False, True), strict=True)
+        ],
+        estimates=estimates,
+        units={"mean_error": "m"},
+        protocol={
+            "bodies": bodies,
+            "vertices": bodies * cube.num_vertices,
+            "tets": bodies * cube.num_tets,
+            "steps": steps,
+            "target_step": target_step,
+            "iterations": counts,
+            "edge": EDGE,
+            "squeeze": SQUEEZE,
+            "density": DENSITY,
+            "mu": MU,
+            "lam": LAM,
+            "time_step": TIME_STEP,
+            "sweeps": SWEEPS,
+            "checkpoint_every": CHECKPOINT_EVERY,
+            "radius": RADIUS,
+            "stiffness": STIFFNESS,
+            "dtype": str(dtype),
+        },
+        findings=findings,
+        picture=picture,
+        animation=animation,
+    )
+
+
+def launch_pad(bodies: int) -> np.ndarray:
+    """Places [m] in layers on a square about the y axis, in the order of x, then z, then y, shape [bodies, 3]."""
+    layers = min(LAYERS, bodies)
+    side = math.ceil(math.sqrt(bodies / layers))
+    x, z, y = np.meshgrid(np.arange(side), np.arange(side), np.arange(layers), indexing="ij")
+    places = np.stack([x - 0.5 * (side - 1), y, z - 0.5 * (side - 1)], -1).reshape(-1, 3)
+    return PAD * places[:bodies]
+
+
+def ring(bodies: int, height: float) -> np.ndarray:
+    """Lattice places [m] in a torus that stands upright at a height, in the order of x, then z, then y."""
+    # the torus of the volume of so many cells whose outer radius is three times that of its tube
+    tube = (bodies / (4 * math.pi**2)) ** (1 / 3)
+    reach = math.ceil(3 * tube) + 2
+    axis, deep = np.arange(-reach, reach + 1), np.arange(-math.ceil(tube) - 2, math.ceil(tube) + 3)
+    x, z, y = (a.ravel() for a in np.meshgrid(axis, deep, axis, indexing="ij"))
+    inside = np.hypot(np.hypot(x, y) - 2 * tube, z)
+    chosen = np.sort(np.argsort(inside, kind="stable")[:bodies])
+    return RING * np.stack([x, y, z], -1)[chosen] + [0.0, height, 0.0]
+
+
+def matched(places: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """The places in another order: each has moved by about MIXED ranks."""
+    return places[np.argsort(np.arange(len(places)) + random.uniform(0, MIXED, len(places)), kind="stable")]
