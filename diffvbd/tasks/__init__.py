@@ -12,6 +12,8 @@ from diffvbd.tasks import (
     cape_wind,
     cover_the_spot,
     cube_bounce,
+    dress_mu_lam,
+    dress_silhouette,
     dress_size,
     flag_wind,
     million_cubes,
@@ -52,6 +54,8 @@ TASKS = {
         cube_bounce.problem,
         {"sweeps": Option(int, "sweeps per step (default 20)")},
     ),
+    "dress-mu-lam": Task("both Lame parameters of a dress that drapes over a mannequin", dress_mu_lam.problem),
+    "dress-silhouette": Task("the same from nothing but the dress's outline", dress_silhouette.problem),
     "dress-size": Task("size of a dress from the height of its hem", dress_size.problem),
     "flag-wind": Task("wind in eight windows that moves a flag as observed", flag_wind.problem),
     "million-cubes": Task(
@@ -60,7 +64,7 @@ TASKS = {
         {
             "bodies": Option(int, "number of cubes (default 1000000)"),
             "steps": Option(int, "steps of a rollout, at least 120 (default 240)"),
-            "iterations": Option(int, "of each of the two stages (default 60)"),
+            "iterations": Option(int, "of each of the two stages (default 40)"),
         },
     ),
 }

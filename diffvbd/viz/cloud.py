@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from diffvbd.viz.drawing import INK, VIEW, as_array, bounds_of, new_figure
 
-SHOWN = 20_000  # points; of more, evenly many
+SHOWN = 20_000  # points; of more, so many of them
 
 
 def cloud(
@@ -68,7 +68,9 @@ def cloud_animation(path: str | Path, frames: Any, time_step: float) -> None:
 
 
 def _chosen(frames: Any) -> NDArray[np.float64]:
-    return as_array(frames[:, :: max(1, -(-frames.shape[1] // SHOWN))])
+    # at random: every n-th of bodies in rows would draw lines that are not there
+    order = np.random.default_rng(0).permutation(frames.shape[1])[:SHOWN]
+    return as_array(frames[:, order])
 
 
 def _points(axes: Any, points: NDArray[np.float64], first: NDArray[np.float64], bounds: tuple[Any, Any]) -> None:
