@@ -1,7 +1,7 @@
 """`python -m bench tasks [--only NAME,...] [--device D] [--seeds 0,1,2] [--options bodies=10000]`.
 
 Runs inverse problems and keeps their logs, each with the machine it ran on, as results/tasks/NAME.json, with device,
-options and seed added where they are others; picture and animation of seed 0 go to docs/images/tasks. `python -m bench
+options and seed added where they are others; the picture of seed 0 goes to docs/images/tasks. `python -m bench
 report` makes docs/tasks.md of them.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,8 @@ from bench.common import RESULTS, device_suffix, environment, markdown_table
 from bench.paper import TASKS as PAPER
 from diffvbd.tasks import TASKS, Settings, solve
 
-IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images" / "tasks"
-PICTURES = {"picture.png": ".png", "animation.gif": ".gif"}
+ROOT = Path(__file__).resolve().parents[1]
+IMAGES = ROOT / "docs" / "images" / "tasks"
 
 
 def main(only: str | None, device: str, seeds: str, options: str, out: Path | None, quick: bool) -> int:
@@ -33,11 +32,12 @@ def main(only: str | None, device: str, seeds: str, options: str, out: Path | No
         return 2
     given = dict(text.split("=") for text in options.split(",") if text)
     logs, images = (RESULTS / "tasks", IMAGES) if out is None else (out, out)
+    unfinished = ROOT / "runs" / "bench" if out is None else out / "unfinished"
     for name in names:
         for seed in (int(s) for s in seeds.split(",")):
             stem = "-".join([name + device_suffix(device), *(k + v for k, v in given.items())])
             stem += f"-seed{seed}" if seed else ""
-            folder = Path(tempfile.gettempdir()) / f"diffvbd-{stem}"
+            folder = unfinished / stem
             settings = Settings(folder, device, seed, quick)
             chosen = {key: TASKS[name].options[key].kind(value) for key, value in given.items()}
             solve(TASKS[name].build(settings, **chosen), settings)
@@ -46,19 +46,22 @@ def main(only: str | None, device: str, seeds: str, options: str, out: Path | No
             logs.mkdir(parents=True, exist_ok=True)
             (logs / f"{stem}.json").write_text(json.dumps(log, indent=1) + "\n", encoding="utf-8")
             if not (seed or chosen):
-                keep_pictures(folder, name, images, device)
+                keep_picture(folder, name, images, device)
             print(f"wrote {logs / stem}.json", file=sys.stderr)
             shutil.rmtree(folder)
     return 0
 
 
-def keep_pictures(folder: Path, name: str, images: Path, device: str) -> None:
-    images.mkdir(parents=True, exist_ok=True)
-    for file, ending in PICTURES.items():
-        target = images / f"{name.replace('-', '_')}{ending}"
-        # where a task runs on both, the picture is that of the CPU
-        if (folder / file).exists() and (device == "cpu" or not target.exists()):
-            shutil.copyfile(folder / file, target)
+def keep_picture(folder: Path, name: str, images: Path, device: str) -> None:
+    target = picture_of(name, images)
+    # where a task runs on both, the picture is that of the CPU
+    if (folder / "picture.png").exists() and (device == "cpu" or not target.exists()):
+        images.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(folder / "picture.png", target)
+
+
+def picture_of(name: str, images: Path) -> Path:
+    return images / f"{name.replace('-', '_')}.png"
 
 
 # --- docs/tasks.md ----------------------------------------------------------------------------------------------------
@@ -98,10 +101,8 @@ def page(folder: Path, images: Path, root: Path) -> str:
 def section(name: str, runs: dict[str, Any], main_run: dict[str, Any], images: Path, root: Path) -> str:
     """One task: what it is, its picture, and a row for each run."""
     text = [f"## {name}\n", (sys.modules[TASKS[name].build.__module__].__doc__ or "").strip() + "\n"]
-    for ending in PICTURES.values():
-        picture = images / f"{name.replace('-', '_')}{ending}"
-        if picture.exists():
-            text.append(f"![{TASKS[name].summary}]({picture.relative_to(root).as_posix()})\n")
+    if (picture := picture_of(name, images)).exists():
+        text.append(f"![{TASKS[name].summary}]({picture.relative_to(root).as_posix()})\n")
     rows = []
     for run in runs.values():
         options = ", ".join(f"{key} {value}" for key, value in run["options"].items())
