@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from diffvbd.tasks import (
@@ -15,6 +16,7 @@ from diffvbd.tasks import (
     dress_mu_lam,
     dress_silhouette,
     dress_size,
+    fit_real_mesh,
     flag_wind,
     million_cubes,
 )
@@ -57,6 +59,15 @@ TASKS = {
     "dress-mu-lam": Task("both Lame parameters of a dress that drapes over a mannequin", dress_mu_lam.problem),
     "dress-silhouette": Task("the same from nothing but the dress's outline", dress_silhouette.problem),
     "dress-size": Task("size of a dress from the height of its hem", dress_size.problem),
+    "fit-real-mesh": Task(
+        "map the stiffness inside a body from pulls at its surface",
+        fit_real_mesh.problem,
+        {
+            "mesh": Option(Path, "file of tets, or a surface to fill with tets (default: a rabbit)"),
+            "edge-length": Option(float, "of tets that fill a surface, in its unit (default 1/20 of its diagonal)"),
+            "iterations": Option(int, "evaluations for each weight (default 40, 24, 24, 30)"),
+        },
+    ),
     "flag-wind": Task("wind in eight windows that moves a flag as observed", flag_wind.problem),
     "million-cubes": Task(
         "launch a million small cubes that meet in a ring at one moment",

@@ -4,6 +4,7 @@ from diffvbd.viz.animation import animation
 from diffvbd.viz.cloud import cloud, cloud_animation
 from diffvbd.viz.comparison import comparison
 from diffvbd.viz.drawing import Scenery, box, capsule, draw, floor
+from diffvbd.viz.field import field
 from diffvbd.viz.landing import landing
 from diffvbd.viz.paths import paths
 
@@ -16,6 +17,7 @@ __all__ = [
     "cloud_animation",
     "comparison",
     "draw",
+    "field",
     "floor",
     "landing",
     "paths",
