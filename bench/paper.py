@@ -79,7 +79,7 @@ TASKS = {
     "bunny-bounce": Task("3", "100", "0.035 -> 0.034 m", {"distance": 0.034}),
     "cover-the-spot": Task("18", "600", "0.0 % uncovered", {"uncovered": 0.0}),
     "cape-mu": Task("1", "80", "mu 0.16 %", {"mu": 1.6e-3}),
-    "dress-size": Task("1", "80", "scale < 0.5 %", {"scale": 5e-3}),
+    "dress-size": Task("1", "80", "scale < 0.5 %", {"size": 5e-3}),
     "cape-wind": Task("3", "120", "wind < 0.3 %", {"deviation": 3e-3}),
     "million-cubes": Task(
         "4 per body", "about 180 + 200, 300 s each", "mean error 0.291 m, with contact 0.311 m",

@@ -153,9 +153,8 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def _solve(problem: Problem, settings: Settings) -> None:
-    start = problem.estimates()
     result = solve(problem, settings)
-    print(table(problem, start, result))
+    print(table(problem, result))
     print("wrote " + ", ".join(str(path) for path in result.files))
 
 

@@ -27,6 +27,11 @@ def check_fall(name: str, out: Path, factor: float, iterations: int | None = Non
     result = solve(problem, settings)
     last = [row for row in result.history if row.get("stage", 0) == len(problem.stages) - 1]
     assert result.best["loss"] <= factor * last[0]["loss"]
+    # the best parameters are back in place
+    stage = problem.stages[-1]
+    if stage.before:
+        stage.before(last.index(result.best))
+    assert stage.loss().item() == result.best["loss"]
     assert problem.estimates() == result.estimates
     return result
 

@@ -66,7 +66,8 @@ def test_scenes_of_a_batch_do_not_mix(tmp_path: Path) -> None:
 
 
 def test_sweeps_are_an_option_of_the_cube(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    starts = [quick("cube-bounce", tmp_path, sweeps=sweeps)[0].estimates()["distance"] for sweeps in (1, 5, 20)]
+    problems = [quick("cube-bounce", tmp_path, sweeps=sweeps)[0] for sweeps in (1, 5, 20)]
+    starts = [problem.stages[0].loss().sqrt().item() for problem in problems]
     # few sweeps change the bounce
     assert abs(starts[0] - starts[2]) > abs(starts[1] - starts[2]) > 1e-3
     assert main(["run", "cube-bounce", "--sweeps", "-1", "--out", str(tmp_path)]) == 2

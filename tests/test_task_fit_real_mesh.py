@@ -12,7 +12,7 @@ from task_checks import check_fall, check_gradient
 import diffvbd as dv
 from diffvbd import viz
 from diffvbd.tasks import Settings, fit_real_mesh
-from diffvbd.tasks.fit_real_mesh import HEIGHT, HELD, TRACTION, neighbours, pulls, scaled
+from diffvbd.tasks.fit_real_mesh import HEIGHT, HELD, TRACTION, neighbors, pulls, scaled
 from diffvbd.viz.field import boundary
 
 BODY = scaled(dv.mesh.bunny(8), HEIGHT)
@@ -35,7 +35,7 @@ def test_gradient_matches_central_differences(tmp_path: Path, stage: int) -> Non
 def test_weight_falls_until_the_misfit_is_that_of_the_noise(tmp_path: Path) -> None:
     # this seed's noise is a little smaller than stated
     problem = fit_real_mesh.problem(Settings(tmp_path, seed=2))
-    exponents, lowered = (problem.parameters[name] for name in ("exponents", "lowered"))
+    exponents, lowered = problem.parameters["exponents"], problem.state["lowered"]
 
     def enter(stage: int) -> None:
         before = problem.stages[stage].before
@@ -60,12 +60,12 @@ def test_weight_falls_until_the_misfit_is_that_of_the_noise(tmp_path: Path) -> N
     assert lowered.tolist() == [0, 0, 1, 0, 0]
 
 
-def test_neighbours_are_all_inner_faces() -> None:
-    first, second, _ = neighbours(BODY)
+def test_neighbors_are_all_inner_faces() -> None:
+    first, second, _ = neighbors(BODY)
     assert 2 * len(first) + len(BODY.surface) == 4 * BODY.num_tets
     assert all(len(np.intersect1d(*BODY.tets[[i, j]])) == 3 for i, j in zip(first, second, strict=True))
     # six tets about the diagonal of a cube: a face has an edge, the diagonal of a side and that of the cube
-    _, _, area = neighbours(dv.mesh.cube(2, size=0.5))
+    _, _, area = neighbors(dv.mesh.cube(2, size=0.5))
     assert area == pytest.approx(6 * [0.5 * 0.5 * 0.5 * math.sqrt(2)])
 
 

@@ -21,13 +21,12 @@ def quick(name: str, out: Path) -> tuple:
 @pytest.mark.parametrize("name", MATERIAL)
 def test_quick_run_recovers_the_material(name: str, tmp_path: Path) -> None:
     problem, settings = quick(name, tmp_path)
-    start = problem.estimates()
     result = solve(problem, settings)
+    start = result.history[0]
     assert result.best["loss"] < 1e-4 * result.history[0]["loss"]
     for quantity, error in result.errors.items():
         assert error < 0.02 < abs(start[quantity] / problem.truth[quantity] - 1)
-    assert problem.estimates() == result.estimates
-    assert f"{result.estimates['mu']:.6g}" in table(problem, start, result)
+    assert f"{result.estimates['mu']:.6g}" in table(problem, result)
 
 
 @pytest.mark.parametrize("name", MATERIAL)

@@ -20,7 +20,8 @@ from diffvbd.tasks import (
     flag_wind,
     million_cubes,
 )
-from diffvbd.tasks.runner import Problem, Result, Settings, Stage, solve, table
+from diffvbd.tasks.problem import Problem, Result, Settings, Stage
+from diffvbd.tasks.runner import solve, table
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ import torch
 
 import diffvbd as dv
 from diffvbd import losses, viz
+from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
-from diffvbd.tasks.runner import Problem, Settings, Stage
 
 TRUE_MU = 1.0e6  # [Pa]
 START_MU = 1.0e5
@@ -51,11 +51,13 @@ def problem(settings: Settings) -> Problem:
         target = simulate(torch.full_like(start, TRUE_MU))
     log_mu = start.log().requires_grad_()
 
+    @torch.no_grad()
+    def motions() -> dict[str, torch.Tensor]:
+        return {"initial": simulate(start), "target": target, "recovered": simulate(log_mu.exp())}
+
     def picture(path: Path, history: list[Row]) -> None:
         shown = [steps // 20, steps // 5, steps]
-        with torch.no_grad():
-            motions = {"initial": simulate(start), "target": target, "recovered": simulate(log_mu.exp())}
-        frames = {name: motion[shown] for name, motion in motions.items()}
+        frames = {name: motion[shown] for name, motion in motions().items()}
         viz.comparison(path, mesh.surface, frames, [k * TIME_STEP for k in shown], history, {"mu": TRUE_MU})
 
     return Problem(
@@ -71,6 +73,7 @@ def problem(settings: Settings) -> Problem:
         ],
         estimates=lambda: {"mu": log_mu.exp().item()},
         truth={"mu": TRUE_MU},
+        units={"mu": "Pa"},
         protocol={
             "vertices": vertices,
             "steps": steps,
@@ -81,6 +84,7 @@ def problem(settings: Settings) -> Problem:
             "start_mu": START_MU,
         },
         picture=picture,
+        animation=lambda path: viz.animation(path, mesh.surface, motions(), TIME_STEP),
     )
 
 

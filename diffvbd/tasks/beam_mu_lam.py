@@ -20,8 +20,8 @@ import torch
 
 import diffvbd as dv
 from diffvbd import losses, viz
+from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
-from diffvbd.tasks.runner import Problem, Settings, Stage
 
 TRUTH = {"mu": 800.0, "lam": 400.0}  # [Pa]
 START = (300.0, 150.0)
@@ -53,11 +53,13 @@ def problem(settings: Settings) -> Problem:
         target = simulate(*start.new_tensor([TRUTH["mu"], TRUTH["lam"]]))
     log_material = start.log().requires_grad_()
 
+    @torch.no_grad()
+    def motions() -> dict[str, torch.Tensor]:
+        return {"initial": simulate(*start), "target": target, "recovered": simulate(*log_material.exp())}
+
     def picture(path: Path, history: list[Row]) -> None:
         shown = [steps // 4, steps // 2, steps]
-        with torch.no_grad():
-            motions = {"initial": simulate(*start), "target": target, "recovered": simulate(*log_material.exp())}
-        frames = {name: motion[shown] for name, motion in motions.items()}
+        frames = {name: motion[shown] for name, motion in motions().items()}
         viz.comparison(path, mesh.surface, frames, [k * TIME_STEP for k in shown], history, TRUTH)
 
     return Problem(
@@ -73,6 +75,7 @@ def problem(settings: Settings) -> Problem:
         ],
         estimates=lambda: dict(zip(("mu", "lam"), log_material.exp().tolist(), strict=True)),
         truth=TRUTH,
+        units={"mu": "Pa", "lam": "Pa"},
         protocol={
             "vertices": vertices,
             "steps": steps,
@@ -83,6 +86,7 @@ def problem(settings: Settings) -> Problem:
             "kick": KICK,
         },
         picture=picture,
+        animation=lambda path: viz.animation(path, mesh.surface, motions(), TIME_STEP),
     )
 
 

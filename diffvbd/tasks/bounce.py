@@ -11,8 +11,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, viz
+from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
-from diffvbd.tasks.runner import Problem, Settings, Stage
 
 VOXEL = 0.05  # side of the target in pictures [m]; the distance is that to its center
 
@@ -106,20 +106,11 @@ def problem(
     first = {"offset": scene.tensor((0.0, 0.0, 0.0)), "velocity": scene.tensor(velocity)}
     now = {key: value.clone().requires_grad_(key in moves) for key, value in first.items()}
     squared = torch.zeros_like(first["offset"][0])
-    thrown = torch.full_like(torch.cat(list(first.values())), math.nan)  # what led to this squared distance
 
     def loss() -> Tensor:
         value = scene.squared_miss(**now)
-        with torch.no_grad():
-            squared.copy_(value)
-            thrown.copy_(torch.cat(list(now.values())))
+        squared.copy_(value.detach())
         return value
-
-    @torch.no_grad()
-    def estimates() -> Row:
-        if not torch.equal(thrown, torch.cat(list(now.values()))):
-            loss()
-        return {"distance": squared.sqrt().item()}
 
     @torch.no_grad()
     def findings(history: list[Row]) -> dict[str, float]:
@@ -164,7 +155,7 @@ def problem(
                 capturable=True,
             )
         ],
-        estimates=estimates,
+        estimates=lambda: {"distance": squared.sqrt().item()},
         units={"distance": "m"},
         protocol=scene.protocol() | {"velocity": velocity},
         findings=findings,

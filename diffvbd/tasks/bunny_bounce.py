@@ -15,7 +15,7 @@ from the path of 40 sweeps (a stiffer bunny needs more); floor, loss and end of 
 import diffvbd as dv
 from diffvbd.tasks import bounce
 from diffvbd.tasks.bounce import Bounce
-from diffvbd.tasks.runner import Problem, Settings
+from diffvbd.tasks.problem import Problem, Settings
 
 HEIGHT = 0.3  # of the feet above the floor at the release [m]
 VELOCITY = (1.2, -2.0, 0.2)  # at the start [m/s]

@@ -21,8 +21,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import viz
+from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
-from diffvbd.tasks.runner import Problem, Settings, Stage
 
 TRUE_MU, START_MU, LAM = 2000.0, 8000.0, 2000.0  # [Pa]
 SIDE, THICKNESS = 0.6, 0.01  # [m]

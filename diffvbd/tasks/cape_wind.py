@@ -23,8 +23,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, viz
+from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
-from diffvbd.tasks.runner import Problem, Settings, Stage
 
 TRUE_WIND = (2.5, 0.0, 1.5)  # [m/s^2]
 GRAVITY = (0.0, -9.81, 0.0)

@@ -25,8 +25,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import viz
+from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
-from diffvbd.tasks.runner import Problem, Settings, Stage
 
 TARGET_RADIUS = 0.45  # R [m]
 RADIUS = 0.42  # r [m]
@@ -84,7 +84,6 @@ def problem(settings: Settings, radius: float = RADIUS) -> Problem:
     velocity = (OUTWARD * torch.from_numpy(outward) + NOISE * noise).to(**like).requires_grad_()
     offset = torch.zeros((3, 3), **like, requires_grad=True)
     landed = torch.zeros((3, disk.num_vertices, 3), **like)
-    thrown = torch.full((2, 3, 3), torch.nan, **like)  # velocity and offset that led to it
 
     def simulate(save: Literal["all", "last"] = "last") -> Tensor:
         """Positions [m] of saved frames, shape [frames, 3, vertices of a disk, 3]."""
@@ -97,20 +96,12 @@ def problem(settings: Settings, radius: float = RADIUS) -> Problem:
 
     def loss() -> Tensor:
         end = simulate()[-1]
-        with torch.no_grad():
-            landed.copy_(end)
-            thrown.copy_(torch.stack([velocity, offset]))
+        landed.copy_(end.detach())
         return smooth_uncovered(end[:, rim], samples, sharpness)
 
     def anneal(iteration: int) -> None:
         share = iteration / max(1, iterations - 1)
         sharpness.fill_((SHARPNESS[0] + share * (SHARPNESS[1] - SHARPNESS[0])) / TARGET_RADIUS)
-
-    @torch.no_grad()
-    def estimates() -> Row:
-        if not torch.equal(thrown, torch.stack([velocity, offset])):
-            loss()
-        return {"uncovered": uncovered(landed[:, top], fine).item()}
 
     def picture(path: Path, history: list[Row]) -> None:
         with torch.no_grad():
@@ -119,6 +110,10 @@ def problem(settings: Settings, radius: float = RADIUS) -> Problem:
         shown = [int((heights > share * heights[0]).sum()) for share in (0.75, 0.25)] + [steps]
         surfaces = [disk.surface + k * disk.num_vertices for k in range(3)]
         viz.landing(path, surfaces, motion[shown], [k * TIME_STEP for k in shown], TARGET_RADIUS, history)
+
+    @torch.no_grad()
+    def animation(path: Path) -> None:
+        viz.animation(path, model.surface.cpu().numpy(), {"recovered": simulate("all").flatten(1, 2)}, TIME_STEP)
 
     return Problem(
         name="cover-the-spot",
@@ -133,7 +128,7 @@ def problem(settings: Settings, radius: float = RADIUS) -> Problem:
                 capturable=True,
             )
         ],
-        estimates=estimates,
+        estimates=lambda: {"uncovered": uncovered(landed[:, top], fine).item()},
         protocol={
             "radius": radius,
             "target_radius": TARGET_RADIUS,
@@ -155,6 +150,7 @@ def problem(settings: Settings, radius: float = RADIUS) -> Problem:
             "sharpness": SHARPNESS,
         },
         picture=picture,
+        animation=animation,
     )
 
 

@@ -33,8 +33,9 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import losses, viz
 from diffvbd.tasks.newton import Newton
+from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
-from diffvbd.tasks.runner import Problem, Settings, Stage, solve
+from diffvbd.tasks.runner import solve
 
 TRUTH = {"mu": 1500.0, "lam": 800.0}  # [Pa]
 START = (5000.0, 3000.0)

@@ -4,7 +4,7 @@ The scene, the two stages and the choices are those of `dress`; everything is ob
 """
 
 from diffvbd.tasks import dress
-from diffvbd.tasks.runner import Problem, Settings
+from diffvbd.tasks.problem import Problem, Settings
 
 
 def problem(settings: Settings) -> Problem:

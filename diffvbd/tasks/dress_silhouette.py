@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from diffvbd.tasks import dress
-from diffvbd.tasks.runner import Problem, Settings
+from diffvbd.tasks.problem import Problem, Settings
 
 HEIGHTS = 21
 WINDOW = 0.03  # standard deviation [m]

@@ -31,8 +31,8 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import viz
 from diffvbd.tasks.cape_mu import weights
+from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
-from diffvbd.tasks.runner import Problem, Settings, Stage
 
 TRUE_SIZE, START_SIZE = 0.910, 0.45
 NECK, THICKNESS = 1.45, 0.01  # [m]

@@ -30,8 +30,8 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import losses, viz
 from diffvbd.tasks.cape_wind import hanging
+from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
-from diffvbd.tasks.runner import Problem, Settings, Stage
 
 WINDOWS = 8
 STRENGTH = 16.0  # of the reference wind [m/s^2]
@@ -98,7 +98,7 @@ def problem(settings: Settings) -> Problem:
             )
         ],
         estimates=lambda: {"deviation": deviation()},
-        units={"deviation": "m/s^2"},
+        units={"deviation": "m/s^2", "loss": "m^2"},
         protocol={
             "reference_wind": true.tolist(),
             "gravity": GRAVITY,

@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 
 from diffvbd import losses, viz
+from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
-from diffvbd.tasks.runner import Problem, Settings, Stage
 from diffvbd.tasks.scene import Observation
 
 WOLFE = "strong_wolfe"

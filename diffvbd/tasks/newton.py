@@ -1,5 +1,6 @@
 """Newton's method for one number, from first derivatives alone."""
 
+import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -10,21 +11,20 @@ from torch import Tensor
 class Newton(torch.optim.Optimizer):
     """Damped Newton steps for a parameter of one number whose second derivative comes from two gradients.
 
-    A step evaluates at p and at p + probe, takes f'' from the difference of f', goes to p - damping f' / |f''|, by at
-    most `limit`, and keeps to f' where f'' says nothing. The absolute value makes it go downhill where f bends down.
+    A step evaluates at p and at p + probe, takes f'' from the difference of f', goes to p - f' / |f''|, by at most
+    `limit`, and goes by `limit` where f'' says nothing. The absolute value makes it go downhill where f bends down.
 
     Args:
         parameters: One tensor with one element.
         probe: Distance to the second gradient.
         limit: Longest step.
-        damping: Share of the Newton step that is taken.
 
     Raises:
         ValueError: not one parameter of one element.
     """
 
-    def __init__(self, parameters: Iterable[Tensor], probe: float, limit: float, damping: float = 1.0) -> None:
-        super().__init__(parameters, {"probe": probe, "limit": limit, "damping": damping})
+    def __init__(self, parameters: Iterable[Tensor], probe: float, limit: float) -> None:
+        super().__init__(parameters, {"probe": probe, "limit": limit})
         self.parameters = [p for group in self.param_groups for p in group["params"]]
         if len(self.parameters) != 1 or self.parameters[0].numel() != 1:
             raise ValueError(f"parameters: expected one of one element, got {[list(p.shape) for p in self.parameters]}")
@@ -43,7 +43,7 @@ class Newton(torch.optim.Optimizer):
         loss, first = slope()
         parameter.add_(chosen["probe"])
         bend = (slope()[1] - first) / chosen["probe"]
-        newton = chosen["damping"] * first / abs(bend) if bend else float("inf") * first
+        newton = first / abs(bend) if bend else math.copysign(math.inf, first)
         limited = max(-chosen["limit"], min(chosen["limit"], newton)) if first else 0.0
         parameter.copy_(start - limited)
         return loss

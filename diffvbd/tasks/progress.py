@@ -48,13 +48,14 @@ class Progress:
             print(file=sys.stderr)
 
 
-def table_of(start: Mapping[str, float], estimates: Row, truth: Row, errors: Row) -> str:
+def table_of(start: Mapping[str, float], estimates: Row, truth: Row, errors: Row, units: Mapping[str, str]) -> str:
     """Start, true and recovered values as aligned text."""
     rows = [("parameter", "start", "true", "recovered", "relative error")]
     for name, value in estimates.items():
         true = f"{truth[name]:.6g}" if name in truth else "-"
         error = f"{100 * errors[name]:.2g} %" if name in errors else "-"
-        rows.append((name, f"{start[name]:.6g}", true, f"{value:.6g}", error))
+        label = f"{name} [{units[name]}]" if name in units else name
+        rows.append((label, f"{start[name]:.6g}", true, f"{value:.6g}", error))
     widths = [max(len(row[k]) for row in rows) for k in range(5)]
     lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
     lines.insert(1, "  ".join("-" * width for width in widths))

@@ -5,130 +5,42 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from diffvbd.tasks.problem import Problem, Result, Settings, Stage, check, check_device, estimates_of
 from diffvbd.tasks.progress import Progress, Row, summary, table_of, versions
 
 LISTED = 1000  # numbers of a parameter that log.json lists; larger ones go to parameters.pt
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What the user chooses about a run.
-
-    Attributes:
-        out: Directory for log.json, picture.png, animation.gif, parameters.pt (if there are more than LISTED numbers)
-            and state.pt (which exists only while a run is unfinished).
-        device: A torch device.
-        seed: Seed of torch's generators.
-        quick: Ask the task for a small version that runs in seconds; it leaves the animation out.
-    """
-
-    out: Path
-    device: str = "cpu"
-    seed: int = 0
-    quick: bool = False
-
-
-@dataclass
-class Stage:
-    """One minimisation. A problem has one, or several that follow each other.
-
-    Attributes:
-        loss: Scalar loss at the present parameters.
-        iterations: Most loss evaluations.
-        learning_rate: First rate of Adam; it falls to 0 along a cosine.
-        optimizer: Makes another optimiser; it keeps its rate.
-        moves: Names of the parameters that it moves; default: all of the problem's.
-        tolerance: The stage ends once the loss is at most this fraction of its first loss.
-        gradient_tolerance: It also ends once the norm of the gradient is at most this fraction of the first one.
-        before: Called with the number of each iteration of the stage before its loss, to change tensors that it reads.
-        criterion: Key of the history by whose lowest value the best iteration is chosen, and by the loss among equals;
-            for losses that change on the way.
-        clip: Longest gradient, over all parameters together; longer ones are scaled down to it. None: no limit.
-        capturable: On a CUDA device loss and gradient may be captured in one CUDA graph, which is replayed: the loss
-            reads nothing but tensors that stay where they are, and never waits for the device.
-        name: For the log.
-    """
-
-    loss: Callable[[], Tensor]
-    iterations: int
-    learning_rate: float = 0.15
-    optimizer: Callable[[Iterable[Tensor]], torch.optim.Optimizer] | None = None
-    moves: Sequence[str] | None = None
-    tolerance: float = 0.0
-    gradient_tolerance: float = 0.0
-    before: Callable[[int], object] | None = None
-    criterion: str = "loss"
-    clip: float | None = None
-    capturable: bool = False
-    name: str = ""
-
-
-@dataclass
-class Problem:
-    """An inverse problem.
-
-    Attributes:
-        name: Name of the task.
-        parameters: Leaf tensors that the optimisers move; `solve` leaves the best ones in them.
-        stages: What is minimised, one after another, each from the best parameters of the one before.
-        estimates: The quantities to report, from the present parameters.
-        truth: Known values of some estimates, for the table.
-        units: Units of estimates, for tables.
-        protocol: Numbers that define the problem, for the log.
-        findings: Called once with the history at the end; what it returns is logged as "findings".
-        picture: Draws the result, given a path and the history; needs matplotlib.
-        animation: Writes the motion as a .gif, given a path; needs matplotlib.
-    """
-
-    name: str
-    parameters: dict[str, Tensor]
-    stages: Sequence[Stage]
-    estimates: Callable[[], Row]
-    truth: Row = field(default_factory=dict)
-    units: dict[str, str] = field(default_factory=dict)
-    protocol: dict[str, Any] = field(default_factory=dict)
-    findings: Callable[[list[Row]], dict[str, Any]] | None = None
-    picture: Callable[[Path, list[Row]], object] | None = None
-    animation: Callable[[Path], object] | None = None
-
-
-@dataclass
-class Result:
-    """What `solve` found: the best row of the last stage, and every row."""
-
-    best: Row
-    history: list[Row]
-    estimates: Row
-    errors: Row
-    converged: bool
-    files: list[Path]
-    findings: dict[str, Any] = field(default_factory=dict)
 
 
 def solve(problem: Problem, settings: Settings) -> Result:
     """Minimise the losses of all stages; of each stage the parameters with the lowest criterion win.
 
     After every step of an optimiser the whole state is on disk, so the same call continues an interrupted run with the
-    very numbers the uninterrupted one would have had. A state of other settings or of another protocol is ignored.
+    very numbers the uninterrupted one would have had. A state of other settings, of another protocol or of a first loss
+    that is no longer the same number is ignored.
 
     Returns:
         The result; log.json, picture.png and animation.gif (where matplotlib is installed) are in settings.out.
 
     Raises:
         ArithmeticError: the loss or a gradient is not finite.
+        ValueError, TypeError: the problem is not well formed; or the device is not there.
     """
+    check(problem)
+    check_device(settings.device)
     torch.manual_seed(settings.seed)
     settings.out.mkdir(parents=True, exist_ok=True)
     run = _Run(problem, settings)
     run.resume()
+    if run.cuda:
+        torch.cuda.reset_peak_memory_stats(settings.device)
     progress = Progress(problem.name, sum(stage.iterations for stage in problem.stages), done=len(run.history))
     begun = time.perf_counter() - (run.history[-1]["seconds"] if run.history else 0.0)
     while run.at < len(problem.stages):
@@ -183,11 +95,12 @@ def _gradient(run: "_Run") -> Callable[[], Tensor]:
         loss.backward(inputs=run.moved)
         return loss.detach()
 
-    if not (stage.capturable and torch.device(run.settings.device).type == "cuda"):
+    if not (stage.capturable and run.cuda):
         return gradient
     if stage.before:
         stage.before(len(run.rows))
-    return _captured(gradient)
+    with torch.cuda.device(run.settings.device):
+        return _captured(gradient)
 
 
 def _captured(run: Callable[[], Tensor], warm: int = 2) -> Callable[[], Tensor]:
@@ -223,6 +136,7 @@ class _Run:
         self.state = settings.out / "state.pt"
         choices = {key: value for key, value in asdict(settings).items() if key != "out"}
         self.identity = {"task": problem.name, "settings": choices, "protocol": problem.protocol}
+        self.cuda = torch.device(settings.device).type == "cuda"
         self._enter(0)
 
     def _enter(self, stage: int) -> None:
@@ -257,10 +171,8 @@ class _Run:
         if not self.rows:
             return False
         first, last, stage = self.rows[0], self.rows[-1], self.stage
-        return (
-            last["loss"] <= stage.tolerance * first["loss"]
-            or last["gradient_norm"] <= stage.gradient_tolerance * first["gradient_norm"]
-        )
+        limits = {"loss": stage.tolerance, "gradient_norm": stage.gradient_tolerance}
+        return any(limit > 0 and last[key] <= limit * first[key] for key, limit in limits.items())
 
     @property
     def stage_ended(self) -> bool:
@@ -284,11 +196,12 @@ class _Run:
 
     def save(self) -> None:
         state = {
-            "identity": json.dumps(self.identity),
+            "identity": self._fingerprint(),
             "history": self.history,
             "stage": (self.at, self.first, self.best),
             "best_parameters": self.best_parameters,
             "parameters": {name: p.detach() for name, p in self.problem.parameters.items()},
+            "state": self.problem.state,
             "optimizer": self.optimizer.state_dict(),
             "schedule": self.schedule.state_dict() if self.schedule else None,
             "random": torch.get_rng_state(),
@@ -297,22 +210,53 @@ class _Run:
         self.write_log()
 
     def resume(self) -> None:
+        """Continue where the file says, if it is of the same problem."""
         if not self.state.exists():
             return
-        state = torch.load(self.state, map_location=self.settings.device)
-        if state["identity"] != json.dumps(self.identity):
-            print(f"{self.state} belongs to other settings; starting anew", file=sys.stderr)
+        try:
+            state = torch.load(self.state, map_location=self.settings.device)
+            same = state["identity"] == self._fingerprint() and state["history"][0]["loss"] == self._first_loss()
+        except Exception as error:  # torch.load raises errors of many kinds
+            same, state = False, {}
+            print(f"{self.state} cannot be read ({type(error).__name__})", file=sys.stderr)
+        if not same:
+            print(f"{self.state} does not belong to this run; starting anew", file=sys.stderr)
             return
         self.history = state["history"]
         self._enter(state["stage"][0])
         _, self.first, self.best = state["stage"]
         self.best_parameters = state["best_parameters"]
         _assign(self.problem.parameters, state["parameters"])
+        _assign(self.problem.state, state["state"])
         self.optimizer.load_state_dict(state["optimizer"])
         if self.schedule:
             self.schedule.load_state_dict(state["schedule"])
         torch.set_rng_state(state["random"].cpu())
         print(f"continuing after {len(self.history)} iterations", file=sys.stderr)
+
+    def _fingerprint(self) -> str:
+        """What must be the same for a run to be continued, besides the first loss."""
+        numbers = (
+            "name",
+            "iterations",
+            "learning_rate",
+            "moves",
+            "tolerance",
+            "gradient_tolerance",
+            "criterion",
+            "clip",
+        )
+        stages = [{key: getattr(stage, key) for key in numbers} for stage in self.problem.stages]
+        known = versions(self.settings.device)
+        libraries = {key: known[key] for key in ("diffvbd", "torch", "device")}
+        return json.dumps(self.identity | {"stages": stages, "versions": libraries}, default=str)
+
+    @torch.no_grad()
+    def _first_loss(self) -> float:
+        stage = self.problem.stages[0]
+        if stage.before:
+            stage.before(0)
+        return stage.loss().item()
 
     def write_log(self, **result: Any) -> Path:
         stages = [stage.name for stage in self.problem.stages]
@@ -323,10 +267,9 @@ class _Run:
         return log
 
     def finish(self) -> Result:
-        problem = self.problem
-        estimates = problem.estimates()
+        problem, best = self.problem, self.history[self.last_best]
+        estimates = estimates_of(best)
         errors = {name: abs(estimates[name] / true - 1) for name, true in problem.truth.items()}
-        best = self.history[self.last_best]
         findings = problem.findings(self.history) if problem.findings else {}
         listed = {name: p.tolist() for name, p in problem.parameters.items() if p.numel() <= LISTED}
         log = self.write_log(
@@ -338,6 +281,7 @@ class _Run:
             units=problem.units,
             relative_error=errors,
             findings=findings,
+            **self._memory(),
         )
         result = Result(best, self.history, estimates, errors, self.last_converged, [log], findings)
         if listed.keys() != problem.parameters.keys():
@@ -347,6 +291,10 @@ class _Run:
         self._draw(result)
         self.state.unlink(missing_ok=True)
         return result
+
+    def _memory(self) -> dict[str, float]:
+        """What the run has reserved of a CUDA device at most."""
+        return {"peak_memory_gb": torch.cuda.max_memory_reserved(self.settings.device) / 1e9} if self.cuda else {}
 
     def _draw(self, result: Result) -> None:
         out, problem = self.settings.out, self.problem
@@ -361,13 +309,14 @@ class _Run:
             print(f"no picture: {missing}", file=sys.stderr)
 
 
-def table(problem: Problem, start: Mapping[str, float], result: Result) -> str:
+def table(problem: Problem, result: Result) -> str:
     """Start, true and recovered values as aligned text, and how the run ended."""
     seconds, first = result.history[-1]["seconds"], result.history[0]["loss"]
     how = "converged" if result.converged else "stopped"
-    return table_of(start, result.estimates, problem.truth, result.errors) + (
-        f"\n{how} after {len(result.history)} iterations in {seconds:.0f} s; "
-        f"loss {first:.3g} -> {result.best['loss']:.3g} (lowest at iteration {result.best['iteration']:.0f})"
+    start = estimates_of(result.history[0])
+    return table_of(start, result.estimates, problem.truth, result.errors, problem.units) + (
+        f"\n{how} after {len(result.history)} evaluations in {seconds:.0f} s; "
+        f"loss {first:.3g} -> {result.best['loss']:.3g} (lowest at evaluation {result.best['iteration']:.0f})"
     )
 
 
