@@ -129,3 +129,14 @@ def cell(value: Any) -> str:
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     lines = [header, ["---"] * len(header), *([cell(v) for v in row] for row in rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def place(environment: dict[str, Any]) -> str:
+    """The GPU of a run, or its processor."""
+    device = environment.get("device") or "cpu"
+    return (environment.get("cpu") or "unknown processor") if device == "cpu" else device
+
+
+def commit(environment: dict[str, Any]) -> str:
+    known = environment.get("commit")
+    return "unknown" if not known else known[:10] + (" with changes" if environment.get("dirty") else "")

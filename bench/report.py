@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bench import plots, tasks
-from bench.common import RESULTS, markdown_table
+from bench.common import RESULTS, commit, markdown_table, place
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "performance.md"
@@ -78,17 +78,6 @@ def machine(environment: dict[str, Any]) -> str:
         where = f"{known['device']}, driver {known.get('driver', 'unknown')}"
     versions = ", ".join(f"{key} {known[key]}" for key in ("python", "torch", "cuda", "diffvbd") if key in known)
     return f"{where}; {versions}; {known.get('date', 'no date')}."
-
-
-def place(environment: dict[str, Any]) -> str:
-    """The GPU of a run, or its processor."""
-    device = environment.get("device") or "cpu"
-    return (environment.get("cpu") or "unknown processor") if device == "cpu" else device
-
-
-def commit(environment: dict[str, Any]) -> str:
-    known = environment.get("commit")
-    return "unknown" if not known else known[:10] + (" with changes" if environment.get("dirty") else "")
 
 
 # --- docs/results.md --------------------------------------------------------------------------------------------------

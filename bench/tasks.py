@@ -8,12 +8,14 @@ report` makes docs/tasks.md of them.
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from bench.common import RESULTS, device_suffix, environment, markdown_table
+from bench.common import RESULTS, commit, device_suffix, environment, markdown_table, place
 from bench.paper import TASKS as PAPER
 from diffvbd.tasks import TASKS, Settings, solve
 
@@ -30,34 +32,29 @@ def main(only: str | None, device: str, seeds: str, options: str, out: Path | No
     if quick and out is None:
         print("--out: expected a folder: quick runs are no results", file=sys.stderr)
         return 2
-    given = dict(text.split("=") for text in options.split(",") if text)
+    written = dict(text.partition("=")[::2] for text in options.split(",") if text)
+    chosen = {name: TASKS[name].chosen(written) for name in names}
     logs, images = (RESULTS / "tasks", IMAGES) if out is None else (out, out)
     unfinished = ROOT / "runs" / "bench" if out is None else out / "unfinished"
     for name in names:
         for seed in (int(s) for s in seeds.split(",")):
-            stem = "-".join([name + device_suffix(device), *(k + v for k, v in given.items())])
-            stem += f"-seed{seed}" if seed else ""
-            folder = unfinished / stem
-            settings = Settings(folder, device, seed, quick)
-            chosen = {key: TASKS[name].options[key].kind(value) for key, value in given.items()}
-            solve(TASKS[name].build(settings, **chosen), settings)
-            log = {"environment": environment(device), "options": chosen}
-            log |= json.loads((folder / "log.json").read_text(encoding="utf-8"))
+            parts = [name + device_suffix(device), *(k + re.sub(r"\W+", "_", v) for k, v in written.items())]
+            stem = "-".join(parts) + (f"-seed{seed}" if seed else "")
+            settings = Settings(unfinished / stem, device, seed, quick)
+            log = {"environment": environment(device), "options": written}
+            problem = TASKS[name].build(settings, **chosen[name])
+            problem.animation = None
+            solve(problem, settings)
+            log |= json.loads((settings.out / "log.json").read_text(encoding="utf-8"))
             logs.mkdir(parents=True, exist_ok=True)
             (logs / f"{stem}.json").write_text(json.dumps(log, indent=1) + "\n", encoding="utf-8")
-            if not (seed or chosen):
-                keep_picture(folder, name, images, device)
+            # where a task runs on both, the picture is that of the CPU
+            if not (seed or written) and (device == "cpu" or not (logs / f"{name}.json").exists()):
+                images.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(settings.out / "picture.png", picture_of(name, images))
             print(f"wrote {logs / stem}.json", file=sys.stderr)
-            shutil.rmtree(folder)
+            shutil.rmtree(settings.out)
     return 0
-
-
-def keep_picture(folder: Path, name: str, images: Path, device: str) -> None:
-    target = picture_of(name, images)
-    # where a task runs on both, the picture is that of the CPU
-    if (folder / "picture.png").exists() and (device == "cpu" or not target.exists()):
-        images.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(folder / "picture.png", target)
 
 
 def picture_of(name: str, images: Path) -> Path:
@@ -82,7 +79,7 @@ numbers, bit by bit.
 def page(folder: Path, images: Path, root: Path) -> str:
     """The page of all logs in a folder, with pictures from `images`, which lie below the page's folder `root`."""
     logs = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))}
-    header = ("task", "variables", "the paper", "iterations", "ours", "iterations", "CPU [s]", "GPU [s]", "bar met")
+    header = ("task", "variables", "the paper", "iterations", "ours", "evaluations", "CPU [s]", "GPU [s]", "bar met")
     rows, parts = [], []
     for name in PAPER:
         runs = {key: log for key, log in logs.items() if log["task"] == name}
@@ -90,7 +87,8 @@ def page(folder: Path, images: Path, root: Path) -> str:
             continue
         main_run = runs.get(name) or runs.get(f"{name}-cuda") or next(iter(runs.values()))
         bars, paper = PAPER[name].bars, PAPER[name]
-        met = [figure(run, key) <= bar for run in runs.values() if not run["options"] for key, bar in bars.items()]
+        reached = [(figure(run, key), bar) for run in runs.values() if not run["options"] for key, bar in bars.items()]
+        met = [value is not None and value <= bar for value, bar in reached]
         rows.append((f"[{name}](#{name})", paper.variables, paper.outcome, paper.iterations, outcome(main_run),
                      len(main_run["history"]), seconds(runs.get(name)), seconds(runs.get(f"{name}-cuda")),
                      all(met) if met else None))  # fmt: skip
@@ -106,32 +104,41 @@ def section(name: str, runs: dict[str, Any], main_run: dict[str, Any], images: P
     rows = []
     for run in runs.values():
         options = ", ".join(f"{key} {value}" for key, value in run["options"].items())
-        e, first = run["environment"], run["history"][0]
-        where = e["device"] if e["device"] != "cpu" else f"{e['cpu']}, {e['threads']} threads"
-        commit = (e["commit"] or "unknown")[:10]
+        e, last = run["environment"], run["history"][-1].get("stage", 0)
+        # of the last stage: those before it may have other losses
+        first = next(row for row in run["history"] if row.get("stage", 0) == last)
+        where = place(e) + (f", {e['threads']} threads" if e["device"] == "cpu" else "")
         rows.append((where, options or "-", run["settings"]["seed"], len(run["history"]), first["loss"],
-                     run["best"]["loss"], outcome(run), seconds(run), e["torch"], e["date"], commit))  # fmt: skip
-    header = ("on", "options", "seed", "iterations", "first loss", "best loss", "result", "seconds", "torch", "date",
+                     run["best"]["loss"], outcome(run), seconds(run), e["torch"], e["date"], commit(e)))  # fmt: skip
+    header = ("on", "options", "seed", "evaluations", "first loss", "best loss", "result", "seconds", "torch", "date",
               "commit")  # fmt: skip
     text.append(markdown_table(header, rows))
-    found = [(key, plain(value)) for key, value in main_run["findings"].items() if not isinstance(value, (list, dict))]
+    found = list(flat(main_run["findings"]))
     if found:
         text.append(markdown_table(("finding", "value"), found))
     return "\n".join(text)
+
+
+def flat(values: dict[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Numbers of nested findings with their names; lists are left to the log."""
+    for key, value in values.items():
+        name = f"{before}{key.replace('_', ' ')}"
+        if isinstance(value, dict):
+            yield from flat(value, f"{name}: ")
+        elif not isinstance(value, list):
+            yield name, f"{value:.4g}" if isinstance(value, float) else value
 
 
 def seconds(run: dict[str, Any] | None) -> float | None:
     return None if run is None else run["history"][-1]["seconds"]
 
 
-def figure(run: dict[str, Any], key: str) -> float:
-    """A number of a log: the loss, a relative error, an estimate or a finding."""
-    if key == "loss":
-        return run["best"]["loss"]
-    for kind in ("relative_error", "estimates", "findings"):
-        if key in run[kind]:
-            return run[kind][key]
-    raise KeyError(f"{run['task']}: no {key} in its log")
+def figure(run: dict[str, Any], key: str) -> float | None:
+    """A number of a log: the loss, a relative error, an estimate, a finding, or one of the log itself."""
+    for values in ({"loss": run["best"]["loss"]}, run["relative_error"], run["estimates"], run["findings"], run):
+        if key in values:
+            return values[key]
+    return None
 
 
 def outcome(run: dict[str, Any]) -> str:
@@ -141,13 +148,9 @@ def outcome(run: dict[str, Any]) -> str:
     for key in keys:
         value = figure(run, key)
         if key in run["relative_error"]:
-            shown.append(f"{key} {100 * value:.2g} %")
-        else:
+            shown.append(f"{key} {100 * run['relative_error'][key]:.2g} %")
+        elif value is not None:
             first = run["history"][0].get(key)
             came = f"{first:.3g} -> " if isinstance(first, float) else ""
             shown.append(f"{key.replace('_', ' ')} {came}{value:.3g} {run['units'].get(key, '')}".rstrip())
     return ", ".join(shown)
-
-
-def plain(value: Any) -> Any:
-    return f"{value:.4g}" if isinstance(value, float) else value

@@ -64,8 +64,8 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("name", choices=sorted(TASKS), metavar="NAME", help="a task that `diffvbd list` names")
     run.add_argument("--quick", action="store_true", help="a small version that takes seconds")
     _add_run_options(run, "runs/NAME")
-    for name, (kind, texts) in sorted(_task_options().items()):
-        run.add_argument(f"--{name}", type=kind, help="; ".join(texts))
+    for name, texts in sorted(_task_options().items()):
+        run.add_argument(f"--{name}", help="; ".join(texts))
     run.set_defaults(command=_run)
 
     listing = commands.add_parser("list", help="list the shipped inverse problems")
@@ -146,9 +146,7 @@ def _run(options: argparse.Namespace) -> None:
     task = TASKS[options.name]
     chosen = {name: getattr(options, name.replace("-", "_")) for name in _task_options()}
     given = {name: value for name, value in chosen.items() if value is not None}
-    if unknown := sorted(given.keys() - task.options.keys()):
-        raise ValueError(f"--{unknown[0]}: {options.name} has no such option")
-    given = {name.replace("-", "_"): value for name, value in given.items()}
+    given = task.chosen(given)
     _solve(task.build(settings, **given), settings)
 
 
@@ -219,12 +217,12 @@ def _info(options: argparse.Namespace) -> None:
         print(f"{name:10} {value}")
 
 
-def _task_options() -> dict[str, tuple[Any, list[str]]]:
-    """Options of single tasks: type, and what each says about it."""
-    found: dict[str, tuple[Any, list[str]]] = {}
+def _task_options() -> dict[str, list[str]]:
+    """Options of single tasks, and what each task says about it."""
+    found: dict[str, list[str]] = {}
     for task_name, task in sorted(TASKS.items()):
         for name, option in task.options.items():
-            found.setdefault(name, (option.kind, []))[1].append(f"{task_name}: {option.help}")
+            found.setdefault(name, []).append(f"{task_name}: {option.help}")
     return found
 
 

@@ -8,7 +8,7 @@ import pytest
 from bench import report, tasks
 from bench.__main__ import main
 from bench.paper import TASKS as PAPER
-from diffvbd.tasks import TASKS
+from diffvbd.tasks import TASKS, Settings
 
 
 def test_a_run_is_kept_with_its_machine_and_shown(tmp_path: Path) -> None:
@@ -33,10 +33,36 @@ def test_a_run_is_kept_with_its_machine_and_shown(tmp_path: Path) -> None:
     assert row.endswith("| no |")
 
 
-def test_options_are_part_of_the_name(tmp_path: Path) -> None:
-    arguments = ["tasks", "--only", "cover-the-spot", "--options", "radius=0.3", "--quick", "--out", str(tmp_path)]
-    with pytest.raises(ValueError, match="radius: expected more than"):
-        main(arguments)
+def test_options_are_part_of_the_name_and_do_not_count_for_the_bar(tmp_path: Path) -> None:
+    run = ["tasks", "--quick", "--out", str(tmp_path), "--only"]
+    assert main([*run, "million-cubes", "--options", "bodies=8,iterations=2", "--seeds", "3"]) == 0
+    stem = "million-cubes-bodies8-iterations2-seed3"
+    log = json.loads((tmp_path / f"{stem}.json").read_text())
+    assert log["options"] == {"bodies": "8", "iterations": "2"} and log["protocol"]["bodies"] == 8
+    page = tasks.page(tmp_path, tmp_path, tmp_path)
+    (row,) = [line for line in page.splitlines() if line.startswith("| [million-cubes]")]
+    assert row.endswith("| - |") and "bodies 8, iterations 2 | 3 | 4 |" in page
+    for options, expected in (
+        ("bodies=many", "--bodies: expected int, got 'many'"),
+        ("radius=1", "--radius: expected"),
+    ):
+        with pytest.raises(ValueError, match=expected):
+            main([*run, "million-cubes", "--options", options])
+
+
+def test_every_bar_is_about_a_number_of_the_log(tmp_path: Path) -> None:
+    for name, paper in PAPER.items():
+        problem = TASKS[name].build(Settings(tmp_path, quick=True))
+        problem.stages[0].loss()
+        known = {"loss", *problem.truth, *problem.estimates()}
+        if name == "million-cubes":  # the others are findings of a whole run, and the memory of a GPU
+            known |= {
+                "mean_error_without_contact",
+                "mean_error_with_contact",
+                "seconds_per_iteration",
+                "peak_memory_gb",
+            }
+        assert set(paper.bars) <= known, name
 
 
 @pytest.mark.parametrize("arguments", [["--only", "beam"], ["--only", "beam-mu", "--quick"]])

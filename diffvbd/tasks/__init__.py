@@ -18,7 +18,9 @@ from diffvbd.tasks import (
     dress_size,
     fit_real_mesh,
     flag_wind,
+    learn_controller,
     million_cubes,
+    throw,
 )
 from diffvbd.tasks.problem import Problem, Result, Settings, Stage
 from diffvbd.tasks.runner import solve, table
@@ -39,6 +41,23 @@ class Task:
     summary: str
     build: Callable[..., Problem]
     options: dict[str, Option] = field(default_factory=dict)
+
+    def chosen(self, texts: dict[str, str]) -> dict[str, Any]:
+        """Keywords of `build` from options as they are written on a command line.
+
+        Raises:
+            ValueError: an option that the task has not, or a value that is not of its kind.
+        """
+        if unknown := sorted(texts.keys() - self.options.keys()):
+            raise ValueError(f"--{unknown[0]}: expected an option of the task ({', '.join(self.options) or 'none'})")
+        found = {}
+        for name, text in texts.items():
+            try:
+                found[name.replace("-", "_")] = self.options[name].kind(text)
+            except ValueError:
+                kind = getattr(self.options[name].kind, "__name__", "value")
+                raise ValueError(f"--{name}: expected {kind}, got {text!r}") from None
+        return found
 
 
 TASKS = {
@@ -70,6 +89,7 @@ TASKS = {
         },
     ),
     "flag-wind": Task("wind in eight windows that moves a flag as observed", flag_wind.problem),
+    "learn-controller": Task("train a network that drives a soft arm to where it must be", learn_controller.problem),
     "million-cubes": Task(
         "launch a million small cubes that meet in a ring at one moment",
         million_cubes.problem,
@@ -79,6 +99,7 @@ TASKS = {
             "iterations": Option(int, "of each of the two stages (default 40)"),
         },
     ),
+    "throw": Task("throw a soft ball into a box with a stretched sheet", throw.problem),
 }
 
 __all__ = ["TASKS", "Option", "Problem", "Result", "Settings", "Stage", "Task", "solve", "table"]

@@ -6,6 +6,7 @@ from diffvbd.viz.comparison import comparison
 from diffvbd.viz.drawing import Scenery, box, capsule, draw, floor
 from diffvbd.viz.field import field
 from diffvbd.viz.landing import landing
+from diffvbd.viz.learning import learning
 from diffvbd.viz.paths import paths
 
 __all__ = [
@@ -20,5 +21,6 @@ __all__ = [
     "field",
     "floor",
     "landing",
+    "learning",
     "paths",
 ]

@@ -1,0 +1,259 @@
+"""Train a network to drive a soft arm, by gradients through the simulation (a task that the paper does not have).
+
+A soft column of 0.4 m stands on a cart. The cart moves along the ground with an acceleration of at most 6 m/s^2 along
+each axis, which a network with one hidden layer of 32 tanh units chooses at every step from what it sees: tip and cart
+relative to the target, their velocities, and the time. The arm starts with a swing; after 0.75 s its tip must be at a
+target 0.15 to 0.35 m away, and stay there for another 0.25 s. Training runs 64 scenes in one batch, each with its own
+target and swing, and minimises the mean squared distance from tip to target over the last 0.25 s of all scenes. The
+findings report the same for 64 scenes that the training has not seen.
+
+The same network from the same start is then trained by CMA-ES, which needs no gradient, for as many seconds as the
+gradient took. A generation is one batch of 21 networks in 64 scenes, without tapes. This needs the package cma, and how
+far it gets depends on the speed of the machine.
+
+Choices: 28 vertices; 1000 kg/m^3; mu = lam = 4e4 Pa, so soft that the column leans far over when the cart speeds up;
+h = 1/60 s; K = 16 sweeps. Targets are as high as the column stands, or a tip would reach them lying down. The cart is
+the prescribed motion of the column's foot: x and v are all the state there is.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+import diffvbd as dv
+from diffvbd import viz
+from diffvbd.tasks.problem import Problem, Settings, Stage
+from diffvbd.tasks.progress import Row
+
+SIZE = (0.08, 0.4, 0.08)  # [m]
+DENSITY = 1000.0  # [kg/m^3]
+MU = LAM = 4e4  # [Pa]
+TIME_STEP, SWEEPS = 1 / 60, 16  # [s]
+STEPS, HELD = 60, 15  # of a motion, and of its end, where the tip must be at the target
+SCENES = 64
+DISTANCE = (0.15, 0.35)  # from the tip to its target, along the ground [m]
+HEIGHT = 0.39  # of the targets; the weight of the column shortens it [m]
+SWING = (0.0, 0.5)  # first velocity of the tip [m/s]
+ACCELERATION = 6.0  # largest of the cart along an axis [m/s^2]
+HIDDEN = 32
+LENGTH, SPEED = 0.2, 1.0  # [m], [m/s]; the network sees multiples of them
+NEAR = 0.02  # a scene in which the tip is closer than this [m], root mean square, counts as reached
+SPREAD = 0.3  # first standard deviation of CMA-ES; for seed 0 the best of 0.03, 0.1, 0.3 and 1
+SHOWN = 4  # scenes in pictures
+
+Scenes = tuple[Tensor, Tensor]  # targets [m] and first velocities of the tips [m/s] along the ground, shape [scenes, 2]
+Policy = Callable[[Tensor], Tensor]  # from what is seen, shape [..., scenes, 9], to what is done, [..., scenes, 2]
+
+
+def problem(settings: Settings) -> Problem:
+    scenes, iterations = (8, 40) if settings.quick else (SCENES, 150)
+    mesh = dv.mesh.box((2, 7, 2), SIZE).translate((-SIZE[0] / 2, 0.0, -SIZE[2] / 2))
+    height = mesh.points[:, 1]
+    model = dv.Model(mesh, density=DENSITY, pinned=height == 0.0).to(settings.device)
+    like = {"dtype": model.dtype, "device": model.device}
+    foot, tip = (torch.as_tensor(np.flatnonzero(height == y), device=model.device) for y in (0.0, SIZE[1]))
+    ground = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], **like)
+    standing = torch.tensor([0.0, HEIGHT, 0.0], **like)
+    bend = model.rest_points[:, 1:2] / SIZE[1]  # share of the tip's velocity that a vertex starts with
+
+    def mean(x: Tensor, part: Tensor) -> Tensor:
+        return x.index_select(-2, part).mean(-2)
+
+    def along_ground(x: Tensor, part: Tensor) -> Tensor:
+        """Mean x and z of some vertices, shape [..., 2]."""
+        return mean(x, part) @ ground.T
+
+    def simulate(policy: Policy, given: Scenes, lead: tuple[int, ...] = (), save: Literal["all", "last"] = "last"):
+        """The motion of each scene, for each of the policies of shape `lead`; it observes from target to tip [m]."""
+        targets, swings = given
+
+        def drive(step: int, x: Tensor, v: Tensor) -> Tensor:
+            """Where the foot is after a step: what the network decides, carried out by the cart."""
+            speed = along_ground(v, foot)
+            places = [(along_ground(x, part) - targets) / LENGTH for part in (tip, foot)]
+            clock = torch.full_like(speed[..., :1], step / STEPS)
+            seen = torch.cat([*places, along_ground(v, tip) / SPEED, speed / SPEED, clock], -1)
+            travel = TIME_STEP * (speed + TIME_STEP * ACCELERATION * policy(seen).tanh())
+            return x + (travel @ ground)[..., None, :]
+
+        shape = (*lead, len(targets), model.num_vertices, 3)
+        return dv.rollout(
+            model,
+            model.rest_points.expand(shape),
+            (bend * (swings @ ground)[:, None]).expand(shape),
+            steps=STEPS,
+            mu=MU,
+            lam=LAM,
+            time_step=TIME_STEP,
+            sweeps=SWEEPS,
+            prescribed=drive,
+            observe=lambda x, v, step: mean(x, tip) - (targets @ ground + standing),
+            save=save,
+            checkpoint_every=None,
+        )
+
+    def misses(policy: Policy, given: Scenes, lead: tuple[int, ...] = ()) -> Tensor:
+        """Mean squared distance from tip to target while it must be there [m^2], shape [*lead, scenes]."""
+        return simulate(policy, given, lead).observations[-HELD:].square().sum(-1).mean(0)
+
+    random = torch.Generator().manual_seed(settings.seed)
+    train, test = (
+        (around(scenes, DISTANCE, random).to(**like), around(scenes, SWING, random).to(**like)) for _ in range(2)
+    )
+    torch.manual_seed(settings.seed)
+    network = nn.Sequential(nn.Linear(9, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, 2)).to(**like)
+    first = vector(network)
+    missed = torch.zeros(scenes, **like)
+    course: list[tuple[float, float]] = []  # of CMA-ES: seconds, lowest loss so far
+
+    def loss() -> Tensor:
+        each = misses(network, train)
+        missed.copy_(each.detach())
+        return each.mean()
+
+    @torch.no_grad()
+    def findings(history: list[Row]) -> dict[str, Any]:
+        found: dict[str, Any] = {"test": judged(misses(network, test))}
+        if settings.quick:
+            return found
+        seconds = history[-1]["seconds"]
+
+        def losses(candidates: Tensor) -> Tensor:
+            return misses(policies(network, candidates.to(**like)), train, candidates.shape[:1]).mean(-1)
+
+        best, course[:], networks = cma_es(losses, first, seconds, settings.seed)
+        lowest = course[-1][1]
+        return found | {
+            "seconds": seconds,
+            "gradient_was_there_after": next((row["seconds"] for row in history if row["loss"] <= lowest), None),
+            "cma_es": {
+                "networks": networks,
+                "train": {"distance": lowest**0.5},
+                "test": judged(misses(policies(network, best.to(**like)), test)),
+                "course": course,
+            },
+        }
+
+    stands = 0.9 * torch.tensor([[k // 2, 0.0, k % 2] for k in range(SHOWN)], **like)
+    surface = np.concatenate([mesh.surface + k * mesh.num_vertices for k in range(SHOWN)])
+
+    @torch.no_grad()
+    def shown(policy: Policy) -> Tensor:
+        """Motion of a few scenes beside each other, shape [frames, SHOWN V, 3]."""
+        motion = simulate(policy, (test[0][:SHOWN], test[1][:SHOWN]), save="all").x
+        return (motion + stands[:, None]).flatten(1, 2)
+
+    def goals() -> list[viz.Scenery]:
+        points = (test[0][:SHOWN] @ ground + stands + standing).cpu().numpy()
+        return [viz.capsule(point, point, 0.03, "#e4704f") for point in points]
+
+    def picture(path: Path, history: list[Row]) -> None:
+        motions = {"untrained": shown(policies(network, first)), "trained": shown(network)}
+        at = [0, STEPS // 4, STEPS // 2, STEPS]
+        curves = {"gradient": [(row["seconds"], row["loss"]) for row in history], "CMA-ES": course}
+        viz.learning(
+            path,
+            surface,
+            {name: motion[at] for name, motion in motions.items()},
+            [k * TIME_STEP for k in at],
+            {name: curve for name, curve in curves.items() if curve},
+            goals(),
+        )
+
+    return Problem(
+        name="learn-controller",
+        parameters=dict(network.named_parameters()),
+        stages=[Stage(loss=loss, iterations=iterations, learning_rate=0.05, capturable=True)],
+        estimates=lambda: judged(missed),
+        units={"distance": "m"},
+        protocol={
+            "scenes": scenes,
+            "vertices": model.num_vertices,
+            "steps": STEPS,
+            "held": HELD,
+            "time_step": TIME_STEP,
+            "sweeps": SWEEPS,
+            "density": DENSITY,
+            "mu": MU,
+            "lam": LAM,
+            "size": SIZE,
+            "height": HEIGHT,
+            "distance": DISTANCE,
+            "swing": SWING,
+            "acceleration": ACCELERATION,
+            "hidden": HIDDEN,
+        },
+        findings=findings,
+        picture=picture,
+        animation=lambda path: viz.animation(path, surface, {"trained": shown(network)}, TIME_STEP, goals()),
+    )
+
+
+def around(count: int, radii: tuple[float, float], random: torch.Generator) -> Tensor:
+    """Vectors [count, 2] of random direction whose lengths are even in an interval."""
+    length, turn = torch.rand((2, count), generator=random, dtype=torch.float64)
+    length, turn = radii[0] + (radii[1] - radii[0]) * length, 2 * torch.pi * turn
+    return length[:, None] * torch.stack([turn.cos(), turn.sin()], 1)
+
+
+def judged(misses: Tensor) -> Row:
+    """Of scenes: root mean square of the distance [m], and share that is reached."""
+    return {"distance": misses.mean().sqrt().item(), "reached": (misses < NEAR**2).double().mean().item()}
+
+
+def vector(network: nn.Module) -> Tensor:
+    """All numbers of a network, detached, shape [n]."""
+    return nn.utils.parameters_to_vector(network.parameters()).detach()
+
+
+def policies(network: nn.Module, vectors: Tensor) -> Policy:
+    """The network with other numbers, shape [*lead, n]; it takes and returns tensors whose shape begins with lead."""
+    named = dict(network.named_parameters())
+    parts = vectors.split([p.numel() for p in named.values()], -1)
+    numbers = {name: part.unflatten(-1, p.shape) for (name, p), part in zip(named.items(), parts, strict=True)}
+
+    def act(numbers: dict[str, Tensor], seen: Tensor) -> Tensor:
+        return torch.func.functional_call(network, numbers, (seen,))
+
+    for _ in vectors.shape[:-1]:
+        act = torch.func.vmap(act)
+    return lambda seen: act(numbers, seen)
+
+
+def cma_es(
+    losses: Callable[[Tensor], Tensor], start: Tensor, seconds: float, seed: int
+) -> tuple[Tensor, list[tuple[float, float]], int]:
+    """Lower a loss without its gradient for some seconds, at least one generation.
+
+    Args:
+        losses: Of each row of a tensor [n, N] on the CPU, shape [n].
+        start: [N].
+
+    Returns:
+        The best row, (seconds, lowest loss so far) after each generation, and how many losses that took.
+
+    Raises:
+        ImportError: the package cma is not installed.
+    """
+    try:
+        import cma
+    except ImportError:
+        raise ImportError(
+            "the comparison with CMA-ES needs cma: pip install 'diffvbd[tasks]'; the same run then goes on from here"
+        ) from None
+    begun = time.perf_counter()
+    search = cma.CMAEvolutionStrategy(start.tolist(), SPREAD, {"seed": seed + 1, "verbose": -9})  # 0 is the clock
+    course: list[tuple[float, float]] = []
+    count = 0
+    while not course or course[-1][0] < seconds:
+        rows = search.ask()
+        found = losses(torch.tensor(np.array(rows)))
+        search.tell(rows, found.tolist())
+        count += len(rows)
+        course.append((time.perf_counter() - begun, search.best.f))
+    return torch.tensor(search.best.x), course, count
