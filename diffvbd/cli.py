@@ -11,6 +11,7 @@ import torch
 
 import diffvbd as dv
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
+from diffvbd.tasks.problem import check_device
 from diffvbd.tasks.progress import versions
 from diffvbd.tasks.scene import Array, Observation, Scene
 
@@ -62,8 +63,12 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="run one of the shipped inverse problems", description=_task_list())
     run.formatter_class = raw
     run.add_argument("name", choices=sorted(TASKS), metavar="NAME", help="a task that `diffvbd list` names")
-    run.add_argument("--quick", action="store_true", help="a small version that takes seconds")
-    _add_run_options(run, "runs/NAME")
+    run.add_argument(
+        "--quick",
+        action="store_true",
+        help="a small version that takes seconds and need not be as accurate",
+    )
+    _add_run_options(run, "runs/NAME, or runs/NAME-quick")
     for name, texts in sorted(_task_options().items()):
         run.add_argument(f"--{name}", help="; ".join(texts))
     run.set_defaults(command=_run)
@@ -141,7 +146,8 @@ def _add_scene_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    out = options.out or Path("runs") / options.name
+    out = options.out or Path("runs") / (options.name + ("-quick" if options.quick else ""))
+    check_device(options.device)
     settings = Settings(out, options.device, options.seed, options.quick)
     task = TASKS[options.name]
     chosen = {name: getattr(options, name.replace("-", "_")) for name in _task_options()}
@@ -200,6 +206,7 @@ def _simulate(options: argparse.Namespace) -> None:
 def _identify(options: argparse.Namespace) -> None:
     mesh = _mesh(options)
     given = _given_scene_options(options, mesh) | {"steps": options.steps}
+    check_device(options.device)
     observation = Observation.load(options.target, mesh, **given)
     settings = Settings(options.out or Path("runs/identify"), options.device, options.seed)
     start = (options.start[0], options.start[1])
@@ -227,7 +234,7 @@ def _task_options() -> dict[str, list[str]]:
 
 
 def _task_list() -> str:
-    return "\n".join(f"{name:14} {task.summary}" for name, task in sorted(TASKS.items()))
+    return "\n".join(f"{name:16} {task.summary}" for name, task in sorted(TASKS.items()))
 
 
 def _material(options: argparse.Namespace) -> tuple[float, float]:

@@ -127,3 +127,20 @@ def test_center_of_mass_weighs_by_mass() -> None:
     center = losses.center_of_mass(x, torch.tensor([3.0, 1.0], dtype=torch.float64))
     assert center.tolist() == [[1.0, 0.0, 2.0]]
     assert losses.vertex_distance(center, torch.zeros(3)).item() == 5.0
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_captured_run_has_the_numbers_of_an_eager_one(name: str, tmp_path: Path) -> None:
+    histories = []
+    for capturable in (True, False):
+        settings = Settings(tmp_path / str(capturable), device="cuda", quick=True)
+        problem = TASKS[name].build(settings)
+        problem.picture = None
+        for stage in problem.stages:
+            stage.iterations = min(stage.iterations, 4)
+            stage.capturable = stage.capturable and capturable
+        histories.append(solve(problem, settings).history)
+        histories[-1] = [{key: value for key, value in row.items() if key != "seconds"} for row in histories[-1]]
+    assert histories[0] == histories[1]
+    assert histories[0][0]["loss"] != histories[0][3]["loss"] != 0.0

@@ -49,7 +49,9 @@ class Task:
             ValueError: an option that the task has not, or a value that is not of its kind.
         """
         if unknown := sorted(texts.keys() - self.options.keys()):
-            raise ValueError(f"--{unknown[0]}: expected an option of the task ({', '.join(self.options) or 'none'})")
+            raise ValueError(
+                f"--{unknown[0]}: expected one of the task's options ({', '.join(self.options) or 'none'})"
+            )
         found = {}
         for name, text in texts.items():
             try:
@@ -77,7 +79,7 @@ TASKS = {
         {"sweeps": Option(int, "sweeps per step (default 20)")},
     ),
     "dress-mu-lam": Task("both Lame parameters of a dress that drapes over a mannequin", dress_mu_lam.problem),
-    "dress-silhouette": Task("the same from nothing but the dress's outline", dress_silhouette.problem),
+    "dress-silhouette": Task("both Lame parameters of the dress from its outline alone", dress_silhouette.problem),
     "dress-size": Task("size of a dress from the height of its hem", dress_size.problem),
     "fit-real-mesh": Task(
         "map the stiffness inside a body from pulls at its surface",
@@ -85,7 +87,7 @@ TASKS = {
         {
             "mesh": Option(Path, "file of tets, or a surface to fill with tets (default: a rabbit)"),
             "edge-length": Option(float, "of tets that fill a surface, in its unit (default 1/20 of its diagonal)"),
-            "iterations": Option(int, "evaluations for each weight (default 40, 24, 24, 30)"),
+            "iterations": Option(int, "evaluations for each smoothing weight (default 40, 24, 24, 30; quick 30)"),
         },
     ),
     "flag-wind": Task("wind in eight windows that moves a flag as observed", flag_wind.problem),
@@ -94,8 +96,8 @@ TASKS = {
         "launch a million small cubes that meet in a ring at one moment",
         million_cubes.problem,
         {
-            "bodies": Option(int, "number of cubes (default 1000000)"),
-            "steps": Option(int, "steps of a rollout, at least 120 (default 240)"),
+            "bodies": Option(int, "number of cubes (default 1000000; quick: at most 64, and so by default)"),
+            "steps": Option(int, "steps of a rollout, at least 120 (default 240; not with --quick)"),
             "iterations": Option(int, "of each of the two stages (default 40)"),
         },
     ),

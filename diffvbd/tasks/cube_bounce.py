@@ -54,7 +54,13 @@ def scene(settings: Settings, sweeps: int = SWEEPS) -> Bounce:
 
 
 def problem(settings: Settings, sweeps: int = SWEEPS) -> Problem:
-    """The task; with another number of sweeps per step on request."""
+    """The task; with another number of sweeps per step on request.
+
+    Raises:
+        ValueError: no sweeps.
+    """
+    if sweeps < 1:
+        raise ValueError(f"sweeps: expected at least 1, got {sweeps}")
     return bounce.problem(
         "cube-bounce",
         settings,

@@ -71,6 +71,10 @@ def problem(
         if iterations < 1:
             raise ValueError(f"iterations: expected at least 1, got {iterations}")
         counts = (counts[0], *(iterations for _ in counts[1:]))
+    if edge_length is not None and (mesh is None or mesh.suffix.lower() not in SURFACES):
+        raise ValueError(
+            f"edge_length: expected it beside a mesh that is a surface ({', '.join(SURFACES)}), got {mesh}"
+        )
     body = scaled(read(mesh, edge_length) if mesh else dv.mesh.bunny(8 if settings.quick else 10), HEIGHT)
     pinned = body.points[:, 1] <= HELD * HEIGHT
     model = dv.Model(body, density=DENSITY, pinned=pinned, relaxation=RELAXATION).to(settings.device)

@@ -33,6 +33,7 @@ from diffvbd import losses, viz
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
 
+BODIES, QUICK_BODIES = 1_000_000, 64
 EDGE = 3e-3  # [m]
 SQUEEZE = 0.9  # height at the start, of the height at rest
 DENSITY = 1000.0  # [kg/m^3]
@@ -54,24 +55,32 @@ STAGES = ("without contact", "with contact")
 ITERATIONS, RATES = (40, 40), (0.5, 0.02)  # of the stages
 
 
-def problem(settings: Settings, bodies: int = 1_000_000, steps: int = STEPS, iterations: int | None = None) -> Problem:
+def problem(
+    settings: Settings, bodies: int | None = None, steps: int | None = None, iterations: int | None = None
+) -> Problem:
     """The task.
 
     Args:
         settings: As of every task.
-        bodies: Number of cubes.
-        steps: Steps of a rollout, at least 120.
+        bodies: Number of cubes; default BODIES, or QUICK_BODIES in the quick version, which takes no more.
+        steps: Steps of a rollout, at least 120; default STEPS. The quick version has its own.
         iterations: Of each stage; default ITERATIONS.
 
     Raises:
-        ValueError: no bodies or iterations, or a rollout that ends before t = 0.6 s.
+        ValueError: no bodies or iterations, too many bodies, or a rollout that ends before t = 0.6 s.
     """
     target_step, height, launch, dtype, counts = TARGET_STEP, HEIGHT, LAUNCH, torch.float32, ITERATIONS
+    most = math.inf
     if settings.quick:
-        bodies, steps, target_step, height, launch = min(bodies, 64), 24, 20, 0.05, 0.6
+        if steps is not None:
+            raise ValueError(f"steps: expected none beside --quick, which has its own, got {steps}")
+        most, steps, target_step, height, launch = QUICK_BODIES, 24, 20, 0.05, 0.6
         dtype, counts = torch.float64, (15, 10)
-    if bodies < 1:
-        raise ValueError(f"bodies: expected at least 1, got {bodies}")
+    steps = STEPS if steps is None else steps
+    if bodies is None:
+        bodies = QUICK_BODIES if settings.quick else BODIES
+    if not 1 <= bodies <= most:
+        raise ValueError(f"bodies: expected at least 1{f' and at most {most}' if settings.quick else ''}, got {bodies}")
     if steps < target_step:
         raise ValueError(f"steps: expected at least {target_step}, which are 0.6 s, got {steps}")
     if iterations is not None:

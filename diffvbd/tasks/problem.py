@@ -30,6 +30,10 @@ class Settings:
     seed: int = 0
     quick: bool = False
 
+    def __post_init__(self) -> None:
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or not 0 <= self.seed < 2**63:
+            raise ValueError(f"seed: expected an integer from 0 to 2^63 - 1, got {self.seed!r}")
+
 
 @dataclass
 class Stage:
@@ -41,10 +45,12 @@ class Stage:
         learning_rate: First rate of Adam; it falls to 0 along a cosine.
         optimizer: Makes another optimiser; it keeps its rate.
         moves: Names of the parameters that it moves; default: all of the problem's.
-        tolerance: The stage ends once the loss is at most this fraction of its first loss; 0: never.
+        tolerance: The stage ends once the loss is at most this fraction of its first loss, which must not be negative
+            then; 0: never.
         gradient_tolerance: It also ends once the norm of the gradient is at most this fraction of the first one; 0:
             never.
-        before: Called with the number of each iteration of the stage before its loss, to change tensors that it reads.
+        before: Called with the number of each iteration of the stage before its loss, to change tensors that it reads;
+            the first number may come more than once.
         criterion: Key of the history by whose lowest value the best iteration is chosen, and by the loss among equals;
             for losses that change on the way.
         clip: Longest gradient, over all parameters together; longer ones are scaled down to it. None: no limit.
@@ -76,7 +82,7 @@ class Problem:
         parameters: Leaf tensors that the optimisers move; `solve` leaves the best ones in them.
         stages: What is minimised, one after another, each from the best parameters of the one before.
         estimates: The quantities to report; called after each evaluation of a loss, at the same parameters.
-        truth: Known values of some estimates, for the table.
+        truth: Known values of some estimates, not 0, for the table.
         units: Units of estimates, for tables.
         protocol: Numbers that define the problem, for the log.
         state: Tensors that `Stage.before` changes and later iterations need: saved and restored, not optimised.
@@ -118,18 +124,61 @@ def estimates_of(row: Row) -> Row:
 
 def check(problem: Problem) -> None:
     """Raises ValueError or TypeError for a problem that cannot be solved, naming what is wrong."""
-    name = problem.name
-    if not problem.stages:
-        raise ValueError(f"{name}: stages: expected at least one Stage, got none")
-    for key, parameter in problem.parameters.items():
+    name, parameters = problem.name, problem.parameters
+    if not isinstance(parameters, dict) or not parameters:
+        raise TypeError(f"{name}: parameters: expected tensors by name, got {parameters!r}")
+    for key, parameter in parameters.items():
         if not (isinstance(parameter, Tensor) and parameter.is_leaf and parameter.requires_grad):
             raise TypeError(f"{name}: parameters[{key!r}]: expected a leaf tensor that requires grad")
+    if not isinstance(problem.stages, Sequence) or not problem.stages:
+        raise ValueError(f"{name}: stages: expected at least one Stage in a list, got {problem.stages!r}")
     for k, stage in enumerate(problem.stages):
-        if stage.iterations < 1:
-            raise ValueError(f"{name}: stages[{k}].iterations: expected at least 1, got {stage.iterations}")
-        unknown = sorted(set(stage.moves or ()) - set(problem.parameters))
-        if unknown:
-            raise ValueError(f"{name}: stages[{k}].moves: expected names of parameters, got {unknown}")
+        where = f"{name}: stages[{k}]"
+        if isinstance(stage.iterations, bool) or not isinstance(stage.iterations, int) or stage.iterations < 1:
+            raise ValueError(f"{where}.iterations: expected an integer of at least 1, got {stage.iterations!r}")
+        if stage.clip is not None and not stage.clip > 0:
+            raise ValueError(f"{where}.clip: expected more than 0, got {stage.clip}")
+        if stage.moves is not None:
+            known = not isinstance(stage.moves, str) and len(stage.moves) > 0 and set(stage.moves) <= set(parameters)
+            if not known:
+                raise ValueError(
+                    f"{where}.moves: expected a list of names among {list(parameters)}, got {stage.moves!r}"
+                )
+    if zeros := [key for key, value in problem.truth.items() if value == 0]:
+        raise ValueError(f"{name}: truth: expected values that an error can be relative to, got 0 for {zeros}")
+
+
+def check_row(problem: Problem, stage: int, estimates: Row) -> None:
+    """Raises ValueError for estimates that cannot stand in the history, or that lack what is said about them."""
+    name = problem.name
+    if taken := sorted(estimates.keys() & set(OWN_KEYS)):
+        raise ValueError(f"{name}: estimates: expected other names than {', '.join(OWN_KEYS)}, got {taken}")
+    wrong = [key for key, value in estimates.items() if not isinstance(value, (int, float))]
+    if wrong:
+        raise TypeError(
+            f"{name}: estimates: expected numbers, got {type(estimates[wrong[0]]).__name__} for {wrong[0]!r}"
+        )
+    if missing := sorted(problem.truth.keys() - estimates.keys()):
+        raise ValueError(f"{name}: truth: expected names of estimates, got {missing}")
+    criterion = problem.stages[stage].criterion
+    if criterion not in {*OWN_KEYS, *estimates}:
+        raise ValueError(f"{name}: stages[{stage}].criterion: expected a key of the history, got {criterion!r}")
+
+
+def check_gradients(problem: Problem, stage: int, names: Sequence[str]) -> None:
+    """Raises ValueError for parameters that the loss does not depend on."""
+    lost = [name for name in names if problem.parameters[name].grad is None]
+    if lost:
+        raise ValueError(f"{problem.name}: stages[{stage}].loss: expected one that depends on {lost}; see Stage.moves")
+
+
+def check_loss(name: str, stage: int, loss: Tensor) -> None:
+    """Raises ValueError for what is not a scalar that depends on parameters."""
+    where = f"{name}: stages[{stage}].loss: expected"
+    if loss.dim() != 0:
+        raise ValueError(f"{where} a scalar, got shape {list(loss.shape)}")
+    if not loss.requires_grad:
+        raise ValueError(f"{where} a tensor that depends on the parameters, got one without a gradient")
 
 
 def check_device(device: str) -> None:

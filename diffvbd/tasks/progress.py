@@ -1,6 +1,7 @@
 """What a run shows: progress while it goes on, a table at its end, and the versions that it depended on."""
 
 import platform
+import shutil
 import sys
 import time
 from collections.abc import Mapping
@@ -37,6 +38,7 @@ class Progress:
         text = f"{self.name} [{'#' * filled}{'.' * (20 - filled)}] {self.done}/{self.total}  {summary(self.last)}"
         text += f"  {left:.0f} s left"
         if self.terminal:
+            text = text[: shutil.get_terminal_size().columns - 1]  # a line that wraps cannot be cleared
             print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
         else:
             print(text, file=sys.stderr, flush=True)

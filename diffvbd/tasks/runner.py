@@ -7,15 +7,28 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from diffvbd.tasks.problem import Problem, Result, Settings, Stage, check, check_device, estimates_of
+from diffvbd.tasks.problem import (
+    Problem,
+    Result,
+    Settings,
+    Stage,
+    check,
+    check_device,
+    check_gradients,
+    check_loss,
+    check_row,
+    estimates_of,
+)
 from diffvbd.tasks.progress import Progress, Row, summary, table_of, versions
 
+RESULTS = ("log.json", "picture.png", "animation.gif", "parameters.pt")  # files of a run
 LISTED = 1000  # numbers of a parameter that log.json lists; larger ones go to parameters.pt
 
 
@@ -62,7 +75,9 @@ def _minimise(run: "_Run", progress: Progress, begun: float) -> None:
         row = {"iteration": float(len(run.history)), "loss": loss.item(), "gradient_norm": _norm(parameters)}
         if len(problem.stages) > 1:
             row["stage"] = float(run.at)
-        row |= problem.estimates() | {"seconds": time.perf_counter() - begun}
+        estimates = problem.estimates()
+        check_row(problem, run.at, estimates)
+        row |= estimates | {"seconds": time.perf_counter() - begun}
         if not (math.isfinite(row["loss"]) and math.isfinite(row["gradient_norm"])):
             raise ArithmeticError(f"{problem.name}: the loss or its gradient is not finite: {summary(row)}")
         if stage.clip is not None:
@@ -92,7 +107,9 @@ def _gradient(run: "_Run") -> Callable[[], Tensor]:
         for parameter in run.problem.parameters.values():
             parameter.grad = None
         loss = stage.loss()
+        check_loss(run.problem.name, run.at, loss)
         loss.backward(inputs=run.moved)
+        check_gradients(run.problem, run.at, run.moved_names)
         return loss.detach()
 
     if not (stage.capturable and run.cuda):
@@ -157,9 +174,12 @@ class _Run:
         return self.problem.stages[self.at]
 
     @property
+    def moved_names(self) -> list[str]:
+        return list(self.problem.parameters if self.stage.moves is None else self.stage.moves)
+
+    @property
     def moved(self) -> list[Tensor]:
-        names = self.problem.parameters if self.stage.moves is None else self.stage.moves
-        return [self.problem.parameters[name] for name in names]
+        return [self.problem.parameters[name] for name in self.moved_names]
 
     @property
     def rows(self) -> list[Row]:
@@ -212,6 +232,8 @@ class _Run:
     def resume(self) -> None:
         """Continue where the file says, if it is of the same problem."""
         if not self.state.exists():
+            for name in RESULTS:  # of a run before, which this one's would be mixed with
+                (self.settings.out / name).unlink(missing_ok=True)
             return
         try:
             state = torch.load(self.state, map_location=self.settings.device)
@@ -220,7 +242,9 @@ class _Run:
             same, state = False, {}
             print(f"{self.state} cannot be read ({type(error).__name__})", file=sys.stderr)
         if not same:
-            print(f"{self.state} does not belong to this run; starting anew", file=sys.stderr)
+            aside = self.state.with_name("state.other.pt")
+            os.replace(self.state, aside)
+            print(f"{self.state} does not belong to this run, and is {aside.name} now; starting anew", file=sys.stderr)
             return
         self.history = state["history"]
         self._enter(state["stage"][0])
@@ -247,9 +271,12 @@ class _Run:
             "clip",
         )
         stages = [{key: getattr(stage, key) for key in numbers} for stage in self.problem.stages]
+        for content, stage in zip(stages, self.problem.stages, strict=True):
+            content["optimizer"] = stage.optimizer is not None
+        shapes = {name: list(p.shape) for name, p in self.problem.parameters.items()}
         known = versions(self.settings.device)
         libraries = {key: known[key] for key in ("diffvbd", "torch", "device")}
-        return json.dumps(self.identity | {"stages": stages, "versions": libraries}, default=str)
+        return json.dumps(self.identity | {"stages": stages, "shapes": shapes, "versions": libraries}, default=str)
 
     @torch.no_grad()
     def _first_loss(self) -> float:
@@ -262,7 +289,7 @@ class _Run:
         stages = [stage.name for stage in self.problem.stages]
         content = self.identity | {"stages": stages, "versions": versions(self.settings.device), **result}
         log = self.settings.out / "log.json"
-        text = json.dumps(content | {"history": self.history}, indent=1)
+        text = json.dumps(content | {"history": self.history}, indent=1, default=str)
         _replace(log, lambda path: path.write_text(text + "\n"))
         return log
 
@@ -288,8 +315,8 @@ class _Run:
             path = self.settings.out / "parameters.pt"
             _replace(path, lambda new: torch.save({k: p.detach().cpu() for k, p in problem.parameters.items()}, new))
             result.files.append(path)
-        self._draw(result)
         self.state.unlink(missing_ok=True)
+        self._draw(result)
         return result
 
     def _memory(self) -> dict[str, float]:
@@ -297,16 +324,18 @@ class _Run:
         return {"peak_memory_gb": torch.cuda.max_memory_reserved(self.settings.device) / 1e9} if self.cuda else {}
 
     def _draw(self, result: Result) -> None:
-        out, problem = self.settings.out, self.problem
-        try:
-            if problem.picture:
-                problem.picture(out / "picture.png", self.history)
-                result.files.append(out / "picture.png")
-            if problem.animation and not self.settings.quick:
-                problem.animation(out / "animation.gif")
-                result.files.append(out / "animation.gif")
-        except ImportError as missing:
-            print(f"no picture: {missing}", file=sys.stderr)
+        """Pictures come last, and what goes wrong with them costs no result."""
+        problem, draw = self.problem, {}
+        if problem.picture:
+            draw["picture.png"] = partial(problem.picture, self.settings.out / "picture.png", self.history)
+        if problem.animation and not self.settings.quick:
+            draw["animation.gif"] = partial(problem.animation, self.settings.out / "animation.gif")
+        for name, function in draw.items():
+            try:
+                function()
+                result.files.append(self.settings.out / name)
+            except Exception as error:
+                print(f"no {name}: {error or type(error).__name__}", file=sys.stderr)
 
 
 def table(problem: Problem, result: Result) -> str:
@@ -332,6 +361,6 @@ def _assign(parameters: dict[str, Tensor], values: dict[str, Tensor]) -> None:
 
 def _replace(path: Path, write: Callable[[Path], object]) -> None:
     # An interruption in the middle of a write must not destroy the previous file.
-    unfinished = path.with_name(path.name + ".part")
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}.part")
     write(unfinished)
     os.replace(unfinished, path)
