@@ -79,6 +79,9 @@ numbers, bit by bit.
 def page(folder: Path, images: Path, root: Path) -> str:
     """The page of all logs in a folder, with pictures from `images`, which lie below the page's folder `root`."""
     logs = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))}
+    for stem, log in logs.items():
+        if not {"environment", "options", "findings", "units"} <= log.keys():
+            raise ValueError(f"{stem}.json: expected a log of `python -m bench tasks`, got an older one; run it again")
     header = ("task", "variables", "the paper", "iterations", "ours", "evaluations", "CPU [s]", "GPU [s]", "bar met")
     rows, parts = [], []
     for name in PAPER:
@@ -89,7 +92,8 @@ def page(folder: Path, images: Path, root: Path) -> str:
         bars, paper = PAPER[name].bars, PAPER[name]
         reached = [(figure(run, key), bar) for run in runs.values() if not run["options"] for key, bar in bars.items()]
         met = [value is not None and value <= bar for value, bar in reached]
-        rows.append((f"[{name}](#{name})", paper.variables, paper.outcome, paper.iterations, outcome(main_run),
+        variables = main_run.get("variables", paper.variables)
+        rows.append((f"[{name}](#{name})", variables, paper.outcome, paper.iterations, outcome(main_run),
                      len(main_run["history"]), seconds(runs.get(name)), seconds(runs.get(f"{name}-cuda")),
                      all(met) if met else None))  # fmt: skip
         parts.append(section(name, runs, main_run, images, root))

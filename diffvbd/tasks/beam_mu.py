@@ -69,6 +69,7 @@ def problem(settings: Settings) -> Problem:
                 iterations=iterations,
                 learning_rate=0.2,
                 tolerance=1e-9,
+                capturable=True,
             )
         ],
         estimates=lambda: {"mu": log_mu.exp().item()},

@@ -71,6 +71,7 @@ def problem(settings: Settings) -> Problem:
                 iterations=iterations,
                 learning_rate=0.15,
                 tolerance=1e-10,
+                capturable=True,
             )
         ],
         estimates=lambda: dict(zip(("mu", "lam"), log_material.exp().tolist(), strict=True)),

@@ -308,6 +308,7 @@ class _Run:
             units=problem.units,
             relative_error=errors,
             findings=findings,
+            variables=sum(p.numel() for p in problem.parameters.values()),
             **self._memory(),
         )
         result = Result(best, self.history, estimates, errors, self.last_converged, [log], findings)
