@@ -129,6 +129,18 @@ def test_center_of_mass_weighs_by_mass() -> None:
     assert losses.vertex_distance(center, torch.zeros(3)).item() == 5.0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_two_runs_have_the_same_numbers(name: str, tmp_path: Path) -> None:
+    histories = []
+    for k in range(2):
+        problem, settings = quick(name, tmp_path / str(k))
+        problem.picture = None
+        history = solve(problem, settings).history
+        histories.append([{key: value for key, value in row.items() if key != "seconds"} for row in history])
+    assert histories[0] == histories[1]
+
+
 @pytest.mark.cuda
 @pytest.mark.parametrize("name", sorted(TASKS))
 def test_captured_run_has_the_numbers_of_an_eager_one(name: str, tmp_path: Path) -> None:

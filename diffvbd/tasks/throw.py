@@ -41,6 +41,7 @@ CONTROLS, KNOT = 4, 0.06  # control points of an end, and the time between them 
 LIMIT = 0.4  # largest control point [m]
 LIFT = (0.3, 0.1)  # second control point of the ends of the rear and the front bar at the start [m]
 BOX = ((1.35, 0.0, 0.4), (1.85, 0.4, 0.9))  # two corners [m]
+VIEW = (35.0, 20.0)  # into the box
 EFFORT = 1e-7  # weight of the squared acceleration of the ends [s^4]
 
 
@@ -126,10 +127,10 @@ def problem(settings: Settings) -> Problem:
     def picture(path: Path, history: list[Row]) -> None:
         shown = [steps // 4, steps // 2, 3 * steps // 4, steps, 2 * steps]
         frames = {name: motion[shown] for name, motion in motions.items()}
-        viz.comparison(path, mesh.surface, frames, [k * time_step for k in shown], history, scenery=[walls])
+        viz.comparison(path, mesh.surface, frames, [k * time_step for k in shown], history, scenery=[walls], view=VIEW)
 
     def animation(path: Path) -> None:
-        viz.animation(path, mesh.surface, {"recovered": motions["recovered"]}, time_step, [walls])
+        viz.animation(path, mesh.surface, {"recovered": motions["recovered"]}, time_step, [walls], VIEW)
 
     return Problem(
         name="throw",

@@ -65,7 +65,7 @@ def draw(
     )
     low, high = (as_array(corner)[cyclic] for corner in bounds) if bounds else (body.min((0, 1)), body.max((0, 1)))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(np.maximum(high - low, 1e-9), zoom=1.25)
+    axes.set_box_aspect(np.maximum(high - low, 1e-9), zoom=1.15)
     axes.view_init(elev=view[0], azim=view[1])
     axes.set_axis_off()
 
