@@ -17,9 +17,10 @@ from typing import Any
 
 from bench.common import RESULTS, commit, device_suffix, environment, markdown_table, place
 from bench.paper import TASKS as PAPER
-from diffvbd.tasks import TASKS, Settings, solve
+from diffvbd.tasks import TASKS, Settings, dress, solve
 
 ROOT = Path(__file__).resolve().parents[1]
+SHARED = {"dress-mu-lam": dress}  # what several tasks share is told once, in the section of the first
 IMAGES = ROOT / "docs" / "images" / "tasks"
 
 
@@ -78,11 +79,18 @@ numbers, bit by bit.
 
 def page(folder: Path, images: Path, root: Path) -> str:
     """The page of all logs in a folder, with pictures from `images`, which lie below the page's folder `root`."""
-    logs = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))}
+    logs = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")}
+    # the CPU's before a GPU's, without options before with, then by seed
+    order = {
+        key: (log["settings"]["device"], len(log.get("options", ())), log["settings"]["seed"])
+        for key, log in logs.items()
+    }
+    logs = {key: logs[key] for key in sorted(logs, key=lambda key: (order[key], key))}
     for stem, log in logs.items():
         if not {"environment", "options", "findings", "units"} <= log.keys():
             raise ValueError(f"{stem}.json: expected a log of `python -m bench tasks`, got an older one; run it again")
-    header = ("task", "variables", "the paper", "iterations", "ours", "evaluations", "CPU [s]", "GPU [s]", "bar met")
+    header = ("task", "variables", "the paper", "its iterations", "ours", "evaluations", "CPU [s]", "GPU [s]",
+              "bar met")  # fmt: skip
     rows, parts = [], []
     for name in PAPER:
         runs = {key: log for key, log in logs.items() if log["task"] == name}
@@ -100,9 +108,17 @@ def page(folder: Path, images: Path, root: Path) -> str:
     return "\n".join([INTRODUCTION, markdown_table(header, rows), *parts]).rstrip() + "\n"
 
 
+def place_on_page(entry: tuple[str, dict[str, Any]]) -> tuple[str, int, int, str]:
+    stem, log = entry
+    return log["settings"]["device"], len(log.get("options", ())), log["settings"]["seed"], stem
+
+
 def section(name: str, runs: dict[str, Any], main_run: dict[str, Any], images: Path, root: Path) -> str:
     """One task: what it is, its picture, and a row for each run."""
-    text = [f"## {name}\n", (sys.modules[TASKS[name].build.__module__].__doc__ or "").strip() + "\n"]
+    module = sys.modules[TASKS[name].build.__module__]
+    text = [f"## {name}\n", (module.__doc__ or "").strip() + "\n"]
+    if name in SHARED:
+        text.append((SHARED[name].__doc__ or "").strip() + "\n")
     if (picture := picture_of(name, images)).exists():
         text.append(f"![{TASKS[name].summary}]({picture.relative_to(root).as_posix()})\n")
     rows = []
@@ -114,8 +130,8 @@ def section(name: str, runs: dict[str, Any], main_run: dict[str, Any], images: P
         where = place(e) + (f", {e['threads']} threads" if e["device"] == "cpu" else "")
         rows.append((where, options or "-", run["settings"]["seed"], len(run["history"]), first["loss"],
                      run["best"]["loss"], outcome(run), seconds(run), e["torch"], e["date"], commit(e)))  # fmt: skip
-    header = ("on", "options", "seed", "evaluations", "first loss", "best loss", "result", "seconds", "torch", "date",
-              "commit")  # fmt: skip
+    header = ("on", "options", "seed", "evaluations", "first loss of the last stage", "best loss", "result", "seconds",
+              "torch", "date", "commit")  # fmt: skip
     text.append(markdown_table(header, rows))
     found = list(flat(main_run["findings"]))
     if found:

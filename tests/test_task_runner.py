@@ -1,6 +1,7 @@
 """Claim: the runner's stages, optimisers and interruptions leave the numbers that one run in one go would have."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,8 @@ def toy(**changes: Any) -> Problem:
     scale = torch.ones((), dtype=torch.float64)
 
     def loss() -> torch.Tensor:
-        return scale * ((a - CENTER[0]).square() + (b - CENTER[1] * a).square() + 0.1 * (a - CENTER[0]) ** 4)
+        noise = 1e-3 * torch.rand((), dtype=torch.float64)  # an interruption must not change what is drawn
+        return noise + scale * ((a - CENTER[0]).square() + (b - CENTER[1] * a).square() + 0.1 * (a - CENTER[0]) ** 4)
 
     def grow(iteration: int) -> None:
         scale.mul_(1.25)
@@ -57,15 +59,22 @@ def interrupt(problem: Problem, at: int) -> None:
 
 
 @pytest.mark.parametrize("at", range(1, 23))
-def test_a_run_interrupted_anywhere_ends_as_one_in_one_go(at: int, tmp_path: Path) -> None:
+def test_a_run_interrupted_anywhere_ends_as_one_in_one_go(
+    at: int, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     whole, parts = toy(), toy()
     expected = solve(whole, Settings(tmp_path / "whole"))
     assert len(expected.history) == 23
     interrupt(parts, at)
     with pytest.raises(KeyboardInterrupt):
         solve(parts, Settings(tmp_path / "parts"))
-    resumed = toy()
+    resumed, evaluations = toy(), []
+    first = resumed.stages[0].loss
+    resumed.stages = [replace(stage, loss=lambda: (evaluations.append(1), first())[1]) for stage in resumed.stages]
     found = solve(resumed, Settings(tmp_path / "parts"))
+    # the first loss once more, and of the steps done none
+    done = int(re.findall(r"continuing after (\d+) iterations", capsys.readouterr().err)[0])
+    assert len(evaluations) == 1 + 23 - done and at - 3 <= done <= at
     assert timeless(found.history) == timeless(expected.history)
     assert found.estimates == expected.estimates and found.best["iteration"] == expected.best["iteration"]
     for key, value in whole.parameters.items():
@@ -103,8 +112,11 @@ def test_a_state_whose_first_loss_is_another_is_not_continued(tmp_path: Path, ca
     with torch.no_grad():
         other.parameters["a"].add_(1e-9)  # as if the code had changed, and no number of the protocol
     history = solve(other, Settings(tmp_path)).history
-    assert len(history) == 23 and history[0]["seconds"] < history[4]["seconds"]
     assert "starting anew" in capsys.readouterr().err
+    fresh = toy()
+    with torch.no_grad():
+        fresh.parameters["a"].add_(1e-9)
+    assert timeless(history) == timeless(solve(fresh, Settings(tmp_path / "fresh")).history)
 
 
 def test_a_loss_below_zero_is_not_an_end(tmp_path: Path) -> None:
@@ -144,6 +156,9 @@ def two() -> torch.Tensor:
 BAD = [
     ({"stages": []}, ValueError, "toy: stages: expected at least one Stage"),
     ({"stages": Stage(flat, 1)}, ValueError, "toy: stages: expected at least one Stage in a list"),
+    ({"stages": [3]}, TypeError, r"stages\[0\]: expected a Stage, got int"),
+    ({"stages": [Stage(lambda: 1.0, 1)]}, TypeError, r"stages\[0\].loss: expected a tensor, got float"),  # type: ignore
+    ({"estimates": lambda: None}, TypeError, "estimates: expected a dict of numbers, got NoneType"),
     ({"stages": [Stage(flat, 0)]}, ValueError, r"stages\[0\].iterations: expected an integer of at least 1, got 0"),
     ({"stages": [Stage(flat, 2.5)]}, ValueError, r"stages\[0\].iterations: .* got 2.5"),  # type: ignore[arg-type]
     ({"stages": [Stage(flat, 1, clip=0.0)]}, ValueError, r"stages\[0\].clip: expected more than 0"),

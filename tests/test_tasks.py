@@ -151,7 +151,8 @@ def test_captured_run_has_the_numbers_of_an_eager_one(name: str, tmp_path: Path)
         problem.picture = None
         for stage in problem.stages:
             stage.iterations = min(stage.iterations, 4)
-            stage.capturable = stage.capturable and capturable
+            assert stage.capturable
+            stage.capturable = capturable
         histories.append(solve(problem, settings).history)
         histories[-1] = [{key: value for key, value in row.items() if key != "seconds"} for row in histories[-1]]
     assert histories[0] == histories[1]

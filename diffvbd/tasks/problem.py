@@ -1,5 +1,6 @@
 """What an inverse problem is: parameters, stages with a loss each, what to report."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -134,6 +135,8 @@ def check(problem: Problem) -> None:
         raise ValueError(f"{name}: stages: expected at least one Stage in a list, got {problem.stages!r}")
     for k, stage in enumerate(problem.stages):
         where = f"{name}: stages[{k}]"
+        if not isinstance(stage, Stage):
+            raise TypeError(f"{where}: expected a Stage, got {type(stage).__name__}")
         if isinstance(stage.iterations, bool) or not isinstance(stage.iterations, int) or stage.iterations < 1:
             raise ValueError(f"{where}.iterations: expected an integer of at least 1, got {stage.iterations!r}")
         if stage.clip is not None and not stage.clip > 0:
@@ -151,17 +154,19 @@ def check(problem: Problem) -> None:
 def check_row(problem: Problem, stage: int, estimates: Row) -> None:
     """Raises ValueError for estimates that cannot stand in the history, or that lack what is said about them."""
     name = problem.name
+    if not isinstance(estimates, dict):
+        raise TypeError(f"{name}: estimates: expected a dict of numbers, got {type(estimates).__name__}")
     if taken := sorted(estimates.keys() & set(OWN_KEYS)):
         raise ValueError(f"{name}: estimates: expected other names than {', '.join(OWN_KEYS)}, got {taken}")
-    wrong = [key for key, value in estimates.items() if not isinstance(value, (int, float))]
-    if wrong:
-        raise TypeError(
-            f"{name}: estimates: expected numbers, got {type(estimates[wrong[0]]).__name__} for {wrong[0]!r}"
-        )
+    for key, value in estimates.items():
+        if not isinstance(value, (int, float)):
+            raise TypeError(f"{name}: estimates: expected numbers, got {type(value).__name__} for {key!r}")
+        if key == problem.stages[stage].criterion and math.isnan(value):
+            raise ArithmeticError(f"{name}: estimates: expected a number to judge by, got NaN for {key!r}")
     if missing := sorted(problem.truth.keys() - estimates.keys()):
         raise ValueError(f"{name}: truth: expected names of estimates, got {missing}")
     criterion = problem.stages[stage].criterion
-    if criterion not in {*OWN_KEYS, *estimates}:
+    if criterion not in {"loss", "gradient_norm", *estimates}:
         raise ValueError(f"{name}: stages[{stage}].criterion: expected a key of the history, got {criterion!r}")
 
 
@@ -175,6 +180,8 @@ def check_gradients(problem: Problem, stage: int, names: Sequence[str]) -> None:
 def check_loss(name: str, stage: int, loss: Tensor) -> None:
     """Raises ValueError for what is not a scalar that depends on parameters."""
     where = f"{name}: stages[{stage}].loss: expected"
+    if not isinstance(loss, Tensor):
+        raise TypeError(f"{where} a tensor, got {type(loss).__name__}")
     if loss.dim() != 0:
         raise ValueError(f"{where} a scalar, got shape {list(loss.shape)}")
     if not loss.requires_grad:
@@ -186,7 +193,7 @@ def check_device(device: str) -> None:
     try:
         kind = torch.device(device).type
         torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
+    except (RuntimeError, AssertionError, TypeError) as error:
         seen = f"cpu{', cuda' if torch.cuda.is_available() else ''}"
         raise ValueError(f"device: expected one of this machine ({seen}), got {device!r}") from error
     if kind not in ("cpu", "cuda"):

@@ -53,6 +53,7 @@ def solve(problem: Problem, settings: Settings) -> Result:
     run = _Run(problem, settings)
     run.resume()
     if run.cuda:
+        torch.cuda.empty_cache()  # what others have left would count
         torch.cuda.reset_peak_memory_stats(settings.device)
     progress = Progress(problem.name, sum(stage.iterations for stage in problem.stages), done=len(run.history))
     begun = time.perf_counter() - (run.history[-1]["seconds"] if run.history else 0.0)
@@ -161,13 +162,7 @@ class _Run:
         self.best_parameters: dict[str, Tensor] = {}
         if stage >= len(self.problem.stages):
             return
-        if self.stage.optimizer:
-            self.optimizer, self.schedule = self.stage.optimizer(self.moved), None
-        else:
-            # A few parameters and gradients without noise need no long average, and overshoot less without it. Losses
-            # in m^2 can be tiny: the default eps would exceed their gradients.
-            self.optimizer = torch.optim.Adam(self.moved, self.stage.learning_rate, betas=(0.7, 0.9), eps=1e-20)
-            self.schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self.optimizer, self.stage.iterations)
+        self.optimizer, self.schedule = _optimizer(self.stage, self.moved)
 
     @property
     def stage(self) -> Stage:
@@ -175,11 +170,14 @@ class _Run:
 
     @property
     def moved_names(self) -> list[str]:
-        return list(self.problem.parameters if self.stage.moves is None else self.stage.moves)
+        return [name for name in self.problem.parameters if self.stage.moves is None or name in self.stage.moves]
 
     @property
     def moved(self) -> list[Tensor]:
-        return [self.problem.parameters[name] for name in self.moved_names]
+        return self._moved(self.stage)
+
+    def _moved(self, stage: Stage) -> list[Tensor]:
+        return [p for name, p in self.problem.parameters.items() if stage.moves is None or name in stage.moves]
 
     @property
     def rows(self) -> list[Row]:
@@ -231,17 +229,20 @@ class _Run:
 
     def resume(self) -> None:
         """Continue where the file says, if it is of the same problem."""
+        out = self.settings.out
+        for unfinished in out.glob("*.part"):
+            unfinished.unlink()
         if not self.state.exists():
             for name in RESULTS:  # of a run before, which this one's would be mixed with
-                (self.settings.out / name).unlink(missing_ok=True)
+                (out / name).unlink(missing_ok=True)
             return
         try:
             state = torch.load(self.state, map_location=self.settings.device)
-            same = state["identity"] == self._fingerprint() and state["history"][0]["loss"] == self._first_loss()
+            same = state["identity"] == self._fingerprint()
         except Exception as error:  # torch.load raises errors of many kinds
             same, state = False, {}
             print(f"{self.state} cannot be read ({type(error).__name__})", file=sys.stderr)
-        if not same:
+        if not (same and state["history"][0]["loss"] == self._first_loss()):
             aside = self.state.with_name("state.other.pt")
             os.replace(self.state, aside)
             print(f"{self.state} does not belong to this run, and is {aside.name} now; starting anew", file=sys.stderr)
@@ -260,36 +261,33 @@ class _Run:
 
     def _fingerprint(self) -> str:
         """What must be the same for a run to be continued, besides the first loss."""
-        numbers = (
-            "name",
-            "iterations",
-            "learning_rate",
-            "moves",
-            "tolerance",
-            "gradient_tolerance",
-            "criterion",
-            "clip",
-        )
-        stages = [{key: getattr(stage, key) for key in numbers} for stage in self.problem.stages]
-        for content, stage in zip(stages, self.problem.stages, strict=True):
-            content["optimizer"] = stage.optimizer is not None
-        shapes = {name: list(p.shape) for name, p in self.problem.parameters.items()}
+        kept = ("name", "iterations", "moves", "tolerance", "gradient_tolerance", "criterion", "clip")
+        stages = []
+        for stage in self.problem.stages:
+            optimizer, _ = _optimizer(stage, self._moved(stage))
+            groups = [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
+            stages.append([[getattr(stage, key) for key in kept], type(optimizer).__name__, groups])
+        tensors = {name: [str(p.dtype), *p.shape] for name, p in self.problem.parameters.items()}
         known = versions(self.settings.device)
         libraries = {key: known[key] for key in ("diffvbd", "torch", "device")}
-        return json.dumps(self.identity | {"stages": stages, "shapes": shapes, "versions": libraries}, default=str)
+        content = {"stages": stages, "tensors": tensors, "versions": libraries}
+        return json.dumps(self.identity | content, default=str)
 
-    @torch.no_grad()
     def _first_loss(self) -> float:
-        stage = self.problem.stages[0]
+        """Of a run that begins now, which it leaves as it would have begun."""
+        stage, kept = self.problem.stages[0], {name: t.clone() for name, t in self.problem.state.items()}
         if stage.before:
             stage.before(0)
-        return stage.loss().item()
+        loss = stage.loss().item()
+        _assign(self.problem.state, kept)
+        torch.manual_seed(self.settings.seed)
+        return loss
 
     def write_log(self, **result: Any) -> Path:
         stages = [stage.name for stage in self.problem.stages]
         content = self.identity | {"stages": stages, "versions": versions(self.settings.device), **result}
         log = self.settings.out / "log.json"
-        text = json.dumps(content | {"history": self.history}, indent=1, default=str)
+        text = json.dumps(content | {"history": self.history}, indent=1, default=_plain)
         _replace(log, lambda path: path.write_text(text + "\n"))
         return log
 
@@ -297,6 +295,7 @@ class _Run:
         problem, best = self.problem, self.history[self.last_best]
         estimates = estimates_of(best)
         errors = {name: abs(estimates[name] / true - 1) for name, true in problem.truth.items()}
+        memory = self._memory()  # before findings, which may run other things
         findings = problem.findings(self.history) if problem.findings else {}
         listed = {name: p.tolist() for name, p in problem.parameters.items() if p.numel() <= LISTED}
         log = self.write_log(
@@ -309,15 +308,15 @@ class _Run:
             relative_error=errors,
             findings=findings,
             variables=sum(p.numel() for p in problem.parameters.values()),
-            **self._memory(),
+            **memory,
         )
         result = Result(best, self.history, estimates, errors, self.last_converged, [log], findings)
         if listed.keys() != problem.parameters.keys():
             path = self.settings.out / "parameters.pt"
             _replace(path, lambda new: torch.save({k: p.detach().cpu() for k, p in problem.parameters.items()}, new))
             result.files.append(path)
-        self.state.unlink(missing_ok=True)
         self._draw(result)
+        self.state.unlink(missing_ok=True)
         return result
 
     def _memory(self) -> dict[str, float]:
@@ -358,6 +357,22 @@ def _norm(parameters: list[Tensor]) -> float:
 def _assign(parameters: dict[str, Tensor], values: dict[str, Tensor]) -> None:
     for name, value in values.items():
         parameters[name].copy_(value)
+
+
+def _plain(value: Any) -> Any:
+    """Arrays and tensors as numbers; of anything else, such as paths, its name."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def _optimizer(
+    stage: Stage, parameters: list[Tensor]
+) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler | None]:
+    if stage.optimizer:
+        return stage.optimizer(parameters), None
+    # A few parameters and gradients without noise need no long average, and overshoot less without it. Losses in m^2
+    # can be tiny: the default eps would exceed their gradients.
+    optimizer = torch.optim.Adam(parameters, stage.learning_rate, betas=(0.7, 0.9), eps=1e-20)
+    return optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, stage.iterations)
 
 
 def _replace(path: Path, write: Callable[[Path], object]) -> None:
