@@ -81,11 +81,7 @@ def page(folder: Path, images: Path, root: Path) -> str:
     """The page of all logs in a folder, with pictures from `images`, which lie below the page's folder `root`."""
     logs = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")}
     # the CPU's before a GPU's, without options before with, then by seed
-    order = {
-        key: (log["settings"]["device"], len(log.get("options", ())), log["settings"]["seed"])
-        for key, log in logs.items()
-    }
-    logs = {key: logs[key] for key in sorted(logs, key=lambda key: (order[key], key))}
+    logs = dict(sorted(logs.items(), key=place_on_page))
     for stem, log in logs.items():
         if not {"environment", "options", "findings", "units"} <= log.keys():
             raise ValueError(f"{stem}.json: expected a log of `python -m bench tasks`, got an older one; run it again")
