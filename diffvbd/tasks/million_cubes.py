@@ -52,7 +52,7 @@ PAIRS = 2  # room for pairs, for each body
 MIXED = 8  # bodies whose places are mixed
 LAUNCH = 3.0  # first guess, upwards [m/s]
 STAGES = ("without contact", "with contact")
-ITERATIONS, RATES = (40, 40), (0.5, 0.02)  # of the stages
+ITERATIONS, RATES = (40, 40), (0.5, 0.005)  # of the stages
 
 
 def problem(
