@@ -41,8 +41,7 @@ it was found with; "converged" is the median distance of the same throws with {c
 throws that pass within {near:g} m, which the paper's cube reaches in 151 iterations. Mean and standard deviation
 include throws that end in a local minimum far from the target; the median and the count say how many do not.
 
-How much depth matters depends on the cube, whose stiffness was chosen so that 5 sweeps leave its steps unsolved. With a
-softer one (mu = lam = 5e4 Pa) every throw at 5 and at 20 sweeps comes near.
+How much depth matters depends on the cube, whose stiffness was chosen so that 5 sweeps leave its steps unsolved.
 """
 
 

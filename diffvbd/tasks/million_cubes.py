@@ -114,9 +114,8 @@ def problem(
     def push(step: int, x: Tensor, v: Tensor) -> Tensor | None:
         if step >= target_step:
             return None
-        return dv.contact.center_of_mass_penalty(x.flatten(0, 1), together, RADIUS, STIFFNESS, max_pairs=pairs).view_as(
-            x
-        )
+        all_bodies = x.flatten(0, 1)
+        return dv.contact.center_of_mass_penalty(all_bodies, together, RADIUS, STIFFNESS, max_pairs=pairs).view_as(x)
 
     def simulate(save: int) -> Tensor:
         """Centers of mass [m] of every n-th frame, shape [frames, bodies, 3]."""

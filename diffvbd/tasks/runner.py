@@ -66,7 +66,7 @@ def solve(problem: Problem, settings: Settings) -> Result:
 
 def _minimise(run: "_Run", progress: Progress, begun: float) -> None:
     """The run's present stage, from where it stands to its end."""
-    problem, stage, parameters = run.problem, run.stage, run.moved
+    problem, stage, parameters = run.problem, run.stage, list(run.moved.values())
     gradient = _gradient(run)
 
     def evaluate() -> float:
@@ -109,8 +109,8 @@ def _gradient(run: "_Run") -> Callable[[], Tensor]:
             parameter.grad = None
         loss = stage.loss()
         check_loss(run.problem.name, run.at, loss)
-        loss.backward(inputs=run.moved)
-        check_gradients(run.problem, run.at, run.moved_names)
+        loss.backward(inputs=list(run.moved.values()))
+        check_gradients(run.problem, run.at, list(run.moved))
         return loss.detach()
 
     if not (stage.capturable and run.cuda):
@@ -155,6 +155,7 @@ class _Run:
         choices = {key: value for key, value in asdict(settings).items() if key != "out"}
         self.identity = {"task": problem.name, "settings": choices, "protocol": problem.protocol}
         self.cuda = torch.device(settings.device).type == "cuda"
+        self.fingerprint = self._fingerprint()
         self._enter(0)
 
     def _enter(self, stage: int) -> None:
@@ -162,22 +163,16 @@ class _Run:
         self.best_parameters: dict[str, Tensor] = {}
         if stage >= len(self.problem.stages):
             return
-        self.optimizer, self.schedule = _optimizer(self.stage, self.moved)
+        self.optimizer, self.schedule = _optimizer(self.stage, list(self.moved.values()))
 
     @property
     def stage(self) -> Stage:
         return self.problem.stages[self.at]
 
     @property
-    def moved_names(self) -> list[str]:
-        return [name for name in self.problem.parameters if self.stage.moves is None or name in self.stage.moves]
-
-    @property
-    def moved(self) -> list[Tensor]:
-        return self._moved(self.stage)
-
-    def _moved(self, stage: Stage) -> list[Tensor]:
-        return [p for name, p in self.problem.parameters.items() if stage.moves is None or name in stage.moves]
+    def moved(self) -> dict[str, Tensor]:
+        """Parameters that the present stage moves, by name."""
+        return _moved(self.problem, self.stage)
 
     @property
     def rows(self) -> list[Row]:
@@ -214,7 +209,7 @@ class _Run:
 
     def save(self) -> None:
         state = {
-            "identity": self._fingerprint(),
+            "identity": self.fingerprint,
             "history": self.history,
             "stage": (self.at, self.first, self.best),
             "best_parameters": self.best_parameters,
@@ -238,7 +233,7 @@ class _Run:
             return
         try:
             state = torch.load(self.state, map_location=self.settings.device)
-            same = state["identity"] == self._fingerprint()
+            same = state["identity"] == self.fingerprint
         except Exception as error:  # torch.load raises errors of many kinds
             same, state = False, {}
             print(f"{self.state} cannot be read ({type(error).__name__})", file=sys.stderr)
@@ -264,7 +259,7 @@ class _Run:
         kept = ("name", "iterations", "moves", "tolerance", "gradient_tolerance", "criterion", "clip")
         stages = []
         for stage in self.problem.stages:
-            optimizer, _ = _optimizer(stage, self._moved(stage))
+            optimizer, _ = _optimizer(stage, list(_moved(self.problem, stage).values()))
             groups = [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
             stages.append([[getattr(stage, key) for key in kept], type(optimizer).__name__, groups])
         tensors = {name: [str(p.dtype), *p.shape] for name, p in self.problem.parameters.items()}
@@ -362,6 +357,10 @@ def _assign(parameters: dict[str, Tensor], values: dict[str, Tensor]) -> None:
 def _plain(value: Any) -> Any:
     """Arrays and tensors as numbers; of anything else, such as paths, its name."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def _moved(problem: Problem, stage: Stage) -> dict[str, Tensor]:
+    return {name: p for name, p in problem.parameters.items() if stage.moves is None or name in stage.moves}
 
 
 def _optimizer(
