@@ -49,10 +49,12 @@ def main(only: str | None, device: str, seeds: str, options: str, out: Path | No
             log |= json.loads((settings.out / "log.json").read_text(encoding="utf-8"))
             logs.mkdir(parents=True, exist_ok=True)
             (logs / f"{stem}.json").write_text(json.dumps(log, indent=1) + "\n", encoding="utf-8")
+            drawn = settings.out / "picture.png"  # not there without matplotlib
             # where a task runs on both, the picture is that of the CPU
-            if not (seed or written) and (device == "cpu" or not (logs / f"{name}.json").exists()):
+            first_choice = device == "cpu" or not (logs / f"{name}.json").exists()
+            if drawn.exists() and first_choice and not (seed or written):
                 images.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(settings.out / "picture.png", picture_of(name, images))
+                shutil.copyfile(drawn, picture_of(name, images))
             print(f"wrote {logs / stem}.json", file=sys.stderr)
             shutil.rmtree(settings.out)
     return 0

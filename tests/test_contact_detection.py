@@ -256,6 +256,23 @@ def test_bits_repeat(device: str, dtype: torch.dtype) -> None:
         assert torch.equal(first.near_values[b], alone.near_values[0])
 
 
+def test_threads_that_share_a_scene_change_nothing() -> None:
+    sheet, threads = dv.mesh.sheet(28, 28, (1.0, 1.0), 0.02), torch.get_num_threads()
+    s = Scene.of([solid(sheet), solid(sheet.translate((0.013, 0.03, 0.007)))])
+    s.x += 0.002 * generator("shared").standard_normal(s.x.shape)
+    results = []
+    try:
+        for n in (1, 2, 4):
+            torch.set_num_threads(n)
+            results.append(detect(s, "cpu"))
+    finally:
+        torch.set_num_threads(threads)
+    # far more than the search hands to one thread: 2,048 points and edges
+    assert s.x.shape[1] > 3000 and int(results[0].counts[0]) > 3000
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
 def test_bad_input(device: str) -> None:
     good = list(mixed_scene().arguments(device))
     names = (

@@ -10,12 +10,15 @@
 #include <utility>
 #include <vector>
 
+#include "grain.h"
+
 namespace diffvbd {
 namespace {
 
 using namespace contact;
 
-constexpr int64_t kChunk = 256;                    // items of one piece of work
+constexpr int64_t kChunk = 256;                    // primitives of one piece of the search
+constexpr int64_t kSearchGrain = 8;                // pieces that are worth one more thread: about 300 us
 constexpr int32_t kGroup = 8;                      // neighbors in a tree that look for pairs together
 constexpr int kDigitBits = 12, kShortSort = 2048;  // up to this many items a comparison sort is quicker
 
@@ -50,8 +53,8 @@ int bits_of(uint64_t below) {
 
 // f(i) for all i < n; within a parallel region, one thread does it all.
 template <class F>
-void in_chunks(int64_t n, const F& f) {
-  torch::stable::parallel_for(0, n, kChunk, [&](int64_t begin, int64_t end) {
+void for_each(int64_t n, const F& f) {
+  torch::stable::parallel_for(0, n, kGrain, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) f(i);
   });
 }
@@ -65,12 +68,11 @@ struct Tree {
   void build(const Box& bounds) {
     const auto n = static_cast<int64_t>(boxes.size());
     codes.resize(n);
-    in_chunks(n,
-              [&](int64_t i) { codes[i] = {morton_code(boxes[i], bounds, kMostAxisBits), static_cast<int32_t>(i)}; });
+    for_each(n, [&](int64_t i) { codes[i] = {morton_code(boxes[i], bounds, kMostAxisBits), static_cast<int32_t>(i)}; });
     sort_by_key(codes, scratch, 3 * kMostAxisBits);
     leaves = std::max(kGroup, padded_leaves(n));
     nodes.resize(int64_t{2} * leaves);
-    in_chunks(leaves, [&](int64_t k) { nodes[leaves + k] = k < n ? boxes[codes[k].item] : empty_box(); });
+    for_each(leaves, [&](int64_t k) { nodes[leaves + k] = k < n ? boxes[codes[k].item] : empty_box(); });
     for (int32_t i = leaves - 1; i >= kRoot; --i) nodes[i] = hull(nodes[2 * i], nodes[2 * i + 1]);
   }
   int32_t groups() const { return leaves / kGroup; }
@@ -117,7 +119,7 @@ class SceneDetection {
     const int32_t point_chunks = (points_.groups() + each - 1) / each,
                   edge_chunks = (edges_.groups() + each - 1) / each;
     finds_.resize(point_chunks + edge_chunks);
-    torch::stable::parallel_for(0, point_chunks + edge_chunks, 1, [&](int64_t begin, int64_t end) {
+    torch::stable::parallel_for(0, point_chunks + edge_chunks, kSearchGrain, [&](int64_t begin, int64_t end) {
       std::vector<Met> met;
       for (int64_t c = begin; c < end; ++c) {
         Finds<T>& finds = finds_[c];
@@ -140,7 +142,7 @@ class SceneDetection {
 
   void store_near(const Detected<T>& out) const {
     const int64_t row = scene_ * in_.corners;
-    in_chunks(in_.corners, [&](int64_t i) {
+    for_each(in_.corners, [&](int64_t i) {
       store_near_pair(in_, static_cast<int32_t>(i), near_[i].key, out.near_corners + kNearRow * (row + i),
                       out.near_values + kNearValues * (row + i));
     });
@@ -155,7 +157,7 @@ class SceneDetection {
     Box bounds = empty_box();
     const auto fill = [&](Tree& tree, const int32_t* items, int64_t count, int corners) {
       tree.boxes.resize(count);
-      in_chunks(count, [&](int64_t i) {
+      for_each(count, [&](int64_t i) {
         tree.boxes[i] = primitive_box(in_, scene_, items + corners * i, corners, static_cast<int32_t>(i), reference);
       });
       for (const Box& box : tree.boxes) bounds = hull(bounds, box);
@@ -235,7 +237,7 @@ class SceneDetection {
 
   // The list, sorted, now that all near gaps are known.
   void select() {
-    torch::stable::parallel_for(0, static_cast<int64_t>(finds_.size()), 1, [&](int64_t begin, int64_t end) {
+    torch::stable::parallel_for(0, static_cast<int64_t>(finds_.size()), kSearchGrain, [&](int64_t begin, int64_t end) {
       for (int64_t f = begin; f < end; ++f) {
         auto& pairs = finds_[f].pairs;
         const auto needless = [&](const typename Finds<T>::Pair& pair) {
@@ -313,7 +315,7 @@ void detect(const Surfaces<T>& in, const Detected<T>& out) {
     touches += touching[b], first = std::min(first, first_touching[b]);
   }
   const auto needed = static_cast<int64_t>(keys.size()), rows = std::min(needed, out.capacity);
-  in_chunks(out.capacity, [&](int64_t i) {
+  for_each(out.capacity, [&](int64_t i) {
     store_listed_pair(in, i < rows ? keys[i] : kNoKey, out.pairs + kPairRow * i, out.constants + kConstants * i);
   });
   store_entries(in, rows, out);

@@ -6,6 +6,8 @@
 #include <numeric>
 #include <vector>
 
+#include "grain.h"
+
 namespace diffvbd {
 namespace {
 
@@ -128,7 +130,7 @@ void add_rows(const T* values, const int32_t* order, int64_t n, int64_t c, T* su
 
 template <class T>
 void find_islands(const IslandInputs<T>& in, int32_t* island) {
-  torch::stable::parallel_for(0, in.scenes, 1, [&](int64_t begin, int64_t end) {
+  torch::stable::parallel_for(0, in.scenes, pieces_per_thread(in.vertices), [&](int64_t begin, int64_t end) {
     SceneIslands<T> islands(in);
     for (int64_t b = begin; b < end; ++b) islands.run(b, island + b * in.mesh_bodies);
   });
@@ -137,7 +139,8 @@ void find_islands(const IslandInputs<T>& in, int32_t* island) {
 template <class T>
 void segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
                  int64_t segments, int64_t c, T* out) {
-  torch::stable::parallel_for(0, scenes * segments, 1, [&](int64_t begin, int64_t end) {
+  const int64_t grain = pieces_per_thread(segments > 0 ? items / segments : 0);
+  torch::stable::parallel_for(0, scenes * segments, grain, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       const int64_t scene = i / segments, s = i - scene * segments;
       add_rows(values + scene * items * c, order + ptr[s], ptr[s + 1] - ptr[s], c, out + i * c);

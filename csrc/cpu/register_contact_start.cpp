@@ -7,16 +7,15 @@
 
 #include "../arguments_contact_start.h"
 #include "binding.h"
+#include "grain.h"
 
 namespace {
 
 namespace contact = diffvbd::contact;
-using diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::StartTensors, diffvbd::TranslationTensors;
-using diffvbd::zeros;
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::kGrain, diffvbd::StartTensors;
+using diffvbd::TranslationTensors, diffvbd::zeros;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
-
-constexpr int64_t kGrain = 2048;
 
 // Calls f(scene, item) for all items of all scenes.
 template <class F>

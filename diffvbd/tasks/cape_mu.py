@@ -21,6 +21,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import viz
+from diffvbd.tasks.cloth import mean_weights
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
 
@@ -39,7 +40,7 @@ def problem(settings: Settings) -> Problem:
     model = dv.Model(mesh, density=DENSITY, pinned=corners, relaxation=RELAXATION).to(settings.device)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     distance = np.hypot(*from_center.T)
-    center = weights(distance < distance.min() + 1e-9, x)
+    center = mean_weights(distance < distance.min() + 1e-9, x)
 
     def simulate(mu: Tensor) -> Tensor:
         """Positions [m] after each step, shape [steps + 1, V, 3]."""
@@ -98,8 +99,3 @@ def problem(settings: Settings) -> Problem:
         picture=picture,
         animation=lambda path: viz.animation(path, upper, motions(), TIME_STEP),
     )
-
-
-def weights(chosen: np.ndarray, like: Tensor) -> Tensor:
-    """Weights [V] whose dot product with values of vertices is the mean over the chosen ones, a bool mask [V]."""
-    return torch.as_tensor(chosen / chosen.sum(), dtype=like.dtype, device=like.device)

@@ -17,12 +17,12 @@ first one, or after 120 iterations, the paper's count.
 
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, viz
+from diffvbd.tasks.cloth import hanging
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
 
@@ -99,12 +99,3 @@ def problem(settings: Settings) -> Problem:
         picture=picture,
         animation=lambda path: viz.animation(path, mesh.surface, motions(), TIME_STEP, view=VIEW),
     )
-
-
-def hanging(nx: int, ny: int, width: float, length: float, thickness: float) -> tuple[dv.TetMesh, np.ndarray]:
-    """A cloth in the xy plane, with nx vertices across and ny down each of its two layers, and the mask [V] of its top
-    edge."""
-    # a quarter turn about x: what lay along z hangs along y
-    upright = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
-    mesh = dv.mesh.sheet(nx, ny, (width, length), thickness).transform(upright)
-    return mesh, mesh.points[:, 1] > length - 1e-9

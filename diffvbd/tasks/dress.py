@@ -32,6 +32,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, viz
+from diffvbd.tasks.cloth import ring_of_vertices
 from diffvbd.tasks.newton import Newton
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
@@ -66,7 +67,7 @@ def problem(name: str, settings: Settings, observe: Callable[[Tensor], Tensor], 
     model = dv.Model(
         mesh,
         density=DENSITY,
-        pinned=np.arange(mesh.num_vertices) % (segments * rings) < segments,
+        pinned=ring_of_vertices(mesh, segments, rings) == 0,
         energies=(
             dv.StableNeoHookean(),
             dv.FloorBarrier(kappa=KAPPA, dhat=DHAT, damping=DAMPING),

@@ -24,13 +24,12 @@ of the first one, or after 80 iterations, the paper's count.
 
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import viz
-from diffvbd.tasks.cape_mu import weights
+from diffvbd.tasks.cloth import mean_weights, ring_of_vertices
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
 
@@ -48,10 +47,10 @@ def problem(settings: Settings) -> Problem:
     if settings.quick:
         (around, rings), steps, sweeps, iterations = ((8, 6), 15, 15, 40)
     mesh = dv.mesh.dress(around, rings, THICKNESS, neck_height=NECK)
-    ring = np.arange(mesh.num_vertices) % (around * rings) // around
+    ring = ring_of_vertices(mesh, around, rings)
     model = dv.Model(mesh, density=DENSITY, pinned=ring == 0, relaxation=RELAXATION).to(settings.device)
     v = torch.zeros_like(model.rest_points)
-    hem = weights(ring == rings - 1, v)
+    hem = mean_weights(ring == rings - 1, v)
     neck = torch.tensor((0.0, NECK, 0.0), dtype=v.dtype, device=v.device)
 
     def simulate(size: Tensor) -> Tensor:

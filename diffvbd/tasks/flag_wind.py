@@ -29,7 +29,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, viz
-from diffvbd.tasks.cape_wind import hanging
+from diffvbd.tasks.cloth import hanging
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
 
