@@ -9,8 +9,8 @@ import torch
 from task_checks import check_fall, check_gradient, quick
 
 import diffvbd as dv
-from diffvbd.tasks.cape_mu import weights
-from diffvbd.tasks.cape_wind import TRUE_WIND, hanging
+from diffvbd.tasks.cape_wind import TRUE_WIND
+from diffvbd.tasks.cloth import hanging, mean_weights
 from diffvbd.tasks.dress_size import cut
 from diffvbd.tasks.flag_wind import reference_wind, singular_values
 
@@ -101,5 +101,5 @@ def test_cut_is_the_dress_of_that_size_in_the_same_cloth(size: float) -> None:
 def test_weights_average_the_chosen_vertices() -> None:
     mesh, top = hanging(5, 4, 0.6, 0.8, 0.01)
     points = torch.tensor(mesh.points)
-    middle = weights(top, points) @ points
+    middle = mean_weights(top, points) @ points
     assert middle.tolist() == pytest.approx([0.3, 0.8, 0.0])
