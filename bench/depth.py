@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bench import paper
 from bench.common import markdown_table
 from diffvbd.tasks import Problem, Settings, Stage, cube_bounce, solve
 from diffvbd.tasks.bounce import Bounce
@@ -21,17 +22,8 @@ SWEEPS = (5, 20, 100)
 CONVERGED = 500  # sweeps that judge what was found with fewer
 STARTS, JITTER, SEED = 8, 0.15, 0  # first states around the task's own; standard deviation of each number, relative
 ITERATIONS = 40
-NEAR = 0.013  # [m], what the paper's cube reaches in 151 iterations
-
-# what the paper measures: best distance [m] over 8 starts, and from its default start; Welch's t of the means
-PAPER = {
-    5: {"mean": 0.052, "std": 0.020, "min": 0.023, "max": 0.081, "default": 0.039},
-    20: {"mean": 0.034, "std": 0.018, "min": 0.015, "max": 0.065, "default": 0.058},
-    100: {"mean": 0.035, "std": 0.010, "min": 0.021, "max": 0.053, "default": 0.024},
-}
 PAPER_COLUMNS = ("mean", "std", "min", "max", "default")
 COLUMNS = ("mean", "std", "median", "min", "max", "near", "default", "converged")
-PAPER_T = {(5, 20): 1.87, (5, 100): 2.16, (20, 100): 0.11}
 
 INTRODUCTION = """\
 Best distance [m] of the cube's center of mass from its target after the bounce, within {iterations} iterations of Adam,
@@ -75,7 +67,7 @@ def study(sweeps: int, starts: int, iterations: int, converged: int) -> dict[str
         "max": max(found[1:]),
         "default": found[0],
         "converged": statistics.median(judged[1:]),
-        "near": sum(distance <= NEAR for distance in found[1:]),
+        "near": sum(distance <= paper.BOUNCE_DISTANCE for distance in found[1:]),
         "seconds": history[-1]["seconds"],
     }
 
@@ -142,14 +134,14 @@ def welch(a: Sequence[float], b: Sequence[float]) -> dict[str, float]:
 
 def markdown(results: dict[str, Any]) -> str:
     depths = results["depths"]
-    text = INTRODUCTION.format(starts=len(depths[0]["starts"]), near=NEAR,
+    text = INTRODUCTION.format(starts=len(depths[0]["starts"]), near=paper.BOUNCE_DISTANCE,
                                **{key: results[key] for key in ("iterations", "jitter", "converged")})  # fmt: skip
     rows = []
     for row in depths:
-        paper = PAPER.get(row["sweeps"], {})
+        theirs = paper.DEPTH.get(row["sweeps"], {})
         ours = [statistics.mean(row["starts"]), *(row[key] for key in COLUMNS)]
-        rows.append([row["sweeps"], *ours, *(paper.get(key) for key in PAPER_COLUMNS)])
+        rows.append([row["sweeps"], *ours, *(theirs.get(key) for key in PAPER_COLUMNS)])
     header = ["sweeps", "start, mean", *COLUMNS, *(f"paper, {key}" for key in PAPER_COLUMNS)]
-    pairs = [[*row["sweeps"], row["t"], row["df"], PAPER_T.get(tuple(row["sweeps"]))] for row in results["pairs"]]
+    pairs = [[*row["sweeps"], row["t"], row["df"], paper.DEPTH_T.get(tuple(row["sweeps"]))] for row in results["pairs"]]
     tests = markdown_table(["sweeps", "sweeps", "Welch's t", "degrees of freedom", "paper, t"], pairs)
     return f"{text}\n{markdown_table(header, rows)}\nDifferences of the means:\n\n{tests}"

@@ -37,6 +37,8 @@ def main(only: str | None, device: str, seeds: str, options: str, out: Path | No
     chosen = {name: TASKS[name].chosen(written) for name in names}
     logs, images = (RESULTS / "tasks", IMAGES) if out is None else (out, out)
     unfinished = ROOT / "runs" / "bench" if out is None else out / "unfinished"
+    # what another commit has begun, this one's log must not claim
+    unfinished /= str(environment()["commit"])[:10]
     for name in names:
         for seed in (int(s) for s in seeds.split(",")):
             parts = [name + device_suffix(device), *(k + re.sub(r"\W+", "_", v) for k, v in written.items())]
@@ -75,7 +77,7 @@ which `python -m bench tasks` writes and `python -m bench report` turns into thi
 `bench/paper.py`.
 
 Times are those of the optimisation, without pictures. Runs are repeatable: on one device the same seed gives the same
-numbers, bit by bit.
+numbers, bit by bit; only what runs for a given time, as CMA-ES in learn-controller, depends on the machine's speed.
 """
 
 
@@ -131,10 +133,17 @@ def section(name: str, runs: dict[str, Any], main_run: dict[str, Any], images: P
     header = ("on", "options", "seed", "evaluations", "first loss of the last stage", "best loss", "result", "seconds",
               "torch", "date", "commit")  # fmt: skip
     text.append(markdown_table(header, rows))
-    found = list(flat(main_run["findings"]))
-    if found:
-        text.append(markdown_table(("finding", "value"), found))
+    found = {label(run): dict(flat(run["findings"])) for run in runs.values()}
+    keys = list(dict.fromkeys(key for values in found.values() for key in values))
+    if keys:
+        text.append(markdown_table(("finding", *found), [(key, *(f.get(key) for f in found.values())) for key in keys]))
     return "\n".join(text)
+
+
+def label(run: dict[str, Any]) -> str:
+    """Where a run differs from the others of its task."""
+    settings, options = run["settings"], [f"{key} {value}" for key, value in run["options"].items()]
+    return ", ".join(["CPU" if settings["device"] == "cpu" else "GPU", *options, f"seed {settings['seed']}"])
 
 
 def flat(values: dict[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
@@ -161,7 +170,7 @@ def figure(run: dict[str, Any], key: str) -> float | None:
 
 def outcome(run: dict[str, Any]) -> str:
     """Errors of what has a true value in per cent, or else the figures that the bars are about."""
-    keys = list(PAPER[run["task"]].bars) or list(run["relative_error"]) or list(run["estimates"])
+    keys = list(PAPER[run["task"]].bars) or list(run["estimates"])
     shown = []
     for key in keys:
         value = figure(run, key)
@@ -170,5 +179,6 @@ def outcome(run: dict[str, Any]) -> str:
         elif value is not None:
             first = run["history"][0].get(key)
             came = f"{first:.3g} -> " if isinstance(first, float) else ""
-            shown.append(f"{key.replace('_', ' ')} {came}{value:.3g} {run['units'].get(key, '')}".rstrip())
+            unit = next((unit for name, unit in run["units"].items() if key.startswith(name)), "")
+            shown.append(f"{key.replace('_', ' ')} {came}{value:.3g} {unit}".rstrip())
     return ", ".join(shown)

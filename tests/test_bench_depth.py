@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench import depth
+from bench import depth, paper
 from bench.__main__ import main
 from diffvbd.tasks import Settings, cube_bounce, solve
 
@@ -74,6 +74,6 @@ def test_welch_is_that_of_scipy_and_of_the_paper() -> None:
         return [mean + sign * std * math.sqrt(7 / 8) for sign in (1, -1)] * 4
 
     # the paper gives mean and standard deviation to two digits
-    for (few, many), t in depth.PAPER_T.items():
-        pair = [sample(depth.PAPER[k]["mean"], depth.PAPER[k]["std"]) for k in (few, many)]
+    for (few, many), t in paper.DEPTH_T.items():
+        pair = [sample(paper.DEPTH[k]["mean"], paper.DEPTH[k]["std"]) for k in (few, many)]
         assert abs(depth.welch(*pair)["t"]) == pytest.approx(t, abs=0.05)

@@ -193,6 +193,27 @@ def test_segment_sum(device: str, sizes: list[int], dtype: torch.dtype) -> None:
     assert torch.equal(got, ops_contact.segment_sum(values, order, ptr))
 
 
+def test_threads_that_share_scenes_and_segments_change_nothing() -> None:
+    rng, scenes, threads = generator("shared"), 100, torch.get_num_threads()
+    s = cubes(*rng.uniform(0, 12, (25, 3)), scenes=scenes)
+    move = rng.normal(0, 1, (scenes, s.mesh_bodies, 3))[:, s.body[: s.x.shape[1]]]
+    values = torch.as_tensor(rng.standard_normal((2, 12_000, 3)))
+    order = torch.as_tensor(rng.permutation(12_000).astype(np.int32))
+    ptr = torch.arange(0, 12_001, 20, dtype=torch.int32)
+    results = []
+    try:
+        for n in (1, 2, 4):
+            torch.set_num_threads(n)
+            found = ops_contact.contact_islands(*arguments(s, move, np.ones((1, s.x.shape[1]))))
+            results.append((found, ops_contact.segment_sum(values, order, ptr)))
+    finally:
+        torch.set_num_threads(threads)
+    # more than one thread is given
+    assert scenes * s.x.shape[1] > 4 * 4096 and results[0][0].unique().numel() > 2
+    for found, sums in results[1:]:
+        assert torch.equal(found, results[0][0]) and torch.equal(sums, results[0][1])
+
+
 def test_opcheck_and_bad_input(device: str) -> None:
     s = cubes((0, 0, 0), (1.001, 0, 0), colliders=(sphere((5, 0, 0), 1),))
     good = arguments(s, np.zeros(s.x.shape), np.ones((1, s.x.shape[1])), device)

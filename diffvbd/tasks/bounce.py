@@ -11,7 +11,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, viz
-from diffvbd.tasks.problem import Problem, Settings, Stage
+from diffvbd.tasks.problem import Problem, Stage
 from diffvbd.tasks.progress import Row
 
 VOXEL = 0.05  # side of the target in pictures [m]; the distance is that to its center
@@ -93,7 +93,6 @@ class Bounce:
 
 def problem(
     name: str,
-    settings: Settings,
     scene: Bounce,
     velocity: tuple[float, float, float],
     moves: tuple[str, ...],

@@ -41,7 +41,6 @@ def problem(settings: Settings) -> Problem:
     )
     return bounce.problem(
         "bunny-bounce",
-        settings,
         scene,
         VELOCITY,
         moves=("velocity",),

@@ -63,7 +63,6 @@ def problem(settings: Settings, sweeps: int = SWEEPS) -> Problem:
         raise ValueError(f"sweeps: expected at least 1, got {sweeps}")
     return bounce.problem(
         "cube-bounce",
-        settings,
         scene(settings, sweeps),
         VELOCITY,
         moves=("offset", "velocity"),

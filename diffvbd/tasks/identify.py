@@ -89,6 +89,7 @@ def problem(
             "start": list(start),
             "fixed_lam": fixed_lam,
             "iterations": iterations,
+            "range": RANGE,
             "steps": observed,
             "observation": hashlib.sha256(observation.x.tobytes()).hexdigest(),
         },

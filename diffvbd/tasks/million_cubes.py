@@ -16,8 +16,9 @@ bodies that fly side by side and touch drift apart exponentially, at 0.1 N/m the
 The first guess is 3 m/s upwards for all. After t = 0.6 s bodies fly on without contact, which does not change the loss;
 the paper rolls these steps out, so it is the default (option `steps`). The center of mass of a free body does not
 depend on its material, except through what K = 5 sweeps leave unsolved: the gradient of mu is that of the executed
-solver, and 1e-4 of that of the velocity; where nothing else decides, Adam moves mu all the same, and the task does not
-identify it. float32, because a million bodies fill some ten GB; the quick version uses float64.
+solver, and tiny beside that of the velocity; where nothing else decides, Adam moves mu all the same, and the task does
+not identify it. float32, because a million bodies fill tens of GB; the quick version uses float64. The paper does not
+say where its bodies start and end, so its errors and ours are of different scenes.
 """
 
 import math
@@ -43,7 +44,7 @@ TARGET_STEP = 120  # t = 0.6 s
 CHECKPOINT_EVERY = 5
 HUBER = 1.0  # delta [m]
 CLIP = 5.0  # longest gradient of a body
-PAD, RING = 8e-3, 8e-3  # spacing of places [m]
+PAD_SPACING, RING_SPACING = 8e-3, 8e-3  # of places [m]
 LAYERS = 16
 HEIGHT = 1.77  # of the middle of the ring [m]
 RADIUS, STIFFNESS = math.sqrt(3) * EDGE, 3e-3  # [m], [N/m]
@@ -198,6 +199,10 @@ def problem(
             "checkpoint_every": CHECKPOINT_EVERY,
             "radius": RADIUS,
             "stiffness": STIFFNESS,
+            "huber": HUBER,
+            "clip": CLIP,
+            "spacing": (PAD_SPACING, RING_SPACING),
+            "height": HEIGHT,
             "dtype": str(dtype),
         },
         findings=findings,
@@ -212,7 +217,7 @@ def launch_pad(bodies: int) -> np.ndarray:
     side = math.ceil(math.sqrt(bodies / layers))
     x, z, y = np.meshgrid(np.arange(side), np.arange(side), np.arange(layers), indexing="ij")
     places = np.stack([x - 0.5 * (side - 1), y, z - 0.5 * (side - 1)], -1).reshape(-1, 3)
-    return PAD * places[:bodies]
+    return PAD_SPACING * places[:bodies]
 
 
 def ring(bodies: int, height: float) -> np.ndarray:
@@ -224,7 +229,7 @@ def ring(bodies: int, height: float) -> np.ndarray:
     x, z, y = (a.ravel() for a in np.meshgrid(axis, deep, axis, indexing="ij"))
     inside = np.hypot(np.hypot(x, y) - 2 * tube, z)
     chosen = np.sort(np.argsort(inside, kind="stable")[:bodies])
-    return RING * np.stack([x, y, z], -1)[chosen] + [0.0, height, 0.0]
+    return RING_SPACING * np.stack([x, y, z], -1)[chosen] + [0.0, height, 0.0]
 
 
 def matched(places: np.ndarray, random: np.random.Generator) -> np.ndarray:

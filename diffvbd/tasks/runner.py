@@ -209,7 +209,7 @@ class _Run:
 
     def save(self) -> None:
         state = {
-            "identity": self.fingerprint,
+            "fingerprint": self.fingerprint,
             "history": self.history,
             "stage": (self.at, self.first, self.best),
             "best_parameters": self.best_parameters,
@@ -233,7 +233,7 @@ class _Run:
             return
         try:
             state = torch.load(self.state, map_location=self.settings.device)
-            same = state["identity"] == self.fingerprint
+            same = state["fingerprint"] == self.fingerprint
         except Exception as error:  # torch.load raises errors of many kinds
             same, state = False, {}
             print(f"{self.state} cannot be read ({type(error).__name__})", file=sys.stderr)
