@@ -196,7 +196,7 @@ def test_segment_sum(device: str, sizes: list[int], dtype: torch.dtype) -> None:
 def test_threads_that_share_scenes_and_segments_change_nothing() -> None:
     rng, scenes, threads = generator("shared"), 100, torch.get_num_threads()
     s = cubes(*rng.uniform(0, 12, (25, 3)), scenes=scenes)
-    move = rng.normal(0, 1, (scenes, s.mesh_bodies, 3))[:, s.body[: s.x.shape[1]]]
+    move = np.repeat(rng.normal(0, 1, (scenes, s.mesh_bodies, 3)), CUBE.num_vertices, axis=1)
     values = torch.as_tensor(rng.standard_normal((2, 12_000, 3)))
     order = torch.as_tensor(rng.permutation(12_000).astype(np.int32))
     ptr = torch.arange(0, 12_001, 20, dtype=torch.int32)
