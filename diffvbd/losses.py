@@ -13,7 +13,16 @@ def vertex_distance(x: Tensor, target: Tensor) -> Tensor:
 
     Returns:
         Scalar [m^2].
+
+    Raises:
+        ValueError: a target that does not broadcast to x.
     """
+    try:
+        target = target.expand_as(x)
+    except RuntimeError:
+        raise ValueError(
+            f"target: expected a shape that broadcasts to {list(x.shape)}, got {list(target.shape)}"
+        ) from None
     return (x - target).square().sum(-1).mean()
 
 

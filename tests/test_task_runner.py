@@ -1,6 +1,7 @@
 """Claim: the runner's stages, optimisers and interruptions leave the numbers that one run in one go would have."""
 
 import json
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -161,16 +162,25 @@ BAD = [
     ({"estimates": lambda: None}, TypeError, "estimates: expected a dict of numbers, got NoneType"),
     ({"stages": [Stage(flat, 0)]}, ValueError, r"stages\[0\].iterations: expected an integer of at least 1, got 0"),
     ({"stages": [Stage(flat, 2.5)]}, ValueError, r"stages\[0\].iterations: .* got 2.5"),  # type: ignore[arg-type]
-    ({"stages": [Stage(flat, 1, clip=0.0)]}, ValueError, r"stages\[0\].clip: expected more than 0"),
+    ({"stages": [Stage(flat, 1, clip=0.0)]}, ValueError, r"stages\[0\].clip: expected a number above 0, got 0.0"),
     ({"stages": [Stage(flat, 1, moves=("c",))]}, ValueError, r"stages\[0\].moves: expected a list of names"),
     ({"stages": [Stage(flat, 1, moves="a")]}, ValueError, r"stages\[0\].moves: expected a list .* got 'a'"),
     ({"stages": [Stage(flat, 1, moves=())]}, ValueError, r"stages\[0\].moves: expected a list of names"),
     ({"stages": [Stage(flat, 1)]}, ValueError, r"stages\[0\].loss: expected .* depends on the parameters"),
     ({"stages": [Stage(two, 1)]}, ValueError, r"stages\[0\].loss: expected a scalar, got shape \[2\]"),
     ({"parameters": {}}, TypeError, "toy: parameters: expected tensors by name"),
-    ({"parameters": {"a": torch.zeros(())}}, TypeError, r"parameters\['a'\]: expected a leaf tensor"),
+    (
+        {"parameters": {"a": torch.zeros(())}},
+        TypeError,
+        r"\['a'\]: expected .* got a leaf with requires_grad = False",
+    ),
     ({"truth": {"b": 1.0}}, ValueError, r"truth: expected names of estimates, got \['b'\]"),
-    ({"truth": {"a": 0.0}}, ValueError, r"truth: .* got 0 for \['a'\]"),
+    ({"truth": {"a": 0.0}}, ValueError, r"truth\['a'\]: expected a number .* got 0.0"),
+    ({"truth": {"a": math.nan}}, ValueError, r"truth\['a'\]: expected a number .* got nan"),
+    ({"truth": None}, TypeError, "truth: expected numbers by name, got None"),
+    ({"stages": [Stage(flat, 1, learning_rate=-1.0)]}, ValueError, r"stages\[0\].learning_rate: .* above 0, got -1.0"),
+    ({"stages": [Stage(flat, 1, tolerance=math.nan)]}, ValueError, r"stages\[0\].tolerance: .* at least 0, got nan"),
+    ({"stages": [Stage(None, 1)]}, TypeError, r"stages\[0\].loss: expected a function, got None"),  # type: ignore
     ({"estimates": lambda: {"loss": 1.0}}, ValueError, r"estimates: expected other names .* got \['loss'\]"),
     ({"estimates": lambda: {"a": torch.ones(())}}, TypeError, "estimates: expected numbers, got Tensor for 'a'"),
 ]
@@ -191,6 +201,8 @@ def test_parameters_and_criteria_that_the_loss_does_not_know_are_refused(tmp_pat
     problem.stages = [replace(stage, criterion="c")]
     with pytest.raises(ValueError, match=r"stages\[0\].criterion: expected a key of the history, got 'c'"):
         solve(problem, Settings(tmp_path))
+    with pytest.raises(TypeError, match="out: expected a pathlib.Path, got 'runs'"):
+        Settings("runs")  # type: ignore[arg-type]
     for seed in (-1, 2**64, 1.5):
         with pytest.raises(ValueError, match="seed: expected an integer"):
             Settings(tmp_path, seed=seed)  # type: ignore[arg-type]
@@ -200,6 +212,7 @@ def test_a_picture_that_fails_costs_no_result(tmp_path: Path, capsys: pytest.Cap
     def fail(*_: Any) -> None:
         raise RuntimeError("no paint")
 
+    solve(toy(), Settings(tmp_path))
     (tmp_path / "animation.gif").write_bytes(b"of a run before")
     result = solve(toy(picture=fail, animation=fail), Settings(tmp_path))
     assert [path.name for path in result.files] == ["log.json"]
@@ -216,6 +229,60 @@ def test_another_run_puts_a_state_aside(tmp_path: Path, capsys: pytest.CaptureFi
     solve(toy(), Settings(tmp_path, seed=1))
     assert (tmp_path / "state.other.pt").read_bytes() == kept
     assert "starting anew" in capsys.readouterr().err
+
+
+def no_history(state: dict) -> None:
+    state["history"] = []
+
+
+def no_seconds(state: dict) -> None:
+    del state["history"][1]["seconds"]
+
+
+def late_stage(state: dict) -> None:
+    state["stage"] = (7, 0, 0)
+
+
+def no_optimizer(state: dict) -> None:
+    del state["optimizer"]
+
+
+def no_number(state: dict) -> None:
+    state["parameters"]["a"].fill_(math.nan)
+
+
+@pytest.mark.parametrize("damage", [no_history, no_seconds, late_stage, no_optimizer, no_number])
+def test_a_damaged_state_is_put_aside_as_if_it_had_never_been(
+    damage: Callable[[dict], None], tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    expected = solve(toy(), Settings(tmp_path / "whole")).history
+    first = toy()
+    interrupt(first, 5)
+    with pytest.raises(KeyboardInterrupt):
+        solve(first, Settings(tmp_path / "run"))
+    path = tmp_path / "run" / "state.pt"
+    state = torch.load(path)
+    damage(state)
+    torch.save(state, path)
+    (tmp_path / "run" / "state.other.pt").write_bytes(b"an earlier one")
+    assert timeless(solve(toy(), Settings(tmp_path / "run")).history) == timeless(expected)
+    assert "state.other-2.pt now; starting anew" in capsys.readouterr().err
+    assert (tmp_path / "run" / "state.other.pt").read_bytes() == b"an earlier one"
+
+
+@pytest.mark.parametrize("name", ["picture.png", "log.json"])
+def test_files_that_are_not_of_the_task_stay(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"{}")
+    (tmp_path / "video.mp4.part").write_bytes(b"half")
+    with pytest.raises(ValueError, match=f"out: expected a folder without results, .* {name} of something else"):
+        solve(toy(), Settings(tmp_path))
+    (tmp_path / name).unlink()
+    solve(toy(), Settings(tmp_path))
+    with pytest.raises(ValueError, match="with those of bowl, got .* with log.json of toy"):
+        solve(toy(name="bowl"), Settings(tmp_path))
+    assert {path.name for path in tmp_path.iterdir()} == {"log.json", "video.mp4.part"}
+    with pytest.raises(ValueError, match="out: expected a folder or a place for one, got .*log.json"):
+        solve(toy(), Settings(tmp_path / "log.json"))
 
 
 @pytest.mark.parametrize("device", ["cud", "meta", "cuda:77"])

@@ -49,9 +49,8 @@ class Task:
             ValueError: an option that the task has not, or a value that is not of its kind.
         """
         if unknown := sorted(texts.keys() - self.options.keys()):
-            raise ValueError(
-                f"--{unknown[0]}: expected one of the task's options ({', '.join(self.options) or 'none'})"
-            )
+            known = ", ".join(self.options) or "none"
+            raise ValueError(f"--{unknown[0]}: expected one of the task's options ({known}), got {texts[unknown[0]]!r}")
         found = {}
         for name, text in texts.items():
             try:

@@ -32,6 +32,8 @@ class Settings:
     quick: bool = False
 
     def __post_init__(self) -> None:
+        if not isinstance(self.out, Path):
+            raise TypeError(f"out: expected a pathlib.Path, got {self.out!r}")
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or not 0 <= self.seed < 2**63:
             raise ValueError(f"seed: expected an integer from 0 to 2^63 - 1, got {self.seed!r}")
 
@@ -130,7 +132,10 @@ def check(problem: Problem) -> None:
         raise TypeError(f"{name}: parameters: expected tensors by name, got {parameters!r}")
     for key, parameter in parameters.items():
         if not (isinstance(parameter, Tensor) and parameter.is_leaf and parameter.requires_grad):
-            raise TypeError(f"{name}: parameters[{key!r}]: expected a leaf tensor that requires grad")
+            got = type(parameter).__name__
+            if isinstance(parameter, Tensor):
+                got = f"{'a leaf' if parameter.is_leaf else 'a result'} with requires_grad = {parameter.requires_grad}"
+            raise TypeError(f"{name}: parameters[{key!r}]: expected a leaf tensor that requires grad, got {got}")
     if not isinstance(problem.stages, Sequence) or not problem.stages:
         raise ValueError(f"{name}: stages: expected at least one Stage in a list, got {problem.stages!r}")
     for k, stage in enumerate(problem.stages):
@@ -139,16 +144,35 @@ def check(problem: Problem) -> None:
             raise TypeError(f"{where}: expected a Stage, got {type(stage).__name__}")
         if isinstance(stage.iterations, bool) or not isinstance(stage.iterations, int) or stage.iterations < 1:
             raise ValueError(f"{where}.iterations: expected an integer of at least 1, got {stage.iterations!r}")
-        if stage.clip is not None and not stage.clip > 0:
-            raise ValueError(f"{where}.clip: expected more than 0, got {stage.clip}")
+        for key in ("loss", "optimizer", "before"):
+            value = getattr(stage, key)
+            if not (callable(value) or (value is None and key != "loss")):
+                raise TypeError(f"{where}.{key}: expected a function, got {value!r}")
+        for key in ("learning_rate", "clip"):
+            value = getattr(stage, key)
+            if not (_is_number(value) and value > 0 or (value is None and key == "clip")):
+                raise ValueError(f"{where}.{key}: expected a number above 0, got {value!r}")
+        for key in ("tolerance", "gradient_tolerance"):
+            value = getattr(stage, key)
+            if not (_is_number(value) and value >= 0):
+                raise ValueError(f"{where}.{key}: expected a number of at least 0, got {value!r}")
         if stage.moves is not None:
             known = not isinstance(stage.moves, str) and len(stage.moves) > 0 and set(stage.moves) <= set(parameters)
             if not known:
                 raise ValueError(
                     f"{where}.moves: expected a list of names among {list(parameters)}, got {stage.moves!r}"
                 )
-    if zeros := [key for key, value in problem.truth.items() if value == 0]:
-        raise ValueError(f"{name}: truth: expected values that an error can be relative to, got 0 for {zeros}")
+    if not isinstance(problem.truth, dict):
+        raise TypeError(f"{name}: truth: expected numbers by name, got {problem.truth!r}")
+    for key, value in problem.truth.items():
+        if not _is_number(value) or value == 0:
+            raise ValueError(
+                f"{name}: truth[{key!r}]: expected a number that an error can be relative to, got {value!r}"
+            )
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def check_row(problem: Problem, stage: int, estimates: Row) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -14,7 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffvbd.tasks.folder import STATE, prepare, put_aside, remove_results, replace
 from diffvbd.tasks.problem import (
+    OWN_KEYS,
     Problem,
     Result,
     Settings,
@@ -28,7 +29,6 @@ from diffvbd.tasks.problem import (
 )
 from diffvbd.tasks.progress import Progress, Row, summary, table_of, versions
 
-RESULTS = ("log.json", "picture.png", "animation.gif", "parameters.pt")  # files of a run
 LISTED = 1000  # numbers of a parameter that log.json lists; larger ones go to parameters.pt
 
 
@@ -37,19 +37,20 @@ def solve(problem: Problem, settings: Settings) -> Result:
 
     After every step of an optimiser the whole state is on disk, so the same call continues an interrupted run with the
     very numbers the uninterrupted one would have had. A state of other settings, of another protocol or of a first loss
-    that is no longer the same number is ignored.
+    that is no longer the same number is put aside.
 
     Returns:
         The result; log.json, picture.png and animation.gif (where matplotlib is installed) are in settings.out.
 
     Raises:
         ArithmeticError: the loss or a gradient is not finite.
-        ValueError, TypeError: the problem is not well formed; or the device is not there.
+        ValueError, TypeError: the problem is not well formed; the device is not there; the folder cannot be written to,
+            or holds results of another task.
     """
     check(problem)
     check_device(settings.device)
     torch.manual_seed(settings.seed)
-    settings.out.mkdir(parents=True, exist_ok=True)
+    prepare(settings.out, problem.name)
     run = _Run(problem, settings)
     run.resume()
     if run.cuda:
@@ -151,7 +152,7 @@ class _Run:
     def __init__(self, problem: Problem, settings: Settings) -> None:
         self.problem, self.settings = problem, settings
         self.history: list[Row] = []
-        self.state = settings.out / "state.pt"
+        self.state = settings.out / STATE
         choices = {key: value for key, value in asdict(settings).items() if key != "out"}
         self.identity = {"task": problem.name, "settings": choices, "protocol": problem.protocol}
         self.cuda = torch.device(settings.device).type == "cuda"
@@ -219,40 +220,56 @@ class _Run:
             "schedule": self.schedule.state_dict() if self.schedule else None,
             "random": torch.get_rng_state(),
         }
-        _replace(self.state, lambda path: torch.save(state, path))
+        replace(self.state, lambda path: torch.save(state, path))
         self.write_log()
 
     def resume(self) -> None:
         """Continue where the file says, if it is of the same problem."""
-        out = self.settings.out
-        for unfinished in out.glob("*.part"):
-            unfinished.unlink()
         if not self.state.exists():
-            for name in RESULTS:  # of a run before, which this one's would be mixed with
-                (out / name).unlink(missing_ok=True)
+            remove_results(self.settings.out)  # of a run before, which this one's would be mixed with
             return
+        tensors = (self.problem.parameters, self.problem.state)
+        begun = [{name: t.detach().clone() for name, t in each.items()} for each in tensors]
+        first = self._first_loss()
         try:
             state = torch.load(self.state, map_location=self.settings.device)
-            same = state["fingerprint"] == self.fingerprint
-        except Exception as error:  # torch.load raises errors of many kinds
-            same, state = False, {}
-            print(f"{self.state} cannot be read ({type(error).__name__})", file=sys.stderr)
-        if not (same and state["history"][0]["loss"] == self._first_loss()):
-            aside = self.state.with_name("state.other.pt")
-            os.replace(self.state, aside)
-            print(f"{self.state} does not belong to this run, and is {aside.name} now; starting anew", file=sys.stderr)
+            same = state["fingerprint"] == self.fingerprint and state["history"][0]["loss"] == first
+            if same:
+                self._restore(state)
+        except Exception as error:  # torch.load raises errors of many kinds, and a damaged state others
+            same = False
+            print(f"{self.state} cannot be read ({type(error).__name__}: {error})", file=sys.stderr)
+        if same:
+            print(f"continuing after {len(self.history)} iterations", file=sys.stderr)
             return
+        for each, values in zip(tensors, begun, strict=True):
+            _assign(each, values)
+        torch.manual_seed(self.settings.seed)
+        self.history = []
+        self._enter(0)
+        aside = put_aside(self.state)
+        print(f"{self.state} does not belong to this run, and is {aside.name} now; starting anew", file=sys.stderr)
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        stage, first, best = state["stage"]
+        if not 0 <= stage < len(self.problem.stages):
+            raise ValueError(f"there is no stage {stage}")
         self.history = state["history"]
-        self._enter(state["stage"][0])
-        _, self.first, self.best = state["stage"]
+        self._enter(stage)
+        self.first, self.best = first, best
         self.best_parameters = state["best_parameters"]
+        for each in (state["parameters"], self.best_parameters):
+            if not all(value.isfinite().all() for value in each.values()):
+                raise ValueError("a parameter is not finite")
         _assign(self.problem.parameters, state["parameters"])
         _assign(self.problem.state, state["state"])
         self.optimizer.load_state_dict(state["optimizer"])
         if self.schedule:
             self.schedule.load_state_dict(state["schedule"])
         torch.set_rng_state(state["random"].cpu())
-        print(f"continuing after {len(self.history)} iterations", file=sys.stderr)
+        keys = set(OWN_KEYS) - {"stage"}
+        if not (all(keys <= row.keys() for row in self.history) and 0 <= first <= best <= len(self.history)):
+            raise ValueError("its history is not whole")
 
     def _fingerprint(self) -> str:
         """What must be the same for a run to be continued, besides the first loss."""
@@ -283,7 +300,7 @@ class _Run:
         content = self.identity | {"stages": stages, "versions": versions(self.settings.device), **result}
         log = self.settings.out / "log.json"
         text = json.dumps(content | {"history": self.history}, indent=1, default=_plain)
-        _replace(log, lambda path: path.write_text(text + "\n"))
+        replace(log, lambda path: path.write_text(text + "\n"))
         return log
 
     def finish(self) -> Result:
@@ -308,7 +325,7 @@ class _Run:
         result = Result(best, self.history, estimates, errors, self.last_converged, [log], findings)
         if listed.keys() != problem.parameters.keys():
             path = self.settings.out / "parameters.pt"
-            _replace(path, lambda new: torch.save({k: p.detach().cpu() for k, p in problem.parameters.items()}, new))
+            replace(path, lambda new: torch.save({k: p.detach().cpu() for k, p in problem.parameters.items()}, new))
             result.files.append(path)
         self._draw(result)
         self.state.unlink(missing_ok=True)
@@ -372,10 +389,3 @@ def _optimizer(
     # can be tiny: the default eps would exceed their gradients.
     optimizer = torch.optim.Adam(parameters, stage.learning_rate, betas=(0.7, 0.9), eps=1e-20)
     return optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, stage.iterations)
-
-
-def _replace(path: Path, write: Callable[[Path], object]) -> None:
-    # An interruption in the middle of a write must not destroy the previous file.
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}.part")
-    write(unfinished)
-    os.replace(unfinished, path)

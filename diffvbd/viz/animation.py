@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.viz.drawing import COLORS, OTHER, VIEW, Scenery, as_array, bounds_of, draw, new_figure
+from diffvbd.viz.drawing import COLORS, OTHER, VIEW, Scenery, bounds_of, draw, motions_as_arrays, new_figure
 
 FRAMES = 40  # of a longer motion so many are shown
 
@@ -34,13 +34,14 @@ def animation(
 
     Raises:
         ImportError: matplotlib is not installed.
+        ValueError: motions or triangles of another shape.
     """
     figure = new_figure(3.4 * len(motions), 3.2, dots=70)
     from matplotlib.animation import FuncAnimation, PillowWriter
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
-    frames = {name: as_array(motion) for name, motion in motions.items()}
+    frames = motions_as_arrays(motions, surface)
     count = min(len(motion) for motion in frames.values())
     shown = np.unique(np.linspace(0, count - 1, min(count, FRAMES)).round().astype(int))
     bounds = bounds_of([*frames.values(), *(thing.points for thing in scenery)])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.viz.drawing import COLORS, OTHER, VIEW, Scenery, as_array, bounds_of, course, draw, new_figure
+from diffvbd.viz.drawing import COLORS, OTHER, VIEW, Scenery, bounds_of, course, draw, motions_as_arrays, new_figure
 
 
 def comparison(
@@ -34,8 +34,9 @@ def comparison(
 
     Raises:
         ImportError: matplotlib is not installed.
+        ValueError: motions or triangles of another shape.
     """
-    frames = {name: as_array(motion) for name, motion in motions.items()}
+    frames = motions_as_arrays(motions, surface, len(times))
     low, high = bounds_of([*frames.values(), *(thing.points for thing in scenery)])
 
     columns = len(times)

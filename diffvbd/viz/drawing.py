@@ -41,13 +41,18 @@ def draw(
         bounds: Lowest and highest corner [m] of the box to show; default: that of the points.
         scenery: What else is there.
         view: Elevation and azimuth of the eye [degrees].
+
+    Raises:
+        ValueError: no triangles of the points.
     """
     from matplotlib.colors import to_rgb
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     # matplotlib's up is its third axis: y goes there by a cyclic exchange, which keeps the handedness.
     cyclic = [2, 0, 1]
-    body = as_array(points)[surface][..., cyclic]
+    vertices = as_array(points)
+    check_surface(surface, len(vertices))
+    body = vertices[surface][..., cyclic]
     parts, colors = [body], [np.broadcast_to(to_rgb(color) if isinstance(color, str) else color, (len(body), 3))]
     for thing in scenery:
         parts.append(as_array(thing.points)[thing.triangles][..., cyclic])
@@ -130,6 +135,32 @@ def as_array(values: Any) -> NDArray[np.float64]:
     """An array or tensor of any device, as float64."""
     values = values.detach().cpu().numpy() if hasattr(values, "detach") else values
     return np.asarray(values, dtype=np.float64)
+
+
+def check_surface(surface: Any, vertices: int) -> None:
+    """Raises ValueError for what is not a list of triangles of so many vertices."""
+    shape, last = list(np.shape(surface)), np.max(surface, initial=-1)
+    if len(shape) != 2 or shape[1] != 3 or last >= vertices:
+        raise ValueError(
+            f"surface: expected triangles [F, 3] of {vertices} vertices, got shape {shape} with indices up to {last}"
+        )
+
+
+def motions_as_arrays(
+    motions: Mapping[str, Any], surface: Any, times: int | None = None
+) -> dict[str, NDArray[np.float64]]:
+    """Positions of each motion, shape [N, V, 3].
+
+    Raises:
+        ValueError: another shape, another N than there are times, or a surface of other vertices.
+    """
+    frames = {name: as_array(motion) for name, motion in motions.items()}
+    for name, motion in frames.items():
+        if motion.ndim != 3 or motion.shape[-1] != 3 or times not in (None, len(motion)):
+            count = "N" if times is None else f"N = {times}"
+            raise ValueError(f"motions[{name!r}]: expected shape [{count}, V, 3], got {list(motion.shape)}")
+        check_surface(surface, motion.shape[1])
+    return frames
 
 
 def new_figure(width: float, height: float, dots: int = 130) -> Any:

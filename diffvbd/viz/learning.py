@@ -1,5 +1,6 @@
 """What was learnt, and how soon."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.viz.drawing import BODIES, OTHER, VIEW, Scenery, as_array, bounds_of, draw, new_figure
+from diffvbd.viz.drawing import BODIES, OTHER, VIEW, Scenery, bounds_of, draw, motions_as_arrays, new_figure
 
 
 def learning(
@@ -32,8 +33,9 @@ def learning(
 
     Raises:
         ImportError: matplotlib is not installed.
+        ValueError: motions or triangles of another shape.
     """
-    frames = {name: as_array(motion) for name, motion in motions.items()}
+    frames = motions_as_arrays(motions, surface, len(times))
     bounds = bounds_of([*frames.values(), *(thing.points for thing in scenery)])
     figure = new_figure(3.0 * len(times) + 4.2, 2.6 * len(frames))
     shapes, chart = figure.subfigures(1, 2, width_ratios=(3.0 * len(times), 4.2))
@@ -45,7 +47,7 @@ def learning(
     shapes.subplots_adjust(left=0.0, right=1.0, bottom=0.0, top=0.95, wspace=0.0, hspace=0.05)
 
     axes = chart.subplots()
-    for color, (name, curve) in zip(BODIES, curves.items(), strict=False):
+    for color, (name, curve) in zip(itertools.cycle(BODIES), curves.items()):
         seconds, losses = zip(*curve, strict=True)
         axes.semilogy(seconds, np.minimum.accumulate(losses), label=name, color=color)
     axes.set(xlabel="seconds", ylabel="lowest loss so far")

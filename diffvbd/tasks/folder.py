@@ -1,0 +1,57 @@
+"""The folder of a run: what may lie there before it, and how its files are written."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+RESULTS = ("log.json", "picture.png", "animation.gif", "parameters.pt")  # files of a run
+STATE = "state.pt"  # of an unfinished one
+
+
+def prepare(out: Path, task: str) -> None:
+    """Make the folder, or make sure that what lies in it may be replaced.
+
+    Raises:
+        ValueError: no folder, one that cannot be written to, or one with results of another task or of something else.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"out: expected a folder or a place for one, got {out} ({error.strerror})") from None
+    if not os.access(out, os.W_OK | os.X_OK):
+        raise ValueError(f"out: expected a folder that can be written to, got {out}")
+    there = [name for name in RESULTS if (out / name).exists()]
+    if there and (found := _task_of(out / "log.json")) != task:
+        whose = f"{', '.join(there)} of {found or 'something else'}"
+        raise ValueError(f"out: expected a folder without results, or with those of {task}, got {out} with {whose}")
+    for name in (*RESULTS, STATE):
+        for unfinished in out.glob(f"{name}.[0-9]*.part"):
+            unfinished.unlink()
+
+
+def _task_of(log: Path) -> str | None:
+    try:
+        return str(json.loads(log.read_text(encoding="utf-8"))["task"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def remove_results(out: Path) -> None:
+    for name in RESULTS:
+        (out / name).unlink(missing_ok=True)
+
+
+def put_aside(state: Path) -> Path:
+    """Give a state that is not continued a name that no other has; returns its new path."""
+    aside, k = state.with_name("state.other.pt"), 1
+    while aside.exists():
+        aside, k = state.with_name(f"state.other-{k + 1}.pt"), k + 1
+    return state.rename(aside)
+
+
+def replace(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file anew; an interruption in the middle leaves the one before."""
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}.part")
+    write(unfinished)
+    os.replace(unfinished, path)
