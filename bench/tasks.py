@@ -87,7 +87,7 @@ def page(folder: Path, images: Path, root: Path) -> str:
     # the CPU's before a GPU's, without options before with, then by seed
     logs = dict(sorted(logs.items(), key=place_on_page))
     for stem, log in logs.items():
-        if not {"environment", "options", "findings", "units"} <= log.keys():
+        if not {"environment", "options", "findings", "units", "variables"} <= log.keys():
             raise ValueError(f"{stem}.json: expected a log of `python -m bench tasks`, got an older one; run it again")
     header = ("task", "variables", "the paper", "its iterations", "ours", "evaluations", "CPU [s]", "GPU [s]",
               "bar met")  # fmt: skip
@@ -100,8 +100,7 @@ def page(folder: Path, images: Path, root: Path) -> str:
         bars, paper = PAPER[name].bars, PAPER[name]
         reached = [(figure(run, key), bar) for run in runs.values() if not run["options"] for key, bar in bars.items()]
         met = [value is not None and value <= bar for value, bar in reached]
-        variables = main_run.get("variables", paper.variables)
-        rows.append((f"[{name}](#{name})", variables, paper.outcome, paper.iterations, outcome(main_run),
+        rows.append((f"[{name}](#{name})", main_run["variables"], paper.outcome, paper.iterations, outcome(main_run),
                      len(main_run["history"]), seconds(runs.get(name)), seconds(runs.get(f"{name}-cuda")),
                      all(met) if met else None))  # fmt: skip
         parts.append(section(name, runs, main_run, images, root))
@@ -123,12 +122,12 @@ def section(name: str, runs: dict[str, Any], main_run: dict[str, Any], images: P
         text.append(f"![{TASKS[name].summary}]({picture.relative_to(root).as_posix()})\n")
     rows = []
     for run in runs.values():
-        options = ", ".join(f"{key} {value}" for key, value in run["options"].items())
         e, last = run["environment"], run["history"][-1].get("stage", 0)
         # of the last stage: those before it may have other losses
         first = next(row for row in run["history"] if row.get("stage", 0) == last)
         where = place(e) + (f", {e['threads']} threads" if e["device"] == "cpu" else "")
-        rows.append((where, options or "-", run["settings"]["seed"], len(run["history"]), first["loss"],
+        options = ", ".join(options_of(run)) or "-"
+        rows.append((where, options, run["settings"]["seed"], len(run["history"]), first["loss"],
                      run["best"]["loss"], outcome(run), seconds(run), e["torch"], e["date"], commit(e)))  # fmt: skip
     header = ("on", "options", "seed", "evaluations", "first loss of the last stage", "best loss", "result", "seconds",
               "torch", "date", "commit")  # fmt: skip
@@ -142,8 +141,12 @@ def section(name: str, runs: dict[str, Any], main_run: dict[str, Any], images: P
 
 def label(run: dict[str, Any]) -> str:
     """Where a run differs from the others of its task."""
-    settings, options = run["settings"], [f"{key} {value}" for key, value in run["options"].items()]
-    return ", ".join(["CPU" if settings["device"] == "cpu" else "GPU", *options, f"seed {settings['seed']}"])
+    settings = run["settings"]
+    return ", ".join(["CPU" if settings["device"] == "cpu" else "GPU", *options_of(run), f"seed {settings['seed']}"])
+
+
+def options_of(run: dict[str, Any]) -> list[str]:
+    return [f"{key} {value}" for key, value in run["options"].items()]
 
 
 def flat(values: dict[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from diffvbd.tasks import TASKS, Problem, Result, Settings, solve
+from diffvbd.tasks.progress import Row
 
 
 def quick(name: str, out: Path, **options: Any) -> tuple[Problem, Settings]:
@@ -16,6 +17,11 @@ def quick(name: str, out: Path, **options: Any) -> tuple[Problem, Settings]:
     problem = TASKS[name].build(settings, **options)
     problem.picture = None
     return problem, settings
+
+
+def timeless(history: list[Row]) -> list[Row]:
+    """What two runs of the same numbers have in common."""
+    return [{key: value for key, value in row.items() if key != "seconds"} for row in history]
 
 
 def check_fall(name: str, out: Path, factor: float, iterations: int | None = None, **options: Any) -> Result:

@@ -11,9 +11,9 @@ from task_checks import check_fall, check_gradient
 
 import diffvbd as dv
 from diffvbd import viz
+from diffvbd.mesh.tet_mesh import boundary_faces
 from diffvbd.tasks import Settings, fit_real_mesh
 from diffvbd.tasks.fit_real_mesh import HEIGHT, HELD, TRACTION, neighbors, pulls, scaled
-from diffvbd.viz.field import boundary
 
 BODY = scaled(dv.mesh.bunny(8), HEIGHT)
 
@@ -105,7 +105,7 @@ def test_mesh_of_a_file(tmp_path: Path) -> None:
 
 def test_map_of_a_field(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    triangles, owner = boundary(BODY.tets)
+    triangles, owner = boundary_faces(BODY.tets, BODY.num_vertices)
     assert (triangles == BODY.surface).all()
     assert all(np.isin(t, BODY.tets[k]).all() for t, k in zip(triangles, owner, strict=True))
     mu = np.geomspace(1.0, 2.0, BODY.num_tets)

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from task_checks import timeless
 
 from diffvbd.tasks import Problem, Settings, Stage, solve
 from diffvbd.tasks.newton import Newton
@@ -37,10 +38,6 @@ def toy(**changes: Any) -> Problem:
     ]  # fmt: skip
     problem = Problem("toy", {"a": a, "b": b}, stages, lambda: {"a": a.item()}, state={"scale": scale})
     return replace(problem, **changes)
-
-
-def timeless(history: list[dict[str, float]]) -> list[dict[str, float]]:
-    return [{key: value for key, value in row.items() if key != "seconds"} for row in history]
 
 
 def interrupt(problem: Problem, at: int) -> None:

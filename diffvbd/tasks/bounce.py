@@ -171,4 +171,4 @@ def moments(squared: Tensor) -> tuple[int, int]:
 def target(scene: Bounce) -> viz.Scenery:
     """The voxel about the target, for pictures."""
     cube = dv.mesh.cube(2, VOXEL)
-    return viz.Scenery(cube.points - cube.points.mean(0) + scene.target, cube.surface, "#e4704f")
+    return viz.Scenery(cube.points - cube.points.mean(0) + scene.target, cube.surface, viz.COLORS["target"])

@@ -158,7 +158,7 @@ def problem(settings: Settings) -> Problem:
 
     def goals() -> list[viz.Scenery]:
         points = (test[0][:SHOWN] @ ground + stands + standing).cpu().numpy()
-        return [viz.capsule(point, point, 0.03, "#e4704f") for point in points]
+        return [viz.capsule(point, point, 0.03, viz.COLORS["target"]) for point in points]
 
     def picture(path: Path, history: list[Row]) -> None:
         motions = {"untrained": shown(policies(network, first)), "trained": shown(network)}

@@ -7,7 +7,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.viz.drawing import COLORS, OTHER, VIEW, Scenery, bounds_of, draw, motions_as_arrays, new_figure
+from diffvbd.viz.drawing import (
+    COLORS,
+    OTHER,
+    VIEW,
+    Scenery,
+    bounds_of,
+    draw,
+    motions_as_arrays,
+    new_figure,
+    save_motion,
+)
 
 FRAMES = 40  # of a longer motion so many are shown
 
@@ -37,7 +47,6 @@ def animation(
         ValueError: motions or triangles of another shape.
     """
     figure = new_figure(3.4 * len(motions), 3.2, dots=70)
-    from matplotlib.animation import FuncAnimation, PillowWriter
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
@@ -55,5 +64,4 @@ def animation(
             draw(axes, motion[k], surface, paint, bounds, scenery, view)
             axes.set_title(f"{name}, {1e3 * k * time_step:.0f} ms", fontsize=10, y=1.0)
 
-    seconds = max(2.0, (count - 1) * time_step)
-    FuncAnimation(figure, show, frames=shown.tolist()).save(path, PillowWriter(fps=max(1, round(len(shown) / seconds))))
+    save_motion(path, figure, show, shown.tolist(), (count - 1) * time_step)

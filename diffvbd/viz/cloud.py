@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.viz.drawing import INK, VIEW, as_array, bounds_of, new_figure
+from diffvbd.viz.drawing import INK, VIEW, as_array, bounds_of, new_figure, save_motion
 
 SHOWN = 20_000  # points; of more, so many of them
 
@@ -50,7 +50,6 @@ def cloud(
 def cloud_animation(path: str | Path, frames: Any, time_step: float) -> None:
     """Save moving points as a .gif in the time of `animation`; arguments and errors as for `cloud`."""
     figure = new_figure(4.5, 4.5, dots=80)
-    from matplotlib.animation import FuncAnimation, PillowWriter
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
@@ -64,8 +63,7 @@ def cloud_animation(path: str | Path, frames: Any, time_step: float) -> None:
         _points(axes, shown[k], shown[0], bounds)
         axes.set_title(f"{1e3 * k * time_step:.0f} ms", fontsize=10, y=1.0)
 
-    seconds = max(2.0, (len(shown) - 1) * time_step)
-    FuncAnimation(figure, show, frames=len(shown)).save(path, PillowWriter(fps=max(1, round(len(shown) / seconds))))
+    save_motion(path, figure, show, range(len(shown)), (len(shown) - 1) * time_step)
 
 
 def _chosen(frames: Any) -> NDArray[np.float64]:

@@ -1,6 +1,7 @@
 """What every picture is made of."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -171,6 +172,16 @@ def new_figure(width: float, height: float, dots: int = 130) -> Any:
     except ImportError:
         raise ImportError("pictures need matplotlib: pip install 'diffvbd[viz]'") from None
     return Figure(figsize=(width, height), dpi=dots)
+
+
+def save_motion(
+    path: str | Path, figure: Any, show: Callable[[int], None], frames: Sequence[int], seconds: float
+) -> None:
+    """Write a .gif of `show(k)` for these k; it runs for the time given [s], or 2 s where that is less."""
+    from matplotlib.animation import FuncAnimation, PillowWriter
+
+    rate = max(1, round(len(frames) / max(2.0, seconds)))
+    FuncAnimation(figure, show, frames=frames).save(path, PillowWriter(fps=rate))
 
 
 def bounds_of(shapes: Sequence[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

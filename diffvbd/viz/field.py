@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffvbd.mesh.tet_mesh import boundary_faces
 from diffvbd.viz.drawing import VIEW, as_array, bounds_of, course, draw, new_figure
 
 COLORMAP = "viridis"
@@ -62,7 +63,7 @@ def field(
     left, right, top = 0.06, 1.0 - 1.3 / width, 0.93
     bounds = bounds_of([corners])
     for row, (kind, kept) in enumerate(rows.items()):
-        triangles, owner = boundary(tets[kept])
+        triangles, owner = boundary_faces(tets[kept], len(corners))
         for column, value in enumerate(maps.values()):
             axes = shapes.add_subplot(len(rows), len(maps), row * len(maps) + column + 1, projection="3d")
             draw(axes, corners, triangles, paint.to_rgba(value[kept][owner])[:, :3], bounds, view=view)
@@ -92,11 +93,3 @@ def behind(
     if len(kept) == 0:
         raise ValueError(f"cut: expected tets behind the plane through {list(origin)}, got none")
     return kept
-
-
-def boundary(tets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Triangles that belong to one tet only, wound outwards [F, 3], and that tet [F]."""
-    faces = tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
-    _, same, count = np.unique(np.sort(faces, 1), axis=0, return_inverse=True, return_counts=True)
-    single = np.flatnonzero(count[same.reshape(-1)] == 1)
-    return faces[single], single // 4

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.viz.drawing import BODIES, as_array, draw, new_figure
+from diffvbd.viz.drawing import BODIES, INK, as_array, draw, new_figure
 
 
 def landing(
@@ -56,7 +56,7 @@ def landing(
 
     charts = right.subplots(2, 1, sharex=True)
     for axes, key, scale, label in zip(charts, ("loss", "uncovered"), (1, 100), ("loss", "uncovered [%]"), strict=True):
-        axes.plot([scale * row[key] for row in history], color="#333333")
+        axes.plot([scale * row[key] for row in history], color=INK)
         axes.set_ylabel(label)
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
