@@ -36,6 +36,7 @@ CPU_SOURCES = [
     "csrc/cpu/register_contact_start.cpp",
     "csrc/cpu/register_contact_sweep.cpp",
     "csrc/cpu/register_neighbors.cpp",
+    "csrc/cpu/register_rigid.cpp",
     "csrc/cpu/run.cpp",
     "csrc/cpu/sweep_backward_double.cpp",
     "csrc/cpu/sweep_backward_float.cpp",

@@ -48,9 +48,9 @@ Batched<const T> batched(const Tensor& t, const Tensor& like, int64_t scenes, in
 
 template <class T>
 StepParameters<T> step_parameters(const std::vector<double>& numbers) {
-  require(numbers.size() == 6, "diffvbd: expected 6 numbers");
+  require(numbers.size() == 7, "diffvbd: expected 7 numbers");
   const auto at = [&](int i) { return static_cast<T>(numbers[i]); };
-  return {at(0), at(1), at(2), at(3), at(4), at(5), numbers[3] >= 0};
+  return {at(0), at(1), at(2), at(3), at(4), at(5), at(6), numbers[3] >= 0};
 }
 
 // Scalars of the energies' data for a scene.

@@ -3,7 +3,8 @@
 #include <torch/csrc/stable/library.h>
 
 STABLE_TORCH_LIBRARY(diffvbd, m) {
-  // numbers: time_step, regularization, relaxation, saturation (< 0: none), saturation_eps, filter_eta
+  // numbers: time_step, regularization, relaxation, saturation (< 0: none), saturation_eps, filter_eta,
+  // relaxation of the last sweep
   // sizes: active vertices, tets, slots of the plan; on CUDA also the rest of its header and color_block (plan_sizes in
   // ops.py) data_count: scalars per scene, or per vertex, of each energy of one vertex launch: on CUDA the regime and
   // the threads per vertex of the sweeps and of their reverse, else empty
@@ -79,6 +80,17 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   m.def(
       "contact_lag_backward(Tensor bar, Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor "
       "constants, Tensor ptr, Tensor entry) -> (Tensor x, Tensor collider, Tensor kappa)");
+  // The rigid correction of each body that is listed, see rigid/body.h; order, ptr: their vertices; spread: squared
+  // radius of gyration [m^2]; groups: how many bodies a part of a warp, a block and the whole device work on (CUDA)
+  m.def(
+      "rigid(Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor energy_data, Tensor origin, Tensor order, Tensor "
+      "ptr, Tensor spread, int[] groups, int[] data_count, float time_step) -> Tensor");
+  // adjoints of x, x_prev (empty without energies), y, mass, and of data: [scenes, bodies, scalars of a scene] and
+  // [scenes, vertices, scalars of a vertex]
+  m.def(
+      "rigid_backward(Tensor x_bar, Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor energy_data, Tensor origin, "
+      "Tensor order, Tensor ptr, Tensor spread, int[] groups, int[] data_count, float time_step, bool wants_data) -> "
+      "(Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own)");
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");
   m.def(
       "build_plan(Tensor points, Tensor tets, Tensor active, int lanes) -> (Tensor plan, Tensor color_ptr, Tensor "

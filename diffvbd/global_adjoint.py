@@ -33,17 +33,20 @@ _DIFFERENTIABLE = 8  # as in sweeps.py: x_start, x_prev, y, mu, lam, mass, rest,
 
 
 def global_sweep(
-    model: Model, tensors: SweepTensors, settings: ops.SweepSettings, adjoint: GlobalAdjoint, debug_step: int = -1
-) -> Tensor:
-    """Positions after the sweeps [B, V, 3]; ``tensors`` are the nine arguments of sweeps.sweep."""
-    return _GlobalSweep.apply(*tensors, model, settings, adjoint, debug_step)
+    model: Model, tensors: SweepTensors, settings: ops.SweepSettings, adjoint: GlobalAdjoint, debug_step: int = -1,
+    then: Callable[[Tensor], Tensor] = lambda x: x,
+) -> Tensor:  # fmt: skip
+    """Positions after the sweeps and what comes ``then`` [B, V, 3]; ``tensors`` are the nine arguments of sweeps.sweep.
+    """
+    return _GlobalSweep.apply(*tensors, model, settings, adjoint, debug_step, then)
 
 
 class _GlobalSweep(Function):
     @staticmethod
     def forward(ctx: Any, *args: Any) -> Tensor:
-        tensors, (model, settings, adjoint, debug_step) = SweepTensors(*args[:9]), args[9:]
+        tensors, (model, settings, adjoint, debug_step) = SweepTensors(*args[:9]), args[9:-1]
         x = sweep(*tensors, model._packed_rest, model._plan, settings, tape_policy=ops.NO_TAPE, debug_step=debug_step)
+        x = args[-1](x)
         ctx.save_for_backward(*tensors, x)
         ctx.model, ctx.h, ctx.adjoint = model, settings.numbers[0], adjoint
         return x
@@ -52,7 +55,7 @@ class _GlobalSweep(Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple:
         needs = ctx.needs_input_grad[:_DIFFERENTIABLE]
         out = _GlobalBackward.apply(grads[0], *ctx.saved_tensors, ctx.model, ctx.h, ctx.adjoint, needs)
-        return of_inputs(out, needs, 5)
+        return of_inputs(out, needs, 6)
 
 
 class _GlobalBackward(Function):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from . import native, ops, regimes
+from . import native, ops, ops_rigid, regimes
 from .checks import check_number, check_positive, fail, vertex_mask
 from .colliders import Collider
 from .contact_surface import ContactSurface, build_surface, check_colliders
@@ -42,6 +42,12 @@ class Model:
         regularization: tau [kg], added to the diagonal of every block. 0: off.
         relaxation: omega, 0 < omega < 2, multiplies every update. Above 1 it needs fewer sweeps; use it with the exact
             block or with saturation (docs/numerics.md).
+        rigid: Whether each step moves every free body as a whole to where the step's potential is least, before and
+            after the sweeps (docs/method.md, section 14): it rests, falls and spins right at any number of sweeps. The
+            last sweep of a step then has a relaxation of at most 1. None: where there is no contact of pairs and no
+            friction, which it does not see yet.
+        start: Where the sweeps of the other bodies start: ``"predictor"`` (y, gravity and forces included) or
+            ``"inertia"`` (x + h v), right for stiff pinned bodies that few sweeps hardly move (docs/numerics.md).
         colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier among the
             energies.
         dtype: torch.float64 or torch.float32.
@@ -66,6 +72,8 @@ class Model:
         saturation: float | None = None,
         regularization: float = 0.0,
         relaxation: float = 1.0,
+        rigid: bool | None = None,
+        start: Literal["predictor", "inertia"] = "predictor",
         colliders: Sequence[Collider] = (),
         *,
         dtype: torch.dtype = torch.float64,
@@ -86,6 +94,10 @@ class Model:
         self.energy_mask = 0
         for energy in self.energies:
             self.energy_mask |= energy.bit
+        self.rigid = self._checked_rigid(rigid)
+        if start not in ("predictor", "inertia"):
+            fail("start", '"predictor" or "inertia"', repr(start))
+        self.start = start
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
 
@@ -102,6 +114,11 @@ class Model:
         self.pinned = mask
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = _first_of_body(body)
+        self._bodies = ops_rigid.find_bodies(points, tets, mask)
+        # which vertices the sweeps take from x + h v: those of bodies that are corrected, or all
+        self._from_inertia = torch.full((mesh.num_vertices,), start == "inertia")
+        if self.rigid:
+            self._from_inertia[self._bodies.order.long()] = True
         self.surface_of_contact = self._build_surface(check_colliders(colliders))
         device = _checked_device(device)
         self._arrange(points, tets, device)
@@ -128,6 +145,20 @@ class Model:
                 fail("energies", "a FloorBarrier or a PairBarrier for Friction to act on", "none")
             return None
         return build_surface(self.mesh, self.pinned, self.contact, colliders)
+
+    def _checked_rigid(self, rigid: bool | None) -> bool:
+        if rigid is None:
+            return not self.touches
+        if not isinstance(rigid, bool):
+            raise TypeError(f"rigid: expected True, False or None, got {type(rigid).__name__}")
+        if rigid and self.touches:
+            fail("rigid", "False beside a PairBarrier or Friction, which the correction does not see", "True")
+        return rigid
+
+    @property
+    def corrects(self) -> bool:
+        """Whether steps have a rigid correction: asked for, and some body is free."""
+        return self.rigid and self._bodies.count > 0
 
     @property
     def touches(self) -> bool:
@@ -226,6 +257,7 @@ class Model:
             if isinstance(value, Tensor):
                 setattr(self, name, value.to(device, dtype) if value.is_floating_point() else value.to(device))
         self._topology = tuple(t.to(device) for t in self._topology)
+        self._bodies = self._bodies.to(device)
         placed = [e.placed(self.num_vertices, device) if isinstance(e, VertexEnergy) else e for e in self.energies]
         self._set_energies(tuple(placed))
         if hasattr(self, "_rest"):
@@ -320,7 +352,9 @@ class Model:
     def settings(self, time_step: float, sweeps: int, scenes: int = 1) -> ops.SweepSettings:
         """What the kernels execute for this Model besides its tensors; ``scenes`` chooses the regime on CUDA."""
         saturation = -1.0 if self.saturation is None else self.saturation
-        numbers = (time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS, FILTER_ETA)
+        # a lone over-relaxed sweep would leave the correction a shape that the next step starts wrong from
+        last = min(self.relaxation, 1.0) if self.corrects else self.relaxation
+        numbers = (time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS, FILTER_ETA, last)
         cuda = self.device.type == "cuda"
         launch = regimes.choose(self.num_vertices, self.num_colors, scenes, contact=self.touches) if cuda else ()
         return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps, launch)
@@ -335,6 +369,8 @@ class Model:
         safeguards = [f"relaxation={self.relaxation:g}"] if self.relaxation != 1 else []
         safeguards += [f"saturation={self.saturation:g} m"] if self.saturation is not None else []
         safeguards += [f"regularization={self.regularization:g} kg"] if self.regularization else []
+        safeguards += ["rigid=False"] if not self.rigid and not self.touches else []
+        safeguards += [f'start="{self.start}"'] if self.start != "predictor" else []
         return (
             f"Model({self.num_vertices} vertices, {self.num_tets} tets, {int(self.pinned.sum())} pinned, "
             f"{self.num_colors} colors, mass {float(self.mass.sum()):.4g} kg, "

@@ -33,7 +33,8 @@ class SweepSettings(NamedTuple):
     sizes: tuple[int, ...]  # active vertices, tets, slots of the plan; more on CUDA, see plan_sizes
     energies: int  # mask
     data_count: tuple[int, ...]  # scalars per scene, or per vertex, of each energy of one vertex
-    numbers: tuple[float, ...]  # time_step, regularization, relaxation, saturation, saturation_eps, filter_eta
+    # time_step, regularization, relaxation, saturation, saturation_eps, filter_eta, relaxation of the last sweep
+    numbers: tuple[float, ...]
     sweeps: int
     launch: tuple[int, ...] = ()  # on CUDA: regime and threads per vertex of sweeps and reverse, see regimes.py
 

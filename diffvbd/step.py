@@ -26,6 +26,7 @@ from .debug import check_on_cpu, checking
 from .global_adjoint import global_sweep
 from .memory import out_of_memory_named
 from .model import Model
+from .rigid import correct
 from .sweeps import SweepTensors, fused_step, sweep
 
 
@@ -124,6 +125,14 @@ class Begun(NamedTuple):
         return SweepTensors(self.x_start, self.x_prev, self.y, prepared.mu, prepared.lam, prepared.mass, prepared.rest,
                             self.data, origin)  # fmt: skip
 
+    def corrected(self, x: Tensor, model: Model, prepared: Prepared) -> Tensor:
+        """x [B, V, 3] after the rigid correction, where the Model has one."""
+        if not model.corrects:
+            return x
+        origin, settings = self.y.new_empty((0,)) if self.origin is None else self.origin, prepared.settings
+        return correct(x, self.x_prev, self.y, prepared.mass, self.data, origin, model._bodies, settings.data_count,
+                       settings.numbers[0])  # fmt: skip
+
     def finish(self, end: Tensor, h: float) -> tuple[Tensor, Tensor]:
         """Positions and velocities after the step whose sweeps ended at ``end``."""
         velocity = (end - self.x_prev) / h
@@ -150,7 +159,8 @@ def begin(
     if model.dtype == torch.float32 and model.num_vertices:
         origin = start.detach()[:, model._first_of_body]
         start = start - origin
-    y = start + h * velocity + (h * h) * acceleration
+    coasting = start + h * velocity
+    y = coasting + (h * h) * acceleration
     held = start
     if prescribed is not None:
         held = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
@@ -158,11 +168,14 @@ def begin(
     y = torch.where(model.pinned[:, None], held, y)
     data = _energy_data(model, prepared, origin)
     x_start = y
+    if model.corrects or model.start == "inertia":
+        x_start = torch.where((model._from_inertia & ~model.pinned)[:, None], coasting, y)
     if model.floor is not None and model.contact is None:  # with pairs the state moves to y in parts
         count = model.floor.count()
-        filtered = model.floor.filter(start, y - start, data[:, :count], origin)
+        filtered = model.floor.filter(start, x_start - start, data[:, :count], origin)
         x_start = torch.where(model.pinned[:, None], y, filtered)
-    return Begun(x_start, start, y, data, origin)
+    begun = Begun(x_start, start, y, data, origin)
+    return begun._replace(x_start=begun.corrected(x_start, model, prepared))
 
 
 def advance(
@@ -196,6 +209,8 @@ def advance(
             swept(model, begun.detached(), looked_at, given, index=index)
         return prepared.unrolled(x, v, force, gravity, prescribed)
     x_end = swept(model, begun, prepared, given, adjoint, index, where)
+    if not isinstance(adjoint, GlobalAdjoint):  # which corrects before it takes the end as the solution
+        x_end = begun.corrected(x_end, model, prepared)
     x_end, v_end = begun.finish(x_end, prepared.settings.numbers[0])
     return x_end.reshape(x.shape), v_end.reshape(x.shape)
 
@@ -224,7 +239,8 @@ def swept(
             check_on_cpu(model, tensors, settings, index)
         with out_of_memory_named(model, begun.x_start, settings, policy):
             if isinstance(adjoint, GlobalAdjoint):
-                return global_sweep(model, tensors, settings, adjoint, debug_step)
+                return global_sweep(model, tensors, settings, adjoint, debug_step,
+                                    lambda x: begun.corrected(x, model, prepared))  # fmt: skip
             return sweep(*tensors, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)
     except ValueError as error:
         name_argument(error, given)
@@ -235,6 +251,7 @@ def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
     """Whether one operator can do the whole step on CUDA. Forces, vertex energies, float32's local origin, function
     transforms and checks take the parts."""
     simple = force is None and not model.vertex_energies and not model.touches and model.dtype == torch.float64
+    simple = simple and not model.corrects and model.start == "predictor"
     if not simple or checking() or torch.compiler.is_compiling() or gravity.dim() > 1:
         return False
     return torch._C._functorch.peek_interpreter_stack() is None  # pyright: ignore[reportAttributeAccessIssue]

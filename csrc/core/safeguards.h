@@ -14,8 +14,16 @@ struct StepParameters {
   T saturation;      // c [m]
   T saturation_eps;  // added to |d_raw| + c
   T filter_eta;      // largest fraction of a gap that one move may close
+  T last_relaxation;  // omega of the last sweep of a step
   bool saturates;    // whether c is given: asked once for a vertex, never inside its star
 };
+
+// Those of one sweep.
+template <class T>
+DIFFVBD_FN StepParameters<T> of_sweep(StepParameters<T> q, bool last) {
+  if (last) q.relaxation = q.last_relaxation;
+  return q;
+}
 
 // d = s d_raw with s = c / (|d_raw| + c + eps): |d| < c, and d = d_raw to first order near 0.
 template <class R, class T>

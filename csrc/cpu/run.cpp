@@ -191,6 +191,7 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
     }
     Team::run(looks ? 1 : team_size(plan, in.scenes, in.sweeps), [&](Team::Member member) {
       for (int k = 0; k < in.sweeps; ++k) {
+        const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
         for (int c = 0; c < plan.colors; ++c) {
           const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
           if (contact) {
@@ -198,7 +199,7 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
             member.barrier();
           }
           member.each(first, last, [&](int64_t begin, int64_t end) {
-            kernel(plan, scene.view, in.parameters, k, in.tape_policy, begin, end);
+            kernel(plan, scene.view, q, k, in.tape_policy, begin, end);
           });
           member.barrier();
           if (looks) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
@@ -249,6 +250,7 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
 
     Team::run(team_size(plan, in.scenes, in.sweeps), [&](Team::Member member) {
       for (int k = in.sweeps - 1; k >= 0; --k) {
+        const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
         for (int c = plan.colors - 1; c >= 0; --c) {
           const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
           if (contact) {
@@ -261,7 +263,7 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
             }
           }
           member.each(first, last, [&](int64_t begin, int64_t end) {
-            kernel(plan, s, in.parameters, k, in.tape_policy, begin, end);
+            kernel(plan, s, q, k, in.tape_policy, begin, end);
           });
           member.barrier();
           if (contact) {

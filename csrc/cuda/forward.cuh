@@ -21,14 +21,15 @@ __global__ void __launch_bounds__(kMaxThreads)
     GroupStar<T, lanes> star(s, at, shared);
     if constexpr (Set::elastic) star.fetch_neighbours(s.own);
     const Block<T> b = load_block<Set>(s, at, s.own);
-    const System<T> system = assemble<Set>(b, star, s.parameters);
-    const Factor<T> H = factored(b, system, s.parameters);
-    const Update<T> u = safeguarded<Set>(b, newton_step(system, H), s.parameters);
+    const StepParameters<T> q = of_sweep(s.parameters, sweep + 1 == s.sweeps);
+    const System<T> system = assemble<Set>(b, star, q);
+    const Factor<T> H = factored(b, system, q);
+    const Update<T> u = safeguarded<Set>(b, newton_step(system, H), q);
     const int64_t position = static_cast<int64_t>(block) * kSlice + at.v;
     if (at.lane == 0) store_row(s.w.x, scene * s.positions + position, moved<Set>(b.state.x, u));
     if constexpr (Set::contact) {
       if (at.lane == 0 && rank < end_rank &&
-          is_cut(b.state.x, relaxed(u.d_raw, s.parameters), b.contact.bound) > T(0)) {
+          is_cut(b.state.x, relaxed(u.d_raw, q), b.contact.bound) > T(0)) {
         s.cut[(s.base + scene) * s.plan.num_vertices + __ldg(s.plan.order + position)] = 1;
       }
     }

@@ -38,11 +38,12 @@ __global__ void __maxnreg__(kReverseRegisters)
     if constexpr (Set::elastic) star.clear_sums(shared);
     const Vec3<T> x_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
     if constexpr (Set::elastic) star.fetch_neighbours(false);
-    const Update<T> u = replayed<Set>(b, star, r, full, s.parameters);
+    const StepParameters<T> q = of_sweep(s.parameters, turn == 0);
+    const Update<T> u = replayed<Set>(b, star, r, full, q);
     star.repeats = false;
     const bool writes = at.lane == 0 && real;
     const BlockAdjoint<T> out = reverse_vertex<Set, wanted>(
-        b, star, u, r.H, x_bar, s.parameters, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
+        b, star, u, r.H, x_bar, q, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
           if (writes) s.w.data_bar[(scene * s.data_scalars + s.data_row[k] + i) * s.positions + position] += value;
         });
     if constexpr (Set::elastic) {

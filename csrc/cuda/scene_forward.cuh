@@ -28,12 +28,13 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
     if (scene < in.scenes) {
       SceneStar<T, common> star(in, nullptr, plan, list, x, nullptr, scene);
       for (int k = 0; k < in.sweeps; ++k) {
+        const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
         for (int r = 0; r < plan.num_active; ++r) {
           const int vertex = star.go_to(r);
           const Block<T> b = load_scene_block<Set>(in, plan, start, scene, vertex, x, y);
-          const System<T> system = assemble<Set>(b, star, in.parameters);
-          const Factor<T> H = factored(b, system, in.parameters);
-          const Update<T> u = safeguarded<Set>(b, newton_step(system, H), in.parameters);
+          const System<T> system = assemble<Set>(b, star, q);
+          const Factor<T> H = factored(b, system, q);
+          const Update<T> u = safeguarded<Set>(b, newton_step(system, H), q);
           set_column3(x, vertex, moved<Set>(b.state.x, u));
           if (in.tape_policy == kNoTape) continue;
           T* to = out.tape + ((static_cast<int64_t>(k) * rows) * plan.num_active + r) * in.scenes + scene;

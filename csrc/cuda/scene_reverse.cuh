@@ -63,15 +63,16 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
       Recalled<T> next{};
       if (in.sweeps > 0 && plan.num_active > 0) next = read(in.sweeps - 1, plan.num_active - 1);
       for (int k = in.sweeps - 1; k >= 0; --k) {
+        const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
         for (int r = plan.num_active - 1; r >= 0; --r) {
           const int vertex = star.go_to(r);
           Recalled<T> now = next;
           if (r > 0 || k > 0) next = read(r > 0 ? k : k - 1, r > 0 ? r - 1 : plan.num_active - 1);
           Block<T> b = load_scene_block<Set>(in, plan, start, scene, vertex, x, y);
-          const Update<T> u = replayed<Set>(b, star, now, full, in.parameters);
+          const Update<T> u = replayed<Set>(b, star, now, full, q);
           set_column3(x, vertex, b.state.x);
           const BlockAdjoint<T> bar = reverse_vertex<Set, wanted>(
-              b, star, u, now.H, column3(x_bar, vertex), in.parameters, out.data != nullptr,
+              b, star, u, now.H, column3(x_bar, vertex), q, out.data != nullptr,
               [&](int e, int i, const T& value) {
                 const bool own = is_per_vertex(e, VertexEnergies{});
                 const int64_t place = start[e] + (own ? static_cast<int64_t>(vertex) * in.data_count[e] : 0) + i;

@@ -22,6 +22,13 @@ struct Anchor {
     g += k * (s.x - Vec3<R>{data[1], data[2], data[3]});
     add_diagonal(H, k);
   }
+
+  // the potential whose gradient block() adds
+  template <class R>
+  DIFFVBD_FN static R value(const VertexState<R>& s, const R* data, int) {
+    const Vec3<R> d = s.x - Vec3<R>{data[1], data[2], data[3]};
+    return R(0.5) * s.h * s.h * data[0] * dot(d, d);
+  }
 };
 
 }  // namespace diffvbd

@@ -60,6 +60,35 @@ struct FloorBarrier {
     }
   }
 
+  // the potential whose gradient block() adds
+  template <class R>
+  DIFFVBD_FN static R value(const VertexState<R>& s, const R* data, int count) {
+    R sum = R(0);
+    for (int k = 0; k < count; k += stride) {
+      const Plane<R> plane(data + k, s);
+      const R d = plane.gap(s.x);
+      if (any(d < plane.dhat)) sum = sum + s.h * s.h * LogBarrier<R>(d, plane.dhat, plane.kappa).value;
+      const R approach = dot(plane.n, s.x - s.x_prev);
+      const auto near = plane.gap(s.x_prev) < plane.dhat;
+      const R c = select(near, select(approach < R(0), plane.damping * s.h, R(0)), R(0));
+      sum = sum + R(0.5) * c * approach * approach;
+    }
+    return sum;
+  }
+
+  // Whether a move from `before` to s.x leaves every plane at least `share` of the gap there was, and more than rounding
+  // in T. The barrier's potential means nothing elsewhere.
+  template <class T, class R>
+  DIFFVBD_FN static bool admits(const VertexState<R>& s, const Vec3<R>& before, const R* data, int count, R share) {
+    bool out = true;
+    for (int k = 0; k < count; k += stride) {
+      const Plane<R> plane(data + k, s);
+      const R d = plane.gap(s.x);
+      out = out && plane.template guard<T>(s) < d && share * plane.gap(before) <= d;
+    }
+    return out;
+  }
+
   // adjoint of p . (g + H d_raw), negated, toward x and x_prev; toward the data Dual serves
   template <class R>
   DIFFVBD_FN static void block_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,

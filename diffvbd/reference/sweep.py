@@ -9,6 +9,7 @@ from torch import Tensor
 from .energies import build_energies
 from .friction import floor_friction
 from .layout import Layout, build_layout, dot, put, solve6, take
+from .rigid import Correction
 from .scene import Scene, build_scene
 
 SATURATION_EPS = 1e-12  # [m] keeps s finite at a zero step
@@ -112,12 +113,23 @@ def stepper(
     energies = build_energies(scene, elsewhere=("friction",))
     energies += floor_friction(scene, energies)
     masses = color_masses(scene)
+    correct = Correction(scene, energies)
 
     def advance(x: Tensor, v: Tensor, force: Any, gravity: Any, prescribed: Any) -> tuple[Tensor, Tensor]:
         y = predictor(scene, x, v, force, gravity, prescribed)
-        x_prev, y = x.transpose(-1, -2).contiguous(), y.transpose(-1, -2).contiguous()
+        coasting = torch.where(model.pinned[:, None], y, x + time_step * v)
+        x_prev, y, coasting = (a.transpose(-1, -2).contiguous() for a in (x, y, coasting))
         check_start(energies, x_prev)
-        state = run_sweeps(scene, energies, masses, y, _start(scene, energies, x_prev, y), x_prev, sweeps)
+        wanted = coasting if model.start == "inertia" else y
+        for body in correct.bodies:
+            wanted = put(wanted, body, take(coasting, body))
+        state = correct(_start(scene, energies, x_prev, wanted), y, x_prev)
+        if sweeps and correct.bodies and model.relaxation > 1:
+            state = run_sweeps(scene, energies, masses, y, state, x_prev, sweeps - 1)
+            state = run_sweeps(scene, energies, masses, y, state, x_prev, 1, relaxation=1.0)
+        else:
+            state = run_sweeps(scene, energies, masses, y, state, x_prev, sweeps)
+        state = correct(state, y, x_prev)
         x_new = state.transpose(-1, -2).contiguous()
         return x_new, (x_new - x) / time_step
 
@@ -172,17 +184,18 @@ def run_sweeps(
     x_prev: Tensor,
     sweeps: int,
     cut: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None,
+    relaxation: float | None = None,
 ) -> Tensor:
     """The state [..., 3, V] after `sweeps` sweeps of all colors toward the predictor y [..., 3, V].
 
     masses: `color_masses`. x_prev: start of the step, for lagged terms. cut(x, update, vertices): what a bound on the
-    motion leaves of the update [..., 3, n] of some vertices at x [..., 3, n].
+    motion leaves of the update [..., 3, n] of some vertices at x [..., 3, n]. relaxation: None for the Model's.
     """
     targets = [take(y, color.vertices) for color in scene.layout.colors]
     for _ in range(sweeps):
         for k, color in enumerate(scene.layout.colors):
             if color.vertices.numel():
-                state = _update_color(scene, energies, k, masses[k], targets[k], state, x_prev, cut)
+                state = _update_color(scene, energies, k, masses[k], targets[k], state, x_prev, cut, relaxation)
     return state
 
 
@@ -195,6 +208,7 @@ def _update_color(
     state: Tensor,
     x_prev: Tensor,
     cut: Callable[[Tensor, Tensor, Tensor], Tensor] | None,
+    relaxation: float | None,
 ) -> Tensor:
     """Newton update of all vertices of color k: H d = -g, saturate, relax, cut, filter, write."""
     model, vertices = scene.model, scene.layout.colors[k].vertices
@@ -208,8 +222,9 @@ def _update_color(
     update = -solve6(hessian, gradient)
     if model.saturation is not None:
         update = update * _saturation(update, model.saturation).unsqueeze(-2)
-    if model.relaxation != 1.0:
-        update = model.relaxation * update
+    relaxation = model.relaxation if relaxation is None else relaxation
+    if relaxation != 1.0:
+        update = relaxation * update
     if cut is not None:
         update = cut(x, update, vertices)
     return put(state, vertices, x + filtered(energies, x, update))

@@ -1,0 +1,202 @@
+"""The rigid correction of every free body, in plain torch: the same executed steps, differentiated by autograd.
+
+For each body the rigid motion of least  1/2 sum m |R r + c - y|^2 + energies of single vertices.  Where no such energy acts
+at the polar fit of x to y, that fit is it; else at most ITERATIONS Newton steps (Gauss-Newton block, exact exponential),
+each halved until the potential does not rise and no vertex loses more of a gap than an update may take.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .energies import StableNeoHookean
+from .layout import dot
+from .scene import Scene
+
+ITERATIONS, HALVINGS = 8, 30
+LEAST_SHARE = 0.1  # of its gap that a vertex keeps in one step
+DAMPING = 1e-9  # of the inertia
+ARRIVED = 1e-24  # squared step over squared radius of gyration at which the steps end
+ROUNDING = 1e-12  # relative rise of the energies that is rounding
+DEFINITE = 1e-12  # least eigenvalue of a turning stiffness over its trace
+GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
+
+
+def free_bodies(model: Any) -> list[Tensor]:
+    """Vertices of each connected set of tets that has no pinned vertex."""
+    parent = list(range(model.rest_points.shape[-2]))
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = parent[i]
+        return i
+
+    tets = model.tets.tolist()
+    for tet in tets:
+        for other in tet[1:]:
+            parent[root(other)] = root(tet[0])
+    members: dict[int, list[int]] = {}
+    for i in sorted({i for tet in tets for i in tet}):
+        members.setdefault(root(i), []).append(i)
+    pinned = model.pinned.tolist()
+    device = model.pinned.device
+    return [torch.tensor(m, device=device) for m in members.values() if not any(pinned[i] for i in m)]
+
+
+class Correction:
+    """The correction of a run; ``energies``: the reference formulas, of which those of single vertices count."""
+
+    def __init__(self, scene: Scene, energies: list[Any]) -> None:
+        self.scene, self.bodies = scene, free_bodies(scene.model) if scene.model.rigid else []
+        self.energies = [e for e in energies if not isinstance(e, StableNeoHookean)]
+
+    def __call__(self, x: Tensor, y: Tensor, x_prev: Tensor) -> Tensor:
+        """The state after the correction; all [..., 3, V]."""
+        for body in self.bodies:
+            x = self._corrected(body, x, y, x_prev)
+        return x
+
+    def _load(self, state: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient [..., 3, V] and block [..., V, 3, 3] of the vertex energies."""
+        total = torch.zeros_like(state).repeat_interleave(3, -2)  # [..., 9, V]
+        for k, color in enumerate(self.scene.layout.colors):
+            for energy in self.energies:
+                total = total.index_add(-1, color.vertices, energy.block(k, state, x_prev))
+        g, (xx, xy, xz, yy, yz, zz) = total[..., :3, :], total[..., 3:, :].unbind(-2)
+        rows = [torch.stack(row, -1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
+        return g, torch.stack(rows, -2)
+
+    def _value(self, state: Tensor, x_prev: Tensor) -> Tensor:
+        return sum((e.energy(state, x_prev) for e in self.energies), torch.zeros_like(state[..., 0, 0]))
+
+    def _admits(self, state: Tensor, before: Tensor, body: Tensor) -> Tensor:
+        out = torch.ones_like(state[..., 0, 0], dtype=torch.bool)
+        for energy in self.energies:
+            if hasattr(energy, "gap"):
+                x = state[..., body]
+                size = (energy.normal * x.unsqueeze(-3)).abs().sum(-2) + energy.height.abs()
+                gap = energy.gap(x)
+                good = (gap > GUARD * torch.finfo(x.dtype).eps * size) & (
+                    gap >= LEAST_SHARE * energy.gap(before[..., body])
+                )
+                out = out & good.all((-2, -1))
+        return out
+
+    def _corrected(self, body: Tensor, x: Tensor, y: Tensor, x_prev: Tensor) -> Tensor:
+        mass = self.scene.mass[..., body].unsqueeze(-2)  # [..., 1, n]
+        total = mass.sum(-1, keepdim=True)
+        center, target = ((mass * a[..., body]).sum(-1, keepdim=True) / total for a in (x, y))
+        r, eta = x[..., body] - center, y[..., body] - target
+        y_x = (mass * eta) @ r.transpose(-1, -2)
+        x_x = (mass * r) @ r.transpose(-1, -2)
+
+        def placed(turn: Tensor, at: Tensor) -> Tensor:
+            return x.index_copy(-1, body, (turn @ r + at).expand_as(x[..., body]))
+
+        turn = _polar(y_x)
+        closed = placed(turn, target)
+        with torch.no_grad():
+            g, block = self._load(closed, x_prev)
+            acts = g[..., body].ne(0).any((-2, -1)) | block[..., body, :, :].ne(0).any((-3, -2, -1))
+            acts = acts | ~self._admits(closed, closed, body)
+        if not bool(acts.any()):
+            return closed
+
+        points = self.scene.model.rest_points.to(x)[body]
+        spread = (points - points.mean(0)).square().sum(-1).mean()
+        turn, at = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:-2], 3, 3), center
+        running = acts
+        for _ in range(ITERATIONS):
+            state = placed(turn, at)
+            g, block = self._load(state, x_prev)
+            g, block, arm = g[..., body], block[..., body, :, :], turn @ r
+            torque = -_axial(y_x @ turn.transpose(-1, -2)) + torch.linalg.cross(arm, g, dim=-2).sum(-1)
+            force = (total * (at - target)).squeeze(-1) + g.sum(-1)
+            jacobian = torch.cat([-_cross_matrix(arm.movedim(-2, -1)), _eye_like(block)], -1)  # [..., n, 3, 6]
+            matrix = (jacobian.transpose(-1, -2) @ block @ jacobian).sum(-3)
+            turning = _turning_stiffness(turn @ x_x @ turn.transpose(-1, -2))
+            damping = DAMPING * total * spread * torch.eye(3, dtype=x.dtype, device=x.device)
+            inertia = torch.zeros_like(matrix)
+            inertia[..., :3, :3] = turning + damping
+            inertia[..., 3:, 3:] = total * torch.eye(3, dtype=x.dtype, device=x.device)
+            gradient = torch.cat([torque, force], -1)
+            step = -torch.linalg.solve(matrix + inertia, gradient)
+            with torch.no_grad():
+                decrease = -(gradient * step).sum(-1)
+                running = running & (decrease > ARRIVED * (total * spread)[..., 0, 0])
+                share = self._share(running, step, turn, at, state, total, target, y_x, placed, body, x_prev)
+                running = running & (share > 0)
+            share = torch.where(running, share, 0.0)[..., None]
+            turn = turn + _turned_by(share * step[..., :3]) @ turn
+            at = at + (share * step[..., 3:]).unsqueeze(-1)
+            if not bool(running.any()):
+                break
+        return torch.where(acts[..., None, None], placed(turn, at), closed)
+
+    def _share(self, running: Tensor, step: Tensor, turn: Tensor, at: Tensor, state: Tensor, total: Tensor,
+               target: Tensor, y_x: Tensor, placed: Any, body: Tensor, x_prev: Tensor) -> Tensor:  # fmt: skip
+        """The largest of 1, 1/2, 1/4, ... that is admitted and does not raise the potential; 0: none."""
+        share, found = torch.ones_like(running, dtype=state.dtype), torch.zeros_like(running)
+        value = self._value(state, x_prev)
+        for _ in range(HALVINGS):
+            w, t = share[..., None] * step[..., :3], (share[..., None] * step[..., 3:]).unsqueeze(-1)
+            turned = _turned_by(w) @ turn
+            there = placed(turn + turned, at + t)
+            rise = (total * dot(t, at - target + t / 2).unsqueeze(-1))[..., 0, 0] - (turned * y_x).sum((-2, -1))
+            rise = rise + self._value(there, x_prev) - value
+            good = self._admits(there, state, body) & (rise <= ROUNDING * value)
+            found = found | (good & running)
+            if bool((found | ~running).all()):
+                break
+            share = torch.where(found, share, share / 2)
+        return torch.where(found, share, 0.0)
+
+
+def _eye_like(block: Tensor) -> Tensor:
+    return torch.eye(3, dtype=block.dtype, device=block.device).expand_as(block)
+
+
+def _cross_matrix(w: Tensor) -> Tensor:
+    """[w] with [w] r = w x r; [..., 3] -> [..., 3, 3]."""
+    x, y, z = w.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([torch.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
+
+
+def _axial(a: Tensor) -> Tensor:
+    b = a - a.transpose(-1, -2)
+    return torch.stack([b[..., 2, 1], b[..., 0, 2], b[..., 1, 0]], -1)
+
+
+def _turning_stiffness(a: Tensor) -> Tensor:
+    trace = a.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    return trace * torch.eye(3, dtype=a.dtype, device=a.device) - (a + a.transpose(-1, -2)) / 2
+
+
+def _turned_by(w: Tensor) -> Tensor:
+    """exp [w] - 1; the angle's square is kept from 0, where the root has no derivative."""
+    square = (w * w).sum(-1)
+    small = square < 1e-8
+    angle = torch.where(small, 1.0, square).sqrt()
+    a = torch.where(small, 1 - square / 6 + square**2 / 120, torch.sin(angle) / angle)
+    b = torch.where(small, 0.5 - square / 24 + square**2 / 720, 2 * (torch.sin(angle / 2) / angle) ** 2)
+    k = _cross_matrix(w)
+    return a[..., None, None] * k + b[..., None, None] * (k @ k)
+
+
+def _polar(b: Tensor) -> Tensor:
+    """The rotation closest to b [..., 3, 3]: by its singular values, then one Newton step, which carries the derivative.
+    The identity where b determines none."""
+    with torch.no_grad():
+        u, _, vt = torch.linalg.svd(b)
+        sign = torch.ones_like(b[..., 0])
+        sign[..., 2] = torch.det(u) * torch.det(vt)
+        found = (u * sign[..., None, :]) @ vt
+        eigenvalues = torch.linalg.eigvalsh(_turning_stiffness(found.transpose(-1, -2) @ b))
+        good = (eigenvalues[..., 0] > DEFINITE * eigenvalues.sum(-1))[..., None, None]
+    m = found.transpose(-1, -2) @ b
+    stiffness = torch.where(good, _turning_stiffness(m), torch.eye(3, dtype=b.dtype, device=b.device))
+    w = torch.linalg.solve(stiffness, torch.where(good[..., 0], _axial(m), 0.0))
+    return torch.where(good, found + found @ _turned_by(w), torch.eye(3, dtype=b.dtype, device=b.device))
