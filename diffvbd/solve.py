@@ -104,7 +104,11 @@ def solve(
 
     with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
         frozen = begun.detached()
-        end, count, rounding = frozen.x_start, 0, None
+        # The end of a step is its last sweep, which may be relaxed less, and its correction: what was swept before them
+        # is what further sweeps go on from.
+        before, count, rounding = frozen.x_start, 0, None
+        over = settings._replace(numbers=(*settings.numbers[:-1], settings.numbers[2]))
+        end = frozen.corrected(before, model, prepared)
 
         def look(x: Tensor) -> tuple[float, bool]:
             nonlocal rounding
@@ -116,8 +120,11 @@ def solve(
         while not converged and count < max_sweeps and math.isfinite(residual):
             # a look costs many sweeps: at first after check_every, later after a quarter of what there were
             some = min(max(check_every, count // 4), max_sweeps - count)
-            part = prepared._replace(settings=settings._replace(sweeps=some))
-            end = swept(model, frozen._replace(x_start=end), part, {"x": x, "v": v, **loads})
+            part = prepared._replace(settings=over._replace(sweeps=some - (count == 0)))
+            given = {"x": x, "v": v, **loads}
+            before = swept(model, frozen._replace(x_start=before), part, given)
+            last = prepared._replace(settings=settings._replace(sweeps=1))
+            end = frozen.corrected(swept(model, frozen._replace(x_start=before), last, given), model, prepared)
             count += some
             residual, converged = look(end)
     if not converged:

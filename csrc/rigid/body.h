@@ -78,16 +78,15 @@ struct Body {
   }
 };
 
-// Where the rigid motion takes a body: its center of mass, and its turn since the start of the correction.
+// Where the rigid motion takes a body: its turn, and how far its center of mass moves.
 struct Pose {
   Matrix turn;
-  Vector center;
-  DIFFVBD_FN Vector at(const Vector& r) const { return turn * r + center; }
+  Vector shift;
 };
 
 struct Moments {
   double mass;
-  Vector center, target;  // centers of mass of x and y
+  Vector center, shift;  // center of mass of x, and from there to that of y
   Matrix x_x, y_x;        // sum m r r^T and sum m (y - target) r^T
 };
 
@@ -127,10 +126,11 @@ DIFFVBD_FN Moments moments_of(const Body<T>& b, const Team& team) {
   team.template sum<count>(b.size(), sum, [&](int32_t i, double* to) {
     const int32_t v = b.vertex(i);
     const double m = b.mass(v);
-    const Vector x = b.position(v) - about, y = b.target(v) - about, mx = m * x;
+    const Vector at = b.position(v), x = at - about, mx = m * x;
+    const Vector move = b.target(v) - at, y = x + move;  // small: its mean is what momentum rounds to
     to[0] += m;
     to[1] += mx.x, to[2] += mx.y, to[3] += mx.z;
-    to[4] += m * y.x, to[5] += m * y.y, to[6] += m * y.z;
+    to[4] += m * move.x, to[5] += m * move.y, to[6] += m * move.z;
     to[7] += y.x * mx.x, to[8] += y.x * mx.y, to[9] += y.x * mx.z;
     to[10] += y.y * mx.x, to[11] += y.y * mx.y, to[12] += y.y * mx.z;
     to[13] += y.z * mx.x, to[14] += y.z * mx.y, to[15] += y.z * mx.z;
@@ -142,11 +142,11 @@ DIFFVBD_FN Moments moments_of(const Body<T>& b, const Team& team) {
   Moments out{};
   out.mass = sum[0];
   const double inverse = 1 / sum[0];
-  const Vector x = inverse * Vector{sum[1], sum[2], sum[3]}, y = inverse * Vector{sum[4], sum[5], sum[6]};
+  const Vector x = inverse * Vector{sum[1], sum[2], sum[3]}, move = inverse * Vector{sum[4], sum[5], sum[6]};
   out.center = about + x;
-  out.target = about + y;
+  out.shift = move;
   out.y_x = Matrix{{sum[7], sum[8], sum[9]}, {sum[10], sum[11], sum[12]}, {sum[13], sum[14], sum[15]}} +
-            (-sum[0]) * outer(y, x);
+            (-sum[0]) * outer(x + move, x);
   if constexpr (energies) {
     out.x_x = Matrix{{sum[16], sum[17], sum[18]}, {sum[17], sum[19], sum[20]}, {sum[18], sum[20], sum[21]}} +
               (-sum[0]) * outer(x, x);
@@ -180,14 +180,14 @@ DIFFVBD_FN Load load_at(const Body<T>& b, const Team& team, const Vector& center
   team.template sum<1 + 6 + kSix>(b.size(), sum, [&](int32_t i, double* to) {
     const int32_t v = b.vertex(i);
     const Vector at_start = b.position(v) - center, r = pose.turn * at_start;
-    const VertexState<double> s = b.state(v, pose.center + r);
+    const VertexState<double> s = b.state(v, center + pose.shift + r);
     Vector g{};
     Sym3<double> H{};
     bool admitted = true;
     b.energies(v, [&](auto energy, int, const double* data, int count) {
       using E = decltype(energy);
       if constexpr (E::has_filter) {
-        admitted = admitted && E::template admits<T>(s, before.at(at_start), data, count, kLeastShare);
+        admitted = admitted && E::template admits<T>(s, center + before.shift + before.turn * at_start, data, count, kLeastShare);
       }
       to[0] += E::value(s, data, count);
       E::block(s, data, count, g, H);
@@ -204,7 +204,7 @@ DIFFVBD_FN Load load_at(const Body<T>& b, const Team& team, const Vector& center
 // The Newton step at a pose; false where the method has arrived, or finds no descent.
 DIFFVBD_FN bool newton_step(const Moments& m, double spread, const Pose& pose, const Load& load, Iteration& out) {
   const Matrix turned = m.y_x * transposed(pose.turn);  // sum m (y - target) r^T
-  const Vector torque = -axial(turned), force = m.mass * (pose.center - m.target);
+  const Vector torque = -axial(turned), force = m.mass * (pose.shift - m.shift);
   const double inertial[6] = {torque.x, torque.y, torque.z, force.x, force.y, force.z};
   const Sym3<double> turning = turning_stiffness(pose.turn * m.x_x * transposed(pose.turn));
   double g[6];
@@ -229,11 +229,11 @@ DIFFVBD_FN bool newton_step(const Moments& m, double spread, const Pose& pose, c
 // By how much the inertial part of the potential rises from the pose of a step to the next one, without cancellation.
 DIFFVBD_FN double inertial_rise(const Moments& m, const Iteration& k) {
   const Vector turn = k.share * k.turn(), shift = k.share * k.shift();
-  return m.mass * dot(shift, k.pose.center - m.target + 0.5 * shift) - inner(turned_by(turn) * k.pose.turn, m.y_x);
+  return m.mass * dot(shift, k.pose.shift - m.shift + 0.5 * shift) - inner(turned_by(turn) * k.pose.turn, m.y_x);
 }
 
 DIFFVBD_FN Pose after(const Iteration& k) {
-  return {k.pose.turn + turned_by(k.share * k.turn()) * k.pose.turn, k.pose.center + k.share * k.shift()};
+  return {k.pose.turn + turned_by(k.share * k.turn()) * k.pose.turn, k.pose.shift + k.share * k.shift()};
 }
 
 // Finds the motion; `record`, which a team shares, receives the executed Newton steps unless it is null.
@@ -242,8 +242,8 @@ DIFFVBD_FN Executed find(const Body<T>& b, const Team& team, Iteration* record) 
   Executed out{};
   out.moments = moments_of<energies>(b, team);
   const Moments& m = out.moments;
-  const Pose start{identity(), m.center};
-  out.end = {identity(), m.target};
+  const Pose start{identity(), Vector{}};
+  out.end = {identity(), m.shift};
   out.turned = polar_rotation(m.y_x, out.end.turn);
   if constexpr (energies) {
     Load load = load_at(b, team, m.center, out.end, out.end);
@@ -287,12 +287,15 @@ template <bool energies, class T, class Team>
 DIFFVBD_FN void correct(const Body<T>& b, const Team& team, Iteration* record, T* x) {
   const Executed e = find<energies>(b, team, record);
   const bool moves = e.closed || e.count > 0;
+  const Matrix turned = e.end.turn + -1.0 * identity();
   team.each(b.size(), [&](int32_t i) {
     const int32_t v = b.vertex(i);
     const T* from = b.in.x + 3 * b.row(v);
     T* to = x + 3 * b.row(v);
     if (moves) {
-      put(to, e.end.at(b.position(v) - e.moments.center));
+      // as a change of x, which rounds once: momentum is kept to that
+      const Vector p = b.position(v), r = p - e.moments.center;
+      put(to, p + (turned * r + e.end.shift));
     } else {
       for (int c = 0; c < 3; ++c) to[c] = from[c];
     }
@@ -316,7 +319,7 @@ struct VertexShare {
                          const Vector& p_shift)
       : r_start(b.position(v) - center),
         r(k.pose.turn * r_start),
-        x(k.pose.center + r),
+        x(center + k.pose.shift + r),
         P(cross(p_turn, r) + p_shift),
         D(cross(k.turn(), r) + k.shift()) {}
 };
@@ -397,7 +400,7 @@ DIFFVBD_FN void reverse(const Body<T>& b, const Team& team, Iteration* record, c
       const int32_t v = b.vertex(i);
       const int64_t row = b.row(v);
       const double mass = b.mass(v);
-      const Vector r = b.position(v) - m.center, y = b.target(v) - m.target, pulled = y_x_bar * r + target_bar;
+      const Vector r = b.position(v) - m.center, y = b.target(v) - (m.center + m.shift), pulled = y_x_bar * r + target_bar;
       add_to(a.x + 3 * row, mass * (transposed_times(y_x_bar, y) + common));
       put(a.y + 3 * row, mass * pulled);
       a.mass[row] = static_cast<T>(dot(y, pulled) + dot(r, common));
