@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "arguments.h"
-#include "rigid/body.h"
+#include "rigid/reverse.h"
 
 namespace diffvbd {
 

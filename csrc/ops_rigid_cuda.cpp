@@ -66,10 +66,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> correct_backward(
     const auto in = diffvbd::rigid_inputs<T>(given, data_count, time_step);
     const auto teams = groups_of(groups, spread);
     const Tensor workspace = workspace_of(teams, x);
-    const diffvbd::RigidBars bars(given, in, data_count, wants_data,
-                                  [&](const std::vector<int64_t>& shape, bool zeroed) {
-                                    return zeroed ? zeros(x, shape) : empty(x, shape);
-                                  });
+    const diffvbd::RigidBars bars(
+        given, in, data_count, wants_data,
+        [&](const std::vector<int64_t>& shape, bool zeroed) { return zeroed ? zeros(x, shape) : empty(x, shape); });
     if (!bars.all) copy(x_bar, bars.x);
     check(cuda::rigid_reverse<T>(in, teams, bars.pointers<T>(x_bar), data<double>(workspace), current_stream(x)),
           "the adjoint of the rigid correction");

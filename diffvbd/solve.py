@@ -19,7 +19,8 @@ from .incremental import IncrementalPotential
 from .model import Model
 from .step import advance, begin, swept
 
-ROUNDINGS = 0.125  # of block times position, below which a residual counts as zero; sweeps stall at 0.03 to 0.08
+ROUNDINGS = 0.25  # of block times position, below which a residual counts as zero: sweeps stall at 0.03 to 0.08, a
+# corrected start in free fall at 0.15
 
 
 @dataclass(frozen=True)

@@ -154,6 +154,11 @@ CASES: dict[str, Case] = {
     "floor_filtered": Case(floor=_NEAR | {"damping": 50.0}, pinned=False, fall=20.0, relaxation=1.6),
     "floor_corner": Case(floor=_CORNER | {"damping": 50.0}, fall=10.0, block="paper", saturation=0.05),
     "anchored": Case(anchor=2e3, floor=_NEAR, fall=1.0),
+    "free": Case(pinned=False),
+    "free_relaxed": Case(pinned=False, relaxation=1.6),
+    "free_anchored": Case(pinned=False, anchor=2e3, floor=_NEAR, fall=1.0),
+    "free_corner": Case(pinned=False, floor=_CORNER | {"height": (-0.1, -0.75, -0.4), "damping": 50.0}, fall=10.0),
+    "free_batch": Case(pinned=False, batch=(3,), floor=_NEAR | {"damping": 50.0}, fall=2.0),
     "batch": Case(batch=(3,), floor=_NEAR | {"damping": 50.0}, fall=2.0),
 }
 

@@ -8,14 +8,14 @@ namespace diffvbd {
 
 template <class T>
 struct StepParameters {
-  T time_step;       // h [s]
-  T regularization;  // tau [kg], 0 when absent
-  T relaxation;      // omega [-], 1 when absent
-  T saturation;      // c [m]
-  T saturation_eps;  // added to |d_raw| + c
-  T filter_eta;      // largest fraction of a gap that one move may close
+  T time_step;        // h [s]
+  T regularization;   // tau [kg], 0 when absent
+  T relaxation;       // omega [-], 1 when absent
+  T saturation;       // c [m]
+  T saturation_eps;   // added to |d_raw| + c
+  T filter_eta;       // largest fraction of a gap that one move may close
   T last_relaxation;  // omega of the last sweep of a step
-  bool saturates;    // whether c is given: asked once for a vertex, never inside its star
+  bool saturates;     // whether c is given: asked once for a vertex, never inside its star
 };
 
 // Those of one sweep.

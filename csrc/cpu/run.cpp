@@ -198,9 +198,8 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
             member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
             member.barrier();
           }
-          member.each(first, last, [&](int64_t begin, int64_t end) {
-            kernel(plan, scene.view, q, k, in.tape_policy, begin, end);
-          });
+          member.each(first, last,
+                      [&](int64_t begin, int64_t end) { kernel(plan, scene.view, q, k, in.tape_policy, begin, end); });
           member.barrier();
           if (looks) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
         }
@@ -262,9 +261,8 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
               member.barrier();
             }
           }
-          member.each(first, last, [&](int64_t begin, int64_t end) {
-            kernel(plan, s, q, k, in.tape_policy, begin, end);
-          });
+          member.each(first, last,
+                      [&](int64_t begin, int64_t end) { kernel(plan, s, q, k, in.tape_policy, begin, end); });
           member.barrier();
           if (contact) {
             member.each(first, last, [&](int64_t begin, int64_t end) { contact->reverse(begin, end); });

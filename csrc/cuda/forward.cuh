@@ -28,8 +28,7 @@ __global__ void __launch_bounds__(kMaxThreads)
     const int64_t position = static_cast<int64_t>(block) * kSlice + at.v;
     if (at.lane == 0) store_row(s.w.x, scene * s.positions + position, moved<Set>(b.state.x, u));
     if constexpr (Set::contact) {
-      if (at.lane == 0 && rank < end_rank &&
-          is_cut(b.state.x, relaxed(u.d_raw, q), b.contact.bound) > T(0)) {
+      if (at.lane == 0 && rank < end_rank && is_cut(b.state.x, relaxed(u.d_raw, q), b.contact.bound) > T(0)) {
         s.cut[(s.base + scene) * s.plan.num_vertices + __ldg(s.plan.order + position)] = 1;
       }
     }

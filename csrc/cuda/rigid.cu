@@ -179,13 +179,13 @@ cudaError_t run(const rigid::Inputs<T>& in, RigidGroups groups, const Act& act, 
   if (in.scenes == 0) return cudaSuccess;
   if (groups.small > 0) {
     const int64_t items = in.scenes * groups.small;
-    small_bodies<T><<<static_cast<unsigned>((items + kTiles - 1) / kTiles), kTileThreads, 0, stream>>>(in, act,
-                                                                                                      groups.small);
+    small_bodies<T>
+        <<<static_cast<unsigned>((items + kTiles - 1) / kTiles), kTileThreads, 0, stream>>>(in, act, groups.small);
   }
   if (by_block(groups, in.scenes)) groups.medium += groups.large, groups.large = 0;
   if (groups.medium > 0) {
     medium_bodies<T><<<static_cast<unsigned>(in.scenes * groups.medium), kThreads, 0, stream>>>(in, act, groups.small,
-                                                                                               groups.medium);
+                                                                                                groups.medium);
   }
   if (groups.large > 0) {
     int32_t first = groups.small + groups.medium, bodies = groups.large;
@@ -218,9 +218,9 @@ cudaError_t rigid_reverse(const rigid::Inputs<T>& in, const RigidGroups& groups,
   return run(in, groups, Reverse<T, false>{a}, workspace, stream);
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                     \
-  template cudaError_t rigid_correct<T>(const rigid::Inputs<T>&, const RigidGroups&, T*, double*, cudaStream_t);   \
-  template cudaError_t rigid_reverse<T>(const rigid::Inputs<T>&, const RigidGroups&, const rigid::Adjoints<T>&,    \
+#define DIFFVBD_INSTANTIATE(T)                                                                                   \
+  template cudaError_t rigid_correct<T>(const rigid::Inputs<T>&, const RigidGroups&, T*, double*, cudaStream_t); \
+  template cudaError_t rigid_reverse<T>(const rigid::Inputs<T>&, const RigidGroups&, const rigid::Adjoints<T>&,  \
                                         double*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

@@ -3,7 +3,7 @@
 
 #include <cuda_runtime.h>
 
-#include "../rigid/body.h"
+#include "../rigid/reverse.h"
 
 namespace diffvbd::cuda {
 

@@ -76,8 +76,8 @@ struct FloorBarrier {
     return sum;
   }
 
-  // Whether a move from `before` to s.x leaves every plane at least `share` of the gap there was, and more than rounding
-  // in T. The barrier's potential means nothing elsewhere.
+  // Whether a move from `before` to s.x leaves every plane at least `share` of the gap there was, and more than
+  // rounding in T. The barrier's potential means nothing elsewhere.
   template <class T, class R>
   DIFFVBD_FN static bool admits(const VertexState<R>& s, const Vec3<R>& before, const R* data, int count, R share) {
     bool out = true;

@@ -1,7 +1,7 @@
 // The rigid correction of one body: the rigid motion of its current shape that minimises the incremental potential
 //     1/2 sum m |R r + c - y|^2 + the vertex energies (h^2-scaled),      r = x - center of mass,
-// and the transpose of what was executed (docs/method.md, section 14). A rigid motion leaves the tets' energy as it is, so
-// only sums over vertices are needed. Loops and sums belong to a Team: one thread, a part of a block, or a whole grid.
+// (docs/method.md, section 14; its transpose is in reverse.h). A rigid motion leaves the tets' energy as it is, so only
+// sums over vertices are needed. Loops and sums belong to a Team: a few threads, a block, or a whole device.
 #pragma once
 
 #include <limits>
@@ -20,11 +20,11 @@ constexpr double kRounding = 1e-12;  // relative rise of the energies' sum that 
 
 template <class T>
 struct Inputs {
-  const T* x;                                       // [B, V, 3]
-  Batched<const T> x_prev, y, mass, origin, data;   // origin may be null
-  const int32_t *order, *ptr;                       // vertices by body [listed], [bodies + 1]
-  const double* spread;                             // [bodies]  squared radius of gyration at rest [m^2]
-  int64_t scenes, data_start[kVertexEnergies];      // of each energy among the data of a scene
+  const T* x;                                      // [B, V, 3]
+  Batched<const T> x_prev, y, mass, origin, data;  // origin may be null
+  const int32_t *order, *ptr;                      // vertices by body [listed], [bodies + 1]
+  const double* spread;                            // [bodies]  squared radius of gyration at rest [m^2]
+  int64_t scenes, data_start[kVertexEnergies];     // of each energy among the data of a scene
   int32_t vertices, bodies, data_count[kVertexEnergies];
   double time_step;
 };
@@ -87,7 +87,7 @@ struct Pose {
 struct Moments {
   double mass;
   Vector center, shift;  // center of mass of x, and from there to that of y
-  Matrix x_x, y_x;        // sum m r r^T and sum m (y - target) r^T
+  Matrix x_x, y_x;       // sum m r r^T and sum m (y - target) r^T
 };
 
 // Of the vertex energies at a pose: their sum (infinite where a vertex is too near a plane), gradient and Gauss-Newton
@@ -187,7 +187,8 @@ DIFFVBD_FN Load load_at(const Body<T>& b, const Team& team, const Vector& center
     b.energies(v, [&](auto energy, int, const double* data, int count) {
       using E = decltype(energy);
       if constexpr (E::has_filter) {
-        admitted = admitted && E::template admits<T>(s, center + before.shift + before.turn * at_start, data, count, kLeastShare);
+        admitted = admitted &&
+                   E::template admits<T>(s, center + before.shift + before.turn * at_start, data, count, kLeastShare);
       }
       to[0] += E::value(s, data, count);
       E::block(s, data, count, g, H);
@@ -251,7 +252,8 @@ DIFFVBD_FN Executed find(const Body<T>& b, const Team& team, Iteration* record) 
     if (out.closed) return out;
     out.end = start;
     load = load_at(b, team, m.center, start, start);
-    if (!(load.value < std::numeric_limits<double>::infinity())) return out;  // starts outside: there is no way to judge
+    if (!(load.value < std::numeric_limits<double>::infinity()))
+      return out;  // starts outside: there is no way to judge
     Iteration k;
     while (out.count < kMaxIterations && newton_step(m, b.in.spread[b.body], out.end, load, k)) {
       bool taken = false;
@@ -300,166 +302,6 @@ DIFFVBD_FN void correct(const Body<T>& b, const Team& team, Iteration* record, T
       for (int c = 0; c < 3; ++c) to[c] = from[c];
     }
   });
-}
-
-template <class T>
-struct Adjoints {
-  const T* end;                // of the result [B, V, 3]
-  T *x, *x_prev, *y, *mass;    // [B, V, 3] three times, [B, V]; x_prev only with energies
-  T *shared, *own;             // of the data: [B, bodies, scalars of a scene], [B, V, scalars of a vertex]; or null
-  int32_t shared_count, own_count;
-};
-
-// One executed Newton step seen from a vertex, with p = A^-1 (adjoint of the step). With P and D the displacements of the
-// vertex by p and by the whole step, A d = -g makes the adjoint that of -(P . (m (x - y) + g) + P . (m + H) D).
-struct VertexShare {
-  Vector r_start, r, x, P, D;
-  template <class T>
-  DIFFVBD_FN VertexShare(const Body<T>& b, int32_t v, const Vector& center, const Iteration& k, const Vector& p_turn,
-                         const Vector& p_shift)
-      : r_start(b.position(v) - center),
-        r(k.pose.turn * r_start),
-        x(center + k.pose.shift + r),
-        P(cross(p_turn, r) + p_shift),
-        D(cross(k.turn(), r) + k.shift()) {}
-};
-
-// The adjoints of an energy's data, record by record, through Dual.
-template <class T, class Team>
-DIFFVBD_FN void reverse_data(const Body<T>& b, const Team& team, const Vector& center, const Iteration& k,
-                             const Vector& p_turn, const Vector& p_shift, const Adjoints<T>& a) {
-  const StepParameters<double> none{b.in.time_step, 0, 1, -1, 0, 1, 1, false};
-  int shared = 0, own = 0;
-  each_energy(
-      [&](auto energy, int e) {
-        using E = decltype(energy);
-        const int count = b.in.data_count[e];
-        for (int j = 0; j < count; j += E::stride) {
-          const auto bars = [&](int32_t i, double* to) {
-            const int32_t v = b.vertex(i);
-            const VertexShare at(b, v, center, k, p_turn, p_shift);
-            b.energies(v, [&](auto other, int which, const double* data, int) {
-              if constexpr (std::is_same_v<decltype(other), E>) {
-                record_vjp<E>(b.state(v, at.x), data + j, at.P, at.D, zero3<double>(), none, 0.0, 0.0, to);
-              }
-            });
-          };
-          if constexpr (E::per_vertex) {
-            team.each(b.size(), [&](int32_t i) {
-              double bar[E::stride];
-              bars(i, bar);
-              T* to = a.own + b.row(b.vertex(i)) * a.own_count + own + j;
-              for (int c = 0; c < E::stride; ++c) to[c] += static_cast<T>(bar[c]);
-            });
-          } else {
-            double sum[E::stride];
-            team.template sum<E::stride>(b.size(), sum, [&](int32_t i, double* to) {
-              double bar[E::stride];
-              bars(i, bar);
-              for (int c = 0; c < E::stride; ++c) to[c] += bar[c];
-            });
-            if (team.leads()) {
-              T* to = a.shared + (b.scene * b.in.bodies + b.body) * a.shared_count + shared + j;
-              for (int c = 0; c < E::stride; ++c) to[c] += static_cast<T>(sum[c]);
-            }
-          }
-        }
-        (E::per_vertex ? own : shared) += count;
-      },
-      VertexEnergies{});
-}
-
-// Transpose of correct(). x, y, mass (and x_prev) are written; the adjoints of data are added to.
-template <bool energies, class T, class Team>
-DIFFVBD_FN void reverse(const Body<T>& b, const Team& team, Iteration* record, const Adjoints<T>& a) {
-  const Executed e = find<energies>(b, team, record);
-  const Moments& m = e.moments;
-  const bool moves = e.closed || e.count > 0;
-  double sum[12];
-  team.template sum<12>(b.size(), sum, [&](int32_t i, double* to) {
-    const int32_t v = b.vertex(i);
-    const int64_t row = b.row(v);
-    const Vector bar = Body<T>::at(a.end + 3 * row), r = b.position(v) - m.center;
-    const double values[] = {bar.x,       bar.y,       bar.z,       bar.x * r.x, bar.x * r.y, bar.x * r.z,
-                             bar.y * r.x, bar.y * r.y, bar.y * r.z, bar.z * r.x, bar.z * r.y, bar.z * r.z};
-    for (int c = 0; c < 12; ++c) to[c] += values[c];
-    put(a.x + 3 * row, moves ? transposed_times(e.end.turn, bar) : bar);
-    put(a.y + 3 * row, Vector{});
-    if (a.x_prev) put(a.x_prev + 3 * row, Vector{});
-    a.mass[row] = T(0);
-  });
-  if (!moves) return;
-  Vector center_bar{sum[0], sum[1], sum[2]};
-  Matrix turn_bar{{sum[3], sum[4], sum[5]}, {sum[6], sum[7], sum[8]}, {sum[9], sum[10], sum[11]}};
-  Vector start_bar = -transposed_times(e.end.turn, center_bar);  // of the center of mass, through r = x - center
-  const double inverse = 1 / m.mass;
-  if (e.closed) {
-    const Matrix y_x_bar = e.turned ? polar_vjp(m.y_x, e.end.turn, turn_bar) : 0.0 * identity();
-    const Vector target_bar = inverse * center_bar, common = inverse * start_bar;
-    team.each(b.size(), [&](int32_t i) {
-      const int32_t v = b.vertex(i);
-      const int64_t row = b.row(v);
-      const double mass = b.mass(v);
-      const Vector r = b.position(v) - m.center, y = b.target(v) - (m.center + m.shift), pulled = y_x_bar * r + target_bar;
-      add_to(a.x + 3 * row, mass * (transposed_times(y_x_bar, y) + common));
-      put(a.y + 3 * row, mass * pulled);
-      a.mass[row] = static_cast<T>(dot(y, pulled) + dot(r, common));
-    });
-    return;
-  }
-  if constexpr (energies) {
-    Matrix after_turn = e.end.turn;
-    for (int n = e.count - 1; n >= 0; --n) {
-      const Iteration& k = record[n];
-      const Vector turn_step = k.share * k.turn();
-      const Vector turning = k.share * turn_vjp(turn_step, turn_bar * transposed(after_turn));
-      double p[6] = {turning.x, turning.y, turning.z, k.share * center_bar.x, k.share * center_bar.y,
-                     k.share * center_bar.z};
-      solve6(k.factor, p);
-      const Vector p_turn{p[0], p[1], p[2]}, p_shift{p[3], p[4], p[5]};
-      turn_bar = turn_bar + transposed(turned_by(turn_step)) * turn_bar;
-      const double damped = kDamping * b.in.spread[b.body] * dot(p_turn, k.turn());
-      if (a.shared != nullptr || a.own != nullptr) reverse_data(b, team, m.center, k, p_turn, p_shift, a);
-      double add[15];
-      team.template sum<15>(b.size(), add, [&](int32_t i, double* to) {
-        const int32_t v = b.vertex(i);
-        const int64_t row = b.row(v);
-        const double mass = b.mass(v);
-        const VertexShare at(b, v, m.center, k, p_turn, p_shift);
-        const VertexState<double> s = b.state(v, at.x);
-        const Vector lag = at.x - b.target(v);
-        Vector g = mass * lag, x_bar = -mass * at.P, x_prev_bar{};
-        Sym3<double> H = diagonal(mass);
-        b.energies(v, [&](auto energy, int, const double* data, int count) {
-          using E = decltype(energy);
-          E::block(s, data, count, g, H);
-          vertex_energy_vjp<E>(s, data, count, at.P, at.D, x_bar, x_prev_bar);
-        });
-        const Vector r_bar = x_bar - cross(g + H * at.D, p_turn) - cross(H * at.P, k.turn());
-        add_to(a.x + 3 * row, transposed_times(k.pose.turn, r_bar));
-        add_to(a.y + 3 * row, mass * at.P);
-        if (a.x_prev) add_to(a.x_prev + 3 * row, x_prev_bar);
-        a.mass[row] = static_cast<T>(a.mass[row] - dot(at.P, lag + at.D) - damped);
-        const Vector& r = at.r_start;
-        const double values[] = {x_bar.x,       x_bar.y,       x_bar.z,       r_bar.x,       r_bar.y,
-                                 r_bar.z,       r_bar.x * r.x, r_bar.x * r.y, r_bar.x * r.z, r_bar.y * r.x,
-                                 r_bar.y * r.y, r_bar.y * r.z, r_bar.z * r.x, r_bar.z * r.y, r_bar.z * r.z};
-        for (int c = 0; c < 15; ++c) to[c] += values[c];
-      });
-      center_bar += Vector{add[0], add[1], add[2]};
-      start_bar -= transposed_times(k.pose.turn, Vector{add[3], add[4], add[5]});
-      turn_bar = turn_bar + Matrix{{add[6], add[7], add[8]}, {add[9], add[10], add[11]}, {add[12], add[13], add[14]}};
-      after_turn = k.pose.turn;
-    }
-    start_bar += center_bar;  // the first pose starts at the center of mass
-    const Vector common = inverse * start_bar;
-    team.each(b.size(), [&](int32_t i) {
-      const int32_t v = b.vertex(i);
-      const int64_t row = b.row(v);
-      add_to(a.x + 3 * row, b.mass(v) * common);
-      a.mass[row] = static_cast<T>(a.mass[row] + dot(b.position(v) - m.center, common));
-    });
-  }
 }
 
 }  // namespace diffvbd::rigid

@@ -65,8 +65,8 @@ DIFFVBD_FN Vector turn_vjp(const Vector& w, const Matrix& bar_times_transposed) 
 
 // tr(a) - (a + a^T) / 2: with a = sum m r q^T what a turn of the r sees of sum m r . q to second order
 DIFFVBD_FN Sym3<double> turning_stiffness(const Matrix& a) {
-  return {a.y.y + a.z.z,           -0.5 * (a.x.y + a.y.x), -0.5 * (a.x.z + a.z.x), a.x.x + a.z.z,
-          -0.5 * (a.y.z + a.z.y), a.x.x + a.y.y};
+  return {a.y.y + a.z.z, -0.5 * (a.x.y + a.y.x), -0.5 * (a.x.z + a.z.x),
+          a.x.x + a.z.z, -0.5 * (a.y.z + a.z.y), a.x.x + a.y.y};
 }
 
 // Whether a symmetric matrix is positive definite by more than rounding, as a fraction of its trace.

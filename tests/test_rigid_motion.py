@@ -1,0 +1,116 @@
+"""Claim: with the rigid correction any number of sweeps falls freely, keeps momentum and turns as a converged step does."""
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd.testing import relative_error
+from diffvbd.tolerances import tolerance
+
+SWEEPS = (0, 1, 2, 5, 20)
+
+
+def momenta(model: dv.Model, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Linear momentum, and angular momentum about the center of mass."""
+    m = model.mass[:, None]
+    center = (m * x).sum(0) / m.sum()
+    return (m * v).sum(0), torch.linalg.cross(x - center, m * v).sum(0)
+
+
+def spinning(model: dv.Model) -> tuple[Tensor, Tensor]:
+    x = model.rest_points.clone()
+    spin = torch.tensor([0.0, 0.0, 8.0], dtype=x.dtype, device=x.device)
+    drift = torch.tensor([1.0, 0.0, 0.0], dtype=x.dtype, device=x.device)
+    return x, torch.linalg.cross(spin.expand_as(x), x - x.mean(0)) + drift
+
+
+def flown(model: dv.Model, mu: float, sweeps: int) -> tuple[float, float]:
+    """Relative loss of momentum, and share of the angular momentum that is left, after 60 steps of 10 ms."""
+    x, v = spinning(model)
+    p, spin = momenta(model, x, v)
+    with torch.no_grad():
+        for _ in range(60):
+            x, v = dv.step(model, x, v, mu=mu, lam=mu, time_step=0.01, sweeps=sweeps, gravity=(0.0, 0.0, 0.0))
+    p1, spin1 = momenta(model, x, v)
+    return float((p1 - p).norm() / p.norm()), float(spin1[2] / spin[2])
+
+
+@pytest.mark.parametrize("mu", (1e5, 1e7))
+def test_free_flight(device: str, mu: float) -> None:
+    model = dv.Model(dv.mesh.cube(4, size=0.2), device=device)
+    for sweeps in (1, 2, 5, 20):
+        lost, left = flown(model, mu, sweeps)
+        assert lost <= tolerance("rigid_momentum")
+        assert abs(left - 0.7548) <= tolerance("rigid_spin")  # implicit Euler's own loss, of converged steps
+    alone, left = flown(dv.Model(model.mesh, rigid=False, device=device), mu, 2)
+    assert alone > 0.05 and left < 0.745  # what sweeps alone do
+
+
+@pytest.mark.parametrize("mu", (1e3, 1e9))
+def test_free_fall_is_exact(device: str, mu: float) -> None:
+    """x_n = x_0 + g h^2 n (n + 1) / 2, of a stiff body too, which few sweeps from x + h v hardly move."""
+    model = dv.Model(dv.mesh.cube(3), device=device)
+    n, h = 20, 0.01
+    for sweeps in SWEEPS:
+        x, v = model.rest_points.clone(), torch.zeros_like(model.rest_points)
+        for _ in range(n):
+            x, v = dv.step(model, x, v, mu=mu, lam=mu, time_step=h, sweeps=sweeps)
+        fallen = torch.tensor([0.0, -9.81 * h * h * n * (n + 1) / 2, 0.0], dtype=x.dtype, device=device)
+        assert relative_error(x - model.rest_points, fallen.expand_as(x)) <= tolerance("rigid_fall")
+
+
+def test_each_body_falls_by_itself(device: str) -> None:
+    """Bodies are the connected sets of tets, whatever their labels; one with a pinned vertex is left to the sweeps."""
+    mesh = dv.mesh.replicate(dv.mesh.cube(2), [[0, 0, 0], [3, 0, 0], [6, 0, 0]])
+    mesh = dv.TetMesh(mesh.points, mesh.tets)  # one label
+    model = dv.Model(mesh, pinned=[0], device=device)
+    x = model.rest_points.clone()
+    v = torch.zeros_like(x)
+    v[8:16, 0], v[16:, 1] = 1.0, 2.0
+    x1, v1 = dv.step(model, x, v, mu=1e6, lam=1e6, time_step=0.01, sweeps=1)
+    fallen = torch.tensor([0.0, -9.81 * 0.01, 0.0], dtype=x.dtype, device=device)
+    assert relative_error(v1[8:], v[8:] + fallen) <= tolerance("rigid_fall")
+    assert bool((x1[0] == x[0]).all()) and relative_error(v1[1:8], fallen.expand(7, 3)) > 1e-3
+
+
+def test_a_body_of_thousands_among_small_ones(device: str) -> None:
+    """Bodies of all sizes go together: on CUDA each size has its own team of threads."""
+    parts = [dv.mesh.cube(27), dv.mesh.cube(2), dv.mesh.cube(9), dv.mesh.cube(2)]  # 19,683, 8, 729 and 8 vertices
+    mesh = dv.mesh.join([part.translate((2.0 * i, 0.0, 0.0)) for i, part in enumerate(parts)])
+    model = dv.Model(mesh, device=device)
+    x = model.rest_points.clone()
+    spin = torch.tensor([0.3, 0.2, 0.1], dtype=x.dtype, device=device)
+    v = torch.linalg.cross(spin.expand_as(x), x)
+    x1, v1 = dv.step(model, x, v, mu=1e5, lam=1e5, time_step=0.01, sweeps=1)
+    one, start = 0, 0.01 * v
+    for part in parts:
+        rows = slice(one, one + part.num_vertices)
+        one = rows.stop
+        m = model.mass[rows, None]
+        wanted = (m * start[rows]).sum(0) / m.sum() + torch.tensor([0.0, -9.81e-4, 0.0], dtype=x.dtype, device=device)
+        got = (m * (x1 - x)[rows]).sum(0) / m.sum()
+        assert relative_error(got, wanted) <= tolerance("rigid_fall")
+    again, _ = dv.step(model, x, v, mu=1e5, lam=1e5, time_step=0.01, sweeps=1)
+    assert torch.equal(again, x1)
+
+
+def test_float32_falls_and_flies(device: str) -> None:
+    model = dv.Model(dv.mesh.cube(4, size=0.2), dtype=torch.float32, device=device)
+    lost, left = flown(model, 1e5, 5)
+    assert lost <= tolerance("rigid_momentum_float32") and abs(left - 0.7548) <= tolerance("rigid_spin")
+
+
+def test_it_can_be_left_out(device: str) -> None:
+    mesh = dv.mesh.cube(3)
+    model = dv.Model(mesh, rigid=False, device=device)
+    assert not model.corrects and dv.Model(mesh, device=device).corrects
+    assert not dv.Model(mesh, pinned=[0], device=device).corrects  # there is no free body
+    touching = (dv.StableNeoHookean(), dv.PairBarrier())
+    assert not dv.Model(mesh, energies=touching, device=device).rigid
+    with pytest.raises(ValueError, match="rigid: expected False beside a PairBarrier or Friction"):
+        dv.Model(mesh, energies=touching, rigid=True, device=device)
+    with pytest.raises(TypeError, match="rigid: expected True, False or None, got int"):
+        dv.Model(mesh, rigid=1, device=device)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match='start: expected "predictor" or "inertia", got \'rest\''):
+        dv.Model(mesh, start="rest", device=device)  # type: ignore[arg-type]
