@@ -15,9 +15,10 @@ from .checks import check_number, check_positive, fail, vertex_mask
 from .colliders import Collider
 from .contact_surface import ContactSurface, build_surface, check_colliders
 from .energies import VERTEX_ENERGIES, FloorBarrier, StableNeoHookean, VertexEnergy
+from .mask import CONTACT
 from .mesh import TetMesh
 from .metric import lumped_mass, rest_metric
-from .pair_barrier import CONTACT, Friction, PairBarrier
+from .pair_barrier import Friction, PairBarrier
 from .safeguards import FILTER_ETA, SATURATION_EPS
 
 Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction

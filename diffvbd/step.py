@@ -22,10 +22,11 @@ from .arguments import (
     prepare,
 )
 from .contact_step import run_contact
-from .debug import check_on_cpu, checking
+from .debug import check_on_cpu
 from .global_adjoint import global_sweep
 from .memory import out_of_memory_named
 from .model import Model
+from .scopes import checking
 from .sweeps import SweepTensors, fused_step, sweep
 
 

@@ -148,10 +148,18 @@ def check_start(energies: list[Any], x: Tensor) -> None:
 
 
 def _start(scene: Scene, energies: list[Any], x: Tensor, y: Tensor) -> Tensor:
-    """Start of the sweep: y, or with filters as far from x towards y as they allow."""
-    if not any(hasattr(energy, "limit") for energy in energies):
+    """Start of the sweep: y, or with filters what they leave of the way from x to y."""
+    if not any(hasattr(energy, "start") for energy in energies):
         return y
-    return torch.where(scene.model.pinned, y, x + filtered(energies, x, y - x))
+    return torch.where(scene.model.pinned, y, x + started(energies, x, y - x))
+
+
+def started(energies: list[Any], x: Tensor, step: Tensor) -> Tensor:
+    """What the start of a step may take of a step [..., 3, n] from x [..., 3, n]."""
+    for energy in energies:
+        if hasattr(energy, "start"):
+            step = energy.start(x, step)
+    return step
 
 
 def filtered(energies: list[Any], x: Tensor, step: Tensor) -> Tensor:
