@@ -104,10 +104,10 @@ class FloorBarrier:
     def gap(self, x: Tensor) -> Tensor:
         return dot(self.normal, x.unsqueeze(-3)) - self.height
 
-    def _approach(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
-        """Normal travel since x_prev [..., planes, n], and where it is damped."""
-        travel = dot(self.normal, (x - x_prev).unsqueeze(-3))
-        return travel, (self.gap(x_prev) < self.dhat) & (travel < 0)
+    def _approach(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Normal travel since x_prev [..., planes, n], where it is damped, and where its approach would be."""
+        travel, near = dot(self.normal, (x - x_prev).unsqueeze(-3)), self.gap(x_prev) < self.dhat
+        return travel, near & (travel < 0), near
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         vertices = self.scene.layout.colors[k].vertices
@@ -121,9 +121,9 @@ class FloorBarrier:
         second = torch.where(active, -self.kappa * (2 * log + 4 * past / d - (past / d) ** 2), 0.0)
         first, second = h**2 * first, h**2 * second
         if self.damped:
-            travel, damped = self._approach(x, take(x_prev, vertices))
+            travel, damped, near = self._approach(x, take(x_prev, vertices))
             first = first + torch.where(damped, self.damping * h * travel, 0.0)
-            second = second + torch.where(damped, self.damping * h, 0.0)
+            second = second + torch.where(near, self.damping * h, 0.0)
         gradient = (first.unsqueeze(-2) * self.normal).sum(-3)
         return torch.cat((gradient, (second.unsqueeze(-2) * self.outer).sum(-3)), -2)
 
@@ -136,7 +136,7 @@ class FloorBarrier:
         total = h**2 * torch.where(active, -self.kappa * (d - self.dhat) ** 2 * torch.log(d / self.dhat), 0.0)
         total = torch.where(gap > 0, total, torch.inf)
         if self.damped:
-            travel, damped = self._approach(x[..., free], x_prev[..., free])
+            travel, damped, _ = self._approach(x[..., free], x_prev[..., free])
             total = total + torch.where(damped, self.damping * h / 2 * travel**2, 0.0)
         return total.sum((-2, -1))
 
