@@ -106,7 +106,8 @@ def _barrier_slope(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
 class FloorBarrier(VertexEnergy):
     """IPC log barrier above planes: b(d) = -kappa (d - dhat)^2 log(d / dhat) for a gap 0 < d < dhat.
 
-    No executed sweep lets an unpinned vertex reach a plane: the predictor and every update pass a step filter.
+    No executed sweep lets an unpinned vertex reach a plane: every update passes a step filter, and the start of a step
+    approaches no plane within its dhat, so that what rests there keeps its gap at any number of sweeps.
 
     Args:
         height: Height of the plane along its normal [m], or one for each plane.
