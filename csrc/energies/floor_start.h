@@ -65,7 +65,7 @@ struct FloorStart {
       Vec3<R> w = n;
       for (int j = 0; j < number; ++j) w -= (dot(n, taken[j]) / square[j]) * taken[j];
       square[number] = dot(w, w);
-      if (!(R(kParallel) < square[number])) break;
+      if (!(R(T(kParallel)) < square[number])) break;
       out += (most / square[number]) * w;
       taken[number] = w;
       binding[number++] = worst;
