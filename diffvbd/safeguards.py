@@ -61,10 +61,13 @@ def _within(room: Tensor, n: Tensor, step: Tensor) -> Tensor:
         return -(n * move[:, :, None]).sum(-1) - room
 
     planes = room.shape[-1]
-    index = torch.arange(planes, device=step.device)
     length = (step.detach() ** 2).sum(-1)
     slack = 8 * torch.finfo(step.dtype).eps * length.sqrt()
-    every = n.expand(*room.shape, 3)
+    if planes == 1:  # the same in fewer operations
+        excess, own = excess_of(step), n[..., 0, :]
+        excess = torch.where(excess.detach() > slack[..., None], excess, torch.zeros_like(excess))
+        return step + excess / (own * own).sum(-1, keepdim=True) * own
+    every, index = n.expand(*room.shape, 3), torch.arange(planes, device=step.device)
     bound = torch.zeros_like(room, dtype=torch.bool)
     stuck = torch.zeros_like(slack, dtype=torch.bool)
     out, taken = step, []
@@ -83,8 +86,6 @@ def _within(room: Tensor, n: Tensor, step: Tensor) -> Tensor:
         out = out + (excess.gather(-1, worst)[..., 0] / square)[..., None] * w
         taken.append((w, square))
         bound = bound | ((index == worst) & binds[..., None])
-    if planes == 1:
-        return out
     with torch.no_grad():
         stuck = stuck | (excess_of(out).masked_fill(bound, -torch.inf) > slack[..., None]).any(-1)
         stuck = stuck | ((out * out).sum(-1) > (1 + 1e-6) * length)

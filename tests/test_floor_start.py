@@ -192,6 +192,7 @@ def test_gradients_of_a_step_through_the_start(detections: int | None) -> None:
     rng = generator("step", detections)
     x = model.rest_points + 5e-3 * torch.from_numpy(rng.normal(size=(27, 3)))
     v = torch.tensor([1.0, -3.0, 0.5]).double() + 0.3 * torch.from_numpy(rng.normal(size=(27, 3)))
+    assert model.floor is not None
     constants = {f"floor_barrier.{k}": c for k, c in model.constants(model.floor).items()}
 
     def loss(values: dict[str, Tensor]) -> Tensor:
