@@ -12,9 +12,9 @@ from torch import Tensor
 from . import ops, reference
 from .adjoints import Adjoint, ReverseSweep, Unrolled
 from .checks import check_broadcast, check_count, check_positive, check_tensor, fail
-from .debug import checking
 from .metric import lumped_mass, rest_metric
 from .model import Model
+from .scopes import checking
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
 

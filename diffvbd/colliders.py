@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from .checks import check_positive, fail
 from .mesh.tet_mesh import float_array, int_array
 
+MOST_LENGTH = 1e9  # [m] of coordinates and radii: fourth powers of distances must be numbers in float32
+
 
 class Corners(NamedTuple):
     """What a collider is made of; indices are into ``points``."""
@@ -30,6 +32,21 @@ class Corners(NamedTuple):
 
 
 _NONE = np.zeros(0, np.int64)
+
+
+def _place(name: str, value: Any, shape: tuple[int | None, ...] = (3,)) -> NDArray[np.float64]:
+    """Coordinates [m]."""
+    out = float_array(name, value, shape)
+    if out.size and np.abs(out).max() > MOST_LENGTH:
+        fail(name, f"coordinates of at most {MOST_LENGTH:g} m", f"{out.flat[np.abs(out).argmax()]:g}")
+    return out
+
+
+def _radius(value: Any) -> float:
+    radius = check_positive("radius", value, "m")
+    if radius > MOST_LENGTH:
+        fail("radius", f"at most {MOST_LENGTH:g} m", f"{radius:g}")
+    return radius
 
 
 def _corners(points: Any, triangles: Any = None, edges: Any = None, lone: Any = None, **options: Any) -> Corners:
@@ -56,7 +73,7 @@ class Plane:
     normal: Sequence[float] = (0.0, 1.0, 0.0)
 
     def corners(self) -> Corners:
-        point, normal = float_array("point", self.point, (3,)), float_array("normal", self.normal, (3,))
+        point, normal = _place("point", self.point), float_array("normal", self.normal, (3,))
         if not np.abs(normal).max() > 0:
             fail("normal", "a vector that is not zero", self.normal)
         normal /= np.abs(normal).max()
@@ -79,8 +96,8 @@ class Sphere:
     radius: float = 1.0
 
     def corners(self) -> Corners:
-        center = float_array("center", self.center, (3,))
-        return _corners(center[None], lone=[0], radius=check_positive("radius", self.radius, "m"))
+        center = _place("center", self.center)
+        return _corners(center[None], lone=[0], radius=_radius(self.radius))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +113,10 @@ class Capsule:
     radius: float = 0.25
 
     def corners(self) -> Corners:
-        ends = np.stack([float_array("a", self.a, (3,)), float_array("b", self.b, (3,))])
+        ends = np.stack([_place("a", self.a), _place("b", self.b)])
         if not np.linalg.norm(ends[1] - ends[0]) > 0:
             fail("b", "an end apart from a (a Sphere has one point)", self.b)
-        return _corners(ends, edges=[[0, 1]], lone=[0, 1], radius=check_positive("radius", self.radius, "m"))
+        return _corners(ends, edges=[[0, 1]], lone=[0, 1], radius=_radius(self.radius))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +131,7 @@ class Obstacle:
     triangles: Any = None
 
     def corners(self) -> Corners:
-        points = float_array("points", self.points, (None, 3))
+        points = _place("points", self.points, (None, 3))
         triangles = int_array("triangles", self.triangles, (None, 3))
         if triangles.size == 0:
             fail("triangles", "at least one", 0)

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from .checks import check_count, fail
 from .contact_penalty import Bodies, center_of_mass_penalty
-from .contact_step import Detection, outcomes, recorders
+from .contact_step import Detection, outcomes
 from .model import Model
 from .reference.intersections import intersections as _intersections
+from .scopes import record_to
 
 __all__ = ["Bodies", "Detection", "Status", "center_of_mass_penalty", "intersections", "record", "reserve", "status"]
 
@@ -89,13 +90,11 @@ def reserve(model: Model, pairs: int) -> None:
 @contextlib.contextmanager
 def record() -> Iterator[list[Detection]]:
     """Inside, the detections of all steps (those that a checkpointed backward runs again, too) are appended to the list
-    that it gives: which pairs were near, for looking at and for comparing with ``diffvbd.reference.contact_step``."""
+    that it gives: which pairs were near, for looking at and for comparing with ``diffvbd.reference.contact_step``.
+    Steps of other threads and tasks are not recorded, those under torch.compile are."""
     found: list[Detection] = []
-    recorders.append(found)
-    try:
+    with record_to(found):
         yield found
-    finally:
-        recorders[:] = [record for record in recorders if record is not found]
 
 
 def intersections(model: Model, x: Tensor) -> Tensor:

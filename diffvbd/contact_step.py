@@ -12,10 +12,10 @@ from . import detection as search
 from .contact_start import start_part
 from .contact_surface import LEAST_CAPACITY
 from .contact_sweeps import ContactTensors, Pairs, contact_sweep, no_transforms, of_scene, pair_lag
-from .debug import checking
 from .model import Model
 from .ops import SweepSettings, broadcast
 from .reference.intersections import intersections
+from .scopes import checking, recorders
 
 if TYPE_CHECKING:
     from .arguments import Prepared
@@ -56,7 +56,6 @@ class Outcome(NamedTuple):
 
 
 outcomes: weakref.WeakKeyDictionary[Model, Outcome] = weakref.WeakKeyDictionary()
-recorders: list[list[Detection]] = []  # of diffvbd.contact.record
 
 
 def sweeps_of_parts(sweeps: int, parts: int) -> list[int]:
@@ -218,8 +217,8 @@ class ContactStep:
             if self.floor_data is not None:
                 lowest = search.lowest(x, self.origin, self.floor_data.detach(), island, surface)
         detection = Detection(Pairs(*index), corners, values, counts, smallest, island, lowest)
-        for record in recorders:
-            record.append(detection)
+        for found in recorders():
+            found.append(detection)
         return detection
 
     def _above(self, held: Tensor, was: Tensor, now: Tensor, detection: Detection) -> Tensor:

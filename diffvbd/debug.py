@@ -8,11 +8,9 @@ from typing import Any
 
 import torch
 
-from . import ops
+from . import ops, scopes
 from .model import Model
 from .sweeps import sweep
-
-_debug = False  # a plain global: torch.compile guards it
 
 
 @contextlib.contextmanager
@@ -20,19 +18,11 @@ def debug_checks(enabled: bool = True) -> Iterator[None]:
     """Inside, a position that is not finite raises RuntimeError naming step, sweep, color, vertex and scene.
 
     Off (the default) it costs nothing. On CUDA the CPU repeats each step to find out, and values that a step cannot
-    work with raise only here, because looking at them waits for the device.
+    work with raise only here, because looking at them waits for the device. It holds for the thread or task that is
+    inside, and for the backward of what ran there; a step under torch.compile checks while any thread is inside.
     """
-    global _debug
-    before, _debug = _debug, enabled
-    try:
+    with scopes.checks(enabled):
         yield
-    finally:
-        _debug = before
-
-
-def checking() -> bool:
-    """Whether debug_checks() is on."""
-    return _debug
 
 
 def check_on_cpu(model: Model, tensors: Sequence[Any], settings: ops.SweepSettings, index: int) -> None:

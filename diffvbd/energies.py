@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from .checks import check_number, check_positive, fail
+from .mask import EXACT_BLOCK, FIRST_VERTEX_BIT, PAPER_BLOCK
 from .safeguards import filter_against_planes
 
-EXACT_BLOCK, PAPER_BLOCK = 1, 2  # bits of the elastic block in a scene's mask
 MAX_PLANES = 8
 
 
@@ -60,7 +60,7 @@ class VertexEnergy:
     """An energy of one vertex at a time. Subclasses are dataclasses; see docs/extending.md."""
 
     name: ClassVar[str]
-    bit: ClassVar[int]  # 4 << position in the list of csrc/energies/energies.h
+    bit: ClassVar[int]  # in a scene's mask; follows from the position in VERTEX_ENERGIES
     per_vertex: ClassVar[bool]
     parameters: ClassVar[dict[str, int]]  # differentiable parameters and their number of own dimensions
 
@@ -106,7 +106,8 @@ def _barrier_slope(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
 class FloorBarrier(VertexEnergy):
     """IPC log barrier above planes: b(d) = -kappa (d - dhat)^2 log(d / dhat) for a gap 0 < d < dhat.
 
-    No executed sweep lets an unpinned vertex reach a plane: the predictor and every update pass a step filter.
+    No executed sweep lets an unpinned vertex reach a plane: every update passes a step filter, and the start of a step
+    approaches no plane within its dhat, so that what rests there keeps its gap at any number of sweeps.
 
     Args:
         height: Height of the plane along its normal [m], or one for each plane.
@@ -122,7 +123,6 @@ class FloorBarrier(VertexEnergy):
     """
 
     name: ClassVar[str] = "floor_barrier"
-    bit: ClassVar[int] = 4
     per_vertex: ClassVar[bool] = False
     parameters: ClassVar[dict[str, int]] = {"normal": 2, "height": 1, "kappa": 0, "dhat": 0, "damping": 0}
 
@@ -198,9 +198,9 @@ class FloorBarrier(VertexEnergy):
         return -_barrier_slope(gap, kappa, dhat), normal
 
     def filter(self, x: Tensor, step: Tensor, data: Tensor, origin: Tensor | None) -> Tensor:
-        """x + alpha step for the packed ``data`` of this energy, see safeguards.filter_against_planes."""
+        """Where a step starts that wants to go from x by ``step``, see safeguards.filter_against_planes."""
         planes = data.reshape(data.shape[0], self.planes, 7)
-        return filter_against_planes(x, step, planes[..., :3], planes[..., 3], origin)
+        return filter_against_planes(x, step, planes[..., :3], planes[..., 3], planes[..., 5], origin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,6 @@ class Anchor(VertexEnergy):
     """
 
     name: ClassVar[str] = "anchor"
-    bit: ClassVar[int] = 8
     per_vertex: ClassVar[bool] = True
     parameters: ClassVar[dict[str, int]] = {"stiffness": 1, "points": 2}
 
@@ -292,3 +291,5 @@ class Anchor(VertexEnergy):
 
 
 VERTEX_ENERGIES: tuple[type[VertexEnergy], ...] = (FloorBarrier, Anchor)  # order of csrc/energies/energies.h
+for _position, _kind in enumerate(VERTEX_ENERGIES):
+    _kind.bit = 1 << (FIRST_VERTEX_BIT + _position)

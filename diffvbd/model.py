@@ -15,9 +15,10 @@ from .checks import check_number, check_positive, fail, vertex_mask
 from .colliders import Collider
 from .contact_surface import ContactSurface, build_surface, check_colliders
 from .energies import VERTEX_ENERGIES, FloorBarrier, StableNeoHookean, VertexEnergy
+from .mask import CONTACT
 from .mesh import TetMesh
 from .metric import lumped_mass, rest_metric
-from .pair_barrier import CONTACT, Friction, PairBarrier
+from .pair_barrier import Friction, PairBarrier
 from .safeguards import FILTER_ETA, SATURATION_EPS
 
 Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction
@@ -115,10 +116,9 @@ class Model:
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = _first_of_body(body)
         self._bodies = ops_rigid.find_bodies(points, tets, mask)
-        # which vertices the sweeps take from x + h v: those of bodies that are corrected, or all
-        self._from_inertia = torch.full((mesh.num_vertices,), start == "inertia")
-        if self.rigid:
-            self._from_inertia[self._bodies.order.long()] = True
+        # vertices of bodies that are corrected, and those that the sweeps take from x + h v
+        self._corrected = (self._bodies.member < self._bodies.count) & self.rigid
+        self._from_inertia = self._corrected | (~mask & (start == "inertia"))
         self.surface_of_contact = self._build_surface(check_colliders(colliders))
         device = _checked_device(device)
         self._arrange(points, tets, device)

@@ -17,10 +17,10 @@ from torch import Tensor
 from torch.autograd import Function
 
 from . import native
+from .mask import KEEPS_POSITIONS
 
 NO_TAPE, COMPACT_TAPE, FULL_TAPE = 0, 1, 2
 REST_SCALARS = 7  # k01 k02 k03 k12 k13 k23 c6 of a tet
-_KEEPS_POSITIONS = 4 | 16  # mask of FloorBarrier and contact; twin of keeps_positions in csrc/energies/energies.h
 
 
 native.load()
@@ -66,7 +66,7 @@ def plan_sizes(plan: Tensor, device: str) -> tuple[int, ...]:
 
 def tape_rows(policy: int, energies: int) -> int:
     """Scalars of tape per active vertex and sweep; twin of tape_rows in csrc/core/views.h."""
-    return {NO_TAPE: 0, COMPACT_TAPE: 3, FULL_TAPE: 12 if energies & _KEEPS_POSITIONS else 9}[policy]
+    return {NO_TAPE: 0, COMPACT_TAPE: 3, FULL_TAPE: 12 if energies & KEEPS_POSITIONS else 9}[policy]
 
 
 def tape_shape(x: Tensor, sizes: Sequence[int], energies: int, sweeps: int, launch: Sequence[int], policy: int) -> list:

@@ -21,13 +21,20 @@ class Bodies(NamedTuple):
     ptr: Tensor  # int32 [bodies + 1]
     spread: Tensor  # float64 [bodies], squared radius of gyration at rest [m^2]
     groups: tuple[int, int, int]  # how many are small, medium and large, by LARGEST
+    member: Tensor  # int64 [V], the body of each vertex; of the others the number of bodies
 
     @property
     def count(self) -> int:
         return self.ptr.shape[0] - 1
 
     def to(self, device: torch.device) -> Bodies:
-        return Bodies(*(t.to(device) for t in self[:3]), self.groups)
+        order, ptr, spread, groups, member = self
+        return Bodies(order.to(device), ptr.to(device), spread.to(device), groups, member.to(device))
+
+    @property
+    def arguments(self) -> tuple[Tensor, Tensor, Tensor, tuple[int, int, int]]:
+        """What the operators take."""
+        return self[:4]
 
 
 def find_bodies(points: Tensor, tets: Tensor, pinned: Tensor) -> Bodies:
@@ -56,17 +63,19 @@ def find_bodies(points: Tensor, tets: Tensor, pinned: Tensor) -> Bodies:
     square = (points[order] - center[of_body]).square().sum(-1)
     spread = points.new_zeros(len(size)).index_add_(0, of_body, square) / size
     small, medium = (int((size <= largest).sum()) for largest in LARGEST)
-    return Bodies(order.int(), ptr.int(), spread.double(), (small, medium - small, len(size) - medium))
+    member = torch.full((count,), len(size)).index_copy_(0, order, of_body)
+    return Bodies(order.int(), ptr.int(), spread.double(), (small, medium - small, len(size) - medium), member)
 
 
-def correct(x: Tensor, x_prev: Tensor, y: Tensor, mass: Tensor, data: Tensor, origin: Tensor, bodies: Bodies,
+def correct(x: Tensor, x_prev: Tensor, y: Tensor, mass: Tensor, data: Tensor, origin: Tensor, bodies: tuple,
             data_count: Sequence[int], time_step: float) -> Tensor:  # fmt: skip
-    """Positions after the correction of every listed body [B, V, 3]; arguments as in csrc/ops.cpp."""
+    """Positions after the correction of every listed body [B, V, 3]; bodies: Bodies.arguments, the others as in
+    csrc/ops.cpp."""
     return ops.raw.rigid(x, x_prev, y, mass, data, origin, *bodies, data_count, time_step)
 
 
 def correct_backward(x_bar: Tensor, x: Tensor, x_prev: Tensor, y: Tensor, mass: Tensor, data: Tensor, origin: Tensor,
-                     bodies: Bodies, data_count: Sequence[int], time_step: float, wants_data: bool
+                     bodies: tuple, data_count: Sequence[int], time_step: float, wants_data: bool
                      ) -> tuple[Tensor, ...]:  # fmt: skip
     """Adjoints of x, x_prev (empty without data), y, mass, the data of scenes by body and of vertices."""
     return ops.raw.rigid_backward(

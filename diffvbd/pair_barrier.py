@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from .checks import check_count, check_number, check_positive, fail
+from .mask import CONTACT
 
-CONTACT = 16  # bit of a scene's mask; twin of kContact in csrc/energies/energies.h
 MOST_REACH = 1e6  # [m]; its square must be a number in float32
 GAMMA = 0.45  # share of its smallest gap that a vertex may move between two detections; two sides leave a tenth
 

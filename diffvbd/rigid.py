@@ -18,6 +18,7 @@ from torch.autograd import Function
 
 from . import ops, ops_rigid
 from .ops_rigid import Bodies
+from .safeguards import FILTER_ETA, GUARD_ULPS
 from .sweeps import distinct, no_second_derivative, of_inputs
 
 _TENSORS = 5  # x, x_prev, y, mass, data: the differentiable inputs, all [1 | B, ...]
@@ -26,7 +27,7 @@ _TENSORS = 5  # x, x_prev, y, mass, data: the differentiable inputs, all [1 | B,
 class _Correct(Function):
     @staticmethod
     def forward(x, x_prev, y, mass, data, origin, order, ptr, spread, groups, data_count, time_step):
-        bodies = Bodies(order, ptr, spread, groups)
+        bodies = (order, ptr, spread, groups)
         return ops_rigid.correct(x, x_prev, y, mass, data, origin, bodies, data_count, time_step)
 
     @staticmethod
@@ -49,7 +50,7 @@ class _Correct(Function):
 class _CorrectBackward(Function):
     @staticmethod
     def forward(x_bar, x, x_prev, y, mass, data, origin, order, ptr, spread, groups, data_count, time_step, needs):
-        bodies = Bodies(order, ptr, spread, groups)
+        bodies = (order, ptr, spread, groups)
         x_out, x_prev_out, y_out, mass_out, shared, own = ops_rigid.correct_backward(
             x_bar.contiguous(), x, x_prev, y, mass, data, origin, bodies, data_count, time_step, needs[4]
         )
@@ -99,7 +100,46 @@ def correct(
     """Positions [B, V, 3] after every listed body was moved rigidly to the least potential; differentiable in the first
     five tensors, whose shapes are those of sweeps.sweep. ``origin`` is empty where positions are absolute."""
     tensors = distinct(x, x_prev, y, mass, data, origin)
-    return _Correct.apply(*tensors, *bodies, data_count, time_step)
+    return _Correct.apply(*tensors, *bodies.arguments, data_count, time_step)
+
+
+def coast(x: Tensor, step: Tensor, planes: Tensor, origin: Tensor | None, bodies: Bodies) -> Tensor:
+    """The share of a step that each body may take together, toward planes: filtered vertex by vertex it would arrive
+    deformed, and few sweeps do not undo that.
+
+    Args:
+        x: Positions above every plane [m], [B, V, 3].  step: Wanted moves [m], [B, V, 3].
+        planes: Data of a FloorBarrier [1 | B, 7 planes].  origin: [B, V, 3] or None.
+
+    Returns:
+        Positions [B, V, 3]: no vertex comes nearer to a plane within dhat, or closes more than FILTER_ETA of the way to
+        there. Of vertices in no body nothing is said.
+    """
+    data = planes.reshape(planes.shape[0], 1, -1, 7)
+    n, height, dhat = data[..., :3], data[..., 3], data[..., 5]
+    local = height if origin is None else height - (n * origin[:, :, None]).sum(-1)
+    gap = (n * x[:, :, None]).sum(-1) - local  # [B, V, P]
+    room = FILTER_ETA * (gap - dhat).clamp(min=0)
+    closing = -(n * step[:, :, None]).sum(-1)
+    with torch.no_grad():  # a motion along a plane is none toward it, however it rounds
+        slack = 8 * torch.finfo(x.dtype).eps * step.norm(dim=-1, keepdim=True)
+        over = closing > room + slack
+    share = torch.where(over, room / torch.where(over, closing, torch.ones_like(closing)), torch.ones_like(room))
+    share = _least(share.amin(-1), bodies)
+    with torch.no_grad():  # rounding must not close a gap
+        moved = x + share[..., None] * step
+        world = moved if origin is None else moved + origin
+        guard = (n * world[:, :, None]).abs().sum(-1) + height.abs()
+        good = (n * moved[:, :, None]).sum(-1) - local > GUARD_ULPS * torch.finfo(x.dtype).eps * guard
+        safe = _least(good.all(-1).to(x.dtype), bodies) > 0
+    return x + torch.where(safe, share, torch.zeros_like(share))[..., None] * step
+
+
+def _least(values: Tensor, bodies: Bodies) -> Tensor:
+    """For each vertex the least value [B, V] of its body."""
+    start = values.new_ones((values.shape[0], bodies.count + 1))
+    index = bodies.member.expand(values.shape)
+    return start.scatter_reduce(1, index, values, "amin").gather(1, index)
 
 
 ops.ready_signature(_Correct, _CorrectBackward)

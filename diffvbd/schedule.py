@@ -15,6 +15,7 @@ from . import ops
 from .adjoints import Adjoint, ReverseSweep, Unrolled
 from .checks import check_count, fail
 from .model import Model
+from .scopes import Scope
 
 MAX_REPEATS = 64  # of a step under Binomial: each is a nested checkpoint, and a run of the step
 TAPE_BUDGET = 2 * 2**30  # bytes of tape that "auto" lets a rollout keep
@@ -101,7 +102,16 @@ def _again(run: Callable[..., Segment], *args: Any) -> Segment:
     capturing = (
         not torch.compiler.is_compiling() and torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
     )
-    return checkpoint(run, *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
+    again = run if torch.compiler.is_compiling() else _resuming(run, Scope())
+    return checkpoint(again, *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
+
+
+def _resuming(run: Callable[..., Segment], scope: Scope) -> Callable[..., Segment]:
+    def resumed(*args: Any) -> Segment:
+        with scope.resumed():
+            return run(*args)
+
+    return resumed
 
 
 def _binomial(run: Run, first: int, end: int, x: Tensor, v: Tensor, snapshots: int) -> Segment:

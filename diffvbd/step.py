@@ -22,11 +22,12 @@ from .arguments import (
     prepare,
 )
 from .contact_step import run_contact
-from .debug import check_on_cpu, checking
+from .debug import check_on_cpu
 from .global_adjoint import global_sweep
 from .memory import out_of_memory_named
 from .model import Model
-from .rigid import correct
+from .rigid import coast, correct
+from .scopes import checking
 from .sweeps import SweepTensors, fused_step, sweep
 
 
@@ -169,11 +170,17 @@ def begin(
     data = _energy_data(model, prepared, origin)
     x_start = y
     if model.corrects or model.start == "inertia":
-        x_start = torch.where((model._from_inertia & ~model.pinned)[:, None], coasting, y)
+        x_start = torch.where(model._from_inertia[:, None], coasting, y)
     if model.floor is not None and model.contact is None:  # with pairs the state moves to y in parts
-        count = model.floor.count()
-        filtered = model.floor.filter(start, x_start - start, data[:, :count], origin)
-        x_start = torch.where(model.pinned[:, None], y, filtered)
+        move, planes = x_start - start, data[:, : model.floor.count()]
+        if not model.corrects:
+            x_start = model.floor.filter(start, move, planes, origin)
+        else:
+            x_start = coast(start, move, planes, origin, model._bodies)
+            if model._bodies.order.shape[0] < model.num_vertices:
+                alone = model.floor.filter(start, move, planes, origin)
+                x_start = torch.where(model._corrected[:, None], x_start, alone)
+        x_start = torch.where(model.pinned[:, None], y, x_start)
     begun = Begun(x_start, start, y, data, origin)
     return begun._replace(x_start=begun.corrected(x_start, model, prepared))
 

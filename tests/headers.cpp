@@ -242,7 +242,7 @@ bool lanes_are_scalars(const std::vector<Values>& in) {
 template <class... E>
 py::dict listed(EnergyList<E...>) {
   py::dict out;
-  int bit = 4;
+  int bit = 1 << kFirstVertexBit;
   const auto add = [&](const char* mangled, int stride, bool per_vertex, bool has_filter) {
     int status = 0;
     char* name = abi::__cxa_demangle(mangled, nullptr, nullptr, &status);
@@ -282,6 +282,14 @@ PYBIND11_MODULE(headers, m) {
   });
   m.def("vertex_energies", [] { return listed(VertexEnergies{}); });
   m.def("tape_rows", &tape_rows);
+  m.def("keeps_positions", &keeps_positions);
+  m.def("variant_masks", [] {
+    std::vector<std::vector<int>> out(2);  // of all variants, and of those without contact; each must be its own place
+    for (int n = 0; n < kEnergySets; ++n) out[0].push_back(energy_index(energy_mask(n)) == n ? energy_mask(n) : -1);
+    for (int n = 0; n < kFreeSets; ++n) out[1].push_back(free_index(free_mask(n)) == n ? free_mask(n) : -1);
+    return out;
+  });
+  m.attr("contact") = kContact;
   m.attr("exact_block") = static_cast<int>(kExactBlock);
   m.attr("paper_block") = static_cast<int>(kPaperBlock);
   m.attr("max_energy_data") = kMaxEnergyData;

@@ -3,8 +3,10 @@ are loud, and routes of differentiation that do not exist raise."""
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from test_contact_interface import STEP, ball, two_boxes
@@ -86,6 +88,12 @@ def test_friction(name: str, value: Any, got: str) -> None:
         (lambda: colliders.Capsule(radius=0.0), "radius", "0"),
         (lambda: colliders.Capsule((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "b", r"\(0.0, 0.0, 0.0\)"),
         (lambda: colliders.Capsule(a=(0.0, 0.0, INF)), "a", "Inf"),
+        (lambda: colliders.Capsule((1.0, -1.0, 0.0), (2.0, -5.0, 0.0), 1e100), "radius", r"1e\+100"),
+        (lambda: colliders.Sphere(radius=2e9), "radius", r"2e\+09"),
+        (lambda: colliders.Sphere((0.0, -1e38, 0.0)), "center", r"-1e\+38"),
+        (lambda: colliders.Plane((0.0, 1e10, 0.0)), "point", r"1e\+10"),
+        (lambda: colliders.Capsule(b=(1e300, 0.0, 0.0)), "b", r"1e\+300"),
+        (lambda: colliders.Obstacle(1e20 * np.eye(3), [[0, 1, 2]]), "points", r"1e\+20"),
         (lambda: colliders.Obstacle(TRIANGLE, [[0, 1, 3]]), "triangles", "0..3"),
         (lambda: colliders.Obstacle(TRIANGLE, [[0, 1, -1]]), "triangles", "-1"),
         (lambda: colliders.Obstacle(TRIANGLE, [[0, 1, 1]]), "triangles", "0"),
@@ -98,6 +106,19 @@ def test_friction(name: str, value: Any, got: str) -> None:
 def test_colliders(make: Callable[[], Any], name: str, got: str) -> None:
     """At the latest where a Model is made of them."""
     raises(lambda: dv.Model(box(2), energies=(dv.StableNeoHookean(), dv.PairBarrier()), colliders=[make()]), name, got)
+
+
+def test_a_box_without_end_meets_primitives_only(device: str) -> None:
+    """Its distance from the empty leaves that fill a tree up is not a number, and they are no primitives."""
+    capsule = colliders.Capsule((1.0, -1.0, 0.0), (2.0, -5.0, 0.0), 0.5)
+    mesh = dv.mesh.join([box(3, 0.2), box(3, 0.2).translate((0.0, 0.5, 0.0))])
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier()), colliders=[capsule], device=device)
+    surface = model.surface_of_contact
+    assert surface is not None and surface.triangles.shape[0] & (surface.triangles.shape[0] - 1), "a tree filled up"
+    model.surface_of_contact = replace(surface, radius=torch.where(surface.radius > 0, INF, surface.radius))
+    x = model.rest_points
+    with pytest.raises(ValueError, match="x or colliders: expected surfaces that do not touch"):
+        dv.step(model, x, torch.zeros_like(x), **STEP)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import diffvbd as dv
 from diffvbd import energies, ops
+from diffvbd.mask import CONTACT, FIRST_VERTEX_BIT
 from diffvbd.testing import generator, tolerance
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -287,7 +289,26 @@ def test_python_lists_the_energies_of_the_headers(headers: Any) -> None:
 
 
 def test_python_tape_is_the_compiled_one(headers: Any) -> None:
-    for mask in range(16):
+    for mask in range(masks()):
         filters = any(mask & bit and has_filter for bit, _, _, has_filter in headers.vertex_energies().values())
+        assert headers.keeps_positions(mask) == (filters or bool(mask & CONTACT))
         for policy in (ops.NO_TAPE, ops.COMPACT_TAPE, ops.FULL_TAPE):
-            assert ops.tape_rows(policy, mask) == headers.tape_rows(policy, filters)
+            assert ops.tape_rows(policy, mask) == headers.tape_rows(policy, headers.keeps_positions(mask))
+
+
+def masks() -> int:
+    """Bits of a mask run below this: the elastic block's, contact, the vertex energies'."""
+    return 1 << (FIRST_VERTEX_BIT + len(energies.VERTEX_ENERGIES))
+
+
+def test_each_set_of_energies_is_one_variant(headers: Any) -> None:
+    every, free = headers.variant_masks()
+    both = energies.EXACT_BLOCK | energies.PAPER_BLOCK
+    assert sorted(every) == [mask for mask in range(masks()) if mask & both != both]
+    assert sorted(free) == [mask for mask in sorted(every) if not mask & CONTACT]
+
+
+def test_no_two_energies_share_a_bit(headers: Any) -> None:
+    bits = [energies.EXACT_BLOCK, energies.PAPER_BLOCK, dv.PairBarrier.bit, *(e.bit for e in energies.VERTEX_ENERGIES)]
+    assert bits == [1 << k for k in range(len(bits))]  # contact before the list: a new energy moves no bit
+    assert dv.PairBarrier.bit == dv.Friction.bit == headers.contact == CONTACT

@@ -3,7 +3,7 @@
 #pragma once
 
 #include "../core/bounds.h"
-#include "../energies/energies.h"
+#include "../energies/floor_start.h"
 #include "candidates.h"
 #include "passes.h"
 
@@ -44,7 +44,7 @@ struct StartInputs {
     return {at(x, scene, v) + vector_at(u + 3 * (scene * bodies + body[v])), T(0) < radius ? radius : T(0)};
   }
   DIFFVBD_FN const T* planes(int64_t scene) const { return floor.data + scene * floor.scene; }
-  // The floor filters from the center of the bound: all between it and the target lies inside.
+  // The floor acts on the way from the center of the bound, which it does not lengthen: its end lies inside, too.
   DIFFVBD_FN VertexState<T> state(const Bound<T>& b, int64_t scene, int32_t v) const {
     return {b.center, b.center, local_origin(scene, v), parameters.time_step};
   }
@@ -67,9 +67,8 @@ DIFFVBD_FN void start_vertex(const StartInputs<T>& in, const StartOutputs<T>& ou
     start = x + bounded(x, move, b);
     out.outside[row] = is_cut(x, move, b) > T(0);
     if (in.floor.data) {
-      const Vec3<T> step = start - b.center;
-      const VertexState<T> s = in.state(b, scene, v);
-      start = b.center + FloorBarrier::filter(s, in.planes(scene), in.floor_scalars, step, in.parameters) * step;
+      start = b.center + FloorStart::moved(in.state(b, scene, v), in.planes(scene), in.floor_scalars, start - b.center,
+                                           in.parameters);
     }
   }
   const Vec3<T> left = move - (start - x);
@@ -102,20 +101,10 @@ DIFFVBD_FN void reverse_start(const StartInputs<T>& in, const StartAdjoints<T>& 
     Vec3<T> target_bar = start_bar;
     if (in.floor.data) {
       const Vec3<T> step = x + bounded(x, move, b) - b.center;
-      const VertexState<T> s = in.state(b, scene, v);
-      const T* data = in.planes(scene);
-      const T alpha = FloorBarrier::filter(s, data, in.floor_scalars, step, in.parameters);
-      const T alpha_bar = dot(step, start_bar);
-      target_bar = alpha * start_bar;
       b_bar.center += start_bar;
-      FloorBarrier::filter_vjp(s, data, in.floor_scalars, step, in.parameters, alpha, alpha_bar, b_bar.center,
-                               target_bar);
+      FloorStart::moved_vjp(in.state(b, scene, v), in.planes(scene), in.floor_scalars, step, in.parameters, target_bar,
+                            b_bar.center, floor_bar);
       b_bar.center -= target_bar;
-      if (floor_bar) {
-        const Update<T> u{none, step, alpha};
-        vertex_energy_data_vjp<FloorBarrier>(s, data, in.floor_scalars, none, u, in.parameters, alpha_bar,
-                                             [&](int k, const T& value) { floor_bar[k] += value; });
-      }
     }
     x_bar += target_bar;
     bounded_vjp(x, move, b, target_bar, x_bar, b_bar);

@@ -109,15 +109,17 @@ DIFFVBD_FN int32_t next_node(int32_t i) {
 }
 
 // The first leaf node in a traversal from node i that is not further from the query than the reach, or `end`;
-// `skips(group)` says which nodes are of no interest.
+// `skips(group)` says which nodes are of no interest. Empty leaves are passed over: an infinite query is near them,
+// too, because the distance of infinite boxes is not a number.
 template <class Skips>
 DIFFVBD_FN int32_t find_leaf(const Box* nodes, int32_t leaves, int32_t i, int32_t end, const Box& query, float reach2,
                              const Skips& skips) {
   do {
     const Box& node = nodes[i];
     const bool hit = distance2(node, query) <= reach2 && !skips(node.group);
-    if (hit && i >= leaves) return i;
-    i = hit ? 2 * i : next_node(i);
+    const bool leaf = i >= leaves;
+    if (hit && leaf && !is_empty(node)) return i;
+    i = hit && !leaf ? 2 * i : next_node(i);
   } while (i != end);
   return end;
 }

@@ -20,11 +20,4 @@ ForwardKernel<T> forward_kernel(int energies);
 template <class T>
 ReverseKernel<T> reverse_kernel(int energies, int wanted);
 
-constexpr int kElasticVariants = 3;                                     // none, exact, paper
-constexpr int kEnergySets = kElasticVariants << (kVertexEnergies + 1);  // and contact
-
-// The variants are numbered (elastic, set of vertex energies): mask of the n-th, and back.
-constexpr int energy_mask(int n) { return n % kElasticVariants + (n / kElasticVariants) * 4; }
-constexpr int energy_index(int mask) { return (mask & 3) + (mask >> 2) * kElasticVariants; }
-
 }  // namespace diffvbd

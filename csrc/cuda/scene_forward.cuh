@@ -63,7 +63,7 @@ using SceneForward = void (*)(StepInputs<T>, StepOutputs<T>, GroupPlan);
 
 template <class T, bool common, int... n>
 SceneForward<T> pick_scene_forward(int index, std::integer_sequence<int, n...>) {
-  static constexpr SceneForward<T> table[kFreeSets] = {scene_forward<T, energy_mask(n), common>...};
+  static constexpr SceneForward<T> table[kFreeSets] = {scene_forward<T, free_mask(n), common>...};
   return table[index];
 }
 
@@ -74,7 +74,7 @@ cudaError_t run_scene_forward(const HostPlan& host, const StepInputs<T>& in, con
                               const Choice& choice, cudaStream_t stream) {
   if (host.plan.num_vertices > kSmallMesh) return cudaErrorInvalidConfiguration;
   constexpr auto sets = std::make_integer_sequence<int, kFreeSets>{};
-  const int index = energy_index(in.energies);
+  const int index = free_index(in.energies);
   const auto kernel =
       is_common(in) ? pick_scene_forward<T, true>(index, sets) : pick_scene_forward<T, false>(index, sets);
   StepInputs<T> inputs = in;

@@ -122,13 +122,13 @@ constexpr int useful(int mask, int wanted) { return (mask & 3) == 0 ? kState : w
 template <class T, int wanted, bool common, int... n>
 SceneReverse<T> pick_scene_reverse(int index, std::integer_sequence<int, n...>) {
   static constexpr SceneReverse<T> table[kFreeSets] = {
-      scene_reverse<T, energy_mask(n), useful(energy_mask(n), wanted), common>...};
+      scene_reverse<T, free_mask(n), useful(free_mask(n), wanted), common>...};
   return table[index];
 }
 template <class T, bool common>
 SceneReverse<T> pick_scene_reverse(int energies, int wanted) {
   constexpr auto sets = std::make_integer_sequence<int, kFreeSets>{};
-  const int index = energy_index(energies);
+  const int index = free_index(energies);
   // rest shapes that are differentiated are no common ones, or cost too much memory traffic for it to matter
   if (wanted & kRest) return pick_scene_reverse<T, kMaterial | kRest, false>(index, sets);
   if (wanted & kMaterial) return pick_scene_reverse<T, kMaterial, common>(index, sets);

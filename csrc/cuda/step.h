@@ -127,12 +127,6 @@ DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int lanes, bool
   return groups * (3 * degree + (reverse ? contributions : 0));
 }
 
-constexpr int kElasticVariants = 3;                                     // none, exact, paper
-constexpr int kFreeSets = kElasticVariants << kVertexEnergies;          // without contact
-constexpr int kEnergySets = kElasticVariants << (kVertexEnergies + 1);  // and contact
-constexpr int energy_mask(int n) { return n % kElasticVariants + (n / kElasticVariants) * 4; }
-constexpr int energy_index(int mask) { return (mask & 3) + (mask >> 2) * kElasticVariants; }
-
 // Contact launches color by color, where few threads per vertex gain little: one variant less to build.
 constexpr bool is_built(int mask, int lanes) { return (mask & kContact) == 0 || lanes != kFewLanes; }
 

@@ -19,11 +19,23 @@ struct EnergyList {
   static constexpr int size = sizeof...(E);
 };
 
-// bits 0 and 1 of a mask: the elastic block; bit 2 + k: the k-th energy of this list; the bit after them: contact
 using VertexEnergies = EnergyList<FloorBarrier, Anchor>;
 constexpr int kVertexEnergies = VertexEnergies::size;
+// Bits of a mask: the elastic block, contact, then the energies of the list, so that a new one moves no other bit.
+// Twins stand in diffvbd/mask.py.
 enum ElasticBits { kExactBlock = 1, kPaperBlock = 2 };
-constexpr int kContact = 4 << kVertexEnergies;
+constexpr int kContact = 4;
+constexpr int kFirstVertexBit = 3;
+
+// The compiled variants are numbered (elastic, the bits above): mask of the n-th, and back; and of those without
+// contact.
+constexpr int kElasticVariants = 3;                                     // none, exact, paper
+constexpr int kFreeSets = kElasticVariants << kVertexEnergies;          // without contact
+constexpr int kEnergySets = kElasticVariants << (kVertexEnergies + 1);  // and with it
+constexpr int energy_mask(int n) { return n % kElasticVariants + (n / kElasticVariants) * kContact; }
+constexpr int energy_index(int mask) { return (mask & 3) + mask / kContact * kElasticVariants; }
+constexpr int free_mask(int n) { return n % kElasticVariants + (n / kElasticVariants << kFirstVertexBit); }
+constexpr int free_index(int mask) { return (mask & 3) + (mask >> kFirstVertexBit) * kElasticVariants; }
 constexpr int kMaxEnergyData = 64;  // scalars that the energies of one vertex may read
 
 // One block update, from the Newton step to the executed one.
@@ -52,21 +64,21 @@ constexpr int data_stride(int k, EnergyList<E...>) {
 }
 template <class... E>
 constexpr bool any_filter(int mask, EnergyList<E...>) {
-  int k = 2;
+  int k = kFirstVertexBit;
   return ((((mask >> k++) & 1) && E::has_filter) || ...);
 }
 // Whether a vertex must come back to its old position exactly in the reverse: gaps depend on it to the bit.
 constexpr bool keeps_positions(int mask) { return (mask & kContact) != 0 || any_filter(mask, VertexEnergies{}); }
 template <class... E>
 constexpr bool any_x_prev(int mask, EnergyList<E...>) {
-  int k = 2;
+  int k = kFirstVertexBit;
   return ((((mask >> k++) & 1) && E::reads_x_prev) || ...);
 }
 
 template <int mask>
 struct EnergySet {
   static constexpr bool contact = (mask & kContact) != 0;
-  static constexpr bool of_vertices = ((mask & ~kContact) >> 2) != 0;
+  static constexpr bool of_vertices = (mask >> kFirstVertexBit) != 0;
   static constexpr bool elastic = (mask & (kExactBlock | kPaperBlock)) != 0;
   using Elastic = StableNeoHookean<(mask & kExactBlock) != 0>;
 
@@ -84,7 +96,7 @@ struct EnergySet {
   DIFFVBD_FN static void visit(F&, EnergyList<>) {}
   template <int k, class F, class E, class... Rest>
   DIFFVBD_FN static void visit(F& f, EnergyList<E, Rest...>) {
-    if constexpr ((mask >> (2 + k)) & 1) f(E{}, k);
+    if constexpr ((mask >> (kFirstVertexBit + k)) & 1) f(E{}, k);
     visit<k + 1>(f, EnergyList<Rest...>{});
   }
 };

@@ -54,8 +54,9 @@ struct FloorBarrier {
       }
       const R approach = dot(plane.n, s.x - s.x_prev);
       const auto near = plane.gap(s.x_prev) < plane.dhat;
-      const R c = select(near, select(approach < R(0), plane.damping * s.h, R(0)), R(0));
-      g += c * approach * plane.n;
+      // H has it for both directions, as for pairs: where a start has left no approach, rounding would switch it.
+      const R c = select(near, plane.damping * s.h, R(0));
+      g += c * select(approach < R(0), approach, R(0)) * plane.n;
       add_outer(H, c, plane.n);
     }
   }

@@ -17,7 +17,7 @@ from .energies import FloorBarrier, build_energies
 from .friction import floor_friction, smoothed, tangential6
 from .layout import build_layout, dot, outer6, take
 from .scene import Scene, build_scene
-from .sweep import check_start, color_masses, filtered, predictor, run_sweeps
+from .sweep import check_start, color_masses, predictor, run_sweeps, started
 
 GUARD = 32  # ulps of a vertex's coordinates that are taken off its gap before it becomes a bound
 
@@ -307,7 +307,7 @@ def contact_step(
         target = state + bounds.cut(state, wanted, every)
         moved = target
         if floor is not None:  # from the center: all between it and the target lies in the ball
-            moved = bounds.center + filtered(energies, bounds.center, target - bounds.center)
+            moved = bounds.center + started(energies, bounds.center, target - bounds.center)
         moved = torch.where(model.pinned, x_prev + ((r + 1) / count) * (y - x_prev), moved)
         wanted = wanted - (moved - state)
         forces = [PairBarrier(scene, listed[r], now), LaggedPairForces(scene, listed[0], start, now)]

@@ -5,7 +5,8 @@ An energy class is built once per run from (its dataclass, Scene) and offers
 * `block(k, x, x_prev)` -> [..., 9, n]: h^2 times gradient (3 rows) and Hessian block (xx, xy, xz, yy, yz, zz) of the n
   vertices of color k, at the state x [..., 3, V], lagged terms at x_prev;
 * `energy(x, x_prev)` -> [...]: the matching h^2-scaled energy of the whole body (unpinned vertices only);
-* optionally `limit(x, step)` -> [..., n]: the largest admissible fraction of `step` [..., 3, n] from x [..., 3, n].
+* optionally `limit(x, step)` -> [..., n]: the largest admissible fraction of `step` [..., 3, n] from x [..., 3, n],
+  and with it `start(x, step)` -> [..., 3, n]: what the start of a step may take of it.
 
 Vertex energies take what is per vertex from the full vectors by color.
 """
@@ -21,6 +22,7 @@ from .scene import Scene
 
 ETA = 0.9  # a filtered step closes at most this fraction of a gap
 GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
+PARALLEL = 1e-6  # squared sine below which a plane counts as parallel to those that bind
 
 
 class StableNeoHookean:
@@ -102,10 +104,10 @@ class FloorBarrier:
     def gap(self, x: Tensor) -> Tensor:
         return dot(self.normal, x.unsqueeze(-3)) - self.height
 
-    def _approach(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
-        """Normal travel since x_prev [..., planes, n], and where it is damped."""
-        travel = dot(self.normal, (x - x_prev).unsqueeze(-3))
-        return travel, (self.gap(x_prev) < self.dhat) & (travel < 0)
+    def _approach(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Normal travel since x_prev [..., planes, n], where it is damped, and where its approach would be."""
+        travel, near = dot(self.normal, (x - x_prev).unsqueeze(-3)), self.gap(x_prev) < self.dhat
+        return travel, near & (travel < 0), near
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         vertices = self.scene.layout.colors[k].vertices
@@ -119,9 +121,9 @@ class FloorBarrier:
         second = torch.where(active, -self.kappa * (2 * log + 4 * past / d - (past / d) ** 2), 0.0)
         first, second = h**2 * first, h**2 * second
         if self.damped:
-            travel, damped = self._approach(x, take(x_prev, vertices))
+            travel, damped, near = self._approach(x, take(x_prev, vertices))
             first = first + torch.where(damped, self.damping * h * travel, 0.0)
-            second = second + torch.where(damped, self.damping * h, 0.0)
+            second = second + torch.where(near, self.damping * h, 0.0)
         gradient = (first.unsqueeze(-2) * self.normal).sum(-3)
         return torch.cat((gradient, (second.unsqueeze(-2) * self.outer).sum(-3)), -2)
 
@@ -134,7 +136,7 @@ class FloorBarrier:
         total = h**2 * torch.where(active, -self.kappa * (d - self.dhat) ** 2 * torch.log(d / self.dhat), 0.0)
         total = torch.where(gap > 0, total, torch.inf)
         if self.damped:
-            travel, damped = self._approach(x[..., free], x_prev[..., free])
+            travel, damped, _ = self._approach(x[..., free], x_prev[..., free])
             total = total + torch.where(damped, self.damping * h / 2 * travel**2, 0.0)
         return total.sum((-2, -1))
 
@@ -143,12 +145,52 @@ class FloorBarrier:
         bites = (travel < 0) & (ETA * gap < -travel)
         fraction = torch.where(bites, ETA * gap / torch.where(bites, -travel, 1.0), 1.0)
         fraction = fraction.min(-2).values
-        # Rounding may still close a gap of few ulps; such a vertex stays where it is.
+        return torch.where(self._closes(x, fraction.unsqueeze(-2) * step), 0.0, fraction)
+
+    def _closes(self, x: Tensor, step: Tensor) -> Tensor:
+        """Where rounding may still close a gap of few ulps, [..., n]; such a vertex stays where it is."""
         with torch.no_grad():
             size = (self.normal * x.unsqueeze(-3)).abs().sum(-2) + self.height.abs()
-            after = self.gap(x + fraction.unsqueeze(-2) * step)
-            closed = (after <= GUARD * torch.finfo(x.dtype).eps * size).any(-2)
-        return torch.where(closed, 0.0, fraction)
+            return (self.gap(x + step) <= GUARD * torch.finfo(x.dtype).eps * size).any(-2)
+
+    def start(self, x: Tensor, step: Tensor) -> Tensor:
+        """The step projected on n.s = -room of the planes that bind, room = ETA max(0, gap - dhat); the one exceeded
+        most joins them until none is exceeded. Where that fails, the step shortened as a whole."""
+        gap = self.gap(x)
+        room = (ETA * (gap - self.dhat).clamp(min=0)).movedim(-2, -1)  # [..., n, planes]
+        step = step.movedim(-2, -1)
+        normals = self.normal.movedim(-1, -3).expand(*room.shape, 3)
+
+        def excess(s: Tensor) -> Tensor:
+            return -(normals * s.unsqueeze(-2)).sum(-1) - room
+
+        def solve(binding: Tensor, right: Tensor) -> Tensor:
+            """sum_p c_p n_p over binding planes with n_q . sum = right_q at each of them; right [..., n, planes]."""
+            rows = torch.where(binding.unsqueeze(-1), normals, 0.0)
+            system = rows @ rows.mT + torch.diag_embed((~binding).to(rows))
+            return (rows.mT @ torch.linalg.solve(system, torch.where(binding, right, 0.0).unsqueeze(-1))).squeeze(-1)
+
+        slack = 8 * torch.finfo(x.dtype).eps * step.detach().norm(dim=-1, keepdim=True)
+        binding = torch.zeros_like(room, dtype=torch.bool)
+        with torch.no_grad():
+            over, stuck = excess(step), torch.zeros_like(slack, dtype=torch.bool)
+            for _ in range(min(3, room.shape[-1])):
+                open_ = torch.where(binding, -torch.inf, over)
+                worst = torch.zeros_like(binding).scatter(-1, open_.argmax(-1, keepdim=True), True)
+                worst = worst & (open_ > slack)
+                own = (torch.where(worst.unsqueeze(-1), normals, 0.0)).sum(-2)
+                rest = own - solve(binding, (normals * own.unsqueeze(-2)).sum(-1))
+                parallel = worst.any(-1, keepdim=True) & ((rest * rest).sum(-1, keepdim=True) <= PARALLEL)
+                stuck, binding = stuck | parallel, binding | (worst & ~parallel)
+                over = excess(step + solve(binding, excess(step)))
+            stuck = stuck | (torch.where(binding, -torch.inf, over) > slack).any(-1, keepdim=True)
+        moved = step + solve(binding, excess(step))
+        stuck = stuck | ((moved**2).sum(-1, keepdim=True) > (1 + 1e-6) * (step**2).sum(-1, keepdim=True))
+        bites = excess(step) > 0
+        along = torch.where(bites, (normals * step.unsqueeze(-2)).sum(-1), -1.0)
+        alpha = torch.where(bites, -room / along, 1.0).min(-1, keepdim=True).values
+        moved = torch.where(stuck, alpha * step, moved).movedim(-1, -2)
+        return torch.where(self._closes(x, moved).unsqueeze(-2), 0.0, moved)
 
     def check_start(self, x: Tensor) -> None:
         below = ((self.gap(x) <= 0).any(-2) & ~self.scene.model.pinned).nonzero()

@@ -15,6 +15,7 @@ from .layout import dot
 from .scene import Scene
 
 ITERATIONS, HALVINGS = 8, 30
+ETA = 0.9  # largest fraction of the way to where a barrier begins that a start may close
 LEAST_SHARE = 0.1  # of its gap that a vertex keeps in one step
 DAMPING = 1e-9  # of the inertia
 ARRIVED = 1e-24  # squared step over squared radius of gyration at which the steps end
@@ -58,6 +59,29 @@ class Correction:
             x = self._corrected(body, x, y, x_prev)
         return x
 
+    def coasted(self, x: Tensor, goal: Tensor) -> Tensor:
+        """The vertices of one body on the way from x to goal [..., 3, n], as far as all of them may go together."""
+        step = goal - x
+        share, good = torch.ones_like(x[..., :1, :1]), torch.ones_like(x[..., :1, :1], dtype=torch.bool)
+        floors = [e for e in self.energies if hasattr(e, "gap")]
+        slack = 8 * torch.finfo(x.dtype).eps * step.detach().norm(dim=-2).unsqueeze(-2)
+        for energy in floors:
+            room = ETA * (energy.gap(x) - energy.dhat).clamp(min=0)  # [..., planes, n]
+            closing = -dot(energy.normal, step.unsqueeze(-3))
+            bites = closing.detach() > room.detach() + slack
+            part = torch.where(bites, room / torch.where(bites, closing, 1.0), 1.0)
+            share = torch.minimum(share, part.amin(-2).amin(-1, keepdim=True).unsqueeze(-1))
+        for energy in floors:
+            moved = (x + share * step).detach()
+            good = good & self._clear(energy, moved).all((-2, -1))[..., None, None]
+        return x + torch.where(good, share, 0.0) * step
+
+    @staticmethod
+    def _clear(energy: Any, x: Tensor) -> Tensor:
+        """Where a gap is more than rounding, [..., planes, n]."""
+        size = (energy.normal * x.unsqueeze(-3)).abs().sum(-2) + energy.height.abs()
+        return energy.gap(x) > GUARD * torch.finfo(x.dtype).eps * size
+
     def _load(self, state: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient [..., 3, V] and block [..., V, 3, 3] of the vertex energies."""
         total = torch.zeros_like(state).repeat_interleave(3, -2)  # [..., 9, V]
@@ -76,12 +100,8 @@ class Correction:
         for energy in self.energies:
             if hasattr(energy, "gap"):
                 x = state[..., body]
-                size = (energy.normal * x.unsqueeze(-3)).abs().sum(-2) + energy.height.abs()
-                gap = energy.gap(x)
-                good = (gap > GUARD * torch.finfo(x.dtype).eps * size) & (
-                    gap >= LEAST_SHARE * energy.gap(before[..., body])
-                )
-                out = out & good.all((-2, -1))
+                kept = energy.gap(x) >= LEAST_SHARE * energy.gap(before[..., body])
+                out = out & (self._clear(energy, x) & kept).all((-2, -1))
         return out
 
     def _corrected(self, body: Tensor, x: Tensor, y: Tensor, x_prev: Tensor) -> Tensor:

@@ -123,7 +123,10 @@ def stepper(
         wanted = coasting if model.start == "inertia" else y
         for body in correct.bodies:
             wanted = put(wanted, body, take(coasting, body))
-        state = correct(_start(scene, energies, x_prev, wanted), y, x_prev)
+        begun = _start(scene, energies, x_prev, wanted)
+        for body in correct.bodies:
+            begun = put(begun, body, correct.coasted(take(x_prev, body), take(coasting, body)))
+        state = correct(begun, y, x_prev)
         if sweeps and correct.bodies and model.relaxation > 1:
             state = run_sweeps(scene, energies, masses, y, state, x_prev, sweeps - 1)
             state = run_sweeps(scene, energies, masses, y, state, x_prev, 1, relaxation=1.0)
@@ -160,10 +163,18 @@ def check_start(energies: list[Any], x: Tensor) -> None:
 
 
 def _start(scene: Scene, energies: list[Any], x: Tensor, y: Tensor) -> Tensor:
-    """Start of the sweep: y, or with filters as far from x towards y as they allow."""
-    if not any(hasattr(energy, "limit") for energy in energies):
+    """Start of the sweep: y, or with filters what they leave of the way from x to y."""
+    if not any(hasattr(energy, "start") for energy in energies):
         return y
-    return torch.where(scene.model.pinned, y, x + filtered(energies, x, y - x))
+    return torch.where(scene.model.pinned, y, x + started(energies, x, y - x))
+
+
+def started(energies: list[Any], x: Tensor, step: Tensor) -> Tensor:
+    """What the start of a step may take of a step [..., 3, n] from x [..., 3, n]."""
+    for energy in energies:
+        if hasattr(energy, "start"):
+            step = energy.start(x, step)
+    return step
 
 
 def filtered(energies: list[Any], x: Tensor, step: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch.autograd import Function
 
 from .. import ops
 from ..checks import check_count, fail
-from ..debug import checking
+from ..scopes import Scope, checking
 
 Rows = Tensor | slice | None
 Tensors = tuple[Tensor, ...]
@@ -354,13 +354,14 @@ class _Sweeps(Function):
             _write(update, state, new)
         # All of it through autograd, which then sees whether a parameter was changed in place before the backward.
         ctx.save_for_backward(*state, *parameters, *tape)
-        ctx.updates, ctx.count, ctx.given = updates, count, len(parameters)
+        ctx.updates, ctx.count, ctx.given, ctx.scope = updates, count, len(parameters), Scope()
         return tuple(state)
 
     @staticmethod
     def backward(ctx: Any, *state_bar: Tensor) -> tuple:
         # A Function of its own, so that a second derivative raises; made of torch operations it would be a silent zero.
-        bars = _ReversedSweeps.apply(ctx.updates, ctx.count, ctx.given, *state_bar, *ctx.saved_tensors)
+        with ctx.scope.resumed():
+            bars = _ReversedSweeps.apply(ctx.updates, ctx.count, ctx.given, *state_bar, *ctx.saved_tensors)
         needs = ctx.needs_input_grad[3:]
         return (None, None, None, *(bar if need else None for bar, need in zip(bars, needs, strict=True)))
 

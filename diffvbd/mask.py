@@ -1,0 +1,10 @@
+"""Bits of a scene's mask of energies; twins of those in csrc/energies/energies.h.
+
+The elastic block, contact, then the energies of single vertices in the order of their list: a new one moves no bit.
+"""
+
+EXACT_BLOCK, PAPER_BLOCK = 1, 2  # of the elastic block
+CONTACT = 4
+FIRST_VERTEX_BIT = 3  # shift of the first energy of energies.VERTEX_ENERGIES
+# Contact and the one energy with a step filter, FloorBarrier: their gaps must come back to the bit.
+KEEPS_POSITIONS = CONTACT | 1 << FIRST_VERTEX_BIT

@@ -1,0 +1,86 @@
+"""What holds inside a ``with``, for the thread or task that is in it: debug_checks() and contact.record().
+
+Each is a context variable. A compiled step cannot read one; it reads a plain global beside it, which torch.compile
+guards, and so sees what any thread is inside of.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from contextvars import ContextVar
+from typing import Any
+
+import torch
+
+_checking: ContextVar[bool] = ContextVar("diffvbd.debug_checks", default=False)
+_recording: ContextVar[tuple[list[Any], ...]] = ContextVar("diffvbd.contact.record", default=())
+_lock = threading.Lock()
+_checked_by = 0  # threads and tasks inside debug_checks()
+_any_checking = False
+_recorders: tuple[list[Any], ...] = ()  # of all threads and tasks
+
+
+def checking() -> bool:
+    """Whether debug_checks() is on."""
+    return _any_checking if torch.compiler.is_compiling() else _checking.get()
+
+
+def recorders() -> tuple[list[Any], ...]:
+    """The lists that contact.record() has given."""
+    return _recorders if torch.compiler.is_compiling() else _recording.get()
+
+
+def _count(change: int) -> None:
+    global _checked_by, _any_checking
+    with _lock:
+        _checked_by += change
+        _any_checking = _checked_by > 0
+
+
+@contextlib.contextmanager
+def checks(enabled: bool) -> Iterator[None]:
+    """Inside, checking() is ``enabled``."""
+    change = int(enabled) - int(_checking.get())
+    token = _checking.set(enabled)
+    _count(change)
+    try:
+        yield
+    finally:
+        _count(-change)
+        _checking.reset(token)
+
+
+@contextlib.contextmanager
+def record_to(found: list[Any]) -> Iterator[None]:
+    """Inside, recorders() has ``found``."""
+    global _recorders
+    token = _recording.set((*_recording.get(), found))
+    with _lock:
+        _recorders = (*_recorders, found)
+    try:
+        yield
+    finally:
+        with _lock:
+            _recorders = tuple(r for r in _recorders if r is not found)
+        _recording.reset(token)
+
+
+class Scope:
+    """What the code that makes one is inside of. A backward may run in another thread, as torch's own on CUDA does;
+    inside ``resumed()`` what held in the forward holds there, too."""
+
+    def __init__(self) -> None:
+        self.checking, self.recorders = checking(), recorders()
+
+    @contextlib.contextmanager
+    def resumed(self) -> Iterator[None]:
+        known = _recording.get()
+        more = tuple(r for r in self.recorders if all(r is not k for k in known))
+        checked, recording = _checking.set(_checking.get() or self.checking), _recording.set((*known, *more))
+        try:
+            yield
+        finally:
+            _recording.reset(recording)
+            _checking.reset(checked)

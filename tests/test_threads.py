@@ -1,0 +1,142 @@
+"""Claim: debug_checks() and contact.record() hold for the thread or task that is inside, and for its backward."""
+
+import asyncio
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import scopes
+
+OPTIONS: dict[str, Any] = {"mu": 1e4, "lam": 2e4, "time_step": 0.01, "sweeps": 2}
+
+
+def overflowing(run: Callable[..., Any] = dv.step) -> None:
+    """A step in which positions cease to be finite: an error inside debug_checks(), none outside."""
+    model = dv.Model(dv.mesh.cube(2))
+    run(model, model.rest_points, 1e200 * model.rest_points, **OPTIONS)
+
+
+def touching() -> tuple[dv.Model, Tensor]:
+    mesh = dv.mesh.join([dv.mesh.cube(2, size=0.2), dv.mesh.cube(2, size=0.2).translate((0.0, 0.21, 0.0))])
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier()))
+    return model, model.rest_points
+
+
+def in_thread(run: Callable[[], Any]) -> list[BaseException]:
+    """What a run in another thread raises."""
+    raised: list[BaseException] = []
+
+    def caught() -> None:
+        try:
+            run()
+        except BaseException as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=caught)
+    thread.start()
+    thread.join()
+    return raised
+
+
+def test_another_thread_is_not_checked() -> None:
+    with dv.debug_checks():
+        assert not in_thread(overflowing)
+        with pytest.raises(RuntimeError, match="step 0, sweep"):
+            overflowing()
+        with dv.debug_checks(False):
+            overflowing()
+    overflowing()
+
+
+def test_checks_of_another_thread_do_not_reach_here() -> None:
+    inside, done = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        with dv.debug_checks():
+            inside.set()
+            done.wait(60)
+            overflowing()
+
+    raised: list[BaseException] = []
+    thread = threading.Thread(target=lambda: raised.extend(in_thread(hold)))
+    thread.start()
+    assert inside.wait(60)
+    overflowing()
+    done.set()
+    thread.join()
+    assert len(raised) == 1 and "step 0, sweep" in str(raised[0])
+
+
+def test_another_thread_is_not_recorded() -> None:
+    model, x = touching()
+    with dv.contact.record() as mine:
+        assert not in_thread(lambda: dv.step(model, x, torch.zeros_like(x), **OPTIONS))
+        assert mine == []
+        with dv.contact.record() as inner:
+            dv.step(model, x, torch.zeros_like(x), **OPTIONS)
+        dv.step(model, x, torch.zeros_like(x), **OPTIONS)
+    dv.step(model, x, torch.zeros_like(x), **OPTIONS)
+    assert (len(mine), len(inner)) == (4, 2)
+
+
+def test_tasks_are_apart() -> None:
+    async def one(checked: bool, turn: Any) -> bool:
+        with dv.debug_checks(checked):
+            await turn.wait()
+            try:
+                overflowing()
+            except RuntimeError:
+                return True
+            finally:
+                await turn.wait()
+            return False
+
+    class Turn:
+        """Both tasks are inside before one goes on."""
+
+        def __init__(self) -> None:
+            self.arrived, self.open = 0, asyncio.Event()
+
+        async def wait(self) -> None:
+            self.arrived += 1
+            if self.arrived >= 2:
+                self.open.set()
+            await self.open.wait()
+
+    async def both() -> list[bool]:
+        turn = Turn()
+        return list(await asyncio.gather(one(True, turn), one(False, turn)))
+
+    assert asyncio.run(both()) == [True, False]
+
+
+def test_a_checkpointed_backward_in_another_thread_is_recorded() -> None:
+    """As torch does it on CUDA, whose backward has threads of its own."""
+    model, x = touching()
+    v = torch.zeros_like(x, requires_grad=True)
+    with dv.contact.record() as found:
+        end = dv.rollout(model, x, v, steps=4, checkpoint_every=2, save="last", **OPTIONS)
+        assert len(found) == 8
+        assert not in_thread(end.x[-1].sum().backward)
+    assert len(found) == 16 and v.grad is not None and v.grad.abs().max() > 0
+
+
+def test_a_compiled_step_sees_the_switch() -> None:
+    torch.compiler.reset()
+
+    def run(x: Tensor) -> Tensor:
+        return x + 1 if scopes.checking() else 2 * x
+
+    compiled, x = torch.compile(run, fullgraph=True, backend="eager"), torch.full((), 3.0)
+    for _ in range(2):
+        assert compiled(x) == 6
+        with dv.debug_checks():
+            assert compiled(x) == 4
+            with dv.debug_checks(False):
+                assert compiled(x) == 6
+            assert compiled(x) == 4
