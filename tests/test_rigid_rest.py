@@ -74,7 +74,7 @@ def test_a_body_rests(device: str, relaxation: float, sweeps: int) -> None:
         assert model.corrects
         n = torch.tensor(NORMALS[normal], dtype=torch.float64, device=device)
         x = model.rest_points.expand(3, -1, -1).clone()
-        x, v, lowest = run(model, x, torch.zeros_like(x), 400, sweeps, tuple((-9.81 * n).tolist()), mu)
+        x, v, lowest = run(model, x, torch.zeros_like(x), 500, sweeps, tuple((-9.81 * n).tolist()), mu)
         assert lowest >= 0.1 * least
         assert float(v.norm(dim=-1).max()) <= tolerance("rest_speed")
         moved = (x - model.rest_points).mean(-2)
@@ -113,9 +113,9 @@ def energy(model: dv.Model, x: torch.Tensor, v: torch.Tensor, mu: float) -> torc
     return kinetic + 9.81 * (model.mass * x[..., 1]).sum(-1) + elastic + barrier
 
 
-@pytest.mark.parametrize(("sweeps", "relaxation"), ((0, 1.0), (1, 1.0), (2, 1.6), (5, 1.0), (5, 1.6)))
+@pytest.mark.parametrize(("sweeps", "relaxation"), ((1, 0.5), (1, 1.0), (1, 1.6), (2, 1.6), (5, 1.0)))
 def test_no_drop_gains_energy(device: str, sweeps: int, relaxation: float) -> None:
-    """A hundred drops, tilted and spinning, at 0 to 5 m/s: no step ends with more energy than the run began with."""
+    """A hundred drops, tilted and spinning, at 0 to 5 m/s (without a sweep nothing holds a spinning body together): no step ends with more energy than the run began with."""
     model = resting(device, lift=0.25, relaxation=relaxation)
     generator = torch.Generator().manual_seed(5)
     center = model.rest_points.mean(0)
