@@ -102,10 +102,12 @@ def predict(
     policy = adjoint.policy(scalars, item, model.energy_mask)
     tape_bytes = scalars * ops.tape_rows(policy, model.energy_mask) * item
     state = scenes * model.num_vertices * 3 * item
-    # y and x of each step; a floor adds the filtered start, the wanted step and the filter's own intermediates
+    # y and x of each step; a floor adds what safeguards.filter_against_planes keeps, in rounds where planes are several
     per_step = 2 * state + tape_bytes
     if model.floor is not None:
-        per_step += 2 * state + scenes * model.num_vertices * model.floor.planes * (4 * item + 2)
+        planes = model.floor.planes
+        several = item + 10 + min(planes, 3) * (6 * item + 8) + planes * (5 * item + 1)
+        per_step += scenes * model.num_vertices * (3 * item + 2 if planes == 1 else several)
     if save in ("all", "last"):
         frames = steps + 1 if save == "all" else 1
     else:

@@ -14,10 +14,14 @@ from diffvbd.testing import tolerance
 SWEEPS = 20
 
 
-def beam_model(floor: bool = False, dtype: torch.dtype = torch.float64) -> dv.Model:
+def beam_model(floor: bool = False, dtype: torch.dtype = torch.float64, planes: int = 1) -> dv.Model:
     """The 1,029-vertex beam: large enough that bookkeeping of a few kB per step does not decide."""
     mesh = dv.mesh.beam()
-    energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-1.0)) if floor else (dv.StableNeoHookean(),)
+    energies = (
+        (dv.StableNeoHookean(), dv.FloorBarrier([-1.0, -1.1, -1.2, -1.3, -1.4][:planes]))
+        if floor
+        else (dv.StableNeoHookean(),)
+    )
     return dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, energies=energies, dtype=dtype)
 
 
@@ -84,6 +88,15 @@ def test_bytes_of_one_step(tape: str, floor: bool, scenes: int, wanted: str) -> 
         assert measured >= predicted["tape"]
         return
     assert_near(predicted["step"] + (graph if wanted == "rest_points" else 0), measured)
+
+
+@pytest.mark.parametrize("planes", [1, 2, 3, 5])
+def test_bytes_of_a_start_above_planes(planes: int) -> None:
+    model = beam_model(True, planes=planes)
+    v = torch.zeros_like(model.rest_points, requires_grad=True)
+    options = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": SWEEPS, "adjoint": dv.ReverseSweep("recompute")}
+    measured = saved_bytes(lambda: dv.step(model, model.rest_points, v, **options), [v, *own_tensors(model)])
+    assert_near(model.memory(sweeps=SWEEPS, tape="recompute")["step"], measured)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
