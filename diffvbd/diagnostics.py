@@ -14,7 +14,8 @@ from torch.linalg import cross
 from . import reference
 from .arguments import GRAVITY, check_state
 from .checks import check_positive, fail
-from .model import HEAVY_REGULARIZATION, STABLE_RELAXATION, Model
+from .model import Model
+from .model_warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
 
 # Limits with their measurements in docs/numerics.md
 SATURATION_TOO_LARGE = 1.0  # c over the mean edge: one update may then turn a tet inside out

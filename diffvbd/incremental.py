@@ -50,7 +50,7 @@ class IncrementalPotential:
         self.origin = tensors.origin if tensors.origin.numel() else None
         rest = tensors.rest
         self.rest = model.derived("rest", lambda: _metric(model)) if rest is None else rest  # [1 | B, T, 7]
-        self.free = (~model.pinned)[:, None].to(x.dtype)
+        self.free = (~model._pinned)[:, None].to(x.dtype)
 
         k = dict(zip(PAIRS, self.rest[..., :6].unbind(-1), strict=True))
         k |= {(b, a): value for (a, b), value in k.items()}

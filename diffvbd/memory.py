@@ -57,7 +57,7 @@ def _cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = 
     if reverse:
         one += 4 * (edge_slots * lanes + 1) + 8 * positions
         one += (2 * pairs if material or rest else 0) + (4 * pairs if rest else 0)
-    one *= model.mass.element_size()
+    one *= model._mass.element_size()
     return one * min(scenes, max(1, WORKSPACE_BUDGET // max(1, one)))
 
 
@@ -94,7 +94,7 @@ def predict(
             scratch: of one backward step, in scenes that run side by side on as many threads;
             total: kept + scratch.
     """
-    item = model.mass.element_size()
+    item = model._mass.element_size()
     steps, scenes = check_count("steps", steps), check_count("scenes", scenes)
     schedule, adjoint = choose_schedule(checkpoint_every, ReverseSweep(tape), model, scenes, steps, sweeps)  # type: ignore[arg-type]
     assert isinstance(adjoint, ReverseSweep)
@@ -151,4 +151,4 @@ def _cpu_scratch(model: Model, scenes: int, material: bool, rest: bool) -> int:
     work = blocks * (22 if model.floor else 16) + 4 * edge_slots
     work += slots * ((2 if material or rest else 0) + (4 if rest else 0))
     threads = torch.get_num_threads()
-    return work * (threads if scenes >= threads else 1) * model.mass.element_size()
+    return work * (threads if scenes >= threads else 1) * model._mass.element_size()

@@ -131,7 +131,7 @@ def solve(
 
     if isinstance(adjoint, GlobalAdjoint):
         # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph
-        begun = begun._replace(x_start=torch.where(model.pinned[:, None], begun.x_start, end))
+        begun = begun._replace(x_start=torch.where(model._pinned[:, None], begun.x_start, end))
         x_end, v_end = begun.finish(global_sweep(model, begun.tensors(prepared), settings, adjoint), time_step)
     else:
         again = prepare(model, lead, sweeps=count, adjoint=adjoint, **options)

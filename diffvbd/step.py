@@ -141,7 +141,7 @@ def begin(
     if force is not None:
         total = ops.broadcast(broadcastable("force", force, x), shape).reshape(flat)
         # A pinned vertex is moved by no force, whatever stands there.
-        total = torch.where(model.pinned[:, None], torch.zeros_like(total), total)
+        total = torch.where(model._pinned[:, None], torch.zeros_like(total), total)
         weight = ops.broadcast(prepared.mass, (flat[0], flat[1]))[..., None]
         # A vertex without mass is isolated and pinned: no force moves it.
         acceleration = acceleration + total / torch.where(weight > 0, weight, torch.ones_like(weight))
@@ -155,13 +155,13 @@ def begin(
     if prescribed is not None:
         held = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
         held = held if origin is None else held - origin
-    y = torch.where(model.pinned[:, None], held, y)
+    y = torch.where(model._pinned[:, None], held, y)
     data = _energy_data(model, prepared, origin)
     x_start = y
     if model.floor is not None and model.contact is None:  # with pairs the state moves to y in parts
         count = model.floor.count()
         filtered = model.floor.filter(start, y - start, data[:, :count], origin)
-        x_start = torch.where(model.pinned[:, None], y, filtered)
+        x_start = torch.where(model._pinned[:, None], y, filtered)
     return Begun(x_start, start, y, data, origin)
 
 

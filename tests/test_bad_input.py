@@ -107,6 +107,10 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
     ("floor_barrier.kappa", None, "None"),
     ("parameters", [("floor_barrier.kappa", 1.0)], "list"),
     ("adjoint", "full", "str|full"),
+    # numbers that no float holds
+    *((name, 10**400, "1329 bits") for name in ("mu", "lam", "density", "time_step", "floor_barrier.kappa")),
+    ("gravity", (0, -(10**400), 0), "1329 bits"),
+    ("sweeps", 10**400, "10000"),
     # not finite
     *((name, spoiled(bad, 3, 1), str(bad)) for name in ("x", "v", "force") for bad in (NAN, INF)),
     ("x", spoiled(NAN, 0, 0), "nan"),
@@ -135,8 +139,11 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
     ("floor_barrier.dhat", -1.0, "-1"),
     ("floor_barrier.damping", -1.0, "-1"),
     ("anchor.stiffness", -1.0, "-1"),
-    ("parameters", {"floor.kappa": 1.0}, "floor.kappa"),
-    ("parameters", {"kappa": 1.0}, "kappa"),
+    ("parameters", {"floor.kappa": 1.0}, r"'floor.kappa' \(is 'floor_barrier.kappa' meant\?\)$"),
+    ("parameters", {"friction.coefficient": 1.0}, "'friction.coefficient': the Model has no Friction among its"),
+    ("parameters", {"pair_barier.kappa": 1.0}, r"\(is 'pair_barrier.kappa' meant\?\): the Model has no PairBarrier"),
+    ("parameters", {"kappa": 1.0}, "'kappa'$"),
+    ("parameters", {3: 1.0}, "3$"),
     # rest shapes that are no shapes
     ("rest_points", torch.from_numpy(MESH.points * [-1.0, 1.0, 1.0]), r"-0\.16.* at \[0, 0\]"),
     ("rest_points", torch.from_numpy(MESH.points * [1.0, 1.0, 0.0]), r"got 0 at \[0, 0\]"),
@@ -146,6 +153,9 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
     ("time_step", -0.1, "-0.1"),
     ("time_step", NAN, "nan"),
     ("time_step", INF, "inf"),
+    ("time_step", 1e-310, "1e-310"),
+    ("time_step", 1e-160, "1e-160"),
+    ("time_step", 1e160, r"1e\+160"),
     ("time_step", True, "bool"),
     ("time_step", "fast", "str"),
     ("time_step", None, "None"),
@@ -200,6 +210,42 @@ def test_negative_lam_is_legal_where_its_block_allows_it(device: str, value_chec
 )  # fmt: skip
 def test_mismatched_batch(device: str, name: str, shape: tuple[int, ...]) -> None:
     raises(lambda: step_with(model_of(device), name, ones(*shape), lead=(2,)), name, re.escape(str(list(shape))))
+
+
+@pytest.mark.parametrize("name", ["x", "v", "force", "prescribed", "rest_points", "mu", "lam", "density"])
+def test_only_dense_tensors(device: str, name: str) -> None:
+    full = ones(8, 3) if name in ("x", "v", "force", "prescribed", "rest_points") else ones(6)
+    raises(lambda: step_with(model_of(device), name, full.to_sparse()), name, r"torch.sparse_coo: use \.to_dense")
+    for layout in (torch.strided, torch.jagged):
+        nested = torch.nested.as_nested_tensor([full, full], layout=layout)
+        raises(lambda nested=nested: step_with(model_of(device), name, nested), name, "nested")
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "hint"), [("mu", (3,), [3, 1]), ("lam", (3,), [3, 1]), ("density", (3,), [3, 1]),
+                                ("gravity", (3, 3), [3, 1, 3]), ("force", (3, 3), [3, 1, 3])],
+)  # fmt: skip
+def test_one_value_for_each_scene_gets_a_hint(device: str, name: str, shape: tuple[int, ...], hint: list[int]) -> None:
+    lead = (3,)
+    if name in ("gravity", "force"):  # 3 scenes of 3 numbers would broadcast where there are 3 vertices
+        shape, hint, lead = (5, 3), [5, 1, 3], (5,)
+    raises(lambda: step_with(model_of(device), name, ones(*shape), lead=lead), name, re.escape(f"has shape {hint}"))
+    step_with(model_of(device), name, ones(*hint), lead=lead)
+    raises(lambda: step_with(model_of(device), "mu", ones(2), lead=(3,)), "mu", r"got shape \[2\]$")
+
+
+def test_numbers_of_numpy_are_numbers(device: str) -> None:
+    expected = step_with(model_of(device), "mu", 1e4)[0]
+    for number in (np.float64(1e4), np.float32(1e4), np.int64(10_000)):
+        assert torch.equal(step_with(model_of(device), "mu", number)[0], expected)
+
+
+def test_the_smallest_time_steps_of_float32(device: str) -> None:
+    model = dv.Model(MESH, dtype=torch.float32, device=device)
+    x = model.rest_points
+    for h in (1e-20, 1e20, 1e-40):
+        raises(lambda h=h: dv.step(model, x, 0 * x, **(STEP | {"time_step": h})), "time_step", re.escape(f"{h}"))
+    assert torch.isfinite(dv.step(model, x, 0 * x, **(STEP | {"time_step": 1e-18}))[0]).all()
 
 
 def test_a_value_check_names_the_scene(device: str, value_checks: None) -> None:
@@ -258,6 +304,15 @@ MODELS: list[tuple[str, dict[str, Any], str]] = [
     ("pinned", {"pinned": [0.5]}, "float"),
     ("pinned", {"pinned": torch.zeros(7, dtype=torch.bool)}, r"\[7\]"),
     ("pinned", {"pinned": "left"}, "str|left"),
+    ("pinned", {"pinned": torch.ones(8, dtype=torch.uint8)}, r"uint8.* use \.bool\(\) for a mask, \.long\(\) for"),
+    ("pinned", {"pinned": np.ones(8, dtype=np.uint8)}, "uint8"),
+    ("pinned", {"pinned": torch.ones(8, dtype=torch.bool, device="meta")}, "meta"),
+    ("pinned", {"pinned": torch.ones(8).bool().to_sparse()}, "sparse"),
+    ("pinned", {"pinned": torch.ones(8, dtype=torch.complex64)}, "complex64"),
+    ("pinned", {"pinned": [10**400]}, "list"),
+    ("density", {"density": torch.ones(6, device="meta")}, "meta"),
+    ("density", {"density": torch.ones(6).to_sparse()}, "sparse"),
+    *((name, {name: 10**400}, "1329 bits") for name in ("density", "saturation", "regularization", "relaxation")),
     ("saturation", {"saturation": 0.0}, "0"),
     ("saturation", {"saturation": -0.1}, "-0.1"),
     ("saturation", {"saturation": NAN}, "nan"),
@@ -307,6 +362,13 @@ ENERGIES: list[tuple[str, Callable[[], Any], str]] = [
     ("points", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, points=spoiled(NAN, 2, 2)),)), "nan"),
     ("vertices", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, vertices=[9]),)), "9"),
     ("vertices", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, vertices=[0.5]),)), "float"),
+    ("vertices", lambda: dv.Anchor(1.0, vertices=torch.ones(8, dtype=torch.uint8)), r"uint8.*\.bool\(\)"),
+    ("vertices", lambda: dv.Anchor(1.0, vertices=torch.ones(8, dtype=torch.bool, device="meta")), "meta"),
+    ("stiffness", lambda: dv.Anchor(ones(8).to("meta")), "meta"),
+    ("points", lambda: dv.Anchor(1.0, points=ones(8, 3).to_sparse()), "sparse"),
+    *((n, lambda n=n: dv.FloorBarrier(**{n: 10**400}), "float|bits") for n in ("kappa", "dhat", "damping", "height")),
+    *((n, lambda n=n: dv.PairBarrier(**{n: 10**400}), "bits") for n in ("kappa", "dhat", "damping", "reach", "gamma")),
+    *((n, lambda n=n: dv.Friction(**{n: 10**400}), "bits") for n in ("coefficient", "velocity")),
     ("vertices", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, vertices=torch.zeros(7, dtype=torch.bool)),)), "7"),
     ("tape", lambda: dv.ReverseSweep("half"), "half"),
     ("dtype", lambda: dv.Model(MESH).to(dtype=torch.int64), "int64"),

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .. import ops
 from ..arguments import GRAVITY, acceleration_of, name_value
-from ..checks import check_broadcast, check_positive, check_tensor, fail, vertex_mask
+from ..checks import check_broadcast, check_positive, check_tensor, check_time_step, fail, vertex_mask
 from ..mesh import TetMesh
 from ..model import _checked_device
 
@@ -85,7 +85,7 @@ class ParticleSolver:
                 fail(name, f"shape [..., {self.num_points}, 3]", f"shape {list(value.shape)}")
         if v.shape != x.shape:
             fail("v", f"x's shape {list(x.shape)}", f"shape {list(v.shape)}")
-        h, pinned = checked_time_step(time_step, self.mass.dtype), self.pinned[:, None]
+        h, pinned = check_time_step(time_step, self.mass.dtype), self.pinned[:, None]
         masses = self.mass if mass is None else self.per("mass", mass, x, self.num_points)
         if mass is not None and not masses.is_cuda:  # on CUDA a look would wait for the device
             self._check_mass(masses.detach())
@@ -133,16 +133,6 @@ def checked_device(device: Any) -> torch.device:
     except (RuntimeError, TypeError):
         fail("device", '"cpu" or "cuda"', repr(device))
     return _checked_device(device)
-
-
-def checked_time_step(time_step: Any, dtype: torch.dtype) -> float:
-    """h [s] > 0, with an h^2 that dtype can hold."""
-    if isinstance(time_step, Tensor) and time_step.requires_grad:
-        raise TypeError("time_step: expected a number, got a tensor that requires grad: it is not differentiable")
-    h, limits = check_positive("time_step", time_step, "s"), torch.finfo(dtype)
-    if not limits.tiny <= h * h <= limits.max:
-        fail("time_step", f"a number of seconds whose square lies between {limits.tiny:.1e} and {limits.max:.1e}", h)
-    return h
 
 
 def all_finite(value: Tensor) -> bool:
@@ -212,7 +202,6 @@ __all__ = [
     "check_finite",
     "checked_edges",
     "checked_mesh",
-    "checked_time_step",
     "mesh_edges",
     "mesh_mass",
     "numbers",

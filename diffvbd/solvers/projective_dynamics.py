@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, NoReturn
 import torch
 from torch import Tensor
 
-from ..checks import fail
+from ..checks import check_time_step, fail
 from ..mesh import TetMesh
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
 from .particles import (
@@ -18,7 +18,6 @@ from .particles import (
     all_finite,
     checked_edges,
     checked_mesh,
-    checked_time_step,
     mesh_edges,
     mesh_mass,
 )
@@ -253,7 +252,7 @@ class ProjectiveDynamics(ParticleSolver):
                 rounding of h^2 times stiffness.
             TypeError: An argument is no number, or a tensor of another dtype than the solver's.
         """
-        h = checked_time_step(time_step, self.mass.dtype)
+        h = check_time_step(time_step, self.mass.dtype)
         given = (("stiffness", stiffness, self.edges.shape[0], ">= 0"),
                  ("tet_stiffness", tet_stiffness, self.tets.nodes.shape[0], ">= 0"),
                  ("mass", self.mass if mass is None else mass, self.num_points, ""))  # fmt: skip

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from ..arguments import name_value
-from ..checks import check_broadcast, check_tensor, fail
+from ..checks import check_broadcast, check_tensor, check_time_step, fail
 from ..energies import StableNeoHookean
 from ..metric import rest_metric
 from ..model import Model
 from ..safeguards import SATURATION_EPS
 from .compose import Bars, BlockUpdate, Solver, Tensors, _tensors
-from .particles import check_finite, checked_time_step
+from .particles import check_finite
 from .sums import FixedSum, placed
 
 # (j, k, l) such that (j, i, k, l) is an even permutation of the corners, for i = 0, 1, 2, 3
@@ -71,7 +71,7 @@ class VertexBlock(BlockUpdate):
 
     def __init__(self, model: Model, time_step: float, vertices: Tensor) -> None:
         energy = elastic_energy(model)
-        self.rows, self.factor = (vertices,), checked_time_step(time_step, model.mass.dtype) ** 2
+        self.rows, self.factor = (vertices,), check_time_step(time_step, model.mass.dtype) ** 2
         self.exact = energy.block == "exact"
         self.relaxation, self.saturation = model.relaxation, model.saturation
         self.regularization = model.regularization
@@ -228,7 +228,7 @@ def vertex_block_descent(model: Model, time_step: float, update: type[VertexBloc
             finite, mu < 0, mu + lam < 0, or a mass that is not > 0 where the Model is not pinned.
     """
     elastic_energy(model)
-    time_step = checked_time_step(time_step, model.mass.dtype)
+    time_step = check_time_step(time_step, model.mass.dtype)
     bounds = model.color_ptr.tolist()
     colors = (model.color_vertices[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True))
     return _ColorSolver(model, (update(model, time_step, vertices) for vertices in colors))

@@ -1,0 +1,70 @@
+"""What a Model warns of: sizes and safeguards outside the range in which they make sense (docs/numerics.md)."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .energies import StableNeoHookean
+from .mesh import TetMesh
+
+if TYPE_CHECKING:
+    from .model import Model
+
+STABLE_RELAXATION = 1.7  # largest omega that never grew in the rollouts of docs/numerics.md
+HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
+LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
+
+
+def warn_of(model: Model) -> None:
+    """Warns (UserWarning) of what is legal and seldom meant."""
+    _warn_of_size(model.mesh)
+    if not any(isinstance(e, StableNeoHookean) for e in model.energies) and model.mesh.num_tets:
+        _warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
+    if model.relaxation > STABLE_RELAXATION:
+        _warn(f"relaxation: rollouts were seen to gain energy above {STABLE_RELAXATION}, got {model.relaxation:g}")
+    if model.relaxation > 1 and model.friction is not None:
+        _warn(
+            f"relaxation: {model.relaxation:g} with Friction: above 1 gradients were seen to grow by ten decades while "
+            "vertices stick; take relaxation=1 and more sweeps where gradients matter"
+        )
+    paper = any(isinstance(e, StableNeoHookean) and e.block == "paper" for e in model.energies)
+    if paper and model.relaxation > 1 and model.saturation is None:
+        _warn('relaxation: block="paper" with relaxation > 1 and no saturation may diverge')
+    active = model._mass[~model._pinned]
+    if active.numel() and model.regularization > HEAVY_REGULARIZATION * float(active.min()):
+        _warn(
+            f"regularization: {model.regularization:g} kg is {model.regularization / float(active.min()):.2g} of the "
+            "lightest vertex; the sweeps converge that much more slowly"
+        )
+
+
+def _warn_of_size(mesh: TetMesh) -> None:
+    size = _largest_body(mesh)
+    if size > LARGE_BODY:
+        _warn(f"mesh: a body is {size:.4g} m long; points are in metres: a mesh in mm needs mesh.transform(1e-3 * I)")
+    if 0 < size < SMALL_BODY:
+        _warn(f"mesh: the largest body is {size:.2g} m long; points are in metres: is it in other units?")
+
+
+def _largest_body(mesh: TetMesh) -> float:
+    """Longest side of the bounding box of a body [m]."""
+    if not mesh.num_tets:
+        return 0.0
+    total = float(np.ptp(mesh.points, axis=0).max())
+    if total < SMALL_BODY:
+        return total
+    # a tet is never longer than its body, and most bodies are neither large nor small: no need to know them exactly
+    if total <= LARGE_BODY and float(np.ptp(mesh.points[mesh.tets[:100]], axis=1).max()) >= SMALL_BODY:
+        return total
+    order = np.argsort(mesh.body, kind="stable")
+    first = np.unique(mesh.body[order], return_index=True)[1]
+    points = mesh.points[order]
+    high, low = np.maximum.reduceat(points, first), np.minimum.reduceat(points, first)
+    return float((high - low).max())
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, UserWarning, stacklevel=5)  # _warn, warn_of, Model.__init__, its decorator, the caller
