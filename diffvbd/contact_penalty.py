@@ -11,6 +11,7 @@ from torch.nn.functional import pad, softplus
 
 from . import ops
 from .checks import check_count, check_positive, check_tensor, fail
+from .lasting import lasting_tensors
 from .model import Model
 from .ops_neighbors import neighbor_pairs, unread
 
@@ -59,6 +60,7 @@ class Bodies:
         TypeError, ValueError: Wrong dtypes or shapes, masses that are negative or not finite, a body without mass.
     """
 
+    @lasting_tensors()
     def __init__(self, body: Tensor, mass: Tensor) -> None:
         if not isinstance(mass, Tensor) or mass.dtype not in (torch.float64, torch.float32):
             raise TypeError(f"mass: expected a float64 or float32 tensor, got {_kind(mass)}")

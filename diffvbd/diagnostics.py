@@ -125,7 +125,7 @@ def diagnose(
     f = (edges[..., :, :, None] * gradients[:, 1:, None, :]).sum(-3)  # F_ij = sum_a e_ai (grad N_a)_j
     norm = f.square().sum((-2, -1)).sqrt()
     det = (cross(f[..., 0, :], f[..., 1, :]) * f[..., 2, :]).sum(-1)
-    green = 0.5 * ((f[..., :, :, None] * f[..., :, None, :]).sum(-3) - torch.eye(3).to(f))
+    green = 0.5 * ((f[..., :, :, None] * f[..., :, None, :]).sum(-3) - torch.eye(3, dtype=f.dtype, device=f.device))
     critical = collapse_stretch(mu, lam)
     margin = norm / (3**0.5 * critical)
     edge = _edge_lengths(points, model.tets)

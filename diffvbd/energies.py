@@ -234,7 +234,7 @@ class Anchor(VertexEnergy):
         if self.vertices is not None:
             object.__setattr__(self, "vertices", mask_or_indices("vertices", self.vertices))
         object.__setattr__(self, "stiffness", _numbers("stiffness", self.stiffness))
-        if bool((torch.as_tensor(self.stiffness) < 0).any()):
+        if bool((self._spring < 0).any()):
             fail("stiffness", "numbers >= 0 N/m", self.stiffness)
         if self.points is not None:
             object.__setattr__(self, "points", _numbers("points", self.points))
@@ -249,11 +249,17 @@ class Anchor(VertexEnergy):
             shown.append(f"{name}={value}")
         return f"Anchor({', '.join(shown)})"
 
+    @property
+    def _spring(self) -> Tensor:
+        """stiffness, which is a tensor since it was checked."""
+        assert isinstance(self.stiffness, Tensor)
+        return self.stiffness
+
     def count(self) -> int:
         return 4
 
     def check(self, num_vertices: int) -> None:
-        stiffness = torch.as_tensor(self.stiffness)
+        stiffness = self._spring
         if stiffness.dim() > 0 and stiffness.shape != (num_vertices,):
             fail("stiffness", f"a number or shape [{num_vertices}]", f"shape {list(stiffness.shape)}")
         if self.points is not None and self.points.shape != (num_vertices, 3):
@@ -274,7 +280,7 @@ class Anchor(VertexEnergy):
     def constants(self, rest_points: Tensor) -> dict[str, Tensor]:
         points = rest_points if self.points is None else self.points.to(rest_points)
         mask = self._mask(rest_points.shape[0]).to(rest_points)
-        return {"stiffness": torch.as_tensor(self.stiffness).to(rest_points).expand(len(mask)) * mask, "points": points}
+        return {"stiffness": self._spring.to(rest_points).expand(len(mask)) * mask, "points": points}
 
     def pack(self, values: dict[str, Tensor], origin: Tensor | None) -> Tensor:
         points = values["points"] if origin is None else values["points"] - origin

@@ -14,7 +14,7 @@ from .checks import check_number, check_positive, check_readable, fail, to_float
 from .colliders import Collider
 from .contact_surface import ContactSurface, build_surface, check_colliders
 from .energies import VERTEX_ENERGIES, FloorBarrier, StableNeoHookean, VertexEnergy
-from .lasting import lasting_tensors
+from .lasting import lasting, lasting_tensors
 from .mesh import TetMesh
 from .metric import lumped_mass, rest_metric
 from .model_warnings import warn_of
@@ -270,7 +270,7 @@ class Model:
     @lasting_tensors()
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Unpickles, also where torch.load(map_location=...) has moved the tensors to another device."""
-        self.__dict__.update(state)
+        self.__dict__.update(lasting(state))
         self._derived = {}
         actual = _checked_device(self._mass.device)
         if actual != self.device:

@@ -12,6 +12,7 @@ from torch import Tensor
 from .. import ops
 from ..arguments import GRAVITY, acceleration_of, name_value
 from ..checks import check_broadcast, check_positive, check_tensor, check_time_step, fail, vertex_mask
+from ..lasting import lasting_tensors
 from ..mesh import TetMesh
 from ..model import _checked_device
 
@@ -34,6 +35,7 @@ class ParticleSolver:
         ValueError, TypeError: naming the argument, what was expected and what came.
     """
 
+    @lasting_tensors()
     def __init__(
         self,
         points: Any,

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..checks import check_time_step, fail
+from ..lasting import lasting_tensors
 from ..mesh import TetMesh
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
 from .particles import (
@@ -172,6 +173,7 @@ class ProjectiveDynamics(ParticleSolver):
         ValueError, TypeError: naming the argument; more than ``MAX_FREE`` free particles, because the factor is dense.
     """
 
+    @lasting_tensors()
     def __init__(
         self,
         points: Any,
@@ -193,8 +195,8 @@ class ProjectiveDynamics(ParticleSolver):
             ends = self.rest_points[self.edges]
             self.rest_length = torch.linalg.vector_norm(ends[:, 0] - ends[:, 1], dim=-1)
         self.springs = Springs(self.edges, self.num_points)
-        corners = torch.zeros((0, 4), dtype=torch.int64)
-        rest = torch.zeros((self.num_points, 3), dtype=dtype)
+        corners = torch.zeros((0, 4), dtype=torch.int64, device="cpu")
+        rest = torch.zeros((self.num_points, 3), dtype=dtype, device="cpu")
         if tets is not None:
             if self.rest_points is None:
                 fail("points", "rest positions, because there are tets", "a number of particles")

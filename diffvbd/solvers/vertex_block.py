@@ -20,9 +20,11 @@ from .particles import check_finite
 from .sums import FixedSum, placed
 
 # (j, k, l) such that (j, i, k, l) is an even permutation of the corners, for i = 0, 1, 2, 3
-_OTHERS = torch.tensor([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]])
+_OTHERS = torch.tensor([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]], device="cpu")
 _EDGES = {(0, 1): 0, (0, 2): 1, (0, 3): 2, (1, 2): 3, (1, 3): 4, (2, 3): 5}  # columns of rest_metric
-_COLUMNS = torch.tensor([[_EDGES[min(i, a), max(i, a)] for a in o] for i, o in enumerate(_OTHERS.tolist())])
+_COLUMNS = torch.tensor(
+    [[_EDGES[min(i, a), max(i, a)] for a in o] for i, o in enumerate(_OTHERS.tolist())], device="cpu"
+)
 
 
 @dataclass(frozen=True)

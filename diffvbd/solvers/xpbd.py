@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..checks import check_time_step, fail
+from ..lasting import lasting_tensors
 from ..mesh import TetMesh
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
 from .particles import (
@@ -130,6 +131,7 @@ class XPBD(ParticleSolver):
         ValueError, TypeError: naming the argument, what was expected and what came.
     """
 
+    @lasting_tensors()
     def __init__(
         self,
         points: Any,
