@@ -12,11 +12,12 @@ from torch import Tensor
 
 from . import ops, reference
 from .adjoints import Adjoint, ReverseSweep, Unrolled
-from .checks import check_broadcast, check_count, check_tensor, check_time_step, fail, to_float
+from .checks import check_broadcast, check_count, check_tensor, check_time_step, fail, name_value, to_float
 from .debug import checking
 from .energies import VERTEX_ENERGIES
 from .metric import lumped_mass, rest_metric
 from .model import Model
+from .moduli import moduli_of
 from .pair_barrier import Friction, PairBarrier
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
@@ -77,8 +78,10 @@ def prepare(
     model: Model,
     lead: tuple[int, ...],
     *,
-    mu: float | Tensor,
-    lam: float | Tensor,
+    mu: float | Tensor | None,
+    lam: float | Tensor | None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
     time_step: float,
     sweeps: int,
     rest_points: Tensor | None,
@@ -91,6 +94,7 @@ def prepare(
     like, tets = model._mass, (model.num_tets,)
     if settings is None:
         settings = step_settings(model, lead, time_step, sweeps)
+    mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
     rest, mass, given_density = None, model._mass[None], density
     if density is not None:
         density = _scenes_first("density", density, like, lead, tets)
@@ -186,13 +190,6 @@ def name_argument(error: ValueError, arguments: dict[str, Any]) -> None:
     for name, value in arguments.items():
         if isinstance(value, Tensor):
             name_value(name, "finite values", value, torch.isfinite(value))
-
-
-def name_value(name: str, expected: str, value: Tensor, good: Tensor) -> None:
-    good = good & torch.isfinite(value)
-    if not bool(good.all()):
-        where = (~good).nonzero()[0].tolist()
-        raise ValueError(f"{name}: expected {expected}, got {float(value[tuple(where)]):g} at {where}") from None
 
 
 def acceleration_of(gravity: Any, like: Tensor) -> Tensor:

@@ -144,3 +144,11 @@ def vertex_mask(given: Any, num_vertices: int, name: str = "pinned") -> Tensor:
     if index.numel() and (int(index.min()) < 0 or int(index.max()) >= num_vertices):
         fail(name, f"indices in [0, {num_vertices})", f"{int(index.min())}..{int(index.max())}")
     return torch.zeros(num_vertices, dtype=torch.bool, device="cpu").index_fill(0, index, True)
+
+
+def name_value(name: str, expected: str, value: Tensor, good: Tensor) -> None:
+    """Raises ValueError for the first value that is not good or not finite."""
+    good = good & torch.isfinite(value)
+    if not bool(good.all()):
+        where = (~good).nonzero()[0].tolist()
+        raise ValueError(f"{name}: expected {expected}, got {float(value[tuple(where)]):g} at {where}") from None

@@ -16,6 +16,7 @@ from .arguments import GRAVITY, check_state
 from .checks import check_positive, fail
 from .model import Model
 from .model_warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
+from .moduli import moduli_of
 
 # Limits with their measurements in docs/numerics.md
 SATURATION_TOO_LARGE = 1.0  # c over the mean edge: one update may then turn a tet inside out
@@ -80,8 +81,10 @@ def diagnose(
     model: Model,
     x: Tensor,
     *,
-    mu: float | Tensor,
-    lam: float | Tensor,
+    mu: float | Tensor | None = None,
+    lam: float | Tensor | None = None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
     time_step: float | None = None,
     previous: tuple[Tensor, Tensor] | None = None,
     force: Tensor | None = None,
@@ -96,7 +99,7 @@ def diagnose(
     Args:
         model: The scene.
         x: Positions [m], shape [..., V, 3].
-        mu, lam: Material [Pa], as in :func:`diffvbd.step`.
+        mu, lam, young, poisson: Material, as in :func:`diffvbd.step`.
         time_step: h [s]; needed for the Courant number, the stiffness and the left-over force.
         previous: State (x, v) from which one step led to ``x``; needed for the left-over force. force [N],
             gravity [m/s^2], prescribed [m] and parameters are then those of that step.
@@ -111,7 +114,8 @@ def diagnose(
     The F = 0 well: with s* the root of s^3 + s^2 + s = mu / (mu + lam), the elastic stress pulls every F with
     |F| < sqrt(3) s* towards 0 when lam >= 0 (docs/numerics.md, with the proof).
     """
-    check_state(model, x, x)
+    lead = check_state(model, x, x)
+    mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
     if previous is not None and model.touches:
         raise NotImplementedError("previous: the left-over force of a step with contact or friction is not computed")
     if previous is not None and time_step is None:

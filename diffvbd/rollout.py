@@ -17,7 +17,14 @@ from .model import Model
 from .schedule import Binomial, Segment, choose_schedule, run_segments
 from .step import advance
 
-_STATIC = ("mu", "lam", "rest_points", "density")  # enter through prepare(); the others through advance()
+_STATIC = (
+    "mu",
+    "lam",
+    "young",
+    "poisson",
+    "rest_points",
+    "density",
+)  # enter through prepare(); the others through advance()
 
 
 @dataclass(frozen=True)
@@ -56,8 +63,10 @@ def rollout(
     v: Tensor,
     *,
     steps: int,
-    mu: Any,
-    lam: Any,
+    mu: Any = None,
+    lam: Any = None,
+    young: Any = None,
+    poisson: Any = None,
     time_step: float,
     sweeps: int,
     force: Any = None,
@@ -82,8 +91,8 @@ def rollout(
         colliders: Corner points of the Model's colliders [m]: constant, they rest there; in :func:`per_step`, where
             they are at the end of each step.
         colliders_before: Where per_step colliders are at the start; None: the Model's collider_points.
-        mu, lam, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in time; or wrapped
-            in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step. A callable may
+        mu, lam (or young, poisson), force, gravity, prescribed, rest_points, density, parameters: As in step, constant
+            in time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step. A callable may
             close over tensors and modules that require grad: they get gradients under every schedule. It must be
             deterministic, because a checkpointed segment calls it again in the backward.
         checkpoint_every: Between checkpoints of n steps only states are kept, and the segment is run again in the
@@ -103,8 +112,8 @@ def rollout(
     if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
         fail("save", '"all", "last" or an integer > 0', repr(save))
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
-    options = {"mu": mu, "lam": lam, "rest_points": rest_points, "density": density, "force": force,
-               "gravity": gravity, "prescribed": prescribed, "colliders": colliders}  # fmt: skip
+    options = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "rest_points": rest_points,
+               "density": density, "force": force, "gravity": gravity, "prescribed": prescribed, "colliders": colliders}  # fmt: skip
     if _changes(colliders) and not isinstance(colliders, PerStep):
         raise TypeError("colliders: expected a tensor or per_step, got a callable: a step needs where they come from")
     if colliders_before is not None and not isinstance(colliders, PerStep):

@@ -45,8 +45,10 @@ def solve(
     x: Tensor,
     v: Tensor,
     *,
-    mu: float | Tensor,
-    lam: float | Tensor,
+    mu: float | Tensor | None = None,
+    lam: float | Tensor | None = None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
     time_step: float,
     tolerance: float = 1e-8,
     max_sweeps: int = 10_000,
@@ -67,7 +69,7 @@ def solve(
     (in float32, or far from the origin, that can be much) counts as converged.
 
     Args:
-        model, x, v, mu, lam, time_step, force, gravity, prescribed, rest_points, density, parameters: As in
+        model, x, v, mu, lam, young, poisson, time_step, force, gravity, prescribed, rest_points, density, parameters: As in
             :func:`diffvbd.step`; x, v of shape [..., V, 3].
         tolerance: Residual in (0, 1) at which the sweeps end. A gradient of GlobalAdjoint is off by about that, times
             the conditioning of the step.
@@ -95,8 +97,8 @@ def solve(
     max_sweeps, check_every = check_count("max_sweeps", max_sweeps), check_count("check_every", check_every, 1)
     if on_failure not in ("raise", "warn"):
         fail("on_failure", '"raise" or "warn"', repr(on_failure))
-    options: dict[str, Any] = {"mu": mu, "lam": lam, "time_step": time_step, "rest_points": rest_points,
-                               "density": density, "parameters": parameters}  # fmt: skip
+    options: dict[str, Any] = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "time_step": time_step,
+                               "rest_points": rest_points, "density": density, "parameters": parameters}  # fmt: skip
     prepared = prepare(model, lead, sweeps=0, **options)
     settings = prepared.settings
     loads: dict[str, Any] = {"force": force, "gravity": gravity, "prescribed": prescribed}

@@ -34,8 +34,10 @@ def step(
     x: Tensor,
     v: Tensor,
     *,
-    mu: float | Tensor,
-    lam: float | Tensor,
+    mu: float | Tensor | None = None,
+    lam: float | Tensor | None = None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
     time_step: float,
     sweeps: int,
     force: Tensor | None = None,
@@ -56,6 +58,7 @@ def step(
         v: Velocities [m/s], shape of x.
         mu: Shear modulus [Pa], broadcasts to x.shape[:-2] + (T,); a value per scene is [B, 1].
         lam: First Lame parameter [Pa], likewise. mu >= 0 and mu + lam >= 0 (lam >= 0 with block="paper").
+        young, poisson: Young's modulus [Pa] and Poisson's ratio [-] in place of mu and lam, likewise (:func:`diffvbd.lame`).
         time_step: h [s] > 0.
         sweeps: K >= 0, the number of colored sweeps that are executed (and differentiated).
         force: External forces [N], broadcasts to x.shape.
@@ -83,8 +86,8 @@ def step(
     Source: paper, eqs. 1-3 and section 3; docs/method.md.
     """
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
-    prepared = prepare(model, lead, mu=mu, lam=lam, time_step=time_step, sweeps=sweeps, rest_points=rest_points,
-                       density=density, parameters=parameters, adjoint=adjoint)  # fmt: skip
+    prepared = prepare(model, lead, mu=mu, lam=lam, young=young, poisson=poisson, time_step=time_step, sweeps=sweeps,
+                       rest_points=rest_points, density=density, parameters=parameters, adjoint=adjoint)  # fmt: skip
     return advance(model, x, v, prepared, force=force, gravity=gravity, prescribed=prescribed, colliders=colliders,
                    colliders_before=colliders_before, adjoint=adjoint)  # fmt: skip
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..arguments import GRAVITY, acceleration_of, name_value
-from ..checks import check_broadcast, check_positive, check_tensor, check_time_step, fail, vertex_mask
+from ..arguments import GRAVITY, acceleration_of
+from ..checks import check_broadcast, check_positive, check_tensor, check_time_step, fail, name_value, vertex_mask
 from ..lasting import lasting_tensors
 from ..mesh import TetMesh
 from ..model import _checked_device

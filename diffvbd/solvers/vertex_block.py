@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..arguments import name_value
-from ..checks import check_broadcast, check_tensor, check_time_step, fail
+from ..checks import check_broadcast, check_tensor, check_time_step, fail, name_value
 from ..energies import StableNeoHookean
 from ..metric import rest_metric
 from ..model import Model
