@@ -13,7 +13,7 @@ from torch import Tensor
 from . import ops, reference
 from .adjoints import Adjoint, ReverseSweep, Unrolled
 from .checks import check_broadcast, check_count, check_tensor, check_time_step, fail, name_value, to_float
-from .debug import checking
+from .debug import checking, looks_at
 from .energies import VERTEX_ENERGIES
 from .metric import lumped_mass, rest_metric
 from .model import Model
@@ -147,6 +147,27 @@ def prepare(
         settings=settings,
         unrolled=unrolled,
     )
+
+
+def check_prescribed(model: Model, prescribed: Any, x: Tensor, *others: Tensor) -> None:
+    """Raises where ``prescribed`` would move a vertex that is not pinned: a row that is not read and is neither x,
+    nor one of the ``others``, nor the Model's rest position, nor NaN."""
+    if prescribed is None or model.num_active == 0:
+        return
+    value = broadcastable("prescribed", prescribed, x).detach()
+    if value.dim() < 2 or value.shape[-2] != model.num_vertices or not looks_at(value):
+        return  # one position for all that are pinned
+    ignored = ~model._pinned[:, None] & ~torch.isnan(value)
+    for known in (x, *others, model._rest_points):
+        ignored = ignored & (value != known.detach())
+    if bool(ignored.any()):
+        *scene, vertex, _ = ignored.nonzero()[0].tolist()
+        where = f"vertex {vertex}" + (f" of scene {scene}" if scene else "")
+        fail(
+            "prescribed",
+            "positions for pinned vertices (elsewhere x, the Model's rest_points or NaN)",
+            f"another position for {where}, which is not pinned: Model(pinned=...) says which vertices follow",
+        )
 
 
 def _absent(name: Any, model: Model) -> str:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.linalg import cross
 
 from . import reference
-from .arguments import GRAVITY, check_state
+from .arguments import GRAVITY, check_prescribed, check_state
 from .checks import check_positive, fail
 from .model import Model
 from .model_warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
@@ -215,6 +215,7 @@ def _unbalanced(
     parameters: dict[str, Any] | None,
 ) -> float:
     check_state(model, *previous)
+    check_prescribed(model, prescribed, previous[0])
     x0, v0 = (t.detach().to(torch.float64) for t in previous)
     mass = model.mass.to(torch.float64)[:, None]
     acceleration = _as(gravity, x)

@@ -20,7 +20,8 @@ LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is li
 
 def warn_of(model: Model) -> None:
     """Warns (UserWarning) of what is legal and seldom meant."""
-    _warn_of_size(model.mesh)
+    if size := _size_message(model.mesh):
+        _warn(size)
     if not any(isinstance(e, StableNeoHookean) for e in model.energies) and model.mesh.num_tets:
         _warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
     if model.relaxation > STABLE_RELAXATION:
@@ -41,12 +42,13 @@ def warn_of(model: Model) -> None:
         )
 
 
-def _warn_of_size(mesh: TetMesh) -> None:
+def _size_message(mesh: TetMesh) -> str:
     size = _largest_body(mesh)
     if size > LARGE_BODY:
-        _warn(f"mesh: a body is {size:.4g} m long; points are in metres: a mesh in mm needs mesh.transform(1e-3 * I)")
+        return f"mesh: a body is {size:.4g} m long; points are in metres: one in mm needs mesh.transform(1e-3 * I)"
     if 0 < size < SMALL_BODY:
-        _warn(f"mesh: the largest body is {size:.2g} m long; points are in metres: is it in other units?")
+        return f"mesh: the largest body is {size:.2g} m long; points are in metres: are they in other units?"
+    return ""
 
 
 def _largest_body(mesh: TetMesh) -> float:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .adjoints import Adjoint, GlobalAdjoint, check_adjoint
-from .arguments import GRAVITY, acceleration_of, check_state, prepare
+from .arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare
 from .checks import check_count, check_positive, fail
 from .global_adjoint import global_sweep
 from .incremental import IncrementalPotential
@@ -69,8 +69,8 @@ def solve(
     (in float32, or far from the origin, that can be much) counts as converged.
 
     Args:
-        model, x, v, mu, lam, young, poisson, time_step, force, gravity, prescribed, rest_points, density, parameters: As in
-            :func:`diffvbd.step`; x, v of shape [..., V, 3].
+        model, x, v, mu, lam, young, poisson, time_step, force, gravity, prescribed, rest_points, density, parameters:
+            As in :func:`diffvbd.step`; x, v of shape [..., V, 3].
         tolerance: Residual in (0, 1) at which the sweeps end. A gradient of GlobalAdjoint is off by about that, times
             the conditioning of the step.
         max_sweeps: Number of sweeps after which to give up.
@@ -100,6 +100,7 @@ def solve(
     options: dict[str, Any] = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "time_step": time_step,
                                "rest_points": rest_points, "density": density, "parameters": parameters}  # fmt: skip
     prepared = prepare(model, lead, sweeps=0, **options)
+    check_prescribed(model, prescribed, x)
     settings = prepared.settings
     loads: dict[str, Any] = {"force": force, "gravity": gravity, "prescribed": prescribed}
     begun = begin(model, x, v, prepared, force, acceleration_of(gravity, x), prescribed)

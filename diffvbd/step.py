@@ -16,6 +16,7 @@ from .arguments import (
     Prepared,
     acceleration_of,
     broadcastable,
+    check_prescribed,
     check_state,
     collider_state,
     name_argument,
@@ -58,13 +59,14 @@ def step(
         v: Velocities [m/s], shape of x.
         mu: Shear modulus [Pa], broadcasts to x.shape[:-2] + (T,); a value per scene is [B, 1].
         lam: First Lame parameter [Pa], likewise. mu >= 0 and mu + lam >= 0 (lam >= 0 with block="paper").
-        young, poisson: Young's modulus [Pa] and Poisson's ratio [-] in place of mu and lam, likewise (:func:`diffvbd.lame`).
+        young, poisson: Young's modulus [Pa] and Poisson's ratio [-] in place of mu and lam, likewise
+            (:func:`diffvbd.lame`).
         time_step: h [s] > 0.
         sweeps: K >= 0, the number of colored sweeps that are executed (and differentiated).
         force: External forces [N], broadcasts to x.shape.
         gravity: Acceleration [m/s^2], 3 numbers, or a tensor that broadcasts to x.shape.
-        prescribed: Positions of pinned vertices at the end of the step [m], broadcasts to x.shape; read only where
-            pinned. None holds them where x has them.
+        prescribed: Positions of pinned vertices at the end of the step [m], broadcasts to x.shape; None holds
+            them where x has them. Where a vertex is not pinned it must have x, the Model's rest_points or NaN.
         colliders: Corner points of the Model's colliders at the end of the step [m], broadcasts to
             x.shape[:-2] + (Vc, 3). None: the Model's collider_points.
         colliders_before: The same at the start of the step, where they move. None: they rest.
@@ -88,6 +90,7 @@ def step(
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
     prepared = prepare(model, lead, mu=mu, lam=lam, young=young, poisson=poisson, time_step=time_step, sweeps=sweeps,
                        rest_points=rest_points, density=density, parameters=parameters, adjoint=adjoint)  # fmt: skip
+    check_prescribed(model, prescribed, x)
     return advance(model, x, v, prepared, force=force, gravity=gravity, prescribed=prescribed, colliders=colliders,
                    colliders_before=colliders_before, adjoint=adjoint)  # fmt: skip
 

@@ -14,8 +14,8 @@ from .checks import check_tensor, fail, to_float
 from .model import Model
 from .step import step
 
-_ARGUMENTS = ("x", "v", "mu", "lam", "young", "poisson", "force", "gravity", "prescribed", "rest_points", "density", "colliders",
-              "colliders_before")  # fmt: skip
+_ARGUMENTS = ("x", "v", "mu", "lam", "young", "poisson", "force", "gravity", "prescribed", "rest_points", "density",
+              "colliders", "colliders_before")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ def step_forward(
 
     Args:
         model, x, v, options: As in :func:`diffvbd.step`; works under torch.no_grad() too.
-        wrt: Names of the arguments to differentiate: x, v, mu, lam, young, poisson, force, gravity, prescribed, rest_points,
-            density, colliders, colliders_before, or a name in ``parameters``. Only these leave a tape.
+        wrt: Names of the arguments to differentiate: x, v, mu, lam, young, poisson, force, gravity, prescribed,
+            rest_points, density, colliders, colliders_before, or a name in ``parameters``. Only these leave a tape.
 
     Returns:
         Positions, velocities (both detached) and the tape.
