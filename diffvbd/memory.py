@@ -15,25 +15,31 @@ from .adjoints import ReverseSweep
 from .checks import check_count
 from .model import Model
 from .schedule import Binomial, _left, choose_schedule
+from .sweeps import is_out_of_memory
 
 
 @contextlib.contextmanager
 def out_of_memory_named(model: Model, x: Tensor, settings: ops.SweepSettings, policy: int) -> Iterator[None]:
-    """Says of a step that does not fit a CUDA device how much it wanted and which tape would fit."""
-    if not x.is_cuda:
-        yield
-        return
+    """Says of a step that does not fit the memory how much it wanted, and which tape would fit a CUDA device."""
     try:
         yield
-    except RuntimeError as error:
-        if "out of memory" not in str(error):
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error) or isinstance(error, torch.OutOfMemoryError) and not x.is_cuda:
             raise
-        free, _ = torch.cuda.mem_get_info(x.device)
-        free += torch.cuda.memory_reserved(x.device) - torch.cuda.memory_allocated(x.device)
         scalars = x.shape[0] * settings.sweeps * model.num_active * x.element_size()
-        base = 2 * x.numel() * x.element_size() + _cuda_scratch(model, x.shape[0], reverse=False)
+        base = 2 * x.numel() * x.element_size()
+        base += _cuda_scratch(model, x.shape[0], reverse=False) if x.is_cuda else 0
         wanted = {name: base + scalars * ops.tape_rows(code, model.energy_mask) for name, code in _POLICIES.items()}
         chosen = next(name for name, code in _POLICIES.items() if code == policy)
+        if not x.is_cuda:
+            smaller = [f'"{name}" {size} bytes' for name, size in wanted.items() if size < wanted[chosen]]
+            advice = f", or a smaller ReverseSweep(tape=...): {', '.join(smaller)}" if smaller else ""
+            raise torch.OutOfMemoryError(
+                f'CPU out of memory: a step of {settings.sweeps} sweeps with tape="{chosen}" wanted {wanted[chosen]} '
+                f"bytes; use fewer sweeps or scenes{advice}"
+            ) from error
+        free, _ = torch.cuda.mem_get_info(x.device)
+        free += torch.cuda.memory_reserved(x.device) - torch.cuda.memory_allocated(x.device)
         fits = [f'"{name}" ({bytes_wanted} bytes)' for name, bytes_wanted in wanted.items() if bytes_wanted <= free]
         advice = f"ReverseSweep(tape=...) that fits: {', '.join(fits)}" if fits else "no tape policy fits: fewer scenes"
         raise torch.OutOfMemoryError(
