@@ -204,13 +204,16 @@ def collider_state(model: Model, x: Tensor, end: Any, start: Any) -> tuple[Tenso
     return given.get("colliders_before", after), after
 
 
-def name_argument(error: ValueError, arguments: dict[str, Any]) -> None:
+def name_argument(model: Model, error: ValueError, arguments: dict[str, Any]) -> None:
     """Raises an error that names the argument, where the operator could name only what was made of several."""
     if not str(error).startswith(("predictor", "start")):
         return
     for name, value in arguments.items():
         if isinstance(value, Tensor):
-            name_value(name, "finite values", value, torch.isfinite(value))
+            good = torch.isfinite(value)
+            if name == "prescribed":  # read only where pinned
+                value, good = torch.where(model._pinned[:, None], value, 0.0), good | ~model._pinned[:, None]
+            name_value(name, "finite values", value, good)
 
 
 def acceleration_of(gravity: Any, like: Tensor) -> Tensor:

@@ -343,7 +343,10 @@ class Model:
 
 
 def _checked_device(device: torch.device | str) -> torch.device:
-    device = torch.device(device)
+    try:
+        device = torch.device(device)
+    except (RuntimeError, TypeError):
+        fail("device", '"cpu" or "cuda"', repr(device))
     if device.type not in ops.LANES:
         fail("device", '"cpu" or "cuda"', repr(str(device)))
     if device.type == "cuda":

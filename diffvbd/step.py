@@ -233,7 +233,7 @@ def swept(
                 return global_sweep(model, tensors, settings, adjoint, debug_step)
             return sweep(*tensors, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)
     except ValueError as error:
-        name_argument(error, given)
+        name_argument(model, error, given)
         raise
 
 

@@ -47,7 +47,7 @@ def small_inputs(model: dv.Model, seed: int = 0) -> Arguments:
         "lam": 2.0 + noise(tets, size=0.5),
         "force": noise(n, 3, size=0.3),
         "gravity": given([0.1, -1.0, 0.2]),
-        "prescribed": x + noise(n, 3, size=0.1),
+        "prescribed": torch.where(model.pinned[:, None].to(x.device), x + noise(n, 3, size=0.1), torch.nan),
         "rest_points": model.rest_points + noise(n, 3, size=0.05),
         "density": 2.0 + noise(tets, size=0.5),
         "floor_barrier.kappa": given(2.0),

@@ -47,7 +47,7 @@ class ParticleSolver:
     ) -> None:
         if dtype not in (torch.float64, torch.float32):
             raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
-        device = checked_device(device)
+        device = _checked_device(device)
         self.rest_points: Tensor | None = None
         if isinstance(points, bool) or not isinstance(points, (int, np.integer)):
             self.rest_points = numbers("points", points, dtype, device)
@@ -126,15 +126,6 @@ class ParticleSolver:
             if bool(wrong.any()):
                 fail(name, f"{'' if least == '> 0' else 'finite '}numbers {least}", float(value.detach()[wrong][0]))
         return ops.broadcast(value, (*value.shape[:-1], count))
-
-
-def checked_device(device: Any) -> torch.device:
-    """As a Model's; raises ValueError for a name that torch does not know."""
-    try:
-        device = torch.device(device)
-    except (RuntimeError, TypeError):
-        fail("device", '"cpu" or "cuda"', repr(device))
-    return _checked_device(device)
 
 
 def all_finite(value: Tensor) -> bool:
