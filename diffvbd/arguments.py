@@ -36,6 +36,10 @@ class Prepared(NamedTuple):
     settings: ops.SweepSettings
     unrolled: Callable[..., tuple[Tensor, Tensor]] | None = None  # the reference's step, where autograd unrolls it
 
+    @property
+    def time_step_and_sweeps(self) -> tuple[float, int]:
+        return self.settings.numbers[0], self.settings.sweeps
+
 
 def check_state(model: Model, x: Tensor, v: Tensor) -> tuple[int, ...]:
     """Raises where x or v does not fit the Model; returns the leading (scene) shape."""

@@ -13,7 +13,9 @@ from torch import Tensor
 from .adjoints import Adjoint, check_adjoint
 from .arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
 from .checks import check_count, fail
+from .debug import looks_at
 from .model import Model
+from .model_warnings import warn_of_thin_tets
 from .schedule import Binomial, Segment, choose_schedule, run_segments
 from .step import advance
 
@@ -131,6 +133,8 @@ def rollout(
     settings = step_settings(model, lead, time_step, sweeps)
     chosen: dict[str, Any] = {"time_step": time_step, "sweeps": sweeps, "adjoint": adjoint, "settings": settings}
     fixed = None if changes else prepare(model, lead, **chosen, **static)
+    if fixed is not None and looks_at(fixed.mu) and looks_at(fixed.lam):
+        warn_of_thin_tets(model, fixed.mu, fixed.lam, *fixed.time_step_and_sweeps)
 
     start, moved = x, options["prescribed"]
     for value in _tensors(moved):

@@ -23,10 +23,11 @@ from .arguments import (
     prepare,
 )
 from .contact_step import run_contact
-from .debug import check_on_cpu, checking
+from .debug import check_on_cpu, checking, looks_at
 from .global_adjoint import global_sweep
 from .memory import out_of_memory_named
 from .model import Model
+from .model_warnings import warn_of_thin_tets
 from .sweeps import SweepTensors, fused_step, sweep
 
 
@@ -91,6 +92,8 @@ def step(
     prepared = prepare(model, lead, mu=mu, lam=lam, young=young, poisson=poisson, time_step=time_step, sweeps=sweeps,
                        rest_points=rest_points, density=density, parameters=parameters, adjoint=adjoint)  # fmt: skip
     check_prescribed(model, prescribed, x)
+    if looks_at(prepared.mu) and looks_at(prepared.lam):
+        warn_of_thin_tets(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps)
     return advance(model, x, v, prepared, force=force, gravity=gravity, prescribed=prescribed, colliders=colliders,
                    colliders_before=colliders_before, adjoint=adjoint)  # fmt: skip
 
