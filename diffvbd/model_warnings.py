@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 STABLE_RELAXATION = 1.7  # largest omega that never grew in the rollouts of docs/numerics.md
 HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
-THIN = 5.0  # longest edge over shortest height; those of a cube have 2.4
+THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
 SAMPLED = 10_000  # tets that are looked at: a sheet's are all alike
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 
@@ -77,9 +77,9 @@ def warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, s
     if sweeps < needed:
         warnings.warn(
             f"sweeps: {sweeps} at time_step = {time_step:.3g} s are too few for tets {aspect:.2g} times as wide as "
-            f"thick, which need about {needed:.0f} or more: the body moves as if it had little stiffness; take a shorter "
-            f"time step, more sweeps with relaxation up to {STABLE_RELAXATION}, or a thicker body of softer material. "
-            "Linear tets this thin are also much too stiff in bending (docs/numerics.md)",
+            f"thick, which need about {needed:.0f} or more: the body moves as if it had little stiffness; take a "
+            f"shorter time step, more sweeps with relaxation up to {STABLE_RELAXATION}, or a thicker body of softer "
+            "material. Linear tets this thin are also much too stiff in bending (docs/numerics.md)",
             UserWarning,
             stacklevel=3,
         )
