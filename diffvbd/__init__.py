@@ -13,6 +13,7 @@ from .energies import Anchor, FloorBarrier, StableNeoHookean
 from .gradcheck import GradientCheck, check_gradients
 from .mesh import TetMesh
 from .model import Model
+from .moduli import lame, young_poisson
 from .pair_barrier import Friction, PairBarrier
 from .regimes import regime
 from .rollout import Trajectory, per_step, rollout
@@ -46,6 +47,7 @@ __all__ = [
     "contact",
     "debug_checks",
     "diagnose",
+    "lame",
     "mesh",
     "per_step",
     "regime",
@@ -55,4 +57,5 @@ __all__ = [
     "step",
     "step_backward",
     "step_forward",
+    "young_poisson",
 ]

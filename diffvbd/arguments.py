@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,9 +12,13 @@ from torch import Tensor
 
 from . import ops, reference
 from .adjoints import Adjoint, ReverseSweep, Unrolled
-from .checks import check_broadcast, check_count, check_positive, check_tensor, fail
+from .checks import check_broadcast, check_count, check_tensor, check_time_step, fail, name_value, to_float
+from .debug import looks_at
+from .energies import VERTEX_ENERGIES
 from .metric import lumped_mass, rest_metric
 from .model import Model
+from .moduli import moduli_of
+from .pair_barrier import Friction, PairBarrier
 from .scopes import checking
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
@@ -32,6 +37,10 @@ class Prepared(NamedTuple):
     settings: ops.SweepSettings
     unrolled: Callable[..., tuple[Tensor, Tensor]] | None = None  # the reference's step, where autograd unrolls it
 
+    @property
+    def time_step_and_sweeps(self) -> tuple[float, int]:
+        return self.settings.numbers[0], self.settings.sweeps
+
 
 def check_state(model: Model, x: Tensor, v: Tensor) -> tuple[int, ...]:
     """Raises where x or v does not fit the Model; returns the leading (scene) shape."""
@@ -42,7 +51,7 @@ def check_state(model: Model, x: Tensor, v: Tensor) -> tuple[int, ...]:
             raise TypeError(
                 f"{name}: expected a tensor of shape [..., {model.num_vertices}, 3], got {type(value).__name__}"
             )
-        check_tensor(name, value, model.mass)
+        check_tensor(name, value, model._mass)
         if value.dim() < 2 or value.shape[-2:] != (model.num_vertices, 3):
             fail(name, f"shape [..., {model.num_vertices}, 3]", f"shape {list(value.shape)}")
     if v.shape != x.shape:
@@ -52,7 +61,7 @@ def check_state(model: Model, x: Tensor, v: Tensor) -> tuple[int, ...]:
 
 def _scenes_first(name: str, value: Any, like: Tensor, lead: tuple[int, ...], own: tuple[int, ...]) -> Tensor:
     """A value that broadcasts to lead + own, as [1 | B, ...] with as many further dimensions as own."""
-    value = check_broadcast(name, check_tensor(name, value, like), lead + own)
+    value = check_broadcast(name, check_tensor(name, value, like), lead + own, len(lead))
     shape = (1,) * (len(lead) + len(own) - value.dim()) + tuple(value.shape)
     scenes, rest = shape[: len(lead)], shape[len(lead) :]
     value = value.reshape(shape)
@@ -63,10 +72,8 @@ def _scenes_first(name: str, value: Any, like: Tensor, lead: tuple[int, ...], ow
 
 def step_settings(model: Model, lead: tuple[int, ...], time_step: Any, sweeps: Any) -> ops.SweepSettings:
     """What is executed for scenes of shape ``lead``, the regime on CUDA included."""
-    if isinstance(time_step, Tensor) and time_step.requires_grad:
-        raise TypeError("time_step: expected a number, got a tensor that requires grad: it is not differentiable")
     return model.settings(
-        check_positive("time_step", time_step, "s"),
+        check_time_step(time_step, model.dtype),
         check_count("sweeps", sweeps, maximum=MAX_SWEEPS),
         math.prod(lead),
     )
@@ -76,8 +83,10 @@ def prepare(
     model: Model,
     lead: tuple[int, ...],
     *,
-    mu: float | Tensor,
-    lam: float | Tensor,
+    mu: float | Tensor | None,
+    lam: float | Tensor | None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
     time_step: float,
     sweeps: int,
     rest_points: Tensor | None,
@@ -87,20 +96,21 @@ def prepare(
     settings: ops.SweepSettings | None = None,
 ) -> Prepared:
     """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
-    like, tets = model.mass, (model.num_tets,)
+    like, tets = model._mass, (model.num_tets,)
     if settings is None:
         settings = step_settings(model, lead, time_step, sweeps)
-    rest, mass, given_density = None, model.mass[None], density
+    mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
+    rest, mass, given_density = None, model._mass[None], density
     if density is not None:
         density = _scenes_first("density", density, like, lead, tets)
     if rest_points is not None or density is not None:
-        points = model.rest_points if rest_points is None else rest_points
+        points = model._rest_points if rest_points is None else rest_points
         points = _scenes_first("rest_points", points, like, lead, (model.num_vertices, 3))
         points = ops.broadcast(points, (points.shape[0], model.num_vertices, 3))
         metric, volume = rest_metric(ops.tet_gather(points, *model._topology))
         rest = None if rest_points is None else metric
         if density is None:
-            density = model.density[None]
+            density = model._density[None]
         shape = (max(density.shape[0], volume.shape[0]), model.num_tets)
         if checking() and model.device.type == "cuda":  # where star_sum does not look
             name_value("density", "finite numbers > 0 kg/m^3", density, density > 0)
@@ -119,7 +129,7 @@ def prepare(
         known = {f"{e.name}.{k}": (e, k, own) for e in model.parametric_energies for k, own in e.parameters.items()}
     for name, value in (parameters or {}).items():
         if name not in known:
-            fail("parameters", f"names among {sorted(known)}", repr(name))
+            fail("parameters", f"names among {sorted(known)}", f"{name!r}{_absent(name, model)}")
         energy, key, own = known[name]
         shape = tuple(model.constants(energy)[key].shape)[:own]
         given[name] = _scenes_first(name, value, like, lead, shape)
@@ -144,6 +154,41 @@ def prepare(
     )
 
 
+def check_prescribed(model: Model, prescribed: Any, x: Tensor, *others: Tensor) -> None:
+    """Raises where ``prescribed`` would move a vertex that is not pinned: a row that is not read and is neither x,
+    nor one of the ``others``, nor the Model's rest position, nor NaN."""
+    if prescribed is None or model.num_active == 0:
+        return
+    value = broadcastable("prescribed", prescribed, x).detach()
+    if value.dim() < 2 or value.shape[-2] != model.num_vertices or not looks_at(value):
+        return  # one position for all that are pinned
+    ignored = ~model._pinned[:, None] & ~torch.isnan(value)
+    for known in (x, *others, model._rest_points):
+        ignored = ignored & (value != known.detach())
+    if bool(ignored.any()):
+        *scene, vertex, _ = ignored.nonzero()[0].tolist()
+        where = f"vertex {vertex}" + (f" of scene {scene}" if scene else "")
+        fail(
+            "prescribed",
+            "positions for pinned vertices (elsewhere x, the Model's rest_points or NaN)",
+            f"another position for {where}, which is not pinned: Model(pinned=...) says which vertices follow",
+        )
+
+
+def _absent(name: Any, model: Model) -> str:
+    """Why a Model does not know a parameter: perhaps its energy is missing, or misspelt."""
+    kinds = {
+        f"{kind.name}.{key}": kind for kind in (*VERTEX_ENERGIES, PairBarrier, Friction) for key in kind.parameters
+    }
+    meant = difflib.get_close_matches(str(name), kinds, 1)
+    if not meant:
+        return ""
+    (full,), kind = meant, kinds[meant[0]]
+    text = "" if full == name else f" (is {full!r} meant?)"
+    present = any(isinstance(energy, kind) for energy in model.energies)
+    return text if present else f"{text}: the Model has no {kind.__name__} among its energies"
+
+
 def collider_state(model: Model, x: Tensor, end: Any, start: Any) -> tuple[Tensor, Tensor] | None:
     """Corner points of the colliders at the start and at the end of a step [B, Vc, 3]; one tensor where they rest. None
     for a Model without contact."""
@@ -156,7 +201,7 @@ def collider_state(model: Model, x: Tensor, end: Any, start: Any) -> tuple[Tenso
             continue
         if count == 0:
             fail(name, "a Model with colliders", "one without")
-        value = check_broadcast(name, check_tensor(name, value, x), (*lead, count, 3))
+        value = check_broadcast(name, check_tensor(name, value, x), (*lead, count, 3), len(lead))
         given[name] = ops.broadcast(value, (*lead, count, 3)).reshape(flat)
     if not model.touches:
         return None
@@ -164,20 +209,16 @@ def collider_state(model: Model, x: Tensor, end: Any, start: Any) -> tuple[Tenso
     return given.get("colliders_before", after), after
 
 
-def name_argument(error: ValueError, arguments: dict[str, Any]) -> None:
+def name_argument(model: Model, error: ValueError, arguments: dict[str, Any]) -> None:
     """Raises an error that names the argument, where the operator could name only what was made of several."""
     if not str(error).startswith(("predictor", "start")):
         return
     for name, value in arguments.items():
         if isinstance(value, Tensor):
-            name_value(name, "finite values", value, torch.isfinite(value))
-
-
-def name_value(name: str, expected: str, value: Tensor, good: Tensor) -> None:
-    good = good & torch.isfinite(value)
-    if not bool(good.all()):
-        where = (~good).nonzero()[0].tolist()
-        raise ValueError(f"{name}: expected {expected}, got {float(value[tuple(where)]):g} at {where}") from None
+            good = torch.isfinite(value)
+            if name == "prescribed":  # read only where pinned
+                value, good = torch.where(model._pinned[:, None], value, 0.0), good | ~model._pinned[:, None]
+            name_value(name, "finite values", value, good)
 
 
 def acceleration_of(gravity: Any, like: Tensor) -> Tensor:
@@ -192,10 +233,11 @@ def _three_numbers(name: str, value: Any, like: Tensor) -> Tensor:
         raise TypeError(f"{name}: expected 3 numbers or a tensor, got {value!r}")
     if len(value) != 3:
         fail(name, "3 numbers or a tensor", f"{len(value)} numbers")
+    numbers = [to_float(name, a) for a in value]
     if like.is_cuda:  # kernels fill it: a copy from the host would wait for the device and break a graph's capture
-        return torch.stack([torch.full((), float(a), dtype=like.dtype, device=like.device) for a in value])
-    return torch.tensor([float(a) for a in value], dtype=like.dtype, device=like.device)
+        return torch.stack([torch.full((), a, dtype=like.dtype, device=like.device) for a in numbers])
+    return torch.tensor(numbers, dtype=like.dtype, device=like.device)
 
 
 def broadcastable(name: str, value: Any, x: Tensor) -> Tensor:
-    return check_broadcast(name, check_tensor(name, value, x), tuple(x.shape))
+    return check_broadcast(name, check_tensor(name, value, x), tuple(x.shape), x.dim() - 2)

@@ -18,9 +18,10 @@ def fail(name: str, expected: str, got: Any) -> NoReturn:
 def check_tensor(name: str, value: Any, like: Tensor, what: str = "a tensor", owner: str = "the Model's") -> Tensor:
     """``value`` as a tensor of like's dtype and device; python numbers are converted, other tensors must match."""
     if not isinstance(value, Tensor):
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
-            return torch.full((), float(value), dtype=like.dtype, device=like.device)
+        if isinstance(value, (int, float, np.floating, np.integer)) and not isinstance(value, bool):
+            return torch.full((), to_float(name, value), dtype=like.dtype, device=like.device)
         raise TypeError(f"{name}: expected {what}, got {type(value).__name__}")
+    check_dense(name, value)
     if value.dtype != like.dtype:
         raise TypeError(f"{name}: expected dtype {like.dtype} ({owner}), got {value.dtype}")
     if value.device != like.device:
@@ -28,13 +29,44 @@ def check_tensor(name: str, value: Any, like: Tensor, what: str = "a tensor", ow
     return value
 
 
-def check_broadcast(name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Raises unless value broadcasts to shape."""
-    ok = value.dim() <= len(shape) and all(
-        a in (1, b) for a, b in zip(reversed(value.shape), reversed(shape), strict=False)
+def check_dense(name: str, value: Tensor) -> None:
+    """Raises for sparse and nested tensors, whose rows no kernel can read."""
+    if value.is_nested:
+        raise TypeError(f"{name}: expected a dense tensor, got a nested one: stack its parts to one shape")
+    if value.layout != torch.strided:
+        raise TypeError(f"{name}: expected a dense tensor, got layout {value.layout}: use .to_dense()")
+
+
+def check_readable(name: str, value: Tensor) -> None:
+    """Raises for tensors without values that can be copied: sparse, nested, meta."""
+    check_dense(name, value)
+    if value.is_meta:
+        raise ValueError(f"{name}: expected values, got a tensor on the meta device, which has none")
+
+
+def to_float(name: str, value: Any) -> float:
+    """A python or numpy number as a float; raises where it is too large for one."""
+    try:
+        return float(value)
+    except OverflowError:
+        fail(name, "a number that a float can hold", f"one of {value.bit_length()} bits")
+
+
+def _fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
+    return len(shape) <= len(wanted) and all(
+        a in (1, b) for a, b in zip(reversed(shape), reversed(wanted), strict=False)
     )
-    if not ok:
-        fail(name, f"a shape that broadcasts to {list(shape)}", f"shape {list(value.shape)}")
+
+
+def check_broadcast(name: str, value: Tensor, shape: tuple[int, ...], scenes: int = 0) -> Tensor:
+    """Raises unless value broadcasts to shape, whose first ``scenes`` dimensions count scenes."""
+    got = tuple(value.shape)
+    if not _fits(got, shape):
+        hint, missing = "", len(shape) - len(got)
+        each = (*got[:scenes], *(1,) * missing, *got[scenes:])  # as meant by who gives one value for each scene
+        if scenes and missing > 0 and got[:scenes] == shape[:scenes] and _fits(each, shape):
+            hint = f": one for each scene has shape {list(each)}"
+        fail(name, f"a shape that broadcasts to {list(shape)}", f"shape {list(got)}{hint}")
     return value
 
 
@@ -58,6 +90,7 @@ def check_number(name: str, value: Any) -> float:
         value = value.detach().item()
     if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+    value = to_float(name, value)
     if not (math.isfinite(value) and value >= 0):
         fail(name, "a finite number >= 0", value)
     return float(value)
@@ -65,26 +98,57 @@ def check_number(name: str, value: Any) -> float:
 
 def check_positive(name: str, value: Any, unit: str = "") -> float:
     """A finite number > 0, its unit for the message."""
-    if check_number(name, value) == 0:
+    number = check_number(name, value)
+    if number == 0:
         fail(name, f"a finite number > 0 {unit}".rstrip(), value)
-    return float(value)
+    return number
 
 
-def vertex_mask(pinned: Any, num_vertices: int) -> Tensor:
-    """``pinned``, a bool mask or indices, as a bool mask [V] on the CPU."""
-    if pinned is None:
-        return torch.zeros(num_vertices, dtype=torch.bool)
+def check_time_step(value: Any, dtype: torch.dtype) -> float:
+    """h [s] > 0, with an h^2 that dtype can hold: with less, forces and masses would vanish from a step."""
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise TypeError("time_step: expected a number, got a tensor that requires grad: it is not differentiable")
+    h, limits = check_positive("time_step", value, "s"), torch.finfo(dtype)
+    if not limits.tiny <= h * h <= limits.max:
+        fail("time_step", f"a number of seconds whose square lies between {limits.tiny:.1e} and {limits.max:.1e}", h)
+    return h
+
+
+def mask_or_indices(name: str, given: Any) -> Tensor:
+    """A bool mask or indices of vertices as a tensor, its values not looked at."""
     try:
-        pinned = torch.as_tensor(pinned).detach().cpu()
-    except (TypeError, ValueError, RuntimeError):
-        raise TypeError(f"pinned: expected a bool mask or integer indices, got {type(pinned).__name__}") from None
-    if pinned.dtype == torch.bool:
-        if pinned.shape != (num_vertices,):
-            fail("pinned", f"a mask of shape [{num_vertices}] or indices", f"a mask of shape {list(pinned.shape)}")
-        return pinned.clone()
-    if pinned.numel() and pinned.is_floating_point():
-        raise TypeError(f"pinned: expected a bool mask or integer indices, got dtype {pinned.dtype}")
-    index = pinned.to(torch.int64).reshape(-1)
+        out = given.detach() if isinstance(given, Tensor) else torch.as_tensor(given, device="cpu")
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise TypeError(f"{name}: expected a bool mask or integer indices, got {type(given).__name__}") from None
+    check_readable(name, out)
+    if out.dtype == torch.uint8 and out.numel():
+        raise TypeError(
+            f"{name}: expected a bool mask or indices of another dtype, got torch.uint8, which may mean either: use "
+            ".bool() for a mask, .long() for indices"
+        )
+    if out.numel() and (out.is_floating_point() or out.is_complex()):
+        raise TypeError(f"{name}: expected a bool mask or integer indices, got dtype {out.dtype}")
+    return out
+
+
+def vertex_mask(given: Any, num_vertices: int, name: str = "pinned") -> Tensor:
+    """A bool mask or indices of vertices as a bool mask [V] on the CPU; None: no vertex."""
+    if given is None:
+        return torch.zeros(num_vertices, dtype=torch.bool, device="cpu")
+    given = mask_or_indices(name, given).cpu()
+    if given.dtype == torch.bool:
+        if given.shape != (num_vertices,):
+            fail(name, f"a mask of shape [{num_vertices}] or indices", f"a mask of shape {list(given.shape)}")
+        return given.clone()
+    index = given.to(torch.int64).reshape(-1)
     if index.numel() and (int(index.min()) < 0 or int(index.max()) >= num_vertices):
-        fail("pinned", f"indices in [0, {num_vertices})", f"{int(index.min())}..{int(index.max())}")
-    return torch.zeros(num_vertices, dtype=torch.bool).index_fill(0, index, True)
+        fail(name, f"indices in [0, {num_vertices})", f"{int(index.min())}..{int(index.max())}")
+    return torch.zeros(num_vertices, dtype=torch.bool, device="cpu").index_fill(0, index, True)
+
+
+def name_value(name: str, expected: str, value: Tensor, good: Tensor) -> None:
+    """Raises ValueError for the first value that is not good or not finite."""
+    good = good & torch.isfinite(value)
+    if not bool(good.all()):
+        where = (~good).nonzero()[0].tolist()
+        raise ValueError(f"{name}: expected {expected}, got {float(value[tuple(where)]):g} at {where}") from None

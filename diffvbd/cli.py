@@ -1,6 +1,7 @@
 """The command line: `diffvbd` or `python -m diffvbd`."""
 
 import argparse
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,9 +12,9 @@ import torch
 
 import diffvbd as dv
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
-from diffvbd.tasks.problem import check_device
+from diffvbd.tasks.problem import Result, check_device
 from diffvbd.tasks.progress import versions
-from diffvbd.tasks.scene import Array, Observation, Scene
+from diffvbd.tasks.scene import MOST_STEPS, Array, Observation, Scene
 
 DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Units: m, kg, s, Pa; y points up."
 EXAMPLES = """examples:
@@ -35,7 +36,7 @@ TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here re
   steps      time steps after which each was observed, shape [N]; default 0, 1, 2, ...
   x0, v0     initial positions [m] and velocities [m/s], shape [V, 3]; default: the mesh, at rest
   pinned     vertices that are held, bool, shape [V]; default none
-  time_step [s], sweeps, density [kg/m^3], gravity [m/s^2], floor [m], kappa, dhat [m]
+  time_step [s], sweeps, density [kg/m^3], gravity [m/s^2], floor [m], kappa, dhat [m], friction, relaxation
   mu, lam    the true material [Pa], if known: only used to report the error
 `diffvbd simulate --save-target TARGET.npz` writes such a file.
 """
@@ -49,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\ninterrupted; `run` and `identify` continue when the same command is given again", file=sys.stderr)
         return 130
-    except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
+    except (ValueError, TypeError, OSError, ImportError, ArithmeticError, MemoryError, torch.OutOfMemoryError) as error:
         print(f"diffvbd: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     return 0
@@ -78,7 +79,10 @@ def _parser() -> argparse.ArgumentParser:
 
     simulate = commands.add_parser("simulate", help="simulate a mesh and write a series for ParaView")
     simulate.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra (.msh, .vtu, .vtk, ...)")
-    simulate.add_argument("--out", type=Path, required=True, metavar="PART.pvd", help="the series to write")
+    simulate.add_argument(
+        "--out", type=Path, required=True, metavar="PART.pvd", help="the series to write; missing folders are made"
+    )
+    simulate.add_argument("--force", action="store_true", help="overwrite without asking")
     simulate.add_argument("--steps", type=int, default=100, help="time steps (default 100)")
     simulate.add_argument("--stride", type=int, default=1, help="write every n-th frame (default 1)")
     simulate.add_argument("--device", default="cpu", help="torch device (default cpu)")
@@ -101,10 +105,11 @@ def _parser() -> argparse.ArgumentParser:
         "--start",
         type=float,
         nargs=2,
-        default=(1e5, 1e5),
         metavar=("MU", "LAM"),
         help="first guess [Pa], right to a factor 1e4 (default 1e5)",
     )
+    identification.add_argument("--start-young", type=float, help="the same as Young's modulus [Pa]")
+    identification.add_argument("--start-poisson", type=float, help="and Poisson's ratio, above 0 and below 0.5")
     identification.add_argument("--fixed-lam", action="store_true", help="keep lam at its first guess")
     identification.add_argument("--iterations", type=int, default=100, help="at most so many (default 100)")
     identification.add_argument("--steps", type=int, help="time steps that led to the shape, if x is one shape")
@@ -136,6 +141,8 @@ def _add_scene_options(parser: argparse.ArgumentParser) -> None:
     scene.add_argument("--floor", type=float, metavar="HEIGHT", help="height of a floor [m] (default: none)")
     scene.add_argument("--kappa", type=float, help=f"stiffness of the floor's barrier (default {Scene.kappa:g})")
     scene.add_argument("--dhat", type=float, help=f"distance where the barrier begins [m] (default {Scene.dhat:g})")
+    scene.add_argument("--friction", type=float, help="coefficient of friction on the floor (default: none)")
+    scene.add_argument("--relaxation", type=float, help="1.5 to 1.7 needs fewer sweeps (default 1; not with friction)")
     scene.add_argument(
         "--pin",
         action="append",
@@ -156,10 +163,11 @@ def _run(options: argparse.Namespace) -> None:
     _solve(task.build(settings, **given), settings)
 
 
-def _solve(problem: Problem, settings: Settings) -> None:
+def _solve(problem: Problem, settings: Settings) -> Result:
     result = solve(problem, settings)
     print(table(problem, result))
     print("wrote " + ", ".join(str(path) for path in result.files))
+    return result
 
 
 def _mesh(options: argparse.Namespace) -> dv.TetMesh:
@@ -170,16 +178,19 @@ def _mesh(options: argparse.Namespace) -> dv.TetMesh:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    if options.out.suffix != ".pvd" or not options.out.parent.is_dir():
-        raise ValueError(f"--out: expected a name that ends in .pvd in an existing directory, got {options.out}")
+    if options.out.suffix != ".pvd":
+        raise ValueError(f"--out: expected a name that ends in .pvd, got {options.out}")
     if options.stride < 1:
         raise ValueError(f"--stride: expected at least 1, got {options.stride}")
+    _check_steps(options.steps)
+    check_device(options.device)
     mesh = _mesh(options)
     mu, lam = _material(options)
     v0 = np.broadcast_to(np.asarray(options.velocity or (0.0, 0.0, 0.0)), mesh.points.shape)
     given = _given_scene_options(options, mesh)
     pinned = given.pop("pinned", np.zeros(mesh.num_vertices, dtype=bool))
     scene = Scene(mesh, mesh.points, np.where(pinned[:, None], 0.0, v0), pinned, **given)
+    _make_place(options)
     with torch.no_grad():
         model, progress = scene.model(options.device), sys.stderr.isatty()
         motion = scene.simulate(model, mu, lam, options.steps, save=options.stride, progress=progress)
@@ -192,7 +203,7 @@ def _simulate(options: argparse.Namespace) -> None:
             f"warning: --pin holds {held} vertices; a fraction takes more, for example --pin x-:0.05", file=sys.stderr
         )
     if len(steps) > 1 and options.stride == 1:
-        previous = (motion.x[-2], motion.v[-2])
+        previous = None if model.touches else (motion.x[-2], motion.v[-2])  # it knows no friction
         found = dv.diagnose(
             model, motion.x[-1], mu=mu, lam=lam, time_step=scene.time_step, previous=previous, warn=False
         )
@@ -203,15 +214,56 @@ def _simulate(options: argparse.Namespace) -> None:
         print(f"wrote {options.save_target}")
 
 
+def _make_place(options: argparse.Namespace) -> None:
+    """Folders for the files of a simulation, and leave to write over those that are there; the mesh stays."""
+    out, target = options.out, options.save_target
+    frames = re.compile(re.escape(out.stem) + r"_\d+\.vtu")
+    mesh = options.mesh.resolve()
+    if mesh.parent == out.parent.resolve() and frames.fullmatch(mesh.name):
+        raise ValueError(f"--out: expected another name than {out}, whose frames would overwrite {options.mesh}")
+    if target is not None and target.resolve() in (mesh, out.resolve()):
+        raise ValueError(f"--save-target: expected a file of its own, got {target}")
+    for folder in {out.parent, *([] if target is None else [target.parent])}:
+        folder.mkdir(parents=True, exist_ok=True)
+    there = [path for path in (out, target) if path is not None and path.exists()]
+    there += [path for path in sorted(out.parent.iterdir()) if frames.fullmatch(path.name)]
+    if not there or options.force:
+        return
+    what = f"{there[0]}" + (f" and {len(there) - 1} more" if len(there) > 1 else "")
+    if not sys.stdin.isatty():
+        raise ValueError(f"--out: {what} would be overwritten; give --force, or another name")
+    if input(f"overwrite {what}? [y/N] ").strip().lower() not in ("y", "yes"):
+        raise ValueError("--out: nothing was written")
+
+
+def _check_steps(steps: int | None) -> None:
+    if steps is not None and not 0 <= steps <= MOST_STEPS:
+        raise ValueError(f"--steps: expected an integer from 0 to {MOST_STEPS}, got {steps}")
+
+
+def _start(options: argparse.Namespace) -> tuple[float, float]:
+    """First guess of mu and lam [Pa] from either pair of options."""
+    young, poisson = options.start_young, options.start_poisson
+    if young is None and poisson is None:
+        mu, lam = options.start or (1e5, 1e5)
+        return mu, lam
+    if young is None or poisson is None or options.start is not None:
+        raise ValueError("--start: expected --start MU LAM, or --start-young and --start-poisson")
+    return dv.lame(young, poisson)
+
+
 def _identify(options: argparse.Namespace) -> None:
+    _check_steps(options.steps)
+    start = _start(options)
+    check_device(options.device)
     mesh = _mesh(options)
     given = _given_scene_options(options, mesh) | {"steps": options.steps}
-    check_device(options.device)
     observation = Observation.load(options.target, mesh, **given)
     settings = Settings(options.out or Path("runs/identify"), options.device, options.seed)
-    start = (options.start[0], options.start[1])
     problem = identify.problem(observation, settings, start, options.fixed_lam, options.iterations)
-    _solve(problem, settings)
+    found = _solve(problem, settings).estimates
+    young, poisson = dv.young_poisson(found["mu"], found["lam"])
+    print(f"Young's modulus {young:.6g} Pa, Poisson's ratio {poisson:.4g}")
 
 
 def _info(options: argparse.Namespace) -> None:
@@ -244,13 +296,14 @@ def _material(options: argparse.Namespace) -> tuple[float, float]:
         return (1e5 if options.mu is None else options.mu), (1e5 if options.lam is None else options.lam)
     if young is None or poisson is None or options.mu is not None or options.lam is not None:
         raise ValueError("material: give --mu and --lam, or --young and --poisson")
-    if not -1.0 < poisson < 0.5:
-        raise ValueError(f"--poisson: expected a value between -1 and 0.5, got {poisson}")
-    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+    try:
+        return dv.lame(young, poisson)
+    except ValueError as error:
+        raise ValueError(f"--{error}") from None
 
 
 def _given_scene_options(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
-    names = ("time_step", "sweeps", "density", "gravity", "floor", "kappa", "dhat")
+    names = ("time_step", "sweeps", "density", "gravity", "floor", "kappa", "dhat", "friction", "relaxation")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     if options.pin:
         given["pinned"] = np.logical_or.reduce([_side(mesh.points, text) for text in options.pin])

@@ -114,6 +114,6 @@ def intersections(model: Model, x: Tensor) -> Tensor:
     edges = unique_edges(triangles)
     found = []
     for scene, points in enumerate(x.detach().reshape(-1, model.num_vertices, 3).cpu().double()):
-        pairs = torch.as_tensor(_intersections(points, triangles, edges)).reshape(-1, 2)
-        found.append(torch.cat([torch.full((len(pairs), 1), scene), pairs], 1))
-    return torch.cat(found) if found else torch.zeros((0, 3), dtype=torch.int64)
+        pairs = torch.as_tensor(_intersections(points, triangles, edges), device="cpu").reshape(-1, 2)
+        found.append(torch.cat([torch.full((len(pairs), 1), scene, device="cpu"), pairs], 1))
+    return torch.cat(found) if found else torch.zeros((0, 3), dtype=torch.int64, device="cpu")

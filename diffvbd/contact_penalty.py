@@ -11,6 +11,8 @@ from torch.nn.functional import pad, softplus
 
 from . import ops
 from .checks import check_count, check_positive, check_tensor, fail
+from .debug import looks_at
+from .lasting import lasting_tensors
 from .model import Model
 from .ops_neighbors import neighbor_pairs, unread
 
@@ -59,6 +61,7 @@ class Bodies:
         TypeError, ValueError: Wrong dtypes or shapes, masses that are negative or not finite, a body without mass.
     """
 
+    @lasting_tensors()
     def __init__(self, body: Tensor, mass: Tensor) -> None:
         if not isinstance(mass, Tensor) or mass.dtype not in (torch.float64, torch.float32):
             raise TypeError(f"mass: expected a float64 or float32 tensor, got {_kind(mass)}")
@@ -216,11 +219,11 @@ def _check_positions(x: Any, bodies: Bodies) -> tuple[int, ...]:
 
 
 def _check_stiffness(stiffness: Any, x: Tensor) -> Tensor:
-    if isinstance(stiffness, (int, float)) and not isinstance(stiffness, bool) and not 0 <= stiffness < math.inf:
-        fail("stiffness", "a finite number >= 0 N/m", stiffness)
     stiffness = check_tensor("stiffness", stiffness, x, "a number or a tensor with one element", "that of x")
     if stiffness.numel() != 1:
         fail("stiffness", "a number or a tensor with one element", f"shape {list(stiffness.shape)}")
+    if looks_at(stiffness) and not 0 <= float(stiffness.detach()) < math.inf:
+        fail("stiffness", "a finite number >= 0 N/m", float(stiffness.detach()))
     return stiffness
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -79,7 +80,7 @@ class ContactStep:
         self.surface, self.barrier = model.surface_of_contact, model.contact
         self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()].contiguous()
         floor = model.floor
-        oblique = floor is not None and bool(((torch.as_tensor(floor.normal) != 0).sum(-1) > 1).any())
+        oblique = floor is not None and bool((np.count_nonzero(floor.normal, axis=-1) > 1).any())
         self.any_direction = oblique or "floor_barrier.normal" in prepared.parameters
         self.parts = 1 if self.barrier is None else self.barrier.detections
         like = begun.x_prev

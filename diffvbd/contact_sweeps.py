@@ -82,7 +82,7 @@ class _ContactBackward(Function):
     def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, bounds, collider, collider_prev, kappa,
                 lag, floor_lag, origin, packed_rest, plan, x, tape, listed, lagged, friction_eps, settings, tape_policy,
                 needs):  # fmt: skip
-        with backward_memory():
+        with backward_memory(x, settings, tape_policy):
             if rest is not None:
                 packed_rest = ops.pack_rest(rest, plan, settings.sizes)
             inputs = (x_prev, y, mu, lam, mass, packed_rest, energy_data, origin)

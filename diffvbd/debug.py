@@ -7,9 +7,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from . import ops, scopes
 from .model import Model
+from .scopes import checking
 from .sweeps import sweep
 
 
@@ -23,6 +25,14 @@ def debug_checks(enabled: bool = True) -> Iterator[None]:
     """
     with scopes.checks(enabled):
         yield
+
+
+def looks_at(value: Tensor) -> bool:
+    """Whether values may be looked at now. On CUDA that waits for the device; compiled and transformed ones cannot."""
+    if torch.compiler.is_compiling():
+        return False
+    transformed = torch._C._functorch.peek_interpreter_stack()  # pyright: ignore[reportAttributeAccessIssue]
+    return transformed is None and (checking() or not value.is_cuda)
 
 
 def check_on_cpu(model: Model, tensors: Sequence[Any], settings: ops.SweepSettings, index: int) -> None:

@@ -12,9 +12,11 @@ from torch import Tensor
 from torch.linalg import cross
 
 from . import reference
-from .arguments import GRAVITY, check_state
+from .arguments import GRAVITY, check_prescribed, check_state
 from .checks import check_positive, fail
-from .model import HEAVY_REGULARIZATION, STABLE_RELAXATION, Model
+from .model import Model
+from .model_warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
+from .moduli import moduli_of
 
 # Limits with their measurements in docs/numerics.md
 SATURATION_TOO_LARGE = 1.0  # c over the mean edge: one update may then turn a tet inside out
@@ -79,8 +81,10 @@ def diagnose(
     model: Model,
     x: Tensor,
     *,
-    mu: float | Tensor,
-    lam: float | Tensor,
+    mu: float | Tensor | None = None,
+    lam: float | Tensor | None = None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
     time_step: float | None = None,
     previous: tuple[Tensor, Tensor] | None = None,
     force: Tensor | None = None,
@@ -95,7 +99,7 @@ def diagnose(
     Args:
         model: The scene.
         x: Positions [m], shape [..., V, 3].
-        mu, lam: Material [Pa], as in :func:`diffvbd.step`.
+        mu, lam, young, poisson: Material, as in :func:`diffvbd.step`.
         time_step: h [s]; needed for the Courant number, the stiffness and the left-over force.
         previous: State (x, v) from which one step led to ``x``; needed for the left-over force. force [N],
             gravity [m/s^2], prescribed [m] and parameters are then those of that step.
@@ -110,7 +114,8 @@ def diagnose(
     The F = 0 well: with s* the root of s^3 + s^2 + s = mu / (mu + lam), the elastic stress pulls every F with
     |F| < sqrt(3) s* towards 0 when lam >= 0 (docs/numerics.md, with the proof).
     """
-    check_state(model, x, x)
+    lead = check_state(model, x, x)
+    mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
     if previous is not None and model.touches:
         raise NotImplementedError("previous: the left-over force of a step with contact or friction is not computed")
     if previous is not None and time_step is None:
@@ -124,7 +129,7 @@ def diagnose(
     f = (edges[..., :, :, None] * gradients[:, 1:, None, :]).sum(-3)  # F_ij = sum_a e_ai (grad N_a)_j
     norm = f.square().sum((-2, -1)).sqrt()
     det = (cross(f[..., 0, :], f[..., 1, :]) * f[..., 2, :]).sum(-1)
-    green = 0.5 * ((f[..., :, :, None] * f[..., :, None, :]).sum(-3) - torch.eye(3).to(f))
+    green = 0.5 * ((f[..., :, :, None] * f[..., :, None, :]).sum(-3) - torch.eye(3, dtype=f.dtype, device=f.device))
     critical = collapse_stretch(mu, lam)
     margin = norm / (3**0.5 * critical)
     edge = _edge_lengths(points, model.tets)
@@ -210,6 +215,7 @@ def _unbalanced(
     parameters: dict[str, Any] | None,
 ) -> float:
     check_state(model, *previous)
+    check_prescribed(model, prescribed, previous[0])
     x0, v0 = (t.detach().to(torch.float64) for t in previous)
     mass = model.mass.to(torch.float64)[:, None]
     acceleration = _as(gravity, x)

@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from .checks import check_number, check_positive, fail
+from .checks import check_number, check_positive, check_readable, fail, mask_or_indices, vertex_mask
 from .mask import EXACT_BLOCK, FIRST_VERTEX_BIT, PAPER_BLOCK
 from .safeguards import filter_against_planes
 
@@ -23,8 +24,13 @@ MAX_PLANES = 8
 
 def _numbers(name: str, value: Any) -> Tensor:
     """Finite numbers as a detached float64 tensor."""
+    if isinstance(value, Tensor):
+        check_readable(name, value)
     try:
-        out = torch.as_tensor(value, dtype=torch.float64).detach()
+        given = value if isinstance(value, Tensor) else torch.from_numpy(np.array(value, dtype=np.float64))
+        out = given.detach().to(torch.float64)
+    except OverflowError:
+        fail(name, "numbers that a float can hold", "an integer beyond 1.8e308")
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{name}: expected numbers, got {value!r}") from None
     if not bool(torch.isfinite(out).all()):
@@ -225,12 +231,9 @@ class Anchor(VertexEnergy):
 
     def __post_init__(self) -> None:
         if self.vertices is not None:
-            vertices = torch.as_tensor(self.vertices)
-            if vertices.is_floating_point():
-                raise TypeError(f"vertices: expected a bool mask or integer indices, got dtype {vertices.dtype}")
-            object.__setattr__(self, "vertices", vertices)
+            object.__setattr__(self, "vertices", mask_or_indices("vertices", self.vertices))
         object.__setattr__(self, "stiffness", _numbers("stiffness", self.stiffness))
-        if bool((torch.as_tensor(self.stiffness) < 0).any()):
+        if bool((self._spring < 0).any()):
             fail("stiffness", "numbers >= 0 N/m", self.stiffness)
         if self.points is not None:
             object.__setattr__(self, "points", _numbers("points", self.points))
@@ -245,11 +248,17 @@ class Anchor(VertexEnergy):
             shown.append(f"{name}={value}")
         return f"Anchor({', '.join(shown)})"
 
+    @property
+    def _spring(self) -> Tensor:
+        """stiffness, which is a tensor since it was checked."""
+        assert isinstance(self.stiffness, Tensor)
+        return self.stiffness
+
     def count(self) -> int:
         return 4
 
     def check(self, num_vertices: int) -> None:
-        stiffness = torch.as_tensor(self.stiffness)
+        stiffness = self._spring
         if stiffness.dim() > 0 and stiffness.shape != (num_vertices,):
             fail("stiffness", f"a number or shape [{num_vertices}]", f"shape {list(stiffness.shape)}")
         if self.points is not None and self.points.shape != (num_vertices, 3):
@@ -262,20 +271,15 @@ class Anchor(VertexEnergy):
 
     def _mask(self, num_vertices: int) -> Tensor:
         if self.vertices is None:
-            return torch.ones(num_vertices, dtype=torch.bool)
-        if self.vertices.dtype == torch.bool:
-            if self.vertices.shape != (num_vertices,):
-                fail("vertices", f"a mask of shape [{num_vertices}] or indices", f"shape {list(self.vertices.shape)}")
-            return self.vertices
-        index = self.vertices.to(torch.int64).reshape(-1)
-        if index.numel() and (int(index.min()) < 0 or int(index.max()) >= num_vertices):
-            fail("vertices", f"indices in [0, {num_vertices})", f"{int(index.min())}..{int(index.max())}")
-        return torch.zeros(num_vertices, dtype=torch.bool).index_fill(0, index.cpu(), True)
+            return torch.ones(num_vertices, dtype=torch.bool, device="cpu")
+        if self.vertices.dtype == torch.bool and self.vertices.shape == (num_vertices,):
+            return self.vertices  # where it lies: a step copies nothing from the host
+        return vertex_mask(self.vertices, num_vertices, "vertices")
 
     def constants(self, rest_points: Tensor) -> dict[str, Tensor]:
         points = rest_points if self.points is None else self.points.to(rest_points)
         mask = self._mask(rest_points.shape[0]).to(rest_points)
-        return {"stiffness": torch.as_tensor(self.stiffness).to(rest_points).expand(len(mask)) * mask, "points": points}
+        return {"stiffness": self._spring.to(rest_points).expand(len(mask)) * mask, "points": points}
 
     def pack(self, values: dict[str, Tensor], origin: Tensor | None) -> Tensor:
         points = values["points"] if origin is None else values["points"] - origin

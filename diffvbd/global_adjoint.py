@@ -215,7 +215,7 @@ class _Structure(NamedTuple):
 
 
 def _structure(model: Model) -> _Structure:
-    count, tets, free = model.num_vertices, model.tets, ~model.pinned
+    count, tets, free = model.num_vertices, model._topology[0], ~model._pinned
     a, b = (list(corners) for corners in zip(*PAIRS, strict=True))
     rows, columns = tets[:, a + b].reshape(-1), tets[:, b + a].reshape(-1)
     key, term = torch.sort(rows * count + columns, stable=True)

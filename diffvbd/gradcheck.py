@@ -66,11 +66,11 @@ def check_gradients(
     if value.numel() != 1:
         fail("loss", "a scalar", f"shape {list(value.shape)}")
     grads = torch.autograd.grad(value, list(leaves.values()), allow_unused=True, materialize_grads=True)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator("cpu").manual_seed(seed)
     rows = []
     for (name, leaf), grad in zip(leaves.items(), grads, strict=True):
         fixed = {k: t.detach() for k, t in leaves.items()}
-        direction = torch.randn(leaf.shape, dtype=leaf.dtype, generator=generator).to(leaf.device)
+        direction = torch.randn(leaf.shape, dtype=leaf.dtype, generator=generator, device="cpu").to(leaf.device)
         adjoint = float((grad * direction).sum())
         scale = float(leaf.detach().abs().max()) if leaf.numel() else 0.0
         best = (float("inf"), 0.0)

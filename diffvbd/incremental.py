@@ -24,7 +24,8 @@ from .sweeps import SweepTensors
 
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners (a, b) of k_ab, the first six rest scalars
 # a, b and the other two corners c, d, in the order in which det(x_a - x_d, x_b - x_d, x_c - x_d) > 0
-_OF_PAIRS = torch.tensor([(0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2), (1, 2, 0, 3), (1, 3, 2, 0), (2, 3, 0, 1)]).T
+_PAIRS = [(0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2), (1, 2, 0, 3), (1, 3, 2, 0), (2, 3, 0, 1)]
+_OF_PAIRS = torch.tensor(_PAIRS, device="cpu").T
 
 
 def _rolled(vectors: Tensor, by: int) -> Tensor:
@@ -50,7 +51,7 @@ class IncrementalPotential:
         self.origin = tensors.origin if tensors.origin.numel() else None
         rest = tensors.rest
         self.rest = model.derived("rest", lambda: _metric(model)) if rest is None else rest  # [1 | B, T, 7]
-        self.free = (~model.pinned)[:, None].to(x.dtype)
+        self.free = (~model._pinned)[:, None].to(x.dtype)
 
         k = dict(zip(PAIRS, self.rest[..., :6].unbind(-1), strict=True))
         k |= {(b, a): value for (a, b), value in k.items()}

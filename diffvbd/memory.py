@@ -15,25 +15,31 @@ from .adjoints import ReverseSweep
 from .checks import check_count
 from .model import Model
 from .schedule import Binomial, _left, choose_schedule
+from .sweeps import is_out_of_memory
 
 
 @contextlib.contextmanager
 def out_of_memory_named(model: Model, x: Tensor, settings: ops.SweepSettings, policy: int) -> Iterator[None]:
-    """Says of a step that does not fit a CUDA device how much it wanted and which tape would fit."""
-    if not x.is_cuda:
-        yield
-        return
+    """Says of a step that does not fit the memory how much it wanted, and which tape would fit a CUDA device."""
     try:
         yield
-    except RuntimeError as error:
-        if "out of memory" not in str(error):
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error) or isinstance(error, torch.OutOfMemoryError) and not x.is_cuda:
             raise
-        free, _ = torch.cuda.mem_get_info(x.device)
-        free += torch.cuda.memory_reserved(x.device) - torch.cuda.memory_allocated(x.device)
         scalars = x.shape[0] * settings.sweeps * model.num_active * x.element_size()
-        base = 2 * x.numel() * x.element_size() + _cuda_scratch(model, x.shape[0], reverse=False)
+        base = 2 * x.numel() * x.element_size()
+        base += _cuda_scratch(model, x.shape[0], reverse=False) if x.is_cuda else 0
         wanted = {name: base + scalars * ops.tape_rows(code, model.energy_mask) for name, code in _POLICIES.items()}
         chosen = next(name for name, code in _POLICIES.items() if code == policy)
+        if not x.is_cuda:
+            smaller = [f'"{name}" {size} bytes' for name, size in wanted.items() if size < wanted[chosen]]
+            advice = f", or a smaller ReverseSweep(tape=...): {', '.join(smaller)}" if smaller else ""
+            raise torch.OutOfMemoryError(
+                f'CPU out of memory: a step of {settings.sweeps} sweeps with tape="{chosen}" wanted {wanted[chosen]} '
+                f"bytes; use fewer sweeps or scenes{advice}"
+            ) from error
+        free, _ = torch.cuda.mem_get_info(x.device)
+        free += torch.cuda.memory_reserved(x.device) - torch.cuda.memory_allocated(x.device)
         fits = [f'"{name}" ({bytes_wanted} bytes)' for name, bytes_wanted in wanted.items() if bytes_wanted <= free]
         advice = f"ReverseSweep(tape=...) that fits: {', '.join(fits)}" if fits else "no tape policy fits: fewer scenes"
         raise torch.OutOfMemoryError(
@@ -57,7 +63,7 @@ def _cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = 
     if reverse:
         one += 4 * (edge_slots * lanes + 1) + 8 * positions
         one += (2 * pairs if material or rest else 0) + (4 * pairs if rest else 0)
-    one *= model.mass.element_size()
+    one *= model._mass.element_size()
     return one * min(scenes, max(1, WORKSPACE_BUDGET // max(1, one)))
 
 
@@ -94,7 +100,7 @@ def predict(
             scratch: of one backward step, in scenes that run side by side on as many threads;
             total: kept + scratch.
     """
-    item = model.mass.element_size()
+    item = model._mass.element_size()
     steps, scenes = check_count("steps", steps), check_count("scenes", scenes)
     schedule, adjoint = choose_schedule(checkpoint_every, ReverseSweep(tape), model, scenes, steps, sweeps)  # type: ignore[arg-type]
     assert isinstance(adjoint, ReverseSweep)
@@ -153,4 +159,4 @@ def _cpu_scratch(model: Model, scenes: int, material: bool, rest: bool) -> int:
     work = blocks * (22 if model.floor else 16) + 4 * edge_slots
     work += slots * ((2 if material or rest else 0) + (4 if rest else 0))
     threads = torch.get_num_threads()
-    return work * (threads if scenes >= threads else 1) * model.mass.element_size()
+    return work * (threads if scenes >= threads else 1) * model._mass.element_size()

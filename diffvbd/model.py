@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -11,13 +10,15 @@ import torch
 from torch import Tensor
 
 from . import native, ops, ops_rigid, regimes
-from .checks import check_number, check_positive, fail, vertex_mask
+from .checks import check_number, check_positive, check_readable, fail, to_float, vertex_mask
 from .colliders import Collider
 from .contact_surface import ContactSurface, build_surface, check_colliders
 from .energies import VERTEX_ENERGIES, FloorBarrier, StableNeoHookean, VertexEnergy
+from .lasting import lasting, lasting_tensors
 from .mask import CONTACT
 from .mesh import TetMesh
 from .metric import lumped_mass, rest_metric
+from .model_warnings import warn_of
 from .pair_barrier import Friction, PairBarrier
 from .safeguards import FILTER_ETA, SATURATION_EPS
 
@@ -25,8 +26,11 @@ Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction
 
 PAPER_SATURATION = 0.1  # [m]
 PAPER_REGULARIZATION = 1e-6  # [kg]
-STABLE_RELAXATION = 1.7  # largest omega that never grew in the rollouts of docs/numerics.md
-HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
+
+
+def _copy(name: str, text: str) -> Any:
+    """A property that hands out copies of a tensor: what is done to one in place does not reach the Model."""
+    return property(lambda self: getattr(self, name).clone(), doc=text)
 
 
 class Model:
@@ -54,7 +58,7 @@ class Model:
         dtype: torch.float64 or torch.float32.
         device: Where the tensors live.
 
-    Attributes (torch tensors in the user's numbering):
+    Attributes (torch tensors in the user's numbering, a copy at each access):
         rest_points [V, 3] [m]; tets [T, 4]; density [T]; mass [V] [kg]; pinned [V] bool; surface [F, 3];
         color_vertices [active]: the vertices in sweep order, color c being
         ``color_vertices[color_ptr[c]:color_ptr[c + 1]]``; color_ptr [colors + 1]; collider_points [Vc, 3]: where the
@@ -64,6 +68,14 @@ class Model:
         ValueError, TypeError: naming the argument, what was expected and what came.
     """
 
+    rest_points: Tensor = _copy("_rest_points", "Rest positions [m], shape [V, 3].")
+    density: Tensor = _copy("_density", "[kg/m^3], shape [T].")
+    mass: Tensor = _copy("_mass", "Masses of the vertices [kg], shape [V].")
+    pinned: Tensor = _copy("_pinned", "Which vertices sweeps do not move, bool [V].")
+    color_ptr: Tensor = _copy("_color_ptr", "Where each color begins in color_vertices, int [colors + 1].")
+    color_vertices: Tensor = _copy("_color_vertices", "Vertices in sweep order, int [active].")
+
+    @lasting_tensors()
     def __init__(
         self,
         mesh: TetMesh,
@@ -111,8 +123,8 @@ class Model:
         if loose.numel():
             shown = ", ".join(map(str, loose[:5].tolist())) + (", ..." if loose.numel() > 5 else "")
             fail("mesh", "every vertex in a tet, or pinned", f"{loose.numel()} isolated vertices: {shown}")
-        self.density = _per_tet_density(density, mesh.num_tets)
-        self.pinned = mask
+        self._density = _per_tet_density(density, mesh.num_tets)
+        self._pinned = mask
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = _first_of_body(body)
         self._bodies = ops_rigid.find_bodies(points, tets, mask)
@@ -123,7 +135,7 @@ class Model:
         device = _checked_device(device)
         self._arrange(points, tets, device)
         self._measure(points)
-        self._warn()
+        warn_of(self)
         self._place(dtype, device)
 
     def _set_energies(self, energies: tuple[Energy, ...]) -> None:
@@ -144,7 +156,7 @@ class Model:
             if self.friction is not None and self.floor is None:
                 fail("energies", "a FloorBarrier or a PairBarrier for Friction to act on", "none")
             return None
-        return build_surface(self.mesh, self.pinned, self.contact, colliders)
+        return build_surface(self.mesh, self._pinned, self.contact, colliders)
 
     def _checked_rigid(self, rigid: bool | None) -> bool:
         if rigid is None:
@@ -169,7 +181,7 @@ class Model:
     def collider_points(self) -> Tensor:
         """Corner points of the colliders [m], shape [Vc, 3]; a copy."""
         surface = self.surface_of_contact
-        return self.mass.new_zeros((0, 3)) if surface is None else surface.collider_points.clone()
+        return self._mass.new_zeros((0, 3)) if surface is None else surface.collider_points.clone()
 
     @property
     def collider_rows(self) -> tuple[slice, ...]:
@@ -188,13 +200,13 @@ class Model:
     def plane_points(self) -> Tensor:
         """Which rows of collider_points span planes, bool [Vc]."""
         surface = self.surface_of_contact
-        return self.pinned.new_zeros((0,)) if surface is None else surface.plane_points[self.num_vertices :]
+        return self._pinned.new_zeros((0,)) if surface is None else surface.plane_points[self.num_vertices :].clone()
 
     @property
     def collider_radius(self) -> Tensor:
         """How far the surface of a collider lies outside its corner points [m], shape [Vc]."""
         surface = self.surface_of_contact
-        return self.mass.new_zeros((0,)) if surface is None else surface.radius[self.num_vertices :]
+        return self._mass.new_zeros((0,)) if surface is None else surface.radius[self.num_vertices :].clone()
 
     @property
     def contact_numbers(self) -> tuple[float, float, float]:
@@ -213,37 +225,21 @@ class Model:
     def constants(self, energy: VertexEnergy | PairBarrier | Friction) -> dict[str, Tensor]:
         """The parameters of one of the Model's energies, as tensors of its dtype and device."""
         if energy.name not in self._constants:
-            self._constants[energy.name] = energy.constants(self.rest_points)
+            self._constants[energy.name] = energy.constants(self._rest_points)
         return self._constants[energy.name]
-
-    def _warn(self) -> None:
-        """Warns of safeguards outside the range in which they were found to help (docs/numerics.md)."""
-        if not any(isinstance(e, StableNeoHookean) for e in self.energies) and self.mesh.num_tets:
-            _warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
-        if self.relaxation > STABLE_RELAXATION:
-            _warn(f"relaxation: rollouts were seen to gain energy above {STABLE_RELAXATION}, got {self.relaxation:g}")
-        paper = any(isinstance(e, StableNeoHookean) and e.block == "paper" for e in self.energies)
-        if paper and self.relaxation > 1 and self.saturation is None:
-            _warn('relaxation: block="paper" with relaxation > 1 and no saturation may diverge')
-        active = self.mass[~self.pinned]
-        if active.numel() and self.regularization > HEAVY_REGULARIZATION * float(active.min()):
-            _warn(
-                f"regularization: {self.regularization:g} kg is {self.regularization / float(active.min()):.2g} of the "
-                "lightest vertex; the sweeps converge that much more slowly"
-            )
 
     def _arrange(self, points: Tensor, tets: Tensor, device: torch.device) -> None:
         """The order of the sweeps, in the form that a device wants; everything still on the CPU."""
-        plan = ops.build_plan(points, tets, ~self.pinned, ops.LANES[device.type])
-        self._plan, self.color_ptr, self.color_vertices, star_ptr, star = plan
+        plan = ops.build_plan(points, tets, ~self._pinned, ops.LANES[device.type])
+        self._plan, self._color_ptr, self._color_vertices, star_ptr, star = plan
         self._topology = (tets, star_ptr, star)
         self._sizes = ops.plan_sizes(self._plan, device.type)
 
     def _measure(self, points: Tensor) -> None:
         """Everything that follows from the rest positions, in float64."""
         rest, volume = rest_metric(ops.tet_gather(points[None], *self._topology))
-        self.rest_points = points
-        self.mass = lumped_mass(self.density[None], volume, *self._topology)[0]
+        self._rest_points = points
+        self._mass = lumped_mass(self._density[None], volume, *self._topology)[0]
         self._rest = rest
         data = [e.pack(self._parameters(e, points), None) for e in self.vertex_energies]
         self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
@@ -280,6 +276,7 @@ class Model:
         options = {"saturation": PAPER_SATURATION, "regularization": PAPER_REGULARIZATION, **options}
         return cls(mesh, energies=energies, **options)
 
+    @lasting_tensors()
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Model:
         """A new Model on another device or of another dtype (float64 or float32); this one is untouched."""
         dtype = dtype or self.dtype
@@ -302,11 +299,12 @@ class Model:
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_derived": {}}
 
+    @lasting_tensors()
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Unpickles, also where torch.load(map_location=...) has moved the tensors to another device."""
-        self.__dict__.update(state)
+        self.__dict__.update(lasting(state))
         self._derived = {}
-        actual = _checked_device(self.mass.device)
+        actual = _checked_device(self._mass.device)
         if actual != self.device:
             self.__dict__.update(self.to(actual).__dict__)
 
@@ -323,8 +321,8 @@ class Model:
 
     @property
     def tets(self) -> Tensor:
-        """Vertices of each tet, shape [T, 4]."""
-        return self._topology[0]
+        """Vertices of each tet, shape [T, 4]; a copy."""
+        return self._topology[0].clone()
 
     @property
     def surface(self) -> Tensor:
@@ -347,7 +345,7 @@ class Model:
     @property
     def num_colors(self) -> int:
         """Groups of vertices that a sweep updates one after another."""
-        return self.color_ptr.shape[0] - 1
+        return self._color_ptr.shape[0] - 1
 
     def settings(self, time_step: float, sweeps: int, scenes: int = 1) -> ops.SweepSettings:
         """What the kernels execute for this Model besides its tensors; ``scenes`` chooses the regime on CUDA."""
@@ -372,8 +370,8 @@ class Model:
         safeguards += ["rigid=False"] if not self.rigid and not self.touches else []
         safeguards += [f'start="{self.start}"'] if self.start != "predictor" else []
         return (
-            f"Model({self.num_vertices} vertices, {self.num_tets} tets, {int(self.pinned.sum())} pinned, "
-            f"{self.num_colors} colors, mass {float(self.mass.sum()):.4g} kg, "
+            f"Model({self.num_vertices} vertices, {self.num_tets} tets, {int(self._pinned.sum())} pinned, "
+            f"{self.num_colors} colors, mass {float(self._mass.sum()):.4g} kg, "
             f"energies=({', '.join(map(repr, self.energies))})"
             f"{f', {len(self.colliders)} colliders' if self.colliders else ''}"
             f"{''.join(', ' + s for s in safeguards)}, {self.dtype}, {self.device})"
@@ -381,7 +379,10 @@ class Model:
 
 
 def _checked_device(device: torch.device | str) -> torch.device:
-    device = torch.device(device)
+    try:
+        device = torch.device(device)
+    except (RuntimeError, TypeError):
+        fail("device", '"cpu" or "cuda"', repr(device))
     if device.type not in ops.LANES:
         fail("device", '"cpu" or "cuda"', repr(str(device)))
     if device.type == "cuda":
@@ -389,10 +390,6 @@ def _checked_device(device: torch.device | str) -> torch.device:
         if device.index is None:
             device = torch.device("cuda", torch.cuda.current_device())
     return device
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, UserWarning, stacklevel=4)
 
 
 def _checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
@@ -418,6 +415,10 @@ def _checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
 def _per_tet_density(density: Any, num_tets: int) -> Tensor:
     if isinstance(density, bool) or not (isinstance(density, (int, float)) or hasattr(density, "__array__")):
         raise TypeError(f"density: expected a number or shape [{num_tets}], got {type(density).__name__}")
+    if isinstance(density, Tensor):
+        check_readable("density", density)
+    elif isinstance(density, int):
+        density = to_float("density", density)
     density = torch.as_tensor(density).detach().cpu().to(torch.float64)
     if density.shape not in ((), (1,), (num_tets,)):
         fail("density", f"a number or shape [{num_tets}]", f"shape {list(density.shape)}")

@@ -90,7 +90,7 @@ def _scalars_of_data(data_count: Sequence[int]) -> tuple[int, int]:
 
 
 def join_data(shared: Tensor, own: Tensor, data_count: Sequence[int]) -> Tensor:
-    """Adjoints by body [B, bodies, scalars of a scene] and by vertex [B, V, scalars of a vertex] -> of the data [B, n]."""
+    """Adjoints by body [B, bodies, scalars of a scene] and by vertex [B, V, scalars of a vertex] -> of data [B, n]."""
     total = ops.sum_to(shared, (shared.shape[0], 1, shared.shape[2]))[:, 0]
     parts, at = [], {False: 0, True: 0}
     for energy, count in zip(VERTEX_ENERGIES, data_count, strict=True):

@@ -2,8 +2,8 @@
 
     min over (R, t)   1/2 sum m |R r + t - y|^2 + the energies of single vertices,      r = x - center of mass
 
-A rigid motion leaves the energy of the tets as it is, so this costs sums over vertices alone, and it is what few sweeps do
-worst: they see neighbours, not the body. Away from planes and anchors the minimum is closed (means and a polar factor);
+A rigid motion leaves the energy of the tets as it is, so this costs sums over vertices alone, and it is what few sweeps
+do worst: they see neighbours, not the body. Away from planes and anchors the minimum is closed (means and a polar factor);
 else it is Newton's method in six unknowns, differentiated as executed. docs/method.md, section 14.
 """
 

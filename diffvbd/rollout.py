@@ -11,13 +11,16 @@ import torch
 from torch import Tensor
 
 from .adjoints import Adjoint, check_adjoint
-from .arguments import GRAVITY, check_state, prepare, step_settings
+from .arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
 from .checks import check_count, fail
+from .debug import looks_at
 from .model import Model
+from .model_warnings import warn_of_thin_tets
 from .schedule import Binomial, Segment, choose_schedule, run_segments
 from .step import advance
 
-_STATIC = ("mu", "lam", "rest_points", "density")  # enter through prepare(); the others through advance()
+# these enter through prepare(), the others through advance()
+_STATIC = ("mu", "lam", "young", "poisson", "rest_points", "density")
 
 
 @dataclass(frozen=True)
@@ -56,8 +59,10 @@ def rollout(
     v: Tensor,
     *,
     steps: int,
-    mu: Any,
-    lam: Any,
+    mu: Any = None,
+    lam: Any = None,
+    young: Any = None,
+    poisson: Any = None,
     time_step: float,
     sweeps: int,
     force: Any = None,
@@ -82,10 +87,11 @@ def rollout(
         colliders: Corner points of the Model's colliders [m]: constant, they rest there; in :func:`per_step`, where
             they are at the end of each step.
         colliders_before: Where per_step colliders are at the start; None: the Model's collider_points.
-        mu, lam, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in time; or wrapped
-            in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step. A callable may
-            close over tensors and modules that require grad: they get gradients under every schedule. It must be
-            deterministic, because a checkpointed segment calls it again in the backward.
+        mu, lam (or young, poisson), force, gravity, prescribed, rest_points, density, parameters: As in step, constant
+            in time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step.
+            A callable may close over tensors and modules that require grad: they get gradients under every schedule. It
+            must be deterministic, because a checkpointed segment calls it again in the backward. ``prescribed`` may
+            also have the initial x where a vertex is not pinned.
         checkpoint_every: Between checkpoints of n steps only states are kept, and the segment is run again in the
             backward: n keeps steps / n states and the tapes of n steps. ``None`` keeps all tapes.
             :class:`diffvbd.Binomial` keeps a given number of states and one tape. ``"auto"`` keeps all tapes while
@@ -103,8 +109,9 @@ def rollout(
     if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
         fail("save", '"all", "last" or an integer > 0', repr(save))
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
-    options = {"mu": mu, "lam": lam, "rest_points": rest_points, "density": density, "force": force,
-               "gravity": gravity, "prescribed": prescribed, "colliders": colliders}  # fmt: skip
+    options = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "rest_points": rest_points,
+               "density": density, "force": force, "gravity": gravity, "prescribed": prescribed,
+               "colliders": colliders}  # fmt: skip
     if _changes(colliders) and not isinstance(colliders, PerStep):
         raise TypeError("colliders: expected a tensor or per_step, got a callable: a step needs where they come from")
     if colliders_before is not None and not isinstance(colliders, PerStep):
@@ -126,6 +133,12 @@ def rollout(
     settings = step_settings(model, lead, time_step, sweeps)
     chosen: dict[str, Any] = {"time_step": time_step, "sweeps": sweeps, "adjoint": adjoint, "settings": settings}
     fixed = None if changes else prepare(model, lead, **chosen, **static)
+    if fixed is not None and looks_at(fixed.mu) and looks_at(fixed.lam):
+        warn_of_thin_tets(model, fixed.mu, fixed.lam, *fixed.time_step_and_sweeps)
+
+    start, moved = x, options["prescribed"]
+    for value in _tensors(moved):
+        check_prescribed(model, value, x)
 
     def one_step(k: int, x: Tensor, v: Tensor, adjoint: Adjoint) -> tuple[Tensor, Tensor]:
         prepared = fixed
@@ -134,6 +147,8 @@ def rollout(
             now["parameters"] = {name: _at(value, k, x, v) for name, value in parameters.items()}
             prepared = prepare(model, lead, **chosen, **now)
         given = {name: _at(options[name], k, x, v) for name in ("force", "gravity", "prescribed", "colliders")}
+        if _changes(moved) and not isinstance(moved, _Steps):
+            check_prescribed(model, given["prescribed"], x, start)
         if isinstance(options["colliders"], _Steps):
             first = model.collider_points if colliders_before is None else colliders_before
             given["colliders_before"] = options["colliders"][k - 1] if k else first
@@ -165,9 +180,9 @@ def rollout(
                 bar.show(k + 1)
         return Segment(x, v, frames, observed)
 
-    start = [] if save == "last" and steps > 0 else [(0, x, v)]
+    first = [] if save == "last" and steps > 0 else [(0, x, v)]
     done = run_segments(segment, steps, x, v, every if torch.is_grad_enabled() else None)
-    frames = start + done.frames
+    frames = first + done.frames
     return Trajectory(
         x=torch.stack([f[1] for f in frames]),
         v=torch.stack([f[2] for f in frames]),

@@ -70,7 +70,7 @@ def choose_schedule(
         if isinstance(checkpoint_every, str):
             fail("checkpoint_every", '"auto", None, an integer > 0 or Binomial(snapshots)', repr(checkpoint_every))
         return check_count("checkpoint_every", checkpoint_every, 1), adjoint
-    row = scenes * check_count("sweeps", sweeps) * model.num_active * model.mass.element_size()
+    row = scenes * check_count("sweeps", sweeps) * model.num_active * model._mass.element_size()
     if not isinstance(adjoint, ReverseSweep):  # a step of GlobalAdjoint keeps a few states and no tape
         kept = UNROLLED_SCALARS * row if isinstance(adjoint, Unrolled) else 0
         return None if steps * kept <= TAPE_BUDGET else max(1, math.isqrt(steps)), adjoint

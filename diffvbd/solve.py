@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .adjoints import Adjoint, GlobalAdjoint, check_adjoint
-from .arguments import GRAVITY, acceleration_of, check_state, prepare
+from .arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare
 from .checks import check_count, check_positive, fail
 from .global_adjoint import global_sweep
 from .incremental import IncrementalPotential
@@ -46,8 +46,10 @@ def solve(
     x: Tensor,
     v: Tensor,
     *,
-    mu: float | Tensor,
-    lam: float | Tensor,
+    mu: float | Tensor | None = None,
+    lam: float | Tensor | None = None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
     time_step: float,
     tolerance: float = 1e-8,
     max_sweeps: int = 10_000,
@@ -68,8 +70,8 @@ def solve(
     (in float32, or far from the origin, that can be much) counts as converged.
 
     Args:
-        model, x, v, mu, lam, time_step, force, gravity, prescribed, rest_points, density, parameters: As in
-            :func:`diffvbd.step`; x, v of shape [..., V, 3].
+        model, x, v, mu, lam, young, poisson, time_step, force, gravity, prescribed, rest_points, density, parameters:
+            As in :func:`diffvbd.step`; x, v of shape [..., V, 3].
         tolerance: Residual in (0, 1) at which the sweeps end. A gradient of GlobalAdjoint is off by about that, times
             the conditioning of the step.
         max_sweeps: Number of sweeps after which to give up.
@@ -96,9 +98,10 @@ def solve(
     max_sweeps, check_every = check_count("max_sweeps", max_sweeps), check_count("check_every", check_every, 1)
     if on_failure not in ("raise", "warn"):
         fail("on_failure", '"raise" or "warn"', repr(on_failure))
-    options: dict[str, Any] = {"mu": mu, "lam": lam, "time_step": time_step, "rest_points": rest_points,
-                               "density": density, "parameters": parameters}  # fmt: skip
+    options: dict[str, Any] = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "time_step": time_step,
+                               "rest_points": rest_points, "density": density, "parameters": parameters}  # fmt: skip
     prepared = prepare(model, lead, sweeps=0, **options)
+    check_prescribed(model, prescribed, x)
     settings = prepared.settings
     loads: dict[str, Any] = {"force": force, "gravity": gravity, "prescribed": prescribed}
     begun = begin(model, x, v, prepared, force, acceleration_of(gravity, x), prescribed)
@@ -139,7 +142,7 @@ def solve(
 
     if isinstance(adjoint, GlobalAdjoint):
         # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph
-        begun = begun._replace(x_start=torch.where(model.pinned[:, None], begun.x_start, end))
+        begun = begun._replace(x_start=torch.where(model._pinned[:, None], begun.x_start, end))
         x_end, v_end = begun.finish(global_sweep(model, begun.tensors(prepared), settings, adjoint), time_step)
     else:
         again = prepare(model, lead, sweeps=count, adjoint=adjoint, **options)

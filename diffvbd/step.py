@@ -16,16 +16,18 @@ from .arguments import (
     Prepared,
     acceleration_of,
     broadcastable,
+    check_prescribed,
     check_state,
     collider_state,
     name_argument,
     prepare,
 )
 from .contact_step import run_contact
-from .debug import check_on_cpu
+from .debug import check_on_cpu, looks_at
 from .global_adjoint import global_sweep
 from .memory import out_of_memory_named
 from .model import Model
+from .model_warnings import warn_of_thin_tets
 from .rigid import coast, correct
 from .scopes import checking
 from .sweeps import SweepTensors, fused_step, sweep
@@ -36,8 +38,10 @@ def step(
     x: Tensor,
     v: Tensor,
     *,
-    mu: float | Tensor,
-    lam: float | Tensor,
+    mu: float | Tensor | None = None,
+    lam: float | Tensor | None = None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
     time_step: float,
     sweeps: int,
     force: Tensor | None = None,
@@ -58,12 +62,14 @@ def step(
         v: Velocities [m/s], shape of x.
         mu: Shear modulus [Pa], broadcasts to x.shape[:-2] + (T,); a value per scene is [B, 1].
         lam: First Lame parameter [Pa], likewise. mu >= 0 and mu + lam >= 0 (lam >= 0 with block="paper").
+        young, poisson: Young's modulus [Pa] and Poisson's ratio [-] in place of mu and lam, likewise
+            (:func:`diffvbd.lame`).
         time_step: h [s] > 0.
         sweeps: K >= 0, the number of colored sweeps that are executed (and differentiated).
         force: External forces [N], broadcasts to x.shape.
         gravity: Acceleration [m/s^2], 3 numbers, or a tensor that broadcasts to x.shape.
-        prescribed: Positions of pinned vertices at the end of the step [m], broadcasts to x.shape; read only where
-            pinned. None holds them where x has them.
+        prescribed: Positions of pinned vertices at the end of the step [m], broadcasts to x.shape; None holds
+            them where x has them. Where a vertex is not pinned it must have x, the Model's rest_points or NaN.
         colliders: Corner points of the Model's colliders at the end of the step [m], broadcasts to
             x.shape[:-2] + (Vc, 3). None: the Model's collider_points.
         colliders_before: The same at the start of the step, where they move. None: they rest.
@@ -85,8 +91,11 @@ def step(
     Source: paper, eqs. 1-3 and section 3; docs/method.md.
     """
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
-    prepared = prepare(model, lead, mu=mu, lam=lam, time_step=time_step, sweeps=sweeps, rest_points=rest_points,
-                       density=density, parameters=parameters, adjoint=adjoint)  # fmt: skip
+    prepared = prepare(model, lead, mu=mu, lam=lam, young=young, poisson=poisson, time_step=time_step, sweeps=sweeps,
+                       rest_points=rest_points, density=density, parameters=parameters, adjoint=adjoint)  # fmt: skip
+    check_prescribed(model, prescribed, x)
+    if looks_at(prepared.mu) and looks_at(prepared.lam):
+        warn_of_thin_tets(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps)
     return advance(model, x, v, prepared, force=force, gravity=gravity, prescribed=prescribed, colliders=colliders,
                    colliders_before=colliders_before, adjoint=adjoint)  # fmt: skip
 
@@ -151,7 +160,7 @@ def begin(
     if force is not None:
         total = ops.broadcast(broadcastable("force", force, x), shape).reshape(flat)
         # A pinned vertex is moved by no force, whatever stands there.
-        total = torch.where(model.pinned[:, None], torch.zeros_like(total), total)
+        total = torch.where(model._pinned[:, None], torch.zeros_like(total), total)
         weight = ops.broadcast(prepared.mass, (flat[0], flat[1]))[..., None]
         # A vertex without mass is isolated and pinned: no force moves it.
         acceleration = acceleration + total / torch.where(weight > 0, weight, torch.ones_like(weight))
@@ -166,7 +175,7 @@ def begin(
     if prescribed is not None:
         held = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
         held = held if origin is None else held - origin
-    y = torch.where(model.pinned[:, None], held, y)
+    y = torch.where(model._pinned[:, None], held, y)
     data = _energy_data(model, prepared, origin)
     x_start = y
     if model.corrects or model.start == "inertia":
@@ -180,7 +189,7 @@ def begin(
             if model._bodies.order.shape[0] < model.num_vertices:
                 alone = model.floor.filter(start, move, planes, origin)
                 x_start = torch.where(model._corrected[:, None], x_start, alone)
-        x_start = torch.where(model.pinned[:, None], y, x_start)
+        x_start = torch.where(model._pinned[:, None], y, x_start)
     begun = Begun(x_start, start, y, data, origin)
     return begun._replace(x_start=begun.corrected(x_start, model, prepared))
 
@@ -250,7 +259,7 @@ def swept(
                                     lambda x: begun.corrected(x, model, prepared))  # fmt: skip
             return sweep(*tensors, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)
     except ValueError as error:
-        name_argument(error, given)
+        name_argument(model, error, given)
         raise
 
 

@@ -14,18 +14,32 @@ from torch.autograd import Function
 from . import ops
 from .regimes import BLOCK, FEW_LANES, THREAD
 
+_FAILED_ALLOCATION = (
+    "out of memory", "can't allocate memory", "bad_alloc", "Storage size calculation overflowed", '"aten::new_'
+)  # fmt: skip
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an allocation failed. On the CPU an operator can only say which of torch's functions gave up."""
+    text = str(error)
+    return any(part in text for part in _FAILED_ALLOCATION)
+
 
 @contextlib.contextmanager
-def backward_memory() -> Iterator[None]:
-    """Says what to change where a backward does not fit a CUDA device."""
+def backward_memory(x: Tensor, settings: ops.SweepSettings, tape_policy: int) -> Iterator[None]:
+    """Says what to change where the backward of a step does not fit."""
     try:
         yield
-    except RuntimeError as error:
-        if "out of memory" not in str(error):
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error):
             raise
+        rows = ops.tape_rows(ops.FULL_TAPE, settings.energies) if tape_policy == ops.NO_TAPE else 0
+        made = x.shape[0] * settings.sweeps * settings.sizes[0] * rows * x.element_size()
+        bytes_wanted = f", which runs the step again with a tape of {made} bytes" if made else ""
+        native = f" ({error})" if x.is_cuda else ""
         raise torch.OutOfMemoryError(
-            f"CUDA out of memory in the backward of a step ({error}): use fewer scenes, a smaller tape "
-            '(ReverseSweep(tape="compact"), then "recompute") or more checkpoints'
+            f"{x.device.type.upper()} out of memory in the backward of a step{bytes_wanted}{native}: use fewer sweeps "
+            'or scenes, a smaller tape (ReverseSweep(tape="compact"), then "recompute") or more checkpoints'
         ) from error
 
 
@@ -87,7 +101,7 @@ class _SweepBackward(Function):
     @staticmethod
     def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, packed_rest, plan, x, tape,
                 settings, tape_policy, needs):  # fmt: skip
-        with backward_memory():
+        with backward_memory(x, settings, tape_policy):
             if rest is not None:
                 packed_rest = ops.pack_rest(rest, plan, settings.sizes)
             inputs = (x_prev, y, mu, lam, mass, packed_rest, energy_data, origin)
@@ -232,7 +246,7 @@ class _FusedBackward(Function):
     @staticmethod
     def forward(x_bar, v_bar, x, v, acceleration, held, mu, lam, mass, rest, packed_rest, plan, x_end, tape, settings,
                 tape_policy, needs):  # fmt: skip
-        with backward_memory():
+        with backward_memory(x, settings, tape_policy):
             if rest is not None:
                 packed_rest = ops.pack_rest(rest, plan, settings.sizes)
             inputs = (x, v, acceleration, held, mu, lam, mass, packed_rest)

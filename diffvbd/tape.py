@@ -9,12 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .checks import fail
+from .arguments import check_state
+from .checks import check_tensor, fail, to_float
 from .model import Model
 from .step import step
 
-_ARGUMENTS = ("x", "v", "mu", "lam", "force", "gravity", "prescribed", "rest_points", "density", "colliders",
-              "colliders_before")  # fmt: skip
+_ARGUMENTS = ("x", "v", "mu", "lam", "young", "poisson", "force", "gravity", "prescribed", "rest_points", "density",
+              "colliders", "colliders_before")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -35,14 +36,19 @@ def step_forward(
 
     Args:
         model, x, v, options: As in :func:`diffvbd.step`; works under torch.no_grad() too.
-        wrt: Names of the arguments to differentiate: x, v, mu, lam, force, gravity, prescribed, rest_points, density,
-            colliders, colliders_before, or a name in ``parameters``. Only these leave a tape.
+        wrt: Names of the arguments to differentiate: x, v, mu, lam, young, poisson, force, gravity, prescribed,
+            rest_points, density, colliders, colliders_before, or a name in ``parameters``. Only these leave a tape.
 
     Returns:
         Positions, velocities (both detached) and the tape.
     """
-    if isinstance(wrt, str):
-        wrt = (wrt,)
+    wrt = (wrt,) if isinstance(wrt, str) else wrt
+    if not isinstance(wrt, Sequence) or not all(isinstance(name, str) for name in wrt):
+        raise TypeError(f"wrt: expected names of arguments, got {wrt!r}")
+    check_state(model, x, v)
+    if not isinstance(options.get("parameters"), dict | None):
+        got = type(options["parameters"]).__name__
+        raise TypeError(f"parameters: expected a dict of tensors by name, got {got}")
     values: dict[str, Any] = {"x": x, "v": v, **options}
     parameters = dict(options.get("parameters") or {})
     if "rest_points" in wrt and values.get("rest_points") is None:
@@ -54,9 +60,10 @@ def step_forward(
         place = values if name in _ARGUMENTS else parameters
         value = place.get(name)
         if isinstance(value, (int, float)) and not isinstance(value, bool):
-            value = torch.tensor(float(value), dtype=model.dtype, device=model.device)
+            value = torch.tensor(to_float(name, value), dtype=model.dtype, device=model.device)
         if not isinstance(value, Tensor):
             fail("wrt", "names of given tensors", f"{name!r}, which is {type(value).__name__}")
+        check_tensor(name, value, model._mass)
         place[name] = inputs[name] = value.detach().requires_grad_()
     values["parameters"] = parameters or None
     with torch.enable_grad():

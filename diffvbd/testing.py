@@ -241,7 +241,7 @@ def build_scene(case: str, kind: str = "structured", size: str = "small") -> Sce
         "density": per_tet(c.density),
         "force": c.force * rng.uniform(-1, 1, full),
         "gravity": np.asarray(c.gravity),
-        "prescribed": x + c.size * c.jitter * rng.uniform(-1, 1, full),
+        "prescribed": np.where(pinned[:, None], x + c.size * c.jitter * rng.uniform(-1, 1, full), np.nan),
         "rest_points": points,
     }
     return Scene(f"{case}-{kind}-{size}", c, points, tets, pinned, arrays)

@@ -128,7 +128,8 @@ def obstacles() -> Scene:
     scene.inputs["colliders_before"] = points + noise("obstacles", "before", shape=points.shape, size=2e-4)
     moved = noise("obstacles", "move", shape=points.shape, size=5e-4)
     scene.inputs["colliders"] = scene.inputs["colliders_before"] + moved
-    scene.inputs["prescribed"] = scene.x + noise("obstacles", "held", shape=scene.x.shape, size=5e-4)
+    held = scene.x + noise("obstacles", "held", shape=scene.x.shape, size=5e-4)
+    scene.inputs["prescribed"] = torch.where(scene.model.pinned[:, None], held, torch.nan)
     return scene
 
 

@@ -1,6 +1,11 @@
 """The command line: what it writes, what it recovers, and how it refuses."""
 
+import io
+import json
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +13,9 @@ import pytest
 
 import diffvbd as dv
 from diffvbd.cli import main
+from diffvbd.tasks import archive
+from diffvbd.tasks.folder import alone_in
+from diffvbd.tasks.scene import Observation
 
 SCENE = ["--steps", "12", "--time-step", "0.01", "--sweeps", "8", "--pin", "x-"]
 
@@ -64,7 +72,7 @@ def test_young_and_poisson_mean_their_lame_parameters(mesh_file: Path, tmp_path:
     files = [tmp_path / "a.npz", tmp_path / "b.npz"]
     materials = (["--young", 1.3e5, "--poisson", 0.3], ["--mu", 5e4, "--lam", 7.5e4])
     for file, material in zip(files, materials, strict=True):
-        arguments = ["--out", tmp_path / "part.pvd", *SCENE, *material, "--save-target", file]
+        arguments = ["--force", "--out", tmp_path / "part.pvd", *SCENE, *material, "--save-target", file]
         assert run("simulate", mesh_file, *arguments) == 0
     a, b = (dict(np.load(file)) for file in files)
     assert (a["mu"], a["lam"]) == (pytest.approx(5e4), pytest.approx(7.5e4))
@@ -118,6 +126,32 @@ def test_identify_from_one_final_shape(mesh_file: Path, tmp_path: Path) -> None:
         (["simulate", "MESH", "--out", "a.pvd", "--young", "1e5", "--poisson", "0.5"], "--poisson"),
         (["simulate", "MESH", "--out", "a.pvd", "--mu=-1"], "mu"),
         (["simulate", "MESH", "--out", "a.pvd", "--time-step", "0"], "time_step"),
+        (["simulate", "MESH", "--out", "a.pvd", "--device", "bogus"], "device: expected one of this machine"),
+        (["simulate", "MESH", "--out", "a.pvd", "--steps", str(2**62)], "--steps: expected an integer from 0 to"),
+        (["simulate", "MESH", "--out", "a.pvd", "--steps", "-1"], "--steps"),
+        (["simulate", "MESH", "--out", "a.pvd", "--friction", "0.5"], "FloorBarrier"),
+        (["simulate", "MESH", "--out", "a.pvd", "--relaxation", "2"], "relaxation"),
+        (["simulate", "MESH", "--out", "there.pvd"], "there.pvd would be overwritten; give --force"),
+        (["simulate", "MESH", "--out", "frames.pvd"], "frames_0003.vtu would be overwritten; give --force"),
+        (["simulate", "MESH", "--out", "new.pvd", "--save-target", "shape.npz"], "shape.npz would be overwritten"),
+        (["simulate", "frames_0003.vtu", "--out", "frames.pvd", "--force"], "would overwrite frames_0003.vtu"),
+        (["simulate", "MESH", "--out", "a.pvd", "--force", "--save-target", "MESH"], "--save-target: expected a file"),
+        (["identify", "MESH", "SHAPE", "--device", "bogus", "--steps", "3"], "device: expected one of this machine"),
+        (["identify", "MESH", "SHAPE", "--steps", str(2**62)], "--steps: expected an integer from 0 to 10000000"),
+        (["identify", "MESH", "SHAPE", "--steps", "3", "--start-young", "1e5"], "--start-poisson"),
+        (["identify", "MESH", "SHAPE", "--steps", "3", "--start-young", "1e5", "--start-poisson", "0.6"], "poisson"),
+        (["identify", "MESH", "SHAPE", "--steps", "3", "--start", "1", "1", "--start-young", "1"], "--start"),
+        (["identify", "MESH", "SHAPE", "--steps", "3", "--start", "nan", "1"], "start"),
+        (["identify", "MESH", "none.npz"], "x: expected at least one observed shape, got none"),
+        (["identify", "MESH", "decreasing.npz"], "steps: expected 2 increasing integers from 0 to 10000000"),
+        (["identify", "MESH", "far.npz"], "the last >= 1, got 1 to 4611686018427387904"),
+        (["identify", "MESH", "sweeps.npz"], "sweeps: expected an integer, got [3, 4]"),
+        (["identify", "MESH", "gravity.npz"], "gravity: expected finite numbers of shape [3], got -9.81"),
+        (["identify", "MESH", "pinned.npz"], "pinned: expected bool of shape [45], got [0, 3]"),
+        (["identify", "MESH", "words.npz"], "x: expected numbers, got dtype <U4"),
+        (["identify", "MESH", "claims.npz"], "claims.npz: expected an .npz file"),
+        (["identify", "MESH", "cut.npz"], "cut.npz: expected an .npz file"),
+        (["identify", "MESH", "bomb.npz"], "expected at most 1000000 bytes of arrays, got 8000128 when unpacked"),
         (["identify", "MESH", "missing.npz"], "missing.npz"),
         (["identify", "MESH", "MESH"], "expected an .npz file"),
         (["identify", "MESH", "SHAPE"], "--steps"),
@@ -131,11 +165,105 @@ def test_an_error_is_one_clear_line_and_status_2(
     monkeypatch.chdir(tmp_path)
     np.savez("shape.npz", x=dv.mesh.load(mesh_file).points)
     np.savez("wrong.npz", x=np.zeros((3, 4, 3)))
+    damaged_targets(dv.mesh.load(mesh_file).points)
+    monkeypatch.setattr(archive, "MOST_BYTES", 10**6)
+    monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))  # no terminal: not asked
+    Path("there.pvd").touch()
+    dv.mesh.load(mesh_file).save("frames_0003.vtu")
+    kept = {path: path.read_bytes() for path in tmp_path.iterdir()}
     names = {"MESH": mesh_file, "SHAPE": "shape.npz", "WRONG": "wrong.npz"}
     assert run(*(names.get(a, a) for a in arguments)) == 2
     error = capsys.readouterr().err
     assert error.startswith("diffvbd: error: ") and error.count("\n") == 1
     assert message in error
+    assert {path: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == kept
+
+
+def damaged_targets(points: np.ndarray) -> None:
+    """Targets that are almost right, in the present folder."""
+    two = np.stack([points, points + 0.1])
+    np.savez("none.npz", x=two[:0])
+    np.savez("decreasing.npz", x=two, steps=np.array([5, 3], dtype=np.uint64))
+    np.savez("far.npz", x=two, steps=np.array([1, 2**62]))
+    np.savez("sweeps.npz", x=two, sweeps=[3, 4])
+    np.savez("gravity.npz", x=two, gravity=-9.81)
+    np.savez("pinned.npz", x=two, pinned=[0, 3])
+    np.savez("words.npz", x=np.array(["soft"]))
+    np.savez_compressed("bomb.npz", x=np.zeros(10**6))
+    Path("cut.npz").write_bytes(Path("none.npz").read_bytes()[:-40])
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (2**50,)})
+    with zipfile.ZipFile("claims.npz", "w") as file:
+        file.writestr("x.npy", header.getvalue() + bytes(80))
+
+
+def test_simulate_makes_folders_and_asks_before_it_overwrites(
+    mesh_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    out, target = tmp_path / "a" / "b" / "part.pvd", tmp_path / "c" / "target.npz"
+    arguments = ["simulate", mesh_file, "--out", out, "--save-target", target, *SCENE]
+    assert run(*arguments) == 0
+    first = target.read_bytes()
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr("sys.stdin", terminal)
+    asked: list[str] = []
+    for answer, status in (("n", 2), ("", 2), ("y", 0)):
+        monkeypatch.setattr("builtins.input", lambda text, answer=answer: asked.append(text) or answer)
+        assert run(*arguments, "--mu", 5e4) == status
+        assert (target.read_bytes() == first) == (status == 2)
+    assert len(asked) == 3 and all(f"overwrite {out} and 14 more?" in text for text in asked)
+    assert "nothing was written" in capsys.readouterr().err
+    assert run(*arguments, "--force") == 0 and len(asked) == 3
+
+
+def test_friction_and_relaxation_are_part_of_the_scene(mesh_file: Path, tmp_path: Path) -> None:
+    low = dv.mesh.load(mesh_file).points[:, 1].min()
+    ends = {}
+    options = ["--floor", low - 0.002, "--dhat", 0.005, "--velocity", 1, 0, 0, "--steps", 12, "--time-step", 0.01]
+    for name, more in {"smooth": [], "rough": ["--friction", 0.8], "relaxed": ["--relaxation", 1.5]}.items():
+        target = tmp_path / f"{name}.npz"
+        out = ["--out", tmp_path / f"{name}.pvd", "--save-target", target]
+        assert run("simulate", mesh_file, *out, *options, *more) == 0
+        content = np.load(target)
+        ends[name] = content["x"][-1]
+        assert ("friction" in content, "relaxation" in content) == (name == "rough", name == "relaxed")
+        scene = Observation.load(target, dv.mesh.load(mesh_file)).scene
+        assert (scene.friction, scene.relaxation) == (0.8 if name == "rough" else None, 1.5 if name == "relaxed" else 1)
+    assert ends["rough"][:, 0].mean() < ends["smooth"][:, 0].mean() - 0.01
+    assert not np.array_equal(ends["relaxed"], ends["smooth"])
+
+
+def test_identify_starts_from_young_and_poisson(mesh_file: Path, tmp_path: Path, capsys) -> None:
+    target = tmp_path / "target.npz"
+    material = ["--young", 1e5, "--poisson", 0.3]
+    assert run("simulate", mesh_file, "--out", tmp_path / "a.pvd", *SCENE, *material, "--save-target", target) == 0
+    start = ["--start-young", 2.6e4, "--start-poisson", 0.3, "--iterations", 60, "--out", tmp_path / "run"]
+    assert run("identify", mesh_file, target, *start) == 0
+    log = json.loads((tmp_path / "run" / "log.json").read_text())
+    assert [log["history"][0][name] for name in ("mu", "lam")] == pytest.approx([1e4, 1.5e4])
+    assert "Young's modulus 1" in capsys.readouterr().out
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out = tmp_path / "run"
+    code = "import sys; from pathlib import Path; from diffvbd.tasks.folder import alone_in\n"
+    code += "with alone_in(Path(sys.argv[1])): print('in', flush=True); sys.stdin.read()"
+    other = subprocess.Popen(
+        [sys.executable, "-c", code, out], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert other.stdout is not None and other.stdout.readline() == "in\n"
+        assert run("run", "beam-mu", "--quick", "--out", out) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("diffvbd: error: out: expected a folder that no other run works in")
+        assert error.count("\n") == 1 and list(out.iterdir()) == []
+    finally:
+        other.kill()  # as a crash: nothing is cleaned up
+        other.communicate()
+    with alone_in(out):
+        pass
+    assert list(out.iterdir()) == []
 
 
 def test_wrong_usage_has_status_2() -> None:

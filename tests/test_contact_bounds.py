@@ -218,7 +218,9 @@ def test_a_prescribed_body_pushes() -> None:
     h, rise = 1 / 100, torch.tensor([0.0, 0.2 / 100, 0.0], dtype=torch.float64)
     start = x
     for n in range(40):
-        x, v = dv.step(model, x, v, time_step=h, sweeps=8, prescribed=x + rise, **MATERIAL)
+        x, v = dv.step(
+            model, x, v, time_step=h, sweeps=8, prescribed=torch.where(model.pinned[:, None], x + rise, x), **MATERIAL
+        )
         assert apart(model, x)
         assert relative_error(x[:8], start[:8] + (n + 1) * rise) <= 1e-14
         assert dv.contact.status(model).above_bounds == 0
@@ -231,7 +233,7 @@ def test_prescribed_motion_above_a_bound(device: str, value_checks: None, detect
     model, x, v = falling_on(0.0, detections=detections)
     model, x, v = model.to(device), x.to(device), v.to(device)
     step: dict[str, Any] = {"time_step": 1 / 100, "sweeps": 4, "gravity": WEIGHTLESS, **MATERIAL}
-    up = torch.tensor([0.0, height, 0.0], dtype=torch.float64, device=device)
+    up = torch.tensor([0.0, height, 0.0], dtype=torch.float64, device=device) * model.pinned[:, None]
     end, _ = dv.step(model, x, v, prescribed=x + up, **step)
     assert dv.contact.status(model).above_bounds == 0 and apart(model, end)
     with pytest.raises(ValueError, match=r"prescribed or colliders: expected motion below .* got \d+ points .*"

@@ -122,7 +122,7 @@ def odd_scene(name: str, scenes: tuple[int, ...]) -> tuple[dv.Model, dict[str, A
         "mu": 1e4 * (1 + noise(*scenes, model.num_tets or 1, size=0.5)),
         "lam": torch.tensor(2e4, dtype=torch.float64),
         "force": noise(*full, size=1.0),
-        "prescribed": x + noise(*full, size=0.01),
+        "prescribed": torch.where(model.pinned[:, None].cpu(), x + noise(*full, size=0.01), torch.nan),
         "rest_points": model.rest_points + noise(model.num_vertices, 3, size=0.01),
         "density": torch.tensor(90.0, dtype=torch.float64),
         "time_step": 0.02,

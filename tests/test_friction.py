@@ -238,7 +238,7 @@ def test_a_moving_support_drags(support: str) -> None:
     x, v = block.x, torch.zeros_like(block.x)
     points = block.model.collider_points
     for n in range(steps):
-        moved: dict[str, Any] = {"prescribed": x + shift}
+        moved: dict[str, Any] = {"prescribed": x + shift * block.model.pinned[:, None]}
         if support == "plane":
             moved = {"colliders_before": points + n * shift, "colliders": points + (n + 1) * shift}
         x, v = dv.step(block.model, x, v, mu=LAME, lam=LAME, time_step=h, sweeps=SWEEPS, **moved)

@@ -266,7 +266,7 @@ def test_inputs_are_untouched(device: str) -> None:
         trajectory = dv.rollout(model, **inputs, steps=3, sweeps=2)
     assert torch.equal(trajectory.x[0], inputs["x"])
     trajectory.x.zero_()
-    assert all(torch.equal(inputs[k], before[k]) for k in before)
+    assert all(torch.equal(inputs[k].nan_to_num(), before[k].nan_to_num()) for k in before)  # NaN: not read
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,8 @@
 """The rigid correction of every free body, in plain torch: the same executed steps, differentiated by autograd.
 
-For each body the rigid motion of least  1/2 sum m |R r + c - y|^2 + energies of single vertices.  Where no such energy acts
-at the polar fit of x to y, that fit is it; else at most ITERATIONS Newton steps (Gauss-Newton block, exact exponential),
-each halved until the potential does not rise and no vertex loses more of a gap than an update may take.
+For each body the rigid motion of least  1/2 sum m |R r + c - y|^2 + energies of single vertices.  Where no such energy
+acts at the polar fit of x to y, that fit is it; else at most ITERATIONS Newton steps (Gauss-Newton block, exact
+exponential), each halved until the potential does not rise and no vertex loses more of a gap than an update may take.
 """
 
 from typing import Any
@@ -207,8 +207,8 @@ def _turned_by(w: Tensor) -> Tensor:
 
 
 def _polar(b: Tensor) -> Tensor:
-    """The rotation closest to b [..., 3, 3]: by its singular values, then one Newton step, which carries the derivative.
-    The identity where b determines none."""
+    """The rotation closest to b [..., 3, 3]: by its singular values, then one Newton step, which carries the
+    derivative. The identity where b determines none."""
     with torch.no_grad():
         u, _, vt = torch.linalg.svd(b)
         sign = torch.ones_like(b[..., 0])

@@ -52,7 +52,7 @@ def build_scene(
         value = value.expand(*value.shape[:-1], layout.tets.shape[1])
         return value if layout.order is None else value[..., layout.order]
 
-    points = torch.as_tensor(model.rest_points if rest_points is None else rest_points)
+    points = torch.as_tensor(model.rest_points if rest_points is None else rest_points, device=like.device)
     points = points.to(like).transpose(-1, -2)
     a, b, c, d = (points[..., corner] for corner in layout.tets)
     # Rows of Dm^-1, Dm = [b-a, c-a, d-a], are the gradients of the shape functions of b, c, d.

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..arguments import GRAVITY, acceleration_of, name_value
-from ..checks import check_broadcast, check_positive, check_tensor, fail, vertex_mask
+from ..arguments import GRAVITY, acceleration_of
+from ..checks import check_broadcast, check_positive, check_tensor, check_time_step, fail, name_value, vertex_mask
+from ..lasting import lasting_tensors
 from ..mesh import TetMesh
 from ..model import _checked_device
 
@@ -34,6 +35,7 @@ class ParticleSolver:
         ValueError, TypeError: naming the argument, what was expected and what came.
     """
 
+    @lasting_tensors()
     def __init__(
         self,
         points: Any,
@@ -45,7 +47,7 @@ class ParticleSolver:
     ) -> None:
         if dtype not in (torch.float64, torch.float32):
             raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
-        device = checked_device(device)
+        device = _checked_device(device)
         self.rest_points: Tensor | None = None
         if isinstance(points, bool) or not isinstance(points, (int, np.integer)):
             self.rest_points = numbers("points", points, dtype, device)
@@ -85,7 +87,7 @@ class ParticleSolver:
                 fail(name, f"shape [..., {self.num_points}, 3]", f"shape {list(value.shape)}")
         if v.shape != x.shape:
             fail("v", f"x's shape {list(x.shape)}", f"shape {list(v.shape)}")
-        h, pinned = checked_time_step(time_step, self.mass.dtype), self.pinned[:, None]
+        h, pinned = check_time_step(time_step, self.mass.dtype), self.pinned[:, None]
         masses = self.mass if mass is None else self.per("mass", mass, x, self.num_points)
         if mass is not None and not masses.is_cuda:  # on CUDA a look would wait for the device
             self._check_mass(masses.detach())
@@ -124,25 +126,6 @@ class ParticleSolver:
             if bool(wrong.any()):
                 fail(name, f"{'' if least == '> 0' else 'finite '}numbers {least}", float(value.detach()[wrong][0]))
         return ops.broadcast(value, (*value.shape[:-1], count))
-
-
-def checked_device(device: Any) -> torch.device:
-    """As a Model's; raises ValueError for a name that torch does not know."""
-    try:
-        device = torch.device(device)
-    except (RuntimeError, TypeError):
-        fail("device", '"cpu" or "cuda"', repr(device))
-    return _checked_device(device)
-
-
-def checked_time_step(time_step: Any, dtype: torch.dtype) -> float:
-    """h [s] > 0, with an h^2 that dtype can hold."""
-    if isinstance(time_step, Tensor) and time_step.requires_grad:
-        raise TypeError("time_step: expected a number, got a tensor that requires grad: it is not differentiable")
-    h, limits = check_positive("time_step", time_step, "s"), torch.finfo(dtype)
-    if not limits.tiny <= h * h <= limits.max:
-        fail("time_step", f"a number of seconds whose square lies between {limits.tiny:.1e} and {limits.max:.1e}", h)
-    return h
 
 
 def all_finite(value: Tensor) -> bool:
@@ -212,7 +195,6 @@ __all__ = [
     "check_finite",
     "checked_edges",
     "checked_mesh",
-    "checked_time_step",
     "mesh_edges",
     "mesh_mass",
     "numbers",

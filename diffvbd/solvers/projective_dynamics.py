@@ -9,7 +9,8 @@ from typing import Any, NamedTuple, NoReturn
 import torch
 from torch import Tensor
 
-from ..checks import fail
+from ..checks import check_time_step, fail
+from ..lasting import lasting_tensors
 from ..mesh import TetMesh
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
 from .particles import (
@@ -18,7 +19,6 @@ from .particles import (
     all_finite,
     checked_edges,
     checked_mesh,
-    checked_time_step,
     mesh_edges,
     mesh_mass,
 )
@@ -173,6 +173,7 @@ class ProjectiveDynamics(ParticleSolver):
         ValueError, TypeError: naming the argument; more than ``MAX_FREE`` free particles, because the factor is dense.
     """
 
+    @lasting_tensors()
     def __init__(
         self,
         points: Any,
@@ -194,8 +195,8 @@ class ProjectiveDynamics(ParticleSolver):
             ends = self.rest_points[self.edges]
             self.rest_length = torch.linalg.vector_norm(ends[:, 0] - ends[:, 1], dim=-1)
         self.springs = Springs(self.edges, self.num_points)
-        corners = torch.zeros((0, 4), dtype=torch.int64)
-        rest = torch.zeros((self.num_points, 3), dtype=dtype)
+        corners = torch.zeros((0, 4), dtype=torch.int64, device="cpu")
+        rest = torch.zeros((self.num_points, 3), dtype=dtype, device="cpu")
         if tets is not None:
             if self.rest_points is None:
                 fail("points", "rest positions, because there are tets", "a number of particles")
@@ -253,7 +254,7 @@ class ProjectiveDynamics(ParticleSolver):
                 rounding of h^2 times stiffness.
             TypeError: An argument is no number, or a tensor of another dtype than the solver's.
         """
-        h = checked_time_step(time_step, self.mass.dtype)
+        h = check_time_step(time_step, self.mass.dtype)
         given = (("stiffness", stiffness, self.edges.shape[0], ">= 0"),
                  ("tet_stiffness", tet_stiffness, self.tets.nodes.shape[0], ">= 0"),
                  ("mass", self.mass if mass is None else mass, self.num_points, ""))  # fmt: skip

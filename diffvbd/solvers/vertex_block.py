@@ -9,20 +9,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..arguments import name_value
-from ..checks import check_broadcast, check_tensor, fail
+from ..checks import check_broadcast, check_tensor, check_time_step, fail, name_value
 from ..energies import StableNeoHookean
 from ..metric import rest_metric
 from ..model import Model
 from ..safeguards import SATURATION_EPS
 from .compose import Bars, BlockUpdate, Solver, Tensors, _tensors
-from .particles import check_finite, checked_time_step
+from .particles import check_finite
 from .sums import FixedSum, placed
 
 # (j, k, l) such that (j, i, k, l) is an even permutation of the corners, for i = 0, 1, 2, 3
-_OTHERS = torch.tensor([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]])
+_OTHERS = torch.tensor([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]], device="cpu")
 _EDGES = {(0, 1): 0, (0, 2): 1, (0, 3): 2, (1, 2): 3, (1, 3): 4, (2, 3): 5}  # columns of rest_metric
-_COLUMNS = torch.tensor([[_EDGES[min(i, a), max(i, a)] for a in o] for i, o in enumerate(_OTHERS.tolist())])
+_COLUMNS = torch.tensor(
+    [[_EDGES[min(i, a), max(i, a)] for a in o] for i, o in enumerate(_OTHERS.tolist())], device="cpu"
+)
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class VertexBlock(BlockUpdate):
 
     def __init__(self, model: Model, time_step: float, vertices: Tensor) -> None:
         energy = elastic_energy(model)
-        self.rows, self.factor = (vertices,), checked_time_step(time_step, model.mass.dtype) ** 2
+        self.rows, self.factor = (vertices,), check_time_step(time_step, model.mass.dtype) ** 2
         self.exact = energy.block == "exact"
         self.relaxation, self.saturation = model.relaxation, model.saturation
         self.regularization = model.regularization
@@ -228,7 +229,7 @@ def vertex_block_descent(model: Model, time_step: float, update: type[VertexBloc
             finite, mu < 0, mu + lam < 0, or a mass that is not > 0 where the Model is not pinned.
     """
     elastic_energy(model)
-    time_step = checked_time_step(time_step, model.mass.dtype)
+    time_step = check_time_step(time_step, model.mass.dtype)
     bounds = model.color_ptr.tolist()
     colors = (model.color_vertices[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True))
     return _ColorSolver(model, (update(model, time_step, vertices) for vertices in colors))

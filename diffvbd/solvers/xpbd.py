@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import fail
+from ..checks import check_time_step, fail
+from ..lasting import lasting_tensors
 from ..mesh import TetMesh
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
 from .particles import (
@@ -17,7 +18,6 @@ from .particles import (
     all_finite,
     checked_edges,
     checked_mesh,
-    checked_time_step,
     mesh_edges,
     mesh_mass,
 )
@@ -131,6 +131,7 @@ class XPBD(ParticleSolver):
         ValueError, TypeError: naming the argument, what was expected and what came.
     """
 
+    @lasting_tensors()
     def __init__(
         self,
         points: Any,
@@ -208,7 +209,7 @@ class XPBD(ParticleSolver):
         y, masses = self.begin(
             x, v, mass=mass, time_step=time_step, force=force, gravity=gravity, prescribed=prescribed
         )
-        h, count = checked_time_step(time_step, self.mass.dtype), self.edges.shape[0]
+        h, count = check_time_step(time_step, self.mass.dtype), self.edges.shape[0]
         if rest_length is None and self.rest_length is None:
             fail("rest_length", "a value, because the solver was made without rest positions", None)
         lengths = self.per("rest_length", self.rest_length if rest_length is None else rest_length, x, count, ">= 0")

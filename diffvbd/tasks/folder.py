@@ -1,12 +1,52 @@
 """The folder of a run: what may lie there before it, and how its files are written."""
 
+import contextlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None
 
 RESULTS = ("log.json", "picture.png", "animation.gif", "parameters.pt")  # files of a run
 STATE = "state.pt"  # of an unfinished one
+
+
+def _make(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"out: expected a folder or a place for one, got {out} ({error.strerror})") from None
+
+
+@contextlib.contextmanager
+def alone_in(out: Path) -> Iterator[None]:
+    """Makes a folder that one run at a time works in.
+
+    The system keeps the lock for as long as the process lives, on the folder itself: no file is left behind by a crash.
+
+    Raises:
+        ValueError: no folder, or one that another run works in.
+    """
+    _make(out)
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(out, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"out: expected a folder that no other run works in, got {out}: wait for that run, or "
+                             "choose another folder") from None  # fmt: skip
+        except OSError:
+            pass  # a file system without locks
+        yield
+    finally:
+        os.close(handle)
 
 
 def prepare(out: Path, task: str) -> None:
@@ -15,10 +55,7 @@ def prepare(out: Path, task: str) -> None:
     Raises:
         ValueError: no folder, one that cannot be written to, or one with results of another task or of something else.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"out: expected a folder or a place for one, got {out} ({error.strerror})") from None
+    _make(out)
     if not os.access(out, os.W_OK | os.X_OK):
         raise ValueError(f"out: expected a folder that can be written to, got {out}")
     there = [name for name in RESULTS if (out / name).exists()]

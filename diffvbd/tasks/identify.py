@@ -39,7 +39,7 @@ def problem(
     Raises:
         ValueError: a start value is not positive, or nothing moves.
     """
-    if min(start) <= 0:
+    if not all(0 < value < math.inf for value in start):
         raise ValueError(f"start: expected positive mu and lam, got {start}")
     scene = observation.scene
     model = scene.model(settings.device)

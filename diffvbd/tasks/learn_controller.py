@@ -60,6 +60,7 @@ def problem(settings: Settings) -> Problem:
     model = dv.Model(mesh, density=DENSITY, pinned=height == 0.0).to(settings.device)
     like = {"dtype": model.dtype, "device": model.device}
     foot, tip = (torch.as_tensor(np.flatnonzero(height == y), device=model.device) for y in (0.0, SIZE[1]))
+    held = model.pinned[:, None]
     ground = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], **like)
     standing = torch.tensor([0.0, HEIGHT, 0.0], **like)
     bend = model.rest_points[:, 1:2] / SIZE[1]  # share of the tip's velocity that a vertex starts with
@@ -82,7 +83,7 @@ def problem(settings: Settings) -> Problem:
             clock = torch.full_like(speed[..., :1], step / STEPS)
             seen = torch.cat([*places, along_ground(v, tip) / SPEED, speed / SPEED, clock], -1)
             travel = TIME_STEP * (speed + TIME_STEP * ACCELERATION * policy(seen).tanh())
-            return x + (travel @ ground)[..., None, :]
+            return torch.where(held, x + (travel @ ground)[..., None, :], x)
 
         shape = (*lead, len(targets), model.num_vertices, 3)
         return dv.rollout(

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffvbd.tasks.folder import STATE, prepare, put_aside, remove_results, replace
+from diffvbd.tasks.folder import STATE, alone_in, prepare, put_aside, remove_results, replace
 from diffvbd.tasks.problem import (
     OWN_KEYS,
     Problem,
@@ -45,10 +45,15 @@ def solve(problem: Problem, settings: Settings) -> Result:
     Raises:
         ArithmeticError: the loss or a gradient is not finite.
         ValueError, TypeError: the problem is not well formed; the device is not there; the folder cannot be written to,
-            or holds results of another task.
+            holds results of another task, or another run works in it.
     """
     check(problem)
     check_device(settings.device)
+    with alone_in(settings.out):
+        return _solve(problem, settings)
+
+
+def _solve(problem: Problem, settings: Settings) -> Result:
     torch.manual_seed(settings.seed)
     prepare(settings.out, problem.name)
     run = _Run(problem, settings)

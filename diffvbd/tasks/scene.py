@@ -1,6 +1,5 @@
 """One body with one uniform material: what `simulate` runs and `identify` fits, and the .npz file between them."""
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd.tasks import archive
+
+MOST_STEPS = 10**7  # beyond, a typing error is likelier than patience
 
 Array = NDArray[np.float64]
 
@@ -31,6 +33,8 @@ class Scene:
         floor: Height of a floor with normal +y [m]; None: no floor.
         kappa: Stiffness of the floor's barrier.
         dhat: Distance at which the barrier begins [m].
+        friction: Coefficient of the floor's friction; None: none.
+        relaxation: Multiplies every update, as in `diffvbd.Model`.
     """
 
     mesh: dv.TetMesh
@@ -44,12 +48,17 @@ class Scene:
     floor: float | None = None
     kappa: float = 400.0
     dhat: float = 0.02
+    friction: float | None = None
+    relaxation: float = 1.0
 
     def model(self, device: str = "cpu") -> dv.Model:
         energies: tuple[Any, ...] = (dv.StableNeoHookean(),)
         if self.floor is not None:
             energies += (dv.FloorBarrier(height=self.floor, kappa=self.kappa, dhat=self.dhat),)
-        return dv.Model(self.mesh, density=self.density, pinned=self.pinned, energies=energies).to(device)
+        if self.friction is not None:
+            energies += (dv.Friction(self.friction),)
+        options: dict[str, Any] = {"density": self.density, "pinned": self.pinned, "relaxation": self.relaxation}
+        return dv.Model(self.mesh, energies=energies, **options).to(device)
 
     def simulate(
         self, model: dv.Model, mu: Tensor | float, lam: Tensor | float, steps: int, **options: Any
@@ -93,6 +102,10 @@ class Observation:
         values |= {"time_step": s.time_step, "sweeps": s.sweeps, "density": s.density, "gravity": s.gravity}
         if s.floor is not None:
             values |= {"floor": s.floor, "kappa": s.kappa, "dhat": s.dhat}
+        if s.friction is not None:
+            values["friction"] = s.friction
+        if s.relaxation != 1.0:
+            values["relaxation"] = s.relaxation
         values |= self.truth
         with open(path, "wb") as file:
             np.savez_compressed(file, **values)
@@ -104,7 +117,8 @@ class Observation:
         * x: observed positions [m], shape [N, V, 3], or [V, 3] for one shape;
         * steps: steps after which each was observed, shape [N] (default 0, 1, ...; required for one shape);
         * x0, v0: initial positions [m] and velocities [m/s], shape [V, 3] (default: the mesh, at rest);
-        * pinned: bool [V]; time_step [s]; sweeps; density [kg/m^3]; gravity [3]; floor, kappa, dhat: as in `Scene`;
+        * pinned: bool [V]; time_step [s]; sweeps; density [kg/m^3]; gravity [3]; floor, kappa, dhat,
+          friction, relaxation: as in `Scene`;
         * mu, lam: the true material [Pa], only to report the error.
 
         Args:
@@ -116,14 +130,10 @@ class Observation:
             OSError: the file cannot be opened.
             ValueError: not an .npz file, unknown or missing keys, wrong shapes.
         """
-        try:
-            with np.load(path, allow_pickle=False) as content:
-                values = dict(content)
-        except (zipfile.BadZipFile, EOFError, ValueError, AttributeError, TypeError):
-            raise ValueError(f"{path}: expected an .npz file with the key x") from None
+        values = archive.read(path, "an .npz file with the key x")
         values |= {key: value for key, value in overrides.items() if value is not None}
         known = {"x", "steps", "x0", "v0", "pinned", "mu", "lam"}
-        numbers = {"time_step", "density", "floor", "kappa", "dhat"}
+        numbers = {"time_step", "density", "floor", "kappa", "dhat", "friction", "relaxation"}
         unknown = sorted(set(values) - known - numbers - {"sweeps", "gravity"})
         if unknown or "x" not in values:
             raise ValueError(f"{path}: {f'unknown keys {unknown}' if unknown else 'the key x is missing'}")
@@ -133,26 +143,71 @@ class Observation:
         if x.ndim == 2 and "steps" not in values:
             raise ValueError(f"{path}: x is one shape, so steps must say how many steps led to it (key or --steps)")
         x = x.reshape(-1, *shape)
-        steps = np.atleast_1d(values.get("steps", np.arange(len(x))))
-        if steps.shape != (len(x),) or steps.dtype.kind not in "iu" or (np.diff(steps) <= 0).any() or steps[-1] < 1:
-            raise ValueError(f"{path}: steps: expected {len(x)} increasing integers, the last >= 1, got {steps}")
-        fields: dict[str, Any] = {key: float(values[key]) for key in numbers & set(values)}
+        if len(x) == 0:
+            raise ValueError(f"{path}: x: expected at least one observed shape, got none")
+        steps = _steps(path, values.get("steps", np.arange(len(x))), len(x))
+        fields: dict[str, Any] = {key: _number(path, key, values[key]) for key in sorted(numbers & set(values))}
         if "sweeps" in values:
-            fields["sweeps"] = int(values["sweeps"])
+            fields["sweeps"] = int(_number(path, "sweeps", values["sweeps"], whole=True))
         if "gravity" in values:
-            fields["gravity"] = tuple(float(c) for c in values["gravity"])
+            fields["gravity"] = tuple(_array(path, "gravity", values["gravity"], (3,)).tolist())
         scene = Scene(
             mesh=mesh,
             x0=_checked(path, "x0", values.get("x0", mesh.points), shape),
             v0=_checked(path, "v0", values.get("v0", np.zeros(shape)), shape),
-            pinned=np.asarray(values.get("pinned", np.zeros(shape[0], bool)), dtype=bool),
+            pinned=_mask(path, values.get("pinned", np.zeros(shape[0], bool)), shape[0]),
             **fields,
         )
-        return cls(scene, x, steps.astype(np.int64), {k: float(values[k]) for k in ("mu", "lam") if k in values})
+        truth = {key: _number(path, key, values[key]) for key in ("mu", "lam") if key in values}
+        return cls(scene, x, steps, truth)
+
+
+def _steps(path: str | Path, given: Any, count: int) -> NDArray[np.int64]:
+    steps = np.atleast_1d(given)
+    expected = f"{path}: steps: expected {count} increasing integers from 0 to {MOST_STEPS}, the last >= 1"
+    if steps.shape != (count,) or steps.dtype.kind not in "iu":
+        raise ValueError(f"{expected}, got {_shown(steps)}")
+    if int(steps.min()) < 0 or int(steps.max()) > MOST_STEPS:
+        raise ValueError(f"{expected}, got {steps.min()} to {steps.max()}")
+    steps = steps.astype(np.int64)  # differences of unsigned integers would wrap around
+    if (np.diff(steps) <= 0).any() or steps[-1] < 1:
+        raise ValueError(f"{expected}, got {_shown(steps)}")
+    return steps
+
+
+def _number(path: str | Path, name: str, given: Any, whole: bool = False) -> float:
+    values = np.asarray(given)
+    good = values.size == 1 and values.dtype.kind in ("iu" if whole else "iuf")
+    if not good or not np.isfinite(values).all():
+        raise ValueError(
+            f"{path}: {name}: expected {'an integer' if whole else 'a finite number'}, got {_shown(values)}"
+        )
+    return values.reshape(-1)[0].item()
+
+
+def _array(path: str | Path, name: str, given: Any, shape: tuple[int, ...]) -> Array:
+    values = np.asarray(given)
+    if values.shape != shape or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        raise ValueError(f"{path}: {name}: expected finite numbers of shape {list(shape)}, got {_shown(values)}")
+    return values.astype(np.float64)
+
+
+def _mask(path: str | Path, given: Any, count: int) -> NDArray[np.bool_]:
+    values = np.asarray(given)
+    if values.shape != (count,) or values.dtype != bool:
+        raise ValueError(f"{path}: pinned: expected bool of shape [{count}], got {_shown(values)}")
+    return values
+
+
+def _shown(values: np.ndarray) -> str:
+    return str(values.tolist()) if values.size <= 6 else f"{values.dtype} of shape {list(values.shape)}"
 
 
 def _checked(path: str | Path, name: str, values: Any, shape: tuple[int, int], leading: str = "") -> Array:
-    values = np.asarray(values, dtype=np.float64)
+    values = np.asarray(values)
+    if values.dtype.kind not in "iuf":
+        raise ValueError(f"{path}: {name}: expected numbers, got dtype {values.dtype}")
+    values = values.astype(np.float64)
     if values.shape[-2:] != shape or values.ndim > (3 if leading else 2) or not np.isfinite(values).all():
         expected = f"[{leading}{shape[0]}, {shape[1]}]"
         raise ValueError(f"{path}: {name}: expected finite values of shape {expected}, got shape {list(values.shape)}")

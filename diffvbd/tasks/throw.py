@@ -70,10 +70,11 @@ def problem(settings: Settings) -> Problem:
     mu[sheet.num_tets :] = BALL
     middle = torch.tensor([(BOX[0][0] + BOX[1][0]) / 2, BOX[1][1], (BOX[0][2] + BOX[1][2]) / 2], **like)
     curve = spline(time_step * torch.arange(1, 2 * steps + 1, dtype=torch.float64), CONTROLS, KNOT).to(**like)
-    # how much each end lifts a vertex of the sheet: only the bars' own are read
+    # how much each end lifts a vertex of the bars
     ends = [(1 - along) * (1 - across), (1 - along) * across, along * (1 - across), along * across]
     lifts = torch.zeros((4, mesh.num_vertices, 3), **like)
     lifts[:, : sheet.num_vertices, 1] = torch.stack(ends).to(**like)
+    lifts[:, torch.from_numpy(~pinned).to(model.device)] = 0.0
     walls = viz.box(*BOX)
 
     start = torch.zeros((CONTROLS, 4), **like)

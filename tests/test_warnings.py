@@ -1,0 +1,108 @@
+"""What is legal and seldom meant is warned of (UserWarning), once, and nothing else is."""
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import diffvbd as dv
+
+STEP: dict[str, Any] = {"mu": 1e5, "lam": 1e5, "time_step": 1 / 60}
+FLOOR = (dv.StableNeoHookean(), dv.FloorBarrier(height=-1.0), dv.Friction(0.5))
+
+
+def scaled(size: float, bodies: int = 1) -> dv.TetMesh:
+    return dv.mesh.replicate(dv.mesh.cube(2, size=size), np.arange(bodies)[:, None] * [10.0 * size, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: dv.Model(scaled(200.0)), r"mesh: a body is 200 m long; points are in metres: one in mm needs"),
+        (lambda: dv.Model(scaled(101.0, 3)), "mesh: a body is 101 m long"),
+        (lambda: dv.Model(scaled(5e-5)), "mesh: the largest body is 5e-05 m long"),
+        (lambda: dv.Model(scaled(5e-5, 3)), "mesh: the largest body is 5e-05 m long"),
+        (lambda: dv.Model(scaled(1.0), energies=FLOOR, relaxation=1.5), "relaxation: 1.5 with Friction"),
+    ],
+)
+def test_a_model_warns_where_it_is_made(build: Callable[[], Any], message: str) -> None:
+    with pytest.warns(UserWarning, match=message) as found:
+        build()
+    assert len(found) == 1 and found[0].filename == __file__
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: dv.Model(scaled(99.0)),
+        lambda: dv.Model(scaled(50.0, 3)),  # 1 km of bodies
+        lambda: dv.Model(scaled(2e-4, 3)),
+        lambda: dv.Model(scaled(1.0), energies=FLOOR),
+        lambda: dv.Model(scaled(1.0), relaxation=1.7),
+        lambda: dv.Model(dv.TetMesh(np.zeros((0, 3)), np.zeros((0, 4), dtype=int))),
+    ],
+)
+def test_sound_models_do_not_warn(build: Callable[[], Any]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        build()
+
+
+def sheet(thickness: float, **options: Any) -> dv.Model:
+    mesh = dv.mesh.sheet(8, 8, (0.14, 0.14), thickness)
+    return dv.Model(mesh, density=200.0, pinned=mesh.points[:, 0] == 0, **options)
+
+
+RUNS: list[Callable[..., Any]] = [
+    lambda model, x, **options: dv.step(model, x, 0 * x, **options),
+    lambda model, x, **options: dv.rollout(model, x, 0 * x, steps=2, **options),
+]
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_thin_tets_and_few_sweeps_are_named_once_for_a_model(run: Callable[..., Any]) -> None:
+    model = sheet(1e-3)
+    x = model.rest_points
+    with pytest.warns(
+        UserWarning, match="sweeps: 20 at time_step = 0.0167 s are too few for tets .* times as wide"
+    ) as found:
+        run(model, x, sweeps=20, **STEP)
+        run(model, x, sweeps=20, **STEP)
+    assert len(found) == 1 and found[0].filename == __file__
+
+
+@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize(
+    ("thickness", "changes"),
+    [
+        (0.01, {"sweeps": 20}),  # twice as wide as thick
+        (1e-3, {"sweeps": 2000}),
+        (1e-3, {"sweeps": 0}),
+        (1e-3, {"sweeps": 20, "time_step": 1e-5}),  # a wave crosses less than an element
+        (1e-3, {"sweeps": 20, "mu": 1.0, "lam": 0.0}),
+    ],
+)
+def test_sound_steps_do_not_warn(run: Callable[..., Any], thickness: float, changes: dict[str, Any]) -> None:
+    model = sheet(thickness)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run(model, model.rest_points, **(STEP | changes))
+
+
+def test_the_warning_is_right() -> None:
+    """Where it is given a step is far from converged; with a shorter step or more sweeps of a relaxed one it is not."""
+    errors = {}
+    for name, thickness, h, sweeps in (("thin", 1e-3, 1 / 60, 20), ("thick", 0.02, 1 / 240, 20)):
+        model = sheet(thickness)
+        x = model.rest_points
+        options = STEP | {"time_step": h, "mu": 1e4, "lam": 1e4}
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            few = dv.step(model, x, torch.zeros_like(x), sweeps=sweeps, **options)[0]
+        converged = dv.step(sheet(thickness, relaxation=1.7), x, torch.zeros_like(x), sweeps=20_000, **options)[0]
+        errors[name] = float((few - converged).norm() / (converged - x).norm())
+        assert bool(found) == (name == "thin")
+    assert errors["thin"] > 10 * errors["thick"]
