@@ -5,6 +5,7 @@
 
 #include "../energies/energies.h"
 #include "bounds.h"
+#include "frame.h"
 #include "safeguards.h"
 #include "views.h"
 
@@ -21,10 +22,16 @@ struct Block {
   ContactTerm<R> contact;  // where the set has contact
 };
 
-template <class R>
+// The axes in which a set's blocks are factored.
+template <class Set, class R>
+using Axes = std::conditional_t<Set::filters, Frame<R>, NoFrame<R>>;
+
+// g and H in these axes.
+template <class Set, class R>
 struct System {
   Vec3<R> g;
   Sym3<R> H;
+  Axes<Set, R> axes;
 };
 
 // Energies only add semidefinite parts to the mass.
@@ -33,11 +40,23 @@ DIFFVBD_FN R least_eigenvalue(const Block<R>& b, const StepParameters<T>& q) {
   return b.mass + R(q.regularization);
 }
 
-template <class Set, class R, class T, class Star>
-DIFFVBD_FN System<R> assemble(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
+// The planes that turn the axes are those of the one energy with a step filter.
+template <class T, class Set, class R>
+DIFFVBD_FN Axes<Set, R> axes_of(const Block<R>& b) {
+  Axes<Set, R> axes{};
+  Set::for_each([&](auto energy, int k) {
+    using E = decltype(energy);
+    if constexpr (E::has_filter) axes = E::template frame<T>(b.state, b.data[k], b.data_count[k]);
+  });
+  return axes;
+}
+
+// The system of a vertex; without its tets where `tets` is false.
+template <class Set, bool tets = true, class R, class T, class Star>
+DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
   const R h2 = R(q.time_step) * R(q.time_step);
-  System<R> out{b.mass * (b.state.x - b.y), diagonal(least_eigenvalue(b, q))};
-  if constexpr (Set::elastic) {
+  System<Set, R> out{b.mass * (b.state.x - b.y), diagonal(least_eigenvalue(b, q)), axes_of<T, Set>(b)};
+  if constexpr (Set::elastic && tets) {
     Vec3<R> g = zero3<R>();
     R h_diagonal = R(0);
     Sym3<R> h_outer = diagonal(R(0));
@@ -52,23 +71,45 @@ DIFFVBD_FN System<R> assemble(const Block<R>& b, const Star& star, const StepPar
   }
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
-    E::block(b.state, b.data[k], b.data_count[k], out.g, out.H);
+    if constexpr (!E::has_filter) E::block(b.state, b.data[k], b.data_count[k], out.g, out.H);
   });
   if constexpr (Set::contact) {
     out.g += b.contact.g;
     out.H += b.contact.H;
   }
+  if constexpr (Set::filters) {
+    out.g = out.axes.to(out.g);
+    out.H = out.axes.to(out.H);
+    Set::for_each([&](auto energy, int k) {
+      using E = decltype(energy);
+      if constexpr (E::has_filter) E::block(b.state, b.data[k], b.data_count[k], out.g, out.H, out.axes);
+    });
+  }
   return out;
 }
 
-template <class R, class T>
-DIFFVBD_FN Factor<R> factored(const Block<R>& b, const System<R>& system, const StepParameters<T>& q) {
-  return factor<T>(system.H, least_eigenvalue(b, q));
-}
+}  // namespace diffvbd
 
+#include "uneven.h"
+
+namespace diffvbd {
+
+// The Newton step and the block that gave it, factored in the axes of the system.
 template <class R>
-DIFFVBD_FN Vec3<R> newton_step(const System<R>& system, const Factor<R>& H) {
-  return -solve(H, system.g);
+struct NewtonStep {
+  Factor<R> H;
+  Vec3<R> d_raw;
+};
+
+template <class Set, class R, class T, class Star>
+DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
+  const System<Set, R> system = assemble<Set>(b, star, q);
+  const Factor<R> H = factor<T>(system.H, least_eigenvalue(b, q));
+  Vec3<R> d = -solve(H, system.g);
+  if constexpr (Set::elastic) {
+    if (star.any(is_uneven<Set, T>(H, system.axes))) d = refined_step<Set>(b, star, q, system.axes, H, d);
+  }
+  return {H, system.axes.from(d)};
 }
 
 // Saturated, then relaxed.
@@ -117,9 +158,9 @@ DIFFVBD_FN Update<R> replayed(Block<R>& b, const Star& star, Recalled<R>& r, boo
     b.state.x -= u.step;
   }
   if (!full) {
-    const System<R> system = assemble<Set>(b, star, q);
-    r.H = factored(b, system, q);
-    if (Set::keeps_positions) r.d_raw = newton_step(system, r.H);
+    const NewtonStep<R> step = newton_step<Set>(b, star, q);
+    r.H = step.H;
+    if (Set::keeps_positions) r.d_raw = step.d_raw;
   }
   if constexpr (Set::keeps_positions) u = safeguarded<Set>(b, r.d_raw, q);
   return u;
@@ -175,29 +216,46 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   }
   Vec3<R> z = R(q.relaxation) * step_bar;
   if (q.saturates) z = saturate_vjp(u.d_raw, z, q);
-  const Vec3<R> p = solve(H, z);
+  const Axes<Set, R> axes = axes_of<T, Set>(b);
+  const auto z_axes = axes.to(z);
+  Vec3<R> p_axes = solve(H, z_axes);
+  bool uneven = false;
+  if constexpr (Set::elastic) {
+    uneven = star.any(is_uneven<Set, T>(H, axes));
+    if (uneven) out.x += reverse_uneven<Set, wanted>(b, star, q, axes, H, u.d_raw, z_axes, p_axes);
+  }
+  const Vec3<R> p = axes.from(p_axes);
   out.p = p;
 
   out.y = b.mass * p;
   out.x -= out.y;
   out.mass = -(dot(b.state.x - b.y, p) + dot(u.d_raw, p));
   if constexpr (Set::elastic) {
-    Vec3<R> own = zero3<R>();
-    for (int e = 0; e < star.size(); ++e) {
-      const auto pair = Set::Elastic::template block_vjp<wanted>(star.pair(e), b.state.x, u.d_raw, p, minus_h2);
-      own += pair.xi;
-      star.template add<wanted>(e, pair);
+    if (!uneven) {
+      Vec3<R> own = zero3<R>();
+      for (int e = 0; e < star.size(); ++e) {
+        const auto pair = Set::Elastic::template block_vjp<wanted>(star.pair(e), b.state.x, u.d_raw, p, minus_h2);
+        own += pair.xi;
+        star.template add<wanted>(e, pair);
+      }
+      star.total(own);
+      out.x += own;
     }
-    star.total(own);
-    out.x += own;
   }
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
-    const R* data = b.data[k];
-    vertex_energy_vjp<E>(b.state, data, b.data_count[k], p, u.d_raw, out.x, out.x_prev);
-    if (wants_data) {
-      vertex_energy_data_vjp<E>(b.state, data, b.data_count[k], p, u, q, alpha_bar,
-                                [&](int i, const R& value) { add_data(k, i, value); });
+    const auto reverse = [&](const Vec3<R>& p, const Update<R>& u, const auto& axes) {
+      vertex_energy_vjp<E>(b.state, b.data[k], b.data_count[k], p, u.d_raw, out.x, out.x_prev, axes);
+      if (wants_data) {
+        vertex_energy_data_vjp<E>(
+            b.state, b.data[k], b.data_count[k], p, u, q, alpha_bar,
+            [&](int i, const R& value) { add_data(k, i, value); }, axes);
+      }
+    };
+    if constexpr (E::has_filter) {
+      reverse(p_axes, Update<R>{axes.to(u.d_raw), u.step, u.alpha}, axes);  // there n . p has all its digits
+    } else {
+      reverse(p, u, NoFrame<R>{});
     }
   });
   return out;

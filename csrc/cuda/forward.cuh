@@ -21,9 +21,8 @@ __global__ void __launch_bounds__(kMaxThreads)
     GroupStar<T, lanes> star(s, at, shared);
     if constexpr (Set::elastic) star.fetch_neighbours(s.own);
     const Block<T> b = load_block<Set>(s, at, s.own);
-    const System<T> system = assemble<Set>(b, star, s.parameters);
-    const Factor<T> H = factored(b, system, s.parameters);
-    const Update<T> u = safeguarded<Set>(b, newton_step(system, H), s.parameters);
+    const NewtonStep<T> newton = newton_step<Set>(b, star, s.parameters);
+    const Update<T> u = safeguarded<Set>(b, newton.d_raw, s.parameters);
     const int64_t position = static_cast<int64_t>(block) * kSlice + at.v;
     if (at.lane == 0) store_row(s.w.x, scene * s.positions + position, moved<Set>(b.state.x, u));
     if constexpr (Set::contact) {
@@ -38,7 +37,7 @@ __global__ void __launch_bounds__(kMaxThreads)
         *to = value;
         to += s.plan.num_active;
       };
-      record<Set>(s.tape_policy == kFullTape, b, u, H, put);
+      record<Set>(s.tape_policy == kFullTape, b, u, newton.H, put);
     }
     __syncwarp();
   });

@@ -6,6 +6,7 @@
 #include <type_traits>
 
 #include "../core/dual.h"
+#include "../core/frame.h"
 #include "../core/safeguards.h"
 #include "../core/views.h"
 #include "anchor.h"
@@ -95,17 +96,23 @@ template <class E>
 struct has_block_vjp<E, std::void_t<decltype(&E::template block_vjp<double>)>> : std::true_type {};
 
 // Adjoint of phi = p . (g + H d_raw) for one record of an energy's data, by one Dual evaluation for each input. The
-// records of an energy only add up. Kept out of line: it is shared by all variants and seldom wanted.
-template <class E, class R>
+// records of an energy only add up. Kept out of line: it is shared by all variants and seldom wanted. p and d_raw, of an
+// energy with planes, are in the axes of the block (core/frame.h).
+template <class E, class R, class Axes = NoFrame<R>>
 struct DualAdjoint {
   const VertexState<R>& s;
   const R* record;
   const Vec3<R>&p, &d_raw;
+  Axes axes = {};
 
   DIFFVBD_FN R derivative(const VertexState<Dual<R>>& state, const Dual<R>* values) const {
     Vec3<Dual<R>> g = zero3<Dual<R>>();
     Sym3<Dual<R>> H = diagonal(Dual<R>(0));
-    E::block(state, values, E::stride, g, H);
+    if constexpr (std::is_same_v<Axes, Frame<R>>) {
+      E::block(state, values, E::stride, g, H, constant(axes));
+    } else {
+      E::block(state, values, E::stride, g, H);
+    }
     return dot(constant(p), g + H * constant(d_raw)).derivative;
   }
   DIFFVBD_FN VertexState<Dual<R>> lifted() const {
@@ -128,14 +135,16 @@ struct DualAdjoint {
 };
 
 // x_bar, x_prev_bar -= d phi / d(x, x_prev)
-template <class E, class R>
+template <class E, class R, class Axes = NoFrame<R>>
 DIFFVBD_FN void vertex_energy_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
-                                  const Vec3<R>& d_raw, Vec3<R>& x_bar, Vec3<R>& x_prev_bar) {
-  if constexpr (has_block_vjp<E>::value) {
+                                  const Vec3<R>& d_raw, Vec3<R>& x_bar, Vec3<R>& x_prev_bar, const Axes& axes = {}) {
+  if constexpr (has_block_vjp<E>::value && std::is_same_v<Axes, Frame<R>>) {
+    E::block_vjp(s, data, count, p, d_raw, x_bar, x_prev_bar, axes);
+  } else if constexpr (has_block_vjp<E>::value) {
     E::block_vjp(s, data, count, p, d_raw, x_bar, x_prev_bar);
   } else {
     for (int k = 0; k < count; k += E::stride) {
-      const DualAdjoint<E, R> adjoint{s, data + k, p, d_raw};
+      const DualAdjoint<E, R, Axes> adjoint{s, data + k, p, d_raw, axes};
       adjoint.subtract_from(x_bar, &VertexState<Dual<R>>::x);
       if constexpr (E::reads_x_prev) adjoint.subtract_from(x_prev_bar, &VertexState<Dual<R>>::x_prev);
     }
@@ -143,11 +152,11 @@ DIFFVBD_FN void vertex_energy_vjp(const VertexState<R>& s, const R* data, int co
 }
 
 // data_bar[i] = alpha_bar d alpha / d data_i - d phi / d data_i for one record; binds = 1 if it set alpha, else 0
-template <class E, class R, class T>
+template <class E, class R, class T, class Axes>
 DIFFVBD_COLD void record_vjp(const VertexState<R>& s, const R* record, const Vec3<R>& p, const Vec3<R>& d_raw,
                              const Vec3<R>& step, const StepParameters<T>& q, const R& binds, const R& alpha_bar,
-                             R* data_bar) {
-  const DualAdjoint<E, R> adjoint{s, record, p, d_raw};
+                             const Axes& axes, R* data_bar) {
+  const DualAdjoint<E, R, Axes> adjoint{s, record, p, d_raw, axes};
   Dual<R> values[E::stride];
   adjoint.lift(values);
   const VertexState<Dual<R>> state = adjoint.lifted();
@@ -163,9 +172,10 @@ DIFFVBD_COLD void record_vjp(const VertexState<R>& s, const R* record, const Vec
 }
 
 // Calls add(i, data_bar[i]) for all data of one energy.
-template <class E, class R, class T, class Add>
+template <class E, class R, class T, class Add, class Axes = NoFrame<R>>
 DIFFVBD_FN void vertex_energy_data_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
-                                       const Update<R>& u, const StepParameters<T>& q, const R& alpha_bar, Add&& add) {
+                                       const Update<R>& u, const StepParameters<T>& q, const R& alpha_bar, Add&& add,
+                                       const Axes& axes = {}) {
   R alpha = R(1);
   for (int k = 0; k < count; k += E::stride) {
     R data_bar[E::stride];
@@ -175,9 +185,9 @@ DIFFVBD_FN void vertex_energy_data_vjp(const VertexState<R>& s, const R* data, i
       const R same = select(own < u.alpha, R(0), select(u.alpha < own, R(0), R(1)));
       const R binds = select(own < alpha, same, R(0));
       alpha = select(own < alpha, own, alpha);
-      record_vjp<E>(s, data + k, p, u.d_raw, u.step, q, binds, alpha_bar, data_bar);
+      record_vjp<E>(s, data + k, p, u.d_raw, u.step, q, binds, alpha_bar, axes, data_bar);
     } else {
-      record_vjp<E>(s, data + k, p, u.d_raw, u.step, q, R(0), alpha_bar, data_bar);
+      record_vjp<E>(s, data + k, p, u.d_raw, u.step, q, R(0), alpha_bar, axes, data_bar);
     }
     for (int i = 0; i < E::stride; ++i) add(k + i, data_bar[i]);
   }

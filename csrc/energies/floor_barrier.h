@@ -4,6 +4,7 @@
 
 #include <limits>
 
+#include "../core/frame.h"
 #include "../core/safeguards.h"
 #include "../core/views.h"
 #include "log_barrier.h"
@@ -42,31 +43,55 @@ struct FloorBarrier {
     }
   };
 
-  template <class R>
-  DIFFVBD_FN static void block(const VertexState<R>& s, const R* data, int count, Vec3<R>& g, Sym3<R>& H) {
+  // The axes of the two nearest planes within dhat, the nearest, and so the stiffest, first.
+  template <class T, class R>
+  DIFFVBD_FN static Frame<R> frame(const VertexState<R>& s, const R* data, int count) {
+    const R far = R(std::numeric_limits<T>::max());
+    R d1 = far, d2 = far;
+    Vec3<R> n1 = zero3<R>(), n2 = zero3<R>();
     for (int k = 0; k < count; k += stride) {
       const Plane<R> plane(data + k, s);
+      const R gap = plane.gap(s.x), d = select(gap < plane.dhat, gap, far);
+      const auto first = d < d1, second = d < d2;
+      n2 = select(first, n1, select(second, plane.n, n2));
+      d2 = select(first, d1, select(second, d, d2));
+      n1 = select(first, plane.n, n1);
+      d1 = select(first, d, d1);
+    }
+    if (!any(d1 < far)) return Frame<R>::none();
+    return Frame<R>::along(n1, n2, R(8 * std::numeric_limits<T>::epsilon()));
+  }
+
+  // g and H, and below p and d_raw, in the axes of `axes`.
+  template <class R>
+  DIFFVBD_FN static void block(const VertexState<R>& s, const R* data, int count, Vec3<R>& g, Sym3<R>& H,
+                               const Frame<R>& axes = Frame<R>::none()) {
+    for (int k = 0; k < count; k += stride) {
+      const Plane<R> plane(data + k, s);
+      const Vec3<R> n = axes.normal(plane.n);
       const R d = plane.gap(s.x), h2 = s.h * s.h;
       if (any(d < plane.dhat)) {
         const LogBarrier<R> b(d, plane.dhat, plane.kappa);
-        g += h2 * b.first * plane.n;
-        add_outer(H, h2 * b.second, plane.n);
+        g += h2 * b.first * n;
+        add_outer(H, h2 * b.second, n);
       }
       const R approach = dot(plane.n, s.x - s.x_prev);
       const auto near = plane.gap(s.x_prev) < plane.dhat;
       const R c = select(near, select(approach < R(0), plane.damping * s.h, R(0)), R(0));
-      g += c * approach * plane.n;
-      add_outer(H, c, plane.n);
+      g += c * approach * n;
+      add_outer(H, c, n);
     }
   }
 
   // adjoint of p . (g + H d_raw), negated, toward x and x_prev; toward the data Dual serves
   template <class R>
   DIFFVBD_FN static void block_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
-                                   const Vec3<R>& d_raw, Vec3<R>& x_bar, Vec3<R>& x_prev_bar) {
+                                   const Vec3<R>& d_raw, Vec3<R>& x_bar, Vec3<R>& x_prev_bar,
+                                   const Frame<R>& axes = Frame<R>::none()) {
     for (int k = 0; k < count; k += stride) {
       const Plane<R> plane(data + k, s);
-      const R n_p = dot(plane.n, p), n_d = dot(plane.n, d_raw), d = plane.gap(s.x), h2 = s.h * s.h;
+      const Vec3<R> n = axes.normal(plane.n);
+      const R n_p = dot(n, p), n_d = dot(n, d_raw), d = plane.gap(s.x), h2 = s.h * s.h;
       if (any(d < plane.dhat)) {
         const LogBarrier<R> b(d, plane.dhat, plane.kappa);
         x_bar -= h2 * (b.second * n_p + b.third * n_d * n_p) * plane.n;
