@@ -58,8 +58,8 @@ struct Frame {
   DIFFVBD_FN Sym3<R> to(const Sym3<R>& a) const {
     if (!turned) return a;
     const Vec3<R> av = a * v, w = av - (R(0.5) * dot(v, av)) * v;
-    const Sym3<R> b = {a.xx - R(2) * v.x * w.x,         a.xy - v.x * w.y - w.x * v.y, a.xz - v.x * w.z - w.x * v.z,
-                       a.yy - R(2) * v.y * w.y,         a.yz - v.y * w.z - w.y * v.z, a.zz - R(2) * v.z * w.z};
+    const Sym3<R> b = {a.xx - R(2) * v.x * w.x, a.xy - v.x * w.y - w.x * v.y, a.xz - v.x * w.z - w.x * v.z,
+                       a.yy - R(2) * v.y * w.y, a.yz - v.y * w.z - w.y * v.z, a.zz - R(2) * v.z * w.z};
     const R cc = cosine * cosine, ss = sine * sine, cs = cosine * sine, twice = R(2) * cs * b.yz;
     return {b.xx,
             cosine * b.xy + sine * b.xz,

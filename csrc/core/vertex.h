@@ -3,102 +3,16 @@
 // where several threads share them, total() sums over the threads.
 #pragma once
 
-#include "../energies/energies.h"
-#include "bounds.h"
-#include "frame.h"
 #include "safeguards.h"
-#include "views.h"
-
-namespace diffvbd {
-
-// Everything one block update reads besides its star.
-template <class R>
-struct Block {
-  VertexState<R> state;
-  Vec3<R> y;                       // predictor [m]
-  R mass;                          // [kg]
-  const R* data[kVertexEnergies];  // of each energy that is present
-  int data_count[kVertexEnergies];
-  ContactTerm<R> contact;  // where the set has contact
-};
-
-// The axes in which a set's blocks are factored.
-template <class Set, class R>
-using Axes = std::conditional_t<Set::filters, Frame<R>, NoFrame<R>>;
-
-// g and H in these axes.
-template <class Set, class R>
-struct System {
-  Vec3<R> g;
-  Sym3<R> H;
-  Axes<Set, R> axes;
-};
-
-// Energies only add semidefinite parts to the mass.
-template <class R, class T>
-DIFFVBD_FN R least_eigenvalue(const Block<R>& b, const StepParameters<T>& q) {
-  return b.mass + R(q.regularization);
-}
-
-// The planes that turn the axes are those of the one energy with a step filter.
-template <class T, class Set, class R>
-DIFFVBD_FN Axes<Set, R> axes_of(const Block<R>& b) {
-  Axes<Set, R> axes{};
-  Set::for_each([&](auto energy, int k) {
-    using E = decltype(energy);
-    if constexpr (E::has_filter) axes = E::template frame<T>(b.state, b.data[k], b.data_count[k]);
-  });
-  return axes;
-}
-
-// The system of a vertex; without its tets where `tets` is false.
-template <class Set, bool tets = true, class R, class T, class Star>
-DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
-  const R h2 = R(q.time_step) * R(q.time_step);
-  System<Set, R> out{b.mass * (b.state.x - b.y), diagonal(least_eigenvalue(b, q)), axes_of<T, Set>(b)};
-  if constexpr (Set::elastic && tets) {
-    Vec3<R> g = zero3<R>();
-    R h_diagonal = R(0);
-    Sym3<R> h_outer = diagonal(R(0));
-    for (int e = 0; e < star.size(); ++e) {
-      Set::Elastic::block(star.pair(e), b.state.x, g, h_diagonal, h_outer);
-    }
-    star.total(g, h_diagonal, h_outer);
-    out.g += h2 * g;
-    add_diagonal(h_outer, h_diagonal);
-    const Sym3<R> scaled = h2 * h_outer;
-    out.H = {out.H.xx + scaled.xx, scaled.xy, scaled.xz, out.H.yy + scaled.yy, scaled.yz, out.H.zz + scaled.zz};
-  }
-  Set::for_each([&](auto energy, int k) {
-    using E = decltype(energy);
-    if constexpr (!E::has_filter) E::block(b.state, b.data[k], b.data_count[k], out.g, out.H);
-  });
-  if constexpr (Set::contact) {
-    out.g += b.contact.g;
-    out.H += b.contact.H;
-  }
-  if constexpr (Set::filters) {
-    out.g = out.axes.to(out.g);
-    out.H = out.axes.to(out.H);
-    Set::for_each([&](auto energy, int k) {
-      using E = decltype(energy);
-      if constexpr (E::has_filter) E::block(b.state, b.data[k], b.data_count[k], out.g, out.H, out.axes);
-    });
-  }
-  return out;
-}
-
-}  // namespace diffvbd
-
 #include "uneven.h"
 
 namespace diffvbd {
 
-// The Newton step and the block that gave it, factored in the axes of the system.
+// The Newton step, in the axes of the block and in those of the mesh, and the factored block.
 template <class R>
 struct NewtonStep {
+  Vec3<R> d, d_raw;
   Factor<R> H;
-  Vec3<R> d_raw;
 };
 
 template <class Set, class R, class T, class Star>
@@ -109,7 +23,7 @@ DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const 
   if constexpr (Set::elastic) {
     if (star.any(is_uneven<Set, T>(H, system.axes))) d = refined_step<Set>(b, star, q, system.axes, H, d);
   }
-  return {H, system.axes.from(d)};
+  return {d, system.axes.from(d), H};
 }
 
 // Saturated, then relaxed.
@@ -139,14 +53,6 @@ DIFFVBD_FN Vec3<R> moved(const Vec3<R>& x, const Update<R>& u) {
   return x + u.step;
 }
 
-// What a tape keeps of one update: step filters and contact need the old position, a compact tape leaves H (and with
-// them d_raw) to be assembled again.
-template <class R>
-struct Recalled {
-  Vec3<R> x_old, d_raw;
-  Factor<R> H;
-};
-
 // The update that was executed. Puts b.state.x back to where it was before it, and completes what the tape left out.
 template <class Set, class R, class T, class Star>
 DIFFVBD_FN Update<R> replayed(Block<R>& b, const Star& star, Recalled<R>& r, bool full, const StepParameters<T>& q) {
@@ -154,15 +60,15 @@ DIFFVBD_FN Update<R> replayed(Block<R>& b, const Star& star, Recalled<R>& r, boo
   if constexpr (Set::keeps_positions) {
     b.state.x = r.x_old;
   } else {
-    u = safeguarded<Set>(b, r.d_raw, q);
+    u = safeguarded<Set>(b, r.d, q);
     b.state.x -= u.step;
   }
   if (!full) {
     const NewtonStep<R> step = newton_step<Set>(b, star, q);
     r.H = step.H;
-    if (Set::keeps_positions) r.d_raw = step.d_raw;
+    if (Set::keeps_positions) r.d = step.d;
   }
-  if constexpr (Set::keeps_positions) u = safeguarded<Set>(b, r.d_raw, q);
+  if constexpr (Set::keeps_positions) u = safeguarded<Set>(b, axes_of<T, Set>(b).from(r.d), q);
   return u;
 }
 
@@ -171,14 +77,16 @@ template <class Set, class R, class Get>
 DIFFVBD_FN Recalled<R> recall(bool full, Get&& get) {
   Recalled<R> r{};
   if (Set::keeps_positions) r.x_old = {get(), get(), get()};
-  if (full || !Set::keeps_positions) r.d_raw = {get(), get(), get()};
+  if (full || !Set::keeps_positions) r.d = {get(), get(), get()};
   if (full) r.H = {get(), get(), get(), get(), get(), get()};
   return r;
 }
 template <class Set, class R, class Put>
-DIFFVBD_FN void record(bool full, const Block<R>& before, const Update<R>& u, const Factor<R>& H, Put&& put) {
+DIFFVBD_FN void record(bool full, const Block<R>& before, const NewtonStep<R>& step, Put&& put) {
+  const Vec3<R>& d = step.d;
+  const Factor<R>& H = step.H;
   if (Set::keeps_positions) put(before.state.x.x), put(before.state.x.y), put(before.state.x.z);
-  if (full || !Set::keeps_positions) put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
+  if (full || !Set::keeps_positions) put(d.x), put(d.y), put(d.z);
   if (full) put(H.l21), put(H.l31), put(H.l32), put(H.inv1), put(H.inv2), put(H.inv3);
 }
 
@@ -194,7 +102,7 @@ struct BlockAdjoint {
 // Transpose of one block update. `b` holds the state before it, `x_bar` the adjoint of the position after it.
 // add_data(k, i, value) receives the adjoint of b.data[k][i]; it is called only if `wants_data`.
 template <class Set, int wanted, class R, class T, class Star, class AddData>
-DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, const Update<R>& u, const Factor<R>& H,
+DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, const Update<R>& u, const Recalled<R>& r,
                                           const Vec3<R>& x_bar, const StepParameters<T>& q, bool wants_data,
                                           AddData&& add_data) {
   const R h = R(q.time_step), minus_h2 = -(h * h);
@@ -217,13 +125,12 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   Vec3<R> z = R(q.relaxation) * step_bar;
   if (q.saturates) z = saturate_vjp(u.d_raw, z, q);
   const Axes<Set, R> axes = axes_of<T, Set>(b);
-  const auto z_axes = axes.to(z);
-  Vec3<R> p_axes = solve(H, z_axes);
+  const Vec3<R> z_axes = axes.to(z);
+  Vec3<R> p_axes = solve(r.H, z_axes), d_low = zero3<R>();
   bool uneven = false;
-  if constexpr (Set::elastic) {
-    uneven = star.any(is_uneven<Set, T>(H, axes));
-    if (uneven) out.x += reverse_uneven<Set, wanted>(b, star, q, axes, H, u.d_raw, z_axes, p_axes);
-  }
+  if constexpr (Set::elastic) uneven = star.any(is_uneven<Set, T>(r.H, axes));
+  if constexpr (Set::filters) uneven = uneven || (wants_data && star.any(axes.turned));
+  if (uneven) out.x += reverse_uneven<Set, wanted>(b, star, q, axes, r, u.d_raw, z_axes, p_axes, d_low);
   const Vec3<R> p = axes.from(p_axes);
   out.p = p;
 
@@ -244,16 +151,16 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   }
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
-    const auto reverse = [&](const Vec3<R>& p, const Update<R>& u, const auto& axes) {
-      vertex_energy_vjp<E>(b.state, b.data[k], b.data_count[k], p, u.d_raw, out.x, out.x_prev, axes);
+    const auto reverse = [&](const Vec3<R>& p, const Update<R>& u, const auto& planes) {
+      vertex_energy_vjp<E>(b.state, b.data[k], b.data_count[k], p, u.d_raw, out.x, out.x_prev, planes);
       if (wants_data) {
         vertex_energy_data_vjp<E>(
             b.state, b.data[k], b.data_count[k], p, u, q, alpha_bar,
-            [&](int i, const R& value) { add_data(k, i, value); }, axes);
+            [&](int i, const R& value) { add_data(k, i, value); }, planes);
       }
     };
     if constexpr (E::has_filter) {
-      reverse(p_axes, Update<R>{axes.to(u.d_raw), u.step, u.alpha}, axes);  // there n . p has all its digits
+      reverse(p_axes, Update<R>{r.d, u.step, u.alpha}, PlaneStep<R>{axes, d_low});
     } else {
       reverse(p, u, NoFrame<R>{});
     }

@@ -25,7 +25,7 @@ DIFFVBD_HOT void forward_color(const Plan& plan, const SceneView<T>& s, const St
       value.store(at, count);
       at += plan.num_active;
     };
-    record<Set>(tape == kFullTape, b, u, newton.H, put);
+    record<Set>(tape == kFullTape, b, newton, put);
   }
 }
 

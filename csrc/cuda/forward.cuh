@@ -37,7 +37,7 @@ __global__ void __launch_bounds__(kMaxThreads)
         *to = value;
         to += s.plan.num_active;
       };
-      record<Set>(s.tape_policy == kFullTape, b, u, newton.H, put);
+      record<Set>(s.tape_policy == kFullTape, b, newton, put);
     }
     __syncwarp();
   });

@@ -40,7 +40,7 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
             *to = value;
             to += plan.num_active * in.scenes;
           };
-          record<Set>(in.tape_policy == kFullTape, b, u, newton.H, put);
+          record<Set>(in.tape_policy == kFullTape, b, newton, put);
         }
       }
     }

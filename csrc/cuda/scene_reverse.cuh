@@ -71,7 +71,7 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
           const Update<T> u = replayed<Set>(b, star, now, full, in.parameters);
           set_column3(x, vertex, b.state.x);
           const BlockAdjoint<T> bar = reverse_vertex<Set, wanted>(
-              b, star, u, now.H, column3(x_bar, vertex), in.parameters, out.data != nullptr,
+              b, star, u, now, column3(x_bar, vertex), in.parameters, out.data != nullptr,
               [&](int e, int i, const T& value) {
                 const bool own = is_per_vertex(e, VertexEnergies{});
                 const int64_t place = start[e] + (own ? static_cast<int64_t>(vertex) * in.data_count[e] : 0) + i;

@@ -62,24 +62,36 @@ struct FloorBarrier {
     return Frame<R>::along(n1, n2, R(8 * std::numeric_limits<T>::epsilon()));
   }
 
-  // g and H, and below p and d_raw, in the axes of `axes`.
+  // What one plane adds to the block: slope n to g, curvature n n^T to H.
+  template <class R>
+  struct Push {
+    Vec3<R> n;  // in the axes of the block
+    R slope, curvature;
+  };
+  template <class R>
+  DIFFVBD_FN static Push<R> push(const VertexState<R>& s, const R* record, const Frame<R>& axes) {
+    const Plane<R> plane(record, s);
+    const R d = plane.gap(s.x), h2 = s.h * s.h;
+    const R approach = dot(plane.n, s.x - s.x_prev);
+    const auto near = plane.gap(s.x_prev) < plane.dhat;
+    const R c = select(near, select(approach < R(0), plane.damping * s.h, R(0)), R(0));
+    Push<R> out{axes.normal(plane.n), c * approach, c};
+    if (any(d < plane.dhat)) {
+      const LogBarrier<R> b(d, plane.dhat, plane.kappa);
+      out.slope = out.slope + h2 * b.first;
+      out.curvature = out.curvature + h2 * b.second;
+    }
+    return out;
+  }
+
+  // g and H, and below p and d_raw, are in the axes of `axes`.
   template <class R>
   DIFFVBD_FN static void block(const VertexState<R>& s, const R* data, int count, Vec3<R>& g, Sym3<R>& H,
                                const Frame<R>& axes = Frame<R>::none()) {
     for (int k = 0; k < count; k += stride) {
-      const Plane<R> plane(data + k, s);
-      const Vec3<R> n = axes.normal(plane.n);
-      const R d = plane.gap(s.x), h2 = s.h * s.h;
-      if (any(d < plane.dhat)) {
-        const LogBarrier<R> b(d, plane.dhat, plane.kappa);
-        g += h2 * b.first * n;
-        add_outer(H, h2 * b.second, n);
-      }
-      const R approach = dot(plane.n, s.x - s.x_prev);
-      const auto near = plane.gap(s.x_prev) < plane.dhat;
-      const R c = select(near, select(approach < R(0), plane.damping * s.h, R(0)), R(0));
-      g += c * approach * n;
-      add_outer(H, c, n);
+      const Push<R> f = push(s, data + k, axes);
+      g += f.slope * f.n;
+      add_outer(H, f.curvature, f.n);
     }
   }
 
