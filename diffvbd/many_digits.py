@@ -14,7 +14,6 @@ from decimal import Decimal, localcontext
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 DIGITS = 80
@@ -42,17 +41,15 @@ def exact_step(
 ) -> Exact:
     """The step of one scene and the gradient of weights[0] . x' + h weights[1] . v'.
 
-    inputs: x, v [V, 3], mu, lam [T] or scalars, time_step, gravity [3], and "parameters" of a floor. names: the inputs to
-    differentiate, those of the floor by their full names. Raises nothing: a scene that penetrates gives nonsense.
+    inputs: x, v [V, 3], mu, lam [T] or scalars, time_step, gravity [3], and "parameters" of a floor. names: the inputs
+    to differentiate, those of the floor by their full names. A scene that starts below its floor gives nonsense.
     """
     flat = {k: np.asarray(v, dtype=np.float64) for k, v in inputs.items() if isinstance(v, Tensor)}
     flat |= {k: np.asarray(v, dtype=np.float64) for k, v in inputs.get("parameters", {}).items()}
     flat.setdefault("gravity", np.array([0.0, -9.81, 0.0]))
     flat["rest_points"] = np.asarray(model.rest_points, dtype=np.float64)
     rng = np.random.default_rng(0)
-    scenes = [flat] + [
-        {k: v * (1 + ULP * rng.choice((-1, 1), v.shape)) for k, v in flat.items()} for _ in range(3)
-    ]
+    scenes = [flat] + [{k: v * (1 + ULP * rng.choice((-1, 1), v.shape)) for k, v in flat.items()} for _ in range(3)]
     with localcontext() as context:
         context.prec = DIGITS
         variants: dict[str, list[np.ndarray]] = {k: [] for k in flat}
@@ -155,9 +152,7 @@ def _step(
         for i, v in enumerate(inputs["v"])
     ]
     floor = _Floor(inputs, h) if "floor_barrier.height" in inputs else None
-    now = [
-        y[i] if pinned[i] or floor is None else floor.filtered(x[i], _sub(y[i], x[i])) for i in range(len(x))
-    ]
+    now = [y[i] if pinned[i] or floor is None else floor.filtered(x[i], _sub(y[i], x[i])) for i in range(len(x))]
     tau, omega = Decimal(float(model.regularization)), Decimal(float(model.relaxation))
     for _ in range(sweeps):
         for i in model.color_vertices.tolist():  # vertices of one color do not see each other

@@ -52,7 +52,7 @@ DIFFVBD_FN Axes<Set, R> axes_of(const Block<R>& b) {
 template <class Set, bool all = true, class R, class T, class Star>
 DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
   const R h2 = R(q.time_step) * R(q.time_step);
-  System<Set, R> out{b.mass * (b.state.x - b.y), diagonal(least_eigenvalue(b, q)), axes_of<T, Set>(b)};
+  System<Set, R> out{b.mass * (b.state.x - b.y), diagonal(least_eigenvalue(b, q)), {}};
   if constexpr (Set::elastic && all) {
     Vec3<R> g = zero3<R>();
     R h_diagonal = R(0);
@@ -75,6 +75,7 @@ DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const St
     out.H += b.contact.H;
   }
   if constexpr (Set::filters) {
+    out.axes = axes_of<T, Set>(b);
     out.g = out.axes.to(out.g);
     out.H = out.axes.to(out.H);
     Set::for_each([&](auto energy, int k) {

@@ -137,6 +137,22 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   out.y = b.mass * p;
   out.x -= out.y;
   out.mass = -(dot(b.state.x - b.y, p) + dot(u.d_raw, p));
+  Set::for_each([&](auto energy, int k) {
+    using E = decltype(energy);
+    const auto reverse = [&](const Vec3<R>& p, const Update<R>& u, const auto& planes) {
+      vertex_energy_vjp<E>(b.state, b.data[k], b.data_count[k], p, u.d_raw, out.x, out.x_prev, planes);
+      if (wants_data) {
+        vertex_energy_data_vjp<E>(
+            b.state, b.data[k], b.data_count[k], p, u, q, alpha_bar,
+            [&](int i, const R& value) { add_data(k, i, value); }, planes);
+      }
+    };
+    if constexpr (E::has_filter) {
+      reverse(p_axes, Update<R>{r.d, u.step, u.alpha}, plane_step(axes, d_low));
+    } else {
+      reverse(p, u, NoFrame<R>{});
+    }
+  });
   if constexpr (Set::elastic) {
     if (!uneven) {
       Vec3<R> own = zero3<R>();
@@ -149,22 +165,6 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
       out.x += own;
     }
   }
-  Set::for_each([&](auto energy, int k) {
-    using E = decltype(energy);
-    const auto reverse = [&](const Vec3<R>& p, const Update<R>& u, const auto& planes) {
-      vertex_energy_vjp<E>(b.state, b.data[k], b.data_count[k], p, u.d_raw, out.x, out.x_prev, planes);
-      if (wants_data) {
-        vertex_energy_data_vjp<E>(
-            b.state, b.data[k], b.data_count[k], p, u, q, alpha_bar,
-            [&](int i, const R& value) { add_data(k, i, value); }, planes);
-      }
-    };
-    if constexpr (E::has_filter) {
-      reverse(p_axes, Update<R>{r.d, u.step, u.alpha}, PlaneStep<R>{axes, d_low});
-    } else {
-      reverse(p, u, NoFrame<R>{});
-    }
-  });
   return out;
 }
 

@@ -119,6 +119,14 @@ struct PlaneStep {
     return f.reaction + f.curvature * dot(f.n, d_low);
   }
 };
+template <class R>
+DIFFVBD_FN PlaneStep<R> plane_step(const Frame<R>& axes, const Vec3<R>& d_low) {
+  return {axes, d_low};
+}
+template <class R>
+DIFFVBD_FN NoFrame<R> plane_step(const NoFrame<R>& axes, const Vec3<R>&) {
+  return axes;
+}
 
 // Adjoint of phi = p . (g + H d_raw) for one record of an energy's data, by one Dual evaluation for each input. The
 // records of an energy only add up. Kept out of line: it is shared by all variants and seldom wanted.
