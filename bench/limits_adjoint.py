@@ -84,8 +84,8 @@ class Errors(NamedTuple):
         return max(ratios, key=lambda k: ratios[k])
 
 
-def measure(scene: Scene, truth: many_digits.Exact, sweeps: int, tape: str = "full", device: str = "cpu") -> Errors:
-    """A step and its gradients against 80 digits, which `exact` has of the same scene."""
+def measure(scene: Scene, truth: many_digits.Exact, sweeps: int, tape: Any = "full", device: str = "cpu") -> Errors:
+    """A step and its gradients against 120 digits, which `exact` has of the same scene."""
     model, inputs = scene.model, scene.inputs
     there, adjoint = model.to(device), dv.ReverseSweep(tape=tape)
 
@@ -137,8 +137,9 @@ def row(scene: Scene, device: str) -> dict[str, Any]:
 
 def markdown(results: dict[str, Any]) -> str:
     text = (
-        "Relative error of the gradient that is farthest from a step in 80 digits, over what an ulp in every input does "
-        "to that gradient. One step of a cube of 8 vertices; the worst of one and three sweeps, full and compact tape.\n"
+        "Relative error of the gradient that is farthest from a step in 120 digits, over what an ulp in every input "
+        "does to that gradient. One step of a cube of 8 vertices; the worst of one and three sweeps, full and compact "
+        "tape.\n"
     )
     titles = {"oblique": "A plane at a small gap", "volumetric": "lam far above mu"}
     for name, title in titles.items():

@@ -29,16 +29,17 @@ struct Frame {
   // the axes as they are
   DIFFVBD_FN static Frame none() { return {zero3<R>(), R(1), R(0), R(0), false}; }
   // `first` and `second` are unit normals, or zero where a lane has none
-  DIFFVBD_FN static Frame along(const Vec3<R>& first, const Vec3<R>& second, const R& tiny) {
+  template <class T>
+  DIFFVBD_FN static Frame along(const Vec3<R>& first, const Vec3<R>& second) {
     Frame f = none();
-    f.tiny = tiny;
+    f.tiny = R(8 * std::numeric_limits<T>::epsilon());
     f.turned = true;
     const Vec3<R> u = {first.x + select(first.x < R(0), R(-1), R(1)), first.y, first.z};
     const R scale = select(R(0) < dot(first, first), square_root(R(2) / dot(u, u)), R(0));
     f.v = scale * u;
     const Vec3<R> t = f.to(second);
     const R length = square_root(t.y * t.y + t.z * t.z);
-    const auto apart = tiny < length;  // parallel planes have one direction
+    const auto apart = f.tiny < length;  // parallel planes have one direction
     const R inverse = R(1) / select(apart, length, R(1));
     f.cosine = select(apart, t.y * inverse, R(1));
     f.sine = select(apart, t.z * inverse, R(0));

@@ -59,7 +59,7 @@ struct FloorBarrier {
       d1 = select(first, d, d1);
     }
     if (!any(d1 < far)) return Frame<R>::none();
-    return Frame<R>::along(n1, n2, R(8 * std::numeric_limits<T>::epsilon()));
+    return Frame<R>::template along<T>(n1, n2);
   }
 
   // What one plane adds to the block: slope n to g, curvature n n^T to H.
