@@ -5,6 +5,7 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "forward": (1e-14, "one step in float64: same update, sums in another order, about 50 ulps of the largest entry"),
     "adjoint": (1e-12, "floor of the bar on gradients; above it the bar is `spread_factor` times the scene's spread"),
     "spread_factor": (10.0, "how far the compiled gradient may lie beyond two references that differ in tet order"),
+    "stiff_direction": (10.0, "error of a gradient over what an ulp in the inputs does to it, against 120 digits"),
     "headline_spread": (1e-13, "scenes better conditioned than this enter the headline table"),
     "headline": (5e-15, "what the headline table aims at: a few ulps per pair, averaged over a star"),
     "headline_median": (

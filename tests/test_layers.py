@@ -178,9 +178,9 @@ def test_shared_headers_know_no_torch() -> None:
 @needs_csrc
 def test_cpp_layers_include_only_what_lies_below() -> None:
     assert layer_includes("energies") <= {"core"}
-    # vertex.h alone knows the list of energies: it is the algorithm that runs them
+    # block.h alone knows the list of energies, which the algorithm runs
     assert layer_includes("core") <= {"energies"}
-    assert [p.name for p in sources("core") if any("energies/" in name for name in includes(p))] == ["vertex.h"]
+    assert [p.name for p in sources("core") if any("energies/" in name for name in includes(p))] == ["block.h"]
     shared = {"core", "energies", "contact"}
     assert layer_includes("contact") <= {"core", "energies"}
     tensors = {p.name for p in CSRC.glob("arguments*.h")}

@@ -61,6 +61,10 @@ DIFFVBD_FN void operator-=(Vec3<R>& a, const Vec3<R>& b) {
   a.y = a.y - b.y;
   a.z = a.z - b.z;
 }
+template <class M, class R>
+DIFFVBD_FN Vec3<R> select(const M& condition, const Vec3<R>& a, const Vec3<R>& b) {
+  return {select(condition, a.x, b.x), select(condition, a.y, b.y), select(condition, a.z, b.z)};
+}
 template <class R>
 DIFFVBD_FN R dot(const Vec3<R>& a, const Vec3<R>& b) {
   return a.x * b.x + a.y * b.y + a.z * b.z;

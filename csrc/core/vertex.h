@@ -3,72 +3,27 @@
 // where several threads share them, total() sums over the threads.
 #pragma once
 
-#include "../energies/energies.h"
-#include "bounds.h"
 #include "safeguards.h"
-#include "views.h"
+#include "uneven.h"
 
 namespace diffvbd {
 
-// Everything one block update reads besides its star.
+// The Newton step, in the axes of the block and in those of the mesh, and the factored block.
 template <class R>
-struct Block {
-  VertexState<R> state;
-  Vec3<R> y;                       // predictor [m]
-  R mass;                          // [kg]
-  const R* data[kVertexEnergies];  // of each energy that is present
-  int data_count[kVertexEnergies];
-  ContactTerm<R> contact;  // where the set has contact
+struct NewtonStep {
+  Vec3<R> d, d_raw;
+  Factor<R> H;
 };
-
-template <class R>
-struct System {
-  Vec3<R> g;
-  Sym3<R> H;
-};
-
-// Energies only add semidefinite parts to the mass.
-template <class R, class T>
-DIFFVBD_FN R least_eigenvalue(const Block<R>& b, const StepParameters<T>& q) {
-  return b.mass + R(q.regularization);
-}
 
 template <class Set, class R, class T, class Star>
-DIFFVBD_FN System<R> assemble(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
-  const R h2 = R(q.time_step) * R(q.time_step);
-  System<R> out{b.mass * (b.state.x - b.y), diagonal(least_eigenvalue(b, q))};
+DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
+  const System<Set, R> system = assemble<Set>(b, star, q);
+  const Factor<R> H = factor<T>(system.H, least_eigenvalue(b, q));
+  Vec3<R> d = -solve(H, system.g);
   if constexpr (Set::elastic) {
-    Vec3<R> g = zero3<R>();
-    R h_diagonal = R(0);
-    Sym3<R> h_outer = diagonal(R(0));
-    for (int e = 0; e < star.size(); ++e) {
-      Set::Elastic::block(star.pair(e), b.state.x, g, h_diagonal, h_outer);
-    }
-    star.total(g, h_diagonal, h_outer);
-    out.g += h2 * g;
-    add_diagonal(h_outer, h_diagonal);
-    const Sym3<R> scaled = h2 * h_outer;
-    out.H = {out.H.xx + scaled.xx, scaled.xy, scaled.xz, out.H.yy + scaled.yy, scaled.yz, out.H.zz + scaled.zz};
+    if (star.any(is_uneven<Set, T>(H, system.axes))) d = refined_step<Set>(b, star, q, system.axes, H, d);
   }
-  Set::for_each([&](auto energy, int k) {
-    using E = decltype(energy);
-    E::block(b.state, b.data[k], b.data_count[k], out.g, out.H);
-  });
-  if constexpr (Set::contact) {
-    out.g += b.contact.g;
-    out.H += b.contact.H;
-  }
-  return out;
-}
-
-template <class R, class T>
-DIFFVBD_FN Factor<R> factored(const Block<R>& b, const System<R>& system, const StepParameters<T>& q) {
-  return factor<T>(system.H, least_eigenvalue(b, q));
-}
-
-template <class R>
-DIFFVBD_FN Vec3<R> newton_step(const System<R>& system, const Factor<R>& H) {
-  return -solve(H, system.g);
+  return {d, system.axes.from(d), H};
 }
 
 // Saturated, then relaxed.
@@ -98,14 +53,6 @@ DIFFVBD_FN Vec3<R> moved(const Vec3<R>& x, const Update<R>& u) {
   return x + u.step;
 }
 
-// What a tape keeps of one update: step filters and contact need the old position, a compact tape leaves H (and with
-// them d_raw) to be assembled again.
-template <class R>
-struct Recalled {
-  Vec3<R> x_old, d_raw;
-  Factor<R> H;
-};
-
 // The update that was executed. Puts b.state.x back to where it was before it, and completes what the tape left out.
 template <class Set, class R, class T, class Star>
 DIFFVBD_FN Update<R> replayed(Block<R>& b, const Star& star, Recalled<R>& r, bool full, const StepParameters<T>& q) {
@@ -113,15 +60,15 @@ DIFFVBD_FN Update<R> replayed(Block<R>& b, const Star& star, Recalled<R>& r, boo
   if constexpr (Set::keeps_positions) {
     b.state.x = r.x_old;
   } else {
-    u = safeguarded<Set>(b, r.d_raw, q);
+    u = safeguarded<Set>(b, r.d, q);
     b.state.x -= u.step;
   }
   if (!full) {
-    const System<R> system = assemble<Set>(b, star, q);
-    r.H = factored(b, system, q);
-    if (Set::keeps_positions) r.d_raw = newton_step(system, r.H);
+    const NewtonStep<R> step = newton_step<Set>(b, star, q);
+    r.H = step.H;
+    if (Set::keeps_positions) r.d = step.d;
   }
-  if constexpr (Set::keeps_positions) u = safeguarded<Set>(b, r.d_raw, q);
+  if constexpr (Set::keeps_positions) u = safeguarded<Set>(b, axes_of<T, Set>(b).from(r.d), q);
   return u;
 }
 
@@ -130,14 +77,16 @@ template <class Set, class R, class Get>
 DIFFVBD_FN Recalled<R> recall(bool full, Get&& get) {
   Recalled<R> r{};
   if (Set::keeps_positions) r.x_old = {get(), get(), get()};
-  if (full || !Set::keeps_positions) r.d_raw = {get(), get(), get()};
+  if (full || !Set::keeps_positions) r.d = {get(), get(), get()};
   if (full) r.H = {get(), get(), get(), get(), get(), get()};
   return r;
 }
 template <class Set, class R, class Put>
-DIFFVBD_FN void record(bool full, const Block<R>& before, const Update<R>& u, const Factor<R>& H, Put&& put) {
+DIFFVBD_FN void record(bool full, const Block<R>& before, const NewtonStep<R>& step, Put&& put) {
+  const Vec3<R>& d = step.d;
+  const Factor<R>& H = step.H;
   if (Set::keeps_positions) put(before.state.x.x), put(before.state.x.y), put(before.state.x.z);
-  if (full || !Set::keeps_positions) put(u.d_raw.x), put(u.d_raw.y), put(u.d_raw.z);
+  if (full || !Set::keeps_positions) put(d.x), put(d.y), put(d.z);
   if (full) put(H.l21), put(H.l31), put(H.l32), put(H.inv1), put(H.inv2), put(H.inv3);
 }
 
@@ -153,7 +102,7 @@ struct BlockAdjoint {
 // Transpose of one block update. `b` holds the state before it, `x_bar` the adjoint of the position after it.
 // add_data(k, i, value) receives the adjoint of b.data[k][i]; it is called only if `wants_data`.
 template <class Set, int wanted, class R, class T, class Star, class AddData>
-DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, const Update<R>& u, const Factor<R>& H,
+DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, const Update<R>& u, const Recalled<R>& r,
                                           const Vec3<R>& x_bar, const StepParameters<T>& q, bool wants_data,
                                           AddData&& add_data) {
   const R h = R(q.time_step), minus_h2 = -(h * h);
@@ -175,31 +124,47 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   }
   Vec3<R> z = R(q.relaxation) * step_bar;
   if (q.saturates) z = saturate_vjp(u.d_raw, z, q);
-  const Vec3<R> p = solve(H, z);
+  const Axes<Set, R> axes = axes_of<T, Set>(b);
+  const Vec3<R> z_axes = axes.to(z);
+  Vec3<R> p_axes = solve(r.H, z_axes), d_low = zero3<R>();
+  bool uneven = false;
+  if constexpr (Set::elastic) uneven = star.any(is_uneven<Set, T>(r.H, axes));
+  if constexpr (Set::filters) uneven = uneven || (wants_data && star.any(axes.turned));
+  if (uneven) out.x += reverse_uneven<Set, wanted>(b, star, q, axes, r, u.d_raw, z_axes, p_axes, d_low);
+  const Vec3<R> p = axes.from(p_axes);
   out.p = p;
 
   out.y = b.mass * p;
   out.x -= out.y;
   out.mass = -(dot(b.state.x - b.y, p) + dot(u.d_raw, p));
-  if constexpr (Set::elastic) {
-    Vec3<R> own = zero3<R>();
-    for (int e = 0; e < star.size(); ++e) {
-      const auto pair = Set::Elastic::template block_vjp<wanted>(star.pair(e), b.state.x, u.d_raw, p, minus_h2);
-      own += pair.xi;
-      star.template add<wanted>(e, pair);
-    }
-    star.total(own);
-    out.x += own;
-  }
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
-    const R* data = b.data[k];
-    vertex_energy_vjp<E>(b.state, data, b.data_count[k], p, u.d_raw, out.x, out.x_prev);
-    if (wants_data) {
-      vertex_energy_data_vjp<E>(b.state, data, b.data_count[k], p, u, q, alpha_bar,
-                                [&](int i, const R& value) { add_data(k, i, value); });
+    const auto reverse = [&](const Vec3<R>& p, const Update<R>& u, const auto& planes) {
+      vertex_energy_vjp<E>(b.state, b.data[k], b.data_count[k], p, u.d_raw, out.x, out.x_prev, planes);
+      if (wants_data) {
+        vertex_energy_data_vjp<E>(
+            b.state, b.data[k], b.data_count[k], p, u, q, alpha_bar,
+            [&](int i, const R& value) { add_data(k, i, value); }, planes);
+      }
+    };
+    if constexpr (E::has_filter) {
+      reverse(p_axes, Update<R>{r.d, u.step, u.alpha}, plane_step(axes, d_low));
+    } else {
+      reverse(p, u, NoFrame<R>{});
     }
   });
+  if constexpr (Set::elastic) {
+    if (!uneven) {
+      Vec3<R> own = zero3<R>();
+      for (int e = 0; e < star.size(); ++e) {
+        const auto pair = Set::Elastic::template block_vjp<wanted>(star.pair(e), b.state.x, u.d_raw, p, minus_h2);
+        own += pair.xi;
+        star.template add<wanted>(e, pair);
+      }
+      star.total(own);
+      out.x += own;
+    }
+  }
   return out;
 }
 

@@ -116,6 +116,13 @@ struct LaneStar {
   DIFFVBD_FN int size() const { return count; }
   template <class... R>
   DIFFVBD_FN void total(R&...) const {}  // one lane visits the whole star
+  template <class M>
+  DIFFVBD_FN bool any(const M& condition) const {
+    return diffvbd::any(condition);
+  }
+  DIFFVBD_FN void rewind() const {}
+  DIFFVBD_FN void adopt(const LaneStar&) const {}
+  DIFFVBD_FN const Vec3<Lanes<T>>& predictor(const Block<Lanes<T>>& b) const { return b.y; }
 
   DIFFVBD_FN TetPair<Lanes<T>> pair(int e) const {
     const int64_t slot = first + e;

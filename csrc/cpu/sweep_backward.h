@@ -28,8 +28,8 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
     store_rows(s.x, block, b.state.x);
 
     const Vec3<R> x_bar = load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block);
-    const BlockAdjoint<R> out = reverse_vertex<Set, wanted>(
-        b, star, u, r.H, x_bar, q, s.data_bar != nullptr, [&](int k, int i, const R& value) {
+    const BlockAdjoint<R> out =
+        reverse_vertex<Set, wanted>(b, star, u, r, x_bar, q, s.data_bar != nullptr, [&](int k, int i, const R& value) {
           const int64_t row = b.data[k] - values + i;
           LaneStar<T>::accumulate(s.data_bar + (row * plan.blocks + block) * kLanes, value);
         });

@@ -12,9 +12,8 @@ DIFFVBD_HOT void forward_color(const Plan& plan, const SceneView<T>& s, const St
   for (int64_t block = begin; block < end; ++block) {
     R values[kMaxEnergyData];
     const Block<R> b = load_block<Set>(plan, s, block, q, values);
-    const System<R> system = assemble<Set>(b, LaneStar<T>(plan, s, block), q);
-    const Factor<R> H = factored(b, system, q);
-    const Update<R> u = safeguarded<Set>(b, newton_step(system, H), q);
+    const NewtonStep<R> newton = newton_step<Set>(b, LaneStar<T>(plan, s, block), q);
+    const Update<R> u = safeguarded<Set>(b, newton.d_raw, q);
     store_rows(s.x, block, moved<Set>(b.state.x, u));
     if constexpr (Set::contact) {
       LaneStar<T>::accumulate(s.cut + block * kLanes, is_cut(b.state.x, relaxed(u.d_raw, q), b.contact.bound));
@@ -26,7 +25,7 @@ DIFFVBD_HOT void forward_color(const Plan& plan, const SceneView<T>& s, const St
       value.store(at, count);
       at += plan.num_active;
     };
-    record<Set>(tape == kFullTape, b, u, H, put);
+    record<Set>(tape == kFullTape, b, newton, put);
   }
 }
 

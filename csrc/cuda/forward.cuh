@@ -22,9 +22,8 @@ __global__ void __launch_bounds__(kMaxThreads)
     if constexpr (Set::elastic) star.fetch_neighbours(s.own);
     const Block<T> b = load_block<Set>(s, at, s.own);
     const StepParameters<T> q = of_sweep(s.parameters, sweep + 1 == s.sweeps);
-    const System<T> system = assemble<Set>(b, star, q);
-    const Factor<T> H = factored(b, system, q);
-    const Update<T> u = safeguarded<Set>(b, newton_step(system, H), q);
+    const NewtonStep<T> newton = newton_step<Set>(b, star, q);
+    const Update<T> u = safeguarded<Set>(b, newton.d_raw, q);
     const int64_t position = static_cast<int64_t>(block) * kSlice + at.v;
     if (at.lane == 0) store_row(s.w.x, scene * s.positions + position, moved<Set>(b.state.x, u));
     if constexpr (Set::contact) {
@@ -38,7 +37,7 @@ __global__ void __launch_bounds__(kMaxThreads)
         *to = value;
         to += s.plan.num_active;
       };
-      record<Set>(s.tape_policy == kFullTape, b, u, H, put);
+      record<Set>(s.tape_policy == kFullTape, b, newton, put);
     }
     __syncwarp();
   });

@@ -227,6 +227,16 @@ struct GroupStar {
     if constexpr (lanes > 1) (P::sum(values), ...);
   }
 
+  // the threads of a warp visit stars together, so one that must go the longer way takes all along
+  __device__ __forceinline__ bool any(bool condition) const { return __any_sync(kWholeWarp, condition); }
+  __device__ __forceinline__ void rewind() const { fetch(0); }
+  // the sums of a copy
+  __device__ __forceinline__ void adopt(const GroupStar& a) const {
+    material_bar[0] = a.material_bar[0];
+    material_bar[1] = a.material_bar[1];
+  }
+  __device__ __forceinline__ const Vec3<T>& predictor(const Block<T>& b) const { return b.y; }
+
   __device__ __forceinline__ void put(int row, const Vec3<T>& v) const {
     T* to = sums + row * 3 * P::groups;
     to[0] = v.x;

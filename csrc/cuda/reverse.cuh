@@ -43,7 +43,7 @@ __global__ void __maxnreg__(kReverseRegisters)
     star.repeats = false;
     const bool writes = at.lane == 0 && real;
     const BlockAdjoint<T> out = reverse_vertex<Set, wanted>(
-        b, star, u, r.H, x_bar, q, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
+        b, star, u, r, x_bar, q, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
           if (writes) s.w.data_bar[(scene * s.data_scalars + s.data_row[k] + i) * s.positions + position] += value;
         });
     if constexpr (Set::elastic) {

@@ -111,7 +111,7 @@ struct SceneStar {
   const T* x;
   T* x_bar;
   int64_t scene;
-  int first, count;
+  int vertex, first, count;
   T mu, lam;
 
   __device__ __forceinline__ SceneStar(const StepInputs<T>& in, const StepAdjoints<T>* out, const GroupPlan& plan,
@@ -124,11 +124,30 @@ struct SceneStar {
     const int2 v = list.visit[rank];
     count = v.x >> kLocalBits;
     first = v.y;
-    return v.x & kMaxDegree;
+    vertex = v.x & kMaxDegree;
+    return vertex;
   }
   __device__ __forceinline__ int size() const { return count; }
   template <class... R>
   __device__ __forceinline__ void total(R&...) const {}
+  __device__ __forceinline__ bool any(bool condition) const { return condition; }
+  __device__ __forceinline__ void rewind() const {}
+  __device__ __forceinline__ void adopt(const SceneStar& a) const { mu_bar = a.mu_bar, lam_bar = a.lam_bar; }
+  // A block may come without its y (scene_reverse.cuh), which the few uneven ones fetch.
+  __device__ __forceinline__ Vec3<T> predictor(const Block<T>& b) const {
+    const auto load = [&](const Batched<const T>& t, int c) { return __ldg(t.data + scene * t.scene + c); };
+    Vec3<T> y;
+    T* to[3] = {&y.x, &y.y, &y.z};
+    const T h = in.parameters.time_step;
+#pragma unroll
+    for (int c = 0; c < 3; ++c) {
+      const int item = 3 * vertex + c;
+      *to[c] = in.fused ? load(in.x_prev, item) + h * load(in.v, item) +
+                              (h * h) * load(in.acceleration, in.acceleration.item ? item : c)
+                        : load(in.y, item);
+    }
+    return y;
+  }
   __device__ __forceinline__ Vec3<T> at(int offset) const {
     const T* a = x + offset;
     return {a[0], a[kColumn], a[2 * kColumn]};

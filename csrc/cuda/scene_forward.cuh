@@ -32,9 +32,8 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
         for (int r = 0; r < plan.num_active; ++r) {
           const int vertex = star.go_to(r);
           const Block<T> b = load_scene_block<Set>(in, plan, start, scene, vertex, x, y);
-          const System<T> system = assemble<Set>(b, star, q);
-          const Factor<T> H = factored(b, system, q);
-          const Update<T> u = safeguarded<Set>(b, newton_step(system, H), q);
+          const NewtonStep<T> newton = newton_step<Set>(b, star, q);
+          const Update<T> u = safeguarded<Set>(b, newton.d_raw, q);
           set_column3(x, vertex, moved<Set>(b.state.x, u));
           if (in.tape_policy == kNoTape) continue;
           T* to = out.tape + ((static_cast<int64_t>(k) * rows) * plan.num_active + r) * in.scenes + scene;
@@ -42,7 +41,7 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
             *to = value;
             to += plan.num_active * in.scenes;
           };
-          record<Set>(in.tape_policy == kFullTape, b, u, H, put);
+          record<Set>(in.tape_policy == kFullTape, b, newton, put);
         }
       }
     }

@@ -72,7 +72,7 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
           const Update<T> u = replayed<Set>(b, star, now, full, q);
           set_column3(x, vertex, b.state.x);
           const BlockAdjoint<T> bar = reverse_vertex<Set, wanted>(
-              b, star, u, now.H, column3(x_bar, vertex), q, out.data != nullptr, [&](int e, int i, const T& value) {
+              b, star, u, now, column3(x_bar, vertex), q, out.data != nullptr, [&](int e, int i, const T& value) {
                 const bool own = is_per_vertex(e, VertexEnergies{});
                 const int64_t place = start[e] + (own ? static_cast<int64_t>(vertex) * in.data_count[e] : 0) + i;
                 out.data[scene * in.data_size + place] += value;

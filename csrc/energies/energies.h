@@ -6,6 +6,7 @@
 #include <type_traits>
 
 #include "../core/dual.h"
+#include "../core/frame.h"
 #include "../core/safeguards.h"
 #include "../core/views.h"
 #include "anchor.h"
@@ -106,15 +107,55 @@ struct has_block_vjp : std::false_type {};
 template <class E>
 struct has_block_vjp<E, std::void_t<decltype(&E::template block_vjp<double>)>> : std::true_type {};
 
+// A plane as a step has met it: out of line, so that no compiler fuses its products in one place and not in another.
+template <class E, class R>
+struct PlanePush {
+  Vec3<R> n;
+  R curvature, reaction;  // slope + curvature n . d_raw
+};
+template <class E, class R>
+DIFFVBD_COLD PlanePush<E, R> push_of(const VertexState<R>& s, const R* record, const Frame<R>& axes,
+                                     const Vec3<R>& d_raw) {
+  const auto f = E::push(s, record, axes);
+  return {f.n, f.curvature, f.slope + f.curvature * dot(f.n, d_raw)};
+}
+// The axes of p and d_raw, and a small part of d_raw that is kept apart (core/uneven.h). The reaction of a plane is the
+// small difference of a large slope and a large answer to it: that part gives it its digits.
+template <class R>
+struct PlaneStep {
+  Frame<R> axes;
+  Vec3<R> d_low;
+  template <class E>
+  DIFFVBD_FN R reaction(const VertexState<R>& s, const R* record, const Vec3<R>& d_raw) const {
+    const PlanePush<E, R> f = push_of<E>(s, record, axes, d_raw);
+    return f.reaction + f.curvature * dot(f.n, d_low);
+  }
+};
+template <class R>
+DIFFVBD_FN PlaneStep<R> plane_step(const Frame<R>& axes, const Vec3<R>& d_low) {
+  return {axes, d_low};
+}
+template <class R>
+DIFFVBD_FN NoFrame<R> plane_step(const NoFrame<R>& axes, const Vec3<R>&) {
+  return axes;
+}
+
 // Adjoint of phi = p . (g + H d_raw) for one record of an energy's data, by one Dual evaluation for each input. The
 // records of an energy only add up. Kept out of line: it is shared by all variants and seldom wanted.
-template <class E, class R>
+template <class E, class R, class Planes = NoFrame<R>>
 struct DualAdjoint {
   const VertexState<R>& s;
   const R* record;
   const Vec3<R>&p, &d_raw;
+  Planes planes = {};
 
   DIFFVBD_FN R derivative(const VertexState<Dual<R>>& state, const Dual<R>* values) const {
+    if constexpr (std::is_same_v<Planes, PlaneStep<R>>) {
+      const auto f = E::push(state, values, constant(planes.axes));
+      Dual<R> reaction = f.slope + f.curvature * dot(f.n, constant(d_raw));
+      reaction.value = planes.template reaction<E>(s, record, d_raw);
+      return (reaction * dot(f.n, constant(p))).derivative;
+    }
     Vec3<Dual<R>> g = zero3<Dual<R>>();
     Sym3<Dual<R>> H = diagonal(Dual<R>(0));
     E::block(state, values, E::stride, g, H);
@@ -140,10 +181,13 @@ struct DualAdjoint {
 };
 
 // x_bar, x_prev_bar -= d phi / d(x, x_prev)
-template <class E, class R>
+template <class E, class R, class Planes = NoFrame<R>>
 DIFFVBD_FN void vertex_energy_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
-                                  const Vec3<R>& d_raw, Vec3<R>& x_bar, Vec3<R>& x_prev_bar) {
-  if constexpr (has_block_vjp<E>::value) {
+                                  const Vec3<R>& d_raw, Vec3<R>& x_bar, Vec3<R>& x_prev_bar,
+                                  const Planes& planes = {}) {
+  if constexpr (std::is_same_v<Planes, PlaneStep<R>>) {
+    E::block_vjp(s, data, count, p, d_raw, x_bar, x_prev_bar, planes.axes);
+  } else if constexpr (has_block_vjp<E>::value) {
     E::block_vjp(s, data, count, p, d_raw, x_bar, x_prev_bar);
   } else {
     for (int k = 0; k < count; k += E::stride) {
@@ -155,11 +199,11 @@ DIFFVBD_FN void vertex_energy_vjp(const VertexState<R>& s, const R* data, int co
 }
 
 // data_bar[i] = alpha_bar d alpha / d data_i - d phi / d data_i for one record; binds = 1 if it set alpha, else 0
-template <class E, class R, class T>
+template <class E, class R, class T, class Planes>
 DIFFVBD_COLD void record_vjp(const VertexState<R>& s, const R* record, const Vec3<R>& p, const Vec3<R>& d_raw,
                              const Vec3<R>& step, const StepParameters<T>& q, const R& binds, const R& alpha_bar,
-                             R* data_bar) {
-  const DualAdjoint<E, R> adjoint{s, record, p, d_raw};
+                             const Planes& planes, R* data_bar) {
+  const DualAdjoint<E, R, Planes> adjoint{s, record, p, d_raw, planes};
   Dual<R> values[E::stride];
   adjoint.lift(values);
   const VertexState<Dual<R>> state = adjoint.lifted();
@@ -175,9 +219,10 @@ DIFFVBD_COLD void record_vjp(const VertexState<R>& s, const R* record, const Vec
 }
 
 // Calls add(i, data_bar[i]) for all data of one energy.
-template <class E, class R, class T, class Add>
+template <class E, class R, class T, class Add, class Planes = NoFrame<R>>
 DIFFVBD_FN void vertex_energy_data_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
-                                       const Update<R>& u, const StepParameters<T>& q, const R& alpha_bar, Add&& add) {
+                                       const Update<R>& u, const StepParameters<T>& q, const R& alpha_bar, Add&& add,
+                                       const Planes& planes = {}) {
   R alpha = R(1);
   for (int k = 0; k < count; k += E::stride) {
     R data_bar[E::stride];
@@ -187,9 +232,9 @@ DIFFVBD_FN void vertex_energy_data_vjp(const VertexState<R>& s, const R* data, i
       const R same = select(own < u.alpha, R(0), select(u.alpha < own, R(0), R(1)));
       const R binds = select(own < alpha, same, R(0));
       alpha = select(own < alpha, own, alpha);
-      record_vjp<E>(s, data + k, p, u.d_raw, u.step, q, binds, alpha_bar, data_bar);
+      record_vjp<E>(s, data + k, p, u.d_raw, u.step, q, binds, alpha_bar, planes, data_bar);
     } else {
-      record_vjp<E>(s, data + k, p, u.d_raw, u.step, q, R(0), alpha_bar, data_bar);
+      record_vjp<E>(s, data + k, p, u.d_raw, u.step, q, R(0), alpha_bar, planes, data_bar);
     }
     for (int i = 0; i < E::stride; ++i) add(k + i, data_bar[i]);
   }

@@ -4,6 +4,7 @@
 
 #include <limits>
 
+#include "../core/frame.h"
 #include "../core/safeguards.h"
 #include "../core/views.h"
 #include "log_barrier.h"
@@ -42,22 +43,56 @@ struct FloorBarrier {
     }
   };
 
-  template <class R>
-  DIFFVBD_FN static void block(const VertexState<R>& s, const R* data, int count, Vec3<R>& g, Sym3<R>& H) {
+  // The axes of the two nearest planes within dhat, the nearest, and so the stiffest, first.
+  template <class T, class R>
+  DIFFVBD_FN static Frame<R> frame(const VertexState<R>& s, const R* data, int count) {
+    const R far = R(std::numeric_limits<T>::max());
+    R d1 = far, d2 = far;
+    Vec3<R> n1 = zero3<R>(), n2 = zero3<R>();
     for (int k = 0; k < count; k += stride) {
       const Plane<R> plane(data + k, s);
-      const R d = plane.gap(s.x), h2 = s.h * s.h;
-      if (any(d < plane.dhat)) {
-        const LogBarrier<R> b(d, plane.dhat, plane.kappa);
-        g += h2 * b.first * plane.n;
-        add_outer(H, h2 * b.second, plane.n);
-      }
-      const R approach = dot(plane.n, s.x - s.x_prev);
-      const auto near = plane.gap(s.x_prev) < plane.dhat;
-      // H has it for both directions, as for pairs: where a start has left no approach, rounding would switch it.
-      const R c = select(near, plane.damping * s.h, R(0));
-      g += c * select(approach < R(0), approach, R(0)) * plane.n;
-      add_outer(H, c, plane.n);
+      const R gap = plane.gap(s.x), d = select(gap < plane.dhat, gap, far);
+      const auto first = d < d1, second = d < d2;
+      n2 = select(first, n1, select(second, plane.n, n2));
+      d2 = select(first, d1, select(second, d, d2));
+      n1 = select(first, plane.n, n1);
+      d1 = select(first, d, d1);
+    }
+    if (!any(d1 < far)) return Frame<R>::none();
+    return Frame<R>::template along<T>(n1, n2);
+  }
+
+  // What one plane adds to the block: slope n to g, curvature n n^T to H.
+  template <class R>
+  struct Push {
+    Vec3<R> n;  // in the axes of the block
+    R slope, curvature;
+  };
+  template <class R>
+  DIFFVBD_FN static Push<R> push(const VertexState<R>& s, const R* record, const Frame<R>& axes) {
+    const Plane<R> plane(record, s);
+    const R d = plane.gap(s.x), h2 = s.h * s.h;
+    const R approach = dot(plane.n, s.x - s.x_prev);
+    const auto near = plane.gap(s.x_prev) < plane.dhat;
+    // H has it for both directions, as for pairs: where a start has left no approach, rounding would switch it.
+    const R c = select(near, plane.damping * s.h, R(0));
+    Push<R> out{axes.normal(plane.n), c * select(approach < R(0), approach, R(0)), c};
+    if (any(d < plane.dhat)) {
+      const LogBarrier<R> b(d, plane.dhat, plane.kappa);
+      out.slope = out.slope + h2 * b.first;
+      out.curvature = out.curvature + h2 * b.second;
+    }
+    return out;
+  }
+
+  // g and H, and below p and d_raw, are in the axes of `axes`.
+  template <class R>
+  DIFFVBD_FN static void block(const VertexState<R>& s, const R* data, int count, Vec3<R>& g, Sym3<R>& H,
+                               const Frame<R>& axes = Frame<R>::none()) {
+    for (int k = 0; k < count; k += stride) {
+      const Push<R> f = push(s, data + k, axes);
+      g += f.slope * f.n;
+      add_outer(H, f.curvature, f.n);
     }
   }
 
@@ -93,10 +128,12 @@ struct FloorBarrier {
   // adjoint of p . (g + H d_raw), negated, toward x and x_prev; toward the data Dual serves
   template <class R>
   DIFFVBD_FN static void block_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
-                                   const Vec3<R>& d_raw, Vec3<R>& x_bar, Vec3<R>& x_prev_bar) {
+                                   const Vec3<R>& d_raw, Vec3<R>& x_bar, Vec3<R>& x_prev_bar,
+                                   const Frame<R>& axes = Frame<R>::none()) {
     for (int k = 0; k < count; k += stride) {
       const Plane<R> plane(data + k, s);
-      const R n_p = dot(plane.n, p), n_d = dot(plane.n, d_raw), d = plane.gap(s.x), h2 = s.h * s.h;
+      const Vec3<R> n = axes.normal(plane.n);
+      const R n_p = dot(n, p), n_d = dot(n, d_raw), d = plane.gap(s.x), h2 = s.h * s.h;
       if (any(d < plane.dhat)) {
         const LogBarrier<R> b(d, plane.dhat, plane.kappa);
         x_bar -= h2 * (b.second * n_p + b.third * n_d * n_p) * plane.n;

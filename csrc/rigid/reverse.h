@@ -44,7 +44,8 @@ DIFFVBD_FN void reverse_data(const Body<T>& b, const Team& team, const Vector& c
             const VertexShare at(b, v, center, k, p_turn, p_shift);
             b.energies(v, [&](auto other, int which, const double* data, int) {
               if constexpr (std::is_same_v<decltype(other), E>) {
-                record_vjp<E>(b.state(v, at.x), data + j, at.P, at.D, zero3<double>(), none, 0.0, 0.0, to);
+                record_vjp<E>(b.state(v, at.x), data + j, at.P, at.D, zero3<double>(), none, 0.0, 0.0,
+                              NoFrame<double>{}, to);
               }
             });
           };

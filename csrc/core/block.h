@@ -1,0 +1,97 @@
+// The system of one vertex: what its update reads, its gradient and its 3x3 block.
+#pragma once
+
+#include "../energies/energies.h"
+#include "bounds.h"
+#include "frame.h"
+#include "views.h"
+
+namespace diffvbd {
+
+// Everything one block update reads besides its star.
+template <class R>
+struct Block {
+  VertexState<R> state;
+  Vec3<R> y;                       // predictor [m]
+  R mass;                          // [kg]
+  const R* data[kVertexEnergies];  // of each energy that is present
+  int data_count[kVertexEnergies];
+  ContactTerm<R> contact;  // where the set has contact
+};
+
+// The axes in which a set's blocks are factored.
+template <class Set, class R>
+using Axes = std::conditional_t<Set::filters, Frame<R>, NoFrame<R>>;
+
+// g and H in these axes.
+template <class Set, class R>
+struct System {
+  Vec3<R> g;
+  Sym3<R> H;
+  Axes<Set, R> axes;
+};
+
+// Energies only add semidefinite parts to the mass.
+template <class R, class T>
+DIFFVBD_FN R least_eigenvalue(const Block<R>& b, const StepParameters<T>& q) {
+  return b.mass + R(q.regularization);
+}
+
+// The planes that turn the axes are those of the one energy with a step filter.
+template <class T, class Set, class R>
+DIFFVBD_FN Axes<Set, R> axes_of(const Block<R>& b) {
+  Axes<Set, R> axes{};
+  Set::for_each([&](auto energy, int k) {
+    using E = decltype(energy);
+    if constexpr (E::has_filter) axes = E::template frame<T>(b.state, b.data[k], b.data_count[k]);
+  });
+  return axes;
+}
+
+// The system of a vertex; of its masses, anchors and contact alone where `all` is false.
+template <class Set, bool all = true, class R, class T, class Star>
+DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
+  const R h2 = R(q.time_step) * R(q.time_step);
+  System<Set, R> out{b.mass * (b.state.x - b.y), diagonal(least_eigenvalue(b, q)), {}};
+  if constexpr (Set::elastic && all) {
+    Vec3<R> g = zero3<R>();
+    R h_diagonal = R(0);
+    Sym3<R> h_outer = diagonal(R(0));
+    for (int e = 0; e < star.size(); ++e) {
+      Set::Elastic::block(star.pair(e), b.state.x, g, h_diagonal, h_outer);
+    }
+    star.total(g, h_diagonal, h_outer);
+    out.g += h2 * g;
+    add_diagonal(h_outer, h_diagonal);
+    const Sym3<R> scaled = h2 * h_outer;
+    out.H = {out.H.xx + scaled.xx, scaled.xy, scaled.xz, out.H.yy + scaled.yy, scaled.yz, out.H.zz + scaled.zz};
+  }
+  Set::for_each([&](auto energy, int k) {
+    using E = decltype(energy);
+    if constexpr (!E::has_filter) E::block(b.state, b.data[k], b.data_count[k], out.g, out.H);
+  });
+  if constexpr (Set::contact) {
+    out.g += b.contact.g;
+    out.H += b.contact.H;
+  }
+  if constexpr (Set::filters) {
+    out.axes = axes_of<T, Set>(b);
+    out.g = out.axes.to(out.g);
+    out.H = out.axes.to(out.H);
+    Set::for_each([&](auto energy, int k) {
+      using E = decltype(energy);
+      if constexpr (E::has_filter && all) E::block(b.state, b.data[k], b.data_count[k], out.g, out.H, out.axes);
+    });
+  }
+  return out;
+}
+
+// What a tape keeps of one update: step filters and contact need the old position, a compact tape leaves H (and with
+// them d_raw) to be assembled again.
+template <class R>
+struct Recalled {
+  Vec3<R> x_old, d;  // d_raw, and H, in the axes of the block: there a small n . d keeps its digits
+  Factor<R> H;
+};
+
+}  // namespace diffvbd

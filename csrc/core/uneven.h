@@ -1,0 +1,140 @@
+// Blocks whose directions differ widely in stiffness: lam far above mu, a stiff tet beside soft ones, large strain. The
+// sums of g and H round by eps times the stiffest direction, and so does a strain of a tet that hardly strains. The
+// step is therefore refined: what it leaves of its own equation is summed up again, tet by tet, where the stiff terms
+// are small already, and solved for with the same factors. In the reverse the last correction stays apart, because
+// added to p or d_raw it would round away: what it does to n . p and to the strain of each tet is added to these. Here
+// alone, out of line: most blocks never come here.
+#pragma once
+
+#include "block.h"
+
+namespace diffvbd {
+
+constexpr double kUneven = 3e3, kUnevenFloat = 1e3;
+constexpr int kRefinements = 2;  // each leaves eps times the unevenness of the error: from 1e-4 to 1e-12 at 1e12
+
+// Whether the pivots lie further apart than rounding forgives. One that belongs to a plane stands on its own axis and
+// does no harm.
+template <class Set, class T, class R, class A>
+DIFFVBD_FN auto is_uneven(const Factor<R>& f, const A& axes) {
+  R first = f.inv1;
+  if constexpr (Set::filters) first = select(R(0) < dot(axes.v, axes.v), f.inv2, first);
+  const auto below = f.inv2 < f.inv3;
+  const R a = select(below, f.inv2, f.inv3), b = select(below, f.inv3, f.inv2);
+  const R least = select(first < a, first, a), most = select(b < first, first, b);
+  return R(sizeof(T) == 8 ? kUneven : kUnevenFloat) * least < most;
+}
+
+// Out of line, so that no compiler fuses its products in one place and not in another: the rounding of a strain that a
+// solve has seen must be the one that its adjoint sees.
+template <class Elastic, class R>
+DIFFVBD_COLD typename Elastic::template View<R> view_of(const TetPair<R>& e, const Vec3<R>& xi, const Vec3<R>& d_raw,
+                                                        const Vec3<R>& p) {
+  return Elastic::view(e, xi, d_raw, p);
+}
+
+// A vector in the axes of a block, and in those of the mesh.
+template <class R>
+struct Both {
+  Vec3<R> block, mesh;
+};
+
+template <class R>
+struct Applied {
+  Vec3<R> g, p;  // g + H d and H p, in the axes of the block
+};
+
+template <class Set, class R, class T, class Star>
+DIFFVBD_COLD Applied<R> apply(const Block<R>& b, const Star& star, const StepParameters<T>& q, const Axes<Set, R>& axes,
+                              const Both<R>& d, const Both<R>& p) {
+  const System<Set, R> own = assemble<Set, false>(b, star, q);
+  Applied<R> out{own.g + own.H * d.block, own.H * p.block};
+  if constexpr (Set::filters) {
+    Set::for_each([&](auto energy, int k) {
+      using E = decltype(energy);
+      if constexpr (E::has_filter) {
+        for (int i = 0; i < b.data_count[k]; i += E::stride) {
+          const auto f = push_of<E>(b.state, b.data[k] + i, axes, d.block);
+          out.g += f.reaction * f.n;
+          out.p += (f.curvature * dot(f.n, p.block)) * f.n;
+        }
+      }
+    });
+  }
+  if constexpr (Set::elastic) {
+    const R h2 = R(q.time_step) * R(q.time_step);
+    Vec3<R> g_sum = zero3<R>(), p_sum = zero3<R>();
+    star.rewind();
+    for (int e = 0; e < star.size(); ++e) {
+      const TetPair<R> pair = star.pair(e);
+      const auto view = view_of<typename Set::Elastic>(pair, b.state.x, d.mesh, p.mesh);
+      Set::Elastic::apply(pair, view, d.mesh, p.mesh, g_sum, p_sum);
+    }
+    star.total(g_sum, p_sum);
+    out.g += axes.to(h2 * g_sum);
+    out.p += axes.to(h2 * p_sum);
+  }
+  return out;
+}
+
+// The Newton step d of a block, refined. In the axes of the block, as `d`.
+template <class Set, class R, class T, class Star>
+DIFFVBD_COLD Vec3<R> refined_step(Block<R> b, const Star star, const StepParameters<T>& q, const Axes<Set, R> axes,
+                                  const Factor<R> H, Vec3<R> d) {
+  for (int k = 0; k < kRefinements; ++k) {
+    const Both<R> now{d, axes.from(d)}, none{zero3<R>(), zero3<R>()};
+    d -= solve(H, apply<Set>(b, star, q, axes, now, none).g);
+  }
+  return d;
+}
+
+// p = H^-1 z, refined, the small part of d, and the adjoints of the star, which go through star.add() but for that of
+// x_i. z, p and d_low are in the axes of the block.
+template <class Set, int wanted, class R, class T, class Star>
+DIFFVBD_COLD Vec3<R> reverse_star(Block<R> b, const Star& star, const StepParameters<T>& q, const Axes<Set, R> axes,
+                                  const Recalled<R> r, const Vec3<R> d_raw, const Vec3<R> z, Vec3<R>& p,
+                                  Vec3<R>& d_low) {
+  using Elastic = typename Set::Elastic;
+  const Factor<R>& H = r.H;
+  b.y = star.predictor(b);
+  const Both<R> d{r.d, d_raw};
+  for (int k = 0; k < kRefinements; ++k) {
+    const Both<R> now{p, axes.from(p)};
+    p += solve(H, z - apply<Set>(b, star, q, axes, d, now).p);
+  }
+  const Vec3<R> p_mesh = axes.from(p);
+  const Applied<R> left = apply<Set>(b, star, q, axes, d, Both<R>{p, p_mesh});
+  d_low = -solve(H, left.g);
+  Vec3<R> own = zero3<R>();
+  if constexpr (Set::elastic) {
+    const R h = R(q.time_step), minus_h2 = -(h * h);
+    const Vec3<R> d_low_mesh = axes.from(d_low), p_low_mesh = axes.from(solve(H, z - left.p));
+    star.rewind();
+    for (int e = 0; e < star.size(); ++e) {
+      const TetPair<R> pair = star.pair(e);
+      auto view = view_of<Elastic>(pair, b.state.x, d_raw, p_mesh);
+      Elastic::correct(pair, view, d_low_mesh, p_low_mesh);
+      const auto bar = Elastic::template view_vjp<wanted>(pair, view, d_raw, p_mesh, minus_h2);
+      own += bar.xi;
+      star.template add<wanted>(e, bar);
+    }
+    star.total(own);
+  }
+  return own;
+}
+
+// Copies keep what the usual path works with in registers.
+template <class Set, int wanted, class R, class T, class Star>
+DIFFVBD_FN Vec3<R> reverse_uneven(const Block<R>& b, const Star& star, const StepParameters<T>& q,
+                                  const Axes<Set, R>& axes, const Recalled<R>& r, const Vec3<R>& d_raw,
+                                  const Vec3<R>& z, Vec3<R>& p, Vec3<R>& d_low) {
+  const Star copy = star;
+  Vec3<R> refined = p, low;
+  const Vec3<R> own = reverse_star<Set, wanted>(b, copy, q, axes, r, d_raw, z, refined, low);
+  star.adopt(copy);
+  p = refined;
+  d_low = low;
+  return own;
+}
+
+}  // namespace diffvbd

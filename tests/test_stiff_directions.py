@@ -1,0 +1,47 @@
+"""Claim: a direction that is far stiffer than the others costs the gradient no digits: planes at small gaps in any
+direction, and lam far above mu. Measured against a step in 120 digits, in units of what an ulp in the inputs does."""
+
+import pytest
+
+from bench import limits_adjoint as limits
+from diffvbd import many_digits, testing
+from diffvbd.testing import tolerance
+
+TAPES = ("full", "compact", "recompute")
+
+
+def check(device: str, scene: limits.Scene, sweeps: int) -> None:
+    truth = limits.exact(scene, sweeps)
+    assert len(truth.values) == 1 + len(scene.names) and all(value.any() for value in truth.values.values())
+    for tape in TAPES:
+        found = limits.measure(scene, truth, sweeps, tape, device)
+        for name, error in found.errors.items():
+            allowed = tolerance("stiff_direction") * max(found.sensitivity[name], many_digits.ULP)
+            assert error <= allowed, f"{tape}, {name}: {error:.1e}, allowed {allowed:.1e}"
+
+
+@pytest.mark.parametrize("gap", limits.GAPS)
+def test_an_oblique_plane(device: str, gap: float) -> None:
+    for sweeps, normal in zip((1, 3, 3, 1), limits.NORMALS, strict=True):
+        check(device, limits.oblique(gap, (normal,)), sweeps)
+
+
+@pytest.mark.parametrize("gap", (1e-3, 1e-7))
+def test_two_planes_that_meet(device: str, gap: float) -> None:
+    check(device, limits.oblique(gap, limits.CORNER), 2)
+
+
+@pytest.mark.parametrize("block", ("exact", "paper"))
+@pytest.mark.parametrize(("ratio", "sweeps"), ((1e2, 3), (1e4, 1), (1e6, 3), (1e9, 1), (1e9, 3), (1e12, 3)))
+def test_volume_far_stiffer_than_shape(device: str, ratio: float, sweeps: int, block: str) -> None:
+    check(device, limits.volumetric(ratio, block), sweeps)
+
+
+def test_the_truth_is_one() -> None:
+    """120 digits against autograd through the reference, where nothing is stiff."""
+    for scene in (limits.volumetric(1.0), limits.volumetric(1.0, "paper"), limits.oblique(0.05)):
+        truth = limits.exact(scene, 2)
+        expected = testing.reference_result(scene.model, scene.inputs, 2)
+        for name, value in truth.values.items():
+            assert value.any(), name
+            assert testing.relative_error(expected[name], value) <= tolerance("adjoint"), name
