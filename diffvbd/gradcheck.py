@@ -72,7 +72,7 @@ def check_gradients(
         fixed = {k: t.detach() for k, t in leaves.items()}
         direction = torch.randn(leaf.shape, dtype=leaf.dtype, generator=generator, device="cpu").to(leaf.device)
         adjoint = float((grad * direction).sum())
-        scale = float(leaf.detach().abs().max()) if leaf.numel() else 0.0
+        scale = float(leaf.detach().nan_to_num(nan=0.0).abs().max()) if leaf.numel() else 0.0
         best = (float("inf"), 0.0)
         for relative in relative_steps:
             eps = relative * (scale or 1.0)

@@ -94,6 +94,18 @@ def test_gradients_pass_where_pinned_and_nowhere_else(model: dv.Model) -> None:
     assert (slope[:3] != 0).all() and not slope[3:].any()
 
 
+def test_check_gradients_takes_rows_that_are_not_read() -> None:
+    model = dv.Model(dv.mesh.cube(3, size=0.2), pinned=[0, 1, 2])
+    x, v = start(model)
+    target = torch.where(model.pinned[:, None], moved(x, 1), torch.nan)
+
+    def loss(prescribed: Tensor) -> Tensor:
+        return dv.step(model, x, v, prescribed=prescribed, **GIVEN)[0].square().sum()
+
+    found = dv.check_gradients(loss, {"prescribed": target}, verbose=False)
+    assert found.ok and found.rows[0][1] > 0.1
+
+
 def test_on_cuda_values_are_looked_at_only_on_request(model: dv.Model, device: str) -> None:
     x, v = start(model)
     if device == "cuda":
