@@ -4,6 +4,8 @@
 // of every direction.
 #pragma once
 
+#include <limits>
+
 #include "dual.h"
 
 namespace diffvbd {
