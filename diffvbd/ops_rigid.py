@@ -78,9 +78,7 @@ def correct_backward(x_bar: Tensor, x: Tensor, x_prev: Tensor, y: Tensor, mass: 
                      bodies: tuple, data_count: Sequence[int], time_step: float, wants_data: bool
                      ) -> tuple[Tensor, ...]:  # fmt: skip
     """Adjoints of x, x_prev (empty without data), y, mass, the data of scenes by body and of vertices."""
-    return ops.raw.rigid_backward(
-        x_bar, x, x_prev, y, mass, data, origin, *bodies, data_count, time_step, wants_data
-    )
+    return ops.raw.rigid_backward(x_bar, x, x_prev, y, mass, data, origin, *bodies, data_count, time_step, wants_data)
 
 
 def _scalars_of_data(data_count: Sequence[int]) -> tuple[int, int]:

@@ -106,7 +106,9 @@ def energy(model: dv.Model, x: torch.Tensor, v: torch.Tensor, mu: float) -> torc
     f = edges @ torch.linalg.inv(dm)
     volume, j = torch.linalg.det(dm) / 6, torch.linalg.det(f)
     lam = 2 * mu
-    elastic = (volume * (mu / 2 * (f.square().sum((-2, -1)) - 3) - mu * (j - 1) + (mu + lam) / 2 * (j - 1) ** 2)).sum(-1)
+    elastic = (volume * (mu / 2 * (f.square().sum((-2, -1)) - 3) - mu * (j - 1) + (mu + lam) / 2 * (j - 1) ** 2)).sum(
+        -1
+    )
     d = gaps(model, x)
     barrier = torch.where(d < DHAT, -KAPPA * (d - DHAT) ** 2 * torch.log(d / DHAT), 0.0).sum(-1)
     kinetic = 0.5 * (model.mass[:, None] * v.square()).sum((-2, -1))
@@ -122,7 +124,9 @@ def test_no_drop_gains_energy(device: str, sweeps: int, relaxation: float) -> No
     axes = torch.nn.functional.normalize(torch.randn(100, 3, generator=generator, dtype=torch.float64), dim=-1)
     angle = 3 * torch.rand(100, 1, generator=generator, dtype=torch.float64)
     rotation = torch.linalg.matrix_exp(
-        torch.linalg.cross((angle * axes)[:, None].expand(-1, 3, -1), torch.eye(3, dtype=torch.float64).expand(100, 3, 3))
+        torch.linalg.cross(
+            (angle * axes)[:, None].expand(-1, 3, -1), torch.eye(3, dtype=torch.float64).expand(100, 3, 3)
+        )
     ).to(device)
     x = (model.rest_points - center) @ rotation + center
     spin = 4 * torch.randn(100, 1, 3, generator=generator, dtype=torch.float64).to(device)
@@ -150,4 +154,6 @@ def test_a_body_slides_without_friction(device: str) -> None:
     mean = x.mean(0)
     x, v, _ = run(model, x, v, 100, 5, (0.0, -9.81, 0.0))
     traveled = x.mean(0) - mean
-    assert abs(float(traveled[0]) - 1.0) <= tolerance("rest_drift") and abs(float(traveled[2])) <= tolerance("rest_drift")
+    assert abs(float(traveled[0]) - 1.0) <= tolerance("rest_drift") and abs(float(traveled[2])) <= tolerance(
+        "rest_drift"
+    )
