@@ -1,9 +1,9 @@
 """Claim: the compiled step and its reverse sweep equal autograd through an independent execution of the same sweep.
 
 For every scene the forward comes first, then each gradient. The bar of a gradient is max(1e-12, 10 x spread), where
-spread is the disagreement of two references that differ only in rounding (`diffvbd.testing.spread`; where that sample
-is too kind, `diffvbd.testing.sensitivity`). A table of the worst scene of each case and device is printed at the end.
-The references always run on the CPU, once for all devices.
+spread is the disagreement of two references that differ only in rounding (`diffvbd.testing.spread`; in scenes that are
+limited by conditioning on purpose also `diffvbd.testing.sensitivity`). A table of the worst scene of each case and
+device is printed at the end. The references always run on the CPU, once for all devices.
 """
 
 import contextlib
@@ -22,6 +22,7 @@ from diffvbd.testing import CASES, KINDS, build_scene, evaluate, generator, rela
 
 SWEEPS = (0, 1, 2, 5, 20)
 TAPES = ("full", "compact", "recompute")
+CONDITIONED = ("tiny_strain", "huge_strain", "huge_saturated")  # rounding decides many of their digits
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ def measure(place: str, case: str, kind: str, size: str, sweeps: int, steps: int
     zeros = frozenset(name for name in expected if not any(r[name].any() for r in (expected, *results)))
     errors = {name: max(relative_error(r[name], expected[name]) for r in results) for name in expected}
     bars = {name: testing.bar(spreads[name]) for name in expected} | {"x": forward_bar(spreads)}
-    if any(errors[name] > bars[name] for name in expected if name != "v"):
+    if case in CONDITIONED and any(errors[name] > bars[name] for name in expected if name != "v"):
         # one permutation is one sample: ask also what an ulp in the inputs does to this scene
         moved = sensitivities(*row)
         spreads = {name: max(spreads[name], moved[name]) for name in expected}

@@ -40,7 +40,7 @@ DIFFVBD_FN R least_eigenvalue(const Block<R>& b, const StepParameters<T>& q) {
 // The planes that turn the axes are those of the one energy with a step filter.
 template <class T, class Set, class R>
 DIFFVBD_FN Axes<Set, R> axes_of(const Block<R>& b) {
-  Axes<Set, R> axes{};
+  Axes<Set, R> axes;
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
     if constexpr (E::has_filter) axes = E::template frame<T>(b.state, b.data[k], b.data_count[k]);
@@ -52,7 +52,7 @@ DIFFVBD_FN Axes<Set, R> axes_of(const Block<R>& b) {
 template <class Set, bool all = true, class R, class T, class Star>
 DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
   const R h2 = R(q.time_step) * R(q.time_step);
-  System<Set, R> out{b.mass * (b.state.x - b.y), diagonal(least_eigenvalue(b, q)), {}};
+  System<Set, R> out{b.mass * (b.state.x - b.y), diagonal(least_eigenvalue(b, q)), Axes<Set, R>::none()};
   if constexpr (Set::elastic && all) {
     Vec3<R> g = zero3<R>();
     R h_diagonal = R(0);

@@ -28,12 +28,18 @@ struct Frame {
   R tiny;       // components of a unit normal below it are rounding
   bool turned;  // whether any lane has a plane
 
-  // the axes as they are
-  DIFFVBD_FN static Frame none() { return {zero3<R>(), R(1), R(0), R(0), false}; }
+  // The axes as they are: nothing else is read, or written.
+  DIFFVBD_FN static Frame none() {
+    Frame f;
+    f.turned = false;
+    return f;
+  }
   // `first` and `second` are unit normals, or zero where a lane has none
   template <class T>
   DIFFVBD_FN static Frame along(const Vec3<R>& first, const Vec3<R>& second) {
-    Frame f = none();
+    Frame f;
+    f.cosine = R(1);
+    f.sine = R(0);
     f.tiny = R(8 * std::numeric_limits<T>::epsilon());
     f.turned = true;
     const Vec3<R> u = {first.x + select(first.x < R(0), R(-1), R(1)), first.y, first.z};
@@ -81,6 +87,7 @@ struct Frame {
 
 template <class R>
 DIFFVBD_FN Frame<Dual<R>> constant(const Frame<R>& f) {
+  if (!f.turned) return Frame<Dual<R>>::none();
   return {constant(f.v), Dual<R>(f.cosine), Dual<R>(f.sine), Dual<R>(f.tiny), f.turned};
 }
 
@@ -88,6 +95,7 @@ DIFFVBD_FN Frame<Dual<R>> constant(const Frame<R>& f) {
 template <class R>
 struct NoFrame {
   static constexpr bool turned = false;
+  DIFFVBD_FN static NoFrame none() { return {}; }
   template <class A>
   DIFFVBD_FN const A& to(const A& a) const {
     return a;

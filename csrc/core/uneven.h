@@ -10,21 +10,22 @@
 
 namespace diffvbd {
 
-constexpr double kUneven = 3e3, kUnevenFloat = 1e3;
+constexpr double kUneven = 1e3;  // lam of some hundred mu; errors grow by eps times it
 constexpr int kRefinements = 2;  // each leaves eps times the unevenness of the error: from 1e-4 to 1e-12 at 1e12
 
 // Whether the diagonal and the least pivot lie further apart than rounding forgives. What a plane puts on the first
 // axis stands alone there and does no harm. Inverse pivots are compared, so that nothing is divided.
-template <class Set, class T, class R, class A>
+template <class Set, class R, class A>
 DIFFVBD_FN auto is_uneven(const Factor<R>& f, const A& axes) {
-  const R limit = R(sizeof(T) == 8 ? kUneven : kUnevenFloat);
   R first = R(1) + f.l21 * f.l21 + f.l31 * f.l31;
-  if constexpr (Set::filters) first = select(R(0) < dot(axes.v, axes.v), R(0), first);
+  if constexpr (Set::filters) {
+    if (axes.turned) first = select(R(0) < dot(axes.v, axes.v), R(0), first);
+  }
   const R rest = select(f.inv2 < f.inv3, f.inv3, f.inv2), most = select(rest < f.inv1, f.inv1, rest);
   const R second = R(1) + f.l32 * f.l32;
   // first / inv1 and second / inv2 bound the diagonal from both sides, up to a factor of two
   const R a = first * f.inv2, b = second * f.inv1;
-  return limit * f.inv1 * f.inv2 < most * select(a < b, b, a);
+  return R(kUneven) * f.inv1 * f.inv2 < most * select(a < b, b, a);
 }
 
 // Out of line, so that no compiler fuses its products in one place and not in another: the rounding of a strain that a

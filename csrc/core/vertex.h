@@ -21,7 +21,7 @@ DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const 
   const Factor<R> H = factor<T>(system.H, least_eigenvalue(b, q));
   Vec3<R> d = -solve(H, system.g);
   if constexpr (Set::elastic) {
-    if (star.any(is_uneven<Set, T>(H, system.axes))) d = refined_step<Set>(b, star, q, system.axes, H, d);
+    if (star.any(is_uneven<Set>(H, system.axes))) d = refined_step<Set>(b, star, q, system.axes, H, d);
   }
   return {d, system.axes.from(d), H};
 }
@@ -128,7 +128,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   const Vec3<R> z_axes = axes.to(z);
   Vec3<R> p_axes = solve(r.H, z_axes), d_low = zero3<R>();
   bool uneven = false;
-  if constexpr (Set::elastic) uneven = star.any(is_uneven<Set, T>(r.H, axes));
+  if constexpr (Set::elastic) uneven = star.any(is_uneven<Set>(r.H, axes));
   if constexpr (Set::filters) uneven = uneven || (wants_data && star.any(axes.turned));
   if (uneven) out.x += reverse_uneven<Set, wanted>(b, star, q, axes, r, u.d_raw, z_axes, p_axes, d_low);
   const Vec3<R> p = axes.from(p_axes);

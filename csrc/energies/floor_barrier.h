@@ -46,6 +46,12 @@ struct FloorBarrier {
   // The axes of the two nearest planes within dhat, the nearest, and so the stiffest, first.
   template <class T, class R>
   DIFFVBD_FN static Frame<R> frame(const VertexState<R>& s, const R* data, int count) {
+    bool near = false;
+    for (int k = 0; k < count; k += stride) {
+      const Plane<R> plane(data + k, s);
+      near = near || any(plane.gap(s.x) < plane.dhat);
+    }
+    if (!near) return Frame<R>::none();
     const R far = R(std::numeric_limits<T>::max());
     R d1 = far, d2 = far;
     Vec3<R> n1 = zero3<R>(), n2 = zero3<R>();
@@ -58,7 +64,6 @@ struct FloorBarrier {
       n1 = select(first, plane.n, n1);
       d1 = select(first, d, d1);
     }
-    if (!any(d1 < far)) return Frame<R>::none();
     return Frame<R>::template along<T>(n1, n2);
   }
 
