@@ -160,7 +160,7 @@ class Model:
 
     def _checked_rigid(self, rigid: bool | None) -> bool:
         if rigid is None:
-            return not self.touches
+            return not self.touches and any(isinstance(e, StableNeoHookean) for e in self.energies)
         if not isinstance(rigid, bool):
             raise TypeError(f"rigid: expected True, False or None, got {type(rigid).__name__}")
         if rigid and self.touches:

@@ -259,6 +259,7 @@ def test_inputs_on_the_device_are_untouched() -> None:
         with forced(regime):
             evaluate(lambda **o: dv.step(model, sweeps=3, **o), inputs)
     after = on_device(inputs, "cpu")
-    assert all(torch.equal(after[k], t) for k, t in before.items() if isinstance(t, Tensor))
+    same = [torch.equal(after[k].nan_to_num(), t.nan_to_num()) for k, t in before.items() if isinstance(t, Tensor)]
+    assert all(same)  # NaN stands in rows of prescribed that are not read
     assert all(torch.equal(after["parameters"][k], t) for k, t in before["parameters"].items())
     assert all(torch.equal(getattr(model, name), t) for name, t in constants.items())

@@ -96,7 +96,8 @@ def problem(
     # a GPU has one thread sweep a whole cube; a CPU sweeps eight vertices of a color at once, and wants more cubes
     group = 1 if torch.device(settings.device).type == "cuda" else math.gcd(bodies, GROUP)
     scenes = (bodies // group, group * cube.num_vertices, 3)
-    model = dv.Model(dv.mesh.replicate(cube, np.zeros((group, 3))), density=DENSITY, dtype=dtype).to(settings.device)
+    model = dv.Model(dv.mesh.replicate(cube, np.zeros((group, 3))), density=DENSITY, dtype=dtype, rigid=False)
+    model = model.to(settings.device)
     like = {"dtype": dtype, "device": model.device}
     target, pad = torch.as_tensor(place, **like), torch.as_tensor(launch_pad(bodies), **like)
     corners, mass = (each[: cube.num_vertices] for each in (model.rest_points, model.mass))
