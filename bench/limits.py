@@ -205,8 +205,8 @@ def paper_preset(quick: bool) -> list[dict[str, Any]]:
 
 
 def momentum(quick: bool) -> list[dict[str, Any]]:
-    """What unconverged sweeps of a free body add to its momentum in one step without the rigid correction (converged, or
-    with it: nothing)."""
+    """What unconverged sweeps of a free body add to its momentum in one step without the rigid correction. (Converged,
+    or with it: nothing.)"""
     mesh = dv.mesh.cube(4)
     model = dv.Model(mesh, rigid=False)
     noise = torch.from_numpy(testing.generator("momentum").uniform(-1, 1, (2, mesh.num_vertices, 3)))

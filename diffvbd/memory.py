@@ -114,6 +114,8 @@ def predict(
         planes = model.floor.planes
         several = item + 10 + min(planes, 3) * (6 * item + 8) + planes * (5 * item + 1)
         per_step += scenes * model.num_vertices * (3 * item + 2 if planes == 1 else several)
+    if model.corrects:  # the positions that are corrected at the start, and where a floor has a say how far they coast
+        per_step += state * (1 if model.floor is not None else 2)
     if save in ("all", "last"):
         frames = steps + 1 if save == "all" else 1
     else:

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from . import native, ops, ops_rigid, regimes
-from .checks import check_number, check_positive, check_readable, fail, to_float, vertex_mask
+from . import ops, ops_rigid, regimes
+from .checks import check_number, check_positive, fail, vertex_mask
 from .colliders import Collider
 from .contact_surface import ContactSurface, build_surface, check_colliders
 from .energies import VERTEX_ENERGIES, FloorBarrier, StableNeoHookean, VertexEnergy
@@ -18,11 +18,10 @@ from .lasting import lasting, lasting_tensors
 from .mask import CONTACT
 from .mesh import TetMesh
 from .metric import lumped_mass, rest_metric
+from .model_arguments import Energy, checked_correction, checked_device, checked_energies, per_tet_density
 from .model_warnings import warn_of
 from .pair_barrier import Friction, PairBarrier
 from .safeguards import FILTER_ETA, SATURATION_EPS
-
-Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction
 
 PAPER_SATURATION = 0.1  # [m]
 PAPER_REGULARIZATION = 1e-6  # [kg]
@@ -103,14 +102,11 @@ class Model:
         self.relaxation = check_positive("relaxation", relaxation, "")
         if self.relaxation >= 2:
             fail("relaxation", "a number in (0, 2): from 2 on the updates raise the potential", relaxation)
-        self._set_energies(_checked_energies(energies, mesh.num_vertices))
+        self._set_energies(checked_energies(energies, mesh.num_vertices))
         self.energy_mask = 0
         for energy in self.energies:
             self.energy_mask |= energy.bit
-        self.rigid = self._checked_rigid(rigid)
-        if start not in ("predictor", "inertia"):
-            fail("start", '"predictor" or "inertia"', repr(start))
-        self.start = start
+        self.rigid, self.start = checked_correction(rigid, start, self.energies)
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
 
@@ -123,16 +119,16 @@ class Model:
         if loose.numel():
             shown = ", ".join(map(str, loose[:5].tolist())) + (", ..." if loose.numel() > 5 else "")
             fail("mesh", "every vertex in a tet, or pinned", f"{loose.numel()} isolated vertices: {shown}")
-        self._density = _per_tet_density(density, mesh.num_tets)
+        self._density = per_tet_density(density, mesh.num_tets)
         self._pinned = mask
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = _first_of_body(body)
         self._bodies = ops_rigid.find_bodies(points, tets, mask)
         # vertices of bodies that are corrected, and those that the sweeps take from x + h v
-        self._corrected = (self._bodies.member < self._bodies.count) & self.rigid
+        self._corrected = (self._bodies.member < self._bodies.number) & self.rigid
         self._from_inertia = self._corrected | (~mask & (start == "inertia"))
         self.surface_of_contact = self._build_surface(check_colliders(colliders))
-        device = _checked_device(device)
+        device = checked_device(device)
         self._arrange(points, tets, device)
         self._measure(points)
         warn_of(self)
@@ -158,19 +154,10 @@ class Model:
             return None
         return build_surface(self.mesh, self._pinned, self.contact, colliders)
 
-    def _checked_rigid(self, rigid: bool | None) -> bool:
-        if rigid is None:
-            return not self.touches and any(isinstance(e, StableNeoHookean) for e in self.energies)
-        if not isinstance(rigid, bool):
-            raise TypeError(f"rigid: expected True, False or None, got {type(rigid).__name__}")
-        if rigid and self.touches:
-            fail("rigid", "False beside a PairBarrier or Friction, which the correction does not see", "True")
-        return rigid
-
     @property
     def corrects(self) -> bool:
         """Whether steps have a rigid correction: asked for, and some body is free."""
-        return self.rigid and self._bodies.count > 0
+        return self.rigid and self._bodies.number > 0
 
     @property
     def touches(self) -> bool:
@@ -282,7 +269,7 @@ class Model:
         dtype = dtype or self.dtype
         if dtype not in (torch.float64, torch.float32):
             raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
-        device = self.device if device is None else _checked_device(device)
+        device = self.device if device is None else checked_device(device)
         out = object.__new__(type(self))
         out.__dict__.update(self.__dict__)
         out._derived = {}
@@ -304,7 +291,7 @@ class Model:
         """Unpickles, also where torch.load(map_location=...) has moved the tensors to another device."""
         self.__dict__.update(lasting(state))
         self._derived = {}
-        actual = _checked_device(self._mass.device)
+        actual = checked_device(self._mass.device)
         if actual != self.device:
             self.__dict__.update(self.to(actual).__dict__)
 
@@ -376,56 +363,6 @@ class Model:
             f"{f', {len(self.colliders)} colliders' if self.colliders else ''}"
             f"{''.join(', ' + s for s in safeguards)}, {self.dtype}, {self.device})"
         )
-
-
-def _checked_device(device: torch.device | str) -> torch.device:
-    try:
-        device = torch.device(device)
-    except (RuntimeError, TypeError):
-        fail("device", '"cpu" or "cuda"', repr(device))
-    if device.type not in ops.LANES:
-        fail("device", '"cpu" or "cuda"', repr(str(device)))
-    if device.type == "cuda":
-        native.require_cuda()
-        if device.index is None:
-            device = torch.device("cuda", torch.cuda.current_device())
-    return device
-
-
-def _checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
-    kinds = (StableNeoHookean, *VERTEX_ENERGIES, PairBarrier, Friction)
-    if isinstance(energies, kinds):
-        energies = (energies,)
-    out: list[Energy] = []
-    if not isinstance(energies, (tuple, list)):
-        raise TypeError(f"energies: expected a sequence of energies, got {type(energies).__name__}")
-    for energy in energies:
-        if not isinstance(energy, kinds):
-            names = ", ".join(k.__name__ for k in kinds)
-            raise TypeError(f"energies: expected instances of {names}, got {type(energy).__name__}")
-        if any(type(energy) is type(other) for other in out):
-            fail("energies", f"one {type(energy).__name__} (several planes are one FloorBarrier)", "two")
-        if isinstance(energy, VertexEnergy):
-            energy.check(num_vertices)
-            energy = energy.detached()
-        out.append(energy)
-    return tuple(out)
-
-
-def _per_tet_density(density: Any, num_tets: int) -> Tensor:
-    if isinstance(density, bool) or not (isinstance(density, (int, float)) or hasattr(density, "__array__")):
-        raise TypeError(f"density: expected a number or shape [{num_tets}], got {type(density).__name__}")
-    if isinstance(density, Tensor):
-        check_readable("density", density)
-    elif isinstance(density, int):
-        density = to_float("density", density)
-    density = torch.as_tensor(density).detach().cpu().to(torch.float64)
-    if density.shape not in ((), (1,), (num_tets,)):
-        fail("density", f"a number or shape [{num_tets}]", f"shape {list(density.shape)}")
-    if not bool((torch.isfinite(density) & (density > 0)).all()):
-        wrong = density.reshape(-1)[~(torch.isfinite(density) & (density > 0)).reshape(-1)]
-        fail("density", "finite numbers > 0 kg/m^3", float(wrong[0]))
-    return density.expand(num_tets).clone()
 
 
 def _first_of_body(body: Tensor) -> Tensor:

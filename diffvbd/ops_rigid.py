@@ -24,7 +24,7 @@ class Bodies(NamedTuple):
     member: Tensor  # int64 [V], the body of each vertex; of the others the number of bodies
 
     @property
-    def count(self) -> int:
+    def number(self) -> int:
         return self.ptr.shape[0] - 1
 
     def to(self, device: torch.device) -> Bodies:

@@ -3,8 +3,8 @@
     min over (R, t)   1/2 sum m |R r + t - y|^2 + the energies of single vertices,      r = x - center of mass
 
 A rigid motion leaves the energy of the tets as it is, so this costs sums over vertices alone, and it is what few sweeps
-do worst: they see neighbours, not the body. Away from planes and anchors the minimum is closed (means and a polar factor);
-else it is Newton's method in six unknowns, differentiated as executed. docs/method.md, section 14.
+do worst: they see neighbours, not the body. Away from planes and anchors the minimum is closed (means and a polar
+factor); else it is Newton's method in six unknowns, differentiated as executed. docs/method.md, section 14.
 """
 
 # pyright: reportIncompatibleMethodOverride=false
@@ -137,7 +137,7 @@ def coast(x: Tensor, step: Tensor, planes: Tensor, origin: Tensor | None, bodies
 
 def _least(values: Tensor, bodies: Bodies) -> Tensor:
     """For each vertex the least value [B, V] of its body."""
-    start = values.new_ones((values.shape[0], bodies.count + 1))
+    start = values.new_ones((values.shape[0], bodies.number + 1))
     index = bodies.member.expand(values.shape)
     return start.scatter_reduce(1, index, values, "amin").gather(1, index)
 

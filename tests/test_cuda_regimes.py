@@ -16,7 +16,6 @@ from diffvbd import testing
 from diffvbd.testing import (
     CASES,
     KINDS,
-    bar,
     evaluate,
     generator,
     on_device,
@@ -159,7 +158,7 @@ def test_odd_scenes_equal_the_cpu(name: str, regime: str, scenes: tuple[int, ...
                 error = relative_error(result[key], value)
                 # masses of a body that falls freely hardly matter: what is left of their gradient is small differences
                 moved = 0.0 if error <= tolerance("adjoint") else sensitivity(model, inputs, sweeps)[key]
-                assert error <= bar(moved), (key, tape)
+                assert error <= testing.bar(moved), (key, tape)
 
 
 def evaluated(model: dv.Model, inputs: dict[str, Any], sweeps: int, tape: str = "full") -> dict[str, Tensor]:

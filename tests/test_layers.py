@@ -76,7 +76,7 @@ def test_mesh_and_ops_stand_alone() -> None:
             assert inside <= {"diffvbd.__version__", "diffvbd.build_cuda.architectures"}
         if module == "build_cuda":
             assert not inside
-    assert layer_users("native") == {"ops", "model"}
+    assert layer_users("native") == {"ops", "model_arguments"}
 
 
 def test_reference_is_independent_of_what_it_checks() -> None:
@@ -124,10 +124,10 @@ def test_only_ops_names_the_compiled_operators() -> None:
 
     assert naming(r"\bload_library\b") == {"native"}
     assert naming(r"torch\.ops\b(?!\.load_library\b)|torch\.library\b|\bdiffvbd::") == {
-        "ops", "ops_contact", "ops_contact_start", "ops_contact_sweep", "ops_neighbors"
+        "ops", "ops_contact", "ops_contact_start", "ops_contact_sweep", "ops_neighbors", "ops_rigid"
     }  # fmt: skip
     assert naming(r"\bops\.raw\b") == {
-        "ops_contact", "ops_contact_start", "ops_contact_sweep", "ops_neighbors", "sweeps"
+        "ops_contact", "ops_contact_start", "ops_contact_sweep", "ops_neighbors", "ops_rigid", "sweeps"
     }  # fmt: skip
     assert not [m for m, imports in PYTHON.items() if "diffvbd.ops.raw" in imports or "torch.ops" in imports]
 
@@ -165,9 +165,9 @@ def layer_includes(folder: str) -> set[str]:
 
 @needs_csrc
 def test_shared_headers_know_no_torch() -> None:
-    for folder in ("core", "energies", "contact"):
+    for folder in ("core", "energies", "contact", "rigid"):
         paths = sources(folder)
-        assert len(paths) >= 4
+        assert len(paths) >= 3
         for path in paths:
             assert path.suffix == ".h", path
             text = path.read_text(encoding="utf-8")
@@ -181,8 +181,9 @@ def test_cpp_layers_include_only_what_lies_below() -> None:
     # block.h alone knows the list of energies, which the algorithm runs
     assert layer_includes("core") <= {"energies"}
     assert [p.name for p in sources("core") if any("energies/" in name for name in includes(p))] == ["block.h"]
-    shared = {"core", "energies", "contact"}
+    shared = {"core", "energies", "contact", "rigid"}
     assert layer_includes("contact") <= {"core", "energies"}
+    assert layer_includes("rigid") <= {"core", "energies"}
     tensors = {p.name for p in CSRC.glob("arguments*.h")}
     assert "core" in layer_includes("cpu") <= shared | tensors
     assert "core" in layer_includes("cuda") <= shared

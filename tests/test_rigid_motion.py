@@ -1,4 +1,4 @@
-"""Claim: with the rigid correction any number of sweeps falls freely, keeps momentum and turns as a converged step does."""
+"""Claim: with the rigid correction any number of sweeps falls freely, keeps momentum, turns as converged steps do."""
 
 import pytest
 import torch

@@ -16,7 +16,7 @@ constexpr int kMaxHalvings = 30;
 constexpr double kLeastShare = 0.1;  // of its gap that a vertex keeps in one step: that of the updates, 1 - FILTER_ETA
 constexpr double kDamping = 1e-9;    // of the inertia, so that a body collapsed to a line has a turning block
 constexpr double kArrived = 1e-24;   // squared step over squared radius of gyration at which Newton's method ends
-constexpr double kRounding = 1e-12;  // relative rise of the energies' sum that is rounding
+constexpr double kRounding = 1e-13;  // relative rise of the energies' sum that is rounding
 
 template <class T>
 struct Inputs {

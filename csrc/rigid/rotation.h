@@ -71,7 +71,7 @@ DIFFVBD_FN Sym3<double> turning_stiffness(const Matrix& a) {
 
 // Whether a symmetric matrix is positive definite by more than rounding, as a fraction of its trace.
 DIFFVBD_FN bool definite(const Sym3<double>& a) {
-  constexpr double kLeast = 1e-12;
+  constexpr double kLeast = 1e-10;
   const double least = kLeast * (a.xx + a.yy + a.zz);
   if (!(a.xx > least)) return false;
   const double second = a.yy - a.xy * a.xy / a.xx, off = a.yz - a.xy * a.xz / a.xx;

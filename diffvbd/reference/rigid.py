@@ -19,8 +19,8 @@ ETA = 0.9  # largest fraction of the way to where a barrier begins that a start 
 LEAST_SHARE = 0.1  # of its gap that a vertex keeps in one step
 DAMPING = 1e-9  # of the inertia
 ARRIVED = 1e-24  # squared step over squared radius of gyration at which the steps end
-ROUNDING = 1e-12  # relative rise of the energies that is rounding
-DEFINITE = 1e-12  # least eigenvalue of a turning stiffness over its trace
+ROUNDING = 1e-13  # relative rise of the energies that is rounding
+DEFINITE = 1e-10  # least eigenvalue of a turning stiffness over its trace
 GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
 
 

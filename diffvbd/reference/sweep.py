@@ -233,9 +233,9 @@ def _update_color(
     update = -solve6(hessian, gradient)
     if model.saturation is not None:
         update = update * _saturation(update, model.saturation).unsqueeze(-2)
-    relaxation = model.relaxation if relaxation is None else relaxation
-    if relaxation != 1.0:
-        update = relaxation * update
+    factor = model.relaxation if relaxation is None else relaxation
+    if factor != 1.0:
+        update = factor * update
     if cut is not None:
         update = cut(x, update, vertices)
     return put(state, vertices, x + filtered(energies, x, update))

@@ -14,7 +14,7 @@ from ..arguments import GRAVITY, acceleration_of
 from ..checks import check_broadcast, check_positive, check_tensor, check_time_step, fail, name_value, vertex_mask
 from ..lasting import lasting_tensors
 from ..mesh import TetMesh
-from ..model import _checked_device
+from ..model_arguments import checked_device
 
 
 class ParticleSolver:
@@ -47,7 +47,7 @@ class ParticleSolver:
     ) -> None:
         if dtype not in (torch.float64, torch.float32):
             raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
-        device = _checked_device(device)
+        device = checked_device(device)
         self.rest_points: Tensor | None = None
         if isinstance(points, bool) or not isinstance(points, (int, np.integer)):
             self.rest_points = numbers("points", points, dtype, device)
