@@ -10,22 +10,20 @@
 
 namespace diffvbd {
 
-constexpr double kUneven = 1e3;  // lam of some hundred mu; errors grow by eps times it
+constexpr double kUneven = 3e3;  // errors grow by eps times it; lam of some hundred mu
 constexpr int kRefinements = 2;  // each leaves eps times the unevenness of the error: from 1e-4 to 1e-12 at 1e12
 
-// Whether the diagonal and the least pivot lie further apart than rounding forgives. What a plane puts on the first
-// axis stands alone there and does no harm. Inverse pivots are compared, so that nothing is divided.
+// Whether the trace and the least pivot of a block lie further apart than rounding forgives: trace(D^-1) trace(L D L^T)
+// but for the last pivot's own part, both times inv1 inv2, so that nothing is divided. What a plane puts on the first
+// axis stands alone there and does no harm.
 template <class Set, class R, class A>
 DIFFVBD_FN auto is_uneven(const Factor<R>& f, const A& axes) {
   R first = R(1) + f.l21 * f.l21 + f.l31 * f.l31;
   if constexpr (Set::filters) {
     if (axes.turned) first = select(R(0) < dot(axes.v, axes.v), R(0), first);
   }
-  const R rest = select(f.inv2 < f.inv3, f.inv3, f.inv2), most = select(rest < f.inv1, f.inv1, rest);
-  const R second = R(1) + f.l32 * f.l32;
-  // first / inv1 and second / inv2 bound the diagonal from both sides, up to a factor of two
-  const R a = first * f.inv2, b = second * f.inv1;
-  return R(kUneven) * f.inv1 * f.inv2 < most * select(a < b, b, a);
+  const R trace = first * f.inv2 + (R(1) + f.l32 * f.l32) * f.inv1;
+  return R(kUneven) * (f.inv1 * f.inv2) < (f.inv1 + f.inv2 + f.inv3) * trace;
 }
 
 // Out of line, so that no compiler fuses its products in one place and not in another: the rounding of a strain that a
@@ -80,13 +78,19 @@ DIFFVBD_COLD Applied<R> apply(const Block<R>& b, const Star& star, const StepPar
   return out;
 }
 
+// A correction, or none where it is not smaller than what it should be small against: the factors hold no digits then.
+template <class R>
+DIFFVBD_FN Vec3<R> if_small(const Vec3<R>& correction, const R& limit) {
+  return select(dot(correction, correction) < limit, correction, zero3<R>());
+}
+
 // The Newton step d of a block, refined. In the axes of the block, as `d`.
 template <class Set, class R, class T, class Star>
 DIFFVBD_COLD Vec3<R> refined_step(Block<R> b, const Star star, const StepParameters<T>& q, const Axes<Set, R> axes,
                                   const Factor<R> H, Vec3<R> d) {
   for (int k = 0; k < kRefinements; ++k) {
     const Both<R> now{d, axes.from(d)}, none{zero3<R>(), zero3<R>()};
-    d -= solve(H, apply<Set>(b, star, q, axes, now, none).g);
+    d -= if_small(solve(H, apply<Set>(b, star, q, axes, now, none).g), dot(d, d));
   }
   return d;
 }
@@ -103,15 +107,17 @@ DIFFVBD_COLD Vec3<R> reverse_star(Block<R> b, const Star& star, const StepParame
   const Both<R> d{r.d, d_raw};
   for (int k = 0; k < kRefinements; ++k) {
     const Both<R> now{p, axes.from(p)};
-    p += solve(H, z - apply<Set>(b, star, q, axes, d, now).p);
+    p += if_small(solve(H, z - apply<Set>(b, star, q, axes, d, now).p), dot(p, p));
   }
   const Vec3<R> p_mesh = axes.from(p);
   const Applied<R> left = apply<Set>(b, star, q, axes, d, Both<R>{p, p_mesh});
-  d_low = -solve(H, left.g);
+  // of d the small part may be what x + d_raw has been rounded by
+  const R rounding = R(std::numeric_limits<T>::epsilon()) * dot(b.state.x, b.state.x);
+  d_low = if_small(-solve(H, left.g), dot(d_raw, d_raw) + rounding);
   Vec3<R> own = zero3<R>();
   if constexpr (Set::elastic) {
     const R h = R(q.time_step), minus_h2 = -(h * h);
-    const Vec3<R> d_low_mesh = axes.from(d_low), p_low_mesh = axes.from(solve(H, z - left.p));
+    const Vec3<R> d_low_mesh = axes.from(d_low), p_low_mesh = axes.from(if_small(solve(H, z - left.p), dot(p, p)));
     star.rewind();
     for (int e = 0; e < star.size(); ++e) {
       const TetPair<R> pair = star.pair(e);
