@@ -1,4 +1,5 @@
-"""One implicit time step: predictor, sweeps, velocity. Only the sweeps are a custom operator; the rest is torch."""
+"""One implicit time step: predictor, rigid correction, sweeps, rigid correction, velocity. Sweeps and corrections are
+operators of ours; the rest is torch."""
 
 from __future__ import annotations
 

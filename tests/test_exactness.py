@@ -117,7 +117,10 @@ def measure(place: str, case: str, kind: str, size: str, sweeps: int, steps: int
 def may_vanish(case: str, name: str, sweeps: int) -> bool:
     """Whether a gradient is zero by construction."""
     c = CASES[case]
-    if sweeps == 0:  # the step is its predictor: energies do not enter, mass only where a force acts
+    if sweeps == 0:  # the step is its predictor: tets do not enter, masses only where a force acts, and other energies
+        # only through the correction of a free body
+        if not c.pinned and (c.floor is not None or c.anchor is not None):
+            return name in ("grad_mu", "grad_lam", "grad_prescribed", "grad_floor_barrier.damping")
         massless = ("grad_density", "grad_rest_points") if c.force == 0 else ()
         energies = name.startswith(("grad_floor_barrier", "grad_anchor"))
         return energies or name in ("grad_mu", "grad_lam", *massless) or (name == "grad_prescribed" and not c.pinned)
