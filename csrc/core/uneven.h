@@ -3,7 +3,8 @@
 // step is therefore refined: what it leaves of its own equation is summed up again, tet by tet, where the stiff terms
 // are small already, and solved for with the same factors. In the reverse the last correction stays apart, because
 // added to p or d_raw it would round away: what it does to n . p and to the strain of each tet is added to these. Here
-// alone, out of line: most blocks never come here.
+// alone, out of line: most blocks never come here. Packs of lanes go by reference: by value a function of one
+// instruction set and one of another disagree on where they lie on the stack.
 #pragma once
 
 #include "block.h"
@@ -86,8 +87,9 @@ DIFFVBD_FN Vec3<R> if_small(const Vec3<R>& correction, const R& limit) {
 
 // The Newton step d of a block, refined. In the axes of the block, as `d`.
 template <class Set, class R, class T, class Star>
-DIFFVBD_COLD Vec3<R> refined_step(Block<R> b, const Star star, const StepParameters<T>& q, const Axes<Set, R> axes,
-                                  const Factor<R> H, Vec3<R> d) {
+DIFFVBD_COLD Vec3<R> refined_step(const Block<R>& b, const Star& star, const StepParameters<T>& q,
+                                  const Axes<Set, R>& axes, const Factor<R>& H, const Vec3<R>& first) {
+  Vec3<R> d = first;
   for (int k = 0; k < kRefinements; ++k) {
     const Both<R> now{d, axes.from(d)}, none{zero3<R>(), zero3<R>()};
     d -= if_small(solve(H, apply<Set>(b, star, q, axes, now, none).g), dot(d, d));
@@ -98,11 +100,12 @@ DIFFVBD_COLD Vec3<R> refined_step(Block<R> b, const Star star, const StepParamet
 // p = H^-1 z, refined, the small part of d, and the adjoints of the star, which go through star.add() but for that of
 // x_i. z, p and d_low are in the axes of the block.
 template <class Set, int wanted, class R, class T, class Star>
-DIFFVBD_COLD Vec3<R> reverse_star(Block<R> b, const Star& star, const StepParameters<T>& q, const Axes<Set, R> axes,
-                                  const Recalled<R> r, const Vec3<R> d_raw, const Vec3<R> z, Vec3<R>& p,
-                                  Vec3<R>& d_low) {
+DIFFVBD_COLD Vec3<R> reverse_star(const Block<R>& given, const Star& star, const StepParameters<T>& q,
+                                  const Axes<Set, R>& axes, const Recalled<R>& r, const Vec3<R>& d_raw,
+                                  const Vec3<R>& z, Vec3<R>& p, Vec3<R>& d_low) {
   using Elastic = typename Set::Elastic;
   const Factor<R>& H = r.H;
+  Block<R> b = given;
   b.y = star.predictor(b);
   const Both<R> d{r.d, d_raw};
   for (int k = 0; k < kRefinements; ++k) {
@@ -133,14 +136,28 @@ DIFFVBD_COLD Vec3<R> reverse_star(Block<R> b, const Star& star, const StepParame
 }
 
 // Copies keep what the usual path works with in registers.
+template <class Set, class R, class T, class Star>
+DIFFVBD_FN Vec3<R> step_uneven(const Block<R>& b, const Star& star, const StepParameters<T>& q,
+                               const Axes<Set, R>& axes, const Factor<R>& H, const Vec3<R>& d) {
+  const Block<R> b_copy = b;
+  const Star star_copy = star;
+  const Axes<Set, R> axes_copy = axes;
+  const Factor<R> H_copy = H;
+  const Vec3<R> d_copy = d;
+  return refined_step<Set>(b_copy, star_copy, q, axes_copy, H_copy, d_copy);
+}
 template <class Set, int wanted, class R, class T, class Star>
 DIFFVBD_FN Vec3<R> reverse_uneven(const Block<R>& b, const Star& star, const StepParameters<T>& q,
                                   const Axes<Set, R>& axes, const Recalled<R>& r, const Vec3<R>& d_raw,
                                   const Vec3<R>& z, Vec3<R>& p, Vec3<R>& d_low) {
-  const Star copy = star;
+  const Star star_copy = star;
+  const Block<R> b_copy = b;
+  const Axes<Set, R> axes_copy = axes;
+  const Recalled<R> r_copy = r;
+  const Vec3<R> d_copy = d_raw, z_copy = z;
   Vec3<R> refined = p, low;
-  const Vec3<R> own = reverse_star<Set, wanted>(b, copy, q, axes, r, d_raw, z, refined, low);
-  star.adopt(copy);
+  const Vec3<R> own = reverse_star<Set, wanted>(b_copy, star_copy, q, axes_copy, r_copy, d_copy, z_copy, refined, low);
+  star.adopt(star_copy);
   p = refined;
   d_low = low;
   return own;

@@ -21,7 +21,7 @@ DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const 
   const Factor<R> H = factor<T>(system.H, least_eigenvalue(b, q));
   Vec3<R> d = -solve(H, system.g);
   if constexpr (Set::elastic) {
-    if (star.any(is_uneven<Set>(H, system.axes))) d = refined_step<Set>(b, star, q, system.axes, H, d);
+    if (star.any(is_uneven<Set>(H, system.axes))) d = step_uneven<Set>(b, star, q, system.axes, H, d);
   }
   return {d, system.axes.from(d), H};
 }
