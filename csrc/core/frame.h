@@ -19,63 +19,54 @@ DIFFVBD_FN Dual<R> without_rounding(const Dual<R>& a, const Dual<R>& tiny) {
   return {without_rounding(a.value, tiny.value), a.derivative};
 }
 
-// A reflection I - v v^T with |v|^2 = 2 that brings a first normal to the x axis, then a turn about x that brings a
-// second one to the xy plane.
+// Three axes: the first along a first normal, the second in the plane of it and a second one. Where a normal is an axis
+// of the mesh so are all three, and turning rounds nothing.
 template <class R>
 struct Frame {
-  Vec3<R> v;
-  R cosine, sine;
-  R tiny;       // components of a unit normal below it are rounding
+  Vec3<R> first, second, third;
+  R tiny;       // components of a unit normal below it are rounding; 0 for a lane without a plane
   bool turned;  // whether any lane has a plane
 
-  // The axes as they are: nothing else is read, or written.
+  // The axes of the mesh: nothing else is read, or written.
   DIFFVBD_FN static Frame none() {
     Frame f;
     f.turned = false;
     return f;
   }
-  // `first` and `second` are unit normals, or zero where a lane has none
+  // n and m are unit normals, or zero where a lane has none
   template <class T>
-  DIFFVBD_FN static Frame along(const Vec3<R>& first, const Vec3<R>& second) {
+  DIFFVBD_FN static Frame along(const Vec3<R>& n, const Vec3<R>& m) {
     Frame f;
-    f.cosine = R(1);
-    f.sine = R(0);
-    f.tiny = R(8 * std::numeric_limits<T>::epsilon());
     f.turned = true;
-    const Vec3<R> u = {first.x + select(first.x < R(0), R(-1), R(1)), first.y, first.z};
-    const R scale = select(R(0) < dot(first, first), square_root(R(2) / dot(u, u)), R(0));
-    f.v = scale * u;
-    const Vec3<R> t = f.to(second);
-    const R length = square_root(t.y * t.y + t.z * t.z);
+    const auto exists = R(0) < dot(n, n);
+    f.tiny = select(exists, R(8 * std::numeric_limits<T>::epsilon()), R(0));
+    // the rows of a reflection I - s u u^T that brings n to -+ the x axis
+    const Vec3<R> u = {n.x + select(n.x < R(0), R(-1), R(1)), n.y, n.z};
+    const R s = select(exists, R(2) / dot(u, u), R(0));
+    const Vec3<R> a = {-s * u.y * u.x, R(1) - s * u.y * u.y, -s * u.y * u.z};
+    const Vec3<R> b = {-s * u.z * u.x, -s * u.z * u.y, R(1) - s * u.z * u.z};
+    f.first = select(exists, n, Vec3<R>{R(1), R(0), R(0)});
+    const R y = dot(a, m), z = dot(b, m), length = square_root(y * y + z * z);
     const auto apart = f.tiny < length;  // parallel planes have one direction
     const R inverse = R(1) / select(apart, length, R(1));
-    f.cosine = select(apart, t.y * inverse, R(1));
-    f.sine = select(apart, t.z * inverse, R(0));
+    const R cosine = select(apart, y * inverse, R(1)), sine = select(apart, z * inverse, R(0));
+    f.second = cosine * a + sine * b;
+    f.third = cosine * b - sine * a;
     return f;
   }
 
   DIFFVBD_FN Vec3<R> to(const Vec3<R>& a) const {
     if (!turned) return a;
-    const Vec3<R> b = a - dot(v, a) * v;
-    return {b.x, cosine * b.y + sine * b.z, cosine * b.z - sine * b.y};
+    return {dot(first, a), dot(second, a), dot(third, a)};
   }
   DIFFVBD_FN Vec3<R> from(const Vec3<R>& a) const {
     if (!turned) return a;
-    const Vec3<R> b = {a.x, cosine * a.y - sine * a.z, sine * a.y + cosine * a.z};
-    return b - dot(v, b) * v;
+    return a.x * first + a.y * second + a.z * third;
   }
   DIFFVBD_FN Sym3<R> to(const Sym3<R>& a) const {
     if (!turned) return a;
-    const Vec3<R> av = a * v, w = av - (R(0.5) * dot(v, av)) * v;
-    const Sym3<R> b = {a.xx - R(2) * v.x * w.x, a.xy - v.x * w.y - w.x * v.y, a.xz - v.x * w.z - w.x * v.z,
-                       a.yy - R(2) * v.y * w.y, a.yz - v.y * w.z - w.y * v.z, a.zz - R(2) * v.z * w.z};
-    const R cc = cosine * cosine, ss = sine * sine, cs = cosine * sine, twice = R(2) * cs * b.yz;
-    return {b.xx,
-            cosine * b.xy + sine * b.xz,
-            cosine * b.xz - sine * b.xy,
-            cc * b.yy + twice + ss * b.zz,
-            cs * (b.zz - b.yy) + (cc - ss) * b.yz,
-            ss * b.yy - twice + cc * b.zz};
+    const Vec3<R> x = a * first, y = a * second, z = a * third;
+    return {dot(first, x), dot(first, y), dot(first, z), dot(second, y), dot(second, z), dot(third, z)};
   }
   // A unit normal whose zeros are exact: one that is rounding instead would bring s to another axis.
   DIFFVBD_FN Vec3<R> normal(const Vec3<R>& n) const {
@@ -88,7 +79,7 @@ struct Frame {
 template <class R>
 DIFFVBD_FN Frame<Dual<R>> constant(const Frame<R>& f) {
   if (!f.turned) return Frame<Dual<R>>::none();
-  return {constant(f.v), Dual<R>(f.cosine), Dual<R>(f.sine), Dual<R>(f.tiny), f.turned};
+  return {constant(f.first), constant(f.second), constant(f.third), Dual<R>(f.tiny), f.turned};
 }
 
 // Where no energy has planes.

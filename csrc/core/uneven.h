@@ -21,7 +21,7 @@ template <class Set, class R, class A>
 DIFFVBD_FN auto is_uneven(const Factor<R>& f, const A& axes) {
   R first = R(1) + f.l21 * f.l21 + f.l31 * f.l31;
   if constexpr (Set::filters) {
-    if (axes.turned) first = select(R(0) < dot(axes.v, axes.v), R(0), first);
+    if (axes.turned) first = select(R(0) < axes.tiny, R(0), first);
   }
   const R trace = first * f.inv2 + (R(1) + f.l32 * f.l32) * f.inv1;
   return R(kUneven) * (f.inv1 * f.inv2) < (f.inv1 + f.inv2 + f.inv3) * trace;

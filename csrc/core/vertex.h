@@ -128,8 +128,10 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   const Vec3<R> z_axes = axes.to(z);
   Vec3<R> p_axes = solve(r.H, z_axes), d_low = zero3<R>();
   bool uneven = false;
-  if constexpr (Set::elastic) uneven = star.any(is_uneven<Set>(r.H, axes));
-  if constexpr (Set::filters) uneven = uneven || (wants_data && star.any(axes.turned));
+  if constexpr (!Set::contact) {  // what contact adds to a block is not on a full tape
+    if constexpr (Set::elastic) uneven = star.any(is_uneven<Set>(r.H, axes));
+    if constexpr (Set::filters) uneven = uneven || (wants_data && star.any(axes.turned));
+  }
   if (uneven) out.x += reverse_uneven<Set, wanted>(b, star, q, axes, r, u.d_raw, z_axes, p_axes, d_low);
   const Vec3<R> p = axes.from(p_axes);
   out.p = p;
