@@ -14,15 +14,18 @@ from bench.common import markdown_table
 
 def run(quick: bool, device: str = "cpu") -> list[dict[str, Any]]:
     out = []
-    sizes: list[tuple[str, Callable[[], dv.TetMesh], int]] = [
-        ("cube of 27", lambda: dv.mesh.cube(3, size=0.2), 20),
-        ("cube of 1,331", lambda: dv.mesh.cube(11), 20),
+    sizes: list[tuple[str, Callable[[], dv.TetMesh], int, int]] = [
+        ("cube of 27", lambda: dv.mesh.cube(3, size=0.2), 20, 1),
+        ("cube of 1,331", lambda: dv.mesh.cube(11), 20, 1),
     ]
     if not quick:
-        sizes += [("cube of 195,112", lambda: dv.mesh.cube(58), 20), ("10,000 cubes of 8", lambda: _cubes(10_000), 5)]
+        sizes += [
+            ("cube of 195,112", lambda: dv.mesh.cube(58), 20, 1),
+            ("10,000 cubes of 8, one mesh", lambda: _cubes(10_000), 5, 1),
+        ]
         if device != "cpu":
-            sizes.append(("1,000,000 cubes of 8", lambda: _cubes(1_000_000), 5))
-    for name, make, sweeps in sizes:
+            sizes.append(("1,000,000 cubes of 8, a scene each", lambda: dv.mesh.cube(2, size=0.2), 5, 1_000_000))
+    for name, make, sweeps, scenes in sizes:
         mesh = make()
         for energies in ("none", "floor, in contact"):
             floor = (dv.FloorBarrier(height=-0.005, kappa=1e3, dhat=0.01),) if energies != "none" else ()
@@ -30,11 +33,11 @@ def run(quick: bool, device: str = "cpu") -> list[dict[str, Any]]:
             for rigid in (False, True):
                 model = dv.Model(mesh, energies=(dv.StableNeoHookean(), *floor), rigid=rigid, device=device)
                 key = "with" if rigid else "without"
-                row[f"step_{key}"] = _seconds(model, sweeps, False, quick)
+                row[f"step_{key}"] = _seconds(model, scenes, sweeps, False, quick)
                 if not rigid:
-                    few = _seconds(model, 1, False, quick)
+                    few = _seconds(model, scenes, 1, False, quick)
                     row["sweep"] = (row["step_without"] - few) / (sweeps - 1)
-                row[f"both_{key}"] = _seconds(model, sweeps, True, quick)
+                row[f"both_{key}"] = _seconds(model, scenes, sweeps, True, quick)
             row["corrections_over_sweep"] = (row["step_with"] - row["step_without"]) / row["sweep"]
             row["step_ratio"] = row["step_with"] / row["step_without"]
             row["both_ratio"] = row["both_with"] / row["both_without"]
@@ -49,9 +52,10 @@ def _cubes(count: int) -> dv.TetMesh:
     return dv.mesh.replicate(dv.mesh.cube(2, size=0.2), place.numpy())
 
 
-def _seconds(model: dv.Model, sweeps: int, backward: bool, quick: bool) -> float:
+def _seconds(model: dv.Model, scenes: int, sweeps: int, backward: bool, quick: bool) -> float:
     """Median time of a step, or of a step and its backward."""
-    x = model.rest_points.clone().requires_grad_(backward)
+    x = model.rest_points
+    x = (x if scenes == 1 else x.expand(scenes, -1, -1).contiguous()).requires_grad_(backward)
     v = torch.zeros_like(x)
     cuda = model.device.type == "cuda"
 
