@@ -63,8 +63,8 @@ def run(model: dv.Model, x: torch.Tensor, v: torch.Tensor, steps: int, sweeps: i
 @pytest.mark.parametrize("sweeps", (0, 1, 2, 3, 5))
 @pytest.mark.parametrize("relaxation", (0.5, 1.0, 1.6))
 def test_a_body_rests(device: str, relaxation: float, sweeps: int) -> None:
-    """The gap is above a tenth of the equilibrium gap at all times, in the end at it; nothing moves or drifts. Materials
-    are scenes: from jelly to rubber."""
+    """The gap is above a tenth of the equilibrium gap at all times, in the end at it; nothing moves or drifts.
+    Materials are scenes: from jelly to rubber."""
     mu = torch.tensor([[2e4], [2e5], [2e7]], dtype=torch.float64, device=device)
     weight = DENSITY * EDGE**3 * 9.81
     # all of the weight on nine vertices alike, or on the corner that bears least of it
