@@ -29,6 +29,8 @@ def lasting(value: Any) -> Any:
         return {key: lasting(each) for key, each in value.items()}
     if type(value) in (tuple, list):
         return type(value)(lasting(each) for each in value)
+    if isinstance(value, tuple) and hasattr(value, "_fields"):  # a NamedTuple
+        return type(value)(*(lasting(each) for each in value))
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kept = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
         made = {name: lasting(each) for name, each in kept.items()}

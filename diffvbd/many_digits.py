@@ -151,7 +151,7 @@ def _step(
         for i, v in enumerate(inputs["v"])
     ]
     floor = _Floor(inputs, h) if "floor_barrier.height" in inputs else None
-    now = [y[i] if pinned[i] or floor is None else floor.filtered(x[i], _sub(y[i], x[i])) for i in range(len(x))]
+    now = [y[i] if pinned[i] or floor is None else floor.started(x[i], _sub(y[i], x[i])) for i in range(len(x))]
     tau, omega = Decimal(float(model.regularization)), Decimal(float(model.relaxation))
     for _ in range(sweeps):
         for i in model.color_vertices.tolist():  # vertices of one color do not see each other
@@ -222,10 +222,37 @@ class _Floor:
             log, past = _log(safe / self.dhat), safe - self.dhat
             first = -self.kappa * (2 * past * log + past * past / safe)
             second = -self.kappa * (2 * log + 4 * past / safe - (past / safe) * (past / safe))
-            damped = (_dot(n, x_prev) - height < self.dhat) & (travel < 0)
-            c = np.where(damped, self.damping * self.h, 0 * self.damping)
-            out.append((n, self.h * self.h * first + c * travel, self.h * self.h * second + c))
+            c = np.where(_dot(n, x_prev) - height < self.dhat, self.damping * self.h, 0 * self.damping)
+            approach = np.where(travel < 0, travel, 0 * travel)
+            out.append((n, self.h * self.h * first + c * approach, self.h * self.h * second + c))
         return out
+
+    def started(self, x: Vector, move: Vector) -> Vector:
+        """Where a step starts: the motion less what approaches a plane too closely, of at most two planes the one that
+        is exceeded most first (safeguards.filter_against_planes)."""
+        slack = Decimal(8 * 2.0**-52) * _root(_dot(move, move) + Decimal("1e-200"))
+        limits = []
+        for n, height in self.planes:
+            away = _dot(n, x) - height - self.dhat
+            limits.append((n, Decimal(ETA) * np.where(away > 0, away, 0 * away)))
+        if len(limits) == 2:
+            over = [-_dot(n, move) - room for n, room in limits]
+            swap = over[1] > over[0]
+            (n, a), (m, b) = limits
+            first = ([np.where(swap, q, p) for p, q in zip(n, m, strict=True)], np.where(swap, b, a))
+            other = ([np.where(swap, p, q) for p, q in zip(n, m, strict=True)], np.where(swap, a, b))
+            limits = [first, other]
+        taken: list[tuple[Vector, np.ndarray]] = []
+        for n, room in limits:
+            excess, w = -_dot(n, move) - room, n
+            binds = excess > slack
+            for other_w, square in taken:
+                w = _sub(w, _times(_dot(n, other_w) / square, other_w))
+            w = [np.where(binds, c, 0 * c) for c in w]
+            square = np.where(binds, _dot(w, w), 1 + 0 * excess)
+            move = _add(move, _times(np.where(binds, excess, 0 * excess) / square, w))
+            taken.append((w, square))
+        return _add(x, move)
 
     def filtered(self, x: Vector, move: Vector) -> Vector:
         alpha = 0 * x[0] + 1

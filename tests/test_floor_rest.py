@@ -36,7 +36,8 @@ def scenes(
     """A cube of 27 vertices that stands flat on a plane, in a scene for each direction; model, state and arguments."""
     mesh = dv.mesh.cube(3, size=0.2)
     floor = dv.FloorBarrier(kappa=KAPPA, dhat=DHAT)
-    model = dv.Model(mesh, density=density, energies=(dv.StableNeoHookean(), floor, *energies), relaxation=relaxation)
+    model = dv.Model(mesh, density=density, energies=(dv.StableNeoHookean(), floor, *energies), relaxation=relaxation,
+                     rigid=False)  # fmt: skip
     turned = []
     for n in DIRECTIONS:  # the columns of an orthonormal matrix whose second is n
         other = torch.linalg.cross(n, torch.eye(3, dtype=n.dtype)[int(n.abs().argmin())])

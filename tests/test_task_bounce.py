@@ -68,8 +68,8 @@ def test_scenes_of_a_batch_do_not_mix(tmp_path: Path) -> None:
 def test_sweeps_are_an_option_of_the_cube(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     problems = [quick("cube-bounce", tmp_path, sweeps=sweeps)[0] for sweeps in (1, 5, 20)]
     starts = [problem.stages[0].loss().sqrt().item() for problem in problems]
-    # few sweeps change the bounce
-    assert abs(starts[0] - starts[2]) > abs(starts[1] - starts[2]) > 1e-3
+    # few sweeps change the bounce, by tenths of a millimetre: the rigid correction holds the body's motion
+    assert 1e-2 > abs(starts[0] - starts[2]) > abs(starts[1] - starts[2]) > 1e-5
     assert main(["run", "cube-bounce", "--sweeps", "-1", "--out", str(tmp_path)]) == 2
     assert "sweeps: expected" in capsys.readouterr().err
 

@@ -207,15 +207,20 @@ def _turned_by(w: Tensor) -> Tensor:
 
 
 def _polar(b: Tensor) -> Tensor:
-    """The rotation closest to b [..., 3, 3]: by its singular values, then one Newton step, which carries the
-    derivative. The identity where b determines none."""
+    """The rotation closest to b [..., 3, 3]: by Newton steps from the identity, the last of which carries
+    the derivative. The identity where b determines none, or one that is too far."""
+    one = torch.eye(3, dtype=b.dtype, device=b.device)
     with torch.no_grad():
-        u, _, vt = torch.linalg.svd(b)
-        sign = torch.ones_like(b[..., 0])
-        sign[..., 2] = torch.det(u) * torch.det(vt)
-        found = (u * sign[..., None, :]) @ vt
-        eigenvalues = torch.linalg.eigvalsh(_turning_stiffness(found.transpose(-1, -2) @ b))
-        good = (eigenvalues[..., 0] > DEFINITE * eigenvalues.sum(-1))[..., None, None]
+        found, good = one.expand_as(b), torch.ones_like(b[..., :1, :1], dtype=torch.bool)
+        for _ in range(30):
+            m = found.transpose(-1, -2) @ b
+            stiffness = _turning_stiffness(m)
+            definite = torch.linalg.eigvalsh(stiffness)[..., 0] > DEFINITE * stiffness.diagonal(dim1=-2, dim2=-1).sum(
+                -1
+            )
+            w = torch.linalg.solve(torch.where(definite[..., None, None], stiffness, one), _axial(m))
+            good = good & (definite & ((w * w).sum(-1) < 1))[..., None, None]
+            found = found + torch.where(good, found @ _turned_by(w), 0.0)
     m = found.transpose(-1, -2) @ b
     stiffness = torch.where(good, _turning_stiffness(m), torch.eye(3, dtype=b.dtype, device=b.device))
     w = torch.linalg.solve(stiffness, torch.where(good[..., 0], _axial(m), 0.0))
