@@ -34,7 +34,11 @@ def _watched(model: dv.Model, steps: int, sweeps: int, speed: float = 0.0) -> di
     v[:, 1] -= speed
     low, mu = torch.full((), torch.inf, dtype=x.dtype, device=x.device), 2e5
     for _ in range(steps):
-        x, v = dv.step(model, x, v, mu=mu, lam=2 * mu, time_step=H, sweeps=sweeps)
+        try:
+            x, v = dv.step(model, x, v, mu=mu, lam=2 * mu, time_step=H, sweeps=sweeps)
+        except ValueError:  # the state before was no longer finite, or below the floor
+            x, v, low = x * torch.nan, v * torch.nan, low * torch.nan
+            break
         low = torch.minimum(low, x[:, 1].min())
     moved = (x - model.rest_points).mean(0)
     return {
