@@ -19,7 +19,7 @@ from torch.autograd import Function
 from . import ops, ops_rigid
 from .ops_rigid import Bodies
 from .safeguards import FILTER_ETA, GUARD_ULPS
-from .sweeps import distinct, no_second_derivative, of_inputs
+from .sweeps import distinct, no_second_derivative, of_inputs, one_by_one
 
 _TENSORS = 5  # x, x_prev, y, mass, data: the differentiable inputs, all [1 | B, ...]
 
@@ -72,14 +72,7 @@ class _CorrectBackward(Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         """Several adjoints, one after another."""
-        members = []
-        for i in range(info.batch_size):
-            own = [a.select(d, i) if isinstance(a, Tensor) and d is not None else a
-                   for a, d in zip(args, in_dims, strict=True)]  # fmt: skip
-            out = _CorrectBackward.apply(*own)
-            members.append(out if isinstance(out, tuple) else (out,))
-        stacked = tuple(torch.stack(parts) for parts in zip(*members, strict=True))
-        return stacked, (0,) * len(stacked)
+        return one_by_one(_CorrectBackward, info.batch_size, in_dims, args)
 
 
 def _folded(size: int, tensors: tuple, in_dims: tuple) -> tuple[list[Tensor], int]:

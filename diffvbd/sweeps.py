@@ -184,6 +184,18 @@ def of_inputs(out: Any, needs: Sequence[bool], others: int) -> tuple:
     return tuple(next(given) if need else None for need in needs) + (None,) * others
 
 
+def one_by_one(function: Any, size: int, in_dims: tuple, args: tuple) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+    """A vmap that applies a function to one member of the batch after another."""
+    members = []
+    for i in range(size):
+        own = [a.select(d, i) if isinstance(a, Tensor) and d is not None else a
+               for a, d in zip(args, in_dims, strict=True)]  # fmt: skip
+        out = function.apply(*own)
+        members.append(out if isinstance(out, tuple) else (out,))
+    stacked = tuple(torch.stack(parts) for parts in zip(*members, strict=True))
+    return stacked, (0,) * len(stacked)
+
+
 class SweepTensors(NamedTuple):
     """The first arguments of :func:`sweep`, with their shapes there."""
 
@@ -270,14 +282,7 @@ class _FusedBackward(Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         """Several adjoints of one step, one after another (the forward is no fused step under vmap)."""
-        members = []
-        for i in range(info.batch_size):
-            own = [a.select(d, i) if isinstance(a, Tensor) and d is not None else a
-                   for a, d in zip(args, in_dims, strict=True)]  # fmt: skip
-            out = _FusedBackward.apply(*own)
-            members.append(out if isinstance(out, tuple) else (out,))
-        stacked = tuple(torch.stack(parts) for parts in zip(*members, strict=True))
-        return stacked, (0,) * len(stacked)
+        return one_by_one(_FusedBackward, info.batch_size, in_dims, args)
 
 
 def fused_step(x, v, acceleration, held, mu, lam, mass, rest, packed_rest, plan, settings: ops.SweepSettings, *,
