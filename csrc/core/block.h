@@ -23,12 +23,13 @@ struct Block {
 template <class Set, class R>
 using Axes = std::conditional_t<Set::filters, Frame<R>, NoFrame<R>>;
 
-// g and H in these axes.
+// g and H in these axes, and what no pivot of H lies below.
 template <class Set, class R>
 struct System {
   Vec3<R> g;
   Sym3<R> H;
   Axes<Set, R> axes;
+  R least;
 };
 
 // Energies only add semidefinite parts to the mass.
@@ -52,7 +53,8 @@ DIFFVBD_FN Axes<Set, R> axes_of(const Block<R>& b) {
 template <class Set, bool all = true, class R, class T, class Star>
 DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
   const R h2 = R(q.time_step) * R(q.time_step);
-  System<Set, R> out{b.mass * (b.state.x - b.y), diagonal(least_eigenvalue(b, q)), Axes<Set, R>::none()};
+  const R least = least_eigenvalue(b, q);
+  System<Set, R> out{b.mass * (b.state.x - b.y), diagonal(least), Axes<Set, R>::none(), least};
   if constexpr (Set::elastic && all) {
     Vec3<R> g = zero3<R>();
     R h_diagonal = R(0);
@@ -76,6 +78,10 @@ DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const St
   }
   if constexpr (Set::filters) {
     out.axes = axes_of<T, Set>(b);
+    if (out.axes.turned) {  // which rounds every entry by the largest ones
+      const R rounding = R(0.5) * out.axes.tiny * (out.H.xx + out.H.yy + out.H.zz);
+      out.least = select(least < rounding, rounding, least);
+    }
     out.g = out.axes.to(out.g);
     out.H = out.axes.to(out.H);
     Set::for_each([&](auto energy, int k) {

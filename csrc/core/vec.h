@@ -136,7 +136,7 @@ DIFFVBD_FN Factor<R> factor(const Sym3<R>& a, const R& least) {
     return select(bound < computed, computed, bound);
   };
   Factor<R> f;
-  f.inv1 = R(1) / a.xx;
+  f.inv1 = R(1) / pivot(a.xx, a.xx);
   f.l21 = a.xy * f.inv1;
   f.l31 = a.xz * f.inv1;
   f.inv2 = R(1) / pivot(a.yy - f.l21 * a.xy, a.yy);

@@ -18,7 +18,7 @@ struct NewtonStep {
 template <class Set, class R, class T, class Star>
 DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const StepParameters<T>& q) {
   const System<Set, R> system = assemble<Set>(b, star, q);
-  const Factor<R> H = factor<T>(system.H, least_eigenvalue(b, q));
+  const Factor<R> H = factor<T>(system.H, system.least);
   Vec3<R> d = -solve(H, system.g);
   if constexpr (Set::elastic) {
     if (star.any(is_uneven<Set>(H, system.axes))) d = step_uneven<Set>(b, star, q, system.axes, H, d);
