@@ -32,6 +32,7 @@ CPU_SOURCES = [
     "csrc/cpu/neighbors.cpp",
     "csrc/cpu/plan.cpp",
     "csrc/cpu/register.cpp",
+    "csrc/cpu/register_begin.cpp",
     "csrc/cpu/register_contact.cpp",
     "csrc/cpu/register_contact_start.cpp",
     "csrc/cpu/register_contact_sweep.cpp",

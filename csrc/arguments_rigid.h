@@ -9,20 +9,24 @@
 
 namespace diffvbd {
 
-// In the order of csrc/ops.cpp; data and origin may be empty.
+// In the order of csrc/ops.cpp; data and origin may be empty. Of bodies that are not corrected spread is not looked at.
 struct RigidTensors {
-  const Tensor &x, &x_prev, &y, &mass, &data, &origin, &order, &ptr, &spread;
+  const Tensor &x, &x_prev, &y, &mass, &data, &origin, &order, &ptr, &spread, &other;
 };
 
 template <class T>
-rigid::Inputs<T> rigid_inputs(const RigidTensors& t, const std::vector<int64_t>& data_count, double time_step) {
+rigid::Inputs<T> rigid_inputs(const RigidTensors& t, const std::vector<int64_t>& data_count, double time_step,
+                              bool corrected = true) {
   require(t.x.dim() == 3 && t.x.size(2) == 3 && t.x.is_contiguous(),
           "diffvbd::rigid: expected x of shape [scenes, vertices, 3]");
   const int64_t b = t.x.size(0), v = t.x.size(1), bodies = t.ptr.numel() - 1;
   require(t.order.scalar_type() == ScalarType::Int && t.ptr.scalar_type() == ScalarType::Int && bodies >= 0 &&
-              t.order.numel() <= v && t.spread.scalar_type() == ScalarType::Double && t.spread.numel() == bodies &&
-              t.order.is_contiguous() && t.ptr.is_contiguous() && t.spread.is_contiguous(),
-          "diffvbd::rigid: expected order and ptr int32, spread float64, of one list of bodies");
+              t.order.numel() <= v && t.order.is_contiguous() && t.ptr.is_contiguous(),
+          "diffvbd::rigid: expected order and ptr int32 of one list of bodies");
+  if (corrected) {
+    require(t.spread.scalar_type() == ScalarType::Double && t.spread.numel() == bodies && t.spread.is_contiguous(),
+            "diffvbd::rigid: expected spread float64 [bodies]");
+  }
   require(time_step > 0, "diffvbd::rigid: expected time_step > 0");
   rigid::Inputs<T> in{};
   in.x = data<const T>(t.x);
@@ -33,7 +37,10 @@ rigid::Inputs<T> rigid_inputs(const RigidTensors& t, const std::vector<int64_t>&
   in.data = batched<T>(t.data, t.x, b, energy_data_size(data_count, v));
   in.order = data<const int32_t>(t.order);
   in.ptr = data<const int32_t>(t.ptr);
-  in.spread = data<const double>(t.spread);
+  in.spread = corrected ? data<const double>(t.spread) : nullptr;
+  require(t.other.scalar_type() == ScalarType::Int && t.other.numel() == v && t.other.is_contiguous(),
+          "diffvbd::rigid: expected other int32 [V]");
+  in.other = data<const int32_t>(t.other);
   in.scenes = b;
   in.vertices = static_cast<int32_t>(v);
   in.bodies = static_cast<int32_t>(bodies);
@@ -47,32 +54,33 @@ rigid::Inputs<T> rigid_inputs(const RigidTensors& t, const std::vector<int64_t>&
   return in;
 }
 
-// The adjoints of a correction; make(shape, zeroed) allocates. What no body touches must be zero from the start, and x
-// that of the result.
+// The adjoints of a correction; make(shape, zeroed) allocates.
 struct RigidBars {
-  bool all;  // every vertex is in a body
   Tensor x, x_prev, y, mass, shared, own;
 
   template <class T, class Make>
-  RigidBars(const RigidTensors& t, const rigid::Inputs<T>& in, const std::vector<int64_t>& data_count, bool wants_data,
-            const Make& make)
-      : all(t.order.numel() == in.vertices) {
+  RigidBars(const rigid::Inputs<T>& in, const std::vector<int64_t>& data_count, bool has_velocity, bool wants_data,
+            const Make& make) {
     const int64_t b = in.scenes, v = in.vertices;
     int64_t of_scene = 0, of_vertex = 0;
     for (int k = 0; k < kVertexEnergies; ++k) {
       (is_per_vertex(k, VertexEnergies{}) ? of_vertex : of_scene) += data_count[k];
     }
-    x = make({b, v, 3}, false), y = make({b, v, 3}, !all), mass = make({b, v}, !all);
-    x_prev = in.data.data ? make({b, v, 3}, !all) : make({0}, false);
+    x = make({b, v, 3}, false), y = make({b, v, 3}, false), mass = make({b, v}, false);
+    x_prev = in.data.data || has_velocity ? make({b, v, 3}, false) : make({0}, false);
     shared = make({b, wants_data ? in.bodies : 0, of_scene}, true);
     own = make({b, wants_data ? v : 0, of_vertex}, true);
   }
   template <class T>
-  rigid::Adjoints<T> pointers(const Tensor& end) const {
-    require(end.is_contiguous() && end.numel() == x.numel() && end.scalar_type() == x.scalar_type(),
-            "diffvbd::rigid_backward: x_bar must be like x");
+  rigid::Adjoints<T> pointers(const Tensor& end, const Tensor& velocity) const {
+    for (const Tensor* bar : {&end, &velocity}) {
+      require(bar->is_contiguous() && (bar->numel() == x.numel() || (bar == &velocity && bar->numel() == 0)) &&
+                  bar->scalar_type() == x.scalar_type(),
+              "diffvbd::rigid_backward: x_bar and v_bar must be like x");
+    }
     const auto or_null = [](const Tensor& t) { return t.numel() > 0 ? data<T>(t) : nullptr; };
     return {data<const T>(end),
+            velocity.numel() > 0 ? data<const T>(velocity) : nullptr,
             data<T>(x),
             or_null(x_prev),
             data<T>(y),

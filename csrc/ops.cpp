@@ -80,17 +80,39 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   m.def(
       "contact_lag_backward(Tensor bar, Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor "
       "constants, Tensor ptr, Tensor entry) -> (Tensor x, Tensor collider, Tensor kappa)");
-  // The rigid correction of each body that is listed, see rigid/body.h; order, ptr: their vertices; spread: squared
-  // radius of gyration [m^2]; groups: how many bodies a part of a warp, a block and the whole device work on (CUDA)
+  // The rigid correction of each body that is listed, see rigid/body.h, and the velocity (x - x_prev) / h; order, ptr:
+  // their vertices; spread: squared radius of gyration [m^2]; other [vertices]: -2 for what is listed; groups: how many
+  // bodies a part of a warp, a block and the whole device work on (CUDA)
   m.def(
       "rigid(Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor energy_data, Tensor origin, Tensor order, Tensor "
-      "ptr, Tensor spread, int[] groups, int[] data_count, float time_step) -> Tensor");
-  // adjoints of x, x_prev (empty without energies), y, mass, and of data: [scenes, bodies, scalars of a scene] and
-  // [scenes, vertices, scalars of a vertex]
+      "ptr, Tensor spread, Tensor other, int[] groups, int[] data_count, float time_step) -> (Tensor x, Tensor v)");
+  // v_bar: empty where there is none. Adjoints of x, x_prev (empty without energies and v_bar), y, mass, and of data:
+  // [scenes, bodies, scalars of a scene] and [scenes, vertices, scalars of a vertex]
   m.def(
-      "rigid_backward(Tensor x_bar, Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor energy_data, Tensor origin, "
-      "Tensor order, Tensor ptr, Tensor spread, int[] groups, int[] data_count, float time_step, bool wants_data) -> "
+      "rigid_backward(Tensor x_bar, Tensor v_bar, Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor energy_data, "
+      "Tensor origin, "
+      "Tensor order, Tensor ptr, Tensor spread, Tensor other, int[] groups, int[] data_count, float time_step, bool "
+      "wants_data) -> "
       "(Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own)");
+  // Predictor and start of the sweeps, see start/begin.h. x, v, held: held is where pinned vertices go, or empty;
+  // order ... groups: the bodies that are corrected, as of rigid(); other [vertices]: which of the other bodies a
+  // vertex is in, -1: none, -2: it is corrected; other_tets [listed, 5]: a tet and its corners; start: of the other
+  // bodies, 0 x + h v, 1 y, 2 the lower potential of the two, for which mu, lam and rest [1 | scenes, tets, 7] are
+  // (rest is empty where tets have no energy); falls [scenes, other bodies]: 1 where that is y
+  m.def(
+      "begin(Tensor x, Tensor v, Tensor acceleration, Tensor held, Tensor mass, Tensor energy_data, Tensor origin, "
+      "Tensor mu, Tensor lam, Tensor rest, Tensor pinned, Tensor order, Tensor ptr, Tensor spread, int[] groups, "
+      "Tensor other, Tensor other_order, Tensor other_ptr, Tensor other_tets, Tensor other_tet_ptr, int[] "
+      "other_groups, int[] data_count, float time_step, float filter_eta, int start, bool filters) -> (Tensor x_start, "
+      "Tensor y, Tensor falls)");
+  // wants: acceleration, held, energy_data. Of data: from corrections as of rigid_backward(), and of the planes by
+  // vertex [scenes, vertices, scalars of the planes]
+  m.def(
+      "begin_backward(Tensor x_start_bar, Tensor y_bar, Tensor falls, Tensor x, Tensor v, Tensor acceleration, Tensor "
+      "held, Tensor mass, Tensor energy_data, Tensor origin, Tensor pinned, Tensor order, Tensor ptr, Tensor spread, "
+      "int[] groups, Tensor other, int others, int[] data_count, float time_step, float filter_eta, int start, bool "
+      "filters, bool[] wants) -> (Tensor x, Tensor v, Tensor acceleration, Tensor held, Tensor mass, Tensor shared, "
+      "Tensor own, Tensor planes)");
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");
   m.def(
       "build_plan(Tensor points, Tensor tets, Tensor active, int lanes) -> (Tensor plan, Tensor color_ptr, Tensor "

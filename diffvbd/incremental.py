@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from . import ops
-from .metric import rest_metric
 from .model import Model
 from .sweeps import SweepTensors
 
@@ -50,7 +49,7 @@ class IncrementalPotential:
         self.mu, self.lam, self.mass = tensors.mu, tensors.lam, tensors.mass[..., None]
         self.origin = tensors.origin if tensors.origin.numel() else None
         rest = tensors.rest
-        self.rest = model.derived("rest", lambda: _metric(model)) if rest is None else rest  # [1 | B, T, 7]
+        self.rest = model.rest_scalars if rest is None else rest  # [1 | B, T, 7]
         self.free = (~model._pinned)[:, None].to(x.dtype)
 
         k = dict(zip(PAIRS, self.rest[..., :6].unbind(-1), strict=True))
@@ -193,10 +192,3 @@ class IncrementalPotential:
         energies = self.model.vertex_energies
         sizes = [e.count() * (self.model.num_vertices if e.per_vertex else 1) for e in energies]
         return list(zip(energies, data.split(sizes, -1), strict=True)) if energies else []
-
-
-def _metric(model: Model) -> Tensor:
-    """The Model's rest scalars [1, T, 7], rounded once from float64."""
-    points = torch.from_numpy(model.mesh.points.copy())[None].to(model.device)
-    rest, _ = rest_metric(ops.tet_gather(points, *model._topology))
-    return rest.to(model.dtype)

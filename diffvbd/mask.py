@@ -4,6 +4,7 @@ The elastic block, contact, then the energies of single vertices in the order of
 """
 
 EXACT_BLOCK, PAPER_BLOCK = 1, 2  # of the elastic block
+ELASTIC = EXACT_BLOCK | PAPER_BLOCK
 CONTACT = 4
 FIRST_VERTEX_BIT = 3  # shift of the first energy of energies.VERTEX_ENERGIES
 # Contact and the one energy with a step filter, FloorBarrier: their gaps must come back to the bit.

@@ -9,13 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from . import ops, ops_rigid, regimes
+from . import ops, regimes
+from .bodies import find_bodies
 from .checks import check_number, check_positive, fail, vertex_mask
 from .colliders import Collider
 from .contact_surface import ContactSurface, build_surface, check_colliders
 from .energies import VERTEX_ENERGIES, FloorBarrier, StableNeoHookean, VertexEnergy
 from .lasting import lasting, lasting_tensors
-from .mask import CONTACT
+from .mask import CONTACT, ELASTIC
 from .mesh import TetMesh
 from .metric import lumped_mass, rest_metric
 from .model_arguments import Energy, checked_correction, checked_device, checked_energies, per_tet_density
@@ -50,8 +51,9 @@ class Model:
             after the sweeps (docs/method.md, section 14): it rests, falls and spins right at any number of sweeps. The
             last sweep of a step then has a relaxation of at most 1. None: where there is no contact of pairs and no
             friction, which it does not see yet.
-        start: Where the sweeps of the other bodies start: ``"predictor"`` (y, gravity and forces included) or
-            ``"inertia"`` (x + h v), right for stiff pinned bodies that few sweeps hardly move (docs/numerics.md).
+        start: Where the sweeps of the other bodies start: ``"predictor"`` (y, with gravity and forces), ``"inertia"``
+            (x + h v, right for stiff pinned bodies that few sweeps hardly move) or ``"auto"``: for each body and step
+            the one of lower incremental potential; beside pairs and friction the predictor (docs/numerics.md).
         colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier among the
             energies.
         dtype: torch.float64 or torch.float32.
@@ -85,7 +87,7 @@ class Model:
         regularization: float = 0.0,
         relaxation: float = 1.0,
         rigid: bool | None = None,
-        start: Literal["predictor", "inertia"] = "predictor",
+        start: Literal["auto", "predictor", "inertia"] = "auto",
         colliders: Sequence[Collider] = (),
         *,
         dtype: torch.dtype = torch.float64,
@@ -123,10 +125,7 @@ class Model:
         self._pinned = mask
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = _first_of_body(body)
-        self._bodies = ops_rigid.find_bodies(points, tets, mask)
-        # vertices of bodies that are corrected, and those that the sweeps take from x + h v
-        self._corrected = (self._bodies.member < self._bodies.number) & self.rigid
-        self._from_inertia = self._corrected | (~mask & (start == "inertia"))
+        self._bodies, self._other_bodies = find_bodies(points, tets, mask, self.rigid)
         self.surface_of_contact = self._build_surface(check_colliders(colliders))
         device = checked_device(device)
         self._arrange(points, tets, device)
@@ -157,7 +156,23 @@ class Model:
     @property
     def corrects(self) -> bool:
         """Whether steps have a rigid correction: asked for, and some body is free."""
-        return self.rigid and self._bodies.number > 0
+        return self._bodies.number > 0
+
+    @property
+    def starts_from(self) -> str:
+        """Where the sweeps of bodies that are not corrected start: "auto" only where there is something to choose."""
+        if self.start != "auto":
+            return self.start
+        return "predictor" if self.touches or not self._other_bodies.number else "auto"
+
+    @property
+    def rest_scalars(self) -> Tensor:
+        """Stiffness weights and inverse volume of each tet at rest [1, T, 7], rounded once from float64."""
+        return self._rest_scalars if self._rest_scalars.numel() else self.derived("rest", self._find_rest_scalars)
+
+    def _find_rest_scalars(self) -> Tensor:
+        points = torch.from_numpy(self.mesh.points.copy())[None].to(self.device)
+        return rest_metric(ops.tet_gather(points, *self._topology))[0].to(self.dtype)
 
     @property
     def touches(self) -> bool:
@@ -228,6 +243,9 @@ class Model:
         self._rest_points = points
         self._mass = lumped_mass(self._density[None], volume, *self._topology)[0]
         self._rest = rest
+        # what "auto" asks for in every step
+        chooses = self.starts_from == "auto" and self.energy_mask & ELASTIC
+        self._rest_scalars = rest if chooses else rest.new_empty((0,))
         data = [e.pack(self._parameters(e, points), None) for e in self.vertex_energies]
         self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
 
@@ -240,7 +258,7 @@ class Model:
             if isinstance(value, Tensor):
                 setattr(self, name, value.to(device, dtype) if value.is_floating_point() else value.to(device))
         self._topology = tuple(t.to(device) for t in self._topology)
-        self._bodies = self._bodies.to(device)
+        self._bodies, self._other_bodies = self._bodies.to(device), self._other_bodies.to(device)
         placed = [e.placed(self.num_vertices, device) if isinstance(e, VertexEnergy) else e for e in self.energies]
         self._set_energies(tuple(placed))
         if hasattr(self, "_rest"):
@@ -355,7 +373,7 @@ class Model:
         safeguards += [f"saturation={self.saturation:g} m"] if self.saturation is not None else []
         safeguards += [f"regularization={self.regularization:g} kg"] if self.regularization else []
         safeguards += ["rigid=False"] if not self.rigid and not self.touches else []
-        safeguards += [f'start="{self.start}"'] if self.start != "predictor" else []
+        safeguards += [f'start="{self.start}"'] if self.start != "auto" else []
         return (
             f"Model({self.num_vertices} vertices, {self.num_tets} tets, {int(self._pinned.sum())} pinned, "
             f"{self.num_colors} colors, mass {float(self._mass.sum()):.4g} kg, "

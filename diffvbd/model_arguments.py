@@ -71,10 +71,10 @@ def per_tet_density(density: Any, num_tets: int) -> Tensor:
 def checked_correction(rigid: Any, start: Any, energies: tuple[Energy, ...]) -> tuple[bool, str]:
     """Whether free bodies are corrected, and where the sweeps of the others start."""
     touches = any(isinstance(e, (PairBarrier, Friction)) for e in energies)
-    if start not in ("predictor", "inertia"):
-        fail("start", '"predictor" or "inertia"', repr(start))
+    if start not in ("auto", "predictor", "inertia"):
+        fail("start", '"auto", "predictor" or "inertia"', repr(start))
     if start == "inertia" and any(isinstance(e, PairBarrier) for e in energies):
-        fail("start", '"predictor" beside a PairBarrier, whose steps go to y in parts', '"inertia"')
+        fail("start", '"auto" or "predictor" beside a PairBarrier, whose steps go to y in parts', '"inertia"')
     if rigid is None:  # tets without stiffness are no body
         return not touches and any(isinstance(e, StableNeoHookean) for e in energies), start
     if not isinstance(rigid, bool):

@@ -143,7 +143,9 @@ def solve(
     if isinstance(adjoint, GlobalAdjoint):
         # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph
         begun = begun._replace(x_start=torch.where(model._pinned[:, None], begun.x_start, end))
-        x_end, v_end = begun.finish(global_sweep(model, begun.tensors(prepared), settings, adjoint), time_step)
+        x_end, v_end = begun.finish(
+            global_sweep(model, begun.tensors(prepared), settings, adjoint), model, prepared, corrects=False
+        )
     else:
         again = prepare(model, lead, sweeps=count, adjoint=adjoint, **options)
         x_end, v_end = advance(model, x, v, again, adjoint=adjoint, **loads)

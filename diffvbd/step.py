@@ -26,11 +26,13 @@ from .arguments import (
 from .contact_step import run_contact
 from .debug import check_on_cpu, looks_at
 from .global_adjoint import global_sweep
+from .mask import ELASTIC
 from .memory import out_of_memory_named
 from .model import Model
 from .model_warnings import warn_of_thin_tets
-from .rigid import coast, correct
+from .rigid import correct
 from .scopes import checking
+from .start import begin as start_of
 from .sweeps import SweepTensors, fused_step, sweep
 
 
@@ -138,15 +140,19 @@ class Begun(NamedTuple):
 
     def corrected(self, x: Tensor, model: Model, prepared: Prepared) -> Tensor:
         """x [B, V, 3] after the rigid correction, where the Model has one."""
-        if not model.corrects:
-            return x
-        origin, settings = self.y.new_empty((0,)) if self.origin is None else self.origin, prepared.settings
-        return correct(x, self.x_prev, self.y, prepared.mass, self.data, origin, model._bodies, settings.data_count,
-                       settings.numbers[0])  # fmt: skip
+        return self._correct(x, model, prepared)[0] if model.corrects else x
 
-    def finish(self, end: Tensor, h: float) -> tuple[Tensor, Tensor]:
+    def _correct(self, x: Tensor, model: Model, prepared: Prepared) -> tuple[Tensor, Tensor]:
+        origin, settings = self.y.new_empty((0,)) if self.origin is None else self.origin, prepared.settings
+        return correct(x, self.x_prev, self.y, prepared.mass, self.data, origin, model._bodies, model._other_bodies,
+                       settings.data_count, settings.numbers[0])  # fmt: skip
+
+    def finish(self, end: Tensor, model: Model, prepared: Prepared, corrects: bool = True) -> tuple[Tensor, Tensor]:
         """Positions and velocities after the step whose sweeps ended at ``end``."""
-        velocity = (end - self.x_prev) / h
+        if corrects and model.corrects:
+            end, velocity = self._correct(end, model, prepared)
+        else:
+            velocity = (end - self.x_prev) / prepared.settings.numbers[0]
         return end if self.origin is None else end + self.origin, velocity
 
 
@@ -157,7 +163,10 @@ def begin(
     h = prepared.settings.numbers[0]
     shape, flat = x.shape, (math.prod(x.shape[:-2]), *x.shape[-2:])
     start, velocity = x.reshape(flat), v.reshape(flat)
-    acceleration = ops.broadcast(gravity, shape).reshape(flat)
+    if gravity.dim() == 1 and force is None:
+        acceleration = gravity[None, None]
+    else:
+        acceleration = ops.broadcast(gravity, shape).reshape(flat)
     if force is not None:
         total = ops.broadcast(broadcastable("force", force, x), shape).reshape(flat)
         # A pinned vertex is moved by no force, whatever stands there.
@@ -170,29 +179,21 @@ def begin(
     if model.dtype == torch.float32 and model.num_vertices:
         origin = start.detach()[:, model._first_of_body]
         start = start - origin
-    coasting = start + h * velocity
-    y = coasting + (h * h) * acceleration
-    held = start
+    none = start.new_empty((0,))
+    held = none
     if prescribed is not None:
         held = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
         held = held if origin is None else held - origin
-    y = torch.where(model._pinned[:, None], held, y)
     data = _energy_data(model, prepared, origin)
-    x_start = y
-    if model.corrects or model.start == "inertia":
-        x_start = torch.where(model._from_inertia[:, None], coasting, y)
-    if model.floor is not None and model.contact is None:  # with pairs the state moves to y in parts
-        move, planes = x_start - start, data[:, : model.floor.count()]
-        if not model.corrects:
-            x_start = model.floor.filter(start, move, planes, origin)
-        else:
-            x_start = coast(start, move, planes, origin, model._bodies)
-            if model._bodies.order.shape[0] < model.num_vertices:
-                alone = model.floor.filter(start, move, planes, origin)
-                x_start = torch.where(model._corrected[:, None], x_start, alone)
-        x_start = torch.where(model._pinned[:, None], y, x_start)
-    begun = Begun(x_start, start, y, data, origin)
-    return begun._replace(x_start=begun.corrected(x_start, model, prepared))
+    rest = none
+    if model.starts_from == "auto" and model.energy_mask & ELASTIC:
+        rest = model.rest_scalars if prepared.rest is None else prepared.rest
+    x_start, y = start_of(
+        start, velocity, acceleration, held, prepared.mass, data, none if origin is None else origin, prepared.mu,
+        prepared.lam, rest, model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
+        start=model.starts_from, filters=model.floor is not None and model.contact is None,
+    )  # fmt: skip
+    return Begun(x_start, start, y, data, origin)
 
 
 def advance(
@@ -226,9 +227,8 @@ def advance(
             swept(model, begun.detached(), looked_at, given, index=index)
         return prepared.unrolled(x, v, force, gravity, prescribed)
     x_end = swept(model, begun, prepared, given, adjoint, index, where)
-    if not isinstance(adjoint, GlobalAdjoint):  # which corrects before it takes the end as the solution
-        x_end = begun.corrected(x_end, model, prepared)
-    x_end, v_end = begun.finish(x_end, prepared.settings.numbers[0])
+    # GlobalAdjoint corrects before it takes the end as the solution
+    x_end, v_end = begun.finish(x_end, model, prepared, corrects=not isinstance(adjoint, GlobalAdjoint))
     return x_end.reshape(x.shape), v_end.reshape(x.shape)
 
 
@@ -268,7 +268,7 @@ def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
     """Whether one operator can do the whole step on CUDA. Forces, vertex energies, float32's local origin, function
     transforms and checks take the parts."""
     simple = force is None and not model.vertex_energies and not model.touches and model.dtype == torch.float64
-    simple = simple and not model.corrects and model.start == "predictor"
+    simple = simple and not model.corrects and model.starts_from == "predictor"
     if not simple or checking() or torch.compiler.is_compiling() or gravity.dim() > 1:
         return False
     return torch._C._functorch.peek_interpreter_stack() is None  # pyright: ignore[reportAttributeAccessIssue]

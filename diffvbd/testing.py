@@ -314,7 +314,7 @@ def reference_result(
 def _turned(model: Any) -> Any:
     """What the reference reads of a model, each tet listed from another corner (an even permutation)."""
     names = ("rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies")
-    names += ("saturation", "regularization", "relaxation", "rigid", "start")
+    names += ("saturation", "regularization", "relaxation", "rigid", "starts_from")
     return SimpleNamespace(tets=model.tets[:, [3, 2, 1, 0]], **{name: getattr(model, name) for name in names})
 
 

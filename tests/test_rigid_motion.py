@@ -112,5 +112,5 @@ def test_it_can_be_left_out(device: str) -> None:
         dv.Model(mesh, energies=touching, rigid=True, device=device)
     with pytest.raises(TypeError, match="rigid: expected True, False or None, got int"):
         dv.Model(mesh, rigid=1, device=device)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match='start: expected "predictor" or "inertia", got \'rest\''):
+    with pytest.raises(ValueError, match='start: expected "auto", "predictor" or "inertia", got \'rest\''):
         dv.Model(mesh, start="rest", device=device)  # type: ignore[arg-type]

@@ -18,12 +18,15 @@ constexpr double kDamping = 1e-9;    // of the inertia, so that a body collapsed
 constexpr double kArrived = 1e-24;   // squared step over squared radius of gyration at which Newton's method ends
 constexpr double kRounding = 1e-13;  // relative rise of the energies' sum that is rounding
 
+constexpr int32_t kCorrected = -2;  // as `other` of a vertex whose body is corrected
+
 template <class T>
 struct Inputs {
   const T* x;                                      // [B, V, 3]
   Batched<const T> x_prev, y, mass, origin, data;  // origin may be null
   const int32_t *order, *ptr;                      // vertices by body [listed], [bodies + 1]
   const double* spread;                            // [bodies]  squared radius of gyration at rest [m^2]
+  const int32_t* other;                            // [V]  which of the other bodies a vertex is in, -1: none
   int64_t scenes, data_start[kVertexEnergies];     // of each energy among the data of a scene
   int32_t vertices, bodies, data_count[kVertexEnergies];
   double time_step;
@@ -284,9 +287,25 @@ DIFFVBD_FN void add_to(T* to, const Vector& a) {
   put(to, Body<T>::at(to) + a);
 }
 
-// x after the correction
+template <class T>
+DIFFVBD_FN void set_velocity(const Inputs<T>& in, int64_t scene, int32_t v, const T* x, T* velocity) {
+  const T* before = in.x_prev.data + scene * in.x_prev.scene + 3 * int64_t{v};
+  T* to = velocity + 3 * (scene * in.vertices + v);
+  for (int c = 0; c < 3; ++c) to[c] = (x[c] - before[c]) / T(in.time_step);
+}
+
+// A vertex whose body is not corrected.
+template <class T>
+DIFFVBD_FN void keep_vertex(const Inputs<T>& in, int64_t scene, int32_t v, T* x, T* velocity) {
+  if (in.other[v] == kCorrected) return;
+  const int64_t at = 3 * (scene * in.vertices + v);
+  for (int c = 0; c < 3; ++c) x[at + c] = in.x[at + c];
+  set_velocity(in, scene, v, x + at, velocity);
+}
+
+// x after the correction and, unless null, v = (x - x_prev) / h
 template <bool energies, class T, class Team>
-DIFFVBD_FN void correct(const Body<T>& b, const Team& team, Iteration* record, T* x) {
+DIFFVBD_FN void correct(const Body<T>& b, const Team& team, Iteration* record, T* x, T* velocity = nullptr) {
   const Executed e = find<energies>(b, team, record);
   const bool moves = e.closed || e.count > 0;
   const Matrix turned = e.end.turn + -1.0 * identity();
@@ -301,6 +320,7 @@ DIFFVBD_FN void correct(const Body<T>& b, const Team& team, Iteration* record, T
     } else {
       for (int c = 0; c < 3; ++c) to[c] = from[c];
     }
+    if (velocity) set_velocity(b.in, b.scene, v, to, velocity);
   });
 }
 

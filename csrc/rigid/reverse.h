@@ -8,11 +8,34 @@ namespace diffvbd::rigid {
 
 template <class T>
 struct Adjoints {
-  const T* end;              // of the result [B, V, 3]
-  T *x, *x_prev, *y, *mass;  // [B, V, 3] three times, [B, V]; x_prev only with energies
+  const T *end, *velocity;   // of the result [B, V, 3]; velocity may be null
+  T *x, *x_prev, *y, *mass;  // [B, V, 3] three times, [B, V]; x_prev only with energies or a velocity
   T *shared, *own;           // of the data: [B, bodies, scalars of a scene], [B, V, scalars of a vertex]; or null
   int32_t shared_count, own_count;
 };
+
+// The adjoint of an end position, velocity included; and what the velocity sends to x_prev.
+template <class T>
+DIFFVBD_FN Vector end_bar(const Adjoints<T>& a, int64_t row, double h) {
+  const Vector bar = Body<T>::at(a.end + 3 * row);
+  return a.velocity ? bar + 1 / h * Body<T>::at(a.velocity + 3 * row) : bar;
+}
+template <class T>
+DIFFVBD_FN Vector before_bar(const Adjoints<T>& a, int64_t row, double h) {
+  return a.velocity ? -1 / h * Body<T>::at(a.velocity + 3 * row) : Vector{};
+}
+
+// A vertex whose body is not corrected.
+template <class T>
+DIFFVBD_FN void reverse_kept(const Inputs<T>& in, const Adjoints<T>& a, int64_t scene, int32_t v) {
+  if (in.other[v] == kCorrected) return;
+  const int64_t row = scene * in.vertices + v;
+  const double h = in.time_step;
+  put(a.x + 3 * row, end_bar(a, row, h));
+  put(a.y + 3 * row, Vector{});
+  if (a.x_prev) put(a.x_prev + 3 * row, before_bar(a, row, h));
+  a.mass[row] = T(0);
+}
 
 // One executed Newton step seen from a vertex, with p = A^-1 (adjoint of the step). With P and D the displacements of
 // the vertex by p and by the whole step, A d = -g makes the adjoint that of -(P . (m (x - y) + g) + P . (m + H) D).
@@ -84,13 +107,13 @@ DIFFVBD_FN void reverse(const Body<T>& b, const Team& team, Iteration* record, c
   team.template sum<12>(b.size(), sum, [&](int32_t i, double* to) {
     const int32_t v = b.vertex(i);
     const int64_t row = b.row(v);
-    const Vector bar = Body<T>::at(a.end + 3 * row), r = b.position(v) - m.center;
+    const Vector bar = end_bar(a, row, b.in.time_step), r = b.position(v) - m.center;
     const double values[] = {bar.x,       bar.y,       bar.z,       bar.x * r.x, bar.x * r.y, bar.x * r.z,
                              bar.y * r.x, bar.y * r.y, bar.y * r.z, bar.z * r.x, bar.z * r.y, bar.z * r.z};
     for (int c = 0; c < 12; ++c) to[c] += values[c];
     put(a.x + 3 * row, moves ? transposed_times(e.end.turn, bar) : bar);
     put(a.y + 3 * row, Vector{});
-    if (a.x_prev) put(a.x_prev + 3 * row, Vector{});
+    if (a.x_prev) put(a.x_prev + 3 * row, before_bar(a, row, b.in.time_step));
     a.mass[row] = T(0);
   });
   if (!moves) return;

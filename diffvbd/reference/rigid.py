@@ -24,8 +24,8 @@ DEFINITE = 1e-10  # least eigenvalue of a turning stiffness over its trace
 GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
 
 
-def free_bodies(model: Any) -> list[Tensor]:
-    """Vertices of each connected set of tets that has no pinned vertex."""
+def connected_bodies(model: Any) -> list[Tensor]:
+    """Vertices of each connected set of tets."""
     parent = list(range(model.rest_points.shape[-2]))
 
     def root(i: int) -> int:
@@ -41,16 +41,17 @@ def free_bodies(model: Any) -> list[Tensor]:
     members: dict[int, list[int]] = {}
     for i in sorted({i for tet in tets for i in tet}):
         members.setdefault(root(i), []).append(i)
-    pinned = model.pinned.tolist()
-    device = model.pinned.device
-    return [torch.tensor(m, device=device) for m in members.values() if not any(pinned[i] for i in m)]
+    return [torch.tensor(m, device=model.pinned.device) for m in members.values()]
 
 
 class Correction:
     """The correction of a run; ``energies``: the reference formulas, of which those of single vertices count."""
 
     def __init__(self, scene: Scene, energies: list[Any]) -> None:
-        self.scene, self.bodies = scene, free_bodies(scene.model) if scene.model.rigid else []
+        model, bodies = scene.model, connected_bodies(scene.model)
+        self.scene = scene
+        self.bodies = [b for b in bodies if model.rigid and not bool(model.pinned[b].any())]
+        self.others = [b for b in bodies if not any(b is own for own in self.bodies)]
         self.energies = [e for e in energies if not isinstance(e, StableNeoHookean)]
 
     def __call__(self, x: Tensor, y: Tensor, x_prev: Tensor) -> Tensor:

@@ -120,10 +120,9 @@ def stepper(
         coasting = torch.where(model.pinned[:, None], y, x + time_step * v)
         x_prev, y, coasting = (a.transpose(-1, -2).contiguous() for a in (x, y, coasting))
         check_start(energies, x_prev)
-        wanted = coasting if model.start == "inertia" else y
-        for body in correct.bodies:
-            wanted = put(wanted, body, take(coasting, body))
-        begun = _start(scene, energies, x_prev, wanted)
+        begun = _start(scene, energies, x_prev, coasting if model.starts_from == "inertia" else y)
+        if model.starts_from == "auto":
+            begun = _lower(scene, energies, begun, _start(scene, energies, x_prev, coasting), y, x_prev, correct.others)
         for body in correct.bodies:
             begun = put(begun, body, correct.coasted(take(x_prev, body), take(coasting, body)))
         state = correct(begun, y, x_prev)
@@ -167,6 +166,24 @@ def _start(scene: Scene, energies: list[Any], x: Tensor, y: Tensor) -> Tensor:
     if not any(hasattr(energy, "start") for energy in energies):
         return y
     return torch.where(scene.model.pinned, y, x + started(energies, x, y - x))
+
+
+def _lower(scene: Scene, energies: list[Any], one: Tensor, two: Tensor, y: Tensor, x_prev: Tensor, bodies: list[Tensor]
+           ) -> Tensor:  # fmt: skip
+    """Of two states the one that has, for each body, the lower incremental potential; the first where they are equal.
+    Bodies do not see each other, so the whole scene's potential with one body exchanged decides."""
+
+    def potential(x: Tensor) -> Tensor:
+        total = (scene.mass / 2 * ((x - y) ** 2).sum(-2)).sum(-1)
+        return total + sum(energy.energy(x, x_prev) for energy in energies)
+
+    out = one
+    for body in bodies:
+        with torch.no_grad():
+            exchanged = put(one, body, take(two, body))
+            lower = potential(exchanged) < potential(one)
+        out = torch.where(lower[..., None, None], put(out, body, take(two, body)), out)
+    return out
 
 
 def started(energies: list[Any], x: Tensor, step: Tensor) -> Tensor:

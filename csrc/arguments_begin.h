@@ -1,0 +1,122 @@
+// The tensors of the beginning of a step, as the operators of all backends take them.
+#pragma once
+
+#include <tuple>
+#include <vector>
+
+#include "arguments_rigid.h"
+#include "start/begin.h"
+#include "start/lower.h"
+
+namespace diffvbd {
+
+// In the order of csrc/ops.cpp.
+struct BeginTensors {
+  const Tensor &x, &v, &acceleration, &held, &mass, &data, &origin, &pinned, &order, &ptr, &spread, &other;
+};
+struct OtherBodies {
+  const Tensor &mu, &lam, &rest, &order, &ptr, &tets, &tet_ptr;
+  int32_t number() const { return static_cast<int32_t>(ptr.numel() - 1); }
+};
+struct BeginSettings {
+  const std::vector<int64_t>& data_count;
+  double time_step, filter_eta;
+  int64_t from;
+  bool filters;
+};
+
+// x_start and y: [B, V, 3] that the bodies read and the kernels write.
+template <class T>
+start::Inputs<T> begin_inputs(const BeginTensors& t, const BeginSettings& q, const Tensor& x_start, const Tensor& y,
+                              const Tensor& falls, int32_t others) {
+  start::Inputs<T> in{};
+  in.bodies = rigid_inputs<T>({x_start, t.x, y, t.mass, t.data, t.origin, t.order, t.ptr, t.spread, t.other},
+                              q.data_count, q.time_step);
+  const int64_t b = in.bodies.scenes, v = in.bodies.vertices;
+  in.x = in.bodies.x_prev;
+  in.v = batched<T>(t.v, t.x, b, 3 * v);
+  in.acceleration = batched<T>(t.acceleration, t.x, b, 3 * v, 3);
+  in.held = batched<T>(t.held, t.x, b, 3 * v);
+  require(t.pinned.scalar_type() == ScalarType::Bool && t.pinned.numel() == v && t.pinned.is_contiguous(),
+          "diffvbd::begin: expected pinned bool [V]");
+  require(q.from >= start::kInertia && q.from <= start::kLower, "diffvbd::begin: expected start 0, 1 or 2");
+  require(q.from != start::kLower || falls.numel() == b * others, "diffvbd::begin: expected falls [scenes, bodies]");
+  require(!q.filters || in.bodies.data_count[0] > 0, "diffvbd::begin: there are no planes");
+  in.pinned = data<const bool>(t.pinned);
+  in.falls = data<const uint8_t>(falls);
+  in.others = others;
+  in.from = static_cast<int>(q.from);
+  in.some_alone = t.order.numel() < v;
+  in.filters = q.filters;
+  in.parameters.time_step = T(q.time_step);
+  in.parameters.filter_eta = T(q.filter_eta);
+  return in;
+}
+
+// x_start: the states from x + h v; from_y: those from y
+template <class T>
+start::Candidates<T> candidates(const BeginTensors& t, const OtherBodies& o, const BeginSettings& q,
+                                const Tensor& x_start, const Tensor& from_y, const Tensor& y) {
+  start::Candidates<T> in{};
+  in.bodies = rigid_inputs<T>({x_start, t.x, y, t.mass, t.data, t.origin, o.order, o.ptr, t.spread, t.other},
+                              q.data_count, q.time_step, false);
+  const int64_t b = in.bodies.scenes, tets = o.rest.dim() == 3 ? o.rest.size(1) : 0;
+  require(o.tets.scalar_type() == ScalarType::Int && o.tets.dim() == 2 && o.tets.size(1) == 5 &&
+              o.tets.is_contiguous() && o.tet_ptr.scalar_type() == ScalarType::Int && o.tet_ptr.is_contiguous() &&
+              o.tet_ptr.numel() == o.ptr.numel(),
+          "diffvbd::begin: expected the tets of the other bodies int32 [listed, 5]");
+  in.other = data<const T>(from_y);
+  in.tets = data<const int32_t>(o.tets);
+  in.tet_ptr = data<const int32_t>(o.tet_ptr);
+  if (tets > 0) {
+    in.mu = batched<T>(o.mu, t.x, b, tets);
+    in.lam = batched<T>(o.lam, t.x, b, tets);
+    in.rest = batched<T>(o.rest, t.x, b, kRestScalars * tets);
+  }
+  return in;
+}
+
+// The adjoints of begin; make(shape, zeroed) allocates. wants: acceleration, held, data.
+struct BeginBars {
+  Tensor x, v, acceleration, held, mass, shared, own, planes, x_prev;
+
+  template <class T, class Make>
+  BeginBars(const BeginTensors& t, const start::Inputs<T>& in, const std::vector<bool>& wants, const Make& make) {
+    require(wants.size() == 3, "diffvbd::begin_backward: expected 3 wishes");
+    const int64_t b = in.bodies.scenes, v_ = in.bodies.vertices;
+    int64_t of_scene = 0, of_vertex = 0;
+    for (int k = 0; k < kVertexEnergies; ++k) {
+      (is_per_vertex(k, VertexEnergies{}) ? of_vertex : of_scene) += in.bodies.data_count[k];
+    }
+    const auto wanted = [&](bool wish, const std::vector<int64_t>& shape) {
+      return make(wish ? shape : std::vector<int64_t>{0}, false);
+    };
+    x = make({b, v_, 3}, false), v = make({b, v_, 3}, false);
+    acceleration = wanted(wants[0], {b, v_, 3}), held = wanted(wants[1], {b, v_, 3});
+    mass = make({b, v_}, t.order.numel() < v_);
+    shared = make({b, wants[2] ? in.bodies.bodies : 0, of_scene}, true);
+    own = make({b, wants[2] ? v_ : 0, of_vertex}, true);
+    planes = make({b, wants[2] && in.filters ? v_ : 0, in.bodies.data_count[0]}, true);
+    x_prev = wanted(in.bodies.data.data != nullptr && t.order.numel() > 0, {b, v_, 3});
+  }
+  template <class T>
+  start::Adjoints<T> pointers(const Tensor& x_start_bar, const Tensor& y_bar) const {
+    for (const Tensor* bar : {&x_start_bar, &y_bar}) {
+      require(bar->is_contiguous() && bar->numel() == x.numel() && bar->scalar_type() == x.scalar_type(),
+              "diffvbd::begin_backward: expected adjoints like x");
+    }
+    const auto or_null = [](const Tensor& t) { return t.numel() > 0 ? data<T>(t) : nullptr; };
+    start::Adjoints<T> a{};
+    a.x_start = data<const T>(x_start_bar), a.y = data<const T>(y_bar);
+    a.x = data<T>(x), a.v = data<T>(v), a.mass = data<T>(mass);
+    a.acceleration = or_null(acceleration), a.held = or_null(held), a.planes = or_null(planes);
+    a.shared = or_null(shared), a.own = or_null(own), a.x_prev = or_null(x_prev);
+    a.shared_count = static_cast<int32_t>(shared.size(2)), a.own_count = static_cast<int32_t>(own.size(2));
+    return a;
+  }
+  std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> tensors() const {
+    return {x, v, acceleration, held, mass, shared, own, planes};
+  }
+};
+
+}  // namespace diffvbd

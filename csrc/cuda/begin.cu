@@ -1,0 +1,100 @@
+#include "begin.h"
+#include "bodies.cuh"
+
+namespace diffvbd::cuda {
+namespace {
+
+template <class T>
+__global__ void __launch_bounds__(kVertexThreads)
+    begin_vertices(const __grid_constant__ start::Inputs<T> in, T* x_start, T* from_y, T* y) {
+  const Row row(in.bodies);
+  if (row.exists) begin_vertex(in, x_start, from_y, y, row.scene, row.vertex);
+}
+template <class T>
+__global__ void __launch_bounds__(kVertexThreads)
+    choose_vertices(const __grid_constant__ start::Inputs<T> in, T* x_start, const T* from_y) {
+  const Row row(in.bodies);
+  if (row.exists) choose_vertex(in, x_start, from_y, row.scene, row.vertex);
+}
+template <class T>
+__global__ void __launch_bounds__(kVertexThreads)
+    reverse_vertices(const __grid_constant__ start::Inputs<T> in, const __grid_constant__ start::Adjoints<T> a) {
+  const Row row(in.bodies);
+  if (row.exists) reverse_vertex(in, a, row.scene, row.vertex);
+}
+
+// What a kernel does to a body.
+template <class T>
+struct Choose {
+  static constexpr bool keeps_record = false;
+  start::Candidates<T> two;
+  uint8_t* falls;
+  template <class Team>
+  __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration*) const {
+    const double rise = start::rise(two, body, team);
+    if (team.leads()) falls[body.scene * two.bodies.bodies + body.body] = rise <= 0;
+  }
+};
+template <class T, bool energies>
+struct Begin {
+  static constexpr bool keeps_record = false;
+  start::Inputs<T> in;
+  T *x_start, *y;
+  template <class Team>
+  __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration*) const {
+    start::begin_body<energies>(in, body, team, x_start, y);
+  }
+};
+template <class T, bool energies>
+struct ReverseBegin {
+  static constexpr bool keeps_record = energies;
+  start::Inputs<T> in;
+  start::Adjoints<T> a;
+  T *coasted, *y;
+  template <class Team>
+  __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration* record) const {
+    start::reverse_body<energies>(in, body, team, record, coasted, y, a);
+  }
+};
+
+}  // namespace
+
+template <class T>
+cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const start::Candidates<T>* two,
+                  const BodyGroups& two_groups, T* x_start, T* from_y, T* y, uint8_t* falls, double* workspace,
+                  cudaStream_t stream) {
+  if (in.bodies.scenes * in.bodies.vertices == 0) return cudaSuccess;
+  if (in.some_alone) {
+    T* second = two != nullptr && from_y != y ? from_y : nullptr;
+    begin_vertices<T><<<blocks_of(in.bodies), kVertexThreads, 0, stream>>>(in, x_start, second, y);
+  }
+  if (two != nullptr) {
+    const auto error = run_bodies(two->bodies, two_groups, Choose<T>{*two, falls}, workspace, stream);
+    if (error != cudaSuccess) return error;
+    choose_vertices<T><<<blocks_of(in.bodies), kVertexThreads, 0, stream>>>(in, x_start, from_y);
+  }
+  if (in.bodies.data.data) return run_bodies(in.bodies, groups, Begin<T, true>{in, x_start, y}, workspace, stream);
+  return run_bodies(in.bodies, groups, Begin<T, false>{in, x_start, y}, workspace, stream);
+}
+
+template <class T>
+cudaError_t begin_backward(const start::Inputs<T>& in, const BodyGroups& groups, const start::Adjoints<T>& a,
+                           T* coasted, T* y, double* workspace, cudaStream_t stream) {
+  if (in.bodies.scenes * in.bodies.vertices == 0) return cudaSuccess;
+  if (in.some_alone) reverse_vertices<T><<<blocks_of(in.bodies), kVertexThreads, 0, stream>>>(in, a);
+  if (in.bodies.data.data) {
+    return run_bodies(in.bodies, groups, ReverseBegin<T, true>{in, a, coasted, y}, workspace, stream);
+  }
+  return run_bodies(in.bodies, groups, ReverseBegin<T, false>{in, a, coasted, y}, workspace, stream);
+}
+
+#define DIFFVBD_INSTANTIATE(T)                                                                                      \
+  template cudaError_t begin<T>(const start::Inputs<T>&, const BodyGroups&, const start::Candidates<T>*,            \
+                                const BodyGroups&, T*, T*, T*, uint8_t*, double*, cudaStream_t);                    \
+  template cudaError_t begin_backward<T>(const start::Inputs<T>&, const BodyGroups&, const start::Adjoints<T>&, T*, \
+                                         T*, double*, cudaStream_t);
+DIFFVBD_INSTANTIATE(float)
+DIFFVBD_INSTANTIATE(double)
+#undef DIFFVBD_INSTANTIATE
+
+}  // namespace diffvbd::cuda

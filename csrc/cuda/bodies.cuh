@@ -1,0 +1,252 @@
+// Work on bodies: a team of threads for each, 8 lanes of a warp, a block, or, one body after another, the whole device.
+#pragma once
+
+#include <cooperative_groups.h>
+#include <math_constants.h>
+
+#include "../rigid/body.h"
+#include "bodies.h"
+
+namespace diffvbd::cuda {
+
+constexpr int kTile = 8, kTileThreads = 128, kTiles = kTileThreads / kTile;
+constexpr int kThreads = 256, kWarps = kThreads / 32;
+constexpr int kMostSums = 1 + 6 + rigid::kSix;  // numbers that a team adds up at once
+constexpr int64_t kEnoughBlocks = 48;           // large bodies of all scenes that fill the device with a block each
+
+template <int n, class F>
+__device__ __forceinline__ void own_sum(int32_t first, int32_t count, int32_t stride, double* out, const F& f) {
+#pragma unroll
+  for (int k = 0; k < n; ++k) out[k] = 0;
+  for (int32_t i = first; i < count; i += stride) f(i, out);
+}
+
+// Sums by a butterfly, after which every lane holds the same bits.
+template <int n, int width>
+__device__ __forceinline__ void butterfly(unsigned mask, double* out) {
+#pragma unroll
+  for (int k = 0; k < n; ++k) {
+#pragma unroll
+    for (int d = width / 2; d > 0; d /= 2) out[k] += __shfl_xor_sync(mask, out[k], d, width);
+  }
+}
+
+// The least of the lanes of a part of a warp.
+template <int width>
+__device__ __forceinline__ double butterfly_least(unsigned mask, double value) {
+#pragma unroll
+  for (int d = width / 2; d > 0; d /= 2) value = fmin(value, __shfl_xor_sync(mask, value, d, width));
+  return value;
+}
+
+template <class F>
+__device__ __forceinline__ double own_least(int32_t first, int32_t count, int32_t stride, const F& f) {
+  double out = CUDART_INF;
+  for (int32_t i = first; i < count; i += stride) out = fmin(out, f(i));
+  return out;
+}
+
+struct Tile {
+  int lane;
+  unsigned mask;
+  __device__ Tile() : lane(threadIdx.x % kTile), mask(((1u << kTile) - 1) << (threadIdx.x % 32 / kTile * kTile)) {}
+  __device__ bool leads() const { return lane == 0; }
+  template <int n, class F>
+  __device__ void sum(int32_t count, double* out, const F& f) const {
+    own_sum<n>(lane, count, kTile, out, f);
+    __syncwarp(mask);
+    butterfly<n, kTile>(mask, out);
+  }
+  template <class F>
+  __device__ double least(int32_t count, const F& f) const {
+    const double own = own_least(lane, count, kTile, f);
+    __syncwarp(mask);
+    return butterfly_least<kTile>(mask, own);
+  }
+  __device__ void meet() const { __syncwarp(mask); }
+  template <class F>
+  __device__ void each(int32_t count, const F& f) const {
+    for (int32_t i = lane; i < count; i += kTile) f(i);
+  }
+};
+
+struct BlockTeam {
+  double (*part)[kMostSums];  // [kWarps], shared
+  __device__ bool leads() const { return threadIdx.x == 0; }
+  template <int n, class F>
+  __device__ void sum(int32_t count, double* out, const F& f) const {
+    static_assert(n <= kMostSums);
+    own_sum<n>(static_cast<int32_t>(threadIdx.x), count, kThreads, out, f);
+    reduce<n>(out);
+  }
+  template <class F>
+  __device__ double least(int32_t count, const F& f) const {
+    return reduce_least(own_least(static_cast<int32_t>(threadIdx.x), count, kThreads, f));
+  }
+  __device__ void meet() const { __syncthreads(); }
+  template <class F>
+  __device__ void each(int32_t count, const F& f) const {
+    for (int32_t i = static_cast<int32_t>(threadIdx.x); i < count; i += kThreads) f(i);
+  }
+  __device__ double reduce_least(double own) const {
+    own = butterfly_least<32>(0xffffffffu, own);
+    if (threadIdx.x % 32 == 0) part[threadIdx.x / 32][0] = own;
+    __syncthreads();
+    for (int w = 0; w < kWarps; ++w) own = fmin(own, part[w][0]);
+    __syncthreads();
+    return own;
+  }
+  template <int n>
+  __device__ void reduce(double* out) const {
+    butterfly<n, 32>(0xffffffffu, out);
+    if (threadIdx.x % 32 == 0) {
+      for (int k = 0; k < n; ++k) part[threadIdx.x / 32][k] = out[k];
+    }
+    __syncthreads();
+    for (int k = 0; k < n; ++k) {
+      double sum = part[0][k];
+      for (int w = 1; w < kWarps; ++w) sum += part[w][k];
+      out[k] = sum;
+    }
+    __syncthreads();
+  }
+};
+
+struct DeviceTeam {
+  BlockTeam block;
+  double* workspace;  // [2, blocks, kMostSums]
+  mutable int turn = 0;
+  __device__ bool leads() const { return block.leads(); }  // each block keeps a record of its own
+  template <int n, class F>
+  __device__ void sum(int32_t count, double* out, const F& f) const {
+    own_sum<n>(first(), count, stride(), out, f);
+    block.reduce<n>(out);
+    double* to = share<n>(out);
+    own_sum<n>(static_cast<int32_t>(threadIdx.x), static_cast<int32_t>(gridDim.x), kThreads, out,
+               [&](int32_t b, double* sum) {
+                 for (int k = 0; k < n; ++k) sum[k] += __ldcg(to + b * kMostSums + k);
+               });
+    block.reduce<n>(out);
+  }
+  template <class F>
+  __device__ double least(int32_t count, const F& f) const {
+    const double own = block.reduce_least(own_least(first(), count, stride(), f));
+    const double* of = share<1>(&own);
+    return block.reduce_least(own_least(static_cast<int32_t>(threadIdx.x), static_cast<int32_t>(gridDim.x), kThreads,
+                                        [&](int32_t b) { return __ldcg(of + b * kMostSums); }));
+  }
+  __device__ void meet() const { cooperative_groups::this_grid().sync(); }
+  template <class F>
+  __device__ void each(int32_t count, const F& f) const {
+    for (int32_t i = first(); i < count; i += stride()) f(i);
+  }
+  // The numbers of every block, once all are there.
+  template <int n>
+  __device__ double* share(const double* own) const {
+    double* to = workspace + static_cast<int64_t>(turn) * gridDim.x * kMostSums;  // two in turn: one barrier a sum
+    turn = 1 - turn;
+    if (threadIdx.x == 0) {
+      for (int k = 0; k < n; ++k) to[blockIdx.x * kMostSums + k] = own[k];
+    }
+    cooperative_groups::this_grid().sync();
+    return to;
+  }
+  __device__ int32_t first() const { return static_cast<int32_t>(blockIdx.x * kThreads + threadIdx.x); }
+  __device__ int32_t stride() const { return static_cast<int32_t>(gridDim.x * kThreads); }
+};
+
+// A record has no constructor that shared memory could run, so it is named by its size.
+struct alignas(8) RecordBytes {
+  unsigned char bytes[sizeof(rigid::Iteration) * rigid::kMaxIterations];
+  __device__ rigid::Iteration* get() { return reinterpret_cast<rigid::Iteration*>(bytes); }
+};
+
+template <class T, class Act>
+__global__ void __launch_bounds__(kTileThreads)
+    small_bodies(const __grid_constant__ rigid::Inputs<T> in, const __grid_constant__ Act act, int32_t bodies) {
+  __shared__ RecordBytes records[Act::keeps_record ? kTiles : 1];
+  const int64_t item = static_cast<int64_t>(blockIdx.x) * kTiles + threadIdx.x / kTile;
+  if (item >= in.scenes * bodies) return;
+  const rigid::Body<T> body{in, item / bodies, static_cast<int32_t>(item % bodies)};
+  act(body, Tile(), records[Act::keeps_record ? threadIdx.x / kTile : 0].get());
+}
+
+template <class T, class Act>
+__global__ void __launch_bounds__(kThreads)
+    medium_bodies(const __grid_constant__ rigid::Inputs<T> in, const __grid_constant__ Act act, int32_t first,
+                  int32_t bodies) {
+  __shared__ RecordBytes record;
+  __shared__ double part[kWarps][kMostSums];
+  const int64_t item = blockIdx.x;
+  const rigid::Body<T> body{in, item / bodies, static_cast<int32_t>(first + item % bodies)};
+  act(body, BlockTeam{part}, record.get());
+}
+
+template <class T, class Act>
+__global__ void __launch_bounds__(kThreads)
+    large_bodies(const __grid_constant__ rigid::Inputs<T> in, const __grid_constant__ Act act, int32_t first,
+                 int32_t bodies, double* workspace) {
+  __shared__ RecordBytes record;
+  __shared__ double part[kWarps][kMostSums];
+  const DeviceTeam team{BlockTeam{part}, workspace};
+  for (int64_t item = 0; item < in.scenes * bodies; ++item) {
+    const rigid::Body<T> body{in, item / bodies, static_cast<int32_t>(first + item % bodies)};
+    act(body, team, record.get());
+  }
+}
+
+// A thread for each vertex of each scene.
+constexpr int kVertexThreads = 128;
+template <class T>
+unsigned blocks_of(const rigid::Inputs<T>& in) {
+  return static_cast<unsigned>((in.scenes * in.vertices + kVertexThreads - 1) / kVertexThreads);
+}
+struct Row {
+  int64_t scene;
+  int32_t vertex;
+  bool exists;
+  template <class T>
+  __device__ explicit Row(const rigid::Inputs<T>& in) {
+    const int64_t row = static_cast<int64_t>(blockIdx.x) * kVertexThreads + threadIdx.x;
+    exists = row < in.scenes * in.vertices;
+    scene = row / in.vertices;
+    vertex = static_cast<int32_t>(row % in.vertices);
+  }
+};
+
+inline int multiprocessors() {
+  int device = 0, count = 1;
+  cudaGetDevice(&device);
+  cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device);
+  return count;
+}
+
+// Whether large bodies take a block each: there are enough of them.
+inline bool by_block(const BodyGroups& groups, int64_t scenes) { return scenes * groups.large >= kEnoughBlocks; }
+
+// Calls act(body, team, record) for all bodies of all scenes.
+template <class T, class Act>
+cudaError_t run_bodies(const rigid::Inputs<T>& in, BodyGroups groups, const Act& act, double* workspace,
+                       cudaStream_t stream) {
+  if (in.scenes == 0) return cudaSuccess;
+  if (groups.small > 0) {
+    const int64_t items = in.scenes * groups.small;
+    small_bodies<T>
+        <<<static_cast<unsigned>((items + kTiles - 1) / kTiles), kTileThreads, 0, stream>>>(in, act, groups.small);
+  }
+  if (by_block(groups, in.scenes)) groups.medium += groups.large, groups.large = 0;
+  if (groups.medium > 0) {
+    medium_bodies<T><<<static_cast<unsigned>(in.scenes * groups.medium), kThreads, 0, stream>>>(in, act, groups.small,
+                                                                                                groups.medium);
+  }
+  if (groups.large > 0) {
+    int32_t first = groups.small + groups.medium, bodies = groups.large;
+    void* arguments[] = {const_cast<rigid::Inputs<T>*>(&in), const_cast<Act*>(&act), &first, &bodies, &workspace};
+    const auto kernel = reinterpret_cast<const void*>(&large_bodies<T, Act>);
+    const auto error = cudaLaunchCooperativeKernel(kernel, multiprocessors(), kThreads, arguments, 0, stream);
+    if (error != cudaSuccess) return error;
+  }
+  return cudaGetLastError();
+}
+
+}  // namespace diffvbd::cuda

@@ -1,0 +1,16 @@
+// Bodies of a scene as kernels take them.
+#pragma once
+
+#include <cstdint>
+
+namespace diffvbd::cuda {
+
+// How many of the bodies, smallest first, are worked on by a part of a warp, by a block, and by the whole device.
+struct BodyGroups {
+  int32_t small, medium, large;
+};
+
+// Doubles of memory that the sums of the whole device go through; 0 where no body needs it.
+int64_t bodies_workspace(const BodyGroups& groups, int64_t scenes);
+
+}  // namespace diffvbd::cuda

@@ -1,0 +1,269 @@
+// Where a step begins: the predictor y = x + h v + h^2 a, and where the sweeps start. The vertices of a body that is
+// corrected coast together, x + s h v with one share s, as far as planes let them, and are corrected; every other
+// vertex goes toward x + h v or y as far as planes let it alone (docs/method.md, sections 6 and 14). With the adjoint.
+#pragma once
+
+#include "../energies/floor_start.h"
+#include "../rigid/reverse.h"
+
+namespace diffvbd::start {
+
+// Where the vertices of bodies that are not corrected start from. kLower: for each body the lower potential of the two.
+enum From { kInertia = 0, kPredictor = 1, kLower = 2 };
+
+using rigid::Body, rigid::kCorrected, rigid::put, rigid::Vector;
+
+template <class T>
+struct Inputs {
+  rigid::Inputs<T> bodies;                    // that are corrected: x is where they have coasted to, y the predictor
+  Batched<const T> x, v, acceleration, held;  // [B, V, 3]; acceleration also [B, 1, 3] (item 0); held may be null
+  const bool* pinned;                         // [V]
+  const uint8_t* falls;                       // [B, others]  with kLower: whether a body starts from y
+  int32_t others;
+  int from;
+  bool some_alone;  // whether some vertices are in no body that is corrected
+  bool filters;     // whether planes hold back a start
+  StepParameters<T> parameters;
+
+  DIFFVBD_FN static Vec3<T> at(const Batched<const T>& a, int64_t scene, int32_t v) {
+    const T* p = a.data + scene * a.scene + 3 * a.item * v;
+    return {p[0], p[1], p[2]};
+  }
+  DIFFVBD_FN int64_t row(int64_t scene, int32_t v) const { return scene * bodies.vertices + v; }
+  DIFFVBD_FN const T* planes(int64_t scene) const { return bodies.data.data + scene * bodies.data.scene; }
+  DIFFVBD_FN int plane_scalars() const { return bodies.data_count[0]; }  // FloorBarrier is the first energy
+  DIFFVBD_FN VertexState<T> state(int64_t scene, int32_t v, const Vec3<T>& x) const {
+    return {x, x, bodies.origin.data ? at(bodies.origin, scene, v) : zero3<T>(), T(bodies.time_step)};
+  }
+  DIFFVBD_FN bool starts_from_y(int64_t scene, int32_t v) const {
+    return from == kPredictor ||
+           (from == kLower && bodies.other[v] >= 0 && falls[scene * others + bodies.other[v]] != 0);
+  }
+};
+
+// Positions before the step, after coasting, and the predictor.
+template <class T>
+struct Motion {
+  Vec3<T> x, coasting, y;
+  DIFFVBD_FN Motion(const Inputs<T>& in, int64_t scene, int32_t v) : x(in.at(in.x, scene, v)) {
+    const double h = in.bodies.time_step;
+    if (in.pinned[v]) {
+      coasting = y = in.held.data ? in.at(in.held, scene, v) : x;
+    } else {
+      coasting = x + T(h) * in.at(in.v, scene, v);
+      y = coasting + T(h * h) * in.at(in.acceleration, scene, v);
+    }
+  }
+};
+
+// How far a vertex goes alone from x toward a goal.
+template <class T>
+DIFFVBD_FN Vec3<T> toward(const Inputs<T>& in, int64_t scene, int32_t v, const Vec3<T>& x, const Vec3<T>& goal) {
+  if (!in.filters || in.pinned[v]) return goal;
+  return x + FloorStart::moved(in.state(scene, v, x), in.planes(scene), in.plane_scalars(), goal - x, in.parameters);
+}
+
+// A vertex of a body that is not corrected. With kLower x_start is the start from x + h v, and `from_y` (null where
+// that is y itself) the one from y.
+template <class T>
+DIFFVBD_FN void begin_vertex(const Inputs<T>& in, T* x_start, T* from_y, T* y, int64_t scene, int32_t v) {
+  if (in.bodies.other[v] == kCorrected) return;
+  const Motion<T> m(in, scene, v);
+  const int64_t at = 3 * in.row(scene, v);
+  const auto store = [&](T* to, const Vec3<T>& a) { to[at] = a.x, to[at + 1] = a.y, to[at + 2] = a.z; };
+  store(y, m.y);
+  store(x_start, toward(in, scene, v, m.x, in.from == kPredictor ? m.y : m.coasting));
+  if (from_y) store(from_y, toward(in, scene, v, m.x, m.y));
+}
+template <class T>
+DIFFVBD_FN void choose_vertex(const Inputs<T>& in, T* x_start, const T* from_y, int64_t scene, int32_t v) {
+  if (in.bodies.other[v] < 0 || !in.starts_from_y(scene, v)) return;
+  const int64_t at = 3 * in.row(scene, v);
+  for (int c = 0; c < 3; ++c) x_start[at + c] = from_y[at + c];
+}
+
+template <class T>
+struct Adjoints {
+  const T *x_start, *y;      // of the outputs [B, V, 3]
+  T *x, *v;                  // [B, V, 3]
+  T *acceleration, *held;    // [B, V, 3], null where not wanted
+  T *mass, *planes;          // [B, V]; [B, V, scalars of planes], zero at first, null where not wanted
+  T *shared, *own, *x_prev;  // of a rigid correction's data, and scratch [B, V, 3]
+  int32_t shared_count, own_count;
+};
+
+template <class T>
+DIFFVBD_FN Vec3<T> vector_of(const T* p, int64_t row) {
+  return {p[3 * row], p[3 * row + 1], p[3 * row + 2]};
+}
+
+template <class T>
+DIFFVBD_FN void reverse_vertex(const Inputs<T>& in, const Adjoints<T>& a, int64_t scene, int32_t v) {
+  if (in.bodies.other[v] == kCorrected) return;
+  const int64_t row = in.row(scene, v);
+  const auto store = [&](T* to, const Vec3<T>& value) {
+    if (to) to[3 * row] = value.x, to[3 * row + 1] = value.y, to[3 * row + 2] = value.z;
+  };
+  const Vec3<T> start_bar = vector_of(a.x_start, row), y_bar = vector_of(a.y, row), none = zero3<T>();
+  if (in.pinned[v]) {
+    store(a.x, in.held.data ? none : start_bar + y_bar);
+    store(a.held, start_bar + y_bar);
+    store(a.v, none);
+    store(a.acceleration, none);
+    return;
+  }
+  const double h = in.bodies.time_step;
+  const bool from_y = in.starts_from_y(scene, v);
+  Vec3<T> goal_bar = start_bar, x_bar = start_bar + y_bar;
+  if (in.filters) {
+    const Motion<T> m(in, scene, v);
+    T* planes = a.planes ? a.planes + row * in.plane_scalars() : nullptr;
+    FloorStart::moved_vjp(in.state(scene, v, m.x), in.planes(scene), in.plane_scalars(),
+                          (from_y ? m.y : m.coasting) - m.x, in.parameters, goal_bar, x_bar, planes);
+  }
+  store(a.x, x_bar);
+  store(a.held, none);
+  store(a.v, T(h) * (goal_bar + y_bar));
+  store(a.acceleration, T(h * h) * (from_y ? goal_bar + y_bar : y_bar));
+}
+
+// What planes leave of the share 1 of h v that a vertex of a body coasts.
+template <class T>
+struct Room {
+  using Plane = FloorBarrier::Plane<double>;
+  const Inputs<T>& in;
+  const Body<T>& b;
+  Vector x, step;
+  double slack;  // a motion along a plane is none toward it, however it rounds
+  int32_t v;
+
+  DIFFVBD_FN Room(const Inputs<T>& inputs, const Body<T>& body, int32_t vertex) : in(inputs), b(body), v(vertex) {
+    const Motion<T> m(in, b.scene, v);
+    const Vec3<T> way = m.coasting - m.x;
+    x = {double(m.x.x), double(m.x.y), double(m.x.z)};
+    step = {double(way.x), double(way.y), double(way.z)};
+    slack = 8 * double(std::numeric_limits<T>::epsilon()) * std::sqrt(dot(step, step));
+  }
+  // calls f(plane, its number, the share that it leaves)
+  template <class F>
+  DIFFVBD_FN void each(F&& f) const {
+    const VertexState<double> s = b.state(v, x);
+    b.energies(v, [&](auto energy, int, const double* data, int count) {
+      if constexpr (std::is_same_v<decltype(energy), FloorBarrier>) {
+        for (int k = 0; k < count; k += FloorBarrier::stride) {
+          const Plane plane(data + k, s);
+          const double wide = plane.gap(x) - plane.dhat, closing = -dot(plane.n, step);
+          const double room = wide > 0 ? double(in.parameters.filter_eta) * wide : 0;
+          f(plane, k, closing > room + slack ? room / closing : 1.0);
+        }
+      }
+    });
+  }
+  // the number of planes whose side is not sure after a share of the step
+  DIFFVBD_FN double lost(double share) const {
+    const VertexState<double> s = b.state(v, x + share * step);
+    double count = 0;
+    each([&](const Plane& plane, int, double) {
+      if (!(plane.template guard<T>(s) < plane.gap(s.x))) count += 1;
+    });
+    return count;
+  }
+};
+
+// The share of h v that all vertices of a body take; 0 where rounding would close a gap.
+template <class T, class Team>
+DIFFVBD_FN double share_of(const Inputs<T>& in, const Body<T>& b, const Team& team) {
+  const double share = team.least(b.size(), [&](int32_t i) {
+    double least = 1;
+    Room<T>(in, b, b.vertex(i)).each([&](const auto&, int, double own) { least = own < least ? own : least; });
+    return least;
+  });
+  double lost[1];
+  team.template sum<1>(b.size(), lost,
+                       [&](int32_t i, double* to) { to[0] += Room<T>(in, b, b.vertex(i)).lost(share); });
+  return lost[0] > 0 ? 0 : share;
+}
+
+// Writes y and where a body has coasted to; returns its share. b reads what is written here once the team has met.
+template <bool energies, class T, class Team>
+DIFFVBD_FN double coast(const Inputs<T>& in, const Body<T>& b, const Team& team, T* x, T* y) {
+  const double share = energies && in.filters ? share_of(in, b, team) : 1;
+  team.each(b.size(), [&](int32_t i) {
+    const int32_t v = b.vertex(i);
+    const int64_t at = 3 * b.row(v);
+    const Motion<T> m(in, b.scene, v);
+    const Vec3<T> start = share < 1 ? m.x + T(share) * (m.coasting - m.x) : m.coasting;
+    x[at] = start.x, x[at + 1] = start.y, x[at + 2] = start.z;
+    y[at] = m.y.x, y[at + 1] = m.y.y, y[at + 2] = m.y.z;
+  });
+  team.meet();
+  return share;
+}
+
+template <bool energies, class T, class Team>
+DIFFVBD_FN void begin_body(const Inputs<T>& in, const Body<T>& b, const Team& team, T* x_start, T* y) {
+  coast<energies>(in, b, team, x_start, y);
+  rigid::correct<energies>(b, team, nullptr, x_start);
+}
+
+// The adjoint of a share: of x, v and the planes that set it, evenly where several do.
+template <class T, class Team>
+DIFFVBD_FN void reverse_share(const Inputs<T>& in, const Body<T>& b, const Team& team, double share, double share_bar,
+                              const Adjoints<T>& a) {
+  const double h = in.bodies.time_step;
+  const auto ties = [&](const Room<T>& room) {
+    int count = 0;
+    room.each([&](const auto&, int, double own) { count += own == share; });
+    return count;
+  };
+  double binding[1];
+  team.template sum<1>(b.size(), binding,
+                       [&](int32_t i, double* to) { to[0] += ties(Room<T>(in, b, b.vertex(i))) > 0 ? 1 : 0; });
+  team.each(b.size(), [&](int32_t i) {
+    const int32_t v = b.vertex(i);
+    const int64_t row = b.row(v);
+    const Room<T> room(in, b, v);
+    const int tied = ties(room);
+    if (tied == 0) return;
+    const double bar = share_bar / (binding[0] * tied);
+    room.each([&](const auto& plane, int k, double own) {
+      if (own != share) return;
+      const double closing = -dot(plane.n, room.step), wide = plane.gap(room.x) - plane.dhat;
+      const double closing_bar = -bar * share / closing;
+      const double gap_bar = wide >= 0 ? double(in.parameters.filter_eta) * bar / closing : 0;
+      rigid::add_to(a.x + 3 * row, gap_bar * plane.n);
+      rigid::add_to(a.v + 3 * row, (-h * closing_bar) * plane.n);
+      if (a.planes == nullptr) return;
+      const Vector world = room.x + b.state(v, room.x).origin, n_bar = gap_bar * world + (-closing_bar) * room.step;
+      const double values[] = {n_bar.x, n_bar.y, n_bar.z, -gap_bar, 0, -gap_bar};
+      T* to = a.planes + row * in.plane_scalars() + k;
+      for (int c = 0; c < 6; ++c) to[c] += static_cast<T>(values[c]);
+    });
+  });
+}
+
+// Transpose of begin_body(). x and y, [B, V, 3], receive what b reads; a.v holds what the correction sends to y first.
+template <bool energies, class T, class Team>
+DIFFVBD_FN void reverse_body(const Inputs<T>& in, const Body<T>& b, const Team& team, rigid::Iteration* record, T* x,
+                             T* y, const Adjoints<T>& a) {
+  const double share = coast<energies>(in, b, team, x, y), h = in.bodies.time_step;
+  rigid::reverse<energies>(b, team, record,
+                           {a.x_start, nullptr, a.x, energies ? a.x_prev : nullptr, a.v, a.mass, a.shared, a.own,
+                            a.shared_count, a.own_count});
+  double share_bar[1];
+  team.template sum<1>(b.size(), share_bar, [&](int32_t i, double* to) {
+    const int32_t v = b.vertex(i);
+    const int64_t row = b.row(v);
+    const Vector coasted = Body<T>::at(a.x + 3 * row), y_bar = Body<T>::at(a.v + 3 * row) + Body<T>::at(a.y + 3 * row);
+    if (share < 1) to[0] += dot(coasted, Room<T>(in, b, v).step);
+    put(a.x + 3 * row, coasted + y_bar + (energies ? Body<T>::at(a.x_prev + 3 * row) : Vector{}));
+    put(a.v + 3 * row, h * (share * coasted + y_bar));
+    if (a.acceleration) put(a.acceleration + 3 * row, (h * h) * y_bar);
+    if (a.held) put(a.held + 3 * row, Vector{});
+  });
+  if constexpr (energies) {
+    if (0 < share && share < 1) reverse_share(in, b, team, share, share_bar[0], a);
+  }
+}
+
+}  // namespace diffvbd::start
