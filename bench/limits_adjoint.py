@@ -38,7 +38,7 @@ def oblique(gap: float, normals: tuple = NORMALS[1:2]) -> Scene:
     planes = np.array(normals) / np.linalg.norm(normals, axis=1, keepdims=True)
     height = (points @ planes.T).min(0) - gap
     floor = dv.FloorBarrier(height=height.tolist(), normal=planes.tolist(), kappa=2e4, dhat=0.1, damping=0.0)
-    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), floor), rigid=False)
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), floor), rigid=False, start="predictor")
     noise = testing.generator("oblique").uniform(-1, 1, points.shape)
     across = np.linalg.pinv(planes) @ planes  # what of a vector changes the gaps
     away = np.linalg.pinv(planes) @ np.full(len(planes), 0.01 * gap * 60)
@@ -61,7 +61,8 @@ def volumetric(ratio: float, block: str = "exact") -> Scene:
     mesh = dv.mesh.cube(2)
     rng = testing.generator("volumetric")
     points = torch.from_numpy(mesh.points.copy())
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, energies=(dv.StableNeoHookean(block),))
+    pinned = mesh.points[:, 0] < 1e-9
+    model = dv.Model(mesh, pinned=pinned, energies=(dv.StableNeoHookean(block),), start="predictor")
     mu = 1e4 * torch.from_numpy(rng.uniform(0.8, 1.2, mesh.num_tets))
     inputs = {
         "x": points + 0.05 * torch.from_numpy(rng.uniform(-1, 1, points.shape)) + torch.from_numpy(PLACE),

@@ -9,9 +9,10 @@
 namespace diffvbd::cuda {
 
 inline BodyGroups groups_of(const std::vector<int64_t>& groups, int64_t bodies) {
-  require(groups.size() == 3 && groups[0] + groups[1] + groups[2] == bodies,
-          "diffvbd: expected three groups of bodies");
-  return {static_cast<int32_t>(groups[0]), static_cast<int32_t>(groups[1]), static_cast<int32_t>(groups[2])};
+  require(groups.size() == 4 && groups[0] + groups[1] + groups[2] + groups[3] == bodies,
+          "diffvbd: expected four groups of bodies");
+  const auto at = [&](int i) { return static_cast<int32_t>(groups[i]); };
+  return {at(0), at(1), at(2), at(3)};
 }
 
 inline Tensor workspace_of(const BodyGroups& groups, const Tensor& x) {

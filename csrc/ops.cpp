@@ -82,7 +82,7 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "constants, Tensor ptr, Tensor entry) -> (Tensor x, Tensor collider, Tensor kappa)");
   // The rigid correction of each body that is listed, see rigid/body.h, and the velocity (x - x_prev) / h; order, ptr:
   // their vertices; spread: squared radius of gyration [m^2]; other [vertices]: -2 for what is listed; groups: how many
-  // bodies a part of a warp, a block and the whole device work on (CUDA)
+  // bodies a thread, a part of a warp, a block and the whole device work on (CUDA)
   m.def(
       "rigid(Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor energy_data, Tensor origin, Tensor order, Tensor "
       "ptr, Tensor spread, Tensor other, int[] groups, int[] data_count, float time_step) -> (Tensor x, Tensor v)");

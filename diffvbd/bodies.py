@@ -7,7 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-LARGEST = (64, 16384)  # vertices of a body that a part of a warp, and a block, of a CUDA device work on
+# vertices of a body that a thread (where there are many), a part of a warp and a block of a CUDA device work on
+LARGEST = (12, 64, 16384)
+Groups = tuple[int, int, int, int]  # how many bodies are tiny, small, medium and large, by LARGEST
 CORRECTED = -2  # twin of kCorrected in csrc/start/begin.h
 
 
@@ -17,7 +19,7 @@ class Bodies(NamedTuple):
     order: Tensor  # int32 [listed], their vertices
     ptr: Tensor  # int32 [bodies + 1]
     spread: Tensor  # float64 [bodies], squared radius of gyration at rest [m^2]
-    groups: tuple[int, int, int]  # how many are small, medium and large, by LARGEST
+    groups: Groups
 
     @property
     def number(self) -> int:
@@ -36,7 +38,7 @@ class OtherBodies(NamedTuple):
     ptr: Tensor  # int32 [bodies + 1]
     tets: Tensor  # int32 [tets of these bodies, 5]: the number of a tet and its corners
     tet_ptr: Tensor  # int32 [bodies + 1]
-    groups: tuple[int, int, int]
+    groups: Groups
 
     @property
     def number(self) -> int:
@@ -51,7 +53,7 @@ class _Grouped(NamedTuple):
     of: Tensor  # int64 [V], -1 for a vertex that is not listed
     order: Tensor
     ptr: Tensor
-    groups: tuple[int, int, int]
+    groups: Groups
 
 
 def find_bodies(points: Tensor, tets: Tensor, pinned: Tensor, correct: bool) -> tuple[Bodies, OtherBodies]:
@@ -107,7 +109,7 @@ def _grouped(label: Tensor, which: Tensor) -> _Grouped:
     rank = torch.argsort(size, stable=True)
     of_body = torch.empty_like(rank).index_copy_(0, rank, torch.arange(len(roots)))[of_body]
     size = size[rank]
-    small, medium = (int((size <= largest).sum()) for largest in LARGEST)
+    tiny, small, medium = (int((size <= largest).sum()) for largest in LARGEST)
     of = torch.full((len(label),), -1).index_copy_(0, listed, of_body)
     order = listed[torch.argsort(of_body, stable=True)]
-    return _Grouped(of, order, _starts(size), (small, medium - small, len(size) - medium))
+    return _Grouped(of, order, _starts(size), (tiny, small - tiny, medium - small, len(size) - medium))

@@ -91,7 +91,7 @@ def predict(
         A dict of bytes:
             model: index data and rest scalars of the Model;
             tape: of one step, scenes x sweeps x active vertices x 72 (full), 24 (compact) or 0 bytes in float64;
-            step: what one step keeps for its backward, tape included;
+            step: what one step keeps for its backward beside the state it starts from, tape included;
             kept: the largest amount kept at once: all steps without checkpoints; states plus the steps of one segment
                 with checkpoints every n; states plus one step with Binomial. The state of the random number generator,
                 5 kB, is kept with every checkpoint (with Binomial: with every step). ``rest`` adds the graph of the
@@ -108,21 +108,19 @@ def predict(
     policy = adjoint.policy(scalars, item, model.energy_mask)
     tape_bytes = scalars * ops.tape_rows(policy, model.energy_mask) * item
     state = scenes * model.num_vertices * 3 * item
-    # y and x of each step; a floor adds what safeguards.filter_against_planes keeps, in rounds where planes are several
-    per_step = 2 * state + tape_bytes
-    if model.floor is not None:
-        planes = model.floor.planes
-        several = item + 10 + min(planes, 3) * (6 * item + 8) + planes * (5 * item + 1)
-        per_step += scenes * model.num_vertices * (3 * item + 2 if planes == 1 else several)
-    if model.corrects:  # the positions that are corrected at the start, and where a floor has a say how far they coast
-        per_step += state * (1 if model.floor is not None else 2)
+    local = model.dtype == torch.float32  # positions about an origin, which the result does not share
+    # where the sweeps start, the predictor and where the sweeps end; about an origin that, and where the step started
+    per_step = (5 if local else 3) * state + tape_bytes
+    per_step += scenes * sum(model._data_count) * item if local else 0
+    # of the state before a step, which a step alone is given: v, and x where the sweeps before did not end at it
+    between = state * (2 if model.corrects and not local else 1)
     if save in ("all", "last"):
         frames = steps + 1 if save == "all" else 1
     else:
         frames = steps // check_count("save", save, 1) + 2
     generator = torch.get_rng_state().numel()
     if schedule is None:
-        kept = steps * per_step
+        kept = steps * per_step + max(0, steps - 1) * between
     elif isinstance(schedule, Binomial):
         kept = 2 * state * min(schedule.snapshots + 1, steps) + per_step + max(0, steps - 1) * generator
         # A part that runs again saves its frames again, inside parts that have done so.
@@ -132,7 +130,8 @@ def predict(
             kept += 2 * state * (part * frames // (steps + 1))
     else:
         segments = math.ceil(steps / schedule)
-        kept = segments * (2 * state + generator) + min(schedule, steps) * per_step
+        kept = segments * (2 * state + generator)
+        kept += min(schedule, steps) * per_step + max(0, min(schedule, steps) - 1) * between
     kept += 2 * state * frames
     if rest:
         kept += (37 * model.num_tets + model.num_vertices) * item
@@ -144,7 +143,8 @@ def predict(
         scratch = _cpu_scratch(model, scenes, material, rest) + outputs * scenes * item
     if policy == ops.NO_TAPE:
         scratch += scalars * ops.tape_rows(ops.FULL_TAPE, model.energy_mask) * item
-    tensors = [t for t in vars(model).values() if hasattr(t, "element_size")] + list(model._topology)
+    parts = (vars(model).values(), model._topology, model._bodies, model._other_bodies)
+    tensors = [t for part in parts for t in part if isinstance(t, Tensor)]
     return {
         "model": sum(t.numel() * t.element_size() for t in tensors),
         "tape": tape_bytes,

@@ -23,7 +23,8 @@ def join_data(shared: Tensor, own: Tensor, data_count: Sequence[int]) -> Tensor:
     parts, at = [], {False: 0, True: 0}
     for energy, count in zip(VERTEX_ENERGIES, data_count, strict=True):
         rows, start = (own if energy.per_vertex else total), at[energy.per_vertex]
-        parts.append(rows[..., start : start + count].flatten(1))
+        part = rows.narrow(-1, start, count)  # not rows[...] nor flatten(), which is_grads_batched cannot do
+        parts.append(part.reshape(part.shape[0], -1) if energy.per_vertex else part)
         at[energy.per_vertex] += count
     return torch.cat(parts, -1)
 

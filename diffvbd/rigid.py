@@ -25,8 +25,9 @@ _TENSORS = 5  # x, x_prev, y, mass, data: the differentiable inputs, all [1 | B,
 
 class _Correct(Function):
     @staticmethod
-    def forward(*args: Any) -> tuple[Tensor, Tensor]:
-        return ops.raw.rigid(*args)
+    def forward(x, x_prev, y, mass, data, origin, order, ptr, spread, other, groups, data_count, time_step):
+        # torch.compile counts these arguments: *args would get the context as well
+        return ops.raw.rigid(x, x_prev, y, mass, data, origin, order, ptr, spread, other, groups, data_count, time_step)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:

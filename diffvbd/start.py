@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor
 from torch.autograd import Function
 
@@ -27,8 +28,15 @@ _SCENES = 10  # and origin, mu, lam, rest: what has a scene dimension
 
 class _Begin(Function):
     @staticmethod
-    def forward(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
-        return ops.raw.begin(*args)
+    def forward(x, v, acceleration, held, mass, data, origin, mu, lam, rest, pinned, order, ptr, spread, groups, other,
+                other_order, other_ptr, other_tets, other_tet_ptr, other_groups, data_count, time_step, filter_eta,
+                start, filters):  # fmt: skip
+        # torch.compile counts these arguments: *args would get the context as well
+        return ops.raw.begin(
+            x, v, acceleration, held, mass, data, origin, mu, lam, rest, pinned, order, ptr, spread, groups, other,
+            other_order, other_ptr, other_tets, other_tet_ptr, other_groups, data_count, time_step, filter_eta,
+            start, filters,
+        )  # fmt: skip
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
@@ -68,7 +76,9 @@ class _BeginBackward(Function):
             data_out = ops_rigid.join_data(shared, own, data_count)
             if planes.numel():  # the first energy's data
                 of_planes = ops.sum_to(planes, (planes.shape[0], 1, planes.shape[2]))[:, 0]
-                data_out[:, : planes.shape[2]] += of_planes
+                count = planes.shape[2]
+                first, others_out = data_out.narrow(1, 0, count), data_out.narrow(1, count, data_out.shape[1] - count)
+                data_out = torch.cat([first + of_planes, others_out], 1)
         out = (x_out, v_out, acceleration_out, held_out, mass_out, data_out)
         given = (x, v, acceleration, held, mass, data)
         return tuple(ops.sum_to(bar, t.shape) for bar, t, need in zip(out, given, needs, strict=True) if need)

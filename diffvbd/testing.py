@@ -186,8 +186,8 @@ class Scene:
             built.append(Anchor(self.case.anchor))
         return tuple(built)
 
-    def model(self, device: str = "cpu") -> Any:
-        """A `diffvbd.Model` of the scene, float64."""
+    def model(self, device: str = "cpu", **options: Any) -> Any:
+        """A `diffvbd.Model` of the scene, float64; options of it beside."""
         from diffvbd.mesh import TetMesh
         from diffvbd.model import Model
 
@@ -200,6 +200,7 @@ class Scene:
             regularization=self.case.regularization,
             relaxation=self.case.relaxation,
             device=device,
+            **options,
         )
 
     def inputs(self, dtype: torch.dtype = torch.float64, device: str = "cpu") -> dict[str, Any]:

@@ -19,9 +19,9 @@ def doubles(*values: Any) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def model_of(device: str, kind: str = "exact") -> dv.Model:
+def model_of(device: str, kind: str = "exact", **options: Any) -> dv.Model:
     energies = (dv.StableNeoHookean(kind), dv.FloorBarrier(height=-0.5), dv.Anchor(1.0))
-    return dv.Model(MESH, pinned=[0], energies=energies, device=device)
+    return dv.Model(MESH, pinned=[0], energies=energies, device=device, **options)
 
 
 def spoiled(value: float, *where: int) -> Tensor:

@@ -144,9 +144,10 @@ def test_nested_vmap(device: str) -> None:
     assert relative_error(actual, expected) <= 1e-13
 
 
-@pytest.mark.parametrize("name", ["x", "mu", "rest_points", "floor_barrier.kappa"])
-def test_jacrev_and_batched_gradients_equal_one_row_at_a_time(device: str, name: str) -> None:
-    model = small_model(device)
+@pytest.mark.parametrize("pinned", [[0, 1], []], ids=["pinned", "free"])
+@pytest.mark.parametrize("name", ["x", "mu", "rest_points", "floor_barrier.kappa", "anchor.points"])
+def test_jacrev_and_batched_gradients_equal_one_row_at_a_time(device: str, name: str, pinned: list[int]) -> None:
+    model = small_model(device, pinned=pinned)
     inputs = small_inputs(model)
 
     def run(value: Tensor) -> Tensor:

@@ -25,8 +25,8 @@ def small_model(device: str, dtype: torch.dtype = torch.float64, **options: Any)
     """One cube of six tets in units where every quantity is near 1, so that no gradient hides below a tolerance."""
     mesh = dv.mesh.cube()
     floor = dv.FloorBarrier(height=-0.2, normal=(0.1, 1.0, 0.0), kappa=2.0, dhat=0.5, damping=0.5)
-    options = {"energies": (dv.StableNeoHookean(), floor, dv.Anchor(0.7)), **options}
-    return dv.Model(mesh, density=2.0, pinned=[0, 1], dtype=dtype, device=device, **options)
+    options = {"energies": (dv.StableNeoHookean(), floor, dv.Anchor(0.7)), "pinned": [0, 1], **options}
+    return dv.Model(mesh, density=2.0, dtype=dtype, device=device, **options)
 
 
 def small_inputs(model: dv.Model, seed: int = 0) -> Arguments:
@@ -120,8 +120,9 @@ def test_compile_with_inductor(device: str, fresh_compiler: None) -> None:
     compiled_gradients(device, "inductor", ARGUMENTS, plain=False)
 
 
-def test_compile_of_a_step_without_gradients(device: str, fresh_compiler: None) -> None:
-    model = small_model(device)
+@pytest.mark.parametrize("pinned", [[0, 1], []], ids=["pinned", "free"])
+def test_compile_of_a_step_without_gradients(device: str, fresh_compiler: None, pinned: list[int]) -> None:
+    model = small_model(device, pinned=pinned)
     arguments = small_inputs(model)
     with torch.no_grad():
         x, v = torch.compile(lambda a: run_step(model, a), fullgraph=True, backend="aot_eager")(arguments)

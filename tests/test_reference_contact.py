@@ -52,7 +52,7 @@ def stand_in(model: dv.Model, **changes: Any) -> Any:
     """A model with what the step with contact reads."""
     names = ("tets", "rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies", "saturation")
     values = {name: getattr(model, name) for name in (*names, "regularization", "relaxation")}
-    values |= {"rigid": False, "start": "predictor"}
+    values |= {"rigid": False, "starts_from": "predictor"}
     detections = changes.pop("detections", 1)
     barrier = {"kappa": 200.0, "dhat": DHAT, "damping": 3.0, "detections": detections}
     values |= {

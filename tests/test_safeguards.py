@@ -142,8 +142,9 @@ def states(
     """Model, arguments of the potential, predictor, and the positions after 0, 1, ... sweeps; all on the CPU."""
     scene = build_scene(case, "random", "small")
     energies = (dv.StableNeoHookean(), dv.Anchor(1.0))
+    model_options = {"energies": energies, "start": "predictor", **model_options}
     model = dv.Model(dv.TetMesh(scene.points, scene.tets), density=torch.from_numpy(scene.arrays["density"]),
-                     pinned=torch.from_numpy(scene.pinned), energies=energies, **model_options)  # fmt: skip
+                     pinned=torch.from_numpy(scene.pinned), **model_options)  # fmt: skip
     inputs = scene.inputs()
     options = {name: inputs[name] for name in ("mu", "lam", "time_step")}
     given = options | {"gravity": inputs["gravity"], "prescribed": inputs["prescribed"]}

@@ -32,6 +32,11 @@ def composed(model: Any, sweeps: int, update: type[VertexBlock] = VertexBlock) -
     return run
 
 
+def model_of(scene: Any, device: str = "cpu") -> Any:
+    """Its sweeps start where composed() starts them."""
+    return scene.model(device, start="predictor")
+
+
 def inputs_of(scene: Any, device: str = "cpu") -> dict[str, Any]:
     inputs = scene.inputs(device=device)
     del inputs["rest_points"]  # a constant of VertexBlock
@@ -52,26 +57,26 @@ def assert_agree(found: dict[str, Tensor], expected: dict[str, Tensor], spreads:
 @pytest.mark.parametrize("case", CASES)
 def test_equals_the_reference(case: str, sweeps: int, device: str) -> None:
     scene = build_scene(case, "delaunay")
-    model, inputs = scene.model(), inputs_of(scene)
+    model, inputs = model_of(scene), inputs_of(scene)
     expected = testing.reference_result(model, inputs, sweeps)
     spreads = testing.spread(model, inputs, sweeps, expected=expected)
-    found = evaluate(composed(scene.model(device), sweeps), inputs_of(scene, device))
+    found = evaluate(composed(model_of(scene, device), sweeps), inputs_of(scene, device))
     assert_agree(found, expected, spreads)
 
 
 @pytest.mark.parametrize("case", ["plain", "paper"])
 def test_equals_the_step_of_the_package(case: str, device: str) -> None:
     scene = build_scene(case, "delaunay", "medium")
-    model, inputs = scene.model(device), inputs_of(scene, device)
+    model, inputs = model_of(scene, device), inputs_of(scene, device)
     expected = evaluate(lambda **given: dv.step(model, sweeps=3, **given), inputs)
     found = evaluate(composed(model, 3), inputs)
-    assert_agree(found, expected, testing.spread(scene.model(), inputs_of(scene), 3))
+    assert_agree(found, expected, testing.spread(model_of(scene), inputs_of(scene), 3))
 
 
 def test_no_sweeps_and_numbers_for_materials() -> None:
     scene = build_scene("paper")
     inputs = inputs_of(scene) | {"mu": torch.tensor(800.0).double(), "lam": torch.tensor([400.0]).double()}
-    model = scene.model()
+    model = model_of(scene)
     expected = testing.reference_result(model, inputs, 2)
     found = evaluate(composed(model, 2), inputs)
     assert found["grad_mu"].shape == () and found["grad_lam"].shape == (1,)
@@ -89,7 +94,7 @@ def assert_equal_start(found: dict[str, Tensor], expected: dict[str, Tensor]) ->
 def test_scenes_of_a_batch_do_not_mix() -> None:
     scene = build_scene("paper", "delaunay")
     inputs = inputs_of(scene)
-    model, x = scene.model(), inputs["x"]
+    model, x = model_of(scene), inputs["x"]
     solver = vertex_block_descent(model, 0.01)
     scale = torch.tensor([1.0, 1.1, 0.9], dtype=x.dtype)[:, None, None]
     results = []
@@ -120,7 +125,7 @@ def test_each_part_of_the_adjoint_is_seen(part: str) -> None:
             return super().gradient_tangent(b, 0 * p if part == "gradient_tangent" else p)
 
     scene = build_scene("inverted_paper", "delaunay")
-    model, inputs = scene.model(), inputs_of(scene)
+    model, inputs = model_of(scene), inputs_of(scene)
     full, without = (evaluate(composed(model, 1, kind), inputs) for kind in (VertexBlock, Without))
     assert torch.equal(full["x"], without["x"])
     assert relative_error(without["grad_x"], full["grad_x"]) > 1e-3
@@ -128,10 +133,10 @@ def test_each_part_of_the_adjoint_is_seen(part: str) -> None:
 
 def test_float32() -> None:
     scene = build_scene("plain", "delaunay")
-    model = scene.model().to(dtype=torch.float32)
+    model = model_of(scene).to(dtype=torch.float32)
     single = {name: t.float() if isinstance(t, Tensor) else t for name, t in inputs_of(scene).items()}
     found = evaluate(composed(model, 2), single)
-    expected = evaluate(composed(scene.model(), 2), inputs_of(scene))
+    expected = evaluate(composed(model_of(scene), 2), inputs_of(scene))
     assert found["grad_x"].dtype == torch.float32 and found["grad_x"].any()
     assert relative_error(found["x"], expected["x"]) <= tolerance("float32_forward")
     assert relative_error(found["grad_x"], expected["grad_x"]) <= tolerance("float32_gradient")

@@ -21,7 +21,7 @@ struct Block {
 
 // The axes in which a set's blocks are factored.
 template <class Set, class R>
-using Axes = std::conditional_t<Set::filters, Frame<R>, NoFrame<R>>;
+using Axes = std::conditional_t<Set::filters && !Set::usual, Frame<R>, NoFrame<R>>;
 
 // g and H in these axes, and what no pivot of H lies below.
 template <class Set, class R>
@@ -44,9 +44,49 @@ DIFFVBD_FN Axes<Set, R> axes_of(const Block<R>& b) {
   Axes<Set, R> axes;
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
-    if constexpr (E::has_filter) axes = E::template frame<T>(b.state, b.data[k], b.data_count[k]);
+    if constexpr (E::has_filter && !Set::usual) axes = E::template frame<T>(b.state, b.data[k], b.data_count[k]);
   });
   return axes;
+}
+
+// Which of the first two diagonal entries a plane does not stand on alone (1, else 0): what it puts there does no harm
+// to the other entries.
+template <class R>
+struct Shared {
+  R first, second;
+};
+template <class Set, class R>
+DIFFVBD_FN Shared<R> shared_entries(const Block<R>& b, const Axes<Set, R>& axes) {
+  Shared<R> out{R(1), R(1)};
+  if constexpr (Set::filters) {
+    Set::for_each([&](auto energy, int k) {
+      using E = decltype(energy);
+      if constexpr (E::has_filter) {
+        if constexpr (!Set::usual) {
+          if (axes.turned) {
+            out.first = select(R(0) < axes.tiny, R(0), R(1));
+            return;
+          }
+        }
+        E::leave_out(b.state, b.data[k], b.data_count[k], out.first, out.second);
+      }
+    });
+  }
+  return out;
+}
+// Whether planes ask for axes other than those of the mesh; and whether there are any near at x.
+template <class Set, class R>
+DIFFVBD_FN bool is_oblique(const Block<R>& b, const Vec3<R>& x, bool or_near = false) {
+  bool out = false;
+  VertexState<R> s = b.state;
+  s.x = x;
+  Set::for_each([&](auto energy, int k) {
+    using E = decltype(energy);
+    if constexpr (E::has_filter) {
+      out = or_near ? E::is_near(s, b.data[k], b.data_count[k]) : E::is_oblique(s, b.data[k], b.data_count[k]);
+    }
+  });
+  return out;
 }
 
 // The system of a vertex; of its masses, anchors and contact alone where `all` is false.
@@ -78,15 +118,21 @@ DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const St
   }
   if constexpr (Set::filters) {
     out.axes = axes_of<T, Set>(b);
-    if (out.axes.turned) {  // which rounds every entry by the largest ones
-      const R rounding = R(0.5) * out.axes.tiny * (out.H.xx + out.H.yy + out.H.zz);
-      out.least = select(least < rounding, rounding, least);
+    if constexpr (!Set::usual) {
+      if (out.axes.turned) {  // which rounds every entry by the largest ones
+        const R rounding = R(0.5) * out.axes.tiny * (out.H.xx + out.H.yy + out.H.zz);
+        out.least = select(least < rounding, rounding, least);
+      }
     }
     out.g = out.axes.to(out.g);
     out.H = out.axes.to(out.H);
     Set::for_each([&](auto energy, int k) {
       using E = decltype(energy);
-      if constexpr (E::has_filter && all) E::block(b.state, b.data[k], b.data_count[k], out.g, out.H, out.axes);
+      if constexpr (E::has_filter && Set::usual) {
+        E::block(b.state, b.data[k], b.data_count[k], out.g, out.H);
+      } else if constexpr (E::has_filter && all) {
+        E::block(b.state, b.data[k], b.data_count[k], out.g, out.H, out.axes);
+      }
     });
   }
   return out;

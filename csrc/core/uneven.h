@@ -15,15 +15,12 @@ constexpr double kUneven = 3e3;  // errors grow by eps times it; lam of some hun
 constexpr int kRefinements = 2;  // each leaves eps times the unevenness of the error: from 1e-4 to 1e-12 at 1e12
 
 // Whether the trace and the least pivot of a block lie further apart than rounding forgives: trace(D^-1) trace(L D L^T)
-// but for the last pivot's own part, both times inv1 inv2, so that nothing is divided. What a plane puts on the first
-// axis stands alone there and does no harm.
-template <class Set, class R, class A>
-DIFFVBD_FN auto is_uneven(const Factor<R>& f, const A& axes) {
-  R first = R(1) + f.l21 * f.l21 + f.l31 * f.l31;
-  if constexpr (Set::filters) {
-    if (axes.turned) first = select(R(0) < axes.tiny, R(0), first);
-  }
-  const R trace = first * f.inv2 + (R(1) + f.l32 * f.l32) * f.inv1;
+// but for the last pivot's own part, both times inv1 inv2, so that nothing is divided. What a plane puts on an entry of
+// its own does no harm.
+template <class R>
+DIFFVBD_FN auto is_uneven(const Factor<R>& f, const Shared<R>& on) {
+  const R trace =
+      on.first * (R(1) + f.l21 * f.l21 + f.l31 * f.l31) * f.inv2 + on.second * (R(1) + f.l32 * f.l32) * f.inv1;
   return R(kUneven) * (f.inv1 * f.inv2) < (f.inv1 + f.inv2 + f.inv3) * trace;
 }
 

@@ -20,10 +20,18 @@ DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const 
   const System<Set, R> system = assemble<Set>(b, star, q);
   const Factor<R> H = factor<T>(system.H, system.least);
   Vec3<R> d = -solve(H, system.g);
-  if constexpr (Set::elastic) {
-    if (star.any(is_uneven<Set>(H, system.axes))) d = step_uneven<Set>(b, star, q, system.axes, H, d);
+  if constexpr (Set::elastic && !Set::usual) {
+    if (star.any(is_uneven(H, shared_entries<Set>(b, system.axes))))
+      d = step_uneven<Set>(b, star, q, system.axes, H, d);
   }
   return {d, system.axes.from(d), H};
+}
+
+// Whether factors of the usual way are none to go on with: all threads that share a star must know.
+template <class Set, class R, class Star>
+DIFFVBD_FN bool is_rare(const Block<R>& b, const Star& star, const Factor<R>& H) {
+  if constexpr (Set::elastic) return star.any(is_uneven(H, shared_entries<Set>(b, NoFrame<R>{})));
+  return false;
 }
 
 // Saturated, then relaxed.
@@ -128,11 +136,13 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   const Vec3<R> z_axes = axes.to(z);
   Vec3<R> p_axes = solve(r.H, z_axes), d_low = zero3<R>();
   bool uneven = false;
-  if constexpr (!Set::contact) {  // what contact adds to a block is not on a full tape
-    if constexpr (Set::elastic) uneven = star.any(is_uneven<Set>(r.H, axes));
-    if constexpr (Set::filters) uneven = uneven || (wants_data && star.any(axes.turned));
+  if constexpr (!Set::contact && !Set::usual) {  // what contact adds to a block is not on a full tape
+    if constexpr (Set::elastic) uneven = star.any(is_uneven(r.H, shared_entries<Set>(b, axes)));
+    if constexpr (Set::filters) uneven = uneven || (wants_data && star.any(is_oblique<Set>(b, b.state.x, true)));
   }
-  if (uneven) out.x += reverse_uneven<Set, wanted>(b, star, q, axes, r, u.d_raw, z_axes, p_axes, d_low);
+  if constexpr (!Set::usual) {
+    if (uneven) out.x += reverse_uneven<Set, wanted>(b, star, q, axes, r, u.d_raw, z_axes, p_axes, d_low);
+  }
   const Vec3<R> p = axes.from(p_axes);
   out.p = p;
 

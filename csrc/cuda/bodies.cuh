@@ -9,7 +9,8 @@
 
 namespace diffvbd::cuda {
 
-constexpr int kTile = 8, kTileThreads = 128, kTiles = kTileThreads / kTile;
+constexpr int kTile = 8, kTileThreads = 128;
+constexpr int64_t kEnoughThreads = 16384;  // tiny bodies of all scenes that fill the device with a thread each
 constexpr int kThreads = 256, kWarps = kThreads / 32;
 constexpr int kMostSums = 1 + 6 + rigid::kSix;  // numbers that a team adds up at once
 constexpr int64_t kEnoughBlocks = 48;           // large bodies of all scenes that fill the device with a block each
@@ -46,27 +47,33 @@ __device__ __forceinline__ double own_least(int32_t first, int32_t count, int32_
   return out;
 }
 
+// `width` lanes of a warp.
+template <int width>
 struct Tile {
   int lane;
   unsigned mask;
-  __device__ Tile() : lane(threadIdx.x % kTile), mask(((1u << kTile) - 1) << (threadIdx.x % 32 / kTile * kTile)) {}
+  __device__ Tile()
+      : lane(threadIdx.x % width), mask(width == 1 ? 0 : ((1u << width) - 1) << (threadIdx.x % 32 / width * width)) {}
   __device__ bool leads() const { return lane == 0; }
   template <int n, class F>
   __device__ void sum(int32_t count, double* out, const F& f) const {
-    own_sum<n>(lane, count, kTile, out, f);
-    __syncwarp(mask);
-    butterfly<n, kTile>(mask, out);
+    own_sum<n>(lane, count, width, out, f);
+    meet();
+    if constexpr (width > 1) butterfly<n, width>(mask, out);
   }
   template <class F>
   __device__ double least(int32_t count, const F& f) const {
-    const double own = own_least(lane, count, kTile, f);
-    __syncwarp(mask);
-    return butterfly_least<kTile>(mask, own);
+    const double own = own_least(lane, count, width, f);
+    meet();
+    if constexpr (width > 1) return butterfly_least<width>(mask, own);
+    return own;
   }
-  __device__ void meet() const { __syncwarp(mask); }
+  __device__ void meet() const {
+    if constexpr (width > 1) __syncwarp(mask);
+  }
   template <class F>
   __device__ void each(int32_t count, const F& f) const {
-    for (int32_t i = lane; i < count; i += kTile) f(i);
+    for (int32_t i = lane; i < count; i += width) f(i);
   }
 };
 
@@ -161,14 +168,28 @@ struct alignas(8) RecordBytes {
   __device__ rigid::Iteration* get() { return reinterpret_cast<rigid::Iteration*>(bytes); }
 };
 
-template <class T, class Act>
+template <int width, class T, class Act>
 __global__ void __launch_bounds__(kTileThreads)
-    small_bodies(const __grid_constant__ rigid::Inputs<T> in, const __grid_constant__ Act act, int32_t bodies) {
-  __shared__ RecordBytes records[Act::keeps_record ? kTiles : 1];
-  const int64_t item = static_cast<int64_t>(blockIdx.x) * kTiles + threadIdx.x / kTile;
+    small_bodies(const __grid_constant__ rigid::Inputs<T> in, const __grid_constant__ Act act, int32_t first,
+                 int32_t bodies) {
+  constexpr int tiles = kTileThreads / width;
+  const int64_t item = static_cast<int64_t>(blockIdx.x) * tiles + threadIdx.x / width;
   if (item >= in.scenes * bodies) return;
-  const rigid::Body<T> body{in, item / bodies, static_cast<int32_t>(item % bodies)};
-  act(body, Tile(), records[Act::keeps_record ? threadIdx.x / kTile : 0].get());
+  const rigid::Body<T> body{in, item / bodies, static_cast<int32_t>(first + item % bodies)};
+  if constexpr (width == 1) {  // a record for each thread would not fit
+    RecordBytes record;
+    act(body, Tile<width>(), record.get());
+  } else {
+    __shared__ RecordBytes records[Act::keeps_record ? tiles : 1];
+    act(body, Tile<width>(), records[Act::keeps_record ? threadIdx.x / width : 0].get());
+  }
+}
+template <int width, class T, class Act>
+void launch_small(const rigid::Inputs<T>& in, const Act& act, int32_t first, int32_t bodies, cudaStream_t stream) {
+  constexpr int tiles = kTileThreads / width;
+  const int64_t items = in.scenes * bodies;
+  small_bodies<width>
+      <<<static_cast<unsigned>((items + tiles - 1) / tiles), kTileThreads, 0, stream>>>(in, act, first, bodies);
 }
 
 template <class T, class Act>
@@ -229,18 +250,20 @@ template <class T, class Act>
 cudaError_t run_bodies(const rigid::Inputs<T>& in, BodyGroups groups, const Act& act, double* workspace,
                        cudaStream_t stream) {
   if (in.scenes == 0) return cudaSuccess;
-  if (groups.small > 0) {
-    const int64_t items = in.scenes * groups.small;
-    small_bodies<T>
-        <<<static_cast<unsigned>((items + kTiles - 1) / kTiles), kTileThreads, 0, stream>>>(in, act, groups.small);
+  if (in.scenes * groups.tiny >= kEnoughThreads) {
+    launch_small<1>(in, act, 0, groups.tiny, stream);
+  } else if (groups.tiny > 0) {
+    launch_small<kTile>(in, act, 0, groups.tiny, stream);
   }
+  const int32_t medium = groups.tiny + groups.small;
+  if (groups.small > 0) launch_small<kTile>(in, act, groups.tiny, groups.small, stream);
   if (by_block(groups, in.scenes)) groups.medium += groups.large, groups.large = 0;
   if (groups.medium > 0) {
-    medium_bodies<T><<<static_cast<unsigned>(in.scenes * groups.medium), kThreads, 0, stream>>>(in, act, groups.small,
-                                                                                                groups.medium);
+    medium_bodies<T>
+        <<<static_cast<unsigned>(in.scenes * groups.medium), kThreads, 0, stream>>>(in, act, medium, groups.medium);
   }
   if (groups.large > 0) {
-    int32_t first = groups.small + groups.medium, bodies = groups.large;
+    int32_t first = medium + groups.medium, bodies = groups.large;
     void* arguments[] = {const_cast<rigid::Inputs<T>*>(&in), const_cast<Act*>(&act), &first, &bodies, &workspace};
     const auto kernel = reinterpret_cast<const void*>(&large_bodies<T, Act>);
     const auto error = cudaLaunchCooperativeKernel(kernel, multiprocessors(), kThreads, arguments, 0, stream);

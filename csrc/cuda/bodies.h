@@ -5,9 +5,10 @@
 
 namespace diffvbd::cuda {
 
-// How many of the bodies, smallest first, are worked on by a part of a warp, by a block, and by the whole device.
+// How many of the bodies, smallest first, are worked on by a thread (where there are many), by a part of a warp, by a
+// block, and by the whole device.
 struct BodyGroups {
-  int32_t small, medium, large;
+  int32_t tiny, small, medium, large;
 };
 
 // Doubles of memory that the sums of the whole device go through; 0 where no body needs it.

@@ -8,37 +8,70 @@
 namespace diffvbd::cuda {
 namespace {
 
+// What the threads of a warp do at one turn.
+struct Turn {
+  int64_t scene;
+  int sweep, block, part;
+};
+
+// Updates a warp's vertices; false, and nothing is done, where a usual set finds a block that it does not suit.
+template <class Set, class T, int lanes>
+__device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Turn& turn) {
+  const Place<lanes> at(turn.scene, turn.block, turn.part);
+  const int rank = __ldg(s.plan.block_rank + at.block) + at.v, end_rank = __ldg(s.plan.block_rank + at.block + 1);
+  if (rank - at.group >= end_rank) return true;  // the whole warp: phantoms alone
+  GroupStar<T, lanes> star(s, at, shared);
+  if constexpr (Set::elastic) star.fetch_neighbours(s.own);
+  const Block<T> b = load_block<Set>(s, at, s.own);
+  if constexpr (Set::usual && Set::filters) {
+    if (star.any(is_oblique<Set>(b, b.state.x))) return false;
+  }
+  const StepParameters<T> q = of_sweep(s.parameters, turn.sweep + 1 == s.sweeps);
+  const NewtonStep<T> newton = newton_step<Set>(b, star, q);
+  if constexpr (Set::usual) {
+    if (is_rare<Set>(b, star, newton.H)) return false;
+  }
+  const Update<T> u = safeguarded<Set>(b, newton.d_raw, q);
+  const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
+  if (at.lane == 0) store_row(s.w.x, at.scene * s.positions + position, moved<Set>(b.state.x, u));
+  if constexpr (Set::contact) {
+    if (at.lane == 0 && rank < end_rank && is_cut(b.state.x, relaxed(u.d_raw, q), b.contact.bound) > T(0)) {
+      s.cut[(s.base + at.scene) * s.plan.num_vertices + __ldg(s.plan.order + position)] = 1;
+    }
+  }
+  if (s.tape_policy != kNoTape && at.lane == 0 && rank < end_rank) {
+    const int rows = tape_rows(s.tape_policy, Set::keeps_positions);
+    T* to = s.tape + (at.scene * s.sweeps + turn.sweep) * rows * s.plan.num_active + rank;
+    const auto put = [&](const T& value) {
+      *to = value;
+      to += s.plan.num_active;
+    };
+    record<Set>(s.tape_policy == kFullTape, b, newton, put);
+  }
+  return true;
+}
+
+// Out of line, so that what few vertices need takes no registers from the others.
+template <class Set, class T, int lanes>
+__device__ __noinline__ void rare_update(const StepView<T>& s, T* shared, Turn turn) {
+  update<Set, T, lanes>(s, shared, turn);
+}
+
+// What the usual blocks take: the rare ones must do with as many.
+template <class T, class Set>
+constexpr int forward_registers() {
+  const int own = sizeof(T) == sizeof(double) ? 128 : 80;
+  return Set::contact ? own + 32 : Set::filters ? own + 16 : own;
+}
+
 template <class T, int mask, int lanes>
-__global__ void __launch_bounds__(kMaxThreads)
+__global__ void __maxnreg__((forward_registers<T, EnergySet<mask>>()))
     sweep_forward(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range) {
   using Set = EnergySet<mask>;
-  const int rows = tape_rows(s.tape_policy, Set::keeps_positions);
   T* const shared = memory_of_warp<T, lanes>(s, false);
   each_color<T, lanes>(s, range, false, [&](int64_t scene, int sweep, int block, int part) {
-    const Place<lanes> at(scene, block, part);
-    const int rank = __ldg(s.plan.block_rank + block) + at.v, end_rank = __ldg(s.plan.block_rank + block + 1);
-    if (rank - at.group >= end_rank) return;  // the whole warp: phantoms alone
-    GroupStar<T, lanes> star(s, at, shared);
-    if constexpr (Set::elastic) star.fetch_neighbours(s.own);
-    const Block<T> b = load_block<Set>(s, at, s.own);
-    const StepParameters<T> q = of_sweep(s.parameters, sweep + 1 == s.sweeps);
-    const NewtonStep<T> newton = newton_step<Set>(b, star, q);
-    const Update<T> u = safeguarded<Set>(b, newton.d_raw, q);
-    const int64_t position = static_cast<int64_t>(block) * kSlice + at.v;
-    if (at.lane == 0) store_row(s.w.x, scene * s.positions + position, moved<Set>(b.state.x, u));
-    if constexpr (Set::contact) {
-      if (at.lane == 0 && rank < end_rank && is_cut(b.state.x, relaxed(u.d_raw, q), b.contact.bound) > T(0)) {
-        s.cut[(s.base + scene) * s.plan.num_vertices + __ldg(s.plan.order + position)] = 1;
-      }
-    }
-    if (s.tape_policy != kNoTape && at.lane == 0 && rank < end_rank) {
-      T* to = s.tape + (scene * s.sweeps + sweep) * rows * s.plan.num_active + rank;
-      const auto put = [&](const T& value) {
-        *to = value;
-        to += s.plan.num_active;
-      };
-      record<Set>(s.tape_policy == kFullTape, b, newton, put);
-    }
+    const Turn turn{scene, sweep, block, part};
+    if (!update<Usual<Set>, T, lanes>(s, shared, turn)) rare_update<Set, T, lanes>(s, shared, turn);
     __syncwarp();
   });
 }

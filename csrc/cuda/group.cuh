@@ -13,22 +13,28 @@ struct alignas(16) Pack {
   T v[size];
 };
 
+// The vector type of a Pack, by whose name the loads go: a Pack that is one in disguise would live on the stack.
+template <class T>
+using Wide = std::conditional_t<sizeof(T) == sizeof(double), double2, float4>;
+__device__ __forceinline__ Pack<double> pack(const double2& a) { return {a.x, a.y}; }
+__device__ __forceinline__ Pack<float> pack(const float4& a) { return {a.x, a.y, a.z, a.w}; }
+
 // Values that other multiprocessors may write during the launch come from the L2 cache; a block that has its scene to
 // itself (`own`) can use the nearer one.
 template <class T>
 __device__ __forceinline__ Pack<T> load_state(const T* p, bool own) {
-  const float4* from = reinterpret_cast<const float4*>(p);
-  const float4 a = own ? *from : __ldcg(from);
-  return reinterpret_cast<const Pack<T>&>(a);
+  const auto* from = reinterpret_cast<const Wide<T>*>(p);
+  return own ? pack(*from) : pack(__ldcg(from));
 }
 template <class T>
 __device__ __forceinline__ Pack<T> load_constant(const T* p) {
-  const float4 a = __ldg(reinterpret_cast<const float4*>(p));
-  return reinterpret_cast<const Pack<T>&>(a);
+  return pack(__ldg(reinterpret_cast<const Wide<T>*>(p)));
 }
-template <class T>
-__device__ __forceinline__ void store(T* p, const Pack<T>& a) {
-  *reinterpret_cast<float4*>(p) = reinterpret_cast<const float4&>(a);
+__device__ __forceinline__ void store(double* p, const Pack<double>& a) {
+  *reinterpret_cast<double2*>(p) = {a.v[0], a.v[1]};
+}
+__device__ __forceinline__ void store(float* p, const Pack<float>& a) {
+  *reinterpret_cast<float4*>(p) = {a.v[0], a.v[1], a.v[2], a.v[3]};
 }
 
 // rows of x, y, z and one unused

@@ -10,69 +10,107 @@ namespace {
 
 constexpr int kReverseRegisters = 168;  // three warps of each scheduler fit
 
+// What the threads of a warp do at one turn, counted from the last sweep.
+struct Turn {
+  int64_t scene;
+  int number, block, part;
+};
+
+// Reverses the updates of a warp's vertices; false, and nothing is done, where a usual set finds a block that it does
+// not suit.
+template <class Set, int wanted, class T, int lanes>
+__device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, const Turn& turn) {
+  const int rows = tape_rows(s.tape_policy, Set::keeps_positions);
+  const Place<lanes> at(turn.scene, turn.block, turn.part);
+  const int64_t scene = at.scene, position = static_cast<int64_t>(at.block) * kSlice + at.v,
+                row = scene * s.positions + position;
+  // What the tape and the accumulators hold is asked for first: it comes from farthest away.
+  const int rank = __ldg(s.plan.block_rank + at.block) + at.v;
+  const int end_rank = __ldg(s.plan.block_rank + at.block + 1);
+  if (rank - at.group >= end_rank) return true;  // the whole warp: phantoms alone
+  const bool real = rank < end_rank, full = s.tape_policy == kFullTape;
+  const T* from =
+      s.tape + (scene * s.sweeps + (s.sweeps - 1 - turn.number)) * rows * s.plan.num_active + (real ? rank : 0);
+  const auto get = [&] {
+    const T value = __ldg(from);
+    from += s.plan.num_active;
+    return value;
+  };
+  Recalled<T> r = recall<Set, T>(full, get);
+  const Vec3<T> y_bar = load_own3(s.w.y_bar + scene * s.positions * 3, at.block, at.v);
+  GroupStar<T, lanes> star(s, at, shared);
+  star.repeats = !full;
+  Block<T> b = load_block<Set>(s, at, false);
+  if constexpr (Set::usual) {
+    if constexpr (Set::filters) {
+      if (star.any(is_oblique<Set>(b, r.x_old, s.w.data_bar != nullptr))) return false;
+    }
+    if (full) {
+      Block<T> before = b;
+      if constexpr (Set::keeps_positions) before.state.x = r.x_old;
+      if (is_rare<Set>(before, star, r.H)) return false;
+    }
+  }
+  if constexpr (Set::elastic) star.clear_sums(shared);
+  const Vec3<T> x_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
+  if constexpr (Set::elastic) star.fetch_neighbours(false);
+  const StepParameters<T> q = of_sweep(s.parameters, turn.number == 0);
+  const Update<T> u = replayed<Set>(b, star, r, full, q);
+  if constexpr (Set::usual) {
+    if (!full && is_rare<Set>(b, star, r.H)) return false;
+  }
+  star.repeats = false;
+  const bool writes = at.lane == 0 && real;
+  const BlockAdjoint<T> out =
+      reverse_vertex<Set, wanted>(b, star, u, r, x_bar, q, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
+        if (writes) s.w.data_bar[(scene * s.data_scalars + s.data_row[k] + i) * s.positions + position] += value;
+      });
+  if constexpr (Set::elastic) {
+    star.send_rows(__ldg(s.plan.color_block + s.plan.colors) * kSlice);
+    if constexpr ((wanted & kMaterial) != 0) {
+      if (s.one_material) {
+        star.total(star.material_bar[0], star.material_bar[1]);
+        T* m = s.w.material_bar + row * 2;
+        if (writes) m[0] += star.material_bar[0], m[1] += star.material_bar[1];
+      }
+    }
+  }
+  if (writes) {
+    store_row(s.w.x, row, b.state.x);
+    store_row(s.w.x_bar, row, out.x);
+    store3(s.w.y_bar + scene * s.positions * 3, at.block, at.v, y_bar + out.y);
+    if (s.w.mass_bar) s.w.mass_bar[row] += out.mass;
+    if constexpr (Set::reads_x_prev) {
+      T* to = s.w.x_prev_bar + scene * s.positions * 3;
+      store3(to, at.block, at.v, load_own3(to, at.block, at.v) + out.x_prev);
+    }
+    if constexpr (Set::contact) {
+      T* turned = s.w.turn + 6 * row;
+      turned[0] = out.p.x, turned[1] = out.p.y, turned[2] = out.p.z;
+      turned[3] = u.d_raw.x, turned[4] = u.d_raw.y, turned[5] = u.d_raw.z;
+      T* bound = s.w.bound_bar + 4 * row;
+      contact::add_at(bound, out.bound.center);
+      bound[3] += out.bound.radius;
+    }
+  }
+  return true;
+}
+
+// Out of line, so that what few vertices need takes no registers from the others.
+template <class Set, int wanted, class T, int lanes>
+__device__ __noinline__ void reverse_rare_update(const StepView<T>& s, T* shared, Turn turn) {
+  reverse_update<Set, wanted, T, lanes>(s, shared, turn);
+}
+
 template <class T, int mask, int wanted, int lanes>
 __global__ void __maxnreg__(kReverseRegisters)
     sweep_reverse(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range) {
   using Set = EnergySet<mask>;
-  const int rows = tape_rows(s.tape_policy, Set::keeps_positions);
   T* const shared = memory_of_warp<T, lanes>(s, true);
-  each_color<T, lanes>(s, range, true, [&](int64_t scene, int turn, int block, int part) {
-    const Place<lanes> at(scene, block, part);
-    const int64_t position = static_cast<int64_t>(block) * kSlice + at.v, row = scene * s.positions + position;
-    // What the tape and the accumulators hold is asked for first: it comes from farthest away.
-    const int rank = __ldg(s.plan.block_rank + block) + at.v;
-    const int end_rank = __ldg(s.plan.block_rank + block + 1);
-    if (rank - at.group >= end_rank) return;  // the whole warp: phantoms alone
-    const bool real = rank < end_rank, full = s.tape_policy == kFullTape;
-    const T* from = s.tape + (scene * s.sweeps + (s.sweeps - 1 - turn)) * rows * s.plan.num_active + (real ? rank : 0);
-    const auto get = [&] {
-      const T value = __ldg(from);
-      from += s.plan.num_active;
-      return value;
-    };
-    Recalled<T> r = recall<Set, T>(full, get);
-    const Vec3<T> y_bar = load_own3(s.w.y_bar + scene * s.positions * 3, block, at.v);
-    GroupStar<T, lanes> star(s, at, shared);
-    star.repeats = !full;
-    Block<T> b = load_block<Set>(s, at, false);
-    if constexpr (Set::elastic) star.clear_sums(shared);
-    const Vec3<T> x_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
-    if constexpr (Set::elastic) star.fetch_neighbours(false);
-    const StepParameters<T> q = of_sweep(s.parameters, turn == 0);
-    const Update<T> u = replayed<Set>(b, star, r, full, q);
-    star.repeats = false;
-    const bool writes = at.lane == 0 && real;
-    const BlockAdjoint<T> out = reverse_vertex<Set, wanted>(
-        b, star, u, r, x_bar, q, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
-          if (writes) s.w.data_bar[(scene * s.data_scalars + s.data_row[k] + i) * s.positions + position] += value;
-        });
-    if constexpr (Set::elastic) {
-      star.send_rows(__ldg(s.plan.color_block + s.plan.colors) * kSlice);
-      if constexpr ((wanted & kMaterial) != 0) {
-        if (s.one_material) {
-          star.total(star.material_bar[0], star.material_bar[1]);
-          T* m = s.w.material_bar + row * 2;
-          if (writes) m[0] += star.material_bar[0], m[1] += star.material_bar[1];
-        }
-      }
-    }
-    if (writes) {
-      store_row(s.w.x, row, b.state.x);
-      store_row(s.w.x_bar, row, out.x);
-      store3(s.w.y_bar + scene * s.positions * 3, block, at.v, y_bar + out.y);
-      if (s.w.mass_bar) s.w.mass_bar[row] += out.mass;
-      if constexpr (Set::reads_x_prev) {
-        T* to = s.w.x_prev_bar + scene * s.positions * 3;
-        store3(to, block, at.v, load_own3(to, block, at.v) + out.x_prev);
-      }
-      if constexpr (Set::contact) {
-        T* turn = s.w.turn + 6 * row;
-        turn[0] = out.p.x, turn[1] = out.p.y, turn[2] = out.p.z;
-        turn[3] = u.d_raw.x, turn[4] = u.d_raw.y, turn[5] = u.d_raw.z;
-        T* bound = s.w.bound_bar + 4 * row;
-        contact::add_at(bound, out.bound.center);
-        bound[3] += out.bound.radius;
-      }
+  each_color<T, lanes>(s, range, true, [&](int64_t scene, int number, int block, int part) {
+    const Turn turn{scene, number, block, part};
+    if (!reverse_update<Usual<Set>, wanted, T, lanes>(s, shared, turn)) {
+      reverse_rare_update<Set, wanted, T, lanes>(s, shared, turn);
     }
     __syncwarp();
   });

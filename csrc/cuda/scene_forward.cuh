@@ -6,6 +6,46 @@
 namespace diffvbd::cuda {
 namespace {
 
+// Updates the r-th vertex in sweep k; false, and nothing is done, where a usual set finds a block that it does not
+// suit.
+template <class Set, bool common, class T>
+__device__ __forceinline__ bool visit(const StepInputs<T>& in, const StepOutputs<T>& out, const GroupPlan& plan,
+                                      const Visits<T>& list, T* x, const T* y, int64_t scene, int k, int r) {
+  SceneStar<T, common> star(in, nullptr, plan, list, x, nullptr, scene);
+  const int vertex = star.go_to(r);
+  int64_t start[kVertexEnergies];
+  data_starts(in, plan, start);
+  const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
+  const Block<T> b = load_scene_block<Set>(in, plan, start, scene, vertex, x, y);
+  if constexpr (Set::usual && Set::filters) {
+    if (is_oblique<Set>(b, b.state.x)) return false;
+  }
+  const NewtonStep<T> newton = newton_step<Set>(b, star, q);
+  if constexpr (Set::usual) {
+    if (is_rare<Set>(b, star, newton.H)) return false;
+  }
+  const Update<T> u = safeguarded<Set>(b, newton.d_raw, q);
+  set_column3(x, vertex, moved<Set>(b.state.x, u));
+  if (in.tape_policy == kNoTape) return true;
+  const int rows = tape_rows(in.tape_policy, Set::keeps_positions);
+  T* to = out.tape + ((static_cast<int64_t>(k) * rows) * plan.num_active + r) * in.scenes + scene;
+  const auto put = [&](const T& value) {
+    *to = value;
+    to += plan.num_active * in.scenes;
+  };
+  record<Set>(in.tape_policy == kFullTape, b, newton, put);
+  return true;
+}
+
+// The visits from the r-th of sweep k on. Out of line, so that what few scenes need takes no registers from the others.
+template <class Set, bool common, class T>
+__device__ __noinline__ void rare_visits(const StepInputs<T>& in, const StepOutputs<T>& out, const GroupPlan& plan,
+                                         Visits<T> list, T* x, const T* y, int64_t scene, int k, int r) {
+  for (; k < in.sweeps; ++k, r = 0) {
+    for (; r < plan.num_active; ++r) visit<Set, common>(in, out, plan, list, x, y, scene, k, r);
+  }
+}
+
 template <class T, int mask, bool common>
 __global__ void __launch_bounds__(kMaxSceneThreads, 4)
     scene_forward(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepOutputs<T> out,
@@ -13,37 +53,21 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
   using Set = EnergySet<mask>;
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
-  const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice,
-            rows = tape_rows(in.tape_policy, Set::keeps_positions);
+  const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice;
   T *const x_tile = tiles_of_warp<T>(plan, memory, 2), *const y_tile = x_tile + size * kColumn;
   T *const x = x_tile + lane, *const y = y_tile + lane;
-  int64_t start[kVertexEnergies];
-  data_starts(in, plan, start);
   const int64_t stride = static_cast<int64_t>(gridDim.x) * blockDim.x;
   for (int64_t base = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x / kSlice * kSlice; base < in.scenes;
        base += stride) {
     load_start(in, plan, list, base, x_tile, y_tile);
     __syncwarp();
     const int64_t scene = base + lane;
-    if (scene < in.scenes) {
-      SceneStar<T, common> star(in, nullptr, plan, list, x, nullptr, scene);
-      for (int k = 0; k < in.sweeps; ++k) {
-        const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
-        for (int r = 0; r < plan.num_active; ++r) {
-          const int vertex = star.go_to(r);
-          const Block<T> b = load_scene_block<Set>(in, plan, start, scene, vertex, x, y);
-          const NewtonStep<T> newton = newton_step<Set>(b, star, q);
-          const Update<T> u = safeguarded<Set>(b, newton.d_raw, q);
-          set_column3(x, vertex, moved<Set>(b.state.x, u));
-          if (in.tape_policy == kNoTape) continue;
-          T* to = out.tape + ((static_cast<int64_t>(k) * rows) * plan.num_active + r) * in.scenes + scene;
-          const auto put = [&](const T& value) {
-            *to = value;
-            to += plan.num_active * in.scenes;
-          };
-          record<Set>(in.tape_policy == kFullTape, b, newton, put);
-        }
+    if (scene < in.scenes && plan.num_active > 0) {
+      int k = 0, r = 0;
+      while (k < in.sweeps && visit<Usual<Set>, common>(in, out, plan, list, x, y, scene, k, r)) {
+        if (++r == plan.num_active) r = 0, ++k;
       }
+      if (k < in.sweeps) rare_visits<Set, common>(in, out, plan, list, x, y, scene, k, r);
     }
     __syncwarp();
     const T rate = T(1) / in.parameters.time_step;

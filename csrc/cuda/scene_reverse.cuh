@@ -12,6 +12,114 @@ DIFFVBD_FN bool reads_y(const StepAdjoints<T>& out, int policy, bool filters) {
   return out.mass != nullptr || (filters && policy != kFullTape);
 }
 
+// Those of a thread's scene.
+template <class T>
+struct Columns {
+  T* x;
+  const T* y;
+  T *x_bar, *y_bar;
+};
+
+// The reversed visits of a scene, counted down: the n-th is of rank (n - 1) % active in sweep (n - 1) / active.
+template <class Set, int wanted, bool common, class T>
+struct ReverseVisits {
+  const StepInputs<T>& in;
+  const T* tape;
+  const StepAdjoints<T>& out;
+  const GroupPlan& plan;
+  const Columns<T>& columns;
+  int64_t scene;
+  SceneStar<T, common> star;
+
+  __device__ __forceinline__ ReverseVisits(const StepInputs<T>& in, const T* tape, const StepAdjoints<T>& out,
+                                           const GroupPlan& plan, const Visits<T>& list, const Columns<T>& columns,
+                                           int64_t scene)
+      : in(in),
+        tape(tape),
+        out(out),
+        plan(plan),
+        columns(columns),
+        scene(scene),
+        star(in, &out, plan, list, columns.x, columns.x_bar, scene) {}
+
+  __device__ __forceinline__ Recalled<T> read(int k, int r) const {
+    const int rows = tape_rows(in.tape_policy, Set::keeps_positions);
+    const T* from = tape + ((static_cast<int64_t>(k) * rows) * plan.num_active + r) * in.scenes + scene;
+    const auto get = [&] {
+      const T value = __ldg(from);
+      from += plan.num_active * in.scenes;
+      return value;
+    };
+    return recall<Set, T>(in.tape_policy == kFullTape, get);
+  }
+
+  // Returns how many are left: a usual set stops before a block that it does not suit.
+  __device__ __forceinline__ int run(int left, const T& mu_bar, const T& lam_bar) {
+    star.mu_bar = mu_bar, star.lam_bar = lam_bar;
+    if (left > 0) {
+      int64_t start[kVertexEnergies];
+      data_starts(in, plan, start);
+      int k = (left - 1) / plan.num_active, r = (left - 1) % plan.num_active;
+      // what a visit reads of the tape is on its way during the visit before it
+      Recalled<T> next = read(k, r);
+      for (; left > 0; --left) {
+        const int rank = r;
+        const bool last = k + 1 == in.sweeps;
+        Recalled<T> now = next;
+        if (--r < 0) r = plan.num_active - 1, --k;
+        if (left > 1) next = read(k, r);
+        if (!visit(start, rank, last, now)) break;
+      }
+    }
+    if (left == 0 && out.mu && in.mu.item == 0 && in.lam.item == 0) {
+      out.mu[scene] = star.mu_bar;
+      out.lam[scene] = star.lam_bar;
+    }
+    return left;
+  }
+
+ private:
+  __device__ __forceinline__ bool visit(const int64_t* start, int rank, bool last, Recalled<T>& now) {
+    const bool full = in.tape_policy == kFullTape;
+    const int vertex = star.go_to(rank);
+    const StepParameters<T> q = of_sweep(in.parameters, last);
+    Block<T> b = load_scene_block<Set>(in, plan, start, scene, vertex, columns.x, columns.y);
+    if constexpr (Set::usual && Set::filters) {
+      if (is_oblique<Set>(b, now.x_old, out.data != nullptr)) return false;
+    }
+    const Update<T> u = replayed<Set>(b, star, now, full, q);
+    if constexpr (Set::usual) {
+      if (is_rare<Set>(b, star, now.H)) return false;
+    }
+    set_column3(columns.x, vertex, b.state.x);
+    const BlockAdjoint<T> bar = reverse_vertex<Set, wanted>(
+        b, star, u, now, column3(columns.x_bar, vertex), q, out.data != nullptr, [&](int e, int i, const T& value) {
+          const bool own = is_per_vertex(e, VertexEnergies{});
+          const int64_t place = start[e] + (own ? static_cast<int64_t>(vertex) * in.data_count[e] : 0) + i;
+          out.data[scene * in.data_size + place] += value;
+        });
+    set_column3(columns.x_bar, vertex, bar.x);
+    set_column3(columns.y_bar, vertex, column3(columns.y_bar, vertex) + bar.y);
+    if (out.mass) out.mass[scene * plan.num_vertices + vertex] += bar.mass;
+    if constexpr (Set::reads_x_prev) {
+      T* to = out.x_prev + (scene * plan.num_vertices + vertex) * 3;
+      to[0] += bar.x_prev.x;
+      to[1] += bar.x_prev.y;
+      to[2] += bar.x_prev.z;
+    }
+    return true;
+  }
+};
+
+// Out of line, so that what few scenes need takes no registers from the others.
+template <class Set, int wanted, bool common, class T>
+__device__ __noinline__ void rare_visits(const StepInputs<T>& in, const T* tape, const StepAdjoints<T>& out,
+                                         const GroupPlan& plan, Visits<T> list, Columns<T> columns, int64_t scene,
+                                         int left, T mu_bar, T lam_bar) {
+  ReverseVisits<Set, wanted, common, T> visits(in, tape, out, plan, list, columns, scene);
+  visits.run(left, mu_bar, lam_bar);
+}
+
 template <class T, int mask, int wanted, bool common>
 __global__ void __launch_bounds__(kMaxSceneThreads, 3)
     scene_reverse(const __grid_constant__ StepInputs<T> in, const T* ends, const T* tape,
@@ -19,16 +127,13 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
   using Set = EnergySet<mask>;
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
-  const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice,
-            rows = tape_rows(in.tape_policy, Set::keeps_positions);
-  const bool needs_y = reads_y(out, in.tape_policy, Set::filters), full = in.tape_policy == kFullTape;
+  const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice;
+  const bool needs_y = reads_y(out, in.tape_policy, Set::filters);
   T* const x_tile = tiles_of_warp<T>(plan, memory, needs_y ? 4 : 3);
   T *const bar_tile = x_tile + size * kColumn, *const y_bar_tile = bar_tile + size * kColumn;
   T* const y_tile = needs_y ? y_bar_tile + size * kColumn : nullptr;
   T *const x = x_tile + lane, *const x_bar = bar_tile + lane, *const y_bar = y_bar_tile + lane;
   const T* const y = needs_y ? y_tile + lane : nullptr;
-  int64_t start[kVertexEnergies];
-  data_starts(in, plan, start);
   const T h = in.parameters.time_step, rate = T(1) / h;
   const int64_t stride = static_cast<int64_t>(gridDim.x) * blockDim.x;
   for (int64_t base = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x / kSlice * kSlice; base < in.scenes;
@@ -49,48 +154,12 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
     __syncwarp();
     const int64_t scene = base + lane;
     if (scene < in.scenes) {
-      SceneStar<T, common> star(in, &out, plan, list, x, x_bar, scene);
-      // what a visit reads of the tape is on its way during the visit before it
-      const auto read = [&](int k, int r) {
-        const T* from = tape + ((static_cast<int64_t>(k) * rows) * plan.num_active + r) * in.scenes + scene;
-        const auto get = [&] {
-          const T value = __ldg(from);
-          from += plan.num_active * in.scenes;
-          return value;
-        };
-        return recall<Set, T>(full, get);
-      };
-      Recalled<T> next{};
-      if (in.sweeps > 0 && plan.num_active > 0) next = read(in.sweeps - 1, plan.num_active - 1);
-      for (int k = in.sweeps - 1; k >= 0; --k) {
-        const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
-        for (int r = plan.num_active - 1; r >= 0; --r) {
-          const int vertex = star.go_to(r);
-          Recalled<T> now = next;
-          if (r > 0 || k > 0) next = read(r > 0 ? k : k - 1, r > 0 ? r - 1 : plan.num_active - 1);
-          Block<T> b = load_scene_block<Set>(in, plan, start, scene, vertex, x, y);
-          const Update<T> u = replayed<Set>(b, star, now, full, q);
-          set_column3(x, vertex, b.state.x);
-          const BlockAdjoint<T> bar = reverse_vertex<Set, wanted>(
-              b, star, u, now, column3(x_bar, vertex), q, out.data != nullptr, [&](int e, int i, const T& value) {
-                const bool own = is_per_vertex(e, VertexEnergies{});
-                const int64_t place = start[e] + (own ? static_cast<int64_t>(vertex) * in.data_count[e] : 0) + i;
-                out.data[scene * in.data_size + place] += value;
-              });
-          set_column3(x_bar, vertex, bar.x);
-          set_column3(y_bar, vertex, column3(y_bar, vertex) + bar.y);
-          if (out.mass) out.mass[scene * plan.num_vertices + vertex] += bar.mass;
-          if constexpr (Set::reads_x_prev) {
-            T* to = out.x_prev + scene * size + 3 * vertex;
-            to[0] += bar.x_prev.x;
-            to[1] += bar.x_prev.y;
-            to[2] += bar.x_prev.z;
-          }
-        }
-      }
-      if (out.mu && in.mu.item == 0 && in.lam.item == 0) {
-        out.mu[scene] = star.mu_bar;
-        out.lam[scene] = star.lam_bar;
+      const Columns<T> columns{x, y, x_bar, y_bar};
+      ReverseVisits<Usual<Set>, wanted, common, T> usual(in, tape, out, plan, list, columns, scene);
+      const int left = usual.run(in.sweeps * plan.num_active, T(0), T(0));
+      if (left > 0) {
+        rare_visits<Set, wanted, common>(in, tape, out, plan, list, columns, scene, left, usual.star.mu_bar,
+                                         usual.star.lam_bar);
       }
     }
     __syncwarp();

@@ -78,6 +78,7 @@ constexpr bool any_x_prev(int mask, EnergyList<E...>) {
 
 template <int mask>
 struct EnergySet {
+  static constexpr bool usual = false;
   static constexpr bool contact = (mask & kContact) != 0;
   static constexpr bool of_vertices = (mask >> kFirstVertexBit) != 0;
   static constexpr bool elastic = (mask & (kExactBlock | kPaperBlock)) != 0;
@@ -100,6 +101,13 @@ struct EnergySet {
     if constexpr ((mask >> (kFirstVertexBit + k)) & 1) f(E{}, k);
     visit<k + 1>(f, EnergyList<Rest...>{});
   }
+};
+
+// The same energies for blocks that need neither axes along planes nor a refined solve (core/frame.h, core/uneven.h):
+// nearly all of them. CUDA does these first, with fewer registers, and the others once more by themselves.
+template <class Set>
+struct Usual : Set {
+  static constexpr bool usual = true;
 };
 
 template <class E, class = void>

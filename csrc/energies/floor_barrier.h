@@ -43,15 +43,42 @@ struct FloorBarrier {
     }
   };
 
-  // The axes of the two nearest planes within dhat, the nearest, and so the stiffest, first.
-  template <class T, class R>
-  DIFFVBD_FN static Frame<R> frame(const VertexState<R>& s, const R* data, int count) {
-    bool near = false;
+  // Whether a plane within its dhat lies along no axis of the mesh, so that a block needs axes of its own.
+  template <class R>
+  DIFFVBD_FN static bool is_oblique(const VertexState<R>& s, const R* data, int count) {
+    bool out = false;
     for (int k = 0; k < count; k += stride) {
       const Plane<R> plane(data + k, s);
-      near = near || any(plane.gap(s.x) < plane.dhat);
+      const Vec3<R>& n = plane.n;
+      const R slant = absolute(n.x * n.y) + absolute(n.y * n.z) + absolute(n.z * n.x);
+      out = out || any(R(0) < select(plane.gap(s.x) < plane.dhat, slant, R(0)));
     }
-    if (!near) return Frame<R>::none();
+    return out;
+  }
+  // 0 for a component on which such a plane stands alone, else 1.
+  template <class R>
+  DIFFVBD_FN static void leave_out(const VertexState<R>& s, const R* data, int count, R& first, R& second) {
+    for (int k = 0; k < count; k += stride) {
+      const Plane<R> plane(data + k, s);
+      const auto near = plane.gap(s.x) < plane.dhat;
+      first = select(near, first - plane.n.x * plane.n.x, first);
+      second = select(near, second - plane.n.y * plane.n.y, second);
+    }
+  }
+  template <class R>
+  DIFFVBD_FN static bool is_near(const VertexState<R>& s, const R* data, int count) {
+    bool out = false;
+    for (int k = 0; k < count; k += stride) {
+      const Plane<R> plane(data + k, s);
+      out = out || any(plane.gap(s.x) < plane.dhat);
+    }
+    return out;
+  }
+
+  // Where one is oblique, the axes of the two nearest planes within dhat, the nearest, and so the stiffest, first.
+  template <class T, class R>
+  DIFFVBD_FN static Frame<R> frame(const VertexState<R>& s, const R* data, int count) {
+    if (!is_oblique(s, data, count)) return Frame<R>::none();
     const R far = R(std::numeric_limits<T>::max());
     R d1 = far, d2 = far;
     Vec3<R> n1 = zero3<R>(), n2 = zero3<R>();
