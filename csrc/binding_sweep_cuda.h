@@ -72,7 +72,7 @@ inline Choice choose(const Tensor& x, const std::vector<int64_t>& launch, bool r
 template <class T>
 Tensor workspace(const Tensor& x, const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints,
                  Choice& choice) {
-  if (choice.regime == kThread) return empty(x, {0});
+  if (choice.regime == kThread) return empty(x, {in.scenes}, ScalarType::Byte);  // which scenes are rare
   choice.chunk = 1;
   const int64_t one = static_cast<int64_t>(workspace_bytes(host, in, adjoints, choice));
   const int64_t wave = choice.multiprocessors;

@@ -26,7 +26,7 @@ __global__ void __launch_bounds__(kVertexThreads)
 // What a kernel does to a body.
 template <class T>
 struct Choose {
-  static constexpr bool keeps_record = false;
+  static constexpr bool keeps_record = false, computes = false;
   start::Candidates<T> two;
   uint8_t* falls;
   template <class Team>
@@ -37,7 +37,7 @@ struct Choose {
 };
 template <class T, bool energies>
 struct Begin {
-  static constexpr bool keeps_record = false;
+  static constexpr bool keeps_record = false, computes = energies;
   start::Inputs<T> in;
   T *x_start, *y;
   template <class Team>
@@ -47,7 +47,7 @@ struct Begin {
 };
 template <class T, bool energies>
 struct ReverseBegin {
-  static constexpr bool keeps_record = energies;
+  static constexpr bool keeps_record = energies, computes = energies;
   start::Inputs<T> in;
   start::Adjoints<T> a;
   T *coasted, *y;

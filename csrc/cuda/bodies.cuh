@@ -250,7 +250,8 @@ template <class T, class Act>
 cudaError_t run_bodies(const rigid::Inputs<T>& in, BodyGroups groups, const Act& act, double* workspace,
                        cudaStream_t stream) {
   if (in.scenes == 0) return cudaSuccess;
-  if (in.scenes * groups.tiny >= kEnoughThreads) {
+  // work that is not memory's alone
+  if (Act::computes && in.scenes * groups.tiny >= kEnoughThreads) {
     launch_small<1>(in, act, 0, groups.tiny, stream);
   } else if (groups.tiny > 0) {
     launch_small<kTile>(in, act, 0, groups.tiny, stream);

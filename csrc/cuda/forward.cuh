@@ -60,8 +60,8 @@ __device__ __noinline__ void rare_update(const StepView<T>& s, T* shared, Turn t
 // What the usual blocks take: the rare ones must do with as many.
 template <class T, class Set>
 constexpr int forward_registers() {
-  const int own = sizeof(T) == sizeof(double) ? 128 : 80;
-  return Set::contact ? own + 32 : Set::filters ? own + 16 : own;
+  if (sizeof(T) == sizeof(float)) return Set::contact ? 96 : 80;
+  return Set::contact ? 160 : Set::filters ? 144 : 128;
 }
 
 template <class T, int mask, int lanes>

@@ -8,7 +8,11 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int kReverseRegisters = 168;  // three warps of each scheduler fit
+// Three warps of each scheduler fit; in float32, without gaps, four.
+template <class T, class Set>
+constexpr int reverse_registers() {
+  return sizeof(T) == sizeof(float) && !Set::keeps_positions ? 128 : 168;
+}
 
 // What the threads of a warp do at one turn, counted from the last sweep.
 struct Turn {
@@ -103,7 +107,7 @@ __device__ __noinline__ void reverse_rare_update(const StepView<T>& s, T* shared
 }
 
 template <class T, int mask, int wanted, int lanes>
-__global__ void __maxnreg__(kReverseRegisters)
+__global__ void __maxnreg__((reverse_registers<T, EnergySet<mask>>()))
     sweep_reverse(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range) {
   using Set = EnergySet<mask>;
   T* const shared = memory_of_warp<T, lanes>(s, true);

@@ -7,7 +7,7 @@ namespace {
 // What a kernel does to a body: the correction, or its transpose.
 template <class T, bool energies>
 struct Forward {
-  static constexpr bool keeps_record = false;
+  static constexpr bool keeps_record = false, computes = energies;
   T *x, *velocity;
   template <class Team>
   __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration*) const {
@@ -16,7 +16,7 @@ struct Forward {
 };
 template <class T, bool energies>
 struct Reverse {
-  static constexpr bool keeps_record = energies;
+  static constexpr bool keeps_record = energies, computes = energies;
   rigid::Adjoints<T> a;
   template <class Team>
   __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration* record) const {

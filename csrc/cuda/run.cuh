@@ -276,7 +276,8 @@ template <class T>
 cudaError_t run_forward(const HostPlan& host, const StepInputs<T>& in, const StepOutputs<T>& out, const Choice& choice,
                         void* workspace, cudaStream_t stream) {
   if (in.scenes == 0 || host.plan.num_vertices == 0) return cudaSuccess;
-  if (choice.regime == kThread) return run_scene_forward(host, in, out, choice, stream);
+  if (choice.regime == kThread)
+    return run_scene_forward(host, in, out, choice, static_cast<uint8_t*>(workspace), stream);
   Runner<T> run(host, in, nullptr, choice, workspace, stream);
   run.s.cut = out.cut;
   const int lanes = possible_lanes<T>(host, choice, false);
@@ -294,7 +295,9 @@ template <class T>
 cudaError_t run_reverse(const HostPlan& host, const StepInputs<T>& in, const T* ends, const T* tape,
                         const StepAdjoints<T>& out, const Choice& choice, void* workspace, cudaStream_t stream) {
   if (in.scenes == 0 || host.plan.num_vertices == 0) return cudaSuccess;
-  if (choice.regime == kThread) return run_scene_reverse(host, in, ends, tape, out, choice, stream);
+  if (choice.regime == kThread) {
+    return run_scene_reverse(host, in, ends, tape, out, choice, static_cast<uint8_t*>(workspace), stream);
+  }
   Runner<T> run(host, in, &out, choice, workspace, stream);
   const int lanes = possible_lanes<T>(host, choice, true);
   for (int64_t base = 0; base < in.scenes; base += choice.chunk) {

@@ -14,6 +14,30 @@ namespace {
 constexpr int kMaxSceneThreads = 128;
 constexpr int kColumn = kSlice + 1;  // distance of a column's entries: one more than a warp, against bank conflicts
 
+// Two kernels do a step: one of usual sets for all scenes, and one for those that it has marked.
+template <int mask>
+struct UsualVariant {
+  using Set = Usual<EnergySet<mask>>;
+};
+template <int mask>
+struct RareVariant {
+  using Set = EnergySet<mask>;
+};
+constexpr bool may_be_rare(int mask) {
+  return (mask & (kExactBlock | kPaperBlock)) != 0 || any_filter(mask, VertexEnergies{});
+}
+template <class Set>
+constexpr bool marks() {
+  return Set::usual && (Set::elastic || Set::filters);
+}
+// A bit for each thread of the warp: whether it has its scene to do.
+template <class Set>
+__device__ __forceinline__ unsigned scenes_to_do(const uint8_t* rare, int64_t scene, int64_t scenes) {
+  bool mine = scene < scenes;
+  if constexpr (!Set::usual) mine = mine && rare[scene] != 0;
+  return __ballot_sync(kWholeWarp, mine);
+}
+
 // What the threads of a block share: the list of visits, and the rest scalars unless scenes have their own.
 template <class T>
 struct Visits {

@@ -37,20 +37,11 @@ __device__ __forceinline__ bool visit(const StepInputs<T>& in, const StepOutputs
   return true;
 }
 
-// The visits from the r-th of sweep k on. Out of line, so that what few scenes need takes no registers from the others.
-template <class Set, bool common, class T>
-__device__ __noinline__ void rare_visits(const StepInputs<T>& in, const StepOutputs<T>& out, const GroupPlan& plan,
-                                         Visits<T> list, T* x, const T* y, int64_t scene, int k, int r) {
-  for (; k < in.sweeps; ++k, r = 0) {
-    for (; r < plan.num_active; ++r) visit<Set, common>(in, out, plan, list, x, y, scene, k, r);
-  }
-}
-
-template <class T, int mask, bool common>
+// With a usual set: marks the scenes that it does not suit. With the others: does those again.
+template <class T, class Set, bool common>
 __global__ void __launch_bounds__(kMaxSceneThreads, 4)
     scene_forward(const __grid_constant__ StepInputs<T> in, const __grid_constant__ StepOutputs<T> out,
-                  const __grid_constant__ GroupPlan plan) {
-  using Set = EnergySet<mask>;
+                  const __grid_constant__ GroupPlan plan, uint8_t* rare) {
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
   const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice;
@@ -59,21 +50,25 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
   const int64_t stride = static_cast<int64_t>(gridDim.x) * blockDim.x;
   for (int64_t base = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x / kSlice * kSlice; base < in.scenes;
        base += stride) {
+    const int64_t scene = base + lane;
+    const unsigned mine = scenes_to_do<Set>(rare, scene, in.scenes);
+    if (mine == 0) continue;
     load_start(in, plan, list, base, x_tile, y_tile);
     __syncwarp();
-    const int64_t scene = base + lane;
-    if (scene < in.scenes && plan.num_active > 0) {
+    if (mine >> lane & 1) {
       int k = 0, r = 0;
-      while (k < in.sweeps && visit<Usual<Set>, common>(in, out, plan, list, x, y, scene, k, r)) {
+      if (plan.num_active == 0) k = in.sweeps;
+      while (k < in.sweeps && visit<Set, common>(in, out, plan, list, x, y, scene, k, r)) {
         if (++r == plan.num_active) r = 0, ++k;
       }
-      if (k < in.sweeps) rare_visits<Set, common>(in, out, plan, list, x, y, scene, k, r);
+      if (marks<Set>()) rare[scene] = k < in.sweeps;
     }
     __syncwarp();
     const T rate = T(1) / in.parameters.time_step;
     each_element(
         base, in.scenes, size, [&](int64_t from) { return out.v ? __ldg(in.x_prev.data + from) : T(0); },
         [&](int64_t to, int from, const T& before) {
+          if (!(mine >> from % kColumn & 1)) return;
           out.x[to] = x_tile[from];
           if (out.v) out.v[to] = rate * (x_tile[from] - before);
         });
@@ -82,11 +77,12 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
 }
 
 template <class T>
-using SceneForward = void (*)(StepInputs<T>, StepOutputs<T>, GroupPlan);
+using SceneForward = void (*)(StepInputs<T>, StepOutputs<T>, GroupPlan, uint8_t*);
 
-template <class T, bool common, int... n>
+template <class T, bool common, template <int> class Variant, int... n>
 SceneForward<T> pick_scene_forward(int index, std::integer_sequence<int, n...>) {
-  static constexpr SceneForward<T> table[kFreeSets] = {scene_forward<T, free_mask(n), common>...};
+  static constexpr SceneForward<T> table[kFreeSets] = {
+      scene_forward<T, typename Variant<free_mask(n)>::Set, common>...};
   return table[index];
 }
 
@@ -94,21 +90,25 @@ SceneForward<T> pick_scene_forward(int index, std::integer_sequence<int, n...>) 
 
 template <class T>
 cudaError_t run_scene_forward(const HostPlan& host, const StepInputs<T>& in, const StepOutputs<T>& out,
-                              const Choice& choice, cudaStream_t stream) {
+                              const Choice& choice, uint8_t* rare, cudaStream_t stream) {
   if (host.plan.num_vertices > kSmallMesh) return cudaErrorInvalidConfiguration;
   constexpr auto sets = std::make_integer_sequence<int, kFreeSets>{};
   const int index = free_index(in.energies);
-  const auto kernel =
-      is_common(in) ? pick_scene_forward<T, true>(index, sets) : pick_scene_forward<T, false>(index, sets);
   StepInputs<T> inputs = in;
   StepOutputs<T> outputs = out;
   GroupPlan plan = host.plan;
-  void* arguments[] = {&inputs, &outputs, &plan};
-  return launch_scenes(kernel, arguments, in, plan, 2, choice, stream);
+  void* arguments[] = {&inputs, &outputs, &plan, &rare};
+  const auto usual = is_common(in) ? pick_scene_forward<T, true, UsualVariant>(index, sets)
+                                   : pick_scene_forward<T, false, UsualVariant>(index, sets);
+  const auto error = launch_scenes(usual, arguments, in, plan, 2, choice, stream);
+  if (error != cudaSuccess || !may_be_rare(in.energies)) return error;
+  const auto again = is_common(in) ? pick_scene_forward<T, true, RareVariant>(index, sets)
+                                   : pick_scene_forward<T, false, RareVariant>(index, sets);
+  return launch_scenes(again, arguments, in, plan, 2, choice, stream);
 }
 
 }  // namespace diffvbd::cuda
 
-#define DIFFVBD_INSTANTIATE_SCENE_FORWARD(T)                                                      \
-  template cudaError_t diffvbd::cuda::run_scene_forward<T>(const HostPlan&, const StepInputs<T>&, \
-                                                           const StepOutputs<T>&, const Choice&, cudaStream_t);
+#define DIFFVBD_INSTANTIATE_SCENE_FORWARD(T)                \
+  template cudaError_t diffvbd::cuda::run_scene_forward<T>( \
+      const HostPlan&, const StepInputs<T>&, const StepOutputs<T>&, const Choice&, uint8_t*, cudaStream_t);

@@ -54,8 +54,7 @@ struct ReverseVisits {
   }
 
   // Returns how many are left: a usual set stops before a block that it does not suit.
-  __device__ __forceinline__ int run(int left, const T& mu_bar, const T& lam_bar) {
-    star.mu_bar = mu_bar, star.lam_bar = lam_bar;
+  __device__ __forceinline__ int run(int left) {
     if (left > 0) {
       int64_t start[kVertexEnergies];
       data_starts(in, plan, start);
@@ -111,20 +110,24 @@ struct ReverseVisits {
   }
 };
 
-// Out of line, so that what few scenes need takes no registers from the others.
-template <class Set, int wanted, bool common, class T>
-__device__ __noinline__ void rare_visits(const StepInputs<T>& in, const T* tape, const StepAdjoints<T>& out,
-                                         const GroupPlan& plan, Visits<T> list, Columns<T> columns, int64_t scene,
-                                         int left, T mu_bar, T lam_bar) {
-  ReverseVisits<Set, wanted, common, T> visits(in, tape, out, plan, list, columns, scene);
-  visits.run(left, mu_bar, lam_bar);
+// What a first attempt may have added to the adjoints of a scene.
+template <class T>
+__device__ void clear_scene(const StepInputs<T>& in, const StepAdjoints<T>& out, const GroupPlan& plan, int64_t scene) {
+  const auto clear = [&](T* p, int64_t count) {
+    for (int64_t i = 0; p != nullptr && i < count; ++i) p[scene * count + i] = T(0);
+  };
+  clear(out.mass, plan.num_vertices);
+  clear(out.x_prev, 3 * int64_t{plan.num_vertices});
+  if (in.mu.item != 0 || in.lam.item != 0) clear(out.mu, plan.num_tets), clear(out.lam, plan.num_tets);
+  clear(out.rest, int64_t{plan.num_tets} * kRestScalars);
+  clear(out.data, in.data_size);
 }
 
-template <class T, int mask, int wanted, bool common>
+// With a usual set: marks the scenes that it does not suit. With the others: does those again.
+template <class T, class Set, int wanted, bool common>
 __global__ void __launch_bounds__(kMaxSceneThreads, 3)
     scene_reverse(const __grid_constant__ StepInputs<T> in, const T* ends, const T* tape,
-                  const __grid_constant__ StepAdjoints<T> out, const __grid_constant__ GroupPlan plan) {
-  using Set = EnergySet<mask>;
+                  const __grid_constant__ StepAdjoints<T> out, const __grid_constant__ GroupPlan plan, uint8_t* rare) {
   extern __shared__ __align__(16) unsigned char memory[];
   const Visits<T> list(in, plan, memory);
   const int size = 3 * plan.num_vertices, lane = threadIdx.x % kSlice;
@@ -138,6 +141,9 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
   const int64_t stride = static_cast<int64_t>(gridDim.x) * blockDim.x;
   for (int64_t base = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x / kSlice * kSlice; base < in.scenes;
        base += stride) {
+    const int64_t scene = base + lane;
+    const unsigned mine = scenes_to_do<Set>(rare, scene, in.scenes);
+    if (mine == 0) continue;
     if (needs_y) load_start(in, plan, list, base, static_cast<T*>(nullptr), y_tile);
     each_element(
         base, in.scenes, size,
@@ -152,20 +158,18 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
           y_bar_tile[to] = T(0);
         });
     __syncwarp();
-    const int64_t scene = base + lane;
-    if (scene < in.scenes) {
+    if (mine >> lane & 1) {
+      if constexpr (!Set::usual) clear_scene(in, out, plan, scene);
       const Columns<T> columns{x, y, x_bar, y_bar};
-      ReverseVisits<Usual<Set>, wanted, common, T> usual(in, tape, out, plan, list, columns, scene);
-      const int left = usual.run(in.sweeps * plan.num_active, T(0), T(0));
-      if (left > 0) {
-        rare_visits<Set, wanted, common>(in, tape, out, plan, list, columns, scene, left, usual.star.mu_bar,
-                                         usual.star.lam_bar);
-      }
+      ReverseVisits<Set, wanted, common, T> visits(in, tape, out, plan, list, columns, scene);
+      const int left = visits.run(in.sweeps * plan.num_active);
+      if (marks<Set>()) rare[scene] = left > 0;
     }
     __syncwarp();
     each_element(
         base, in.scenes, size, [&](int64_t to) { return out.v_bar ? rate * __ldg(out.v_bar + to) : T(0); },
         [&](int64_t to, int from, const T& of_velocity) {
+          if (!(mine >> from % kColumn & 1)) return;
           const T begin = bar_tile[from], moved_y = y_bar_tile[from];
           if (!in.fused) {
             out.x_start[to] = begin;
@@ -184,31 +188,31 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
 }
 
 template <class T>
-using SceneReverse = void (*)(StepInputs<T>, const T*, const T*, StepAdjoints<T>, GroupPlan);
+using SceneReverse = void (*)(StepInputs<T>, const T*, const T*, StepAdjoints<T>, GroupPlan, uint8_t*);
 
 constexpr int useful(int mask, int wanted) { return (mask & 3) == 0 ? kState : wanted; }
 
-template <class T, int wanted, bool common, int... n>
+template <class T, template <int> class Variant, int wanted, bool common, int... n>
 SceneReverse<T> pick_scene_reverse(int index, std::integer_sequence<int, n...>) {
   static constexpr SceneReverse<T> table[kFreeSets] = {
-      scene_reverse<T, free_mask(n), useful(free_mask(n), wanted), common>...};
+      scene_reverse<T, typename Variant<free_mask(n)>::Set, useful(free_mask(n), wanted), common>...};
   return table[index];
 }
-template <class T, bool common>
+template <class T, template <int> class Variant, bool common>
 SceneReverse<T> pick_scene_reverse(int energies, int wanted) {
   constexpr auto sets = std::make_integer_sequence<int, kFreeSets>{};
   const int index = free_index(energies);
   // rest shapes that are differentiated are no common ones, or cost too much memory traffic for it to matter
-  if (wanted & kRest) return pick_scene_reverse<T, kMaterial | kRest, false>(index, sets);
-  if (wanted & kMaterial) return pick_scene_reverse<T, kMaterial, common>(index, sets);
-  return pick_scene_reverse<T, kState, common>(index, sets);
+  if (wanted & kRest) return pick_scene_reverse<T, Variant, kMaterial | kRest, false>(index, sets);
+  if (wanted & kMaterial) return pick_scene_reverse<T, Variant, kMaterial, common>(index, sets);
+  return pick_scene_reverse<T, Variant, kState, common>(index, sets);
 }
 
 }  // namespace
 
 template <class T>
 cudaError_t run_scene_reverse(const HostPlan& host, const StepInputs<T>& in, const T* ends, const T* tape,
-                              const StepAdjoints<T>& out, const Choice& choice, cudaStream_t stream) {
+                              const StepAdjoints<T>& out, const Choice& choice, uint8_t* rare, cudaStream_t stream) {
   const GroupPlan& plan = host.plan;
   if (plan.num_vertices > kSmallMesh) return cudaErrorInvalidConfiguration;
   const auto clear = [&](T* p, int64_t per_scene) {
@@ -221,18 +225,23 @@ cudaError_t run_scene_reverse(const HostPlan& host, const StepInputs<T>& in, con
   if (auto error = clear(per_tet ? out.lam : nullptr, plan.num_tets)) return error;
   if (auto error = clear(out.rest, int64_t{plan.num_tets} * kRestScalars)) return error;
   if (auto error = clear(out.data, in.data_size)) return error;
-  const auto kernel = is_common(in) ? pick_scene_reverse<T, true>(in.energies, choice.wanted)
-                                    : pick_scene_reverse<T, false>(in.energies, choice.wanted);
   const int tiles = reads_y(out, in.tape_policy, any_filter(in.energies, VertexEnergies{})) ? 4 : 3;
   StepInputs<T> inputs = in;
   StepAdjoints<T> adjoints = out;
   GroupPlan list = plan;
-  void* arguments[] = {&inputs, &ends, &tape, &adjoints, &list};
-  return launch_scenes(kernel, arguments, in, plan, tiles, choice, stream);
+  void* arguments[] = {&inputs, &ends, &tape, &adjoints, &list, &rare};
+  const auto usual = is_common(in) ? pick_scene_reverse<T, UsualVariant, true>(in.energies, choice.wanted)
+                                   : pick_scene_reverse<T, UsualVariant, false>(in.energies, choice.wanted);
+  const auto error = launch_scenes(usual, arguments, in, plan, tiles, choice, stream);
+  if (error != cudaSuccess || !may_be_rare(in.energies)) return error;
+  const auto again = is_common(in) ? pick_scene_reverse<T, RareVariant, true>(in.energies, choice.wanted)
+                                   : pick_scene_reverse<T, RareVariant, false>(in.energies, choice.wanted);
+  return launch_scenes(again, arguments, in, plan, tiles, choice, stream);
 }
 
 }  // namespace diffvbd::cuda
 
 #define DIFFVBD_INSTANTIATE_SCENE_REVERSE(T)                                                                          \
   template cudaError_t diffvbd::cuda::run_scene_reverse<T>(const HostPlan&, const StepInputs<T>&, const T*, const T*, \
-                                                           const StepAdjoints<T>&, const Choice&, cudaStream_t);
+                                                           const StepAdjoints<T>&, const Choice&, uint8_t*,           \
+                                                           cudaStream_t);
