@@ -1,4 +1,4 @@
-// The transposed sweeps. Instantiated in one file for each scalar, so that the build can run them side by side.
+// The transposed sweeps.
 #pragma once
 
 #include "sweep.h"
@@ -49,20 +49,22 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
 // Without tets there is nothing but the state to differentiate: one variant serves every wish.
 constexpr int useful(int mask, int wanted) { return (mask & 3) == 0 ? kState : wanted; }
 
-template <class T, int... n>
-ReverseKernel<T> pick(int index, int wanted, std::integer_sequence<int, n...>) {
-  static constexpr ReverseKernel<T> table[3][kEnergySets] = {
-      {reverse_color<T, energy_mask(n), kState>...},
-      {reverse_color<T, energy_mask(n), useful(energy_mask(n), kMaterial)>...},
-      {reverse_color<T, energy_mask(n), useful(energy_mask(n), kMaterial | kRest)>...}};
-  return table[(wanted & kRest) ? 2 : (wanted & kMaterial) ? 1 : 0][index];
+template <class T, int wanted, int... n>
+ReverseKernel<T> pick(int index, std::integer_sequence<int, n...>) {
+  static constexpr ReverseKernel<T> table[kEnergySets] = {
+      reverse_color<T, energy_mask(n), useful(energy_mask(n), wanted)>...};
+  return table[index];
 }
 
 }  // namespace
 
-template <class T>
-ReverseKernel<T> reverse_kernel(int energies, int wanted) {
-  return pick<T>(energy_index(energies), wanted, std::make_integer_sequence<int, kEnergySets>{});
+template <class T, int wanted>
+ReverseKernel<T> reverse_kernel_of(int energies) {
+  return pick<T, wanted>(energy_index(energies), std::make_integer_sequence<int, kEnergySets>{});
 }
 
 }  // namespace diffvbd
+
+#define DIFFVBD_INSTANTIATE_REVERSE(wanted)                                                  \
+  template diffvbd::ReverseKernel<double> diffvbd::reverse_kernel_of<double, (wanted)>(int); \
+  template diffvbd::ReverseKernel<float> diffvbd::reverse_kernel_of<float, (wanted)>(int);

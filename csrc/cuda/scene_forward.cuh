@@ -10,8 +10,7 @@ namespace {
 // suit.
 template <class Set, bool common, class T>
 __device__ __forceinline__ bool visit(const StepInputs<T>& in, const StepOutputs<T>& out, const GroupPlan& plan,
-                                      const Visits<T>& list, T* x, const T* y, int64_t scene, int k, int r) {
-  SceneStar<T, common> star(in, nullptr, plan, list, x, nullptr, scene);
+                                      SceneStar<T, common>& star, T* x, const T* y, int64_t scene, int k, int r) {
   const int vertex = star.go_to(r);
   int64_t start[kVertexEnergies];
   data_starts(in, plan, start);
@@ -56,12 +55,14 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 4)
     load_start(in, plan, list, base, x_tile, y_tile);
     __syncwarp();
     if (mine >> lane & 1) {
-      int k = 0, r = 0;
-      if (plan.num_active == 0) k = in.sweeps;
-      while (k < in.sweeps && visit<Set, common>(in, out, plan, list, x, y, scene, k, r)) {
-        if (++r == plan.num_active) r = 0, ++k;
+      SceneStar<T, common> star(in, nullptr, plan, list, x, nullptr, scene);
+      bool suits = true;
+      for (int k = 0; suits && k < in.sweeps; ++k) {
+        for (int r = 0; suits && r < plan.num_active; ++r) {
+          suits = visit<Set, common>(in, out, plan, star, x, y, scene, k, r);
+        }
       }
-      if (marks<Set>()) rare[scene] = k < in.sweeps;
+      if (marks<Set>()) rare[scene] = !suits;
     }
     __syncwarp();
     const T rate = T(1) / in.parameters.time_step;

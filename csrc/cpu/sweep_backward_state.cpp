@@ -1,0 +1,3 @@
+#include "sweep_backward.h"
+
+DIFFVBD_INSTANTIATE_REVERSE(diffvbd::kState)
