@@ -17,7 +17,6 @@ from torch import Tensor
 
 from .checks import check_number, check_positive, check_readable, fail, mask_or_indices, vertex_mask
 from .mask import EXACT_BLOCK, FIRST_VERTEX_BIT, PAPER_BLOCK
-from .safeguards import filter_against_planes
 
 MAX_PLANES = 8
 
@@ -202,11 +201,6 @@ class FloorBarrier(VertexEnergy):
             height = height - (normal[:, None] * origin[:, :, None]).sum(-1)
         gap = (normal[:, None] * x[:, :, None]).sum(-1) - height
         return -_barrier_slope(gap, kappa, dhat), normal
-
-    def filter(self, x: Tensor, step: Tensor, data: Tensor, origin: Tensor | None) -> Tensor:
-        """Where a step starts that wants to go from x by ``step``, see safeguards.filter_against_planes."""
-        planes = data.reshape(data.shape[0], self.planes, 7)
-        return filter_against_planes(x, step, planes[..., :3], planes[..., 3], planes[..., 5], origin)
 
 
 @dataclass(frozen=True, eq=False)

@@ -229,7 +229,7 @@ class _Floor:
 
     def started(self, x: Vector, move: Vector) -> Vector:
         """Where a step starts: the motion less what approaches a plane too closely, of at most two planes the one that
-        is exceeded most first (safeguards.filter_against_planes)."""
+        is exceeded most first (csrc/energies/floor_start.h)."""
         slack = Decimal(8 * 2.0**-52) * _root(_dot(move, move) + Decimal("1e-200"))
         limits = []
         for n, height in self.planes:

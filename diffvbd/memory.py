@@ -137,7 +137,9 @@ def predict(
         kept += (37 * model.num_tets + model.num_vertices) * item
 
     # what the transposed sweeps return, and what the correction before them has
-    outputs = (19 if model.corrects else 12) * model.num_vertices + model.num_tets * ((2 if material else 0) + (7 if rest else 0))
+    outputs = (19 if model.corrects else 12) * model.num_vertices + model.num_tets * (
+        (2 if material else 0) + (7 if rest else 0)
+    )
     if model.device.type == "cuda":
         scratch = _cuda_scratch(model, scenes, reverse=True, material=material, rest=rest) + outputs * scenes * item
     else:

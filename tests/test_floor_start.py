@@ -1,7 +1,7 @@
 """Claim: the start of a step approaches no plane within its dhat and leaves sliding alone, differentiated as executed.
 
-Three codes say where a start lies: torch in diffvbd/safeguards.py, the header that parts of a step with contact use,
-and the reference.
+Two codes say where a start lies, a header and the reference; the operators of a step's beginning and of the parts of a
+step with contact both use the header.
 """
 
 import itertools
@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
+from diffvbd.bodies import Bodies, OtherBodies
 from diffvbd.contact_start import _Start
 from diffvbd.reference.energies import FloorBarrier
-from diffvbd.safeguards import FILTER_ETA, filter_against_planes
+from diffvbd.safeguards import FILTER_ETA
+from diffvbd.start import begin
 from diffvbd.testing import generator, relative_error, tolerance
 
 PLANES = {
@@ -52,8 +54,27 @@ def leaves(given: dict[str, Tensor]) -> dict[str, Tensor]:
     return {k: v.clone().requires_grad_() for k, v in given.items()}
 
 
-def by_torch(a: dict[str, Tensor]) -> Tensor:
-    return filter_against_planes(a["x"], a["step"], a["normal"], a["height"], a["dhat"], None) - a["x"]
+def packed(a: dict[str, Tensor]) -> Tensor:
+    """Data of the planes for the kernels; kappa and damping do not matter to a start."""
+    shape = (a["height"].shape[0], *a["normal"].shape[1:2])
+    zero = a["height"].new_zeros(shape)
+    scalars = torch.stack([a["height"].expand(shape), zero, a["dhat"].expand(shape), zero], -1)
+    return torch.cat([a["normal"].expand(*shape, 3), scalars], -1).reshape(shape[0], -1)
+
+
+def by_begin(a: dict[str, Tensor]) -> Tensor:
+    """The beginning of a step of 1 s from x with velocity `step`, of vertices that are in no body."""
+    x, none = a["x"].contiguous(), a["x"].new_empty((0,))
+    vertices, planes = x.shape[1], packed(a)
+    empty, one = torch.empty(0, dtype=torch.int32), torch.zeros(1, dtype=torch.int32)
+    bodies = Bodies(empty, one, torch.empty(0, dtype=torch.float64), (0, 0, 0, 0))
+    others = OtherBodies(torch.full((vertices,), -1, dtype=torch.int32), empty, one,
+                         torch.empty((0, 5), dtype=torch.int32), one, (0, 0, 0, 0))  # fmt: skip
+    step = a["step"].expand_as(x).contiguous()
+    start, _ = begin(x, step, x.new_zeros((1, 1, 3)), none, x.new_ones((1, vertices)), planes, none, none, none, none,
+                     torch.zeros(vertices, dtype=torch.bool), bodies, others, (planes.shape[1], 0), 1.0,
+                     start="inertia", filters=True)  # fmt: skip
+    return start - x
 
 
 def by_reference(a: dict[str, Tensor]) -> Tensor:
@@ -63,12 +84,10 @@ def by_reference(a: dict[str, Tensor]) -> Tensor:
     return floor.start(a["x"].mT, a["step"].mT).mT
 
 
-def by_header(a: dict[str, Tensor]) -> Tensor:
+def by_contact(a: dict[str, Tensor]) -> Tensor:
     """A part of a step with contact where no bound cuts and no island moves."""
     scenes, vertices = a["x"].shape[:2]
-    zero, dhat = torch.zeros_like(a["height"]), a["dhat"].expand(a["height"].shape)
-    scalars = torch.stack([a["height"], zero, dhat, zero], -1)
-    planes = torch.cat([a["normal"].expand(*zero.shape, 3), scalars], -1).reshape(scenes, -1)
+    planes = packed(a)
     near = a["x"].new_full((scenes, vertices, 8), 1e6)
     free = torch.zeros(vertices, dtype=torch.bool)
     body = torch.zeros(vertices, dtype=torch.int32)
@@ -80,7 +99,7 @@ def by_header(a: dict[str, Tensor]) -> Tensor:
     return start[1] - a["x"]
 
 
-CODES = {"torch": by_torch, "reference": by_reference, "header": by_header}
+CODES = {"begin": by_begin, "reference": by_reference, "contact": by_contact}
 
 
 def limits(given: dict[str, Tensor]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -108,7 +127,7 @@ def closest(step: np.ndarray, normal: np.ndarray, room: np.ndarray) -> np.ndarra
 def test_no_start_goes_where_it_may_not(name: str) -> None:
     given = inputs(name)
     step, normal, room = limits(given)
-    out = by_torch(given).reshape(-1, 3).numpy()
+    out = by_begin(given).reshape(-1, 3).numpy()
     size = np.linalg.norm(step, axis=1)
     assert (out @ normal.T >= -room - 1e-12 * size[:, None]).all()
     assert (np.linalg.norm(out, axis=1) <= (1 + 1e-6) * size).all()
@@ -123,7 +142,7 @@ def test_no_start_goes_where_it_may_not(name: str) -> None:
 def test_it_is_the_closest_admitted_motion(name: str) -> None:
     given = inputs(name)
     step, normal, room = limits(given)
-    out = by_torch(given).reshape(-1, 3).numpy()
+    out = by_begin(given).reshape(-1, 3).numpy()
     expected = np.array([closest(s, normal, r) for s, r in zip(step, room, strict=True)])
     assert np.abs(out - expected).max() <= 1e-12 * np.abs(step).max()
     assert (np.linalg.norm(expected - step, axis=1) > 1e-3).sum() > 50
@@ -132,7 +151,7 @@ def test_it_is_the_closest_admitted_motion(name: str) -> None:
 def test_sliding_stays() -> None:
     given = inputs("tilted")
     step, normal, _ = limits(given)
-    out = by_torch(given).reshape(-1, 3).numpy()
+    out = by_begin(given).reshape(-1, 3).numpy()
     across = (out - step) - ((out - step) @ normal[0])[:, None] * normal[0]
     assert np.abs(across).max() <= 1e-14 * np.abs(step).max()
 
@@ -146,7 +165,8 @@ def test_it_is_continuous_where_a_vertex_leaves_dhat() -> None:
     x = torch.stack([torch.zeros_like(at), at, torch.zeros_like(at)], -1)
     step = torch.tensor([0.3, -1.0, 0.1], dtype=torch.float64).expand_as(x)
     zero, dhat = torch.zeros_like(n[..., 0]), torch.full_like(n[..., 0], DHAT)
-    inside, outside = filter_against_planes(x, step, n, zero, dhat, None)[0]
+    given = {"x": x, "step": step, "normal": n, "height": zero, "dhat": dhat}
+    inside, outside = (by_begin(given) + x)[0]
     assert (inside - outside).abs().max() < 1e-8 and abs(inside[1] - DHAT) < 1e-8 and outside[0] == 0.3
 
 
@@ -160,7 +180,7 @@ def test_codes_agree(name: str) -> None:
         out = run(a)
         results[code] = {"out": out.detach(), **dict(zip(a, torch.autograd.grad((weight * out).sum(), list(a.values())),
                                                          strict=True))}  # fmt: skip
-    for code in ("torch", "header"):
+    for code in ("begin", "contact"):
         for key, expected in results["reference"].items():
             assert expected.abs().max() > 0, key
             assert relative_error(results[code][key], expected) <= tolerance("adjoint"), (code, key)
@@ -173,11 +193,11 @@ def test_gradients_are_those_of_differences(name: str) -> None:
     weight = torch.from_numpy(rng.normal(size=tuple(given["x"].shape)))
     for key in given:
         a = leaves(given)
-        (grad,) = torch.autograd.grad((weight * by_torch(a)).sum(), a[key])
+        (grad,) = torch.autograd.grad((weight * by_begin(a)).sum(), a[key])
         direction = torch.from_numpy(rng.normal(size=tuple(a[key].shape)))
         size = 1e-7
         values = [
-            (weight * by_torch({**given, key: given[key] + sign * size * direction})).sum() for sign in (1.0, -1.0)
+            (weight * by_begin({**given, key: given[key] + sign * size * direction})).sum() for sign in (1.0, -1.0)
         ]
         expected = float(values[0] - values[1]) / (2 * size)
         assert abs(float((grad * direction).sum()) - expected) <= tolerance("finite_difference") * abs(expected), key

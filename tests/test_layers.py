@@ -243,9 +243,9 @@ def test_constants_agree_across_languages() -> None:
     assert dv.Anchor(1.0).count() == strides[1]
     assert energies.MAX_PLANES * strides[0] + strides[1] <= constant("energies/energies.h", "kMaxEnergyData")
     guard = re.findall(r"(\d+) \* std::numeric_limits<T>::epsilon\(\)", floor.read_text(encoding="utf-8"))
-    assert guard == [str(safeguards.GUARD_ULPS)]
+    assert guard == [str(reference.energies.GUARD)] == [str(reference.rigid.GUARD)]
     start = code_of(CSRC / "energies" / "floor_start.h")
-    assert float(*re.findall(r"kParallel = ([\d.e-]+);", start)) == safeguards.PARALLEL
+    assert float(*re.findall(r"kParallel = ([\d.e-]+);", start)) == reference.energies.PARALLEL
     assert constant("energies/floor_start.h", "kMostPlanes") == energies.MAX_PLANES
 
 
