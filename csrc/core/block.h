@@ -62,13 +62,13 @@ DIFFVBD_FN Shared<R> shared_entries(const Block<R>& b, const Axes<Set, R>& axes)
     Set::for_each([&](auto energy, int k) {
       using E = decltype(energy);
       if constexpr (E::has_filter) {
+        E::leave_out(b.state, b.data[k], b.data_count[k], out.first, out.second);
         if constexpr (!Set::usual) {
-          if (axes.turned) {
-            out.first = select(R(0) < axes.tiny, R(0), R(1));
-            return;
+          if (axes.turned) {  // where the nearest plane has the first axis
+            const auto turns = R(0) < axes.tiny;
+            out = {select(turns, R(0), out.first), select(turns, R(1), out.second)};
           }
         }
-        E::leave_out(b.state, b.data[k], b.data_count[k], out.first, out.second);
       }
     });
   }

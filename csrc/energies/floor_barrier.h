@@ -43,17 +43,21 @@ struct FloorBarrier {
     }
   };
 
-  // Whether a plane within its dhat lies along no axis of the mesh, so that a block needs axes of its own.
+  // Above 0 where a plane within its dhat lies along no axis of the mesh, so that a block needs axes of its own.
   template <class R>
-  DIFFVBD_FN static bool is_oblique(const VertexState<R>& s, const R* data, int count) {
-    bool out = false;
+  DIFFVBD_FN static R slant(const VertexState<R>& s, const R* data, int count) {
+    R out = R(0);
     for (int k = 0; k < count; k += stride) {
       const Plane<R> plane(data + k, s);
       const Vec3<R>& n = plane.n;
-      const R slant = absolute(n.x * n.y) + absolute(n.y * n.z) + absolute(n.z * n.x);
-      out = out || any(R(0) < select(plane.gap(s.x) < plane.dhat, slant, R(0)));
+      const R own = absolute(n.x * n.y) + absolute(n.y * n.z) + absolute(n.z * n.x);
+      out = out + select(plane.gap(s.x) < plane.dhat, own, R(0));
     }
     return out;
+  }
+  template <class R>
+  DIFFVBD_FN static bool is_oblique(const VertexState<R>& s, const R* data, int count) {
+    return any(R(0) < slant(s, data, count));
   }
   // 0 for a component on which such a plane stands alone, else 1.
   template <class R>
@@ -75,10 +79,12 @@ struct FloorBarrier {
     return out;
   }
 
-  // Where one is oblique, the axes of the two nearest planes within dhat, the nearest, and so the stiffest, first.
+  // Where one is oblique, the axes of the two nearest planes within dhat, the nearest, and so the stiffest, first. Each
+  // lane decides for itself: the lanes that fill up a pack are elsewhere in the reverse.
   template <class T, class R>
   DIFFVBD_FN static Frame<R> frame(const VertexState<R>& s, const R* data, int count) {
-    if (!is_oblique(s, data, count)) return Frame<R>::none();
+    const R oblique = slant(s, data, count);
+    if (!any(R(0) < oblique)) return Frame<R>::none();
     const R far = R(std::numeric_limits<T>::max());
     R d1 = far, d2 = far;
     Vec3<R> n1 = zero3<R>(), n2 = zero3<R>();
@@ -91,7 +97,8 @@ struct FloorBarrier {
       n1 = select(first, plane.n, n1);
       d1 = select(first, d, d1);
     }
-    return Frame<R>::template along<T>(n1, n2);
+    const auto turns = R(0) < oblique;
+    return Frame<R>::template along<T>(select(turns, n1, zero3<R>()), select(turns, n2, zero3<R>()));
   }
 
   // What one plane adds to the block: slope n to g, curvature n n^T to H.
