@@ -158,3 +158,27 @@ def test_a_body_slides_without_friction(device: str) -> None:
     assert abs(float(traveled[0]) - 1.0) <= tolerance("rest_drift") and abs(float(traveled[2])) <= tolerance(
         "rest_drift"
     )
+
+
+@pytest.mark.parametrize("mu", (1e5, 1e7))
+@pytest.mark.parametrize("sweeps", (0, 1, 3))
+def test_the_gradient_of_a_body_at_rest(device: str, sweeps: int, mu: float) -> None:
+    """Without friction a push makes it slide: its center of mass moves n h as fast, and by h^2 n (n + 1) / 2 over its
+    mass for a force; raising the floor raises it as much. At rest the correction has nothing to do but for that."""
+    model, n = resting(device), 20
+    rest, _, _ = run(
+        model, model.rest_points, torch.zeros_like(model.rest_points), 600, max(sweeps, 1), (0, -9.81, 0), mu
+    )
+    share = model.mass / model.mass.sum()
+    v, force = (torch.zeros_like(rest).requires_grad_() for _ in range(2))
+    height = torch.zeros(1, dtype=rest.dtype, device=device, requires_grad=True)
+    end = dv.rollout(model, rest, v, steps=n, mu=mu, lam=2 * mu, time_step=H, sweeps=sweeps, force=force, save="last",
+                     parameters={"floor_barrier.height": height}).x[-1]  # fmt: skip
+    center = share @ end
+    by_v, by_force = torch.autograd.grad(center[0], (v, force), retain_graph=True)
+    assert abs(float(by_v[:, 0].sum()) / (n * H) - 1) <= tolerance("finite_difference")
+    # the force per vertex is one for all, so its sum over the mass accelerates
+    expected = len(rest) * H**2 * n * (n + 1) / 2 / float(model.mass.sum())
+    assert abs(float(by_force[:, 0].sum()) / expected - 1) <= tolerance("finite_difference")
+    (by_height,) = torch.autograd.grad(center[1], height)
+    assert abs(float(by_height) - 1) <= 0.05

@@ -205,7 +205,7 @@ DIFFVBD_FN Load load_at(const Body<T>& b, const Team& team, const Vector& center
   return out;
 }
 
-// The Newton step at a pose; false where the method has arrived, or finds no descent.
+// The Newton step at a pose; false where it is too small for another one to follow.
 DIFFVBD_FN bool newton_step(const Moments& m, double spread, const Pose& pose, const Load& load, Iteration& out) {
   const Matrix turned = m.y_x * transposed(pose.turn);  // sum m (y - target) r^T
   const Vector torque = -axial(turned), force = m.mass * (pose.shift - m.shift);
@@ -258,14 +258,19 @@ DIFFVBD_FN Executed find(const Body<T>& b, const Team& team, Iteration* record) 
     if (!(load.value < std::numeric_limits<double>::infinity()))
       return out;  // starts outside: there is no way to judge
     Iteration k;
-    while (out.count < kMaxIterations && newton_step(m, b.in.spread[b.body], out.end, load, k)) {
+    // The step that arrives is taken as well, and whole: where a body rests it is the only one, and carries the
+    // derivative.
+    bool goes_on = true;
+    while (goes_on && out.count < kMaxIterations) {
+      goes_on = newton_step(m, b.in.spread[b.body], out.end, load, k);
       bool taken = false;
       k.share = 1;
       for (int halving = 0; halving < kMaxHalvings && !taken; ++halving) {
         if (halving > 0) k.share *= 0.5;
         const Pose next = after(k);
         const Load there = load_at(b, team, m.center, next, k.pose);
-        taken = inertial_rise(m, k) + there.value - load.value <= kRounding * load.value;
+        taken = goes_on ? inertial_rise(m, k) + there.value - load.value <= kRounding * load.value
+                        : there.value < std::numeric_limits<double>::infinity();
         if (taken) load = there, out.end = next;
       }
       if (!taken) break;

@@ -146,19 +146,22 @@ class Correction:
             step = -torch.linalg.solve(matrix + inertia, gradient)
             with torch.no_grad():
                 decrease = -(gradient * step).sum(-1)
-                running = running & (decrease > ARRIVED * (total * spread)[..., 0, 0])
-                share = self._share(running, step, turn, at, state, total, target, y_x, placed, body, x_prev)
-                running = running & (share > 0)
-            share = torch.where(running, share, 0.0)[..., None]
+                # the step that arrives is taken as well, and whole: it carries the derivative of a body at rest
+                arrives = ~(decrease > ARRIVED * (total * spread)[..., 0, 0])
+                share = self._share(running, arrives, step, turn, at, state, total, target, y_x, placed, body, x_prev)
+                share = torch.where(running, share, 0.0)
+                running = running & (share > 0) & ~arrives
+            share = share[..., None]
             turn = turn + _turned_by(share * step[..., :3]) @ turn
             at = at + (share * step[..., 3:]).unsqueeze(-1)
             if not bool(running.any()):
                 break
         return torch.where(acts[..., None, None], placed(turn, at), closed)
 
-    def _share(self, running: Tensor, step: Tensor, turn: Tensor, at: Tensor, state: Tensor, total: Tensor,
-               target: Tensor, y_x: Tensor, placed: Any, body: Tensor, x_prev: Tensor) -> Tensor:  # fmt: skip
-        """The largest of 1, 1/2, 1/4, ... that is admitted and does not raise the potential; 0: none."""
+    def _share(self, running: Tensor, arrives: Tensor, step: Tensor, turn: Tensor, at: Tensor, state: Tensor,
+               total: Tensor, target: Tensor, y_x: Tensor, placed: Any, body: Tensor, x_prev: Tensor
+               ) -> Tensor:  # fmt: skip
+        """The largest of 1, 1/2, 1/4, ... that is admitted and, unless a step arrives, raises no potential; 0: none."""
         share, found = torch.ones_like(running, dtype=state.dtype), torch.zeros_like(running)
         value = self._value(state, x_prev)
         for _ in range(HALVINGS):
@@ -167,7 +170,7 @@ class Correction:
             there = placed(turn + turned, at + t)
             rise = (total * dot(t, at - target + t / 2).unsqueeze(-1))[..., 0, 0] - (turned * y_x).sum((-2, -1))
             rise = rise + self._value(there, x_prev) - value
-            good = self._admits(there, state, body) & (rise <= ROUNDING * value)
+            good = self._admits(there, state, body) & ((rise <= ROUNDING * value) | arrives)
             found = found | (good & running)
             if bool((found | ~running).all()):
                 break
