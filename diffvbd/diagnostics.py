@@ -156,7 +156,7 @@ def diagnose(
         stiffness=stiffness,
         unbalanced=unbalanced,
     )
-    result.messages.extend(_state_messages(result) + _setting_messages(model, mu, lam, edge))
+    result.messages.extend(_state_messages(model, result) + _setting_messages(model, mu, lam, edge))
     if warn:
         for message in result.messages:
             warnings.warn(f"diffvbd: {message}", stacklevel=2)
@@ -243,7 +243,7 @@ def _largest(values: Tensor) -> float:
     return float(values.max()) if values.numel() else 0.0
 
 
-def _state_messages(result: Diagnosis) -> list[str]:
+def _state_messages(model: Model, result: Diagnosis) -> list[str]:
     out = []
     if bool(result.nonfinite.any()):
         first = result.nonfinite.nonzero()[0].tolist()
@@ -264,8 +264,9 @@ def _state_messages(result: Diagnosis) -> list[str]:
         out.append(f"positions are rounded to {result.resolution:.1e} of the shortest edge: move the scene to the "
                    "origin, or use float64")  # fmt: skip
     if result.unbalanced is not None and result.unbalanced > UNBALANCED:
-        out.append(f"the step left {100 * result.unbalanced:.2g} % of its forces unbalanced: take more sweeps, a "
-                   "smaller time step, or relaxation between 1.5 and 1.7")  # fmt: skip
+        faster = ", or relaxation between 1.5 and 1.7" if model.relaxation < 1.5 else ""
+        out.append(f"the step left {100 * result.unbalanced:.2g} % of its forces unbalanced: take more sweeps or a "
+                   f"smaller time step{faster}")  # fmt: skip
     return out
 
 

@@ -106,8 +106,11 @@ def test_leftover_force_falls_with_sweeps_and_knows_every_energy() -> None:
     assert left[2] < 1e-9
     stiff = {"time_step": 1 / 60, "mu": 1e8, "lam": 1e8}
     end, _ = dv.step(model, x, v, sweeps=1, **stiff)
-    with pytest.warns(UserWarning, match="sweeps"):
+    with pytest.warns(UserWarning, match="sweeps or a smaller time step, or relaxation between"):
         diagnose(model, end, previous=(x, v), **stiff)
+    over = dv.Model(mesh, energies=model.energies, relaxation=1.6)
+    with pytest.warns(UserWarning, match="sweeps or a smaller time step$"):
+        diagnose(over, end, previous=(x, v), **stiff)
 
 
 def test_pinned_reactions_are_no_residual() -> None:

@@ -16,6 +16,7 @@ constexpr int kMaxHalvings = 30;
 constexpr double kLeastShare = 0.1;  // of its gap that a vertex keeps in one step: that of the updates, 1 - FILTER_ETA
 constexpr double kDamping = 1e-9;    // of the inertia, so that a body collapsed to a line has a turning block
 constexpr double kArrived = 1e-24;   // squared step over squared radius of gyration at which Newton's method ends
+constexpr int kArrivals = 2;  // steps of no length: each leaves of the derivative's error what the block leaves out
 constexpr double kRounding = 1e-13;  // relative rise of the energies' sum that is rounding
 
 constexpr int32_t kCorrected = -2;  // as `other` of a vertex whose body is corrected
@@ -258,11 +259,12 @@ DIFFVBD_FN Executed find(const Body<T>& b, const Team& team, Iteration* record) 
     if (!(load.value < std::numeric_limits<double>::infinity()))
       return out;  // starts outside: there is no way to judge
     Iteration k;
-    // The step that arrives is taken as well, and whole: where a body rests it is the only one, and carries the
+    // The steps that arrive are taken as well, and whole: where a body rests they are the only ones, and carry the
     // derivative.
-    bool goes_on = true;
-    while (goes_on && out.count < kMaxIterations) {
-      goes_on = newton_step(m, b.in.spread[b.body], out.end, load, k);
+    int arrived = 0;
+    while (arrived < kArrivals && out.count < kMaxIterations) {
+      const bool goes_on = newton_step(m, b.in.spread[b.body], out.end, load, k);
+      arrived += !goes_on;
       bool taken = false;
       k.share = 1;
       for (int halving = 0; halving < kMaxHalvings && !taken; ++halving) {

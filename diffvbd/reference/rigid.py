@@ -18,7 +18,8 @@ ITERATIONS, HALVINGS = 8, 30
 ETA = 0.9  # largest fraction of the way to where a barrier begins that a start may close
 LEAST_SHARE = 0.1  # of its gap that a vertex keeps in one step
 DAMPING = 1e-9  # of the inertia
-ARRIVED = 1e-24  # squared step over squared radius of gyration at which the steps end
+ARRIVED = 1e-24  # squared step over squared radius of gyration from which on two more steps are taken
+ARRIVALS = 2
 ROUNDING = 1e-13  # relative rise of the energies that is rounding
 DEFINITE = 1e-10  # least eigenvalue of a turning stiffness over its trace
 GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
@@ -128,7 +129,7 @@ class Correction:
         points = self.scene.model.rest_points.to(x)[body]
         spread = (points - points.mean(0)).square().sum(-1).mean()
         turn, at = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:-2], 3, 3), center
-        running = acts
+        running, arrived = acts, torch.zeros_like(acts, dtype=torch.int64)
         for _ in range(ITERATIONS):
             state = placed(turn, at)
             g, block = self._load(state, x_prev)
@@ -146,11 +147,12 @@ class Correction:
             step = -torch.linalg.solve(matrix + inertia, gradient)
             with torch.no_grad():
                 decrease = -(gradient * step).sum(-1)
-                # the step that arrives is taken as well, and whole: it carries the derivative of a body at rest
+                # steps that arrive are taken as well, and whole: they carry the derivative of a body at rest
                 arrives = ~(decrease > ARRIVED * (total * spread)[..., 0, 0])
                 share = self._share(running, arrives, step, turn, at, state, total, target, y_x, placed, body, x_prev)
                 share = torch.where(running, share, 0.0)
-                running = running & (share > 0) & ~arrives
+                arrived = arrived + arrives.to(arrived.dtype)
+                running = running & (share > 0) & (arrived < ARRIVALS)
             share = share[..., None]
             turn = turn + _turned_by(share * step[..., :3]) @ turn
             at = at + (share * step[..., 3:]).unsqueeze(-1)
