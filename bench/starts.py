@@ -37,7 +37,7 @@ def cantilever(quick: bool) -> list[dict[str, Any]]:
 def hanging_bar(quick: bool) -> list[dict[str, Any]]:
     """The bar of `tradeoff` begins at rest in equilibrium: its elongation over that of equilibrium 1 s later."""
     out = []
-    for mu in (1e5,) if quick else (1e5, 1e7):
+    for mu in (1e5,):
         material = {"mu": mu, "lam": 1.5 * mu}
         x = bar().rest_points
         for _ in range(10 if quick else 60):  # long steps without inertia
