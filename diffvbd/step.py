@@ -122,7 +122,7 @@ def _energy_data(model: Model, prepared: Prepared, origin: Tensor | None) -> Ten
 class Begun(NamedTuple):
     """What the sweeps of a step start from; positions [B, V, 3], relative to ``origin`` where there is one."""
 
-    x_start: Tensor  # the predictor as far as contact lets it
+    x_start: Tensor  # as far as planes let it go
     x_prev: Tensor  # the state before the step
     y: Tensor  # the predictor
     data: Tensor  # [1 | B, n], of the energies

@@ -15,7 +15,7 @@ constexpr int kMaxIterations = 8;
 constexpr int kMaxHalvings = 30;
 constexpr double kLeastShare = 0.1;  // of its gap that a vertex keeps in one step: that of the updates, 1 - FILTER_ETA
 constexpr double kDamping = 1e-9;    // of the inertia, so that a body collapsed to a line has a turning block
-constexpr double kArrived = 1e-24;   // squared step over squared radius of gyration at which Newton's method ends
+constexpr double kArrived = 1e-24;   // squared step over squared radius of gyration below which a step has arrived
 constexpr int kArrivals = 2;  // steps of no length: each leaves of the derivative's error what the block leaves out
 constexpr double kRounding = 1e-13;  // relative rise of the energies' sum that is rounding
 
