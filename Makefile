@@ -1,5 +1,6 @@
 # make         environment, build, and the main job: identify a beam's material
-# make test    the default test suite (ARGS='-m slow' and the like are passed to pytest)
+# make test    the default test suite, a process for each core (ARGS='-m slow' and the like are passed to pytest)
+# make test-all  the slow tests, too
 # make lint    ruff, pyright and clang-format in check mode
 # make clean   remove what the build made; `make distclean` removes the environment too
 PYTHON ?= python3
@@ -16,7 +17,7 @@ ENVIRONMENT := $(VENV)/environment.stamp
 NATIVE := diffvbd/_C.abi3.so
 SOURCES := $(shell find csrc -type f -name '*.h' -o -type f -name '*.cpp' -o -type f -name '*.cu*')
 
-.PHONY: run build test lint clean distclean
+.PHONY: run build test test-all lint clean distclean
 
 run: build
 	$(BIN)/python -m diffvbd run beam-mu $(ARGS)
@@ -24,7 +25,10 @@ run: build
 build: $(ENVIRONMENT) $(NATIVE)
 
 test: build
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal $(ARGS)
+
+test-all: build
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "slow or not slow" $(ARGS)
 
 lint: $(ENVIRONMENT)
 	$(BIN)/ruff check .

@@ -39,9 +39,8 @@ CPU_SOURCES = [
     "csrc/cpu/register_neighbors.cpp",
     "csrc/cpu/register_rigid.cpp",
     "csrc/cpu/run.cpp",
-    "csrc/cpu/sweep_backward_material.cpp",
-    "csrc/cpu/sweep_backward_rest.cpp",
-    "csrc/cpu/sweep_backward_state.cpp",
+    "csrc/cpu/sweep_backward_double.cpp",
+    "csrc/cpu/sweep_backward_float.cpp",
     "csrc/cpu/sweep_forward.cpp",
 ]
 

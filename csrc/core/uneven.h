@@ -11,17 +11,19 @@
 
 namespace diffvbd {
 
-constexpr double kUneven = 3e3;  // errors grow by eps times it; lam of some hundred mu
+// Errors grow by eps times the unevenness of a block: some tenths of it beside what an ulp of the input does. 40 is lam
+// of a hundred mu. Pairs in contact make blocks uneven all the time, and their adjoint is not refined.
+constexpr double kUneven = 40, kUnevenContact = 1e3;
 constexpr int kRefinements = 2;  // each leaves eps times the unevenness of the error: from 1e-4 to 1e-12 at 1e12
 
 // Whether the trace and the least pivot of a block lie further apart than rounding forgives: trace(D^-1) trace(L D L^T)
 // but for the last pivot's own part, both times inv1 inv2, so that nothing is divided. What a plane puts on an entry of
 // its own does no harm.
-template <class R>
+template <class Set, class R>
 DIFFVBD_FN auto is_uneven(const Factor<R>& f, const Shared<R>& on) {
   const R trace =
       on.first * (R(1) + f.l21 * f.l21 + f.l31 * f.l31) * f.inv2 + on.second * (R(1) + f.l32 * f.l32) * f.inv1;
-  return R(kUneven) * (f.inv1 * f.inv2) < (f.inv1 + f.inv2 + f.inv3) * trace;
+  return R(Set::contact ? kUnevenContact : kUneven) * (f.inv1 * f.inv2) < (f.inv1 + f.inv2 + f.inv3) * trace;
 }
 
 // Out of line, so that no compiler fuses its products in one place and not in another: the rounding of a strain that a
@@ -123,7 +125,8 @@ DIFFVBD_COLD Vec3<R> reverse_star(const Block<R>& given, const Star& star, const
       const TetPair<R> pair = star.pair(e);
       auto view = view_of<Elastic>(pair, b.state.x, d_raw, p_mesh);
       Elastic::correct(pair, view, d_low_mesh, p_low_mesh);
-      const auto bar = Elastic::template view_vjp<wanted>(pair, view, d_raw, p_mesh, minus_h2);
+      const auto bar =
+          Elastic::template view_vjp<wanted>(pair, view, d_raw, p_mesh, minus_h2, star.template asked<wanted>());
       own += bar.xi;
       star.template add<wanted>(e, bar);
     }

@@ -9,7 +9,7 @@
 #define DIFFVBD_COLD __host__ __device__ __noinline__
 #else
 #define DIFFVBD_FN inline __attribute__((always_inline))
-#define DIFFVBD_COLD __attribute__((noinline))
+#define DIFFVBD_COLD __attribute__((noinline, cold))
 #endif
 
 namespace diffvbd {

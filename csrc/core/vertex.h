@@ -21,7 +21,7 @@ DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const 
   const Factor<R> H = factor<T>(system.H, system.least);
   Vec3<R> d = -solve(H, system.g);
   if constexpr (Set::elastic && !Set::usual) {
-    if (star.any(is_uneven(H, shared_entries<Set>(b, system.axes))))
+    if (star.any(is_uneven<Set>(H, shared_entries<Set>(b, system.axes))))
       d = step_uneven<Set>(b, star, q, system.axes, H, d);
   }
   return {d, system.axes.from(d), H};
@@ -30,7 +30,7 @@ DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const 
 // Whether factors of the usual way are none to go on with: all threads that share a star must know.
 template <class Set, class R, class Star>
 DIFFVBD_FN bool is_rare(const Block<R>& b, const Star& star, const Factor<R>& H) {
-  if constexpr (Set::elastic) return star.any(is_uneven(H, shared_entries<Set>(b, NoFrame<R>{})));
+  if constexpr (Set::elastic) return star.any(is_uneven<Set>(H, shared_entries<Set>(b, NoFrame<R>{})));
   return false;
 }
 
@@ -137,7 +137,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   Vec3<R> p_axes = solve(r.H, z_axes), d_low = zero3<R>();
   bool uneven = false;
   if constexpr (!Set::contact && !Set::usual) {  // what contact adds to a block is not on a full tape
-    if constexpr (Set::elastic) uneven = star.any(is_uneven(r.H, shared_entries<Set>(b, axes)));
+    if constexpr (Set::elastic) uneven = star.any(is_uneven<Set>(r.H, shared_entries<Set>(b, axes)));
     if constexpr (Set::filters) uneven = uneven || (wants_data && star.any(is_oblique<Set>(b, b.state.x, true)));
   }
   if constexpr (!Set::usual) {
@@ -169,7 +169,8 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
     if (!uneven) {
       Vec3<R> own = zero3<R>();
       for (int e = 0; e < star.size(); ++e) {
-        const auto pair = Set::Elastic::template block_vjp<wanted>(star.pair(e), b.state.x, u.d_raw, p, minus_h2);
+        const auto pair = Set::Elastic::template block_vjp<wanted>(star.pair(e), b.state.x, u.d_raw, p, minus_h2,
+                                                                   star.template asked<wanted>());
         own += pair.xi;
         star.template add<wanted>(e, pair);
       }

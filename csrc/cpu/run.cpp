@@ -214,7 +214,7 @@ template <class T>
 void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T* x_bar, const T* tape,
                  const StepAdjoints<T>& out) {
   const int wanted = (out.mu ? kMaterial : 0) | (out.rest ? kMaterial | kRest : 0);
-  const auto kernel = reverse_kernel<T>(in.energies, wanted);
+  const auto kernel = reverse_kernel<T>(in.energies);
   const int64_t tape_size =
       int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
   const int64_t n = plan.num_vertices, tets = plan.num_tets, lanes = int64_t{plan.blocks} * kLanes;

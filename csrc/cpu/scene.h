@@ -153,6 +153,11 @@ struct LaneStar {
       r[l].store(a);
     }
   }
+  // One variant serves every wish.
+  template <int wanted>
+  DIFFVBD_FN int asked() const {
+    return (s.mu_bar ? kMaterial : 0) | (s.rest_bar ? kRest : 0);
+  }
   DIFFVBD_FN static void accumulate(T* p, const Lanes<T>& v) { (Lanes<T>::load(p) + v).store(p); }
 
   template <int wanted>
@@ -162,11 +167,11 @@ struct LaneStar {
     scatter(edge, a.xj);
     scatter(edge + kLanes, a.xk);
     scatter(edge + 2 * kLanes, a.xl);
-    if constexpr ((wanted & kMaterial) != 0) {
+    if (s.mu_bar) {
       accumulate(s.mu_bar + slot * kLanes, a.mu);
       accumulate(s.lam_bar + slot * kLanes, a.lam);
     }
-    if constexpr ((wanted & kRest) != 0) {
+    if (s.rest_bar) {
       T* r = s.rest_bar + slot * 4 * kLanes;
       accumulate(r, a.k_ij);
       accumulate(r + kLanes, a.k_ik);
@@ -217,7 +222,7 @@ DIFFVBD_FN Block<Lanes<T>> load_block(const Plan& plan, const SceneView<T>& s, i
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
     out.data[k] = values;
-    out.data_count[k] = E::per_vertex ? E::stride : s.data_count[k];
+    out.data_count[k] = s.data_count[k];
     const T* data = s.data + s.data_start[k];
     for (int i = 0; i < out.data_count[k]; ++i) {
       R& value = *values++;

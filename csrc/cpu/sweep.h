@@ -17,14 +17,7 @@ using ReverseKernel = void (*)(const Plan&, const SceneView<T>&, const StepParam
 
 template <class T>
 ForwardKernel<T> forward_kernel(int energies);
-// For one of kState, kMaterial and kMaterial | kRest: a file for each, so that the build can run them side by side.
-template <class T, int wanted>
-ReverseKernel<T> reverse_kernel_of(int energies);
 template <class T>
-ReverseKernel<T> reverse_kernel(int energies, int wanted) {
-  if (wanted & kRest) return reverse_kernel_of<T, kMaterial | kRest>(energies);
-  if (wanted & kMaterial) return reverse_kernel_of<T, kMaterial>(energies);
-  return reverse_kernel_of<T, kState>(energies);
-}
+ReverseKernel<T> reverse_kernel(int energies);
 
 }  // namespace diffvbd

@@ -1,4 +1,4 @@
-// The transposed sweeps.
+// The transposed sweeps: a file for each precision, so that the build can run them side by side.
 #pragma once
 
 #include "sweep.h"
@@ -6,7 +6,7 @@
 namespace diffvbd {
 namespace {
 
-template <class T, int mask, int wanted>
+template <class T, int mask>
 DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const StepParameters<T>& q, int sweep, int tape,
                                int64_t begin, int64_t end) {
   using R = Lanes<T>;
@@ -28,8 +28,8 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
     store_rows(s.x, block, b.state.x);
 
     const Vec3<R> x_bar = load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block);
-    const BlockAdjoint<R> out =
-        reverse_vertex<Set, wanted>(b, star, u, r, x_bar, q, s.data_bar != nullptr, [&](int k, int i, const R& value) {
+    const BlockAdjoint<R> out = reverse_vertex<Set, kMaterial | kRest>(
+        b, star, u, r, x_bar, q, s.data_bar != nullptr, [&](int k, int i, const R& value) {
           const int64_t row = b.data[k] - values + i;
           LaneStar<T>::accumulate(s.data_bar + (row * plan.blocks + block) * kLanes, value);
         });
@@ -46,25 +46,17 @@ DIFFVBD_HOT void reverse_color(const Plan& plan, const SceneView<T>& s, const St
   }
 }
 
-// Without tets there is nothing but the state to differentiate: one variant serves every wish.
-constexpr int useful(int mask, int wanted) { return (mask & 3) == 0 ? kState : wanted; }
-
-template <class T, int wanted, int... n>
+template <class T, int... n>
 ReverseKernel<T> pick(int index, std::integer_sequence<int, n...>) {
-  static constexpr ReverseKernel<T> table[kEnergySets] = {
-      reverse_color<T, energy_mask(n), useful(energy_mask(n), wanted)>...};
+  static constexpr ReverseKernel<T> table[kEnergySets] = {reverse_color<T, with_rare(energy_mask(n))>...};
   return table[index];
 }
 
 }  // namespace
 
-template <class T, int wanted>
-ReverseKernel<T> reverse_kernel_of(int energies) {
-  return pick<T, wanted>(energy_index(energies), std::make_integer_sequence<int, kEnergySets>{});
+template <class T>
+ReverseKernel<T> reverse_kernel(int energies) {
+  return pick<T>(energy_index(energies), std::make_integer_sequence<int, kEnergySets>{});
 }
 
 }  // namespace diffvbd
-
-#define DIFFVBD_INSTANTIATE_REVERSE(wanted)                                                  \
-  template diffvbd::ReverseKernel<double> diffvbd::reverse_kernel_of<double, (wanted)>(int); \
-  template diffvbd::ReverseKernel<float> diffvbd::reverse_kernel_of<float, (wanted)>(int);

@@ -31,7 +31,7 @@ DIFFVBD_HOT void forward_color(const Plan& plan, const SceneView<T>& s, const St
 
 template <class T, int... n>
 ForwardKernel<T> pick(int index, std::integer_sequence<int, n...>) {
-  static constexpr ForwardKernel<T> table[kEnergySets] = {forward_color<T, energy_mask(n)>...};
+  static constexpr ForwardKernel<T> table[kEnergySets] = {forward_color<T, with_rare(energy_mask(n))>...};
   return table[index];
 }
 

@@ -286,6 +286,10 @@ struct GroupStar {
       }
     }
   }
+  template <int wanted>
+  __device__ static constexpr int asked() {
+    return wanted;
+  }
   mutable T material_bar[2] = {T(0), T(0)};
 
   // Writes the rows of the vertex's edges: the sums of its threads, in their order. What is pinned has no turn of its

@@ -228,6 +228,10 @@ struct SceneStar {
       r[kRestScalars - 1] += a.c6;
     }
   }
+  template <int wanted>
+  __device__ static constexpr int asked() {
+    return wanted;
+  }
   mutable T mu_bar = T(0), lam_bar = T(0);
 };
 

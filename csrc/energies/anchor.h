@@ -10,6 +10,7 @@ struct Anchor {
   static constexpr int stride = 4;
   static constexpr bool has_filter = false;
   static constexpr bool reads_x_prev = false;
+  static constexpr bool rare = true;
 
   template <class T>
   static const char* invalid(const T* a) {
@@ -17,10 +18,12 @@ struct Anchor {
   }
 
   template <class R>
-  DIFFVBD_FN static void block(const VertexState<R>& s, const R* data, int, Vec3<R>& g, Sym3<R>& H) {
-    const R k = s.h * s.h * data[0];
-    g += k * (s.x - Vec3<R>{data[1], data[2], data[3]});
-    add_diagonal(H, k);
+  DIFFVBD_FN static void block(const VertexState<R>& s, const R* data, int count, Vec3<R>& g, Sym3<R>& H) {
+    for (int i = 0; i < count; i += stride) {
+      const R k = s.h * s.h * data[i];
+      g += k * (s.x - Vec3<R>{data[i + 1], data[i + 2], data[i + 3]});
+      add_diagonal(H, k);
+    }
   }
 
   // the potential whose gradient block() adds

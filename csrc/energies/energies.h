@@ -1,6 +1,6 @@
 // THE list of energies. A scene's energies form a mask; each mask is a compiled variant, so an absent energy costs no
-// instruction. An energy of one vertex is a struct with stride, per_vertex, has_filter, reads_x_prev, block() and
-// value(); with a block_vjp() too it is hot, without one Dual derives its adjoint.
+// instruction. An energy of one vertex is a struct with stride, per_vertex, has_filter, reads_x_prev, rare,
+// block() and value(); with a block_vjp() too it is hot, without one Dual derives its adjoint.
 #pragma once
 
 #include <type_traits>
@@ -37,6 +37,15 @@ constexpr int energy_mask(int n) { return n % kElasticVariants + (n / kElasticVa
 constexpr int energy_index(int mask) { return (mask & 3) + mask / kContact * kElasticVariants; }
 constexpr int free_mask(int n) { return n % kElasticVariants + (n / kElasticVariants << kFirstVertexBit); }
 constexpr int free_index(int mask) { return (mask & 3) + (mask >> kFirstVertexBit) * kElasticVariants; }
+// Bits of the energies that are rare. The CPU compiles them into every variant, where an absent one is a loop of no
+// turns: variants then double with hot energies alone.
+template <class... E>
+constexpr int rare_bits(EnergyList<E...>) {
+  int k = kFirstVertexBit, bits = 0;
+  ((bits |= int(E::rare) << k++), ...);
+  return bits;
+}
+constexpr int with_rare(int mask) { return mask | rare_bits(VertexEnergies{}); }
 constexpr int kMaxEnergyData = 64;  // scalars that the energies of one vertex may read
 
 // One block update, from the Newton step to the executed one.

@@ -16,6 +16,7 @@ struct FloorBarrier {
   static constexpr int stride = 7;
   static constexpr bool has_filter = true;
   static constexpr bool reads_x_prev = true;
+  static constexpr bool rare = false;
 
   // what is wrong with the data of one plane, or null
   template <class T>
@@ -85,6 +86,10 @@ struct FloorBarrier {
   DIFFVBD_FN static Frame<R> frame(const VertexState<R>& s, const R* data, int count) {
     const R oblique = slant(s, data, count);
     if (!any(R(0) < oblique)) return Frame<R>::none();
+    return turned<T>(s, data, count, oblique);
+  }
+  template <class T, class R>
+  DIFFVBD_COLD static Frame<R> turned(const VertexState<R>& s, const R* data, int count, const R& oblique) {
     const R far = R(std::numeric_limits<T>::max());
     R d1 = far, d2 = far;
     Vec3<R> n1 = zero3<R>(), n2 = zero3<R>();

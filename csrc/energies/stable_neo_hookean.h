@@ -28,7 +28,7 @@ struct TetPairAdjoint {
   R k_ij, k_ik, k_il, c6;
 };
 
-// Which adjoints beyond the state are wanted.
+// Which adjoints beyond the state are wanted: those that a variant is compiled for, and of them those asked for.
 enum Wanted { kState = 0, kMaterial = 1, kRest = 2 };
 
 template <bool Exact>
@@ -75,12 +75,12 @@ struct StableNeoHookean {
   // The adjoint of p . (g + H d_raw) times -h^2 (method.md, section 3; paper, eqs. 7-12, 14-15).
   template <int wanted, class R>
   DIFFVBD_FN static TetPairAdjoint<R> block_vjp(const TetPair<R>& e, const Vec3<R>& xi, const Vec3<R>& d_raw,
-                                                const Vec3<R>& p, const R& minus_h2) {
-    return view_vjp<wanted>(e, view(e, xi, d_raw, p), d_raw, p, minus_h2);
+                                                const Vec3<R>& p, const R& minus_h2, int asked = wanted) {
+    return view_vjp<wanted>(e, view(e, xi, d_raw, p), d_raw, p, minus_h2, asked);
   }
   template <int wanted, class R>
   DIFFVBD_FN static TetPairAdjoint<R> view_vjp(const TetPair<R>& e, const View<R>& v, const Vec3<R>& d_raw,
-                                               const Vec3<R>& p, const R& minus_h2) {
+                                               const Vec3<R>& p, const R& minus_h2, int asked = wanted) {
     const R sixth = R(1) / R(6);
     const Vec3<R>&ek = v.ek, &el = v.el, &d = v.d, &n = v.n;
     const R lb = e.mu + e.lam, n_p = v.n_p;
@@ -99,15 +99,16 @@ struct StableNeoHookean {
     out.xi = cut - (e.k_ij + e.k_ik + e.k_il) * w;
     // dE depends on differences of positions only: the four adjoints sum to zero.
     out.xj = -(out.xi + out.xk + out.xl);
-    if constexpr ((wanted & (kMaterial | kRest)) != 0) {
+    const int more = wanted & asked;
+    if (more != 0) {
       const R dj = -dot(d, p), dk = dot(ek - d, p), dl = dot(el - d, p);
-      if constexpr ((wanted & kMaterial) != 0) {
+      if (more & kMaterial) {
         R stretch = e.k_ij * dj + e.k_ik * dk + e.k_il * dl;
         if constexpr (!Exact) stretch = stretch - (e.k_ij + e.k_ik + e.k_il) * dot(d_raw, p);
         out.lam = b * v.after * n_p;
         out.mu = minus_h2 * stretch + b * (v.strain - R(1)) * n_p;
       }
-      if constexpr ((wanted & kRest) != 0) {
+      if (more & kRest) {
         const R tangent = Exact ? R(0) : dot(d_raw, p);
         out.k_ij = mu_h2 * (dj - tangent);
         out.k_ik = mu_h2 * (dk - tangent);

@@ -1,0 +1,3 @@
+#include "sweep_backward.h"
+
+template diffvbd::ReverseKernel<float> diffvbd::reverse_kernel<float>(int);

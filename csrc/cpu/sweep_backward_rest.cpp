@@ -1,3 +1,0 @@
-#include "sweep_backward.h"
-
-DIFFVBD_INSTANTIATE_REVERSE(diffvbd::kMaterial | diffvbd::kRest)
