@@ -89,7 +89,7 @@ def test_a_third_energy_of_single_vertices_and_contact(tmp_path: Path) -> None:
     for name in ("setup.py", "pyproject.toml", "README.md"):
         shutil.copy(ROOT / name, tmp_path)
     add_an_energy(tmp_path)
-    edit(tmp_path / "setup.py", '"-O3", ', '"-O0", ')  # twice as many variants as ever; it must be quick to build
+    edit(tmp_path / "setup.py", '"-O3", ', '"-O0", ')  # it must be quick to build
     options = {"DIFFVBD_NO_CLONES": "1", "DIFFVBD_NO_CUDA": "1", "PYTHONPATH": f"{tmp_path}:{ROOT / 'tests'}"}
     environment = os.environ | options
     build = [sys.executable, "setup.py", "--quiet", "build_ext", "--inplace", "--force"]
