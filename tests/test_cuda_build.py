@@ -61,18 +61,14 @@ def failures(jobs: list[tuple[Path, list[str]]], folder: Path) -> dict[str, str]
         return {name: output for name, output in pool.map(run, jobs) if output}
 
 
-def compile_for(kernels: list[Path], architectures: list[str], folder: Path, optimised: tuple[str, ...]) -> None:
-    """As the package is built; kernels not named in `optimised` with less effort."""
+def compile_for(kernels: list[Path], architectures: list[str], folder: Path, *flags: str) -> None:
+    """As the package is built, and with `flags`."""
     known = subprocess.run([str(nvcc()), "--list-gpu-code"], capture_output=True, text=True).stdout.split()
     missing = {f"sm_{a}" for a in architectures} - set(known)
     if missing:
         pytest.skip(f"this nvcc is too old for {', '.join(sorted(missing))}")
-    flags = [*build_cuda.NVCC_FLAGS, "-Xcompiler", "-fPIC"]
-    jobs = [
-        (k, [*flags, *([] if k.name in optimised else quick()), f"-arch=sm_{a}"])
-        for k, a in zip(kernels, architectures, strict=True)
-    ]
-    failed = failures(jobs, folder)
+    given = [*build_cuda.NVCC_FLAGS, "-Xcompiler", "-fPIC", *flags]
+    failed = failures([(k, [*given, f"-arch=sm_{a}"]) for k, a in zip(kernels, architectures, strict=True)], folder)
     assert not failed, "\n".join(f"{name}:\n{output}" for name, output in failed.items())
 
 
@@ -132,23 +128,31 @@ def test_architectures(monkeypatch: pytest.MonkeyPatch) -> None:
     assert build_cuda.architectures() == "8.0 9.0+PTX"
 
 
+TURNS = [(k, ARCHITECTURES[i % len(ARCHITECTURES)]) for i, k in enumerate(KERNELS)]
+
+
 @needs_csrc
 @needs_nvcc
-def test_kernels_compile(tmp_path: Path) -> None:
-    """To machine code, as ptxas alone finds what does not fit the hardware; the architectures take turns. One of the
-    large files as it is built; the others as such only among the slow tests, where they take minutes."""
-    turns = [ARCHITECTURES[i % len(ARCHITECTURES)] for i in range(len(KERNELS))]
-    optimised = "forward_double.cu"
-    assert optimised in {k.name for k in KERNELS}
-    compile_for(KERNELS, turns, tmp_path, (optimised,))
+@pytest.mark.parametrize(("kernel", "architecture"), TURNS, ids=[k.stem for k in KERNELS])
+def test_kernels_compile(tmp_path: Path, kernel: Path, architecture: str) -> None:
+    """To machine code, as ptxas alone finds what does not fit the hardware: the variant that has everything. The
+    architectures take turns."""
+    compile_for([kernel], [architecture], tmp_path, *quick(), "-DDIFFVBD_ONE_VARIANT")
 
 
 @pytest.mark.slow
 @needs_csrc
 @needs_nvcc
-def test_kernels_compile_for_every_architecture(tmp_path: Path) -> None:
-    everything = [k for k in KERNELS for _ in ARCHITECTURES]
-    compile_for(everything, [*ARCHITECTURES] * len(KERNELS), tmp_path, tuple(k.name for k in KERNELS))
+@pytest.mark.parametrize(("kernel", "architecture"), TURNS, ids=[k.stem for k in KERNELS])
+def test_every_variant_compiles(tmp_path: Path, kernel: Path, architecture: str) -> None:
+    compile_for([kernel], [architecture], tmp_path, *quick())
+
+
+@pytest.mark.slow
+@needs_csrc
+@needs_nvcc
+def test_every_variant_compiles_as_it_is_built(tmp_path: Path) -> None:
+    compile_for([k for k in KERNELS for _ in ARCHITECTURES], [*ARCHITECTURES] * len(KERNELS), tmp_path)
 
 
 @needs_csrc

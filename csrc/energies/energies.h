@@ -33,9 +33,14 @@ constexpr int kFirstVertexBit = 3;
 constexpr int kElasticVariants = 3;                                     // none, exact, paper
 constexpr int kFreeSets = kElasticVariants << kVertexEnergies;          // without contact
 constexpr int kEnergySets = kElasticVariants << (kVertexEnergies + 1);  // and with it
+#ifdef DIFFVBD_ONE_VARIANT  // everything at once, for all sets: tells whether the sources compile, and runs nothing
+constexpr int energy_mask(int) { return kExactBlock | kContact | ((1 << kVertexEnergies) - 1) << kFirstVertexBit; }
+constexpr int free_mask(int) { return energy_mask(0) & ~kContact; }
+#else
 constexpr int energy_mask(int n) { return n % kElasticVariants + (n / kElasticVariants) * kContact; }
-constexpr int energy_index(int mask) { return (mask & 3) + mask / kContact * kElasticVariants; }
 constexpr int free_mask(int n) { return n % kElasticVariants + (n / kElasticVariants << kFirstVertexBit); }
+#endif
+constexpr int energy_index(int mask) { return (mask & 3) + mask / kContact * kElasticVariants; }
 constexpr int free_index(int mask) { return (mask & 3) + (mask >> kFirstVertexBit) * kElasticVariants; }
 // Bits of the energies that are rare. The CPU compiles them into every variant, where an absent one is a loop of no
 // turns: variants then double with hot energies alone.
