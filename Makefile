@@ -44,7 +44,7 @@ $(ENVIRONMENT): .ci/bootstrap.py pyproject.toml
 
 # pip has just built it in a new environment. Later this recompiles only what an edit concerns (--force: setuptools
 # itself looks at no header; ninja does).
-$(NATIVE): $(SOURCES) setup.py diffvbd/build_cuda.py | $(ENVIRONMENT)
+$(NATIVE): $(SOURCES) setup.py diffvbd/ops/build_cuda.py | $(ENVIRONMENT)
 	$(BIN)/python setup.py --quiet build_ext --inplace --force
 	@touch $@
 

@@ -76,7 +76,7 @@ extensions = [
     )
 ]
 # Run, not imported: the package does not load before it is built.
-cuda = runpy.run_path("diffvbd/build_cuda.py")
+cuda = runpy.run_path("diffvbd/ops/build_cuda.py")
 if cuda["has_compiler"]() and not os.environ.get("DIFFVBD_NO_CUDA"):
     extensions.append(cuda["extension"]())
 

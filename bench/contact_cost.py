@@ -14,7 +14,8 @@ import diffvbd as dv
 from bench.common import markdown_table
 from bench.cpu import kept_bytes, least
 from bench.gpu_measure import Card
-from diffvbd import detection, mesh
+from diffvbd import mesh
+from diffvbd.contact import detection
 
 DHAT = 2e-3  # [m]
 CLOSE = 0.5 * DHAT  # gap of bodies that touch [m]

@@ -22,7 +22,8 @@ import diffvbd as dv
 from bench.cpu import peak_memory, reset_peak_memory
 from bench.exactness import PRESET, UNROLLED, Case, Row, Scene, Solves, build
 from bench.gpu_measure import Card
-from diffvbd import global_adjoint, testing
+from diffvbd import testing
+from diffvbd.adjoint import implicit as global_adjoint
 
 SWEEPS = 20
 TOLERANCE = 1e-10  # of the linear solves: the default, and about the errors in the paper's table
@@ -133,7 +134,7 @@ class Recorded:
 
 @contextmanager
 def recording(card: Card) -> Iterator[Recorded]:
-    """Within, steps of global backwards are recorded; in `diffvbd.global_adjoint` itself, so that it is what runs."""
+    """Within, steps of global backwards are recorded; in `diffvbd.adjoint.implicit` itself, so that it is what runs."""
     done = Recorded()
 
     def now() -> float:
@@ -224,7 +225,7 @@ def _by_scipy(card: Card, systems: list[tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _conjugate_gradients(matrix: Any, inverse: Any, b: np.ndarray) -> tuple[np.ndarray, int]:
-    """Solution and iterations: the recurrence, preconditioner and end of `diffvbd.global_adjoint`, in numpy."""
+    """Solution and iterations: the recurrence, preconditioner and end of `diffvbd.adjoint.implicit`, in numpy."""
     x, r, goal, count = np.zeros_like(b), b.copy(), TOLERANCE**2 * (b @ b), 0
     p = z = inverse @ r
     rz = r @ z

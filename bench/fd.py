@@ -20,7 +20,8 @@ from torch import Tensor
 import diffvbd as dv
 from bench import paper
 from bench.common import markdown_table
-from diffvbd import native, testing
+from diffvbd import testing
+from diffvbd.ops import load as native
 
 STEPS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 BAR = 1e-6

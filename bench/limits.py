@@ -13,7 +13,7 @@ from torch import Tensor
 import diffvbd as dv
 from bench.common import markdown_table
 from diffvbd import testing
-from diffvbd.diagnostics import collapse_stretch
+from diffvbd.inspect.diagnose import collapse_stretch
 
 ARGUMENTS = ("grad_x", "grad_v", "grad_mu", "grad_lam")
 

@@ -10,7 +10,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench.common import markdown_table
-from diffvbd import many_digits, testing
+from diffvbd import testing
+from diffvbd.testing import many_digits
 
 GAPS = (1e-3, 1e-4, 1e-5, 1e-6, 3e-7, 1e-7)  # [m]
 NORMALS = ((0.0, 1.0, 0.0), (0.3, 0.9, -0.3), (1.0, 2.0, 3.0), (-0.7, 0.7, 0.02))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench.common import markdown_table
-from diffvbd.diagnostics import diagnose
+from diffvbd.inspect.diagnose import diagnose
 
 SWEEPS = (5, 10, 20, 50, 100, 200, 500, 1000)
 RELAXATIONS = (1.0, 1.6)

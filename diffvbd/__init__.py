@@ -5,24 +5,25 @@ import os as _os
 # Idle threads that spin make a parallel region cost milliseconds on a busy machine; only the first import decides.
 _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from . import colliders, contact, mesh, solvers
-from .adjoints import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
-from .debug import debug_checks
-from .diagnostics import Diagnosis, diagnose
+from . import mesh, solvers
+from ._version import __version__ as __version__
+from .adjoint.routes import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
+from .contact import colliders
+from .contact.barrier import Friction, PairBarrier
 from .energies import Anchor, FloorBarrier, StableNeoHookean
-from .gradcheck import GradientCheck, check_gradients
+from .inspect import contact
+from .inspect.debug import debug_checks
+from .inspect.diagnose import Diagnosis, diagnose
+from .inspect.gradcheck import GradientCheck, check_gradients
 from .mesh import TetMesh
-from .model import Model
-from .moduli import lame, young_poisson
-from .pair_barrier import Friction, PairBarrier
-from .regimes import regime
-from .rollout import Trajectory, per_step, rollout
-from .schedule import Binomial
-from .solve import Solution, solve
-from .step import step
-from .tape import Tape, step_backward, step_forward
-
-__version__ = "0.1.0"
+from .model.model import Model
+from .model.moduli import lame, young_poisson
+from .ops.regimes import regime
+from .rollout.checkpoints import Binomial
+from .rollout.converge import Solution, solve
+from .rollout.rollout import Trajectory, per_step, rollout
+from .step.manual import Tape, step_backward, step_forward
+from .step.step import step
 
 __all__ = [
     "Anchor",

@@ -13,6 +13,7 @@ from contextvars import ContextVar
 from typing import Any
 
 import torch
+from torch import Tensor
 
 _checking: ContextVar[bool] = ContextVar("diffvbd.debug_checks", default=False)
 _recording: ContextVar[tuple[list[Any], ...]] = ContextVar("diffvbd.contact.record", default=())
@@ -25,6 +26,14 @@ _recorders: tuple[list[Any], ...] = ()  # of all threads and tasks
 def checking() -> bool:
     """Whether debug_checks() is on."""
     return _any_checking if torch.compiler.is_compiling() else _checking.get()
+
+
+def looks_at(value: Tensor) -> bool:
+    """Whether values may be looked at now. On CUDA that waits for the device; compiled and transformed ones cannot."""
+    if torch.compiler.is_compiling():
+        return False
+    transformed = torch._C._functorch.peek_interpreter_stack()  # pyright: ignore[reportAttributeAccessIssue]
+    return transformed is None and (checking() or not value.is_cuda)
 
 
 def recorders() -> tuple[list[Any], ...]:

@@ -24,7 +24,7 @@ def why_no_cuda() -> str | None:
     """What keeps the tests off CUDA on this machine, or None."""
     if not torch.cuda.is_available():
         return "torch sees no CUDA device"
-    from diffvbd import native
+    from diffvbd.ops import load as native
 
     try:
         native.require_cuda()

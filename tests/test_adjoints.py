@@ -145,7 +145,7 @@ def _weights(x: Tensor) -> list[Any]:
 
 
 def test_auto_checkpoints_bound_what_unrolled_keeps(device: str) -> None:
-    from diffvbd import schedule
+    from diffvbd.rollout import checkpoints as schedule
 
     model, _ = scene_on(device, "plain")
     row = model.num_active * 8 * schedule.UNROLLED_SCALARS

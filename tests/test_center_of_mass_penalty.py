@@ -12,7 +12,7 @@ from test_cuda_graph import captured
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.contact_penalty import Bodies, center_of_mass_penalty
+from diffvbd.inspect.penalty import Bodies, center_of_mass_penalty
 from diffvbd.testing import relative_error
 
 RADIUS = 0.35

@@ -23,7 +23,7 @@ from detection_scenes import (
 )
 
 import diffvbd as dv
-from diffvbd import ops_contact
+from diffvbd.ops import detect as ops_contact
 from diffvbd.testing import generator
 
 

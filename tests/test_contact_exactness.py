@@ -15,7 +15,7 @@ from contact_scenes import GRAVITY, SCENES, compiled, noise, part_of, unrolled
 
 import diffvbd as dv
 from diffvbd.testing import relative_error
-from diffvbd.tolerances import tolerance
+from diffvbd.testing.tolerances import tolerance
 
 # (steps, sweeps)
 RUNS = [(1, 1), (1, 5), (1, 20), (4, 5), (20, 2)]

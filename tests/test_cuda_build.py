@@ -16,7 +16,8 @@ import pytest
 import torch
 from torch.utils import cpp_extension
 
-from diffvbd import build_cuda, native
+from diffvbd.ops import build_cuda
+from diffvbd.ops import load as native
 
 ROOT = Path(__file__).parents[1]
 CSRC = ROOT / "csrc"

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import diffvbd as dv
-from diffvbd.diagnostics import collapse_stretch, diagnose
+from diffvbd.inspect.diagnose import collapse_stretch, diagnose
 
 MATERIAL = {"mu": 1e5, "lam": 1.5e5}
 

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.bodies import Bodies, OtherBodies
-from diffvbd.contact_start import _Start
+from diffvbd.contact.start import _Start
+from diffvbd.model.bodies import Bodies, OtherBodies
 from diffvbd.reference.energies import FloorBarrier
 from diffvbd.safeguards import FILTER_ETA
-from diffvbd.start import begin
+from diffvbd.step.start import begin
 from diffvbd.testing import generator, relative_error, tolerance
 
 PLANES = {

@@ -10,10 +10,10 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import reference
-from diffvbd.arguments import acceleration_of, prepare
-from diffvbd.global_adjoint import Assembled, conjugate_gradients
-from diffvbd.incremental import IncrementalPotential
-from diffvbd.step import begin
+from diffvbd.adjoint.implicit import Assembled, conjugate_gradients
+from diffvbd.adjoint.potential import IncrementalPotential
+from diffvbd.step.arguments import acceleration_of, prepare
+from diffvbd.step.step import begin
 from diffvbd.testing import build_scene, relative_error, tolerance
 
 CASES = ("plain", "paper", "inverted", "contrast", "no_shear", "floor_damped", "floor_corner", "anchored", "batch")

@@ -8,7 +8,9 @@ import pytest
 import torch
 
 import diffvbd as dv
-from diffvbd import energies, memory, ops, reference, regimes, safeguards
+from diffvbd import energies, ops, reference, safeguards
+from diffvbd.ops import regimes
+from diffvbd.step import memory
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "diffvbd"
@@ -22,11 +24,22 @@ def module_of(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+def is_for_types_only(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+
+
+def running(path: Path) -> ast.Module:
+    """A file without what only type checkers read."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree.body = [node for node in tree.body if not is_for_types_only(node)]
+    return tree
+
+
 def imports_of(path: Path) -> set[str]:
     """Absolute names of everything a file imports, lazily or not, relative imports resolved."""
     package = ["diffvbd", *path.relative_to(PACKAGE).parent.parts] if PACKAGE in path.parents else []
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(running(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -36,7 +49,42 @@ def imports_of(path: Path) -> set[str]:
     return found
 
 
-PYTHON = {module_of(path): imports_of(path) for path in sorted(PACKAGE.rglob("*.py"))}
+FILES = {module_of(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+PYTHON = {module: imports_of(path) for module, path in FILES.items()}
+
+# What may be imported, lowest first: each room knows only those before it. A file beside the rooms is a room of one.
+ROOMS = (
+    "_version", "safeguards", "mask", "checks", "lasting", "scopes", "reference", "energies", "mesh", "ops", "contact",
+    "model", "adjoint", "step", "rollout", "inspect", "solvers", "losses", "viz", "testing", "", "tasks", "cli",
+    "__main__",
+)  # fmt: skip
+# Model.memory() asks, when it is called, what a rollout would take.
+UPWARD = {("model.model", "rollout.memory")}
+
+
+def arrows() -> set[tuple[str, str]]:
+    """(importing module, imported module) of the package, lazy imports included."""
+    found = set()
+    for module, imports in PYTHON.items():
+        for name in imports:
+            if name.split(".")[0] != "diffvbd":
+                continue
+            parts = name.split(".")[1:]
+            while parts and ".".join(parts) not in FILES:
+                parts = parts[:-1]
+            found.add((module, ".".join(parts)))
+    return {(a, b) for a, b in found if a != b}
+
+
+def circle(arrows: set[tuple[str, str]]) -> list[str]:
+    """Modules that import one another in a circle, or none."""
+    left = {module for arrow in arrows for module in arrow}
+    while left:
+        free = {a for a in left if not any(b in left for source, b in arrows if source == a)}
+        if not free:
+            return sorted(left)
+        left -= free
+    return []
 
 
 def layer_users(layer: str) -> set[str]:
@@ -50,18 +98,23 @@ def in_layer(module: str, layer: str) -> bool:
 
 
 def test_the_sources_are_found() -> None:
-    assert {"", "ops", "model", "step", "rollout", "mesh.io", "reference.sweep", "tasks.runner"} <= PYTHON.keys()
-    assert "diffvbd.metric.rest_metric" in PYTHON["model"] and "torch" in PYTHON["step"]
-    assert {"model", "step", "adjoints"} <= layer_users("ops")
+    assert {"", "ops.sweep", "model.model", "step.step", "rollout.rollout", "mesh.io", "tasks.runner"} <= PYTHON.keys()
+    assert "diffvbd.model.rest.rest_metric" in PYTHON["model.model"] and "torch" in PYTHON["step.step"]
+    assert {"model.model", "step.step", "adjoint.routes"} <= layer_users("ops")
+    assert {room.split(".")[0] for room in FILES} == set(ROOMS) and len(arrows()) > 200
 
 
-def test_layers_import_only_what_lies_below() -> None:
-    layers = ("mesh", "model", "step", "rollout", "tasks")
-    for low, upper in enumerate(layers):
-        for module in layer_users(upper):
-            below = [layer for layer in layers[:low] if in_layer(module, layer)]
-            assert not below, f"{module} imports {upper}"
-    assert {m for m in layer_users("tasks") if not in_layer(m, "tasks")} <= {"cli", "__main__"}
+def test_rooms_import_only_what_lies_below() -> None:
+    def floor(module: str) -> int:
+        return ROOMS.index(module.split(".")[0])
+
+    up = {(a, b) for a, b in arrows() if floor(b) > floor(a)}
+    assert up == UPWARD
+
+
+def test_no_files_import_each_other_in_a_circle() -> None:
+    assert not circle(arrows() - UPWARD)
+    assert circle({("a", "b"), ("b", "c"), ("c", "a"), ("c", "d")}) == ["a", "b", "c"]
 
 
 def test_mesh_and_ops_stand_alone() -> None:
@@ -70,13 +123,9 @@ def test_mesh_and_ops_stand_alone() -> None:
         if in_layer(module, "mesh"):
             assert all(i.startswith("diffvbd.mesh") for i in inside), module
             assert not any(i.split(".")[0] == "torch" for i in imports), module
-        if module == "ops":
-            assert inside <= {"diffvbd.native", "diffvbd.mask.KEEPS_POSITIONS"}
-        if module == "native":  # what it asks for when it compiles, inside a function
-            assert inside <= {"diffvbd.__version__", "diffvbd.build_cuda.architectures"}
-        if module == "build_cuda":
+        if module == "ops.build_cuda":
             assert not inside
-    assert layer_users("native") == {"ops", "model_arguments"}
+    assert layer_users("ops.load") <= {m for m in PYTHON if in_layer(m, "ops")}
 
 
 def test_reference_is_independent_of_what_it_checks() -> None:
@@ -101,7 +150,7 @@ def test_nothing_imports_tests_or_benchmarks_and_dependencies_are_declared() -> 
     assert not {(m, i) for m, i in roots if i in ("tests", "bench", "pytest", "hypothesis", "conftest")}
     optional = {"matplotlib", "mpl_toolkits", "pyvista", "pytetwild", "scipy"}
     importers = {m for m, i in roots if i in optional}
-    assert {m for m in importers if not m.startswith("viz.")} <= {"mesh.tetrahedralize", "testing"}
+    assert {m for m in importers if not m.startswith("viz.")} <= {"mesh.tetrahedralize", "testing.scenes"}
 
 
 def test_optional_packages_are_imported_where_they_are_used() -> None:
@@ -116,20 +165,15 @@ def test_optional_packages_are_imported_where_they_are_used() -> None:
 
 
 def test_only_ops_names_the_compiled_operators() -> None:
-    """One file loads the objects, one names what is in them, one runs the sweeps."""
+    """One file loads the objects, one room knows what is in them."""
 
     def naming(pattern: str) -> set[str]:
         texts = {module_of(path): path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")}
         return {module for module, text in texts.items() if re.search(pattern, text)}
 
-    assert naming(r"\bload_library\b") == {"native"}
-    assert naming(r"torch\.ops\b(?!\.load_library\b)|torch\.library\b|\bdiffvbd::") == {
-        "ops", "ops_begin", "ops_contact", "ops_contact_start", "ops_contact_sweep", "ops_neighbors", "ops_rigid"
-    }  # fmt: skip
-    assert naming(r"\bops\.raw\b") == {
-        "ops_contact", "ops_contact_start", "ops_contact_sweep", "ops_neighbors", "rigid", "start", "sweeps"
-    }  # fmt: skip
-    assert not [m for m, imports in PYTHON.items() if "diffvbd.ops.raw" in imports or "torch.ops" in imports]
+    assert naming(r"\bload_library\b") == {"ops.load"}
+    named = naming(r"\btorch\.ops\b|\btorch\.library\b|\bdiffvbd::")
+    assert "ops.sweep" in named and all(in_layer(module, "ops") for module in named), named
 
 
 # --- C++ --------------------------------------------------------------------------------------------------------------

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffvbd import ops_neighbors
-from diffvbd.ops_neighbors import neighbor_pairs
+from diffvbd.ops import neighbors as ops_neighbors
+from diffvbd.ops.neighbors import neighbor_pairs
 
 DTYPES = [torch.float64, torch.float32]
 

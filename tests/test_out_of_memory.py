@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import diffvbd as dv
+from diffvbd.adjoint.sweep import backward_memory
 from diffvbd.ops import FULL_TAPE, NO_TAPE
-from diffvbd.sweeps import backward_memory
 
 SWEEPS, SCENES = 2**31 - 1, 256  # more bytes than addresses
 

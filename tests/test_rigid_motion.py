@@ -6,7 +6,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.testing import relative_error
-from diffvbd.tolerances import tolerance
+from diffvbd.testing.tolerances import tolerance
 
 SWEEPS = (0, 1, 2, 5, 20)
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import diffvbd as dv
-from diffvbd.tolerances import tolerance
+from diffvbd.testing.tolerances import tolerance
 
 H, DENSITY, KAPPA, DHAT, EDGE = 0.01, 3000.0, 1e3, 1e-2, 0.2
 NORMALS = {"y": (0.0, 1.0, 0.0), "x": (1.0, 0.0, 0.0), "oblique": (0.48, 0.6, 0.64)}

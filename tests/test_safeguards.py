@@ -10,8 +10,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import ops, reference
+from diffvbd.adjoint.sweep import sweep
 from diffvbd.safeguards import FILTER_ETA
-from diffvbd.sweeps import sweep
 from diffvbd.testing import build_scene, generator, on_device, relative_error, structured, tolerance
 
 # --- the step filter -------------------------------------------------------------------------------------------------

@@ -10,8 +10,8 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench import limits_adjoint as limits
-from diffvbd import many_digits, testing
-from diffvbd.testing import evaluate, relative_error, tolerance
+from diffvbd import testing
+from diffvbd.testing import evaluate, many_digits, relative_error, tolerance
 
 TAPES = ("full", "compact", "recompute")
 
@@ -38,7 +38,9 @@ def test_two_planes_that_meet(device: str, gap: float) -> None:
 
 
 @pytest.mark.parametrize("block", ("exact", "paper"))
-@pytest.mark.parametrize(("ratio", "sweeps"), ((1e2, 3), (1e4, 1), (1e4, 3), (1e5, 1), (1e6, 3), (1e9, 1), (1e9, 3), (1e12, 3)))
+@pytest.mark.parametrize(
+    ("ratio", "sweeps"), ((1e2, 3), (1e4, 1), (1e4, 3), (1e5, 1), (1e6, 3), (1e9, 1), (1e9, 3), (1e12, 3))
+)
 def test_volume_far_stiffer_than_shape(device: str, ratio: float, sweeps: int, block: str) -> None:
     check(device, limits.volumetric(ratio, block), sweeps)
 

@@ -6,9 +6,10 @@ from functools import reduce
 
 import numpy as np
 
+from diffvbd.mesh.arrays import FloatArray, float_array
 from diffvbd.mesh.implicit import fill
 from diffvbd.mesh.shapes import count, positive
-from diffvbd.mesh.tet_mesh import FloatArray, TetMesh, float_array
+from diffvbd.mesh.tet_mesh import TetMesh
 
 
 def capsule(radius: float = 0.1, length: float = 0.3, resolution: int = 6) -> TetMesh:

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from diffvbd.mesh.tet_mesh import IntArray, TetMesh, float_array
+from diffvbd.mesh.arrays import IntArray, float_array
+from diffvbd.mesh.tet_mesh import TetMesh
 
 # Edges of a tet; edge k has its midpoint at slot 4 + k of the ten-node tet below.
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])

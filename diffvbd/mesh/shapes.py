@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from diffvbd.mesh.tet_mesh import FloatArray, IntArray, TetMesh, float_array, int_array
+from diffvbd.mesh.arrays import FloatArray, IntArray, float_array, int_array
+from diffvbd.mesh.tet_mesh import TetMesh
 
 Split = Literal["kuhn", "five"]
 

@@ -6,10 +6,9 @@ from os import PathLike
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from diffvbd.mesh.arrays import FloatArray, IntArray, float_array, int_array, listed, to_numpy
+from diffvbd.mesh.write import save
 
 # Faces of a positively oriented tet, wound so that their normals point out of it.
 TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
@@ -18,50 +17,6 @@ TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 FLAT = 16 * np.finfo(np.float64).eps
 
 _CHUNK = 1 << 16
-
-
-def to_numpy(array: Any) -> NDArray[Any]:
-    """`array` as a numpy array; torch tensors are detached and brought to the CPU first (torch is not imported)."""
-    if hasattr(array, "detach"):
-        array = array.detach().cpu()
-    return np.asarray(array)
-
-
-def float_array(name: str, array: Any, shape: tuple[int | None, ...]) -> FloatArray:
-    """A finite float64 copy of `array`; None in `shape` stands for any length."""
-    values = to_numpy(array)
-    if values.size and values.dtype.kind not in "fiu":
-        raise TypeError(f"{name}: expected real numbers, got dtype {values.dtype}")
-    _check_shape(name, values, shape)
-    values = np.array(values, dtype=np.float64, order="C")
-    if not np.isfinite(values).all():
-        if values.ndim == 0:
-            raise ValueError(f"{name}: expected a finite number, got {values}")
-        bad = np.unique(np.nonzero(~np.isfinite(values))[0])
-        raise ValueError(f"{name}: expected finite numbers, got NaN or Inf in {_listed(bad, 'row')}")
-    return values
-
-
-def int_array(name: str, array: Any, shape: tuple[int | None, ...]) -> IntArray:
-    """An int64 copy of `array`; floats are refused, even whole ones."""
-    values = to_numpy(array)
-    if values.size and values.dtype.kind not in "iu":
-        raise TypeError(f"{name}: expected integers, got dtype {values.dtype}")
-    _check_shape(name, values, shape)
-    return np.array(values, dtype=np.int64, order="C")
-
-
-def _check_shape(name: str, values: NDArray[Any], shape: tuple[int | None, ...]) -> None:
-    fits = values.ndim == len(shape) and all(want in (None, got) for want, got in zip(shape, values.shape, strict=True))
-    if not fits:
-        wanted = ", ".join("*" if n is None else str(n) for n in shape)
-        raise ValueError(f"{name}: expected shape [{wanted}], got {list(values.shape)}")
-
-
-def _listed(ids: IntArray, noun: str) -> str:
-    """'3 tets: 1, 5, 9', at most five of them."""
-    shown = ", ".join(map(str, ids[:5])) + (", ..." if len(ids) > 5 else "")
-    return f"{len(ids)} {noun}{'' if len(ids) == 1 else 's'}: {shown}"
 
 
 def signed_volume(points: FloatArray, tets: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -161,7 +116,7 @@ class TetMesh:
             bad = np.nonzero(((tets < 0) | (tets >= count)).any(axis=1))[0]
             raise ValueError(
                 f"tets: expected vertex indices from 0 to {count - 1}, got {tets[bad[0]].tolist()} "
-                f"(out of range in {_listed(bad, 'tet')})"
+                f"(out of range in {listed(bad, 'tet')})"
             )
         repeats = np.zeros(len(tets), dtype=bool)
         for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)):
@@ -170,7 +125,7 @@ class TetMesh:
             bad = np.nonzero(repeats)[0]
             raise ValueError(
                 f"tets: expected four different vertices, got {tets[bad[0]].tolist()} "
-                f"(repeated vertices in {_listed(bad, 'tet')})"
+                f"(repeated vertices in {listed(bad, 'tet')})"
             )
 
     def _checked_volume(self, orient: bool) -> FloatArray:
@@ -178,12 +133,12 @@ class TetMesh:
         flat = np.abs(volume) <= FLAT * product
         if flat.any():
             raise ValueError(
-                f"tets: expected positive volumes, got zero volume in {_listed(np.nonzero(flat)[0], 'tet')}"
+                f"tets: expected positive volumes, got zero volume in {listed(np.nonzero(flat)[0], 'tet')}"
             )
         if (volume < 0).any() and not orient:
             bad = np.nonzero(volume < 0)[0]
             raise ValueError(
-                f"tets: expected positive volumes, got inverted {_listed(bad, 'tet')} of {self.num_tets} "
+                f"tets: expected positive volumes, got inverted {listed(bad, 'tet')} of {self.num_tets} "
                 "(orient=True flips them)"
             )
         return volume
@@ -193,7 +148,7 @@ class TetMesh:
         bad = np.nonzero((of_tets != of_tets[:, :1]).any(axis=1))[0]
         if len(bad):
             raise ValueError(
-                f"body: expected one label per tet, got {of_tets[bad[0]].tolist()} (mixed in {_listed(bad, 'tet')})"
+                f"body: expected one label per tet, got {of_tets[bad[0]].tolist()} (mixed in {listed(bad, 'tet')})"
             )
 
     @property
@@ -266,8 +221,6 @@ class TetMesh:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the mesh to a file; see `diffvbd.mesh.save`."""
-        from diffvbd.mesh.io import save
-
         save(path, self)
 
     def __repr__(self) -> str:

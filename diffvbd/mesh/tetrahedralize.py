@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from diffvbd.mesh.arrays import FloatArray, IntArray, float_array, int_array
 from diffvbd.mesh.io import read_triangles
 from diffvbd.mesh.shapes import count, positive
-from diffvbd.mesh.tet_mesh import FloatArray, IntArray, TetMesh, float_array, int_array
+from diffvbd.mesh.tet_mesh import TetMesh
 
 
 def tetrahedralize(

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..arguments import GRAVITY, acceleration_of
 from ..checks import check_broadcast, check_positive, check_tensor, check_time_step, fail, name_value, vertex_mask
 from ..lasting import lasting_tensors
 from ..mesh import TetMesh
-from ..model_arguments import checked_device
+from ..model.arguments import checked_device
+from ..step.arguments import GRAVITY, acceleration_of
 
 
 class ParticleSolver:

@@ -13,15 +13,7 @@ from ..checks import check_time_step, fail
 from ..lasting import lasting_tensors
 from ..mesh import TetMesh
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
-from .particles import (
-    GRAVITY,
-    ParticleSolver,
-    all_finite,
-    checked_edges,
-    checked_mesh,
-    mesh_edges,
-    mesh_mass,
-)
+from .particles import GRAVITY, ParticleSolver, all_finite, checked_edges, checked_mesh, mesh_edges, mesh_mass
 from .projections import Springs, Tets
 from .sums import placed
 

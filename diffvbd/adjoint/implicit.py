@@ -1,0 +1,271 @@
+"""GlobalAdjoint: the executed sweeps forward, the derivative of the equation G'(x) = 0 backward.
+
+At a state with dG/dx = 0 at the free vertices, the implicit function theorem gives for the adjoint x_bar of that state
+
+    (d2G/dx2) w = x_bar  at the free vertices, w = 0 at the pinned,          theta_bar = -w . d(dG/dx)/dtheta
+
+and what is left over, x_bar - (d2G/dx2) w at the pinned vertices, is the adjoint of where they are held.
+"""
+
+# pyright: reportIncompatibleMethodOverride=false
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from .. import ops
+from ..model.model import Model
+from ..ops import no_second_derivative, of_inputs
+from .potential import PAIRS, IncrementalPotential
+from .routes import GlobalAdjoint, LinearSolve
+from .sweep import SweepTensors, sweep
+
+MAX_ITERATIONS = 10_000  # of a solve whose adjoint does not say
+DEFAULT_TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}
+CHECK_EVERY = 8  # iterations on CUDA between two looks at whether all scenes have converged: each waits for the device
+
+_DIFFERENTIABLE = 8  # as in sweeps.py: x_start, x_prev, y, mu, lam, mass, rest, energy_data
+
+
+def global_sweep(
+    model: Model, tensors: SweepTensors, settings: ops.SweepSettings, adjoint: GlobalAdjoint, debug_step: int = -1,
+    then: Callable[[Tensor], Tensor] = lambda x: x,
+) -> Tensor:  # fmt: skip
+    """Positions after the sweeps and what comes ``then`` [B, V, 3]; ``tensors``: the nine arguments of sweeps.sweep."""
+    return _GlobalSweep.apply(*tensors, model, settings, adjoint, debug_step, then)
+
+
+class _GlobalSweep(Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> Tensor:
+        tensors, (model, settings, adjoint, debug_step) = SweepTensors(*args[:9]), args[9:-1]
+        x = sweep(*tensors, model._packed_rest, model._plan, settings, tape_policy=ops.NO_TAPE, debug_step=debug_step)
+        x = args[-1](x)
+        ctx.save_for_backward(*tensors, x)
+        ctx.model, ctx.h, ctx.adjoint = model, settings.numbers[0], adjoint
+        return x
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        needs = ctx.needs_input_grad[:_DIFFERENTIABLE]
+        out = _GlobalBackward.apply(grads[0], *ctx.saved_tensors, ctx.model, ctx.h, ctx.adjoint, needs)
+        return of_inputs(out, needs, 6)
+
+
+class _GlobalBackward(Function):
+    @staticmethod
+    def forward(ctx: Any, x_bar: Tensor, *args: Any) -> tuple[Tensor, ...]:
+        tensors, (x, model, h, adjoint, needs) = SweepTensors(*args[:9]), args[9:]
+        if x.is_cuda and torch.cuda.is_current_stream_capturing():
+            raise RuntimeError("adjoint: expected ReverseSweep while a CUDA graph is captured, got GlobalAdjoint, "
+                               "whose solve waits for the device")  # fmt: skip
+        with torch.autocast(x.device.type, enabled=False):  # which would take the products in half precision
+            potential = IncrementalPotential(model, x, tensors, h)
+            w = _solve(potential, torch.where(potential.free > 0, x_bar, 0), adjoint)
+            bars = potential.dependence(w, needs)
+            if needs[0]:
+                bars[0] = torch.where(potential.free > 0, 0, x_bar - potential.product(w))
+        out = []
+        for bar, tensor, need in zip(bars, tensors, needs, strict=False):
+            if need and tensor is not None:
+                out.append(torch.zeros_like(tensor) if bar is None else ops.sum_to(bar, tensor.shape))
+        return tuple(out)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        no_second_derivative()
+
+
+def _solve(potential: IncrementalPotential, x_bar: Tensor, adjoint: GlobalAdjoint) -> Tensor:
+    """w with (d2G/dx2) w = x_bar at the free vertices, w = 0 at the pinned."""
+    # of order one, so that no square of it leaves the range of its numbers
+    size = x_bar.abs().amax((-2, -1), keepdim=True) if x_bar.numel() else x_bar.new_ones((len(x_bar), 1, 1))
+    b = x_bar / torch.where(size == 0, 1, size)
+    tolerance = adjoint.tolerance or DEFAULT_TOLERANCE[b.dtype]
+    limit = adjoint.max_iterations or min(max(10 * 3 * potential.model.num_active, 1), MAX_ITERATIONS)
+    product, precondition = system(potential, adjoint.assembled)
+    found = conjugate_gradients(product, b, precondition, tolerance, limit)
+    residual = float(found.residual.max()) if len(b) else 0.0
+    if adjoint.report is not None:
+        adjoint.report(LinearSolve(found.iterations, residual, residual <= tolerance))
+    if not residual <= tolerance:
+        scene = int(found.residual.argmax())
+        if not bool(torch.isfinite(size[scene])):
+            text = (
+                f"GlobalAdjoint: expected finite adjoints of the positions, got {float(size[scene])} in scene {scene}"
+            )
+        else:
+            text = (
+                f"GlobalAdjoint: expected conjugate gradients to meet a relative residual of {tolerance:g}, got "
+                f"{residual:.3g} in scene {scene} after {found.iterations} iterations"
+                f"{'; the Hessian is not positive definite there' if found.indefinite else ''}"
+            )
+        if adjoint.on_failure == "raise":
+            raise RuntimeError(text)
+        warnings.warn(text, RuntimeWarning, stacklevel=2)
+    return found.x * size
+
+
+Operator = Callable[[Tensor], Tensor]
+
+
+def system(potential: IncrementalPotential, matrix: bool) -> tuple[Operator, Operator]:
+    """Product with the Hessian between free vertices, by a matrix or without, and with the inverse of its diagonal
+    blocks, which preconditions it; functions of [B, V, 3]."""
+    blocks, free = potential.diagonal(), potential.free
+    eye = torch.eye(3, dtype=blocks.dtype, device=blocks.device)
+    # a pinned vertex may have neither mass nor tets, so that its block is zero
+    inverse = torch.linalg.inv(torch.where(free[..., None] > 0, blocks, eye)) * free[..., None]
+    product = Assembled(potential, blocks) if matrix else lambda w: free * potential.product(w)
+    return product, lambda r: (inverse @ r[..., None])[..., 0]
+
+
+class Conjugate(NamedTuple):
+    """Result of conjugate_gradients."""
+
+    x: Tensor  # [B, V, 3]
+    residual: Tensor  # |b - A x| / |b| of each scene, infinite where it is not a number [B]
+    iterations: int  # of the scene that took most
+    indefinite: bool  # a direction of negative curvature was met
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return (a * b).sum((-2, -1), keepdim=True)
+
+
+def conjugate_gradients(
+    product: Operator,
+    b: Tensor,
+    precondition: Operator,
+    tolerance: float,
+    max_iterations: int,
+) -> Conjugate:
+    """Preconditioned conjugate gradients for each scene of b [B, V, 3] on its own.
+
+    The recurrence may believe in a residual that rounding has not kept, so its end is judged by b - A x; where that is
+    too large it starts again from there, as long as this gains a digit. Negative curvature does not end it: the
+    system has a solution as long as the matrix has an inverse.
+
+    Source: Hestenes and Stiefel (1952); Saad, Iterative Methods for Sparse Linear Systems, algorithm 9.1.
+    """
+    size = _dot(b, b)
+    goal = tolerance * tolerance * size
+    x, r, left, iterations, lowest = torch.zeros_like(b), b, size, 0, torch.zeros_like(size)
+    while True:
+        some, count, curvature = _cycle(product, r, precondition, goal, max_iterations - iterations)
+        x, iterations, lowest = x + some, iterations + count, torch.minimum(lowest, curvature)
+        r = b - product(x)
+        before, left = left, _dot(r, r)
+        missed = ~(left <= goal)
+        if count == 0 or iterations >= max_iterations or not bool((missed & (left < 0.01 * before)).any()):
+            break
+        r = torch.where(missed, r, 0)
+    ratio = (left / torch.where(size > 0, size, 1)).sqrt().flatten()
+    return Conjugate(x, torch.nan_to_num(ratio, nan=math.inf), iterations, bool((lowest < 0).any()))
+
+
+def _cycle(
+    product: Operator,
+    r: Tensor,
+    precondition: Operator,
+    goal: Tensor,
+    max_iterations: int,
+) -> tuple[Tensor, int, Tensor]:
+    """What the recurrence from zero makes of A x = r: x, the most iterations of a scene, the lowest curvature met."""
+    x, rr = torch.zeros_like(r), _dot(r, r)
+    p = z = precondition(r)
+    rz = _dot(r, z)
+    zero = torch.zeros_like(rr)
+    active, counts, lowest = rr > goal, zero.clone(), zero
+    every = CHECK_EVERY if r.is_cuda else 1
+    for iteration in range(max_iterations):
+        if iteration % every == 0 and not bool(active.any()):
+            break
+        q = product(p)
+        curvature = _dot(p, q)
+        lowest = torch.minimum(lowest, curvature)
+        # a scene that has arrived, or broken down, rests
+        alpha = torch.where(active, rz / curvature, zero)
+        x.addcmul_(alpha, p)
+        r = torch.addcmul(r, alpha, q, value=-1)
+        counts += active
+        z = precondition(r)
+        before, rz = rz, _dot(r, z)
+        p = torch.addcmul(z, torch.where(active, rz / before, zero), p)
+        rr = _dot(r, r)
+        active &= rr > goal  # never true of NaN
+    return x, int(counts.max()) if len(r) else 0, lowest
+
+
+class _Structure(NamedTuple):
+    """Which blocks of the Hessian of one scene exist, pinned rows and columns left out, and what they sum."""
+
+    row_ptr: Tensor  # [V + 1]
+    columns: Tensor  # [N]
+    on_diagonal: Tensor  # [free] place of the diagonal block of each free vertex
+    off_diagonal: Tensor  # [M] places of the others
+    terms: Tensor  # [D, M] which of IncrementalPotential.edge_blocks each of these adds up; 12 T stands for none
+    free: Tensor  # [free]
+
+
+def _structure(model: Model) -> _Structure:
+    count, tets, free = model.num_vertices, model._topology[0], ~model._pinned
+    a, b = (list(corners) for corners in zip(*PAIRS, strict=True))
+    rows, columns = tets[:, a + b].reshape(-1), tets[:, b + a].reshape(-1)
+    key, term = torch.sort(rows * count + columns, stable=True)
+    keep = (free[rows] & free[columns])[term]
+    key, term = key[keep], term[keep]
+    off, place, sizes = torch.unique_consecutive(key, return_inverse=True, return_counts=True)
+    vertices = free.nonzero().reshape(-1)
+    # place of each term among those of its block
+    nth = torch.arange(len(key), device=key.device) - (sizes.cumsum(0) - sizes)[place]
+    depth = int(sizes.max()) if len(sizes) else 0
+    terms = torch.full((depth, len(off)), 12 * len(tets), device=key.device)
+    terms[nth, place] = term
+    blocks, order = torch.sort(torch.cat([off, vertices * (count + 1)]))
+    where = torch.empty_like(order)
+    where[order] = torch.arange(len(order), device=order.device)
+    row_ptr = torch.searchsorted(blocks, torch.arange(count + 1, device=blocks.device) * count)
+    return _Structure(row_ptr, blocks % max(count, 1), where[len(off) :], where[: len(off)], terms, vertices)
+
+
+class Assembled:
+    """The Hessian of all scenes between free vertices, as one sparse matrix of 3x3 blocks."""
+
+    def __init__(self, potential: IncrementalPotential, diagonal: Tensor) -> None:
+        model, x = potential.model, potential.x
+        if not x.is_cuda and not torch.backends.mkl.is_available():
+            raise RuntimeError("assembled: expected a torch with MKL for sparse products on the CPU, got one without; "
+                               "use GlobalAdjoint(assembled=False)")  # fmt: skip
+        s: _Structure = model.derived("hessian_structure", lambda: _structure(model))
+        scenes, count, n = x.shape[0], model.num_vertices, len(s.columns)
+        values = x.new_empty((scenes, n, 9))
+        values[:, s.on_diagonal] = diagonal[:, s.free].flatten(-2)
+        of_tets = potential.edge_blocks().flatten(1, 2)
+        of_tets = torch.cat([of_tets, of_tets.new_zeros((scenes, 1, 9))], 1)
+        off = x.new_zeros((scenes, len(s.off_diagonal), 9))
+        for term in s.terms:  # in a fixed order, where index_add on CUDA would have none
+            off += of_tets[:, term]
+        values[:, s.off_diagonal] = off
+        row_ptr, columns = s.row_ptr, s.columns
+        if scenes != 1:
+            shift = torch.arange(scenes, device=x.device)[:, None]
+            row_ptr = torch.cat([(row_ptr[:-1] + n * shift).reshape(-1), row_ptr.new_full((1,), n * scenes)])
+            columns = (columns + count * shift).reshape(-1)
+        index = torch.int32 if 9 * n * scenes < 2**31 else torch.int64  # MKL and cuSPARSE convert the other one anew
+        self.matrix = torch.sparse_bsr_tensor(
+            row_ptr.to(index), columns.to(index), values.reshape(-1, 3, 3), size=(3 * count * scenes,) * 2,
+            check_invariants=False)  # fmt: skip
+
+    def __call__(self, w: Tensor) -> Tensor:
+        return (self.matrix @ w.reshape(-1)).reshape(w.shape)
+
+
+# torch says of every first block-sparse matrix that it is new; here, once, because a filter is global to a process
+warnings.filterwarnings("ignore", message="Sparse (BSR tensor support is in beta|invariant checks are implicitly)")

@@ -1,0 +1,194 @@
+"""The incremental potential of a step at one state: its gradient, its Hessian, and what the two depend on.
+
+    G(x) = 1/2 sum m |x - y|^2 + h^2 E(x)          [kg m^2]
+
+In plain torch from the arguments of the sweep operator, so that it needs no deformation gradient: with the rest scalars
+k_ab and c6 of docs/method.md, section 2, and the edges e_1, e_2, e_3 from the first corner of a tet,
+
+    E = mu/2 sum_ij S_ij e_i.e_j + V [lb/2 (J - 1)^2 - mu (J - 1)]
+    J = c6 e_1.(e_2 x e_3),    S_ij = V grad N_i.grad N_j,    lb = mu + lam,    V = 1/(6 c6)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import ops
+from ..model.model import Model
+from .sweep import SweepTensors
+
+PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners (a, b) of k_ab, the first six rest scalars
+# a, b and the other two corners c, d, in the order in which det(x_a - x_d, x_b - x_d, x_c - x_d) > 0
+_PAIRS = [(0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2), (1, 2, 0, 3), (1, 3, 2, 0), (2, 3, 0, 1)]
+_OF_PAIRS = torch.tensor(_PAIRS, device="cpu").T
+
+
+def _rolled(vectors: Tensor, by: int) -> Tensor:
+    """v_1, v_2, v_3 -> v_(1 + by), v_(2 + by), v_(3 + by), counted in a circle."""
+    return vectors.roll(-by, 0)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return torch.linalg.cross(a, b, dim=1)
+
+
+class IncrementalPotential:
+    """G at the state x. Vectors are [B, V, 3]; entries of pinned vertices count as given, and as zero where asked for.
+
+    Per tet, arrays are [3 edges, 3 components, B, T]: rows of whole meshes, which elementwise operations want.
+    """
+
+    def __init__(self, model: Model, x: Tensor, tensors: SweepTensors, time_step: float) -> None:
+        """tensors: of the step; where its sweeps start does not enter."""
+        self.model, self.x, self.h = model, x, time_step
+        self.x_prev, self.y, self.data = tensors.x_prev, tensors.y, tensors.energy_data
+        self.mu, self.lam, self.mass = tensors.mu, tensors.lam, tensors.mass[..., None]
+        self.origin = tensors.origin if tensors.origin.numel() else None
+        rest = tensors.rest
+        self.rest = model.rest_scalars if rest is None else rest  # [1 | B, T, 7]
+        self.free = (~model._pinned)[:, None].to(x.dtype)
+
+        k = dict(zip(PAIRS, self.rest[..., :6].unbind(-1), strict=True))
+        k |= {(b, a): value for (a, b), value in k.items()}
+        k |= {(i, i): -(k[i, 0] + k[i, a] + k[i, b]) for i, a, b in ((1, 2, 3), (2, 3, 1), (3, 1, 2))}
+        h2 = time_step * time_step
+        rows = [torch.stack([k[i, j] for j in (1, 2, 3)]) for i in (1, 2, 3)]
+        self._shear = (h2 * self.mu) * torch.stack(rows)  # h^2 mu S, [3, 3, 1 | B, T]
+        self.edges = self._edges_of(x)
+        self._next, self._last = _rolled(self.edges, 1), _rolled(self.edges, 2)
+        self.normals = _cross(self._next, self._last)  # of det = e_1.(e_2 x e_3) with respect to e_i
+        self.c6 = self.rest[..., 6]
+        self.ratio = self.c6 * (self.edges[0] * self.normals[0]).sum(0)  # J [B, T]
+        total = self.mu + self.lam
+        self._pressure = (h2 / 6) * (total * (self.ratio - 1) - self.mu)
+        self._bulk = (h2 / 6) * total * self.c6
+
+    def _edges_of(self, x: Tensor) -> Tensor:
+        corners = ops.tet_gather(x, *self.model._topology).permute(2, 3, 0, 1).contiguous()
+        return corners[1:] - corners[:1]
+
+    def _summed(self, per_edge: Tensor) -> Tensor:
+        """Contributions to e_1, e_2, e_3 -> sums over the tets of each vertex, in their order."""
+        corners = torch.cat([-per_edge.sum(0, keepdim=True), per_edge])
+        return ops.star_sum(corners.permute(2, 3, 0, 1), *self.model._topology)
+
+    def _sheared(self, edges: Tensor) -> Tensor:
+        first, second, third = self._shear[:, :, None].unbind(1)
+        out = torch.addcmul(first * edges[0], second, edges[1])
+        return torch.addcmul(out, third, edges[2])
+
+    def forces(self) -> Tensor:
+        """h^2 dE/dx [kg m], [B, V, 3]."""
+        total = self._summed(self._sheared(self.edges) + self._pressure * self.normals)
+        for energy, data in self._vertex_energies(self.data):
+            total = total + energy.gradient(self.x, self.x_prev, data, self.h, self.origin)
+        return total
+
+    def inertia(self) -> Tensor:
+        """M (x - y) [kg m], [B, V, 3]."""
+        return self.mass * (self.x - self.y)
+
+    def product(self, w: Tensor) -> Tensor:
+        """Hessian times w, [B, V, 3], rows of pinned vertices included."""
+        f = self._edges_of(w)
+        turned = _cross(_rolled(f, 1), self._last) + _cross(self._next, _rolled(f, 2))
+        stretched = self._bulk * (self.normals * f).sum((0, 1))
+        out = self._summed(self._sheared(f) + self._pressure * turned + stretched * self.normals)
+        out = out + self.mass * w
+        blocks = self.vertex_blocks()
+        return out if blocks is None else out + (blocks * w[..., None, :]).sum(-1)
+
+    def vertex_blocks(self) -> Tensor | None:
+        """3x3 blocks of the energies of single vertices, [B, V, 3, 3], or None where there are none."""
+        if not self.model.vertex_energies:
+            return None
+        if not hasattr(self, "_blocks"):
+            with torch.inference_mode(False), torch.enable_grad():
+                # clones: what was made in inference mode cannot be differentiated
+                x, x_prev, data = (t.detach().clone() for t in (self.x, self.x_prev, self.data))
+                x.requires_grad_()
+                origin = None if self.origin is None else self.origin.detach().clone()
+                pairs = self._vertex_energies(data)
+                total = sum(e.gradient(x, x_prev, part, self.h, origin) for e, part in pairs)
+                assert isinstance(total, Tensor)
+                columns = [torch.autograd.grad(total[..., c].sum(), x, retain_graph=True)[0] for c in range(3)]
+            self._blocks = torch.stack(columns, -1) * self.free[..., None]
+        return self._blocks
+
+    def diagonal(self) -> Tensor:
+        """The 3x3 blocks on the diagonal, [B, V, 3, 3]: positive definite wherever mu >= 0 and mu + lam >= 0."""
+        shear = torch.cat([self._shear.sum((0, 1))[None], self._shear.diagonal().movedim(-1, 0)])  # [4, 1 | B, T]
+        normals = self._corner_normals()
+        eye = torch.eye(3, dtype=shear.dtype, device=shear.device)
+        blocks = self._bulk * normals[:, :, None] * normals[:, None] + shear[:, None, None] * eye[..., None, None]
+        total = ops.star_sum(blocks.permute(3, 4, 0, 1, 2).flatten(-2), *self.model._topology).unflatten(-1, (3, 3))
+        total = total + self.mass[..., None] * eye
+        own = self.vertex_blocks()
+        return total if own is None else total + own
+
+    def edge_blocks(self) -> Tensor:
+        """Blocks off the diagonal of the tets' Hessians: of the corners (a, b) of PAIRS, then of (b, a),
+        [B, T, 12, 9]."""
+        corners = torch.cat([torch.zeros_like(self.edges[:1]), self.edges])
+        normals = self._corner_normals()
+        a, b, c, d = _OF_PAIRS.to(self.x.device)
+        # n_a = dV6/dx_a changes with x_b by arm x dx_b, the arm being the edge between the other two corners
+        arm = self._pressure * (corners[c] - corners[d])  # [6, 3, B, T]
+        blocks = self._bulk * normals[a][:, :, None] * normals[b][:, None]  # [6, 3, 3, B, T]
+        for k, i, j in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
+            blocks[:, i, j] += arm[:, k]
+            blocks[:, j, i] -= arm[:, k]
+        rest = self.rest[..., :6].movedim(-1, 0)
+        blocks.diagonal(dim1=1, dim2=2).add_(((self.h * self.h) * self.mu * rest)[..., None])
+        blocks = blocks.permute(3, 4, 0, 1, 2)
+        return torch.cat([blocks, blocks.transpose(-1, -2)], 2).flatten(-2)
+
+    def _corner_normals(self) -> Tensor:
+        """Derivatives of six volumes with respect to the four corners, [4, 3, B, T]."""
+        return torch.cat([-self.normals.sum(0, keepdim=True), self.normals])
+
+    def dependence(self, w: Tensor, wants: Sequence[bool]) -> list[Tensor | None]:
+        """Gradient of -w . dG/dx, with w fixed and zero where pinned, with respect to the arguments of the sweep.
+
+        wants: for x_start, x_prev, y, mu, lam, mass, rest, energy_data. The first is zero and left to the caller.
+        """
+        h2 = self.h * self.h
+        out: list[Tensor | None] = [None] * 8
+        f = self._edges_of(w)
+        bent = (self.normals * f).sum((0, 1)) / 6  # d(V J) along w, over c6 V = 1/6
+        if wants[2]:
+            out[2] = self.mass * w
+        if wants[5]:
+            out[5] = -(w * (self.x - self.y)).sum(-1)
+        if wants[3] or wants[6]:
+            corners = [torch.cat([torch.zeros_like(a[:1]), a]) for a in (self.edges, f)]
+            stretch = [((corners[0][a] - corners[0][b]) * (corners[1][a] - corners[1][b])).sum(0) for a, b in PAIRS]
+            k = self.rest[..., :6].unbind(-1)
+            if wants[3]:
+                sheared = sum(scalar * s for scalar, s in zip(k, stretch, strict=True))
+                out[3] = h2 * (sheared - (self.ratio - 2) * bent)
+            if wants[6]:
+                shape = torch.broadcast_shapes(bent.shape, self.c6.shape)
+                of_c6 = -h2 * (self.mu + self.lam) * (self.ratio / self.c6) * bent
+                columns = [h2 * self.mu * s for s in stretch] + [of_c6]
+                out[6] = torch.stack([c.expand(shape) for c in columns], -1)
+        if wants[4]:
+            out[4] = -h2 * (self.ratio - 1) * bent
+        if self.model.vertex_energies and (wants[1] or wants[7]):
+            with torch.enable_grad():
+                x_prev, data = (t.detach().requires_grad_() for t in (self.x_prev, self.data))
+                pairs = self._vertex_energies(data)
+                total = sum(e.gradient(self.x.detach(), x_prev, d, self.h, self.origin) for e, d in pairs)
+                assert isinstance(total, Tensor)
+                out[1], out[7] = torch.autograd.grad(-(w * total).sum(), (x_prev, data), allow_unused=True)
+        return out
+
+    def _vertex_energies(self, data: Tensor) -> list[tuple[Any, Tensor]]:
+        """Each energy of single vertices with its part of the data [1 | B, n]."""
+        energies = self.model.vertex_energies
+        sizes = [e.count() * (self.model.num_vertices if e.per_vertex else 1) for e in energies]
+        return list(zip(energies, data.split(sizes, -1), strict=True)) if energies else []

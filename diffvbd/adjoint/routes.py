@@ -1,0 +1,125 @@
+"""Adjoint routes: small objects given to the one step function. docs/adjoints.md says when to use which."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from .. import ops
+from ..checks import check_count, check_positive, fail
+
+FULL_TAPE_LIMIT = 256 * 2**20  # bytes of full tape per step up to which "auto" keeps it
+
+
+@dataclass(frozen=True)
+class ReverseSweep:
+    """The executed sweeps backwards: exact for every number of sweeps, without a global system. Recommended.
+
+    Args:
+        tape: What a step keeps for its backward, per active vertex and sweep (float64):
+            ``"full"`` 72 bytes, raw update and factored block (96 with a floor, whose gaps must come back to the bit);
+            ``"compact"`` 24 bytes, raw update, or with a floor the old position; blocks are assembled again;
+            ``"recompute"`` nothing; the backward runs the step again;
+            ``"auto"`` full while a step's full tape fits 256 MiB, compact beyond; a rollout that keeps all its tapes
+            decides by their sum against 2 GiB.
+
+    Source: paper, section 3; docs/method.md, sections 3 and 7.
+    """
+
+    tape: Literal["auto", "full", "compact", "recompute"] = "auto"
+
+    def __post_init__(self) -> None:
+        if self.tape not in ("auto", "full", "compact", "recompute"):
+            fail("tape", '"auto", "full", "compact" or "recompute"', repr(self.tape))
+
+    def policy(self, scalars_per_row: int, itemsize: int, energies: int) -> int:
+        """The tape policy of ops.py for a step of scalars_per_row = scenes x sweeps x active vertices."""
+        if self.tape == "auto":
+            full = scalars_per_row * itemsize * ops.tape_rows(ops.FULL_TAPE, energies)
+            return ops.FULL_TAPE if full <= FULL_TAPE_LIMIT else ops.COMPACT_TAPE
+        return {"full": ops.FULL_TAPE, "compact": ops.COMPACT_TAPE, "recompute": ops.NO_TAPE}[self.tape]
+
+
+@dataclass(frozen=True)
+class Unrolled:
+    """torch.autograd through the executed colored sweep in plain torch (``diffvbd.reference``).
+
+    Exact for every number of sweeps, as ReverseSweep is, at a hundred times its time and tens of times its memory: for
+    checking a gradient, or for a formula that is not compiled yet. Not recommended otherwise. The forward is plain
+    torch too: it agrees with the compiled one to rounding, not to the bit.
+    """
+
+
+@dataclass(frozen=True)
+class LinearSolve:
+    """How the linear solves of one step's backward ended; what GlobalAdjoint hands to its ``report``.
+
+    Attributes:
+        iterations: Of conjugate gradients, the most over all scenes.
+        residual: |b - A w| / |b|, computed anew at the end, the largest over all scenes.
+        converged: Whether every scene met the tolerance.
+    """
+
+    iterations: int
+    residual: float
+    converged: bool
+
+
+@dataclass(frozen=True)
+class GlobalAdjoint:
+    """The adjoint of the equation, not of the solver: one linear system per step with the Hessian of the incremental
+    potential at the executed end state, solved by preconditioned conjugate gradients (3x3 blocks of vertices).
+
+    Right where the sweeps have converged, as after :func:`diffvbd.solve`; before, wrong in size and even in sign. Keeps
+    no tape: memory does not grow with the sweeps. Not recommended for steps of few
+    sweeps. Its backward waits for the device, so that it cannot be captured in a CUDA graph, and is not available to
+    ``torch.func``.
+
+    Args:
+        assembled: Store the Hessian as a sparse matrix of 3V x 3V; else multiply with it matrix-free, tet by tet.
+        tolerance: Relative residual |b - A w| / |b| at which a scene's solve ends, in (0, 1); None: 1e-10 in float64,
+            1e-5 in float32. An ill-conditioned system may not get there: then the solve fails.
+        max_iterations: Of conjugate gradients; None: ten times the unknowns of a scene, at most 10,000.
+        on_failure: ``"raise"`` a RuntimeError, or ``"warn"`` and go on, where a solve does not meet the tolerance.
+        report: Called with a :class:`diffvbd.LinearSolve` after each backward of a step, e.g. ``solves.append``.
+
+    Raises:
+        RuntimeError: In the backward, for a solve that fails, for adjoints that are not finite, and while a CUDA graph
+            is captured.
+        NotImplementedError: In the backward, for second derivatives.
+
+    Source: paper, eq. 5 (right) and section 6.3; docs/adjoints.md.
+    """
+
+    assembled: bool = True
+    tolerance: float | None = None
+    max_iterations: int | None = None
+    on_failure: Literal["raise", "warn"] = "raise"
+    report: Callable[[LinearSolve], object] | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.assembled, bool):
+            raise TypeError(f"assembled: expected a bool, got {type(self.assembled).__name__}")
+        if self.tolerance is not None and check_positive("tolerance", self.tolerance) >= 1:
+            fail("tolerance", "a number in (0, 1)", self.tolerance)
+        if self.max_iterations is not None:
+            check_count("max_iterations", self.max_iterations, 1)
+        if self.on_failure not in ("raise", "warn"):
+            fail("on_failure", '"raise" or "warn"', repr(self.on_failure))
+        if self.report is not None and not callable(self.report):
+            raise TypeError(f"report: expected a function of a LinearSolve, got {type(self.report).__name__}")
+
+
+Adjoint = ReverseSweep | Unrolled | GlobalAdjoint
+
+
+def check_adjoint(adjoint: Adjoint | None) -> Adjoint:
+    """The route to take; None is the default one."""
+    if adjoint is None:
+        return ReverseSweep()
+    if not isinstance(adjoint, (ReverseSweep, Unrolled, GlobalAdjoint)):
+        kinds = "diffvbd.ReverseSweep, Unrolled or GlobalAdjoint"
+        got = f"the class {adjoint.__name__}" if isinstance(adjoint, type) else type(adjoint).__name__
+        raise TypeError(f"adjoint: expected a {kinds}, got {got}")
+    return adjoint

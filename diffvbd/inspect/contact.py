@@ -1,0 +1,119 @@
+"""What contact has done, and contact between whole bodies: ``diffvbd.contact``."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ..checks import check_count, fail
+from ..model.model import Model
+from ..reference.intersections import intersections as _intersections
+from ..scopes import record_to
+from ..step.contact import Detection, outcomes
+from .penalty import Bodies, center_of_mass_penalty
+
+__all__ = ["Bodies", "Detection", "Status", "center_of_mass_penalty", "intersections", "record", "reserve", "status"]
+
+
+@dataclass(frozen=True)
+class Status:
+    """How the latest step of a Model went.
+
+    Attributes:
+        pairs: The most pairs of one detection, of all scenes.
+        capacity: Pairs that fit, of all scenes; with more, an eager step has raised, a captured one returned NaN.
+        touching: Pairs without a gap that detections found (the step has raised or returned NaN).
+        above_bounds: Prescribed vertices and collider points moved above their bound (likewise).
+        cut: Vertices whose motion a bound has cut: they lost velocity that no force took, [scenes].
+        smallest_gap: The smallest gap that a detection found [m], or the search distance, [scenes].
+    """
+
+    pairs: int
+    capacity: int
+    touching: int
+    above_bounds: int
+    cut: list[int]
+    smallest_gap: list[float]
+
+    @property
+    def overflowed(self) -> bool:
+        return self.pairs > self.capacity
+
+
+def status(model: Model) -> Status:
+    """How the latest step of ``model`` went, in a replayed CUDA graph that of the replay; a backward with checkpoints
+    runs steps again, and counts. Waits for the device.
+
+    Raises:
+        ValueError: If the Model has taken no step with contact yet.
+    """
+    if not isinstance(model, Model):
+        raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
+    outcome = outcomes.get(model)
+    if outcome is None:
+        fail("model", "one that has taken a step with a PairBarrier", "none so far")
+    counts = outcome.counts
+    return Status(
+        pairs=int(counts[:, 0].max()),
+        capacity=outcome.capacity,
+        touching=int(counts[:, 1].sum()),
+        above_bounds=int(counts[:, 3].sum()),
+        cut=torch.stack(outcome.cut).amax(0).sum(-1).tolist() if outcome.cut else [],
+        smallest_gap=outcome.smallest.min(0).values.tolist(),
+    )
+
+
+def reserve(model: Model, pairs: int) -> None:
+    """Gives a Model room for ``pairs`` pairs per scene, from its next step on. A captured graph keeps the room that it
+    was captured with.
+
+    Raises:
+        ValueError, TypeError: If the Model has no PairBarrier, or for a number < 1.
+    """
+    if not isinstance(model, Model):
+        raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
+    surface = model.surface_of_contact
+    if surface is None or model.contact is None:
+        fail("model", "a PairBarrier among its energies", "none")
+    pairs = check_count("pairs", pairs, 1, 2**26)
+    model.surface_of_contact = replace(surface, capacity=pairs)
+    barrier = replace(model.contact, capacity=pairs)
+    model._set_energies(tuple(barrier if e is model.contact else e for e in model.energies))
+    for energy in model.parametric_energies:  # here, so that a step that is captured copies nothing from the host
+        model.constants(energy)
+
+
+@contextlib.contextmanager
+def record() -> Iterator[list[Detection]]:
+    """Inside, the detections of all steps (those that a checkpointed backward runs again, too) are appended to the list
+    that it gives: which pairs were near, for looking at and for comparing with ``diffvbd.reference.contact_step``.
+    Steps of other threads and tasks are not recorded, those under torch.compile are."""
+    found: list[Detection] = []
+    with record_to(found):
+        yield found
+
+
+def intersections(model: Model, x: Tensor) -> Tensor:
+    """Edges of the bodies' surfaces that pass through a triangle, [n, 3]: scene, edge row, triangle row of the surface.
+
+    Every edge is compared with every triangle that does not share a vertex with it: slow, apart from detection, for
+    checking a start or a result.
+
+    Args:
+        x: Positions [m], shape [..., V, 3].
+    """
+    from ..contact.colliders import unique_edges
+
+    if x.shape[-2:] != (model.num_vertices, 3):
+        fail("x", f"shape [..., {model.num_vertices}, 3]", f"shape {list(x.shape)}")
+    triangles = model.mesh.surface
+    edges = unique_edges(triangles)
+    found = []
+    for scene, points in enumerate(x.detach().reshape(-1, model.num_vertices, 3).cpu().double()):
+        pairs = torch.as_tensor(_intersections(points, triangles, edges), device="cpu").reshape(-1, 2)
+        found.append(torch.cat([torch.full((len(pairs), 1), scene, device="cpu"), pairs], 1))
+    return torch.cat(found) if found else torch.zeros((0, 3), dtype=torch.int64, device="cpu")

@@ -1,0 +1,299 @@
+"""Checks of a state, and of the step that led to it, against the limits of docs/numerics.md. Plain torch, no sweeps."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.linalg import cross
+
+from .. import reference
+from ..checks import check_positive, fail
+from ..model.model import Model
+from ..model.moduli import moduli_of
+from ..model.warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
+from ..step.arguments import GRAVITY, check_prescribed, check_state
+
+# Limits with their measurements in docs/numerics.md
+SATURATION_TOO_LARGE = 1.0  # c over the mean edge: one update may then turn a tet inside out
+SATURATION_TOO_SMALL = 0.01  # c over the mean edge: 20 sweeps no longer reach a large deformation
+RESOLUTION = 1e-5  # rounding of a position over the shortest edge; a gradient's error is 6 to 22 times that
+LARGE_STRAIN = 100.0  # Green strain; a gradient keeps 11 digits there and loses them with a power of the strain
+UNBALANCED = 0.01  # left-over force over the forces of the step; at 0.014 a hanging bar rests 1.5 to 11 % off
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Result of :func:`diagnose`. Numbers are the worst over scenes; None where an argument was not given.
+
+    Attributes:
+        messages: What crosses a limit, one sentence each; empty when nothing does.
+        collapsing: Tets inside the F = 0 well, bool, shape [..., T].
+        inverted: Tets with J <= 0, bool, shape [..., T].
+        nonfinite: Vertices whose position is NaN or Inf, bool, shape [..., V].
+        smallest_volume_ratio: min J [-].
+        largest_strain: max Frobenius norm of the Green strain (F^T F - I) / 2 [-].
+        collapse_margin: min |F| / (sqrt(3) s*) [-]; a tet is lost below 1.
+        resolution: Spacing of the Model's numbers at the largest coordinate over the shortest edge [-]. float32
+            computes about a point of each body, but stores positions as they are given.
+        courant: Largest number of elements that a pressure wave crosses in one step [-].
+        stiffness: Largest ratio of the elastic to the inertial part of a vertex block [-].
+        unbalanced: Left-over force of the step, |dG/dx| / h^2, over its elastic and inertial forces (2-norms) [-].
+    """
+
+    messages: list[str]
+    collapsing: Tensor = field(repr=False)
+    inverted: Tensor = field(repr=False)
+    nonfinite: Tensor = field(repr=False)
+    smallest_volume_ratio: float
+    largest_strain: float
+    collapse_margin: float
+    resolution: float
+    courant: float | None
+    stiffness: float | None
+    unbalanced: float | None
+
+    @property
+    def ok(self) -> bool:
+        return not self.messages
+
+    def __str__(self) -> str:
+        rows = [
+            ("collapsing tets", int(self.collapsing.sum())),
+            ("inverted tets", int(self.inverted.sum())),
+            ("smallest J", self.smallest_volume_ratio),
+            ("largest Green strain", self.largest_strain),
+            ("|F| over the collapse radius", self.collapse_margin),
+            ("rounding over shortest edge", self.resolution),
+            ("elements a wave crosses per step", self.courant),
+            ("elastic over inertial block", self.stiffness),
+            ("left-over force of the step", self.unbalanced),
+        ]
+        lines = [f"{name:<34}{value:.4g}" for name, value in rows if value is not None]
+        return "\n".join(lines + [f"warning: {message}" for message in self.messages])
+
+
+def diagnose(
+    model: Model,
+    x: Tensor,
+    *,
+    mu: float | Tensor | None = None,
+    lam: float | Tensor | None = None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
+    time_step: float | None = None,
+    previous: tuple[Tensor, Tensor] | None = None,
+    force: Tensor | None = None,
+    gravity: Sequence[float] | Tensor = GRAVITY,
+    prescribed: Tensor | None = None,
+    parameters: dict[str, Any] | None = None,
+    warn: bool = True,
+) -> Diagnosis:
+    """Looks for what makes a result unreliable: collapsed or inverted tets, lost digits, safeguards out of scale, too
+    few sweeps. Not differentiable; call it on a first and a last frame, not in every step.
+
+    Args:
+        model: The scene.
+        x: Positions [m], shape [..., V, 3].
+        mu, lam, young, poisson: Material, as in :func:`diffvbd.step`.
+        time_step: h [s]; needed for the Courant number, the stiffness and the left-over force.
+        previous: State (x, v) from which one step led to ``x``; needed for the left-over force. force [N],
+            gravity [m/s^2], prescribed [m] and parameters are then those of that step.
+        warn: Also emit each message as a UserWarning.
+
+    Returns:
+        A :class:`Diagnosis`; print it for a table.
+
+    Raises:
+        ValueError, TypeError: As :func:`diffvbd.step`; also for ``previous`` without ``time_step``.
+
+    The F = 0 well: with s* the root of s^3 + s^2 + s = mu / (mu + lam), the elastic stress pulls every F with
+    |F| < sqrt(3) s* towards 0 when lam >= 0 (docs/numerics.md, with the proof).
+    """
+    lead = check_state(model, x, x)
+    mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
+    if previous is not None and model.touches:
+        raise NotImplementedError("previous: the left-over force of a step with contact or friction is not computed")
+    if previous is not None and time_step is None:
+        fail("time_step", "a number in [s] where previous is given", None)
+    state = x.detach().to(torch.float64)
+    mu, lam = (_as(a, state) for a in (mu, lam))
+    points = torch.from_numpy(model.mesh.points.copy()).to(state)
+    nonfinite = ~torch.isfinite(state).all(-1)
+    gradients, volume = _shape_gradients(points[model.tets])
+    edges = state[..., model.tets[:, 1:], :] - state[..., model.tets[:, :1], :]  # [..., T, 3, 3], rows are edges
+    f = (edges[..., :, :, None] * gradients[:, 1:, None, :]).sum(-3)  # F_ij = sum_a e_ai (grad N_a)_j
+    norm = f.square().sum((-2, -1)).sqrt()
+    det = (cross(f[..., 0, :], f[..., 1, :]) * f[..., 2, :]).sum(-1)
+    green = 0.5 * ((f[..., :, :, None] * f[..., :, None, :]).sum(-3) - torch.eye(3, dtype=f.dtype, device=f.device))
+    critical = collapse_stretch(mu, lam)
+    margin = norm / (3**0.5 * critical)
+    edge = _edge_lengths(points, model.tets)
+    courant = stiffness = unbalanced = None
+    if time_step is not None:
+        h = check_positive("time_step", time_step, "s")
+        stiffness = _largest(h * h * _block_ratio(model, gradients, volume, mu, lam))
+        speed = ((lam + 2 * mu) / model.density.to(state)).clamp(min=0).sqrt()
+        height = 1 / gradients.square().sum(-1).amax(-1).sqrt()  # the shortest of a tet's four
+        courant = _largest(h * speed / height)
+        if previous is not None:
+            unbalanced = _unbalanced(model, state, points, previous, mu, lam, h, force, gravity, prescribed, parameters)
+    spacing = torch.finfo(model.dtype).eps * _largest(state.abs())
+    result = Diagnosis(
+        messages=[],
+        collapsing=margin < 1,
+        inverted=det <= 0,
+        nonfinite=nonfinite,
+        smallest_volume_ratio=-_largest(-det) if det.numel() else 1.0,
+        largest_strain=_largest(green.square().sum((-2, -1)).sqrt()),
+        collapse_margin=-_largest(-margin) if margin.numel() else float("inf"),
+        resolution=spacing / float(edge.min()) if edge.numel() else 0.0,
+        courant=courant,
+        stiffness=stiffness,
+        unbalanced=unbalanced,
+    )
+    result.messages.extend(_state_messages(model, result) + _setting_messages(model, mu, lam, edge))
+    if warn:
+        for message in result.messages:
+            warnings.warn(f"diffvbd: {message}", stacklevel=2)
+    return result
+
+
+def collapse_stretch(mu: Tensor, lam: Tensor) -> Tensor:
+    """s*, the uniform stretch below which a tet collapses to a point: the root of s^3 + s^2 + s = mu / (mu + lam).
+
+    Args:
+        mu, lam: [Pa], broadcast together.
+
+    Returns:
+        s* [-] of that shape: 0 at mu = 0, 0.343 at mu = lam, 0.544 at lam = 0.
+    """
+    total = mu + lam
+    ratio = torch.where(total > 0, mu / torch.where(total > 0, total, torch.ones_like(total)), torch.zeros_like(total))
+    s = ratio / (1 + ratio)  # Newton on a convex increasing cubic converges from any s >= 0
+    for _ in range(60):
+        s = s - (((s + 1) * s + 1) * s - ratio) / ((3 * s + 2) * s + 1)
+    return s
+
+
+def _shape_gradients(corners: Tensor) -> tuple[Tensor, Tensor]:
+    """grad N_a [1/m] of each tet, [T, 4, 3], and volumes [m^3]."""
+    e1, e2, e3 = (corners[:, a] - corners[:, 0] for a in (1, 2, 3))
+    n1, n2, n3 = cross(e2, e3), cross(e3, e1), cross(e1, e2)
+    six = (e1 * n1).sum(-1)
+    return torch.stack([-(n1 + n2 + n3), n1, n2, n3], 1) / six[:, None, None], six / 6
+
+
+def _edge_lengths(points: Tensor, tets: Tensor) -> Tensor:
+    pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+    return torch.stack([(points[tets[:, a]] - points[tets[:, b]]).norm(dim=-1) for a, b in pairs], -1)
+
+
+def _block_ratio(model: Model, gradients: Tensor, volume: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
+    """Largest eigenvalue bound of each active vertex's elastic block at rest over its mass [1/s^2], [..., V]."""
+    stiffness = (volume * (2 * mu + lam))[..., None] * gradients.square().sum(-1)  # [..., T, 4]
+    shape = (*stiffness.shape[:-2], model.num_vertices)
+    total = stiffness.new_zeros(shape).index_add(-1, model.tets.reshape(-1), stiffness.flatten(-2))
+    return total[..., model.color_vertices] / model.mass.to(total)[model.color_vertices]
+
+
+def _unbalanced(
+    model: Model,
+    x: Tensor,
+    points: Tensor,
+    previous: tuple[Tensor, Tensor],
+    mu: Tensor,
+    lam: Tensor,
+    h: float,
+    force: Tensor | None,
+    gravity: Sequence[float] | Tensor,
+    prescribed: Tensor | None,
+    parameters: dict[str, Any] | None,
+) -> float:
+    check_state(model, *previous)
+    check_prescribed(model, prescribed, previous[0])
+    x0, v0 = (t.detach().to(torch.float64) for t in previous)
+    mass = model.mass.to(torch.float64)[:, None]
+    acceleration = _as(gravity, x)
+    if force is not None:
+        acceleration = acceleration + force.detach().to(x) / torch.where(mass > 0, mass, torch.ones_like(mass))
+    y = x0 + h * v0 + h * h * acceleration
+    pinned = model.pinned[:, None]
+    y = torch.where(pinned, x0 if prescribed is None else prescribed.detach().to(x), y)
+    options = {"rest_points": points, "parameters": parameters}
+    left = reference.residual(model, x, y, mu, lam, h, x0, **options)
+    inertia = mass * (x - y)
+    # at a pinned vertex the residual is the reaction that holds it, not an error
+    left, inertia = (torch.where(pinned, 0.0, t) for t in (left, inertia))
+    scale = (left - inertia).flatten(-2).norm(dim=-1) + inertia.flatten(-2).norm(dim=-1)
+    ratio = left.flatten(-2).norm(dim=-1) / torch.where(scale > 0, scale, torch.ones_like(scale))
+    return _largest(ratio)
+
+
+def _as(value: Any, like: Tensor) -> Tensor:
+    """Numbers or a tensor in like's dtype; python numbers do not pass through float32."""
+    return torch.as_tensor(value, dtype=like.dtype, device=like.device).detach()
+
+
+def _largest(values: Tensor) -> float:
+    return float(values.max()) if values.numel() else 0.0
+
+
+def _state_messages(model: Model, result: Diagnosis) -> list[str]:
+    out = []
+    if bool(result.nonfinite.any()):
+        first = result.nonfinite.nonzero()[0].tolist()
+        out.append(f"{int(result.nonfinite.sum())} positions are NaN or Inf, the first at {first}; run again inside "
+                   "diffvbd.debug_checks() to learn where they appear")  # fmt: skip
+    if bool(result.collapsing.any()):
+        first = result.collapsing.nonzero()[0].tolist()
+        out.append(f"{int(result.collapsing.sum())} tets are inside the F = 0 well (|F| < sqrt(3) s*), the first at "
+                   f"{first}: the material pulls them to a point and nothing brings them back")  # fmt: skip
+    if bool(result.inverted.any()):
+        out.append(
+            f"{int(result.inverted.sum())} tets are inverted (J <= 0), smallest J {result.smallest_volume_ratio:.3g}"
+        )
+    if result.largest_strain > LARGE_STRAIN:
+        out.append(f"the largest Green strain is {result.largest_strain:.3g}: gradients lose digits beyond "
+                   f"{LARGE_STRAIN:g}")  # fmt: skip
+    if result.resolution > RESOLUTION:
+        out.append(f"positions are rounded to {result.resolution:.1e} of the shortest edge: move the scene to the "
+                   "origin, or use float64")  # fmt: skip
+    if result.unbalanced is not None and result.unbalanced > UNBALANCED:
+        faster = ", or relaxation between 1.5 and 1.7" if model.relaxation < 1.5 else ""
+        out.append(f"the step left {100 * result.unbalanced:.2g} % of its forces unbalanced: take more sweeps or a "
+                   f"smaller time step{faster}")  # fmt: skip
+    return out
+
+
+def _setting_messages(model: Model, mu: Tensor, lam: Tensor, edge: Tensor) -> list[str]:
+    out = []
+    paper = any(getattr(e, "block", "") == "paper" for e in model.energies)
+    if bool((3 * lam + 2 * mu < 0).any()):
+        out.append("lam < -2/3 mu: the bulk modulus is negative and the rest state unstable")
+    if paper and model.saturation is None and bool((lam < mu).any()):
+        out.append('block="paper" with lam < mu and no saturation: an update may raise the potential')
+    if paper and model.saturation is None and model.relaxation > 1:
+        out.append('block="paper" with relaxation above 1 and no saturation diverges on many scenes')
+    if model.relaxation > STABLE_RELAXATION:
+        out.append(f"relaxation {model.relaxation:g} is above {STABLE_RELAXATION:g}: each step descends, but rollouts "
+                   "may grow")  # fmt: skip
+    if edge.numel() == 0 or model.num_active == 0:
+        return out
+    if model.saturation is not None:
+        ratio = model.saturation / float(edge.mean())
+        if ratio > SATURATION_TOO_LARGE:
+            out.append(
+                f"saturation {model.saturation:g} m is {ratio:.3g} mean edges: it never limits an update of this mesh"
+            )
+        if ratio < SATURATION_TOO_SMALL:
+            out.append(f"saturation {model.saturation:g} m is {ratio:.3g} mean edges: sweeps move by that little")
+    lightest = float(model.mass[model.color_vertices].min())
+    if model.regularization > HEAVY_REGULARIZATION * lightest:
+        out.append(f"regularization {model.regularization:g} kg is {model.regularization / lightest:.3g} of the "
+                   "lightest vertex: it slows every update")  # fmt: skip
+    return out

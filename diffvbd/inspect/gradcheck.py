@@ -1,0 +1,90 @@
+"""Comparison of a scene's gradients with central differences, for users who want to see it on their own scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..checks import fail
+
+
+@dataclass(frozen=True)
+class GradientCheck:
+    """Result of :func:`check_gradients`: one row (name, |gradient|, adjoint, difference, error) for each argument."""
+
+    rows: list[tuple[str, float, float, float, float]]
+    tolerance: float
+
+    @property
+    def ok(self) -> bool:
+        return all(row[4] <= self.tolerance for row in self.rows)
+
+    def __str__(self) -> str:
+        lines = [f"{'argument':<24}{'|gradient|':>12}{'adjoint . u':>20}{'difference . u':>20}{'error':>10}"]
+        for name, size, adjoint, difference, error in self.rows:
+            mark = "" if error <= self.tolerance else "  <-- above tolerance"
+            lines.append(f"{name:<24}{size:>12.4g}{adjoint:>20.12g}{difference:>20.12g}{error:>10.1e}{mark}")
+        return "\n".join(lines)
+
+
+def check_gradients(
+    loss: Callable[..., Tensor],
+    arguments: dict[str, Tensor],
+    *,
+    relative_steps: Sequence[float] = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7),
+    tolerance: float = 1e-6,
+    seed: int = 0,
+    verbose: bool = True,
+) -> GradientCheck:
+    """Checks the gradient of ``loss(**arguments)`` against central differences along random directions.
+
+    For each argument the difference quotient is taken at several steps and the one nearest the adjoint counts: large
+    steps truncate, small ones round, and where a contact or filter switches there may be no good step at all.
+
+    Args:
+        loss: Any scalar function of tensors, typically a few steps and a sum.
+        arguments: float64 tensors by name, of any shape.
+        relative_steps: Steps relative to the size of the argument (1 where it is zero).
+        tolerance: Largest error |adjoint - difference| / max(|adjoint|, |difference|) that counts as agreement.
+        seed: Of the directions.
+        verbose: Print the table.
+
+    Returns:
+        A :class:`GradientCheck`; ``ok`` says whether every argument agrees within the tolerance.
+
+    Raises:
+        ValueError: If an argument is not float64 or the loss is not a scalar.
+    """
+    for name, value in arguments.items():
+        if not isinstance(value, Tensor) or value.dtype != torch.float64:
+            fail(name, "a float64 tensor", getattr(value, "dtype", type(value).__name__))
+    leaves = {k: t.detach().clone().requires_grad_() for k, t in arguments.items()}
+    value = loss(**leaves)
+    if value.numel() != 1:
+        fail("loss", "a scalar", f"shape {list(value.shape)}")
+    grads = torch.autograd.grad(value, list(leaves.values()), allow_unused=True, materialize_grads=True)
+    generator = torch.Generator("cpu").manual_seed(seed)
+    rows = []
+    for (name, leaf), grad in zip(leaves.items(), grads, strict=True):
+        fixed = {k: t.detach() for k, t in leaves.items()}
+        direction = torch.randn(leaf.shape, dtype=leaf.dtype, generator=generator, device="cpu").to(leaf.device)
+        adjoint = float((grad * direction).sum())
+        scale = float(leaf.detach().nan_to_num(nan=0.0).abs().max()) if leaf.numel() else 0.0
+        best = (float("inf"), 0.0)
+        for relative in relative_steps:
+            eps = relative * (scale or 1.0)
+            with torch.no_grad():
+                ahead = loss(**{**fixed, name: leaf + eps * direction})
+                behind = loss(**{**fixed, name: leaf - eps * direction})
+            difference = float(ahead - behind) / (2 * eps)
+            size = max(abs(adjoint), abs(difference))
+            error = abs(adjoint - difference) / size if size > 0 else 0.0
+            best = min(best, (error, difference))
+        rows.append((name, float(grad.norm()), adjoint, best[1], best[0]))
+    result = GradientCheck(rows, tolerance)
+    if verbose:
+        print(result)
+    return result

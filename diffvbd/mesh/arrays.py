@@ -1,0 +1,55 @@
+"""Arrays that users give: copies in one dtype, of a checked shape, finite."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+def to_numpy(array: Any) -> NDArray[Any]:
+    """`array` as a numpy array; torch tensors are detached and brought to the CPU first (torch is not imported)."""
+    if hasattr(array, "detach"):
+        array = array.detach().cpu()
+    return np.asarray(array)
+
+
+def float_array(name: str, array: Any, shape: tuple[int | None, ...]) -> FloatArray:
+    """A finite float64 copy of `array`; None in `shape` stands for any length."""
+    values = to_numpy(array)
+    if values.size and values.dtype.kind not in "fiu":
+        raise TypeError(f"{name}: expected real numbers, got dtype {values.dtype}")
+    _check_shape(name, values, shape)
+    values = np.array(values, dtype=np.float64, order="C")
+    if not np.isfinite(values).all():
+        if values.ndim == 0:
+            raise ValueError(f"{name}: expected a finite number, got {values}")
+        bad = np.unique(np.nonzero(~np.isfinite(values))[0])
+        raise ValueError(f"{name}: expected finite numbers, got NaN or Inf in {listed(bad, 'row')}")
+    return values
+
+
+def int_array(name: str, array: Any, shape: tuple[int | None, ...]) -> IntArray:
+    """An int64 copy of `array`; floats are refused, even whole ones."""
+    values = to_numpy(array)
+    if values.size and values.dtype.kind not in "iu":
+        raise TypeError(f"{name}: expected integers, got dtype {values.dtype}")
+    _check_shape(name, values, shape)
+    return np.array(values, dtype=np.int64, order="C")
+
+
+def _check_shape(name: str, values: NDArray[Any], shape: tuple[int | None, ...]) -> None:
+    fits = values.ndim == len(shape) and all(want in (None, got) for want, got in zip(shape, values.shape, strict=True))
+    if not fits:
+        wanted = ", ".join("*" if n is None else str(n) for n in shape)
+        raise ValueError(f"{name}: expected shape [{wanted}], got {list(values.shape)}")
+
+
+def listed(ids: IntArray, noun: str) -> str:
+    """'3 tets: 1, 5, 9', at most five of them."""
+    shown = ", ".join(map(str, ids[:5])) + (", ..." if len(ids) > 5 else "")
+    return f"{len(ids)} {noun}{'' if len(ids) == 1 else 's'}: {shown}"

@@ -1,0 +1,84 @@
+"""What a Model is given, checked and in the form that it keeps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import ops
+from ..checks import check_readable, fail, to_float
+from ..contact.barrier import Friction, PairBarrier
+from ..energies import VERTEX_ENERGIES, StableNeoHookean, VertexEnergy
+
+Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction
+
+
+def checked_device(device: torch.device | str) -> torch.device:
+    """A device that there is an object for; "cuda" is the current one."""
+    try:
+        device = torch.device(device)
+    except (RuntimeError, TypeError):
+        fail("device", '"cpu" or "cuda"', repr(device))
+    if device.type not in ops.LANES:
+        fail("device", '"cpu" or "cuda"', repr(str(device)))
+    if device.type == "cuda":
+        ops.require_cuda()
+        if device.index is None:
+            device = torch.device("cuda", torch.cuda.current_device())
+    return device
+
+
+def checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
+    """At most one energy of each kind, with detached tensors that fit the mesh."""
+    kinds = (StableNeoHookean, *VERTEX_ENERGIES, PairBarrier, Friction)
+    if isinstance(energies, kinds):
+        energies = (energies,)
+    out: list[Energy] = []
+    if not isinstance(energies, (tuple, list)):
+        raise TypeError(f"energies: expected a sequence of energies, got {type(energies).__name__}")
+    for energy in energies:
+        if not isinstance(energy, kinds):
+            names = ", ".join(k.__name__ for k in kinds)
+            raise TypeError(f"energies: expected instances of {names}, got {type(energy).__name__}")
+        if any(type(energy) is type(other) for other in out):
+            fail("energies", f"one {type(energy).__name__} (several planes are one FloorBarrier)", "two")
+        if isinstance(energy, VertexEnergy):
+            energy.check(num_vertices)
+            energy = energy.detached()
+        out.append(energy)
+    return tuple(out)
+
+
+def per_tet_density(density: Any, num_tets: int) -> Tensor:
+    """The density of each tet [kg/m^3], float64 [T]."""
+    if isinstance(density, bool) or not (isinstance(density, (int, float)) or hasattr(density, "__array__")):
+        raise TypeError(f"density: expected a number or shape [{num_tets}], got {type(density).__name__}")
+    if isinstance(density, Tensor):
+        check_readable("density", density)
+    elif isinstance(density, int):
+        density = to_float("density", density)
+    density = torch.as_tensor(density).detach().cpu().to(torch.float64)
+    if density.shape not in ((), (1,), (num_tets,)):
+        fail("density", f"a number or shape [{num_tets}]", f"shape {list(density.shape)}")
+    if not bool((torch.isfinite(density) & (density > 0)).all()):
+        wrong = density.reshape(-1)[~(torch.isfinite(density) & (density > 0)).reshape(-1)]
+        fail("density", "finite numbers > 0 kg/m^3", float(wrong[0]))
+    return density.expand(num_tets).clone()
+
+
+def checked_correction(rigid: Any, start: Any, energies: tuple[Energy, ...]) -> tuple[bool, str]:
+    """Whether free bodies are corrected, and where the sweeps of the others start."""
+    touches = any(isinstance(e, (PairBarrier, Friction)) for e in energies)
+    if start not in ("auto", "predictor", "inertia"):
+        fail("start", '"auto", "predictor" or "inertia"', repr(start))
+    if start == "inertia" and any(isinstance(e, PairBarrier) for e in energies):
+        fail("start", '"auto" or "predictor" beside a PairBarrier, whose steps go to y in parts', '"inertia"')
+    if rigid is None:  # tets without stiffness are no body
+        return not touches and any(isinstance(e, StableNeoHookean) for e in energies), start
+    if not isinstance(rigid, bool):
+        raise TypeError(f"rigid: expected True, False or None, got {type(rigid).__name__}")
+    if rigid and touches:
+        fail("rigid", "False beside a PairBarrier or Friction, which the correction does not see", "True")
+    return rigid, start

@@ -1,0 +1,392 @@
+"""Model: everything that does not change while a scene is simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .. import ops
+from ..checks import check_number, check_positive, fail, vertex_mask
+from ..contact.barrier import Friction, PairBarrier
+from ..contact.colliders import Collider
+from ..contact.surface import ContactSurface, build_surface, check_colliders
+from ..energies import VERTEX_ENERGIES, FloorBarrier, StableNeoHookean, VertexEnergy
+from ..lasting import lasting, lasting_tensors
+from ..mask import CONTACT, ELASTIC
+from ..mesh import TetMesh
+from ..ops import regimes
+from ..safeguards import FILTER_ETA, SATURATION_EPS
+from .arguments import Energy, checked_correction, checked_device, checked_energies, per_tet_density
+from .bodies import find_bodies
+from .rest import lumped_mass, rest_metric
+from .warnings import warn_of
+
+PAPER_SATURATION = 0.1  # [m]
+PAPER_REGULARIZATION = 1e-6  # [kg]
+
+
+def _copy(name: str, text: str) -> Any:
+    """A property that hands out copies of a tensor: what is done to one in place does not reach the Model."""
+    return property(lambda self: getattr(self, name).clone(), doc=text)
+
+
+class Model:
+    """A mesh with its masses, pins, energies and safeguards, colored and laid out for the sweeps.
+
+    A Model holds detached constants; what is differentiated is an argument of :func:`diffvbd.step`.
+
+    Args:
+        mesh: Tetrahedra with positive rest volume.
+        density: [kg/m^3], a number or one for each tet, shape [T].
+        pinned: Vertices that sweeps do not move: a bool mask [V] or indices.
+        energies: At most one of each kind.
+        saturation: c [m]: every update d is shortened to c d / (|d| + c). None: off.
+        regularization: tau [kg], added to the diagonal of every block. 0: off.
+        relaxation: omega, 0 < omega < 2, multiplies every update. Above 1 it needs fewer sweeps; use it with the exact
+            block or with saturation (docs/numerics.md).
+        rigid: Whether each step moves every free body as a whole to where the step's potential is least, before and
+            after the sweeps (docs/method.md, section 14): it rests, falls and spins right at any number of sweeps. The
+            last sweep of a step then has a relaxation of at most 1. None: where there is no contact of pairs and no
+            friction, which it does not see yet.
+        start: Where the sweeps of the other bodies start: ``"predictor"`` (y, with gravity and forces), ``"inertia"``
+            (x + h v, right for stiff pinned bodies that few sweeps hardly move) or ``"auto"``: for each body and step
+            the one of lower incremental potential; beside pairs and friction the predictor (docs/numerics.md).
+        colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier among the
+            energies.
+        dtype: torch.float64 or torch.float32.
+        device: Where the tensors live.
+
+    Attributes (torch tensors in the user's numbering, a copy at each access):
+        rest_points [V, 3] [m]; tets [T, 4]; density [T]; mass [V] [kg]; pinned [V] bool; surface [F, 3];
+        color_vertices [active]: the vertices in sweep order, color c being
+        ``color_vertices[color_ptr[c]:color_ptr[c + 1]]``; color_ptr [colors + 1]; collider_points [Vc, 3]: where the
+        colliders' corner points are unless a step is told otherwise, those of collider k being ``collider_rows[k]``.
+
+    Raises:
+        ValueError, TypeError: naming the argument, what was expected and what came.
+    """
+
+    rest_points: Tensor = _copy("_rest_points", "Rest positions [m], shape [V, 3].")
+    density: Tensor = _copy("_density", "[kg/m^3], shape [T].")
+    mass: Tensor = _copy("_mass", "Masses of the vertices [kg], shape [V].")
+    pinned: Tensor = _copy("_pinned", "Which vertices sweeps do not move, bool [V].")
+    color_ptr: Tensor = _copy("_color_ptr", "Where each color begins in color_vertices, int [colors + 1].")
+    color_vertices: Tensor = _copy("_color_vertices", "Vertices in sweep order, int [active].")
+
+    @lasting_tensors()
+    def __init__(
+        self,
+        mesh: TetMesh,
+        density: float | Tensor = 1000.0,
+        pinned: Any = None,
+        energies: Sequence[Energy] = (StableNeoHookean(),),
+        saturation: float | None = None,
+        regularization: float = 0.0,
+        relaxation: float = 1.0,
+        rigid: bool | None = None,
+        start: Literal["auto", "predictor", "inertia"] = "auto",
+        colliders: Sequence[Collider] = (),
+        *,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        if not isinstance(mesh, TetMesh):
+            raise TypeError(f"mesh: expected a diffvbd.TetMesh, got {type(mesh).__name__}")
+        if dtype not in (torch.float64, torch.float32):
+            raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
+        self.mesh = mesh
+        self._derived: dict[str, Any] = {}
+        self.saturation = None if saturation is None else check_positive("saturation", saturation, "m")
+        self.regularization = check_number("regularization", regularization)
+        self.relaxation = check_positive("relaxation", relaxation, "")
+        if self.relaxation >= 2:
+            fail("relaxation", "a number in (0, 2): from 2 on the updates raise the potential", relaxation)
+        self._set_energies(checked_energies(energies, mesh.num_vertices))
+        self.energy_mask = 0
+        for energy in self.energies:
+            self.energy_mask |= energy.bit
+        self.rigid, self.start = checked_correction(rigid, start, self.energies)
+        kinds = {type(e): e for e in self.vertex_energies}
+        self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
+
+        points = torch.from_numpy(mesh.points.copy())
+        tets = torch.from_numpy(mesh.tets.copy())
+        mask = vertex_mask(pinned, mesh.num_vertices)
+        touched = torch.zeros(mesh.num_vertices, dtype=torch.bool)
+        touched[tets.reshape(-1)] = True
+        loose = (~touched & ~mask).nonzero().reshape(-1)
+        if loose.numel():
+            shown = ", ".join(map(str, loose[:5].tolist())) + (", ..." if loose.numel() > 5 else "")
+            fail("mesh", "every vertex in a tet, or pinned", f"{loose.numel()} isolated vertices: {shown}")
+        self._density = per_tet_density(density, mesh.num_tets)
+        self._pinned = mask
+        body = torch.from_numpy(mesh.body.copy())
+        self._first_of_body = _first_of_body(body)
+        self._bodies, self._other_bodies = find_bodies(points, tets, mask, self.rigid)
+        self.surface_of_contact = self._build_surface(check_colliders(colliders))
+        device = checked_device(device)
+        self._arrange(points, tets, device)
+        self._measure(points)
+        warn_of(self)
+        self._place(dtype, device)
+
+    def _set_energies(self, energies: tuple[Energy, ...]) -> None:
+        self.energies = energies
+        # the energies of single vertices, in the order in which kernels and data keep them
+        present = [e for e in energies if isinstance(e, VertexEnergy)]
+        self.vertex_energies: tuple[VertexEnergy, ...] = tuple(sorted(present, key=lambda e: e.bit))
+        self.floor = next((e for e in energies if isinstance(e, FloorBarrier)), None)
+        self.contact = next((e for e in energies if isinstance(e, PairBarrier)), None)
+        self.friction = next((e for e in energies if isinstance(e, Friction)), None)
+        self._constants: dict[str, dict[str, Tensor]] = {}
+
+    def _build_surface(self, colliders: tuple[Collider, ...]) -> ContactSurface | None:
+        self.colliders = colliders
+        if self.contact is None:
+            if colliders:
+                fail("colliders", "a PairBarrier among the energies, which they act through", "none")
+            if self.friction is not None and self.floor is None:
+                fail("energies", "a FloorBarrier or a PairBarrier for Friction to act on", "none")
+            return None
+        return build_surface(self.mesh, self._pinned, self.contact, colliders)
+
+    @property
+    def corrects(self) -> bool:
+        """Whether steps have a rigid correction: asked for, and some body is free."""
+        return self._bodies.number > 0
+
+    @property
+    def starts_from(self) -> str:
+        """Where the sweeps of bodies that are not corrected start: "auto" only where there is something to choose."""
+        if self.start != "auto":
+            return self.start
+        return "predictor" if self.touches or not self._other_bodies.number else "auto"
+
+    @property
+    def rest_scalars(self) -> Tensor:
+        """Stiffness weights and inverse volume of each tet at rest [1, T, 7], rounded once from float64."""
+        return self._rest_scalars if self._rest_scalars.numel() else self.derived("rest", self._find_rest_scalars)
+
+    def _find_rest_scalars(self) -> Tensor:
+        points = torch.from_numpy(self.mesh.points.copy())[None].to(self.device)
+        return rest_metric(ops.tet_gather(points, *self._topology))[0].to(self.dtype)
+
+    @property
+    def touches(self) -> bool:
+        """Whether steps go through contact: pairs or friction."""
+        return bool(self.energy_mask & CONTACT)
+
+    @property
+    def collider_points(self) -> Tensor:
+        """Corner points of the colliders [m], shape [Vc, 3]; a copy."""
+        surface = self.surface_of_contact
+        return self._mass.new_zeros((0, 3)) if surface is None else surface.collider_points.clone()
+
+    @property
+    def collider_rows(self) -> tuple[slice, ...]:
+        """Rows of collider_points of each collider."""
+        return () if self.surface_of_contact is None else self.surface_of_contact.rows
+
+    @property
+    def body(self) -> Tensor:
+        """Body of each vertex, counted from 0, int64 [V]."""
+        if self.surface_of_contact is None:
+            labels = np.unique(self.mesh.body, return_inverse=True)[1].reshape(-1)
+            return torch.from_numpy(labels).to(self.device)
+        return self.surface_of_contact.body[: self.num_vertices].to(torch.int64)
+
+    @property
+    def plane_points(self) -> Tensor:
+        """Which rows of collider_points span planes, bool [Vc]."""
+        surface = self.surface_of_contact
+        return self._pinned.new_zeros((0,)) if surface is None else surface.plane_points[self.num_vertices :].clone()
+
+    @property
+    def collider_radius(self) -> Tensor:
+        """How far the surface of a collider lies outside its corner points [m], shape [Vc]."""
+        surface = self.surface_of_contact
+        return self._mass.new_zeros((0,)) if surface is None else surface.radius[self.num_vertices :].clone()
+
+    @property
+    def contact_numbers(self) -> tuple[float, float, float]:
+        """Search distance [m], largest bound [m] and gamma of the PairBarrier."""
+        surface, barrier = self.surface_of_contact, self.contact
+        if surface is None or barrier is None:
+            fail("model", "a PairBarrier among its energies", "none")
+        return surface.reach, surface.cap, barrier.gamma
+
+    @property
+    def parametric_energies(self) -> tuple[VertexEnergy | PairBarrier | Friction, ...]:
+        """The energies whose numbers a step may override through ``parameters``."""
+        contact = [e for e in (self.contact, self.friction) if e is not None]
+        return (*self.vertex_energies, *contact)
+
+    def constants(self, energy: VertexEnergy | PairBarrier | Friction) -> dict[str, Tensor]:
+        """The parameters of one of the Model's energies, as tensors of its dtype and device."""
+        if energy.name not in self._constants:
+            self._constants[energy.name] = energy.constants(self._rest_points)
+        return self._constants[energy.name]
+
+    def _arrange(self, points: Tensor, tets: Tensor, device: torch.device) -> None:
+        """The order of the sweeps, in the form that a device wants; everything still on the CPU."""
+        plan = ops.build_plan(points, tets, ~self._pinned, ops.LANES[device.type])
+        self._plan, self._color_ptr, self._color_vertices, star_ptr, star = plan
+        self._topology = (tets, star_ptr, star)
+        self._sizes = ops.plan_sizes(self._plan, device.type)
+
+    def _measure(self, points: Tensor) -> None:
+        """Everything that follows from the rest positions, in float64."""
+        rest, volume = rest_metric(ops.tet_gather(points[None], *self._topology))
+        self._rest_points = points
+        self._mass = lumped_mass(self._density[None], volume, *self._topology)[0]
+        self._rest = rest
+        # what "auto" asks for in every step
+        chooses = self.starts_from == "auto" and self.energy_mask & ELASTIC
+        self._rest_scalars = rest if chooses else rest.new_empty((0,))
+        data = [e.pack(self._parameters(e, points), None) for e in self.vertex_energies]
+        self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
+
+    def _parameters(self, energy: VertexEnergy, rest_points: Tensor) -> dict[str, Tensor]:
+        return {name: value[None] for name, value in energy.constants(rest_points).items()}
+
+    def _place(self, dtype: torch.dtype, device: torch.device) -> None:
+        self.dtype, self.device = dtype, device
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                setattr(self, name, value.to(device, dtype) if value.is_floating_point() else value.to(device))
+        self._topology = tuple(t.to(device) for t in self._topology)
+        self._bodies, self._other_bodies = self._bodies.to(device), self._other_bodies.to(device)
+        placed = [e.placed(self.num_vertices, device) if isinstance(e, VertexEnergy) else e for e in self.energies]
+        self._set_energies(tuple(placed))
+        if hasattr(self, "_rest"):
+            self._packed_rest = ops.pack_rest(self._rest, self._plan, self._sizes)
+            del self._rest
+        if self.surface_of_contact is not None:
+            self.surface_of_contact = self.surface_of_contact.to(device, dtype)
+        for energy in self.parametric_energies:
+            self.constants(energy)
+
+    @classmethod
+    def paper(cls, mesh: TetMesh, **options: Any) -> Model:
+        """The paper's preset: block="paper", saturation 0.1 m, regularization 1e-6 kg.
+
+        Both constants are absolute: 0.1 m is 33 edges of a 3 mm cube, and 1e-6 kg is 0.15-0.44 of the mass of such a
+        cube's vertex, so the preset does not suit small bodies (docs/numerics.md).
+        """
+        energies = tuple(options.pop("energies", ()))
+        energies = (StableNeoHookean("paper"), *(e for e in energies if not isinstance(e, StableNeoHookean)))
+        options = {"saturation": PAPER_SATURATION, "regularization": PAPER_REGULARIZATION, **options}
+        return cls(mesh, energies=energies, **options)
+
+    @lasting_tensors()
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Model:
+        """A new Model on another device or of another dtype (float64 or float32); this one is untouched."""
+        dtype = dtype or self.dtype
+        if dtype not in (torch.float64, torch.float32):
+            raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
+        device = self.device if device is None else checked_device(device)
+        out = object.__new__(type(self))
+        out.__dict__.update(self.__dict__)
+        out._derived = {}
+        out._place(torch.float64, torch.device("cpu"))
+        # from the mesh's own float64 positions, so that a way through float32 loses nothing
+        points = torch.from_numpy(self.mesh.points.copy())
+        out.surface_of_contact = out._build_surface(self.colliders)
+        if device.type != self.device.type:
+            out._arrange(points, out.tets, device)
+        out._measure(points)
+        out._place(dtype, device)
+        return out
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_derived": {}}
+
+    @lasting_tensors()
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Unpickles, also where torch.load(map_location=...) has moved the tensors to another device."""
+        self.__dict__.update(lasting(state))
+        self._derived = {}
+        actual = checked_device(self._mass.device)
+        if actual != self.device:
+            self.__dict__.update(self.to(actual).__dict__)
+
+    def _on_cpu(self) -> Model:
+        """The same Model on the CPU: what debug_checks() asks about a step on CUDA."""
+        return self.derived("on_cpu", lambda: self.to("cpu"))
+
+    def derived(self, name: str, build: Callable[[], Any]) -> Any:
+        """Something that follows from the Model alone, built at its first use and kept."""
+        if name not in self._derived:
+            with torch.inference_mode(False), torch.no_grad():  # later steps may be differentiated
+                self._derived[name] = build()
+        return self._derived[name]
+
+    @property
+    def tets(self) -> Tensor:
+        """Vertices of each tet, shape [T, 4]; a copy."""
+        return self._topology[0].clone()
+
+    @property
+    def surface(self) -> Tensor:
+        """Outward triangles of the boundary, shape [F, 3]."""
+        return torch.from_numpy(self.mesh.surface.copy()).to(self.device)
+
+    @property
+    def num_vertices(self) -> int:
+        return self.mesh.num_vertices
+
+    @property
+    def num_tets(self) -> int:
+        return self.mesh.num_tets
+
+    @property
+    def num_active(self) -> int:
+        """Vertices that sweeps move."""
+        return self._sizes[0]
+
+    @property
+    def num_colors(self) -> int:
+        """Groups of vertices that a sweep updates one after another."""
+        return self._color_ptr.shape[0] - 1
+
+    def settings(self, time_step: float, sweeps: int, scenes: int = 1) -> ops.SweepSettings:
+        """What the kernels execute for this Model besides its tensors; ``scenes`` chooses the regime on CUDA."""
+        saturation = -1.0 if self.saturation is None else self.saturation
+        # a lone over-relaxed sweep would leave the correction a shape that the next step starts wrong from
+        last = min(self.relaxation, 1.0) if self.corrects else self.relaxation
+        numbers = (time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS, FILTER_ETA, last)
+        cuda = self.device.type == "cuda"
+        launch = regimes.choose(self.num_vertices, self.num_colors, scenes, contact=self.touches) if cuda else ()
+        return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps, launch)
+
+    def memory(self, **options: Any) -> dict[str, int]:
+        """Predicted bytes of a step or rollout of this Model; see :func:`diffvbd.rollout.memory.predict`."""
+        from ..rollout.memory import predict
+
+        return predict(self, **options)
+
+    def __repr__(self) -> str:
+        safeguards = [f"relaxation={self.relaxation:g}"] if self.relaxation != 1 else []
+        safeguards += [f"saturation={self.saturation:g} m"] if self.saturation is not None else []
+        safeguards += [f"regularization={self.regularization:g} kg"] if self.regularization else []
+        safeguards += ["rigid=False"] if not self.rigid and not self.touches else []
+        safeguards += [f'start="{self.start}"'] if self.start != "auto" else []
+        return (
+            f"Model({self.num_vertices} vertices, {self.num_tets} tets, {int(self._pinned.sum())} pinned, "
+            f"{self.num_colors} colors, mass {float(self._mass.sum()):.4g} kg, "
+            f"energies=({', '.join(map(repr, self.energies))})"
+            f"{f', {len(self.colliders)} colliders' if self.colliders else ''}"
+            f"{''.join(', ' + s for s in safeguards)}, {self.dtype}, {self.device})"
+        )
+
+
+def _first_of_body(body: Tensor) -> Tensor:
+    """For each vertex the first vertex of its body: the origin that float32 computes about."""
+    labels, inverse = torch.unique(body, return_inverse=True)
+    order = torch.arange(body.shape[0])
+    first = torch.full((labels.shape[0],), body.shape[0]).scatter_reduce(0, inverse, order, "amin")
+    return first[inverse]

@@ -1,0 +1,115 @@
+"""What a Model warns of: sizes and safeguards outside the range in which they make sense (docs/numerics.md)."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+from torch import Tensor
+
+from ..energies import StableNeoHookean
+from ..mesh import TetMesh
+
+if TYPE_CHECKING:
+    from .model import Model
+
+STABLE_RELAXATION = 1.7  # largest omega that never grew in the rollouts of docs/numerics.md
+HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
+THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
+SAMPLED = 10_000  # tets that are looked at: a sheet's are all alike
+LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
+
+
+def warn_of(model: Model) -> None:
+    """Warns (UserWarning) of what is legal and seldom meant."""
+    if size := _size_message(model.mesh):
+        _warn(size)
+    if not any(isinstance(e, StableNeoHookean) for e in model.energies) and model.mesh.num_tets:
+        _warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
+    if model.relaxation > STABLE_RELAXATION:
+        _warn(f"relaxation: rollouts were seen to gain energy above {STABLE_RELAXATION}, got {model.relaxation:g}")
+    if model.relaxation > 1 and model.friction is not None:
+        _warn(
+            f"relaxation: {model.relaxation:g} with Friction: above 1 gradients were seen to grow by ten decades while "
+            "vertices stick; take relaxation=1 and more sweeps where gradients matter"
+        )
+    paper = any(isinstance(e, StableNeoHookean) and e.block == "paper" for e in model.energies)
+    if paper and model.relaxation > 1 and model.saturation is None:
+        _warn('relaxation: block="paper" with relaxation > 1 and no saturation may diverge')
+    active = model._mass[~model._pinned]
+    if active.numel() and model.regularization > HEAVY_REGULARIZATION * float(active.min()):
+        _warn(
+            f"regularization: {model.regularization:g} kg is {model.regularization / float(active.min()):.2g} of the "
+            "lightest vertex; the sweeps converge that much more slowly"
+        )
+
+
+def warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
+    """Warns, once for each Model, where tets are so thin that few sweeps leave a sheet without stiffness; the caller's
+    caller is shown.
+
+    The two faces of a sheet are coupled (w / t)^2 times as stiffly as neighbours in its plane, w wide and t thick, and
+    sweeps move them together by that much less; inertia helps where a wave crosses fewer elements than w / t.
+
+    Args:
+        mu, lam: [Pa], [1 | B, 1 | T]; on CUDA they are not looked at outside debug_checks().
+        time_step, sweeps: Of the step.
+    """
+    if "thin" in model._derived or sweeps == 0 or not model.mesh.num_tets:
+        return
+    model._derived["thin"] = True
+    tets = model.mesh.tets[:: max(1, model.mesh.num_tets // SAMPLED)]
+    corners = model.mesh.points[tets]
+    edges = corners[:, 1:] - corners[:, :1]
+    normals = np.stack([np.cross(edges[:, i], edges[:, j]) for i, j in ((1, 2), (2, 0), (0, 1))], 1)
+    volume = np.abs((edges[:, 0] * normals[:, 0]).sum(-1))
+    normals = np.concatenate([normals, -normals.sum(1, keepdims=True)], 1)
+    height = volume / np.linalg.norm(normals, axis=-1).max(1)  # the shortest of a tet's four
+    sides = np.linalg.norm(corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]], axis=-1)
+    aspect = float(np.median(sides.max(1) / height))
+    if aspect < THIN:
+        return
+    modulus = float((lam.detach() + 2 * mu.detach()).median())
+    density = float(model._density.median())
+    crossed = time_step * (max(0.0, modulus) / density) ** 0.5 / float(np.median(height))
+    needed = min(aspect, crossed) ** 2 * (2 - model.relaxation) / model.relaxation
+    if sweeps < needed:
+        warnings.warn(
+            f"sweeps: {sweeps} at time_step = {time_step:.3g} s are too few for tets {aspect:.2g} times as wide as "
+            f"thick, which need about {needed:.0f} or more: the body moves as if it had little stiffness; take a "
+            f"shorter time step, more sweeps with relaxation up to {STABLE_RELAXATION}, or a thicker body of softer "
+            "material. Linear tets this thin are also much too stiff in bending (docs/numerics.md)",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
+def _size_message(mesh: TetMesh) -> str:
+    size = _largest_body(mesh)
+    if size > LARGE_BODY:
+        return f"mesh: a body is {size:.4g} m long; points are in metres: one in mm needs mesh.transform(1e-3 * I)"
+    if 0 < size < SMALL_BODY:
+        return f"mesh: the largest body is {size:.2g} m long; points are in metres: are they in other units?"
+    return ""
+
+
+def _largest_body(mesh: TetMesh) -> float:
+    """Longest side of the bounding box of a body [m]."""
+    if not mesh.num_tets:
+        return 0.0
+    total = float(np.ptp(mesh.points, axis=0).max())
+    if total < SMALL_BODY:
+        return total
+    # a tet is never longer than its body, and most bodies are neither large nor small: no need to know them exactly
+    if total <= LARGE_BODY and float(np.ptp(mesh.points[mesh.tets[:100]], axis=1).max()) >= SMALL_BODY:
+        return total
+    order = np.argsort(mesh.body, kind="stable")
+    first = np.unique(mesh.body[order], return_index=True)[1]
+    points = mesh.points[order]
+    high, low = np.maximum.reduceat(points, first), np.minimum.reduceat(points, first)
+    return float((high - low).max())
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, UserWarning, stacklevel=5)  # _warn, warn_of, Model.__init__, its decorator, the caller

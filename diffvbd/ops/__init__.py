@@ -1,0 +1,63 @@
+"""The compiled operators: the only room that names torch.ops.
+
+Raw operators are private and functional: `raw.NAME`, with shapes for torch.compile beside each. Those that are
+differentiable are autograd.Functions in the form that also serves torch.func and torch.compile, in the rooms that use
+them; the fixed-order sums, which everybody uses, are here.
+"""
+
+from .fields import (
+    COMPACT_TAPE,
+    FULL_TAPE,
+    LANES,
+    NO_TAPE,
+    PLAN_HEADER,
+    REST_SCALARS,
+    THREAD,
+    SweepSettings,
+    plan_sizes,
+    tape_rows,
+    tape_shape,
+)
+from .functions import (
+    distinct,
+    fold_scenes,
+    no_second_derivative,
+    of_inputs,
+    one_by_one,
+    raw_backward,
+    ready_signature,
+)
+from .load import has_cuda, raw, require_cuda
+from .sums import broadcast, star_sum, sum_to, tet_gather
+from .sweep import build_plan, pack_rest, sweep_adjoints
+
+__all__ = [
+    "COMPACT_TAPE",
+    "FULL_TAPE",
+    "LANES",
+    "NO_TAPE",
+    "PLAN_HEADER",
+    "REST_SCALARS",
+    "THREAD",
+    "SweepSettings",
+    "broadcast",
+    "build_plan",
+    "distinct",
+    "fold_scenes",
+    "has_cuda",
+    "no_second_derivative",
+    "of_inputs",
+    "one_by_one",
+    "pack_rest",
+    "plan_sizes",
+    "raw",
+    "raw_backward",
+    "ready_signature",
+    "require_cuda",
+    "star_sum",
+    "sum_to",
+    "sweep_adjoints",
+    "tape_rows",
+    "tape_shape",
+    "tet_gather",
+]

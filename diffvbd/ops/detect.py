@@ -1,0 +1,133 @@
+"""The compiled operators of contact: detection, islands, sums over segments. Raw and functional, like those of ops.py.
+
+Sizes: B scenes that never mix, V vertices, Vc collider points, N = V + Vc corner points (vertices first), F triangles,
+E edges, P points, L planes, NB bodies of the mesh. Index tensors are int32; float tensors have the dtype of x; all are
+contiguous and on one device.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .functions import raw_backward
+from .load import raw
+
+PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS = 6, 3, 5, 8, 4  # twins of those in csrc/contact/candidates.h
+
+
+class Detection(NamedTuple):
+    """Pairs of primitives that are, or may come, closer than the barrier's reach."""
+
+    pairs: Tensor  # [capacity, 6]  corner points, kind (0 point-triangle, 1 edge-edge, 2 point-plane), scene; or -1
+    constants: Tensor  # [capacity, 3]  reach of the barrier [m], sum of the radii [m], mollifier threshold [m^4]
+    ptr: Tensor  # [B N + 1]  pairs of corner point i of scene b: entry[ptr[b N + i] : ptr[b N + i + 1]],
+    entry: Tensor  # [4 capacity]  each 4 pair + local corner, in ascending order
+    near_corners: Tensor  # [B, N, 5]  corner points and kind of the pair with the smallest gap; i four times, -1: none
+    near_values: Tensor  # [B, N, 8]  its weights, normal and gap [m]; without one, zeros and the reach
+    counts: Tensor  # [4] int64  pairs that the list needs, pairs that touch, smallest key of those or -1, 0
+    smallest: Tensor  # [B]  smallest gap [m], or the reach
+
+
+def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
+                   triangles: Tensor, edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, held: Tensor,
+                   mesh_bodies: int, self_contact: bool, between_bodies: bool, dhat: float, reach: float, cap: float,
+                   gamma: float, capacity: int) -> Detection:  # fmt: skip
+    """Near pair of every corner point, and the pairs that may come within reach of the barrier before the next call.
+
+    A corner point may move by ``min(gamma gap, cap)``, gap being that of its near pair. Pairs are considered up to a
+    gap of ``reach``; one is listed if its gap, less the bounds of its two sides, is below the barrier's reach, which is
+    ``dhat`` or, for two sides of one body that are closer at rest, 0.9 times their distance at rest. Two colliders make
+    no pair, nor do four held corner points, nor two sides of one body that are one place at rest.
+
+    A surface point that is not finite counts as touching. Where ``counts[0] > capacity``, the list holds some of the
+    pairs that it needs. Not differentiable; results repeat to the bit.
+
+    Args:
+        x: [B, V, 3] positions [m], relative to ``origin`` [B, V, 3], one point for each body; or empty.
+        collider, collider_next: [B, Vc, 3] [m] now, and during the sweeps that follow; planes are taken at the latter.
+        rest, radius: [N, 3] [m], [N] [m], the latter 0 for vertices.
+        triangles, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique.
+        planes: [L, 3] collider points that span each plane, counterclockwise seen from the free side.
+        body, held: [N]; labels from ``mesh_bodies`` on are colliders; held: bool, no sweep moves it.
+        self_contact, between_bodies: Which pairs of mesh bodies to consider.
+        dhat, reach, cap: [m].  gamma: Part of a gap that a corner point may move.
+        capacity: Rows of the list.
+
+    Raises:
+        ValueError: A tensor with the wrong shape, dtype or device; too large a scene.
+    """
+    return Detection(
+        *raw.contact_detect(
+            x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies,
+            self_contact, between_bodies, dhat, reach, cap, gamma, capacity,
+        )
+    )  # fmt: skip
+
+
+def contact_islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, collider: Tensor, collider_next: Tensor,
+                    planes: Tensor, body: Tensor, body_order: Tensor, body_ptr: Tensor, held: Tensor, radius: Tensor,
+                    mesh_bodies: int, cap: float, dhat: float, any_direction: bool = False) -> Tensor:  # fmt: skip
+    """Smallest body of the island of bodies in contact that each body is in [B, NB] int32, or -1.
+
+    An island moves by the mass-weighted mean of ``move`` over its vertices that are not held. Bodies whose boxes, swept
+    by that and grown by ``cap + dhat / 2``, overlap are of one island. -1: the island holds a held vertex or may reach
+    a collider, and must stay. Not differentiable; results repeat to the bit.
+
+    Args:
+        x, origin, collider, collider_next, planes, body, held, radius, cap, dhat: As for :func:`contact_detect`.
+        move, mass: [B, V, 3] where each vertex wants to go [m], [1 | B, V] [kg].
+        any_direction: Whether a floor may turn a translation into any direction, by which it does not become longer.
+        body_order, body_ptr: [V] vertices sorted by body, [NB + 1] the first of each body.
+
+    Raises:
+        ValueError: A tensor with the wrong shape, dtype or device.
+    """
+    return raw.contact_islands(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr,
+                                held, radius, mesh_bodies, cap, dhat, any_direction)  # fmt: skip
+
+
+def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
+    """[B, V, C] -> [B, S, C]: sums of ``values[:, order[ptr[s] : ptr[s + 1]]]``, in an order that shapes alone decide.
+
+    Args:
+        values: [B, V, C], float64 or float32.
+        order, ptr: Rows of ``values``, segment by segment, and the first of each segment [S + 1].
+
+    Raises:
+        ValueError: A tensor with the wrong shape, dtype or device.
+    """
+    return raw.segment_sum(values, order, ptr)
+
+
+# --- shapes without execution, no autograd ----------------------------------------------------------------------------
+
+
+@torch.library.register_fake("diffvbd::contact_detect")
+def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies,
+      self_contact, between_bodies, dhat, reach, cap, gamma, capacity):  # fmt: skip
+    b, n = x.shape[0], body.shape[0]
+
+    def integers(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
+        return x.new_empty(shape, dtype=dtype)
+
+    return (integers(capacity, PAIR_ROW), x.new_empty((capacity, CONSTANTS)), integers(b * n + 1),
+            integers(4 * capacity), integers(b, n, NEAR_ROW), x.new_empty((b, n, NEAR_VALUES)),
+            integers(COUNTS, dtype=torch.int64), x.new_empty((b,)))  # fmt: skip
+
+
+@torch.library.register_fake("diffvbd::contact_islands")
+def _(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr, held, radius, mesh_bodies,
+      cap, dhat, any_direction):  # fmt: skip
+    return x.new_empty((x.shape[0], mesh_bodies), dtype=torch.int32)
+
+
+@torch.library.register_fake("diffvbd::segment_sum")
+def _(values, order, ptr):
+    return values.new_empty((values.shape[0], ptr.shape[0] - 1, values.shape[2]))
+
+
+for _name in ("contact_detect", "contact_islands", "segment_sum"):
+    torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

@@ -1,0 +1,62 @@
+"""What the autograd functions of all operators share: no second derivatives, arguments, transforms."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+
+def raw_backward(ctx: Any, *grads: Tensor) -> NoReturn:
+    raise NotImplementedError("diffvbd: the raw operators are not differentiable; call diffvbd.step")
+
+
+def no_second_derivative() -> NoReturn:
+    raise NotImplementedError("diffvbd: second derivatives of a step are not supported (create_graph, hessian)")
+
+
+def ready_signature(*functions: type[Function]) -> None:
+    """apply() asks for the signature of forward at every call: ready-made, it costs less."""
+    for function in functions:
+        function.forward.__signature__ = inspect.signature(function.forward)  # type: ignore[attr-defined]
+
+
+def distinct(*tensors: Tensor | None) -> list[Tensor | None]:
+    """Contiguous, and none of them twice, which torch.compile refuses."""
+    out: list[Tensor | None] = []
+    for t in tensors:
+        t = t if t is None else t.contiguous()
+        out.append(t.view_as(t) if t is not None and any(t is other for other in out) else t)
+    return out
+
+
+def of_inputs(out: Any, needs: Sequence[bool], others: int) -> tuple:
+    """Gradients of what needs one, in the order of a forward's arguments, of which ``others`` more follow."""
+    given = iter(out if isinstance(out, tuple) else (out,))
+    return tuple(next(given) if need else None for need in needs) + (None,) * others
+
+
+def one_by_one(function: Any, size: int, in_dims: tuple, args: tuple) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+    """A vmap that applies a function to one member of the batch after another."""
+    members = []
+    for i in range(size):
+        own = [a.select(d, i) if isinstance(a, Tensor) and d is not None else a
+               for a, d in zip(args, in_dims, strict=True)]  # fmt: skip
+        out = function.apply(*own)
+        members.append(out if isinstance(out, tuple) else (out,))
+    stacked = tuple(torch.stack(parts) for parts in zip(*members, strict=True))
+    return stacked, (0,) * len(stacked)
+
+
+def fold_scenes(tensor: Tensor, dim: int | None, size: int, scenes: int) -> Tensor:
+    """[1 | B, ...] with a vmapped dimension of ``size`` -> [1 | size B, ...], for functions with a scene dimension."""
+    if dim is None:
+        if tensor.shape[0] == 1:
+            return tensor
+        return tensor.expand(size, *tensor.shape).reshape(size * tensor.shape[0], *tensor.shape[1:])
+    tensor = tensor.movedim(dim, 0)
+    return tensor.expand(size, scenes, *tensor.shape[2:]).reshape(size * scenes, *tensor.shape[2:])

@@ -1,0 +1,81 @@
+"""How the sweeps of a step are spread over a CUDA device: four regimes, chosen by the size of the work."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Literal
+
+from ..checks import fail
+from . import THREAD
+
+Regime = Literal["thread", "block", "grid", "color"]
+
+# twins of Regime, kFewLanes, kSomeLanes and kManyLanes in csrc/cuda/step.h, of kSmallMesh in csrc/core/views.h
+BLOCK, GRID, COLOR = 2, 3, 4
+CODES: dict[str, int] = {"thread": THREAD, "block": BLOCK, "grid": GRID, "color": COLOR}
+FEW_LANES, SOME_LANES, MANY_LANES = 2, 8, 32
+SMALL_MESH = 64
+
+# Where one regime overtakes another on an H100: the table "regimes" of docs/performance.md.
+THREAD_SCENES = 4096  # below, a scene per thread leaves most of the device idle
+TINY_VERTICES = 32  # up to here a scene per thread or, of fewer scenes, per block beats whatever spreads a scene out
+BLOCK_SCENES = 256  # of larger scenes: below, a scene per block leaves multiprocessors idle
+BLOCK_VERTICES = 1_000  # above, a block has too few threads for a scene
+GRID_VERTICES = 50_000  # vertices of all scenes: above, launches cost less than a cooperative grid's barriers
+MANY_SCENES = 64  # of a scene per block: from here on they fill a multiprocessor with few threads per vertex
+# Vertices of all scenes in a color up to which that many threads of each find room, in the sweeps and in their reverse.
+MANY_LANES_VERTICES = 1_500
+SOME_LANES_VERTICES = (16_000, 4_000)
+
+_forced: str | None = None
+
+
+@contextlib.contextmanager
+def regime(name: Regime | None) -> Iterator[None]:
+    """Inside, steps on CUDA run in the named regime; None: chosen by size (the default). For measuring.
+
+    Args:
+        name: ``"thread"``: a scene per thread (meshes of at most 64 vertices); ``"block"``: a scene per thread block, a
+            step per launch; ``"grid"``: all scenes by one cooperative grid, a step per launch; ``"color"``: a launch
+            per color. Each is reproducible to the bit; they differ from each other by rounding. No effect on the CPU.
+            The setting is of the process: threads share it.
+
+    Raises:
+        ValueError: For another name; in a step, where the regime cannot run the scene.
+    """
+    if name is not None and not (isinstance(name, str) and name in CODES):
+        fail("regime", f"one of {sorted(CODES)} or None", repr(name))
+    global _forced
+    before, _forced = _forced, name
+    try:
+        yield
+    finally:
+        _forced = before
+
+
+def choose(vertices: int, colors: int, scenes: int, *, contact: bool = False) -> tuple[int, int, int]:
+    """Regime, and threads per vertex of the sweeps and of their reverse, for SweepSettings.launch. Pairs are summed
+    between the launches of colors: a scene with contact has one regime."""
+    at_once = vertices * scenes / max(1, colors)
+    if contact:
+        lanes = MANY_LANES if at_once <= MANY_LANES_VERTICES else SOME_LANES
+        return COLOR, lanes, lanes
+    code = CODES[_forced] if _forced else _automatic(vertices, scenes)
+    if code == THREAD and vertices > SMALL_MESH:
+        fail("regime", f"a mesh of at most {SMALL_MESH} vertices for a scene per thread", f"{vertices} vertices")
+    if code == BLOCK:  # scenes enough fill a multiprocessor; one alone wants its threads
+        lanes = SOME_LANES if scenes < MANY_SCENES else FEW_LANES
+        return code, lanes, lanes
+    if at_once <= MANY_LANES_VERTICES:
+        return code, MANY_LANES, MANY_LANES
+    forward, reverse = (SOME_LANES if at_once <= limit else FEW_LANES for limit in SOME_LANES_VERTICES)
+    return code, forward, reverse
+
+
+def _automatic(vertices: int, scenes: int) -> int:
+    if vertices <= TINY_VERTICES:
+        return THREAD if scenes >= THREAD_SCENES else BLOCK
+    if vertices <= BLOCK_VERTICES and scenes >= BLOCK_SCENES:
+        return BLOCK
+    return GRID if vertices * scenes <= GRID_VERTICES else COLOR

@@ -1,0 +1,50 @@
+"""Shapes of the compiled operators of the rigid correction, and how adjoints of its data are joined."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..energies import VERTEX_ENERGIES
+from .functions import raw_backward
+from .sums import sum_to
+
+
+def scalars_of_data(data_count: Sequence[int]) -> tuple[int, int]:
+    """Scalars of energy data that a scene has, and that each vertex has."""
+    counts = list(zip(VERTEX_ENERGIES, data_count, strict=True))
+    return sum(n for e, n in counts if not e.per_vertex), sum(n for e, n in counts if e.per_vertex)
+
+
+def join_data(shared: Tensor, own: Tensor, data_count: Sequence[int]) -> Tensor:
+    """Adjoints by body [B, bodies, scalars of a scene] and by vertex [B, V, scalars of a vertex] -> of data [B, n]."""
+    total = sum_to(shared, (shared.shape[0], 1, shared.shape[2]))[:, 0]
+    parts, at = [], {False: 0, True: 0}
+    for energy, count in zip(VERTEX_ENERGIES, data_count, strict=True):
+        rows, start = (own if energy.per_vertex else total), at[energy.per_vertex]
+        part = rows.narrow(-1, start, count)  # not rows[...] nor flatten(), which is_grads_batched cannot do
+        parts.append(part.reshape(part.shape[0], -1) if energy.per_vertex else part)
+        at[energy.per_vertex] += count
+    return torch.cat(parts, -1)
+
+
+@torch.library.register_fake("diffvbd::rigid")
+def _(x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other, groups, data_count, time_step):
+    return torch.empty_like(x), torch.empty_like(x)
+
+
+@torch.library.register_fake("diffvbd::rigid_backward")
+def _(x_bar, v_bar, x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other, groups, data_count, time_step,
+      wants_data):  # fmt: skip
+    b, v = x.shape[:2]
+    shared, own = scalars_of_data(data_count)
+    x_prev_bar = torch.empty_like(x) if energy_data.numel() or v_bar.numel() else x.new_empty((0,))
+    return (torch.empty_like(x), x_prev_bar, torch.empty_like(x), x.new_empty((b, v)),
+            x.new_empty((b, spread.shape[0] if wants_data else 0, shared)),
+            x.new_empty((b, v if wants_data else 0, own)))  # fmt: skip
+
+
+for _name in ("rigid", "rigid_backward"):
+    torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

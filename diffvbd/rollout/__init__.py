@@ -1,0 +1,1 @@
+"""Many steps: trajectories, checkpoints, memory, and steps that sweep until they have converged."""

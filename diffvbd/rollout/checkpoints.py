@@ -1,0 +1,141 @@
+"""Checkpoint schedules of a rollout: which states are kept, and which steps the backward runs again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from .. import ops
+from ..adjoint.routes import Adjoint, ReverseSweep, Unrolled
+from ..checks import check_count, fail
+from ..model.model import Model
+from ..scopes import Scope
+
+MAX_REPEATS = 64  # of a step under Binomial: each is a nested checkpoint, and a run of the step
+TAPE_BUDGET = 2 * 2**30  # bytes of tape that "auto" lets a rollout keep
+UNROLLED_SCALARS = 540  # that autograd keeps per active vertex and sweep; measured on a structured beam (bench/cpu.py)
+
+
+@dataclass(frozen=True)
+class Binomial:
+    """Binomial (treeverse) checkpointing: at most ``snapshots`` states and the tape of one step are kept.
+
+    ``steps`` steps cost at most t extra forward runs of a step, t the least number with C(snapshots + t, t) >= steps.
+
+    Source: Griewank and Walther (2000), Algorithm 799.
+    """
+
+    snapshots: int
+
+    def __post_init__(self) -> None:
+        check_count("snapshots", self.snapshots, 1)
+
+
+class Segment(NamedTuple):
+    """State after some steps, the frames (step, x, v) saved on the way, and what was observed."""
+
+    x: Tensor
+    v: Tensor
+    frames: list[tuple[int, Tensor, Tensor]]
+    observed: list[Any]
+
+
+Run = Callable[[int, int, Tensor, Tensor], Segment]
+
+
+def choose_schedule(
+    checkpoint_every: int | Binomial | Literal["auto"] | None,
+    adjoint: Adjoint,
+    model: Model,
+    scenes: int,
+    steps: int,
+    sweeps: int,
+) -> tuple[int | Binomial | None, Adjoint]:
+    """Resolves ``"auto"`` for schedule and tape from the bytes they would keep."""
+    if isinstance(checkpoint_every, Binomial):
+        snapshots = checkpoint_every.snapshots
+        while _repeats(steps, snapshots) > MAX_REPEATS:
+            snapshots += 1
+        if snapshots > checkpoint_every.snapshots:
+            fail("checkpoint_every", f"Binomial of at least {snapshots} snapshots for {steps} steps", checkpoint_every)
+    if checkpoint_every is None or isinstance(checkpoint_every, Binomial):
+        return checkpoint_every, adjoint
+    if checkpoint_every != "auto":
+        if isinstance(checkpoint_every, str):
+            fail("checkpoint_every", '"auto", None, an integer > 0 or Binomial(snapshots)', repr(checkpoint_every))
+        return check_count("checkpoint_every", checkpoint_every, 1), adjoint
+    row = scenes * check_count("sweeps", sweeps) * model.num_active * model._mass.element_size()
+    if not isinstance(adjoint, ReverseSweep):  # a step of GlobalAdjoint keeps a few states and no tape
+        kept = UNROLLED_SCALARS * row if isinstance(adjoint, Unrolled) else 0
+        return None if steps * kept <= TAPE_BUDGET else max(1, math.isqrt(steps)), adjoint
+    candidates = ("full", "compact") if adjoint.tape == "auto" else (adjoint.tape,)
+    for tape in candidates:
+        if steps * row * ops.tape_rows(ReverseSweep(tape).policy(0, 0, 0), model.energy_mask) <= TAPE_BUDGET:
+            return None, ReverseSweep(tape)
+    return max(1, math.isqrt(steps)), adjoint
+
+
+def run_segments(run: Run, steps: int, x: Tensor, v: Tensor, every: int | Binomial | None) -> Segment:
+    """Runs all steps under a schedule."""
+    if isinstance(every, Binomial):
+        return _binomial(run, 0, steps, x, v, every.snapshots)
+    if every is None:
+        return run(0, steps, x, v)
+    frames, observed = [], []
+    for first in range(0, steps, every):
+        part = _again(run, first, min(first + every, steps), x, v)
+        x, v = part.x, part.v
+        frames += part.frames
+        observed += part.observed
+    return Segment(x, v, frames, observed)
+
+
+def _again(run: Callable[..., Segment], *args: Any) -> Segment:
+    # The non-reentrant form: gradients reach what a callable closes over, and checkpoints nest.
+    # A graph's capture admits no look at the state of the random number generator; what is replayed draws none.
+    capturing = (
+        not torch.compiler.is_compiling() and torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
+    )
+    again = run if torch.compiler.is_compiling() else _resuming(run, Scope())
+    return checkpoint(again, *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
+
+
+def _resuming(run: Callable[..., Segment], scope: Scope) -> Callable[..., Segment]:
+    def resumed(*args: Any) -> Segment:
+        with scope.resumed():
+            return run(*args)
+
+    return resumed
+
+
+def _binomial(run: Run, first: int, end: int, x: Tensor, v: Tensor, snapshots: int) -> Segment:
+    length = end - first
+    if length <= 1:
+        return run(first, end, x, v)
+    middle = first + _left(length, snapshots)
+    left = _again(_binomial, run, first, middle, x, v, snapshots)
+    right = _binomial(run, middle, end, left.x, left.v, max(snapshots - 1, 0))
+    return Segment(right.x, right.v, left.frames + right.frames, left.observed + right.observed)
+
+
+def _left(length: int, snapshots: int) -> int:
+    """Steps before the first snapshot, so that both parts repeat their steps as rarely as can be."""
+    if snapshots == 0:
+        return length - 1
+    repeats = _repeats(length, snapshots)
+    most = math.comb(snapshots + repeats - 1, repeats - 1)
+    return max(1, min(most, length - 1))
+
+
+def _repeats(length: int, snapshots: int) -> int:
+    """How often a step is run again at most."""
+    repeats = 1
+    while math.comb(snapshots + repeats, repeats) < length:
+        repeats += 1
+    return repeats

@@ -1,0 +1,244 @@
+"""Many steps, with checkpointing: what backpropagation through time keeps is chosen, not suffered."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from ..adjoint.routes import Adjoint, check_adjoint
+from ..checks import check_count, fail
+from ..model.model import Model
+from ..model.warnings import warn_of_thin_tets
+from ..scopes import looks_at
+from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
+from ..step.step import advance
+from .checkpoints import Binomial, Segment, choose_schedule, run_segments
+
+# these enter through prepare(), the others through advance()
+_STATIC = ("mu", "lam", "young", "poisson", "rest_points", "density")
+
+
+@dataclass(frozen=True)
+class PerStep:
+    """A value that changes from step to step, see :func:`per_step`."""
+
+    values: Tensor
+
+
+def per_step(values: Tensor) -> PerStep:
+    """Marks a tensor whose leading dimension counts the steps of a rollout, shape [steps, ...]."""
+    if not isinstance(values, Tensor) or values.dim() == 0:
+        raise TypeError(f"values: expected a tensor of shape [steps, ...], got {type(values).__name__}")
+    return PerStep(values)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Saved states of a rollout.
+
+    Attributes:
+        x, v: Positions [m] and velocities [m/s] of the saved frames, shape [frames, ..., V, 3].
+        steps: Step number of each frame (0: the initial state); the last frame is the final state.
+        observations: What ``observe`` returned, stacked over steps (a tensor, or a tuple or dict of them), or None.
+    """
+
+    x: Tensor
+    v: Tensor
+    steps: list[int]
+    observations: Any = None
+
+
+def rollout(
+    model: Model,
+    x: Tensor,
+    v: Tensor,
+    *,
+    steps: int,
+    mu: Any = None,
+    lam: Any = None,
+    young: Any = None,
+    poisson: Any = None,
+    time_step: float,
+    sweeps: int,
+    force: Any = None,
+    gravity: Any = GRAVITY,
+    prescribed: Any = None,
+    colliders: Any = None,
+    colliders_before: Tensor | None = None,
+    rest_points: Any = None,
+    density: Any = None,
+    parameters: dict[str, Any] | None = None,
+    adjoint: Adjoint | None = None,
+    checkpoint_every: int | Binomial | Literal["auto"] | None = "auto",
+    save: Literal["all", "last"] | int = "all",
+    observe: Callable[[Tensor, Tensor, int], Any] | None = None,
+    progress: bool = False,
+) -> Trajectory:
+    """Runs ``steps`` steps; the gradient is that of calling :func:`diffvbd.step` in a loop.
+
+    Args:
+        model, x, v, time_step, sweeps, adjoint: As in :func:`diffvbd.step`.
+        steps: Number of steps >= 0.
+        colliders: Corner points of the Model's colliders [m]: constant, they rest there; in :func:`per_step`, where
+            they are at the end of each step.
+        colliders_before: Where per_step colliders are at the start; None: the Model's collider_points.
+        mu, lam (or young, poisson), force, gravity, prescribed, rest_points, density, parameters: As in step, constant
+            in time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step.
+            A callable may close over tensors and modules that require grad: they get gradients under every schedule. It
+            must be deterministic, because a checkpointed segment calls it again in the backward. ``prescribed`` may
+            also have the initial x where a vertex is not pinned.
+        checkpoint_every: Between checkpoints of n steps only states are kept, and the segment is run again in the
+            backward: n keeps steps / n states and the tapes of n steps. ``None`` keeps all tapes.
+            :class:`diffvbd.Binomial` keeps a given number of states and one tape. ``"auto"`` keeps all tapes while
+            they fit diffvbd.rollout.checkpoints.TAPE_BUDGET, else takes n near sqrt(steps). See ``model.memory``.
+        save: Which frames the trajectory holds: ``"all"`` (steps + 1 frames, from the initial state), every n-th and
+            the last, or only the ``"last"``.
+        observe: Called after each step as observe(x, v, step) with step = 1 ... steps; its results (a tensor, or a
+            tuple, list or dict of tensors) are stacked and differentiable, so that long rollouts need not keep frames.
+        progress: Print progress to stderr.
+
+    Raises:
+        ValueError, TypeError: As step; also where a per_step value has another number of steps.
+    """
+    steps = check_count("steps", steps)
+    if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
+        fail("save", '"all", "last" or an integer > 0', repr(save))
+    lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
+    options = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "rest_points": rest_points,
+               "density": density, "force": force, "gravity": gravity, "prescribed": prescribed,
+               "colliders": colliders}  # fmt: skip
+    if _changes(colliders) and not isinstance(colliders, PerStep):
+        raise TypeError("colliders: expected a tensor or per_step, got a callable: a step needs where they come from")
+    if colliders_before is not None and not isinstance(colliders, PerStep):
+        raise TypeError("colliders_before: expected it beside per_step colliders, which it is the start of")
+    if parameters is not None and not isinstance(parameters, dict):
+        raise TypeError(f"parameters: expected a dict of tensors by name, got {type(parameters).__name__}")
+    named = {f'parameters["{k}"]': value for k, value in (parameters or {}).items()}
+    for name, value in {**options, **named}.items():
+        if isinstance(value, PerStep) and value.values.shape[0] != steps:
+            fail(name, f"{steps} steps in per_step", f"shape {list(value.values.shape)}")
+
+    # What a checkpointed segment reads again must not change in between: lists and dicts are copied. unbind, not
+    # indexing: the backward of values[k] would fill a tensor of all steps at every step.
+    options = {name: _frozen(value) for name, value in options.items()}
+    parameters = {k: _frozen(value) for k, value in (parameters or {}).items()}
+    static: dict[str, Any] = {k: options[k] for k in _STATIC} | {"parameters": parameters}
+    changes = any(_changes(value) for value in (*(options[k] for k in _STATIC), *parameters.values()))
+    # once: what a checkpoint runs again must run as it did, whatever dv.regime says by then
+    settings = step_settings(model, lead, time_step, sweeps)
+    chosen: dict[str, Any] = {"time_step": time_step, "sweeps": sweeps, "adjoint": adjoint, "settings": settings}
+    fixed = None if changes else prepare(model, lead, **chosen, **static)
+    if fixed is not None and looks_at(fixed.mu) and looks_at(fixed.lam):
+        warn_of_thin_tets(model, fixed.mu, fixed.lam, *fixed.time_step_and_sweeps)
+
+    start, moved = x, options["prescribed"]
+    for value in _tensors(moved):
+        check_prescribed(model, value, x)
+
+    def one_step(k: int, x: Tensor, v: Tensor, adjoint: Adjoint) -> tuple[Tensor, Tensor]:
+        prepared = fixed
+        if prepared is None:
+            now: dict[str, Any] = {name: _at(options[name], k, x, v) for name in _STATIC}
+            now["parameters"] = {name: _at(value, k, x, v) for name, value in parameters.items()}
+            prepared = prepare(model, lead, **chosen, **now)
+        given = {name: _at(options[name], k, x, v) for name in ("force", "gravity", "prescribed", "colliders")}
+        if _changes(moved) and not isinstance(moved, _Steps):
+            check_prescribed(model, given["prescribed"], x, start)
+        if isinstance(options["colliders"], _Steps):
+            first = model.collider_points if colliders_before is None else colliders_before
+            given["colliders_before"] = options["colliders"][k - 1] if k else first
+        return advance(model, x, v, prepared, adjoint=adjoint, index=k, **given)
+
+    scenes = x.numel() // max(1, 3 * model.num_vertices)
+    every, adjoint = choose_schedule(checkpoint_every, adjoint, model, scenes, steps, sweeps)
+    bar = _Progress(steps) if progress else None
+
+    # A segment that runs again reads these anew: autograd cannot see that they were changed in between.
+    read = {**options, **{f'parameters["{k}"]': value for k, value in parameters.items()}}
+    versions: list[tuple[str, Tensor, int]] = []
+    if every is not None and not torch.compiler.is_compiling():
+        found = [(name, t) for name, value in read.items() for t in _tensors(value)]
+        versions = [(name, t, t._version) for name, t in found if not t.is_inference()]
+
+    def segment(first: int, end: int, x: Tensor, v: Tensor) -> Segment:
+        for name, tensor, version in versions:
+            if tensor._version != version:
+                raise RuntimeError(f"{name}: changed in place between the rollout and its backward")
+        frames, observed = [], []
+        for k in range(first, end):
+            x, v = one_step(k, x, v, adjoint)
+            if save == "all" or k + 1 == steps or (save != "last" and (k + 1) % save == 0):
+                frames.append((k + 1, x, v))
+            if observe is not None:
+                observed.append(observe(x, v, k + 1))
+            if bar is not None:
+                bar.show(k + 1)
+        return Segment(x, v, frames, observed)
+
+    first = [] if save == "last" and steps > 0 else [(0, x, v)]
+    done = run_segments(segment, steps, x, v, every if torch.is_grad_enabled() else None)
+    frames = first + done.frames
+    return Trajectory(
+        x=torch.stack([f[1] for f in frames]),
+        v=torch.stack([f[2] for f in frames]),
+        steps=[f[0] for f in frames],
+        observations=_stacked(done.observed),
+    )
+
+
+class _Steps(tuple):
+    """The tensors of a per_step value, one for each step."""
+
+
+def _tensors(value: Any) -> list[Tensor]:
+    return [value] if isinstance(value, Tensor) else list(value) if isinstance(value, _Steps) else []
+
+
+def _frozen(value: Any) -> Any:
+    if isinstance(value, PerStep):
+        return _Steps(value.values.unbind(0))
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _changes(value: Any) -> bool:
+    return isinstance(value, _Steps) or (callable(value) and not isinstance(value, Tensor))
+
+
+def _at(value: Any, k: int, x: Tensor, v: Tensor) -> Any:
+    if isinstance(value, _Steps):
+        return value[k]
+    return value(k, x, v) if _changes(value) else value
+
+
+def _stacked(observed: list[Any]) -> Any:
+    if not observed or observed[0] is None:
+        return None
+    first = observed[0]
+    if isinstance(first, dict):
+        return {k: _stacked([o[k] for o in observed]) for k in first}
+    if isinstance(first, (tuple, list)):
+        return tuple(_stacked([o[i] for o in observed]) for i in range(len(first)))
+    if not isinstance(first, Tensor):
+        raise TypeError(f"observe: expected tensors, or tuples or dicts of them, got {type(first).__name__}")
+    return torch.stack(observed)
+
+
+class _Progress:
+    """One line on a terminal, ten in a log. Steps that a backward runs again are not counted twice."""
+
+    def __init__(self, steps: int) -> None:
+        self.steps, self.shown, self.terminal = steps, 0, sys.stderr.isatty()
+
+    def show(self, k: int) -> None:
+        if k <= self.shown:
+            return
+        last, self.shown = self.shown, k
+        if self.terminal:
+            print(f"\rstep {k}/{self.steps}", end="\n" if k == self.steps else "", file=sys.stderr, flush=True)
+        elif 10 * k // self.steps > 10 * last // self.steps:
+            print(f"step {k}/{self.steps}", file=sys.stderr, flush=True)

@@ -1,0 +1,1 @@
+"""One step: arguments, predictor and start, sweeps, correction; with contact, in parts."""

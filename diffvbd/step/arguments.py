@@ -1,0 +1,242 @@
+"""Arguments of a step: checked, and in the shapes of the operator. Everything here happens before any work."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .. import ops, reference
+from ..adjoint.routes import Adjoint, ReverseSweep, Unrolled
+from ..checks import check_broadcast, check_count, check_tensor, check_time_step, fail, name_value, to_float
+from ..contact.barrier import Friction, PairBarrier
+from ..energies import VERTEX_ENERGIES
+from ..model.model import Model
+from ..model.moduli import moduli_of
+from ..model.rest import lumped_mass, rest_metric
+from ..scopes import checking, looks_at
+
+GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
+
+MAX_SWEEPS = 2**31 - 1
+
+
+class Prepared(NamedTuple):
+    """Arguments of a step that do not depend on x and v, in the shapes of the operator (scenes first)."""
+
+    mu: Tensor  # [1 | B, 1 | T]
+    lam: Tensor  # [1 | B, 1 | T]
+    mass: Tensor  # [1 | B, V]
+    rest: Tensor | None  # [1 | B, T, 7]; None: the Model's
+    parameters: dict[str, Tensor]  # differentiable energy parameters, [1 | B, ...]
+    settings: ops.SweepSettings
+    unrolled: Callable[..., tuple[Tensor, Tensor]] | None = None  # the reference's step, where autograd unrolls it
+
+    @property
+    def time_step_and_sweeps(self) -> tuple[float, int]:
+        return self.settings.numbers[0], self.settings.sweeps
+
+
+def check_state(model: Model, x: Tensor, v: Tensor) -> tuple[int, ...]:
+    """Raises where x or v does not fit the Model; returns the leading (scene) shape."""
+    if not isinstance(model, Model):
+        raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
+    for name, value in (("x", x), ("v", v)):
+        if not isinstance(value, Tensor):
+            raise TypeError(
+                f"{name}: expected a tensor of shape [..., {model.num_vertices}, 3], got {type(value).__name__}"
+            )
+        check_tensor(name, value, model._mass)
+        if value.dim() < 2 or value.shape[-2:] != (model.num_vertices, 3):
+            fail(name, f"shape [..., {model.num_vertices}, 3]", f"shape {list(value.shape)}")
+    if v.shape != x.shape:
+        fail("v", f"x's shape {list(x.shape)}", f"shape {list(v.shape)}")
+    return tuple(x.shape[:-2])
+
+
+def _scenes_first(name: str, value: Any, like: Tensor, lead: tuple[int, ...], own: tuple[int, ...]) -> Tensor:
+    """A value that broadcasts to lead + own, as [1 | B, ...] with as many further dimensions as own."""
+    value = check_broadcast(name, check_tensor(name, value, like), lead + own, len(lead))
+    shape = (1,) * (len(lead) + len(own) - value.dim()) + tuple(value.shape)
+    scenes, rest = shape[: len(lead)], shape[len(lead) :]
+    value = value.reshape(shape)
+    if math.prod(scenes) == 1:
+        return value.reshape(1, *rest)
+    return ops.broadcast(value, (*lead, *rest)).reshape(-1, *rest)
+
+
+def step_settings(model: Model, lead: tuple[int, ...], time_step: Any, sweeps: Any) -> ops.SweepSettings:
+    """What is executed for scenes of shape ``lead``, the regime on CUDA included."""
+    return model.settings(
+        check_time_step(time_step, model.dtype),
+        check_count("sweeps", sweeps, maximum=MAX_SWEEPS),
+        math.prod(lead),
+    )
+
+
+def prepare(
+    model: Model,
+    lead: tuple[int, ...],
+    *,
+    mu: float | Tensor | None,
+    lam: float | Tensor | None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
+    time_step: float,
+    sweeps: int,
+    rest_points: Tensor | None,
+    density: float | Tensor | None,
+    parameters: dict[str, Any] | None,
+    adjoint: Adjoint | None = None,
+    settings: ops.SweepSettings | None = None,
+) -> Prepared:
+    """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
+    like, tets = model._mass, (model.num_tets,)
+    if settings is None:
+        settings = step_settings(model, lead, time_step, sweeps)
+    mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
+    rest, mass, given_density = None, model._mass[None], density
+    if density is not None:
+        density = _scenes_first("density", density, like, lead, tets)
+    if rest_points is not None or density is not None:
+        points = model._rest_points if rest_points is None else rest_points
+        points = _scenes_first("rest_points", points, like, lead, (model.num_vertices, 3))
+        points = ops.broadcast(points, (points.shape[0], model.num_vertices, 3))
+        metric, volume = rest_metric(ops.tet_gather(points, *model._topology))
+        rest = None if rest_points is None else metric
+        if density is None:
+            density = model._density[None]
+        shape = (max(density.shape[0], volume.shape[0]), model.num_tets)
+        if checking() and model.device.type == "cuda":  # where star_sum does not look
+            name_value("density", "finite numbers > 0 kg/m^3", density, density > 0)
+            name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0)
+        try:
+            mass = lumped_mass(ops.broadcast(density, shape), ops.broadcast(volume, shape), *model._topology)
+        except ValueError:
+            name_value("density", "finite numbers > 0 kg/m^3", density, density > 0)
+            name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0)
+            raise
+    given: dict[str, Tensor] = {}
+    if parameters is not None and not isinstance(parameters, dict):
+        raise TypeError(f"parameters: expected a dict of tensors by name, got {type(parameters).__name__}")
+    known = {}
+    if parameters:
+        known = {f"{e.name}.{k}": (e, k, own) for e in model.parametric_energies for k, own in e.parameters.items()}
+    for name, value in (parameters or {}).items():
+        if name not in known:
+            fail("parameters", f"names among {sorted(known)}", f"{name!r}{_absent(name, model)}")
+        energy, key, own = known[name]
+        shape = tuple(model.constants(energy)[key].shape)[:own]
+        given[name] = _scenes_first(name, value, like, lead, shape)
+        if energy in (model.contact, model.friction) and (checking() or not like.is_cuda):
+            name_value(name, "finite numbers >= 0", given[name], given[name] >= 0)
+    materials = [_scenes_first(name, value, like, lead, tets) for name, value in (("mu", mu), ("lam", lam))]
+    if model.touches and not isinstance(adjoint, ReverseSweep | None):
+        raise NotImplementedError(f"adjoint: contact is differentiated by ReverseSweep, got {type(adjoint).__name__}")
+    unrolled = None
+    if isinstance(adjoint, Unrolled):
+        layout = model.derived("layout", lambda: reference.build_layout(model))
+        h, count = settings.numbers[0], settings.sweeps
+        unrolled = reference.stepper(model, like, mu, lam, h, count, rest_points, given_density, parameters, layout)
+    return Prepared(
+        mu=materials[0],
+        lam=materials[1],
+        mass=mass,
+        rest=rest,
+        parameters=given,
+        settings=settings,
+        unrolled=unrolled,
+    )
+
+
+def check_prescribed(model: Model, prescribed: Any, x: Tensor, *others: Tensor) -> None:
+    """Raises where ``prescribed`` would move a vertex that is not pinned: a row that is not read and is neither x,
+    nor one of the ``others``, nor the Model's rest position, nor NaN."""
+    if prescribed is None or model.num_active == 0:
+        return
+    value = broadcastable("prescribed", prescribed, x).detach()
+    if value.dim() < 2 or value.shape[-2] != model.num_vertices or not looks_at(value):
+        return  # one position for all that are pinned
+    ignored = ~model._pinned[:, None] & ~torch.isnan(value)
+    for known in (x, *others, model._rest_points):
+        ignored = ignored & (value != known.detach())
+    if bool(ignored.any()):
+        *scene, vertex, _ = ignored.nonzero()[0].tolist()
+        where = f"vertex {vertex}" + (f" of scene {scene}" if scene else "")
+        fail(
+            "prescribed",
+            "positions for pinned vertices (elsewhere x, the Model's rest_points or NaN)",
+            f"another position for {where}, which is not pinned: Model(pinned=...) says which vertices follow",
+        )
+
+
+def _absent(name: Any, model: Model) -> str:
+    """Why a Model does not know a parameter: perhaps its energy is missing, or misspelt."""
+    kinds = {
+        f"{kind.name}.{key}": kind for kind in (*VERTEX_ENERGIES, PairBarrier, Friction) for key in kind.parameters
+    }
+    meant = difflib.get_close_matches(str(name), kinds, 1)
+    if not meant:
+        return ""
+    (full,), kind = meant, kinds[meant[0]]
+    text = "" if full == name else f" (is {full!r} meant?)"
+    present = any(isinstance(energy, kind) for energy in model.energies)
+    return text if present else f"{text}: the Model has no {kind.__name__} among its energies"
+
+
+def collider_state(model: Model, x: Tensor, end: Any, start: Any) -> tuple[Tensor, Tensor] | None:
+    """Corner points of the colliders at the start and at the end of a step [B, Vc, 3]; one tensor where they rest. None
+    for a Model without contact."""
+    count = model.collider_points.shape[0]
+    lead = tuple(x.shape[:-2])
+    flat = (math.prod(lead), count, 3)
+    given = {}
+    for name, value in (("colliders", end), ("colliders_before", start)):
+        if value is None:
+            continue
+        if count == 0:
+            fail(name, "a Model with colliders", "one without")
+        value = check_broadcast(name, check_tensor(name, value, x), (*lead, count, 3), len(lead))
+        given[name] = ops.broadcast(value, (*lead, count, 3)).reshape(flat)
+    if not model.touches:
+        return None
+    after = given.get("colliders", model.collider_points.expand(flat).contiguous())
+    return given.get("colliders_before", after), after
+
+
+def name_argument(model: Model, error: ValueError, arguments: dict[str, Any]) -> None:
+    """Raises an error that names the argument, where the operator could name only what was made of several."""
+    if not str(error).startswith(("predictor", "start")):
+        return
+    for name, value in arguments.items():
+        if isinstance(value, Tensor):
+            good = torch.isfinite(value)
+            if name == "prescribed":  # read only where pinned
+                value, good = torch.where(model._pinned[:, None], value, 0.0), good | ~model._pinned[:, None]
+            name_value(name, "finite values", value, good)
+
+
+def acceleration_of(gravity: Any, like: Tensor) -> Tensor:
+    """The argument ``gravity`` as a tensor."""
+    if not isinstance(gravity, Tensor):
+        gravity = _three_numbers("gravity", gravity, like)
+    return broadcastable("gravity", gravity, like)
+
+
+def _three_numbers(name: str, value: Any, like: Tensor) -> Tensor:
+    if not isinstance(value, (tuple, list)) or not all(isinstance(a, (int, float)) for a in value):
+        raise TypeError(f"{name}: expected 3 numbers or a tensor, got {value!r}")
+    if len(value) != 3:
+        fail(name, "3 numbers or a tensor", f"{len(value)} numbers")
+    numbers = [to_float(name, a) for a in value]
+    if like.is_cuda:  # kernels fill it: a copy from the host would wait for the device and break a graph's capture
+        return torch.stack([torch.full((), a, dtype=like.dtype, device=like.device) for a in numbers])
+    return torch.tensor(numbers, dtype=like.dtype, device=like.device)
+
+
+def broadcastable(name: str, value: Any, x: Tensor) -> Tensor:
+    return check_broadcast(name, check_tensor(name, value, x), tuple(x.shape), x.dim() - 2)

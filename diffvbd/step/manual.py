@@ -1,0 +1,104 @@
+"""Steps without autograd: a forward that returns a tape, and a backward that takes one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..checks import check_tensor, fail, to_float
+from ..model.model import Model
+from .arguments import check_state
+from .step import step
+
+_ARGUMENTS = ("x", "v", "mu", "lam", "young", "poisson", "force", "gravity", "prescribed", "rest_points", "density",
+              "colliders", "colliders_before")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Tape:
+    """What :func:`step_backward` needs of one step; opaque.
+
+    Holds the arguments of ``wrt`` and the step's x', v' [m, m/s], shape [..., V, 3], with their graph.
+    """
+
+    inputs: dict[str, Tensor]
+    outputs: tuple[Tensor, Tensor]
+
+
+def step_forward(
+    model: Model, x: Tensor, v: Tensor, *, wrt: Sequence[str] = ("x", "v"), **options: Any
+) -> tuple[Tensor, Tensor, Tape]:
+    """One step and its tape, for code that keeps its own backward.
+
+    Args:
+        model, x, v, options: As in :func:`diffvbd.step`; works under torch.no_grad() too.
+        wrt: Names of the arguments to differentiate: x, v, mu, lam, young, poisson, force, gravity, prescribed,
+            rest_points, density, colliders, colliders_before, or a name in ``parameters``. Only these leave a tape.
+
+    Returns:
+        Positions, velocities (both detached) and the tape.
+    """
+    wrt = (wrt,) if isinstance(wrt, str) else wrt
+    if not isinstance(wrt, Sequence) or not all(isinstance(name, str) for name in wrt):
+        raise TypeError(f"wrt: expected names of arguments, got {wrt!r}")
+    check_state(model, x, v)
+    if not isinstance(options.get("parameters"), dict | None):
+        got = type(options["parameters"]).__name__
+        raise TypeError(f"parameters: expected a dict of tensors by name, got {got}")
+    values: dict[str, Any] = {"x": x, "v": v, **options}
+    parameters = dict(options.get("parameters") or {})
+    if "rest_points" in wrt and values.get("rest_points") is None:
+        values["rest_points"] = model.rest_points
+    if "density" in wrt and values.get("density") is None:
+        values["density"] = model.density
+    inputs: dict[str, Tensor] = {}
+    for name in wrt:
+        place = values if name in _ARGUMENTS else parameters
+        value = place.get(name)
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            value = torch.tensor(to_float(name, value), dtype=model.dtype, device=model.device)
+        if not isinstance(value, Tensor):
+            fail("wrt", "names of given tensors", f"{name!r}, which is {type(value).__name__}")
+        check_tensor(name, value, model._mass)
+        place[name] = inputs[name] = value.detach().requires_grad_()
+    values["parameters"] = parameters or None
+    with torch.enable_grad():
+        outputs = step(model, **values)
+    return outputs[0].detach(), outputs[1].detach(), Tape(inputs, outputs)
+
+
+def step_backward(tape: Tape, grad_x: Tensor | None = None, grad_v: Tensor | None = None) -> dict[str, Tensor]:
+    """Gradients of grad_x . x' + grad_v . v' with respect to the arguments named in ``wrt``.
+
+    Args:
+        tape: From :func:`step_forward`; may be used again.
+        grad_x, grad_v: Adjoints of the returned positions and velocities, shape of x; None: zero.
+
+    Returns:
+        A dict keyed by argument, each of the argument's shape.
+    """
+    pairs = []
+    for name, out, grad in zip(("grad_x", "grad_v"), tape.outputs, (grad_x, grad_v), strict=True):
+        if grad is None:
+            continue
+        if not isinstance(grad, Tensor) or grad.shape != out.shape or grad.dtype != out.dtype:
+            got = f"{grad.dtype} {list(grad.shape)}" if isinstance(grad, Tensor) else type(grad).__name__
+            fail(name, f"a tensor like x, {out.dtype} {list(out.shape)}", got)
+        if out.requires_grad:
+            pairs.append((out, grad))
+    names, leaves = list(tape.inputs), list(tape.inputs.values())
+    if not pairs:
+        return {n: torch.zeros_like(t) for n, t in tape.inputs.items()}
+    grads = torch.autograd.grad(
+        [p[0] for p in pairs],
+        leaves,
+        [p[1] for p in pairs],
+        retain_graph=True,
+        allow_unused=True,
+        materialize_grads=True,
+    )
+    return dict(zip(names, grads, strict=True))

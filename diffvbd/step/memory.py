@@ -1,0 +1,63 @@
+"""What a step needs of memory on CUDA, and what it says where that is not there."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from .. import ops
+from ..adjoint.sweep import is_out_of_memory
+from ..model.model import Model
+from ..ops import regimes
+
+
+@contextlib.contextmanager
+def out_of_memory_named(model: Model, x: Tensor, settings: ops.SweepSettings, policy: int) -> Iterator[None]:
+    """Says of a step that does not fit the memory how much it wanted, and which tape would fit a CUDA device."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error) or isinstance(error, torch.OutOfMemoryError) and not x.is_cuda:
+            raise
+        scalars = x.shape[0] * settings.sweeps * model.num_active * x.element_size()
+        base = 2 * x.numel() * x.element_size()
+        base += cuda_scratch(model, x.shape[0], reverse=False) if x.is_cuda else 0
+        wanted = {name: base + scalars * ops.tape_rows(code, model.energy_mask) for name, code in _POLICIES.items()}
+        chosen = next(name for name, code in _POLICIES.items() if code == policy)
+        if not x.is_cuda:
+            smaller = [f'"{name}" {size} bytes' for name, size in wanted.items() if size < wanted[chosen]]
+            advice = f", or a smaller ReverseSweep(tape=...): {', '.join(smaller)}" if smaller else ""
+            raise torch.OutOfMemoryError(
+                f'CPU out of memory: a step of {settings.sweeps} sweeps with tape="{chosen}" wanted {wanted[chosen]} '
+                f"bytes; use fewer sweeps or scenes{advice}"
+            ) from error
+        free, _ = torch.cuda.mem_get_info(x.device)
+        free += torch.cuda.memory_reserved(x.device) - torch.cuda.memory_allocated(x.device)
+        fits = [f'"{name}" ({bytes_wanted} bytes)' for name, bytes_wanted in wanted.items() if bytes_wanted <= free]
+        advice = f"ReverseSweep(tape=...) that fits: {', '.join(fits)}" if fits else "no tape policy fits: fewer scenes"
+        raise torch.OutOfMemoryError(
+            f'CUDA out of memory: a step with tape="{chosen}" wanted {wanted[chosen]} bytes, {free} are free; {advice}'
+        ) from error
+
+
+_POLICIES = {"full": ops.FULL_TAPE, "compact": ops.COMPACT_TAPE, "recompute": ops.NO_TAPE}
+WORKSPACE_BUDGET = 2 << 30  # bytes; twin of kWorkspaceBudget in csrc/binding_sweep_cuda.h
+
+
+def cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = True, rest: bool = False) -> int:
+    """Bytes of workspace of one step on CUDA, as carved in csrc/cuda/run.cuh (a material per tet)."""
+    if regimes.choose(model.num_vertices, model.num_colors, scenes, contact=model.touches)[0] == regimes.THREAD:
+        return 0
+    _, _, slots, _, _, blocks, edge_slots, *_ = model._sizes
+    lanes = ops.LANES["cuda"]
+    positions, pairs = blocks * lanes, slots * lanes
+    one = 8 * positions + (6 * positions if model.floor else 0) + 2 * pairs
+    one += 3 * positions if model.dtype == torch.float32 else 0  # local origins
+    if reverse:
+        one += 4 * (edge_slots * lanes + 1) + 8 * positions
+        one += (2 * pairs if material or rest else 0) + (4 * pairs if rest else 0)
+    one *= model._mass.element_size()
+    return one * min(scenes, max(1, WORKSPACE_BUDGET // max(1, one)))

@@ -1,0 +1,110 @@
+"""How a step begins and ends: from arguments to what the sweeps start from, and from where they ended to the state."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .. import ops
+from ..adjoint.sweep import SweepTensors
+from ..mask import ELASTIC
+from ..model.model import Model
+from .arguments import Prepared, broadcastable
+from .rigid import correct
+from .start import begin as start_of
+
+
+def _energy_data(model: Model, prepared: Prepared, origin: Tensor | None) -> Tensor:
+    """The energies' data [1 | B, n]: the Model's constants unless a parameter or an origin changes them."""
+    if not prepared.parameters and origin is None:
+        return model._energy_data
+    packed = []
+    for energy in model.vertex_energies:
+        values = {k: v[None] for k, v in model.constants(energy).items()}
+        values.update({k: prepared.parameters[f"{energy.name}.{k}"] for k in values
+                       if f"{energy.name}.{k}" in prepared.parameters})  # fmt: skip
+        packed.append(energy.pack(values, origin))
+    if not packed:
+        return model._energy_data
+    scenes = max([p.shape[0] for p in packed])
+    return torch.cat([ops.broadcast(p, (scenes, p.shape[1])) for p in packed], -1)
+
+
+class Begun(NamedTuple):
+    """What the sweeps of a step start from; positions [B, V, 3], relative to ``origin`` where there is one."""
+
+    x_start: Tensor  # as far as planes let it go
+    x_prev: Tensor  # the state before the step
+    y: Tensor  # the predictor
+    data: Tensor  # [1 | B, n], of the energies
+    origin: Tensor | None
+
+    def detached(self) -> Begun:
+        origin = None if self.origin is None else self.origin.detach()
+        return Begun(self.x_start.detach(), self.x_prev.detach(), self.y.detach(), self.data.detach(), origin)
+
+    def tensors(self, prepared: Prepared) -> SweepTensors:
+        """The arguments of adjoint.sweep.sweep."""
+        origin = self.y.new_empty((0,)) if self.origin is None else self.origin
+        return SweepTensors(self.x_start, self.x_prev, self.y, prepared.mu, prepared.lam, prepared.mass, prepared.rest,
+                            self.data, origin)  # fmt: skip
+
+    def corrected(self, x: Tensor, model: Model, prepared: Prepared) -> Tensor:
+        """x [B, V, 3] after the rigid correction, where the Model has one."""
+        return self._correct(x, model, prepared)[0] if model.corrects else x
+
+    def _correct(self, x: Tensor, model: Model, prepared: Prepared) -> tuple[Tensor, Tensor]:
+        origin, settings = self.y.new_empty((0,)) if self.origin is None else self.origin, prepared.settings
+        return correct(x, self.x_prev, self.y, prepared.mass, self.data, origin, model._bodies, model._other_bodies,
+                       settings.data_count, settings.numbers[0])  # fmt: skip
+
+    def finish(self, end: Tensor, model: Model, prepared: Prepared, corrects: bool = True) -> tuple[Tensor, Tensor]:
+        """Positions and velocities after the step whose sweeps ended at ``end``."""
+        if corrects and model.corrects:
+            end, velocity = self._correct(end, model, prepared)
+        else:
+            velocity = (end - self.x_prev) / prepared.settings.numbers[0]
+        return end if self.origin is None else end + self.origin, velocity
+
+
+def begin(
+    model: Model, x: Tensor, v: Tensor, prepared: Prepared, force: Any, gravity: Tensor, prescribed: Any
+) -> Begun:
+    """Predictor, local origin, data of the energies and start of the sweeps."""
+    h = prepared.settings.numbers[0]
+    shape, flat = x.shape, (math.prod(x.shape[:-2]), *x.shape[-2:])
+    start, velocity = x.reshape(flat), v.reshape(flat)
+    if gravity.dim() == 1 and force is None:
+        acceleration = gravity[None, None]
+    else:
+        acceleration = ops.broadcast(gravity, shape).reshape(flat)
+    if force is not None:
+        total = ops.broadcast(broadcastable("force", force, x), shape).reshape(flat)
+        # A pinned vertex is moved by no force, whatever stands there.
+        total = torch.where(model._pinned[:, None], torch.zeros_like(total), total)
+        weight = ops.broadcast(prepared.mass, (flat[0], flat[1]))[..., None]
+        # A vertex without mass is isolated and pinned: no force moves it.
+        acceleration = acceleration + total / torch.where(weight > 0, weight, torch.ones_like(weight))
+    # float32 computes about a point of each body, where positions are small and their spacing fine
+    origin = None
+    if model.dtype == torch.float32 and model.num_vertices:
+        origin = start.detach()[:, model._first_of_body]
+        start = start - origin
+    none = start.new_empty((0,))
+    held = none
+    if prescribed is not None:
+        held = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
+        held = held if origin is None else held - origin
+    data = _energy_data(model, prepared, origin)
+    rest = none
+    if model.starts_from == "auto" and model.energy_mask & ELASTIC:
+        rest = model.rest_scalars if prepared.rest is None else prepared.rest
+    x_start, y = start_of(
+        start, velocity, acceleration, held, prepared.mass, data, none if origin is None else origin, prepared.mu,
+        prepared.lam, rest, model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
+        start=model.starts_from, filters=model.floor is not None and model.contact is None,
+    )  # fmt: skip
+    return Begun(x_start, start, y, data, origin)

@@ -1,0 +1,122 @@
+"""Where a step begins: the predictor y = x + h v + h^2 a, and where its sweeps start.
+
+A body that is corrected coasts: x + s h v with one share s for all its vertices, as far as planes let it, and is
+corrected there (rigid.py). Any other body starts from y or from x + h v, every vertex as far as planes let it. Few
+sweeps hardly move a stiff body away from its start, so "auto" takes, for each body and step, the one of lower
+incremental potential: y where a body is soft or flies, x + h v where its pins carry it. docs/method.md, sections 6, 14.
+"""
+
+# pyright: reportIncompatibleMethodOverride=false
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from .. import ops
+from ..model.bodies import Bodies, OtherBodies
+from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
+from ..ops import rigid as ops_rigid
+from ..ops.begin import STARTS
+from ..safeguards import FILTER_ETA
+from .rigid import folded
+
+_TENSORS = 6  # x, v, acceleration, held, mass, data: the differentiable inputs
+_SCENES = 10  # and origin, mu, lam, rest: what has a scene dimension
+
+
+class _Begin(Function):
+    @staticmethod
+    def forward(x, v, acceleration, held, mass, data, origin, mu, lam, rest, pinned, order, ptr, spread, groups, other,
+                other_order, other_ptr, other_tets, other_tet_ptr, other_groups, data_count, time_step, filter_eta,
+                start, filters):  # fmt: skip
+        # torch.compile counts these arguments: *args would get the context as well
+        return ops.raw.begin(
+            x, v, acceleration, held, mass, data, origin, mu, lam, rest, pinned, order, ptr, spread, groups, other,
+            other_order, other_ptr, other_tets, other_tet_ptr, other_groups, data_count, time_step, filter_eta,
+            start, filters,
+        )  # fmt: skip
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
+        x, v, acceleration, held, mass, data, origin, _, _, _, pinned, order, ptr, spread, groups, other = inputs[:16]
+        ctx.save_for_backward(
+            output[2], x, v, acceleration, held, mass, data, origin, pinned, order, ptr, spread, other
+        )
+        ctx.options = (groups, inputs[17].shape[0] - 1, *inputs[21:])
+        ctx.mark_non_differentiable(output[2])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        needs = ctx.needs_input_grad[:_TENSORS]
+        out = _BeginBackward.apply(*grads[:2], *ctx.saved_tensors, ctx.options, needs)
+        return of_inputs(out, needs, len(ctx.needs_input_grad) - _TENSORS)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        tensors, scenes = folded(info.batch_size, args[:_SCENES], in_dims, 2)
+        x_start, y, falls = _Begin.apply(*tensors, *args[_SCENES:])
+        shape = (info.batch_size, falls.shape[0] // info.batch_size)
+        return (x_start.unflatten(0, (-1, scenes)), y.unflatten(0, (-1, scenes)), falls.unflatten(0, shape)), (0, 0, 0)
+
+
+class _BeginBackward(Function):
+    @staticmethod
+    def forward(x_start_bar, y_bar, falls, x, v, acceleration, held, mass, data, origin, pinned, order, ptr, spread,
+                other, options, needs):  # fmt: skip
+        groups, others, data_count, *numbers = options
+        wants = (needs[2], needs[3], needs[5])
+        x_out, v_out, acceleration_out, held_out, mass_out, shared, own, planes = ops.raw.begin_backward(
+            x_start_bar.contiguous(), y_bar.contiguous(), falls, x, v, acceleration, held, mass, data, origin, pinned,
+            order, ptr, spread, groups, other, others, data_count, *numbers, wants,
+        )  # fmt: skip
+        data_out = data
+        if needs[5]:
+            data_out = ops_rigid.join_data(shared, own, data_count)
+            if planes.numel():  # the first energy's data
+                of_planes = ops.sum_to(planes, (planes.shape[0], 1, planes.shape[2]))[:, 0]
+                count = planes.shape[2]
+                first, others_out = data_out.narrow(1, 0, count), data_out.narrow(1, count, data_out.shape[1] - count)
+                data_out = torch.cat([first + of_planes, others_out], 1)
+        out = (x_out, v_out, acceleration_out, held_out, mass_out, data_out)
+        given = (x, v, acceleration, held, mass, data)
+        return tuple(ops.sum_to(bar, t.shape) for bar, t, need in zip(out, given, needs, strict=True) if need)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        no_second_derivative()
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        """Several adjoints, one after another."""
+        return one_by_one(_BeginBackward, info.batch_size, in_dims, args)
+
+
+def begin(
+    x: Tensor, v: Tensor, acceleration: Tensor, held: Tensor, mass: Tensor, data: Tensor, origin: Tensor, mu: Tensor,
+    lam: Tensor, rest: Tensor, pinned: Tensor, bodies: Bodies, others: OtherBodies, data_count: tuple[int, ...],
+    time_step: float, *, start: str, filters: bool,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Where the sweeps start and the predictor [m], both [B, V, 3]; differentiable in the first six tensors.
+
+    Args:
+        x, v: State [m, m/s], [B, V, 3].  acceleration: [1 | B, 1 | V, 3] [m/s^2].
+        held: Where pinned vertices go [m], [1 | B, V, 3], or empty: they stay.
+        mass, data, origin, mu, lam: As of sweeps.sweep.  pinned: bool [V].
+        rest: [1 | B, T, 7], or empty where tets have no energy; like mu and lam looked at by "auto" only.
+        start: "auto", "predictor" or "inertia", of the bodies that are not corrected.
+        filters: Whether the planes of a floor hold back a start.
+    """
+    tensors = distinct(x, v, acceleration, held, mass, data, origin, mu, lam, rest)
+    x_start, y, _ = _Begin.apply(*tensors, pinned, *bodies, *others, data_count, time_step, FILTER_ETA, STARTS[start],
+                                 filters)  # fmt: skip
+    return x_start, y
+
+
+ops.ready_signature(_Begin, _BeginBackward)

@@ -1,0 +1,209 @@
+"""One implicit time step: predictor, rigid correction, sweeps, rigid correction, velocity. Sweeps and corrections are
+operators of ours; the rest is torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import ops
+from ..adjoint.implicit import global_sweep
+from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
+from ..adjoint.sweep import fused_step, sweep
+from ..model.model import Model
+from ..model.warnings import warn_of_thin_tets
+from ..scopes import checking, looks_at
+from .arguments import (
+    GRAVITY,
+    Prepared,
+    acceleration_of,
+    broadcastable,
+    check_prescribed,
+    check_state,
+    collider_state,
+    name_argument,
+    prepare,
+)
+from .check import check_on_cpu
+from .contact import run_contact
+from .memory import out_of_memory_named
+from .predict import Begun, begin
+
+
+def step(
+    model: Model,
+    x: Tensor,
+    v: Tensor,
+    *,
+    mu: float | Tensor | None = None,
+    lam: float | Tensor | None = None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
+    time_step: float,
+    sweeps: int,
+    force: Tensor | None = None,
+    gravity: Sequence[float] | Tensor = GRAVITY,
+    prescribed: Tensor | None = None,
+    colliders: Tensor | None = None,
+    colliders_before: Tensor | None = None,
+    rest_points: Tensor | None = None,
+    density: float | Tensor | None = None,
+    parameters: dict[str, Any] | None = None,
+    adjoint: Adjoint | None = None,
+) -> tuple[Tensor, Tensor]:
+    """One implicit Euler step by Vertex Block Descent, differentiable, by default by the exact reverse sweep.
+
+    Args:
+        model: The scene; x, v and the other tensors must have its dtype and device.
+        x: Positions [m], shape [..., V, 3]; leading dimensions are scenes over one mesh, which never mix.
+        v: Velocities [m/s], shape of x.
+        mu: Shear modulus [Pa], broadcasts to x.shape[:-2] + (T,); a value per scene is [B, 1].
+        lam: First Lame parameter [Pa], likewise. mu >= 0 and mu + lam >= 0 (lam >= 0 with block="paper").
+        young, poisson: Young's modulus [Pa] and Poisson's ratio [-] in place of mu and lam, likewise
+            (:func:`diffvbd.lame`).
+        time_step: h [s] > 0.
+        sweeps: K >= 0, the number of colored sweeps that are executed (and differentiated).
+        force: External forces [N], broadcasts to x.shape.
+        gravity: Acceleration [m/s^2], 3 numbers, or a tensor that broadcasts to x.shape.
+        prescribed: Positions of pinned vertices at the end of the step [m], broadcasts to x.shape; None holds
+            them where x has them. Where a vertex is not pinned it must have x, the Model's rest_points or NaN.
+        colliders: Corner points of the Model's colliders at the end of the step [m], broadcasts to
+            x.shape[:-2] + (Vc, 3). None: the Model's collider_points.
+        colliders_before: The same at the start of the step, where they move. None: they rest.
+        rest_points: Rest positions [m], broadcasts to x.shape; None: the Model's. Enter through rest metric and mass.
+        density: [kg/m^3], broadcasts to x.shape[:-2] + (T,); None: the Model's.
+        parameters: Energy parameters by name, as {"floor_barrier.kappa": tensor}; each broadcasts to
+            x.shape[:-2] + its own shape.
+        adjoint: How the backward is computed: ReverseSweep(), which None stands for, Unrolled() or GlobalAdjoint().
+
+    Returns:
+        Positions and velocities after the step, shape of x. Inputs are untouched.
+
+    Raises:
+        ValueError, TypeError: Naming the argument, what was expected and what came, before any work. With contact also
+            for surfaces that touch at the start, and for prescribed motion above the bounds.
+        RuntimeError: Where more pairs are near than the PairBarrier has capacity for.
+        NotImplementedError: In the backward, for second derivatives and forward mode (which Unrolled has).
+
+    Source: paper, eqs. 1-3 and section 3; docs/method.md.
+    """
+    lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
+    prepared = prepare(model, lead, mu=mu, lam=lam, young=young, poisson=poisson, time_step=time_step, sweeps=sweeps,
+                       rest_points=rest_points, density=density, parameters=parameters, adjoint=adjoint)  # fmt: skip
+    check_prescribed(model, prescribed, x)
+    if looks_at(prepared.mu) and looks_at(prepared.lam):
+        warn_of_thin_tets(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps)
+    return advance(model, x, v, prepared, force=force, gravity=gravity, prescribed=prescribed, colliders=colliders,
+                   colliders_before=colliders_before, adjoint=adjoint)  # fmt: skip
+
+
+def advance(
+    model: Model,
+    x: Tensor,
+    v: Tensor,
+    prepared: Prepared,
+    *,
+    force: Tensor | None,
+    gravity: Sequence[float] | Tensor,
+    prescribed: Tensor | None,
+    adjoint: Adjoint | None,
+    colliders: Tensor | None = None,
+    colliders_before: Tensor | None = None,
+    index: int = 0,
+) -> tuple[Tensor, Tensor]:
+    """The step itself; ``index`` is its number in a rollout, for debug_checks()."""
+    adjoint = check_adjoint(adjoint)
+    gravity = acceleration_of(gravity, x)
+    where = collider_state(model, x, colliders, colliders_before)
+    if isinstance(adjoint, ReverseSweep) and x.is_cuda and _fuses(model, force, gravity):
+        held = None if prescribed is None else broadcastable("prescribed", prescribed, x)
+        return _fused(model, x, v, gravity, held, prepared, adjoint)
+    begun = begin(model, x, v, prepared, force, gravity, prescribed)
+    given = {"x": x, "v": v, "force": force, "gravity": gravity, "prescribed": prescribed, "colliders": colliders,
+             "colliders_before": colliders_before}  # fmt: skip
+    if prepared.unrolled is not None:
+        with torch.no_grad():  # for what it raises: the values are looked at even by no sweep
+            count = prepared.settings.sweeps if checking() else 0
+            looked_at = prepared._replace(settings=prepared.settings._replace(sweeps=count))
+            swept(model, begun.detached(), looked_at, given, index=index)
+        return prepared.unrolled(x, v, force, gravity, prescribed)
+    x_end = swept(model, begun, prepared, given, adjoint, index, where)
+    # GlobalAdjoint corrects before it takes the end as the solution
+    x_end, v_end = begun.finish(x_end, model, prepared, corrects=not isinstance(adjoint, GlobalAdjoint))
+    return x_end.reshape(x.shape), v_end.reshape(x.shape)
+
+
+def swept(
+    model: Model,
+    begun: Begun,
+    prepared: Prepared,
+    given: dict[str, Any],
+    adjoint: Adjoint | None = None,
+    index: int = 0,
+    colliders: tuple[Tensor, Tensor] | None = None,
+) -> Tensor:
+    """Positions after the sweeps, with the backward of an adjoint route. ``given``: arguments that errors may name;
+    ``colliders``: where they are at the start and at the end, of a Model with contact."""
+    tensors, settings, adjoint = begun.tensors(prepared), prepared.settings, check_adjoint(adjoint)
+    more = (*(colliders or ()), *prepared.parameters.values())
+    policy = _tape_policy(model, (*tensors, *more), settings, adjoint)
+    debug_step = index if checking() else -1
+    try:
+        if colliders is not None:
+            with out_of_memory_named(model, begun.x_start, settings, policy):
+                moves = given.get("prescribed") is not None
+                return run_contact(model, begun, prepared, *colliders, moves, policy, debug_step)
+        if checking() and begun.y.is_cuda:
+            check_on_cpu(model, tensors, settings, index)
+        with out_of_memory_named(model, begun.x_start, settings, policy):
+            if isinstance(adjoint, GlobalAdjoint):
+                return global_sweep(model, tensors, settings, adjoint, debug_step,
+                                    lambda x: begun.corrected(x, model, prepared))  # fmt: skip
+            return sweep(*tensors, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)
+    except ValueError as error:
+        name_argument(model, error, given)
+        raise
+
+
+def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
+    """Whether one operator can do the whole step on CUDA. Forces, vertex energies, float32's local origin, function
+    transforms and checks take the parts."""
+    simple = force is None and not model.vertex_energies and not model.touches and model.dtype == torch.float64
+    simple = simple and not model.corrects and model.starts_from == "predictor"
+    if not simple or checking() or torch.compiler.is_compiling() or gravity.dim() > 1:
+        return False
+    return torch._C._functorch.peek_interpreter_stack() is None  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _fused(
+    model: Model,
+    x: Tensor,
+    v: Tensor,
+    gravity: Tensor,
+    held: Tensor | None,
+    prepared: Prepared,
+    adjoint: ReverseSweep,
+) -> tuple[Tensor, Tensor]:
+    shape, flat = x.shape, (math.prod(x.shape[:-2]), *x.shape[-2:])
+    held = x.new_empty((0,)) if held is None else ops.broadcast(held, shape).reshape(flat)
+    acceleration = ops.broadcast(gravity, (1, 1, 3))
+    x, v = x.reshape(flat), v.reshape(flat)
+    tensors = (x, v, acceleration, held, prepared.mu, prepared.lam, prepared.mass, prepared.rest)
+    policy = _tape_policy(model, tensors, prepared.settings, adjoint)
+    with out_of_memory_named(model, x, prepared.settings, policy):
+        x_end, v_end = fused_step(*tensors, model._packed_rest, model._plan, prepared.settings, tape_policy=policy)
+    return x_end.reshape(shape), v_end.reshape(shape)
+
+
+def _tape_policy(model: Model, tensors: Sequence[Tensor | None], settings: ops.SweepSettings, adjoint: Adjoint) -> int:
+    if not isinstance(adjoint, ReverseSweep):
+        return ops.NO_TAPE
+    if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)):
+        return ops.NO_TAPE
+    x = tensors[0]
+    assert x is not None
+    return adjoint.policy(x.shape[0] * settings.sweeps * model.num_active, x.element_size(), model.energy_mask)
