@@ -22,7 +22,7 @@ from diffvbd.ops import load as native
 ROOT = Path(__file__).parents[1]
 CSRC = ROOT / "csrc"
 KERNELS = sorted(CSRC.glob("cuda/*.cu"))
-BINDINGS = sorted(CSRC.glob("ops*cuda.cpp"))
+BINDINGS = sorted(CSRC.glob("bind/cuda/*.cpp"))
 ARCHITECTURES = ("80", "90", "100", "120")
 LIMIT = 120  # [s] for what takes one on an idle machine: a hang, not slowness
 BUILT = "lib/diffvbd/_C_cuda.abi3.so"  # where setuptools leaves the object
@@ -212,7 +212,7 @@ def test_an_object_that_does_not_load_is_reported_when_needed(tmp_path: Path, mo
 FAKE = f"""
 import os, pathlib, sys, time
 here = pathlib.Path(os.environ["FAKE"])
-assert pathlib.Path("csrc/ops_cuda.cpp").exists()
+assert pathlib.Path("csrc/bind/cuda/sweep.cpp").exists()
 with open(here / "runs", "a") as runs:
     print(os.getpid(), file=runs)
 mode = (here / "mode").read_text()
@@ -235,8 +235,9 @@ class Fake:
     def __init__(self, folder: Path) -> None:
         self.folder, self.package, self.cache = folder, folder / "package", folder / "cache"
         (self.package / "csrc" / "cuda").mkdir(parents=True)
-        (self.package / "csrc" / "ops_cuda.cpp").write_text("// nothing")
-        (self.package / "build_cuda.py").write_text(FAKE)
+        for path, text in ((("csrc", "bind", "schema.cpp"), "// nothing"), (("ops", "build_cuda.py"), FAKE)):
+            self.package.joinpath(*path).parent.mkdir()
+            self.package.joinpath(*path).write_text(text)
         self.mode("build")
 
     def mode(self, name: str) -> None:
@@ -281,7 +282,7 @@ def test_jit_compiles_once_for_what_it_depends_on(fake: Fake, monkeypatch: pytes
 def test_jit_survives_a_killed_build(fake: Fake) -> None:
     """Both builds are processes of their own with a time limit, so that a hang fails this test, not the whole suite."""
     fake.mode("hang")
-    program = f"from pathlib import Path; from diffvbd import native; import torch; torch.version.cuda = '13.0'; \
+    program = f"from pathlib import Path; from diffvbd.ops import load as native; import torch; torch.version.cuda = '13.0'; \
 native._FOLDER = Path({str(fake.package)!r}); print(native.jit_build())"
     build = [sys.executable, "-c", program]
     victim = subprocess.Popen(build, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

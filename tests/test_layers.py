@@ -202,14 +202,20 @@ def targets(path: Path) -> set[str]:
     return {t.relative_to(CSRC.resolve()).as_posix() for t in found if CSRC.resolve() in t.parents and t.exists()}
 
 
-def layer_includes(folder: str) -> set[str]:
-    """Layers of csrc, or files beside them, whose headers a layer includes."""
-    return {target.split("/")[0] for path in sources(folder) for target in targets(path)} - {folder}
+# lowest first: each folder includes only what comes before it, and cpu and cuda not each other
+CPP_ROOMS = ("core", "energies", "sweep", "rigid", "start", "contact", "cpu", "cuda", "bind")
+SHARED = CPP_ROOMS[: CPP_ROOMS.index("cpu")]
+
+
+def inclusions() -> set[tuple[str, str]]:
+    paths = [path for folder in CPP_ROOMS for path in sources(folder)]
+    return {(path.relative_to(CSRC).as_posix(), target) for path in paths for target in targets(path)}
 
 
 @needs_csrc
 def test_shared_headers_know_no_torch() -> None:
-    for folder, files in {"core": 3, "energies": 3, "contact": 3, "rigid": 3, "start": 2}.items():
+    for folder, files in {"core": 3, "energies": 3, "sweep": 3, "contact": 3, "rigid": 3, "start": 2}.items():
+        assert folder in SHARED
         paths = sources(folder)
         assert len(paths) >= files
         for path in paths:
@@ -220,33 +226,28 @@ def test_shared_headers_know_no_torch() -> None:
 
 
 @needs_csrc
-def test_cpp_layers_include_only_what_lies_below() -> None:
-    assert layer_includes("energies") <= {"core"}
-    # block.h alone knows the list of energies, which the algorithm runs
-    assert layer_includes("core") <= {"energies"}
-    assert [p.name for p in sources("core") if any("energies/" in name for name in includes(p))] == ["block.h"]
-    shared = {"core", "energies", "contact", "rigid", "start"}
-    assert layer_includes("contact") <= {"core", "energies"}
-    assert layer_includes("rigid") <= {"core", "energies"}
-    assert "rigid" in layer_includes("start") <= {"core", "energies", "rigid"}
-    tensors = {p.name for p in CSRC.glob("arguments*.h")}
-    assert "core" in layer_includes("cpu") <= shared | tensors
-    assert "core" in layer_includes("cuda") <= shared
-    for path in CSRC.glob("arguments*.h"):
-        assert {t.split("/")[0] for t in targets(path)} <= shared | tensors
-    bindings = {p.name for p in CSRC.glob("binding*_cuda.h")}
-    for path in CSRC.glob("ops*cuda.cpp"):
-        known = {t.split("/")[0] for t in targets(path)}
-        assert "cuda" in known <= {*shared, *tensors, *bindings, "cuda"}
-    assert not targets(CSRC / "ops.cpp")
+def test_cpp_rooms_include_only_what_lies_below() -> None:
+    assert sorted(p.name for p in CSRC.iterdir()) == sorted(CPP_ROOMS)
+    found = inclusions()
+    assert len(found) > 100
+    for path, target in found:
+        (upper, *upper_names), (lower, *_) = path.split("/"), target.split("/")
+        assert CPP_ROOMS.index(lower) <= CPP_ROOMS.index(upper), f"{path} includes {target}"
+        backend = {"cpu": "cuda", "cuda": "cpu"}.get(upper_names[0] if upper == "bind" else upper)
+        assert backend not in target.split("/")[:2], f"{path} includes {target}"
+    assert not circle(found)
+    # what is about an algorithm does not know the list of energies unless it runs them
+    assert not {target for path, target in found if path == "bind/schema.cpp"}
 
 
 @needs_csrc
 def test_tensors_end_where_the_operators_are_registered() -> None:
     """Everything behind works on raw pointers; of torch the CPU's loops know the thread pool, CUDA's nothing."""
-    registrations = {p for p in sources(".") if re.match(r"ops|register|arguments|binding", p.name)}
-    assert len(registrations) >= 12
-    assert {p for p in sources(".") if re.search(r"\bTensor\b", code_of(p))} <= registrations
+    bindings = set(sources("bind"))
+    assert len(bindings) >= 12
+    assert {p for p in sources(".") if re.search(r"\bTensor\b", code_of(p))} <= bindings
+    names = {kind: {p.name for p in sources(f"bind/{kind}") if p.suffix == ".cpp"} for kind in ("cpu", "cuda")}
+    assert names["cpu"] == names["cuda"]
     for path in sources("cuda"):
         assert path.suffix in (".cu", ".cuh", ".h"), path
         assert not any(re.match(TORCH, name) for name in includes(path)), path
@@ -280,7 +281,7 @@ def test_constants_agree_across_languages() -> None:
     assert ops.LANES == {"cpu": constant("core/views.h", "kLanes"), "cuda": constant("core/views.h", "kSlice")}
     assert ops.REST_SCALARS == constant("core/views.h", "kRestScalars")
     assert ops.PLAN_HEADER == constant("core/plan_views.h", "kPlanHeader")
-    assert memory.WORKSPACE_BUDGET == constant("binding_sweep_cuda.h", "kWorkspaceBudget")
+    assert memory.WORKSPACE_BUDGET == constant("bind/cuda/sweep.h", "kWorkspaceBudget")
     floor, anchor = (CSRC / "energies" / f"{name}.h" for name in ("floor_barrier", "anchor"))
     strides = [int(re.findall(r"stride = (\d+);", p.read_text(encoding="utf-8"))[0]) for p in (floor, anchor)]
     assert dv.FloorBarrier(normal=[(0, 1, 0)] * 3).count() == 3 * strides[0]
@@ -302,7 +303,7 @@ def test_regimes_and_plans_agree() -> None:
     assert lanes == [regimes.FEW_LANES, regimes.SOME_LANES, regimes.MANY_LANES]
     assert regimes.SMALL_MESH == constant("core/views.h", "kSmallMesh") >= regimes.TINY_VERTICES
     # the host gets a plan's header in an order of its own, with active vertices, tets and slots first
-    (order,) = re.findall(r"order\[kPlanHeader\] = \{([^}]*)\}", code_of(CSRC / "binding_sweep_cuda.h"))
+    (order,) = re.findall(r"order\[kPlanHeader\] = \{([^}]*)\}", code_of(CSRC / "bind" / "cuda" / "sweep.h"))
     sizes = ops.plan_sizes(torch.arange(100), "cuda")
     assert [sizes[int(n)] for n in order.split(",")] == list(range(ops.PLAN_HEADER))
     colors = 3  # both the place of the number of colors in the header and, in this plan, that number

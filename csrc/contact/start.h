@@ -2,7 +2,7 @@
 // floor let it; with the adjoint.
 #pragma once
 
-#include "../core/bounds.h"
+#include "../sweep/bounds.h"
 #include "../energies/floor_start.h"
 #include "candidates.h"
 #include "passes.h"

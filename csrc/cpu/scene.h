@@ -5,7 +5,7 @@
 #include <memory>
 #include <new>
 
-#include "../core/vertex.h"
+#include "../sweep/vertex.h"
 #include "lanes.h"
 
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && !defined(DIFFVBD_NO_CLONES)

@@ -1,7 +1,7 @@
-// A group of threads of one warp shares a vertex: memory and sums, so that core/vertex.h runs unchanged.
+// A group of threads of one warp shares a vertex: memory and sums, so that sweep/vertex.h runs unchanged.
 #pragma once
 
-#include "../core/vertex.h"
+#include "../sweep/vertex.h"
 #include "step.h"
 
 namespace diffvbd::cuda {

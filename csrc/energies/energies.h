@@ -117,7 +117,7 @@ struct EnergySet {
   }
 };
 
-// The same energies for blocks that need neither axes along planes nor a refined solve (core/frame.h, core/uneven.h):
+// The same energies for blocks that need neither axes along planes nor a refined solve (core/frame.h, sweep/uneven.h):
 // nearly all of them. CUDA does these first, with fewer registers, and the others once more by themselves.
 template <class Set>
 struct Usual : Set {
@@ -141,7 +141,7 @@ DIFFVBD_COLD PlanePush<E, R> push_of(const VertexState<R>& s, const R* record, c
   const auto f = E::push(s, record, axes);
   return {f.n, f.curvature, f.slope + f.curvature * dot(f.n, d_raw)};
 }
-// The axes of p and d_raw, and a small part of d_raw that is kept apart (core/uneven.h). The reaction of a plane is the
+// The axes of p and d_raw, and a small part of d_raw that is kept apart (sweep/uneven.h). The reaction of a plane is the
 // small difference of a large slope and a large answer to it: that part gives it its digits.
 template <class R>
 struct PlaneStep {

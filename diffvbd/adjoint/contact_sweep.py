@@ -26,7 +26,7 @@ class Pairs(NamedTuple):
 
 
 class ContactTensors(NamedTuple):
-    """What the sweeps with contact differentiate besides SweepTensors, in the order of csrc/ops.cpp."""
+    """What the sweeps with contact differentiate besides SweepTensors, in the order of csrc/bind/schema.cpp."""
 
     bounds: Tensor  # [B, V, 4]  center and radius [m]
     collider: Tensor  # [B, Vc, 3] during the sweeps [m]

@@ -1,1 +1,1 @@
-"""Contact between surfaces: potentials, colliders, detection, starts. Knows no Model. dv.contact is inspect/contact.py."""
+"""Contact between surfaces: potentials, colliders, detection, starts. Knows no Model (dv.contact is inspect.contact)."""

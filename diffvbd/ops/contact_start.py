@@ -13,7 +13,7 @@ from .load import raw
 
 def translation(move: Tensor, mass: Tensor, x: Tensor, origin: Tensor, planes: Tensor, held: Tensor, body: Tensor,
                 body_order: Tensor, body_ptr: Tensor, island: Tensor, lowest: Tensor) -> Tensor:  # fmt: skip
-    """Translation of each body's island [B, bodies, 3]; arguments in the order of csrc/ops.cpp."""
+    """Translation of each body's island [B, bodies, 3]; arguments in the order of csrc/bind/schema.cpp."""
     return raw.contact_translation(move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest)
 
 

@@ -19,7 +19,7 @@ LAG_SCALARS = 9  # twin of kLagScalars in csrc/contact/pairs.h
 def sweep(tensors: Sequence[Tensor], contact: Sequence[Tensor], friction_eps: float, plan: Tensor,
           settings: SweepSettings, tape_policy: int, debug_step: int, checked: bool
           ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """x [B, V, 3], tape, and where a bound has held back, uint8 [B, V]; arguments in the order of csrc/ops.cpp."""
+    """x [B, V, 3], tape, and where a bound has held back, uint8 [B, V]; arguments in the schema's order."""
     return raw.contact_sweep(*tensors, *contact, friction_eps, plan, *settings, tape_policy, debug_step, checked)
 
 

@@ -17,7 +17,7 @@ PLAN_HEADER = 11  # twin of kPlanHeader in csrc/core/plan_views.h
 
 
 class SweepSettings(NamedTuple):
-    """What a sweep executes besides its tensors, in the order of csrc/ops.cpp."""
+    """What a sweep executes besides its tensors, in the order of csrc/bind/schema.cpp."""
 
     sizes: tuple[int, ...]  # active vertices, tets, slots of the plan; more on CUDA, see plan_sizes
     energies: int  # mask
@@ -29,7 +29,7 @@ class SweepSettings(NamedTuple):
 
 
 def plan_sizes(plan: Tensor, device: str) -> tuple[int, ...]:
-    """What the host must know of a plan that is still on the CPU; the order is that of csrc/ops_cuda.cpp."""
+    """What the host must know of a plan that is still on the CPU; the order is that of csrc/bind/cuda/sweep.cpp."""
     header = plan[:PLAN_HEADER].tolist()
     vertices, tets, active, colors, blocks, slots, *rest = header
     if device == "cpu":

@@ -15,7 +15,6 @@ import torch
 
 _FOLDER = Path(__file__).parents[1]  # of the package, where the objects are
 _COMMAND = "pip install --no-build-isolation -e ."  # in a checkout
-_BUILD = Path(__file__).with_name("build_cuda.py")
 _cuda = False
 _why_not = ""  # what the loader said of a CUDA object that is there and does not load
 
@@ -95,7 +94,7 @@ def jit_build() -> Path:
 
 def _compile(folder: Path) -> Path:
     shutil.copytree(_sources(), folder / "csrc")
-    shutil.copy(_BUILD, folder)
+    shutil.copy(_FOLDER / "ops" / "build_cuda.py", folder)
     print("diffvbd: compiling the CUDA object, once for this machine (minutes)", file=sys.stderr, flush=True)
     # torch finds ninja through PATH alone, and the environment's own need not be there
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
@@ -123,7 +122,7 @@ def _jit_folder() -> Path:
 
     root = _sources()
     digest = hashlib.sha256(architectures().encode())
-    for path in [_BUILD, *sorted(p for p in root.rglob("*") if p.is_file())]:
+    for path in [_FOLDER / "ops" / "build_cuda.py", *sorted(p for p in root.rglob("*") if p.is_file())]:
         digest.update(f"\0{path.name}\0".encode() + path.read_bytes())
     name = f"diffvbd-{__version__}-torch{torch.__version__}-cuda{torch.version.cuda}-{digest.hexdigest()[:16]}"
     return Path(os.environ.get("TORCH_EXTENSIONS_DIR") or get_default_build_root()) / name
@@ -132,7 +131,7 @@ def _jit_folder() -> Path:
 def _sources() -> Path:
     """csrc: inside an installed package, beside the package in a checkout."""
     for path in (_FOLDER / "csrc", _FOLDER.parent / "csrc"):
-        if (path / "ops_cuda.cpp").exists():
+        if (path / "bind" / "schema.cpp").exists():
             return path
     raise RuntimeError(f"diffvbd: DIFFVBD_JIT=1 finds no sources beside {_FOLDER}: run `{_COMMAND}`")
 

@@ -44,7 +44,7 @@ def out_of_memory_named(model: Model, x: Tensor, settings: ops.SweepSettings, po
 
 
 _POLICIES = {"full": ops.FULL_TAPE, "compact": ops.COMPACT_TAPE, "recompute": ops.NO_TAPE}
-WORKSPACE_BUDGET = 2 << 30  # bytes; twin of kWorkspaceBudget in csrc/binding_sweep_cuda.h
+WORKSPACE_BUDGET = 2 << 30  # bytes; twin of kWorkspaceBudget in csrc/bind/cuda/sweep.h
 
 
 def cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = True, rest: bool = False) -> int:

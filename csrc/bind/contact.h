@@ -2,12 +2,12 @@
 #pragma once
 
 #include "arguments.h"
-#include "contact/lowest.h"
-#include "contact/passes.h"
+#include "../contact/lowest.h"
+#include "../contact/passes.h"
 
 namespace diffvbd {
 
-// In the order of csrc/ops.cpp. Empty: collider where there is none, lag and the lists after it where nothing is
+// In the order of csrc/bind/schema.cpp. Empty: collider where there is none, lag and the lists after it where nothing is
 // lagged, floor_lag without friction on a floor.
 struct ContactTensors {
   const Tensor &bounds, &collider, &collider_prev, &kappa, &pairs, &constants, &ptr, &entry;

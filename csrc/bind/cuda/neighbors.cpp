@@ -4,9 +4,9 @@
 
 #include <tuple>
 
-#include "arguments_neighbors.h"
-#include "binding_cuda.h"
-#include "cuda/neighbors.h"
+#include "../neighbors.h"
+#include "binding.h"
+#include "../../cuda/neighbors.h"
 
 namespace {
 

@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "../arguments.h"
-#include "run.h"
+#include "../../cpu/run.h"
 
 namespace diffvbd {
 

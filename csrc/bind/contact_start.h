@@ -1,13 +1,13 @@
 // The tensors of the start of a part, as the operators of all backends take them.
 #pragma once
 
-#include "arguments_contact.h"
-#include "contact/start.h"
-#include "contact/translation.h"
+#include "contact.h"
+#include "../contact/start.h"
+#include "../contact/translation.h"
 
 namespace diffvbd {
 
-// In the order of csrc/ops.cpp; planes, lowest and origin may be empty.
+// In the order of csrc/bind/schema.cpp; planes, lowest and origin may be empty.
 struct TranslationTensors {
   const Tensor &move, &mass, &x, &origin, &planes, &held, &body, &body_order, &body_ptr, &island, &lowest;
 };

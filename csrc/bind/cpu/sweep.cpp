@@ -5,8 +5,8 @@
 #include <tuple>
 #include <vector>
 
-#include "binding.h"
-#include "reductions.h"
+#include "sweep.h"
+#include "../../cpu/reductions.h"
 
 namespace {
 

@@ -4,13 +4,13 @@
 #include <tuple>
 #include <vector>
 
-#include "arguments_rigid.h"
-#include "start/begin.h"
-#include "start/lower.h"
+#include "rigid.h"
+#include "../start/begin.h"
+#include "../start/lower.h"
 
 namespace diffvbd {
 
-// In the order of csrc/ops.cpp.
+// In the order of csrc/bind/schema.cpp.
 struct BeginTensors {
   const Tensor &x, &v, &acceleration, &held, &mass, &data, &origin, &pinned, &order, &ptr, &spread, &other;
 };

@@ -3,7 +3,7 @@
 // where several threads share them, total() sums over the threads.
 #pragma once
 
-#include "safeguards.h"
+#include "../core/safeguards.h"
 #include "uneven.h"
 
 namespace diffvbd {

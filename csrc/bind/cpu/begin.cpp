@@ -1,34 +1,30 @@
-// CUDA implementation of the beginning of a step.
-#include <torch/csrc/stable/accelerator.h>
+// CPU implementation of the beginning of a step.
 #include <torch/csrc/stable/library.h>
 
 #include <tuple>
 #include <vector>
 
-#include "arguments_begin.h"
-#include "binding_bodies_cuda.h"
-#include "cuda/begin.h"
+#include "../begin.h"
+#include "sweep.h"
+#include "../../cpu/bodies.h"
 
 namespace {
 
-namespace cuda = diffvbd::cuda;
+namespace rigid = diffvbd::rigid;
 namespace start = diffvbd::start;
-using cuda::check, cuda::current_stream, cuda::empty, cuda::groups_of, cuda::workspace_of, cuda::zeros;
-using diffvbd::BeginSettings, diffvbd::BeginTensors, diffvbd::data, diffvbd::dispatch_float, diffvbd::OtherBodies;
-using torch::headeronly::ScalarType;
+using diffvbd::BeginSettings, diffvbd::BeginTensors, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty,
+    diffvbd::for_bodies, diffvbd::for_vertices, diffvbd::OtherBodies, diffvbd::Threads, diffvbd::zeros;
 using torch::stable::Tensor;
-using torch::stable::accelerator::DeviceGuard;
 
 std::tuple<Tensor, Tensor, Tensor> begin(const Tensor& x, const Tensor& v, const Tensor& acceleration,
                                          const Tensor& held, const Tensor& mass, const Tensor& energy_data,
                                          const Tensor& origin, const Tensor& mu, const Tensor& lam, const Tensor& rest,
                                          const Tensor& pinned, const Tensor& order, const Tensor& ptr,
-                                         const Tensor& spread, std::vector<int64_t> groups, const Tensor& other,
+                                         const Tensor& spread, std::vector<int64_t> /*groups*/, const Tensor& other,
                                          const Tensor& other_order, const Tensor& other_ptr, const Tensor& other_tets,
-                                         const Tensor& other_tet_ptr, std::vector<int64_t> other_groups,
+                                         const Tensor& other_tet_ptr, std::vector<int64_t> /*other_groups*/,
                                          std::vector<int64_t> data_count, double time_step, double filter_eta,
                                          int64_t from, bool filters) {
-  const DeviceGuard guard(x.get_device_index());
   const BeginTensors given{x, v, acceleration, held, mass, energy_data, origin, pinned, order, ptr, spread, other};
   const OtherBodies others{mu, lam, rest, other_order, other_ptr, other_tets, other_tet_ptr};
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
@@ -38,17 +34,29 @@ std::tuple<Tensor, Tensor, Tensor> begin(const Tensor& x, const Tensor& v, const
     const bool chooses = from == start::kLower && others.number() > 0;
     const Tensor x_start = empty(x, shape), y = empty(x, shape);
     const Tensor from_y = chooses && filters ? empty(x, shape) : y;
-    const Tensor falls = empty(x, {from == start::kLower ? x.size(0) : 0, others.number()}, ScalarType::Byte);
+    const Tensor falls = torch::stable::new_empty(x, {from == start::kLower ? x.size(0) : 0, others.number()},
+                                                  std::make_optional(diffvbd::ScalarType::Byte));
     const auto in = diffvbd::begin_inputs<T>(given, settings, x_start, y, falls, others.number());
-    const auto teams = groups_of(groups, spread.numel());
-    const auto other_teams = groups_of(other_groups, others.number());
-    const Tensor workspace = workspace_of(teams, x), other_workspace = workspace_of(other_teams, x);
-    const Tensor& shared = workspace.numel() > 0 ? workspace : other_workspace;
-    start::Candidates<T> two{};
-    if (chooses) two = diffvbd::candidates<T>(given, others, settings, x_start, from_y, y);
-    check(cuda::begin<T>(in, teams, chooses ? &two : nullptr, other_teams, data<T>(x_start), data<T>(from_y),
-                         data<T>(y), data<uint8_t>(falls), data<double>(shared), current_stream(x)),
-          "the beginning of a step");
+    T *to = data<T>(x_start), *to_y = data<T>(y), *to_other = data<T>(from_y);
+    if (in.some_alone) {
+      T* second = chooses && filters ? to_other : nullptr;
+      for_vertices(in.bodies, [&](int64_t scene, int32_t i) { begin_vertex(in, to, second, to_y, scene, i); });
+    }
+    if (chooses) {
+      const auto two = diffvbd::candidates<T>(given, others, settings, x_start, from_y, y);
+      uint8_t* chosen = data<uint8_t>(falls);
+      for_bodies(two.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
+        chosen[body.scene * in.others + body.body] = start::rise(two, body, team) <= 0;
+      });
+      for_vertices(in.bodies, [&](int64_t scene, int32_t i) { choose_vertex(in, to, to_other, scene, i); });
+    }
+    for_bodies(in.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
+      if (in.bodies.data.data != nullptr) {
+        start::begin_body<true>(in, body, team, to, to_y);
+      } else {
+        start::begin_body<false>(in, body, team, to, to_y);
+      }
+    });
     return std::make_tuple(x_start, y, falls);
   });
 }
@@ -56,10 +64,9 @@ std::tuple<Tensor, Tensor, Tensor> begin(const Tensor& x, const Tensor& v, const
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin_backward(
     const Tensor& x_start_bar, const Tensor& y_bar, const Tensor& falls, const Tensor& x, const Tensor& v,
     const Tensor& acceleration, const Tensor& held, const Tensor& mass, const Tensor& energy_data, const Tensor& origin,
-    const Tensor& pinned, const Tensor& order, const Tensor& ptr, const Tensor& spread, std::vector<int64_t> groups,
+    const Tensor& pinned, const Tensor& order, const Tensor& ptr, const Tensor& spread, std::vector<int64_t> /*groups*/,
     const Tensor& other, int64_t others, std::vector<int64_t> data_count, double time_step, double filter_eta,
     int64_t from, bool filters, std::vector<bool> wants) {
-  const DeviceGuard guard(x.get_device_index());
   const BeginTensors given{x, v, acceleration, held, mass, energy_data, origin, pinned, order, ptr, spread, other};
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
   return dispatch_float(x, [&](auto scalar) {
@@ -68,21 +75,29 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin
     const std::vector<int64_t> shape{x.size(0), x.size(1), 3};
     const Tensor coasted = order.numel() > 0 ? empty(x, shape) : x, y = order.numel() > 0 ? empty(x, shape) : x;
     const auto in = diffvbd::begin_inputs<T>(given, settings, coasted, y, falls, static_cast<int32_t>(others));
-    const auto teams = groups_of(groups, spread.numel());
-    const Tensor workspace = workspace_of(teams, x);
     const diffvbd::BeginBars bars(given, in, wants, [&](const std::vector<int64_t>& sizes, bool zeroed) {
       return zeroed ? zeros(x, sizes) : empty(x, sizes);
     });
-    check(cuda::begin_backward<T>(in, teams, bars.pointers<T>(x_start_bar, y_bar), data<T>(coasted), data<T>(y),
-                                  data<double>(workspace), current_stream(x)),
-          "the adjoint of the beginning of a step");
+    const auto a = bars.pointers<T>(x_start_bar, y_bar);
+    if (in.some_alone) {
+      for_vertices(in.bodies, [&](int64_t scene, int32_t i) { reverse_vertex(in, a, scene, i); });
+    }
+    T *to = data<T>(coasted), *to_y = data<T>(y);
+    for_bodies(in.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
+      rigid::Iteration record[rigid::kMaxIterations];
+      if (in.bodies.data.data != nullptr) {
+        start::reverse_body<true>(in, body, team, record, to, to_y, a);
+      } else {
+        start::reverse_body<false>(in, body, team, record, to, to_y, a);
+      }
+    });
     return bars.tensors();
   });
 }
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
+STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
   m.impl("begin", TORCH_BOX(&begin));
   m.impl("begin_backward", TORCH_BOX(&begin_backward));
 }

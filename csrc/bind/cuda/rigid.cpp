@@ -1,47 +1,39 @@
-// CPU implementations of the rigid correction: bodies side by side, or the vertices of a large one.
+// CUDA implementations of the rigid correction.
+#include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
-#include <algorithm>
 #include <tuple>
 #include <vector>
 
-#include "../arguments_rigid.h"
-#include "binding.h"
+#include "../rigid.h"
 #include "bodies.h"
+#include "../../cuda/rigid.h"
 
 namespace {
 
+namespace cuda = diffvbd::cuda;
 namespace rigid = diffvbd::rigid;
-using diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::for_bodies, diffvbd::for_vertices,
-    diffvbd::RigidTensors, diffvbd::Threads, diffvbd::zeros;
+using cuda::check, cuda::current_stream, cuda::empty, cuda::groups_of, cuda::workspace_of, cuda::zeros;
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::require, diffvbd::RigidTensors;
+using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
-
-template <class T>
-bool has_energies(const rigid::Inputs<T>& in) {
-  return in.data.data != nullptr;
-}
+using torch::stable::accelerator::DeviceGuard;
 
 std::tuple<Tensor, Tensor> correct(const Tensor& x, const Tensor& x_prev, const Tensor& y, const Tensor& mass,
                                    const Tensor& energy_data, const Tensor& origin, const Tensor& order,
                                    const Tensor& ptr, const Tensor& spread, const Tensor& other,
-                                   std::vector<int64_t> /*groups*/, std::vector<int64_t> data_count, double time_step) {
+                                   std::vector<int64_t> groups, std::vector<int64_t> data_count, double time_step) {
+  const DeviceGuard guard(x.get_device_index());
   const RigidTensors given{x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::rigid_inputs<T>(given, data_count, time_step);
+    const auto teams = groups_of(groups, spread.numel());
     const Tensor out = empty(x, {in.scenes, in.vertices, 3}), v = empty(x, {in.scenes, in.vertices, 3});
-    T *to = data<T>(out), *velocity = data<T>(v);
-    if (order.numel() < in.vertices) {
-      for_vertices(in, [&](int64_t scene, int32_t i) { keep_vertex(in, scene, i, to, velocity); });
-    }
-    for_bodies(in, [&](const rigid::Body<T>& body, const Threads& team) {
-      rigid::Iteration record[rigid::kMaxIterations];
-      if (has_energies(in)) {
-        rigid::correct<true>(body, team, record, to, velocity);
-      } else {
-        rigid::correct<false>(body, team, record, to, velocity);
-      }
-    });
+    const Tensor workspace = workspace_of(teams, x);
+    check(cuda::rigid_correct<T>(in, teams, order.numel() < in.vertices, data<T>(out), data<T>(v),
+                                 data<double>(workspace), current_stream(x)),
+          "the rigid correction");
     return std::make_tuple(out, v);
   });
 }
@@ -49,34 +41,28 @@ std::tuple<Tensor, Tensor> correct(const Tensor& x, const Tensor& x_prev, const 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> correct_backward(
     const Tensor& x_bar, const Tensor& v_bar, const Tensor& x, const Tensor& x_prev, const Tensor& y,
     const Tensor& mass, const Tensor& energy_data, const Tensor& origin, const Tensor& order, const Tensor& ptr,
-    const Tensor& spread, const Tensor& other, std::vector<int64_t> /*groups*/, std::vector<int64_t> data_count,
+    const Tensor& spread, const Tensor& other, std::vector<int64_t> groups, std::vector<int64_t> data_count,
     double time_step, bool wants_data) {
+  const DeviceGuard guard(x.get_device_index());
   const RigidTensors given{x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::rigid_inputs<T>(given, data_count, time_step);
+    const auto teams = groups_of(groups, spread.numel());
+    const Tensor workspace = workspace_of(teams, x);
     const diffvbd::RigidBars bars(
         in, data_count, v_bar.numel() > 0, wants_data,
         [&](const std::vector<int64_t>& shape, bool zeroed) { return zeroed ? zeros(x, shape) : empty(x, shape); });
-    const auto a = bars.pointers<T>(x_bar, v_bar);
-    if (order.numel() < in.vertices) {
-      for_vertices(in, [&](int64_t scene, int32_t i) { reverse_kept(in, a, scene, i); });
-    }
-    for_bodies(in, [&](const rigid::Body<T>& body, const Threads& team) {
-      rigid::Iteration record[rigid::kMaxIterations];
-      if (has_energies(in)) {
-        rigid::reverse<true>(body, team, record, a);
-      } else {
-        rigid::reverse<false>(body, team, record, a);
-      }
-    });
+    check(cuda::rigid_reverse<T>(in, teams, order.numel() < in.vertices, bars.pointers<T>(x_bar, v_bar),
+                                 data<double>(workspace), current_stream(x)),
+          "the adjoint of the rigid correction");
     return bars.tensors();
   });
 }
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
+STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("rigid", TORCH_BOX(&correct));
   m.impl("rigid_backward", TORCH_BOX(&correct_backward));
 }

@@ -3,8 +3,8 @@
 
 #include "../energies/energies.h"
 #include "bounds.h"
-#include "frame.h"
-#include "views.h"
+#include "../core/frame.h"
+#include "../core/views.h"
 
 namespace diffvbd {
 

@@ -6,9 +6,9 @@
 #include <tuple>
 #include <vector>
 
-#include "arguments.h"
-#include "binding_sweep_cuda.h"
-#include "cuda/reductions.h"
+#include "../arguments.h"
+#include "sweep.h"
+#include "../../cuda/reductions.h"
 
 namespace {
 

@@ -1,61 +1,35 @@
-// CPU implementations of the operators of the start of a part.
+// CUDA implementations of the operators of the start of a part.
+#include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
-#include <algorithm>
 #include <tuple>
 #include <vector>
 
-#include "../arguments_contact_start.h"
+#include "../contact_start.h"
 #include "binding.h"
-#include "grain.h"
+#include "../../cuda/start.h"
 
 namespace {
 
 namespace contact = diffvbd::contact;
-using diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::kGrain, diffvbd::StartTensors;
-using diffvbd::TranslationTensors, diffvbd::zeros;
+namespace cuda = diffvbd::cuda;
+using cuda::check, cuda::current_stream, cuda::empty, cuda::zeros;
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::StartTensors, diffvbd::TranslationTensors;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
-
-// Calls f(scene, item) for all items of all scenes.
-template <class F>
-void each(int64_t scenes, int64_t items, const F& f) {
-  torch::stable::parallel_for(0, scenes * items, kGrain, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) f(i / items, static_cast<int32_t>(i % items));
-  });
-}
-
-template <class T>
-diffvbd::Buffer<T> body_sums(const contact::TranslationInputs<T>& in) {
-  diffvbd::Buffer<T> sums(4 * in.scenes * in.bodies);
-  for (int64_t row = 0; row < in.scenes * in.bodies; ++row) {
-    const auto body = static_cast<int32_t>(row % in.bodies);
-    const contact::Mean<T> mean = contact::mean_of_body(in, row / in.bodies, body, 0, 1);
-    const T values[] = {mean.sum.x, mean.sum.y, mean.sum.z, mean.mass};
-    for (int k = 0; k < 4; ++k) sums.get()[4 * row + k] = values[k];
-  }
-  return sums;
-}
+using torch::stable::accelerator::DeviceGuard;
 
 Tensor contact_translation(const Tensor& move, const Tensor& mass, const Tensor& x, const Tensor& origin,
                            const Tensor& planes, const Tensor& held, const Tensor& body, const Tensor& body_order,
                            const Tensor& body_ptr, const Tensor& island, const Tensor& lowest) {
+  const DeviceGuard guard(x.get_device_index());
   const TranslationTensors given{move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::translation_inputs<T>(given);
     Tensor out = empty(x, {in.scenes, in.bodies, 3});
-    const diffvbd::Buffer<T> sums = body_sums(in);
-    for (int64_t row = 0; row < in.scenes * in.bodies; ++row) {
-      const int64_t scene = row / in.bodies, body = row % in.bodies, first = in.island[row];
-      T* to = data<T>(out) + 3 * row;
-      if (first >= 0 && first < body) {  // that of its island's first body
-        std::copy_n(data<T>(out) + 3 * (scene * in.bodies + first), 3, to);
-        continue;
-      }
-      const auto u = contact::translation_of(in, sums.get(), scene, static_cast<int32_t>(body));
-      to[0] = u.x, to[1] = u.y, to[2] = u.z;
-    }
+    const Tensor sums = empty(x, {in.scenes, in.bodies, 4});
+    check(cuda::translation<T>(in, data<T>(sums), data<T>(out), current_stream(x)), "the translation of islands");
     return out;
   });
 }
@@ -64,22 +38,18 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_translation_backward(
     const Tensor& u_bar, const Tensor& move, const Tensor& mass, const Tensor& x, const Tensor& origin,
     const Tensor& planes, const Tensor& held, const Tensor& body, const Tensor& body_order, const Tensor& body_ptr,
     const Tensor& island, const Tensor& lowest) {
+  const DeviceGuard guard(x.get_device_index());
   const TranslationTensors given{move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::translation_inputs<T>(given);
-    const int64_t b = in.scenes, scalars = int64_t{in.floor.num_planes} * contact::kPlaneScalars;
-    Tensor move_bar = empty(x, {b, in.vertices, 3}), mass_bar = empty(x, {b, in.vertices});
-    Tensor x_bar = zeros(x, {b, in.vertices, 3}), planes_bar = zeros(x, {b, scalars});
-    const diffvbd::Buffer<T> sums = body_sums(in), rate(3 * b * in.bodies, true), mean(3 * b * in.bodies, true);
-    for (int64_t row = 0; row < b * in.bodies; ++row) {
-      contact::reverse_island(in, sums.get(), data<const T>(u_bar), row / in.bodies,
-                              static_cast<int32_t>(row % in.bodies), rate.get(), mean.get(), data<T>(x_bar),
-                              data<T>(planes_bar) + row / in.bodies * scalars);
-    }
-    each(b, in.vertices, [&](int64_t scene, int32_t v) {
-      contact::reverse_vertex_share(in, rate.get(), mean.get(), scene, v, data<T>(move_bar), data<T>(mass_bar));
-    });
+    const int64_t b = in.scenes, v = in.vertices, scalars = int64_t{in.floor.num_planes} * contact::kPlaneScalars;
+    Tensor move_bar = empty(x, {b, v, 3}), mass_bar = empty(x, {b, v}), x_bar = zeros(x, {b, v, 3});
+    Tensor planes_bar = zeros(x, {b, scalars});
+    const Tensor sums = empty(x, {b, in.bodies, 4}), zeroed = zeros(x, {b, in.bodies, 6 + scalars});
+    check(cuda::translation_backward<T>(in, data<const T>(u_bar), data<T>(sums), data<T>(zeroed), data<T>(move_bar),
+                                        data<T>(mass_bar), data<T>(x_bar), data<T>(planes_bar), current_stream(x)),
+          "the translation of islands");
     return std::make_tuple(move_bar, mass_bar, x_bar, planes_bar);
   });
 }
@@ -88,15 +58,17 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_start(const Tensor& x, const 
                                                          const Tensor& u, const Tensor& near, const Tensor& origin,
                                                          const Tensor& planes, const Tensor& held, const Tensor& body,
                                                          double gamma, double cap, double filter_eta) {
+  const DeviceGuard guard(x.get_device_index());
   const StartTensors given{x, move, goal, u, near, origin, planes, held, body};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::start_inputs<T>(given, gamma, cap, filter_eta);
     const int64_t b = in.scenes, v = in.vertices;
     Tensor bounds = empty(x, {b, v, 4}), start = empty(x, {b, v, 3}), left = empty(x, {b, v, 3});
-    Tensor outside = torch::stable::empty({b, v}, ScalarType::Byte);
-    const contact::StartOutputs<T> out{data<T>(bounds), data<T>(start), data<T>(left), data<uint8_t>(outside)};
-    each(b, v, [&](int64_t scene, int32_t i) { contact::start_vertex(in, out, scene, i); });
+    Tensor outside = empty(x, {b, v}, ScalarType::Byte);
+    check(
+        cuda::start<T>(in, {data<T>(bounds), data<T>(start), data<T>(left), data<uint8_t>(outside)}, current_stream(x)),
+        "the start of a part");
     return std::make_tuple(bounds, start, left, outside);
   });
 }
@@ -105,6 +77,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_start_backwar
     const Tensor& bounds_bar, const Tensor& start_bar, const Tensor& left_bar, const Tensor& x, const Tensor& move,
     const Tensor& goal, const Tensor& u, const Tensor& near, const Tensor& origin, const Tensor& planes,
     const Tensor& held, const Tensor& body, double gamma, double cap, double filter_eta, bool wants_planes) {
+  const DeviceGuard guard(x.get_device_index());
   const StartTensors given{x, move, goal, u, near, origin, planes, held, body};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
@@ -123,14 +96,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_start_backwar
                                       data<T>(u_bar),
                                       data<T>(gap_bar),
                                       planes_bar.numel() ? data<T>(planes_bar) : nullptr};
-    each(b, v, [&](int64_t scene, int32_t i) { contact::reverse_start(in, a, scene, i); });
+    check(cuda::start_backward<T>(in, a, current_stream(x)), "the start of a part");
     return std::make_tuple(x_bar, move_bar, goal_bar, u_bar, gap_bar, planes_bar);
   });
 }
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
+STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_translation", TORCH_BOX(&contact_translation));
   m.impl("contact_translation_backward", TORCH_BOX(&contact_translation_backward));
   m.impl("contact_start", TORCH_BOX(&contact_start));

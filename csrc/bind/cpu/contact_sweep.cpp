@@ -4,9 +4,9 @@
 #include <tuple>
 #include <vector>
 
-#include "../arguments_contact.h"
-#include "../contact/lag.h"
-#include "binding.h"
+#include "../contact.h"
+#include "../../contact/lag.h"
+#include "sweep.h"
 
 namespace {
 

@@ -4,8 +4,8 @@
 #include <cmath>
 
 #include "arguments.h"
-#include "contact/candidates.h"
-#include "contact/islands.h"
+#include "../contact/candidates.h"
+#include "../contact/islands.h"
 
 namespace diffvbd {
 

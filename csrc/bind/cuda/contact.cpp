@@ -1,27 +1,29 @@
-// CPU implementations of detection, islands and sums over segments: tensors in, raw pointers on.
+// CUDA implementations of detection, islands and sums over segments: tensors in, raw pointers on.
+#include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
 #include <tuple>
-#include <vector>
 
-#include "../arguments_detection.h"
-#include "detect.h"
-#include "islands.h"
+#include "../detection.h"
+#include "binding.h"
+#include "../../cuda/detect.h"
+#include "../../cuda/islands.h"
 
 namespace {
 
-using diffvbd::data, diffvbd::dispatch_float;
+namespace contact = diffvbd::contact;
+namespace cuda = diffvbd::cuda;
+using cuda::check, cuda::current_stream, cuda::empty, diffvbd::data, diffvbd::dispatch_float;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
-
-Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes) { return torch::stable::new_empty(like, sizes); }
-Tensor integers(const std::vector<int64_t>& sizes) { return torch::stable::empty(sizes, ScalarType::Int); }
+using torch::stable::accelerator::DeviceGuard;
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_detect(
     const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& collider_next, const Tensor& rest,
     const Tensor& radius, const Tensor& triangles, const Tensor& edges, const Tensor& points, const Tensor& planes,
     const Tensor& body, const Tensor& held, int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat,
     double reach, double cap, double gamma, int64_t capacity) {
+  const DeviceGuard guard(x.get_device_index());
   diffvbd::require_capacity(capacity);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
@@ -29,15 +31,19 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> conta
         diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes,
                                 body, held, mesh_bodies, self_contact, between_bodies, dhat, reach, cap, gamma);
     const int64_t b = in.scenes, n = in.corners;
-    Tensor pairs = integers({capacity, diffvbd::contact::kPairRow});
-    Tensor constants = empty(x, {capacity, diffvbd::contact::kConstants});
-    Tensor ptr = integers({b * n + 1}), entry = integers({4 * capacity}),
-           near_corners = integers({b, n, diffvbd::contact::kNearRow});
-    Tensor near_values = empty(x, {b, n, diffvbd::contact::kNearValues}), smallest = empty(x, {b});
-    Tensor counts = torch::stable::empty({diffvbd::contact::kCounts}, ScalarType::Long);
-    diffvbd::detect<T>(in,
-                       {capacity, data<int32_t>(pairs), data<T>(constants), data<int32_t>(ptr), data<int32_t>(entry),
-                        data<int32_t>(near_corners), data<T>(near_values), data<int64_t>(counts), data<T>(smallest)});
+    Tensor pairs = empty(x, {capacity, contact::kPairRow}, ScalarType::Int);
+    Tensor constants = empty(x, {capacity, contact::kConstants});
+    Tensor ptr = empty(x, {b * n + 1}, ScalarType::Int), entry = empty(x, {4 * capacity}, ScalarType::Int);
+    Tensor near_corners = empty(x, {b, n, contact::kNearRow}, ScalarType::Int);
+    Tensor near_values = empty(x, {b, n, contact::kNearValues}), smallest = empty(x, {b});
+    Tensor counts = empty(x, {contact::kCounts}, ScalarType::Long);
+    const auto bytes = static_cast<int64_t>(cuda::detect_workspace_bytes<T>(in, capacity));
+    const Tensor work = empty(x, {bytes}, ScalarType::Byte);
+    check(cuda::detect<T>(in,
+                          {capacity, data<int32_t>(pairs), data<T>(constants), data<int32_t>(ptr), data<int32_t>(entry),
+                           data<int32_t>(near_corners), data<T>(near_values), data<int64_t>(counts), data<T>(smallest)},
+                          work.data_ptr(), current_stream(x)),
+          "detection");
     return std::make_tuple(pairs, constants, ptr, entry, near_corners, near_values, counts, smallest);
   });
 }
@@ -46,31 +52,36 @@ Tensor contact_islands(const Tensor& x, const Tensor& origin, const Tensor& move
                        const Tensor& collider, const Tensor& collider_next, const Tensor& planes, const Tensor& body,
                        const Tensor& body_order, const Tensor& body_ptr, const Tensor& held, const Tensor& radius,
                        int64_t mesh_bodies, double cap, double dhat, bool any_direction) {
+  const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::island_inputs<T>(x, origin, move, mass, collider, collider_next, planes, body, body_order,
                                               body_ptr, held, radius, mesh_bodies, cap, dhat, any_direction);
-    Tensor island = integers({in.scenes, in.mesh_bodies});
-    diffvbd::find_islands<T>(in, data<int32_t>(island));
+    Tensor island = empty(x, {in.scenes, in.mesh_bodies}, ScalarType::Int);
+    const auto bytes = static_cast<int64_t>(cuda::islands_workspace_bytes<T>(in));
+    const Tensor work = empty(x, {bytes}, ScalarType::Byte);
+    check(cuda::find_islands<T>(in, data<int32_t>(island), work.data_ptr(), current_stream(x)), "the islands");
     return island;
   });
 }
 
 Tensor segment_sum(const Tensor& values, const Tensor& order, const Tensor& ptr) {
+  const DeviceGuard guard(values.get_device_index());
   diffvbd::check_segments(values, order, ptr);
   return dispatch_float(values, [&](auto scalar) {
     using T = decltype(scalar);
     const int64_t b = values.size(0), n = values.size(1), c = values.size(2), segments = ptr.numel() - 1;
     Tensor out = empty(values, {b, segments, c});
-    diffvbd::segment_sum<T>(data<const T>(values), data<const int32_t>(order), data<const int32_t>(ptr), b, n, segments,
-                            c, data<T>(out));
+    check(cuda::segment_sum<T>(data<const T>(values), data<const int32_t>(order), data<const int32_t>(ptr), b, n,
+                               segments, c, data<T>(out), current_stream(values)),
+          "segment_sum");
     return out;
   });
 }
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
+STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_detect", TORCH_BOX(&contact_detect));
   m.impl("contact_islands", TORCH_BOX(&contact_islands));
   m.impl("segment_sum", TORCH_BOX(&segment_sum));

@@ -4,10 +4,10 @@
 #include <tuple>
 #include <vector>
 
-#include "arguments_contact.h"
-#include "binding_sweep_cuda.h"
-#include "cuda/contact.h"
-#include "cuda/lowest.h"
+#include "../contact.h"
+#include "sweep.h"
+#include "../../cuda/contact.h"
+#include "../../cuda/lowest.h"
 
 namespace {
 

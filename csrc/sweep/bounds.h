@@ -3,7 +3,7 @@
 // `center`. Like the other safeguards a bound stands with its derivative (docs/method.md, section 12).
 #pragma once
 
-#include "vec.h"
+#include "../core/vec.h"
 
 namespace diffvbd {
 

@@ -3,8 +3,8 @@
 
 #include <vector>
 
-#include "binding_cuda.h"
-#include "cuda/bodies.h"
+#include "binding.h"
+#include "../../cuda/bodies.h"
 
 namespace diffvbd::cuda {
 

@@ -5,8 +5,8 @@
 
 #include <tuple>
 
-#include "binding_cuda.h"
-#include "cuda/step.h"
+#include "binding.h"
+#include "../../cuda/step.h"
 
 namespace diffvbd::cuda {
 

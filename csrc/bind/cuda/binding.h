@@ -9,7 +9,7 @@
 #include <string>
 #include <vector>
 
-#include "arguments.h"
+#include "../arguments.h"
 
 namespace diffvbd::cuda {
 

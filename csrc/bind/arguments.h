@@ -9,7 +9,7 @@
 #include <stdexcept>
 #include <vector>
 
-#include "energies/energies.h"
+#include "../energies/energies.h"
 
 namespace diffvbd {
 

@@ -3,8 +3,8 @@
 
 #include <tuple>
 
-#include "../arguments_neighbors.h"
-#include "neighbors.h"
+#include "../neighbors.h"
+#include "../../cpu/neighbors.h"
 
 namespace {
 
