@@ -1,6 +1,8 @@
 """diffvbd: differentiable soft-body simulation by Vertex Block Descent, by the exact adjoint of the executed solver."""
 
 import os as _os
+import warnings as _warnings
+from typing import Any as _Any
 
 # Idle threads that spin make a parallel region cost milliseconds on a busy machine; only the first import decides.
 _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -19,7 +21,7 @@ from .mesh import TetMesh
 from .model.model import Model
 from .model.moduli import lame, young_poisson
 from .ops.regimes import regime
-from .rollout.checkpoints import Binomial
+from .rollout.checkpoints import BinomialCheckpoints
 from .rollout.converge import Solution, solve
 from .rollout.rollout import Trajectory, per_step, rollout
 from .step.manual import Tape, step_backward, step_forward
@@ -27,7 +29,7 @@ from .step.step import step
 
 __all__ = [
     "Anchor",
-    "Binomial",
+    "BinomialCheckpoints",
     "Diagnosis",
     "FloorBarrier",
     "Friction",
@@ -60,3 +62,10 @@ __all__ = [
     "step_forward",
     "young_poisson",
 ]
+
+
+def __getattr__(name: str) -> _Any:
+    if name == "Binomial":
+        _warnings.warn("diffvbd.Binomial is now diffvbd.BinomialCheckpoints", DeprecationWarning, stacklevel=2)
+        return BinomialCheckpoints
+    raise AttributeError(f"module 'diffvbd' has no attribute {name!r}")

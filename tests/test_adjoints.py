@@ -101,7 +101,7 @@ def test_what_a_step_keeps_does_not_grow_with_the_sweeps(device: str) -> None:
     assert kept[0] == kept[1] > 0
 
 
-@pytest.mark.parametrize("schedule", (None, 2, dv.Binomial(1)), ids=str)
+@pytest.mark.parametrize("schedule", (None, 2, dv.BinomialCheckpoints(1)), ids=str)
 @pytest.mark.parametrize("adjoint", [dv.Unrolled(), *GLOBAL], ids=("unrolled", "assembled", "matrix-free"))
 def test_a_rollout_is_its_steps_under_every_schedule(device: str, adjoint: Any, schedule: Any) -> None:
     model, inputs = scene_on(device, "batch")

@@ -164,7 +164,7 @@ def test_rollout_with_moving_colliders_equals_a_loop() -> None:
         assert torch.equal(a, b) and a.any()
 
 
-@pytest.mark.parametrize("every", (1, 2, 4, dv.Binomial(2)), ids=str)
+@pytest.mark.parametrize("every", (1, 2, 4, dv.BinomialCheckpoints(2)), ids=str)
 def test_a_checkpointed_rollout_is_the_same_to_the_bit(every: Any) -> None:
     model, x0, v0, path = moving()
     results = []

@@ -282,8 +282,10 @@ def test_jit_compiles_once_for_what_it_depends_on(fake: Fake, monkeypatch: pytes
 def test_jit_survives_a_killed_build(fake: Fake) -> None:
     """Both builds are processes of their own with a time limit, so that a hang fails this test, not the whole suite."""
     fake.mode("hang")
-    program = f"from pathlib import Path; from diffvbd.ops import load as native; import torch; torch.version.cuda = '13.0'; \
+    program = (
+        f"from pathlib import Path; from diffvbd.ops import load as native; import torch; torch.version.cuda = '13.0'; \
 native._FOLDER = Path({str(fake.package)!r}); print(native.jit_build())"
+    )
     build = [sys.executable, "-c", program]
     victim = subprocess.Popen(build, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:

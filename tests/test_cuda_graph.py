@@ -110,7 +110,7 @@ def test_every_regime_and_tape_can_be_captured(regime: str, tape: str) -> None:
     check_optimisation(6, (3,), regime, adjoint=dv.ReverseSweep(tape))
 
 
-@pytest.mark.parametrize("schedule", (2, dv.Binomial(2)), ids=("segments", "binomial"))
+@pytest.mark.parametrize("schedule", (2, dv.BinomialCheckpoints(2)), ids=("segments", "binomial"))
 def test_checkpoints_can_be_captured(schedule: Any) -> None:
     check_optimisation(7, checkpoint_every=schedule)
 
@@ -193,7 +193,7 @@ def test_numbers_and_defaults_do_not_synchronise() -> None:
             dv.rollout(model, **state, checkpoint_every=schedule, **options)
 
 
-@pytest.mark.parametrize("schedule", (None, 3, dv.Binomial(2)), ids=("all", "segments", "binomial"))
+@pytest.mark.parametrize("schedule", (None, 3, dv.BinomialCheckpoints(2)), ids=("all", "segments", "binomial"))
 def test_a_rollout_and_its_backward_do_not_synchronise(schedule: Any) -> None:
     scene = build_scene("floor_damped")
     model, inputs = scene.model("cuda"), scene.inputs(device="cuda")

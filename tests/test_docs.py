@@ -124,3 +124,17 @@ def test_results_page_shows_the_results_that_are_there_and_no_other(monkeypatch:
     assert set(shown) == set(found), "not made of bench/results: run `python -m bench report`"
     for stem, content in found.items():
         assert content["environment"]["date"] in page, f"{stem}.json is newer: run `python -m bench report`"
+
+
+def test_the_operators_of_a_backend_are_listed() -> None:
+    text = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    (table,) = re.findall(r"^\| for \| operators \|\n(.*?)\n\n", text, re.MULTILINE | re.DOTALL)
+    listed: set[str] = set()
+    for cell in re.split(r"[|;]", table):
+        names = set(re.findall(r"`([a-z_]+)`", cell)) - {"_backward"}
+        listed |= names | ({f"{name}_backward" for name in names} if "each with its `_backward`" in cell else set())
+    schema = ROOT / "csrc" / "bind" / "schema.cpp"
+    if not schema.exists():
+        pytest.skip("the C++ sources are not here")
+    defined = set(re.findall(r'"([a-z_]+)\(Tensor', schema.read_text(encoding="utf-8"))) - {"build_plan"}
+    assert len(defined) > 20 and listed == defined

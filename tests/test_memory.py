@@ -138,11 +138,11 @@ ROLLOUTS = [
     ("full", 12, 4, "last"),
     ("full", 12, 1, "last"),
     ("full", 12, 5, 3),
-    ("full", 24, dv.Binomial(3), "last"),
-    ("full", 24, dv.Binomial(5), "all"),
+    ("full", 24, dv.BinomialCheckpoints(3), "last"),
+    ("full", 24, dv.BinomialCheckpoints(5), "all"),
     ("compact", 12, None, "last"),
     ("compact", 12, 4, "all"),
-    ("compact", 40, dv.Binomial(4), "last"),
+    ("compact", 40, dv.BinomialCheckpoints(4), "last"),
     ("recompute", 12, None, "all"),
     ("recompute", 40, 10, "last"),
 ]
@@ -173,7 +173,7 @@ def test_bytes_of_a_rollout(tape: str, steps: int, schedule: Any, save: Any, pin
     held, _ = allocated_bytes(forward)
     peak = allocated_bytes(backward)[1]
     predicted = model.memory(sweeps=SWEEPS, steps=steps, tape=tape, checkpoint_every=schedule, save=save)
-    if isinstance(schedule, dv.Binomial) and save != "last":  # an upper estimate, see its documentation
+    if isinstance(schedule, dv.BinomialCheckpoints) and save != "last":  # an upper estimate, see its documentation
         assert 0.7 * predicted["kept"] <= peak - passing <= predicted["kept"]
     else:
         assert_near(predicted["kept"], peak - passing)
@@ -189,7 +189,7 @@ def test_binomial_keeps_less_than_even_and_even_less_than_all() -> None:
     options = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": SWEEPS, "steps": 36, "save": "last"}
     adjoint = dv.ReverseSweep("full")
     peaks = []
-    for schedule in (None, 6, dv.Binomial(3)):
+    for schedule in (None, 6, dv.BinomialCheckpoints(3)):
         kept = {"checkpoint_every": schedule, "adjoint": adjoint}
         peaks.append(allocated_bytes(lambda k=kept: dv.rollout(model, x, v, **options, **k).x.sum().backward())[1])
     assert peaks[1] < 0.25 * peaks[0]

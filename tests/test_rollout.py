@@ -11,7 +11,19 @@ from diffvbd.testing import build_scene, relative_error
 
 STEPS = 7
 SWEEPS = 3
-SCHEDULES = [None, "auto", 1, 2, 3, STEPS, 100, dv.Binomial(1), dv.Binomial(2), dv.Binomial(3), dv.Binomial(50)]
+SCHEDULES = [
+    None,
+    "auto",
+    1,
+    2,
+    3,
+    STEPS,
+    100,
+    dv.BinomialCheckpoints(1),
+    dv.BinomialCheckpoints(2),
+    dv.BinomialCheckpoints(3),
+    dv.BinomialCheckpoints(50),
+]
 CASES = ["plain", "floor_damped", "anchored", "batch"]
 
 
@@ -78,7 +90,7 @@ def test_no_grad_rollouts_save_nothing(device: str) -> None:
     scene = build_scene("plain")
     model, inputs = scene.model(device), scene.inputs(device=device)
     expected = looped(model, inputs)
-    for schedule in (None, 2, dv.Binomial(2)):
+    for schedule in (None, 2, dv.BinomialCheckpoints(2)):
         trajectory = dv.rollout(model, **inputs, steps=STEPS, sweeps=SWEEPS, checkpoint_every=schedule)
         assert torch.equal(trajectory.x, expected[0]) and not trajectory.x.requires_grad
 
@@ -113,7 +125,7 @@ def test_callables_that_close_over_a_network_get_gradients_under_every_schedule(
 ) -> None:
     expected = controlled(device, None, every_argument)
     assert all(g.abs().max() > 0 for g in expected)
-    for schedule in (1, 3, dv.Binomial(1), dv.Binomial(3)):
+    for schedule in (1, 3, dv.BinomialCheckpoints(1), dv.BinomialCheckpoints(3)):
         for a, b in zip(controlled(device, schedule, every_argument), expected, strict=True):
             assert relative_error(a, b) <= 1e-12
 
@@ -178,7 +190,7 @@ def test_per_step_wants_a_tensor_with_a_leading_dimension(value: Any) -> None:
 # --- what a trajectory holds ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("schedule", [None, 2, dv.Binomial(2)])
+@pytest.mark.parametrize("schedule", [None, 2, dv.BinomialCheckpoints(2)])
 @pytest.mark.parametrize(
     ("save", "kept"),
     [("all", [0, 1, 2, 3, 4, 5, 6, 7]), ("last", [7]), (1, [0, 1, 2, 3, 4, 5, 6, 7]), (3, [0, 3, 6, 7]), (7, [0, 7]),
@@ -195,7 +207,7 @@ def test_save_modes(device: str, save: Any, kept: list[int], schedule: Any) -> N
     torch.autograd.grad(loss_of_frames(trajectory.x, trajectory.v), leaves, allow_unused=True)
 
 
-@pytest.mark.parametrize("schedule", [None, 3, dv.Binomial(2)])
+@pytest.mark.parametrize("schedule", [None, 3, dv.BinomialCheckpoints(2)])
 def test_observations_are_stacked_and_differentiable(device: str, schedule: Any) -> None:
     scene = build_scene("plain")
     model, inputs = scene.model(device), scene.inputs(device=device)
@@ -236,7 +248,7 @@ def test_zero_steps_return_the_initial_state(device: str) -> None:
     scene = build_scene("batch")
     model, inputs = scene.model(device), scene.inputs(device=device)
     for save in ("all", "last", 2):
-        for schedule in (None, "auto", 2, dv.Binomial(1)):
+        for schedule in (None, "auto", 2, dv.BinomialCheckpoints(1)):
             call, leaves = leaves_of(inputs)
             options = {"steps": 0, "sweeps": SWEEPS, "save": save, "checkpoint_every": schedule}
             trajectory = dv.rollout(model, **call, observe=lambda x, v, k: x, **options)
@@ -249,7 +261,9 @@ def test_zero_steps_return_the_initial_state(device: str) -> None:
 def test_progress_goes_to_stderr_and_counts_each_step_once(capsys: pytest.CaptureFixture[str]) -> None:
     scene = build_scene("plain")
     call, leaves = leaves_of(scene.inputs())
-    trajectory = dv.rollout(scene.model(), **call, steps=3, sweeps=1, progress=True, checkpoint_every=dv.Binomial(1))
+    trajectory = dv.rollout(
+        scene.model(), **call, steps=3, sweeps=1, progress=True, checkpoint_every=dv.BinomialCheckpoints(1)
+    )
     torch.autograd.grad(trajectory.x.sum(), leaves, allow_unused=True)
     shown = capsys.readouterr()
     assert shown.out == ""
@@ -286,7 +300,7 @@ def test_bad_options_raise(name: str, value: Any, error: type[Exception]) -> Non
 @pytest.mark.parametrize(("value", "error"), [(0, ValueError), (-2, ValueError), (1.0, TypeError), (True, TypeError)])
 def test_binomial_wants_a_positive_count(value: Any, error: type[Exception]) -> None:
     with pytest.raises(error, match="snapshots: expected .*got"):
-        dv.Binomial(value)
+        dv.BinomialCheckpoints(value)
 
 
 # --- cost of a schedule -----------------------------------------------------------------------------------------------
@@ -307,7 +321,7 @@ def test_binomial_runs_steps_as_rarely_as_promised(steps: int, snapshots: int) -
 
     x = inputs["x"].clone().requires_grad_()
     options = inputs | {"x": x, "force": force}
-    schedule = dv.Binomial(snapshots)
+    schedule = dv.BinomialCheckpoints(snapshots)
     trajectory = dv.rollout(model, **options, steps=steps, sweeps=1, save="last", checkpoint_every=schedule)
     assert runs == [1] * steps
     trajectory.x.sum().backward()
@@ -316,7 +330,7 @@ def test_binomial_runs_steps_as_rarely_as_promised(steps: int, snapshots: int) -
     assert sum(runs) > steps
 
 
-@pytest.mark.parametrize("schedule", [2, dv.Binomial(2)])
+@pytest.mark.parametrize("schedule", [2, dv.BinomialCheckpoints(2)])
 @pytest.mark.parametrize("name", ["mu", "lam", "force", "gravity", "prescribed", "floor_barrier.kappa"])
 def test_changing_an_argument_before_a_checkpointed_backward_raises(device: str, name: str, schedule: Any) -> None:
     scene = build_scene("floor_damped")
@@ -352,3 +366,10 @@ def test_what_is_not_differentiated_raises() -> None:
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     with pytest.raises(TypeError, match="time_step: .*not differentiable"):
         dv.step(model, x, v, mu=1.0, lam=1.0, time_step=torch.tensor(0.01, requires_grad=True), sweeps=1)
+
+
+def test_the_old_name_of_binomial_checkpoints_works() -> None:
+    with pytest.warns(DeprecationWarning, match="BinomialCheckpoints"):
+        assert dv.Binomial is dv.BinomialCheckpoints  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(AttributeError, match="Trinomial"):
+        _ = dv.Trinomial  # pyright: ignore[reportAttributeAccessIssue]

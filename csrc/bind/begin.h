@@ -4,9 +4,9 @@
 #include <tuple>
 #include <vector>
 
-#include "rigid.h"
 #include "../start/begin.h"
 #include "../start/lower.h"
+#include "rigid.h"
 
 namespace diffvbd {
 

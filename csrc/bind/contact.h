@@ -1,14 +1,14 @@
 // The tensors of contact, as the operators of all backends take them.
 #pragma once
 
-#include "arguments.h"
 #include "../contact/lowest.h"
 #include "../contact/passes.h"
+#include "arguments.h"
 
 namespace diffvbd {
 
-// In the order of csrc/bind/schema.cpp. Empty: collider where there is none, lag and the lists after it where nothing is
-// lagged, floor_lag without friction on a floor.
+// In the order of csrc/bind/schema.cpp. Empty: collider where there is none, lag and the lists after it where nothing
+// is lagged, floor_lag without friction on a floor.
 struct ContactTensors {
   const Tensor &bounds, &collider, &collider_prev, &kappa, &pairs, &constants, &ptr, &entry;
   const Tensor &lag, &lag_pairs, &lag_ptr, &lag_entry, &floor_lag;

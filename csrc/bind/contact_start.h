@@ -1,9 +1,9 @@
 // The tensors of the start of a part, as the operators of all backends take them.
 #pragma once
 
-#include "contact.h"
 #include "../contact/start.h"
 #include "../contact/translation.h"
+#include "contact.h"
 
 namespace diffvbd {
 

@@ -3,9 +3,9 @@
 
 #include <cmath>
 
-#include "arguments.h"
 #include "../contact/candidates.h"
 #include "../contact/islands.h"
+#include "arguments.h"
 
 namespace diffvbd {
 

@@ -4,12 +4,13 @@
 #include <tuple>
 #include <vector>
 
-#include "arguments.h"
 #include "../rigid/reverse.h"
+#include "arguments.h"
 
 namespace diffvbd {
 
-// In the order of csrc/bind/schema.cpp; data and origin may be empty. Of bodies that are not corrected spread is not looked at.
+// In the order of csrc/bind/schema.cpp; data and origin may be empty. Of bodies that are not corrected spread is not
+// looked at.
 struct RigidTensors {
   const Tensor &x, &x_prev, &y, &mass, &data, &origin, &order, &ptr, &spread, &other;
 };

@@ -6,8 +6,9 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   // numbers: time_step, regularization, relaxation, saturation (< 0: none), saturation_eps, filter_eta,
   // relaxation of the last sweep
   // sizes: active vertices, tets, slots of the plan; on CUDA also the rest of its header and color_block (plan_sizes in
-  // ops.py) data_count: scalars per scene, or per vertex, of each energy of one vertex launch: on CUDA the regime and
-  // the threads per vertex of the sweeps and of their reverse, else empty
+  // diffvbd/ops/fields.py)
+  // data_count: scalars per scene, or per vertex, of each energy of one vertex
+  // launch: on CUDA the regime and the threads per vertex of the sweeps and of their reverse, else empty
   m.def(
       "sweep(Tensor x_start, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, "
       "Tensor energy_data, Tensor origin, Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, "
@@ -30,7 +31,7 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "held, Tensor mu, Tensor lam, Tensor mass, Tensor rest, Tensor tape, Tensor plan, int[] sizes, int energies, "
       "int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> (Tensor x, "
       "Tensor v, Tensor acceleration, Tensor held, Tensor mu, Tensor lam, Tensor mass, Tensor rest)");
-  // The same with contact, of pairs made by contact_detect: see arguments_contact.h and contact/passes.h for the
+  // The same with contact, of pairs made by contact_detect: see bind/contact.h and contact/passes.h for the
   // shapes. cut [scenes, vertices]: 1 where a bound has held back an update.
   m.def(
       "contact_sweep(Tensor x_start, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, "

@@ -2,8 +2,8 @@
 // floor let it; with the adjoint.
 #pragma once
 
-#include "../sweep/bounds.h"
 #include "../energies/floor_start.h"
+#include "../sweep/bounds.h"
 #include "candidates.h"
 #include "passes.h"
 

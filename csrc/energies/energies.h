@@ -141,8 +141,8 @@ DIFFVBD_COLD PlanePush<E, R> push_of(const VertexState<R>& s, const R* record, c
   const auto f = E::push(s, record, axes);
   return {f.n, f.curvature, f.slope + f.curvature * dot(f.n, d_raw)};
 }
-// The axes of p and d_raw, and a small part of d_raw that is kept apart (sweep/uneven.h). The reaction of a plane is the
-// small difference of a large slope and a large answer to it: that part gives it its digits.
+// The axes of p and d_raw, and a small part of d_raw that is kept apart (sweep/uneven.h). The reaction of a plane is
+// the small difference of a large slope and a large answer to it: that part gives it its digits.
 template <class R>
 struct PlaneStep {
   Frame<R> axes;

@@ -1,10 +1,10 @@
 // The system of one vertex: what its update reads, its gradient and its 3x3 block.
 #pragma once
 
-#include "../energies/energies.h"
-#include "bounds.h"
 #include "../core/frame.h"
 #include "../core/views.h"
+#include "../energies/energies.h"
+#include "bounds.h"
 
 namespace diffvbd {
 

@@ -1,4 +1,4 @@
-"""The sweeps of a step with contact as autograd functions: as in sweeps.py, and with pairs, bounds and lagged terms."""
+"""The sweeps of a step with contact as autograd functions: as in sweep.py, and with pairs, bounds and lagged terms."""
 
 # pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations

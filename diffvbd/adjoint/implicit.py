@@ -30,7 +30,7 @@ MAX_ITERATIONS = 10_000  # of a solve whose adjoint does not say
 DEFAULT_TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}
 CHECK_EVERY = 8  # iterations on CUDA between two looks at whether all scenes have converged: each waits for the device
 
-_DIFFERENTIABLE = 8  # as in sweeps.py: x_start, x_prev, y, mu, lam, mass, rest, energy_data
+_DIFFERENTIABLE = 8  # as in sweep.py: x_start, x_prev, y, mu, lam, mass, rest, energy_data
 
 
 def global_sweep(

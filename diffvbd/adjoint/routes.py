@@ -34,7 +34,7 @@ class ReverseSweep:
             fail("tape", '"auto", "full", "compact" or "recompute"', repr(self.tape))
 
     def policy(self, scalars_per_row: int, itemsize: int, energies: int) -> int:
-        """The tape policy of ops.py for a step of scalars_per_row = scenes x sweeps x active vertices."""
+        """The tape policy of ops.fields for a step of scalars_per_row = scenes x sweeps x active vertices."""
         if self.tape == "auto":
             full = scalars_per_row * itemsize * ops.tape_rows(ops.FULL_TAPE, energies)
             return ops.FULL_TAPE if full <= FULL_TAPE_LIMIT else ops.COMPACT_TAPE

@@ -1,1 +1,1 @@
-"""Contact between surfaces: potentials, colliders, detection, starts. Knows no Model (dv.contact is inspect.contact)."""
+"""Contact between surfaces: potentials, colliders, detection, starts. Knows no Model; users ask inspect.contact."""

@@ -1,4 +1,4 @@
-"""The compiled operators of the beginning of a step, in the form of ops.py."""
+"""The compiled operators of the beginning of a step, as in sweep.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The compiled operators of the start of a part of a step with contact, in the form of ops.py."""
+"""The compiled operators of the start of a part of a step with contact, as in sweep.py."""
 
 from __future__ import annotations
 

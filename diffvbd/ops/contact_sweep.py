@@ -1,4 +1,4 @@
-"""The compiled operators of sweeps with contact, in the form of ops.py."""
+"""The compiled operators of sweeps with contact, as in sweep.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The compiled operators of contact: detection, islands, sums over segments. Raw and functional, like those of ops.py.
+"""The compiled operators of contact: detection, islands, sums over segments. Raw and functional, as in sweep.py.
 
 Sizes: B scenes that never mix, V vertices, Vc collider points, N = V + Vc corner points (vertices first), F triangles,
 E edges, P points, L planes, NB bodies of the mesh. Index tensors are int32; float tensors have the dtype of x; all are

@@ -17,13 +17,13 @@ from ..checks import check_count, fail
 from ..model.model import Model
 from ..scopes import Scope
 
-MAX_REPEATS = 64  # of a step under Binomial: each is a nested checkpoint, and a run of the step
+MAX_REPEATS = 64  # of a step under BinomialCheckpoints: each is a nested checkpoint, and a run of the step
 TAPE_BUDGET = 2 * 2**30  # bytes of tape that "auto" lets a rollout keep
 UNROLLED_SCALARS = 540  # that autograd keeps per active vertex and sweep; measured on a structured beam (bench/cpu.py)
 
 
 @dataclass(frozen=True)
-class Binomial:
+class BinomialCheckpoints:
     """Binomial (treeverse) checkpointing: at most ``snapshots`` states and the tape of one step are kept.
 
     ``steps`` steps cost at most t extra forward runs of a step, t the least number with C(snapshots + t, t) >= steps.
@@ -50,25 +50,33 @@ Run = Callable[[int, int, Tensor, Tensor], Segment]
 
 
 def choose_schedule(
-    checkpoint_every: int | Binomial | Literal["auto"] | None,
+    checkpoint_every: int | BinomialCheckpoints | Literal["auto"] | None,
     adjoint: Adjoint,
     model: Model,
     scenes: int,
     steps: int,
     sweeps: int,
-) -> tuple[int | Binomial | None, Adjoint]:
+) -> tuple[int | BinomialCheckpoints | None, Adjoint]:
     """Resolves ``"auto"`` for schedule and tape from the bytes they would keep."""
-    if isinstance(checkpoint_every, Binomial):
+    if isinstance(checkpoint_every, BinomialCheckpoints):
         snapshots = checkpoint_every.snapshots
         while _repeats(steps, snapshots) > MAX_REPEATS:
             snapshots += 1
         if snapshots > checkpoint_every.snapshots:
-            fail("checkpoint_every", f"Binomial of at least {snapshots} snapshots for {steps} steps", checkpoint_every)
-    if checkpoint_every is None or isinstance(checkpoint_every, Binomial):
+            fail(
+                "checkpoint_every",
+                f"BinomialCheckpoints of at least {snapshots} snapshots for {steps} steps",
+                checkpoint_every,
+            )
+    if checkpoint_every is None or isinstance(checkpoint_every, BinomialCheckpoints):
         return checkpoint_every, adjoint
     if checkpoint_every != "auto":
         if isinstance(checkpoint_every, str):
-            fail("checkpoint_every", '"auto", None, an integer > 0 or Binomial(snapshots)', repr(checkpoint_every))
+            fail(
+                "checkpoint_every",
+                '"auto", None, an integer > 0 or BinomialCheckpoints(snapshots)',
+                repr(checkpoint_every),
+            )
         return check_count("checkpoint_every", checkpoint_every, 1), adjoint
     row = scenes * check_count("sweeps", sweeps) * model.num_active * model._mass.element_size()
     if not isinstance(adjoint, ReverseSweep):  # a step of GlobalAdjoint keeps a few states and no tape
@@ -81,9 +89,9 @@ def choose_schedule(
     return max(1, math.isqrt(steps)), adjoint
 
 
-def run_segments(run: Run, steps: int, x: Tensor, v: Tensor, every: int | Binomial | None) -> Segment:
+def run_segments(run: Run, steps: int, x: Tensor, v: Tensor, every: int | BinomialCheckpoints | None) -> Segment:
     """Runs all steps under a schedule."""
-    if isinstance(every, Binomial):
+    if isinstance(every, BinomialCheckpoints):
         return _binomial(run, 0, steps, x, v, every.snapshots)
     if every is None:
         return run(0, steps, x, v)

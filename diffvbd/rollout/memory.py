@@ -13,7 +13,7 @@ from ..adjoint.routes import ReverseSweep
 from ..checks import check_count
 from ..model.model import Model
 from ..step.memory import cuda_scratch
-from .checkpoints import Binomial, _left, choose_schedule
+from .checkpoints import BinomialCheckpoints, _left, choose_schedule
 
 
 def predict(
@@ -42,10 +42,10 @@ def predict(
             tape: of one step, scenes x sweeps x active vertices x 72 (full), 24 (compact) or 0 bytes in float64;
             step: what one step keeps for its backward beside the state it starts from, tape included;
             kept: the largest amount kept at once: all steps without checkpoints; states plus the steps of one segment
-                with checkpoints every n; states plus one step with Binomial. The state of the random number generator,
-                5 kB, is kept with every checkpoint (with Binomial: with every step). ``rest`` adds the graph of the
-                rest metric, once (297 B per tet), for rest_points that the scenes share. Binomial with frames saved:
-                an upper estimate;
+                with checkpoints every n; states plus one step with BinomialCheckpoints. The state of the random number
+                generator, 5 kB, is kept with every checkpoint (with BinomialCheckpoints: with every step). ``rest``
+                adds the graph of the rest metric, once (297 B per tet), for rest_points that the scenes share.
+                BinomialCheckpoints with frames saved: an upper estimate;
             scratch: of one backward step, in scenes that run side by side on as many threads;
             total: kept + scratch.
     """
@@ -70,7 +70,7 @@ def predict(
     generator = torch.get_rng_state().numel()
     if schedule is None:
         kept = steps * per_step + max(0, steps - 1) * between
-    elif isinstance(schedule, Binomial):
+    elif isinstance(schedule, BinomialCheckpoints):
         kept = 2 * state * min(schedule.snapshots + 1, steps) + per_step + max(0, steps - 1) * generator
         # A part that runs again saves its frames again, inside parts that have done so.
         part = steps if frames > 1 else 1

@@ -17,7 +17,7 @@ from ..model.warnings import warn_of_thin_tets
 from ..scopes import looks_at
 from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
 from ..step.step import advance
-from .checkpoints import Binomial, Segment, choose_schedule, run_segments
+from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
 
 # these enter through prepare(), the others through advance()
 _STATIC = ("mu", "lam", "young", "poisson", "rest_points", "density")
@@ -74,7 +74,7 @@ def rollout(
     density: Any = None,
     parameters: dict[str, Any] | None = None,
     adjoint: Adjoint | None = None,
-    checkpoint_every: int | Binomial | Literal["auto"] | None = "auto",
+    checkpoint_every: int | BinomialCheckpoints | Literal["auto"] | None = "auto",
     save: Literal["all", "last"] | int = "all",
     observe: Callable[[Tensor, Tensor, int], Any] | None = None,
     progress: bool = False,
@@ -94,8 +94,9 @@ def rollout(
             also have the initial x where a vertex is not pinned.
         checkpoint_every: Between checkpoints of n steps only states are kept, and the segment is run again in the
             backward: n keeps steps / n states and the tapes of n steps. ``None`` keeps all tapes.
-            :class:`diffvbd.Binomial` keeps a given number of states and one tape. ``"auto"`` keeps all tapes while
-            they fit diffvbd.rollout.checkpoints.TAPE_BUDGET, else takes n near sqrt(steps). See ``model.memory``.
+            :class:`diffvbd.BinomialCheckpoints` keeps a given number of states and one tape. ``"auto"`` keeps all tapes
+            while they fit diffvbd.rollout.checkpoints.TAPE_BUDGET, else takes n near sqrt(steps). See
+            ``model.memory``.
         save: Which frames the trajectory holds: ``"all"`` (steps + 1 frames, from the initial state), every n-th and
             the last, or only the ``"last"``.
         observe: Called after each step as observe(x, v, step) with step = 1 ... steps; its results (a tensor, or a

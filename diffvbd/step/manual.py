@@ -1,4 +1,6 @@
-"""Steps without autograd: a forward that returns a tape, and a backward that takes one."""
+"""A step in two calls, for code that keeps its own backward: a forward that returns a tape, and a backward that takes
+one. torch.autograd is inside: a tape holds the graph of its one step, and the backward runs it. Around the two calls
+there is none: what they return is detached, and both work under torch.no_grad()."""
 
 from __future__ import annotations
 
@@ -33,6 +35,9 @@ def step_forward(
     model: Model, x: Tensor, v: Tensor, *, wrt: Sequence[str] = ("x", "v"), **options: Any
 ) -> tuple[Tensor, Tensor, Tape]:
     """One step and its tape, for code that keeps its own backward.
+
+    The step is that of :func:`diffvbd.step`, recorded by torch.autograd whether or not gradients are enabled around the
+    call. The tape keeps that graph, with the tapes of the sweeps in it, until it is dropped.
 
     Args:
         model, x, v, options: As in :func:`diffvbd.step`; works under torch.no_grad() too.
@@ -73,6 +78,8 @@ def step_forward(
 
 def step_backward(tape: Tape, grad_x: Tensor | None = None, grad_v: Tensor | None = None) -> dict[str, Tensor]:
     """Gradients of grad_x . x' + grad_v . v' with respect to the arguments named in ``wrt``.
+
+    Runs the tape's graph by torch.autograd.grad and keeps it. The gradients are detached.
 
     Args:
         tape: From :func:`step_forward`; may be used again.

@@ -1,5 +1,8 @@
-"""One implicit time step: predictor, rigid correction, sweeps, rigid correction, velocity. Sweeps and corrections are
-operators of ours; the rest is torch."""
+"""One implicit time step: beginning (predictor, start, first correction), sweeps, correction, velocity.
+
+Beginning, sweeps and correction are compiled operators; with pairs so are detection, islands, the start of a part and
+the sweeps of contact, R times a step. Where one operator can do all of it on CUDA, it does. What is left to torch are
+small sums: loads to accelerations, rest shape to masses, packing of energies, the velocity of bodies not corrected."""
 
 from __future__ import annotations
 

@@ -13,6 +13,8 @@ kg/m^3 and mu = lam = 5 kPa; h = 1/120 s, half of what the paper's figure sugges
 which the target is within 6 mm of converged steps. The loss is the mean squared vertex distance at the end. As the true
 w_y is zero, the result is judged by |w - w*| / |w*|, the row "deviation". The run ends when the loss is 1e-10 of the
 first one, or after 120 iterations, the paper's count. The sweeps start from the predictor, as in the paper.
+
+Start near zero. From (-6, 2, 4) and from (20, 5, -15) m/s^2 the task fails: 120 iterations miss the paper's 0.3 %.
 """
 
 from pathlib import Path

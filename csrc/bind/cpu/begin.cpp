@@ -1,12 +1,13 @@
 // CPU implementation of the beginning of a step.
+#include "../begin.h"
+
 #include <torch/csrc/stable/library.h>
 
 #include <tuple>
 #include <vector>
 
-#include "../begin.h"
-#include "sweep.h"
 #include "../../cpu/bodies.h"
+#include "sweep.h"
 
 namespace {
 

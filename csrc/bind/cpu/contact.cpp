@@ -4,9 +4,9 @@
 #include <tuple>
 #include <vector>
 
-#include "../detection.h"
 #include "../../cpu/detect.h"
 #include "../../cpu/islands.h"
+#include "../detection.h"
 
 namespace {
 

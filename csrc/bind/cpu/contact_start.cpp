@@ -1,13 +1,14 @@
 // CPU implementations of the operators of the start of a part.
+#include "../contact_start.h"
+
 #include <torch/csrc/stable/library.h>
 
 #include <algorithm>
 #include <tuple>
 #include <vector>
 
-#include "../contact_start.h"
-#include "sweep.h"
 #include "../../cpu/grain.h"
+#include "sweep.h"
 
 namespace {
 

@@ -4,8 +4,8 @@
 #include <tuple>
 #include <vector>
 
-#include "../contact.h"
 #include "../../contact/lag.h"
+#include "../contact.h"
 #include "sweep.h"
 
 namespace {

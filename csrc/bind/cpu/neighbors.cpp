@@ -1,9 +1,10 @@
 // CPU implementation of the search for neighbors: tensors in, raw pointers on.
+#include "../neighbors.h"
+
 #include <torch/csrc/stable/library.h>
 
 #include <tuple>
 
-#include "../neighbors.h"
 #include "../../cpu/neighbors.h"
 
 namespace {

@@ -1,13 +1,14 @@
 // CPU implementations of the rigid correction: bodies side by side, or the vertices of a large one.
+#include "../rigid.h"
+
 #include <torch/csrc/stable/library.h>
 
 #include <algorithm>
 #include <tuple>
 #include <vector>
 
-#include "../rigid.h"
-#include "sweep.h"
 #include "../../cpu/bodies.h"
+#include "sweep.h"
 
 namespace {
 

@@ -1,11 +1,12 @@
 // CPU implementations of the operators: tensors in, raw pointers on.
+#include "sweep.h"
+
 #include <torch/csrc/stable/library.h>
 
 #include <limits>
 #include <tuple>
 #include <vector>
 
-#include "sweep.h"
 #include "../../cpu/reductions.h"
 
 namespace {

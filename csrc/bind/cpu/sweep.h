@@ -4,8 +4,8 @@
 #include <tuple>
 #include <vector>
 
-#include "../arguments.h"
 #include "../../cpu/run.h"
+#include "../arguments.h"
 
 namespace diffvbd {
 

@@ -1,13 +1,14 @@
 // CUDA implementation of the beginning of a step.
+#include "../begin.h"
+
 #include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
 #include <tuple>
 #include <vector>
 
-#include "../begin.h"
-#include "bodies.h"
 #include "../../cuda/begin.h"
+#include "bodies.h"
 
 namespace {
 

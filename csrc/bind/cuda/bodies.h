@@ -3,8 +3,8 @@
 
 #include <vector>
 
-#include "binding.h"
 #include "../../cuda/bodies.h"
+#include "binding.h"
 
 namespace diffvbd::cuda {
 

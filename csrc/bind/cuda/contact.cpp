@@ -4,10 +4,10 @@
 
 #include <tuple>
 
-#include "../detection.h"
-#include "binding.h"
 #include "../../cuda/detect.h"
 #include "../../cuda/islands.h"
+#include "../detection.h"
+#include "binding.h"
 
 namespace {
 

@@ -1,13 +1,14 @@
 // CUDA implementations of the operators of the start of a part.
+#include "../contact_start.h"
+
 #include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
 #include <tuple>
 #include <vector>
 
-#include "../contact_start.h"
-#include "binding.h"
 #include "../../cuda/start.h"
+#include "binding.h"
 
 namespace {
 

@@ -4,10 +4,10 @@
 #include <tuple>
 #include <vector>
 
-#include "../contact.h"
-#include "sweep.h"
 #include "../../cuda/contact.h"
 #include "../../cuda/lowest.h"
+#include "../contact.h"
+#include "sweep.h"
 
 namespace {
 

@@ -1,12 +1,13 @@
 // CUDA implementation of the search for neighbors: tensors in, raw pointers on.
+#include "../neighbors.h"
+
 #include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
 #include <tuple>
 
-#include "../neighbors.h"
-#include "binding.h"
 #include "../../cuda/neighbors.h"
+#include "binding.h"
 
 namespace {
 

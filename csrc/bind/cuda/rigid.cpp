@@ -1,13 +1,14 @@
 // CUDA implementations of the rigid correction.
+#include "../rigid.h"
+
 #include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
 #include <tuple>
 #include <vector>
 
-#include "../rigid.h"
-#include "bodies.h"
 #include "../../cuda/rigid.h"
+#include "bodies.h"
 
 namespace {
 

@@ -1,4 +1,6 @@
 // CUDA implementations of the operators: tensors in, raw pointers on, on the tensors' device and its current stream.
+#include "sweep.h"
+
 #include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
@@ -6,9 +8,8 @@
 #include <tuple>
 #include <vector>
 
-#include "../arguments.h"
-#include "sweep.h"
 #include "../../cuda/reductions.h"
+#include "../arguments.h"
 
 namespace {
 

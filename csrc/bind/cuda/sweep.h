@@ -5,8 +5,8 @@
 
 #include <tuple>
 
-#include "binding.h"
 #include "../../cuda/step.h"
+#include "binding.h"
 
 namespace diffvbd::cuda {
 
