@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from bench import plots, tasks
+from bench import paper, plots, tasks
 from bench.common import RESULTS, commit, markdown_table, place
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -92,7 +92,7 @@ def results_page(results: Path, images: Path) -> str:
         e = content["environment"]
         run = "quick" if content.get("quick") else "full"
         rows.append((f"[{stem}](#{name})", place(e), e.get("torch"), e.get("date"), commit(e), run))
-    parts = [INTRODUCTION, markdown_table(header, rows)] if rows else [INTRODUCTION, EMPTY]
+    parts = [INTRODUCTION, markdown_table(header, rows), paper.beside(results)] if rows else [INTRODUCTION, EMPTY]
     for name in dict.fromkeys(name for name, _, _ in found):
         module = importlib.import_module(f"bench.{name}")
         parts.append(f"## {name}\n\n{inspect.cleandoc(module.__doc__ or '')}\n")

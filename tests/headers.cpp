@@ -16,7 +16,7 @@ inline long double square_root(long double a) { return std::sqrt(a); }
 inline long double natural_log(long double a) { return std::log(a); }
 }  // namespace diffvbd
 
-#include "core/vertex.h"
+#include "sweep/vertex.h"
 #include "cpu/lanes.h"
 #include "cpu/scene.h"
 

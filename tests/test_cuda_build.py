@@ -212,7 +212,7 @@ def test_an_object_that_does_not_load_is_reported_when_needed(tmp_path: Path, mo
 FAKE = f"""
 import os, pathlib, sys, time
 here = pathlib.Path(os.environ["FAKE"])
-assert pathlib.Path("csrc/bind/cuda/sweep.cpp").exists()
+assert pathlib.Path("csrc/bind/schema.cpp").exists()
 with open(here / "runs", "a") as runs:
     print(os.getpid(), file=runs)
 mode = (here / "mode").read_text()

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from diffvbd import ops
 from diffvbd.ops import neighbors as ops_neighbors
 from diffvbd.ops.neighbors import neighbor_pairs
 
@@ -148,9 +149,9 @@ def test_too_many_pairs_raise_with_their_number(device: str, rng: np.random.Gene
     for room in (0, 1, needed // 2, needed - 1):
         with pytest.raises(ValueError, match=rf"max_pairs: expected room for {needed} pairs .* got {room}$"):
             neighbor_pairs(points, 0.5, room)
-        pairs, count = ops_neighbors.ops.raw.neighbor_pairs(points, 0.5, room)
+        pairs, count = ops.raw.neighbor_pairs(points, 0.5, room)
         assert pairs.shape == (room, 3) and int(count) == needed and bool((pairs == -1).all())
-    pairs, count = ops_neighbors.ops.raw.neighbor_pairs(points, 0.5, needed + 7)
+    pairs, count = ops.raw.neighbor_pairs(points, 0.5, needed + 7)
     assert bool((pairs[:needed] >= 0).all()) and bool((pairs[needed:] == -1).all()) and int(count) == needed
 
 

@@ -116,7 +116,7 @@ def contact_sweep(tensors: SweepTensors, contact: ContactTensors, listed: Pairs,
     """Positions after the sweeps [B, V, 3], and where a bound has held back an update, uint8 [B, V].
 
     Args:
-        tensors, packed_rest, plan, settings, tape_policy, debug_step: As sweeps.sweep.
+        tensors, packed_rest, plan, settings, tape_policy, debug_step: As adjoint.sweep.sweep.
         contact: Differentiable, see ContactTensors.  listed, lagged: Pairs that repel, and those of ``lag``.
         friction_eps: Motion within the step below which friction is smoothed [m].
     """

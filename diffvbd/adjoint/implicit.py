@@ -37,7 +37,7 @@ def global_sweep(
     model: Model, tensors: SweepTensors, settings: ops.SweepSettings, adjoint: GlobalAdjoint, debug_step: int = -1,
     then: Callable[[Tensor], Tensor] = lambda x: x,
 ) -> Tensor:  # fmt: skip
-    """Positions after the sweeps and what comes ``then`` [B, V, 3]; ``tensors``: the nine arguments of sweeps.sweep."""
+    """Positions after the sweeps and what comes ``then`` [B, V, 3]; ``tensors``: SweepTensors."""
     return _GlobalSweep.apply(*tensors, model, settings, adjoint, debug_step, then)
 
 

@@ -100,8 +100,8 @@ def correct(
     others: OtherBodies, data_count: tuple[int, ...], time_step: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Positions after every listed body was moved rigidly to the least potential, and the velocities (x - x_prev) / h,
-    [B, V, 3]; differentiable in the first five tensors, whose shapes are those of sweeps.sweep. ``origin`` is empty
-    where positions are absolute."""
+    [B, V, 3]; differentiable in the first five tensors, whose shapes are those of adjoint.sweep.sweep. ``origin`` is
+    empty where positions are absolute."""
     tensors = distinct(x, x_prev, y, mass, data, origin)
     *listed, groups = bodies
     return _Correct.apply(*tensors, *listed, others.of, groups, data_count, time_step)

@@ -108,7 +108,7 @@ def begin(
     Args:
         x, v: State [m, m/s], [B, V, 3].  acceleration: [1 | B, 1 | V, 3] [m/s^2].
         held: Where pinned vertices go [m], [1 | B, V, 3], or empty: they stay.
-        mass, data, origin, mu, lam: As of sweeps.sweep.  pinned: bool [V].
+        mass, data, origin, mu, lam: As of adjoint.sweep.sweep.  pinned: bool [V].
         rest: [1 | B, T, 7], or empty where tets have no energy; like mu and lam looked at by "auto" only.
         start: "auto", "predictor" or "inertia", of the bodies that are not corrected.
         filters: Whether the planes of a floor hold back a start.

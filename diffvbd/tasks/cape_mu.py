@@ -2,9 +2,9 @@
 
 A square cloth of 0.6 x 0.6 m and 484 vertices, a shell of two layers, is held at its four corners and falls from flat
 into a hammock. Given is one number, the height of its center after t = 1/3 s, simulated with mu = 2000 Pa. Adam moves
-log mu from 8000 Pa on the squared difference of the two heights [m^2]. On the way
-from there a softer cloth hangs lower at that moment, and the loss has one minimum. Above 1e5 Pa this is false: a
-stiffer cloth hangs lower again, the loss falls as mu grows, and Adam started there moves away from the solution.
+log mu from 8000 Pa on the squared difference of the two heights [m^2]. On the way from there a softer cloth hangs lower
+at that moment, and the loss has one minimum. Above 1e5 Pa this is false: a stiffer cloth hangs lower again, the loss
+falls as mu grows, and Adam started there moves away from the solution.
 
 Choices the paper leaves open: the layers have 22 x 11 vertices, 1 cm apart; a corner is one vertex of each layer; the
 center is the mean of the four vertices nearest to it. Density 50 kg/m^3 (0.5 kg/m^2, a heavy wool); lam = 2000 Pa is

@@ -21,7 +21,8 @@ not identify it. The rigid correction is off (`rigid=False`) and the sweeps star
 float32, because a million bodies fill tens of GB; the quick version uses float64.
 
 That the bar is met says little: the paper does not say where its bodies start and end, so its errors and ours are of
-different scenes, and its times and memory are those of float64, ours of float32. What the bar holds is this task.
+different scenes, and its times and memory are those of float64, ours of float32. The bar only keeps this task from
+getting worse.
 """
 
 import math
