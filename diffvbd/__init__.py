@@ -7,13 +7,11 @@ from typing import Any as _Any
 # Idle threads that spin make a parallel region cost milliseconds on a busy machine; only the first import decides.
 _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from . import mesh, solvers
+from . import colliders, contact, mesh, solvers
 from ._version import __version__ as __version__
 from .adjoint.routes import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
-from .contact import colliders
 from .contact.barrier import Friction, PairBarrier
 from .energies import Anchor, FloorBarrier, StableNeoHookean
-from .inspect import contact
 from .inspect.debug import debug_checks
 from .inspect.diagnose import Diagnosis, diagnose
 from .inspect.gradcheck import GradientCheck, check_gradients

@@ -55,11 +55,11 @@ PYTHON = {module: imports_of(path) for module, path in FILES.items()}
 # What may be imported, lowest first: each room knows only those before it. A file beside the rooms is a room of one.
 ROOMS = (
     "_version", "safeguards", "mask", "checks", "lasting", "scopes", "reference", "energies", "mesh", "ops", "contact",
-    "model", "adjoint", "step", "rollout", "inspect", "solvers", "losses", "viz", "testing", "", "tasks", "cli",
-    "__main__",
+    "model", "adjoint", "step", "rollout", "inspect", "colliders", "solvers", "losses", "viz", "testing", "", "tasks",
+    "cli", "__main__",
 )  # fmt: skip
-# Model.memory() asks, when it is called, what a rollout would take.
-UPWARD = {("model.model", "rollout.memory")}
+# Both only when they are asked: Model.memory() for what a rollout would take, diffvbd.contact for what users call.
+UPWARD = {("model.model", "rollout.memory"), ("contact", "inspect.contact")}
 
 
 def arrows() -> set[tuple[str, str]]:

@@ -105,14 +105,16 @@ struct LaneStar {
   const SceneView<T>& s;
   int64_t first;
   int count;
-  T* edges;  // [edges of the block, kLanes, 4], reverse only
+  T* edges;    // [edges of the block, kLanes, 4], reverse only
+  int wishes;  // Wanted: of the adjoints that every variant has, those to be stored
 
   DIFFVBD_FN LaneStar(const Plan& p, const SceneView<T>& scene, int64_t block, T* edge_rows = nullptr)
       : plan(p),
         s(scene),
         first(p.block_slot[block]),
         count(p.block_slot[block + 1] - p.block_slot[block]),
-        edges(edge_rows) {}
+        edges(edge_rows),
+        wishes((scene.mu_bar ? kMaterial : 0) | (scene.rest_bar ? kRest : 0)) {}
   DIFFVBD_FN int size() const { return count; }
   template <class... R>
   DIFFVBD_FN void total(R&...) const {}  // one lane visits the whole star
@@ -156,28 +158,29 @@ struct LaneStar {
   // One variant serves every wish.
   template <int wanted>
   DIFFVBD_FN int asked() const {
-    return (s.mu_bar ? kMaterial : 0) | (s.rest_bar ? kRest : 0);
+    return wishes;
   }
   DIFFVBD_FN static void accumulate(T* p, const Lanes<T>& v) { (Lanes<T>::load(p) + v).store(p); }
 
   template <int wanted>
   DIFFVBD_FN void add(int e, const TetPairAdjoint<Lanes<T>>& a) const {
     const int64_t slot = first + e;
-    const int32_t* edge = plan.edge + slot * 3 * kLanes;
-    scatter(edge, a.xj);
-    scatter(edge + kLanes, a.xk);
-    scatter(edge + 2 * kLanes, a.xl);
-    if (s.mu_bar) {
+    // These first: where they have just been worked out under the same condition.
+    if (wishes & kMaterial) {
       accumulate(s.mu_bar + slot * kLanes, a.mu);
       accumulate(s.lam_bar + slot * kLanes, a.lam);
     }
-    if (s.rest_bar) {
+    if (wishes & kRest) {
       T* r = s.rest_bar + slot * 4 * kLanes;
       accumulate(r, a.k_ij);
       accumulate(r + kLanes, a.k_ik);
       accumulate(r + 2 * kLanes, a.k_il);
       accumulate(r + 3 * kLanes, a.c6);
     }
+    const int32_t* edge = plan.edge + slot * 3 * kLanes;
+    scatter(edge, a.xj);
+    scatter(edge + kLanes, a.xk);
+    scatter(edge + 2 * kLanes, a.xl);
   }
 };
 
