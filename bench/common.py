@@ -97,9 +97,9 @@ def write(
     return path
 
 
-def as_json(content: Any, indent: str = "") -> str:
+def as_json(content: Any) -> str:
     """JSON with a line for each row of a table, so that it is short and a change of it can be read."""
-    return _lines(content, indent) + "\n"
+    return _lines(content, "") + "\n"
 
 
 def _lines(value: Any, indent: str) -> str:

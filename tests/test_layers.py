@@ -236,7 +236,7 @@ def test_cpp_rooms_include_only_what_lies_below() -> None:
         backend = {"cpu": "cuda", "cuda": "cpu"}.get(upper_names[0] if upper == "bind" else upper)
         assert backend not in target.split("/")[:2], f"{path} includes {target}"
     assert not circle(found)
-    # what is about an algorithm does not know the list of energies unless it runs them
+    # schemas are text: they include nothing of ours
     assert not {target for path, target in found if path == "bind/schema.cpp"}
 
 

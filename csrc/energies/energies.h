@@ -1,6 +1,7 @@
 // THE list of energies. A scene's energies form a mask; each mask is a compiled variant, so an absent energy costs no
-// instruction. An energy of one vertex is a struct with stride, per_vertex, has_filter, reads_x_prev, rare,
-// block() and value(); with a block_vjp() too it is hot, without one Dual derives its adjoint.
+// instruction, but for one that is rare: on the CPU it costs a test. An energy of one vertex is a struct with stride,
+// per_vertex, has_filter, reads_x_prev, rare, block() and value(); with a block_vjp() too it is hot, without one Dual
+// derives its adjoint.
 #pragma once
 
 #include <type_traits>
