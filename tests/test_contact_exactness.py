@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import DEVICES
-from contact_scenes import GRAVITY, SCENES, compiled, noise, part_of, unrolled
+from diffvbd.testing.contact_scenes import GRAVITY, SCENES, compiled, noise, part_of, unrolled
 
 import diffvbd as dv
 from diffvbd.testing import relative_error

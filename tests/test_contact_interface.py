@@ -7,10 +7,10 @@ import pickle
 from collections.abc import Callable
 from typing import Any
 
-import contact_scenes
+from diffvbd.testing import contact_scenes
 import pytest
 import torch
-from contact_scenes import GRAVITY, Scene, split
+from diffvbd.testing.contact_scenes import GRAVITY, Scene, split
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 

@@ -8,10 +8,10 @@ read both before either moves, and the reverse must know both adjoints before it
 import itertools
 from collections.abc import Callable
 
-import contact_scenes
+from diffvbd.testing import contact_scenes
 import pytest
 import torch
-from contact_scenes import Scene, boxes, build, compiled, unrolled
+from diffvbd.testing.contact_scenes import Scene, boxes, build, compiled, unrolled
 from torch import Tensor
 
 import diffvbd as dv

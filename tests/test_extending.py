@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 SCRIPT = """
 import torch
 import diffvbd as dv
-from contact_scenes import boxes, build, compiled, unrolled
+from diffvbd.testing.contact_scenes import boxes, build, compiled, unrolled
 from diffvbd.energies import Tether
 from diffvbd.testing import relative_error, tolerance
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from contact_scenes import noise, part_of
+from diffvbd.testing.contact_scenes import noise, part_of
 from torch import Tensor
 
 import diffvbd as dv

@@ -10,10 +10,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import diffvbd as dv
-from diffvbd import colliders, mesh
-from diffvbd.reference import contact as reference
-from diffvbd.testing import generator
+from .. import mesh
+from ..adjoint.routes import ReverseSweep
+from ..contact import colliders
+from ..contact.barrier import Friction, PairBarrier
+from ..energies import FloorBarrier, StableNeoHookean
+from ..model.model import Model
+from ..reference import contact as reference
+from ..inspect.contact import record
+from ..step.step import step
+from .scenes import generator
 
 GRAVITY = (0.3, -9.81, 0.2)
 
@@ -22,7 +28,7 @@ GRAVITY = (0.3, -9.81, 0.2)
 class Scene:
     """A Model with contact and everything that a step is differentiated in; tensors of float64 on the CPU."""
 
-    model: dv.Model
+    model: Model
     x: Tensor
     v: Tensor
     time_step: float = 1 / 100
@@ -48,7 +54,7 @@ def build(name: str, tets: mesh.TetMesh, energies: Sequence[Any], speed: float =
     batch = options.pop("batch", ())
     scene_options = {k: options.pop(k) for k in ("time_step",) if k in options}
     jitter = options.pop("jitter", 2e-3)
-    model = dv.Model(tets, energies=(dv.StableNeoHookean(), *energies), **options)
+    model = Model(tets, energies=(StableNeoHookean(), *energies), **options)
     shape = (*batch, model.num_vertices, 3)
     x = torch.from_numpy(tets.points.copy()) + noise(name, "x", shape=shape, size=jitter)
     v = noise(name, "v", shape=shape, size=speed)
@@ -68,8 +74,8 @@ def build(name: str, tets: mesh.TetMesh, energies: Sequence[Any], speed: float =
 
 def stacked() -> Scene:
     """A box that has landed on a box on the floor, a little turned: faces, edges and corners touch."""
-    energies = (dv.FloorBarrier(height=-0.015, kappa=3e4, dhat=0.02, damping=2.0),
-                dv.PairBarrier(kappa=3e4, dhat=0.02, damping=3.0), dv.Friction(0.4, 0.05))  # fmt: skip
+    energies = (FloorBarrier(height=-0.015, kappa=3e4, dhat=0.02, damping=2.0),
+                PairBarrier(kappa=3e4, dhat=0.02, damping=3.0), Friction(0.4, 0.05))  # fmt: skip
     scene = build("stacked", boxes((0, 0, 0), (0.03, 0.213, 0.02)), energies, jitter=3e-3)
     scene.v[27:] += torch.tensor([0.4, -0.8, 0.2])
     return scene
@@ -79,7 +85,7 @@ def crossed() -> Scene:
     """Two beams that cross like the sticks of a fire: edges meet edges, inside a bounded motion."""
     tets = mesh.join([mesh.box((5, 2, 2), (0.4, 0.08, 0.08)),
                       mesh.box((2, 2, 5), (0.08, 0.08, 0.4)).translate((0.163, 0.094, -0.157))])  # fmt: skip
-    scene = build("crossed", tets, (dv.PairBarrier(kappa=1e4, dhat=0.03, damping=1.0), dv.Friction(0.3, 0.1)),
+    scene = build("crossed", tets, (PairBarrier(kappa=1e4, dhat=0.03, damping=1.0), Friction(0.3, 0.1)),
                   jitter=4e-3)  # fmt: skip
     scene.v[:, 1] += torch.where(scene.model.body == 0, 1.5, -1.5)
     return scene
@@ -87,8 +93,8 @@ def crossed() -> Scene:
 
 def fast() -> Scene:
     """Two boxes at 12 m/s against each other, with spin: bounds hold most vertices back."""
-    scene = build("fast", boxes((0, 0, 0), (0.05, 0.23, 0.03)), (dv.PairBarrier(kappa=1e4, dhat=0.02, detections=3),
-                                                                dv.Friction(0.2, 0.1)))  # fmt: skip
+    scene = build("fast", boxes((0, 0, 0), (0.05, 0.23, 0.03)), (PairBarrier(kappa=1e4, dhat=0.02, detections=3),
+                                                                Friction(0.2, 0.1)))  # fmt: skip
     turning = torch.linalg.cross(
         scene.x - scene.x.mean(0), torch.tensor([[3.0, 9.0, -5.0]], dtype=torch.float64), dim=-1
     )
@@ -101,7 +107,7 @@ def fast() -> Scene:
 def folded() -> Scene:
     """A thin strip folded over itself: self-contact, and pairs that are closer than dhat at rest."""
     tets = mesh.box((9, 2, 3), (0.8, 0.02, 0.2))
-    scene = build("folded", tets, (dv.PairBarrier(kappa=5e3, dhat=0.03, damping=0.5),), jitter=0.0)
+    scene = build("folded", tets, (PairBarrier(kappa=5e3, dhat=0.03, damping=0.5),), jitter=0.0)
     points = scene.x.clone()
     radius, bend = 0.02, torch.pi
     along = points[:, 0] - 0.4
@@ -121,8 +127,8 @@ def obstacles() -> Scene:
     wedge = colliders.Obstacle([[-0.02, 0.1, 0.24], [0.22, 0.1, 0.24], [0.1, 0.32, 0.25]], [[0, 1, 2]])
     things = (colliders.Sphere((0.1, -0.061, 0.1), 0.05), colliders.Capsule((0.31, 0.0, 0.0), (0.31, 0.2, 0.1), 0.1),
               wedge, colliders.Plane((0, 0, -0.012), (0.02, 0.03, 1.0)))  # fmt: skip
-    barrier = dv.PairBarrier(kappa=2e4, dhat=0.03, self_contact=False, damping=2.0)
-    scene = build("obstacles", boxes((0, 0, 0)), (barrier, dv.Friction(0.5, 0.05)), colliders=things, pinned=[8, 17],
+    barrier = PairBarrier(kappa=2e4, dhat=0.03, self_contact=False, damping=2.0)
+    scene = build("obstacles", boxes((0, 0, 0)), (barrier, Friction(0.5, 0.05)), colliders=things, pinned=[8, 17],
                   jitter=1e-3)  # fmt: skip
     points = scene.model.collider_points
     scene.inputs["colliders_before"] = points + noise("obstacles", "before", shape=points.shape, size=2e-4)
@@ -136,8 +142,8 @@ def obstacles() -> Scene:
 def batched() -> Scene:
     """Three scenes of two boxes, each with its own material and parameters."""
     scene = build("batched", boxes((0, 0, 0), (0.04, 0.212, -0.03), points=2), (
-        dv.FloorBarrier(height=-0.012, kappa=2e4, dhat=0.02), dv.PairBarrier(kappa=2e4, dhat=0.02, damping=1.0),
-        dv.Friction(0.3, 0.05)), batch=(3,), jitter=4e-3)  # fmt: skip
+        FloorBarrier(height=-0.012, kappa=2e4, dhat=0.02), PairBarrier(kappa=2e4, dhat=0.02, damping=1.0),
+        Friction(0.3, 0.05)), batch=(3,), jitter=4e-3)  # fmt: skip
     for name in ("pair_barrier.kappa", "pair_barrier.damping", "friction.coefficient"):
         scene.parameters[name] = scene.parameters[name] * torch.tensor([0.8, 1.0, 1.3], dtype=torch.float64)
     return scene
@@ -166,17 +172,17 @@ def objective(x: Tensor, v: Tensor) -> Tensor:
     return (weights[0] * x).sum() + 1e-2 * (weights[1] * v).sum()
 
 
-def compiled(scene: Scene, steps: int, sweeps: int, tape: str = "full", model: dv.Model | None = None
+def compiled(scene: Scene, steps: int, sweeps: int, tape: str = "full", model: Model | None = None
              ) -> tuple[dict[str, Tensor], list[reference.Part]]:  # fmt: skip
     """End state and gradients of the package's steps, and the detections of all of them."""
     model = scene.model if model is None else model
     leaves = {k: v.detach().to(model.device, model.dtype).requires_grad_() for k, v in scene.leaves().items()}
     options, parameters = split(leaves)
     x, v = options.pop("x"), options.pop("v")
-    with dv.contact.record() as found:
+    with record() as found:
         for _ in range(steps):
-            x, v = dv.step(model, x, v, time_step=scene.time_step, sweeps=sweeps, gravity=GRAVITY,
-                           parameters=parameters, adjoint=dv.ReverseSweep(tape=tape), **options)  # fmt: skip
+            x, v = step(model, x, v, time_step=scene.time_step, sweeps=sweeps, gravity=GRAVITY,
+                           parameters=parameters, adjoint=ReverseSweep(tape=tape), **options)  # fmt: skip
     return _result(x, v, leaves), [part_of(d) for d in found]
 
 
