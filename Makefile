@@ -1,6 +1,6 @@
 # make         environment, build, and the main job: identify a beam's material
-# make test    the default test suite, a process for each core (ARGS='-m slow' and the like are passed to pytest)
-# make test-all  the slow tests, too
+# make test    the quick tests, a process for each core (ARGS='-k floor' and the like are passed to pytest)
+# make test-all  the slow tests, too; ARGS='-m hours' instead: what is run by hand before a release
 # make lint    ruff, pyright and clang-format in check mode
 # make clean   remove what the build made; `make distclean` removes the environment too
 PYTHON ?= python3
@@ -28,7 +28,7 @@ test: build
 	$(BIN)/python -m pytest -n auto --dist worksteal $(ARGS)
 
 test-all: build
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "slow or not slow" $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not hours" $(ARGS)
 
 lint: $(ENVIRONMENT)
 	$(BIN)/ruff check .

@@ -2,6 +2,7 @@
 
 Environment:
     DIFFVBD_NO_CLONES=1  compile the CPU kernels for the baseline instruction set only (quicker builds, slower kernels)
+    DIFFVBD_QUICK=1      the same with less optimisation and without the paper's block: for work on an energy
     DIFFVBD_NO_CUDA=1    leave the CUDA object out; without it, it is built where torch has CUDA and nvcc is found
     TORCH_CUDA_ARCH_LIST what the CUDA object runs on (default: the visible devices, or 8.0 9.0 10.0 12.0+PTX)
     CUDA_HOME, MAX_JOBS  read by torch
@@ -22,12 +23,17 @@ try:
 except ImportError:
     sys.exit("diffvbd: torch is not importable here.\nInstall torch first, then: pip install --no-build-isolation .")
 
+# The sweeps for each scalar and instruction set come first: they take longest.
+QUICK = bool(os.environ.get("DIFFVBD_QUICK"))
+INSTRUCTION_SETS = ["baseline"] if QUICK or os.environ.get("DIFFVBD_NO_CLONES") else ["v4", "v3", "baseline"]
 CPU_SOURCES = [
+    *(f"csrc/cpu/sweep_{scalar}_{name}.cpp" for scalar in ("double", "float") for name in INSTRUCTION_SETS),
     "csrc/bind/schema.cpp",
     "csrc/cpu/checks.cpp",
     "csrc/cpu/contact.cpp",
     "csrc/cpu/detect.cpp",
     "csrc/cpu/islands.cpp",
+    "csrc/cpu/kernels.cpp",
     "csrc/cpu/layout.cpp",
     "csrc/cpu/neighbors.cpp",
     "csrc/cpu/plan.cpp",
@@ -35,19 +41,19 @@ CPU_SOURCES = [
     "csrc/bind/cpu/begin.cpp",
     "csrc/bind/cpu/contact.cpp",
     "csrc/bind/cpu/contact_start.cpp",
-    "csrc/bind/cpu/contact_sweep.cpp",
+    "csrc/bind/cpu/contact_lag.cpp",
+    "csrc/bind/cpu/mesh.cpp",
     "csrc/bind/cpu/neighbors.cpp",
     "csrc/bind/cpu/rigid.cpp",
     "csrc/cpu/run.cpp",
-    "csrc/cpu/sweep_backward_double.cpp",
-    "csrc/cpu/sweep_backward_float.cpp",
-    "csrc/cpu/sweep_forward.cpp",
 ]
 
 # -ffp-contract=off: the same bits from every instruction set. -fno-math-errno: sqrt is one instruction.
 FLAGS = ["-O3", "-g0", "-fno-math-errno", "-ffp-contract=off", "-Wno-psabi", "-Wno-ignored-attributes"]
-if os.environ.get("DIFFVBD_NO_CLONES"):
+if INSTRUCTION_SETS == ["baseline"]:
     FLAGS += ["-DDIFFVBD_NO_CLONES"]
+if QUICK:
+    FLAGS += ["-O1", "-DDIFFVBD_QUICK"]
 
 
 class BuildPy(build_py):

@@ -22,6 +22,7 @@ import torch
 import bench
 from bench import common, report, tasks
 
+ASKED = ("bits",)  # only when they are asked for by name: what is written is no result
 PAPER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's own measurements, in its order
 
 
@@ -56,6 +57,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     if options.name == "all":
         return run_all(parser, options, known)
+    if options.name in ASKED and options.out is None:
+        parser.error(f"--out: {options.name} is compared between two folders, and needs one")
     if options.name not in known:
         parser.error(f"name: expected one of {', '.join(known)}, all, tasks, report or list, got {options.name}")
     accepted = inspect.signature(known[options.name].run).parameters
@@ -83,7 +86,8 @@ def run_one(name: str, module: ModuleType, options: argparse.Namespace, only: st
 
 def run_all(parser: argparse.ArgumentParser, options: argparse.Namespace, known: dict[str, ModuleType]) -> int:
     """The paper's measurements, then the others that the device allows. One that fails does not keep back the next."""
-    names = [name for name in PAPER if name in known] + [name for name in known if name not in PAPER]
+    others = [name for name in known if name not in PAPER and name not in ASKED]
+    names = [name for name in PAPER if name in known] + others
     if options.only is not None:
         chosen = [name.strip() for name in options.only.split(",")]
         if unknown := [name for name in chosen if name not in known]:

@@ -132,8 +132,8 @@ def described(model: dv.Model, inputs: dict[str, Any]) -> dict[str, Any]:
     """What the first update of the step meets: tets at the predictor, and how far one sweep moves a vertex."""
     h = TIME_STEP
     y = inputs["x"] + h * inputs["v"] + h * h * inputs["gravity"]
-    corners, rest = y[model.tets], model.rest_points[model.tets]
-    det = torch.linalg.det(corners[:, 1:] - corners[:, :1]) / torch.linalg.det(rest[:, 1:] - rest[:, :1])
+    corners, at_rest = y[model.tets], model.rest_points[model.tets]
+    det = torch.linalg.det(corners[:, 1:] - corners[:, :1]) / torch.linalg.det(at_rest[:, 1:] - at_rest[:, :1])
     end, _ = dv.step(model, sweeps=1, **inputs)
     return {
         "vertices": model.num_vertices,

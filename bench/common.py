@@ -24,7 +24,8 @@ def environment(device: str = "cpu") -> dict[str, Any]:
     """Machine and versions of a run. Names only: no host, user or path."""
     # a copy of the tree without its history is told by this variable what it is a copy of
     commit = _git("rev-parse", "HEAD") or os.environ.get("DIFFVBD_COMMIT")
-    status = _git("status", "--porcelain")
+    # what benchmarks and pages write changes nothing that the next benchmark measures
+    status = _git("status", "--porcelain", "--", ":/", ":(top,exclude)bench/results", ":(top,exclude)docs")
     gpu = {} if device == "cpu" else {"driver": driver(), "cuda": torch.version.cuda}
     return {
         "device": device if device == "cpu" else torch.cuda.get_device_name(device),
@@ -56,6 +57,12 @@ def driver() -> str | None:
     """Version of the NVIDIA driver."""
     lines = _output("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
     return lines.splitlines()[0].strip() if lines else None
+
+
+def is_ancestor(commit: str) -> bool:
+    """Whether a commit, or the one that these digits begin, is HEAD or an ancestor of it; False outside of a
+    repository."""
+    return _git("merge-base", "--is-ancestor", commit, "HEAD") is not None
 
 
 def _git(*arguments: str) -> str | None:

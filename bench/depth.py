@@ -41,10 +41,10 @@ def run(quick: bool) -> dict[str, Any]:
     sweeps, starts, iterations = ((5, 20), 2, 3) if quick else (SWEEPS, STARTS, ITERATIONS)
     converged = 20 if quick else CONVERGED
     depths = [study(k, starts, iterations, converged) for k in sweeps]
-    pairs = [{"sweeps": [a["sweeps"], b["sweeps"]], **welch(a["distances"], b["distances"])}
+    tests = [{"sweeps": [a["sweeps"], b["sweeps"]], **welch(a["distances"], b["distances"])}
              for a, b in itertools.combinations(depths, 2)]  # fmt: skip
     setting = {"iterations": iterations, "jitter": JITTER, "seed": SEED, "converged": converged}
-    return setting | {"depths": depths, "pairs": pairs}
+    return setting | {"depths": depths, "pairs": tests}
 
 
 def study(sweeps: int, starts: int, iterations: int, converged: int) -> dict[str, Any]:
@@ -142,6 +142,6 @@ def markdown(results: dict[str, Any]) -> str:
         ours = [statistics.mean(row["starts"]), *(row[key] for key in COLUMNS)]
         rows.append([row["sweeps"], *ours, *(theirs.get(key) for key in PAPER_COLUMNS)])
     header = ["sweeps", "start, mean", *COLUMNS, *(f"paper, {key}" for key in PAPER_COLUMNS)]
-    pairs = [[*row["sweeps"], row["t"], row["df"], paper.DEPTH_T.get(tuple(row["sweeps"]))] for row in results["pairs"]]
-    tests = markdown_table(["sweeps", "sweeps", "Welch's t", "degrees of freedom", "paper, t"], pairs)
-    return f"{text}\n{markdown_table(header, rows)}\nDifferences of the means:\n\n{tests}"
+    tests = [[*row["sweeps"], row["t"], row["df"], paper.DEPTH_T.get(tuple(row["sweeps"]))] for row in results["pairs"]]
+    table = markdown_table(["sweeps", "sweeps", "Welch's t", "degrees of freedom", "paper, t"], tests)
+    return f"{text}\n{markdown_table(header, rows)}\nDifferences of the means:\n\n{table}"

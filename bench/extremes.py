@@ -279,8 +279,8 @@ def potential_rise(case: Extreme, model: dv.Model, inputs: dict[str, Any]) -> fl
 
 def _rounding_scale(model: dv.Model, x: Tensor, y: Tensor, mu: Tensor, lam: Tensor, h: float) -> float:
     """What an error of one eps in positions and sums changes in the potential: the sum of its terms' magnitudes."""
-    rest, now = (p[model.tets] for p in (model.rest_points, x))
-    dm, ds = (torch.stack([p[:, k] - p[:, 0] for k in (1, 2, 3)], -1) for p in (rest, now))
+    at_rest, now = (p[model.tets] for p in (model.rest_points, x))
+    dm, ds = (torch.stack([p[:, k] - p[:, 0] for k in (1, 2, 3)], -1) for p in (at_rest, now))
     volume = torch.linalg.det(dm) / 6
     f = ds @ torch.linalg.inv(dm)
     size, j = f.square().sum((-2, -1)), torch.linalg.det(f)

@@ -96,8 +96,8 @@ def reference_of(solver: Any) -> Callable[..., tuple[Tensor, Tensor]]:
     if isinstance(solver, XPBD):
         return functools.partial(reference_xpbd.step, **network, groups=solver.groups)
     absent = {"tet_stiffness": 0.0} if len(solver.edges) else {"stiffness": 0.0, "rest_length": 0.0}
-    rest = {"rest_points": solver.rest_points, "tets": solver.tets.nodes}
-    return functools.partial(reference_pd.step, **network, **rest, **absent)
+    body = {"rest_points": solver.rest_points, "tets": solver.tets.nodes}
+    return functools.partial(reference_pd.step, **network, **body, **absent)
 
 
 def markdown(results: dict[str, Any]) -> str:

@@ -106,14 +106,14 @@ def _mesh_rows(
             "forward", timed_forward(card, s, sweeps, count), targets[0], None, False, p))  # fmt: skip
         for tape in ("full", "compact"):
 
-            def pair(s: Scene = scene, tape: str = tape, per_tet: bool = per_tet) -> list[Row]:
+            def both(s: Scene = scene, tape: str = tape, per_tet: bool = per_tet) -> list[Row]:
                 taped, reverse = timed_reverse(card, s.requiring(*GRADIENTS), sweeps, count, tape)
                 return [
                     one(f"forward with {tape} tape", taped, None, tape, False, per_tet),
                     one(f"reverse, {tape} tape", reverse, targets[1], tape, True, per_tet),
                 ]
 
-            attempt(card, rows, {**about, "part": f"reverse, {tape} tape"}, pair)
+            attempt(card, rows, {**about, "part": f"reverse, {tape} tape"}, both)
     return rows
 
 
@@ -139,7 +139,7 @@ def bunny(card: Card, rate: float, sweeps: int = 20) -> list[Row]:
         moved, near = sweep_traffic(counts, sweeps, 8, per_tet=False, tape=tape, reverse=reverse)
         return rated({"part": part, "target_ms": target, "l2_bytes": near, **row}, seconds_of(row), moved, rate)
 
-    def pair() -> list[Row]:
+    def both() -> list[Row]:
         taped, reverse = timed_reverse(card, scene.requiring(*GRADIENTS), sweeps, count, "full")
         return [
             one("forward with full tape", taped, 3.0, "full", False),
@@ -148,7 +148,7 @@ def bunny(card: Card, rate: float, sweeps: int = 20) -> list[Row]:
 
     attempt(card, rows, {**about, "part": "forward"},
             lambda: one("forward", timed_forward(card, scene, sweeps, count), 3.0, None, False))  # fmt: skip
-    attempt(card, rows, {**about, "part": "reverse, full tape"}, pair)
+    attempt(card, rows, {**about, "part": "reverse, full tape"}, both)
     return rows
 
 

@@ -94,9 +94,9 @@ def float32(quick: bool) -> list[dict[str, Any]]:
         def worst(value: dict[str, Tensor], expected: dict[str, Tensor]) -> float:
             return max(testing.relative_error(value[k], expected[k]) for k in ARGUMENTS)
 
-        pairs = ((model, exact), (model.to(dtype=torch.float32), small))
+        versions = ((model, exact), (model.to(dtype=torch.float32), small))
         options = {"mu": 1e4, "lam": 2e4, "time_step": 1 / 60, "sweeps": 10, "save": "last"}
-        ends = [dv.rollout(m, i["x"], i["v"], steps=100, **options).x[-1] for m, i in pairs]
+        ends = [dv.rollout(m, i["x"], i["v"], steps=100, **options).x[-1] for m, i in versions]
         row = {
             "offset": float(offset),
             "edge": 1 / cells,
@@ -150,10 +150,10 @@ def conditioning(quick: bool) -> list[dict[str, Any]]:
 def relaxation(quick: bool) -> list[dict[str, Any]]:
     """How many of 24 violent rollouts grow without bound, for each relaxation."""
     mesh = dv.mesh.beam(5, 3, 3, size=(1.0, 0.5, 0.5))
-    rest = torch.from_numpy(mesh.points.copy())
-    turned, stretched = rest.clone(), rest * torch.tensor([3.0, 1.0, 1.0])
+    points = torch.from_numpy(mesh.points.copy())
+    turned, stretched = points.clone(), points * torch.tensor([3.0, 1.0, 1.0])
     turned[:, 0] *= -1.0
-    squashed = rest * torch.tensor([1.0, 0.05, 1.0])
+    squashed = points * torch.tensor([1.0, 0.05, 1.0])
     materials = ((1e3, 1e3), (1e5, 1.5e5), (1e6, 1e8), (1e8, 1e8))
     states = torch.stack([s for s in (turned, stretched, squashed) for _ in materials])
     mu, lam = (torch.tensor([m[i] for _ in range(3) for m in materials])[:, None].double() for i in (0, 1))
@@ -162,13 +162,13 @@ def relaxation(quick: bool) -> list[dict[str, Any]]:
         model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=omega)
         grown, total = 0, 0
         for h in (1 / 60, 0.2):
-            x = torch.where(model.pinned[:, None], rest, states)
+            x = torch.where(model.pinned[:, None], points, states)
             v, lost = torch.zeros_like(x), torch.zeros(len(x), dtype=torch.bool)
             for _ in range(50 if quick else 300):
                 x, v = dv.step(model, x, v, mu=mu, lam=lam, time_step=h, sweeps=5, gravity=(0.0, 0.0, 0.0))
                 # no start is longer than 3 m: at 30 m the sweeps have added energy
                 lost |= (~torch.isfinite(x).all(-1) | (x.norm(dim=-1) > 30)).any(-1)
-                x, v = torch.where(lost[:, None, None], rest, x), torch.where(lost[:, None, None], 0.0, v)
+                x, v = torch.where(lost[:, None, None], points, x), torch.where(lost[:, None, None], 0.0, v)
             grown += int(lost.sum())
             total += len(lost)
         out.append({"relaxation": omega, "grown": grown, "rollouts": total})
@@ -185,9 +185,9 @@ def paper_preset(quick: bool) -> list[dict[str, Any]]:
         mesh = dv.mesh.cube(3, size=size)
         pinned = mesh.points[:, 0] < 1e-9 * size
         models = {"paper": dv.Model.paper(mesh, pinned=pinned), "exact": dv.Model(mesh, pinned=pinned)}
-        rest = models["exact"].rest_points
-        noise = torch.from_numpy(testing.generator("paper").uniform(-1, 1, (2, *rest.shape)))
-        x = torch.where(models["exact"].pinned[:, None], rest, rest + 0.1 * size * noise[0])
+        points = models["exact"].rest_points
+        noise = torch.from_numpy(testing.generator("paper").uniform(-1, 1, (2, *points.shape)))
+        x = torch.where(models["exact"].pinned[:, None], points, points + 0.1 * size * noise[0])
         # stiffness and speed follow the size and there is no gravity: without safeguards every size behaves alike
         options = {"mu": 1e5 * size**2, "lam": 1.5e5 * size**2, "time_step": 1 / 60, "gravity": (0.0, 0.0, 0.0)}
         v = size * noise[1]

@@ -132,7 +132,7 @@ def row(scene: Scene, device: str) -> dict[str, Any]:
     for k in SWEEPS:
         truth = exact(scene, k)
         found += [(measure(scene, truth, k, tape, device), k) for tape in ("full", "compact")]
-    errors, sweeps = max(found, key=lambda pair: max(pair[0].ratios().values()))
+    errors, sweeps = max(found, key=lambda entry: max(entry[0].ratios().values()))
     name = errors.worst()
     return {
         "sweeps": sweeps,

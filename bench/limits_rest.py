@@ -15,7 +15,7 @@ SWEEPS = (0, 1, 2, 3, 5, 10)
 
 
 def run(quick: bool, device: str = "cpu", only: str | None = None) -> dict[str, Any]:
-    groups = {"rest": rest, "drift": drift, "momentum": momentum, "spin": spin}
+    groups = {"rest": at_rest, "drift": drift, "momentum": momentum, "spin": spin}
     chosen = list(groups) if only is None else [name.strip() for name in only.split(",")]
     return {name: groups[name](quick, device) for name in chosen}
 
@@ -49,7 +49,7 @@ def _watched(model: dv.Model, steps: int, sweeps: int, speed: float = 0.0) -> di
     }
 
 
-def rest(quick: bool, device: str) -> list[dict[str, Any]]:
+def at_rest(quick: bool, device: str) -> list[dict[str, Any]]:
     """A cube let go 2 mm above where its barrier begins, 1,500 steps."""
     out = []
     for rigid in (False, True):

@@ -187,7 +187,7 @@ def _range(values: Iterable[Any]) -> str | None:
     return " to ".join(dict.fromkeys((cell(min(found)), cell(max(found))))) if found else None
 
 
-def _pair(values: Iterable[Any]) -> str:
+def _slashed(values: Iterable[Any]) -> str:
     return " / ".join(cell(value) for value in values)
 
 
@@ -206,8 +206,8 @@ def _grid(rows: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
         ("K x V grid, backward over forward", _range(GRID_RATIO), _range(row.get("ratio") for row in rows)),
         *by_size,
         ("grid, peak memory [KB per vertex and sweep]", f"about 4, {_range(GRID_KB)}", _range(each)),
-        ("grid at K = 10, times more vertices / times more memory", _pair((GRID_MORE_VERTICES, GRID_MORE_MEMORY)),
-         _pair(more)),
+        ("grid at K = 10, times more vertices / times more memory", _slashed((GRID_MORE_VERTICES, GRID_MORE_MEMORY)),
+         _slashed(more)),
     ]  # fmt: skip
 
 
@@ -222,9 +222,9 @@ def _bunny(rows: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
     ratio = both[1] / both[0] if both[0] and both[1] else None
     name = rows[0]["name"] if rows else "bunny"
     return [
-        (f"{name}: forward / backward of a step [ms]", f"about {_pair(BUNNY_MS)}", _pair(both)),
+        (f"{name}: forward / backward of a step [ms]", f"about {_slashed(BUNNY_MS)}", _slashed(both)),
         ("bunny, backward over forward", BUNNY_RATIO, ratio),
-        ("Warp backend, bunny, forward / backward of a step [ms]", _pair(BUNNY_WARP_MS), NO_WARP),
+        ("Warp backend, bunny, forward / backward of a step [ms]", _slashed(BUNNY_WARP_MS), NO_WARP),
         ("Warp backend, bunny, backward over forward", BUNNY_WARP_RATIO, NO_WARP),
         ("Warp backend, times slower than the CUDA one", _range(WARP_SLOWER), NO_WARP),
     ]

@@ -25,7 +25,6 @@ def draw(name: str, results: dict[str, Any], path: Path) -> bool:
         return False
     try:
         from matplotlib.figure import Figure
-        from PIL import Image  # matplotlib needs it, too
     except ImportError:
         return False
     figure = Figure(figsize=(8, 3.2), layout="constrained")
@@ -33,9 +32,17 @@ def draw(name: str, results: dict[str, Any], path: Path) -> bool:
     path.parent.mkdir(parents=True, exist_ok=True)
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=100)
-    # lines and letters need few colors; the file stays in the repository
-    Image.open(drawn).convert("RGB").quantize(64).save(path, optimize=True)
+    keep_picture(drawn, path)
     return True
+
+
+def keep_picture(drawn: Path | io.BytesIO, to: Path) -> None:
+    """A picture for the repository: at most 1,200 pixels wide and in 64 colors, an eighth of the bytes."""
+    from PIL import Image  # matplotlib needs it, too
+
+    picture = Image.open(drawn).convert("RGB")
+    picture.thumbnail((1200, 1200))
+    picture.quantize(64).save(to, optimize=True)
 
 
 def exactness(figure: Any, results: dict[str, Any]) -> None:

@@ -7,11 +7,13 @@ import importlib
 import inspect
 import json
 import re
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from bench import paper, plots, tasks
-from bench.common import RESULTS, commit, markdown_table, place
+from bench.common import RESULTS, commit, is_ancestor, markdown_table, place
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "performance.md"
@@ -20,6 +22,15 @@ TASKS_PAGE = ROOT / "docs" / "tasks.md"
 BENCHMARKS = ("cpu", "gpu")  # whose figures docs/performance.md shows, in this order
 ORDER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's come first, the others by name
 BEGIN, END = "<!-- figures: begin, written by python -m bench report -->", "<!-- figures: end -->"
+# Files of bench/results that `report` would refuse, and why they stand all the same; run again, they come off the list.
+KNOWN = {
+    "gpu.json": "All groups but regimes were measured at 77dba6f90b beside changes that were not committed; to be run "
+    "again on an H100.",
+    "starts.json": "Measured at 97bc544986 beside changes that were not committed; to be run again.",
+    "tradeoff.json": "Measured at cf911805e3 beside changes that were not committed; to be run again.",
+    "tasks/bunny-bounce.json": "Run at 97bc544986 beside changes that were not committed; to be run again.",
+    "tasks/cube-bounce.json": "Run at 97bc544986 beside changes that were not committed; to be run again.",
+}
 EMPTY = "No figures yet: run `python -m bench cpu` or `python -m bench gpu`, then `python -m bench report`.\n"
 
 INTRODUCTION = """\
@@ -33,18 +44,65 @@ its scenes, meshes and machines are others, as the text of each table says.
 
 
 def main(out: Path | None = None) -> int:
-    """Fills the pages; with a folder, makes results.md there of the results in it and leaves docs alone."""
+    """Fills the pages, if every result says what it was measured on; with a folder, makes results.md there of the
+    results in it, whatever they were measured on, and leaves docs alone."""
     if out is not None:
         page = out / "results.md"
         page.write_text(results_page(out, out / "images"), encoding="utf-8")
         print(f"wrote {page}")
         return 0
+    if wrong := refused(RESULTS):
+        print("\n".join([*wrong, "nothing written: measure these again on a clean commit"]), file=sys.stderr)
+        return 1
     RESULTS_PAGE.write_text(results_page(RESULTS, ROOT / "docs" / "images"), encoding="utf-8")
     TASKS_PAGE.write_text(tasks.page(RESULTS / "tasks", tasks.IMAGES, ROOT / "docs"), encoding="utf-8")
     PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), section(RESULTS)), encoding="utf-8")
     for page in (RESULTS_PAGE, TASKS_PAGE, PAGE):
         print(f"wrote {page.relative_to(ROOT)}")
     return 0
+
+
+# --- provenance -------------------------------------------------------------------------------------------------------
+
+
+def refused(
+    results: Path, known: Mapping[str, str] = KNOWN, is_ancestor: Callable[[str], bool] = is_ancestor
+) -> list[str]:
+    """A line for each result that cannot be measured again: its file, its commit, and what is wrong with that. Files
+    in `known` are let through; one that needs it no longer is an error, too."""
+    lines, wrong = [], set()
+    paths = {path.relative_to(results).as_posix(): path for path in results.glob("**/*.json")}
+    for name, path in sorted(paths.items()):
+        for group, origin in origins(json.loads(path.read_text(encoding="utf-8"))).items():
+            if reason := why_refused(origin, is_ancestor):
+                wrong.add(name)
+                if name not in known:
+                    lines.append(f"{name}{group}: commit {commit(origin)}: {reason}")
+    for name in sorted(known.keys() - wrong):
+        what = "nothing is wrong with it; take it off KNOWN" if name in paths else "KNOWN names it, and it is not there"
+        lines.append(f"{name}: {what}")
+    return lines
+
+
+def origins(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What a file says of its commit: one for all, and one for each group that was measured by itself (`--only`)."""
+    groups = content.get("results")
+    groups = groups if isinstance(groups, dict) else {}
+    own = {f", {name}": group for name, group in groups.items() if isinstance(group, dict) and "commit" in group}
+    return {"": content.get("environment", {}), **own}
+
+
+def why_refused(environment: dict[str, Any], is_ancestor: Callable[[str], bool]) -> str:
+    """What is wrong with the commit of a result, or an empty string. A machine without history (`dirty` is None) is
+    believed; it was told its commit by DIFFVBD_COMMIT."""
+    known = environment.get("commit")
+    if not known:
+        return "expected the commit that was measured, got none"
+    if environment.get("dirty"):
+        return "expected a clean commit, got one with changes that were not committed"
+    if not is_ancestor(known):
+        return "expected an ancestor of HEAD in the history of this repository"
+    return ""
 
 
 # --- docs/performance.md ----------------------------------------------------------------------------------------------

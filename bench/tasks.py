@@ -17,6 +17,7 @@ from typing import Any
 
 from bench.common import RESULTS, as_json, commit, device_suffix, environment, markdown_table, place
 from bench.paper import TASKS as PAPER
+from bench.plots import keep_picture
 from diffvbd.tasks import TASKS, Settings, dress, solve
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -65,15 +66,6 @@ def main(only: str | None, device: str, seeds: str, options: str, out: Path | No
 def trimmed(log: dict[str, Any]) -> dict[str, Any]:
     """A log whose histories have the digits that a table shows; parameters that a run ended with keep theirs."""
     return log | {"history": [{k: float(f"{v:.6g}") for k, v in row.items()} for row in log["history"]]}
-
-
-def keep_picture(drawn: Path, to: Path) -> None:
-    """At most 1,200 pixels wide and in 64 colors, an eighth of the bytes: nobody measures in it."""
-    from PIL import Image
-
-    picture = Image.open(drawn).convert("RGB")
-    picture.thumbnail((1200, 1200))
-    picture.quantize(64, dither=Image.Dither.NONE).save(to, optimize=True)
 
 
 def picture_of(name: str, images: Path) -> Path:

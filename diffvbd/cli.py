@@ -196,11 +196,11 @@ def _simulate(options: argparse.Namespace) -> None:
         motion = scene.simulate(model, mu, lam, options.steps, save=options.stride, progress=progress)
     frames, steps = motion.x.cpu().numpy(), np.asarray(motion.steps)
     dv.mesh.write_series(options.out, mesh, frames, steps * scene.time_step)
-    held = int(pinned.sum())
-    print(f"wrote {options.out} ({len(steps)} frames of {mesh.num_vertices} vertices, {held} pinned)")
-    if options.pin and held < 3:
+    count = int(pinned.sum())
+    print(f"wrote {options.out} ({len(steps)} frames of {mesh.num_vertices} vertices, {count} pinned)")
+    if options.pin and count < 3:
         print(
-            f"warning: --pin holds {held} vertices; a fraction takes more, for example --pin x-:0.05", file=sys.stderr
+            f"warning: --pin holds {count} vertices; a fraction takes more, for example --pin x-:0.05", file=sys.stderr
         )
     if len(steps) > 1 and options.stride == 1:
         previous = None if model.touches else (motion.x[-2], motion.v[-2])  # it knows no friction

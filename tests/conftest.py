@@ -37,7 +37,6 @@ DEVICES = ["cpu"] if why_no_cuda() else ["cpu", pytest.param("cuda", marks=pytes
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "cuda: runs on a CUDA device; `-m 'cuda and not slow'` runs only these")
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     torch.set_num_threads(max(1, min(4, (os.cpu_count() or 1) // workers)))
 

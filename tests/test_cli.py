@@ -16,6 +16,7 @@ from diffvbd.cli import main
 from diffvbd.tasks import archive
 from diffvbd.tasks.folder import alone_in
 from diffvbd.tasks.scene import Observation
+from diffvbd.testing import tolerance
 
 SCENE = ["--steps", "12", "--time-step", "0.01", "--sweeps", "8", "--pin", "x-"]
 
@@ -65,7 +66,7 @@ def test_simulate_writes_a_series_with_times(mesh_file: Path, tmp_path: Path) ->
     rest = dv.mesh.load(mesh_file)
     pinned = rest.points[:, 0] < rest.points[:, 0].min() + 1e-9
     assert np.array_equal(last.points[pinned], rest.points[pinned])
-    assert last.points[:, 1].min() < rest.points[:, 1].min() - 1e-3
+    assert rest.points[:, 1].min() - last.points[:, 1].min() > 1e-3
 
 
 def test_young_and_poisson_mean_their_lame_parameters(mesh_file: Path, tmp_path: Path) -> None:
@@ -76,7 +77,7 @@ def test_young_and_poisson_mean_their_lame_parameters(mesh_file: Path, tmp_path:
         assert run("simulate", mesh_file, *arguments) == 0
     a, b = (dict(np.load(file)) for file in files)
     assert (a["mu"], a["lam"]) == (pytest.approx(5e4), pytest.approx(7.5e4))
-    np.testing.assert_allclose(a["x"], b["x"], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(a["x"], b["x"], rtol=0, atol=tolerance("cancelling"))
 
 
 def test_floor_holds(mesh_file: Path, tmp_path: Path) -> None:
@@ -111,7 +112,7 @@ def test_identify_from_one_final_shape(mesh_file: Path, tmp_path: Path) -> None:
     assert run("identify", mesh_file, tmp_path / "shape.npz", *SCENE, *options) == 0
     log = (tmp_path / "run" / "log.json").read_text()
     mu = float(log.split('"estimates": {')[1].split('"mu": ')[1].split(",")[0])
-    assert mu == pytest.approx(4e4, rel=1e-4)
+    assert mu == pytest.approx(4e4, rel=tolerance("identified"))
 
 
 @pytest.mark.parametrize(

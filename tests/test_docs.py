@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.paths import ROOT
 
 import diffvbd as dv
+from diffvbd.testing import tolerance
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 # How a docstring states the shape of an array: "shape [...]", a bracket of sizes, or by reference to another function.
@@ -39,7 +40,7 @@ def test_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         if info == "python":
             exec(compile(text, str(page), "exec"), names)
     if page.name == "README.md":
-        assert names["log_mu"].exp().item() == pytest.approx(1.5e5, rel=1e-3)
+        assert names["log_mu"].exp().item() == pytest.approx(1.5e5, rel=tolerance("identified_by_example"))
 
 
 @pages

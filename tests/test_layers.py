@@ -4,18 +4,13 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
 import torch
+from helpers.paths import CSRC, PACKAGE, ROOT, TESTS, needs_csrc
 
 import diffvbd as dv
 from diffvbd import energies, ops, reference, safeguards
 from diffvbd.ops import regimes
 from diffvbd.step import memory
-
-ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / "diffvbd"
-CSRC = ROOT / "csrc"
-needs_csrc = pytest.mark.skipif(not CSRC.exists(), reason="the C++ sources are not here")
 
 
 def module_of(path: Path) -> str:
@@ -257,7 +252,7 @@ def test_tensors_end_where_the_operators_are_registered() -> None:
 
 
 def test_files_are_short() -> None:
-    folders = [f for f in (PACKAGE, CSRC, ROOT / "tests", ROOT / "bench") if f.exists()]
+    folders = [f for f in (PACKAGE, CSRC, TESTS, ROOT / "bench") if f.exists()]
     paths = [p for f in folders for p in f.rglob("*") if p.suffix in (".py", *CPP)]
     assert len(paths) > 40
     lengths = {str(p.relative_to(ROOT)): len(p.read_text(encoding="utf-8").splitlines()) for p in paths}
@@ -279,7 +274,7 @@ def constant(path: str, name: str) -> int:
 @needs_csrc
 def test_constants_agree_across_languages() -> None:
     assert ops.LANES == {"cpu": constant("core/views.h", "kLanes"), "cuda": constant("core/views.h", "kSlice")}
-    assert ops.REST_SCALARS == constant("core/views.h", "kRestScalars")
+    assert ops.REST_SCALARS == constant("energies/tet.h", "rest")
     assert ops.PLAN_HEADER == constant("core/plan_views.h", "kPlanHeader")
     assert memory.WORKSPACE_BUDGET == constant("bind/cuda/sweep.h", "kWorkspaceBudget")
     floor, anchor = (CSRC / "energies" / f"{name}.h" for name in ("floor_barrier", "anchor"))

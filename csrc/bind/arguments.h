@@ -46,9 +46,12 @@ Batched<const T> batched(const Tensor& t, const Tensor& like, int64_t scenes, in
   return {data<const T>(t), t.size(0) == 1 ? 0 : per_scene, per_scene == items ? 1 : 0};
 }
 
+// Of SweepSettings: those of StepParameters, and the motion below which friction is smoothed [m].
+constexpr int kNumbers = 8, kFrictionEps = 7;
+
 template <class T>
 StepParameters<T> step_parameters(const std::vector<double>& numbers) {
-  require(numbers.size() == 7, "diffvbd: expected 7 numbers");
+  require(numbers.size() == kNumbers, "diffvbd: expected 8 numbers");
   const auto at = [&](int i) { return static_cast<T>(numbers[i]); };
   return {at(0), at(1), at(2), at(3), at(4), at(5), at(6), numbers[3] >= 0};
 }

@@ -10,14 +10,7 @@
 
 namespace diffvbd {
 
-// In the order of csrc/bind/schema.cpp.
-struct BeginTensors {
-  const Tensor &x, &v, &acceleration, &held, &mass, &data, &origin, &pinned, &order, &ptr, &spread, &other;
-};
-struct OtherBodies {
-  const Tensor &mu, &lam, &rest, &order, &ptr, &tets, &tet_ptr;
-  int32_t number() const { return static_cast<int32_t>(ptr.numel() - 1); }
-};
+inline int32_t other_bodies(const BeginFields& f) { return static_cast<int32_t>(f.other_ptr.numel() - 1); }
 struct BeginSettings {
   const std::vector<int64_t>& data_count;
   double time_step, filter_eta;
@@ -27,16 +20,17 @@ struct BeginSettings {
 
 // x_start and y: [B, V, 3] that the bodies read and the kernels write.
 template <class T>
-start::Inputs<T> begin_inputs(const BeginTensors& t, const BeginSettings& q, const Tensor& x_start, const Tensor& y,
-                              const Tensor& falls, int32_t others) {
+start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, const Tensor& x_start, const Tensor& y,
+                              const Tensor& falls) {
+  const int32_t others = other_bodies(t);
   start::Inputs<T> in{};
-  in.bodies = rigid_inputs<T>({x_start, t.x, y, t.mass, t.data, t.origin, t.order, t.ptr, t.spread, t.other},
+  in.bodies = rigid_inputs<T>({x_start, t.x, y, t.mass, t.energy_data, t.origin, t.order, t.ptr, t.spread, t.other},
                               q.data_count, q.time_step);
   const int64_t b = in.bodies.scenes, v = in.bodies.vertices;
   in.x = in.bodies.x_prev;
   in.v = batched<T>(t.v, t.x, b, 3 * v);
   in.acceleration = batched<T>(t.acceleration, t.x, b, 3 * v, 3);
-  in.held = batched<T>(t.held, t.x, b, 3 * v);
+  in.prescribed = batched<T>(t.prescribed, t.x, b, 3 * v);
   require(t.pinned.scalar_type() == ScalarType::Bool && t.pinned.numel() == v && t.pinned.is_contiguous(),
           "diffvbd::begin: expected pinned bool [V]");
   require(q.from >= start::kInertia && q.from <= start::kLower, "diffvbd::begin: expected start 0, 1 or 2");
@@ -55,33 +49,34 @@ start::Inputs<T> begin_inputs(const BeginTensors& t, const BeginSettings& q, con
 
 // x_start: the states from x + h v; from_y: those from y
 template <class T>
-start::Candidates<T> candidates(const BeginTensors& t, const OtherBodies& o, const BeginSettings& q,
-                                const Tensor& x_start, const Tensor& from_y, const Tensor& y) {
+start::Candidates<T> candidates(const BeginFields& t, const BeginSettings& q, const Tensor& x_start,
+                                const Tensor& from_y, const Tensor& y) {
   start::Candidates<T> in{};
-  in.bodies = rigid_inputs<T>({x_start, t.x, y, t.mass, t.data, t.origin, o.order, o.ptr, t.spread, t.other},
-                              q.data_count, q.time_step, false);
-  const int64_t b = in.bodies.scenes, tets = o.rest.dim() == 3 ? o.rest.size(1) : 0;
-  require(o.tets.scalar_type() == ScalarType::Int && o.tets.dim() == 2 && o.tets.size(1) == 5 &&
-              o.tets.is_contiguous() && o.tet_ptr.scalar_type() == ScalarType::Int && o.tet_ptr.is_contiguous() &&
-              o.tet_ptr.numel() == o.ptr.numel(),
+  const RigidFields bodies{x_start,  t.x,           y,           t.mass,   t.energy_data,
+                           t.origin, t.other_order, t.other_ptr, t.spread, t.other};
+  in.bodies = rigid_inputs<T>(bodies, q.data_count, q.time_step, false);
+  const int64_t b = in.bodies.scenes, tets = t.rest.dim() == 3 ? t.rest.size(1) : 0;
+  require(t.other_tets.scalar_type() == ScalarType::Int && t.other_tets.dim() == 2 && t.other_tets.size(1) == 5 &&
+              t.other_tets.is_contiguous() && t.other_tet_ptr.scalar_type() == ScalarType::Int &&
+              t.other_tet_ptr.is_contiguous() && t.other_tet_ptr.numel() == t.other_ptr.numel(),
           "diffvbd::begin: expected the tets of the other bodies int32 [listed, 5]");
   in.other = data<const T>(from_y);
-  in.tets = data<const int32_t>(o.tets);
-  in.tet_ptr = data<const int32_t>(o.tet_ptr);
+  in.tets = data<const int32_t>(t.other_tets);
+  in.tet_ptr = data<const int32_t>(t.other_tet_ptr);
   if (tets > 0) {
-    in.mu = batched<T>(o.mu, t.x, b, tets);
-    in.lam = batched<T>(o.lam, t.x, b, tets);
-    in.rest = batched<T>(o.rest, t.x, b, kRestScalars * tets);
+    const Tensor* const material[] = {&t.mu, &t.lam};
+    for (int m = 0; m < kMaterialScalars; ++m) in.material[m] = batched<T>(*material[m], t.x, b, tets);
+    in.rest = batched<T>(t.rest, t.x, b, kRestScalars * tets);
   }
   return in;
 }
 
-// The adjoints of begin; make(shape, zeroed) allocates. wants: acceleration, held, data.
+// The adjoints of begin; make(shape, zeroed) allocates. wants: acceleration, prescribed, data.
 struct BeginBars {
-  Tensor x, v, acceleration, held, mass, shared, own, planes, x_prev;
+  Tensor x, v, acceleration, prescribed, mass, shared, own, planes, x_prev;
 
   template <class T, class Make>
-  BeginBars(const BeginTensors& t, const start::Inputs<T>& in, const std::vector<bool>& wants, const Make& make) {
+  BeginBars(const BeginFields& t, const start::Inputs<T>& in, const std::vector<bool>& wants, const Make& make) {
     require(wants.size() == 3, "diffvbd::begin_backward: expected 3 wishes");
     const int64_t b = in.bodies.scenes, v_ = in.bodies.vertices;
     int64_t of_scene = 0, of_vertex = 0;
@@ -92,7 +87,7 @@ struct BeginBars {
       return make(wish ? shape : std::vector<int64_t>{0}, false);
     };
     x = make({b, v_, 3}, false), v = make({b, v_, 3}, false);
-    acceleration = wanted(wants[0], {b, v_, 3}), held = wanted(wants[1], {b, v_, 3});
+    acceleration = wanted(wants[0], {b, v_, 3}), prescribed = wanted(wants[1], {b, v_, 3});
     mass = make({b, v_}, t.order.numel() < v_);
     shared = make({b, wants[2] ? in.bodies.bodies : 0, of_scene}, true);
     own = make({b, wants[2] ? v_ : 0, of_vertex}, true);
@@ -109,13 +104,13 @@ struct BeginBars {
     start::Adjoints<T> a{};
     a.x_start = data<const T>(x_start_bar), a.y = data<const T>(y_bar);
     a.x = data<T>(x), a.v = data<T>(v), a.mass = data<T>(mass);
-    a.acceleration = or_null(acceleration), a.held = or_null(held), a.planes = or_null(planes);
+    a.acceleration = or_null(acceleration), a.prescribed = or_null(prescribed), a.planes = or_null(planes);
     a.shared = or_null(shared), a.own = or_null(own), a.x_prev = or_null(x_prev);
     a.shared_count = static_cast<int32_t>(shared.size(2)), a.own_count = static_cast<int32_t>(own.size(2));
     return a;
   }
   std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> tensors() const {
-    return {x, v, acceleration, held, mass, shared, own, planes};
+    return {x, v, acceleration, prescribed, mass, shared, own, planes};
   }
 };
 

@@ -4,15 +4,9 @@
 #include "../contact/lowest.h"
 #include "../contact/passes.h"
 #include "arguments.h"
+#include "fields.h"
 
 namespace diffvbd {
-
-// In the order of csrc/bind/schema.cpp. Empty: collider where there is none, lag and the lists after it where nothing
-// is lagged, floor_lag without friction on a floor.
-struct ContactTensors {
-  const Tensor &bounds, &collider, &collider_prev, &kappa, &pairs, &constants, &ptr, &entry;
-  const Tensor &lag, &lag_pairs, &lag_ptr, &lag_entry, &floor_lag;
-};
 
 inline contact::PairList pair_list(const Tensor& pairs, const Tensor& ptr, const Tensor& entry, int64_t scenes,
                                    int64_t corners) {
@@ -23,8 +17,10 @@ inline contact::PairList pair_list(const Tensor& pairs, const Tensor& ptr, const
   return {data<const int32_t>(pairs), data<const int32_t>(ptr), data<const int32_t>(entry)};
 }
 
+// x: where the sweeps start or end. Empty: collider where there is none, lag and the lists after it where nothing is
+// lagged, floor_lag without friction on a floor.
 template <class T>
-contact::ContactInputs<T> contact_inputs(const ContactTensors& t, const Tensor& x, const Batched<const T>& x_prev,
+contact::ContactInputs<T> contact_inputs(const SweepFields& t, const Tensor& x, const Batched<const T>& x_prev,
                                          const Batched<const T>& origin, double friction_eps) {
   const int64_t b = x.size(0), v = x.size(1), colliders = t.collider.dim() == 3 ? t.collider.size(1) : 0;
   contact::ContactInputs<T> in{};

@@ -6,17 +6,13 @@
 
 #include "../rigid/reverse.h"
 #include "arguments.h"
+#include "fields.h"
 
 namespace diffvbd {
 
-// In the order of csrc/bind/schema.cpp; data and origin may be empty. Of bodies that are not corrected spread is not
-// looked at.
-struct RigidTensors {
-  const Tensor &x, &x_prev, &y, &mass, &data, &origin, &order, &ptr, &spread, &other;
-};
-
+// energy_data and origin may be empty. Of bodies that are not corrected spread is not looked at.
 template <class T>
-rigid::Inputs<T> rigid_inputs(const RigidTensors& t, const std::vector<int64_t>& data_count, double time_step,
+rigid::Inputs<T> rigid_inputs(const RigidFields& t, const std::vector<int64_t>& data_count, double time_step,
                               bool corrected = true) {
   require(t.x.dim() == 3 && t.x.size(2) == 3 && t.x.is_contiguous(),
           "diffvbd::rigid: expected x of shape [scenes, vertices, 3]");
@@ -35,7 +31,7 @@ rigid::Inputs<T> rigid_inputs(const RigidTensors& t, const std::vector<int64_t>&
   in.y = batched<T>(t.y, t.x, b, 3 * v);
   in.mass = batched<T>(t.mass, t.x, b, v);
   in.origin = batched<T>(t.origin, t.x, b, 3 * v);
-  in.data = batched<T>(t.data, t.x, b, energy_data_size(data_count, v));
+  in.data = batched<T>(t.energy_data, t.x, b, energy_data_size(data_count, v));
   in.order = data<const int32_t>(t.order);
   in.ptr = data<const int32_t>(t.ptr);
   in.spread = corrected ? data<const double>(t.spread) : nullptr;

@@ -1,53 +1,32 @@
 // Schemas of all operators, CPU and CUDA. The shapes are those of views.h and cpu/run.h; a leading size of 1 means that
-// the scenes share a tensor, a last size of 1 in mu and lam that all tets do.
+// the scenes share a tensor, a last size of 1 in a material that all tets do.
 #include <torch/csrc/stable/library.h>
 
 STABLE_TORCH_LIBRARY(diffvbd, m) {
+  // fields: see bind/fields.h. cut [scenes, vertices]: 1 where a bound has held back an update; empty without contact.
   // numbers: time_step, regularization, relaxation, saturation (< 0: none), saturation_eps, filter_eta,
-  // relaxation of the last sweep
+  // relaxation of the last sweep, motion within a step below which friction is smoothed
   // sizes: active vertices, tets, slots of the plan; on CUDA also the rest of its header and color_block (plan_sizes in
   // diffvbd/ops/fields.py)
   // data_count: scalars per scene, or per vertex, of each energy of one vertex
   // launch: on CUDA the regime and the threads per vertex of the sweeps and of their reverse, else empty
   m.def(
-      "sweep(Tensor x_start, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, "
-      "Tensor energy_data, Tensor origin, Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, "
-      "int sweeps, int[] launch, int tape_policy, int debug_step, bool checked) -> (Tensor x, Tensor tape)");
-  // wants: material, mass, rest, energy_data
+      "sweep(Tensor[] fields, Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, int sweeps, "
+      "int[] launch, int tape_policy, int debug_step, bool checked) -> (Tensor x, Tensor tape, Tensor cut)");
+  // x: the end of the sweeps; wants: material, mass, rest, energy_data; the adjoints are those of SweepBars
   m.def(
-      "sweep_backward(Tensor x_bar, Tensor x, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor "
-      "rest, Tensor energy_data, Tensor origin, Tensor tape, Tensor plan, int[] sizes, int energies, int[] data_count, "
-      "float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> (Tensor x_start, Tensor x_prev, "
-      "Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, Tensor energy_data)");
-  // CUDA only: predictor and velocity in the same launches, for scenes whose only energy is that of the tets. `held` is
-  // where pinned vertices go, or empty.
+      "sweep_backward(Tensor x_bar, Tensor x, Tensor[] fields, Tensor tape, Tensor plan, int[] sizes, int energies, "
+      "int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> Tensor[]");
+  // CUDA only: predictor and velocity in the same launches, for scenes whose only energy is that of the tets.
+  // prescribed: where pinned vertices go, or empty.
   m.def(
-      "fused_step(Tensor x, Tensor v, Tensor acceleration, Tensor held, Tensor mu, Tensor lam, Tensor mass, Tensor "
-      "rest, Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, int sweeps, int[] launch, int "
-      "tape_policy) -> (Tensor x, Tensor v, Tensor tape)");
-  // x_bar, v_bar: empty where there is none; wants: x, v, acceleration, held, material, mass, rest
+      "fused_step(Tensor[] fields, Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, int "
+      "sweeps, int[] launch, int tape_policy) -> (Tensor x, Tensor v, Tensor tape)");
+  // x_bar, v_bar: empty where there is none; wants: x, v, acceleration, prescribed, material, mass, rest
   m.def(
-      "fused_step_backward(Tensor x_bar, Tensor v_bar, Tensor x_end, Tensor x, Tensor v, Tensor acceleration, Tensor "
-      "held, Tensor mu, Tensor lam, Tensor mass, Tensor rest, Tensor tape, Tensor plan, int[] sizes, int energies, "
-      "int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> (Tensor x, "
-      "Tensor v, Tensor acceleration, Tensor held, Tensor mu, Tensor lam, Tensor mass, Tensor rest)");
-  // The same with contact, of pairs made by contact_detect: see bind/contact.h and contact/passes.h for the
-  // shapes. cut [scenes, vertices]: 1 where a bound has held back an update.
-  m.def(
-      "contact_sweep(Tensor x_start, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, "
-      "Tensor energy_data, Tensor origin, Tensor bounds, Tensor collider, Tensor collider_prev, Tensor kappa, Tensor "
-      "pairs, Tensor constants, Tensor ptr, Tensor entry, Tensor lag, Tensor lag_pairs, Tensor lag_ptr, Tensor "
-      "lag_entry, Tensor floor_lag, float friction_eps, Tensor plan, int[] sizes, int energies, int[] data_count, "
-      "float[] numbers, int sweeps, int[] launch, int tape_policy, int debug_step, bool checked) -> (Tensor x, Tensor "
-      "tape, Tensor cut)");
-  m.def(
-      "contact_sweep_backward(Tensor x_bar, Tensor x, Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, "
-      "Tensor rest, Tensor energy_data, Tensor origin, Tensor bounds, Tensor collider, Tensor collider_prev, Tensor "
-      "kappa, Tensor pairs, Tensor constants, Tensor ptr, Tensor entry, Tensor lag, Tensor lag_pairs, Tensor lag_ptr, "
-      "Tensor lag_entry, Tensor floor_lag, float friction_eps, Tensor tape, Tensor plan, int[] sizes, int energies, "
-      "int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> (Tensor x_start, "
-      "Tensor x_prev, Tensor y, Tensor mu, Tensor lam, Tensor mass, Tensor rest, Tensor energy_data, Tensor bounds, "
-      "Tensor collider, Tensor collider_prev, Tensor kappa, Tensor lag, Tensor floor_lag)");
+      "fused_step_backward(Tensor x_bar, Tensor v_bar, Tensor x_end, Tensor[] fields, Tensor tape, Tensor plan, int[] "
+      "sizes, int energies, int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] "
+      "wants) -> Tensor[]");
   // The lowest vertex above each plane of a floor, of the island that a body is in; planes as in the data of
   // FloorBarrier
   m.def(
@@ -81,39 +60,25 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   m.def(
       "contact_lag_backward(Tensor bar, Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor "
       "constants, Tensor ptr, Tensor entry) -> (Tensor x, Tensor collider, Tensor kappa)");
-  // The rigid correction of each body that is listed, see rigid/body.h, and the velocity (x - x_prev) / h; order, ptr:
-  // their vertices; spread: squared radius of gyration [m^2]; other [vertices]: -2 for what is listed; groups: how many
-  // bodies a thread, a part of a warp, a block and the whole device work on (CUDA)
-  m.def(
-      "rigid(Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor energy_data, Tensor origin, Tensor order, Tensor "
-      "ptr, Tensor spread, Tensor other, int[] groups, int[] data_count, float time_step) -> (Tensor x, Tensor v)");
+  // The rigid correction of each body that is listed, and the velocity (x - x_prev) / h. groups: how many bodies a
+  // thread, a part of a warp, a block and the whole device work on (CUDA)
+  m.def("rigid(Tensor[] fields, int[] groups, int[] data_count, float time_step) -> (Tensor x, Tensor v)");
   // v_bar: empty where there is none. Adjoints of x, x_prev (empty without energies and v_bar), y, mass, and of data:
   // [scenes, bodies, scalars of a scene] and [scenes, vertices, scalars of a vertex]
   m.def(
-      "rigid_backward(Tensor x_bar, Tensor v_bar, Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor energy_data, "
-      "Tensor origin, "
-      "Tensor order, Tensor ptr, Tensor spread, Tensor other, int[] groups, int[] data_count, float time_step, bool "
-      "wants_data) -> "
-      "(Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own)");
-  // Predictor and start of the sweeps, see start/begin.h. x, v, held: held is where pinned vertices go, or empty;
-  // order ... groups: the bodies that are corrected, as of rigid(); other [vertices]: which of the other bodies a
-  // vertex is in, -1: none, -2: it is corrected; other_tets [listed, 5]: a tet and its corners; start: of the other
-  // bodies, 0 x + h v, 1 y, 2 the lower potential of the two, for which mu, lam and rest [1 | scenes, tets, 7] are
-  // (rest is empty where tets have no energy); falls [scenes, other bodies]: 1 where that is y
+      "rigid_backward(Tensor x_bar, Tensor v_bar, Tensor[] fields, int[] groups, int[] data_count, float time_step, "
+      "bool wants_data) -> (Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own)");
+  // Predictor and start of the sweeps. start: of the bodies that are not corrected, 0 x + h v, 1 y, 2 the lower
+  // potential of the two; falls [scenes, other bodies]: 1 where that is y
   m.def(
-      "begin(Tensor x, Tensor v, Tensor acceleration, Tensor held, Tensor mass, Tensor energy_data, Tensor origin, "
-      "Tensor mu, Tensor lam, Tensor rest, Tensor pinned, Tensor order, Tensor ptr, Tensor spread, int[] groups, "
-      "Tensor other, Tensor other_order, Tensor other_ptr, Tensor other_tets, Tensor other_tet_ptr, int[] "
-      "other_groups, int[] data_count, float time_step, float filter_eta, int start, bool filters) -> (Tensor x_start, "
-      "Tensor y, Tensor falls)");
-  // wants: acceleration, held, energy_data. Of data: from corrections as of rigid_backward(), and of the planes by
-  // vertex [scenes, vertices, scalars of the planes]
+      "begin(Tensor[] fields, int[] groups, int[] other_groups, int[] data_count, float time_step, float filter_eta, "
+      "int start, bool filters) -> (Tensor x_start, Tensor y, Tensor falls)");
+  // wants: acceleration, prescribed, energy_data. Of data: from corrections as of rigid_backward(), and of the planes
+  // by vertex [scenes, vertices, scalars of the planes]
   m.def(
-      "begin_backward(Tensor x_start_bar, Tensor y_bar, Tensor falls, Tensor x, Tensor v, Tensor acceleration, Tensor "
-      "held, Tensor mass, Tensor energy_data, Tensor origin, Tensor pinned, Tensor order, Tensor ptr, Tensor spread, "
-      "int[] groups, Tensor other, int others, int[] data_count, float time_step, float filter_eta, int start, bool "
-      "filters, bool[] wants) -> (Tensor x, Tensor v, Tensor acceleration, Tensor held, Tensor mass, Tensor shared, "
-      "Tensor own, Tensor planes)");
+      "begin_backward(Tensor x_start_bar, Tensor y_bar, Tensor falls, Tensor[] fields, int[] groups, int[] data_count, "
+      "float time_step, float filter_eta, int start, bool filters, bool[] wants) -> (Tensor x, Tensor v, Tensor "
+      "acceleration, Tensor prescribed, Tensor mass, Tensor shared, Tensor own, Tensor planes)");
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");
   m.def(
       "build_plan(Tensor points, Tensor tets, Tensor active, int lanes) -> (Tensor plan, Tensor color_ptr, Tensor "

@@ -11,7 +11,7 @@ namespace diffvbd {
 template <class R>
 struct Dual {
   R value, derivative;
-  DIFFVBD_FN Dual() : value(R(0)), derivative(R(0)) {}
+  Dual() = default;
   DIFFVBD_FN Dual(const R& v, const R& d) : value(v), derivative(d) {}
   DIFFVBD_FN explicit Dual(const R& v) : value(v), derivative(R(0)) {}
   template <class S, std::enable_if_t<std::is_arithmetic_v<S>, int> = 0>

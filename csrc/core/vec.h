@@ -3,13 +3,19 @@
 
 #include <cmath>
 #include <limits>
+#include <type_traits>
 
 #if defined(__CUDACC__)
 #define DIFFVBD_FN __host__ __device__ __forceinline__
+#define DIFFVBD_APART __host__ __device__ __noinline__
+#define DIFFVBD_LOOP DIFFVBD_FN
 #define DIFFVBD_COLD __host__ __device__ __noinline__
 #else
 #define DIFFVBD_FN inline __attribute__((always_inline))
-#define DIFFVBD_COLD __attribute__((noinline, cold))
+#define DIFFVBD_APART __attribute__((noinline))       // out of line
+#define DIFFVBD_COLD __attribute__((noinline, cold))  // and seldom called
+// A hot loop out of line: shared by the variants, and its registers do not depend on what they have around it.
+#define DIFFVBD_LOOP __attribute__((noinline, flatten))
 #endif
 
 namespace diffvbd {
@@ -26,6 +32,16 @@ DIFFVBD_FN float natural_log(float a) { return std::log(a); }
 template <class R>
 DIFFVBD_FN R absolute(const R& a) {
   return select(a < R(0), -a, a);
+}
+
+// f(0) ... f(n - 1) with indices that are constants (decltype(i)::value): an array that is read in no other way is
+// taken apart into registers before any loop is unrolled.
+template <int n, int i = 0, class F>
+DIFFVBD_FN void each_below(F&& f) {
+  if constexpr (i < n) {
+    f(std::integral_constant<int, i>{});
+    each_below<n, i + 1>(f);
+  }
 }
 
 template <class R>

@@ -22,6 +22,19 @@ struct Batched {
   T* data = nullptr;
   int64_t scene = 0, item = 1;
 };
+// Whether each of several tensors holds one value for all items of a scene; and one group of them for all scenes.
+template <class T, int n>
+DIFFVBD_FN bool one_for_items(const Batched<T> (&tensors)[n]) {
+  bool one = true;
+  for (int i = 0; i < n; ++i) one = one && tensors[i].item == 0;
+  return one;
+}
+template <class T, int n>
+DIFFVBD_FN bool one_for_scenes(const Batched<T> (&tensors)[n]) {
+  bool one = true;
+  for (int i = 0; i < n; ++i) one = one && tensors[i].scene == 0;
+  return one;
+}
 
 enum TapePolicy { kNoTape = 0, kCompactTape = 1, kFullTape = 2 };
 
@@ -38,8 +51,7 @@ DIFFVBD_FN constexpr int other_corner(int i, int a) {
   return others[i][a];
 }
 
-// The rest scalars of a tet: k01 k02 k03 k12 k13 k23 c6; where the stiffness weight k_ab stands among them.
-constexpr int kRestScalars = 7;
+// Where the weight of an edge stands among the six of a tet: k01 k02 k03 k12 k13 k23.
 DIFFVBD_FN constexpr int weight_index(int a, int b) {
   constexpr int first[4] = {0, 3, 5, 0};
   return a < b ? first[a] + b - a - 1 : first[b] + a - b - 1;

@@ -13,7 +13,18 @@
 #endif
 #endif
 
+// A file that is compiled for a newer instruction set (sweep_*_v3.cpp) says so before it includes this: what is named
+// after its packs is then no other file's, and none of its code runs where it must not.
+#ifndef DIFFVBD_SET
+#define DIFFVBD_SET baseline
+#endif
+// Sets beside the baseline: one compiler knows both the pragma that compiles for them and the test of a processor.
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && !defined(DIFFVBD_NO_CLONES)
+#define DIFFVBD_HAS_SETS
+#endif
+
 namespace diffvbd {
+inline namespace DIFFVBD_SET {
 
 template <class T>
 struct Lanes {
@@ -163,4 +174,5 @@ DIFFVBD_FN void to_rows(const Vec3<Lanes<T>>& v, Row<T>* r) {
 #endif
 }
 
+}  // namespace DIFFVBD_SET
 }  // namespace diffvbd

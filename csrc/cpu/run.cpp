@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "contact.h"
+#include "kernels.h"
 #include "message.h"
 #include "team.h"
 
@@ -91,12 +92,14 @@ struct Scene {
     view.origin = origin.get();
     view.mass = mass.get();
     if (in.energies & (kExactBlock | kPaperBlock)) {
-      material = Buffer<T>(size_t(plan.slots) * 2 * kLanes);
-      const T *mu = in.mu.data + scene * in.mu.scene, *lam = in.lam.data + scene * in.lam.scene;
-      for (int64_t i = 0; i < int64_t{plan.slots} * kLanes; ++i) {
-        const int64_t tet = plan.pair[i] >> 2, at = i / kLanes * 2 * kLanes + i % kLanes;
-        material.get()[at] = mu[tet * in.mu.item];
-        material.get()[at + kLanes] = lam[tet * in.lam.item];
+      material = Buffer<T>(size_t(plan.slots) * kMaterialScalars * kLanes);
+      for (int m = 0; m < kMaterialScalars; ++m) {
+        const Batched<const T>& given = in.material[m];
+        const T* of_tet = given.data + scene * given.scene;
+        for (int64_t i = 0; i < int64_t{plan.slots} * kLanes; ++i) {
+          const int64_t tet = plan.pair[i] >> 2, slot = i / kLanes;
+          material.get()[(slot * kMaterialScalars + m) * kLanes + i % kLanes] = of_tet[tet * given.item];
+        }
       }
       view.material = material.get();
     }
@@ -213,7 +216,7 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
 template <class T>
 void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T* x_bar, const T* tape,
                  const StepAdjoints<T>& out) {
-  const int wanted = (out.mu ? kMaterial : 0) | (out.rest ? kMaterial | kRest : 0);
+  const bool wants_material = out.material[0] != nullptr;
   const auto kernel = reverse_kernel<T>(in.energies);
   const int64_t tape_size =
       int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
@@ -226,17 +229,16 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     s.tape = const_cast<T*>(tape) + b * tape_size;
     const Buffer<T> x_rows(4 * lanes), y_bar(3 * lanes, true), mass_bar(lanes, true),
         rows(4 * (int64_t{plan.edge_slots} * kLanes + 1), true);
-    const Buffer<T> x_prev_bar(s.x_prev ? 3 * lanes : 0, true), mu_bar(wanted & kMaterial ? pairs : 0, true),
-        lam_bar(wanted & kMaterial ? pairs : 0, true), rest_bar(wanted & kRest ? 4 * pairs : 0, true),
-        data_bar(out.data ? kMaxEnergyData * lanes : 0, true);
+    const Buffer<T> x_prev_bar(s.x_prev ? 3 * lanes : 0, true),
+        material_bar(wants_material ? kMaterialScalars * pairs : 0, true),
+        rest_bar(out.rest ? kPairRest * pairs : 0, true), data_bar(out.data ? kMaxEnergyData * lanes : 0, true);
     pack_rows(plan, x_bar + b * 3 * n, x_rows.get(), false);
     s.x_bar = x_rows.get();
     s.y_bar = y_bar.get();
     s.x_prev_bar = x_prev_bar.get();
     s.mass_bar = mass_bar.get();
     s.rows = rows.get();
-    s.mu_bar = mu_bar.get();
-    s.lam_bar = lam_bar.get();
+    s.material_bar = material_bar.get();
     s.rest_bar = rest_bar.get();
     s.data_bar = data_bar.get();
     const Buffer<T> turn(in.contact ? 6 * lanes : 0), bound_bar(in.contact ? 4 * lanes : 0, true);
@@ -292,20 +294,19 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
       }
     }
     // Each tet's four pairs are added in the order of the slots, whatever the number of threads.
-    for (int64_t block = 0; wanted && block < plan.blocks; ++block) {
+    for (int64_t block = 0; (wants_material || out.rest) && block < plan.blocks; ++block) {
       for (int64_t slot = plan.block_slot[block]; slot < plan.block_slot[block + 1]; ++slot) {
         for (int l = 0; l < kLanes; ++l) {
           if (is_padding(plan, slot, block, l)) continue;
-          const int64_t pair = slot * kLanes + l;
-          const int64_t tet = plan.pair[pair] >> 2;
-          const int local = plan.pair[pair] & 3;
-          if (out.mu) out.mu[b * tets + tet] += s.mu_bar[pair];
-          if (out.lam) out.lam[b * tets + tet] += s.lam_bar[pair];
-          if (!out.rest) continue;
-          T* row = out.rest + (b * tets + tet) * kRestScalars;
-          const T* bar = s.rest_bar + slot * 4 * kLanes + l;
-          for (int a = 0; a < 3; ++a) row[weight_index(local, other_corner(local, a))] += bar[a * kLanes];
-          row[6] += bar[3 * kLanes];
+          const int64_t tet = plan.pair[slot * kLanes + l] >> 2;
+          const int local = plan.pair[slot * kLanes + l] & 3;
+          for (int m = 0; wants_material && m < kMaterialScalars; ++m) {
+            out.material[m][b * tets + tet] += s.material_bar[(slot * kMaterialScalars + m) * kLanes + l];
+          }
+          for (int i = 0; out.rest && i < kPairRest; ++i) {
+            out.rest[(b * tets + tet) * kRestScalars + TetLayout::rest_index(local, i)] +=
+                s.rest_bar[(slot * kPairRest + i) * kLanes + l];
+          }
         }
       }
     }
@@ -329,22 +330,23 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
 template <class T>
 void pack_rest(const Plan& plan, const T* rest, T* packed) {
   for (int64_t t = 0; t < plan.num_tets; ++t) {
-    const T c6 = rest[t * kRestScalars + 6];
-    if (c6 > 0 && std::isfinite(c6)) continue;
+    const T volume = TetLayout::volume(rest + t * kRestScalars);
+    if (volume > 0 && std::isfinite(volume)) continue;
     Message out;
-    out << "rest_points: expected tets of positive volume, got " << 1 / (6 * c6) << " m^3 at tet " << t;
+    out << "rest_points: expected tets of positive volume, got " << volume << " m^3 at tet " << t;
     throw std::invalid_argument(out.text);
   }
   for (int64_t block = 0; block < plan.blocks; ++block) {
     for (int64_t slot = plan.block_slot[block]; slot < plan.block_slot[block + 1]; ++slot) {
       for (int l = 0; l < kLanes; ++l) {
-        T* out = packed + slot * 4 * kLanes + l;
+        T* out = packed + slot * kPairRest * kLanes + l;
         const bool padding = is_padding(plan, slot, block, l);
         const int32_t pair = plan.pair[slot * kLanes + l];
         const T* row = rest + int64_t{pair >> 2} * kRestScalars;
         const int local = pair & 3;
-        for (int a = 0; a < 3; ++a) out[a * kLanes] = padding ? T(0) : row[weight_index(local, other_corner(local, a))];
-        out[3 * kLanes] = padding ? T(0) : row[6];
+        for (int i = 0; i < kPairRest; ++i) {
+          out[i * kLanes] = padding ? T(0) : row[TetLayout::rest_index(local, i)];
+        }
       }
     }
   }

@@ -4,21 +4,23 @@
 
 #include "../contact/passes.h"
 #include "plan.h"
-#include "sweep.h"
+#include "scene.h"
 
 namespace diffvbd {
 
 // Inputs in the user's numbering; `scene` strides are 0 where scenes share a tensor.
 template <class T>
 struct StepInputs {
+  using Scalar = T;
   int64_t scenes;
   Batched<const T> x_start, x_prev, y, origin;  // [B, V, 3]; origin may be null
-  Batched<const T> mu, lam;                     // [B, T], also item stride 0 for one value
+  Batched<const T> material[kMaterialScalars];  // [B, T], also item stride 0 for one value
   Batched<const T> mass;                        // [B, V]
-  Batched<const T> rest;                        // [B, slots, 4, kLanes]
+  Batched<const T> rest;                        // [B, slots, kPairRest, kLanes]
   Batched<const T> data;                        // [B, N]
   int energies;                                 // mask, see energies.h
   int data_count[kVertexEnergies];              // scalars per scene, or per vertex, of each energy
+  int64_t data_size;                            // N
   StepParameters<T> parameters;
   int sweeps, tape_policy;
   const contact::ContactInputs<T>* contact;  // null without contact
@@ -27,8 +29,10 @@ struct StepInputs {
 
 template <class T>
 struct StepAdjoints {
+  using Scalar = T;
   T *x_start, *x_prev, *y;                     // [B, V, 3]
-  T *mu, *lam, *mass, *rest, *data;            // [B, T], [B, T], [B, V], [B, T, 7], [B, N]; null where not wanted
+  T* material[kMaterialScalars];               // [B, T] each; null where not wanted, as below
+  T *mass, *rest, *data;                       // [B, V], [B, T, kRestScalars], [B, N]
   const contact::ContactAdjoints<T>* contact;  // with contact
   T *bounds, *collider;                        // [B, V, 4], [B, Vc, 3] with contact
 };
@@ -50,7 +54,7 @@ template <class T>
 void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T* x_bar, const T* tape,
                  const StepAdjoints<T>& out);
 
-// [T, 7] -> [slots, 4, kLanes]: k01 k02 k03 k12 k13 k23 c6 of each tet, as its four vertices see them
+// [T, kRestScalars] -> [slots, kPairRest, kLanes]: the rest shape of each tet, as its four vertices see it
 template <class T>
 void pack_rest(const Plan& plan, const T* rest, T* packed);
 

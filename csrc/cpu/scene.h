@@ -8,13 +8,6 @@
 #include "../sweep/vertex.h"
 #include "lanes.h"
 
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && !defined(DIFFVBD_NO_CLONES)
-// flatten: each clone must inline the whole algorithm, or its callees would stay at the baseline instruction set
-#define DIFFVBD_HOT __attribute__((target_clones("default", "arch=x86-64-v3", "arch=x86-64-v4"), flatten))
-#else
-#define DIFFVBD_HOT __attribute__((flatten))
-#endif
-
 namespace diffvbd {
 
 template <class T>
@@ -44,8 +37,8 @@ struct SceneView {
   const T* x_prev;    // [blocks, 3, kLanes] or null
   const T* origin;    // [blocks, 3, kLanes] or null
   const T* mass;      // [blocks, kLanes]
-  const T* material;  // [slots, 2, kLanes]  mu, lam: gathered once a step, read in every sweep
-  const T* rest;      // [slots, 4, kLanes]  k_ij, k_ik, k_il, c6
+  const T* material;  // [slots, kMaterialScalars, kLanes]: gathered once a step, read in every sweep; null: no tets
+  const T* rest;      // [slots, kPairRest, kLanes]
   const T* data;      // energies: per-scene ones (count), per-vertex ones (vertices, stride), in the order of the list
   int64_t data_start[kVertexEnergies];
   int data_count[kVertexEnergies];
@@ -54,17 +47,16 @@ struct SceneView {
   T* cut;      // [blocks, kLanes]: > 0 where a bound has changed an update; or null
 
   // reverse only
-  T* x_bar;       // [blocks kLanes, 4]
-  T* y_bar;       // [blocks, 3, kLanes]
-  T* x_prev_bar;  // [blocks, 3, kLanes] or null
-  T* mass_bar;    // [blocks, kLanes]
-  T* rows;        // [edge_slots kLanes + 1, 4]  what the latest reversed update of a vertex adds to a neighbour
-  T* mu_bar;      // [slots, kLanes] or null
-  T* lam_bar;     // [slots, kLanes] or null
-  T* rest_bar;    // [slots, 4, kLanes] or null
-  T* data_bar;    // [kMaxEnergyData, blocks kLanes] or null
-  T* turn;        // [blocks, 6, kLanes]: p and d_raw of the latest reversed update; or null
-  T* bound_bar;   // [blocks, 4, kLanes] or null
+  T* x_bar;         // [blocks kLanes, 4]
+  T* y_bar;         // [blocks, 3, kLanes]
+  T* x_prev_bar;    // [blocks, 3, kLanes] or null
+  T* mass_bar;      // [blocks, kLanes]
+  T* rows;          // [edge_slots kLanes + 1, 4]  what the latest reversed update of a vertex adds to a neighbour
+  T* material_bar;  // [slots, kMaterialScalars, kLanes] or null
+  T* rest_bar;      // [slots, kPairRest, kLanes] or null
+  T* data_bar;      // [kMaxEnergyData, blocks kLanes] or null
+  T* turn;          // [blocks, 6, kLanes]: p and d_raw of the latest reversed update; or null
+  T* bound_bar;     // [blocks, 4, kLanes] or null
 };
 
 template <class T>
@@ -112,9 +104,9 @@ struct LaneStar {
       : plan(p),
         s(scene),
         first(p.block_slot[block]),
-        count(p.block_slot[block + 1] - p.block_slot[block]),
+        count(scene.material ? p.block_slot[block + 1] - p.block_slot[block] : 0),
         edges(edge_rows),
-        wishes((scene.mu_bar ? kMaterial : 0) | (scene.rest_bar ? kRest : 0)) {}
+        wishes((scene.material_bar ? kMaterial : 0) | (scene.rest_bar ? kRest : 0)) {}
   DIFFVBD_FN int size() const { return count; }
   template <class... R>
   DIFFVBD_FN void total(R&...) const {}  // one lane visits the whole star
@@ -129,18 +121,14 @@ struct LaneStar {
   DIFFVBD_FN TetPair<Lanes<T>> pair(int e) const {
     const int64_t slot = first + e;
     const int32_t* j = plan.neighbors + slot * 3 * kLanes;
-    const T* r = s.rest + slot * 4 * kLanes;
-    const T* m = s.material + slot * 2 * kLanes;
+    const T* r = s.rest + slot * kPairRest * kLanes;
+    const T* m = s.material + slot * kMaterialScalars * kLanes;
     TetPair<Lanes<T>> out;
     out.xj = gather3(s.x, j);
     out.xk = gather3(s.x, j + kLanes);
     out.xl = gather3(s.x, j + 2 * kLanes);
-    out.k_ij = Lanes<T>::load(r);
-    out.k_ik = Lanes<T>::load(r + kLanes);
-    out.k_il = Lanes<T>::load(r + 2 * kLanes);
-    out.c6 = Lanes<T>::load(r + 3 * kLanes);
-    out.mu = Lanes<T>::load(m);
-    out.lam = Lanes<T>::load(m + kLanes);
+    each_below<kPairRest>([&](auto i) { out.rest[decltype(i)::value] = Lanes<T>::load(r + i * kLanes); });
+    each_below<kMaterialScalars>([&](auto i) { out.material[decltype(i)::value] = Lanes<T>::load(m + i * kLanes); });
     return out;
   }
 
@@ -155,32 +143,33 @@ struct LaneStar {
       r[l].store(a);
     }
   }
-  // One variant serves every wish.
+  DIFFVBD_FN LaneStar local() const { return *this; }
+  // A loop for each wish; the rest of a variant serves them all.
+  template <class Law, int>
+  DIFFVBD_FN Vec3<Lanes<T>> reverse_tets(const Reversed<Lanes<T>>& update) const {
+    if (wishes & kRest) return diffvbd::reverse_tets<Law, kMaterial | kRest>(*this, update);
+    if (wishes & kMaterial) return diffvbd::reverse_tets<Law, kMaterial>(*this, update);
+    return diffvbd::reverse_tets<Law, kState>(*this, update);
+  }
   template <int wanted>
-  DIFFVBD_FN int asked() const {
-    return wishes;
+  DIFFVBD_FN bool wants(int what) const {
+    return (wanted & wishes & what) != 0;
   }
   DIFFVBD_FN static void accumulate(T* p, const Lanes<T>& v) { (Lanes<T>::load(p) + v).store(p); }
 
-  template <int wanted>
-  DIFFVBD_FN void add(int e, const TetPairAdjoint<Lanes<T>>& a) const {
-    const int64_t slot = first + e;
-    // These first: where they have just been worked out under the same condition.
-    if (wishes & kMaterial) {
-      accumulate(s.mu_bar + slot * kLanes, a.mu);
-      accumulate(s.lam_bar + slot * kLanes, a.lam);
-    }
-    if (wishes & kRest) {
-      T* r = s.rest_bar + slot * 4 * kLanes;
-      accumulate(r, a.k_ij);
-      accumulate(r + kLanes, a.k_ik);
-      accumulate(r + 2 * kLanes, a.k_il);
-      accumulate(r + 3 * kLanes, a.c6);
-    }
-    const int32_t* edge = plan.edge + slot * 3 * kLanes;
+  DIFFVBD_FN void add(int e, const TetAdjoint<Lanes<T>>& a) const {
+    const int32_t* edge = plan.edge + (first + e) * 3 * kLanes;
     scatter(edge, a.xj);
     scatter(edge + kLanes, a.xk);
     scatter(edge + 2 * kLanes, a.xl);
+  }
+  DIFFVBD_FN void add_material(int e, const Lanes<T>* bar) const {
+    T* to = s.material_bar + (first + e) * kMaterialScalars * kLanes;
+    each_below<kMaterialScalars>([&](auto i) { accumulate(to + i * kLanes, bar[decltype(i)::value]); });
+  }
+  DIFFVBD_FN void add_rest(int e, const Lanes<T>* bar) const {
+    T* to = s.rest_bar + (first + e) * kPairRest * kLanes;
+    each_below<kPairRest>([&](auto i) { accumulate(to + i * kLanes, bar[decltype(i)::value]); });
   }
 };
 

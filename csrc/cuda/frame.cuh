@@ -20,11 +20,11 @@ __device__ __forceinline__ void store_user(T* p, int64_t index, const Vec3<T>& a
   p[1] = a.y;
   p[2] = a.z;
 }
-// y = x + h v + h^2 a; a pinned vertex goes where it is held
+// y = x + h v + h^2 a; a pinned vertex goes where it is prescribed
 template <class T>
 __device__ __forceinline__ Vec3<T> predict(const StepInputs<T>& in, int64_t scene, int64_t vertex, bool pinned) {
   const Vec3<T> x = load_user(in.x_prev, scene, vertex);
-  if (pinned) return in.held.data ? load_user(in.held, scene, vertex) : x;
+  if (pinned) return in.prescribed.data ? load_user(in.prescribed, scene, vertex) : x;
   const T h = in.parameters.time_step;
   const Vec3<T> v = load_user(in.v, scene, vertex), a = load_user(in.acceleration, scene, vertex);
   return x + h * v + (h * h) * a;
@@ -93,8 +93,11 @@ __global__ void load_material(const __grid_constant__ StepInputs<T> in, const __
   if (i >= scenes * pairs) return;
   const int64_t local = i / pairs, scene = base + local;
   const int64_t tet = max(0, __ldg(s.plan.pair + (i - local * pairs))) >> 2;
-  s.w.material[2 * i] = in.mu.data[scene * in.mu.scene + tet * in.mu.item];
-  s.w.material[2 * i + 1] = in.lam.data[scene * in.lam.scene + tet * in.lam.item];
+#pragma unroll
+  for (int m = 0; m < kMaterialScalars; ++m) {
+    const Batched<const T>& given = in.material[m];
+    s.w.material[kMaterialScalars * i + m] = given.data[scene * given.scene + tet * given.item];
+  }
 }
 
 // What is left in the rows after the last reversed update: of lower colors for a vertex that has had its turn,
@@ -131,13 +134,13 @@ __global__ void store_adjoints(const __grid_constant__ StepInputs<T> in, const _
   } else {
     const T h = in.parameters.time_step;
     const Vec3<T> all = start + y, none = zero3<T>();
-    const bool held = pinned && in.held.data != nullptr;
-    Vec3<T> x = held ? none : all;
+    const bool follows = pinned && in.prescribed.data != nullptr;
+    Vec3<T> x = follows ? none : all;
     if (out.v_bar) x -= (T(1) / h) * Vec3<T>{out.v_bar[3 * own], out.v_bar[3 * own + 1], out.v_bar[3 * own + 2]};
     if (out.x) store_user(out.x, own, x);
     if (out.v) store_user(out.v, own, pinned ? none : h * all);
     if (out.acceleration) store_user(out.acceleration, own, pinned ? none : (h * h) * all);
-    if (out.held) store_user(out.held, own, held ? all : none);
+    if (out.prescribed) store_user(out.prescribed, own, follows ? all : none);
   }
   for (int k = 0; out.data && k < kVertexEnergies; ++k) {
     if (is_per_vertex(k, VertexEnergies{})) {
@@ -157,27 +160,23 @@ __global__ void store_tets(const __grid_constant__ StepView<T> s, int64_t base,
   if (i >= s.scenes * s.plan.num_tets) return;
   const int64_t local = i / s.plan.num_tets, scene = base + local, tet = i - local * s.plan.num_tets;
   const int64_t pairs = static_cast<int64_t>(s.plan.slots) * kSlice, to = scene * s.plan.num_tets + tet;
-  T mu = T(0), lam = T(0), rest[kRestScalars] = {};
+  T material_bar[kMaterialScalars] = {}, rest[kRestScalars] = {};
 #pragma unroll
   for (int a = 0; a < 4; ++a) {
     const int64_t at = __ldg(s.plan.tet_pair + 4 * tet + a);
     if (at < 0) continue;
     if (material) {
-      const T* m = s.w.material_bar + (local * pairs + at) * 2;
-      mu += m[0];
-      lam += m[1];
+      const T* m = s.w.material_bar + (local * pairs + at) * kMaterialScalars;
+#pragma unroll
+      for (int k = 0; k < kMaterialScalars; ++k) material_bar[k] += m[k];
     }
     if (out.rest) {
-      const T* r = s.w.rest_bar + (local * pairs + at) * 4;
+      const T* r = s.w.rest_bar + (local * pairs + at) * kPairRest;
 #pragma unroll
-      for (int b = 0; b < 3; ++b) rest[weight_index(a, other_corner(a, b))] += r[b];
-      rest[6] += r[3];
+      for (int b = 0; b < kPairRest; ++b) rest[TetLayout::rest_index(a, b)] += r[b];
     }
   }
-  if (material) {
-    out.mu[to] = mu;
-    out.lam[to] = lam;
-  }
+  for (int k = 0; material && k < kMaterialScalars; ++k) out.material[k][to] = material_bar[k];
   for (int k = 0; out.rest && k < kRestScalars; ++k) out.rest[to * kRestScalars + k] = rest[k];
 }
 

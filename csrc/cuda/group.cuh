@@ -132,14 +132,16 @@ struct GroupStar {
   __device__ __forceinline__ GroupStar(const StepView<T>& s, const P& at, T* shared)
       : s(s), at(at), near(shared + at.group) {
     first = __ldg(s.plan.block_slot + at.block);
-    count = __ldg(s.plan.block_slot + at.block + 1) - first;
+    count = s.has_tets ? __ldg(s.plan.block_slot + at.block + 1) - first : 0;
     first_edge = __ldg(s.plan.block_edge + at.block);
     degree = __ldg(s.plan.block_edge + at.block + 1) - first_edge;
     if (s.one_material) {
-      next.mu = __ldg(s.mu.data + at.scene * s.mu.scene);
-      next.lam = __ldg(s.lam.data + at.scene * s.lam.scene);
+#pragma unroll
+      for (int m = 0; m < kMaterialScalars; ++m) {
+        next.material[m] = __ldg(s.material[m].data + at.scene * s.material[m].scene);
+      }
     }
-    fetch(0);
+    if (s.has_tets) fetch(0);
   }
 
   // Several loads are under way at once: what is beyond the last neighbour repeats it, and is not stored.
@@ -186,7 +188,7 @@ struct GroupStar {
   // What a pair reads of the mesh; always loaded one pair ahead.
   struct Record {
     int where;
-    T k_ij, k_ik, k_il, c6, mu, lam;
+    T rest[kPairRow], material[kMaterialScalars];
   };
   mutable Record next;
   mutable int where;     // of the pair at work
@@ -194,17 +196,18 @@ struct GroupStar {
   __device__ __forceinline__ void fetch(int e) const {
     const int64_t base = slot(e);
     next.where = __ldg(s.plan.local + base + at.v);
-    const T* rest = s.rest.data + at.scene * s.rest.scene + base * 4;
-    if constexpr (Pack<T>::size == 4) {
-      const Pack<T> r = load_constant(rest + at.v * 4);
-      next.k_ij = r.v[0], next.k_ik = r.v[1], next.k_il = r.v[2], next.c6 = r.v[3];
-    } else {
-      const Pack<T> r = load_constant(rest + at.v * 2), q = load_constant(rest + 2 * kSlice + at.v * 2);
-      next.k_ij = r.v[0], next.k_ik = r.v[1], next.k_il = q.v[0], next.c6 = q.v[1];
+    const T* rest = s.rest.data + at.scene * s.rest.scene + base * kPairRow;
+    constexpr int width = Pack<T>::size;
+#pragma unroll
+    for (int i = 0; i < kPairRow; i += width) {
+      const Pack<T> part = load_constant(rest + i * kSlice + at.v * width);
+#pragma unroll
+      for (int k = 0; k < width; ++k) next.rest[i + k] = part.v[k];
     }
     if (!s.one_material) {
-      const T* m = s.w.material + at.scene * s.material_scene + (base + at.v) * 2;
-      next.mu = __ldg(m), next.lam = __ldg(m + 1);
+      const T* m = s.w.material + at.scene * s.material_scene + (base + at.v) * kMaterialScalars;
+#pragma unroll
+      for (int i = 0; i < kMaterialScalars; ++i) next.material[i] = __ldg(m + i);
     }
   }
   __device__ __forceinline__ Vec3<T> neighbour(int a) const {
@@ -224,8 +227,10 @@ struct GroupStar {
     out.xj = neighbour(where & kMaxDegree);
     out.xk = neighbour(where >> kLocalBits & kMaxDegree);
     out.xl = neighbour(where >> 2 * kLocalBits);
-    out.k_ij = now.k_ij, out.k_ik = now.k_ik, out.k_il = now.k_il, out.c6 = now.c6;
-    out.mu = now.mu, out.lam = now.lam;
+#pragma unroll
+    for (int i = 0; i < kPairRest; ++i) out.rest[i] = now.rest[i];
+#pragma unroll
+    for (int i = 0; i < kMaterialScalars; ++i) out.material[i] = now.material[i];
     return out;
   }
   template <class... R>
@@ -235,11 +240,13 @@ struct GroupStar {
 
   // the threads of a warp visit stars together, so one that must go the longer way takes all along
   __device__ __forceinline__ bool any(bool condition) const { return __any_sync(kWholeWarp, condition); }
-  __device__ __forceinline__ void rewind() const { fetch(0); }
+  __device__ __forceinline__ void rewind() const {
+    if (s.has_tets) fetch(0);
+  }
   // the sums of a copy
   __device__ __forceinline__ void adopt(const GroupStar& a) const {
-    material_bar[0] = a.material_bar[0];
-    material_bar[1] = a.material_bar[1];
+#pragma unroll
+    for (int i = 0; i < kMaterialScalars; ++i) material_bar[i] = a.material_bar[i];
   }
   __device__ __forceinline__ const Vec3<T>& predictor(const Block<T>& b) const { return b.y; }
 
@@ -255,9 +262,16 @@ struct GroupStar {
     to[kSlice] += v.y;
     to[2 * kSlice] += v.z;
   }
+  __device__ __forceinline__ const GroupStar& local() const { return *this; }  // it has sums
+  template <class Law, int wanted>
+  __device__ __forceinline__ Vec3<T> reverse_tets(const Reversed<T>& update) const {
+    return diffvbd::reverse_tets<Law, wanted>(*this, update);
+  }
   template <int wanted>
-  __device__ __forceinline__ void add(int e, const TetPairAdjoint<T>& a) const {
-    const int64_t base = slot(e);
+  __device__ static constexpr bool wants(int what) {
+    return (wanted & what) != 0;
+  }
+  __device__ __forceinline__ void add(int e, const TetAdjoint<T>& a) const {
     if constexpr (gather) {
       const int row = 3 * (e * lanes + at.lane);
       if (real(e)) put(row, a.xj), put(row + 1, a.xk), put(row + 2, a.xl);
@@ -266,31 +280,27 @@ struct GroupStar {
       send(where >> kLocalBits & kMaxDegree, a.xk);
       send(where >> 2 * kLocalBits, a.xl);
     }
-    if constexpr ((wanted & kMaterial) != 0) {
-      if (s.one_material) {
-        material_bar[0] += a.mu;
-        material_bar[1] += a.lam;
-      } else if (real(e)) {
-        T* m = s.w.material_bar + (at.scene * s.plan.slots * kSlice + base + at.v) * 2;
-        m[0] += a.mu;
-        m[1] += a.lam;
-      }
-    }
-    if constexpr ((wanted & kRest) != 0) {
-      if (real(e)) {
-        T* r = s.w.rest_bar + (at.scene * s.plan.slots * kSlice + base + at.v) * 4;
-        r[0] += a.k_ij;
-        r[1] += a.k_ik;
-        r[2] += a.k_il;
-        r[3] += a.c6;
-      }
+  }
+  __device__ __forceinline__ int64_t pair_index(int e) const {
+    return at.scene * s.plan.slots * kSlice + slot(e) + at.v;
+  }
+  __device__ __forceinline__ void add_material(int e, const T* bar) const {
+    if (s.one_material) {
+#pragma unroll
+      for (int i = 0; i < kMaterialScalars; ++i) material_bar[i] += bar[i];
+    } else if (real(e)) {
+      T* to = s.w.material_bar + pair_index(e) * kMaterialScalars;
+#pragma unroll
+      for (int i = 0; i < kMaterialScalars; ++i) to[i] += bar[i];
     }
   }
-  template <int wanted>
-  __device__ static constexpr int asked() {
-    return wanted;
+  __device__ __forceinline__ void add_rest(int e, const T* bar) const {
+    if (!real(e)) return;
+    T* to = s.w.rest_bar + pair_index(e) * kPairRest;
+#pragma unroll
+    for (int i = 0; i < kPairRest; ++i) to[i] += bar[i];
   }
-  mutable T material_bar[2] = {T(0), T(0)};
+  mutable T material_bar[kMaterialScalars] = {};
 
   // Writes the rows of the vertex's edges: the sums of its threads, in their order. What is pinned has no turn of its
   // own: rows that lead to it add up over the sweeps.

@@ -18,16 +18,17 @@ __global__ void pack_rest_kernel(GroupPlan plan, int64_t scenes, const T* rest, 
   if (i >= scenes * pairs) return;
   const int64_t scene = i / pairs, pair = i - scene * pairs, slot = pair / kSlice, lane = pair % kSlice;
   const int32_t entry = plan.pair[pair];
-  T values[4] = {};
+  T values[kPairRow] = {};
   if (entry >= 0) {
     const T* row = rest + (scene * plan.num_tets + (entry >> 2)) * kRestScalars;
     const int own = entry & 3;
-    for (int a = 0; a < 3; ++a) values[a] = row[weight_index(own, other_corner(own, a))];
-    values[3] = row[kRestScalars - 1];
+    for (int a = 0; a < kPairRest; ++a) values[a] = row[TetLayout::rest_index(own, a)];
   }
-  T* to = packed + scene * pairs * 4;
+  T* to = packed + scene * pairs * kPairRow;
 #pragma unroll
-  for (int a = 0; a < 4; ++a) to[((slot * (4 / width) + a / width) * kSlice + lane) * width + a % width] = values[a];
+  for (int a = 0; a < kPairRow; ++a) {
+    to[((slot * (kPairRow / width) + a / width) * kSlice + lane) * width + a % width] = values[a];
+  }
 }
 
 template <class T>

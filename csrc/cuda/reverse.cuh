@@ -55,9 +55,9 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
       if (is_rare<Set>(before, star, r.H)) return false;
     }
   }
-  if constexpr (Set::elastic) star.clear_sums(shared);
+  star.clear_sums(shared);
   const Vec3<T> x_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
-  if constexpr (Set::elastic) star.fetch_neighbours(false);
+  star.fetch_neighbours(false);
   const StepParameters<T> q = of_sweep(s.parameters, turn.number == 0);
   const Update<T> u = replayed<Set>(b, star, r, full, q);
   if constexpr (Set::usual) {
@@ -69,13 +69,14 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
       reverse_vertex<Set, wanted>(b, star, u, r, x_bar, q, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
         if (writes) s.w.data_bar[(scene * s.data_scalars + s.data_row[k] + i) * s.positions + position] += value;
       });
-  if constexpr (Set::elastic) {
-    star.send_rows(__ldg(s.plan.color_block + s.plan.colors) * kSlice);
-    if constexpr ((wanted & kMaterial) != 0) {
-      if (s.one_material) {
-        star.total(star.material_bar[0], star.material_bar[1]);
-        T* m = s.w.material_bar + row * 2;
-        if (writes) m[0] += star.material_bar[0], m[1] += star.material_bar[1];
+  star.send_rows(__ldg(s.plan.color_block + s.plan.colors) * kSlice);
+  if constexpr ((wanted & kMaterial) != 0) {
+    if (s.one_material) {
+      T* to = s.w.material_bar + row * kMaterialScalars;
+#pragma unroll
+      for (int i = 0; i < kMaterialScalars; ++i) {
+        star.total(star.material_bar[i]);
+        if (writes) to[i] += star.material_bar[i];
       }
     }
   }
@@ -120,12 +121,9 @@ __global__ void __maxnreg__((reverse_registers<T, EnergySet<mask>>()))
   });
 }
 
-// Without tets there is nothing but the state to differentiate: one variant serves every wish.
-constexpr int useful(int mask, int wanted) { return (mask & 3) == 0 ? kState : wanted; }
-
 template <class T, int mask, int wanted, int lanes>
 constexpr SweepKernel<T> reverse_variant() {
-  if constexpr (is_built(mask, lanes)) return sweep_reverse<T, mask, useful(mask, wanted), lanes>;
+  if constexpr (is_built(mask, lanes)) return sweep_reverse<T, mask, wanted, lanes>;
   return nullptr;
 }
 
@@ -137,23 +135,13 @@ SweepKernel<T> pick_reverse(int index, std::integer_sequence<int, n...>) {
 
 }  // namespace
 
-template <class T, int wanted>
-SweepKernel<T> reverse_kernel(int energies, int lanes) {
-  constexpr auto sets = std::make_integer_sequence<int, kEnergySets>{};
-  const int index = energy_index(energies);
-  switch (lanes) {
-    case kFewLanes:
-      return pick_reverse<T, wanted, kFewLanes>(index, sets);
-    case kSomeLanes:
-      return pick_reverse<T, wanted, kSomeLanes>(index, sets);
-    case kManyLanes:
-      return pick_reverse<T, wanted, kManyLanes>(index, sets);
-    default:
-      return pick_reverse<T, wanted, kSpillLanes>(index, sets);
-  }
+template <class T, int wanted, int lanes>
+SweepKernel<T> reverse_kernel(int energies) {
+  return pick_reverse<T, wanted, lanes>(energy_index(energies), std::make_integer_sequence<int, kEnergySets>{});
 }
 
 }  // namespace diffvbd::cuda
 
-#define DIFFVBD_INSTANTIATE_REVERSE(T, wanted) \
-  template diffvbd::cuda::SweepKernel<T> diffvbd::cuda::reverse_kernel<T, (wanted)>(int, int);
+// Few threads a vertex and many are compiled apart: these are the files that take longest.
+#define DIFFVBD_INSTANTIATE_REVERSE(T, wanted, lanes) \
+  template diffvbd::cuda::SweepKernel<T> diffvbd::cuda::reverse_kernel<T, (wanted), diffvbd::cuda::lanes>(int);

@@ -43,7 +43,8 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   const GroupPlan& plan = host.plan;
   const int64_t n = choice.chunk, positions = int64_t{plan.blocks} * kSlice, pairs = int64_t{plan.slots} * kSlice;
   const bool elastic = (in.energies & 3) != 0, reverse = adjoints != nullptr;
-  const bool lagged = any_x_prev(in.energies, VertexEnergies{}), one = in.mu.item == 0 && in.lam.item == 0;
+  const bool lagged = any_x_prev(in.energies, VertexEnergies{});
+  const bool one = one_for_items(in.material);
   int scalars = 0;
   for (int k = 0; k < kVertexEnergies; ++k) scalars += in.data_count[k];
   Workspace<T> w{};
@@ -51,8 +52,8 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   w.y_bar = take(reverse, n * 3 * positions);
   w.x_prev_bar = take(reverse && lagged, n * 3 * positions);
   w.mass_bar = take(reverse && adjoints->mass, n * positions);
-  w.material_bar = take(elastic && (choice.wanted & kMaterial), n * 2 * (one ? positions : pairs));
-  w.rest_bar = take(elastic && (choice.wanted & kRest), n * 4 * pairs);
+  w.material_bar = take(elastic && (choice.wanted & kMaterial), n * kMaterialScalars * (one ? positions : pairs));
+  w.rest_bar = take(elastic && (choice.wanted & kRest), n * kPairRest * pairs);
   w.data_bar = take(reverse && adjoints->data, n * scalars * positions);
   w.bound_bar = take(reverse && in.contact, n * 4 * positions);
   *zeroed = take.used;
@@ -62,8 +63,7 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   w.x_prev = take(lagged, n * 3 * positions);
   w.origin = take(in.origin.data != nullptr, n * 3 * positions);
   w.mass = take(true, (in.mass.scene != 0 ? n : 1) * positions);
-  const bool shared_material = in.mu.scene == 0 && in.lam.scene == 0;
-  w.material = take(elastic && !one, (shared_material ? 1 : n) * 2 * pairs);
+  w.material = take(elastic && !one, (one_for_scenes(in.material) ? 1 : n) * kMaterialScalars * pairs);
   w.contact = take(in.contact != nullptr, n * kContactRecord * positions);
   w.turn = take(reverse && in.contact, n * 6 * positions);
   w.position = reinterpret_cast<int32_t*>(take(in.contact != nullptr, plan.num_vertices));
@@ -107,10 +107,11 @@ struct Runner {
     s.parameters = in.parameters;
     s.sweeps = in.sweeps;
     s.tape_policy = in.tape_policy;
-    s.one_material = in.mu.item == 0 && in.lam.item == 0;
+    s.has_tets = (in.energies & (kExactBlock | kPaperBlock)) != 0;
+    s.one_material = one_for_items(in.material);
     s.mass = {s.w.mass, in.mass.scene != 0 ? s.positions : 0, 1};
-    material_is_shared = in.mu.scene == 0 && in.lam.scene == 0;
-    s.material_scene = material_is_shared ? 0 : int64_t{host.plan.slots} * kSlice * 2;
+    material_is_shared = one_for_scenes(in.material);
+    s.material_scene = material_is_shared ? 0 : int64_t{host.plan.slots} * kSlice * kMaterialScalars;
     int64_t start = 0;
     for (int k = 0; k < kVertexEnergies; ++k) {
       s.data_start[k] = start;
@@ -129,8 +130,7 @@ struct Runner {
     s.scenes = count;
     s.base = base;
     s.rest = at(in.rest);
-    s.mu = at(in.mu);
-    s.lam = at(in.lam);
+    for (int m = 0; m < kMaterialScalars; ++m) s.material[m] = at(in.material[m]);
     s.data = at(in.data);
     const int rows = tape_rows(in.tape_policy, keeps_positions(in.energies));
     s.tape = tape + base * in.sweeps * rows * host.plan.num_active;
@@ -225,14 +225,16 @@ struct Runner {
       if (auto error = passes().collect()) return error;
     }
     if (auto error = per_item(store_adjoints<T>, s.scenes * s.positions, in, s, base, out)) return error;
-    const bool material = out.mu != nullptr, per_tet = material && !s.one_material;
+    const bool material = out.material[0] != nullptr, per_tet = material && !s.one_material;
     if (per_tet || s.w.rest_bar) {
       const int64_t items = s.scenes * host.plan.num_tets;
       if (auto error = per_item(store_tets<T>, items, s, base, out, per_tet)) return error;
     }
-    if (material && s.one_material) {
-      if (auto error = sum(s.w.material_bar, 2 * s.positions, 2, s.scenes, out.mu + base, 1)) return error;
-      if (auto error = sum(s.w.material_bar + 1, 2 * s.positions, 2, s.scenes, out.lam + base, 1)) return error;
+    for (int m = 0; material && s.one_material && m < kMaterialScalars; ++m) {
+      const int64_t stride = kMaterialScalars * s.positions;
+      if (auto error = sum(s.w.material_bar + m, stride, kMaterialScalars, s.scenes, out.material[m] + base, 1)) {
+        return error;
+      }
     }
     for (int k = 0; out.data && k < kVertexEnergies; ++k) {
       if (is_per_vertex(k, VertexEnergies{})) continue;
@@ -253,11 +255,24 @@ struct Runner {
   }
 };
 
+template <class T, int wanted>
+SweepKernel<T> reverse_kernel_for(int energies, int lanes) {
+  switch (lanes) {
+    case kFewLanes:
+      return reverse_kernel<T, wanted, kFewLanes>(energies);
+    case kSomeLanes:
+      return reverse_kernel<T, wanted, kSomeLanes>(energies);
+    case kManyLanes:
+      return reverse_kernel<T, wanted, kManyLanes>(energies);
+    default:
+      return reverse_kernel<T, wanted, kSpillLanes>(energies);
+  }
+}
 template <class T>
 SweepKernel<T> reverse_kernel_for(int energies, int wanted, int lanes) {
-  if (wanted & kRest) return reverse_kernel<T, kMaterial | kRest>(energies, lanes);
-  if (wanted & kMaterial) return reverse_kernel<T, kMaterial>(energies, lanes);
-  return reverse_kernel<T, kState>(energies, lanes);
+  if (wanted & kRest) return reverse_kernel_for<T, kMaterial | kRest>(energies, lanes);
+  if (wanted & kMaterial) return reverse_kernel_for<T, kMaterial>(energies, lanes);
+  return reverse_kernel_for<T, kState>(energies, lanes);
 }
 
 }  // namespace

@@ -23,12 +23,9 @@ template <int mask>
 struct RareVariant {
   using Set = EnergySet<mask>;
 };
-constexpr bool may_be_rare(int mask) {
-  return (mask & (kExactBlock | kPaperBlock)) != 0 || any_filter(mask, VertexEnergies{});
-}
 template <class Set>
 constexpr bool marks() {
-  return Set::usual && (Set::elastic || Set::filters);
+  return Set::usual;
 }
 // A bit for each thread of the warp: whether it has its scene to do.
 template <class Set>
@@ -43,14 +40,14 @@ template <class T>
 struct Visits {
   const int2* visit;  // vertex + (its pairs << kLocalBits), its first pair
   const int4* pair;   // offsets of j, k, l in a column; tet
-  const T* rest;      // [pairs, 4]
+  const T* rest;      // [pairs, kPairRow]
   uint64_t active;    // mask of the vertices that sweeps move
 
   // int32 of the visits, rounded so that the pairs' rows are aligned
   DIFFVBD_FN static int visit_ints(const GroupPlan& plan) { return (2 * plan.num_active + 3) / 4 * 4; }
   DIFFVBD_FN static size_t bytes(const GroupPlan& plan) {
     return 4 * (static_cast<size_t>(visit_ints(plan)) + 16 * static_cast<size_t>(plan.num_tets)) +
-           16 * sizeof(T) * static_cast<size_t>(plan.num_tets);
+           4 * kPairRow * sizeof(T) * static_cast<size_t>(plan.num_tets);
   }
   __device__ __forceinline__ Visits(const StepInputs<T>& in, const GroupPlan& plan, unsigned char* memory) {
     int32_t* to = reinterpret_cast<int32_t*>(memory);
@@ -62,7 +59,7 @@ struct Visits {
       const int where = __ldg(row);
       pairs[i] = {3 * kColumn * (where & kMaxDegree), 3 * kColumn * (where >> kLocalBits & kMaxDegree),
                   3 * kColumn * (where >> 2 * kLocalBits), __ldg(row + 1)};
-      if (in.rest.scene == 0 && in.rest.data) load_rest(in.rest.data, __ldg(row + 2), own + 4 * i);
+      if (in.rest.scene == 0 && in.rest.data) load_rest(in.rest.data, __ldg(row + 2), own + kPairRow * i);
     }
     visit = reinterpret_cast<const int2*>(to);
     pair = pairs;
@@ -74,9 +71,9 @@ struct Visits {
   // Pairs of inactive corners stand in no list: their entries are zero and are never read.
   __device__ __forceinline__ static void load_rest(const T* packed, int pair, T* to) {
     constexpr int width = Pack<T>::size;
-    const T* from = packed + (static_cast<int64_t>(pair / kSlice) * 4 * kSlice + pair % kSlice * width);
+    const T* from = packed + (static_cast<int64_t>(pair / kSlice) * kPairRow * kSlice + pair % kSlice * width);
 #pragma unroll
-    for (int a = 0; a < 4; ++a) to[a] = __ldg(from + a / width * width * kSlice + a % width);
+    for (int a = 0; a < kPairRow; ++a) to[a] = __ldg(from + a / width * width * kSlice + a % width);
   }
   __device__ __forceinline__ bool moves(int vertex) const { return active >> vertex & 1; }
 };
@@ -136,17 +133,20 @@ struct SceneStar {
   T* x_bar;
   int64_t scene;
   int vertex, first, count;
-  T mu, lam;
+  T material[kMaterialScalars];  // of all tets, where they share it
 
   __device__ __forceinline__ SceneStar(const StepInputs<T>& in, const StepAdjoints<T>* out, const GroupPlan& plan,
                                        const Visits<T>& list, const T* x, T* x_bar, int64_t scene)
-      : in(in), out(out), plan(plan), list(list), x(x), x_bar(x_bar), scene(scene), mu(T(0)), lam(T(0)) {
-    if (in.mu.data && in.mu.item == 0) mu = __ldg(in.mu.data + scene * in.mu.scene);
-    if (in.lam.data && in.lam.item == 0) lam = __ldg(in.lam.data + scene * in.lam.scene);
+      : in(in), out(out), plan(plan), list(list), x(x), x_bar(x_bar), scene(scene) {
+#pragma unroll
+    for (int m = 0; m < kMaterialScalars; ++m) {
+      const Batched<const T>& given = in.material[m];
+      material[m] = given.data && given.item == 0 ? __ldg(given.data + scene * given.scene) : T(0);
+    }
   }
   __device__ __forceinline__ int go_to(int rank) {
     const int2 v = list.visit[rank];
-    count = v.x >> kLocalBits;
+    count = in.rest.data ? v.x >> kLocalBits : 0;
     first = v.y;
     vertex = v.x & kMaxDegree;
     return vertex;
@@ -156,7 +156,10 @@ struct SceneStar {
   __device__ __forceinline__ void total(R&...) const {}
   __device__ __forceinline__ bool any(bool condition) const { return condition; }
   __device__ __forceinline__ void rewind() const {}
-  __device__ __forceinline__ void adopt(const SceneStar& a) const { mu_bar = a.mu_bar, lam_bar = a.lam_bar; }
+  __device__ __forceinline__ void adopt(const SceneStar& a) const {
+#pragma unroll
+    for (int m = 0; m < kMaterialScalars; ++m) material_bar[m] = a.material_bar[m];
+  }
   // A block may come without its y (scene_reverse.cuh), which the few uneven ones fetch.
   __device__ __forceinline__ Vec3<T> predictor(const Block<T>& b) const {
     const auto load = [&](const Batched<const T>& t, int c) { return __ldg(t.data + scene * t.scene + c); };
@@ -182,21 +185,25 @@ struct SceneStar {
     p.xj = at(row.x);
     p.xk = at(row.y);
     p.xl = at(row.z);
-    p.mu = mu;
-    p.lam = lam;
-    const Pack<T>* shared = reinterpret_cast<const Pack<T>*>(list.rest + 4 * (first + e));
-    T rest[4];
 #pragma unroll
-    for (int a = 0; a < 4; ++a) rest[a] = shared[a / Pack<T>::size].v[a % Pack<T>::size];
+    for (int m = 0; m < kMaterialScalars; ++m) p.material[m] = material[m];
+    const Pack<T>* shared = reinterpret_cast<const Pack<T>*>(list.rest + kPairRow * (first + e));
+    T rest[kPairRow];
+#pragma unroll
+    for (int a = 0; a < kPairRow; ++a) rest[a] = shared[a / Pack<T>::size].v[a % Pack<T>::size];
     if constexpr (!common) {
       if (in.rest.scene != 0) {
         const int pair = __ldg(plan.visit_pair + 4 * (first + e) + 2);
         Visits<T>::load_rest(in.rest.data + scene * in.rest.scene, pair, rest);
       }
-      if (in.mu.item != 0) p.mu = __ldg(in.mu.data + scene * in.mu.scene + row.w);
-      if (in.lam.item != 0) p.lam = __ldg(in.lam.data + scene * in.lam.scene + row.w);
+#pragma unroll
+      for (int m = 0; m < kMaterialScalars; ++m) {
+        const Batched<const T>& given = in.material[m];
+        if (given.item != 0) p.material[m] = __ldg(given.data + scene * given.scene + row.w);
+      }
     }
-    p.k_ij = rest[0], p.k_ik = rest[1], p.k_il = rest[2], p.c6 = rest[3];
+#pragma unroll
+    for (int a = 0; a < kPairRest; ++a) p.rest[a] = rest[a];
     return p;
   }
   __device__ __forceinline__ void send(int offset, const Vec3<T>& v) const {
@@ -205,34 +212,37 @@ struct SceneStar {
     to[kColumn] += v.y;
     to[2 * kColumn] += v.z;
   }
+  __device__ __forceinline__ const SceneStar& local() const { return *this; }  // it has sums
+  template <class Law, int wanted>
+  __device__ __forceinline__ Vec3<T> reverse_tets(const Reversed<T>& update) const {
+    return diffvbd::reverse_tets<Law, wanted>(*this, update);
+  }
   template <int wanted>
-  __device__ __forceinline__ void add(int e, const TetPairAdjoint<T>& a) const {
+  __device__ static constexpr bool wants(int what) {
+    return (wanted & what) != 0;
+  }
+  __device__ __forceinline__ void add(int e, const TetAdjoint<T>& a) const {
     const int4 row = list.pair[first + e];
     send(row.x, a.xj);
     send(row.y, a.xk);
     send(row.z, a.xl);
-    if constexpr ((wanted & kMaterial) != 0) {
-      mu_bar += a.mu;
-      lam_bar += a.lam;
-      if (!common && out->mu && (in.mu.item != 0 || in.lam.item != 0)) {
-        out->mu[scene * plan.num_tets + row.w] += a.mu;
-        out->lam[scene * plan.num_tets + row.w] += a.lam;
-      }
-    }
-    if constexpr ((wanted & kRest) != 0) {
-      const int own = __ldg(plan.visit_pair + 4 * (first + e) + 3);
-      T* r = out->rest + (scene * plan.num_tets + row.w) * kRestScalars;
-      r[weight_index(own, other_corner(own, 0))] += a.k_ij;
-      r[weight_index(own, other_corner(own, 1))] += a.k_ik;
-      r[weight_index(own, other_corner(own, 2))] += a.k_il;
-      r[kRestScalars - 1] += a.c6;
+  }
+  __device__ __forceinline__ void add_material(int e, const T* bar) const {
+#pragma unroll
+    for (int m = 0; m < kMaterialScalars; ++m) material_bar[m] += bar[m];
+    if (!common && out->material[0] && !one_for_items(in.material)) {
+      const int64_t tet = scene * plan.num_tets + list.pair[first + e].w;
+#pragma unroll
+      for (int m = 0; m < kMaterialScalars; ++m) out->material[m][tet] += bar[m];
     }
   }
-  template <int wanted>
-  __device__ static constexpr int asked() {
-    return wanted;
+  __device__ __forceinline__ void add_rest(int e, const T* bar) const {
+    const int own = __ldg(plan.visit_pair + 4 * (first + e) + 3);
+    T* to = out->rest + (scene * plan.num_tets + list.pair[first + e].w) * kRestScalars;
+#pragma unroll
+    for (int a = 0; a < kPairRest; ++a) to[TetLayout::rest_index(own, a)] += bar[a];
   }
-  mutable T mu_bar = T(0), lam_bar = T(0);
+  mutable T material_bar[kMaterialScalars] = {};
 };
 
 // y is null where nothing depends on it.
@@ -308,8 +318,8 @@ __device__ __forceinline__ void load_start(const StepInputs<T>& in, const GroupP
         if (list.moves(item / 3)) {
           const T* a = in.acceleration.data + scene * in.acceleration.scene;
           value = value + h * state.second + (h * h) * __ldg(a + (in.acceleration.item ? item : item % 3));
-        } else if (in.held.data) {
-          value = in.held.data[scene * in.held.scene + item];
+        } else if (in.prescribed.data) {
+          value = in.prescribed.data[scene * in.prescribed.scene + item];
         }
         if (y) y[to] = value;
         if (x) x[to] = value;
@@ -318,7 +328,7 @@ __device__ __forceinline__ void load_start(const StepInputs<T>& in, const GroupP
 
 template <class T>
 bool is_common(const StepInputs<T>& in) {
-  return in.rest.scene == 0 && in.mu.item == 0 && in.lam.item == 0;
+  return in.rest.scene == 0 && one_for_items(in.material);
 }
 
 // One launch: as many blocks as the device holds, each going on until all scenes are done.

@@ -102,7 +102,7 @@ cudaError_t run_scene_forward(const HostPlan& host, const StepInputs<T>& in, con
   const auto usual = is_common(in) ? pick_scene_forward<T, true, UsualVariant>(index, sets)
                                    : pick_scene_forward<T, false, UsualVariant>(index, sets);
   const auto error = launch_scenes(usual, arguments, in, plan, 2, choice, stream);
-  if (error != cudaSuccess || !may_be_rare(in.energies)) return error;
+  if (error != cudaSuccess) return error;
   const auto again = is_common(in) ? pick_scene_forward<T, true, RareVariant>(index, sets)
                                    : pick_scene_forward<T, false, RareVariant>(index, sets);
   return launch_scenes(again, arguments, in, plan, 2, choice, stream);

@@ -70,9 +70,9 @@ struct ReverseVisits {
         if (!visit(start, rank, last, now)) break;
       }
     }
-    if (left == 0 && out.mu && in.mu.item == 0 && in.lam.item == 0) {
-      out.mu[scene] = star.mu_bar;
-      out.lam[scene] = star.lam_bar;
+    if (left == 0 && out.material[0] && one_for_items(in.material)) {
+#pragma unroll
+      for (int m = 0; m < kMaterialScalars; ++m) out.material[m][scene] = star.material_bar[m];
     }
     return left;
   }
@@ -118,7 +118,7 @@ __device__ void clear_scene(const StepInputs<T>& in, const StepAdjoints<T>& out,
   };
   clear(out.mass, plan.num_vertices);
   clear(out.x_prev, 3 * int64_t{plan.num_vertices});
-  if (in.mu.item != 0 || in.lam.item != 0) clear(out.mu, plan.num_tets), clear(out.lam, plan.num_tets);
+  for (int m = 0; !one_for_items(in.material) && m < kMaterialScalars; ++m) clear(out.material[m], plan.num_tets);
   clear(out.rest, int64_t{plan.num_tets} * kRestScalars);
   clear(out.data, in.data_size);
 }
@@ -176,12 +176,12 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
             out.y[to] = moved_y;
             return;
           }
-          const bool pinned = !list.moves(from / kColumn / 3), held = pinned && in.held.data != nullptr;
+          const bool pinned = !list.moves(from / kColumn / 3), follows = pinned && in.prescribed.data != nullptr;
           const T all = begin + moved_y;
-          if (out.x) out.x[to] = (held ? T(0) : all) - of_velocity;
+          if (out.x) out.x[to] = (follows ? T(0) : all) - of_velocity;
           if (out.v) out.v[to] = pinned ? T(0) : h * all;
           if (out.acceleration) out.acceleration[to] = pinned ? T(0) : h * h * all;
-          if (out.held) out.held[to] = held ? all : T(0);
+          if (out.prescribed) out.prescribed[to] = follows ? all : T(0);
         });
     __syncwarp();
   }
@@ -190,12 +190,10 @@ __global__ void __launch_bounds__(kMaxSceneThreads, 3)
 template <class T>
 using SceneReverse = void (*)(StepInputs<T>, const T*, const T*, StepAdjoints<T>, GroupPlan, uint8_t*);
 
-constexpr int useful(int mask, int wanted) { return (mask & 3) == 0 ? kState : wanted; }
-
 template <class T, template <int> class Variant, int wanted, bool common, int... n>
 SceneReverse<T> pick_scene_reverse(int index, std::integer_sequence<int, n...>) {
   static constexpr SceneReverse<T> table[kFreeSets] = {
-      scene_reverse<T, typename Variant<free_mask(n)>::Set, useful(free_mask(n), wanted), common>...};
+      scene_reverse<T, typename Variant<free_mask(n)>::Set, wanted, common>...};
   return table[index];
 }
 template <class T, template <int> class Variant, bool common>
@@ -218,11 +216,12 @@ cudaError_t run_scene_reverse(const HostPlan& host, const StepInputs<T>& in, con
   const auto clear = [&](T* p, int64_t per_scene) {
     return p ? cudaMemsetAsync(p, 0, in.scenes * per_scene * sizeof(T), stream) : cudaSuccess;
   };
-  const bool per_tet = in.mu.item != 0 || in.lam.item != 0;
+  const bool per_tet = !one_for_items(in.material);
   if (auto error = clear(out.mass, plan.num_vertices)) return error;
   if (auto error = clear(out.x_prev, 3 * int64_t{plan.num_vertices})) return error;
-  if (auto error = clear(per_tet ? out.mu : nullptr, plan.num_tets)) return error;
-  if (auto error = clear(per_tet ? out.lam : nullptr, plan.num_tets)) return error;
+  for (T* material : out.material) {
+    if (auto error = clear(per_tet ? material : nullptr, plan.num_tets)) return error;
+  }
   if (auto error = clear(out.rest, int64_t{plan.num_tets} * kRestScalars)) return error;
   if (auto error = clear(out.data, in.data_size)) return error;
   const int tiles = reads_y(out, in.tape_policy, any_filter(in.energies, VertexEnergies{})) ? 4 : 3;
@@ -233,7 +232,7 @@ cudaError_t run_scene_reverse(const HostPlan& host, const StepInputs<T>& in, con
   const auto usual = is_common(in) ? pick_scene_reverse<T, UsualVariant, true>(in.energies, choice.wanted)
                                    : pick_scene_reverse<T, UsualVariant, false>(in.energies, choice.wanted);
   const auto error = launch_scenes(usual, arguments, in, plan, tiles, choice, stream);
-  if (error != cudaSuccess || !may_be_rare(in.energies)) return error;
+  if (error != cudaSuccess) return error;
   const auto again = is_common(in) ? pick_scene_reverse<T, RareVariant, true>(in.energies, choice.wanted)
                                    : pick_scene_reverse<T, RareVariant, false>(in.energies, choice.wanted);
   return launch_scenes(again, arguments, in, plan, tiles, choice, stream);

@@ -10,6 +10,9 @@
 
 namespace diffvbd::cuda {
 
+// Scalars of a pair's rest shape in memory: a whole number of the widest loads.
+constexpr int kPairRow = (kPairRest + 3) / 4 * 4;
+
 // How the sweeps of a step are spread over the device (docs/performance.md).
 enum Regime {
   kThread = 1,  // a scene per thread, a step per launch
@@ -21,21 +24,23 @@ enum Regime {
 // A step in the user's numbering.
 template <class T>
 struct StepInputs {
+  using Scalar = T;
   int64_t scenes;
   Batched<const T> x_start, x_prev, y, origin;  // [B, V, 3]; origin may be null
-  Batched<const T> mu, lam;                     // [B, T] or one value for a scene (item 0)
+  Batched<const T> material[kMaterialScalars];  // [B, T] or one value for a scene (item 0)
   Batched<const T> mass;                        // [B, V]
-  Batched<const T> rest;                        // [B, slots, 4 / pack, kSlice, pack], see pack_rest
+  Batched<const T> rest;                        // [B, slots, kPairRow / pack, kSlice, pack], see pack_rest
   Batched<const T> data;                        // [B, N]
   int energies;                                 // mask, see energies.h
   int data_count[kVertexEnergies];
   int64_t data_size;  // N
   StepParameters<T> parameters;
   int sweeps, tape_policy;
-  // A fused step has these in place of x_start and y, which are then the predictor (pinned vertices: `held`, or where
-  // x_prev has them), and returns velocities.
+  // A fused step has these in place of x_start and y, which are then the predictor (pinned vertices: `prescribed`, or
+  // where x_prev has them), and returns velocities.
   bool fused;
-  Batched<const T> v, acceleration, held;    // [B, V, 3]; acceleration also [B, 1, 3] (item 0); held may be null
+  Batched<const T> v, acceleration,
+      prescribed;                            // [B, V, 3]; acceleration also [B, 1, 3] (item 0); prescribed may be null
   const contact::ContactInputs<T>* contact;  // on the host; null without contact
 };
 
@@ -48,10 +53,12 @@ struct StepOutputs {
 
 template <class T>
 struct StepAdjoints {
-  const T *x_bar, *v_bar;            // of the outputs; v_bar only of a fused step, either may be null there
-  T *x_start, *x_prev, *y;           // [B, V, 3]
-  T *mu, *lam, *mass, *rest, *data;  // [B, 1 | T], [B, 1 | T], [B, V], [B, T, 7], [B, N]; null where not wanted
-  T *x, *v, *acceleration, *held;    // of a fused step, null where not wanted
+  using Scalar = T;
+  const T *x_bar, *v_bar;                        // of the outputs; v_bar only of a fused step, either may be null there
+  T *x_start, *x_prev, *y;                       // [B, V, 3]
+  T* material[kMaterialScalars];                 // [B, 1 | T] each; null where not wanted, as below
+  T *mass, *rest, *data;                         // [B, V], [B, T, kRestScalars], [B, N]
+  T *x, *v, *acceleration, *prescribed;          // of a fused step, null where not wanted
   const contact::ContactAdjoints<T>* contact;    // on the host; with contact
   T *bounds, *collider, *collider_prev, *kappa;  // [B, V, 4], [B, Vc, 3], [B, Vc, 3], [B] with contact
 };
@@ -62,12 +69,13 @@ struct Workspace {
   T *x, *x_bar, *rows;                          // [positions, 4], [positions, 4], [edge_slots kSlice + 1, 4]
   T *y, *x_prev, *origin, *y_bar, *x_prev_bar;  // [blocks, 3, kSlice]
   T *mass, *mass_bar;                           // [positions]
-  T *material, *material_bar;  // [slots, kSlice, 2]; the bar [positions, 2] if a scene has one material
-  T* rest_bar;                 // [slots, kSlice, 4]
-  T* data_bar;                 // [scalars, positions]
-  T* contact;                  // [positions, kContactRecord]: the pairs' part of the block, and the bound
-  T *turn, *bound_bar;         // [positions, 6]: p and d_raw of the latest reversed update; [positions, 4]
-  int32_t* position;           // [V] with contact: where a vertex stands in sweep order
+  T *material,
+      *material_bar;    // [slots, kSlice, kMaterialScalars]; the bar [positions, ...] if a scene has one material
+  T* rest_bar;          // [slots, kSlice, kPairRest]
+  T* data_bar;          // [scalars, positions]
+  T* contact;           // [positions, kContactRecord]: the pairs' part of the block, and the bound
+  T *turn, *bound_bar;  // [positions, 6]: p and d_raw of the latest reversed update; [positions, 4]
+  int32_t* position;    // [V] with contact: where a vertex stands in sweep order
 };
 constexpr int kContactRecord = 16;
 
@@ -80,9 +88,10 @@ struct StepView {
   int degree, valence;  // largest number of neighbours and of pairs
   StepParameters<T> parameters;
   int sweeps, tape_policy;
-  bool one_material;  // mu and lam below; else w.material
+  bool one_material;  // `material` below; else w.material
+  bool has_tets;      // whether they have an energy
   bool own;           // whether a block has its scene to itself
-  Batched<const T> mass, rest, mu, lam, data;
+  Batched<const T> mass, rest, data, material[kMaterialScalars];
   int64_t material_scene;
   int64_t data_start[kVertexEnergies];
   int data_count[kVertexEnergies], data_row[kVertexEnergies];
@@ -117,8 +126,8 @@ DIFFVBD_FN constexpr bool gathers(int lanes) { return lanes > kFewLanes; }
 // The kernels of a scene's energies for `lanes` threads per vertex.
 template <class T>
 SweepKernel<T> forward_kernel(int energies, int lanes);
-template <class T, int wanted>
-SweepKernel<T> reverse_kernel(int energies, int lanes);
+template <class T, int wanted, int lanes>
+SweepKernel<T> reverse_kernel(int energies);
 
 // scalars of shared memory that a warp needs, for stars of up to `degree` neighbours and `valence` pairs
 DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int lanes, bool reverse) {

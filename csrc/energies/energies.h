@@ -27,22 +27,30 @@ constexpr int kVertexEnergies = VertexEnergies::size;
 // Twins stand in diffvbd/mask.py.
 enum ElasticBits { kExactBlock = 1, kPaperBlock = 2 };
 constexpr int kContact = 4;
+using TetLaw = StableNeoHookean<true>;  // of the energy and the shape at rest; the two blocks have one potential
 constexpr int kFirstVertexBit = 3;
 
 // The compiled variants are numbered (elastic, the bits above): mask of the n-th, and back; and of those without
-// contact.
-constexpr int kElasticVariants = 3;                                     // none, exact, paper
+// contact. A scene without an elastic energy runs the first, with no tet in any star.
+constexpr int kElasticVariants = 2;                                     // exact, paper
 constexpr int kFreeSets = kElasticVariants << kVertexEnergies;          // without contact
 constexpr int kEnergySets = kElasticVariants << (kVertexEnergies + 1);  // and with it
 #ifdef DIFFVBD_ONE_VARIANT  // everything at once, for all sets: tells whether the sources compile, and runs nothing
 constexpr int energy_mask(int) { return kExactBlock | kContact | ((1 << kVertexEnergies) - 1) << kFirstVertexBit; }
 constexpr int free_mask(int) { return energy_mask(0) & ~kContact; }
 #else
-constexpr int energy_mask(int n) { return n % kElasticVariants + (n / kElasticVariants) * kContact; }
-constexpr int free_mask(int n) { return n % kElasticVariants + (n / kElasticVariants << kFirstVertexBit); }
+constexpr int energy_mask(int n) { return 1 + n % kElasticVariants + (n / kElasticVariants) * kContact; }
+constexpr int free_mask(int n) { return 1 + n % kElasticVariants + (n / kElasticVariants << kFirstVertexBit); }
 #endif
-constexpr int energy_index(int mask) { return (mask & 3) + mask / kContact * kElasticVariants; }
-constexpr int free_index(int mask) { return (mask & 3) + (mask >> kFirstVertexBit) * kElasticVariants; }
+constexpr int elastic_index(int mask) { return (mask & kPaperBlock) != 0 ? 1 : 0; }
+constexpr int energy_index(int mask) { return elastic_index(mask) + mask / kContact * kElasticVariants; }
+constexpr int free_index(int mask) { return elastic_index(mask) + (mask >> kFirstVertexBit) * kElasticVariants; }
+// A quick build, for work on an energy (docs/extending.md), leaves out the paper's block.
+#ifdef DIFFVBD_QUICK
+constexpr bool is_compiled(int mask) { return (mask & kPaperBlock) == 0; }
+#else
+constexpr bool is_compiled(int) { return true; }
+#endif
 // Bits of the energies that are rare. The CPU compiles them into every variant, where an absent one is a loop of no
 // turns: variants then double with hot energies alone.
 template <class... E>
@@ -96,7 +104,6 @@ struct EnergySet {
   static constexpr bool usual = false;
   static constexpr bool contact = (mask & kContact) != 0;
   static constexpr bool of_vertices = (mask >> kFirstVertexBit) != 0;
-  static constexpr bool elastic = (mask & (kExactBlock | kPaperBlock)) != 0;
   using Elastic = StableNeoHookean<(mask & kExactBlock) != 0>;
 
   // calls f(energy, its position in the list) for each energy of one vertex that is present
@@ -190,7 +197,7 @@ struct DualAdjoint {
   DIFFVBD_FN void lift(Dual<R>* values) const {
     for (int i = 0; i < E::stride; ++i) values[i] = Dual<R>(record[i]);
   }
-  DIFFVBD_COLD void subtract_from(Vec3<R>& bar, Vec3<Dual<R>> VertexState<Dual<R>>::* which) const {
+  DIFFVBD_APART void subtract_from(Vec3<R>& bar, Vec3<Dual<R>> VertexState<Dual<R>>::* which) const {
     Dual<R> values[E::stride];
     lift(values);
     R* out[3] = {&bar.x, &bar.y, &bar.z};
@@ -203,6 +210,24 @@ struct DualAdjoint {
   }
 };
 
+// -d phi / d(x, x_prev), derived from block() by dual numbers: out of line, and for copies of what the update works
+// with, which would leave its registers for the address of one that is seldom there.
+template <class R>
+struct DerivedAdjoint {
+  Vec3<R> x, x_prev;
+};
+template <class E, class R>
+DIFFVBD_APART DerivedAdjoint<R> derived_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
+                                            const Vec3<R>& d_raw) {
+  DerivedAdjoint<R> out{zero3<R>(), zero3<R>()};
+  for (int k = 0; k < count; k += E::stride) {
+    const DualAdjoint<E, R> adjoint{s, data + k, p, d_raw};
+    adjoint.subtract_from(out.x, &VertexState<Dual<R>>::x);
+    if constexpr (E::reads_x_prev) adjoint.subtract_from(out.x_prev, &VertexState<Dual<R>>::x_prev);
+  }
+  return out;
+}
+
 // x_bar, x_prev_bar -= d phi / d(x, x_prev)
 template <class E, class R, class Planes = NoFrame<R>>
 DIFFVBD_FN void vertex_energy_vjp(const VertexState<R>& s, const R* data, int count, const Vec3<R>& p,
@@ -212,20 +237,20 @@ DIFFVBD_FN void vertex_energy_vjp(const VertexState<R>& s, const R* data, int co
     E::block_vjp(s, data, count, p, d_raw, x_bar, x_prev_bar, planes.axes);
   } else if constexpr (has_block_vjp<E>::value) {
     E::block_vjp(s, data, count, p, d_raw, x_bar, x_prev_bar);
-  } else {
-    for (int k = 0; k < count; k += E::stride) {
-      const DualAdjoint<E, R> adjoint{s, data + k, p, d_raw};
-      adjoint.subtract_from(x_bar, &VertexState<Dual<R>>::x);
-      if constexpr (E::reads_x_prev) adjoint.subtract_from(x_prev_bar, &VertexState<Dual<R>>::x_prev);
-    }
+  } else if (count > 0) {
+    const VertexState<R> s_copy = s;
+    const Vec3<R> p_copy = p, d_copy = d_raw;
+    const DerivedAdjoint<R> bar = derived_vjp<E>(s_copy, data, count, p_copy, d_copy);
+    x_bar += bar.x;
+    if constexpr (E::reads_x_prev) x_prev_bar += bar.x_prev;
   }
 }
 
 // data_bar[i] = alpha_bar d alpha / d data_i - d phi / d data_i for one record; binds = 1 if it set alpha, else 0
 template <class E, class R, class T, class Planes>
-DIFFVBD_COLD void record_vjp(const VertexState<R>& s, const R* record, const Vec3<R>& p, const Vec3<R>& d_raw,
-                             const Vec3<R>& step, const StepParameters<T>& q, const R& binds, const R& alpha_bar,
-                             const Planes& planes, R* data_bar) {
+DIFFVBD_APART void record_vjp(const VertexState<R>& s, const R* record, const Vec3<R>& p, const Vec3<R>& d_raw,
+                              const Vec3<R>& step, const StepParameters<T>& q, const R& binds, const R& alpha_bar,
+                              const Planes& planes, R* data_bar) {
   const DualAdjoint<E, R, Planes> adjoint{s, record, p, d_raw, planes};
   Dual<R> values[E::stride];
   adjoint.lift(values);

@@ -86,7 +86,9 @@ struct FloorBarrier {
   DIFFVBD_FN static Frame<R> frame(const VertexState<R>& s, const R* data, int count) {
     const R oblique = slant(s, data, count);
     if (!any(R(0) < oblique)) return Frame<R>::none();
-    return turned<T>(s, data, count, oblique);
+    const VertexState<R> s_copy = s;
+    const R oblique_copy = oblique;
+    return turned<T>(s_copy, data, count, oblique_copy);
   }
   template <class T, class R>
   DIFFVBD_COLD static Frame<R> turned(const VertexState<R>& s, const R* data, int count, const R& oblique) {

@@ -8,44 +8,62 @@
 // Every sum below still lacks the factor h^2, which the vertex applies once.
 #pragma once
 
-#include "../core/vec.h"
+#include <limits>
+
+#include "tet.h"
 
 namespace diffvbd {
 
-// One (vertex, tet) pair as its vertex sees it; (j, i, k, l) is an even permutation of the tet.
-template <class R>
-struct TetPair {
-  Vec3<R> xj, xk, xl;
-  R k_ij, k_ik, k_il, c6;
-  R mu, lam;
-};
-
-// What one reversed update adds to the adjoints of a pair's inputs (each with the sign and h^2 already applied).
-template <class R>
-struct TetPairAdjoint {
-  Vec3<R> xi, xj, xk, xl;
-  R mu, lam;
-  R k_ij, k_ik, k_il, c6;
-};
-
-// Which adjoints beyond the state are wanted: those that a variant is compiled for, and of them those asked for.
-enum Wanted { kState = 0, kMaterial = 1, kRest = 2 };
-
 template <bool Exact>
 struct StableNeoHookean {
+  // The material of a tet: mu, lam [Pa].
+  template <class R>
+  DIFFVBD_FN static const R& mu(const TetPair<R>& e) {
+    return e.material[0];
+  }
+  template <class R>
+  DIFFVBD_FN static const R& lam(const TetPair<R>& e) {
+    return e.material[1];
+  }
+  // what is expected of the scalar `which` of a material, if it is not met, or null
+  template <class T>
+  static const char* invalid(const T* material, int which) {
+    const T mu = material[0], lam = material[1], most = std::numeric_limits<T>::max();
+    if (which == 0) return mu >= 0 && mu <= most ? nullptr : "mu: expected finite values >= 0 Pa";
+    if (Exact) return lam + mu >= 0 && lam <= most ? nullptr : "lam: expected finite values with mu + lam >= 0 Pa";
+    return lam >= 0 && lam <= most ? nullptr : "lam: expected finite values >= 0 Pa with block=\"paper\"";
+  }
+  // Its rest shape as the vertex sees it: k_ij, k_ik, k_il [m], c6 [1/m^3].
+  template <class R>
+  DIFFVBD_FN static const R& k_ij(const TetPair<R>& e) {
+    return e.rest[0];
+  }
+  template <class R>
+  DIFFVBD_FN static const R& k_ik(const TetPair<R>& e) {
+    return e.rest[1];
+  }
+  template <class R>
+  DIFFVBD_FN static const R& k_il(const TetPair<R>& e) {
+    return e.rest[2];
+  }
+  template <class R>
+  DIFFVBD_FN static const R& c6(const TetPair<R>& e) {
+    return e.rest[3];
+  }
+
   // g += dE/dx_i / h^2, and the block mu k I + (lh c6 / 6) n n^T; lh = lam + mu is the exact block, lam the paper's.
   template <class R>
   DIFFVBD_FN static void block(const TetPair<R>& e, const Vec3<R>& xi, Vec3<R>& g, R& h_diagonal, Sym3<R>& h_outer) {
     const R sixth = R(1) / R(6);
     const Vec3<R> ek = e.xk - e.xj, el = e.xl - e.xj, d = xi - e.xj;
     const Vec3<R> n = cross(ek, el);
-    const R j_minus_1 = e.c6 * dot(n, d) - R(1);
-    const R lb = e.mu + e.lam;
-    const R a = sixth * (lb * j_minus_1 - e.mu);
-    const Vec3<R> stretch = e.k_ik * (ek - d) + e.k_il * (el - d) - e.k_ij * d;
-    g += e.mu * stretch + a * n;
-    h_diagonal = h_diagonal - e.mu * (e.k_ij + e.k_ik + e.k_il);
-    add_outer(h_outer, sixth * e.c6 * (Exact ? lb : e.lam), n);
+    const R j_minus_1 = c6(e) * dot(n, d) - R(1);
+    const R lb = mu(e) + lam(e);
+    const R a = sixth * (lb * j_minus_1 - mu(e));
+    const Vec3<R> stretch = k_ik(e) * (ek - d) + k_il(e) * (el - d) - k_ij(e) * d;
+    g += mu(e) * stretch + a * n;
+    h_diagonal = h_diagonal - mu(e) * (k_ij(e) + k_ik(e) + k_il(e));
+    add_outer(h_outer, sixth * c6(e) * (Exact ? lb : lam(e)), n);
   }
 
   // A tet as the adjoint of an update of x_i sees it. With the exact block g + H d_raw is g at x_i + d_raw, so the
@@ -62,69 +80,93 @@ struct StableNeoHookean {
     const Vec3<R> at = Exact ? xi + d_raw : xi;
     const Vec3<R> ek = e.xk - e.xj, el = e.xl - e.xj, d = at - e.xj;
     const Vec3<R> n = cross(ek, el);
-    const R strain = e.c6 * dot(n, d) - R(1);
-    return {ek, el, d, n, dot(n, p), strain, Exact ? strain : strain + e.c6 * dot(n, d_raw)};
+    const R strain = c6(e) * dot(n, d) - R(1);
+    return {ek, el, d, n, dot(n, p), strain, Exact ? strain : strain + c6(e) * dot(n, d_raw)};
   }
   // 6 V times the factor of q in the gradient at x_i + d_raw
   template <class R>
   DIFFVBD_FN static R stress(const TetPair<R>& e, const View<R>& v) {
-    if constexpr (Exact) return (e.mu + e.lam) * v.after - e.mu;
-    return e.lam * v.after + e.mu * v.strain - e.mu;
+    if constexpr (Exact) return (mu(e) + lam(e)) * v.after - mu(e);
+    return lam(e) * v.after + mu(e) * v.strain - mu(e);
   }
 
-  // The adjoint of p . (g + H d_raw) times -h^2 (method.md, section 3; paper, eqs. 7-12, 14-15).
-  template <int wanted, class R>
-  DIFFVBD_FN static TetPairAdjoint<R> block_vjp(const TetPair<R>& e, const Vec3<R>& xi, const Vec3<R>& d_raw,
-                                                const Vec3<R>& p, const R& minus_h2, int asked = wanted) {
-    return view_vjp<wanted>(e, view(e, xi, d_raw, p), d_raw, p, minus_h2, asked);
-  }
-  template <int wanted, class R>
-  DIFFVBD_FN static TetPairAdjoint<R> view_vjp(const TetPair<R>& e, const View<R>& v, const Vec3<R>& d_raw,
-                                               const Vec3<R>& p, const R& minus_h2, int asked = wanted) {
-    const R sixth = R(1) / R(6);
-    const Vec3<R>&ek = v.ek, &el = v.el, &d = v.d, &n = v.n;
-    const R lb = e.mu + e.lam, n_p = v.n_p;
+  // The adjoint of p . (g + H d_raw) times -h^2 (method.md, section 3; paper, eqs. 7-12, 14-15): of the corners, of the
+  // material, of the rest shape.
+  template <class R>
+  DIFFVBD_FN static TetAdjoint<R> block_vjp(const TetPair<R>& e, const View<R>& v, const Vec3<R>& d_raw,
+                                            const Vec3<R>& p, const R& minus_h2) {
+    const R sixth = R(1) / R(6), lb = mu(e) + lam(e);
     const R b = sixth * minus_h2;
-    const R c6_n_p = e.c6 * n_p;
+    const R c6_n_p = c6(e) * v.n_p;
     const R along = b * lb * c6_n_p;
 
-    Vec3<R> u = b * stress(e, v) * p + along * d;
-    if constexpr (!Exact) u += b * e.lam * c6_n_p * d_raw;
-    const R mu_h2 = minus_h2 * e.mu;
-    const Vec3<R> w = mu_h2 * p, cut = along * n;
+    Vec3<R> u = b * stress(e, v) * p + along * v.d;
+    if constexpr (!Exact) u += b * lam(e) * c6_n_p * d_raw;
+    const R mu_h2 = minus_h2 * mu(e);
+    const Vec3<R> w = mu_h2 * p, cut = along * v.n;
 
-    TetPairAdjoint<R> out{};
-    out.xk = e.k_ik * w + cross(el, u);
-    out.xl = e.k_il * w + cross(u, ek);
-    out.xi = cut - (e.k_ij + e.k_ik + e.k_il) * w;
+    TetAdjoint<R> out;
+    out.xk = k_ik(e) * w + cross(v.el, u);
+    out.xl = k_il(e) * w + cross(u, v.ek);
+    out.xi = cut - (k_ij(e) + k_ik(e) + k_il(e)) * w;
     // dE depends on differences of positions only: the four adjoints sum to zero.
     out.xj = -(out.xi + out.xk + out.xl);
-    const int more = wanted & asked;
-    if (more != 0) {
-      const R dj = -dot(d, p), dk = dot(ek - d, p), dl = dot(el - d, p);
-      if (more & kMaterial) {
-        R stretch = e.k_ij * dj + e.k_ik * dk + e.k_il * dl;
-        if constexpr (!Exact) stretch = stretch - (e.k_ij + e.k_ik + e.k_il) * dot(d_raw, p);
-        out.lam = b * v.after * n_p;
-        out.mu = minus_h2 * stretch + b * (v.strain - R(1)) * n_p;
-      }
-      if (more & kRest) {
-        const R tangent = Exact ? R(0) : dot(d_raw, p);
-        out.k_ij = mu_h2 * (dj - tangent);
-        out.k_ik = mu_h2 * (dk - tangent);
-        out.k_il = mu_h2 * (dl - tangent);
-        out.c6 = b * lb * n_p * dot(n, d);
-        if constexpr (!Exact) out.c6 = out.c6 + b * e.lam * n_p * dot(n, d_raw);
+    return out;
+  }
+  template <class R>
+  DIFFVBD_FN static void material_vjp(const TetPair<R>& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& p,
+                                      const R& minus_h2, R* material_bar) {
+    const R b = R(1) / R(6) * minus_h2;
+    const R dj = -dot(v.d, p), dk = dot(v.ek - v.d, p), dl = dot(v.el - v.d, p);
+    R stretch = k_ij(e) * dj + k_ik(e) * dk + k_il(e) * dl;
+    if constexpr (!Exact) stretch = stretch - (k_ij(e) + k_ik(e) + k_il(e)) * dot(d_raw, p);
+    material_bar[0] = minus_h2 * stretch + b * (v.strain - R(1)) * v.n_p;
+    material_bar[1] = b * v.after * v.n_p;
+  }
+  template <class R>
+  DIFFVBD_FN static void rest_vjp(const TetPair<R>& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& p,
+                                  const R& minus_h2, R* rest_bar) {
+    const R b = R(1) / R(6) * minus_h2, mu_h2 = minus_h2 * mu(e), lb = mu(e) + lam(e);
+    const R dj = -dot(v.d, p), dk = dot(v.ek - v.d, p), dl = dot(v.el - v.d, p);
+    const R tangent = Exact ? R(0) : dot(d_raw, p);
+    rest_bar[0] = mu_h2 * (dj - tangent);
+    rest_bar[1] = mu_h2 * (dk - tangent);
+    rest_bar[2] = mu_h2 * (dl - tangent);
+    rest_bar[3] = b * lb * v.n_p * dot(v.n, v.d);
+    if constexpr (!Exact) rest_bar[3] = rest_bar[3] + b * lam(e) * v.n_p * dot(v.n, d_raw);
+  }
+
+  // The energy of a tet [J] from its four corners, up to a constant.
+  template <class R>
+  DIFFVBD_FN static R value(const Vec3<R> (&x)[4], const R* rest, const R* material) {
+    const R mu = material[0], lam = material[1], c6 = rest[6];
+    R shear = R(0);
+    for (int a = 0; a < 4; ++a) {
+      for (int b = a + 1; b < 4; ++b) {
+        const Vec3<R> edge = x[b] - x[a];
+        shear = shear - rest[weight_index(a, b)] * dot(edge, edge);
       }
     }
-    return out;
+    const R strain = c6 * dot(x[1] - x[0], cross(x[2] - x[0], x[3] - x[0])) - R(1);
+    return R(0.5) * mu * shear + (R(0.5) * (mu + lam) * strain * strain - mu * strain) / (R(6) * c6);
+  }
+
+  // The stiffness of two corners at rest, per volume [Pa/m^2], from the gradients of their shape functions [1/m]: three
+  // rows of 2 mu eps : eps + lam tr(eps)^2. Positive semidefinite down to the least lam that a body can have.
+  template <class R>
+  DIFFVBD_FN static void rest_stiffness(const Vec3<R>& a, const Vec3<R>& b, const R* material, Vec3<R> (&rows)[3]) {
+    const R mu = material[0], least = R(-2) / R(3) * mu, lam = select(material[1] < least, least, material[1]);
+    const R both = mu * dot(a, b);
+    rows[0] = mu * b.x * a + lam * a.x * b + Vec3<R>{both, R(0), R(0)};
+    rows[1] = mu * b.y * a + lam * a.y * b + Vec3<R>{R(0), both, R(0)};
+    rows[2] = mu * b.z * a + lam * a.z * b + Vec3<R>{R(0), R(0), both};
   }
 
   // Adds what small parts of d_raw and p, kept apart, do to n . p and to the strain.
   template <class R>
   DIFFVBD_FN static void correct(const TetPair<R>& e, View<R>& v, const Vec3<R>& d_low, const Vec3<R>& p_low) {
     v.n_p = v.n_p + dot(v.n, p_low);
-    v.after = v.after + e.c6 * dot(v.n, d_low);
+    v.after = v.after + c6(e) * dot(v.n, d_low);
     if constexpr (Exact) v.strain = v.after;
   }
 
@@ -132,11 +174,11 @@ struct StableNeoHookean {
   template <class R>
   DIFFVBD_FN static void apply(const TetPair<R>& e, const View<R>& v, const Vec3<R>& d_raw, const Vec3<R>& p,
                                Vec3<R>& g_sum, Vec3<R>& p_sum) {
-    const R sixth = R(1) / R(6), k_ii = -(e.k_ij + e.k_ik + e.k_il);
-    Vec3<R> stretch = e.k_ik * (v.ek - v.d) + e.k_il * (v.el - v.d) - e.k_ij * v.d;
+    const R sixth = R(1) / R(6), k_ii = -(k_ij(e) + k_ik(e) + k_il(e));
+    Vec3<R> stretch = k_ik(e) * (v.ek - v.d) + k_il(e) * (v.el - v.d) - k_ij(e) * v.d;
     if constexpr (!Exact) stretch += k_ii * d_raw;
-    g_sum += e.mu * stretch + sixth * stress(e, v) * v.n;
-    p_sum += e.mu * k_ii * p + sixth * (Exact ? e.mu + e.lam : e.lam) * e.c6 * v.n_p * v.n;
+    g_sum += mu(e) * stretch + sixth * stress(e, v) * v.n;
+    p_sum += mu(e) * k_ii * p + sixth * (Exact ? mu(e) + lam(e) : lam(e)) * c6(e) * v.n_p * v.n;
   }
 };
 

@@ -15,10 +15,11 @@ using rigid::Body, rigid::kCorrected, rigid::put, rigid::Vector;
 
 template <class T>
 struct Inputs {
-  rigid::Inputs<T> bodies;                    // that are corrected: x is where they have coasted to, y the predictor
-  Batched<const T> x, v, acceleration, held;  // [B, V, 3]; acceleration also [B, 1, 3] (item 0); held may be null
-  const bool* pinned;                         // [V]
-  const uint8_t* falls;                       // [B, others]  with kLower: whether a body starts from y
+  rigid::Inputs<T> bodies;  // that are corrected: x is where they have coasted to, y the predictor
+  Batched<const T> x, v, acceleration,
+      prescribed;        // [B, V, 3]; acceleration also [B, 1, 3] (item 0); prescribed may be null
+  const bool* pinned;    // [V]
+  const uint8_t* falls;  // [B, others]  with kLower: whether a body starts from y
   int32_t others;
   int from;
   bool some_alone;  // whether some vertices are in no body that is corrected
@@ -48,7 +49,7 @@ struct Motion {
   DIFFVBD_FN Motion(const Inputs<T>& in, int64_t scene, int32_t v) : x(in.at(in.x, scene, v)) {
     const double h = in.bodies.time_step;
     if (in.pinned[v]) {
-      coasting = y = in.held.data ? in.at(in.held, scene, v) : x;
+      coasting = y = in.prescribed.data ? in.at(in.prescribed, scene, v) : x;
     } else {
       coasting = x + T(h) * in.at(in.v, scene, v);
       y = coasting + T(h * h) * in.at(in.acceleration, scene, v);
@@ -84,11 +85,11 @@ DIFFVBD_FN void choose_vertex(const Inputs<T>& in, T* x_start, const T* from_y, 
 
 template <class T>
 struct Adjoints {
-  const T *x_start, *y;      // of the outputs [B, V, 3]
-  T *x, *v;                  // [B, V, 3]
-  T *acceleration, *held;    // [B, V, 3], null where not wanted
-  T *mass, *planes;          // [B, V]; [B, V, scalars of planes], zero at first, null where not wanted
-  T *shared, *own, *x_prev;  // of a rigid correction's data, and scratch [B, V, 3]
+  const T *x_start, *y;          // of the outputs [B, V, 3]
+  T *x, *v;                      // [B, V, 3]
+  T *acceleration, *prescribed;  // [B, V, 3], null where not wanted
+  T *mass, *planes;              // [B, V]; [B, V, scalars of planes], zero at first, null where not wanted
+  T *shared, *own, *x_prev;      // of a rigid correction's data, and scratch [B, V, 3]
   int32_t shared_count, own_count;
 };
 
@@ -106,8 +107,8 @@ DIFFVBD_FN void reverse_vertex(const Inputs<T>& in, const Adjoints<T>& a, int64_
   };
   const Vec3<T> start_bar = vector_of(a.x_start, row), y_bar = vector_of(a.y, row), none = zero3<T>();
   if (in.pinned[v]) {
-    store(a.x, in.held.data ? none : start_bar + y_bar);
-    store(a.held, start_bar + y_bar);
+    store(a.x, in.prescribed.data ? none : start_bar + y_bar);
+    store(a.prescribed, start_bar + y_bar);
     store(a.v, none);
     store(a.acceleration, none);
     return;
@@ -122,7 +123,7 @@ DIFFVBD_FN void reverse_vertex(const Inputs<T>& in, const Adjoints<T>& a, int64_
                           (from_y ? m.y : m.coasting) - m.x, in.parameters, goal_bar, x_bar, planes);
   }
   store(a.x, x_bar);
-  store(a.held, none);
+  store(a.prescribed, none);
   store(a.v, T(h) * (goal_bar + y_bar));
   store(a.acceleration, T(h * h) * (from_y ? goal_bar + y_bar : y_bar));
 }
@@ -259,7 +260,7 @@ DIFFVBD_FN void reverse_body(const Inputs<T>& in, const Body<T>& b, const Team& 
     put(a.x + 3 * row, coasted + y_bar + (energies ? Body<T>::at(a.x_prev + 3 * row) : Vector{}));
     put(a.v + 3 * row, h * (share * coasted + y_bar));
     if (a.acceleration) put(a.acceleration + 3 * row, (h * h) * y_bar);
-    if (a.held) put(a.held + 3 * row, Vector{});
+    if (a.prescribed) put(a.prescribed + 3 * row, Vector{});
   });
   if constexpr (energies) {
     if (0 < share && share < 1) reverse_share(in, b, team, share, share_bar[0], a);

@@ -7,24 +7,11 @@ namespace diffvbd::start {
 
 template <class T>
 struct Candidates {
-  rigid::Inputs<T> bodies;         // x: one state; y the predictor
-  const T* other;                  // [B, V, 3]  the other state
-  const int32_t *tets, *tet_ptr;   // [listed tets, 5]: its number, its corners; [bodies + 1]
-  Batched<const T> mu, lam, rest;  // [B, T] or [B, 1] twice, [B, T, 7]; mu is null without an elastic energy
+  rigid::Inputs<T> bodies;                            // x: one state; y the predictor
+  const T* other;                                     // [B, V, 3]  the other state
+  const int32_t *tets, *tet_ptr;                      // [listed tets, 5]: its number, its corners; [bodies + 1]
+  Batched<const T> material[kMaterialScalars], rest;  // [B, T] or [B, 1] each, [B, T, kRestScalars]; null: no tets
 };
-
-// Energy of a tet over h^2, from its corners, weights k and c6 (stable_neo_hookean.h), up to a constant.
-DIFFVBD_FN double tet_energy(const rigid::Vector (&x)[4], const double* k, double mu, double lam) {
-  double shear = 0;
-  for (int a = 0; a < 4; ++a) {
-    for (int b = a + 1; b < 4; ++b) {
-      const rigid::Vector edge = x[b] - x[a];
-      shear -= k[weight_index(a, b)] * dot(edge, edge);
-    }
-  }
-  const double c6 = k[6], strain = c6 * dot(x[1] - x[0], cross(x[2] - x[0], x[3] - x[0])) - 1;
-  return 0.5 * mu * shear + (0.5 * (mu + lam) * strain * strain - mu * strain) / (6 * c6);
-}
 
 // By how much the potential of `other` lies above that of x.
 template <class T, class Team>
@@ -41,19 +28,20 @@ DIFFVBD_FN double rise(const Candidates<T>& in, const rigid::Body<T>& b, const T
       to[0] += E::value(b.state(v, two), data, count) - E::value(b.state(v, one), data, count);
     });
   });
-  if (in.mu.data == nullptr) return vertices[0];
+  if (in.rest.data == nullptr) return vertices[0];
   double tets[1];
   const int32_t first = in.tet_ptr[b.body];
   team.template sum<1>(in.tet_ptr[b.body + 1] - first, tets, [&](int32_t i, double* to) {
     const int32_t* tet = in.tets + 5 * int64_t{first + i};
     rigid::Vector one[4], two[4];
     for (int c = 0; c < 4; ++c) one[c] = b.position(tet[1 + c]), two[c] = other(tet[1 + c]);
-    double k[kRestScalars];
-    const T* rest = in.rest.data + b.scene * in.rest.scene + kRestScalars * int64_t{tet[0]};
-    for (int c = 0; c < kRestScalars; ++c) k[c] = rest[c];
-    const double mu = in.mu.data[b.scene * in.mu.scene + in.mu.item * tet[0]],
-                 lam = in.lam.data[b.scene * in.lam.scene + in.lam.item * tet[0]];
-    to[0] += tet_energy(two, k, mu, lam) - tet_energy(one, k, mu, lam);
+    double rest[kRestScalars], material[kMaterialScalars];
+    const T* of_tet = in.rest.data + b.scene * in.rest.scene + kRestScalars * int64_t{tet[0]};
+    for (int c = 0; c < kRestScalars; ++c) rest[c] = of_tet[c];
+    for (int m = 0; m < kMaterialScalars; ++m) {
+      material[m] = in.material[m].data[b.scene * in.material[m].scene + in.material[m].item * tet[0]];
+    }
+    to[0] += TetLaw::value(two, rest, material) - TetLaw::value(one, rest, material);
   });
   return vertices[0] + b.in.time_step * b.in.time_step * tets[0];
 }

@@ -95,17 +95,12 @@ DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const St
   const R h2 = R(q.time_step) * R(q.time_step);
   const R least = least_eigenvalue(b, q);
   System<Set, R> out{b.mass * (b.state.x - b.y), diagonal(least), Axes<Set, R>::none(), least};
-  if constexpr (Set::elastic && all) {
-    Vec3<R> g = zero3<R>();
-    R h_diagonal = R(0);
-    Sym3<R> h_outer = diagonal(R(0));
-    for (int e = 0; e < star.size(); ++e) {
-      Set::Elastic::block(star.pair(e), b.state.x, g, h_diagonal, h_outer);
-    }
-    star.total(g, h_diagonal, h_outer);
-    out.g += h2 * g;
-    add_diagonal(h_outer, h_diagonal);
-    const Sym3<R> scaled = h2 * h_outer;
+  if constexpr (all) {
+    TetSums<R> tets = sum_tets<typename Set::Elastic>(star, b.state.x);
+    star.total(tets.g, tets.h_diagonal, tets.h_outer);
+    out.g += h2 * tets.g;
+    add_diagonal(tets.h_outer, tets.h_diagonal);
+    const Sym3<R> scaled = h2 * tets.h_outer;
     out.H = {out.H.xx + scaled.xx, scaled.xy, scaled.xz, out.H.yy + scaled.yy, scaled.yz, out.H.zz + scaled.zz};
   }
   Set::for_each([&](auto energy, int k) {

@@ -62,19 +62,17 @@ DIFFVBD_COLD Applied<R> apply(const Block<R>& b, const Star& star, const StepPar
       }
     });
   }
-  if constexpr (Set::elastic) {
-    const R h2 = R(q.time_step) * R(q.time_step);
-    Vec3<R> g_sum = zero3<R>(), p_sum = zero3<R>();
-    star.rewind();
-    for (int e = 0; e < star.size(); ++e) {
-      const TetPair<R> pair = star.pair(e);
-      const auto view = view_of<typename Set::Elastic>(pair, b.state.x, d.mesh, p.mesh);
-      Set::Elastic::apply(pair, view, d.mesh, p.mesh, g_sum, p_sum);
-    }
-    star.total(g_sum, p_sum);
-    out.g += axes.to(h2 * g_sum);
-    out.p += axes.to(h2 * p_sum);
+  const R h2 = R(q.time_step) * R(q.time_step);
+  Vec3<R> g_sum = zero3<R>(), p_sum = zero3<R>();
+  star.rewind();
+  for (int e = 0; e < star.size(); ++e) {
+    const TetPair<R> pair = star.pair(e);
+    const auto view = view_of<typename Set::Elastic>(pair, b.state.x, d.mesh, p.mesh);
+    Set::Elastic::apply(pair, view, d.mesh, p.mesh, g_sum, p_sum);
   }
+  star.total(g_sum, p_sum);
+  out.g += axes.to(h2 * g_sum);
+  out.p += axes.to(h2 * p_sum);
   return out;
 }
 
@@ -117,21 +115,16 @@ DIFFVBD_COLD Vec3<R> reverse_star(const Block<R>& given, const Star& star, const
   const R rounding = R(std::numeric_limits<T>::epsilon()) * dot(b.state.x, b.state.x);
   d_low = if_small(-solve(H, left.g), dot(d_raw, d_raw) + rounding);
   Vec3<R> own = zero3<R>();
-  if constexpr (Set::elastic) {
-    const R h = R(q.time_step), minus_h2 = -(h * h);
-    const Vec3<R> d_low_mesh = axes.from(d_low), p_low_mesh = axes.from(if_small(solve(H, z - left.p), dot(p, p)));
-    star.rewind();
-    for (int e = 0; e < star.size(); ++e) {
-      const TetPair<R> pair = star.pair(e);
-      auto view = view_of<Elastic>(pair, b.state.x, d_raw, p_mesh);
-      Elastic::correct(pair, view, d_low_mesh, p_low_mesh);
-      const auto bar =
-          Elastic::template view_vjp<wanted>(pair, view, d_raw, p_mesh, minus_h2, star.template asked<wanted>());
-      own += bar.xi;
-      star.template add<wanted>(e, bar);
-    }
-    star.total(own);
+  const R h = R(q.time_step), minus_h2 = -(h * h);
+  const Vec3<R> d_low_mesh = axes.from(d_low), p_low_mesh = axes.from(if_small(solve(H, z - left.p), dot(p, p)));
+  star.rewind();
+  for (int e = 0; e < star.size(); ++e) {
+    const TetPair<R> pair = star.pair(e);
+    auto view = view_of<Elastic>(pair, b.state.x, d_raw, p_mesh);
+    Elastic::correct(pair, view, d_low_mesh, p_low_mesh);
+    reverse_tet<Elastic, wanted>(star, e, pair, view, d_raw, p_mesh, minus_h2, own);
   }
+  star.total(own);
   return own;
 }
 

@@ -20,7 +20,7 @@ DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const 
   const System<Set, R> system = assemble<Set>(b, star, q);
   const Factor<R> H = factor<T>(system.H, system.least);
   Vec3<R> d = -solve(H, system.g);
-  if constexpr (Set::elastic && !Set::usual) {
+  if constexpr (!Set::usual) {
     if (star.any(is_uneven<Set>(H, shared_entries<Set>(b, system.axes))))
       d = step_uneven<Set>(b, star, q, system.axes, H, d);
   }
@@ -30,8 +30,7 @@ DIFFVBD_FN NewtonStep<R> newton_step(const Block<R>& b, const Star& star, const 
 // Whether factors of the usual way are none to go on with: all threads that share a star must know.
 template <class Set, class R, class Star>
 DIFFVBD_FN bool is_rare(const Block<R>& b, const Star& star, const Factor<R>& H) {
-  if constexpr (Set::elastic) return star.any(is_uneven<Set>(H, shared_entries<Set>(b, NoFrame<R>{})));
-  return false;
+  return star.any(is_uneven<Set>(H, shared_entries<Set>(b, NoFrame<R>{})));
 }
 
 // Saturated, then relaxed.
@@ -137,7 +136,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   Vec3<R> p_axes = solve(r.H, z_axes), d_low = zero3<R>();
   bool uneven = false;
   if constexpr (!Set::contact && !Set::usual) {  // what contact adds to a block is not on a full tape
-    if constexpr (Set::elastic) uneven = star.any(is_uneven<Set>(r.H, shared_entries<Set>(b, axes)));
+    uneven = star.any(is_uneven<Set>(r.H, shared_entries<Set>(b, axes)));
     if constexpr (Set::filters) uneven = uneven || (wants_data && star.any(is_oblique<Set>(b, b.state.x, true)));
   }
   if constexpr (!Set::usual) {
@@ -153,10 +152,14 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
     using E = decltype(energy);
     const auto reverse = [&](const Vec3<R>& p, const Update<R>& u, const auto& planes) {
       vertex_energy_vjp<E>(b.state, b.data[k], b.data_count[k], p, u.d_raw, out.x, out.x_prev, planes);
-      if (wants_data) {
+      if (wants_data) {  // out of line, so for copies: those that stay in registers have no address
+        const VertexState<R> s_copy = b.state;
+        const Vec3<R> p_copy = p;
+        const Update<R> u_copy = u;
+        const auto planes_copy = planes;
         vertex_energy_data_vjp<E>(
-            b.state, b.data[k], b.data_count[k], p, u, q, alpha_bar,
-            [&](int i, const R& value) { add_data(k, i, value); }, planes);
+            s_copy, b.data[k], b.data_count[k], p_copy, u_copy, q, alpha_bar,
+            [&](int i, const R& value) { add_data(k, i, value); }, planes_copy);
       }
     };
     if constexpr (E::has_filter) {
@@ -165,18 +168,10 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
       reverse(p, u, NoFrame<R>{});
     }
   });
-  if constexpr (Set::elastic) {
-    if (!uneven) {
-      Vec3<R> own = zero3<R>();
-      for (int e = 0; e < star.size(); ++e) {
-        const auto pair = Set::Elastic::template block_vjp<wanted>(star.pair(e), b.state.x, u.d_raw, p, minus_h2,
-                                                                   star.template asked<wanted>());
-        own += pair.xi;
-        star.template add<wanted>(e, pair);
-      }
-      star.total(own);
-      out.x += own;
-    }
+  if (!uneven) {
+    Vec3<R> own = star.template reverse_tets<typename Set::Elastic, wanted>({b.state.x, u.d_raw, p, minus_h2});
+    star.total(own);
+    out.x += own;
   }
   return out;
 }

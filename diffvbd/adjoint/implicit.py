@@ -24,31 +24,32 @@ from ..model.model import Model
 from ..ops import no_second_derivative, of_inputs
 from .potential import PAIRS, IncrementalPotential
 from .routes import GlobalAdjoint, LinearSolve
-from .sweep import SweepTensors, sweep
+from .sweep import sweep
 
 MAX_ITERATIONS = 10_000  # of a solve whose adjoint does not say
 DEFAULT_TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}
 CHECK_EVERY = 8  # iterations on CUDA between two looks at whether all scenes have converged: each waits for the device
 
-_DIFFERENTIABLE = 8  # as in sweep.py: x_start, x_prev, y, mu, lam, mass, rest, energy_data
+_DIFFERENTIABLE = ops.SweepFields._fields.index("origin")  # x_start ... energy_data
+_FIELDS = _DIFFERENTIABLE + 1  # and the origin
 
 
 def global_sweep(
-    model: Model, tensors: SweepTensors, settings: ops.SweepSettings, adjoint: GlobalAdjoint, debug_step: int = -1,
+    model: Model, fields: ops.SweepFields, settings: ops.SweepSettings, adjoint: GlobalAdjoint, debug_step: int = -1,
     then: Callable[[Tensor], Tensor] = lambda x: x,
 ) -> Tensor:  # fmt: skip
-    """Positions after the sweeps and what comes ``then`` [B, V, 3]; ``tensors``: SweepTensors."""
-    return _GlobalSweep.apply(*tensors, model, settings, adjoint, debug_step, then)
+    """Positions after the sweeps and what comes ``then`` [B, V, 3]; ``fields``: without contact."""
+    return _GlobalSweep.apply(*fields[:_FIELDS], model, settings, adjoint, debug_step, then)
 
 
 class _GlobalSweep(Function):
     @staticmethod
     def forward(ctx: Any, *args: Any) -> Tensor:
-        tensors, (model, settings, adjoint, debug_step) = SweepTensors(*args[:9]), args[9:-1]
-        x = sweep(*tensors, model._packed_rest, model._plan, settings, tape_policy=ops.NO_TAPE, debug_step=debug_step)
+        fields, (model, settings, adjoint, debug_step) = ops.SweepFields(*args[:_FIELDS]), args[_FIELDS:-1]
+        x, _ = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=ops.NO_TAPE, debug_step=debug_step)
         x = args[-1](x)
-        ctx.save_for_backward(*tensors, x)
-        ctx.model, ctx.h, ctx.adjoint = model, settings.numbers[0], adjoint
+        ctx.save_for_backward(*fields[:_FIELDS], x)
+        ctx.model, ctx.h, ctx.adjoint = model, settings.numbers.time_step, adjoint
         return x
 
     @staticmethod
@@ -61,18 +62,18 @@ class _GlobalSweep(Function):
 class _GlobalBackward(Function):
     @staticmethod
     def forward(ctx: Any, x_bar: Tensor, *args: Any) -> tuple[Tensor, ...]:
-        tensors, (x, model, h, adjoint, needs) = SweepTensors(*args[:9]), args[9:]
+        fields, (x, model, h, adjoint, needs) = ops.SweepFields(*args[:_FIELDS]), args[_FIELDS:]
         if x.is_cuda and torch.cuda.is_current_stream_capturing():
             raise RuntimeError("adjoint: expected ReverseSweep while a CUDA graph is captured, got GlobalAdjoint, "
                                "whose solve waits for the device")  # fmt: skip
         with torch.autocast(x.device.type, enabled=False):  # which would take the products in half precision
-            potential = IncrementalPotential(model, x, tensors, h)
+            potential = IncrementalPotential(model, x, fields, h)
             w = _solve(potential, torch.where(potential.free > 0, x_bar, 0), adjoint)
             bars = potential.dependence(w, needs)
             if needs[0]:
                 bars[0] = torch.where(potential.free > 0, 0, x_bar - potential.product(w))
         out = []
-        for bar, tensor, need in zip(bars, tensors, needs, strict=False):
+        for bar, tensor, need in zip(bars, fields, needs, strict=False):
             if need and tensor is not None:
                 out.append(torch.zeros_like(tensor) if bar is None else ops.sum_to(bar, tensor.shape))
         return tuple(out)

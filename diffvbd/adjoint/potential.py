@@ -19,7 +19,6 @@ from torch import Tensor
 
 from .. import ops
 from ..model.model import Model
-from .sweep import SweepTensors
 
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners (a, b) of k_ab, the first six rest scalars
 # a, b and the other two corners c, d, in the order in which det(x_a - x_d, x_b - x_d, x_c - x_d) > 0
@@ -42,13 +41,13 @@ class IncrementalPotential:
     Per tet, arrays are [3 edges, 3 components, B, T]: rows of whole meshes, which elementwise operations want.
     """
 
-    def __init__(self, model: Model, x: Tensor, tensors: SweepTensors, time_step: float) -> None:
-        """tensors: of the step; where its sweeps start does not enter."""
+    def __init__(self, model: Model, x: Tensor, fields: ops.SweepFields, time_step: float) -> None:
+        """fields: of the step; where its sweeps start does not enter."""
         self.model, self.x, self.h = model, x, time_step
-        self.x_prev, self.y, self.data = tensors.x_prev, tensors.y, tensors.energy_data
-        self.mu, self.lam, self.mass = tensors.mu, tensors.lam, tensors.mass[..., None]
-        self.origin = tensors.origin if tensors.origin.numel() else None
-        rest = tensors.rest
+        self.x_prev, self.y, self.data = fields.x_prev, fields.y, fields.energy_data
+        self.mu, self.lam, self.mass = fields.mu, fields.lam, fields.mass[..., None]
+        self.origin = fields.origin
+        rest = fields.rest
         self.rest = model.rest_scalars if rest is None else rest  # [1 | B, T, 7]
         self.free = (~model._pinned)[:, None].to(x.dtype)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ..ops import contact_sweep as ops_contact_sweep
+from ..ops import contact_lag
 from ..ops import detect as ops_contact
 from .barrier import PairBarrier
 from .surface import ContactSurface
@@ -44,4 +44,4 @@ def islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, was: Tensor, 
 
 def lowest(x: Tensor, origin: Tensor, data: Tensor, island: Tensor, surface: ContactSurface) -> Tensor:
     """Lowest vertex of each body's island above each plane [B, bodies, planes] int32; ``data`` as FloorBarrier.pack."""
-    return ops_contact_sweep.lowest(x, origin, data, surface.body_order, surface.body_ptr, island)
+    return contact_lag.lowest(x, origin, data, surface.body_order, surface.body_ptr, island)

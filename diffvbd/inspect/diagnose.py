@@ -189,8 +189,8 @@ def _shape_gradients(corners: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _edge_lengths(points: Tensor, tets: Tensor) -> Tensor:
-    pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
-    return torch.stack([(points[tets[:, a]] - points[tets[:, b]]).norm(dim=-1) for a, b in pairs], -1)
+    edges = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+    return torch.stack([(points[tets[:, a]] - points[tets[:, b]]).norm(dim=-1) for a, b in edges], -1)
 
 
 def _block_ratio(model: Model, gradients: Tensor, volume: Tensor, mu: Tensor, lam: Tensor) -> Tensor:

@@ -358,7 +358,9 @@ class Model:
         saturation = -1.0 if self.saturation is None else self.saturation
         # a lone over-relaxed sweep would leave the correction a shape that the next step starts wrong from
         last = min(self.relaxation, 1.0) if self.corrects else self.relaxation
-        numbers = (time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS, FILTER_ETA, last)
+        friction_eps = 1.0 if self.friction is None else time_step * self.friction.velocity
+        numbers = ops.StepNumbers(time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS,
+                                  FILTER_ETA, last, friction_eps)  # fmt: skip
         cuda = self.device.type == "cuda"
         launch = regimes.choose(self.num_vertices, self.num_colors, scenes, contact=self.touches) if cuda else ()
         return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps, launch)

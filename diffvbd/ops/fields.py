@@ -16,14 +16,123 @@ THREAD = 1  # the regime whose tape has scenes last; twin of kThread in csrc/cud
 PLAN_HEADER = 11  # twin of kPlanHeader in csrc/core/plan_views.h
 
 
+class SweepFields(NamedTuple):
+    """What the sweeps read, in the order of DIFFVBD_SWEEP_FIELDS in csrc/bind/fields.h; None where a scene lacks it.
+
+    ``rest`` is [1 | B, T, 7] where a step is given one; to the operator it goes packed, as the tets' vertices see it.
+    """
+
+    x_start: Tensor  # start of the sweeps [m], [B, V, 3]
+    x_prev: Tensor  # start of the step [m], [B, V, 3]
+    y: Tensor  # predictor [m], [B, V, 3]
+    mu: Tensor  # [1 | B, 1 | T] [Pa]
+    lam: Tensor  # [1 | B, 1 | T] [Pa]
+    mass: Tensor  # [1 | B, V] [kg]
+    rest: Tensor | None
+    energy_data: Tensor  # [1 | B, n], see VertexEnergy.pack
+    origin: Tensor | None = None  # [B, V, 3], what positions are relative to
+    # contact; the shapes of the index data are those of ops.detect
+    bounds: Tensor | None = None  # center and radius [m], [B, V, 4]
+    collider: Tensor | None = None  # during the sweeps [m], [B, Vc, 3]
+    collider_prev: Tensor | None = None  # at the start of the step [m], [B, Vc, 3]
+    kappa: Tensor | None = None  # [1 | B] [N/m]
+    pairs: Tensor | None = None  # that repel
+    constants: Tensor | None = None
+    ptr: Tensor | None = None
+    entry: Tensor | None = None
+    lag: Tensor | None = None  # friction and damping of pairs at the start of the step, [pairs, 9]
+    lag_pairs: Tensor | None = None
+    lag_ptr: Tensor | None = None
+    lag_entry: Tensor | None = None
+    floor_lag: Tensor | None = None  # [B, V, planes, 4]
+
+
+# What the reverse differentiates: the fields that are ADJOINT in csrc/bind/fields.h.
+SWEEP_ADJOINTS = ("x_start", "x_prev", "y", "mu", "lam", "mass", "rest", "energy_data", "bounds", "collider",
+                  "collider_prev", "kappa", "lag", "floor_lag")  # fmt: skip
+
+
+class StepFields(NamedTuple):
+    """What a whole step in one operator reads (CUDA), in the order of DIFFVBD_STEP_FIELDS; all are differentiable."""
+
+    x: Tensor  # [B, V, 3] [m]
+    v: Tensor  # [B, V, 3] [m/s]
+    acceleration: Tensor  # [1 | B, 1 | V, 3] [m/s^2]
+    prescribed: Tensor | None  # where pinned vertices go [m], [1 | B, V, 3]; None: they stay
+    mu: Tensor
+    lam: Tensor
+    mass: Tensor
+    rest: Tensor | None
+
+
+STEP_ADJOINTS = StepFields._fields
+
+
+class RigidFields(NamedTuple):
+    """What the rigid correction reads, in the order of DIFFVBD_RIGID_FIELDS; the first five are differentiable."""
+
+    x: Tensor  # as in SweepFields, which ends there
+    x_prev: Tensor
+    y: Tensor
+    mass: Tensor
+    energy_data: Tensor
+    origin: Tensor | None
+    order: Tensor  # of model.bodies.Bodies, as are the next two
+    ptr: Tensor
+    spread: Tensor
+    other: Tensor  # OtherBodies.of
+
+
+class BeginFields(NamedTuple):
+    """What the beginning of a step reads, in the order of DIFFVBD_BEGIN_FIELDS; the first six are differentiable."""
+
+    x: Tensor
+    v: Tensor
+    acceleration: Tensor
+    prescribed: Tensor | None
+    mass: Tensor
+    energy_data: Tensor
+    origin: Tensor | None
+    mu: Tensor
+    lam: Tensor
+    rest: Tensor | None  # [1 | B, T, 7], None where tets have no energy or nobody asks for it
+    pinned: Tensor  # bool [V]
+    order: Tensor
+    ptr: Tensor
+    spread: Tensor
+    other: Tensor
+    other_order: Tensor  # of model.bodies.OtherBodies, as are the next three
+    other_ptr: Tensor
+    other_tets: Tensor
+    other_tet_ptr: Tensor
+
+
+def as_list(fields: NamedTuple, like: Tensor) -> list[Tensor]:
+    """Fields as the operators take them: what a scene lacks is empty."""
+    absent = like.new_empty((0,))
+    return [absent if t is None else t for t in fields]
+
+
+class StepNumbers(NamedTuple):
+    """Numbers of a sweep, in the order of StepParameters in csrc/core/safeguards.h."""
+
+    time_step: float  # [s]
+    regularization: float  # [kg]
+    relaxation: float
+    saturation: float  # [m]; negative: none
+    saturation_eps: float
+    filter_eta: float
+    last_relaxation: float  # of the last sweep of a step
+    friction_eps: float = 1.0  # motion within the step below which friction is smoothed [m]
+
+
 class SweepSettings(NamedTuple):
     """What a sweep executes besides its tensors, in the order of csrc/bind/schema.cpp."""
 
     sizes: tuple[int, ...]  # active vertices, tets, slots of the plan; more on CUDA, see plan_sizes
     energies: int  # mask
     data_count: tuple[int, ...]  # scalars per scene, or per vertex, of each energy of one vertex
-    # time_step, regularization, relaxation, saturation, saturation_eps, filter_eta, relaxation of the last sweep
-    numbers: tuple[float, ...]
+    numbers: StepNumbers
     sweeps: int
     launch: tuple[int, ...] = ()  # on CUDA: regime and threads per vertex of sweeps and reverse, see regimes.py
 

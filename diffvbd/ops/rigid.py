@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..energies import VERTEX_ENERGIES
+from .fields import RigidFields
 from .functions import raw_backward
 from .sums import sum_to
 
@@ -31,18 +32,18 @@ def join_data(shared: Tensor, own: Tensor, data_count: Sequence[int]) -> Tensor:
 
 
 @torch.library.register_fake("diffvbd::rigid")
-def _(x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other, groups, data_count, time_step):
-    return torch.empty_like(x), torch.empty_like(x)
+def _(fields, groups, data_count, time_step):
+    return torch.empty_like(fields[0]), torch.empty_like(fields[0])
 
 
 @torch.library.register_fake("diffvbd::rigid_backward")
-def _(x_bar, v_bar, x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other, groups, data_count, time_step,
-      wants_data):  # fmt: skip
-    b, v = x.shape[:2]
+def _(x_bar, v_bar, fields, groups, data_count, time_step, wants_data):
+    f = RigidFields(*fields)
+    x, (b, v) = f.x, f.x.shape[:2]
     shared, own = scalars_of_data(data_count)
-    x_prev_bar = torch.empty_like(x) if energy_data.numel() or v_bar.numel() else x.new_empty((0,))
+    x_prev_bar = torch.empty_like(x) if f.energy_data.numel() or v_bar.numel() else x.new_empty((0,))
     return (torch.empty_like(x), x_prev_bar, torch.empty_like(x), x.new_empty((b, v)),
-            x.new_empty((b, spread.shape[0] if wants_data else 0, shared)),
+            x.new_empty((b, f.spread.shape[0] if wants_data else 0, shared)),
             x.new_empty((b, v if wants_data else 0, own)))  # fmt: skip
 
 

@@ -1,81 +1,127 @@
-"""The compiled operators of sweeps, of whole steps on CUDA and of a mesh's plan: shapes without execution."""
+"""The compiled operators of sweeps, and of whole steps on CUDA: calls, and shapes without execution."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from .fields import LANES, REST_SCALARS, tape_shape
+from .fields import (
+    FULL_TAPE,
+    NO_TAPE,
+    REST_SCALARS,
+    STEP_ADJOINTS,
+    SWEEP_ADJOINTS,
+    StepFields,
+    SweepFields,
+    SweepSettings,
+    as_list,
+    tape_shape,
+)
 from .functions import raw_backward
 from .load import raw
+from .mesh import pack_rest
+
+LAG_SCALARS = 9  # twin of kLagScalars in csrc/contact/pairs.h
+
+
+def listed(fields: SweepFields | StepFields, packed_rest: Tensor, plan: Tensor, settings: SweepSettings
+           ) -> list[Tensor]:  # fmt: skip
+    """Fields as the operators take them, with the rest shape packed."""
+    rest = packed_rest if fields.rest is None else pack_rest(fields.rest, plan, settings.sizes)
+    return as_list(fields._replace(rest=rest), fields.mass)
+
+
+def sweep(fields: SweepFields, packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int,
+          debug_step: int = -1, checked: bool = False) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """x [B, V, 3], tape, and with contact where a bound has held back, uint8 [B, V]."""
+    given = listed(fields, packed_rest, plan, settings)
+    return raw.sweep(given, plan, *settings, tape_policy, debug_step, checked)
+
+
+def sweep_backward(x_bar: Tensor, x: Tensor, tape: Tensor, fields: SweepFields, packed_rest: Tensor, plan: Tensor,
+                   settings: SweepSettings, tape_policy: int, wants: dict[str, bool]) -> dict[str, Tensor]:  # fmt: skip
+    """Adjoints of the fields by name; an empty tape: the sweeps run again. ``wants``: of SWEEP_ADJOINTS."""
+    given = listed(fields, packed_rest, plan, settings)
+    if tape_policy == NO_TAPE:
+        tape_policy = FULL_TAPE
+        x, tape, _ = raw.sweep(given, plan, *settings, tape_policy, -1, False)
+    flags = [wants["mu"] or wants["lam"], wants["mass"], wants["rest"], wants["energy_data"]]
+    bars = raw.sweep_backward(x_bar.contiguous(), x, given, tape, plan, *settings, tape_policy, flags)
+    return dict(zip(SWEEP_ADJOINTS, bars, strict=True))
+
+
+def fused_step(fields: StepFields, packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int
+               ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """x, v [B, V, 3] and tape of a step on CUDA whose only energy is that of the tets."""
+    return raw.fused_step(listed(fields, packed_rest, plan, settings), plan, *settings, tape_policy)
+
+
+def fused_step_backward(x_bar: Tensor | None, v_bar: Tensor | None, x: Tensor, tape: Tensor, fields: StepFields,
+                        packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int,
+                        wants: dict[str, bool]) -> dict[str, Tensor]:  # fmt: skip
+    """As sweep_backward, of STEP_ADJOINTS."""
+    given = listed(fields, packed_rest, plan, settings)
+    if tape_policy == NO_TAPE:
+        tape_policy = FULL_TAPE
+        x, _, tape = raw.fused_step(given, plan, *settings, tape_policy)
+    out = [fields.x.new_empty((0,)) if bar is None else bar.contiguous() for bar in (x_bar, v_bar)]
+    flags = [wants[name] for name in ("x", "v", "acceleration", "prescribed")]
+    flags += [wants["mu"] or wants["lam"], wants["mass"], wants["rest"]]
+    bars = raw.fused_step_backward(*out, x, given, tape, plan, *settings, tape_policy, flags)
+    return dict(zip(STEP_ADJOINTS, bars, strict=True))
 
 
 @torch.library.register_fake("diffvbd::sweep")
-def _(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, plan, sizes, energies, data_count, numbers, sweeps,
-      launch, tape_policy, debug_step, checked):  # fmt: skip
-    return torch.empty_like(x_start), x_start.new_empty(
-        tape_shape(x_start, sizes, energies, sweeps, launch, tape_policy)
-    )
+def _(fields, plan, sizes, energies, data_count, numbers, sweeps, launch, tape_policy, debug_step, checked):
+    x, contact = fields[0], fields[SweepFields._fields.index("bounds")].numel() > 0
+    tape = x.new_empty(tape_shape(x, sizes, energies, sweeps, launch, tape_policy))
+    cut = x.new_empty((x.shape[0] if contact else 0, x.shape[1]), dtype=torch.uint8)
+    return torch.empty_like(x), tape, cut
 
 
-def _materials(mu: Tensor, lam: Tensor, num_tets: int) -> int:
-    """Length of the adjoints of mu and lam: CUDA sums what a scene shares."""
-    return 1 if mu.is_cuda and mu.shape[-1] == 1 and lam.shape[-1] == 1 else num_tets
+def _body_adjoints(x: Tensor, f: SweepFields | StepFields, num_tets: int, wants: Sequence[bool]) -> list[Tensor]:
+    """Empty adjoints of mu, lam, mass, rest. CUDA sums the material that a scene shares."""
+    shares = f.mu.is_cuda and f.mu.shape[-1] == 1 and f.lam.shape[-1] == 1
+    b, v = x.shape[:2]
+    materials = (b, 1 if shares else num_tets)
+    shapes = (materials, materials, (b, v), (b, num_tets, REST_SCALARS))
+    flags = (wants[0], *wants)
+    return [x.new_empty(shape if flag else (0,)) for shape, flag in zip(shapes, flags, strict=True)]
 
 
 @torch.library.register_fake("diffvbd::sweep_backward")
-def _(x_bar, x, x_prev, y, mu, lam, mass, rest, energy_data, origin, tape, plan, sizes, energies, data_count, numbers,
-      sweeps, launch, tape_policy, wants):  # fmt: skip
-    return sweep_adjoints(x, mu, lam, energy_data, sizes, wants)
-
-
-def sweep_adjoints(x: Tensor, mu: Tensor, lam: Tensor, energy_data: Tensor, sizes: Sequence[int], wants: Sequence[bool]
-                   ) -> tuple[Tensor, ...]:  # fmt: skip
-    """Empty tensors in the shapes of a sweep's adjoints."""
-    (b, v), materials = x.shape[:2], _materials(mu, lam, sizes[1])
-
-    def wanted(flag: bool, *shape: int) -> Tensor:
-        return x.new_empty((b, *shape) if flag else (0,))
-
-    return (*(torch.empty_like(x) for _ in range(3)), wanted(wants[0], materials), wanted(wants[0], materials),
-            wanted(wants[1], v), wanted(wants[2], sizes[1], REST_SCALARS),
-            wanted(wants[3], energy_data.shape[-1]))  # fmt: skip
+def _(x_bar, x, fields, tape, plan, sizes, energies, data_count, numbers, sweeps, launch, tape_policy, wants):
+    f: Any = SweepFields(*fields)
+    b, v = x.shape[:2]
+    own = [*(torch.empty_like(x) for _ in range(3)), *_body_adjoints(x, f, sizes[1], wants[:3])]
+    own.append(x.new_empty((b, f.energy_data.shape[-1]) if wants[3] else (0,)))
+    if f.bounds.numel() == 0:
+        return [*own, *(x.new_empty((0,)) for _ in range(len(SWEEP_ADJOINTS) - len(own)))]
+    colliders = f.collider.shape[1] if f.collider.dim() == 3 else 0
+    planes = f.floor_lag.numel() // max(1, f.floor_lag.shape[0] * 4 * v)
+    shapes = [(b, v, 4), (b, colliders, 3), (b, colliders, 3), (b,), (f.lag_pairs.shape[0], LAG_SCALARS),
+              (b, v, planes, 4)]  # fmt: skip
+    return [*own, *(x.new_empty(shape) for shape in shapes)]
 
 
 @torch.library.register_fake("diffvbd::fused_step")
-def _(x, v, acceleration, held, mu, lam, mass, rest, plan, sizes, energies, data_count, numbers, sweeps, launch,
-      tape_policy):  # fmt: skip
-    shape = tape_shape(x, sizes, energies, sweeps, launch, tape_policy)
-    return torch.empty_like(x), torch.empty_like(x), x.new_empty(shape)
+def _(fields, plan, sizes, energies, data_count, numbers, sweeps, launch, tape_policy):
+    x = fields[0]
+    tape = x.new_empty(tape_shape(x, sizes, energies, sweeps, launch, tape_policy))
+    return torch.empty_like(x), torch.empty_like(x), tape
 
 
 @torch.library.register_fake("diffvbd::fused_step_backward")
-def _(x_bar, v_bar, x_end, x, v, acceleration, held, mu, lam, mass, rest, tape, plan, sizes, energies, data_count,
-      numbers, sweeps, launch, tape_policy, wants):  # fmt: skip
-    b, materials = x.shape[0], _materials(mu, lam, sizes[1])
-    shapes = [x.shape] * 4 + [(b, materials)] * 2 + [(b, x.shape[1]), (b, sizes[1], REST_SCALARS)]
-    flags = [*wants[:5], wants[4], *wants[5:]]
-    return tuple(x.new_empty(shape if flag else (0,)) for flag, shape in zip(flags, shapes, strict=True))
+def _(
+    x_bar, v_bar, x_end, fields, tape, plan, sizes, energies, data_count, numbers, sweeps, launch, tape_policy, wants
+):
+    x = fields[0]
+    state = [x.new_empty(x.shape if flag else (0,)) for flag in wants[:4]]
+    return [*state, *_body_adjoints(x, StepFields(*fields), sizes[1], wants[4:])]
 
 
-@torch.library.register_fake("diffvbd::pack_rest")
-def _(rest, plan, sizes):
-    return rest.new_empty((rest.shape[0], sizes[2], 4, LANES[rest.device.type]))
-
-
-for _name in ("sweep", "sweep_backward", "fused_step", "fused_step_backward", "pack_rest"):
+for _name in ("sweep", "sweep_backward", "fused_step", "fused_step_backward"):
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)
-
-
-def build_plan(
-    points: Tensor, tets: Tensor, active: Tensor, lanes: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Plan, color_ptr, color_vertices, star_ptr and star of a mesh, see csrc/cpu/plan.h; lanes: of :data:`LANES`."""
-    return raw.build_plan(points, tets, active, lanes)
-
-
-def pack_rest(rest: Tensor, plan: Tensor, sizes: tuple[int, ...]) -> Tensor:
-    """Rest scalars of the tets [B, T, 7] -> as their vertices see them [B, slots, 4, lanes]. Not differentiable."""
-    return raw.pack_rest(rest.contiguous(), plan, sizes)

@@ -16,8 +16,9 @@ from ..adjoint.potential import IncrementalPotential
 from ..adjoint.routes import Adjoint, GlobalAdjoint, check_adjoint
 from ..checks import check_count, check_positive, fail
 from ..model.model import Model
-from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare
-from ..step.predict import begin
+from ..ops import SweepSettings
+from ..step.arguments import GRAVITY, Prepared, acceleration_of, check_prescribed, check_state, prepare
+from ..step.predict import Begun, begin
 from ..step.step import advance, swept
 
 ROUNDINGS = 0.25  # of block times position, below which a residual counts as zero: sweeps stall at 0.03 to 0.08, a
@@ -108,34 +109,12 @@ def solve(
     begun = begin(model, x, v, prepared, force, acceleration_of(gravity, x), prescribed)
 
     with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-        frozen = begun.detached()
-        # The end of a step is its last sweep, which may be relaxed less, and its correction: what was swept before them
-        # is what further sweeps go on from.
-        before, count, rounding = frozen.x_start, 0, None
-        over = settings._replace(numbers=(*settings.numbers[:-1], settings.numbers[2]))
-        end = frozen.corrected(before, model, prepared)
-
-        def look(x: Tensor) -> tuple[float, bool]:
-            nonlocal rounding
-            at = IncrementalPotential(model, x, frozen.tensors(prepared), time_step)
-            rounding = _rounding(at) if rounding is None else rounding
-            return _residual(at, tolerance, rounding)
-
-        residual, converged = look(end)
-        while not converged and count < max_sweeps and math.isfinite(residual):
-            # a look costs many sweeps: at first after check_every, later after a quarter of what there were
-            some = min(max(check_every, count // 4), max_sweeps - count)
-            part = prepared._replace(settings=over._replace(sweeps=some - (count == 0)))
-            given = {"x": x, "v": v, **loads}
-            before = swept(model, frozen._replace(x_start=before), part, given)
-            last = prepared._replace(settings=settings._replace(sweeps=1))
-            end = frozen.corrected(swept(model, frozen._replace(x_start=before), last, given), model, prepared)
-            count += some
-            residual, converged = look(end)
-    if not converged:
+        done = _Sweeping(model, begun.detached(), prepared, {"x": x, "v": v, **loads}, time_step, tolerance)
+        done.run(max_sweeps, check_every)
+    if not done.converged:
         text = (
-            f"solve: expected a residual of at most {tolerance:g}, got {residual:.3g} after {count} sweeps; take more "
-            "(max_sweeps), a smaller time step, or with the exact block a relaxation between 1.5 and 1.7"
+            f"solve: expected a residual of at most {tolerance:g}, got {done.residual:.3g} after {done.count} sweeps; "
+            "take more (max_sweeps), a smaller time step, or with the exact block a relaxation between 1.5 and 1.7"
         )
         if on_failure == "raise":
             raise RuntimeError(text)
@@ -143,14 +122,65 @@ def solve(
 
     if isinstance(adjoint, GlobalAdjoint):
         # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph
-        begun = begun._replace(x_start=torch.where(model._pinned[:, None], begun.x_start, end))
+        begun = begun._replace(x_start=torch.where(model._pinned[:, None], begun.x_start, done.end))
         x_end, v_end = begun.finish(
-            global_sweep(model, begun.tensors(prepared), settings, adjoint), model, prepared, corrects=False
+            global_sweep(model, begun.fields(prepared), settings, adjoint), model, prepared, corrects=False
         )
     else:
-        again = prepare(model, lead, sweeps=count, adjoint=adjoint, **options)
+        again = prepare(model, lead, sweeps=done.count, adjoint=adjoint, **options)
         x_end, v_end = advance(model, x, v, again, adjoint=adjoint, **loads)
-    return Solution(x_end.reshape(x.shape), v_end.reshape(x.shape), count, residual, converged)
+    return Solution(x_end.reshape(x.shape), v_end.reshape(x.shape), done.count, done.residual, done.converged)
+
+
+class _Sweeping:
+    """A step that is swept part by part, without gradients, and how far from converged its end is.
+
+    Attributes:
+        end: Where the step ends after the sweeps so far, shape [B, V, 3].
+        count: Sweeps so far.
+        residual, converged: As in :class:`Solution`.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        begun: Begun,
+        prepared: Prepared,
+        given: dict[str, Any],
+        time_step: float,
+        tolerance: float,
+    ) -> None:
+        self.model, self.begun, self.prepared, self.given = model, begun, prepared, given
+        self.time_step, self.tolerance = time_step, tolerance
+        # The end of a step is its last sweep, which may be relaxed less, and its correction: what was swept before them
+        # is what further sweeps go on from.
+        self.before, self.count = begun.x_start, 0
+        numbers = prepared.settings.numbers
+        self.over = prepared.settings._replace(numbers=numbers._replace(last_relaxation=numbers.relaxation))
+        self.rounding: Tensor | None = None
+        self._end_at(self.before)
+
+    def run(self, max_sweeps: int, check_every: int) -> None:
+        """Sweeps until the step has converged, or is lost, or max_sweeps are done."""
+        while not self.converged and self.count < max_sweeps and math.isfinite(self.residual):
+            # a look costs many sweeps: at first after check_every, later after a quarter of what there were
+            some = min(max(check_every, self.count // 4), max_sweeps - self.count)
+            # one of `count` is the last sweep, which each part makes anew
+            self.before = self._swept(self.over._replace(sweeps=some - (self.count == 0)))
+            self.count += some
+            self._end_at(self._swept(self.prepared.settings._replace(sweeps=1)))
+
+    def _swept(self, settings: SweepSettings) -> Tensor:
+        part = self.prepared._replace(settings=settings)
+        return swept(self.model, self.begun._replace(x_start=self.before), part, self.given)
+
+    def _end_at(self, x: Tensor) -> None:
+        """Corrects what the last sweep left, and looks at it."""
+        self.end = self.begun.corrected(x, self.model, self.prepared)
+        at = IncrementalPotential(self.model, self.end, self.begun.fields(self.prepared), self.time_step)
+        if self.rounding is None:
+            self.rounding = _rounding(at)
+        self.residual, self.converged = _residual(at, self.tolerance, self.rounding)
 
 
 def _rounding(at: IncrementalPotential) -> Tensor:
@@ -164,9 +194,9 @@ def _residual(at: IncrementalPotential, tolerance: float, rounding: Tensor) -> t
     if not at.x.numel():
         return 0.0, True
     inertia, forces = at.free * at.inertia(), at.free * at.forces()
-    left, scale = _norm(inertia + forces), _norm(inertia) + _norm(forces)
-    ratio = left / torch.where(scale > 0, scale, 1)
-    done = (ratio <= tolerance) | ((left <= rounding) & torch.isfinite(rounding))
+    unbalanced, scale = _norm(inertia + forces), _norm(inertia) + _norm(forces)
+    ratio = unbalanced / torch.where(scale > 0, scale, 1)
+    done = (ratio <= tolerance) | ((unbalanced <= rounding) & torch.isfinite(rounding))
     return float(torch.nan_to_num(ratio, nan=torch.inf).max()), bool(done.all())
 
 

@@ -15,7 +15,7 @@ from ..checks import check_count, fail
 from ..model.model import Model
 from ..model.warnings import warn_of_thin_tets
 from ..scopes import looks_at
-from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
+from ..step.arguments import GRAVITY, Prepared, check_prescribed, check_state, prepare, step_settings
 from ..step.step import advance
 from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
 
@@ -113,66 +113,29 @@ def rollout(
     options = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "rest_points": rest_points,
                "density": density, "force": force, "gravity": gravity, "prescribed": prescribed,
                "colliders": colliders}  # fmt: skip
-    if _changes(colliders) and not isinstance(colliders, PerStep):
-        raise TypeError("colliders: expected a tensor or per_step, got a callable: a step needs where they come from")
-    if colliders_before is not None and not isinstance(colliders, PerStep):
-        raise TypeError("colliders_before: expected it beside per_step colliders, which it is the start of")
-    if parameters is not None and not isinstance(parameters, dict):
-        raise TypeError(f"parameters: expected a dict of tensors by name, got {type(parameters).__name__}")
-    named = {f'parameters["{k}"]': value for k, value in (parameters or {}).items()}
-    for name, value in {**options, **named}.items():
-        if isinstance(value, PerStep) and value.values.shape[0] != steps:
-            fail(name, f"{steps} steps in per_step", f"shape {list(value.values.shape)}")
-
-    # What a checkpointed segment reads again must not change in between: lists and dicts are copied. unbind, not
-    # indexing: the backward of values[k] would fill a tensor of all steps at every step.
-    options = {name: _frozen(value) for name, value in options.items()}
-    parameters = {k: _frozen(value) for k, value in (parameters or {}).items()}
-    static: dict[str, Any] = {k: options[k] for k in _STATIC} | {"parameters": parameters}
-    changes = any(_changes(value) for value in (*(options[k] for k in _STATIC), *parameters.values()))
+    _check_values(options, parameters, colliders_before, steps)
+    values = _Values.of(options, parameters or {})
     # once: what a checkpoint runs again must run as it did, whatever dv.regime says by then
     settings = step_settings(model, lead, time_step, sweeps)
     chosen: dict[str, Any] = {"time_step": time_step, "sweeps": sweeps, "adjoint": adjoint, "settings": settings}
-    fixed = None if changes else prepare(model, lead, **chosen, **static)
+    fixed = None if values.prepared_anew else prepare(model, lead, **chosen, **values.to_prepare(0, x, v))
     if fixed is not None and looks_at(fixed.mu) and looks_at(fixed.lam):
         warn_of_thin_tets(model, fixed.mu, fixed.lam, *fixed.time_step_and_sweeps)
-
-    start, moved = x, options["prescribed"]
-    for value in _tensors(moved):
+    for value in _tensors(values.options["prescribed"]):
         check_prescribed(model, value, x)
-
-    def one_step(k: int, x: Tensor, v: Tensor, adjoint: Adjoint) -> tuple[Tensor, Tensor]:
-        prepared = fixed
-        if prepared is None:
-            now: dict[str, Any] = {name: _at(options[name], k, x, v) for name in _STATIC}
-            now["parameters"] = {name: _at(value, k, x, v) for name, value in parameters.items()}
-            prepared = prepare(model, lead, **chosen, **now)
-        given = {name: _at(options[name], k, x, v) for name in ("force", "gravity", "prescribed", "colliders")}
-        if _changes(moved) and not isinstance(moved, _Steps):
-            check_prescribed(model, given["prescribed"], x, start)
-        if isinstance(options["colliders"], _Steps):
-            first = model.collider_points if colliders_before is None else colliders_before
-            given["colliders_before"] = options["colliders"][k - 1] if k else first
-        return advance(model, x, v, prepared, adjoint=adjoint, index=k, **given)
 
     scenes = x.numel() // max(1, 3 * model.num_vertices)
     every, adjoint = choose_schedule(checkpoint_every, adjoint, model, scenes, steps, sweeps)
+    one_step = _OneStep(model, lead, chosen, values, fixed, x, colliders_before, adjoint)
+    # A segment that runs again reads these anew: autograd cannot see that they were changed in between.
+    versions = [] if every is None or torch.compiler.is_compiling() else values.versions()
     bar = _Progress(steps) if progress else None
 
-    # A segment that runs again reads these anew: autograd cannot see that they were changed in between.
-    read = {**options, **{f'parameters["{k}"]': value for k, value in parameters.items()}}
-    versions: list[tuple[str, Tensor, int]] = []
-    if every is not None and not torch.compiler.is_compiling():
-        found = [(name, t) for name, value in read.items() for t in _tensors(value)]
-        versions = [(name, t, t._version) for name, t in found if not t.is_inference()]
-
     def segment(first: int, end: int, x: Tensor, v: Tensor) -> Segment:
-        for name, tensor, version in versions:
-            if tensor._version != version:
-                raise RuntimeError(f"{name}: changed in place between the rollout and its backward")
+        _check_versions(versions)
         frames, observed = [], []
         for k in range(first, end):
-            x, v = one_step(k, x, v, adjoint)
+            x, v = one_step(k, x, v)
             if save == "all" or k + 1 == steps or (save != "last" and (k + 1) % save == 0):
                 frames.append((k + 1, x, v))
             if observe is not None:
@@ -190,6 +153,96 @@ def rollout(
         steps=[f[0] for f in frames],
         observations=_stacked(done.observed),
     )
+
+
+# --- values of each step ----------------------------------------------------------------------------------------------
+
+
+def _check_values(
+    options: dict[str, Any], parameters: dict[str, Any] | None, colliders_before: Tensor | None, steps: int
+) -> None:
+    """Raises for values that cannot be those of so many steps."""
+    colliders = options["colliders"]
+    if _changes(colliders) and not isinstance(colliders, PerStep):
+        raise TypeError("colliders: expected a tensor or per_step, got a callable: a step needs where they come from")
+    if colliders_before is not None and not isinstance(colliders, PerStep):
+        raise TypeError("colliders_before: expected it beside per_step colliders, which it is the start of")
+    if parameters is not None and not isinstance(parameters, dict):
+        raise TypeError(f"parameters: expected a dict of tensors by name, got {type(parameters).__name__}")
+    for name, value in {**options, **_named(parameters or {})}.items():
+        if isinstance(value, PerStep) and value.values.shape[0] != steps:
+            fail(name, f"{steps} steps in per_step", f"shape {list(value.values.shape)}")
+
+
+@dataclass(frozen=True)
+class _Values:
+    """The arguments that may change from step to step, by name; per_step ones as :class:`_Steps`."""
+
+    options: dict[str, Any]
+    parameters: dict[str, Any]
+
+    @classmethod
+    def of(cls, options: dict[str, Any], parameters: dict[str, Any]) -> _Values:
+        # What a checkpointed segment reads again must not change in between: lists and dicts are copied. unbind, not
+        # indexing: the backward of values[k] would fill a tensor of all steps at every step.
+        return cls({k: _frozen(v) for k, v in options.items()}, {k: _frozen(v) for k, v in parameters.items()})
+
+    @property
+    def prepared_anew(self) -> bool:
+        """Whether what enters through prepare() changes from step to step."""
+        return any(_changes(value) for value in (*(self.options[k] for k in _STATIC), *self.parameters.values()))
+
+    def to_prepare(self, k: int, x: Tensor, v: Tensor) -> dict[str, Any]:
+        """What enters step k through prepare()."""
+        now = {name: _at(self.options[name], k, x, v) for name in _STATIC}
+        return now | {"parameters": {name: _at(value, k, x, v) for name, value in self.parameters.items()}}
+
+    def to_advance(self, k: int, x: Tensor, v: Tensor) -> dict[str, Any]:
+        """What enters step k through advance()."""
+        return {name: _at(self.options[name], k, x, v) for name in ("force", "gravity", "prescribed", "colliders")}
+
+    def versions(self) -> list[tuple[str, Tensor, int]]:
+        """(name, tensor, version) of all tensors whose changes in place can be seen."""
+        found = [(name, t) for name, value in {**self.options, **_named(self.parameters)}.items()
+                 for t in _tensors(value)]  # fmt: skip
+        return [(name, t, t._version) for name, t in found if not t.is_inference()]
+
+
+@dataclass(frozen=True)
+class _OneStep:
+    """A step of a rollout, by its number: which values it takes, and the step itself."""
+
+    model: Model
+    lead: tuple[int, ...]
+    chosen: dict[str, Any]  # arguments of prepare() that are the same for all steps
+    values: _Values
+    fixed: Prepared | None  # where it is the same for all steps
+    start: Tensor  # x before the first step
+    colliders_before: Tensor | None
+    adjoint: Adjoint
+
+    def __call__(self, k: int, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        prepared, options = self.fixed, self.values.options
+        if prepared is None:
+            prepared = prepare(self.model, self.lead, **self.chosen, **self.values.to_prepare(k, x, v))
+        given = self.values.to_advance(k, x, v)
+        if _changes(options["prescribed"]) and not isinstance(options["prescribed"], _Steps):
+            check_prescribed(self.model, given["prescribed"], x, self.start)
+        if isinstance(options["colliders"], _Steps):
+            first = self.model.collider_points if self.colliders_before is None else self.colliders_before
+            given["colliders_before"] = options["colliders"][k - 1] if k else first
+        return advance(self.model, x, v, prepared, adjoint=self.adjoint, index=k, **given)
+
+
+def _check_versions(versions: list[tuple[str, Tensor, int]]) -> None:
+    for name, tensor, version in versions:
+        if tensor._version != version:
+            raise RuntimeError(f"{name}: changed in place between the rollout and its backward")
+
+
+def _named(parameters: dict[str, Any]) -> dict[str, Any]:
+    """Energy parameters by the name that an error gives them."""
+    return {f'parameters["{k}"]': value for k, value in parameters.items()}
 
 
 class _Steps(tuple):
@@ -214,6 +267,9 @@ def _at(value: Any, k: int, x: Tensor, v: Tensor) -> Any:
     if isinstance(value, _Steps):
         return value[k]
     return value(k, x, v) if _changes(value) else value
+
+
+# --- what a rollout returns and prints --------------------------------------------------------------------------------
 
 
 def _stacked(observed: list[Any]) -> Any:

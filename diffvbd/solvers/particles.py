@@ -98,8 +98,8 @@ class ParticleSolver:
             force = torch.where(pinned, 0.0, self.like("force", force, x))
             acceleration = acceleration + force / torch.where(self.pinned, 1.0, masses)[..., None]
         # The predictor is also where sweeps start; pinned particles keep the place that they have in it.
-        held = x if prescribed is None else self.like("prescribed", prescribed, x)
-        y = torch.where(pinned, held, x + h * v + (h * h) * acceleration)
+        held_at = x if prescribed is None else self.like("prescribed", prescribed, x)
+        y = torch.where(pinned, held_at, x + h * v + (h * h) * acceleration)
         # One look at what they make tells whether to look at each: values that are not used may be NaN.
         if not y.is_cuda and not (all_finite(y) and all_finite(x)):
             check_finite(x=x, v=v, gravity=gravity, force=force, prescribed=prescribed)
@@ -172,8 +172,8 @@ def checked_edges(edges: Any, num_points: int, device: torch.device | str) -> Te
 
 def mesh_edges(mesh: TetMesh) -> np.ndarray:
     """The edges of a mesh, each once, lower vertex first, sorted, shape [C, 2]."""
-    pairs = mesh.tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
-    return np.unique(np.sort(pairs, axis=1), axis=0)
+    edges = mesh.tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
+    return np.unique(np.sort(edges, axis=1), axis=0)
 
 
 def mesh_mass(mesh: TetMesh, density: float) -> np.ndarray:

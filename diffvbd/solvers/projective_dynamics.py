@@ -136,9 +136,9 @@ class LocalGlobal(BlockUpdate):
         f_bar = self.tets.project_vjp(f, self.scale * w * p_f)
 
         # Pinned particles stand on the right-hand side with their own columns of A.
-        held = self.springs.transpose(k[..., None] * p_d) + self.tets.transpose(w * p_f)
-        held[..., self.free, :] = 0
-        x_bar = self.springs.transpose(d_bar) + self.tets.transpose(f_bar) - self.scale * held
+        from_pinned = self.springs.transpose(k[..., None] * p_d) + self.tets.transpose(w * p_f)
+        from_pinned[..., self.free, :] = 0
+        x_bar = self.springs.transpose(d_bar) + self.tets.transpose(f_bar) - self.scale * from_pinned
         mass_bar = -(p * (new - y)).sum(-1)
         return (x_bar,), (mass[..., None] * p, mass_bar, k_bar, length_bar, stiffness_bar)
 
@@ -188,15 +188,15 @@ class ProjectiveDynamics(ParticleSolver):
             self.rest_length = torch.linalg.vector_norm(ends[:, 0] - ends[:, 1], dim=-1)
         self.springs = Springs(self.edges, self.num_points)
         corners = torch.zeros((0, 4), dtype=torch.int64, device="cpu")
-        rest = torch.zeros((self.num_points, 3), dtype=dtype, device="cpu")
+        rest_points = torch.zeros((self.num_points, 3), dtype=dtype, device="cpu")
         if tets is not None:
             if self.rest_points is None:
                 fail("points", "rest positions, because there are tets", "a number of particles")
             # A mesh checks the corners and that no volume is zero or negative, where F and w would be worthless.
-            rest = self.rest_points.cpu()
-            mesh = TetMesh(rest, tets)
+            rest_points = self.rest_points.cpu()
+            mesh = TetMesh(rest_points, tets)
             corners = torch.from_numpy(mesh.tets.copy())
-        self.tets = Tets(corners.to(device), rest.to(device))
+        self.tets = Tets(corners.to(device), rest_points.to(device))
 
     @classmethod
     def from_mesh(

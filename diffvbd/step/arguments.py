@@ -38,7 +38,7 @@ class Prepared(NamedTuple):
 
     @property
     def time_step_and_sweeps(self) -> tuple[float, int]:
-        return self.settings.numbers[0], self.settings.sweeps
+        return self.settings.numbers.time_step, self.settings.sweeps
 
 
 def check_state(model: Model, x: Tensor, v: Tensor) -> tuple[int, ...]:
@@ -140,7 +140,7 @@ def prepare(
     unrolled = None
     if isinstance(adjoint, Unrolled):
         layout = model.derived("layout", lambda: reference.build_layout(model))
-        h, count = settings.numbers[0], settings.sweeps
+        h, count = settings.numbers.time_step, settings.sweeps
         unrolled = reference.stepper(model, like, mu, lam, h, count, rest_points, given_density, parameters, layout)
     return Prepared(
         mu=materials[0],

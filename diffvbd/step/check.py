@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import torch
 
 from .. import ops
@@ -12,11 +9,10 @@ from ..adjoint.sweep import sweep
 from ..model.model import Model
 
 
-def check_on_cpu(model: Model, tensors: Sequence[Any], settings: ops.SweepSettings, index: int) -> None:
+def check_on_cpu(model: Model, fields: ops.SweepFields, settings: ops.SweepSettings, index: int) -> None:
     """The CPU repeats a step and names what is wrong with it."""
     twin = model._on_cpu()
     settings = settings._replace(sizes=twin._sizes, launch=())
     with torch.no_grad():
-        here: list[Any] = [t if t is None else t.detach().cpu() for t in tensors]
-        repeated: Any = sweep
-        repeated(*here, twin._packed_rest, twin._plan, settings, tape_policy=ops.NO_TAPE, debug_step=index)
+        here = ops.SweepFields(*(t if t is None else t.detach().cpu() for t in fields))  # pyright: ignore
+        sweep(here, twin._packed_rest, twin._plan, settings, tape_policy=ops.NO_TAPE, debug_step=index)

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..adjoint.contact_sweep import ContactTensors, Pairs, contact_sweep, no_transforms, of_scene, pair_lag
+from ..adjoint.contact_lag import Pairs, of_scene, pair_lag
+from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
 from ..contact.start import start_part
 from ..contact.surface import LEAST_CAPACITY
@@ -75,8 +76,8 @@ class ContactStep:
         # [B, Vc, 3] at the end and at the start of the step: one tensor if they rest
         self.before = before.contiguous()
         self.colliders = self.before if colliders is before else colliders.contiguous()
-        self.tensors = begun.tensors(prepared)
-        self.origin = self.tensors.origin
+        self.fields = begun.fields(prepared)
+        self.origin = begun.x_prev.new_empty((0,)) if begun.origin is None else begun.origin
         self.surface, self.barrier = model.surface_of_contact, model.contact
         self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()].contiguous()
         floor = model.floor
@@ -87,8 +88,6 @@ class ContactStep:
         self.kappa = self._parameter("pair_barrier.kappa", like.new_zeros((1,)))
         self.lagged, self.lag = no_pairs(like, 0), like.new_zeros((0, 9))
         self.floor_lag = self._floor_lag()
-        friction = model.friction
-        self.friction_eps = prepared.settings.numbers[0] * friction.velocity if friction is not None else 1.0
 
     def _parameter(self, name: str, default: Tensor) -> Tensor:
         """A parameter [1 | B]."""
@@ -154,7 +153,7 @@ class ContactStep:
                 detection = found[-1] = detection.trimmed()
             if r == 0:
                 self._set_lag(detection.listed, was)
-            start = start_part(x, move, goal, self.tensors.mass, was, now, self.floor_data, self.origin, detection,
+            start = start_part(x, move, goal, self.fields.mass, was, now, self.floor_data, self.origin, detection,
                                surface, barrier.gamma)  # fmt: skip
             x, move = start.x, start.move
             cut.append(start.outside)
@@ -190,10 +189,13 @@ class ContactStep:
 
     def _sweep(self, x: Tensor, bounds: Tensor, collider: Tensor, listed: Pairs, settings: SweepSettings, policy: int,
                debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
-        tensors = self.tensors._replace(x_start=x)
-        contact = ContactTensors(bounds, collider, self.before, self.kappa, self.lag, self.floor_lag)
-        return contact_sweep(tensors, contact, listed, self.lagged, self.friction_eps, self.model._packed_rest,
-                             self.model._plan, settings, tape_policy=policy, debug_step=debug_step)  # fmt: skip
+        lagged, model = self.lagged, self.model
+        fields = self.fields._replace(
+            x_start=x, bounds=bounds, collider=collider, collider_prev=self.before, kappa=self.kappa,
+            **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs, lag_ptr=lagged.ptr, lag_entry=lagged.entry,
+            floor_lag=self.floor_lag,
+        )  # fmt: skip
+        return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)
 
     def _detect(self, x: Tensor, was: Tensor, now: Tensor, remaining: Tensor) -> Detection:
         surface, barrier = self.surface, self.barrier
@@ -207,7 +209,7 @@ class ContactStep:
                 x,
                 self.origin,
                 remaining.detach(),
-                self.tensors.mass.detach(),
+                self.fields.mass.detach(),
                 was,
                 now,
                 surface,

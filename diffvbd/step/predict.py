@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.sweep import SweepTensors
 from ..mask import ELASTIC
 from ..model.model import Model
 from .arguments import Prepared, broadcastable
@@ -46,27 +45,26 @@ class Begun(NamedTuple):
         origin = None if self.origin is None else self.origin.detach()
         return Begun(self.x_start.detach(), self.x_prev.detach(), self.y.detach(), self.data.detach(), origin)
 
-    def tensors(self, prepared: Prepared) -> SweepTensors:
-        """The arguments of adjoint.sweep.sweep."""
-        origin = self.y.new_empty((0,)) if self.origin is None else self.origin
-        return SweepTensors(self.x_start, self.x_prev, self.y, prepared.mu, prepared.lam, prepared.mass, prepared.rest,
-                            self.data, origin)  # fmt: skip
+    def fields(self, prepared: Prepared) -> ops.SweepFields:
+        """What the sweeps read, without contact."""
+        return ops.SweepFields(self.x_start, self.x_prev, self.y, prepared.mu, prepared.lam, prepared.mass,
+                               prepared.rest, self.data, self.origin)  # fmt: skip
 
     def corrected(self, x: Tensor, model: Model, prepared: Prepared) -> Tensor:
         """x [B, V, 3] after the rigid correction, where the Model has one."""
         return self._correct(x, model, prepared)[0] if model.corrects else x
 
     def _correct(self, x: Tensor, model: Model, prepared: Prepared) -> tuple[Tensor, Tensor]:
-        origin, settings = self.y.new_empty((0,)) if self.origin is None else self.origin, prepared.settings
-        return correct(x, self.x_prev, self.y, prepared.mass, self.data, origin, model._bodies, model._other_bodies,
-                       settings.data_count, settings.numbers[0])  # fmt: skip
+        settings = prepared.settings
+        return correct(x, self.x_prev, self.y, prepared.mass, self.data, self.origin, model._bodies,
+                       model._other_bodies, settings.data_count, settings.numbers.time_step)  # fmt: skip
 
     def finish(self, end: Tensor, model: Model, prepared: Prepared, corrects: bool = True) -> tuple[Tensor, Tensor]:
         """Positions and velocities after the step whose sweeps ended at ``end``."""
         if corrects and model.corrects:
             end, velocity = self._correct(end, model, prepared)
         else:
-            velocity = (end - self.x_prev) / prepared.settings.numbers[0]
+            velocity = (end - self.x_prev) / prepared.settings.numbers.time_step
         return end if self.origin is None else end + self.origin, velocity
 
 
@@ -74,7 +72,7 @@ def begin(
     model: Model, x: Tensor, v: Tensor, prepared: Prepared, force: Any, gravity: Tensor, prescribed: Any
 ) -> Begun:
     """Predictor, local origin, data of the energies and start of the sweeps."""
-    h = prepared.settings.numbers[0]
+    h = prepared.settings.numbers.time_step
     shape, flat = x.shape, (math.prod(x.shape[:-2]), *x.shape[-2:])
     start, velocity = x.reshape(flat), v.reshape(flat)
     if gravity.dim() == 1 and force is None:
@@ -93,18 +91,16 @@ def begin(
     if model.dtype == torch.float32 and model.num_vertices:
         origin = start.detach()[:, model._first_of_body]
         start = start - origin
-    none = start.new_empty((0,))
-    held = none
     if prescribed is not None:
-        held = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
-        held = held if origin is None else held - origin
+        prescribed = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
+        prescribed = prescribed if origin is None else prescribed - origin
     data = _energy_data(model, prepared, origin)
-    rest = none
+    rest = None
     if model.starts_from == "auto" and model.energy_mask & ELASTIC:
         rest = model.rest_scalars if prepared.rest is None else prepared.rest
     x_start, y = start_of(
-        start, velocity, acceleration, held, prepared.mass, data, none if origin is None else origin, prepared.mu,
-        prepared.lam, rest, model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
+        start, velocity, acceleration, prescribed, prepared.mass, data, origin, prepared.mu, prepared.lam, rest,
+        model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
         start=model.starts_from, filters=model.floor is not None and model.contact is None,
     )  # fmt: skip
     return Begun(x_start, start, y, data, origin)

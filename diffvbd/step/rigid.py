@@ -10,6 +10,7 @@ factor); else it is Newton's method in six unknowns, differentiated as executed.
 # pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -21,19 +22,21 @@ from ..model.bodies import Bodies, OtherBodies
 from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
 from ..ops import rigid as ops_rigid
 
-_TENSORS = 5  # x, x_prev, y, mass, data: the differentiable inputs, all [1 | B, ...]
+_TENSORS = 5  # differentiable fields: x, x_prev, y, mass, energy_data, all [1 | B, ...]
+_FIELDS = len(ops.RigidFields._fields)
 
 
 class _Correct(Function):
     @staticmethod
-    def forward(x, x_prev, y, mass, data, origin, order, ptr, spread, other, groups, data_count, time_step):
+    def forward(x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other, groups, data_count, time_step):
         # torch.compile counts these arguments: *args would get the context as well
-        return ops.raw.rigid(x, x_prev, y, mass, data, origin, order, ptr, spread, other, groups, data_count, time_step)
+        fields = ops.RigidFields(x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other)
+        return ops.raw.rigid(ops.as_list(fields, x), groups, data_count, time_step)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
-        *tensors, ctx.groups, ctx.data_count, ctx.time_step = inputs
-        ctx.save_for_backward(*tensors)
+        ctx.save_for_backward(*inputs[:_FIELDS])
+        ctx.options = inputs[_FIELDS:]
         ctx.set_materialize_grads(False)
 
     @staticmethod
@@ -44,7 +47,7 @@ class _Correct(Function):
         saved = ctx.saved_tensors  # read once, as torch's checkpoints want
         x_bar = torch.zeros_like(saved[0]) if grads[0] is None else grads[0]
         v_bar = saved[0].new_empty((0,)) if grads[1] is None else grads[1]
-        out = _CorrectBackward.apply(x_bar, v_bar, *saved, ctx.groups, ctx.data_count, ctx.time_step, needs)
+        out = _CorrectBackward.apply(x_bar, v_bar, *saved, ctx.options, needs)
         return of_inputs(out, needs, len(ctx.needs_input_grad) - _TENSORS)
 
     @staticmethod
@@ -56,18 +59,16 @@ class _Correct(Function):
 
 class _CorrectBackward(Function):
     @staticmethod
-    def forward(x_bar, v_bar, x, x_prev, y, mass, data, origin, order, ptr, spread, other, groups, data_count,
-                time_step, needs):  # fmt: skip
+    def forward(x_bar, v_bar, x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other, options, needs):
+        fields = ops.RigidFields(x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other)
+        groups, data_count, time_step = options
         x_out, x_prev_out, y_out, mass_out, shared, own = ops.raw.rigid_backward(
-            x_bar.contiguous(), v_bar.contiguous(), x, x_prev, y, mass, data, origin, order, ptr, spread, other, groups,
-            data_count, time_step, needs[4],
-        )  # fmt: skip
+            x_bar.contiguous(), v_bar.contiguous(), ops.as_list(fields, x), groups, data_count, time_step, needs[4]
+        )
         if not x_prev_out.numel():
             x_prev_out = torch.zeros_like(x_prev)
-        data_out = ops_rigid.join_data(shared, own, data_count) if needs[4] else data
-        out = (x_out, x_prev_out, y_out, mass_out, data_out)
-        given = (x, x_prev, y, mass, data)
-        return tuple(ops.sum_to(bar, t.shape) for bar, t, need in zip(out, given, needs, strict=True) if need)
+        data_out = ops_rigid.join_data(shared, own, data_count) if needs[4] else energy_data
+        return needed((x_out, x_prev_out, y_out, mass_out, data_out), fields, needs)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
@@ -83,26 +84,31 @@ class _CorrectBackward(Function):
         return one_by_one(_CorrectBackward, info.batch_size, in_dims, args)
 
 
-def folded(size: int, tensors: tuple, in_dims: tuple, full: int) -> tuple[list[Tensor], int]:
+def needed(bars: Sequence[Tensor], fields: Sequence[Tensor | None], needs: Sequence[bool]) -> tuple[Tensor, ...]:
+    """The adjoints of those first fields that need one, each in its field's shape."""
+    return tuple(ops.sum_to(bar, t.shape) for bar, t, need in zip(bars, fields, needs, strict=False)
+                 if need and t is not None)  # fmt: skip
+
+
+def folded(size: int, tensors: tuple, in_dims: tuple, full: int) -> tuple[list[Any], int]:
     """Tensors of vmap with its dimension folded into that of scenes, and the scenes of a member. The first ``full``
     have the shape of positions afterwards."""
-    counts = [(t if d is None else t.movedim(d, 0)[0]).shape[0] for t, d in zip(tensors, in_dims, strict=False)
-              if t.numel() > 0]  # fmt: skip
+    given = [(t, d) for t, d in zip(tensors, in_dims, strict=False)]
+    counts = [(t if d is None else t.movedim(d, 0)[0]).shape[0] for t, d in given if t is not None and t.numel() > 0]
     scenes = max(counts, default=1)
-    out = [t if t.numel() == 0 else ops.fold_scenes(t, d, size, scenes) for t, d in zip(tensors, in_dims, strict=False)]
+    out: list[Any] = [t if t is None or t.numel() == 0 else ops.fold_scenes(t, d, size, scenes) for t, d in given]
     shape = (size * scenes, *out[0].shape[1:])
     out[:full] = [t.expand(shape).contiguous() for t in out[:full]]
     return out, scenes
 
 
 def correct(
-    x: Tensor, x_prev: Tensor, y: Tensor, mass: Tensor, data: Tensor, origin: Tensor, bodies: Bodies,
+    x: Tensor, x_prev: Tensor, y: Tensor, mass: Tensor, energy_data: Tensor, origin: Tensor | None, bodies: Bodies,
     others: OtherBodies, data_count: tuple[int, ...], time_step: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Positions after every listed body was moved rigidly to the least potential, and the velocities (x - x_prev) / h,
-    [B, V, 3]; differentiable in the first five tensors, whose shapes are those of adjoint.sweep.sweep. ``origin`` is
-    empty where positions are absolute."""
-    tensors = distinct(x, x_prev, y, mass, data, origin)
+    [B, V, 3]; differentiable in the first five tensors, whose shapes are those of ops.SweepFields."""
+    tensors = distinct(x, x_prev, y, mass, energy_data, origin)
     *listed, groups = bodies
     return _Correct.apply(*tensors, *listed, others.of, groups, data_count, time_step)
 

@@ -21,31 +21,27 @@ from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
 from ..ops import rigid as ops_rigid
 from ..ops.begin import STARTS
 from ..safeguards import FILTER_ETA
-from .rigid import folded
+from .rigid import folded, needed
 
-_TENSORS = 6  # x, v, acceleration, held, mass, data: the differentiable inputs
+_TENSORS = 6  # differentiable fields: x, v, acceleration, prescribed, mass, energy_data
 _SCENES = 10  # and origin, mu, lam, rest: what has a scene dimension
+_FIELDS = len(ops.BeginFields._fields)
 
 
 class _Begin(Function):
     @staticmethod
-    def forward(x, v, acceleration, held, mass, data, origin, mu, lam, rest, pinned, order, ptr, spread, groups, other,
-                other_order, other_ptr, other_tets, other_tet_ptr, other_groups, data_count, time_step, filter_eta,
-                start, filters):  # fmt: skip
+    def forward(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest, pinned, order, ptr, spread,
+                other, other_order, other_ptr, other_tets, other_tet_ptr, groups, other_groups, options):  # fmt: skip
         # torch.compile counts these arguments: *args would get the context as well
-        return ops.raw.begin(
-            x, v, acceleration, held, mass, data, origin, mu, lam, rest, pinned, order, ptr, spread, groups, other,
-            other_order, other_ptr, other_tets, other_tet_ptr, other_groups, data_count, time_step, filter_eta,
-            start, filters,
-        )  # fmt: skip
+        fields = ops.BeginFields(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest, pinned,
+                                 order, ptr, spread, other, other_order, other_ptr, other_tets,
+                                 other_tet_ptr)  # fmt: skip
+        return ops.raw.begin(ops.as_list(fields, x), groups, other_groups, *options)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
-        x, v, acceleration, held, mass, data, origin, _, _, _, pinned, order, ptr, spread, groups, other = inputs[:16]
-        ctx.save_for_backward(
-            output[2], x, v, acceleration, held, mass, data, origin, pinned, order, ptr, spread, other
-        )
-        ctx.options = (groups, inputs[17].shape[0] - 1, *inputs[21:])
+        ctx.save_for_backward(output[2], *inputs[:_FIELDS])
+        ctx.options = (inputs[_FIELDS], *inputs[-1])
         ctx.mark_non_differentiable(output[2])
 
     @staticmethod
@@ -64,25 +60,25 @@ class _Begin(Function):
 
 class _BeginBackward(Function):
     @staticmethod
-    def forward(x_start_bar, y_bar, falls, x, v, acceleration, held, mass, data, origin, pinned, order, ptr, spread,
-                other, options, needs):  # fmt: skip
-        groups, others, data_count, *numbers = options
+    def forward(x_start_bar, y_bar, falls, x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest,
+                pinned, order, ptr, spread, other, other_order, other_ptr, other_tets, other_tet_ptr, options,
+                needs):  # fmt: skip
+        fields = ops.BeginFields(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest, pinned,
+                                 order, ptr, spread, other, other_order, other_ptr, other_tets,
+                                 other_tet_ptr)  # fmt: skip
         wants = (needs[2], needs[3], needs[5])
-        x_out, v_out, acceleration_out, held_out, mass_out, shared, own, planes = ops.raw.begin_backward(
-            x_start_bar.contiguous(), y_bar.contiguous(), falls, x, v, acceleration, held, mass, data, origin, pinned,
-            order, ptr, spread, groups, other, others, data_count, *numbers, wants,
-        )  # fmt: skip
-        data_out = data
+        *bars, shared, own, planes = ops.raw.begin_backward(
+            x_start_bar.contiguous(), y_bar.contiguous(), falls, ops.as_list(fields, x), *options, wants
+        )
+        data_out = energy_data
         if needs[5]:
-            data_out = ops_rigid.join_data(shared, own, data_count)
+            data_out = ops_rigid.join_data(shared, own, options[1])
             if planes.numel():  # the first energy's data
                 of_planes = ops.sum_to(planes, (planes.shape[0], 1, planes.shape[2]))[:, 0]
                 count = planes.shape[2]
                 first, others_out = data_out.narrow(1, 0, count), data_out.narrow(1, count, data_out.shape[1] - count)
                 data_out = torch.cat([first + of_planes, others_out], 1)
-        out = (x_out, v_out, acceleration_out, held_out, mass_out, data_out)
-        given = (x, v, acceleration, held, mass, data)
-        return tuple(ops.sum_to(bar, t.shape) for bar, t, need in zip(out, given, needs, strict=True) if need)
+        return needed((*bars, data_out), fields, needs)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
@@ -99,23 +95,25 @@ class _BeginBackward(Function):
 
 
 def begin(
-    x: Tensor, v: Tensor, acceleration: Tensor, held: Tensor, mass: Tensor, data: Tensor, origin: Tensor, mu: Tensor,
-    lam: Tensor, rest: Tensor, pinned: Tensor, bodies: Bodies, others: OtherBodies, data_count: tuple[int, ...],
-    time_step: float, *, start: str, filters: bool,
+    x: Tensor, v: Tensor, acceleration: Tensor, prescribed: Tensor | None, mass: Tensor, energy_data: Tensor,
+    origin: Tensor | None, mu: Tensor, lam: Tensor, rest: Tensor | None, pinned: Tensor, bodies: Bodies,
+    others: OtherBodies, data_count: tuple[int, ...], time_step: float, *, start: str, filters: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Where the sweeps start and the predictor [m], both [B, V, 3]; differentiable in the first six tensors.
 
     Args:
         x, v: State [m, m/s], [B, V, 3].  acceleration: [1 | B, 1 | V, 3] [m/s^2].
-        held: Where pinned vertices go [m], [1 | B, V, 3], or empty: they stay.
-        mass, data, origin, mu, lam: As of adjoint.sweep.sweep.  pinned: bool [V].
-        rest: [1 | B, T, 7], or empty where tets have no energy; like mu and lam looked at by "auto" only.
+        prescribed: Where pinned vertices go [m], [1 | B, V, 3]; None: they stay.
+        mass, energy_data, origin, mu, lam: As in ops.SweepFields.  pinned: bool [V].
+        rest: [1 | B, T, 7], or None where tets have no energy; like mu and lam looked at by "auto" only.
         start: "auto", "predictor" or "inertia", of the bodies that are not corrected.
         filters: Whether the planes of a floor hold back a start.
     """
-    tensors = distinct(x, v, acceleration, held, mass, data, origin, mu, lam, rest)
-    x_start, y, _ = _Begin.apply(*tensors, pinned, *bodies, *others, data_count, time_step, FILTER_ETA, STARTS[start],
-                                 filters)  # fmt: skip
+    tensors = distinct(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest)
+    *listed, groups = bodies
+    *listed_others, other_groups = others
+    options = (data_count, time_step, FILTER_ETA, STARTS[start], filters)
+    x_start, y, _ = _Begin.apply(*tensors, pinned, *listed, *listed_others, groups, other_groups, options)
     return x_start, y
 
 

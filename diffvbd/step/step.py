@@ -123,8 +123,8 @@ def advance(
     gravity = acceleration_of(gravity, x)
     where = collider_state(model, x, colliders, colliders_before)
     if isinstance(adjoint, ReverseSweep) and x.is_cuda and _fuses(model, force, gravity):
-        held = None if prescribed is None else broadcastable("prescribed", prescribed, x)
-        return _fused(model, x, v, gravity, held, prepared, adjoint)
+        prescribed = None if prescribed is None else broadcastable("prescribed", prescribed, x)
+        return _fused(model, x, v, gravity, prescribed, prepared, adjoint)
     begun = begin(model, x, v, prepared, force, gravity, prescribed)
     given = {"x": x, "v": v, "force": force, "gravity": gravity, "prescribed": prescribed, "colliders": colliders,
              "colliders_before": colliders_before}  # fmt: skip
@@ -151,9 +151,9 @@ def swept(
 ) -> Tensor:
     """Positions after the sweeps, with the backward of an adjoint route. ``given``: arguments that errors may name;
     ``colliders``: where they are at the start and at the end, of a Model with contact."""
-    tensors, settings, adjoint = begun.tensors(prepared), prepared.settings, check_adjoint(adjoint)
+    fields, settings, adjoint = begun.fields(prepared), prepared.settings, check_adjoint(adjoint)
     more = (*(colliders or ()), *prepared.parameters.values())
-    policy = _tape_policy(model, (*tensors, *more), settings, adjoint)
+    policy = _tape_policy(model, (*fields, *more), settings, adjoint)
     debug_step = index if checking() else -1
     try:
         if colliders is not None:
@@ -161,12 +161,13 @@ def swept(
                 moves = given.get("prescribed") is not None
                 return run_contact(model, begun, prepared, *colliders, moves, policy, debug_step)
         if checking() and begun.y.is_cuda:
-            check_on_cpu(model, tensors, settings, index)
+            check_on_cpu(model, fields, settings, index)
         with out_of_memory_named(model, begun.x_start, settings, policy):
             if isinstance(adjoint, GlobalAdjoint):
-                return global_sweep(model, tensors, settings, adjoint, debug_step,
+                return global_sweep(model, fields, settings, adjoint, debug_step,
                                     lambda x: begun.corrected(x, model, prepared))  # fmt: skip
-            return sweep(*tensors, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)
+            return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy,
+                         debug_step=debug_step)[0]  # fmt: skip
     except ValueError as error:
         name_argument(model, error, given)
         raise
@@ -187,18 +188,18 @@ def _fused(
     x: Tensor,
     v: Tensor,
     gravity: Tensor,
-    held: Tensor | None,
+    prescribed: Tensor | None,
     prepared: Prepared,
     adjoint: ReverseSweep,
 ) -> tuple[Tensor, Tensor]:
     shape, flat = x.shape, (math.prod(x.shape[:-2]), *x.shape[-2:])
-    held = x.new_empty((0,)) if held is None else ops.broadcast(held, shape).reshape(flat)
+    prescribed = None if prescribed is None else ops.broadcast(prescribed, shape).reshape(flat)
     acceleration = ops.broadcast(gravity, (1, 1, 3))
     x, v = x.reshape(flat), v.reshape(flat)
-    tensors = (x, v, acceleration, held, prepared.mu, prepared.lam, prepared.mass, prepared.rest)
-    policy = _tape_policy(model, tensors, prepared.settings, adjoint)
+    fields = ops.StepFields(x, v, acceleration, prescribed, prepared.mu, prepared.lam, prepared.mass, prepared.rest)
+    policy = _tape_policy(model, fields, prepared.settings, adjoint)
     with out_of_memory_named(model, x, prepared.settings, policy):
-        x_end, v_end = fused_step(*tensors, model._packed_rest, model._plan, prepared.settings, tape_policy=policy)
+        x_end, v_end = fused_step(fields, model._packed_rest, model._plan, prepared.settings, tape_policy=policy)
     return x_end.reshape(shape), v_end.reshape(shape)
 
 

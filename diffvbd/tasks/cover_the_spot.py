@@ -19,7 +19,7 @@ that fall side by side meet rim to rim on the floor, and no small change lifts o
 
 import math
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -48,6 +48,19 @@ SHARPNESS = (4.0, 25.0)  # at the first and the last iteration [1 / R]
 SAMPLES, FINE_SAMPLES = 400, 4000  # points of the target: of the loss, of the result
 
 
+class Version(NamedTuple):
+    """What the quick version has other values of."""
+
+    rings: int
+    height: float  # release of the lowest disk above the floor [m]
+    steps: int
+    sweeps: int
+    iterations: int
+
+
+FULL, QUICK = Version(3, HEIGHT, 160, SWEEPS, 600), Version(2, 0.5, 75, 4, 30)
+
+
 def problem(settings: Settings, radius: float = RADIUS) -> Problem:
     """The task; disks of another radius [m] on request.
 
@@ -60,103 +73,121 @@ def problem(settings: Settings, radius: float = RADIUS) -> Problem:
             f"radius: expected more than R sqrt(3)/2 = {least:.4f} m, below which no three disks cover the target of "
             f"R = {TARGET_RADIUS} m, got {radius}"
         )
-    rings, height, steps, sweeps, iterations = 3, HEIGHT, 160, SWEEPS, 600
-    if settings.quick:
-        rings, height, steps, sweeps, iterations = 2, 0.5, 75, 4, 30
-    disk = dv.mesh.disk(radius, THICKNESS, rings)
-    angles = 2 * np.pi * np.arange(3) / 3
-    outward = np.stack([np.cos(angles), np.zeros(3), np.sin(angles)], axis=1)
-    centers = RING * outward
-    centers[:, 1] = height + SPACING * np.arange(3)
+    version = QUICK if settings.quick else FULL
+    fall = Fall(settings, radius, version)
+    return Problem(
+        name="cover-the-spot",
+        parameters={"velocity": fall.velocity, "offset": fall.offset},
+        stages=[
+            Stage(
+                loss=fall.loss,
+                iterations=version.iterations,
+                learning_rate=0.03,
+                before=fall.anneal,
+                criterion="uncovered",
+                capturable=True,
+            )
+        ],
+        estimates=fall.estimates,
+        protocol=protocol(fall, radius),
+        picture=fall.picture,
+        animation=fall.animation,
+    )
+
+
+class Fall:
+    """Three disks from their release to where they come to lie, and the 18 numbers that decide it."""
+
+    def __init__(self, settings: Settings, radius: float, version: Version) -> None:
+        self.version, self.disk = version, dv.mesh.disk(radius, THICKNESS, version.rings)
+        angles = 2 * np.pi * np.arange(3) / 3
+        outward = np.stack([np.cos(angles), np.zeros(3), np.sin(angles)], axis=1)
+        self.centers = RING * outward
+        self.centers[:, 1] = version.height + SPACING * np.arange(3)
+        self.model = model_of(self.disk, self.centers).to(settings.device)
+        like = {"dtype": self.model.dtype, "device": self.model.device}
+        self.rim = torch.as_tensor(outline(self.disk), device=self.model.device)
+        self.top = torch.as_tensor(faces_up(self.disk), device=self.model.device)
+        self.samples, self.fine = (sunflower(n, TARGET_RADIUS).to(**like) for n in (SAMPLES, FINE_SAMPLES))
+        self.sharpness = torch.tensor(SHARPNESS[0] / TARGET_RADIUS, **like)
+        self.landed = torch.zeros((3, self.disk.num_vertices, 3), **like)  # by the latest loss
+
+        noise = torch.randn((3, 3), generator=torch.Generator().manual_seed(settings.seed), dtype=torch.float64)
+        self.velocity = (OUTWARD * torch.from_numpy(outward) + NOISE * noise).to(**like).requires_grad_()
+        self.offset = torch.zeros((3, 3), **like, requires_grad=True)
+
+    def simulate(self, save: Literal["all", "last"] = "last") -> Tensor:
+        """Positions [m] of saved frames, shape [frames, 3, vertices of a disk, 3]."""
+        moved, v = (
+            each[:, None].expand(-1, self.disk.num_vertices, -1).flatten(0, 1)
+            for each in (OFFSET * self.offset.tanh(), self.velocity)
+        )
+        motion = dv.rollout(self.model, self.model.rest_points + moved, v, steps=self.version.steps, mu=MU, lam=LAM,
+                            time_step=TIME_STEP, sweeps=self.version.sweeps, save=save)  # fmt: skip
+        return motion.x.unflatten(1, (3, -1))
+
+    def loss(self) -> Tensor:
+        end = self.simulate()[-1]
+        self.landed.copy_(end.detach())
+        return smooth_uncovered(end[:, self.rim], self.samples, self.sharpness)
+
+    def anneal(self, iteration: int) -> None:
+        share = iteration / max(1, self.version.iterations - 1)
+        self.sharpness.fill_((SHARPNESS[0] + share * (SHARPNESS[1] - SHARPNESS[0])) / TARGET_RADIUS)
+
+    def estimates(self) -> Row:
+        return {"uncovered": uncovered(self.landed[:, self.top], self.fine).item()}
+
+    @torch.no_grad()
+    def motion(self) -> Tensor:
+        """All frames, shape [frames, V, 3]."""
+        return self.simulate("all").flatten(1, 2)
+
+    def picture(self, path: Path, history: list[Row]) -> None:
+        motion = self.motion()
+        heights = motion[..., 1].mean(1)
+        shown = [int((heights > share * heights[0]).sum()) for share in (0.75, 0.25)] + [self.version.steps]
+        surfaces = [self.disk.surface + k * self.disk.num_vertices for k in range(3)]
+        viz.landing(path, surfaces, motion[shown], [k * TIME_STEP for k in shown], TARGET_RADIUS, history)
+
+    def animation(self, path: Path) -> None:
+        viz.animation(path, self.model.surface.cpu().numpy(), {"recovered": self.motion()}, TIME_STEP)
+
+
+def model_of(disk: dv.TetMesh, centers: np.ndarray) -> dv.Model:
+    """A disk at each of some centers [m], shape [n, 3], above a floor."""
     energies = (
         dv.StableNeoHookean(),
         dv.FloorBarrier(kappa=KAPPA, dhat=DHAT, damping=DAMPING),
         dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, detections=1, reach=REACH, capacity=CAPACITY),
     )
-    model = dv.Model(dv.mesh.join([disk.translate(c) for c in centers]), density=DENSITY, energies=energies)
-    model = model.to(settings.device)
-    like = {"dtype": model.dtype, "device": model.device}
+    return dv.Model(dv.mesh.join([disk.translate(c) for c in centers]), density=DENSITY, energies=energies)
 
-    rim, top = outline(disk), faces_up(disk)
-    rim, top = (torch.as_tensor(part, device=model.device) for part in (rim, top))
-    samples, fine = (sunflower(n, TARGET_RADIUS).to(**like) for n in (SAMPLES, FINE_SAMPLES))
-    sharpness = torch.tensor(SHARPNESS[0] / TARGET_RADIUS, **like)
 
-    noise = torch.randn((3, 3), generator=torch.Generator().manual_seed(settings.seed), dtype=torch.float64)
-    velocity = (OUTWARD * torch.from_numpy(outward) + NOISE * noise).to(**like).requires_grad_()
-    offset = torch.zeros((3, 3), **like, requires_grad=True)
-    landed = torch.zeros((3, disk.num_vertices, 3), **like)
-
-    def simulate(save: Literal["all", "last"] = "last") -> Tensor:
-        """Positions [m] of saved frames, shape [frames, 3, vertices of a disk, 3]."""
-        moved, v = (
-            each[:, None].expand(-1, disk.num_vertices, -1).flatten(0, 1) for each in (OFFSET * offset.tanh(), velocity)
-        )
-        motion = dv.rollout(model, model.rest_points + moved, v, steps=steps, mu=MU, lam=LAM, time_step=TIME_STEP,
-                            sweeps=sweeps, save=save)  # fmt: skip
-        return motion.x.unflatten(1, (3, -1))
-
-    def loss() -> Tensor:
-        end = simulate()[-1]
-        landed.copy_(end.detach())
-        return smooth_uncovered(end[:, rim], samples, sharpness)
-
-    def anneal(iteration: int) -> None:
-        share = iteration / max(1, iterations - 1)
-        sharpness.fill_((SHARPNESS[0] + share * (SHARPNESS[1] - SHARPNESS[0])) / TARGET_RADIUS)
-
-    def picture(path: Path, history: list[Row]) -> None:
-        with torch.no_grad():
-            motion = simulate("all").flatten(1, 2)
-        heights = motion[..., 1].mean(1)
-        shown = [int((heights > share * heights[0]).sum()) for share in (0.75, 0.25)] + [steps]
-        surfaces = [disk.surface + k * disk.num_vertices for k in range(3)]
-        viz.landing(path, surfaces, motion[shown], [k * TIME_STEP for k in shown], TARGET_RADIUS, history)
-
-    @torch.no_grad()
-    def animation(path: Path) -> None:
-        viz.animation(path, model.surface.cpu().numpy(), {"recovered": simulate("all").flatten(1, 2)}, TIME_STEP)
-
-    return Problem(
-        name="cover-the-spot",
-        parameters={"velocity": velocity, "offset": offset},
-        stages=[
-            Stage(
-                loss=loss,
-                iterations=iterations,
-                learning_rate=0.03,
-                before=anneal,
-                criterion="uncovered",
-                capturable=True,
-            )
-        ],
-        estimates=lambda: {"uncovered": uncovered(landed[:, top], fine).item()},
-        protocol={
-            "radius": radius,
-            "target_radius": TARGET_RADIUS,
-            "vertices": model.num_vertices,
-            "tets": model.num_tets,
-            "rings": rings,
-            "steps": steps,
-            "time_step": TIME_STEP,
-            "sweeps": sweeps,
-            "density": DENSITY,
-            "mu": MU,
-            "lam": LAM,
-            "kappa": KAPPA,
-            "dhat": DHAT,
-            "damping": DAMPING,
-            "reach": REACH,
-            "detections": 1,
-            "heights": centers[:, 1].tolist(),
-            "sharpness": SHARPNESS,
-            "offset": OFFSET,
-            "noise": NOISE,
-            "samples": (SAMPLES, FINE_SAMPLES),
-        },
-        picture=picture,
-        animation=animation,
-    )
+def protocol(fall: Fall, radius: float) -> dict[str, Any]:
+    return {
+        "radius": radius,
+        "target_radius": TARGET_RADIUS,
+        "vertices": fall.model.num_vertices,
+        "tets": fall.model.num_tets,
+        "rings": fall.version.rings,
+        "steps": fall.version.steps,
+        "time_step": TIME_STEP,
+        "sweeps": fall.version.sweeps,
+        "density": DENSITY,
+        "mu": MU,
+        "lam": LAM,
+        "kappa": KAPPA,
+        "dhat": DHAT,
+        "damping": DAMPING,
+        "reach": REACH,
+        "detections": 1,
+        "heights": fall.centers[:, 1].tolist(),
+        "sharpness": SHARPNESS,
+        "offset": OFFSET,
+        "noise": NOISE,
+        "samples": (SAMPLES, FINE_SAMPLES),
+    }
 
 
 def outline(disk: dv.TetMesh) -> np.ndarray:

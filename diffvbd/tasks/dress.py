@@ -25,7 +25,7 @@ two of them. The sweeps start from the predictor, as in the paper.
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -52,6 +52,21 @@ ROUNDS, NEWTON_STEPS = 5, 2  # of stage B, of each of its solves
 PROBE, LIMIT = 1e-3, 0.5  # distance of the second gradient, longest step, in log mu or log lam
 
 
+class Version(NamedTuple):
+    """What the quick version has other values of."""
+
+    segments: int
+    rings: int
+    steps: int
+    early: int  # frames that the early objective sees
+    settled: int  # frames that the settled one averages
+    iterations: int  # of stage A
+    rounds: int  # of stage B
+
+
+FULL, QUICK = Version(20, 15, 80, 16, 32, 100, ROUNDS), Version(8, 6, 24, 8, 12, 25, 2)
+
+
 def problem(name: str, settings: Settings, observe: Callable[[Tensor], Tensor], alone: bool = False) -> Problem:
     """The task of this name.
 
@@ -61,67 +76,12 @@ def problem(name: str, settings: Settings, observe: Callable[[Tensor], Tensor], 
         observe: What is seen of frames [N, V, 3] [m]: lengths [N, ..., c] [m], compared as points of c coordinates.
         alone: Leave stage A out.
     """
-    segments, rings, steps, early, settled, iterations, rounds = 20, 15, 80, 16, 32, 100, ROUNDS
-    if settings.quick:
-        segments, rings, steps, early, settled, iterations, rounds = 8, 6, 24, 8, 12, 25, 2
-    mesh = dv.mesh.dress(segments, rings, THICKNESS, NECK, HEM)
-    model = dv.Model(
-        mesh,
-        density=DENSITY,
-        pinned=ring_of_vertices(mesh, segments, rings) == 0,
-        energies=(
-            dv.StableNeoHookean(),
-            dv.FloorBarrier(kappa=KAPPA, dhat=DHAT, damping=DAMPING),
-            dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, detections=1, reach=REACH),
-        ),
-        colliders=[dv.colliders.Capsule(FOOT, HEAD, RADIUS)],
-        start="predictor",
-    ).to(settings.device)
-    still = torch.zeros_like(model.rest_points)
-
-    def drape(mu: Tensor, lam: Tensor, steps: int = steps) -> Tensor:
-        """Positions [m] of all frames, shape [steps + 1, V, 3]."""
-        return dv.rollout(
-            model, model.rest_points, still, steps=steps, mu=mu, lam=lam, time_step=TIME_STEP, sweeps=SWEEPS
-        ).x
-
-    def first_frames(x: Tensor) -> Tensor:
-        return observe(x[1 : early + 1])
-
-    def settled_drape(x: Tensor) -> Tensor:
-        return observe(x[-settled:]).mean(0)
-
-    start, truth = (still.new_tensor(values) for values in (START, list(TRUTH.values())))
-    with torch.no_grad():
-        target = drape(truth[0], truth[1])
-        target_early, target_settled = first_frames(target), settled_drape(target)
-    log_mu, log_lam = (value.log().requires_grad_() for value in start)
-
-    def early_loss(x: Tensor | None = None) -> Tensor:
-        x = drape(log_mu.exp(), log_lam.exp(), early) if x is None else x
-        return losses.vertex_distance(first_frames(x), target_early)
-
-    def settled_loss(x: Tensor | None = None) -> Tensor:
-        x = drape(log_mu.exp(), log_lam.exp()) if x is None else x
-        return losses.vertex_distance(settled_drape(x), target_settled)
-
-    def both() -> Tensor:
-        x = drape(log_mu.exp(), log_lam.exp())
-        return early_loss(x) + settled_loss(x)
-
-    def newton(loss: Callable[[], Tensor], moved: str, of: str) -> Stage:
-        return Stage(
-            loss=loss,
-            iterations=2 * NEWTON_STEPS + 1,  # two gradients a step, and the result's
-            optimizer=lambda parameters: Newton(parameters, PROBE, LIMIT),
-            moves=(moved,),
-            capturable=True,
-            name=of,
-        )
-
-    stages = [] if alone else [Stage(both, iterations, LEARNING_RATE, capturable=True, name="both objectives")]
-    for k in range(rounds):
-        stages += [newton(settled_loss, "log_mu", f"mu {k + 1}"), newton(early_loss, "log_lam", f"lam {k + 1}")]
+    version = QUICK if settings.quick else FULL
+    drape = Drape(settings, observe, version)
+    first = Stage(drape.both, version.iterations, LEARNING_RATE, capturable=True, name="both objectives")
+    stages = [] if alone else [first]
+    for k in range(1, version.rounds + 1):
+        stages += [newton(drape.settled_loss, "log_mu", f"mu {k}"), newton(drape.early_loss, "log_lam", f"lam {k}")]
 
     def findings(history: list[Row]) -> dict[str, Any]:
         other = problem(name, settings, observe, alone=True)
@@ -129,51 +89,135 @@ def problem(name: str, settings: Settings, observe: Callable[[Tensor], Tensor], 
         other.picture = other.animation = None
         return {"alternation_alone": solve(other, replace(settings, out=settings.out / "alternation_alone")).estimates}
 
-    def motions() -> dict[str, Tensor]:
-        with torch.no_grad():
-            return {
-                "initial": drape(start[0], start[1]),
-                "target": target,
-                "recovered": drape(log_mu.exp(), log_lam.exp()),
-            }
+    return Problem(
+        name=name,
+        parameters={"log_mu": drape.log_mu, "log_lam": drape.log_lam},
+        stages=stages,
+        estimates=drape.estimates,
+        truth=TRUTH,
+        units={"mu": "Pa", "lam": "Pa"},
+        protocol=protocol(drape.model, version, len(stages)),
+        findings=None if alone or settings.quick else findings,
+        picture=drape.picture,
+        animation=drape.animation,
+    )
 
+
+class Drape:
+    """A dress, what is seen of its fall, and the material that is looked for."""
+
+    def __init__(self, settings: Settings, observe: Callable[[Tensor], Tensor], version: Version) -> None:
+        self.observe, self.version = observe, version
+        self.mesh = dv.mesh.dress(version.segments, version.rings, THICKNESS, NECK, HEM)
+        neck = ring_of_vertices(self.mesh, version.segments, version.rings) == 0
+        self.model = model_of(self.mesh, neck).to(settings.device)
+        self.still = torch.zeros_like(self.model.rest_points)
+        self.start, truth = (self.still.new_tensor(values) for values in (START, list(TRUTH.values())))
+        with torch.no_grad():
+            self.target = self.fall(truth[0], truth[1])
+            self.target_early, self.target_settled = self.first_frames(self.target), self.settled_drape(self.target)
+        self.log_mu, self.log_lam = (value.log().requires_grad_() for value in self.start)
+
+    def fall(self, mu: Tensor, lam: Tensor, steps: int | None = None) -> Tensor:
+        """Positions [m] of all frames, shape [steps + 1, V, 3]."""
+        steps = self.version.steps if steps is None else steps
+        return dv.rollout(self.model, self.model.rest_points, self.still, steps=steps, mu=mu, lam=lam,
+                          time_step=TIME_STEP, sweeps=SWEEPS).x  # fmt: skip
+
+    def recovered(self, steps: int | None = None) -> Tensor:
+        return self.fall(self.log_mu.exp(), self.log_lam.exp(), steps)
+
+    def first_frames(self, x: Tensor) -> Tensor:
+        return self.observe(x[1 : self.version.early + 1])
+
+    def settled_drape(self, x: Tensor) -> Tensor:
+        return self.observe(x[-self.version.settled :]).mean(0)
+
+    def early_loss(self, x: Tensor | None = None) -> Tensor:
+        x = self.recovered(self.version.early) if x is None else x
+        return losses.vertex_distance(self.first_frames(x), self.target_early)
+
+    def settled_loss(self, x: Tensor | None = None) -> Tensor:
+        x = self.recovered() if x is None else x
+        return losses.vertex_distance(self.settled_drape(x), self.target_settled)
+
+    def both(self) -> Tensor:
+        x = self.recovered()
+        return self.early_loss(x) + self.settled_loss(x)
+
+    def estimates(self) -> Row:
+        return {"mu": self.log_mu.exp().item(), "lam": self.log_lam.exp().item()}
+
+    @torch.no_grad()
+    def motions(self) -> dict[str, Tensor]:
+        return {
+            "initial": self.fall(self.start[0], self.start[1]),
+            "target": self.target,
+            "recovered": self.recovered(),
+        }
+
+    def picture(self, path: Path, history: list[Row]) -> None:
+        shown = [0, self.version.early, self.version.steps]
+        frames = {name: motion[shown] for name, motion in self.motions().items()}
+        viz.comparison(path, self.mesh.surface, frames, [k * TIME_STEP for k in shown], history, TRUTH, scenery())
+
+    def animation(self, path: Path) -> None:
+        viz.animation(path, self.mesh.surface, self.motions(), TIME_STEP, scenery())
+
+
+def model_of(mesh: dv.TetMesh, neck: np.ndarray) -> dv.Model:
+    """The dress, pinned at the neck, above floor and mannequin."""
+    return dv.Model(
+        mesh,
+        density=DENSITY,
+        pinned=neck,
+        energies=(
+            dv.StableNeoHookean(),
+            dv.FloorBarrier(kappa=KAPPA, dhat=DHAT, damping=DAMPING),
+            dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, detections=1, reach=REACH),
+        ),
+        colliders=[dv.colliders.Capsule(FOOT, HEAD, RADIUS)],
+        start="predictor",
+    )
+
+
+def newton(loss: Callable[[], Tensor], moved: str, name: str) -> Stage:
+    """One solve of stage B: Newton's method for one of the two numbers."""
+    return Stage(
+        loss=loss,
+        iterations=2 * NEWTON_STEPS + 1,  # two gradients a step, and the result's
+        optimizer=lambda parameters: Newton(parameters, PROBE, LIMIT),
+        moves=(moved,),
+        capturable=True,
+        name=name,
+    )
+
+
+def scenery() -> list[viz.Scenery]:
+    """Floor and mannequin."""
     # pieces: a picture sorts triangles by depth, and the long ones of a whole mannequin would shine through the dress
     cuts = np.linspace(FOOT, HEAD, 13)
     mannequin = [viz.capsule(a, b, RADIUS) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
-    scenery = [viz.floor((-0.5, -0.5), (0.5, 0.5)), *mannequin]
+    return [viz.floor((-0.5, -0.5), (0.5, 0.5)), *mannequin]
 
-    def picture(path: Path, history: list[Row]) -> None:
-        shown = [0, early, steps]
-        frames = {name: motion[shown] for name, motion in motions().items()}
-        viz.comparison(path, mesh.surface, frames, [k * TIME_STEP for k in shown], history, TRUTH, scenery)
 
-    return Problem(
-        name=name,
-        parameters={"log_mu": log_mu, "log_lam": log_lam},
-        stages=stages,
-        estimates=lambda: {"mu": log_mu.exp().item(), "lam": log_lam.exp().item()},
-        truth=TRUTH,
-        units={"mu": "Pa", "lam": "Pa"},
-        protocol={
-            "vertices": model.num_vertices,
-            "tets": model.num_tets,
-            "thickness": THICKNESS,
-            "steps": steps,
-            "early": early,
-            "settled": settled,
-            "time_step": TIME_STEP,
-            "sweeps": SWEEPS,
-            "density": DENSITY,
-            "mannequin": [FOOT, HEAD, RADIUS],
-            "kappa": KAPPA,
-            "dhat": DHAT,
-            "damping": DAMPING,
-            "reach": REACH,
-            "detections": 1,
-            "start": START,
-            "stages": len(stages),
-        },
-        findings=None if alone or settings.quick else findings,
-        picture=picture,
-        animation=lambda path: viz.animation(path, mesh.surface, motions(), TIME_STEP, scenery),
-    )
+def protocol(model: dv.Model, version: Version, stages: int) -> dict[str, Any]:
+    return {
+        "vertices": model.num_vertices,
+        "tets": model.num_tets,
+        "thickness": THICKNESS,
+        "steps": version.steps,
+        "early": version.early,
+        "settled": version.settled,
+        "time_step": TIME_STEP,
+        "sweeps": SWEEPS,
+        "density": DENSITY,
+        "mannequin": [FOOT, HEAD, RADIUS],
+        "kappa": KAPPA,
+        "dhat": DHAT,
+        "damping": DAMPING,
+        "reach": REACH,
+        "detections": 1,
+        "start": START,
+        "stages": stages,
+    }

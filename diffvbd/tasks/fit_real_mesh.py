@@ -30,6 +30,7 @@ predictor, as in the paper's tasks.
 import math
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -55,6 +56,20 @@ SMOOTH = 0.05  # jumps of log mu below which total variation is quadratic
 SURFACES = (".obj", ".off", ".ply", ".stl")
 
 
+class Version(NamedTuple):
+    """What the quick version has other values of."""
+
+    grips: int
+    steps: int
+    every: int  # steps from one observed shape to the next
+    weight: float  # of the total variation at first
+    counts: tuple[int, ...]  # evaluations of each stage
+    bunny: int
+
+
+FULL, QUICK = Version(8, 48, 8, WEIGHT, (8, 40, 24, 24, 30), 10), Version(3, 32, 8, WEIGHT / 10, (5, 30), 8)
+
+
 def problem(
     settings: Settings, mesh: Path | None = None, edge_length: float | None = None, iterations: int | None = None
 ) -> Problem:
@@ -65,72 +80,124 @@ def problem(
         FileNotFoundError, ValueError: no such file, no body in it, edge_length or iterations not positive.
         ImportError: the file holds a surface, and pytetwild is missing.
     """
-    grips, steps, every, heavy, counts = 8, 48, 8, WEIGHT, (8, 40, 24, 24, 30)
-    if settings.quick:
-        grips, steps, every, heavy, counts = 3, 32, 8, WEIGHT / 10, (5, 30)
+    version = QUICK if settings.quick else FULL
     if iterations is not None:
         if iterations < 1:
             raise ValueError(f"iterations: expected at least 1, got {iterations}")
-        counts = (counts[0], *(iterations for _ in counts[1:]))
+        version = version._replace(counts=(version.counts[0], *(iterations for _ in version.counts[1:])))
     if edge_length is not None and (mesh is None or mesh.suffix.lower() not in SURFACES):
         raise ValueError(
             f"edge_length: expected it beside a mesh that is a surface ({', '.join(SURFACES)}), got {mesh}"
         )
-    body = scaled(read(mesh, edge_length) if mesh else dv.mesh.bunny(8 if settings.quick else 10), HEIGHT)
-    pinned = body.points[:, 1] <= HELD * HEIGHT
-    model = dv.Model(body, density=DENSITY, pinned=pinned, relaxation=RELAXATION, start="predictor").to(settings.device)
-    like = {"dtype": model.dtype, "device": model.device}
-    force = torch.as_tensor(pulls(body, grips), **like)
-    x = model.rest_points.expand(grips, -1, -1)
-    v = torch.zeros_like(x)
-    seen = np.setdiff1d(body.surface, np.flatnonzero(pinned))
-    seen = torch.as_tensor(seen, device=model.device)
+    body = scaled(read(mesh, edge_length) if mesh else dv.mesh.bunny(version.bunny), HEIGHT)
+    pulled = Pulled(body, settings, version)
+    fit = Fit(pulled, version)
+    return Problem(
+        name="fit-real-mesh",
+        parameters={"level": fit.level, "exponents": fit.exponents},
+        state={"lowered": fit.lowered},
+        stages=[stage_of(fit, k, count) for k, count in enumerate(version.counts)],
+        estimates=fit.estimates,
+        truth={"mu_soft": SOFT, "mu_stiff": STIFF},
+        units={"mu_soft": "Pa", "mu_stiff": "Pa"},
+        protocol={
+            "mesh": str(mesh or "bunny"),
+            "edge_length": edge_length,
+            "vertices": body.num_vertices,
+            "tets": body.num_tets,
+            "observed": list(pulled.observed.shape),
+            "noise": pulled.sigma,
+            "iterations": version.counts,
+            "steps": version.steps,
+            "time_step": TIME_STEP,
+            "sweeps": SWEEPS,
+            "relaxation": RELAXATION,
+            "density": DENSITY,
+            "poisson": POISSON,
+            "start_mu": START,
+            "traction": TRACTION,
+            "weight": version.weight,
+            "fall": FALL,
+            "smooth": SMOOTH,
+            "range": RANGE,
+        },
+        findings=fit.findings,
+        picture=fit.picture,
+        animation=fit.animation,
+    )
 
-    def simulate(mu: Tensor, save: int = every) -> Tensor:
+
+class Pulled:
+    """The body, its true material, and the shapes that were seen of each pull."""
+
+    def __init__(self, body: dv.TetMesh, settings: Settings, version: Version) -> None:
+        self.body, self.version = body, version
+        pinned = body.points[:, 1] <= HELD * HEIGHT
+        model = dv.Model(body, density=DENSITY, pinned=pinned, relaxation=RELAXATION, start="predictor")
+        self.model = model.to(settings.device)
+        self.like = {"dtype": self.model.dtype, "device": self.model.device}
+        self.force = torch.as_tensor(pulls(body, version.grips), **self.like)
+        self.x = self.model.rest_points.expand(version.grips, -1, -1)
+        self.v = torch.zeros_like(self.x)
+        seen = np.setdiff1d(body.surface, np.flatnonzero(pinned))
+        self.seen = torch.as_tensor(seen, device=self.model.device)
+
+        side = (body.points[body.tets].mean(1) - 0.5 * (body.points.min(0) + body.points.max(0))) @ np.array(PLANE)
+        self.stiff = torch.as_tensor(side > 0, device=self.model.device)
+        self.true = torch.where(self.stiff, torch.tensor(STIFF, **self.like), torch.tensor(SOFT, **self.like))
+        with torch.no_grad():
+            self.observed = self.simulate(self.true)[1:, :, self.seen]
+        self.sigma = NOISE * HEIGHT
+        random = torch.Generator().manual_seed(settings.seed)
+        noise = torch.randn(self.observed.shape, generator=random, dtype=torch.float64)
+        self.observed += self.sigma * noise.to(**self.like)
+
+    def simulate(self, mu: Tensor, save: int | None = None) -> Tensor:
         """Positions [m] of saved frames, shape [frames, grips, V, 3]."""
         lam = 2 * POISSON / (1 - 2 * POISSON) * mu
-        motion = dv.rollout(model, x, v, steps=steps, mu=mu, lam=lam, time_step=TIME_STEP, sweeps=SWEEPS, force=force,
-                            gravity=(0.0, 0.0, 0.0), save=save)  # fmt: skip
+        motion = dv.rollout(self.model, self.x, self.v, steps=self.version.steps, mu=mu, lam=lam, time_step=TIME_STEP,
+                            sweeps=SWEEPS, force=self.force, gravity=(0.0, 0.0, 0.0),
+                            save=self.version.every if save is None else save)  # fmt: skip
         return motion.x
 
-    side = (body.points[body.tets].mean(1) - 0.5 * (body.points.min(0) + body.points.max(0))) @ np.array(PLANE)
-    stiff = torch.as_tensor(side > 0, device=model.device)
-    true = torch.where(stiff, torch.tensor(STIFF, **like), torch.tensor(SOFT, **like))
-    with torch.no_grad():
-        observed = simulate(true)[1:, :, seen]
-    sigma = NOISE * HEIGHT
-    random = torch.Generator().manual_seed(settings.seed)
-    observed += sigma * torch.randn(observed.shape, generator=random, dtype=torch.float64).to(**like)
+    def misfit(self, mu: Tensor) -> Tensor:
+        """Mean squared residual over the variance of the noise."""
+        return (self.simulate(mu)[1:, :, self.seen] - self.observed).square().mean() / self.sigma**2
 
-    first, second, area = (torch.as_tensor(a, device=model.device) for a in neighbors(body))
-    share = area / area.sum()
-    level = torch.zeros((), **like, requires_grad=True)
-    exponents = torch.zeros(body.num_tets, **like, requires_grad=True)
-    lowered = torch.zeros(len(counts), **like)  # 1 for each stage that began with a lower weight
-    weight = torch.tensor(heavy, **like)
 
-    def log_mu() -> Tensor:
+class Fit:
+    """The unknowns, and the loss with its total variation, whose weight falls from stage to stage."""
+
+    def __init__(self, pulled: Pulled, version: Version) -> None:
+        self.pulled, self.body, self.start_weight = pulled, pulled.body, version.weight
+        device, like = pulled.model.device, pulled.like
+        self.first, self.second, area = (torch.as_tensor(a, device=device) for a in neighbors(pulled.body))
+        self.share = area / area.sum()
+        self.level = torch.zeros((), **like, requires_grad=True)
+        self.exponents = torch.zeros(pulled.body.num_tets, **like, requires_grad=True)
+        self.lowered = torch.zeros(len(version.counts), **like)  # 1 for each stage that began with a lower weight
+        self.weight = torch.tensor(version.weight, **like)
+
+    def log_mu(self) -> Tensor:
         limit = math.log(RANGE)
-        return math.log(START) + limit * ((level + exponents) / limit).tanh()
+        return math.log(START) + limit * ((self.level + self.exponents) / limit).tanh()
 
-    def misfit(mu: Tensor) -> Tensor:
-        return (simulate(mu)[1:, :, seen] - observed).square().mean() / sigma**2
-
-    def loss() -> Tensor:
-        field = log_mu()
-        jumps = ((field[first] - field[second]).square() + SMOOTH**2).sqrt() - SMOOTH
-        return misfit(field.exp()) + weight * (share * jumps).sum()
+    def loss(self) -> Tensor:
+        field = self.log_mu()
+        jumps = ((field[self.first] - field[self.second]).square() + SMOOTH**2).sqrt() - SMOOTH
+        return self.pulled.misfit(field.exp()) + self.weight * (self.share * jumps).sum()
 
     @torch.no_grad()
-    def lower(stage: int, iteration: int) -> None:
+    def lower(self, stage: int, iteration: int) -> None:
+        """Before an iteration of a stage: its weight."""
         if iteration == 0 and stage > 1:
-            lowered[stage] = misfit(log_mu().exp()) > 1
-        weight.copy_(heavy * FALL ** -lowered.sum())
+            self.lowered[stage] = self.pulled.misfit(self.log_mu().exp()) > 1
+        self.weight.copy_(self.start_weight * FALL ** -self.lowered.sum())
 
     @torch.no_grad()
-    def estimates() -> Row:
-        mu = log_mu().exp()
-        error = (mu / true - 1).abs()
+    def estimates(self) -> Row:
+        mu, stiff = self.log_mu().exp(), self.pulled.stiff
+        error = (mu / self.pulled.true - 1).abs()
         return {
             "mu_soft": mu[~stiff].mean().item(),
             "mu_stiff": mu[stiff].mean().item(),
@@ -139,67 +206,37 @@ def problem(
         }
 
     @torch.no_grad()
-    def findings(history: list[Row]) -> dict[str, float]:
-        found = {"misfit": misfit(log_mu().exp()), "misfit_of_truth": misfit(true), "weight": weight}
+    def findings(self, history: list[Row]) -> dict[str, float]:
+        misfit, true = self.pulled.misfit, self.pulled.true
+        found = {"misfit": misfit(self.log_mu().exp()), "misfit_of_truth": misfit(true), "weight": self.weight}
         return {name: value.item() for name, value in found.items()}
 
-    def picture(path: Path, history: list[Row]) -> None:
-        maps = {"true": true, "recovered": log_mu().exp()}
+    def picture(self, path: Path, history: list[Row]) -> None:
+        body, maps = self.body, {"true": self.pulled.true, "recovered": self.log_mu().exp()}
         middle = 0.5 * (body.points.min(0) + body.points.max(0))
         truth = {"mu_soft": SOFT, "mu_stiff": STIFF}
         viz.field(path, body.points, body.tets, maps, "mu [Pa]", (middle.tolist(), (0.0, 0.0, 1.0)), history, truth)
 
     @torch.no_grad()
-    def animation(path: Path) -> None:
+    def animation(self, path: Path) -> None:
         # the first pull, at the highest place
-        motions = {"target": simulate(true, 1)[:, 0], "recovered": simulate(log_mu().exp(), 1)[:, 0]}
-        viz.animation(path, body.surface, motions, TIME_STEP)
+        materials = {"target": self.pulled.true, "recovered": self.log_mu().exp()}
+        motions = {name: self.pulled.simulate(mu, 1)[:, 0] for name, mu in materials.items()}
+        viz.animation(path, self.body.surface, motions, TIME_STEP)
 
-    return Problem(
-        name="fit-real-mesh",
-        parameters={"level": level, "exponents": exponents},
-        state={"lowered": lowered},
-        stages=[
-            Stage(
-                loss=loss,
-                iterations=count,
-                optimizer=lambda p: torch.optim.LBFGS(
-                    p, max_iter=5, history_size=30, tolerance_grad=0, tolerance_change=0, line_search_fn="strong_wolfe"
-                ),
-                moves=("exponents",) if k else ("level",),
-                before=partial(lower, k),
-                capturable=True,
-                name=f"field, weight {k}" if k else "uniform",
-            )
-            for k, count in enumerate(counts)
-        ],
-        estimates=estimates,
-        truth={"mu_soft": SOFT, "mu_stiff": STIFF},
-        units={"mu_soft": "Pa", "mu_stiff": "Pa"},
-        protocol={
-            "mesh": str(mesh or "bunny"),
-            "edge_length": edge_length,
-            "vertices": body.num_vertices,
-            "tets": body.num_tets,
-            "observed": list(observed.shape),
-            "noise": sigma,
-            "iterations": counts,
-            "steps": steps,
-            "time_step": TIME_STEP,
-            "sweeps": SWEEPS,
-            "relaxation": RELAXATION,
-            "density": DENSITY,
-            "poisson": POISSON,
-            "start_mu": START,
-            "traction": TRACTION,
-            "weight": heavy,
-            "fall": FALL,
-            "smooth": SMOOTH,
-            "range": RANGE,
-        },
-        findings=findings,
-        picture=picture,
-        animation=animation,
+
+def stage_of(fit: Fit, number: int, iterations: int) -> Stage:
+    """L-BFGS on one number for all tets (stage 0), or on one for each."""
+    return Stage(
+        loss=fit.loss,
+        iterations=iterations,
+        optimizer=lambda p: torch.optim.LBFGS(
+            p, max_iter=5, history_size=30, tolerance_grad=0, tolerance_change=0, line_search_fn="strong_wolfe"
+        ),
+        moves=("exponents",) if number else ("level",),
+        before=partial(fit.lower, number),
+        capturable=True,
+        name=f"field, weight {number}" if number else "uniform",
     )
 
 

@@ -38,7 +38,7 @@ SIZE = (0.08, 0.4, 0.08)  # [m]
 DENSITY = 1000.0  # [kg/m^3]
 MU = LAM = 4e4  # [Pa]
 TIME_STEP, SWEEPS = 1 / 60, 16  # [s]
-STEPS, HELD = 60, 15  # of a motion, and of its end, where the tip must be at the target
+STEPS, STAY = 60, 15  # of a motion, and of its end, where the tip must be at the target
 SCENES = 64
 DISTANCE = (0.15, 0.35)  # from the tip to its target, along the ground [m]
 HEIGHT = 0.39  # of the targets; the weight of the column shortens it [m]
@@ -56,136 +56,19 @@ Policy = Callable[[Tensor], Tensor]  # from what is seen, shape [..., scenes, 9]
 
 def problem(settings: Settings) -> Problem:
     scenes, iterations = (8, 40) if settings.quick else (SCENES, 150)
-    mesh = dv.mesh.box((2, 7, 2), SIZE).translate((-SIZE[0] / 2, 0.0, -SIZE[2] / 2))
-    height = mesh.points[:, 1]
-    model = dv.Model(mesh, density=DENSITY, pinned=height == 0.0, start="predictor").to(settings.device)
-    like = {"dtype": model.dtype, "device": model.device}
-    foot, tip = (torch.as_tensor(np.flatnonzero(height == y), device=model.device) for y in (0.0, SIZE[1]))
-    held = model.pinned[:, None]
-    ground = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], **like)
-    standing = torch.tensor([0.0, HEIGHT, 0.0], **like)
-    bend = model.rest_points[:, 1:2] / SIZE[1]  # share of the tip's velocity that a vertex starts with
-
-    def mean(x: Tensor, part: Tensor) -> Tensor:
-        return x.index_select(-2, part).mean(-2)
-
-    def along_ground(x: Tensor, part: Tensor) -> Tensor:
-        """Mean x and z of some vertices, shape [..., 2]."""
-        return mean(x, part) @ ground.T
-
-    def simulate(policy: Policy, given: Scenes, lead: tuple[int, ...] = (), save: Literal["all", "last"] = "last"):
-        """The motion of each scene, for each of the policies of shape `lead`; it observes from target to tip [m]."""
-        targets, swings = given
-
-        def drive(step: int, x: Tensor, v: Tensor) -> Tensor:
-            """Where the foot is after a step: what the network decides, carried out by the cart."""
-            speed = along_ground(v, foot)
-            places = [(along_ground(x, part) - targets) / LENGTH for part in (tip, foot)]
-            clock = torch.full_like(speed[..., :1], step / STEPS)
-            seen = torch.cat([*places, along_ground(v, tip) / SPEED, speed / SPEED, clock], -1)
-            travel = TIME_STEP * (speed + TIME_STEP * ACCELERATION * policy(seen).tanh())
-            return torch.where(held, x + (travel @ ground)[..., None, :], x)
-
-        shape = (*lead, len(targets), model.num_vertices, 3)
-        return dv.rollout(
-            model,
-            model.rest_points.expand(shape),
-            (bend * (swings @ ground)[:, None]).expand(shape),
-            steps=STEPS,
-            mu=MU,
-            lam=LAM,
-            time_step=TIME_STEP,
-            sweeps=SWEEPS,
-            prescribed=drive,
-            observe=lambda x, v, step: mean(x, tip) - (targets @ ground + standing),
-            save=save,
-            checkpoint_every=None,
-        )
-
-    def misses(policy: Policy, given: Scenes, lead: tuple[int, ...] = ()) -> Tensor:
-        """Mean squared distance from tip to target while it must be there [m^2], shape [*lead, scenes]."""
-        return simulate(policy, given, lead).observations[-HELD:].square().sum(-1).mean(0)
-
-    random = torch.Generator().manual_seed(settings.seed)
-    train, test = (
-        (around(scenes, DISTANCE, random).to(**like), around(scenes, SWING, random).to(**like)) for _ in range(2)
-    )
-    torch.manual_seed(settings.seed)
-    network = nn.Sequential(nn.Linear(9, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, 2)).to(**like)
-    first = vector(network)
-    missed = torch.zeros(scenes, **like)
-    course: list[tuple[float, float]] = []  # of CMA-ES: seconds, lowest loss so far
-
-    def loss() -> Tensor:
-        each = misses(network, train)
-        missed.copy_(each.detach())
-        return each.mean()
-
-    @torch.no_grad()
-    def findings(history: list[Row]) -> dict[str, Any]:
-        found: dict[str, Any] = {"test": judged(misses(network, test))}
-        if settings.quick:
-            return found
-        seconds = history[-1]["seconds"]
-
-        def losses(candidates: Tensor) -> Tensor:
-            return misses(policies(network, candidates.to(**like)), train, candidates.shape[:1]).mean(-1)
-
-        try:
-            best, course[:], networks = cma_es(losses, first, seconds, settings.seed)
-        except ImportError as missing:  # which costs the comparison, but not what was learned
-            print(missing, file=sys.stderr)
-            return found
-        lowest = course[-1][1]
-        return found | {
-            "seconds": seconds,
-            "gradient_was_there_after": next((row["seconds"] for row in history if row["loss"] <= lowest), None),
-            "cma_es": {
-                "version": importlib.metadata.version("cma"),
-                "networks": networks,
-                "train": {"distance": lowest**0.5},
-                "test": judged(misses(policies(network, best.to(**like)), test)),
-                "course": course,
-            },
-        }
-
-    stands = 0.9 * torch.tensor([[k // 2, 0.0, k % 2] for k in range(SHOWN)], **like)
-    surface = np.concatenate([mesh.surface + k * mesh.num_vertices for k in range(SHOWN)])
-
-    @torch.no_grad()
-    def shown(policy: Policy) -> Tensor:
-        """Motion of a few scenes beside each other, shape [frames, SHOWN V, 3]."""
-        motion = simulate(policy, (test[0][:SHOWN], test[1][:SHOWN]), save="all").x
-        return (motion + stands[:, None]).flatten(1, 2)
-
-    def goals() -> list[viz.Scenery]:
-        points = (test[0][:SHOWN] @ ground + stands + standing).cpu().numpy()
-        return [viz.capsule(point, point, 0.03, viz.COLORS["target"]) for point in points]
-
-    def picture(path: Path, history: list[Row]) -> None:
-        motions = {"untrained": shown(policies(network, first)), "trained": shown(network)}
-        at = [0, STEPS // 4, STEPS // 2, STEPS]
-        curves = {"gradient": [(row["seconds"], row["loss"]) for row in history], "CMA-ES": course}
-        viz.learning(
-            path,
-            surface,
-            {name: motion[at] for name, motion in motions.items()},
-            [k * TIME_STEP for k in at],
-            {name: curve for name, curve in curves.items() if curve},
-            goals(),
-        )
-
+    arm = Arm(settings.device)
+    training = Training(arm, scenes, settings)
     return Problem(
         name="learn-controller",
-        parameters=dict(network.named_parameters()),
-        stages=[Stage(loss=loss, iterations=iterations, learning_rate=0.05, capturable=True)],
-        estimates=lambda: judged(missed),
+        parameters=dict(training.network.named_parameters()),
+        stages=[Stage(loss=training.loss, iterations=iterations, learning_rate=0.05, capturable=True)],
+        estimates=lambda: judged(training.missed),
         units={"distance": "m"},
         protocol={
             "scenes": scenes,
-            "vertices": model.num_vertices,
+            "vertices": arm.model.num_vertices,
             "steps": STEPS,
-            "held": HELD,
+            "held": STAY,
             "time_step": TIME_STEP,
             "sweeps": SWEEPS,
             "density": DENSITY,
@@ -200,10 +83,162 @@ def problem(settings: Settings) -> Problem:
             "near": NEAR,
             "spread": SPREAD,
         },
-        findings=findings,
-        picture=picture,
-        animation=lambda path: viz.animation(path, surface, {"trained": shown(network)}, TIME_STEP, goals()),
+        findings=training.findings,
+        picture=training.picture,
+        animation=training.animation,
     )
+
+
+class Arm:
+    """The column on its cart, and its motion under a policy."""
+
+    def __init__(self, device: str) -> None:
+        self.mesh = dv.mesh.box((2, 7, 2), SIZE).translate((-SIZE[0] / 2, 0.0, -SIZE[2] / 2))
+        height = self.mesh.points[:, 1]
+        self.model = dv.Model(self.mesh, density=DENSITY, pinned=height == 0.0, start="predictor").to(device)
+        self.like = {"dtype": self.model.dtype, "device": self.model.device}
+        self.foot, self.tip = (
+            torch.as_tensor(np.flatnonzero(height == y), device=self.model.device) for y in (0.0, SIZE[1])
+        )
+        self.pinned = self.model.pinned[:, None]
+        self.ground = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], **self.like)
+        self.standing = torch.tensor([0.0, HEIGHT, 0.0], **self.like)
+        self.bend = self.model.rest_points[:, 1:2] / SIZE[1]  # share of the tip's velocity that a vertex starts with
+
+    def along_ground(self, x: Tensor, part: Tensor) -> Tensor:
+        """Mean x and z of some vertices, shape [..., 2]."""
+        return mean(x, part) @ self.ground.T
+
+    def driven(self, policy: Policy, targets: Tensor) -> Callable[[int, Tensor, Tensor], Tensor]:
+        """Where the foot is after a step: what the network decides, carried out by the cart."""
+
+        def drive(step: int, x: Tensor, v: Tensor) -> Tensor:
+            speed = self.along_ground(v, self.foot)
+            places = [(self.along_ground(x, part) - targets) / LENGTH for part in (self.tip, self.foot)]
+            clock = torch.full_like(speed[..., :1], step / STEPS)
+            seen = torch.cat([*places, self.along_ground(v, self.tip) / SPEED, speed / SPEED, clock], -1)
+            travel = TIME_STEP * (speed + TIME_STEP * ACCELERATION * policy(seen).tanh())
+            return torch.where(self.pinned, x + (travel @ self.ground)[..., None, :], x)
+
+        return drive
+
+    def simulate(
+        self, policy: Policy, given: Scenes, lead: tuple[int, ...] = (), save: Literal["all", "last"] = "last"
+    ) -> dv.Trajectory:
+        """The motion of each scene, for each of the policies of shape `lead`; it observes from target to tip [m]."""
+        targets, swings = given
+        shape = (*lead, len(targets), self.model.num_vertices, 3)
+        return dv.rollout(
+            self.model,
+            self.model.rest_points.expand(shape),
+            (self.bend * (swings @ self.ground)[:, None]).expand(shape),
+            steps=STEPS,
+            mu=MU,
+            lam=LAM,
+            time_step=TIME_STEP,
+            sweeps=SWEEPS,
+            prescribed=self.driven(policy, targets),
+            observe=lambda x, v, step: mean(x, self.tip) - (targets @ self.ground + self.standing),
+            save=save,
+            checkpoint_every=None,
+        )
+
+    def misses(self, policy: Policy, given: Scenes, lead: tuple[int, ...] = ()) -> Tensor:
+        """Mean squared distance from tip to target while it must be there [m^2], shape [*lead, scenes]."""
+        return self.simulate(policy, given, lead).observations[-STAY:].square().sum(-1).mean(0)
+
+
+class Training:
+    """The network, the scenes that it learns from and those that it is judged by, and what CMA-ES makes of it."""
+
+    def __init__(self, arm: Arm, scenes: int, settings: Settings) -> None:
+        self.arm, self.settings = arm, settings
+        random = torch.Generator().manual_seed(settings.seed)
+        self.train, self.test = (
+            (around(scenes, DISTANCE, random).to(**arm.like), around(scenes, SWING, random).to(**arm.like))
+            for _ in range(2)
+        )
+        torch.manual_seed(settings.seed)
+        self.network = nn.Sequential(nn.Linear(9, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, 2)).to(**arm.like)
+        self.first = vector(self.network)
+        self.missed = torch.zeros(scenes, **arm.like)  # of each scene, by the latest loss
+        self.course: list[tuple[float, float]] = []  # of CMA-ES: seconds, lowest loss so far
+        self.stands = 0.9 * torch.tensor([[k // 2, 0.0, k % 2] for k in range(SHOWN)], **arm.like)
+        self.surface = np.concatenate([arm.mesh.surface + k * arm.mesh.num_vertices for k in range(SHOWN)])
+
+    def loss(self) -> Tensor:
+        each = self.arm.misses(self.network, self.train)
+        self.missed.copy_(each.detach())
+        return each.mean()
+
+    @torch.no_grad()
+    def findings(self, history: list[Row]) -> dict[str, Any]:
+        found: dict[str, Any] = {"test": judged(self.arm.misses(self.network, self.test))}
+        if self.settings.quick:
+            return found
+        try:
+            return found | self.comparison(history)
+        except ImportError as missing:  # which costs the comparison, but not what was learned
+            print(missing, file=sys.stderr)
+            return found
+
+    def comparison(self, history: list[Row]) -> dict[str, Any]:
+        """CMA-ES for as long as the gradient took.
+
+        Raises:
+            ImportError: the package cma is not installed.
+        """
+        network, like, seconds = self.network, self.arm.like, history[-1]["seconds"]
+
+        def losses(candidates: Tensor) -> Tensor:
+            each = policies(network, candidates.to(**like))
+            return self.arm.misses(each, self.train, candidates.shape[:1]).mean(-1)
+
+        best, self.course, networks = cma_es(losses, self.first, seconds, self.settings.seed)
+        lowest = self.course[-1][1]
+        return {
+            "seconds": seconds,
+            "gradient_was_there_after": next((row["seconds"] for row in history if row["loss"] <= lowest), None),
+            "cma_es": {
+                "version": importlib.metadata.version("cma"),
+                "networks": networks,
+                "train": {"distance": lowest**0.5},
+                "test": judged(self.arm.misses(policies(network, best.to(**like)), self.test)),
+                "course": self.course,
+            },
+        }
+
+    @torch.no_grad()
+    def shown(self, policy: Policy) -> Tensor:
+        """Motion of a few scenes beside each other, shape [frames, SHOWN V, 3]."""
+        targets, swings = self.test
+        motion = self.arm.simulate(policy, (targets[:SHOWN], swings[:SHOWN]), save="all").x
+        return (motion + self.stands[:, None]).flatten(1, 2)
+
+    def goals(self) -> list[viz.Scenery]:
+        points = (self.test[0][:SHOWN] @ self.arm.ground + self.stands + self.arm.standing).cpu().numpy()
+        return [viz.capsule(point, point, 0.03, viz.COLORS["target"]) for point in points]
+
+    def picture(self, path: Path, history: list[Row]) -> None:
+        motions = {"untrained": self.shown(policies(self.network, self.first)), "trained": self.shown(self.network)}
+        at = [0, STEPS // 4, STEPS // 2, STEPS]
+        curves = {"gradient": [(row["seconds"], row["loss"]) for row in history], "CMA-ES": self.course}
+        viz.learning(
+            path,
+            self.surface,
+            {name: motion[at] for name, motion in motions.items()},
+            [k * TIME_STEP for k in at],
+            {name: curve for name, curve in curves.items() if curve},
+            self.goals(),
+        )
+
+    def animation(self, path: Path) -> None:
+        viz.animation(path, self.surface, {"trained": self.shown(self.network)}, TIME_STEP, self.goals())
+
+
+def mean(x: Tensor, part: Tensor) -> Tensor:
+    """Mean position of some vertices, shape [..., 3]."""
+    return x.index_select(-2, part).mean(-2)
 
 
 def around(count: int, radii: tuple[float, float], random: torch.Generator) -> Tensor:

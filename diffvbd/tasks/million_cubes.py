@@ -28,6 +28,7 @@ getting worse.
 import math
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -60,6 +61,23 @@ STAGES = ("without contact", "with contact")
 ITERATIONS, RATES = (40, 40), (0.5, 0.005)  # of the stages
 
 
+class Version(NamedTuple):
+    """What options change, and what the quick version has other values of."""
+
+    bodies: int = BODIES
+    steps: int = STEPS
+    target_step: int = TARGET_STEP
+    height: float = HEIGHT  # [m]
+    launch: float = LAUNCH  # [m/s]
+    dtype: torch.dtype = torch.float32
+    counts: tuple[int, int] = ITERATIONS
+    rates: tuple[float, float] = RATES
+
+
+# a flight of a sixth of the time
+QUICK = Version(QUICK_BODIES, 24, 20, 0.05, 0.6, torch.float64, (15, 10), (0.5, 0.02))
+
+
 def problem(
     settings: Settings, bodies: int | None = None, steps: int | None = None, iterations: int | None = None
 ) -> Problem:
@@ -74,147 +92,160 @@ def problem(
     Raises:
         ValueError: no bodies or iterations, too many bodies, or a rollout that ends before t = 0.6 s.
     """
-    target_step, height, launch, dtype, counts = TARGET_STEP, HEIGHT, LAUNCH, torch.float32, ITERATIONS
-    rates = RATES
-    most = math.inf
-    if settings.quick:
-        if steps is not None:
-            raise ValueError(f"steps: expected none beside --quick, which has its own, got {steps}")
-        most, steps, target_step, height, launch = QUICK_BODIES, 24, 20, 0.05, 0.6
-        dtype, counts = torch.float64, (15, 10)
-        rates = (0.5, 0.02)  # a flight of a sixth of the time
-    steps = STEPS if steps is None else steps
-    if bodies is None:
-        bodies = QUICK_BODIES if settings.quick else BODIES
-    if not 1 <= bodies <= most:
-        raise ValueError(f"bodies: expected at least 1{f' and at most {most}' if settings.quick else ''}, got {bodies}")
-    if steps < target_step:
-        raise ValueError(f"steps: expected at least {target_step}, which are 0.6 s, got {steps}")
-    if iterations is not None:
-        if iterations < 1:
-            raise ValueError(f"iterations: expected at least 1, got {iterations}")
-        counts = (iterations, iterations)
-
-    place = matched(ring(bodies, height), np.random.default_rng(settings.seed))
-    cube = dv.mesh.cube(2, EDGE).translate((-EDGE / 2,) * 3)
-    # a GPU has one thread sweep a whole cube; a CPU sweeps eight vertices of a color at once, and wants more cubes
-    group = 1 if torch.device(settings.device).type == "cuda" else math.gcd(bodies, GROUP)
-    scenes = (bodies // group, group * cube.num_vertices, 3)
-    model = dv.Model(dv.mesh.replicate(cube, np.zeros((group, 3))), density=DENSITY, dtype=dtype, rigid=False,
-                     start="predictor")  # fmt: skip
-    model = model.to(settings.device)
-    like = {"dtype": dtype, "device": model.device}
-    target, pad = torch.as_tensor(place, **like), torch.as_tensor(launch_pad(bodies), **like)
-    corners, mass = (each[: cube.num_vertices] for each in (model.rest_points, model.mass))
-    x = (pad[:, None] + torch.tensor([1.0, SQUEEZE, 1.0], **like) * corners).reshape(scenes)
-    # all bodies see each other: to the penalty they are one scene
-    labels = torch.arange(bodies, device=model.device).repeat_interleave(cube.num_vertices)
-    together = dv.contact.Bodies(labels, mass.repeat(bodies))
-
-    velocity = torch.tensor([0.0, launch, 0.0], **like).repeat(bodies, 1).requires_grad_()
-    material = torch.zeros(bodies, **like, requires_grad=True)
-    error = torch.full((bodies,), torch.nan, **like)  # distances of centers of mass from their places [m]
-    contact, pairs = False, PAIRS * bodies + 256
-    # a body that bounces off many others has a huge gradient, which a limit for all together would make all others pay
-    velocity.register_hook(lambda g: g * (CLIP / g.norm(dim=1, keepdim=True)).clamp(max=1.0))
-
-    def push(step: int, x: Tensor, v: Tensor) -> Tensor | None:
-        if step >= target_step:
-            return None
-        all_bodies = x.flatten(0, 1)
-        return dv.contact.center_of_mass_penalty(all_bodies, together, RADIUS, STIFFNESS, max_pairs=pairs).view_as(x)
-
-    def simulate(save: int) -> Tensor:
-        """Centers of mass [m] of every n-th frame, shape [frames, bodies, 3]."""
-        mu = MU[0] + (MU[1] - MU[0]) * material.sigmoid()
-        motion = dv.rollout(
-            model,
-            x,
-            velocity[:, None].expand(-1, cube.num_vertices, -1).reshape(scenes),
-            steps=steps,
-            mu=mu.view(-1, group, 1).expand(-1, -1, cube.num_tets).flatten(1),
-            lam=LAM,
-            time_step=TIME_STEP,
-            sweeps=SWEEPS,
-            force=push if contact else None,
-            save=save,
-            checkpoint_every=CHECKPOINT_EVERY,
-        )
-        return losses.center_of_mass(motion.x.view(-1, bodies, cube.num_vertices, 3), mass)
-
-    def loss() -> Tensor:
-        arrived = simulate(save=target_step)[1]
-        error.copy_((arrived - target).detach().norm(dim=1))
-        return bodies * losses.huber(arrived, target, HUBER)
-
-    def begin(iteration: int, touching: bool) -> None:
-        nonlocal contact
-        contact = touching
-
-    def findings(history: list[Row]) -> dict[str, float]:
-        found = {
-            f"mean_error_{name}": min(row["mean_error"] for row in history if row["stage"] == stage)
-            for stage, name in enumerate(("without_contact", "with_contact"))
-        }
-        times = np.array([row["seconds"] for row in history])
-        found["seconds_per_iteration"] = float(np.median(np.diff(times)[-counts[1] // 2 :]))  # with contact
-        return found
-
-    @torch.no_grad()
-    def frames(every: int) -> Tensor:
-        return simulate(save=every)
-
-    def picture(path: Path, history: list[Row]) -> None:
-        every = target_step // 4
-        viz.cloud(path, frames(every)[: 6 if steps > target_step else 5], every * TIME_STEP, history, "mean_error")
-
-    def animation(path: Path) -> None:
-        viz.cloud_animation(path, frames(every=4), 4 * TIME_STEP)
-
+    version = chosen(settings.quick, bodies, steps, iterations)
+    cubes = Cubes(settings, version)
     return Problem(
         name="million-cubes",
-        parameters={"velocity": velocity, "material": material},
+        parameters={"velocity": cubes.velocity, "material": cubes.material},
         stages=[
             Stage(
-                loss=loss,
+                loss=cubes.loss,
                 iterations=count,
                 learning_rate=rate,
-                before=partial(begin, touching=touching),
+                before=partial(cubes.begin, touching=touching),
                 criterion="mean_error",
                 capturable=True,
                 name=name,
             )
-            for name, count, rate, touching in zip(STAGES, counts, rates, (False, True), strict=True)
+            for name, count, rate, touching in zip(STAGES, version.counts, version.rates, (False, True), strict=True)
         ],
-        estimates=lambda: {"mean_error": error.mean().item()},
+        estimates=lambda: {"mean_error": cubes.error.mean().item()},
         units={"mean_error": "m"},
-        protocol={
-            "bodies": bodies,
-            "vertices": bodies * cube.num_vertices,
-            "tets": bodies * cube.num_tets,
-            "steps": steps,
-            "target_step": target_step,
-            "iterations": counts,
-            "edge": EDGE,
-            "squeeze": SQUEEZE,
-            "density": DENSITY,
-            "mu": MU,
-            "lam": LAM,
-            "time_step": TIME_STEP,
-            "sweeps": SWEEPS,
-            "checkpoint_every": CHECKPOINT_EVERY,
-            "radius": RADIUS,
-            "stiffness": STIFFNESS,
-            "huber": HUBER,
-            "clip": CLIP,
-            "spacing": (PAD_SPACING, RING_SPACING),
-            "height": HEIGHT,
-            "dtype": str(dtype),
-        },
-        findings=findings,
-        picture=picture,
-        animation=animation,
+        protocol=protocol(cubes.cube, version),
+        findings=cubes.findings,
+        picture=cubes.picture,
+        animation=cubes.animation,
     )
+
+
+def chosen(quick: bool, bodies: int | None, steps: int | None, iterations: int | None) -> Version:
+    """The version that these options make; None: its own value."""
+    version, most = (QUICK, QUICK_BODIES) if quick else (Version(), math.inf)
+    if quick and steps is not None:
+        raise ValueError(f"steps: expected none beside --quick, which has its own, got {steps}")
+    bodies = version.bodies if bodies is None else bodies
+    if not 1 <= bodies <= most:
+        raise ValueError(f"bodies: expected at least 1{f' and at most {most}' if quick else ''}, got {bodies}")
+    steps = version.steps if steps is None else steps
+    if steps < version.target_step:
+        raise ValueError(f"steps: expected at least {version.target_step}, which are 0.6 s, got {steps}")
+    counts = version.counts
+    if iterations is not None:
+        if iterations < 1:
+            raise ValueError(f"iterations: expected at least 1, got {iterations}")
+        counts = (iterations, iterations)
+    return version._replace(bodies=bodies, steps=steps, counts=counts)
+
+
+class Cubes:
+    """The bodies, their places, and the four numbers of each that are looked for."""
+
+    def __init__(self, settings: Settings, version: Version) -> None:
+        self.version, bodies = version, version.bodies
+        place = matched(ring(bodies, version.height), np.random.default_rng(settings.seed))
+        self.cube = cube = dv.mesh.cube(2, EDGE).translate((-EDGE / 2,) * 3)
+        # a GPU has one thread sweep a whole cube; a CPU sweeps eight vertices of a color at once, and wants more cubes
+        self.group = 1 if torch.device(settings.device).type == "cuda" else math.gcd(bodies, GROUP)
+        self.shape = (bodies // self.group, self.group * cube.num_vertices, 3)
+        model = dv.Model(dv.mesh.replicate(cube, np.zeros((self.group, 3))), density=DENSITY, dtype=version.dtype,
+                         rigid=False, start="predictor")  # fmt: skip
+        self.model = model.to(settings.device)
+        device = self.model.device
+        like = {"dtype": version.dtype, "device": device}
+        self.target, pad = torch.as_tensor(place, **like), torch.as_tensor(launch_pad(bodies), **like)
+        corners, self.mass = (each[: cube.num_vertices] for each in (self.model.rest_points, self.model.mass))
+        self.x = (pad[:, None] + torch.tensor([1.0, SQUEEZE, 1.0], **like) * corners).reshape(self.shape)
+        # all bodies see each other: to the penalty they are one scene
+        labels = torch.arange(bodies, device=device).repeat_interleave(cube.num_vertices)
+        self.together = dv.contact.Bodies(labels, self.mass.repeat(bodies))
+        self.contact, self.max_pairs = False, PAIRS * bodies + 256
+
+        self.velocity = torch.tensor([0.0, version.launch, 0.0], **like).repeat(bodies, 1).requires_grad_()
+        self.material = torch.zeros(bodies, **like, requires_grad=True)
+        # distances of centers of mass from their places [m], by the latest loss
+        self.error = torch.full((bodies,), torch.nan, **like)
+        # a body that bounces off many others has a huge gradient, which a limit for all would make all others pay
+        self.velocity.register_hook(lambda g: g * (CLIP / g.norm(dim=1, keepdim=True)).clamp(max=1.0))
+
+    def push(self, step: int, x: Tensor, v: Tensor) -> Tensor | None:
+        if step >= self.version.target_step:
+            return None
+        force = dv.contact.center_of_mass_penalty(
+            x.flatten(0, 1), self.together, RADIUS, STIFFNESS, max_pairs=self.max_pairs
+        )
+        return force.view_as(x)
+
+    def simulate(self, save: int) -> Tensor:
+        """Centers of mass [m] of every n-th frame, shape [frames, bodies, 3]."""
+        cube, mu = self.cube, MU[0] + (MU[1] - MU[0]) * self.material.sigmoid()
+        motion = dv.rollout(
+            self.model,
+            self.x,
+            self.velocity[:, None].expand(-1, cube.num_vertices, -1).reshape(self.shape),
+            steps=self.version.steps,
+            mu=mu.view(-1, self.group, 1).expand(-1, -1, cube.num_tets).flatten(1),
+            lam=LAM,
+            time_step=TIME_STEP,
+            sweeps=SWEEPS,
+            force=self.push if self.contact else None,
+            save=save,
+            checkpoint_every=CHECKPOINT_EVERY,
+        )
+        return losses.center_of_mass(motion.x.view(-1, self.version.bodies, cube.num_vertices, 3), self.mass)
+
+    def begin(self, iteration: int, touching: bool) -> None:
+        self.contact = touching
+
+    def loss(self) -> Tensor:
+        arrived = self.simulate(save=self.version.target_step)[1]
+        self.error.copy_((arrived - self.target).detach().norm(dim=1))
+        return self.version.bodies * losses.huber(arrived, self.target, HUBER)
+
+    def findings(self, history: list[Row]) -> dict[str, float]:
+        found = {
+            f"mean_error_{name}": min(row["mean_error"] for row in history if row["stage"] == stage)
+            for stage, name in enumerate(("without_contact", "with_contact"))
+        }
+        times = np.diff([row["seconds"] for row in history])
+        found["seconds_per_iteration"] = float(np.median(times[-self.version.counts[1] // 2 :]))  # with contact
+        return found
+
+    @torch.no_grad()
+    def frames(self, every: int) -> Tensor:
+        return self.simulate(save=every)
+
+    def picture(self, path: Path, history: list[Row]) -> None:
+        every, count = self.version.target_step // 4, 6 if self.version.steps > self.version.target_step else 5
+        viz.cloud(path, self.frames(every)[:count], every * TIME_STEP, history, "mean_error")
+
+    def animation(self, path: Path) -> None:
+        viz.cloud_animation(path, self.frames(every=4), 4 * TIME_STEP)
+
+
+def protocol(cube: dv.TetMesh, version: Version) -> dict[str, Any]:
+    return {
+        "bodies": version.bodies,
+        "vertices": version.bodies * cube.num_vertices,
+        "tets": version.bodies * cube.num_tets,
+        "steps": version.steps,
+        "target_step": version.target_step,
+        "iterations": version.counts,
+        "edge": EDGE,
+        "squeeze": SQUEEZE,
+        "density": DENSITY,
+        "mu": MU,
+        "lam": LAM,
+        "time_step": TIME_STEP,
+        "sweeps": SWEEPS,
+        "checkpoint_every": CHECKPOINT_EVERY,
+        "radius": RADIUS,
+        "stiffness": STIFFNESS,
+        "huber": HUBER,
+        "clip": CLIP,
+        "spacing": (PAD_SPACING, RING_SPACING),
+        "height": HEIGHT,
+        "dtype": str(version.dtype),
+    }
 
 
 def launch_pad(bodies: int) -> np.ndarray:

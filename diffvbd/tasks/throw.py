@@ -18,7 +18,7 @@ paper's tasks.
 """
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -46,105 +46,33 @@ VIEW = (35.0, 20.0)  # into the box
 EFFORT = 1e-7  # weight of the squared acceleration of the ends [s^4]
 
 
+class Version(NamedTuple):
+    """What the quick version has other values of."""
+
+    nx: int  # vertices of the sheet along its sides
+    ny: int
+    time_step: float
+    iterations: int
+    rate: float  # of Adam
+
+
+FULL, QUICK = Version(9, 7, TIME_STEP, 60, 0.05), Version(7, 5, 1 / 150, 8, 0.1)
+
+
 def problem(settings: Settings) -> Problem:
-    nx, ny, time_step, iterations, rate = 9, 7, TIME_STEP, 60, 0.05
-    if settings.quick:
-        nx, ny, time_step, iterations, rate = 7, 5, 1 / 150, 8, 0.1
-    steps = round(LANDING / time_step)
-    sheet = dv.mesh.sheet(nx, ny, SIZE, THICKNESS)
-    ball = dv.mesh.capsule(RADIUS, 0.0, resolution=3)
-    # not in the middle of a vertex or an edge of the sheet, where several pairs would be nearest at once
-    above = (SIZE[0] / 2 + 0.003, THICKNESS / 2 + GAP - ball.points[:, 1].min(), SIZE[1] / 2 + 0.002)
-    mesh = dv.mesh.join([sheet, ball.translate(above)]).translate((0.0, HEIGHT, 0.0))
-    part = slice(sheet.num_vertices, None)  # the ball's vertices
-    along, across = (torch.from_numpy(sheet.points[:, k] / SIZE[k // 2]) for k in (0, 2))
-    pinned = np.zeros(mesh.num_vertices, bool)
-    pinned[: sheet.num_vertices] = (along.numpy() == 0.0) | (along.numpy() == 1.0)
-    barrier = dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, reach=REACH, capacity=4000)
-    options: dict[str, Any] = {"density": DENSITY, "pinned": pinned, "start": "predictor"}
-    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), barrier), **options).to(settings.device)
-    like = {"dtype": model.dtype, "device": model.device}
-
-    x = model.rest_points.clone()
-    x[: sheet.num_vertices, 0] += (STRETCH - 1) * (x[: sheet.num_vertices, 0] - SIZE[0] / 2)
-    mu = torch.full((mesh.num_tets,), SHEET, **like)
-    mu[sheet.num_tets :] = BALL
-    middle = torch.tensor([(BOX[0][0] + BOX[1][0]) / 2, BOX[1][1], (BOX[0][2] + BOX[1][2]) / 2], **like)
-    curve = spline(time_step * torch.arange(1, 2 * steps + 1, dtype=torch.float64), CONTROLS, KNOT).to(**like)
-    # how much each end lifts a vertex of the bars
-    ends = [(1 - along) * (1 - across), (1 - along) * across, along * (1 - across), along * across]
-    lifts = torch.zeros((4, mesh.num_vertices, 3), **like)
-    lifts[:, : sheet.num_vertices, 1] = torch.stack(ends).to(**like)
-    lifts[:, torch.from_numpy(~pinned).to(model.device)] = 0.0
-    walls = viz.box(*BOX)
-
-    start = torch.zeros((CONTROLS, 4), **like)
-    start[1] = torch.tensor(LIFT, **like).repeat_interleave(2) / LIMIT
-    raw = start.atanh().requires_grad_()
-    landed = x.new_zeros(3)
-
-    def heights(raw: Tensor) -> Tensor:
-        """Of the ends above where they start [m], shape [2 steps, 4]."""
-        return curve @ (LIMIT * raw.tanh())
-
-    def simulate(
-        raw: Tensor, model: dv.Model = model, steps: int = steps, save: Literal["all", "last"] = "last"
-    ) -> dv.Trajectory:
-        bars = x + (heights(raw)[:steps] @ lifts.flatten(1)).unflatten(-1, (-1, 3))
-        return dv.rollout(
-            model,
-            x,
-            torch.zeros_like(x),
-            steps=steps,
-            mu=mu,
-            lam=mu,
-            time_step=time_step,
-            sweeps=SWEEPS,
-            prescribed=dv.per_step(bars),
-            save=save,
-            checkpoint_every=None,
-        )
-
-    def loss() -> Tensor:
-        center = losses.center_of_mass(simulate(raw).x[-1, part], model.mass[part])
-        landed.copy_(center.detach())
-        acceleration = heights(raw).diff(n=2, dim=0) / time_step**2
-        return losses.vertex_distance(center, middle) + EFFORT * acceleration[:steps].square().mean()
-
-    @torch.no_grad()
-    def with_walls(raw: Tensor) -> Tensor:
-        """The same throw with walls and floor, for twice the time; positions [m], shape [2 steps + 1, V, 3]."""
-        energies = (dv.StableNeoHookean(), dv.FloorBarrier(kappa=KAPPA, dhat=DHAT), barrier)
-        obstacle = dv.colliders.Obstacle(walls.points, walls.triangles)
-        room = dv.Model(mesh, energies=energies, colliders=[obstacle], **options).to(settings.device)
-        return simulate(raw, room, 2 * steps, "all").x
-
-    motions: dict[str, Tensor] = {}
-
-    def findings(history: list[Row]) -> dict[str, Any]:
-        motions.update(initial=with_walls(start.atanh()), recovered=with_walls(raw))
-        at_start, at_end = (inside(motion[-1, part], BOX) for motion in motions.values())
-        return {"caught": at_end, "caught_at_start": at_start}
-
-    def picture(path: Path, history: list[Row]) -> None:
-        shown = [steps // 4, steps // 2, 3 * steps // 4, steps, 2 * steps]
-        frames = {name: motion[shown] for name, motion in motions.items()}
-        viz.comparison(path, mesh.surface, frames, [k * time_step for k in shown], history, scenery=[walls], view=VIEW)
-
-    def animation(path: Path) -> None:
-        viz.animation(path, mesh.surface, {"recovered": motions["recovered"]}, time_step, [walls], VIEW)
-
+    version = QUICK if settings.quick else FULL
+    throw = Throw(settings, version)
     return Problem(
         name="throw",
-        parameters={"ends": raw},
-        stages=[Stage(loss=loss, iterations=iterations, learning_rate=rate, capturable=True)],
-        estimates=lambda: {"miss": (landed - middle).norm().item()},
+        parameters={"ends": throw.raw},
+        stages=[Stage(loss=throw.loss, iterations=version.iterations, learning_rate=version.rate, capturable=True)],
+        estimates=throw.estimates,
         units={"miss": "m"},
         protocol={
-            "vertices": model.num_vertices,
-            "tets": model.num_tets,
-            "steps": steps,
-            "time_step": time_step,
+            "vertices": throw.model.num_vertices,
+            "tets": throw.model.num_tets,
+            "steps": throw.steps,
+            "time_step": version.time_step,
             "sweeps": SWEEPS,
             "density": DENSITY,
             "sheet": SHEET,
@@ -161,10 +89,122 @@ def problem(settings: Settings) -> Problem:
             "box": BOX,
             "effort": EFFORT,
         },
-        findings=findings,
-        picture=picture,
-        animation=animation,
+        findings=throw.findings,
+        picture=throw.picture,
+        animation=throw.animation,
     )
+
+
+class Throw:
+    """Sheet and ball, and the motion of the sheet's four ends, which is looked for."""
+
+    def __init__(self, settings: Settings, version: Version) -> None:
+        self.device, self.time_step = settings.device, version.time_step
+        self.steps = round(LANDING / version.time_step)
+        self.sheet = sheet = dv.mesh.sheet(version.nx, version.ny, SIZE, THICKNESS)
+        self.mesh = with_ball(sheet)
+        self.part = slice(sheet.num_vertices, None)  # the ball's vertices
+        along = sheet.points[:, 0] / SIZE[0]
+        self.pinned = np.zeros(self.mesh.num_vertices, bool)
+        self.pinned[: sheet.num_vertices] = (along == 0.0) | (along == 1.0)
+        self.barrier = dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, reach=REACH, capacity=4000)
+        self.model = self.model_of()
+        like = {"dtype": self.model.dtype, "device": self.model.device}
+
+        self.x = self.model.rest_points.clone()
+        self.x[: sheet.num_vertices, 0] += (STRETCH - 1) * (self.x[: sheet.num_vertices, 0] - SIZE[0] / 2)
+        self.mu = torch.full((self.mesh.num_tets,), SHEET, **like)
+        self.mu[sheet.num_tets :] = BALL
+        self.middle = torch.tensor([(BOX[0][0] + BOX[1][0]) / 2, BOX[1][1], (BOX[0][2] + BOX[1][2]) / 2], **like)
+        times = version.time_step * torch.arange(1, 2 * self.steps + 1, dtype=torch.float64)
+        self.curve = spline(times, CONTROLS, KNOT).to(**like)
+        self.lifts = lifts(sheet, self.pinned).to(**like)
+        self.walls = viz.box(*BOX)
+
+        self.start = torch.zeros((CONTROLS, 4), **like)
+        self.start[1] = torch.tensor(LIFT, **like).repeat_interleave(2) / LIMIT
+        self.raw = self.start.atanh().requires_grad_()
+        self.landed = self.x.new_zeros(3)  # the ball's center by the latest loss
+        self.motions: dict[str, Tensor] = {}  # of the findings, for pictures
+
+    def model_of(self, *others: Any, **more: Any) -> dv.Model:
+        """Sheet and ball, with other energies and arguments of the Model beside their own."""
+        energies = (dv.StableNeoHookean(), *others, self.barrier)
+        model = dv.Model(self.mesh, energies=energies, density=DENSITY, pinned=self.pinned, start="predictor", **more)
+        return model.to(self.device)
+
+    def heights(self, raw: Tensor) -> Tensor:
+        """Of the ends above where they start [m], shape [2 steps, 4]."""
+        return self.curve @ (LIMIT * raw.tanh())
+
+    def simulate(
+        self, raw: Tensor, model: dv.Model, steps: int, save: Literal["all", "last"] = "last"
+    ) -> dv.Trajectory:
+        bars = self.x + (self.heights(raw)[:steps] @ self.lifts.flatten(1)).unflatten(-1, (-1, 3))
+        return dv.rollout(
+            model,
+            self.x,
+            torch.zeros_like(self.x),
+            steps=steps,
+            mu=self.mu,
+            lam=self.mu,
+            time_step=self.time_step,
+            sweeps=SWEEPS,
+            prescribed=dv.per_step(bars),
+            save=save,
+            checkpoint_every=None,
+        )
+
+    def loss(self) -> Tensor:
+        ball = self.simulate(self.raw, self.model, self.steps).x[-1, self.part]
+        center = losses.center_of_mass(ball, self.model.mass[self.part])
+        self.landed.copy_(center.detach())
+        acceleration = self.heights(self.raw).diff(n=2, dim=0) / self.time_step**2
+        return losses.vertex_distance(center, self.middle) + EFFORT * acceleration[: self.steps].square().mean()
+
+    def estimates(self) -> Row:
+        return {"miss": (self.landed - self.middle).norm().item()}
+
+    @torch.no_grad()
+    def with_walls(self, raw: Tensor) -> Tensor:
+        """The same throw with walls and floor, for twice the time; positions [m], shape [2 steps + 1, V, 3]."""
+        obstacle = dv.colliders.Obstacle(self.walls.points, self.walls.triangles)
+        room = self.model_of(dv.FloorBarrier(kappa=KAPPA, dhat=DHAT), colliders=[obstacle])
+        return self.simulate(raw, room, 2 * self.steps, "all").x
+
+    def findings(self, history: list[Row]) -> dict[str, Any]:
+        self.motions.update(initial=self.with_walls(self.start.atanh()), recovered=self.with_walls(self.raw))
+        at_start, at_end = (inside(motion[-1, self.part], BOX) for motion in self.motions.values())
+        return {"caught": at_end, "caught_at_start": at_start}
+
+    def picture(self, path: Path, history: list[Row]) -> None:
+        steps = self.steps
+        shown = [steps // 4, steps // 2, 3 * steps // 4, steps, 2 * steps]
+        frames = {name: motion[shown] for name, motion in self.motions.items()}
+        times = [k * self.time_step for k in shown]
+        viz.comparison(path, self.mesh.surface, frames, times, history, scenery=[self.walls], view=VIEW)
+
+    def animation(self, path: Path) -> None:
+        motions = {"recovered": self.motions["recovered"]}
+        viz.animation(path, self.mesh.surface, motions, self.time_step, [self.walls], VIEW)
+
+
+def with_ball(sheet: dv.TetMesh) -> dv.TetMesh:
+    """Sheet and ball, in this order, at the height of the throw."""
+    ball = dv.mesh.capsule(RADIUS, 0.0, resolution=3)
+    # not in the middle of a vertex or an edge of the sheet, where several pairs would be nearest at once
+    above = (SIZE[0] / 2 + 0.003, THICKNESS / 2 + GAP - ball.points[:, 1].min(), SIZE[1] / 2 + 0.002)
+    return dv.mesh.join([sheet, ball.translate(above)]).translate((0.0, HEIGHT, 0.0))
+
+
+def lifts(sheet: dv.TetMesh, pinned: np.ndarray) -> Tensor:
+    """How much each end lifts a vertex of the bars along y, shape [4, V, 3]; `pinned`: these vertices, bool [V]."""
+    along, across = (torch.from_numpy(sheet.points[:, k] / SIZE[k // 2]) for k in (0, 2))
+    ends = [(1 - along) * (1 - across), (1 - along) * across, along * (1 - across), along * across]
+    out = torch.zeros((4, len(pinned), 3), dtype=torch.float64)
+    out[:, : sheet.num_vertices, 1] = torch.stack(ends)
+    out[:, torch.from_numpy(~pinned)] = 0.0
+    return out
 
 
 def spline(times: Tensor, controls: int, knot: float) -> Tensor:

@@ -15,9 +15,9 @@ from ..adjoint.routes import ReverseSweep
 from ..contact import colliders
 from ..contact.barrier import Friction, PairBarrier
 from ..energies import FloorBarrier, StableNeoHookean
+from ..inspect.contact import record
 from ..model.model import Model
 from ..reference import contact as reference
-from ..inspect.contact import record
 from ..step.step import step
 from .scenes import generator
 
@@ -172,7 +172,7 @@ def objective(x: Tensor, v: Tensor) -> Tensor:
     return (weights[0] * x).sum() + 1e-2 * (weights[1] * v).sum()
 
 
-def compiled(scene: Scene, steps: int, sweeps: int, tape: str = "full", model: Model | None = None
+def compiled(scene: Scene, steps: int, sweeps: int, tape: Any = "full", model: Model | None = None
              ) -> tuple[dict[str, Tensor], list[reference.Part]]:  # fmt: skip
     """End state and gradients of the package's steps, and the detections of all of them."""
     model = scene.model if model is None else model

@@ -13,38 +13,32 @@ namespace {
 
 namespace rigid = diffvbd::rigid;
 namespace start = diffvbd::start;
-using diffvbd::BeginSettings, diffvbd::BeginTensors, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty,
-    diffvbd::for_bodies, diffvbd::for_vertices, diffvbd::OtherBodies, diffvbd::Threads, diffvbd::zeros;
+using diffvbd::BeginSettings, diffvbd::BeginFields, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty,
+    diffvbd::for_bodies, diffvbd::for_vertices, diffvbd::Threads, diffvbd::zeros;
 using torch::stable::Tensor;
 
-std::tuple<Tensor, Tensor, Tensor> begin(const Tensor& x, const Tensor& v, const Tensor& acceleration,
-                                         const Tensor& held, const Tensor& mass, const Tensor& energy_data,
-                                         const Tensor& origin, const Tensor& mu, const Tensor& lam, const Tensor& rest,
-                                         const Tensor& pinned, const Tensor& order, const Tensor& ptr,
-                                         const Tensor& spread, std::vector<int64_t> /*groups*/, const Tensor& other,
-                                         const Tensor& other_order, const Tensor& other_ptr, const Tensor& other_tets,
-                                         const Tensor& other_tet_ptr, std::vector<int64_t> /*other_groups*/,
-                                         std::vector<int64_t> data_count, double time_step, double filter_eta,
-                                         int64_t from, bool filters) {
-  const BeginTensors given{x, v, acceleration, held, mass, energy_data, origin, pinned, order, ptr, spread, other};
-  const OtherBodies others{mu, lam, rest, other_order, other_ptr, other_tets, other_tet_ptr};
+std::tuple<Tensor, Tensor, Tensor> begin(std::vector<Tensor> fields, std::vector<int64_t> /*groups*/,
+                                         std::vector<int64_t> /*other_groups*/, std::vector<int64_t> data_count,
+                                         double time_step, double filter_eta, int64_t from, bool filters) {
+  const BeginFields f = BeginFields::of(fields);
+  const Tensor& x = f.x;
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const std::vector<int64_t> shape{x.size(0), x.size(1), 3};
-    const bool chooses = from == start::kLower && others.number() > 0;
+    const bool chooses = from == start::kLower && diffvbd::other_bodies(f) > 0;
     const Tensor x_start = empty(x, shape), y = empty(x, shape);
     const Tensor from_y = chooses && filters ? empty(x, shape) : y;
-    const Tensor falls = torch::stable::new_empty(x, {from == start::kLower ? x.size(0) : 0, others.number()},
+    const Tensor falls = torch::stable::new_empty(x, {from == start::kLower ? x.size(0) : 0, diffvbd::other_bodies(f)},
                                                   std::make_optional(diffvbd::ScalarType::Byte));
-    const auto in = diffvbd::begin_inputs<T>(given, settings, x_start, y, falls, others.number());
+    const auto in = diffvbd::begin_inputs<T>(f, settings, x_start, y, falls);
     T *to = data<T>(x_start), *to_y = data<T>(y), *to_other = data<T>(from_y);
     if (in.some_alone) {
       T* second = chooses && filters ? to_other : nullptr;
       for_vertices(in.bodies, [&](int64_t scene, int32_t i) { begin_vertex(in, to, second, to_y, scene, i); });
     }
     if (chooses) {
-      const auto two = diffvbd::candidates<T>(given, others, settings, x_start, from_y, y);
+      const auto two = diffvbd::candidates<T>(f, settings, x_start, from_y, y);
       uint8_t* chosen = data<uint8_t>(falls);
       for_bodies(two.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
         chosen[body.scene * in.others + body.body] = start::rise(two, body, team) <= 0;
@@ -63,20 +57,19 @@ std::tuple<Tensor, Tensor, Tensor> begin(const Tensor& x, const Tensor& v, const
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin_backward(
-    const Tensor& x_start_bar, const Tensor& y_bar, const Tensor& falls, const Tensor& x, const Tensor& v,
-    const Tensor& acceleration, const Tensor& held, const Tensor& mass, const Tensor& energy_data, const Tensor& origin,
-    const Tensor& pinned, const Tensor& order, const Tensor& ptr, const Tensor& spread, std::vector<int64_t> /*groups*/,
-    const Tensor& other, int64_t others, std::vector<int64_t> data_count, double time_step, double filter_eta,
-    int64_t from, bool filters, std::vector<bool> wants) {
-  const BeginTensors given{x, v, acceleration, held, mass, energy_data, origin, pinned, order, ptr, spread, other};
+    const Tensor& x_start_bar, const Tensor& y_bar, const Tensor& falls, std::vector<Tensor> fields,
+    std::vector<int64_t> /*groups*/, std::vector<int64_t> data_count, double time_step, double filter_eta, int64_t from,
+    bool filters, std::vector<bool> wants) {
+  const BeginFields f = BeginFields::of(fields);
+  const Tensor &x = f.x, &order = f.order;
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     // where the bodies that are corrected coast to, and their predictor, once more
     const std::vector<int64_t> shape{x.size(0), x.size(1), 3};
     const Tensor coasted = order.numel() > 0 ? empty(x, shape) : x, y = order.numel() > 0 ? empty(x, shape) : x;
-    const auto in = diffvbd::begin_inputs<T>(given, settings, coasted, y, falls, static_cast<int32_t>(others));
-    const diffvbd::BeginBars bars(given, in, wants, [&](const std::vector<int64_t>& sizes, bool zeroed) {
+    const auto in = diffvbd::begin_inputs<T>(f, settings, coasted, y, falls);
+    const diffvbd::BeginBars bars(f, in, wants, [&](const std::vector<int64_t>& sizes, bool zeroed) {
       return zeroed ? zeros(x, sizes) : empty(x, sizes);
     });
     const auto a = bars.pointers<T>(x_start_bar, y_bar);

@@ -14,7 +14,7 @@ namespace {
 
 namespace rigid = diffvbd::rigid;
 using diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::for_bodies, diffvbd::for_vertices,
-    diffvbd::RigidTensors, diffvbd::Threads, diffvbd::zeros;
+    diffvbd::RigidFields, diffvbd::Threads, diffvbd::zeros;
 using torch::stable::Tensor;
 
 template <class T>
@@ -22,14 +22,13 @@ bool has_energies(const rigid::Inputs<T>& in) {
   return in.data.data != nullptr;
 }
 
-std::tuple<Tensor, Tensor> correct(const Tensor& x, const Tensor& x_prev, const Tensor& y, const Tensor& mass,
-                                   const Tensor& energy_data, const Tensor& origin, const Tensor& order,
-                                   const Tensor& ptr, const Tensor& spread, const Tensor& other,
-                                   std::vector<int64_t> /*groups*/, std::vector<int64_t> data_count, double time_step) {
-  const RigidTensors given{x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other};
+std::tuple<Tensor, Tensor> correct(std::vector<Tensor> fields, std::vector<int64_t> /*groups*/,
+                                   std::vector<int64_t> data_count, double time_step) {
+  const RigidFields f = RigidFields::of(fields);
+  const Tensor &x = f.x, &order = f.order;
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::rigid_inputs<T>(given, data_count, time_step);
+    const auto in = diffvbd::rigid_inputs<T>(f, data_count, time_step);
     const Tensor out = empty(x, {in.scenes, in.vertices, 3}), v = empty(x, {in.scenes, in.vertices, 3});
     T *to = data<T>(out), *velocity = data<T>(v);
     if (order.numel() < in.vertices) {
@@ -47,15 +46,16 @@ std::tuple<Tensor, Tensor> correct(const Tensor& x, const Tensor& x_prev, const 
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> correct_backward(
-    const Tensor& x_bar, const Tensor& v_bar, const Tensor& x, const Tensor& x_prev, const Tensor& y,
-    const Tensor& mass, const Tensor& energy_data, const Tensor& origin, const Tensor& order, const Tensor& ptr,
-    const Tensor& spread, const Tensor& other, std::vector<int64_t> /*groups*/, std::vector<int64_t> data_count,
-    double time_step, bool wants_data) {
-  const RigidTensors given{x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other};
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> correct_backward(const Tensor& x_bar, const Tensor& v_bar,
+                                                                            std::vector<Tensor> fields,
+                                                                            std::vector<int64_t> /*groups*/,
+                                                                            std::vector<int64_t> data_count,
+                                                                            double time_step, bool wants_data) {
+  const RigidFields f = RigidFields::of(fields);
+  const Tensor &x = f.x, &order = f.order;
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::rigid_inputs<T>(given, data_count, time_step);
+    const auto in = diffvbd::rigid_inputs<T>(f, data_count, time_step);
     const diffvbd::RigidBars bars(
         in, data_count, v_bar.numel() > 0, wants_data,
         [&](const std::vector<int64_t>& shape, bool zeroed) { return zeroed ? zeros(x, shape) : empty(x, shape); });

@@ -1,150 +1,128 @@
-// CPU implementations of the operators: tensors in, raw pointers on.
+// CPU implementations of the sweeps: tensors in, raw pointers on.
 #include "sweep.h"
 
 #include <torch/csrc/stable/library.h>
 
-#include <limits>
 #include <tuple>
 #include <vector>
 
-#include "../../cpu/reductions.h"
-
 namespace {
 
-using diffvbd::Bars, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::inputs, diffvbd::plan_of;
-using diffvbd::require;
+namespace contact = diffvbd::contact;
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::plan_of, diffvbd::require, diffvbd::zeros;
+using diffvbd::SweepFields, diffvbd::SweepSettings;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
-std::tuple<Tensor, Tensor> sweep(const Tensor& x_start, const Tensor& x_prev, const Tensor& y, const Tensor& mu,
-                                 const Tensor& lam, const Tensor& mass, const Tensor& rest, const Tensor& energy_data,
-                                 const Tensor& origin, const Tensor& plan_buffer, std::vector<int64_t> sizes,
-                                 int64_t energies, std::vector<int64_t> data_count, std::vector<double> numbers,
-                                 int64_t sweeps, std::vector<int64_t> /*launch*/, int64_t tape_policy,
-                                 int64_t debug_step, bool checked) {
+// The arrays of a step, and what they point into. x: where the sweeps start or end.
+template <class T>
+struct Given {
+  diffvbd::StepInputs<T> in{};
+  contact::ContactInputs<T> pairs{};
+
+  Given(const diffvbd::Plan& plan, const SweepFields& f, const Tensor& x, const SweepSettings& q, int64_t debug_step) {
+    const int64_t packed = int64_t{plan.slots} * diffvbd::kPairRest * diffvbd::kLanes;
+    diffvbd::set_fields(in, f, x, q, plan.num_vertices, plan.num_tets, packed);
+    in.debug_step = debug_step;
+    if (!diffvbd::has_contact(q)) return;
+    pairs = diffvbd::contact_inputs<T>(f, x, in.x_prev, in.origin, q.numbers[diffvbd::kFrictionEps]);
+    in.contact = &pairs;
+  }
+  Given(const Given&) = delete;  // in points into itself
+};
+
+std::tuple<Tensor, Tensor, Tensor> sweep(std::vector<Tensor> fields, const Tensor& plan_buffer,
+                                         std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
+                                         std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
+                                         int64_t tape_policy, int64_t debug_step, bool checked) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
-  return dispatch_float(x_start, [&](auto scalar) {
+  const SweepFields f = SweepFields::of(fields);
+  const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
+  return dispatch_float(f.x_start, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = inputs<T>(plan, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, energies, data_count,
-                              numbers, sweeps, tape_policy, debug_step);
+    const Given<T> given(plan, f, f.x_start, q, debug_step);
+    const auto& in = given.in;
     if (checked) diffvbd::check_values(plan, in);
-    Tensor x = empty(x_start, {in.scenes, plan.num_vertices, 3});
-    Tensor tape = empty(x_start, diffvbd::tape_shape(plan, in));
-    diffvbd::run_forward<T>(plan, in, data<T>(x), data<T>(tape));
-    return std::make_tuple(x, tape);
+    Tensor x = empty(f.x_start, {in.scenes, plan.num_vertices, 3}),
+           tape = empty(f.x_start, diffvbd::tape_shape(plan, in));
+    Tensor cut = torch::stable::empty({in.contact ? in.scenes : 0, plan.num_vertices}, ScalarType::Byte);
+    diffvbd::run_forward<T>(plan, in, data<T>(x), data<T>(tape), data<uint8_t>(cut));
+    return std::make_tuple(x, tape, cut);
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> sweep_backward(
-    const Tensor& x_bar, const Tensor& x, const Tensor& x_prev, const Tensor& y, const Tensor& mu, const Tensor& lam,
-    const Tensor& mass, const Tensor& rest, const Tensor& energy_data, const Tensor& origin, const Tensor& tape,
-    const Tensor& plan_buffer, std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
-    std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> /*launch*/, int64_t tape_policy,
-    std::vector<bool> wants) {
+// What the reverse of contact adds up pair by pair and corner by corner, and where it ends.
+template <class T>
+struct ContactSlots {
+  const contact::ContactInputs<T>& in;
+  int64_t scenes, listed, lagged;
+  diffvbd::Buffer<T> rows, lag_rows, kappa, lag, prev;
+
+  ContactSlots(const contact::ContactInputs<T>& pairs, int64_t scenes)
+      : in(pairs),
+        scenes(scenes),
+        listed(pairs.listed.ptr[scenes * pairs.corners] / 4),
+        lagged(pairs.lag ? pairs.lagged.ptr[scenes * pairs.corners] / 4 : 0),
+        rows(48 * listed, true),
+        lag_rows(48 * lagged, true),
+        kappa(4 * listed, true),
+        lag(4 * lagged * contact::kLagScalars, true),
+        prev(3 * scenes * pairs.corners, true) {}
+
+  contact::ContactAdjoints<T> pointers(T* floor_lag) const {
+    return {rows.get(), lag_rows.get(), kappa.get(), lag.get(), floor_lag, prev.get()};
+  }
+  // in a fixed order
+  void sum(const diffvbd::SweepBars& bars) const {
+    for (int64_t entry = 0; entry < 4 * listed; ++entry) {
+      data<T>(bars.kappa)[in.listed.pairs[contact::kPairRow * (entry / 4) + 5]] += kappa.get()[entry];
+    }
+    for (int64_t i = 0; i < 4 * lagged * contact::kLagScalars; ++i) {
+      const int64_t entry = i / contact::kLagScalars, scalar = i % contact::kLagScalars;
+      data<T>(bars.lag)[entry / 4 * contact::kLagScalars + scalar] += lag.get()[i];
+    }
+    const int64_t corners = in.corners, v = in.num_vertices;
+    for (int64_t at = 0; at < scenes * corners; ++at) {
+      const int64_t scene = at / corners, corner = at % corners;
+      T* to = corner < v ? data<T>(bars.x_prev) + 3 * (scene * v + corner)
+                         : data<T>(bars.collider_prev) + 3 * (scene * (corners - v) + corner - v);
+      contact::add_at(to, contact::vector_at(prev.get() + 3 * at));
+    }
+  }
+};
+
+std::vector<Tensor> sweep_backward(const Tensor& x_bar, const Tensor& x, std::vector<Tensor> fields, const Tensor& tape,
+                                   const Tensor& plan_buffer, std::vector<int64_t> sizes, int64_t energies,
+                                   std::vector<int64_t> data_count, std::vector<double> numbers, int64_t sweeps,
+                                   std::vector<int64_t> launch, int64_t tape_policy, std::vector<bool> wants) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
+  const SweepFields f = SweepFields::of(fields);
+  const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
   require(tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: bad arguments");
+  require(x_bar.is_contiguous() && x_bar.numel() == x.numel(), "diffvbd::sweep_backward: x_bar must be like x");
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = inputs<T>(plan, x, x_prev, y, mu, lam, mass, rest, energy_data, origin, energies, data_count,
-                              numbers, sweeps, tape_policy, -1);
-    require(x_bar.is_contiguous() && x_bar.numel() == x.numel(), "diffvbd::sweep_backward: x_bar must be like x");
+    const Given<T> given(plan, f, x, q, -1);
+    const auto& in = given.in;
     diffvbd::check_tape(tape, plan, in);
-    const Bars bars(x, plan, data_count, wants);
-    diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), bars.pointers<T>());
-    return bars.tensors();
-  });
-}
-
-Tensor pack_rest(const Tensor& rest, const Tensor& plan_buffer, std::vector<int64_t> sizes) {
-  const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
-  require(rest.dim() == 3 && rest.size(1) == plan.num_tets && rest.size(2) == 7 && rest.is_contiguous(),
-          "diffvbd::pack_rest: expected contiguous rest of shape [scenes, tets, 7]");
-  return dispatch_float(rest, [&](auto scalar) {
-    using T = decltype(scalar);
-    const int64_t b = rest.size(0), size = int64_t{plan.slots} * 4 * diffvbd::kLanes;
-    Tensor out = empty(rest, {b, plan.slots, 4, diffvbd::kLanes});
-    for (int64_t i = 0; i < b; ++i) {
-      diffvbd::pack_rest<T>(plan, data<const T>(rest) + i * plan.num_tets * 7, data<T>(out) + i * size);
+    const auto make = [&](const std::vector<int64_t>& shape, bool zeroed) {
+      return zeroed ? zeros(x, shape) : empty(x, shape);
+    };
+    diffvbd::SweepBars bars = make_bars(x, in, plan.num_vertices, plan.num_tets, plan.num_tets, true, wants, make);
+    diffvbd::StepAdjoints<T> out{};
+    set_bars(out, bars, in);
+    if (!in.contact) {
+      diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), out);
+      return bars.list();
     }
-    return out;
-  });
-}
-
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> build_plan(const Tensor& points, const Tensor& tets,
-                                                              const Tensor& active, int64_t lanes) {
-  require(points.scalar_type() == ScalarType::Double && tets.scalar_type() == ScalarType::Long &&
-              active.scalar_type() == ScalarType::Bool && points.is_contiguous() && tets.is_contiguous() &&
-              active.is_contiguous() && points.size(0) == active.size(0),
-          "diffvbd::build_plan: expected points [V, 3] float64, tets [T, 4] int64, active [V] bool");
-  const int64_t v = points.size(0), t = tets.size(0);
-  require(4 * t <= std::numeric_limits<int32_t>::max() && v <= std::numeric_limits<int32_t>::max(),
-          "mesh: too large, expected at most 2^31 (vertex, tet) pairs");
-  const int64_t* tet = data<const int64_t>(tets);
-  const diffvbd::Stars stars = diffvbd::build_stars(tet, t, v);
-  int colors = 0;
-  const diffvbd::Adjacency graph = diffvbd::build_adjacency(tet, stars);
-  const std::vector<int32_t> color = diffvbd::color_vertices(stars, graph, data<const uint8_t>(active), &colors);
-  require(lanes == diffvbd::kLanes || lanes == diffvbd::kSlice, "diffvbd::build_plan: expected 8 or 32 lanes");
-  const auto build = lanes == diffvbd::kLanes ? diffvbd::build_plan : diffvbd::build_group_plan;
-  const std::vector<int32_t> buffer = build(data<const double>(points), tet, t, stars, graph, color, colors);
-  diffvbd::Plan plan{};
-  diffvbd::PlanReader(buffer.data(), buffer.data()).blocks(plan, static_cast<int>(lanes));
-
-  Tensor plan_out = torch::stable::empty({static_cast<int64_t>(buffer.size())}, ScalarType::Int);
-  std::copy(buffer.begin(), buffer.end(), data<int32_t>(plan_out));
-  Tensor color_ptr = empty(tets, {colors + 1}), members = empty(tets, {plan.num_active});
-  for (int c = 0; c <= colors; ++c) data<int64_t>(color_ptr)[c] = plan.block_rank[plan.color_block[c]];
-  int64_t n = 0;
-  for (int64_t i = 0; i < plan.color_block[colors] * lanes; ++i) {
-    if (plan.order[i] >= 0) data<int64_t>(members)[n++] = plan.order[i];
-  }
-  Tensor star_ptr = empty(tets, {v + 1}), star = torch::stable::empty({4 * t}, ScalarType::Int);
-  std::copy(stars.ptr.begin(), stars.ptr.end(), data<int64_t>(star_ptr));
-  std::copy(stars.entry.begin(), stars.entry.end(), data<int32_t>(star));
-  return {plan_out, color_ptr, members, star_ptr, star};
-}
-
-Tensor tet_gather(const Tensor& values, const Tensor& tets) {
-  require(values.dim() == 3 && values.is_contiguous() && tets.is_contiguous() && tets.scalar_type() == ScalarType::Long,
-          "diffvbd::tet_gather: expected values [scenes, vertices, C] and tets [T, 4] int64");
-  return dispatch_float(values, [&](auto scalar) {
-    using T = decltype(scalar);
-    const int64_t b = values.size(0), v = values.size(1), c = values.size(2), n = tets.numel();
-    Tensor out = empty(values, {b, tets.size(0), 4, c});
-    for (int64_t i = 0; i < b; ++i) {
-      diffvbd::gather_rows(data<const T>(values) + i * v * c, data<const int64_t>(tets), n, c,
-                           data<T>(out) + i * n * c);
-    }
-    return out;
-  });
-}
-
-Tensor star_sum(const Tensor& values, const Tensor& star_ptr, const Tensor& star, bool positive) {
-  require(values.dim() == 4 && values.is_contiguous() && star.scalar_type() == ScalarType::Int,
-          "diffvbd::star_sum: expected values [scenes, tets, 4, C]");
-  return dispatch_float(values, [&](auto scalar) {
-    using T = decltype(scalar);
-    const int64_t b = values.size(0), n = values.size(1) * 4, c = values.size(3), v = star_ptr.size(0) - 1;
-    if (positive) diffvbd::check_masses(data<const T>(values), b, values.size(1), 4 * c);
-    Tensor out = empty(values, {b, v, c});
-    for (int64_t i = 0; i < b; ++i) {
-      diffvbd::sum_segments(data<const T>(values) + i * n * c, data<const int64_t>(star_ptr), data<const int32_t>(star),
-                            v, c, data<T>(out) + i * v * c);
-    }
-    return out;
-  });
-}
-
-Tensor row_sum(const Tensor& values) {
-  require(values.dim() == 2 && values.is_contiguous(), "diffvbd::row_sum: expected a contiguous matrix");
-  return dispatch_float(values, [&](auto scalar) {
-    using T = decltype(scalar);
-    const int64_t rows = values.size(0), columns = values.size(1);
-    Tensor out = empty(values, {rows});
-    for (int64_t i = 0; i < rows; ++i) {
-      data<T>(out)[i] = diffvbd::pairwise_sum(data<const T>(values) + i * columns, columns);
-    }
-    return out;
+    const ContactSlots<T> slots(given.pairs, in.scenes);
+    make_contact_bars(bars, given.pairs, in.scenes, plan.num_vertices, f.lag_pairs.numel() / contact::kPairRow, make);
+    const auto pointers = slots.pointers(data<T>(bars.floor_lag));
+    out.contact = &pointers;
+    out.bounds = data<T>(bars.bounds), out.collider = data<T>(bars.collider);
+    diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), out);
+    slots.sum(bars);
+    return bars.list();
   });
 }
 
@@ -153,9 +131,4 @@ Tensor row_sum(const Tensor& values) {
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
   m.impl("sweep", TORCH_BOX(&sweep));
   m.impl("sweep_backward", TORCH_BOX(&sweep_backward));
-  m.impl("pack_rest", TORCH_BOX(&pack_rest));
-  m.impl("build_plan", TORCH_BOX(&build_plan));
-  m.impl("tet_gather", TORCH_BOX(&tet_gather));
-  m.impl("star_sum", TORCH_BOX(&star_sum));
-  m.impl("row_sum", TORCH_BOX(&row_sum));
 }

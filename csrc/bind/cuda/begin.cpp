@@ -15,38 +15,32 @@ namespace {
 namespace cuda = diffvbd::cuda;
 namespace start = diffvbd::start;
 using cuda::check, cuda::current_stream, cuda::empty, cuda::groups_of, cuda::workspace_of, cuda::zeros;
-using diffvbd::BeginSettings, diffvbd::BeginTensors, diffvbd::data, diffvbd::dispatch_float, diffvbd::OtherBodies;
+using diffvbd::BeginSettings, diffvbd::BeginFields, diffvbd::data, diffvbd::dispatch_float;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
 
-std::tuple<Tensor, Tensor, Tensor> begin(const Tensor& x, const Tensor& v, const Tensor& acceleration,
-                                         const Tensor& held, const Tensor& mass, const Tensor& energy_data,
-                                         const Tensor& origin, const Tensor& mu, const Tensor& lam, const Tensor& rest,
-                                         const Tensor& pinned, const Tensor& order, const Tensor& ptr,
-                                         const Tensor& spread, std::vector<int64_t> groups, const Tensor& other,
-                                         const Tensor& other_order, const Tensor& other_ptr, const Tensor& other_tets,
-                                         const Tensor& other_tet_ptr, std::vector<int64_t> other_groups,
-                                         std::vector<int64_t> data_count, double time_step, double filter_eta,
-                                         int64_t from, bool filters) {
+std::tuple<Tensor, Tensor, Tensor> begin(std::vector<Tensor> fields, std::vector<int64_t> groups,
+                                         std::vector<int64_t> other_groups, std::vector<int64_t> data_count,
+                                         double time_step, double filter_eta, int64_t from, bool filters) {
+  const BeginFields f = BeginFields::of(fields);
+  const Tensor& x = f.x;
   const DeviceGuard guard(x.get_device_index());
-  const BeginTensors given{x, v, acceleration, held, mass, energy_data, origin, pinned, order, ptr, spread, other};
-  const OtherBodies others{mu, lam, rest, other_order, other_ptr, other_tets, other_tet_ptr};
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const std::vector<int64_t> shape{x.size(0), x.size(1), 3};
-    const bool chooses = from == start::kLower && others.number() > 0;
+    const bool chooses = from == start::kLower && diffvbd::other_bodies(f) > 0;
     const Tensor x_start = empty(x, shape), y = empty(x, shape);
     const Tensor from_y = chooses && filters ? empty(x, shape) : y;
-    const Tensor falls = empty(x, {from == start::kLower ? x.size(0) : 0, others.number()}, ScalarType::Byte);
-    const auto in = diffvbd::begin_inputs<T>(given, settings, x_start, y, falls, others.number());
-    const auto teams = groups_of(groups, spread.numel());
-    const auto other_teams = groups_of(other_groups, others.number());
+    const Tensor falls = empty(x, {from == start::kLower ? x.size(0) : 0, diffvbd::other_bodies(f)}, ScalarType::Byte);
+    const auto in = diffvbd::begin_inputs<T>(f, settings, x_start, y, falls);
+    const auto teams = groups_of(groups, f.spread.numel());
+    const auto other_teams = groups_of(other_groups, diffvbd::other_bodies(f));
     const Tensor workspace = workspace_of(teams, x), other_workspace = workspace_of(other_teams, x);
     const Tensor& shared = workspace.numel() > 0 ? workspace : other_workspace;
     start::Candidates<T> two{};
-    if (chooses) two = diffvbd::candidates<T>(given, others, settings, x_start, from_y, y);
+    if (chooses) two = diffvbd::candidates<T>(f, settings, x_start, from_y, y);
     check(cuda::begin<T>(in, teams, chooses ? &two : nullptr, other_teams, data<T>(x_start), data<T>(from_y),
                          data<T>(y), data<uint8_t>(falls), data<double>(shared), current_stream(x)),
           "the beginning of a step");
@@ -55,23 +49,22 @@ std::tuple<Tensor, Tensor, Tensor> begin(const Tensor& x, const Tensor& v, const
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin_backward(
-    const Tensor& x_start_bar, const Tensor& y_bar, const Tensor& falls, const Tensor& x, const Tensor& v,
-    const Tensor& acceleration, const Tensor& held, const Tensor& mass, const Tensor& energy_data, const Tensor& origin,
-    const Tensor& pinned, const Tensor& order, const Tensor& ptr, const Tensor& spread, std::vector<int64_t> groups,
-    const Tensor& other, int64_t others, std::vector<int64_t> data_count, double time_step, double filter_eta,
-    int64_t from, bool filters, std::vector<bool> wants) {
+    const Tensor& x_start_bar, const Tensor& y_bar, const Tensor& falls, std::vector<Tensor> fields,
+    std::vector<int64_t> groups, std::vector<int64_t> data_count, double time_step, double filter_eta, int64_t from,
+    bool filters, std::vector<bool> wants) {
+  const BeginFields f = BeginFields::of(fields);
+  const Tensor &x = f.x, &order = f.order;
   const DeviceGuard guard(x.get_device_index());
-  const BeginTensors given{x, v, acceleration, held, mass, energy_data, origin, pinned, order, ptr, spread, other};
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     // where the bodies that are corrected coast to, and their predictor, once more
     const std::vector<int64_t> shape{x.size(0), x.size(1), 3};
     const Tensor coasted = order.numel() > 0 ? empty(x, shape) : x, y = order.numel() > 0 ? empty(x, shape) : x;
-    const auto in = diffvbd::begin_inputs<T>(given, settings, coasted, y, falls, static_cast<int32_t>(others));
-    const auto teams = groups_of(groups, spread.numel());
+    const auto in = diffvbd::begin_inputs<T>(f, settings, coasted, y, falls);
+    const auto teams = groups_of(groups, f.spread.numel());
     const Tensor workspace = workspace_of(teams, x);
-    const diffvbd::BeginBars bars(given, in, wants, [&](const std::vector<int64_t>& sizes, bool zeroed) {
+    const diffvbd::BeginBars bars(f, in, wants, [&](const std::vector<int64_t>& sizes, bool zeroed) {
       return zeroed ? zeros(x, sizes) : empty(x, sizes);
     });
     check(cuda::begin_backward<T>(in, teams, bars.pointers<T>(x_start_bar, y_bar), data<T>(coasted), data<T>(y),

@@ -15,21 +15,20 @@ namespace {
 namespace cuda = diffvbd::cuda;
 namespace rigid = diffvbd::rigid;
 using cuda::check, cuda::current_stream, cuda::empty, cuda::groups_of, cuda::workspace_of, cuda::zeros;
-using diffvbd::data, diffvbd::dispatch_float, diffvbd::require, diffvbd::RigidTensors;
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::require, diffvbd::RigidFields;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
 
-std::tuple<Tensor, Tensor> correct(const Tensor& x, const Tensor& x_prev, const Tensor& y, const Tensor& mass,
-                                   const Tensor& energy_data, const Tensor& origin, const Tensor& order,
-                                   const Tensor& ptr, const Tensor& spread, const Tensor& other,
-                                   std::vector<int64_t> groups, std::vector<int64_t> data_count, double time_step) {
+std::tuple<Tensor, Tensor> correct(std::vector<Tensor> fields, std::vector<int64_t> groups,
+                                   std::vector<int64_t> data_count, double time_step) {
+  const RigidFields f = RigidFields::of(fields);
+  const Tensor &x = f.x, &order = f.order;
   const DeviceGuard guard(x.get_device_index());
-  const RigidTensors given{x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::rigid_inputs<T>(given, data_count, time_step);
-    const auto teams = groups_of(groups, spread.numel());
+    const auto in = diffvbd::rigid_inputs<T>(f, data_count, time_step);
+    const auto teams = groups_of(groups, f.spread.numel());
     const Tensor out = empty(x, {in.scenes, in.vertices, 3}), v = empty(x, {in.scenes, in.vertices, 3});
     const Tensor workspace = workspace_of(teams, x);
     check(cuda::rigid_correct<T>(in, teams, order.numel() < in.vertices, data<T>(out), data<T>(v),
@@ -39,17 +38,18 @@ std::tuple<Tensor, Tensor> correct(const Tensor& x, const Tensor& x_prev, const 
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> correct_backward(
-    const Tensor& x_bar, const Tensor& v_bar, const Tensor& x, const Tensor& x_prev, const Tensor& y,
-    const Tensor& mass, const Tensor& energy_data, const Tensor& origin, const Tensor& order, const Tensor& ptr,
-    const Tensor& spread, const Tensor& other, std::vector<int64_t> groups, std::vector<int64_t> data_count,
-    double time_step, bool wants_data) {
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> correct_backward(const Tensor& x_bar, const Tensor& v_bar,
+                                                                            std::vector<Tensor> fields,
+                                                                            std::vector<int64_t> groups,
+                                                                            std::vector<int64_t> data_count,
+                                                                            double time_step, bool wants_data) {
+  const RigidFields f = RigidFields::of(fields);
+  const Tensor &x = f.x, &order = f.order;
   const DeviceGuard guard(x.get_device_index());
-  const RigidTensors given{x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::rigid_inputs<T>(given, data_count, time_step);
-    const auto teams = groups_of(groups, spread.numel());
+    const auto in = diffvbd::rigid_inputs<T>(f, data_count, time_step);
+    const auto teams = groups_of(groups, f.spread.numel());
     const Tensor workspace = workspace_of(teams, x);
     const diffvbd::RigidBars bars(
         in, data_count, v_bar.numel() > 0, wants_data,

@@ -1,11 +1,10 @@
-// What the CUDA registrations of sweeps share: tensors to the arrays of a step, of its adjoint and of its kernels.
+// What the CUDA registrations of sweeps share: plans, tapes, launches and workspace.
 #pragma once
 
 #include <torch/csrc/stable/accelerator.h>
 
-#include <tuple>
-
 #include "../../cuda/step.h"
+#include "../sweep.h"
 #include "binding.h"
 
 namespace diffvbd::cuda {
@@ -24,31 +23,6 @@ inline HostPlan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes)
   for (int i = 0; i < kPlanHeader; ++i) header[i] = static_cast<int32_t>(sizes[order[i]]);
   return {view_group_plan(header, data<const int32_t>(buffer)), sizes.data() + kHostSizes, static_cast<int>(sizes[9]),
           static_cast<int>(sizes[10])};
-}
-
-// What all four sweep operators have in common.
-template <class T>
-StepInputs<T> inputs(const HostPlan& host, const Tensor& x, const Tensor& mu, const Tensor& lam, const Tensor& mass,
-                     const Tensor& rest, int64_t energies, const std::vector<int64_t>& data_count,
-                     const std::vector<double>& numbers, int64_t sweeps, int64_t tape_policy) {
-  const GroupPlan& plan = host.plan;
-  require(x.dim() == 3 && x.size(1) == plan.num_vertices && x.size(2) == 3,
-          "diffvbd::sweep: expected x of shape [scenes, vertices, 3]");
-  const int64_t b = x.size(0);
-  StepInputs<T> in{};
-  in.scenes = b;
-  in.mu = batched<T>(mu, x, b, plan.num_tets);
-  in.lam = batched<T>(lam, x, b, plan.num_tets);
-  in.mass = batched<T>(mass, x, b, plan.num_vertices);
-  in.rest = batched<T>(rest, x, b, int64_t{plan.slots} * 4 * kSlice);
-  constexpr int elastic = kExactBlock | kPaperBlock;
-  in.energies = static_cast<int>(plan.num_tets > 0 ? energies : energies & ~elastic);
-  in.data_size = energy_data_size(data_count, plan.num_vertices);
-  for (int k = 0; k < kVertexEnergies; ++k) in.data_count[k] = static_cast<int>(data_count[k]);
-  in.parameters = step_parameters<T>(numbers);
-  in.sweeps = count_of(sweeps);
-  in.tape_policy = static_cast<int>(tape_policy);
-  return in;
 }
 
 // The regime and threads per vertex that Python chose, and what the device adds.
@@ -100,44 +74,10 @@ void check_tape(const Tensor& tape, const HostPlan& host, const StepInputs<T>& i
   require(same, "diffvbd: the tape does not belong to this step");
 }
 
-// The adjoints of a sweep's tensors. wants: material, mass, rest, energy data.
-template <class T>
-struct Bars {
-  Tensor x_start, x_prev, y, mu, lam, mass, rest, data;
-  bool elastic;
-
-  Bars(const Tensor& x, const StepInputs<T>& in, const HostPlan& host, const std::vector<bool>& wants) {
-    require(wants.size() == 4, "diffvbd: expected 4 wishes");
-    const int64_t b = in.scenes, v = host.plan.num_vertices, t = host.plan.num_tets;
-    elastic = (in.energies & (kExactBlock | kPaperBlock)) != 0;
-    const int64_t materials = in.mu.item == 0 && in.lam.item == 0 ? 1 : t;
-    const auto wanted = [&](int i, const std::vector<int64_t>& shape, bool zeroed) {
-      const std::vector<int64_t> sizes = wants[i] ? shape : std::vector<int64_t>{0};
-      return zeroed ? zeros(x, sizes) : empty(x, sizes);
-    };
-    x_start = empty(x, {b, v, 3}), x_prev = empty(x, {b, v, 3}), y = empty(x, {b, v, 3});
-    mu = wanted(0, {b, materials}, !elastic), lam = wanted(0, {b, materials}, !elastic);
-    mass = wanted(1, {b, v}, false), rest = wanted(2, {b, t, kRestScalars}, !elastic);
-    data = wanted(3, {b, in.data_size}, false);
-  }
-  // Null: not wanted, or nothing to write.
-  StepAdjoints<T> pointers(const Tensor& x_bar) const {
-    require(x_bar.is_contiguous() && x_bar.numel() == x_start.numel(), "diffvbd::sweep_backward: x_bar must be like x");
-    const auto of = [](bool flag, const Tensor& a) { return flag && a.numel() ? diffvbd::data<T>(a) : nullptr; };
-    StepAdjoints<T> out{};
-    out.x_bar = diffvbd::data<const T>(x_bar);
-    out.x_start = diffvbd::data<T>(x_start), out.x_prev = diffvbd::data<T>(x_prev), out.y = diffvbd::data<T>(y);
-    out.mu = of(elastic, mu), out.lam = of(elastic, lam), out.rest = of(elastic, rest);
-    out.mass = of(true, mass), out.data = of(true, data);
-    return out;
-  }
-  auto tensors() const { return std::make_tuple(x_start, x_prev, y, mu, lam, mass, rest, data); }
-};
-
 // The kinds of adjoints that a reverse kernel is compiled for.
 template <class T>
 int wishes(const StepAdjoints<T>& out) {
-  return (out.mu ? kMaterial : 0) | (out.rest ? kMaterial | kRest : 0);
+  return (out.material[0] ? kMaterial : 0) | (out.rest ? kMaterial | kRest : 0);
 }
 
 }  // namespace diffvbd::cuda

@@ -1,0 +1,125 @@
+// CPU implementations of the operators that sweeps with contact start from: lagged pairs, lowest vertices.
+#include <torch/csrc/stable/library.h>
+
+#include <tuple>
+#include <vector>
+
+#include "../../contact/lag.h"
+#include "sweep.h"
+
+namespace {
+
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::zeros;
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+namespace contact = diffvbd::contact;
+
+// Positions in the user's numbering.
+template <class T>
+struct UserPositions {
+  const T* x;
+  diffvbd::Vec3<T> operator()(int v) const { return contact::vector_at(x + int64_t{3} * v); }
+};
+
+template <class T>
+contact::ContactInputs<T> lag_inputs(const Tensor& x, const Tensor& origin, const Tensor& collider) {
+  contact::ContactInputs<T> in{};
+  const int64_t b = x.size(0), v = x.size(1), colliders = collider.dim() == 3 ? collider.size(1) : 0;
+  in.num_vertices = static_cast<int32_t>(v);
+  in.corners = v + colliders;
+  in.collider = diffvbd::batched<T>(collider, x, b, 3 * colliders);
+  in.origin = diffvbd::batched<T>(origin, x, b, 3 * v);
+  return in;
+}
+
+// Calls f(pair, kind, corners, constants, kappa) for each listed pair.
+template <class T, class F>
+void each_pair(const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& kappa, const Tensor& pairs,
+               const Tensor& constants, int64_t count, const F& f) {
+  const auto in = lag_inputs<T>(x, origin, collider);
+  const auto stiffness = diffvbd::batched<T>(kappa, x, x.size(0), 1);
+  for (int64_t pair = 0; pair < count; ++pair) {
+    const int32_t* record = data<const int32_t>(pairs) + contact::kPairRow * pair;
+    const UserPositions<T> positions{data<const T>(x) + int64_t{record[5]} * 3 * in.num_vertices};
+    const contact::Source<T, UserPositions<T>> source{in, record[5], positions};
+    const contact::PairConstants<T> a(data<const T>(constants) + contact::kConstants * pair);
+    f(pair, record, source.corners(record), a, stiffness.data[record[5] * stiffness.scene]);
+  }
+}
+
+Tensor contact_lag(const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& kappa,
+                   const Tensor& pairs, const Tensor& constants, const Tensor& ptr, const Tensor& /*entry*/) {
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    Tensor out = zeros(x, {pairs.size(0), contact::kLagScalars});
+    const int64_t count = data<const int32_t>(ptr)[ptr.numel() - 1] / 4;
+    each_pair<T>(x, origin, collider, kappa, pairs, constants, count,
+                 [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
+                   contact::store_lag(contact::lag_state(record[4], corners, a, stiffness),
+                                      data<T>(out) + contact::kLagScalars * pair);
+                 });
+    return out;
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor> contact_lag_backward(const Tensor& bar, const Tensor& x, const Tensor& origin,
+                                                        const Tensor& collider, const Tensor& kappa,
+                                                        const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
+                                                        const Tensor& /*entry*/) {
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const int64_t b = x.size(0), v = x.size(1), colliders = collider.dim() == 3 ? collider.size(1) : 0;
+    Tensor x_bar = zeros(x, {b, v, 3}), collider_bar = zeros(x, {b, colliders, 3}), kappa_bar = zeros(x, {b});
+    const int64_t count = data<const int32_t>(ptr)[ptr.numel() - 1] / 4;
+    each_pair<T>(x, origin, collider, kappa, pairs, constants, count,
+                 [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
+                   contact::PairAdjoint<T> out;
+                   contact::reverse_lag(record[4], corners, a, stiffness,
+                                        data<const T>(bar) + contact::kLagScalars * pair, out);
+                   const int64_t scene = record[5];
+                   for (int k = 0; k < 4; ++k) {
+                     T* to = record[k] < v ? data<T>(x_bar) + 3 * (scene * v + record[k])
+                                           : data<T>(collider_bar) + 3 * (scene * colliders + record[k] - v);
+                     contact::add_at(to, out.x[k]);
+                   }
+                   data<T>(kappa_bar)[scene] += out.kappa;
+                 });
+    return std::make_tuple(x_bar, collider_bar, kappa_bar);
+  });
+}
+
+Tensor contact_lowest(const Tensor& x, const Tensor& origin, const Tensor& planes, const Tensor& body_order,
+                      const Tensor& body_ptr, const Tensor& island) {
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::lowest_inputs<T>(x, origin, planes, body_order, body_ptr, island);
+    Tensor out = torch::stable::empty({in.scenes, in.bodies, in.num_planes}, ScalarType::Int);
+    std::vector<int32_t> own(out.numel());
+    const auto each = [&](auto&& f) {
+      int64_t i = 0;
+      for (int64_t b = 0; b < in.scenes; ++b) {
+        for (int32_t body = 0; body < in.bodies; ++body) {
+          for (int32_t plane = 0; plane < in.num_planes; ++plane) f(i++, b, body, plane);
+        }
+      }
+    };
+    each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
+      own[i] = contact::lowest_of_body(in, b, body, plane, 0, 1).vertex;
+    });
+    each([&](int64_t i, int64_t b, int32_t body, int32_t plane) {
+      const int32_t first = in.island[b * in.bodies + body];
+      int32_t* to = data<int32_t>(out);
+      to[i] = first >= 0 && first < body ? to[i - int64_t{body - first} * in.num_planes]  // that of its first body
+                                         : contact::lowest_of_island(in, own.data(), b, body, plane);
+    });
+    return out;
+  });
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
+  m.impl("contact_lag", TORCH_BOX(&contact_lag));
+  m.impl("contact_lag_backward", TORCH_BOX(&contact_lag_backward));
+  m.impl("contact_lowest", TORCH_BOX(&contact_lowest));
+}

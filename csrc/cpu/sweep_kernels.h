@@ -1,0 +1,23 @@
+// The loops of the instruction set DIFFVBD_SET: the body of the files sweep_<scalar>_<set>.cpp.
+#pragma once
+
+#include "forward.h"
+#include "reverse.h"
+
+namespace diffvbd::DIFFVBD_SET {
+
+template <class T>
+SweepKernel<T> forward(int energies) {
+  return pick_forward<T>(energy_index(energies), std::make_integer_sequence<int, kEnergySets>{});
+}
+template <class T>
+SweepKernel<T> reverse(int energies) {
+  return pick_reverse<T>(energy_index(energies), std::make_integer_sequence<int, kEnergySets>{});
+}
+
+template <class T>
+Kernels<T> sweep_kernels() {
+  return {forward<T>, reverse<T>};
+}
+
+}  // namespace diffvbd::DIFFVBD_SET

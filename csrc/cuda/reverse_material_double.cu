@@ -1,3 +1,0 @@
-#include "reverse.cuh"
-
-DIFFVBD_INSTANTIATE_REVERSE(double, diffvbd::kMaterial)

@@ -1,0 +1,4 @@
+#include "reverse.cuh"
+
+DIFFVBD_INSTANTIATE_REVERSE(float, diffvbd::kMaterial | diffvbd::kRest, kManyLanes)
+DIFFVBD_INSTANTIATE_REVERSE(float, diffvbd::kMaterial | diffvbd::kRest, kSpillLanes)

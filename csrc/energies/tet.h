@@ -1,0 +1,96 @@
+// A tet and its law: how many scalars of material and of rest shape it reads, and what of them one of its vertices
+// sees. Everything outside the law's own header counts them and knows no names.
+#pragma once
+
+#include "../core/views.h"
+
+namespace diffvbd {
+
+// Material and rest shape of the law that scenes use (stable_neo_hookean.h).
+struct TetLayout {
+  static constexpr int material = 2;   // of a tet: mu, lam [Pa]
+  static constexpr int rest = 7;       // of a tet: the stiffness weights k01 k02 k03 k12 k13 k23 [m], c6 [1/m^3]
+  static constexpr int pair_rest = 4;  // of them, as corner `local` sees them: k_ij, k_ik, k_il, c6
+
+  DIFFVBD_FN static constexpr int rest_index(int local, int i) {
+    return i == 3 ? 6 : weight_index(local, other_corner(local, i));
+  }
+  template <class T>
+  DIFFVBD_FN static T volume(const T* rest) {
+    return 1 / (6 * rest[6]);
+  }
+};
+constexpr int kMaterialScalars = TetLayout::material, kRestScalars = TetLayout::rest, kPairRest = TetLayout::pair_rest;
+
+// One (vertex, tet) pair as its vertex sees it; (j, i, k, l) is an even permutation of the tet.
+template <class R>
+struct TetPair {
+  Vec3<R> xj, xk, xl;
+  R rest[kPairRest], material[kMaterialScalars];
+};
+
+// What one reversed update adds to the adjoints of a tet's corners, with the sign and h^2 already applied.
+template <class R>
+struct TetAdjoint {
+  Vec3<R> xi, xj, xk, xl;
+};
+
+// Which adjoints beyond the state are wanted: those that a variant is compiled for, and of them those asked for.
+enum Wanted { kState = 0, kMaterial = 1, kRest = 2 };
+
+// The adjoints of one tet's inputs, sent to its star.
+template <class Law, int wanted, class R, class Star, class View>
+DIFFVBD_FN void reverse_tet(const Star& star, int e, const TetPair<R>& tet, const View& view, const Vec3<R>& d_raw,
+                            const Vec3<R>& p, const R& minus_h2, Vec3<R>& own) {
+  const TetAdjoint<R> bar = Law::block_vjp(tet, view, d_raw, p, minus_h2);
+  own += bar.xi;
+  star.add(e, bar);
+  if (star.template wants<wanted>(kMaterial)) {
+    R material_bar[kMaterialScalars];
+    Law::material_vjp(tet, view, d_raw, p, minus_h2, material_bar);
+    star.add_material(e, material_bar);
+  }
+  if (star.template wants<wanted>(kRest)) {
+    R rest_bar[kPairRest];
+    Law::rest_vjp(tet, view, d_raw, p, minus_h2, rest_bar);
+    star.add_rest(e, rest_bar);
+  }
+}
+
+// What the tets of a star add to the block of its vertex, without h^2.
+template <class R>
+struct TetSums {
+  Vec3<R> g;
+  R h_diagonal;
+  Sym3<R> h_outer;
+};
+// What these loops read over and over they copy first: no store of theirs can then be to it.
+template <class Law, class R, class Star>
+DIFFVBD_LOOP TetSums<R> sum_tets(const Star& shared, const Vec3<R>& position) {
+  decltype(auto) star = shared.local();
+  const Vec3<R> x = position;
+  TetSums<R> out{zero3<R>(), R(0), diagonal(R(0))};
+  for (int e = 0; e < star.size(); ++e) Law::block(star.pair(e), x, out.g, out.h_diagonal, out.h_outer);
+  return out;
+}
+
+// An update of x by d_raw, and p as in reverse_vertex().
+template <class R>
+struct Reversed {
+  Vec3<R> x, d_raw, p;
+  R minus_h2;
+};
+// The adjoints of a star's tets; returns that of its vertex.
+template <class Law, int wanted, class R, class Star>
+DIFFVBD_LOOP Vec3<R> reverse_tets(const Star& shared, const Reversed<R>& update) {
+  decltype(auto) star = shared.local();
+  const Reversed<R> u = update;
+  Vec3<R> own = zero3<R>();
+  for (int e = 0; e < star.size(); ++e) {
+    const TetPair<R> tet = star.pair(e);
+    reverse_tet<Law, wanted>(star, e, tet, Law::view(tet, u.x, u.d_raw, u.p), u.d_raw, u.p, u.minus_h2, own);
+  }
+  return own;
+}
+
+}  // namespace diffvbd

@@ -1,0 +1,79 @@
+"""What sweeps with contact keep of the start of a step: forces, normals and weights of pairs, differentiable."""
+
+# pyright: reportIncompatibleMethodOverride=false
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from .. import ops
+from ..ops import contact_lag as ops_lag
+from ..ops import detect as ops_contact
+
+
+class Pairs(NamedTuple):
+    """Index data of a detection: which pairs there are; not differentiable. Shapes: detection.detect."""
+
+    pairs: Tensor
+    constants: Tensor
+    ptr: Tensor
+    entry: Tensor
+
+
+class _Lag(Function):
+    """Normal force, activity, normal and weights of pairs at the start of a step [pairs, 9]."""
+
+    @staticmethod
+    def forward(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed: Pairs) -> Tensor:
+        return ops_lag.lag(x, origin, collider, kappa, *listed)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        x, collider, kappa, origin, ctx.listed = inputs
+        ctx.save_for_backward(x, origin, collider, kappa)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        x, origin, collider, kappa = ctx.saved_tensors
+        bars = ops_lag.lag_backward(grads[0].contiguous(), x, origin, collider, kappa, *ctx.listed)
+        given = (x, collider, kappa)
+        return (*(ops.sum_to(b, t.shape) for b, t in zip(bars, given, strict=True)), None, None)
+
+
+class _OfScene(Function):
+    """A value of each scene [B] for each pair of a list [pairs]."""
+
+    @staticmethod
+    def forward(value: Tensor, listed: Pairs) -> Tensor:
+        return value[listed.pairs[:, 5].clamp(min=0).to(torch.int64)]
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        ctx.scenes, ctx.listed = inputs[0].shape[0], inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        ptr = ctx.listed.ptr  # pairs are sorted by scene, with four entries each
+        first = (ptr[:: (ptr.shape[0] - 1) // ctx.scenes] // 4).contiguous()
+        order = torch.arange(grads[0].shape[0], dtype=torch.int32, device=ptr.device)
+        return ops_contact.segment_sum(grads[0][None, :, None].contiguous(), order, first)[0, :, 0], None
+
+
+def of_scene(value: Tensor, listed: Pairs) -> Tensor:
+    """value [B], one for each scene, for each pair [pairs]; its gradient is summed in a fixed order."""
+    return _OfScene.apply(value, listed)
+
+
+def pair_lag(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed: Pairs) -> Tensor:
+    """[pairs, 9]: normal force [N], 1 where closer than dhat, normal (3), weights (4); differentiable in three.
+
+    Args:
+        x: [B, V, 3] [m].  collider: [B, Vc, 3] [m].  kappa: [1 | B] [N/m].  origin: [B, V, 3] or empty.
+    """
+    return _Lag.apply(x.contiguous(), collider.contiguous(), kappa.contiguous(), origin, listed)
+
+
+ops.ready_signature(_Lag, _OfScene)

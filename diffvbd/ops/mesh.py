@@ -1,0 +1,32 @@
+"""The compiled operators on a mesh: its plan, and rest shapes as the sweeps read them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .fields import LANES
+from .functions import raw_backward
+from .load import raw
+
+PAIR_REST = 4  # scalars of a rest shape that one vertex sees; twin of TetLayout::pair_rest in csrc/energies/tet.h
+
+
+def build_plan(
+    points: Tensor, tets: Tensor, active: Tensor, lanes: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Plan, color_ptr, color_vertices, star_ptr and star of a mesh, see csrc/cpu/plan.h; lanes: of :data:`LANES`."""
+    return raw.build_plan(points, tets, active, lanes)
+
+
+def pack_rest(rest: Tensor, plan: Tensor, sizes: tuple[int, ...]) -> Tensor:
+    """Rest scalars of the tets [B, T, 7] -> as their vertices see them [B, slots, 4, lanes]. Not differentiable."""
+    return raw.pack_rest(rest.contiguous(), plan, sizes)
+
+
+@torch.library.register_fake("diffvbd::pack_rest")
+def _(rest, plan, sizes):
+    return rest.new_empty((rest.shape[0], sizes[2], PAIR_REST, LANES[rest.device.type]))
+
+
+torch.library.register_autograd("diffvbd::pack_rest", raw_backward)

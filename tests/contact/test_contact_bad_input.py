@@ -1,0 +1,301 @@
+"""Claim: what contact cannot do it says: bad input is named with what was expected and what came, more pairs than fit
+are loud, and routes of differentiation that do not exist raise."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.bad_input import INF, NAN
+from helpers.two_boxes import STEP, ball, two_boxes
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import colliders
+from diffvbd.mesh import box
+
+TRIANGLE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+
+
+def raises(run: Callable[[], Any], name: str, got: str) -> None:
+    """run() raises an error whose message begins with the argument and says what was expected and came."""
+    with pytest.raises((ValueError, TypeError)) as error:
+        run()
+    message = str(error.value)
+    assert type(error.value) in (ValueError, TypeError)
+    assert message.startswith(f"{name}: expected") and re.search(got, message), message
+
+
+# --- bad input -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "got"),
+    [
+        ("kappa", -1.0, "-1"),
+        ("kappa", NAN, "nan"),
+        ("kappa", "stiff", "str"),
+        ("dhat", 0.0, "0"),
+        ("dhat", -1.0, "-1"),
+        ("dhat", INF, "inf"),
+        ("dhat", None, "NoneType"),
+        ("damping", -1.0, "-1"),
+        ("damping", [1.0], "list"),
+        ("self_contact", 1, "int"),
+        ("between_bodies", "yes", "str"),
+        ("detections", 0, "0"),
+        ("detections", 1001, "1001"),
+        ("detections", 1.5, "float"),
+        ("detections", True, "bool"),
+        ("reach", 0.02, "0.02"),
+        ("reach", -1.0, "-1"),
+        ("reach", NAN, "nan"),
+        ("reach", "far", "str"),
+        ("gamma", 0.0, "0"),
+        ("gamma", 0.5, "0.5"),
+        ("gamma", NAN, "nan"),
+        ("capacity", 0, "0"),
+        ("capacity", 10.5, "float"),
+        ("capacity", 2**27, str(2**27)),
+    ],
+)
+def test_pair_barrier(name: str, value: Any, got: str) -> None:
+    raises(lambda: dv.PairBarrier(**{name: value}), name, got)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "got"),
+    [("coefficient", -0.1, "-0.1"), ("coefficient", NAN, "nan"), ("coefficient", "rough", "str"),
+     ("velocity", 0.0, "0"), ("velocity", -1.0, "-1"), ("velocity", True, "bool")],
+)  # fmt: skip
+def test_friction(name: str, value: Any, got: str) -> None:
+    raises(lambda: dv.Friction(**{name: value}), name, got)
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "got"),
+    [
+        (lambda: colliders.Plane(normal=(0.0, 0.0, 0.0)), "normal", r"\(0.0, 0.0, 0.0\)"),
+        (lambda: colliders.Plane(normal=(0.0, 1.0)), "normal", "2"),
+        (lambda: colliders.Plane(point=(0.0, NAN, 0.0)), "point", "NaN"),
+        (lambda: colliders.Sphere(radius=0.0), "radius", "0"),
+        (lambda: colliders.Sphere(radius=-1.0), "radius", "-1"),
+        (lambda: colliders.Sphere(center=(0.0, 0.0)), "center", "2"),
+        (lambda: colliders.Sphere(center="here"), "center", "<U4"),
+        (lambda: colliders.Capsule(radius=0.0), "radius", "0"),
+        (lambda: colliders.Capsule((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "b", r"\(0.0, 0.0, 0.0\)"),
+        (lambda: colliders.Capsule(a=(0.0, 0.0, INF)), "a", "Inf"),
+        (lambda: colliders.Capsule((1.0, -1.0, 0.0), (2.0, -5.0, 0.0), 1e100), "radius", r"1e\+100"),
+        (lambda: colliders.Sphere(radius=2e9), "radius", r"2e\+09"),
+        (lambda: colliders.Sphere((0.0, -1e38, 0.0)), "center", r"-1e\+38"),
+        (lambda: colliders.Plane((0.0, 1e10, 0.0)), "point", r"1e\+10"),
+        (lambda: colliders.Capsule(b=(1e300, 0.0, 0.0)), "b", r"1e\+300"),
+        (lambda: colliders.Obstacle(1e20 * np.eye(3), [[0, 1, 2]]), "points", r"1e\+20"),
+        (lambda: colliders.Obstacle(TRIANGLE, [[0, 1, 3]]), "triangles", "0..3"),
+        (lambda: colliders.Obstacle(TRIANGLE, [[0, 1, -1]]), "triangles", "-1"),
+        (lambda: colliders.Obstacle(TRIANGLE, [[0, 1, 1]]), "triangles", "0"),
+        (lambda: colliders.Obstacle(TRIANGLE, []), "triangles", "0"),
+        (lambda: colliders.Obstacle(TRIANGLE, [[0.0, 1.0, 2.0]]), "triangles", "float"),
+        (lambda: colliders.Obstacle([[0.0, 0.0]], [[0, 0, 0]]), "points", "2"),
+        (lambda: colliders.Obstacle(), "points", "object"),
+    ],
+)
+def test_colliders(make: Callable[[], Any], name: str, got: str) -> None:
+    """At the latest where a Model is made of them."""
+    raises(lambda: dv.Model(box(2), energies=(dv.StableNeoHookean(), dv.PairBarrier()), colliders=[make()]), name, got)
+
+
+def test_a_box_without_end_meets_primitives_only(device: str) -> None:
+    """Its distance from the empty leaves that fill a tree up is not a number, and they are no primitives."""
+    capsule = colliders.Capsule((1.0, -1.0, 0.0), (2.0, -5.0, 0.0), 0.5)
+    mesh = dv.mesh.join([box(3, 0.2), box(3, 0.2).translate((0.0, 0.5, 0.0))])
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier()), colliders=[capsule], device=device)
+    surface = model.surface_of_contact
+    assert surface is not None and surface.triangles.shape[0] & (surface.triangles.shape[0] - 1), "a tree filled up"
+    model.surface_of_contact = replace(surface, radius=torch.where(surface.radius > 0, INF, surface.radius))
+    x = model.rest_points
+    with pytest.raises(ValueError, match="x or colliders: expected surfaces that do not touch"):
+        dv.step(model, x, torch.zeros_like(x), **STEP)
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "got"),
+    [
+        ({"colliders": [ball()]}, "colliders", "none"),
+        ({"energies": (dv.StableNeoHookean(), dv.Friction())}, "energies", "none"),
+        ({"energies": (dv.PairBarrier(), dv.PairBarrier())}, "energies", "two"),
+        ({"energies": (dv.PairBarrier(), dv.Friction(), dv.Friction())}, "energies", "two"),
+        ({"energies": (dv.PairBarrier(),), "colliders": "floor"}, "colliders", "str"),
+        ({"energies": (dv.PairBarrier(),), "colliders": [box(2)]}, "colliders", "TetMesh"),
+        ({"energies": (dv.PairBarrier(),), "colliders": [colliders.Sphere]}, "colliders", "type"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:energies. no StableNeoHookean")
+def test_model(options: dict[str, Any], name: str, got: str) -> None:
+    raises(lambda: dv.Model(box(2), **options), name, got)
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "got"),
+    [
+        ({"colliders": torch.zeros(2, 3).double()}, "colliders", r"\[2, 3\]"),
+        ({"colliders": torch.zeros(1, 3)}, "colliders", "float32"),
+        ({"colliders": [[0.0, 0.0, 0.0]]}, "colliders", "list"),
+        ({"colliders_before": torch.zeros(4, 1, 3).double()}, "colliders_before", r"\[4, 1, 3\]"),
+        ({"colliders_before": torch.zeros(1, 3).int()}, "colliders_before", "int32"),
+        ({"parameters": {"pair_barrier.dhat": 0.1}}, "parameters", "pair_barrier.dhat"),
+        ({"parameters": {"friction.velocity": 0.1}}, "parameters", "friction.velocity"),
+        ({"parameters": {"friction.coefficient": torch.ones(2).double()}}, "friction.coefficient", r"\[2\]"),
+        ({"parameters": {"pair_barrier.kappa": "stiff"}}, "pair_barrier.kappa", "str"),
+        ({"parameters": {"pair_barrier.damping": torch.ones(())}}, "pair_barrier.damping", "float32"),
+    ],
+)
+def test_step(options: dict[str, Any], name: str, got: str) -> None:
+    model = two_boxes(things=[ball()])
+    x = model.rest_points
+    raises(lambda: dv.step(model, x, torch.zeros_like(x), **STEP, **options), name, got)
+
+
+def test_colliders_of_a_model_without() -> None:
+    points = torch.zeros(1, 3).double()
+    for model in (two_boxes(), dv.Model(box(2))):
+        x = model.rest_points
+        for name in ("colliders", "colliders_before"):
+            raises(lambda name=name, model=model, x=x: dv.step(model, x, x, **STEP, **{name: points}), name, "without")
+
+
+@pytest.mark.parametrize("name", ("colliders", "colliders_before", "prescribed", "force"))
+def test_values_that_are_not_finite(device: str, value_checks: None, name: str) -> None:
+    model = dv.Model(box(2, 0.2), energies=(dv.StableNeoHookean(), dv.PairBarrier()), colliders=[ball()], pinned=[0],
+                     device=device)  # fmt: skip
+    x = model.rest_points
+    value = (model.collider_points if name.startswith("colliders") else x).clone()
+    value[0, 1] = NAN
+    value = x.clone().index_fill(0, torch.tensor([3], device=device), NAN) if name == "force" else value
+    raises(lambda: dv.step(model, x, 0 * x, **STEP, **{name: value}), name, "nan")
+
+
+@pytest.mark.parametrize("value", (-5.0, NAN))
+@pytest.mark.parametrize("name", ("pair_barrier.kappa", "pair_barrier.damping", "friction.coefficient"))
+def test_parameters_out_of_range(device: str, value_checks: None, name: str, value: float) -> None:
+    model = two_boxes(device)
+    x, given = model.rest_points, torch.tensor(value, dtype=torch.float64, device=device)
+    raises(lambda: dv.step(model, x, 0 * x, parameters={name: given}, **STEP), name, f"{value:g}")
+
+
+def test_rollout_and_contact_functions() -> None:
+    model = two_boxes(things=[ball()])
+    x, points = model.rest_points, model.collider_points
+
+    def rollout(value: Any) -> Any:
+        return dv.rollout(model, x, 0 * x, steps=3, colliders=value, **STEP)
+
+    raises(lambda: rollout(lambda *_: points), "colliders", "callable")
+    raises(lambda: rollout(dv.per_step(points.expand(2, 1, 3))), "colliders", r"\[2, 1, 3\]")
+    raises(lambda: rollout(dv.per_step(points.expand(3, 2, 3).contiguous())), "colliders", r"\[2, 3\]")
+    raises(lambda: dv.contact.status("model"), "model", "str")
+    raises(lambda: dv.contact.reserve("model", 5), "model", "str")
+    raises(lambda: dv.contact.reserve(dv.Model(box(2)), 5), "model", "none")
+    raises(lambda: dv.contact.reserve(model, 0), "pairs", "0")
+    raises(lambda: dv.contact.reserve(model, 1.5), "pairs", "float")
+    raises(lambda: dv.contact.intersections(model, x[:5]), "x", r"\[5, 3\]")
+
+
+def test_status_before_any_step() -> None:
+    model = two_boxes()
+    raises(lambda: dv.contact.status(model), "model", "none so far")
+    x = model.rest_points
+    dv.step(model, x, 0 * x, **STEP)
+    status = dv.contact.status(model)
+    assert 0 < status.pairs <= status.capacity and not status.overflowed
+    assert status.touching == status.above_bounds == 0 and status.cut == [0]
+    assert status.smallest_gap == [pytest.approx(0.008)]
+    plain = dv.Model(box(2))
+    dv.step(plain, plain.rest_points, 0 * plain.rest_points, **STEP)
+    raises(lambda: dv.contact.status(plain), "model", "none so far")
+
+
+# --- more pairs than fit ---------------------------------------------------------------------------------------------
+
+
+def test_overflow_names_the_size_and_reserve_helps() -> None:
+    model, roomy = two_boxes(capacity=3), two_boxes()
+    x = model.rest_points.expand(2, -1, -1).contiguous()
+    with pytest.raises(
+        RuntimeError, match=r"pair_barrier.capacity: \d+ pairs .* do not fit 6 \(3 per scene\)"
+    ) as error:
+        dv.step(model, x, 0 * x, **STEP)
+    status = dv.contact.status(model)
+    assert status.overflowed and status.capacity == 6
+    found = re.search(r"capacity: (\d+) pairs.*reserve\(model, (\d+)\)", str(error.value))
+    assert found is not None and int(found[1]) == status.pairs
+    dv.contact.reserve(model, int(found[2]))
+    for a, b in zip(dv.step(model, x, 0 * x, **STEP), dv.step(roomy, x, 0 * x, **STEP), strict=True):
+        assert torch.equal(a, b)
+    assert dv.contact.status(model).capacity == 2 * int(found[2]) and not dv.contact.status(model).overflowed
+    assert model.contact is not None and model.contact.capacity == int(found[2])
+    assert model.to(dtype=torch.float32).surface_of_contact.capacity == int(found[2])  # it stays
+
+
+def test_exactly_as_many_pairs_as_fit() -> None:
+    model = two_boxes(detections=1)
+    x = model.rest_points
+    expected = dv.step(model, x, 0 * x, **STEP)
+    needed = dv.contact.status(model).pairs
+    dv.contact.reserve(model, needed)
+    for a, b in zip(dv.step(model, x, 0 * x, **STEP), expected, strict=True):
+        assert torch.equal(a, b)
+    dv.contact.reserve(model, needed - 1)
+    with pytest.raises(RuntimeError, match=rf"{needed} pairs .* do not fit {needed - 1}"):
+        dv.step(model, x, 0 * x, **STEP)
+
+
+# --- what cannot be differentiated -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("adjoint", (dv.Unrolled(), dv.GlobalAdjoint()), ids=("Unrolled", "GlobalAdjoint"))
+def test_other_adjoints_raise(adjoint: Any) -> None:
+    model, floor = two_boxes(), dv.FloorBarrier(height=-1.0)
+    rubbed = dv.Model(box(2), energies=(dv.StableNeoHookean(), floor, dv.Friction()))
+    for m in (model, rubbed):
+        x = m.rest_points
+        for run in (dv.step, lambda *a, **k: dv.rollout(*a, steps=2, **k)):
+            with pytest.raises(NotImplementedError, match=f"adjoint: .*ReverseSweep.*{type(adjoint).__name__}"):
+                run(m, x, 0 * x, adjoint=adjoint, **STEP)
+
+
+def test_solve_raises() -> None:
+    model = two_boxes()
+    with pytest.raises(NotImplementedError, match="contact"):
+        dv.solve(model, model.rest_points, 0 * model.rest_points, mu=2e4, lam=4e4, time_step=0.01)
+
+
+def speed_of(model: dv.Model, v: Tensor, **options: Any) -> Tensor:
+    return (dv.step(model, model.rest_points, v, **STEP, **options)[0] ** 2).sum()
+
+
+def test_second_derivatives_and_forward_mode_raise(device: str) -> None:
+    model = two_boxes(device)
+    v = torch.zeros_like(model.rest_points).requires_grad_()
+    (slope,) = torch.autograd.grad(speed_of(model, v), v, create_graph=True)
+    with pytest.raises(NotImplementedError, match="second derivatives"):
+        torch.autograd.grad(slope.sum(), v)
+    coefficient = torch.tensor(0.3, dtype=torch.float64, device=device, requires_grad=True)
+    named = {"parameters": {"friction.coefficient": coefficient}}
+    (slope,) = torch.autograd.grad(speed_of(model, v, **named), coefficient, create_graph=True)
+    with pytest.raises(NotImplementedError, match="second derivatives"):
+        torch.autograd.grad(slope, coefficient)
+    with pytest.raises((NotImplementedError, RuntimeError), match="(?i)forward.mode|jvp|forward AD|contact"):
+        torch.func.jvp(lambda v: speed_of(model, v), (v.detach(),), (torch.ones_like(v),))
+
+
+def test_function_transforms_raise() -> None:
+    model = two_boxes()
+    v = torch.zeros(3, model.num_vertices, 3, dtype=torch.float64)
+    with pytest.raises(NotImplementedError, match="contact"):
+        torch.func.vmap(lambda v: speed_of(model, v))(v)
+    with pytest.raises(NotImplementedError, match="contact"):
+        torch.func.jacrev(lambda v: dv.step(model, model.rest_points, v, **STEP)[0])(v[0])

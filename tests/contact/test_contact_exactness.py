@@ -1,0 +1,137 @@
+"""Claim: a step with contact and its reverse equal autograd through an independent execution of the same step.
+
+The detections of the compiled step give the reference its indices; everything else the reference computes for itself.
+The bar of a gradient is max(1e-11, 10 x spread), the spread being the disagreement of two references that differ only
+in the order of pairs and tets, or the largest of three such.
+"""
+
+import functools
+from typing import Any
+
+import pytest
+import torch
+from conftest import DEVICES
+from helpers.marks import slow
+
+import diffvbd as dv
+from diffvbd.testing import relative_error
+from diffvbd.testing.contact_scenes import GRAVITY, SCENES, compiled, noise, part_of, unrolled
+from diffvbd.testing.tolerances import tolerance
+
+# (steps, sweeps)
+RUNS = [(1, 1), (1, 5), (4, 5)]
+SLOW = [(1, 0), (1, 20), (4, 1), (4, 20), (20, 2), (20, 5)]
+# Bounds hold every vertex back in the first step, which therefore starts without a pair closer than dhat.
+ZERO = {("fast", 1): {"grad_pair_barrier.damping", "grad_friction.coefficient"}}
+
+
+@functools.cache
+def scene_of(name: str) -> Any:
+    return SCENES[name]()
+
+
+def check(name: str, steps: int, sweeps: int, device: str, tape: str = "full") -> None:
+    scene = scene_of(name)
+    model = scene.model if device == "cpu" else scene.model.to(device)
+    result, parts = compiled(scene, steps, sweeps, tape, model)
+    expected = unrolled(scene, steps, sweeps, parts)
+    others: dict[int, Any] = {}
+
+    def bar_of(key: str, value: torch.Tensor, seeds: int) -> float:
+        for seed in range(1, seeds + 1):
+            if seed not in others:
+                others[seed] = unrolled(scene, steps, sweeps, parts, seed=seed)
+        spread = max(relative_error(others[seed][key], value) for seed in range(1, seeds + 1))
+        return max(tolerance("contact_adjoint"), tolerance("spread_factor") * spread)
+
+    assert relative_error(result["x"], expected["x"]) <= tolerance("contact_forward")
+    assert relative_error(result["v"], expected["v"]) <= tolerance("contact_forward") / scene.time_step
+    for key, value in expected.items():
+        if not key.startswith("grad_"):
+            continue
+        error = relative_error(result[key], value)
+        # one sample of rounding is at times too kind
+        assert error <= bar_of(key, value, 1) or error <= bar_of(key, value, 3), key
+        if sweeps > 0 and key not in ZERO.get((name, steps), set()):
+            assert float(value.abs().max()) > 0, key
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("steps", "sweeps"), RUNS)
+@pytest.mark.parametrize("name", list(SCENES))
+def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int, device: str) -> None:
+    check(name, steps, sweeps, device)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(
+    ("steps", "sweeps"), [*(slow(*run) for run in SLOW), pytest.param(20, 20, marks=pytest.mark.hours)]
+)
+@pytest.mark.parametrize("name", list(SCENES))
+def test_gradients_of_longer_runs(name: str, steps: int, sweeps: int, device: str) -> None:
+    check(name, steps, sweeps, device)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("tape", ["compact", "recompute"])
+@pytest.mark.parametrize("name", list(SCENES))
+def test_smaller_tapes_give_the_same_gradients(name: str, tape: str, device: str) -> None:
+    scene = scene_of(name)
+    model = scene.model if device == "cpu" else scene.model.to(device)
+    full, _ = compiled(scene, 2, 3, "full", model)
+    small, _ = compiled(scene, 2, 3, tape, model)
+    for key, value in full.items():
+        if device == "cpu":
+            assert torch.equal(value, small[key]), key
+        else:  # other kernels, in which products and sums fuse otherwise
+            assert relative_error(small[key], value) <= tolerance("contact_adjoint"), key
+
+
+def test_the_scenes_meet_every_kind_of_contact() -> None:
+    """Point-triangle, edge-edge and point-plane pairs; closest points on faces, edges and corners; bounds that bind and
+    bounds that do not; mollified pairs of edges."""
+    kinds, features, cut, free, mollified = set(), set(), 0, 0, 0
+    for name in SCENES:
+        scene = scene_of(name)
+        options = {k: v for k, v in scene.inputs.items()}
+        with dv.contact.record() as found:
+            dv.step(scene.model, scene.x, scene.v, time_step=scene.time_step, sweeps=2, gravity=GRAVITY, **options)
+        held = dv.contact.status(scene.model).cut
+        cut, free = cut + sum(held), free + scene.x[..., 0].numel() - sum(held)
+        for detection in found:
+            part = part_of(detection)
+            kinds |= set(part.pairs[:, 4].tolist())
+            near, values = detection.near_corners, detection.near_values
+            touching = (values[..., 7] < scene.model.contact.dhat) & (near[..., 4] >= 0)
+            corners = (values[touching][:, :4] != 0).sum(-1)
+            features |= set(zip(near[touching][:, 4].tolist(), corners.tolist(), strict=True))
+            mollified += int((part.constants[:, 2] > 0).sum())
+    assert kinds == {0, 1, 2}
+    assert {(0, 4), (0, 3), (0, 2), (1, 4)} <= features  # point on face, edge, corner; edge across edge
+    assert cut > 0
+    assert free > 0
+    assert mollified > 0
+
+
+@pytest.mark.parametrize("name", ["obstacles", slow("stacked"), slow("crossed")])
+def test_central_differences_over_fifty_steps(name: str) -> None:
+    scene = scene_of(name)
+    static = {
+        k: v for k, v in scene.inputs.items() if k not in ("colliders", "colliders_before", "force", "prescribed")
+    }
+    start, velocity = scene.x, 0.2 * scene.v
+    weights = noise("differences", name, shape=start.shape, size=1.0)
+    direction = noise("direction", name, shape=start.shape, size=1.0)
+
+    def run(size: Any) -> torch.Tensor:
+        x, v = start, velocity + size * direction
+        for _ in range(50):
+            x, v = dv.step(scene.model, x, v, time_step=1 / 200, sweeps=4, **static)
+        return (weights * x).sum()
+
+    size = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(run(size), size)
+    with torch.no_grad():
+        errors = [abs(float((run(h) - run(-h)) / (2 * h) - slope)) for h in (1e-4, 1e-5, 1e-6, 1e-7)]
+    assert abs(float(slope)) > 0
+    assert min(errors) <= tolerance("contact_finite_difference") * abs(float(slope))

@@ -1,0 +1,269 @@
+"""Claim: a Model with contact is used like any other: it can be copied, rolled out, checkpointed and repeated to the
+bit; scenes do not mix, and a Model without contact runs no line of it."""
+
+import copy
+import importlib
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from helpers.two_boxes import STEP, ball, two_boxes
+from torch import Tensor
+from torch.profiler import ProfilerActivity, profile
+
+import diffvbd as dv
+from diffvbd.mesh import box
+from diffvbd.testing import contact_scenes, relative_error, tolerance
+from diffvbd.testing.contact_scenes import GRAVITY, Scene, split
+
+NAN = float("nan")
+
+
+def run(scene: Scene, model: dv.Model, steps: int = 2, sweeps: int = 4, **options: Any) -> dict[str, Tensor]:
+    """End state and gradients of a scene."""
+    leaves = {k: v.detach().to(model.device, model.dtype).requires_grad_() for k, v in scene.leaves().items()}
+    given, parameters = split(leaves)
+    x, v = given.pop("x"), given.pop("v")
+    for _ in range(steps):
+        x, v = dv.step(model, x, v, time_step=scene.time_step, sweeps=sweeps, gravity=GRAVITY, parameters=parameters,
+                       **given, **options)  # fmt: skip
+    return contact_scenes._result(x, v, leaves)
+
+
+# --- a Model moves and is kept ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", contact_scenes.SCENES)
+def test_float32_is_close(device: str, name: str) -> None:
+    scene = contact_scenes.SCENES[name]()
+    model = scene.model.to(device)
+    single = model.to(dtype=torch.float32)
+    assert single.collider_points.dtype == torch.float32 and single.contact is not None
+    expected, result = run(scene, model, steps=1), run(scene, single, steps=1)
+    assert dv.contact.status(single).pairs == dv.contact.status(model).pairs
+    for key, value in expected.items():
+        allowed = tolerance("contact_float32" if key.startswith("grad") else "contact_float32_forward")
+        allowed = allowed / scene.time_step if key == "v" else allowed
+        assert relative_error(result[key], value) <= allowed, key
+
+
+@pytest.mark.parametrize("way", ("pickle", "deepcopy", "to", "float32 and back"))
+def test_a_copy_does_the_same(way: str) -> None:
+    scene = contact_scenes.obstacles()
+    model = scene.model
+    copies: dict[str, Callable[[], dv.Model]] = {
+        "pickle": lambda: pickle.loads(pickle.dumps(model)),
+        "deepcopy": lambda: copy.deepcopy(model),
+        "to": lambda: model.to("cpu"),
+        "float32 and back": lambda: model.to(dtype=torch.float32).to(dtype=torch.float64),
+    }
+    other = copies[way]()
+    assert other.collider_rows == model.collider_rows and torch.equal(other.collider_points, model.collider_points)
+    assert other.contact_numbers == model.contact_numbers
+    expected, result = run(scene, model), run(scene, other)
+    for key, value in expected.items():
+        assert torch.equal(result[key], value), key
+    assert dv.contact.status(other) == dv.contact.status(model)
+
+
+def test_strides_do_not_matter(device: str) -> None:
+    model = two_boxes(device, things=[ball()])
+    x, points = model.rest_points, model.collider_points
+    expected = dv.step(model, x, 0 * x, **STEP)
+    turned = dv.step(model, x.t().contiguous().t(), (0 * x).t().contiguous().t(), **STEP)
+    spread = x.expand(2, 16, 3)
+    copies = dv.step(model, spread, 0 * spread, colliders=points.expand(2, 1, 3), **STEP)
+    for a, b, c in zip(expected, turned, copies, strict=True):
+        assert torch.equal(a, b) and torch.equal(c[0], a) and torch.equal(c[1], a)
+
+
+def test_scenes_do_not_mix(one_regime: None, device: str) -> None:
+    """Each scene of [2, 3, V, 3] as if alone, to the bit: pairs, islands, bounds and parameters."""
+    model = two_boxes(device, things=[ball()])
+    noise = contact_scenes.noise("scenes", shape=(2, 3, 16, 3), size=0.3).to(device)
+    kappa = 400.0 * torch.arange(1, 7, dtype=torch.float64, device=device).reshape(2, 3)
+    x = model.rest_points + 5e-3 * noise
+    points = model.collider_points + 1e-3 * noise[..., :1, :]
+
+    def run(x: Tensor, v: Tensor, points: Tensor, kappa: Tensor) -> tuple[Tensor, ...]:
+        leaves = [t.clone().requires_grad_() for t in (x, v, points, kappa)]
+        named = {"pair_barrier.kappa": leaves[3]}
+        out = dv.step(model, *leaves[:2], colliders=leaves[2], colliders_before=points, parameters=named, **STEP)
+        return (*out, *torch.autograd.grad((out[0] ** 2).sum() + (out[1] ** 2).sum(), leaves))
+
+    together = run(x, noise, points, kappa)
+    status = dv.contact.status(model)
+    for i in range(2):
+        for j in range(3):
+            alone = run(x[i, j], noise[i, j], points[i, j], kappa[i, j])
+            for a, b in zip(together, alone, strict=True):
+                assert torch.equal(a[i, j], b)
+            own = dv.contact.status(model)
+            assert own.cut[0] == status.cut[3 * i + j] and own.smallest_gap[0] == status.smallest_gap[3 * i + j]
+    assert len(set(status.cut)) > 1
+
+
+def test_no_scenes_no_pairs_no_sweeps() -> None:
+    model = two_boxes(things=[ball()])
+    x = model.rest_points
+    none = x.new_zeros(0, 16, 3)
+    assert dv.step(model, none, none, **STEP)[0].shape == (0, 16, 3)
+    assert dv.contact.status(model).cut == []
+    held = dv.Model(model.mesh, energies=model.energies, colliders=model.colliders, pinned=range(16))
+    assert torch.equal(dv.step(held, x, 0 * x, **STEP)[0], x)
+    assert dv.contact.status(held).pairs == 0
+    before = x.clone()
+    end, _ = dv.step(model, x, 0 * x, **(STEP | {"sweeps": 0}))
+    assert relative_error(end - x, (0 * x).index_fill(1, torch.tensor([1]), -9.81e-4)) <= tolerance("property_subset")
+    assert torch.equal(x, before)
+
+
+# --- rollouts and the other ways to take a step ----------------------------------------------------------------------
+
+
+def moving() -> tuple[dv.Model, Tensor, Tensor, Tensor]:
+    """Two boxes over a ball that moves; points of its center at the ends of the steps [steps, 1, 3]."""
+    model = two_boxes(things=[ball()])
+    v = torch.zeros_like(model.rest_points)
+    v[8:, 1] = -0.3
+    path = torch.arange(1, 7, dtype=torch.float64)[:, None, None] * torch.tensor([5e-4, 1e-3, 0.0], dtype=torch.float64)
+    return model, model.rest_points, v, model.collider_points + path
+
+
+def test_rollout_with_moving_colliders_equals_a_loop() -> None:
+    model, x0, v0, path = moving()
+    results = []
+    for looped in (False, True):
+        leaves = [t.clone().requires_grad_() for t in (v0, path)]
+        if looped:
+            x, v = x0, leaves[0]
+            before = model.collider_points
+            for now in leaves[1].unbind(0):
+                x, v = dv.step(model, x, v, colliders=now, colliders_before=before, **STEP)
+                before = now
+        else:
+            end = dv.rollout(model, x0, leaves[0], steps=len(path), colliders=dv.per_step(leaves[1]), **STEP)
+            x, v = end.x[-1], end.v[-1]
+        results.append((x, v, *torch.autograd.grad((x**2).sum() + (v**2).sum(), leaves)))
+    for a, b in zip(*results, strict=True):
+        assert torch.equal(a, b) and a.any()
+
+
+@pytest.mark.parametrize("every", (1, 2, 4, dv.BinomialCheckpoints(2)), ids=str)
+def test_a_checkpointed_rollout_is_the_same_to_the_bit(every: Any) -> None:
+    model, x0, v0, path = moving()
+    results = []
+    for checkpoints in (None, every):
+        named = {"pair_barrier.kappa": 400.0, "pair_barrier.damping": 1.0, "friction.coefficient": 0.4}
+        named = {k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in named.items()}
+        v, points = v0.clone().requires_grad_(), path.clone().requires_grad_()
+        end = dv.rollout(model, x0, v, steps=len(path), colliders=dv.per_step(points), parameters=named,
+                         checkpoint_every=checkpoints, **STEP)  # fmt: skip
+        leaves = (v, points, *named.values())
+        results.append((end.x, end.v, *torch.autograd.grad((end.x[-1] ** 2).sum() + (end.v**2).sum(), leaves)))
+    for a, b in zip(*results, strict=True):
+        assert torch.equal(a, b) and a.any()
+
+
+def test_step_forward_and_backward() -> None:
+    scene = contact_scenes.obstacles()
+    leaves = scene.leaves()
+    given, parameters = split(leaves)
+    options: dict[str, Any] = {"time_step": scene.time_step, "sweeps": 3, "gravity": GRAVITY}
+    out = dv.step(scene.model, parameters=parameters, **given, **options)
+    grads = [torch.ones_like(out[0]), 1e-2 * torch.ones_like(out[1])]
+    expected = torch.autograd.grad(out, list(leaves.values()), grads)
+    plain, named = split({k: v.detach() for k, v in leaves.items()})
+    x, v, tape = dv.step_forward(scene.model, wrt=tuple(leaves), parameters=named, **plain, **options)
+    assert torch.equal(x, out[0]) and torch.equal(v, out[1])
+    result = dv.step_backward(tape, *grads)
+    assert {"colliders", "colliders_before", "friction.coefficient"} <= set(result)
+    for (name, value), slope in zip(result.items(), expected, strict=True):
+        assert torch.equal(value, slope) and value.any(), name
+
+
+def test_debug_checks_run(device: str) -> None:
+    scene = contact_scenes.stacked()
+    model = scene.model.to(device)
+    expected = run(scene, model)
+    with dv.debug_checks():
+        result = run(scene, model)
+    for key, value in expected.items():
+        assert torch.equal(result[key], value), key
+    x = scene.x.to(device).clone()
+    x[4, 1] = NAN
+    with dv.debug_checks(), pytest.raises((RuntimeError, ValueError), match="(?i)x: expected finite|nan|finite"):
+        dv.step(model, x, 0 * x, **STEP)
+
+
+# --- to the bit ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", contact_scenes.SCENES)
+def test_runs_repeat_to_the_bit(device: str, name: str) -> None:
+    scene = contact_scenes.SCENES[name]()
+    model = scene.model.to(device)
+    first = run(scene, model)
+    for key, value in run(scene, model).items():
+        assert torch.equal(value, first[key]), key
+
+
+@pytest.mark.parametrize("name", contact_scenes.SCENES)
+def test_threads_change_nothing(name: str) -> None:
+    scene = contact_scenes.SCENES[name]()
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            results.append(run(scene, scene.model))
+    finally:
+        torch.set_num_threads(before)
+    for key, value in results[0].items():
+        assert torch.equal(results[1][key], value), key
+
+
+# --- without contact -------------------------------------------------------------------------------------------------
+
+
+def called(run: Callable[[], Any]) -> set[str]:
+    """Operators of the package that run."""
+    with profile(activities=[ProfilerActivity.CPU]) as seen:
+        run()
+    return {e.key for e in seen.key_averages() if e.key.startswith("diffvbd::")}
+
+
+@pytest.mark.parametrize("energies", ((), (dv.FloorBarrier(height=-0.01, kappa=1e4), dv.Anchor(1.0))))
+def test_a_model_without_contact_runs_none_of_it(monkeypatch: pytest.MonkeyPatch, energies: tuple) -> None:
+    model = dv.Model(box(3, 0.2), energies=(dv.StableNeoHookean(), *energies))
+    x, v = model.rest_points, torch.zeros_like(model.rest_points).requires_grad_()
+
+    def forward_and_backward() -> None:
+        end, _ = dv.step(model, x, v, **STEP)
+        torch.autograd.grad(end.sum(), v)
+
+    def touching() -> None:
+        other = two_boxes()
+        dv.step(other, other.rest_points, 0 * other.rest_points, **STEP)
+
+    operators = called(forward_and_backward)
+    assert operators and not any("contact" in name for name in operators)
+    assert any("contact" in name for name in called(touching))
+    monkeypatch.setattr(importlib.import_module("diffvbd.step.step"), "run_contact", lambda *_: pytest.fail("contact"))
+    forward_and_backward()
+    assert model.surface_of_contact is None and not model.touches
+
+
+@pytest.mark.parametrize("detections", (1, 3))
+def test_contact_that_meets_nothing_changes_nothing(detections: int) -> None:
+    """A body alone with a PairBarrier that finds no pair takes the same steps, in any number of parts."""
+    plain = dv.Model(box(3, 0.2), pinned=[0])
+    barrier = dv.PairBarrier(self_contact=False, reach=1.0, detections=detections)
+    model = dv.Model(plain.mesh, energies=(dv.StableNeoHookean(), barrier), pinned=[0])
+    x, v = plain.rest_points, contact_scenes.noise("alone", shape=(27, 3), size=0.3)
+    for sweeps in (0, 1, 5):
+        for a, b in zip(dv.step(model, x, v, **(STEP | {"sweeps": sweeps})),
+                        dv.step(plain, x, v, **(STEP | {"sweeps": sweeps})), strict=True):  # fmt: skip
+            assert relative_error(a, b) <= tolerance("forward" if a.abs().max() < 1 else "invariance")
+    assert dv.contact.status(model).cut == [0] and dv.contact.status(model).pairs == 0

@@ -1,0 +1,250 @@
+"""Claim: a block on an incline sticks, slides and stops as Coulomb's law says, on a floor, a plane and another body.
+
+Converged sweeps on purpose (K = 60 on 8 vertices). The block starts in the shape that it has while friction acts in
+full, so that its center of mass follows the closed form from the first step on, with the error h / t of backward Euler.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import reference
+from diffvbd.energies import _barrier_slope
+from diffvbd.mesh import box, join
+from diffvbd.testing import relative_error, tolerance
+from diffvbd.testing.contact_scenes import noise, part_of
+
+GRAVITY = 9.81  # [m/s^2]
+KAPPA, DHAT, GAP = 2e3, 0.05, 0.025  # [N/m], [m], gap of the undeformed block [m]
+CREEP = 1e-3  # eps_v [m/s]
+LAME, SWEEPS = 2e4, 60  # [Pa]
+SUPPORTS = ("floor", "plane", "body")
+ANGLE = math.radians(20)
+
+
+@dataclass
+class Block:
+    """A block of 2 kg above a support whose normal is y; positions [V, 3] of everything at rest."""
+
+    model: dv.Model
+    x: Tensor
+
+    @property
+    def free(self) -> Tensor:
+        return ~self.model.pinned
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Mean over the block by mass of the components along x."""
+        weight = self.model.mass * self.free
+        return (weight * values[..., 0]).sum() / weight.sum()
+
+
+def block_on(support: str, *friction: dv.Friction, device: str = "cpu") -> Block:
+    block, pinned, floor, colliders = box(2, (0.2, 0.1, 0.2)), None, (), ()
+    if support == "floor":
+        floor = (dv.FloorBarrier(height=-GAP, kappa=KAPPA, dhat=DHAT),)
+    else:
+        floor = (dv.PairBarrier(KAPPA, DHAT, self_contact=False, detections=1),)
+    if support == "plane":
+        colliders = (dv.colliders.Plane((0.0, -GAP, 0.0)),)
+    elif support == "body":  # one triangle of it lies below the whole way: every normal is y
+        block, pinned = join([block, box(2, (6.0, 1.0, 6.0)).translate((-4.5, -1.0 - GAP, -1.5))]), range(8, 16)
+    energies = (dv.StableNeoHookean(), *floor, *friction)
+    model = dv.Model(block, density=500.0, pinned=None if pinned is None else list(pinned), energies=energies,
+                     colliders=colliders, device=device)  # fmt: skip
+    return Block(model, model.rest_points)
+
+
+def settle(block: Block, angle: float, shear: float) -> None:
+    """Brings a block to rest on its incline, its feet held back by ``shear`` times the load that each carries."""
+    model, x = block.model, block.x
+    free, still = block.free, torch.zeros_like(x)
+    normal = GRAVITY * math.cos(angle)
+    options: dict[str, Any] = {"gravity": (shear * normal, -normal, 0.0)}
+    if model.friction is not None:
+        options["parameters"] = {"friction.coefficient": 0.0}
+    for _ in range(80):
+        kappa, dhat = torch.full_like(x[:, 1], KAPPA), torch.full_like(x[:, 1], DHAT)
+        load = torch.where(free, -_barrier_slope(x[:, 1] + GAP, kappa, dhat), 0.0)
+        weight = normal * (model.mass * free).sum()
+        load = load * (weight / load.sum().clamp(min=1e-3 * weight))
+        force = torch.stack([-shear * load, 0 * load, 0 * load], -1)
+        x, v = dv.step(model, x, still, mu=LAME, lam=LAME, time_step=0.05, sweeps=100, force=force, **options)
+    assert float(v.abs().max()) < tolerance("settled_speed")
+    block.x = x
+
+
+def slide(block: Block, angle: float, h: float, duration: float, speed: float = 0.0, coefficient: Any = None
+          ) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Positions and velocities after ``duration``; no bound may have cut the motion."""
+    model, x, v = block.model, block.x, torch.zeros_like(block.x)
+    v[block.free, 0] = speed
+    gravity = (GRAVITY * math.sin(angle), -GRAVITY * math.cos(angle), 0.0)
+    parameters = {} if coefficient is None else {"friction.coefficient": coefficient}
+    for _ in range(round(duration / h)):
+        x, v = dv.step(model, x, v, mu=LAME, lam=LAME, time_step=h, sweeps=SWEEPS, gravity=gravity,
+                       parameters=parameters)  # fmt: skip
+        assert model.contact is None or dv.contact.status(model).cut == [0]
+    return x, v
+
+
+def distance(block: Block, *args: Any, **options: Any) -> Tensor:
+    return block.mean(slide(block, *args, **options)[0] - block.x)
+
+
+def order_of(errors: list[float]) -> float:
+    """Of convergence, over halvings of h."""
+    return math.log2(abs(errors[-2] / errors[-1]))
+
+
+@pytest.mark.parametrize("support", SUPPORTS)
+def test_sticks_below_the_angle_of_friction(device: str, support: str) -> None:
+    """mu_f 10 % above tan(angle): every foot creeps at less than eps_v."""
+    block, duration = block_on(support, dv.Friction(1.1 * math.tan(ANGLE), CREEP), device=device), 0.4
+    settle(block, ANGLE, math.tan(ANGLE))
+    x, v = slide(block, ANGLE, 0.01, duration)
+    moved = (x - block.x)[block.free]
+    feet = block.x[block.free, 1] < 0.05
+    assert int(feet.sum()) == 4
+    assert float(moved[feet][:, [0, 2]].norm(dim=-1).max()) <= CREEP * duration
+    assert abs(float(block.mean(x - block.x))) <= CREEP * duration
+    assert float(block.mean(x - block.x)) > 0.1 * CREEP * duration  # it creeps: the price of smoothing
+    assert abs(float(block.mean(v))) <= CREEP
+
+
+@pytest.mark.parametrize("support", SUPPORTS)
+def test_slides_above_the_angle_of_friction(device: str, support: str) -> None:
+    """mu_f 10 % below tan(angle): half of (g sin - mu_f g cos) t^2, plus the half step of backward Euler."""
+    coefficient, duration, h = 0.9 * math.tan(ANGLE), 0.4, 0.01
+    block = block_on(support, dv.Friction(coefficient, CREEP), device=device)
+    settle(block, ANGLE, coefficient)
+    a = GRAVITY * (math.sin(ANGLE) - coefficient * math.cos(ANGLE))
+    expected = a * duration * (duration + h) / 2
+    assert float(distance(block, ANGLE, h, duration)) == pytest.approx(expected, rel=tolerance("sliding"))
+
+
+@pytest.mark.parametrize("support", SUPPORTS)
+def test_sliding_distance_converges(support: str) -> None:
+    coefficient, duration = 0.3, 0.4
+    block = block_on(support, dv.Friction(coefficient, CREEP))
+    settle(block, ANGLE, coefficient)
+    expected = GRAVITY * (math.sin(ANGLE) - coefficient * math.cos(ANGLE)) * duration**2 / 2
+    errors = [float(distance(block, ANGLE, h, duration)) / expected - 1 for h in (0.02, 0.01, 0.005)]
+    assert order_of(errors) == pytest.approx(1.0, abs=tolerance("order"))
+    finest = 0.005 / duration
+    assert errors[-1] == pytest.approx(finest, rel=tolerance("sliding") / finest)
+
+
+@pytest.mark.parametrize("support", SUPPORTS)
+def test_a_sliding_block_stops(support: str) -> None:
+    """After v0^2 / (2 mu_f g), and it stays there."""
+    coefficient, duration = 0.4, 0.16
+    speed = coefficient * GRAVITY * duration
+    block = block_on(support, dv.Friction(coefficient, CREEP))
+    settle(block, 0.0, coefficient)
+    expected = speed**2 / (2 * coefficient * GRAVITY)
+    errors = []
+    for h in (0.02, 0.01, 0.005):
+        x, v = slide(block, 0.0, h, duration, speed)
+        errors.append(float(block.mean(x - block.x)) / expected - 1)
+        assert abs(float(block.mean(v))) < tolerance("stopped") * speed
+        later, _ = slide(block, 0.0, h, duration + 0.3, speed)
+        feet = block.x[:, 1] < 0.05
+        moved = (later - x)[feet & block.free]  # the block springs back to its shape, on feet that hold
+        assert len(moved) == 4 and float(moved[:, [0, 2]].norm(dim=-1).max()) <= CREEP * 0.3
+    assert order_of(errors) == pytest.approx(1.0, abs=tolerance("order"))
+    finest = 0.005 / duration
+    assert errors[-1] == pytest.approx(-finest, rel=tolerance("sliding") / finest)
+
+
+@pytest.mark.parametrize("support", SUPPORTS)
+def test_gradient_of_the_sliding_distance(support: str) -> None:
+    """-g cos t (t + h) / 2 per unit of mu_f, down to mu_f = 0, where the distance has no friction in it."""
+    duration, h = 0.2, 0.01
+    for value in (0.3, 0.0):
+        block = block_on(support, dv.Friction(value, CREEP))
+        settle(block, ANGLE, value)
+
+        def run(coefficient: Tensor, block: Block = block) -> Tensor:
+            return distance(block, ANGLE, h, duration, coefficient=coefficient)
+
+        coefficient = torch.tensor(value, dtype=torch.float64, requires_grad=True)
+        (gradient,) = torch.autograd.grad(run(coefficient), coefficient)
+        expected = -GRAVITY * math.cos(ANGLE) * duration * (duration + h) / 2
+        assert float(gradient) == pytest.approx(expected, rel=tolerance("sliding"))
+        eps = 1e-4
+        with torch.no_grad():
+            if value > 0:
+                difference = float(run(coefficient + eps) - run(coefficient - eps)) / (2 * eps)
+            else:  # from one side, in second order: a coefficient is not negative
+                there = [float(run(coefficient + k * eps)) for k in range(3)]
+                difference = (-3 * there[0] + 4 * there[1] - there[2]) / (2 * eps)
+        assert float(gradient) == pytest.approx(difference, rel=tolerance("finite_difference"))
+
+
+@pytest.mark.parametrize("support", SUPPORTS)
+def test_without_friction(device: str, support: str) -> None:
+    """A coefficient of zero is no friction: to the bit where both take the way through contact."""
+    none, zero = block_on(support, device=device), block_on(support, dv.Friction(0.0, CREEP), device=device)
+    settle(none, ANGLE, 0.0)
+    zero.x = none.x
+    for a, b in zip(slide(none, ANGLE, 0.01, 0.1, 0.3), slide(zero, ANGLE, 0.01, 0.1, 0.3), strict=True):
+        if support != "floor":
+            assert torch.equal(a, b)
+        assert relative_error(a, b) <= tolerance("forward")
+
+
+@pytest.mark.parametrize("support", SUPPORTS)
+def test_friction_at_rest_has_finite_gradients(support: str) -> None:
+    """No motion, so no direction of slip: the smoothed force has a derivative there all the same."""
+    block = block_on(support, dv.Friction(0.5, CREEP))
+    x = block.x.clone().requires_grad_()
+    v = torch.zeros_like(x, requires_grad=True)
+    coefficient = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    end, _ = dv.step(block.model, x, v, mu=0.0, lam=0.0, time_step=0.01, sweeps=3, gravity=(0.0, 0.0, 0.0),
+                     parameters={"friction.coefficient": coefficient})  # fmt: skip
+    gradients = torch.autograd.grad(end[:, 0].sum(), (x, v, coefficient))
+    assert all(torch.isfinite(g).all() for g in gradients)
+    assert float(gradients[2]) == 0.0
+    feet = block.free & (block.x[:, 1] == 0)
+    assert (gradients[1][feet, 0] > 0).all() and (gradients[1][feet, 0] < 0.5 * 0.01).all()  # stuck, not free
+
+
+def test_gradient_without_slip_is_that_of_the_reference() -> None:
+    """Where |u| is zero but for rounding, the kink of the smoothed force has no direction."""
+    tets = join([box(2, 0.2), box(2, 0.2).translate((0.02, 0.208, 0.03))])
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(dhat=0.02, detections=1), dv.Friction(0.4, 0.05))
+    model = dv.Model(tets, energies=energies)
+    step: dict[str, Any] = {"mu": LAME, "lam": LAME, "time_step": 0.01, "sweeps": 2}
+    gradients = []
+    with dv.contact.record() as found:
+        for run in (dv.step, reference.contact_step):
+            v = torch.full_like(model.rest_points, 0.01).requires_grad_()
+            more = {} if run is dv.step else {"parts": [part_of(found[0])]}
+            x, _ = run(model, model.rest_points, v, **more, **step)
+            gradients.append(torch.autograd.grad((noise("slip", shape=x.shape, size=1.0) * x).sum(), v)[0])
+    assert relative_error(*gradients) <= tolerance("contact_adjoint")
+
+
+@pytest.mark.parametrize("support", ("plane", "body"))
+def test_a_moving_support_drags(support: str) -> None:
+    """A plane, and a prescribed body, at 0.05 m/s along x: a block that sticks soon moves as fast."""
+    block, h, speed, steps = block_on(support, dv.Friction(0.5, CREEP)), 0.01, 0.05, 40
+    settle(block, 0.0, 0.0)
+    shift = torch.tensor([speed * h, 0.0, 0.0], dtype=torch.float64)
+    x, v = block.x, torch.zeros_like(block.x)
+    points = block.model.collider_points
+    for n in range(steps):
+        moved: dict[str, Any] = {"prescribed": x + shift * block.model.pinned[:, None]}
+        if support == "plane":
+            moved = {"colliders_before": points + n * shift, "colliders": points + (n + 1) * shift}
+        x, v = dv.step(block.model, x, v, mu=LAME, lam=LAME, time_step=h, sweeps=SWEEPS, **moved)
+    feet = block.free & (block.x[:, 1] < 0.05)
+    assert int(feet.sum()) == 4
+    assert float((v[feet, 0] - speed).abs().max()) < CREEP
+    assert 0 < speed * steps * h - float(block.mean(x - block.x)) < 2 * speed**2 / (0.5 * GRAVITY) + CREEP * steps * h

@@ -1,0 +1,98 @@
+"""Claim: an energy added as docs/extending.md says works, and leaves contact working.
+
+The docs' own example, Anchor, is added once more under another name, in a copy of the sources, which is then built.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers.paths import ROOT, needs_csrc
+
+SCRIPT = """
+import torch
+import diffvbd as dv
+from diffvbd.testing.contact_scenes import boxes, build, compiled, unrolled
+from diffvbd.energies import Tether
+from diffvbd.testing import relative_error, tolerance
+
+assert [e.bit for e in dv.energies.VERTEX_ENERGIES] == [8, 16, 32] and dv.PairBarrier.bit == 4
+floor, pairs = dv.FloorBarrier(height=-0.015, kappa=3e4, dhat=0.02, damping=2.0), dv.PairBarrier(kappa=3e4, dhat=0.02)
+
+def scene_of(*energies):
+    scene = build("third", boxes((0, 0, 0), (0.03, 0.213, 0.02)), energies, jitter=3e-3)
+    for name in ("anchor", "tether"):
+        if any(getattr(e, "name", "") == name for e in energies):
+            scene.parameters[f"{name}.stiffness"] = torch.full((54,), 50.0, dtype=torch.float64)
+    return scene
+
+results = {}
+for kind in (dv.Anchor, Tether):
+    for more in ((), (floor,)):
+        results[kind.name, bool(more)], parts = compiled(scene_of(*more, pairs, kind(50.0)), 2, 3)
+        assert any(len(part.pairs) for part in parts)
+for name, one in results.items():
+    other = results["anchor", name[1]]
+    for key, value in one.items():
+        assert torch.equal(value, other[key.replace("tether", "anchor")]), (name, key)
+    assert one[f"grad_{name[0]}.stiffness"].abs().max() > 0
+
+scene = scene_of(floor, pairs, dv.Anchor(50.0), Tether(30.0))
+result, parts = compiled(scene, 2, 3)
+for key, value in unrolled(scene, 2, 3, parts).items():
+    assert value.abs().max() > 0 and relative_error(result[key], value) <= tolerance("contact_adjoint"), key
+print("a third energy and contact")
+"""
+
+
+def renamed(text: str) -> str:
+    return text.replace("Anchor", "Tether").replace("anchor", "tether")
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert text.count(old) == 1, f"{path.name}: {old}"
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def class_of(path: Path, name: str) -> str:
+    """Source of a class up to the next statement of the module, with its decorators."""
+    (found,) = re.findall(rf"(?:^@[^\n]*\n)*^class {name}\b.*?(?=^\S(?<!\)))", path.read_text(encoding="utf-8"),
+                          re.MULTILINE | re.DOTALL)  # fmt: skip
+    return found
+
+
+def add_an_energy(root: Path) -> None:
+    """The four places of docs/extending.md."""
+    energies = root / "csrc" / "energies"
+    header = (energies / "anchor.h").read_text(encoding="utf-8")
+    (energies / "tether.h").write_text(renamed(header), encoding="utf-8")
+    edit(energies / "energies.h", '#include "anchor.h"', '#include "anchor.h"\n#include "tether.h"')
+    edit(energies / "energies.h", "EnergyList<FloorBarrier, Anchor>", "EnergyList<FloorBarrier, Anchor, Tether>")
+    python, reference = root / "diffvbd" / "energies.py", root / "diffvbd" / "reference" / "energies.py"
+    edit(python, "\nVERTEX_ENERGIES:", "\n" + renamed(class_of(python, "Anchor")) + "\nVERTEX_ENERGIES:")
+    edit(python, "(FloorBarrier, Anchor)", "(FloorBarrier, Anchor, Tether)")
+    edit(reference, "\nENERGIES:", "\n" + renamed(class_of(reference, "Anchor")) + "\nENERGIES:")
+    edit(reference, '    "anchor": Anchor,\n', '    "anchor": Anchor,\n    "tether": Tether,\n')
+
+
+@pytest.mark.slow
+@needs_csrc
+def test_a_third_energy_of_single_vertices_and_contact(tmp_path: Path) -> None:
+    for name in ("csrc", "diffvbd"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    for name in ("setup.py", "pyproject.toml", "README.md"):
+        shutil.copy(ROOT / name, tmp_path)
+    add_an_energy(tmp_path)
+    edit(tmp_path / "setup.py", '"-O3", ', '"-O0", ')  # it must be quick to build
+    options = {"DIFFVBD_NO_CLONES": "1", "DIFFVBD_NO_CUDA": "1", "PYTHONPATH": str(tmp_path)}
+    environment = os.environ | options
+    build = [sys.executable, "setup.py", "--quiet", "build_ext", "--inplace", "--force"]
+    subprocess.run(build, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    run = [sys.executable, "-c", SCRIPT]
+    done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0 and "a third energy and contact" in done.stdout, done.stderr[-3000:]

@@ -1,0 +1,192 @@
+"""How a step and its gradients are held against the reference: measurements, bars, scenes of every shape.
+
+The bar of a gradient is max(1e-12, 10 x spread), where spread is the disagreement of two references that differ only in
+rounding (`diffvbd.testing.spread`; in scenes that are limited by conditioning on purpose also
+`diffvbd.testing.sensitivity`). The references always run on the CPU, once for all devices.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import reference, testing
+from diffvbd.testing import build_scene, evaluate, generator, relative_error, tolerance
+from helpers.regimes import forced
+from helpers.results import TAPES
+
+CONDITIONED = ("tiny_strain", "huge_strain", "huge_saturated")  # rounding decides many of their digits
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Errors of the worst tape policy and spreads of one scene, by entry of `testing.evaluate`."""
+
+    errors: dict[str, float]
+    spreads: dict[str, float]
+    zeros: frozenset[str]  # gradients that vanish in both
+    velocity_error: float  # of v, on the scale on which x is rounded
+
+    @property
+    def gradients(self) -> list[str]:
+        return [name for name in self.errors if name.startswith("grad_")]
+
+    @property
+    def worst(self) -> str:
+        return max(self.gradients, key=lambda name: self.errors[name] / testing.bar(self.spreads[name]))
+
+    @property
+    def spread(self) -> float:
+        return max(self.spreads[name] for name in self.gradients)
+
+
+MEASURED: dict[tuple, Measurement] = {}
+
+
+def compiled_result(model: Any, inputs: dict, sweeps: int, steps: int, tape: str) -> dict[str, Tensor]:
+    """`testing.evaluate` of the package's own step or rollout, on the CPU whatever the model's device."""
+    adjoint = dv.ReverseSweep(tape=tape)
+
+    def run(**options: Any) -> tuple[Tensor, Tensor]:
+        if steps == 1:
+            return dv.step(model, sweeps=sweeps, adjoint=adjoint, **options)
+        end = dv.rollout(model, steps=steps, sweeps=sweeps, adjoint=adjoint, save="last", **options)
+        return end.x[-1], end.v[-1]
+
+    return testing.on_device(evaluate(run, inputs), "cpu")
+
+
+def forward_bar(spreads: dict[str, float]) -> float:
+    return max(tolerance("forward"), tolerance("spread_factor") * spreads["x"])
+
+
+@functools.cache
+def expectation(case: str, kind: str, size: str, sweeps: int, steps: int) -> tuple[dict[str, Tensor], dict[str, float]]:
+    """Result and spreads of the reference."""
+    scene = build_scene(case, kind, size)
+    model, inputs = scene.model(), scene.inputs()
+    expected = testing.reference_result(model, inputs, sweeps, steps)
+    return expected, testing.spread(model, inputs, sweeps, steps, expected)
+
+
+@functools.cache
+def sensitivities(case: str, kind: str, size: str, sweeps: int, steps: int) -> dict[str, float]:
+    """How far an ulp in the inputs moves the reference."""
+    scene = build_scene(case, kind, size)
+    expected, _ = expectation(case, kind, size, sweeps, steps)
+    return testing.sensitivity(scene.model(), scene.inputs(), sweeps, steps, expected)
+
+
+@functools.cache
+def measure(place: str, case: str, kind: str, size: str, sweeps: int, steps: int) -> Measurement:
+    """Errors on a device, or, for a place like "cuda block", in one of its regimes."""
+    row = (case, kind, size, sweeps, steps)
+    scene = build_scene(case, kind, size)
+    expected, spreads = expectation(*row)
+    device, _, regime = place.partition(" ")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    with forced(regime or None):
+        results = [compiled_result(model, inputs, sweeps, steps, tape) for tape in TAPES]
+    full, _, recompute = results
+    assert all(torch.equal(full[name], recompute[name]) for name in full), "recompute must repeat full to the bit"
+    zeros = frozenset(name for name in expected if not any(r[name].any() for r in (expected, *results)))
+    errors = {name: max(relative_error(r[name], expected[name]) for r in results) for name in expected}
+    bars = {name: testing.bar(spreads[name]) for name in expected} | {"x": forward_bar(spreads)}
+    if case in CONDITIONED and any(errors[name] > bars[name] for name in expected if name != "v"):
+        # one permutation is one sample: ask also what an ulp in the inputs does to this scene
+        moved = sensitivities(*row)
+        spreads = {name: max(spreads[name], moved[name]) for name in expected}
+    scale = float(expected["x"].abs().max()) / scene.case.time_step
+    velocity = max(float((r["v"] - expected["v"]).abs().max()) for r in results) / scale
+    MEASURED[(place, *row)] = result = Measurement(errors, spreads, zeros, velocity)
+    return result
+
+
+@functools.cache
+def may_vanish(name: str, case: str, kind: str, size: str, sweeps: int, steps: int) -> bool:
+    """Whether an argument has no say: with another value of it the reference ends in the same bits."""
+    scene = build_scene(case, kind, size)
+    model, inputs = scene.model(), scene.inputs()
+    place = inputs["parameters"] if "." in name else inputs
+    value = place[name]
+    scale = float(value.nan_to_num().abs().max()) or 1.0
+    place[name] = value + 1e-6 * scale * torch.as_tensor(generator("another", name).uniform(0.5, 1, tuple(value.shape)))
+    moved = reference.rollout(model, steps=steps, sweeps=sweeps, **inputs)
+    expected, _ = expectation(case, kind, size, sweeps, steps)
+    return torch.equal(moved.x[-1], expected["x"]) and torch.equal(moved.v[-1], expected["v"])
+
+
+def check(place: str, case: str, kind: str, size: str, sweeps: int, steps: int) -> None:
+    m = measure(place, case, kind, size, sweeps, steps)
+    forward = forward_bar(m.spreads)
+    assert m.errors["x"] <= forward, f"x: {m.errors['x']:.1e} > {forward:.1e}"
+    assert m.velocity_error <= forward, f"v: {m.velocity_error:.1e} > {forward:.1e}"
+    missing = [name for name in m.zeros if not may_vanish(name.removeprefix("grad_"), case, kind, size, sweeps, steps)]
+    assert not missing, f"gradients that must not vanish: {missing}"
+    failures = [
+        f"{name}: error {m.errors[name]:.1e} > bar {testing.bar(m.spreads[name]):.1e}"
+        for name in m.gradients
+        if not m.errors[name] <= testing.bar(m.spreads[name])
+    ]
+    assert not failures, "; ".join(failures)
+
+
+BATCHED = {  # shapes of each argument over scenes [2, 3]; V vertices, T tets, P planes
+    "own": {"mu": (2, 3, "T"), "lam": (2, 3, "T"), "density": (2, 3, "T"), "force": (2, 3, "V", 3),
+            "gravity": (2, 3, "V", 3), "prescribed": (2, 3, "V", 3), "rest_points": (2, 3, "V", 3),
+            "floor_barrier.kappa": (2, 3), "floor_barrier.height": (2, 3, "P"), "floor_barrier.normal": (2, 3, "P", 3),
+            "anchor.stiffness": (2, 3, "V"), "anchor.points": (2, 3, "V", 3)},
+    "shared": {"mu": (1,), "lam": ("T",), "density": (1,), "force": (1, 3), "gravity": (3,), "prescribed": ("V", 3),
+               "rest_points": ("V", 3), "floor_barrier.kappa": (), "floor_barrier.height": ("P",),
+               "floor_barrier.normal": ("P", 3), "anchor.stiffness": ("V",), "anchor.points": ("V", 3)},
+    "mixed": {"mu": (2, 3, 1), "lam": (3, 1), "density": (2, 1, 1), "force": (3, 1, 3), "gravity": (2, 1, 1, 3),
+              "prescribed": (3, "V", 3), "rest_points": (2, 1, "V", 3), "floor_barrier.dhat": (3,),
+              "floor_barrier.damping": (2, 1), "floor_barrier.height": (3, "P"), "anchor.points": (2, 1, "V", 3)},
+}  # fmt: skip
+
+
+@functools.cache
+def scene_of_shapes(shapes: str, sweeps: int) -> tuple[dv.Model, dict[str, Any], dict[str, Tensor]]:
+    """Model, inputs and the reference's result of six scenes whose arguments have the shapes of an entry of BATCHED."""
+    scene = build_scene("anchored", "random", "small")
+    planes = ((0.0, 1.0, 0.0), (-0.6, 0.8, 0.0))
+    floor = dv.FloorBarrier(height=(-0.06, -0.7), normal=planes, kappa=2e4, dhat=0.1, damping=20.0)
+    model = dv.Model(dv.TetMesh(scene.points, scene.tets), pinned=torch.from_numpy(scene.pinned),
+                     energies=(dv.StableNeoHookean(), floor, dv.Anchor(2e3)))  # fmt: skip
+    sizes = {"T": model.num_tets, "V": model.num_vertices, "P": len(planes)}
+    rng = generator("shapes")
+
+    def shaped(base: Tensor, shape: tuple) -> Tensor:
+        """Values near those of `base` [own dimensions], in a shape that broadcasts over scenes."""
+        shape = tuple(sizes.get(n, n) for n in shape)
+        values = base.expand(2, 3, *base.shape)
+        for d, n in enumerate(reversed(shape), start=1):
+            values = values.narrow(-d, 0, 1) if n == 1 else values
+        values = values[(0,) * (values.dim() - len(shape))]
+        return values * torch.as_tensor(rng.uniform(0.999, 1.001, shape))
+
+    base: dict[str, Any] = scene.inputs()
+    time_step, parameters = base.pop("time_step"), base.pop("parameters")
+    parameters |= {"floor_barrier.normal": torch.tensor(planes), "floor_barrier.height": torch.tensor([-0.06, -0.7]),
+                   "floor_barrier.damping": torch.tensor(20.0)}  # fmt: skip
+    base["gravity"] = base["gravity"].expand_as(base["force"])
+    inputs: dict[str, Any] = {"time_step": time_step, "parameters": {}}
+    inputs |= {name: shaped(base[name], (2, 3, "V", 3)) for name in ("x", "v")}
+    for name, shape in BATCHED[shapes].items():
+        place = inputs["parameters"] if "." in name else inputs
+        place[name] = shaped((parameters if "." in name else base)[name].double(), shape)
+    return model, inputs, testing.reference_result(model, inputs, sweeps)
+
+
+def check_shapes(device: str, shapes: str, sweeps: int, regime: str | None = None) -> None:
+    model, inputs, expected = scene_of_shapes(shapes, sweeps)
+    with forced(regime):
+        result = compiled_result(model.to(device), testing.on_device(inputs, device), sweeps, 1, "full")
+    assert relative_error(result["x"], expected["x"]) <= tolerance("forward")
+    for name in expected:
+        assert result[name].any(), name
+        if name.startswith("grad_"):
+            assert relative_error(result[name], expected[name]) <= tolerance("adjoint"), name

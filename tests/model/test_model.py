@@ -1,0 +1,298 @@
+"""Model: coloring, masses, pins, copies, presets, and the number of colors against DSATUR."""
+
+import heapq
+import itertools
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd.testing import build_mesh, relative_error, tolerance
+
+STEP = {"mu": 1e4, "lam": 2e4, "time_step": 1 / 60, "sweeps": 2}
+
+
+def mesh_of(kind: str, size: Any) -> dv.TetMesh:
+    if kind in ("kuhn", "five"):
+        return dv.mesh.box(size, 1.0, kind)
+    return dv.TetMesh(*build_mesh(kind, size))
+
+
+MESHES = [
+    *((kind, n) for kind in ("kuhn", "five") for n in ((2, 2, 2), (5, 3, 3), (4, 4, 4), (7, 5, 3), (9, 9, 9))),
+    *(("delaunay", size) for size in ("small", "medium", "large")),
+    *(("random", size) for size in ("small", "medium", "large")),
+]
+
+
+def neighbors(tets: np.ndarray, count: int) -> list[set[int]]:
+    out: list[set[int]] = [set() for _ in range(count)]
+    for tet in tets.tolist():
+        for a, b in itertools.permutations(tet, 2):
+            out[a].add(b)
+    return out
+
+
+def dsatur(tets: np.ndarray, count: int) -> int:
+    """Colors of DSATUR (Brelaz 1979): the vertex with the most colors around it comes next, ties by degree."""
+    near = neighbors(tets, count)
+    color = [-1] * count
+    around: list[set[int]] = [set() for _ in range(count)]
+    queue = [(0, -len(near[v]), v) for v in range(count)]
+    heapq.heapify(queue)
+    while queue:
+        saturation, _, v = heapq.heappop(queue)
+        if color[v] >= 0 or -saturation != len(around[v]):
+            continue
+        color[v] = next(c for c in itertools.count() if c not in around[v])
+        for u in near[v]:
+            if color[u] < 0 and color[v] not in around[u]:
+                around[u].add(color[v])
+                heapq.heappush(queue, (-len(around[u]), -len(near[u]), u))
+    return 1 + max(color, default=-1)
+
+
+@pytest.mark.parametrize(("kind", "size"), MESHES)
+def test_number_of_colors_is_within_one_of_dsatur(kind: str, size: Any, record_property: Any) -> None:
+    mesh = mesh_of(kind, size)
+    ours, theirs = dv.Model(mesh).num_colors, dsatur(mesh.tets, mesh.num_vertices)
+    record_property("colors", f"{kind} {size}: {ours}, DSATUR {theirs}")
+    print(f"{kind} {size}: {ours} colors, DSATUR {theirs}")
+    assert 4 <= ours <= theirs + 1
+
+
+@pytest.mark.parametrize(("kind", "size"), MESHES)
+@pytest.mark.parametrize("pinned", [None, "face"])
+def test_colors_are_a_partition_without_shared_tets(kind: str, size: Any, pinned: Any) -> None:
+    mesh = mesh_of(kind, size)
+    mask = mesh.points[:, 0] < 0.01 if pinned else np.zeros(mesh.num_vertices, dtype=bool)
+    model = dv.Model(mesh, pinned=mask)
+    ptr, order = model.color_ptr, model.color_vertices
+    assert ptr.dtype == torch.int64 and order.dtype == torch.int64
+    assert int(ptr[0]) == 0 and int(ptr[-1]) == len(order) == model.num_active
+    assert (ptr.diff() > 0).all() and len(ptr) == model.num_colors + 1
+    assert torch.equal(order.sort().values, torch.from_numpy(np.flatnonzero(~mask)))
+    color = torch.full((mesh.num_vertices,), -1)
+    color[order] = torch.repeat_interleave(torch.arange(model.num_colors), ptr.diff())
+    of_tets = color[model.tets].sort(1).values
+    assert not ((of_tets[:, 1:] == of_tets[:, :-1]) & (of_tets[:, 1:] >= 0)).any()
+
+
+def test_coloring_depends_on_nothing_but_the_mesh() -> None:
+    first, second = (dv.Model(mesh_of("delaunay", "medium")) for _ in range(2))
+    assert torch.equal(first.color_vertices, second.color_vertices) and torch.equal(first.color_ptr, second.color_ptr)
+
+
+# --- masses, density, pins --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["structured", "delaunay", "random"])
+def test_masses_sum_to_density_times_volume(kind: str) -> None:
+    mesh = dv.TetMesh(*build_mesh(kind, "medium"))
+    density = torch.linspace(100.0, 3000.0, mesh.num_tets, dtype=torch.float64)
+    model = dv.Model(mesh, density=density)
+    total = float((density * torch.from_numpy(mesh.volume.copy())).sum())
+    assert abs(float(model.mass.sum()) - total) <= tolerance("sum") * total
+    expected = np.zeros(mesh.num_vertices)
+    np.add.at(expected, mesh.tets, (density.numpy() * mesh.volume / 4)[:, None])
+    assert relative_error(model.mass, torch.from_numpy(expected)) <= tolerance("formula")
+    assert torch.equal(model.density, density)
+    assert torch.equal(dv.Model(mesh, density=700).density, torch.full((mesh.num_tets,), 700.0, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    "pinned",
+    [[3, 0, 3], (0, 3), np.array([0, 3]), torch.tensor([0, 3]), torch.tensor([0, 3], dtype=torch.int32),
+     np.isin(np.arange(8), (0, 3)), torch.tensor([True, False, False, True, False, False, False, False])],
+)  # fmt: skip
+def test_pins_by_mask_or_indices(pinned: Any) -> None:
+    model = dv.Model(dv.mesh.cube(), pinned=pinned)
+    assert model.pinned.dtype == torch.bool
+    assert model.pinned.nonzero().reshape(-1).tolist() == [0, 3]
+    x, _ = dv.step(model, model.rest_points, torch.ones(8, 3, dtype=torch.float64), **STEP)
+    still = (x == model.rest_points).all(-1)
+    assert still.nonzero().reshape(-1).tolist() == [0, 3]
+
+
+def test_a_models_mask_is_its_own() -> None:
+    mask = torch.zeros(8, dtype=torch.bool)
+    density = torch.full((6,), 500.0, dtype=torch.float64)
+    model = dv.Model(dv.mesh.cube(), density=density, pinned=mask)
+    mask[:] = True
+    density[:] = 1.0
+    assert not model.pinned.any() and (model.density == 500.0).all()
+
+
+# --- what a Model shows -----------------------------------------------------------------------------------------------
+
+
+def test_repr_says_what_it_is() -> None:
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(damping=3.0), dv.Anchor(2.0))
+    model = dv.Model(dv.mesh.beam(5, 3, 3), pinned=[0, 1], energies=energies, saturation=0.25, regularization=1e-3,
+                     relaxation=1.5)  # fmt: skip
+    text = repr(model)
+    for part in ("45 vertices", "96 tets", "2 pinned", f"{model.num_colors} colors", "20 kg", "StableNeoHookean",
+                 "FloorBarrier", "damping=3.0", "Anchor", "stiffness=2.0", "saturation=0.25 m",
+                 "regularization=0.001 kg", "relaxation=1.5", "float64", "cpu"):  # fmt: skip
+        assert part in text, part
+    assert "\n" not in text and len(text) < 700
+    plain = repr(dv.Model(dv.mesh.cube(), dtype=torch.float32))
+    assert "float32" in plain and "saturation" not in plain and "relaxation" not in plain
+
+
+def test_repr_shows_no_tensors() -> None:
+    stiffness, points = torch.rand(45), torch.rand(45, 3)
+    anchor = dv.Anchor(stiffness, points, vertices=[1, 4, 7])
+    text = repr(dv.Model(dv.mesh.beam(5, 3, 3), energies=(dv.StableNeoHookean(), anchor)))
+    for shown in (text, repr(anchor)):
+        assert "stiffness=[45]" in shown and "points=[45, 3]" in shown
+        assert "tensor" not in shown and "\n" not in shown and len(shown) < 700
+    assert "vertices=3 of 45" in text and "vertices=[3]" in repr(anchor)
+    assert repr(dv.Anchor(2.5)) == "Anchor(stiffness=2.5, points=None, vertices=None)"
+
+
+def test_surface_and_geometry_are_the_meshes() -> None:
+    mesh = dv.mesh.box((4, 3, 2))
+    model = dv.Model(mesh)
+    assert torch.equal(model.surface, torch.from_numpy(mesh.surface.copy()))
+    assert torch.equal(model.rest_points, torch.from_numpy(mesh.points.copy()))
+    assert torch.equal(model.tets, torch.from_numpy(mesh.tets.copy()))
+    assert (model.num_vertices, model.num_tets) == (mesh.num_vertices, mesh.num_tets)
+    # outward: the divergence theorem gives the volume
+    a, b, c = model.rest_points[model.surface].unbind(1)
+    assert abs(float((a * torch.linalg.cross(b, c)).sum() / 6) - 1.0) <= tolerance("formula")
+
+
+def test_paper_preset() -> None:
+    mesh = dv.mesh.cube()
+    model = dv.Model.paper(mesh, density=700.0, pinned=[0])
+    assert [e.block for e in model.energies] == ["paper"]
+    assert (model.saturation, model.regularization, model.relaxation) == (0.1, 1e-6, 1.0)
+    assert model.pinned[0] and float(model.density[0]) == 700.0
+    floor = dv.FloorBarrier(height=-1.0)
+    other = dv.Model.paper(mesh, energies=(dv.StableNeoHookean(), floor), saturation=0.2)
+    assert other.energies[0].block == "paper" and len(other.energies) == 2 and other.saturation == 0.2
+    same = dv.Model(mesh, 700.0, [0], (dv.StableNeoHookean("paper"),), 0.1, 1e-6)
+    v = torch.ones(8, 3, dtype=torch.float64)
+    assert torch.equal(dv.step(model, model.rest_points, v, **STEP)[0], dv.step(same, same.rest_points, v, **STEP)[0])
+
+
+# --- copies -----------------------------------------------------------------------------------------------------------
+
+
+def tensors_of(model: dv.Model) -> dict[str, Tensor]:
+    return {k: t for k, t in vars(model).items() if isinstance(t, Tensor)} | dict(
+        zip(("tets", "star_ptr", "star"), model._topology, strict=True)
+    )
+
+
+def test_to_returns_a_new_model_and_keeps_the_old() -> None:
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-1 / 3), dv.Anchor(0.1))
+    model = dv.Model(dv.mesh.box((3, 3, 2), 0.1), density=123.4, pinned=[1], energies=energies)
+    before = {k: t.clone() for k, t in tensors_of(model).items()}
+    single = model.to(dtype=torch.float32)
+    assert single is not model and single.dtype == torch.float32 and model.dtype == torch.float64
+    for name, t in tensors_of(model).items():
+        assert torch.equal(t, before[name]) and t.dtype == before[name].dtype, name
+    for name, t in tensors_of(single).items():
+        expected = before[name].float() if before[name].is_floating_point() else before[name]
+        assert t.dtype == expected.dtype and torch.equal(t, expected), name
+    # a way through float32 loses nothing
+    again = single.to(dtype=torch.float64)
+    for name, t in tensors_of(again).items():
+        assert torch.equal(t, before[name]), name
+    assert torch.equal(model.to("cpu").mass, model.mass) and model.to("cpu") is not model
+    direct = dv.Model(dv.mesh.box((3, 3, 2), 0.1), 123.4, [1], energies, dtype=torch.float32)
+    for name, t in tensors_of(direct).items():
+        assert torch.equal(t, tensors_of(single)[name]), name
+
+
+def test_a_device_without_kernels_raises() -> None:
+    """Moves to CUDA are in test_cuda_device.py."""
+    model = dv.Model(dv.mesh.cube())
+    for device in ("meta", torch.device("meta"), "xpu:1"):
+        with pytest.raises(ValueError, match=r"device: .*cpu.*cuda.*, got '(meta|xpu:1)'"):
+            model.to(device)
+        with pytest.raises(ValueError, match="device: "):
+            dv.Model(dv.mesh.cube(), device=device)
+    assert model.device.type == "cpu" and all(t.device.type == "cpu" for t in tensors_of(model).values())
+
+
+# --- degenerate models ------------------------------------------------------------------------------------------------
+
+
+def gradients(model: dv.Model, x: Tensor, **options: Any) -> tuple[Tensor, Tensor, Tensor]:
+    x, v = x.clone().requires_grad_(), torch.ones_like(x).requires_grad_()
+    new, speed = dv.step(model, x, v, **{**STEP, **options})
+    return (new.detach(), *torch.autograd.grad(new.sum() + speed.sum(), (x, v), allow_unused=True))
+
+
+@pytest.mark.parametrize("batch", [(), (2,)])
+def test_an_empty_mesh_is_legal(batch: tuple[int, ...]) -> None:
+    model = dv.Model(dv.TetMesh(np.zeros((0, 3)), np.zeros((0, 4), dtype=int)))
+    assert (model.num_vertices, model.num_tets, model.num_colors) == (0, 0, 0)
+    assert "0 vertices" in repr(model)
+    x = torch.zeros(*batch, 0, 3, dtype=torch.float64)
+    new, by_x, _ = gradients(model, x)
+    assert new.shape == x.shape and by_x.shape == x.shape
+    trajectory = dv.rollout(model, x, x, steps=2, **STEP)
+    assert trajectory.x.shape == (3, *x.shape)
+    assert model.memory(sweeps=2)["total"] >= 0
+    for dtype in (torch.float32, torch.float64):
+        assert dv.step(model.to(dtype=dtype), x.to(dtype), x.to(dtype), **STEP)[0].shape == x.shape
+
+
+def test_a_batch_without_scenes_is_legal() -> None:
+    model = dv.Model(dv.mesh.cube())
+    new, by_x, _ = gradients(model, torch.zeros(0, 8, 3, dtype=torch.float64))
+    assert new.shape == (0, 8, 3) and by_x.shape == (0, 8, 3)
+
+
+def test_all_vertices_pinned_is_legal() -> None:
+    mesh = dv.mesh.cube()
+    model = dv.Model(mesh, pinned=range(8))
+    assert model.num_colors == 0 and model.num_active == 0
+    new, by_x, by_v = gradients(model, model.rest_points)
+    assert torch.equal(new, model.rest_points)
+    assert torch.equal(by_x, torch.ones_like(by_x)) and torch.equal(by_v, torch.zeros_like(by_v))
+    target = model.rest_points + 0.1
+    assert torch.equal(gradients(model, model.rest_points, prescribed=target)[0], target)
+
+
+def test_vertices_without_tets_are_legal_when_pinned() -> None:
+    mesh = dv.mesh.cube()
+    loose = dv.TetMesh(np.concatenate([mesh.points, [[5.0, 5.0, 5.0]]]), mesh.tets)
+    model = dv.Model(loose, pinned=[8])
+    force = torch.ones(9, 3, dtype=torch.float64).requires_grad_()
+    x, v = dv.step(model, model.rest_points, torch.ones(9, 3, dtype=torch.float64), force=force, **STEP)
+    expected = dv.step(dv.Model(mesh), model.rest_points[:8], torch.ones(8, 3, dtype=torch.float64),
+                       force=force[:8].detach(), **STEP)  # fmt: skip
+    assert torch.equal(x[:8], expected[0]) and x[8].tolist() == [5.0, 5.0, 5.0] and v[8].tolist() == [0.0, 0.0, 0.0]
+    (slope,) = torch.autograd.grad(x.sum(), force)
+    assert torch.isfinite(slope).all() and slope[8].abs().max() == 0 and slope[:8].abs().max() > 0
+
+
+def test_a_model_without_elastic_energy_falls_freely() -> None:
+    model = dv.Model(dv.mesh.cube(), energies=())
+    v = torch.full((8, 3), 2.0, dtype=torch.float64)
+    x, _ = dv.step(model, model.rest_points, v, mu=0.0, lam=0.0, time_step=0.1, sweeps=3)
+    expected = model.rest_points + 0.1 * v + 0.01 * torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64)
+    assert relative_error(x, expected) <= tolerance("ulps")
+
+
+def test_safeguards_out_of_scale_warn() -> None:
+    small = dv.mesh.cube(size=0.003)
+    with pytest.warns(UserWarning, match="regularization: 1e-06 kg is 0.44"):
+        dv.Model.paper(small)
+    with pytest.warns(UserWarning, match="relaxation: .* got 1.9"):
+        dv.Model(small, relaxation=1.9)
+    with pytest.warns(UserWarning, match="may diverge"):
+        dv.Model(small, energies=(dv.StableNeoHookean("paper"),), relaxation=1.6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dv.Model.paper(dv.mesh.cube())
+        dv.Model(small, relaxation=1.6)

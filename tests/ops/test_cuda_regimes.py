@@ -1,0 +1,317 @@
+"""Claim: every CUDA regime executes the same sweeps: each equals the reference within the bars of helpers/exactness.py,
+each repeats itself to the bit, and the automatic choice is one of them."""
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.exactness import BATCHED, check, check_shapes
+from helpers.regimes import ANY_SIZE, REGIMES, forced, large_inputs
+from helpers.results import TAPES, assert_same_bits, evaluated
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import testing
+from diffvbd.testing import (
+    CASES,
+    KINDS,
+    generator,
+    on_device,
+    relative_error,
+    sensitivity,
+    tolerance,
+)
+
+pytestmark = pytest.mark.cuda
+
+
+# --- against the reference --------------------------------------------------------------------------------------------
+
+
+def rows() -> list[tuple]:
+    """Every case with every sweep count; mesh kinds and steps rotate. The small meshes fit a thread."""
+    out = []
+    for i, case in enumerate(CASES):
+        for j, sweeps in enumerate((0, 1, 5, 20)):
+            out.append((case, KINDS[(i + j) % 3], "small", sweeps, 4 if sweeps == 5 and i % 3 == 0 else 1))
+        out.append((case, KINDS[i % 3], "medium", 5, 1))
+    return [*out, ("floor_filtered", "structured", "large", 5, 1), ("paper", "random", "large", 2, 1)]
+
+
+def rows_of_regimes() -> list[tuple]:
+    return [(regime, *row) for row in rows() for regime in REGIMES if regime != "thread" or row[2] == "small"]
+
+
+@pytest.mark.parametrize(("regime", "case", "kind", "size", "sweeps", "steps"), rows_of_regimes())
+def test_every_regime_equals_the_reference(
+    regime: str, case: str, kind: str, size: str, sweeps: int, steps: int
+) -> None:
+    """State and all gradients, under each tape."""
+    check(f"cuda {regime}", case, kind, size, sweeps, steps)
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.parametrize("sweeps", (1, 3))
+@pytest.mark.parametrize("shapes", BATCHED)
+def test_every_shape_of_every_argument(shapes: str, sweeps: int, regime: str) -> None:
+    """Batches with values shared by scenes, shared by tets, or of each."""
+    check_shapes("cuda", shapes, sweeps, regime)
+
+
+# --- scenes that strain the layout ------------------------------------------------------------------------------------
+
+
+def ball(rings: int, around: int) -> dv.TetMesh:
+    """A sphere's triangles joined to its centre: vertex 0 is in all of 2 rings x around tets."""
+    theta = np.pi * np.arange(1, rings + 1) / (rings + 1)
+    phi = 2 * np.pi * np.arange(around) / around
+    ring = np.stack([np.outer(np.sin(theta), np.cos(phi)), np.outer(np.sin(theta), np.sin(phi)),
+                     np.outer(np.cos(theta), np.ones(around))], -1)  # fmt: skip
+    points = np.concatenate([np.zeros((1, 3)), [[0.0, 0.0, 1.0]], ring.reshape(-1, 3), [[0.0, 0.0, -1.0]]])
+    last, faces = len(points) - 1, []
+    for j in range(around):
+        k = (j + 1) % around
+        faces += [(1, 2 + j, 2 + k), (last, last - around + k, last - around + j)]
+        for i in range(rings - 1):
+            a, b, c, d = (2 + (i + m) * around + n for m, n in ((0, j), (1, j), (0, k), (1, k)))
+            faces += [(a, b, c), (c, b, d)]
+    tets = np.concatenate([np.zeros((len(faces), 1), dtype=np.int64), np.array(faces)], 1)
+    negative = testing.volumes(points, tets) < 0
+    tets[negative] = tets[negative][:, [0, 2, 1, 3]]
+    return dv.TetMesh(points, tets)
+
+
+def cube_with_loose_vertices() -> dv.TetMesh:
+    cube = dv.mesh.cube()
+    return dv.TetMesh(np.concatenate([cube.points, 3 + np.eye(3)]), cube.tets)
+
+
+def bodies() -> dv.TetMesh:
+    cube = dv.mesh.cube()
+    return dv.mesh.join([cube, cube.translate([3.0, 0.0, 0.0]), cube.translate([0.0, 2.0, 4.0])])
+
+
+FLOOR = dv.FloorBarrier(height=-0.2, kappa=2e4, dhat=0.5, damping=20.0)  # below a cube
+BELOW = dv.FloorBarrier(height=-1.2, kappa=2e4, dhat=0.5, damping=20.0)  # below a ball
+BODY = dv.StableNeoHookean()
+ODD: dict[str, tuple[Callable[[], dv.TetMesh], dict[str, Any], tuple[str, ...]]] = {  # mesh, options, regimes
+    "fan for a thread": (lambda: ball(4, 7), {"energies": (BODY, BELOW)}, REGIMES),
+    "fan of 98": (lambda: ball(8, 12), {"energies": (BODY, BELOW, dv.Anchor(10.0)), "pinned": [1]}, REGIMES[1:]),
+    "fan of 602": (lambda: ball(20, 30), {"energies": (BODY,), "relaxation": 1.3}, REGIMES[1:]),
+    "bodies": (bodies, {"energies": (BODY, FLOOR), "pinned": [0]}, REGIMES),
+    "isolated vertices": (cube_with_loose_vertices, {"energies": (BODY, FLOOR), "pinned": [0, 8, 9, 10]}, REGIMES),
+    "one tet": (lambda: dv.TetMesh(np.eye(4)[:, 1:], [[0, 1, 2, 3]]), {"energies": (BODY,)}, REGIMES),
+    "no energies": (dv.mesh.cube, {"energies": ()}, REGIMES),
+    "floor alone": (dv.mesh.cube, {"energies": (FLOOR,)}, REGIMES),
+    "anchor alone": (dv.mesh.cube, {"energies": (dv.Anchor(50.0, vertices=[1, 4]),), "saturation": 0.05}, REGIMES),
+    "all pinned": (dv.mesh.cube, {"energies": (BODY, FLOOR), "pinned": range(8)}, REGIMES),
+    "no tets": (lambda: dv.TetMesh(np.eye(3)[:2], np.zeros((0, 4), dtype=int)), {"pinned": [0, 1]}, REGIMES),
+}
+
+
+def odd_scene(name: str, scenes: tuple[int, ...]) -> tuple[dv.Model, dict[str, Any]]:
+    """Model and inputs of an entry of ODD on the CPU."""
+    mesh, options, _ = ODD[name]
+    model = dv.Model(mesh(), density=100.0, **options)
+    rng = generator("odd", name)
+
+    def noise(*shape: int, size: float) -> Tensor:
+        return torch.as_tensor(size * rng.uniform(-1, 1, shape))
+
+    full = (*scenes, model.num_vertices, 3)
+    x = model.rest_points + noise(*full, size=0.05)
+    inputs: dict[str, Any] = {
+        "x": x,
+        "v": noise(*full, size=1.0) - torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64),
+        "mu": 1e4 * (1 + noise(*scenes, model.num_tets or 1, size=0.5)),
+        "lam": torch.tensor(2e4, dtype=torch.float64),
+        "force": noise(*full, size=1.0),
+        "prescribed": torch.where(model.pinned[:, None].cpu(), x + noise(*full, size=0.01), torch.nan),
+        "rest_points": model.rest_points + noise(model.num_vertices, 3, size=0.01),
+        "density": torch.tensor(90.0, dtype=torch.float64),
+        "time_step": 0.02,
+    }
+    if model.floor is not None:
+        inputs["parameters"] = {"floor_barrier.kappa": torch.tensor(3e4, dtype=torch.float64)}
+    return model, inputs
+
+
+@pytest.mark.filterwarnings("ignore:energies")
+@pytest.mark.parametrize("sweeps", (0, 1, 4))
+@pytest.mark.parametrize("scenes", ((), (5,)), ids=("one", "batch"))
+@pytest.mark.parametrize(("name", "regime"), [(name, r) for name, entry in ODD.items() for r in entry[2]])
+def test_odd_scenes_equal_the_cpu(name: str, regime: str, scenes: tuple[int, ...], sweeps: int) -> None:
+    model, inputs = odd_scene(name, scenes)
+    for tape in TAPES:
+        expected = evaluated(model, inputs, sweeps, tape)
+        with forced(regime):
+            result = evaluated(model.to("cuda"), on_device(inputs, "cuda"), sweeps, tape)
+        assert relative_error(result["x"], expected["x"]) <= tolerance("spread_factor") * tolerance("forward")
+        for key, value in expected.items():
+            if key.startswith("grad_"):
+                error = relative_error(result[key], value)
+                # masses of a body that falls freely hardly matter: what is left of their gradient is small differences
+                moved = 0.0 if error <= tolerance("adjoint") else sensitivity(model, inputs, sweeps)[key]
+                assert error <= testing.bar(moved), (key, tape)
+
+
+def test_the_fans_have_the_degree_they_promise() -> None:
+    for name, degree in (("fan for a thread", 30), ("fan of 98", 98), ("fan of 602", 602)):
+        tets = ODD[name][0]().tets
+        assert len(set(tets[(tets == 0).any(1)].ravel())) - 1 == degree
+
+
+@pytest.mark.parametrize("regime", (None, *REGIMES))
+def test_no_scenes(regime: str | None) -> None:
+    model = dv.Model(dv.mesh.cube(), device="cuda")
+    x = model.rest_points.expand(0, -1, -1).clone().requires_grad_()
+    with forced(regime):
+        end, v = dv.step(model, x, torch.zeros_like(x), mu=1e4, lam=1e4, time_step=0.01, sweeps=2)
+        assert end.shape == v.shape == (0, 8, 3)
+        (slope,) = torch.autograd.grad(end.sum() + v.sum(), x)
+    assert slope.shape == x.shape
+
+
+# --- to the bit -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", (torch.float64, torch.float32), ids=("float64", "float32"))
+@pytest.mark.parametrize("tape", TAPES)
+@pytest.mark.parametrize(
+    ("regime", "cells", "lead"),
+    [("thread", 2, (3000,)), ("block", 10, (200,)), ("grid", 10, ()), ("grid", 31, ()), ("grid", 4, (7,)),
+     ("color", 31, ()), ("color", 4, (7,)), (None, 2, (3000,)), (None, 10, (200,)), (None, 10, ()), (None, 31, ())],
+)  # fmt: skip
+def test_runs_repeat_to_the_bit(
+    regime: str | None, cells: int, lead: tuple[int, ...], tape: str, dtype: torch.dtype
+) -> None:
+    model, inputs = large_inputs(cells, *lead, dtype=dtype)
+    with forced(regime):
+        expected = evaluated(model, inputs, 3, tape)
+        for i in range(3):
+            # memory that held other numbers, and other work on the device at the same time
+            torch.full((1 << 24,), float("nan"), device="cuda")
+            side = torch.cuda.Stream()
+            with torch.cuda.stream(side):
+                busy = torch.ones(1 << 24, device="cuda")
+                for _ in range(10 * i):
+                    busy.mul_(1.5)
+            assert_same_bits(evaluated(model, inputs, 3, tape), expected)
+            side.synchronize()
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.parametrize("tape", TAPES)
+def test_a_scene_is_the_same_alone_and_in_a_batch(regime: str, tape: str) -> None:
+    """Its place in the batch matters as little. So does the size of that, unless another number of threads shares a
+    vertex: they add up in another order, and the batches differ by rounding."""
+    model, inputs = large_inputs(2 if regime == "thread" else 4, 130)
+    inputs["lam"] = inputs["lam"] * torch.linspace(0.5, 1.5, 130, dtype=torch.float64, device="cuda")[:, None]
+    weights = torch.as_tensor(generator("weights").standard_normal(tuple(inputs["x"].shape)), device="cuda")
+    names = ("x", "v", "mu", "lam")
+    shared = {name: value for name, value in inputs.items() if name not in names}
+
+    def run(i: Any) -> tuple[Tensor, ...]:
+        leaves = [inputs[name][i].clone().requires_grad_() for name in names]
+        options = {**dict(zip(names, leaves, strict=True)), **shared}
+        x, v = dv.step(model, sweeps=3, adjoint=dv.ReverseSweep(tape), **options)
+        return x.detach(), v.detach(), *torch.autograd.grad((weights[i] * (x + 0.01 * v)).sum(), leaves)
+
+    batches = [range(130), range(20, 130), range(60, 101), range(62, 66), *(range(i, i + 1) for i in (0, 31, 64, 129))]
+    results, launches = {}, {}
+    with forced(regime):
+        for batch in batches:
+            if len(batch) == 1:
+                results[batch] = [value[None] for value in run(batch[0])]
+            else:
+                results[batch] = run(slice(batch.start, batch.stop))
+            launch = model.settings(inputs["time_step"], 3, len(batch)).launch
+            launches[batch] = launch[:1] if regime == "thread" else launch  # there a vertex has one thread anyway
+    scales = [float(value.abs().max()) for value in results[batches[0]]]
+    scales[1] = scales[0] / inputs["time_step"]  # v is a difference of positions
+    bars = [tolerance("spread_factor") * tolerance("forward")] * 2 + [tolerance("adjoint")] * len(names)
+    equal = set()
+    for batch, part in itertools.permutations(batches, 2):
+        if not set(part) < set(batch):
+            continue
+        at = slice(part.start - batch.start, part.stop - batch.start)
+        if launches[batch] == launches[part]:
+            equal.add((len(batch), len(part)))
+        pairs = zip(("x", "v", *names), results[batch], results[part], scales, bars, strict=True)
+        for name, larger, smaller, scale, bar in pairs:
+            assert smaller.any(), name
+            if launches[batch] == launches[part]:
+                assert torch.equal(larger[at], smaller), (name, batch, part)
+            else:
+                assert float((larger[at] - smaller).abs().max()) <= bar * scale, (name, batch, part)
+    # both kinds of pairs were compared to the bit: batches with each other, and with a scene alone
+    assert any(size > 1 for _, size in equal) and any(size == 1 for _, size in equal), equal
+
+
+# --- the choice -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cells", "lead", "able"),
+    [(1, (20_000,), REGIMES), (4, (256,), REGIMES[1:]), (10, (), REGIMES[1:]), (31, (), ANY_SIZE), (1, (), REGIMES)],
+)  # fmt: skip
+def test_the_automatic_choice_is_one_of_the_regimes(cells: int, lead: tuple[int, ...], able: tuple[str, ...]) -> None:
+    """Many small bodies, many medium meshes, one medium mesh, one large mesh, one small one."""
+    model, inputs = large_inputs(cells, *lead)
+    inputs.pop("rest_points")
+    chosen = evaluated(model, inputs, 3)
+    matches = []
+    for regime in able:
+        with forced(regime):
+            result = evaluated(model, inputs, 3)
+        # regimes differ by rounding only
+        limit = tolerance("property_factor") * tolerance("adjoint")
+        assert all(relative_error(result[k], chosen[k]) <= limit for k in chosen if k != "v")
+        matches.append(all(torch.equal(result[k], chosen[k]) for k in chosen))
+    assert any(matches)
+
+
+@pytest.mark.parametrize(("cells", "lead"), ((1, (20_000,)), (4, (256,)), (10, ()), (31, ())))
+def test_the_choice_does_not_depend_on_what_is_differentiated(cells: int, lead: tuple[int, ...]) -> None:
+    """A step of an inference run equals the step of a training run to the bit, whatever the tape."""
+    model, inputs = large_inputs(cells, *lead)
+    inputs.pop("rest_points")
+    bare = dv.step(model, sweeps=3, **inputs)
+    for tape in TAPES:
+        taped = evaluated(model, inputs, 3, tape)
+        assert torch.equal(taped["x"], bare[0]) and torch.equal(taped["v"], bare[1]), tape
+
+
+def test_a_regime_that_cannot_run_a_scene_raises() -> None:
+    model, inputs = large_inputs(10)
+    with forced("thread"), pytest.raises(ValueError, match="regime"):
+        dv.step(model, sweeps=1, **inputs)
+    dv.step(model, sweeps=1, **inputs)  # outside, the choice is free again
+
+
+@pytest.mark.parametrize("name", ("warp", "", "Thread", 3))
+def test_an_unknown_regime_raises(name: Any) -> None:
+    with pytest.raises((ValueError, TypeError), match="regime"), dv.regime(name):
+        pass
+
+
+def test_regimes_nest_and_end_with_an_exception() -> None:
+    model, inputs = large_inputs(10)
+    with dv.regime("grid"):
+        with pytest.raises(ValueError, match="regime"), dv.regime("thread"):
+            dv.step(model, sweeps=1, **inputs)
+        inner = dv.step(model, sweeps=3, **inputs)
+    with dv.regime("grid"):
+        assert torch.equal(dv.step(model, sweeps=3, **inputs)[0], inner[0])
+
+
+def test_a_regime_means_nothing_on_the_cpu() -> None:
+    model, inputs = odd_scene("bodies", (2,))
+    expected = evaluated(model, inputs, 3)
+    for regime in REGIMES:
+        with forced(regime):
+            result = evaluated(model, inputs, 3)
+        assert all(torch.equal(result[name], expected[name]) for name in expected)

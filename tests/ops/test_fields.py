@@ -1,0 +1,58 @@
+"""Claim: what an operator of a step takes is listed once in each language, and the lists agree."""
+
+import re
+
+import pytest
+import torch
+from helpers.paths import CSRC, needs_csrc
+
+from diffvbd import ops
+
+LISTS = {"SWEEP": ops.SweepFields, "STEP": ops.StepFields, "RIGID": ops.RigidFields, "BEGIN": ops.BeginFields}
+
+
+def listed(name: str) -> list[tuple[str, str]]:
+    """(ADJOINT or INDEX, field) of a list of csrc/bind/fields.h."""
+    text = (CSRC / "bind" / "fields.h").read_text(encoding="utf-8").replace("\\\n", " ")
+    (body,) = re.findall(rf"#define DIFFVBD_{name}_FIELDS\(ADJOINT, INDEX\)(.*)", text)
+    return re.findall(r"(ADJOINT|INDEX)\((\w+)\)", body)
+
+
+@needs_csrc
+@pytest.mark.parametrize("name", LISTS)
+def test_fields_agree(name: str) -> None:
+    assert tuple(field for _, field in listed(name)) == LISTS[name]._fields
+
+
+@needs_csrc
+@pytest.mark.parametrize(("name", "adjoints"), [("SWEEP", ops.SWEEP_ADJOINTS), ("STEP", ops.STEP_ADJOINTS)])
+def test_adjoints_agree(name: str, adjoints: tuple[str, ...]) -> None:
+    assert tuple(field for kind, field in listed(name) if kind == "ADJOINT") == adjoints
+
+
+@needs_csrc
+def test_numbers_agree() -> None:
+    text = (CSRC / "core" / "safeguards.h").read_text(encoding="utf-8")
+    (body,) = re.findall(r"struct StepParameters \{(.*?)\n\};", text, re.DOTALL)
+    kernel = re.findall(r"^\s*T (\w+);", body, re.MULTILINE)
+    assert [*kernel, "friction_eps"] == list(ops.StepNumbers._fields)
+
+
+@needs_csrc
+def test_material_and_rest_agree() -> None:
+    text = (CSRC / "energies" / "tet.h").read_text(encoding="utf-8")
+    counts = {name: int(n) for name, n in re.findall(r"static constexpr int (\w+) = (\d+);", text)}
+    assert counts == {"material": 2, "rest": ops.REST_SCALARS, "pair_rest": ops.PAIR_REST}
+    assert ops.SweepFields._fields.index("lam") == ops.SweepFields._fields.index("mu") + 1
+
+
+def test_there_are_four_sweep_operators() -> None:
+    names = {name for name in dir(torch.ops.diffvbd) if "sweep" in name or "fused" in name}
+    assert names == {"sweep", "sweep_backward", "fused_step", "fused_step_backward"}
+
+
+def test_a_list_of_the_wrong_length_is_refused() -> None:
+    points, tets = torch.eye(4, 3, dtype=torch.float64), torch.tensor([[0, 1, 2, 3]])
+    plan, *_ = ops.build_plan(points, tets, torch.ones(4, dtype=torch.bool), ops.LANES["cpu"])
+    with pytest.raises(ValueError, match="a list of fields has the wrong length"):
+        ops.raw.sweep([points[None]] * 3, plan, ops.plan_sizes(plan, "cpu"), 0, (0, 0), [0.1] * 8, 1, (), 0, -1, True)

@@ -1,0 +1,196 @@
+"""Claim: forces and blocks of contact in the reference are derivatives of the potentials that its formulas say.
+
+The scene is two tets with a few colliders; a detection is brute force over all of their pairs.
+"""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from helpers.two_tets import COLLIDERS, DHAT, detect, moved_state, scene_of, stand_in, two_tets
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import reference
+from diffvbd.reference import distance
+from diffvbd.reference.contact import LaggedPairForces, PairBarrier, Pairs
+from diffvbd.reference.energies import build_energies
+from diffvbd.reference.friction import floor_friction
+from diffvbd.reference.layout import build_layout
+from diffvbd.testing import generator, relative_error, tolerance
+
+# --- two tets, a sphere, a capsule, a plane ---------------------------------------------------------------------------
+
+
+def blocks(model: Any, energy: Any, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradient [V, 3] and blocks [V, 3, 3] of all vertices from an energy's colors, all at the state x."""
+    gradient, hessian = x.new_zeros(8, 3), x.new_zeros(8, 3, 3)
+    for k, color in enumerate(build_layout(model).colors):
+        g, h = energy.block(k, x.T, x_prev.T).split((3, 6))
+        gradient[color.vertices] = g.T
+        hessian[color.vertices] = h[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3)
+    return gradient, hessian
+
+
+def setup(**changes: Any) -> tuple[Any, Tensor, Pairs]:
+    model = stand_in(dv.Model(two_tets()), **changes)
+    x = moved_state(model)
+    part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None], [[0, 1]])
+    assert len(part.pairs) > 20 and {0, 1, 2} == set(part.pairs[:, 4].tolist())
+    return model, x, Pairs(scene_of(model, x), part, None)
+
+
+@pytest.mark.parametrize("mollified", (False, True))
+def test_barrier_force_is_the_gradient_of_its_energy(mollified: bool) -> None:
+    model, x, pairs = setup()
+    if mollified:  # thresholds above where the edges are
+        a, b, c, d = torch.cat((x, COLLIDERS))[pairs.corners].unbind(1)
+        pairs.threshold = 1.7 * torch.linalg.cross(b - a, d - c).square().sum(-1)
+    barrier = PairBarrier(scene_of(model, x), pairs, COLLIDERS[None])
+    state = x.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(barrier.energy(state.T, x.T), state)
+    gradient, hessian = blocks(model, barrier, x, x)
+    assert relative_error(gradient, expected) <= tolerance("hessian")
+    assert expected.abs().max() > 1e-4
+    least = torch.linalg.eigvalsh(hessian)
+    assert (least[:, 0] >= -tolerance("formula") * least[:, 2]).all() and (least[:, 2] > 0).any()
+
+
+def test_barrier_block_is_the_curvature_along_the_normals() -> None:
+    """Of one pair at a time, H is h^2 e (Hess b - b' Hess d)."""
+    model, x, _ = setup()
+    part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None], [[0, 1]])
+    vertex = 4
+    for row in (part.pairs[:, :4] == vertex).any(1).nonzero()[:, 0].tolist():
+        one = part._replace(pairs=part.pairs[row : row + 1], constants=part.constants[row : row + 1].clone())
+        one.constants[:, 2] = 0
+        barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
+
+        def potential(p: Tensor, barrier: PairBarrier = barrier) -> Tensor:
+            return barrier.energy(torch.cat((x[:vertex], p[None], x[vertex + 1 :])).T, x.T)
+
+        def gap(p: Tensor, one: reference.Part = one) -> Tensor:
+            points = torch.cat((x[:vertex], p[None], x[vertex + 1 :], COLLIDERS))
+            return (distance.distance(one.pairs[:, 4], points[one.pairs[:, :4]]) - one.constants[:, 1])[0]
+
+        _, first, _ = distance.log_barrier(gap(x[vertex]), *torch.tensor([200.0, DHAT], dtype=torch.float64))
+        full = torch.autograd.functional.hessian(potential, x[vertex])
+        bent = torch.autograd.functional.hessian(gap, x[vertex])
+        _, hessian = blocks(model, barrier, x, x)
+        difference = hessian[vertex] - (full - 1e-4 * first * bent)
+        assert difference.abs().max() <= tolerance("cancelling") * hessian[vertex].abs().max()
+        if one.pairs[0, 4] == distance.EDGE_EDGE:
+            a, b, c, d = torch.cat((x, COLLIDERS))[one.pairs[0, :4]]
+            one.constants[:, 2] = 2 * torch.linalg.cross(b - a, d - c).square().sum()  # s = 1/2, e = 3/4
+            barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
+            _, mollified = blocks(model, barrier, x, x)
+            assert torch.allclose(mollified, 0.75 * hessian, rtol=tolerance("cancelling"), atol=0)
+
+
+@pytest.mark.parametrize("travel", (1e-4, 1e-2))
+def test_friction_force_is_the_gradient_of_its_potential(travel: float) -> None:
+    """mu lambda f0(|u|) by a formula of its own, below and above the travel at which friction is full."""
+    model, x_prev, pairs = setup(contact=SimpleNamespace(kappa=200.0, dhat=DHAT, damping=0.0, detections=1))
+    x = x_prev + travel * torch.as_tensor(generator("travel").standard_normal((8, 3)))
+    start = torch.cat((x_prev, COLLIDERS))[None]
+    now = COLLIDERS + travel * 0.3
+    friction = LaggedPairForces(scene_of(model, x), pairs, start, now[None])
+    corners = start[0][pairs.corners].requires_grad_()
+    d = distance.distance(pairs.kind, corners)
+    (slope,) = torch.autograd.grad(d.sum(), corners)
+    normal = slope[:, 0] + (pairs.kind == distance.EDGE_EDGE)[:, None] * slope[:, 1]
+    weights = (slope * normal[:, None]).sum(-1)
+    gap = (d - pairs.offset).detach().requires_grad_()
+    e = distance.mollifier(pairs.kind, corners.detach(), pairs.threshold)
+    inside = gap < DHAT
+    (force,) = torch.autograd.grad((200 * inside * e * (gap - DHAT) ** 2 * (gap / DHAT).log()).sum(), gap)
+    reach = 0.01 * 0.05
+
+    def potential(state: Tensor) -> Tensor:
+        m = (weights[..., None] * (torch.cat((state, now))[pairs.corners] - start[0][pairs.corners])).sum(1)
+        slip = (m - (m * normal).sum(-1, keepdim=True) * normal).norm(dim=-1)
+        slow = -(slip**3) / (3 * reach**2) + slip**2 / reach + reach / 3
+        return 1e-4 * 0.4 * (force * torch.where(slip < reach, slow, slip)).sum()
+
+    state = x.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(potential(state), state)
+    gradient, hessian = blocks(model, friction, x, x_prev)
+    assert relative_error(gradient, expected) <= tolerance("hessian")
+    assert relative_error(friction.energy(x.T, x_prev.T), potential(x)) <= tolerance("hessian")
+    assert expected.abs().max() > 1e-6
+    least = torch.linalg.eigvalsh(hessian)
+    assert (least[:, 0] >= -tolerance("sum") * least[:, 2]).all() and (least[:, 2] > 0).any()
+
+
+def test_damping_opposes_approach_alone() -> None:
+    """h c / 2 (n.m)^2 where n.m < 0, with n.m the distance's change to first order."""
+    model, x_prev, pairs = setup(friction=None)
+    start = torch.cat((x_prev, COLLIDERS))[None]
+    x = x_prev + 1e-3 * torch.as_tensor(generator("approach").standard_normal((8, 3)))
+    damping = LaggedPairForces(scene_of(model, x), pairs, start, COLLIDERS[None])
+
+    corners = start[0][pairs.corners].requires_grad_()
+    (slope,) = torch.autograd.grad(distance.distance(pairs.kind, corners).sum(), corners)
+
+    def change(state: Tensor) -> Tensor:
+        moved = (slope * (torch.cat((state, COLLIDERS))[pairs.corners] - corners.detach())).sum((1, 2))
+        return torch.where(gap < DHAT, moved, 0.0)
+
+    gap = distance.distance(pairs.kind, corners.detach()) - pairs.offset
+    assert (gap > DHAT).any()
+    along = change(x)
+    assert (along < 0).sum() > 5 and (along > 0).sum() > 5
+    state = x.clone().requires_grad_()
+    (expected,) = torch.autograd.grad((0.01 * 3 / 2 * change(state).clamp(max=0) ** 2).sum(), state)
+    gradient, hessian = blocks(model, damping, x, x_prev)
+    assert relative_error(gradient, expected) <= tolerance("hessian")
+    least = torch.linalg.eigvalsh(hessian)
+    assert (least[:, 0] >= -tolerance("formula") * least[:, 2]).all() and (least[:, 2] > 0).any()
+
+
+def test_forces_between_bodies_are_equal_and_opposite() -> None:
+    model, x_prev, _ = setup()
+    x = x_prev + 1e-3 * torch.as_tensor(generator("move").standard_normal((8, 3)))
+    part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None], [[0, 1]])
+    own = (part.pairs[:, :4] < 8).all(1)
+    pairs = Pairs(scene_of(model, x), part._replace(pairs=part.pairs[own], constants=part.constants[own]), None)
+    start = torch.cat((x_prev, COLLIDERS))[None]
+    barrier = PairBarrier(scene_of(model, x), pairs, COLLIDERS[None])
+    lagged = LaggedPairForces(scene_of(model, x), pairs, start, COLLIDERS[None])
+    for energy in (barrier, lagged):
+        gradient, _ = blocks(model, energy, x, x_prev)
+        size = gradient.abs().sum()
+        assert size > 0 and gradient.sum(0).abs().max() <= tolerance("momentum") * size
+    gradient, _ = blocks(model, barrier, x, x_prev)
+    assert torch.linalg.cross(x, gradient).sum(0).abs().max() <= tolerance("momentum") * gradient.abs().sum()
+
+
+@pytest.mark.parametrize("travel", (1e-4, 1e-2))
+def test_floor_friction_is_the_gradient_of_its_potential(travel: float) -> None:
+    """Of two planes, against the force of the barrier at the start of the step."""
+    floor = dv.FloorBarrier(height=(-1.0, -1.1), normal=((0.0, 1, 0), (0.6, 0.8, 0)), kappa=300.0, dhat=0.5)
+    model = stand_in(dv.Model(two_tets(), energies=(dv.StableNeoHookean(), floor)))
+    x_prev = moved_state(model)
+    x = x_prev + travel * torch.as_tensor(generator("slide").standard_normal((8, 3)))
+    scene = scene_of(model, x)
+    (friction,) = floor_friction(scene, build_energies(scene))
+
+    def potential(state: Tensor) -> Tensor:
+        total, reach = state.new_zeros(()), 0.01 * 0.05
+        for normal, height in zip(torch.tensor(floor.normal).double(), floor.height, strict=True):
+            gap = x_prev @ normal - height
+            force = 300 * (2 * (gap - 0.5) * (gap / 0.5).log() + (gap - 0.5) ** 2 / gap) * (gap < 0.5)
+            m = state - x_prev
+            slip = (m - (m @ normal)[:, None] * normal).norm(dim=-1)
+            slow = -(slip**3) / (3 * reach**2) + slip**2 / reach + reach / 3
+            total = total + 1e-4 * 0.4 * (force * torch.where(slip < reach, slow, slip)).sum()
+        return total
+
+    state = x.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(potential(state), state)
+    gradient, hessian = blocks(model, friction, x, x_prev)
+    assert expected.any() and relative_error(gradient, expected) <= tolerance("hessian")
+    assert relative_error(friction.energy(x.T, x_prev.T), potential(x)) <= tolerance("hessian")
+    least = torch.linalg.eigvalsh(hessian)
+    assert (least[:, 0] >= -tolerance("sum") * least[:, 2]).all() and (least[:, 2] > 0).any()

@@ -1,0 +1,375 @@
+"""Rollouts: the same numbers as a loop of steps, under every checkpoint schedule, tape and save mode."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd.testing import build_scene, relative_error, tolerance
+
+STEPS = 7
+SWEEPS = 3
+SCHEDULES = [
+    None,
+    "auto",
+    1,
+    2,
+    3,
+    STEPS,
+    100,
+    dv.BinomialCheckpoints(1),
+    dv.BinomialCheckpoints(2),
+    dv.BinomialCheckpoints(3),
+    dv.BinomialCheckpoints(50),
+]
+CASES = ["plain", "floor_damped", "anchored", "batch"]
+
+
+def leaves_of(inputs: dict[str, Any]) -> tuple[dict[str, Any], list[Tensor]]:
+    """The inputs with fresh leaves, and the leaves."""
+    parameters = {k: t.clone().requires_grad_() for k, t in inputs.get("parameters", {}).items()}
+    call = {k: t.clone().requires_grad_() if isinstance(t, Tensor) else t for k, t in inputs.items()}
+    call = {**call, "parameters": parameters} if parameters else call
+    return call, [t for t in (*call.values(), *parameters.values()) if isinstance(t, Tensor)]
+
+
+def loss_of_frames(x: Tensor, v: Tensor) -> Tensor:
+    weights = torch.linspace(1, 2, x.numel(), dtype=x.dtype, device=x.device).reshape(x.shape)
+    return (weights * x.square()).sum() + 0.01 * (weights * v).sum()
+
+
+def looped(model: dv.Model, call: dict[str, Any], steps: int = STEPS) -> tuple[Tensor, Tensor]:
+    options = {k: value for k, value in call.items() if k not in ("x", "v")}
+    x, v = call["x"], call["v"]
+    frames = [(x, v)]
+    for _ in range(steps):
+        x, v = dv.step(model, x, v, sweeps=SWEEPS, **options)
+        frames.append((x, v))
+    return torch.stack([f[0] for f in frames]), torch.stack([f[1] for f in frames])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_rollout_is_a_loop_of_steps_under_every_schedule(device: str, case: str) -> None:
+    scene = build_scene(case)
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    call, leaves = leaves_of(inputs)
+    expected = looped(model, call)
+    slopes = torch.autograd.grad(loss_of_frames(*expected), leaves, allow_unused=True)
+    assert sum(s is not None and float(s.abs().max()) > 0 for s in slopes) >= 7
+    first = None
+    for schedule in SCHEDULES:
+        call, leaves = leaves_of(inputs)
+        trajectory = dv.rollout(model, **call, steps=STEPS, sweeps=SWEEPS, checkpoint_every=schedule)
+        assert trajectory.steps == list(range(STEPS + 1))
+        assert torch.equal(trajectory.x, expected[0]) and torch.equal(trajectory.v, expected[1])
+        grads = torch.autograd.grad(loss_of_frames(trajectory.x, trajectory.v), leaves, allow_unused=True)
+        for a, b in zip(grads, slopes, strict=True):
+            assert (a is None) == (b is None)
+            # The loop prepares masses and rest shape anew in each step, so the sums over steps associate differently.
+            assert a is None or relative_error(a, b) <= tolerance("schedules"), schedule
+        # Among schedules nothing differs: the same steps, the same order of accumulation.
+        first = first or grads
+        assert all(a is None or torch.equal(a, b) for a, b in zip(grads, first, strict=True)), schedule
+
+
+@pytest.mark.parametrize("tape", ["full", "compact", "recompute"])
+def test_tapes_under_checkpoints(device: str, tape: str) -> None:
+    scene = build_scene("floor_filtered")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    results = []
+    for adjoint, schedule in ((dv.ReverseSweep("full"), None), (dv.ReverseSweep(tape), 3)):
+        call, leaves = leaves_of(inputs)
+        trajectory = dv.rollout(model, **call, steps=5, sweeps=SWEEPS, adjoint=adjoint, checkpoint_every=schedule)
+        results.append(torch.autograd.grad(loss_of_frames(trajectory.x, trajectory.v), leaves, allow_unused=True))
+    assert all(a is None or relative_error(a, b) <= tolerance("schedules") for a, b in zip(*results, strict=True))
+
+
+def test_no_grad_rollouts_save_nothing(device: str) -> None:
+    scene = build_scene("plain")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    expected = looped(model, inputs)
+    for schedule in (None, 2, dv.BinomialCheckpoints(2)):
+        trajectory = dv.rollout(model, **inputs, steps=STEPS, sweeps=SWEEPS, checkpoint_every=schedule)
+        assert torch.equal(trajectory.x, expected[0]) and not trajectory.x.requires_grad
+
+
+# --- callables and per_step -------------------------------------------------------------------------------------------
+
+
+def controlled(device: str, schedule: Any, every_argument: bool) -> list[Tensor]:
+    """Gradients of a network that a force (and a stiffness) close over."""
+    scene = build_scene("floor_active")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(torch.nn.Linear(7, 5), torch.nn.Tanh(), torch.nn.Linear(5, 3)).double().to(device)
+    scale = torch.tensor(1.1, dtype=torch.float64, device=device, requires_grad=True)
+
+    def force(k: int, x: Tensor, v: Tensor) -> Tensor:
+        clock = torch.full_like(x[..., :1], float(k))
+        return network(torch.cat([x, v, clock], -1))
+
+    options = inputs | {"force": force}
+    if every_argument:
+        options["mu"] = lambda k, x, v: inputs["mu"] * scale * (1 + 0.1 * k)
+        options["parameters"] = inputs["parameters"] | {"floor_barrier.kappa": lambda k, x, v: 2e4 * scale}
+    trajectory = dv.rollout(model, **options, steps=STEPS, sweeps=SWEEPS, checkpoint_every=schedule)
+    leaves = [*network.parameters(), *([scale] if every_argument else [])]
+    return list(torch.autograd.grad(loss_of_frames(trajectory.x, trajectory.v), leaves))
+
+
+@pytest.mark.parametrize("every_argument", [False, True])
+def test_callables_that_close_over_a_network_get_gradients_under_every_schedule(
+    device: str, every_argument: bool
+) -> None:
+    expected = controlled(device, None, every_argument)
+    assert all(g.abs().max() > 0 for g in expected)
+    for schedule in (1, 3, dv.BinomialCheckpoints(1), dv.BinomialCheckpoints(3)):
+        for a, b in zip(controlled(device, schedule, every_argument), expected, strict=True):
+            assert relative_error(a, b) <= tolerance("schedules")
+
+
+def values_per_step(name: str, value: Tensor) -> Tensor:
+    factors = 1 + 0.05 * torch.arange(STEPS, dtype=value.dtype, device=value.device)
+    return value * factors.reshape(-1, *[1] * value.dim())
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["mu", "lam", "force", "gravity", "prescribed", "rest_points", "density", "floor_barrier.kappa",
+     "floor_barrier.height", "anchor.stiffness", "anchor.points"],
+)  # fmt: skip
+@pytest.mark.parametrize("schedule", [None, 3])
+def test_per_step_and_callables_of_every_argument(device: str, name: str, schedule: Any) -> None:
+    scene = build_scene("anchored")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    base = inputs["parameters"][name] if "." in name else inputs[name]
+
+    def given(value: Any) -> dict[str, Any]:
+        return inputs | ({"parameters": {name: value}} if "." in name else {name: value})
+
+    results = []
+    for form in ("loop", "per_step", "callable"):
+        values = values_per_step(name, base).requires_grad_()
+        if form == "loop":
+            x, v = inputs["x"], inputs["v"]
+            for k in range(STEPS):
+                x, v = dv.step(model, sweeps=SWEEPS, **(given(values[k]) | {"x": x, "v": v}))
+        else:
+            value = dv.per_step(values) if form == "per_step" else lambda k, x, v, values=values: values[k]
+            trajectory = dv.rollout(
+                model, **given(value), steps=STEPS, sweeps=SWEEPS, checkpoint_every=schedule, save="last"
+            )
+            x, v = trajectory.x[-1], trajectory.v[-1]
+        results.append((x, v, *torch.autograd.grad(loss_of_frames(x, v), values)))
+    assert results[0][2].abs().max() > 0
+    assert (results[0][2][0] - results[0][2][-1]).abs().max() > 0  # every step has its own gradient
+    for result in results[1:]:
+        assert torch.equal(result[0], results[0][0]) and torch.equal(result[1], results[0][1])
+        assert relative_error(result[2], results[0][2]) <= tolerance("schedules")
+
+
+@pytest.mark.parametrize("name", ["mu", "force", "prescribed", "density", "parameters"])
+def test_wrong_number_of_steps_raises(name: str) -> None:
+    scene = build_scene("anchored")
+    model, inputs = scene.model(), scene.inputs()
+    base = inputs["parameters"]["anchor.stiffness"] if name == "parameters" else inputs[name]
+    value: Any = dv.per_step(torch.stack([base] * (STEPS + 1)))
+    value = {"anchor.stiffness": value} if name == "parameters" else value
+    with pytest.raises(ValueError, match=f"{name}.*{STEPS} steps.*{STEPS + 1}"):
+        dv.rollout(model, **(inputs | {name: value}), steps=STEPS, sweeps=SWEEPS)
+
+
+@pytest.mark.parametrize("value", [3.0, [1.0, 2.0], torch.tensor(1.0), None])
+def test_per_step_wants_a_tensor_with_a_leading_dimension(value: Any) -> None:
+    with pytest.raises(TypeError, match=r"\[steps, \.\.\.\]"):
+        dv.per_step(value)
+
+
+# --- what a trajectory holds ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("schedule", [None, 2, dv.BinomialCheckpoints(2)])
+@pytest.mark.parametrize(
+    ("save", "kept"),
+    [("all", [0, 1, 2, 3, 4, 5, 6, 7]), ("last", [7]), (1, [0, 1, 2, 3, 4, 5, 6, 7]), (3, [0, 3, 6, 7]), (7, [0, 7]),
+     (9, [0, 7])],
+)  # fmt: skip
+def test_save_modes(device: str, save: Any, kept: list[int], schedule: Any) -> None:
+    scene = build_scene("batch")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    frames = looped(model, inputs)
+    call, leaves = leaves_of(inputs)
+    trajectory = dv.rollout(model, **call, steps=STEPS, sweeps=SWEEPS, save=save, checkpoint_every=schedule)
+    assert trajectory.steps == kept
+    assert torch.equal(trajectory.x, frames[0][kept]) and torch.equal(trajectory.v, frames[1][kept])
+    torch.autograd.grad(loss_of_frames(trajectory.x, trajectory.v), leaves, allow_unused=True)
+
+
+@pytest.mark.parametrize("schedule", [None, 3, dv.BinomialCheckpoints(2)])
+def test_observations_are_stacked_and_differentiable(device: str, schedule: Any) -> None:
+    scene = build_scene("plain")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    frames = looped(model, inputs)
+    tip = frames[0][1:, -1]
+    observers = {
+        "tensor": lambda x, v, k: x[-1],
+        "tuple": lambda x, v, k: (x[-1], v.square().sum(), torch.tensor(k)),
+        "dict": lambda x, v, k: {"tip": x[-1], "nested": [v.square().sum()]},
+        "none": lambda x, v, k: None,
+    }
+    seen = {}
+    for form, observe in observers.items():
+        call, leaves = leaves_of(inputs)
+        options = {"steps": STEPS, "sweeps": SWEEPS, "save": "last", "checkpoint_every": schedule}
+        seen[form] = dv.rollout(model, **call, observe=observe, **options).observations
+        if form == "tensor":
+            (slope,) = torch.autograd.grad(seen[form].square().sum(), leaves[0])
+    assert torch.equal(seen["tensor"], tip)
+    assert isinstance(seen["tuple"], tuple) and torch.equal(seen["tuple"][0], tip)
+    assert relative_error(seen["tuple"][1], frames[1][1:].square().sum((-1, -2))) <= tolerance("formula")
+    assert seen["tuple"][2].tolist() == list(range(1, STEPS + 1))
+    assert torch.equal(seen["dict"]["tip"], tip) and torch.equal(seen["dict"]["nested"][0], seen["tuple"][1])
+    assert seen["none"] is None
+    call, leaves = leaves_of(inputs)
+    (expected,) = torch.autograd.grad(looped(model, call)[0][1:, -1].square().sum(), leaves[0])
+    assert expected.abs().max() > 0
+    assert relative_error(slope, expected) <= tolerance("schedules")
+
+
+def test_observing_something_else_raises() -> None:
+    scene = build_scene("plain")
+    with pytest.raises(TypeError, match="observe.*float"):
+        dv.rollout(scene.model(), **scene.inputs(), steps=2, sweeps=1, observe=lambda x, v, k: float(k))
+
+
+def test_zero_steps_return_the_initial_state(device: str) -> None:
+    scene = build_scene("batch")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    for save in ("all", "last", 2):
+        for schedule in (None, "auto", 2, dv.BinomialCheckpoints(1)):
+            call, leaves = leaves_of(inputs)
+            options = {"steps": 0, "sweeps": SWEEPS, "save": save, "checkpoint_every": schedule}
+            trajectory = dv.rollout(model, **call, observe=lambda x, v, k: x, **options)
+            assert trajectory.steps == [0] and trajectory.observations is None
+            assert torch.equal(trajectory.x[0], inputs["x"]) and torch.equal(trajectory.v[0], inputs["v"])
+            (slope,) = torch.autograd.grad(trajectory.x.sum(), leaves[0])
+            assert torch.equal(slope, torch.ones_like(slope))
+
+
+def test_progress_goes_to_stderr_and_counts_each_step_once(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = build_scene("plain")
+    call, leaves = leaves_of(scene.inputs())
+    trajectory = dv.rollout(
+        scene.model(), **call, steps=3, sweeps=1, progress=True, checkpoint_every=dv.BinomialCheckpoints(1)
+    )
+    torch.autograd.grad(trajectory.x.sum(), leaves, allow_unused=True)
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert [line for line in shown.err.replace("\n", "\r").split("\r") if line] == ["step 1/3", "step 2/3", "step 3/3"]
+    dv.rollout(scene.model(), **scene.inputs(), steps=3, sweeps=1)
+    assert capsys.readouterr().err == ""
+
+
+def test_inputs_are_untouched(device: str) -> None:
+    scene = build_scene("anchored")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    before = {k: t.clone() for k, t in inputs.items() if isinstance(t, Tensor)}
+    for _ in range(2):
+        trajectory = dv.rollout(model, **inputs, steps=3, sweeps=2)
+    assert torch.equal(trajectory.x[0], inputs["x"])
+    trajectory.x.zero_()
+    assert all(torch.equal(inputs[k].nan_to_num(), before[k].nan_to_num()) for k in before)  # NaN: not read
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [("steps", -1, ValueError), ("steps", 2.5, TypeError), ("steps", True, TypeError), ("save", "every", ValueError),
+     ("save", 0, ValueError), ("save", True, ValueError), ("checkpoint_every", 0, ValueError),
+     ("checkpoint_every", "even", ValueError), ("checkpoint_every", 1.5, TypeError),
+     ("checkpoint_every", True, TypeError)],
+)  # fmt: skip
+def test_bad_options_raise(name: str, value: Any, error: type[Exception]) -> None:
+    scene = build_scene("plain")
+    options = scene.inputs() | {"steps": 2, "sweeps": 1, name: value}
+    with pytest.raises(error, match=f"{name}: expected .*got"):
+        dv.rollout(scene.model(), **options)
+
+
+@pytest.mark.parametrize(("value", "error"), [(0, ValueError), (-2, ValueError), (1.0, TypeError), (True, TypeError)])
+def test_binomial_wants_a_positive_count(value: Any, error: type[Exception]) -> None:
+    with pytest.raises(error, match="snapshots: expected .*got"):
+        dv.BinomialCheckpoints(value)
+
+
+# --- cost of a schedule -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("steps", "snapshots"), [(10, 1), (12, 2), (20, 3), (40, 4), (35, 3)])
+def test_binomial_runs_steps_as_rarely_as_promised(steps: int, snapshots: int) -> None:
+    """No step runs forward more than 1 + t times, t the least number with C(snapshots + t, t) >= steps."""
+    from math import comb
+
+    scene = build_scene("plain")
+    model, inputs = scene.model(), scene.inputs()
+    runs = [0] * steps
+
+    def force(k: int, x: Tensor, v: Tensor) -> Tensor:
+        runs[k] += 1
+        return inputs["force"]
+
+    x = inputs["x"].clone().requires_grad_()
+    options = inputs | {"x": x, "force": force}
+    schedule = dv.BinomialCheckpoints(snapshots)
+    trajectory = dv.rollout(model, **options, steps=steps, sweeps=1, save="last", checkpoint_every=schedule)
+    assert runs == [1] * steps
+    trajectory.x.sum().backward()
+    repeats = next(t for t in range(steps + 1) if comb(snapshots + t, t) >= steps)
+    assert max(runs) <= 1 + repeats
+    assert sum(runs) > steps
+
+
+@pytest.mark.parametrize("schedule", [2, dv.BinomialCheckpoints(2)])
+@pytest.mark.parametrize("name", ["mu", "lam", "force", "gravity", "prescribed", "floor_barrier.kappa"])
+def test_changing_an_argument_before_a_checkpointed_backward_raises(device: str, name: str, schedule: Any) -> None:
+    scene = build_scene("floor_damped")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    call, _ = leaves_of(inputs)
+    options = {k: value for k, value in call.items() if k not in ("x", "v")}
+    end = dv.rollout(model, call["x"], call["v"], steps=4, sweeps=1, checkpoint_every=schedule, **options).x[-1]
+    changed = call["parameters"][name] if "." in name else call[name]
+    with torch.no_grad():
+        changed.mul_(2)
+    with pytest.raises(RuntimeError, match="changed in place|modified by an inplace operation"):
+        end.sum().backward()
+
+
+def test_a_force_on_a_pinned_vertex_reaches_nothing(device: str) -> None:
+    mesh = dv.mesh.cube(2)
+    model = dv.Model(mesh, pinned=[0], device=device)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    force = torch.zeros_like(x)
+    force[0] = float("nan")
+    density = torch.tensor(1e3, dtype=x.dtype, device=device, requires_grad=True)
+    rest = model.rest_points.clone().requires_grad_()
+    options = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 2, "density": density, "rest_points": rest}
+    end = dv.step(model, x, v, force=force, **options)[0]
+    grads = torch.autograd.grad(end.square().sum(), (density, rest))
+    clean = dv.step(model, x, v, force=torch.zeros_like(x), **options)[0]
+    for grad, expected in zip(grads, torch.autograd.grad(clean.square().sum(), (density, rest)), strict=True):
+        assert torch.equal(grad, expected) and bool(expected.any())
+
+
+def test_what_is_not_differentiated_raises() -> None:
+    model = dv.Model(dv.mesh.cube(2))
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    with pytest.raises(TypeError, match="time_step: .*not differentiable"):
+        dv.step(model, x, v, mu=1.0, lam=1.0, time_step=torch.tensor(0.01, requires_grad=True), sweeps=1)
+
+
+def test_the_old_name_of_binomial_checkpoints_works() -> None:
+    with pytest.warns(DeprecationWarning, match="BinomialCheckpoints"):
+        assert dv.Binomial is dv.BinomialCheckpoints  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(AttributeError, match="Trinomial"):
+        _ = dv.Trinomial  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,0 +1,139 @@
+"""Claim: dv.solve sweeps until the step has converged, says so, and has the derivative of the converged step."""
+
+from typing import Any
+
+import pytest
+import torch
+
+import diffvbd as dv
+from diffvbd import reference
+from diffvbd.testing import build_scene, evaluate, relative_error, tolerance
+
+CASES = ("plain", "paper", "stiff", "floor_damped", "floor_corner", "anchored", "batch")
+
+
+def scene_on(device: str, case: str) -> tuple[dv.Model, dict[str, Any]]:
+    scene = build_scene(case, "delaunay")
+    return scene.model(device), scene.inputs(device=device)
+
+
+@pytest.mark.parametrize("goal", (1e-4, 1e-9))
+@pytest.mark.parametrize("case", CASES)
+def test_the_residual_meets_the_tolerance(device: str, case: str, goal: float) -> None:
+    """Measured by the reference's potential."""
+    model, inputs = scene_on(device, case)
+    done = dv.solve(model, tolerance=goal, check_every=5, **inputs)
+    assert done.converged and done.sweeps >= 5
+    x, v, h = inputs["x"], inputs["v"], inputs["time_step"]
+    mass = torch.where(model.mass > 0, model.mass, 1.0)[:, None]
+    y = x + h * v + h * h * (inputs["gravity"] + inputs["force"] / mass)
+    left = reference.residual(model, done.x, y, inputs["mu"], inputs["lam"], h, x, density=inputs["density"],
+                              rest_points=inputs["rest_points"], parameters=inputs.get("parameters"))  # fmt: skip
+    left, inertia = (torch.where(model.pinned[:, None], 0.0, a) for a in (left, mass * (done.x - y)))
+    scale = inertia.flatten(-2).norm(dim=-1) + (left - inertia).flatten(-2).norm(dim=-1)
+    residual = float((left.flatten(-2).norm(dim=-1) / scale).max())
+    assert residual <= goal
+    rel, least = tolerance("reported_residual"), tolerance("linear_residual")
+    assert done.residual == pytest.approx(residual, rel=rel, abs=least)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_is_a_step_of_as_many_sweeps(device: str, case: str) -> None:
+    model, inputs = scene_on(device, case)
+    done = dv.solve(model, tolerance=1e-6, **inputs)
+    x, v = dv.step(model, sweeps=done.sweeps, **inputs)
+    assert relative_error(done.x, x) <= tolerance("forward")
+    assert relative_error(done.v * inputs["time_step"], v * inputs["time_step"]) <= tolerance("travel")
+    assert device != "cpu" or (torch.equal(done.x, x) and torch.equal(done.v, v))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_its_default_derivative_is_that_of_the_executed_sweeps(device: str, case: str) -> None:
+    """At convergence; the two come to it by different ways."""
+    model, inputs = scene_on(device, case)
+
+    def run(adjoint: Any) -> dict[str, torch.Tensor]:
+        def solved(**options: Any) -> tuple[torch.Tensor, torch.Tensor]:
+            done = dv.solve(model, tolerance=1e-13, adjoint=adjoint, on_failure="warn", **options)
+            return done.x, done.v
+
+        return evaluate(solved, inputs)
+
+    implicit, executed = run(dv.GlobalAdjoint(tolerance=1e-13)), run(dv.ReverseSweep())
+    names = [name for name in executed if name.startswith("grad_") and bool(executed[name].any())]
+    assert {"grad_x", "grad_mu", "grad_rest_points", "grad_force"} <= set(names)
+    for name in names:
+        assert relative_error(implicit[name], executed[name]) <= tolerance("global_converged"), name
+
+
+def test_its_gradient_agrees_with_differences(device: str) -> None:
+    model, inputs = scene_on(device, "floor_damped")
+    fixed = {k: inputs.pop(k) for k in ("lam", "time_step", "density", "gravity", "prescribed", "force", "parameters")}
+
+    def loss(**arguments: Any) -> torch.Tensor:
+        done = dv.solve(model, tolerance=1e-13, adjoint=dv.GlobalAdjoint(tolerance=1e-12), **arguments, **fixed)
+        return done.x.square().sum() + 0.01 * done.v[..., 0].sum()
+
+    check = dv.check_gradients(loss, inputs, verbose=False)
+    assert check.ok and all(size > 0 for _, size, *_ in check.rows), str(check)
+
+
+def test_a_body_at_rest_or_in_free_fall_needs_no_sweep(device: str) -> None:
+    """What rounding leaves of a force that is zero does not count."""
+    model = dv.Model(dv.mesh.cube(3), device=device)
+    for height in (0.0, 1e3):
+        x = model.rest_points + height
+        done = dv.solve(model, x, torch.ones_like(x), mu=1e5, lam=1e5, time_step=0.01)
+        assert done.sweeps == 0 and done.converged
+
+
+def test_not_converging_is_never_silent(device: str) -> None:
+    model, inputs = scene_on(device, "stiff")
+    message = "solve: expected a residual of at most 1e-09, got .* after 7 sweeps"
+    with pytest.raises(RuntimeError, match=message):
+        dv.solve(model, tolerance=1e-9, max_sweeps=7, **inputs)
+    with pytest.warns(RuntimeWarning, match=message):
+        done = dv.solve(model, tolerance=1e-9, max_sweeps=7, on_failure="warn", **inputs)
+    assert not done.converged and done.sweeps == 7 and done.residual > 1e-9
+
+
+def test_what_overflows_has_not_converged(device: str) -> None:
+    """Neither its forces nor what rounding leaves of them are numbers."""
+    model = dv.Model(dv.mesh.cube(3), device=device)
+    x = 1.1 * model.rest_points
+    with pytest.raises((RuntimeError, ValueError), match="got inf|mu: expected"):
+        dv.solve(model, x, 0 * x, mu=1e300, lam=1e300, time_step=0.01, max_sweeps=5)
+
+
+def test_positions_that_are_not_finite_are_told(device: str) -> None:
+    model, inputs = scene_on(device, "plain")
+    inputs["x"][~model.pinned] = torch.nan
+    with pytest.raises((ValueError, RuntimeError), match="^x: expected finite values|got inf"):
+        dv.solve(model, max_sweeps=10, **inputs)
+
+
+BAD = [
+    ({"tolerance": 0.0}, ValueError, "tolerance: expected a finite number > 0"),
+    ({"tolerance": 1.0}, ValueError, r"tolerance: expected a number in \(0, 1\), got 1.0"),
+    ({"tolerance": "1e-3"}, TypeError, "tolerance: expected a number, got str"),
+    ({"max_sweeps": -1}, ValueError, "max_sweeps: expected an integer >= 0"),
+    ({"check_every": 0}, ValueError, "check_every: expected an integer >= 1"),
+    ({"on_failure": "pass"}, ValueError, "on_failure: expected"),
+    ({"adjoint": "global"}, TypeError, "adjoint: expected a diffvbd.ReverseSweep, Unrolled or GlobalAdjoint, got str"),
+]
+
+
+@pytest.mark.parametrize(("options", "error", "message"), BAD)
+def test_bad_arguments_are_named(options: dict, error: type, message: str) -> None:
+    model, inputs = scene_on("cpu", "plain")
+    with pytest.raises(error, match=message):
+        dv.solve(model, **inputs, **options)
+
+
+def test_float32(device: str) -> None:
+    scene = build_scene("floor_damped", "delaunay")
+    single = dv.solve(
+        scene.model(device).to(dtype=torch.float32), tolerance=1e-4, **scene.inputs(torch.float32, device)
+    )
+    double = dv.solve(scene.model(), **scene.inputs())
+    assert relative_error(single.x, double.x) <= tolerance("float32_forward") and single.x.dtype == torch.float32

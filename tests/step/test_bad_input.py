@@ -1,0 +1,307 @@
+"""Bad input: a ValueError or TypeError that names the argument and says what came; inputs stay untouched.
+
+Shapes, types and devices are checked always. Values are read on CUDA only inside debug_checks(), because a look at one
+waits for the device: `value_checks` opens it there.
+"""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.bad_input import INF, MESH, NAN, STEP, doubles, model_of, ones, raises, spoiled
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd.testing import on_device
+
+# --- arguments of a step ----------------------------------------------------------------------------------------------
+
+ARGUMENTS: list[tuple[str, Any, str]] = [
+    # shape
+    ("x", ones(5, 3), r"\[5, 3\]"),
+    ("x", ones(3), r"\[3\]"),
+    ("x", ones(8, 2), r"\[8, 2\]"),
+    ("v", ones(5, 3), r"\[5, 3\]"),
+    ("v", ones(1, 8, 3), r"\[1, 8, 3\]"),
+    ("mu", ones(5), r"\[5\]"),
+    ("mu", ones(2, 6), r"\[2, 6\]"),
+    ("lam", ones(6, 1), r"\[6, 1\]"),
+    ("density", ones(8), r"\[8\]"),
+    ("force", ones(8, 2), r"\[8, 2\]"),
+    ("force", ones(2, 8, 3), r"\[2, 8, 3\]"),
+    ("gravity", ones(2), r"\[2\]"),
+    ("gravity", (0.0, 1.0), "2 numbers"),
+    ("prescribed", ones(3, 3), r"\[3, 3\]"),
+    ("rest_points", ones(4, 3), r"\[4, 3\]"),
+    ("floor_barrier.height", ones(3), r"\[3\]"),
+    ("floor_barrier.kappa", ones(2), r"\[2\]"),
+    ("anchor.stiffness", ones(7), r"\[7\]"),
+    ("anchor.points", ones(7, 3), r"\[7, 3\]"),
+    # dtype
+    *((name, ones(8, 3, dtype=torch.float32), "float32") for name in ("x", "v", "force", "prescribed", "rest_points")),
+    ("x", ones(8, 3, dtype=torch.int64), "int64"),
+    ("x", ones(8, 3, dtype=torch.complex128), "complex128"),
+    ("mu", ones(6, dtype=torch.float32), "float32"),
+    ("lam", ones(dtype=torch.int64), "int64"),
+    ("density", ones(dtype=torch.float16), "float16"),
+    ("gravity", ones(3, dtype=torch.float32), "float32"),
+    ("anchor.stiffness", ones(dtype=torch.float32), "float32"),
+    # device
+    *((name, ones(8, 3).to("meta"), "meta") for name in ("x", "v", "force", "gravity", "prescribed", "rest_points")),
+    *((name, ones(6).to("meta"), "meta") for name in ("mu", "lam", "density")),
+    ("anchor.points", ones(8, 3).to("meta"), "meta"),
+    # type
+    ("x", [[0.0, 0.0, 0.0]] * 8, "list"),
+    ("x", np.zeros((8, 3)), "ndarray"),
+    ("v", None, "None"),
+    ("mu", "soft", "str"),
+    ("mu", None, "None"),
+    ("mu", True, "bool"),
+    ("mu", [1e4] * 6, "list"),
+    ("lam", np.full(6, 1e4), "ndarray"),
+    ("density", "heavy", "str"),
+    ("force", [1.0, 2.0, 3.0], "list"),
+    ("gravity", "off", "str|off"),
+    ("gravity", -9.81, "float|9.81"),
+    ("gravity", None, "None"),
+    ("prescribed", "here", "str"),
+    ("rest_points", MESH, "TetMesh"),
+    ("floor_barrier.kappa", "stiff", "str"),
+    ("floor_barrier.kappa", None, "None"),
+    ("parameters", [("floor_barrier.kappa", 1.0)], "list"),
+    ("adjoint", "full", "str|full"),
+    # numbers that no float holds
+    *((name, 10**400, "1329 bits") for name in ("mu", "lam", "density", "time_step", "floor_barrier.kappa")),
+    ("gravity", (0, -(10**400), 0), "1329 bits"),
+    ("sweeps", 10**400, "10000"),
+    # not finite
+    *((name, spoiled(bad, 3, 1), str(bad)) for name in ("x", "v", "force") for bad in (NAN, INF)),
+    ("x", spoiled(NAN, 0, 0), "nan"),
+    ("gravity", (0.0, NAN, 0.0), "nan"),
+    ("gravity", doubles(0.0, INF, 0.0), "inf"),
+    ("prescribed", spoiled(NAN, 0, 2), "nan"),
+    ("rest_points", spoiled(NAN, 5, 0), "nan"),
+    ("rest_points", spoiled(INF, 5, 0), "nan|inf"),
+    *((name, bad, str(bad)) for name in ("mu", "lam", "density") for bad in (NAN, INF)),
+    *((f"floor_barrier.{name}", NAN, "nan") for name in ("kappa", "dhat", "damping")),
+    ("parameters", {"floor_barrier.height": doubles(NAN)}, "nan"),
+    ("parameters", {"floor_barrier.normal": doubles([0.0, NAN, 0.0])}, "nan"),
+    ("parameters", {"floor_barrier.normal": doubles([0.0, 0.0, 0.0])}, "nan|0"),
+    ("anchor.stiffness", NAN, "nan"),
+    ("parameters", {"anchor.points": spoiled(NAN, 3, 1)}, "nan"),
+    # range
+    ("mu", -1.0, "-1"),
+    ("mu", doubles(1.0, 1.0, 1.0, -2.5, 1.0, 1.0), "-2.5.*tet 3"),
+    ("lam", -2e4, "-20000.*mu 10000"),
+    ("lam", doubles(1.0, -1e4 - 1, 1.0, 1.0, 1.0, 1.0), "-10001.*tet 1"),
+    ("density", -5.0, "-"),
+    ("density", 0.0, "0"),
+    ("density", doubles(1e3, 1e3, -100.0, 1e3, 1e3, 1e3), "-100"),
+    ("floor_barrier.kappa", -1.0, "-1"),
+    ("floor_barrier.dhat", 0.0, "0"),
+    ("floor_barrier.dhat", -1.0, "-1"),
+    ("floor_barrier.damping", -1.0, "-1"),
+    ("anchor.stiffness", -1.0, "-1"),
+    ("parameters", {"floor.kappa": 1.0}, r"'floor.kappa' \(is 'floor_barrier.kappa' meant\?\)$"),
+    ("parameters", {"friction.coefficient": 1.0}, "'friction.coefficient': the Model has no Friction among its"),
+    ("parameters", {"pair_barier.kappa": 1.0}, r"\(is 'pair_barrier.kappa' meant\?\): the Model has no PairBarrier"),
+    ("parameters", {"kappa": 1.0}, "'kappa'$"),
+    ("parameters", {3: 1.0}, "3$"),
+    # rest shapes that are no shapes
+    ("rest_points", torch.from_numpy(MESH.points * [-1.0, 1.0, 1.0]), r"-0\.16.* at \[0, 0\]"),
+    ("rest_points", torch.from_numpy(MESH.points * [1.0, 1.0, 0.0]), r"got 0 at \[0, 0\]"),
+    ("rest_points", spoiled(-1.0, 7), r"-.* at \[0, 0\]"),
+    # counts and sizes
+    ("time_step", 0, "0"),
+    ("time_step", -0.1, "-0.1"),
+    ("time_step", NAN, "nan"),
+    ("time_step", INF, "inf"),
+    ("time_step", 1e-310, "1e-310"),
+    ("time_step", 1e-160, "1e-160"),
+    ("time_step", 1e160, r"1e\+160"),
+    ("time_step", True, "bool"),
+    ("time_step", "fast", "str"),
+    ("time_step", None, "None"),
+    ("sweeps", -1, "-1"),
+    ("sweeps", 1.5, "1.5"),
+    ("sweeps", 2.0, "2.0"),
+    ("sweeps", True, "bool"),
+    ("sweeps", "3", "'3'"),
+    ("sweeps", None, "None"),
+]
+
+
+def step_with(model: dv.Model, name: str, value: Any, lead: tuple[int, ...] = (), **options: Any) -> Any:
+    device = model.device if isinstance(model, dv.Model) else "cpu"
+    x = torch.from_numpy(MESH.points.copy()).repeat(*lead, 1, 1).to(device)
+    given: dict[str, Any] = {"x": x, "v": torch.zeros_like(x), **STEP, **options}
+    value = value if getattr(value, "is_meta", False) else on_device(value, device)
+    given |= {"parameters": {name: value}} if "." in name else {name: value}
+    return dv.step(model, **given)
+
+
+@pytest.mark.parametrize(("name", "value", "got"), ARGUMENTS, ids=lambda a: str(a)[:24].replace("\n", " "))
+def test_bad_argument_of_a_step(device: str, value_checks: None, name: str, value: Any, got: str) -> None:
+    model = model_of(device)
+    before = value.clone() if isinstance(value, Tensor) and value.device.type == "cpu" else None
+    raises(lambda: step_with(model, name, value), name, got)
+    if before is not None:
+        assert torch.equal(value.nan_to_num(), before.nan_to_num())
+    step_with(model, "mu", 1e4)  # the Model still works
+
+
+@pytest.mark.parametrize("name", ["x", "v", "mu", "force", "gravity", "rest_points", "density"])
+def test_the_same_in_a_rollout(device: str, value_checks: None, name: str) -> None:
+    bad = {"mu": -1.0, "density": -1.0, "gravity": (0.0, NAN, 0.0)}.get(name, spoiled(NAN, 3, 1))
+    x = torch.from_numpy(MESH.points.copy()).to(device)
+    given = {"x": x, "v": torch.zeros_like(x), **STEP, name: on_device(bad, device)}
+    raises(lambda: dv.rollout(model_of(device), steps=2, **given), name, "nan|-")
+    given[name] = dv.per_step(torch.stack([torch.full_like(x[0], NAN)] * 2)) if name == "gravity" else given[name]
+    raises(lambda: dv.rollout(model_of(device), steps=2, **given), name, "nan|-")
+
+
+def test_negative_lam_is_legal_where_its_block_allows_it(device: str, value_checks: None) -> None:
+    assert torch.isfinite(step_with(model_of(device, "exact"), "lam", -9e3)[0]).all()
+    raises(lambda: step_with(model_of(device, "paper"), "lam", -1.0), "lam", "-1")
+    for kind in ("exact", "paper"):
+        assert torch.isfinite(step_with(model_of(device, kind), "mu", 0.0)[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"), [("mu", (3, 1)), ("lam", (3, 6)), ("density", (3, 1)), ("force", (3, 8, 3)),
+                        ("gravity", (3, 1, 3)), ("rest_points", (3, 8, 3)), ("anchor.points", (3, 8, 3))],
+)  # fmt: skip
+def test_mismatched_batch(device: str, name: str, shape: tuple[int, ...]) -> None:
+    raises(lambda: step_with(model_of(device), name, ones(*shape), lead=(2,)), name, re.escape(str(list(shape))))
+
+
+@pytest.mark.parametrize("name", ["x", "v", "force", "prescribed", "rest_points", "mu", "lam", "density"])
+def test_only_dense_tensors(device: str, name: str) -> None:
+    full = ones(8, 3) if name in ("x", "v", "force", "prescribed", "rest_points") else ones(6)
+    raises(lambda: step_with(model_of(device), name, full.to_sparse()), name, r"torch.sparse_coo: use \.to_dense")
+    for layout in (torch.strided, torch.jagged):
+        nested = torch.nested.as_nested_tensor([full, full], layout=layout)
+        raises(lambda nested=nested: step_with(model_of(device), name, nested), name, "nested")
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "hint"), [("mu", (3,), [3, 1]), ("lam", (3,), [3, 1]), ("density", (3,), [3, 1]),
+                                ("gravity", (3, 3), [3, 1, 3]), ("force", (3, 3), [3, 1, 3])],
+)  # fmt: skip
+def test_one_value_for_each_scene_gets_a_hint(device: str, name: str, shape: tuple[int, ...], hint: list[int]) -> None:
+    lead = (3,)
+    if name in ("gravity", "force"):  # 3 scenes of 3 numbers would broadcast where there are 3 vertices
+        shape, hint, lead = (5, 3), [5, 1, 3], (5,)
+    raises(lambda: step_with(model_of(device), name, ones(*shape), lead=lead), name, re.escape(f"has shape {hint}"))
+    step_with(model_of(device), name, ones(*hint), lead=lead)
+    raises(lambda: step_with(model_of(device), "mu", ones(2), lead=(3,)), "mu", r"got shape \[2\]$")
+
+
+def test_numbers_of_numpy_are_numbers(device: str) -> None:
+    expected = step_with(model_of(device), "mu", 1e4)[0]
+    for number in (np.float64(1e4), np.float32(1e4), np.int64(10_000)):
+        assert torch.equal(step_with(model_of(device), "mu", number)[0], expected)
+
+
+def test_the_smallest_time_steps_of_float32(device: str) -> None:
+    model = dv.Model(MESH, dtype=torch.float32, device=device)
+    x = model.rest_points
+    for h in (1e-20, 1e20, 1e-40):
+        raises(lambda h=h: dv.step(model, x, 0 * x, **(STEP | {"time_step": h})), "time_step", re.escape(f"{h}"))
+    assert torch.isfinite(dv.step(model, x, 0 * x, **(STEP | {"time_step": 1e-18}))[0]).all()
+
+
+def test_a_value_check_names_the_scene(device: str, value_checks: None) -> None:
+    raises(lambda: step_with(model_of(device), "mu", doubles([1.0], [-1.0]), lead=(2,)), "mu", "-1 at tet 0 of scene 1")
+    second = torch.stack([spoiled(0.0, 0, 0), spoiled(NAN, 3, 1)])
+    raises(
+        lambda: step_with(model_of(device), "x", second, v=torch.zeros_like(second, device=device)),
+        "x",
+        "vertex 3 of scene 1",
+    )
+
+
+def test_starting_below_a_plane_names_vertices(device: str, value_checks: None) -> None:
+    below = spoiled(-0.6, 5, 1)
+    below[2, 1] = -0.5  # on the plane
+    below[0, 1] = -3.0  # pinned: legal
+    raises(lambda: step_with(model_of(device), "x", below), "x", r"2 on or below.*\b(2, 5|5, 2)$")
+    below[[2, 5], 1] = 0.0
+    assert torch.isfinite(step_with(model_of(device), "x", below)[0]).all()
+
+
+def test_values_that_are_not_read_are_not_checked(device: str, value_checks: None) -> None:
+    model = model_of(device)
+    prescribed = torch.where(model.pinned[:, None], model.rest_points, NAN).requires_grad_()
+    x, _ = step_with(model, "prescribed", prescribed)
+    assert torch.isfinite(x).all()
+    (slope,) = torch.autograd.grad(x.sum(), prescribed)
+    assert torch.isfinite(slope).all()
+    assert (slope[model.pinned] != 0).all() and (slope[~model.pinned] == 0).all()
+
+
+def test_a_model_of_another_class_or_mesh() -> None:
+    raises(lambda: step_with(MESH, "mu", 1.0), "model", "TetMesh")
+    other = dv.Model(dv.mesh.cube(3))
+    raises(lambda: step_with(other, "mu", 1.0), "x", r"\[8, 3\]")
+
+
+# --- debug_checks -----------------------------------------------------------------------------------------------------
+
+HUGE = {"mu": 1e305, "lam": 1e308, "time_step": 1.0}
+
+
+@pytest.mark.parametrize("lead", [(), (1,), (2,), (5,)])
+def test_debug_checks_say_where_a_position_ceased_to_be_finite(device: str, lead: tuple[int, ...]) -> None:
+    model = model_of(device, start="predictor")  # the other start is at rest and stays finite
+    x = model.rest_points.repeat(*lead, 1, 1)
+    force = torch.zeros_like(x)
+    force.reshape(-1, 8, 3)[-1] = 1e150  # the last scene only
+    options = HUGE | {"sweeps": 3, "force": force}
+    if lead:
+        for name in ("mu", "lam"):
+            options[name] = torch.full((*lead, 1), 1e4, dtype=torch.float64, device=device)
+            options[name][-1] = HUGE[name]
+    with dv.debug_checks():
+        with pytest.raises(RuntimeError) as error:
+            dv.step(model, x, torch.zeros_like(x), **options)
+    scene = lead[-1] - 1 if lead else 0
+    assert re.search(rf"step 0, sweep \d+, color \d+, vertex \d+, scene {scene}\b", str(error.value)), str(error.value)
+    x, _ = dv.step(model, x, torch.zeros_like(x), **options)  # off again
+    assert not torch.isfinite(x).all()
+
+
+def test_debug_checks_count_the_steps_of_a_rollout(device: str) -> None:
+    model = model_of(device, start="predictor")  # the other start is at rest and stays finite
+    x = model.rest_points
+    options = STEP | {"time_step": 1.0, "sweeps": 2, "force": torch.full_like(x, 1e3)}
+    options["mu"] = lambda k, x, v: 1e308 if k == 2 else 1e4
+    with dv.debug_checks(), pytest.raises(RuntimeError, match=r"step 2, sweep 0, color \d+, vertex \d+"):
+        dv.rollout(model, x, torch.zeros_like(x), steps=4, **options)
+    with dv.debug_checks(), dv.debug_checks(False):
+        assert len(dv.rollout(model, x, torch.zeros_like(x), steps=3, **options).steps) == 4
+
+
+def test_debug_checks_change_nothing_in_a_sound_step(device: str) -> None:
+    model = model_of(device)
+    x = model.rest_points + 0.01
+    expected = dv.step(model, x, torch.zeros_like(x), **STEP)
+    with dv.debug_checks():
+        actual = dv.step(model, x, torch.zeros_like(x), **STEP)
+    assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
+
+
+@pytest.mark.parametrize("adjoint", ["full", {}, 0, dv.ReverseSweep])
+def test_a_rollout_refuses_what_is_no_adjoint(adjoint: Any) -> None:
+    model = dv.Model(dv.mesh.cube())
+    x = model.rest_points
+    with pytest.raises(TypeError, match="adjoint: expected a diffvbd.ReverseSweep, Unrolled or GlobalAdjoint, got"):
+        dv.rollout(model, x, 0 * x, steps=2, mu=1e4, lam=1e4, time_step=0.01, sweeps=1, adjoint=adjoint)
+
+
+@pytest.mark.parametrize("name", ["bogus", 3, ["grid"], {}])
+def test_an_unknown_regime(name: Any) -> None:
+    with pytest.raises(ValueError, match="regime: expected one of"), dv.regime(name):
+        pass

@@ -1,0 +1,110 @@
+"""Claim: what rests on a floor keeps its gap, for any number of sweeps and detections and any relaxation.
+
+docs/method.md, section 6: no gap falls below min(first gap, (1 - eta) d*(F)), with d*(F) the gap where the barrier
+bears the largest force F that presses a vertex down. These tests take the whole weight of the cube for F.
+"""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd.safeguards import FILTER_ETA
+from diffvbd.testing import tolerance
+
+KAPPA, DHAT, DENSITY, START = 1e3, 1e-2, 3000.0, 5e-3
+GRAVITY = 9.81
+DIRECTIONS = torch.nn.functional.normalize(
+    torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [0.48, 0.8, -0.36]], dtype=torch.float64), dim=-1
+)
+
+
+def bearing_gap(force: float) -> float:
+    """d* with |b'(d*)| = force [N], by bisection."""
+    low, high = 0.0, DHAT
+    for _ in range(200):
+        d = (low + high) / 2
+        borne = KAPPA * (2 * (d - DHAT) * torch.log(torch.tensor(d / DHAT).double()) + (d - DHAT) ** 2 / d)
+        low, high = (d, high) if float(borne) > force else (low, d)
+    return low
+
+
+def scenes(
+    *energies: Any, density: float = DENSITY, relaxation: float = 1.0
+) -> tuple[dv.Model, Tensor, dict[str, Any]]:
+    """A cube of 27 vertices that stands flat on a plane, in a scene for each direction; model, state and arguments."""
+    mesh = dv.mesh.cube(3, size=0.2)
+    floor = dv.FloorBarrier(kappa=KAPPA, dhat=DHAT)
+    model = dv.Model(mesh, density=density, energies=(dv.StableNeoHookean(), floor, *energies), relaxation=relaxation,
+                     rigid=False)  # fmt: skip
+    turned = []
+    for n in DIRECTIONS:  # the columns of an orthonormal matrix whose second is n
+        other = torch.linalg.cross(n, torch.eye(3, dtype=n.dtype)[int(n.abs().argmin())])
+        other = other / other.norm()
+        turned.append(torch.stack([other, n, torch.linalg.cross(other, n)], 1))
+    points = model.rest_points - torch.tensor([0.0, float(model.rest_points[:, 1].min()) - START, 0.0]).double()
+    x = torch.stack([points @ axes.T for axes in turned])
+    options = {"mu": 2e5, "lam": 4e5, "time_step": 0.01, "gravity": -GRAVITY * DIRECTIONS[:, None],
+               "parameters": {"floor_barrier.normal": DIRECTIONS[:, None]}}  # fmt: skip
+    return model, x, options
+
+
+def gaps(x: Tensor) -> Tensor:
+    return (x * DIRECTIONS[:, None]).sum(-1)
+
+
+def check_rest(model: dv.Model, x: Tensor, options: dict[str, Any], steps: int, sweeps: int, floor: float) -> None:
+    v, highest = torch.zeros_like(x), gaps(x).mean(-1)
+    for k in range(steps):
+        x, v = dv.step(model, x, v, sweeps=sweeps, **options)
+        gap = gaps(x)
+        assert gap.min() >= floor, f"step {k}: gap {float(gap.min()):.2e}, {floor:.2e} expected"
+        assert (gap.mean(-1) <= highest + tolerance("rest_rise")).all(), f"step {k}: thrown up, energy from nothing"
+    assert bool(torch.isfinite(v).all())
+
+
+def least_gap(density: float = DENSITY) -> float:
+    return (1 - FILTER_ETA) * bearing_gap(density * 0.2**3 * GRAVITY)
+
+
+CASES = [(k, omega) for k in range(6) for omega in (0.5, 1.0, 1.6) if k != 1 or omega <= 1]
+
+
+@pytest.mark.parametrize(("sweeps", "relaxation"), CASES)
+def test_a_cube_at_rest(sweeps: int, relaxation: float) -> None:
+    model, x, options = scenes(relaxation=relaxation)
+    check_rest(model, x, options, 300, sweeps, min(START, least_gap()) * (1 - 1e-9))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sweeps", "relaxation"), CASES)
+def test_a_cube_at_rest_for_long(sweeps: int, relaxation: float) -> None:
+    model, x, options = scenes(relaxation=relaxation)
+    check_rest(model, x, options, 1500, sweeps, min(START, least_gap()) * (1 - 1e-9))
+
+
+@pytest.mark.parametrize("friction", (None, 0.3))
+@pytest.mark.parametrize(("sweeps", "detections"), ((0, 2), (1, 2), (1, 4), (2, 1), (4, 2)))
+def test_a_cube_at_rest_in_parts(sweeps: int, detections: int, friction: float | None) -> None:
+    """Floor and pairs: each of R parts has a start, and some no sweep."""
+    pairs = dv.PairBarrier(kappa=KAPPA, dhat=DHAT, detections=detections, self_contact=False)
+    more = () if friction is None else (dv.Friction(friction),)
+    model, x, options = scenes(pairs, *more)
+    check_rest(model, x, options, 240, sweeps, min(START, least_gap()) * (1 - 1e-9))
+
+
+@pytest.mark.parametrize(("sweeps", "detections"), ((1, None), (4, 2), (1, 2)))
+def test_a_heavy_cube(sweeps: int, detections: int | None) -> None:
+    more = () if detections is None else (dv.PairBarrier(dhat=DHAT, detections=detections, self_contact=False),)
+    model, x, options = scenes(*more, density=2e4)
+    check_rest(model, x, options, 240, sweeps, least_gap(2e4))
+
+
+def test_without_sweeps_a_body_sinks_to_dhat_and_no_deeper() -> None:
+    model, x, options = scenes()
+    x, v = x + (0.02 - START) * DIRECTIONS[:, None], torch.zeros_like(x)
+    for _ in range(200):
+        x, v = dv.step(model, x, v, sweeps=0, **options)
+    assert (gaps(x) - DHAT).abs().max() < tolerance("sunk")

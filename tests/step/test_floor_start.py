@@ -1,0 +1,239 @@
+"""Claim: the start of a step approaches no plane within its dhat and leaves sliding alone, differentiated as executed.
+
+Two codes say where a start lies, a header and the reference; the operators of a step's beginning and of the parts of a
+step with contact both use the header.
+"""
+
+import itertools
+import types
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd.contact.start import _Start
+from diffvbd.model.bodies import Bodies, OtherBodies
+from diffvbd.reference.energies import FloorBarrier
+from diffvbd.safeguards import FILTER_ETA
+from diffvbd.step.start import begin
+from diffvbd.testing import generator, relative_error, tolerance
+
+PLANES = {
+    "floor": ((0.0, 1.0, 0.0),),
+    "tilted": ((0.3, 0.9, -0.3),),
+    "valley": ((0.6, 0.8, 0.0), (-0.8, 0.6, 0.3)),
+    "narrow": ((1.0, 0.1, 0.0), (-1.0, 0.2, 0.1)),
+    "ridge": ((0.6, 0.8, 0.0), (0.5, 0.8, 0.2)),
+    "corner": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "pyramid": ((0.7, 0.7, 0.0), (-0.7, 0.7, 0.1), (0.1, 0.7, 0.7), (0.0, 0.7, -0.7)),
+    # no four of them through one point, where it would be open which of them bind
+    "eight": tuple((a, b + 0.1 * a * c, c) for a, b, c in itertools.product((1.0, -1.1), (0.9, -1.1), (1.2, -0.8))),
+}
+DHAT = 0.1
+VERTICES = 300
+
+
+def inputs(name: str) -> dict[str, Tensor]:
+    """Two scenes, with gaps of 0.3 and 5 dhat at the origin; vertices about it, steps from a millimetre to metres."""
+    rng = generator("floor start", name)
+    normal = np.array([np.divide(n, np.linalg.norm(n)) for n in PLANES[name]])
+    height = -DHAT * np.array([[0.3], [5.0]]).repeat(len(normal), 1)
+    x = rng.normal(size=(2, VERTICES, 3)) * 10 ** rng.uniform(-2, 0, (2, VERTICES, 1))
+    for _ in range(20):
+        below = ((x @ normal.T - height[:, None]) < 1e-3).any(-1, keepdims=True)
+        x = np.where(below, x / 2, x)
+    step = rng.normal(size=x.shape) * 10 ** rng.uniform(-3, 0.5, (2, VERTICES, 1))
+    given = {"x": x, "step": step, "normal": normal[None], "height": height, "dhat": np.full((1, len(normal)), DHAT)}
+    return {k: torch.from_numpy(v.copy()) for k, v in given.items()}
+
+
+def leaves(given: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {k: v.clone().requires_grad_() for k, v in given.items()}
+
+
+def packed(a: dict[str, Tensor]) -> Tensor:
+    """Data of the planes for the kernels; kappa and damping do not matter to a start."""
+    shape = (a["height"].shape[0], *a["normal"].shape[1:2])
+    zero = a["height"].new_zeros(shape)
+    scalars = torch.stack([a["height"].expand(shape), zero, a["dhat"].expand(shape), zero], -1)
+    return torch.cat([a["normal"].expand(*shape, 3), scalars], -1).reshape(shape[0], -1)
+
+
+def by_begin(a: dict[str, Tensor]) -> Tensor:
+    """The beginning of a step of 1 s from x with velocity `step`, of vertices that are in no body."""
+    x, none = a["x"].contiguous(), a["x"].new_empty((0,))
+    vertices, planes = x.shape[1], packed(a)
+    empty, one = torch.empty(0, dtype=torch.int32), torch.zeros(1, dtype=torch.int32)
+    bodies = Bodies(empty, one, torch.empty(0, dtype=torch.float64), (0, 0, 0, 0))
+    others = OtherBodies(torch.full((vertices,), -1, dtype=torch.int32), empty, one,
+                         torch.empty((0, 5), dtype=torch.int32), one, (0, 0, 0, 0))  # fmt: skip
+    step = a["step"].expand_as(x).contiguous()
+    start, _ = begin(x, step, x.new_zeros((1, 1, 3)), none, x.new_ones((1, vertices)), planes, none, none, none, none,
+                     torch.zeros(vertices, dtype=torch.bool), bodies, others, (planes.shape[1], 0), 1.0,
+                     start="inertia", filters=True)  # fmt: skip
+    return start - x
+
+
+def by_reference(a: dict[str, Tensor]) -> Tensor:
+    floor = object.__new__(FloorBarrier)
+    floor.normal, floor.height = a["normal"][..., None], a["height"][..., None]
+    floor.dhat = a["dhat"][..., None]
+    return floor.start(a["x"].mT, a["step"].mT).mT
+
+
+def by_contact(a: dict[str, Tensor]) -> Tensor:
+    """A part of a step with contact where no bound cuts and no island moves."""
+    scenes, vertices = a["x"].shape[:2]
+    planes = packed(a)
+    near = a["x"].new_full((scenes, vertices, 8), 1e6)
+    free = torch.zeros(vertices, dtype=torch.bool)
+    body = torch.zeros(vertices, dtype=torch.int32)
+    surface = types.SimpleNamespace(held=free, body=body, cap=1e6, body_order=torch.arange(vertices, dtype=torch.int32),
+                                    body_ptr=torch.tensor([0, vertices], dtype=torch.int32))  # fmt: skip
+    u = a["x"].new_zeros((scenes, 1, 3))
+    start: Any = _Start.apply(a["x"], a["step"], a["x"].detach(), u, near[..., 7], planes, near, a["x"].new_empty((0,)),
+                              surface, 0.45)  # fmt: skip
+    return start[1] - a["x"]
+
+
+CODES = {"begin": by_begin, "reference": by_reference, "contact": by_contact}
+
+
+def limits(given: dict[str, Tensor]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Steps [n, 3], normals [P, 3], and how far each step may approach each plane [n, P]."""
+    normal = given["normal"][0].numpy()
+    gap = given["x"].numpy() @ normal.T - given["height"].numpy()[:, None]
+    return given["step"].reshape(-1, 3).numpy(), normal, FILTER_ETA * np.maximum(gap - DHAT, 0).reshape(-1, len(normal))
+
+
+def closest(step: np.ndarray, normal: np.ndarray, room: np.ndarray) -> np.ndarray:
+    """The admitted motion closest to one step: the best of the projections on all sets of up to three planes."""
+    best = np.zeros(3)
+    for size in range(4):
+        for which in map(list, itertools.combinations(range(len(normal)), size)):
+            n = normal[which]
+            if np.linalg.matrix_rank(n, 1e-9) < size:
+                continue
+            s = step - np.linalg.pinv(n) @ (n @ step + room[which]) if size else step
+            if (normal @ s >= -room - 1e-12).all() and np.linalg.norm(s - step) < np.linalg.norm(best - step):
+                best = s
+    return best
+
+
+@pytest.mark.parametrize("name", PLANES)
+def test_no_start_goes_where_it_may_not(name: str) -> None:
+    given = inputs(name)
+    step, normal, room = limits(given)
+    out = by_begin(given).reshape(-1, 3).numpy()
+    size = np.linalg.norm(step, axis=1)
+    assert (out @ normal.T >= -room - tolerance("cancelling") * size[:, None]).all()
+    assert (np.linalg.norm(out, axis=1) <= (1 + tolerance("parallel_planes")) * size).all()
+    admitted = (step @ normal.T >= -room).all(1)
+    assert 20 < admitted.sum() < len(step) - 20
+    assert np.abs(out - step)[admitted].max() <= tolerance("formula") * np.abs(step).max()
+    within = (room == 0) & (step @ normal.T < 0)
+    assert within.any(0).all(), "vertices within dhat of every plane that want to approach it"
+
+
+@pytest.mark.parametrize("name", ("floor", "tilted", "valley", "narrow", "ridge", "corner"))
+def test_it_is_the_closest_admitted_motion(name: str) -> None:
+    given = inputs(name)
+    step, normal, room = limits(given)
+    out = by_begin(given).reshape(-1, 3).numpy()
+    expected = np.array([closest(s, normal, r) for s, r in zip(step, room, strict=True)])
+    assert np.abs(out - expected).max() <= tolerance("cancelling") * np.abs(step).max()
+    assert (np.linalg.norm(expected - step, axis=1) > 1e-3).sum() > 50
+
+
+def test_sliding_stays() -> None:
+    given = inputs("tilted")
+    step, normal, _ = limits(given)
+    out = by_begin(given).reshape(-1, 3).numpy()
+    across = (out - step) - ((out - step) @ normal[0])[:, None] * normal[0]
+    assert np.abs(across).max() <= tolerance("formula") * np.abs(step).max()
+
+
+def test_it_is_continuous_where_a_vertex_leaves_dhat() -> None:
+    """A rule that lets what is just outside go to a tenth of its gap would raise its barrier from nothing."""
+    n, at = (
+        torch.eye(3, dtype=torch.float64)[None, 1:2],
+        torch.tensor([[DHAT - 1e-9, DHAT + 1e-9]], dtype=torch.float64),
+    )
+    x = torch.stack([torch.zeros_like(at), at, torch.zeros_like(at)], -1)
+    step = torch.tensor([0.3, -1.0, 0.1], dtype=torch.float64).expand_as(x)
+    zero, dhat = torch.zeros_like(n[..., 0]), torch.full_like(n[..., 0], DHAT)
+    given = {"x": x, "step": step, "normal": n, "height": zero, "dhat": dhat}
+    inside, outside = (by_begin(given) + x)[0]
+    assert (
+        (inside - outside).abs().max() < tolerance("continuous")
+        and abs(inside[1] - DHAT) < tolerance("continuous")
+        and outside[0] == 0.3
+    )
+
+
+@pytest.mark.parametrize("name", PLANES)
+def test_codes_agree(name: str) -> None:
+    given = inputs(name)
+    weight = torch.from_numpy(generator("weight", name).normal(size=tuple(given["x"].shape)))
+    results = {}
+    for code, run in CODES.items():
+        a = leaves(given)
+        out = run(a)
+        results[code] = {"out": out.detach(), **dict(zip(a, torch.autograd.grad((weight * out).sum(), list(a.values())),
+                                                         strict=True))}  # fmt: skip
+    for code in ("begin", "contact"):
+        for key, expected in results["reference"].items():
+            assert expected.abs().max() > 0, key
+            assert relative_error(results[code][key], expected) <= tolerance("adjoint"), (code, key)
+
+
+@pytest.mark.parametrize("name", PLANES)
+def test_gradients_are_those_of_differences(name: str) -> None:
+    given = inputs(name)
+    rng = generator("direction", name)
+    weight = torch.from_numpy(rng.normal(size=tuple(given["x"].shape)))
+    for key in given:
+        a = leaves(given)
+        (grad,) = torch.autograd.grad((weight * by_begin(a)).sum(), a[key])
+        direction = torch.from_numpy(rng.normal(size=tuple(a[key].shape)))
+        size = 1e-7
+        values = [
+            (weight * by_begin({**given, key: given[key] + sign * size * direction})).sum() for sign in (1.0, -1.0)
+        ]
+        expected = float(values[0] - values[1]) / (2 * size)
+        assert abs(float((grad * direction).sum()) - expected) <= tolerance("finite_difference") * abs(expected), key
+
+
+@pytest.mark.parametrize("detections", (None, 1, 3))
+def test_gradients_of_a_step_through_the_start(detections: int | None) -> None:
+    """Without sweeps the end of a step is its start: every argument of the floor shows through it."""
+    mesh = dv.mesh.cube(3, size=0.2).translate((0.0, 0.11, 0.0))
+    pairs = () if detections is None else (dv.PairBarrier(dhat=0.02, detections=detections, self_contact=False),)
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.FloorBarrier(normal=(0.1, 1, 0.2), dhat=0.1), *pairs))
+    rng = generator("step", detections)
+    x = model.rest_points + 5e-3 * torch.from_numpy(rng.normal(size=(27, 3)))
+    v = torch.tensor([1.0, -3.0, 0.5]).double() + 0.3 * torch.from_numpy(rng.normal(size=(27, 3)))
+    assert model.floor is not None
+    constants = {f"floor_barrier.{k}": c for k, c in model.constants(model.floor).items()}
+
+    def loss(values: dict[str, Tensor]) -> Tensor:
+        parameters = {k: values[k] for k in constants}
+        end, _ = dv.step(
+            model, values["x"], values["v"], mu=1e4, lam=2e4, time_step=0.02, sweeps=0, parameters=parameters
+        )
+        return (torch.from_numpy(generator("loss").normal(size=(27, 3))) * end).sum()
+
+    given = {"x": x, "v": v, **constants}
+    a = leaves(given)
+    names = [k for k in given if k.rpartition(".")[2] not in ("kappa", "damping")]
+    for name, grad in zip(names, torch.autograd.grad(loss(a), [a[k] for k in names]), strict=True):
+        direction = torch.from_numpy(rng.normal(size=tuple(given[name].shape))).reshape(given[name].shape)
+        size = 1e-7
+        values = [float(loss({**given, name: given[name] + sign * size * direction})) for sign in (1.0, -1.0)]
+        expected = (values[0] - values[1]) / (2 * size)
+        assert abs(expected) > 1e-3, name
+        allowed = tolerance("finite_difference") * abs(expected) + tolerance("difference_noise")
+        assert abs(float((grad * direction).sum()) - expected) <= allowed, name

@@ -1,0 +1,210 @@
+"""torch.func and gradcheck of every argument; what cannot be differentiated says so."""
+
+from typing import Any
+
+import pytest
+import torch
+from helpers.small_step import (
+    ARGUMENTS,
+    STEP,
+    Arguments,
+    assert_same,
+    gradients,
+    loss,
+    run_step,
+    scalar,
+    small_inputs,
+    small_model,
+)
+from torch import Tensor
+from torch.autograd import forward_ad
+
+import diffvbd as dv
+from diffvbd.testing import relative_error, tolerance
+
+# --- gradcheck --------------------------------------------------------------------------------------------------------
+
+
+def gradcheck(run: Any, values: tuple[Tensor, ...]) -> bool:
+    near_zero, bar = tolerance("gradcheck_near_zero"), tolerance("gradcheck")
+    return torch.autograd.gradcheck(run, values, atol=near_zero, rtol=bar, check_batched_grad=True)
+
+
+@pytest.mark.parametrize("name", ARGUMENTS)
+def test_gradcheck_of_every_argument(device: str, name: str) -> None:
+    model = small_model(device)
+    fixed = small_inputs(model)
+
+    def run(value: Tensor) -> tuple[Tensor, Tensor]:
+        return run_step(model, fixed | {name: value})
+
+    value = fixed[name].clone().requires_grad_()
+    (jacobian,) = torch.autograd.grad(scalar(*run(value)), value)
+    assert jacobian.abs().max() > 1e-3
+    assert gradcheck(run, (value,))
+
+
+def test_gradcheck_of_material_and_state_together_without_vertex_energies(device: str) -> None:
+    model = small_model(
+        device, energies=(dv.StableNeoHookean("paper"),), saturation=0.2, regularization=0.1, relaxation=1.3
+    )
+    fixed = small_inputs(model)
+    values = tuple(fixed[k].clone().requires_grad_() for k in ("x", "v", "mu", "lam"))
+
+    def run(x: Tensor, v: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
+        return dv.step(model, x, v, mu=mu, lam=lam, **STEP)
+
+    assert gradcheck(run, values)
+
+
+# --- torch.func -------------------------------------------------------------------------------------------------------
+
+
+def members(inputs: Arguments, name: str, count: int = 3) -> Tensor:
+    """`count` different values of one argument, stacked."""
+    generator = torch.Generator().manual_seed(1)
+    shape = (count, *inputs[name].shape)
+    return inputs[name] + 0.1 * torch.rand(shape, dtype=inputs[name].dtype, generator=generator).to(inputs[name])
+
+
+def test_func_grad_equals_autograd(device: str) -> None:
+    model = small_model(device)
+    inputs = small_inputs(model)
+    assert_same(torch.func.grad(lambda a: loss(model, a))(inputs), gradients(model, inputs), 0.0)
+
+
+@pytest.mark.parametrize("name", ARGUMENTS)
+def test_vmap_and_its_gradients_over_each_argument(device: str, one_regime: None, name: str) -> None:
+    model = small_model(device)
+    inputs = small_inputs(model)
+    batch = members(inputs, name)
+
+    def one(value: Tensor) -> Tensor:
+        return loss(model, inputs | {name: value})
+
+    values = torch.func.vmap(one)(batch)
+    expected = torch.stack([one(value) for value in batch])
+    assert expected.std() > 1e-6
+    assert relative_error(values, expected) <= tolerance("formula")
+    slopes = torch.stack([torch.func.grad(one)(value) for value in batch])
+    assert slopes.abs().max() > 1e-3
+    assert relative_error(torch.func.vmap(torch.func.grad(one))(batch), slopes) <= tolerance("sum")
+    assert relative_error(torch.func.grad(lambda b: torch.func.vmap(one)(b).sum())(batch), slopes) <= tolerance("sum")
+
+
+def test_vmap_over_several_arguments_and_gradient_of_a_shared_one(device: str) -> None:
+    model = small_model(device)
+    inputs = small_inputs(model)
+    x, mu = members(inputs, "x"), members(inputs, "mu")
+
+    def one(x: Tensor, mu: Tensor, lam: Tensor, gravity: Tensor) -> Tensor:
+        return loss(model, inputs | {"x": x, "mu": mu, "lam": lam, "gravity": gravity})
+
+    shared = (inputs["lam"], inputs["gravity"])
+
+    def total(*values: Tensor) -> Tensor:
+        return torch.func.vmap(one, in_dims=(0, 0, None, None))(*values).sum()
+
+    def looped(x: Tensor, mu: Tensor, *rest: Tensor) -> Tensor:
+        return torch.stack([one(a, b, *rest) for a, b in zip(x, mu, strict=True)]).sum()
+
+    actual = torch.func.grad(total, argnums=(0, 1, 2, 3))(x, mu, *shared)
+    expected = torch.func.grad(looped, argnums=(0, 1, 2, 3))(x, mu, *shared)
+    for a, b in zip(actual, expected, strict=True):
+        assert b.abs().max() > 1e-3
+        assert relative_error(a, b) <= tolerance("sum")
+    # vmap of grad: each member its own gradient of what it shares
+    each = torch.func.vmap(torch.func.grad(one, argnums=2), in_dims=(0, 0, None, None))(x, mu, *shared)
+    single = torch.stack([torch.func.grad(one, argnums=2)(a, b, *shared) for a, b in zip(x, mu, strict=True)])
+    assert relative_error(each, single) <= tolerance("sum")
+
+
+def test_vmap_over_a_batch_of_scenes_and_other_dimensions(device: str, one_regime: None) -> None:
+    model = small_model(device)
+    inputs = small_inputs(model)
+    x = torch.stack([members(inputs, "x", 2), members(inputs, "x", 2) + 0.05, members(inputs, "x", 2) - 0.05], 1)
+    v = inputs["v"].expand(2, -1, -1)
+    plain = {k: t for k, t in inputs.items() if k not in ("x", "v")}
+
+    def run(x: Tensor) -> tuple[Tensor, Tensor]:
+        return run_step(model, plain | {"x": x, "v": v})
+
+    actual = torch.func.vmap(run, in_dims=1, out_dims=1)(x)  # members in dimension 1, scenes in dimension 0
+    for k in range(2):
+        assert torch.equal(actual[k], torch.stack([run(x[:, n])[k] for n in range(3)], 1))
+    slope = torch.func.vmap(torch.func.grad(lambda x: scalar(*run(x))), in_dims=1, out_dims=1)(x)
+    expected = torch.stack([torch.func.grad(lambda x: scalar(*run(x)))(x[:, n]) for n in range(3)], 1)
+    assert relative_error(slope, expected) <= tolerance("sum")
+
+
+def test_nested_vmap(device: str) -> None:
+    model = small_model(device)
+    inputs = small_inputs(model)
+    x, mu = members(inputs, "x", 2), members(inputs, "mu", 3)
+
+    def one(x: Tensor, mu: Tensor) -> Tensor:
+        return torch.func.grad(lambda m: loss(model, inputs | {"x": x, "mu": m}))(mu)
+
+    inner = torch.func.vmap(one, in_dims=(None, 0))
+    actual = torch.func.vmap(inner, in_dims=(0, None))(x, mu)
+    expected = torch.stack([torch.stack([one(a, b) for b in mu]) for a in x])
+    assert relative_error(actual, expected) <= tolerance("sum")
+
+
+@pytest.mark.parametrize("pinned", [[0, 1], []], ids=["pinned", "free"])
+@pytest.mark.parametrize("name", ["x", "mu", "rest_points", "floor_barrier.kappa", "anchor.points"])
+def test_jacrev_and_batched_gradients_equal_one_row_at_a_time(device: str, name: str, pinned: list[int]) -> None:
+    model = small_model(device, pinned=pinned)
+    inputs = small_inputs(model)
+
+    def run(value: Tensor) -> Tensor:
+        return run_step(model, inputs | {name: value})[0]
+
+    leaf = inputs[name].clone().requires_grad_()
+    out = run(leaf)
+    rows = torch.eye(out.numel(), dtype=out.dtype, device=device).reshape(-1, *out.shape)
+    expected = torch.stack([torch.autograd.grad(out, leaf, row, retain_graph=True)[0] for row in rows])
+    (batched,) = torch.autograd.grad(out, leaf, rows, is_grads_batched=True)
+    assert expected.abs().max() > 1e-3
+    assert relative_error(batched, expected) <= tolerance("sum")
+    jacobian = torch.func.jacrev(run)(inputs[name])
+    assert relative_error(jacobian.reshape(expected.shape), expected) <= tolerance("sum")
+
+
+# --- what cannot be differentiated says so ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["x", "mu", "rest_points", "anchor.points"])
+def test_second_order_raises(device: str, name: str) -> None:
+    model = small_model(device)
+    inputs = small_inputs(model)
+
+    def one(value: Tensor) -> Tensor:
+        return loss(model, inputs | {name: value})
+
+    leaf = inputs[name].clone().requires_grad_()
+    (slope,) = torch.autograd.grad(one(leaf), leaf, create_graph=True)
+    with pytest.raises(NotImplementedError, match="second derivatives"):
+        torch.autograd.grad(slope.sum(), leaf)
+    with pytest.raises(NotImplementedError, match="second derivatives"):
+        torch.func.jacrev(torch.func.grad(one))(inputs[name])
+    with pytest.raises((NotImplementedError, RuntimeError), match="(?i)second derivatives|forward.mode|jvp"):
+        torch.func.hessian(one)(inputs[name])
+    with pytest.raises(NotImplementedError, match="second derivatives"):
+        torch.autograd.functional.hessian(one, inputs[name])
+
+
+@pytest.mark.parametrize("name", ["x", "v", "mu", "rest_points", "density", "gravity", "floor_barrier.kappa"])
+def test_forward_mode_raises(device: str, name: str) -> None:
+    model = small_model(device)
+    inputs = small_inputs(model)
+    tangent = torch.ones_like(inputs[name])
+
+    def one(value: Tensor) -> Tensor:
+        return loss(model, inputs | {name: value})
+
+    with pytest.raises((NotImplementedError, RuntimeError), match="(?i)forward.mode|jvp|forward AD"):
+        torch.func.jvp(one, (inputs[name],), (tangent,))
+    with forward_ad.dual_level():
+        with pytest.raises((NotImplementedError, RuntimeError), match="(?i)forward.mode|jvp|forward AD"):
+            one(forward_ad.make_dual(inputs[name], tangent))

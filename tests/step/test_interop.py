@@ -1,0 +1,256 @@
+"""The step inside torch's own machinery: compile, checkpoint, autocast, copies of a Model, opcheck."""
+
+import copy
+import io
+import pickle
+from typing import Any
+
+import pytest
+import torch
+from helpers.marks import slow
+from helpers.small_step import (
+    ARGUMENTS,
+    STEP,
+    assert_same,
+    gradients,
+    loss,
+    run_step,
+    scalar,
+    small_inputs,
+    small_model,
+)
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+import diffvbd as dv
+from diffvbd import ops
+from diffvbd.testing import relative_error, tolerance
+
+# --- torch.compile ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def fresh_compiler() -> None:
+    torch._dynamo.reset()
+
+
+def compiled_gradients(device: str, backend: str, names: tuple[str, ...], plain: bool) -> None:
+    model = small_model(device, energies=(dv.StableNeoHookean(),)) if plain else small_model(device)
+    arguments = {k: t for k, t in small_inputs(model).items() if k in names}
+    expected = gradients(model, arguments)
+    run = torch.compile(lambda a: loss(model, a), fullgraph=True, backend=backend)
+    leaves = {k: t.clone().requires_grad_() for k, t in arguments.items()}
+    value = run(leaves)
+    actual = dict(zip(leaves, torch.autograd.grad(value, list(leaves.values())), strict=True))
+    assert relative_error(value, loss(model, arguments)) <= tolerance("formula")
+    assert_same(actual, expected)
+
+
+def test_compile_of_a_plain_step(device: str, fresh_compiler: None) -> None:
+    compiled_gradients(device, "aot_eager", ("x", "v", "mu", "lam"), plain=True)
+
+
+def test_compile_of_a_step_with_every_argument(device: str, fresh_compiler: None) -> None:
+    compiled_gradients(device, "aot_eager", ARGUMENTS, plain=False)
+
+
+@pytest.mark.slow
+def test_compile_with_inductor(device: str, fresh_compiler: None) -> None:
+    compiled_gradients(device, "inductor", ARGUMENTS, plain=False)
+
+
+@pytest.mark.parametrize("pinned", [[0, 1], slow([])], ids=["pinned", "free"])
+def test_compile_of_a_step_without_gradients(device: str, fresh_compiler: None, pinned: list[int]) -> None:
+    model = small_model(device, pinned=pinned)
+    arguments = small_inputs(model)
+    with torch.no_grad():
+        x, v = torch.compile(lambda a: run_step(model, a), fullgraph=True, backend="aot_eager")(arguments)
+    expected = run_step(model, arguments)
+    assert torch.equal(x, expected[0]) and torch.equal(v, expected[1])
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_compile_of_one_tensor_as_two_arguments(device: str, fresh_compiler: None, batched: bool) -> None:
+    model = small_model(device, energies=(dv.StableNeoHookean(),))
+    inputs = small_inputs(model)
+    x, v = (inputs[k].expand(2, -1, -1).contiguous() if batched else inputs[k] for k in ("x", "v"))
+    modulus = inputs["mu"][None] if batched else inputs["mu"]
+
+    def run(modulus: Tensor) -> Tensor:
+        return scalar(*dv.step(model, x, v, mu=modulus, lam=modulus, **STEP))
+
+    grads = []
+    for function in (run, torch.compile(run, fullgraph=True, backend="aot_eager")):
+        leaf = modulus.clone().requires_grad_()
+        grads += torch.autograd.grad(function(leaf), leaf)
+    assert grads[0].abs().max() > 1e-3
+    assert relative_error(grads[1], grads[0]) <= tolerance("formula")
+
+
+@pytest.mark.parametrize("every", [slow(None), 2])
+def test_compile_of_a_rollout(device: str, fresh_compiler: None, every: Any) -> None:
+    model = small_model(device)
+    inputs = small_inputs(model)
+
+    def run(v: Tensor, mu: Tensor, force: Tensor) -> Tensor:
+        trajectory = dv.rollout(model, inputs["x"], v, steps=3, mu=mu, lam=2.0, force=dv.per_step(force),
+                                checkpoint_every=every, **STEP)  # fmt: skip
+        return scalar(trajectory.x[-1], trajectory.v[-1]) + trajectory.x.square().sum()
+
+    values = {"v": inputs["v"], "mu": inputs["mu"], "force": torch.stack([k * inputs["force"] for k in (1, 2, 3)])}
+    results = []
+    for function in (run, torch.compile(run, fullgraph=True, backend="aot_eager")):
+        leaves = {k: t.clone().requires_grad_() for k, t in values.items()}
+        results.append(dict(zip(values, torch.autograd.grad(function(**leaves), list(leaves.values())), strict=True)))
+    assert_same(results[1], results[0])
+
+
+# --- checkpoint, autocast, copies -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reentrant", [False, True])
+def test_checkpoint(device: str, reentrant: bool) -> None:
+    model = small_model(device)
+    inputs = small_inputs(model)
+    leaves = {k: t.clone().requires_grad_() for k, t in inputs.items()}
+    names = list(leaves)
+
+    def run(*values: Tensor) -> tuple[Tensor, Tensor]:
+        return run_step(model, dict(zip(names, values, strict=True)))
+
+    scalar(*checkpoint(run, *leaves.values(), use_reentrant=reentrant)).backward()
+    assert_same({k: t.grad for k, t in leaves.items()}, gradients(model, inputs), 0.0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_autocast_changes_nothing(device: str, dtype: torch.dtype) -> None:
+    model = small_model(device, dtype)
+    inputs = small_inputs(model)
+    expected = run_step(model, inputs)
+    slopes = gradients(model, inputs)
+    with torch.autocast(device, dtype=torch.bfloat16):
+        actual = run_step(model, inputs)
+        cast = gradients(model, inputs)
+        rebuilt = small_model(device, dtype)
+    assert actual[0].dtype == dtype
+    assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
+    assert_same(cast, slopes, 0.0)
+    assert torch.equal(rebuilt.mass, model.mass)
+
+
+def saved_and_loaded(model: dv.Model) -> dv.Model:
+    buffer = io.BytesIO()
+    torch.save(model, buffer)
+    return torch.load(io.BytesIO(buffer.getvalue()), weights_only=False)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m)), saved_and_loaded])
+def test_copies_of_a_model_compute_the_same(device: str, copied: Any) -> None:
+    model = small_model(device, saturation=0.3, relaxation=1.2)
+    inputs = small_inputs(model)
+    twin = copied(model)
+    assert twin is not model and twin._mass.data_ptr() != model._mass.data_ptr()
+    assert repr(twin) == repr(model)
+    for a, b in zip(run_step(twin, inputs), run_step(model, inputs), strict=True):
+        assert torch.equal(a, b)
+    assert_same(gradients(twin, inputs), gradients(model, inputs), 0.0)
+
+
+def test_model_of_tensors_that_require_grad_survives_two_backwards_and_copies(device: str) -> None:
+    mesh = dv.mesh.cube()
+    density = torch.full((mesh.num_tets,), 2.0, dtype=torch.float64, requires_grad=True)
+    stiffness = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
+    kappa = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    points = torch.from_numpy(mesh.points.copy()).requires_grad_()
+    # Each is the result of an operation: a kept graph would fail in the second backward and in deepcopy.
+    energies = (
+        dv.StableNeoHookean(),
+        dv.FloorBarrier(height=-0.2, kappa=kappa * 1, dhat=0.5),
+        dv.Anchor(stiffness * 1, points * 1),
+    )
+    model = dv.Model(
+        dv.TetMesh(points * 1, mesh.tets), density=density * 1, pinned=[0], energies=energies, device=device
+    )
+    twin = pickle.loads(pickle.dumps(copy.deepcopy(model)))
+    assert repr(twin) == repr(model)
+    x = (model.rest_points + 0.01).requires_grad_()
+    slopes = []
+    for _ in range(2):
+        out = dv.step(model, x, torch.zeros_like(x), mu=3.0, lam=2.0, **STEP)
+        slopes += torch.autograd.grad(scalar(*out), x)
+    assert torch.equal(slopes[0], slopes[1])
+    assert all(t.grad is None for t in (density, stiffness, kappa, points))
+
+
+# --- raw operators ----------------------------------------------------------------------------------------------------
+
+
+def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
+    """Arguments of every raw operator, in the order of its schema."""
+    model = small_model(device)
+    inputs = small_inputs(model)
+    settings = model.settings(0.3, 2, scenes=1)  # sizes, energies, data_count, numbers, sweeps, launch
+    assert len(settings.launch) == (3 if device == "cuda" else 0)
+    x, y = inputs["x"][None], (inputs["x"] + 0.1 * inputs["v"])[None]
+    given = ops.SweepFields(x, x, y, inputs["mu"][None], inputs["lam"][None], model.mass[None], model._packed_rest,
+                            model._energy_data)  # fmt: skip
+    fields = ops.as_list(given, x)
+    sweep = (fields, model._plan, *settings, policy, -1, True)
+    x, tape, _ = torch.ops.diffvbd.sweep(*sweep)
+    tets, star_ptr, star = model._topology
+    points = model.rest_points[None].contiguous()
+    corners = torch.ops.diffvbd.tet_gather(points, tets)
+    arguments = {
+        "sweep": sweep,
+        "pack_rest": (torch.rand(1, model.num_tets, 7).to(x), model._plan, model._sizes),
+        "tet_gather": (points, tets),
+        "star_sum": (corners, star_ptr, star, False),
+        "row_sum": (inputs["x"],),
+    }
+    if policy != ops.NO_TAPE:
+        wants = [True, True, True, True]
+        arguments["sweep_backward"] = (torch.ones_like(x), x, fields, tape, model._plan, *settings, policy, wants)
+    return arguments | (fused_arguments(policy) if device == "cuda" else {})
+
+
+def fused_arguments(policy: int) -> dict[str, tuple[Any, ...]]:
+    """The same of the operators that only CUDA has; their only energy is that of the tets."""
+    model = small_model("cuda", energies=(dv.StableNeoHookean(),))
+    inputs = {name: value[None] for name, value in small_inputs(model).items()}
+    state = (inputs["x"], inputs["v"], inputs["force"], inputs["prescribed"])  # a force is as good an acceleration
+    fields = [*state, inputs["mu"], inputs["lam"], model.mass[None], model._packed_rest]
+    settings = model.settings(0.3, 2, scenes=1)
+    step = (fields, model._plan, *settings, policy)
+    x, v, tape = torch.ops.diffvbd.fused_step(*step)
+    arguments: dict[str, tuple[Any, ...]] = {"fused_step": step}
+    if policy != ops.NO_TAPE:
+        bars, wants = (torch.ones_like(x), torch.ones_like(v)), [True] * 7
+        arguments["fused_step_backward"] = (*bars, x, fields, tape, model._plan, *settings, policy, wants)
+    return arguments
+
+
+@pytest.mark.parametrize("policy", [ops.NO_TAPE, ops.COMPACT_TAPE, ops.FULL_TAPE])
+def test_opcheck_of_the_raw_operators(device: str, policy: int) -> None:
+    for name, arguments in raw_arguments(device, policy).items():
+        torch.library.opcheck(getattr(torch.ops.diffvbd, name).default, arguments)
+
+
+@pytest.mark.parametrize("lanes", ops.LANES.values(), ids=ops.LANES)
+def test_opcheck_of_the_plan(lanes: int) -> None:
+    """It is built on the CPU, for either device, and has no shapes without execution: they follow from the colors."""
+    model = small_model("cpu")
+    arguments = (model.rest_points, model.tets, ~model.pinned, lanes)
+    torch.library.opcheck(torch.ops.diffvbd.build_plan.default, arguments, test_utils="test_schema")
+
+
+def test_raw_operators_refuse_to_be_differentiated(device: str) -> None:
+    for name, arguments in raw_arguments(device, ops.FULL_TAPE).items():
+        first = arguments[0]
+        if isinstance(first, list):
+            first = [first[0].clone().requires_grad_(), *first[1:]]
+        else:
+            first = first.clone().requires_grad_()
+        out = getattr(torch.ops.diffvbd, name)(first, *arguments[1:])
+        out = out[0] if isinstance(out, (tuple, list)) else out
+        with pytest.raises(NotImplementedError, match="call diffvbd.step"):
+            out.sum().backward()

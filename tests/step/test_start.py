@@ -1,0 +1,166 @@
+"""Claim: where a step starts. A body that is not corrected starts, under "auto", from y or from x + h v, whichever has
+the lower incremental potential: each body and scene for itself, and its gradient is that of the start it took."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import reference
+from diffvbd.testing import generator, relative_error, tolerance
+
+STEP = 1 / 60
+MESH = dv.mesh.beam(6, 3, 3, size=(0.5, 0.2, 0.2))
+STARTS = ("predictor", "inertia")
+SOFT, STIFF = 1e2, 1e7  # [Pa]
+
+
+def model_of(start: Any, device: str, mesh: dv.TetMesh = MESH, **options: Any) -> dv.Model:
+    return dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, start=start, device=device, **options)
+
+
+def moving(model: dv.Model) -> tuple[Tensor, Tensor]:
+    """A bent body that moves: no start is the other, and none is at rest."""
+    noise = torch.from_numpy(generator("start").uniform(-1, 1, (2, model.num_vertices, 3))).to(model.device)
+    x = model.rest_points + 1e-3 * noise[0]
+    return x, 0.02 * torch.where(model.pinned[:, None], 0.0, noise[1])
+
+
+def start_of(start: Any, device: str, x: Tensor, v: Tensor, mesh: dv.TetMesh = MESH, **options: Any) -> Tensor:
+    """Where a step's sweeps start: a step without sweeps."""
+    return dv.step(model_of(start, device, mesh), x, v, time_step=STEP, sweeps=0, **options)[0]
+
+
+@pytest.mark.parametrize("floor", (False, True))
+@pytest.mark.parametrize(("mu", "wanted"), ((SOFT, "predictor"), (3e3, None), (STIFF, "inertia")))
+def test_auto_takes_the_lower_potential(device: str, mu: float, wanted: str | None, floor: bool) -> None:
+    energies: tuple[Any, ...] = (dv.StableNeoHookean(), dv.Anchor(10.0))
+    energies += (dv.FloorBarrier(height=-2e-3, kappa=40.0, dhat=0.01),) if floor else ()
+    models = {start: model_of(start, device, energies=energies) for start in ("auto", *STARTS)}
+    x, v = moving(models["auto"])
+    options = {"mu": mu, "lam": 1.5 * mu, "time_step": STEP}
+    at = {start: dv.step(model, x, v, sweeps=0, **options)[0].cpu() for start, model in models.items()}
+    plain = models["auto"].to("cpu")
+    y = x + STEP * v + STEP**2 * torch.tensor([0.0, -9.81, 0.0], dtype=x.dtype, device=device)
+    y = torch.where(models["auto"].pinned[:, None], x, y).cpu()
+    held_back = relative_error(at["predictor"], y)
+    assert held_back > 1e-4 if floor else held_back <= tolerance("ulps")
+    assert relative_error(at["predictor"], at["inertia"]) > 1e-4
+    potential = {start: float(reference.incremental_potential(plain, at[start], y, x_prev=x.cpu(), **options))
+                 for start in STARTS}  # fmt: skip
+    lower = min(STARTS, key=lambda start: potential[start])
+    assert wanted in (lower, None)
+    assert torch.equal(at["auto"], at[lower])
+
+
+def two_beams() -> dv.TetMesh:
+    return dv.mesh.join([MESH, MESH.translate((0.0, 0.0, 1.0))])
+
+
+def by_tet(*mu: float, device: str) -> Tensor:
+    """A modulus for each body, by tet."""
+    return torch.tensor(mu, dtype=torch.float64, device=device).repeat_interleave(MESH.num_tets)
+
+
+def test_bodies_and_scenes_choose_for_themselves(device: str) -> None:
+    mesh, half = two_beams(), MESH.num_vertices
+    x, v = moving(model_of("auto", device, mesh))
+    mu = torch.stack([by_tet(SOFT, STIFF, device=device), by_tet(STIFF, SOFT, device=device)])
+    xs, vs = x.repeat(2, 1, 1), v.repeat(2, 1, 1)
+    auto, y, coasting = (start_of(start, device, xs, vs, mesh, mu=mu, lam=1.5 * mu) for start in ("auto", *STARTS))
+    first, second = slice(None, half), slice(half, None)
+    assert torch.equal(auto[0, first], y[0, first]) and torch.equal(auto[0, second], coasting[0, second])
+    assert torch.equal(auto[1, first], coasting[1, first]) and torch.equal(auto[1, second], y[1, second])
+    assert min(float((y - coasting)[:, rows].abs().max()) for rows in (first, second)) > 1e-3
+    alone = start_of("auto", device, x, v, mesh, mu=mu[1], lam=1.5 * mu[1])
+    assert torch.equal(alone, auto[1])
+
+
+@pytest.mark.parametrize(("mu", "taken"), ((SOFT, "predictor"), (STIFF, "inertia")))
+@pytest.mark.parametrize("sweeps", (0, 3))
+def test_gradients_are_those_of_the_start_that_was_taken(device: str, mu: float, taken: str, sweeps: int) -> None:
+    results = []
+    for start in ("auto", taken):
+        model = model_of(start, device)
+        x, v = moving(model)
+        given = {"x": x, "v": v, "mu": torch.full((model.num_tets,), mu).to(x), "force": 0.1 * torch.sin(40 * x)}
+        given["gravity"] = torch.tensor([0.0, -9.81, 1.0], dtype=x.dtype, device=device)
+        leaves: dict[str, Any] = {name: t.clone().requires_grad_() for name, t in given.items()}
+        end, velocity = dv.step(model, **leaves, lam=1.5 * mu, time_step=STEP, sweeps=sweeps)
+        loss = (torch.cos(3 * end) * end).sum() + (velocity * torch.sin(end)).sum()
+        results.append(
+            dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values()), allow_unused=True), strict=True))
+        )
+    auto, expected = results
+    used = {name for name, bar in expected.items() if bar is not None and bar.any()}
+    # without sweeps x + h v knows neither loads nor material
+    unused = set() if sweeps else {"mu"} | ({"force", "gravity"} if taken == "inertia" else set())
+    assert used == set(auto) - unused
+    for name, bar in expected.items():
+        if name in used:
+            assert relative_error(auto[name], bar) <= tolerance("formula"), name
+        else:
+            assert auto[name] is None or not auto[name].any(), name
+
+
+def test_gradients_of_bodies_that_choose_differently(device: str) -> None:
+    """Each body's rows are those of the start that it took."""
+    mesh, half = two_beams(), MESH.num_vertices
+    mu, bars = by_tet(SOFT, STIFF, device=device), {}
+    for start in ("auto", *STARTS):
+        model = model_of(start, device, mesh)
+        x, v = moving(model)
+        leaves = [x.clone().requires_grad_(), v.clone().requires_grad_(), torch.zeros_like(x).requires_grad_()]
+        end = dv.step(model, *leaves[:2], mu=mu, lam=1.5 * mu, force=leaves[2], time_step=STEP, sweeps=2)[0]
+        bars[start] = torch.autograd.grad((torch.cos(3 * end) * end).sum(), leaves)
+    for auto, y, coasting in zip(*bars.values(), strict=True):
+        assert relative_error(auto[:half], y[:half]) <= tolerance("formula")
+        assert relative_error(auto[half:], coasting[half:]) <= tolerance("formula")
+        assert auto[:half].any() and auto[half:].any()
+        assert relative_error(y[half:], coasting[half:]) > 1e-6
+
+
+def test_a_stiff_cantilever_under_few_sweeps(device: str) -> None:
+    """Off converged steps, after half a second and in units of how far these have moved."""
+    mesh, steps = dv.mesh.beam(11, 3, 3, size=(1.0, 0.2, 0.2)), 30
+    options = {"mu": 1e7, "lam": 1.5e7, "time_step": STEP, "steps": steps, "save": "last"}
+
+    def end(start: Any, sweeps: int, relaxation: float = 1.0) -> Tensor:
+        model = model_of(start, device, mesh, relaxation=relaxation)
+        x = model.rest_points
+        return dv.rollout(model, x, torch.zeros_like(x), sweeps=sweeps, **options).x[-1]
+
+    goal = end("inertia", 1500, 1.6)
+    moved = float((goal - model_of("auto", device, mesh).rest_points).norm(dim=-1).max())
+    off = {start: float((end(start, 20) - goal).norm(dim=-1).max()) / moved for start in ("auto", "predictor")}
+    assert moved > 1e-3
+    assert off["auto"] < 1
+    assert off["predictor"] > 10 * off["auto"]
+
+
+def test_what_is_executed(device: str) -> None:
+    """`starts_from`: there is nothing to choose where every body is corrected, nor beside friction and pairs."""
+    free, floor = dv.Model(MESH, device=device), dv.FloorBarrier(height=-1.0)
+    friction = (dv.StableNeoHookean(), floor, dv.Friction(0.3))
+    pairs = (dv.StableNeoHookean(), dv.PairBarrier(1e3, 1e-2))
+    assert model_of("auto", device).starts_from == "auto"
+    assert dv.Model(MESH, rigid=False, device=device).starts_from == "auto"
+    assert {free.starts_from, *(model_of("auto", device, energies=e).starts_from for e in (friction, pairs))} == {
+        "predictor"
+    }
+    for start in STARTS:
+        model = model_of(start, device)
+        assert model.start == model.starts_from == start and f'start="{start}"' in repr(model)
+        assert model.to(dtype=torch.float32).start == start
+    assert model_of("auto", device).start == "auto" and "start" not in repr(model_of("auto", device))
+
+
+def test_bad_starts(device: str) -> None:
+    for start in ("rest", "Auto", None, 1):
+        with pytest.raises((ValueError, TypeError), match='^start: expected "auto", "predictor" or "inertia", got '):
+            model_of(start, device)
+    pairs = (dv.StableNeoHookean(), dv.PairBarrier(1e3, 1e-2))
+    with pytest.raises(ValueError, match='^start: expected "auto" or "predictor" beside a PairBarrier.*"inertia"'):
+        model_of("inertia", device, energies=pairs)

@@ -1,0 +1,352 @@
+"""The step's arguments: broadcasting, shapes of gradients, what leaves no tape, tapes without autograd, energies."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.results import saved_bytes
+from helpers.values import STEP, uniform
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd.testing import build_scene, evaluate, relative_error, tolerance
+
+GROUND = {"height": -0.06, "kappa": 2e4, "dhat": 0.1, "damping": 20.0}
+
+
+def beam_model(device: str, **options: Any) -> dv.Model:
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(**GROUND), dv.Anchor(50.0))
+    return dv.Model(dv.mesh.box((3, 2, 2)), **{"pinned": [0, 1], "energies": energies, **options}, device=device)
+
+
+def state(model: dv.Model, *lead: int) -> tuple[Tensor, Tensor]:
+    shape = (*lead, model.num_vertices, 3)
+    x, v = uniform(*shape, low=-0.03, high=0.03), uniform(*shape, low=-1.0, high=0.5)
+    return model.rest_points + x.to(model.device), v.to(model.device)
+
+
+def total(x: Tensor, v: Tensor) -> Tensor:
+    weights = uniform(*x.shape).to(x.device)
+    return (weights * (x.square() + 0.01 * v.square())).sum()
+
+
+# Name of an argument, its own shape (letters: V vertices, T tets) and its size.
+OWN = {
+    "mu": ("T", 1e4),
+    "lam": ("T", 1e4),
+    "density": ("T", 1e3),
+    "force": ("V3", 5.0),
+    "gravity": ("13", 5.0),
+    "prescribed": ("V3", 0.1),
+    "rest_points": ("V3", 0.05),
+    "floor_barrier.kappa": ("", 2e4),
+    "floor_barrier.dhat": ("", 0.1),
+    "floor_barrier.damping": ("", 20.0),
+    "floor_barrier.height": ("1", -0.06),
+    "floor_barrier.normal": ("13", 1.0),
+    "anchor.stiffness": ("V", 50.0),
+    "anchor.points": ("V3", 0.1),
+}
+
+
+def own_shape(model: dv.Model, name: str) -> tuple[int, ...]:
+    sizes = {"V": model.num_vertices, "T": model.num_tets}
+    return tuple(sizes.get(letter) or int(letter) for letter in OWN[name][0])
+
+
+def value_of(model: dv.Model, name: str, shape: tuple[int, ...]) -> Tensor:
+    value = OWN[name][1] * uniform(*shape).to(model.device)
+    if name in ("prescribed", "rest_points", "anchor.points") and shape[-2:] == (model.num_vertices, 3):
+        value = value + model.rest_points
+    if name == "prescribed" and shape[-2:] == (model.num_vertices, 3):
+        value = torch.where(model.pinned[:, None], value, torch.nan)
+    if name == "floor_barrier.normal":
+        value = 0.1 * value + torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64, device=model.device)
+    return value
+
+
+def broadcast_cases() -> list[tuple[str, tuple[int, ...], str]]:
+    """(argument, leading shape of x, shape of the value, in which 'own' stands for the argument's own shape)."""
+    cases = []
+    for name in OWN:
+        cases += [(name, (), "own"), (name, (3,), "own"), (name, (3,), "3,own"), (name, (2, 3), "2,3,own")]
+        cases += [(name, (2, 3), "3,own"), (name, (2, 3), "2,1,own"), (name, (1,), "own"), (name, (3,), "1,own")]
+        if name in ("mu", "lam", "density"):
+            cases += [(name, (3,), "3,1"), (name, (2, 3), "2,1,1"), (name, (3,), ""), (name, (2, 3), "1")]
+    return cases
+
+
+@pytest.mark.parametrize(("name", "lead", "spec"), broadcast_cases())
+def test_broadcasting_equals_a_loop_over_scenes(
+    device: str, one_regime: None, name: str, lead: tuple[int, ...], spec: str
+) -> None:
+    model = beam_model(device)
+    own = own_shape(model, name)
+    shape = tuple(n for part in spec.split(",") if part for n in (own if part == "own" else (int(part),)))
+    value = value_of(model, name, shape).requires_grad_()
+    # the value that each scene sees, by torch's own broadcasting
+    full = value.expand((*lead, *(own if spec.endswith("own") else (model.num_tets,))))
+    x, v = state(model, *lead)
+
+    def run(x: Tensor, v: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+        options: dict[str, Any] = {"mu": 1e4, "lam": 2e4}
+        options |= {"parameters": {name: value}} if "." in name else {name: value}
+        return dv.step(model, x, v, **options, **STEP)
+
+    actual = run(x, v, value)
+    scenes = list(np.ndindex(*lead))
+    expected = [run(x[i], v[i], full[i]) for i in scenes]
+    for k in range(2):
+        assert actual[k].shape == x.shape
+        assert torch.equal(actual[k], torch.stack([e[k] for e in expected]).reshape(x.shape))
+    (slope,) = torch.autograd.grad(total(*actual), value)
+    looped = total(*(torch.stack([e[k] for e in expected]).reshape(x.shape) for k in range(2)))
+    (expected_slope,) = torch.autograd.grad(looped, value)
+    assert slope.shape == value.shape
+    assert expected_slope.abs().max() > 0
+    assert relative_error(slope, expected_slope) <= tolerance("cancelling")
+
+
+def test_python_numbers_mean_constant_tensors(device: str) -> None:
+    model = beam_model(device)
+    x, v = state(model, 2)
+    numbers = {"mu": 1e4, "lam": 2e4, "density": 900.0}
+    tensors = {k: torch.tensor(a, dtype=torch.float64, device=device) for k, a in numbers.items()}
+    kappa = {"floor_barrier.kappa": 1e4}
+    actual = dv.step(model, x, v, **numbers, gravity=[0, -5, 1], parameters=kappa, **STEP)
+    kappa = {"floor_barrier.kappa": torch.tensor(1e4, dtype=torch.float64, device=device)}
+    gravity = torch.tensor([0.0, -5.0, 1.0], dtype=torch.float64, device=device)
+    expected = dv.step(model, x, v, **tensors, gravity=gravity, parameters=kappa, **STEP)
+    assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
+
+
+def test_defaults_are_the_models_own_values(device: str) -> None:
+    mesh = dv.mesh.box((3, 2, 2))
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(**GROUND))
+    model = dv.Model(mesh, density=700.0, pinned=[0], energies=energies, device=device)
+    x, v = state(model)
+    plain = dv.step(model, x, v, mu=1e4, lam=2e4, **STEP)
+    options = {"force": torch.zeros_like(x), "gravity": (0.0, -9.81, 0.0), "prescribed": x, "density": 700.0}
+    options |= {"rest_points": model.rest_points, "parameters": {"floor_barrier.kappa": 2e4}}
+    spelled = dv.step(model, x, v, mu=1e4, lam=2e4, **options, **STEP)
+    for a, b in zip(spelled, plain, strict=True):
+        assert relative_error(a, b) <= tolerance("sum")
+    moved = dv.step(model, x, v, mu=1e4, lam=2e4, prescribed=torch.where(model.pinned[:, None], x + 0.01, x), **STEP)
+    assert torch.equal(moved[0][0], x[0] + 0.01)
+    assert torch.isfinite(moved[0]).all() and (moved[0][1:] - plain[0][1:]).abs().max() > 1e-6
+
+
+def test_strided_inputs_mean_their_values(device: str) -> None:
+    model = beam_model(device)
+    x, v = state(model, 2)
+    strided = [torch.stack([t, t + 1e9], -1)[..., 0] for t in (x, v)]
+    strided[1] = v.transpose(0, 1).contiguous().transpose(0, 1)
+    mu = torch.stack([1e4 * uniform(model.num_tets), -uniform(model.num_tets)], -1).to(device)
+    assert not any(t.is_contiguous() for t in (*strided, mu[:, 0]))
+    actual = dv.step(model, *strided, mu=mu[:, 0], lam=2e4, force=strided[1], **STEP)
+    expected = dv.step(model, x, v, mu=mu[:, 0].contiguous(), lam=2e4, force=v, **STEP)
+    assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
+
+
+def same(a: Tensor, b: Tensor) -> bool:
+    """To the bit, NaN included: it stands where `prescribed` is not read."""
+    return torch.equal(a.nan_to_num(nan=1e99), b.nan_to_num(nan=1e99))
+
+
+def test_inputs_are_untouched_and_steps_repeat(device: str) -> None:
+    scene = build_scene("floor_damped")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    flat = {k: t for k, t in inputs.items() if isinstance(t, Tensor)} | inputs["parameters"]
+    constants = {k: t.clone() for k, t in vars(model).items() if isinstance(t, Tensor)}
+    before = {k: t.clone() for k, t in flat.items()}
+    results = [evaluate(lambda **o: dv.step(model, sweeps=4, **o), inputs) for _ in range(2)]
+    assert all(same(flat[k], before[k]) for k in flat)
+    assert all(torch.equal(getattr(model, k), constants[k]) for k in constants)
+    assert results[0].keys() == results[1].keys()
+    assert all(torch.equal(results[0][k], results[1][k]) for k in results[0])
+
+
+# --- what requires no grad leaves no tape -----------------------------------------------------------------------------
+
+
+def test_without_grad_nothing_is_saved(device: str) -> None:
+    model = beam_model(device)
+    x, v = state(model)
+    assert saved_bytes(lambda: dv.step(model, x, v, mu=1e4, lam=2e4, density=900.0, **STEP)) == 0
+    mu = torch.tensor(1e4, dtype=torch.float64, device=device, requires_grad=True)
+    with torch.no_grad():
+        assert saved_bytes(lambda: dv.step(model, x, v, mu=mu, lam=2e4, **STEP)) == 0
+    step = dv.step(model, x, v, mu=1e4, lam=2e4, **STEP)
+    assert not step[0].requires_grad and not step[1].requires_grad
+
+
+def test_a_tape_exists_only_for_steps_that_need_one(device: str) -> None:
+    """Velocity alone: the tape; with recompute: no tape; through the last of two steps only: one tape."""
+    model = beam_model(device, energies=(dv.StableNeoHookean(),))
+    x, v = state(model)
+    leaf = v.clone().requires_grad_()
+    sweeps = 20
+    full = sweeps * model.num_active * 72
+
+    def run(first: Tensor, second: Tensor, tape: str) -> Tensor:
+        adjoint = dv.ReverseSweep(tape)
+        state = (x, first)
+        for velocity in (first, second):
+            state = dv.step(model, state[0], velocity, mu=1e4, lam=2e4, time_step=0.01, sweeps=sweeps, adjoint=adjoint)
+        return state[0]
+
+    own = [t for t in vars(model).values() if isinstance(t, Tensor)]
+    once = saved_bytes(lambda: run(v, leaf, "full"), own)
+    twice = saved_bytes(lambda: run(leaf, leaf, "full"), own)
+    nothing = saved_bytes(lambda: run(leaf, leaf, "recompute"), own)
+    assert full <= once < 1.5 * full
+    assert 2 * full <= twice < 2.5 * full
+    assert nothing < 0.5 * full
+
+
+# --- tapes without autograd -------------------------------------------------------------------------------------------
+
+
+def leaves_of(inputs: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The inputs with every tensor a fresh leaf, and those leaves by name."""
+    flat = {k: t for k, t in inputs.items() if isinstance(t, Tensor)} | inputs.get("parameters", {})
+    leaves = {k: t.clone().requires_grad_() for k, t in flat.items()}
+    call = {k: leaves.get(k, value) for k, value in inputs.items()}
+    if "parameters" in inputs:
+        call["parameters"] = {k: leaves[k] for k in inputs["parameters"]}
+    return call, leaves
+
+
+@pytest.mark.parametrize("case", ["plain", "paper", "floor_damped", "anchored", "batch"])
+def test_step_forward_and_backward_equal_autograd(device: str, case: str) -> None:
+    scene = build_scene(case)
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    call, leaves = leaves_of(inputs)
+    out = dv.step(model, sweeps=3, **call)
+    grad_x, grad_v = (uniform(*t.shape, low=-1.0, high=1.0).to(device) for t in out)
+    expected = torch.autograd.grad(out, list(leaves.values()), (grad_x, grad_v), allow_unused=True, retain_graph=True)
+    of_x = torch.autograd.grad(out[0], list(leaves.values()), grad_x, allow_unused=True)
+    with torch.no_grad():
+        x, v, tape = dv.step_forward(model, sweeps=3, wrt=tuple(leaves), **inputs)
+        assert torch.equal(x, out[0]) and torch.equal(v, out[1])
+        assert not x.requires_grad and not v.requires_grad
+        for _ in range(2):
+            grads = dv.step_backward(tape, grad_x, grad_v)
+            assert list(grads) == list(leaves)
+            for (name, leaf), slope in zip(leaves.items(), expected, strict=True):
+                assert grads[name].shape == leaf.shape
+                assert torch.equal(grads[name], torch.zeros_like(leaf) if slope is None else slope), name
+        for name, slope in zip(leaves, of_x, strict=True):
+            assert slope is None or torch.equal(dv.step_backward(tape, grad_x)[name], slope), name
+    assert sum(float(g.abs().max()) > 0 for g in grads.values()) >= 5
+    assert all(not t.requires_grad for t in inputs.values() if isinstance(t, Tensor))
+
+
+def test_step_forward_keeps_a_tape_for_wrt_only(device: str) -> None:
+    model = beam_model(device, energies=(dv.StableNeoHookean(),))
+    x, v = state(model)
+    _, _, tape = dv.step_forward(model, x, v, mu=1e4, lam=2e4, **STEP)
+    assert set(dv.step_backward(tape, torch.ones_like(x))) == {"x", "v"}
+    _, _, tape = dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=("mu", "rest_points", "density"), **STEP)
+    grads = dv.step_backward(tape, torch.ones_like(x))
+    assert {k: tuple(t.shape) for k, t in grads.items()} == {
+        "mu": (), "rest_points": (model.num_vertices, 3), "density": (model.num_tets,)}  # fmt: skip
+    assert all(t.abs().max() > 0 for t in grads.values())
+    zero = dv.step_backward(tape)
+    assert all(torch.equal(zero[k], torch.zeros_like(t)) for k, t in grads.items())
+    assert saved_bytes(lambda: dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=(), **STEP)) == 0
+    with pytest.raises(ValueError, match="grad_x.*got"):
+        dv.step_backward(tape, torch.ones(2, 3, dtype=torch.float64, device=device))
+    with pytest.raises((ValueError, TypeError), match="wrt.*force"):
+        dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=("force",), **STEP)
+    with pytest.raises((ValueError, TypeError), match="wrt.*stiffness"):
+        dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=("stiffness",), **STEP)
+
+
+# --- check_gradients --------------------------------------------------------------------------------------------------
+
+
+class WrongBackward(torch.autograd.Function):
+    """The identity with a gradient that is 1 % too large."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor) -> Tensor:
+        return value.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        return 1.01 * grads[0]
+
+
+def test_check_gradients_tells_right_from_wrong(device: str, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = build_scene("anchored")
+    model, inputs = scene.model(device), scene.inputs(device=device)
+    arguments = {k: inputs[k] for k in ("x", "v", "mu", "lam", "force", "rest_points", "density")}
+    rest = {k: value for k, value in inputs.items() if k not in arguments}
+
+    def loss(**given: Tensor) -> Tensor:
+        return total(*dv.step(model, **given, **rest, sweeps=3))
+
+    right = dv.check_gradients(loss, arguments)
+    assert right.ok, str(right)
+    assert [row[0] for row in right.rows] == list(arguments)
+    assert all(row[1] > 0 for row in right.rows)
+    assert "mu" in capsys.readouterr().out
+    wrong = dv.check_gradients(lambda **a: loss(**(a | {"mu": WrongBackward.apply(a["mu"])})), arguments, verbose=False)
+    assert not wrong.ok
+    assert [row[0] for row in wrong.rows if row[4] > wrong.tolerance] == ["mu"]
+    assert capsys.readouterr().out == "" and "above tolerance" in str(wrong)
+    with pytest.raises(ValueError, match="x.*float32"):
+        dv.check_gradients(loss, {"x": arguments["x"].float()})
+    with pytest.raises(ValueError, match="loss.*scalar"):
+        dv.check_gradients(lambda x: x, {"x": arguments["x"]})
+
+
+# --- vertex energies end to end ---------------------------------------------------------------------------------------
+
+
+def test_anchor_pulls_chosen_vertices_to_their_points(device: str) -> None:
+    """A free vertex without elastic energy is a damped spring: implicit Euler has a closed form."""
+    mesh = dv.mesh.cube()
+    points = torch.from_numpy(mesh.points.copy()) + 0.1
+    k, h = 30.0, 0.02
+    model = dv.Model(mesh, density=6.0, energies=(dv.Anchor(k, points=points, vertices=[2, 5]),), device=device)
+    x, v = state(model)
+    new, speed = dv.step(model, x, v, mu=0.0, lam=0.0, time_step=h, sweeps=1, gravity=(0.0, 0.0, 0.0))
+    m = model.mass[:, None]
+    y = x + h * v
+    chosen = torch.zeros(8, 1, dtype=torch.bool).index_fill(0, torch.tensor([2, 5]), True)
+    chosen, points = chosen.to(device), points.to(device)
+    expected = torch.where(chosen, (m * y + h * h * k * points) / (m + h * h * k), y)
+    assert relative_error(new, expected) <= tolerance("formula")
+    assert relative_error(speed, (expected - x) / h) <= tolerance("cancelling")
+    by_mask = dv.Model(mesh, density=6.0, energies=(dv.Anchor(k, points=points, vertices=chosen[:, 0]),), device=device)
+    assert torch.equal(dv.step(by_mask, x, v, mu=0.0, lam=0.0, time_step=h, sweeps=1, gravity=(0, 0, 0))[0], new)
+    stiffness = torch.full((8,), k, dtype=torch.float64, device=device, requires_grad=True)
+    options = {"mu": 0.0, "lam": 0.0, "time_step": h, "sweeps": 1, "gravity": (0.0, 0.0, 0.0)}
+    out = dv.step(model, x, v, parameters={"anchor.stiffness": stiffness}, **options)
+    (slope,) = torch.autograd.grad(out[0].sum(), stiffness)
+    formula = (h * h * m * (points - y) / (m + h * h * k) ** 2).sum(-1) * chosen[:, 0]
+    assert relative_error(slope, formula) <= tolerance("cancelling")
+
+
+def test_several_planes_keep_a_body_in_a_corner(device: str) -> None:
+    mesh = dv.mesh.cube(3, 0.2)
+    floor = dv.FloorBarrier(height=(0.0, 0.0), normal=((0.0, 2.0, 0.0), (1.0, 1.0, 0.0)), kappa=1e3, dhat=0.05)
+    model = dv.Model(mesh.translate([0.1, 0.1, 0.0]), energies=(dv.StableNeoHookean(), floor), device=device)
+    thrown = torch.tensor([-30.0, -30.0, 0.0], dtype=torch.float64, device=device)
+    x, v = model.rest_points, thrown.expand(model.num_vertices, 3)
+    closest = []
+    for _ in range(20):
+        x, v = dv.step(model, x, v, mu=1e4, lam=1e4, time_step=0.01, sweeps=3)
+        closest.append(torch.stack([x[:, 1].min(), ((x[:, 0] + x[:, 1]) / math.sqrt(2)).min()]))
+    gaps = torch.stack(closest)
+    assert (gaps > 0).all()
+    assert (gaps.min(0).values < 0.05).all()  # both planes were met
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(kappa=1e3))
+    one = dv.Model(mesh.translate([0.1, 0.1, 0.0]), energies=energies, device=device)
+    x, v = one.rest_points, thrown.expand(one.num_vertices, 3)
+    x, _ = dv.step(one, x, v, mu=1e4, lam=1e4, time_step=0.01, sweeps=3)
+    assert (x[:, 0] + x[:, 1]).min() < 0  # without the second plane the body crosses it
