@@ -2,31 +2,44 @@
 // the scenes share a tensor, a last size of 1 in a material that all tets do.
 #include <torch/csrc/stable/library.h>
 
+#include <string>
+
+#include "fields.h"
+
+namespace {
+
+// numbers: time_step, regularization, relaxation, saturation (< 0: none), saturation_eps, filter_eta, relaxation of the
+// last sweep, motion within a step below which friction is smoothed
+// sizes: active vertices, tets, slots of the plan; on CUDA also the rest of its header and color_block (plan_sizes in
+// diffvbd/ops/fields.py)
+// data_count: scalars per scene, or per vertex, of each energy of one vertex
+// launch: on CUDA the regime and the threads per vertex of the sweeps and of their reverse, else empty
+#define DIFFVBD_SETTINGS                                                                                      \
+  "Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, int sweeps, int[] launch, int " \
+  "tape_policy"
+
+// Fields come first; what is returned ends without the comma of its last.
+void define(torch::stable::detail::StableLibrary& m, const std::string& name, const std::string& fields,
+            const std::string& others, const std::string& returns) {
+  m.def((name + "(" + fields + others + ") -> (" + returns.substr(0, returns.size() - 2) + ")").c_str());
+}
+
+}  // namespace
+
 STABLE_TORCH_LIBRARY(diffvbd, m) {
-  // fields: see bind/fields.h. cut [scenes, vertices]: 1 where a bound has held back an update; empty without contact.
-  // numbers: time_step, regularization, relaxation, saturation (< 0: none), saturation_eps, filter_eta,
-  // relaxation of the last sweep, motion within a step below which friction is smoothed
-  // sizes: active vertices, tets, slots of the plan; on CUDA also the rest of its header and color_block (plan_sizes in
-  // diffvbd/ops/fields.py)
-  // data_count: scalars per scene, or per vertex, of each energy of one vertex
-  // launch: on CUDA the regime and the threads per vertex of the sweeps and of their reverse, else empty
-  m.def(
-      "sweep(Tensor[] fields, Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, int sweeps, "
-      "int[] launch, int tape_policy, int debug_step, bool checked) -> (Tensor x, Tensor tape, Tensor cut)");
-  // x: the end of the sweeps; wants: material, mass, rest, energy_data; the adjoints are those of SweepBars
-  m.def(
-      "sweep_backward(Tensor x_bar, Tensor x, Tensor[] fields, Tensor tape, Tensor plan, int[] sizes, int energies, "
-      "int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] wants) -> Tensor[]");
+  // cut [scenes, vertices]: 1 where a bound has held back an update; empty without contact
+  define(m, "sweep", DIFFVBD_ARGUMENTS(SWEEP), DIFFVBD_SETTINGS ", int debug_step, bool checked",
+         "Tensor x, Tensor tape, Tensor cut, ");
+  // x: the end of the sweeps; wants: material, mass, rest, energy_data
+  define(m, "sweep_backward", DIFFVBD_ARGUMENTS(SWEEP),
+         "Tensor x_bar, Tensor x, Tensor tape, " DIFFVBD_SETTINGS ", bool[] wants", DIFFVBD_RETURNS(SWEEP));
   // CUDA only: predictor and velocity in the same launches, for scenes whose only energy is that of the tets.
   // prescribed: where pinned vertices go, or empty.
-  m.def(
-      "fused_step(Tensor[] fields, Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, int "
-      "sweeps, int[] launch, int tape_policy) -> (Tensor x, Tensor v, Tensor tape)");
+  define(m, "fused_step", DIFFVBD_ARGUMENTS(STEP), DIFFVBD_SETTINGS, "Tensor x, Tensor v, Tensor tape, ");
   // x_bar, v_bar: empty where there is none; wants: x, v, acceleration, prescribed, material, mass, rest
-  m.def(
-      "fused_step_backward(Tensor x_bar, Tensor v_bar, Tensor x_end, Tensor[] fields, Tensor tape, Tensor plan, int[] "
-      "sizes, int energies, int[] data_count, float[] numbers, int sweeps, int[] launch, int tape_policy, bool[] "
-      "wants) -> Tensor[]");
+  define(m, "fused_step_backward", DIFFVBD_ARGUMENTS(STEP),
+         "Tensor x_bar, Tensor v_bar, Tensor x_end, Tensor tape, " DIFFVBD_SETTINGS ", bool[] wants",
+         DIFFVBD_RETURNS(STEP));
   // The lowest vertex above each plane of a floor, of the island that a body is in; planes as in the data of
   // FloorBarrier
   m.def(
@@ -49,36 +62,38 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "Tensor outside)");
   m.def(
       "contact_start_backward(Tensor bounds_bar, Tensor start_bar, Tensor move_bar, Tensor x, Tensor move, Tensor "
-      "goal, "
-      "Tensor u, Tensor near, Tensor origin, Tensor planes, Tensor held, Tensor body, float gamma, float cap, float "
-      "filter_eta, bool wants_planes) -> (Tensor x, Tensor move, Tensor goal, Tensor u, Tensor gap, Tensor planes)");
+      "goal, Tensor u, Tensor near, Tensor origin, Tensor planes, Tensor held, Tensor body, float gamma, float cap, "
+      "float filter_eta, bool wants_planes) -> (Tensor x, Tensor move, Tensor goal, Tensor u, Tensor gap, Tensor "
+      "planes)");
   // Normal force, 1 where active, normal and weights of each pair [pairs, 9], and the adjoint of x, collider and kappa
   m.def(
       "contact_lag(Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor constants, Tensor ptr, "
-      "Tensor "
-      "entry) -> Tensor");
+      "Tensor entry) -> Tensor");
   m.def(
       "contact_lag_backward(Tensor bar, Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor "
       "constants, Tensor ptr, Tensor entry) -> (Tensor x, Tensor collider, Tensor kappa)");
   // The rigid correction of each body that is listed, and the velocity (x - x_prev) / h. groups: how many bodies a
   // thread, a part of a warp, a block and the whole device work on (CUDA)
-  m.def("rigid(Tensor[] fields, int[] groups, int[] data_count, float time_step) -> (Tensor x, Tensor v)");
+  define(m, "rigid", DIFFVBD_ARGUMENTS(RIGID), "int[] groups, int[] data_count, float time_step",
+         "Tensor x, Tensor v, ");
   // v_bar: empty where there is none. Adjoints of x, x_prev (empty without energies and v_bar), y, mass, and of data:
   // [scenes, bodies, scalars of a scene] and [scenes, vertices, scalars of a vertex]
-  m.def(
-      "rigid_backward(Tensor x_bar, Tensor v_bar, Tensor[] fields, int[] groups, int[] data_count, float time_step, "
-      "bool wants_data) -> (Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own)");
+  define(m, "rigid_backward", DIFFVBD_ARGUMENTS(RIGID),
+         "Tensor x_bar, Tensor v_bar, int[] groups, int[] data_count, float time_step, bool wants_data",
+         "Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own, ");
   // Predictor and start of the sweeps. start: of the bodies that are not corrected, 0 x + h v, 1 y, 2 the lower
   // potential of the two; falls [scenes, other bodies]: 1 where that is y
-  m.def(
-      "begin(Tensor[] fields, int[] groups, int[] other_groups, int[] data_count, float time_step, float filter_eta, "
-      "int start, bool filters) -> (Tensor x_start, Tensor y, Tensor falls)");
+  define(m, "begin", DIFFVBD_ARGUMENTS(BEGIN),
+         "int[] groups, int[] other_groups, int[] data_count, float time_step, float filter_eta, int start, bool "
+         "filters",
+         "Tensor x_start, Tensor y, Tensor falls, ");
   // wants: acceleration, prescribed, energy_data. Of data: from corrections as of rigid_backward(), and of the planes
   // by vertex [scenes, vertices, scalars of the planes]
-  m.def(
-      "begin_backward(Tensor x_start_bar, Tensor y_bar, Tensor falls, Tensor[] fields, int[] groups, int[] data_count, "
-      "float time_step, float filter_eta, int start, bool filters, bool[] wants) -> (Tensor x, Tensor v, Tensor "
-      "acceleration, Tensor prescribed, Tensor mass, Tensor shared, Tensor own, Tensor planes)");
+  define(m, "begin_backward", DIFFVBD_ARGUMENTS(BEGIN),
+         "Tensor x_start_bar, Tensor y_bar, Tensor falls, int[] groups, int[] data_count, float time_step, float "
+         "filter_eta, int start, bool filters, bool[] wants",
+         "Tensor x, Tensor v, Tensor acceleration, Tensor prescribed, Tensor mass, Tensor shared, Tensor own, Tensor "
+         "planes, ");
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");
   m.def(
       "build_plan(Tensor points, Tensor tets, Tensor active, int lanes) -> (Tensor plan, Tensor color_ptr, Tensor "

@@ -90,8 +90,9 @@ template <class In, class Make>
 SweepBars make_bars(const Tensor& x, const In& in, int64_t vertices, int64_t tets, int64_t materials, bool zeroed,
                     const std::vector<bool>& wants, const Make& make) {
   require(wants.size() == 4, "diffvbd::sweep_backward: expected 4 wishes");
-  const Tensor none = make({0}, false);
-  SweepBars bars{none, none, none, none, none, none, none, none, none, none, none, none, none, none};
+  const auto none = [&] { return make({0}, false); };
+  SweepBars bars{none(), none(), none(), none(), none(), none(), none(),
+                 none(), none(), none(), none(), none(), none(), none()};
   const std::vector<int64_t> state{in.scenes, vertices, 3};
   bars.x_start = make(state, false), bars.x_prev = make(state, zeroed), bars.y = make(state, false);
   make_body_bars(bars, in, vertices, tets, materials, zeroed, {wants[0], wants[1], wants[2]}, make);

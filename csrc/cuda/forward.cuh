@@ -21,7 +21,7 @@ __device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Tu
   const int rank = __ldg(s.plan.block_rank + at.block) + at.v, end_rank = __ldg(s.plan.block_rank + at.block + 1);
   if (rank - at.group >= end_rank) return true;  // the whole warp: phantoms alone
   GroupStar<T, lanes> star(s, at, shared);
-  star.fetch_neighbours(s.own);
+  if (s.has_tets) star.fetch_neighbours(s.own);
   const Block<T> b = load_block<Set>(s, at, s.own);
   if constexpr (Set::usual && Set::filters) {
     if (star.any(is_oblique<Set>(b, b.state.x))) return false;

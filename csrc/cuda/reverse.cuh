@@ -55,9 +55,9 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
       if (is_rare<Set>(before, star, r.H)) return false;
     }
   }
-  star.clear_sums(shared);
+  if (s.has_tets) star.clear_sums(shared);
   const Vec3<T> x_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
-  star.fetch_neighbours(false);
+  if (s.has_tets) star.fetch_neighbours(false);
   const StepParameters<T> q = of_sweep(s.parameters, turn.number == 0);
   const Update<T> u = replayed<Set>(b, star, r, full, q);
   if constexpr (Set::usual) {
@@ -69,14 +69,16 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
       reverse_vertex<Set, wanted>(b, star, u, r, x_bar, q, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
         if (writes) s.w.data_bar[(scene * s.data_scalars + s.data_row[k] + i) * s.positions + position] += value;
       });
-  star.send_rows(__ldg(s.plan.color_block + s.plan.colors) * kSlice);
-  if constexpr ((wanted & kMaterial) != 0) {
-    if (s.one_material) {
-      T* to = s.w.material_bar + row * kMaterialScalars;
-#pragma unroll
-      for (int i = 0; i < kMaterialScalars; ++i) {
-        star.total(star.material_bar[i]);
-        if (writes) to[i] += star.material_bar[i];
+  if (s.has_tets) {
+    star.send_rows(__ldg(s.plan.color_block + s.plan.colors) * kSlice);
+    if constexpr ((wanted & kMaterial) != 0) {
+      if (s.one_material) {
+        T* to = s.w.material_bar + row * kMaterialScalars;
+  #pragma unroll
+        for (int i = 0; i < kMaterialScalars; ++i) {
+          star.total(star.material_bar[i]);
+          if (writes) to[i] += star.material_bar[i];
+        }
       }
     }
   }

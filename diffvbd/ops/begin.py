@@ -11,17 +11,22 @@ from .rigid import scalars_of_data
 STARTS = {"inertia": 0, "predictor": 1, "auto": 2}  # twins of From in csrc/start/begin.h
 
 
+_FIELDS = len(BeginFields._fields)
+
+
 @torch.library.register_fake("diffvbd::begin")
-def _(fields, groups, other_groups, data_count, time_step, filter_eta, start, filters):
-    f = BeginFields(*fields)
+def _(*arguments):
+    f = BeginFields(*arguments[:_FIELDS])
+    *_, start, _ = arguments[_FIELDS:]
     scenes = f.x.shape[0] if start == STARTS["auto"] else 0
     falls = f.x.new_empty((scenes, f.other_ptr.shape[0] - 1), dtype=torch.uint8)
     return torch.empty_like(f.x), torch.empty_like(f.x), falls
 
 
 @torch.library.register_fake("diffvbd::begin_backward")
-def _(x_start_bar, y_bar, falls, fields, groups, data_count, time_step, filter_eta, start, filters, wants):
-    f = BeginFields(*fields)
+def _(*arguments):
+    f = BeginFields(*arguments[:_FIELDS])
+    _, _, _, _, data_count, _, _, _, filters, wants = arguments[_FIELDS:]
     x, (b, v) = f.x, f.x.shape[:2]
     shared, own = scalars_of_data(data_count)
 

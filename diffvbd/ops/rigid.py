@@ -31,14 +31,18 @@ def join_data(shared: Tensor, own: Tensor, data_count: Sequence[int]) -> Tensor:
     return torch.cat(parts, -1)
 
 
+_FIELDS = len(RigidFields._fields)
+
+
 @torch.library.register_fake("diffvbd::rigid")
-def _(fields, groups, data_count, time_step):
-    return torch.empty_like(fields[0]), torch.empty_like(fields[0])
+def _(*arguments):
+    return torch.empty_like(arguments[0]), torch.empty_like(arguments[0])
 
 
 @torch.library.register_fake("diffvbd::rigid_backward")
-def _(x_bar, v_bar, fields, groups, data_count, time_step, wants_data):
-    f = RigidFields(*fields)
+def _(*arguments):
+    f = RigidFields(*arguments[:_FIELDS])
+    _, v_bar, _, data_count, _, wants_data = arguments[_FIELDS:]
     x, (b, v) = f.x, f.x.shape[:2]
     shared, own = scalars_of_data(data_count)
     x_prev_bar = torch.empty_like(x) if f.energy_data.numel() or v_bar.numel() else x.new_empty((0,))

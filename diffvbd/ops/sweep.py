@@ -38,7 +38,7 @@ def sweep(fields: SweepFields, packed_rest: Tensor, plan: Tensor, settings: Swee
           debug_step: int = -1, checked: bool = False) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """x [B, V, 3], tape, and with contact where a bound has held back, uint8 [B, V]."""
     given = listed(fields, packed_rest, plan, settings)
-    return raw.sweep(given, plan, *settings, tape_policy, debug_step, checked)
+    return raw.sweep(*given, plan, *settings, tape_policy, debug_step, checked)
 
 
 def sweep_backward(x_bar: Tensor, x: Tensor, tape: Tensor, fields: SweepFields, packed_rest: Tensor, plan: Tensor,
@@ -47,16 +47,16 @@ def sweep_backward(x_bar: Tensor, x: Tensor, tape: Tensor, fields: SweepFields, 
     given = listed(fields, packed_rest, plan, settings)
     if tape_policy == NO_TAPE:
         tape_policy = FULL_TAPE
-        x, tape, _ = raw.sweep(given, plan, *settings, tape_policy, -1, False)
+        x, tape, _ = raw.sweep(*given, plan, *settings, tape_policy, -1, False)
     flags = [wants["mu"] or wants["lam"], wants["mass"], wants["rest"], wants["energy_data"]]
-    bars = raw.sweep_backward(x_bar.contiguous(), x, given, tape, plan, *settings, tape_policy, flags)
+    bars = raw.sweep_backward(*given, x_bar.contiguous(), x, tape, plan, *settings, tape_policy, flags)
     return dict(zip(SWEEP_ADJOINTS, bars, strict=True))
 
 
 def fused_step(fields: StepFields, packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int
                ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """x, v [B, V, 3] and tape of a step on CUDA whose only energy is that of the tets."""
-    return raw.fused_step(listed(fields, packed_rest, plan, settings), plan, *settings, tape_policy)
+    return raw.fused_step(*listed(fields, packed_rest, plan, settings), plan, *settings, tape_policy)
 
 
 def fused_step_backward(x_bar: Tensor | None, v_bar: Tensor | None, x: Tensor, tape: Tensor, fields: StepFields,
@@ -66,61 +66,64 @@ def fused_step_backward(x_bar: Tensor | None, v_bar: Tensor | None, x: Tensor, t
     given = listed(fields, packed_rest, plan, settings)
     if tape_policy == NO_TAPE:
         tape_policy = FULL_TAPE
-        x, _, tape = raw.fused_step(given, plan, *settings, tape_policy)
+        x, _, tape = raw.fused_step(*given, plan, *settings, tape_policy)
     out = [fields.x.new_empty((0,)) if bar is None else bar.contiguous() for bar in (x_bar, v_bar)]
     flags = [wants[name] for name in ("x", "v", "acceleration", "prescribed")]
     flags += [wants["mu"] or wants["lam"], wants["mass"], wants["rest"]]
-    bars = raw.fused_step_backward(*out, x, given, tape, plan, *settings, tape_policy, flags)
+    bars = raw.fused_step_backward(*given, *out, x, tape, plan, *settings, tape_policy, flags)
     return dict(zip(STEP_ADJOINTS, bars, strict=True))
 
 
+_FIELDS, _STEP_FIELDS = len(SweepFields._fields), len(StepFields._fields)
+
+
 @torch.library.register_fake("diffvbd::sweep")
-def _(fields, plan, sizes, energies, data_count, numbers, sweeps, launch, tape_policy, debug_step, checked):
-    x, contact = fields[0], fields[SweepFields._fields.index("bounds")].numel() > 0
+def _(*arguments):
+    f: Any = SweepFields(*arguments[:_FIELDS])
+    _, sizes, energies, _, _, sweeps, launch, tape_policy, *_ = arguments[_FIELDS:]
+    x, scenes = f.x_start, f.x_start.shape[0] if f.bounds.numel() else 0
     tape = x.new_empty(tape_shape(x, sizes, energies, sweeps, launch, tape_policy))
-    cut = x.new_empty((x.shape[0] if contact else 0, x.shape[1]), dtype=torch.uint8)
-    return torch.empty_like(x), tape, cut
+    return torch.empty_like(x), tape, x.new_empty((scenes, x.shape[1]), dtype=torch.uint8)
 
 
-def _body_adjoints(x: Tensor, f: SweepFields | StepFields, num_tets: int, wants: Sequence[bool]) -> list[Tensor]:
+def _body_adjoints(x: Tensor, f: Any, num_tets: int, wants: Sequence[bool]) -> list[Tensor]:
     """Empty adjoints of mu, lam, mass, rest. CUDA sums the material that a scene shares."""
     shares = f.mu.is_cuda and f.mu.shape[-1] == 1 and f.lam.shape[-1] == 1
     b, v = x.shape[:2]
     materials = (b, 1 if shares else num_tets)
     shapes = (materials, materials, (b, v), (b, num_tets, REST_SCALARS))
-    flags = (wants[0], *wants)
-    return [x.new_empty(shape if flag else (0,)) for shape, flag in zip(shapes, flags, strict=True)]
+    return [x.new_empty(shape if flag else (0,)) for shape, flag in zip(shapes, (wants[0], *wants), strict=True)]
 
 
 @torch.library.register_fake("diffvbd::sweep_backward")
-def _(x_bar, x, fields, tape, plan, sizes, energies, data_count, numbers, sweeps, launch, tape_policy, wants):
-    f: Any = SweepFields(*fields)
+def _(*arguments):
+    f: Any = SweepFields(*arguments[:_FIELDS])
+    _, x, _, _, sizes, *_, wants = arguments[_FIELDS:]
     b, v = x.shape[:2]
     own = [*(torch.empty_like(x) for _ in range(3)), *_body_adjoints(x, f, sizes[1], wants[:3])]
     own.append(x.new_empty((b, f.energy_data.shape[-1]) if wants[3] else (0,)))
     if f.bounds.numel() == 0:
-        return [*own, *(x.new_empty((0,)) for _ in range(len(SWEEP_ADJOINTS) - len(own)))]
+        return (*own, *(x.new_empty((0,)) for _ in range(len(SWEEP_ADJOINTS) - len(own))))
     colliders = f.collider.shape[1] if f.collider.dim() == 3 else 0
     planes = f.floor_lag.numel() // max(1, f.floor_lag.shape[0] * 4 * v)
     shapes = [(b, v, 4), (b, colliders, 3), (b, colliders, 3), (b,), (f.lag_pairs.shape[0], LAG_SCALARS),
               (b, v, planes, 4)]  # fmt: skip
-    return [*own, *(x.new_empty(shape) for shape in shapes)]
+    return (*own, *(x.new_empty(shape) for shape in shapes))
 
 
 @torch.library.register_fake("diffvbd::fused_step")
-def _(fields, plan, sizes, energies, data_count, numbers, sweeps, launch, tape_policy):
-    x = fields[0]
+def _(*arguments):
+    x, (_, sizes, energies, _, _, sweeps, launch, tape_policy) = arguments[0], arguments[_STEP_FIELDS:]
     tape = x.new_empty(tape_shape(x, sizes, energies, sweeps, launch, tape_policy))
     return torch.empty_like(x), torch.empty_like(x), tape
 
 
 @torch.library.register_fake("diffvbd::fused_step_backward")
-def _(
-    x_bar, v_bar, x_end, fields, tape, plan, sizes, energies, data_count, numbers, sweeps, launch, tape_policy, wants
-):
-    x = fields[0]
-    state = [x.new_empty(x.shape if flag else (0,)) for flag in wants[:4]]
-    return [*state, *_body_adjoints(x, StepFields(*fields), sizes[1], wants[4:])]
+def _(*arguments):
+    f = StepFields(*arguments[:_STEP_FIELDS])
+    _, _, _, _, _, sizes, *_, wants = arguments[_STEP_FIELDS:]
+    state = [f.x.new_empty(f.x.shape if flag else (0,)) for flag in wants[:4]]
+    return (*state, *_body_adjoints(f.x, f, sizes[1], wants[4:]))
 
 
 for _name in ("sweep", "sweep_backward", "fused_step", "fused_step_backward"):

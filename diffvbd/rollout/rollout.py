@@ -15,7 +15,7 @@ from ..checks import check_count, fail
 from ..model.model import Model
 from ..model.warnings import warn_of_thin_tets
 from ..scopes import looks_at
-from ..step.arguments import GRAVITY, Prepared, check_prescribed, check_state, prepare, step_settings
+from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
 from ..step.step import advance
 from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
 
@@ -107,35 +107,38 @@ def rollout(
         ValueError, TypeError: As step; also where a per_step value has another number of steps.
     """
     steps = check_count("steps", steps)
-    if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
-        fail("save", '"all", "last" or an integer > 0', repr(save))
+    _check_save(save)
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
     options = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "rest_points": rest_points,
                "density": density, "force": force, "gravity": gravity, "prescribed": prescribed,
                "colliders": colliders}  # fmt: skip
     _check_values(options, parameters, colliders_before, steps)
-    values = _Values.of(options, parameters or {})
+    # What a checkpointed segment reads again must not change in between: lists and dicts are copied. Plain dicts and
+    # functions of them: torch.compile takes no object of ours along.
+    options, own = ({k: _frozen(v) for k, v in given.items()} for given in (options, parameters or {}))
     # once: what a checkpoint runs again must run as it did, whatever dv.regime says by then
     settings = step_settings(model, lead, time_step, sweeps)
     chosen: dict[str, Any] = {"time_step": time_step, "sweeps": sweeps, "adjoint": adjoint, "settings": settings}
-    fixed = None if values.prepared_anew else prepare(model, lead, **chosen, **values.to_prepare(0, x, v))
+    anew = any(_changes(value) for value in (*(options[k] for k in _STATIC), *own.values()))
+    fixed = None if anew else prepare(model, lead, **chosen, **_to_prepare(options, own, 0, x, v))
     if fixed is not None and looks_at(fixed.mu) and looks_at(fixed.lam):
         warn_of_thin_tets(model, fixed.mu, fixed.lam, *fixed.time_step_and_sweeps)
-    for value in _tensors(values.options["prescribed"]):
+    for value in _tensors(options["prescribed"]):
         check_prescribed(model, value, x)
 
     scenes = x.numel() // max(1, 3 * model.num_vertices)
     every, adjoint = choose_schedule(checkpoint_every, adjoint, model, scenes, steps, sweeps)
-    one_step = _OneStep(model, lead, chosen, values, fixed, x, colliders_before, adjoint)
     # A segment that runs again reads these anew: autograd cannot see that they were changed in between.
-    versions = [] if every is None or torch.compiler.is_compiling() else values.versions()
+    versions = [] if every is None or torch.compiler.is_compiling() else _versions(options, own)
     bar = _Progress(steps) if progress else None
 
-    def segment(first: int, end: int, x: Tensor, v: Tensor) -> Segment:
+    def segment(first: int, end: int, x: Tensor, v: Tensor, start: Tensor = x) -> Segment:
         _check_versions(versions)
         frames, observed = [], []
         for k in range(first, end):
-            x, v = one_step(k, x, v)
+            now = prepare(model, lead, **chosen, **_to_prepare(options, own, k, x, v)) if fixed is None else fixed
+            given = _to_advance(model, options, k, x, v, start, colliders_before)
+            x, v = advance(model, x, v, now, adjoint=adjoint, index=k, **given)
             if save == "all" or k + 1 == steps or (save != "last" and (k + 1) % save == 0):
                 frames.append((k + 1, x, v))
             if observe is not None:
@@ -144,9 +147,8 @@ def rollout(
                 bar.show(k + 1)
         return Segment(x, v, frames, observed)
 
-    first = [] if save == "last" and steps > 0 else [(0, x, v)]
     done = run_segments(segment, steps, x, v, every if torch.is_grad_enabled() else None)
-    frames = first + done.frames
+    frames = ([] if save == "last" and steps > 0 else [(0, x, v)]) + done.frames
     return Trajectory(
         x=torch.stack([f[1] for f in frames]),
         v=torch.stack([f[2] for f in frames]),
@@ -156,6 +158,11 @@ def rollout(
 
 
 # --- values of each step ----------------------------------------------------------------------------------------------
+
+
+def _check_save(save: Any) -> None:
+    if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
+        fail("save", '"all", "last" or an integer > 0', repr(save))
 
 
 def _check_values(
@@ -174,64 +181,28 @@ def _check_values(
             fail(name, f"{steps} steps in per_step", f"shape {list(value.values.shape)}")
 
 
-@dataclass(frozen=True)
-class _Values:
-    """The arguments that may change from step to step, by name; per_step ones as :class:`_Steps`."""
-
-    options: dict[str, Any]
-    parameters: dict[str, Any]
-
-    @classmethod
-    def of(cls, options: dict[str, Any], parameters: dict[str, Any]) -> _Values:
-        # What a checkpointed segment reads again must not change in between: lists and dicts are copied. unbind, not
-        # indexing: the backward of values[k] would fill a tensor of all steps at every step.
-        return cls({k: _frozen(v) for k, v in options.items()}, {k: _frozen(v) for k, v in parameters.items()})
-
-    @property
-    def prepared_anew(self) -> bool:
-        """Whether what enters through prepare() changes from step to step."""
-        return any(_changes(value) for value in (*(self.options[k] for k in _STATIC), *self.parameters.values()))
-
-    def to_prepare(self, k: int, x: Tensor, v: Tensor) -> dict[str, Any]:
-        """What enters step k through prepare()."""
-        now = {name: _at(self.options[name], k, x, v) for name in _STATIC}
-        return now | {"parameters": {name: _at(value, k, x, v) for name, value in self.parameters.items()}}
-
-    def to_advance(self, k: int, x: Tensor, v: Tensor) -> dict[str, Any]:
-        """What enters step k through advance()."""
-        return {name: _at(self.options[name], k, x, v) for name in ("force", "gravity", "prescribed", "colliders")}
-
-    def versions(self) -> list[tuple[str, Tensor, int]]:
-        """(name, tensor, version) of all tensors whose changes in place can be seen."""
-        found = [(name, t) for name, value in {**self.options, **_named(self.parameters)}.items()
-                 for t in _tensors(value)]  # fmt: skip
-        return [(name, t, t._version) for name, t in found if not t.is_inference()]
+def _to_prepare(options: dict[str, Any], parameters: dict[str, Any], k: int, x: Tensor, v: Tensor) -> dict[str, Any]:
+    """What enters step k through prepare()."""
+    now = {name: _at(options[name], k, x, v) for name in _STATIC}
+    return now | {"parameters": {name: _at(value, k, x, v) for name, value in parameters.items()}}
 
 
-@dataclass(frozen=True)
-class _OneStep:
-    """A step of a rollout, by its number: which values it takes, and the step itself."""
+def _to_advance(model: Model, options: dict[str, Any], k: int, x: Tensor, v: Tensor, start: Tensor,
+                colliders_before: Tensor | None) -> dict[str, Any]:  # fmt: skip
+    """What enters step k through advance(); ``start``: x before the first step."""
+    now = {name: _at(options[name], k, x, v) for name in ("force", "gravity", "prescribed", "colliders")}
+    if _changes(options["prescribed"]) and not isinstance(options["prescribed"], _Steps):
+        check_prescribed(model, now["prescribed"], x, start)
+    if isinstance(options["colliders"], _Steps):
+        first = model.collider_points if colliders_before is None else colliders_before
+        now["colliders_before"] = options["colliders"][k - 1] if k else first
+    return now
 
-    model: Model
-    lead: tuple[int, ...]
-    chosen: dict[str, Any]  # arguments of prepare() that are the same for all steps
-    values: _Values
-    fixed: Prepared | None  # where it is the same for all steps
-    start: Tensor  # x before the first step
-    colliders_before: Tensor | None
-    adjoint: Adjoint
 
-    def __call__(self, k: int, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        prepared, options = self.fixed, self.values.options
-        if prepared is None:
-            prepared = prepare(self.model, self.lead, **self.chosen, **self.values.to_prepare(k, x, v))
-        given = self.values.to_advance(k, x, v)
-        if _changes(options["prescribed"]) and not isinstance(options["prescribed"], _Steps):
-            check_prescribed(self.model, given["prescribed"], x, self.start)
-        if isinstance(options["colliders"], _Steps):
-            first = self.model.collider_points if self.colliders_before is None else self.colliders_before
-            given["colliders_before"] = options["colliders"][k - 1] if k else first
-        return advance(self.model, x, v, prepared, adjoint=self.adjoint, index=k, **given)
+def _versions(options: dict[str, Any], parameters: dict[str, Any]) -> list[tuple[str, Tensor, int]]:
+    """(name, tensor, version) of all tensors whose changes in place can be seen."""
+    found = [(name, t) for name, value in {**options, **_named(parameters)}.items() for t in _tensors(value)]
+    return [(name, t, t._version) for name, t in found if not t.is_inference()]
 
 
 def _check_versions(versions: list[tuple[str, Tensor, int]]) -> None:
@@ -254,7 +225,7 @@ def _tensors(value: Any) -> list[Tensor]:
 
 
 def _frozen(value: Any) -> Any:
-    if isinstance(value, PerStep):
+    if isinstance(value, PerStep):  # unbind: the backward of values[k] would fill a tensor of all steps at every step
         return _Steps(value.values.unbind(0))
     return tuple(value) if isinstance(value, list) else value
 

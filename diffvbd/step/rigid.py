@@ -31,7 +31,7 @@ class _Correct(Function):
     def forward(x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other, groups, data_count, time_step):
         # torch.compile counts these arguments: *args would get the context as well
         fields = ops.RigidFields(x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other)
-        return ops.raw.rigid(ops.as_list(fields, x), groups, data_count, time_step)
+        return ops.raw.rigid(*ops.as_list(fields, x), groups, data_count, time_step)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
@@ -63,7 +63,7 @@ class _CorrectBackward(Function):
         fields = ops.RigidFields(x, x_prev, y, mass, energy_data, origin, order, ptr, spread, other)
         groups, data_count, time_step = options
         x_out, x_prev_out, y_out, mass_out, shared, own = ops.raw.rigid_backward(
-            x_bar.contiguous(), v_bar.contiguous(), ops.as_list(fields, x), groups, data_count, time_step, needs[4]
+            *ops.as_list(fields, x), x_bar.contiguous(), v_bar.contiguous(), groups, data_count, time_step, needs[4]
         )
         if not x_prev_out.numel():
             x_prev_out = torch.zeros_like(x_prev)

@@ -36,7 +36,7 @@ class _Begin(Function):
         fields = ops.BeginFields(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest, pinned,
                                  order, ptr, spread, other, other_order, other_ptr, other_tets,
                                  other_tet_ptr)  # fmt: skip
-        return ops.raw.begin(ops.as_list(fields, x), groups, other_groups, *options)
+        return ops.raw.begin(*ops.as_list(fields, x), groups, other_groups, *options)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
@@ -68,7 +68,7 @@ class _BeginBackward(Function):
                                  other_tet_ptr)  # fmt: skip
         wants = (needs[2], needs[3], needs[5])
         *bars, shared, own, planes = ops.raw.begin_backward(
-            x_start_bar.contiguous(), y_bar.contiguous(), falls, ops.as_list(fields, x), *options, wants
+            *ops.as_list(fields, x), x_start_bar.contiguous(), y_bar.contiguous(), falls, *options, wants
         )
         data_out = energy_data
         if needs[5]:

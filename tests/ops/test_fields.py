@@ -51,8 +51,9 @@ def test_there_are_four_sweep_operators() -> None:
     assert names == {"sweep", "sweep_backward", "fused_step", "fused_step_backward"}
 
 
-def test_a_list_of_the_wrong_length_is_refused() -> None:
-    points, tets = torch.eye(4, 3, dtype=torch.float64), torch.tensor([[0, 1, 2, 3]])
-    plan, *_ = ops.build_plan(points, tets, torch.ones(4, dtype=torch.bool), ops.LANES["cpu"])
-    with pytest.raises(ValueError, match="a list of fields has the wrong length"):
-        ops.raw.sweep([points[None]] * 3, plan, ops.plan_sizes(plan, "cpu"), 0, (0, 0), [0.1] * 8, 1, (), 0, -1, True)
+@pytest.mark.parametrize(("name", "fields"), [("sweep", ops.SweepFields), ("rigid", ops.RigidFields),
+                                              ("begin", ops.BeginFields)])  # fmt: skip
+@pytest.mark.parametrize("end", ("", "_backward"))
+def test_schemas_begin_with_the_fields(name: str, fields: type, end: str) -> None:
+    arguments = [a.name for a in getattr(torch.ops.diffvbd, name + end).default._schema.arguments]
+    assert tuple(arguments[: len(fields._fields)]) == fields._fields

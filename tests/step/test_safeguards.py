@@ -193,9 +193,10 @@ def test_an_update_forgets_where_its_vertex_was(device: str) -> None:
     y = predictor(model, inputs)[None]
 
     def swept(start: Tensor, sweeps: int) -> Tensor:
-        arguments = (start, start.detach(), y, inputs["mu"][None], inputs["lam"][None], model.mass[None], None)
-        return sweep(*arguments, model._energy_data, y.new_empty(0), model._packed_rest, model._plan,
-                     model.settings(inputs["time_step"], sweeps), tape_policy=ops.FULL_TAPE)  # fmt: skip
+        fields = ops.SweepFields(start, start.detach(), y, inputs["mu"][None], inputs["lam"][None], model.mass[None],
+                                 None, model._energy_data)  # fmt: skip
+        settings = model.settings(inputs["time_step"], sweeps)
+        return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=ops.FULL_TAPE)[0]
 
     other = y.clone()
     other[:, first] += 3.0 * torch.as_tensor(generator("other").standard_normal((1, len(first), 3)), device=device)

@@ -17,11 +17,10 @@ using diffvbd::BeginSettings, diffvbd::BeginFields, diffvbd::data, diffvbd::disp
     diffvbd::for_bodies, diffvbd::for_vertices, diffvbd::Threads, diffvbd::zeros;
 using torch::stable::Tensor;
 
-std::tuple<Tensor, Tensor, Tensor> begin(std::vector<Tensor> fields, std::vector<int64_t> /*groups*/,
+std::tuple<Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::vector<int64_t> /*groups*/,
                                          std::vector<int64_t> /*other_groups*/, std::vector<int64_t> data_count,
                                          double time_step, double filter_eta, int64_t from, bool filters) {
-  const BeginFields f = BeginFields::of(fields);
-  const Tensor& x = f.x;
+  const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
@@ -57,11 +56,10 @@ std::tuple<Tensor, Tensor, Tensor> begin(std::vector<Tensor> fields, std::vector
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin_backward(
-    const Tensor& x_start_bar, const Tensor& y_bar, const Tensor& falls, std::vector<Tensor> fields,
+    DIFFVBD_PARAMETERS(BEGIN) const Tensor& x_start_bar, const Tensor& y_bar, const Tensor& falls,
     std::vector<int64_t> /*groups*/, std::vector<int64_t> data_count, double time_step, double filter_eta, int64_t from,
     bool filters, std::vector<bool> wants) {
-  const BeginFields f = BeginFields::of(fields);
-  const Tensor &x = f.x, &order = f.order;
+  const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);

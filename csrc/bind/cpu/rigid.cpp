@@ -22,10 +22,9 @@ bool has_energies(const rigid::Inputs<T>& in) {
   return in.data.data != nullptr;
 }
 
-std::tuple<Tensor, Tensor> correct(std::vector<Tensor> fields, std::vector<int64_t> /*groups*/,
+std::tuple<Tensor, Tensor> correct(DIFFVBD_PARAMETERS(RIGID) std::vector<int64_t> /*groups*/,
                                    std::vector<int64_t> data_count, double time_step) {
-  const RigidFields f = RigidFields::of(fields);
-  const Tensor &x = f.x, &order = f.order;
+  const RigidFields f{DIFFVBD_ITEMS(RIGID)};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::rigid_inputs<T>(f, data_count, time_step);
@@ -46,13 +45,10 @@ std::tuple<Tensor, Tensor> correct(std::vector<Tensor> fields, std::vector<int64
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> correct_backward(const Tensor& x_bar, const Tensor& v_bar,
-                                                                            std::vector<Tensor> fields,
-                                                                            std::vector<int64_t> /*groups*/,
-                                                                            std::vector<int64_t> data_count,
-                                                                            double time_step, bool wants_data) {
-  const RigidFields f = RigidFields::of(fields);
-  const Tensor &x = f.x, &order = f.order;
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> correct_backward(
+    DIFFVBD_PARAMETERS(RIGID) const Tensor& x_bar, const Tensor& v_bar, std::vector<int64_t> /*groups*/,
+    std::vector<int64_t> data_count, double time_step, bool wants_data) {
+  const RigidFields f{DIFFVBD_ITEMS(RIGID)};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::rigid_inputs<T>(f, data_count, time_step);

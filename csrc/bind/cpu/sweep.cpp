@@ -31,12 +31,12 @@ struct Given {
   Given(const Given&) = delete;  // in points into itself
 };
 
-std::tuple<Tensor, Tensor, Tensor> sweep(std::vector<Tensor> fields, const Tensor& plan_buffer,
+std::tuple<Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const Tensor& plan_buffer,
                                          std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
                                          std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
                                          int64_t tape_policy, int64_t debug_step, bool checked) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
-  const SweepFields f = SweepFields::of(fields);
+  const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
   return dispatch_float(f.x_start, [&](auto scalar) {
     using T = decltype(scalar);
@@ -91,12 +91,13 @@ struct ContactSlots {
   }
 };
 
-std::vector<Tensor> sweep_backward(const Tensor& x_bar, const Tensor& x, std::vector<Tensor> fields, const Tensor& tape,
-                                   const Tensor& plan_buffer, std::vector<int64_t> sizes, int64_t energies,
-                                   std::vector<int64_t> data_count, std::vector<double> numbers, int64_t sweeps,
-                                   std::vector<int64_t> launch, int64_t tape_policy, std::vector<bool> wants) {
+diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_bar, const Tensor& x,
+                                      const Tensor& tape, const Tensor& plan_buffer, std::vector<int64_t> sizes,
+                                      int64_t energies, std::vector<int64_t> data_count, std::vector<double> numbers,
+                                      int64_t sweeps, std::vector<int64_t> launch, int64_t tape_policy,
+                                      std::vector<bool> wants) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
-  const SweepFields f = SweepFields::of(fields);
+  const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
   require(tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: bad arguments");
   require(x_bar.is_contiguous() && x_bar.numel() == x.numel(), "diffvbd::sweep_backward: x_bar must be like x");
@@ -113,7 +114,7 @@ std::vector<Tensor> sweep_backward(const Tensor& x_bar, const Tensor& x, std::ve
     set_bars(out, bars, in);
     if (!in.contact) {
       diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), out);
-      return bars.list();
+      return bars.tensors();
     }
     const ContactSlots<T> slots(given.pairs, in.scenes);
     make_contact_bars(bars, given.pairs, in.scenes, plan.num_vertices, f.lag_pairs.numel() / contact::kPairRow, make);
@@ -122,7 +123,7 @@ std::vector<Tensor> sweep_backward(const Tensor& x_bar, const Tensor& x, std::ve
     out.bounds = data<T>(bars.bounds), out.collider = data<T>(bars.collider);
     diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), out);
     slots.sum(bars);
-    return bars.list();
+    return bars.tensors();
   });
 }
 

@@ -20,10 +20,9 @@ using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
 
-std::tuple<Tensor, Tensor> correct(std::vector<Tensor> fields, std::vector<int64_t> groups,
+std::tuple<Tensor, Tensor> correct(DIFFVBD_PARAMETERS(RIGID) std::vector<int64_t> groups,
                                    std::vector<int64_t> data_count, double time_step) {
-  const RigidFields f = RigidFields::of(fields);
-  const Tensor &x = f.x, &order = f.order;
+  const RigidFields f{DIFFVBD_ITEMS(RIGID)};
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
@@ -38,13 +37,10 @@ std::tuple<Tensor, Tensor> correct(std::vector<Tensor> fields, std::vector<int64
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> correct_backward(const Tensor& x_bar, const Tensor& v_bar,
-                                                                            std::vector<Tensor> fields,
-                                                                            std::vector<int64_t> groups,
-                                                                            std::vector<int64_t> data_count,
-                                                                            double time_step, bool wants_data) {
-  const RigidFields f = RigidFields::of(fields);
-  const Tensor &x = f.x, &order = f.order;
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> correct_backward(
+    DIFFVBD_PARAMETERS(RIGID) const Tensor& x_bar, const Tensor& v_bar, std::vector<int64_t> groups,
+    std::vector<int64_t> data_count, double time_step, bool wants_data) {
+  const RigidFields f{DIFFVBD_ITEMS(RIGID)};
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);

@@ -55,11 +55,11 @@ cuda::Choice choose(const cuda::StepInputs<T>& in, const Tensor& x, const SweepS
   return out;
 }
 
-std::tuple<Tensor, Tensor, Tensor> sweep(std::vector<Tensor> fields, const Tensor& plan, std::vector<int64_t> sizes,
+std::tuple<Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const Tensor& plan, std::vector<int64_t> sizes,
                                          int64_t energies, std::vector<int64_t> data_count, std::vector<double> numbers,
                                          int64_t sweeps, std::vector<int64_t> launch, int64_t tape_policy,
                                          int64_t /*debug_step*/, bool /*checked*/) {
-  const SweepFields f = SweepFields::of(fields);
+  const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
   const Tensor& from = f.x_start;
   const DeviceGuard guard(from.get_device_index());
@@ -97,11 +97,12 @@ struct ContactSlots {
   }
 };
 
-std::vector<Tensor> sweep_backward(const Tensor& x_bar, const Tensor& x, std::vector<Tensor> fields, const Tensor& tape,
-                                   const Tensor& plan, std::vector<int64_t> sizes, int64_t energies,
-                                   std::vector<int64_t> data_count, std::vector<double> numbers, int64_t sweeps,
-                                   std::vector<int64_t> launch, int64_t tape_policy, std::vector<bool> wants) {
-  const SweepFields f = SweepFields::of(fields);
+diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_bar, const Tensor& x,
+                                      const Tensor& tape, const Tensor& plan, std::vector<int64_t> sizes,
+                                      int64_t energies, std::vector<int64_t> data_count, std::vector<double> numbers,
+                                      int64_t sweeps, std::vector<int64_t> launch, int64_t tape_policy,
+                                      std::vector<bool> wants) {
+  const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
   const DeviceGuard guard(x.get_device_index());
   const cuda::HostPlan host = plan_of(plan, sizes);
@@ -130,7 +131,7 @@ std::vector<Tensor> sweep_backward(const Tensor& x_bar, const Tensor& x, std::ve
     };
     if (!in.contact) {
       run();
-      return bars.list();
+      return bars.tensors();
     }
     const int64_t lagged = given.pairs.lag ? f.lag_pairs.size(0) : 0;
     const ContactSlots<T> slots(x, given.pairs, f.pairs.size(0), lagged);
@@ -141,15 +142,15 @@ std::vector<Tensor> sweep_backward(const Tensor& x_bar, const Tensor& x, std::ve
     out.collider_prev = data<T>(bars.collider_prev), out.kappa = data<T>(bars.kappa);
     run();
     check(cuda::sum_lag<T>(pointers, lagged, data<T>(bars.lag), stream), "the reverse sweep");
-    return bars.list();
+    return bars.tensors();
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor> fused_step(std::vector<Tensor> fields, const Tensor& plan,
-                                              std::vector<int64_t> sizes, int64_t energies,
-                                              std::vector<int64_t> data_count, std::vector<double> numbers,
-                                              int64_t sweeps, std::vector<int64_t> launch, int64_t tape_policy) {
-  const StepFields f = StepFields::of(fields);
+std::tuple<Tensor, Tensor, Tensor> fused_step(DIFFVBD_PARAMETERS(STEP) const Tensor& plan, std::vector<int64_t> sizes,
+                                              int64_t energies, std::vector<int64_t> data_count,
+                                              std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
+                                              int64_t tape_policy) {
+  const StepFields f{DIFFVBD_ITEMS(STEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
   const DeviceGuard guard(f.x.get_device_index());
   const cuda::HostPlan host = plan_of(plan, sizes);
@@ -168,14 +169,13 @@ std::tuple<Tensor, Tensor, Tensor> fused_step(std::vector<Tensor> fields, const 
   });
 }
 
-std::vector<Tensor> fused_step_backward(const Tensor& x_bar, const Tensor& v_bar, const Tensor& x_end,
-                                        std::vector<Tensor> fields, const Tensor& tape, const Tensor& plan,
-                                        std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
-                                        std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
-                                        int64_t tape_policy, std::vector<bool> wants) {
-  const StepFields f = StepFields::of(fields);
+diffvbd::FusedAdjoints fused_step_backward(DIFFVBD_PARAMETERS(STEP) const Tensor& x_bar, const Tensor& v_bar,
+                                           const Tensor& x_end, const Tensor& tape, const Tensor& plan,
+                                           std::vector<int64_t> sizes, int64_t energies,
+                                           std::vector<int64_t> data_count, std::vector<double> numbers, int64_t sweeps,
+                                           std::vector<int64_t> launch, int64_t tape_policy, std::vector<bool> wants) {
+  const StepFields f{DIFFVBD_ITEMS(STEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
-  const Tensor& x = f.x;
   const DeviceGuard guard(x.get_device_index());
   const cuda::HostPlan host = plan_of(plan, sizes);
   require(wants.size() == 7 && tape_policy != diffvbd::kNoTape, "diffvbd::fused_step_backward: bad arguments");
@@ -195,8 +195,8 @@ std::vector<Tensor> fused_step_backward(const Tensor& x_bar, const Tensor& v_bar
     const auto state = [&](int i) {
       return empty(x, wants[i] ? std::vector<int64_t>{in.scenes, n, 3} : std::vector<int64_t>{0});
     };
-    const Tensor none = empty(x, {0});
-    diffvbd::StepBars bars{state(0), state(1), state(2), state(3), none, none, none, none};
+    const auto none = [&] { return empty(x, {0}); };
+    diffvbd::StepBars bars{state(0), state(1), state(2), state(3), none(), none(), none(), none()};
     diffvbd::make_body_bars(bars, in, n, t, diffvbd::one_for_items(in.material) ? 1 : t, false,
                             {wants[4], wants[5], wants[6]}, make);
     cuda::StepAdjoints<T> out{};
@@ -210,7 +210,7 @@ std::vector<Tensor> fused_step_backward(const Tensor& x_bar, const Tensor& v_bar
     check(cuda::run_reverse<T>(host, in, data<const T>(x_end), data<const T>(tape), out, choice, work.data_ptr(),
                                current_stream(x)),
           "the reverse step");
-    return bars.list();
+    return bars.tensors();
   });
 }
 
