@@ -19,10 +19,28 @@ def no_second_derivative() -> NoReturn:
     raise NotImplementedError("diffvbd: second derivatives of a step are not supported (create_graph, hessian)")
 
 
+class _Given:
+    """Arguments that were all given by position, in place of inspect.BoundArguments."""
+
+    def __init__(self, args: tuple) -> None:
+        self.args, self.kwargs = args, {}
+
+    def apply_defaults(self) -> None:
+        pass
+
+
+class _Ready(inspect.Signature):
+    def bind(self, *args: Any, **kwargs: Any) -> Any:
+        complete = not kwargs and len(args) == len(self.parameters)
+        return _Given(args) if complete else super().bind(*args, **kwargs)
+
+
 def ready_signature(*functions: type[Function]) -> None:
-    """apply() asks for the signature of forward at every call: ready-made, it costs less."""
+    """apply() binds its arguments to the signature of forward at every call: a third of a small step's host time,
+    which goes with the number of arguments. All are given by position, so there is nothing to bind."""
     for function in functions:
-        function.forward.__signature__ = inspect.signature(function.forward)  # type: ignore[attr-defined]
+        parameters = inspect.signature(function.forward).parameters.values()
+        function.forward.__signature__ = _Ready(list(parameters))  # type: ignore[attr-defined]
 
 
 def distinct(*tensors: Tensor | None) -> list[Tensor | None]:
