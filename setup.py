@@ -2,7 +2,7 @@
 
 Environment:
     DIFFVBD_NO_CLONES=1  compile the CPU kernels for the baseline instruction set only (quicker builds, slower kernels)
-    DIFFVBD_QUICK=1      the same with less optimisation and without the paper's block: for work on an energy
+    DIFFVBD_QUICK=1      one instruction set, less optimisation, no paper's block and no CUDA: for work on an energy
     DIFFVBD_NO_CUDA=1    leave the CUDA object out; without it, it is built where torch has CUDA and nvcc is found
     TORCH_CUDA_ARCH_LIST what the CUDA object runs on (default: the visible devices, or 8.0 9.0 10.0 12.0+PTX)
     CUDA_HOME, MAX_JOBS  read by torch
@@ -83,7 +83,7 @@ extensions = [
 ]
 # Run, not imported: the package does not load before it is built.
 cuda = runpy.run_path("diffvbd/ops/build_cuda.py")
-if cuda["has_compiler"]() and not os.environ.get("DIFFVBD_NO_CUDA"):
+if cuda["has_compiler"]() and not os.environ.get("DIFFVBD_NO_CUDA") and not QUICK:
     extensions.append(cuda["extension"]())
 
 setup(

@@ -6,6 +6,7 @@
 
 #include "../start/begin.h"
 #include "../start/lower.h"
+#include "material.h"
 #include "rigid.h"
 
 namespace diffvbd {
@@ -64,7 +65,7 @@ start::Candidates<T> candidates(const BeginFields& t, const BeginSettings& q, co
   in.tets = data<const int32_t>(t.other_tets);
   in.tet_ptr = data<const int32_t>(t.other_tet_ptr);
   if (tets > 0) {
-    const Tensor* const material[] = {&t.mu, &t.lam};
+    const auto material = material_of(t);
     for (int m = 0; m < kMaterialScalars; ++m) in.material[m] = batched<T>(*material[m], t.x, b, tets);
     in.rest = batched<T>(t.rest, t.x, b, kRestScalars * tets);
   }

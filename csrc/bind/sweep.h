@@ -6,6 +6,7 @@
 #include "arguments.h"
 #include "contact.h"
 #include "fields.h"
+#include "material.h"
 
 namespace diffvbd {
 
@@ -20,8 +21,6 @@ struct SweepSettings {
   int64_t tape_policy;
 };
 
-constexpr int kElastic = kExactBlock | kPaperBlock;
-
 // What sweeps and whole steps have in common. `packed`: scalars of the packed rest shape of a scene.
 template <class In, class Fields, class T = typename In::Scalar>
 void set_body(In& in, const Fields& f, const Tensor& x, const SweepSettings& q, int64_t vertices, int64_t tets,
@@ -32,12 +31,9 @@ void set_body(In& in, const Fields& f, const Tensor& x, const SweepSettings& q, 
   in.scenes = b;
   in.energies = static_cast<int>(tets > 0 ? q.energies : q.energies & ~kElastic);
   in.mass = batched<T>(f.mass, x, b, vertices);
-  if (in.energies & kElastic) {
-    const Tensor* const material[] = {&f.mu, &f.lam};
-    static_assert(sizeof(material) / sizeof(material[0]) == kMaterialScalars, "the fields of the law's material");
-    for (int m = 0; m < kMaterialScalars; ++m) in.material[m] = batched<T>(*material[m], x, b, tets);
-    in.rest = batched<T>(f.rest, x, b, packed);
-  }
+  if (in.energies & kElastic) in.rest = batched<T>(f.rest, x, b, packed);
+  const auto material = material_of(f);
+  for (int m = 0; m < kMaterialScalars; ++m) in.material[m] = batched<T>(*material[m], x, b, tets);
   in.data_size = energy_data_size(q.data_count, vertices);
   for (int k = 0; k < kVertexEnergies; ++k) in.data_count[k] = static_cast<int>(q.data_count[k]);
   in.parameters = step_parameters<T>(q.numbers);
@@ -58,7 +54,12 @@ void set_fields(In& in, const SweepFields& f, const Tensor& x, const SweepSettin
   in.data = batched<T>(f.energy_data, x, b, in.data_size);
 }
 
-inline bool has_contact(const SweepSettings& q) { return (q.energies & kContact) != 0; }
+inline bool has_contact(const SweepSettings& q, const SweepFields& f) {
+  const bool given = f.ptr.numel() > 0;
+  require(given == ((q.energies & kContact) != 0),
+          "diffvbd::sweep: expected pairs where contact is among the energies");
+  return given;
+}
 
 // Adjoints of the body; make(shape, zeroed) allocates. `materials`: values of a scene; wants: material, mass, rest.
 template <class Bars, class In, class Make>
@@ -78,7 +79,7 @@ template <class Out, class Bars, class In, class T = typename Out::Scalar>
 void set_body_bars(Out& out, const Bars& bars, const In& in) {
   const auto of = [](const Tensor& a) { return a.numel() > 0 ? data<T>(a) : nullptr; };
   if (in.energies & kElastic) {
-    const Tensor* const material[] = {&bars.mu, &bars.lam};
+    const auto material = material_of(bars);
     for (int m = 0; m < kMaterialScalars; ++m) out.material[m] = of(*material[m]);
     out.rest = of(bars.rest);
   }

@@ -22,7 +22,7 @@ struct Batched {
   T* data = nullptr;
   int64_t scene = 0, item = 1;
 };
-// Whether each of several tensors holds one value for all items of a scene; and one group of them for all scenes.
+// Of several tensors: whether each holds one value for all items of a scene; whether the scenes share each.
 template <class T, int n>
 DIFFVBD_FN bool one_for_items(const Batched<T> (&tensors)[n]) {
   bool one = true;

@@ -24,7 +24,9 @@ void check_material(const StepInputs<T>& in, int64_t tets) {
         const char* message = Law::invalid(material, m);
         if (!message) continue;
         Message out;
-        out << message << ", got " << material[m] << " at tet " << i << " of scene " << b;
+        out << message << ", got " << material[m];
+        for (int other = 0; other < m; ++other) out << " with " << Law::material_names[other] << " " << material[other];
+        out << " at tet " << i << " of scene " << b;
         throw std::invalid_argument(out.text);
       }
     }

@@ -4,6 +4,7 @@
 #include <cstdlib>
 #include <cstring>
 #include <stdexcept>
+#include <string>
 
 namespace diffvbd {
 namespace {
@@ -13,32 +14,34 @@ enum InstructionSet { kBaseline, kV3, kV4 };
 InstructionSet newest() {
 #ifdef DIFFVBD_HAS_SETS
   __builtin_cpu_init();
-  const bool v3 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
-                  __builtin_cpu_supports("bmi2");
-  const bool v4 = v3 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-                  __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
-                  __builtin_cpu_supports("avx512vl");
-  return v4 ? kV4 : v3 ? kV3 : kBaseline;
-#else
-  return kBaseline;
+  if (__builtin_cpu_supports("x86-64-v4")) return kV4;
+  if (__builtin_cpu_supports("x86-64-v3")) return kV3;
 #endif
+  return kBaseline;
 }
 
-InstructionSet chosen() {
+InstructionSet find() {
   const InstructionSet best = newest();
   const char* name = std::getenv("DIFFVBD_ISA");
-  if (!name) return best;
+  if (!name || !*name) return best;
   const char* names[] = {"baseline", "v3", "v4"};
   for (int i = 0; i <= best; ++i) {
     if (std::strcmp(name, names[i]) == 0) return static_cast<InstructionSet>(i);
   }
-  throw std::invalid_argument("DIFFVBD_ISA: expected baseline, v3 or v4, as the processor and the build have it");
+  throw std::invalid_argument(std::string("DIFFVBD_ISA: expected one of baseline, v3, v4 that this processor and this "
+                                          "build have, got ") +
+                              name);
+}
+// for the life of the process
+InstructionSet chosen() {
+  static const InstructionSet set = find();
+  return set;
 }
 
 template <class T>
 Kernels<T> kernels() {
+  [[maybe_unused]] const InstructionSet set = chosen();
 #ifdef DIFFVBD_HAS_SETS
-  static const InstructionSet set = chosen();
   if (set == kV4) return v4::sweep_kernels<T>();
   if (set == kV3) return v3::sweep_kernels<T>();
 #endif

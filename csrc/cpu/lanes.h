@@ -6,6 +6,7 @@
 #include <cstring>
 
 #include "../core/views.h"
+#include "standard.h"
 
 #if defined(__has_builtin)
 #if __has_builtin(__builtin_shufflevector)
@@ -13,14 +14,10 @@
 #endif
 #endif
 
-// A file that is compiled for a newer instruction set (sweep_*_v3.cpp) says so before it includes this: what is named
-// after its packs is then no other file's, and none of its code runs where it must not.
+// A file for a newer instruction set (sweep_*_v3.cpp) names it before it includes this. Its packs, and every function
+// of them, then have names of their own: the linker takes none of its code for a processor that lacks the set.
 #ifndef DIFFVBD_SET
 #define DIFFVBD_SET baseline
-#endif
-// Sets beside the baseline: one compiler knows both the pragma that compiles for them and the test of a processor.
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && !defined(DIFFVBD_NO_CLONES)
-#define DIFFVBD_HAS_SETS
 #endif
 
 namespace diffvbd {

@@ -91,7 +91,7 @@ struct Scene {
     view.x_prev = x_prev.get();
     view.origin = origin.get();
     view.mass = mass.get();
-    if (in.energies & (kExactBlock | kPaperBlock)) {
+    if (in.energies & kElastic) {
       material = Buffer<T>(size_t(plan.slots) * kMaterialScalars * kLanes);
       for (int m = 0; m < kMaterialScalars; ++m) {
         const Batched<const T>& given = in.material[m];

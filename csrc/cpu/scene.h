@@ -127,11 +127,10 @@ struct LaneStar {
     out.xj = gather3(s.x, j);
     out.xk = gather3(s.x, j + kLanes);
     out.xl = gather3(s.x, j + 2 * kLanes);
-    each_below<kPairRest>(
-        [&](auto i) __attribute__((always_inline)) { out.rest[decltype(i)::value] = Lanes<T>::load(r + i * kLanes); });
-    each_below<kMaterialScalars>([&](auto i) __attribute__((always_inline)) {
-      out.material[decltype(i)::value] = Lanes<T>::load(m + i * kLanes);
-    });
+    each_below<kPairRest>([&](auto i)
+                              DIFFVBD_INLINE { out.rest[decltype(i)::value] = Lanes<T>::load(r + i * kLanes); });
+    each_below<kMaterialScalars>(
+        [&](auto i) DIFFVBD_INLINE { out.material[decltype(i)::value] = Lanes<T>::load(m + i * kLanes); });
     return out;
   }
 
@@ -168,13 +167,11 @@ struct LaneStar {
   }
   DIFFVBD_FN void add_material(int e, const Lanes<T>* bar) const {
     T* to = s.material_bar + (first + e) * kMaterialScalars * kLanes;
-    each_below<kMaterialScalars>(
-        [&](auto i) __attribute__((always_inline)) { accumulate(to + i * kLanes, bar[decltype(i)::value]); });
+    each_below<kMaterialScalars>([&](auto i) DIFFVBD_INLINE { accumulate(to + i * kLanes, bar[decltype(i)::value]); });
   }
   DIFFVBD_FN void add_rest(int e, const Lanes<T>* bar) const {
     T* to = s.rest_bar + (first + e) * kPairRest * kLanes;
-    each_below<kPairRest>([&](auto i)
-                              __attribute__((always_inline)) { accumulate(to + i * kLanes, bar[decltype(i)::value]); });
+    each_below<kPairRest>([&](auto i) DIFFVBD_INLINE { accumulate(to + i * kLanes, bar[decltype(i)::value]); });
   }
 };
 

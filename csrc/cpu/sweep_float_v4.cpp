@@ -1,6 +1,6 @@
 // The standard library comes first: what it has inline is compiled for every processor.
 #include "standard.h"
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+#ifdef DIFFVBD_HAS_SETS
 #pragma GCC target("arch=x86-64-v4")
 #define DIFFVBD_SET v4
 #include "sweep_kernels.h"

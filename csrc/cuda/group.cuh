@@ -188,7 +188,7 @@ struct GroupStar {
   // What a pair reads of the mesh; always loaded one pair ahead.
   struct Record {
     int where;
-    T rest[kPairRow], material[kMaterialScalars];
+    T rest[kRestRow], material[kMaterialScalars];
   };
   mutable Record next;
   mutable int where;     // of the pair at work
@@ -196,10 +196,10 @@ struct GroupStar {
   __device__ __forceinline__ void fetch(int e) const {
     const int64_t base = slot(e);
     next.where = __ldg(s.plan.local + base + at.v);
-    const T* rest = s.rest.data + at.scene * s.rest.scene + base * kPairRow;
+    const T* rest = s.rest.data + at.scene * s.rest.scene + base * kRestRow;
     constexpr int width = Pack<T>::size;
 #pragma unroll
-    for (int i = 0; i < kPairRow; i += width) {
+    for (int i = 0; i < kRestRow; i += width) {
       const Pack<T> part = load_constant(rest + i * kSlice + at.v * width);
 #pragma unroll
       for (int k = 0; k < width; ++k) next.rest[i + k] = part.v[k];

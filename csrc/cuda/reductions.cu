@@ -18,16 +18,16 @@ __global__ void pack_rest_kernel(GroupPlan plan, int64_t scenes, const T* rest, 
   if (i >= scenes * pairs) return;
   const int64_t scene = i / pairs, pair = i - scene * pairs, slot = pair / kSlice, lane = pair % kSlice;
   const int32_t entry = plan.pair[pair];
-  T values[kPairRow] = {};
+  T values[kRestRow] = {};
   if (entry >= 0) {
     const T* row = rest + (scene * plan.num_tets + (entry >> 2)) * kRestScalars;
     const int own = entry & 3;
     for (int a = 0; a < kPairRest; ++a) values[a] = row[TetLayout::rest_index(own, a)];
   }
-  T* to = packed + scene * pairs * kPairRow;
+  T* to = packed + scene * pairs * kRestRow;
 #pragma unroll
-  for (int a = 0; a < kPairRow; ++a) {
-    to[((slot * (kPairRow / width) + a / width) * kSlice + lane) * width + a % width] = values[a];
+  for (int a = 0; a < kRestRow; ++a) {
+    to[((slot * (kRestRow / width) + a / width) * kSlice + lane) * width + a % width] = values[a];
   }
 }
 

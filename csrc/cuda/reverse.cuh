@@ -74,7 +74,7 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
     if constexpr ((wanted & kMaterial) != 0) {
       if (s.one_material) {
         T* to = s.w.material_bar + row * kMaterialScalars;
-  #pragma unroll
+#pragma unroll
         for (int i = 0; i < kMaterialScalars; ++i) {
           star.total(star.material_bar[i]);
           if (writes) to[i] += star.material_bar[i];

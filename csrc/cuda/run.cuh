@@ -42,7 +42,7 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
                    Carver<T>& take, int64_t* zeroed, T** spill) {
   const GroupPlan& plan = host.plan;
   const int64_t n = choice.chunk, positions = int64_t{plan.blocks} * kSlice, pairs = int64_t{plan.slots} * kSlice;
-  const bool elastic = (in.energies & 3) != 0, reverse = adjoints != nullptr;
+  const bool elastic = (in.energies & kElastic) != 0, reverse = adjoints != nullptr;
   const bool lagged = any_x_prev(in.energies, VertexEnergies{});
   const bool one = one_for_items(in.material);
   int scalars = 0;
@@ -107,7 +107,7 @@ struct Runner {
     s.parameters = in.parameters;
     s.sweeps = in.sweeps;
     s.tape_policy = in.tape_policy;
-    s.has_tets = (in.energies & (kExactBlock | kPaperBlock)) != 0;
+    s.has_tets = (in.energies & kElastic) != 0;
     s.one_material = one_for_items(in.material);
     s.mass = {s.w.mass, in.mass.scene != 0 ? s.positions : 0, 1};
     material_is_shared = one_for_scenes(in.material);

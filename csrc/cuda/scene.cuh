@@ -40,14 +40,14 @@ template <class T>
 struct Visits {
   const int2* visit;  // vertex + (its pairs << kLocalBits), its first pair
   const int4* pair;   // offsets of j, k, l in a column; tet
-  const T* rest;      // [pairs, kPairRow]
+  const T* rest;      // [pairs, kRestRow]
   uint64_t active;    // mask of the vertices that sweeps move
 
   // int32 of the visits, rounded so that the pairs' rows are aligned
   DIFFVBD_FN static int visit_ints(const GroupPlan& plan) { return (2 * plan.num_active + 3) / 4 * 4; }
   DIFFVBD_FN static size_t bytes(const GroupPlan& plan) {
     return 4 * (static_cast<size_t>(visit_ints(plan)) + 16 * static_cast<size_t>(plan.num_tets)) +
-           4 * kPairRow * sizeof(T) * static_cast<size_t>(plan.num_tets);
+           4 * kRestRow * sizeof(T) * static_cast<size_t>(plan.num_tets);
   }
   __device__ __forceinline__ Visits(const StepInputs<T>& in, const GroupPlan& plan, unsigned char* memory) {
     int32_t* to = reinterpret_cast<int32_t*>(memory);
@@ -59,7 +59,7 @@ struct Visits {
       const int where = __ldg(row);
       pairs[i] = {3 * kColumn * (where & kMaxDegree), 3 * kColumn * (where >> kLocalBits & kMaxDegree),
                   3 * kColumn * (where >> 2 * kLocalBits), __ldg(row + 1)};
-      if (in.rest.scene == 0 && in.rest.data) load_rest(in.rest.data, __ldg(row + 2), own + kPairRow * i);
+      if (in.rest.scene == 0 && in.rest.data) load_rest(in.rest.data, __ldg(row + 2), own + kRestRow * i);
     }
     visit = reinterpret_cast<const int2*>(to);
     pair = pairs;
@@ -71,9 +71,9 @@ struct Visits {
   // Pairs of inactive corners stand in no list: their entries are zero and are never read.
   __device__ __forceinline__ static void load_rest(const T* packed, int pair, T* to) {
     constexpr int width = Pack<T>::size;
-    const T* from = packed + (static_cast<int64_t>(pair / kSlice) * kPairRow * kSlice + pair % kSlice * width);
+    const T* from = packed + (static_cast<int64_t>(pair / kSlice) * kRestRow * kSlice + pair % kSlice * width);
 #pragma unroll
-    for (int a = 0; a < kPairRow; ++a) to[a] = __ldg(from + a / width * width * kSlice + a % width);
+    for (int a = 0; a < kRestRow; ++a) to[a] = __ldg(from + a / width * width * kSlice + a % width);
   }
   __device__ __forceinline__ bool moves(int vertex) const { return active >> vertex & 1; }
 };
@@ -187,10 +187,10 @@ struct SceneStar {
     p.xl = at(row.z);
 #pragma unroll
     for (int m = 0; m < kMaterialScalars; ++m) p.material[m] = material[m];
-    const Pack<T>* shared = reinterpret_cast<const Pack<T>*>(list.rest + kPairRow * (first + e));
-    T rest[kPairRow];
+    const Pack<T>* shared = reinterpret_cast<const Pack<T>*>(list.rest + kRestRow * (first + e));
+    T rest[kRestRow];
 #pragma unroll
-    for (int a = 0; a < kPairRow; ++a) rest[a] = shared[a / Pack<T>::size].v[a % Pack<T>::size];
+    for (int a = 0; a < kRestRow; ++a) rest[a] = shared[a / Pack<T>::size].v[a % Pack<T>::size];
     if constexpr (!common) {
       if (in.rest.scene != 0) {
         const int pair = __ldg(plan.visit_pair + 4 * (first + e) + 2);

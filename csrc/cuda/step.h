@@ -11,7 +11,7 @@
 namespace diffvbd::cuda {
 
 // Scalars of a pair's rest shape in memory: a whole number of the widest loads.
-constexpr int kPairRow = (kPairRest + 3) / 4 * 4;
+constexpr int kRestRow = (kPairRest + 3) / 4 * 4;
 
 // How the sweeps of a step are spread over the device (docs/performance.md).
 enum Regime {
@@ -29,7 +29,7 @@ struct StepInputs {
   Batched<const T> x_start, x_prev, y, origin;  // [B, V, 3]; origin may be null
   Batched<const T> material[kMaterialScalars];  // [B, T] or one value for a scene (item 0)
   Batched<const T> mass;                        // [B, V]
-  Batched<const T> rest;                        // [B, slots, kPairRow / pack, kSlice, pack], see pack_rest
+  Batched<const T> rest;                        // [B, slots, kRestRow / pack, kSlice, pack], see pack_rest
   Batched<const T> data;                        // [B, N]
   int energies;                                 // mask, see energies.h
   int data_count[kVertexEnergies];

@@ -26,8 +26,9 @@ constexpr int kVertexEnergies = VertexEnergies::size;
 // Bits of a mask: the elastic block, contact, then the energies of the list, so that a new one moves no other bit.
 // Twins stand in diffvbd/mask.py.
 enum ElasticBits { kExactBlock = 1, kPaperBlock = 2 };
+constexpr int kElastic = kExactBlock | kPaperBlock;
 constexpr int kContact = 4;
-using TetLaw = StableNeoHookean<true>;  // of the energy and the shape at rest; the two blocks have one potential
+using TetLaw = StableNeoHookean<true>;  // for what both blocks share: the potential and the stiffness at rest
 constexpr int kFirstVertexBit = 3;
 
 // The compiled variants are numbered (elastic, the bits above): mask of the n-th, and back; and of those without

@@ -25,6 +25,7 @@ struct StableNeoHookean {
   DIFFVBD_FN static const R& lam(const TetPair<R>& e) {
     return e.material[1];
   }
+  static constexpr const char* material_names[] = {"mu", "lam"};
   // what is expected of the scalar `which` of a material, if it is not met, or null
   template <class T>
   static const char* invalid(const T* material, int which) {

@@ -3,8 +3,7 @@
 // step is therefore refined: what it leaves of its own equation is summed up again, tet by tet, where the stiff terms
 // are small already, and solved for with the same factors. In the reverse the last correction stays apart, because
 // added to p or d_raw it would round away: what it does to n . p and to the strain of each tet is added to these. Here
-// alone, out of line: most blocks never come here. Packs of lanes go by reference: by value a function of one
-// instruction set and one of another disagree on where they lie on the stack.
+// alone, out of line: most blocks never come here.
 #pragma once
 
 #include "block.h"

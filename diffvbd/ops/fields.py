@@ -114,7 +114,7 @@ def as_list(fields: NamedTuple, like: Tensor) -> list[Tensor]:
 
 
 class StepNumbers(NamedTuple):
-    """Numbers of a sweep, in the order of StepParameters in csrc/core/safeguards.h."""
+    """Numbers of a sweep: StepParameters of csrc/core/safeguards.h in their order, then that of friction."""
 
     time_step: float  # [s]
     regularization: float  # [kg]
@@ -123,7 +123,7 @@ class StepNumbers(NamedTuple):
     saturation_eps: float
     filter_eta: float
     last_relaxation: float  # of the last sweep of a step
-    friction_eps: float = 1.0  # motion within the step below which friction is smoothed [m]
+    friction_eps: float  # motion within the step below which friction is smoothed [m]
 
 
 class SweepSettings(NamedTuple):
@@ -138,7 +138,7 @@ class SweepSettings(NamedTuple):
 
 
 def plan_sizes(plan: Tensor, device: str) -> tuple[int, ...]:
-    """What the host must know of a plan that is still on the CPU; the order is that of csrc/bind/cuda/sweep.cpp."""
+    """What the host must know of a plan that is still on the CPU; the order is that of csrc/bind/cuda/sweep.h."""
     header = plan[:PLAN_HEADER].tolist()
     vertices, tets, active, colors, blocks, slots, *rest = header
     if device == "cpu":

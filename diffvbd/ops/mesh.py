@@ -26,7 +26,10 @@ def pack_rest(rest: Tensor, plan: Tensor, sizes: tuple[int, ...]) -> Tensor:
 
 @torch.library.register_fake("diffvbd::pack_rest")
 def _(rest, plan, sizes):
-    return rest.new_empty((rest.shape[0], sizes[2], PAIR_REST, LANES[rest.device.type]))
+    row = (
+        PAIR_REST if rest.device.type == "cpu" else -(-PAIR_REST // 4) * 4
+    )  # whole loads: kRestRow in csrc/cuda/step.h
+    return rest.new_empty((rest.shape[0], sizes[2], row, LANES[rest.device.type]))
 
 
 torch.library.register_autograd("diffvbd::pack_rest", raw_backward)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..mask import CONTACT
 from .fields import (
     FULL_TAPE,
     NO_TAPE,
@@ -81,7 +82,7 @@ _FIELDS, _STEP_FIELDS = len(SweepFields._fields), len(StepFields._fields)
 def _(*arguments):
     f: Any = SweepFields(*arguments[:_FIELDS])
     _, sizes, energies, _, _, sweeps, launch, tape_policy, *_ = arguments[_FIELDS:]
-    x, scenes = f.x_start, f.x_start.shape[0] if f.bounds.numel() else 0
+    x, scenes = f.x_start, f.x_start.shape[0] if energies & CONTACT else 0
     tape = x.new_empty(tape_shape(x, sizes, energies, sweeps, launch, tape_policy))
     return torch.empty_like(x), tape, x.new_empty((scenes, x.shape[1]), dtype=torch.uint8)
 
@@ -98,11 +99,11 @@ def _body_adjoints(x: Tensor, f: Any, num_tets: int, wants: Sequence[bool]) -> l
 @torch.library.register_fake("diffvbd::sweep_backward")
 def _(*arguments):
     f: Any = SweepFields(*arguments[:_FIELDS])
-    _, x, _, _, sizes, *_, wants = arguments[_FIELDS:]
+    _, x, _, _, sizes, energies, *_, wants = arguments[_FIELDS:]
     b, v = x.shape[:2]
     own = [*(torch.empty_like(x) for _ in range(3)), *_body_adjoints(x, f, sizes[1], wants[:3])]
     own.append(x.new_empty((b, f.energy_data.shape[-1]) if wants[3] else (0,)))
-    if f.bounds.numel() == 0:
+    if not energies & CONTACT:
         return (*own, *(x.new_empty((0,)) for _ in range(len(SWEEP_ADJOINTS) - len(own))))
     colliders = f.collider.shape[1] if f.collider.dim() == 3 else 0
     planes = f.floor_lag.numel() // max(1, f.floor_lag.shape[0] * 4 * v)

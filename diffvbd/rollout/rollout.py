@@ -132,7 +132,7 @@ def rollout(
     versions = [] if every is None or torch.compiler.is_compiling() else _versions(options, own)
     bar = _Progress(steps) if progress else None
 
-    def segment(first: int, end: int, x: Tensor, v: Tensor, start: Tensor = x) -> Segment:
+    def segment(first: int, end: int, x: Tensor, v: Tensor, start: Tensor = x) -> Segment:  # start: the outer x
         _check_versions(versions)
         frames, observed = [], []
         for k in range(first, end):

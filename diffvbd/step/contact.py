@@ -136,17 +136,17 @@ class ContactStep:
             return self._sweep(x, bounds, self.colliders, none, settings, policy, debug_step)[0]
         if checking():
             self._look_for_intersections()
-        x, held = self.x_prev, begun.y - self.x_prev
-        move = held
+        x, way = self.x_prev, begun.y - self.x_prev
+        move = way
         cut: list[Tensor] = []
         found: list[Detection] = []
         counts: list[Tensor] = []
         for r, sweeps in enumerate(sweeps_of_parts(settings.sweeps, self.parts)):
             was, now = (self._colliders_at(n / self.parts) for n in (r, r + 1))
-            goal = begun.y if r + 1 == self.parts else self.x_prev + ((r + 1) / self.parts) * held
+            goal = begun.y if r + 1 == self.parts else self.x_prev + ((r + 1) / self.parts) * way
             detection = self._detect(x, was, now, move)
             found.append(detection)
-            counts.append(torch.cat([detection.counts[:3], self._above(held, was, now, detection)]))
+            counts.append(torch.cat([detection.counts[:3], self._above(way, was, now, detection)]))
             if not x.is_cuda and not torch.compiler.is_compiling():  # reading is free: before any work
                 self._record(found, counts, cut)
                 self._check(r, counts[-1].tolist())
@@ -224,7 +224,7 @@ class ContactStep:
             found.append(detection)
         return detection
 
-    def _above(self, held: Tensor, was: Tensor, now: Tensor, detection: Detection) -> Tensor:
+    def _above(self, way: Tensor, was: Tensor, now: Tensor, detection: Detection) -> Tensor:
         """How many pinned vertices and collider points this part moves above their bound, int64 [1]."""
         surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
@@ -232,7 +232,7 @@ class ContactStep:
             return detection.counts[3:]  # a zero: nothing that is held moves
         with torch.no_grad():
             radius = (barrier.gamma * detection.near_values[..., 7]).clamp(0, surface.cap)
-            moves = torch.cat([held / self.parts, now - was], 1).square().sum(-1).sqrt()
+            moves = torch.cat([way / self.parts, now - was], 1).square().sum(-1).sqrt()
             above = (moves > radius) & surface.held & ~surface.plane_points
             return above.sum().reshape(1)
 

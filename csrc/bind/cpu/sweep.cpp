@@ -24,7 +24,7 @@ struct Given {
     const int64_t packed = int64_t{plan.slots} * diffvbd::kPairRest * diffvbd::kLanes;
     diffvbd::set_fields(in, f, x, q, plan.num_vertices, plan.num_tets, packed);
     in.debug_step = debug_step;
-    if (!diffvbd::has_contact(q)) return;
+    if (!diffvbd::has_contact(q, f)) return;
     pairs = diffvbd::contact_inputs<T>(f, x, in.x_prev, in.origin, q.numbers[diffvbd::kFrictionEps]);
     in.contact = &pairs;
   }

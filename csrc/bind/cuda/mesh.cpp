@@ -22,7 +22,7 @@ Tensor pack_rest(const Tensor& rest, const Tensor& plan, std::vector<int64_t> si
           "diffvbd::pack_rest: expected contiguous rest of shape [scenes, tets, 7]");
   return dispatch_float(rest, [&](auto scalar) {
     using T = decltype(scalar);
-    Tensor out = empty(rest, {rest.size(0), host.plan.slots, cuda::kPairRow, diffvbd::kSlice});
+    Tensor out = empty(rest, {rest.size(0), host.plan.slots, cuda::kRestRow, diffvbd::kSlice});
     check(cuda::pack_rest<T>(host.plan, rest.size(0), data<const T>(rest), data<T>(out), current_stream(rest)),
           "pack_rest");
     return out;

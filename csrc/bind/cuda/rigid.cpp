@@ -15,8 +15,7 @@ namespace {
 namespace cuda = diffvbd::cuda;
 namespace rigid = diffvbd::rigid;
 using cuda::check, cuda::current_stream, cuda::empty, cuda::groups_of, cuda::workspace_of, cuda::zeros;
-using diffvbd::data, diffvbd::dispatch_float, diffvbd::require, diffvbd::RigidFields;
-using torch::headeronly::ScalarType;
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::RigidFields;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
 

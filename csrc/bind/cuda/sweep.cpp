@@ -18,7 +18,7 @@ using diffvbd::StepFields, diffvbd::SweepFields, diffvbd::SweepSettings;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
-int64_t packed_size(const cuda::HostPlan& host) { return int64_t{host.plan.slots} * cuda::kPairRow * diffvbd::kSlice; }
+int64_t packed_size(const cuda::HostPlan& host) { return int64_t{host.plan.slots} * cuda::kRestRow * diffvbd::kSlice; }
 
 // The arrays of a step, and what they point into. x: where the sweeps start or end.
 template <class T>
@@ -28,7 +28,7 @@ struct Given {
 
   Given(const cuda::HostPlan& host, const SweepFields& f, const Tensor& x, const SweepSettings& q) {
     diffvbd::set_fields(in, f, x, q, host.plan.num_vertices, host.plan.num_tets, packed_size(host));
-    if (!diffvbd::has_contact(q)) return;
+    if (!diffvbd::has_contact(q, f)) return;
     pairs = diffvbd::contact_inputs<T>(f, x, in.x_prev, in.origin, q.numbers[diffvbd::kFrictionEps]);
     in.contact = &pairs;
   }
