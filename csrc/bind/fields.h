@@ -8,39 +8,37 @@
 #include <tuple>
 #include <utility>
 
+// clang-format off
 // The predictor and the start; the body; data of the energies; contact, all empty without it: bounds, colliders,
 // stiffness, the pairs that repel, and what friction and damping keep of the start of the step.
-#define DIFFVBD_SWEEP_FIELDS(ADJOINT, INDEX)                                                                   \
-  ADJOINT(x_start)                                                                                             \
-  ADJOINT(x_prev)                                                                                              \
-  ADJOINT(y)                                                                                                   \
-  ADJOINT(mu)                                                                                                  \
-  ADJOINT(lam)                                                                                                 \
-  ADJOINT(mass) ADJOINT(rest) ADJOINT(energy_data) INDEX(origin) ADJOINT(bounds) ADJOINT(collider)             \
-      ADJOINT(collider_prev) ADJOINT(kappa) INDEX(pairs) INDEX(constants) INDEX(ptr) INDEX(entry) ADJOINT(lag) \
-          INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag)
+#define DIFFVBD_SWEEP_FIELDS(ADJOINT, INDEX) \
+  ADJOINT(x_start) ADJOINT(x_prev) ADJOINT(y) \
+  ADJOINT(mu) ADJOINT(lam) ADJOINT(mass) ADJOINT(rest) \
+  ADJOINT(energy_data) INDEX(origin) \
+  ADJOINT(bounds) ADJOINT(collider) ADJOINT(collider_prev) ADJOINT(kappa) \
+  INDEX(pairs) INDEX(constants) INDEX(ptr) INDEX(entry) \
+  ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag)
 
 // A whole step in one operator (CUDA).
 #define DIFFVBD_STEP_FIELDS(ADJOINT, INDEX) \
-  ADJOINT(x) ADJOINT(v) ADJOINT(acceleration) ADJOINT(prescribed) ADJOINT(mu) ADJOINT(lam) ADJOINT(mass) ADJOINT(rest)
+  ADJOINT(x) ADJOINT(v) ADJOINT(acceleration) ADJOINT(prescribed) \
+  ADJOINT(mu) ADJOINT(lam) ADJOINT(mass) ADJOINT(rest)
 
 // The rigid correction (rigid/body.h): order, ptr: vertices of the bodies that are corrected; spread: their squared
 // radius of gyration [m^2]; other [vertices]: -2 for what is listed.
 #define DIFFVBD_RIGID_FIELDS(ADJOINT, INDEX) \
-  ADJOINT(x)                                 \
-  ADJOINT(x_prev)                            \
-  ADJOINT(y) ADJOINT(mass) ADJOINT(energy_data) INDEX(origin) INDEX(order) INDEX(ptr) INDEX(spread) INDEX(other)
+  ADJOINT(x) ADJOINT(x_prev) ADJOINT(y) ADJOINT(mass) ADJOINT(energy_data) INDEX(origin) \
+  INDEX(order) INDEX(ptr) INDEX(spread) INDEX(other)
 
 // The beginning of a step (start/begin.h): as of the correction, and the other bodies. other [vertices]: which of them
 // a vertex is in, -1: none, -2: it is corrected; other_tets [listed, 5]: a tet and its corners; rest [1 | scenes, tets,
 // kRestScalars], empty where tets have no energy.
-#define DIFFVBD_BEGIN_FIELDS(ADJOINT, INDEX)                                                                   \
-  ADJOINT(x)                                                                                                   \
-  ADJOINT(v)                                                                                                   \
-  ADJOINT(acceleration)                                                                                        \
-  ADJOINT(prescribed)                                                                                          \
-  ADJOINT(mass) ADJOINT(energy_data) INDEX(origin) INDEX(mu) INDEX(lam) INDEX(rest) INDEX(pinned) INDEX(order) \
-      INDEX(ptr) INDEX(spread) INDEX(other) INDEX(other_order) INDEX(other_ptr) INDEX(other_tets) INDEX(other_tet_ptr)
+#define DIFFVBD_BEGIN_FIELDS(ADJOINT, INDEX) \
+  ADJOINT(x) ADJOINT(v) ADJOINT(acceleration) ADJOINT(prescribed) ADJOINT(mass) ADJOINT(energy_data) INDEX(origin) \
+  INDEX(mu) INDEX(lam) INDEX(rest) INDEX(pinned) \
+  INDEX(order) INDEX(ptr) INDEX(spread) INDEX(other) \
+  INDEX(other_order) INDEX(other_ptr) INDEX(other_tets) INDEX(other_tet_ptr)
+// clang-format on
 
 // The parameters of an operator's function, each with a comma; and a struct of them.
 #define DIFFVBD_PARAMETER(name) const torch::stable::Tensor &name,
