@@ -26,10 +26,6 @@ BEGIN, END = "<!-- figures: begin, written by python -m bench report -->", "<!--
 KNOWN = {
     "gpu.json": "All groups but regimes were measured at 77dba6f90b beside changes that were not committed; to be run "
     "again on an H100.",
-    "starts.json": "Measured at 97bc544986 beside changes that were not committed; to be run again.",
-    "tradeoff.json": "Measured at cf911805e3 beside changes that were not committed; to be run again.",
-    "tasks/bunny-bounce.json": "Run at 97bc544986 beside changes that were not committed; to be run again.",
-    "tasks/cube-bounce.json": "Run at 97bc544986 beside changes that were not committed; to be run again.",
 }
 EMPTY = "No figures yet: run `python -m bench cpu` or `python -m bench gpu`, then `python -m bench report`.\n"
 
