@@ -64,9 +64,9 @@ struct TetSums {
   R h_diagonal;
   Sym3<R> h_outer;
 };
-// What these loops read over and over they copy first: no store of theirs can then be to it.
+// What the two loops below read over and over they copy first: no store of theirs can then be to it.
 template <class Law, class R, class Star>
-DIFFVBD_LOOP TetSums<R> sum_tets(const Star& shared, const Vec3<R>& position) {
+DIFFVBD_FN TetSums<R> sum_tets(const Star& shared, const Vec3<R>& position) {
   decltype(auto) star = shared.local();
   const Vec3<R> x = position;
   TetSums<R> out{zero3<R>(), R(0), diagonal(R(0))};
