@@ -30,6 +30,8 @@ SOLVERS: dict[str, Callable[..., Any]] = {"XPBD": XPBD.from_mesh, "projective dy
 def run(quick: bool, *, device: str = "cpu") -> dict[str, Any]:
     cases = list(CASES)[:4] if quick else list(CASES)
     rows = {name: of_case(name, device) for name in cases}
+    if not quick:
+        rows["no tets' energy"] = of_vertices(device)
     rows |= {f"{name}, float32": of_case(name, device, torch.float32) for name in FLOAT32 if name in cases}
     rows |= {f"{name}, compact tape": of_case(name, device, tape="compact") for name in COMPACT if name in cases}
     for name, make in ({} if quick else contact_scenes.SCENES).items():
@@ -52,6 +54,15 @@ def of_case(name: str, device: str, dtype: torch.dtype = torch.float64, tape: st
         return x, v
 
     return digest(testing.evaluate(rollout, scene.inputs(dtype, device)))
+
+
+def of_vertices(device: str) -> str:
+    """The hash of one step of a box whose only energies are those of single vertices."""
+    box, near = dv.mesh.box((3, 4, 3), (0.2, 0.3, 0.2)), dv.FloorBarrier(height=-0.01, kappa=2e4, dhat=0.05)
+    model = dv.Model(box, energies=(near, dv.Anchor(50.0)), device=device)
+    x = model.rest_points
+    inputs = {"x": x + 0.004 * torch.sin(9 * x.flip(-1)), "v": torch.cos(7 * x), "time_step": 1 / 60}
+    return digest(testing.evaluate(lambda **given: dv.step(model, mu=1e4, lam=1e4, sweeps=SWEEPS, **given), inputs))
 
 
 def of_solver(make: Callable[..., Any], device: str) -> str:

@@ -40,8 +40,8 @@ class _Begin(Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
-        # the backward reads no material and no rest shape
-        ctx.save_for_backward(output[2], *inputs[:7], None, None, None, *inputs[10:_FIELDS])
+        read = ops.BeginFields(*inputs[:_FIELDS])._replace(mu=None, lam=None, rest=None)  # by the backward
+        ctx.save_for_backward(output[2], *read)
         ctx.options = (inputs[_FIELDS], *inputs[-1])
         ctx.mark_non_differentiable(output[2])
 
