@@ -10,14 +10,16 @@
 
 // clang-format off
 // The predictor and the start; the body; data of the energies; contact, all empty without it: bounds, colliders,
-// stiffness, the pairs that repel, and what friction and damping keep of the start of the step.
+// stiffness, the pairs that repel, and what friction and damping keep of the start of the step; last the tets' corners
+// then, empty for a law that does not read them.
 #define DIFFVBD_SWEEP_FIELDS(ADJOINT, INDEX) \
   ADJOINT(x_start) ADJOINT(x_prev) ADJOINT(y) \
   ADJOINT(mu) ADJOINT(lam) ADJOINT(mass) ADJOINT(rest) \
   ADJOINT(energy_data) INDEX(origin) \
   ADJOINT(bounds) ADJOINT(collider) ADJOINT(collider_prev) ADJOINT(kappa) \
   INDEX(pairs) INDEX(constants) INDEX(ptr) INDEX(entry) \
-  ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag)
+  ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag) \
+  ADJOINT(corners_prev)
 
 // A whole step in one operator (CUDA).
 #define DIFFVBD_STEP_FIELDS(ADJOINT, INDEX) \

@@ -52,6 +52,14 @@ void set_fields(In& in, const SweepFields& f, const Tensor& x, const SweepSettin
   in.y = batched<T>(f.y, x, b, 3 * vertices);
   in.origin = batched<T>(f.origin, x, b, 3 * vertices);
   in.data = batched<T>(f.energy_data, x, b, in.data_size);
+  if constexpr (kPrevScalars > 0) {
+    const bool elastic = (in.energies & kElastic) != 0;
+    require(!elastic || f.corners_prev.numel() == kPrevScalars * b * tets,
+            "diffvbd::sweep: expected the corners' positions at the start of the step");
+    const Batched<const T> all = batched<T>(f.corners_prev, x, kPrevScalars, b * tets);
+    for (int i = 0; elastic && i < kPrevScalars; ++i)
+      in.material[kMaterialScalars + i] = {all.data + i * b * tets, tets, 1};
+  }
 }
 
 inline bool has_contact(const SweepSettings& q, const SweepFields& f) {
@@ -92,17 +100,24 @@ SweepBars make_bars(const Tensor& x, const In& in, int64_t vertices, int64_t tet
                     const std::vector<bool>& wants, const Make& make) {
   require(wants.size() == 4, "diffvbd::sweep_backward: expected 4 wishes");
   const auto none = [&] { return make({0}, false); };
-  SweepBars bars{none(), none(), none(), none(), none(), none(), none(),
+  SweepBars bars{none(), none(), none(), none(), none(), none(), none(), none(),
                  none(), none(), none(), none(), none(), none(), none()};
   const std::vector<int64_t> state{in.scenes, vertices, 3};
   bars.x_start = make(state, false), bars.x_prev = make(state, zeroed), bars.y = make(state, false);
   make_body_bars(bars, in, vertices, tets, materials, zeroed, {wants[0], wants[1], wants[2]}, make);
+  bars.corners_prev =
+      make(wants[0] && kPrevScalars > 0 ? std::vector<int64_t>{kPrevScalars, in.scenes, tets} : std::vector<int64_t>{0},
+           zeroed || (in.energies & kElastic) == 0);
   bars.energy_data = make(wants[3] ? std::vector<int64_t>{in.scenes, in.data_size} : std::vector<int64_t>{0}, zeroed);
   return bars;
 }
 template <class Out, class In, class T = typename Out::Scalar>
 void set_bars(Out& out, const SweepBars& bars, const In& in) {
   set_body_bars(out, bars, in);
+  const bool follows = bars.corners_prev.numel() > 0 && (in.energies & kElastic);
+  for (int i = 0; follows && i < kPrevScalars; ++i) {
+    out.material[kMaterialScalars + i] = data<T>(bars.corners_prev) + i * bars.corners_prev.numel() / kPrevScalars;
+  }
   out.x_start = data<T>(bars.x_start), out.x_prev = data<T>(bars.x_prev), out.y = data<T>(bars.y);
   out.data = bars.energy_data.numel() > 0 ? data<T>(bars.energy_data) : nullptr;
 }

@@ -16,7 +16,7 @@ void check_material(const StepInputs<T>& in, int64_t tets) {
   const int64_t count = one_for_items(in.material) ? std::min<int64_t>(tets, 1) : tets;
   for (int64_t b = 0; b < distinct; ++b) {
     for (int64_t i = 0; i < count; ++i) {
-      T material[kMaterialScalars];
+      T material[kMaterialScalars];  // x_prev has been looked at
       for (int m = 0; m < kMaterialScalars; ++m) {
         material[m] = in.material[m].data[b * in.material[m].scene + i * in.material[m].item];
       }

@@ -92,13 +92,13 @@ struct Scene {
     view.origin = origin.get();
     view.mass = mass.get();
     if (in.energies & kElastic) {
-      material = Buffer<T>(size_t(plan.slots) * kMaterialScalars * kLanes);
-      for (int m = 0; m < kMaterialScalars; ++m) {
-        const Batched<const T>& given = in.material[m];
-        const T* of_tet = given.data + scene * given.scene;
+      material = Buffer<T>(size_t(plan.slots) * kTetScalars * kLanes);
+      for (int m = 0; m < kTetScalars; ++m) {
         for (int64_t i = 0; i < int64_t{plan.slots} * kLanes; ++i) {
+          const Batched<const T>& given = in.material[TetLayout::scalar_index(plan.pair[i] & 3, m)];
           const int64_t tet = plan.pair[i] >> 2, slot = i / kLanes;
-          material.get()[(slot * kMaterialScalars + m) * kLanes + i % kLanes] = of_tet[tet * given.item];
+          material.get()[(slot * kTetScalars + m) * kLanes + i % kLanes] =
+              given.data[scene * given.scene + tet * given.item];
         }
       }
       view.material = material.get();
@@ -230,8 +230,8 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     const Buffer<T> x_rows(4 * lanes), y_bar(3 * lanes, true), mass_bar(lanes, true),
         rows(4 * (int64_t{plan.edge_slots} * kLanes + 1), true);
     const Buffer<T> x_prev_bar(s.x_prev ? 3 * lanes : 0, true),
-        material_bar(wants_material ? kMaterialScalars * pairs : 0, true),
-        rest_bar(out.rest ? kPairRest * pairs : 0, true), data_bar(out.data ? kMaxEnergyData * lanes : 0, true);
+        material_bar(wants_material ? kTetScalars * pairs : 0, true), rest_bar(out.rest ? kPairRest * pairs : 0, true),
+        data_bar(out.data ? kMaxEnergyData * lanes : 0, true);
     pack_rows(plan, x_bar + b * 3 * n, x_rows.get(), false);
     s.x_bar = x_rows.get();
     s.y_bar = y_bar.get();
@@ -300,8 +300,9 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
           if (is_padding(plan, slot, block, l)) continue;
           const int64_t tet = plan.pair[slot * kLanes + l] >> 2;
           const int local = plan.pair[slot * kLanes + l] & 3;
-          for (int m = 0; wants_material && m < kMaterialScalars; ++m) {
-            out.material[m][b * tets + tet] += s.material_bar[(slot * kMaterialScalars + m) * kLanes + l];
+          for (int m = 0; wants_material && m < kTetScalars; ++m) {
+            out.material[TetLayout::scalar_index(local, m)][b * tets + tet] +=
+                s.material_bar[(slot * kTetScalars + m) * kLanes + l];
           }
           for (int i = 0; out.rest && i < kPairRest; ++i) {
             out.rest[(b * tets + tet) * kRestScalars + TetLayout::rest_index(local, i)] +=

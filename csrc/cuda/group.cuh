@@ -137,7 +137,7 @@ struct GroupStar {
     degree = __ldg(s.plan.block_edge + at.block + 1) - first_edge;
     if (s.one_material) {
 #pragma unroll
-      for (int m = 0; m < kMaterialScalars; ++m) {
+      for (int m = 0; m < kTetScalars; ++m) {
         next.material[m] = __ldg(s.material[m].data + at.scene * s.material[m].scene);
       }
     }
@@ -188,7 +188,7 @@ struct GroupStar {
   // What a pair reads of the mesh; always loaded one pair ahead.
   struct Record {
     int where;
-    T rest[kRestRow], material[kMaterialScalars];
+    T rest[kRestRow], material[kTetScalars];
   };
   mutable Record next;
   mutable int where;     // of the pair at work
@@ -205,9 +205,9 @@ struct GroupStar {
       for (int k = 0; k < width; ++k) next.rest[i + k] = part.v[k];
     }
     if (!s.one_material) {
-      const T* m = s.w.material + at.scene * s.material_scene + (base + at.v) * kMaterialScalars;
+      const T* m = s.w.material + at.scene * s.material_scene + (base + at.v) * kTetScalars;
 #pragma unroll
-      for (int i = 0; i < kMaterialScalars; ++i) next.material[i] = __ldg(m + i);
+      for (int i = 0; i < kTetScalars; ++i) next.material[i] = __ldg(m + i);
     }
   }
   __device__ __forceinline__ Vec3<T> neighbour(int a) const {
@@ -230,7 +230,7 @@ struct GroupStar {
 #pragma unroll
     for (int i = 0; i < kPairRest; ++i) out.rest[i] = now.rest[i];
 #pragma unroll
-    for (int i = 0; i < kMaterialScalars; ++i) out.material[i] = now.material[i];
+    for (int i = 0; i < kTetScalars; ++i) out.material[i] = now.material[i];
     return out;
   }
   template <class... R>
@@ -246,7 +246,7 @@ struct GroupStar {
   // the sums of a copy
   __device__ __forceinline__ void adopt(const GroupStar& a) const {
 #pragma unroll
-    for (int i = 0; i < kMaterialScalars; ++i) material_bar[i] = a.material_bar[i];
+    for (int i = 0; i < kTetScalars; ++i) material_bar[i] = a.material_bar[i];
   }
   __device__ __forceinline__ const Vec3<T>& predictor(const Block<T>& b) const { return b.y; }
 
@@ -287,11 +287,11 @@ struct GroupStar {
   __device__ __forceinline__ void add_material(int e, const T* bar) const {
     if (s.one_material) {
 #pragma unroll
-      for (int i = 0; i < kMaterialScalars; ++i) material_bar[i] += bar[i];
+      for (int i = 0; i < kTetScalars; ++i) material_bar[i] += bar[i];
     } else if (real(e)) {
-      T* to = s.w.material_bar + pair_index(e) * kMaterialScalars;
+      T* to = s.w.material_bar + pair_index(e) * kTetScalars;
 #pragma unroll
-      for (int i = 0; i < kMaterialScalars; ++i) to[i] += bar[i];
+      for (int i = 0; i < kTetScalars; ++i) to[i] += bar[i];
     }
   }
   __device__ __forceinline__ void add_rest(int e, const T* bar) const {
@@ -300,7 +300,7 @@ struct GroupStar {
 #pragma unroll
     for (int i = 0; i < kPairRest; ++i) to[i] += bar[i];
   }
-  mutable T material_bar[kMaterialScalars] = {};
+  mutable T material_bar[kTetScalars] = {};
 
   // Writes the rows of the vertex's edges: the sums of its threads, in their order. What is pinned has no turn of its
   // own: rows that lead to it add up over the sweeps.

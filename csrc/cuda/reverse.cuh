@@ -73,9 +73,9 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
     star.send_rows(__ldg(s.plan.color_block + s.plan.colors) * kSlice);
     if constexpr ((wanted & kMaterial) != 0) {
       if (s.one_material) {
-        T* to = s.w.material_bar + row * kMaterialScalars;
+        T* to = s.w.material_bar + row * kTetScalars;
 #pragma unroll
-        for (int i = 0; i < kMaterialScalars; ++i) {
+        for (int i = 0; i < kTetScalars; ++i) {
           star.total(star.material_bar[i]);
           if (writes) to[i] += star.material_bar[i];
         }

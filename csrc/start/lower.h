@@ -35,11 +35,18 @@ DIFFVBD_FN double rise(const Candidates<T>& in, const rigid::Body<T>& b, const T
     const int32_t* tet = in.tets + 5 * int64_t{first + i};
     rigid::Vector one[4], two[4];
     for (int c = 0; c < 4; ++c) one[c] = b.position(tet[1 + c]), two[c] = other(tet[1 + c]);
-    double rest[kRestScalars], material[kMaterialScalars];
+    double rest[kRestScalars], material[kTetScalars];
     const T* of_tet = in.rest.data + b.scene * in.rest.scene + kRestScalars * int64_t{tet[0]};
     for (int c = 0; c < kRestScalars; ++c) rest[c] = of_tet[c];
     for (int m = 0; m < kMaterialScalars; ++m) {
       material[m] = in.material[m].data[b.scene * in.material[m].scene + in.material[m].item * tet[0]];
+    }
+    if constexpr (TetLayout::reads_x_prev) {
+      for (int c = 0; c < 4; ++c) {
+        const rigid::Vector before = b.state(tet[1 + c], one[c]).x_prev;
+        double* at = material + kMaterialScalars + 3 * c;
+        at[0] = before.x, at[1] = before.y, at[2] = before.z;
+      }
     }
     to[0] += TetLaw::value(two, rest, material) - TetLaw::value(one, rest, material);
   });

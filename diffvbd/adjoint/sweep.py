@@ -70,12 +70,12 @@ class _Sweep(Function):
 
     @staticmethod
     def forward(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider, collider_prev, kappa,
-                pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, packed_rest, plan,
-                settings, tape_policy, debug_step, checked):  # fmt: skip
+                pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, corners_prev,
+                packed_rest, plan, settings, tape_policy, debug_step, checked):  # fmt: skip
         # torch.compile counts these arguments: *args would get the context as well
         fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider,
                                  collider_prev, kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry,
-                                 floor_lag)  # fmt: skip
+                                 floor_lag, corners_prev)  # fmt: skip
         return ops.sweep(fields, packed_rest, plan, settings, tape_policy, debug_step, checked)
 
     @staticmethod
@@ -96,7 +96,7 @@ class _Sweep(Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int | None, ...]]:
         fields = ops.SweepFields(*args[:_FIELDS])
-        _no_contact(fields)
+        _plain(fields)
         scenes = _scenes(fields, in_dims)
         folded: list[Any] = [_folded(t, d, info.batch_size, scenes) for t, d in zip(fields, in_dims, strict=False)]
         full = (info.batch_size * scenes, *folded[0].shape[1:])
@@ -109,11 +109,11 @@ class _Sweep(Function):
 class _SweepBackward(Function):
     @staticmethod
     def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider, collider_prev,
-                kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, packed_rest, plan,
-                x, tape, settings, tape_policy, needs):  # fmt: skip
+                kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, corners_prev,
+                packed_rest, plan, x, tape, settings, tape_policy, needs):  # fmt: skip
         fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider,
                                  collider_prev, kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry,
-                                 floor_lag)  # fmt: skip
+                                 floor_lag, corners_prev)  # fmt: skip
         wants = _wants(ops.SWEEP_ADJOINTS, fields._fields, needs)
         with backward_memory(x, settings, tape_policy):
             bars = ops.sweep_backward(x_bar, x, tape, fields, packed_rest, plan, settings, tape_policy, wants)
@@ -133,7 +133,7 @@ class _SweepBackward(Function):
         if settings.launch[:1] == (THREAD,):  # its tape has scenes last: run again, with one that does not
             settings, tape_policy, saved[-1] = _scenes_first(settings), ops.NO_TAPE, x_bar.new_empty((0,))
         fields = ops.SweepFields(*saved[:_FIELDS])
-        _no_contact(fields)
+        _plain(fields)
         scenes, size = _scenes((x_bar, *fields), in_dims), info.batch_size
         folded: list[Any] = [_folded(t, d, size, scenes) for t, d in zip(fields, in_dims[1:], strict=False)]
         packed_rest, plan, x, tape = saved[_FIELDS:]
@@ -162,9 +162,11 @@ def no_transforms() -> NoReturn:
     raise NotImplementedError("diffvbd: torch.func transforms of a step with contact are not supported")
 
 
-def _no_contact(fields: ops.SweepFields) -> None:
+def _plain(fields: ops.SweepFields) -> None:
     if fields.bounds is not None:
         no_transforms()
+    if fields.corners_prev is not None:
+        raise NotImplementedError("diffvbd: torch.func transforms of a law that reads x_prev are not supported")
 
 
 def _folded(t: Any, dim: int | None, size: int, scenes: int) -> Any:

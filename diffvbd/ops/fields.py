@@ -11,6 +11,7 @@ from ..mask import KEEPS_POSITIONS
 
 NO_TAPE, COMPACT_TAPE, FULL_TAPE = 0, 1, 2
 REST_SCALARS = 7  # k01 k02 k03 k12 k13 k23 c6 of a tet
+TET_READS_X_PREV = False  # twin of TetLayout::reads_x_prev in csrc/energies/tet.h
 LANES = {"cpu": 8, "cuda": 32}  # vertices of a block of the plan; twins of kLanes and kSlice in csrc/core/views.h
 THREAD = 1  # the regime whose tape has scenes last; twin of kThread in csrc/cuda/step.h
 PLAN_HEADER = 11  # twin of kPlanHeader in csrc/core/plan_views.h
@@ -45,11 +46,12 @@ class SweepFields(NamedTuple):
     lag_ptr: Tensor | None = None
     lag_entry: Tensor | None = None
     floor_lag: Tensor | None = None  # [B, V, planes, 4]
+    corners_prev: Tensor | None = None  # x_prev of the tets' corners, [12, B, T], where their law reads it
 
 
 # What the reverse differentiates: the fields that are ADJOINT in csrc/bind/fields.h.
 SWEEP_ADJOINTS = ("x_start", "x_prev", "y", "mu", "lam", "mass", "rest", "energy_data", "bounds", "collider",
-                  "collider_prev", "kappa", "lag", "floor_lag")  # fmt: skip
+                  "collider_prev", "kappa", "lag", "floor_lag", "corners_prev")  # fmt: skip
 
 
 class StepFields(NamedTuple):

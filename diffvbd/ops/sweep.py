@@ -15,6 +15,7 @@ from .fields import (
     REST_SCALARS,
     STEP_ADJOINTS,
     SWEEP_ADJOINTS,
+    TET_READS_X_PREV,
     StepFields,
     SweepFields,
     SweepSettings,
@@ -49,7 +50,8 @@ def sweep_backward(x_bar: Tensor, x: Tensor, tape: Tensor, fields: SweepFields, 
     if tape_policy == NO_TAPE:
         tape_policy = FULL_TAPE
         x, tape, _ = raw.sweep(*given, plan, *settings, tape_policy, -1, False)
-    flags = [wants["mu"] or wants["lam"], wants["mass"], wants["rest"], wants["energy_data"]]
+    material = wants["mu"] or wants["lam"] or wants["corners_prev"]
+    flags = [material, wants["mass"], wants["rest"], wants["energy_data"]]
     bars = raw.sweep_backward(*given, x_bar.contiguous(), x, tape, plan, *settings, tape_policy, flags)
     return dict(zip(SWEEP_ADJOINTS, bars, strict=True))
 
@@ -89,7 +91,7 @@ def _(*arguments):
 
 def _body_adjoints(x: Tensor, f: Any, num_tets: int, wants: Sequence[bool]) -> list[Tensor]:
     """Empty adjoints of mu, lam, mass, rest. CUDA sums the material that a scene shares."""
-    shares = f.mu.is_cuda and f.mu.shape[-1] == 1 and f.lam.shape[-1] == 1
+    shares = f.mu.is_cuda and f.mu.shape[-1] == 1 and f.lam.shape[-1] == 1 and not TET_READS_X_PREV
     b, v = x.shape[:2]
     materials = (b, 1 if shares else num_tets)
     shapes = (materials, materials, (b, v), (b, num_tets, REST_SCALARS))
@@ -103,13 +105,14 @@ def _(*arguments):
     b, v = x.shape[:2]
     own = [*(torch.empty_like(x) for _ in range(3)), *_body_adjoints(x, f, sizes[1], wants[:3])]
     own.append(x.new_empty((b, f.energy_data.shape[-1]) if wants[3] else (0,)))
+    corners = x.new_empty(f.corners_prev.shape if wants[0] else (0,))
     if not energies & CONTACT:
-        return (*own, *(x.new_empty((0,)) for _ in range(len(SWEEP_ADJOINTS) - len(own))))
+        return (*own, *(x.new_empty((0,)) for _ in range(len(SWEEP_ADJOINTS) - len(own) - 1)), corners)
     colliders = f.collider.shape[1] if f.collider.dim() == 3 else 0
     planes = f.floor_lag.numel() // max(1, f.floor_lag.shape[0] * 4 * v)
     shapes = [(b, v, 4), (b, colliders, 3), (b, colliders, 3), (b,), (f.lag_pairs.shape[0], LAG_SCALARS),
               (b, v, planes, 4)]  # fmt: skip
-    return (*own, *(x.new_empty(shape) for shape in shapes))
+    return (*own, *(x.new_empty(shape) for shape in shapes), corners)
 
 
 @torch.library.register_fake("diffvbd::fused_step")

@@ -124,7 +124,7 @@ def solve(
         # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph
         begun = begun._replace(x_start=torch.where(model._pinned[:, None], begun.x_start, done.end))
         x_end, v_end = begun.finish(
-            global_sweep(model, begun.fields(prepared), settings, adjoint), model, prepared, corrects=False
+            global_sweep(model, begun.fields(model, prepared), settings, adjoint), model, prepared, corrects=False
         )
     else:
         again = prepare(model, lead, sweeps=done.count, adjoint=adjoint, **options)
@@ -177,7 +177,7 @@ class _Sweeping:
     def _end_at(self, x: Tensor) -> None:
         """Corrects what the last sweep left, and looks at it."""
         self.end = self.begun.corrected(x, self.model, self.prepared)
-        at = IncrementalPotential(self.model, self.end, self.begun.fields(self.prepared), self.time_step)
+        at = IncrementalPotential(self.model, self.end, self.begun.fields(self.model, self.prepared), self.time_step)
         if self.rounding is None:
             self.rounding = _rounding(at)
         self.residual, self.converged = _residual(at, self.tolerance, self.rounding)

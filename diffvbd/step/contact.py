@@ -76,7 +76,7 @@ class ContactStep:
         # [B, Vc, 3] at the end and at the start of the step: one tensor if they rest
         self.before = before.contiguous()
         self.colliders = self.before if colliders is before else colliders.contiguous()
-        self.fields = begun.fields(prepared)
+        self.fields = begun.fields(model, prepared)
         self.origin = begun.x_prev.new_empty((0,)) if begun.origin is None else begun.origin
         self.surface, self.barrier = model.surface_of_contact, model.contact
         self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()].contiguous()

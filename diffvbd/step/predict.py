@@ -45,10 +45,14 @@ class Begun(NamedTuple):
         origin = None if self.origin is None else self.origin.detach()
         return Begun(self.x_start.detach(), self.x_prev.detach(), self.y.detach(), self.data.detach(), origin)
 
-    def fields(self, prepared: Prepared) -> ops.SweepFields:
+    def fields(self, model: Model, prepared: Prepared) -> ops.SweepFields:
         """What the sweeps read, without contact."""
-        return ops.SweepFields(self.x_start, self.x_prev, self.y, prepared.mu, prepared.lam, prepared.mass,
-                               prepared.rest, self.data, self.origin)  # fmt: skip
+        fields = ops.SweepFields(self.x_start, self.x_prev, self.y, prepared.mu, prepared.lam, prepared.mass,
+                                 prepared.rest, self.data, self.origin)  # fmt: skip
+        if not ops.TET_READS_X_PREV:
+            return fields
+        corners = self.x_prev[:, model.tets].flatten(2).permute(2, 0, 1).contiguous()
+        return fields._replace(corners_prev=corners)
 
     def corrected(self, x: Tensor, model: Model, prepared: Prepared) -> Tensor:
         """x [B, V, 3] after the rigid correction, where the Model has one."""

@@ -29,7 +29,7 @@ def at_a_state(device: str, case: str, kind: str) -> tuple[IncrementalPotential,
     prepared = prepare(model, tuple(x.shape[:-2]), rest_points=None, density=None, parameters=None, **options)
     begun = begin(model, x, v, prepared, loads["force"], acceleration_of(loads["gravity"], x), loads["prescribed"])
     end = dv.step(model, x, v, **options, **loads)[0].reshape(begun.y.shape)
-    potential = IncrementalPotential(model, end, begun.fields(prepared), h)
+    potential = IncrementalPotential(model, end, begun.fields(model, prepared), h)
     w = torch.randn(end.shape, dtype=end.dtype, generator=torch.Generator().manual_seed(1)).to(device) * potential.free
 
     leaf = end.clone().requires_grad_()

@@ -3,15 +3,11 @@
 The docs' own example, Anchor, is added once more under another name, in a copy of the sources, which is then built.
 """
 
-import os
 import re
-import shlex
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from helpers.copied_sources import build, copy_sources, edit, run
 from helpers.paths import ROOT, needs_csrc
 
 SCRIPT = """
@@ -54,12 +50,6 @@ def renamed(text: str) -> str:
     return text.replace("Anchor", "Tether").replace("anchor", "tether")
 
 
-def edit(path: Path, old: str, new: str) -> None:
-    text = path.read_text(encoding="utf-8")
-    assert text.count(old) == 1, f"{path.name}: {old}"
-    path.write_text(text.replace(old, new), encoding="utf-8")
-
-
 def class_of(path: Path, name: str) -> str:
     """Source of a class up to the next statement of the module, with its decorators."""
     (found,) = re.findall(rf"(?:^@[^\n]*\n)*^class {name}\b.*?(?=^\S(?<!\)))", path.read_text(encoding="utf-8"),
@@ -90,16 +80,7 @@ def test_the_page_counts_its_places() -> None:
 @pytest.mark.slow
 @needs_csrc
 def test_a_third_energy_of_single_vertices_and_contact(tmp_path: Path) -> None:
-    for name in ("csrc", "diffvbd"):
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
-    for name in ("setup.py", "pyproject.toml", "README.md"):
-        shutil.copy(ROOT / name, tmp_path)
+    copy_sources(tmp_path)
     add_an_energy(tmp_path)
-    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
-    (command,) = re.findall(r"^(DIFFVBD_QUICK=1) python (setup.py .*)$", page, re.MULTILINE)
-    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
-    build = f"{command[0]} {shlex.quote(sys.executable)} {command[1]}"
-    subprocess.run(build, shell=True, cwd=tmp_path, env=environment, check=True, capture_output=True)
-    run = [sys.executable, "-c", SCRIPT]
-    done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0 and "a third energy and contact" in done.stdout, done.stderr[-3000:]
+    build(tmp_path)
+    assert "a third energy and contact" in run(tmp_path, SCRIPT)

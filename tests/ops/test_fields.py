@@ -43,6 +43,7 @@ def test_material_and_rest_agree() -> None:
     text = (CSRC / "energies" / "tet.h").read_text(encoding="utf-8")
     counts = {name: int(n) for name, n in re.findall(r"static constexpr int (\w+) = (\d+);", text)}
     assert counts == {"material": 2, "rest": ops.REST_SCALARS, "pair_rest": ops.PAIR_REST}
+    assert f"bool reads_x_prev = {str(ops.TET_READS_X_PREV).lower()};" in text
     assert ops.SweepFields._fields.index("lam") == ops.SweepFields._fields.index("mu") + 1
 
 
