@@ -16,6 +16,7 @@ from .inspect.debug import debug_checks
 from .inspect.diagnose import Diagnosis, diagnose
 from .inspect.gradcheck import GradientCheck, check_gradients
 from .mesh import TetMesh
+from .model.coarse import CoarseSpace
 from .model.model import Model
 from .model.moduli import lame, young_poisson
 from .ops.regimes import regime
@@ -28,6 +29,7 @@ from .step.step import step
 __all__ = [
     "Anchor",
     "BinomialCheckpoints",
+    "CoarseSpace",
     "Diagnosis",
     "FloorBarrier",
     "Friction",

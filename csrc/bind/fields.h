@@ -10,8 +10,8 @@
 
 // clang-format off
 // The predictor and the start; the body; data of the energies; contact, all empty without it: bounds, colliders,
-// stiffness, the pairs that repel, and what friction and damping keep of the start of the step; last the tets' corners
-// then, empty for a law that does not read them.
+// stiffness, the pairs that repel, and what friction and damping keep of the start of the step; then the tets' corners
+// there, empty for a law that does not read them; last the corrections on a coarse space (coarse/views.h), if any.
 #define DIFFVBD_SWEEP_FIELDS(ADJOINT, INDEX) \
   ADJOINT(x_start) ADJOINT(x_prev) ADJOINT(y) \
   ADJOINT(mu) ADJOINT(lam) ADJOINT(mass) ADJOINT(rest) \
@@ -19,7 +19,13 @@
   ADJOINT(bounds) ADJOINT(collider) ADJOINT(collider_prev) ADJOINT(kappa) \
   INDEX(pairs) INDEX(constants) INDEX(ptr) INDEX(entry) \
   ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag) \
-  ADJOINT(corners_prev)
+  ADJOINT(corners_prev) \
+  ADJOINT(coarse_matrix) INDEX(coarse_inverse) INDEX(coarse_mass) INDEX(coarse_plan) INDEX(coarse_weights) INDEX(coarse_rest)
+
+// The matrix of a coarse space at the start of a step (coarse/matrix.h): plan int32, moments [n, 3] and volume [groups]
+// of the groups, stiffness [1 | scenes, groups, 3 width, 3 width], mass [1 | scenes, cells].
+#define DIFFVBD_COARSE_FIELDS(ADJOINT, INDEX) \
+  ADJOINT(x_prev) ADJOINT(stiffness) ADJOINT(mass) INDEX(plan) INDEX(moments) INDEX(volume)
 
 // A whole step in one operator (CUDA).
 #define DIFFVBD_STEP_FIELDS(ADJOINT, INDEX) \
@@ -73,6 +79,7 @@ DIFFVBD_STRUCT(SweepFields, SWEEP)
 DIFFVBD_STRUCT(StepFields, STEP)
 DIFFVBD_STRUCT(RigidFields, RIGID)
 DIFFVBD_STRUCT(BeginFields, BEGIN)
+DIFFVBD_STRUCT(CoarseFields, COARSE)
 DIFFVBD_BARS(SweepBars, SWEEP)
 DIFFVBD_BARS(StepBars, STEP)
 using SweepAdjoints = decltype(std::declval<SweepBars>().tensors());

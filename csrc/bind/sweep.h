@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "arguments.h"
+#include "coarse.h"
 #include "contact.h"
 #include "fields.h"
 #include "material.h"
@@ -94,20 +95,22 @@ void set_body_bars(Out& out, const Bars& bars, const In& in) {
   out.mass = of(bars.mass);
 }
 
-// Adjoints of a sweep, without those of contact. wants: material, mass, rest, energy data.
+// Adjoints of a sweep, without those of contact. wants: material, mass, rest, energy data, coarse matrix.
 template <class In, class Make>
-SweepBars make_bars(const Tensor& x, const In& in, int64_t vertices, int64_t tets, int64_t materials, bool zeroed,
+SweepBars make_bars(const Tensor& x, const SweepFields& f, const In& in, int64_t vertices, int64_t tets, int64_t materials, bool zeroed,
                     const std::vector<bool>& wants, const Make& make) {
-  require(wants.size() == 4, "diffvbd::sweep_backward: expected 4 wishes");
+  require(wants.size() == 5, "diffvbd::sweep_backward: expected 5 wishes");
   const auto none = [&] { return make({0}, false); };
-  SweepBars bars{none(), none(), none(), none(), none(), none(), none(), none(),
-                 none(), none(), none(), none(), none(), none(), none()};
+  SweepBars bars{none(), none(), none(), none(), none(), none(), none(), none(), none(), none(), none(), none(), none(), none(), none(), none()};
   const std::vector<int64_t> state{in.scenes, vertices, 3};
   bars.x_start = make(state, false), bars.x_prev = make(state, zeroed), bars.y = make(state, false);
   make_body_bars(bars, in, vertices, tets, materials, zeroed, {wants[0], wants[1], wants[2]}, make);
   bars.corners_prev =
       make(wants[0] && kPrevScalars > 0 ? std::vector<int64_t>{kPrevScalars, in.scenes, tets} : std::vector<int64_t>{0},
            zeroed || (in.energies & kElastic) == 0);
+  const bool corrects = wants[4] && f.coarse_plan.numel() > 0;
+  bars.coarse_matrix = make(corrects ? std::vector<int64_t>{in.scenes, f.coarse_matrix.size(1)}
+                                     : std::vector<int64_t>{0}, true);
   bars.energy_data = make(wants[3] ? std::vector<int64_t>{in.scenes, in.data_size} : std::vector<int64_t>{0}, zeroed);
   return bars;
 }

@@ -65,9 +65,16 @@ SweepKernel<T> reverse_kernel(int energies) {
   return compiled(kernels<T>().reverse(energies));
 }
 
+template <class T>
+CoarseKernels<T> coarse_kernels(int energies) {
+  return kernels<T>().coarse(energies);
+}
+
 template SweepKernel<float> forward_kernel<float>(int);
 template SweepKernel<double> forward_kernel<double>(int);
 template SweepKernel<float> reverse_kernel<float>(int);
 template SweepKernel<double> reverse_kernel<double>(int);
+template CoarseKernels<float> coarse_kernels<float>(int);
+template CoarseKernels<double> coarse_kernels<double>(int);
 
 }  // namespace diffvbd

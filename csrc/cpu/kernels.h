@@ -15,10 +15,29 @@ SweepKernel<T> forward_kernel(int energies);
 template <class T>
 SweepKernel<T> reverse_kernel(int energies);
 
+// The loops of coarse corrections (coarse.h): the gradient of the blocks [begin, end), and its transpose.
+template <class T>
+using GradientKernel = void (*)(const Plan&, const SceneView<T>&, const StepParameters<T>&, int64_t begin, int64_t end);
+template <class T>
+struct CoarseKernels {
+  GradientKernel<T> gradient, reverse;
+  // to[row] = sum of weight[e] from[of[e]] for e of the rows [begin, end); rows of four scalars
+  void (*gather)(const int32_t* ptr, const int32_t* of, const T* weight, const T* from, T* to, int64_t begin,
+                 int64_t end);
+  // to[i] = sum over j of matrix[j, i] from[j], i of [begin, end), for a matrix of n x n
+  void (*multiply)(const T* matrix, const T* from, int64_t n, T* to, int64_t begin, int64_t end);
+  // adds the coefficients of the tets' potential along `way`, blocks [begin, end) of the coarse plan
+  void (*line)(const int32_t* corner, const T* rest, const T* material, const T* x, const T* way, int64_t begin,
+               int64_t end, double* coefficients);
+};
+template <class T>
+CoarseKernels<T> coarse_kernels(int energies);
+
 // The loops of one instruction set: each is compiled in files of its own, sweep_<scalar>_<set>.cpp.
 template <class T>
 struct Kernels {
   SweepKernel<T> (*forward)(int energies), (*reverse)(int energies);
+  CoarseKernels<T> (*coarse)(int energies);
 };
 namespace baseline {
 template <class T>

@@ -6,6 +6,7 @@
 #include <stdexcept>
 #include <vector>
 
+#include "coarse.h"
 #include "contact.h"
 #include "kernels.h"
 #include "message.h"
@@ -183,6 +184,7 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
   const int64_t tape_size =
       int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
   const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
+  const int every = in.coarse ? in.coarse->plan.every : 0;
   // a message thrown inside a parallel region would be lost
   const bool looks = in.debug_step >= 0;
   for_scenes(in.scenes, !looks, [&](int64_t b) {
@@ -192,8 +194,13 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
     if (in.contact) {
       contact.emplace(plan, *in.contact, position.data(), b, scene.view, in.parameters.time_step, nullptr);
     }
+    std::optional<CoarseScene<T>> coarse;
+    if (in.coarse) coarse.emplace(plan, in, b, scene.view);
     Team::run(looks ? 1 : team_size(plan, in.scenes, in.sweeps), [&](Team::Member member) {
-      for (int k = 0; k < in.sweeps; ++k) {
+      int corrections = 0;
+      for (int k = 0; k <= in.sweeps; ++k) {
+        if (coarse && coarse::corrects_before(k, in.sweeps, every)) coarse->correct(corrections++, member);
+        if (k == in.sweeps) break;
         const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
         for (int c = 0; c < plan.colors; ++c) {
           const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
@@ -249,35 +256,45 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
       contact.emplace(plan, *in.contact, position.data(), b, s, in.parameters.time_step, out.contact);
     }
 
-    Team::run(team_size(plan, in.scenes, in.sweeps), [&](Team::Member member) {
-      for (int k = in.sweeps - 1; k >= 0; --k) {
-        const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
-        for (int c = plan.colors - 1; c >= 0; --c) {
-          const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
-          if (contact) {
-            member.each(first, last,
-                        [&](int64_t begin, int64_t end) { contact->prepare(k, in.tape_policy, begin, end); });
-            member.barrier();
-            if (in.tape_policy != kFullTape) {
-              member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
-              member.barrier();
-            }
-          }
+    std::optional<CoarseScene<T>> coarse;
+    if (in.coarse) coarse.emplace(plan, in, b, s);
+    const int every = in.coarse ? in.coarse->plan.every : 0;
+
+    const auto sweep_back = [&](int k, Team::Member& member) {
+      const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
+      for (int c = plan.colors - 1; c >= 0; --c) {
+        const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
+        if (contact) {
           member.each(first, last,
-                      [&](int64_t begin, int64_t end) { kernel(plan, s, q, k, in.tape_policy, begin, end); });
+                      [&](int64_t begin, int64_t end) { contact->prepare(k, in.tape_policy, begin, end); });
           member.barrier();
-          if (contact) {
-            member.each(first, last, [&](int64_t begin, int64_t end) { contact->reverse(begin, end); });
+          if (in.tape_policy != kFullTape) {
+            member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
             member.barrier();
           }
         }
-        // Pinned vertices have no turn of their own: they collect after each sweep, before the rows are overwritten.
-        member.each(plan.color_block[plan.colors], plan.blocks, [&](int64_t begin, int64_t end) {
-          for (int64_t block = begin; block < end; ++block) {
-            store_rows(s.x_bar, block, load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block));
-          }
-        });
+        member.each(first, last,
+                    [&](int64_t begin, int64_t end) { kernel(plan, s, q, k, in.tape_policy, begin, end); });
         member.barrier();
+        if (contact) {
+          member.each(first, last, [&](int64_t begin, int64_t end) { contact->reverse(begin, end); });
+          member.barrier();
+        }
+      }
+      // Pinned vertices have no turn of their own: they collect after each sweep, before the rows are overwritten.
+      member.each(plan.color_block[plan.colors], plan.blocks, [&](int64_t begin, int64_t end) {
+        for (int64_t block = begin; block < end; ++block) {
+          store_rows(s.x_bar, block, load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block));
+        }
+      });
+      member.barrier();
+    };
+    Team::run(team_size(plan, in.scenes, in.sweeps), [&](Team::Member member) {
+      int corrections = in.coarse ? in.coarse->corrections : 0;
+      for (int k = in.sweeps; k >= 0; --k) {
+        // what sweep k has read it no longer holds back: a correction before it comes next
+        if (k < in.sweeps) sweep_back(k, member);
+        if (coarse && coarse::corrects_before(k, in.sweeps, every)) coarse->reverse(--corrections, member);
       }
     });
     collect_last(plan, s.rows, s.x_bar);

@@ -2,6 +2,7 @@
 // colors.
 #pragma once
 
+#include "../coarse/views.h"
 #include "../contact/passes.h"
 #include "plan.h"
 #include "scene.h"
@@ -24,6 +25,7 @@ struct StepInputs {
   StepParameters<T> parameters;
   int sweeps, tape_policy;
   const contact::ContactInputs<T>* contact;  // null without contact
+  const coarse::Inputs<T>* coarse;           // null without coarse corrections
   int64_t debug_step;                        // step number to name when a position is not finite; -1: do not look
 };
 

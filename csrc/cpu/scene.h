@@ -42,9 +42,11 @@ struct SceneView {
   const T* data;      // energies: per-scene ones (count), per-vertex ones (vertices, stride), in the order of the list
   int64_t data_start[kVertexEnergies];
   int data_count[kVertexEnergies];
-  T* tape;     // [sweeps, rows, active]
-  T* contact;  // [blocks, kContactScalars, kLanes] or null: what contact adds to the blocks, and the bounds
-  T* cut;      // [blocks, kLanes]: > 0 where a bound has changed an update; or null
+  T* tape;      // [sweeps, rows, active]
+  T* contact;   // [blocks, kContactScalars, kLanes] or null: what contact adds to the blocks, and the bounds
+  T* cut;       // [blocks, kLanes]: > 0 where a bound has changed an update; or null
+  T* gradient;  // [blocks kLanes, 4] of the potential, for a coarse correction
+  T* way;       // [blocks kLanes, 4] along which one goes; in the reverse what the gradient is multiplied with
 
   // reverse only
   T* x_bar;         // [blocks kLanes, 4]

@@ -1,6 +1,7 @@
 // The loops of the instruction set DIFFVBD_SET: the body of the files sweep_<scalar>_<set>.cpp.
 #pragma once
 
+#include "coarse_kernels.h"
 #include "forward.h"
 #include "reverse.h"
 
@@ -16,8 +17,13 @@ SweepKernel<T> reverse(int energies) {
 }
 
 template <class T>
+CoarseKernels<T> coarse(int energies) {
+  return pick_coarse<T>(free_index(energies), std::make_integer_sequence<int, kFreeSets>{});
+}
+
+template <class T>
 Kernels<T> sweep_kernels() {
-  return {forward<T>, reverse<T>};
+  return {forward<T>, reverse<T>, coarse<T>};
 }
 
 }  // namespace diffvbd::DIFFVBD_SET

@@ -152,6 +152,34 @@ struct StableNeoHookean {
     return R(0.5) * mu * shear + (R(0.5) * (mu + lam) * strain * strain - mu * strain) / (R(6) * c6);
   }
 
+  // The energy of a tet at x + s p less that at x, a polynomial in s: adds its coefficients of s, s^2, ... s^6.
+  template <class R>
+  DIFFVBD_FN static void line(const Vec3<R> (&x)[4], const Vec3<R> (&p)[4], const R* rest, const R* material,
+                              R (&c)[TetLayout::line_degree]) {
+    const R mu = material[0], lam = material[1], c6 = rest[6], half = R(1) / R(2);
+    R first = R(0), second = R(0);
+    for (int a = 0; a < 4; ++a) {
+      for (int b = a + 1; b < 4; ++b) {
+        const Vec3<R> e = x[b] - x[a], f = p[b] - p[a];
+        first = first - rest[weight_index(a, b)] * dot(e, f);
+        second = second - rest[weight_index(a, b)] * dot(f, f);
+      }
+    }
+    const Vec3<R> e1 = x[1] - x[0], e2 = x[2] - x[0], e3 = x[3] - x[0];
+    const Vec3<R> f1 = p[1] - p[0], f2 = p[2] - p[0], f3 = p[3] - p[0];
+    const Vec3<R> n = cross(e2, e3), m = cross(f2, e3) + cross(e2, f3), o = cross(f2, f3);
+    // the strain is strain + q, q = j1 s + j2 s^2 + j3 s^3
+    const R strain = c6 * dot(e1, n) - R(1);
+    const R j1 = c6 * (dot(f1, n) + dot(e1, m)), j2 = c6 * (dot(f1, m) + dot(e1, o)), j3 = c6 * dot(f1, o);
+    const R volume = R(1) / (R(6) * c6), b = volume * half * (mu + lam), t = R(2) * b * strain - volume * mu;
+    c[0] = c[0] + mu * first + t * j1;
+    c[1] = c[1] + half * mu * second + t * j2 + b * j1 * j1;
+    c[2] = c[2] + t * j3 + R(2) * b * j1 * j2;
+    c[3] = c[3] + b * (R(2) * j1 * j3 + j2 * j2);
+    c[4] = c[4] + R(2) * b * j2 * j3;
+    c[5] = c[5] + b * j3 * j3;
+  }
+
   // The stiffness of two corners at rest, per volume [Pa/m^2], from the gradients of their shape functions [1/m]: three
   // rows of 2 mu eps : eps + lam tr(eps)^2. Positive semidefinite down to the least lam that a body can have.
   template <class R>

@@ -18,6 +18,8 @@ struct TetLayout {
   DIFFVBD_FN static constexpr int rest_index(int local, int i) {
     return i == 3 ? 6 : weight_index(local, other_corner(local, i));
   }
+  static constexpr int line_degree = 6;  // of the tet's energy along a line, a polynomial: StableNeoHookean::line()
+
   // Which of a tet's scalars corner `local` has at `i`: the material is the same to all; of the twelve that follow,
   // if the law reads them, its own corner's come first.
   DIFFVBD_FN static constexpr int scalar_index(int local, int i) {

@@ -176,4 +176,28 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   return out;
 }
 
+// Adjoint of w . g, with g the gradient of the potential at b.state.x: its Hessian times w, and what else g depends on.
+// What a step without a Newton part leaves of reverse_vertex().
+template <class Set, int wanted, class R, class T, class Star, class AddData>
+DIFFVBD_FN BlockAdjoint<R> reverse_gradient(const Block<R>& b, const Star& star, const Vec3<R>& w,
+                                            const StepParameters<T>& q, bool wants_data, AddData&& add_data) {
+  const R h = R(q.time_step), minus_h2 = -(h * h);
+  const Vec3<R> p = -w, none = zero3<R>();
+  BlockAdjoint<R> out{none, b.mass * p, none, -dot(b.state.x - b.y, p), p, {none, R(0)}};
+  out.x = -out.y;
+  Set::for_each([&](auto energy, int k) {
+    using E = decltype(energy);
+    vertex_energy_vjp<E>(b.state, b.data[k], b.data_count[k], p, none, out.x, out.x_prev);
+    if (wants_data) {
+      const Update<R> still{none, none, R(1)};
+      vertex_energy_data_vjp<E>(b.state, b.data[k], b.data_count[k], p, still, q, R(0),
+                                [&](int i, const R& value) { add_data(k, i, value); });
+    }
+  });
+  Vec3<R> own = star.template reverse_tets<typename Set::Elastic, wanted>({b.state.x, none, p, minus_h2});
+  star.total(own);
+  out.x += own;
+  return out;
+}
+
 }  // namespace diffvbd

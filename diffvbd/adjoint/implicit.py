@@ -39,14 +39,16 @@ def global_sweep(
     then: Callable[[Tensor], Tensor] = lambda x: x,
 ) -> Tensor:  # fmt: skip
     """Positions after the sweeps and what comes ``then`` [B, V, 3]; ``fields``: without contact."""
-    return _GlobalSweep.apply(*fields[:_FIELDS], model, settings, adjoint, debug_step, then)
+    others = tuple(t if t is None else t.detach() for t in fields[_FIELDS:])  # coarse corrections
+    return _GlobalSweep.apply(*fields[:_FIELDS], others, model, settings, adjoint, debug_step, then)
 
 
 class _GlobalSweep(Function):
     @staticmethod
     def forward(ctx: Any, *args: Any) -> Tensor:
-        fields, (model, settings, adjoint, debug_step) = ops.SweepFields(*args[:_FIELDS]), args[_FIELDS:-1]
-        x, _ = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=ops.NO_TAPE, debug_step=debug_step)
+        others, model, settings, adjoint, debug_step = args[_FIELDS:-1]
+        fields = ops.SweepFields(*args[:_FIELDS], *others)
+        x = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=ops.NO_TAPE, debug_step=debug_step)[0]
         x = args[-1](x)
         ctx.save_for_backward(*fields[:_FIELDS], x)
         ctx.model, ctx.h, ctx.adjoint = model, settings.numbers.time_step, adjoint
@@ -56,7 +58,7 @@ class _GlobalSweep(Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple:
         needs = ctx.needs_input_grad[:_DIFFERENTIABLE]
         out = _GlobalBackward.apply(grads[0], *ctx.saved_tensors, ctx.model, ctx.h, ctx.adjoint, needs)
-        return of_inputs(out, needs, 6)
+        return of_inputs(out, needs, 7)
 
 
 class _GlobalBackward(Function):

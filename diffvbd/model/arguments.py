@@ -11,6 +11,7 @@ from .. import ops
 from ..checks import check_readable, fail, to_float
 from ..contact.barrier import Friction, PairBarrier
 from ..energies import VERTEX_ENERGIES, StableNeoHookean, VertexEnergy
+from .coarse import CoarseSpace
 
 Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction
 
@@ -82,3 +83,24 @@ def checked_correction(rigid: Any, start: Any, energies: tuple[Energy, ...]) -> 
     if rigid and touches:
         fail("rigid", "False beside a PairBarrier or Friction, which the correction does not see", "True")
     return rigid, start
+
+
+def checked_coarse(coarse: Any, energies: tuple[Energy, ...], saturation: float | None, device: torch.device
+                   ) -> CoarseSpace | None:  # fmt: skip
+    """The coarse space, where it is one that the other arguments allow."""
+    if coarse is None:
+        return None
+    if coarse == "auto":
+        coarse = CoarseSpace()
+    if not isinstance(coarse, CoarseSpace):
+        raise TypeError(f'coarse: expected a diffvbd.CoarseSpace, "auto" or None, got {coarse!r}')
+    elastic = next((e for e in energies if isinstance(e, StableNeoHookean)), None)
+    if elastic is None or elastic.block != "exact":
+        fail("coarse", "None without StableNeoHookean and its exact block", repr(coarse))
+    if any(isinstance(e, (PairBarrier, Friction)) for e in energies):
+        fail("coarse", "None beside a PairBarrier or Friction, which its corrections do not see", repr(coarse))
+    if saturation is not None:
+        fail("coarse", "None with saturation, which a correction would go around", repr(coarse))
+    if device.type != "cpu":
+        raise NotImplementedError(f"coarse: corrections run on the CPU so far, got {device}")
+    return coarse

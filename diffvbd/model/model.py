@@ -20,8 +20,10 @@ from ..mask import CONTACT, ELASTIC
 from ..mesh import TetMesh
 from ..ops import regimes
 from ..safeguards import FILTER_ETA, SATURATION_EPS
-from .arguments import Energy, checked_correction, checked_device, checked_energies, per_tet_density
+from .arguments import Energy, checked_coarse, checked_correction, checked_device, checked_energies, per_tet_density
 from .bodies import find_bodies
+from .coarse import CoarseSpace, build_coarse
+from .coarse_plan import arrange_coarse
 from .rest import lumped_mass, rest_metric
 from .warnings import warn_of
 
@@ -55,6 +57,9 @@ class Model:
         start: Where the sweeps of the other bodies start: ``"predictor"`` (y, with gravity and forces), ``"inertia"``
             (x + h v, right for stiff pinned bodies that few sweeps hardly move) or ``"auto"``: for each body and step
             the one of lower incremental potential; beside pairs and friction the predictor (docs/numerics.md).
+        coarse: Corrections on a coarse space between the sweeps (:class:`diffvbd.CoarseSpace`), which do in few sweeps
+            what is stiff, long, thin or finely meshed; ``"auto"`` is ``CoarseSpace()``. None: none. CPU; not beside a
+            PairBarrier, Friction, the paper's block or saturation.
         colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier among the
             energies.
         dtype: torch.float64 or torch.float32.
@@ -91,6 +96,7 @@ class Model:
         start: Literal["auto", "predictor", "inertia"] = "auto",
         colliders: Sequence[Collider] = (),
         *,
+        coarse: CoarseSpace | Literal["auto"] | None = None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -110,6 +116,7 @@ class Model:
         for energy in self.energies:
             self.energy_mask |= energy.bit
         self.rigid, self.start = checked_correction(rigid, start, self.energies)
+        self.coarse = checked_coarse(coarse, self.energies, self.saturation, checked_device(device))
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
 
@@ -131,6 +138,7 @@ class Model:
         device = checked_device(device)
         self._arrange(points, tets, device)
         self._measure(points)
+        self._arrange_coarse(body)
         warn_of(self)
         self._place(dtype, device)
 
@@ -164,6 +172,8 @@ class Model:
         """Where the sweeps of bodies that are not corrected start: "auto" only where there is something to choose."""
         if self.start != "auto":
             return self.start
+        if self.coarse is not None:  # which takes out a fall better than any start
+            return "inertia"
         return "predictor" if self.touches or not self._other_bodies.number else "auto"
 
     @property
@@ -250,6 +260,16 @@ class Model:
         data = [e.pack(self._parameters(e, points), None) for e in self.vertex_energies]
         self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
 
+    def _arrange_coarse(self, body: Tensor) -> None:
+        """Functions and groups of the coarse corrections; everything still on the CPU and in float64."""
+        if self.coarse is None:
+            return
+        points, tets, pinned = self.mesh.points, self.mesh.tets, self._pinned.numpy()
+        self.coarse_geometry = build_coarse(points, tets, pinned, body.numpy(), self.coarse)
+        rest, _ = rest_metric(ops.tet_gather(torch.from_numpy(points.copy())[None], *self._topology))
+        self._coarse_plan = arrange_coarse(self.coarse_geometry, self.coarse.every, points, tets, self._mass.numpy(),
+                                           rest[0].numpy(), self._plan)  # fmt: skip
+
     def _parameters(self, energy: VertexEnergy, rest_points: Tensor) -> dict[str, Tensor]:
         return {name: value[None] for name, value in energy.constants(rest_points).items()}
 
@@ -267,6 +287,8 @@ class Model:
             del self._rest
         if self.surface_of_contact is not None:
             self.surface_of_contact = self.surface_of_contact.to(device, dtype)
+        if self.coarse is not None:
+            self._coarse_plan = self._coarse_plan.to(device, dtype)
         for energy in self.parametric_energies:
             self.constants(energy)
 
@@ -299,6 +321,8 @@ class Model:
         if device.type != self.device.type:
             out._arrange(points, out.tets, device)
         out._measure(points)
+        out.coarse = checked_coarse(out.coarse, out.energies, out.saturation, device)
+        out._arrange_coarse(torch.from_numpy(self.mesh.body.copy()))
         out._place(dtype, device)
         return out
 
@@ -377,6 +401,7 @@ class Model:
         safeguards += [f"regularization={self.regularization:g} kg"] if self.regularization else []
         safeguards += ["rigid=False"] if not self.rigid and not self.touches else []
         safeguards += [f'start="{self.start}"'] if self.start != "auto" else []
+        safeguards += [f"coarse={self.coarse}"] if self.coarse is not None else []
         return (
             f"Model({self.num_vertices} vertices, {self.num_tets} tets, {int(self._pinned.sum())} pinned, "
             f"{self.num_colors} colors, mass {float(self._mass.sum()):.4g} kg, "

@@ -17,6 +17,7 @@ from .fields import (
     TET_READS_X_PREV,
     THREAD,
     BeginFields,
+    CoarseFields,
     RigidFields,
     StepFields,
     StepNumbers,
@@ -37,7 +38,7 @@ from .functions import (
     ready_signature,
 )
 from .load import has_cuda, raw, require_cuda
-from .mesh import PAIR_REST, build_plan, pack_rest
+from .mesh import PAIR_REST, build_plan, pack_rest, plan_order
 from .sums import broadcast, star_sum, sum_to, tet_gather
 from .sweep import fused_step, fused_step_backward, sweep, sweep_backward
 
@@ -54,6 +55,7 @@ __all__ = [
     "SWEEP_ADJOINTS",
     "THREAD",
     "BeginFields",
+    "CoarseFields",
     "RigidFields",
     "StepFields",
     "StepNumbers",
@@ -71,6 +73,7 @@ __all__ = [
     "of_inputs",
     "one_by_one",
     "pack_rest",
+    "plan_order",
     "plan_sizes",
     "raw",
     "raw_backward",

@@ -47,11 +47,18 @@ class SweepFields(NamedTuple):
     lag_entry: Tensor | None = None
     floor_lag: Tensor | None = None  # [B, V, planes, 4]
     corners_prev: Tensor | None = None  # x_prev of the tets' corners, [12, B, T], where their law reads it
+    # coarse corrections; see model.coarse_plan for the constants
+    coarse_matrix: Tensor | None = None  # [B, cells] [kg]
+    coarse_inverse: Tensor | None = None  # of it, body by body
+    coarse_mass: Tensor | None = None  # [1 | B, cells / 9] [kg]
+    coarse_plan: Tensor | None = None
+    coarse_weights: Tensor | None = None
+    coarse_rest: Tensor | None = None  # [1 | B, blocks, 7, lanes]
 
 
 # What the reverse differentiates: the fields that are ADJOINT in csrc/bind/fields.h.
 SWEEP_ADJOINTS = ("x_start", "x_prev", "y", "mu", "lam", "mass", "rest", "energy_data", "bounds", "collider",
-                  "collider_prev", "kappa", "lag", "floor_lag", "corners_prev")  # fmt: skip
+                  "collider_prev", "kappa", "lag", "floor_lag", "corners_prev", "coarse_matrix")  # fmt: skip
 
 
 class StepFields(NamedTuple):
@@ -83,6 +90,18 @@ class RigidFields(NamedTuple):
     ptr: Tensor
     spread: Tensor
     other: Tensor  # OtherBodies.of
+
+
+class CoarseFields(NamedTuple):
+    """What the matrix of a coarse space reads, in the order of DIFFVBD_COARSE_FIELDS; the first three are
+    differentiable."""
+
+    x_prev: Tensor
+    stiffness: Tensor  # [1 | B, groups, 3 width, 3 width], at rest [N/m]
+    mass: Tensor  # [1 | B, cells] [kg]
+    plan: Tensor  # of model.coarse_plan, as are the next two
+    moments: Tensor
+    volume: Tensor
 
 
 class BeginFields(NamedTuple):

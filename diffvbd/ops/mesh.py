@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .fields import LANES
+from .fields import LANES, PLAN_HEADER
 from .functions import raw_backward
 from .load import raw
 
@@ -17,6 +17,12 @@ def build_plan(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Plan, color_ptr, color_vertices, star_ptr and star of a mesh, see csrc/cpu/plan.h; lanes: of :data:`LANES`."""
     return raw.build_plan(points, tets, active, lanes)
+
+
+def plan_order(plan: Tensor, lanes: int) -> Tensor:
+    """The vertex at each position of the sweep order [blocks lanes], -1: none; see csrc/core/plan_views.h."""
+    colors, blocks = plan[3:5].tolist()
+    return plan.narrow(0, PLAN_HEADER + colors + 1 + 4 * (blocks + 1), blocks * lanes).cpu()
 
 
 def pack_rest(rest: Tensor, plan: Tensor, sizes: tuple[int, ...]) -> Tensor:

@@ -19,6 +19,7 @@ from ..model.model import Model
 from ..model.moduli import moduli_of
 from ..model.rest import lumped_mass, rest_metric
 from ..scopes import checking, looks_at
+from .coarse import CoarseParts, coarse_parts
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
 
@@ -34,6 +35,7 @@ class Prepared(NamedTuple):
     rest: Tensor | None  # [1 | B, T, 7]; None: the Model's
     parameters: dict[str, Tensor]  # differentiable energy parameters, [1 | B, ...]
     settings: ops.SweepSettings
+    coarse: CoarseParts | None = None  # what the coarse corrections of all steps have in common
     unrolled: Callable[..., tuple[Tensor, Tensor]] | None = None  # the reference's step, where autograd unrolls it
 
     @property
@@ -99,15 +101,16 @@ def prepare(
     if settings is None:
         settings = step_settings(model, lead, time_step, sweeps)
     mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
-    rest, mass, given_density = None, model._mass[None], density
+    rest, corners, mass, given_density = None, None, model._mass[None], density
     if density is not None:
         density = _scenes_first("density", density, like, lead, tets)
     if rest_points is not None or density is not None:
         points = model._rest_points if rest_points is None else rest_points
         points = _scenes_first("rest_points", points, like, lead, (model.num_vertices, 3))
         points = ops.broadcast(points, (points.shape[0], model.num_vertices, 3))
-        metric, volume = rest_metric(ops.tet_gather(points, *model._topology))
-        rest = None if rest_points is None else metric
+        gathered = ops.tet_gather(points, *model._topology)
+        metric, volume = rest_metric(gathered)
+        rest, corners = (None, None) if rest_points is None else (metric, gathered)
         if density is None:
             density = model._density[None]
         shape = (max(density.shape[0], volume.shape[0]), model.num_tets)
@@ -142,6 +145,10 @@ def prepare(
         layout = model.derived("layout", lambda: reference.build_layout(model))
         h, count = settings.numbers.time_step, settings.sweeps
         unrolled = reference.stepper(model, like, mu, lam, h, count, rest_points, given_density, parameters, layout)
+    coarse = None
+    if model.coarse is not None and model.coarse_geometry.bodies:
+        given_mass = None if given_density is None and rest_points is None else mass
+        coarse = coarse_parts(model, *materials, given_mass, rest, corners)
     return Prepared(
         mu=materials[0],
         lam=materials[1],
@@ -149,6 +156,7 @@ def prepare(
         rest=rest,
         parameters=given,
         settings=settings,
+        coarse=coarse,
         unrolled=unrolled,
     )
 

@@ -195,7 +195,7 @@ class ContactStep:
             **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs, lag_ptr=lagged.ptr, lag_entry=lagged.entry,
             floor_lag=self.floor_lag,
         )  # fmt: skip
-        return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)
+        return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
     def _detect(self, x: Tensor, was: Tensor, now: Tensor, remaining: Tensor) -> Detection:
         surface, barrier = self.surface, self.barrier

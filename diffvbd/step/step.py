@@ -32,6 +32,7 @@ from .arguments import (
     prepare,
 )
 from .check import check_on_cpu
+from .coarse import with_corrections
 from .contact import run_contact
 from .memory import out_of_memory_named
 from .predict import Begun, begin
@@ -152,6 +153,8 @@ def swept(
     """Positions after the sweeps, with the backward of an adjoint route. ``given``: arguments that errors may name;
     ``colliders``: where they are at the start and at the end, of a Model with contact."""
     fields, settings, adjoint = begun.fields(model, prepared), prepared.settings, check_adjoint(adjoint)
+    if prepared.coarse is not None:
+        fields = with_corrections(model, prepared.coarse, fields, settings.numbers.time_step)
     more = (*(colliders or ()), *prepared.parameters.values())
     policy = _tape_policy(model, (*fields, *more), settings, adjoint)
     debug_step = index if checking() else -1
@@ -177,7 +180,13 @@ def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
     """Whether one operator can do the whole step on CUDA. Forces, vertex energies, float32's local origin, function
     transforms and checks take the parts."""
     simple = force is None and not model.vertex_energies and not model.touches and model.dtype == torch.float64
-    simple = simple and not model.corrects and model.starts_from == "predictor" and not ops.TET_READS_X_PREV
+    simple = (
+        simple
+        and not model.corrects
+        and model.coarse is None
+        and model.starts_from == "predictor"
+        and not ops.TET_READS_X_PREV
+    )
     if not simple or checking() or torch.compiler.is_compiling() or gravity.dim() > 1:
         return False
     return torch._C._functorch.peek_interpreter_stack() is None  # pyright: ignore[reportAttributeAccessIssue]

@@ -19,11 +19,18 @@ template <class T>
 struct Given {
   diffvbd::StepInputs<T> in{};
   contact::ContactInputs<T> pairs{};
+  diffvbd::coarse::Inputs<T> coarse{};
 
   Given(const diffvbd::Plan& plan, const SweepFields& f, const Tensor& x, const SweepSettings& q, int64_t debug_step) {
     const int64_t packed = int64_t{plan.slots} * diffvbd::kPairRest * diffvbd::kLanes;
     diffvbd::set_fields(in, f, x, q, plan.num_vertices, plan.num_tets, packed);
     in.debug_step = debug_step;
+    if (f.coarse_plan.numel() > 0) {
+      coarse = diffvbd::coarse_inputs<T>(f, x, q.sweeps);
+      require(!diffvbd::has_contact(q, f) && !(in.energies & diffvbd::kPaperBlock) && !in.parameters.saturates,
+              "diffvbd::sweep: coarse corrections take no contact, no paper block and no saturation");
+      in.coarse = &coarse;
+    }
     if (!diffvbd::has_contact(q, f)) return;
     pairs = diffvbd::contact_inputs<T>(f, x, in.x_prev, in.origin, q.numbers[diffvbd::kFrictionEps]);
     in.contact = &pairs;
@@ -31,7 +38,13 @@ struct Given {
   Given(const Given&) = delete;  // in points into itself
 };
 
-std::tuple<Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const Tensor& plan_buffer,
+template <class T>
+std::vector<int64_t> corrections_shape(const diffvbd::coarse::Inputs<T>& c, const diffvbd::StepInputs<T>& in) {
+  if (!in.coarse) return {0};
+  return {in.scenes, c.corrections, c.tape_size()};
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const Tensor& plan_buffer,
                                          std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
                                          std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
                                          int64_t tape_policy, int64_t debug_step, bool checked) {
@@ -40,14 +53,16 @@ std::tuple<Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const Tensor&
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
   return dispatch_float(f.x_start, [&](auto scalar) {
     using T = decltype(scalar);
-    const Given<T> given(plan, f, f.x_start, q, debug_step);
+    Given<T> given(plan, f, f.x_start, q, debug_step);
     const auto& in = given.in;
     if (checked) diffvbd::check_values(plan, in);
     Tensor x = empty(f.x_start, {in.scenes, plan.num_vertices, 3}),
            tape = empty(f.x_start, diffvbd::tape_shape(plan, in));
     Tensor cut = torch::stable::empty({in.contact ? in.scenes : 0, plan.num_vertices}, ScalarType::Byte);
+    Tensor corrections = empty(f.x_start, corrections_shape(given.coarse, in));
+    given.coarse.tape = data<T>(corrections);
     diffvbd::run_forward<T>(plan, in, data<T>(x), data<T>(tape), data<uint8_t>(cut));
-    return std::make_tuple(x, tape, cut);
+    return std::make_tuple(x, tape, cut, corrections);
   });
 }
 
@@ -92,7 +107,7 @@ struct ContactSlots {
 };
 
 diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_bar, const Tensor& x,
-                                      const Tensor& tape, const Tensor& plan_buffer, std::vector<int64_t> sizes,
+                                      const Tensor& tape, const Tensor& corrections, const Tensor& plan_buffer, std::vector<int64_t> sizes,
                                       int64_t energies, std::vector<int64_t> data_count, std::vector<double> numbers,
                                       int64_t sweeps, std::vector<int64_t> launch, int64_t tape_policy,
                                       std::vector<bool> wants) {
@@ -103,15 +118,21 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
   require(x_bar.is_contiguous() && x_bar.numel() == x.numel(), "diffvbd::sweep_backward: x_bar must be like x");
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const Given<T> given(plan, f, x, q, -1);
+    Given<T> given(plan, f, x, q, -1);
     const auto& in = given.in;
     diffvbd::check_tape(tape, plan, in);
     const auto make = [&](const std::vector<int64_t>& shape, bool zeroed) {
       return zeroed ? zeros(x, shape) : empty(x, shape);
     };
-    diffvbd::SweepBars bars = make_bars(x, in, plan.num_vertices, plan.num_tets, plan.num_tets, true, wants, make);
+    diffvbd::SweepBars bars = make_bars(x, f, in, plan.num_vertices, plan.num_tets, plan.num_tets, true, wants, make);
     diffvbd::StepAdjoints<T> out{};
     set_bars(out, bars, in);
+    int64_t size = 1;
+    for (const int64_t n : corrections_shape(given.coarse, in)) size *= n;
+    require(corrections.is_contiguous() && corrections.numel() == size && corrections.scalar_type() == x.scalar_type(),
+            "diffvbd::sweep_backward: the corrections do not belong to this step");
+    given.coarse.tape = data<T>(corrections);
+    given.coarse.matrix_bar = bars.coarse_matrix.numel() > 0 ? data<T>(bars.coarse_matrix) : nullptr;
     if (!in.contact) {
       diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), out);
       return bars.tensors();

@@ -1,0 +1,61 @@
+// CPU implementation of the matrices of a coarse space; the corrections themselves belong to the sweeps.
+#include "../coarse.h"
+
+#include <torch/csrc/stable/library.h>
+
+#include <tuple>
+
+#include "sweep.h"
+
+namespace {
+
+namespace coarse = diffvbd::coarse;
+using diffvbd::CoarseFields, diffvbd::data, diffvbd::dispatch_float, diffvbd::require, diffvbd::zeros;
+using torch::stable::Tensor;
+
+template <class F>
+void for_bodies(int64_t scenes, int64_t bodies, const F& f) {
+  torch::stable::parallel_for(0, scenes * bodies, 1, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) f(i / bodies, static_cast<int>(i % bodies));
+  });
+}
+
+Tensor matrix(DIFFVBD_PARAMETERS(COARSE) double time_step) {
+  const CoarseFields f{DIFFVBD_ITEMS(COARSE)};
+  return dispatch_float(x_prev, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::matrix_inputs<T>(f, time_step);
+    const int64_t size = int64_t{9} * in.plan.mass_ptr[in.plan.bodies];
+    const Tensor out = zeros(x_prev, {in.scenes, size});
+    for_bodies(in.scenes, in.plan.bodies,
+               [&](int64_t scene, int body) { coarse::assemble(in, scene, body, data<T>(out) + scene * size); });
+    return out;
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor> matrix_backward(DIFFVBD_PARAMETERS(COARSE) const Tensor& bar, double time_step) {
+  const CoarseFields f{DIFFVBD_ITEMS(COARSE)};
+  return dispatch_float(x_prev, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::matrix_inputs<T>(f, time_step);
+    const coarse::Plan& p = in.plan;
+    const int64_t cells = p.mass_ptr[p.bodies], size = int64_t{9} * p.groups * p.width * p.width;
+    require(bar.is_contiguous() && bar.scalar_type() == x_prev.scalar_type() && bar.numel() == 9 * cells * in.scenes,
+            "diffvbd::coarse_matrix_backward: expected an adjoint like the matrix");
+    const Tensor x_bar = zeros(x_prev, {in.scenes, in.vertices, 3}), stiffness_bar = zeros(x_prev, {in.scenes, size}),
+                 mass_bar = zeros(x_prev, {in.scenes, cells});
+    for_bodies(in.scenes, p.bodies, [&](int64_t scene, int body) {
+      coarse::assemble_vjp(in, scene, body, data<const T>(bar) + 9 * cells * scene,
+                           data<T>(x_bar) + 3 * in.vertices * scene, data<T>(stiffness_bar) + size * scene,
+                           data<T>(mass_bar) + cells * scene);
+    });
+    return std::make_tuple(x_bar, stiffness_bar, mass_bar);
+  });
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
+  m.impl("coarse_matrix", TORCH_BOX(&matrix));
+  m.impl("coarse_matrix_backward", TORCH_BOX(&matrix_backward));
+}

@@ -1,0 +1,50 @@
+// How far a body goes along a correction: the longest of a few lengths that lowers the potential enough.
+#pragma once
+
+#include <cmath>
+#include <limits>
+
+#include "../energies/tet.h"
+
+namespace diffvbd::coarse {
+
+constexpr int kLengths = 8;  // 1, 1/2, ... 1/128; then 0
+constexpr int kDegree = TetLayout::line_degree;
+constexpr double kDecrease = 1e-4;   // share of what the slope promises
+constexpr double kRounding = 8;      // ulps of the terms that a sum may lose
+constexpr int kFailures = 2;         // lengths of 0 after which a body's corrections are over
+constexpr double kLeastShare = 0.1;  // of its gap that a vertex keeps, as in rigid/body.h
+
+inline double length_of(int trial) { return std::ldexp(1.0, -trial); }
+
+// The smooth part of the change of the potential, c[0] s + ... + c[5] s^6, and the sum of its terms' sizes.
+struct Change {
+  double c[kDegree];
+
+  double at(double s) const {
+    double sum = 0;
+    for (int i = kDegree - 1; i >= 0; --i) sum = (sum + c[i]) * s;
+    return sum;
+  }
+  double size(double s) const {
+    double sum = 0;
+    for (int i = kDegree - 1; i >= 0; --i) sum = (sum + std::abs(c[i])) * s;
+    return sum;
+  }
+};
+
+// slope: of the whole potential at s = 0. more(s, size): the change of what is no polynomial, which adds to `size` and
+// is infinite where s is not admissible.
+template <class T, class More>
+double length(const Change& change, double slope, const More& more) {
+  if (!(slope < 0)) return 0;
+  for (int trial = 0; trial < kLengths; ++trial) {
+    const double s = length_of(trial);
+    double size = change.size(s);
+    const double rise = change.at(s) + more(s, size);
+    if (rise <= kDecrease * s * slope + kRounding * double(std::numeric_limits<T>::epsilon()) * size) return s;
+  }
+  return 0;
+}
+
+}  // namespace diffvbd::coarse

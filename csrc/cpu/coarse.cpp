@@ -1,0 +1,302 @@
+#include "coarse.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "../coarse/length.h"
+#include "../rigid/body.h"
+
+namespace diffvbd {
+
+namespace {
+constexpr int32_t kPartBlocks = 32;  // blocks of tets that a member takes at once
+}
+
+template <class T>
+CoarseScene<T>::CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t scene, SceneView<T>& s)
+    : plan_(plan),
+      in_(in),
+      c_(*in.coarse),
+      scene_(scene),
+      s_(s),
+      kernels_(coarse_kernels<T>(in.energies)),
+      failures_(c_.plan.bodies, 0),
+      gradient_(size_t(plan.blocks) * kLanes * 4, true),
+      way_(size_t(plan.blocks) * kLanes * 4, true),
+      material_(size_t(c_.plan.tet_blocks) * kTetScalars * kLanes),
+      coarse_(size_t(c_.plan.functions) * 4, true),
+      rows_(size_t(c_.plan.functions) * 7, true) {
+  s.gradient = gradient_.get();
+  s.way = way_.get();
+  const coarse::Plan& p = c_.plan;
+  for (int32_t b = 0; b < p.bodies; ++b) {
+    for (int32_t at = p.block_ptr[b]; at < p.block_ptr[b + 1]; at += kPartBlocks) {
+      parts_.push_back({b, at, std::min(at + kPartBlocks, p.block_ptr[b + 1])});
+    }
+  }
+  sums_ = Buffer<double>(parts_.size() * coarse::kDegree);
+  if (!(in.energies & kElastic)) return;
+  for (int m = 0; m < kTetScalars; ++m) {
+    const Batched<const T>& given = in.material[m];
+    const T* of_tet = given.data + scene * given.scene;
+    for (int64_t block = 0; block < p.tet_blocks; ++block) {
+      T* to = material_.get() + (block * kTetScalars + m) * kLanes;
+      for (int l = 0; l < kLanes; ++l) to[l] = of_tet[p.tet[block * kLanes + l] * given.item];
+    }
+  }
+}
+
+template <class T>
+const T* CoarseScene<T>::inverse(int32_t body) const {
+  return c_.inverse.data + scene_ * c_.inverse.scene + int64_t{9} * c_.plan.mass_ptr[body];
+}
+
+// to := A^-1 from, both three scalars a function
+template <class T>
+void CoarseScene<T>::multiply(const T* from, T* to, Team::Member& member) const {
+  const coarse::Plan& p = c_.plan;
+  member.each(0, int64_t{3} * p.functions, [&](int64_t begin, int64_t end) {
+    int32_t b =
+        int32_t(std::upper_bound(p.function_ptr, p.function_ptr + p.bodies + 1, begin / 3) - p.function_ptr) - 1;
+    for (; b < p.bodies && int64_t{3} * p.function_ptr[b] < end; ++b) {
+      const int64_t first = int64_t{3} * p.function_ptr[b], n = int64_t{3} * p.function_ptr[b + 1] - first;
+      kernels_.multiply(inverse(b), from + first, n, to + first, std::max<int64_t>(begin - first, 0),
+                        std::min(end - first, n));
+    }
+  });
+  member.barrier();
+}
+
+template <class T>
+void CoarseScene<T>::correct(int k, Team::Member& member) {
+  const coarse::Plan& p = c_.plan;
+  T *a = tape(k), *lengths = a + int64_t{3} * p.functions;
+  if (over_) {  // in the state that all members have seen
+    member.each(0, c_.tape_size(), [&](int64_t begin, int64_t end) { std::fill(a + begin, a + end, T(0)); });
+    return member.barrier();
+  }
+  T *restricted = rows_.get() + 4 * int64_t{p.functions}, *coarse = coarse_.get();
+  member.each(0, plan_.color_block[plan_.colors],
+              [&](int64_t begin, int64_t end) { kernels_.gradient(plan_, s_, in_.parameters, begin, end); });
+  member.barrier();
+  member.each(0, p.functions, [&](int64_t begin, int64_t end) {
+    kernels_.gather(p.row_ptr, p.row, c_.row_weight, s_.gradient, rows_.get(), begin, end);
+    for (int64_t f = begin; f < end; ++f) {
+      for (int i = 0; i < 3; ++i) restricted[3 * f + i] = rows_.get()[4 * f + i];
+    }
+  });
+  member.barrier();
+  multiply(restricted, a, member);
+  member.each(0, p.functions, [&](int64_t begin, int64_t end) {
+    for (int64_t f = begin; f < end; ++f) {
+      for (int i = 0; i < 3; ++i) coarse[4 * f + i] = -a[3 * f + i];
+    }
+  });
+  member.barrier();
+  member.each(0, p.positions, [&](int64_t begin, int64_t end) {
+    kernels_.gather(p.position_ptr, p.function, c_.weight, coarse, s_.way, begin, end);
+  });
+  member.barrier();
+  member.each(0, int64_t(parts_.size()), [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      double* sum = sums_.get() + i * coarse::kDegree;
+      std::fill(sum, sum + coarse::kDegree, 0.0);
+      if (!(in_.energies & kElastic)) continue;
+      kernels_.line(p.corner, c_.rest.data + scene_ * c_.rest.scene, material_.get(), s_.x, s_.way, parts_[i].begin,
+                    parts_[i].end, sum);
+    }
+  });
+  member.barrier();
+  member.each(0, p.bodies, [&](int64_t begin, int64_t end) {
+    for (int64_t b = begin; b < end; ++b) decide(static_cast<int32_t>(b), a, lengths + b);
+  });
+  member.barrier();
+  if (member.first == 0) {
+    over_ = std::all_of(failures_.begin(), failures_.end(), [](int n) { return n >= coarse::kFailures; });
+  }
+  member.each(0, p.positions, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      if (p.position_body[i] < 0) continue;
+      const T length = lengths[p.position_body[i]];
+      for (int c = 0; c < 3; ++c) s_.x[4 * i + c] += length * s_.way[4 * i + c];
+    }
+  });
+  member.barrier();
+}
+
+// Sums of one body belong to one member, in a fixed order.
+template <class T>
+void CoarseScene<T>::decide(int32_t body, const T* a, T* length) {
+  const coarse::Plan& p = c_.plan;
+  *length = T(0);
+  if (failures_[body] >= coarse::kFailures) return;
+  const int32_t first = p.function_ptr[body], count = p.function_ptr[body + 1] - first;
+  const T* restricted = rows_.get() + 4 * int64_t{p.functions};
+  double slope = 0, momentum = 0;
+  for (int64_t i = 3 * first; i < 3 * (first + count); ++i) slope -= double(a[i]) * double(restricted[i]);
+  const T* mass = c_.mass.data + scene_ * c_.mass.scene + p.mass_ptr[body];
+  for (int i = 0; i < count; ++i) {
+    for (int j = 0; j < count; ++j) {
+      const T *x = a + 3 * (first + i), *y = a + 3 * (first + j);
+      momentum += double(mass[i * count + j]) * (double(x[0]) * y[0] + double(x[1]) * y[1] + double(x[2]) * y[2]);
+    }
+  }
+  coarse::Change change{};
+  const double h2 = double(in_.parameters.time_step) * double(in_.parameters.time_step);
+  const auto part =
+      std::lower_bound(parts_.begin(), parts_.end(), body, [](const Part& one, int32_t b) { return one.body < b; });
+  for (auto at = part; at != parts_.end() && at->body == body; ++at) {
+    const double* sum = sums_.get() + (at - parts_.begin()) * coarse::kDegree;
+    for (int i = 0; i < coarse::kDegree; ++i) change.c[i] += h2 * sum[i];
+  }
+  change.c[1] += 0.5 * momentum;
+  const bool others = std::any_of(in_.data_count, in_.data_count + kVertexEnergies, [](int n) { return n > 0; });
+  change.c[0] = others ? change.c[0] + inertia(body) : slope;
+  const double s = coarse::length<T>(change, slope,
+                                     [&](double at, double& size) { return others ? energies(body, at, size) : 0.0; });
+  *length = T(s);
+  if (!(s > 0)) ++failures_[body];
+}
+
+// Slope of the inertial part of the potential.
+template <class T>
+double CoarseScene<T>::inertia(int32_t body) const {
+  const coarse::Plan& p = c_.plan;
+  double sum = 0;
+  for (int32_t i = p.list_ptr[body]; i < p.list_ptr[body + 1]; ++i) {
+    const int64_t v = p.list[i], at = 4 * int64_t{p.list_position[i]};
+    const T *y = in_.y.data + scene_ * in_.y.scene + 3 * v, mass = in_.mass.data[scene_ * in_.mass.scene + v];
+    for (int c = 0; c < 3; ++c) sum += double(mass) * (double(s_.x[at + c]) - y[c]) * s_.way[at + c];
+  }
+  return sum;
+}
+
+// By how much the energies of single vertices rise, and infinity where one of them does not admit the motion.
+template <class T>
+double CoarseScene<T>::energies(int32_t body, double s, double& size) const {
+  const coarse::Plan& p = c_.plan;
+  double rise = 0;
+  bool admitted = true;
+  for (int32_t i = p.list_ptr[body]; i < p.list_ptr[body + 1]; ++i) {
+    const int64_t v = p.list[i], at = 4 * int64_t{p.list_position[i]};
+    const auto vector = [](const T* a) { return rigid::Vector{double(a[0]), double(a[1]), double(a[2])}; };
+    const rigid::Vector x = vector(s_.x + at), moved = x + s * vector(s_.way + at);
+    VertexState<double> state{
+        x, vector(in_.x_prev.data + scene_ * in_.x_prev.scene + 3 * v), {}, double(in_.parameters.time_step)};
+    if (in_.origin.data) state.origin = vector(in_.origin.data + scene_ * in_.origin.scene + 3 * v);
+    rigid::each_energy(
+        [&](auto energy, int k) {
+          using E = decltype(energy);
+          const int count = in_.data_count[k];
+          if (count == 0) return;
+          const T* own = s_.data + s_.data_start[k] + (E::per_vertex ? v * count : 0);
+          double data[kMaxEnergyData];
+          for (int d = 0; d < count; ++d) data[d] = own[d];
+          VertexState<double> there = state;
+          there.x = moved;
+          if constexpr (E::has_filter) {
+            if (!E::template admits<T>(there, x, data, count, coarse::kLeastShare)) admitted = false;
+          }
+          const double before = E::value(state, data, count), after = E::value(there, data, count);
+          rise += after - before;
+          size += std::abs(before) + std::abs(after);
+        },
+        VertexEnergies{});
+    if (!admitted) return std::numeric_limits<double>::infinity();
+  }
+  return rise;
+}
+
+// Takes what is left in the rows into x_bar, of lower colors or of all vertices, and clears them.
+template <class T>
+void CoarseScene<T>::flush(Team::Member& member, bool all) {
+  const int64_t blocks = all ? plan_.blocks : plan_.color_block[plan_.colors];
+  member.each(0, blocks, [&](int64_t begin, int64_t end) {
+    int color = 0;
+    for (int64_t block = begin; block < end; ++block) {
+      while (color < plan_.colors && block >= plan_.color_block[color + 1]) ++color;
+      const int64_t below = all ? std::numeric_limits<int64_t>::max()
+                                : kRow * int64_t{plan_.block_edge[plan_.color_block[color]]} * kLanes;
+      for (int64_t e = plan_.block_incoming[block]; e < plan_.block_incoming[block + 1]; ++e) {
+        for (int l = 0; l < kLanes; ++l) {
+          const int64_t row = plan_.incoming[e * kLanes + l];
+          for (int i = 0; row < below && i < 3; ++i) s_.x_bar[4 * (block * kLanes + l) + i] += s_.rows[row + i];
+        }
+      }
+    }
+  });
+  member.barrier();
+  member.each(0, int64_t{plan_.edge_slots} * kLanes,
+              [&](int64_t begin, int64_t end) { std::fill(s_.rows + 4 * begin, s_.rows + 4 * end, T(0)); });
+  member.barrier();
+}
+
+template <class T>
+void CoarseScene<T>::reverse(int k, Team::Member& member) {
+  const coarse::Plan& p = c_.plan;
+  const T *a = tape(k), *lengths = a + int64_t{3} * p.functions;
+  if (std::all_of(lengths, lengths + p.bodies, [](T s) { return s == 0; })) return;
+  T *restricted = rows_.get() + 4 * int64_t{p.functions}, *coarse = coarse_.get();
+  flush(member, false);
+  // u = P' x_bar, q = -s A^-1 u
+  member.each(0, p.functions, [&](int64_t begin, int64_t end) {
+    kernels_.gather(p.row_ptr, p.row, c_.row_weight, s_.x_bar, rows_.get(), begin, end);
+    int32_t b = int32_t(std::upper_bound(p.function_ptr, p.function_ptr + p.bodies + 1, begin) - p.function_ptr) - 1;
+    for (int64_t f = begin; f < end; ++f) {
+      while (f >= p.function_ptr[b + 1]) ++b;
+      for (int i = 0; i < 3; ++i) restricted[3 * f + i] = -lengths[b] * rows_.get()[4 * f + i];
+    }
+  });
+  member.barrier();
+  T* q = rows_.get();  // its rows have been read
+  multiply(restricted, q, member);
+  // back to where the correction began: x -= s (-P a)
+  member.each(0, p.functions, [&](int64_t begin, int64_t end) {
+    for (int64_t f = begin; f < end; ++f) {
+      for (int i = 0; i < 3; ++i) coarse[4 * f + i] = a[3 * f + i];
+    }
+  });
+  member.barrier();
+  member.each(0, p.positions, [&](int64_t begin, int64_t end) {
+    kernels_.gather(p.position_ptr, p.function, c_.weight, coarse, s_.way, begin, end);
+    for (int64_t i = begin; i < end; ++i) {
+      if (p.position_body[i] < 0) continue;
+      const T length = lengths[p.position_body[i]];
+      for (int c = 0; c < 3; ++c) s_.x[4 * i + c] += length * s_.way[4 * i + c];
+    }
+  });
+  member.barrier();
+  // w = P q, and the Hessian times w
+  member.each(0, p.functions, [&](int64_t begin, int64_t end) {
+    for (int64_t f = begin; f < end; ++f) {
+      for (int i = 0; i < 3; ++i) coarse[4 * f + i] = q[3 * f + i];
+    }
+  });
+  if (c_.matrix_bar) {
+    T* bar = c_.matrix_bar + scene_ * 9 * int64_t{p.mass_ptr[p.bodies]};
+    member.each(0, p.bodies, [&](int64_t begin, int64_t end) {
+      for (int64_t b = begin; b < end; ++b) {
+        const int64_t first = int64_t{3} * p.function_ptr[b], n = int64_t{3} * p.function_ptr[b + 1] - first;
+        T* to = bar + int64_t{9} * p.mass_ptr[b];
+        for (int64_t i = 0; i < n; ++i) {
+          for (int64_t j = 0; j < n; ++j) to[i * n + j] -= q[first + i] * a[first + j];
+        }
+      }
+    });
+  }
+  member.barrier();
+  member.each(0, p.positions, [&](int64_t begin, int64_t end) {
+    kernels_.gather(p.position_ptr, p.function, c_.weight, coarse, s_.way, begin, end);
+  });
+  member.barrier();
+  member.each(0, plan_.color_block[plan_.colors],
+              [&](int64_t begin, int64_t end) { kernels_.reverse(plan_, s_, in_.parameters, begin, end); });
+  member.barrier();
+  flush(member, true);
+}
+
+template class CoarseScene<float>;
+template class CoarseScene<double>;
+
+}  // namespace diffvbd

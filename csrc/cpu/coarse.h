@@ -1,0 +1,49 @@
+// The coarse corrections of a step on the CPU (docs/method.md, section 15), between the sweeps of run.cpp.
+#pragma once
+
+#include <vector>
+
+#include "../coarse/views.h"
+#include "kernels.h"
+#include "run.h"
+#include "team.h"
+
+namespace diffvbd {
+
+// One scene's corrections. All members of a team call each method; it ends with a barrier.
+template <class T>
+class CoarseScene {
+ public:
+  CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t scene, SceneView<T>& s);
+
+  // The correction of number k: moves s.x, and records what it did.
+  void correct(int k, Team::Member& member);
+  // Its transpose, from the state after it; `s` has the adjoints of what the sweeps after it have left.
+  void reverse(int k, Team::Member& member);
+
+ private:
+  struct Part {  // of the tets of a body, small enough to share the work
+    int32_t body, begin, end;
+  };
+  T* tape(int k) const { return c_.tape + (scene_ * c_.corrections + k) * c_.tape_size(); }
+  const T* inverse(int32_t body) const;
+  void multiply(const T* from, T* to, Team::Member& member) const;
+  void decide(int32_t body, const T* a, T* length);
+  double energies(int32_t body, double s, double& size) const;
+  double inertia(int32_t body) const;
+  void flush(Team::Member& member, bool all);
+
+  const Plan& plan_;
+  const StepInputs<T>& in_;
+  const coarse::Inputs<T>& c_;
+  const int64_t scene_;
+  SceneView<T>& s_;
+  const CoarseKernels<T> kernels_;
+  std::vector<Part> parts_;
+  std::vector<int> failures_;
+  Buffer<T> gradient_, way_, material_, coarse_, rows_;
+  Buffer<double> sums_;
+  bool over_ = false;
+};
+
+}  // namespace diffvbd

@@ -1,0 +1,190 @@
+"""The coarse space of a Model as tensors: what the corrections read, and what their matrices are made of."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .. import ops
+from .coarse import CoarseGeometry
+
+LANES = ops.LANES["cpu"]  # tets of a block; twin of kLanes
+KRON = 4  # twin of kRow in csrc/core/views.h: scalars of a row of positions
+
+
+class CoarsePlan(NamedTuple):
+    """All tensors are constants of the Model; floating ones have its dtype, but for ``volume`` (float64)."""
+
+    plan: Tensor  # int32, see csrc/coarse/views.h
+    weights: Tensor  # [2 entries], of W by position and by function
+    rest: Tensor  # [1, blocks, 7, lanes], rest scalars of the tets of each body
+    tet: Tensor  # int64 [blocks, lanes], their numbers; any at padding
+    moments: Tensor  # [n, 3], what the mean deformations of the groups are made of
+    volume: Tensor  # float64 [groups]
+    mass: (
+        Tensor  # [1, cells], W' M W of each body with the Model's own masses; 1 on the diagonal of functions that fill
+    )
+    group_tets: Tensor  # int64 [groups, n], any at padding
+    group_weights: Tensor  # [groups, n, 4, width], functions of a group at the corners of its tets; 0 at padding
+    sizes: tuple[tuple[int, int], ...]  # bodies one after another whose matrices have the same number of functions
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> CoarsePlan:
+        def placed(t: Tensor) -> Tensor:
+            return t.to(device, dtype) if t.is_floating_point() else t.to(device)
+
+        out = self._replace(**{name: placed(t) for name, t in self._asdict().items() if isinstance(t, Tensor)})
+        return out._replace(volume=self.volume.to(device))
+
+    @property
+    def width(self) -> int:
+        """Most functions of a group."""
+        return self.group_weights.shape[-1]
+
+
+def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tets: np.ndarray, mass: np.ndarray,
+                   rest: np.ndarray, plan: Tensor) -> CoarsePlan:  # fmt: skip
+    """points [V, 3], tets [T, 4], mass [V], rest [T, 7], all float64; plan: of the sweeps, on the CPU."""
+    g, vertices = geometry, len(points)
+    order = ops.plan_order(plan, LANES).numpy()
+    position = np.full(vertices, -1)
+    real = np.flatnonzero(order >= 0)
+    position[order[real]] = real
+    counts = np.diff(g.function_ptr)
+    mass_ptr = np.concatenate(([0], np.cumsum(counts**2)))
+
+    at = position[g.vertex]
+    sort = np.lexsort((g.function, at))
+    by_position = (at[sort], g.function[sort], g.weight[sort])
+    rows = np.lexsort((at, g.function))
+    function_body = np.repeat(np.arange(g.bodies), counts)
+    position_body = np.full(len(order), -1)
+    position_body[at] = function_body[g.function]
+
+    listed, vertex_body = np.unique(g.vertex), np.full(vertices, -1)
+    vertex_body[g.vertex] = function_body[g.function]
+    listed = listed[np.argsort(vertex_body[listed], kind="stable")]
+    tet_body = np.where(g.tet_group >= 0, g.group_body[g.tet_group], -1) if len(g.group_body) else g.tet_group
+    tet, block_ptr = _blocks(tet_body, g.bodies)
+    corner = np.where(tet[:, None] >= 0, position[tets[np.maximum(tet, 0)].swapaxes(1, 2)], -1)
+    corner = np.where(corner >= 0, corner, corner.max(initial=0))  # padding has one corner four times
+
+    group_tets, inside = _padded(g.tet_group, len(g.group_body))
+    gradients, volume = _shape_gradients(points[tets]), 1 / (6 * rest[:, 6])
+    moment = _moments(g, tets, gradients, volume, group_tets, inside, vertices)
+    header = [g.bodies, g.functions, len(g.group_body), g.group_functions.shape[1], len(g.vertex), len(tet),
+              len(moment[1]), every, len(order), len(listed)]  # fmt: skip
+    arrays = [
+        header, g.function_ptr, mass_ptr, position_body, _starts(by_position[0], len(order)), by_position[1],
+        _starts(g.function[rows], g.functions), at[rows], block_ptr, KRON * corner, tet,
+        _starts(g.group_body, g.bodies), g.group_functions, *moment[:2],
+        _starts(vertex_body[listed], g.bodies), listed, position[listed],
+    ]  # fmt: skip
+    arrays[10] = np.maximum(tet, 0)
+    lanes = np.where(tet[:, None] >= 0, rest[np.maximum(tet, 0)].swapaxes(1, 2), _NO_TET[None, :, None])
+    real_value = torch.from_numpy
+    return CoarsePlan(
+        plan=torch.from_numpy(np.concatenate([np.asarray(a).reshape(-1) for a in arrays]).astype(np.int32)),
+        weights=real_value(np.concatenate((by_position[2], g.weight[rows]))),
+        rest=real_value(lanes[None].copy()),
+        tet=real_value(np.maximum(tet, 0)),
+        moments=real_value(moment[2]),
+        volume=real_value(np.bincount(g.tet_group[g.tet_group >= 0], volume[g.tet_group >= 0], len(g.group_body))),
+        mass=real_value(_mass_cells(g, mass, mass_ptr)[None]),
+        group_tets=real_value(group_tets),
+        group_weights=real_value(_group_weights(g, tets, group_tets, inside, vertices)),
+        sizes=tuple((int(n), int(c)) for n, c in zip(*np.unique(counts, return_counts=True), strict=True)),
+    )
+
+
+_NO_TET = np.array([0.0, 0, 0, 0, 0, 0, 1])  # rest scalars without stiffness
+
+
+def _starts(sorted_values: np.ndarray, count: int) -> np.ndarray:
+    return np.searchsorted(sorted_values, np.arange(count + 1))
+
+
+def _blocks(of: np.ndarray, bodies: int) -> tuple[np.ndarray, np.ndarray]:
+    """Tets of each body in blocks [blocks, LANES], -1 at the end of the last one, and where each body's begin."""
+    order = np.argsort(of, kind="stable")
+    order = order[of[order] >= 0]
+    count = np.bincount(of[order], minlength=bodies)
+    ptr = np.concatenate(([0], np.cumsum(-(-count // LANES))))
+    out = np.full(ptr[-1] * LANES, -1)
+    first = np.concatenate(([0], np.cumsum(count)[:-1])) if bodies else count
+    out[np.arange(len(order)) + np.repeat(ptr[:-1] * LANES - first, count)] = order
+    return out.reshape(-1, LANES), ptr
+
+
+def _padded(of: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
+    order = np.argsort(of, kind="stable")
+    order = order[of[order] >= 0]
+    count = np.bincount(of[order], minlength=groups)
+    out = np.full((groups, int(count.max(initial=0))), -1)
+    out[of[order], np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)] = order
+    return np.maximum(out, 0), out >= 0
+
+
+def _shape_gradients(corners: np.ndarray) -> np.ndarray:
+    """Of the shape functions of tets [T, 4, 3] at their corners [1/m]."""
+    inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1]) if len(corners) else np.zeros((0, 3, 3))
+    rows = inverse.swapaxes(1, 2)
+    return np.concatenate((-rows.sum(1, keepdims=True), rows), 1)
+
+
+def _moments(g: CoarseGeometry, tets: np.ndarray, gradients: np.ndarray, volume: np.ndarray, group_tets: np.ndarray,
+             inside: np.ndarray, vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """For each group its vertices and the vectors D with sum over them of x D' = sum of V F over the group's tets."""
+    listed = np.flatnonzero(g.tet_group >= 0)
+    key = np.repeat(g.tet_group[listed], 4) * vertices + tets[listed].reshape(-1)
+    unique, inverse = np.unique(key, return_inverse=True)
+    out = np.zeros((len(unique), 3))
+    np.add.at(out, inverse.reshape(-1), (volume[listed, None, None] * gradients[listed]).reshape(-1, 3))
+    return _starts(unique // max(vertices, 1), len(g.group_body)), unique % max(vertices, 1), out
+
+
+def _group_weights(g: CoarseGeometry, tets: np.ndarray, group_tets: np.ndarray, inside: np.ndarray, vertices: int
+                   ) -> np.ndarray:  # fmt: skip
+    groups, most = group_tets.shape
+    width = g.group_functions.shape[1]
+    out = np.zeros((groups, most, 4, width))
+    local = np.full(g.functions + 1, -1)
+    ptr = _starts(g.vertex, vertices)
+    for group in range(groups):
+        functions = g.group_functions[group]
+        local[:] = -1
+        local[functions[functions >= 0]] = np.flatnonzero(functions >= 0)
+        corners = tets[group_tets[group][inside[group]]].reshape(-1)
+        count = ptr[corners + 1] - ptr[corners]
+        entry = np.repeat(ptr[corners] - np.cumsum(count) + count, count) + np.arange(count.sum())
+        flat = out[group].reshape(-1, width)
+        flat[np.repeat(np.arange(len(corners)), count), local[g.function[entry]]] = g.weight[entry]
+    return out
+
+
+def _mass_cells(g: CoarseGeometry, mass: np.ndarray, mass_ptr: np.ndarray) -> np.ndarray:
+    """W' M W of each body, one after the other."""
+    out = np.zeros(int(mass_ptr[-1]))
+    first, second, weight = mass_pairs(g, mass_ptr)
+    np.add.at(out, first, weight * mass[second])
+    body = np.repeat(np.arange(g.bodies), np.diff(g.function_ptr))
+    own = np.arange(g.functions) - g.function_ptr[body]
+    diagonal = mass_ptr[body] + own * (np.diff(g.function_ptr)[body] + 1)
+    out[diagonal[g.filling]] = 1.0
+    return out
+
+
+def mass_pairs(g: CoarseGeometry, mass_ptr: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cell, vertex and weight of each product that W' M W is a sum of."""
+    ptr = np.searchsorted(g.vertex, np.unique(g.vertex))
+    count = np.diff(np.append(ptr, len(g.vertex)))
+    of = np.repeat(count, count)  # of each entry: how many its vertex has
+    one = np.repeat(np.arange(len(g.vertex)), of)
+    start = np.repeat(np.repeat(ptr, count), of)
+    two = start + np.arange(len(one)) - np.repeat(np.cumsum(of) - of, of)
+    body = np.searchsorted(g.function_ptr, g.function[one], side="right") - 1
+    size, first = np.diff(g.function_ptr)[body], g.function_ptr[body]
+    cell = mass_ptr[body] + (g.function[one] - first) * size + g.function[two] - first
+    return cell, g.vertex[one], g.weight[one] * g.weight[two]

@@ -1,0 +1,180 @@
+"""The matrices of the coarse corrections of a step (docs/method.md, section 15).
+
+What depends on material, masses and rest shape alone is made once for all steps of a rollout; what turns with the
+bodies once a step. The corrections themselves belong to the sweeps (csrc/cpu/coarse.h).
+"""
+
+# pyright: reportIncompatibleMethodOverride=false
+from __future__ import annotations
+
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from .. import ops
+from ..model.coarse_plan import mass_pairs
+from ..model.model import Model
+from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
+from ..ops import distinct, no_second_derivative, of_inputs
+
+_TENSORS = 3  # differentiable fields
+_FIELDS = len(ops.CoarseFields._fields)
+
+
+class CoarseParts(NamedTuple):
+    """What the matrices of all steps are made of."""
+
+    stiffness: Tensor  # [1 | B, groups, 3 width, 3 width], at rest [N/m]
+    mass: Tensor  # [1 | B, cells] [kg]
+    rest: Tensor  # [1 | B, blocks, 7, lanes], see CoarsePlan
+
+
+def coarse_parts(model: Model, mu: Tensor, lam: Tensor, mass: Tensor | None, rest: Tensor | None, corners: Tensor | None
+                 ) -> CoarseParts:  # fmt: skip
+    """mu, lam [1 | B, 1 | T]; mass [B, V], rest [B, T, 7] and the tets' corners at rest [B, T, 4, 3] where a step is
+    given them, else None."""
+    plan = model._coarse_plan
+    least = torch.maximum(lam, mu * (-2 / 3))
+    if corners is None and mu.shape[-1] == 1 and lam.shape[-1] == 1:
+        unit = model.derived("coarse_unit", lambda: _unit_stiffness(model))
+        stiffness = mu[..., None, None] * unit[:1] + least[..., None, None] * unit[1:]
+    else:
+        gradients, volume = _shape_gradients(model, corners)
+        shape = (max(mu.shape[0], lam.shape[0]), model.num_tets)
+        stiffness = _stiffness(plan, ops.broadcast(mu, shape), ops.broadcast(least, shape), gradients, volume)
+    lanes = plan.rest if rest is None else _in_lanes(model, rest.detach())
+    return CoarseParts(stiffness, plan.mass if mass is None else _mass(model, mass), lanes)
+
+
+def _unit_stiffness(model: Model) -> Tensor:
+    """Of all groups with mu = 1 Pa and lam = 0, and with mu = 0 and lam = 1 Pa."""
+    gradients, volume = _shape_gradients(model, None)
+    one, none = volume.new_ones((1, model.num_tets)), volume.new_zeros((1, model.num_tets))
+    parts = [_stiffness(model._coarse_plan, *pair, gradients, volume) for pair in ((one, none), (none, one))]
+    return torch.cat(parts)
+
+
+def _shape_gradients(model: Model, corners: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Gradients of the shape functions [1 | B, T, 4, 3] and volumes [1 | B, T] of the tets at rest."""
+    if corners is None:
+        corners = model._rest_points[model._topology[0]][None]
+    a, b, c, d = corners.unbind(-2)
+    b, c, d = b - a, c - a, d - a
+    normals = torch.stack((torch.linalg.cross(c, d), torch.linalg.cross(d, b), torch.linalg.cross(b, c)), -2)
+    six = (b * normals[..., 0, :]).sum(-1)
+    rows = normals / six[..., None, None]
+    return torch.cat((-rows.sum(-2, keepdim=True), rows), -2), six / 6
+
+
+def _stiffness(plan: Any, mu: Tensor, lam: Tensor, gradients: Tensor, volume: Tensor) -> Tensor:
+    """sum over the tets of each group of P' K P: rest_stiffness() of csrc/energies/stable_neo_hookean.h, where the
+    gradients are those of the coarse functions."""
+    tets, width = plan.group_tets, plan.width
+    groups, most = tets.shape
+    slopes = torch.einsum("bgmac,gman->bgmnc", gradients[:, tets], plan.group_weights).flatten(3)
+
+    def weighted(modulus: Tensor) -> Tensor:
+        scale = (modulus * volume)[:, tets]
+        out = torch.einsum("bgmi,bgmj->bgij", scale[..., None] * slopes, slopes.expand(len(scale), -1, -1, -1))
+        return out.reshape(-1, groups, width, 3, width, 3)
+
+    shear, bulk = weighted(mu), weighted(lam)
+    identity = torch.eye(3, dtype=shear.dtype, device=shear.device)
+    trace = torch.einsum("bgicjc,pq->bgipjq", shear, identity)
+    out = shear.transpose(3, 5) + trace + bulk
+    return out.reshape(-1, groups, 3 * width, 3 * width).contiguous()
+
+
+def _in_lanes(model: Model, rest: Tensor) -> Tensor:
+    plan = model._coarse_plan
+    lanes = rest[:, plan.tet].transpose(-1, -2)
+    return torch.where(plan.rest[:, :, 6:] == 1, plan.rest, lanes) if _has_padding(model) else lanes.contiguous()
+
+
+def _has_padding(model: Model) -> bool:
+    return model.derived("coarse_padding", lambda: bool((model._coarse_plan.rest[:, :, :6] == 0).all(2).any()))
+
+
+def _mass(model: Model, mass: Tensor) -> Tensor:
+    """W' M W of each body [B, cells]."""
+
+    def pairs() -> tuple[Tensor, ...]:
+        geometry = model.coarse_geometry
+        mass_ptr = np.concatenate(([0], np.cumsum(np.diff(geometry.function_ptr) ** 2)))
+        cell, vertex, weight = mass_pairs(geometry, mass_ptr)
+        known = model._coarse_plan.mass
+        filled = torch.zeros_like(known)
+        body = np.repeat(np.arange(geometry.bodies), np.diff(geometry.function_ptr))
+        own = np.arange(geometry.functions) - geometry.function_ptr[body]
+        diagonal = mass_ptr[body] + own * (np.diff(geometry.function_ptr)[body] + 1)
+        filled[0, torch.from_numpy(diagonal[geometry.filling]).to(known.device)] = 1
+        found = (torch.from_numpy(cell).to(known.device), torch.from_numpy(vertex).to(known.device),
+                 torch.from_numpy(weight).to(known))  # fmt: skip
+        return (*found, filled)
+
+    cell, vertex, weight, filled = model.derived("coarse_mass_pairs", pairs)
+    return filled.expand(len(mass), -1).index_add(1, cell, weight * mass[:, vertex])
+
+
+class _Matrix(Function):
+    @staticmethod
+    def forward(x_prev, stiffness, mass, plan, moments, volume, time_step):
+        return ops.raw.coarse_matrix(x_prev, stiffness, mass, plan, moments, volume, time_step)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[:_FIELDS])
+        ctx.time_step = inputs[_FIELDS]
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple:
+        if grads[0] is None:
+            return (None,) * (_FIELDS + 1)
+        needs = ctx.needs_input_grad[:_TENSORS]
+        out = _MatrixBackward.apply(grads[0], *ctx.saved_tensors, ctx.time_step, needs)
+        return of_inputs(out, needs, _FIELDS + 1 - _TENSORS)
+
+
+class _MatrixBackward(Function):
+    @staticmethod
+    def forward(bar, x_prev, stiffness, mass, plan, moments, volume, time_step, needs):
+        fields = (x_prev, stiffness, mass, plan, moments, volume)
+        bars = ops.raw.coarse_matrix_backward(*fields, bar.contiguous(), time_step)
+        return tuple(ops.sum_to(b, t.shape) for b, t, need in zip(bars, fields, needs, strict=False) if need)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> NoReturn:
+        no_second_derivative()
+
+
+def with_corrections(model: Model, parts: CoarseParts, fields: ops.SweepFields, time_step: float) -> ops.SweepFields:
+    """What the sweeps read, with the corrections between them."""
+    plan = model._coarse_plan
+    tensors = distinct(fields.x_prev, parts.stiffness.contiguous(), parts.mass)
+    matrix = _Matrix.apply(*tensors, plan.plan, plan.moments, plan.volume, time_step)
+    return fields._replace(coarse_matrix=matrix, coarse_inverse=_inverse(model, matrix.detach()),
+                           coarse_mass=parts.mass.detach(), coarse_plan=plan.plan, coarse_weights=plan.weights,
+                           coarse_rest=parts.rest)  # fmt: skip
+
+
+def _inverse(model: Model, matrix: Tensor) -> Tensor:
+    """Of the matrix of each body, which is positive definite."""
+    out, at = torch.empty_like(matrix), 0
+    for functions, bodies in model._coarse_plan.sizes:
+        n = 3 * functions
+        part = matrix.narrow(1, at, bodies * n * n).reshape(-1, n, n)
+        factor, _ = torch.linalg.cholesky_ex(part)
+        out.narrow(1, at, bodies * n * n).copy_(torch.cholesky_inverse(factor).reshape(len(matrix), -1))
+        at += bodies * n * n
+    return out
+
+
+ops.ready_signature(_Matrix, _MatrixBackward)
