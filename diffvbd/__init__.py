@@ -12,6 +12,7 @@ from ._version import __version__ as __version__
 from .adjoint.routes import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
 from .contact.barrier import Friction, PairBarrier
 from .energies import Anchor, FloorBarrier, StableNeoHookean
+from .inspect import coarse
 from .inspect.debug import debug_checks
 from .inspect.diagnose import Diagnosis, diagnose
 from .inspect.gradcheck import GradientCheck, check_gradients
@@ -46,6 +47,7 @@ __all__ = [
     "Trajectory",
     "Unrolled",
     "check_gradients",
+    "coarse",
     "colliders",
     "contact",
     "debug_checks",

@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 
 _checking: ContextVar[bool] = ContextVar("diffvbd.debug_checks", default=False)
-_recording: ContextVar[tuple[list[Any], ...]] = ContextVar("diffvbd.contact.record", default=())
+_recording: ContextVar[tuple[tuple[str, list[Any]], ...]] = ContextVar("diffvbd.contact.record", default=())
 _lock = threading.Lock()
 _checked_by = 0  # threads and tasks inside debug_checks()
 _any_checking = False
-_recorders: tuple[list[Any], ...] = ()  # of all threads and tasks
+_recorders: tuple[tuple[str, list[Any]], ...] = ()  # of all threads and tasks
 
 
 def checking() -> bool:
@@ -36,9 +36,10 @@ def looks_at(value: Tensor) -> bool:
     return transformed is None and (checking() or not value.is_cuda)
 
 
-def recorders() -> tuple[list[Any], ...]:
-    """The lists that contact.record() has given."""
-    return _recorders if torch.compiler.is_compiling() else _recording.get()
+def recorders(kind: str = "contact") -> tuple[list[Any], ...]:
+    """The lists that contact.record(), or coarse.record(), has given."""
+    given = _recorders if torch.compiler.is_compiling() else _recording.get()
+    return tuple(found for of, found in given if of == kind)
 
 
 def _count(change: int) -> None:
@@ -62,17 +63,17 @@ def checks(enabled: bool) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def record_to(found: list[Any]) -> Iterator[None]:
-    """Inside, recorders() has ``found``."""
+def record_to(found: list[Any], kind: str = "contact") -> Iterator[None]:
+    """Inside, recorders(kind) has ``found``."""
     global _recorders
-    token = _recording.set((*_recording.get(), found))
+    token = _recording.set((*_recording.get(), (kind, found)))
     with _lock:
-        _recorders = (*_recorders, found)
+        _recorders = (*_recorders, (kind, found))
     try:
         yield
     finally:
         with _lock:
-            _recorders = tuple(r for r in _recorders if r is not found)
+            _recorders = tuple(r for r in _recorders if r[1] is not found)
         _recording.reset(token)
 
 

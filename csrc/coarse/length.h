@@ -37,7 +37,7 @@ struct Change {
 // is infinite where s is not admissible.
 template <class T, class More>
 double length(const Change& change, double slope, const More& more) {
-  if (!(slope < 0)) return 0;
+  if (!(slope <= 0)) return 0;  // at rest it is 0: the whole correction is taken, for its derivative
   for (int trial = 0; trial < kLengths; ++trial) {
     const double s = length_of(trial);
     double size = change.size(s);

@@ -56,20 +56,25 @@ class _Grouped(NamedTuple):
     groups: Groups
 
 
-def find_bodies(points: Tensor, tets: Tensor, pinned: Tensor, correct: bool) -> tuple[Bodies, OtherBodies]:
-    """Connected sets of tets: those without a pinned vertex, if they are to be corrected, and the others.
-
-    points [V, 3], tets int64 [T, 4], pinned bool [V]; all on the CPU.
-    """
-    count = points.shape[0]
+def connected(tets: Tensor, count: int) -> Tensor:
+    """The lowest vertex of the connected set of tets that each of ``count`` vertices is in, int64 [count]."""
     label = torch.arange(count)
     while True:  # every vertex takes the lowest label of its tets, and that label's own: paths halve each time
         low = label[tets].amin(1) if len(tets) else label[:0]
         new = label.scatter_reduce(0, tets.reshape(-1), low.repeat_interleave(4), "amin")
         new = new[new]
         if torch.equal(new, label):
-            break
+            return label
         label = new
+
+
+def find_bodies(points: Tensor, tets: Tensor, pinned: Tensor, correct: bool) -> tuple[Bodies, OtherBodies]:
+    """Connected sets of tets: those without a pinned vertex, if they are to be corrected, and the others.
+
+    points [V, 3], tets int64 [T, 4], pinned bool [V]; all on the CPU.
+    """
+    label = connected(tets, points.shape[0])
+    count = len(label)
     loose = torch.ones(count, dtype=torch.bool)
     loose[tets.reshape(-1)] = False
     held = torch.full((count,), not correct).index_fill_(0, label[pinned], True)[label]

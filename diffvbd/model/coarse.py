@@ -155,7 +155,7 @@ def _functions(points: np.ndarray, free: np.ndarray, space: CoarseSpace) -> tupl
 
 
 def _in_its_box(points: np.ndarray) -> np.ndarray:
-    """Positions from the lowest corner of a body's box: along the axes, or along its own where these are far thinner."""
+    """Positions from the lowest corner of a body's box, along the axes, or along its own where that is far thinner."""
     own = (points - points.mean(0)) @ np.linalg.svd(points - points.mean(0), full_matrices=False)[2].T
     local = own if np.ptp(own, axis=0).min() < 0.5 * np.ptp(points, axis=0).min() else points
     return local - local.min(0)

@@ -21,7 +21,7 @@ from ..mesh import TetMesh
 from ..ops import regimes
 from ..safeguards import FILTER_ETA, SATURATION_EPS
 from .arguments import Energy, checked_coarse, checked_correction, checked_device, checked_energies, per_tet_density
-from .bodies import find_bodies
+from .bodies import connected, find_bodies
 from .coarse import CoarseSpace, build_coarse
 from .coarse_plan import arrange_coarse
 from .rest import lumped_mass, rest_metric
@@ -138,7 +138,7 @@ class Model:
         device = checked_device(device)
         self._arrange(points, tets, device)
         self._measure(points)
-        self._arrange_coarse(body)
+        self._arrange_coarse()
         warn_of(self)
         self._place(dtype, device)
 
@@ -260,12 +260,13 @@ class Model:
         data = [e.pack(self._parameters(e, points), None) for e in self.vertex_energies]
         self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
 
-    def _arrange_coarse(self, body: Tensor) -> None:
+    def _arrange_coarse(self) -> None:
         """Functions and groups of the coarse corrections; everything still on the CPU and in float64."""
         if self.coarse is None:
             return
         points, tets, pinned = self.mesh.points, self.mesh.tets, self._pinned.numpy()
-        self.coarse_geometry = build_coarse(points, tets, pinned, body.numpy(), self.coarse)
+        label = connected(self._topology[0], len(points)).numpy()
+        self.coarse_geometry = build_coarse(points, tets, pinned, label, self.coarse)
         rest, _ = rest_metric(ops.tet_gather(torch.from_numpy(points.copy())[None], *self._topology))
         self._coarse_plan = arrange_coarse(self.coarse_geometry, self.coarse.every, points, tets, self._mass.numpy(),
                                            rest[0].numpy(), self._plan)  # fmt: skip
@@ -322,7 +323,7 @@ class Model:
             out._arrange(points, out.tets, device)
         out._measure(points)
         out.coarse = checked_coarse(out.coarse, out.energies, out.saturation, device)
-        out._arrange_coarse(torch.from_numpy(self.mesh.body.copy()))
+        out._arrange_coarse()
         out._place(dtype, device)
         return out
 

@@ -5,6 +5,7 @@ An energy class is built once per run from (its dataclass, Scene) and offers
 * `block(k, x, x_prev)` -> [..., 9, n]: h^2 times gradient (3 rows) and Hessian block (xx, xy, xz, yy, yz, zz) of the n
   vertices of color k, at the state x [..., 3, V], lagged terms at x_prev;
 * `energy(x, x_prev)` -> [...]: the matching h^2-scaled energy of the whole body (unpinned vertices only);
+* `terms(x, x_prev)` -> [..., n], [n]: the terms that add up to it, but for a constant, and a vertex of each;
 * optionally `limit(x, step)` -> [..., n]: the largest admissible fraction of `step` [..., 3, n] from x [..., 3, n],
   and with it `start(x, step)` -> [..., 3, n]: what the start of a step may take of it.
 
@@ -64,14 +65,26 @@ class StableNeoHookean:
         gradient = w_mu * _combine(f, own) + (w_lb * (det - 1) - w_mu) * q
         return add_at(constant, color.owner, torch.cat((gradient, w_lh * outer6(q)), -2))
 
-    def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+    def _measures(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """|F|^2 and J - 1 of each tet, [..., T]."""
         s = self.scene
         a, b, c, d = (x[..., corner] for corner in s.layout.tets)
         f = _columns((b - a, c - a, d - a), [g.split(1, -2) for g in s.shape_gradients.unbind(-3)[1:]])
-        strain = dot(f[0], cross(f[1], f[2])) - 1
-        norm = sum(dot(column, column) for column in f)
+        norm = dot(f[0], f[0]) + dot(f[1], f[1]) + dot(f[2], f[2])
+        return norm, dot(f[0], cross(f[1], f[2])) - 1
+
+    def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+        s = self.scene
+        norm, strain = self._measures(x)
         psi = s.mu * ((norm - 3) / 2 - strain) + (s.mu + s.lam) / 2 * strain**2
         return s.time_step**2 * (s.volume * psi).sum(-1)
+
+    def terms(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
+        s = self.scene
+        norm, strain = self._measures(x)
+        weight = s.time_step**2 * s.volume
+        split = (s.mu / 2 * norm, -s.mu * strain, (s.mu + s.lam) / 2 * strain**2)
+        return torch.cat([weight * term for term in split], -1), s.layout.tets[0].repeat(3)
 
 
 def _combine(vectors: Any, weights: Any) -> Tensor:
@@ -128,6 +141,9 @@ class FloorBarrier:
         return torch.cat((gradient, (second.unsqueeze(-2) * self.outer).sum(-3)), -2)
 
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+        return self.terms(x, x_prev)[0].sum(-1)
+
+    def terms(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
         h = self.scene.time_step
         free = ~self.scene.model.pinned
         gap = self.gap(x[..., free])
@@ -138,7 +154,7 @@ class FloorBarrier:
         if self.damped:
             travel, damped, _ = self._approach(x[..., free], x_prev[..., free])
             total = total + torch.where(damped, self.damping * h / 2 * travel**2, 0.0)
-        return total.sum((-2, -1))
+        return total.flatten(-2), free.nonzero()[:, 0].repeat(total.shape[-2])
 
     def limit(self, x: Tensor, step: Tensor) -> Tensor:
         gap, travel = self.gap(x), dot(self.normal, step.unsqueeze(-3))
@@ -227,8 +243,12 @@ class Anchor:
         return torch.cat((gradient, diagonal, no, no, diagonal, no, diagonal), -2)
 
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+        return self.terms(x, x_prev)[0].sum(-1)
+
+    def terms(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
         offset = x - self.points
-        return self.scene.time_step**2 / 2 * (self.stiffness * dot(offset, offset)).sum(-1)
+        each = self.scene.time_step**2 / 2 * self.stiffness * dot(offset, offset)
+        return each, torch.arange(x.shape[-1], device=x.device)
 
 
 ENERGIES: dict[str, type] = {

@@ -38,7 +38,7 @@ class FloorFriction:
         self.coefficient = scene.parameter("friction", friction, "coefficient")[..., None, None]
         self.reach = scene.time_step * friction.velocity
 
-    def _terms(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
+    def _full(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
         """h^2 times the friction that full slip meets [..., planes, n], and the slip [..., planes, 3, n]."""
         floor, x_prev = self.floor, x_prev.unsqueeze(-3)
         gap = dot(floor.normal, x_prev) - floor.height
@@ -49,15 +49,19 @@ class FloorFriction:
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         vertices = self.scene.layout.colors[k].vertices
-        weight, slip = self._terms(take(x, vertices), take(x_prev, vertices))
+        weight, slip = self._full(take(x, vertices), take(x_prev, vertices))
         weight = (weight * smoothed(slip, self.reach)[1]).unsqueeze(-2)
         across = tangential6(self.floor.normal)
         return torch.cat(((weight * slip).sum(-3), (weight * across).sum(-3)), -2)
 
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+        return self.terms(x, x_prev)[0].sum(-1)
+
+    def terms(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
         free = ~self.scene.model.pinned
-        weight, slip = self._terms(x[..., free], x_prev[..., free])
-        return (weight * smoothed(slip, self.reach)[0]).sum((-2, -1))
+        weight, slip = self._full(x[..., free], x_prev[..., free])
+        total = weight * smoothed(slip, self.reach)[0]
+        return total.flatten(-2), free.nonzero()[:, 0].repeat(total.shape[-2])
 
 
 def floor_friction(scene: Scene, energies: list[Any]) -> list[FloorFriction]:

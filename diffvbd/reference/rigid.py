@@ -75,14 +75,8 @@ class Correction:
             share = torch.minimum(share, part.amin(-2).amin(-1, keepdim=True).unsqueeze(-1))
         for energy in floors:
             moved = (x + share * step).detach()
-            good = good & self._clear(energy, moved).all((-2, -1))[..., None, None]
+            good = good & clear(energy, moved).all((-2, -1))[..., None, None]
         return x + torch.where(good, share, 0.0) * step
-
-    @staticmethod
-    def _clear(energy: Any, x: Tensor) -> Tensor:
-        """Where a gap is more than rounding, [..., planes, n]."""
-        size = (energy.normal * x.unsqueeze(-3)).abs().sum(-2) + energy.height.abs()
-        return energy.gap(x) > GUARD * torch.finfo(x.dtype).eps * size
 
     def _load(self, state: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient [..., 3, V] and block [..., V, 3, 3] of the vertex energies."""
@@ -96,15 +90,6 @@ class Correction:
 
     def _value(self, state: Tensor, x_prev: Tensor) -> Tensor:
         return sum((e.energy(state, x_prev) for e in self.energies), torch.zeros_like(state[..., 0, 0]))
-
-    def _admits(self, state: Tensor, before: Tensor, body: Tensor) -> Tensor:
-        out = torch.ones_like(state[..., 0, 0], dtype=torch.bool)
-        for energy in self.energies:
-            if hasattr(energy, "gap"):
-                x = state[..., body]
-                kept = energy.gap(x) >= LEAST_SHARE * energy.gap(before[..., body])
-                out = out & (self._clear(energy, x) & kept).all((-2, -1))
-        return out
 
     def _corrected(self, body: Tensor, x: Tensor, y: Tensor, x_prev: Tensor) -> Tensor:
         mass = self.scene.mass[..., body].unsqueeze(-2)  # [..., 1, n]
@@ -122,7 +107,7 @@ class Correction:
         with torch.no_grad():
             g, block = self._load(closed, x_prev)
             acts = g[..., body].ne(0).any((-2, -1)) | block[..., body, :, :].ne(0).any((-3, -2, -1))
-            acts = acts | ~self._admits(closed, closed, body)
+            acts = acts | ~admits(self.energies, closed, closed, body)
         if not bool(acts.any()):
             return closed
 
@@ -134,11 +119,11 @@ class Correction:
             state = placed(turn, at)
             g, block = self._load(state, x_prev)
             g, block, arm = g[..., body], block[..., body, :, :], turn @ r
-            torque = -_axial(y_x @ turn.transpose(-1, -2)) + torch.linalg.cross(arm, g, dim=-2).sum(-1)
+            torque = -axial(y_x @ turn.transpose(-1, -2)) + torch.linalg.cross(arm, g, dim=-2).sum(-1)
             force = (total * (at - target)).squeeze(-1) + g.sum(-1)
-            jacobian = torch.cat([-_cross_matrix(arm.movedim(-2, -1)), _eye_like(block)], -1)  # [..., n, 3, 6]
+            jacobian = torch.cat([-cross_matrix(arm.movedim(-2, -1)), _eye_like(block)], -1)  # [..., n, 3, 6]
             matrix = (jacobian.transpose(-1, -2) @ block @ jacobian).sum(-3)
-            turning = _turning_stiffness(turn @ x_x @ turn.transpose(-1, -2))
+            turning = turning_stiffness(turn @ x_x @ turn.transpose(-1, -2))
             damping = DAMPING * total * spread * torch.eye(3, dtype=x.dtype, device=x.device)
             inertia = torch.zeros_like(matrix)
             inertia[..., :3, :3] = turning + damping
@@ -172,7 +157,7 @@ class Correction:
             there = placed(turn + turned, at + t)
             rise = (total * dot(t, at - target + t / 2).unsqueeze(-1))[..., 0, 0] - (turned * y_x).sum((-2, -1))
             rise = rise + self._value(there, x_prev) - value
-            good = self._admits(there, state, body) & ((rise <= ROUNDING * value) | arrives)
+            good = admits(self.energies, there, state, body) & ((rise <= ROUNDING * value) | arrives)
             found = found | (good & running)
             if bool((found | ~running).all()):
                 break
@@ -180,23 +165,42 @@ class Correction:
         return torch.where(found, share, 0.0)
 
 
+def clear(energy: Any, x: Tensor) -> Tensor:
+    """Where a gap is more than rounding, [..., planes, n]."""
+    size = (energy.normal * x.unsqueeze(-3)).abs().sum(-2) + energy.height.abs()
+    return energy.gap(x) > GUARD * torch.finfo(x.dtype).eps * size
+
+
+def admits(energies: list[Any], state: Tensor, before: Tensor, body: Tensor) -> Tensor:
+    """Whether all vertices of a body keep LEAST_SHARE of their gaps before, and more than rounding, [...]."""
+    out = torch.ones_like(state[..., 0, 0], dtype=torch.bool)
+    for energy in energies:
+        if hasattr(energy, "gap"):
+            x = state[..., body]
+            kept = energy.gap(x) >= LEAST_SHARE * energy.gap(before[..., body])
+            out = out & (clear(energy, x) & kept).all((-2, -1))
+    return out
+
+
 def _eye_like(block: Tensor) -> Tensor:
     return torch.eye(3, dtype=block.dtype, device=block.device).expand_as(block)
 
 
-def _cross_matrix(w: Tensor) -> Tensor:
+def cross_matrix(w: Tensor) -> Tensor:
     """[w] with [w] r = w x r; [..., 3] -> [..., 3, 3]."""
     x, y, z = w.unbind(-1)
     o = torch.zeros_like(x)
     return torch.stack([torch.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
 
 
-def _axial(a: Tensor) -> Tensor:
+def axial(a: Tensor) -> Tensor:
+    """(a_zy - a_yz, a_xz - a_zx, a_yx - a_xy) of [..., 3, 3]."""
     b = a - a.transpose(-1, -2)
     return torch.stack([b[..., 2, 1], b[..., 0, 2], b[..., 1, 0]], -1)
 
 
-def _turning_stiffness(a: Tensor) -> Tensor:
+def turning_stiffness(a: Tensor) -> Tensor:
+    """tr(a) 1 - (a + a^T) / 2 of [..., 3, 3]: what a turn [w] of a rotation is axial(a) for."""
     trace = a.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     return trace * torch.eye(3, dtype=a.dtype, device=a.device) - (a + a.transpose(-1, -2)) / 2
 
@@ -208,7 +212,7 @@ def _turned_by(w: Tensor) -> Tensor:
     angle = torch.where(small, 1.0, square).sqrt()
     a = torch.where(small, 1 - square / 6 + square**2 / 120, torch.sin(angle) / angle)
     b = torch.where(small, 0.5 - square / 24 + square**2 / 720, 2 * (torch.sin(angle / 2) / angle) ** 2)
-    k = _cross_matrix(w)
+    k = cross_matrix(w)
     return a[..., None, None] * k + b[..., None, None] * (k @ k)
 
 
@@ -220,14 +224,14 @@ def _polar(b: Tensor) -> Tensor:
         found, good = one.expand_as(b), torch.ones_like(b[..., :1, :1], dtype=torch.bool)
         for _ in range(30):
             m = found.transpose(-1, -2) @ b
-            stiffness = _turning_stiffness(m)
+            stiffness = turning_stiffness(m)
             definite = torch.linalg.eigvalsh(stiffness)[..., 0] > DEFINITE * stiffness.diagonal(dim1=-2, dim2=-1).sum(
                 -1
             )
-            w = torch.linalg.solve(torch.where(definite[..., None, None], stiffness, one), _axial(m))
+            w = torch.linalg.solve(torch.where(definite[..., None, None], stiffness, one), axial(m))
             good = good & (definite & ((w * w).sum(-1) < 1))[..., None, None]
             found = found + torch.where(good, found @ _turned_by(w), 0.0)
     m = found.transpose(-1, -2) @ b
-    stiffness = torch.where(good, _turning_stiffness(m), torch.eye(3, dtype=b.dtype, device=b.device))
-    w = torch.linalg.solve(stiffness, torch.where(good[..., 0], _axial(m), 0.0))
+    stiffness = torch.where(good, turning_stiffness(m), torch.eye(3, dtype=b.dtype, device=b.device))
+    w = torch.linalg.solve(stiffness, torch.where(good[..., 0], axial(m), 0.0))
     return torch.where(good, found + found @ _turned_by(w), torch.eye(3, dtype=b.dtype, device=b.device))

@@ -54,14 +54,7 @@ def build_scene(
 
     points = torch.as_tensor(model.rest_points if rest_points is None else rest_points, device=like.device)
     points = points.to(like).transpose(-1, -2)
-    a, b, c, d = (points[..., corner] for corner in layout.tets)
-    # Rows of Dm^-1, Dm = [b-a, c-a, d-a], are the gradients of the shape functions of b, c, d.
-    b, c, d = b - a, c - a, d - a
-    area_b, area_c, area_d = cross(c, d), cross(d, b), cross(b, c)
-    det = dot(b, area_b).unsqueeze(-2)
-    of_b, of_c, of_d = area_b / det, area_c / det, area_d / det
-    volume = det.squeeze(-2) / 6
-
+    gradients, volume = shape_functions(points, layout.tets)
     corner_mass = per_tet(model.density if density is None else density) * volume / 4
     mass = corner_mass.new_zeros(*corner_mass.shape[:-1], points.shape[-1])
     for corner in layout.tets:
@@ -74,8 +67,19 @@ def build_scene(
         mu=per_tet(mu),
         lam=per_tet(lam),
         rest_points=points,
-        shape_gradients=torch.stack((-(of_b + of_c + of_d), of_b, of_c, of_d), -3),
+        shape_gradients=gradients,
         volume=volume,
         mass=mass,
         parameters=dict(parameters or {}),
     )
+
+
+def shape_functions(points: Tensor, tets: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of the shape functions [..., 4, 3, T] and volumes [..., T] of tets [4, T] at points [..., 3, V]."""
+    a, b, c, d = (points[..., corner] for corner in tets)
+    # Rows of Dm^-1, Dm = [b-a, c-a, d-a], are the gradients of the shape functions of b, c, d.
+    b, c, d = b - a, c - a, d - a
+    area_b, area_c, area_d = cross(c, d), cross(d, b), cross(b, c)
+    det = dot(b, area_b).unsqueeze(-2)
+    of_b, of_c, of_d = area_b / det, area_c / det, area_d / det
+    return torch.stack((-(of_b + of_c + of_d), of_b, of_c, of_d), -3), det.squeeze(-2) / 6

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .coarse import REFUSALS, Coarse
 from .energies import build_energies
 from .friction import floor_friction
 from .layout import Layout, build_layout, dot, put, solve6, take
@@ -38,17 +39,21 @@ def step(
     density: Any = None,
     parameters: dict[str, Any] | None = None,
     tet_order: Tensor | None = None,
+    coarse_steps: Tensor | None = None,
+    record: list[Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """One time step; every tensor argument is differentiable by autograd.
 
     x, v: positions [m] and velocities [m/s], [..., V, 3]; leading dimensions are scenes. mu, lam [Pa] broadcast to
     x.shape[:-2] + (T,). force [N], gravity [m/s^2], prescribed, rest_points [m] broadcast to x's shape; density
     [kg/m^3] to [..., T]. tet_order: permutation [T] of the tets that changes only the order of summation.
+    coarse_steps: lengths of a model.coarse's corrections [corrections, ..., bodies], which are searched for if not
+    given; record: a list, to which the step appends those that it took.
     Raises ValueError when an unpinned vertex starts below a floor plane. Returns (x', v').
     """
     layout = build_layout(model, tet_order)
     advance = stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
-    return advance(x, v, force, gravity, prescribed)
+    return advance(x, v, force, gravity, prescribed, coarse_steps, record)
 
 
 def rollout(
@@ -70,16 +75,19 @@ def rollout(
     tet_order: Tensor | None = None,
     force_per_step: Tensor | Sequence[Tensor] | None = None,
     prescribed_per_step: Tensor | Sequence[Tensor] | None = None,
+    coarse_steps: Tensor | Sequence[Tensor] | None = None,
+    record: list[Tensor] | None = None,
 ) -> Trajectory:
     """`steps` steps with everything constant in time, except `force_per_step` and `prescribed_per_step`, whose first
-    dimension is the step and which replace `force` and `prescribed`. Other arguments as in `step`."""
+    dimension is the step and which replace `force` and `prescribed`; so it is that of `coarse_steps`, and `record` gets
+    an entry for each step. Other arguments as in `step`."""
     layout = build_layout(model, tet_order)
     advance = stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
     xs, vs = [x], [v]
     for n in range(steps):
         f = force if force_per_step is None else force_per_step[n]
         held = prescribed if prescribed_per_step is None else prescribed_per_step[n]
-        x, v = advance(x, v, f, gravity, held)
+        x, v = advance(x, v, f, gravity, held, None if coarse_steps is None else coarse_steps[n], record)
         xs.append(x)
         vs.append(v)
     return Trajectory(torch.stack(xs), torch.stack(vs))
@@ -97,8 +105,9 @@ def stepper(
     parameters: dict[str, Any] | None,
     layout: Layout,
 ) -> Callable[..., tuple[Tensor, Tensor]]:
-    """Do what is common to all steps of a run, and return the function (x, v, force, gravity, prescribed) -> (x', v')
-    that makes one. Arguments as in `step`; like decides dtype and device; layout is the model's `build_layout`."""
+    """Do what is common to all steps of a run, and return the function
+    (x, v, force, gravity, prescribed, coarse_steps=None, record=None) -> (x', v') that makes one.
+    Arguments as in `step`; like decides dtype and device; layout is the model's `build_layout`."""
     scene = build_scene(
         model,
         layout,
@@ -114,8 +123,18 @@ def stepper(
     energies += floor_friction(scene, energies)
     masses = color_masses(scene)
     correct = Correction(scene, energies)
+    coarse = Coarse(scene, energies) if getattr(model, "coarse", None) is not None else None
+    last = 1.0 if correct.bodies and model.relaxation > 1 else None
 
-    def advance(x: Tensor, v: Tensor, force: Any, gravity: Any, prescribed: Any) -> tuple[Tensor, Tensor]:
+    def advance(
+        x: Tensor,
+        v: Tensor,
+        force: Any,
+        gravity: Any,
+        prescribed: Any,
+        coarse_steps: Tensor | None = None,
+        record: list[Tensor] | None = None,
+    ) -> tuple[Tensor, Tensor]:
         y = predictor(scene, x, v, force, gravity, prescribed)
         coasting = torch.where(model.pinned[:, None], y, x + time_step * v)
         x_prev, y, coasting = (a.transpose(-1, -2).contiguous() for a in (x, y, coasting))
@@ -126,16 +145,52 @@ def stepper(
         for body in correct.bodies:
             begun = put(begun, body, correct.coasted(take(x_prev, body), take(coasting, body)))
         state = correct(begun, y, x_prev)
-        if sweeps and correct.bodies and model.relaxation > 1:
-            state = run_sweeps(scene, energies, masses, y, state, x_prev, sweeps - 1)
-            state = run_sweeps(scene, energies, masses, y, state, x_prev, 1, relaxation=1.0)
+
+        def swept(state: Tensor, count: int, ends: bool) -> Tensor:
+            usual = max(count - 1, 0) if ends else count
+            state = run_sweeps(scene, energies, masses, y, state, x_prev, usual)
+            return run_sweeps(scene, energies, masses, y, state, x_prev, count - usual, relaxation=last)
+
+        if coarse is None:
+            state = swept(state, sweeps, True)
         else:
-            state = run_sweeps(scene, energies, masses, y, state, x_prev, sweeps)
+            state, taken = _in_two_levels(coarse, swept, sweeps, state, y, x_prev, coarse_steps)
+            if record is not None:
+                record.append(taken)
         state = correct(state, y, x_prev)
         x_new = state.transpose(-1, -2).contiguous()
         return x_new, (x_new - x) / time_step
 
     return advance
+
+
+def _in_two_levels(
+    coarse: Coarse,
+    swept: Callable[[Tensor, int, bool], Tensor],
+    sweeps: int,
+    state: Tensor,
+    y: Tensor,
+    x_prev: Tensor,
+    steps: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """A sweep, then corrections with up to `every` sweeps after each, until all sweeps are done; or a correction alone.
+
+    swept(state, count, ends): the state after so many sweeps, which end the step or do not. Returns the state and the
+    lengths of the corrections [corrections, ..., bodies], which are `steps` if these are given.
+    """
+    space, matrix = coarse.scene.model.coarse, coarse.begin(x_prev)
+    state = swept(state, min(sweeps, 1), sweeps == 1)
+    left, taken = sweeps - min(sweeps, 1), []
+    refused = torch.zeros((), dtype=torch.int64, device=y.device)
+    for n in range(space.corrections(sweeps)):
+        given = None if steps is None else steps[n]
+        state, s = coarse.correct(state, y, x_prev, matrix, given, refused >= REFUSALS)
+        refused = refused + (s == 0)
+        count = min(space.every, left)
+        left -= count
+        state = swept(state, count, left == 0)
+        taken.append(s)
+    return state, torch.stack(taken)
 
 
 def color_masses(scene: Scene) -> list[Tensor]:

@@ -19,7 +19,7 @@ from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
 from ..adjoint.sweep import fused_step, sweep
 from ..model.model import Model
 from ..model.warnings import warn_of_thin_tets
-from ..scopes import checking, looks_at
+from ..scopes import checking, looks_at, recorders
 from .arguments import (
     GRAVITY,
     Prepared,
@@ -169,8 +169,12 @@ def swept(
             if isinstance(adjoint, GlobalAdjoint):
                 return global_sweep(model, fields, settings, adjoint, debug_step,
                                     lambda x: begun.corrected(x, model, prepared))  # fmt: skip
-            return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy,
-                         debug_step=debug_step)[0]  # fmt: skip
+            x, _, corrections = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy,
+                                      debug_step=debug_step)  # fmt: skip
+            if corrections.numel():
+                for found in recorders("coarse"):
+                    found.append(corrections[..., 3 * model.coarse_geometry.functions :].detach().clone())
+            return x
     except ValueError as error:
         name_argument(model, error, given)
         raise

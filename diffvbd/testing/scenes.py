@@ -301,12 +301,19 @@ def evaluate(run: Callable[..., tuple[Tensor, Tensor]], inputs: dict[str, Any]) 
 
 
 def reference_result(
-    model: Any, inputs: dict[str, Any], sweeps: int, steps: int = 1, tet_order: Tensor | None = None
+    model: Any,
+    inputs: dict[str, Any],
+    sweeps: int,
+    steps: int = 1,
+    tet_order: Tensor | None = None,
+    coarse_steps: Any = None,
 ) -> dict[str, Tensor]:
-    """`evaluate` of the reference rollout."""
+    """`evaluate` of the reference rollout; coarse_steps: recorded lengths of coarse corrections, one entry a step."""
 
     def run(**options: Any) -> tuple[Tensor, Tensor]:
-        trajectory = reference.rollout(model, steps=steps, sweeps=sweeps, tet_order=tet_order, **options)
+        trajectory = reference.rollout(
+            model, steps=steps, sweeps=sweeps, tet_order=tet_order, coarse_steps=coarse_steps, **options
+        )
         return trajectory.x[-1], trajectory.v[-1]
 
     return evaluate(run, inputs)
@@ -315,12 +322,17 @@ def reference_result(
 def _turned(model: Any) -> Any:
     """What the reference reads of a model, each tet listed from another corner (an even permutation)."""
     names = ("rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies")
-    names += ("saturation", "regularization", "relaxation", "rigid", "starts_from")
-    return SimpleNamespace(tets=model.tets[:, [3, 2, 1, 0]], **{name: getattr(model, name) for name in names})
+    names += ("saturation", "regularization", "relaxation", "rigid", "starts_from", "coarse", "coarse_geometry")
+    return SimpleNamespace(tets=model.tets[:, [3, 2, 1, 0]], **{name: getattr(model, name, None) for name in names})
 
 
 def spread(
-    model: Any, inputs: dict[str, Any], sweeps: int, steps: int = 1, expected: dict[str, Tensor] | None = None
+    model: Any,
+    inputs: dict[str, Any],
+    sweeps: int,
+    steps: int = 1,
+    expected: dict[str, Tensor] | None = None,
+    coarse_steps: Any = None,
 ) -> dict[str, float]:
     """How far two references with permuted tets disagree, per entry of `evaluate`: what rounding alone does here.
 
@@ -328,8 +340,9 @@ def spread(
     `expected`: the unpermuted `reference_result`, when it is at hand.
     """
     order = torch.from_numpy(generator("order").permutation(model.tets.shape[0]))
-    permuted = reference_result(_turned(model), inputs, sweeps, steps, order)
-    expected = reference_result(model, inputs, sweeps, steps) if expected is None else expected
+    permuted = reference_result(_turned(model), inputs, sweeps, steps, order, coarse_steps)
+    if expected is None:
+        expected = reference_result(model, inputs, sweeps, steps, coarse_steps=coarse_steps)
     return {name: relative_error(permuted[name], expected[name]) for name in expected}
 
 

@@ -3,6 +3,7 @@
 # name: (value, reason). Relative to the largest entry (`relative_error`) unless the reason says otherwise.
 TOLERANCE: dict[str, tuple[float, str]] = {
     "forward": (1e-14, "one step in float64: same update, sums in another order, about 50 ulps of the largest entry"),
+    "coarse_forward": (1e-13, "a step with coarse corrections: their inverse loses the condition of a small matrix"),
     "adjoint": (1e-12, "floor of the bar on gradients; above it the bar is `spread_factor` times the scene's spread"),
     "spread_factor": (10.0, "how far the compiled gradient may lie beyond two references that differ in tet order"),
     "stiff_direction": (10.0, "error of a gradient over what an ulp in the inputs does to it, against 120 digits"),

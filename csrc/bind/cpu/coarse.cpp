@@ -42,7 +42,8 @@ std::tuple<Tensor, Tensor, Tensor> matrix_backward(DIFFVBD_PARAMETERS(COARSE) co
     const int64_t cells = p.mass_ptr[p.bodies], size = int64_t{9} * p.groups * p.width * p.width;
     require(bar.is_contiguous() && bar.scalar_type() == x_prev.scalar_type() && bar.numel() == 9 * cells * in.scenes,
             "diffvbd::coarse_matrix_backward: expected an adjoint like the matrix");
-    const Tensor x_bar = zeros(x_prev, {in.scenes, in.vertices, 3}), stiffness_bar = zeros(x_prev, {in.scenes, size}),
+    const Tensor x_bar = zeros(x_prev, {in.scenes, in.vertices, 3}),
+                 stiffness_bar = zeros(x_prev, {in.scenes, p.groups, 3 * p.width, 3 * p.width}),
                  mass_bar = zeros(x_prev, {in.scenes, cells});
     for_bodies(in.scenes, p.bodies, [&](int64_t scene, int body) {
       coarse::assemble_vjp(in, scene, body, data<const T>(bar) + 9 * cells * scene,

@@ -1,0 +1,22 @@
+"""What coarse corrections have done: ``diffvbd.coarse``."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+from torch import Tensor
+
+from ..scopes import record_to
+
+__all__ = ["record"]
+
+
+@contextlib.contextmanager
+def record() -> Iterator[list[Tensor]]:
+    """Inside, every step of a Model with a coarse space appends the lengths of its corrections, a tensor [scenes,
+    corrections, bodies]: 1 is a whole correction, 0 one that was refused, because it would have raised the potential.
+    A backward with checkpoints runs steps again, and counts."""
+    found: list[Tensor] = []
+    with record_to(found, "coarse"):
+        yield found

@@ -1,0 +1,365 @@
+"""Claim: the reference's coarse correction is a projected Newton step, of a length that lowers the potential, and is
+differentiated as executed.
+
+Two boxes, one of them pinned, above a floor; functions and groups as a Model's coarse space has them.
+"""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import reference
+from diffvbd.model.coarse import CoarseSpace, build_coarse
+from diffvbd.reference import coarse, friction, rigid, sweep
+from diffvbd.reference.layout import build_layout
+from diffvbd.reference.scene import build_scene
+from diffvbd.testing import generator, relative_error, structured, tolerance
+
+NAMES = ("tets", "rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies", "saturation")
+NAMES += ("regularization", "relaxation", "rigid", "starts_from")
+POINTS, BODIES, SCENES = 72, 2, 2
+TURN = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.5, 0.9], [0.5, 0.0, 0.3], [-0.9, -0.3, 0.0]]).double())
+
+
+def stand_in(every: int = 2, coarse: bool = True, **options: Any) -> Any:
+    """A model with what the reference reads, a coarse space among it."""
+    (left, tets), (right, more) = structured((2, 2, 2)), structured((4, 2, 2), (2.0, 1.0, 1.0))
+    mesh = dv.TetMesh(np.concatenate((left, right + [0.0, 1.7, 0.3])), np.concatenate((tets, more + len(left))))
+    floor = dv.FloorBarrier(height=-0.05, kappa=2e4, dhat=0.1, damping=20.0)
+    energies = (dv.StableNeoHookean(), dv.Anchor(300.0, vertices=torch.tensor([3, 60])), floor)
+    model = dv.Model(mesh, **({"pinned": np.flatnonzero(left[:, 0] == 0), "energies": energies} | options))
+    values = {name: getattr(model, name) for name in NAMES}
+    if coarse:
+        space = CoarseSpace(functions=12, groups=3, every=every)
+        geometry = build_coarse(mesh.points, mesh.tets, model.pinned.numpy(), np.arange(POINTS) >= len(left), space)
+        values |= {"coarse": space, "coarse_geometry": geometry}
+    return SimpleNamespace(**values)
+
+
+def inputs_of(model: Any, jitter: float = 0.02) -> dict[str, Any]:
+    """Inputs of two scenes: the free box turned, everything jittered."""
+    rng = generator("coarse step")
+
+    def normal(*shape: int) -> Tensor:
+        return torch.as_tensor(rng.standard_normal(shape))
+
+    rest, count = model.rest_points, len(model.tets)
+    free = torch.arange(POINTS) >= 27
+    center = rest[free].mean(0)
+    turned = torch.where(free[:, None], (rest - center) @ TURN.T + center, rest)
+    x = turned + jitter * normal(SCENES, POINTS, 3)
+    return {
+        "x": x,
+        "v": 0.4 * normal(SCENES, POINTS, 3),
+        "mu": 8e3 * (1 + 0.2 * normal(SCENES, count).clamp(-2, 2)),
+        "lam": 2e4 * (1 + 0.2 * normal(count).clamp(-2, 2)),
+        "density": 900 * (1 + 0.1 * normal(SCENES, count).clamp(-2, 2)),
+        "force": 3 * normal(SCENES, POINTS, 3),
+        "gravity": torch.tensor([0.3, -9.81, 0.1]).double(),
+        "prescribed": x + 0.01 * normal(SCENES, POINTS, 3),
+        "rest_points": rest + 5e-3 * normal(SCENES, POINTS, 3),
+        "parameters": {"anchor.stiffness": 300 * (1 + 0.1 * normal(SCENES, POINTS).clamp(-2, 2))},
+        "time_step": 0.02,
+    }
+
+
+def coarse_of(model: Any, x: Tensor, energies: Any = None, **changes: Any) -> tuple[coarse.Coarse, Any]:
+    """The correction of a run from x, and its scene."""
+    options = {"mu": 8e3, "lam": 2e4, "time_step": 0.02, "rest_points": None, "density": None, "parameters": None}
+    scene = build_scene(model, build_layout(model), x, **(options | changes))
+    return coarse.Coarse(scene, sweep.build_energies(scene) if energies is None else energies), scene
+
+
+def test_bodies_are_as_expected() -> None:
+    """What the other tests rely on: filling functions, several groups, both bodies."""
+    geometry = stand_in().coarse_geometry
+    assert geometry.bodies == BODIES and 0 < geometry.filling.sum() < geometry.functions
+    assert np.bincount(geometry.group_body).tolist() == [3, 3]
+
+
+def test_stiffness_is_the_projected_hessian_at_rest() -> None:
+    model = stand_in()
+    inputs = inputs_of(model)
+    values = {name: inputs[name] for name in ("mu", "lam", "rest_points")}
+    values = {name: value[1] if name != "lam" else value for name, value in values.items()}
+    correction, scene = coarse_of(model, model.rest_points, **values)
+    elastic = correction.energies[0]
+    rest = scene.rest_points
+
+    def energy(x: Tensor) -> Tensor:
+        return elastic.energy(x, x) / scene.time_step**2
+
+    hessian = torch.autograd.functional.hessian(energy, rest)  # [3, V, 3, V]
+    assert isinstance(hessian, Tensor)
+    projected = torch.einsum("ivjw,vf,wk->fikj", hessian, correction.weight, correction.weight)
+    for own, stiffness in zip(correction.own, correction.stiffness, strict=True):
+        assert relative_error(stiffness.sum(0), projected[own, :, own, :]) <= tolerance("hessian")
+    assert not projected[correction.own[0], :, correction.own[1], :].any()
+
+
+def test_a_negative_lam_is_bounded() -> None:
+    model = stand_in()
+    mu = torch.tensor(8e3).double().requires_grad_()
+    below, least = (coarse_of(model, model.rest_points, mu=mu, lam=lam)[0].stiffness[1] for lam in (-7e3, -2 / 3 * mu))
+    assert relative_error(below, least) <= tolerance("ulps")
+    slopes = [torch.autograd.grad(k.sum((0, 1, 3)).square().sum(), mu, retain_graph=True)[0] for k in (below, least)]
+    assert relative_error(*slopes) <= tolerance("formula") and slopes[0] != 0
+    n = below.shape[1]
+    values = torch.linalg.eigvalsh(below.detach().sum(0).reshape(3 * n, 3 * n))
+    assert values[0] >= -tolerance("formula") * values[-1]
+
+
+def test_rotations_are_the_nearest_ones() -> None:
+    model = stand_in()
+    rest = model.rest_points
+    correction, _ = coarse_of(model, rest)
+    # of a turned body, whose gradient has equal singular values
+    turned = correction.rotations((rest @ TURN.T + 1.0).T)
+    assert relative_error(turned, TURN.expand_as(turned)) <= tolerance("formula")
+    rng = generator("rotations")
+    gradient = torch.as_tensor(rng.standard_normal((200, 3, 3)))
+    found = coarse.nearest_rotation(gradient, torch.tensor(1e-3).double())
+    _, s, _ = torch.linalg.svd(gradient)
+    last = s[:, 2] * torch.linalg.det(gradient).sign()
+    good = s[:, 1] + last > 0.01
+    one = torch.eye(3).double()
+    assert relative_error(found @ found.mT, one.expand_as(found)) <= tolerance("cancelling")
+    assert (torch.linalg.det(found) > 0).all() and (last[good] < 0).any() and (last[good] > 0).any()
+    most = (s[:, 0] + s[:, 1] + last)[good]
+    assert relative_error((found * gradient).sum((-2, -1))[good], most) <= tolerance("cancelling")
+
+
+def test_rotations_against_central_differences() -> None:
+    """Also where singular values are equal; and where nothing determines a rotation there is none to differentiate."""
+    rng = generator("rotations and differences")
+    some = torch.as_tensor(rng.standard_normal((3, 3)))
+    some = some @ some.T + torch.as_tensor(0.2 * rng.standard_normal((3, 3)))
+    mirrored = TURN @ torch.diag(torch.tensor([3.0, 2.0, -0.5]).double())
+    least = torch.tensor(1e-3).double()
+    for f in (TURN.clone(), 2 * TURN @ torch.diag(torch.tensor([2.0, 1.0, 1.0]).double()), some, mirrored):
+        torch.autograd.gradcheck(lambda f: coarse.nearest_rotation(f, least), f.requires_grad_())
+    flat = torch.diag(torch.tensor([1.0, 1e-4, 0.0]).double()).requires_grad_()
+    turn = coarse.nearest_rotation(flat, least)
+    assert torch.equal(turn, torch.eye(3).double())
+    assert not torch.autograd.grad(turn.square().sum() + turn.sum(), flat)[0].any()
+
+
+def test_functions_that_span_everything_make_a_newton_step() -> None:
+    """W the identity on the vertices that move, two tets of a group each, at rest, where the rotations are 1."""
+    points = np.array([[0.0, 0, 0], [1, 0.1, 0], [0.1, 1, 0.1], [0, 0.1, 1], [1, 1.1, 0.9]])
+    tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])
+    tets[1] = tets[1] if np.linalg.det(points[tets[1, 1:]] - points[tets[1, 0]]) > 0 else [2, 1, 3, 4]
+    model = dv.Model(dv.TetMesh(points, tets), pinned=[0], energies=(dv.StableNeoHookean(), dv.Anchor(0.0)))
+    geometry = SimpleNamespace(
+        function_ptr=[0, 4], vertex=[1, 2, 3, 4], function=[0, 1, 2, 3], weight=[1.0] * 4, tet_group=[0, 1],
+        group_body=[0, 0], filling=[False] * 4,
+    )  # fmt: skip
+    model = SimpleNamespace(**{n: getattr(model, n) for n in NAMES}, coarse=CoarseSpace(), coarse_geometry=geometry)
+    rest = model.rest_points
+    correction, scene = coarse_of(model, rest)
+    y = rest + torch.where(model.pinned[:, None], 0.0, 0.05 * torch.as_tensor(generator("y").standard_normal((5, 3))))
+
+    def potential(z: Tensor) -> Tensor:
+        z = torch.cat((rest[:1], z))
+        return reference.incremental_potential(model, z, y, 8e3, 2e4, scene.time_step)
+
+    gradient = torch.autograd.functional.jacobian(potential, rest[1:])
+    hessian = torch.autograd.functional.hessian(potential, rest[1:])
+    assert isinstance(hessian, Tensor) and isinstance(gradient, Tensor)
+    step = -torch.linalg.solve(hessian.reshape(12, 12), gradient.reshape(12)).reshape(4, 3)
+    matrix = correction.begin(rest.T)
+    assert relative_error(matrix, hessian.reshape(12, 12)) <= tolerance("hessian")
+    moved, s = correction.correct(rest.T, y.T, rest.T, matrix)
+    assert s.tolist() == [1.0]
+    assert torch.equal(moved.T[0], rest[0])
+    assert relative_error(moved.T[1:] - rest[1:], step) <= tolerance("cancelling")
+
+
+def test_its_gradient_is_that_of_the_potential() -> None:
+    model = stand_in()
+    inputs = inputs_of(model)
+    x = inputs["x"]
+    y = torch.where(model.pinned[:, None], x, x + 0.01)
+    correction, scene = coarse_of(model, x)
+    above = x + torch.where(model.pinned[:, None], 0.0, torch.tensor([0.0, -1e-3, 2e-3]).double())
+    expected = reference.residual(model, above, y, 8e3, 2e4, scene.time_step, x)
+    found = correction._gradient(above.mT, y.mT, x.mT).mT
+    assert relative_error(found[:, ~model.pinned], expected[:, ~model.pinned]) <= tolerance("hessian")
+
+
+def test_terms_add_up_to_the_energies() -> None:
+    """Of each energy, friction included, but for what does not change; and body by body."""
+    model = stand_in()
+    model.friction = dv.Friction(0.5)
+    x = inputs_of(model)["x"]
+    correction, scene = coarse_of(model, x)
+    energies = [*correction.energies, *friction.floor_friction(scene, correction.energies)]
+    assert len(energies) == 4
+    moved = x + 0.01 * torch.as_tensor(generator("terms").standard_normal(tuple(x.shape)))
+    for energy in energies:
+        (before, vertex), (after, _) = (energy.terms(z.mT, x.mT) for z in (x, moved))
+        whole = energy.energy(moved.mT, x.mT) - energy.energy(x.mT, x.mT)
+        assert relative_error((after - before).sum(-1), whole) <= tolerance("cancelling")
+        for body in range(BODIES):
+            of_body = correction.body == body
+            mixed = torch.where(of_body[:, None], moved, x)
+            part = energy.energy(mixed.mT, x.mT) - energy.energy(x.mT, x.mT)
+            assert relative_error((after - before)[:, of_body[vertex]].sum(-1), part) <= tolerance("cancelling")
+
+
+@pytest.mark.parametrize("rigid", (False, True))
+@pytest.mark.parametrize("sweeps", (0, 1, 4))
+def test_step_against_central_differences(sweeps: int, rigid: bool) -> None:
+    """With as many sweeps, and the lengths of the corrections as they were found."""
+    model = stand_in(relaxation=1.3, rigid=rigid, start="predictor")
+    inputs = inputs_of(model)
+    rng = generator("loss of a coarse step")
+    weights = [torch.as_tensor(rng.standard_normal((SCENES, POINTS, 3))) for _ in range(2)]
+    names = [name for name in inputs if isinstance(inputs[name], Tensor)]
+    flat = {name: inputs[name] for name in names} | inputs["parameters"]
+    lengths: list[Tensor] = []
+    reference.step(model, sweeps=sweeps, record=lengths, **inputs)
+    assert lengths[0].shape == (model.coarse.corrections(sweeps), SCENES, BODIES) and (lengths[0] > 0).any()
+
+    def loss(values: dict[str, Tensor]) -> Tensor:
+        given = {name: values[name] for name in names}
+        parameters = {name: values[name] for name in inputs["parameters"]}
+        x, v = reference.step(model, time_step=0.02, sweeps=sweeps, coarse_steps=lengths[0], parameters=parameters,
+                              **given)  # fmt: skip
+        return (weights[0] * x + 0.02 * weights[1] * v).sum()
+
+    leaves = {name: value.clone().requires_grad_() for name, value in flat.items()}
+    gradients = torch.autograd.grad(loss(leaves), list(leaves.values()))
+    for name, gradient in zip(leaves, gradients, strict=True):
+        direction = torch.as_tensor(rng.standard_normal(tuple(gradient.shape))) * flat[name].abs().max()
+        value = float((gradient * direction).sum())
+        errors = []
+        for size in (1e-7, 1e-6, 1e-5, 1e-3):
+            ends = [float(loss(flat | {name: flat[name] + sign * size * direction})) for sign in (1, -1)]
+            errors.append(abs(value - (ends[0] - ends[1]) / (2 * size)))
+        assert gradient.any(), name
+        assert min(errors) <= tolerance("finite_difference") * abs(value), name
+
+
+@pytest.mark.parametrize("jitter", (0.0, 0.03, 0.3))
+def test_no_body_ends_above_its_start(jitter: float) -> None:
+    """Whatever the state, also among inverted tets; and no vertex loses more of its gap than it may."""
+    model = stand_in()
+    rest = model.rest_points
+    rng = generator("never above", jitter)
+    shape = (6, POINTS, 3)
+    x = rest + jitter * torch.as_tensor(rng.uniform(-1, 1, shape))
+    x[..., 1] = x[..., 1].clamp(min=-0.04)
+    state = x + jitter * torch.as_tensor(rng.uniform(-1, 1, shape))
+    state[..., 1] = state[..., 1].clamp(min=-0.04)
+    state = torch.where(model.pinned[:, None], x, state)
+    y = state + 0.1 * jitter * torch.as_tensor(rng.standard_normal(shape)) - torch.tensor([0.0, 0.2, 0.0]).double()
+    y = torch.where(model.pinned[:, None], x, y)
+    correction, scene = coarse_of(model, x)
+    moved, s = correction.correct(state.mT, y.mT, x.mT, correction.begin(x.mT))
+    assert s.shape == (6, BODIES) and (s > 0).any()
+    assert set(s.flatten().tolist()) <= {0.0, *(0.5**n for n in range(coarse.HALVINGS))}
+    for body in range(BODIES):
+        of_body = (correction.body == body)[:, None]
+        ends = [reference.incremental_potential(model, z, y, 8e3, 2e4, scene.time_step, x)
+                for z in (state, torch.where(of_body, moved.mT, state))]  # fmt: skip
+        assert (ends[1] <= ends[0] * (1 + tolerance("ulps"))).all()
+        assert (ends[1] < ends[0])[s[:, body] > 0].all()
+    floor = correction.energies[-1]
+    kept = floor.gap(moved) - rigid.LEAST_SHARE * floor.gap(state.mT)
+    assert (kept[..., ~model.pinned] >= 0).all()
+    assert torch.equal(moved.mT[:, model.pinned], state[:, model.pinned])
+
+
+@pytest.mark.parametrize(
+    ("sweeps", "every", "expected"),
+    [(0, 3, "c"), (1, 3, "sc"), (2, 3, "scs"), (4, 3, "scsss"), (5, 3, "scssscs"), (4, 1, "scscscs")],
+)
+def test_order_of_a_step(sweeps: int, every: int, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = stand_in(every=every, relaxation=1.4, rigid=True)
+    seen, relaxations, corrected, swept = [], [], coarse.Coarse.correct, sweep.run_sweeps
+
+    def correct(*args: Any) -> Any:
+        seen.append("c")
+        return corrected(*args)
+
+    def run_sweeps(*args: Any, relaxation: float | None = None) -> Tensor:
+        seen.extend("s" * args[6])
+        relaxations.extend([relaxation] * args[6])
+        return swept(*args, relaxation=relaxation)
+
+    monkeypatch.setattr(coarse.Coarse, "correct", correct)
+    monkeypatch.setattr(sweep, "run_sweeps", run_sweeps)
+    reference.step(model, sweeps=sweeps, **inputs_of(model))
+    assert "".join(seen) == expected and relaxations == [None] * (sweeps - 1) + [1.0] * min(sweeps, 1)
+
+
+def test_a_body_that_is_refused_twice_is_left_to_the_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And then the step is that of a model without a coarse space, to the bit."""
+    model, plain = stand_in(every=1), stand_in(coarse=False)
+    inputs = inputs_of(model)
+    monkeypatch.setattr(coarse, "DECREASE", 1e12)
+    given, corrected = [], coarse.Coarse.correct
+
+    def correct(*args: Any) -> Any:
+        given.append(bool(args[-1].all()))
+        return corrected(*args)
+
+    monkeypatch.setattr(coarse.Coarse, "correct", correct)
+    record: list[Tensor] = []
+    x, v = reference.step(model, sweeps=5, record=record, **inputs)
+    assert not record[0].any() and given == [False, False, True, True]
+    expected = reference.step(plain, sweeps=5, **inputs)
+    assert torch.equal(x, expected[0]) and torch.equal(v, expected[1])
+
+
+def test_scenes_and_order_of_tets_change_rounding_alone() -> None:
+    model = stand_in()
+    inputs = inputs_of(model)
+    record: list[Tensor] = []
+    run: dict[str, Any] = {"steps": 2, "sweeps": 4}
+    ends = reference.rollout(model, record=record, **run, **inputs)
+    assert len(record) == 2 and record[0].shape == (2, SCENES, BODIES)
+    order = torch.as_tensor(generator("order").permutation(len(model.tets)))
+    permuted = reference.rollout(model, tet_order=order, coarse_steps=record, **run, **inputs)
+    assert relative_error(permuted.x, ends.x) <= tolerance("forward")
+    for n in range(SCENES):
+        alone: dict[str, Any] = {name: value[n] if isinstance(value, Tensor) and value.shape[:1] == (SCENES,) else value
+                 for name, value in inputs.items()}  # fmt: skip
+        alone["parameters"] = {name: value[n] for name, value in inputs["parameters"].items()}
+        single: list[Tensor] = []
+        end = reference.rollout(model, record=single, **run, **alone)
+        assert all(torch.equal(a, b[:, n]) for a, b in zip(single, record, strict=True))
+        assert relative_error(end.x, ends.x[:, n]) <= tolerance("forward")
+
+
+def test_few_sweeps_come_closer_with_it() -> None:
+    """What it is for: of what the potential of a step may still fall, four sweeps leave less."""
+    model, plain = stand_in(), stand_in(coarse=False)
+    inputs = inputs_of(model)
+    inputs |= {"mu": inputs["mu"] * 100, "lam": inputs["lam"] * 100}
+    x, v, options = inputs["x"], inputs["v"], {n: inputs[n] for n in ("rest_points", "density", "parameters")}
+    scene = coarse_of(model, x, **options)[1]
+    y = sweep.predictor(scene, x, v, inputs["force"], inputs["gravity"], inputs["prescribed"])
+
+    def left(model: Any, sweeps: int) -> Tensor:
+        end, _ = reference.step(model, sweeps=sweeps, **inputs)
+        return reference.incremental_potential(model, end, y, inputs["mu"], inputs["lam"], 0.02, x, **options)
+
+    least = left(model, 100)
+    assert (left(model, 4) - least < left(plain, 4) - least).all()
+
+
+def test_a_model_without_a_body_to_correct() -> None:
+    """All vertices pinned: no function, and the step is the plain one."""
+    model, plain = (stand_in(pinned=np.arange(POINTS), coarse=given) for given in (True, False))
+    inputs = inputs_of(plain)
+    record: list[Tensor] = []
+    x, _ = reference.step(model, sweeps=3, record=record, **inputs)
+    assert record[0].shape == (1, SCENES, 0)
+    assert torch.equal(x, reference.step(plain, sweeps=3, **inputs)[0])
