@@ -17,7 +17,7 @@ inline coarse::Plan coarse_plan(const Tensor& plan) {
 }
 
 template <class T>
-coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, int64_t sweeps) {
+coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, int64_t sweeps, int energies) {
   coarse::Inputs<T> in{};
   in.plan = coarse_plan(f.coarse_plan);
   const coarse::Plan& p = in.plan;
@@ -32,6 +32,7 @@ coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, int64_t s
   in.mass = batched<T>(f.coarse_mass, x, b, cells);
   require(in.inverse.data && in.mass.data && (in.rest.data || p.tet_blocks == 0),
           "diffvbd::sweep: expected the matrix of the coarse space");
+  in.keeps_positions = keeps_positions(energies);
   in.corrections = coarse::corrections_of(static_cast<int>(sweeps), p.every);
   return in;
 }

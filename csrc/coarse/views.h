@@ -71,8 +71,12 @@ struct Inputs {
   T* tape;        // [B, corrections, tape_size()]
   T* matrix_bar;  // [B, 9 mass_ptr[bodies]], reverse only; null where not wanted
 
-  // of a correction: the coarse vector, then the length of each body
-  int64_t tape_size() const { return int64_t{3} * plan.functions + plan.bodies; }
+  bool keeps_positions;
+
+  // of a correction: the coarse vector, the length of each body and, where gaps must come back to the bit, what it read
+  int64_t tape_size() const {
+    return int64_t{3} * plan.functions + plan.bodies + (keeps_positions ? int64_t{3} * plan.positions : 0);
+  }
 };
 
 // How many corrections a step has, and whether one comes before sweep k, which is `sweeps` at the end of a short step;

@@ -115,11 +115,15 @@ void CoarseScene<T>::correct(int k, Team::Member& member) {
   if (member.first == 0) {
     over_ = std::all_of(failures_.begin(), failures_.end(), [](int n) { return n >= coarse::kFailures; });
   }
+  T* before = lengths + p.bodies;
   member.each(0, p.positions, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       if (p.position_body[i] < 0) continue;
       const T length = lengths[p.position_body[i]];
-      for (int c = 0; c < 3; ++c) s_.x[4 * i + c] += length * s_.way[4 * i + c];
+      for (int c = 0; c < 3; ++c) {
+        if (c_.keeps_positions) before[3 * i + c] = s_.x[4 * i + c];
+        s_.x[4 * i + c] += length * s_.way[4 * i + c];
+      }
     }
   });
   member.barrier();
@@ -235,7 +239,7 @@ void CoarseScene<T>::flush(Team::Member& member, bool all) {
 template <class T>
 void CoarseScene<T>::reverse(int k, Team::Member& member) {
   const coarse::Plan& p = c_.plan;
-  const T *a = tape(k), *lengths = a + int64_t{3} * p.functions;
+  const T *a = tape(k), *lengths = a + int64_t{3} * p.functions, *before = lengths + p.bodies;
   if (std::all_of(lengths, lengths + p.bodies, [](T s) { return s == 0; })) return;
   T *restricted = rows_.get() + 4 * int64_t{p.functions}, *coarse = coarse_.get();
   flush(member, false);
@@ -259,11 +263,13 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
   });
   member.barrier();
   member.each(0, p.positions, [&](int64_t begin, int64_t end) {
-    kernels_.gather(p.position_ptr, p.function, c_.weight, coarse, s_.way, begin, end);
+    if (!c_.keeps_positions) kernels_.gather(p.position_ptr, p.function, c_.weight, coarse, s_.way, begin, end);
     for (int64_t i = begin; i < end; ++i) {
       if (p.position_body[i] < 0) continue;
       const T length = lengths[p.position_body[i]];
-      for (int c = 0; c < 3; ++c) s_.x[4 * i + c] += length * s_.way[4 * i + c];
+      for (int c = 0; c < 3; ++c) {
+        s_.x[4 * i + c] = c_.keeps_positions ? before[3 * i + c] : s_.x[4 * i + c] + length * s_.way[4 * i + c];
+      }
     }
   });
   member.barrier();

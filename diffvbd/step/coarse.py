@@ -165,6 +165,12 @@ def with_corrections(model: Model, parts: CoarseParts, fields: ops.SweepFields, 
                            coarse_rest=parts.rest)  # fmt: skip
 
 
+def lengths_of(model: Model, corrections: Tensor) -> Tensor:
+    """Of what an operator has recorded, the length of each body's corrections [B, corrections, bodies]."""
+    geometry = model.coarse_geometry
+    return corrections.detach().narrow(-1, 3 * geometry.functions, geometry.bodies).clone()
+
+
 def _inverse(model: Model, matrix: Tensor) -> Tensor:
     """Of the matrix of each body, which is positive definite."""
     out, at = torch.empty_like(matrix), 0

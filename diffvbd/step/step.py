@@ -32,7 +32,7 @@ from .arguments import (
     prepare,
 )
 from .check import check_on_cpu
-from .coarse import with_corrections
+from .coarse import lengths_of, with_corrections
 from .contact import run_contact
 from .memory import out_of_memory_named
 from .predict import Begun, begin
@@ -173,7 +173,7 @@ def swept(
                                       debug_step=debug_step)  # fmt: skip
             if corrections.numel():
                 for found in recorders("coarse"):
-                    found.append(corrections[..., 3 * model.coarse_geometry.functions :].detach().clone())
+                    found.append(lengths_of(model, corrections))
             return x
     except ValueError as error:
         name_argument(model, error, given)

@@ -51,7 +51,7 @@ def check(case: str, kind: str, space: dv.CoarseSpace, sweeps: int, steps: int, 
             least = tolerance("coarse_forward" if name == "x" else "cancelling")
             bar = max(least, tolerance("spread_factor") * spreads[name])
         assert error <= bar, f"{name}: error {error:.1e}, spread {spreads[name]:.1e}"
-        if name in ("grad_x", "grad_v", "grad_mu", "grad_density"):
+        if name in ("grad_x", "grad_v") or (name in ("grad_mu", "grad_density") and (sweeps or lengths[0].any())):
             assert value.abs().max() > 0, name
     return lengths
 
