@@ -99,13 +99,13 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
-  require(tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: bad arguments");
-  require(x_bar.is_contiguous() && x_bar.numel() == x.numel(), "diffvbd::sweep_backward: x_bar must be like x");
+  require(tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: expected a tape_policy with a tape");
+  diffvbd::require_like("x_bar", x_bar, x, x.numel());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const Given<T> given(plan, f, x, q, -1);
     const auto& in = given.in;
-    diffvbd::check_tape(tape, plan, in);
+    diffvbd::check_tape(tape, x, plan, in);
     const auto make = [&](const std::vector<int64_t>& shape, bool zeroed) {
       return zeroed ? zeros(x, shape) : empty(x, shape);
     };
