@@ -21,7 +21,10 @@ from setuptools.command.build_py import build_py
 try:
     from torch.utils.cpp_extension import BuildExtension, CppExtension
 except ImportError:
-    sys.exit("diffvbd: torch is not importable here.\nInstall torch first, then: pip install --no-build-isolation .")
+    sys.exit(
+        "diffvbd: this build cannot import torch. pip builds in an empty environment, which sees no torch, even if one "
+        "is installed.\nInstall torch if it is missing, then: pip install --no-build-isolation ."
+    )
 
 # The sweeps for each scalar and instruction set come first: they take longest.
 QUICK = bool(os.environ.get("DIFFVBD_QUICK"))

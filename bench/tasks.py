@@ -77,10 +77,10 @@ def picture_of(name: str, images: Path) -> Path:
 INTRODUCTION = """\
 # Inverse problems
 
-`diffvbd run NAME` runs one; each is a short module in `diffvbd/tasks/`, written on the public interface alone, and
-its docstring, repeated here, states the protocol. Figures in the tables come from the logs in `bench/results/tasks`,
-which `python -m bench tasks` writes and `python -m bench report` turns into this page; those of the paper stand in
-`bench/paper.py`.
+`diffvbd run NAME` runs one (after `make`: `. .venv/bin/activate` first); its pictures need matplotlib. Each is a short
+module in `diffvbd/tasks/`, written on the public interface alone, and its docstring, repeated here, states the
+protocol. Figures in the tables come from the logs in `bench/results/tasks`, which `python -m bench tasks` writes and
+`python -m bench report` turns into this page; those of the paper stand in `bench/paper.py`.
 
 Times are those of the optimisation, without pictures. Runs are repeatable: on one device the same seed gives the same
 numbers, bit by bit; only what runs for a given time, as CMA-ES in learn-controller, depends on the machine's speed.

@@ -151,4 +151,5 @@ def name_value(name: str, expected: str, value: Tensor, good: Tensor) -> None:
     good = good & torch.isfinite(value)
     if not bool(good.all()):
         where = (~good).nonzero()[0].tolist()
-        raise ValueError(f"{name}: expected {expected}, got {float(value[tuple(where)]):g} at {where}") from None
+        got = float(value.detach()[tuple(where)])  # of a tensor that requires grad float() warns
+        raise ValueError(f"{name}: expected {expected}, got {got:g} at {where}")

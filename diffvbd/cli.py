@@ -28,8 +28,9 @@ EXAMPLES = """examples:
   diffvbd identify part.msh target.npz --start 1e4 1e4
                                                    recover (mu, lam) from the observed motion
 
-`diffvbd COMMAND --help` explains each command. Errors are one line, with exit status 2. An interrupted `run` or
-`identify` continues where it stopped when the same command is given again.
+`diffvbd COMMAND --help` explains each command. Errors are one line, with exit status 2. `identify` ends with status 1
+where it stalled, and warns wherever it did not converge. An interrupted `run` or `identify` continues where it stopped
+when the same command is given again.
 """
 TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here replaces the file's value):
   x          observed positions [m], shape [N, V, 3], or [V, 3] for one final shape
@@ -43,17 +44,16 @@ TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here re
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status: 0, 2 after an error, 130 after an interruption."""
+    """Run one command; returns the exit status: 0, 1 where `identify` stalled, 2 after an error, 130 if interrupted."""
     options = _parser().parse_args(arguments)
     try:
-        options.command(options)
+        return options.command(options) or 0
     except KeyboardInterrupt:
         print("\ninterrupted; `run` and `identify` continue when the same command is given again", file=sys.stderr)
         return 130
     except (ValueError, TypeError, OSError, ImportError, ArithmeticError, MemoryError, torch.OutOfMemoryError) as error:
         print(f"diffvbd: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    return 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -106,7 +106,7 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         nargs=2,
         metavar=("MU", "LAM"),
-        help="first guess [Pa], right to a factor 1e4 (default 1e5)",
+        help=f"first guess [Pa] (default 1e5); the result stays within a factor {identify.RANGE:.0e} of it",
     )
     identification.add_argument("--start-young", type=float, help="the same as Young's modulus [Pa]")
     identification.add_argument("--start-poisson", type=float, help="and Poisson's ratio, above 0 and below 0.5")
@@ -252,7 +252,7 @@ def _start(options: argparse.Namespace) -> tuple[float, float]:
     return dv.lame(young, poisson)
 
 
-def _identify(options: argparse.Namespace) -> None:
+def _identify(options: argparse.Namespace) -> int:
     _check_steps(options.steps)
     start = _start(options)
     check_device(options.device)
@@ -261,9 +261,14 @@ def _identify(options: argparse.Namespace) -> None:
     observation = Observation.load(options.target, mesh, **given)
     settings = Settings(options.out or Path("runs/identify"), options.device, options.seed)
     problem = identify.problem(observation, settings, start, options.fixed_lam, options.iterations)
-    found = _solve(problem, settings).estimates
-    young, poisson = dv.young_poisson(found["mu"], found["lam"])
+    result = _solve(problem, settings)
+    young, poisson = dv.young_poisson(result.estimates["mu"], result.estimates["lam"])
     print(f"Young's modulus {young:.6g} Pa, Poisson's ratio {poisson:.4g}")
+    if not result.converged:
+        how = "stalled" if result.stalled else f"did not converge in {len(result.history)} evaluations"
+        advice = "try another --start, more --iterations, or --fixed-lam"
+        print(f"warning: identify {how}: mu and lam are the best seen and may be far off; {advice}", file=sys.stderr)
+    return int(result.stalled)
 
 
 def _info(options: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import diffvbd as dv
 from diffvbd.cli import main
@@ -244,6 +245,22 @@ def test_identify_starts_from_young_and_poisson(mesh_file: Path, tmp_path: Path,
     log = json.loads((tmp_path / "run" / "log.json").read_text())
     assert [log["history"][0][name] for name in ("mu", "lam")] == pytest.approx([1e4, 1.5e4])
     assert "Young's modulus 1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("rate", "status", "message"),
+    [(0.0, 1, "warning: identify stalled: "), (1e-3, 0, "warning: identify did not converge in 3 evaluations: ")],
+)
+def test_identify_says_where_it_did_not_converge(
+    rate: float, status: int, message: str, mesh_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    target = tmp_path / "target.npz"
+    assert run("simulate", mesh_file, "--out", tmp_path / "a.pvd", *SCENE, "--mu", 4e4, "--save-target", target) == 0
+    monkeypatch.setattr(torch.optim, "LBFGS", lambda parameters, **_: torch.optim.SGD(parameters, lr=rate))
+    options = ["--start", 1e4, 1e4, "--iterations", 3, "--out", tmp_path / "run"]
+    assert run("identify", mesh_file, target, *options) == status
+    output = capsys.readouterr()
+    assert message in output.err and "Young's modulus" in output.out
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

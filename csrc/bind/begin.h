@@ -11,6 +11,13 @@
 
 namespace diffvbd {
 
+// Before anything is read of them: the shape of x, and the lists of the other bodies.
+inline void require_states(const BeginFields& f) {
+  require_positions(f.x);
+  require(is_index(f.other_ptr, f.x) && is_index(f.other_tet_ptr, f.x) && f.other_ptr.numel() > 0 &&
+              f.other_tet_ptr.numel() == f.other_ptr.numel(),
+          "diffvbd::begin: expected other_ptr and other_tet_ptr int32 [bodies + 1]");
+}
 inline int32_t other_bodies(const BeginFields& f) { return static_cast<int32_t>(f.other_ptr.numel() - 1); }
 struct BeginSettings {
   const std::vector<int64_t>& data_count;
@@ -29,14 +36,17 @@ start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, cons
                               q.data_count, q.time_step);
   const int64_t b = in.bodies.scenes, v = in.bodies.vertices;
   in.x = in.bodies.x_prev;
-  in.v = batched<T>(t.v, t.x, b, 3 * v);
-  in.acceleration = batched<T>(t.acceleration, t.x, b, 3 * v, 3);
-  in.prescribed = batched<T>(t.prescribed, t.x, b, 3 * v);
-  require(t.pinned.scalar_type() == ScalarType::Bool && t.pinned.numel() == v && t.pinned.is_contiguous(),
+  in.v = batched<T>("v", t.v, t.x, b, 3 * v);
+  in.acceleration = batched<T>("acceleration", t.acceleration, t.x, b, 3 * v, 3);
+  in.prescribed = batched_or_null<T>("prescribed", t.prescribed, t.x, b, 3 * v);
+  require(is_beside(t.pinned, t.x, ScalarType::Bool) && t.pinned.numel() == v,
           "diffvbd::begin: expected pinned bool [V]");
   require(q.from >= start::kInertia && q.from <= start::kLower, "diffvbd::begin: expected start 0, 1 or 2");
-  require(q.from != start::kLower || falls.numel() == b * others, "diffvbd::begin: expected falls [scenes, bodies]");
-  require(!q.filters || in.bodies.data_count[0] > 0, "diffvbd::begin: there are no planes");
+  require(q.from != start::kLower || (is_beside(falls, t.x, ScalarType::Byte) && falls.numel() == b * others),
+          "diffvbd::begin: expected falls [scenes, bodies]");
+  require(!q.filters || (in.bodies.data_count[0] > 0 &&
+                         in.bodies.data_count[0] <= FloorStart::kMostPlanes * FloorBarrier::stride),
+          "diffvbd::begin: expected 1 to 8 planes");
   in.pinned = data<const bool>(t.pinned);
   in.falls = data<const uint8_t>(falls);
   in.others = others;
@@ -57,17 +67,19 @@ start::Candidates<T> candidates(const BeginFields& t, const BeginSettings& q, co
                            t.origin, t.other_order, t.other_ptr, t.spread, t.other};
   in.bodies = rigid_inputs<T>(bodies, q.data_count, q.time_step, false);
   const int64_t b = in.bodies.scenes, tets = t.rest.dim() == 3 ? t.rest.size(1) : 0;
-  require(t.other_tets.scalar_type() == ScalarType::Int && t.other_tets.dim() == 2 && t.other_tets.size(1) == 5 &&
-              t.other_tets.is_contiguous() && t.other_tet_ptr.scalar_type() == ScalarType::Int &&
-              t.other_tet_ptr.is_contiguous() && t.other_tet_ptr.numel() == t.other_ptr.numel(),
+  require(is_index(t.other_tets, t.x) && t.other_tets.dim() == 2 && t.other_tets.size(1) == 5,
           "diffvbd::begin: expected the tets of the other bodies int32 [listed, 5]");
+  require(t.rest.numel() == 0 || (t.rest.dim() == 3 && t.rest.size(2) == kRestScalars),
+          "diffvbd::begin: expected rest [scenes, tets, 7], or empty");
   in.other = data<const T>(from_y);
   in.tets = data<const int32_t>(t.other_tets);
   in.tet_ptr = data<const int32_t>(t.other_tet_ptr);
   if (tets > 0) {
     const auto material = material_of(t);
-    for (int m = 0; m < kMaterialScalars; ++m) in.material[m] = batched<T>(*material[m], t.x, b, tets);
-    in.rest = batched<T>(t.rest, t.x, b, kRestScalars * tets);
+    for (int m = 0; m < kMaterialScalars; ++m) {
+      in.material[m] = batched<T>(kMaterialNames[m], *material[m], t.x, b, tets, 1);
+    }
+    in.rest = batched<T>("rest", t.rest, t.x, b, kRestScalars * tets);
   }
   return in;
 }
@@ -97,10 +109,8 @@ struct BeginBars {
   }
   template <class T>
   start::Adjoints<T> pointers(const Tensor& x_start_bar, const Tensor& y_bar) const {
-    for (const Tensor* bar : {&x_start_bar, &y_bar}) {
-      require(bar->is_contiguous() && bar->numel() == x.numel() && bar->scalar_type() == x.scalar_type(),
-              "diffvbd::begin_backward: expected adjoints like x");
-    }
+    require_like("x_start_bar", x_start_bar, x, x.numel());
+    require_like("y_bar", y_bar, x, x.numel());
     const auto or_null = [](const Tensor& t) { return t.numel() > 0 ? data<T>(t) : nullptr; };
     start::Adjoints<T> a{};
     a.x_start = data<const T>(x_start_bar), a.y = data<const T>(y_bar);

@@ -23,15 +23,12 @@ coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, int64_t s
   const coarse::Plan& p = in.plan;
   const int64_t b = x.size(0), cells = p.mass_ptr[p.bodies];
   const Tensor& w = f.coarse_weights;
-  require(w.scalar_type() == x.scalar_type() && w.is_contiguous() && w.numel() == 2 * int64_t{p.entries},
-          "diffvbd::sweep: expected the weights of a coarse space");
+  require_like("coarse_weights", w, x, 2 * int64_t{p.entries});
   in.weight = data<const T>(w);
   in.row_weight = in.weight + p.entries;
-  in.rest = batched<T>(f.coarse_rest, x, b, int64_t{p.tet_blocks} * kRestScalars * kLanes);
-  in.inverse = batched<T>(f.coarse_inverse, x, b, 9 * cells);
-  in.mass = batched<T>(f.coarse_mass, x, b, cells);
-  require(in.inverse.data && in.mass.data && (in.rest.data || p.tet_blocks == 0),
-          "diffvbd::sweep: expected the matrix of the coarse space");
+  in.rest = batched<T>("coarse_rest", f.coarse_rest, x, b, int64_t{p.tet_blocks} * kRestScalars * kLanes);
+  in.inverse = batched<T>("coarse_inverse", f.coarse_inverse, x, b, 9 * cells);
+  in.mass = batched<T>("coarse_mass", f.coarse_mass, x, b, cells);
   in.keeps_positions = keeps_positions(energies);
   in.corrections = coarse::corrections_of(static_cast<int>(sweeps), p.every);
   return in;
@@ -40,23 +37,20 @@ coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, int64_t s
 template <class T>
 coarse::MatrixInputs<T> matrix_inputs(const CoarseFields& f, double time_step) {
   const Tensor& x = f.x_prev;
-  require(x.dim() == 3 && x.size(2) == 3 && x.is_contiguous() && time_step > 0,
-          "diffvbd::coarse_matrix: expected x_prev [scenes, vertices, 3] and time_step > 0");
+  require_positions(x);
+  require(time_step > 0, "diffvbd::coarse_matrix: expected time_step > 0");
   coarse::MatrixInputs<T> in{};
   in.plan = coarse_plan(f.plan);
   const coarse::Plan& p = in.plan;
   in.scenes = x.size(0), in.vertices = x.size(1), in.time_step = time_step;
   in.x_prev = data<const T>(x);
-  require(f.moments.scalar_type() == x.scalar_type() && f.moments.is_contiguous() &&
-              f.moments.numel() == 3 * int64_t{p.moments},
-          "diffvbd::coarse_matrix: expected moments [n, 3]");
+  require_like("moments", f.moments, x, 3 * int64_t{p.moments});
   in.moment = data<const T>(f.moments);
   require(f.volume.scalar_type() == ScalarType::Double && f.volume.is_contiguous() && f.volume.numel() == p.groups,
           "diffvbd::coarse_matrix: expected volume float64 [groups]");
   in.volume = data<const double>(f.volume);
-  in.stiffness = batched<T>(f.stiffness, x, in.scenes, int64_t{9} * p.groups * p.width * p.width);
-  in.mass = batched<T>(f.mass, x, in.scenes, p.mass_ptr[p.bodies]);
-  require(in.stiffness.data && in.mass.data, "diffvbd::coarse_matrix: expected stiffness and mass");
+  in.stiffness = batched<T>("stiffness", f.stiffness, x, in.scenes, int64_t{9} * p.groups * p.width * p.width);
+  in.mass = batched<T>("mass", f.mass, x, in.scenes, p.mass_ptr[p.bodies]);
   return in;
 }
 

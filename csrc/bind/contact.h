@@ -8,11 +8,10 @@
 
 namespace diffvbd {
 
-inline contact::PairList pair_list(const Tensor& pairs, const Tensor& ptr, const Tensor& entry, int64_t scenes,
+inline contact::PairList pair_list(const Tensor& pairs, const Tensor& ptr, const Tensor& entry, const Tensor& x,
                                    int64_t corners) {
-  const auto good = [](const Tensor& t) { return t.scalar_type() == ScalarType::Int && t.is_contiguous(); };
-  require(good(pairs) && good(ptr) && good(entry) && ptr.numel() == scenes * corners + 1 &&
-              pairs.numel() % contact::kPairRow == 0 && 4 * (pairs.numel() / contact::kPairRow) == entry.numel(),
+  require(is_index(pairs, x) && is_index(ptr, x) && is_index(entry, x) && ptr.numel() == x.size(0) * corners + 1 &&
+              pairs.dim() == 2 && pairs.size(1) == contact::kPairRow && 4 * pairs.size(0) == entry.numel(),
           "diffvbd: expected pairs made by contact_detect for this batch");
   return {data<const int32_t>(pairs), data<const int32_t>(ptr), data<const int32_t>(entry)};
 }
@@ -26,25 +25,22 @@ contact::ContactInputs<T> contact_inputs(const SweepFields& t, const Tensor& x, 
   contact::ContactInputs<T> in{};
   in.num_vertices = static_cast<int32_t>(v);
   in.corners = v + colliders;
-  in.listed = pair_list(t.pairs, t.ptr, t.entry, b, in.corners);
-  require(t.constants.is_contiguous() && t.constants.scalar_type() == x.scalar_type() &&
-              2 * t.constants.numel() == t.pairs.numel(),
-          "diffvbd: expected the constants of the pairs");
+  in.listed = pair_list(t.pairs, t.ptr, t.entry, x, in.corners);
+  require_like("constants", t.constants, x, t.pairs.size(0) * contact::kConstants);
   in.constants = data<const T>(t.constants);
   if (t.lag.numel() > 0) {
-    in.lagged = pair_list(t.lag_pairs, t.lag_ptr, t.lag_entry, b, in.corners);
-    require(t.lag.is_contiguous() && t.lag.scalar_type() == x.scalar_type() &&
-                t.lag.numel() * contact::kPairRow == t.lag_pairs.numel() * contact::kLagScalars,
-            "diffvbd: expected the lag of the pairs");
+    in.lagged = pair_list(t.lag_pairs, t.lag_ptr, t.lag_entry, x, in.corners);
+    require_like("lag", t.lag, x, t.lag_pairs.size(0) * contact::kLagScalars);
     in.lag = data<const T>(t.lag);
   }
-  in.kappa = batched<T>(t.kappa, x, b, 1);
-  in.bounds = batched<T>(t.bounds, x, b, 4 * v);
-  in.collider = batched<T>(t.collider, x, b, 3 * colliders);
-  in.collider_prev = batched<T>(t.collider_prev, x, b, 3 * colliders);
+  in.kappa = batched<T>("kappa", t.kappa, x, b, 1);
+  in.bounds = batched<T>("bounds", t.bounds, x, b, 4 * v);
+  in.collider = batched<T>("collider", t.collider, x, b, 3 * colliders);
+  in.collider_prev = batched<T>("collider_prev", t.collider_prev, x, b, 3 * colliders);
   if (t.floor_lag.numel() > 0) {
+    require(v > 0, "diffvbd: expected no floor_lag without vertices");
     in.planes = static_cast<int>(t.floor_lag.numel() / t.floor_lag.size(0) / (v * contact::kFloorLag));
-    in.floor_lag = batched<T>(t.floor_lag, x, b, v * in.planes * contact::kFloorLag);
+    in.floor_lag = batched<T>("floor_lag", t.floor_lag, x, b, v * in.planes * contact::kFloorLag);
   }
   in.x_prev = x_prev;
   in.origin = origin;
@@ -52,20 +48,42 @@ contact::ContactInputs<T> contact_inputs(const SweepFields& t, const Tensor& x, 
   return in;
 }
 
+// Of contact_lag: corner points and the pairs that repel.
+template <class T>
+contact::ContactInputs<T> lag_inputs(const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& kappa,
+                                     const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
+                                     const Tensor& entry) {
+  require_positions(x);
+  contact::ContactInputs<T> in{};
+  const int64_t b = x.size(0), v = x.size(1), colliders = collider.dim() == 3 ? collider.size(1) : 0;
+  in.num_vertices = static_cast<int32_t>(v);
+  in.corners = v + colliders;
+  in.collider = batched<T>("collider", collider, x, b, 3 * colliders);
+  in.origin = batched_or_null<T>("origin", origin, x, b, 3 * v);
+  in.kappa = batched<T>("kappa", kappa, x, b, 1);
+  in.listed = pair_list(pairs, ptr, entry, x, in.corners);
+  require_like("constants", constants, x, pairs.size(0) * contact::kConstants);
+  in.constants = data<const T>(constants);
+  return in;
+}
+
 template <class T>
 contact::LowestInputs<T> lowest_inputs(const Tensor& x, const Tensor& origin, const Tensor& planes,
                                        const Tensor& body_order, const Tensor& body_ptr, const Tensor& island) {
+  require_positions(x);
   const int64_t b = x.size(0), v = x.size(1), bodies = body_ptr.numel() - 1;
-  const auto good = [](const Tensor& t) { return t.scalar_type() == ScalarType::Int && t.is_contiguous(); };
-  require(good(body_order) && good(body_ptr) && good(island) && body_order.numel() == v &&
-              island.numel() == b * bodies && x.is_contiguous() && planes.numel() > 0,
-          "diffvbd::contact_lowest: bad arguments");
+  require(bodies >= 0 && is_index(body_order, x) && is_index(body_ptr, x) && is_index(island, x) &&
+              body_order.numel() == v && island.numel() == b * bodies,
+          "diffvbd::contact_lowest: expected bodies of x and their islands");
   contact::LowestInputs<T> in{};
-  const int64_t scalars = planes.numel() / planes.size(0);
+  const int64_t scalars = planes.dim() > 0 && planes.size(0) > 0 ? planes.numel() / planes.size(0) : 0;
+  require(scalars > 0 && scalars % contact::kPlaneScalars == 0,
+          "diffvbd::contact_lowest: expected planes [scenes, 7 planes]");
+  if (origin.numel() > 0) require_like("origin", origin, x, x.numel());
   in.x = data<const T>(x);
-  in.origin = batched<T>(origin, x, b, 3 * v).data;
+  in.origin = batched_or_null<T>("origin", origin, x, b, 3 * v).data;
   in.planes = data<const T>(planes);
-  in.plane_scene = batched<T>(planes, x, b, scalars).scene;
+  in.plane_scene = batched<T>("planes", planes, x, b, scalars).scene;
   in.body_order = data<const int32_t>(body_order);
   in.body_ptr = data<const int32_t>(body_ptr);
   in.island = data<const int32_t>(island);

@@ -16,9 +16,16 @@ struct StartTensors {
 };
 
 inline void require_vectors(const Tensor& t, const Tensor& x) {
-  require(t.is_contiguous() && t.dim() == 3 && t.size(0) == x.size(0) && t.size(1) == x.size(1) && t.size(2) == 3 &&
-              t.scalar_type() == x.scalar_type() && t.get_device_index() == x.get_device_index(),
+  require(t.dim() == 3 && x.dim() == 3 && t.size(0) == x.size(0) && t.size(1) == x.size(1) && t.size(2) == 3 &&
+              is_like(t, x),
           "diffvbd: expected contiguous vectors like x [scenes, vertices, 3]");
+}
+
+// Of vertices, and then perhaps of colliders: bool, int32.
+inline void require_of_vertices(const Tensor& held, const Tensor& body, const Tensor& x) {
+  require(is_beside(held, x, ScalarType::Bool) && is_index(body, x) && held.numel() >= x.size(1) &&
+              body.numel() >= x.size(1),
+          "diffvbd: expected held bool and body int32 of at least the vertices");
 }
 
 template <class T>
@@ -26,18 +33,20 @@ contact::TranslationInputs<T> translation_inputs(const TranslationTensors& t) {
   require_vectors(t.move, t.x);
   require_vectors(t.x, t.move);
   const int64_t b = t.x.size(0), v = t.x.size(1), bodies = t.body_ptr.numel() - 1;
-  require(t.held.scalar_type() == ScalarType::Bool && t.held.numel() >= v && t.body.numel() >= v &&
+  require_of_vertices(t.held, t.body, t.x);
+  require(is_index(t.island, t.x) && is_index(t.body_order, t.x) && is_index(t.body_ptr, t.x) && bodies >= 0 &&
               t.island.numel() == b * bodies && t.body_order.numel() == v,
-          "diffvbd::contact_translation: bad arguments");
+          "diffvbd::contact_translation: expected bodies of x and their islands");
   contact::TranslationInputs<T> in{};
   if (t.planes.numel() > 0) {
     in.floor = lowest_inputs<T>(t.x, t.origin, t.planes, t.body_order, t.body_ptr, t.island);
-    require(in.floor.num_planes <= contact::kMostPlanes && t.lowest.numel() == b * bodies * in.floor.num_planes,
+    require(in.floor.num_planes <= contact::kMostPlanes && is_index(t.lowest, t.x) &&
+                t.lowest.numel() == b * bodies * in.floor.num_planes,
             "diffvbd::contact_translation: expected the lowest vertices of at most 8 planes");
     in.lowest = data<const int32_t>(t.lowest);
   }
   in.move = data<const T>(t.move);
-  const auto mass = batched<T>(t.mass, t.x, b, v);
+  const auto mass = batched<T>("mass", t.mass, t.x, b, v);
   in.mass = mass.data;
   in.mass_scene = mass.scene;
   in.held = data<const bool>(t.held);
@@ -53,22 +62,30 @@ contact::TranslationInputs<T> translation_inputs(const TranslationTensors& t) {
 
 template <class T>
 contact::StartInputs<T> start_inputs(const StartTensors& t, double gamma, double cap, double filter_eta) {
+  require_vectors(t.x, t.move);
   require_vectors(t.move, t.x);
   require_vectors(t.goal, t.x);
   const int64_t b = t.x.size(0), v = t.x.size(1);
-  require(t.u.dim() == 3 && t.u.is_contiguous() && t.near.dim() == 3 && t.near.is_contiguous() &&
-              t.near.size(2) == contact::kNearValues && t.held.numel() >= v && t.body.numel() >= v,
-          "diffvbd::contact_start: bad arguments");
+  require_of_vertices(t.held, t.body, t.x);
+  require(t.u.dim() == 3 && is_like(t.u, t.x) && t.u.size(0) == b && t.u.size(2) == 3,
+          "diffvbd::contact_start: expected u like x, [scenes, bodies, 3]");
+  require(t.near.dim() == 3 && is_like(t.near, t.x) && t.near.size(0) == b && t.near.size(1) >= v &&
+              t.near.size(2) == contact::kNearValues,
+          "diffvbd::contact_start: expected near like x, [scenes, corner points, 8]");
   contact::StartInputs<T> in{};
   in.x = data<const T>(t.x);
   in.move = data<const T>(t.move);
   in.goal = data<const T>(t.goal);
   in.u = data<const T>(t.u);
   in.near = data<const T>(t.near);
-  in.origin = batched<T>(t.origin, t.x, b, 3 * v);
+  in.origin = batched_or_null<T>("origin", t.origin, t.x, b, 3 * v);
   if (t.planes.numel() > 0) {
-    in.floor_scalars = static_cast<int32_t>(t.planes.numel() / t.planes.size(0));
-    in.floor = batched<T>(t.planes, t.x, b, in.floor_scalars);
+    const int64_t scalars = t.planes.dim() > 0 ? t.planes.numel() / t.planes.size(0) : 0;
+    require(scalars > 0 && scalars % contact::kPlaneScalars == 0 &&
+                scalars <= contact::kMostPlanes * contact::kPlaneScalars,
+            "diffvbd::contact_start: expected planes [scenes, 7 planes], at most 8");
+    in.floor_scalars = static_cast<int32_t>(scalars);
+    in.floor = batched<T>("planes", t.planes, t.x, b, scalars);
   }
   in.pinned = data<const bool>(t.held);
   in.body = data<const int32_t>(t.body);

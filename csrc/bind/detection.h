@@ -12,15 +12,9 @@ namespace diffvbd {
 // A tensor of these sizes, contiguous, on the device of `like`.
 inline void require_shape(const Tensor& t, const Tensor& like, ScalarType dtype, const std::vector<int64_t>& sizes,
                           const char* message) {
-  bool fits = t.dim() == static_cast<int64_t>(sizes.size()) && t.is_contiguous() && t.scalar_type() == dtype &&
-              t.is_cuda() == like.is_cuda() && t.get_device_index() == like.get_device_index();
+  bool fits = t.dim() == static_cast<int64_t>(sizes.size()) && is_beside(t, like, dtype);
   for (size_t k = 0; fits && k < sizes.size(); ++k) fits = t.size(static_cast<int64_t>(k)) == sizes[k];
   require(fits, message);
-}
-
-inline void require_positions(const Tensor& x) {
-  require(x.dim() == 3 && x.size(2) == 3 && x.is_contiguous(),
-          "diffvbd: expected contiguous x of shape [scenes, vertices, 3]");
 }
 
 // Sizes that kernels count in 32 bits.

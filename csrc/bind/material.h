@@ -7,6 +7,8 @@
 
 namespace diffvbd {
 
+constexpr const char* kMaterialNames[kMaterialScalars] = {"mu", "lam"};
+
 // Of any list with these fields.
 template <class Fields>
 std::array<const Tensor*, kMaterialScalars> material_of(const Fields& f) {

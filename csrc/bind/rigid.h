@@ -14,29 +14,26 @@ namespace diffvbd {
 template <class T>
 rigid::Inputs<T> rigid_inputs(const RigidFields& t, const std::vector<int64_t>& data_count, double time_step,
                               bool corrected = true) {
-  require(t.x.dim() == 3 && t.x.size(2) == 3 && t.x.is_contiguous(),
-          "diffvbd::rigid: expected x of shape [scenes, vertices, 3]");
+  require_positions(t.x);
   const int64_t b = t.x.size(0), v = t.x.size(1), bodies = t.ptr.numel() - 1;
-  require(t.order.scalar_type() == ScalarType::Int && t.ptr.scalar_type() == ScalarType::Int && bodies >= 0 &&
-              t.order.numel() <= v && t.order.is_contiguous() && t.ptr.is_contiguous(),
+  require(is_index(t.order, t.x) && is_index(t.ptr, t.x) && bodies >= 0 && t.order.numel() <= v,
           "diffvbd::rigid: expected order and ptr int32 of one list of bodies");
   if (corrected) {
-    require(t.spread.scalar_type() == ScalarType::Double && t.spread.numel() == bodies && t.spread.is_contiguous(),
+    require(is_beside(t.spread, t.x, ScalarType::Double) && t.spread.numel() == bodies,
             "diffvbd::rigid: expected spread float64 [bodies]");
   }
   require(time_step > 0, "diffvbd::rigid: expected time_step > 0");
   rigid::Inputs<T> in{};
   in.x = data<const T>(t.x);
-  in.x_prev = batched<T>(t.x_prev, t.x, b, 3 * v);
-  in.y = batched<T>(t.y, t.x, b, 3 * v);
-  in.mass = batched<T>(t.mass, t.x, b, v);
-  in.origin = batched<T>(t.origin, t.x, b, 3 * v);
-  in.data = batched<T>(t.energy_data, t.x, b, energy_data_size(data_count, v));
+  in.x_prev = batched<T>("x_prev", t.x_prev, t.x, b, 3 * v);
+  in.y = batched<T>("y", t.y, t.x, b, 3 * v);
+  in.mass = batched<T>("mass", t.mass, t.x, b, v);
+  in.origin = batched_or_null<T>("origin", t.origin, t.x, b, 3 * v);
+  in.data = batched<T>("energy_data", t.energy_data, t.x, b, energy_data_size(data_count, v));
   in.order = data<const int32_t>(t.order);
   in.ptr = data<const int32_t>(t.ptr);
   in.spread = corrected ? data<const double>(t.spread) : nullptr;
-  require(t.other.scalar_type() == ScalarType::Int && t.other.numel() == v && t.other.is_contiguous(),
-          "diffvbd::rigid: expected other int32 [V]");
+  require(is_index(t.other, t.x) && t.other.numel() == v, "diffvbd::rigid: expected other int32 [V]");
   in.other = data<const int32_t>(t.other);
   in.scenes = b;
   in.vertices = static_cast<int32_t>(v);
@@ -70,11 +67,8 @@ struct RigidBars {
   }
   template <class T>
   rigid::Adjoints<T> pointers(const Tensor& end, const Tensor& velocity) const {
-    for (const Tensor* bar : {&end, &velocity}) {
-      require(bar->is_contiguous() && (bar->numel() == x.numel() || (bar == &velocity && bar->numel() == 0)) &&
-                  bar->scalar_type() == x.scalar_type(),
-              "diffvbd::rigid_backward: x_bar and v_bar must be like x");
-    }
+    require_like("x_bar", end, x, x.numel());
+    if (velocity.numel() > 0) require_like("v_bar", velocity, x, x.numel());
     const auto or_null = [](const Tensor& t) { return t.numel() > 0 ? data<T>(t) : nullptr; };
     return {data<const T>(end),
             velocity.numel() > 0 ? data<const T>(velocity) : nullptr,

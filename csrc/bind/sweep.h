@@ -28,15 +28,26 @@ void set_body(In& in, const Fields& f, const Tensor& x, const SweepSettings& q, 
               int64_t packed) {
   require(x.dim() == 3 && x.size(1) == vertices && x.size(2) == 3,
           "diffvbd::sweep: expected x of shape [scenes, vertices, 3]");
+  constexpr int64_t known = int64_t{1} << (kFirstVertexBit + kVertexEnergies);
+  require(q.energies >= 0 && q.energies < known && (q.energies & kElastic) != kElastic,
+          "energies: expected a mask of known energies, at most one of them elastic");
+  require(q.tape_policy >= kNoTape && q.tape_policy <= kFullTape, "tape_policy: expected 0, 1 or 2");
   const int64_t b = x.size(0);
   in.scenes = b;
   in.energies = static_cast<int>(tets > 0 ? q.energies : q.energies & ~kElastic);
-  in.mass = batched<T>(f.mass, x, b, vertices);
-  if (in.energies & kElastic) in.rest = batched<T>(f.rest, x, b, packed);
+  in.mass = batched<T>("mass", f.mass, x, b, vertices);
+  if (in.energies & kElastic) in.rest = batched<T>("rest", f.rest, x, b, packed);
   const auto material = material_of(f);
-  for (int m = 0; m < kMaterialScalars; ++m) in.material[m] = batched<T>(*material[m], x, b, tets);
+  for (int m = 0; m < kMaterialScalars; ++m) {  // a scene without an elastic energy may have none
+    in.material[m] = in.energies & kElastic ? batched<T>(kMaterialNames[m], *material[m], x, b, tets, 1)
+                                            : batched_or_null<T>(kMaterialNames[m], *material[m], x, b, tets, 1);
+  }
   in.data_size = energy_data_size(q.data_count, vertices);
-  for (int k = 0; k < kVertexEnergies; ++k) in.data_count[k] = static_cast<int>(q.data_count[k]);
+  for (int k = 0; k < kVertexEnergies; ++k) {
+    in.data_count[k] = static_cast<int>(q.data_count[k]);
+    require(!(q.energies >> (kFirstVertexBit + k) & 1) || in.data_count[k] > 0,
+            "data_count: expected data of each energy of single vertices");
+  }
   in.parameters = step_parameters<T>(q.numbers);
   in.sweeps = count_of(q.sweeps);
   in.tape_policy = static_cast<int>(q.tape_policy);
@@ -48,16 +59,16 @@ void set_fields(In& in, const SweepFields& f, const Tensor& x, const SweepSettin
                 int64_t packed) {
   set_body(in, f, x, q, vertices, tets, packed);
   const int64_t b = in.scenes;
-  in.x_start = batched<T>(x, x, b, 3 * vertices);
-  in.x_prev = batched<T>(f.x_prev, x, b, 3 * vertices);
-  in.y = batched<T>(f.y, x, b, 3 * vertices);
-  in.origin = batched<T>(f.origin, x, b, 3 * vertices);
-  in.data = batched<T>(f.energy_data, x, b, in.data_size);
+  in.x_start = batched<T>("x", x, x, b, 3 * vertices);
+  in.x_prev = batched<T>("x_prev", f.x_prev, x, b, 3 * vertices);
+  in.y = batched<T>("y", f.y, x, b, 3 * vertices);
+  in.origin = batched_or_null<T>("origin", f.origin, x, b, 3 * vertices);
+  in.data = batched<T>("energy_data", f.energy_data, x, b, in.data_size);
   if constexpr (kPrevScalars > 0) {
     const bool elastic = (in.energies & kElastic) != 0;
     require(!elastic || f.corners_prev.numel() == kPrevScalars * b * tets,
             "diffvbd::sweep: expected the corners' positions at the start of the step");
-    const Batched<const T> all = batched<T>(f.corners_prev, x, kPrevScalars, b * tets);
+    const Batched<const T> all = batched_or_null<T>("corners_prev", f.corners_prev, x, kPrevScalars, b * tets);
     for (int i = 0; elastic && i < kPrevScalars; ++i)
       in.material[kMaterialScalars + i] = {all.data + i * b * tets, tets, 1};
   }
@@ -97,11 +108,12 @@ void set_body_bars(Out& out, const Bars& bars, const In& in) {
 
 // Adjoints of a sweep, without those of contact. wants: material, mass, rest, energy data, coarse matrix.
 template <class In, class Make>
-SweepBars make_bars(const Tensor& x, const SweepFields& f, const In& in, int64_t vertices, int64_t tets, int64_t materials, bool zeroed,
-                    const std::vector<bool>& wants, const Make& make) {
+SweepBars make_bars(const Tensor& x, const SweepFields& f, const In& in, int64_t vertices, int64_t tets,
+                    int64_t materials, bool zeroed, const std::vector<bool>& wants, const Make& make) {
   require(wants.size() == 5, "diffvbd::sweep_backward: expected 5 wishes");
   const auto none = [&] { return make({0}, false); };
-  SweepBars bars{none(), none(), none(), none(), none(), none(), none(), none(), none(), none(), none(), none(), none(), none(), none(), none()};
+  SweepBars bars{none(), none(), none(), none(), none(), none(), none(), none(),
+                 none(), none(), none(), none(), none(), none(), none(), none()};
   const std::vector<int64_t> state{in.scenes, vertices, 3};
   bars.x_start = make(state, false), bars.x_prev = make(state, zeroed), bars.y = make(state, false);
   make_body_bars(bars, in, vertices, tets, materials, zeroed, {wants[0], wants[1], wants[2]}, make);
@@ -109,8 +121,8 @@ SweepBars make_bars(const Tensor& x, const SweepFields& f, const In& in, int64_t
       make(wants[0] && kPrevScalars > 0 ? std::vector<int64_t>{kPrevScalars, in.scenes, tets} : std::vector<int64_t>{0},
            zeroed || (in.energies & kElastic) == 0);
   const bool corrects = wants[4] && f.coarse_plan.numel() > 0;
-  bars.coarse_matrix = make(corrects ? std::vector<int64_t>{in.scenes, f.coarse_matrix.size(1)}
-                                     : std::vector<int64_t>{0}, true);
+  bars.coarse_matrix =
+      make(corrects ? std::vector<int64_t>{in.scenes, f.coarse_matrix.size(1)} : std::vector<int64_t>{0}, true);
   bars.energy_data = make(wants[3] ? std::vector<int64_t>{in.scenes, in.data_size} : std::vector<int64_t>{0}, zeroed);
   return bars;
 }

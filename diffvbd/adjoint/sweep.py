@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..ops import distinct, no_second_derivative, of_inputs, one_by_one, ready_signature
+from ..ops import distinct, no_second_derivative, no_transforms, of_inputs, one_by_one, ready_signature
 from ..ops.regimes import BLOCK, FEW_LANES, THREAD
 
 _FAILED_ALLOCATION = (
@@ -161,10 +161,6 @@ class _SweepBackward(Function):
             for o, n in zip(out, shapes, strict=True)
         )
         return result, (0,) * len(result)
-
-
-def no_transforms() -> NoReturn:
-    raise NotImplementedError("diffvbd: torch.func transforms of a step with contact are not supported")
 
 
 def _plain(fields: ops.SweepFields) -> None:

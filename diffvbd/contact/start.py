@@ -12,7 +12,7 @@ from torch.autograd import Function
 from .. import ops
 from ..ops import contact_start as ops_contact_start
 from ..ops import detect as ops_contact
-from ..ops import no_second_derivative
+from ..ops import no_second_derivative, not_batched
 from ..safeguards import FILTER_ETA
 from .surface import ContactSurface
 
@@ -39,6 +39,7 @@ class _NearGap(Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:
+        not_batched(grads[0])
         corners, values, plane_points = ctx.index
         own = values[:, : ctx.vertices]
         rows = (grads[0][..., None] * own[..., :4])[..., None] * own[..., None, 4:7]  # [B, V, 4, 3]
@@ -71,6 +72,7 @@ class _Translation(Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:
+        not_batched(grads[0])
         move, mass, x, planes, origin = ctx.saved_tensors
         out = _TranslationBackward.apply(grads[0].contiguous(), move, mass, x, origin, planes, ctx.index)
         return (*(ops.sum_to(bar, t.shape) for bar, t in zip(out, (move, mass, x, planes), strict=True)), None, None)
@@ -111,6 +113,8 @@ class _Start(Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:
+        for grad in grads[:3]:
+            not_batched(grad)
         bars = [g.contiguous() for g in grads[:3]]
         out = _StartBackward.apply(*bars, *ctx.saved_tensors, ctx.surface, ctx.gamma, ctx.needs_input_grad[5])
         return (*out[:5], out[5] if ctx.needs_input_grad[5] else None, None, None, None, None)

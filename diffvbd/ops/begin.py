@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from .fields import BeginFields
-from .functions import raw_backward
+from .functions import raw_backward, shapes_of
 from .rigid import scalars_of_data
 
 STARTS = {"inertia": 0, "predictor": 1, "auto": 2}  # twins of From in csrc/start/begin.h
@@ -14,7 +14,7 @@ STARTS = {"inertia": 0, "predictor": 1, "auto": 2}  # twins of From in csrc/star
 _FIELDS = len(BeginFields._fields)
 
 
-@torch.library.register_fake("diffvbd::begin")
+@shapes_of("begin")
 def _(*arguments):
     f = BeginFields(*arguments[:_FIELDS])
     *_, start, _ = arguments[_FIELDS:]
@@ -23,7 +23,7 @@ def _(*arguments):
     return torch.empty_like(f.x), torch.empty_like(f.x), falls
 
 
-@torch.library.register_fake("diffvbd::begin_backward")
+@shapes_of("begin_backward")
 def _(*arguments):
     f = BeginFields(*arguments[:_FIELDS])
     _, _, _, _, data_count, _, _, _, filters, wants = arguments[_FIELDS:]

@@ -5,19 +5,19 @@ from __future__ import annotations
 import torch
 
 from .fields import CoarseFields
-from .functions import raw_backward
+from .functions import raw_backward, shapes_of
 
 HEADER = 10  # ints of a coarse plan's header; twin of kHeader in csrc/coarse/views.h
 _FIELDS = len(CoarseFields._fields)
 
 
-@torch.library.register_fake("diffvbd::coarse_matrix")
+@shapes_of("coarse_matrix")
 def _(*arguments):
     f = CoarseFields(*arguments[:_FIELDS])
     return f.x_prev.new_empty((f.x_prev.shape[0], 9 * f.mass.shape[-1]))
 
 
-@torch.library.register_fake("diffvbd::coarse_matrix_backward")
+@shapes_of("coarse_matrix_backward")
 def _(*arguments):
     f = CoarseFields(*arguments[:_FIELDS])
     scenes = f.x_prev.shape[0]

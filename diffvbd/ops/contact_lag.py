@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .functions import raw_backward
+from .functions import raw_backward, shapes_of
 from .load import raw
 from .sweep import LAG_SCALARS
 
@@ -30,18 +30,18 @@ def lowest(x: Tensor, origin: Tensor, planes: Tensor, body_order: Tensor, body_p
     return raw.contact_lowest(x, origin, planes, body_order, body_ptr, island)
 
 
-@torch.library.register_fake("diffvbd::contact_lag")
+@shapes_of("contact_lag")
 def _(x, origin, collider, kappa, pairs, constants, ptr, entry):
     return x.new_empty((pairs.shape[0], LAG_SCALARS))
 
 
-@torch.library.register_fake("diffvbd::contact_lag_backward")
+@shapes_of("contact_lag_backward")
 def _(bar, x, origin, collider, kappa, pairs, constants, ptr, entry):
     colliders = collider.shape[1] if collider.dim() == 3 else 0
     return torch.empty_like(x), x.new_empty((x.shape[0], colliders, 3)), x.new_empty((x.shape[0],))
 
 
-@torch.library.register_fake("diffvbd::contact_lowest")
+@shapes_of("contact_lowest")
 def _(x, origin, planes, body_order, body_ptr, island):
     return x.new_empty((*island.shape, planes.shape[-1] // PLANE_SCALARS), dtype=torch.int32)
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from .functions import raw_backward
+from .functions import raw_backward, shapes_of
 from .load import raw
 
 
@@ -41,24 +41,24 @@ def start_backward(bars: Sequence[Tensor], x: Tensor, move: Tensor, goal: Tensor
     )
 
 
-@torch.library.register_fake("diffvbd::contact_translation")
+@shapes_of("contact_translation")
 def _(move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest):
     return x.new_empty((*island.shape, 3))
 
 
-@torch.library.register_fake("diffvbd::contact_translation_backward")
+@shapes_of("contact_translation_backward")
 def _(u_bar, move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest):
     scalars = planes.shape[-1] if planes.numel() else 0
     return torch.empty_like(move), x.new_empty(x.shape[:2]), torch.empty_like(x), x.new_empty((x.shape[0], scalars))
 
 
-@torch.library.register_fake("diffvbd::contact_start")
+@shapes_of("contact_start")
 def _(x, move, goal, u, near, origin, planes, held, body, gamma, cap, filter_eta):
     bounds = x.new_empty((*x.shape[:2], 4))
     return bounds, torch.empty_like(x), torch.empty_like(x), x.new_empty(x.shape[:2], dtype=torch.uint8)
 
 
-@torch.library.register_fake("diffvbd::contact_start_backward")
+@shapes_of("contact_start_backward")
 def _(bounds_bar, start_bar, move_bar, x, move, goal, u, near, origin, planes, held, body, gamma, cap, filter_eta,
       wants_planes):  # fmt: skip
     scalars = planes.shape[-1] if wants_planes else 0

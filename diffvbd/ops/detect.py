@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .functions import raw_backward
+from .functions import raw_backward, shapes_of
 from .load import raw
 
 PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS = 6, 3, 5, 8, 4  # twins of those in csrc/contact/candidates.h
@@ -105,7 +105,7 @@ def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
 # --- shapes without execution, no autograd ----------------------------------------------------------------------------
 
 
-@torch.library.register_fake("diffvbd::contact_detect")
+@shapes_of("contact_detect")
 def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies,
       self_contact, between_bodies, dhat, reach, cap, gamma, capacity):  # fmt: skip
     b, n = x.shape[0], body.shape[0]
@@ -118,13 +118,13 @@ def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points
             integers(COUNTS, dtype=torch.int64), x.new_empty((b,)))  # fmt: skip
 
 
-@torch.library.register_fake("diffvbd::contact_islands")
+@shapes_of("contact_islands")
 def _(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr, held, radius, mesh_bodies,
       cap, dhat, any_direction):  # fmt: skip
     return x.new_empty((x.shape[0], mesh_bodies), dtype=torch.int32)
 
 
-@torch.library.register_fake("diffvbd::segment_sum")
+@shapes_of("segment_sum")
 def _(values, order, ptr):
     return values.new_empty((values.shape[0], ptr.shape[0] - 1, values.shape[2]))
 

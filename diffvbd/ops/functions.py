@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 import torch
@@ -17,6 +17,38 @@ def raw_backward(ctx: Any, *grads: Tensor) -> NoReturn:
 
 def no_second_derivative() -> NoReturn:
     raise NotImplementedError("diffvbd: second derivatives of a step are not supported (create_graph, hessian)")
+
+
+def no_transforms() -> NoReturn:
+    raise NotImplementedError(
+        "diffvbd: torch.func transforms and batched gradients (is_grads_batched) of a step with contact are not "
+        "supported"
+    )
+
+
+def not_batched(grad: Tensor) -> None:
+    """Raises for the gradients of torch.func.vmap and of is_grads_batched, which no vmap of a Function sees."""
+    known = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
+    if not torch.compiler.is_compiling() and (known.is_batchedtensor(grad) or known.is_legacy_batchedtensor(grad)):
+        no_transforms()
+
+
+def shapes_of(name: str) -> Callable[[Callable], Callable]:
+    """Registers the shapes of an operator without execution, for tensors of one device: torch asks for them, too, where
+    some are on the meta device, and then what comes back would be as if all were."""
+
+    def register(shapes: Callable) -> Callable:
+        def checked(*arguments: Any) -> Any:
+            devices = {a.device for a in arguments if isinstance(a, Tensor)}
+            if len(devices) > 1:
+                names = sorted(str(device) for device in devices)
+                raise ValueError(f"diffvbd::{name}: expected tensors on one device, got {', '.join(names)}")
+            return shapes(*arguments)
+
+        torch.library.register_fake(f"diffvbd::{name}", checked)
+        return shapes
+
+    return register
 
 
 class _Given:

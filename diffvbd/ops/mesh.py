@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .fields import LANES, PLAN_HEADER
-from .functions import raw_backward
+from .functions import raw_backward, shapes_of
 from .load import raw
 
 PAIR_REST = 4  # scalars of a rest shape that one vertex sees; twin of TetLayout::pair_rest in csrc/energies/tet.h
@@ -30,7 +30,7 @@ def pack_rest(rest: Tensor, plan: Tensor, sizes: tuple[int, ...]) -> Tensor:
     return raw.pack_rest(rest.contiguous(), plan, sizes)
 
 
-@torch.library.register_fake("diffvbd::pack_rest")
+@shapes_of("pack_rest")
 def _(rest, plan, sizes):
     row = (
         PAIR_REST if rest.device.type == "cpu" else -(-PAIR_REST // 4) * 4

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..energies import VERTEX_ENERGIES
 from .fields import RigidFields
-from .functions import raw_backward
+from .functions import raw_backward, shapes_of
 from .sums import sum_to
 
 
@@ -34,12 +34,12 @@ def join_data(shared: Tensor, own: Tensor, data_count: Sequence[int]) -> Tensor:
 _FIELDS = len(RigidFields._fields)
 
 
-@torch.library.register_fake("diffvbd::rigid")
+@shapes_of("rigid")
 def _(*arguments):
     return torch.empty_like(arguments[0]), torch.empty_like(arguments[0])
 
 
-@torch.library.register_fake("diffvbd::rigid_backward")
+@shapes_of("rigid_backward")
 def _(*arguments):
     f = RigidFields(*arguments[:_FIELDS])
     _, v_bar, _, data_count, _, wants_data = arguments[_FIELDS:]

@@ -22,7 +22,7 @@ from .fields import (
     as_list,
     tape_shape,
 )
-from .functions import raw_backward
+from .functions import raw_backward, shapes_of
 from .load import raw
 from .mesh import pack_rest
 
@@ -80,7 +80,7 @@ def fused_step_backward(x_bar: Tensor | None, v_bar: Tensor | None, x: Tensor, t
 _FIELDS, _STEP_FIELDS = len(SweepFields._fields), len(StepFields._fields)
 
 
-@torch.library.register_fake("diffvbd::sweep")
+@shapes_of("sweep")
 def _(*arguments):
     f: Any = SweepFields(*arguments[:_FIELDS])
     _, sizes, energies, _, _, sweeps, launch, tape_policy, *_ = arguments[_FIELDS:]
@@ -100,7 +100,7 @@ def _body_adjoints(x: Tensor, f: Any, num_tets: int, wants: Sequence[bool]) -> l
     return [x.new_empty(shape if flag else (0,)) for shape, flag in zip(shapes, (wants[0], *wants), strict=True)]
 
 
-@torch.library.register_fake("diffvbd::sweep_backward")
+@shapes_of("sweep_backward")
 def _(*arguments):
     f: Any = SweepFields(*arguments[:_FIELDS])
     _, x, _, _, _, sizes, energies, *_, wants = arguments[_FIELDS:]
@@ -118,14 +118,14 @@ def _(*arguments):
     return (*own, *(x.new_empty(shape) for shape in shapes), *last)
 
 
-@torch.library.register_fake("diffvbd::fused_step")
+@shapes_of("fused_step")
 def _(*arguments):
     x, (_, sizes, energies, _, _, sweeps, launch, tape_policy) = arguments[0], arguments[_STEP_FIELDS:]
     tape = x.new_empty(tape_shape(x, sizes, energies, sweeps, launch, tape_policy))
     return torch.empty_like(x), torch.empty_like(x), tape
 
 
-@torch.library.register_fake("diffvbd::fused_step_backward")
+@shapes_of("fused_step_backward")
 def _(*arguments):
     f = StepFields(*arguments[:_STEP_FIELDS])
     _, _, _, _, _, sizes, *_, wants = arguments[_STEP_FIELDS:]

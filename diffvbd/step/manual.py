@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
@@ -24,11 +24,19 @@ _ARGUMENTS = ("x", "v", "mu", "lam", "young", "poisson", "force", "gravity", "pr
 class Tape:
     """What :func:`step_backward` needs of one step; opaque.
 
-    Holds the arguments of ``wrt`` and the step's x', v' [m, m/s], shape [..., V, 3], with their graph.
+    Holds the arguments of ``wrt`` and the step's x', v' [m, m/s], shape [..., V, 3], with their graph. A graph cannot
+    be copied or stored, so a tape cannot: keep the states, and run step_forward again.
     """
 
     inputs: dict[str, Tensor]
     outputs: tuple[Tensor, Tensor]
+    constant: bool = False  # a step that nothing of ``inputs`` moves: no graph, and gradients of zero
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:  # of copy, deepcopy, pickle and torch.save
+        raise TypeError(
+            "Tape: expected to stay as it is, got a copy or pickle of it: it holds torch's graph of its step, which is "
+            "lost there. Keep the states (x, v and the other arguments) and run step_forward again"
+        )
 
 
 def step_forward(
@@ -73,7 +81,8 @@ def step_forward(
     values["parameters"] = parameters or None
     with torch.enable_grad():
         outputs = step(model, **values)
-    return outputs[0].detach(), outputs[1].detach(), Tape(inputs, outputs)
+    constant = not any(out.requires_grad for out in outputs)
+    return outputs[0].detach(), outputs[1].detach(), Tape(inputs, outputs, constant)
 
 
 def step_backward(tape: Tape, grad_x: Tensor | None = None, grad_v: Tensor | None = None) -> dict[str, Tensor]:
@@ -88,13 +97,19 @@ def step_backward(tape: Tape, grad_x: Tensor | None = None, grad_v: Tensor | Non
     Returns:
         A dict keyed by argument, each of the argument's shape.
     """
+    if not isinstance(tape, Tape):
+        raise TypeError(f"tape: expected a diffvbd.Tape of step_forward, got {type(tape).__name__}")
+    if tape.inputs and not tape.constant and not any(out.requires_grad for out in tape.outputs):
+        raise RuntimeError("tape: expected one with the graph of its step, got one without: run step_forward again")
     pairs = []
     for name, out, grad in zip(("grad_x", "grad_v"), tape.outputs, (grad_x, grad_v), strict=True):
         if grad is None:
             continue
-        if not isinstance(grad, Tensor) or grad.shape != out.shape or grad.dtype != out.dtype:
-            got = f"{grad.dtype} {list(grad.shape)}" if isinstance(grad, Tensor) else type(grad).__name__
-            fail(name, f"a tensor like x, {out.dtype} {list(out.shape)}", got)
+        if not isinstance(grad, Tensor):
+            raise TypeError(f"{name}: expected a tensor like x or None, got {type(grad).__name__}")
+        check_tensor(name, grad, out, owner="that of x")
+        if grad.shape != out.shape:
+            fail(name, f"shape {list(out.shape)} (that of x)", f"shape {list(grad.shape)}")
         if out.requires_grad:
             pairs.append((out, grad))
     names, leaves = list(tape.inputs), list(tape.inputs.values())

@@ -33,7 +33,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, viz
-from diffvbd.tasks.cloth import ring_of_vertices
+from diffvbd.tasks.cloth import few_sweeps, ring_of_vertices
 from diffvbd.tasks.newton import Newton
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
@@ -113,7 +113,7 @@ class Drape:
         self.model = model_of(self.mesh, neck).to(settings.device)
         self.still = torch.zeros_like(self.model.rest_points)
         self.start, truth = (self.still.new_tensor(values) for values in (START, list(TRUTH.values())))
-        with torch.no_grad():
+        with torch.no_grad(), few_sweeps():
             self.target = self.fall(truth[0], truth[1])
             self.target_early, self.target_settled = self.first_frames(self.target), self.settled_drape(self.target)
         self.log_mu, self.log_lam = (value.log().requires_grad_() for value in self.start)

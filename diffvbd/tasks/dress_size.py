@@ -29,7 +29,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import viz
-from diffvbd.tasks.cloth import mean_weights, ring_of_vertices
+from diffvbd.tasks.cloth import few_sweeps, mean_weights, ring_of_vertices
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
 
@@ -66,7 +66,7 @@ def problem(settings: Settings) -> Problem:
 
     start = torch.tensor(START_SIZE, dtype=v.dtype, device=v.device)
     true = torch.full_like(start, TRUE_SIZE)
-    with torch.no_grad():
+    with torch.no_grad(), few_sweeps():
         target = height(true)
     log_size = start.log().requires_grad_()
 

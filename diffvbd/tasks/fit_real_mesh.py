@@ -38,6 +38,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import viz
+from diffvbd.tasks.newton import lbfgs
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
 
@@ -230,9 +231,7 @@ def stage_of(fit: Fit, number: int, iterations: int) -> Stage:
     return Stage(
         loss=fit.loss,
         iterations=iterations,
-        optimizer=lambda p: torch.optim.LBFGS(
-            p, max_iter=5, history_size=30, tolerance_grad=0, tolerance_change=0, line_search_fn="strong_wolfe"
-        ),
+        optimizer=lambda p: lbfgs(p, history=30),
         moves=("exponents",) if number else ("level",),
         before=partial(fit.lower, number),
         capturable=True,

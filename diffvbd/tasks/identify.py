@@ -11,11 +11,11 @@ from pathlib import Path
 import torch
 
 from diffvbd import losses, viz
+from diffvbd.tasks.newton import lbfgs
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
 from diffvbd.tasks.scene import Observation
 
-WOLFE = "strong_wolfe"
 # Line searches try wild steps: the material stays within this factor of the first guess, or its inverse.
 RANGE = 1e4
 
@@ -78,9 +78,7 @@ def problem(
                 iterations=iterations,
                 tolerance=1e-12,
                 gradient_tolerance=1e-7,
-                optimizer=lambda p: torch.optim.LBFGS(
-                    p, max_iter=5, tolerance_grad=0, tolerance_change=0, line_search_fn=WOLFE
-                ),
+                optimizer=lbfgs,
             )
         ],
         estimates=lambda: dict(zip(("mu", "lam"), material().tolist(), strict=True)),

@@ -1,4 +1,4 @@
-"""Newton's method for one number, from first derivatives alone."""
+"""What tasks use where Adam is slow: Newton's method for one number, and L-BFGS; first derivatives are enough."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -47,3 +47,22 @@ class Newton(torch.optim.Optimizer):
         limited = max(-chosen["limit"], min(chosen["limit"], newton)) if first else 0.0
         parameter.copy_(start - limited)
         return loss
+
+
+def lbfgs(parameters: Iterable[Tensor], history: int = 100) -> torch.optim.Optimizer:
+    """L-BFGS with steps of five line searches, after each of which the runner can save.
+
+    Args:
+        parameters: Tensors that it moves.
+        history: How many earlier changes of the gradient it remembers.
+    """
+    # torch's own max_eval, 6 here, can leave a search too few evaluations: it ends where it began, as do all others.
+    return torch.optim.LBFGS(
+        parameters,
+        max_iter=5,
+        max_eval=30,
+        tolerance_grad=0,
+        tolerance_change=0,
+        history_size=history,
+        line_search_fn="strong_wolfe",
+    )

@@ -109,13 +109,17 @@ class Problem:
 
 @dataclass
 class Result:
-    """What `solve` found: the best row of the last stage, and every row."""
+    """What `solve` found: the best row of the last stage, and every row; their "iteration" counts from 0.
+
+    `converged` and `stalled` are about the last stage: it met a tolerance; its optimiser moved no parameter any more.
+    """
 
     best: Row
     history: list[Row]
     estimates: Row
     errors: Row
     converged: bool
+    stalled: bool
     files: list[Path]
     findings: dict[str, Any] = field(default_factory=dict)
 

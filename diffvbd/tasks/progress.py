@@ -43,6 +43,10 @@ class Progress:
         else:
             print(text, file=sys.stderr, flush=True)
 
+    def say(self, text: str) -> None:
+        """A line of its own."""
+        print(f"\n{text}" if self.terminal and self.last else text, file=sys.stderr, flush=True)
+
     def close(self) -> None:
         if not self.printed:
             self._print()

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffvbd.tasks.capture import captured
 from diffvbd.tasks.folder import STATE, alone_in, prepare, put_aside, remove_results, replace
 from diffvbd.tasks.problem import (
     OWN_KEYS,
@@ -34,6 +35,9 @@ LISTED = 1000  # numbers of a parameter that log.json lists; larger ones go to p
 
 def solve(problem: Problem, settings: Settings) -> Result:
     """Minimise the losses of all stages; of each stage the parameters with the lowest criterion win.
+
+    A stage whose optimiser has stalled ends there, and stderr says so: two steps in a row moved no parameter and saw
+    the same losses, so that every further one would, too.
 
     After every step of an optimiser the whole state is on disk, so the same call continues an interrupted run with the
     very numbers the uninterrupted one would have had. A state of other settings, of another protocol or of a first loss
@@ -98,12 +102,17 @@ def _minimise(run: "_Run", progress: Progress, begun: float) -> None:
     try:
         while not run.stage_ended:
             # A step of an optimiser with a line search evaluates more than once.
+            before, rows = [p.detach().clone() for p in parameters], len(run.history)
             run.optimizer.step(evaluate)
             if run.schedule:
                 run.schedule.step()
+            run.notice(before, rows)
             run.save()
     except _Ended:
         pass
+    if run.stalled:
+        name = f", stage {stage.name or run.at}" if len(problem.stages) > 1 else ""
+        progress.say(f"{problem.name}{name}: stalled: the last two steps of the optimiser moved no parameter")
 
 
 def _gradient(run: "_Run") -> Callable[[], Tensor]:
@@ -124,27 +133,7 @@ def _gradient(run: "_Run") -> Callable[[], Tensor]:
     if stage.before:
         stage.before(len(run.rows))
     with torch.cuda.device(run.settings.device):
-        return _captured(gradient)
-
-
-def _captured(run: Callable[[], Tensor], warm: int = 2) -> Callable[[], Tensor]:
-    """`run` as a CUDA graph: the same work on the same memory, results and gradients included. The optimiser stays
-    outside: its few launches cost nothing beside a rollout, and so any optimiser will do."""
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        for _ in range(warm):  # libraries load, autograd makes its buffers
-            run()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        result = run()
-
-    def replay() -> Tensor:
-        graph.replay()
-        return result
-
-    return replay
+        return captured(gradient)
 
 
 class _Ended(Exception):
@@ -167,6 +156,8 @@ class _Run:
     def _enter(self, stage: int) -> None:
         self.at, self.first, self.best = stage, len(self.history), len(self.history)
         self.best_parameters: dict[str, Tensor] = {}
+        self.stalled = False
+        self.still: list[float] = []  # losses of the last step, if it moved no parameter
         if stage >= len(self.problem.stages):
             return
         self.optimizer, self.schedule = _optimizer(self.stage, list(self.moved.values()))
@@ -195,7 +186,7 @@ class _Run:
 
     @property
     def stage_ended(self) -> bool:
-        return self.converged or len(self.rows) >= self.stage.iterations
+        return self.converged or self.stalled or len(self.rows) >= self.stage.iterations
 
     def record(self, row: Row) -> None:
         self.history.append(row)
@@ -203,12 +194,19 @@ class _Run:
             self.best = len(self.history) - 1
             self.best_parameters = {name: p.detach().clone() for name, p in self.problem.parameters.items()}
 
+    def notice(self, before: list[Tensor], rows: int) -> None:
+        """Whether the optimiser stalls, after its step from the parameters `before` and as many rows of the history."""
+        moved = any(not torch.equal(p, old) for p, old in zip(self.moved.values(), before, strict=True))
+        losses = [row["loss"] for row in self.history[rows:]]
+        self.stalled = not self.converged and not moved and losses == self.still
+        self.still = [] if moved else losses
+
     def _merit(self, row: Row) -> tuple[float, float]:
         return row[self.stage.criterion], row["loss"]
 
     def next_stage(self) -> None:
         _assign(self.problem.parameters, self.best_parameters)
-        self.last_best, self.last_converged = self.best, self.converged
+        self.last_best, self.last_converged, self.last_stalled = self.best, self.converged, self.stalled
         self._enter(self.at + 1)
         if self.at < len(self.problem.stages):
             self.save()
@@ -218,6 +216,7 @@ class _Run:
             "fingerprint": self.fingerprint,
             "history": self.history,
             "stage": (self.at, self.first, self.best),
+            "stalls": (self.stalled, self.still),
             "best_parameters": self.best_parameters,
             "parameters": {name: p.detach() for name, p in self.problem.parameters.items()},
             "state": self.problem.state,
@@ -262,6 +261,7 @@ class _Run:
         self.history = state["history"]
         self._enter(stage)
         self.first, self.best = first, best
+        self.stalled, self.still = state["stalls"]
         self.best_parameters = state["best_parameters"]
         for each in (state["parameters"], self.best_parameters):
             if not all(value.isfinite().all() for value in each.values()):
@@ -317,6 +317,7 @@ class _Run:
         listed = {name: p.tolist() for name, p in problem.parameters.items() if p.numel() <= LISTED}
         log = self.write_log(
             converged=self.last_converged,
+            stalled=self.last_stalled,
             best=best,
             parameters=listed,
             estimates=estimates,
@@ -327,7 +328,7 @@ class _Run:
             variables=sum(p.numel() for p in problem.parameters.values()),
             **memory,
         )
-        result = Result(best, self.history, estimates, errors, self.last_converged, [log], findings)
+        result = Result(best, self.history, estimates, errors, self.last_converged, self.last_stalled, [log], findings)
         if listed.keys() != problem.parameters.keys():
             path = self.settings.out / "parameters.pt"
             replace(path, lambda new: torch.save({k: p.detach().cpu() for k, p in problem.parameters.items()}, new))
@@ -358,11 +359,11 @@ class _Run:
 def table(problem: Problem, result: Result) -> str:
     """Start, true and recovered values as aligned text, and how the run ended."""
     seconds, first = result.history[-1]["seconds"], result.history[0]["loss"]
-    how = "converged" if result.converged else "stopped"
+    how = "converged" if result.converged else "stalled" if result.stalled else "stopped"
     start = estimates_of(result.history[0])
     return table_of(start, result.estimates, problem.truth, result.errors, problem.units) + (
         f"\n{how} after {len(result.history)} evaluations in {seconds:.0f} s; "
-        f"loss {first:.3g} -> {result.best['loss']:.3g} (lowest at evaluation {result.best['iteration']:.0f})"
+        f"loss {first:.3g} -> {result.best['loss']:.3g} (lowest at evaluation {result.best['iteration'] + 1:.0f})"
     )
 
 

@@ -8,7 +8,8 @@ from helpers.paths import CSRC, needs_csrc
 
 from diffvbd import ops
 
-LISTS = {"SWEEP": ops.SweepFields, "STEP": ops.StepFields, "RIGID": ops.RigidFields, "BEGIN": ops.BeginFields}
+LISTS = {"SWEEP": ops.SweepFields, "STEP": ops.StepFields, "RIGID": ops.RigidFields, "BEGIN": ops.BeginFields,
+         "COARSE": ops.CoarseFields}  # fmt: skip
 
 
 def listed(name: str) -> list[tuple[str, str]]:
@@ -25,7 +26,8 @@ def test_fields_agree(name: str) -> None:
 
 
 @needs_csrc
-@pytest.mark.parametrize(("name", "adjoints"), [("SWEEP", ops.SWEEP_ADJOINTS), ("STEP", ops.STEP_ADJOINTS)])
+@pytest.mark.parametrize(("name", "adjoints"), [("SWEEP", ops.SWEEP_ADJOINTS), ("STEP", ops.STEP_ADJOINTS),
+                                                  ("COARSE", ("x_prev", "stiffness", "mass"))])  # fmt: skip
 def test_adjoints_agree(name: str, adjoints: tuple[str, ...]) -> None:
     assert tuple(field for kind, field in listed(name) if kind == "ADJOINT") == adjoints
 
@@ -42,7 +44,7 @@ def test_numbers_agree() -> None:
 def test_material_and_rest_agree() -> None:
     text = (CSRC / "energies" / "tet.h").read_text(encoding="utf-8")
     counts = {name: int(n) for name, n in re.findall(r"static constexpr int (\w+) = (\d+);", text)}
-    assert counts == {"material": 2, "rest": ops.REST_SCALARS, "pair_rest": ops.PAIR_REST}
+    assert counts == {"material": 2, "rest": ops.REST_SCALARS, "pair_rest": ops.PAIR_REST, "line_degree": 6}
     assert f"bool reads_x_prev = {str(ops.TET_READS_X_PREV).lower()};" in text
     assert ops.SweepFields._fields.index("lam") == ops.SweepFields._fields.index("mu") + 1
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 from helpers.task_checks import timeless
 
-from diffvbd.tasks import Problem, Settings, Stage, solve
-from diffvbd.tasks.newton import Newton
+from diffvbd.tasks import Problem, Settings, Stage, solve, table
+from diffvbd.tasks.newton import Newton, lbfgs
 from diffvbd.testing import tolerance
 
 CENTER = (0.5, -1.0)
@@ -316,3 +316,56 @@ def test_newton_solves_a_parabola_in_one_step_and_goes_downhill_everywhere() -> 
     assert newton_path(lambda p: 0 * p, 0.4, 2)[-1] == 0.4
     with pytest.raises(ValueError, match=r"parameters: expected one of one element, got \[\[2\]\]"):
         Newton([torch.zeros(2, requires_grad=True)], 1e-3, 1.0)
+
+
+def wall(optimizer: Callable[..., torch.optim.Optimizer]) -> Problem:
+    """A slope behind a steep wall, where a line search needs more than the five evaluations of torch's default."""
+    x = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+
+    def loss() -> torch.Tensor:
+        return (-300 * x[0] - 1).exp() + x[0] + (x[1] - 1).square()
+
+    stage = Stage(loss, 60, gradient_tolerance=tolerance("end_of_a_stage"), optimizer=optimizer)
+    return Problem("wall", {"x": x}, [stage], lambda: {"first": x[0].item()})
+
+
+def test_line_searches_of_lbfgs_have_room_to_end(tmp_path: Path) -> None:
+    result = solve(wall(lbfgs), Settings(tmp_path))
+    assert result.converged and not result.stalled
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_an_optimizer_that_moves_nothing_ends_its_stage(
+    terminal: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr("sys.stderr.isatty", lambda: terminal)
+    problem = wall(lambda p: torch.optim.SGD(p, lr=0.0))
+    result = solve(problem, Settings(tmp_path))
+    assert result.stalled and not result.converged and len(result.history) == 2
+    assert "\nwall: stalled: the last two steps of the optimiser moved no parameter\n" in capsys.readouterr().err
+    assert "stalled after 2 evaluations" in table(problem, result)
+    assert "(lowest at evaluation 1)" in table(problem, result), "as the progress counts"
+    assert json.loads((tmp_path / "log.json").read_text())["stalled"] is True
+
+
+def test_a_step_that_moves_nothing_is_no_stall_where_the_loss_changes(tmp_path: Path) -> None:
+    problem = wall(lambda p: torch.optim.SGD(p, lr=0.0))
+    loss, numbers = problem.stages[0].loss, iter(range(60))
+    problem.stages = [replace(problem.stages[0], loss=lambda: loss() + next(numbers), iterations=5)]
+    result = solve(problem, Settings(tmp_path))
+    assert len(result.history) == 5 and not result.stalled
+
+
+@pytest.mark.parametrize("at", [1, 2])
+def test_an_interrupted_run_stalls_where_one_in_one_go_does(at: int, tmp_path: Path) -> None:
+    def build() -> Problem:
+        problem = wall(lambda p: torch.optim.SGD(p, lr=0.0))
+        return replace(problem, stages=[replace(problem.stages[0], name=name) for name in ("first", "second")])
+
+    expected = solve(build(), Settings(tmp_path / "whole"))
+    first = build()
+    interrupt(first, at)
+    with pytest.raises(KeyboardInterrupt):
+        solve(first, Settings(tmp_path / "parts"))
+    found = solve(build(), Settings(tmp_path / "parts"))
+    assert timeless(found.history) == timeless(expected.history) and len(found.history) == 4 and found.stalled

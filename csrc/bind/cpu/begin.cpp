@@ -21,6 +21,7 @@ std::tuple<Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::vector<i
                                          std::vector<int64_t> /*other_groups*/, std::vector<int64_t> data_count,
                                          double time_step, double filter_eta, int64_t from, bool filters) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
+  diffvbd::require_states(f);
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
@@ -60,6 +61,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin
     std::vector<int64_t> /*groups*/, std::vector<int64_t> data_count, double time_step, double filter_eta, int64_t from,
     bool filters, std::vector<bool> wants) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
+  diffvbd::require_states(f);
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);

@@ -10,7 +10,7 @@
 namespace {
 
 namespace coarse = diffvbd::coarse;
-using diffvbd::CoarseFields, diffvbd::data, diffvbd::dispatch_float, diffvbd::require, diffvbd::zeros;
+using diffvbd::CoarseFields, diffvbd::data, diffvbd::dispatch_float, diffvbd::zeros;
 using torch::stable::Tensor;
 
 template <class F>
@@ -40,8 +40,7 @@ std::tuple<Tensor, Tensor, Tensor> matrix_backward(DIFFVBD_PARAMETERS(COARSE) co
     const auto in = diffvbd::matrix_inputs<T>(f, time_step);
     const coarse::Plan& p = in.plan;
     const int64_t cells = p.mass_ptr[p.bodies], size = int64_t{9} * p.groups * p.width * p.width;
-    require(bar.is_contiguous() && bar.scalar_type() == x_prev.scalar_type() && bar.numel() == 9 * cells * in.scenes,
-            "diffvbd::coarse_matrix_backward: expected an adjoint like the matrix");
+    diffvbd::require_like("bar", bar, x_prev, 9 * cells * in.scenes);
     const Tensor x_bar = zeros(x_prev, {in.scenes, in.vertices, 3}),
                  stiffness_bar = zeros(x_prev, {in.scenes, p.groups, 3 * p.width, 3 * p.width}),
                  mass_bar = zeros(x_prev, {in.scenes, cells});

@@ -21,43 +21,29 @@ struct UserPositions {
   diffvbd::Vec3<T> operator()(int v) const { return contact::vector_at(x + int64_t{3} * v); }
 };
 
-template <class T>
-contact::ContactInputs<T> lag_inputs(const Tensor& x, const Tensor& origin, const Tensor& collider) {
-  contact::ContactInputs<T> in{};
-  const int64_t b = x.size(0), v = x.size(1), colliders = collider.dim() == 3 ? collider.size(1) : 0;
-  in.num_vertices = static_cast<int32_t>(v);
-  in.corners = v + colliders;
-  in.collider = diffvbd::batched<T>(collider, x, b, 3 * colliders);
-  in.origin = diffvbd::batched<T>(origin, x, b, 3 * v);
-  return in;
-}
-
 // Calls f(pair, kind, corners, constants, kappa) for each listed pair.
 template <class T, class F>
-void each_pair(const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& kappa, const Tensor& pairs,
-               const Tensor& constants, int64_t count, const F& f) {
-  const auto in = lag_inputs<T>(x, origin, collider);
-  const auto stiffness = diffvbd::batched<T>(kappa, x, x.size(0), 1);
+void each_pair(const contact::ContactInputs<T>& in, const Tensor& x, const F& f) {
+  const int64_t count = in.listed.ptr[x.size(0) * in.corners] / 4;
   for (int64_t pair = 0; pair < count; ++pair) {
-    const int32_t* record = data<const int32_t>(pairs) + contact::kPairRow * pair;
+    const int32_t* record = in.listed.pairs + contact::kPairRow * pair;
     const UserPositions<T> positions{data<const T>(x) + int64_t{record[5]} * 3 * in.num_vertices};
     const contact::Source<T, UserPositions<T>> source{in, record[5], positions};
-    const contact::PairConstants<T> a(data<const T>(constants) + contact::kConstants * pair);
-    f(pair, record, source.corners(record), a, stiffness.data[record[5] * stiffness.scene]);
+    const contact::PairConstants<T> a(in.constants + contact::kConstants * pair);
+    f(pair, record, source.corners(record), a, in.kappa.data[record[5] * in.kappa.scene]);
   }
 }
 
 Tensor contact_lag(const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& kappa,
-                   const Tensor& pairs, const Tensor& constants, const Tensor& ptr, const Tensor& /*entry*/) {
+                   const Tensor& pairs, const Tensor& constants, const Tensor& ptr, const Tensor& entry) {
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
+    const auto in = diffvbd::lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
     Tensor out = zeros(x, {pairs.size(0), contact::kLagScalars});
-    const int64_t count = data<const int32_t>(ptr)[ptr.numel() - 1] / 4;
-    each_pair<T>(x, origin, collider, kappa, pairs, constants, count,
-                 [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
-                   contact::store_lag(contact::lag_state(record[4], corners, a, stiffness),
-                                      data<T>(out) + contact::kLagScalars * pair);
-                 });
+    each_pair(in, x, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
+      contact::store_lag(contact::lag_state(record[4], corners, a, stiffness),
+                         data<T>(out) + contact::kLagScalars * pair);
+    });
     return out;
   });
 }
@@ -65,25 +51,24 @@ Tensor contact_lag(const Tensor& x, const Tensor& origin, const Tensor& collider
 std::tuple<Tensor, Tensor, Tensor> contact_lag_backward(const Tensor& bar, const Tensor& x, const Tensor& origin,
                                                         const Tensor& collider, const Tensor& kappa,
                                                         const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
-                                                        const Tensor& /*entry*/) {
+                                                        const Tensor& entry) {
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const int64_t b = x.size(0), v = x.size(1), colliders = collider.dim() == 3 ? collider.size(1) : 0;
+    const auto in = diffvbd::lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
+    diffvbd::require_like("bar", bar, x, pairs.size(0) * contact::kLagScalars);
+    const int64_t b = x.size(0), v = x.size(1), colliders = in.corners - v;
     Tensor x_bar = zeros(x, {b, v, 3}), collider_bar = zeros(x, {b, colliders, 3}), kappa_bar = zeros(x, {b});
-    const int64_t count = data<const int32_t>(ptr)[ptr.numel() - 1] / 4;
-    each_pair<T>(x, origin, collider, kappa, pairs, constants, count,
-                 [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
-                   contact::PairAdjoint<T> out;
-                   contact::reverse_lag(record[4], corners, a, stiffness,
-                                        data<const T>(bar) + contact::kLagScalars * pair, out);
-                   const int64_t scene = record[5];
-                   for (int k = 0; k < 4; ++k) {
-                     T* to = record[k] < v ? data<T>(x_bar) + 3 * (scene * v + record[k])
-                                           : data<T>(collider_bar) + 3 * (scene * colliders + record[k] - v);
-                     contact::add_at(to, out.x[k]);
-                   }
-                   data<T>(kappa_bar)[scene] += out.kappa;
-                 });
+    each_pair(in, x, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
+      contact::PairAdjoint<T> out;
+      contact::reverse_lag(record[4], corners, a, stiffness, data<const T>(bar) + contact::kLagScalars * pair, out);
+      const int64_t scene = record[5];
+      for (int k = 0; k < 4; ++k) {
+        T* to = record[k] < v ? data<T>(x_bar) + 3 * (scene * v + record[k])
+                              : data<T>(collider_bar) + 3 * (scene * colliders + record[k] - v);
+        contact::add_at(to, out.x[k]);
+      }
+      data<T>(kappa_bar)[scene] += out.kappa;
+    });
     return std::make_tuple(x_bar, collider_bar, kappa_bar);
   });
 }

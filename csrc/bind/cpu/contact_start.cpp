@@ -69,6 +69,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_translation_backward(
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::translation_inputs<T>(given);
+    diffvbd::require_like("u_bar", u_bar, x, 3 * in.scenes * in.bodies);
     const int64_t b = in.scenes, scalars = int64_t{in.floor.num_planes} * contact::kPlaneScalars;
     Tensor move_bar = empty(x, {b, in.vertices, 3}), mass_bar = empty(x, {b, in.vertices});
     Tensor x_bar = zeros(x, {b, in.vertices, 3}), planes_bar = zeros(x, {b, scalars});
@@ -111,6 +112,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_start_backwar
     using T = decltype(scalar);
     const auto in = diffvbd::start_inputs<T>(given, gamma, cap, filter_eta);
     const int64_t b = in.scenes, v = in.vertices;
+    diffvbd::require_like("bounds_bar", bounds_bar, x, 4 * b * v);
+    diffvbd::require_like("start_bar", start_bar, x, x.numel());
+    diffvbd::require_like("move_bar", left_bar, x, x.numel());
     const std::vector<int64_t> vectors{b, v, 3};
     Tensor x_bar = empty(x, vectors), move_bar = empty(x, vectors), goal_bar = empty(x, vectors);
     Tensor u_bar = empty(x, vectors), gap_bar = empty(x, {b, v});

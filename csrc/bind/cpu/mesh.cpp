@@ -11,7 +11,8 @@
 
 namespace {
 
-using diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::plan_of, diffvbd::require;
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::is_beside, diffvbd::is_index, diffvbd::plan_of,
+    diffvbd::require;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
@@ -36,7 +37,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> build_plan(const Tensor& poin
                                                               const Tensor& active, int64_t lanes) {
   require(points.scalar_type() == ScalarType::Double && tets.scalar_type() == ScalarType::Long &&
               active.scalar_type() == ScalarType::Bool && points.is_contiguous() && tets.is_contiguous() &&
-              active.is_contiguous() && points.size(0) == active.size(0),
+              active.is_contiguous() && points.dim() == 2 && points.size(1) == 3 && tets.dim() == 2 &&
+              tets.size(1) == 4 && active.dim() == 1 && points.size(0) == active.size(0),
           "diffvbd::build_plan: expected points [V, 3] float64, tets [T, 4] int64, active [V] bool");
   const int64_t v = points.size(0), t = tets.size(0);
   require(4 * t <= std::numeric_limits<int32_t>::max() && v <= std::numeric_limits<int32_t>::max(),
@@ -67,7 +69,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> build_plan(const Tensor& poin
 }
 
 Tensor tet_gather(const Tensor& values, const Tensor& tets) {
-  require(values.dim() == 3 && values.is_contiguous() && tets.is_contiguous() && tets.scalar_type() == ScalarType::Long,
+  require(values.dim() == 3 && values.is_contiguous() && is_beside(tets, values, ScalarType::Long) && tets.dim() == 2 &&
+              tets.size(1) == 4,
           "diffvbd::tet_gather: expected values [scenes, vertices, C] and tets [T, 4] int64");
   return dispatch_float(values, [&](auto scalar) {
     using T = decltype(scalar);
@@ -82,8 +85,10 @@ Tensor tet_gather(const Tensor& values, const Tensor& tets) {
 }
 
 Tensor star_sum(const Tensor& values, const Tensor& star_ptr, const Tensor& star, bool positive) {
-  require(values.dim() == 4 && values.is_contiguous() && star.scalar_type() == ScalarType::Int,
-          "diffvbd::star_sum: expected values [scenes, tets, 4, C]");
+  require(values.dim() == 4 && values.size(2) == 4 && values.is_contiguous() &&
+              is_beside(star_ptr, values, ScalarType::Long) && star_ptr.dim() == 1 && star_ptr.numel() > 0 &&
+              is_index(star, values),
+          "diffvbd::star_sum: expected values [scenes, tets, 4, C], star_ptr [V + 1] int64, star int32");
   return dispatch_float(values, [&](auto scalar) {
     using T = decltype(scalar);
     const int64_t b = values.size(0), n = values.size(1) * 4, c = values.size(3), v = star_ptr.size(0) - 1;

@@ -45,9 +45,10 @@ std::vector<int64_t> corrections_shape(const diffvbd::coarse::Inputs<T>& c, cons
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const Tensor& plan_buffer,
-                                         std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
-                                         std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
-                                         int64_t tape_policy, int64_t debug_step, bool checked) {
+                                                 std::vector<int64_t> sizes, int64_t energies,
+                                                 std::vector<int64_t> data_count, std::vector<double> numbers,
+                                                 int64_t sweeps, std::vector<int64_t> launch, int64_t tape_policy,
+                                                 int64_t debug_step, bool checked) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
@@ -107,20 +108,20 @@ struct ContactSlots {
 };
 
 diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_bar, const Tensor& x,
-                                      const Tensor& tape, const Tensor& corrections, const Tensor& plan_buffer, std::vector<int64_t> sizes,
-                                      int64_t energies, std::vector<int64_t> data_count, std::vector<double> numbers,
-                                      int64_t sweeps, std::vector<int64_t> launch, int64_t tape_policy,
-                                      std::vector<bool> wants) {
+                                      const Tensor& tape, const Tensor& corrections, const Tensor& plan_buffer,
+                                      std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
+                                      std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
+                                      int64_t tape_policy, std::vector<bool> wants) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
-  require(tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: bad arguments");
-  require(x_bar.is_contiguous() && x_bar.numel() == x.numel(), "diffvbd::sweep_backward: x_bar must be like x");
+  require(tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: expected a tape_policy with a tape");
+  diffvbd::require_like("x_bar", x_bar, x, x.numel());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     Given<T> given(plan, f, x, q, -1);
     const auto& in = given.in;
-    diffvbd::check_tape(tape, plan, in);
+    diffvbd::check_tape(tape, x, plan, in);
     const auto make = [&](const std::vector<int64_t>& shape, bool zeroed) {
       return zeroed ? zeros(x, shape) : empty(x, shape);
     };
@@ -129,8 +130,7 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     set_bars(out, bars, in);
     int64_t size = 1;
     for (const int64_t n : corrections_shape(given.coarse, in)) size *= n;
-    require(corrections.is_contiguous() && corrections.numel() == size && corrections.scalar_type() == x.scalar_type(),
-            "diffvbd::sweep_backward: the corrections do not belong to this step");
+    diffvbd::require_like("corrections", corrections, x, size);
     given.coarse.tape = data<T>(corrections);
     given.coarse.matrix_bar = bars.coarse_matrix.numel() > 0 ? data<T>(bars.coarse_matrix) : nullptr;
     if (!in.contact) {

@@ -18,7 +18,11 @@ inline Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes) {
 inline Plan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes) {
   require(buffer.scalar_type() == ScalarType::Int && buffer.is_contiguous() && buffer.numel() >= kPlanHeader,
           "diffvbd: expected a plan made by build_plan");
-  const Plan plan = view_plan(data<const int32_t>(buffer));
+  const int32_t* start = data<const int32_t>(buffer);
+  require_header(start);
+  const Plan plan = view_plan(start);
+  require(plan.incoming - start + int64_t{plan.incoming_slots} * kLanes <= buffer.numel(),
+          "diffvbd: the plan is shorter than its header says");
   require(sizes.size() == 3 && sizes[0] == plan.num_active && sizes[1] == plan.num_tets && sizes[2] == plan.slots,
           "diffvbd: the sizes are not those of the plan");
   return plan;
@@ -30,10 +34,10 @@ std::vector<int64_t> tape_shape(const Plan& plan, const StepInputs<T>& in) {
 }
 
 template <class T>
-void check_tape(const Tensor& tape, const Plan& plan, const StepInputs<T>& in) {
+void check_tape(const Tensor& tape, const Tensor& x, const Plan& plan, const StepInputs<T>& in) {
   int64_t size = 1;
   for (const int64_t n : tape_shape(plan, in)) size *= n;
-  require(tape.is_contiguous() && tape.numel() == size, "diffvbd: the tape does not belong to this step");
+  require_like("tape", tape, x, size);
 }
 
 }  // namespace diffvbd

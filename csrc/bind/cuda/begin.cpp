@@ -24,6 +24,7 @@ std::tuple<Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::vector<i
                                          std::vector<int64_t> other_groups, std::vector<int64_t> data_count,
                                          double time_step, double filter_eta, int64_t from, bool filters) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
+  diffvbd::require_states(f);
   const DeviceGuard guard(x.get_device_index());
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
   return dispatch_float(x, [&](auto scalar) {
@@ -52,6 +53,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin
     std::vector<int64_t> groups, std::vector<int64_t> data_count, double time_step, double filter_eta, int64_t from,
     bool filters, std::vector<bool> wants) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
+  diffvbd::require_states(f);
   const DeviceGuard guard(x.get_device_index());
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
   return dispatch_float(x, [&](auto scalar) {

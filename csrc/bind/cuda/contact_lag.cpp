@@ -13,33 +13,16 @@ namespace {
 namespace contact = diffvbd::contact;
 namespace cuda = diffvbd::cuda;
 using cuda::check, cuda::current_stream, cuda::DeviceGuard, cuda::empty;
-using diffvbd::batched, diffvbd::data, diffvbd::dispatch_float;
+using diffvbd::data, diffvbd::dispatch_float;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
-
-// The arrays of contact_lag: corner points and pairs.
-template <class T>
-contact::ContactInputs<T> lag_inputs(const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& kappa,
-                                     const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
-                                     const Tensor& entry) {
-  contact::ContactInputs<T> in{};
-  const int64_t b = x.size(0), v = x.size(1), colliders = collider.dim() == 3 ? collider.size(1) : 0;
-  in.num_vertices = static_cast<int32_t>(v);
-  in.corners = v + colliders;
-  in.collider = batched<T>(collider, x, b, 3 * colliders);
-  in.origin = batched<T>(origin, x, b, 3 * v);
-  in.kappa = batched<T>(kappa, x, b, 1);
-  in.listed = diffvbd::pair_list(pairs, ptr, entry, b, in.corners);
-  in.constants = data<const T>(constants);
-  return in;
-}
 
 Tensor contact_lag(const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& kappa,
                    const Tensor& pairs, const Tensor& constants, const Tensor& ptr, const Tensor& entry) {
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
+    const auto in = diffvbd::lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
     Tensor out = empty(x, {pairs.size(0), contact::kLagScalars});
     check(cuda::pair_lag<T>(in, data<const T>(x), x.size(0), pairs.size(0), data<T>(out), current_stream(x)),
           "the lag of pairs");
@@ -54,7 +37,8 @@ std::tuple<Tensor, Tensor, Tensor> contact_lag_backward(const Tensor& bar, const
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
+    const auto in = diffvbd::lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
+    diffvbd::require_like("bar", bar, x, pairs.size(0) * contact::kLagScalars);
     const int64_t b = x.size(0), v = x.size(1);
     Tensor x_bar = empty(x, {b, v, 3}), collider_bar = empty(x, {b, in.corners - v, 3}), kappa_bar = empty(x, {b});
     const Tensor slots = empty(x, {pairs.size(0), 16});

@@ -10,13 +10,13 @@ namespace {
 
 namespace cuda = diffvbd::cuda;
 using cuda::check, cuda::current_stream, cuda::DeviceGuard, cuda::empty, cuda::plan_of;
-using diffvbd::data, diffvbd::dispatch_float, diffvbd::require;
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::is_beside, diffvbd::is_index, diffvbd::require;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
 Tensor pack_rest(const Tensor& rest, const Tensor& plan, std::vector<int64_t> sizes) {
   const DeviceGuard guard(rest.get_device_index());
-  const cuda::HostPlan host = plan_of(plan, sizes);
+  const cuda::HostPlan host = plan_of(plan, rest, sizes);
   require(rest.dim() == 3 && rest.size(1) == host.plan.num_tets && rest.size(2) == diffvbd::kRestScalars &&
               rest.is_contiguous(),
           "diffvbd::pack_rest: expected contiguous rest of shape [scenes, tets, 7]");
@@ -31,8 +31,8 @@ Tensor pack_rest(const Tensor& rest, const Tensor& plan, std::vector<int64_t> si
 
 Tensor tet_gather(const Tensor& values, const Tensor& tets) {
   const DeviceGuard guard(values.get_device_index());
-  require(values.dim() == 3 && values.is_contiguous() && tets.is_contiguous() && tets.is_cuda() &&
-              tets.scalar_type() == ScalarType::Long,
+  require(values.dim() == 3 && values.is_contiguous() && is_beside(tets, values, ScalarType::Long) && tets.dim() == 2 &&
+              tets.size(1) == 4,
           "diffvbd::tet_gather: expected values [scenes, vertices, C] and tets [T, 4] int64");
   return dispatch_float(values, [&](auto scalar) {
     using T = decltype(scalar);
@@ -47,8 +47,10 @@ Tensor tet_gather(const Tensor& values, const Tensor& tets) {
 // Masses are not looked at here: that would wait for the device.
 Tensor star_sum(const Tensor& values, const Tensor& star_ptr, const Tensor& star, bool /*positive*/) {
   const DeviceGuard guard(values.get_device_index());
-  require(values.dim() == 4 && values.is_contiguous() && star.is_cuda() && star.scalar_type() == ScalarType::Int,
-          "diffvbd::star_sum: expected values [scenes, tets, 4, C]");
+  require(values.dim() == 4 && values.size(2) == 4 && values.is_contiguous() &&
+              is_beside(star_ptr, values, ScalarType::Long) && star_ptr.dim() == 1 && star_ptr.numel() > 0 &&
+              is_index(star, values),
+          "diffvbd::star_sum: expected values [scenes, tets, 4, C], star_ptr [V + 1] int64, star int32");
   return dispatch_float(values, [&](auto scalar) {
     using T = decltype(scalar);
     const int64_t b = values.size(0), n = values.size(1) * 4, c = values.size(3), v = star_ptr.size(0) - 1;

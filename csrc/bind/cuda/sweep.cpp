@@ -38,10 +38,10 @@ struct Given {
     require((in.energies & ~diffvbd::kElastic) == 0, "diffvbd::fused_step: expected no energies of single vertices");
     const int64_t v3 = f.x.size(1) * 3;
     in.fused = true;
-    in.x_prev = diffvbd::batched<T>(f.x, f.x, in.scenes, v3);
-    in.v = diffvbd::batched<T>(f.v, f.x, in.scenes, v3);
-    in.acceleration = diffvbd::batched<T>(f.acceleration, f.x, in.scenes, v3, 3);
-    in.prescribed = diffvbd::batched<T>(f.prescribed, f.x, in.scenes, v3);
+    in.x_prev = diffvbd::batched<T>("x", f.x, f.x, in.scenes, v3);
+    in.v = diffvbd::batched<T>("v", f.v, f.x, in.scenes, v3);
+    in.acceleration = diffvbd::batched<T>("acceleration", f.acceleration, f.x, in.scenes, v3, 3);
+    in.prescribed = diffvbd::batched_or_null<T>("prescribed", f.prescribed, f.x, in.scenes, v3);
   }
   Given(const Given&) = delete;  // in points into itself
 };
@@ -55,15 +55,17 @@ cuda::Choice choose(const cuda::StepInputs<T>& in, const Tensor& x, const SweepS
   return out;
 }
 
-std::tuple<Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const Tensor& plan, std::vector<int64_t> sizes,
-                                         int64_t energies, std::vector<int64_t> data_count, std::vector<double> numbers,
-                                         int64_t sweeps, std::vector<int64_t> launch, int64_t tape_policy,
-                                         int64_t /*debug_step*/, bool /*checked*/) {
+std::tuple<Tensor, Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const Tensor& plan,
+                                                 std::vector<int64_t> sizes, int64_t energies,
+                                                 std::vector<int64_t> data_count, std::vector<double> numbers,
+                                                 int64_t sweeps, std::vector<int64_t> launch, int64_t tape_policy,
+                                                 int64_t /*debug_step*/, bool /*checked*/) {
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
+  require(f.coarse_plan.numel() == 0, "diffvbd::sweep: coarse corrections run on the CPU");
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
   const Tensor& from = f.x_start;
   const DeviceGuard guard(from.get_device_index());
-  const cuda::HostPlan host = plan_of(plan, sizes);
+  const cuda::HostPlan host = plan_of(plan, from, sizes);
   return dispatch_float(from, [&](auto scalar) {
     using T = decltype(scalar);
     const Given<T> given(host, f, from, q);
@@ -78,7 +80,7 @@ std::tuple<Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const Tensor&
     check(cuda::run_forward<T>(host, in, {data<T>(x), nullptr, data<T>(tape), data<uint8_t>(cut)}, choice,
                                work.data_ptr(), stream),
           "the forward sweep");
-    return std::make_tuple(x, tape, cut);
+    return std::make_tuple(x, tape, cut, empty(from, {0}));
   });
 }
 
@@ -98,27 +100,28 @@ struct ContactSlots {
 };
 
 diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_bar, const Tensor& x,
-                                      const Tensor& tape, const Tensor& plan, std::vector<int64_t> sizes,
-                                      int64_t energies, std::vector<int64_t> data_count, std::vector<double> numbers,
-                                      int64_t sweeps, std::vector<int64_t> launch, int64_t tape_policy,
-                                      std::vector<bool> wants) {
+                                      const Tensor& tape, const Tensor& /*corrections*/, const Tensor& plan,
+                                      std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
+                                      std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
+                                      int64_t tape_policy, std::vector<bool> wants) {
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
+  require(f.coarse_plan.numel() == 0, "diffvbd::sweep: coarse corrections run on the CPU");
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
   const DeviceGuard guard(x.get_device_index());
-  const cuda::HostPlan host = plan_of(plan, sizes);
-  require(tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: bad arguments");
-  require(x_bar.is_contiguous() && x_bar.numel() == x.numel(), "diffvbd::sweep_backward: x_bar must be like x");
+  const cuda::HostPlan host = plan_of(plan, x, sizes);
+  require(tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: expected a tape_policy with a tape");
+  diffvbd::require_like("x_bar", x_bar, x, x.numel());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const Given<T> given(host, f, x, q);
     const auto& in = given.in;
-    cuda::check_tape(tape, host, in, launch);
+    cuda::check_tape(tape, x, host, in, launch);
     const auto make = [&](const std::vector<int64_t>& shape, bool zeroed) {
       return zeroed ? zeros(x, shape) : empty(x, shape);
     };
     const int64_t v = host.plan.num_vertices, t = host.plan.num_tets;
     const int64_t materials = diffvbd::one_for_items(in.material) ? 1 : t;
-    diffvbd::SweepBars bars = diffvbd::make_bars(x, in, v, t, materials, false, wants, make);
+    diffvbd::SweepBars bars = diffvbd::make_bars(x, f, in, v, t, materials, false, wants, make);
     cuda::StepAdjoints<T> out{};
     diffvbd::set_bars(out, bars, in);
     out.x_bar = data<const T>(x_bar);
@@ -153,7 +156,7 @@ std::tuple<Tensor, Tensor, Tensor> fused_step(DIFFVBD_PARAMETERS(STEP) const Ten
   const StepFields f{DIFFVBD_ITEMS(STEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
   const DeviceGuard guard(f.x.get_device_index());
-  const cuda::HostPlan host = plan_of(plan, sizes);
+  const cuda::HostPlan host = plan_of(plan, f.x, sizes);
   return dispatch_float(f.x, [&](auto scalar) {
     using T = decltype(scalar);
     const Given<T> given(host, f, q);
@@ -177,17 +180,16 @@ diffvbd::FusedAdjoints fused_step_backward(DIFFVBD_PARAMETERS(STEP) const Tensor
   const StepFields f{DIFFVBD_ITEMS(STEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
   const DeviceGuard guard(x.get_device_index());
-  const cuda::HostPlan host = plan_of(plan, sizes);
+  const cuda::HostPlan host = plan_of(plan, f.x, sizes);
   require(wants.size() == 7 && tape_policy != diffvbd::kNoTape, "diffvbd::fused_step_backward: bad arguments");
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    for (const Tensor* bar : {&x_bar, &v_bar}) {
-      require(bar->numel() == 0 || (bar->is_contiguous() && bar->numel() == x.numel()),
-              "diffvbd::fused_step_backward: expected adjoints like x");
-    }
+    if (x_bar.numel() > 0) diffvbd::require_like("x_bar", x_bar, x, x.numel());
+    if (v_bar.numel() > 0) diffvbd::require_like("v_bar", v_bar, x, x.numel());
+    diffvbd::require_like("x_end", x_end, x, x.numel());
     const Given<T> given(host, f, q);
     const auto& in = given.in;
-    cuda::check_tape(tape, host, in, launch);
+    cuda::check_tape(tape, x, host, in, launch);
     const auto make = [&](const std::vector<int64_t>& shape, bool zeroed) {
       return zeroed ? zeros(x, shape) : empty(x, shape);
     };

@@ -14,15 +14,20 @@ using torch::stable::accelerator::DeviceGuard;
 constexpr int64_t kWorkspaceBudget = int64_t{2} << 30;  // bytes; a batch that needs more is worked on in chunks
 constexpr int kHostSizes = kPlanHeader;                 // a plan's header, but active, tets and slots come first
 
-inline HostPlan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes) {
-  require(buffer.scalar_type() == ScalarType::Int && buffer.is_contiguous() && buffer.is_cuda() &&
-              sizes.size() > kHostSizes && static_cast<int64_t>(sizes.size()) == kHostSizes + sizes[4] + 1,
+inline HostPlan plan_of(const Tensor& buffer, const Tensor& x, const std::vector<int64_t>& sizes) {
+  require(is_index(buffer, x) && sizes.size() > kHostSizes &&
+              static_cast<int64_t>(sizes.size()) == kHostSizes + sizes[4] + 1,
           "diffvbd: expected a plan made for CUDA by build_plan, and its sizes");
   const int order[kPlanHeader] = {3, 1, 0, 4, 5, 2, 6, 7, 8, 9, 10};
   int32_t header[kPlanHeader];
   for (int i = 0; i < kPlanHeader; ++i) header[i] = static_cast<int32_t>(sizes[order[i]]);
-  return {view_group_plan(header, data<const int32_t>(buffer)), sizes.data() + kHostSizes, static_cast<int>(sizes[9]),
-          static_cast<int>(sizes[10])};
+  require_header(header);
+  const int32_t* start = data<const int32_t>(buffer);
+  const GroupPlan plan = view_group_plan(header, start);
+  const int32_t* end =
+      plan.visit_pair ? plan.visit_pair + 16 * int64_t{plan.num_tets} : plan.tet_pair + 4 * int64_t{plan.num_tets};
+  require(end - start <= buffer.numel(), "diffvbd: the plan is shorter than its sizes say");
+  return {plan, sizes.data() + kHostSizes, static_cast<int>(sizes[9]), static_cast<int>(sizes[10])};
 }
 
 // The regime and threads per vertex that Python chose, and what the device adds.
@@ -67,11 +72,12 @@ std::vector<int64_t> tape_shape(const HostPlan& host, const StepInputs<T>& in, c
 }
 
 template <class T>
-void check_tape(const Tensor& tape, const HostPlan& host, const StepInputs<T>& in, const std::vector<int64_t>& launch) {
+void check_tape(const Tensor& tape, const Tensor& x, const HostPlan& host, const StepInputs<T>& in,
+                const std::vector<int64_t>& launch) {
   const std::vector<int64_t> shape = tape_shape(host, in, launch);
-  bool same = tape.is_contiguous() && tape.dim() == 4;
+  bool same = is_like(tape, x) && tape.dim() == 4;
   for (int i = 0; same && i < 4; ++i) same = tape.size(i) == shape[i];
-  require(same, "diffvbd: the tape does not belong to this step");
+  require(same, "tape: expected that of this step, of the dtype and on the device of x");
 }
 
 // The kinds of adjoints that a reverse kernel is compiled for.
