@@ -27,7 +27,7 @@ coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, int64_t s
   in.weight = data<const T>(w);
   in.row_weight = in.weight + p.entries;
   in.rest = batched<T>("coarse_rest", f.coarse_rest, x, b, int64_t{p.tet_blocks} * kRestScalars * kLanes);
-  in.inverse = batched<T>("coarse_inverse", f.coarse_inverse, x, b, 9 * cells);
+  in.factor = batched<T>("coarse_factor", f.coarse_factor, x, b, 9 * cells);
   in.mass = batched<T>("coarse_mass", f.coarse_mass, x, b, cells);
   in.keeps_positions = keeps_positions(energies);
   in.corrections = coarse::corrections_of(static_cast<int>(sweeps), p.every);

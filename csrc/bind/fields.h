@@ -20,7 +20,7 @@
   INDEX(pairs) INDEX(constants) INDEX(ptr) INDEX(entry) \
   ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag) \
   ADJOINT(corners_prev) \
-  ADJOINT(coarse_matrix) INDEX(coarse_inverse) INDEX(coarse_mass) INDEX(coarse_plan) INDEX(coarse_weights) INDEX(coarse_rest)
+  ADJOINT(coarse_matrix) INDEX(coarse_factor) INDEX(coarse_mass) INDEX(coarse_plan) INDEX(coarse_weights) INDEX(coarse_rest)
 
 // The matrix of a coarse space at the start of a step (coarse/matrix.h): plan int32, moments [n, 3] and volume [groups]
 // of the groups, stiffness [1 | scenes, groups, 3 width, 3 width], mass [1 | scenes, cells].

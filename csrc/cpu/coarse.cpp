@@ -47,22 +47,15 @@ CoarseScene<T>::CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t s
   }
 }
 
+// x := A^-1 x body by body, three scalars a function
 template <class T>
-const T* CoarseScene<T>::inverse(int32_t body) const {
-  return c_.inverse.data + scene_ * c_.inverse.scene + int64_t{9} * c_.plan.mass_ptr[body];
-}
-
-// to := A^-1 from, both three scalars a function
-template <class T>
-void CoarseScene<T>::multiply(const T* from, T* to, Team::Member& member) const {
+void CoarseScene<T>::solve(T* x, Team::Member& member) const {
   const coarse::Plan& p = c_.plan;
-  member.each(0, int64_t{3} * p.functions, [&](int64_t begin, int64_t end) {
-    int32_t b =
-        int32_t(std::upper_bound(p.function_ptr, p.function_ptr + p.bodies + 1, begin / 3) - p.function_ptr) - 1;
-    for (; b < p.bodies && int64_t{3} * p.function_ptr[b] < end; ++b) {
+  const T* factor = c_.factor.data + scene_ * c_.factor.scene;
+  member.each(0, p.bodies, [&](int64_t begin, int64_t end) {
+    for (int64_t b = begin; b < end; ++b) {
       const int64_t first = int64_t{3} * p.function_ptr[b], n = int64_t{3} * p.function_ptr[b + 1] - first;
-      kernels_.multiply(inverse(b), from + first, n, to + first, std::max<int64_t>(begin - first, 0),
-                        std::min(end - first, n));
+      kernels_.solve(factor + int64_t{9} * p.mass_ptr[b], n, x + first);
     }
   });
   member.barrier();
@@ -83,11 +76,11 @@ void CoarseScene<T>::correct(int k, Team::Member& member) {
   member.each(0, p.functions, [&](int64_t begin, int64_t end) {
     kernels_.gather(p.row_ptr, p.row, c_.row_weight, s_.gradient, rows_.get(), begin, end);
     for (int64_t f = begin; f < end; ++f) {
-      for (int i = 0; i < 3; ++i) restricted[3 * f + i] = rows_.get()[4 * f + i];
+      for (int i = 0; i < 3; ++i) a[3 * f + i] = restricted[3 * f + i] = rows_.get()[4 * f + i];
     }
   });
   member.barrier();
-  multiply(restricted, a, member);
+  solve(a, member);
   member.each(0, p.functions, [&](int64_t begin, int64_t end) {
     for (int64_t f = begin; f < end; ++f) {
       for (int i = 0; i < 3; ++i) coarse[4 * f + i] = -a[3 * f + i];
@@ -253,8 +246,8 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
     }
   });
   member.barrier();
-  T* q = rows_.get();  // its rows have been read
-  multiply(restricted, q, member);
+  T* q = restricted;
+  solve(q, member);
   // back to where the correction began: x -= s (-P a)
   member.each(0, p.functions, [&](int64_t begin, int64_t end) {
     for (int64_t f = begin; f < end; ++f) {

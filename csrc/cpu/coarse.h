@@ -26,8 +26,7 @@ class CoarseScene {
     int32_t body, begin, end;
   };
   T* tape(int k) const { return c_.tape + (scene_ * c_.corrections + k) * c_.tape_size(); }
-  const T* inverse(int32_t body) const;
-  void multiply(const T* from, T* to, Team::Member& member) const;
+  void solve(T* x, Team::Member& member) const;
   void decide(int32_t body, const T* a, T* length);
   double energies(int32_t body, double s, double& size) const;
   double inertia(int32_t body) const;

@@ -52,26 +52,26 @@ void gather_rows(const int32_t* ptr, const int32_t* of, const T* weight, const T
   }
 }
 
-// by packs of rows, whose sums keep the order of j
+// Sums along rows by packs, in an order that n fixes.
 template <class T>
-void multiply_rows(const T* matrix, const T* from, int64_t n, T* to, int64_t begin, int64_t end) {
-  int64_t i = begin;
-  constexpr int kPacks = 4;
-  for (; i + kPacks * kLanes <= end; i += kPacks * kLanes) {
-    Lanes<T> sum[kPacks];
-    for (auto& s : sum) s = Lanes<T>(T(0));
-    for (int64_t j = 0; j < n; ++j) {
-      const Lanes<T> f(from[j]);
-      const T* row = matrix + j * n + i;
-      for (int k = 0; k < kPacks; ++k) sum[k] = sum[k] + Lanes<T>::load(row + k * kLanes) * f;
-    }
-    for (int k = 0; k < kPacks; ++k) sum[k].store(to + i + k * kLanes);
-  }
-  for (; i < end; i += kLanes) {
-    const int count = static_cast<int>(end - i < kLanes ? end - i : kLanes);
+void solve_rows(const T* factor, int64_t n, T* x) {
+  for (int64_t i = 0; i < n; ++i) {
+    const T* row = factor + i * n;
     Lanes<T> sum(T(0));
-    for (int64_t j = 0; j < n; ++j) sum = sum + Lanes<T>::load(matrix + j * n + i, count) * Lanes<T>(from[j]);
-    sum.store(to + i, count);
+    int64_t j = 0;
+    for (; j + kLanes <= i; j += kLanes) sum = sum + Lanes<T>::load(row + j) * Lanes<T>::load(x + j);
+    T rest = T(0);
+    for (; j < i; ++j) rest += row[j] * x[j];
+    for (int l = 0; l < kLanes; ++l) rest += sum.v[l];
+    x[i] = (x[i] - rest) / row[i];
+  }
+  for (int64_t i = n - 1; i >= 0; --i) {
+    const T* row = factor + i * n;
+    x[i] /= row[i];
+    const Lanes<T> own(x[i]);
+    int64_t j = 0;
+    for (; j + kLanes <= i; j += kLanes) (Lanes<T>::load(x + j) - Lanes<T>::load(row + j) * own).store(x + j);
+    for (; j < i; ++j) x[j] -= row[j] * x[i];
   }
 }
 
@@ -101,7 +101,7 @@ template <class T, int mask>
 constexpr CoarseKernels<T> coarse_variant() {
   if constexpr ((mask & kPaperBlock) == 0 && is_compiled(mask)) {
     return {gradient_of_blocks<T, with_rare(mask)>, reverse_gradient_of_blocks<T, with_rare(mask)>, gather_rows<T>,
-            multiply_rows<T>, line_of_tets<T>};
+            solve_rows<T>, line_of_tets<T>};
   }
   return {};
 }

@@ -24,8 +24,8 @@ struct CoarseKernels {
   // to[row] = sum of weight[e] from[of[e]] for e of the rows [begin, end); rows of four scalars
   void (*gather)(const int32_t* ptr, const int32_t* of, const T* weight, const T* from, T* to, int64_t begin,
                  int64_t end);
-  // to[i] = sum over j of matrix[j, i] from[j], i of [begin, end), for a matrix of n x n
-  void (*multiply)(const T* matrix, const T* from, int64_t n, T* to, int64_t begin, int64_t end);
+  // x := (L L^T)^-1 x, L of n x n with its rows in full
+  void (*solve)(const T* factor, int64_t n, T* x);
   // adds the coefficients of the tets' potential along `way`, blocks [begin, end) of the coarse plan
   void (*line)(const int32_t* corner, const T* rest, const T* material, const T* x, const T* way, int64_t begin,
                int64_t end, double* coefficients);

@@ -8,6 +8,7 @@ and R_g the mean rotation of that group (docs/method.md, section 15). Everything
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -162,13 +163,21 @@ def _in_its_box(points: np.ndarray) -> np.ndarray:
 
 
 def _cells(extent: np.ndarray, degree: np.ndarray, target: int) -> np.ndarray:
-    """Cells of a grid, as cubic as the box allows, of at most ``target`` splines."""
-    best = np.ones(3, dtype=np.int64)
-    for size in np.geomspace(extent.max(), extent.max() / 64, 128):
-        cells = np.maximum(1, np.round(extent / size)).astype(np.int64)
-        if np.prod(cells + degree) > target:
-            break
-        best = cells
+    """Cells of a grid of at most ``target`` splines: the longest edge of a cell is as short as it can be, then the
+    others are."""
+    most = [max(1, target // int(np.prod(np.delete(degree, a) + 1)) - int(degree[a])) for a in range(3)]
+    best, found = np.ones(3, dtype=np.int64), (np.inf,)
+    for first in range(1, most[0] + 1):
+        for second in range(1, most[1] + 1):
+            third = target // int((first + degree[0]) * (second + degree[1])) - int(degree[2])
+            if third < 1:
+                break
+            # no shorter across than the longest edge asks for
+            longest = max(extent[0] / first, extent[1] / second)
+            third = min(third, max(1, math.ceil(extent[2] / longest)))
+            edges = sorted((extent[0] / first, extent[1] / second, extent[2] / third), reverse=True)
+            if tuple(edges) < found:
+                best, found = np.array((first, second, third)), tuple(edges)
     return best
 
 

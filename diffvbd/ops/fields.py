@@ -49,7 +49,7 @@ class SweepFields(NamedTuple):
     corners_prev: Tensor | None = None  # x_prev of the tets' corners, [12, B, T], where their law reads it
     # coarse corrections; see model.coarse_plan for the constants
     coarse_matrix: Tensor | None = None  # [B, cells] [kg]
-    coarse_inverse: Tensor | None = None  # of it, body by body
+    coarse_factor: Tensor | None = None  # its Cholesky factors, body by body
     coarse_mass: Tensor | None = None  # [1 | B, cells / 9] [kg]
     coarse_plan: Tensor | None = None
     coarse_weights: Tensor | None = None

@@ -44,7 +44,8 @@ def sweep(fields: SweepFields, packed_rest: Tensor, plan: Tensor, settings: Swee
 
 
 def sweep_backward(x_bar: Tensor, x: Tensor, tape: Tensor, corrections: Tensor, fields: SweepFields,
-                   packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int, wants: dict[str, bool]) -> dict[str, Tensor]:  # fmt: skip
+                   packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int,
+                   wants: dict[str, bool]) -> dict[str, Tensor]:  # fmt: skip
     """Adjoints of the fields by name; an empty tape: the sweeps run again. ``wants``: of SWEEP_ADJOINTS."""
     given = listed(fields, packed_rest, plan, settings)
     if tape_policy == NO_TAPE:

@@ -160,7 +160,7 @@ def with_corrections(model: Model, parts: CoarseParts, fields: ops.SweepFields, 
     plan = model._coarse_plan
     tensors = distinct(fields.x_prev, parts.stiffness.contiguous(), parts.mass)
     matrix = _Matrix.apply(*tensors, plan.plan, plan.moments, plan.volume, time_step)
-    return fields._replace(coarse_matrix=matrix, coarse_inverse=_inverse(model, matrix.detach()),
+    return fields._replace(coarse_matrix=matrix, coarse_factor=_factor(model, matrix.detach()),
                            coarse_mass=parts.mass.detach(), coarse_plan=plan.plan, coarse_weights=plan.weights,
                            coarse_rest=parts.rest)  # fmt: skip
 
@@ -171,16 +171,15 @@ def lengths_of(model: Model, corrections: Tensor) -> Tensor:
     return corrections.detach().narrow(-1, 3 * geometry.functions, geometry.bodies).clone()
 
 
-def _inverse(model: Model, matrix: Tensor) -> Tensor:
-    """Of the matrix of each body, which is positive definite."""
-    out, at = torch.empty_like(matrix), 0
+def _factor(model: Model, matrix: Tensor) -> Tensor:
+    """Cholesky factors of the matrices of all bodies, which are positive definite."""
+    out, at = [], 0
     for functions, bodies in model._coarse_plan.sizes:
         n = 3 * functions
-        part = matrix.narrow(1, at, bodies * n * n).reshape(-1, n, n)
-        factor, _ = torch.linalg.cholesky_ex(part)
-        out.narrow(1, at, bodies * n * n).copy_(torch.cholesky_inverse(factor).reshape(len(matrix), -1))
+        part = matrix.narrow(1, at, bodies * n * n).unflatten(1, (bodies, n, n))
+        out.append(torch.linalg.cholesky_ex(part)[0].reshape(len(matrix), -1))
         at += bodies * n * n
-    return out
+    return out[0] if len(out) == 1 else torch.cat(out, 1)
 
 
 ops.ready_signature(_Matrix, _MatrixBackward)
