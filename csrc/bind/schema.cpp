@@ -33,7 +33,8 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "Tensor x, Tensor tape, Tensor cut, Tensor corrections, ");
   // x: the end of the sweeps; wants: material, mass, rest, energy_data
   define(m, "sweep_backward", DIFFVBD_ARGUMENTS(SWEEP),
-         "Tensor x_bar, Tensor x, Tensor tape, Tensor corrections, " DIFFVBD_SETTINGS ", bool[] wants", DIFFVBD_RETURNS(SWEEP));
+         "Tensor x_bar, Tensor x, Tensor tape, Tensor corrections, " DIFFVBD_SETTINGS ", bool[] wants",
+         DIFFVBD_RETURNS(SWEEP));
   // CUDA only: predictor and velocity in the same launches, for scenes whose only energy is that of the tets.
   // prescribed: where pinned vertices go, or empty.
   define(m, "fused_step", DIFFVBD_ARGUMENTS(STEP), DIFFVBD_SETTINGS, "Tensor x, Tensor v, Tensor tape, ");
@@ -95,8 +96,8 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "filter_eta, int start, bool filters, bool[] wants",
          "Tensor x, Tensor v, Tensor acceleration, Tensor prescribed, Tensor mass, Tensor shared, Tensor own, Tensor "
          "planes, ");
-  // The matrices of all bodies, one after the other, and the adjoints of x_prev, stiffness and mass
-  define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "float time_step", "Tensor matrix, ");
+  // The matrices of all bodies, one after the other, and their Cholesky factors; adjoints of x_prev, stiffness and mass
+  define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "float time_step", "Tensor matrix, Tensor factor, ");
   define(m, "coarse_matrix_backward", DIFFVBD_ARGUMENTS(COARSE), "Tensor bar, float time_step",
          DIFFVBD_RETURNS(COARSE));
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");

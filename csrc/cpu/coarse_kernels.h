@@ -52,18 +52,39 @@ void gather_rows(const int32_t* ptr, const int32_t* of, const T* weight, const T
   }
 }
 
-// Sums along rows by packs, in an order that n fixes.
+// sum of a[j] b[j], j < n, by packs: in an order that n fixes
 template <class T>
-void solve_rows(const T* factor, int64_t n, T* x) {
+DIFFVBD_FN T dot_rows(const T* a, const T* b, int64_t n) {
+  Lanes<T> sum(T(0)), other(T(0));
+  int64_t j = 0;
+  for (; j + 2 * kLanes <= n; j += 2 * kLanes) {
+    sum = sum + Lanes<T>::load(a + j) * Lanes<T>::load(b + j);
+    other = other + Lanes<T>::load(a + j + kLanes) * Lanes<T>::load(b + j + kLanes);
+  }
+  sum = sum + other;
+  T out = T(0);
+  for (; j < n; ++j) out += a[j] * b[j];
+  for (int l = 0; l < kLanes; ++l) out += sum.v[l];
+  return out;
+}
+
+template <class T>
+__attribute__((flatten)) void factor_rows(const T* matrix, int64_t n, T* factor) {
+  for (int64_t i = 0; i < n; ++i) {
+    T* own = factor + i * n;
+    for (int64_t j = 0; j < i; ++j) {
+      own[j] = (matrix[i * n + j] - dot_rows(own, factor + j * n, j)) / factor[j * n + j];
+    }
+    own[i] = std::sqrt(matrix[i * n + i] - dot_rows(own, own, i));
+    for (int64_t j = i + 1; j < n; ++j) own[j] = T(0);
+  }
+}
+
+template <class T>
+__attribute__((flatten)) void solve_rows(const T* factor, int64_t n, T* x) {
   for (int64_t i = 0; i < n; ++i) {
     const T* row = factor + i * n;
-    Lanes<T> sum(T(0));
-    int64_t j = 0;
-    for (; j + kLanes <= i; j += kLanes) sum = sum + Lanes<T>::load(row + j) * Lanes<T>::load(x + j);
-    T rest = T(0);
-    for (; j < i; ++j) rest += row[j] * x[j];
-    for (int l = 0; l < kLanes; ++l) rest += sum.v[l];
-    x[i] = (x[i] - rest) / row[i];
+    x[i] = (x[i] - dot_rows(row, x, i)) / row[i];
   }
   for (int64_t i = n - 1; i >= 0; --i) {
     const T* row = factor + i * n;
@@ -100,8 +121,12 @@ __attribute__((flatten)) void line_of_tets(const int32_t* corner, const T* rest,
 template <class T, int mask>
 constexpr CoarseKernels<T> coarse_variant() {
   if constexpr ((mask & kPaperBlock) == 0 && is_compiled(mask)) {
-    return {gradient_of_blocks<T, with_rare(mask)>, reverse_gradient_of_blocks<T, with_rare(mask)>, gather_rows<T>,
-            solve_rows<T>, line_of_tets<T>};
+    return {gradient_of_blocks<T, with_rare(mask)>,
+            reverse_gradient_of_blocks<T, with_rare(mask)>,
+            gather_rows<T>,
+            factor_rows<T>,
+            solve_rows<T>,
+            line_of_tets<T>};
   }
   return {};
 }

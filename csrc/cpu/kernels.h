@@ -24,7 +24,9 @@ struct CoarseKernels {
   // to[row] = sum of weight[e] from[of[e]] for e of the rows [begin, end); rows of four scalars
   void (*gather)(const int32_t* ptr, const int32_t* of, const T* weight, const T* from, T* to, int64_t begin,
                  int64_t end);
-  // x := (L L^T)^-1 x, L of n x n with its rows in full
+  // L of a positive definite matrix = L L^T, n x n, whose upper triangle is not looked at
+  void (*factor)(const T* matrix, int64_t n, T* factor);
+  // x := (L L^T)^-1 x
   void (*solve)(const T* factor, int64_t n, T* x);
   // adds the coefficients of the tets' potential along `way`, blocks [begin, end) of the coarse plan
   void (*line)(const int32_t* corner, const T* rest, const T* material, const T* x, const T* way, int64_t begin,

@@ -14,7 +14,8 @@ _FIELDS = len(CoarseFields._fields)
 @shapes_of("coarse_matrix")
 def _(*arguments):
     f = CoarseFields(*arguments[:_FIELDS])
-    return f.x_prev.new_empty((f.x_prev.shape[0], 9 * f.mass.shape[-1]))
+    shape = (f.x_prev.shape[0], 9 * f.mass.shape[-1])
+    return f.x_prev.new_empty(shape), f.x_prev.new_empty(shape)
 
 
 @shapes_of("coarse_matrix_backward")

@@ -18,7 +18,7 @@ from .. import ops
 from ..model.coarse_plan import mass_pairs
 from ..model.model import Model
 from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
-from ..ops import distinct, no_second_derivative, of_inputs
+from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
 
 _TENSORS = 3  # differentiable fields
 _FIELDS = len(ops.CoarseFields._fields)
@@ -125,8 +125,9 @@ class _Matrix(Function):
         return ops.raw.coarse_matrix(x_prev, stiffness, mass, plan, moments, volume, time_step)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
         ctx.save_for_backward(*inputs[:_FIELDS])
+        ctx.mark_non_differentiable(output[1])
         ctx.time_step = inputs[_FIELDS]
         ctx.set_materialize_grads(False)
 
@@ -137,6 +138,10 @@ class _Matrix(Function):
         needs = ctx.needs_input_grad[:_TENSORS]
         out = _MatrixBackward.apply(grads[0], *ctx.saved_tensors, ctx.time_step, needs)
         return of_inputs(out, needs, _FIELDS + 1 - _TENSORS)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> NoReturn:
+        raise NotImplementedError("diffvbd: torch.func.vmap of coarse corrections is not supported")
 
 
 class _MatrixBackward(Function):
@@ -154,13 +159,18 @@ class _MatrixBackward(Function):
     def backward(ctx: Any, *grads: Tensor) -> NoReturn:
         no_second_derivative()
 
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        """Several adjoints, one after another."""
+        return one_by_one(_MatrixBackward, info.batch_size, in_dims, args)
+
 
 def with_corrections(model: Model, parts: CoarseParts, fields: ops.SweepFields, time_step: float) -> ops.SweepFields:
     """What the sweeps read, with the corrections between them."""
     plan = model._coarse_plan
     tensors = distinct(fields.x_prev, parts.stiffness.contiguous(), parts.mass)
-    matrix = _Matrix.apply(*tensors, plan.plan, plan.moments, plan.volume, time_step)
-    return fields._replace(coarse_matrix=matrix, coarse_factor=_factor(model, matrix.detach()),
+    matrix, factor = _Matrix.apply(*tensors, plan.plan, plan.moments, plan.volume, time_step)
+    return fields._replace(coarse_matrix=matrix, coarse_factor=factor,
                            coarse_mass=parts.mass.detach(), coarse_plan=plan.plan, coarse_weights=plan.weights,
                            coarse_rest=parts.rest)  # fmt: skip
 
@@ -169,17 +179,6 @@ def lengths_of(model: Model, corrections: Tensor) -> Tensor:
     """Of what an operator has recorded, the length of each body's corrections [B, corrections, bodies]."""
     geometry = model.coarse_geometry
     return corrections.detach().narrow(-1, 3 * geometry.functions, geometry.bodies).clone()
-
-
-def _factor(model: Model, matrix: Tensor) -> Tensor:
-    """Cholesky factors of the matrices of all bodies, which are positive definite."""
-    out, at = [], 0
-    for functions, bodies in model._coarse_plan.sizes:
-        n = 3 * functions
-        part = matrix.narrow(1, at, bodies * n * n).unflatten(1, (bodies, n, n))
-        out.append(torch.linalg.cholesky_ex(part)[0].reshape(len(matrix), -1))
-        at += bodies * n * n
-    return out[0] if len(out) == 1 else torch.cat(out, 1)
 
 
 ops.ready_signature(_Matrix, _MatrixBackward)

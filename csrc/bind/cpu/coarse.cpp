@@ -5,12 +5,13 @@
 
 #include <tuple>
 
+#include "../../cpu/kernels.h"
 #include "sweep.h"
 
 namespace {
 
 namespace coarse = diffvbd::coarse;
-using diffvbd::CoarseFields, diffvbd::data, diffvbd::dispatch_float, diffvbd::zeros;
+using diffvbd::CoarseFields, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::zeros;
 using torch::stable::Tensor;
 
 template <class F>
@@ -20,16 +21,21 @@ void for_bodies(int64_t scenes, int64_t bodies, const F& f) {
   });
 }
 
-Tensor matrix(DIFFVBD_PARAMETERS(COARSE) double time_step) {
+std::tuple<Tensor, Tensor> matrix(DIFFVBD_PARAMETERS(COARSE) double time_step) {
   const CoarseFields f{DIFFVBD_ITEMS(COARSE)};
   return dispatch_float(x_prev, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::matrix_inputs<T>(f, time_step);
     const int64_t size = int64_t{9} * in.plan.mass_ptr[in.plan.bodies];
-    const Tensor out = zeros(x_prev, {in.scenes, size});
-    for_bodies(in.scenes, in.plan.bodies,
-               [&](int64_t scene, int body) { coarse::assemble(in, scene, body, data<T>(out) + scene * size); });
-    return out;
+    const Tensor out = zeros(x_prev, {in.scenes, size}), factor = empty(x_prev, {in.scenes, size});
+    const auto kernels = diffvbd::coarse_kernels<T>(diffvbd::kExactBlock);
+    for_bodies(in.scenes, in.plan.bodies, [&](int64_t scene, int body) {
+      coarse::assemble(in, scene, body, data<T>(out) + scene * size);
+      const int64_t at = scene * size + int64_t{9} * in.plan.mass_ptr[body];
+      const int64_t n = 3 * int64_t{in.plan.function_ptr[body + 1] - in.plan.function_ptr[body]};
+      kernels.factor(data<T>(out) + at, n, data<T>(factor) + at);
+    });
+    return std::make_tuple(out, factor);
   });
 }
 
