@@ -99,11 +99,12 @@ cache may beat their floor. Regimes are the median of up to 10 replays of graphs
 def markdown(results: dict[str, Any]) -> str:
     first = next(iter(results.values()), {})
     parts = [NOTE.format(rate=float(first.get("copy_GB_per_s", 0.0)))]
-    when = {name: (r.get("date"), (r.get("commit") or "")[:10], r.get("dirty")) for name, r in results.items()}
+    when = {name: (r.get("date"), (r.get("commit") or "")[:10], r.get("dirty"), r.get("device"))
+            for name, r in results.items()}  # fmt: skip
     if len(set(when.values())) > 1:  # groups of several runs
         runs = [
-            f"{name} {date} at {commit}{' with changes' if dirty else ''}"
-            for name, (date, commit, dirty) in when.items()
+            f"{name} {date} at {commit}{' with changes' if dirty else ''}{f', on {device}' if device else ''}"
+            for name, (date, commit, dirty, device) in when.items()
         ]
         parts.append(f"Measured: {'; '.join(runs)}.\n")
     for name, table in TABLES.items():

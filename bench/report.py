@@ -24,8 +24,8 @@ ORDER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's com
 BEGIN, END = "<!-- figures: begin, written by python -m bench report -->", "<!-- figures: end -->"
 # Files of bench/results that `report` would refuse, and why they stand all the same; run again, they come off the list.
 KNOWN = {
-    "gpu.json": "All groups but regimes were measured at 77dba6f90b beside changes that were not committed; to be run "
-    "again on an H100.",
+    "gpu.json": "The groups grid and newton were measured at 77dba6f90b beside changes that were not committed, on an "
+    "H100; to be run again.",
 }
 EMPTY = "No figures yet: run `python -m bench cpu` or `python -m bench gpu`, then `python -m bench report`.\n"
 
