@@ -82,12 +82,12 @@ class Scope:
     inside ``resumed()`` what held in the forward holds there, too."""
 
     def __init__(self) -> None:
-        self.checking, self.recorders = checking(), recorders()
+        self.checking, self.recorders = checking(), _recorders if torch.compiler.is_compiling() else _recording.get()
 
     @contextlib.contextmanager
     def resumed(self) -> Iterator[None]:
         known = _recording.get()
-        more = tuple(r for r in self.recorders if all(r is not k for k in known))
+        more = tuple(r for r in self.recorders if all(r[1] is not k[1] for k in known))
         checked, recording = _checking.set(_checking.get() or self.checking), _recording.set((*known, *more))
         try:
             yield

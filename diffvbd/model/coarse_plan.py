@@ -9,10 +9,12 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from .coarse import CoarseGeometry
+from .bodies import connected
+from .coarse import CoarseGeometry, CoarseSpace, build_coarse
+from .rest import rest_metric
 
 LANES = ops.LANES["cpu"]  # tets of a block; twin of kLanes
-KRON = 4  # twin of kRow in csrc/core/views.h: scalars of a row of positions
+ROW = 4  # scalars of a row of positions; twin of kRow in csrc/core/views.h
 
 
 class CoarsePlan(NamedTuple):
@@ -42,6 +44,15 @@ class CoarsePlan(NamedTuple):
     def width(self) -> int:
         """Most functions of a group."""
         return self.group_weights.shape[-1]
+
+
+def plan_of(space: CoarseSpace, points: Tensor, tets: Tensor, pinned: Tensor, mass: Tensor, plan: Tensor
+            ) -> tuple[CoarseGeometry, CoarsePlan]:  # fmt: skip
+    """The space on a mesh in float64, on the CPU; plan: of the sweeps."""
+    arrays = points.numpy(), tets.numpy()
+    geometry = build_coarse(*arrays, pinned.numpy(), connected(tets, len(points)).numpy(), space)
+    rest, _ = rest_metric(points[tets][None])
+    return geometry, arrange_coarse(geometry, space.every, *arrays, mass.numpy(), rest[0].numpy(), plan)
 
 
 def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tets: np.ndarray, mass: np.ndarray,
@@ -78,23 +89,22 @@ def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tet
               len(moment[1]), every, len(order), len(listed)]  # fmt: skip
     arrays = [
         header, g.function_ptr, mass_ptr, position_body, _starts(by_position[0], len(order)), by_position[1],
-        _starts(g.function[rows], g.functions), at[rows], block_ptr, KRON * corner, tet,
+        _starts(g.function[rows], g.functions), at[rows], block_ptr, ROW * corner, np.maximum(tet, 0),
         _starts(g.group_body, g.bodies), g.group_functions, *moment[:2],
         _starts(vertex_body[listed], g.bodies), listed, position[listed],
     ]  # fmt: skip
-    arrays[10] = np.maximum(tet, 0)
     lanes = np.where(tet[:, None] >= 0, rest[np.maximum(tet, 0)].swapaxes(1, 2), _NO_TET[None, :, None])
-    real_value = torch.from_numpy
+    as_tensor = torch.from_numpy
     return CoarsePlan(
         plan=torch.from_numpy(np.concatenate([np.asarray(a).reshape(-1) for a in arrays]).astype(np.int32)),
-        weights=real_value(np.concatenate((by_position[2], g.weight[rows]))),
-        rest=real_value(lanes[None].copy()),
-        tet=real_value(np.maximum(tet, 0)),
-        moments=real_value(moment[2]),
-        volume=real_value(np.bincount(g.tet_group[g.tet_group >= 0], volume[g.tet_group >= 0], len(g.group_body))),
-        mass=real_value(_mass_cells(g, mass, mass_ptr)[None]),
-        group_tets=real_value(group_tets),
-        group_weights=real_value(_group_weights(g, tets, group_tets, inside, vertices)),
+        weights=as_tensor(np.concatenate((by_position[2], g.weight[rows]))),
+        rest=as_tensor(lanes[None].copy()),
+        tet=as_tensor(np.maximum(tet, 0)),
+        moments=as_tensor(moment[2]),
+        volume=as_tensor(np.bincount(g.tet_group[g.tet_group >= 0], volume[g.tet_group >= 0], len(g.group_body))),
+        mass=as_tensor(_mass_cells(g, mass, mass_ptr)[None]),
+        group_tets=as_tensor(group_tets),
+        group_weights=as_tensor(_group_weights(g, tets, group_tets, inside, vertices)),
         sizes=tuple((int(n), int(c)) for n, c in zip(*np.unique(counts, return_counts=True), strict=True)),
     )
 

@@ -21,9 +21,10 @@ from ..mesh import TetMesh
 from ..ops import regimes
 from ..safeguards import FILTER_ETA, SATURATION_EPS
 from .arguments import Energy, checked_coarse, checked_correction, checked_device, checked_energies, per_tet_density
-from .bodies import connected, find_bodies
-from .coarse import CoarseSpace, build_coarse
-from .coarse_plan import arrange_coarse
+from .bodies import find_bodies
+from .coarse import CoarseSpace
+from .coarse_plan import plan_of
+from .describe import describe
 from .rest import lumped_mass, rest_metric
 from .warnings import warn_of
 
@@ -57,9 +58,8 @@ class Model:
         start: Where the sweeps of the other bodies start: ``"predictor"`` (y, with gravity and forces), ``"inertia"``
             (x + h v, right for stiff pinned bodies that few sweeps hardly move) or ``"auto"``: for each body and step
             the one of lower incremental potential; beside pairs and friction the predictor (docs/numerics.md).
-        coarse: Corrections on a coarse space between the sweeps (:class:`diffvbd.CoarseSpace`), which do in few sweeps
-            what is stiff, long, thin or finely meshed; ``"auto"`` is ``CoarseSpace()``. None: none. CPU; not beside a
-            PairBarrier, Friction, the paper's block or saturation.
+        coarse: Corrections between the sweeps, for what is stiff, long, thin or finely meshed: None, a
+            :class:`diffvbd.CoarseSpace`, or ``"auto"``, which is ``CoarseSpace()``. CPU only.
         colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier among the
             energies.
         dtype: torch.float64 or torch.float32.
@@ -170,10 +170,8 @@ class Model:
     @property
     def starts_from(self) -> str:
         """Where the sweeps of bodies that are not corrected start: "auto" only where there is something to choose."""
-        if self.start != "auto":
-            return self.start
-        if self.coarse is not None:  # which takes out a fall better than any start
-            return "inertia"
+        if self.start != "auto" or self.coarse is not None:  # to corrections a fall, too, can be left
+            return "inertia" if self.start == "auto" else self.start
         return "predictor" if self.touches or not self._other_bodies.number else "auto"
 
     @property
@@ -261,15 +259,9 @@ class Model:
         self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
 
     def _arrange_coarse(self) -> None:
-        """Functions and groups of the coarse corrections; everything still on the CPU and in float64."""
-        if self.coarse is None:
-            return
-        points, tets, pinned = self.mesh.points, self.mesh.tets, self._pinned.numpy()
-        label = connected(self._topology[0], len(points)).numpy()
-        self.coarse_geometry = build_coarse(points, tets, pinned, label, self.coarse)
-        rest, _ = rest_metric(ops.tet_gather(torch.from_numpy(points.copy())[None], *self._topology))
-        self._coarse_plan = arrange_coarse(self.coarse_geometry, self.coarse.every, points, tets, self._mass.numpy(),
-                                           rest[0].numpy(), self._plan)  # fmt: skip
+        if self.coarse is not None:
+            given = (self._rest_points, self._topology[0], self._pinned, self._mass, self._plan)
+            self.coarse_geometry, self._coarse_plan = plan_of(self.coarse, *given)
 
     def _parameters(self, energy: VertexEnergy, rest_points: Tensor) -> dict[str, Tensor]:
         return {name: value[None] for name, value in energy.constants(rest_points).items()}
@@ -397,19 +389,7 @@ class Model:
         return predict(self, **options)
 
     def __repr__(self) -> str:
-        safeguards = [f"relaxation={self.relaxation:g}"] if self.relaxation != 1 else []
-        safeguards += [f"saturation={self.saturation:g} m"] if self.saturation is not None else []
-        safeguards += [f"regularization={self.regularization:g} kg"] if self.regularization else []
-        safeguards += ["rigid=False"] if not self.rigid and not self.touches else []
-        safeguards += [f'start="{self.start}"'] if self.start != "auto" else []
-        safeguards += [f"coarse={self.coarse}"] if self.coarse is not None else []
-        return (
-            f"Model({self.num_vertices} vertices, {self.num_tets} tets, {int(self._pinned.sum())} pinned, "
-            f"{self.num_colors} colors, mass {float(self._mass.sum()):.4g} kg, "
-            f"energies=({', '.join(map(repr, self.energies))})"
-            f"{f', {len(self.colliders)} colliders' if self.colliders else ''}"
-            f"{''.join(', ' + s for s in safeguards)}, {self.dtype}, {self.device})"
-        )
+        return describe(self)
 
 
 def _first_of_body(body: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ import torch
 from .fields import CoarseFields
 from .functions import raw_backward, shapes_of
 
-HEADER = 10  # ints of a coarse plan's header; twin of kHeader in csrc/coarse/views.h
 _FIELDS = len(CoarseFields._fields)
 
 

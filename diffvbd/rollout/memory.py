@@ -11,6 +11,7 @@ from torch import Tensor
 from .. import ops
 from ..adjoint.routes import ReverseSweep
 from ..checks import check_count
+from ..mask import KEEPS_POSITIONS
 from ..model.model import Model
 from ..step.memory import cuda_scratch
 from .checkpoints import BinomialCheckpoints, _left, choose_schedule
@@ -61,6 +62,7 @@ def predict(
     # where the sweeps start, the predictor and where the sweeps end; about an origin that, and where the step started
     per_step = (5 if local else 3) * state + tape_bytes
     per_step += scenes * sum(model._data_count) * item if local else 0
+    per_step += scenes * coarse_scalars(model, sweeps) * item
     # of the state before a step, which a step alone is given: v, and x where the sweeps before did not end at it
     between = state * (2 if model.corrects and not local else 1)
     if save in ("all", "last"):
@@ -93,9 +95,17 @@ def predict(
         scratch = cuda_scratch(model, scenes, reverse=True, material=material, rest=rest) + outputs * scenes * item
     else:
         scratch = _cpu_scratch(model, scenes, material, rest) + outputs * scenes * item
+    if model.coarse is not None:
+        plan = model._coarse_plan
+        groups, of_tets = plan.group_tets.shape
+        stiffness = groups * (3 * plan.width) ** 2
+        # once for all steps: what the matrices are made of, and the slopes of the functions that a material meets
+        kept += (stiffness + (groups * of_tets * 3 * plan.width if material else 0)) * item
+        scratch += scenes * (10 * plan.mass.numel() + stiffness) * item
     if policy == ops.NO_TAPE:
         scratch += scalars * ops.tape_rows(ops.FULL_TAPE, model.energy_mask) * item
     parts = (vars(model).values(), model._topology, model._bodies, model._other_bodies)
+    parts += () if model.coarse is None else (model._coarse_plan,)
     tensors = [t for part in parts for t in part if isinstance(t, Tensor)]
     return {
         "model": sum(t.numel() * t.element_size() for t in tensors),
@@ -105,6 +115,17 @@ def predict(
         "scratch": scratch,
         "total": kept + scratch,
     }
+
+
+def coarse_scalars(model: Model, sweeps: int) -> int:
+    """Scalars that the coarse corrections of a step keep for its backward, for each scene: the matrix, its factors, and
+    what each correction has done; with a floor also where it began."""
+    if model.coarse is None:
+        return 0
+    geometry, plan = model.coarse_geometry, model._coarse_plan
+    positions = 3 * int(plan.plan[8]) if model.energy_mask & KEEPS_POSITIONS else 0
+    of_one = 3 * geometry.functions + geometry.bodies + positions
+    return 18 * plan.mass.numel() + model.coarse.corrections(sweeps) * of_one
 
 
 def _cpu_scratch(model: Model, scenes: int, material: bool, rest: bool) -> int:

@@ -148,7 +148,7 @@ def prepare(
     coarse = None
     if model.coarse is not None and model.coarse_geometry.bodies:
         given_mass = None if given_density is None and rest_points is None else mass
-        coarse = coarse_parts(model, *materials, given_mass, rest, corners)
+        coarse = coarse_parts(model, materials[0], materials[1], given_mass, rest, corners)
     return Prepared(
         mu=materials[0],
         lam=materials[1],

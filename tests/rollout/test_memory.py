@@ -46,6 +46,7 @@ def allocated_bytes(run: Callable[[], Any]) -> tuple[int, int]:
 
 def own_tensors(model: dv.Model) -> list[Tensor]:
     parts = (vars(model).values(), model._topology, model._bodies, model._other_bodies)
+    parts += () if model.coarse is None else (model._coarse_plan,)
     return [t for part in parts for t in part if isinstance(t, Tensor)]
 
 
@@ -72,6 +73,23 @@ def test_bytes_of_one_step(tape: str, floor: bool, scenes: int, wanted: str) -> 
     predicted = model.memory(sweeps=SWEEPS, scenes=scenes, tape=tape, rest=wanted == "rest_points")
     graph = model.memory(sweeps=SWEEPS, rest=True)["kept"] - model.memory(sweeps=SWEEPS)["kept"]
     assert_near(predicted["step"] + (graph if wanted == "rest_points" else 0), measured)
+
+
+@pytest.mark.parametrize("floor", [False, True])
+@pytest.mark.parametrize("wanted", ["x", "mu"])
+def test_bytes_of_one_step_with_coarse_corrections(floor: bool, wanted: str) -> None:
+    energies = (dv.StableNeoHookean(), *((dv.FloorBarrier(-1.0),) if floor else ()))
+    mesh = dv.mesh.beam()
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, energies=energies, coarse="auto")
+    x = model.rest_points[None]
+    arguments = {"x": x, "v": torch.zeros_like(x), "mu": torch.full((model.num_tets,), 1e4, dtype=x.dtype)}
+    arguments[wanted].requires_grad_()
+    options = {"lam": 1e4, "time_step": 0.01, "sweeps": 8, "adjoint": dv.ReverseSweep("compact")}
+    given = [*arguments.values(), *own_tensors(model)]
+    measured = saved_bytes(lambda: dv.step(model, **arguments, **options), given)
+    predicted = model.memory(sweeps=8, tape="compact", material=wanted == "mu")
+    frame = 2 * x.numel() * x.element_size()  # which a rollout returns
+    assert_near(predicted["kept"] - frame, measured)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

@@ -1,0 +1,156 @@
+"""Claim: coarse corrections bring stiff bodies near converged steps in a few sweeps, raise no potential, keep momentum,
+and are refused where they are not known to be right."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import reference
+from diffvbd.testing import build_scene, relative_error, tolerance
+
+
+def cantilever(**options: Any) -> tuple[dv.Model, dict[str, Any]]:
+    mesh = dv.mesh.box((13, 4, 4), (1.0, 0.2, 0.2))
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, **options)
+    return model, {"mu": 1e7, "lam": 1e7, "time_step": 1 / 60}
+
+
+def end(model: dv.Model, given: dict[str, Any], sweeps: int, steps: int = 10) -> Tensor:
+    x = model.rest_points
+    return dv.rollout(model, x, torch.zeros_like(x), steps=steps, sweeps=sweeps, save="last", **given).x[-1]
+
+
+def test_a_stiff_cantilever_in_four_sweeps() -> None:
+    model, given = cantilever(coarse="auto", relaxation=1.5)
+    goal = end(model, given, 60)
+    motion = (goal - model.rest_points).abs().max()
+    x, v = goal, torch.zeros_like(goal)
+    after, _ = dv.step(model, x, v, sweeps=60, **given)
+    solved = dv.solve(model, x, v, tolerance=1e-10, **given)  # which looks at the forces that are left
+    assert relative_error(after - x, solved.x - x) <= tolerance("closed_form")
+    error = {k: float((end(model, given, k) - goal).abs().max() / motion) for k in (4, 10)}
+    plain = float((end(cantilever(relaxation=1.5)[0], given, 20) - goal).abs().max() / motion)
+    assert error[4] < 0.01 and error[10] < error[4] / 100 and plain > 0.1, (error, plain)
+
+
+@pytest.mark.parametrize("case", ("inverted", "violent", "huge_strain", "contrast", "floor_filtered"))
+@pytest.mark.parametrize("sweeps", (0, 5))
+def test_no_step_ends_above_its_start(case: str, sweeps: int) -> None:
+    scene = build_scene(case, "structured", "small")
+    model, inputs = scene.model(coarse="auto", rigid=False), scene.inputs()
+    with torch.no_grad():
+        model_of_start = scene.model(start="inertia", rigid=False)
+        begun, _ = dv.step(model_of_start, sweeps=0, **inputs)
+        ended, _ = dv.step(model, sweeps=sweeps, **inputs)
+        potential = [_potential(model, at, inputs) for at in (begun, ended)]
+    assert not torch.equal(begun, ended) or case == "huge_strain"
+    assert potential[1] <= potential[0] * (1 + tolerance("energy_gain")), potential
+
+
+def _potential(model: dv.Model, x: Tensor, inputs: dict[str, Any]) -> float:
+    names = ("mu", "lam", "time_step", "rest_points", "density", "parameters")
+    given = {name: inputs[name] for name in names if name in inputs}
+    load = inputs["gravity"] + inputs["force"] / model.mass[:, None]
+    h, held = inputs["time_step"], model.pinned[:, None]
+    y = torch.where(held, inputs["prescribed"], inputs["x"] + h * inputs["v"] + h * h * load)
+    return float(reference.incremental_potential(model, x, y, x_prev=inputs["x"], **given))
+
+
+def test_momentum_of_a_free_body() -> None:
+    mesh = dv.mesh.box((5, 4, 4), (0.3, 0.15, 0.15))
+    model = dv.Model(mesh, coarse="auto", relaxation=1.5)
+    wave = torch.sin(40 * model.rest_points.flip(-1))
+    x, v = model.rest_points + 0.01 * wave, torch.cos(30 * model.rest_points)
+    x_end, v_end = dv.step(model, x, v, mu=1e6, lam=1e6, time_step=1 / 60, sweeps=4, gravity=(0.0, 0.0, 0.0))
+    mass = model.mass[:, None]
+    before, after = (mass * v).sum(0), (mass * v_end).sum(0)
+    assert relative_error(after, before) <= tolerance("sum")
+    # implicit Euler: L' - L = h sum m v' x v, to what the sweeps have left
+    arm = x - (mass * x).sum(0) / mass.sum()
+    spin = torch.linalg.cross(arm, mass * v).sum(0)
+    arm = x_end - (mass * x_end).sum(0) / mass.sum()
+    change = torch.linalg.cross(arm, mass * v_end).sum(0) - spin
+    expected = torch.linalg.cross(v_end, mass * v).sum(0) / 60
+    assert (change - expected).abs().max() <= tolerance("rigid_momentum") * 100 * spin.abs().max()
+
+
+def test_same_bits_on_one_thread_and_on_two() -> None:
+    mesh = dv.mesh.box((16, 16, 16), (1.0, 1.0, 1.0))
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, coarse="auto", relaxation=1.5)
+    x = model.rest_points.requires_grad_()
+    threads, found = torch.get_num_threads(), []
+    try:
+        for n in (1, 2):
+            torch.set_num_threads(n)
+            x_end, v_end = dv.step(model, x, torch.zeros_like(x), mu=1e6, lam=1e6, time_step=1 / 60, sweeps=8)
+            (bar,) = torch.autograd.grad(x_end.square().sum() + v_end.square().sum(), x)
+            found.append((x_end.detach(), bar))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(one, two) for one, two in zip(*found, strict=True)) and found[0][1].abs().max() > 0
+
+
+def test_scenes_and_bodies_do_not_mix() -> None:
+    """A batch is its scenes one by one, and two bodies far apart are what each is alone."""
+    one = dv.mesh.box((4, 4, 4), (0.2, 0.2, 0.2))
+    two = dv.mesh.join([one, dv.mesh.box((5, 3, 3), (0.4, 0.1, 0.1)).translate((3.0, 0.0, 0.0))])
+    options = {"coarse": dv.CoarseSpace(functions=10), "relaxation": 1.5}
+    given = {"mu": 1e6, "lam": 1e6, "time_step": 1 / 60, "sweeps": 5}
+    model, alone = dv.Model(two, **options), dv.Model(one, **options)
+    x = torch.stack([model.rest_points, model.rest_points * 1.05])
+    ends, _ = dv.step(model, x, torch.zeros_like(x), **given)
+    for scene in range(2):
+        single, _ = dv.step(model, x[scene], torch.zeros_like(x[scene]), **given)
+        assert torch.equal(ends[scene], single)
+        part = x[scene, : one.num_vertices]
+        own, _ = dv.step(alone, part, torch.zeros_like(part), **given)
+        assert relative_error(single[: one.num_vertices], own) <= tolerance("coarse_forward")
+
+
+def test_float32_is_near_float64() -> None:
+    model, given = cantilever(coarse="auto", relaxation=1.5)
+    single = end(model.to(dtype=torch.float32), given, 5)
+    assert single.dtype == torch.float32
+    assert relative_error(single, end(model, given, 5)) <= tolerance("float32_forward")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"coarse": "yes"}, 'coarse: expected a diffvbd.CoarseSpace, "auto" or None'),
+        ({"coarse": "auto", "saturation": 0.1}, "coarse: expected None with saturation"),
+        ({"coarse": "auto", "energies": dv.StableNeoHookean("paper")}, "its exact block"),
+        ({"coarse": "auto", "energies": (dv.StableNeoHookean(), dv.PairBarrier(1e3, 0.01))}, "beside a PairBarrier"),
+        ({"coarse": "auto", "energies": ()}, "None without StableNeoHookean"),
+    ],
+)
+def test_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=message):
+        dv.Model(dv.mesh.cube(3), **options)
+
+
+@pytest.mark.parametrize("options", [{"functions": 0}, {"degree": 4}, {"every": 0}, {"groups": "many"}])
+def test_bad_spaces(options: dict[str, Any]) -> None:
+    (name,) = options
+    with pytest.raises((ValueError, TypeError), match=f"{name}: expected"):
+        dv.CoarseSpace(**options)
+
+
+def test_transforms_are_refused() -> None:
+    model, given = cantilever(coarse="auto")
+    x = model.rest_points
+    with pytest.raises(NotImplementedError, match="coarse corrections"):
+        torch.func.vmap(lambda y: dv.step(model, y, torch.zeros_like(y), sweeps=2, **given)[0])(torch.stack([x, x]))
+
+
+def test_corrections_of_a_step() -> None:
+    """One sweep, a correction, three sweeps, a correction, ..."""
+    space = dv.CoarseSpace()
+    assert [space.corrections(n) for n in (0, 1, 2, 4, 5, 7, 8)] == [1, 1, 1, 1, 2, 2, 3]
+    model, given = cantilever(coarse=space)
+    with dv.coarse.record() as lengths:
+        end(model, given, 8, steps=2)
+    assert [t.shape for t in lengths] == [(1, 3, 1)] * 2 and all((t == 1).all() for t in lengths)
