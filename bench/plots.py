@@ -12,6 +12,7 @@ CAPTIONS = {
     "cost": "Iterations and time of the backward over stiffness, by route",
     "ablation": "Gradient error without each exactness term, over mesh refinement",
     "fd": "Error of the gradients over the step of the difference",
+    "twolevel": "Error over motion against the time of a step, with coarse corrections and with plain sweeps",
 }
 LABELS = {"reverse sweep": ("o", "C0"), "global, assembled": ("s", "C1"), "global, matrix-free": ("x", "C2"),
           "reverse sweep, full tape": ("o", "C0"), "unrolled autograd": ("d", "C3")}  # fmt: skip
@@ -111,9 +112,28 @@ def finite_differences(figure: Any, results: dict[str, Any]) -> None:
     figure.legend(fontsize="small", loc="outside right center")
 
 
+def two_level(figure: Any, results: dict[str, Any]) -> None:
+    rows = results["scenes"]
+    names = ("cantilever, 1029 vertices", "cantilever, 6929 vertices", "sheet, thickness 1/4 cell", "contrast 1e+03")
+    rows = [row for row in rows if row["scene"] in names] or rows[:4]
+    all_axes = figure.subplots(1, len(rows), sharey=True, squeeze=False)[0]
+    for ax, row in zip(all_axes, rows, strict=True):
+        for name, marker, color in (("two_level", "o", "C0"), ("plain", "s", "C1")):
+            shown = [entry for entry in row[name] if entry["error"] > 1e-7 and entry["sweeps"] > 1]
+            label = {"two_level": "coarse corrections", "plain": "plain sweeps"}[name]
+            ax.loglog([e["ms"] for e in shown], [e["error"] for e in shown], marker, linestyle="-", color=color,
+                      markersize=3, label=label)  # fmt: skip
+        ax.set_title(row["scene"], fontsize="small")
+        ax.set(xlabel="ms a step", ylim=(5e-8, 5))
+        ax.grid(alpha=0.3)
+    all_axes[0].set_ylabel("error over motion")
+    all_axes[min(2, len(rows) - 1)].legend(fontsize="x-small", loc="lower left")
+
+
 FIGURES: dict[str, Callable[[Any, dict[str, Any]], None]] = {
     "exactness": exactness,
     "ablation": ablation,
     "cost": cost,
     "fd": finite_differences,
+    "twolevel": two_level,
 }

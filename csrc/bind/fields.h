@@ -23,7 +23,7 @@
   ADJOINT(coarse_matrix) INDEX(coarse_factor) INDEX(coarse_mass) INDEX(coarse_plan) INDEX(coarse_weights) INDEX(coarse_rest)
 
 // The matrix of a coarse space at the start of a step (coarse/matrix.h): plan int32, moments [n, 3] and volume [groups]
-// of the groups, stiffness [1 | scenes, groups, 3 width, 3 width], mass [1 | scenes, cells].
+// of the groups, stiffness [1 | scenes, groups, 3, 3, width, width], mass [1 | scenes, cells].
 #define DIFFVBD_COARSE_FIELDS(ADJOINT, INDEX) \
   ADJOINT(x_prev) ADJOINT(stiffness) ADJOINT(mass) INDEX(plan) INDEX(moments) INDEX(volume)
 

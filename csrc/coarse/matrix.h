@@ -80,7 +80,7 @@ struct MatrixInputs {
   const T* moment;             // [moments, 3]
   const double* volume;        // [groups]
   const T* x_prev;             // [B, V, 3]
-  Batched<const T> stiffness;  // [B, groups, 3 width, 3 width]
+  Batched<const T> stiffness;  // [B, groups, 3, 3, width, width]
   Batched<const T> mass;       // [B, mass_ptr[bodies]]
   int64_t scenes, vertices;
   double time_step;
@@ -100,15 +100,19 @@ bool rotation_of(const MatrixInputs<T>& in, int64_t scene, int group, Matrix& f,
 }
 
 template <class T>
-Matrix block_at(const T* m, int64_t row) {
-  const auto at = [&](int i) { return Vector{double(m[i * row]), double(m[i * row + 1]), double(m[i * row + 2])}; };
+Matrix block_at(const T* m, int64_t row, int64_t column = 1) {
+  const auto at = [&](int i) {
+    const T* a = m + i * row;
+    return Vector{double(a[0]), double(a[column]), double(a[2 * column])};
+  };
   return {at(0), at(1), at(2)};
 }
 template <class T>
-void add_block(T* m, int64_t row, const Matrix& a) {
+void add_block(T* m, int64_t row, const Matrix& a, int64_t column = 1) {
   const Vector* rows[3] = {&a.x, &a.y, &a.z};
   for (int i = 0; i < 3; ++i) {
-    m[i * row] += T(rows[i]->x), m[i * row + 1] += T(rows[i]->y), m[i * row + 2] += T(rows[i]->z);
+    T* to = m + i * row;
+    to[0] += T(rows[i]->x), to[column] += T(rows[i]->y), to[2 * column] += T(rows[i]->z);
   }
 }
 
@@ -125,39 +129,49 @@ void each_pair(const Plan& plan, int body, int group, const F& f) {
   }
 }
 
-// `out` [9 mass_ptr[bodies]] of a scene, zeroed
-template <class T>
-void assemble(const MatrixInputs<T>& in, int64_t scene, int body, T* out) {
+// `out` [9 mass_ptr[bodies]] of a scene, zeroed. rotate(k, plane, r, n, to): to [3, 3, n] := r k r^T of n blocks, whose
+// entries are a plane apart. `work`: 9 width scalars.
+template <class T, class Rotate>
+void assemble(const MatrixInputs<T>& in, int64_t scene, int body, const Rotate& rotate, T* work, T* out) {
   const Plan& plan = in.plan;
-  const int count = plan.function_ptr[body + 1] - plan.function_ptr[body];
+  const int32_t first = plan.function_ptr[body], count = plan.function_ptr[body + 1] - first;
   const T* mass = in.mass.data + scene * in.mass.scene + plan.mass_ptr[body];
   T* to = out + int64_t{9} * plan.mass_ptr[body];
-  const int64_t n = 3 * count;
+  const int64_t n = 3 * count, width = plan.width;
   for (int i = 0; i < count; ++i) {
     for (int j = 0; j < count; ++j) {
       for (int c = 0; c < 3; ++c) to[(3 * i + c) * n + 3 * j + c] += mass[i * count + j];
     }
   }
   const double h2 = in.time_step * in.time_step;
-  const int64_t row = 3 * plan.width;
   for (int g = plan.group_ptr[body]; g < plan.group_ptr[body + 1]; ++g) {
     Matrix f, r;
     rotation_of(in, scene, g, f, r);
-    const Matrix back = transposed(r);
-    const T* k = in.stiffness.data + scene * in.stiffness.scene + g * row * row;
-    each_pair(plan, body, g, [&](int i, int j, int64_t at, int64_t stride) {
-      if (j < i) return;
-      const Matrix block = h2 * (r * block_at(k + 3 * i * row + 3 * j, row) * back);
-      add_block(to + at, stride, block);
-      if (j > i) {  // the same number on both sides of the diagonal
-        const int64_t mirrored = at % stride * stride + at / stride;
-        add_block(to + mirrored, stride, transposed(block));
+    const T turn[9] = {T(r.x.x), T(r.x.y), T(r.x.z), T(r.y.x), T(r.y.y), T(r.y.z), T(r.z.x), T(r.z.y), T(r.z.z)};
+    const T* k = in.stiffness.data + scene * in.stiffness.scene + g * 9 * width * width;
+    const int32_t* functions = plan.group_function + g * width;
+    int64_t used = 0;
+    while (used < width && functions[used] >= 0) ++used;
+    for (int64_t i = 0; i < used; ++i) {
+      // the blocks from the diagonal on: the same numbers go to both sides of it
+      const int64_t blocks = used - i;
+      rotate(k + i * width + i, width * width, turn, blocks, work);
+      const int64_t own = 3 * (functions[i] - first);
+      for (int64_t j = 0; j < blocks; ++j) {
+        const int64_t other = 3 * (functions[i + j] - first);
+        for (int a = 0; a < 3; ++a) {
+          for (int c = 0; c < 3; ++c) {
+            const T value = T(h2) * work[(3 * a + c) * blocks + j];
+            to[(own + a) * n + other + c] += value;
+            if (j > 0) to[(other + c) * n + own + a] += value;
+          }
+        }
       }
-    });
+    }
   }
 }
 
-// Adds to x_bar [V, 3], stiffness_bar [groups, 3 width, 3 width] and mass_bar of a scene; the last two may be null.
+// Adds to x_bar [V, 3], stiffness_bar [groups, 3, 3, width, width] and mass_bar of a scene; the last two may be null.
 template <class T>
 void assemble_vjp(const MatrixInputs<T>& in, int64_t scene, int body, const T* bar, T* x_bar, T* stiffness_bar,
                   T* mass_bar) {
@@ -172,19 +186,21 @@ void assemble_vjp(const MatrixInputs<T>& in, int64_t scene, int body, const T* b
     }
   }
   const double h2 = in.time_step * in.time_step;
-  const int64_t row = 3 * plan.width;
+  const int64_t width = plan.width, plane = width * width;
   for (int g = plan.group_ptr[body]; g < plan.group_ptr[body + 1]; ++g) {
     Matrix f, r, r_bar{};
     const bool turns = rotation_of(in, scene, g, f, r);
     const Matrix back = transposed(r);
-    const T* k = in.stiffness.data + scene * in.stiffness.scene + g * row * row;
+    const T* k = in.stiffness.data + scene * in.stiffness.scene + g * 9 * plane;
     each_pair(plan, body, g, [&](int i, int j, int64_t at, int64_t stride) {
       // the forward takes the upper blocks, and mirrors them
       if (j < i) return;
       Matrix a_bar = h2 * block_at(from + at, stride);
       if (j > i) a_bar = a_bar + h2 * transposed(block_at(from + at % stride * stride + at / stride, stride));
-      const Matrix block = block_at(k + 3 * i * row + 3 * j, row);
-      if (stiffness_bar) add_block(stiffness_bar + g * row * row + 3 * i * row + 3 * j, row, back * a_bar * r);
+      const Matrix block = block_at(k + i * width + j, 3 * plane, plane);
+      if (stiffness_bar) {
+        add_block(stiffness_bar + g * 9 * plane + i * width + j, 3 * plane, back * a_bar * r, plane);
+      }
       r_bar = r_bar + a_bar * r * transposed(block) + transposed(a_bar) * r * block;
     });
     if (!turns) continue;

@@ -52,6 +52,27 @@ void gather_rows(const int32_t* ptr, const int32_t* of, const T* weight, const T
   }
 }
 
+template <class T>
+__attribute__((flatten)) void rotate_blocks(const T* k, int64_t plane, const T* r, int64_t n, T* to) {
+  using R = Lanes<T>;
+  for (int64_t j = 0; j < n; j += kLanes) {
+    const int count = static_cast<int>(n - j < kLanes ? n - j : kLanes);
+    R block[9], half[9];
+    for (int i = 0; i < 9; ++i) block[i] = R::load(k + i * plane + j, count);
+    for (int a = 0; a < 3; ++a) {
+      for (int d = 0; d < 3; ++d) {
+        half[3 * a + d] = R(r[3 * a]) * block[d] + R(r[3 * a + 1]) * block[3 + d] + R(r[3 * a + 2]) * block[6 + d];
+      }
+    }
+    for (int a = 0; a < 3; ++a) {
+      for (int c = 0; c < 3; ++c) {
+        const R sum = half[3 * a] * R(r[3 * c]) + half[3 * a + 1] * R(r[3 * c + 1]) + half[3 * a + 2] * R(r[3 * c + 2]);
+        sum.store(to + (3 * a + c) * n + j, count);
+      }
+    }
+  }
+}
+
 // sum of a[j] b[j], j < n, by packs: in an order that n fixes
 template <class T>
 DIFFVBD_FN T dot_rows(const T* a, const T* b, int64_t n) {
@@ -68,15 +89,64 @@ DIFFVBD_FN T dot_rows(const T* a, const T* b, int64_t n) {
   return out;
 }
 
+// Cholesky's method on `size` rows and columns from `begin` on.
 template <class T>
-__attribute__((flatten)) void factor_rows(const T* matrix, int64_t n, T* factor) {
-  for (int64_t i = 0; i < n; ++i) {
+DIFFVBD_FN void factor_block(T* factor, int64_t n, int64_t begin, int64_t size) {
+  for (int64_t i = begin; i < begin + size; ++i) {
     T* own = factor + i * n;
-    for (int64_t j = 0; j < i; ++j) {
-      own[j] = (matrix[i * n + j] - dot_rows(own, factor + j * n, j)) / factor[j * n + j];
+    for (int64_t j = begin; j <= i; ++j) {
+      const T* row = factor + j * n;
+      T left = own[j];
+      for (int64_t k = begin; k < j; ++k) left -= own[k] * row[k];
+      own[j] = i == j ? std::sqrt(left) : left / row[j];
     }
-    own[i] = std::sqrt(matrix[i * n + i] - dot_rows(own, own, i));
-    for (int64_t j = i + 1; j < n; ++j) own[j] = T(0);
+  }
+}
+
+// The columns of the inverse of a block of kLanes rows.
+template <class T>
+DIFFVBD_FN void invert_block(const T* factor, int64_t n, int64_t begin, Lanes<T>* columns) {
+  for (int j = 0; j < kLanes; ++j) {
+    columns[j] = Lanes<T>(T(0));
+    for (int i = j; i < kLanes; ++i) {
+      const T* row = factor + (begin + i) * n + begin;
+      T sum = T(i == j);
+      for (int k = j; k < i; ++k) sum -= row[k] * columns[j].v[k];
+      columns[j].v[i] = sum / row[i];
+    }
+  }
+}
+
+// By blocks of kLanes columns; `panel` has what earlier columns have in the rows of a block, n x kLanes.
+template <class T>
+__attribute__((flatten)) void factor_rows(const T* matrix, int64_t n, T* panel, T* factor) {
+  using R = Lanes<T>;
+  std::memcpy(factor, matrix, n * n * sizeof(T));
+  if (n % kLanes != 0) return factor_block(factor, n, 0, n);
+  constexpr int kRows = 4;
+  for (int64_t begin = 0; begin < n; begin += kLanes) {
+    for (int64_t k = 0; k < begin; ++k) {
+      for (int64_t j = 0; j < kLanes; ++j) panel[k * kLanes + j] = factor[(begin + j) * n + k];
+    }
+    R columns[kLanes];
+    for (int64_t i = begin; i < n; i += kRows) {
+      R left[kRows];
+      for (int r = 0; r < kRows; ++r) left[r] = R::load(factor + (i + r) * n + begin);
+      for (int64_t k = 0; k < begin; ++k) {
+        const R column = R::load(panel + k * kLanes);
+        for (int r = 0; r < kRows; ++r) left[r] = left[r] - R(factor[(i + r) * n + k]) * column;
+      }
+      for (int r = 0; i >= begin + kLanes && r < kRows; ++r) {
+        R sum(T(0));
+        for (int j = 0; j < kLanes; ++j) sum = sum + R(left[r].v[j]) * columns[j];
+        left[r] = sum;
+      }
+      for (int r = 0; r < kRows; ++r) left[r].store(factor + (i + r) * n + begin);
+      if (i + kRows == begin + kLanes) {
+        factor_block(factor, n, begin, kLanes);
+        invert_block(factor, n, begin, columns);
+      }
+    }
   }
 }
 
@@ -124,6 +194,7 @@ constexpr CoarseKernels<T> coarse_variant() {
     return {gradient_of_blocks<T, with_rare(mask)>,
             reverse_gradient_of_blocks<T, with_rare(mask)>,
             gather_rows<T>,
+            rotate_blocks<T>,
             factor_rows<T>,
             solve_rows<T>,
             line_of_tets<T>};

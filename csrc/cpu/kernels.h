@@ -24,8 +24,11 @@ struct CoarseKernels {
   // to[row] = sum of weight[e] from[of[e]] for e of the rows [begin, end); rows of four scalars
   void (*gather)(const int32_t* ptr, const int32_t* of, const T* weight, const T* from, T* to, int64_t begin,
                  int64_t end);
-  // L of a positive definite matrix = L L^T, n x n, whose upper triangle is not looked at
-  void (*factor)(const T* matrix, int64_t n, T* factor);
+  // to [3, 3, n] := r k r^T of n blocks, whose entries are a plane apart
+  void (*rotate)(const T* k, int64_t plane, const T* r, int64_t n, T* to);
+  // L of a positive definite matrix = L L^T, n x n, small or a multiple of kLanes; above the diagonal
+  // anything. panel: n x kLanes to work with
+  void (*factor)(const T* matrix, int64_t n, T* panel, T* factor);
   // x := (L L^T)^-1 x
   void (*solve)(const T* factor, int64_t n, T* x);
   // adds the coefficients of the tets' potential along `way`, blocks [begin, end) of the coarse plan

@@ -19,11 +19,12 @@ from ..checks import check_count, fail
 FEWEST, MOST = 32, 128  # functions of a body under "auto"
 PER_FUNCTION = 25  # vertices of a large body for each function
 PER_FUNCTION_SMALL = 6  # and of a small one
-PER_FUNCTION_SHEET = 12
+PER_FUNCTION_SHEET = 18
+PER_GROUP = 4
 SHEET = 0.125  # a body is a sheet if its thickness is below this share of its second extent
 GRID = 8  # functions from which on they are splines; fewer are affine
 DEPENDENT = 1e-6  # squared distance of a normalised function from the span of others, below which it is left out
-SIZES = (1, 2, 4, 8, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)  # of a body's matrix, in functions; or multiples
+PACK = 8  # a body's matrix has 1, 2, 4 or a multiple of as many functions
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,7 @@ class CoarseSpace:
         functions: Of each body, at most. ``"auto"``: a 25th of its vertices, 32 to 128; small bodies fewer, down to
             affine functions and constants.
         degree: Of the splines on the body's rest box, 1 to 3. ``"auto"``: 1, in the plane of a sheet 3.
-        groups: Sets of neighbouring tets of a body with one rotation each. ``"auto"``: a quarter of its functions, in
-            a sheet half of them.
+        groups: Sets of neighbouring tets of a body with one rotation each. ``"auto"``: a quarter of its functions.
         every: Sweeps after each correction. A step is: one sweep, then a correction and up to ``every`` sweeps, again
             until ``sweeps`` are done; without sweeps it is one correction.
 
@@ -94,11 +94,11 @@ def build_coarse(points: np.ndarray, tets: np.ndarray, pinned: np.ndarray, label
         free = ~pinned[vertices]
         if own.start == own.stop or not free.any():
             continue
-        weights, sheet = _functions(points[vertices], free, space)
+        weights = _functions(points[vertices], free, space)
         count = weights.shape[1]
         if not count:
             continue
-        groups = -(-count // (2 if sheet else 4)) if space.groups == "auto" else space.groups
+        groups = -(-count // PER_GROUP) if space.groups == "auto" else space.groups
         members = tet_order[own]
         group = _groups(points[tets[members]].mean(1), min(groups, len(members)))
         found.append((_size(count), count, vertices, weights, members, group))
@@ -127,11 +127,11 @@ def build_coarse(points: np.ndarray, tets: np.ndarray, pinned: np.ndarray, label
 
 
 def _size(count: int) -> int:
-    return next((size for size in SIZES if size >= count), -(-count // 128) * 128)
+    return next((size for size in (1, 2, 4) if size >= count), -(-count // PACK) * PACK)
 
 
-def _functions(points: np.ndarray, free: np.ndarray, space: CoarseSpace) -> tuple[np.ndarray, bool]:
-    """Independent functions at the vertices of a body [V, n], zero where they are pinned, and whether it is a sheet."""
+def _functions(points: np.ndarray, free: np.ndarray, space: CoarseSpace) -> np.ndarray:
+    """Independent functions at the vertices of a body [V, n], zero where they are pinned."""
     local = _in_its_box(points)
     extent = np.ptp(local, axis=0)
     long = np.argsort(-extent)
@@ -152,7 +152,7 @@ def _functions(points: np.ndarray, free: np.ndarray, space: CoarseSpace) -> tupl
         axes = [_splines(local[:, a], cells[a], degree[a]) for a in range(3)]
         out = np.einsum("va,vb,vc->vabc", *axes).reshape(len(points), -1)
     out = out * free[:, None]
-    return out[:, _independent(out)], bool(sheet)
+    return out[:, _independent(out)]
 
 
 def _in_its_box(points: np.ndarray) -> np.ndarray:

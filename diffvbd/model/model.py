@@ -374,7 +374,7 @@ class Model:
         """What the kernels execute for this Model besides its tensors; ``scenes`` chooses the regime on CUDA."""
         saturation = -1.0 if self.saturation is None else self.saturation
         # a lone over-relaxed sweep would leave the correction a shape that the next step starts wrong from
-        last = min(self.relaxation, 1.0) if self.corrects else self.relaxation
+        last = min(self.relaxation, 1.0) if self.corrects or self.coarse is not None else self.relaxation
         friction_eps = 1.0 if self.friction is None else time_step * self.friction.velocity
         numbers = ops.StepNumbers(time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS,
                                   FILTER_ETA, last, friction_eps)  # fmt: skip

@@ -97,7 +97,7 @@ class CoarseFields(NamedTuple):
     differentiable."""
 
     x_prev: Tensor
-    stiffness: Tensor  # [1 | B, groups, 3 width, 3 width], at rest [N/m]
+    stiffness: Tensor  # [1 | B, groups, 3, 3, width, width], at rest [N/m]
     mass: Tensor  # [1 | B, cells] [kg]
     plan: Tensor  # of model.coarse_plan, as are the next two
     moments: Tensor

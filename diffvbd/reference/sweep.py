@@ -124,7 +124,7 @@ def stepper(
     masses = color_masses(scene)
     correct = Correction(scene, energies)
     coarse = Coarse(scene, energies) if getattr(model, "coarse", None) is not None else None
-    last = 1.0 if correct.bodies and model.relaxation > 1 else None
+    last = min(model.relaxation, 1.0) if correct.bodies or coarse is not None else model.relaxation
 
     def advance(
         x: Tensor,

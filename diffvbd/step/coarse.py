@@ -27,7 +27,7 @@ _FIELDS = len(ops.CoarseFields._fields)
 class CoarseParts(NamedTuple):
     """What the matrices of all steps are made of."""
 
-    stiffness: Tensor  # [1 | B, groups, 3 width, 3 width], at rest [N/m]
+    stiffness: Tensor  # [1 | B, groups, 3, 3, width, width], at rest [N/m]
     mass: Tensor  # [1 | B, cells] [kg]
     rest: Tensor  # [1 | B, blocks, 7, lanes], see CoarsePlan
 
@@ -40,7 +40,8 @@ def coarse_parts(model: Model, mu: Tensor, lam: Tensor, mass: Tensor | None, res
     least = torch.maximum(lam, mu * (-2 / 3))
     if corners is None and mu.shape[-1] == 1 and lam.shape[-1] == 1:
         unit = model.derived("coarse_unit", lambda: _unit_stiffness(model))
-        stiffness = mu[..., None, None] * unit[:1] + least[..., None, None] * unit[1:]
+        shape = (-1, 1, 1, 1, 1, 1)
+        stiffness = torch.addcmul(mu.reshape(shape) * unit[:1], least.reshape(shape), unit[1:])
     else:
         gradients, volume = _shape_gradients(model, corners)
         shape = (max(mu.shape[0], lam.shape[0]), model.num_tets)
@@ -84,8 +85,7 @@ def _stiffness(plan: Any, mu: Tensor, lam: Tensor, gradients: Tensor, volume: Te
     shear, bulk = weighted(mu), weighted(lam)
     identity = torch.eye(3, dtype=shear.dtype, device=shear.device)
     trace = torch.einsum("bgicjc,pq->bgipjq", shear, identity)
-    out = shear.transpose(3, 5) + trace + bulk
-    return out.reshape(-1, groups, 3 * width, 3 * width).contiguous()
+    return (shear.transpose(3, 5) + trace + bulk).permute(0, 1, 3, 5, 2, 4).contiguous()
 
 
 def _in_lanes(model: Model, rest: Tensor) -> Tensor:

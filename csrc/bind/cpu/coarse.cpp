@@ -3,7 +3,9 @@
 
 #include <torch/csrc/stable/library.h>
 
+#include <algorithm>
 #include <tuple>
+#include <vector>
 
 #include "../../cpu/kernels.h"
 #include "sweep.h"
@@ -30,10 +32,11 @@ std::tuple<Tensor, Tensor> matrix(DIFFVBD_PARAMETERS(COARSE) double time_step) {
     const Tensor out = zeros(x_prev, {in.scenes, size}), factor = empty(x_prev, {in.scenes, size});
     const auto kernels = diffvbd::coarse_kernels<T>(diffvbd::kExactBlock);
     for_bodies(in.scenes, in.plan.bodies, [&](int64_t scene, int body) {
-      coarse::assemble(in, scene, body, data<T>(out) + scene * size);
       const int64_t at = scene * size + int64_t{9} * in.plan.mass_ptr[body];
       const int64_t n = 3 * int64_t{in.plan.function_ptr[body + 1] - in.plan.function_ptr[body]};
-      kernels.factor(data<T>(out) + at, n, data<T>(factor) + at);
+      std::vector<T> work(std::max<int64_t>(9 * in.plan.width, n * diffvbd::kLanes));
+      coarse::assemble(in, scene, body, kernels.rotate, work.data(), data<T>(out) + scene * size);
+      kernels.factor(data<T>(out) + at, n, work.data(), data<T>(factor) + at);
     });
     return std::make_tuple(out, factor);
   });
@@ -48,7 +51,7 @@ std::tuple<Tensor, Tensor, Tensor> matrix_backward(DIFFVBD_PARAMETERS(COARSE) co
     const int64_t cells = p.mass_ptr[p.bodies], size = int64_t{9} * p.groups * p.width * p.width;
     diffvbd::require_like("bar", bar, x_prev, 9 * cells * in.scenes);
     const Tensor x_bar = zeros(x_prev, {in.scenes, in.vertices, 3}),
-                 stiffness_bar = zeros(x_prev, {in.scenes, p.groups, 3 * p.width, 3 * p.width}),
+                 stiffness_bar = zeros(x_prev, {in.scenes, p.groups, 3, 3, p.width, p.width}),
                  mass_bar = zeros(x_prev, {in.scenes, cells});
     for_bodies(in.scenes, p.bodies, [&](int64_t scene, int body) {
       coarse::assemble_vjp(in, scene, body, data<const T>(bar) + 9 * cells * scene,

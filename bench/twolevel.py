@@ -1,0 +1,321 @@
+"""Coarse corrections between sweeps: error and time beside plain sweeps, violent states, and what a correction costs.
+
+Error: the largest distance of a vertex from where converged steps of the same h end, over the largest motion, after 30
+steps. Time: a whole step, on one thread, everything included; also in plain sweeps of the same scene, and as the K of a
+plain step that takes as long. With coarse corrections relaxation is 1.5; plain sweeps have the best of three
+relaxations and two starts at each K.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from bench.common import markdown_table
+from bench.twolevel_scenes import Scene, cantilever, hanging_bar, scenes, violent_scenes
+from diffvbd import reference
+
+SWEEPS = (1, 2, 4, 5, 7, 8, 10, 11, 13, 14, 16, 17, 19, 20, 22, 23, 25, 31, 40, 52, 70, 100, 150, 200, 300)
+PLAIN_SWEEPS = (5, 10, 20, 50, 100, 200, 300)
+LAST = 1000  # plain sweeps where those do not reach 1 %
+PLAIN = tuple((relaxation, start) for relaxation in (1.0, 1.6, 1.8) for start in ("auto", "inertia"))
+VIOLENT_SWEEPS = (13, 25, 49)
+ROUNDS = 7  # of times
+LEVELS = (0.01, 1e-4)
+CONVERGED = 1e-7  # of the motion, between two K
+RISE = 1e-12  # of the potential at the start of a step, below which a rise counts as none
+HANGING, VIOLENT_RATIO, FORWARD, REVERSE = 1e-3, 1.3, 2.5, 3.0  # targets; those of calm scenes stand in `scenes`
+
+
+def run(quick: bool, only: str = "scenes,violent,cost") -> dict[str, Any]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    groups: dict[str, Callable[[bool], Any]] = {
+        "scenes": lambda quick: [measure(scene, quick) for scene in scenes(quick)],
+        "violent": lambda quick: [row for scene in violent_scenes(quick) for row in violent(scene, quick)],
+        "cost": cost,
+    }
+    try:
+        return {name: groups[name](quick) for name in only.split(",")}
+    finally:
+        torch.set_num_threads(threads)
+
+
+def converged(scene: Scene, steps: int, quick: bool, most: int = 6400) -> tuple[Tensor, dict[str, float]]:
+    """Where converged steps end, and how well they have: of the last step the share of its forces left over."""
+    model = scene.model()
+    sweeps, last, apart = 100 if quick else 200, None, float("inf")
+    while True:
+        way = scene.rolled(model, sweeps, steps)
+        moved = float((way.x[-1] - way.x[0]).norm(dim=-1).max())
+        if last is not None:
+            apart = float((way.x[-1] - last).norm(dim=-1).max()) / moved
+        if apart < CONVERGED or sweeps >= most:
+            break
+        last, sweeps = way.x[-1], 2 * sweeps
+    left = dv.diagnose(model, way.x[-1], time_step=scene.time_step, previous=(way.x[-2], way.v[-2]), warn=False,
+                       **scene.material)  # fmt: skip
+    found = {"sweeps": sweeps, "apart": apart, "unbalanced": left.unbalanced, "motion": moved, "courant": left.courant}
+    return way.x[-1], found
+
+
+def measure(scene: Scene, quick: bool) -> dict[str, Any]:
+    steps = 5 if quick else 30
+    goal, found = converged(scene, steps, quick)
+
+    def error(model: dv.Model, sweeps: int) -> float:
+        return float((scene.end(model, sweeps, steps) - goal).norm(dim=-1).max()) / found["motion"]
+
+    model = scene.model()
+    two = [{"sweeps": k, "error": error(model, k)} for k in (SWEEPS[:6] if quick else SWEEPS)]
+    models = {options: scene.model(None, *options) for options in PLAIN}
+    plain = []
+    for k in PLAIN_SWEEPS[:4] if quick else PLAIN_SWEEPS:
+        best = min((error(m, k), *options) for options, m in models.items())
+        plain.append({"sweeps": k, "error": best[0], "relaxation": best[1], "start": best[2]})
+    if not quick and plain[-1]["error"] > LEVELS[0]:
+        options = (plain[-1]["relaxation"], plain[-1]["start"])
+        plain.append({**plain[-1], "sweeps": LAST, "error": error(models[options], LAST)})
+    least_times(scene, [(model, two), (models[PLAIN[0]], plain)], 2 if quick else ROUNDS)
+    sweep, fixed = line(plain)
+    reached = {}
+    for name, rows in (("two_level", two), ("plain", plain)):
+        for level in LEVELS:
+            at = first_below(rows, level)
+            reached[f"{name}_{level:g}"] = None if at is None else {"K": at["sweeps"], "ms": at["ms"],
+                "sweeps": at["ms"] / sweep, "plain_K": (at["ms"] - fixed) / sweep}  # fmt: skip
+    row = {"scene": scene.name, "vertices": scene.mesh.num_vertices, "functions": functions(model),
+           "reference": found, "sweep_ms": sweep, "fixed_ms": fixed, "targets": scene.targets, **reached,
+           "two_level": two, "plain": plain}  # fmt: skip
+    if scene.name == "hanging bar":
+        row["at_rest"] = at_rest(quick)
+    _say(scene.name, {k: v for k, v in row.items() if k not in ("two_level", "plain")})
+    return row
+
+
+def least_times(scene: Scene, models: list[tuple[dv.Model, list[dict[str, Any]]]], rounds: int) -> None:
+    """Adds to each row the time of a step, the least of several rounds of all: the machine is not always as fast."""
+    for n in range(rounds):
+        for model, rows in models:
+            for row in rows:
+                if row["sweeps"] <= 100 or n < 2:
+                    row["ms"] = min(row.get("ms", float("inf")), 1e3 * scene.seconds(model, row["sweeps"]))
+
+
+def line(rows: list[dict[str, Any]]) -> tuple[float, float]:
+    """Milliseconds of a sweep of plain steps, and of what a step costs besides, from K = 10 and K = 50."""
+    few, many = (next(row["ms"] for row in rows if row["sweeps"] == k) for k in (10, 50))
+    sweep = (many - few) / 40
+    return sweep, few - 10 * sweep
+
+
+def first_below(rows: list[dict[str, Any]], level: float) -> dict[str, Any] | None:
+    """The row of least K from which on all errors are below a level."""
+    found = None
+    for row in reversed(rows):
+        if not row["error"] < level:
+            break
+        found = row
+    return found
+
+
+def functions(model: dv.Model) -> int:
+    return int((~model.coarse_geometry.filling).sum())
+
+
+def at_rest(quick: bool) -> list[dict[str, Any]]:
+    """Error of the elongation at which steps without inertia come to rest, as `bench tradeoff` measures it."""
+    scene, out, ends = hanging_bar(), [], {}
+    for k in (10,) if quick else (500, 5, 10, 20):
+        model, (x, v) = scene.model(), scene.state()
+        for _ in range(20 if quick else 2000):
+            before, (x, _) = x, dv.step(model, x, v, time_step=scene.time_step, sweeps=k, **scene.material)
+            if float((x - before).abs().max()) < 1e-12:
+                break
+        ends[k] = float(-1 - x[:, 1].min())
+        out.append({"sweeps": k, "elongation": ends[k], "error": ends[k] / ends[next(iter(ends))] - 1})
+    return out
+
+
+def violent(scene: Scene, quick: bool) -> list[dict[str, Any]]:
+    """Two-level and plain sweeps of equal relaxation and time; whether steps descend from where they start."""
+    steps = 5 if quick else 30
+    goal, found = converged(scene, steps, quick, 1600)
+    two, plain = scene.model(), scene.model(None)
+    # where minima are several, plain sweeps may come to another; each error is to the nearer
+    other = scene.end(plain, 200 if quick else 3000, steps)
+    motion = found["motion"]
+
+    def error(way: dv.Trajectory) -> float:
+        return min(float((way.x[-1] - g).norm(dim=-1).max()) for g in (goal, other)) / motion
+
+    rows = [{"sweeps": k} for k in (VIOLENT_SWEEPS[:1] if quick else VIOLENT_SWEEPS)]
+    beside = [{"sweeps": 10}, {"sweeps": 50}]
+    least_times(scene, [(two, rows), (plain, beside)], 2 if quick else ROUNDS)
+    sweep, fixed = line(beside)
+    out = []
+    for row in rows:
+        k, ms = row["sweeps"], row["ms"]
+        same = max(1, round((ms - fixed) / sweep))
+        with dv.coarse.record() as lengths:
+            way = scene.rolled(two, k, steps)
+        plainly = scene.rolled(plain, same, steps)
+        errors = error(way), error(plainly)
+        # one K may be lucky, so means over K nearby as well
+        around = [error(scene.rolled(two, k + d, steps)) for d in (-6, -3, 0, 3, 6)]
+        plainly_around = [error(scene.rolled(plain, max(1, round(same * f)), steps)) for f in (0.8, 0.9, 1, 1.1, 1.25)]
+        out.append({
+            "scene": scene.name, "sweeps": k, "ms": ms, "plain_sweeps": same, "error": errors[0],
+            "plain_error": errors[1], "ratio": errors[0] / errors[1],
+            "ratio_near": mean(around) / mean(plainly_around),
+            "rise": rise(scene, plain, way), "plain_rise": rise(scene, plain, plainly),
+            "mean_length": float(torch.cat([s.flatten() for s in lengths]).mean()),
+            "references_apart": float((goal - other).norm(dim=-1).max()) / motion, "reference": found,
+        })  # fmt: skip
+        _say(scene.name, out[-1])
+    return out
+
+
+def mean(errors: list[float]) -> float:
+    return float(np.exp(np.mean(np.log(errors))))
+
+
+def rise(scene: Scene, model: dv.Model, way: dv.Trajectory) -> float:
+    """The largest rise of the incremental potential from where a step's sweeps start to its end, over what it is
+    there; negative where all steps descend. model: without corrections, so that no sweeps end where they start."""
+    h, worst = scene.time_step, -float("inf")
+    gravity = torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64)
+    for n in range(len(way.x) - 1):
+        x, v = way.x[n], way.v[n]
+        y = torch.where(model.pinned[:, None], x, x + h * v + h * h * gravity)
+        start, _ = dv.step(model, x, v, time_step=h, sweeps=0, **scene.material)
+        before, after = (
+            float(reference.incremental_potential(model, at, y, **scene.material, time_step=h, x_prev=x))
+            for at in (start, way.x[n + 1])
+        )
+        worst = max(worst, (after - before) / max(abs(before), 1e-300))
+    return worst
+
+
+def cost(quick: bool) -> list[dict[str, Any]]:
+    """One correction in sweeps' time, by differences over K; `reverse` the backward to state and material alone."""
+    beam = cantilever((5, 3, 3) if quick else (21, 7, 7))
+    small = dv.mesh.beam(5, 5, 4, size=(0.1, 0.1, 0.075))
+    side = 2 if quick else 100
+    grid = np.stack(np.meshgrid(range(side), [0], range(side)), -1).reshape(-1, 3)
+    out = [_cost(beam, 31, 61, 3 if quick else 40)]
+    begun = time.perf_counter()
+    many = dv.mesh.replicate(small, 0.2 * grid)
+    meshed = time.perf_counter() - begun
+    pinned = np.tile(small.points[:, 0] < 1e-9, len(grid))
+    crowd = Scene(f"{len(grid)} bodies of {small.num_vertices} vertices", many, pinned, {"mu": 1e7, "lam": 1e7})
+    return [*out, {**_cost(crowd, 7, 19, 3 if quick else 5), "mesh_s": meshed}]
+
+
+def _cost(scene: Scene, few: int, many: int, rounds: int) -> dict[str, Any]:
+    built, models = [], []
+    for coarse in (None, "auto"):
+        begun = time.perf_counter()
+        models.append(scene.model(coarse))
+        built.append(time.perf_counter() - begun)
+    jobs = [(model, k) for model in models for k in (few, many)]
+    best = [(float("inf"),) * 2] * len(jobs)
+    for _ in range(rounds):  # of all: the machine is not always as fast
+        best = [tuple(map(min, found, one_step(scene, *job))) for found, job in zip(best, jobs, strict=True)]
+    corrections = dv.CoarseSpace().corrections(many) - dv.CoarseSpace().corrections(few)
+    row: dict[str, Any] = {"scene": scene.name, "functions": functions(models[1]), "build_plain_s": built[0],
+                           "build_two_level_s": built[1]}  # fmt: skip
+    for part, name in enumerate(("forward", "reverse")):
+        plain_few, plain_many, two_few, two_many = (seconds[part] for seconds in best)
+        sweep = (plain_many - plain_few) / (many - few)
+        one = (two_many - two_few - (plain_many - plain_few)) / corrections
+        besides = two_few - plain_few - one * dv.CoarseSpace().corrections(few)
+        row |= {
+            f"{name}_sweep_ms": 1e3 * sweep,
+            f"{name}_correction_ms": 1e3 * one,
+            f"{name}_besides_ms": 1e3 * besides,
+        }
+    for name, unit in (("forward", "forward"), ("reverse", "forward"), ("reverse", "reverse")):
+        row[f"{name}_correction_in_{unit}_sweeps"] = row[f"{name}_correction_ms"] / row[f"{unit}_sweep_ms"]
+    row["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    _say(scene.name, row)
+    return row
+
+
+def one_step(scene: Scene, model: dv.Model, sweeps: int) -> tuple[float, float]:
+    """Seconds of a step that keeps its tape, and of its backward."""
+    x, v = (t.clone().requires_grad_() for t in scene.state())
+    material: dict[str, Any] = {
+        k: torch.as_tensor(m, dtype=x.dtype).clone().requires_grad_() for k, m in scene.material.items()
+    }
+    begun = time.perf_counter()
+    end, _ = dv.step(model, x, v, time_step=scene.time_step, sweeps=sweeps, **material)
+    middle = time.perf_counter()
+    end.sum().backward()
+    return middle - begun, time.perf_counter() - middle
+
+
+def _say(name: str, row: dict[str, Any]) -> None:
+    print(name, row, file=sys.stderr, flush=True)
+
+
+# --- text -------------------------------------------------------------------------------------------------------------
+
+
+def markdown(results: dict[str, Any]) -> str:
+    parts = []
+    if rows := results.get("scenes"):
+        header = ("scene", "vertices", "functions", "method", "1 %: K", "ms", "sweeps", "equal K", "0.01 %: K", "ms",
+                  "sweeps", "equal K", "error left", "targets")  # fmt: skip
+        parts.append("## Time to an error, and what is left at the most sweeps\n\n" + markdown_table(
+            header, [_time_row(row, method) for row in rows for method in ("two_level", "plain")]))  # fmt: skip
+        counts = [row["sweeps"] for row in rows[0]["two_level"]]
+        table = [[row["scene"], *(r["error"] for r in row["two_level"])] for row in rows]
+        parts.append(
+            "## Error over motion by K, with corrections\n\n" + markdown_table(["scene", *map(str, counts)], table)
+        )
+        table = [[row["scene"], *(f"{r['error']:.3g} ({r['relaxation']:g}, {r['start']})" for r in row["plain"][:7])]
+                 for row in rows]  # fmt: skip
+        counts = [row["sweeps"] for row in rows[0]["plain"][:7]]
+        parts.append("## Plain sweeps: error over motion by K (relaxation, start)\n\n"
+                     + markdown_table(["scene", *map(str, counts)], table))  # fmt: skip
+        table = [[row["scene"], row["sweep_ms"], row["fixed_ms"], *row["reference"].values()] for row in rows]
+        header = ("scene", "ms of a plain sweep", "ms besides", *(k.replace("_", " ") for k in rows[0]["reference"]))
+        parts.append("## References: K, difference of the last two K over motion\n\n" + markdown_table(header, table))
+        for row in rows:
+            if "at_rest" in row:
+                table = markdown_table(list(row["at_rest"][0]), [list(r.values()) for r in row["at_rest"]])
+                error = next(r["error"] for r in row["two_level"] if r["sweeps"] == 10)
+                text = f"Error over motion after 30 steps of K = 10: {error:.3g}; target {HANGING:g}.\n\n"
+                parts.append("## Hanging bar: elongation where steps with corrections come to rest\n\n" + text + table)
+    if rows := results.get("violent"):
+        names = ("scene", "sweeps", "ms", "plain_sweeps", "error", "plain_error", "ratio", "ratio_near", "rise",
+                 "plain_rise", "mean_length", "references_apart")  # fmt: skip
+        risen = sum(row["rise"] > RISE for row in rows)
+        text = f"Target of the ratio: {VIOLENT_RATIO:g}. Rollouts with a step that rises: {risen} of {len(rows)}.\n\n"
+        table = markdown_table([n.replace("_", " ") for n in names], [[row[n] for n in names] for row in rows])
+        parts.append("## Violent states: beside plain sweeps of equal relaxation and time\n\n" + text + table)
+    if rows := results.get("cost"):
+        text = f"Targets, in sweeps: forward {FORWARD:g}, reverse {REVERSE:g}.\n\n"
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        table = [[name.replace("_", " "), *(row.get(name) for row in rows)] for name in names]
+        parts.append("## One correction, in sweeps\n\n" + text + markdown_table(table[0], table[1:]))
+    return "\n".join(parts)
+
+
+def _time_row(row: dict[str, Any], method: str) -> list[Any]:
+    out = [row["scene"], row["vertices"], row["functions"], method.replace("_", " ")]
+    for level in LEVELS:
+        at = row[f"{method}_{level:g}"]
+        out += ["not reached", None, None, None] if at is None else list(at.values())
+    last = row[method][-1]
+    targets = " / ".join("-" if t is None else f"{t:g}" for t in row["targets"]) if method == "two_level" else None
+    return [*out, f"{last['error']:.3g} at {last['sweeps']}", targets]
