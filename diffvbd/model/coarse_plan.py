@@ -26,19 +26,15 @@ class CoarsePlan(NamedTuple):
     tet: Tensor  # int64 [blocks, lanes], their numbers; any at padding
     moments: Tensor  # [n, 3], what the mean deformations of the groups are made of
     volume: Tensor  # float64 [groups]
-    mass: (
-        Tensor  # [1, cells], W' M W of each body with the Model's own masses; 1 on the diagonal of functions that fill
-    )
+    mass: Tensor  # [1, cells], W' M W of each body with the Model's own masses; 1 for functions that fill up
     group_tets: Tensor  # int64 [groups, n], any at padding
     group_weights: Tensor  # [groups, n, 4, width], functions of a group at the corners of its tets; 0 at padding
-    sizes: tuple[tuple[int, int], ...]  # bodies one after another whose matrices have the same number of functions
 
     def to(self, device: torch.device, dtype: torch.dtype) -> CoarsePlan:
         def placed(t: Tensor) -> Tensor:
             return t.to(device, dtype) if t.is_floating_point() else t.to(device)
 
-        out = self._replace(**{name: placed(t) for name, t in self._asdict().items() if isinstance(t, Tensor)})
-        return out._replace(volume=self.volume.to(device))
+        return CoarsePlan(*map(placed, self))._replace(volume=self.volume.to(device))
 
     @property
     def width(self) -> int:
@@ -79,8 +75,8 @@ def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tet
     listed = listed[np.argsort(vertex_body[listed], kind="stable")]
     tet_body = np.where(g.tet_group >= 0, g.group_body[g.tet_group], -1) if len(g.group_body) else g.tet_group
     tet, block_ptr = _blocks(tet_body, g.bodies)
-    corner = np.where(tet[:, None] >= 0, position[tets[np.maximum(tet, 0)].swapaxes(1, 2)], -1)
-    corner = np.where(corner >= 0, corner, corner.max(initial=0))  # padding has one corner four times
+    # padding has one corner of its block four times
+    corner = position[np.where(tet[..., None] >= 0, tets[np.maximum(tet, 0)], tets[tet[:, :1], :1])].swapaxes(1, 2)
 
     group_tets, inside = _padded(g.tet_group, len(g.group_body))
     gradients, volume = _shape_gradients(points[tets]), 1 / (6 * rest[:, 6])
@@ -93,7 +89,7 @@ def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tet
         _starts(g.group_body, g.bodies), g.group_functions, *moment[:2],
         _starts(vertex_body[listed], g.bodies), listed, position[listed],
     ]  # fmt: skip
-    lanes = np.where(tet[:, None] >= 0, rest[np.maximum(tet, 0)].swapaxes(1, 2), _NO_TET[None, :, None])
+    lanes = rest[np.maximum(tet, 0)].swapaxes(1, 2)  # of any tet at padding, whose corners do not move apart
     as_tensor = torch.from_numpy
     return CoarsePlan(
         plan=torch.from_numpy(np.concatenate([np.asarray(a).reshape(-1) for a in arrays]).astype(np.int32)),
@@ -102,14 +98,10 @@ def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tet
         tet=as_tensor(np.maximum(tet, 0)),
         moments=as_tensor(moment[2]),
         volume=as_tensor(np.bincount(g.tet_group[g.tet_group >= 0], volume[g.tet_group >= 0], len(g.group_body))),
-        mass=as_tensor(_mass_cells(g, mass, mass_ptr)[None]),
+        mass=as_tensor(_mass_cells(g, mass)[None]),
         group_tets=as_tensor(group_tets),
         group_weights=as_tensor(_group_weights(g, tets, group_tets, inside, vertices)),
-        sizes=tuple((int(n), int(c)) for n, c in zip(*np.unique(counts, return_counts=True), strict=True)),
     )
-
-
-_NO_TET = np.array([0.0, 0, 0, 0, 0, 0, 1])  # rest scalars without stiffness
 
 
 def _starts(sorted_values: np.ndarray, count: int) -> np.ndarray:
@@ -174,27 +166,27 @@ def _group_weights(g: CoarseGeometry, tets: np.ndarray, group_tets: np.ndarray, 
     return out
 
 
-def _mass_cells(g: CoarseGeometry, mass: np.ndarray, mass_ptr: np.ndarray) -> np.ndarray:
-    """W' M W of each body, one after the other."""
-    out = np.zeros(int(mass_ptr[-1]))
-    first, second, weight = mass_pairs(g, mass_ptr)
-    np.add.at(out, first, weight * mass[second])
-    body = np.repeat(np.arange(g.bodies), np.diff(g.function_ptr))
-    own = np.arange(g.functions) - g.function_ptr[body]
-    diagonal = mass_ptr[body] + own * (np.diff(g.function_ptr)[body] + 1)
-    out[diagonal[g.filling]] = 1.0
+def _mass_cells(g: CoarseGeometry, mass: np.ndarray) -> np.ndarray:
+    cell, vertex, weight, out = mass_parts(g)
+    np.add.at(out, cell, weight * mass[vertex])
     return out
 
 
-def mass_pairs(g: CoarseGeometry, mass_ptr: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cell, vertex and weight of each product that W' M W is a sum of."""
-    ptr = np.searchsorted(g.vertex, np.unique(g.vertex))
-    count = np.diff(np.append(ptr, len(g.vertex)))
-    of = np.repeat(count, count)  # of each entry: how many its vertex has
+def mass_parts(g: CoarseGeometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What W' M W of all bodies is a sum of: cell, vertex and weight of each product; and the cells that this is added
+    to: 1 on the diagonal of functions that fill up a matrix, else 0."""
+    size = np.diff(g.function_ptr)
+    mass_ptr = np.concatenate(([0], np.cumsum(size**2)))
+    body = np.repeat(np.arange(g.bodies), size)
+    own = np.arange(g.functions) - g.function_ptr[body]
+    filled = np.zeros(int(mass_ptr[-1]))
+    filled[(mass_ptr[body] + own * (size[body] + 1))[g.filling]] = 1.0
+
+    first = np.searchsorted(g.vertex, np.unique(g.vertex))
+    count = np.diff(np.append(first, len(g.vertex)))
+    of = np.repeat(count, count)  # of each entry of W: how many its vertex has
     one = np.repeat(np.arange(len(g.vertex)), of)
-    start = np.repeat(np.repeat(ptr, count), of)
-    two = start + np.arange(len(one)) - np.repeat(np.cumsum(of) - of, of)
-    body = np.searchsorted(g.function_ptr, g.function[one], side="right") - 1
-    size, first = np.diff(g.function_ptr)[body], g.function_ptr[body]
-    cell = mass_ptr[body] + (g.function[one] - first) * size + g.function[two] - first
-    return cell, g.vertex[one], g.weight[one] * g.weight[two]
+    two = np.repeat(np.repeat(first, count), of) + np.arange(len(one)) - np.repeat(np.cumsum(of) - of, of)
+    body = body[g.function[one]]
+    cell = mass_ptr[body] + own[g.function[one]] * size[body] + own[g.function[two]]
+    return cell, g.vertex[one], g.weight[one] * g.weight[two], filled

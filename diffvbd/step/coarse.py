@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, NoReturn
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..model.coarse_plan import mass_pairs
+from ..model.coarse_plan import mass_parts
 from ..model.model import Model
 from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
 from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
@@ -36,18 +35,19 @@ def coarse_parts(model: Model, mu: Tensor, lam: Tensor, mass: Tensor | None, res
                  ) -> CoarseParts:  # fmt: skip
     """mu, lam [1 | B, 1 | T]; mass [B, V], rest [B, T, 7] and the tets' corners at rest [B, T, 4, 3] where a step is
     given them, else None."""
-    plan = model._coarse_plan
-    least = torch.maximum(lam, mu * (-2 / 3))
-    if corners is None and mu.shape[-1] == 1 and lam.shape[-1] == 1:
-        unit = model.derived("coarse_unit", lambda: _unit_stiffness(model))
-        shape = (-1, 1, 1, 1, 1, 1)
-        stiffness = torch.addcmul(mu.reshape(shape) * unit[:1], least.reshape(shape), unit[1:])
-    else:
-        gradients, volume = _shape_gradients(model, corners)
-        shape = (max(mu.shape[0], lam.shape[0]), model.num_tets)
-        stiffness = _stiffness(plan, ops.broadcast(mu, shape), ops.broadcast(least, shape), gradients, volume)
-    lanes = plan.rest if rest is None else _in_lanes(model, rest.detach())
-    return CoarseParts(stiffness, plan.mass if mass is None else _mass(model, mass), lanes)
+    with torch.autocast(mu.device.type, enabled=False):  # which would take the products in half precision
+        plan = model._coarse_plan
+        least = torch.maximum(lam, mu * (-2 / 3))
+        if corners is None and mu.shape[-1] == 1 and lam.shape[-1] == 1:
+            unit = model.derived("coarse_unit", lambda: _unit_stiffness(model))
+            shape = (-1, 1, 1, 1, 1, 1)
+            stiffness = torch.addcmul(mu.reshape(shape) * unit[:1], least.reshape(shape), unit[1:])
+        else:
+            gradients, volume = _shape_gradients(model, corners)
+            shape = (max(mu.shape[0], lam.shape[0]), model.num_tets)
+            stiffness = _stiffness(plan, ops.broadcast(mu, shape), ops.broadcast(least, shape), gradients, volume)
+        lanes = plan.rest if rest is None else rest.detach()[:, plan.tet].transpose(-1, -2).contiguous()
+        return CoarseParts(stiffness, plan.mass if mass is None else _mass(model, mass), lanes)
 
 
 def _unit_stiffness(model: Model) -> Tensor:
@@ -88,34 +88,15 @@ def _stiffness(plan: Any, mu: Tensor, lam: Tensor, gradients: Tensor, volume: Te
     return (shear.transpose(3, 5) + trace + bulk).permute(0, 1, 3, 5, 2, 4).contiguous()
 
 
-def _in_lanes(model: Model, rest: Tensor) -> Tensor:
-    plan = model._coarse_plan
-    lanes = rest[:, plan.tet].transpose(-1, -2)
-    return torch.where(plan.rest[:, :, 6:] == 1, plan.rest, lanes) if _has_padding(model) else lanes.contiguous()
-
-
-def _has_padding(model: Model) -> bool:
-    return model.derived("coarse_padding", lambda: bool((model._coarse_plan.rest[:, :, :6] == 0).all(2).any()))
-
-
 def _mass(model: Model, mass: Tensor) -> Tensor:
     """W' M W of each body [B, cells]."""
 
-    def pairs() -> tuple[Tensor, ...]:
-        geometry = model.coarse_geometry
-        mass_ptr = np.concatenate(([0], np.cumsum(np.diff(geometry.function_ptr) ** 2)))
-        cell, vertex, weight = mass_pairs(geometry, mass_ptr)
-        known = model._coarse_plan.mass
-        filled = torch.zeros_like(known)
-        body = np.repeat(np.arange(geometry.bodies), np.diff(geometry.function_ptr))
-        own = np.arange(geometry.functions) - geometry.function_ptr[body]
-        diagonal = mass_ptr[body] + own * (np.diff(geometry.function_ptr)[body] + 1)
-        filled[0, torch.from_numpy(diagonal[geometry.filling]).to(known.device)] = 1
-        found = (torch.from_numpy(cell).to(known.device), torch.from_numpy(vertex).to(known.device),
-                 torch.from_numpy(weight).to(known))  # fmt: skip
-        return (*found, filled)
+    def placed() -> tuple[Tensor, ...]:
+        like = model._coarse_plan.mass
+        cell, vertex, weight, filled = (torch.from_numpy(a).to(like.device) for a in mass_parts(model.coarse_geometry))
+        return cell, vertex, weight.to(like.dtype), filled.to(like.dtype)
 
-    cell, vertex, weight, filled = model.derived("coarse_mass_pairs", pairs)
+    cell, vertex, weight, filled = model.derived("coarse_mass", placed)
     return filled.expand(len(mass), -1).index_add(1, cell, weight * mass[:, vertex])
 
 

@@ -154,3 +154,11 @@ def test_corrections_of_a_step() -> None:
     with dv.coarse.record() as lengths:
         end(model, given, 8, steps=2)
     assert [t.shape for t in lengths] == [(1, 3, 1)] * 2 and all((t == 1).all() for t in lengths)
+
+
+def test_autocast_leaves_the_precision_alone() -> None:
+    model, given = cantilever(coarse="auto", relaxation=1.5)
+    moduli = {name: torch.linspace(1, 2, model.num_tets, dtype=torch.float64) * given[name] for name in ("mu", "lam")}
+    usual = end(model, given | moduli, 4, steps=2)
+    with torch.autocast("cpu"):
+        assert torch.equal(end(model, given | moduli, 4, steps=2), usual)
