@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 _checking: ContextVar[bool] = ContextVar("diffvbd.debug_checks", default=False)
-_recording: ContextVar[tuple[tuple[str, list[Any]], ...]] = ContextVar("diffvbd.contact.record", default=())
+_recording: ContextVar[tuple[tuple[str, list[Any]], ...]] = ContextVar("diffvbd.record", default=())
 _lock = threading.Lock()
 _checked_by = 0  # threads and tasks inside debug_checks()
 _any_checking = False

@@ -278,6 +278,12 @@ def test_constants_agree_across_languages() -> None:
     assert ops.REST_SCALARS == constant("energies/tet.h", "rest")
     assert ops.PLAN_HEADER == constant("core/plan_views.h", "kPlanHeader")
     assert coarse_plan.ROW == constant("core/views.h", "kRow")
+    lengths, twin = code_of(CSRC / "coarse" / "length.h"), reference.coarse
+    names = {"kLengths": twin.HALVINGS, "kDecrease": twin.DECREASE, "kRounding": twin.ROUNDING,
+             "kFailures": twin.REFUSALS}  # fmt: skip
+    assert {name: float(*re.findall(rf"{name} = ([\d.e-]+);", lengths)) for name in names} == names
+    matrix = code_of(CSRC / "coarse" / "matrix.h")
+    assert float(*re.findall(r"kCollapsed = ([\d.e-]+);", matrix)) == twin.LEAST_TURN
     assert memory.WORKSPACE_BUDGET == constant("bind/cuda/sweep.h", "kWorkspaceBudget")
     floor, anchor = (CSRC / "energies" / f"{name}.h" for name in ("floor_barrier", "anchor"))
     strides = [int(re.findall(r"stride = (\d+);", p.read_text(encoding="utf-8"))[0]) for p in (floor, anchor)]

@@ -17,11 +17,14 @@ inline coarse::Plan coarse_plan(const Tensor& plan) {
 }
 
 template <class T>
-coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, int64_t sweeps, int energies) {
+coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, int64_t sweeps, int energies,
+                                int64_t positions) {
   coarse::Inputs<T> in{};
   in.plan = coarse_plan(f.coarse_plan);
   const coarse::Plan& p = in.plan;
   const int64_t b = x.size(0), cells = p.mass_ptr[p.bodies];
+  require(p.positions == positions && p.every > 0, "coarse_plan: expected one of this Model's sweeps");
+  require_like("coarse_matrix", f.coarse_matrix, x, 9 * cells * b);
   const Tensor& w = f.coarse_weights;
   require_like("coarse_weights", w, x, 2 * int64_t{p.entries});
   in.weight = data<const T>(w);

@@ -10,10 +10,9 @@ namespace diffvbd::coarse {
 
 constexpr int kLengths = 8;  // 1, 1/2, ... 1/128; then 0
 constexpr int kDegree = TetLayout::line_degree;
-constexpr double kDecrease = 1e-4;   // share of what the slope promises
-constexpr double kRounding = 8;      // ulps of the terms that a sum may lose
-constexpr int kFailures = 2;         // lengths of 0 after which a body's corrections are over
-constexpr double kLeastShare = 0.1;  // of its gap that a vertex keeps, as in rigid/body.h
+constexpr double kDecrease = 1e-4;  // share of what the slope promises
+constexpr double kRounding = 8;     // ulps of the terms that a sum may lose
+constexpr int kFailures = 2;        // lengths of 0 after which a body's corrections are over
 
 inline double length_of(int trial) { return std::ldexp(1.0, -trial); }
 

@@ -2,6 +2,9 @@
 // the rotation nearest to the mean deformation of the group at the start of the step (docs/method.md, section 15).
 #pragma once
 
+#include <cmath>
+#include <utility>
+
 #include "../rigid/rotation.h"
 #include "views.h"
 
@@ -116,14 +119,14 @@ void add_block(T* m, int64_t row, const Matrix& a, int64_t column = 1) {
   }
 }
 
-// calls f(i, j, where in the body's matrix, its row) for the pairs of functions of a group
+// calls f(i, j, where in the body's matrix, its row) for the pairs i <= j of functions of a group
 template <class F>
 void each_pair(const Plan& plan, int body, int group, const F& f) {
   const int32_t* functions = plan.group_function + int64_t{group} * plan.width;
   const int32_t first = plan.function_ptr[body];
   const int64_t n = int64_t{3} * (plan.function_ptr[body + 1] - first);
   for (int i = 0; i < plan.width && functions[i] >= 0; ++i) {
-    for (int j = 0; j < plan.width && functions[j] >= 0; ++j) {
+    for (int j = i; j < plan.width && functions[j] >= 0; ++j) {
       f(i, j, 3 * (functions[i] - first) * n + 3 * (functions[j] - first), n);
     }
   }
@@ -193,8 +196,7 @@ void assemble_vjp(const MatrixInputs<T>& in, int64_t scene, int body, const T* b
     const Matrix back = transposed(r);
     const T* k = in.stiffness.data + scene * in.stiffness.scene + g * 9 * plane;
     each_pair(plan, body, g, [&](int i, int j, int64_t at, int64_t stride) {
-      // the forward takes the upper blocks, and mirrors them
-      if (j < i) return;
+      // the forward mirrors the blocks above the diagonal
       Matrix a_bar = h2 * block_at(from + at, stride);
       if (j > i) a_bar = a_bar + h2 * transposed(block_at(from + at % stride * stride + at / stride, stride));
       const Matrix block = block_at(k + i * width + j, 3 * plane, plane);

@@ -115,7 +115,7 @@ void CoarseScene<T>::correct(int k, Team::Member& member) {
       const T length = lengths[p.position_body[i]];
       for (int c = 0; c < 3; ++c) {
         if (c_.keeps_positions) before[3 * i + c] = s_.x[4 * i + c];
-        s_.x[4 * i + c] += length * s_.way[4 * i + c];
+        if (length > 0) s_.x[4 * i + c] += length * s_.way[4 * i + c];  // one that was refused may be no number
       }
     }
   });
@@ -130,13 +130,13 @@ void CoarseScene<T>::decide(int32_t body, const T* a, T* length) {
   if (failures_[body] >= coarse::kFailures) return;
   const int32_t first = p.function_ptr[body], count = p.function_ptr[body + 1] - first;
   const T* restricted = rows_.get() + 4 * int64_t{p.functions};
-  double slope = 0, momentum = 0;
+  double slope = 0, inertial = 0;  // the second: a . (P' M P) a
   for (int64_t i = 3 * first; i < 3 * (first + count); ++i) slope -= double(a[i]) * double(restricted[i]);
   const T* mass = c_.mass.data + scene_ * c_.mass.scene + p.mass_ptr[body];
   for (int i = 0; i < count; ++i) {
     for (int j = 0; j < count; ++j) {
       const T *x = a + 3 * (first + i), *y = a + 3 * (first + j);
-      momentum += double(mass[i * count + j]) * (double(x[0]) * y[0] + double(x[1]) * y[1] + double(x[2]) * y[2]);
+      inertial += double(mass[i * count + j]) * (double(x[0]) * y[0] + double(x[1]) * y[1] + double(x[2]) * y[2]);
     }
   }
   coarse::Change change{};
@@ -147,7 +147,7 @@ void CoarseScene<T>::decide(int32_t body, const T* a, T* length) {
     const double* sum = sums_.get() + (at - parts_.begin()) * coarse::kDegree;
     for (int i = 0; i < coarse::kDegree; ++i) change.c[i] += h2 * sum[i];
   }
-  change.c[1] += 0.5 * momentum;
+  change.c[1] += 0.5 * inertial;
   const bool others = std::any_of(in_.data_count, in_.data_count + kVertexEnergies, [](int n) { return n > 0; });
   change.c[0] = others ? change.c[0] + inertia(body) : slope;
   const double s = coarse::length<T>(change, slope,
@@ -193,7 +193,7 @@ double CoarseScene<T>::energies(int32_t body, double s, double& size) const {
           VertexState<double> there = state;
           there.x = moved;
           if constexpr (E::has_filter) {
-            if (!E::template admits<T>(there, x, data, count, coarse::kLeastShare)) admitted = false;
+            if (!E::template admits<T>(there, x, data, count, rigid::kLeastShare)) admitted = false;
           }
           const double before = E::value(state, data, count), after = E::value(there, data, count);
           rise += after - before;
@@ -248,6 +248,12 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
   member.barrier();
   T* q = restricted;
   solve(q, member);
+  member.each(0, p.bodies, [&](int64_t begin, int64_t end) {
+    for (int64_t b = begin; b < end; ++b) {
+      if (!(lengths[b] > 0)) std::fill(q + 3 * p.function_ptr[b], q + 3 * p.function_ptr[b + 1], T(0));
+    }
+  });
+  member.barrier();
   // back to where the correction began: x -= s (-P a)
   member.each(0, p.functions, [&](int64_t begin, int64_t end) {
     for (int64_t f = begin; f < end; ++f) {
@@ -261,7 +267,11 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
       if (p.position_body[i] < 0) continue;
       const T length = lengths[p.position_body[i]];
       for (int c = 0; c < 3; ++c) {
-        s_.x[4 * i + c] = c_.keeps_positions ? before[3 * i + c] : s_.x[4 * i + c] + length * s_.way[4 * i + c];
+        if (c_.keeps_positions) {
+          s_.x[4 * i + c] = before[3 * i + c];
+        } else if (length > 0) {
+          s_.x[4 * i + c] += length * s_.way[4 * i + c];
+        }
       }
     }
   });
@@ -276,6 +286,7 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
     T* bar = c_.matrix_bar + scene_ * 9 * int64_t{p.mass_ptr[p.bodies]};
     member.each(0, p.bodies, [&](int64_t begin, int64_t end) {
       for (int64_t b = begin; b < end; ++b) {
+        if (!(lengths[b] > 0)) continue;
         const int64_t first = int64_t{3} * p.function_ptr[b], n = int64_t{3} * p.function_ptr[b + 1] - first;
         T* to = bar + int64_t{9} * p.mass_ptr[b];
         for (int64_t i = 0; i < n; ++i) {

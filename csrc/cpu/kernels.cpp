@@ -67,7 +67,9 @@ SweepKernel<T> reverse_kernel(int energies) {
 
 template <class T>
 CoarseKernels<T> coarse_kernels(int energies) {
-  return kernels<T>().coarse(energies);
+  const CoarseKernels<T> out = kernels<T>().coarse(energies);
+  if (!out.gradient) throw std::invalid_argument("coarse: expected the exact block");
+  return out;
 }
 
 template SweepKernel<float> forward_kernel<float>(int);

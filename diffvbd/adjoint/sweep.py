@@ -192,7 +192,7 @@ def _scenes(tensors: Sequence[Tensor | None], in_dims: tuple) -> int:
 def sweep(fields: ops.SweepFields, packed_rest: Tensor, plan: Tensor, settings: ops.SweepSettings, *, tape_policy: int,
           debug_step: int = -1, checked: bool = True) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Positions after the sweeps [B, V, 3]; with contact where a bound has held back an update, uint8 [B, V]; and what
-    coarse corrections did [B, corrections, 3 functions + bodies], the length of each body's last.
+    coarse corrections did [B, corrections, n]: 3 numbers a function, each body's length, with a floor where it began.
 
     Args:
         fields: See SweepFields; differentiable in those of SWEEP_ADJOINTS.

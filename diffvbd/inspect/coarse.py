@@ -14,9 +14,10 @@ __all__ = ["record"]
 
 @contextlib.contextmanager
 def record() -> Iterator[list[Tensor]]:
-    """Inside, every step of a Model with a coarse space appends the lengths of its corrections, a tensor [scenes,
-    corrections, bodies]: 1 is a whole correction, 0 one that was refused, because it would have raised the potential.
-    A backward with checkpoints runs steps again, and counts."""
+    """Inside, every step that ReverseSweep differentiates (the default) appends the lengths of its corrections
+    [scenes, corrections, bodies]: 1 is a whole correction, 0 one that was refused, because it would have raised the
+    potential. A backward with checkpoints runs steps again, and counts; so do the parts of :func:`diffvbd.solve`. Steps
+    by Unrolled and GlobalAdjoint append nothing."""
     found: list[Tensor] = []
     with record_to(found, "coarse"):
         yield found

@@ -14,7 +14,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..checks import check_count, fail
+from .. import ops
+from ..checks import check_count
 
 FEWEST, MOST = 32, 128  # functions of a body under "auto"
 PER_FUNCTION = 25  # vertices of a large body for each function
@@ -24,7 +25,7 @@ PER_GROUP = 4
 SHEET = 0.125  # a body is a sheet if its thickness is below this share of its second extent
 GRID = 8  # functions from which on they are splines; fewer are affine
 DEPENDENT = 1e-6  # squared distance of a normalised function from the span of others, below which it is left out
-PACK = 8  # a body's matrix has 1, 2, 4 or a multiple of as many functions
+PACK = ops.LANES["cpu"]  # a body's matrix has 1, 2, 4 or a multiple of as many functions
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,8 @@ class CoarseSpace:
         for name in ("functions", "groups"):
             if getattr(self, name) != "auto":
                 check_count(name, getattr(self, name), 1)
-        if self.degree != "auto" and check_count("degree", self.degree, 1, maximum=3) > 3:
-            fail("degree", '1, 2, 3 or "auto"', self.degree)
+        if self.degree != "auto":
+            check_count("degree", self.degree, 1, maximum=3)
         check_count("every", self.every, 1)
 
     def corrections(self, sweeps: int) -> int:
@@ -148,6 +149,8 @@ def _functions(points: np.ndarray, free: np.ndarray, space: CoarseSpace) -> np.n
         if sheet:
             plane = 3 if space.degree == "auto" else space.degree
             degree[long] = (plane, plane, 1)
+        while np.prod(degree + 1) > target:  # one cell has too many
+            degree[np.argmax(degree)] -= 1
         cells = _cells(extent, degree, target)
         axes = [_splines(local[:, a], cells[a], degree[a]) for a in range(3)]
         out = np.einsum("va,vb,vc->vabc", *axes).reshape(len(points), -1)

@@ -57,7 +57,7 @@ class Model:
             friction, which it does not see yet.
         start: Where the sweeps of the other bodies start: ``"predictor"`` (y, with gravity and forces), ``"inertia"``
             (x + h v, right for stiff pinned bodies that few sweeps hardly move) or ``"auto"``: for each body and step
-            the one of lower incremental potential; beside pairs and friction the predictor (docs/numerics.md).
+            the one of lower incremental potential; beside pairs and friction the predictor, with coarse x + h v.
         coarse: Corrections between the sweeps, for what is stiff, long, thin or finely meshed: None, a
             :class:`diffvbd.CoarseSpace`, or ``"auto"``, which is ``CoarseSpace()``. CPU only.
         colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier among the
@@ -170,7 +170,7 @@ class Model:
     @property
     def starts_from(self) -> str:
         """Where the sweeps of bodies that are not corrected start: "auto" only where there is something to choose."""
-        if self.start != "auto" or self.coarse is not None:  # to corrections a fall, too, can be left
+        if self.start != "auto" or self.coarse is not None:  # corrections do what the predictor is for
             return "inertia" if self.start == "auto" else self.start
         return "predictor" if self.touches or not self._other_bodies.number else "auto"
 

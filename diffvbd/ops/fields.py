@@ -48,9 +48,9 @@ class SweepFields(NamedTuple):
     floor_lag: Tensor | None = None  # [B, V, planes, 4]
     corners_prev: Tensor | None = None  # x_prev of the tets' corners, [12, B, T], where their law reads it
     # coarse corrections; see model.coarse_plan for the constants
-    coarse_matrix: Tensor | None = None  # [B, cells] [kg]
+    coarse_matrix: Tensor | None = None  # [B, 9 cells] [kg]
     coarse_factor: Tensor | None = None  # its Cholesky factors, body by body
-    coarse_mass: Tensor | None = None  # [1 | B, cells / 9] [kg]
+    coarse_mass: Tensor | None = None  # [1 | B, cells] [kg]
     coarse_plan: Tensor | None = None
     coarse_weights: Tensor | None = None
     coarse_rest: Tensor | None = None  # [1 | B, blocks, 7, lanes]

@@ -125,7 +125,8 @@ class Coarse:
                 slope = of_function.new_zeros(*a.shape[:-1], self.bodies)
                 slope = slope.index_add(-1, self.body_of_function, of_function)
                 steps = self._search(state, p, y, x_prev, slope, skipped)
-        return state + self._of_vertices(steps) * p, steps
+        lengths = self._of_vertices(steps)
+        return torch.where(lengths > 0, state + lengths * p, state), steps
 
     def _gradient(self, state: Tensor, y: Tensor, x_prev: Tensor) -> Tensor:
         """dG [..., 3, V], by the formulas that sweeps use; zero at pinned vertices that are where they belong."""

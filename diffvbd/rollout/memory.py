@@ -120,7 +120,7 @@ def predict(
 def coarse_scalars(model: Model, sweeps: int) -> int:
     """Scalars that the coarse corrections of a step keep for its backward, for each scene: the matrix, its factors, and
     what each correction has done; with a floor also where it began."""
-    if model.coarse is None:
+    if model.coarse is None or not model.coarse_geometry.bodies:
         return 0
     geometry, plan = model.coarse_geometry, model._coarse_plan
     positions = 3 * int(plan.plan[8]) if model.energy_mask & KEEPS_POSITIONS else 0

@@ -99,7 +99,7 @@ def step(
     prepared = prepare(model, lead, mu=mu, lam=lam, young=young, poisson=poisson, time_step=time_step, sweeps=sweeps,
                        rest_points=rest_points, density=density, parameters=parameters, adjoint=adjoint)  # fmt: skip
     check_prescribed(model, prescribed, x)
-    if looks_at(prepared.mu) and looks_at(prepared.lam):
+    if model.coarse is None and looks_at(prepared.mu) and looks_at(prepared.lam):
         warn_of_thin_tets(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps)
     return advance(model, x, v, prepared, force=force, gravity=gravity, prescribed=prescribed, colliders=colliders,
                    colliders_before=colliders_before, adjoint=adjoint)  # fmt: skip
@@ -132,7 +132,7 @@ def advance(
     if prepared.unrolled is not None:
         with torch.no_grad():  # for what it raises: the values are looked at even by no sweep
             count = prepared.settings.sweeps if checking() else 0
-            looked_at = prepared._replace(settings=prepared.settings._replace(sweeps=count))
+            looked_at = prepared._replace(settings=prepared.settings._replace(sweeps=count), coarse=None)
             swept(model, begun.detached(), looked_at, given, index=index)
         return prepared.unrolled(x, v, force, gravity, prescribed)
     x_end = swept(model, begun, prepared, given, adjoint, index, where)

@@ -162,3 +162,29 @@ def test_autocast_leaves_the_precision_alone() -> None:
     usual = end(model, given | moduli, 4, steps=2)
     with torch.autocast("cpu"):
         assert torch.equal(end(model, given | moduli, 4, steps=2), usual)
+
+
+def test_no_more_functions_than_asked_for() -> None:
+    thin, thick = dv.mesh.box((6, 6, 2), (1.0, 1.0, 0.01)), dv.mesh.box((5, 5, 5), (1.0, 1.0, 1.0))
+    for mesh in (thin, thick):
+        for functions in (1, 5, 10, 40):
+            for degree in (1, 2, 3):
+                model = dv.Model(mesh, coarse=dv.CoarseSpace(functions=functions, degree=degree))
+                assert 0 < int((~model.coarse_geometry.filling).sum()) <= functions
+
+
+def test_a_refused_correction_leaves_no_trace() -> None:
+    """In float32 the matrix of a stiff free body may have no factor: its corrections are refused, the other body's are
+    not, and nothing becomes NaN."""
+    one = dv.mesh.box((5, 4, 4), (0.2, 0.2, 0.2))
+    two = dv.mesh.join([one, one.translate((3.0, 0.0, 0.0))])
+    model = dv.Model(two, coarse=dv.CoarseSpace(functions=20), dtype=torch.float32, rigid=False)
+    wave = 0.01 * torch.sin(30 * model.rest_points.flip(-1))
+    stiff = torch.arange(model.num_tets) < one.num_tets
+    mu = torch.where(stiff, 1e13, 1e5).requires_grad_()
+    x = (model.rest_points + wave).requires_grad_()
+    with dv.coarse.record() as lengths:
+        x_end, v_end = dv.step(model, x, torch.zeros_like(x), mu=mu, lam=mu.detach(), time_step=1 / 60, sweeps=4)
+    assert (lengths[0][..., 0] == 0).any() and (lengths[0][..., 1] > 0).all(), lengths
+    bars = torch.autograd.grad(x_end.sum() + v_end.square().sum(), (x, mu))
+    assert all(torch.isfinite(t).all() for t in (x_end, v_end, *bars)) and bars[0].abs().max() > 0

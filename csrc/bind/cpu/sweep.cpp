@@ -26,7 +26,7 @@ struct Given {
     diffvbd::set_fields(in, f, x, q, plan.num_vertices, plan.num_tets, packed);
     in.debug_step = debug_step;
     if (f.coarse_plan.numel() > 0) {
-      coarse = diffvbd::coarse_inputs<T>(f, x, q.sweeps, in.energies);
+      coarse = diffvbd::coarse_inputs<T>(f, x, q.sweeps, in.energies, int64_t{plan.blocks} * diffvbd::kLanes);
       require(!diffvbd::has_contact(q, f) && !(in.energies & diffvbd::kPaperBlock) && !in.parameters.saturates,
               "diffvbd::sweep: coarse corrections take no contact, no paper block and no saturation");
       in.coarse = &coarse;
