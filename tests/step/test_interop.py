@@ -24,6 +24,7 @@ from torch.utils.checkpoint import checkpoint
 
 import diffvbd as dv
 from diffvbd import ops
+from diffvbd.step.coarse import coarse_parts
 from diffvbd.testing import relative_error, tolerance
 
 # --- torch.compile ----------------------------------------------------------------------------------------------------
@@ -196,7 +197,7 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
                             model._energy_data)  # fmt: skip
     fields = ops.as_list(given, x)
     sweep = (*fields, model._plan, *settings, policy, -1, True)
-    x, tape, _ = torch.ops.diffvbd.sweep(*sweep)
+    x, tape, _, corrections = torch.ops.diffvbd.sweep(*sweep)
     tets, star_ptr, star = model._topology
     points = model.rest_points[None].contiguous()
     corners = torch.ops.diffvbd.tet_gather(points, tets)
@@ -208,9 +209,22 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
         "row_sum": (inputs["x"],),
     }
     if policy != ops.NO_TAPE:
-        wants = [True, True, True, True]
-        arguments["sweep_backward"] = (*fields, torch.ones_like(x), x, tape, model._plan, *settings, policy, wants)
+        bars = (torch.ones_like(x), x, tape, corrections)
+        arguments["sweep_backward"] = (*fields, *bars, model._plan, *settings, policy, [True] * 5)
+        arguments |= coarse_arguments() if device == "cpu" else {}
     return arguments | (fused_arguments(policy) if device == "cuda" else {})
+
+
+def coarse_arguments() -> dict[str, tuple[Any, ...]]:
+    """The same of the matrix of a coarse space, which only the CPU has."""
+    mesh = dv.mesh.cube(4, size=0.3)
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, coarse=dv.CoarseSpace(functions=8))
+    plan, x = model._coarse_plan, model.rest_points[None].contiguous()
+    moduli = torch.full((1, 1), 1e4, dtype=x.dtype)
+    parts = coarse_parts(model, moduli, moduli, None, None, None)
+    given = (x, parts.stiffness, parts.mass, plan.plan, plan.moments, plan.volume)
+    matrix, _ = torch.ops.diffvbd.coarse_matrix(*given, 0.3)
+    return {"coarse_matrix": (*given, 0.3), "coarse_matrix_backward": (*given, torch.ones_like(matrix), 0.3)}
 
 
 def fused_arguments(policy: int) -> dict[str, tuple[Any, ...]]:
