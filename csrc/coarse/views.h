@@ -20,8 +20,8 @@ struct Plan {
   const int32_t* tet;                      // [tet_blocks, kLanes]  any at padding, which has one corner four times
   const int32_t* group_ptr;                // [bodies + 1]  groups of a body
   const int32_t* group_function;           // [groups, width]  -1 beyond the last
-  const int32_t *moment_ptr,
-      *moment_vertex;  // [groups + 1], [moments]  what the mean deformation of a group is made of
+  // what the mean deformation of a group is made of: [groups + 1], [moments]
+  const int32_t *moment_ptr, *moment_vertex;
   const int32_t *list_ptr, *list, *list_position;  // [bodies + 1], [listed] twice  the vertices of a body that move
 };
 constexpr int kHeader = 10;

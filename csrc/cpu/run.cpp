@@ -141,9 +141,11 @@ void for_scenes(int64_t scenes, bool parallel, const F& f) {
     for (int64_t i = 0; i < scenes; ++i) f(i);
   }
 }
-int64_t team_size(const Plan& plan, int64_t scenes, int sweeps) {
+template <class T>
+int64_t team_size(const Plan& plan, const StepInputs<T>& in) {
   const int64_t threads = torch::stable::get_num_threads(), blocks = plan.color_block[plan.colors];
-  if (scenes >= threads || blocks * sweeps < kTeamBlocks || blocks < kTeamColor * plan.colors) return 1;
+  const int64_t passes = in.sweeps + (in.coarse ? in.coarse->corrections : 0);
+  if (in.scenes >= threads || blocks * passes < kTeamBlocks || blocks < kTeamColor * plan.colors) return 1;
   return threads;
 }
 
@@ -196,31 +198,28 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
     }
     std::optional<CoarseScene<T>> coarse;
     if (in.coarse) coarse.emplace(plan, in, b, scene.view);
-    Team::run(looks ? 1 : team_size(plan, in.scenes, in.sweeps + (in.coarse ? in.coarse->corrections : 0)),
-              [&](Team::Member member) {
-                int corrections = 0;
-                for (int k = 0; k <= in.sweeps; ++k) {
-                  if (coarse && coarse::corrects_before(k, in.sweeps, every)) {
-                    coarse->correct(corrections++, member);
-                    for (int c = 0; looks && c < plan.colors; ++c)
-                      look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
-                  }
-                  if (k == in.sweeps) break;
-                  const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
-                  for (int c = 0; c < plan.colors; ++c) {
-                    const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
-                    if (contact) {
-                      member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
-                      member.barrier();
-                    }
-                    member.each(first, last, [&](int64_t begin, int64_t end) {
-                      kernel(plan, scene.view, q, k, in.tape_policy, begin, end);
-                    });
-                    member.barrier();
-                    if (looks) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
-                  }
-                }
-              });
+    Team::run(looks ? 1 : team_size(plan, in), [&](Team::Member member) {
+      int corrections = 0;
+      for (int k = 0; k <= in.sweeps; ++k) {
+        if (coarse && coarse::corrects_before(k, in.sweeps, every)) {
+          coarse->correct(corrections++, member);
+          for (int c = 0; looks && c < plan.colors; ++c) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
+        }
+        if (k == in.sweeps) break;
+        const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
+        for (int c = 0; c < plan.colors; ++c) {
+          const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
+          if (contact) {
+            member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
+            member.barrier();
+          }
+          member.each(first, last,
+                      [&](int64_t begin, int64_t end) { kernel(plan, scene.view, q, k, in.tape_policy, begin, end); });
+          member.barrier();
+          if (looks) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
+        }
+      }
+    });
     unpack_rows(plan, scene.view.x, x + b * 3 * int64_t{plan.num_vertices});
     if (contact) contact->store_cut(cut + b * plan.num_vertices);
   });
@@ -295,15 +294,13 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
       });
       member.barrier();
     };
-    Team::run(team_size(plan, in.scenes, in.sweeps + (in.coarse ? in.coarse->corrections : 0)),
-              [&](Team::Member member) {
-                int corrections = in.coarse ? in.coarse->corrections : 0;
-                for (int k = in.sweeps; k >= 0; --k) {
-                  // what sweep k has read it no longer holds back: a correction before it comes next
-                  if (k < in.sweeps) sweep_back(k, member);
-                  if (coarse && coarse::corrects_before(k, in.sweeps, every)) coarse->reverse(--corrections, member);
-                }
-              });
+    Team::run(team_size(plan, in), [&](Team::Member member) {
+      int corrections = in.coarse ? in.coarse->corrections : 0;
+      for (int k = in.sweeps; k >= 0; --k) {
+        if (k < in.sweeps) sweep_back(k, member);
+        if (coarse && coarse::corrects_before(k, in.sweeps, every)) coarse->reverse(--corrections, member);
+      }
+    });
     collect_last(plan, s.rows, s.x_bar);
     if (contact) {
       contact->finish(out.collider + b * 3 * (in.contact->corners - n));

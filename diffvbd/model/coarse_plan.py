@@ -11,7 +11,7 @@ from torch import Tensor
 from .. import ops
 from .bodies import connected
 from .coarse import CoarseGeometry, CoarseSpace, build_coarse
-from .rest import rest_metric
+from .rest import rest_metric, shape_gradients
 
 LANES = ops.LANES["cpu"]  # tets of a block; twin of kLanes
 ROW = 4  # scalars of a row of positions; twin of kRow in csrc/core/views.h
@@ -79,7 +79,7 @@ def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tet
     corner = position[np.where(tet[..., None] >= 0, tets[np.maximum(tet, 0)], tets[tet[:, :1], :1])].swapaxes(1, 2)
 
     group_tets, inside = _padded(g.tet_group, len(g.group_body))
-    gradients, volume = _shape_gradients(points[tets]), 1 / (6 * rest[:, 6])
+    gradients, volume = (a.numpy() for a in shape_gradients(torch.from_numpy(points[tets])))
     moment = _moments(g, tets, gradients, volume, group_tets, inside, vertices)
     header = [g.bodies, g.functions, len(g.group_body), g.group_functions.shape[1], len(g.vertex), len(tet),
               len(moment[1]), every, len(order), len(listed)]  # fmt: skip
@@ -127,13 +127,6 @@ def _padded(of: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
     out = np.full((groups, int(count.max(initial=0))), -1)
     out[of[order], np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)] = order
     return np.maximum(out, 0), out >= 0
-
-
-def _shape_gradients(corners: np.ndarray) -> np.ndarray:
-    """Of the shape functions of tets [T, 4, 3] at their corners [1/m]."""
-    inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1]) if len(corners) else np.zeros((0, 3, 3))
-    rows = inverse.swapaxes(1, 2)
-    return np.concatenate((-rows.sum(1, keepdims=True), rows), 1)
 
 
 def _moments(g: CoarseGeometry, tets: np.ndarray, gradients: np.ndarray, volume: np.ndarray, group_tets: np.ndarray,

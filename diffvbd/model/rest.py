@@ -50,3 +50,17 @@ def lumped_mass(density: Tensor, volume: Tensor, tets: Tensor, star_ptr: Tensor,
     """m_i = sum over incident tets of density V / 4 [kg]; density, volume [B, T] -> [B, V]."""
     quarter = (0.25 * density * volume)[..., None, None]
     return ops.star_sum(quarter.expand(*quarter.shape[:2], 4, 1), tets, star_ptr, star, positive=True)[..., 0]
+
+
+def shape_gradients(corners: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of the shape functions of tets at their corners [1/m], shape of corners, and signed volumes [m^3].
+
+    Args:
+        corners: Rest positions of the tets' corners [m], shape [..., T, 4, 3].
+    """
+    a, b, c, d = corners.unbind(-2)
+    b, c, d = b - a, c - a, d - a
+    normals = torch.stack((torch.linalg.cross(c, d), torch.linalg.cross(d, b), torch.linalg.cross(b, c)), -2)
+    six_volumes = (b * normals[..., 0, :]).sum(-1)
+    rows = normals / six_volumes[..., None, None]
+    return torch.cat((-rows.sum(-2, keepdim=True), rows), -2), six_volumes / 6.0

@@ -111,15 +111,7 @@ def solve(
     with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
         done = _Sweeping(model, begun.detached(), prepared, {"x": x, "v": v, **loads}, time_step, tolerance)
         done.run(max_sweeps, check_every)
-    if not done.converged:
-        text = (
-            f"solve: expected a residual of at most {tolerance:g}, got {done.residual:.3g} after {done.count} sweeps; "
-            "take more (max_sweeps), a smaller time step, or with the exact block a relaxation between 1.5 and 1.7"
-        )
-        if on_failure == "raise":
-            raise RuntimeError(text)
-        warnings.warn(text, RuntimeWarning, stacklevel=2)
-
+    _judge(done, tolerance, on_failure)
     if isinstance(adjoint, GlobalAdjoint):
         # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph
         begun = begun._replace(x_start=torch.where(model._pinned[:, None], begun.x_start, done.end))
@@ -129,7 +121,24 @@ def solve(
     else:
         again = prepare(model, lead, sweeps=done.count, adjoint=adjoint, **options)
         x_end, v_end = advance(model, x, v, again, adjoint=adjoint, **loads)
+        if model.coarse is not None:  # the parts above had corrections of their own
+            with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+                end = x_end.detach().reshape(begun.y.shape)
+                done.look_at(end if begun.origin is None else end - begun.origin)
+            _judge(done, tolerance, on_failure)
     return Solution(x_end.reshape(x.shape), v_end.reshape(x.shape), done.count, done.residual, done.converged)
+
+
+def _judge(done: _Sweeping, tolerance: float, on_failure: str) -> None:
+    if done.converged:
+        return
+    text = (
+        f"solve: expected a residual of at most {tolerance:g}, got {done.residual:.3g} after {done.count} sweeps; "
+        "take more (max_sweeps), a smaller time step, or with the exact block a relaxation between 1.5 and 1.7"
+    )
+    if on_failure == "raise":
+        raise RuntimeError(text)
+    warnings.warn(text, RuntimeWarning, stacklevel=3)
 
 
 class _Sweeping:
@@ -176,7 +185,11 @@ class _Sweeping:
 
     def _end_at(self, x: Tensor) -> None:
         """Corrects what the last sweep left, and looks at it."""
-        self.end = self.begun.corrected(x, self.model, self.prepared)
+        self.look_at(self.begun.corrected(x, self.model, self.prepared))
+
+    def look_at(self, end: Tensor) -> None:
+        """Takes a state [B, V, 3] for the end of the step."""
+        self.end = end
         at = IncrementalPotential(self.model, self.end, self.begun.fields(self.model, self.prepared), self.time_step)
         if self.rounding is None:
             self.rounding = _rounding(at)

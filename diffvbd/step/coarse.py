@@ -16,6 +16,7 @@ from torch.autograd import Function
 from .. import ops
 from ..model.coarse_plan import mass_parts
 from ..model.model import Model
+from ..model.rest import shape_gradients
 from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
 from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
 
@@ -43,7 +44,7 @@ def coarse_parts(model: Model, mu: Tensor, lam: Tensor, mass: Tensor | None, res
             shape = (-1, 1, 1, 1, 1, 1)
             stiffness = torch.addcmul(mu.reshape(shape) * unit[:1], least.reshape(shape), unit[1:])
         else:
-            gradients, volume = _shape_gradients(model, corners)
+            gradients, volume = shape_gradients(_corners(model) if corners is None else corners)
             shape = (max(mu.shape[0], lam.shape[0]), model.num_tets)
             stiffness = _stiffness(plan, ops.broadcast(mu, shape), ops.broadcast(least, shape), gradients, volume)
         lanes = plan.rest if rest is None else rest.detach()[:, plan.tet].transpose(-1, -2).contiguous()
@@ -52,22 +53,15 @@ def coarse_parts(model: Model, mu: Tensor, lam: Tensor, mass: Tensor | None, res
 
 def _unit_stiffness(model: Model) -> Tensor:
     """Of all groups with mu = 1 Pa and lam = 0, and with mu = 0 and lam = 1 Pa."""
-    gradients, volume = _shape_gradients(model, None)
+    gradients, volume = shape_gradients(_corners(model))
     one, none = volume.new_ones((1, model.num_tets)), volume.new_zeros((1, model.num_tets))
     parts = [_stiffness(model._coarse_plan, *pair, gradients, volume) for pair in ((one, none), (none, one))]
     return torch.cat(parts)
 
 
-def _shape_gradients(model: Model, corners: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Gradients of the shape functions [1 | B, T, 4, 3] and volumes [1 | B, T] of the tets at rest."""
-    if corners is None:
-        corners = model._rest_points[model._topology[0]][None]
-    a, b, c, d = corners.unbind(-2)
-    b, c, d = b - a, c - a, d - a
-    normals = torch.stack((torch.linalg.cross(c, d), torch.linalg.cross(d, b), torch.linalg.cross(b, c)), -2)
-    six = (b * normals[..., 0, :]).sum(-1)
-    rows = normals / six[..., None, None]
-    return torch.cat((-rows.sum(-2, keepdim=True), rows), -2), six / 6
+def _corners(model: Model) -> Tensor:
+    """Of the tets at the Model's own rest [1, T, 4, 3]."""
+    return model._rest_points[model._topology[0]][None]
 
 
 def _stiffness(plan: Any, mu: Tensor, lam: Tensor, gradients: Tensor, volume: Tensor) -> Tensor:

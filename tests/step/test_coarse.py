@@ -31,6 +31,9 @@ def test_a_stiff_cantilever_in_four_sweeps() -> None:
     after, _ = dv.step(model, x, v, sweeps=60, **given)
     solved = dv.solve(model, x, v, tolerance=1e-10, **given)  # which looks at the forces that are left
     assert relative_error(after - x, solved.x - x) <= tolerance("closed_form")
+    swept = dv.solve(model, x, v, tolerance=1e-10, adjoint=dv.ReverseSweep(), **given)
+    assert swept.converged
+    assert relative_error(swept.x - x, solved.x - x) <= tolerance("closed_form")
     error = {k: float((end(model, given, k) - goal).abs().max() / motion) for k in (4, 10)}
     plain = float((end(cantilever(relaxation=1.5)[0], given, 20) - goal).abs().max() / motion)
     assert error[4] < 0.01 and error[10] < error[4] / 100 and plain > 0.1, (error, plain)
@@ -74,7 +77,7 @@ def test_momentum_of_a_free_body() -> None:
     arm = x_end - (mass * x_end).sum(0) / mass.sum()
     change = torch.linalg.cross(arm, mass * v_end).sum(0) - spin
     expected = torch.linalg.cross(v_end, mass * v).sum(0) / 60
-    assert (change - expected).abs().max() <= tolerance("rigid_momentum") * 100 * spin.abs().max()
+    assert (change - expected).abs().max() <= tolerance("momentum") * spin.abs().max()
 
 
 def test_same_bits_on_one_thread_and_on_two() -> None:
@@ -157,8 +160,9 @@ def test_corrections_of_a_step() -> None:
 
 
 def test_autocast_leaves_the_precision_alone() -> None:
-    model, given = cantilever(coarse="auto", relaxation=1.5)
-    moduli = {name: torch.linspace(1, 2, model.num_tets, dtype=torch.float64) * given[name] for name in ("mu", "lam")}
+    """It would take float32 products in half of it; moduli of each tet go through such products."""
+    model, given = cantilever(coarse="auto", relaxation=1.5, dtype=torch.float32)
+    moduli = {name: torch.linspace(1, 2, model.num_tets) * given[name] for name in ("mu", "lam")}
     usual = end(model, given | moduli, 4, steps=2)
     with torch.autocast("cpu"):
         assert torch.equal(end(model, given | moduli, 4, steps=2), usual)
