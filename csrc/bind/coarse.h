@@ -1,29 +1,35 @@
 // The tensors of coarse corrections, as the operators take them.
 #pragma once
 
+#include <limits>
+#include <vector>
+
 #include "../coarse/matrix.h"
 #include "arguments.h"
 #include "fields.h"
 
 namespace diffvbd {
 
-// On the host.
-inline coarse::Plan coarse_plan(const Tensor& plan) {
-  const char* const what = "diffvbd: expected a plan of a coarse space, int32";
-  require(plan.scalar_type() == ScalarType::Int && plan.is_contiguous() && plan.numel() >= coarse::kHeader, what);
-  const int32_t* p = data<const int32_t>(plan);
-  require(plan.numel() == coarse::plan_size(p), what);
-  return coarse::view_plan(p);
+// sizes: those of the plan, and how many sweeps come before
+inline coarse::Plan coarse_plan(const Tensor& plan, const Tensor& x, const std::vector<int64_t>& sizes) {
+  bool known = is_index(plan, x) && sizes.size() == coarse::kSizes;
+  for (const int64_t size : sizes) known = known && size >= 0 && size <= std::numeric_limits<int32_t>::max();
+  int64_t used = 0;
+  coarse::Plan out{};
+  if (known) out = coarse::view_plan(sizes.data(), data<const int32_t>(plan), used);
+  require(known && used == plan.numel() && out.every > 0 && out.begun <= 1,
+          "diffvbd: expected a plan of a coarse space, int32, and its sizes");
+  return out;
 }
 
 template <class T>
-coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, int64_t sweeps, int energies,
-                                int64_t positions) {
+coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, const std::vector<int64_t>& sizes,
+                                int64_t sweeps, int energies, int64_t positions) {
   coarse::Inputs<T> in{};
-  in.plan = coarse_plan(f.coarse_plan);
+  in.plan = coarse_plan(f.coarse_plan, x, sizes);
   const coarse::Plan& p = in.plan;
-  const int64_t b = x.size(0), cells = p.mass_ptr[p.bodies];
-  require(p.positions == positions && p.every > 0, "coarse_plan: expected one of this Model's sweeps");
+  const int64_t b = x.size(0), cells = p.cells;
+  require(p.positions == positions && p.vertices == x.size(1), "coarse_plan: expected one of this Model's sweeps");
   require_like("coarse_matrix", f.coarse_matrix, x, 9 * cells * b);
   const Tensor& w = f.coarse_weights;
   require_like("coarse_weights", w, x, 2 * int64_t{p.entries});
@@ -33,18 +39,19 @@ coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, int64_t s
   in.factor = batched<T>("coarse_factor", f.coarse_factor, x, b, 9 * cells);
   in.mass = batched<T>("coarse_mass", f.coarse_mass, x, b, cells);
   in.keeps_positions = keeps_positions(energies);
-  in.corrections = coarse::corrections_of(static_cast<int>(sweeps), p.every);
+  in.corrections = coarse::corrections_of(static_cast<int>(sweeps), p.every, p.begun);
   return in;
 }
 
 template <class T>
-coarse::MatrixInputs<T> matrix_inputs(const CoarseFields& f, double time_step) {
+coarse::MatrixInputs<T> matrix_inputs(const CoarseFields& f, const std::vector<int64_t>& sizes, double time_step) {
   const Tensor& x = f.x_prev;
   require_positions(x);
   require(time_step > 0, "diffvbd::coarse_matrix: expected time_step > 0");
   coarse::MatrixInputs<T> in{};
-  in.plan = coarse_plan(f.plan);
+  in.plan = coarse_plan(f.plan, x, sizes);
   const coarse::Plan& p = in.plan;
+  require(p.vertices == x.size(1), "diffvbd::coarse_matrix: expected the plan of this mesh");
   in.scenes = x.size(0), in.vertices = x.size(1), in.time_step = time_step;
   in.x_prev = data<const T>(x);
   require_like("moments", f.moments, x, 3 * int64_t{p.moments});
@@ -53,7 +60,7 @@ coarse::MatrixInputs<T> matrix_inputs(const CoarseFields& f, double time_step) {
           "diffvbd::coarse_matrix: expected volume float64 [groups]");
   in.volume = data<const double>(f.volume);
   in.stiffness = batched<T>("stiffness", f.stiffness, x, in.scenes, int64_t{9} * p.groups * p.width * p.width);
-  in.mass = batched<T>("mass", f.mass, x, in.scenes, p.mass_ptr[p.bodies]);
+  in.mass = batched<T>("mass", f.mass, x, in.scenes, p.cells);
   return in;
 }
 

@@ -14,9 +14,10 @@ namespace {
 // diffvbd/ops/fields.py)
 // data_count: scalars per scene, or per vertex, of each energy of one vertex
 // launch: on CUDA the regime and the threads per vertex of the sweeps and of their reverse, else empty
+// coarse: sizes of the plan of a coarse space, and 1 where the first sweep of the step comes before these; else empty
 #define DIFFVBD_SETTINGS                                                                                      \
-  "Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, int sweeps, int[] launch, int " \
-  "tape_policy"
+  "Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, int sweeps, int[] launch, " \
+  "int[] coarse, int tape_policy"
 
 // Fields come first; what is returned ends without the comma of its last.
 void define(torch::stable::detail::StableLibrary& m, const std::string& name, const std::string& fields,
@@ -97,8 +98,8 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "Tensor x, Tensor v, Tensor acceleration, Tensor prescribed, Tensor mass, Tensor shared, Tensor own, Tensor "
          "planes, ");
   // The matrices of all bodies, one after the other, and their Cholesky factors; adjoints of x_prev, stiffness and mass
-  define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "float time_step", "Tensor matrix, Tensor factor, ");
-  define(m, "coarse_matrix_backward", DIFFVBD_ARGUMENTS(COARSE), "Tensor bar, float time_step",
+  define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "int[] sizes, float time_step", "Tensor matrix, Tensor factor, ");
+  define(m, "coarse_matrix_backward", DIFFVBD_ARGUMENTS(COARSE), "Tensor bar, int[] sizes, float time_step",
          DIFFVBD_RETURNS(COARSE));
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");
   m.def(

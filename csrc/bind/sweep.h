@@ -19,6 +19,7 @@ struct SweepSettings {
   const std::vector<double>& numbers;
   int64_t sweeps;
   const std::vector<int64_t>& launch;
+  const std::vector<int64_t>& coarse;
   int64_t tape_policy;
 };
 

@@ -9,10 +9,6 @@
 
 namespace diffvbd {
 
-namespace {
-constexpr int32_t kPartBlocks = 32;  // blocks of tets that a member takes at once
-}
-
 template <class T>
 CoarseScene<T>::CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t scene, SceneView<T>& s)
     : plan_(plan),
@@ -30,12 +26,7 @@ CoarseScene<T>::CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t s
   s.gradient = gradient_.get();
   s.way = way_.get();
   const coarse::Plan& p = c_.plan;
-  for (int32_t b = 0; b < p.bodies; ++b) {
-    for (int32_t at = p.block_ptr[b]; at < p.block_ptr[b + 1]; at += kPartBlocks) {
-      parts_.push_back({b, at, std::min(at + kPartBlocks, p.block_ptr[b + 1])});
-    }
-  }
-  sums_ = Buffer<double>(parts_.size() * coarse::kDegree);
+  sums_ = Buffer<double>(size_t(p.parts) * coarse::kDegree);
   if (!(in.energies & kElastic)) return;
   for (int m = 0; m < kTetScalars; ++m) {
     const Batched<const T>& given = in.material[m];
@@ -91,13 +82,13 @@ void CoarseScene<T>::correct(int k, Team::Member& member) {
     kernels_.gather(p.position_ptr, p.function, c_.weight, coarse, s_.way, begin, end);
   });
   member.barrier();
-  member.each(0, int64_t(parts_.size()), [&](int64_t begin, int64_t end) {
+  member.each(0, p.parts, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       double* sum = sums_.get() + i * coarse::kDegree;
       std::fill(sum, sum + coarse::kDegree, 0.0);
       if (!(in_.energies & kElastic)) continue;
-      kernels_.line(p.corner, c_.rest.data + scene_ * c_.rest.scene, material_.get(), s_.x, s_.way, parts_[i].begin,
-                    parts_[i].end, sum);
+      kernels_.line(p.corner, c_.rest.data + scene_ * c_.rest.scene, material_.get(), s_.x, s_.way,
+                    p.part_begin[i], p.part_begin[i + 1], sum);
     }
   });
   member.barrier();
@@ -141,10 +132,8 @@ void CoarseScene<T>::decide(int32_t body, const T* a, T* length) {
   }
   coarse::Change change{};
   const double h2 = double(in_.parameters.time_step) * double(in_.parameters.time_step);
-  const auto part =
-      std::lower_bound(parts_.begin(), parts_.end(), body, [](const Part& one, int32_t b) { return one.body < b; });
-  for (auto at = part; at != parts_.end() && at->body == body; ++at) {
-    const double* sum = sums_.get() + (at - parts_.begin()) * coarse::kDegree;
+  for (int64_t part = p.part_ptr[body]; part < p.part_ptr[body + 1]; ++part) {
+    const double* sum = sums_.get() + part * coarse::kDegree;
     for (int i = 0; i < coarse::kDegree; ++i) change.c[i] += h2 * sum[i];
   }
   change.c[1] += 0.5 * inertial;
@@ -283,7 +272,7 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
     }
   });
   if (c_.matrix_bar) {
-    T* bar = c_.matrix_bar + scene_ * 9 * int64_t{p.mass_ptr[p.bodies]};
+    T* bar = c_.matrix_bar + scene_ * 9 * int64_t{p.cells};
     member.each(0, p.bodies, [&](int64_t begin, int64_t end) {
       for (int64_t b = begin; b < end; ++b) {
         if (!(lengths[b] > 0)) continue;

@@ -22,9 +22,6 @@ class CoarseScene {
   void reverse(int k, Team::Member& member);
 
  private:
-  struct Part {  // of the tets of a body, small enough to share the work
-    int32_t body, begin, end;
-  };
   T* tape(int k) const { return c_.tape + (scene_ * c_.corrections + k) * c_.tape_size(); }
   void solve(T* x, Team::Member& member) const;
   void decide(int32_t body, const T* a, T* length);
@@ -38,7 +35,6 @@ class CoarseScene {
   const int64_t scene_;
   SceneView<T>& s_;
   const CoarseKernels<T> kernels_;
-  std::vector<Part> parts_;
   std::vector<int> failures_;
   Buffer<T> gradient_, way_, material_, coarse_, rows_;
   Buffer<double> sums_;

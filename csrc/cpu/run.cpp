@@ -186,7 +186,7 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
   const int64_t tape_size =
       int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
   const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
-  const int every = in.coarse ? in.coarse->plan.every : 0;
+  const int every = in.coarse ? in.coarse->plan.every : 0, begun = in.coarse ? in.coarse->plan.begun : 0;
   // a message thrown inside a parallel region would be lost
   const bool looks = in.debug_step >= 0;
   for_scenes(in.scenes, !looks, [&](int64_t b) {
@@ -201,7 +201,7 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
     Team::run(looks ? 1 : team_size(plan, in), [&](Team::Member member) {
       int corrections = 0;
       for (int k = 0; k <= in.sweeps; ++k) {
-        if (coarse && coarse::corrects_before(k, in.sweeps, every)) {
+        if (coarse && coarse::corrects_before(k, in.sweeps, every, begun)) {
           coarse->correct(corrections++, member);
           for (int c = 0; looks && c < plan.colors; ++c) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
         }
@@ -263,7 +263,7 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
 
     std::optional<CoarseScene<T>> coarse;
     if (in.coarse) coarse.emplace(plan, in, b, s);
-    const int every = in.coarse ? in.coarse->plan.every : 0;
+    const int every = in.coarse ? in.coarse->plan.every : 0, begun = in.coarse ? in.coarse->plan.begun : 0;
 
     const auto sweep_back = [&](int k, Team::Member& member) {
       const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
@@ -298,7 +298,7 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
       int corrections = in.coarse ? in.coarse->corrections : 0;
       for (int k = in.sweeps; k >= 0; --k) {
         if (k < in.sweeps) sweep_back(k, member);
-        if (coarse && coarse::corrects_before(k, in.sweeps, every)) coarse->reverse(--corrections, member);
+        if (coarse && coarse::corrects_before(k, in.sweeps, every, begun)) coarse->reverse(--corrections, member);
       }
     });
     collect_last(plan, s.rows, s.x_bar);

@@ -85,8 +85,7 @@ def checked_correction(rigid: Any, start: Any, energies: tuple[Energy, ...]) -> 
     return rigid, start
 
 
-def checked_coarse(coarse: Any, energies: tuple[Energy, ...], saturation: float | None, device: torch.device
-                   ) -> CoarseSpace | None:  # fmt: skip
+def checked_coarse(coarse: Any, energies: tuple[Energy, ...], saturation: float | None) -> CoarseSpace | None:
     """The coarse space, where it is one that the other arguments allow."""
     if coarse is None:
         return None
@@ -101,6 +100,4 @@ def checked_coarse(coarse: Any, energies: tuple[Energy, ...], saturation: float 
         fail("coarse", "None beside a PairBarrier or Friction, which its corrections do not see", repr(coarse))
     if saturation is not None:
         fail("coarse", "None with saturation, which a correction would go around", repr(coarse))
-    if device.type != "cpu":
-        raise NotImplementedError(f"coarse: corrections run on the CPU so far, got {device}")
     return coarse

@@ -58,7 +58,7 @@ class CoarseSpace:
 
     def corrections(self, sweeps: int) -> int:
         """How many corrections a step of so many sweeps has."""
-        return max(1, -(-(sweeps - 1) // self.every))
+        return ops.corrections_of(sweeps, self.every)
 
 
 class CoarseGeometry(NamedTuple):

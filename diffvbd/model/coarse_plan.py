@@ -13,13 +13,15 @@ from .bodies import connected
 from .coarse import CoarseGeometry, CoarseSpace, build_coarse
 from .rest import rest_metric, shape_gradients
 
-LANES = ops.LANES["cpu"]  # tets of a block; twin of kLanes
+LANES = ops.LANES["cpu"]  # tets of a block, on every device; twin of kLanes
+PART = 32  # most blocks of a part of a body
 ROW = 4  # scalars of a row of positions; twin of kRow in csrc/core/views.h
 
 
 class CoarsePlan(NamedTuple):
     """All tensors are constants of the Model; floating ones have its dtype, but for ``volume`` (float64)."""
 
+    sizes: ops.CoarseSizes
     plan: Tensor  # int32, see csrc/coarse/views.h
     weights: Tensor  # [2 entries], of W by position and by function
     rest: Tensor  # [1, blocks, 7, lanes], rest scalars of the tets of each body
@@ -34,7 +36,8 @@ class CoarsePlan(NamedTuple):
         def placed(t: Tensor) -> Tensor:
             return t.to(device, dtype) if t.is_floating_point() else t.to(device)
 
-        return CoarsePlan(*map(placed, self))._replace(volume=self.volume.to(device))
+        sizes, *tensors = self
+        return CoarsePlan(sizes, *map(placed, tensors))._replace(volume=self.volume.to(device))
 
     @property
     def width(self) -> int:
@@ -42,20 +45,20 @@ class CoarsePlan(NamedTuple):
         return self.group_weights.shape[-1]
 
 
-def plan_of(space: CoarseSpace, points: Tensor, tets: Tensor, pinned: Tensor, mass: Tensor, plan: Tensor
-            ) -> tuple[CoarseGeometry, CoarsePlan]:  # fmt: skip
-    """The space on a mesh in float64, on the CPU; plan: of the sweeps."""
+def plan_of(space: CoarseSpace, points: Tensor, tets: Tensor, pinned: Tensor, mass: Tensor, plan: Tensor,
+            device: str) -> tuple[CoarseGeometry, CoarsePlan]:  # fmt: skip
+    """The space on a mesh in float64, on the CPU; plan: of the sweeps on a device, itself on the CPU."""
     arrays = points.numpy(), tets.numpy()
     geometry = build_coarse(*arrays, pinned.numpy(), connected(tets, len(points)).numpy(), space)
+    order = ops.plan_order(plan, ops.LANES[device]).numpy()
     rest, _ = rest_metric(points[tets][None])
-    return geometry, arrange_coarse(geometry, space.every, *arrays, mass.numpy(), rest[0].numpy(), plan)
+    return geometry, arrange_coarse(geometry, space.every, *arrays, mass.numpy(), rest[0].numpy(), order)
 
 
 def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tets: np.ndarray, mass: np.ndarray,
-                   rest: np.ndarray, plan: Tensor) -> CoarsePlan:  # fmt: skip
-    """points [V, 3], tets [T, 4], mass [V], rest [T, 7], all float64; plan: of the sweeps, on the CPU."""
+                   rest: np.ndarray, order: np.ndarray) -> CoarsePlan:  # fmt: skip
+    """points [V, 3], tets [T, 4], mass [V], rest [T, 7], all float64; order: the vertex at each position, -1: none."""
     g, vertices = geometry, len(points)
-    order = ops.plan_order(plan, LANES).numpy()
     position = np.full(vertices, -1)
     real = np.flatnonzero(order >= 0)
     position[order[real]] = real
@@ -81,17 +84,24 @@ def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tet
     group_tets, inside = _padded(g.tet_group, len(g.group_body))
     gradients, volume = (a.numpy() for a in shape_gradients(torch.from_numpy(points[tets])))
     moment = _moments(g, tets, gradients, volume, group_tets, inside, vertices)
-    header = [g.bodies, g.functions, len(g.group_body), g.group_functions.shape[1], len(g.vertex), len(tet),
-              len(moment[1]), every, len(order), len(listed)]  # fmt: skip
+    moment_group = np.repeat(np.arange(len(g.group_body)), np.diff(moment[0]))
+    part_ptr, part_body, part_begin = _parts(block_ptr)
+    place_ptr, place = _places(g, counts)
+    sizes = ops.CoarseSizes(
+        g.bodies, g.functions, len(g.group_body), g.group_functions.shape[1], len(g.vertex), len(tet), len(moment[1]),
+        len(order), len(listed), int(mass_ptr[-1]), int(counts.max(initial=0)), len(part_body), len(place), vertices,
+        every)  # fmt: skip
     arrays = [
-        header, g.function_ptr, mass_ptr, position_body, _starts(by_position[0], len(order)), by_position[1],
-        _starts(g.function[rows], g.functions), at[rows], block_ptr, ROW * corner, np.maximum(tet, 0),
-        _starts(g.group_body, g.bodies), g.group_functions, *moment[:2],
+        g.function_ptr, mass_ptr, function_body, position_body, _starts(by_position[0], len(order)), by_position[1],
+        _starts(g.function[rows], g.functions), at[rows], block_ptr, part_ptr, part_body, part_begin, ROW * corner,
+        np.maximum(tet, 0), _starts(g.group_body, g.bodies), g.group_body, g.group_functions, place_ptr, place,
+        *moment[:2], moment_group, _starts(np.sort(moment[1]), vertices), np.argsort(moment[1], kind="stable"),
         _starts(vertex_body[listed], g.bodies), listed, position[listed],
     ]  # fmt: skip
     lanes = rest[np.maximum(tet, 0)].swapaxes(1, 2)  # of any tet at padding, whose corners do not move apart
     as_tensor = torch.from_numpy
     return CoarsePlan(
+        sizes=sizes,
         plan=torch.from_numpy(np.concatenate([np.asarray(a).reshape(-1) for a in arrays]).astype(np.int32)),
         weights=as_tensor(np.concatenate((by_position[2], g.weight[rows]))),
         rest=as_tensor(lanes[None].copy()),
@@ -118,6 +128,26 @@ def _blocks(of: np.ndarray, bodies: int) -> tuple[np.ndarray, np.ndarray]:
     first = np.concatenate(([0], np.cumsum(count)[:-1])) if bodies else count
     out[np.arange(len(order)) + np.repeat(ptr[:-1] * LANES - first, count)] = order
     return out.reshape(-1, LANES), ptr
+
+
+def _parts(block_ptr: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Parts of at most PART blocks of one body: where each body's begin, the body of each, its first block and the
+    last one's end."""
+    count = -(-np.diff(block_ptr) // PART)
+    ptr = np.concatenate(([0], np.cumsum(count)))
+    body = np.repeat(np.arange(len(count)), count)
+    begin = block_ptr[body] + PART * (np.arange(len(body)) - ptr[body])
+    return ptr, body, np.append(begin, block_ptr[-1])
+
+
+def _places(g: CoarseGeometry, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For each group where its row begins, which has for each function of its body the place among those of the group,
+    -1: it is none of them."""
+    ptr = np.concatenate(([0], np.cumsum(counts[g.group_body]))).astype(np.int64)
+    out = np.full(ptr[-1], -1)
+    group, place = np.nonzero(g.group_functions >= 0)
+    out[ptr[group] + g.group_functions[group, place] - g.function_ptr[g.group_body[group]]] = place
+    return ptr[:-1], out
 
 
 def _padded(of: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:

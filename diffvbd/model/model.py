@@ -116,7 +116,7 @@ class Model:
         for energy in self.energies:
             self.energy_mask |= energy.bit
         self.rigid, self.start = checked_correction(rigid, start, self.energies)
-        self.coarse = checked_coarse(coarse, self.energies, self.saturation, checked_device(device))
+        self.coarse = checked_coarse(coarse, self.energies, self.saturation)
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
 
@@ -138,7 +138,7 @@ class Model:
         device = checked_device(device)
         self._arrange(points, tets, device)
         self._measure(points)
-        self._arrange_coarse()
+        self._arrange_coarse(device)
         warn_of(self)
         self._place(dtype, device)
 
@@ -258,9 +258,9 @@ class Model:
         data = [e.pack(self._parameters(e, points), None) for e in self.vertex_energies]
         self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
 
-    def _arrange_coarse(self) -> None:
+    def _arrange_coarse(self, device: torch.device) -> None:
         if self.coarse is not None:
-            given = (self._rest_points, self._topology[0], self._pinned, self._mass, self._plan)
+            given = (self._rest_points, self._topology[0], self._pinned, self._mass, self._plan, device.type)
             self.coarse_geometry, self._coarse_plan = plan_of(self.coarse, *given)
 
     def _parameters(self, energy: VertexEnergy, rest_points: Tensor) -> dict[str, Tensor]:
@@ -314,8 +314,7 @@ class Model:
         if device.type != self.device.type:
             out._arrange(points, out.tets, device)
         out._measure(points)
-        out.coarse = checked_coarse(out.coarse, out.energies, out.saturation, device)
-        out._arrange_coarse()
+        out._arrange_coarse(device)
         out._place(dtype, device)
         return out
 
@@ -378,9 +377,10 @@ class Model:
         friction_eps = 1.0 if self.friction is None else time_step * self.friction.velocity
         numbers = ops.StepNumbers(time_step, self.regularization, self.relaxation, saturation, SATURATION_EPS,
                                   FILTER_ETA, last, friction_eps)  # fmt: skip
-        cuda = self.device.type == "cuda"
-        launch = regimes.choose(self.num_vertices, self.num_colors, scenes, contact=self.touches) if cuda else ()
-        return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps, launch)
+        coarse = self._coarse_plan.sizes if self.coarse is not None else ()
+        work = self.num_vertices, self.num_colors, scenes
+        launch = regimes.choose(*work, self.touches, bool(coarse)) if self.device.type == "cuda" else ()
+        return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps, launch, coarse)
 
     def memory(self, **options: Any) -> dict[str, int]:
         """Predicted bytes of a step or rollout of this Model; see :func:`diffvbd.rollout.memory.predict`."""

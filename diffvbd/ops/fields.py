@@ -147,6 +147,27 @@ class StepNumbers(NamedTuple):
     friction_eps: float  # motion within the step below which friction is smoothed [m]
 
 
+class CoarseSizes(NamedTuple):
+    """Sizes of the plan of a coarse space, in the order of Plan in csrc/coarse/views.h."""
+
+    bodies: int
+    functions: int
+    groups: int
+    width: int
+    entries: int
+    tet_blocks: int
+    moments: int
+    positions: int
+    listed: int
+    cells: int
+    most: int
+    parts: int
+    places: int
+    vertices: int
+    every: int
+    begun: int = 0  # 1 where the sweeps to run go on after the first of a step
+
+
 class SweepSettings(NamedTuple):
     """What a sweep executes besides its tensors, in the order of csrc/bind/schema.cpp."""
 
@@ -156,6 +177,7 @@ class SweepSettings(NamedTuple):
     numbers: StepNumbers
     sweeps: int
     launch: tuple[int, ...] = ()  # on CUDA: regime and threads per vertex of sweeps and reverse, see regimes.py
+    coarse: CoarseSizes | tuple[()] = ()  # with coarse corrections
 
 
 def plan_sizes(plan: Tensor, device: str) -> tuple[int, ...]:
@@ -179,6 +201,20 @@ def plan_sizes(plan: Tensor, device: str) -> tuple[int, ...]:
 def tape_rows(policy: int, energies: int) -> int:
     """Scalars of tape per active vertex and sweep; twin of tape_rows in csrc/core/views.h."""
     return {NO_TAPE: 0, COMPACT_TAPE: 3, FULL_TAPE: 12 if energies & KEEPS_POSITIONS else 9}[policy]
+
+
+def corrections_of(sweeps: int, every: int, begun: int = 0) -> int:
+    """Coarse corrections among so many sweeps, of which ``begun`` more came before; twin of corrections_of in
+    csrc/coarse/views.h."""
+    return max(1, -(-(sweeps + begun - 1) // every))
+
+
+def corrections_shape(x: Tensor, coarse: Sequence[int], sweeps: int, energies: int) -> list[int]:
+    """Of what is recorded of coarse corrections; twin of tape_size() there. ``coarse``: as in SweepSettings."""
+    sizes = CoarseSizes(*coarse)
+    before = 3 * sizes.positions if energies & KEEPS_POSITIONS else 0
+    size = 3 * sizes.functions + sizes.bodies + before
+    return [x.shape[0], corrections_of(sweeps, sizes.every, sizes.begun), size]
 
 
 def tape_shape(x: Tensor, sizes: Sequence[int], energies: int, sweeps: int, launch: Sequence[int], policy: int) -> list:

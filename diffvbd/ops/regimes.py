@@ -54,14 +54,18 @@ def regime(name: Regime | None) -> Iterator[None]:
         _forced = before
 
 
-def choose(vertices: int, colors: int, scenes: int, *, contact: bool = False) -> tuple[int, int, int]:
+def choose(vertices: int, colors: int, scenes: int, contact: bool = False, corrects: bool = False
+           ) -> tuple[int, int, int]:  # fmt: skip
     """Regime, and threads per vertex of the sweeps and of their reverse, for SweepSettings.launch. Pairs are summed
-    between the launches of colors: a scene with contact has one regime."""
+    between the launches of colors: a scene with contact has one regime. Coarse corrections are launches between sweeps,
+    so a scene that has them is not left to one thread."""
     at_once = vertices * scenes / max(1, colors)
     if contact:
         lanes = MANY_LANES if at_once <= MANY_LANES_VERTICES else SOME_LANES
         return COLOR, lanes, lanes
     code = CODES[_forced] if _forced else _automatic(vertices, scenes)
+    if code == THREAD and corrects:
+        code = BLOCK
     if code == THREAD and vertices > SMALL_MESH:
         fail("regime", f"a mesh of at most {SMALL_MESH} vertices for a scene per thread", f"{vertices} vertices")
     if code == BLOCK:  # scenes enough fill a multiprocessor; one alone wants its threads

@@ -20,6 +20,7 @@ from .fields import (
     SweepFields,
     SweepSettings,
     as_list,
+    corrections_shape,
     tape_shape,
 )
 from .functions import raw_backward, shapes_of
@@ -84,12 +85,11 @@ _FIELDS, _STEP_FIELDS = len(SweepFields._fields), len(StepFields._fields)
 @shapes_of("sweep")
 def _(*arguments):
     f: Any = SweepFields(*arguments[:_FIELDS])
-    _, sizes, energies, _, _, sweeps, launch, tape_policy, *_ = arguments[_FIELDS:]
-    if f.coarse_plan.numel():
-        raise NotImplementedError("diffvbd: torch.compile of a step with coarse corrections is not supported")
+    _, sizes, energies, _, _, sweeps, launch, coarse, tape_policy, *_ = arguments[_FIELDS:]
     x, scenes = f.x_start, f.x_start.shape[0] if energies & CONTACT else 0
     tape = x.new_empty(tape_shape(x, sizes, energies, sweeps, launch, tape_policy))
-    return torch.empty_like(x), tape, x.new_empty((scenes, x.shape[1]), dtype=torch.uint8), x.new_empty((0,))
+    done = corrections_shape(x, coarse, sweeps, energies) if f.coarse_plan.numel() else (0,)
+    return torch.empty_like(x), tape, x.new_empty((scenes, x.shape[1]), dtype=torch.uint8), x.new_empty(done)
 
 
 def _body_adjoints(x: Tensor, f: Any, num_tets: int, wants: Sequence[bool]) -> list[Tensor]:
@@ -121,7 +121,7 @@ def _(*arguments):
 
 @shapes_of("fused_step")
 def _(*arguments):
-    x, (_, sizes, energies, _, _, sweeps, launch, tape_policy) = arguments[0], arguments[_STEP_FIELDS:]
+    x, (_, sizes, energies, _, _, sweeps, launch, _, tape_policy) = arguments[0], arguments[_STEP_FIELDS:]
     tape = x.new_empty(tape_shape(x, sizes, energies, sweeps, launch, tape_policy))
     return torch.empty_like(x), torch.empty_like(x), tape
 

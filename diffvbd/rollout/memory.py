@@ -123,7 +123,7 @@ def coarse_scalars(model: Model, sweeps: int) -> int:
     if model.coarse is None or not model.coarse_geometry.bodies:
         return 0
     geometry, plan = model.coarse_geometry, model._coarse_plan
-    positions = 3 * int(plan.plan[8]) if model.energy_mask & KEEPS_POSITIONS else 0
+    positions = 3 * plan.sizes.positions if model.energy_mask & KEEPS_POSITIONS else 0
     of_one = 3 * geometry.functions + geometry.bodies + positions
     return 18 * plan.mass.numel() + model.coarse.corrections(sweeps) * of_one
 

@@ -15,4 +15,8 @@ def check_on_cpu(model: Model, fields: ops.SweepFields, settings: ops.SweepSetti
     settings = settings._replace(sizes=twin._sizes, launch=())
     with torch.no_grad():
         here = ops.SweepFields(*(t if t is None else t.detach().cpu() for t in fields))  # pyright: ignore
+        if settings.coarse:
+            plan = twin._coarse_plan  # whose positions are those of the CPU
+            settings = settings._replace(coarse=plan.sizes._replace(begun=settings.coarse.begun))
+            here = here._replace(coarse_plan=plan.plan, coarse_weights=plan.weights)
         sweep(here, twin._packed_rest, twin._plan, settings, tape_policy=ops.NO_TAPE, debug_step=index)

@@ -96,23 +96,23 @@ def _mass(model: Model, mass: Tensor) -> Tensor:
 
 class _Matrix(Function):
     @staticmethod
-    def forward(x_prev, stiffness, mass, plan, moments, volume, time_step):
-        return ops.raw.coarse_matrix(x_prev, stiffness, mass, plan, moments, volume, time_step)
+    def forward(x_prev, stiffness, mass, plan, moments, volume, sizes, time_step):
+        return ops.raw.coarse_matrix(x_prev, stiffness, mass, plan, moments, volume, sizes, time_step)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
         ctx.save_for_backward(*inputs[:_FIELDS])
         ctx.mark_non_differentiable(output[1])
-        ctx.time_step = inputs[_FIELDS]
+        ctx.sizes, ctx.time_step = inputs[_FIELDS:]
         ctx.set_materialize_grads(False)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple:
         if grads[0] is None:
-            return (None,) * (_FIELDS + 1)
+            return (None,) * (_FIELDS + 2)
         needs = ctx.needs_input_grad[:_TENSORS]
-        out = _MatrixBackward.apply(grads[0], *ctx.saved_tensors, ctx.time_step, needs)
-        return of_inputs(out, needs, _FIELDS + 1 - _TENSORS)
+        out = _MatrixBackward.apply(grads[0], *ctx.saved_tensors, ctx.sizes, ctx.time_step, needs)
+        return of_inputs(out, needs, _FIELDS + 2 - _TENSORS)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> NoReturn:
@@ -121,9 +121,9 @@ class _Matrix(Function):
 
 class _MatrixBackward(Function):
     @staticmethod
-    def forward(bar, x_prev, stiffness, mass, plan, moments, volume, time_step, needs):
+    def forward(bar, x_prev, stiffness, mass, plan, moments, volume, sizes, time_step, needs):
         fields = (x_prev, stiffness, mass, plan, moments, volume)
-        bars = ops.raw.coarse_matrix_backward(*fields, bar.contiguous(), time_step)
+        bars = ops.raw.coarse_matrix_backward(*fields, bar.contiguous(), sizes, time_step)
         return tuple(ops.sum_to(b, t.shape) for b, t, need in zip(bars, fields, needs, strict=False) if need)
 
     @staticmethod
@@ -144,7 +144,7 @@ def with_corrections(model: Model, parts: CoarseParts, fields: ops.SweepFields, 
     """What the sweeps read, with the corrections between them."""
     plan = model._coarse_plan
     tensors = distinct(fields.x_prev, parts.stiffness.contiguous(), parts.mass)
-    matrix, factor = _Matrix.apply(*tensors, plan.plan, plan.moments, plan.volume, time_step)
+    matrix, factor = _Matrix.apply(*tensors, plan.plan, plan.moments, plan.volume, plan.sizes, time_step)
     return fields._replace(coarse_matrix=matrix, coarse_factor=factor,
                            coarse_mass=parts.mass.detach(), coarse_plan=plan.plan, coarse_weights=plan.weights,
                            coarse_rest=parts.rest)  # fmt: skip

@@ -223,8 +223,9 @@ def coarse_arguments() -> dict[str, tuple[Any, ...]]:
     moduli = torch.full((1, 1), 1e4, dtype=x.dtype)
     parts = coarse_parts(model, moduli, moduli, None, None, None)
     given = (x, parts.stiffness, parts.mass, plan.plan, plan.moments, plan.volume)
-    matrix, _ = torch.ops.diffvbd.coarse_matrix(*given, 0.3)
-    return {"coarse_matrix": (*given, 0.3), "coarse_matrix_backward": (*given, torch.ones_like(matrix), 0.3)}
+    last = (plan.sizes, 0.3)
+    matrix, _ = torch.ops.diffvbd.coarse_matrix(*given, *last)
+    return {"coarse_matrix": (*given, *last), "coarse_matrix_backward": (*given, torch.ones_like(matrix), *last)}
 
 
 def fused_arguments(policy: int) -> dict[str, tuple[Any, ...]]:

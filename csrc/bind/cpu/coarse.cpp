@@ -23,12 +23,12 @@ void for_bodies(int64_t scenes, int64_t bodies, const F& f) {
   });
 }
 
-std::tuple<Tensor, Tensor> matrix(DIFFVBD_PARAMETERS(COARSE) double time_step) {
+std::tuple<Tensor, Tensor> matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t> sizes, double time_step) {
   const CoarseFields f{DIFFVBD_ITEMS(COARSE)};
   return dispatch_float(x_prev, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::matrix_inputs<T>(f, time_step);
-    const int64_t size = int64_t{9} * in.plan.mass_ptr[in.plan.bodies];
+    const auto in = diffvbd::matrix_inputs<T>(f, sizes, time_step);
+    const int64_t size = int64_t{9} * in.plan.cells;
     const Tensor out = zeros(x_prev, {in.scenes, size}), factor = empty(x_prev, {in.scenes, size});
     const auto kernels = diffvbd::coarse_kernels<T>(diffvbd::kExactBlock);
     for_bodies(in.scenes, in.plan.bodies, [&](int64_t scene, int body) {
@@ -42,13 +42,14 @@ std::tuple<Tensor, Tensor> matrix(DIFFVBD_PARAMETERS(COARSE) double time_step) {
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor> matrix_backward(DIFFVBD_PARAMETERS(COARSE) const Tensor& bar, double time_step) {
+std::tuple<Tensor, Tensor, Tensor> matrix_backward(DIFFVBD_PARAMETERS(COARSE) const Tensor& bar, std::vector<int64_t> sizes,
+                                                   double time_step) {
   const CoarseFields f{DIFFVBD_ITEMS(COARSE)};
   return dispatch_float(x_prev, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::matrix_inputs<T>(f, time_step);
+    const auto in = diffvbd::matrix_inputs<T>(f, sizes, time_step);
     const coarse::Plan& p = in.plan;
-    const int64_t cells = p.mass_ptr[p.bodies], size = int64_t{9} * p.groups * p.width * p.width;
+    const int64_t cells = p.cells, size = int64_t{9} * p.groups * p.width * p.width;
     diffvbd::require_like("bar", bar, x_prev, 9 * cells * in.scenes);
     const Tensor x_bar = zeros(x_prev, {in.scenes, in.vertices, 3}),
                  stiffness_bar = zeros(x_prev, {in.scenes, p.groups, 3, 3, p.width, p.width}),

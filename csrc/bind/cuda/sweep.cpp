@@ -58,11 +58,11 @@ cuda::Choice choose(const cuda::StepInputs<T>& in, const Tensor& x, const SweepS
 std::tuple<Tensor, Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const Tensor& plan,
                                                  std::vector<int64_t> sizes, int64_t energies,
                                                  std::vector<int64_t> data_count, std::vector<double> numbers,
-                                                 int64_t sweeps, std::vector<int64_t> launch, int64_t tape_policy,
+                                                 int64_t sweeps, std::vector<int64_t> launch, std::vector<int64_t> coarse, int64_t tape_policy,
                                                  int64_t /*debug_step*/, bool /*checked*/) {
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   require(f.coarse_plan.numel() == 0, "diffvbd::sweep: coarse corrections run on the CPU");
-  const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
+  const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, coarse, tape_policy};
   const Tensor& from = f.x_start;
   const DeviceGuard guard(from.get_device_index());
   const cuda::HostPlan host = plan_of(plan, from, sizes);
@@ -103,10 +103,10 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
                                       const Tensor& tape, const Tensor& /*corrections*/, const Tensor& plan,
                                       std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
                                       std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
-                                      int64_t tape_policy, std::vector<bool> wants) {
+                                      std::vector<int64_t> coarse, int64_t tape_policy, std::vector<bool> wants) {
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   require(f.coarse_plan.numel() == 0, "diffvbd::sweep: coarse corrections run on the CPU");
-  const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
+  const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, coarse, tape_policy};
   const DeviceGuard guard(x.get_device_index());
   const cuda::HostPlan host = plan_of(plan, x, sizes);
   require(tape_policy != diffvbd::kNoTape, "diffvbd::sweep_backward: expected a tape_policy with a tape");
@@ -152,9 +152,9 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
 std::tuple<Tensor, Tensor, Tensor> fused_step(DIFFVBD_PARAMETERS(STEP) const Tensor& plan, std::vector<int64_t> sizes,
                                               int64_t energies, std::vector<int64_t> data_count,
                                               std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
-                                              int64_t tape_policy) {
+                                              std::vector<int64_t> coarse, int64_t tape_policy) {
   const StepFields f{DIFFVBD_ITEMS(STEP)};
-  const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
+  const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, coarse, tape_policy};
   const DeviceGuard guard(f.x.get_device_index());
   const cuda::HostPlan host = plan_of(plan, f.x, sizes);
   return dispatch_float(f.x, [&](auto scalar) {
@@ -176,9 +176,9 @@ diffvbd::FusedAdjoints fused_step_backward(DIFFVBD_PARAMETERS(STEP) const Tensor
                                            const Tensor& x_end, const Tensor& tape, const Tensor& plan,
                                            std::vector<int64_t> sizes, int64_t energies,
                                            std::vector<int64_t> data_count, std::vector<double> numbers, int64_t sweeps,
-                                           std::vector<int64_t> launch, int64_t tape_policy, std::vector<bool> wants) {
+                                           std::vector<int64_t> launch, std::vector<int64_t> coarse, int64_t tape_policy, std::vector<bool> wants) {
   const StepFields f{DIFFVBD_ITEMS(STEP)};
-  const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, tape_policy};
+  const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, coarse, tape_policy};
   const DeviceGuard guard(x.get_device_index());
   const cuda::HostPlan host = plan_of(plan, f.x, sizes);
   require(wants.size() == 7 && tape_policy != diffvbd::kNoTape, "diffvbd::fused_step_backward: bad arguments");
