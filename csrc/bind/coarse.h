@@ -22,11 +22,14 @@ inline coarse::Plan coarse_plan(const Tensor& plan, const Tensor& x, const std::
   return out;
 }
 
-template <class T>
-coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, const std::vector<int64_t>& sizes,
-                                int64_t sweeps, int energies, int64_t positions) {
+// given: StepInputs of a backend
+template <class T, class In, class Settings>
+coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, const Settings& q, const In& given,
+                                int64_t positions) {
+  require((given.energies & (kContact | kPaperBlock)) == 0 && !given.parameters.saturates,
+          "diffvbd::sweep: coarse corrections take no contact, no paper block and no saturation");
   coarse::Inputs<T> in{};
-  in.plan = coarse_plan(f.coarse_plan, x, sizes);
+  in.plan = coarse_plan(f.coarse_plan, x, q.coarse);
   const coarse::Plan& p = in.plan;
   const int64_t b = x.size(0), cells = p.cells;
   require(p.positions == positions && p.vertices == x.size(1), "coarse_plan: expected one of this Model's sweeps");
@@ -38,8 +41,8 @@ coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, const std
   in.rest = batched<T>("coarse_rest", f.coarse_rest, x, b, int64_t{p.tet_blocks} * kRestScalars * kLanes);
   in.factor = batched<T>("coarse_factor", f.coarse_factor, x, b, 9 * cells);
   in.mass = batched<T>("coarse_mass", f.coarse_mass, x, b, cells);
-  in.keeps_positions = keeps_positions(energies);
-  in.corrections = coarse::corrections_of(static_cast<int>(sweeps), p.every, p.begun);
+  in.keeps_positions = keeps_positions(given.energies);
+  in.corrections = coarse::corrections_of(given.sweeps, p.every, p.begun);
   return in;
 }
 

@@ -14,18 +14,18 @@ constexpr double kDecrease = 1e-4;  // share of what the slope promises
 constexpr double kRounding = 8;     // ulps of the terms that a sum may lose
 constexpr int kFailures = 2;        // lengths of 0 after which a body's corrections are over
 
-inline double length_of(int trial) { return std::ldexp(1.0, -trial); }
+DIFFVBD_FN double length_of(int trial) { return 1.0 / (1 << trial); }
 
 // The smooth part of the change of the potential, c[0] s + ... + c[5] s^6, and the sum of its terms' sizes.
 struct Change {
   double c[kDegree];
 
-  double at(double s) const {
+  DIFFVBD_FN double at(double s) const {
     double sum = 0;
     for (int i = kDegree - 1; i >= 0; --i) sum = (sum + c[i]) * s;
     return sum;
   }
-  double size(double s) const {
+  DIFFVBD_FN double size(double s) const {
     double sum = 0;
     for (int i = kDegree - 1; i >= 0; --i) sum = (sum + std::abs(c[i])) * s;
     return sum;
@@ -35,7 +35,7 @@ struct Change {
 // slope: of the whole potential at s = 0. more(s, size): the change of what is no polynomial, which adds to `size` and
 // is infinite where s is not admissible.
 template <class T, class More>
-double length(const Change& change, double slope, const More& more) {
+DIFFVBD_FN double length(const Change& change, double slope, const More& more) {
   if (!(slope <= 0)) return 0;  // at rest it is 0: the whole correction is taken, for its derivative
   for (int trial = 0; trial < kLengths; ++trial) {
     const double s = length_of(trial);

@@ -3,7 +3,6 @@
 #pragma once
 
 #include <cmath>
-#include <utility>
 
 #include "../rigid/rotation.h"
 #include "views.h"
@@ -15,7 +14,7 @@ using rigid::Matrix, rigid::outer, rigid::Vector;
 constexpr double kCollapsed = 1e-3;  // of a group's volume: below it the sum of two stretches determines no rotation
 
 // Eigenvectors of a symmetric matrix as the columns of v, by Jacobi's rotations.
-inline void eigenvectors(double (&a)[3][3], double (&v)[3][3]) {
+DIFFVBD_FN void eigenvectors(double (&a)[3][3], double (&v)[3][3]) {
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) v[i][j] = i == j;
   }
@@ -47,7 +46,7 @@ inline void eigenvectors(double (&a)[3][3], double (&v)[3][3]) {
 }
 
 // The rotation nearest to f, of any size and sign; false where f has too little of two stretches to tell.
-inline bool nearest_rotation(const Matrix& f, double volume, Matrix& rotation) {
+DIFFVBD_FN bool nearest_rotation(const Matrix& f, double volume, Matrix& rotation) {
   const Matrix square = transposed(f) * f;
   double a[3][3] = {
       {square.x.x, square.x.y, square.x.z}, {square.y.x, square.y.y, square.y.z}, {square.z.x, square.z.y, square.z.z}};
@@ -56,7 +55,8 @@ inline bool nearest_rotation(const Matrix& f, double volume, Matrix& rotation) {
   int order[3] = {0, 1, 2};
   for (int i = 0; i < 2; ++i) {
     for (int j = 0; j < 2 - i; ++j) {
-      if (a[order[j]][order[j]] < a[order[j + 1]][order[j + 1]]) std::swap(order[j], order[j + 1]);
+      const int here = order[j], next = order[j + 1];
+      if (a[here][here] < a[next][next]) order[j] = next, order[j + 1] = here;
     }
   }
   const auto column = [&](int i) { return Vector{v[0][order[i]], v[1][order[i]], v[2][order[i]]}; };
@@ -103,7 +103,7 @@ bool rotation_of(const MatrixInputs<T>& in, int64_t scene, int group, Matrix& f,
 }
 
 template <class T>
-Matrix block_at(const T* m, int64_t row, int64_t column = 1) {
+DIFFVBD_FN Matrix block_at(const T* m, int64_t row, int64_t column = 1) {
   const auto at = [&](int i) {
     const T* a = m + i * row;
     return Vector{double(a[0]), double(a[column]), double(a[2 * column])};

@@ -11,21 +11,22 @@ namespace diffvbd::coarse {
 struct Plan {
   int32_t bodies, functions, groups, width, entries, tet_blocks, moments, positions, listed;
   int32_t cells, most, parts, places, vertices;  // of all matrices; functions of a body at most
+  int32_t large;                                 // bodies of more than kTile unknowns, the last ones
   int32_t every, begun;                          // sweeps after each correction; sweeps before the first that is run
   const int32_t* function_ptr;                   // [bodies + 1]
   const int32_t* mass_ptr;                       // [bodies + 1]  sums of squares of the numbers of functions
   const int32_t* function_body;                  // [functions]
-  const int32_t* position_body;            // [positions]  -1: none with a vertex to move
-  const int32_t *position_ptr, *function;  // [positions + 1], [entries]  the functions of a position
-  const int32_t *row_ptr, *row;            // [functions + 1], [entries]  the positions of a function
-  const int32_t* block_ptr;                // [bodies + 1]  blocks of kLanes tets of a body
-  const int32_t* part_ptr;                 // [bodies + 1]  parts of a body: sums over its tets are made of theirs
-  const int32_t *part_body, *part_begin;   // [parts], [parts + 1]  blocks of a part
-  const int32_t* corner;                   // [tet_blocks, 4, kLanes]  positions times kRow
-  const int32_t* tet;                      // [tet_blocks, kLanes]  any at padding, which has one corner four times
-  const int32_t* group_ptr;                // [bodies + 1]  groups of a body
-  const int32_t* group_body;               // [groups]
-  const int32_t* group_function;           // [groups, width]  -1 beyond the last
+  const int32_t* position_body;                  // [positions]  -1: none with a vertex to move
+  const int32_t *position_ptr, *function;        // [positions + 1], [entries]  the functions of a position
+  const int32_t *row_ptr, *row;                  // [functions + 1], [entries]  the positions of a function
+  const int32_t* block_ptr;                      // [bodies + 1]  blocks of kLanes tets of a body
+  const int32_t* part_ptr;                       // [bodies + 1]  parts of a body: sums over its tets are made of theirs
+  const int32_t *part_body, *part_begin;         // [parts], [parts + 1]  blocks of a part
+  const int32_t* corner;                         // [tet_blocks, 4, kLanes]  positions times kRow
+  const int32_t* tet;             // [tet_blocks, kLanes]  any at padding, which has one corner four times
+  const int32_t* group_ptr;       // [bodies + 1]  groups of a body
+  const int32_t* group_body;      // [groups]
+  const int32_t* group_function;  // [groups, width]  -1 beyond the last
   // the reverse, [groups], [places]: for each function of a body its place in a group, -1: none
   const int32_t *place_ptr, *place;
   // what the mean deformation of a group is made of: [groups + 1], [moments] twice; and by vertex: [vertices + 1],
@@ -33,14 +34,15 @@ struct Plan {
   const int32_t *moment_ptr, *moment_vertex, *moment_group, *vertex_ptr, *vertex_moment;
   const int32_t *list_ptr, *list, *list_position;  // [bodies + 1], [listed] twice  the vertices of a body that move
 };
-constexpr int kSizes = 16;
+constexpr int kSizes = 17;
+constexpr int kTile = 32;  // unknowns that CUDA takes at once; twin of TILE in diffvbd/model/coarse_plan.py
 
 // sizes [kSizes]: those of Plan in their order. Returns the number of int32 behind p through `used`.
 DIFFVBD_FN Plan view_plan(const int64_t* sizes, const int32_t* p, int64_t& used) {
   const int32_t* const start = p;
   const auto size = [&](int i) { return static_cast<int32_t>(sizes[i]); };
-  Plan out{size(0), size(1), size(2),  size(3),  size(4),  size(5),  size(6),  size(7),
-           size(8), size(9), size(10), size(11), size(12), size(13), size(14), size(15)};
+  Plan out{size(0), size(1),  size(2),  size(3),  size(4),  size(5),  size(6),  size(7), size(8),
+           size(9), size(10), size(11), size(12), size(13), size(14), size(15), size(16)};
   const auto take = [&](int64_t count) {
     const int32_t* at = p;
     p += count;
@@ -92,7 +94,7 @@ struct Inputs {
   bool keeps_positions;
 
   // of a correction: the coarse vector, the length of each body and, where gaps must come back to the bit, what it read
-  int64_t tape_size() const {
+  DIFFVBD_FN int64_t tape_size() const {
     return int64_t{3} * plan.functions + plan.bodies + (keeps_positions ? int64_t{3} * plan.positions : 0);
   }
 };

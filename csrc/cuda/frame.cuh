@@ -125,7 +125,7 @@ __global__ void store_adjoints(const __grid_constant__ StepInputs<T> in, const _
   const bool pinned = block >= __ldg(s.plan.color_block + s.plan.colors);
   const int64_t own = scene * s.plan.num_vertices + vertex, vectors = local * s.positions * 3;
   Vec3<T> start = load_row(s.w.x_bar, i);
-  if (s.sweeps > 0) start += rows_left(s, local, block, v, pinned);
+  start += rows_left(s, local, block, v, pinned);
   const Vec3<T> y = load3(s.w.y_bar + vectors, block, v);
   if (out.mass) out.mass[own] = s.w.mass_bar[i];
   if (!in.fused) {

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 
+#include "coarse.h"
 #include "contact.h"
 #include "frame.cuh"
 #include "scene_kernels.h"
@@ -36,10 +37,26 @@ struct Carver {
   }
 };
 
+// scenes: that are worked on at once
+template <class T>
+CoarseWork<T> carve_coarse(const coarse::Inputs<T>& in, int64_t positions, int64_t scenes, bool reverse,
+                           Carver<T>& take) {
+  const coarse::Plan& p = in.plan;
+  const auto bytes = [](int64_t count, size_t size) { return static_cast<int64_t>(count * size / sizeof(T) + 1); };
+  CoarseWork<T> w{};
+  w.gradient = take(!reverse, scenes * kRow * positions);
+  w.way = take(true, scenes * kRow * positions);
+  w.restricted = take(true, scenes * 3 * p.functions);
+  w.solved = take(reverse, scenes * in.corrections * 3 * p.functions);
+  w.sums = reinterpret_cast<double*>(take(!reverse, bytes(scenes * p.parts * coarse::kDegree, sizeof(double))));
+  w.failures = reinterpret_cast<int32_t*>(take(!reverse, bytes(scenes * p.bodies, sizeof(int32_t))));
+  return w;
+}
+
 // Arrays that start from zero come first. Returns their scalars through `zeroed`.
 template <class T>
 Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints, const Choice& choice,
-                   Carver<T>& take, int64_t* zeroed, T** spill) {
+                   Carver<T>& take, int64_t* zeroed, T** spill, CoarseWork<T>& coarse) {
   const GroupPlan& plan = host.plan;
   const int64_t n = choice.chunk, positions = int64_t{plan.blocks} * kSlice, pairs = int64_t{plan.slots} * kSlice;
   const bool elastic = (in.energies & kElastic) != 0, reverse = adjoints != nullptr;
@@ -72,6 +89,8 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
     const int64_t warps = int64_t{choice.multiprocessors} * kWarpsPerBlock;
     *spill = take(true, warps * shared_scalars(host.degree, host.valence, kSpillLanes, reverse));
   }
+  coarse = {};
+  if (in.coarse) coarse = carve_coarse(*in.coarse, positions, n, reverse, take);
   return w;
 }
 
@@ -87,6 +106,7 @@ struct Runner {
   int64_t zeroed = 0;
   T* first = nullptr;
   bool material_is_shared;
+  CoarseWork<T> coarse{};
 
   Runner(const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints, const Choice& choice,
          void* workspace, cudaStream_t stream)
@@ -98,7 +118,7 @@ struct Runner {
         barrier(static_cast<unsigned*>(workspace)) {
     first = reinterpret_cast<T*>(static_cast<char*>(workspace) + kBarrierBytes);
     Carver<T> take{first};
-    s.w = carve(host, in, adjoints, choice, take, &zeroed, &s.spill);
+    s.w = carve(host, in, adjoints, choice, take, &zeroed, &s.spill, coarse);
     s.plan = host.plan;
     s.positions = int64_t{host.plan.blocks} * kSlice;
     s.degree = host.degree;
@@ -162,9 +182,8 @@ struct Runner {
   int64_t blocks_of(int color) const { return host.color_block[color + 1] - host.color_block[color]; }
 
   cudaError_t sweep(SweepKernel<T> kernel, int lanes, bool backward) {
-    const GroupPlan& plan = host.plan;
-    const int colors = plan.colors;
-    if (in.sweeps == 0 || colors == 0) return cudaSuccess;
+    const int colors = host.plan.colors;
+    if (colors == 0) return cudaSuccess;
     int64_t most = 1;
     for (int c = 0; c < colors; ++c) most = std::max(most, blocks_of(c) * threads_of(lanes));
     const bool own = choice.regime == kBlock, spills = lanes == kSpillLanes;
@@ -179,7 +198,7 @@ struct Runner {
       if (auto error = cudaFuncSetAttribute(function, attribute, static_cast<int>(choice.shared))) return error;
     }
     const dim3 threads(static_cast<unsigned>(warps * kSlice));
-    Range range{choice.regime, 0, in.sweeps, 0, colors, barrier};
+    Range range{choice.regime, 0, 0, 0, colors, barrier};
     void* arguments[] = {&s, &range};
     // with spilled stars no more blocks than have memory of their own
     const auto blocks_for = [&](int64_t parts) {
@@ -189,16 +208,45 @@ struct Runner {
     const auto launch = [&](int64_t blocks) {
       return cudaLaunchKernel(function, dim3(static_cast<unsigned>(blocks)), threads, arguments, shared, stream);
     };
-    if (own) return launch(blocks_for(most));
-    if (choice.regime == kGrid) {
+    const auto run = [&](int begin, int end) {  // counted from the last in the reverse
+      range.first_sweep = begin, range.end_sweep = end;
+      range.first_color = 0, range.end_color = colors;
+      if (begin == end) return cudaSuccess;
+      if (own) return launch(blocks_for(most));
+      if (choice.regime == kColor) return color_by_color(range, backward, lanes, blocks_for, launch);
       int resident = 0;
       const int size = static_cast<int>(threads.x);
       if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, function, size, shared)) return error;
       const int64_t blocks = std::min<int64_t>(int64_t{resident} * choice.multiprocessors, blocks_for(most));
       return cudaLaunchCooperativeKernel(function, dim3(static_cast<unsigned>(blocks)), threads, arguments, shared,
                                          stream);
+    };
+    return in.coarse ? corrected(run, backward) : run(0, in.sweeps);
+  }
+
+  // Runs the sweeps with the corrections between them.
+  template <class Run>
+  cudaError_t corrected(const Run& run, bool backward) {
+    const coarse::Inputs<T>& c = *in.coarse;
+    const int64_t active = host.color_block[host.plan.colors] * kSlice;
+    const Corrections<T> corrections{s, in, coarse, active, barrier, stream};
+    int done = 0, number = backward ? c.corrections : 0;
+    for (int i = 0; i <= in.sweeps; ++i) {
+      const int sweep = backward ? in.sweeps - i : i;
+      if (!coarse::corrects_before(sweep, in.sweeps, c.plan.every, c.plan.begun)) continue;
+      if (auto error = run(done, i)) return error;
+      const auto error = backward ? corrections.reverse(--number, choice.wanted) : corrections.correct(number++);
+      if (error != cudaSuccess) return error;
+      done = i;
     }
-    for (int k = 0; k < in.sweeps; ++k) {
+    if (auto error = run(done, in.sweeps)) return error;
+    return backward ? corrections.matrix_bars() : cudaSuccess;
+  }
+
+  template <class Blocks, class Launch>
+  cudaError_t color_by_color(Range& range, bool backward, int lanes, const Blocks& blocks_for, const Launch& launch) {
+    const int colors = host.plan.colors, first = range.first_sweep, last = range.end_sweep;
+    for (int k = first; k < last; ++k) {
       for (int c = 0; c < colors; ++c) {
         range.first_sweep = k, range.end_sweep = k + 1;
         range.first_color = c, range.end_color = c + 1;
@@ -283,7 +331,8 @@ size_t workspace_bytes(const HostPlan& host, const StepInputs<T>& in, const Step
   Carver<T> take{nullptr};
   int64_t zeroed = 0;
   T* spill = nullptr;
-  carve(host, in, adjoints, choice, take, &zeroed, &spill);
+  CoarseWork<T> coarse{};
+  carve(host, in, adjoints, choice, take, &zeroed, &spill, coarse);
   return kBarrierBytes + take.used * sizeof(T);
 }
 

@@ -4,6 +4,7 @@
 
 #include <cuda_runtime_api.h>
 
+#include "../coarse/views.h"
 #include "../contact/passes.h"
 #include "../core/plan_views.h"
 #include "../energies/energies.h"
@@ -42,6 +43,7 @@ struct StepInputs {
   Batched<const T> v, acceleration,
       prescribed;                            // [B, V, 3]; acceleration also [B, 1, 3] (item 0); prescribed may be null
   const contact::ContactInputs<T>* contact;  // on the host; null without contact
+  const coarse::Inputs<T>* coarse;           // on the host; null without corrections
 };
 
 template <class T>

@@ -14,6 +14,7 @@ from .coarse import CoarseGeometry, CoarseSpace, build_coarse
 from .rest import rest_metric, shape_gradients
 
 LANES = ops.LANES["cpu"]  # tets of a block, on every device; twin of kLanes
+TILE = 32  # unknowns of a body beyond which it counts as large; twin of kTile in csrc/coarse/views.h
 PART = 32  # most blocks of a part of a body
 ROW = 4  # scalars of a row of positions; twin of kRow in csrc/core/views.h
 
@@ -90,7 +91,7 @@ def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tet
     sizes = ops.CoarseSizes(
         g.bodies, g.functions, len(g.group_body), g.group_functions.shape[1], len(g.vertex), len(tet), len(moment[1]),
         len(order), len(listed), int(mass_ptr[-1]), int(counts.max(initial=0)), len(part_body), len(place), vertices,
-        every)  # fmt: skip
+        int((3 * counts > TILE).sum()), every)  # fmt: skip
     arrays = [
         g.function_ptr, mass_ptr, function_body, position_body, _starts(by_position[0], len(order)), by_position[1],
         _starts(g.function[rows], g.functions), at[rows], block_ptr, part_ptr, part_body, part_begin, ROW * corner,

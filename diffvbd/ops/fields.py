@@ -164,6 +164,7 @@ class CoarseSizes(NamedTuple):
     parts: int
     places: int
     vertices: int
+    large: int
     every: int
     begun: int = 0  # 1 where the sweeps to run go on after the first of a step
 

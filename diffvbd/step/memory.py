@@ -49,7 +49,8 @@ WORKSPACE_BUDGET = 2 << 30  # bytes; twin of kWorkspaceBudget in csrc/bind/cuda/
 
 def cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = True, rest: bool = False) -> int:
     """Bytes of workspace of one step on CUDA, as carved in csrc/cuda/run.cuh (a material per tet)."""
-    if regimes.choose(model.num_vertices, model.num_colors, scenes, contact=model.touches)[0] == regimes.THREAD:
+    corrects = model.coarse is not None
+    if regimes.choose(model.num_vertices, model.num_colors, scenes, model.touches, corrects)[0] == regimes.THREAD:
         return 0
     _, _, slots, _, _, blocks, edge_slots, *_ = model._sizes
     lanes = ops.LANES["cuda"]
@@ -59,5 +60,8 @@ def cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = T
     if reverse:
         one += 4 * (edge_slots * lanes + 1) + 8 * positions
         one += (2 * pairs if material or rest else 0) + (4 * pairs if rest else 0)
+    if corrects:
+        sizes = model._coarse_plan.sizes
+        one += (4 if reverse else 8) * positions + 3 * sizes.functions + (0 if reverse else 6 * sizes.parts)
     one *= model._mass.element_size()
     return one * min(scenes, max(1, WORKSPACE_BUDGET // max(1, one)))

@@ -36,9 +36,10 @@ def recorded(model: Any, inputs: dict, lengths: list[Tensor]) -> list[Tensor]:
     return [t.transpose(0, 1).reshape(t.shape[1], *lead, t.shape[2]) for t in lengths]
 
 
-def check(case: str, kind: str, space: dv.CoarseSpace, sweeps: int, steps: int, tape: str) -> list[Tensor]:
+def check(device: str, case: str, kind: str, space: dv.CoarseSpace, sweeps: int, steps: int, tape: str
+          ) -> list[Tensor]:  # fmt: skip
     scene = build_scene(case, kind, "small")
-    model, inputs = scene.model(coarse=space), scene.inputs()
+    model, inputs = scene.model(device, coarse=space), scene.inputs(device=device)
     result, lengths = compiled(model, inputs, sweeps, steps, tape)
     assert len(lengths) == steps and all(t.shape[1] == space.corrections(sweeps) for t in lengths)
     given = recorded(model, inputs, lengths)
@@ -71,12 +72,12 @@ def rows() -> list[Any]:
 
 
 @pytest.mark.parametrize(("case", "kind", "space", "sweeps", "steps", "tape"), rows())
-def test_step_and_rollout(case: str, kind: str, space: int, sweeps: int, steps: int, tape: str) -> None:
-    check(case, kind, SPACES[space], sweeps, steps, tape)
+def test_step_and_rollout(device: str, case: str, kind: str, space: int, sweeps: int, steps: int, tape: str) -> None:
+    check(device, case, kind, SPACES[space], sweeps, steps, tape)
 
 
-def test_lengths_below_one_and_zero_occur() -> None:
+def test_lengths_below_one_and_zero_occur(device: str) -> None:
     """What the comparison above is worth: shortened and refused corrections are among its steps."""
-    found = torch.cat([check(case, "structured", SPACES[0], 8, 2, "full")[0].reshape(-1)
+    found = torch.cat([check(device, case, "structured", SPACES[0], 8, 2, "full")[0].reshape(-1)
                        for case in ("inverted", "violent", "floor_filtered", "huge_strain")])  # fmt: skip
     assert (found == 1).any() and ((found > 0) & (found < 1)).any() and (found == 0).any(), found

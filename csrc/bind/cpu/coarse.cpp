@@ -42,8 +42,8 @@ std::tuple<Tensor, Tensor> matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor> matrix_backward(DIFFVBD_PARAMETERS(COARSE) const Tensor& bar, std::vector<int64_t> sizes,
-                                                   double time_step) {
+std::tuple<Tensor, Tensor, Tensor> matrix_backward(DIFFVBD_PARAMETERS(COARSE) const Tensor& bar,
+                                                   std::vector<int64_t> sizes, double time_step) {
   const CoarseFields f{DIFFVBD_ITEMS(COARSE)};
   return dispatch_float(x_prev, [&](auto scalar) {
     using T = decltype(scalar);

@@ -26,9 +26,7 @@ struct Given {
     diffvbd::set_fields(in, f, x, q, plan.num_vertices, plan.num_tets, packed);
     in.debug_step = debug_step;
     if (f.coarse_plan.numel() > 0) {
-      coarse = diffvbd::coarse_inputs<T>(f, x, q.coarse, q.sweeps, in.energies, int64_t{plan.blocks} * diffvbd::kLanes);
-      require(!diffvbd::has_contact(q, f) && !(in.energies & diffvbd::kPaperBlock) && !in.parameters.saturates,
-              "diffvbd::sweep: coarse corrections take no contact, no paper block and no saturation");
+      coarse = diffvbd::coarse_inputs<T>(f, x, q, in, int64_t{plan.blocks} * diffvbd::kLanes);
       in.coarse = &coarse;
     }
     if (!diffvbd::has_contact(q, f)) return;
@@ -47,8 +45,9 @@ std::vector<int64_t> corrections_shape(const diffvbd::coarse::Inputs<T>& c, cons
 std::tuple<Tensor, Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const Tensor& plan_buffer,
                                                  std::vector<int64_t> sizes, int64_t energies,
                                                  std::vector<int64_t> data_count, std::vector<double> numbers,
-                                                 int64_t sweeps, std::vector<int64_t> launch, std::vector<int64_t> coarse, int64_t tape_policy,
-                                                 int64_t debug_step, bool checked) {
+                                                 int64_t sweeps, std::vector<int64_t> launch,
+                                                 std::vector<int64_t> coarse, int64_t tape_policy, int64_t debug_step,
+                                                 bool checked) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, coarse, tape_policy};

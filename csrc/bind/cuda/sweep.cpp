@@ -10,6 +10,7 @@
 
 namespace {
 
+namespace coarse = diffvbd::coarse;
 namespace contact = diffvbd::contact;
 namespace cuda = diffvbd::cuda;
 using cuda::check, cuda::current_stream, cuda::DeviceGuard, cuda::empty, cuda::plan_of, cuda::zeros;
@@ -25,9 +26,15 @@ template <class T>
 struct Given {
   cuda::StepInputs<T> in{};
   contact::ContactInputs<T> pairs{};
+  coarse::Inputs<T> coarse{};
 
   Given(const cuda::HostPlan& host, const SweepFields& f, const Tensor& x, const SweepSettings& q) {
     diffvbd::set_fields(in, f, x, q, host.plan.num_vertices, host.plan.num_tets, packed_size(host));
+    if (f.coarse_plan.numel() > 0) {
+      const int64_t positions = int64_t{host.plan.blocks} * diffvbd::kSlice;
+      coarse = diffvbd::coarse_inputs<T>(f, x, q, in, positions);
+      if (coarse.plan.bodies > 0) in.coarse = &coarse;
+    }
     if (!diffvbd::has_contact(q, f)) return;
     pairs = diffvbd::contact_inputs<T>(f, x, in.x_prev, in.origin, q.numbers[diffvbd::kFrictionEps]);
     in.contact = &pairs;
@@ -46,29 +53,37 @@ struct Given {
   Given(const Given&) = delete;  // in points into itself
 };
 
+// What corrections do is recorded here.
+template <class T>
+std::vector<int64_t> corrections_shape(const Given<T>& given) {
+  if (given.coarse.corrections == 0) return {0};
+  return {given.in.scenes, given.coarse.corrections, given.coarse.tape_size()};
+}
+
 template <class T>
 cuda::Choice choose(const cuda::StepInputs<T>& in, const Tensor& x, const SweepSettings& q, bool reverse,
                     int wanted = 0) {
   const cuda::Choice out = cuda::choose(x, q.launch, reverse, wanted);
   require(!in.contact || (out.regime == cuda::kColor && out.lanes != cuda::kFewLanes),
           "diffvbd::sweep: bad launch for contact");
+  require(!in.coarse || out.regime != cuda::kThread, "diffvbd::sweep: bad launch for coarse corrections");
   return out;
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const Tensor& plan,
                                                  std::vector<int64_t> sizes, int64_t energies,
                                                  std::vector<int64_t> data_count, std::vector<double> numbers,
-                                                 int64_t sweeps, std::vector<int64_t> launch, std::vector<int64_t> coarse, int64_t tape_policy,
+                                                 int64_t sweeps, std::vector<int64_t> launch,
+                                                 std::vector<int64_t> coarse, int64_t tape_policy,
                                                  int64_t /*debug_step*/, bool /*checked*/) {
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
-  require(f.coarse_plan.numel() == 0, "diffvbd::sweep: coarse corrections run on the CPU");
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, coarse, tape_policy};
   const Tensor& from = f.x_start;
   const DeviceGuard guard(from.get_device_index());
   const cuda::HostPlan host = plan_of(plan, from, sizes);
   return dispatch_float(from, [&](auto scalar) {
     using T = decltype(scalar);
-    const Given<T> given(host, f, from, q);
+    Given<T> given(host, f, from, q);
     const auto& in = given.in;
     cuda::Choice choice = choose(in, from, q, false);
     const int64_t v = host.plan.num_vertices;
@@ -76,11 +91,13 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const
     Tensor x = empty(from, {in.scenes, v, 3}), tape = empty(from, cuda::tape_shape(host, in, launch));
     Tensor cut = empty(from, {in.contact ? in.scenes : 0, v}, ScalarType::Byte);
     if (cut.numel()) check(cudaMemsetAsync(cut.data_ptr(), 0, cut.numel(), stream), "memset");
+    const Tensor corrections = empty(from, corrections_shape(given));
+    given.coarse.tape = data<T>(corrections);
     const Tensor work = cuda::workspace<T>(from, host, in, nullptr, choice);
     check(cuda::run_forward<T>(host, in, {data<T>(x), nullptr, data<T>(tape), data<uint8_t>(cut)}, choice,
                                work.data_ptr(), stream),
           "the forward sweep");
-    return std::make_tuple(x, tape, cut, empty(from, {0}));
+    return std::make_tuple(x, tape, cut, corrections);
   });
 }
 
@@ -100,12 +117,11 @@ struct ContactSlots {
 };
 
 diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_bar, const Tensor& x,
-                                      const Tensor& tape, const Tensor& /*corrections*/, const Tensor& plan,
+                                      const Tensor& tape, const Tensor& corrections, const Tensor& plan,
                                       std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
                                       std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
                                       std::vector<int64_t> coarse, int64_t tape_policy, std::vector<bool> wants) {
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
-  require(f.coarse_plan.numel() == 0, "diffvbd::sweep: coarse corrections run on the CPU");
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, coarse, tape_policy};
   const DeviceGuard guard(x.get_device_index());
   const cuda::HostPlan host = plan_of(plan, x, sizes);
@@ -113,9 +129,12 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
   diffvbd::require_like("x_bar", x_bar, x, x.numel());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const Given<T> given(host, f, x, q);
+    Given<T> given(host, f, x, q);
     const auto& in = given.in;
     cuda::check_tape(tape, x, host, in, launch);
+    int64_t recorded = 1;
+    for (const int64_t n : corrections_shape(given)) recorded *= n;
+    diffvbd::require_like("corrections", corrections, x, recorded);
     const auto make = [&](const std::vector<int64_t>& shape, bool zeroed) {
       return zeroed ? zeros(x, shape) : empty(x, shape);
     };
@@ -125,6 +144,8 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     cuda::StepAdjoints<T> out{};
     diffvbd::set_bars(out, bars, in);
     out.x_bar = data<const T>(x_bar);
+    given.coarse.tape = data<T>(corrections);
+    given.coarse.matrix_bar = bars.coarse_matrix.numel() > 0 ? data<T>(bars.coarse_matrix) : nullptr;
     const cudaStream_t stream = current_stream(x);
     const auto run = [&] {
       cuda::Choice choice = choose(in, x, q, true, cuda::wishes(out));
@@ -176,7 +197,8 @@ diffvbd::FusedAdjoints fused_step_backward(DIFFVBD_PARAMETERS(STEP) const Tensor
                                            const Tensor& x_end, const Tensor& tape, const Tensor& plan,
                                            std::vector<int64_t> sizes, int64_t energies,
                                            std::vector<int64_t> data_count, std::vector<double> numbers, int64_t sweeps,
-                                           std::vector<int64_t> launch, std::vector<int64_t> coarse, int64_t tape_policy, std::vector<bool> wants) {
+                                           std::vector<int64_t> launch, std::vector<int64_t> coarse,
+                                           int64_t tape_policy, std::vector<bool> wants) {
   const StepFields f{DIFFVBD_ITEMS(STEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, coarse, tape_policy};
   const DeviceGuard guard(x.get_device_index());

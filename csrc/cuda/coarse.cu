@@ -1,0 +1,323 @@
+// The launches of a coarse correction: gradient, restriction, solve, prolongation, length, motion; and back.
+#include "../coarse/line.h"
+#include "bodies.cuh"
+#include "coarse.h"
+#include "group.cuh"
+
+namespace diffvbd::cuda {
+namespace {
+
+constexpr int kSumThreads = 128;  // of a function, and of a part of a body
+constexpr int kRowThreads = 128;
+constexpr int kMostSmall = 8;  // functions of a body up to which eight threads solve for an unknown, else a warp
+
+template <class T>
+struct View {
+  StepView<T> s;
+  coarse::Inputs<T> c;
+  CoarseWork<T> w;
+
+  __device__ T* tape(int64_t scene, int k) const {
+    return c.tape + ((s.base + scene) * c.corrections + k) * c.tape_size();
+  }
+  __device__ T* lengths(int64_t scene, int k) const { return tape(scene, k) + int64_t{3} * c.plan.functions; }
+  __device__ T* solved(int64_t scene, int k) const {
+    return w.solved + (scene * c.corrections + k) * 3 * c.plan.functions;
+  }
+};
+
+// Sums over the threads of a block, in a fixed order; the first thread has them.
+template <int n>
+__device__ __forceinline__ void block_sum(double (&value)[n]) {
+  __shared__ double part[kSumThreads / 32][n];
+  butterfly<n, 32>(kWholeWarp, value);
+  if (threadIdx.x % 32 == 0) {
+    for (int k = 0; k < n; ++k) part[threadIdx.x / 32][k] = value[k];
+  }
+  __syncthreads();
+  for (int w = 1; threadIdx.x == 0 && w < kSumThreads / 32; ++w) {
+    for (int k = 0; k < n; ++k) value[k] += part[w][k];
+  }
+}
+
+// A block for each function of each scene: what `rows` [positions, 4] are to it. In the reverse times -s of its body,
+// and 0 where the body has not moved.
+template <class T, bool reverse>
+__global__ void __launch_bounds__(kSumThreads)
+    restrict_rows(const __grid_constant__ View<T> a, int k, const T* __restrict__ rows) {
+  const coarse::Plan& p = a.c.plan;
+  const int64_t scene = blockIdx.x / p.functions;
+  const int f = static_cast<int>(blockIdx.x - scene * p.functions);
+  double sum[3] = {0, 0, 0};
+  const T* from = rows + scene * a.s.positions * kRow;
+  for (int e = __ldg(p.row_ptr + f) + static_cast<int>(threadIdx.x); e < __ldg(p.row_ptr + f + 1); e += kSumThreads) {
+    const Vec3<T> row = load_row(from, __ldg(p.row + e), true);
+    const double weight = __ldg(a.c.row_weight + e);
+    sum[0] += weight * row.x, sum[1] += weight * row.y, sum[2] += weight * row.z;
+  }
+  block_sum(sum);
+  if (threadIdx.x != 0) return;
+  T* to = a.w.restricted + (scene * p.functions + f) * 3;
+  if (!reverse) {
+    for (int i = 0; i < 3; ++i) to[i] = T(sum[i]);
+    return;
+  }
+  const T length = a.lengths(scene, k)[p.function_body[f]];
+  for (int i = 0; i < 3; ++i) to[i] = length > 0 ? -length * T(sum[i]) : T(0);
+}
+
+// Some threads for each unknown of each scene: A^-1 times what was restricted.
+template <class T, int threads, bool reverse>
+__global__ void __launch_bounds__(kRowThreads) solve_rows(const __grid_constant__ View<T> a, int k) {
+  const coarse::Plan& p = a.c.plan;
+  const int64_t unknowns = int64_t{3} * p.functions;
+  const int64_t item = (static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x) / threads;
+  const bool exists = item < a.s.scenes * unknowns;
+  const int64_t scene = exists ? item / unknowns : 0, row = exists ? item - scene * unknowns : 0;
+  const int body = __ldg(p.function_body + row / 3), first = 3 * __ldg(p.function_ptr + body);
+  const int n = 3 * __ldg(p.function_ptr + body + 1) - first;
+  const T* inverse = a.c.factor.data + (a.s.base + scene) * a.c.factor.scene + int64_t{9} * __ldg(p.mass_ptr + body) +
+                     (row - first) * n;
+  const T* from = a.w.restricted + scene * unknowns + first;
+  double sum = 0;
+  for (int j = threadIdx.x % threads; j < n; j += threads) sum += double(__ldg(inverse + j)) * double(from[j]);
+#pragma unroll
+  for (int d = threads / 2; d > 0; d /= 2) sum += __shfl_xor_sync(kWholeWarp, sum, d, threads);
+  if (!exists || threadIdx.x % threads != 0) return;
+  const bool still = reverse && !(a.lengths(scene, k)[body] > 0);  // which may be no number
+  (reverse ? a.solved(scene, k) : a.tape(scene, k))[row] = still ? T(0) : T(sum);
+}
+
+// The functions at a position, times three numbers of each.
+template <class T>
+__device__ __forceinline__ Vec3<T> prolonged(const coarse::Inputs<T>& c, int64_t position, const T* of) {
+  Vec3<T> sum = zero3<T>();
+  for (int e = __ldg(c.plan.position_ptr + position); e < __ldg(c.plan.position_ptr + position + 1); ++e) {
+    const T* a = of + 3 * __ldg(c.plan.function + e);
+    sum += __ldg(c.weight + e) * Vec3<T>{a[0], a[1], a[2]};
+  }
+  return sum;
+}
+
+template <class T>
+__global__ void __launch_bounds__(kRowThreads) prolong(const __grid_constant__ View<T> a, int k) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  if (i >= a.s.scenes * a.s.positions) return;
+  const int64_t scene = i / a.s.positions;
+  store_row(a.w.way, i, -prolonged(a.c, i - scene * a.s.positions, a.tape(scene, k)));
+}
+
+// A block for each part of each scene: how the energy of its tets changes along the way.
+template <class T>
+__global__ void __launch_bounds__(kSumThreads)
+    line_of_parts(const __grid_constant__ View<T> a, const __grid_constant__ StepInputs<T> in) {
+  const coarse::Plan& p = a.c.plan;
+  const int64_t scene = blockIdx.x / p.parts, user = a.s.base + scene;
+  const int part = static_cast<int>(blockIdx.x - scene * p.parts);
+  const T *x = a.s.w.x + scene * a.s.positions * kRow, *way = a.w.way + scene * a.s.positions * kRow;
+  double sum[coarse::kDegree] = {};
+  const int end = a.s.has_tets ? __ldg(p.part_begin + part + 1) * kLanes : 0;
+  for (int i = __ldg(p.part_begin + part) * kLanes + static_cast<int>(threadIdx.x); i < end; i += kSumThreads) {
+    const int block = i / kLanes, lane = i % kLanes;
+    Vec3<T> at[4], to[4];
+#pragma unroll
+    for (int corner = 0; corner < 4; ++corner) {
+      const int row = __ldg(p.corner + (static_cast<int64_t>(block) * 4 + corner) * kLanes + lane) / kRow;
+      at[corner] = load_row(x, row, true), to[corner] = load_row(way, row, true);
+    }
+    T rest[kRestScalars], material[kTetScalars], change[coarse::kDegree] = {};
+    const T* scalars =
+        a.c.rest.data + user * a.c.rest.scene + static_cast<int64_t>(block) * kRestScalars * kLanes + lane;
+#pragma unroll
+    for (int r = 0; r < kRestScalars; ++r) rest[r] = __ldg(scalars + r * kLanes);
+    const int64_t tet = __ldg(p.tet + i);
+#pragma unroll
+    for (int m = 0; m < kTetScalars; ++m) {
+      material[m] = __ldg(in.material[m].data + user * in.material[m].scene + tet * in.material[m].item);
+    }
+    TetLaw::line(at, to, rest, material, change);
+#pragma unroll
+    for (int d = 0; d < coarse::kDegree; ++d) sum[d] += change[d];
+  }
+  block_sum(sum);
+  if (threadIdx.x != 0) return;
+  for (int d = 0; d < coarse::kDegree; ++d) a.w.sums[(scene * p.parts + part) * coarse::kDegree + d] = sum[d];
+}
+
+// A block for each body of each scene.
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    decide_lengths(const __grid_constant__ View<T> a, const __grid_constant__ StepInputs<T> in, int k) {
+  __shared__ double part[kWarps][kMostSums];
+  const coarse::Plan& p = a.c.plan;
+  const int64_t scene = blockIdx.x / p.bodies;
+  const int body = static_cast<int>(blockIdx.x - scene * p.bodies);
+  int32_t* failures = a.w.failures + scene * p.bodies + body;
+  const int failed = k == 0 ? 0 : *failures;
+  double length = 0;
+  if (failed < coarse::kFailures) {
+    const coarse::Line<T, StepInputs<T>> line{in,
+                                              a.c,
+                                              a.s.data_start,
+                                              a.s.base + scene,
+                                              body,
+                                              a.s.w.x + scene * a.s.positions * kRow,
+                                              a.w.way + scene * a.s.positions * kRow};
+    length = coarse::decide(line, a.tape(scene, k), a.w.restricted + scene * p.functions * 3,
+                            a.w.sums + scene * p.parts * coarse::kDegree, BlockTeam{part});
+  }
+  if (threadIdx.x != 0) return;
+  a.lengths(scene, k)[body] = T(length);
+  *failures = failed + !(length > 0);
+}
+
+template <class T>
+__global__ void __launch_bounds__(kRowThreads)
+    move_bodies(const __grid_constant__ View<T> a, int k, unsigned* barrier) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  if (i == 0) *barrier = 0;
+  if (i >= a.s.scenes * a.s.positions) return;
+  const int64_t scene = i / a.s.positions, position = i - scene * a.s.positions;
+  const int body = __ldg(a.c.plan.position_body + position);
+  if (body < 0) return;
+  const T length = a.lengths(scene, k)[body];
+  const Vec3<T> x = load_row(a.s.w.x, i, true);
+  if (a.c.keeps_positions) {
+    T* before = a.lengths(scene, k) + a.c.plan.bodies + 3 * position;
+    before[0] = x.x, before[1] = x.y, before[2] = x.z;
+  }
+  // a way that was refused may be no number
+  if (length > 0) store_row(a.s.w.x, i, x + length * load_row(a.w.way, i, true));
+}
+
+// What the sweeps that are already reversed have left for each vertex that moves: rows of lower colors. They are then
+// cleared: its next turn reads them again. Those of higher colors are written anew before it.
+template <class T>
+__global__ void __launch_bounds__(kRowThreads) take_rows(const __grid_constant__ StepView<T> s) {
+  const int64_t active = int64_t{__ldg(s.plan.color_block + s.plan.colors)} * kSlice;
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  if (i >= s.scenes * active) return;
+  const int64_t scene = i / active, position = i - scene * active;
+  const int block = static_cast<int>(position / kSlice), v = static_cast<int>(position % kSlice);
+  int color = 0;
+  while (block >= __ldg(s.plan.color_block + color + 1)) ++color;
+  const int below = __ldg(s.plan.block_edge + __ldg(s.plan.color_block + color)) * kSlice;
+  const int none = s.plan.edge_slots * kSlice;
+  T* rows = s.w.rows + scene * (int64_t{none} + 1) * kRow;
+  Vec3<T> sum = load_row(s.w.x_bar, scene * s.positions + position, true);
+  for (int e = __ldg(s.plan.block_incoming + block); e < __ldg(s.plan.block_incoming + block + 1); ++e) {
+    const int row = __ldg(s.plan.incoming + static_cast<int64_t>(e) * kSlice + v);
+    if (row >= below) continue;
+    sum += load_row(rows, row, true);
+    store_row(rows, row, zero3<T>());
+  }
+  store_row(s.w.x_bar, scene * s.positions + position, sum);
+}
+
+// Back to where the correction began, and the way of its transpose.
+template <class T>
+__global__ void __launch_bounds__(kRowThreads) move_back(const __grid_constant__ View<T> a, int k, unsigned* barrier) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  if (i == 0) *barrier = 0;
+  if (i >= a.s.scenes * a.s.positions) return;
+  const int64_t scene = i / a.s.positions, position = i - scene * a.s.positions;
+  store_row(a.w.way, i, prolonged(a.c, position, a.solved(scene, k)));
+  const int body = __ldg(a.c.plan.position_body + position);
+  if (body < 0) return;
+  const T length = a.lengths(scene, k)[body];
+  if (a.c.keeps_positions) {
+    const T* before = a.lengths(scene, k) + a.c.plan.bodies + 3 * position;
+    store_row(a.s.w.x, i, Vec3<T>{before[0], before[1], before[2]});
+  } else if (length > 0) {
+    const Vec3<T> x = load_row(a.s.w.x, i, true);
+    store_row(a.s.w.x, i, x + length * prolonged(a.c, position, a.tape(scene, k)));
+  }
+}
+
+// A warp for each row of the matrices of each scene: minus the sum over the corrections of q a'.
+template <class T>
+__global__ void __launch_bounds__(kRowThreads) sum_products(const __grid_constant__ View<T> a) {
+  const coarse::Plan& p = a.c.plan;
+  const int64_t unknowns = int64_t{3} * p.functions;
+  const int64_t item = (static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x) / 32;
+  if (item >= a.s.scenes * unknowns) return;
+  const int64_t scene = item / unknowns, row = item - scene * unknowns;
+  const int body = __ldg(p.function_body + row / 3), first = 3 * __ldg(p.function_ptr + body);
+  const int n = 3 * __ldg(p.function_ptr + body + 1) - first;
+  T* to = a.c.matrix_bar + int64_t{9} * (p.cells * (a.s.base + scene) + __ldg(p.mass_ptr + body)) + (row - first) * n;
+  for (int j = threadIdx.x % 32; j < n; j += 32) {
+    T sum = T(0);
+    for (int k = 0; k < a.c.corrections; ++k) {
+      if (a.lengths(scene, k)[body] > 0) sum -= a.solved(scene, k)[row] * a.tape(scene, k)[first + j];
+    }
+    to[j] = sum;
+  }
+}
+
+template <class Kernel, class... A>
+cudaError_t launch(Kernel kernel, int64_t items, int threads, cudaStream_t stream, A... arguments) {
+  if (items == 0) return cudaSuccess;
+  kernel<<<static_cast<unsigned>((items + threads - 1) / threads), threads, 0, stream>>>(arguments...);
+  return cudaGetLastError();
+}
+
+template <bool reverse, class T>
+cudaError_t solve(const View<T>& a, int k, cudaStream_t stream) {
+  const int64_t unknowns = a.s.scenes * 3 * a.c.plan.functions;
+  if (a.c.plan.most <= kMostSmall) {
+    return launch(solve_rows<T, 8, reverse>, unknowns * 8, kRowThreads, stream, a, k);
+  }
+  return launch(solve_rows<T, 32, reverse>, unknowns * 32, kRowThreads, stream, a, k);
+}
+
+}  // namespace
+
+template <class T>
+cudaError_t Corrections<T>::correct(int k) const {
+  const View<T> a{s, *in.coarse, w};
+  const coarse::Plan& p = a.c.plan;
+  if (p.bodies == 0) return cudaSuccess;
+  const int64_t positions = s.scenes * s.positions, active = s.scenes * active_positions;
+  if (auto error = launch(gradient_kernel<T>(in.energies), active, kGradientThreads, stream, s, w)) {
+    return error;
+  }
+  const int64_t functions = s.scenes * p.functions * kSumThreads, parts = s.scenes * p.parts * kSumThreads;
+  if (auto error =
+          launch(restrict_rows<T, false>, functions, kSumThreads, stream, a, k, static_cast<const T*>(w.gradient))) {
+    return error;
+  }
+  if (auto error = solve<false>(a, k, stream)) return error;
+  if (auto error = launch(prolong<T>, positions, kRowThreads, stream, a, k)) return error;
+  if (auto error = launch(line_of_parts<T>, parts, kSumThreads, stream, a, in)) return error;
+  if (auto error = launch(decide_lengths<T>, s.scenes * p.bodies * kThreads, kThreads, stream, a, in, k)) return error;
+  return launch(move_bodies<T>, positions, kRowThreads, stream, a, k, barrier);
+}
+
+template <class T>
+cudaError_t Corrections<T>::reverse(int k, int wanted) const {
+  const View<T> a{s, *in.coarse, w};
+  const coarse::Plan& p = a.c.plan;
+  if (p.bodies == 0) return cudaSuccess;
+  const int64_t positions = s.scenes * s.positions, active = s.scenes * active_positions;
+  if (auto error = launch(take_rows<T>, active, kRowThreads, stream, s)) return error;
+  const int64_t functions = s.scenes * p.functions * kSumThreads;
+  if (auto error =
+          launch(restrict_rows<T, true>, functions, kSumThreads, stream, a, k, static_cast<const T*>(s.w.x_bar))) {
+    return error;
+  }
+  if (auto error = solve<true>(a, k, stream)) return error;
+  if (auto error = launch(move_back<T>, positions, kRowThreads, stream, a, k, barrier)) return error;
+  return launch(gradient_reverse_kernel<T>(in.energies, wanted), active, kGradientThreads, stream, s, w);
+}
+
+template <class T>
+cudaError_t Corrections<T>::matrix_bars() const {
+  const View<T> a{s, *in.coarse, w};
+  if (!a.c.matrix_bar) return cudaSuccess;
+  return launch(sum_products<T>, s.scenes * 3 * a.c.plan.functions * 32, kRowThreads, stream, a);
+}
+
+template struct Corrections<float>;
+template struct Corrections<double>;
+
+}  // namespace diffvbd::cuda

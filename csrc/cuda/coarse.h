@@ -1,0 +1,66 @@
+// Coarse corrections on the device (docs/method.md, section 15): what run.cuh launches between sweeps, and the matrices
+// of a step. No torch here.
+#pragma once
+
+#include "../coarse/length.h"
+#include "../coarse/matrix.h"
+#include "step.h"
+
+namespace diffvbd::cuda {
+
+// Where the corrections of a chunk of scenes work; per scene.
+template <class T>
+struct CoarseWork {
+  T *gradient, *way;  // [positions, 4]
+  T* restricted;      // [functions, 3]  P' gradient
+  T* solved;          // [corrections, functions, 3]  of the reverse: q of each correction
+  double* sums;       // [parts, kDegree]
+  int32_t* failures;  // [bodies]  lengths of 0 so far
+};
+
+// The corrections of a step, of the chunk of scenes that a StepView is of.
+template <class T>
+struct Corrections {
+  const StepView<T>& s;
+  const StepInputs<T>& in;
+  CoarseWork<T> w;
+  int64_t active_positions;  // of a scene: its vertices that move
+  unsigned* barrier;         // of the next cooperative launch: set to zero
+  cudaStream_t stream;
+
+  // The correction of number k: moves s.w.x and records what it did.
+  cudaError_t correct(int k) const;
+  // Its transpose. wanted: as of the sweeps.
+  cudaError_t reverse(int k, int wanted) const;
+  // After all of them: the adjoint of the matrices.
+  cudaError_t matrix_bars() const;
+};
+
+template <class T>
+using GradientKernel = void (*)(StepView<T>, CoarseWork<T>);
+// The gradient of the potential at all vertices, and the adjoint of its product with s.w's `way`.
+template <class T>
+GradientKernel<T> gradient_kernel(int energies);
+template <class T>
+GradientKernel<T> gradient_reverse_kernel(int energies, int wanted);
+constexpr int kGradientThreads = 128;
+
+// What the inverses are made in.
+struct MatrixWork {
+  double* turn;    // [scenes, groups, kTurn]
+  double* matrix;  // [scenes, 9 cells]
+  double* panel;   // [scenes, 2, 3 functions, kEdge]
+  double* block;   // [scenes, bodies, kEdge, kEdge]
+};
+constexpr int kEdge = coarse::kTile;  // of the tiles of a matrix
+constexpr int kTurn = 19;             // deformation of a group, its rotation, and 1 where that is determined
+
+// inverse [scenes, 9 cells]
+template <class T>
+cudaError_t coarse_inverse(const coarse::MatrixInputs<T>& in, const MatrixWork& work, T* inverse, cudaStream_t stream);
+// Adjoints of x_prev [scenes, vertices, 3], stiffness (of as many scenes as there are) and mass [scenes, cells]
+template <class T>
+cudaError_t coarse_inverse_vjp(const coarse::MatrixInputs<T>& in, const T* bar, double* turn, T* x_bar,
+                               T* stiffness_bar, T* mass_bar, cudaStream_t stream);
+
+}  // namespace diffvbd::cuda

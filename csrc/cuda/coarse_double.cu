@@ -1,0 +1,3 @@
+#include "coarse_gradient.cuh"
+
+DIFFVBD_INSTANTIATE_GRADIENT(double)

@@ -1,0 +1,364 @@
+// The matrices of a step and their inverses, body by body, and the transpose.
+#include "bodies.cuh"
+#include "coarse.h"
+
+namespace diffvbd::cuda {
+namespace {
+
+using coarse::MatrixInputs, coarse::Plan;
+using rigid::Matrix, rigid::outer, rigid::transposed, rigid::Vector;
+
+constexpr int kEdgeRows = 8;
+constexpr int kPairThreads = 128;
+constexpr int kTurned = 18;  // where the rotation is known
+
+__device__ __forceinline__ Matrix load_matrix(const double* a) {
+  return {{a[0], a[1], a[2]}, {a[3], a[4], a[5]}, {a[6], a[7], a[8]}};
+}
+__device__ __forceinline__ void store_matrix(double* a, const Matrix& m) {
+  a[0] = m.x.x, a[1] = m.x.y, a[2] = m.x.z;
+  a[3] = m.y.x, a[4] = m.y.y, a[5] = m.y.z;
+  a[6] = m.z.x, a[7] = m.z.y, a[8] = m.z.z;
+}
+
+// A block for each group of each scene.
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    turn_groups(const __grid_constant__ MatrixInputs<T> in, double* __restrict__ turns) {
+  __shared__ double part[kWarps][kMostSums];
+  const int64_t scene = blockIdx.x / in.plan.groups;
+  const int group = static_cast<int>(blockIdx.x - scene * in.plan.groups);
+  const int32_t first = in.plan.moment_ptr[group], count = in.plan.moment_ptr[group + 1] - first;
+  const BlockTeam team{part};
+  double sums[9];
+  team.sum<9>(count, sums, [&](int32_t i, double* out) {
+    const T* x = in.x_prev + 3 * (scene * in.vertices + in.plan.moment_vertex[first + i]);
+    const T* m = in.moment + 3 * static_cast<int64_t>(first + i);
+    for (int r = 0; r < 3; ++r) {
+      for (int c = 0; c < 3; ++c) out[3 * r + c] += double(x[r]) * double(m[c]);
+    }
+  });
+  if (!team.leads()) return;
+  double* to = turns + static_cast<int64_t>(blockIdx.x) * kTurn;
+  Matrix rotation = rigid::identity();
+  const Matrix f = load_matrix(sums);
+  to[kTurned] = coarse::nearest_rotation(f, in.volume[group], rotation) ? 1 : 0;
+  store_matrix(to, f);
+  store_matrix(to + 9, rotation);
+}
+
+// Which body a cell of the matrices is of, and of which two functions.
+struct Cell {
+  int body, i, j, count;
+  __device__ Cell(const Plan& p, int cell) {
+    int low = 0, high = p.bodies;  // mass_ptr[low] <= cell < mass_ptr[high]
+    while (high - low > 1) {
+      const int middle = (low + high) / 2;
+      (__ldg(p.mass_ptr + middle) <= cell ? low : high) = middle;
+    }
+    body = low;
+    count = __ldg(p.function_ptr + body + 1) - __ldg(p.function_ptr + body);
+    const int own = cell - __ldg(p.mass_ptr + body);
+    i = own / count, j = own % count;
+  }
+};
+
+template <class T>
+__device__ __forceinline__ Matrix load_block(const T* k, int64_t plane) {
+  const auto at = [&](int i) { return double(__ldg(k + i * plane)); };
+  return {{at(0), at(1), at(2)}, {at(3), at(4), at(5)}, {at(6), at(7), at(8)}};
+}
+
+// A thread for each two functions of a body.
+template <class T>
+__global__ void __launch_bounds__(kPairThreads)
+    assemble_pairs(const __grid_constant__ MatrixInputs<T> in, const double* __restrict__ turns,
+                   double* __restrict__ matrix) {
+  const Plan& p = in.plan;
+  const int64_t item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  if (item >= in.scenes * p.cells) return;
+  const int64_t scene = item / p.cells, cell = item - scene * p.cells;
+  const Cell at(p, static_cast<int>(cell));
+  const bool mirrored = at.i > at.j;  // the same numbers on both sides of the diagonal
+  const int i = mirrored ? at.j : at.i, j = mirrored ? at.i : at.j;
+  const int64_t plane = int64_t{p.width} * p.width;
+  Matrix sum{};
+  for (int g = __ldg(p.group_ptr + at.body); g < __ldg(p.group_ptr + at.body + 1); ++g) {
+    const int32_t* place = p.place + __ldg(p.place_ptr + g);
+    const int one = __ldg(place + i), two = __ldg(place + j);
+    if (one < 0 || two < 0) continue;
+    const T* k = in.stiffness.data + scene * in.stiffness.scene + g * 9 * plane;
+    const Matrix r = load_matrix(turns + (scene * p.groups + g) * kTurn + 9);
+    sum = sum + r * load_block(k + int64_t{one} * p.width + two, plane) * transposed(r);
+  }
+  sum = in.time_step * in.time_step * sum;
+  const double mass = in.mass.data[scene * in.mass.scene + __ldg(p.mass_ptr + at.body) + i * at.count + j];
+  sum = sum + mass * rigid::identity();
+  if (mirrored) sum = transposed(sum);
+  const int64_t n = 3 * at.count;
+  double* to = matrix + 9 * (scene * p.cells + __ldg(p.mass_ptr + at.body)) + 3 * at.i * n + 3 * at.j;
+  to[0] = sum.x.x, to[1] = sum.x.y, to[2] = sum.x.z;
+  to[n] = sum.y.x, to[n + 1] = sum.y.y, to[n + 2] = sum.y.z;
+  to[2 * n] = sum.z.x, to[2 * n + 1] = sum.z.y, to[2 * n + 2] = sum.z.z;
+}
+
+// --- the inverse: a symmetric sweep (Goodnight) over tiles of the diagonal, after which the matrix holds -A^-1
+// --------
+
+// The body of a block, its matrix and where it works.
+struct Swept {
+  int n, tiles;
+  double *matrix, *panel, *columns, *block;
+  template <class T>
+  __device__ Swept(const MatrixInputs<T>& in, const MatrixWork& work, int64_t scene, int body) {
+    const Plan& p = in.plan;
+    const int first = __ldg(p.function_ptr + body);
+    n = 3 * (__ldg(p.function_ptr + body + 1) - first);
+    tiles = (n + kEdge - 1) / kEdge;
+    matrix = work.matrix + 9 * (scene * p.cells + __ldg(p.mass_ptr + body));
+    panel = work.panel + (2 * scene * 3 * p.functions + 3 * first) * kEdge;
+    columns = panel + int64_t{3} * p.functions * kEdge;
+    block = work.block + (scene * p.bodies + body) * kEdge * kEdge;
+  }
+};
+
+// A block of kEdge x kEdgeRows threads for each tile of rows: its columns of the pivot tile, and these times the
+// inverse of the pivot tile, which every block finds for itself.
+template <class T>
+__global__ void __launch_bounds__(kEdge* kEdgeRows)
+    sweep_panel(const __grid_constant__ MatrixInputs<T> in, const __grid_constant__ MatrixWork work, int bodies,
+                int first_body, int pivot) {
+  __shared__ double own[kEdge][kEdge + 1], row[kEdge], tile[kEdge][kEdge + 1];
+  const int64_t scene = blockIdx.x / bodies;
+  const Swept a(in, work, scene, first_body + static_cast<int>(blockIdx.x - scene * bodies));
+  const int begin = pivot * kEdge, size = min(kEdge, a.n - begin), mine = static_cast<int>(blockIdx.y) * kEdge;
+  if (size <= 0 || mine >= a.n) return;
+  const int c = threadIdx.x, first = threadIdx.y;
+  for (int r = first; r < kEdge; r += kEdgeRows) {
+    const bool inside = r < size && c < size;
+    own[r][c] = inside ? a.matrix[int64_t{begin + r} * a.n + begin + c] : double(r == c);
+    tile[r][c] = mine + r < a.n && c < size ? a.matrix[int64_t{mine + r} * a.n + begin + c] : 0;
+  }
+  __syncthreads();
+  for (int k = 0; k < size; ++k) {  // own becomes minus its inverse
+    const double over = 1 / own[k][k];
+    if (first == 0) row[c] = own[k][c];
+    __syncthreads();
+    for (int r = first; r < kEdge; r += kEdgeRows) {
+      if (r == k) {
+        own[r][c] = c == k ? -over : row[c] * over;
+      } else {
+        own[r][c] = c == k ? row[r] * over : own[r][c] - row[r] * row[c] * over;
+      }
+    }
+    __syncthreads();
+  }
+  for (int r = first; r < kEdge; r += kEdgeRows) {
+    double sum = 0;
+    for (int k = 0; k < size; ++k) sum -= tile[r][k] * own[k][c];
+    if (mine + r < a.n) {
+      a.columns[int64_t{mine + r} * kEdge + c] = tile[r][c];
+      a.panel[int64_t{mine + r} * kEdge + c] = c < size ? sum : 0;
+    }
+    if (mine == begin) a.block[r * kEdge + c] = own[r][c];
+  }
+}
+
+// A block for each two tiles, the lower and its mirror image; the last pivot leaves the inverse.
+template <class T>
+__global__ void __launch_bounds__(kEdge* kEdgeRows)
+    sweep_tiles(const __grid_constant__ MatrixInputs<T> in, const __grid_constant__ MatrixWork work, int bodies,
+                int first_body, int pivot, T* inverse) {
+  __shared__ double one[kEdge][kEdge + 1], two[kEdge][kEdge + 1];
+  const int64_t scene = blockIdx.x / bodies;
+  const int body = first_body + static_cast<int>(blockIdx.x - scene * bodies);
+  const Swept a(in, work, scene, body);
+  int high = static_cast<int>((sqrtf(8.0f * blockIdx.y + 1) - 1) / 2);
+  if (high * (high + 1) / 2 > static_cast<int>(blockIdx.y)) --high;
+  if ((high + 1) * (high + 2) / 2 <= static_cast<int>(blockIdx.y)) ++high;
+  const int low = static_cast<int>(blockIdx.y) - high * (high + 1) / 2;
+  if (pivot >= a.tiles || high >= a.tiles) return;
+  const int c = threadIdx.x, first = threadIdx.y, rows = high * kEdge, columns = low * kEdge;
+  const bool last = pivot + 1 == a.tiles;
+  const bool moves = high != pivot && low != pivot;
+  for (int r = first; r < kEdge; r += kEdgeRows) {
+    one[r][c] = rows + r < a.n ? a.panel[int64_t{rows + r} * kEdge + c] : 0;
+    two[r][c] = columns + r < a.n ? (moves ? a.columns : a.panel)[int64_t{columns + r} * kEdge + c] : 0;
+  }
+  __syncthreads();
+  T* out = inverse + 9 * (scene * in.plan.cells + __ldg(in.plan.mass_ptr + body));
+  for (int r = first; r < kEdge; r += kEdgeRows) {
+    const bool exists = rows + r < a.n && columns + c < a.n;
+    double value = 0;
+    if (moves) {
+      value = exists ? a.matrix[int64_t{rows + r} * a.n + columns + c] : 0;
+      for (int k = 0; k < kEdge; ++k) value -= one[r][k] * two[c][k];
+    } else if (high == low) {
+      value = a.block[r * kEdge + c];
+    } else {
+      value = low == pivot ? one[r][c] : two[c][r];
+    }
+    // on the diagonal what is below it stands for both sides
+    if (!exists || (high == low && c > r)) continue;
+    const int64_t at = int64_t{rows + r} * a.n + columns + c, mirror = int64_t{columns + c} * a.n + rows + r;
+    if (last) {
+      out[at] = T(-value), out[mirror] = T(-value);
+    } else {
+      a.matrix[at] = value, a.matrix[mirror] = value;
+    }
+  }
+}
+
+// --- the transpose --------------------------------------------------------------------------------------------------
+
+// h^2 times the adjoint of a block and of its mirror image.
+template <class T>
+__device__ __forceinline__ Matrix pair_bar(const MatrixInputs<T>& in, const T* bar, int body, int i, int j) {
+  const int64_t n = int64_t{3} * (__ldg(in.plan.function_ptr + body + 1) - __ldg(in.plan.function_ptr + body));
+  const T* own = bar + int64_t{9} * __ldg(in.plan.mass_ptr + body);
+  const Matrix above = coarse::block_at(own + 3 * i * n + 3 * j, n);
+  const double h2 = in.time_step * in.time_step;
+  return i == j ? h2 * above : h2 * (above + transposed(coarse::block_at(own + 3 * j * n + 3 * i, n)));
+}
+
+// A block for each group of each scene: the adjoint of its deformation takes the place of the deformation.
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    turn_groups_vjp(const __grid_constant__ MatrixInputs<T> in, const T* __restrict__ bar, double* turns) {
+  __shared__ double part[kWarps][kMostSums];
+  const Plan& p = in.plan;
+  const int64_t scene = blockIdx.x / p.groups, plane = int64_t{p.width} * p.width;
+  const int g = static_cast<int>(blockIdx.x - scene * p.groups), body = __ldg(p.group_body + g);
+  const int32_t *functions = p.group_function + static_cast<int64_t>(g) * p.width, first = p.function_ptr[body];
+  double* turn = turns + static_cast<int64_t>(blockIdx.x) * kTurn;
+  const Matrix f = load_matrix(turn), r = load_matrix(turn + 9);
+  const T *k = in.stiffness.data + scene * in.stiffness.scene + g * 9 * plane,
+          *own = bar + int64_t{9} * p.cells * scene;
+  const BlockTeam team{part};
+  double sums[9];
+  team.sum<9>(static_cast<int32_t>(plane), sums, [&](int32_t at, double* out) {
+    const int i = at / p.width, j = at % p.width;
+    if (j < i || functions[i] < 0 || functions[j] < 0) return;
+    const Matrix a_bar = pair_bar(in, own, body, functions[i] - first, functions[j] - first);
+    const Matrix block = load_block(k + at, plane);
+    double add[9];
+    store_matrix(add, a_bar * r * transposed(block) + transposed(a_bar) * r * block);
+    for (int c = 0; c < 9; ++c) out[c] += add[c];
+  });
+  if (!team.leads()) return;
+  Matrix f_bar{};
+  if (turn[kTurned] > 0) f_bar = rigid::polar_vjp(f, r, load_matrix(sums));
+  store_matrix(turn, f_bar);
+}
+
+template <class T>
+__global__ void __launch_bounds__(kPairThreads)
+    vertices_vjp(const __grid_constant__ MatrixInputs<T> in, const double* __restrict__ turns, T* __restrict__ x_bar) {
+  const int64_t item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  if (item >= in.scenes * in.vertices) return;
+  const int64_t scene = item / in.vertices, v = item - scene * in.vertices;
+  Vector sum{0, 0, 0};
+  for (int e = __ldg(in.plan.vertex_ptr + v); e < __ldg(in.plan.vertex_ptr + v + 1); ++e) {
+    const int64_t moment = __ldg(in.plan.vertex_moment + e);
+    const T* m = in.moment + 3 * moment;
+    const double* f_bar = turns + (scene * in.plan.groups + __ldg(in.plan.moment_group + moment)) * kTurn;
+    sum += load_matrix(f_bar) * Vector{double(m[0]), double(m[1]), double(m[2])};
+  }
+  x_bar[3 * item] = T(sum.x), x_bar[3 * item + 1] = T(sum.y), x_bar[3 * item + 2] = T(sum.z);
+}
+
+// A thread for each two places of a group; scenes that share a stiffness are added up.
+template <class T>
+__global__ void __launch_bounds__(kPairThreads)
+    stiffness_vjp(const __grid_constant__ MatrixInputs<T> in, const T* __restrict__ bar,
+                  const double* __restrict__ turns, T* __restrict__ stiffness_bar) {
+  const Plan& p = in.plan;
+  const int64_t plane = int64_t{p.width} * p.width,
+                item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  const bool shared = in.stiffness.scene == 0;
+  if (item >= (shared ? 1 : in.scenes) * p.groups * plane) return;
+  const int64_t first_scene = item / (p.groups * plane);
+  const int g = static_cast<int>(item / plane % p.groups), at = static_cast<int>(item % plane);
+  const int i = at / p.width, j = at % p.width, body = __ldg(p.group_body + g), first = p.function_ptr[body];
+  const int32_t* functions = p.group_function + static_cast<int64_t>(g) * p.width;
+  Matrix sum{};
+  if (j >= i && functions[i] >= 0 && functions[j] >= 0) {
+    for (int64_t scene = first_scene; scene < (shared ? in.scenes : first_scene + 1); ++scene) {
+      const Matrix r = load_matrix(turns + (scene * p.groups + g) * kTurn + 9);
+      const T* own = bar + int64_t{9} * p.cells * scene;
+      sum = sum + transposed(r) * pair_bar(in, own, body, functions[i] - first, functions[j] - first) * r;
+    }
+  }
+  T* to = stiffness_bar + (first_scene * p.groups + g) * 9 * plane + at;
+  double out[9];
+  store_matrix(out, sum);
+  for (int c = 0; c < 9; ++c) to[c * plane] = T(out[c]);
+}
+
+template <class T>
+__global__ void __launch_bounds__(kPairThreads)
+    mass_vjp(const __grid_constant__ MatrixInputs<T> in, const T* __restrict__ bar, T* __restrict__ mass_bar) {
+  const Plan& p = in.plan;
+  const int64_t item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  if (item >= in.scenes * p.cells) return;
+  const int64_t scene = item / p.cells;
+  const Cell at(p, static_cast<int>(item - scene * p.cells));
+  const int64_t n = 3 * at.count;
+  const T* own = bar + 9 * (scene * p.cells + __ldg(p.mass_ptr + at.body)) + 3 * at.i * n + 3 * at.j;
+  mass_bar[item] = own[0] + own[n + 1] + own[2 * n + 2];
+}
+
+unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kPairThreads - 1) / kPairThreads); }
+
+// Pivots of the bodies [first, first + count), whose matrices have at most so many tiles.
+template <class T>
+void invert(const MatrixInputs<T>& in, const MatrixWork& work, int first, int count, int tiles, T* inverse,
+            cudaStream_t stream) {
+  const auto items = static_cast<unsigned>(in.scenes * count);
+  const dim3 threads(kEdge, kEdgeRows);
+  for (int pivot = 0; count > 0 && pivot < tiles; ++pivot) {
+    sweep_panel<<<dim3(items, tiles), threads, 0, stream>>>(in, work, count, first, pivot);
+    sweep_tiles<<<dim3(items, tiles * (tiles + 1) / 2), threads, 0, stream>>>(in, work, count, first, pivot, inverse);
+  }
+}
+
+}  // namespace
+
+template <class T>
+cudaError_t coarse_inverse(const MatrixInputs<T>& in, const MatrixWork& work, T* inverse, cudaStream_t stream) {
+  const Plan& p = in.plan;
+  if (in.scenes * p.bodies == 0) return cudaSuccess;
+  if (p.groups > 0) {
+    turn_groups<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, work.turn);
+  }
+  assemble_pairs<<<blocks_for(in.scenes * p.cells), kPairThreads, 0, stream>>>(in, work.turn, work.matrix);
+  invert(in, work, 0, p.bodies - p.large, 1, inverse, stream);
+  invert(in, work, p.bodies - p.large, p.large, (3 * p.most + kEdge - 1) / kEdge, inverse, stream);
+  return cudaGetLastError();
+}
+
+template <class T>
+cudaError_t coarse_inverse_vjp(const MatrixInputs<T>& in, const T* bar, double* turn, T* x_bar, T* stiffness_bar,
+                               T* mass_bar, cudaStream_t stream) {
+  const Plan& p = in.plan;
+  if (in.scenes * in.vertices == 0) return cudaSuccess;
+  const int64_t plane = int64_t{p.width} * p.width;
+  if (p.groups > 0 && p.width > 0) {
+    turn_groups<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, turn);
+    const int64_t pairs = (in.stiffness.scene == 0 ? 1 : in.scenes) * p.groups * plane;
+    stiffness_vjp<<<blocks_for(pairs), kPairThreads, 0, stream>>>(in, bar, turn, stiffness_bar);
+    turn_groups_vjp<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, bar, turn);
+  }
+  vertices_vjp<<<blocks_for(in.scenes * in.vertices), kPairThreads, 0, stream>>>(in, turn, x_bar);
+  if (p.cells > 0) mass_vjp<<<blocks_for(in.scenes * p.cells), kPairThreads, 0, stream>>>(in, bar, mass_bar);
+  return cudaGetLastError();
+}
+
+#define DIFFVBD_INSTANTIATE(T)                                                                         \
+  template cudaError_t coarse_inverse<T>(const MatrixInputs<T>&, const MatrixWork&, T*, cudaStream_t); \
+  template cudaError_t coarse_inverse_vjp<T>(const MatrixInputs<T>&, const T*, double*, T*, T*, T*, cudaStream_t);
+DIFFVBD_INSTANTIATE(float)
+DIFFVBD_INSTANTIATE(double)
+#undef DIFFVBD_INSTANTIATE
+
+}  // namespace diffvbd::cuda
