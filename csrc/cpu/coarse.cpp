@@ -87,8 +87,8 @@ void CoarseScene<T>::correct(int k, Team::Member& member) {
       double* sum = sums_.get() + i * coarse::kDegree;
       std::fill(sum, sum + coarse::kDegree, 0.0);
       if (!(in_.energies & kElastic)) continue;
-      kernels_.line(p.corner, c_.rest.data + scene_ * c_.rest.scene, material_.get(), s_.x, s_.way,
-                    p.part_begin[i], p.part_begin[i + 1], sum);
+      kernels_.line(p.corner, c_.rest.data + scene_ * c_.rest.scene, material_.get(), s_.x, s_.way, p.part_begin[i],
+                    p.part_begin[i + 1], sum);
     }
   });
   member.barrier();
@@ -194,27 +194,29 @@ double CoarseScene<T>::energies(int32_t body, double s, double& size) const {
   return rise;
 }
 
-// Takes what is left in the rows into x_bar, of lower colors or of all vertices, and clears them.
+// Takes into x_bar what the updates of lower colors have added since a vertex's last turn, and clears these rows, which
+// its next turn reads again. Those of higher colors are written anew before it.
 template <class T>
-void CoarseScene<T>::flush(Team::Member& member, bool all) {
-  const int64_t blocks = all ? plan_.blocks : plan_.color_block[plan_.colors];
-  member.each(0, blocks, [&](int64_t begin, int64_t end) {
+void CoarseScene<T>::flush(Team::Member& member) {
+  member.each(0, plan_.color_block[plan_.colors], [&](int64_t begin, int64_t end) {
     int color = 0;
     for (int64_t block = begin; block < end; ++block) {
-      while (color < plan_.colors && block >= plan_.color_block[color + 1]) ++color;
-      const int64_t below = all ? std::numeric_limits<int64_t>::max()
-                                : kRow * int64_t{plan_.block_edge[plan_.color_block[color]]} * kLanes;
+      while (block >= plan_.color_block[color + 1]) ++color;
+      const int32_t below = kRow * plan_.block_edge[plan_.color_block[color]] * kLanes;
+      if (below == 0) continue;
+      T* x_bar = s_.x_bar + 4 * block * kLanes;
       for (int64_t e = plan_.block_incoming[block]; e < plan_.block_incoming[block + 1]; ++e) {
         for (int l = 0; l < kLanes; ++l) {
-          const int64_t row = plan_.incoming[e * kLanes + l];
-          for (int i = 0; row < below && i < 3; ++i) s_.x_bar[4 * (block * kLanes + l) + i] += s_.rows[row + i];
+          const int32_t row = plan_.incoming[e * kLanes + l];
+          if (row >= below) continue;
+          Row<T> sum = Row<T>::load(x_bar + 4 * l);
+          sum.v += Row<T>::load(s_.rows + row).v;
+          sum.store(x_bar + 4 * l);
+          Row<T>{}.store(s_.rows + row);
         }
       }
     }
   });
-  member.barrier();
-  member.each(0, int64_t{plan_.edge_slots} * kLanes,
-              [&](int64_t begin, int64_t end) { std::fill(s_.rows + 4 * begin, s_.rows + 4 * end, T(0)); });
   member.barrier();
 }
 
@@ -224,7 +226,7 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
   const T *a = tape(k), *lengths = a + int64_t{3} * p.functions, *before = lengths + p.bodies;
   if (std::all_of(lengths, lengths + p.bodies, [](T s) { return s == 0; })) return;
   T *restricted = rows_.get() + 4 * int64_t{p.functions}, *coarse = coarse_.get();
-  flush(member, false);
+  flush(member);
   // u = P' x_bar, q = -s A^-1 u
   member.each(0, p.functions, [&](int64_t begin, int64_t end) {
     kernels_.gather(p.row_ptr, p.row, c_.row_weight, s_.x_bar, rows_.get(), begin, end);
@@ -289,10 +291,9 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
     kernels_.gather(p.position_ptr, p.function, c_.weight, coarse, s_.way, begin, end);
   });
   member.barrier();
-  member.each(0, plan_.color_block[plan_.colors],
+  member.each(0, plan_.blocks,
               [&](int64_t begin, int64_t end) { kernels_.reverse(plan_, s_, in_.parameters, begin, end); });
   member.barrier();
-  flush(member, true);
 }
 
 template class CoarseScene<float>;

@@ -27,7 +27,7 @@ class CoarseScene {
   void decide(int32_t body, const T* a, T* length);
   double energies(int32_t body, double s, double& size) const;
   double inertia(int32_t body) const;
-  void flush(Team::Member& member, bool all);
+  void flush(Team::Member& member);
 
   const Plan& plan_;
   const StepInputs<T>& in_;

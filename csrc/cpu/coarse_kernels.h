@@ -27,7 +27,13 @@ __attribute__((flatten)) void reverse_gradient_of_blocks(const Plan& plan, const
   using R = Lanes<T>;
   using Set = EnergySet<mask>;
   for (int64_t block = begin; block < end; ++block) {
-    const LaneStar<T> star(plan, s, block, fresh_rows(plan, s.rows, block));
+    const LaneStar<T> star(plan, s, block);
+    if (block >= plan.color_block[plan.colors]) {  // pinned
+      const Vec3<R> own = star.template multiply_tets<typename Set::Elastic, kMaterial | kRest>(
+          load_rows(s.x, block), zero3<R>(), R(-(q.time_step * q.time_step)));
+      store_rows(s.x_bar, block, load_rows(s.x_bar, block) + own);
+      continue;
+    }
     R values[kMaxEnergyData];
     const Block<R> b = load_block<Set>(plan, s, block, q, values);
     const BlockAdjoint<R> out = reverse_gradient<Set, kMaterial | kRest>(

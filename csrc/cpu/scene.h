@@ -155,6 +155,17 @@ struct LaneStar {
     if (wishes & kMaterial) return diffvbd::reverse_tets<Law, kMaterial>(*this, update);
     return diffvbd::reverse_tets<Law, kState>(*this, update);
   }
+  template <class Law, int>
+  DIFFVBD_FN Vec3<Lanes<T>> multiply_tets(const Vec3<Lanes<T>>& x, const Vec3<Lanes<T>>& w,
+                                          const Lanes<T>& minus_h2) const {
+    if (wishes & kRest) return diffvbd::multiply_tets<Law, kMaterial | kRest>(*this, x, w, minus_h2);
+    if (wishes & kMaterial) return diffvbd::multiply_tets<Law, kMaterial>(*this, x, w, minus_h2);
+    return diffvbd::multiply_tets<Law, kState>(*this, x, w, minus_h2);
+  }
+  DIFFVBD_FN PairWay<Lanes<T>> way(int e) const {
+    const int32_t* j = plan.neighbors + (first + e) * 3 * kLanes;
+    return {gather3(s.way, j), gather3(s.way, j + kLanes), gather3(s.way, j + 2 * kLanes)};
+  }
   template <int wanted>
   DIFFVBD_FN bool wants(int what) const {
     return (wanted & wishes & what) != 0;

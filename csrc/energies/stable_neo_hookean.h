@@ -137,6 +137,19 @@ struct StableNeoHookean {
     if constexpr (!Exact) rest_bar[3] = rest_bar[3] + b * lam(e) * v.n_p * dot(v.n, d_raw);
   }
 
+  // The derivative of the gradient dE/dx_i / h^2 at the view's state along the motion w of the four corners: the tet's
+  // rows of the Hessian times w. Both blocks are of one energy, so of the same Hessian; the view's d_raw is 0.
+  template <class R>
+  DIFFVBD_FN static Vec3<R> product(const TetPair<R>& e, const View<R>& v, const Vec3<R>& wi, const Vec3<R>& wj,
+                                    const Vec3<R>& wk, const Vec3<R>& wl) {
+    const R sixth = R(1) / R(6), lb = mu(e) + lam(e);
+    const Vec3<R> fk = wk - wj, fl = wl - wj, f = wi - wj;
+    const Vec3<R> turn = cross(fk, v.el) + cross(v.ek, fl);  // of n
+    const R strain = c6(e) * (dot(turn, v.d) + dot(v.n, f));
+    const Vec3<R> stretch = k_ik(e) * (fk - f) + k_il(e) * (fl - f) - k_ij(e) * f;
+    return mu(e) * stretch + sixth * (lb * strain * v.n + stress(e, v) * turn);
+  }
+
   // The energy of a tet [J] from its four corners, up to a constant.
   template <class R>
   DIFFVBD_FN static R value(const Vec3<R> (&x)[4], const R* rest, const R* material) {

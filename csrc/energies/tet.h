@@ -59,13 +59,10 @@ struct TetAdjoint {
 // Which adjoints beyond the state are wanted: those that a variant is compiled for, and of them those asked for.
 enum Wanted { kState = 0, kMaterial = 1, kRest = 2 };
 
-// The adjoints of one tet's inputs, sent to its star.
+// What of them belongs to the tet itself, sent to its star.
 template <class Law, int wanted, class R, class Star, class View>
-DIFFVBD_FN void reverse_tet(const Star& star, int e, const TetPair<R>& tet, const View& view, const Vec3<R>& d_raw,
-                            const Vec3<R>& p, const R& minus_h2, Vec3<R>& own) {
-  const TetAdjoint<R> bar = Law::block_vjp(tet, view, d_raw, p, minus_h2);
-  own += bar.xi;
-  star.add(e, bar);
+DIFFVBD_FN void reverse_shape(const Star& star, int e, const TetPair<R>& tet, const View& view, const Vec3<R>& d_raw,
+                              const Vec3<R>& p, const R& minus_h2) {
   if (star.template wants<wanted>(kMaterial)) {
     R material_bar[kTetScalars];
     Law::material_vjp(tet, view, d_raw, p, minus_h2, material_bar);
@@ -76,6 +73,16 @@ DIFFVBD_FN void reverse_tet(const Star& star, int e, const TetPair<R>& tet, cons
     Law::rest_vjp(tet, view, d_raw, p, minus_h2, rest_bar);
     star.add_rest(e, rest_bar);
   }
+}
+
+// The adjoints of one tet's inputs, sent to its star.
+template <class Law, int wanted, class R, class Star, class View>
+DIFFVBD_FN void reverse_tet(const Star& star, int e, const TetPair<R>& tet, const View& view, const Vec3<R>& d_raw,
+                            const Vec3<R>& p, const R& minus_h2, Vec3<R>& own) {
+  const TetAdjoint<R> bar = Law::block_vjp(tet, view, d_raw, p, minus_h2);
+  own += bar.xi;
+  star.add(e, bar);
+  reverse_shape<Law, wanted>(star, e, tet, view, d_raw, p, minus_h2);
 }
 
 // What the tets of a star add to the block of its vertex, without h^2.
@@ -112,6 +119,31 @@ DIFFVBD_LOOP Vec3<R> reverse_tets(const Star& shared, const Reversed<R>& update)
     reverse_tet<Law, wanted>(star, e, tet, Law::view(tet, u.x, u.d_raw, u.p), u.d_raw, u.p, u.minus_h2, own);
   }
   return own;
+}
+
+// w of a pair's neighbours, as TetPair has their positions.
+template <class R>
+struct PairWay {
+  Vec3<R> wj, wk, wl;
+};
+// The adjoint of w . g, with g the gradient that the tets have at all vertices: the vertex's own rows of their Hessian
+// times w, gathered from w of its neighbours, and the adjoints of the tets' inputs as far as they come through the
+// vertex's own w. Nothing is sent to a neighbour. star.way(e) follows star.pair(e).
+template <class Law, int wanted, class R, class Star>
+DIFFVBD_LOOP Vec3<R> multiply_tets(const Star& shared, const Vec3<R>& position, const Vec3<R>& own_way,
+                                   const R& minus_h2) {
+  decltype(auto) star = shared.local();
+  const Vec3<R> x = position, w = own_way, p = -w, none = zero3<R>();
+  const R scale = minus_h2;
+  Vec3<R> sum = none;
+  for (int e = 0; e < star.size(); ++e) {
+    const TetPair<R> tet = star.pair(e);
+    const PairWay<R> way = star.way(e);
+    const auto view = Law::view(tet, x, none, p);
+    sum += Law::product(tet, view, w, way.wj, way.wk, way.wl);
+    reverse_shape<Law, wanted>(star, e, tet, view, none, p, scale);
+  }
+  return -(scale * sum);
 }
 
 }  // namespace diffvbd

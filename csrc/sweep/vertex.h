@@ -176,8 +176,9 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   return out;
 }
 
-// Adjoint of w . g, with g the gradient of the potential at b.state.x: its Hessian times w, and what else g depends on.
-// What a step without a Newton part leaves of reverse_vertex().
+// Adjoint of w . g, with g the gradient of the potential, at one vertex: out.x is the vertex's part of the Hessian
+// times w, with the neighbours' w from the star; the rest is what its own g depends on. What a step without a Newton
+// part leaves of reverse_vertex(). A pinned vertex has w = 0, and of its neighbours' g only tets reach it.
 template <class Set, int wanted, class R, class T, class Star, class AddData>
 DIFFVBD_FN BlockAdjoint<R> reverse_gradient(const Block<R>& b, const Star& star, const Vec3<R>& w,
                                             const StepParameters<T>& q, bool wants_data, AddData&& add_data) {
@@ -194,9 +195,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_gradient(const Block<R>& b, const Star& star,
                                 [&](int i, const R& value) { add_data(k, i, value); });
     }
   });
-  Vec3<R> own = star.template reverse_tets<typename Set::Elastic, wanted>({b.state.x, none, p, minus_h2});
-  star.total(own);
-  out.x += own;
+  out.x += star.template multiply_tets<typename Set::Elastic, wanted>(b.state.x, w, minus_h2);
   return out;
 }
 

@@ -105,7 +105,34 @@ Values elastic_dual(const Values& in) {
   return out;
 }
 
-// --- the energy of a tet: inputs four corners (12) rest (7) mu lam ----------------------------------------------------
+// The derivative of the gradient without h^2 along w; inputs as above, with w of xi xj xk xl (12) in place of d_raw ...
+template <bool exact, class R>
+Values elastic_product(const Values& in) {
+  using Law = StableNeoHookean<exact>;
+  const std::vector<R> a = cast<R>(in);
+  const TetPair<R> e = pair_of(a.data());
+  const auto view = Law::view(e, vec(&a[0]), zero3<R>(), vec(&a[18]));
+  Values out;
+  put(out, Law::product(e, view, vec(&a[18]), vec(&a[21]), vec(&a[24]), vec(&a[27])));
+  return out;
+}
+template <bool exact>
+Values elastic_product_dual(const Values& in) {
+  using D = Dual<Long>;
+  std::vector<D> a;
+  for (const Long v : cast<Long>(in)) a.emplace_back(v);
+  for (int i = 0; i < 12; ++i) a[i].derivative = a[18 + i].value;
+  Vec3<D> g = zero3<D>();
+  D h_diagonal(0);
+  Sym3<D> H = diagonal(D(0));
+  StableNeoHookean<exact>::block(pair_of(a.data()), vec(&a[0]), g, h_diagonal, H);
+  Values out;
+  put(out, Vec3<Long>{g.x.derivative, g.y.derivative, g.z.derivative});
+  return out;
+}
+
+// --- the energy of a tet: inputs four corners (12) rest (7) mu lam
+// ----------------------------------------------------
 template <class R>
 R energy_of(const R* a) {
   const Vec3<R> x[4] = {vec(a), vec(a + 3), vec(a + 6), vec(a + 9)};
@@ -332,6 +359,13 @@ PYBIND11_MODULE(headers, m) {
   });
   m.def("elastic_dual",
         [](const Values& a, bool exact) { return exact ? elastic_dual<true>(a) : elastic_dual<false>(a); });
+  m.def("elastic_product", [](const Values& a, bool exact, bool extended) {
+    if (extended) return exact ? elastic_product<true, Long>(a) : elastic_product<false, Long>(a);
+    return exact ? elastic_product<true, double>(a) : elastic_product<false, double>(a);
+  });
+  m.def("elastic_product_dual", [](const Values& a, bool exact) {
+    return exact ? elastic_product_dual<true>(a) : elastic_product_dual<false>(a);
+  });
   m.def("energy_gradient", &energy_gradient);
   m.def("energy_hessian", &energy_hessian);
   m.def("rest_stiffness", &rest_stiffness);

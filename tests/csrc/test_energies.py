@@ -113,6 +113,18 @@ def test_elastic_block_vjp(headers: Any, case: str, exact: bool) -> None:
 
 
 @pytest.mark.parametrize("exact", (True, False))
+@pytest.mark.parametrize("case", CASES)
+def test_elastic_product(headers: Any, case: str, exact: bool) -> None:
+    rng = generator("elastic product", case)
+    for _ in range(50):
+        values = [*elastic_input(rng, *CASES[case])[:18], *rng.standard_normal(12)]
+        expected = headers.elastic_product_dual(values, exact)
+        one = [slice(0, 3)]
+        assert_close(headers.elastic_product(values, exact, True), expected, one, tolerance("dual"))
+        assert_close(headers.elastic_product(values, exact, False), expected, one, tolerance("dual_rounded"))
+
+
+@pytest.mark.parametrize("exact", (True, False))
 def test_lanes_run_the_scalar_program(headers: Any, exact: bool) -> None:
     rng = generator("lanes")
     values = [elastic_input(rng, *list(CASES.values())[i % len(CASES)]) for i in range(headers.lanes)]
