@@ -33,13 +33,13 @@ coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, const Set
   const coarse::Plan& p = in.plan;
   const int64_t b = x.size(0), cells = p.cells;
   require(p.positions == positions && p.vertices == x.size(1), "coarse_plan: expected one of this Model's sweeps");
-  require_like("coarse_matrix", f.coarse_matrix, x, 9 * cells * b);
   const Tensor& w = f.coarse_weights;
   require_like("coarse_weights", w, x, 2 * int64_t{p.entries});
   in.weight = data<const T>(w);
   in.row_weight = in.weight + p.entries;
   in.rest = batched<T>("coarse_rest", f.coarse_rest, x, b, int64_t{p.tet_blocks} * kRestScalars * kLanes);
-  in.factor = batched<T>("coarse_factor", f.coarse_factor, x, b, 9 * cells);
+  require_like("coarse_factor", f.coarse_factor, x, 9 * cells * b);
+  in.factor = {data<const T>(f.coarse_factor), 9 * cells, 1};
   in.mass = batched<T>("coarse_mass", f.coarse_mass, x, b, cells);
   in.keeps_positions = keeps_positions(given.energies);
   in.corrections = coarse::corrections_of(given.sweeps, p.every, p.begun);

@@ -11,7 +11,8 @@
 // clang-format off
 // The predictor and the start; the body; data of the energies; contact, all empty without it: bounds, colliders,
 // stiffness, the pairs that repel, and what friction and damping keep of the start of the step; then the tets' corners
-// there, empty for a law that does not read them; last the corrections on a coarse space (coarse/views.h), if any.
+// there, empty for a law that does not read them; last the corrections on a coarse space (coarse/views.h), if any. The
+// adjoint of a factor stands for that of the matrix that it is of.
 #define DIFFVBD_SWEEP_FIELDS(ADJOINT, INDEX) \
   ADJOINT(x_start) ADJOINT(x_prev) ADJOINT(y) \
   ADJOINT(mu) ADJOINT(lam) ADJOINT(mass) ADJOINT(rest) \
@@ -20,7 +21,7 @@
   INDEX(pairs) INDEX(constants) INDEX(ptr) INDEX(entry) \
   ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag) \
   ADJOINT(corners_prev) \
-  ADJOINT(coarse_matrix) INDEX(coarse_factor) INDEX(coarse_mass) INDEX(coarse_plan) INDEX(coarse_weights) INDEX(coarse_rest)
+  ADJOINT(coarse_factor) INDEX(coarse_mass) INDEX(coarse_plan) INDEX(coarse_weights) INDEX(coarse_rest)
 
 // The matrix of a coarse space at the start of a step (coarse/matrix.h): plan int32, moments [n, 3] and volume [groups]
 // of the groups, stiffness [1 | scenes, groups, 3, 3, width, width], mass [1 | scenes, cells].

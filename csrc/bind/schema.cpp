@@ -97,8 +97,9 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "filter_eta, int start, bool filters, bool[] wants",
          "Tensor x, Tensor v, Tensor acceleration, Tensor prescribed, Tensor mass, Tensor shared, Tensor own, Tensor "
          "planes, ");
-  // The matrices of all bodies, one after the other, and their Cholesky factors; adjoints of x_prev, stiffness and mass
-  define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "int[] sizes, float time_step", "Tensor matrix, Tensor factor, ");
+  // The Cholesky factors of the matrices of all bodies, one after the other; adjoints of x_prev, stiffness and mass from
+  // that of the matrices
+  define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "int[] sizes, float time_step", "Tensor factor, ");
   define(m, "coarse_matrix_backward", DIFFVBD_ARGUMENTS(COARSE), "Tensor bar, int[] sizes, float time_step",
          DIFFVBD_RETURNS(COARSE));
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");

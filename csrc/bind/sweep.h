@@ -122,8 +122,8 @@ SweepBars make_bars(const Tensor& x, const SweepFields& f, const In& in, int64_t
       make(wants[0] && kPrevScalars > 0 ? std::vector<int64_t>{kPrevScalars, in.scenes, tets} : std::vector<int64_t>{0},
            zeroed || (in.energies & kElastic) == 0);
   const bool corrects = wants[4] && f.coarse_plan.numel() > 0;
-  bars.coarse_matrix =
-      make(corrects ? std::vector<int64_t>{in.scenes, f.coarse_matrix.numel() / (in.scenes > 0 ? in.scenes : 1)}
+  bars.coarse_factor =
+      make(corrects ? std::vector<int64_t>{in.scenes, f.coarse_factor.numel() / (in.scenes > 0 ? in.scenes : 1)}
                     : std::vector<int64_t>{0},
            true);
   bars.energy_data = make(wants[3] ? std::vector<int64_t>{in.scenes, in.data_size} : std::vector<int64_t>{0}, zeroed);

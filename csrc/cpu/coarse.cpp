@@ -22,7 +22,8 @@ CoarseScene<T>::CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t s
       way_(size_t(plan.blocks) * kLanes * 4, true),
       material_(size_t(c_.plan.tet_blocks) * kTetScalars * kLanes),
       coarse_(size_t(c_.plan.functions) * 4, true),
-      rows_(size_t(c_.plan.functions) * 7, true) {
+      rows_(size_t(c_.plan.functions) * 7, true),
+      turns_(size_t(c_.matrix_bar ? c_.corrections : 1) * c_.plan.functions * 3, true) {
   s.gradient = gradient_.get();
   s.way = way_.get();
   const coarse::Plan& p = c_.plan;
@@ -113,12 +114,26 @@ void CoarseScene<T>::correct(int k, Team::Member& member) {
   member.barrier();
 }
 
+template <class T>
+int32_t CoarseScene<T>::body_of(int64_t function) const {
+  const int32_t *first = c_.plan.function_ptr, *end = first + c_.plan.bodies + 1;
+  return static_cast<int32_t>(std::upper_bound(first, end, function) - first) - 1;
+}
+
 // Sums of one body belong to one member, in a fixed order.
 template <class T>
-void CoarseScene<T>::decide(int32_t body, const T* a, T* length) {
+void CoarseScene<T>::decide(int32_t body, T* a, T* length) {
   const coarse::Plan& p = c_.plan;
-  *length = T(0);
-  if (failures_[body] >= coarse::kFailures) return;
+  const int32_t first = p.function_ptr[body], count = p.function_ptr[body + 1] - first;
+  *length = failures_[body] < coarse::kFailures ? length_of(body, a) : T(0);
+  if (*length > 0) return;
+  ++failures_[body];
+  std::fill(a + 3 * first, a + 3 * (first + count), T(0));  // it may be no number
+}
+
+template <class T>
+T CoarseScene<T>::length_of(int32_t body, const T* a) const {
+  const coarse::Plan& p = c_.plan;
   const int32_t first = p.function_ptr[body], count = p.function_ptr[body + 1] - first;
   const T* restricted = rows_.get() + 4 * int64_t{p.functions};
   double slope = 0, inertial = 0;  // the second: a . (P' M P) a
@@ -139,10 +154,8 @@ void CoarseScene<T>::decide(int32_t body, const T* a, T* length) {
   change.c[1] += 0.5 * inertial;
   const bool others = std::any_of(in_.data_count, in_.data_count + kVertexEnergies, [](int n) { return n > 0; });
   change.c[0] = others ? change.c[0] + inertia(body) : slope;
-  const double s = coarse::length<T>(change, slope,
-                                     [&](double at, double& size) { return others ? energies(body, at, size) : 0.0; });
-  *length = T(s);
-  if (!(s > 0)) ++failures_[body];
+  return T(coarse::length<T>(change, slope,
+                             [&](double at, double& size) { return others ? energies(body, at, size) : 0.0; }));
 }
 
 // Slope of the inertial part of the potential.
@@ -225,19 +238,22 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
   const coarse::Plan& p = c_.plan;
   const T *a = tape(k), *lengths = a + int64_t{3} * p.functions, *before = lengths + p.bodies;
   if (std::all_of(lengths, lengths + p.bodies, [](T s) { return s == 0; })) return;
+<<<<<<< HEAD
   T *restricted = rows_.get() + 4 * int64_t{p.functions}, *coarse = coarse_.get();
+=======
+  T *q = turn(k), *coarse = coarse_.get();
+>>>>>>> pull
   flush(member);
   // u = P' x_bar, q = -s A^-1 u
   member.each(0, p.functions, [&](int64_t begin, int64_t end) {
     kernels_.gather(p.row_ptr, p.row, c_.row_weight, s_.x_bar, rows_.get(), begin, end);
-    int32_t b = int32_t(std::upper_bound(p.function_ptr, p.function_ptr + p.bodies + 1, begin) - p.function_ptr) - 1;
+    int32_t b = body_of(begin);
     for (int64_t f = begin; f < end; ++f) {
       while (f >= p.function_ptr[b + 1]) ++b;
-      for (int i = 0; i < 3; ++i) restricted[3 * f + i] = -lengths[b] * rows_.get()[4 * f + i];
+      for (int i = 0; i < 3; ++i) q[3 * f + i] = -lengths[b] * rows_.get()[4 * f + i];
     }
   });
   member.barrier();
-  T* q = restricted;
   solve(q, member);
   member.each(0, p.bodies, [&](int64_t begin, int64_t end) {
     for (int64_t b = begin; b < end; ++b) {
@@ -273,19 +289,6 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
       for (int i = 0; i < 3; ++i) coarse[4 * f + i] = q[3 * f + i];
     }
   });
-  if (c_.matrix_bar) {
-    T* bar = c_.matrix_bar + scene_ * 9 * int64_t{p.cells};
-    member.each(0, p.bodies, [&](int64_t begin, int64_t end) {
-      for (int64_t b = begin; b < end; ++b) {
-        if (!(lengths[b] > 0)) continue;
-        const int64_t first = int64_t{3} * p.function_ptr[b], n = int64_t{3} * p.function_ptr[b + 1] - first;
-        T* to = bar + int64_t{9} * p.mass_ptr[b];
-        for (int64_t i = 0; i < n; ++i) {
-          for (int64_t j = 0; j < n; ++j) to[i * n + j] -= q[first + i] * a[first + j];
-        }
-      }
-    });
-  }
   member.barrier();
   member.each(0, p.positions, [&](int64_t begin, int64_t end) {
     kernels_.gather(p.position_ptr, p.function, c_.weight, coarse, s_.way, begin, end);
@@ -294,6 +297,29 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
   member.each(0, plan_.blocks,
               [&](int64_t begin, int64_t end) { kernels_.reverse(plan_, s_, in_.parameters, begin, end); });
   member.barrier();
+<<<<<<< HEAD
+=======
+}
+
+// The adjoint of the matrix: -q a' of all corrections, in one pass over it.
+template <class T>
+void CoarseScene<T>::finish(Team::Member& member) {
+  if (!c_.matrix_bar) return;
+  const coarse::Plan& p = c_.plan;
+  T* bar = c_.matrix_bar + scene_ * 9 * int64_t{p.cells};
+  member.each(0, p.functions, [&](int64_t begin, int64_t end) {
+    int32_t b = body_of(begin);
+    while (begin < end) {
+      while (begin >= p.function_ptr[b + 1]) ++b;
+      const int64_t first = p.function_ptr[b], last = std::min<int64_t>(end, p.function_ptr[b + 1]);
+      kernels_.outer(turn(0) + 3 * first, int64_t{3} * p.functions, tape(0) + 3 * first, c_.tape_size(), c_.corrections,
+                     3 * (p.function_ptr[b + 1] - first), 3 * (begin - first), 3 * (last - first),
+                     bar + int64_t{9} * p.mass_ptr[b]);
+      begin = last;
+    }
+  });
+  member.barrier();
+>>>>>>> pull
 }
 
 template class CoarseScene<float>;

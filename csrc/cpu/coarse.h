@@ -20,11 +20,17 @@ class CoarseScene {
   void correct(int k, Team::Member& member);
   // Its transpose, from the state after it; `s` has the adjoints of what the sweeps after it have left.
   void reverse(int k, Team::Member& member);
+  // After all of them: the adjoint of the matrix.
+  void finish(Team::Member& member);
 
  private:
   T* tape(int k) const { return c_.tape + (scene_ * c_.corrections + k) * c_.tape_size(); }
   void solve(T* x, Team::Member& member) const;
-  void decide(int32_t body, const T* a, T* length);
+  // q of the correction of number k
+  T* turn(int k) const { return turns_.get() + (c_.matrix_bar ? k : 0) * int64_t{3} * c_.plan.functions; }
+  int32_t body_of(int64_t function) const;
+  void decide(int32_t body, T* a, T* length);
+  T length_of(int32_t body, const T* a) const;
   double energies(int32_t body, double s, double& size) const;
   double inertia(int32_t body) const;
   void flush(Team::Member& member);
@@ -36,7 +42,7 @@ class CoarseScene {
   SceneView<T>& s_;
   const CoarseKernels<T> kernels_;
   std::vector<int> failures_;
-  Buffer<T> gradient_, way_, material_, coarse_, rows_;
+  Buffer<T> gradient_, way_, material_, coarse_, rows_, turns_;
   Buffer<double> sums_;
   bool over_ = false;
 };

@@ -125,9 +125,8 @@ DIFFVBD_FN void invert_block(const T* factor, int64_t n, int64_t begin, Lanes<T>
 
 // By blocks of kLanes columns; `panel` has what earlier columns have in the rows of a block, n x kLanes.
 template <class T>
-__attribute__((flatten)) void factor_rows(const T* matrix, int64_t n, T* panel, T* factor) {
+__attribute__((flatten)) void factor_rows(int64_t n, T* panel, T* factor) {
   using R = Lanes<T>;
-  std::memcpy(factor, matrix, n * n * sizeof(T));
   if (n % kLanes != 0) return factor_block(factor, n, 0, n);
   constexpr int kRows = 4;
   for (int64_t begin = 0; begin < n; begin += kLanes) {
@@ -152,6 +151,20 @@ __attribute__((flatten)) void factor_rows(const T* matrix, int64_t n, T* panel, 
         factor_block(factor, n, begin, kLanes);
         invert_block(factor, n, begin, columns);
       }
+    }
+  }
+}
+
+template <class T>
+__attribute__((flatten)) void outer_rows(const T* q, int64_t q_stride, const T* a, int64_t a_stride, int count,
+                                         int64_t n, int64_t begin, int64_t end, T* to) {
+  using R = Lanes<T>;
+  for (int64_t row = begin; row < end; ++row) {
+    for (int64_t j = 0; j < n; j += kLanes) {
+      const int width = static_cast<int>(n - j < kLanes ? n - j : kLanes);
+      R sum(T(0));
+      for (int i = 0; i < count; ++i) sum = sum - R(q[i * q_stride + row]) * R::load(a + i * a_stride + j, width);
+      sum.store(to + row * n + j, width);
     }
   }
 }
@@ -202,6 +215,7 @@ constexpr CoarseKernels<T> coarse_variant() {
             gather_rows<T>,
             rotate_blocks<T>,
             factor_rows<T>,
+            outer_rows<T>,
             solve_rows<T>,
             line_of_tets<T>};
   }

@@ -300,6 +300,7 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
         if (k < in.sweeps) sweep_back(k, member);
         if (coarse && coarse::corrects_before(k, in.sweeps, every, begun)) coarse->reverse(--corrections, member);
       }
+      if (coarse) coarse->finish(member);
     });
     collect_last(plan, s.rows, s.x_bar);
     if (contact) {

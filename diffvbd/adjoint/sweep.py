@@ -71,12 +71,12 @@ class _Sweep(Function):
     @staticmethod
     def forward(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider, collider_prev, kappa,
                 pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, corners_prev,
-                coarse_matrix, coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
+                coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
                 plan, settings, tape_policy, debug_step, checked):  # fmt: skip
         # torch.compile counts these arguments: *args would get the context as well
         fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider,
                                  collider_prev, kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry,
-                                 floor_lag, corners_prev, coarse_matrix, coarse_factor, coarse_mass,
+                                 floor_lag, corners_prev, coarse_factor, coarse_mass,
                                  coarse_plan, coarse_weights, coarse_rest)  # fmt: skip
         return ops.sweep(fields, packed_rest, plan, settings, tape_policy, debug_step, checked)
 
@@ -112,11 +112,11 @@ class _SweepBackward(Function):
     @staticmethod
     def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider, collider_prev,
                 kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, corners_prev,
-                coarse_matrix, coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
+                coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
                 plan, x, tape, corrections, settings, tape_policy, needs):  # fmt: skip
         fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider,
                                  collider_prev, kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry,
-                                 floor_lag, corners_prev, coarse_matrix, coarse_factor, coarse_mass,
+                                 floor_lag, corners_prev, coarse_factor, coarse_mass,
                                  coarse_plan, coarse_weights, coarse_rest)  # fmt: skip
         wants = _wants(ops.SWEEP_ADJOINTS, fields._fields, needs)
         with backward_memory(x, settings, tape_policy):

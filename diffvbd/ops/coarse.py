@@ -13,8 +13,7 @@ _FIELDS = len(CoarseFields._fields)
 @shapes_of("coarse_matrix")
 def _(*arguments):
     f = CoarseFields(*arguments[:_FIELDS])
-    shape = (f.x_prev.shape[0], 9 * f.mass.shape[-1])
-    return f.x_prev.new_empty(shape), f.x_prev.new_empty(shape)
+    return f.x_prev.new_empty((f.x_prev.shape[0], 9 * f.mass.shape[-1]))
 
 
 @shapes_of("coarse_matrix_backward")

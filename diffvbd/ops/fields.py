@@ -48,8 +48,7 @@ class SweepFields(NamedTuple):
     floor_lag: Tensor | None = None  # [B, V, planes, 4]
     corners_prev: Tensor | None = None  # x_prev of the tets' corners, [12, B, T], where their law reads it
     # coarse corrections; see model.coarse_plan for the constants
-    coarse_matrix: Tensor | None = None  # [B, 9 cells] [kg]
-    coarse_factor: Tensor | None = None  # its Cholesky factors, body by body
+    coarse_factor: Tensor | None = None  # [B, 9 cells]  Cholesky factors, body by body; its adjoint is the matrix's
     coarse_mass: Tensor | None = None  # [1 | B, cells] [kg]
     coarse_plan: Tensor | None = None
     coarse_weights: Tensor | None = None
@@ -58,7 +57,7 @@ class SweepFields(NamedTuple):
 
 # What the reverse differentiates: the fields that are ADJOINT in csrc/bind/fields.h.
 SWEEP_ADJOINTS = ("x_start", "x_prev", "y", "mu", "lam", "mass", "rest", "energy_data", "bounds", "collider",
-                  "collider_prev", "kappa", "lag", "floor_lag", "corners_prev", "coarse_matrix")  # fmt: skip
+                  "collider_prev", "kappa", "lag", "floor_lag", "corners_prev", "coarse_factor")  # fmt: skip
 
 
 class StepFields(NamedTuple):

@@ -53,7 +53,7 @@ def sweep_backward(x_bar: Tensor, x: Tensor, tape: Tensor, corrections: Tensor, 
         tape_policy = FULL_TAPE
         x, tape, _, corrections = raw.sweep(*given, plan, *settings, tape_policy, -1, False)
     material = wants["mu"] or wants["lam"] or wants["corners_prev"]
-    flags = [material, wants["mass"], wants["rest"], wants["energy_data"], wants["coarse_matrix"]]
+    flags = [material, wants["mass"], wants["rest"], wants["energy_data"], wants["coarse_factor"]]
     bars = raw.sweep_backward(*given, x_bar.contiguous(), x, tape, corrections, plan, *settings, tape_policy, flags)
     return dict(zip(SWEEP_ADJOINTS, bars, strict=True))
 
@@ -109,7 +109,7 @@ def _(*arguments):
     own = [*(torch.empty_like(x) for _ in range(3)), *_body_adjoints(x, f, sizes[1], wants[:3])]
     own.append(x.new_empty((b, f.energy_data.shape[-1]) if wants[3] else (0,)))
     last = (x.new_empty(f.corners_prev.shape if wants[0] else (0,)),
-            x.new_empty(f.coarse_matrix.shape if wants[4] else (0,)))  # fmt: skip
+            x.new_empty(f.coarse_factor.shape if wants[4] else (0,)))  # fmt: skip
     if not energies & CONTACT:
         return (*own, *(x.new_empty((0,)) for _ in range(len(SWEEP_ADJOINTS) - len(own) - len(last))), *last)
     colliders = f.collider.shape[1] if f.collider.dim() == 3 else 0

@@ -118,14 +118,14 @@ def predict(
 
 
 def coarse_scalars(model: Model, sweeps: int) -> int:
-    """Scalars that the coarse corrections of a step keep for its backward, for each scene: the matrix, its factors, and
+    """Scalars that the coarse corrections of a step keep for its backward, for each scene: the matrix's factors, and
     what each correction has done; with a floor also where it began."""
     if model.coarse is None or not model.coarse_geometry.bodies:
         return 0
     geometry, plan = model.coarse_geometry, model._coarse_plan
     positions = 3 * plan.sizes.positions if model.energy_mask & KEEPS_POSITIONS else 0
     of_one = 3 * geometry.functions + geometry.bodies + positions
-    return 18 * plan.mass.numel() + model.coarse.corrections(sweeps) * of_one
+    return 9 * plan.mass.numel() + model.coarse.corrections(sweeps) * of_one
 
 
 def _cpu_scratch(model: Model, scenes: int, material: bool, rest: bool) -> int:

@@ -94,15 +94,17 @@ def _mass(model: Model, mass: Tensor) -> Tensor:
     return filled.expand(len(mass), -1).index_add(1, cell, weight * mass[:, vertex])
 
 
-class _Matrix(Function):
+class _Factor(Function):
+    """Cholesky factors of the matrices. What comes back for them is the adjoint of the matrices themselves: no other
+    operator reads a factor, and the matrices need not be kept."""
+
     @staticmethod
     def forward(x_prev, stiffness, mass, plan, moments, volume, sizes, time_step):
         return ops.raw.coarse_matrix(x_prev, stiffness, mass, plan, moments, volume, sizes, time_step)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
         ctx.save_for_backward(*inputs[:_FIELDS])
-        ctx.mark_non_differentiable(output[1])
         ctx.sizes, ctx.time_step = inputs[_FIELDS:]
         ctx.set_materialize_grads(False)
 
@@ -111,7 +113,7 @@ class _Matrix(Function):
         if grads[0] is None:
             return (None,) * (_FIELDS + 2)
         needs = ctx.needs_input_grad[:_TENSORS]
-        out = _MatrixBackward.apply(grads[0], *ctx.saved_tensors, ctx.sizes, ctx.time_step, needs)
+        out = _FactorBackward.apply(grads[0], *ctx.saved_tensors, ctx.sizes, ctx.time_step, needs)
         return of_inputs(out, needs, _FIELDS + 2 - _TENSORS)
 
     @staticmethod
@@ -119,7 +121,7 @@ class _Matrix(Function):
         raise NotImplementedError("diffvbd: torch.func.vmap of coarse corrections is not supported")
 
 
-class _MatrixBackward(Function):
+class _FactorBackward(Function):
     @staticmethod
     def forward(bar, x_prev, stiffness, mass, plan, moments, volume, sizes, time_step, needs):
         fields = (x_prev, stiffness, mass, plan, moments, volume)
@@ -137,17 +139,16 @@ class _MatrixBackward(Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         """Several adjoints, one after another."""
-        return one_by_one(_MatrixBackward, info.batch_size, in_dims, args)
+        return one_by_one(_FactorBackward, info.batch_size, in_dims, args)
 
 
 def with_corrections(model: Model, parts: CoarseParts, fields: ops.SweepFields, time_step: float) -> ops.SweepFields:
     """What the sweeps read, with the corrections between them."""
     plan = model._coarse_plan
     tensors = distinct(fields.x_prev, parts.stiffness.contiguous(), parts.mass)
-    matrix, factor = _Matrix.apply(*tensors, plan.plan, plan.moments, plan.volume, plan.sizes, time_step)
-    return fields._replace(coarse_matrix=matrix, coarse_factor=factor,
-                           coarse_mass=parts.mass.detach(), coarse_plan=plan.plan, coarse_weights=plan.weights,
-                           coarse_rest=parts.rest)  # fmt: skip
+    factor = _Factor.apply(*tensors, plan.plan, plan.moments, plan.volume, plan.sizes, time_step)
+    return fields._replace(coarse_factor=factor, coarse_mass=parts.mass.detach(), coarse_plan=plan.plan,
+                           coarse_weights=plan.weights, coarse_rest=parts.rest)  # fmt: skip
 
 
 def lengths_of(model: Model, corrections: Tensor) -> Tensor:
@@ -156,4 +157,4 @@ def lengths_of(model: Model, corrections: Tensor) -> Tensor:
     return corrections.detach().narrow(-1, 3 * geometry.functions, geometry.bodies).clone()
 
 
-ops.ready_signature(_Matrix, _MatrixBackward)
+ops.ready_signature(_Factor, _FactorBackward)

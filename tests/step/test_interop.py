@@ -224,8 +224,8 @@ def coarse_arguments() -> dict[str, tuple[Any, ...]]:
     parts = coarse_parts(model, moduli, moduli, None, None, None)
     given = (x, parts.stiffness, parts.mass, plan.plan, plan.moments, plan.volume)
     last = (plan.sizes, 0.3)
-    matrix, _ = torch.ops.diffvbd.coarse_matrix(*given, *last)
-    return {"coarse_matrix": (*given, *last), "coarse_matrix_backward": (*given, torch.ones_like(matrix), *last)}
+    factor = torch.ops.diffvbd.coarse_matrix(*given, *last)
+    return {"coarse_matrix": (*given, *last), "coarse_matrix_backward": (*given, torch.ones_like(factor), *last)}
 
 
 def fused_arguments(policy: int) -> dict[str, tuple[Any, ...]]:

@@ -13,7 +13,7 @@
 namespace {
 
 namespace coarse = diffvbd::coarse;
-using diffvbd::CoarseFields, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::zeros;
+using diffvbd::CoarseFields, diffvbd::data, diffvbd::dispatch_float, diffvbd::zeros;
 using torch::stable::Tensor;
 
 template <class F>
@@ -23,22 +23,22 @@ void for_bodies(int64_t scenes, int64_t bodies, const F& f) {
   });
 }
 
-std::tuple<Tensor, Tensor> matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t> sizes, double time_step) {
+Tensor matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t> sizes, double time_step) {
   const CoarseFields f{DIFFVBD_ITEMS(COARSE)};
   return dispatch_float(x_prev, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::matrix_inputs<T>(f, sizes, time_step);
     const int64_t size = int64_t{9} * in.plan.cells;
-    const Tensor out = zeros(x_prev, {in.scenes, size}), factor = empty(x_prev, {in.scenes, size});
+    const Tensor out = zeros(x_prev, {in.scenes, size});
     const auto kernels = diffvbd::coarse_kernels<T>(diffvbd::kExactBlock);
     for_bodies(in.scenes, in.plan.bodies, [&](int64_t scene, int body) {
       const int64_t at = scene * size + int64_t{9} * in.plan.mass_ptr[body];
       const int64_t n = 3 * int64_t{in.plan.function_ptr[body + 1] - in.plan.function_ptr[body]};
       std::vector<T> work(std::max<int64_t>(9 * in.plan.width, n * diffvbd::kLanes));
       coarse::assemble(in, scene, body, kernels.rotate, work.data(), data<T>(out) + scene * size);
-      kernels.factor(data<T>(out) + at, n, work.data(), data<T>(factor) + at);
+      kernels.factor(n, work.data(), data<T>(out) + at);
     });
-    return std::make_tuple(out, factor);
+    return out;
   });
 }
 

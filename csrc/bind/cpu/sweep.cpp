@@ -131,7 +131,7 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     for (const int64_t n : corrections_shape(given.coarse, in)) size *= n;
     diffvbd::require_like("corrections", corrections, x, size);
     given.coarse.tape = data<T>(corrections);
-    given.coarse.matrix_bar = bars.coarse_matrix.numel() > 0 ? data<T>(bars.coarse_matrix) : nullptr;
+    given.coarse.matrix_bar = bars.coarse_factor.numel() > 0 ? data<T>(bars.coarse_factor) : nullptr;
     if (!in.contact) {
       diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), out);
       return bars.tensors();
