@@ -97,7 +97,7 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "filter_eta, int start, bool filters, bool[] wants",
          "Tensor x, Tensor v, Tensor acceleration, Tensor prescribed, Tensor mass, Tensor shared, Tensor own, Tensor "
          "planes, ");
-  // The Cholesky factors of the matrices of all bodies, one after the other; adjoints of x_prev, stiffness and mass from
+  // The Cholesky factors (CUDA: inverses) of the matrices of all bodies, one after the other; adjoints of x_prev, stiffness and mass from
   // that of the matrices
   define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "int[] sizes, float time_step", "Tensor factor, ");
   define(m, "coarse_matrix_backward", DIFFVBD_ARGUMENTS(COARSE), "Tensor bar, int[] sizes, float time_step",

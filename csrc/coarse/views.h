@@ -85,7 +85,7 @@ struct Inputs {
   Plan plan;
   const T *weight, *row_weight;  // [entries] each, by position and by function
   Batched<const T> rest;         // [B, tet_blocks, kRestScalars, kLanes]
-  Batched<const T> factor;       // [B, 9 mass_ptr[bodies]]  L of A = L L^T of each body, n x n
+  Batched<const T> factor;       // [B, 9 cells]  L of A = L L^T of each body, n x n; on CUDA the inverse
   Batched<const T> mass;         // [B, mass_ptr[bodies]]
   int corrections;
   T* tape;        // [B, corrections, tape_size()]

@@ -190,28 +190,23 @@ __global__ void __launch_bounds__(kRowThreads)
   if (length > 0) store_row(a.s.w.x, i, x + length * load_row(a.w.way, i, true));
 }
 
-// What the sweeps that are already reversed have left for each vertex that moves: rows of lower colors. They are then
-// cleared: its next turn reads them again. Those of higher colors are written anew before it.
+// The adjoint of every vertex that moves: its own, and what the sweeps that are already reversed have left for it, the
+// rows of lower colors. They stay where they are, for its next turn.
 template <class T>
-__global__ void __launch_bounds__(kRowThreads) take_rows(const __grid_constant__ StepView<T> s) {
+__global__ void __launch_bounds__(kRowThreads)
+    sum_adjoints(const __grid_constant__ StepView<T> s, T* __restrict__ total) {
   const int64_t active = int64_t{__ldg(s.plan.color_block + s.plan.colors)} * kSlice;
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
   if (i >= s.scenes * active) return;
-  const int64_t scene = i / active, position = i - scene * active;
-  const int block = static_cast<int>(position / kSlice), v = static_cast<int>(position % kSlice);
+  const int64_t scene = i / active, position = i - scene * active, row = scene * s.positions + position;
+  Place<1> at(scene, static_cast<int>(position / kSlice), 0);
+  at.v = static_cast<int>(position % kSlice);
   int color = 0;
-  while (block >= __ldg(s.plan.color_block + color + 1)) ++color;
+  while (at.block >= __ldg(s.plan.color_block + color + 1)) ++color;
   const int below = __ldg(s.plan.block_edge + __ldg(s.plan.color_block + color)) * kSlice;
-  const int none = s.plan.edge_slots * kSlice;
-  T* rows = s.w.rows + scene * (int64_t{none} + 1) * kRow;
-  Vec3<T> sum = load_row(s.w.x_bar, scene * s.positions + position, true);
-  for (int e = __ldg(s.plan.block_incoming + block); e < __ldg(s.plan.block_incoming + block + 1); ++e) {
-    const int row = __ldg(s.plan.incoming + static_cast<int64_t>(e) * kSlice + v);
-    if (row >= below) continue;
-    sum += load_row(rows, row, true);
-    store_row(rows, row, zero3<T>());
-  }
-  store_row(s.w.x_bar, scene * s.positions + position, sum);
+  Vec3<T> sum = load_row(s.w.x_bar, row, true);
+  if (below > 0) sum += pull_rows<false>(s, at, below);
+  store_row(total, row, sum);
 }
 
 // Back to where the correction began, and the way of its transpose.
@@ -299,10 +294,10 @@ cudaError_t Corrections<T>::reverse(int k, int wanted) const {
   const coarse::Plan& p = a.c.plan;
   if (p.bodies == 0) return cudaSuccess;
   const int64_t positions = s.scenes * s.positions, active = s.scenes * active_positions;
-  if (auto error = launch(take_rows<T>, active, kRowThreads, stream, s)) return error;
+  if (auto error = launch(sum_adjoints<T>, active, kRowThreads, stream, s, w.gradient)) return error;
   const int64_t functions = s.scenes * p.functions * kSumThreads;
   if (auto error =
-          launch(restrict_rows<T, true>, functions, kSumThreads, stream, a, k, static_cast<const T*>(s.w.x_bar))) {
+          launch(restrict_rows<T, true>, functions, kSumThreads, stream, a, k, static_cast<const T*>(w.gradient))) {
     return error;
   }
   if (auto error = solve<true>(a, k, stream)) return error;

@@ -11,7 +11,7 @@ namespace diffvbd::cuda {
 // Where the corrections of a chunk of scenes work; per scene.
 template <class T>
 struct CoarseWork {
-  T *gradient, *way;  // [positions, 4]
+  T *gradient, *way;  // [positions, 4]; the first has the adjoint of every vertex in the reverse
   T* restricted;      // [functions, 3]  P' gradient
   T* solved;          // [corrections, functions, 3]  of the reverse: q of each correction
   double* sums;       // [parts, kDegree]

@@ -16,14 +16,14 @@ struct ThreadStar {
   const StepView<T>& s;
   const T* ways;
   int64_t scene;
-  int v, first, count, first_edge, degree, pinned;
+  int block, v, first, count, first_edge, degree, pinned;
   T shared_material[kTetScalars];
   mutable int where;  // of the pair at work
   mutable T material_bar[kTetScalars] = {};
 
   // ways: of all positions, in the reverse
   __device__ __forceinline__ ThreadStar(const StepView<T>& s, const T* ways, int64_t scene, int block, int v)
-      : s(s), ways(ways + scene * s.positions * kRow), scene(scene), v(v) {
+      : s(s), ways(ways + scene * s.positions * kRow), scene(scene), block(block), v(v) {
     first = __ldg(s.plan.block_slot + block);
     count = s.has_tets ? __ldg(s.plan.block_slot + block + 1) - first : 0;
     first_edge = __ldg(s.plan.block_edge + block);
@@ -78,9 +78,14 @@ struct ThreadStar {
   }
   __device__ __forceinline__ int64_t pair_index(int e) const { return (scene * s.plan.slots + first + e) * kSlice + v; }
   __device__ __forceinline__ void add_material(int e, const T* bar) const {
-    T* to = s.one_material ? material_bar : s.w.material_bar + pair_index(e) * kTetScalars;
+    if (s.one_material) {
 #pragma unroll
-    for (int i = 0; i < kTetScalars; ++i) to[i] += bar[i];
+      for (int i = 0; i < kTetScalars; ++i) material_bar[i] += bar[i];
+    } else {
+      T* to = s.w.material_bar + pair_index(e) * kTetScalars;
+#pragma unroll
+      for (int i = 0; i < kTetScalars; ++i) to[i] += bar[i];
+    }
   }
   __device__ __forceinline__ void add_rest(int e, const T* bar) const {
     T* to = s.w.rest_bar + pair_index(e) * kPairRest;
@@ -91,31 +96,34 @@ struct ThreadStar {
   __device__ __forceinline__ Vec3<T> multiply_tets(const Vec3<T>& x, const Vec3<T>& w, const T& minus_h2) const {
     bool touches = false;
     for (int a = 0; a < degree; ++a) touches = touches || neighbour(a) >= pinned;
-    if (touches) send_to_pinned<Law>(x, w, minus_h2);
+    if (touches) send_to_pinned<Law>(s, scene, block, v, x, w, minus_h2);
     return diffvbd::multiply_tets<Law, wanted>(*this, x, w, minus_h2);
   }
-  // The plan lists no tets of pinned vertices: what reaches them goes by rows, which add up (GroupStar::send_rows).
+  // The plan lists no tets of pinned vertices: what reaches them goes by rows, which add up (GroupStar::send_rows). Out
+  // of line with a star of its own, so that this one stays in registers.
   template <class Law>
-  __device__ __noinline__ void send_to_pinned(const Vec3<T>& x, const Vec3<T>& w, T minus_h2) const {
+  __device__ __noinline__ static void send_to_pinned(const StepView<T>& s, int64_t scene, int block, int v,
+                                                     const Vec3<T> x, const Vec3<T> w, T minus_h2) {
+    const ThreadStar star(s, s.w.x, scene, block, v);
     T* rows = s.w.rows + scene * (static_cast<int64_t>(s.plan.edge_slots) * kSlice + 1) * kRow;
     const auto send = [&](int a, const Vec3<T>& bar) {
-      if (neighbour(a) < pinned) return;
-      const int64_t edge = static_cast<int64_t>(first_edge + a) * kSlice + v;
+      if (star.neighbour(a) < star.pinned) return;
+      const int64_t edge = static_cast<int64_t>(star.first_edge + a) * kSlice + v;
       store_row(rows, edge, load_row(rows, edge, true) + bar);
     };
     const Vec3<T> p = -w, none = zero3<T>();
-    for (int e = 0; e < count; ++e) {
-      const TetPair<T> tet = pair(e);
+    for (int e = 0; e < star.count; ++e) {
+      const TetPair<T> tet = star.pair(e);
       const TetAdjoint<T> bar = Law::block_vjp(tet, Law::view(tet, x, none, p), none, p, minus_h2);
-      send(where & kMaxDegree, bar.xj);
-      send(where >> kLocalBits & kMaxDegree, bar.xk);
-      send(where >> 2 * kLocalBits, bar.xl);
+      send(star.where & kMaxDegree, bar.xj);
+      send(star.where >> kLocalBits & kMaxDegree, bar.xk);
+      send(star.where >> 2 * kLocalBits, bar.xl);
     }
   }
 };
 
 template <class T, int mask>
-__global__ void __launch_bounds__(kGradientThreads)
+__global__ void __launch_bounds__(kGradientThreads, 4)
     gradient_of_vertices(const __grid_constant__ StepView<T> s, const __grid_constant__ CoarseWork<T> w) {
   using Set = EnergySet<mask>;
   const int64_t active = static_cast<int64_t>(__ldg(s.plan.color_block + s.plan.colors)) * kSlice;
@@ -131,7 +139,7 @@ __global__ void __launch_bounds__(kGradientThreads)
 }
 
 template <class T, int mask, int wanted>
-__global__ void __launch_bounds__(kGradientThreads)
+__global__ void __launch_bounds__(kGradientThreads, 4)
     reverse_gradients(const __grid_constant__ StepView<T> s, const __grid_constant__ CoarseWork<T> w) {
   using Set = EnergySet<mask>;
   const int64_t active = static_cast<int64_t>(__ldg(s.plan.color_block + s.plan.colors)) * kSlice;

@@ -122,13 +122,35 @@ struct Swept {
   }
 };
 
+// A warp, of which each thread has a column in registers: a symmetric tile becomes minus its inverse.
+__device__ __forceinline__ void invert_tile(double (&tile)[kEdge][kEdge + 1], int c) {
+  double column[kEdge];
+#pragma unroll
+  for (int r = 0; r < kEdge; ++r) column[r] = tile[r][c];
+#pragma unroll
+  for (int k = 0; k < kEdge; ++k) {
+    __syncwarp();
+    tile[0][c] = column[k];  // row k, which is column k
+    __syncwarp();
+    const double over = 1 / tile[0][k], scaled = column[k] * over;
+#pragma unroll
+    for (int r = 0; r < kEdge; ++r) {
+      if (r != k) column[r] = c == k ? tile[0][r] * over : column[r] - tile[0][r] * scaled;
+    }
+    column[k] = c == k ? -over : scaled;
+  }
+  __syncwarp();
+#pragma unroll
+  for (int r = 0; r < kEdge; ++r) tile[r][c] = column[r];
+}
+
 // A block of kEdge x kEdgeRows threads for each tile of rows: its columns of the pivot tile, and these times the
 // inverse of the pivot tile, which every block finds for itself.
 template <class T>
 __global__ void __launch_bounds__(kEdge* kEdgeRows)
     sweep_panel(const __grid_constant__ MatrixInputs<T> in, const __grid_constant__ MatrixWork work, int bodies,
                 int first_body, int pivot) {
-  __shared__ double own[kEdge][kEdge + 1], row[kEdge], tile[kEdge][kEdge + 1];
+  __shared__ double own[kEdge][kEdge + 1], tile[kEdge][kEdge + 1];
   const int64_t scene = blockIdx.x / bodies;
   const Swept a(in, work, scene, first_body + static_cast<int>(blockIdx.x - scene * bodies));
   const int begin = pivot * kEdge, size = min(kEdge, a.n - begin), mine = static_cast<int>(blockIdx.y) * kEdge;
@@ -140,25 +162,19 @@ __global__ void __launch_bounds__(kEdge* kEdgeRows)
     tile[r][c] = mine + r < a.n && c < size ? a.matrix[int64_t{mine + r} * a.n + begin + c] : 0;
   }
   __syncthreads();
-  for (int k = 0; k < size; ++k) {  // own becomes minus its inverse
-    const double over = 1 / own[k][k];
-    if (first == 0) row[c] = own[k][c];
-    __syncthreads();
-    for (int r = first; r < kEdge; r += kEdgeRows) {
-      if (r == k) {
-        own[r][c] = c == k ? -over : row[c] * over;
-      } else {
-        own[r][c] = c == k ? row[r] * over : own[r][c] - row[r] * row[c] * over;
-      }
-    }
-    __syncthreads();
+  if (first == 0) invert_tile(own, c);
+  __syncthreads();
+  double sum[kEdge / kEdgeRows] = {};
+  for (int k = 0; k < kEdge; ++k) {
+#pragma unroll
+    for (int u = 0; u < kEdge / kEdgeRows; ++u) sum[u] -= tile[first + u * kEdgeRows][k] * own[k][c];
   }
-  for (int r = first; r < kEdge; r += kEdgeRows) {
-    double sum = 0;
-    for (int k = 0; k < size; ++k) sum -= tile[r][k] * own[k][c];
+#pragma unroll
+  for (int u = 0; u < kEdge / kEdgeRows; ++u) {
+    const int r = first + u * kEdgeRows;
     if (mine + r < a.n) {
       a.columns[int64_t{mine + r} * kEdge + c] = tile[r][c];
-      a.panel[int64_t{mine + r} * kEdge + c] = c < size ? sum : 0;
+      a.panel[int64_t{mine + r} * kEdge + c] = c < size ? sum[u] : 0;
     }
     if (mine == begin) a.block[r * kEdge + c] = own[r][c];
   }
@@ -187,20 +203,25 @@ __global__ void __launch_bounds__(kEdge* kEdgeRows)
   }
   __syncthreads();
   T* out = inverse + 9 * (scene * in.plan.cells + __ldg(in.plan.mass_ptr + body));
-  for (int r = first; r < kEdge; r += kEdgeRows) {
-    const bool exists = rows + r < a.n && columns + c < a.n;
+  double sum[kEdge / kEdgeRows] = {};
+  for (int k = 0; moves && k < kEdge; ++k) {
+#pragma unroll
+    for (int u = 0; u < kEdge / kEdgeRows; ++u) sum[u] -= one[first + u * kEdgeRows][k] * two[c][k];
+  }
+#pragma unroll
+  for (int u = 0; u < kEdge / kEdgeRows; ++u) {
+    const int r = first + u * kEdgeRows;
+    // on the diagonal what is below it stands for both sides
+    if (rows + r >= a.n || columns + c >= a.n || (high == low && c > r)) continue;
+    const int64_t at = int64_t{rows + r} * a.n + columns + c, mirror = int64_t{columns + c} * a.n + rows + r;
     double value = 0;
     if (moves) {
-      value = exists ? a.matrix[int64_t{rows + r} * a.n + columns + c] : 0;
-      for (int k = 0; k < kEdge; ++k) value -= one[r][k] * two[c][k];
+      value = a.matrix[at] + sum[u];
     } else if (high == low) {
       value = a.block[r * kEdge + c];
     } else {
       value = low == pivot ? one[r][c] : two[c][r];
     }
-    // on the diagonal what is below it stands for both sides
-    if (!exists || (high == low && c > r)) continue;
-    const int64_t at = int64_t{rows + r} * a.n + columns + c, mirror = int64_t{columns + c} * a.n + rows + r;
     if (last) {
       out[at] = T(-value), out[mirror] = T(-value);
     } else {

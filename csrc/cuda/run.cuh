@@ -44,7 +44,7 @@ CoarseWork<T> carve_coarse(const coarse::Inputs<T>& in, int64_t positions, int64
   const coarse::Plan& p = in.plan;
   const auto bytes = [](int64_t count, size_t size) { return static_cast<int64_t>(count * size / sizeof(T) + 1); };
   CoarseWork<T> w{};
-  w.gradient = take(!reverse, scenes * kRow * positions);
+  w.gradient = take(true, scenes * kRow * positions);
   w.way = take(true, scenes * kRow * positions);
   w.restricted = take(true, scenes * 3 * p.functions);
   w.solved = take(reverse, scenes * in.corrections * 3 * p.functions);

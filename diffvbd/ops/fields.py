@@ -48,7 +48,7 @@ class SweepFields(NamedTuple):
     floor_lag: Tensor | None = None  # [B, V, planes, 4]
     corners_prev: Tensor | None = None  # x_prev of the tets' corners, [12, B, T], where their law reads it
     # coarse corrections; see model.coarse_plan for the constants
-    coarse_factor: Tensor | None = None  # [B, 9 cells]  Cholesky factors, body by body; its adjoint is the matrix's
+    coarse_factor: Tensor | None = None  # [B, 9 cells]  Cholesky factors (CUDA: inverses); its adjoint is the matrix's
     coarse_mass: Tensor | None = None  # [1 | B, cells] [kg]
     coarse_plan: Tensor | None = None
     coarse_weights: Tensor | None = None

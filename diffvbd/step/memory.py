@@ -62,6 +62,6 @@ def cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = T
         one += (2 * pairs if material or rest else 0) + (4 * pairs if rest else 0)
     if corrects:
         sizes = model._coarse_plan.sizes
-        one += (4 if reverse else 8) * positions + 3 * sizes.functions + (0 if reverse else 6 * sizes.parts)
+        one += 8 * positions + 3 * sizes.functions + (0 if reverse else 6 * sizes.parts)
     one *= model._mass.element_size()
     return one * min(scenes, max(1, WORKSPACE_BUDGET // max(1, one)))

@@ -363,7 +363,9 @@ def sensitivity(
     def nudged(a: Any) -> Any:
         if isinstance(a, dict):
             return {name: nudged(value) for name, value in a.items()}
-        return a * torch.as_tensor(1 + rng.choice((-1, 1), tuple(a.shape)) * 2.0**-52) if isinstance(a, Tensor) else a
+        if not isinstance(a, Tensor):
+            return a
+        return a * torch.as_tensor(1 + rng.choice((-1, 1), tuple(a.shape)) * 2.0**-52, device=a.device)
 
     moved = [reference_result(model, nudged(inputs), sweeps, steps, coarse_steps=coarse_steps) for _ in range(3)]
     return {name: max(relative_error(m[name], expected[name]) for m in moved) for name in expected}

@@ -14,13 +14,14 @@ namespace {
 
 namespace coarse = diffvbd::coarse;
 namespace cuda = diffvbd::cuda;
-using cuda::check, cuda::current_stream, cuda::empty, cuda::zeros;
+using cuda::check, cuda::current_stream, cuda::empty;
 using diffvbd::CoarseFields, diffvbd::data, diffvbd::dispatch_float;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
 
-std::tuple<Tensor, Tensor> matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t> sizes, double time_step) {
+// The inverses: a product with one is many small sums at once, where factors are solved row after row.
+Tensor matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t> sizes, double time_step) {
   const CoarseFields f{DIFFVBD_ITEMS(COARSE)};
   const DeviceGuard guard(x_prev.get_device_index());
   return dispatch_float(x_prev, [&](auto scalar) {
@@ -36,7 +37,7 @@ std::tuple<Tensor, Tensor> matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t
         cuda::coarse_inverse<T>(in, {data<double>(turn), data<double>(sums), data<double>(panel), data<double>(block)},
                                 data<T>(inverse), current_stream(x_prev)),
         "the matrices of a coarse space");
-    return std::make_tuple(inverse, inverse);
+    return inverse;
   });
 }
 

@@ -145,7 +145,7 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     diffvbd::set_bars(out, bars, in);
     out.x_bar = data<const T>(x_bar);
     given.coarse.tape = data<T>(corrections);
-    given.coarse.matrix_bar = bars.coarse_matrix.numel() > 0 ? data<T>(bars.coarse_matrix) : nullptr;
+    given.coarse.matrix_bar = bars.coarse_factor.numel() > 0 ? data<T>(bars.coarse_factor) : nullptr;
     const cudaStream_t stream = current_stream(x);
     const auto run = [&] {
       cuda::Choice choice = choose(in, x, q, true, cuda::wishes(out));
