@@ -238,11 +238,7 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
   const coarse::Plan& p = c_.plan;
   const T *a = tape(k), *lengths = a + int64_t{3} * p.functions, *before = lengths + p.bodies;
   if (std::all_of(lengths, lengths + p.bodies, [](T s) { return s == 0; })) return;
-<<<<<<< HEAD
-  T *restricted = rows_.get() + 4 * int64_t{p.functions}, *coarse = coarse_.get();
-=======
   T *q = turn(k), *coarse = coarse_.get();
->>>>>>> pull
   flush(member);
   // u = P' x_bar, q = -s A^-1 u
   member.each(0, p.functions, [&](int64_t begin, int64_t end) {
@@ -297,8 +293,6 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
   member.each(0, plan_.blocks,
               [&](int64_t begin, int64_t end) { kernels_.reverse(plan_, s_, in_.parameters, begin, end); });
   member.barrier();
-<<<<<<< HEAD
-=======
 }
 
 // The adjoint of the matrix: -q a' of all corrections, in one pass over it.
@@ -319,7 +313,6 @@ void CoarseScene<T>::finish(Team::Member& member) {
     }
   });
   member.barrier();
->>>>>>> pull
 }
 
 template class CoarseScene<float>;
