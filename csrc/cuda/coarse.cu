@@ -7,7 +7,8 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int kSumThreads = 128;  // of a function, and of a part of a body
+constexpr int kSumThreads = 128, kManySumThreads = 1024;  // of a function, and of a part of a body
+constexpr int kLongRow = 1024;  // positions of a function on average from which on many threads add it up
 constexpr int kRowThreads = 128;
 constexpr int kMostSmall = 8;  // functions of a body up to which eight threads solve for an unknown, else a warp
 
@@ -27,35 +28,35 @@ struct View {
 };
 
 // Sums over the threads of a block, in a fixed order; the first thread has them.
-template <int n>
+template <int threads, int n>
 __device__ __forceinline__ void block_sum(double (&value)[n]) {
-  __shared__ double part[kSumThreads / 32][n];
+  __shared__ double part[threads / 32][n];
   butterfly<n, 32>(kWholeWarp, value);
   if (threadIdx.x % 32 == 0) {
     for (int k = 0; k < n; ++k) part[threadIdx.x / 32][k] = value[k];
   }
   __syncthreads();
-  for (int w = 1; threadIdx.x == 0 && w < kSumThreads / 32; ++w) {
+  for (int w = 1; threadIdx.x == 0 && w < threads / 32; ++w) {
     for (int k = 0; k < n; ++k) value[k] += part[w][k];
   }
 }
 
 // A block for each function of each scene: what `rows` [positions, 4] are to it. In the reverse times -s of its body,
 // and 0 where the body has not moved.
-template <class T, bool reverse>
-__global__ void __launch_bounds__(kSumThreads)
+template <class T, int threads, bool reverse>
+__global__ void __launch_bounds__(threads)
     restrict_rows(const __grid_constant__ View<T> a, int k, const T* __restrict__ rows) {
   const coarse::Plan& p = a.c.plan;
   const int64_t scene = blockIdx.x / p.functions;
   const int f = static_cast<int>(blockIdx.x - scene * p.functions);
   double sum[3] = {0, 0, 0};
   const T* from = rows + scene * a.s.positions * kRow;
-  for (int e = __ldg(p.row_ptr + f) + static_cast<int>(threadIdx.x); e < __ldg(p.row_ptr + f + 1); e += kSumThreads) {
+  for (int e = __ldg(p.row_ptr + f) + static_cast<int>(threadIdx.x); e < __ldg(p.row_ptr + f + 1); e += threads) {
     const Vec3<T> row = load_row(from, __ldg(p.row + e), true);
     const double weight = __ldg(a.c.row_weight + e);
     sum[0] += weight * row.x, sum[1] += weight * row.y, sum[2] += weight * row.z;
   }
-  block_sum(sum);
+  block_sum<threads>(sum);
   if (threadIdx.x != 0) return;
   T* to = a.w.restricted + (scene * p.functions + f) * 3;
   if (!reverse) {
@@ -139,7 +140,7 @@ __global__ void __launch_bounds__(kSumThreads)
 #pragma unroll
     for (int d = 0; d < coarse::kDegree; ++d) sum[d] += change[d];
   }
-  block_sum(sum);
+  block_sum<kSumThreads>(sum);
   if (threadIdx.x != 0) return;
   for (int d = 0; d < coarse::kDegree; ++d) a.w.sums[(scene * p.parts + part) * coarse::kDegree + d] = sum[d];
 }
@@ -265,22 +266,59 @@ cudaError_t solve(const View<T>& a, int k, cudaStream_t stream) {
   return launch(solve_rows<T, 32, reverse>, unknowns * 32, kRowThreads, stream, a, k);
 }
 
+// P' of the rows in `gradient`.
+template <bool reverse, class T>
+cudaError_t restricted(const View<T>& a, int k, cudaStream_t stream) {
+  const coarse::Plan& p = a.c.plan;
+  const int64_t functions = a.s.scenes * p.functions;
+  const T* rows = a.w.gradient;
+  if (p.entries >= int64_t{kLongRow} * p.functions) {
+    constexpr int threads = kManySumThreads;
+    return launch(restrict_rows<T, threads, reverse>, functions * threads, threads, stream, a, k, rows);
+  }
+  return launch(restrict_rows<T, kSumThreads, reverse>, functions * kSumThreads, kSumThreads, stream, a, k, rows);
+}
+
 }  // namespace
+
+// As the sweeps of a color, for all colors at once.
+template <class T>
+cudaError_t Corrections<T>::gradients(int wanted) const {
+  constexpr int64_t kManyVertices = 16000;  // up to which a warp works on each
+  const bool reverse = wanted != kForward;
+  const int64_t active = host.color_block[host.plan.colors];
+  const int least = s.scenes * active * kSlice > kManyVertices ? kFewLanes : kManyLanes;
+  int lanes = possible_lanes<T>(host, choice, least, reverse);
+  if (lanes == kSomeLanes) lanes = kManyLanes;
+  const bool spills = lanes == kSpillLanes;
+  const size_t of_warp = spills ? 0 : shared_scalars(host.degree, host.valence, lanes, reverse) * sizeof(T);
+  int64_t warps = kWarpsPerBlock;
+  if (of_warp > 0) warps = std::min<int64_t>(warps, choice.shared / of_warp);
+  const size_t shared = of_warp * warps;
+  GradientKernel<T> kernel = gradient_kernel_of<T, kForward>(in.energies, lanes);
+  if (reverse) {
+    kernel = wanted & kRest       ? gradient_kernel_of<T, kMaterial | kRest>(in.energies, lanes)
+             : wanted & kMaterial ? gradient_kernel_of<T, kMaterial>(in.energies, lanes)
+                                  : gradient_kernel_of<T, kState>(in.energies, lanes);
+  }
+  if (shared > 48 * 1024) {
+    const auto attribute = cudaFuncAttributeMaxDynamicSharedMemorySize;
+    if (auto error = cudaFuncSetAttribute(kernel, attribute, static_cast<int>(choice.shared))) return error;
+  }
+  int64_t blocks = (s.scenes * active * threads_of(lanes) + warps - 1) / warps;
+  if (blocks == 0) return cudaSuccess;
+  if (spills) blocks = std::min<int64_t>(blocks, choice.multiprocessors);
+  kernel<<<static_cast<unsigned>(blocks), static_cast<unsigned>(warps * kSlice), shared, stream>>>(s, w);
+  return cudaGetLastError();
+}
 
 template <class T>
 cudaError_t Corrections<T>::correct(int k) const {
   const View<T> a{s, *in.coarse, w};
   const coarse::Plan& p = a.c.plan;
-  if (p.bodies == 0) return cudaSuccess;
-  const int64_t positions = s.scenes * s.positions, active = s.scenes * active_positions;
-  if (auto error = launch(gradient_kernel<T>(in.energies), active, kGradientThreads, stream, s, w)) {
-    return error;
-  }
-  const int64_t functions = s.scenes * p.functions * kSumThreads, parts = s.scenes * p.parts * kSumThreads;
-  if (auto error =
-          launch(restrict_rows<T, false>, functions, kSumThreads, stream, a, k, static_cast<const T*>(w.gradient))) {
-    return error;
-  }
+  const int64_t positions = s.scenes * s.positions, parts = s.scenes * p.parts * kSumThreads;
+  if (auto error = gradients(kForward)) return error;
+  if (auto error = restricted<false>(a, k, stream)) return error;
   if (auto error = solve<false>(a, k, stream)) return error;
   if (auto error = launch(prolong<T>, positions, kRowThreads, stream, a, k)) return error;
   if (auto error = launch(line_of_parts<T>, parts, kSumThreads, stream, a, in)) return error;
@@ -291,18 +329,12 @@ cudaError_t Corrections<T>::correct(int k) const {
 template <class T>
 cudaError_t Corrections<T>::reverse(int k, int wanted) const {
   const View<T> a{s, *in.coarse, w};
-  const coarse::Plan& p = a.c.plan;
-  if (p.bodies == 0) return cudaSuccess;
-  const int64_t positions = s.scenes * s.positions, active = s.scenes * active_positions;
-  if (auto error = launch(sum_adjoints<T>, active, kRowThreads, stream, s, w.gradient)) return error;
-  const int64_t functions = s.scenes * p.functions * kSumThreads;
-  if (auto error =
-          launch(restrict_rows<T, true>, functions, kSumThreads, stream, a, k, static_cast<const T*>(w.gradient))) {
-    return error;
-  }
+  const int64_t positions = s.scenes * s.positions, active = host.color_block[host.plan.colors] * kSlice;
+  if (auto error = launch(sum_adjoints<T>, s.scenes * active, kRowThreads, stream, s, w.gradient)) return error;
+  if (auto error = restricted<true>(a, k, stream)) return error;
   if (auto error = solve<true>(a, k, stream)) return error;
   if (auto error = launch(move_back<T>, positions, kRowThreads, stream, a, k, barrier)) return error;
-  return launch(gradient_reverse_kernel<T>(in.energies, wanted), active, kGradientThreads, stream, s, w);
+  return gradients(wanted);
 }
 
 template <class T>

@@ -21,11 +21,12 @@ struct CoarseWork {
 // The corrections of a step, of the chunk of scenes that a StepView is of.
 template <class T>
 struct Corrections {
+  const HostPlan& host;
+  const Choice& choice;
   const StepView<T>& s;
   const StepInputs<T>& in;
   CoarseWork<T> w;
-  int64_t active_positions;  // of a scene: its vertices that move
-  unsigned* barrier;         // of the next cooperative launch: set to zero
+  unsigned* barrier;  // of the next cooperative launch: set to zero
   cudaStream_t stream;
 
   // The correction of number k: moves s.w.x and records what it did.
@@ -34,16 +35,17 @@ struct Corrections {
   cudaError_t reverse(int k, int wanted) const;
   // After all of them: the adjoint of the matrices.
   cudaError_t matrix_bars() const;
+  // wanted: kForward for the gradient
+  cudaError_t gradients(int wanted) const;
 };
 
 template <class T>
 using GradientKernel = void (*)(StepView<T>, CoarseWork<T>);
-// The gradient of the potential at all vertices, and the adjoint of its product with s.w's `way`.
-template <class T>
-GradientKernel<T> gradient_kernel(int energies);
-template <class T>
-GradientKernel<T> gradient_reverse_kernel(int energies, int wanted);
-constexpr int kGradientThreads = 128;
+// The gradient of the potential at all vertices, into `gradient`; or, where adjoints are wanted, that of its product
+// with `way`.
+constexpr int kForward = -1;
+template <class T, int wanted>
+GradientKernel<T> gradient_kernel_of(int energies, int lanes);
 
 // What the inverses are made in.
 struct MatrixWork {

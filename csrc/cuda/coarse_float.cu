@@ -1,3 +1,7 @@
 #include "coarse_gradient.cuh"
 
-DIFFVBD_INSTANTIATE_GRADIENT(float)
+using namespace diffvbd;
+DIFFVBD_INSTANTIATE_GRADIENT(float, cuda::kForward)
+DIFFVBD_INSTANTIATE_GRADIENT(float, kState)
+DIFFVBD_INSTANTIATE_GRADIENT(float, kMaterial)
+DIFFVBD_INSTANTIATE_GRADIENT(float, kMaterial | kRest)

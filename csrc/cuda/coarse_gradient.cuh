@@ -1,5 +1,5 @@
-// The gradient of the potential at every vertex at once, a thread each, and its transpose. One instantiation for each
-// set of energies without contact.
+// The gradient of the potential at every vertex at once, and its transpose. One instantiation for each set of energies
+// without contact and number of threads per vertex.
 #pragma once
 
 #include <utility>
@@ -10,205 +10,187 @@
 namespace diffvbd::cuda {
 namespace {
 
-// The star of a thread's vertex, which reads its neighbours where they stand.
-template <class T>
-struct ThreadStar {
-  const StepView<T>& s;
+// A star that also has w of the neighbours, where the sums of a reversed sweep would stand.
+template <class T, int lanes>
+struct WayStar : GroupStar<T, lanes> {
+  using Base = GroupStar<T, lanes>;
+  using typename Base::P;
   const T* ways;
-  int64_t scene;
-  int block, v, first, count, first_edge, degree, pinned;
-  T shared_material[kTetScalars];
-  mutable int where;  // of the pair at work
-  mutable T material_bar[kTetScalars] = {};
+  __device__ __forceinline__ WayStar(const StepView<T>& s, const P& at, T* shared) : Base(s, at, shared) {}
 
-  // ways: of all positions, in the reverse
-  __device__ __forceinline__ ThreadStar(const StepView<T>& s, const T* ways, int64_t scene, int block, int v)
-      : s(s), ways(ways + scene * s.positions * kRow), scene(scene), block(block), v(v) {
-    first = __ldg(s.plan.block_slot + block);
-    count = s.has_tets ? __ldg(s.plan.block_slot + block + 1) - first : 0;
-    first_edge = __ldg(s.plan.block_edge + block);
-    degree = __ldg(s.plan.block_edge + block + 1) - first_edge;
-    pinned = __ldg(s.plan.color_block + s.plan.colors) * kSlice;
-    if (!s.one_material) return;
-#pragma unroll
-    for (int m = 0; m < kTetScalars; ++m) shared_material[m] = __ldg(s.material[m].data + scene * s.material[m].scene);
-  }
-
-  __device__ __forceinline__ int size() const { return count; }
-  __device__ __forceinline__ const ThreadStar& local() const { return *this; }
-  __device__ __forceinline__ bool any(bool condition) const { return __any_sync(kWholeWarp, condition); }
-  __device__ __forceinline__ void rewind() const {}
-  template <class... R>
-  __device__ __forceinline__ void total(R&...) const {}
-
-  __device__ __forceinline__ int neighbour(int a) const {
-    return __ldg(s.plan.adjacent + static_cast<int64_t>(first_edge + a) * kSlice + v);
-  }
-  __device__ __forceinline__ Vec3<T> position(int a) const {
-    return load_row(s.w.x + scene * s.positions * kRow, neighbour(a), true);
-  }
-  __device__ __forceinline__ TetPair<T> pair(int e) const {
-    const int64_t base = static_cast<int64_t>(first + e) * kSlice;
-    where = __ldg(s.plan.local + base + v);
-    TetPair<T> out;
-    const T* rest = s.rest.data + scene * s.rest.scene + base * kRestRow;
-    constexpr int width = Pack<T>::size;
-#pragma unroll
-    for (int i = 0; i < kRestRow; i += width) {
-      const Pack<T> part = load_constant(rest + i * kSlice + v * width);
-#pragma unroll
-      for (int k = 0; k < width && i + k < kPairRest; ++k) out.rest[i + k] = part.v[k];
+  __device__ __forceinline__ void fetch_ways(const T* of, T* shared) {
+    T* to = shared + this->s.degree * 3 * P::groups + this->at.group;
+    ways = to;
+    of += this->at.scene * this->s.positions * kRow;
+    for (int a = this->at.lane; a < this->degree; a += Base::lanes) {
+      const int64_t edge = static_cast<int64_t>(this->first_edge + a) * kSlice + this->at.v;
+      const Vec3<T> way = load_row(of, __ldg(this->s.plan.adjacent + edge), true);
+      to[(3 * a) * P::groups] = way.x;
+      to[(3 * a + 1) * P::groups] = way.y;
+      to[(3 * a + 2) * P::groups] = way.z;
     }
-    const T* material = s.w.material + scene * s.material_scene + (base + v) * kTetScalars;
-#pragma unroll
-    for (int m = 0; m < kTetScalars; ++m) out.material[m] = s.one_material ? shared_material[m] : __ldg(material + m);
-    out.xj = position(where & kMaxDegree);
-    out.xk = position(where >> kLocalBits & kMaxDegree);
-    out.xl = position(where >> 2 * kLocalBits);
-    return out;
+    __syncwarp();
   }
   __device__ __forceinline__ PairWay<T> way(int) const {
-    const auto of = [&](int a) { return load_row(ways, neighbour(a), true); };
+    const auto of = [&](int a) {
+      const T* from = ways + a * 3 * P::groups;
+      return Vec3<T>{from[0], from[P::groups], from[2 * P::groups]};
+    };
+    const int where = this->where;
     return {of(where & kMaxDegree), of(where >> kLocalBits & kMaxDegree), of(where >> 2 * kLocalBits)};
   }
-
-  template <int wanted>
-  __device__ static constexpr bool wants(int what) {
-    return (wanted & what) != 0;
-  }
-  __device__ __forceinline__ int64_t pair_index(int e) const { return (scene * s.plan.slots + first + e) * kSlice + v; }
-  __device__ __forceinline__ void add_material(int e, const T* bar) const {
-    if (s.one_material) {
-#pragma unroll
-      for (int i = 0; i < kTetScalars; ++i) material_bar[i] += bar[i];
-    } else {
-      T* to = s.w.material_bar + pair_index(e) * kTetScalars;
-#pragma unroll
-      for (int i = 0; i < kTetScalars; ++i) to[i] += bar[i];
-    }
-  }
-  __device__ __forceinline__ void add_rest(int e, const T* bar) const {
-    T* to = s.w.rest_bar + pair_index(e) * kPairRest;
-#pragma unroll
-    for (int i = 0; i < kPairRest; ++i) to[i] += bar[i];
-  }
+  __device__ __forceinline__ const WayStar& local() const { return *this; }
   template <class Law, int wanted>
   __device__ __forceinline__ Vec3<T> multiply_tets(const Vec3<T>& x, const Vec3<T>& w, const T& minus_h2) const {
-    bool touches = false;
-    for (int a = 0; a < degree; ++a) touches = touches || neighbour(a) >= pinned;
-    if (touches) send_to_pinned<Law>(s, scene, block, v, x, w, minus_h2);
-    return diffvbd::multiply_tets<Law, wanted>(*this, x, w, minus_h2);
-  }
-  // The plan lists no tets of pinned vertices: what reaches them goes by rows, which add up (GroupStar::send_rows). Out
-  // of line with a star of its own, so that this one stays in registers.
-  template <class Law>
-  __device__ __noinline__ static void send_to_pinned(const StepView<T>& s, int64_t scene, int block, int v,
-                                                     const Vec3<T> x, const Vec3<T> w, T minus_h2) {
-    const ThreadStar star(s, s.w.x, scene, block, v);
-    T* rows = s.w.rows + scene * (static_cast<int64_t>(s.plan.edge_slots) * kSlice + 1) * kRow;
-    const auto send = [&](int a, const Vec3<T>& bar) {
-      if (star.neighbour(a) < star.pinned) return;
-      const int64_t edge = static_cast<int64_t>(star.first_edge + a) * kSlice + v;
-      store_row(rows, edge, load_row(rows, edge, true) + bar);
-    };
-    const Vec3<T> p = -w, none = zero3<T>();
-    for (int e = 0; e < star.count; ++e) {
-      const TetPair<T> tet = star.pair(e);
-      const TetAdjoint<T> bar = Law::block_vjp(tet, Law::view(tet, x, none, p), none, p, minus_h2);
-      send(star.where & kMaxDegree, bar.xj);
-      send(star.where >> kLocalBits & kMaxDegree, bar.xk);
-      send(star.where >> 2 * kLocalBits, bar.xl);
-    }
+    Vec3<T> out = diffvbd::multiply_tets<Law, wanted>(*this, x, w, minus_h2);
+    this->total(out);
+    return out;
   }
 };
 
-template <class T, int mask>
-__global__ void __launch_bounds__(kGradientThreads, 4)
-    gradient_of_vertices(const __grid_constant__ StepView<T> s, const __grid_constant__ CoarseWork<T> w) {
-  using Set = EnergySet<mask>;
-  const int64_t active = static_cast<int64_t>(__ldg(s.plan.color_block + s.plan.colors)) * kSlice;
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kGradientThreads + threadIdx.x;
-  if (i >= s.scenes * active) return;  // whole warps
-  const int64_t scene = i / active, position = i - scene * active;
-  Place<1> at(scene, static_cast<int>(position / kSlice), 0);
-  at.v = static_cast<int>(position % kSlice);
-  const ThreadStar<T> star(s, w.way, scene, at.block, at.v);
-  const Block<T> b = load_block<Set>(s, at, true);
-  const System<Set, T> system = assemble<Set>(b, star, s.parameters);
-  store_row(w.gradient, scene * s.positions + position, system.axes.from(system.g));
-}
-
-template <class T, int mask, int wanted>
-__global__ void __launch_bounds__(kGradientThreads, 4)
-    reverse_gradients(const __grid_constant__ StepView<T> s, const __grid_constant__ CoarseWork<T> w) {
-  using Set = EnergySet<mask>;
-  const int64_t active = static_cast<int64_t>(__ldg(s.plan.color_block + s.plan.colors)) * kSlice;
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kGradientThreads + threadIdx.x;
-  if (i >= s.scenes * active) return;
-  const int64_t scene = i / active, position = i - scene * active, row = scene * s.positions + position;
-  if (__ldg(s.plan.order + position) < 0) return;
-  Place<1> at(scene, static_cast<int>(position / kSlice), 0);
-  at.v = static_cast<int>(position % kSlice);
-  const ThreadStar<T> star(s, w.way, scene, at.block, at.v);
-  const Block<T> b = load_block<Set>(s, at, true);
-  const BlockAdjoint<T> out = reverse_gradient<Set, wanted>(
-      b, star, load_row(w.way, row, true), s.parameters, s.w.data_bar != nullptr, [&](int k, int d, const T& value) {
-        s.w.data_bar[(scene * s.data_scalars + s.data_row[k] + d) * s.positions + position] += value;
-      });
-  store_row(s.w.x_bar, row, load_row(s.w.x_bar, row, true) + out.x);
-  const auto add3 = [&](T* bars, const Vec3<T>& add) {
-    T* to = bars + scene * s.positions * 3;
-    store3(to, at.block, at.v, load_own3(to, at.block, at.v) + add);
+// The plan lists no tets of pinned vertices: what reaches them goes by rows, which add up (GroupStar::send_rows). One
+// thread does it for a vertex, out of line, so that the others take no registers for it.
+template <class Law, class T>
+__device__ __noinline__ void send_to_pinned(const StepView<T>& s, int64_t scene, int block, int v, const Vec3<T> x,
+                                            const Vec3<T> w, T minus_h2) {
+  const Place<1> place(scene, block, 0);
+  Place<1> at = place;
+  at.v = v;
+  const int pinned = __ldg(s.plan.color_block + s.plan.colors) * kSlice, first_edge = __ldg(s.plan.block_edge + block);
+  const auto neighbour = [&](int a) { return __ldg(s.plan.adjacent + (int64_t{first_edge} + a) * kSlice + v); };
+  const T* rows_of_x = s.w.x + scene * s.positions * kRow;
+  T* rows = s.w.rows + scene * (static_cast<int64_t>(s.plan.edge_slots) * kSlice + 1) * kRow;
+  const auto send = [&](int a, const Vec3<T>& bar) {
+    if (neighbour(a) < pinned) return;
+    const int64_t edge = (int64_t{first_edge} + a) * kSlice + v;
+    store_row(rows, edge, load_row(rows, edge, true) + bar);
   };
-  add3(s.w.y_bar, out.y);
-  if (s.w.mass_bar) s.w.mass_bar[row] += out.mass;
-  if constexpr (Set::reads_x_prev) add3(s.w.x_prev_bar, out.x_prev);
-  if constexpr ((wanted & kMaterial) != 0) {
-    for (int m = 0; s.one_material && m < kTetScalars; ++m) {
-      s.w.material_bar[row * kTetScalars + m] += star.material_bar[m];
+  const Vec3<T> p = -w, none = zero3<T>();
+  for (int slot = __ldg(s.plan.block_slot + block); slot < __ldg(s.plan.block_slot + block + 1); ++slot) {
+    const int64_t pair = int64_t{slot} * kSlice + v;
+    const int where = __ldg(s.plan.local + pair);
+    const int j = where & kMaxDegree, k = where >> kLocalBits & kMaxDegree, l = where >> 2 * kLocalBits;
+    if (max(max(neighbour(j), neighbour(k)), neighbour(l)) < pinned) continue;
+    TetPair<T> tet;
+    tet.xj = load_row(rows_of_x, neighbour(j), true);
+    tet.xk = load_row(rows_of_x, neighbour(k), true);
+    tet.xl = load_row(rows_of_x, neighbour(l), true);
+    constexpr int width = Pack<T>::size;
+    const T* rest = s.rest.data + scene * s.rest.scene + int64_t{slot} * kSlice * kRestRow;
+    for (int i = 0; i < kPairRest; ++i) {
+      tet.rest[i] = __ldg(rest + i / width * width * kSlice + v * width + i % width);
     }
+    for (int m = 0; m < kTetScalars; ++m) {
+      tet.material[m] = s.one_material ? __ldg(s.material[m].data + scene * s.material[m].scene)
+                                       : __ldg(s.w.material + scene * s.material_scene + pair * kTetScalars + m);
+    }
+    const TetAdjoint<T> bar = Law::block_vjp(tet, Law::view(tet, x, none, p), none, p, minus_h2);
+    send(j, bar.xj);
+    send(k, bar.xk);
+    send(l, bar.xl);
   }
 }
 
-template <class T, int mask>
-constexpr GradientKernel<T> gradient_variant() {
-  if constexpr ((mask & kPaperBlock) == 0) return gradient_of_vertices<T, mask>;
-  return nullptr;
-}
-template <class T, int... n>
-GradientKernel<T> pick_gradient(int index, std::integer_sequence<int, n...>) {
-  static constexpr GradientKernel<T> table[kFreeSets] = {gradient_variant<T, free_mask(n)>()...};
-  return table[index];
+// Calls visit(place) for the warps' share of all vertices that move.
+template <int lanes_, class T, class Visit>
+__device__ __forceinline__ void each_vertex(const StepView<T>& s, const Visit& visit) {
+  constexpr int lanes = threads_of(lanes_);
+  const int64_t parts = int64_t{__ldg(s.plan.color_block + s.plan.colors)} * lanes;
+  const int64_t warps = blockDim.x / kSlice, stride = int64_t{gridDim.x} * warps;
+  for (int64_t i = blockIdx.x * warps + threadIdx.x / kSlice; i < s.scenes * parts; i += stride) {
+    const int64_t scene = i / parts, part = i - scene * parts;
+    visit(Place<lanes_>(scene, static_cast<int>(part / lanes), static_cast<int>(part % lanes)));
+    __syncwarp();
+  }
 }
 
-template <class T, int wanted, int mask>
-constexpr GradientKernel<T> reverse_gradient_variant() {
-  if constexpr ((mask & kPaperBlock) == 0) return reverse_gradients<T, mask, wanted>;
-  return nullptr;
+template <class T, int mask, int lanes>
+__global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 80 : 128)
+    gradient_of_vertices(const __grid_constant__ StepView<T> s, const __grid_constant__ CoarseWork<T> w) {
+  using Set = EnergySet<mask>;
+  T* const shared = memory_of_warp<T, lanes>(s, false);
+  each_vertex<lanes>(s, [&](const Place<lanes>& at) {
+    GroupStar<T, lanes> star(s, at, shared);
+    if (s.has_tets) star.fetch_neighbours(true);
+    const Block<T> b = load_block<Set>(s, at, true);
+    const System<Set, T> system = assemble<Set>(b, star, s.parameters);
+    const int64_t row = at.scene * s.positions + int64_t{at.block} * kSlice + at.v;
+    if (at.lane == 0) store_row(w.gradient, row, system.axes.from(system.g));
+  });
 }
-template <class T, int wanted, int... n>
-GradientKernel<T> pick_reverse_gradient(int index, std::integer_sequence<int, n...>) {
-  static constexpr GradientKernel<T> table[kFreeSets] = {reverse_gradient_variant<T, wanted, free_mask(n)>()...};
+
+template <class T, int mask, int wanted, int lanes>
+__global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 128 : 168)
+    reverse_gradients(const __grid_constant__ StepView<T> s, const __grid_constant__ CoarseWork<T> w) {
+  using Set = EnergySet<mask>;
+  T* const shared = memory_of_warp<T, lanes>(s, true);
+  const int pinned = __ldg(s.plan.color_block + s.plan.colors) * kSlice;
+  each_vertex<lanes>(s, [&](const Place<lanes>& at) {
+    const int64_t position = int64_t{at.block} * kSlice + at.v, row = at.scene * s.positions + position;
+    const bool writes = at.lane == 0 && __ldg(s.plan.order + position) >= 0;
+    WayStar<T, lanes> star(s, at, shared);
+    if (s.has_tets) star.fetch_neighbours(true), star.fetch_ways(w.way, shared);
+    const Block<T> b = load_block<Set>(s, at, true);
+    const Vec3<T> way = load_row(w.way, row, true);
+    const BlockAdjoint<T> out = reverse_gradient<Set, wanted>(
+        b, star, way, s.parameters, s.w.data_bar != nullptr, [&](int k, int d, const T& value) {
+          if (writes) s.w.data_bar[(at.scene * s.data_scalars + s.data_row[k] + d) * s.positions + position] += value;
+        });
+    bool touches = false;
+    for (int a = at.lane; s.has_tets && a < star.degree; a += GroupStar<T, lanes>::lanes) {
+      const int64_t edge = (int64_t{star.first_edge} + a) * kSlice + at.v;
+      touches = touches || __ldg(s.plan.adjacent + edge) >= pinned;
+    }
+    if (star.any(touches) && writes) {
+      const T h = s.parameters.time_step;
+      send_to_pinned<typename Set::Elastic>(s, at.scene, at.block, at.v, b.state.x, way, -(h * h));
+    }
+    if constexpr ((wanted & kMaterial) != 0) {
+      for (int m = 0; s.one_material && m < kTetScalars; ++m) {
+        star.total(star.material_bar[m]);
+        if (writes) s.w.material_bar[row * kTetScalars + m] += star.material_bar[m];
+      }
+    }
+    if (!writes) return;
+    const auto add3 = [&](T* bars, const Vec3<T>& add) {
+      T* to = bars + at.scene * s.positions * 3;
+      store3(to, at.block, at.v, load_own3(to, at.block, at.v) + add);
+    };
+    store_row(s.w.x_bar, row, load_row(s.w.x_bar, row, true) + out.x);
+    add3(s.w.y_bar, out.y);
+    if (s.w.mass_bar) s.w.mass_bar[row] += out.mass;
+    if constexpr (Set::reads_x_prev) add3(s.w.x_prev_bar, out.x_prev);
+  });
+}
+
+template <class T, int wanted, int lanes, int mask>
+constexpr GradientKernel<T> gradient_variant() {
+  if constexpr ((mask & kPaperBlock) != 0) {
+    return nullptr;
+  } else if constexpr (wanted < 0) {
+    return gradient_of_vertices<T, mask, lanes>;
+  } else {
+    return reverse_gradients<T, mask, wanted, lanes>;
+  }
+}
+template <class T, int wanted, int lanes, int... n>
+GradientKernel<T> pick_gradient(int index, std::integer_sequence<int, n...>) {
+  static constexpr GradientKernel<T> table[kFreeSets] = {gradient_variant<T, wanted, lanes, free_mask(n)>()...};
   return table[index];
 }
 
 }  // namespace
 
-template <class T>
-GradientKernel<T> gradient_reverse_kernel(int energies, int wanted) {
+template <class T, int wanted>
+GradientKernel<T> gradient_kernel_of(int energies, int lanes) {
   constexpr auto sets = std::make_integer_sequence<int, kFreeSets>{};
   const int index = free_index(energies);
-  if (wanted & kRest) return pick_reverse_gradient<T, kMaterial | kRest>(index, sets);
-  if (wanted & kMaterial) return pick_reverse_gradient<T, kMaterial>(index, sets);
-  return pick_reverse_gradient<T, kState>(index, sets);
-}
-template <class T>
-GradientKernel<T> gradient_kernel(int energies) {
-  return pick_gradient<T>(free_index(energies), std::make_integer_sequence<int, kFreeSets>{});
+  if (lanes == kFewLanes) return pick_gradient<T, wanted, kFewLanes>(index, sets);
+  if (lanes == kSpillLanes) return pick_gradient<T, wanted, kSpillLanes>(index, sets);
+  return pick_gradient<T, wanted, kManyLanes>(index, sets);
 }
 
 }  // namespace diffvbd::cuda
 
-#define DIFFVBD_INSTANTIATE_GRADIENT(T)                                             \
-  template diffvbd::cuda::GradientKernel<T> diffvbd::cuda::gradient_kernel<T>(int); \
-  template diffvbd::cuda::GradientKernel<T> diffvbd::cuda::gradient_reverse_kernel<T>(int, int);
+#define DIFFVBD_INSTANTIATE_GRADIENT(T, wanted) \
+  template diffvbd::cuda::GradientKernel<T> diffvbd::cuda::gradient_kernel_of<T, (wanted)>(int, int);

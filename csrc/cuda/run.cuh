@@ -11,19 +11,7 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int kWarpsPerBlock = 4;  // of the grid and color regimes
 constexpr size_t kBarrierBytes = 256;
-// Threads per vertex: those chosen, or so many more that shared memory holds the stars of several warps.
-template <class T>
-int possible_lanes(const HostPlan& host, const Choice& choice, bool reverse) {
-  constexpr size_t warps = 6;  // fewer leave a multiprocessor waiting for memory
-  const auto needed = [&](int lanes) { return shared_scalars(host.degree, host.valence, lanes, reverse) * sizeof(T); };
-  for (const int lanes : {kFewLanes, kSomeLanes, kManyLanes}) {
-    if (lanes >= choice.lanes && needed(lanes) * warps <= choice.shared) return lanes;
-  }
-  return needed(kManyLanes) <= choice.shared ? kManyLanes : kSpillLanes;
-}
-
 // Hands out the parts of a workspace; without one it only counts.
 template <class T>
 struct Carver {
@@ -85,7 +73,7 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   w.turn = take(reverse && in.contact, n * 6 * positions);
   w.position = reinterpret_cast<int32_t*>(take(in.contact != nullptr, plan.num_vertices));
   *spill = nullptr;
-  if (possible_lanes<T>(host, choice, reverse) == kSpillLanes) {
+  if (possible_lanes<T>(host, choice, choice.lanes, reverse) == kSpillLanes) {
     const int64_t warps = int64_t{choice.multiprocessors} * kWarpsPerBlock;
     *spill = take(true, warps * shared_scalars(host.degree, host.valence, kSpillLanes, reverse));
   }
@@ -228,8 +216,7 @@ struct Runner {
   template <class Run>
   cudaError_t corrected(const Run& run, bool backward) {
     const coarse::Inputs<T>& c = *in.coarse;
-    const int64_t active = host.color_block[host.plan.colors] * kSlice;
-    const Corrections<T> corrections{s, in, coarse, active, barrier, stream};
+    const Corrections<T> corrections{host, choice, s, in, coarse, barrier, stream};
     int done = 0, number = backward ? c.corrections : 0;
     for (int i = 0; i <= in.sweeps; ++i) {
       const int sweep = backward ? in.sweeps - i : i;
@@ -344,7 +331,7 @@ cudaError_t run_forward(const HostPlan& host, const StepInputs<T>& in, const Ste
     return run_scene_forward(host, in, out, choice, static_cast<uint8_t*>(workspace), stream);
   Runner<T> run(host, in, nullptr, choice, workspace, stream);
   run.s.cut = out.cut;
-  const int lanes = possible_lanes<T>(host, choice, false);
+  const int lanes = possible_lanes<T>(host, choice, choice.lanes, false);
   for (int64_t base = 0; base < in.scenes; base += choice.chunk) {
     run.choose(base, std::min(choice.chunk, in.scenes - base), out.tape);
     if (auto error = run.load(base, nullptr, nullptr, nullptr)) return error;
@@ -363,7 +350,7 @@ cudaError_t run_reverse(const HostPlan& host, const StepInputs<T>& in, const T* 
     return run_scene_reverse(host, in, ends, tape, out, choice, static_cast<uint8_t*>(workspace), stream);
   }
   Runner<T> run(host, in, &out, choice, workspace, stream);
-  const int lanes = possible_lanes<T>(host, choice, true);
+  const int lanes = possible_lanes<T>(host, choice, choice.lanes, true);
   for (int64_t base = 0; base < in.scenes; base += choice.chunk) {
     run.choose(base, std::min(choice.chunk, in.scenes - base), const_cast<T*>(tape));
     if (auto error = cudaMemsetAsync(run.first, 0, run.zeroed * sizeof(T), stream)) return error;

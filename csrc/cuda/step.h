@@ -156,6 +156,18 @@ struct Choice {
   size_t shared;  // bytes of shared memory that a block can have
 };
 
+constexpr int kWarpsPerBlock = 4;  // of the grid and color regimes
+// Threads per vertex: so many, or so many more that shared memory holds the stars of several warps.
+template <class T>
+int possible_lanes(const HostPlan& host, const Choice& choice, int least, bool reverse) {
+  constexpr size_t warps = 6;  // fewer leave a multiprocessor waiting for memory
+  const auto needed = [&](int lanes) { return shared_scalars(host.degree, host.valence, lanes, reverse) * sizeof(T); };
+  for (const int lanes : {kFewLanes, kSomeLanes, kManyLanes}) {
+    if (lanes >= least && needed(lanes) * warps <= choice.shared) return lanes;
+  }
+  return needed(kManyLanes) <= choice.shared ? kManyLanes : kSpillLanes;
+}
+
 template <class T>
 size_t workspace_bytes(const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints,
                        const Choice& choice);
