@@ -71,17 +71,17 @@ Values elastic_vjp(const Values& in) {
 }
 
 // the gradient by x_i without h^2; inputs as above
+template <bool exact, class R>
+Vec3<R> gradient_of(const R* a) {
+  Vec3<R> g = zero3<R>();
+  R h_diagonal(0);
+  Sym3<R> H = diagonal(R(0));
+  StableNeoHookean<exact>::block(pair_of(a), vec(a), g, h_diagonal, H);
+  return g;
+}
 Values elastic_gradient(const Values& a, bool exact) {
-  Vec3<double> g = zero3<double>();
-  double h_diagonal = 0;
-  Sym3<double> H = diagonal(0.0);
-  if (exact) {
-    StableNeoHookean<true>::block(pair_of(a.data()), vec(&a[0]), g, h_diagonal, H);
-  } else {
-    StableNeoHookean<false>::block(pair_of(a.data()), vec(&a[0]), g, h_diagonal, H);
-  }
   Values out;
-  put(out, g);
+  put(out, exact ? gradient_of<true>(a.data()) : gradient_of<false>(a.data()));
   return out;
 }
 
@@ -105,27 +105,23 @@ Values elastic_dual(const Values& in) {
   return out;
 }
 
-// The derivative of the gradient without h^2 along w; inputs as above, with w of xi xj xk xl (12) in place of d_raw ...
+// the derivative of the gradient without h^2 along w; inputs as above, with the corners' w (12) for d_raw, p, h^2
 template <bool exact, class R>
 Values elastic_product(const Values& in) {
   using Law = StableNeoHookean<exact>;
   const std::vector<R> a = cast<R>(in);
   const TetPair<R> e = pair_of(a.data());
-  const auto view = Law::view(e, vec(&a[0]), zero3<R>(), vec(&a[18]));
   Values out;
-  put(out, Law::product(e, view, vec(&a[18]), vec(&a[21]), vec(&a[24]), vec(&a[27])));
+  put(out, Law::product(e, Law::view(e, vec(&a[0]), zero3<R>(), zero3<R>()), vec(&a[18]), vec(&a[21]), vec(&a[24]),
+                        vec(&a[27])));
   return out;
 }
-template <bool exact>
 Values elastic_product_dual(const Values& in) {
   using D = Dual<Long>;
   std::vector<D> a;
   for (const Long v : cast<Long>(in)) a.emplace_back(v);
   for (int i = 0; i < 12; ++i) a[i].derivative = a[18 + i].value;
-  Vec3<D> g = zero3<D>();
-  D h_diagonal(0);
-  Sym3<D> H = diagonal(D(0));
-  StableNeoHookean<exact>::block(pair_of(a.data()), vec(&a[0]), g, h_diagonal, H);
+  const Vec3<D> g = gradient_of<true>(a.data());
   Values out;
   put(out, Vec3<Long>{g.x.derivative, g.y.derivative, g.z.derivative});
   return out;
@@ -363,9 +359,7 @@ PYBIND11_MODULE(headers, m) {
     if (extended) return exact ? elastic_product<true, Long>(a) : elastic_product<false, Long>(a);
     return exact ? elastic_product<true, double>(a) : elastic_product<false, double>(a);
   });
-  m.def("elastic_product_dual", [](const Values& a, bool exact) {
-    return exact ? elastic_product_dual<true>(a) : elastic_product_dual<false>(a);
-  });
+  m.def("elastic_product_dual", &elastic_product_dual);
   m.def("energy_gradient", &energy_gradient);
   m.def("energy_hessian", &energy_hessian);
   m.def("rest_stiffness", &rest_stiffness);
