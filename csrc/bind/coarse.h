@@ -28,6 +28,7 @@ coarse::Inputs<T> coarse_inputs(const SweepFields& f, const Tensor& x, const Set
                                 int64_t positions) {
   require((given.energies & (kContact | kPaperBlock)) == 0 && !given.parameters.saturates,
           "diffvbd::sweep: coarse corrections take no contact, no paper block and no saturation");
+  require(kPrevScalars == 0, "diffvbd::sweep: coarse corrections take no law that reads where a step began");
   coarse::Inputs<T> in{};
   in.plan = coarse_plan(f.coarse_plan, x, q.coarse);
   const coarse::Plan& p = in.plan;

@@ -144,8 +144,28 @@ __device__ __forceinline__ void invert_tile(double (&tile)[kEdge][kEdge + 1], in
   for (int r = 0; r < kEdge; ++r) tile[r][c] = column[r];
 }
 
+// A warp for each body: minus the inverse of its pivot tile.
+template <class T>
+__global__ void __launch_bounds__(kEdge)
+    invert_pivots(const __grid_constant__ MatrixInputs<T> in, const __grid_constant__ MatrixWork work, int bodies,
+                  int first_body, int pivot) {
+  __shared__ double own[kEdge][kEdge + 1];
+  const int64_t scene = blockIdx.x / bodies;
+  const Swept a(in, work, scene, first_body + static_cast<int>(blockIdx.x - scene * bodies));
+  const int begin = pivot * kEdge, size = min(kEdge, a.n - begin), c = threadIdx.x;
+  if (size <= 0) return;
+  for (int r = 0; r < kEdge; ++r) {
+    const bool inside = r < size && c < size;
+    own[r][c] = inside ? a.matrix[int64_t{begin + r} * a.n + begin + c] : double(r == c);
+  }
+  __syncwarp();
+  invert_tile(own, c);
+  __syncwarp();
+  for (int r = 0; r < kEdge; ++r) a.block[r * kEdge + c] = own[r][c];
+}
+
 // A block of kEdge x kEdgeRows threads for each tile of rows: its columns of the pivot tile, and these times the
-// inverse of the pivot tile, which every block finds for itself.
+// inverse of that.
 template <class T>
 __global__ void __launch_bounds__(kEdge* kEdgeRows)
     sweep_panel(const __grid_constant__ MatrixInputs<T> in, const __grid_constant__ MatrixWork work, int bodies,
@@ -157,12 +177,9 @@ __global__ void __launch_bounds__(kEdge* kEdgeRows)
   if (size <= 0 || mine >= a.n) return;
   const int c = threadIdx.x, first = threadIdx.y;
   for (int r = first; r < kEdge; r += kEdgeRows) {
-    const bool inside = r < size && c < size;
-    own[r][c] = inside ? a.matrix[int64_t{begin + r} * a.n + begin + c] : double(r == c);
+    own[r][c] = a.block[r * kEdge + c];
     tile[r][c] = mine + r < a.n && c < size ? a.matrix[int64_t{mine + r} * a.n + begin + c] : 0;
   }
-  __syncthreads();
-  if (first == 0) invert_tile(own, c);
   __syncthreads();
   double sum[kEdge / kEdgeRows] = {};
   for (int k = 0; k < kEdge; ++k) {
@@ -176,7 +193,6 @@ __global__ void __launch_bounds__(kEdge* kEdgeRows)
       a.columns[int64_t{mine + r} * kEdge + c] = tile[r][c];
       a.panel[int64_t{mine + r} * kEdge + c] = c < size ? sum[u] : 0;
     }
-    if (mine == begin) a.block[r * kEdge + c] = own[r][c];
   }
 }
 
@@ -338,6 +354,7 @@ void invert(const MatrixInputs<T>& in, const MatrixWork& work, int first, int co
   const auto items = static_cast<unsigned>(in.scenes * count);
   const dim3 threads(kEdge, kEdgeRows);
   for (int pivot = 0; count > 0 && pivot < tiles; ++pivot) {
+    invert_pivots<<<items, kEdge, 0, stream>>>(in, work, count, first, pivot);
     sweep_panel<<<dim3(items, tiles), threads, 0, stream>>>(in, work, count, first, pivot);
     sweep_tiles<<<dim3(items, tiles * (tiles + 1) / 2), threads, 0, stream>>>(in, work, count, first, pivot, inverse);
   }
