@@ -4,10 +4,20 @@
 #include <cmath>
 #include <limits>
 
-#include "../coarse/length.h"
-#include "../rigid/body.h"
+#include "../coarse/line.h"
 
 namespace diffvbd {
+
+namespace {
+// One member of a team sums for a body, in the order of its items.
+struct Member {
+  template <int n, class F>
+  void sum(int32_t count, double (&out)[n], const F& f) const {
+    std::fill(out, out + n, 0.0);
+    for (int32_t i = 0; i < count; ++i) f(i, out);
+  }
+};
+}  // namespace
 
 template <class T>
 CoarseScene<T>::CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t scene, SceneView<T>& s)
@@ -133,78 +143,8 @@ void CoarseScene<T>::decide(int32_t body, T* a, T* length) {
 
 template <class T>
 T CoarseScene<T>::length_of(int32_t body, const T* a) const {
-  const coarse::Plan& p = c_.plan;
-  const int32_t first = p.function_ptr[body], count = p.function_ptr[body + 1] - first;
-  const T* restricted = rows_.get() + 4 * int64_t{p.functions};
-  double slope = 0, inertial = 0;  // the second: a . (P' M P) a
-  for (int64_t i = 3 * first; i < 3 * (first + count); ++i) slope -= double(a[i]) * double(restricted[i]);
-  const T* mass = c_.mass.data + scene_ * c_.mass.scene + p.mass_ptr[body];
-  for (int i = 0; i < count; ++i) {
-    for (int j = 0; j < count; ++j) {
-      const T *x = a + 3 * (first + i), *y = a + 3 * (first + j);
-      inertial += double(mass[i * count + j]) * (double(x[0]) * y[0] + double(x[1]) * y[1] + double(x[2]) * y[2]);
-    }
-  }
-  coarse::Change change{};
-  const double h2 = double(in_.parameters.time_step) * double(in_.parameters.time_step);
-  for (int64_t part = p.part_ptr[body]; part < p.part_ptr[body + 1]; ++part) {
-    const double* sum = sums_.get() + part * coarse::kDegree;
-    for (int i = 0; i < coarse::kDegree; ++i) change.c[i] += h2 * sum[i];
-  }
-  change.c[1] += 0.5 * inertial;
-  const bool others = std::any_of(in_.data_count, in_.data_count + kVertexEnergies, [](int n) { return n > 0; });
-  change.c[0] = others ? change.c[0] + inertia(body) : slope;
-  return T(coarse::length<T>(change, slope,
-                             [&](double at, double& size) { return others ? energies(body, at, size) : 0.0; }));
-}
-
-// Slope of the inertial part of the potential.
-template <class T>
-double CoarseScene<T>::inertia(int32_t body) const {
-  const coarse::Plan& p = c_.plan;
-  double sum = 0;
-  for (int32_t i = p.list_ptr[body]; i < p.list_ptr[body + 1]; ++i) {
-    const int64_t v = p.list[i], at = 4 * int64_t{p.list_position[i]};
-    const T *y = in_.y.data + scene_ * in_.y.scene + 3 * v, mass = in_.mass.data[scene_ * in_.mass.scene + v];
-    for (int c = 0; c < 3; ++c) sum += double(mass) * (double(s_.x[at + c]) - y[c]) * s_.way[at + c];
-  }
-  return sum;
-}
-
-// By how much the energies of single vertices rise, and infinity where one of them does not admit the motion.
-template <class T>
-double CoarseScene<T>::energies(int32_t body, double s, double& size) const {
-  const coarse::Plan& p = c_.plan;
-  double rise = 0;
-  bool admitted = true;
-  for (int32_t i = p.list_ptr[body]; i < p.list_ptr[body + 1]; ++i) {
-    const int64_t v = p.list[i], at = 4 * int64_t{p.list_position[i]};
-    const auto vector = [](const T* a) { return rigid::Vector{double(a[0]), double(a[1]), double(a[2])}; };
-    const rigid::Vector x = vector(s_.x + at), moved = x + s * vector(s_.way + at);
-    VertexState<double> state{
-        x, vector(in_.x_prev.data + scene_ * in_.x_prev.scene + 3 * v), {}, double(in_.parameters.time_step)};
-    if (in_.origin.data) state.origin = vector(in_.origin.data + scene_ * in_.origin.scene + 3 * v);
-    rigid::each_energy(
-        [&](auto energy, int k) {
-          using E = decltype(energy);
-          const int count = in_.data_count[k];
-          if (count == 0) return;
-          const T* own = s_.data + s_.data_start[k] + (E::per_vertex ? v * count : 0);
-          double data[kMaxEnergyData];
-          for (int d = 0; d < count; ++d) data[d] = own[d];
-          VertexState<double> there = state;
-          there.x = moved;
-          if constexpr (E::has_filter) {
-            if (!E::template admits<T>(there, x, data, count, rigid::kLeastShare)) admitted = false;
-          }
-          const double before = E::value(state, data, count), after = E::value(there, data, count);
-          rise += after - before;
-          size += std::abs(before) + std::abs(after);
-        },
-        VertexEnergies{});
-    if (!admitted) return std::numeric_limits<double>::infinity();
-  }
-  return rise;
+  const coarse::Line<T, StepInputs<T>> line{in_, c_, s_.data_start, scene_, body, s_.x, s_.way};
+  return T(coarse::decide(line, a, rows_.get() + 4 * int64_t{c_.plan.functions}, sums_.get(), Member{}));
 }
 
 // Takes into x_bar what the updates of lower colors have added since a vertex's last turn, and clears these rows, which

@@ -31,8 +31,6 @@ class CoarseScene {
   int32_t body_of(int64_t function) const;
   void decide(int32_t body, T* a, T* length);
   T length_of(int32_t body, const T* a) const;
-  double energies(int32_t body, double s, double& size) const;
-  double inertia(int32_t body) const;
   void flush(Team::Member& member);
 
   const Plan& plan_;

@@ -123,6 +123,11 @@ torch.manual_seed(0)
 mesh = dv.TetMesh(*structured((2, 1, 1), (0.2, 0.1, 0.1)))
 model = dv.Model(mesh, pinned=[0, 1], density=1000.0).to(device)
 n, t = mesh.num_vertices, len(mesh.tets)
+try:
+    dv.Model(mesh, coarse="auto")
+    raise AssertionError
+except ValueError as error:
+    assert "reads where a step began" in str(error), error
 f64 = {"dtype": torch.float64, "device": device}
 h, viscosity = 0.01, 0.5
 x = model.rest_points + 0.01 * torch.randn(2, n, 3, **f64)
