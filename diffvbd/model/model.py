@@ -59,7 +59,7 @@ class Model:
             (x + h v, right for stiff pinned bodies that few sweeps hardly move) or ``"auto"``: for each body and step
             the one of lower incremental potential; beside pairs and friction the predictor, with coarse x + h v.
         coarse: Corrections between the sweeps, for what is stiff, long, thin or finely meshed: None, a
-            :class:`diffvbd.CoarseSpace`, or ``"auto"``, which is ``CoarseSpace()``. CPU only.
+            :class:`diffvbd.CoarseSpace`, or ``"auto"``, which is ``CoarseSpace()``.
         colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier among the
             energies.
         dtype: torch.float64 or torch.float32.

@@ -35,8 +35,10 @@ def fresh_compiler() -> None:
     torch._dynamo.reset()
 
 
-def compiled_gradients(device: str, backend: str, names: tuple[str, ...], plain: bool) -> None:
-    model = small_model(device, energies=(dv.StableNeoHookean(),)) if plain else small_model(device)
+def compiled_gradients(device: str, backend: str, names: tuple[str, ...], plain: bool, **options: Any) -> None:
+    if plain:
+        options["energies"] = (dv.StableNeoHookean(),)
+    model = small_model(device, **options)
     arguments = {k: t for k, t in small_inputs(model).items() if k in names}
     expected = gradients(model, arguments)
     run = torch.compile(lambda a: loss(model, a), fullgraph=True, backend=backend)
@@ -53,6 +55,10 @@ def test_compile_of_a_plain_step(device: str, fresh_compiler: None) -> None:
 
 def test_compile_of_a_step_with_every_argument(device: str, fresh_compiler: None) -> None:
     compiled_gradients(device, "aot_eager", ARGUMENTS, plain=False)
+
+
+def test_compile_of_a_step_with_coarse_corrections(device: str, fresh_compiler: None) -> None:
+    compiled_gradients(device, "aot_eager", ARGUMENTS, plain=False, coarse=dv.CoarseSpace(functions=4, groups=1))
 
 
 @pytest.mark.slow
@@ -211,16 +217,16 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
     if policy != ops.NO_TAPE:
         bars = (torch.ones_like(x), x, tape, corrections)
         arguments["sweep_backward"] = (*fields, *bars, model._plan, *settings, policy, [True] * 5)
-        arguments |= coarse_arguments() if device == "cpu" else {}
+        arguments |= coarse_arguments(device)
     return arguments | (fused_arguments(policy) if device == "cuda" else {})
 
 
-def coarse_arguments() -> dict[str, tuple[Any, ...]]:
-    """The same of the matrix of a coarse space, which only the CPU has."""
+def coarse_arguments(device: str) -> dict[str, tuple[Any, ...]]:
+    """The same of the matrix of a coarse space."""
     mesh = dv.mesh.cube(4, size=0.3)
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, coarse=dv.CoarseSpace(functions=8))
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, coarse=dv.CoarseSpace(functions=8), device=device)
     plan, x = model._coarse_plan, model.rest_points[None].contiguous()
-    moduli = torch.full((1, 1), 1e4, dtype=x.dtype)
+    moduli = torch.full((1, 1), 1e4, dtype=x.dtype, device=device)
     parts = coarse_parts(model, moduli, moduli, None, None, None)
     given = (x, parts.stiffness, parts.mass, plan.plan, plan.moments, plan.volume)
     last = (plan.sizes, 0.3)
