@@ -19,7 +19,15 @@ struct StiffnessInputs {
 };
 
 // Sums are double whatever T is: a body may have thousands of tets that nearly cancel.
-using Four = double __attribute__((vector_size(32)));  // three components and one to spare
+struct Four {  // three components and one to spare
+  double v[4];
+  double& operator[](int i) { return v[i]; }
+  double operator[](int i) const { return v[i]; }
+};
+inline void add(Four& to, double scale, const Four& a) {
+  for (int i = 0; i < 4; ++i) to.v[i] += scale * a.v[i];
+}
+inline Four times(double scale, const Four& a) { return {scale * a[0], scale * a[1], scale * a[2], 0}; }
 inline double dot(const Four& a, const Four& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 struct Rows {
   Four row[3];
@@ -48,7 +56,8 @@ class Slopes {
     for (int i = 0; i < size(); ++i) at_[place_[i]] = i, slope_[i] = Four{};
     const T* g = in_.gradient.data + scene * in_.gradient.scene + 12 * tet_;
     each([&](int a, int place, double w) {
-      slope_[at_[place]] += w * Four{double(g[3 * a]), double(g[3 * a + 1]), double(g[3 * a + 2]), 0};
+      Four& to = slope_[at_[place]];
+      for (int c = 0; c < 3; ++c) to[c] += w * g[3 * a + c];
     });
     volume = of(in_.volume, scene), mu = of(in_.mu, scene), lam = of(in_.lam, scene);
     for (const int place : place_) at_[place] = -1;
@@ -92,11 +101,13 @@ void stiffness(const StiffnessInputs<T>& in, int64_t scene, int group, T* out) {
   for (int32_t k = 0; k < p.tet_ptr[group + 1] - p.tet_ptr[group]; ++k) {
     s.find(scene, p.group_body[group], group, k);
     for (int i = 0; i < s.size(); ++i) {
-      const Four shear = s.volume * s.mu * s[i], bulk = s.volume * s.lam * s[i];
+      const Four shear = times(s.volume * s.mu, s[i]), bulk = times(s.volume * s.lam, s[i]);
       for (int j = i; j < s.size(); ++j) {
         Rows& to = sum[s.place(i) * width + s.place(j)];
         const Four b = s[j];
-        for (int r = 0; r < 3; ++r) to.row[r] += b[r] * shear + bulk[r] * b;
+        for (int r = 0; r < 3; ++r) {
+          for (int c = 0; c < 4; ++c) to.row[r][c] += b[r] * shear[c] + bulk[r] * b[c];
+        }
         to.row[0][3] += dot(shear, b);
       }
     }
@@ -131,6 +142,7 @@ void stiffness_vjp(const StiffnessInputs<T>& in, int64_t scene, int group, const
         }
         to.row[r][3] = 0;
       }
+      to.row[0][3] = to.row[0][0] + to.row[1][1] + to.row[2][2];
     }
   }
   Slopes<T> s(in);
@@ -143,17 +155,18 @@ void stiffness_vjp(const StiffnessInputs<T>& in, int64_t scene, int group, const
       for (int j = 0; j < s.size(); ++j) {
         const Four b = s[j];
         const Rows &own = both[s.place(i) * width + s.place(j)], &other = both[s.place(j) * width + s.place(i)];
-        shear += (own.row[0][0] + own.row[1][1] + own.row[2][2]) * b;
-        for (int r = 0; r < 3; ++r) shear += b[r] * own.row[r], bulk += b[r] * other.row[r];
+        add(shear, own.row[0][3], b);
+        for (int r = 0; r < 3; ++r) add(shear, b[r], own.row[r]), add(bulk, b[r], other.row[r]);
       }
       shear_sum += 0.5 * dot(shear, s[i]), bulk_sum += 0.5 * dot(bulk, s[i]);
-      slope_bar[s.place(i)] = s.volume * (s.mu * shear + s.lam * bulk);
+      slope_bar[s.place(i)] = times(s.volume * s.mu, shear);
+      add(slope_bar[s.place(i)], s.volume * s.lam, bulk);
     }
     mu_bar[s.tet()] = T(s.volume * shear_sum), lam_bar[s.tet()] = T(s.volume * bulk_sum);
     if (!gradient_bar) continue;
     volume_bar[s.tet()] = T(s.mu * shear_sum + s.lam * bulk_sum);
     Four of_corner[4]{};
-    s.each([&](int a, int place, double w) { of_corner[a] += w * slope_bar[place]; });
+    s.each([&](int a, int place, double w) { add(of_corner[a], w, slope_bar[place]); });
     for (int a = 0; a < 4; ++a) {
       for (int c = 0; c < 3; ++c) gradient_bar[12 * s.tet() + 3 * a + c] = T(of_corner[a][c]);
     }

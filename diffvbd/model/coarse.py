@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+import torch
 
 from .. import ops
 from ..checks import check_count
@@ -24,8 +25,8 @@ PER_FUNCTION_SHEET = 18
 PER_GROUP = 4
 SHEET = 0.125  # a body is a sheet if its thickness is below this share of its second extent
 GRID = 8  # functions from which on they are splines; fewer are affine
-ZERO = 1e-14  # a function that is no more than this at a vertex is 0 there but for rounding
-EQUAL = 1e-9  # share by which such distances differ from rounding alone
+ZERO = 1e-12  # a function that is no more than this at a vertex is 0 there but for rounding
+EQUAL = 1e-9  # share by which lengths and distances differ from rounding alone
 DEPENDENT = 1e-6  # squared distance of a normalised function from the span of others, below which it is left out
 _AT_ONCE = 2**24  # scalars of a batch of bodies
 PACK = ops.LANES["cpu"]  # a body's matrix has 1, 2, 4 or a multiple of as many functions
@@ -125,9 +126,10 @@ def build_coarse(points: np.ndarray, tets: np.ndarray, pinned: np.ndarray, label
     number = np.minimum(number, of_tet.number)
     group_body = np.repeat(np.arange(len(listed)), number[listed])
     first = np.cumsum(number[listed]) - number[listed]
-    tet_group = np.full(len(tets), -1)
+    tet_group, axes = np.full(len(tets), -1), points.T.copy()
     for which, members in _alike(of_tet, listed, _AT_ONCE // 16, number):
-        centers = points[tets[members]].mean(2)
+        corners = [axis[tets[members]] for axis in axes]
+        centers = np.stack([(c[..., 0] + c[..., 1] + c[..., 2] + c[..., 3]) / 4 for c in corners], 1)
         tet_group[members] = first[rank[which]][:, None] + _groups(centers, int(number[which[0]]))
     groups = _functions_of_groups(tets, tet_group, len(group_body), vertex, function, len(points))
     return CoarseGeometry(function_ptr, vertex, function, weight, tet_group, group_body, groups, filling)
@@ -229,7 +231,7 @@ def _cells(extent: np.ndarray, degree: np.ndarray, target: np.ndarray) -> np.nda
     allowed = cells >= 1
     for k in range(3):
         edge = np.where(allowed, edges[..., k], np.inf)
-        allowed &= edge <= edge.min(1, keepdims=True)
+        allowed &= edge <= (1 + EQUAL) * edge.min(1, keepdims=True)
     best = np.argmax(allowed, axis=1)
     return np.stack((first[best], second[best], cells[np.arange(len(best)), best]), 1)
 
@@ -251,7 +253,8 @@ def _splines(at: np.ndarray, cells: int, degree: int) -> np.ndarray:
 
 def _independent(functions: np.ndarray) -> np.ndarray:
     """Columns of [n, V, f] that are no combination of others, by Cholesky's method with pivots: bool [n, f]."""
-    gram = functions.swapaxes(1, 2) @ functions
+    stack = torch.from_numpy(functions)
+    gram = (stack.mT @ stack).numpy()  # numpy takes ten times as long
     norm = np.sqrt(np.einsum("nii->ni", gram))
     some = norm > 1e-9 * np.maximum(norm.max(1, keepdims=True, initial=0.0), 1e-300)
     norm = np.where(some, norm, 1.0)
@@ -274,18 +277,17 @@ def _independent(functions: np.ndarray) -> np.ndarray:
 
 
 def _groups(centers: np.ndarray, count: int) -> np.ndarray:
-    """Cuts clouds [n, T, 3] into ``count`` parts of nearly equal size, each time across their longest side: [n, T]."""
-    out = np.zeros(centers.shape[:2], dtype=np.int64)
-    body = np.arange(len(centers))[:, None]
-    parts = [(np.broadcast_to(np.arange(centers.shape[1]), out.shape), count, 0)]
+    """Cuts clouds [n, 3, T] into ``count`` parts of nearly equal size, each time across their longest side: [n, T]."""
+    out = np.zeros(centers[:, 0].shape, dtype=np.int64)
+    body = np.arange(len(centers))
+    parts = [(np.broadcast_to(np.arange(out.shape[1]), out.shape), count, 0)]
     while parts:
         members, number, first = parts.pop()
         if number == 1:
-            out[body, members] = first
+            out[body[:, None], members] = first
             continue
-        cloud = centers[body, members]
-        axis = np.argmax(np.ptp(cloud, axis=1), axis=1)
-        along = np.take_along_axis(cloud, axis[:, None, None], 2)[..., 0]
+        cloud = np.take_along_axis(centers, members[:, None], 2)
+        along = cloud[body, np.argmax(np.ptp(cloud, axis=2), axis=1)]
         sort = np.take_along_axis(members, np.argsort(along, axis=1, kind="stable"), 1)
         half = number // 2
         cut = sort.shape[1] * half // number

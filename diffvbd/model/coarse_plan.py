@@ -11,7 +11,6 @@ from torch import Tensor
 from .. import ops
 from .bodies import connected
 from .coarse import CoarseGeometry, CoarseSpace, build_coarse
-from .rest import rest_metric, shape_gradients
 
 LANES = ops.LANES["cpu"]  # tets of a block, on every device; twin of kLanes
 PART = 32  # most blocks of a part of a body
@@ -64,13 +63,13 @@ def views(sizes: ops.CoarseSizes, plan: Tensor) -> dict[str, Tensor]:
     return dict(zip(lengths, plan.long().split(list(lengths.values())), strict=True))
 
 
-def plan_of(space: CoarseSpace, points: Tensor, tets: Tensor, pinned: Tensor, mass: Tensor, plan: Tensor,
+def plan_of(space: CoarseSpace, points: Tensor, tets: Tensor, pinned: Tensor, mass: Tensor, rest: Tensor, plan: Tensor,
             device: str) -> tuple[CoarseGeometry, CoarsePlan]:  # fmt: skip
-    """The space on a mesh in float64, on the CPU; plan: of the sweeps on a device, itself on the CPU."""
+    """The space on a mesh in float64, on the CPU; rest [1, T, 7]; plan: of the sweeps on a device, itself on the
+    CPU."""
     arrays = points.numpy(), tets.numpy()
     geometry = build_coarse(*arrays, pinned.numpy(), connected(tets, len(points)).numpy(), space)
     order = ops.plan_order(plan, ops.LANES[device]).numpy()
-    rest, _ = rest_metric(points[tets][None])
     return geometry, arrange_coarse(geometry, space.every, *arrays, mass.numpy(), rest[0].numpy(), order)
 
 
@@ -85,22 +84,26 @@ def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tet
     mass_ptr = np.concatenate(([0], np.cumsum(counts**2)))
 
     at = position[g.vertex]
-    sort = np.argsort(at, kind="stable")
+    of_vertex = _starts(g.vertex, vertices)
+    some = order[np.sort(position[of_vertex[1:] > of_vertex[:-1]])]  # vertices with functions, in sweep order
+    number = of_vertex[some + 1] - of_vertex[some]
+    sort = np.repeat(of_vertex[some] - np.cumsum(number) + number, number) + np.arange(len(at))
     by_position = (at[sort], g.function[sort], g.weight[sort])
     rows = np.argsort(g.function * len(order) + at)  # no two are equal
     function_body = np.repeat(np.arange(g.bodies), counts)
     position_body = np.full(len(order), -1)
     position_body[at] = function_body[g.function]
 
-    listed, vertex_body = np.unique(g.vertex), np.full(vertices, -1)
+    vertex_body = np.full(vertices, -1)
     vertex_body[g.vertex] = function_body[g.function]
+    listed = np.flatnonzero(vertex_body >= 0)
     listed = listed[np.argsort(vertex_body[listed], kind="stable")]
     tet, block_ptr, tet_ptr = _blocks(g)
     # padding has one corner of its block four times
     corner = position[np.where(tet[..., None] >= 0, tets[np.maximum(tet, 0)], tets[tet[:, :1], :1])].swapaxes(1, 2)
 
-    gradients, volume = (a.numpy() for a in shape_gradients(torch.from_numpy(points[tets])))
-    moment = _moments(g, tets, gradients, volume, vertices)
+    volume = 1 / (6 * rest[:, 6])
+    moment = _moments(g, points, tets)
     moment_group = np.repeat(np.arange(len(g.group_body)), np.diff(moment[0]))
     part_ptr, part_body, part_begin = _parts(block_ptr)
     place_ptr, place = _places(g, counts)
@@ -174,14 +177,26 @@ def _places(g: CoarseGeometry, counts: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return ptr[:-1], out
 
 
-def _moments(g: CoarseGeometry, tets: np.ndarray, gradients: np.ndarray, volume: np.ndarray, vertices: int
-             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+def _moments(g: CoarseGeometry, points: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For each group its vertices and the vectors D with sum over them of x D' = sum of V F over the group's tets."""
-    listed = np.flatnonzero(g.tet_group >= 0)
-    key = (g.tet_group[listed, None] * vertices + tets[listed]).reshape(-1)
+    listed, vertices = np.flatnonzero(g.tet_group >= 0), max(len(points), 1)
+    corners = tets[listed].T.copy()
+    key = (g.tet_group[listed] * vertices + corners).reshape(-1)
     sort = np.argsort(key, kind="stable")
-    key = key[sort]
-    first = np.flatnonzero(np.diff(key, prepend=-1))
-    parts = (volume[listed, None, None] * gradients[listed]).reshape(-1, 3)[sort]
-    out = np.add.reduceat(parts, first, axis=0) if len(first) else parts
-    return _starts(key[first] // max(vertices, 1), len(g.group_body)), key[first] % max(vertices, 1), out
+    new = np.diff(key[sort], prepend=-1) > 0
+    row = np.empty(len(key), dtype=np.int64)
+    row[sort] = np.cumsum(new) - 1
+    key = key[sort[new]]
+    # V times the gradients of the shape functions: normals of the opposite faces, which sum to 0
+    x = [axis[corners] for axis in points.T.copy()]
+    e = [x[c][1:] - x[c][0] for c in range(3)]
+    out = np.empty((len(key), 3))
+    for c in range(3):
+        a, b = e[(c + 1) % 3], e[(c + 2) % 3]
+        normal = np.empty((4, len(listed)))
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            normal[k + 1] = a[i] * b[j] - b[i] * a[j]
+        normal[0] = -(normal[1] + normal[2] + normal[3])
+        out[:, c] = np.bincount(row, normal.reshape(-1), len(key)) / 6
+    return _starts(key // vertices, len(g.group_body)), key % vertices, out

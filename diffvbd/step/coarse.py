@@ -44,7 +44,8 @@ def coarse_parts(model: Model, mu: Tensor, lam: Tensor, mass: Tensor | None, res
             shape = (-1, 1, 1, 1, 1, 1)
             stiffness = torch.addcmul(mu.reshape(shape) * unit[:1], least.reshape(shape), unit[1:])
         else:
-            gradients, volume = shape_gradients(_corners(model) if corners is None else corners)
+            shapes = model.derived("coarse_shapes", lambda: _shapes_of(model)) if corners is None else None
+            gradients, volume = shape_gradients(corners) if shapes is None else shapes
             stiffness = coarse_stiffness(plan, mu, least, gradients, volume)
         lanes = plan.rest if rest is None else rest.detach()[:, plan.tet].transpose(-1, -2).contiguous()
         return CoarseParts(stiffness, plan.mass if mass is None else coarse_mass(plan, mass), lanes)
@@ -52,14 +53,14 @@ def coarse_parts(model: Model, mu: Tensor, lam: Tensor, mass: Tensor | None, res
 
 def _unit_stiffness(model: Model) -> Tensor:
     """Of all groups with mu = 1 Pa and lam = 0, and with mu = 0 and lam = 1 Pa."""
-    gradients, volume = shape_gradients(_corners(model))
+    gradients, volume = _shapes_of(model)
     mu = volume.new_tensor([[1.0], [0.0]])
     return coarse_stiffness(model._coarse_plan, mu, 1 - mu, gradients, volume)
 
 
-def _corners(model: Model) -> Tensor:
-    """Of the tets at the Model's own rest [1, T, 4, 3]."""
-    return model._rest_points[model._topology[0]][None]
+def _shapes_of(model: Model) -> tuple[Tensor, Tensor]:
+    """Gradients of the tets' shape functions and their volumes at the Model's own rest."""
+    return shape_gradients(model._rest_points[model._topology[0]][None])
 
 
 class _Matrix(Function):
