@@ -278,9 +278,9 @@ def _independent(functions: np.ndarray) -> np.ndarray:
 
 def _groups(centers: np.ndarray, count: int) -> np.ndarray:
     """Cuts clouds [n, 3, T] into ``count`` parts of nearly equal size, each time across their longest side: [n, T]."""
-    out = np.zeros(centers[:, 0].shape, dtype=np.int64)
-    body = np.arange(len(centers))
-    parts = [(np.broadcast_to(np.arange(out.shape[1]), out.shape), count, 0)]
+    n, _, tets = centers.shape
+    out, body = np.zeros((n, tets), dtype=np.int64), np.arange(n)
+    parts = [(np.broadcast_to(np.arange(tets), (n, tets)), count, 0)]
     while parts:
         members, number, first = parts.pop()
         if number == 1:

@@ -44,9 +44,9 @@ def coarse_parts(model: Model, mu: Tensor, lam: Tensor, mass: Tensor | None, res
             shape = (-1, 1, 1, 1, 1, 1)
             stiffness = torch.addcmul(mu.reshape(shape) * unit[:1], least.reshape(shape), unit[1:])
         else:
-            shapes = model.derived("coarse_shapes", lambda: _shapes_of(model)) if corners is None else None
-            gradients, volume = shape_gradients(corners) if shapes is None else shapes
-            stiffness = coarse_stiffness(plan, mu, least, gradients, volume)
+            own = corners is None
+            shapes = model.derived("coarse_shapes", lambda: _shapes_of(model)) if own else shape_gradients(corners)
+            stiffness = coarse_stiffness(plan, mu, least, *shapes)
         lanes = plan.rest if rest is None else rest.detach()[:, plan.tet].transpose(-1, -2).contiguous()
         return CoarseParts(stiffness, plan.mass if mass is None else coarse_mass(plan, mass), lanes)
 
