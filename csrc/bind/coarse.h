@@ -1,10 +1,12 @@
 // The tensors of coarse corrections, as the operators take them.
 #pragma once
 
+#include <algorithm>
 #include <limits>
 #include <vector>
 
 #include "../coarse/matrix.h"
+#include "../coarse/sums.h"
 #include "arguments.h"
 #include "fields.h"
 
@@ -66,6 +68,35 @@ coarse::MatrixInputs<T> matrix_inputs(const CoarseFields& f, const std::vector<i
   in.stiffness = batched<T>("stiffness", f.stiffness, x, in.scenes, int64_t{9} * p.groups * p.width * p.width);
   in.mass = batched<T>("mass", f.mass, x, in.scenes, p.cells);
   return in;
+}
+
+// gradients [1 | B, tets, 4, 3] of the tets' shape functions
+template <class T>
+coarse::StiffnessInputs<T> stiffness_inputs(const Tensor& mu, const Tensor& lam, const Tensor& gradients,
+                                            const Tensor& volume, const Tensor& plan, const Tensor& weights,
+                                            const std::vector<int64_t>& sizes) {
+  require(gradients.dim() == 4 && gradients.size(2) == 4 && gradients.size(3) == 3,
+          "diffvbd::coarse_stiffness: expected gradients [scenes, tets, 4, 3]");
+  coarse::StiffnessInputs<T> in{};
+  in.plan = coarse_plan(plan, mu, sizes);
+  require_like("weights", weights, mu, 2 * int64_t{in.plan.entries});
+  in.weight = data<const T>(weights);
+  for (const Tensor* t : {&mu, &lam, &gradients, &volume}) {
+    in.scenes = std::max(in.scenes, t->dim() > 0 ? t->size(0) : 0);
+  }
+  in.tets = gradients.size(1);
+  in.mu = batched<T>("mu", mu, mu, in.scenes, in.tets, 1);
+  in.lam = batched<T>("lam", lam, mu, in.scenes, in.tets, 1);
+  in.gradient = batched<T>("gradients", gradients, mu, in.scenes, 12 * in.tets);
+  in.volume = batched<T>("volume", volume, mu, in.scenes, in.tets);
+  return in;
+}
+
+inline coarse::Plan mass_plan(const Tensor& mass, const Tensor& plan, const Tensor& weights,
+                              const std::vector<int64_t>& sizes) {
+  const coarse::Plan p = coarse_plan(plan, mass, sizes);
+  require_like("weights", weights, mass, 2 * int64_t{p.entries});
+  return p;
 }
 
 }  // namespace diffvbd

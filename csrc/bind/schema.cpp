@@ -15,7 +15,7 @@ namespace {
 // data_count: scalars per scene, or per vertex, of each energy of one vertex
 // launch: on CUDA the regime and the threads per vertex of the sweeps and of their reverse, else empty
 // coarse: sizes of the plan of a coarse space, and 1 where the first sweep of the step comes before these; else empty
-#define DIFFVBD_SETTINGS                                                                                      \
+#define DIFFVBD_SETTINGS                                                                                  \
   "Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, int sweeps, int[] launch, " \
   "int[] coarse, int tape_policy"
 
@@ -97,11 +97,21 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "filter_eta, int start, bool filters, bool[] wants",
          "Tensor x, Tensor v, Tensor acceleration, Tensor prescribed, Tensor mass, Tensor shared, Tensor own, Tensor "
          "planes, ");
-  // The Cholesky factors (CUDA: inverses) of the matrices of all bodies, one after the other; adjoints of x_prev, stiffness and mass from
-  // that of the matrices
+  // The Cholesky factors (CUDA: inverses) of the matrices of all bodies, one after the other; adjoints of x_prev,
+  // stiffness and mass from that of the matrices
   define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "int[] sizes, float time_step", "Tensor factor, ");
   define(m, "coarse_matrix_backward", DIFFVBD_ARGUMENTS(COARSE), "Tensor bar, int[] sizes, float time_step",
          DIFFVBD_RETURNS(COARSE));
+  // Of what these are made, see coarse/sums.h; adjoints of the moduli [scenes, tets], and, where wanted, of the rest
+  // shape. CPU only
+  m.def(
+      "coarse_stiffness(Tensor mu, Tensor lam, Tensor gradients, Tensor volume, Tensor plan, Tensor weights, int[] "
+      "sizes) -> Tensor");
+  m.def(
+      "coarse_stiffness_backward(Tensor mu, Tensor lam, Tensor gradients, Tensor volume, Tensor plan, Tensor weights, "
+      "Tensor bar, int[] sizes, bool wants_rest) -> (Tensor mu, Tensor lam, Tensor gradients, Tensor volume)");
+  m.def("coarse_mass(Tensor mass, Tensor plan, Tensor weights, int[] sizes) -> Tensor");
+  m.def("coarse_mass_backward(Tensor bar, Tensor plan, Tensor weights, int[] sizes) -> Tensor");
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");
   m.def(
       "build_plan(Tensor points, Tensor tets, Tensor active, int lanes) -> (Tensor plan, Tensor color_ptr, Tensor "

@@ -29,6 +29,7 @@ struct Plan {
   const int32_t* group_function;  // [groups, width]  -1 beyond the last
   // the reverse, [groups], [places]: for each function of a body its place in a group, -1: none
   const int32_t *place_ptr, *place;
+  const int32_t* tet_ptr;  // [groups + 1]  tets of a group, which are one after the other in its body's blocks
   // what the mean deformation of a group is made of: [groups + 1], [moments] twice; and by vertex: [vertices + 1],
   // [moments]
   const int32_t *moment_ptr, *moment_vertex, *moment_group, *vertex_ptr, *vertex_moment;
@@ -67,6 +68,7 @@ DIFFVBD_FN Plan view_plan(const int64_t* sizes, const int32_t* p, int64_t& used)
   out.group_function = take(int64_t{out.groups} * out.width);
   out.place_ptr = take(out.groups);
   out.place = take(out.places);
+  out.tet_ptr = take(out.groups + 1);
   out.moment_ptr = take(out.groups + 1);
   out.moment_vertex = take(out.moments);
   out.moment_group = take(out.moments);

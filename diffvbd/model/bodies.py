@@ -58,10 +58,13 @@ class _Grouped(NamedTuple):
 
 def connected(tets: Tensor, count: int) -> Tensor:
     """The lowest vertex of the connected set of tets that each of ``count`` vertices is in, int64 [count]."""
-    label = torch.arange(count)
+    label, corners = torch.arange(count), tets.T.contiguous()
     while True:  # every vertex takes the lowest label of its tets, and that label's own: paths halve each time
-        low = label[tets].amin(1) if len(tets) else label[:0]
-        new = label.scatter_reduce(0, tets.reshape(-1), low.repeat_interleave(4), "amin")
+        a, b, c, d = (label[corner] for corner in corners)
+        low = torch.minimum(torch.minimum(a, b), torch.minimum(c, d))
+        new = label
+        for corner in corners:
+            new = new.scatter_reduce(0, corner, low, "amin")
         new = new[new]
         if torch.equal(new, label):
             return label

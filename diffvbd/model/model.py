@@ -260,8 +260,8 @@ class Model:
 
     def _arrange_coarse(self, device: torch.device) -> None:
         if self.coarse is not None:
-            given = (self._rest_points, self._topology[0], self._pinned, self._mass, self._plan, device.type)
-            self.coarse_geometry, self._coarse_plan = plan_of(self.coarse, *given)
+            given = (self._rest_points, self._topology[0], self._pinned, self._mass, self._rest, self._plan)
+            self.coarse_geometry, self._coarse_plan = plan_of(self.coarse, *given, device.type)
 
     def _parameters(self, energy: VertexEnergy, rest_points: Tensor) -> dict[str, Tensor]:
         return {name: value[None] for name, value in energy.constants(rest_points).items()}

@@ -58,9 +58,12 @@ def shape_gradients(corners: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         corners: Rest positions of the tets' corners [m], shape [..., T, 4, 3].
     """
-    a, b, c, d = corners.unbind(-2)
-    b, c, d = b - a, c - a, d - a
-    normals = torch.stack((torch.linalg.cross(c, d), torch.linalg.cross(d, b), torch.linalg.cross(b, c)), -2)
-    six_volumes = (b * normals[..., 0, :]).sum(-1)
-    rows = normals / six_volumes[..., None, None]
-    return torch.cat((-rows.sum(-2, keepdim=True), rows), -2), six_volumes / 6.0
+    p = [tuple(corners[..., a, c].contiguous() for c in range(3)) for a in range(4)]
+    e1, e2, e3 = (tuple(p[a][c] - p[0][c] for c in range(3)) for a in (1, 2, 3))
+    n1, n2, n3 = _cross(e2, e3), _cross(e3, e1), _cross(e1, e2)
+    six_volumes = _dot(e1, n1)
+    scale = 1.0 / six_volumes
+    rows = [tuple(n[c] * scale for c in range(3)) for n in (n1, n2, n3)]
+    first = tuple(-(rows[0][c] + rows[1][c] + rows[2][c]) for c in range(3))
+    flat = torch.stack([component for row in (first, *rows) for component in row], -1)
+    return flat.unflatten(-1, (4, 3)), six_volumes / 6.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from .fields import CoarseFields
+from .fields import CoarseFields, CoarseSizes
 from .functions import raw_backward, shapes_of
 
 _FIELDS = len(CoarseFields._fields)
@@ -24,5 +24,33 @@ def _(*arguments):
             f.x_prev.new_empty((scenes, *f.mass.shape[1:])))  # fmt: skip
 
 
-for _name in ("coarse_matrix", "coarse_matrix_backward"):
-    torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)
+@shapes_of("coarse_stiffness")
+def _(mu, lam, gradients, volume, plan, weights, sizes):
+    sizes = CoarseSizes(*sizes)
+    return mu.new_empty((_scenes(mu, lam, gradients, volume), sizes.groups, 3, 3, sizes.width, sizes.width))
+
+
+@shapes_of("coarse_stiffness_backward")
+def _(mu, lam, gradients, volume, plan, weights, bar, sizes, wants_rest):
+    scenes, tets = _scenes(mu, lam, gradients, volume), gradients.shape[1]
+    rest = tets if wants_rest else 0
+    return tuple(mu.new_empty((scenes, *own)) for own in ((tets,), (tets,), (rest, 4, 3), (rest,)))
+
+
+def _scenes(*tensors):
+    return max(t.shape[0] for t in tensors)
+
+
+@shapes_of("coarse_mass")
+def _(mass, plan, weights, sizes):
+    return mass.new_empty((mass.shape[0], CoarseSizes(*sizes).cells))
+
+
+@shapes_of("coarse_mass_backward")
+def _(bar, plan, weights, sizes):
+    return bar.new_empty((bar.shape[0], CoarseSizes(*sizes).vertices))
+
+
+for _name in ("coarse_matrix", "coarse_stiffness", "coarse_mass"):
+    for _end in ("", "_backward"):
+        torch.library.register_autograd(f"diffvbd::{_name}{_end}", raw_backward)

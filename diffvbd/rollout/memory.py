@@ -97,10 +97,9 @@ def predict(
         scratch = _cpu_scratch(model, scenes, material, rest) + outputs * scenes * item
     if model.coarse is not None:
         plan = model._coarse_plan
-        groups, of_tets = plan.group_tets.shape
-        stiffness = groups * (3 * plan.width) ** 2
-        # once for all steps: what the matrices are made of, and the slopes of the functions that a material meets
-        kept += (stiffness + (groups * of_tets * 3 * plan.width if material else 0)) * item
+        stiffness = plan.sizes.groups * (3 * plan.sizes.width) ** 2
+        # once for all steps: what the matrices are made of, and, where a material meets it, the rest shape
+        kept += (stiffness + (13 * model.num_tets if material else 0)) * item
         scratch += scenes * (10 * plan.mass.numel() + stiffness) * item
     if policy == ops.NO_TAPE:
         scratch += scalars * ops.tape_rows(ops.FULL_TAPE, model.energy_mask) * item

@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..model.coarse_plan import mass_parts
 from ..model.model import Model
 from ..model.rest import shape_gradients
 from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
 from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
+from .coarse_sums import coarse_mass, coarse_stiffness
 
 _TENSORS = 3  # differentiable fields
 _FIELDS = len(ops.CoarseFields._fields)
@@ -44,54 +44,23 @@ def coarse_parts(model: Model, mu: Tensor, lam: Tensor, mass: Tensor | None, res
             shape = (-1, 1, 1, 1, 1, 1)
             stiffness = torch.addcmul(mu.reshape(shape) * unit[:1], least.reshape(shape), unit[1:])
         else:
-            gradients, volume = shape_gradients(_corners(model) if corners is None else corners)
-            shape = (max(mu.shape[0], lam.shape[0]), model.num_tets)
-            stiffness = _stiffness(plan, ops.broadcast(mu, shape), ops.broadcast(least, shape), gradients, volume)
+            own = corners is None
+            shapes = model.derived("coarse_shapes", lambda: _shapes_of(model)) if own else shape_gradients(corners)
+            stiffness = coarse_stiffness(plan, mu, least, *shapes)
         lanes = plan.rest if rest is None else rest.detach()[:, plan.tet].transpose(-1, -2).contiguous()
-        return CoarseParts(stiffness, plan.mass if mass is None else _mass(model, mass), lanes)
+        return CoarseParts(stiffness, plan.mass if mass is None else coarse_mass(plan, mass), lanes)
 
 
 def _unit_stiffness(model: Model) -> Tensor:
     """Of all groups with mu = 1 Pa and lam = 0, and with mu = 0 and lam = 1 Pa."""
-    gradients, volume = shape_gradients(_corners(model))
-    one, none = volume.new_ones((1, model.num_tets)), volume.new_zeros((1, model.num_tets))
-    parts = [_stiffness(model._coarse_plan, *pair, gradients, volume) for pair in ((one, none), (none, one))]
-    return torch.cat(parts)
+    gradients, volume = _shapes_of(model)
+    mu = volume.new_tensor([[1.0], [0.0]])
+    return coarse_stiffness(model._coarse_plan, mu, 1 - mu, gradients, volume)
 
 
-def _corners(model: Model) -> Tensor:
-    """Of the tets at the Model's own rest [1, T, 4, 3]."""
-    return model._rest_points[model._topology[0]][None]
-
-
-def _stiffness(plan: Any, mu: Tensor, lam: Tensor, gradients: Tensor, volume: Tensor) -> Tensor:
-    """sum over the tets of each group of P' K P: rest_stiffness() of csrc/energies/stable_neo_hookean.h, where the
-    gradients are those of the coarse functions."""
-    tets, width = plan.group_tets, plan.width
-    groups, most = tets.shape
-    slopes = torch.einsum("bgmac,gman->bgmnc", gradients[:, tets], plan.group_weights).flatten(3)
-
-    def weighted(modulus: Tensor) -> Tensor:
-        scale = (modulus * volume)[:, tets]
-        out = torch.einsum("bgmi,bgmj->bgij", scale[..., None] * slopes, slopes.expand(len(scale), -1, -1, -1))
-        return out.reshape(-1, groups, width, 3, width, 3)
-
-    shear, bulk = weighted(mu), weighted(lam)
-    identity = torch.eye(3, dtype=shear.dtype, device=shear.device)
-    trace = torch.einsum("bgicjc,pq->bgipjq", shear, identity)
-    return (shear.transpose(3, 5) + trace + bulk).permute(0, 1, 3, 5, 2, 4).contiguous()
-
-
-def _mass(model: Model, mass: Tensor) -> Tensor:
-    """W' M W of each body [B, cells]."""
-
-    def placed() -> tuple[Tensor, ...]:
-        like = model._coarse_plan.mass
-        cell, vertex, weight, filled = (torch.from_numpy(a).to(like.device) for a in mass_parts(model.coarse_geometry))
-        return cell, vertex, weight.to(like.dtype), filled.to(like.dtype)
-
-    cell, vertex, weight, filled = model.derived("coarse_mass", placed)
-    return filled.expand(len(mass), -1).index_add(1, cell, weight * mass[:, vertex])
+def _shapes_of(model: Model) -> tuple[Tensor, Tensor]:
+    """Gradients of the tets' shape functions and their volumes at the Model's own rest."""
+    return shape_gradients(model._rest_points[model._topology[0]][None])
 
 
 class _Factor(Function):

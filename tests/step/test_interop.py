@@ -24,6 +24,7 @@ from torch.utils.checkpoint import checkpoint
 
 import diffvbd as dv
 from diffvbd import ops
+from diffvbd.model.rest import shape_gradients
 from diffvbd.step.coarse import coarse_parts
 from diffvbd.testing import relative_error, tolerance
 
@@ -222,7 +223,7 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
 
 
 def coarse_arguments(device: str) -> dict[str, tuple[Any, ...]]:
-    """The same of the matrix of a coarse space."""
+    """The same of the matrix of a coarse space and of what it is made of, which only the CPU has compiled."""
     mesh = dv.mesh.cube(4, size=0.3)
     model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, coarse=dv.CoarseSpace(functions=8), device=device)
     plan, x = model._coarse_plan, model.rest_points[None].contiguous()
@@ -231,7 +232,18 @@ def coarse_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     given = (x, parts.stiffness, parts.mass, plan.plan, plan.moments, plan.volume)
     last = (plan.sizes, 0.3)
     factor = torch.ops.diffvbd.coarse_matrix(*given, *last)
-    return {"coarse_matrix": (*given, *last), "coarse_matrix_backward": (*given, torch.ones_like(factor), *last)}
+    out = {"coarse_matrix": (*given, *last), "coarse_matrix_backward": (*given, torch.ones_like(factor), *last)}
+    if device != "cpu":
+        return out
+    tets = shape_gradients(model.rest_points[model.tets][None])
+    sums = (moduli.expand(-1, model.num_tets).contiguous(), moduli, *tets, plan.plan, plan.weights)
+    rest = (plan.plan, plan.weights, plan.sizes)
+    return out | {
+        "coarse_stiffness": (*sums, plan.sizes),
+        "coarse_stiffness_backward": (*sums, torch.ones_like(parts.stiffness), plan.sizes, True),
+        "coarse_mass": (model.mass[None], *rest),
+        "coarse_mass_backward": (torch.ones_like(parts.mass), *rest),
+    }
 
 
 def fused_arguments(policy: int) -> dict[str, tuple[Any, ...]]:
