@@ -9,8 +9,7 @@ from helpers.paths import CSRC, PACKAGE, ROOT, TESTS, needs_csrc
 
 import diffvbd as dv
 from diffvbd import energies, ops, reference, safeguards
-from diffvbd.model import coarse_plan
-from diffvbd.ops import regimes
+from diffvbd.ops import coarse_arrays, regimes
 from diffvbd.step import memory
 
 
@@ -277,7 +276,7 @@ def test_constants_agree_across_languages() -> None:
     assert ops.LANES == {"cpu": constant("core/views.h", "kLanes"), "cuda": constant("core/views.h", "kSlice")}
     assert ops.REST_SCALARS == constant("energies/tet.h", "rest")
     assert ops.PLAN_HEADER == constant("core/plan_views.h", "kPlanHeader")
-    assert coarse_plan.ROW == constant("core/views.h", "kRow")
+    assert coarse_arrays.ROW == constant("core/views.h", "kRow")
     lengths, twin = code_of(CSRC / "coarse" / "length.h"), reference.coarse
     names = {"kLengths": twin.HALVINGS, "kDecrease": twin.DECREASE, "kRounding": twin.ROUNDING,
              "kFailures": twin.REFUSALS}  # fmt: skip

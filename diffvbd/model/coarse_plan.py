@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from .. import ops
+from ..ops.coarse_arrays import PACK as LANES
+from ..ops.coarse_arrays import ROW, lengths
 from .bodies import connected
 from .coarse import CoarseGeometry, CoarseSpace, build_coarse
 
-LANES = ops.LANES["cpu"]  # tets of a block, on every device; twin of kLanes
 TILE = 32  # unknowns of a body beyond which it counts as large; twin of kTile in csrc/coarse/views.h
 PART = 32  # most blocks of a part of a body
-ROW = 4  # scalars of a row of positions; twin of kRow in csrc/core/views.h
 
 
 class CoarsePlan(NamedTuple):
@@ -36,32 +36,6 @@ class CoarsePlan(NamedTuple):
 
         sizes, *tensors = self
         return CoarsePlan(sizes, *map(placed, tensors))._replace(volume=self.volume.to(device))
-
-    @property
-    def most_of_position(self) -> int:
-        """Functions of a vertex at most."""
-        return int(views(self.sizes, self.plan)["position_ptr"].diff().max())
-
-
-def _lengths(s: ops.CoarseSizes) -> dict[str, int]:
-    """Arrays of the plan in their order; twin of view_plan() in csrc/coarse/views.h."""
-    return {
-        "function_ptr": s.bodies + 1, "mass_ptr": s.bodies + 1, "function_body": s.functions,
-        "position_body": s.positions, "position_ptr": s.positions + 1, "function": s.entries,
-        "row_ptr": s.functions + 1, "row": s.entries, "block_ptr": s.bodies + 1, "part_ptr": s.bodies + 1,
-        "part_body": s.parts, "part_begin": s.parts + 1, "corner": 4 * s.tet_blocks * LANES,
-        "tet": s.tet_blocks * LANES, "group_ptr": s.bodies + 1, "group_body": s.groups,
-        "group_function": s.groups * s.width, "place_ptr": s.groups, "place": s.places, "tet_ptr": s.groups + 1,
-        "moment_ptr": s.groups + 1, "moment_vertex": s.moments, "moment_group": s.moments,
-        "vertex_ptr": s.vertices + 1, "vertex_moment": s.moments, "list_ptr": s.bodies + 1, "list": s.listed,
-        "list_position": s.listed,
-    }  # fmt: skip
-
-
-def views(sizes: ops.CoarseSizes, plan: Tensor) -> dict[str, Tensor]:
-    """The arrays of a plan by their names, int64 and flat."""
-    lengths = _lengths(sizes)
-    return dict(zip(lengths, plan.long().split(list(lengths.values())), strict=True))
 
 
 def plan_of(space: CoarseSpace, points: Tensor, tets: Tensor, pinned: Tensor, mass: Tensor, rest: Tensor, plan: Tensor,
@@ -123,7 +97,7 @@ def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tet
         "vertex_ptr": _starts(np.sort(moment[1]), vertices), "vertex_moment": np.argsort(moment[1], kind="stable"),
         "list_ptr": _starts(vertex_body[listed], g.bodies), "list": listed, "list_position": position[listed],
     }  # fmt: skip
-    assert {name: a.size for name, a in arrays.items()} == _lengths(sizes)
+    assert {name: a.size for name, a in arrays.items()} == lengths(sizes)
     index = torch.from_numpy(np.concatenate([a.reshape(-1) for a in arrays.values()]).astype(np.int32))
     weights = torch.from_numpy(np.concatenate((by_position[2], g.weight[rows])))
     lanes = rest[np.maximum(tet, 0)].swapaxes(1, 2)  # of any tet at padding, whose corners do not move apart

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from . import coarse_cuda as _cuda  # noqa: F401  (registers what CUDA runs)
 from .fields import CoarseFields, CoarseSizes
 from .functions import raw_backward, shapes_of
 

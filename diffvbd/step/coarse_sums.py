@@ -1,7 +1,7 @@
 """What the matrices of coarse corrections are made of: stiffness and mass in the functions of the bodies
 (docs/method.md, section 15).
 
-On the CPU by compiled loops (csrc/coarse/sums.h), elsewhere by products of torch (coarse_chunks.py). Either sums in an
+On the CPU by compiled loops (csrc/coarse/sums.h), on CUDA by products of torch (ops/coarse_cuda.py). Either sums in an
 order that depends on the Model alone.
 """
 
@@ -17,7 +17,6 @@ from .. import ops
 from ..model.coarse_plan import CoarsePlan
 from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
 from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
-from . import coarse_chunks as chunks
 
 
 def coarse_stiffness(plan: CoarsePlan, mu: Tensor, lam: Tensor, gradients: Tensor, volume: Tensor) -> Tensor:
@@ -57,8 +56,6 @@ class _Reverse(Function):
 class _Stiffness(_Once):
     @staticmethod
     def forward(mu, lam, gradients, volume, plan):
-        if mu.is_cuda:
-            return chunks.stiffness(plan, mu, lam, gradients, volume)
         return ops.raw.coarse_stiffness(mu, lam, gradients, volume, plan.plan, plan.weights, plan.sizes)
 
     @staticmethod
@@ -76,11 +73,8 @@ class _StiffnessBackward(_Reverse):
     @staticmethod
     def forward(bar, mu, lam, gradients, volume, plan, needs):
         fields, rest = (mu, lam, gradients, volume), needs[2] or needs[3]
-        if mu.is_cuda:
-            bars = chunks.stiffness_backward(plan, *fields, bar)
-        else:
-            bar = bar.contiguous()
-            bars = ops.raw.coarse_stiffness_backward(*fields, plan.plan, plan.weights, bar, plan.sizes, rest)
+        bar = bar.contiguous()
+        bars = ops.raw.coarse_stiffness_backward(*fields, plan.plan, plan.weights, bar, plan.sizes, rest)
         return tuple(ops.sum_to(b, t.shape) for b, t, need in zip(bars, fields, needs, strict=True) if need)
 
     @staticmethod
@@ -91,8 +85,6 @@ class _StiffnessBackward(_Reverse):
 class _Mass(_Once):
     @staticmethod
     def forward(mass, plan):
-        if mass.is_cuda:
-            return chunks.mass(plan, mass)
         return ops.raw.coarse_mass(mass, plan.plan, plan.weights, plan.sizes)
 
     @staticmethod
@@ -107,8 +99,6 @@ class _Mass(_Once):
 class _MassBackward(_Reverse):
     @staticmethod
     def forward(bar, plan):
-        if bar.is_cuda:
-            return chunks.mass_backward(plan, bar)
         return ops.raw.coarse_mass_backward(bar.contiguous(), plan.plan, plan.weights, plan.sizes)
 
     @staticmethod

@@ -10,7 +10,7 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import ops
 from diffvbd.model.rest import shape_gradients
-from diffvbd.step import coarse_chunks
+from diffvbd.ops import coarse_cuda
 from diffvbd.step.coarse_sums import coarse_mass, coarse_stiffness
 from diffvbd.testing import generator, relative_error, tolerance
 
@@ -82,23 +82,24 @@ def test_mass_written_out(model: dv.Model) -> None:
 @pytest.mark.parametrize("limit", [2**25, 20_000], ids=["at once", "in pieces"])
 @pytest.mark.parametrize("scenes", [(1, 1, 1, 1), (2, 1, 1, 1), (1, 1, 2, 2)])
 def test_products_of_torch(model: dv.Model, monkeypatch: Any, limit: int, scenes: tuple[int, ...]) -> None:
-    monkeypatch.setattr(coarse_chunks, "LIMIT", limit)
+    monkeypatch.setattr(coarse_cuda, "LIMIT", limit)
     plan = model._coarse_plan
+    space = (plan.plan, plan.weights)
     for shared in (False, True):
         given = inputs(model, scenes, shared)
         found = coarse_stiffness(plan, *given)
         bar = torch.as_tensor(generator("bar").standard_normal(tuple(found.shape)))
         plain = [t.detach() for t in given]
-        assert relative_error(coarse_chunks.stiffness(plan, *plain), found) <= tolerance("formula")
-        bars = coarse_chunks.stiffness_backward(plan, *plain, bar)
+        assert relative_error(coarse_cuda.stiffness(*plain, *space, plan.sizes), found) <= tolerance("formula")
+        bars = coarse_cuda.stiffness_backward(*plain, *space, bar, plan.sizes, True)
         for ours, theirs, t in zip(bars, torch.autograd.grad((bar * found).sum(), given), given, strict=True):
             assert relative_error(ops.sum_to(ours, t.shape), theirs) <= tolerance("formula")
     mass = (1 + torch.rand((scenes[2], model.num_vertices), generator=torch.Generator().manual_seed(1))).double()
     found = coarse_mass(plan, mass.requires_grad_())
-    assert relative_error(coarse_chunks.mass(plan, mass.detach()), found) <= tolerance("formula")
+    assert relative_error(coarse_cuda.mass(mass.detach(), *space, plan.sizes), found) <= tolerance("formula")
     bar = torch.as_tensor(generator("bar").standard_normal(tuple(found.shape)))
     (expected,) = torch.autograd.grad((bar * found).sum(), mass)
-    assert relative_error(coarse_chunks.mass_backward(plan, bar), expected) <= tolerance("formula")
+    assert relative_error(coarse_cuda.mass_backward(bar, *space, plan.sizes), expected) <= tolerance("formula")
 
 
 def test_same_bits_on_any_number_of_threads(model: dv.Model) -> None:

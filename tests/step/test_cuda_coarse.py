@@ -24,8 +24,9 @@ def bodies(device: str, **options: Any) -> dv.Model:
     mesh = dv.mesh.join([beam, box, small])
     floor = dv.FloorBarrier(kappa=400.0, dhat=0.02, normal=(0.0, 0.0, 1.0))
     energies = (dv.StableNeoHookean(), *((floor,) if options.pop("floor", False) else ()))
-    return dv.Model(mesh, energies=energies, pinned=mesh.points[:, 0] < 1e-9, coarse=dv.CoarseSpace(every=2), relaxation=1.5,
-                    device=device, **options)  # fmt: skip
+    held = mesh.points[:, 0] < 1e-9
+    space = dv.CoarseSpace(every=2)
+    return dv.Model(mesh, energies=energies, pinned=held, coarse=space, relaxation=1.5, device=device, **options)
 
 
 def run(model: dv.Model, scenes: int, sweeps: int = 6, steps: int = 2) -> tuple[dict[str, Tensor], list[Tensor]]:

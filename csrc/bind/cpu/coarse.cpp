@@ -14,7 +14,7 @@
 namespace {
 
 namespace coarse = diffvbd::coarse;
-using diffvbd::CoarseFields, diffvbd::data, diffvbd::dispatch_float, diffvbd::zeros;
+using diffvbd::CoarseFields, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::zeros;
 using torch::stable::Tensor;
 
 // f(scene, which) for all bodies, or groups, functions, vertices, of all scenes
