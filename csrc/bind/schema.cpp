@@ -101,6 +101,14 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "int[] sizes, float time_step", "Tensor matrix, Tensor factor, ");
   define(m, "coarse_matrix_backward", DIFFVBD_ARGUMENTS(COARSE), "Tensor bar, int[] sizes, float time_step",
          DIFFVBD_RETURNS(COARSE));
+  // CPU only: by how much the potential of each body rises from x to `to`, and the sum of the sizes of its terms
+  // [scenes, bodies, 2], float64; infinite where a vertex comes too near a plane. order, ptr: vertices that move, by
+  // body; material [1 | scenes, blocks, 2, lanes], rest [1 | scenes, blocks, 7, lanes] and corner (four times a vertex)
+  // of the tets, by body
+  m.def(
+      "potential_rise(Tensor x, Tensor to, Tensor x_prev, Tensor y, Tensor mass, Tensor energy_data, Tensor origin, "
+      "Tensor material, Tensor rest, Tensor order, Tensor ptr, Tensor other, Tensor corner, Tensor block_ptr, int[] "
+      "data_count, float time_step) -> Tensor");
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");
   m.def(
       "build_plan(Tensor points, Tensor tets, Tensor active, int lanes) -> (Tensor plan, Tensor color_ptr, Tensor "
