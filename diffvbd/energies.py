@@ -219,7 +219,10 @@ class FloorBarrier(VertexEnergy):
 
     def admits(self, x: Tensor, before: Tensor, data: Tensor, origin: Tensor | None, share: float) -> Tensor:
         gap, was = (self._gaps(at, data, origin) for at in (x, before))
-        return ((gap > 0) & (gap >= share * was)).all(-1)
+        planes = data.reshape(data.shape[0], 1, self.planes, 7)
+        terms = planes[..., :3] * (x if origin is None else x + origin)[:, :, None]
+        guard = 8 * torch.finfo(x.dtype).eps * (terms.abs().sum(-1) + planes[..., 3].abs())  # twin of guard() there
+        return ((gap > guard) & (gap >= share * was)).all(-1)
 
     def normal_force(self, x: Tensor, data: Tensor, origin: Tensor | None) -> tuple[Tensor, Tensor]:
         """Force of each plane on each vertex [N], [B, V, planes], and the unit normals [1 | B, planes, 3]."""

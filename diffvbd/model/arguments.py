@@ -80,6 +80,16 @@ def per_tet_density(density: Any, num_tets: int) -> Tensor:
     return density.expand(num_tets).clone()
 
 
+def checked_steps(
+    rigid: Any, start: Any, coarse: Any, acceleration: Any, energies: tuple[Energy, ...], saturation: float | None
+) -> tuple[bool, str, CoarseSpace | None, Anderson | None]:
+    """What steps do besides sweeps: whether free bodies are corrected, where the sweeps of the others start, the coarse
+    space and the acceleration."""
+    rigid, start = checked_correction(rigid, start, energies)
+    coarse = checked_coarse(coarse, energies, saturation)
+    return rigid, start, coarse, checked_acceleration(acceleration, energies, saturation)
+
+
 def checked_correction(rigid: Any, start: Any, energies: tuple[Energy, ...]) -> tuple[bool, str]:
     """Whether free bodies are corrected, and where the sweeps of the others start."""
     touches = any(isinstance(e, (PairBarrier, Friction)) for e in energies)

@@ -21,10 +21,7 @@ from ..mesh import TetMesh
 from ..ops import regimes
 from ..safeguards import FILTER_ETA, SATURATION_EPS
 from .anderson import Anderson, moving_bodies
-from .arguments import (
-    Energy, check_isolated, checked_acceleration, checked_coarse, checked_correction, checked_device, checked_energies,
-    per_tet_density,
-)  # fmt: skip
+from .arguments import Energy, check_isolated, checked_device, checked_energies, checked_steps, per_tet_density
 from .bodies import find_bodies, first_of_body
 from .coarse import CoarseSpace
 from .coarse_plan import plan_of
@@ -121,9 +118,8 @@ class Model:
         self.energy_mask = 0
         for energy in self.energies:
             self.energy_mask |= energy.bit
-        self.rigid, self.start = checked_correction(rigid, start, self.energies)
-        self.coarse = checked_coarse(coarse, self.energies, self.saturation)
-        self.acceleration = checked_acceleration(acceleration, self.energies, self.saturation)
+        checked = checked_steps(rigid, start, coarse, acceleration, self.energies, self.saturation)
+        self.rigid, self.start, self.coarse, self.acceleration = checked
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
 

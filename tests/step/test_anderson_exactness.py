@@ -64,9 +64,7 @@ def rows() -> list[Any]:
 
 
 @pytest.mark.parametrize(("case", "kind", "space", "window", "sweeps", "steps", "tape"), rows())
-def test_step_and_rollout(
-    case: str, kind: str, space: int, window: int, sweeps: int, steps: int, tape: str
-) -> None:
+def test_step_and_rollout(case: str, kind: str, space: int, window: int, sweeps: int, steps: int, tape: str) -> None:
     check(case, kind, space, window, sweeps, steps, tape)
 
 

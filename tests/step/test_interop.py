@@ -211,7 +211,7 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
     if policy != ops.NO_TAPE:
         bars = (torch.ones_like(x), x, tape, corrections)
         arguments["sweep_backward"] = (*fields, *bars, model._plan, *settings, policy, [True] * 5)
-        arguments |= coarse_arguments() if device == "cpu" else {}
+        arguments |= coarse_arguments() | rise_arguments() if device == "cpu" else {}
     return arguments | (fused_arguments(policy) if device == "cuda" else {})
 
 
@@ -226,6 +226,18 @@ def coarse_arguments() -> dict[str, tuple[Any, ...]]:
     last = (plan.sizes, 0.3)
     matrix, _ = torch.ops.diffvbd.coarse_matrix(*given, *last)
     return {"coarse_matrix": (*given, *last), "coarse_matrix_backward": (*given, torch.ones_like(matrix), *last)}
+
+
+def rise_arguments() -> dict[str, tuple[Any, ...]]:
+    """The same of the comparison of two states, which only the CPU has."""
+    mesh = dv.mesh.cube(3, size=0.3)
+    model = dv.Model(mesh, acceleration=dv.Anderson(), energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.1)))
+    moving, x = model._moving, model.rest_points[None].contiguous()
+    material = torch.full((1, *moving.tet.shape, 2), 1e4, dtype=x.dtype).transpose(-1, -2).contiguous()
+    of = model._other_bodies.of
+    given = (x, 1.1 * x, x, x, model.mass[None], model._energy_data, x.new_empty((0,)), material, moving.rest,
+             moving.order, moving.ptr, of, moving.corner, moving.block_ptr)  # fmt: skip
+    return {"potential_rise": (*given, model._data_count, 0.3)}
 
 
 def fused_arguments(policy: int) -> dict[str, tuple[Any, ...]]:
