@@ -198,7 +198,8 @@ class FloorBarrier(VertexEnergy):
     def _columns(self, data: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Normal [1 | B, 1, P, 3], kappa, dhat, damping [1 | B, 1, P]."""
         planes = data.reshape(data.shape[0], 1, self.planes, 7)
-        return planes[..., :3], *planes[..., 4:].unbind(-1)
+        kappa, dhat, damping = planes[..., 4:].unbind(-1)
+        return planes[..., :3], kappa, dhat, damping
 
     def _gaps(self, x: Tensor, data: Tensor, origin: Tensor | None) -> Tensor:
         """[B, V, P]"""

@@ -101,6 +101,11 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "int[] sizes, float time_step", "Tensor matrix, Tensor factor, ");
   define(m, "coarse_matrix_backward", DIFFVBD_ARGUMENTS(COARSE), "Tensor bar, int[] sizes, float time_step",
          DIFFVBD_RETURNS(COARSE));
+  // CPU only: the combination of iterates, states [2, window + 1, scenes, vertices, 3] (of which each cycle began, and
+  // ended), the inverse of each body's system [scenes, bodies, window, window] and its solution
+  m.def(
+      "anderson_combine(Tensor states, Tensor mass, Tensor order, Tensor ptr, float regularization) -> (Tensor to, "
+      "Tensor inverse, Tensor gamma)");
   // CPU only: by how much the potential of each body rises from x to `to`, and the sum of the sizes of its terms
   // [scenes, bodies, 2], float64; infinite where a vertex comes too near a plane. order, ptr: vertices that move, by
   // body; material [1 | scenes, blocks, 2, lanes], rest [1 | scenes, blocks, 7, lanes] and corner (four times a vertex)

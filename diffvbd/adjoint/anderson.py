@@ -20,6 +20,7 @@ from torch.autograd import Function
 from .. import ops
 from ..model.model import Model
 from ..ops import no_second_derivative, of_inputs
+from ..ops.anderson import anderson_combine
 from ..ops.detect import segment_sum
 from .rise import RiseParts, rise_parts, rises
 from .sweep import sweep
@@ -91,7 +92,7 @@ def run_sweeps(model: Model, fields: ops.SweepFields, settings: ops.SweepSetting
         after.append(x)
         if n and not ends:
             before, after = before[-model.acceleration.window - 1 :], after[-model.acceleration.window - 1 :]
-            x, kept = _Combine.apply(fields.mass, parts, len(before), *before, *after)
+            x, kept, *_ = _Combine.apply(fields.mass, parts, len(before), *before, *after)
             taken.append(kept)
     return Swept(x, corrections, taken)
 
@@ -101,33 +102,33 @@ def none_taken(model: Model, x: Tensor) -> Tensor:
     return x.new_empty((len(x), 0, model._moving.number), dtype=torch.bool)
 
 
-class _Combination(NamedTuple):
-    """The small systems of all bodies, and what they are made of; vectors [B, V, 3, window], the last dimension that of
-    differences."""
-
-    residual: Tensor  # f_k, [B, V, 3]
-    of_residuals: Tensor  # dF
-    of_ends: Tensor  # dG
-    inverse: Tensor  # [B, bodies, window, window]
-    gamma: Tensor  # [B, bodies, window]
-
-
-def _combination(parts: RiseParts, mass: Tensor, before: tuple[Tensor, ...], after: tuple[Tensor, ...]
-                 ) -> _Combination:  # fmt: skip
-    residuals = [g - x for x, g in zip(before, after, strict=True)]
-    of_residuals, of_ends = (torch.stack([b - a for a, b in zip(v[:-1], v[1:], strict=True)], -1)
-                             for v in (residuals, after))  # fmt: skip
-    window = len(before) - 1
+def _combined(parts: RiseParts, mass: Tensor, states: tuple[Tensor, ...], count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The combination, and of each body's small system the inverse and the solution, as ops.anderson_combine."""
+    moving = parts.model._moving
+    if not mass.is_cuda:
+        stacked = torch.stack(states).unflatten(0, (2, count))
+        return anderson_combine(stacked, mass, moving.order, moving.ptr, REGULARIZATION)
+    residual, of_residuals, of_ends = _differences(states, count)
+    window = count - 1
     weighted = mass[..., None, None] * of_residuals
-    others = torch.cat((of_residuals, residuals[-1][..., None]), -1)
+    others = torch.cat((of_residuals, residual[..., None]), -1)
     sums = _sums(parts, (weighted[..., None] * others[..., None, :]).sum(2).flatten(-2))
     normal, right = sums.unflatten(-1, (window, window + 1)).split((window, 1), -1)
-    eye = torch.eye(window, dtype=mass.dtype, device=mass.device)
     diagonal = normal.diagonal(dim1=-2, dim2=-1)
     # where nothing moves any more nothing is to be solved; torch's inverse waits for no device
-    scale = torch.where(diagonal > 0, diagonal * REGULARIZATION, 1)
-    inverse = torch.linalg.inv_ex(normal + scale[..., None] * eye)[0]
-    return _Combination(residuals[-1], of_residuals, of_ends, inverse, (inverse @ right)[..., 0])
+    more = torch.where(diagonal > 0, diagonal * REGULARIZATION, 1)
+    inverse = torch.linalg.inv_ex(normal + torch.diag_embed(more))[0]
+    gamma = (inverse @ right)[..., 0]
+    return states[-1] - _weighted(of_ends, _of_vertices(parts, gamma)), inverse, gamma
+
+
+def _differences(states: tuple[Tensor, ...], count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The last residual [B, V, 3], and the differences of residuals and of ends [B, V, 3, window]."""
+    ends = states[count:]
+    residuals = [g - x for x, g in zip(states[:count], ends, strict=True)]
+    of_residuals, of_ends = (torch.stack([b - a for a, b in zip(v[:-1], v[1:], strict=True)], -1)
+                             for v in (residuals, ends))  # fmt: skip
+    return residuals[-1], of_residuals, of_ends
 
 
 def _sums(parts: RiseParts, values: Tensor) -> Tensor:
@@ -147,22 +148,22 @@ def _weighted(vectors: Tensor, weights: Tensor) -> Tensor:
 
 
 class _Combine(Function):
-    """The next iterate [B, V, 3], and whether each body's is the combination, bool [B, bodies]. Arguments: masses
-    [1 | B, V], of the comparison, the number of iterates, these, and what a cycle made of each."""
+    """The next iterate [B, V, 3]; whether each body's is the combination, bool [B, bodies]; and its system, as of
+    _combined(). Arguments: masses [1 | B, V], of the comparison, the number of iterates, these, and what a cycle made
+    of each."""
 
     @staticmethod
-    def forward(mass: Tensor, parts: RiseParts, count: int, *states: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(mass: Tensor, parts: RiseParts, count: int, *states: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         last = states[-1]
-        c = _combination(parts, mass, states[:count], states[count:])
-        to = last - _weighted(c.of_ends, _of_vertices(parts, c.gamma))
+        to, inverse, gamma = _combined(parts, mass, states, count)
         taken = ~rises(parts, last, to)
-        return torch.where(_of_vertices(parts, taken)[..., None], to, last), taken
+        return torch.where(_of_vertices(parts, taken)[..., None], to, last), taken, inverse, gamma
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
         mass, ctx.parts, ctx.count, *states = inputs
-        ctx.save_for_backward(mass, output[1], *states)
-        ctx.mark_non_differentiable(output[1])
+        ctx.save_for_backward(mass, *output[1:], *states)
+        ctx.mark_non_differentiable(*output[1:])
         ctx.set_materialize_grads(False)
 
     @staticmethod
@@ -182,16 +183,14 @@ class _Combine(Function):
 class _CombineBackward(Function):
     @staticmethod
     def forward(bar: Tensor, parts: RiseParts, count: int, needs: tuple[bool, ...], mass: Tensor, taken: Tensor,
-                *states: Tensor) -> tuple[Tensor, ...]:  # fmt: skip
-        c = _combination(parts, mass, states[:count], states[count:])
+                inverse: Tensor, gamma: Tensor, *states: Tensor) -> tuple[Tensor, ...]:  # fmt: skip
+        f, of_f, of_ends = _differences(states, count)
         # a combination that was not taken may be no number
         own = torch.where(_of_vertices(parts, taken)[..., None], bar, 0)
-        gamma_bar = -_sums(parts, (c.of_ends * own[..., None]).sum(2))
-        some = taken[..., None]
-        e = torch.where(some, (c.inverse @ gamma_bar[..., None])[..., 0], 0)
-        gamma = torch.where(some, c.gamma, 0)
-        e, gamma = _of_vertices(parts, e), _of_vertices(parts, gamma)
-        m, f, of_f = mass[..., None], c.residual, c.of_residuals
+        gamma_bar = -_sums(parts, (of_ends * own[..., None]).sum(2))
+        e = torch.where(taken[..., None], (inverse @ gamma_bar[..., None])[..., 0], 0)
+        e, gamma = (_of_vertices(parts, t) for t in (e, torch.where(taken[..., None], gamma, 0)))
+        m = mass[..., None]
         along, solved = _weighted(of_f, e), _weighted(of_f, gamma)  # dF e, dF gamma
         of_f_bar = (f - solved)[..., None] * e[:, :, None] - along[..., None] * gamma[:, :, None]
         of_f_bar = m[..., None] * (of_f_bar - 2 * REGULARIZATION * of_f * (e * gamma)[:, :, None])

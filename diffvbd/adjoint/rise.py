@@ -10,8 +10,8 @@ from torch import Tensor
 from .. import ops
 from ..model.anderson import MovingBodies
 from ..model.model import Model
+from ..ops.anderson import potential_rise
 from ..ops.detect import segment_sum
-from ..ops.rise import potential_rise
 from .potential import PAIRS
 
 ROUNDINGS = 8  # ulps of the terms by which a sum may rise all the same; twin of kRounding in csrc/coarse/length.h

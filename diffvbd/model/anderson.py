@@ -55,8 +55,8 @@ class MovingBodies(NamedTuple):
         return self.ptr.shape[0] - 1
 
     def to(self, device: torch.device, dtype: torch.dtype) -> MovingBodies:
-        *index, rest = (t.to(device) for t in self)
-        return MovingBodies(*index, rest.to(dtype))
+        placed = MovingBodies(*(t.to(device) for t in self))
+        return placed._replace(rest=placed.rest.to(dtype))
 
 
 def moving_bodies(points: Tensor, tets: Tensor, pinned: Tensor, elastic: bool) -> MovingBodies:

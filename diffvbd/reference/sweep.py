@@ -187,13 +187,14 @@ def _in_cycles(
     every = None if coarse is None else coarse.scene.model.coarse.every
     cycles = [sweeps] if anderson is None else anderson.cycles(sweeps, every)
     combines = len(cycles) > 1
-    lengths, combined, matrix = [], 0, None if coarse is None else coarse.begin(x_prev)
+    lengths, combined, matrix = [], 0, y if coarse is None else coarse.begin(x_prev)
     refused = torch.zeros((), dtype=torch.int64, device=y.device)
     left = sweeps
     if coarse is not None:
         state, left = swept(state, min(sweeps, 1), sweeps == 1), sweeps - min(sweeps, 1)
         count = coarse.scene.model.coarse.corrections(sweeps)
-        cycles = [min(every, left - n * every) for n in range(count)]
+        most = coarse.scene.model.coarse.every
+        cycles = [min(most, left - n * most) for n in range(count)]
     before, after = [], []
     for n, count in enumerate(cycles):
         before.append(state)
@@ -205,7 +206,7 @@ def _in_cycles(
         left -= count
         state = swept(state, count, left == 0)
         after.append(state)
-        if combines and n and left > 0:
+        if anderson is not None and combines and n and left > 0:
             state = anderson.combine(before, after, y, x_prev, None if taken is None else taken[combined])
             combined += 1
     return state, torch.stack(lengths) if lengths else y.new_zeros((0,))

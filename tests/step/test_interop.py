@@ -211,7 +211,7 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
     if policy != ops.NO_TAPE:
         bars = (torch.ones_like(x), x, tape, corrections)
         arguments["sweep_backward"] = (*fields, *bars, model._plan, *settings, policy, [True] * 5)
-        arguments |= coarse_arguments() | rise_arguments() if device == "cpu" else {}
+        arguments |= coarse_arguments() | anderson_arguments() if device == "cpu" else {}
     return arguments | (fused_arguments(policy) if device == "cuda" else {})
 
 
@@ -228,8 +228,8 @@ def coarse_arguments() -> dict[str, tuple[Any, ...]]:
     return {"coarse_matrix": (*given, *last), "coarse_matrix_backward": (*given, torch.ones_like(matrix), *last)}
 
 
-def rise_arguments() -> dict[str, tuple[Any, ...]]:
-    """The same of the comparison of two states, which only the CPU has."""
+def anderson_arguments() -> dict[str, tuple[Any, ...]]:
+    """The same of Anderson's method, which CUDA has in torch."""
     mesh = dv.mesh.cube(3, size=0.3)
     model = dv.Model(mesh, acceleration=dv.Anderson(), energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.1)))
     moving, x = model._moving, model.rest_points[None].contiguous()
@@ -237,7 +237,9 @@ def rise_arguments() -> dict[str, tuple[Any, ...]]:
     of = model._other_bodies.of
     given = (x, 1.1 * x, x, x, model.mass[None], model._energy_data, x.new_empty((0,)), material, moving.rest,
              moving.order, moving.ptr, of, moving.corner, moving.block_ptr)  # fmt: skip
-    return {"potential_rise": (*given, model._data_count, 0.3)}
+    states = torch.rand(2, 3, *x.shape, dtype=x.dtype)
+    return {"potential_rise": (*given, model._data_count, 0.3),
+            "anderson_combine": (states, model._mass[None], moving.order, moving.ptr, 1e-6)}  # fmt: skip
 
 
 def fused_arguments(policy: int) -> dict[str, tuple[Any, ...]]:
