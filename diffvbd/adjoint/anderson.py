@@ -82,6 +82,7 @@ def run_sweeps(model: Model, fields: ops.SweepFields, settings: ops.SweepSetting
     parts = rise_parts(model, fields, numbers.time_step)
     assert model.acceleration is not None
     before, after, taken = [], [], []
+    combine = _Combine.apply if torch.is_grad_enabled() else _Combine.forward  # whose call costs a sweep
     for n, count in enumerate(cycles):
         ends = n + 1 == len(cycles)
         now = within._replace(sweeps=count, numbers=numbers if ends else within.numbers)
@@ -92,7 +93,7 @@ def run_sweeps(model: Model, fields: ops.SweepFields, settings: ops.SweepSetting
         after.append(x)
         if n and not ends:
             before, after = before[-model.acceleration.window - 1 :], after[-model.acceleration.window - 1 :]
-            x, kept, *_ = _Combine.apply(fields.mass, parts, len(before), *before, *after)
+            x, kept, *_ = combine(fields.mass, parts, len(before), *before, *after)
             taken.append(kept)
     return Swept(x, corrections, taken)
 
