@@ -285,7 +285,7 @@ def markdown(results: dict[str, Any]) -> str:
         header = ("scene", "vertices", "functions", "method", "1 %: K", "ms", "sweeps", "equal K", "0.01 %: K", "ms",
                   "sweeps", "equal K", "error left", "targets")  # fmt: skip
         parts.append("## Time to an error, and what is left at the most sweeps\n\n" + markdown_table(
-            header, [_time_row(row, method) for row in rows for method in (*METHODS, "plain") if method in row]))  # fmt: skip
+            header, [_time_row(row, name) for row in rows for name in (*METHODS, "plain") if name in row]))  # fmt: skip
         counts = [row["sweeps"] for row in rows[0]["two_level"]]
         for method in METHODS:
             table = [[row["scene"], *(r["error"] for r in row[method])] for row in rows if method in row]
