@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
+from ..model.anderson import MovingBodies
 from ..model.model import Model
 from ..ops import no_second_derivative, of_inputs
 from ..ops.anderson import anderson_combine
@@ -103,9 +104,10 @@ def none_taken(model: Model, x: Tensor) -> Tensor:
     return x.new_empty((len(x), 0, model._moving.number), dtype=torch.bool)
 
 
-def _combined(parts: RiseParts, mass: Tensor, states: tuple[Tensor, ...], count: int) -> tuple[Tensor, Tensor, Tensor]:
+def _combined(
+    moving: MovingBodies, mass: Tensor, states: tuple[Tensor, ...], count: int
+) -> tuple[Tensor, Tensor, Tensor]:
     """The combination, and of each body's small system the inverse and the solution, as ops.anderson_combine."""
-    moving = parts.model._moving
     if not mass.is_cuda:
         stacked = torch.stack(states).unflatten(0, (2, count))
         return anderson_combine(stacked, mass, moving.order, moving.ptr, REGULARIZATION)
@@ -113,14 +115,14 @@ def _combined(parts: RiseParts, mass: Tensor, states: tuple[Tensor, ...], count:
     window = count - 1
     weighted = mass[..., None, None] * of_residuals
     others = torch.cat((of_residuals, residual[..., None]), -1)
-    sums = _sums(parts, (weighted[..., None] * others[..., None, :]).sum(2).flatten(-2))
+    sums = _sums(moving, (weighted[..., None] * others[..., None, :]).sum(2).flatten(-2))
     normal, right = sums.unflatten(-1, (window, window + 1)).split((window, 1), -1)
     diagonal = normal.diagonal(dim1=-2, dim2=-1)
     # where nothing moves any more nothing is to be solved; torch's inverse waits for no device
     more = torch.where(diagonal > 0, diagonal * REGULARIZATION, 1)
     inverse = torch.linalg.inv_ex(normal + torch.diag_embed(more))[0]
     gamma = (inverse @ right)[..., 0]
-    return states[-1] - _weighted(of_ends, _of_vertices(parts, gamma)), inverse, gamma
+    return states[-1] - _weighted(of_ends, _of_vertices(moving, gamma)), inverse, gamma
 
 
 def _differences(states: tuple[Tensor, ...], count: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -132,15 +134,14 @@ def _differences(states: tuple[Tensor, ...], count: int) -> tuple[Tensor, Tensor
     return residuals[-1], of_residuals, of_ends
 
 
-def _sums(parts: RiseParts, values: Tensor) -> Tensor:
+def _sums(moving: MovingBodies, values: Tensor) -> Tensor:
     """Values of vertices [B, V, C] summed over each body, [B, bodies, C]."""
-    moving = parts.model._moving
     return segment_sum(values.contiguous(), moving.order, moving.ptr)
 
 
-def _of_vertices(parts: RiseParts, values: Tensor) -> Tensor:
+def _of_vertices(moving: MovingBodies, values: Tensor) -> Tensor:
     """Values of bodies [B, bodies, ...] at their vertices, [B, V, ...]; 0 elsewhere."""
-    return torch.cat((values, values.new_zeros((len(values), 1, *values.shape[2:]))), 1)[:, parts.model._moving.of]
+    return torch.cat((values, values.new_zeros((len(values), 1, *values.shape[2:]))), 1)[:, moving.of]
 
 
 def _weighted(vectors: Tensor, weights: Tensor) -> Tensor:
@@ -155,14 +156,15 @@ class _Combine(Function):
 
     @staticmethod
     def forward(mass: Tensor, parts: RiseParts, count: int, *states: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        last = states[-1]
-        to, inverse, gamma = _combined(parts, mass, states, count)
+        last, moving = states[-1], parts.model._moving
+        to, inverse, gamma = _combined(moving, mass, states, count)
         taken = ~rises(parts, last, to)
-        return torch.where(_of_vertices(parts, taken)[..., None], to, last), taken, inverse, gamma
+        return torch.where(_of_vertices(moving, taken)[..., None], to, last), taken, inverse, gamma
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        mass, ctx.parts, ctx.count, *states = inputs
+        mass, parts, ctx.count, *states = inputs
+        ctx.moving = parts.model._moving
         ctx.save_for_backward(mass, *output[1:], *states)
         ctx.mark_non_differentiable(*output[1:])
         ctx.set_materialize_grads(False)
@@ -173,7 +175,7 @@ class _Combine(Function):
         if grads[0] is None:
             return (None,) * len(needs)
         needs = (needs[0], *needs[3:])
-        out = of_inputs(_CombineBackward.apply(grads[0], ctx.parts, ctx.count, needs, *ctx.saved_tensors), needs, 0)
+        out = of_inputs(_CombineBackward.apply(grads[0], ctx.moving, ctx.count, needs, *ctx.saved_tensors), needs, 0)
         return (out[0], None, None, *out[1:])
 
     @staticmethod
@@ -183,14 +185,14 @@ class _Combine(Function):
 
 class _CombineBackward(Function):
     @staticmethod
-    def forward(bar: Tensor, parts: RiseParts, count: int, needs: tuple[bool, ...], mass: Tensor, taken: Tensor,
+    def forward(bar: Tensor, moving: MovingBodies, count: int, needs: tuple[bool, ...], mass: Tensor, taken: Tensor,
                 inverse: Tensor, gamma: Tensor, *states: Tensor) -> tuple[Tensor, ...]:  # fmt: skip
         f, of_f, of_ends = _differences(states, count)
         # a combination that was not taken may be no number
-        own = torch.where(_of_vertices(parts, taken)[..., None], bar, 0)
-        gamma_bar = -_sums(parts, (of_ends * own[..., None]).sum(2))
+        own = torch.where(_of_vertices(moving, taken)[..., None], bar, 0)
+        gamma_bar = -_sums(moving, (of_ends * own[..., None]).sum(2))
         e = torch.where(taken[..., None], (inverse @ gamma_bar[..., None])[..., 0], 0)
-        e, gamma = (_of_vertices(parts, t) for t in (e, torch.where(taken[..., None], gamma, 0)))
+        e, gamma = (_of_vertices(moving, t) for t in (e, torch.where(taken[..., None], gamma, 0)))
         m = mass[..., None]
         along, solved = _weighted(of_f, e), _weighted(of_f, gamma)  # dF e, dF gamma
         of_f_bar = (f - solved)[..., None] * e[:, :, None] - along[..., None] * gamma[:, :, None]
