@@ -111,6 +111,12 @@ def _combined(
     if not mass.is_cuda:
         stacked = torch.stack(states).unflatten(0, (2, count))
         return anderson_combine(stacked, mass, moving.order, moving.ptr, REGULARIZATION)
+    return _combined_in_torch(moving, mass, states, count)
+
+
+def _combined_in_torch(moving: MovingBodies, mass: Tensor, states: tuple[Tensor, ...], count: int
+                       ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """_combined() for CUDA."""
     residual, of_residuals, of_ends = _differences(states, count)
     window = count - 1
     weighted = mass[..., None, None] * of_residuals

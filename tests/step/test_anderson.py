@@ -9,7 +9,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import reference
-from diffvbd.adjoint.anderson import _Combine, combinations_of, cycles_of
+from diffvbd.adjoint.anderson import _Combine, _combined, _combined_in_torch, combinations_of, cycles_of
 from diffvbd.adjoint.rise import _rise, rise_parts, rises
 from diffvbd.adjoint.sweep import sweep
 from diffvbd.ops.anderson import potential_rise
@@ -148,6 +148,26 @@ def test_the_potential_of_two_states(case: str) -> None:
     assert not rises(parts, x, to)[expected < 0].any() and rises(parts, to, x)[expected < 0].all()
 
 
+@pytest.mark.parametrize("case", ("plain", "free_batch"))
+@pytest.mark.parametrize("count", [2, 4, 11])
+def test_the_combination_of_iterates(case: str, count: int) -> None:
+    """Compiled, in torch as CUDA has it, and least squares: the rest of the residual is as small as it can be."""
+    model, parts, x, *_ = comparison(case)
+    generator = torch.Generator().manual_seed(1)
+    states = [x + torch.rand(x.shape, generator=generator, dtype=x.dtype) for _ in range(2 * count)]
+    found = [make(model._moving, parts.fields.mass, tuple(states), count) for make in (_combined, _combined_in_torch)]
+    for one, two in zip(*found, strict=True):
+        assert relative_error(one, two) <= tolerance("sum")
+    to, _, gamma = found[0]
+    free = ~model.pinned
+    assert torch.equal(to[:, ~free], states[-1][:, ~free]) and not torch.equal(to, states[-1])
+    residuals = torch.stack([g - x for x, g in zip(states[:count], states[count:], strict=True)])[:, :, free]
+    root = parts.fields.mass[:, free, None].sqrt()
+    of_scene = (root * (residuals[1:] - residuals[:-1])).flatten(2).permute(1, 2, 0)
+    least = torch.linalg.lstsq(of_scene, (root * residuals[-1]).flatten(1)[..., None]).solution[..., 0]
+    assert model._moving.number == 1 and relative_error(gamma[:, 0], least) <= tolerance("regularized")
+
+
 def test_what_is_no_number_or_below_a_floor_is_not_taken() -> None:
     _, parts, x, to, _ = comparison("floor_active")
     for bad in (torch.full_like(to, torch.nan), torch.full_like(to, torch.inf), to - 100):
@@ -189,7 +209,7 @@ def test_checkpoints_and_the_reference_as_a_route() -> None:
     assert torch.equal(found[0][0], found[1][0]) and found[0][1].abs().max() > 0
     assert relative_error(found[1][1], found[0][1]) <= tolerance("schedules")
     assert relative_error(found[2][0], found[0][0]) <= tolerance("coarse_forward")
-    assert relative_error(found[2][1], found[0][1]) <= 1e3 * tolerance("adjoint")
+    assert relative_error(found[2][1], found[0][1]) <= tolerance("schedules")
 
 
 def test_solve_and_the_equation() -> None:
