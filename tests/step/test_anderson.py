@@ -108,6 +108,24 @@ def test_scenes_and_bodies_do_not_mix(coarse: dv.CoarseSpace | None) -> None:
         assert relative_error(single[: one.num_vertices], own) <= tolerance("coarse_forward")
 
 
+def test_same_bits_on_one_thread_and_on_two() -> None:
+    mesh = dv.mesh.box((16, 16, 16), (1.0, 1.0, 1.0))
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, coarse="auto", relaxation=1.5, acceleration=dv.Anderson(2))
+    x = model.rest_points.requires_grad_()
+    threads, found = torch.get_num_threads(), []
+    try:
+        for n in (1, 2):
+            torch.set_num_threads(n)
+            with dv.acceleration.record() as taken:
+                x_end, v_end = dv.step(model, x, torch.zeros_like(x), mu=1e6, lam=1e6, time_step=1 / 60, sweeps=14)
+            assert taken[0].any()
+            (bar,) = torch.autograd.grad(x_end.square().sum() + v_end.square().sum(), x)
+            found.append((x_end.detach(), bar))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(one, two) for one, two in zip(*found, strict=True)) and found[0][1].abs().max() > 0
+
+
 def comparison(case: str, dtype: torch.dtype = torch.float64) -> tuple[dv.Model, Any, Tensor, Tensor, Any]:
     """A step's parts, two states of it, and the reference of its potential."""
     scene = build_scene(case, "structured", "small")
@@ -209,7 +227,7 @@ def test_checkpoints_and_the_reference_as_a_route() -> None:
     assert torch.equal(found[0][0], found[1][0]) and found[0][1].abs().max() > 0
     assert relative_error(found[1][1], found[0][1]) <= tolerance("schedules")
     assert relative_error(found[2][0], found[0][0]) <= tolerance("coarse_forward")
-    assert relative_error(found[2][1], found[0][1]) <= tolerance("schedules")
+    assert relative_error(found[2][1], found[0][1]) <= tolerance("accelerated")
 
 
 def test_solve_and_the_equation() -> None:
