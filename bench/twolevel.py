@@ -3,7 +3,8 @@
 Error: the largest distance of a vertex from where converged steps of the same h end, over the largest motion, after 30
 steps. Time: a whole step, on one thread, everything included; also in plain sweeps of the same scene, and as the K of a
 plain step that takes as long. With coarse corrections relaxation is 1.5; plain sweeps have the best of three
-relaxations and two starts at each K.
+relaxations and two starts at each K. Anderson acceleration: of cycles with corrections, window 2; and of plain sweeps,
+window 5, relaxation 1.3.
 """
 
 from __future__ import annotations
@@ -27,6 +28,12 @@ SWEEPS = (1, 2, 4, 5, 7, 8, 10, 11, 13, 14, 16, 17, 19, 20, 22, 23, 25, 31, 40, 
 PLAIN_SWEEPS = (5, 10, 20, 50, 100, 200, 300)
 LAST = 1000  # plain sweeps where those do not reach 1 %
 PLAIN = tuple((relaxation, start) for relaxation in (1.0, 1.6, 1.8) for start in ("auto", "inertia"))
+# methods beside plain sweeps: name, arguments of Scene.model
+METHODS: dict[str, dict[str, Any]] = {
+    "two_level": {},
+    "two_level_anderson": {"window": 2},
+    "plain_anderson": {"coarse": None, "relaxation": 1.3, "start": "inertia", "window": 5},
+}
 VIOLENT_SWEEPS = (13, 25, 49)
 ROUNDS = 7  # of times
 LEVELS = (0.01, 1e-4)
@@ -74,8 +81,9 @@ def measure(scene: Scene, quick: bool) -> dict[str, Any]:
     def error(model: dv.Model, sweeps: int) -> float:
         return float((scene.end(model, sweeps, steps) - goal).norm(dim=-1).max()) / found["motion"]
 
-    model = scene.model()
-    two = [{"sweeps": k, "error": error(model, k)} for k in (SWEEPS[:6] if quick else SWEEPS)]
+    own = {name: scene.model(**options) for name, options in METHODS.items()}
+    counts = SWEEPS[:6] if quick else SWEEPS
+    found_by = {name: [{"sweeps": k, "error": error(model, k)} for k in counts] for name, model in own.items()}
     models = {options: scene.model(None, *options) for options in PLAIN}
     plain = []
     for k in PLAIN_SWEEPS[:4] if quick else PLAIN_SWEEPS:
@@ -84,20 +92,21 @@ def measure(scene: Scene, quick: bool) -> dict[str, Any]:
     if not quick and plain[-1]["error"] > LEVELS[0]:
         options = (plain[-1]["relaxation"], plain[-1]["start"])
         plain.append({**plain[-1], "sweeps": LAST, "error": error(models[options], LAST)})
-    least_times(scene, [(model, two), (models[PLAIN[0]], plain)], 2 if quick else ROUNDS)
+    timed = [(own[name], rows) for name, rows in found_by.items()]
+    least_times(scene, [*timed, (models[PLAIN[0]], plain)], 2 if quick else ROUNDS)
     sweep, fixed = line(plain)
     reached = {}
-    for name, rows in (("two_level", two), ("plain", plain)):
+    for name, rows in (*found_by.items(), ("plain", plain)):
         for level in LEVELS:
             at = first_below(rows, level)
             reached[f"{name}_{level:g}"] = None if at is None else {"K": at["sweeps"], "ms": at["ms"],
                 "sweeps": at["ms"] / sweep, "plain_K": (at["ms"] - fixed) / sweep}  # fmt: skip
-    row = {"scene": scene.name, "vertices": scene.mesh.num_vertices, "functions": functions(model),
+    row = {"scene": scene.name, "vertices": scene.mesh.num_vertices, "functions": functions(own["two_level"]),
            "reference": found, "sweep_ms": sweep, "fixed_ms": fixed, "targets": scene.targets, **reached,
-           "two_level": two, "plain": plain}  # fmt: skip
+           **found_by, "plain": plain}  # fmt: skip
     if scene.name == "hanging bar":
         row["at_rest"] = at_rest(quick)
-    _say(scene.name, {k: v for k, v in row.items() if k not in ("two_level", "plain")})
+    _say(scene.name, {k: v for k, v in row.items() if k not in (*METHODS, "plain")})
     return row
 
 
@@ -276,12 +285,12 @@ def markdown(results: dict[str, Any]) -> str:
         header = ("scene", "vertices", "functions", "method", "1 %: K", "ms", "sweeps", "equal K", "0.01 %: K", "ms",
                   "sweeps", "equal K", "error left", "targets")  # fmt: skip
         parts.append("## Time to an error, and what is left at the most sweeps\n\n" + markdown_table(
-            header, [_time_row(row, method) for row in rows for method in ("two_level", "plain")]))  # fmt: skip
+            header, [_time_row(row, name) for row in rows for name in (*METHODS, "plain") if name in row]))  # fmt: skip
         counts = [row["sweeps"] for row in rows[0]["two_level"]]
-        table = [[row["scene"], *(r["error"] for r in row["two_level"])] for row in rows]
-        parts.append(
-            "## Error over motion by K, with corrections\n\n" + markdown_table(["scene", *map(str, counts)], table)
-        )
+        for method in METHODS:
+            table = [[row["scene"], *(r["error"] for r in row[method])] for row in rows if method in row]
+            title = f"## Error over motion by K, {method.replace('_', ' ')}\n\n"
+            parts.append(title + markdown_table(["scene", *map(str, counts)], table))
         table = [[row["scene"], *(f"{r['error']:.3g} ({r['relaxation']:g}, {r['start']})" for r in row["plain"][:7])]
                  for row in rows]  # fmt: skip
         counts = [row["sweeps"] for row in rows[0]["plain"][:7]]

@@ -31,9 +31,11 @@ class Scene:
         x = torch.from_numpy(self.mesh.points.copy()) if self.x is None else self.x
         return x, torch.zeros_like(x) if self.v is None else self.v
 
-    def model(self, coarse: Any = "auto", relaxation: float = RELAXATION, start: Any = "auto") -> dv.Model:
+    def model(self, coarse: Any = "auto", relaxation: float = RELAXATION, start: Any = "auto", window: int = 0
+              ) -> dv.Model:  # fmt: skip
+        """window: of Anderson's method; 0: without."""
         return dv.Model(self.mesh, pinned=torch.from_numpy(self.pinned), relaxation=relaxation, start=start,
-                        coarse=coarse)  # fmt: skip
+                        coarse=coarse, acceleration=dv.Anderson(window) if window else None)  # fmt: skip
 
     def end(self, model: dv.Model, sweeps: int, steps: int) -> Tensor:
         return self.rolled(model, sweeps, steps, "last").x[-1]

@@ -12,11 +12,12 @@ from ._version import __version__ as __version__
 from .adjoint.routes import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
 from .contact.barrier import Friction, PairBarrier
 from .energies import Anchor, FloorBarrier, StableNeoHookean
-from .inspect import coarse
+from .inspect import acceleration, coarse
 from .inspect.debug import debug_checks
 from .inspect.diagnose import Diagnosis, diagnose
 from .inspect.gradcheck import GradientCheck, check_gradients
 from .mesh import TetMesh
+from .model.anderson import Anderson
 from .model.coarse import CoarseSpace
 from .model.model import Model
 from .model.moduli import lame, young_poisson
@@ -29,6 +30,7 @@ from .step.step import step
 
 __all__ = [
     "Anchor",
+    "Anderson",
     "BinomialCheckpoints",
     "CoarseSpace",
     "Diagnosis",
@@ -46,6 +48,7 @@ __all__ = [
     "TetMesh",
     "Trajectory",
     "Unrolled",
+    "acceleration",
     "check_gradients",
     "coarse",
     "colliders",

@@ -100,6 +100,14 @@ class VertexEnergy:
         """
         raise NotImplementedError(f"{type(self).__name__} has no gradient() for GlobalAdjoint and solve")
 
+    def value(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
+        """h^2 E [kg m^2] of every vertex, [B, V]; arguments as of gradient(). Anderson's method compares it on CUDA."""
+        raise NotImplementedError(f"{type(self).__name__} has no value() for Anderson's method")
+
+    def admits(self, x: Tensor, before: Tensor, data: Tensor, origin: Tensor | None, share: float) -> Tensor | None:
+        """Where a step from ``before`` to x keeps a share of what limits it, bool [B, V]; None where nothing does."""
+        return None
+
 
 def _barrier_slope(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     """b'(gap) [N] of the log barrier; 0 where a gap is not in (0, dhat)."""
@@ -179,19 +187,43 @@ class FloorBarrier(VertexEnergy):
         return torch.cat([normal.expand(*shape, 3), torch.stack(columns, -1)], -1).reshape(scenes, -1)
 
     def gradient(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
-        planes = data.reshape(data.shape[0], 1, self.planes, 7)
-        normal, (height, kappa, dhat, damping) = planes[..., :3], planes[..., 3:].unbind(-1)
-        if origin is not None:
-            height = height - (normal * origin[:, :, None]).sum(-1)
-
-        def gap_of(x: Tensor) -> Tensor:
-            return (normal * x[:, :, None]).sum(-1) - height  # [B, V, P]
-
+        normal, kappa, dhat, damping = self._columns(data)
+        gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
         travel = (normal * (x - x_prev)[:, :, None]).sum(-1)
-        first = _barrier_slope(gap_of(x), kappa, dhat)
-        damped = (gap_of(x_prev) < dhat) & (travel < 0)
+        first = _barrier_slope(gap, kappa, dhat)
+        damped = (before < dhat) & (travel < 0)
         size = h * h * first + h * torch.where(damped, damping * travel, torch.zeros_like(travel))
         return (size[..., None] * normal).sum(-2)
+
+    def _columns(self, data: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Normal [1 | B, 1, P, 3], kappa, dhat, damping [1 | B, 1, P]."""
+        planes = data.reshape(data.shape[0], 1, self.planes, 7)
+        kappa, dhat, damping = planes[..., 4:].unbind(-1)
+        return planes[..., :3], kappa, dhat, damping
+
+    def _gaps(self, x: Tensor, data: Tensor, origin: Tensor | None) -> Tensor:
+        """[B, V, P]"""
+        planes = data.reshape(data.shape[0], 1, self.planes, 7)
+        normal, height = planes[..., :3], planes[..., 3]
+        if origin is not None:
+            height = height - (normal * origin[:, :, None]).sum(-1)
+        return (normal * x[:, :, None]).sum(-1) - height
+
+    def value(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
+        normal, kappa, dhat, damping = self._columns(data)
+        gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
+        d = torch.where((gap > 0) & (gap < dhat), gap, dhat)
+        travel = (normal * (x - x_prev)[:, :, None]).sum(-1)
+        damped = (before < dhat) & (travel < 0)
+        total = -h * h * kappa * (d - dhat) ** 2 * torch.log(d / dhat)
+        return (total + torch.where(damped, damping * (h / 2) * travel**2, 0)).sum(-1)
+
+    def admits(self, x: Tensor, before: Tensor, data: Tensor, origin: Tensor | None, share: float) -> Tensor:
+        gap, was = (self._gaps(at, data, origin) for at in (x, before))
+        planes = data.reshape(data.shape[0], 1, self.planes, 7)
+        terms = planes[..., :3] * (x if origin is None else x + origin)[:, :, None]
+        guard = 8 * torch.finfo(x.dtype).eps * (terms.abs().sum(-1) + planes[..., 3].abs())  # twin of guard() there
+        return ((gap > guard) & (gap >= share * was)).all(-1)
 
     def normal_force(self, x: Tensor, data: Tensor, origin: Tensor | None) -> tuple[Tensor, Tensor]:
         """Force of each plane on each vertex [N], [B, V, planes], and the unit normals [1 | B, planes, 3]."""
@@ -286,6 +318,10 @@ class Anchor(VertexEnergy):
     def gradient(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         stiffness, points = data.reshape(data.shape[0], -1, 4).split((1, 3), -1)
         return h * h * stiffness * (x - points)
+
+    def value(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
+        stiffness, points = data.reshape(data.shape[0], -1, 4).split((1, 3), -1)
+        return h * h / 2 * stiffness[..., 0] * (x - points).square().sum(-1)
 
 
 VERTEX_ENERGIES: tuple[type[VertexEnergy], ...] = (FloorBarrier, Anchor)  # order of csrc/energies/energies.h

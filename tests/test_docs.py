@@ -73,7 +73,11 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize(
     ("prefix", "module", "name"),
-    [("dv", dv, n) for n in dv.__all__ if n not in ("coarse", "colliders", "contact", "mesh", "solvers")]
+    [
+        ("dv", dv, n)
+        for n in dv.__all__
+        if n not in ("acceleration", "coarse", "colliders", "contact", "mesh", "solvers")
+    ]
     + [("dv.coarse", dv.coarse, n) for n in dv.coarse.__all__]
     + [("dv.colliders", dv.colliders, n) for n in dv.colliders.__all__]
     + [("dv.contact", dv.contact, n) for n in dv.contact.__all__]

@@ -103,7 +103,7 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   define(m, "coarse_matrix_backward", DIFFVBD_ARGUMENTS(COARSE), "Tensor bar, int[] sizes, float time_step",
          DIFFVBD_RETURNS(COARSE));
   // Of what these are made, see coarse/sums.h; adjoints of the moduli [scenes, tets], and, where wanted, of the rest
-  // shape. CPU only
+  // shape.
   m.def(
       "coarse_stiffness(Tensor mu, Tensor lam, Tensor gradients, Tensor volume, Tensor plan, Tensor weights, int[] "
       "sizes) -> Tensor");
@@ -112,6 +112,19 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "Tensor bar, int[] sizes, bool wants_rest) -> (Tensor mu, Tensor lam, Tensor gradients, Tensor volume)");
   m.def("coarse_mass(Tensor mass, Tensor plan, Tensor weights, int[] sizes) -> Tensor");
   m.def("coarse_mass_backward(Tensor bar, Tensor plan, Tensor weights, int[] sizes) -> Tensor");
+  // CPU only: the combination of iterates, states [2, window + 1, scenes, vertices, 3] (of which each cycle began, and
+  // ended), the inverse of each body's system [scenes, bodies, window, window] and its solution
+  m.def(
+      "anderson_combine(Tensor states, Tensor mass, Tensor order, Tensor ptr, float regularization) -> (Tensor to, "
+      "Tensor inverse, Tensor gamma)");
+  // CPU only: by how much the potential of each body rises from x to `to`, and the sum of the sizes of its terms
+  // [scenes, bodies, 2], float64; infinite where a vertex comes too near a plane. order, ptr: vertices that move, by
+  // body; material [1 | scenes, blocks, 2, lanes], rest [1 | scenes, blocks, 7, lanes] and corner (four times a vertex)
+  // of the tets, by body
+  m.def(
+      "potential_rise(Tensor x, Tensor to, Tensor x_prev, Tensor y, Tensor mass, Tensor energy_data, Tensor origin, "
+      "Tensor material, Tensor rest, Tensor order, Tensor ptr, Tensor other, Tensor corner, Tensor block_ptr, int[] "
+      "data_count, float time_step) -> Tensor");
   m.def("pack_rest(Tensor rest, Tensor plan, int[] sizes) -> Tensor");
   m.def(
       "build_plan(Tensor points, Tensor tets, Tensor active, int lanes) -> (Tensor plan, Tensor color_ptr, Tensor "

@@ -22,9 +22,9 @@ from torch.autograd import Function
 from .. import ops
 from ..model.model import Model
 from ..ops import no_second_derivative, of_inputs
+from .anderson import run_sweeps
 from .potential import PAIRS, IncrementalPotential
 from .routes import GlobalAdjoint, LinearSolve
-from .sweep import sweep
 
 MAX_ITERATIONS = 10_000  # of a solve whose adjoint does not say
 DEFAULT_TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}
@@ -48,7 +48,7 @@ class _GlobalSweep(Function):
     def forward(ctx: Any, *args: Any) -> Tensor:
         others, model, settings, adjoint, debug_step = args[_FIELDS:-1]
         fields = ops.SweepFields(*args[:_FIELDS], *others)
-        x = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=ops.NO_TAPE, debug_step=debug_step)[0]
+        x = run_sweeps(model, fields, settings, tape_policy=ops.NO_TAPE, debug_step=debug_step).x
         x = args[-1](x)
         ctx.save_for_backward(*fields[:_FIELDS], x)
         ctx.model, ctx.h, ctx.adjoint = model, settings.numbers.time_step, adjoint

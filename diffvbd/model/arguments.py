@@ -11,6 +11,7 @@ from .. import ops
 from ..checks import check_readable, fail, to_float
 from ..contact.barrier import Friction, PairBarrier
 from ..energies import VERTEX_ENERGIES, StableNeoHookean, VertexEnergy
+from .anderson import Anderson
 from .coarse import CoarseSpace
 
 Energy = StableNeoHookean | VertexEnergy | PairBarrier | Friction
@@ -52,6 +53,16 @@ def checked_energies(energies: Any, num_vertices: int) -> tuple[Energy, ...]:
     return tuple(out)
 
 
+def check_isolated(tets: Tensor, pinned: Tensor) -> None:
+    """Raises where a vertex that moves is in no tet; tets [T, 4], pinned bool [V]."""
+    touched = torch.zeros_like(pinned)
+    touched[tets.reshape(-1)] = True
+    loose = (~touched & ~pinned).nonzero().reshape(-1)
+    if loose.numel():
+        shown = ", ".join(map(str, loose[:5].tolist())) + (", ..." if loose.numel() > 5 else "")
+        fail("mesh", "every vertex in a tet, or pinned", f"{loose.numel()} isolated vertices: {shown}")
+
+
 def per_tet_density(density: Any, num_tets: int) -> Tensor:
     """The density of each tet [kg/m^3], float64 [T]."""
     if isinstance(density, bool) or not (isinstance(density, (int, float)) or hasattr(density, "__array__")):
@@ -67,6 +78,16 @@ def per_tet_density(density: Any, num_tets: int) -> Tensor:
         wrong = density.reshape(-1)[~(torch.isfinite(density) & (density > 0)).reshape(-1)]
         fail("density", "finite numbers > 0 kg/m^3", float(wrong[0]))
     return density.expand(num_tets).clone()
+
+
+def checked_steps(
+    rigid: Any, start: Any, coarse: Any, acceleration: Any, energies: tuple[Energy, ...], saturation: float | None
+) -> tuple[bool, str, CoarseSpace | None, Anderson | None]:
+    """What steps do besides sweeps: whether free bodies are corrected, where the sweeps of the others start, the coarse
+    space and the acceleration."""
+    rigid, start = checked_correction(rigid, start, energies)
+    coarse = checked_coarse(coarse, energies, saturation)
+    return rigid, start, coarse, checked_acceleration(acceleration, energies, saturation)
 
 
 def checked_correction(rigid: Any, start: Any, energies: tuple[Energy, ...]) -> tuple[bool, str]:
@@ -103,3 +124,18 @@ def checked_coarse(coarse: Any, energies: tuple[Energy, ...], saturation: float 
     if saturation is not None:
         fail("coarse", "None with saturation, which a correction would go around", repr(coarse))
     return coarse
+
+
+def checked_acceleration(acceleration: Any, energies: tuple[Energy, ...], saturation: float | None) -> Anderson | None:
+    """Anderson's method, where the other arguments allow it."""
+    if acceleration is None:
+        return None
+    if not isinstance(acceleration, Anderson):
+        raise TypeError(f"acceleration: expected a diffvbd.Anderson or None, got {acceleration!r}")
+    if any(isinstance(e, (PairBarrier, Friction)) for e in energies):
+        fail("acceleration", "None beside a PairBarrier or Friction, which its checks do not see", repr(acceleration))
+    if any(isinstance(e, StableNeoHookean) and e.block != "exact" for e in energies):
+        fail("acceleration", "None without the exact block", repr(acceleration))
+    if saturation is not None:
+        fail("acceleration", "None with saturation, which an accelerated iterate would go around", repr(acceleration))
+    return acceleration

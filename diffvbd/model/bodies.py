@@ -106,6 +106,14 @@ def find_bodies(points: Tensor, tets: Tensor, pinned: Tensor, correct: bool) -> 
     )
 
 
+def first_of_body(body: Tensor) -> Tensor:
+    """For each vertex the first vertex of its body [V]: the origin that float32 computes about."""
+    labels, inverse = torch.unique(body, return_inverse=True)
+    order = torch.arange(body.shape[0])
+    first = torch.full((labels.shape[0],), body.shape[0]).scatter_reduce(0, inverse, order, "amin")
+    return first[inverse]
+
+
 def _starts(sizes: Tensor) -> Tensor:
     return torch.cat([sizes.new_zeros(1), sizes.cumsum(0)])
 

@@ -124,12 +124,16 @@ def _blocks(g: CoarseGeometry) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     order = np.argsort(g.tet_group, kind="stable")
     order = order[g.tet_group[order] >= 0]
     tet_ptr = _starts(g.tet_group[order], len(g.group_body))
-    first = tet_ptr[_starts(g.group_body, g.bodies)]
-    count = np.diff(first)
-    ptr = np.concatenate(([0], np.cumsum(-(-count // LANES))))
+    return *in_blocks(order, np.diff(tet_ptr[_starts(g.group_body, g.bodies)])), tet_ptr
+
+
+def in_blocks(tets: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tets, so many of each body in turn, in blocks [blocks, LANES], -1 at the end of a body's last one; and where each
+    body's blocks begin."""
+    ptr = np.concatenate(([0], np.cumsum(-(-count // LANES)))).astype(np.int64)
     out = np.full(ptr[-1] * LANES, -1)
-    out[np.arange(len(order)) + np.repeat(ptr[:-1] * LANES - first[:-1], count)] = order
-    return out.reshape(-1, LANES), ptr, tet_ptr
+    out[np.arange(len(tets)) + np.repeat(ptr[:-1] * LANES - np.cumsum(count) + count, count)] = tets
+    return out.reshape(-1, LANES), ptr
 
 
 def _parts(block_ptr: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -20,8 +20,9 @@ from ..mask import CONTACT, ELASTIC
 from ..mesh import TetMesh
 from ..ops import regimes
 from ..safeguards import FILTER_ETA, SATURATION_EPS
-from .arguments import Energy, checked_coarse, checked_correction, checked_device, checked_energies, per_tet_density
-from .bodies import find_bodies
+from .anderson import Anderson, moving_bodies
+from .arguments import Energy, check_isolated, checked_device, checked_energies, checked_steps, per_tet_density
+from .bodies import find_bodies, first_of_body
 from .coarse import CoarseSpace
 from .coarse_plan import plan_of
 from .describe import describe
@@ -60,6 +61,7 @@ class Model:
             the one of lower incremental potential; beside pairs and friction the predictor, with coarse x + h v.
         coarse: Corrections between the sweeps, for what is stiff, long, thin or finely meshed: None, a
             :class:`diffvbd.CoarseSpace`, or ``"auto"``, which is ``CoarseSpace()``.
+        acceleration: None, or a :class:`diffvbd.Anderson`, which combines the iterates of each step.
         colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier among the
             energies.
         dtype: torch.float64 or torch.float32.
@@ -97,6 +99,7 @@ class Model:
         colliders: Sequence[Collider] = (),
         *,
         coarse: CoarseSpace | Literal["auto"] | None = None,
+        acceleration: Anderson | None = None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -115,24 +118,19 @@ class Model:
         self.energy_mask = 0
         for energy in self.energies:
             self.energy_mask |= energy.bit
-        self.rigid, self.start = checked_correction(rigid, start, self.energies)
-        self.coarse = checked_coarse(coarse, self.energies, self.saturation)
+        checked = checked_steps(rigid, start, coarse, acceleration, self.energies, self.saturation)
+        self.rigid, self.start, self.coarse, self.acceleration = checked
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
 
         points = torch.from_numpy(mesh.points.copy())
         tets = torch.from_numpy(mesh.tets.copy())
         mask = vertex_mask(pinned, mesh.num_vertices)
-        touched = torch.zeros(mesh.num_vertices, dtype=torch.bool)
-        touched[tets.reshape(-1)] = True
-        loose = (~touched & ~mask).nonzero().reshape(-1)
-        if loose.numel():
-            shown = ", ".join(map(str, loose[:5].tolist())) + (", ..." if loose.numel() > 5 else "")
-            fail("mesh", "every vertex in a tet, or pinned", f"{loose.numel()} isolated vertices: {shown}")
+        check_isolated(tets, mask)
         self._density = per_tet_density(density, mesh.num_tets)
         self._pinned = mask
         body = torch.from_numpy(mesh.body.copy())
-        self._first_of_body = _first_of_body(body)
+        self._first_of_body = first_of_body(body)
         self._bodies, self._other_bodies = find_bodies(points, tets, mask, self.rigid)
         self.surface_of_contact = self._build_surface(check_colliders(colliders))
         device = checked_device(device)
@@ -262,6 +260,9 @@ class Model:
         if self.coarse is not None:
             given = (self._rest_points, self._topology[0], self._pinned, self._mass, self._rest, self._plan)
             self.coarse_geometry, self._coarse_plan = plan_of(self.coarse, *given, device.type)
+        if self.acceleration is not None:
+            elastic = bool(self.energy_mask & ELASTIC)
+            self._moving = moving_bodies(self._rest_points, self._topology[0], self._pinned, elastic)
 
     def _parameters(self, energy: VertexEnergy, rest_points: Tensor) -> dict[str, Tensor]:
         return {name: value[None] for name, value in energy.constants(rest_points).items()}
@@ -282,6 +283,8 @@ class Model:
             self.surface_of_contact = self.surface_of_contact.to(device, dtype)
         if self.coarse is not None:
             self._coarse_plan = self._coarse_plan.to(device, dtype)
+        if self.acceleration is not None:
+            self._moving = self._moving.to(device, dtype)
         for energy in self.parametric_energies:
             self.constants(energy)
 
@@ -390,11 +393,3 @@ class Model:
 
     def __repr__(self) -> str:
         return describe(self)
-
-
-def _first_of_body(body: Tensor) -> Tensor:
-    """For each vertex the first vertex of its body: the origin that float32 computes about."""
-    labels, inverse = torch.unique(body, return_inverse=True)
-    order = torch.arange(body.shape[0])
-    first = torch.full((labels.shape[0],), body.shape[0]).scatter_reduce(0, inverse, order, "amin")
-    return first[inverse]

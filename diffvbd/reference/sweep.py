@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .anderson import Anderson
 from .coarse import REFUSALS, Coarse
 from .energies import build_energies
 from .friction import floor_friction
@@ -40,6 +41,7 @@ def step(
     parameters: dict[str, Any] | None = None,
     tet_order: Tensor | None = None,
     coarse_steps: Tensor | None = None,
+    taken: Tensor | None = None,
     record: list[Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """One time step; every tensor argument is differentiable by autograd.
@@ -48,12 +50,13 @@ def step(
     x.shape[:-2] + (T,). force [N], gravity [m/s^2], prescribed, rest_points [m] broadcast to x's shape; density
     [kg/m^3] to [..., T]. tet_order: permutation [T] of the tets that changes only the order of summation.
     coarse_steps: lengths of a model.coarse's corrections [corrections, ..., bodies], which are searched for if not
-    given; record: a list, to which the step appends those that it took.
+    given; taken: which bodies took the combinations of a model.acceleration [combinations, ..., bodies], bool, which is
+    decided if not given; record: a list, to which the step appends the lengths that it took.
     Raises ValueError when an unpinned vertex starts below a floor plane. Returns (x', v').
     """
     layout = build_layout(model, tet_order)
     advance = stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
-    return advance(x, v, force, gravity, prescribed, coarse_steps, record)
+    return advance(x, v, force, gravity, prescribed, (coarse_steps, taken), record)
 
 
 def rollout(
@@ -76,18 +79,20 @@ def rollout(
     force_per_step: Tensor | Sequence[Tensor] | None = None,
     prescribed_per_step: Tensor | Sequence[Tensor] | None = None,
     coarse_steps: Tensor | Sequence[Tensor] | None = None,
+    taken: Tensor | Sequence[Tensor] | None = None,
     record: list[Tensor] | None = None,
 ) -> Trajectory:
     """`steps` steps with everything constant in time, except `force_per_step` and `prescribed_per_step`, whose first
-    dimension is the step and which replace `force` and `prescribed`; so it is that of `coarse_steps`, and `record` gets
-    an entry for each step. Other arguments as in `step`."""
+    dimension is the step and which replace `force` and `prescribed`; so it is that of `coarse_steps` and `taken`, and
+    `record` gets an entry for each step. Other arguments as in `step`."""
     layout = build_layout(model, tet_order)
     advance = stepper(model, x, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
     xs, vs = [x], [v]
     for n in range(steps):
         f = force if force_per_step is None else force_per_step[n]
         held = prescribed if prescribed_per_step is None else prescribed_per_step[n]
-        x, v = advance(x, v, f, gravity, held, None if coarse_steps is None else coarse_steps[n], record)
+        given = tuple(None if a is None else a[n] for a in (coarse_steps, taken))
+        x, v = advance(x, v, f, gravity, held, given, record)
         xs.append(x)
         vs.append(v)
     return Trajectory(torch.stack(xs), torch.stack(vs))
@@ -106,7 +111,7 @@ def stepper(
     layout: Layout,
 ) -> Callable[..., tuple[Tensor, Tensor]]:
     """Do what is common to all steps of a run, and return the function
-    (x, v, force, gravity, prescribed, coarse_steps=None, record=None) -> (x', v') that makes one.
+    (x, v, force, gravity, prescribed, given=(None, None), record=None) -> (x', v') that makes one.
     Arguments as in `step`; like decides dtype and device; layout is the model's `build_layout`."""
     scene = build_scene(
         model,
@@ -124,6 +129,7 @@ def stepper(
     masses = color_masses(scene)
     correct = Correction(scene, energies)
     coarse = Coarse(scene, energies) if getattr(model, "coarse", None) is not None else None
+    anderson = Anderson(scene, energies) if getattr(model, "acceleration", None) is not None else None
     last = min(model.relaxation, 1.0) if correct.bodies or coarse is not None else model.relaxation
 
     def advance(
@@ -132,7 +138,7 @@ def stepper(
         force: Any,
         gravity: Any,
         prescribed: Any,
-        coarse_steps: Tensor | None = None,
+        given: tuple[Tensor | None, ...] = (None, None),  # coarse_steps, taken
         record: list[Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
         y = predictor(scene, x, v, force, gravity, prescribed)
@@ -151,12 +157,9 @@ def stepper(
             state = run_sweeps(scene, energies, masses, y, state, x_prev, usual)
             return run_sweeps(scene, energies, masses, y, state, x_prev, count - usual, relaxation=last)
 
-        if coarse is None:
-            state = swept(state, sweeps, True)
-        else:
-            state, taken = _in_two_levels(coarse, swept, sweeps, state, y, x_prev, coarse_steps)
-            if record is not None:
-                record.append(taken)
+        state, lengths = _in_cycles(coarse, anderson, swept, sweeps, state, y, x_prev, *given)
+        if record is not None:
+            record.append(lengths)
         state = correct(state, y, x_prev)
         x_new = state.transpose(-1, -2).contiguous()
         return x_new, (x_new - x) / time_step
@@ -164,33 +167,49 @@ def stepper(
     return advance
 
 
-def _in_two_levels(
-    coarse: Coarse,
+def _in_cycles(
+    coarse: Coarse | None,
+    anderson: Anderson | None,
     swept: Callable[[Tensor, int, bool], Tensor],
     sweeps: int,
     state: Tensor,
     y: Tensor,
     x_prev: Tensor,
     steps: Tensor | None,
+    taken: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """A sweep, then corrections with up to `every` sweeps after each, until all sweeps are done; or a correction alone.
+    """All sweeps of a step. With corrections a sweep, then a correction and up to `every` sweeps, until all are done;
+    or a correction alone. Between such cycles, or between single sweeps, iterates are combined.
 
     swept(state, count, ends): the state after so many sweeps, which end the step or do not. Returns the state and the
-    lengths of the corrections [corrections, ..., bodies], which are `steps` if these are given.
+    lengths of the corrections [corrections, ..., bodies], which are `steps` if these are given; `taken` as in `step`.
     """
-    space, matrix = coarse.scene.model.coarse, coarse.begin(x_prev)
-    state = swept(state, min(sweeps, 1), sweeps == 1)
-    left, taken = sweeps - min(sweeps, 1), []
+    every = None if coarse is None else coarse.scene.model.coarse.every
+    cycles = [sweeps] if anderson is None else anderson.cycles(sweeps, every)
+    combines = len(cycles) > 1
+    lengths, combined, matrix = [], 0, y if coarse is None else coarse.begin(x_prev)
     refused = torch.zeros((), dtype=torch.int64, device=y.device)
-    for n in range(space.corrections(sweeps)):
-        given = None if steps is None else steps[n]
-        state, s = coarse.correct(state, y, x_prev, matrix, given, refused >= REFUSALS)
-        refused = refused + (s == 0)
-        count = min(space.every, left)
+    left = sweeps
+    if coarse is not None:
+        state, left = swept(state, min(sweeps, 1), sweeps == 1), sweeps - min(sweeps, 1)
+        count = coarse.scene.model.coarse.corrections(sweeps)
+        most = coarse.scene.model.coarse.every
+        cycles = [min(most, left - n * most) for n in range(count)]
+    before, after = [], []
+    for n, count in enumerate(cycles):
+        before.append(state)
+        if coarse is not None:
+            given = None if steps is None else steps[n]
+            state, s = coarse.correct(state, y, x_prev, matrix, given, refused >= REFUSALS)
+            refused = refused if combines else refused + (s == 0)  # each cycle has its own
+            lengths.append(s)
         left -= count
         state = swept(state, count, left == 0)
-        taken.append(s)
-    return state, torch.stack(taken)
+        after.append(state)
+        if anderson is not None and combines and n and left > 0:
+            state = anderson.combine(before, after, y, x_prev, None if taken is None else taken[combined])
+            combined += 1
+    return state, torch.stack(lengths) if lengths else y.new_zeros((0,))
 
 
 def color_masses(scene: Scene) -> list[Tensor]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from .. import ops
-from ..adjoint.sweep import sweep
+from ..adjoint.anderson import run_sweeps
 from ..model.model import Model
 
 
@@ -19,4 +19,4 @@ def check_on_cpu(model: Model, fields: ops.SweepFields, settings: ops.SweepSetti
             plan = twin._coarse_plan  # whose positions are those of the CPU
             settings = settings._replace(coarse=plan.sizes._replace(begun=settings.coarse.begun))
             here = here._replace(coarse_plan=plan.plan, coarse_weights=plan.weights)
-        sweep(here, twin._packed_rest, twin._plan, settings, tape_policy=ops.NO_TAPE, debug_step=index)
+        run_sweeps(twin, here, settings, tape_policy=ops.NO_TAPE, debug_step=index)

@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from .. import ops
+from ..adjoint.anderson import none_taken, run_sweeps
 from ..adjoint.implicit import global_sweep
 from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
-from ..adjoint.sweep import fused_step, sweep
+from ..adjoint.sweep import fused_step
 from ..model.model import Model
 from ..model.warnings import warn_of_thin_tets
 from ..scopes import checking, looks_at, recorders
@@ -169,12 +170,14 @@ def swept(
             if isinstance(adjoint, GlobalAdjoint):
                 return global_sweep(model, fields, settings, adjoint, debug_step,
                                     lambda x: begun.corrected(x, model, prepared))  # fmt: skip
-            x, _, corrections = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy,
-                                      debug_step=debug_step)  # fmt: skip
-            if corrections.numel():
+            done = run_sweeps(model, fields, settings, tape_policy=policy, debug_step=debug_step)
+            if done.corrections:
                 for found in recorders("coarse"):
-                    found.append(lengths_of(model, corrections))
-            return x
+                    found.append(lengths_of(model, torch.cat(done.corrections, 1)))
+            if model.acceleration is not None:
+                for found in recorders("anderson"):
+                    found.append(torch.stack(done.taken, 1) if done.taken else none_taken(model, begun.x_start))
+            return done.x
     except ValueError as error:
         name_argument(model, error, given)
         raise
@@ -188,6 +191,7 @@ def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
         simple
         and not model.corrects
         and model.coarse is None
+        and model.acceleration is None
         and model.starts_from == "predictor"
         and not ops.TET_READS_X_PREV
     )

@@ -307,12 +307,14 @@ def reference_result(
     steps: int = 1,
     tet_order: Tensor | None = None,
     coarse_steps: Any = None,
+    taken: Any = None,
 ) -> dict[str, Tensor]:
-    """`evaluate` of the reference rollout; coarse_steps: recorded lengths of coarse corrections, one entry a step."""
+    """`evaluate` of the reference rollout; coarse_steps: recorded lengths of coarse corrections, one entry a step;
+    taken: likewise who took the combinations of an acceleration."""
 
     def run(**options: Any) -> tuple[Tensor, Tensor]:
         trajectory = reference.rollout(
-            model, steps=steps, sweeps=sweeps, tet_order=tet_order, coarse_steps=coarse_steps, **options
+            model, steps=steps, sweeps=sweeps, tet_order=tet_order, coarse_steps=coarse_steps, taken=taken, **options
         )
         return trajectory.x[-1], trajectory.v[-1]
 
@@ -322,7 +324,8 @@ def reference_result(
 def _turned(model: Any) -> Any:
     """What the reference reads of a model, each tet listed from another corner (an even permutation)."""
     names = ("rest_points", "density", "pinned", "color_ptr", "color_vertices", "energies")
-    names += ("saturation", "regularization", "relaxation", "rigid", "starts_from", "coarse", "coarse_geometry")
+    names += ("saturation", "regularization", "relaxation", "rigid", "starts_from")
+    names += ("coarse", "coarse_geometry", "acceleration")
     return SimpleNamespace(tets=model.tets[:, [3, 2, 1, 0]], **{name: getattr(model, name, None) for name in names})
 
 
@@ -333,6 +336,7 @@ def spread(
     steps: int = 1,
     expected: dict[str, Tensor] | None = None,
     coarse_steps: Any = None,
+    taken: Any = None,
 ) -> dict[str, float]:
     """How far two references with permuted tets disagree, per entry of `evaluate`: what rounding alone does here.
 
@@ -340,9 +344,9 @@ def spread(
     `expected`: the unpermuted `reference_result`, when it is at hand.
     """
     order = torch.from_numpy(generator("order").permutation(model.tets.shape[0]))
-    permuted = reference_result(_turned(model), inputs, sweeps, steps, order, coarse_steps)
+    permuted = reference_result(_turned(model), inputs, sweeps, steps, order, coarse_steps, taken)
     if expected is None:
-        expected = reference_result(model, inputs, sweeps, steps, coarse_steps=coarse_steps)
+        expected = reference_result(model, inputs, sweeps, steps, coarse_steps=coarse_steps, taken=taken)
     return {name: relative_error(permuted[name], expected[name]) for name in expected}
 
 
@@ -353,11 +357,12 @@ def sensitivity(
     steps: int = 1,
     expected: dict[str, Tensor] | None = None,
     coarse_steps: Any = None,
+    taken: Any = None,
 ) -> dict[str, float]:
     """How far the reference moves, per entry of `evaluate`, when every input moves by an ulp (the worst of three random
     moves): no algorithm can be asked for less. A barrier feels it in a small gap, which the order of the tets hides."""
     if expected is None:
-        expected = reference_result(model, inputs, sweeps, steps, coarse_steps=coarse_steps)
+        expected = reference_result(model, inputs, sweeps, steps, coarse_steps=coarse_steps, taken=taken)
     rng = generator("sensitivity")
 
     def nudged(a: Any) -> Any:
@@ -367,7 +372,8 @@ def sensitivity(
             return a
         return a * torch.as_tensor(1 + rng.choice((-1, 1), tuple(a.shape)) * 2.0**-52, device=a.device)
 
-    moved = [reference_result(model, nudged(inputs), sweeps, steps, coarse_steps=coarse_steps) for _ in range(3)]
+    again = {"coarse_steps": coarse_steps, "taken": taken}
+    moved = [reference_result(model, nudged(inputs), sweeps, steps, **again) for _ in range(3)]
     return {name: max(relative_error(m[name], expected[name]) for m in moved) for name in expected}
 
 

@@ -219,11 +219,12 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
         bars = (torch.ones_like(x), x, tape, corrections)
         arguments["sweep_backward"] = (*fields, *bars, model._plan, *settings, policy, [True] * 5)
         arguments |= coarse_arguments(device)
+        arguments |= anderson_arguments() if device == "cpu" else {}
     return arguments | (fused_arguments(policy) if device == "cuda" else {})
 
 
 def coarse_arguments(device: str) -> dict[str, tuple[Any, ...]]:
-    """The same of the matrix of a coarse space and of what it is made of, which only the CPU has compiled."""
+    """The same of the matrix of a coarse space and of what it is made of."""
     mesh = dv.mesh.cube(4, size=0.3)
     model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, coarse=dv.CoarseSpace(functions=8), device=device)
     plan, x = model._coarse_plan, model.rest_points[None].contiguous()
@@ -233,8 +234,6 @@ def coarse_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     last = (plan.sizes, 0.3)
     factor = torch.ops.diffvbd.coarse_matrix(*given, *last)
     out = {"coarse_matrix": (*given, *last), "coarse_matrix_backward": (*given, torch.ones_like(factor), *last)}
-    if device != "cpu":
-        return out
     tets = shape_gradients(model.rest_points[model.tets][None])
     sums = (moduli.expand(-1, model.num_tets).contiguous(), moduli, *tets, plan.plan, plan.weights)
     rest = (plan.plan, plan.weights, plan.sizes)
@@ -244,6 +243,20 @@ def coarse_arguments(device: str) -> dict[str, tuple[Any, ...]]:
         "coarse_mass": (model.mass[None], *rest),
         "coarse_mass_backward": (torch.ones_like(parts.mass), *rest),
     }
+
+
+def anderson_arguments() -> dict[str, tuple[Any, ...]]:
+    """The same of Anderson's method, which CUDA has in torch."""
+    mesh = dv.mesh.cube(3, size=0.3)
+    model = dv.Model(mesh, acceleration=dv.Anderson(), energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.1)))
+    moving, x = model._moving, model.rest_points[None].contiguous()
+    material = torch.full((1, *moving.tet.shape, 2), 1e4, dtype=x.dtype).transpose(-1, -2).contiguous()
+    of = model._other_bodies.of
+    given = (x, 1.1 * x, x, x, model.mass[None], model._energy_data, x.new_empty((0,)), material, moving.rest,
+             moving.order, moving.ptr, of, moving.corner, moving.block_ptr)  # fmt: skip
+    states = torch.rand(2, 3, *x.shape, dtype=x.dtype)
+    return {"potential_rise": (*given, model._data_count, 0.3),
+            "anderson_combine": (states, model._mass[None], moving.order, moving.ptr, 1e-6)}  # fmt: skip
 
 
 def fused_arguments(policy: int) -> dict[str, tuple[Any, ...]]:

@@ -1,0 +1,223 @@
+// CPU implementations of Anderson's method: the combination of the last iterates of a step, body by body, and by how
+// much the incremental potential of each body rises from one state to another.
+#include <torch/csrc/stable/library.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <limits>
+#include <tuple>
+#include <vector>
+
+#include "../../coarse/length.h"
+#include "../../cpu/bodies.h"
+#include "../../cpu/kernels.h"
+#include "../rigid.h"
+#include "sweep.h"
+
+namespace {
+
+namespace coarse = diffvbd::coarse;
+namespace rigid = diffvbd::rigid;
+using rigid::Vector;
+using diffvbd::Batched, diffvbd::batched, diffvbd::Buffer, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::for_bodies,
+    diffvbd::is_index, diffvbd::kLanes, diffvbd::kRestScalars, diffvbd::kTetScalars, diffvbd::require,
+    diffvbd::require_like, diffvbd::RigidFields, diffvbd::Threads;
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+
+constexpr int kMostWindow = 10;  // twin of MOST in diffvbd/model/anderson.py
+constexpr int kPairs = kMostWindow * (kMostWindow + 1) / 2;
+
+// The last iterates of a step, and what a cycle made of each: x_i and g_i, i = 0 ... window.
+template <class T>
+struct Iterates {
+  const T* states;  // [2, window + 1, B, V, 3]
+  int64_t size;     // of one state
+  int window;
+
+  Vector end(int i, int64_t row) const { return rigid::Body<T>::at(states + (window + 1 + i) * size + 3 * row); }
+  Vector residual(int i, int64_t row) const { return end(i, row) - rigid::Body<T>::at(states + i * size + 3 * row); }
+};
+
+// L L^T = N in place, the lower triangle row by row; then N^-1
+inline void invert(double* n, int m, double* inverse) {
+  const auto at = [](int i, int j) { return i * (i + 1) / 2 + j; };
+  for (int i = 0; i < m; ++i) {
+    for (int j = 0; j <= i; ++j) {
+      double left = n[at(i, j)];
+      for (int k = 0; k < j; ++k) left -= n[at(i, k)] * n[at(j, k)];
+      n[at(i, j)] = i == j ? std::sqrt(left) : left / n[at(j, j)];
+    }
+  }
+  for (int c = 0; c < m; ++c) {
+    double x[kMostWindow];
+    for (int i = 0; i < m; ++i) {
+      x[i] = i == c;
+      for (int k = 0; k < i; ++k) x[i] -= n[at(i, k)] * x[k];
+      x[i] /= n[at(i, i)];
+    }
+    for (int i = m - 1; i >= 0; --i) {
+      for (int k = i + 1; k < m; ++k) x[i] -= n[at(k, i)] * x[k];
+      x[i] /= n[at(i, i)];
+      inverse[i * m + c] = x[i];
+    }
+  }
+}
+
+// g_k - dG gamma of one body, with gamma and the inverse of its system
+template <class T>
+void combine(const rigid::Body<T>& b, const Threads& team, const Iterates<T>& it, double regularization, T* to,
+             T* inverse, T* gamma) {
+  const int m = it.window;
+  double sums[kPairs + kMostWindow];
+  team.template sum<kPairs + kMostWindow>(b.size(), sums, [&](int32_t i, double* sum) {
+    const int32_t v = b.vertex(i);
+    const int64_t row = b.row(v);
+    const double mass = b.mass(v);
+    Vector d[kMostWindow], last = it.residual(0, row);
+    for (int j = 0; j < m; ++j) {
+      const Vector next = it.residual(j + 1, row);
+      d[j] = next - last;
+      last = next;
+    }
+    double* pair = sum;
+    for (int j = 0; j < m; ++j) {
+      const Vector weighted = mass * d[j];
+      for (int k = 0; k <= j; ++k) *pair++ += dot(weighted, d[k]);
+      sum[kPairs + j] += dot(weighted, last);
+    }
+  });
+  double full[kMostWindow * kMostWindow], weights[kMostWindow];
+  for (int j = 0; j < m; ++j) {
+    double& diagonal = sums[j * (j + 1) / 2 + j];
+    diagonal += diagonal > 0 ? regularization * diagonal : 1;  // where nothing moves nothing is to be solved
+  }
+  invert(sums, m, full);
+  for (int j = 0; j < m; ++j) {
+    weights[j] = 0;
+    for (int k = 0; k < m; ++k) weights[j] += full[j * m + k] * sums[kPairs + k], inverse[j * m + k] = T(full[j * m + k]);
+    gamma[j] = T(weights[j]);
+  }
+  team.each(b.size(), [&](int32_t i) {
+    const int64_t row = b.row(b.vertex(i));
+    Vector x = it.end(m, row);
+    for (int j = 0; j < m; ++j) x = x - weights[j] * (it.end(j + 1, row) - it.end(j, row));
+    to[3 * row] = T(x.x), to[3 * row + 1] = T(x.y), to[3 * row + 2] = T(x.z);
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor> anderson_combine(const Tensor& states, const Tensor& mass, const Tensor& order,
+                                                    const Tensor& ptr, double regularization) {
+  require(states.dim() == 5 && states.size(0) == 2 && states.size(1) > 1 && states.size(1) <= kMostWindow + 1 &&
+              states.size(4) == 3 && states.is_contiguous(),
+          "diffvbd::anderson_combine: expected contiguous states [2, iterates, scenes, vertices, 3], 2 to 11 iterates");
+  require(is_index(order, states) && is_index(ptr, states) && ptr.numel() > 0,
+          "diffvbd::anderson_combine: expected order and ptr int32 of one list of bodies");
+  return dispatch_float(states, [&](auto scalar) {
+    using T = decltype(scalar);
+    const int64_t scenes = states.size(2), vertices = states.size(3), bodies = ptr.numel() - 1, m = states.size(1) - 1;
+    const Iterates<T> it{data<const T>(states), scenes * vertices * 3, static_cast<int>(m)};
+    rigid::Inputs<T> in{};
+    in.mass = batched<T>("mass", mass, states, scenes, vertices);
+    in.order = data<const int32_t>(order), in.ptr = data<const int32_t>(ptr);
+    in.scenes = scenes, in.vertices = static_cast<int32_t>(vertices), in.bodies = static_cast<int32_t>(bodies);
+    Tensor to = empty(states, {scenes, vertices, 3}), inverse = empty(states, {scenes, bodies, m, m}),
+           gamma = empty(states, {scenes, bodies, m});
+    // what does not move is where the last cycle left it
+    std::memcpy(data<T>(to), it.states + (2 * m + 1) * it.size, it.size * sizeof(T));
+    for_bodies(in, [&](const rigid::Body<T>& body, const Threads& team) {
+      const int64_t at = body.scene * bodies + body.body;
+      combine(body, team, it, regularization, data<T>(to), data<T>(inverse) + at * m * m, data<T>(gamma) + at * m);
+    });
+    return std::make_tuple(to, inverse, gamma);
+  });
+}
+
+template <class T>
+struct Tets {
+  const int32_t *corner, *ptr;  // [blocks, 4, kLanes]  four times a vertex; [bodies + 1]
+  Batched<const T> rest, material;
+};
+
+// x[i] and to[i] - x[i] as rows of four
+template <class T>
+void pack(const T* x, const T* to, int64_t vertices, T* at, T* way) {
+  for (int64_t v = 0; v < vertices; ++v) {
+    for (int c = 0; c < 3; ++c) {
+      at[4 * v + c] = x[3 * v + c];
+      way[4 * v + c] = to[3 * v + c] - x[3 * v + c];
+    }
+  }
+}
+
+// The rise, and how much of it is rounding at most; infinite where a vertex would be too near a plane.
+template <class T>
+void rise(const rigid::Body<T>& b, const Threads& team, const Tets<T>& tets, const T* to, const T* at, const T* way,
+          const diffvbd::CoarseKernels<T>& kernels, double* out) {
+  double vertices[3];
+  team.template sum<3>(b.size(), vertices, [&](int32_t i, double* sum) {
+    const int32_t v = b.vertex(i);
+    const Vector one = b.position(v), two = rigid::Body<T>::at(to + 3 * b.row(v)), step = two - one;
+    const double inertial = b.mass(v) * dot(step, 0.5 * (one + two) - b.target(v));
+    sum[0] += inertial, sum[1] += std::abs(inertial);
+    b.energies(v, [&](auto energy, int, const double* values, int count) {
+      using E = decltype(energy);
+      const auto there = b.state(v, two);
+      if constexpr (E::has_filter) {
+        if (!E::template admits<T>(there, one, values, count, rigid::kLeastShare)) sum[2] += 1;
+      }
+      const double before = E::value(b.state(v, one), values, count), after = E::value(there, values, count);
+      sum[0] += after - before, sum[1] += std::abs(before) + std::abs(after);
+    });
+  });
+  double change[2 * coarse::kDegree];
+  const int32_t first = tets.ptr[b.body];
+  const T* rest = tets.rest.data + b.scene * tets.rest.scene;
+  const T* material = tets.material.data + b.scene * tets.material.scene;
+  team.template sum<2 * coarse::kDegree>(tets.ptr[b.body + 1] - first, change, [&](int32_t i, double* sum) {
+    double c[coarse::kDegree] = {};
+    kernels.line(tets.corner, rest, material, at, way, first + i, first + i + 1, c);
+    for (int k = 0; k < coarse::kDegree; ++k) sum[k] += c[k], sum[coarse::kDegree + k] += std::abs(c[k]);
+  });
+  const double h2 = b.in.time_step * b.in.time_step;
+  out[0] = vertices[0], out[1] = vertices[1];
+  for (int k = 0; k < coarse::kDegree; ++k) out[0] += h2 * change[k], out[1] += h2 * change[coarse::kDegree + k];
+  if (vertices[2] > 0) out[0] = std::numeric_limits<double>::infinity();
+}
+
+Tensor potential_rise(const Tensor& x, const Tensor& to, const Tensor& x_prev, const Tensor& y, const Tensor& mass,
+                      const Tensor& energy_data, const Tensor& origin, const Tensor& material, const Tensor& rest,
+                      const Tensor& order, const Tensor& ptr, const Tensor& other, const Tensor& corner,
+                      const Tensor& block_ptr, std::vector<int64_t> data_count, double time_step) {
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const RigidFields fields{x, x_prev, y, mass, energy_data, origin, order, ptr, order, other};
+    const auto in = diffvbd::rigid_inputs<T>(fields, data_count, time_step, false);
+    require_like("to", to, x, x.numel());
+    require(is_index(corner, x) && corner.dim() == 3 && corner.size(1) == 4 && corner.size(2) == kLanes &&
+                is_index(block_ptr, x) && block_ptr.numel() == in.bodies + 1,
+            "diffvbd::potential_rise: expected corner [blocks, 4, lanes] and block_ptr [bodies + 1], int32");
+    const int64_t scenes = in.scenes, vertices = in.vertices, blocks = corner.size(0);
+    Tets<T> tets{data<const int32_t>(corner), data<const int32_t>(block_ptr), {}, {}};
+    tets.rest = batched<T>("rest", rest, x, scenes, blocks * kRestScalars * kLanes);
+    tets.material = batched<T>("material", material, x, scenes, blocks * kTetScalars * kLanes);
+    const Buffer<T> at(size_t(scenes * vertices) * 4, true), way(size_t(scenes * vertices) * 4, true);
+    pack(data<const T>(x), data<const T>(to), scenes * vertices, at.get(), way.get());
+    const auto kernels = diffvbd::coarse_kernels<T>(diffvbd::kExactBlock);
+    Tensor out = torch::stable::empty({scenes, in.bodies, 2}, ScalarType::Double);
+    for_bodies(in, [&](const rigid::Body<T>& body, const Threads& team) {
+      const int64_t first = 4 * body.scene * vertices;
+      rise(body, team, tets, data<const T>(to), at.get() + first, way.get() + first, kernels,
+           data<double>(out) + 2 * (body.scene * in.bodies + body.body));
+    });
+    return out;
+  });
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
+  m.impl("anderson_combine", TORCH_BOX(&anderson_combine));
+  m.impl("potential_rise", TORCH_BOX(&potential_rise));
+}

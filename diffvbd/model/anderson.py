@@ -1,0 +1,81 @@
+"""Anderson acceleration of the sweeps of a step: what a Model is asked for, and its bodies as the checks read them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..checks import check_count
+from .bodies import connected
+from .coarse_plan import ROW, in_blocks
+from .rest import rest_metric
+
+MOST = 10  # differences: more fit the noise of the last ones
+
+
+@dataclass(frozen=True)
+class Anderson:
+    """Anderson acceleration: a step goes on from the combination of its last iterates whose residuals cancel best.
+
+    An iterate is a coarse correction with its sweeps, or without coarse corrections one sweep; its residual is the way
+    that it goes. Each body combines its own. What would raise a body's incremental potential, or leave a vertex less
+    than a tenth of its gap to a plane, is not taken. The first two iterates and the last are left as they are.
+
+    Args:
+        window: Differences of iterates that are combined, 1 to 10: 2 or 3 with coarse corrections, 5 without.
+
+    Raises:
+        ValueError, TypeError: where window is no integer from 1 to 10.
+
+    Source: Anderson (1965); Walker and Ni (2011), type II; docs/method.md, section 16.
+    """
+
+    window: int = 2
+
+    def __post_init__(self) -> None:
+        check_count("window", self.window, 1, maximum=MOST)
+
+
+class MovingBodies(NamedTuple):
+    """The connected bodies that have a vertex to move, with their tets in blocks of 8; constants of a Model."""
+
+    order: Tensor  # int32 [active], vertices that move, by body
+    ptr: Tensor  # int32 [bodies + 1]
+    of: Tensor  # int64 [V], the body of a vertex that moves; `number` of the others
+    tet: Tensor  # int64 [blocks, 8], any at padding
+    corner: Tensor  # int32 [blocks, 4, 8], four times a vertex; at padding one vertex of the block four times
+    block_ptr: Tensor  # int32 [bodies + 1]
+    rest: Tensor  # [1, blocks, 7, 8], of the Model's own rest shape and dtype
+
+    @property
+    def number(self) -> int:
+        return self.ptr.shape[0] - 1
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> MovingBodies:
+        placed = MovingBodies(*(t.to(device) for t in self))
+        return placed._replace(rest=placed.rest.to(dtype))
+
+
+def moving_bodies(points: Tensor, tets: Tensor, pinned: Tensor, elastic: bool) -> MovingBodies:
+    """points [V, 3] float64, tets int64 [T, 4], pinned bool [V], on the CPU; elastic: whether tets have energy."""
+    label = connected(tets, len(points))
+    roots, of_active = torch.unique(label[~pinned], return_inverse=True)
+    count = len(roots)
+    of = torch.full((len(points),), count).masked_scatter_(~pinned, of_active)
+    order = torch.argsort(of, stable=True)[: len(of_active)]
+    ptr = torch.cat([of.new_zeros(1), torch.bincount(of_active, minlength=count).cumsum(0)])
+    # the body of each label, also at vertices that are pinned
+    body = torch.full((len(points),), -1).index_copy_(0, roots, torch.arange(count))[label]
+    of_tet = body[tets[:, 0]] if elastic else torch.full((len(tets),), -1)
+    listed = torch.argsort(of_tet, stable=True)[int((of_tet < 0).sum()) :]
+    numbers = torch.bincount(of_tet[listed], minlength=count)
+    blocks, block_ptr = (torch.from_numpy(a) for a in in_blocks(listed.numpy(), numbers.numpy()))
+    tet = blocks.clamp(min=0)
+    corner = torch.where(blocks[..., None] >= 0, tets[tet], tets[tet[:, :1]][..., :1]) if len(tet) else tets.new_empty(
+        (0, blocks.shape[1], 4))  # fmt: skip
+    rest = rest_metric(points[tets][None])[0][0] if len(tets) else points.new_empty((0, 7))
+    return MovingBodies(order.int(), ptr.int(), of, tet, (ROW * corner).transpose(1, 2).contiguous().int(),
+                        block_ptr.int(), rest[tet].transpose(1, 2)[None].contiguous())  # fmt: skip
