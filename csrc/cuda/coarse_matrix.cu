@@ -15,10 +15,10 @@ constexpr int kTurned = 18;  // where the rotation is known
 __device__ __forceinline__ Matrix load_matrix(const double* a) {
   return {{a[0], a[1], a[2]}, {a[3], a[4], a[5]}, {a[6], a[7], a[8]}};
 }
-__device__ __forceinline__ void store_matrix(double* a, const Matrix& m) {
-  a[0] = m.x.x, a[1] = m.x.y, a[2] = m.x.z;
-  a[3] = m.y.x, a[4] = m.y.y, a[5] = m.y.z;
-  a[6] = m.z.x, a[7] = m.z.y, a[8] = m.z.z;
+__device__ __forceinline__ void store_matrix(double* a, const Matrix& m, int64_t row = 3) {
+  a[0] = m.x.x, a[1] = m.x.y, a[2] = m.x.z, a += row;
+  a[0] = m.y.x, a[1] = m.y.y, a[2] = m.y.z, a += row;
+  a[0] = m.z.x, a[1] = m.z.y, a[2] = m.z.z;
 }
 
 // A block for each group of each scene.
@@ -96,10 +96,7 @@ __global__ void __launch_bounds__(kPairThreads)
   sum = sum + mass * rigid::identity();
   if (mirrored) sum = transposed(sum);
   const int64_t n = 3 * at.count;
-  double* to = matrix + 9 * (scene * p.cells + __ldg(p.mass_ptr + at.body)) + 3 * at.i * n + 3 * at.j;
-  to[0] = sum.x.x, to[1] = sum.x.y, to[2] = sum.x.z;
-  to[n] = sum.y.x, to[n + 1] = sum.y.y, to[n + 2] = sum.y.z;
-  to[2 * n] = sum.z.x, to[2 * n + 1] = sum.z.y, to[2 * n + 2] = sum.z.z;
+  store_matrix(matrix + 9 * (scene * p.cells + __ldg(p.mass_ptr + at.body)) + 3 * at.i * n + 3 * at.j, sum, n);
 }
 
 // --- the inverse: a symmetric sweep (Goodnight) over tiles of the diagonal, after which the matrix holds -A^-1
