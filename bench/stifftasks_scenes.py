@@ -41,10 +41,9 @@ class Motion:
     density: float
     seconds: float
     materials: tuple[dict[str, Any], ...]  # mu, lam [Pa]: of the truth, and of the first guess where it is another
-    present: Way
     x: Tensor | None = None  # None: at rest
     v: Tensor | None = None
-    load: Callable[[int], dict[str, Any]] = lambda steps: {"gravity": NONE}  # noqa: E731
+    load: Callable[[int], dict[str, Any]] = lambda steps: {"gravity": NONE}
 
     @cached_property
     def state(self) -> tuple[Tensor, Tensor]:
@@ -82,7 +81,7 @@ def twisted_beam(quick: bool) -> Motion:
     mesh, clamped = _beam(quick)
     truth = {"mu": beam_mu.TRUE_MU, "lam": beam_mu.LAM}
     return Motion("beam-mu", mesh, clamped, beam_mu.DENSITY, 0.2, (truth, {**truth, "mu": beam_mu.START_MU}),
-                  Way(2e-3, 15, start="predictor"), x=beam_mu.twisted(torch.from_numpy(mesh.points), beam_mu.TWIST))  # fmt: skip
+                  x=beam_mu.twisted(torch.from_numpy(mesh.points), beam_mu.TWIST))  # fmt: skip
 
 
 def kicked_beam(quick: bool) -> Motion:
@@ -90,8 +89,7 @@ def kicked_beam(quick: bool) -> Motion:
     v = beam_mu_lam.kicked(torch.from_numpy(mesh.points), beam_mu_lam.KICK / 0.2)
     v[torch.from_numpy(clamped)] = 0
     first = dict(zip(("mu", "lam"), beam_mu_lam.START, strict=True))
-    return Motion("beam-mu-lam", mesh, clamped, beam_mu_lam.DENSITY, 0.2, (beam_mu_lam.TRUTH, first),
-                  Way(2e-3, 15, start="predictor"), v=v)  # fmt: skip
+    return Motion("beam-mu-lam", mesh, clamped, beam_mu_lam.DENSITY, 0.2, (beam_mu_lam.TRUTH, first), v=v)
 
 
 def _beam(quick: bool) -> tuple[dv.TetMesh, np.ndarray]:
@@ -104,8 +102,7 @@ def sagging_cloth(quick: bool) -> Motion:
     mesh = dv.mesh.sheet(*((6, 5) if quick else (22, 11)), size=(task.SIDE, task.SIDE), thickness=task.THICKNESS)
     corners = (np.abs(mesh.points[:, ::2] - 0.5 * task.SIDE) > 0.5 * task.SIDE - 1e-9).all(axis=1)
     materials = tuple({"mu": mu, "lam": task.LAM} for mu in (task.TRUE_MU, task.START_MU))
-    return Motion("cape-mu", mesh, corners, task.DENSITY, 1 / 3, materials,
-                  Way(1 / 240, 40, 1.7, start="predictor"), load=lambda steps: {})  # fmt: skip
+    return Motion("cape-mu", mesh, corners, task.DENSITY, 1 / 3, materials, load=lambda steps: {})
 
 
 def blown_cape(quick: bool) -> Motion:
@@ -113,7 +110,7 @@ def blown_cape(quick: bool) -> Motion:
     mesh, top = hanging(*((5, 6) if quick else (18, 24)), task.WIDTH, task.LENGTH, task.THICKNESS)
     wind = tuple(a + b for a, b in zip(task.GRAVITY, task.TRUE_WIND, strict=True))
     return Motion("cape-wind", mesh, top, task.DENSITY, 0.5, ({"mu": task.MU, "lam": task.LAM},),
-                  Way(1 / 120, 20, 1.7, start="predictor"), load=lambda steps: {"gravity": wind})  # fmt: skip
+                  load=lambda steps: {"gravity": wind})  # fmt: skip
 
 
 def blown_flag(quick: bool) -> Motion:
@@ -126,7 +123,7 @@ def blown_flag(quick: bool) -> Motion:
         return {"gravity": dv.per_step((gravity + task.reference_wind()[window])[:, None])}
 
     return Motion("flag-wind", mesh, top, task.DENSITY, 1.0, ({"mu": task.MU, "lam": task.LAM},),
-                  Way(1 / 120, 10, 1.7, start="predictor"), load=load)  # fmt: skip
+                  load=load)  # fmt: skip
 
 
 def pulled_rabbit(quick: bool) -> Motion:
@@ -136,7 +133,7 @@ def pulled_rabbit(quick: bool) -> Motion:
     load = {"force": pulled.force, "gravity": NONE}
     factor = 2 * task.POISSON / (1 - 2 * task.POISSON)
     return Motion("fit-real-mesh", pulled.body, pulled.model.pinned.numpy(), task.DENSITY, 0.24,
-                  ({"mu": pulled.true, "lam": factor * pulled.true},), Way(5e-3, 20, 1.7, start="predictor"),
+                  ({"mu": pulled.true, "lam": factor * pulled.true},),
                   x=pulled.x.contiguous(), v=pulled.v, load=lambda steps: load)  # fmt: skip
 
 

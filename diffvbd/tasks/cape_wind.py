@@ -10,9 +10,9 @@ this wind on a vertex is m w, and w stands beside gravity. (2.5 m/s at every ste
 
 Choices the paper leaves open: the cape is 0.6 m wide and 0.8 m long, with layers of 18 x 24 vertices 1 cm apart, of 200
 kg/m^3 and mu = lam = 5 kPa; h = 1/60 s, as the paper's figure suggests; K = 8 with coarse corrections and relaxation
-1.7, with which the motion stays within 2 mm of converged steps. The loss is the mean squared vertex distance at the end. As the true
-w_y is zero, the result is judged by |w - w*| / |w*|, the row "deviation". The run ends when the loss is 1e-10 of the
-first one, or after 120 iterations, the paper's count.
+1.7, with which the motion stays within 2 mm of converged steps. The loss is the mean squared vertex distance at the
+end. As the true w_y is zero, the result is judged by |w - w*| / |w*|, the row "deviation". The run ends when the loss
+is 1e-10 of the first one, or after 120 iterations, the paper's count.
 
 Start near zero. From (-6, 2, 4) and from (20, 5, -15) m/s^2 the task fails: 120 iterations miss the paper's 0.3 %.
 """

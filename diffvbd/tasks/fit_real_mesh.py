@@ -134,7 +134,7 @@ class Pulled:
     def __init__(self, body: dv.TetMesh, settings: Settings, version: Version) -> None:
         self.body, self.version = body, version
         pinned = body.points[:, 1] <= HELD * HEIGHT
-        model = dv.Model(body, density=DENSITY, pinned=pinned, relaxation=RELAXATION, start="predictor")
+        model = dv.Model(body, density=DENSITY, pinned=pinned, relaxation=RELAXATION)
         self.model = model.to(settings.device)
         self.like = {"dtype": self.model.dtype, "device": self.model.device}
         self.force = torch.as_tensor(pulls(body, version.grips), **self.like)
