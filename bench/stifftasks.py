@@ -52,14 +52,16 @@ def of_task(motion: Motion, ways: tuple[tuple[Way, str], ...], quick: bool) -> l
         errors = [distance(a, b) for a, b in zip(motion.motions(way), goal, strict=True)]
         rows.append({"task": motion.name, **asdict(way), "vertices": motion.mesh.num_vertices, "motion": moved,
                      "references_apart": apart, "errors": errors, "share": max(map(float.__truediv__, errors, moved)),
-                     "ms": motion.milliseconds(way, 1 if quick else 5), "verdict": verdict})  # fmt: skip
+                     "ms": motion.milliseconds(way, 1 if quick else 4), "verdict": verdict})  # fmt: skip
         print(rows[-1], file=sys.stderr, flush=True)
     return rows
 
 
 def converged(motion: Motion, time_step: float, quick: bool) -> tuple[list[Tensor], list[float], float]:
     """Motions of many sweeps with corrections, how far they go, and how far they are from those of half as many."""
-    few, many = (motion.motions(Way(time_step, k, 1.5, "auto")) for k in ((20, 40) if quick else (400, 800)))
+    few, many = (
+        motion.motions(Way(time_step, k, 1.5, "auto")) for k in ((20, 40) if quick else (motion.many // 2, motion.many))
+    )
     moved = [distance(way, way[:1]) for way in many]
     return many, moved, max(distance(a, b) / m for a, b, m in zip(few, many, moved, strict=True))
 
