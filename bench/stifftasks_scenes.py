@@ -82,12 +82,12 @@ def twisted_beam(quick: bool) -> Motion:
     mesh, clamped = _beam(quick)
     truth = {"mu": beam_mu.TRUE_MU, "lam": beam_mu.LAM}
     return Motion("beam-mu", mesh, clamped, beam_mu.DENSITY, 0.2, (truth, {**truth, "mu": beam_mu.START_MU}), 100,
-                  x=beam_mu.twisted(torch.from_numpy(mesh.points), beam_mu.TWIST))  # fmt: skip
+                  x=beam_mu.twisted(torch.from_numpy(mesh.points.copy()), beam_mu.TWIST))  # fmt: skip
 
 
 def kicked_beam(quick: bool) -> Motion:
     mesh, clamped = _beam(quick)
-    v = beam_mu_lam.kicked(torch.from_numpy(mesh.points), beam_mu_lam.KICK / 0.2)
+    v = beam_mu_lam.kicked(torch.from_numpy(mesh.points.copy()), beam_mu_lam.KICK / 0.2)
     v[torch.from_numpy(clamped)] = 0
     first = dict(zip(("mu", "lam"), beam_mu_lam.START, strict=True))
     return Motion("beam-mu-lam", mesh, clamped, beam_mu_lam.DENSITY, 0.2, (beam_mu_lam.TRUTH, first), 100,
