@@ -67,11 +67,19 @@ def large(card: Card) -> list[dict[str, Any]]:
     sweep = (made[-1][2] - made[0][2]) / (made[-1][0] - made[0][0])
     for row in rows:
         for level in LEVELS:
-            row[f"{level:g}"] = next(({"sweeps": k, "ms": t, "in_plain_sweeps": t / sweep}
-                                      for k, e, t in row["at"] if e <= level), None)  # fmt: skip
+            row[f"{level:g}"] = reached(row["at"], level, sweep)
         row |= {"vertices": scene.mesh.num_vertices, "sweep_ms": sweep, "reference_apart": apart}
         print(row, file=sys.stderr, flush=True)
     return rows
+
+
+def reached(rows: list[tuple[int, float, float]], level: float, sweep: float) -> dict[str, float] | None:
+    """The first K from which on all errors are below a level."""
+    last = max((i for i, (_, error, _) in enumerate(rows) if error > level), default=-1)
+    if last + 1 == len(rows):
+        return None
+    k, _, took = rows[last + 1]
+    return {"sweeps": k, "ms": took, "in_plain_sweeps": took / sweep}
 
 
 def end(scene: Scene, model: dv.Model, sweeps: int, steps: int) -> Tensor:
@@ -97,7 +105,7 @@ def count(model: dv.Model) -> int:
     return int((~model.coarse_geometry.filling).sum())
 
 
-def on(card: Card, scene: Scene) -> dict[str, Tensor]:
+def on(card: Card, scene: Scene) -> dict[str, Any]:
     return {k: torch.as_tensor(m, dtype=torch.float64, device=card.device) for k, m in scene.material.items()}
 
 
@@ -147,7 +155,9 @@ def _cost(card: Card, scene: Scene, scenes: int) -> dict[str, Any]:
 
 def _seconds(card: Card, scene: Scene, model: dv.Model, scenes: int, sweeps: int, backward: bool) -> float:
     x, v = (t.to(model.device).expand(scenes, -1, -1).contiguous().requires_grad_(backward) for t in scene.state())
-    material = {k: m.expand(scenes, 1).clone().requires_grad_(backward) for k, m in on(card, scene).items()}
+    material: dict[str, Any] = {
+        k: m.expand(scenes, 1).clone().requires_grad_(backward) for k, m in on(card, scene).items()
+    }
 
     def work() -> Any:
         with torch.set_grad_enabled(backward):

@@ -8,7 +8,8 @@ namespace diffvbd::cuda {
 namespace {
 
 constexpr int kSumThreads = 128, kManySumThreads = 1024;  // of a function, and of a part of a body
-constexpr int kLongRow = 1024;  // positions of a function on average from which on many threads add it up
+constexpr int kShortRow = 128, kLongRow = 1024;  // positions of a function on average: below which a warp adds it up,
+                                                 // and from which on many threads do
 constexpr int kRowThreads = 128;
 constexpr int kMostSmall = 8;  // functions of a body up to which eight threads solve for an unknown, else a warp
 
@@ -276,6 +277,9 @@ cudaError_t restricted(const View<T>& a, int k, cudaStream_t stream) {
     constexpr int threads = kManySumThreads;
     return launch(restrict_rows<T, threads, reverse>, functions * threads, threads, stream, a, k, rows);
   }
+  if (p.entries < int64_t{kShortRow} * p.functions) {
+    return launch(restrict_rows<T, 32, reverse>, functions * 32, 32, stream, a, k, rows);
+  }
   return launch(restrict_rows<T, kSumThreads, reverse>, functions * kSumThreads, kSumThreads, stream, a, k, rows);
 }
 
@@ -291,7 +295,7 @@ cudaError_t Corrections<T>::gradients(int wanted) const {
   int lanes = possible_lanes<T>(host, choice, least, reverse);
   if (lanes == kSomeLanes) lanes = kManyLanes;
   const bool spills = lanes == kSpillLanes;
-  const size_t of_warp = spills ? 0 : shared_scalars(host.degree, host.valence, lanes, reverse) * sizeof(T);
+  const size_t of_warp = spills ? 0 : gradient_scalars(host.degree, lanes, reverse) * sizeof(T);
   int64_t warps = kWarpsPerBlock;
   if (of_warp > 0) warps = std::min<int64_t>(warps, choice.shared / of_warp);
   const size_t shared = of_warp * warps;

@@ -44,6 +44,10 @@ using GradientKernel = void (*)(StepView<T>, CoarseWork<T>);
 // The gradient of the potential at all vertices, into `gradient`; or, where adjoints are wanted, that of its product
 // with `way`.
 constexpr int kForward = -1;
+// scalars of shared memory that a warp needs for it: no more than for a sweep
+DIFFVBD_FN constexpr int gradient_scalars(int degree, int lanes, bool reverse) {
+  return kSlice / threads_of(lanes) * 3 * degree * (reverse ? 2 : 1);
+}
 template <class T, int wanted>
 GradientKernel<T> gradient_kernel_of(int energies, int lanes);
 

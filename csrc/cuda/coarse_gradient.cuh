@@ -10,7 +10,7 @@
 namespace diffvbd::cuda {
 namespace {
 
-// A star that also has w of the neighbours, where the sums of a reversed sweep would stand.
+// A star that also has w of the neighbours, beside their positions.
 template <class T, int lanes>
 struct WayStar : GroupStar<T, lanes> {
   using Base = GroupStar<T, lanes>;
@@ -91,6 +91,17 @@ __device__ __noinline__ void send_to_pinned(const StepView<T>& s, int64_t scene,
   }
 }
 
+// A warp's own memory: positions of the neighbours, and w of them in the reverse.
+template <class T, int lanes>
+__device__ __forceinline__ T* memory_of_gradients(const StepView<T>& s, bool reverse) {
+  extern __shared__ __align__(16) unsigned char memory[];
+  const int warp = threadIdx.x / kSlice, size = gradient_scalars(s.degree, lanes, reverse);
+  if constexpr (lanes == kSpillLanes) {
+    return s.spill + (blockIdx.x * (blockDim.x / kSlice) + warp) * static_cast<int64_t>(size);
+  }
+  return reinterpret_cast<T*>(memory) + warp * size;
+}
+
 // Calls visit(place) for the warps' share of all vertices that move.
 template <int lanes_, class T, class Visit>
 __device__ __forceinline__ void each_vertex(const StepView<T>& s, const Visit& visit) {
@@ -108,7 +119,7 @@ template <class T, int mask, int lanes>
 __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 80 : 128)
     gradient_of_vertices(const __grid_constant__ StepView<T> s, const __grid_constant__ CoarseWork<T> w) {
   using Set = EnergySet<mask>;
-  T* const shared = memory_of_warp<T, lanes>(s, false);
+  T* const shared = memory_of_gradients<T, lanes>(s, false);
   each_vertex<lanes>(s, [&](const Place<lanes>& at) {
     GroupStar<T, lanes> star(s, at, shared);
     if (s.has_tets) star.fetch_neighbours(true);
@@ -123,7 +134,7 @@ template <class T, int mask, int wanted, int lanes>
 __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 128 : 168)
     reverse_gradients(const __grid_constant__ StepView<T> s, const __grid_constant__ CoarseWork<T> w) {
   using Set = EnergySet<mask>;
-  T* const shared = memory_of_warp<T, lanes>(s, true);
+  T* const shared = memory_of_gradients<T, lanes>(s, true);
   const int pinned = __ldg(s.plan.color_block + s.plan.colors) * kSlice;
   each_vertex<lanes>(s, [&](const Place<lanes>& at) {
     const int64_t position = int64_t{at.block} * kSlice + at.v, row = at.scene * s.positions + position;
