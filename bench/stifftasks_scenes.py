@@ -89,7 +89,7 @@ def kicked_beam(quick: bool) -> Motion:
     mesh, clamped = _beam(quick)
     v = beam_mu_lam.kicked(torch.from_numpy(mesh.points.copy()), beam_mu_lam.KICK / 0.2)
     v[torch.from_numpy(clamped)] = 0
-    first = dict(zip(("mu", "lam"), beam_mu_lam.START, strict=True))
+    first: dict[str, Any] = dict(zip(("mu", "lam"), beam_mu_lam.START, strict=True))
     return Motion("beam-mu-lam", mesh, clamped, beam_mu_lam.DENSITY, 0.2, (beam_mu_lam.TRUTH, first), 100,
                   v=v)  # fmt: skip
 
