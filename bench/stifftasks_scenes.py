@@ -102,7 +102,7 @@ def _beam(quick: bool) -> tuple[dv.TetMesh, np.ndarray]:
 def sagging_cloth(quick: bool) -> Motion:
     task = cape_mu
     mesh = dv.mesh.sheet(*((6, 5) if quick else (22, 11)), size=(task.SIDE, task.SIDE), thickness=task.THICKNESS)
-    corners = (np.abs(mesh.points[:, ::2] - 0.5 * task.SIDE) > 0.5 * task.SIDE - 1e-9).all(axis=1)
+    corners = np.all(np.abs(mesh.points[:, ::2] - 0.5 * task.SIDE) > 0.5 * task.SIDE - 1e-9, axis=1)
     materials = tuple({"mu": mu, "lam": task.LAM} for mu in (task.TRUE_MU, task.START_MU))
     return Motion("cape-mu", mesh, corners, task.DENSITY, 1 / 3, materials, load=lambda steps: {})
 
