@@ -89,7 +89,7 @@ def kicked_beam(quick: bool) -> Motion:
     mesh, clamped = _beam(quick)
     v = beam_mu_lam.kicked(torch.from_numpy(mesh.points.copy()), beam_mu_lam.KICK / 0.2)
     v[torch.from_numpy(clamped)] = 0
-    first = dict(zip(("mu", "lam"), beam_mu_lam.START, strict=True))
+    first: dict[str, Any] = dict(zip(("mu", "lam"), beam_mu_lam.START, strict=True))
     return Motion("beam-mu-lam", mesh, clamped, beam_mu_lam.DENSITY, 0.2, (beam_mu_lam.TRUTH, first), 100,
                   v=v)  # fmt: skip
 
@@ -102,7 +102,7 @@ def _beam(quick: bool) -> tuple[dv.TetMesh, np.ndarray]:
 def sagging_cloth(quick: bool) -> Motion:
     task = cape_mu
     mesh = dv.mesh.sheet(*((6, 5) if quick else (22, 11)), size=(task.SIDE, task.SIDE), thickness=task.THICKNESS)
-    corners = (np.abs(mesh.points[:, ::2] - 0.5 * task.SIDE) > 0.5 * task.SIDE - 1e-9).all(axis=1)
+    corners = np.all(np.abs(mesh.points[:, ::2] - 0.5 * task.SIDE) > 0.5 * task.SIDE - 1e-9, axis=1)
     materials = tuple({"mu": mu, "lam": task.LAM} for mu in (task.TRUE_MU, task.START_MU))
     return Motion("cape-mu", mesh, corners, task.DENSITY, 1 / 3, materials, load=lambda steps: {})
 
