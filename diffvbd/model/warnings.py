@@ -50,13 +50,14 @@ def warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, s
     caller is shown.
 
     The two faces of a sheet are coupled (w / t)^2 times as stiffly as neighbours in its plane, w wide and t thick, and
-    sweeps move them together by that much less; inertia helps where a wave crosses fewer elements than w / t.
+    sweeps move them together by that much less; inertia helps where a wave crosses fewer elements than w / t. Coarse
+    corrections move them together.
 
     Args:
         mu, lam: [Pa], [1 | B, 1 | T]; on CUDA they are not looked at outside debug_checks().
         time_step, sweeps: Of the step.
     """
-    if "thin" in model._derived or sweeps == 0 or not model.mesh.num_tets:
+    if "thin" in model._derived or sweeps == 0 or not model.mesh.num_tets or model.coarse is not None:
         return
     model._derived["thin"] = True
     tets = model.mesh.tets[:: max(1, model.mesh.num_tets // SAMPLED)]

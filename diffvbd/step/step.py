@@ -100,7 +100,7 @@ def step(
     prepared = prepare(model, lead, mu=mu, lam=lam, young=young, poisson=poisson, time_step=time_step, sweeps=sweeps,
                        rest_points=rest_points, density=density, parameters=parameters, adjoint=adjoint)  # fmt: skip
     check_prescribed(model, prescribed, x)
-    if model.coarse is None and looks_at(prepared.mu) and looks_at(prepared.lam):
+    if looks_at(prepared.mu) and looks_at(prepared.lam):
         warn_of_thin_tets(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps)
     return advance(model, x, v, prepared, force=force, gravity=gravity, prescribed=prescribed, colliders=colliders,
                    colliders_before=colliders_before, adjoint=adjoint)  # fmt: skip

@@ -22,7 +22,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import viz
-from diffvbd.tasks.cloth import few_sweeps, mean_weights
+from diffvbd.tasks.cloth import mean_weights
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
 
@@ -54,7 +54,7 @@ def problem(settings: Settings) -> Problem:
 
     start = torch.tensor(START_MU, dtype=x.dtype, device=x.device)
     true = torch.full_like(start, TRUE_MU)
-    with torch.no_grad(), few_sweeps():
+    with torch.no_grad():
         target = height(true)
     log_mu = start.log().requires_grad_()
 

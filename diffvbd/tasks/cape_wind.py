@@ -24,7 +24,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, viz
-from diffvbd.tasks.cloth import few_sweeps, hanging
+from diffvbd.tasks.cloth import hanging
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
 
@@ -51,7 +51,7 @@ def problem(settings: Settings) -> Problem:
                             gravity=gravity + wind)  # fmt: skip
         return motion.x
 
-    with torch.no_grad(), few_sweeps():
+    with torch.no_grad():
         target = simulate(true)[-1]
     wind = torch.zeros_like(true, requires_grad=True)
 
