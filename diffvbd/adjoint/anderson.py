@@ -27,7 +27,7 @@ from .rise import RiseParts, rise_parts, rises
 from .sweep import sweep
 
 REGULARIZATION = 1e-6  # of the diagonal: bounds the condition of the small system, and with it rounding in gradients
-_COARSE = ("coarse_matrix", "coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights", "coarse_rest")
+_COARSE = ("coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights", "coarse_rest")
 
 
 class Swept(NamedTuple):
