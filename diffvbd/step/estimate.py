@@ -1,4 +1,4 @@
-"""How far from converged a step ends, estimated from the changes of its last iterates (docs/numerics.md)."""
+"""How far from converged a step ends, estimated from the changes of its last iterates (docs/method.md, section 17)."""
 
 from __future__ import annotations
 
@@ -33,12 +33,13 @@ class ErrorEstimate(NamedTuple):
         change: d, between the last two iterates [m], shape [..., bodies].
         ratio: rho, d over the change before it, at most 0.98 [-], shape [..., bodies].
         error: d rho / (1 - rho), in accelerated steps 0.4 d: the estimated distance to the converged step [m], shape
-            [..., bodies]. Often two thirds too small: take three times as much to be safe.
+            [..., bodies]. Often two thirds too small: take three times as much to be safe. Far too small for
+            motions that sweeps hardly change.
         relative: ``error`` over the motion of the body in the step [-], shape [..., bodies].
         lengths: Of the coarse corrections of the step, 1 is a whole one and 0 one that was refused; shape
             [..., corrections, bodies], empty without them.
 
-    Source: the remainder of a geometric series; docs/numerics.md, "How wrong a step is".
+    Source: the remainder of a geometric series; docs/numerics.md, "How wrong a step is", where it fails.
     """
 
     change: Tensor

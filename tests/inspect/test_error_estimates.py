@@ -18,6 +18,7 @@ from diffvbd.step.predict import begin
 from diffvbd.testing import relative_error, tolerance
 
 H = 1 / 60
+LOOSE = tolerance("finite_difference")  # of an error of 1e-8 m, positions round at 1e-16
 CORRECTIONS = 4  # of 12 sweeps
 COARSE = {"coarse": "auto", "relaxation": 1.5}
 ACCELERATED = {**COARSE, "acceleration": dv.Anderson(2)}
@@ -287,3 +288,29 @@ def test_no_steps_and_no_vertices(options: dict[str, Any]) -> None:
     x = torch.zeros(0, 3, dtype=torch.float64)
     errors = dv.rollout(empty, x, x, steps=1, **given).errors
     assert errors is not None and errors.error.shape == (1, 0)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("options", [{}, COARSE, ACCELERATED])
+def test_cuda_estimates_as_the_cpu_does_and_waits_for_nothing(options: dict[str, Any]) -> None:
+    c = case("body on a floor")
+
+    def errors(device: str) -> Any:
+        x, v = (t.to(device) for t in (c.x, c.v))
+        return dv.rollout(c.model(**options, device=device), x, v, steps=2, time_step=H, sweeps=12, mu=1e5, lam=1e5,
+                          estimate_errors=True).errors  # fmt: skip
+
+    of_cpu, of_cuda = errors("cpu"), errors("cuda")
+    for one, other in zip(of_cpu, of_cuda, strict=True):
+        assert one.shape == other.shape and (not one.numel() or relative_error(other.cpu(), one) < LOOSE)
+
+    model = c.model(**options, device="cuda")
+    x, v, mu = (t.to("cuda") for t in (c.x, c.v, torch.tensor(1e5).double()))
+    given = {"steps": 2, "time_step": H, "sweeps": 12, "mu": mu, "lam": mu, "estimate_errors": True}
+    dv.rollout(model, x, v, **given)  # what a Model keeps is built at the first use
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        dv.rollout(model, x, v, **given)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
