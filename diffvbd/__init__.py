@@ -25,6 +25,7 @@ from .ops.regimes import regime
 from .rollout.checkpoints import BinomialCheckpoints
 from .rollout.converge import Solution, solve
 from .rollout.rollout import Trajectory, per_step, rollout
+from .step.estimate import ErrorEstimate
 from .step.manual import Tape, step_backward, step_forward
 from .step.step import step
 
@@ -34,6 +35,7 @@ __all__ = [
     "BinomialCheckpoints",
     "CoarseSpace",
     "Diagnosis",
+    "ErrorEstimate",
     "FloorBarrier",
     "Friction",
     "GlobalAdjoint",

@@ -11,6 +11,7 @@ counts as a constant. The cycles are calls of the differentiable sweeps, and aut
 # pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, NoReturn
 
 import torch
@@ -27,7 +28,7 @@ from .rise import RiseParts, rise_parts, rises
 from .sweep import sweep
 
 REGULARIZATION = 1e-6  # of the diagonal: bounds the condition of the small system, and with it rounding in gradients
-_COARSE = ("coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights", "coarse_rest")
+COARSE_FIELDS = ("coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights", "coarse_rest")
 
 
 class Swept(NamedTuple):
@@ -36,6 +37,7 @@ class Swept(NamedTuple):
     x: Tensor  # [B, V, 3]
     corrections: list[Tensor]  # of each operator call, as sweep() returns them
     taken: list[Tensor]  # bool [B, bodies] of each combination: whether it was
+    before: Sequence[Tensor] = ()  # with combinations: where the last two cycles began
 
 
 def cycles_of(model: Model, sweeps: int) -> list[int]:
@@ -75,7 +77,7 @@ def run_sweeps(model: Model, fields: ops.SweepFields, settings: ops.SweepSetting
     within = settings._replace(numbers=numbers._replace(last_relaxation=numbers.relaxation))
     x, corrections, first = fields.x_start, [], True
     if model.coarse is not None:  # a sweep alone: iterates begin after it
-        alone = fields._replace(**dict.fromkeys(_COARSE))
+        alone = fields._replace(**dict.fromkeys(COARSE_FIELDS))
         x, _ = run(alone, within._replace(sweeps=cycles[0], coarse=()))
         cycles, first = cycles[1:], False
         if settings.coarse:
@@ -96,7 +98,7 @@ def run_sweeps(model: Model, fields: ops.SweepFields, settings: ops.SweepSetting
             before, after = before[-model.acceleration.window - 1 :], after[-model.acceleration.window - 1 :]
             x, kept, *_ = combine(fields.mass, parts, len(before), *before, *after)
             taken.append(kept)
-    return Swept(x, corrections, taken)
+    return Swept(x, corrections, taken, before[-2:])
 
 
 def none_taken(model: Model, x: Tensor) -> Tensor:

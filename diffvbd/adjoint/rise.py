@@ -30,7 +30,8 @@ class RiseParts(NamedTuple):
 
 def rise_parts(model: Model, fields: ops.SweepFields, time_step: float) -> RiseParts:
     """fields: of the step's sweeps."""
-    fields = ops.SweepFields(*(t if t is None else t.detach() for t in fields))  # pyright: ignore
+    # contiguous: a state may be expanded over scenes
+    fields = ops.SweepFields(*(t if t is None else t.detach().contiguous() for t in fields))  # pyright: ignore
     moving: MovingBodies = model._moving
     blocks, lanes = moving.tet.shape
     scenes = max(fields.mu.shape[0], fields.lam.shape[0])

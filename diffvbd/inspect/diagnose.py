@@ -1,4 +1,5 @@
-"""Checks of a state, and of the step that led to it, against the limits of docs/numerics.md. Plain torch, no sweeps."""
+"""Checks of a state, and of the step that led to it, against the limits of docs/numerics.md. Plain torch; sweeps only
+where the error of the step is asked for."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from ..checks import check_positive, fail
 from ..model.model import Model
 from ..model.moduli import moduli_of
 from ..model.warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
-from ..step.arguments import GRAVITY, check_prescribed, check_state
+from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare
+from ..step.estimate import ErrorEstimate, error_of
 
 # Limits with their measurements in docs/numerics.md
 SATURATION_TOO_LARGE = 1.0  # c over the mean edge: one update may then turn a tet inside out
@@ -24,6 +26,8 @@ SATURATION_TOO_SMALL = 0.01  # c over the mean edge: 20 sweeps no longer reach a
 RESOLUTION = 1e-5  # rounding of a position over the shortest edge; a gradient's error is 6 to 22 times that
 LARGE_STRAIN = 100.0  # Green strain; a gradient keeps 11 digits there and loses them with a power of the strain
 UNBALANCED = 0.01  # left-over force over the forces of the step; at 0.014 a hanging bar rests 1.5 to 11 % off
+INACCURATE = 0.01  # estimated error of a body over its motion in the step
+NEGLIGIBLE = 1e-5  # error over the mean edge, below which it is none: a body at rest has motions as small as its errors
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,9 @@ class Diagnosis:
         courant: Largest number of elements that a pressure wave crosses in one step [-].
         stiffness: Largest ratio of the elastic to the inertial part of a vertex block [-].
         unbalanced: Left-over force of the step, |dG/dx| / h^2, over its elastic and inertial forces (2-norms) [-].
+        errors: Estimate for each body, shapes [..., bodies], where ``sweeps`` was given.
+        relative_error: The largest estimated error over motion [-], of bodies whose error is no rounding; NaN where a
+            step has too few sweeps to tell.
     """
 
     messages: list[str]
@@ -56,6 +63,8 @@ class Diagnosis:
     courant: float | None
     stiffness: float | None
     unbalanced: float | None
+    errors: ErrorEstimate | None = field(default=None, repr=False)
+    relative_error: float | None = None
 
     @property
     def ok(self) -> bool:
@@ -72,6 +81,7 @@ class Diagnosis:
             ("elements a wave crosses per step", self.courant),
             ("elastic over inertial block", self.stiffness),
             ("left-over force of the step", self.unbalanced),
+            ("error over motion, worst body", self.relative_error),
         ]
         lines = [f"{name:<34}{value:.4g}" for name, value in rows if value is not None]
         return "\n".join(lines + [f"warning: {message}" for message in self.messages])
@@ -91,6 +101,7 @@ def diagnose(
     gravity: Sequence[float] | Tensor = GRAVITY,
     prescribed: Tensor | None = None,
     parameters: dict[str, Any] | None = None,
+    sweeps: int | None = None,
     warn: bool = True,
 ) -> Diagnosis:
     """Looks for what makes a result unreliable: collapsed or inverted tets, lost digits, safeguards out of scale, too
@@ -103,13 +114,16 @@ def diagnose(
         time_step: h [s]; needed for the Courant number, the stiffness and the left-over force.
         previous: State (x, v) from which one step led to ``x``; needed for the left-over force. force [N],
             gravity [m/s^2], prescribed [m] and parameters are then those of that step.
+        sweeps: K of that step: gives an estimate of its error, for which the step is swept again. Needs ``previous``.
         warn: Also emit each message as a UserWarning.
 
     Returns:
         A :class:`Diagnosis`; print it for a table.
 
     Raises:
-        ValueError, TypeError: As :func:`diffvbd.step`; also for ``previous`` without ``time_step``.
+        ValueError, TypeError: As :func:`diffvbd.step`; also for ``previous`` without ``time_step``,
+            and for ``sweeps`` without ``previous``.
+        NotImplementedError: ``previous`` with contact or friction.
 
     The F = 0 well: with s* the root of s^3 + s^2 + s = mu / (mu + lam), the elastic stress pulls every F with
     |F| < sqrt(3) s* towards 0 when lam >= 0 (docs/numerics.md, with the proof).
@@ -120,6 +134,17 @@ def diagnose(
         raise NotImplementedError("previous: the left-over force of a step with contact or friction is not computed")
     if previous is not None and time_step is None:
         fail("time_step", "a number in [s] where previous is given", None)
+    if sweeps is not None and previous is None:
+        fail("sweeps", "the previous state beside it", "none")
+    errors = None
+    if previous is not None and sweeps is not None and time_step is not None:
+        check_state(model, *previous)
+        check_prescribed(model, prescribed, previous[0])
+        if previous[0].shape != x.shape:
+            fail("previous", f"x's shape {list(x.shape)}", f"shape {list(previous[0].shape)}")
+        prepared = prepare(model, lead, mu=mu, lam=lam, time_step=time_step, sweeps=sweeps, rest_points=None,
+                           density=None, parameters=parameters)  # fmt: skip
+        errors = error_of(model, *previous, prepared, force=force, gravity=gravity, prescribed=prescribed)
     state = x.detach().to(torch.float64)
     mu, lam = (_as(a, state) for a in (mu, lam))
     points = torch.from_numpy(model.mesh.points.copy()).to(state)
@@ -155,8 +180,11 @@ def diagnose(
         courant=courant,
         stiffness=stiffness,
         unbalanced=unbalanced,
+        errors=errors,
+        relative_error=None if errors is None else _largest(_relative(errors, edge)),
     )
-    result.messages.extend(_state_messages(model, result) + _setting_messages(model, mu, lam, edge))
+    result.messages.extend(_state_messages(model, result) + _error_messages(model, result, edge))
+    result.messages.extend(_setting_messages(model, mu, lam, edge))
     if warn:
         for message in result.messages:
             warnings.warn(f"diffvbd: {message}", stacklevel=2)
@@ -268,6 +296,26 @@ def _state_messages(model: Model, result: Diagnosis) -> list[str]:
         out.append(f"the step left {100 * result.unbalanced:.2g} % of its forces unbalanced: take more sweeps or a "
                    f"smaller time step{faster}")  # fmt: skip
     return out
+
+
+def _relative(errors: ErrorEstimate, edge: Tensor) -> Tensor:
+    """Error over motion of each body, 0 where the error is none to speak of."""
+    least = NEGLIGIBLE * float(edge.mean()) if edge.numel() else 0.0
+    return torch.where(errors.error <= least, 0, errors.relative)
+
+
+def _error_messages(model: Model, result: Diagnosis, edge: Tensor) -> list[str]:
+    if result.errors is None:
+        return []
+    relative = _relative(result.errors, edge)
+    wrong = relative > INACCURATE
+    if not bool(wrong.any()):
+        return []
+    *scene, body = torch.where(wrong, relative, 0).eq(relative[wrong].max()).nonzero()[0].tolist()
+    where = f"body {body}" + (f" of scene {scene}" if scene else "")
+    coarse = ', or coarse="auto"' if model.coarse is None else ""
+    return [f"the step ends about {100 * float(relative[(*scene, body)]):.2g} % of its motion from where it would "
+            f"converge, in {where}; often three times as much: take more sweeps{coarse}"]  # fmt: skip
 
 
 def _setting_messages(model: Model, mu: Tensor, lam: Tensor, edge: Tensor) -> list[str]:

@@ -59,16 +59,31 @@ class MovingBodies(NamedTuple):
         return placed._replace(rest=placed.rest.to(dtype))
 
 
-def moving_bodies(points: Tensor, tets: Tensor, pinned: Tensor, elastic: bool) -> MovingBodies:
-    """points [V, 3] float64, tets int64 [T, 4], pinned bool [V], on the CPU; elastic: whether tets have energy."""
-    label = connected(tets, len(points))
+class MovingVertices(NamedTuple):
+    """The vertices that move, by connected body, in the order of the bodies' first vertices; on the CPU."""
+
+    order: Tensor  # int64 [active]
+    ptr: Tensor  # int64 [bodies + 1]
+    of: Tensor  # int64 [V], the body of each; `number of bodies` where a vertex does not move
+    body: Tensor  # int64 [V], the body, also of vertices that do not move; -1 where none moves
+
+
+def moving_vertices(tets: Tensor, pinned: Tensor) -> MovingVertices:
+    """tets int64 [T, 4], pinned bool [V], on the CPU."""
+    label = connected(tets, len(pinned))
     roots, of_active = torch.unique(label[~pinned], return_inverse=True)
     count = len(roots)
-    of = torch.full((len(points),), count).masked_scatter_(~pinned, of_active)
+    of = torch.full((len(pinned),), count).masked_scatter_(~pinned, of_active)
     order = torch.argsort(of, stable=True)[: len(of_active)]
     ptr = torch.cat([of.new_zeros(1), torch.bincount(of_active, minlength=count).cumsum(0)])
-    # the body of each label, also at vertices that are pinned
-    body = torch.full((len(points),), -1).index_copy_(0, roots, torch.arange(count))[label]
+    body = torch.full((len(pinned),), -1).index_copy_(0, roots, torch.arange(count))[label]
+    return MovingVertices(order, ptr, of, body)
+
+
+def moving_bodies(points: Tensor, tets: Tensor, pinned: Tensor, elastic: bool) -> MovingBodies:
+    """points [V, 3] float64, tets int64 [T, 4], pinned bool [V], on the CPU; elastic: whether tets have energy."""
+    order, ptr, of, body = moving_vertices(tets, pinned)
+    count = len(ptr) - 1
     of_tet = body[tets[:, 0]] if elastic else torch.full((len(tets),), -1)
     listed = torch.argsort(of_tet, stable=True)[int((of_tet < 0).sum()) :]
     numbers = torch.bincount(of_tet[listed], minlength=count)

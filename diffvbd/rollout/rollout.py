@@ -16,11 +16,13 @@ from ..model.model import Model
 from ..model.warnings import warn_of_thin_tets
 from ..scopes import looks_at
 from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
+from ..step.estimate import ErrorEstimate, check_estimable, error_of, of_steps
 from ..step.step import advance
 from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
 
 # these enter through prepare(), the others through advance()
 _STATIC = ("mu", "lam", "young", "poisson", "rest_points", "density")
+_LOADS = ("force", "gravity", "prescribed")
 
 
 @dataclass(frozen=True)
@@ -45,12 +47,14 @@ class Trajectory:
         x, v: Positions [m] and velocities [m/s] of the saved frames, shape [frames, ..., V, 3].
         steps: Step number of each frame (0: the initial state); the last frame is the final state.
         observations: What ``observe`` returned, stacked over steps (a tensor, or a tuple or dict of them), or None.
+        errors: With ``estimate_errors`` those of each step, its tensors of shape [steps, ..., bodies]; else None.
     """
 
     x: Tensor
     v: Tensor
     steps: list[int]
     observations: Any = None
+    errors: ErrorEstimate | None = None
 
 
 def rollout(
@@ -78,6 +82,7 @@ def rollout(
     save: Literal["all", "last"] | int = "all",
     observe: Callable[[Tensor, Tensor, int], Any] | None = None,
     progress: bool = False,
+    estimate_errors: bool = False,
 ) -> Trajectory:
     """Runs ``steps`` steps; the gradient is that of calling :func:`diffvbd.step` in a loop.
 
@@ -102,12 +107,17 @@ def rollout(
         observe: Called after each step as observe(x, v, step) with step = 1 ... steps; its results (a tensor, or a
             tuple, list or dict of tensors) are stacked and differentiable, so that long rollouts need not keep frames.
         progress: Print progress to stderr.
+        estimate_errors: Also return how far from converged each step ends (:class:`diffvbd.ErrorEstimate`). Each step
+            is swept twice for it, the second time without a tape, once under every schedule; states and gradients are
+            the same.
 
     Raises:
         ValueError, TypeError: As step; also where a per_step value has another number of steps.
+        NotImplementedError: ``estimate_errors`` with contact or friction.
     """
     steps = check_count("steps", steps)
     _check_save(save)
+    _check_estimates(estimate_errors, model)
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
     options = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "rest_points": rest_points,
                "density": density, "force": force, "gravity": gravity, "prescribed": prescribed,
@@ -131,6 +141,7 @@ def rollout(
     # A segment that runs again reads these anew: autograd cannot see that they were changed in between.
     versions = [] if every is None or torch.compiler.is_compiling() else _versions(options, own)
     bar = _Progress(steps) if progress else None
+    errors: dict[int, ErrorEstimate] = {}  # by step: a segment that runs again finds them
 
     def segment(first: int, end: int, x: Tensor, v: Tensor, start: Tensor = x) -> Segment:  # start: the outer x
         _check_versions(versions)
@@ -138,7 +149,9 @@ def rollout(
         for k in range(first, end):
             now = prepare(model, lead, **chosen, **_to_prepare(options, own, k, x, v)) if fixed is None else fixed
             given = _to_advance(model, options, k, x, v, start, colliders_before)
-            x, v = advance(model, x, v, now, adjoint=adjoint, index=k, **given)
+            before, (x, v) = (x, v), advance(model, x, v, now, adjoint=adjoint, index=k, **given)
+            if estimate_errors and k not in errors:
+                errors[k] = error_of(model, *before, now, **{name: given[name] for name in _LOADS})
             if save == "all" or k + 1 == steps or (save != "last" and (k + 1) % save == 0):
                 frames.append((k + 1, x, v))
             if observe is not None:
@@ -154,6 +167,7 @@ def rollout(
         v=torch.stack([f[2] for f in frames]),
         steps=[f[0] for f in frames],
         observations=_stacked(done.observed),
+        errors=of_steps([errors[k] for k in range(steps)], model, x, sweeps) if estimate_errors else None,
     )
 
 
@@ -163,6 +177,13 @@ def rollout(
 def _check_save(save: Any) -> None:
     if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
         fail("save", '"all", "last" or an integer > 0', repr(save))
+
+
+def _check_estimates(asked: Any, model: Any) -> None:
+    if not isinstance(asked, bool):
+        raise TypeError(f"estimate_errors: expected a bool, got {type(asked).__name__}")
+    if asked and isinstance(model, Model):
+        check_estimable(model, "estimate_errors")
 
 
 def _check_values(
@@ -190,7 +211,7 @@ def _to_prepare(options: dict[str, Any], parameters: dict[str, Any], k: int, x: 
 def _to_advance(model: Model, options: dict[str, Any], k: int, x: Tensor, v: Tensor, start: Tensor,
                 colliders_before: Tensor | None) -> dict[str, Any]:  # fmt: skip
     """What enters step k through advance(); ``start``: x before the first step."""
-    now = {name: _at(options[name], k, x, v) for name in ("force", "gravity", "prescribed", "colliders")}
+    now = {name: _at(options[name], k, x, v) for name in (*_LOADS, "colliders")}
     if _changes(options["prescribed"]) and not isinstance(options["prescribed"], _Steps):
         check_prescribed(model, now["prescribed"], x, start)
     if isinstance(options["colliders"], _Steps):
