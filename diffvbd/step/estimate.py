@@ -112,7 +112,9 @@ def _iterates(model: Model, begun: Begun, prepared: Prepared) -> tuple[list[Tens
     x, corrections, states = fields.x_start, [], []
 
     def run(fields: ops.SweepFields, settings: ops.SweepSettings) -> Tensor:
-        end, _, done = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=ops.NO_TAPE)
+        # values are looked at once
+        end, _, done = sweep(fields, model._packed_rest, model._plan, settings, tape_policy=ops.NO_TAPE,
+                             checked=fields.x_start is begun.x_start)  # fmt: skip
         corrections.extend([done] if done.numel() else [])
         return end
 
