@@ -115,7 +115,8 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   // CPU only: the combination of iterates, states [2, window + 1, scenes, vertices, 3] (of which each cycle began, and
   // ended), the inverse of each body's system [scenes, bodies, window, window] and its solution
   m.def(
-      "anderson_combine(Tensor states, Tensor mass, Tensor order, Tensor ptr, float regularization) -> (Tensor to, "
+      "anderson_combine(Tensor states, Tensor mass, Tensor order, Tensor ptr, float regularization, float noise) -> "
+      "(Tensor to, "
       "Tensor inverse, Tensor gamma)");
   // CPU only: by how much the potential of each body rises from x to `to`, and the sum of the sizes of its terms
   // [scenes, bodies, 2], float64; infinite where a vertex comes too near a plane. order, ptr: vertices that move, by

@@ -26,8 +26,8 @@ struct CoarseKernels {
                  int64_t end);
   // to [3, 3, n] := r k r^T of n blocks, whose entries are a plane apart
   void (*rotate)(const T* k, int64_t plane, const T* r, int64_t n, T* to);
-  // From a positive definite matrix n x n, small or with n a multiple of kLanes, to L with L L^T = matrix, in its place;
-  // above the diagonal anything. panel: n x kLanes to work with
+  // From a positive definite matrix n x n, small or with n a multiple of kLanes, to L with L L^T = matrix, in its
+  // place; above the diagonal anything. panel: n x kLanes to work with
   void (*factor)(int64_t n, T* panel, T* factor);
   // rows [begin, end) of n x n: to := -sum over i < count of q_i a_i^T, one after another in q and a, a stride apart
   void (*outer)(const T* q, int64_t q_stride, const T* a, int64_t a_stride, int count, int64_t n, int64_t begin,

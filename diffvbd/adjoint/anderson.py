@@ -4,8 +4,9 @@ With iterates x_i, what a cycle of sweeps makes of them g_i, and residuals f_i =
 
     g_k - dG gamma        (dF' M dF + eps diag(dF' M dF)) gamma = dF' M f_k        dF, dG: differences of f_i, of g_i
 
-body by body, where the body's incremental potential does not rise over that of g_k; else it is g_k. Which one was taken
-counts as a constant. The cycles are calls of the differentiable sweeps, and autograd joins them with this.
+body by body, where the body's incremental potential does not rise over that of g_k and the differences are more than
+rounding; else it is g_k. Which one was taken counts as a constant. The cycles are calls of the differentiable sweeps,
+and autograd joins them with this.
 """
 
 # pyright: reportIncompatibleMethodOverride=false
@@ -28,6 +29,7 @@ from .rise import RiseParts, rise_parts, rises
 from .sweep import sweep
 
 REGULARIZATION = 1e-6  # of the diagonal: bounds the condition of the small system, and with it rounding in gradients
+NOISE = 100  # ulps of the positions: differences of residuals that small are rounding, and so are the weights from them
 COARSE_FIELDS = ("coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights", "coarse_rest")
 
 
@@ -110,14 +112,15 @@ def _combined(
     moving: MovingBodies, mass: Tensor, states: tuple[Tensor, ...], count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The combination, and of each body's small system the inverse and the solution, as ops.anderson_combine."""
+    noise = NOISE * torch.finfo(mass.dtype).eps
     if not mass.is_cuda:
         stacked = torch.stack(states).unflatten(0, (2, count))
-        return anderson_combine(stacked, mass, moving.order, moving.ptr, REGULARIZATION)
-    return _combined_in_torch(moving, mass, states, count)
+        return anderson_combine(stacked, mass, moving.order, moving.ptr, REGULARIZATION, noise)
+    return _combined_in_torch(moving, mass, states, count, noise)
 
 
-def _combined_in_torch(moving: MovingBodies, mass: Tensor, states: tuple[Tensor, ...], count: int
-                       ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+def _combined_in_torch(moving: MovingBodies, mass: Tensor, states: tuple[Tensor, ...], count: int,
+                       noise: float) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """_combined() for CUDA."""
     residual, of_residuals, of_ends = _differences(states, count)
     window = count - 1
@@ -126,10 +129,9 @@ def _combined_in_torch(moving: MovingBodies, mass: Tensor, states: tuple[Tensor,
     sums = _sums(moving, (weighted[..., None] * others[..., None, :]).sum(2).flatten(-2))
     normal, right = sums.unflatten(-1, (window, window + 1)).split((window, 1), -1)
     diagonal = normal.diagonal(dim1=-2, dim2=-1)
-    # where nothing moves any more nothing is to be solved; torch's inverse waits for no device
-    more = torch.where(diagonal > 0, diagonal * REGULARIZATION, 1)
-    inverse = torch.linalg.inv_ex(normal + torch.diag_embed(more))[0]
-    gamma = (inverse @ right)[..., 0]
+    inverse = torch.linalg.inv_ex(normal + torch.diag_embed(diagonal * REGULARIZATION))[0]  # waits for no device
+    least = noise * noise * _sums(moving, mass[..., None] * states[-1].square().sum(-1, keepdim=True))
+    gamma = torch.where((diagonal > least).all(-1, keepdim=True), (inverse @ right)[..., 0], torch.nan)
     return states[-1] - _weighted(of_ends, _of_vertices(moving, gamma)), inverse, gamma
 
 

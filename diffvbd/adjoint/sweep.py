@@ -56,8 +56,10 @@ _STEP_FIELDS = len(ops.StepFields._fields)
 def _adjoints(bars: dict[str, Tensor], fields: ops.SweepFields | ops.StepFields, needs: tuple[bool, ...]
               ) -> tuple[Tensor, ...]:  # fmt: skip
     """Of the fields that need one, each in its field's shape."""
-    return tuple(ops.sum_to(bars[name], t.shape) for name, t, need in zip(fields._fields, fields, needs, strict=True)
-                 if need and t is not None)  # fmt: skip
+    wanted = [(bars[name], t) for name, t, need in zip(fields._fields, fields, needs, strict=True)
+              if need and t is not None]  # fmt: skip
+    # of no scenes there is nothing to add up
+    return tuple(ops.sum_to(bar, t.shape) if bar.numel() else torch.zeros_like(t) for bar, t in wanted)
 
 
 def _wants(names: Sequence[str], fields: Sequence[str], needs: Sequence[bool]) -> dict[str, bool]:

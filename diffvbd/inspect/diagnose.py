@@ -130,6 +130,8 @@ def diagnose(
     """
     lead = check_state(model, x, x)
     mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
+    if previous is not None:
+        _check_previous(model, previous)
     if previous is not None and model.touches:
         raise NotImplementedError("previous: the left-over force of a step with contact or friction is not computed")
     if previous is not None and time_step is None:
@@ -138,7 +140,6 @@ def diagnose(
         fail("sweeps", "the previous state beside it", "none")
     errors = None
     if previous is not None and sweeps is not None and time_step is not None:
-        check_state(model, *previous)
         check_prescribed(model, prescribed, previous[0])
         if previous[0].shape != x.shape:
             fail("previous", f"x's shape {list(x.shape)}", f"shape {list(previous[0].shape)}")
@@ -242,7 +243,6 @@ def _unbalanced(
     prescribed: Tensor | None,
     parameters: dict[str, Any] | None,
 ) -> float:
-    check_state(model, *previous)
     check_prescribed(model, prescribed, previous[0])
     x0, v0 = (t.detach().to(torch.float64) for t in previous)
     mass = model.mass.to(torch.float64)[:, None]
@@ -296,6 +296,16 @@ def _state_messages(model: Model, result: Diagnosis) -> list[str]:
         out.append(f"the step left {100 * result.unbalanced:.2g} % of its forces unbalanced: take more sweeps or a "
                    f"smaller time step{faster}")  # fmt: skip
     return out
+
+
+def _check_previous(model: Model, previous: Any) -> None:
+    if not (isinstance(previous, (tuple, list)) and len(previous) == 2):
+        shown = f"{len(previous)} values" if isinstance(previous, (tuple, list)) else type(previous).__name__
+        raise TypeError(f"previous: expected positions and velocities (x, v), got {shown}")
+    try:
+        check_state(model, *previous)
+    except (ValueError, TypeError) as error:
+        raise type(error)(f"previous: {error}") from None
 
 
 def _relative(errors: ErrorEstimate, edge: Tensor) -> Tensor:

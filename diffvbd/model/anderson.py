@@ -36,7 +36,7 @@ class Anderson:
     window: int = 2
 
     def __post_init__(self) -> None:
-        check_count("window", self.window, 1, maximum=MOST)
+        object.__setattr__(self, "window", check_count("window", self.window, 1, maximum=MOST))
 
 
 class MovingBodies(NamedTuple):

@@ -19,6 +19,7 @@ from .. import ops
 from ..checks import check_count
 
 FEWEST, MOST = 32, 128  # functions of a body under "auto"
+MOST_OF_ANY = 2**20  # that a CoarseSpace may ask for
 PER_FUNCTION = 25  # vertices of a large body for each function
 PER_FUNCTION_SMALL = 6  # and of a small one
 PER_FUNCTION_SHEET = 18
@@ -55,10 +56,10 @@ class CoarseSpace:
     def __post_init__(self) -> None:
         for name in ("functions", "groups"):
             if getattr(self, name) != "auto":
-                check_count(name, getattr(self, name), 1)
+                object.__setattr__(self, name, check_count(name, getattr(self, name), 1, maximum=MOST_OF_ANY))
         if self.degree != "auto":
-            check_count("degree", self.degree, 1, maximum=3)
-        check_count("every", self.every, 1)
+            object.__setattr__(self, "degree", check_count("degree", self.degree, 1, maximum=3))
+        object.__setattr__(self, "every", check_count("every", self.every, 1, maximum=MOST_OF_ANY))
 
     def corrections(self, sweeps: int) -> int:
         """How many corrections a step of so many sweeps has."""

@@ -385,11 +385,11 @@ class Model:
         launch = regimes.choose(*work, self.touches, bool(coarse)) if self.device.type == "cuda" else ()
         return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps, launch, coarse)
 
-    def memory(self, **options: Any) -> dict[str, int]:
+    def memory(self, *, sweeps: int, **options: Any) -> dict[str, int]:
         """Predicted bytes of a step or rollout of this Model; see :func:`diffvbd.rollout.memory.predict`."""
         from ..rollout.memory import predict
 
-        return predict(self, **options)
+        return predict(self, sweeps=sweeps, **options)
 
     def __repr__(self) -> str:
         return describe(self)

@@ -12,7 +12,7 @@ from .functions import raw_backward, shapes_of
 from .load import raw
 
 
-def anderson_combine(states: Tensor, mass: Tensor, order: Tensor, ptr: Tensor, regularization: float
+def anderson_combine(states: Tensor, mass: Tensor, order: Tensor, ptr: Tensor, regularization: float, noise: float
                      ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """The combination of iterates [B, V, 3], not differentiable; the inverse of each body's system [B, bodies, window,
     window], and its solution gamma [B, bodies, window]. CPU only.
@@ -22,8 +22,9 @@ def anderson_combine(states: Tensor, mass: Tensor, order: Tensor, ptr: Tensor, r
         mass: [1 | B, V] [kg].
         order, ptr: Vertices that move, body by body, int32.
         regularization: Share of a system's diagonal that is added to it.
+        noise: Differences of residuals of at most that share of the positions leave a body without numbers.
     """
-    return raw.anderson_combine(states, mass, order, ptr, regularization)
+    return raw.anderson_combine(states, mass, order, ptr, regularization, noise)
 
 
 def potential_rise(fields: SweepFields, x: Tensor, to: Tensor, material: Tensor, rest: Tensor, index: Sequence[Tensor],
@@ -49,7 +50,7 @@ def _(x, to, x_prev, y, mass, energy_data, origin, material, rest, order, ptr, *
 
 
 @shapes_of("anderson_combine")
-def _(states, mass, order, ptr, regularization):
+def _(states, mass, order, ptr, regularization, noise):
     (window, scenes), bodies = states.shape[1:3], ptr.shape[0] - 1
     window -= 1
     return (states.new_empty(states.shape[2:]), states.new_empty((scenes, bodies, window, window)),

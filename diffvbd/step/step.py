@@ -174,7 +174,7 @@ def swept(
             if done.corrections:
                 for found in recorders("coarse"):
                     found.append(lengths_of(model, torch.cat(done.corrections, 1)))
-            if model.acceleration is not None:
+            if model.acceleration is not None and prepared.unrolled is None:
                 for found in recorders("anderson"):
                     found.append(torch.stack(done.taken, 1) if done.taken else none_taken(model, begun.x_start))
             return done.x

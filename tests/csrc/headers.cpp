@@ -16,9 +16,9 @@ inline long double square_root(long double a) { return std::sqrt(a); }
 inline long double natural_log(long double a) { return std::log(a); }
 }  // namespace diffvbd
 
-#include "sweep/vertex.h"
 #include "cpu/lanes.h"
 #include "cpu/scene.h"
+#include "sweep/vertex.h"
 
 namespace py = pybind11;
 using namespace diffvbd;

@@ -192,3 +192,12 @@ def test_a_refused_correction_leaves_no_trace() -> None:
     assert (lengths[0][..., 0] == 0).any() and (lengths[0][..., 1] > 0).all(), lengths
     bars = torch.autograd.grad(x_end.sum() + v_end.square().sum(), (x, mu))
     assert all(torch.isfinite(t).all() for t in (x_end, v_end, *bars)) and bars[0].abs().max() > 0
+
+
+def test_no_scenes_at_all() -> None:
+    model, given = cantilever(coarse="auto")
+    x = torch.zeros((0, model.num_vertices, 3), dtype=torch.float64)
+    mu = torch.tensor(1e6, dtype=torch.float64, requires_grad=True)
+    end, _ = dv.step(model, x, x, sweeps=4, rest_points=model.rest_points, density=1e3, **given | {"mu": mu})
+    (bar,) = torch.autograd.grad(end.sum(), mu)
+    assert end.shape == x.shape and bar == 0

@@ -256,7 +256,7 @@ def anderson_arguments() -> dict[str, tuple[Any, ...]]:
              moving.order, moving.ptr, of, moving.corner, moving.block_ptr)  # fmt: skip
     states = torch.rand(2, 3, *x.shape, dtype=x.dtype)
     return {"potential_rise": (*given, model._data_count, 0.3),
-            "anderson_combine": (states, model._mass[None], moving.order, moving.ptr, 1e-6)}  # fmt: skip
+            "anderson_combine": (states, model._mass[None], moving.order, moving.ptr, 1e-6, 1e-14)}  # fmt: skip
 
 
 def fused_arguments(policy: int) -> dict[str, tuple[Any, ...]]:

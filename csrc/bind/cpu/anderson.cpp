@@ -19,10 +19,10 @@ namespace {
 
 namespace coarse = diffvbd::coarse;
 namespace rigid = diffvbd::rigid;
+using diffvbd::Batched, diffvbd::batched, diffvbd::Buffer, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty,
+    diffvbd::for_bodies, diffvbd::is_index, diffvbd::kLanes, diffvbd::kRestScalars, diffvbd::kTetScalars,
+    diffvbd::require, diffvbd::require_like, diffvbd::RigidFields, diffvbd::Threads;
 using rigid::Vector;
-using diffvbd::Batched, diffvbd::batched, diffvbd::Buffer, diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::for_bodies,
-    diffvbd::is_index, diffvbd::kLanes, diffvbd::kRestScalars, diffvbd::kTetScalars, diffvbd::require,
-    diffvbd::require_like, diffvbd::RigidFields, diffvbd::Threads;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
@@ -65,13 +65,15 @@ inline void invert(double* n, int m, double* inverse) {
   }
 }
 
-// g_k - dG gamma of one body, with gamma and the inverse of its system
+// g_k - dG gamma of one body, with gamma and the inverse of its system; no numbers where a difference of residuals is
+// at most `noise` of the positions
 template <class T>
-void combine(const rigid::Body<T>& b, const Threads& team, const Iterates<T>& it, double regularization, T* to,
-             T* inverse, T* gamma) {
+void combine(const rigid::Body<T>& b, const Threads& team, const Iterates<T>& it, double regularization, double noise,
+             T* to, T* inverse, T* gamma) {
+  constexpr int kSums = kPairs + kMostWindow + 1;
   const int m = it.window;
-  double sums[kPairs + kMostWindow];
-  team.template sum<kPairs + kMostWindow>(b.size(), sums, [&](int32_t i, double* sum) {
+  double sums[kSums];
+  team.template sum<kSums>(b.size(), sums, [&](int32_t i, double* sum) {
     const int32_t v = b.vertex(i);
     const int64_t row = b.row(v);
     const double mass = b.mass(v);
@@ -87,16 +89,21 @@ void combine(const rigid::Body<T>& b, const Threads& team, const Iterates<T>& it
       for (int k = 0; k <= j; ++k) *pair++ += dot(weighted, d[k]);
       sum[kPairs + j] += dot(weighted, last);
     }
+    sum[kSums - 1] += mass * dot(it.end(m, row), it.end(m, row));
   });
+  const double least = noise * noise * sums[kSums - 1];
+  bool noisy = false;
   double full[kMostWindow * kMostWindow], weights[kMostWindow];
   for (int j = 0; j < m; ++j) {
     double& diagonal = sums[j * (j + 1) / 2 + j];
-    diagonal += diagonal > 0 ? regularization * diagonal : 1;  // where nothing moves nothing is to be solved
+    noisy = noisy || !(diagonal > least);
+    diagonal += regularization * diagonal;
   }
   invert(sums, m, full);
   for (int j = 0; j < m; ++j) {
-    weights[j] = 0;
-    for (int k = 0; k < m; ++k) weights[j] += full[j * m + k] * sums[kPairs + k], inverse[j * m + k] = T(full[j * m + k]);
+    weights[j] = noisy ? std::numeric_limits<double>::quiet_NaN() : 0.0;
+    for (int k = 0; k < m; ++k)
+      weights[j] += full[j * m + k] * sums[kPairs + k], inverse[j * m + k] = T(full[j * m + k]);
     gamma[j] = T(weights[j]);
   }
   team.each(b.size(), [&](int32_t i) {
@@ -108,7 +115,7 @@ void combine(const rigid::Body<T>& b, const Threads& team, const Iterates<T>& it
 }
 
 std::tuple<Tensor, Tensor, Tensor> anderson_combine(const Tensor& states, const Tensor& mass, const Tensor& order,
-                                                    const Tensor& ptr, double regularization) {
+                                                    const Tensor& ptr, double regularization, double noise) {
   require(states.dim() == 5 && states.size(0) == 2 && states.size(1) > 1 && states.size(1) <= kMostWindow + 1 &&
               states.size(4) == 3 && states.is_contiguous(),
           "diffvbd::anderson_combine: expected contiguous states [2, iterates, scenes, vertices, 3], 2 to 11 iterates");
@@ -128,7 +135,8 @@ std::tuple<Tensor, Tensor, Tensor> anderson_combine(const Tensor& states, const 
     std::memcpy(data<T>(to), it.states + (2 * m + 1) * it.size, it.size * sizeof(T));
     for_bodies(in, [&](const rigid::Body<T>& body, const Threads& team) {
       const int64_t at = body.scene * bodies + body.body;
-      combine(body, team, it, regularization, data<T>(to), data<T>(inverse) + at * m * m, data<T>(gamma) + at * m);
+      combine(body, team, it, regularization, noise, data<T>(to), data<T>(inverse) + at * m * m,
+              data<T>(gamma) + at * m);
     });
     return std::make_tuple(to, inverse, gamma);
   });
