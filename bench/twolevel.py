@@ -1,4 +1,4 @@
-"""Coarse corrections between sweeps: error and time beside plain sweeps, violent states, and what a correction costs.
+"""Coarse corrections between sweeps, with Anderson acceleration and without: error and time beside plain sweeps.
 
 Error: the largest distance of a vertex from where converged steps of the same h end, over the largest motion, after 30
 steps. Time: a whole step, on one thread, everything included; also in plain sweeps of the same scene, and as the K of a
@@ -9,9 +9,7 @@ window 5, relaxation 1.3.
 
 from __future__ import annotations
 
-import resource
 import sys
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -21,7 +19,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench.common import markdown_table
-from bench.twolevel_scenes import Scene, cantilever, hanging_bar, scenes, violent_scenes
+from bench.twolevel_scenes import Scene, functions, hanging_bar, scenes, violent_scenes
 from diffvbd import reference
 
 SWEEPS = (1, 2, 4, 5, 7, 8, 10, 11, 13, 14, 16, 17, 19, 20, 22, 23, 25, 31, 40, 52, 70, 100, 150, 200, 300)
@@ -39,16 +37,15 @@ ROUNDS = 7  # of times
 LEVELS = (0.01, 1e-4)
 CONVERGED = 1e-7  # of the motion, between two K
 RISE = 1e-12  # of the potential at the start of a step, below which a rise counts as none
-HANGING, VIOLENT_RATIO, FORWARD, REVERSE = 1e-3, 1.3, 2.5, 3.0  # targets; those of calm scenes stand in `scenes`
+HANGING, VIOLENT_RATIO = 1e-3, 1.3  # targets; those of calm scenes stand in `scenes`
 
 
-def run(quick: bool, only: str = "scenes,violent,cost") -> dict[str, Any]:
+def run(quick: bool, only: str = "scenes,violent") -> dict[str, Any]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     groups: dict[str, Callable[[bool], Any]] = {
         "scenes": lambda quick: [measure(scene, quick) for scene in scenes(quick)],
         "violent": lambda quick: [row for scene in violent_scenes(quick) for row in violent(scene, quick)],
-        "cost": cost,
     }
     try:
         return {name: groups[name](quick) for name in only.split(",")}
@@ -136,10 +133,6 @@ def first_below(rows: list[dict[str, Any]], level: float) -> dict[str, Any] | No
     return found
 
 
-def functions(model: dv.Model) -> int:
-    return int((~model.coarse_geometry.filling).sum())
-
-
 def at_rest(quick: bool) -> list[dict[str, Any]]:
     """Error of the elongation at which steps without inertia come to rest, as `bench tradeoff` measures it."""
     scene, out, ends = hanging_bar(), [], {}
@@ -214,64 +207,6 @@ def rise(scene: Scene, model: dv.Model, way: dv.Trajectory) -> float:
     return worst
 
 
-def cost(quick: bool) -> list[dict[str, Any]]:
-    """One correction in sweeps' time, by differences over K; `reverse` the backward to state and material alone."""
-    beam = cantilever((5, 3, 3) if quick else (21, 7, 7))
-    small = dv.mesh.beam(5, 5, 4, size=(0.1, 0.1, 0.075))
-    side = 2 if quick else 100
-    grid = np.stack(np.meshgrid(range(side), [0], range(side)), -1).reshape(-1, 3)
-    out = [_cost(beam, 31, 61, 3 if quick else 40)]
-    begun = time.perf_counter()
-    many = dv.mesh.replicate(small, 0.2 * grid)
-    meshed = time.perf_counter() - begun
-    pinned = np.tile(small.points[:, 0] < 1e-9, len(grid))
-    crowd = Scene(f"{len(grid)} bodies of {small.num_vertices} vertices", many, pinned, {"mu": 1e7, "lam": 1e7})
-    return [*out, {**_cost(crowd, 7, 19, 3 if quick else 5), "mesh_s": meshed}]
-
-
-def _cost(scene: Scene, few: int, many: int, rounds: int) -> dict[str, Any]:
-    built, models = [], []
-    for coarse in (None, "auto"):
-        begun = time.perf_counter()
-        models.append(scene.model(coarse))
-        built.append(time.perf_counter() - begun)
-    jobs = [(model, k) for model in models for k in (few, many)]
-    best = [(float("inf"),) * 2] * len(jobs)
-    for _ in range(rounds):  # of all: the machine is not always as fast
-        best = [tuple(map(min, found, one_step(scene, *job))) for found, job in zip(best, jobs, strict=True)]
-    corrections = dv.CoarseSpace().corrections(many) - dv.CoarseSpace().corrections(few)
-    row: dict[str, Any] = {"scene": scene.name, "functions": functions(models[1]), "build_plain_s": built[0],
-                           "build_two_level_s": built[1]}  # fmt: skip
-    for part, name in enumerate(("forward", "reverse")):
-        plain_few, plain_many, two_few, two_many = (seconds[part] for seconds in best)
-        sweep = (plain_many - plain_few) / (many - few)
-        one = (two_many - two_few - (plain_many - plain_few)) / corrections
-        besides = two_few - plain_few - one * dv.CoarseSpace().corrections(few)
-        row |= {
-            f"{name}_sweep_ms": 1e3 * sweep,
-            f"{name}_correction_ms": 1e3 * one,
-            f"{name}_besides_ms": 1e3 * besides,
-        }
-    for name, unit in (("forward", "forward"), ("reverse", "forward"), ("reverse", "reverse")):
-        row[f"{name}_correction_in_{unit}_sweeps"] = row[f"{name}_correction_ms"] / row[f"{unit}_sweep_ms"]
-    row["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    _say(scene.name, row)
-    return row
-
-
-def one_step(scene: Scene, model: dv.Model, sweeps: int) -> tuple[float, float]:
-    """Seconds of a step that keeps its tape, and of its backward."""
-    x, v = (t.clone().requires_grad_() for t in scene.state())
-    material: dict[str, Any] = {
-        k: torch.as_tensor(m, dtype=x.dtype).clone().requires_grad_() for k, m in scene.material.items()
-    }
-    begun = time.perf_counter()
-    end, _ = dv.step(model, x, v, time_step=scene.time_step, sweeps=sweeps, **material)
-    middle = time.perf_counter()
-    end.sum().backward()
-    return middle - begun, time.perf_counter() - middle
-
-
 def _say(name: str, row: dict[str, Any]) -> None:
     print(name, row, file=sys.stderr, flush=True)
 
@@ -312,11 +247,6 @@ def markdown(results: dict[str, Any]) -> str:
         text = f"Target of the ratio: {VIOLENT_RATIO:g}. Rollouts with a step that rises: {risen} of {len(rows)}.\n\n"
         table = markdown_table([n.replace("_", " ") for n in names], [[row[n] for n in names] for row in rows])
         parts.append("## Violent states: beside plain sweeps of equal relaxation and time\n\n" + text + table)
-    if rows := results.get("cost"):
-        text = f"Targets, in sweeps: forward {FORWARD:g}, reverse {REVERSE:g}.\n\n"
-        names = list(dict.fromkeys(name for row in rows for name in row))
-        table = [[name.replace("_", " "), *(row.get(name) for row in rows)] for name in names]
-        parts.append("## One correction, in sweeps\n\n" + text + markdown_table(table[0], table[1:]))
     return "\n".join(parts)
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 import diffvbd as dv
 from bench.common import markdown_table
 from bench.gpu_measure import Card
-from bench.twolevel_scenes import Scene, cantilever
+from bench.twolevel_scenes import Scene, cantilever, functions
 
 DEVICE = "cuda"
 STEPS = 30
@@ -53,11 +53,11 @@ def large(card: Card) -> list[dict[str, Any]]:
 
     apart = error(ends[0])
     rows = []
-    for functions in FUNCTIONS[: 1 if card.quick else None]:
-        space = "auto" if functions == "auto" else dv.CoarseSpace(functions=functions)
+    for most in FUNCTIONS[: 1 if card.quick else None]:
+        space = "auto" if most == "auto" else dv.CoarseSpace(functions=most)
         model = scene.model(space).to(card.device)
         made = [(k, error(end(scene, model, k, steps)), ms(card, scene, model, k)) for k in SWEEPS]
-        rows.append({"method": f"corrections, {functions} functions", "functions": count(model), "at": made})
+        rows.append({"method": f"corrections, {most} functions", "functions": functions(model), "at": made})
     models = {omega: scene.model(None, omega).to(card.device) for omega in PLAIN}
     made = []
     for k in PLAIN_SWEEPS:
@@ -101,10 +101,6 @@ def ms(card: Card, scene: Scene, model: dv.Model, sweeps: int) -> float:
     return 1e3 * (card.graph(work) or card.eager(work))
 
 
-def count(model: dv.Model) -> int:
-    return int((~model.coarse_geometry.filling).sum())
-
-
 def on(card: Card, scene: Scene) -> dict[str, Any]:
     return {k: torch.as_tensor(m, dtype=torch.float64, device=card.device) for k, m in scene.material.items()}
 
@@ -136,7 +132,7 @@ def _cost(card: Card, scene: Scene, scenes: int) -> dict[str, Any]:
                 took[name, sweeps, backward] = 1e3 * _seconds(card, scene, model, scenes, sweeps, backward)
         card.tidy()
     corrections = dv.CoarseSpace().corrections(MANY) - dv.CoarseSpace().corrections(FEW)
-    row: dict[str, Any] = {"scene": scene.name, "functions": count(models["auto"])}
+    row: dict[str, Any] = {"scene": scene.name, "functions": functions(models["auto"])}
     for part, minus in (("forward", False), ("reverse", True)):
 
         def of(name: Any, sweeps: int, part: str = part, minus: bool = minus) -> float:

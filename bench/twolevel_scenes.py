@@ -136,3 +136,7 @@ def violent_scenes(quick: bool) -> list[Scene]:
         Scene(name, mesh, pinned, material, 0.01, x, speed if name.startswith("tip") else None)
         for name, x in states.items()
     ]
+
+
+def functions(model: dv.Model) -> int:
+    return int((~model.coarse_geometry.filling).sum())
