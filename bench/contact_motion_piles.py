@@ -1,0 +1,243 @@
+"""Scenes of `bench.contact_motion` with many bodies, or with bodies at rest; conventions as in
+`bench.contact_motion_scenes`."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from bench import contact
+from bench.contact_motion_run import (
+    GRAVITY,
+    UP,
+    Array,
+    Course,
+    Row,
+    Scene,
+    energy,
+    march,
+    row,
+)
+from bench.contact_motion_scenes import DHAT, KAPPA, MODULUS, Options, pairs, relative
+from diffvbd import mesh, reference
+from diffvbd.colliders import Plane
+
+BOX = (0.2, 0.2, 0.2)  # [m] of a box in a stack, 27 vertices
+
+
+# --- at rest ----------------------------------------------------------------------------------------------------------
+
+
+def rest(support: str = "Plane", sweeps: int = 5, time_step: float = 1 / 100, device: str = "cpu",
+         barrier: Options = None) -> Row:  # fmt: skip
+    """Sideways speed of a block without friction 0.4 s after it was let go, half of dhat above a Plane or a box that
+    rests on a FloorBarrier."""
+    box, gap = mesh.box(3, BOX), 0.5 * DHAT
+    energies = [dv.StableNeoHookean(), pairs(barrier, self_contact=False)]
+    if support == "Plane":
+        body, own, colliders = box.translate((0, gap, 0)), slice(None), (Plane(),)
+    elif support == "box":
+        lower, own, colliders = box.translate((0, gap, 0)), slice(27, None), ()
+        # askew, so that closest points are not at ties
+        body = mesh.join([lower, box.translate((0.013, 2 * gap + BOX[1], 0.007))])
+        energies.append(dv.FloorBarrier(0.0, UP, kappa=KAPPA, dhat=DHAT))
+    else:
+        raise ValueError(f"support: expected Plane or box, got {support}")
+    model = dv.Model(body, energies=energies, colliders=colliders, device=device)
+    course = march(Scene(model, MODULUS, time_step, sweeps, walls=((UP, 0.0),)), round(0.4 / time_step))
+    speed = float(np.hypot(*course.velocity(rows=own)[[0, 2]]))
+    return row(course, "sideways speed [m/s]", f"on a {support}", speed, 0.0, "<= 0.001", speed <= 1e-3)
+
+
+def stack(count: int = 5, sweeps: int = 5, friction: float = 0.5, seconds: float = 2.0, time_step: float = 1 / 100,
+          device: str = "cpu", barrier: Options = None) -> Row:  # fmt: skip
+    """Sway of a stack: the largest distance that a box's center has moved sideways in 2 s.
+
+    It stands if no box sways by a quarter of its width, and the top one keeps 0.9 of its height.
+    """
+    box, gap, rng = mesh.box(2, BOX), 0.3 * DHAT, np.random.default_rng(0)
+    lifts = gap + np.arange(count) * (BOX[1] + gap)
+    body = mesh.join([box.translate((x, y, z)) for y, (x, z) in zip(lifts, rng.uniform(-0.005, 0.005, (count, 2)),
+                      strict=True)])  # fmt: skip
+    energies = (dv.StableNeoHookean(), pairs(barrier, self_contact=False), dv.Friction(friction),
+                dv.FloorBarrier(0.0, UP, kappa=KAPPA, dhat=DHAT))  # fmt: skip
+    model = dv.Model(body, energies=energies, device=device)
+    course = march(Scene(model, 2 * MODULUS, time_step, sweeps, walls=((UP, 0.0),)), round(seconds / time_step), keep=5)
+    size = box.num_vertices
+    centers = torch.stack([x.reshape(count, size, 3).mean(1) for x in course.x])
+    sway = float((centers - centers[0])[..., [0, 2]].norm(dim=-1).max())
+    top = float(centers[-1, -1, 1] / centers[0, -1, 1])
+    return row(course, "sway [m]", f"{count} boxes", sway, 0.0, "stands", sway < 0.25 * BOX[0] and top > 0.9,
+               f"top at {top:.3f} of its height")  # fmt: skip
+
+
+# --- many bodies ------------------------------------------------------------------------------------------------------
+
+
+def ball(spacing: float = 0.066) -> dv.TetMesh:
+    """A ball of 0.1 m in radius, 65 vertices."""
+    return mesh.fill(lambda p: np.linalg.norm(p, axis=1) - 0.1, [-0.1] * 3, [0.1] * 3, spacing)
+
+
+def balls(count: int = 20, sweeps: int = 10, seconds: float = 2.5, friction: float = 0.3, time_step: float = 1 / 100,
+          device: str = "cpu", barrier: Options = None) -> list[Row]:  # fmt: skip
+    """Balls that fall into a box of five planes, 0.66 m wide: rms speed over the last 0.5 s, and what energy they gain
+    in it above what they had at its beginning."""
+    rng, width, pitch = np.random.default_rng(3), 0.66, 0.216
+    places = [(k, j, i) for j, i, k in itertools.product(range(-(-count // 9)), range(3), range(3))][:count]
+    middles = [pitch * np.array(p) + (0.114, 0.13, 0.114) + rng.uniform(-0.004, 0.004, 3) for p in places]
+    turns = [contact.turned(ball(), rng) for _ in middles]
+    body = mesh.join([b.translate(m) for b, m in zip(turns, middles, strict=True)])
+    walls = ((UP, 0.0), ((1.0, 0, 0), 0.0), ((-1.0, 0, 0), -width), ((0, 0, 1.0), 0.0), ((0, 0, -1.0), -width))
+    floor = dv.FloorBarrier([h for _, h in walls], [n for n, _ in walls], kappa=KAPPA, dhat=DHAT)
+    energies = (dv.StableNeoHookean(), pairs(barrier, self_contact=False), floor, dv.Friction(friction))
+    model = dv.Model(body, energies=energies, device=device)
+    course = march(Scene(model, MODULUS, time_step, sweeps, walls=walls), round(seconds / time_step))
+    last = round(min(0.5, 0.5 * seconds) / time_step)
+    mass = model.mass.cpu()[:, None]
+    squares = [float((mass * v.square()).sum() / mass.sum()) for v in course.v[-last:]]
+    speed = math.sqrt(float(np.mean(squares)))
+    energies_of = energy(course.scene, course)
+    tail = energies_of[-last - 1 :]
+    lost = energies_of[0] - min(energies_of)
+    gained = max(tail) - tail[0]
+    case = f"{count} in a box"
+    return [
+        row(course, "rms speed at the end [m/s]", case, speed, 0.0, "<= 0.02", speed <= 0.02),
+        row(course, "energy gained at the end [J]", case, gained, 0.0, "none", gained <= 1e-3 * lost,
+            f"of {lost:.3g} J that they lose"),
+    ]  # fmt: skip
+
+
+def crowd(per_side: int = 3, layers: int = 2, sweeps: int = 10, seconds: float = 0.5, parts: int = 50,
+          time_step: float = 1 / 60, device: str = "cpu", barrier: Options = None) -> list[Row]:  # fmt: skip
+    """The crowd of `bench contact`, of fewer bodies: the share of cut vertices, and the mean energy over that of steps
+    of h / parts. Energy is kinetic, elastic and of gravity above the floor."""
+    start = contact.crowd(per_side, layers)
+    surface = start.mesh.surface
+    edges = start.mesh.points[surface] - start.mesh.points[surface[:, [1, 2, 0]]]
+    dhat = 0.05 * float(np.linalg.norm(edges, axis=-1).mean())
+    walls = tuple((tuple(float(c) for c in n), float(h)) for n, h in start.walls)
+    floor = dv.FloorBarrier([h for _, h in walls], [n for n, _ in walls], kappa=KAPPA, dhat=dhat)
+    energies = (dv.StableNeoHookean(), pairs(barrier, dhat=dhat), floor, dv.Friction(0.3))
+    model = dv.Model(start.mesh, energies=energies, device=device)
+    v = torch.from_numpy(start.velocity).to(model.rest_points)
+    scene, steps = Scene(model, MODULUS, time_step, sweeps, v=v, walls=walls), round(seconds / time_step)
+    course = march(scene, steps)
+    case = f"{int(model.body.max()) + 1} bodies"
+    cut = float(np.mean(course.cut))
+    rows = [row(course, "share of cut vertices", case, cut, 0.0, "<= 0.05", cut <= 0.05)]
+    if parts > 1:
+        fine = march(scene.finer(parts), parts * steps, keep=parts)
+        lift = float((GRAVITY * model.mass * model.rest_points[:, 1]).sum())
+        own, goal = ([e + lift for e in energy(c.scene, c)] for c in (course, fine))
+        ratio = float(np.mean(own) / np.mean(goal))
+        rows.append(relative(course, f"mean energy / that of h / {parts}", case, ratio, 1.0, 0.1,
+                             f"at the end {own[-1]:.4g} J beside {goal[-1]:.4g} J of {own[0]:.4g} J"))  # fmt: skip
+        rows[-1]["crossings"] += fine.crossings
+        rows[-1]["error"] = rows[-1]["error"] or fine.error
+    return rows
+
+
+# --- flight and impact ------------------------------------------------------------------------------------------------
+
+
+def fall(side_by_side: bool = True, sweeps: int = 5, steps: int = 60, time_step: float = 1 / 100, device: str = "cpu",
+         barrier: Options = None) -> Row:  # fmt: skip
+    """How far centers of mass are off x0 + n h v0 + n (n + 1) / 2 h^2 g, which is exact for free fall."""
+    box, velocity = mesh.box(3, BOX), torch.tensor([3.0, 1.0, -2.0], dtype=torch.float64)
+    body = mesh.join([box, box.translate((BOX[0] + 1e-3, 0.01, 0.02))]) if side_by_side else box
+    model = dv.Model(body, energies=(dv.StableNeoHookean(), pairs(barrier, dhat=5e-4)), device=device)
+    x = model.rest_points
+    scene = Scene(model, MODULUS, time_step, sweeps, v=velocity.to(x).expand_as(x).clone())
+    course = march(scene, steps)
+    worst, g = 0.0, np.array([0, -GRAVITY, 0])
+    for first in range(0, len(x), box.num_vertices):
+        rows = slice(first, first + box.num_vertices)
+        for n in range(len(course.x)):
+            t = n * time_step
+            goal = course.center(0, rows) + t * velocity.numpy() + 0.5 * t * (t + time_step) * g
+            worst = max(worst, float(np.abs(course.center(n, rows) - goal).max()))
+    case = "two boxes 1 mm apart" if side_by_side else "a lone box"
+    return row(course, "center of mass off [m]", case, worst, 0.0, "<= 1e-12", worst <= 1e-12)
+
+
+def impact(speed: float = 10.0, sweeps: int = 20, parts: int = 50, time_step: float = 1 / 200, device: str = "cpu",
+           barrier: Options = None) -> Row:  # fmt: skip
+    """Restitution of two balls that meet head on at a relative speed, against steps of h / parts."""
+    one = ball()
+    body = mesh.join([one, one.translate((0.22, 0.003, 0.002))])
+    model = dv.Model(body, energies=(dv.StableNeoHookean(), pairs(barrier)), device=device)
+    size = one.num_vertices
+    v = torch.zeros_like(model.rest_points)
+    v[:size, 0], v[size:, 0] = 0.5 * speed, -0.5 * speed
+    scene = Scene(model, MODULUS, time_step, sweeps, v=v, gravity=(0.0, 0.0, 0.0))
+    steps = round((0.1 + 0.02 / speed) / time_step)
+
+    def restitution(course: Course) -> float:
+        return float(course.velocity(rows=slice(size, None))[0] - course.velocity(rows=slice(size))[0]) / speed
+
+    course = march(scene, steps)
+    fine = None if parts == 1 else restitution(march(scene.finer(parts), parts * steps, keep=parts))
+    return row(course, "restitution", f"{speed:g} m/s", restitution(course), fine, "", None)
+
+
+# --- grip -------------------------------------------------------------------------------------------------------------
+
+
+def grip(sweeps: int = 40, friction: float = 0.6, squeeze: float = 6e-4, seconds: float = 0.5,
+         time_step: float = 1 / 240, device: str = "cpu", barrier: Options = None) -> Row:  # fmt: skip
+    """Vertical force that a cube of 5 cm and 0.103 kg, held by friction alone, puts on its two clamps.
+
+    The clamps are plates whose outer faces are pinned and move inward in 0.1 s, by squeeze beyond the start of the
+    barrier. Gravity pulls the cube alone, so that the elastic force on the pinned faces is its weight, once at rest:
+    its mean over the last 0.1 s.
+    """
+    size, thick, dhat = 0.05, 0.02, 2e-3
+    cube, plate = mesh.box(3, size), mesh.box((2, 3, 3), (thick, 0.06, 0.06))
+    left = plate.translate((-thick - dhat, -0.0052, -0.0047))
+    right = plate.translate((size + dhat, -0.0049, -0.0051))
+    body = mesh.join([cube, left, right])
+    n, m = cube.num_vertices, plate.num_vertices
+    across = torch.from_numpy(body.points[:, 0])
+    outer = torch.zeros(len(across), dtype=torch.bool)
+    outer[n:] = (across[n:] < -thick - 0.5 * dhat) | (across[n:] > size + thick + 0.5 * dhat)
+    density = torch.full((body.num_tets,), 1000.0)
+    density[: cube.num_tets] = 0.103 / size**3
+    energies = (dv.StableNeoHookean(), pairs(barrier, kappa=KAPPA, dhat=dhat, self_contact=False),
+                dv.Friction(friction))  # fmt: skip
+    model = dv.Model(body, density=density, pinned=outer, energies=energies, device=device)
+    rest = model.rest_points
+    inward = torch.zeros_like(rest)
+    inward[n : n + m, 0], inward[n + m :, 0] = squeeze, -squeeze
+    gravity = torch.zeros_like(rest)
+    gravity[:n, 1] = -GRAVITY
+
+    def clamps(step: int) -> Tensor:
+        share = min(1.0, step * time_step / 0.1)
+        return torch.where(model.pinned[:, None], rest + share * inward, rest)
+
+    steps, last = round(seconds / time_step), round(0.1 / time_step)
+    course = march(Scene(model, MODULUS, time_step, sweeps, gravity=gravity, prescribed=clamps), steps)
+    loads = np.array([_pinned_load(model, x) for x in course.x[-last:]])
+    up = loads[:, n:].sum(1)[:, 1]
+    pressed = float(np.abs(loads[:, n : n + m, 0].sum(1)).mean())
+    fallen = float(course.center(-1, slice(n))[1] - course.center(0, slice(n))[1])
+    weight = 0.103 * GRAVITY
+    return relative(course, "vertical force on the clamps [N]", f"K = {sweeps}", float(up.mean()), weight, 0.05,
+                    f"{up.min():.3g} to {up.max():.3g} N; pressed with {pressed:.3g} N; cube moved {1e3 * fallen:.3g} "
+                    "mm")  # fmt: skip
+
+
+def _pinned_load(model: dv.Model, x: Tensor) -> Array:
+    """Elastic force on each vertex that is pinned [N], downward loads positive along y; zero on the others."""
+    body = dv.Model(model.mesh)
+    leaf = x.clone().requires_grad_()
+    # with a huge step the potential is the elastic energy alone
+    (slope,) = torch.autograd.grad(reference.incremental_potential(body, leaf, x, MODULUS, 2 * MODULUS, 1.0), leaf)
+    return torch.where(model.pinned.cpu()[:, None], slope, 0.0).numpy()
