@@ -53,14 +53,16 @@ GROUPS: dict[str, Group] = {
     "crowd": lambda quick, device: [piles.crowd(2, 1, seconds=0.1, parts=2, device=device)] if quick else [
         piles.crowd(device=device), piles.crowd(seconds=2.5, parts=1, device=device)
     ],
-    "balls": lambda quick, device: [
-        piles.balls(2, seconds=0.2, device=device) if quick else piles.balls(device=device)
+    "balls": lambda quick, device: [piles.balls(2, seconds=0.2, device=device)] if quick else [
+        piles.balls(rise=rise, device=device) for rise in (1.0, 1.8)
     ],
     "stacks": lambda quick, device: [piles.stack(2, seconds=0.1, device=device)] if quick else [
         piles.stack(count, k, device=device) for count, k in ((5, 5), (5, 10), (5, 20), (10, 10), (10, 20))
     ],
     "rest": lambda quick, device: [
-        piles.rest(support, k, device=device) for support in ("Plane", "box") for k in ((5,) if quick else (5, 20))
+        piles.rest(support, k, device=device)
+        for support in ("Plane", "pinned box", "box")
+        for k in ((5,) if quick else (5, 20))
     ],
     "fall": lambda quick, device: [
         piles.fall(both, steps=10 if quick else 60, device=device) for both in (True, False)

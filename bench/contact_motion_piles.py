@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from bench.contact_motion_run import (
     energy,
     march,
     row,
+    settled,
 )
 from bench.contact_motion_scenes import DHAT, KAPPA, MODULUS, Options, pairs, relative
 from diffvbd import mesh, reference
@@ -35,23 +37,33 @@ BOX = (0.2, 0.2, 0.2)  # [m] of a box in a stack, 27 vertices
 
 def rest(support: str = "Plane", sweeps: int = 5, time_step: float = 1 / 100, device: str = "cpu",
          barrier: Options = None) -> Row:  # fmt: skip
-    """Sideways speed of a block without friction 0.4 s after it was let go, half of dhat above a Plane or a box that
-    rests on a FloorBarrier."""
-    box, gap = mesh.box(3, BOX), 0.5 * DHAT
-    energies = [dv.StableNeoHookean(), pairs(barrier, self_contact=False)]
-    if support == "Plane":
-        body, own, colliders = box.translate((0, gap, 0)), slice(None), (Plane(),)
-    elif support == "box":
-        lower, own, colliders = box.translate((0, gap, 0)), slice(27, None), ()
+    """Sideways speed of a block without friction, 0.4 s after it lay at rest.
+
+    It lies on a Plane, on a wider "box" with a pinned bottom, or on a "pinned box" of which nothing moves. Dented
+    surfaces are not level, nor are normals between edges: beside boxes the reference is the speed at K = 400.
+    """
+    supports = ("Plane", "pinned box", "box")
+    if support not in supports:
+        raise ValueError(f"support: expected one of {', '.join(supports)}, got {support}")
+    body, pinned, colliders = mesh.box(3, BOX).translate((0, 0.5 * DHAT, 0)), None, (Plane(),)
+    size = body.num_vertices
+    if support != "Plane":
         # askew, so that closest points are not at ties
-        body = mesh.join([lower, box.translate((0.013, 2 * gap + BOX[1], 0.007))])
-        energies.append(dv.FloorBarrier(0.0, UP, kappa=KAPPA, dhat=DHAT))
-    else:
-        raise ValueError(f"support: expected Plane or box, got {support}")
-    model = dv.Model(body, energies=energies, colliders=colliders, device=device)
-    course = march(Scene(model, MODULUS, time_step, sweeps, walls=((UP, 0.0),)), round(0.4 / time_step))
-    speed = float(np.hypot(*course.velocity(rows=own)[[0, 2]]))
-    return row(course, "sideways speed [m/s]", f"on a {support}", speed, 0.0, "<= 0.001", speed <= 1e-3)
+        lower = mesh.box((4, 3, 4), (0.3, 0.2, 0.3)).translate((-0.053, -0.2, -0.047))
+        body, colliders = mesh.join([body, lower]), ()
+        pinned = torch.from_numpy(body.points[:, 1] < (1e-9 if support == "pinned box" else -0.2 + 1e-9))
+    energies = (dv.StableNeoHookean(), pairs(barrier, self_contact=False))
+    model = dv.Model(body, pinned=pinned, energies=energies, colliders=colliders, device=device)
+    scene = settled(Scene(model, MODULUS, time_step, sweeps))
+
+    def speed(scene: Scene) -> tuple[float, Course]:
+        course = march(scene, round(0.4 / time_step))
+        return float(np.hypot(*course.velocity(rows=slice(size))[[0, 2]])), course
+
+    value, course = speed(scene)
+    goal = 0.0 if support == "Plane" else speed(replace(scene, sweeps=400))[0]
+    return row(course, "sideways speed [m/s]", f"on a {support}", value, goal, "off by <= 0.001",
+               abs(value - goal) <= 1e-3)  # fmt: skip
 
 
 def stack(count: int = 5, sweeps: int = 5, friction: float = 0.5, seconds: float = 2.0, time_step: float = 1 / 100,
@@ -84,13 +96,15 @@ def ball(spacing: float = 0.066) -> dv.TetMesh:
     return mesh.fill(lambda p: np.linalg.norm(p, axis=1) - 0.1, [-0.1] * 3, [0.1] * 3, spacing)
 
 
-def balls(count: int = 20, sweeps: int = 10, seconds: float = 2.5, friction: float = 0.3, time_step: float = 1 / 100,
-          device: str = "cpu", barrier: Options = None) -> list[Row]:  # fmt: skip
-    """Balls that fall into a box of five planes, 0.66 m wide: rms speed over the last 0.5 s, and what energy they gain
-    in it above what they had at its beginning."""
+def balls(count: int = 20, rise: float = 1.0, sweeps: int = 10, seconds: float = 2.5, friction: float = 0.3,
+          time_step: float = 1 / 100, device: str = "cpu", barrier: Options = None) -> list[Row]:  # fmt: skip
+    """Balls let go in a box of five planes, 0.66 m wide: rms speed over the last 0.5 s, and what energy they gain in it
+    above what they had at its beginning. rise: vertical distance of layers over that of neighbors in one."""
     rng, width, pitch = np.random.default_rng(3), 0.66, 0.216
     places = [(k, j, i) for j, i, k in itertools.product(range(-(-count // 9)), range(3), range(3))][:count]
-    middles = [pitch * np.array(p) + (0.114, 0.13, 0.114) + rng.uniform(-0.004, 0.004, 3) for p in places]
+    middles = [
+        pitch * np.array(p) * (1, rise, 1) + (0.114, 0.13, 0.114) + rng.uniform(-0.004, 0.004, 3) for p in places
+    ]
     turns = [contact.turned(ball(), rng) for _ in middles]
     body = mesh.join([b.translate(m) for b, m in zip(turns, middles, strict=True)])
     walls = ((UP, 0.0), ((1.0, 0, 0), 0.0), ((-1.0, 0, 0), -width), ((0, 0, 1.0), 0.0), ((0, 0, -1.0), -width))
@@ -106,7 +120,7 @@ def balls(count: int = 20, sweeps: int = 10, seconds: float = 2.5, friction: flo
     tail = energies_of[-last - 1 :]
     lost = energies_of[0] - min(energies_of)
     gained = max(tail) - tail[0]
-    case = f"{count} in a box"
+    case = f"{count} in a box, layers {pitch * rise:.2g} m apart"
     return [
         row(course, "rms speed at the end [m/s]", case, speed, 0.0, "<= 0.02", speed <= 0.02),
         row(course, "energy gained at the end [J]", case, gained, 0.0, "none", gained <= 1e-3 * lost,
@@ -176,7 +190,7 @@ def impact(speed: float = 10.0, sweeps: int = 20, parts: int = 50, time_step: fl
     size = one.num_vertices
     v = torch.zeros_like(model.rest_points)
     v[:size, 0], v[size:, 0] = 0.5 * speed, -0.5 * speed
-    scene = Scene(model, MODULUS, time_step, sweeps, v=v, gravity=(0.0, 0.0, 0.0))
+    scene = Scene(model, 2 * MODULUS, time_step, sweeps, v=v, gravity=(0.0, 0.0, 0.0))
     steps = round((0.1 + 0.02 / speed) / time_step)
 
     def restitution(course: Course) -> float:
