@@ -57,7 +57,9 @@ GROUPS: dict[str, Group] = {
         piles.balls(rise=rise, device=device) for rise in (1.0, 1.8)
     ],
     "stacks": lambda quick, device: [piles.stack(2, seconds=0.1, device=device)] if quick else [
-        piles.stack(count, k, device=device) for count, k in ((5, 5), (5, 10), (5, 20), (10, 10), (10, 20))
+        piles.stack(count, k, height, device=device)
+        for count, height, sweeps in ((5, 0.2, (5, 10, 20, 160)), (10, 0.06, (10, 20, 160)))
+        for k in sweeps
     ],
     "rest": lambda quick, device: [
         piles.rest(support, k, device=device)
