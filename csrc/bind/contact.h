@@ -42,6 +42,10 @@ contact::ContactInputs<T> contact_inputs(const SweepFields& t, const Tensor& x, 
     in.planes = static_cast<int>(t.floor_lag.numel() / t.floor_lag.size(0) / (v * contact::kFloorLag));
     in.floor_lag = batched<T>("floor_lag", t.floor_lag, x, b, v * in.planes * contact::kFloorLag);
   }
+  if (t.room.numel() > 0) {
+    require_like("room", t.room, x, b * v);
+    in.room = data<const T>(t.room);
+  }
   in.x_prev = x_prev;
   in.origin = origin;
   in.friction_eps = static_cast<T>(friction_eps);

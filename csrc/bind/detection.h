@@ -26,9 +26,9 @@ template <class T>
 contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Tensor& collider,
                                  const Tensor& collider_next, const Tensor& rest, const Tensor& radius,
                                  const Tensor& triangles, const Tensor& edges, const Tensor& points,
-                                 const Tensor& planes, const Tensor& body, const Tensor& held, int64_t mesh_bodies,
-                                 bool self_contact, bool between_bodies, double dhat, double reach, double cap,
-                                 double gamma) {
+                                 const Tensor& planes, const Tensor& body, const Tensor& held, const Tensor& room,
+                                 int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat, double reach,
+                                 double cap, double gamma) {
   require_positions(x);
   const int64_t b = x.size(0), v = x.size(1), n = body.numel();
   const ScalarType real = x.scalar_type();
@@ -66,6 +66,11 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
   out.num_points = static_cast<int32_t>(points.size(0)), out.num_planes = static_cast<int32_t>(planes.size(0));
   out.mesh_bodies = count_of(mesh_bodies);
   out.self_contact = self_contact, out.between_bodies = between_bodies;
+  if (room.numel() > 0) {
+    require_shape(room, x, real, {b, mesh_bodies + 1},
+                  "contact_detect: expected room like x, of shape [B, mesh_bodies + 1], or empty");
+    out.room = data<const T>(room);
+  }
   out.dhat = static_cast<T>(dhat), out.reach = static_cast<T>(reach);
   out.cap = static_cast<T>(cap), out.gamma = static_cast<T>(gamma);
   const double base = static_cast<double>(out.key_base());
@@ -82,8 +87,8 @@ template <class T>
 contact::IslandInputs<T> island_inputs(const Tensor& x, const Tensor& origin, const Tensor& move, const Tensor& mass,
                                        const Tensor& collider, const Tensor& collider_next, const Tensor& planes,
                                        const Tensor& body, const Tensor& body_order, const Tensor& body_ptr,
-                                       const Tensor& held, const Tensor& radius, int64_t mesh_bodies, double cap,
-                                       double dhat, bool any_direction) {
+                                       const Tensor& held, const Tensor& radius, const Tensor& room,
+                                       int64_t mesh_bodies, double dhat, bool any_direction) {
   require_positions(x);
   const int64_t b = x.size(0), v = x.size(1), n = body.numel();
   const ScalarType real = x.scalar_type();
@@ -114,7 +119,8 @@ contact::IslandInputs<T> island_inputs(const Tensor& x, const Tensor& origin, co
   out.held = data<const bool>(held);
   out.scenes = b, out.vertices = static_cast<int32_t>(v), out.corners = static_cast<int32_t>(n);
   out.num_planes = static_cast<int32_t>(planes.size(0)), out.mesh_bodies = static_cast<int32_t>(mesh_bodies);
-  out.margin = static_cast<T>(cap + dhat / 2);
+  require_shape(room, x, real, {b, mesh_bodies + 1}, "contact_islands: expected room like x, of shape [B, NB + 1]");
+  out.room = data<const T>(room), out.half = static_cast<T>(dhat / 2);
   out.any_direction = any_direction;
   return out;
 }

@@ -28,13 +28,14 @@ void define(torch::stable::detail::StableLibrary& m, const std::string& name, co
 }  // namespace
 
 STABLE_TORCH_LIBRARY(diffvbd, m) {
-  // cut [scenes, vertices]: 1 where a bound has held back an update; empty without contact. corrections [scenes,
+  // cut: [scenes, 1, vertices] 1 where a bound has held back an update or, with room, [scenes, sweeps, vertices] the
+  // exponents of limits (contact/limit.h); empty without contact. corrections [scenes,
   // corrections, 3 functions + bodies]: what coarse corrections have done; empty without them
   define(m, "sweep", DIFFVBD_ARGUMENTS(SWEEP), DIFFVBD_SETTINGS ", int debug_step, bool checked",
          "Tensor x, Tensor tape, Tensor cut, Tensor corrections, ");
   // x: the end of the sweeps; wants: material, mass, rest, energy_data
   define(m, "sweep_backward", DIFFVBD_ARGUMENTS(SWEEP),
-         "Tensor x_bar, Tensor x, Tensor tape, Tensor corrections, " DIFFVBD_SETTINGS ", bool[] wants",
+         "Tensor x_bar, Tensor x, Tensor tape, Tensor corrections, Tensor cut, " DIFFVBD_SETTINGS ", bool[] wants",
          DIFFVBD_RETURNS(SWEEP));
   // CUDA only: predictor and velocity in the same launches, for scenes whose only energy is that of the tets.
   // prescribed: where pinned vertices go, or empty.
@@ -136,14 +137,21 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   // results as in contact/candidates.h; mesh_bodies: body labels from there on are colliders
   m.def(
       "contact_detect(Tensor x, Tensor origin, Tensor collider, Tensor collider_next, Tensor rest, Tensor radius, "
-      "Tensor triangles, Tensor edges, Tensor points, Tensor planes, Tensor body, Tensor held, int mesh_bodies, bool "
-      "self_contact, bool between_bodies, float dhat, float reach, float cap, float gamma, int capacity) -> (Tensor "
+      "Tensor triangles, Tensor edges, Tensor points, Tensor planes, Tensor body, Tensor held, Tensor "
+      "room, int mesh_bodies, bool self_contact, bool between_bodies, float dhat, float reach, float cap, float gamma, "
+      "int capacity) -> (Tensor "
       "pairs, Tensor constants, Tensor ptr, Tensor entry, Tensor near_corners, Tensor near_values, Tensor counts, "
       "Tensor smallest)");
   m.def(
       "contact_islands(Tensor x, Tensor origin, Tensor move, Tensor mass, Tensor collider, Tensor collider_next, "
-      "Tensor planes, Tensor body, Tensor body_order, Tensor body_ptr, Tensor held, Tensor radius, int mesh_bodies, "
-      "float cap, float dhat, bool any_direction) -> Tensor");
+      "Tensor planes, Tensor body, Tensor body_order, Tensor body_ptr, Tensor held, Tensor radius, Tensor room, int "
+      "mesh_bodies, float dhat, bool any_direction) -> Tensor");
+  // How much of its way each vertex goes at the start, see contact/advance.h: [scenes, vertices]; stuck: how many pairs
+  // what is prescribed brings too close. center: what a vertex may leave by its room at most
+  m.def(
+      "contact_advance(Tensor x, Tensor move, Tensor u, Tensor center, Tensor origin, Tensor collider, Tensor "
+      "collider_next, Tensor held, Tensor body, Tensor room, Tensor pairs, Tensor constants, Tensor ptr, Tensor entry, "
+      "bool careful) -> (Tensor share, Tensor stuck)");
   m.def("segment_sum(Tensor values, Tensor order, Tensor ptr) -> Tensor");
   // points [B, N, 3]; pairs [max_pairs, 3] int32: (scene, i, j), then rows of -1; count [1] int64: how many there are,
   // or -1 where a point is not finite

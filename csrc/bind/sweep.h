@@ -140,6 +140,21 @@ void set_bars(Out& out, const SweepBars& bars, const In& in) {
   out.data = bars.energy_data.numel() > 0 ? data<T>(bars.energy_data) : nullptr;
 }
 
+// What says where motion was cut.
+template <class In>
+std::vector<int64_t> cut_shape(const In& in, int64_t vertices) {
+  if (!in.contact) return {0, 1, vertices};
+  return {in.scenes, in.contact->room ? int64_t{in.sweeps} : 1, vertices};
+}
+// The same in a reverse, which needs it where there are limits; null elsewhere.
+template <class In>
+const uint8_t* limits_of(const Tensor& cut, const In& in, int64_t vertices) {
+  if (!in.contact || !in.contact->room) return nullptr;
+  require(cut.scalar_type() == ScalarType::Byte && cut.numel() == in.scenes * in.sweeps * vertices,
+          "diffvbd::sweep_backward: expected cut of the same sweeps");
+  return data<const uint8_t>(cut);
+}
+
 // Adjoints of contact, and where its passes add up what they find; `lagged` pairs.
 template <class T, class Make>
 void make_contact_bars(SweepBars& bars, const contact::ContactInputs<T>& in, int64_t scenes, int64_t vertices,

@@ -5,7 +5,7 @@
 
 #include "../core/views.h"
 #include "candidates.h"
-#include "pairs.h"
+#include "limit.h"
 
 namespace diffvbd::contact {
 
@@ -22,11 +22,12 @@ struct ContactInputs {
   int64_t corners = 0;
   int32_t num_vertices = 0;
   PairList listed, lagged;                   // of the last detection; of the first one of the step
-  const T* constants = nullptr;              // [pairs, 3]  of the listed
+  const T* constants = nullptr;              // [pairs, 8]  of the listed
   const T* lag = nullptr;                    // [pairs, kLagScalars]  of the lagged
   Batched<const T> kappa;                    // [B]
   Batched<const T> bounds;                   // [B, V, 4]  center, radius
   Batched<const T> collider, collider_prev;  // [B, Vc, 3]  during the sweeps; at the start of the step
+  const T* room = nullptr;                   // [B, V]  how far a vertex may go from the center of its bound [m]
   Batched<const T> floor_lag;                // [B, V, planes, 4]  coefficient times normal force, normal
   int planes = 0;
   Batched<const T> x_prev, origin;  // [B, V, 3]; origin may be null
@@ -81,6 +82,27 @@ struct Source {
     for (int k = 1; k < 4; ++k) out.x[k] = (x(pair[k]) - x0) + (origin(pair[k]) - o0);
     return out;
   }
+  // How far a corner point is from where the pairs were found, beside its island.
+  DIFFVBD_FN T moved(int v) const {
+    if (v < in.num_vertices) return positions.moved(v);
+    const int64_t row = 3 * (v - in.num_vertices);
+    const Vec3<T> d = x(v) - vector_at(in.collider_prev.data + scene * in.collider_prev.scene + row);
+    return square_root(dot(d, d));
+  }
+  // What the gap of a listed pair cannot be below.
+  DIFFVBD_FN T least_gap(const int32_t* pair, const T* constants) const {
+    T most[2] = {T(0), T(0)};
+    const int first = sides(pair[4]);
+    for (int k = 0; k < 4; ++k) {
+      const T way = moved(pair[k]);
+      T& side = most[k < first ? 0 : 1];
+      side = side < way ? way : side;
+    }
+    return PairHints<T>(constants).gap - (most[0] + most[1]) * T(1 + 1e-6);
+  }
+  DIFFVBD_FN bool is_far(const int32_t* pair, const T* constants) const {
+    return in.room != nullptr && PairConstants<T>(constants).dhat < least_gap(pair, constants);
+  }
   DIFFVBD_FN Vec3<T> motion(const int32_t* pair, const Lag<T>& a) const {
     Vec3<T> m = zero3<T>();
     for (int k = 0; k < 4; ++k) {
@@ -99,8 +121,9 @@ DIFFVBD_FN void add_pairs(const Source<T, Positions>& s, int v, int first, int s
   for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
     const int entry = in.listed.entry[e], pair = entry >> 2;
     const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
-    const PairConstants<T> constants(in.constants + int64_t{kConstants} * pair);
-    add_barrier(record[4], s.corners(record), entry & 3, constants, kappa, h * h, g, H);
+    const T* constants = in.constants + int64_t{kConstants} * pair;
+    if (s.is_far(record, constants)) continue;
+    add_barrier(record[4], s.corners(record), entry & 3, PairConstants<T>(constants), kappa, h * h, g, H);
   }
   if (in.lag) {
     for (int e = in.lagged.ptr[row] + first; e < in.lagged.ptr[row + 1]; e += stride) {
@@ -115,6 +138,40 @@ DIFFVBD_FN void add_pairs(const Source<T, Positions>& s, int v, int first, int s
     const Lag<T> lag = floor_lag(s, v, k);
     if (lag.active()) add_lagged(lag, 0, s.x(v) - s.x_prev(v), h, in.friction_eps, g, H);
   }
+}
+
+// The exponent of the limit of vertex v, whose update goes by d, over every `stride`-th of its pairs from `first` on;
+// goes(w): whether vertex w moves at the same time.
+template <class T, class Positions, class Goes>
+DIFFVBD_FN int limit_by_pairs(const Source<T, Positions>& s, int v, const Vec3<T>& d, int first, int stride,
+                              int exponent, const Goes& goes) {
+  const ContactInputs<T>& in = s.in;
+  const int64_t row = s.scene * in.corners + v;
+  const T length = square_root(dot(d, d));
+  const Vec3<T> at = s.x(v) + s.origin(v);
+  const T guard =
+      T(kGuardUlps) * std::numeric_limits<T>::epsilon() * (absolute(at.x) + absolute(at.y) + absolute(at.z));
+  for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
+    const int entry = in.listed.entry[e], pair = entry >> 2, own = entry & 3;
+    const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
+    const T* constants = in.constants + int64_t{kConstants} * pair;
+    const int sides_first = sides(record[4]);
+    bool both = false;
+    for (int k = 0; k < 4; ++k) {
+      both = both || ((k < sides_first) != (own < sides_first) && record[k] < in.num_vertices && goes(record[k]));
+    }
+    const T share = both ? T(kBothShare) : T(kShare);
+    if (limit_of<T>(exponent) * length <= share * (s.least_gap(record, constants) - guard)) continue;
+    const Gate<T> gate(record[4], s.corners(record), constants, guard);
+    const T shares[4] = {share, share, share, share};
+    Vec3<T> way[4] = {zero3<T>(), zero3<T>(), zero3<T>(), zero3<T>()};
+    while (exponent < kNoMove) {
+      way[own] = limit_of<T>(exponent) * d;
+      if (gate.holds(way, shares, false)) break;
+      ++exponent;
+    }
+  }
+  return exponent;
 }
 
 // Friction on a floor plane: the vertex alone, about the plane's normal.
@@ -138,10 +195,10 @@ DIFFVBD_FN void reverse_pairs(const Source<T, Positions>& s, const ContactAdjoin
   for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
     const int64_t entry = in.listed.entry[e], pair = entry >> 2;
     const int32_t* record = in.listed.pairs + kPairRow * pair;
-    const PairConstants<T> constants(in.constants + kConstants * pair);
+    const T* constants = in.constants + kConstants * pair;
     PairAdjoint<T> bar;
-    if (!reverse_barrier(record[4], s.corners(record), static_cast<int>(entry & 3), constants, kappa, h * h, p, d_raw,
-                         bar)) {
+    if (s.is_far(record, constants) || !reverse_barrier(record[4], s.corners(record), static_cast<int>(entry & 3),
+                                                        PairConstants<T>(constants), kappa, h * h, p, d_raw, bar)) {
       continue;
     }
     for (int k = 0; k < 4; ++k) add_at(out.rows + 12 * entry + 3 * k, bar.x[k]);

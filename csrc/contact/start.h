@@ -9,8 +9,6 @@
 
 namespace diffvbd::contact {
 
-constexpr int kGuardUlps = 32;
-
 template <class T>
 struct StartInputs {
   const T *x, *move;               // [B, V, 3]  at the detection; where each vertex wants to go from there

@@ -1,5 +1,8 @@
 #include "contact.h"
 
+#include <algorithm>
+#include <cmath>
+
 namespace diffvbd {
 
 using namespace contact;
@@ -13,7 +16,9 @@ ContactScene<T>::ContactScene(const Plan& plan, const ContactInputs<T>& in, cons
       scene_(scene),
       s_(s),
       h_(time_step),
-      positions_{s.x, position},
+      way_(in.room ? int64_t{plan.blocks} * kLanes : 0),
+      before_(in.room && !reverse ? int64_t{plan.blocks} * kLanes * 4 : 0),
+      positions_{s.x, position, way_.get()},
       source_{in, scene, positions_} {
   for (int64_t at = 0; at < int64_t{plan.blocks} * kLanes; ++at) {
     const int32_t own = plan.order[at], v = own < 0 ? plan.order[at / kLanes * kLanes] : own;
@@ -21,6 +26,50 @@ ContactScene<T>::ContactScene(const Plan& plan, const ContactInputs<T>& in, cons
     for (int i = 0; i < kContactScalars; ++i) {
       *record(at / kLanes, static_cast<int>(at % kLanes), i) = i < 9 ? T(0) : bound[i - 9];
     }
+    if (in.room) measure(at);
+    if (s.limit) s.limit[at] = T(1);
+  }
+}
+
+// How far a vertex is from the center of its bound.
+template <class T>
+void ContactScene<T>::measure(int64_t at) const {
+  T square = T(0);
+  for (int i = 0; i < 3; ++i) {
+    const T d = s_.x[4 * at + i] - *record(at / kLanes, static_cast<int>(at % kLanes), 9 + i);
+    square += d * d;
+  }
+  way_.get()[at] = std::sqrt(square);
+}
+
+template <class T>
+void ContactScene<T>::measure_color(int64_t begin, int64_t end) const {
+  for (int64_t at = begin * kLanes; at < end * kLanes; ++at) measure(at);
+}
+
+template <class T>
+void ContactScene<T>::remember(int64_t begin, int64_t end) const {
+  std::copy(s_.x + 4 * begin * kLanes, s_.x + 4 * end * kLanes, before_.get() + 4 * begin * kLanes);
+}
+
+template <class T>
+void ContactScene<T>::limit(int64_t first, int64_t last, int64_t begin, int64_t end, uint8_t* limits) const {
+  const Before before{s_.x, before_.get(), positions_.position, way_.get(), first * kLanes, last * kLanes};
+  const Source<T, Before> source{in_, scene_, before};
+  for (int64_t at = begin * kLanes; at < end * kLanes; ++at) {
+    const int32_t v = plan_.order[at];
+    if (v < 0) continue;
+    T *x = s_.x + 4 * at, center[3];
+    const Vec3<T> from = vector_at(before_.get() + 4 * at), d = vector_at(x) - from;
+    for (int i = 0; i < 3; ++i) center[i] = *record(at / kLanes, static_cast<int>(at % kLanes), 9 + i);
+    int exponent = limit_by_room(from - vector_at(center), d, in_.room[scene_ * in_.num_vertices + v]);
+    exponent = limit_by_pairs(source, v, d, 0, 1, exponent, [&](int w) { return before.goes(w); });
+    limits[v] = static_cast<uint8_t>(exponent);
+    if (exponent > 0) {
+      const Vec3<T> to = from + limit_of<T>(exponent) * d;
+      x[0] = to.x, x[1] = to.y, x[2] = to.z;
+    }
+    // others of the color look at the positions before, and so at the ways before: these are measured afterwards
   }
 }
 
@@ -55,13 +104,16 @@ void ContactScene<T>::assemble(int64_t begin, int64_t end) const {
 }
 
 template <class T>
-void ContactScene<T>::prepare(int sweep, int tape_policy, int64_t begin, int64_t end) const {
+void ContactScene<T>::prepare(int sweep, int tape_policy, int64_t begin, int64_t end, const uint8_t* limits) const {
   const int64_t rows = tape_rows(tape_policy, true);
   for (int64_t block = begin; block < end; ++block) {
     const int count = plan_.block_rank[block + 1] - plan_.block_rank[block];
     const T* at = s_.tape + sweep * rows * plan_.num_active + plan_.block_rank[block];
     for (int lane = 0; lane < count; ++lane) {
       for (int c = 0; c < 3; ++c) s_.x[4 * (block * kLanes + lane) + c] = at[c * plan_.num_active + lane];
+      if (!in_.room) continue;
+      measure(block * kLanes + lane);
+      s_.limit[block * kLanes + lane] = limit_of<T>(limits[plan_.order[block * kLanes + lane]]);
     }
   }
   each_vertex(begin, end, [&](int32_t v, int64_t block, int lane) {

@@ -109,11 +109,11 @@ std::array<std::mutex, 256> locks;  // of near pairs; a lock is taken only where
 template <class T>
 class SceneDetection {
  public:
-  explicit SceneDetection(const Surfaces<T>& in) : in_(in), near_(in.corners), reach2_(squared_reach(in)) {}
+  explicit SceneDetection(const Surfaces<T>& in) : in_(in), near_(in.corners) {}
 
   void run(int64_t scene) {
-    scene_ = scene;
-    for (Near<T>& near : near_) near.gap.store(in_.reach, std::memory_order_relaxed), near.key = kNoKey;
+    scene_ = scene, reach_ = reach_of(in_, scene);
+    for (Near<T>& near : near_) near.gap.store(reach_, std::memory_order_relaxed), near.key = kNoKey;
     build_trees();
     constexpr int32_t each = kChunk / kGroup;
     const int32_t point_chunks = (points_.groups() + each - 1) / each,
@@ -143,10 +143,10 @@ class SceneDetection {
   void store_near(const Detected<T>& out) const {
     const int64_t row = scene_ * in_.corners;
     for_each(in_.corners, [&](int64_t i) {
-      store_near_pair(in_, static_cast<int32_t>(i), near_[i].key, out.near_corners + kNearRow * (row + i),
+      store_near_pair(in_, scene_, static_cast<int32_t>(i), near_[i].key, out.near_corners + kNearRow * (row + i),
                       out.near_values + kNearValues * (row + i));
     });
-    T smallest = in_.reach;
+    T smallest = reach_;
     for (const Near<T>& near : near_) smallest = std::min(smallest, near.gap.load(std::memory_order_relaxed));
     out.smallest[scene_] = smallest;
   }
@@ -173,10 +173,11 @@ class SceneDetection {
   void search(const Tree& tree, const Tree& others, int32_t g, std::vector<Met>& met, Finds<T>& finds) {
     const int32_t home = tree.groups() + g;
     const Box &around = tree.nodes[home], *nodes = others.nodes.data();
+    const float reach2 = squared_reach(in_, scene_, around.group);
     met.clear();
     if (!is_empty(around)) {
       const auto skips = [&](int32_t group) { return in_.ignores(around.group, group); };
-      each_leaf(nodes, others.leaves, kind == kEdgeEdge ? home : kRoot, kRoot, around, reach2_, skips, [&](int32_t i) {
+      each_leaf(nodes, others.leaves, kind == kEdgeEdge ? home : kRoot, kRoot, around, reach2, skips, [&](int32_t i) {
         met.push_back({nodes[i], i});
         return true;
       });
@@ -185,7 +186,7 @@ class SceneDetection {
       const Box& own = tree.nodes[leaf];
       if (!is_empty(own)) {
         for (const Met& other : met) {
-          if ((kind == kEdgeEdge && other.node <= leaf) || !(distance2(other.box, own) <= reach2_)) continue;
+          if ((kind == kEdgeEdge && other.node <= leaf) || !(distance2(other.box, own) <= reach2)) continue;
           examine(candidate(in_, scene_, kind, own.item, other.box.item), finds);
         }
       }
@@ -206,7 +207,7 @@ class SceneDetection {
   void examine(const Candidate& c, Finds<T>& finds) {
     if (!is_considered(in_, c)) return;
     const T gap = separation(c.kind, corners_of(in_, c)) - offset_of(in_, c);
-    if (gap >= in_.reach) return;
+    if (gap >= reach_) return;
     // Near gaps only fall while the search goes on: what the list does not need now it never will.
     const T a = bound(c, 0, c.second(), gap), b = c.kind == kPointPlane ? T(0) : bound(c, c.second(), 4, gap);
     const auto improves = [&](int32_t v) { return gap <= near_[v].gap.load(std::memory_order_relaxed); };
@@ -232,7 +233,7 @@ class SceneDetection {
   T bound(const Candidate& c, int from, int to, T gap) const {
     T most = T(0);
     for (int k = from; k < to; ++k) most = std::max(most, near_[c.v[k]].gap.load(std::memory_order_relaxed));
-    return bound_of(in_, std::min(most, gap));
+    return bound_of(in_, scene_, c.v[from], std::min(most, gap));
   }
 
   // The list, sorted, now that all near gaps are known.
@@ -265,7 +266,7 @@ class SceneDetection {
   std::vector<uint64_t> listed_, scratch_;
   int64_t touching_ = 0;
   uint64_t first_touching_ = kNoKey;
-  const float reach2_;
+  T reach_ = T(0);
 };
 
 // ptr and entry: a stable counting sort of the pairs' corners.
@@ -316,7 +317,10 @@ void detect(const Surfaces<T>& in, const Detected<T>& out) {
   }
   const auto needed = static_cast<int64_t>(keys.size()), rows = std::min(needed, out.capacity);
   for_each(out.capacity, [&](int64_t i) {
-    store_listed_pair(in, i < rows ? keys[i] : kNoKey, out.pairs + kPairRow * i, out.constants + kConstants * i);
+    int32_t* pair = out.pairs + kPairRow * i;
+    T* constants = out.constants + kConstants * i;
+    store_listed_pair(in, i < rows ? keys[i] : kNoKey, pair, constants);
+    store_hints(in, out, pair, constants);
   });
   store_entries(in, rows, out);
   out.counts[0] = needed, out.counts[1] = touches;

@@ -187,6 +187,7 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
       int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
   const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
   const int every = in.coarse ? in.coarse->plan.every : 0, begun = in.coarse ? in.coarse->plan.begun : 0;
+  const bool planes = in.contact && in.contact->room;
   // a message thrown inside a parallel region would be lost
   const bool looks = in.debug_step >= 0;
   for_scenes(in.scenes, !looks, [&](int64_t b) {
@@ -210,24 +211,35 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
         for (int c = 0; c < plan.colors; ++c) {
           const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
           if (contact) {
-            member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
+            member.each(first, last, [&](int64_t begin, int64_t end) {
+              contact->assemble(begin, end);
+              if (planes) contact->remember(begin, end);
+            });
             member.barrier();
           }
           member.each(first, last,
                       [&](int64_t begin, int64_t end) { kernel(plan, scene.view, q, k, in.tape_policy, begin, end); });
           member.barrier();
+          if (planes) {
+            uint8_t* limits = cut + (b * in.sweeps + k) * plan.num_vertices;
+            member.each(first, last,
+                        [&](int64_t begin, int64_t end) { contact->limit(first, last, begin, end, limits); });
+            member.barrier();
+            member.each(first, last, [&](int64_t begin, int64_t end) { contact->measure_color(begin, end); });
+            member.barrier();
+          }
           if (looks) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
         }
       }
     });
     unpack_rows(plan, scene.view.x, x + b * 3 * int64_t{plan.num_vertices});
-    if (contact) contact->store_cut(cut + b * plan.num_vertices);
+    if (contact && !planes) contact->store_cut(cut + b * plan.num_vertices);
   });
 }
 
 template <class T>
 void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T* x_bar, const T* tape,
-                 const StepAdjoints<T>& out) {
+                 const uint8_t* limits, const StepAdjoints<T>& out) {
   const bool wants_material = out.material[0] != nullptr;
   const auto kernel = reverse_kernel<T>(in.energies);
   const int64_t tape_size =
@@ -253,8 +265,10 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     s.material_bar = material_bar.get();
     s.rest_bar = rest_bar.get();
     s.data_bar = data_bar.get();
-    const Buffer<T> turn(in.contact ? 6 * lanes : 0), bound_bar(in.contact ? 4 * lanes : 0, true);
+    const Buffer<T> turn(in.contact ? 6 * lanes : 0), bound_bar(in.contact ? 4 * lanes : 0, true),
+        limit(in.contact && in.contact->room ? lanes : 0);
     s.turn = turn.get();
+    s.limit = limit.get();
     s.bound_bar = bound_bar.get();
     std::optional<ContactScene<T>> contact;
     if (in.contact) {
@@ -270,8 +284,9 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
       for (int c = plan.colors - 1; c >= 0; --c) {
         const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
         if (contact) {
-          member.each(first, last,
-                      [&](int64_t begin, int64_t end) { contact->prepare(k, in.tape_policy, begin, end); });
+          member.each(first, last, [&](int64_t begin, int64_t end) {
+            contact->prepare(k, in.tape_policy, begin, end, limits + (b * in.sweeps + k) * n);
+          });
           member.barrier();
           if (in.tape_policy != kFullTape) {
             member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
@@ -375,10 +390,10 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
   }
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                  \
-  template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*, uint8_t*);            \
-  template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*, \
-                               const StepAdjoints<T>&);                                         \
+#define DIFFVBD_INSTANTIATE(T)                                                                                  \
+  template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*, uint8_t*);                            \
+  template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*, const uint8_t*, \
+                               const StepAdjoints<T>&);                                                         \
   template void pack_rest<T>(const Plan&, const T*, T*);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

@@ -57,6 +57,7 @@ struct SceneView {
   T* material_bar;  // [slots, kTetScalars, kLanes] or null
   T* rest_bar;      // [slots, kPairRest, kLanes] or null
   T* data_bar;      // [kMaxEnergyData, blocks kLanes] or null
+  T* limit;         // [blocks, kLanes] or null: what limits let through of the update that is reversed
   T* turn;          // [blocks, 6, kLanes]: p and d_raw of the latest reversed update; or null
   T* bound_bar;     // [blocks, 4, kLanes] or null
 };

@@ -72,11 +72,11 @@ struct Workspace {
 template <class T>
 __global__ void start_kernel(const Surfaces<T> in, Workspace<T> work, int64_t capacity) {
   const int64_t i = own_item();
-  if (i < in.scenes * in.corners) work.near_gap[i] = ordered(in.reach), work.near_key[i] = kNoKey;
+  if (i < in.scenes * in.corners) work.near_gap[i] = ordered(reach_of(in, i / in.corners)), work.near_key[i] = kNoKey;
   if (i < capacity) work.keys[i] = in.keys();
   if (i < in.scenes) {
     const float far = std::numeric_limits<float>::infinity();
-    work.smallest[i] = ordered(in.reach);
+    work.smallest[i] = ordered(reach_of(in, i));
     for (int k = 0; k < 6; ++k) work.forest.bounds[i][k] = ordered(k < 3 ? far : -far);
   }
   if (i == 0) {
@@ -106,7 +106,7 @@ struct Search {
       const T gap = near_gap(c, k);
       most = most < gap ? gap : most;
     }
-    return bound_of(in, most);
+    return bound_of(in, c.scene, c.v[from], most);
   }
 
   __device__ void touch(uint64_t key) const {
@@ -128,7 +128,7 @@ struct Search {
   __device__ void examine(const Candidate& c) const {
     if (!is_considered(in, c)) return;
     const T gap = separation(c.kind, corners_of(in, c)) - offset_of(in, c);
-    if (gap >= in.reach) return;
+    if (gap >= reach_of(in, c.scene)) return;
     const Ordered<T> bits = ordered(gap);
     bool matters = !(gap > T(0));
     T a = T(0), b = T(0);
@@ -184,7 +184,7 @@ struct Search {
   __device__ void walk(const Query& q, int32_t from, int32_t end, int32_t first, const Visit& visit) const {
     const Box* nodes = work.forest.tree(q.kind, q.scene);
     const auto skips = [&](int32_t group) { return in.ignores(q.box.group, group); };
-    each_leaf(nodes, work.forest.leaves[q.kind], from, end, q.box, squared_reach(in), skips, [&](int32_t leaf) {
+    each_leaf(nodes, work.forest.leaves[q.kind], from, end, q.box, squared_reach(in, q.scene, q.box.group), skips, [&](int32_t leaf) {
       if (leaf < first) return true;
       if (!visit(leaf)) return false;
       examine(candidate(in, q.scene, q.kind, q.box.item, nodes[leaf].item));
@@ -272,9 +272,16 @@ __global__ void corner_kernel(const Surfaces<T> in, Workspace<T> work, Detected<
   out.ptr[i] = static_cast<int32_t>(from);
   if (i == rows) return;
   const int64_t scene = i / in.corners;
-  store_near_pair(in, static_cast<int32_t>(i - scene * in.corners), work.near_key[i], out.near_corners + kNearRow * i,
+  store_near_pair(in, scene, static_cast<int32_t>(i - scene * in.corners), work.near_key[i], out.near_corners + kNearRow * i,
                   out.near_values + kNearValues * i);
   lower(work.smallest + scene, work.near_gap[i]);
+}
+
+// What a pair's neighbourhood suggests, once the near pairs are there.
+template <class T>
+__global__ void hint_kernel(const Surfaces<T> in, Detected<T> out) {
+  const int64_t i = own_item();
+  if (i < out.capacity) store_hints(in, out, out.pairs + kPairRow * i, out.constants + kConstants * i);
 }
 
 template <class T>

@@ -61,7 +61,7 @@ class PairBarrier:
     self_contact: bool = True
     between_bodies: bool = True
     damping: float = 0.0
-    detections: int = 2
+    detections: int = 1
     reach: float | None = None
     gamma: float = GAMMA
     capacity: int | None = None

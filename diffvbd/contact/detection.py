@@ -11,7 +11,7 @@ from .surface import ContactSurface
 
 
 def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: ContactSurface, barrier: PairBarrier,
-           capacity: int) -> tuple[Tensor, ...]:  # fmt: skip
+           capacity: int, room: Tensor | None = None) -> tuple[Tensor, ...]:  # fmt: skip
     """Pairs that may come closer than dhat before the next detection, and the nearest pair of each corner point.
 
     Args:
@@ -27,19 +27,19 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
     s = surface
     return ops_contact.contact_detect(
         x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.held, s.bodies,
-        barrier.self_contact, barrier.between_bodies, barrier.dhat, s.reach, s.cap, barrier.gamma, capacity,
+        barrier.self_contact, barrier.between_bodies, barrier.dhat, s.reach, s.cap, barrier.gamma, capacity, room,
     )  # fmt: skip
 
 
 def islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, was: Tensor, now: Tensor, surface: ContactSurface,
-            dhat: float, any_direction: bool) -> Tensor:  # fmt: skip
+            dhat: float, room: Tensor, any_direction: bool) -> Tensor:  # fmt: skip
     """Island of each body [B, bodies] int32, named by its first body; -1 where it must not be translated.
 
     any_direction: Whether the floor has planes across the axes, along which a translation may be turned.
     """
     s = surface
     return ops_contact.contact_islands(x, origin, move, mass, was, now, s.planes, s.body, s.body_order, s.body_ptr,
-                                       s.held, s.radius, s.bodies, s.cap, dhat, any_direction)  # fmt: skip
+                                       s.held, s.radius, room, s.bodies, dhat, any_direction)  # fmt: skip
 
 
 def lowest(x: Tensor, origin: Tensor, data: Tensor, island: Tensor, surface: ContactSurface) -> Tensor:

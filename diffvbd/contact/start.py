@@ -134,6 +134,85 @@ class _StartBackward(_Last):
         return x_bar, move_bar, goal_bar, u_bar, gap_bar, planes_bar
 
 
+class PartStart(NamedTuple):
+    x: Tensor  # [B, V, 3]  where the sweeps start [m]
+    left: Tensor  # [B, V, 3]  what is left to go [m]
+    bounds: Tensor  # [B, V, 4]  the center of each vertex's room, and a radius that binds nothing
+    room: Tensor  # [B, V]  how far from there it may go [m]
+    cut: Tensor  # [B, 1, V] uint8: the way was not free
+    stuck: Tensor  # [1] int64: pairs that hinder what is prescribed
+
+
+FREE = 1e15  # [m]
+
+
+def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
+                         planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface, room: Tensor
+                         ) -> PartStart:  # fmt: skip
+    """Every vertex as far along its way as pairs and floor let all go at once: first by ``move``, then by ``fall``."""
+    none = x.new_empty((0,))
+    floor = none if planes is None else planes
+    index = (surface.held, surface.body, surface.body_order, surface.body_ptr, detection.island, detection.lowest)
+    u = _Translation.apply(move, mass.contiguous(), x, floor, origin, index)
+    vertices = x.shape[1]
+    body = surface.body[:vertices].long()
+    own_room = room[:, body].contiguous()
+    listed = (detection.listed.pairs, detection.listed.constants, detection.listed.ptr, detection.listed.entry)
+    far = torch.full_like(detection.near_values, FREE)
+    gap = torch.full_like(x[..., 0], FREE)
+    pinned = surface.held[:vertices, None]
+    at, center, stuck, cut = x, x.detach(), None, None
+    for n, way in enumerate((move, fall)):
+        by = u if n == 0 else torch.zeros_like(u)
+        here = was if n == 0 else now
+        if floor.numel():
+            target = _Start.apply(at, way, at + way, by, gap, floor, far, origin, _Far(surface), 1.0)[1]
+        else:
+            target = at + way
+        with torch.no_grad():
+            share, held_up = ops_contact_start.advance(
+                at.detach().contiguous(), (target - at).detach().contiguous(), by.detach(), center, origin,
+                here.detach(), now.detach(), surface.held, surface.body, own_room, listed,
+            )  # fmt: skip
+            stuck = held_up if stuck is None else stuck + held_up
+            short = (share < 0.99) & ~pinned[:, 0]
+            cut = short if cut is None else cut | short
+        base = at + by[:, body]
+        moved = base + share[..., None] * (target - base)
+        at = torch.where(pinned, target, moved)
+        if n == 0:
+            center = torch.where(pinned, x, x + u[:, body]).detach().contiguous()
+    bounds = torch.cat([center, torch.full_like(center[..., :1], FREE)], -1)
+    assert stuck is not None and cut is not None
+    return PartStart(at, move + fall - (at - x), bounds, own_room, cut.to(torch.uint8)[:, None], stuck)
+
+
+class _Far(NamedTuple):
+    """A surface whose bounds bind nothing."""
+
+    surface: ContactSurface
+
+    @property
+    def held(self) -> Tensor:
+        return self.surface.held
+
+    @property
+    def body(self) -> Tensor:
+        return self.surface.body
+
+    @property
+    def body_order(self) -> Tensor:
+        return self.surface.body_order
+
+    @property
+    def body_ptr(self) -> Tensor:
+        return self.surface.body_ptr
+
+    @property
+    def cap(self) -> float:
+        return FREE
+
+
 def start_part(x: Tensor, move: Tensor, goal: Tensor, mass: Tensor, was: Tensor, now: Tensor, planes: Tensor | None,
                origin: Tensor, detection: Any, surface: ContactSurface, gamma: float) -> Start:  # fmt: skip
     """Bounds until the next detection, and every vertex as far toward where it wants to go as bound and floor let it.

@@ -16,6 +16,7 @@ from .colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
 
 REACH_PER_EDGE = 0.5  # most pairs of a body at rest are farther apart, so that they cost nothing
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
+MOST_EDGES = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,7 @@ class ContactSurface:
     rows: tuple[slice, ...]  # of each collider in collider_points
     reach: float  # [m]
     cap: float  # [m] largest bound
+    most_room: float  # [m] that any vertex is given beside its island
     capacity: int  # pairs, per scene; all scenes together have room for LEAST_CAPACITY at least
 
     @property
@@ -109,6 +111,11 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         rows=tuple(rows),
         reach=reach,
         cap=min(barrier.gamma * reach, (reach - barrier.dhat) / 2),
+        most_room=(reach - barrier.dhat) / 2
+        if barrier.reach
+        else MOST_EDGES * float(lengths.mean())
+        if len(lengths)
+        else 0.0,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
     )
 

@@ -41,6 +41,27 @@ def start_backward(bars: Sequence[Tensor], x: Tensor, move: Tensor, goal: Tensor
     )
 
 
+def advance(x: Tensor, move: Tensor, u: Tensor, center: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor,
+            held: Tensor, body: Tensor, room: Tensor, listed: Sequence[Tensor],
+            careful: bool = True) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Share of ``move - u`` that each vertex may go at once with all others [B, V]; how many pairs hinder what is
+    prescribed, int64 [1]. Not differentiable.
+
+    Args:
+        x, move: [B, V, 3], state and wanted motion [m].  u: Translation of each body's island [B, bodies, 3] [m].
+        center, room: [B, V, 3] and [B, V]: how far from where a vertex may go [m].
+        listed: pairs, constants, ptr, entry of :func:`contact_detect`.
+        careful: Whether the motion does not minimise the barrier.
+    """
+    return raw.contact_advance(x, move, u, center, origin, collider, collider_next, held, body, room, *listed, careful)
+
+
+@shapes_of("contact_advance")
+def _(x, move, u, center, origin, collider, collider_next, held, body, room, pairs, constants, ptr, entry,
+      careful):  # fmt: skip
+    return x.new_empty(x.shape[:2]), x.new_empty((1,), dtype=torch.int64)
+
+
 @shapes_of("contact_translation")
 def _(move, mass, x, origin, planes, held, body, body_order, body_ptr, island, lowest):
     return x.new_empty((*island.shape, 3))
@@ -66,5 +87,11 @@ def _(bounds_bar, start_bar, move_bar, x, move, goal, u, near, origin, planes, h
     return (*vectors, x.new_empty(x.shape[:2]), x.new_empty((*x.shape[:2], scalars)))
 
 
-for _name in ("contact_translation", "contact_translation_backward", "contact_start", "contact_start_backward"):
+for _name in (
+    "contact_advance",
+    "contact_translation",
+    "contact_translation_backward",
+    "contact_start",
+    "contact_start_backward",
+):
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

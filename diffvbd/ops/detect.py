@@ -15,14 +15,14 @@ from torch import Tensor
 from .functions import raw_backward, shapes_of
 from .load import raw
 
-PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS = 6, 3, 5, 8, 4  # twins of those in csrc/contact/candidates.h
+PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS = 6, 8, 5, 8, 4  # twins of those in csrc/contact/candidates.h
 
 
 class Detection(NamedTuple):
     """Pairs of primitives that are, or may come, closer than the barrier's reach."""
 
     pairs: Tensor  # [capacity, 6]  corner points, kind (0 point-triangle, 1 edge-edge, 2 point-plane), scene; or -1
-    constants: Tensor  # [capacity, 3]  reach of the barrier [m], sum of the radii [m], mollifier threshold [m^4]
+    constants: Tensor  # [capacity, 8]  reach of the barrier [m], sum of the radii [m], mollifier threshold [m^4]; hints
     ptr: Tensor  # [B N + 1]  pairs of corner point i of scene b: entry[ptr[b N + i] : ptr[b N + i + 1]],
     entry: Tensor  # [4 capacity]  each 4 pair + local corner, in ascending order
     near_corners: Tensor  # [B, N, 5]  corner points and kind of the pair with the smallest gap; i four times, -1: none
@@ -34,7 +34,7 @@ class Detection(NamedTuple):
 def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
                    triangles: Tensor, edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, held: Tensor,
                    mesh_bodies: int, self_contact: bool, between_bodies: bool, dhat: float, reach: float, cap: float,
-                   gamma: float, capacity: int) -> Detection:  # fmt: skip
+                   gamma: float, capacity: int, room: Tensor | None = None) -> Detection:  # fmt: skip
     """Near pair of every corner point, and the pairs that may come within reach of the barrier before the next call.
 
     A corner point may move by ``min(gamma gap, cap)``, gap being that of its near pair. Pairs are considered up to a
@@ -55,29 +55,31 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         self_contact, between_bodies: Which pairs of mesh bodies to consider.
         dhat, reach, cap: [m].  gamma: Part of a gap that a corner point may move.
         capacity: Rows of the list.
+        room: [B, mesh_bodies + 1] how far the vertices of each body may go [m], and the largest; in place of reach,
+            cap and gamma.
 
     Raises:
         ValueError: A tensor with the wrong shape, dtype or device; too large a scene.
     """
     return Detection(
         *raw.contact_detect(
-            x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies,
-            self_contact, between_bodies, dhat, reach, cap, gamma, capacity,
+            x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held,
+            x.new_empty((0,)) if room is None else room, mesh_bodies, self_contact, between_bodies, dhat, reach, cap, gamma, capacity,
         )
     )  # fmt: skip
 
 
 def contact_islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, collider: Tensor, collider_next: Tensor,
                     planes: Tensor, body: Tensor, body_order: Tensor, body_ptr: Tensor, held: Tensor, radius: Tensor,
-                    mesh_bodies: int, cap: float, dhat: float, any_direction: bool = False) -> Tensor:  # fmt: skip
+                    room: Tensor, mesh_bodies: int, dhat: float, any_direction: bool = False) -> Tensor:  # fmt: skip
     """Smallest body of the island of bodies in contact that each body is in [B, NB] int32, or -1.
 
     An island moves by the mass-weighted mean of ``move`` over its vertices that are not held. Bodies whose boxes, swept
-    by that and grown by ``cap + dhat / 2``, overlap are of one island. -1: the island holds a held vertex or may reach
+    by that and grown by its room and dhat / 2, overlap are of one island. -1: the island holds a held vertex or may reach
     a collider, and must stay. Not differentiable; results repeat to the bit.
 
     Args:
-        x, origin, collider, collider_next, planes, body, held, radius, cap, dhat: As for :func:`contact_detect`.
+        x, origin, collider, collider_next, planes, body, held, radius, room, dhat: As for :func:`contact_detect`.
         move, mass: [B, V, 3] where each vertex wants to go [m], [1 | B, V] [kg].
         any_direction: Whether a floor may turn a translation into any direction, by which it does not become longer.
         body_order, body_ptr: [V] vertices sorted by body, [NB + 1] the first of each body.
@@ -86,7 +88,7 @@ def contact_islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, colli
         ValueError: A tensor with the wrong shape, dtype or device.
     """
     return raw.contact_islands(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr,
-                                held, radius, mesh_bodies, cap, dhat, any_direction)  # fmt: skip
+                                held, radius, room, mesh_bodies, dhat, any_direction)  # fmt: skip
 
 
 def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
@@ -106,8 +108,8 @@ def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
 
 
 @shapes_of("contact_detect")
-def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies,
-      self_contact, between_bodies, dhat, reach, cap, gamma, capacity):  # fmt: skip
+def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, room,
+      mesh_bodies, self_contact, between_bodies, dhat, reach, cap, gamma, capacity):  # fmt: skip
     b, n = x.shape[0], body.shape[0]
 
     def integers(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
@@ -119,8 +121,8 @@ def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points
 
 
 @shapes_of("contact_islands")
-def _(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr, held, radius, mesh_bodies,
-      cap, dhat, any_direction):  # fmt: skip
+def _(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr, held, radius, room,
+      mesh_bodies, dhat, any_direction):  # fmt: skip
     return x.new_empty((x.shape[0], mesh_bodies), dtype=torch.int32)
 
 

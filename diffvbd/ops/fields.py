@@ -46,6 +46,7 @@ class SweepFields(NamedTuple):
     lag_ptr: Tensor | None = None
     lag_entry: Tensor | None = None
     floor_lag: Tensor | None = None  # [B, V, planes, 4]
+    room: Tensor | None = None  # [B, V] how far a vertex may go from the center of its bound [m], where planes limit it
     corners_prev: Tensor | None = None  # x_prev of the tets' corners, [12, B, T], where their law reads it
     # coarse corrections; see model.coarse_plan for the constants
     coarse_factor: Tensor | None = None  # [B, 9 cells]  Cholesky factors (CUDA: inverses); its adjoint is the matrix's

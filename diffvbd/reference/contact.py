@@ -42,7 +42,7 @@ class Pairs:
         order = torch.arange(len(part.pairs), device=part.pairs.device) if order is None else order
         rows, constants = part.pairs[order], scene.tensor(part.constants)[order]
         self.corners, self.kind, self.batch = rows[:, :4], rows[:, 4], rows[:, 5]
-        self.dhat, self.offset, self.threshold = constants.unbind(1)
+        self.dhat, self.offset, self.threshold = constants[:, :3].unbind(1)
         self.lead = scene.like.shape[:-2]
         self.points = scene.rest_points.shape[-1] + scene.model.collider_points.shape[-2]
         self.sizes = [len(color.vertices) for color in scene.layout.colors]

@@ -12,18 +12,23 @@ from torch import Tensor
 from ..adjoint.contact_lag import Pairs, of_scene, pair_lag
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
-from ..contact.start import start_part
+from ..contact.start import PartStart, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
 from ..reference.intersections import intersections
 from ..scopes import checking, recorders
+from .rigid_contact import Scene, correct
 
 if TYPE_CHECKING:
     from .arguments import Prepared
     from .predict import Begun
 
+import os
+
+STARTS, ENDS = int(os.environ.get("S", 1)), int(os.environ.get("E", 1))
 FREE = 1e15  # [m] radius of a bound that binds nothing
+ROOM = 1.5  # how far a vertex may go, over how far the farthest of its body wants to go
 
 
 class Detection(NamedTuple):
@@ -136,32 +141,156 @@ class ContactStep:
             return self._sweep(x, bounds, self.colliders, none, settings, policy, debug_step)[0]
         if checking():
             self._look_for_intersections()
-        x, way = self.x_prev, begun.y - self.x_prev
-        move = way
+        lift = torch.where(self.model._pinned[:, None], torch.zeros_like(begun.lift), begun.lift)
+        lift = broadcast(lift, begun.y.shape)
+        x, way = self.x_prev, begun.y - self.x_prev - lift
+        left, pinned = torch.zeros_like(way), self.model._pinned[:, None]
         cut: list[Tensor] = []
         found: list[Detection] = []
         counts: list[Tensor] = []
         for r, sweeps in enumerate(sweeps_of_parts(settings.sweeps, self.parts)):
             was, now = (self._colliders_at(n / self.parts) for n in (r, r + 1))
-            goal = begun.y if r + 1 == self.parts else self.x_prev + ((r + 1) / self.parts) * way
-            detection = self._detect(x, was, now, move)
+            move, fall = (way, lift) if r == 0 else (left, torch.zeros_like(lift))
+            if self.parts > 1:
+                move = torch.where(pinned, way / self.parts, move)
+            island, room = self._rooms(x, was, now, move, fall)
+            detection = self._detect(x, was, now, island, room)
             found.append(detection)
-            counts.append(torch.cat([detection.counts[:3], self._above(way, was, now, detection)]))
             if not x.is_cuda and not torch.compiler.is_compiling():  # reading is free: before any work
+                counts.append(torch.cat([detection.counts[:3], detection.counts[3:]]))
                 self._record(found, counts, cut)
                 self._check(r, counts[-1].tolist())
+                counts.pop()
                 detection = found[-1] = detection.trimmed()
             if r == 0:
                 self._set_lag(detection.listed, was)
-            start = start_part(x, move, goal, self.fields.mass, was, now, self.floor_data, self.origin, detection,
-                               surface, barrier.gamma)  # fmt: skip
-            x, move = start.x, start.move
-            cut.append(start.outside)
+                lift = self._supported(lift, x, was, detection.listed)
+                fall = lift
+            start = self._start(x, move, fall, was, now, detection, room)
+            counts.append(torch.cat([detection.counts[:3], start.stuck]))
+            x = start.x
+            cut.append(start.cut)
+            for _ in range(STARTS):
+                x = self._correct(x, was, now, start, detection)
             if sweeps:
                 part = settings._replace(sweeps=sweeps)
-                x, held_back = self._sweep(x, start.bounds, now, detection.listed, part, policy, debug_step)
+                x, held_back = self._sweep(x, start.bounds, now, detection.listed, part, policy, debug_step, start.room)
                 cut.append(held_back)
+            for _ in range(ENDS):
+                x = self._correct(x, was, now, start, detection)
+            if r + 1 < self.parts:  # what has not come through tries again
+                goal = self.x_prev + way + lift
+                left = torch.where(start.cut[:, 0, :, None] > 0, goal - x, torch.zeros_like(x))
         return self._judged(x, found, counts, cut)
+
+    def _correct(self, x: Tensor, was: Tensor, now: Tensor, start: PartStart, detection: Detection) -> Tensor:
+        numbers, surface = self.prepared.settings.numbers, self.surface
+        assert surface is not None
+        scene = Scene(
+            self.x_prev,
+            self.begun.y,
+            self.fields.mass,
+            self.origin,
+            self.before,
+            was,
+            now,
+            self.kappa,
+            detection.listed,
+            self.lagged,
+            self.lag,
+            self.floor_lag,
+            start.bounds[..., :3].detach().contiguous(),
+            start.room,
+            surface,
+            self.model,
+            self.begun.data,
+            numbers.time_step,
+            numbers.friction_eps,
+        )
+        return correct(scene, x)
+
+    def _rooms(self, x: Tensor, was: Tensor, now: Tensor, move: Tensor, fall: Tensor) -> tuple[Tensor, Tensor]:
+        """Islands [B, bodies], and how far the vertices of each body may go beside them, and the largest,
+        [B, bodies + 1] [m]. What is within that of each other is looked for."""
+        surface, barrier = self.surface, self.barrier
+        assert surface is not None and barrier is not None
+        with torch.no_grad():
+            x, was, now, move = x.detach(), was.detach(), now.detach(), move.detach()
+            body = surface.body[: x.shape[1]].long()
+            mass = self.fields.mass.detach()
+            free = ~surface.held[: x.shape[1]]
+            weight = broadcast(torch.where(free, mass, torch.zeros_like(mass)), x.shape[:2])[..., None]
+
+            falls = fall.detach().square().sum(-1).sqrt()
+            falls = falls.new_zeros((x.shape[0], surface.bodies)).index_reduce_(1, body, falls, "amax")
+
+            def largest(beside: Tensor) -> Tensor:
+                length = torch.where(free, beside.square().sum(-1).sqrt(), beside.new_zeros(()))
+                out = length.new_zeros((x.shape[0], surface.bodies)).index_reduce_(1, body, length, "amax")
+                return ROOM * out + falls + barrier.dhat / 4
+
+            sums = x.new_zeros((x.shape[0], surface.bodies, 4))
+            sums.index_add_(1, body, torch.cat([weight * move, weight], -1))
+            own = sums[..., :3] / sums[..., 3:].clamp(min=torch.finfo(x.dtype).tiny)
+            room = largest(move - own[:, body]).clamp(max=surface.most_room)
+
+            def islands(room: Tensor) -> Tensor:
+                room = (
+                    torch.cat([room, room.amax(1, keepdim=True)], 1)
+                    if surface.bodies
+                    else room.new_zeros((x.shape[0], 1))
+                )
+                return search.islands(
+                    x, self.origin, move, mass, was, now, surface, barrier.dhat, room, self.any_direction
+                ), room
+
+            island, _ = islands(room)
+            label = island.clamp(min=0).long()
+            joined = torch.zeros_like(sums).scatter_add_(1, label[..., None].expand_as(sums), sums)
+            u = (joined[..., :3] / joined[..., 3:].clamp(min=torch.finfo(x.dtype).tiny)).gather(
+                1, label[..., None].expand(-1, -1, 3)
+            )
+            u = torch.where((island >= 0)[..., None], u, u.new_zeros(()))
+            room = torch.maximum(room, largest(move - u[:, body]).clamp(max=surface.most_room))
+            return islands(room)
+
+    def _supported(self, lift: Tensor, x: Tensor, was: Tensor, listed: Pairs) -> Tensor:
+        """The part of h^2 a that a body is free to go: what the forces of contact at the start of the step bear of
+        its acceleration is taken away."""
+        model, surface = self.model, self.surface
+        assert surface is not None
+        h2 = self.prepared.settings.numbers.time_step**2
+        state = pair_lag(x, was, self.kappa, self.origin, listed)
+        force, _, n, w = state.split((1, 1, 3, 4), -1)
+        rows = (force * w)[..., None] * n[:, None]  # [pairs, 4, 3]
+        points = x.shape[1] + was.shape[1]
+        used = (listed.pairs[:, :1] >= 0).to(x.dtype)[..., None]
+        index = (listed.pairs[:, 5:6].long() * points + listed.pairs[:, :4].long()).clamp(min=0)
+        total = x.new_zeros((x.shape[0] * points, 3)).index_add(0, index.reshape(-1), (used * rows).reshape(-1, 3))
+        total = total.reshape(x.shape[0], points, 3)[:, : x.shape[1]]
+        if self.floor_data is not None and model.floor is not None:
+            size, normal = model.floor.normal_force(x, self.floor_data, self.begun.origin)
+            total = total + (size[..., None] * broadcast(normal[:, None], (*size.shape, 3))).sum(2)
+        free = ~model._pinned
+        body = surface.body[: x.shape[1]].long()
+        mass = broadcast(self.fields.mass, x.shape[:2])
+        columns = torch.cat([mass[..., None] * lift, h2 * total, mass[..., None]], -1)
+        columns = torch.where(free[:, None], columns, torch.zeros_like(columns))
+        sums = x.new_zeros((x.shape[0], surface.bodies, 7)).index_add(1, body, columns)
+        whole = sums[..., 6:].clamp(min=torch.finfo(x.dtype).tiny)
+        mean, borne = sums[..., :3] / whole, sums[..., 3:6] / whole
+        square = (borne * borne).sum(-1, keepdim=True)
+        share = (-(mean * borne).sum(-1, keepdim=True) / square.clamp(min=torch.finfo(x.dtype).tiny)).clamp(0, 1)
+        pinned = x.new_zeros(surface.bodies).index_add(0, body, model._pinned.to(x.dtype)) > 0
+        taken = torch.where(pinned[:, None], torch.zeros_like(borne), share * borne)
+        return torch.where(free[:, None], lift + taken[:, body], lift)
+
+    def _start(self, x: Tensor, move: Tensor, fall: Tensor, was: Tensor, now: Tensor, detection: Detection, room: Tensor
+               ) -> PartStart:  # fmt: skip
+        surface = self.surface
+        assert surface is not None
+        return start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin, detection,
+                                    surface, room)  # fmt: skip
 
     def _look_for_intersections(self) -> None:
         """Distances do not show that surfaces pass through each other: debug_checks() compares edges with triangles."""
@@ -188,33 +317,22 @@ class ContactStep:
         return self.before + share * (self.colliders - self.before)
 
     def _sweep(self, x: Tensor, bounds: Tensor, collider: Tensor, listed: Pairs, settings: SweepSettings, policy: int,
-               debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
+               debug_step: int, room: Tensor | None = None) -> tuple[Tensor, Tensor]:  # fmt: skip
         lagged, model = self.lagged, self.model
         fields = self.fields._replace(
             x_start=x, bounds=bounds, collider=collider, collider_prev=self.before, kappa=self.kappa,
             **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs, lag_ptr=lagged.ptr, lag_entry=lagged.entry,
-            floor_lag=self.floor_lag,
+            floor_lag=self.floor_lag, room=room,
         )  # fmt: skip
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
-    def _detect(self, x: Tensor, was: Tensor, now: Tensor, remaining: Tensor) -> Detection:
+    def _detect(self, x: Tensor, was: Tensor, now: Tensor, island: Tensor, room: Tensor) -> Detection:
         surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
         with torch.no_grad():
             x, was, now = x.detach(), was.detach(), now.detach()
             *index, corners, values, counts, smallest = search.detect(
-                x, self.origin, was, now, surface, barrier, self.capacity
-            )
-            island = search.islands(
-                x,
-                self.origin,
-                remaining.detach(),
-                self.fields.mass.detach(),
-                was,
-                now,
-                surface,
-                barrier.dhat,
-                self.any_direction,
+                x, self.origin, was, now, surface, barrier, self.capacity, room
             )
             lowest = island.new_empty((0,))
             if self.floor_data is not None:
@@ -223,18 +341,6 @@ class ContactStep:
         for found in recorders():
             found.append(detection)
         return detection
-
-    def _above(self, way: Tensor, was: Tensor, now: Tensor, detection: Detection) -> Tensor:
-        """How many pinned vertices and collider points this part moves above their bound, int64 [1]."""
-        surface, barrier = self.surface, self.barrier
-        assert surface is not None and barrier is not None
-        if not self.prescribed and was is now:
-            return detection.counts[3:]  # a zero: nothing that is held moves
-        with torch.no_grad():
-            radius = (barrier.gamma * detection.near_values[..., 7]).clamp(0, surface.cap)
-            moves = torch.cat([way / self.parts, now - was], 1).square().sum(-1).sqrt()
-            above = (moves > radius) & surface.held & ~surface.plane_points
-            return above.sum().reshape(1)
 
     def _record(self, found: list[Detection], counts: list[Tensor], cut: list[Tensor]) -> None:
         smallest = torch.stack([d.smallest for d in found])

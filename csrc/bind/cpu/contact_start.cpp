@@ -7,6 +7,7 @@
 #include <tuple>
 #include <vector>
 
+#include "../../cpu/advance.h"
 #include "../../cpu/grain.h"
 #include "sweep.h"
 
@@ -133,9 +134,27 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_start_backwar
   });
 }
 
+std::tuple<Tensor, Tensor> contact_advance(const Tensor& x, const Tensor& move, const Tensor& u, const Tensor& center,
+                                           const Tensor& origin, const Tensor& collider, const Tensor& collider_next,
+                                           const Tensor& held, const Tensor& body, const Tensor& room,
+                                           const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
+                                           const Tensor& entry, bool careful) {
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    auto in = diffvbd::advance_inputs<T>(
+        {x, move, u, center, origin, collider, collider_next, held, body, room, pairs, constants, ptr, entry});
+    in.careful = careful;
+    Tensor share = empty(x, {in.scenes, in.vertices});
+    Tensor stuck = torch::stable::empty({1}, ScalarType::Long);
+    *data<int64_t>(stuck) = diffvbd::advance<T>(in, data<T>(share));
+    return std::make_tuple(share, stuck);
+  });
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
+  m.impl("contact_advance", TORCH_BOX(&contact_advance));
   m.impl("contact_translation", TORCH_BOX(&contact_translation));
   m.impl("contact_translation_backward", TORCH_BOX(&contact_translation_backward));
   m.impl("contact_start", TORCH_BOX(&contact_start));
