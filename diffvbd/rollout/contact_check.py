@@ -16,6 +16,7 @@ from ..step.contact import outcomes
 from ..step.predict import begin
 
 CUT = 0.01  # share of the motion that bounds may cut before a rollout warns
+WARNED = "warned_of_contact"  # of a Model's _derived: unasked, one warning is enough for all of its rollouts
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: the look costs about as much as a step
 
 
@@ -28,7 +29,7 @@ def checks_contact(asked: bool | None, model: Model, x: Tensor, steps: int) -> b
         return False
     if asked:
         return not (x.is_cuda and torch.cuda.is_current_stream_capturing())
-    return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS
+    return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and WARNED not in model._derived
 
 
 def cut_share(model: Model) -> float:
@@ -69,6 +70,9 @@ def warn_of_contact(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prep
                     ) -> None:  # fmt: skip
     """Warns (UserWarning) of the step that a rollout ended with; the caller's caller is shown. Arguments as above."""
     cut = cut_share(model)
+    left = unbalanced_friction(model, before, x, prepared, given)
+    if cut > CUT or left > UNBALANCED_FRICTION:
+        model._derived[WARNED] = True
     if cut > CUT:
         warnings.warn(
             f"pair_barrier: bounds cut {100 * cut:.2g} % of the motion in the last step, which is lost as velocity; "
@@ -76,7 +80,6 @@ def warn_of_contact(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prep
             UserWarning,
             stacklevel=3,
         )
-    left = unbalanced_friction(model, before, x, prepared, given)
     if left > UNBALANCED_FRICTION:
         warnings.warn(
             f"friction: {100 * left:.2g} % of it is not balanced in the last step: the sweeps have not converged; take "

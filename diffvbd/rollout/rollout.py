@@ -113,8 +113,9 @@ def rollout(
             is swept twice for it, the second time without a tape, once under every schedule; states and gradients are
             the same.
         check_contact: Whether to warn (UserWarning) where bounds cut more than 1 % of the motion of the last step, or
-            left more than 5 % of its friction unbalanced. None: on the CPU, after ten steps or more. A look costs about
-            a step and on CUDA waits for the device; nothing that is compiled or captured is looked at.
+            left more than 5 % of its friction unbalanced. None: on the CPU, after ten steps or more, until the Model
+            has warned. A look costs about a step and on CUDA waits for the device; nothing that is compiled or captured
+            is looked at.
 
     Raises:
         ValueError, TypeError: As step; also where a per_step value has another number of steps.

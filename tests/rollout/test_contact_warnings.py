@@ -52,6 +52,8 @@ def test_friction_that_has_not_converged_is_warned_of() -> None:
     with pytest.warns(UserWarning, match=r"friction: .* not balanced .*more sweeps, a smaller time_step") as found:
         dv.rollout(model, x, v, steps=10, sweeps=1, **stiff)
     assert len(found) == 1 and found[0].filename == __file__
+    assert not messages(lambda: dv.rollout(model, x, v, steps=10, sweeps=1, **stiff))  # once is enough, unasked
+    assert messages(lambda: dv.rollout(model, x, v, steps=10, sweeps=1, check_contact=True, **stiff))
     soft, x, v = sliding(coefficient=0.5, velocity=0.1)
     assert not messages(lambda: dv.rollout(soft, x, v, steps=10, sweeps=400, **stiff))
 
