@@ -104,7 +104,7 @@ LIMITATIONS = (
      "any sequence of block updates; tasks, contact and CUDA kernels are those of Vertex Block Descent alone"),
     ("(ii)", "the derivative of a converged solve is left to equation-level methods",
      "lifted: `dv.solve` sweeps until a residual meets a tolerance, and `dv.GlobalAdjoint` differentiates the "
-     "equation; neither takes pairs or friction"),
+     "equation; the latter takes no pairs and no friction"),
     ("(iii)", "the backward scatters by atomic additions",
      "lifted: rows along edges, one writer each, no atomics; the same bits from run to run"),
     ("(iv)", "Coulomb friction with changing active sets is future work",

@@ -15,6 +15,7 @@ from .energies import Anchor, FloorBarrier, StableNeoHookean
 from .inspect import acceleration, coarse
 from .inspect.debug import debug_checks
 from .inspect.diagnose import Diagnosis, diagnose
+from .inspect.forces import Stress, reactions, stress
 from .inspect.gradcheck import GradientCheck, check_gradients
 from .mesh import TetMesh
 from .model.anderson import Anderson
@@ -46,6 +47,7 @@ __all__ = [
     "ReverseSweep",
     "Solution",
     "StableNeoHookean",
+    "Stress",
     "Tape",
     "TetMesh",
     "Trajectory",
@@ -60,6 +62,7 @@ __all__ = [
     "lame",
     "mesh",
     "per_step",
+    "reactions",
     "regime",
     "rollout",
     "solve",
@@ -67,6 +70,7 @@ __all__ = [
     "step",
     "step_backward",
     "step_forward",
+    "stress",
     "young_poisson",
 ]
 

@@ -193,7 +193,9 @@ def _simulate(options: argparse.Namespace) -> None:
     _make_place(options)
     with torch.no_grad():
         model, progress = scene.model(options.device), sys.stderr.isatty()
-        motion = scene.simulate(model, mu, lam, options.steps, save=options.stride, progress=progress)
+        said_below = False if options.stride == 1 else None
+        motion = scene.simulate(model, mu, lam, options.steps, save=options.stride, progress=progress,
+                                check_contact=said_below)  # fmt: skip
     frames, steps = motion.x.cpu().numpy(), np.asarray(motion.steps)
     dv.mesh.write_series(options.out, mesh, frames, steps * scene.time_step)
     count = int(pinned.sum())
@@ -203,10 +205,9 @@ def _simulate(options: argparse.Namespace) -> None:
             f"warning: --pin holds {count} vertices; a fraction takes more, for example --pin x-:0.05", file=sys.stderr
         )
     if len(steps) > 1 and options.stride == 1:
-        previous = None if model.touches else (motion.x[-2], motion.v[-2])  # it knows no friction
-        found = dv.diagnose(
-            model, motion.x[-1], mu=mu, lam=lam, time_step=scene.time_step, previous=previous, warn=False
-        )
+        previous = motion.x[-2], motion.v[-2]
+        found = dv.diagnose(model, motion.x[-1], mu=mu, lam=lam, time_step=scene.time_step, previous=previous,
+                            gravity=scene.gravity, warn=False)  # fmt: skip
         for message in found.messages:
             print(f"warning: {message}", file=sys.stderr)
     if options.save_target:

@@ -187,13 +187,17 @@ class FloorBarrier(VertexEnergy):
         return torch.cat([normal.expand(*shape, 3), torch.stack(columns, -1)], -1).reshape(scenes, -1)
 
     def gradient(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
+        size, normal = self.slopes(x, x_prev, data, h, origin)
+        return (size[..., None] * normal).sum(-2)
+
+    def slopes(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> tuple[Tensor, Tensor]:
+        """The gradient along each plane's normal, h^2 dE/dx.n [kg m], [B, V, P], and the normals [1 | B, 1, P, 3]."""
         normal, kappa, dhat, damping = self._columns(data)
         gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
         travel = (normal * (x - x_prev)[:, :, None]).sum(-1)
         first = _barrier_slope(gap, kappa, dhat)
         damped = (before < dhat) & (travel < 0)
-        size = h * h * first + h * torch.where(damped, damping * travel, torch.zeros_like(travel))
-        return (size[..., None] * normal).sum(-2)
+        return h * h * first + h * torch.where(damped, damping * travel, torch.zeros_like(travel)), normal
 
     def _columns(self, data: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Normal [1 | B, 1, P, 3], kappa, dhat, damping [1 | B, 1, P]."""

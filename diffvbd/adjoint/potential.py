@@ -80,9 +80,13 @@ class IncrementalPotential:
         out = torch.addcmul(first * edges[0], second, edges[1])
         return torch.addcmul(out, third, edges[2])
 
+    def elastic(self) -> Tensor:
+        """The part of forces() that is that of the tets [kg m], [B, V, 3]."""
+        return self._summed(self._sheared(self.edges) + self._pressure * self.normals)
+
     def forces(self) -> Tensor:
         """h^2 dE/dx [kg m], [B, V, 3]."""
-        total = self._summed(self._sheared(self.edges) + self._pressure * self.normals)
+        total = self.elastic()
         for energy, data in self._vertex_energies(self.data):
             total = total + energy.gradient(self.x, self.x_prev, data, self.h, self.origin)
         return total
@@ -128,6 +132,10 @@ class IncrementalPotential:
         total = total + self.mass[..., None] * eye
         own = self.vertex_blocks()
         return total if own is None else total + own
+
+    def stiffness(self) -> Tensor:
+        """Traces of the blocks on the diagonal [kg], [B, V, 1]."""
+        return self.diagonal().diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
 
     def edge_blocks(self) -> Tensor:
         """Blocks off the diagonal of the tets' Hessians: of the corners (a, b) of PAIRS, then of (b, a),

@@ -10,8 +10,11 @@ if TYPE_CHECKING:
     from ..inspect.contact import (
         Bodies,
         Detection,
+        ForceParts,
+        Forces,
         Status,
         center_of_mass_penalty,
+        forces,
         intersections,
         record,
         reserve,
@@ -21,8 +24,11 @@ if TYPE_CHECKING:
 __all__ = [
     "Bodies",
     "Detection",
+    "ForceParts",
+    "Forces",
     "Status",
     "center_of_mass_penalty",
+    "forces",
     "intersections",
     "record",
     "reserve",

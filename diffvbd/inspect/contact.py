@@ -14,9 +14,22 @@ from ..model.model import Model
 from ..reference.intersections import intersections as _intersections
 from ..scopes import record_to
 from ..step.contact import Detection, outcomes
+from .forces import ForceParts, Forces, forces
 from .penalty import Bodies, center_of_mass_penalty
 
-__all__ = ["Bodies", "Detection", "Status", "center_of_mass_penalty", "intersections", "record", "reserve", "status"]
+__all__ = [
+    "Bodies",
+    "Detection",
+    "ForceParts",
+    "Forces",
+    "Status",
+    "center_of_mass_penalty",
+    "forces",
+    "intersections",
+    "record",
+    "reserve",
+    "status",
+]
 
 
 @dataclass(frozen=True)

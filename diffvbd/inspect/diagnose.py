@@ -12,13 +12,25 @@ import torch
 from torch import Tensor
 from torch.linalg import cross
 
-from .. import reference
 from ..checks import check_positive, fail
 from ..model.model import Model
 from ..model.moduli import moduli_of
 from ..model.warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
-from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare
-from ..step.estimate import ErrorEstimate, error_of
+from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare
+from ..step.balance import (
+    UNBALANCED_FRICTION,
+    contact_of_step,
+    friction_left_over,
+    left_over,
+    of_bodies,
+    of_scenes,
+    potential_of_step,
+    rounding,
+    share,
+)
+from ..step.estimate import ErrorEstimate, check_estimable, error_of
+from ..step.predict import begin
+from .wide import check_previous, wide, widen
 
 # Limits with their measurements in docs/numerics.md
 SATURATION_TOO_LARGE = 1.0  # c over the mean edge: one update may then turn a tet inside out
@@ -46,7 +58,11 @@ class Diagnosis:
             computes about a point of each body, but stores positions as they are given.
         courant: Largest number of elements that a pressure wave crosses in one step [-].
         stiffness: Largest ratio of the elastic to the inertial part of a vertex block [-].
-        unbalanced: Left-over force of the step, |dG/dx| / h^2, over its elastic and inertial forces (2-norms) [-].
+        unbalanced: Left-over force of the step, |dG/dx| / h^2, over its inertial and all other forces (2-norms) [-].
+        residuals: The same for each body of ``model.body``, shape [..., bodies]; zero where no more is left than
+            rounding leaves.
+        friction_residuals: Of a Model with Friction, the share of the friction on each body that is not balanced [-],
+            shape [..., bodies]: the left-over force across the contact over the friction forces, where friction acts.
         errors: Estimate for each body, shapes [..., bodies], where ``sweeps`` was given.
         relative_error: The largest estimated error over motion [-], of bodies whose error is no rounding; NaN where a
             step has too few sweeps to tell.
@@ -63,6 +79,8 @@ class Diagnosis:
     courant: float | None
     stiffness: float | None
     unbalanced: float | None
+    residuals: Tensor | None = field(default=None, repr=False)
+    friction_residuals: Tensor | None = field(default=None, repr=False)
     errors: ErrorEstimate | None = field(default=None, repr=False)
     relative_error: float | None = None
 
@@ -81,6 +99,8 @@ class Diagnosis:
             ("elements a wave crosses per step", self.courant),
             ("elastic over inertial block", self.stiffness),
             ("left-over force of the step", self.unbalanced),
+            ("left-over force of the worst body", _worst(self.residuals)),
+            ("left-over share of friction", _worst(self.friction_residuals)),
             ("error over motion, worst body", self.relative_error),
         ]
         lines = [f"{name:<34}{value:.4g}" for name, value in rows if value is not None]
@@ -100,6 +120,8 @@ def diagnose(
     force: Tensor | None = None,
     gravity: Sequence[float] | Tensor = GRAVITY,
     prescribed: Tensor | None = None,
+    colliders: Tensor | None = None,
+    colliders_before: Tensor | None = None,
     parameters: dict[str, Any] | None = None,
     sweeps: int | None = None,
     warn: bool = True,
@@ -113,7 +135,8 @@ def diagnose(
         mu, lam, young, poisson: Material, as in :func:`diffvbd.step`.
         time_step: h [s]; needed for the Courant number, the stiffness and the left-over force.
         previous: State (x, v) from which one step led to ``x``; needed for the left-over force. force [N],
-            gravity [m/s^2], prescribed [m] and parameters are then those of that step.
+            gravity [m/s^2], prescribed [m], colliders [m], colliders_before [m] and parameters are then those of that
+            step.
         sweeps: K of that step: gives an estimate of its error, for which the step is swept again. Needs ``previous``.
         warn: Also emit each message as a UserWarning.
 
@@ -123,26 +146,25 @@ def diagnose(
     Raises:
         ValueError, TypeError: As :func:`diffvbd.step`; also for ``previous`` without ``time_step``,
             and for ``sweeps`` without ``previous``.
-        NotImplementedError: ``previous`` with contact or friction.
+        NotImplementedError: ``sweeps`` with contact or friction.
 
     The F = 0 well: with s* the root of s^3 + s^2 + s = mu / (mu + lam), the elastic stress pulls every F with
     |F| < sqrt(3) s* towards 0 when lam >= 0 (docs/numerics.md, with the proof).
     """
     lead = check_state(model, x, x)
     mu, lam = moduli_of(model, lead, mu, lam, young, poisson)
-    if previous is not None:
-        _check_previous(model, previous)
-    if previous is not None and model.touches:
-        raise NotImplementedError("previous: the left-over force of a step with contact or friction is not computed")
-    if previous is not None and time_step is None:
-        fail("time_step", "a number in [s] where previous is given", None)
-    if sweeps is not None and previous is None:
+    check_previous(model, previous, x, time_step)
+    errors = unbalanced = residuals = friction = None
+    if previous is None and sweeps is not None:
         fail("sweeps", "the previous state beside it", "none")
-    errors = None
-    if previous is not None and sweeps is not None and time_step is not None:
+    if previous is not None:
         check_prescribed(model, prescribed, previous[0])
-        if previous[0].shape != x.shape:
-            fail("previous", f"x's shape {list(x.shape)}", f"shape {list(previous[0].shape)}")
+        loads = {"force": force, "gravity": gravity, "prescribed": prescribed}
+        where = {"colliders": colliders, "colliders_before": colliders_before}
+        material = {"mu": mu, "lam": lam, "parameters": parameters}
+        unbalanced, residuals, friction = _balance(model, x, previous, time_step, loads, where, material)
+    if previous is not None and sweeps is not None and time_step is not None:
+        check_estimable(model, "sweeps")
         prepared = prepare(model, lead, mu=mu, lam=lam, time_step=time_step, sweeps=sweeps, rest_points=None,
                            density=None, parameters=parameters)  # fmt: skip
         errors = error_of(model, *previous, prepared, force=force, gravity=gravity, prescribed=prescribed)
@@ -159,15 +181,13 @@ def diagnose(
     critical = collapse_stretch(mu, lam)
     margin = norm / (3**0.5 * critical)
     edge = _edge_lengths(points, model.tets)
-    courant = stiffness = unbalanced = None
+    courant = stiffness = None
     if time_step is not None:
         h = check_positive("time_step", time_step, "s")
         stiffness = _largest(h * h * _block_ratio(model, gradients, volume, mu, lam))
         speed = ((lam + 2 * mu) / model.density.to(state)).clamp(min=0).sqrt()
         height = 1 / gradients.square().sum(-1).amax(-1).sqrt()  # the shortest of a tet's four
         courant = _largest(h * speed / height)
-        if previous is not None:
-            unbalanced = _unbalanced(model, state, points, previous, mu, lam, h, force, gravity, prescribed, parameters)
     spacing = torch.finfo(model.dtype).eps * _largest(state.abs())
     result = Diagnosis(
         messages=[],
@@ -181,6 +201,8 @@ def diagnose(
         courant=courant,
         stiffness=stiffness,
         unbalanced=unbalanced,
+        residuals=residuals,
+        friction_residuals=friction,
         errors=errors,
         relative_error=None if errors is None else _largest(_relative(errors, edge)),
     )
@@ -230,36 +252,32 @@ def _block_ratio(model: Model, gradients: Tensor, volume: Tensor, mu: Tensor, la
     return total[..., model.color_vertices] / model.mass.to(total)[model.color_vertices]
 
 
-def _unbalanced(
+def _balance(
     model: Model,
     x: Tensor,
-    points: Tensor,
     previous: tuple[Tensor, Tensor],
-    mu: Tensor,
-    lam: Tensor,
-    h: float,
-    force: Tensor | None,
-    gravity: Sequence[float] | Tensor,
-    prescribed: Tensor | None,
-    parameters: dict[str, Any] | None,
-) -> float:
-    check_prescribed(model, prescribed, previous[0])
-    x0, v0 = (t.detach().to(torch.float64) for t in previous)
-    mass = model.mass.to(torch.float64)[:, None]
-    acceleration = _as(gravity, x)
-    if force is not None:
-        acceleration = acceleration + force.detach().to(x) / torch.where(mass > 0, mass, torch.ones_like(mass))
-    y = x0 + h * v0 + h * h * acceleration
-    pinned = model.pinned[:, None]
-    y = torch.where(pinned, x0 if prescribed is None else prescribed.detach().to(x), y)
-    options = {"rest_points": points, "parameters": parameters}
-    left = reference.residual(model, x, y, mu, lam, h, x0, **options)
-    inertia = mass * (x - y)
-    # at a pinned vertex the residual is the reaction that holds it, not an error
-    left, inertia = (torch.where(pinned, 0.0, t) for t in (left, inertia))
-    scale = (left - inertia).flatten(-2).norm(dim=-1) + inertia.flatten(-2).norm(dim=-1)
-    ratio = left.flatten(-2).norm(dim=-1) / torch.where(scale > 0, scale, torch.ones_like(scale))
-    return _largest(ratio)
+    time_step: float | None,
+    loads: dict[str, Any],
+    where: dict[str, Any],
+    material: dict[str, Any],
+) -> tuple[float, Tensor, Tensor | None]:
+    """``unbalanced``, ``residuals`` and ``friction_residuals`` of a :class:`Diagnosis`."""
+    given = widen(model, x, time_step, *where.values(), **material)
+    double, prepared = given.model, given.prepared
+    norm, lead = of_bodies(double), x.shape[:-2]
+    if not all(bool(torch.isfinite(t).all()) for t in (x, *previous)):
+        unknown = norm(x.reshape(lead.numel(), *x.shape[-2:])).double().reshape(*lead, -1).fill_(torch.nan)
+        return float("nan"), unknown, None
+    with torch.no_grad():
+        x0, v0 = (t.detach().double() for t in previous)
+        force, gravity, prescribed = (wide(value) for value in loads.values())
+        begun = begin(double, x0, v0, prepared, force, acceleration_of(gravity, x0), prescribed)
+        contact = contact_of_step(double, begun, prepared, (given.before, given.colliders) if model.touches else None)
+        at = potential_of_step(double, x.detach().double().reshape(begun.y.shape), begun, prepared, contact)
+        left, whole = left_over(at, norm)
+        left = torch.where(left <= rounding(at, norm, torch.finfo(model.dtype).eps), 0, left)
+        friction = None if model.friction is None else friction_left_over(at).reshape(*lead, -1)
+        return _largest(share(*left_over(at, of_scenes))), share(left, whole).reshape(*lead, -1), friction
 
 
 def _as(value: Any, like: Tensor) -> Tensor:
@@ -269,6 +287,16 @@ def _as(value: Any, like: Tensor) -> Tensor:
 
 def _largest(values: Tensor) -> float:
     return float(values.max()) if values.numel() else 0.0
+
+
+def _worst(values: Tensor | None) -> float | None:
+    return None if values is None else _largest(values)
+
+
+def _place(values: Tensor) -> str:
+    """The body of the largest of values [..., bodies]."""
+    *scene, body = (values == values.max()).nonzero()[0].tolist()
+    return f"body {body}" + (f" of scene {scene}" if scene else "")
 
 
 def _state_messages(model: Model, result: Diagnosis) -> list[str]:
@@ -291,21 +319,19 @@ def _state_messages(model: Model, result: Diagnosis) -> list[str]:
     if result.resolution > RESOLUTION:
         out.append(f"positions are rounded to {result.resolution:.1e} of the shortest edge: move the scene to the "
                    "origin, or use float64")  # fmt: skip
-    if result.unbalanced is not None and result.unbalanced > UNBALANCED:
-        faster = ", or relaxation between 1.5 and 1.7" if model.relaxation < 1.5 else ""
-        out.append(f"the step left {100 * result.unbalanced:.2g} % of its forces unbalanced: take more sweeps or a "
+    # beside contact one body may be far from converged while the forces of others hide it
+    body = result.residuals if model.touches else None
+    worst = result.unbalanced if body is None else _largest(body)
+    if worst is not None and worst > UNBALANCED:
+        faster = ", or relaxation between 1.5 and 1.7" if model.relaxation < 1.5 and model.friction is None else ""
+        of = "its forces" if body is None else f"the forces of {_place(body)}"
+        out.append(f"the step left {100 * worst:.2g} % of {of} unbalanced: take more sweeps or a "
                    f"smaller time step{faster}")  # fmt: skip
+    slip = result.friction_residuals
+    if slip is not None and _largest(slip) > UNBALANCED_FRICTION:
+        out.append(f"friction has not converged: {100 * _largest(slip):.2g} % of it on {_place(slip)} is not balanced; "
+                   "take more sweeps, a smaller time step or a larger Friction(velocity=)")  # fmt: skip
     return out
-
-
-def _check_previous(model: Model, previous: Any) -> None:
-    if not (isinstance(previous, (tuple, list)) and len(previous) == 2):
-        shown = f"{len(previous)} values" if isinstance(previous, (tuple, list)) else type(previous).__name__
-        raise TypeError(f"previous: expected positions and velocities (x, v), got {shown}")
-    try:
-        check_state(model, *previous)
-    except (ValueError, TypeError) as error:
-        raise type(error)(f"previous: {error}") from None
 
 
 def _relative(errors: ErrorEstimate, edge: Tensor) -> Tensor:

@@ -12,17 +12,15 @@ import torch
 from torch import Tensor
 
 from ..adjoint.implicit import global_sweep
-from ..adjoint.potential import IncrementalPotential
-from ..adjoint.routes import Adjoint, GlobalAdjoint, check_adjoint
+from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
 from ..checks import check_count, check_positive, fail
 from ..model.model import Model
 from ..ops import SweepSettings
-from ..step.arguments import GRAVITY, Prepared, acceleration_of, check_prescribed, check_state, prepare
+from ..step.arguments import GRAVITY, Prepared, acceleration_of, check_prescribed, check_state, collider_state, prepare
+from ..step.balance import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
+from ..step.contact import outcomes
 from ..step.predict import Begun, begin
 from ..step.step import advance, swept
-
-ROUNDINGS = 0.25  # of block times position, below which a residual counts as zero: sweeps stall at 0.03 to 0.08, a
-# corrected start in free fall at 0.15
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class Solution:
     Attributes:
         x, v: Positions [m] and velocities [m/s] after the step, shape [..., V, 3].
         sweeps: Executed sweeps.
-        residual: Left-over force over the forces of the step [-], the largest over scenes.
+        residual: Left-over force over the forces of the step [-], the largest over scenes, with contact over bodies.
         converged: Whether in every scene that meets the tolerance, or is no more than rounding leaves.
     """
 
@@ -60,6 +58,8 @@ def solve(
     force: Tensor | None = None,
     gravity: Sequence[float] | Tensor = GRAVITY,
     prescribed: Tensor | None = None,
+    colliders: Tensor | None = None,
+    colliders_before: Tensor | None = None,
     rest_points: Tensor | None = None,
     density: float | Tensor | None = None,
     parameters: dict[str, Any] | None = None,
@@ -71,9 +71,13 @@ def solve(
     pinned: the part of the step's forces that is not balanced. A scene where no more is left than rounding leaves
     (in float32, or far from the origin, that can be much) counts as converged.
 
+    With a PairBarrier or Friction the residual has the forces of pairs, damping and friction, and every body has to
+    meet the tolerance. Such a step is taken anew with more and more sweeps, because its parts do not go on from where
+    others ended. Where bounds cut it short no number of sweeps converges.
+
     Args:
-        model, x, v, mu, lam, young, poisson, time_step, force, gravity, prescribed, rest_points, density, parameters:
-            As in :func:`diffvbd.step`; x, v of shape [..., V, 3].
+        model, x, v, mu, lam, young, poisson, time_step, force, gravity, prescribed, colliders, colliders_before,
+            rest_points, density, parameters: As in :func:`diffvbd.step`; x, v of shape [..., V, 3].
         tolerance: Residual in (0, 1) at which the sweeps end. A gradient of GlobalAdjoint is off by about that, times
             the conditioning of the step.
         max_sweeps: Number of sweeps after which to give up.
@@ -81,7 +85,7 @@ def solve(
             on CUDA waits for the device; later looks are further apart, at most a quarter of the sweeps so far.
         on_failure: ``"raise"`` a RuntimeError, or ``"warn"`` and go on, where max_sweeps do not meet the tolerance.
         adjoint: None: GlobalAdjoint(), which sees a converged state and no sweeps. ReverseSweep() or Unrolled() run
-            the same sweeps again and differentiate them.
+            the same sweeps again and differentiate them. With contact ReverseSweep(), and no other.
 
     Returns:
         A :class:`Solution`.
@@ -89,12 +93,14 @@ def solve(
     Raises:
         ValueError, TypeError: As :func:`diffvbd.step`.
         RuntimeError: Where the sweeps do not converge.
+        NotImplementedError: For another adjoint than ReverseSweep with contact or friction.
 
     Source: paper, eq. 1; docs/adjoints.md.
     """
-    lead, adjoint = check_state(model, x, v), GlobalAdjoint() if adjoint is None else check_adjoint(adjoint)
-    if model.touches:
-        raise NotImplementedError("model: solve() has no contact or friction; take steps of many sweeps instead")
+    lead = check_state(model, x, v)
+    if adjoint is None:
+        adjoint = ReverseSweep() if model.touches else GlobalAdjoint()
+    adjoint = check_adjoint(adjoint)
     if check_positive("tolerance", tolerance) >= 1:
         fail("tolerance", "a number in (0, 1)", tolerance)
     max_sweeps, check_every = check_count("max_sweeps", max_sweeps), check_count("check_every", check_every, 1)
@@ -102,14 +108,15 @@ def solve(
         fail("on_failure", '"raise" or "warn"', repr(on_failure))
     options: dict[str, Any] = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "time_step": time_step,
                                "rest_points": rest_points, "density": density, "parameters": parameters}  # fmt: skip
-    prepared = prepare(model, lead, sweeps=0, **options)
+    prepared = prepare(model, lead, sweeps=0, adjoint=adjoint if model.touches else None, **options)
     check_prescribed(model, prescribed, x)
-    settings = prepared.settings
-    loads: dict[str, Any] = {"force": force, "gravity": gravity, "prescribed": prescribed}
+    settings, where = prepared.settings, collider_state(model, x, colliders, colliders_before)
+    loads: dict[str, Any] = {"force": force, "gravity": gravity, "prescribed": prescribed, "colliders": colliders,
+                             "colliders_before": colliders_before}  # fmt: skip
     begun = begin(model, x, v, prepared, force, acceleration_of(gravity, x), prescribed)
 
     with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-        done = _Sweeping(model, begun.detached(), prepared, {"x": x, "v": v, **loads}, time_step, tolerance)
+        done = _Sweeping(model, begun.detached(), prepared, {"x": x, "v": v, **loads}, where, tolerance)
         done.run(max_sweeps, check_every)
     _judge(done, tolerance, on_failure)
     if isinstance(adjoint, GlobalAdjoint):
@@ -134,7 +141,7 @@ def _judge(done: _Sweeping, tolerance: float, on_failure: str) -> None:
         return
     text = (
         f"solve: expected a residual of at most {tolerance:g}, got {done.residual:.3g} after {done.count} sweeps; "
-        "take more (max_sweeps), a smaller time step, or with the exact block a relaxation between 1.5 and 1.7"
+        f"take more (max_sweeps), a smaller time step, or {done.remedy}"
     )
     if on_failure == "raise":
         raise RuntimeError(text)
@@ -156,21 +163,39 @@ class _Sweeping:
         begun: Begun,
         prepared: Prepared,
         given: dict[str, Any],
-        time_step: float,
+        where: tuple[Tensor, Tensor] | None,
         tolerance: float,
     ) -> None:
+        """where: collider points at the start and at the end of the step, None without contact."""
         self.model, self.begun, self.prepared, self.given = model, begun, prepared, given
-        self.time_step, self.tolerance = time_step, tolerance
+        self.where = None if where is None else (where[0].detach(), where[1].detach())
+        self.tolerance, self.norm = tolerance, of_scenes if where is None else of_bodies(model)
+        self.contact = contact_of_step(model, begun, prepared, self.where)
         # The end of a step is its last sweep, which may be relaxed less, and its correction: what was swept before them
         # is what further sweeps go on from.
         self.before, self.count = begun.x_start, 0
         numbers = prepared.settings.numbers
         self.over = prepared.settings._replace(numbers=numbers._replace(last_relaxation=numbers.relaxation))
         self.rounding: Tensor | None = None
-        self._end_at(self.before)
+        self.residual, self.converged = math.inf, False
+        if where is None:
+            self._end_at(self.before)
+
+    @property
+    def remedy(self) -> str:
+        """What else may help where the sweeps do not converge."""
+        if self.where is None:
+            return "with the exact block a relaxation between 1.5 and 1.7"
+        outcome = outcomes.get(self.model)
+        if outcome is not None and any(bool(cut.any()) for cut in outcome.cut):
+            return "more detections or a larger reach of the PairBarrier, whose bounds have cut this step short"
+        return "a larger Friction(velocity=)"
 
     def run(self, max_sweeps: int, check_every: int) -> None:
         """Sweeps until the step has converged, or is lost, or max_sweeps are done."""
+        if self.where is not None:
+            self._run_anew(max_sweeps, check_every)
+            return
         while not self.converged and self.count < max_sweeps and math.isfinite(self.residual):
             # a look costs many sweeps: at first after check_every, later after a quarter of what there were
             some = min(max(check_every, self.count // 4), max_sweeps - self.count)
@@ -179,9 +204,17 @@ class _Sweeping:
             self.count += some
             self._end_at(self._swept(self.prepared.settings._replace(sweeps=1)))
 
+    def _run_anew(self, max_sweeps: int, check_every: int) -> None:
+        """The same for steps with contact, each from the beginning: half as many sweeps more each time."""
+        self.count = min(check_every, max_sweeps)
+        self._end_at(self._swept(self.prepared.settings._replace(sweeps=self.count)))
+        while not self.converged and self.count < max_sweeps and math.isfinite(self.residual):
+            self.count = min(self.count + max(check_every, self.count // 2), max_sweeps)
+            self._end_at(self._swept(self.prepared.settings._replace(sweeps=self.count)))
+
     def _swept(self, settings: SweepSettings) -> Tensor:
         part = self.prepared._replace(settings=settings)
-        return swept(self.model, self.begun._replace(x_start=self.before), part, self.given)
+        return swept(self.model, self.begun._replace(x_start=self.before), part, self.given, colliders=self.where)
 
     def _end_at(self, x: Tensor) -> None:
         """Corrects what the last sweep left, and looks at it."""
@@ -190,28 +223,15 @@ class _Sweeping:
     def look_at(self, end: Tensor) -> None:
         """Takes a state [B, V, 3] for the end of the step."""
         self.end = end
-        at = IncrementalPotential(self.model, self.end, self.begun.fields(self.model, self.prepared), self.time_step)
-        if self.rounding is None:
-            self.rounding = _rounding(at)
-        self.residual, self.converged = _residual(at, self.tolerance, self.rounding)
-
-
-def _rounding(at: IncrementalPotential) -> Tensor:
-    """A norm of the gradient that rounding alone may leave, of each scene: a block times what rounds a position."""
-    stiffness = at.free * at.diagonal().diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
-    return ROUNDINGS * torch.finfo(at.x.dtype).eps * at.x.abs().amax((-2, -1)) * _norm(stiffness)
-
-
-def _residual(at: IncrementalPotential, tolerance: float, rounding: Tensor) -> tuple[float, bool]:
-    """The largest residual over scenes, and whether all of them have converged."""
-    if not at.x.numel():
-        return 0.0, True
-    inertia, forces = at.free * at.inertia(), at.free * at.forces()
-    unbalanced, scale = _norm(inertia + forces), _norm(inertia) + _norm(forces)
-    ratio = unbalanced / torch.where(scale > 0, scale, 1)
-    done = (ratio <= tolerance) | ((unbalanced <= rounding) & torch.isfinite(rounding))
-    return float(torch.nan_to_num(ratio, nan=torch.inf).max()), bool(done.all())
-
-
-def _norm(a: Tensor) -> Tensor:
-    return a.square().sum((-2, -1)).sqrt()
+        if not end.numel():
+            self.residual, self.converged = 0.0, True
+            return
+        at = potential_of_step(self.model, end, self.begun, self.prepared, self.contact)
+        if self.rounding is None or self.contact is not None:  # barriers become stiffer as gaps close
+            self.rounding = rounding(at, self.norm)
+        left, whole = left_over(at, self.norm)
+        ratio = share(left, whole)
+        done = (ratio <= self.tolerance) | ((left <= self.rounding) & torch.isfinite(self.rounding))
+        # what rounding leaves is converged, and no residual to speak of where a body is only a part of the scene
+        shown = ratio if self.contact is None else torch.where(done & (ratio > self.tolerance), 0, ratio)
+        self.residual, self.converged = float(torch.nan_to_num(shown, nan=torch.inf).max()), bool(done.all())

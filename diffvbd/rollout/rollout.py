@@ -19,6 +19,7 @@ from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, st
 from ..step.estimate import ErrorEstimate, check_estimable, error_of, of_steps
 from ..step.step import advance
 from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
+from .contact_check import checks_contact, warn_of_contact
 
 # these enter through prepare(), the others through advance()
 _STATIC = ("mu", "lam", "young", "poisson", "rest_points", "density")
@@ -83,6 +84,7 @@ def rollout(
     observe: Callable[[Tensor, Tensor, int], Any] | None = None,
     progress: bool = False,
     estimate_errors: bool = False,
+    check_contact: bool | None = None,
 ) -> Trajectory:
     """Runs ``steps`` steps; the gradient is that of calling :func:`diffvbd.step` in a loop.
 
@@ -110,6 +112,10 @@ def rollout(
         estimate_errors: Also return how far from converged each step ends (:class:`diffvbd.ErrorEstimate`). Each step
             is swept twice for it, the second time without a tape, once under every schedule; states and gradients are
             the same.
+        check_contact: Whether to warn (UserWarning) where bounds cut more than 1 % of the motion of the last step, or
+            left more than 5 % of its friction unbalanced. None: on the CPU, after ten steps or more, until the Model
+            has warned. A look costs about a step and on CUDA waits for the device; nothing that is compiled or captured
+            is looked at.
 
     Raises:
         ValueError, TypeError: As step; also where a per_step value has another number of steps.
@@ -118,6 +124,8 @@ def rollout(
     steps = check_count("steps", steps)
     _check_save(save)
     _check_estimates(estimate_errors, model)
+    if not isinstance(check_contact, bool | None):
+        raise TypeError(f"check_contact: expected a bool or None, got {type(check_contact).__name__}")
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
     options = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "rest_points": rest_points,
                "density": density, "force": force, "gravity": gravity, "prescribed": prescribed,
@@ -142,6 +150,8 @@ def rollout(
     versions = [] if every is None or torch.compiler.is_compiling() else _versions(options, own)
     bar = _Progress(steps) if progress else None
     errors: dict[int, ErrorEstimate] = {}  # by step: a segment that runs again finds them
+    last: list[Any] = []  # what the last step went from, and to
+    looks = checks_contact(check_contact, model, x, steps)
 
     def segment(first: int, end: int, x: Tensor, v: Tensor, start: Tensor = x) -> Segment:  # start: the outer x
         _check_versions(versions)
@@ -152,6 +162,8 @@ def rollout(
             before, (x, v) = (x, v), advance(model, x, v, now, adjoint=adjoint, index=k, **given)
             if estimate_errors and k not in errors:
                 errors[k] = error_of(model, *before, now, **{name: given[name] for name in _LOADS})
+            if looks and k + 1 == steps and not last:
+                last.extend((before, x, now, given))
             if save == "all" or k + 1 == steps or (save != "last" and (k + 1) % save == 0):
                 frames.append((k + 1, x, v))
             if observe is not None:
@@ -161,6 +173,9 @@ def rollout(
         return Segment(x, v, frames, observed)
 
     done = run_segments(segment, steps, x, v, every if torch.is_grad_enabled() else None)
+    if last:
+        warn_of_contact(model, *last)
+        last[:] = [None]  # of no use any more: no tape is held, and a segment that runs again keeps nothing
     frames = ([] if save == "last" and steps > 0 else [(0, x, v)]) + done.frames
     return Trajectory(
         x=torch.stack([f[1] for f in frames]),

@@ -16,7 +16,7 @@ from .rigid import correct
 from .start import begin as start_of
 
 
-def _energy_data(model: Model, prepared: Prepared, origin: Tensor | None) -> Tensor:
+def energy_data(model: Model, prepared: Prepared, origin: Tensor | None) -> Tensor:
     """The energies' data [1 | B, n]: the Model's constants unless a parameter or an origin changes them."""
     if not prepared.parameters and origin is None:
         return model._energy_data
@@ -100,7 +100,7 @@ def begin(
     if prescribed is not None:
         prescribed = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
         prescribed = prescribed if origin is None else prescribed - origin
-    data = _energy_data(model, prepared, origin)
+    data = energy_data(model, prepared, origin)
     rest = None
     if model.starts_from == "auto" and model.energy_mask & ELASTIC:
         rest = model.rest_scalars if prepared.rest is None else prepared.rest

@@ -267,10 +267,11 @@ def test_other_adjoints_raise(adjoint: Any) -> None:
                 run(m, x, 0 * x, adjoint=adjoint, **STEP)
 
 
-def test_solve_raises() -> None:
+@pytest.mark.parametrize("adjoint", (dv.Unrolled(), dv.GlobalAdjoint()), ids=("Unrolled", "GlobalAdjoint"))
+def test_solve_raises(adjoint: Any) -> None:
     model = two_boxes()
-    with pytest.raises(NotImplementedError, match="contact"):
-        dv.solve(model, model.rest_points, 0 * model.rest_points, mu=2e4, lam=4e4, time_step=0.01)
+    with pytest.raises(NotImplementedError, match=f"adjoint: contact .*ReverseSweep.*{type(adjoint).__name__}"):
+        dv.solve(model, model.rest_points, 0 * model.rest_points, mu=2e4, lam=4e4, time_step=0.01, adjoint=adjoint)
 
 
 def speed_of(model: dv.Model, v: Tensor, **options: Any) -> Tensor:

@@ -1,0 +1,176 @@
+"""Contact of a step at one state: forces by pair and plane, and the incremental potential's gradient with them.
+
+Barriers are those of the state, damping and friction those of the start of the step, as sweeps have them. In torch,
+in float64, differentiable but for which pairs there are.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .. import ops
+from ..contact.pair_forces import (
+    NearPairs,
+    barrier_forces,
+    barrier_stiffness,
+    corner_points,
+    lag_of,
+    lagged_forces,
+    lagged_stiffness,
+    near_pairs,
+)
+from ..model.model import Model
+from ..reference.friction import smoothed
+from .potential import IncrementalPotential
+
+
+class ContactState(NamedTuple):
+    """Forces at one state [N]; those of pairs on their corners [Q, 4, 3], those of planes on vertices [B, V, P, 3]."""
+
+    points: Tensor  # [B, N, 3] corner points
+    pairs: NearPairs
+    barrier: Tensor
+    lagged: NearPairs | None  # pairs of the start; None where there are none, or no start is known
+    damping: Tensor
+    friction: Tensor
+    floor: Tensor  # barrier and damping of planes; on vertices that are not pinned
+    floor_friction: Tensor
+
+    def of_pairs(self) -> tuple[Tensor, Tensor]:
+        """Normal and friction forces of pairs on corner points, both [B, N, 3]."""
+        normal = self.pairs.summed(self.barrier, self.points)
+        if self.lagged is None:
+            return normal, torch.zeros_like(normal)
+        return normal + self.lagged.summed(self.damping, self.points), self.lagged.summed(self.friction, self.points)
+
+    def on_vertices(self) -> tuple[Tensor, Tensor]:
+        """Normal and friction forces of everything on the vertices, both [B, V, 3]."""
+        count = self.floor.shape[1]
+        normal, friction = self.of_pairs()
+        return normal[:, :count] + self.floor.sum(-2), friction[:, :count] + self.floor_friction.sum(-2)
+
+
+class StepContact:
+    """What a step of a Model knows of contact before it moves anything.
+
+    Args:
+        data: The energies' data [1 | B, n].  parameters: Those of the energies, [1 | B, ...].
+        colliders, before: Collider points at the end and at the start [B, Vc, 3].
+        x_prev: Start of the step [B, V, 3], relative to ``origin`` where there is one; None: at rest in any state, so
+            that there is neither damping nor friction.
+    """
+
+    def __init__(self, model: Model, data: Tensor, parameters: dict[str, Tensor], colliders: Tensor, before: Tensor,
+                 x_prev: Tensor | None, origin: Tensor | None, time_step: float) -> None:  # fmt: skip
+        self.model, self.parameters, self.origin, self.h = model, parameters, origin, time_step
+        self.colliders, self.x_prev = colliders, x_prev
+        floor = model.floor
+        self.planes = None if floor is None else data[:, : floor.count()].double()
+        self.start = None if x_prev is None else corner_points(x_prev, origin, before)
+        self.reach = 1.0 if model.friction is None else time_step * model.friction.velocity
+        self.lag = None
+        surface, barrier = model.surface_of_contact, model.contact
+        if x_prev is not None and self.start is not None and surface is not None and barrier is not None:
+            first = before + (colliders - before) / barrier.detections
+            near = near_pairs(x_prev, origin, before, first, surface, barrier)
+            self.lag = lag_of(near, self.start, self._number("pair_barrier.kappa"))
+
+    def _number(self, name: str) -> Tensor:
+        """A parameter [1 | B]; zero where its energy is absent."""
+        if name in self.parameters:
+            return self.parameters[name].double()
+        owner, key = name.split(".")
+        energy = next((e for e in self.model.parametric_energies if e.name == owner), None)
+        if energy is None:
+            return self.colliders.new_zeros((1,), dtype=torch.float64)
+        return self.model.constants(energy)[key][None].double()
+
+    def at(self, x: Tensor) -> ContactState:
+        """Forces at x [B, V, 3].
+
+        Raises:
+            ValueError: Where surfaces touch there, or positions are not finite.
+        """
+        surface, barrier = self.model.surface_of_contact, self.model.contact
+        points = corner_points(x, self.origin, self.colliders)
+        if surface is None or barrier is None:
+            pairs = _no_pairs(points)
+        else:
+            pairs = near_pairs(x, self.origin, self.colliders, self.colliders, surface, barrier)
+        pushes = barrier_forces(pairs, points, self._number("pair_barrier.kappa"))
+        damping = friction = points.new_zeros((0, 4, 3))
+        if self.lag is not None:
+            damping, friction = lagged_forces(self.lag, points, self._number("pair_barrier.damping"),
+                                              self._number("friction.coefficient"), self.h, self.reach)  # fmt: skip
+        lagged = None if self.lag is None else self.lag.pairs
+        return ContactState(points, pairs, pushes, lagged, damping, friction, *self._floor(points[:, : x.shape[1]]))
+
+    def _floor(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Normal and friction forces of each plane on each vertex, both [B, V, P, 3]."""
+        floor = self.model.floor
+        if floor is None or self.planes is None:
+            none = x.new_zeros((*x.shape[:2], 0, 3))
+            return none, none
+        start = x if self.start is None else self.start[:, : x.shape[1]]
+        free = ~self.model._pinned[:, None, None]
+        slope, normal = floor.slopes(x, start, self.planes, self.h, None)
+        push = torch.where(free, -(slope / self.h**2)[..., None] * normal, 0.0)
+        if self.start is None or self.model.friction is None:
+            return push, torch.zeros_like(push)
+        lagged, slip, factor = self._floor_slip(x)
+        return push, torch.where(free, -(lagged * factor)[..., None] * slip, 0.0)
+
+    def _floor_slip(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Largest friction of each plane on each vertex [B, V, P], slip [B, V, P, 3], and what their product takes."""
+        floor, start = self.model.floor, self.start
+        assert floor is not None and start is not None and self.planes is not None
+        start = start[:, : x.shape[1]]
+        force, normal = floor.normal_force(start, self.planes, None)
+        lagged = self._number("friction.coefficient")[:, None, None] * force
+        travel, normal = (x - start)[:, :, None], normal[:, None]
+        slip = travel - (travel * normal).sum(-1, keepdim=True) * normal
+        return lagged, slip, smoothed(slip.movedim(-1, -2), self.reach)[1]
+
+    def stiffness(self, forces: ContactState) -> Tensor:
+        """Trace of the contact's part of each vertex's block [N/m], [B, V]; of planes their friction alone."""
+        points, count = forces.points, forces.floor.shape[1]
+        total = barrier_stiffness(forces.pairs, points, self._number("pair_barrier.kappa"))
+        if self.lag is not None:
+            total = total + lagged_stiffness(self.lag, points, self._number("pair_barrier.damping"),
+                                             self._number("friction.coefficient"), self.h, self.reach)  # fmt: skip
+        total = total[:, :count]
+        if self.model.friction is not None and self.start is not None and self.planes is not None:
+            lagged, _, factor = self._floor_slip(points[:, :count])
+            total = total + 2 * (lagged * factor).sum(-1)
+        return total
+
+
+def _no_pairs(points: Tensor) -> NearPairs:
+    whole, real = (points.new_zeros((0,), dtype=d) for d in (torch.int64, torch.float64))
+    return NearPairs(whole.reshape(0, 4), whole, whole, real, real, real)
+
+
+class ContactPotential(IncrementalPotential):
+    """The incremental potential at x with pairs and friction. Its Hessian is that without them."""
+
+    def __init__(self, model: Model, x: Tensor, fields: ops.SweepFields, contact: StepContact) -> None:
+        super().__init__(model, x, fields, contact.h)
+        self.step_contact = contact
+
+    @cached_property
+    def contact(self) -> ContactState:
+        return self.step_contact.at(self.x)
+
+    def forces(self) -> Tensor:
+        """h^2 dE/dx [kg m], [B, V, 3], pairs and friction included."""
+        count = self.x.shape[1]
+        normal, friction = self.contact.of_pairs()
+        total = (normal + friction)[:, :count] + self.contact.floor_friction.sum(-2)
+        return super().forces() - (self.h**2 * total).to(self.x.dtype)
+
+    def stiffness(self) -> Tensor:
+        return super().stiffness() + (self.h**2 * self.step_contact.stiffness(self.contact))[..., None].to(self.x.dtype)

@@ -1,0 +1,294 @@
+"""Forces and stresses at a state: what contact does, what pins bear, what the material bears. Differentiable."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.linalg import cross
+
+from .. import ops
+from ..adjoint.contact_potential import ContactState, StepContact
+from ..adjoint.potential import IncrementalPotential
+from ..checks import fail
+from ..contact.pair_forces import NearPairs
+from ..energies import StableNeoHookean
+from ..model.model import Model
+from ..model.rest import shape_gradients
+from ..step.arguments import GRAVITY, acceleration_of, broadcastable, check_state
+from .wide import Wide, check_previous, wide, widen
+
+# --- contact ----------------------------------------------------------------------------------------------------------
+
+
+class ForceParts(NamedTuple):
+    """Forces [N], shape [..., 3]: ``normal`` by barriers and damping, ``tangential`` by friction."""
+
+    normal: Tensor
+    tangential: Tensor
+
+    @property
+    def total(self) -> Tensor:
+        """Their sum [N]."""
+        return self.normal + self.tangential
+
+
+@dataclass(frozen=True)
+class Forces:
+    """Forces of contact at a state, see :func:`forces`. Bodies are counted as in ``model.body``; N of them.
+
+    Attributes:
+        vertices: On every vertex, [..., V, 3]; those of self-contact, too.
+        body_pairs: Bodies a < b that are near each other in some scene, int64 [M, 2].
+        between: On body a of each of these by body b, [..., M, 3]; b bears the opposite.
+        colliders: On each body by each collider, [..., N, colliders, 3].
+        floors: On each body by each plane of the FloorBarrier, [..., N, planes, 3].
+    """
+
+    vertices: ForceParts
+    body_pairs: Tensor
+    between: ForceParts
+    colliders: ForceParts
+    floors: ForceParts
+
+
+def forces(
+    model: Model,
+    x: Tensor,
+    *,
+    previous: tuple[Tensor, Tensor] | None = None,
+    time_step: float | None = None,
+    colliders: Tensor | None = None,
+    colliders_before: Tensor | None = None,
+    parameters: dict[str, Any] | None = None,
+) -> Forces:
+    """Forces that pairs, colliders and floors exert at x, by vertex, by two bodies, by collider and by plane.
+
+    The barrier's forces are those at x. Damping and friction are those of a step: they follow from its start and from
+    its motion, so they need ``previous`` and ``time_step``; without these x is at rest and they are zero. Which
+    pairs are near has no derivative; all else is differentiable by autograd. Computed in float64.
+
+    Args:
+        model: The scene; a FloorBarrier or a PairBarrier exerts the forces.
+        x: Positions [m], shape [..., V, 3].
+        previous: State (x, v) from which one step led to ``x``, of x's shape; v is not read.
+        time_step: h of that step [s].
+        colliders: Collider points [m] where x is, broadcasts to x.shape[:-2] + (Vc, 3). None: the Model's.
+        colliders_before: The same at the start of the step. None: they rest.
+        parameters: As in :func:`diffvbd.step`, as {"friction.coefficient": tensor}.
+
+    Returns:
+        A :class:`Forces`, of x's dtype.
+
+    Raises:
+        ValueError, TypeError: As :func:`diffvbd.step`; also where surfaces touch, and for ``previous`` without
+            ``time_step``.
+
+    Source: Li et al. (2020); docs/method.md, sections 6 and 12.
+    """
+    check_state(model, x, x)
+    check_previous(model, previous, x, time_step)
+    given = widen(model, x, time_step, colliders, colliders_before, mu=0.0, lam=0.0, parameters=parameters)
+    state = _contact_at(given, x, previous)
+    lead, dtype = x.shape[:-2], x.dtype
+
+    def shaped(normal: Tensor, tangential: Tensor) -> ForceParts:
+        return ForceParts(*(t.reshape(*lead, *t.shape[1:]).to(dtype) for t in (normal, tangential)))
+
+    surface = given.model.surface_of_contact
+    labels = given.model.body
+    bodies = int(labels.max()) + 1 if labels.numel() else 0
+    floors = [_by_label(part, labels, bodies) for part in (state.floor, state.floor_friction)]
+    sums = _OfBodies(state, bodies, 0 if surface is None else len(surface.rows), surface.body if surface else labels)
+    body_pairs, *between = sums.between()
+    return Forces(
+        vertices=shaped(*state.on_vertices()),
+        body_pairs=body_pairs,
+        between=shaped(*between),
+        colliders=shaped(*sums.colliders()),
+        floors=shaped(*floors),
+    )
+
+
+def _contact_at(given: Wide, x: Tensor, previous: tuple[Tensor, Tensor] | None) -> ContactState:
+    flat = (x.shape[:-2].numel(), *x.shape[-2:])
+    start = None if previous is None else previous[0].double().reshape(flat)
+    h = given.prepared.settings.numbers.time_step
+    contact = StepContact(given.model, given.data(), given.prepared.parameters, given.colliders, given.before, start,
+                          None, h)  # fmt: skip
+    return contact.at(x.double().reshape(flat))
+
+
+def _by_label(values: Tensor, labels: Tensor, count: int) -> Tensor:
+    """[B, V, ...] -> [B, count, ...]"""
+    return values.new_zeros(len(values), count, *values.shape[2:]).index_add(1, labels, values)
+
+
+class _OfBodies:
+    """Forces of pairs, added up by the bodies of their two sides; colliders count on from the ``bodies``."""
+
+    def __init__(self, state: ContactState, bodies: int, colliders: int, labels: Tensor) -> None:
+        self.bodies, self.count, self.scenes = bodies, colliders, len(state.points)
+        parts: list[tuple[NearPairs, Tensor, int]] = [(state.pairs, state.barrier, 0)]
+        if state.lagged is not None:
+            parts += [(state.lagged, state.damping, 0), (state.lagged, state.friction, 1)]
+        rows = []
+        for pairs, on_corners, part in parts:
+            (a, b), force = (side.long() for side in pairs.sides(labels)), pairs.of_first(on_corners)
+            turned = a > b  # bodies before colliders, and the lower one first
+            force = torch.where(turned[:, None], -force, force)
+            rows.append((pairs.scene, torch.minimum(a, b), torch.maximum(a, b), torch.full_like(a, part), force))
+        self.scene, self.a, self.b, self.part, self.force = (torch.cat(column) for column in zip(*rows, strict=True))
+
+    def between(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Body pairs [M, 2], normal and tangential forces on their first bodies [B, M, 3]."""
+        own = (self.b < self.bodies) & (self.a < self.b)
+        key = self.a[own] * self.bodies + self.b[own]
+        keys, column = key.unique(return_inverse=True)
+        found = torch.stack([keys // max(1, self.bodies), keys % max(1, self.bodies)], -1)
+        return found, *self._sums(own, column, len(keys))
+
+    def colliders(self) -> tuple[Tensor, Tensor]:
+        """Normal and tangential forces on bodies by colliders [B, bodies, colliders, 3]."""
+        own = self.b >= self.bodies
+        column = self.a[own] * self.count + self.b[own] - self.bodies
+        normal, tangential = self._sums(own, column, self.bodies * self.count)
+        shape = (self.scenes, self.bodies, self.count, 3)
+        return normal.reshape(shape), tangential.reshape(shape)
+
+    def _sums(self, own: Tensor, column: Tensor, columns: int) -> tuple[Tensor, Tensor]:
+        total = self.force.new_zeros(2 * self.scenes * columns, 3)
+        index = (self.part[own] * self.scenes + self.scene[own]) * columns + column
+        normal, tangential = total.index_add(0, index, self.force[own]).reshape(2, self.scenes, columns, 3)
+        return normal, tangential
+
+
+# --- pins and material ------------------------------------------------------------------------------------------------
+
+
+def reactions(
+    model: Model,
+    x: Tensor,
+    *,
+    mu: float | Tensor | None = None,
+    lam: float | Tensor | None = None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
+    previous: tuple[Tensor, Tensor] | None = None,
+    time_step: float | None = None,
+    force: Tensor | None = None,
+    gravity: Sequence[float] | Tensor = GRAVITY,
+    colliders: Tensor | None = None,
+    colliders_before: Tensor | None = None,
+    rest_points: Tensor | None = None,
+    density: float | Tensor | None = None,
+    parameters: dict[str, Any] | None = None,
+) -> Tensor:
+    """Forces that hold the pinned vertices where they are: what a support must bear, with the opposite sign.
+
+    The sum of a pinned vertex's reaction, its weight, the external force, elasticity and contact is its mass times its
+    acceleration, which is zero unless ``previous`` tells another. Differentiable by autograd in every tensor; computed
+    in float64.
+
+    Args:
+        model, mu, lam, young, poisson, force, gravity, rest_points, density, parameters: As in :func:`diffvbd.step`.
+            A force on a pinned vertex goes into its support.
+        x: Positions [m], shape [..., V, 3].
+        previous, time_step, colliders, colliders_before: As in :func:`diffvbd.contact.forces`; v is read.
+
+    Returns:
+        Reactions [N], x's shape and dtype; zero at vertices that are not pinned.
+
+    Raises:
+        ValueError, TypeError: As :func:`diffvbd.step` and :func:`diffvbd.contact.forces`.
+
+    Source: docs/method.md, sections 1, 2 and 12.
+    """
+    check_state(model, x, x)
+    check_previous(model, previous, x, time_step)
+    given = widen(model, x, time_step, colliders, colliders_before, mu=mu, lam=lam, young=young, poisson=poisson,
+                  rest_points=rest_points, density=density, parameters=parameters)  # fmt: skip
+    prepared, h = given.prepared, given.prepared.settings.numbers.time_step
+    flat = (x.shape[:-2].numel(), *x.shape[-2:])
+
+    def full(value: Tensor) -> Tensor:
+        return value.expand(x.shape).double().reshape(flat)
+
+    at = full(x)
+    fields = ops.SweepFields(at, at, at, prepared.mu, prepared.lam, prepared.mass, prepared.rest, given.data(), None)
+    total = IncrementalPotential(given.model, at, fields, h).elastic() / h**2
+    if given.model.contact is not None:  # planes do not act on pinned vertices
+        normal, friction = _contact_at(given, x, previous).on_vertices()
+        total = total - normal - friction
+    acceleration = -full(acceleration_of(gravity, x))
+    if previous is not None:
+        start, speed = (full(t) for t in previous)
+        acceleration = acceleration + ((at - start) / h - speed) / h
+    total = total + prepared.mass[..., None] * acceleration
+    if force is not None:
+        total = total - full(broadcastable("force", force, x))
+    return torch.where(given.model._pinned[:, None], total, 0.0).reshape(x.shape).to(x.dtype)
+
+
+class Stress(NamedTuple):
+    """Stress of each tet [Pa]: ``cauchy`` [..., T, 3, 3], symmetric, tension positive; ``von_mises`` [..., T]."""
+
+    cauchy: Tensor
+    von_mises: Tensor
+
+
+def stress(
+    model: Model,
+    x: Tensor,
+    mu: float | Tensor | None = None,
+    lam: float | Tensor | None = None,
+    *,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
+    rest_points: Tensor | None = None,
+) -> Stress:
+    """Cauchy stress of each tet and the von Mises stress that follows from it.
+
+        cauchy = P F^T / J = mu F F^T / J + ((mu + lam) (J - 1) - mu) I
+
+    Args:
+        model: A scene with StableNeoHookean tets.
+        x: Positions [m], shape [..., V, 3].
+        mu, lam, young, poisson, rest_points: As in :func:`diffvbd.step`.
+
+    Returns:
+        A :class:`Stress` of x's dtype, differentiable by autograd in every tensor; the derivative of a von Mises stress
+        of zero is zero. Where a tet has no volume (J = 0) its stress is not finite.
+
+    Raises:
+        ValueError, TypeError: As :func:`diffvbd.step`; also for a Model without StableNeoHookean.
+
+    Source: Smith, de Goes, Kim (2018); docs/method.md, section 2.
+    """
+    check_state(model, x, x)
+    lead = x.shape[:-2]
+    if not any(isinstance(energy, StableNeoHookean) for energy in model.energies):
+        fail("model", "StableNeoHookean among its energies", "none")
+    given = widen(model, x, None, None, None, mu=mu, lam=lam, young=young, poisson=poisson, rest_points=rest_points)
+    tets = given.model._topology[0]
+    points = given.model._rest_points if rest_points is None else wide(rest_points)
+    gradients, _ = shape_gradients(points.expand(x.shape)[..., tets, :])
+    corners = x.double()[..., tets, :]
+    edges = corners[..., 1:, :] - corners[..., :1, :]
+    f = (edges[..., :, None] * gradients[..., 1:, None, :]).sum(-3)  # F_ij = sum_a e_ai (grad N_a)_j
+    det = (f[..., 0, :] * cross(f[..., 1, :], f[..., 2, :])).sum(-1)
+    shear, second = (
+        t.expand(lead.numel(), t.shape[1]).reshape(*lead, -1) for t in (given.prepared.mu, given.prepared.lam)
+    )
+    eye = torch.eye(3, dtype=f.dtype, device=f.device)
+    left = (f[..., :, None, :] * f[..., None, :, :]).sum(-1)
+    pressure = (shear + second) * (det - 1) - shear
+    cauchy = (shear / det)[..., None, None] * left + pressure[..., None, None] * eye
+    trace = cauchy.diagonal(dim1=-2, dim2=-1).sum(-1)
+    square = 1.5 * (cauchy - (trace / 3)[..., None, None] * eye).square().sum((-2, -1))
+    loaded = square > 0  # a root has no derivative at zero
+    von_mises = torch.where(loaded, torch.where(loaded, square, 1.0).sqrt(), 0.0)
+    return Stress(cauchy.to(x.dtype), von_mises.to(x.dtype))

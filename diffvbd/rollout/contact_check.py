@@ -1,0 +1,89 @@
+"""What a rollout says of its contact: motion that bounds have cut, friction that has not converged."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..model.model import Model
+from ..scopes import looks_at
+from ..step.arguments import Prepared, acceleration_of, collider_state
+from ..step.balance import UNBALANCED_FRICTION, contact_of_step, friction_left_over, potential_of_step
+from ..step.contact import outcomes
+from ..step.predict import begin
+
+CUT = 0.01  # share of the motion that bounds may cut before a rollout warns
+WARNED = "warned_of_contact"  # of a Model's _derived: unasked, one warning is enough for all of its rollouts
+LEAST_STEPS = 10  # of a rollout that is looked at unasked: the look costs about as much as a step
+
+
+def checks_contact(asked: bool | None, model: Model, x: Tensor, steps: int) -> bool:
+    """Whether a rollout of so many steps ends with a look at its contact. A look reads values: never in what is
+    compiled, transformed or captured, and on CUDA, where it waits for the device, only where it is asked for."""
+    if asked is False or not model.touches or steps == 0 or x.numel() == 0 or torch.compiler.is_compiling():
+        return False
+    if torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore[reportAttributeAccessIssue]
+        return False
+    if asked:
+        return not (x.is_cuda and torch.cuda.is_current_stream_capturing())
+    return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and WARNED not in model._derived
+
+
+def cut_share(model: Model) -> float:
+    """Share of the motion of the Model's latest step that bounds have cut [-], of the worst scene.
+
+    Bounds say which vertices they cut and not by how much: it is the share of these.
+    """
+    outcome = outcomes.get(model)
+    if outcome is None or not outcome.cut or model.num_active == 0:
+        return 0.0
+    return float(torch.stack(outcome.cut).amax(0).sum(-1).max()) / model.num_active
+
+
+def unbalanced_friction(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
+                        given: dict[str, Any]) -> float:  # fmt: skip
+    """The largest share of the friction on a body that a step left unbalanced [-]; 0 where it cannot be told.
+
+    Args:
+        before: State (x, v) before the step.  x: Positions after it.  given: Its other arguments, as of advance().
+    """
+    if model.friction is None:
+        return 0.0
+    with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+        x0, v0, x = (t.detach() for t in (*before, x))
+        begun = begin(model, x0, v0, prepared, given["force"], acceleration_of(given["gravity"], x0),
+                      given["prescribed"]).detached()  # fmt: skip
+        where = collider_state(model, x0, given["colliders"], given.get("colliders_before"))
+        end = x.reshape(begun.y.shape)
+        end = end if begun.origin is None else end - begun.origin
+        try:
+            contact = contact_of_step(model, begun, prepared, where)
+            return float(friction_left_over(potential_of_step(model, end, begun, prepared, contact)).max())
+        except ValueError:  # a state that is lost; the next step says why
+            return 0.0
+
+
+def warn_of_contact(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared, given: dict[str, Any]
+                    ) -> None:  # fmt: skip
+    """Warns (UserWarning) of the step that a rollout ended with; the caller's caller is shown. Arguments as above."""
+    cut = cut_share(model)
+    left = unbalanced_friction(model, before, x, prepared, given)
+    if cut > CUT or left > UNBALANCED_FRICTION:
+        model._derived[WARNED] = True
+    if cut > CUT:
+        warnings.warn(
+            f"pair_barrier: bounds cut {100 * cut:.2g} % of the motion in the last step, which is lost as velocity; "
+            "take a smaller time_step, more detections, or a larger reach or dhat of the PairBarrier (docs/contact.md)",
+            UserWarning,
+            stacklevel=3,
+        )
+    if left > UNBALANCED_FRICTION:
+        warnings.warn(
+            f"friction: {100 * left:.2g} % of it is not balanced in the last step: the sweeps have not converged; take "
+            "more sweeps, a smaller time_step or a larger Friction(velocity=) (docs/contact.md)",
+            UserWarning,
+            stacklevel=3,
+        )

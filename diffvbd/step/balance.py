@@ -1,0 +1,94 @@
+"""What a step leaves unbalanced: the residual of the potential that it executed, contact included."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ..adjoint.contact_potential import ContactPotential, StepContact
+from ..adjoint.potential import IncrementalPotential
+from ..model.model import Model
+from .arguments import Prepared
+from .predict import Begun
+
+ROUNDINGS = 0.25  # of block times position, below which a residual counts as zero: sweeps stall at 0.03 to 0.08, a
+# corrected start in free fall at 0.15
+UNBALANCED_FRICTION = 0.05  # share of friction; a grip with 0.55 bore 3.5 times its load, converged ones have 1e-6
+LEAST_FRICTION = 0.01  # of the normal forces, to which friction is compared where it is less: what rests needs none
+
+Norm = Callable[[Tensor], Tensor]  # [B, V, n] -> [B, groups]
+
+
+def contact_of_step(
+    model: Model, begun: Begun, prepared: Prepared, where: tuple[Tensor, Tensor] | None
+) -> StepContact | None:
+    """Contact of a step that has begun; where: collider points at its start and at its end, None without contact."""
+    if where is None:
+        return None
+    before, colliders = where
+    return StepContact(model, begun.data, prepared.parameters, colliders, before, begun.x_prev, begun.origin,
+                       prepared.settings.numbers.time_step)  # fmt: skip
+
+
+def potential_of_step(
+    model: Model, x: Tensor, begun: Begun, prepared: Prepared, contact: StepContact | None
+) -> IncrementalPotential:
+    """The potential of a step that has begun, at x [B, V, 3], relative to the step's origin where there is one."""
+    fields = begun.fields(model, prepared)
+    if contact is None:
+        return IncrementalPotential(model, x, fields, prepared.settings.numbers.time_step)
+    return ContactPotential(model, x, fields, contact)
+
+
+def of_scenes(values: Tensor) -> Tensor:
+    """2-norms over a scene, [B, V, n] -> [B, 1]."""
+    return values.square().sum((-2, -1)).sqrt()[:, None]
+
+
+def of_bodies(model: Model) -> Norm:
+    """2-norms over each body, [B, V, n] -> [B, bodies], bodies as in ``model.body``."""
+    labels = model.derived("labels", lambda: model.body)
+    count = model.derived("labelled", lambda: int(labels.max()) + 1 if labels.numel() else 0)
+
+    def norm(values: Tensor) -> Tensor:
+        squares = values.square().sum(-1)
+        return squares.new_zeros(len(squares), count).index_add(1, labels, squares).sqrt()
+
+    return norm
+
+
+def left_over(at: IncrementalPotential, norm: Norm) -> tuple[Tensor, Tensor]:
+    """What is not balanced, |M (x - y) + h^2 dE/dx|, and what it is a part of, |M (x - y)| + |h^2 dE/dx| [kg m], over
+    the vertices that are not pinned; both [B, groups]."""
+    inertia, forces = at.free * at.inertia(), at.free * at.forces()
+    return norm(inertia + forces), norm(inertia) + norm(forces)
+
+
+def rounding(at: IncrementalPotential, norm: Norm, eps: float | None = None) -> Tensor:
+    """What rounding alone may leave of it [kg m], [B, groups]: a block times what rounds a position."""
+    eps = torch.finfo(at.x.dtype).eps if eps is None else eps
+    return ROUNDINGS * eps * at.x.abs().amax((-2, -1))[:, None] * norm(at.free * at.stiffness())
+
+
+def share(part: Tensor, whole: Tensor) -> Tensor:
+    """part / whole, 0 where there is no whole."""
+    return part / torch.where(whole > 0, whole, torch.ones_like(whole))
+
+
+def friction_left_over(at: IncrementalPotential) -> Tensor:
+    """Share of the friction on each body that the step left unbalanced [-], [B, bodies]; 0 where there is none.
+
+    The left-over force across the contact, over the friction forces; both over the vertices on which friction acts.
+    """
+    norm = of_bodies(at.model)
+    if not isinstance(at, ContactPotential):
+        return torch.zeros_like(norm(at.x))
+    normal, friction = at.contact.on_vertices()
+    acts = ((friction != 0).any(-1, keepdim=True) * at.free).double()
+    left = acts * (at.inertia() + at.forces()).double() / at.h**2
+    size = normal.square().sum(-1, keepdim=True)
+    along = (left * normal).sum(-1, keepdim=True) / torch.where(size > 0, size, torch.ones_like(size))
+    least = LEAST_FRICTION * norm(acts * normal)
+    return share(norm(left - along * normal), torch.maximum(norm(acts * friction), least))

@@ -1,0 +1,242 @@
+"""Claim: `dv.contact.forces` are the forces that the executed step felt, and at rest they carry the weight."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd.mesh import box, join
+from diffvbd.testing import contact_scenes, relative_error, tolerance
+
+GRAVITY = 9.81  # [m/s^2]
+SOFT: dict[str, Any] = {"mu": 2e4, "lam": 2e4}
+
+
+def per_body(model: dv.Model, values: Tensor) -> Tensor:
+    """Sums of vertex values [..., V, 3] over each body, [..., bodies, 3]."""
+    count = int(model.body.max()) + 1
+    shape = (*values.shape[:-2], count, values.shape[-1])
+    return values.new_zeros(shape).index_add(-2, model.body, values)
+
+
+def stack(support: str, *more: Any, device: str = "cpu") -> dv.Model:
+    """A small box on a larger one, on a floor or on the plane of a collider."""
+    energies = [dv.StableNeoHookean(), dv.PairBarrier(2e3, 0.02, self_contact=False, detections=1, reach=0.2), *more]
+    things = [dv.colliders.Plane((0, -0.015, 0))] if support == "plane" else []
+    if support == "floor":
+        energies.append(dv.FloorBarrier(height=-0.015, kappa=2e3, dhat=0.02))
+    blocks = join([box(2, 0.2), box(2, 0.1).translate((0.06, 0.215, 0.04))])
+    return dv.Model(blocks, density=500.0, energies=energies, colliders=things, device=device)
+
+
+def resting(support: str, device: str) -> dv.Model:
+    """A box on a floor, a collider's plane, or one large triangle of a pinned body: every normal is y."""
+    barrier: Any = dv.PairBarrier(2e3, 0.05, self_contact=False, detections=1, reach=0.4)
+    body, things, pinned = box(2, (0.2, 0.1, 0.2)), (), []
+    if support == "floor":
+        barrier = dv.FloorBarrier(height=-0.025, kappa=2e3, dhat=0.05)
+    elif support == "plane":
+        things = (dv.colliders.Plane((0.0, -0.025, 0.0)),)
+    else:
+        body, pinned = join([body, box(2, (6.0, 1.0, 6.0)).translate((-4.5, -1.025, -1.5))]), list(range(8, 16))
+    return dv.Model(body, density=500.0, pinned=pinned, energies=(dv.StableNeoHookean(), barrier), colliders=things,
+                    device=device)  # fmt: skip
+
+
+def settled(model: dv.Model) -> Tensor:
+    """Where bodies rest: steps from rest, until nothing moves but by rounding."""
+    x = model.rest_points
+    for _ in range(60):
+        x, _ = dv.step(model, x, 0 * x, time_step=0.05, sweeps=500, **SOFT)
+    return x
+
+
+@pytest.mark.parametrize("support", ("floor", "plane", "body"))
+def test_at_rest_forces_carry_the_weight(device: str, support: str) -> None:
+    model = resting(support, device)
+    x = settled(model)
+    found = dv.contact.forces(model, x)
+    weight = float(model.mass[:8].sum()) * GRAVITY
+    up = x.new_tensor([0.0, weight, 0.0])
+    least = tolerance("closed_form") * weight
+    ground = {"floor": found.floors, "plane": found.colliders, "body": found.between}[support]
+    assert ground.normal.shape == {"floor": (1, 1, 3), "plane": (1, 1, 3), "body": (1, 3)}[support]
+    assert float((ground.total.reshape(3) - up).abs().max()) <= least
+    assert float((per_body(model, found.vertices.total)[0] - up).abs().max()) <= least
+    assert not found.vertices.tangential.any()  # at rest, and no step is known
+    if support == "body":
+        assert found.body_pairs.tolist() == [[0, 1]]
+        borne = dv.reactions(model, x, gravity=(0.0, 0.0, 0.0), **SOFT)
+        assert not borne[:8].any() and float((borne.sum(0) - up).abs().max()) <= least
+
+
+def run(scene: contact_scenes.Scene, sweeps: int, model: dv.Model | None = None) -> tuple[dv.Model, dict[str, Any]]:
+    """A Model and a step of it, as `dv.contact.forces` takes it; beside it the velocity after the step."""
+    model = scene.model if model is None else model
+    given = {k: v.to(model.device, model.dtype) for k, v in {**scene.inputs, "x": scene.x, "v": scene.v}.items()}
+    parameters = {k: v.to(model.device, model.dtype) for k, v in scene.parameters.items()}
+    x, v = given.pop("x"), given.pop("v")
+    end, speed = dv.step(model, x, v, time_step=scene.time_step, sweeps=sweeps, gravity=contact_scenes.GRAVITY,
+                         parameters=parameters, **given)  # fmt: skip
+    places = {k: given[k] for k in ("colliders", "colliders_before") if k in given}
+    return model, {"x": end, "speed": speed, "previous": (x, v), "time_step": scene.time_step,
+                   "parameters": parameters, **places}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", contact_scenes.SCENES)
+def test_sums_over_bodies_colliders_and_planes_are_those_over_vertices(name: str) -> None:
+    model, options = run(contact_scenes.SCENES[name](), 5)
+    options.pop("speed")
+    found = dv.contact.forces(model, **options)
+    for part in range(2):
+        on_bodies = per_body(model, found.vertices[part])
+        total = found.floors[part].sum(-2) + found.colliders[part].sum(-2)
+        for column, (a, b) in enumerate(found.body_pairs.tolist()):
+            total[..., a, :] += found.between[part][..., column, :]
+            total[..., b, :] -= found.between[part][..., column, :]
+        size = float(found.vertices[part].abs().sum())
+        assert float((on_bodies - total).abs().max()) <= tolerance("formula") * size
+        assert size > 0 or (name in ("folded", "fast") and part == 1)  # without friction, or not near at the start
+
+
+@pytest.mark.parametrize("scene", ("floor", "plane"))
+def test_a_converged_step_is_newtons_second_law(device: str, scene: str) -> None:
+    """Contact, weight and the change of momentum of each body, with friction and damping of a sliding stack."""
+    model = stack(scene, dv.Friction(0.3, 0.05), device=device)
+    x, h = model.rest_points, 0.005
+    v = torch.zeros_like(x)
+    v[:8, 0], v[8:, 2] = 0.2, 0.1
+    parameters = {"pair_barrier.damping": torch.tensor(5.0, dtype=x.dtype, device=device)}
+    done = dv.solve(model, x, v, time_step=h, tolerance=1e-12, parameters=parameters, **SOFT)
+    assert dv.contact.status(model).cut == [0]
+    found = dv.contact.forces(model, done.x, previous=(x, v), time_step=h, parameters=parameters)
+    mass = model.mass[:, None]
+    gained = per_body(model, mass * (done.v - v)) / h + per_body(model, mass) * mass.new_tensor([0.0, GRAVITY, 0.0])
+    on_bodies = per_body(model, found.vertices.total)
+    assert relative_error(on_bodies, gained) <= tolerance("closed_form")
+    ground = (found.floors if scene == "floor" else found.colliders).tangential[0, 0]
+    rubbed = found.between.tangential[0]
+    assert ground[0] < -0.1 and rubbed[0] < -0.1 and rubbed[2] > 0.1  # against the motion
+
+
+def test_without_friction_forces_are_minus_the_gradient_of_the_barrier() -> None:
+    """By the reference's formulas, from the pairs that a step recorded."""
+    from diffvbd.reference.distance import distance, log_barrier, mollifier
+
+    scene = contact_scenes.folded()
+    with dv.contact.record() as listed:
+        dv.step(scene.model, scene.x, 0 * scene.x, mu=1.0, lam=1.0, time_step=1e-6, sweeps=0)
+    part = contact_scenes.part_of(listed[0])
+    x = scene.x.clone().requires_grad_()
+    corners, kind, (dhat, offset, threshold) = x[part.pairs[:, :4]], part.pairs[:, 4], part.constants.unbind(1)
+    b, _, _ = log_barrier(distance(kind, corners) - offset, x.new_tensor(scene.model.contact.kappa), dhat)
+    (slope,) = torch.autograd.grad((mollifier(kind, corners, threshold) * b).sum(), x)
+    found = dv.contact.forces(scene.model, scene.x)
+    assert slope.any() and relative_error(found.vertices.normal, -slope) <= tolerance("geometry")
+
+
+@pytest.mark.parametrize("name", ("stacked", "crossed", "obstacles", "batched"))
+def test_gradients_agree_with_differences(name: str) -> None:
+    scene = contact_scenes.SCENES[name]()
+    model, options = run(scene, 5)
+    options.pop("speed")
+    x, (before, v), parameters = options.pop("x"), options.pop("previous"), options.pop("parameters")
+    h = options.pop("time_step")
+    known = [k for k in parameters if k != "floor_barrier.height"]
+    arguments = {"x": x, "before": before, **options, **{k: parameters[k] for k in known}}
+
+    def loss(**given: Any) -> Tensor:
+        named = {k: given.pop(k) for k in known}
+        at, start = given.pop("x"), given.pop("before")
+        found = dv.contact.forces(model, at, previous=(start, v), time_step=h, parameters=named, **given)
+        out = x.new_zeros(())
+        for part in (found.vertices, found.between, found.colliders, found.floors):
+            for number, values in enumerate(part):
+                weights = contact_scenes.noise("weights", number, shape=values.shape, size=1.0)
+                out = out + (weights * values).sum() / 100
+        return out
+
+    check = dv.check_gradients(loss, arguments, verbose=False)
+    assert check.ok, str(check)
+    damped = name in ("stacked", "obstacles")  # in the others no pair that was near at the start comes closer
+    zero = [argument for argument, size, *_ in check.rows if size == 0]
+    assert zero == ([] if damped else ["pair_barrier.damping"]), str(check)
+
+
+def test_scenes_of_a_batch_are_as_if_alone(device: str) -> None:
+    scene = contact_scenes.batched()
+    model, options = run(scene, 5, scene.model.to(device))
+    options.pop("speed")
+    found = dv.contact.forces(model, **options)
+    for k in range(3):
+        own_parameters = {n: p[k] if p.shape[:1] == (3,) else p for n, p in options["parameters"].items()}
+        alone = {
+            "x": options["x"][k],
+            "previous": tuple(t[k] for t in options["previous"]),
+            "parameters": own_parameters,
+        }
+        own = dv.contact.forces(model, time_step=scene.time_step, **alone)
+        assert own.body_pairs.tolist() == found.body_pairs.tolist() == [[0, 1]]
+        for name in ("vertices", "between", "colliders", "floors"):
+            for a, b in zip(getattr(found, name), getattr(own, name), strict=True):
+                assert relative_error(a[k], b) <= tolerance("formula"), name
+    empty = dv.contact.forces(model, options["x"][:0])
+    assert empty.vertices.normal.shape == (0, 16, 3) and empty.floors.normal.shape == (0, 2, 1, 3)
+
+
+def test_float32_is_float64_rounded(device: str) -> None:
+    scene = contact_scenes.stacked()
+    double, options = run(scene, 5)
+    single = scene.model.to(device, torch.float32)
+    narrow = {k: v.float().to(device) for k, v in options["parameters"].items()}
+    x, previous = options["x"].float().to(device), tuple(t.float().to(device) for t in options["previous"])
+    found = dv.contact.forces(single, x, previous=previous, time_step=scene.time_step, parameters=narrow)
+    options = {"previous": tuple(t.double().cpu() for t in previous), "time_step": scene.time_step,
+               "parameters": {k: v.double().cpu() for k, v in narrow.items()}}  # fmt: skip
+    expected = dv.contact.forces(double, x.double().cpu(), **options)
+    for part in range(2):
+        assert found.vertices[part].dtype == torch.float32
+        assert relative_error(found.vertices[part].cpu().double(), expected.vertices[part]) <= tolerance(
+            "float32_forward"
+        )
+
+
+def test_a_floor_alone_and_a_model_without_contact() -> None:
+    floor = dv.Model(box(2, 0.2), pinned=[0], energies=(dv.StableNeoHookean(), dv.FloorBarrier(height=-0.01)))
+    found = dv.contact.forces(floor, floor.rest_points)
+    assert torch.equal(found.vertices.total.sum(0), found.floors.total[0, 0]) and found.floors.normal[0, 0, 1] > 0
+    assert not found.vertices.total[0].any()  # a plane does not act where a vertex is pinned
+    free = dv.Model(box(2, 0.2))
+    assert not dv.contact.forces(free, free.rest_points).vertices.total.any()
+
+
+def test_more_pairs_than_a_step_has_room_for() -> None:
+    scene = contact_scenes.folded()
+    tight = dv.Model(scene.model.mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier(5e3, 0.03, capacity=3)))
+    expected = dv.contact.forces(scene.model, scene.x)
+    assert torch.equal(dv.contact.forces(tight, scene.x).vertices.normal, expected.vertices.normal)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"x": torch.zeros(3, 3).double()}, r"x: expected shape \[..., 16, 3\], got shape \[3, 3\]"),
+        ({"x": torch.zeros(16, 3)}, "x: expected dtype torch.float64"),
+        ({"previous": torch.zeros(16, 3).double()}, "previous: expected positions and velocities"),
+        ({"previous": (torch.zeros(3).double(), torch.zeros(3).double())}, "previous: x: expected shape"),
+        ({"previous": (torch.zeros(2, 16, 3).double(),) * 2, "time_step": 0.1}, "previous: expected x's shape"),
+        ({"previous": (torch.zeros(16, 3).double(),) * 2}, "time_step: expected a number in .s. where previous"),
+        ({"time_step": -1.0}, "time_step: expected"),
+        ({"colliders": torch.zeros(1, 3).double()}, "colliders: expected a Model with colliders"),
+        ({"parameters": {"pair_barrier.kapa": 1.0}}, "parameters: expected names among"),
+        ({"parameters": {"pair_barrier.kappa": torch.tensor(-1.0).double()}}, "pair_barrier.kappa: expected finite"),
+        ({"x": torch.full((16, 3), torch.nan).double()}, "x: expected finite positions"),
+        ({"x": torch.zeros(16, 3).double()}, "x: expected surfaces that do not touch, got .* pairs without a gap"),
+    ],
+)
+def test_bad_input(change: dict[str, Any], message: str) -> None:
+    model = stack("floor", dv.Friction(0.3))
+    with pytest.raises((ValueError, TypeError), match=message):
+        dv.contact.forces(model, **({"x": model.rest_points} | change))

@@ -1,0 +1,89 @@
+"""Claim: a rollout warns once of motion that bounds cut and of friction that has not converged, and says what helps."""
+
+import warnings
+from typing import Any
+
+import pytest
+import torch
+from helpers.two_boxes import two_boxes
+
+import diffvbd as dv
+from diffvbd.mesh import box
+from diffvbd.rollout import contact_check
+
+FAST: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "time_step": 0.002, "sweeps": 3}
+
+
+def thrown() -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
+    """Two boxes that meet at speed."""
+    model = two_boxes(detections=1)
+    v = torch.zeros_like(model.rest_points)
+    v[8:, 1] = -8.0
+    return model, model.rest_points, v
+
+
+def sliding(**friction: float) -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
+    floor = dv.FloorBarrier(height=-0.01, kappa=2e3)
+    model = dv.Model(box(3, 0.2), energies=(dv.StableNeoHookean(), floor, dv.Friction(**friction)))
+    v = torch.zeros_like(model.rest_points)
+    v[:, 0] = 1e-3
+    return model, model.rest_points, v
+
+
+def messages(run: Any) -> list[str]:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        run()
+    return [str(w.message) for w in found]
+
+
+def test_motion_that_bounds_cut_is_warned_of() -> None:
+    model, x, v = thrown()
+    with pytest.warns(UserWarning, match=r"pair_barrier: bounds cut .* larger reach") as found:
+        dv.rollout(model, x, v, steps=1, check_contact=True, **FAST)
+    assert found[0].filename == __file__
+    assert sum("bounds cut" in str(w.message) for w in found) == 1
+    assert contact_check.cut_share(model) > contact_check.CUT
+
+
+def test_friction_that_has_not_converged_is_warned_of() -> None:
+    model, x, v = sliding(coefficient=0.5, velocity=1e-4)
+    stiff: dict[str, Any] = {"mu": 1e5, "lam": 2e5, "time_step": 0.01}
+    with pytest.warns(UserWarning, match=r"friction: .* not balanced .*more sweeps, a smaller time_step") as found:
+        dv.rollout(model, x, v, steps=10, sweeps=1, **stiff)
+    assert len(found) == 1 and found[0].filename == __file__
+    assert not messages(lambda: dv.rollout(model, x, v, steps=10, sweeps=1, **stiff))  # once is enough, unasked
+    assert messages(lambda: dv.rollout(model, x, v, steps=10, sweeps=1, check_contact=True, **stiff))
+    soft, x, v = sliding(coefficient=0.5, velocity=0.1)
+    assert not messages(lambda: dv.rollout(soft, x, v, steps=10, sweeps=400, **stiff))
+
+
+def test_it_is_said_once_by_any_schedule_and_changes_nothing() -> None:
+    model, x, v = thrown()
+    ends = []
+    for every in (None, 3, dv.BinomialCheckpoints(2)):
+        for check in (True, False):
+            start = v.clone().requires_grad_()
+
+            def run(start: torch.Tensor = start, every: Any = every, check: bool = check) -> None:
+                end = dv.rollout(model, x, start, steps=5, checkpoint_every=every, check_contact=check, **FAST)
+                ends.append((end.x[-1].detach(), torch.autograd.grad(end.x[-1].square().sum(), start)[0]))
+
+            assert sum("bounds cut" in text for text in messages(run)) == int(check)
+    for end, slope in ends[1:]:
+        assert torch.equal(end, ends[0][0]) and torch.equal(slope, ends[0][1]) and slope.any()
+
+
+@pytest.mark.parametrize(("asked", "steps", "looks"), [(None, 9, False), (None, 10, True), (True, 1, True),
+                                                       (True, 0, False), (False, 50, False)])  # fmt: skip
+def test_when_it_is_looked_at(asked: bool | None, steps: int, looks: bool) -> None:
+    model, x, _ = thrown()
+    assert contact_check.checks_contact(asked, model, x, steps) == looks
+    assert not contact_check.checks_contact(asked, dv.Model(box(2, 0.2)), x[:8], steps)
+    assert not contact_check.checks_contact(asked, model, x[None][:0], steps)
+
+
+def test_bad_input() -> None:
+    model, x, v = thrown()
+    with pytest.raises(TypeError, match="check_contact: expected a bool or None, got str"):
+        dv.rollout(model, x, v, steps=1, check_contact="yes", **FAST)  # pyright: ignore[reportArgumentType]
