@@ -16,8 +16,8 @@ from ..contact.start import start_part
 from ..contact.surface import LEAST_CAPACITY
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
-from ..reference.intersections import intersections
 from ..scopes import checking, recorders
+from .intersections import refuse_intersections
 
 if TYPE_CHECKING:
     from .arguments import Prepared
@@ -38,12 +38,6 @@ class Detection(NamedTuple):
     smallest: Tensor
     island: Tensor
     lowest: Tensor  # of a Model with a floor, else empty
-
-    def trimmed(self) -> Detection:
-        """Without the rows that no pair fills; reads the count."""
-        n, (pairs, constants, ptr, entry) = int(self.counts[0]), self.listed
-        listed = Pairs(pairs[:n].clone(), constants[:n].clone(), ptr, entry[: 4 * n].clone())
-        return self._replace(listed=listed)
 
 
 class Outcome(NamedTuple):
@@ -135,7 +129,7 @@ class ContactStep:
             none = no_pairs(x, x.shape[0] * x.shape[1])
             return self._sweep(x, bounds, self.colliders, none, settings, policy, debug_step)[0]
         if checking():
-            self._look_for_intersections()
+            refuse_intersections(self.model, self.x_prev, self.origin, self.before)
         x, way = self.x_prev, begun.y - self.x_prev
         move = way
         cut: list[Tensor] = []
@@ -150,7 +144,6 @@ class ContactStep:
             if not x.is_cuda and not torch.compiler.is_compiling():  # reading is free: before any work
                 self._record(found, counts, cut)
                 self._check(r, counts[-1].tolist())
-                detection = found[-1] = detection.trimmed()
             if r == 0:
                 self._set_lag(detection.listed, was)
             start = start_part(x, move, goal, self.fields.mass, was, now, self.floor_data, self.origin, detection,
@@ -162,25 +155,6 @@ class ContactStep:
                 x, held_back = self._sweep(x, start.bounds, now, detection.listed, part, policy, debug_step)
                 cut.append(held_back)
         return self._judged(x, found, counts, cut)
-
-    def _look_for_intersections(self) -> None:
-        """Distances do not show that surfaces pass through each other: debug_checks() compares edges with triangles."""
-        surface = self.surface
-        assert surface is not None
-        absolute = self.x_prev if self.origin.numel() == 0 else self.x_prev + self.origin
-        points = torch.cat([absolute, self.before], 1).detach().double().cpu()
-        triangles, edges = surface.triangles.cpu(), surface.edges.cpu()
-        for scene, at in enumerate(points):
-            if not bool(torch.isfinite(at).all()):
-                continue  # named elsewhere
-            found = intersections(at, triangles, edges)
-            if len(found):
-                edge, triangle = found[0].tolist()
-                raise ValueError(
-                    f"x: expected surfaces that do not intersect, got {len(found)} edges through triangles, one of the "
-                    f"corner points {surface.edges[edge].tolist()} and {surface.triangles[triangle].tolist()} in scene "
-                    f"{scene}"
-                )
 
     def _colliders_at(self, share: float) -> Tensor:
         if self.colliders is self.before:
