@@ -15,16 +15,22 @@ struct Intersections {
   int32_t* first;   // [B, 2, 2]  the first edge and its triangle, the first point and its plane
 };
 
-// Six times the volume of a tetrahedron is off by less than this times the sizes of its terms (Shewchuk 1997).
+// A determinant of differences is off by less than this times the sizes of its terms (Shewchuk 1997).
 constexpr double kVolumeError = (7 + 56 * 0x1p-53) * 0x1p-53;
 
-// Sign of det [a - d, b - d, c - d], or 0 where rounding could change it: positive where d sees a, b, c clockwise.
-DIFFVBD_FN int side(const Vec3<double>& a, const Vec3<double>& b, const Vec3<double>& c, const Vec3<double>& d) {
-  const Vec3<double> u = a - d, v = b - d, w = c - d;
-  const auto term = [](double f, double p, double q) { return absolute(f) * (absolute(p) + absolute(q)); };
-  const double uv = u.x * v.y, vu = v.x * u.y, vw = v.x * w.y, wv = w.x * v.y, wu = w.x * u.y, uw = u.x * w.y;
-  const double volume = w.z * (uv - vu) + u.z * (vw - wv) + v.z * (wu - uw);
-  const double bound = kVolumeError * (term(w.z, uv, vu) + term(u.z, vw, wv) + term(v.z, wu, uw));
+// u x v, and the sizes of its terms.
+struct Normal {
+  Vec3<double> n, size;
+};
+DIFFVBD_FN Normal normal_of(const Vec3<double>& u, const Vec3<double>& v) {
+  const double yz = u.y * v.z, zy = u.z * v.y, zx = u.z * v.x, xz = u.x * v.z, xy = u.x * v.y, yx = u.y * v.x;
+  return {{yz - zy, zx - xz, xy - yx},
+          {absolute(yz) + absolute(zy), absolute(zx) + absolute(xz), absolute(xy) + absolute(yx)}};
+}
+// Sign of (u x v) . w, all three differences of positions, or 0 where rounding could change it.
+DIFFVBD_FN int side(const Normal& uv, const Vec3<double>& w) {
+  const double volume = dot(uv.n, w);
+  const double bound = kVolumeError * dot(uv.size, Vec3<double>{absolute(w.x), absolute(w.y), absolute(w.z)});
   return bound < volume ? 1 : volume < -bound ? -1 : 0;
 }
 
@@ -33,14 +39,16 @@ DIFFVBD_FN int side(const Vec3<double>& a, const Vec3<double>& b, const Vec3<dou
 // slips through between them.
 DIFFVBD_FN bool crosses(const Vec3<double>& p, const Vec3<double>& q, const Vec3<double>& a, const Vec3<double>& b,
                         const Vec3<double>& c) {
-  // Without this, what cannot be told of a degenerate triangle would count as a crossing far away.
+  const Normal plane = normal_of(b - a, c - a);
+  if (side(plane, p - a) * side(plane, q - a) >= 0) return false;
+  // Else what cannot be told of a degenerate triangle would count as a crossing far away.
   const auto apart = [](double p, double q, double a, double b, double c) {
     const double lo = p < q ? p : q, hi = p < q ? q : p;
     return (hi < a && hi < b && hi < c) || (a < lo && b < lo && c < lo);
   };
   if (apart(p.x, q.x, a.x, b.x, c.x) || apart(p.y, q.y, a.y, b.y, c.y) || apart(p.z, q.z, a.z, b.z, c.z)) return false;
-  if (side(a, b, c, p) * side(a, b, c, q) >= 0) return false;
-  const int ab = side(p, q, a, b), bc = side(p, q, b, c), ca = side(p, q, c, a);
+  const Vec3<double> pq = q - p, pa = a - p, pb = b - p, pc = c - p;
+  const int ab = side(normal_of(pa, pb), pq), bc = side(normal_of(pb, pc), pq), ca = side(normal_of(pc, pa), pq);
   return (ab >= 0 && bc >= 0 && ca >= 0) || (ab <= 0 && bc <= 0 && ca <= 0);
 }
 
@@ -64,13 +72,16 @@ DIFFVBD_COLD bool is_one_place(const Surfaces<T>& in, const int32_t* e, const in
   return false;
 }
 
-// Whether an edge passes through a triangle that contact should keep it from.
+template <class T>
+DIFFVBD_FN bool shares_vertex(const Surfaces<T>& in, int32_t edge, int32_t triangle) {
+  const int32_t *e = in.edges + int64_t{2} * edge, *t = in.triangles + int64_t{3} * triangle;
+  return t[0] == e[0] || t[0] == e[1] || t[1] == e[0] || t[1] == e[1] || t[2] == e[0] || t[2] == e[1];
+}
+
+// Whether an edge passes through a triangle, with which it shares no vertex, and contact should keep it from that.
 template <class T>
 DIFFVBD_FN bool is_crossing(const Surfaces<T>& in, int64_t scene, int32_t edge, int32_t triangle) {
   const int32_t *e = in.edges + int64_t{2} * edge, *t = in.triangles + int64_t{3} * triangle;
-  for (int k = 0; k < 3; ++k) {
-    if (t[k] == e[0] || t[k] == e[1]) return false;
-  }
   if (in.held[e[0]] && in.held[e[1]] && in.held[t[0]] && in.held[t[1]] && in.held[t[2]]) return false;
   if (in.ignores(in.group(e[0]), in.group(t[0]))) return false;
   return crosses(position(in, scene, e[0]), position(in, scene, e[1]), position(in, scene, t[0]),
@@ -82,8 +93,9 @@ DIFFVBD_FN bool is_crossing(const Surfaces<T>& in, int64_t scene, int32_t edge, 
 template <class T>
 DIFFVBD_FN bool is_behind(const Surfaces<T>& in, int64_t scene, int32_t point, int32_t plane) {
   const int32_t i = in.points[point], *t = in.planes + int64_t{3} * plane;
-  return !in.held[i] && side(position(in, scene, t[0]), position(in, scene, t[1]), position(in, scene, t[2]),
-                             position(in, scene, i)) > 0;
+  if (in.held[i]) return false;
+  const Vec3<double> a = position(in, scene, t[0]);
+  return side(normal_of(position(in, scene, t[1]) - a, position(in, scene, t[2]) - a), position(in, scene, i) - a) < 0;
 }
 
 // Keys of crossings in the order of the list; those of all scenes are below crossing_keys().

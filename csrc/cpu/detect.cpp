@@ -86,10 +86,10 @@ class SceneDetection {
 
  private:
   void build_trees() {
-    const Place<T> reference = reference_point(in_, scene_);
-    triangles_.fill(in_, scene_, reference, in_.triangles, in_.num_triangles, 3);
-    edges_.fill(in_, scene_, reference, in_.edges, in_.num_edges, 2);
-    points_.fill(in_, scene_, reference, in_.points, in_.num_points, 1);
+    fill_corner_boxes(in_, scene_, corner_boxes_);
+    triangles_.fill(in_, corner_boxes_, in_.triangles, in_.num_triangles, 3);
+    edges_.fill(in_, corner_boxes_, in_.edges, in_.num_edges, 2);
+    points_.fill(in_, corner_boxes_, in_.points, in_.num_points, 1);
     Box bounds = empty_box();
     for (const Tree* tree : {&triangles_, &edges_, &points_}) {
       for (const Box& box : tree->boxes) bounds = hull(bounds, box);
@@ -104,8 +104,10 @@ class SceneDetection {
     const Box &around = tree.nodes[home], *nodes = others.nodes.data();
     met.clear();
     if (!is_empty(around)) {
-      const auto skips = [&](int32_t group) { return in_.ignores(around.group, group); };
-      each_leaf(nodes, others.leaves, kind == kEdgeEdge ? home : kRoot, kRoot, around, reach2_, skips, [&](int32_t i) {
+      const auto hits = [&](const Box& node) {
+        return distance2(node, around) <= reach2_ && !in_.ignores(around.group, node.group);
+      };
+      each_leaf(nodes, others.leaves, kind == kEdgeEdge ? home : kRoot, kRoot, hits, [&](int32_t i) {
         met.push_back({nodes[i], i});
         return true;
       });
@@ -188,6 +190,7 @@ class SceneDetection {
 
   const Surfaces<T>& in_;
   int64_t scene_ = 0;
+  std::vector<Box> corner_boxes_;
   Tree triangles_, edges_, points_;
   std::vector<Near<T>> near_;
   std::vector<Finds<T>> finds_;

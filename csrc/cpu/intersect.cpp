@@ -7,6 +7,61 @@ namespace {
 
 using namespace contact;
 
+// Triangles near a group of edges, one number of all of them after the other: four at a time are compared with an edge.
+class Met {
+ public:
+  void clear() {
+    for (auto& side : sides_) side.clear();
+    for (auto& corner : corners_) corner.clear();
+    items_.clear();
+  }
+  void add(const Box& box, const int32_t* corners) {
+    const float sides[] = {box.lo.x, box.lo.y, box.lo.z, box.hi.x, box.hi.y, box.hi.z};
+    for (int k = 0; k < 6; ++k) sides_[k].push_back(sides[k]);
+    for (int k = 0; k < 3; ++k) corners_[k].push_back(corners[k]);
+    items_.push_back(box.item);
+  }
+  // Up to a whole number of fours.
+  void fill_up() {
+    const int32_t none[] = {-1, -1, -1};
+    while (items_.size() % kLanes != 0) add(empty_box(), none);
+  }
+  // visit(triangle) for those whose boxes overlap that of an edge with which they share no vertex.
+  template <class Visit>
+  void each_near(const Box& own, const int32_t* ends, const Visit& visit) const {
+    const float lo[] = {own.lo.x, own.lo.y, own.lo.z}, hi[] = {own.hi.x, own.hi.y, own.hi.z};
+    for (size_t i = 0; i < items_.size(); i += kLanes) {
+      Bits out{};
+      for (int k = 0; k < 3; ++k) {
+        out |= (four<Floats>(sides_[k], i) > hi[k]) | (lo[k] > four<Floats>(sides_[3 + k], i));
+        const Bits corner = four<Bits>(corners_[k], i);
+        out |= (corner == ends[0]) | (corner == ends[1]);
+      }
+      const Halves halves = reinterpret_cast<Halves>(out);
+      if ((halves[0] & halves[1]) == -1) continue;
+      for (size_t lane = 0; lane < kLanes; ++lane) {
+        if (out[lane] == 0) visit(items_[i + lane]);
+      }
+    }
+  }
+
+ private:
+  static constexpr size_t kLanes = 4;
+  using Floats = float __attribute__((vector_size(16)));
+  using Bits = int32_t __attribute__((vector_size(16)));
+  using Halves = int64_t __attribute__((vector_size(16)));
+  template <class Four, class Number>
+  static Four four(const std::vector<Number>& from, size_t i) {
+    Four out;
+    __builtin_memcpy(&out, from.data() + i, sizeof out);
+    return out;
+  }
+
+  std::array<std::vector<float>, 6> sides_;
+  std::array<std::vector<int32_t>, 3> corners_;
+  std::vector<int32_t> items_;
+};
+
 // The search in one scene after the other, with the same memory.
 template <class T>
 class SceneIntersections {
@@ -20,7 +75,7 @@ class SceneIntersections {
     const int32_t chunks = (edges_.groups() + each - 1) / each;
     finds_.resize(chunks);
     torch::stable::parallel_for(0, chunks, kSearchGrain, [&](int64_t begin, int64_t end) {
-      std::vector<Box> met;
+      Met met;
       for (int64_t c = begin; c < end; ++c) {
         finds_[c].clear();
         const auto first = static_cast<int32_t>(c) * each;
@@ -46,9 +101,9 @@ class SceneIntersections {
 
  private:
   void build_trees(int64_t scene) {
-    const Place<T> reference = reference_point(in_, scene);
-    triangles_.fill(in_, scene, reference, in_.triangles, in_.num_triangles, 3);
-    edges_.fill(in_, scene, reference, in_.edges, in_.num_edges, 2);
+    fill_corner_boxes(in_, scene, corner_boxes_);
+    triangles_.fill(in_, corner_boxes_, in_.triangles, in_.num_triangles, 3);
+    edges_.fill(in_, corner_boxes_, in_.edges, in_.num_edges, 2);
     Box bounds = empty_box();
     for (const Tree* tree : {&triangles_, &edges_}) {
       for (const Box& box : tree->boxes) bounds = hull(bounds, box);
@@ -57,28 +112,30 @@ class SceneIntersections {
   }
 
   // Crossings of the edges of group g.
-  void search(int64_t scene, int32_t g, std::vector<Box>& met, std::vector<uint64_t>& found) const {
+  void search(int64_t scene, int32_t g, Met& met, std::vector<uint64_t>& found) const {
     const int32_t home = edges_.groups() + g;
     const Box &around = edges_.nodes[home], *nodes = triangles_.nodes.data();
     if (is_empty(around)) return;
     met.clear();
-    const auto skips = [&](int32_t group) { return in_.ignores(around.group, group); };
-    each_leaf(nodes, triangles_.leaves, kRoot, kRoot, around, 0.0F, skips, [&](int32_t i) {
-      met.push_back(nodes[i]);
+    const auto hits = [&](const Box& node) { return overlap(node, around) && !in_.ignores(around.group, node.group); };
+    each_leaf(nodes, triangles_.leaves, kRoot, kRoot, hits, [&](int32_t i) {
+      met.add(nodes[i], in_.triangles + int64_t{3} * nodes[i].item);
       return true;
     });
+    met.fill_up();
     for (int32_t leaf = home * kGroup; leaf < (home + 1) * kGroup; ++leaf) {
       const Box& own = edges_.nodes[leaf];
       if (is_empty(own)) continue;
-      for (const Box& other : met) {
-        if (distance2(other, own) <= 0.0F && is_crossing(in_, scene, own.item, other.item)) {
-          found.push_back(crossing_key(in_, scene, own.item, other.item));
+      met.each_near(own, in_.edges + int64_t{2} * own.item, [&](int32_t triangle) {
+        if (is_crossing(in_, scene, own.item, triangle)) {
+          found.push_back(crossing_key(in_, scene, own.item, triangle));
         }
-      }
+      });
     }
   }
 
   const Surfaces<T>& in_;
+  std::vector<Box> corner_boxes_;
   Tree triangles_, edges_;
   std::vector<std::vector<uint64_t>> finds_;
   std::vector<uint64_t> keys_;

@@ -54,18 +54,28 @@ void for_each(int64_t n, const F& f) {
   });
 }
 
+// Boxes of all corner points of a scene.
+template <class T>
+void fill_corner_boxes(const contact::Surfaces<T>& in, int64_t scene, std::vector<contact::Box>& boxes) {
+  const contact::Place<T> reference = contact::reference_point(in, scene);
+  boxes.resize(in.corners);
+  for_each(in.corners,
+           [&](int64_t i) { boxes[i] = contact::corner_box(in, scene, static_cast<int32_t>(i), reference); });
+}
+
 struct Tree {
   int32_t leaves = kGroup;
   std::vector<contact::Box> boxes, nodes;  // of the primitives in their order, and the tree's
   std::vector<Keyed> codes, scratch;
 
-  // Boxes of `count` primitives with so many corners each.
+  // Boxes of `count` primitives with so many corners each, from those of all corner points.
   template <class T>
-  void fill(const contact::Surfaces<T>& in, int64_t scene, const contact::Place<T>& reference, const int32_t* items,
+  void fill(const contact::Surfaces<T>& in, const std::vector<contact::Box>& corner_boxes, const int32_t* items,
             int64_t count, int corners) {
     boxes.resize(count);
     for_each(count, [&](int64_t i) {
-      boxes[i] = contact::primitive_box(in, scene, items + corners * i, corners, static_cast<int32_t>(i), reference);
+      boxes[i] = contact::primitive_box(in, items + corners * i, corners, static_cast<int32_t>(i),
+                                        [&](int32_t corner) { return corner_boxes[corner]; });
     });
   }
   // `bounds` cover all boxes that are not empty.

@@ -172,8 +172,11 @@ struct Search {
   template <class Visit>
   __device__ void walk(const Query& q, int32_t from, int32_t end, int32_t first, const Visit& visit) const {
     const Box* nodes = work.forest.tree(q.kind, q.scene);
-    const auto skips = [&](int32_t group) { return in.ignores(q.box.group, group); };
-    each_leaf(nodes, work.forest.leaves[q.kind], from, end, q.box, squared_reach(in), skips, [&](int32_t leaf) {
+    const float reach2 = squared_reach(in);
+    const auto hits = [&](const Box& node) {
+      return distance2(node, q.box) <= reach2 && !in.ignores(q.box.group, node.group);
+    };
+    each_leaf(nodes, work.forest.leaves[q.kind], from, end, hits, [&](int32_t leaf) {
       if (leaf < first) return true;
       if (!visit(leaf)) return false;
       examine(candidate(in, q.scene, q.kind, q.box.item, nodes[leaf].item));

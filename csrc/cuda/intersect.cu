@@ -62,10 +62,10 @@ __global__ void intersections_kernel(const Surfaces<T> in, Workspace work, Inter
     const int32_t edge = forest.sorted_items[forest.first(1) + i];
     const Box box = box_of(in, 1, scene, edge, reference_point(in, scene)), *nodes = forest.tree(0, scene);
     if (is_empty(box)) return;
-    const auto skips = [&](int32_t group) { return in.ignores(box.group, group); };
-    each_leaf(nodes, forest.leaves[0], kRoot, kRoot, box, 0.0F, skips, [&](int32_t leaf) {
+    const auto hits = [&](const Box& node) { return overlap(node, box) && !in.ignores(box.group, node.group); };
+    each_leaf(nodes, forest.leaves[0], kRoot, kRoot, hits, [&](int32_t leaf) {
       const int32_t triangle = nodes[leaf].item;
-      if (is_crossing(in, scene, edge, triangle)) {
+      if (!shares_vertex(in, edge, triangle) && is_crossing(in, scene, edge, triangle)) {
         const auto key = static_cast<unsigned long long>(crossing_key(in, scene, edge, triangle));
         atomicAdd(count_of(out, scene, 0), 1ULL);
         lower(&work.first[scene][0], key);

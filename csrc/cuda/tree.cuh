@@ -73,7 +73,8 @@ __device__ __forceinline__ contact::Box box_of(const contact::Surfaces<T>& in, i
                                                const contact::Place<T>& reference) {
   const int corners = kind == 0 ? 3 : kind == 1 ? 2 : 1;
   const int32_t* list = kind == 0 ? in.triangles : kind == 1 ? in.edges : in.points;
-  return contact::primitive_box(in, scene, list + int64_t{corners} * item, corners, item, reference);
+  const auto corner = [&](int32_t i) { return contact::corner_box(in, scene, i, reference); };
+  return contact::primitive_box(in, list + int64_t{corners} * item, corners, item, corner);
 }
 
 // Bounds of the points of each scene. A warp within one scene reduces before it writes.
