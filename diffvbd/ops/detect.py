@@ -87,9 +87,9 @@ def contact_intersections(x: Tensor, origin: Tensor, collider: Tensor, rest: Ten
     An edge crosses a triangle, with which it shares no vertex, when its ends lie on both sides of the plane and it
     meets the closed triangle, border included. Signs are those of ``x + origin`` in double precision: an end that
     rounding could bring to the other side does not count, a border that it could counts as met. What is not finite
-    crosses nothing. Pairs that :func:`contact_detect` does not consider do not count: two colliders, five held corner points,
-    bodies whose contact is off, nor an edge and a triangle of one body with features that are one place at rest.
-    Not differentiable; results repeat to the bit.
+    crosses nothing. Pairs that :func:`contact_detect` does not consider do not count: two colliders, five held corner
+    points, bodies whose contact is off, and an edge and a triangle of one body with features that are one place at
+    rest. Not differentiable; results repeat to the bit.
 
     Args:
         x, origin, collider, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies, self_contact,

@@ -113,8 +113,8 @@ def rollout(
             is swept twice for it, the second time without a tape, once under every schedule; states and gradients are
             the same.
         check_start: With a PairBarrier, raise where surfaces intersect at the start: edges through triangles, or
-            vertices behind a Plane. Contact keeps apart what is apart, and no step notices what is not. It costs a
-            third of one detection and, on CUDA, waits for the device once. Under torch.compile, and while a CUDA graph
+            vertices behind a Plane. Contact keeps apart what is apart, and no step notices what is not. It costs
+            half of one detection and, on CUDA, waits for the device once. Under torch.compile, and while a CUDA graph
             is captured, nothing is checked: run the rollout once before the capture.
 
     Raises:
