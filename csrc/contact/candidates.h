@@ -203,7 +203,7 @@ DIFFVBD_FN Corners<T> corners_at_rest(const Surfaces<T>& in, const Candidate& c)
 // The distance alone. Not inlined: the searches for near pairs and for the list must get the same bits, and a device
 // compiler may round an inlined copy differently in each.
 template <class T>
-DIFFVBD_COLD T separation(int kind, const Corners<T>& c) {
+DIFFVBD_APART T separation(int kind, const Corners<T>& c) {
   return distance(kind, c).d;
 }
 

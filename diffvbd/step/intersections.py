@@ -22,6 +22,8 @@ def check_start(model: Model, x: Tensor, colliders: Any, colliders_before: Tenso
     """
     if model.surface_of_contact is None or torch.compiler.is_compiling():
         return
+    if torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore[reportAttributeAccessIssue]
+        return  # the step says that there are no transforms of it
     if x.is_cuda and torch.cuda.is_current_stream_capturing():
         return
     where = collider_state(model, x, None if moving else colliders, colliders_before)
