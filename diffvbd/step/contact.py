@@ -16,8 +16,8 @@ from ..contact.start import PartStart, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
-from ..reference.intersections import intersections
 from ..scopes import checking, recorders
+from .intersections import refuse_intersections
 from .rigid_contact import Scene, correct
 
 if TYPE_CHECKING:
@@ -43,12 +43,6 @@ class Detection(NamedTuple):
     smallest: Tensor
     island: Tensor
     lowest: Tensor  # of a Model with a floor, else empty
-
-    def trimmed(self) -> Detection:
-        """Without the rows that no pair fills; reads the count."""
-        n, (pairs, constants, ptr, entry) = int(self.counts[0]), self.listed
-        listed = Pairs(pairs[:n].clone(), constants[:n].clone(), ptr, entry[: 4 * n].clone())
-        return self._replace(listed=listed)
 
 
 class Outcome(NamedTuple):
@@ -140,7 +134,7 @@ class ContactStep:
             none = no_pairs(x, x.shape[0] * x.shape[1])
             return self._sweep(x, bounds, self.colliders, none, settings, policy, debug_step)[0]
         if checking():
-            self._look_for_intersections()
+            refuse_intersections(self.model, self.x_prev, self.origin, self.before)
         lift = torch.where(self.model._pinned[:, None], torch.zeros_like(begun.lift), begun.lift)
         lift = broadcast(lift, begun.y.shape)
         x, way = self.x_prev, begun.y - self.x_prev - lift
@@ -161,7 +155,6 @@ class ContactStep:
                 self._record(found, counts, cut)
                 self._check(r, counts[-1].tolist())
                 counts.pop()
-                detection = found[-1] = detection.trimmed()
             if r == 0:
                 self._set_lag(detection.listed, was)
                 lift = self._supported(lift, x, was, detection.listed)
@@ -291,25 +284,6 @@ class ContactStep:
         assert surface is not None
         return start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin, detection,
                                     surface, room)  # fmt: skip
-
-    def _look_for_intersections(self) -> None:
-        """Distances do not show that surfaces pass through each other: debug_checks() compares edges with triangles."""
-        surface = self.surface
-        assert surface is not None
-        absolute = self.x_prev if self.origin.numel() == 0 else self.x_prev + self.origin
-        points = torch.cat([absolute, self.before], 1).detach().double().cpu()
-        triangles, edges = surface.triangles.cpu(), surface.edges.cpu()
-        for scene, at in enumerate(points):
-            if not bool(torch.isfinite(at).all()):
-                continue  # named elsewhere
-            found = intersections(at, triangles, edges)
-            if len(found):
-                edge, triangle = found[0].tolist()
-                raise ValueError(
-                    f"x: expected surfaces that do not intersect, got {len(found)} edges through triangles, one of the "
-                    f"corner points {surface.edges[edge].tolist()} and {surface.triangles[triangle].tolist()} in scene "
-                    f"{scene}"
-                )
 
     def _colliders_at(self, share: float) -> Tensor:
         if self.colliders is self.before:

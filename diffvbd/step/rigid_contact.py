@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..adjoint.contact_lag import Pairs, of_scene, pair_lag
+from ..adjoint.contact_lag import Pairs, pair_lag
 from ..contact.surface import ContactSurface
 from ..ops import broadcast
 from ..ops import contact_start as ops_contact_start
