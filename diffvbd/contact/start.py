@@ -142,6 +142,7 @@ class PartStart(NamedTuple):
     room: Tensor  # [B, V]  how far from there it may go [m]
     short: Tensor  # [B, V] bool: pairs have held up more than a hundredth of its way
     stuck: Tensor  # [1] int64: pairs that hinder what is prescribed
+    shares: Tensor  # [2, B, V]: of the two ways, that vertices went
 
 
 FREE = 1e15  # [m]
@@ -183,7 +184,7 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         at = torch.where(pinned, target, base + share[..., None] * (target - base))
         center = torch.where(pinned, center, center + by.detach()[:, body]).contiguous()
     short = (torch.minimum(*shares) < SHORT) & ~pinned[:, 0]
-    return PartStart(at, center, room, short, stuck[0] + stuck[1])
+    return PartStart(at, center, room, short, stuck[0] + stuck[1], torch.stack(shares))
 
 
 class _Far(NamedTuple):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..adjoint.contact_lag import Pairs, of_scene, pair_lag
+from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
 from ..contact.start import PartStart, start_between_planes
@@ -53,6 +53,11 @@ class Detection(NamedTuple):
     island: Tensor
     lowest: Tensor  # of a Model with a floor, else empty
     room: Tensor  # [B, bodies + 1] [m]: how far the vertices of each body may go beside its island, and the largest
+    # what the part has decided: the shares of the two ways of its start [2, B, V], of the corrections before and after
+    # its sweeps [1 | 2, B, bodies], and the exponents of limits [B, K, V]
+    shares: Tensor | None = None
+    corrections: Tensor | None = None
+    limits: Tensor | None = None
 
 
 class Outcome(NamedTuple):
@@ -137,8 +142,30 @@ class ContactStep:
         zero = force.new_zeros((1,))
         coefficient = self._parameter("friction.coefficient", zero)
         damping = self._parameter("pair_barrier.damping", zero)
-        self.lagged = listed
-        self.lag = torch.cat([of_pair(coefficient) * force, of_pair(damping) * active, rest], -1)
+        lag = torch.cat([of_pair(coefficient) * force, of_pair(damping) * active, rest], -1)
+        if self._reads(force):  # most of what is listed does not touch yet
+            rows = (lag[:, :2] != 0).any(-1).nonzero()[:, 0]
+            listed, lag = some_of(listed, rows, self._points), lag[rows]
+        self.lagged, self.lag = listed, lag
+
+    @staticmethod
+    def _reads(x: Tensor) -> bool:
+        """Whether values may decide sizes: on CUDA that would wait, compiled it would compile anew."""
+        return not x.is_cuda and not torch.compiler.is_compiling()
+
+    @property
+    def _points(self) -> int:
+        return self.x_prev.shape[1] + self.before.shape[1]
+
+    def _between(self, listed: Pairs) -> Pairs:
+        """The pairs between bodies, which alone have a say in rigid motions; all where that would have to be read."""
+        surface = self.surface
+        if surface is None or not self._reads(self.x_prev):
+            return listed
+        corners = listed.pairs[:, :4].long()
+        second = torch.where(listed.pairs[:, 4] == 1, corners[:, 2], corners[:, 1])
+        apart = surface.body[corners[:, 0]] != surface.body[second]
+        return some_of(listed, apart.nonzero()[:, 0], self._points)
 
     def run(self, policy: int, debug_step: int) -> Tensor:
         """Positions after all parts [B, V, 3]; raises where detection did not hold."""
@@ -170,14 +197,18 @@ class ContactStep:
             met.counts.append(torch.cat([detection.counts[:3], start.stuck]))
             if not x.is_cuda and not torch.compiler.is_compiling():
                 self._check(r, met.counts[-1].tolist())
-            x = self._corrected(start.x, now, start, detection.listed)
-            cut = start.short
+            between = self._between(detection.listed)
+            x, first = self._corrected(start.x, now, start, between)
+            taken, limits, cut = [first], None, start.short
             if sweeps:
                 part = settings._replace(sweeps=sweeps)
                 x, limits = self._sweep(x, start.center, start.room, now, detection.listed, part, policy, debug_step)
-                x = self._corrected(x, now, start, detection.listed)
+                x, last = self._corrected(x, now, start, between)
+                taken.append(last)
                 cut = cut | (limits[:, -1] > 0)
             met.cut = cut
+            for found in recorders():
+                found.append(detection._replace(shares=start.shares, corrections=torch.stack(taken), limits=limits))
             left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
         return self._judged(x, met)
 
@@ -185,15 +216,15 @@ class ContactStep:
         """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
         x = self.begun.x_start
         room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
-        start = PartStart(x, x.detach(), room, room > 0, none.ptr[:1].long())
-        x = self._corrected(x, self.colliders, start, none)
+        start = PartStart(x, x.detach(), room, room > 0, none.ptr[:1].long(), x.new_ones((2, *room.shape)))
+        x, _ = self._corrected(x, self.colliders, start, none)
         if self.prepared.settings.sweeps:
             x, _ = self._sweep(x, start.center, room, self.colliders, none, self.prepared.settings, policy, debug_step)
-            x = self._corrected(x, self.colliders, start, none)
+            x, _ = self._corrected(x, self.colliders, start, none)
         return x
 
-    def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> Tensor:
-        """x after the rigid correction of all bodies that are free."""
+    def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> tuple[Tensor, Tensor]:
+        """x after the rigid correction of all bodies that are free, and the share of its motion that each took."""
         numbers = self.prepared.settings.numbers
         scenes = Scenes(
             self.model, self.x_prev, self.begun.y, self.fields.mass, self.begun.data, self.origin, self.before, collider,
@@ -231,10 +262,7 @@ class ContactStep:
             lowest = island.new_empty((0,))
             if self.floor_data is not None:
                 lowest = search.lowest(x, self.origin, self.floor_data.detach(), island, surface)
-        detection = Detection(Pairs(*index), corners, values, counts, smallest, island, lowest, room)
-        for found in recorders():
-            found.append(detection)
-        return detection
+        return Detection(Pairs(*index), corners, values, counts, smallest, island, lowest, room)
 
     def _record(self, met: Met) -> None:
         smallest = torch.stack([d.smallest for d in met.found])

@@ -63,11 +63,13 @@ class _PairTerms(NamedTuple):
     value: Tensor
 
 
-def correct(s: Scenes, x: Tensor) -> Tensor:
-    """x [B, V, 3] after every free body has been moved, as far as pairs, floors and the potential let it."""
+def correct(s: Scenes, x: Tensor) -> tuple[Tensor, Tensor]:
+    """x [B, V, 3] after every free body has been moved, as far as pairs, floors and the potential let it; and the share
+    of its motion that each took [B, bodies]."""
     bodies = _Bodies(s, x)
     motion = _newton_step(s, bodies, x)
-    return x + bodies.displaced(_share(s, bodies, x, motion)[..., None] * motion)
+    share = _share(s, bodies, x, motion)
+    return x + bodies.displaced(share[..., None] * motion), share
 
 
 class _Bodies:
