@@ -27,8 +27,7 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
                                  const Tensor& collider_next, const Tensor& rest, const Tensor& radius,
                                  const Tensor& triangles, const Tensor& edges, const Tensor& points,
                                  const Tensor& planes, const Tensor& body, const Tensor& held, const Tensor& room,
-                                 int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat, double reach,
-                                 double cap, double gamma) {
+                                 int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat) {
   require_positions(x);
   const int64_t b = x.size(0), v = x.size(1), n = body.numel();
   const ScalarType real = x.scalar_type();
@@ -55,8 +54,9 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
   out.body = indices(body, {n}, "contact_detect: expected body [N] int32");
   require_shape(held, x, ScalarType::Bool, {n}, "contact_detect: expected held [N] bool");
   require_countable(b * n + 1, "contact_detect: too large, expected at most 2^31 corner points in all scenes");
-  require(std::isfinite(reach) && reach >= 0 && std::isfinite(dhat),
-          "contact_detect: expected finite dhat and reach >= 0");
+  require(std::isfinite(dhat), "contact_detect: expected a finite dhat");
+  require_shape(room, x, real, {b, mesh_bodies + 1},
+                "contact_detect: expected room like x, of shape [B, mesh_bodies + 1]");
   out.x = data<const T>(x), out.origin = origin.numel() > 0 ? data<const T>(origin) : nullptr;
   out.collider = data<const T>(collider), out.collider_next = data<const T>(collider_next);
   out.rest = data<const T>(rest), out.radius = data<const T>(radius), out.held = data<const bool>(held);
@@ -66,13 +66,7 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
   out.num_points = static_cast<int32_t>(points.size(0)), out.num_planes = static_cast<int32_t>(planes.size(0));
   out.mesh_bodies = count_of(mesh_bodies);
   out.self_contact = self_contact, out.between_bodies = between_bodies;
-  if (room.numel() > 0) {
-    require_shape(room, x, real, {b, mesh_bodies + 1},
-                  "contact_detect: expected room like x, of shape [B, mesh_bodies + 1], or empty");
-    out.room = data<const T>(room);
-  }
-  out.dhat = static_cast<T>(dhat), out.reach = static_cast<T>(reach);
-  out.cap = static_cast<T>(cap), out.gamma = static_cast<T>(gamma);
+  out.room = data<const T>(room), out.dhat = static_cast<T>(dhat);
   const double base = static_cast<double>(out.key_base());
   require(3.0 * static_cast<double>(b) * base * base < 0x1p63, "contact_detect: too many scenes of this size");
   return out;

@@ -88,26 +88,13 @@ __global__ void start_kernel(const Surfaces<T> in, Workspace<T> work, int64_t ca
 // --- search
 // -----------------------------------------------------------------------------------------------------------
 
-// One of two searches: for the near gaps of all corner points, and, when they are known, for the near pairs and the
-// list.
+// One of two searches: for the near gaps of all corner points, and, when they are known, for the near pairs; that one
+// lists.
 template <class T, bool listing>
 struct Search {
   const Surfaces<T>& in;
   const Workspace<T>& work;
   int64_t capacity;
-
-  __device__ T near_gap(const Candidate& c, int k) const {
-    return value_of<T>(work.near_gap[c.scene * in.corners + c.v[k]]);
-  }
-  // How far the corners from..to may move.
-  __device__ T bound(const Candidate& c, int from, int to) const {
-    T most = T(0);
-    for (int k = from; k < to; ++k) {
-      const T gap = near_gap(c, k);
-      most = most < gap ? gap : most;
-    }
-    return bound_of(in, c.scene, c.v[from], most);
-  }
 
   __device__ void touch(uint64_t key) const {
     atomicAdd(&work.touching[0], 1ULL);
@@ -130,12 +117,7 @@ struct Search {
     const T gap = separation(c.kind, corners_of(in, c)) - offset_of(in, c);
     if (gap >= reach_of(in, c.scene)) return;
     const Ordered<T> bits = ordered(gap);
-    bool matters = !(gap > T(0));
-    T a = T(0), b = T(0);
-    if (listing) {
-      a = bound(c, 0, c.second()), b = c.kind == kPointPlane ? T(0) : bound(c, c.second(), 4);
-      matters = matters || is_listed(gap, a, b, in.dhat);
-    }
+    bool matters = !(gap > T(0)) || (listing && is_listed(in, c, gap, in.dhat));
     Ordered<T>* rows = work.near_gap + c.scene * in.corners;
     for (int k = 0; k < 4; ++k) {
       const Ordered<T> known = *static_cast<volatile Ordered<T>*>(rows + c.v[k]);
@@ -156,7 +138,7 @@ struct Search {
         lower(work.near_key + c.scene * in.corners + c.v[k], static_cast<unsigned long long>(key));
       }
     }
-    if (is_listed(gap, a, b, constants.dhat)) append(key);
+    if (is_listed(in, c, gap, constants.dhat)) append(key);
   }
 
   // What query q looks for: those of points come first, in the order of their Morton codes.
@@ -184,12 +166,13 @@ struct Search {
   __device__ void walk(const Query& q, int32_t from, int32_t end, int32_t first, const Visit& visit) const {
     const Box* nodes = work.forest.tree(q.kind, q.scene);
     const auto skips = [&](int32_t group) { return in.ignores(q.box.group, group); };
-    each_leaf(nodes, work.forest.leaves[q.kind], from, end, q.box, squared_reach(in, q.scene, q.box.group), skips, [&](int32_t leaf) {
-      if (leaf < first) return true;
-      if (!visit(leaf)) return false;
-      examine(candidate(in, q.scene, q.kind, q.box.item, nodes[leaf].item));
-      return true;
-    });
+    each_leaf(nodes, work.forest.leaves[q.kind], from, end, q.box, squared_reach(in, q.scene, q.box.group), skips,
+              [&](int32_t leaf) {
+                if (leaf < first) return true;
+                if (!visit(leaf)) return false;
+                examine(candidate(in, q.scene, q.kind, q.box.item, nodes[leaf].item));
+                return true;
+              });
   }
 };
 
@@ -272,8 +255,8 @@ __global__ void corner_kernel(const Surfaces<T> in, Workspace<T> work, Detected<
   out.ptr[i] = static_cast<int32_t>(from);
   if (i == rows) return;
   const int64_t scene = i / in.corners;
-  store_near_pair(in, scene, static_cast<int32_t>(i - scene * in.corners), work.near_key[i], out.near_corners + kNearRow * i,
-                  out.near_values + kNearValues * i);
+  store_near_pair(in, scene, static_cast<int32_t>(i - scene * in.corners), work.near_key[i],
+                  out.near_corners + kNearRow * i, out.near_values + kNearValues * i);
   lower(work.smallest + scene, work.near_gap[i]);
 }
 
@@ -330,6 +313,7 @@ cudaError_t detect(const Surfaces<T>& in, const Detected<T>& out, void* memory, 
       return error;
   }
   corner_kernel<<<blocks_for(rows + 1), kThreads, 0, stream>>>(in, work, out);
+  if (capacity > 0) hint_kernel<<<blocks_for(capacity), kThreads, 0, stream>>>(in, out);
   finish_kernel<<<blocks_for(in.scenes + 1), kThreads, 0, stream>>>(in.scenes, work, out);
   return cudaGetLastError();
 }

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 import os
 
 STARTS, ENDS = int(os.environ.get("S", 1)), int(os.environ.get("E", 1))
-FREE = 1e15  # [m] radius of a bound that binds nothing
+FREE = 1e15  # [m] a room that ends nowhere
 ROOM = 1.5  # how far a vertex may go, over how far the farthest of its body wants to go
 
 
@@ -136,9 +136,8 @@ class ContactStep:
         barrier, surface = self.barrier, self.surface
         if barrier is None or surface is None:  # friction on a floor alone
             x = begun.x_start
-            bounds = torch.cat([x, torch.full_like(x[..., :1], FREE)], -1)
-            none = no_pairs(x, x.shape[0] * x.shape[1])
-            return self._sweep(x, bounds, self.colliders, none, settings, policy, debug_step)[0]
+            none, free = no_pairs(x, x.shape[0] * x.shape[1]), torch.full_like(x[..., 0], FREE)
+            return self._sweep(x, x.detach().contiguous(), free, self.colliders, none, settings, policy, debug_step)[0]
         if checking():
             self._look_for_intersections()
         lift = torch.where(self.model._pinned[:, None], torch.zeros_like(begun.lift), begun.lift)
@@ -174,7 +173,7 @@ class ContactStep:
                 x = self._correct(x, was, now, start, detection)
             if sweeps:
                 part = settings._replace(sweeps=sweeps)
-                x, held_back = self._sweep(x, start.bounds, now, detection.listed, part, policy, debug_step, start.room)
+                x, held_back = self._sweep(x, start.center, start.room, now, detection.listed, part, policy, debug_step)
                 cut.append(held_back)
             for _ in range(ENDS):
                 x = self._correct(x, was, now, start, detection)
@@ -199,7 +198,7 @@ class ContactStep:
             self.lagged,
             self.lag,
             self.floor_lag,
-            start.bounds[..., :3].detach().contiguous(),
+            start.center,
             start.room,
             surface,
             self.model,
@@ -316,13 +315,13 @@ class ContactStep:
             return self.before
         return self.before + share * (self.colliders - self.before)
 
-    def _sweep(self, x: Tensor, bounds: Tensor, collider: Tensor, listed: Pairs, settings: SweepSettings, policy: int,
-               debug_step: int, room: Tensor | None = None) -> tuple[Tensor, Tensor]:  # fmt: skip
+    def _sweep(self, x: Tensor, center: Tensor, room: Tensor, collider: Tensor, listed: Pairs, settings: SweepSettings,
+               policy: int, debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
         lagged, model = self.lagged, self.model
         fields = self.fields._replace(
-            x_start=x, bounds=bounds, collider=collider, collider_prev=self.before, kappa=self.kappa,
+            x_start=x, collider=collider, collider_prev=self.before, kappa=self.kappa,
             **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs, lag_ptr=lagged.ptr, lag_entry=lagged.entry,
-            floor_lag=self.floor_lag, room=room,
+            floor_lag=self.floor_lag, center=center, room=room,
         )  # fmt: skip
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
@@ -408,7 +407,7 @@ class ContactStep:
 def no_pairs(like: Tensor, corners: int) -> Pairs:
     """An empty list for so many corner points of all scenes."""
     none = torch.zeros((corners + 1,), dtype=torch.int32, device=like.device)
-    return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, 3)), none, none[:0])
+    return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, 8)), none, none[:0])
 
 
 def run_contact(model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor, prescribed: bool,

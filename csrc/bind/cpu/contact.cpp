@@ -21,13 +21,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> conta
     const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& collider_next, const Tensor& rest,
     const Tensor& radius, const Tensor& triangles, const Tensor& edges, const Tensor& points, const Tensor& planes,
     const Tensor& body, const Tensor& held, const Tensor& room, int64_t mesh_bodies, bool self_contact,
-    bool between_bodies, double dhat, double reach, double cap, double gamma, int64_t capacity) {
+    bool between_bodies, double dhat, int64_t capacity) {
   diffvbd::require_capacity(capacity);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in =
-        diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes,
-                                body, held, room, mesh_bodies, self_contact, between_bodies, dhat, reach, cap, gamma);
+    const auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points,
+                                            planes, body, held, room, mesh_bodies, self_contact, between_bodies, dhat);
     const int64_t b = in.scenes, n = in.corners;
     Tensor pairs = integers({capacity, diffvbd::contact::kPairRow});
     Tensor constants = empty(x, {capacity, diffvbd::contact::kConstants});
