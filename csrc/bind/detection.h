@@ -26,37 +26,33 @@ template <class T>
 contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Tensor& collider,
                                  const Tensor& collider_next, const Tensor& rest, const Tensor& radius,
                                  const Tensor& triangles, const Tensor& edges, const Tensor& points,
-                                 const Tensor& planes, const Tensor& body, const Tensor& held, const Tensor& room,
-                                 int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat) {
+                                 const Tensor& planes, const Tensor& body, const Tensor& held, int64_t mesh_bodies,
+                                 bool self_contact, bool between_bodies) {
   require_positions(x);
   const int64_t b = x.size(0), v = x.size(1), n = body.numel();
   const ScalarType real = x.scalar_type();
-  require(v <= n && mesh_bodies >= 0,
-          "contact_detect: expected body of shape [N], N >= vertices, and mesh_bodies >= 0");
+  require(v <= n && mesh_bodies >= 0, "contact: expected body of shape [N], N >= vertices, and mesh_bodies >= 0");
   if (origin.numel() > 0) {
-    require_shape(origin, x, real, {b, v, 3}, "contact_detect: expected origin like x, or empty");
+    require_shape(origin, x, real, {b, v, 3}, "contact: expected origin like x, or empty");
   }
-  require_shape(collider, x, real, {b, n - v, 3}, "contact_detect: expected collider like x, of shape [B, N - V, 3]");
+  require_shape(collider, x, real, {b, n - v, 3}, "contact: expected collider like x, of shape [B, N - V, 3]");
   require_shape(collider_next, x, real, {b, n - v, 3},
-                "contact_detect: expected collider_next like x, of shape [B, N - V, 3]");
-  require_shape(rest, x, real, {n, 3}, "contact_detect: expected rest like x, of shape [N, 3]");
-  require_shape(radius, x, real, {n}, "contact_detect: expected radius like x, of shape [N]");
+                "contact: expected collider_next like x, of shape [B, N - V, 3]");
+  require_shape(rest, x, real, {n, 3}, "contact: expected rest like x, of shape [N, 3]");
+  require_shape(radius, x, real, {n}, "contact: expected radius like x, of shape [N]");
   const auto indices = [&](const Tensor& t, const std::vector<int64_t>& sizes, const char* message) {
     require_shape(t, x, ScalarType::Int, sizes, message);
-    require_countable(b * t.numel(), "contact_detect: too large, expected at most 2^31 corners of primitives");
+    require_countable(b * t.numel(), "contact: too large, expected at most 2^31 corners of primitives");
     return data<const int32_t>(t);
   };
   contact::Surfaces<T> out{};
-  out.triangles = indices(triangles, {triangles.size(0), 3}, "contact_detect: expected triangles [F, 3] int32");
-  out.edges = indices(edges, {edges.size(0), 2}, "contact_detect: expected edges [E, 2] int32");
-  out.points = indices(points, {points.size(0)}, "contact_detect: expected points [P] int32");
-  out.planes = indices(planes, {planes.size(0), 3}, "contact_detect: expected planes [L, 3] int32");
-  out.body = indices(body, {n}, "contact_detect: expected body [N] int32");
-  require_shape(held, x, ScalarType::Bool, {n}, "contact_detect: expected held [N] bool");
-  require_countable(b * n + 1, "contact_detect: too large, expected at most 2^31 corner points in all scenes");
-  require(std::isfinite(dhat), "contact_detect: expected a finite dhat");
-  require_shape(room, x, real, {b, mesh_bodies + 1},
-                "contact_detect: expected room like x, of shape [B, mesh_bodies + 1]");
+  out.triangles = indices(triangles, {triangles.size(0), 3}, "contact: expected triangles [F, 3] int32");
+  out.edges = indices(edges, {edges.size(0), 2}, "contact: expected edges [E, 2] int32");
+  out.points = indices(points, {points.size(0)}, "contact: expected points [P] int32");
+  out.planes = indices(planes, {planes.size(0), 3}, "contact: expected planes [L, 3] int32");
+  out.body = indices(body, {n}, "contact: expected body [N] int32");
+  require_shape(held, x, ScalarType::Bool, {n}, "contact: expected held [N] bool");
+  require_countable(b * n + 1, "contact: too large, expected at most 2^31 corner points in all scenes");
   out.x = data<const T>(x), out.origin = origin.numel() > 0 ? data<const T>(origin) : nullptr;
   out.collider = data<const T>(collider), out.collider_next = data<const T>(collider_next);
   out.rest = data<const T>(rest), out.radius = data<const T>(radius), out.held = data<const bool>(held);
@@ -66,15 +62,23 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
   out.num_points = static_cast<int32_t>(points.size(0)), out.num_planes = static_cast<int32_t>(planes.size(0));
   out.mesh_bodies = count_of(mesh_bodies);
   out.self_contact = self_contact, out.between_bodies = between_bodies;
-  out.room = data<const T>(room), out.dhat = static_cast<T>(dhat);
   const double base = static_cast<double>(out.key_base());
-  require(3.0 * static_cast<double>(b) * base * base < 0x1p63, "contact_detect: too many scenes of this size");
+  require(3.0 * static_cast<double>(b) * base * base < 0x1p63, "contact: too many scenes of this size");
   return out;
+}
+
+// What a detection reads besides: how far to look.
+template <class T>
+void set_reach(contact::Surfaces<T>& surfaces, const Tensor& x, const Tensor& room, double dhat) {
+  require(std::isfinite(dhat), "contact: expected a finite dhat");
+  require_shape(room, x, x.scalar_type(), {surfaces.scenes, int64_t{surfaces.mesh_bodies} + 1},
+                "contact: expected room like x, of shape [B, mesh_bodies + 1]");
+  surfaces.room = data<const T>(room), surfaces.dhat = static_cast<T>(dhat);
 }
 
 inline void require_capacity(int64_t capacity) {
   require(capacity >= 0 && 4 * capacity <= std::numeric_limits<int32_t>::max(),
-          "contact_detect: expected 0 <= capacity < 2^29");
+          "contact: expected 0 <= capacity < 2^29");
 }
 
 template <class T>

@@ -131,13 +131,19 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   m.def("star_sum(Tensor values, Tensor star_ptr, Tensor star, bool positive) -> Tensor");
   m.def("row_sum(Tensor values) -> Tensor");
   // results as in contact/candidates.h; mesh_bodies: body labels from there on are colliders; room [scenes, mesh_bodies
-  // + 1]: how far the vertices of a body may go before the next detection, and the largest
+  // + 1]: how far the vertices of a body may go before the next detection, and the largest; trim (CPU): the list has as
+  // many rows as there are pairs, and no more than the capacity
   m.def(
       "contact_detect(Tensor x, Tensor origin, Tensor collider, Tensor collider_next, Tensor rest, Tensor radius, "
-      "Tensor triangles, Tensor edges, Tensor points, Tensor planes, Tensor body, Tensor held, Tensor "
-      "room, int mesh_bodies, bool self_contact, bool between_bodies, float dhat, int capacity) -> (Tensor pairs, "
+      "Tensor triangles, Tensor edges, Tensor points, Tensor planes, Tensor body, Tensor held, Tensor room, int "
+      "mesh_bodies, bool self_contact, bool between_bodies, float dhat, int capacity, bool trim) -> (Tensor pairs, "
       "Tensor constants, Tensor ptr, Tensor entry, Tensor near_corners, Tensor near_values, Tensor counts, "
       "Tensor smallest)");
+  // results as in contact/intersect.h
+  m.def(
+      "contact_intersections(Tensor x, Tensor origin, Tensor collider, Tensor rest, Tensor radius, Tensor triangles, "
+      "Tensor edges, Tensor points, Tensor planes, Tensor body, Tensor held, int mesh_bodies, bool self_contact, bool "
+      "between_bodies, int capacity) -> (Tensor pairs, Tensor counts, Tensor first)");
   m.def(
       "contact_islands(Tensor x, Tensor origin, Tensor move, Tensor mass, Tensor collider, Tensor collider_next, "
       "Tensor planes, Tensor body, Tensor body_order, Tensor body_ptr, Tensor held, Tensor radius, Tensor room, int "

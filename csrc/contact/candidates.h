@@ -104,14 +104,14 @@ DIFFVBD_FN Box corner_box(const Surfaces<T>& in, int64_t scene, int32_t i, const
   return {at - s, in.group(i), at + s, -1};
 }
 
-// Box of a primitive with n corners, grown by its radius; empty where a corner is not finite.
-template <class T>
-DIFFVBD_FN Box primitive_box(const Surfaces<T>& in, int64_t scene, const int32_t* v, int n, int32_t item,
-                             const Place<T>& reference) {
+// Box of a primitive with n corners, whose boxes box_of(corner) gives, grown by its radius; empty where a corner is not
+// finite.
+template <class T, class BoxOf>
+DIFFVBD_FN Box primitive_box(const Surfaces<T>& in, const int32_t* v, int n, int32_t item, const BoxOf& box_of) {
   Box out = empty_box();
   bool finite = true;
   for (int k = 0; k < n; ++k) {
-    const Box corner = corner_box(in, scene, v[k], reference);
+    const Box corner = box_of(v[k]);
     finite = finite && !is_empty(corner);
     out = hull(out, corner);
   }
@@ -216,7 +216,7 @@ DIFFVBD_FN Corners<T> corners_at_rest(const Surfaces<T>& in, const Candidate& c)
 // The distance alone. Not inlined: the searches for near pairs and for the list must get the same bits, and a device
 // compiler may round an inlined copy differently in each.
 template <class T>
-DIFFVBD_COLD T separation(int kind, const Corners<T>& c) {
+DIFFVBD_APART T separation(int kind, const Corners<T>& c) {
   return distance(kind, c).d;
 }
 

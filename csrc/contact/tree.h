@@ -68,6 +68,26 @@ DIFFVBD_FN float distance2(const Box& a, const Box& b) {
 #endif
 }
 
+// Whether boxes overlap; empty ones may.
+DIFFVBD_FN bool overlap(const Box& a, const Box& b) {
+#if defined(__CUDACC__)
+  return a.lo.x <= b.hi.x && b.lo.x <= a.hi.x && a.lo.y <= b.hi.y && b.lo.y <= a.hi.y && a.lo.z <= b.hi.z &&
+         b.lo.z <= a.hi.z;
+#else
+  using Four = float __attribute__((vector_size(16)));
+  using Bits = int32_t __attribute__((vector_size(16)));
+  using Halves = int64_t __attribute__((vector_size(16)));
+  const auto four = [](const void* p) {
+    Four out;
+    __builtin_memcpy(&out, p, sizeof out);
+    return out;
+  };
+  const Bits out = ((four(&a.lo) > four(&b.hi)) | (four(&b.lo) > four(&a.hi))) & Bits{-1, -1, -1, 0};
+  const Halves halves = reinterpret_cast<Halves>(out);
+  return (halves[0] | halves[1]) == 0;
+#endif
+}
+
 // Every third bit of the result is one of the lowest 21 of x.
 DIFFVBD_FN uint64_t spread_bits(uint64_t x) {
   x = (x | x << 32) & 0x001f00000000ffff;
@@ -108,28 +128,25 @@ DIFFVBD_FN int32_t next_node(int32_t i) {
   return i + 1;
 }
 
-// The first leaf node in a traversal from node i that is not further from the query than the reach, or `end`;
-// `skips(group)` says which nodes are of no interest. Empty leaves are passed over: an infinite query is near them,
-// too, because the distance of infinite boxes is not a number.
-template <class Skips>
-DIFFVBD_FN int32_t find_leaf(const Box* nodes, int32_t leaves, int32_t i, int32_t end, const Box& query, float reach2,
-                             const Skips& skips) {
+// The first leaf node in a traversal from node i that the query hits, or `end`. Empty leaves are passed over: an
+// infinite query is near them, too, because the distance of infinite boxes is not a number.
+template <class Hits>
+DIFFVBD_FN int32_t find_leaf(const Box* nodes, int32_t leaves, int32_t i, int32_t end, const Hits& hits) {
   do {
     const Box& node = nodes[i];
-    const bool hit = distance2(node, query) <= reach2 && !skips(node.group);
-    const bool leaf = i >= leaves;
+    const bool hit = hits(node), leaf = i >= leaves;
     if (hit && leaf && !is_empty(node)) return i;
     i = hit && !leaf ? 2 * i : next_node(i);
   } while (i != end);
   return end;
 }
 
-// visit(leaf node) for all of them in a traversal from node i to `end`, until it returns false.
-template <class Skips, class Visit>
-DIFFVBD_FN void each_leaf(const Box* nodes, int32_t leaves, int32_t i, int32_t end, const Box& query, float reach2,
-                          const Skips& skips, const Visit& visit) {
+// visit(leaf node) for all leaves with hits(box) in a traversal from node i to `end`, until it returns false.
+template <class Hits, class Visit>
+DIFFVBD_FN void each_leaf(const Box* nodes, int32_t leaves, int32_t i, int32_t end, const Hits& hits,
+                          const Visit& visit) {
   do {
-    i = find_leaf(nodes, leaves, i, end, query, reach2, skips);
+    i = find_leaf(nodes, leaves, i, end, hits);
     if (i == end || !visit(i)) return;
     i = next_node(i);
   } while (i != end);

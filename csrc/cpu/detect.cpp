@@ -1,82 +1,15 @@
 #include "detect.h"
 
-#include <torch/csrc/stable/ops.h>
-
-#include <algorithm>
-#include <array>
 #include <atomic>
 #include <cmath>
 #include <mutex>
-#include <utility>
-#include <vector>
 
-#include "grain.h"
+#include "tree.h"
 
 namespace diffvbd {
 namespace {
 
 using namespace contact;
-
-constexpr int64_t kChunk = 256;                    // primitives of one piece of the search
-constexpr int64_t kSearchGrain = 8;                // pieces that are worth one more thread: about 300 us
-constexpr int32_t kGroup = 8;                      // neighbors in a tree that look for pairs together
-constexpr int kDigitBits = 12, kShortSort = 2048;  // up to this many items a comparison sort is quicker
-
-struct Keyed {
-  uint64_t key;
-  int32_t item;
-};
-uint64_t key_of(const Keyed& a) { return a.key; }
-uint64_t key_of(uint64_t a) { return a; }
-bool operator<(const Keyed& a, const Keyed& b) { return a.key != b.key ? a.key < b.key : a.item < b.item; }
-
-// Stable sort by keys below 2^bits; the items of equal keys must come in ascending order.
-template <class Item>
-void sort_by_key(std::vector<Item>& items, std::vector<Item>& other, int bits) {
-  if (items.size() <= kShortSort) return std::sort(items.begin(), items.end());
-  other.resize(items.size());
-  for (int shift = 0; shift < bits; shift += kDigitBits) {
-    std::array<size_t, (size_t{1} << kDigitBits) + 1> start{};
-    const auto digit = [&](const Item& a) { return key_of(a) >> shift & ((size_t{1} << kDigitBits) - 1); };
-    for (const Item& a : items) ++start[digit(a) + 1];
-    for (size_t d = 1; d < start.size(); ++d) start[d] += start[d - 1];
-    for (const Item& a : items) other[start[digit(a)]++] = a;
-    items.swap(other);
-  }
-}
-
-int bits_of(uint64_t below) {
-  int bits = 0;
-  while (bits < 64 && below >> bits != 0) ++bits;
-  return bits;
-}
-
-// f(i) for all i < n; within a parallel region, one thread does it all.
-template <class F>
-void for_each(int64_t n, const F& f) {
-  torch::stable::parallel_for(0, n, kGrain, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) f(i);
-  });
-}
-
-struct Tree {
-  int32_t leaves = kGroup;
-  std::vector<Box> boxes, nodes;  // of the primitives in their order, and the tree's
-  std::vector<Keyed> codes, scratch;
-
-  // `bounds` cover all boxes that are not empty.
-  void build(const Box& bounds) {
-    const auto n = static_cast<int64_t>(boxes.size());
-    codes.resize(n);
-    for_each(n, [&](int64_t i) { codes[i] = {morton_code(boxes[i], bounds, kMostAxisBits), static_cast<int32_t>(i)}; });
-    sort_by_key(codes, scratch, 3 * kMostAxisBits);
-    leaves = std::max(kGroup, padded_leaves(n));
-    nodes.resize(int64_t{2} * leaves);
-    for_each(leaves, [&](int64_t k) { nodes[leaves + k] = k < n ? boxes[codes[k].item] : empty_box(); });
-    for (int32_t i = leaves - 1; i >= kRoot; --i) nodes[i] = hull(nodes[2 * i], nodes[2 * i + 1]);
-  }
-  int32_t groups() const { return leaves / kGroup; }
-};
 
 // The near pair of a corner point: the smallest gap, then the smallest key.
 template <class T>
@@ -149,18 +82,14 @@ class SceneDetection {
 
  private:
   void build_trees() {
-    const Place<T> reference = reference_point(in_, scene_);
+    fill_corner_boxes(in_, scene_, corner_boxes_);
+    triangles_.fill(in_, corner_boxes_, in_.triangles, in_.num_triangles, 3);
+    edges_.fill(in_, corner_boxes_, in_.edges, in_.num_edges, 2);
+    points_.fill(in_, corner_boxes_, in_.points, in_.num_points, 1);
     Box bounds = empty_box();
-    const auto fill = [&](Tree& tree, const int32_t* items, int64_t count, int corners) {
-      tree.boxes.resize(count);
-      for_each(count, [&](int64_t i) {
-        tree.boxes[i] = primitive_box(in_, scene_, items + corners * i, corners, static_cast<int32_t>(i), reference);
-      });
-      for (const Box& box : tree.boxes) bounds = hull(bounds, box);
-    };
-    fill(triangles_, in_.triangles, in_.num_triangles, 3);
-    fill(edges_, in_.edges, in_.num_edges, 2);
-    fill(points_, in_.points, in_.num_points, 1);
+    for (const Tree* tree : {&triangles_, &edges_, &points_}) {
+      for (const Box& box : tree->boxes) bounds = hull(bounds, box);
+    }
     for (Tree* tree : {&triangles_, &edges_, &points_}) tree->build(bounds);
   }
 
@@ -172,8 +101,10 @@ class SceneDetection {
     const float reach2 = squared_reach(in_, scene_, around.group);
     met.clear();
     if (!is_empty(around)) {
-      const auto skips = [&](int32_t group) { return in_.ignores(around.group, group); };
-      each_leaf(nodes, others.leaves, kind == kEdgeEdge ? home : kRoot, kRoot, around, reach2, skips, [&](int32_t i) {
+      const auto hits = [&](const Box& node) {
+        return distance2(node, around) <= reach2 && !in_.ignores(around.group, node.group);
+      };
+      each_leaf(nodes, others.leaves, kind == kEdgeEdge ? home : kRoot, kRoot, hits, [&](int32_t i) {
         met.push_back({nodes[i], i});
         return true;
       });
@@ -236,6 +167,7 @@ class SceneDetection {
 
   const Surfaces<T>& in_;
   int64_t scene_ = 0;
+  std::vector<Box> corner_boxes_;
   Tree triangles_, edges_, points_;
   std::vector<Near<T>> near_;
   std::vector<Finds<T>> finds_;
@@ -264,7 +196,7 @@ void store_entries(const Surfaces<T>& in, int64_t rows, const Detected<T>& out) 
 }  // namespace
 
 template <class T>
-void detect(const Surfaces<T>& in, const Detected<T>& out) {
+std::vector<uint64_t> detect(const Surfaces<T>& in, const Detected<T>& out) {
   std::vector<std::vector<uint64_t>> lists(in.scenes);
   std::vector<int64_t> touching(in.scenes);
   std::vector<uint64_t> first_touching(in.scenes);
@@ -291,7 +223,14 @@ void detect(const Surfaces<T>& in, const Detected<T>& out) {
     keys.insert(keys.end(), lists[b].begin(), lists[b].end());
     touches += touching[b], first = std::min(first, first_touching[b]);
   }
-  const auto needed = static_cast<int64_t>(keys.size()), rows = std::min(needed, out.capacity);
+  out.counts[0] = static_cast<int64_t>(keys.size()), out.counts[1] = touches;
+  out.counts[2] = first == kNoKey ? -1 : static_cast<int64_t>(first), out.counts[3] = 0;
+  return keys;
+}
+
+template <class T>
+void store_list(const Surfaces<T>& in, const std::vector<uint64_t>& keys, const Detected<T>& out) {
+  const auto rows = std::min(static_cast<int64_t>(keys.size()), out.capacity);
   for_each(out.capacity, [&](int64_t i) {
     int32_t* pair = out.pairs + kPairRow * i;
     T* constants = out.constants + kConstants * i;
@@ -299,11 +238,13 @@ void detect(const Surfaces<T>& in, const Detected<T>& out) {
     store_hints(in, out, pair, constants);
   });
   store_entries(in, rows, out);
-  out.counts[0] = needed, out.counts[1] = touches;
-  out.counts[2] = first == kNoKey ? -1 : static_cast<int64_t>(first), out.counts[3] = 0;
 }
 
-template void detect<float>(const Surfaces<float>&, const Detected<float>&);
-template void detect<double>(const Surfaces<double>&, const Detected<double>&);
+#define DIFFVBD_INSTANTIATE(T)                                                      \
+  template std::vector<uint64_t> detect<T>(const Surfaces<T>&, const Detected<T>&); \
+  template void store_list<T>(const Surfaces<T>&, const std::vector<uint64_t>&, const Detected<T>&);
+DIFFVBD_INSTANTIATE(float)
+DIFFVBD_INSTANTIATE(double)
+#undef DIFFVBD_INSTANTIATE
 
 }  // namespace diffvbd

@@ -42,27 +42,17 @@ struct Workspace {
       pointer = reinterpret_cast<std::remove_reference_t<decltype(pointer)>>(at + bytes);
       bytes += (items * sizeof(*pointer) + kAlignment - 1) / kAlignment * kAlignment;
     };
-    forest.scenes = in.scenes;
-    forest.count[0] = in.num_triangles, forest.count[1] = in.num_edges, forest.count[2] = in.num_points;
-    const int room = (64 - bits_of(static_cast<uint64_t>(3 * in.scenes))) / 3;
-    forest.axis_bits = room < kMostAxisBits ? room : kMostAxisBits;
-    const int64_t rows = in.scenes * in.corners, n = forest.size();
-    take(forest.bounds, in.scenes);
-    take(forest.keys, n), take(forest.sorted_keys, n), take(forest.items, n), take(forest.sorted_items, n);
-    for (int kind = 0; kind < 2; ++kind) {
-      forest.leaves[kind] = padded_leaves(forest.count[kind]);
-      take(forest.nodes[kind], in.scenes * 2 * forest.leaves[kind]);
-    }
+    forest.lay_out(in, take);
+    const int64_t rows = in.scenes * in.corners;
     take(near_gap, rows), take(near_key, rows), take(smallest, in.scenes), take(listed, 1), take(touching, 2);
     take(keys, capacity), take(sorted_keys, capacity);
     take(points, 4 * capacity), take(sorted_points, 4 * capacity), take(entries, 4 * capacity);
     take(heavy, in.scenes * (int64_t{in.num_points} + in.num_edges)), take(heavy_count, 2);
-    size_t of_primitives = 0, of_pairs = 0, of_points = 0;
-    cub::DeviceRadixSort::SortPairs(nullptr, of_primitives, forest.keys, forest.sorted_keys, forest.items,
-                                    forest.sorted_items, n);
+    size_t of_pairs = 0, of_points = 0;
     cub::DeviceRadixSort::SortKeys(nullptr, of_pairs, keys, sorted_keys, capacity);
     cub::DeviceRadixSort::SortPairs(nullptr, of_points, points, sorted_points, entries, entries, 4 * capacity);
-    sort_bytes = of_primitives > of_pairs ? of_primitives : of_pairs;
+    sort_bytes = forest.sort_bytes();
+    sort_bytes = sort_bytes > of_pairs ? sort_bytes : of_pairs;
     sort_bytes = sort_bytes > of_points ? sort_bytes : of_points;
     sort = at + bytes;
     bytes += sort_bytes;
@@ -75,9 +65,8 @@ __global__ void start_kernel(const Surfaces<T> in, Workspace<T> work, int64_t ca
   if (i < in.scenes * in.corners) work.near_gap[i] = ordered(reach_of(in, i / in.corners)), work.near_key[i] = kNoKey;
   if (i < capacity) work.keys[i] = in.keys();
   if (i < in.scenes) {
-    const float far = std::numeric_limits<float>::infinity();
     work.smallest[i] = ordered(reach_of(in, i));
-    for (int k = 0; k < 6; ++k) work.forest.bounds[i][k] = ordered(k < 3 ? far : -far);
+    clear_bounds(work.forest, i);
   }
   if (i == 0) {
     *work.listed = work.touching[0] = 0, work.touching[1] = kNoKey;
@@ -165,14 +154,16 @@ struct Search {
   template <class Visit>
   __device__ void walk(const Query& q, int32_t from, int32_t end, int32_t first, const Visit& visit) const {
     const Box* nodes = work.forest.tree(q.kind, q.scene);
-    const auto skips = [&](int32_t group) { return in.ignores(q.box.group, group); };
-    each_leaf(nodes, work.forest.leaves[q.kind], from, end, q.box, squared_reach(in, q.scene, q.box.group), skips,
-              [&](int32_t leaf) {
-                if (leaf < first) return true;
-                if (!visit(leaf)) return false;
-                examine(candidate(in, q.scene, q.kind, q.box.item, nodes[leaf].item));
-                return true;
-              });
+    const float reach2 = squared_reach(in, q.scene, q.box.group);
+    const auto hits = [&](const Box& node) {
+      return distance2(node, q.box) <= reach2 && !in.ignores(q.box.group, node.group);
+    };
+    each_leaf(nodes, work.forest.leaves[q.kind], from, end, hits, [&](int32_t leaf) {
+      if (leaf < first) return true;
+      if (!visit(leaf)) return false;
+      examine(candidate(in, q.scene, q.kind, q.box.item, nodes[leaf].item));
+      return true;
+    });
   }
 };
 

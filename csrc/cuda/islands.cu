@@ -128,7 +128,8 @@ __global__ void sweep_kernel(const IslandInputs<T> in, Workspace<T> work) {
   const int64_t i = own_item();
   if (i >= in.scenes * in.mesh_bodies) return;
   const int64_t scene = i / in.mesh_bodies, first = scene * in.mesh_bodies;
-  const Bounds<T> box = swept(in, work.bodies[i].bounds, translation(work.islands[first + work.label[i]]), in.margin(scene, static_cast<int32_t>(i - first)));
+  const Bounds<T> box = swept(in, work.bodies[i].bounds, translation(work.islands[first + work.label[i]]),
+                              in.margin(scene, static_cast<int32_t>(i - first)));
   work.boxes[i] = box;
   bool blocked = false;
   for (int32_t object = 0; object < *work.objects && !blocked; ++object) {

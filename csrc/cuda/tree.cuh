@@ -32,6 +32,28 @@ struct Forest {
   contact::Box* nodes[2];         // [scenes, 2 leaves]
   unsigned (*bounds)[6];          // of each scene, as ordered bits
 
+  // Sizes, and memory by take(pointer, items).
+  template <class T, class Take>
+  void lay_out(const contact::Surfaces<T>& in, const Take& take) {
+    scenes = in.scenes;
+    count[0] = in.num_triangles, count[1] = in.num_edges, count[2] = in.num_points;
+    const int room = (64 - bits_of(static_cast<uint64_t>(3 * in.scenes))) / 3;
+    axis_bits = room < contact::kMostAxisBits ? room : contact::kMostAxisBits;
+    const int64_t n = size();
+    take(bounds, in.scenes);
+    take(keys, n), take(sorted_keys, n), take(items, n), take(sorted_items, n);
+    for (int kind = 0; kind < 2; ++kind) {
+      leaves[kind] = contact::padded_leaves(count[kind]);
+      take(nodes[kind], in.scenes * 2 * leaves[kind]);
+    }
+  }
+  // Bytes that the sort of the primitives works in.
+  size_t sort_bytes() const {
+    size_t bytes = 0;
+    cub::DeviceRadixSort::SortPairs(nullptr, bytes, keys, sorted_keys, items, sorted_items, size());
+    return bytes;
+  }
+
   DIFFVBD_FN int64_t first(int kind) const {
     return scenes * ((kind > 0 ? int64_t{count[0]} : 0) + (kind > 1 ? int64_t{count[1]} : 0));
   }
@@ -40,12 +62,19 @@ struct Forest {
   int key_bits() const { return 3 * axis_bits + bits_of(static_cast<uint64_t>(3 * scenes)); }
 };
 
+// Before any box is known.
+__device__ __forceinline__ void clear_bounds(const Forest& forest, int64_t scene) {
+  const float far = std::numeric_limits<float>::infinity();
+  for (int k = 0; k < 6; ++k) forest.bounds[scene][k] = ordered(k < 3 ? far : -far);
+}
+
 template <class T>
 __device__ __forceinline__ contact::Box box_of(const contact::Surfaces<T>& in, int kind, int64_t scene, int32_t item,
                                                const contact::Place<T>& reference) {
   const int corners = kind == 0 ? 3 : kind == 1 ? 2 : 1;
   const int32_t* list = kind == 0 ? in.triangles : kind == 1 ? in.edges : in.points;
-  return contact::primitive_box(in, scene, list + int64_t{corners} * item, corners, item, reference);
+  const auto corner = [&](int32_t i) { return contact::corner_box(in, scene, i, reference); };
+  return contact::primitive_box(in, list + int64_t{corners} * item, corners, item, corner);
 }
 
 // Bounds of the points of each scene. A warp within one scene reduces before it writes.

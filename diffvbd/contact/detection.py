@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from ..ops import contact_lag
@@ -19,7 +20,7 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
         capacity: Pairs of all scenes that fit.
         room: How far the vertices of each body may go, and the largest [B, bodies + 1] [m]; None: nobody moves.
 
-    Returns:
+    Returns, with ``capacity`` rows, or on the CPU without torch.compile as many as there are pairs:
         pairs [capacity, 6] int32 (four corner points, kind, scene), constants [capacity, 8] (dhat, offset, threshold of
         the mollifier, hints), ptr [B N + 1] int32 and entry [4 capacity] int32 (4 pair + corner of each corner point);
         near_corners [B, N, 5] int32 (corners, kind), near_values [B, N, 8] (weights, normal, gap); counts [4] int64
@@ -31,7 +32,25 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
     return ops_contact.contact_detect(
         x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.held, room, s.bodies,
         barrier.self_contact, barrier.between_bodies, barrier.dhat, capacity,
+        not torch.compiler.is_compiling(),
     )  # fmt: skip
+
+
+def intersections(x: Tensor, origin: Tensor, colliders: Tensor, surface: ContactSurface, self_contact: bool,
+                  between_bodies: bool, capacity: int = 0) -> ops_contact.Intersections:  # fmt: skip
+    """Edges that pass through triangles and points behind planes, see :func:`diffvbd.ops.detect.contact_intersections`.
+
+    Args:
+        x: [B, V, 3] [m], relative to origin [B, V, 3] or empty.  colliders: Their points [B, Vc, 3] [m].
+        self_contact, between_bodies: Whether bodies may not cross themselves, and each other.
+        capacity: Crossings to list; their number and the first of each scene cost nothing.
+    """
+    s = surface
+    with torch.no_grad():
+        return ops_contact.contact_intersections(
+            x.detach().contiguous(), origin, colliders.detach().contiguous(), s.rest, s.radius, s.triangles, s.edges,
+            s.points, s.planes, s.body, s.held, s.bodies, self_contact, between_bodies, capacity,
+        )  # fmt: skip
 
 
 def islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, was: Tensor, now: Tensor, surface: ContactSurface,

@@ -93,50 +93,53 @@ class _TargetBackward(_Last):
 
 
 class PartStart(NamedTuple):
-    x: Tensor  # [B, V, 3]  where the sweeps start [m]
-    left: Tensor  # [B, V, 3]  what is left to go [m]
-    center: Tensor  # [B, V, 3]  from where it may go
-    room: Tensor  # [B, V]  as far as this [m]
-    cut: Tensor  # [B, 1, V] uint8: the way was not free
+    """Where the sweeps of a part start."""
+
+    x: Tensor  # [B, V, 3] [m]
+    center: Tensor  # [B, V, 3]  from where each vertex has its room [m]; a number, not a function of the start
+    room: Tensor  # [B, V]  how far from there it may go [m]
+    short: Tensor  # [B, V] bool: pairs have held up more than a hundredth of its way
     stuck: Tensor  # [1] int64: pairs that hinder what is prescribed
 
 
+SHORT = 0.99  # share of a way that counts as all of it
+
+
 def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
-                         planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface, room: Tensor
+                         planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface
                          ) -> PartStart:  # fmt: skip
-    """Every vertex as far along its way as pairs and floor let all go at once: first by ``move``, then by ``fall``."""
-    none = x.new_empty((0,))
-    floor = none if planes is None else planes
+    """Every vertex as far along its way as pairs and floor let all go at once: first by ``move``, then by ``fall``.
+
+    Args:
+        x, move, fall: [B, V, 3] [m].  mass: [1 | B, V] [kg].
+        was, now: Collider points before and during the sweeps, [B, Vc, 3] [m].
+        planes: Data of the FloorBarrier [1 | B, 7 planes], or None; differentiable as x, move, fall and mass.
+        origin: [B, V, 3] or empty.  detection: of the step.
+    """
+    floor = x.new_empty((0,)) if planes is None else planes
     index = (surface.held, surface.body, surface.body_order, surface.body_ptr, detection.island, detection.lowest)
     u = _Translation.apply(move, mass.contiguous(), x, floor, origin, index)
-    vertices = x.shape[1]
-    body = surface.body[:vertices].long()
-    own_room = room[:, body].contiguous()
-    listed = (detection.listed.pairs, detection.listed.constants, detection.listed.ptr, detection.listed.entry)
-    pinned = surface.held[:vertices, None]
-    at, center, stuck, cut = x, x.detach(), None, None
-    for n, way in enumerate((move, fall)):
-        by = u if n == 0 else torch.zeros_like(u)
-        here = was if n == 0 else now
+    body = surface.body[: x.shape[1]].long()
+    pinned = surface.held[: x.shape[1], None]
+    room, listed = detection.room[:, body].contiguous(), detection.listed
+    listed = (listed.pairs, listed.constants, listed.ptr, listed.entry)
+    at, center, still = x, x.detach(), torch.zeros_like(u)
+    shares, stuck = [], []
+    for way, by, here in ((move, u, was), (fall, still, now)):
+        target = at + way
         if floor.numel():
             target = _Target.apply(at, way, by, floor, origin, surface)
-        else:
-            target = at + way
         with torch.no_grad():
-            share, held_up = ops_contact_start.advance(
+            share, hindered = ops_contact_start.advance(
                 at.detach().contiguous(), (target - at).detach().contiguous(), by.detach(), center, origin,
-                here.detach(), now.detach(), surface.held, surface.body, own_room, listed,
+                here.detach(), now.detach(), surface.held, surface.body, room, listed,
             )  # fmt: skip
-            stuck = held_up if stuck is None else stuck + held_up
-            short = (share < 0.99) & ~pinned[:, 0]
-            cut = short if cut is None else cut | short
+        shares.append(share), stuck.append(hindered)
         base = at + by[:, body]
-        moved = base + share[..., None] * (target - base)
-        at = torch.where(pinned, target, moved)
-        if n == 0:
-            center = torch.where(pinned, x, x + u[:, body]).detach().contiguous()
-    assert stuck is not None and cut is not None
-    return PartStart(at, move + fall - (at - x), center, own_room, cut.to(torch.uint8)[:, None], stuck)
+        at = torch.where(pinned, target, base + share[..., None] * (target - base))
+        center = torch.where(pinned, center, center + by.detach()[:, body]).contiguous()
+    short = (torch.minimum(*shares) < SHORT) & ~pinned[:, 0]
+    return PartStart(at, center, room, short, stuck[0] + stuck[1])
 
 
 ops.ready_signature(_Translation, _TranslationBackward, _Target, _TargetBackward)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from ..checks import check_count, fail
+from ..contact.barrier import PairBarrier
+from ..contact.detection import intersections as find
+from ..contact.surface import build_surface
 from ..model.model import Model
-from ..reference.intersections import intersections as _intersections
 from ..scopes import record_to
 from ..step.contact import Detection, outcomes
 from .forces import ForceParts, Forces, forces
@@ -75,7 +78,7 @@ def status(model: Model) -> Status:
         capacity=outcome.capacity,
         touching=int(counts[:, 1].sum()),
         above_bounds=int(counts[:, 3].sum()),
-        cut=torch.stack([c.amax(1) > 0 for c in outcome.cut]).amax(0).sum(-1).tolist() if outcome.cut else [],
+        cut=outcome.cut.sum(-1).tolist(),
         smallest_gap=outcome.smallest.min(0).values.tolist(),
     )
 
@@ -111,22 +114,31 @@ def record() -> Iterator[list[Detection]]:
 
 
 def intersections(model: Model, x: Tensor) -> Tensor:
-    """Edges of the bodies' surfaces that pass through a triangle, [n, 3]: scene, edge row, triangle row of the surface.
+    """Edges of the bodies' surfaces that pass through a triangle, [n, 3] int64 on the CPU: scene, edge row, triangle
+    row of the surface.
 
-    Every edge is compared with every triangle that does not share a vertex with it: slow, apart from detection, for
-    checking a start or a result.
+    Whatever contact the Model has, every edge is compared with the triangles whose boxes it meets and with which it
+    shares no vertex, in double precision; for checking a start or a result. An edge and a triangle with features that
+    are one place of the material at rest (a crack, doubled vertices) do not count.
 
     Args:
         x: Positions [m], shape [..., V, 3].
-    """
-    from ..contact.colliders import unique_edges
 
+    Raises:
+        ValueError: For another shape, or positions that are not finite.
+    """
     if x.shape[-2:] != (model.num_vertices, 3):
         fail("x", f"shape [..., {model.num_vertices}, 3]", f"shape {list(x.shape)}")
-    triangles = model.mesh.surface
-    edges = unique_edges(triangles)
-    found = []
-    for scene, points in enumerate(x.detach().reshape(-1, model.num_vertices, 3).cpu().double()):
-        pairs = torch.as_tensor(_intersections(points, triangles, edges), device="cpu").reshape(-1, 2)
-        found.append(torch.cat([torch.full((len(pairs), 1), scene, device="cpu"), pairs], 1))
-    return torch.cat(found) if found else torch.zeros((0, 3), dtype=torch.int64, device="cpu")
+    points = x.detach().reshape(-1, model.num_vertices, 3).to(torch.float64)
+    bad = int((~torch.isfinite(points)).any(-1).sum())
+    if bad:
+        fail("x", "finite positions", f"{bad} that are not")
+    surface = build_surface(model.mesh, torch.zeros(model.num_vertices, dtype=torch.bool), PairBarrier(), ())
+    surface = surface.to(x.device, torch.float64)
+    none = points.new_empty((0,))
+    search = partial(find, points, none, points[:, :0], surface, self_contact=True, between_bodies=True)
+    found = search(capacity=len(surface.edges))
+    count = int(found.counts[:, 0].sum())
+    if count > len(found.pairs):
+        found = search(capacity=count)
+    return found.pairs[:count].long().cpu()

@@ -1,4 +1,5 @@
-"""The compiled operators of contact: detection, islands, sums over segments. Raw and functional, as in sweep.py.
+"""The compiled operators of contact: detection, intersections, islands, sums over segments. Raw and functional, as
+in sweep.py.
 
 Sizes: B scenes that never mix, V vertices, Vc collider points, N = V + Vc corner points (vertices first), F triangles,
 E edges, P points, L planes, NB bodies of the mesh. Index tensors are int32; float tensors have the dtype of x; all are
@@ -16,6 +17,7 @@ from .functions import raw_backward, shapes_of
 from .load import raw
 
 PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS = 6, 8, 5, 8, 4  # twins of those in csrc/contact/candidates.h
+CROSSING_ROW = 3  # and in csrc/contact/intersect.h
 
 
 class Detection(NamedTuple):
@@ -34,7 +36,7 @@ class Detection(NamedTuple):
 def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
                    triangles: Tensor, edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, held: Tensor,
                    room: Tensor, mesh_bodies: int, self_contact: bool, between_bodies: bool, dhat: float,
-                   capacity: int) -> Detection:  # fmt: skip
+                   capacity: int, trim: bool = False) -> Detection:  # fmt: skip
     """Near pair of every corner point, and the pairs that may come within reach of the barrier before the next call.
 
     The vertices of a body may go as far as its room beside what its island does; colliders have none. Pairs are looked
@@ -57,6 +59,8 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         self_contact, between_bodies: Which pairs of mesh bodies to consider.
         dhat: [m].
         capacity: Rows of the list.
+        trim: On the CPU, only as many rows as pairs fill: rows that none fills may cost more than the search. CUDA,
+            which would wait for their number, does not trim; torch.compile takes longer with sizes that it cannot know.
 
     Raises:
         ValueError: A tensor with the wrong shape, dtype or device; too large a scene.
@@ -64,7 +68,45 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
     return Detection(
         *raw.contact_detect(
             x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held,
-            room, mesh_bodies, self_contact, between_bodies, dhat, capacity,
+            room, mesh_bodies, self_contact, between_bodies, dhat, capacity, trim,
+        )
+    )  # fmt: skip
+
+
+class Intersections(NamedTuple):
+    """Edges of surfaces that pass through triangles, and points behind planes. Rows are those of the arguments."""
+
+    pairs: Tensor  # [capacity, 3] int32  scene, edge, triangle in lexicographic order, then -1
+    counts: Tensor  # [B, 2] int64  edges through triangles, points behind planes
+    first: Tensor  # [B, 2, 2] int32  the first edge and its triangle, the first point and its plane; or -1
+
+
+def contact_intersections(x: Tensor, origin: Tensor, collider: Tensor, rest: Tensor, radius: Tensor, triangles: Tensor,
+                          edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, held: Tensor, mesh_bodies: int,
+                          self_contact: bool, between_bodies: bool, capacity: int) -> Intersections:  # fmt: skip
+    """Crossings that contact cannot undo, because distances do not show them: a start must have none.
+
+    An edge crosses a triangle, with which it shares no vertex, when its ends lie on both sides of the plane and it
+    meets the closed triangle, border included. Signs are those of ``x + origin`` in double precision: an end that
+    rounding could bring to the other side does not count, a border that it could counts as met. What is not finite
+    crosses nothing. Pairs that :func:`contact_detect` does not consider do not count: two colliders, five held corner
+    points, bodies whose contact is off, and an edge and a triangle of one body with features that are one place at
+    rest. Not differentiable; results repeat to the bit.
+
+    Args:
+        x, origin, collider, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies, self_contact,
+            between_bodies: As for :func:`contact_detect`, collider points and planes at one time.
+        capacity: Rows of ``pairs``. Where ``counts[:, 0].sum()`` is more, CUDA lists any of them.
+
+    Raises:
+        ValueError: A tensor with the wrong shape, dtype or device; too large a scene.
+
+    Source: bounds of rounding after Shewchuk (1997).
+    """
+    return Intersections(
+        *raw.contact_intersections(
+            x, origin, collider, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies, self_contact,
+            between_bodies, capacity,
         )
     )  # fmt: skip
 
@@ -109,15 +151,24 @@ def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
 
 @shapes_of("contact_detect")
 def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, room,
-      mesh_bodies, self_contact, between_bodies, dhat, capacity):  # fmt: skip
+      mesh_bodies, self_contact, between_bodies, dhat, capacity, trim):  # fmt: skip
     b, n = x.shape[0], body.shape[0]
+    rows = torch.library.get_ctx().new_dynamic_size() if trim and x.device.type == "cpu" else capacity
 
     def integers(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
         return x.new_empty(shape, dtype=dtype)
 
-    return (integers(capacity, PAIR_ROW), x.new_empty((capacity, CONSTANTS)), integers(b * n + 1),
-            integers(4 * capacity), integers(b, n, NEAR_ROW), x.new_empty((b, n, NEAR_VALUES)),
+    return (integers(rows, PAIR_ROW), x.new_empty((rows, CONSTANTS)), integers(b * n + 1), integers(4 * rows),
+            integers(b, n, NEAR_ROW), x.new_empty((b, n, NEAR_VALUES)),
             integers(COUNTS, dtype=torch.int64), x.new_empty((b,)))  # fmt: skip
+
+
+@shapes_of("contact_intersections")
+def _(x, origin, collider, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies, self_contact,
+      between_bodies, capacity):  # fmt: skip
+    b = x.shape[0]
+    return (x.new_empty((capacity, CROSSING_ROW), dtype=torch.int32), x.new_empty((b, 2), dtype=torch.int64),
+            x.new_empty((b, 2, 2), dtype=torch.int32))  # fmt: skip
 
 
 @shapes_of("contact_islands")
@@ -131,5 +182,5 @@ def _(values, order, ptr):
     return values.new_empty((values.shape[0], ptr.shape[0] - 1, values.shape[2]))
 
 
-for _name in ("contact_detect", "contact_islands", "segment_sum"):
+for _name in ("contact_detect", "contact_intersections", "contact_islands", "segment_sum"):
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

@@ -1,8 +1,10 @@
-"""The executed step with contact: R times detection, bounds, start and sweeps (docs/method.md, section 12)."""
+"""The executed step with contact: R times detection, start, correction, sweeps and correction (docs/method.md, sections
+12 and 18)."""
 
 from __future__ import annotations
 
 import weakref
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,19 +18,26 @@ from ..contact.start import PartStart, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
-from ..reference.intersections import intersections
+from ..ops.detect import CONSTANTS
 from ..scopes import checking, recorders
-from .rigid_contact import Scene, correct
+from .intersections import refuse_intersections
+from .rigid_contact import Scenes, correct
+from .rooms import rooms, unsupported
 
 if TYPE_CHECKING:
     from .arguments import Prepared
     from .predict import Begun
 
-import os
+FREE = 1e15  # [m] room that nothing fills
+MOST_CAPACITY = 2**26
 
-STARTS, ENDS = int(os.environ.get("S", 1)), int(os.environ.get("E", 1))
-FREE = 1e15  # [m] a room that ends nowhere
-ROOM = 1.5  # how far a vertex may go, over how far the farthest of its body wants to go
+
+class TooManyPairs(RuntimeError):
+    """More pairs than fit; ``needed`` per scene."""
+
+    def __init__(self, needed: int, message: str) -> None:
+        super().__init__(message)
+        self.needed = needed
 
 
 class Detection(NamedTuple):
@@ -43,23 +52,25 @@ class Detection(NamedTuple):
     smallest: Tensor
     island: Tensor
     lowest: Tensor  # of a Model with a floor, else empty
-
-    def trimmed(self) -> Detection:
-        """Without the rows that no pair fills; reads the count."""
-        n, (pairs, constants, ptr, entry) = int(self.counts[0]), self.listed
-        listed = Pairs(pairs[:n].clone(), constants[:n].clone(), ptr, entry[: 4 * n].clone())
-        return self._replace(listed=listed)
+    room: Tensor  # [B, bodies + 1] [m]: how far the vertices of each body may go beside its island, and the largest
 
 
 class Outcome(NamedTuple):
     """What the latest step of a Model has met, on its device; read by diffvbd.contact.status."""
 
-    counts: (
-        Tensor  # [R, 4] int64: pairs needed, touching pairs, key of one or -1, corner points moved above their bound
-    )
+    counts: Tensor  # [R, 4] int64: pairs needed, touching pairs, key of one or -1, pairs that hinder what is prescribed
     capacity: int  # pairs of all scenes
-    cut: list[Tensor]  # [B, V] uint8, of each start and of each part's sweeps
+    cut: Tensor  # [B, V] bool: held up by pairs at the last start, or limited in the last sweep
     smallest: Tensor  # [R, B] [m]
+
+
+class Met:
+    """What the parts of a step meet one after another."""
+
+    def __init__(self) -> None:
+        self.found: list[Detection] = []
+        self.counts: list[Tensor] = []
+        self.cut = torch.zeros(())
 
 
 outcomes: weakref.WeakKeyDictionary[Model, Outcome] = weakref.WeakKeyDictionary()
@@ -73,10 +84,9 @@ def sweeps_of_parts(sweeps: int, parts: int) -> list[int]:
 class ContactStep:
     """What the parts of one step share."""
 
-    def __init__(self, model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor,
-                 prescribed: bool) -> None:  # fmt: skip
+    def __init__(self, model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor) -> None:
         begun = begun._replace(x_prev=begun.x_prev.contiguous(), y=begun.y.contiguous())
-        self.model, self.begun, self.prepared, self.prescribed = model, begun, prepared, prescribed
+        self.model, self.begun, self.prepared = model, begun, prepared
         self.x_prev = begun.x_prev
         # [B, Vc, 3] at the end and at the start of the step: one tensor if they rest
         self.before = before.contiguous()
@@ -132,183 +142,65 @@ class ContactStep:
 
     def run(self, policy: int, debug_step: int) -> Tensor:
         """Positions after all parts [B, V, 3]; raises where detection did not hold."""
-        begun, settings = self.begun, self.prepared.settings
+        settings = self.prepared.settings
         barrier, surface = self.barrier, self.surface
-        if barrier is None or surface is None:  # friction on a floor alone
-            x = begun.x_start
-            none, free = no_pairs(x, x.shape[0] * x.shape[1]), torch.full_like(x[..., 0], FREE)
-            return self._sweep(x, x.detach().contiguous(), free, self.colliders, none, settings, policy, debug_step)[0]
+        if barrier is None or surface is None:
+            return self._run_on_floor(policy, debug_step)
         if checking():
-            self._look_for_intersections()
-        lift = torch.where(self.model._pinned[:, None], torch.zeros_like(begun.lift), begun.lift)
-        lift = broadcast(lift, begun.y.shape)
-        x, way = self.x_prev, begun.y - self.x_prev - lift
-        left, pinned = torch.zeros_like(way), self.model._pinned[:, None]
-        cut: list[Tensor] = []
-        found: list[Detection] = []
-        counts: list[Tensor] = []
+            refuse_intersections(self.model, self.x_prev, self.origin, self.before)
+        pinned = self.model._pinned[:, None]
+        lift = torch.where(pinned, 0.0, broadcast(self.begun.lift, self.begun.y.shape))
+        x, way = self.x_prev, self.begun.y - self.x_prev - lift
+        left, met = way, Met()
         for r, sweeps in enumerate(sweeps_of_parts(settings.sweeps, self.parts)):
             was, now = (self._colliders_at(n / self.parts) for n in (r, r + 1))
-            move, fall = (way, lift) if r == 0 else (left, torch.zeros_like(lift))
-            if self.parts > 1:
-                move = torch.where(pinned, way / self.parts, move)
-            island, room = self._rooms(x, was, now, move, fall)
-            detection = self._detect(x, was, now, island, room)
-            found.append(detection)
+            # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
+            move = left if self.parts == 1 else torch.where(pinned, way / self.parts, left)
+            fall = lift if r == 0 else torch.zeros_like(lift)
+            detection = self._detect(x, was, now, move, fall)
+            met.found.append(detection)
             if not x.is_cuda and not torch.compiler.is_compiling():  # reading is free: before any work
-                counts.append(torch.cat([detection.counts[:3], detection.counts[3:]]))
-                self._record(found, counts, cut)
-                self._check(r, counts[-1].tolist())
-                counts.pop()
-                detection = found[-1] = detection.trimmed()
+                self._check(r, [*detection.counts[:3].tolist(), 0])
             if r == 0:
                 self._set_lag(detection.listed, was)
-                lift = self._supported(lift, x, was, detection.listed)
-                fall = lift
-            start = self._start(x, move, fall, was, now, detection, room)
-            counts.append(torch.cat([detection.counts[:3], start.stuck]))
-            x = start.x
-            cut.append(start.cut)
-            for _ in range(STARTS):
-                x = self._correct(x, was, now, start, detection)
+                fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
+                                          self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
+            start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
+                                         detection, surface)  # fmt: skip
+            met.counts.append(torch.cat([detection.counts[:3], start.stuck]))
+            if not x.is_cuda and not torch.compiler.is_compiling():
+                self._check(r, met.counts[-1].tolist())
+            x = self._corrected(start.x, now, start, detection.listed)
+            cut = start.short
             if sweeps:
                 part = settings._replace(sweeps=sweeps)
-                x, held_back = self._sweep(x, start.center, start.room, now, detection.listed, part, policy, debug_step)
-                cut.append(held_back)
-            for _ in range(ENDS):
-                x = self._correct(x, was, now, start, detection)
-            if r + 1 < self.parts:  # what has not come through tries again
-                goal = self.x_prev + way + lift
-                left = torch.where(start.cut[:, 0, :, None] > 0, goal - x, torch.zeros_like(x))
-        return self._judged(x, found, counts, cut)
+                x, limits = self._sweep(x, start.center, start.room, now, detection.listed, part, policy, debug_step)
+                x = self._corrected(x, now, start, detection.listed)
+                cut = cut | (limits[:, -1] > 0)
+            met.cut = cut
+            left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
+        return self._judged(x, met)
 
-    def _correct(self, x: Tensor, was: Tensor, now: Tensor, start: PartStart, detection: Detection) -> Tensor:
-        numbers, surface = self.prepared.settings.numbers, self.surface
-        assert surface is not None
-        scene = Scene(
-            self.x_prev,
-            self.begun.y,
-            self.fields.mass,
-            self.origin,
-            self.before,
-            was,
-            now,
-            self.kappa,
-            detection.listed,
-            self.lagged,
-            self.lag,
-            self.floor_lag,
-            start.center,
-            start.room,
-            surface,
-            self.model,
-            self.begun.data,
-            numbers.time_step,
-            numbers.friction_eps,
-        )
-        return correct(scene, x)
+    def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
+        """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
+        x = self.begun.x_start
+        room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
+        start = PartStart(x, x.detach(), room, room > 0, none.ptr[:1].long())
+        x = self._corrected(x, self.colliders, start, none)
+        if self.prepared.settings.sweeps:
+            x, _ = self._sweep(x, start.center, room, self.colliders, none, self.prepared.settings, policy, debug_step)
+            x = self._corrected(x, self.colliders, start, none)
+        return x
 
-    def _rooms(self, x: Tensor, was: Tensor, now: Tensor, move: Tensor, fall: Tensor) -> tuple[Tensor, Tensor]:
-        """Islands [B, bodies], and how far the vertices of each body may go beside them, and the largest,
-        [B, bodies + 1] [m]. What is within that of each other is looked for."""
-        surface, barrier = self.surface, self.barrier
-        assert surface is not None and barrier is not None
-        with torch.no_grad():
-            x, was, now, move = x.detach(), was.detach(), now.detach(), move.detach()
-            body = surface.body[: x.shape[1]].long()
-            mass = self.fields.mass.detach()
-            free = ~surface.held[: x.shape[1]]
-            weight = broadcast(torch.where(free, mass, torch.zeros_like(mass)), x.shape[:2])[..., None]
-
-            falls = fall.detach().square().sum(-1).sqrt()
-            falls = falls.new_zeros((x.shape[0], surface.bodies)).index_reduce_(1, body, falls, "amax")
-
-            def largest(beside: Tensor) -> Tensor:
-                length = torch.where(free, beside.square().sum(-1).sqrt(), beside.new_zeros(()))
-                out = length.new_zeros((x.shape[0], surface.bodies)).index_reduce_(1, body, length, "amax")
-                return ROOM * out + falls + barrier.dhat / 4
-
-            sums = x.new_zeros((x.shape[0], surface.bodies, 4))
-            sums.index_add_(1, body, torch.cat([weight * move, weight], -1))
-            own = sums[..., :3] / sums[..., 3:].clamp(min=torch.finfo(x.dtype).tiny)
-            room = largest(move - own[:, body]).clamp(max=surface.most_room)
-
-            def islands(room: Tensor) -> Tensor:
-                room = (
-                    torch.cat([room, room.amax(1, keepdim=True)], 1)
-                    if surface.bodies
-                    else room.new_zeros((x.shape[0], 1))
-                )
-                return search.islands(
-                    x, self.origin, move, mass, was, now, surface, barrier.dhat, room, self.any_direction
-                ), room
-
-            island, _ = islands(room)
-            label = island.clamp(min=0).long()
-            joined = torch.zeros_like(sums).scatter_add_(1, label[..., None].expand_as(sums), sums)
-            u = (joined[..., :3] / joined[..., 3:].clamp(min=torch.finfo(x.dtype).tiny)).gather(
-                1, label[..., None].expand(-1, -1, 3)
-            )
-            u = torch.where((island >= 0)[..., None], u, u.new_zeros(()))
-            room = torch.maximum(room, largest(move - u[:, body]).clamp(max=surface.most_room))
-            return islands(room)
-
-    def _supported(self, lift: Tensor, x: Tensor, was: Tensor, listed: Pairs) -> Tensor:
-        """The part of h^2 a that a body is free to go: what the forces of contact at the start of the step bear of
-        its acceleration is taken away."""
-        model, surface = self.model, self.surface
-        assert surface is not None
-        h2 = self.prepared.settings.numbers.time_step**2
-        state = pair_lag(x, was, self.kappa, self.origin, listed)
-        force, _, n, w = state.split((1, 1, 3, 4), -1)
-        rows = (force * w)[..., None] * n[:, None]  # [pairs, 4, 3]
-        points = x.shape[1] + was.shape[1]
-        used = (listed.pairs[:, :1] >= 0).to(x.dtype)[..., None]
-        index = (listed.pairs[:, 5:6].long() * points + listed.pairs[:, :4].long()).clamp(min=0)
-        total = x.new_zeros((x.shape[0] * points, 3)).index_add(0, index.reshape(-1), (used * rows).reshape(-1, 3))
-        total = total.reshape(x.shape[0], points, 3)[:, : x.shape[1]]
-        if self.floor_data is not None and model.floor is not None:
-            size, normal = model.floor.normal_force(x, self.floor_data, self.begun.origin)
-            total = total + (size[..., None] * broadcast(normal[:, None], (*size.shape, 3))).sum(2)
-        free = ~model._pinned
-        body = surface.body[: x.shape[1]].long()
-        mass = broadcast(self.fields.mass, x.shape[:2])
-        columns = torch.cat([mass[..., None] * lift, h2 * total, mass[..., None]], -1)
-        columns = torch.where(free[:, None], columns, torch.zeros_like(columns))
-        sums = x.new_zeros((x.shape[0], surface.bodies, 7)).index_add(1, body, columns)
-        whole = sums[..., 6:].clamp(min=torch.finfo(x.dtype).tiny)
-        mean, borne = sums[..., :3] / whole, sums[..., 3:6] / whole
-        square = (borne * borne).sum(-1, keepdim=True)
-        share = (-(mean * borne).sum(-1, keepdim=True) / square.clamp(min=torch.finfo(x.dtype).tiny)).clamp(0, 1)
-        pinned = x.new_zeros(surface.bodies).index_add(0, body, model._pinned.to(x.dtype)) > 0
-        taken = torch.where(pinned[:, None], torch.zeros_like(borne), share * borne)
-        return torch.where(free[:, None], lift + taken[:, body], lift)
-
-    def _start(self, x: Tensor, move: Tensor, fall: Tensor, was: Tensor, now: Tensor, detection: Detection, room: Tensor
-               ) -> PartStart:  # fmt: skip
-        surface = self.surface
-        assert surface is not None
-        return start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin, detection,
-                                    surface, room)  # fmt: skip
-
-    def _look_for_intersections(self) -> None:
-        """Distances do not show that surfaces pass through each other: debug_checks() compares edges with triangles."""
-        surface = self.surface
-        assert surface is not None
-        absolute = self.x_prev if self.origin.numel() == 0 else self.x_prev + self.origin
-        points = torch.cat([absolute, self.before], 1).detach().double().cpu()
-        triangles, edges = surface.triangles.cpu(), surface.edges.cpu()
-        for scene, at in enumerate(points):
-            if not bool(torch.isfinite(at).all()):
-                continue  # named elsewhere
-            found = intersections(at, triangles, edges)
-            if len(found):
-                edge, triangle = found[0].tolist()
-                raise ValueError(
-                    f"x: expected surfaces that do not intersect, got {len(found)} edges through triangles, one of the "
-                    f"corner points {surface.edges[edge].tolist()} and {surface.triangles[triangle].tolist()} in scene "
-                    f"{scene}"
-                )
+    def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> Tensor:
+        """x after the rigid correction of all bodies that are free."""
+        numbers = self.prepared.settings.numbers
+        scenes = Scenes(
+            self.model, self.x_prev, self.begun.y, self.fields.mass, self.begun.data, self.origin, self.before, collider,
+            self.kappa, listed, self.lagged, self.lag, self.floor_lag, start.center, start.room, self.surface,
+            numbers.time_step, numbers.friction_eps,
+        )  # fmt: skip
+        return correct(scenes, x)
 
     def _colliders_at(self, share: float) -> Tensor:
         if self.colliders is self.before:
@@ -319,37 +211,38 @@ class ContactStep:
                policy: int, debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
         lagged, model = self.lagged, self.model
         fields = self.fields._replace(
-            x_start=x, collider=collider, collider_prev=self.before, kappa=self.kappa,
+            x_start=x, center=center, room=room, collider=collider, collider_prev=self.before, kappa=self.kappa,
             **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs, lag_ptr=lagged.ptr, lag_entry=lagged.entry,
-            floor_lag=self.floor_lag, center=center, room=room,
+            floor_lag=self.floor_lag,
         )  # fmt: skip
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
-    def _detect(self, x: Tensor, was: Tensor, now: Tensor, island: Tensor, room: Tensor) -> Detection:
+    def _detect(self, x: Tensor, was: Tensor, now: Tensor, move: Tensor, fall: Tensor) -> Detection:
         surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
         with torch.no_grad():
             x, was, now = x.detach(), was.detach(), now.detach()
+            island, room = rooms(surface, barrier, x, self.origin, self.fields.mass, was, now, move, fall,
+                                 self.any_direction)  # fmt: skip
             *index, corners, values, counts, smallest = search.detect(
                 x, self.origin, was, now, surface, barrier, self.capacity, room
             )
             lowest = island.new_empty((0,))
             if self.floor_data is not None:
                 lowest = search.lowest(x, self.origin, self.floor_data.detach(), island, surface)
-        detection = Detection(Pairs(*index), corners, values, counts, smallest, island, lowest)
+        detection = Detection(Pairs(*index), corners, values, counts, smallest, island, lowest, room)
         for found in recorders():
             found.append(detection)
         return detection
 
-    def _record(self, found: list[Detection], counts: list[Tensor], cut: list[Tensor]) -> None:
-        smallest = torch.stack([d.smallest for d in found])
-        outcomes[self.model] = Outcome(torch.stack(counts), self.capacity, cut, smallest)
+    def _record(self, met: Met) -> None:
+        smallest = torch.stack([d.smallest for d in met.found])
+        outcomes[self.model] = Outcome(torch.stack(met.counts), self.capacity, met.cut, smallest)
 
-    def _judged(self, x: Tensor, found: list[Detection], counts: list[Tensor], cut: list[Tensor]) -> Tensor:
+    def _judged(self, x: Tensor, met: Met) -> Tensor:
         """x, or NaN where a captured or compiled step, which cannot raise, must not be trusted."""
-        self._record(found, counts, cut)
-        outcome = outcomes[self.model]
-        table, capacity = outcome.counts, outcome.capacity
+        self._record(met)
+        table, capacity = torch.stack(met.counts), self.capacity
         if torch.compiler.is_compiling() or (x.is_cuda and torch.cuda.is_current_stream_capturing()):
             good = (table[:, :2] <= torch.stack([table.new_full((), capacity), table.new_zeros(())])).all()
             good = good & (table[:, 3] == 0).all()
@@ -364,19 +257,22 @@ class ContactStep:
         """Pairs of all scenes that fit."""
         surface, barrier, scenes = self.surface, self.barrier, self.x_prev.shape[0]
         assert surface is not None and barrier is not None
+        if barrier.capacity is None and not self.x_prev.is_cuda and not torch.compiler.is_compiling():
+            return MOST_CAPACITY  # the list is as long as it must be
         return max(surface.capacity * scenes, 0 if barrier.capacity is not None else LEAST_CAPACITY)
 
     def _check(self, r: int, counts: list[int]) -> None:
         """Raises where a detection found more than fits, surfaces that touch, or motion above a bound."""
         surface = self.surface
         assert surface is not None
-        needed, touching, pair, above = counts
+        needed, touching, pair, hindered = counts
         scenes = self.x_prev.shape[0]
         if needed > self.capacity:
-            raise RuntimeError(
+            raise TooManyPairs(
+                -(-needed // scenes),
                 f"pair_barrier.capacity: {needed} pairs in part {r} of the step do not fit {self.capacity} "
                 f"({-(-self.capacity // scenes)} per scene): "
-                f"use diffvbd.contact.reserve(model, {2 * -(-needed // scenes)})"
+                f"use diffvbd.contact.reserve(model, {2 * -(-needed // scenes)})",
             )
         if touching:
             finite = all(
@@ -396,28 +292,34 @@ class ContactStep:
                 f"{named}: expected surfaces that do not touch, got {touching} pairs without a gap in part {r} of the "
                 f"step, one of the corner points {corners} in scene {scene}"
             )
-        if above:
+        if hindered:
             raise ValueError(
-                f"prescribed or colliders: expected motion below the bounds of contact, got {above} points moved "
-                f"farther in part {r} of {self.parts}: use a larger reach (now {surface.reach:g} m, which allows "
-                f"{surface.cap:g} m a part), more detections or a smaller time_step"
+                f"prescribed or colliders: expected motion that leaves bodies a way, got {hindered} pairs in part {r} of "
+                f"{self.parts} that it would bring too close: use more detections or a smaller time_step"
             )
 
 
 def no_pairs(like: Tensor, corners: int) -> Pairs:
     """An empty list for so many corner points of all scenes."""
     none = torch.zeros((corners + 1,), dtype=torch.int32, device=like.device)
-    return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, 8)), none, none[:0])
+    return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, CONSTANTS)), none, none[:0])
 
 
-def run_contact(model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor, prescribed: bool,
-                policy: int, debug_step: int) -> Tensor:  # fmt: skip
+def run_contact(model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor, policy: int,
+                debug_step: int) -> Tensor:  # fmt: skip
     """Positions after the sweeps of a step with contact.
 
     Args:
         before, colliders: Where the colliders are at its start and at its end, [B, Vc, 3] [m]; one tensor if they rest.
-        prescribed: Whether pinned vertices are moved.
     """
     if torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore[reportAttributeAccessIssue]
         no_transforms()
-    return ContactStep(model, begun, prepared, before, colliders, prescribed).run(policy, debug_step)
+    while True:
+        try:
+            return ContactStep(model, begun, prepared, before, colliders).run(policy, debug_step)
+        except TooManyPairs as error:
+            barrier, surface = model.contact, model.surface_of_contact
+            if barrier is None or surface is None or barrier.capacity is not None or 2 * error.needed > MOST_CAPACITY:
+                raise
+            # nobody has said how many there may be: again, with room for them
+            model.surface_of_contact = replace(surface, capacity=2 * error.needed)

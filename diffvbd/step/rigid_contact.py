@@ -1,9 +1,10 @@
 """The rigid correction of bodies that touch: all bodies of a scene moved, each as a whole, by one Newton step of the
 step's potential over their rigid motions.
 
-A rigid motion leaves the energy of the tets as it is. What remains is inertia, the energies of single vertices, the
-barriers between bodies and lagged friction and damping: sums over vertices and pairs, and six unknowns for each body.
-docs/method.md, section 18.
+    min over (w_b, t_b)   1/2 sum m |x - y|^2 + the energies of single vertices + barriers, friction and damping of pairs
+
+A rigid motion leaves the energy of the tets as it is, so that this costs sums over vertices and pairs, and six unknowns
+a body. It is what few sweeps do worst: they see neighbours, not the body. docs/method.md, section 18.
 """
 
 from __future__ import annotations
@@ -13,312 +14,323 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..adjoint.contact_lag import Pairs, of_scene, pair_lag
+from ..adjoint.contact_lag import Pairs, pair_lag
+from ..adjoint.sums import sum_by
 from ..contact.surface import ContactSurface
 from ..ops import broadcast
-from ..ops import contact_start as ops_contact_start
+from ..ops import contact_start as ops_start
 
-MOST_COUPLED = 64  # bodies of a scene whose system is solved as one; with more each body takes both sides' stiffness
-TRIES = 6  # of shorter motions
-LEAST_GAP = 0.1  # of its gap that a vertex keeps above a plane
+MOST_COUPLED = 64  # bodies of a scene that are solved for together; with more of them, one side of a pair at a time
+TRIES = 8  # of motions, each half as long
+LEAST_GAP = 0.1  # of its gap that a vertex keeps above a plane of the floor
+SPREADS = 4  # how often a shorter motion is handed on to the bodies that one touches
+RISE = 1e-9  # of the potential, that counts as none
+LEAST_STIFFNESS = 1e-12  # of its mass, that keeps the system of a body definite
+RESTING = 1e-6  # of the motion below which friction is smoothed; twin of kRestingMotion in csrc/contact/pairs.h
 
 
-class Scene(NamedTuple):
-    """What the correction reads; positions [B, V, 3]."""
+class Scenes(NamedTuple):
+    """What the correction reads; positions [B, V, 3] [m]."""
 
+    model: Any
     x_prev: Tensor
     y: Tensor
-    mass: Tensor  # [1 | B, V]
-    origin: Tensor  # or empty
-    collider_prev: Tensor  # at the start of the step, at the detection, and now
-    was: Tensor
-    collider: Tensor
+    mass: Tensor  # [1 | B, V] [kg]
+    data: Tensor  # of the energies
+    origin: Tensor  # [B, V, 3] or empty
+    collider_prev: Tensor  # at the start of the step, [B, Vc, 3]
+    collider: Tensor  # and now
     kappa: Tensor
     listed: Pairs
     lagged: Pairs
-    lag: Tensor
-    floor_lag: Tensor
-    center: Tensor
-    room: Tensor
-    surface: ContactSurface
-    model: Any
-    data: Tensor
+    lag: Tensor  # [pairs, 9]
+    floor_lag: Tensor  # [B, V, planes, 4] or empty
+    center: Tensor  # from where each vertex has its room
+    room: Tensor  # [B, V] [m]
+    surface: ContactSurface | None
     time_step: float
-    friction_eps: float
+    friction_eps: float  # [m]
 
 
-def _cross_matrix(r: Tensor) -> Tensor:
-    """[..., 3] -> [..., 3, 3]: the matrix of w -> w x r, which is -[r]x."""
-    zero = torch.zeros_like(r[..., 0])
+class _PairTerms(NamedTuple):
+    """What pairs add: force [n, 3] on the first side's motion, its derivative [n, 3, 3], weights [n, 4], and the
+    potential [n] of which they are."""
+
+    listed: Pairs
+    force: Tensor
+    stiffness: Tensor
+    weights: Tensor
+    value: Tensor
+
+
+def correct(s: Scenes, x: Tensor) -> Tensor:
+    """x [B, V, 3] after every free body has been moved, as far as pairs, floors and the potential let it."""
+    bodies = _Bodies(s, x)
+    motion = _newton_step(s, bodies, x)
+    return x + bodies.displaced(_share(s, bodies, x, motion)[..., None] * motion)
+
+
+class _Bodies:
+    """The bodies of all scenes, which of them move, and where their vertices are from their centers of mass."""
+
+    def __init__(self, s: Scenes, x: Tensor) -> None:
+        self.body = s.model.body
+        self.count = s.model.mesh.num_bodies
+        self.scenes = x.shape[0]
+        rows = self.body + self.count * torch.arange(self.scenes, device=x.device)[:, None]
+        self.rows = rows.reshape(-1)  # of the body of each vertex
+        mass = broadcast(s.mass, x.shape[:2])
+        self.mass = self.sum(mass[..., None])[..., 0]
+        held = self.sum(broadcast(s.model._pinned.to(x.dtype)[None, :, None], (*x.shape[:2], 1)))[..., 0]
+        self.free = (held == 0) & (self.mass > 0)
+        whole = self.mass.clamp(min=torch.finfo(x.dtype).tiny)[..., None]
+        self.arm = x - (self.sum(mass[..., None] * x) / whole)[:, self.body]
+
+    def sum(self, values: Tensor) -> Tensor:
+        """[B, V, ...] -> [B, bodies, ...]"""
+        return sum_by(values.flatten(0, 1), self.rows, self.scenes * self.count).unflatten(0, (self.scenes, self.count))
+
+    def least(self, values: Tensor) -> Tensor:
+        """[B, V] -> [B, bodies]"""
+        out = torch.ones_like(self.mass).reshape(-1)
+        return out.scatter_reduce(0, self.rows, values.reshape(-1), "amin").reshape(self.mass.shape)
+
+    def displaced(self, motion: Tensor) -> Tensor:
+        """What a turn and a shift of each body [B, bodies, 6] do to its vertices, exactly, [B, V, 3]."""
+        turn = _rotation(motion[..., :3]) - torch.eye(3, dtype=motion.dtype, device=motion.device)
+        return (turn[:, self.body] @ self.arm[..., None])[..., 0] + motion[:, self.body, 3:]
+
+
+def _turning(r: Tensor) -> Tensor:
+    """[..., 3] -> [..., 3, 6]: how a point at r from the center moves with a turn and a shift."""
+    zero, eye = torch.zeros_like(r[..., 0]), torch.eye(3, dtype=r.dtype, device=r.device)
     x, y, z = r.unbind(-1)
-    return torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).unflatten(-1, (3, 3))
-
-
-def _friction_rate(length: Tensor, eps: float) -> Tensor:
-    sticks = length < eps
-    return torch.where(sticks, (2 - length / eps) / eps, 1 / torch.where(sticks, torch.ones_like(length), length))
-
-
-def _length(u: Tensor, eps: float) -> Tensor:
-    square = (u * u).sum(-1)
-    moves = square > (1e-6 * eps) ** 2
-    return torch.where(moves, torch.where(moves, square, torch.ones_like(square)).sqrt(), square.detach().sqrt())
+    turn = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).unflatten(-1, (3, 3))
+    return torch.cat([turn, eye.expand(turn.shape)], -1)
 
 
 def _rotation(w: Tensor) -> Tensor:
-    """exp([w]x) of w [..., 3]."""
+    """The rotation by |w| about w, [..., 3, 3]."""
     square = (w * w).sum(-1)[..., None, None]
     small = square < 1e-8
     safe = torch.where(small, torch.ones_like(square), square)
     angle = safe.sqrt()
-    a = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)
-    b = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / safe)
-    k = -_cross_matrix(w)
-    return torch.eye(3, dtype=w.dtype, device=w.device) + a * k + b * (k @ k)
+    first = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)
+    second = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / safe)
+    k = _turning(w)[..., :3].mT
+    return torch.eye(3, dtype=w.dtype, device=w.device) + first * k + second * (k @ k)
 
 
-class _Bodies:
-    """Sums over bodies, and which of them move."""
-
-    def __init__(self, s: Scene, x: Tensor) -> None:
-        self.count, vertices = s.surface.bodies, x.shape[1]
-        self.body = s.surface.body[:vertices].long()
-        self.mass = broadcast(s.mass, x.shape[:2])
-        pinned = s.model._pinned
-        held = x.new_zeros(self.count).index_add(0, self.body, pinned.to(x.dtype)) > 0
-        self.total = self.sum(self.mass[..., None])[..., 0]
-        self.free = ~held & (self.total > 0)  # [B, bodies]
-        whole = self.total.clamp(min=torch.finfo(x.dtype).tiny)[..., None]
-        self.center = self.sum(self.mass[..., None] * x) / whole
-        self.arm = x - self.center[:, self.body]
-
-    def sum(self, values: Tensor) -> Tensor:
-        """[B, V, ...] -> [B, bodies, ...]"""
-        return values.new_zeros((values.shape[0], self.count, *values.shape[2:])).index_add(1, self.body, values)
+def _outer(n: Tensor) -> Tensor:
+    return n[..., None] * n[..., None, :]
 
 
-def newton_step(s: Scene, x: Tensor) -> tuple[Tensor, _Bodies]:
-    """Turn and shift of each body [B, bodies, 6]."""
-    b = _Bodies(s, x)
+def _slip(u: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+    """Friction's potential f0 of slips u [..., 3], and f0'(|u|) / |u|."""
+    square = (u * u).sum(-1)
+    moves = square > (RESTING * eps) ** 2
+    length = torch.where(moves, torch.where(moves, square, torch.ones_like(square)).sqrt(), square.detach().sqrt())
+    slow = length < eps
+    value = torch.where(slow, length**2 / eps - length**3 / (3 * eps**2) + eps / 3, length)
+    return value, torch.where(slow, (2 - length / eps) / eps, 1 / torch.where(slow, torch.ones_like(length), length))
+
+
+def _log_barrier(gap: Tensor, dhat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """b / kappa and its first two derivatives, of gaps in (0, dhat)."""
+    past, log = gap - dhat, torch.log(gap / dhat)
+    part = past / gap
+    return -past * past * log, -past * (2 * log + part), -(2 * log + 4 * part - part * part)
+
+
+def _vertex_terms(s: Scenes, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of inertia, energies of single vertices and friction on a floor: gradient [B, V, 3], blocks [B, V, 3, 3] that are
+    at least its derivative, and the potential of each scene [B]."""
     h, h2, model = s.time_step, s.time_step**2, s.model
-    scenes, nb = x.shape[0], b.count
     eye = torch.eye(3, dtype=x.dtype, device=x.device)
-    force = b.mass[..., None] * (x - s.y)
-    stiff = b.mass[..., None, None] * eye
+    mass = broadcast(s.mass, x.shape[:2])
+    off = torch.where(model._pinned[:, None], torch.zeros_like(x), x - s.y)
+    force, stiffness = mass[..., None] * off, mass[..., None, None] * eye
+    value = (0.5 * mass * (off * off).sum(-1)).sum(1)
     origin = None if s.origin.numel() == 0 else s.origin
-    start = 0
+    first = 0
     for energy in model.vertex_energies:
         size = energy.count() * (model.num_vertices if energy.per_vertex else 1)
-        data = s.data[:, start : start + size]
-        start += size
+        data, first = s.data[:, first : first + size], first + size
         force = force + energy.gradient(x, s.x_prev, data, h, origin)
-        if energy is model.floor:
-            normal, kappa, dhat, damping = energy._columns(data)
-            gap, before = (energy._gaps(at, data, origin) for at in (x, s.x_prev))
-            near = (gap > 0) & (gap < dhat)
-            d = torch.where(near, gap, dhat)
-            second = -kappa * (2 * torch.log(d / dhat) + 4 * (d - dhat) / d - ((d - dhat) / d) ** 2)
-            size = h2 * torch.where(near, second, torch.zeros_like(d)) + h * torch.where(before < dhat, damping, 0.0)
-            stiff = stiff + ((size[..., None] * normal)[..., None] * normal[..., None, :]).sum(2)
-        elif energy.per_vertex:
-            spring = data.reshape(data.shape[0], -1, 4)[..., 0]
-            stiff = stiff + h2 * spring[..., None, None] * eye
+        stiffness = stiffness + energy.blocks(x, s.x_prev, data, h, origin)
+        value = value + energy.value(x, s.x_prev, data, h, origin).sum(1)
     if s.floor_lag.numel():
-        size, n = s.floor_lag[..., 0], s.floor_lag[..., 1:]
+        load, n = s.floor_lag[..., 0], s.floor_lag[..., 1:]
         travel = (x - s.x_prev)[:, :, None]
         u = travel - n * (n * travel).sum(-1, keepdim=True)
-        rate = h2 * size * _friction_rate(_length(u, s.friction_eps), s.friction_eps)
-        force = force + (rate[..., None] * u).sum(2)
-        stiff = stiff + (rate[..., None, None] * (eye - n[..., None] * n[..., None, :])).sum(2)
-    jac = torch.cat([_cross_matrix(b.arm), eye.expand(*x.shape[:2], 3, 3)], -1)  # [B, V, 3, 6]
-    g = b.sum((jac.transpose(-1, -2) @ force[..., None])[..., 0])
-    diagonal = b.sum(jac.transpose(-1, -2) @ stiff @ jac)  # [B, nb, 6, 6]
-    coupled = nb <= MOST_COUPLED
-    cells = x.new_zeros((scenes * nb * (nb if coupled else 1), 6, 6))
+        potential, rate = _slip(u, s.friction_eps)
+        force = force + h2 * ((load * rate)[..., None] * u).sum(2)
+        stiffness = stiffness + h2 * ((load * rate)[..., None, None] * (eye - _outer(n))).sum(2)
+        value = value + h2 * (load * potential).sum((1, 2))
+    return force, stiffness, value
+
+
+def _corners(listed: Pairs) -> tuple[Tensor, Tensor]:
+    """Scene [n, 1] and corner points [n, 4] of pairs; of rows that no pair fills, the first."""
+    rows = listed.pairs.long().clamp(min=0)
+    return rows[:, 5:], rows[:, :4]
+
+
+def _pair_terms(s: Scenes, x: Tensor) -> list[_PairTerms]:
+    """Of barriers, and of lagged friction and damping."""
+    h, h2 = s.time_step, s.time_step**2
     points = torch.cat([x, s.collider], 1)
-    arms = torch.cat([b.arm, torch.zeros_like(s.collider)], 1)
-    label = s.surface.body.long()
-    moves = torch.cat([b.free, b.free.new_zeros((scenes, label.max() + 1 - nb if label.numel() else 0))], 1)
-
-    def sides(listed: Pairs, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Rows of used pairs, scenes, bodies of both sides [n, 2] (-1: does not move), maps [n, 2, 3, 6]."""
-        scene, corners = listed.pairs[:, 5].long(), listed.pairs[:, :4].long()
-        first = torch.where(listed.pairs[:, 4] == 1, 2, 1)[:, None] > torch.arange(4, device=x.device)
-        arm = arms[scene[:, None], corners]
-        one = torch.cat([_cross_matrix(arm), eye.expand(*arm.shape[:2], 3, 3)], -1)  # [n, 4, 3, 6]
-        maps = w[..., None, None] * one
-        both = torch.stack([torch.where(side[..., None, None], maps, 0.0).sum(1) for side in (first, ~first)], 1)
-        second = torch.where(listed.pairs[:, 4] == 1, 2, 1)[:, None]
-        body = torch.stack([label[corners[:, 0]], label[corners.gather(1, second.long())[:, 0]]], 1)
-        there = moves[scene[:, None], body.clamp(max=moves.shape[1] - 1)]
-        there = there & (body[:, :1] != body[:, 1:])
-        return scene, torch.where(there, body, -1), both, there
-
-    def add(g: Tensor, diagonal: Tensor, cells: Tensor, listed: Pairs, w: Tensor, q: Tensor, S: Tensor):
-        scene, body, maps, there = sides(listed, w)
-        maps = torch.where(there[..., None, None], maps, 0.0)
-        row = scene[:, None] * nb + body.clamp(min=0)
-        pull = (maps.transpose(-1, -2) @ q[:, None, :, None])[..., 0]
-        g = g.reshape(-1, 6).index_add(0, row.reshape(-1), pull.reshape(-1, 6)).reshape(g.shape)
-        pressed = S[:, None] @ maps  # [n, 2, 3, 6]
-        for i in range(2):
-            own = maps[:, i].transpose(-1, -2)
-            if coupled:
-                for j in range(2):
-                    at = (scene * nb + body[:, i].clamp(min=0)) * nb + body[:, j].clamp(min=0)
-                    cells = cells.index_add(0, at, own @ pressed[:, j])
-            else:
-                twice = torch.where(there.all(1), 2.0, 1.0)[:, None, None]
-                cells = cells.index_add(0, row[:, i], twice * (own @ pressed[:, i]))
-        return g, diagonal, cells
-
+    out = []
     if s.listed.pairs.shape[0]:
-        state = pair_lag(x, s.collider, s.kappa, s.origin, s.listed)
-        load, active, n, w = state.split((1, 1, 3, 4), -1)
-        corners, scene = s.listed.pairs[:, :4].long(), s.listed.pairs[:, 5].long()
-        at = points[scene[:, None], corners]
-        at = at - at[:, :1].detach()
-        if origin is not None:
-            lifted = torch.cat([s.origin, torch.zeros_like(s.collider)], 1)[scene[:, None], corners]
-            at = at + (lifted - lifted[:, :1])
-        gap = (w * (at * n[:, None]).sum(-1)).sum(-1) - s.listed.constants[:, 1]
-        dhat = s.listed.constants[:, 0]
+        force, active, n, w = pair_lag(x, s.collider, s.kappa, s.origin, s.listed).split((1, 1, 3, 4), -1)
+        scene, corners = _corners(s.listed)
+        at = points[scene, corners]
+        if s.origin.numel():
+            at = at + torch.cat([s.origin, torch.zeros_like(s.collider)], 1)[scene, corners]
+        dhat, offset = s.listed.constants[:, 0], s.listed.constants[:, 1]
         near = active[:, 0] > 0
-        d = torch.where(near, gap, 0.5 * dhat)
-        past, log = d - dhat, torch.log(d / dhat)
-        ratio = (2 * log + 4 * past / d - (past / d) ** 2) / (2 * past * log + past**2 / d)
-        curvature = torch.where(near, -load[:, 0] * ratio, torch.zeros_like(gap))
-        q = -h2 * load * n
-        g, diagonal, cells = add(
-            g, diagonal, cells, s.listed, w, q, h2 * curvature[:, None, None] * n[..., None] * n[..., None, :]
-        )
+        height = ((at - at[:, :1].detach()) * n[:, None]).sum(-1)
+        gap = torch.where(near, (w * height).sum(-1) - offset, 0.5)
+        b, slope, curvature = _log_barrier(gap, torch.where(near, dhat, 1.0))
+        # the force carries stiffness and mollifier: what is left are ratios of the barrier's derivatives
+        load = h2 * torch.where(near, force[:, 0] / -slope, 0.0)
+        out.append(_PairTerms(s.listed, -h2 * force * n, (load * curvature)[:, None, None] * _outer(n), w, load * b))
     if s.lag.numel():
-        size, rate, n, w = s.lag.split((1, 1, 3, 4), -1)
-        corners, scene = s.lagged.pairs[:, :4].long(), s.lagged.pairs[:, 5].long()
-        moved = points[scene[:, None], corners] - torch.cat([s.x_prev, s.collider_prev], 1)[scene[:, None], corners]
+        load, rate, n, w = s.lag.split((1, 1, 3, 4), -1)
+        scene, corners = _corners(s.lagged)
+        moved = points[scene, corners] - torch.cat([s.x_prev, s.collider_prev], 1)[scene, corners]
         m = (w[..., None] * moved).sum(1)
         along = (n * m).sum(-1, keepdim=True)
-        u = m - along * n
-        slip = h2 * size * _friction_rate(_length(u, s.friction_eps), s.friction_eps)[:, None]
-        q = slip * u + h * rate * along.clamp(max=0) * n
-        outer = n[..., None] * n[..., None, :]
-        g, diagonal, cells = add(
-            g, diagonal, cells, s.lagged, w, q, slip[..., None] * (eye - outer) + (h * rate)[..., None] * outer
-        )
+        approach, u = along.clamp(max=0), m - along * n
+        potential, slip = _slip(u, s.friction_eps)
+        slip = h2 * load * slip[:, None]
+        eye = torch.eye(3, dtype=x.dtype, device=x.device)
+        stiffness = slip[..., None] * (eye - _outer(n)) + (h * rate)[..., None] * _outer(n)
+        value = h2 * load[:, 0] * potential + 0.5 * h * (rate * approach**2)[:, 0]
+        out.append(_PairTerms(s.lagged, slip * u + h * rate * approach * n, stiffness, w, value))
+    return out
+
+
+def _potential(s: Scenes, x: Tensor) -> Tensor:
+    """Of each scene [B] [kg m^2], without tets."""
+    value = _vertex_terms(s, x)[2]
+    for terms in _pair_terms(s, x):
+        scene = _corners(terms.listed)[0][:, 0]
+        value = value + sum_by(terms.value[:, None], scene, x.shape[0])[:, 0]
+    return value
+
+
+def _sides(s: Scenes, bodies: _Bodies, listed: Pairs, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows of the bodies of both sides of pairs [n, 2], -1 where one does not move or both are one; and how a side moves
+    with its body [n, 2, 3, 6]."""
+    surface = s.surface
+    assert surface is not None
+    scene, corners = _corners(listed)
+    kind = listed.pairs[:, 4:5]
+    sides = torch.where(kind == 1, 2, 1)
+    first = sides > torch.arange(4, device=kind.device)
+    lead = torch.cat([corners[:, :1], corners.gather(1, sides)], 1)
+    body = surface.body.long()[lead]
+    mesh = body < bodies.count
+    rows = scene * bodies.count + body.clamp(max=bodies.count - 1)
+    there = mesh & bodies.free.reshape(-1)[rows] & (body[:, :1] != body[:, 1:]) & (kind >= 0)
+    arms = bodies.arm[scene, corners.clamp(max=bodies.arm.shape[1] - 1)]
+    one = weights[..., None, None] * _turning(arms)
+    maps = torch.stack([torch.where(side[..., None, None], one, 0.0).sum(1) for side in (first, ~first)], 1)
+    return torch.where(there, rows, -1), torch.where(there[..., None, None], maps, 0.0)
+
+
+def _newton_step(s: Scenes, bodies: _Bodies, x: Tensor) -> Tensor:
+    """Turn and shift of each body [B, bodies, 6]."""
+    n, rows = bodies.count, bodies.scenes * bodies.count
+    together = n <= MOST_COUPLED
+    force, stiffness, _ = _vertex_terms(s, x)
+    maps = _turning(bodies.arm)
+    g = bodies.sum((maps.mT @ force[..., None])[..., 0]).reshape(rows, 6)
+    own = bodies.sum(maps.mT @ stiffness @ maps).reshape(rows, 6, 6)
+    across = []
+    for terms in _pair_terms(s, x):
+        row, maps = _sides(s, bodies, terms.listed, terms.weights)
+        at = row.clamp(min=0)
+        pulled = (maps.mT @ terms.force[:, None, :, None])[..., 0]
+        g = g + sum_by(pulled.flatten(0, 1), at.flatten(), rows)
+        pressed = terms.stiffness[:, None] @ maps
+        # where sides are not solved for together, each bears what both would: then no step is too long
+        twice = 1.0 if together else torch.where((row >= 0).all(1), 2.0, 1.0)[:, None, None, None]
+        own = own + sum_by((maps.mT @ (twice * pressed)).flatten(0, 1), at.flatten(), rows)
+        if together:
+            cell = at[:, 0] * n + at[:, 1] % n
+            across.append(sum_by(maps[:, 0].mT @ pressed[:, 1], cell, rows * n))
+    free = bodies.free.reshape(-1)
     six = torch.eye(6, dtype=x.dtype, device=x.device)
-    scale = torch.where(b.free, b.total, torch.ones_like(b.total))
-    if coupled:
-        matrix = cells.reshape(scenes, nb, nb, 6, 6)
-        matrix = matrix + torch.diag_embed(diagonal.permute(0, 2, 3, 1), dim1=1, dim2=2)
-        keep = b.free[:, :, None] & b.free[:, None]
-        matrix = torch.where(keep[..., None, None], matrix, 0.0)
-        fill = torch.where(b.free, 1e-12 * b.total, torch.ones_like(b.total))
-        matrix = matrix + torch.diag_embed((fill[:, :, None, None] * six).permute(0, 2, 3, 1), dim1=1, dim2=2)
-        matrix = matrix.permute(0, 1, 3, 2, 4).reshape(scenes, 6 * nb, 6 * nb)
-        right = torch.where(b.free[..., None], -g, torch.zeros_like(g)).reshape(scenes, 6 * nb, 1)
-        z = torch.cholesky_solve(right, torch.linalg.cholesky_ex(matrix)[0]).reshape(scenes, nb, 6)
-    else:
-        matrix = torch.where(b.free[..., None, None], diagonal + cells.reshape(scenes, nb, 6, 6), six)
-        matrix = matrix + (1e-12 * scale)[..., None, None] * six
-        right = torch.where(b.free[..., None], -g, torch.zeros_like(g))[..., None]
-        z = torch.cholesky_solve(right, torch.linalg.cholesky_ex(matrix)[0])[..., 0]
-    return z, b
+    fill = torch.where(free, LEAST_STIFFNESS * bodies.mass.reshape(-1), 1.0)
+    own = torch.where(free[:, None, None], own, 0.0) + fill[:, None, None] * six
+    g = torch.where(free[:, None], -g, 0.0)
+    if not together or not across:
+        return _solved(own, g[..., None]).reshape(bodies.scenes, n, 6)
+    between = sum(across[1:], across[0]).reshape(bodies.scenes, n, n, 6, 6)
+    matrix = between + between.permute(0, 2, 1, 4, 3)
+    matrix = matrix + torch.diag_embed(own.reshape(bodies.scenes, n, 6, 6).permute(0, 2, 3, 1), dim1=1, dim2=2)
+    matrix = matrix.permute(0, 1, 3, 2, 4).reshape(bodies.scenes, 6 * n, 6 * n)
+    return _solved(matrix, g.reshape(bodies.scenes, 6 * n, 1)).reshape(bodies.scenes, n, 6)
 
 
-def potential(s: Scene, x: Tensor) -> Tensor:
-    """Of the step at x, without tets, [B] [kg m^2]; not to be differentiated."""
-    h, h2, model = s.time_step, s.time_step**2, s.model
-    mass = broadcast(s.mass, x.shape[:2])
-    total = (0.5 * mass * (x - s.y).square().sum(-1) * (~model._pinned)).sum(1)
-    origin = None if s.origin.numel() == 0 else s.origin
-    start = 0
-    for energy in model.vertex_energies:
-        size = energy.count() * (model.num_vertices if energy.per_vertex else 1)
-        total = total + energy.value(x, s.x_prev, s.data[:, start : start + size], h, origin).sum(1)
-        start += size
-
-    def slip(u: Tensor) -> Tensor:
-        length, eps = _length(u, s.friction_eps), s.friction_eps
-        slow = length < eps
-        return torch.where(slow, length**2 / eps - length**3 / (3 * eps**2) + eps / 3, length)
-
-    if s.floor_lag.numel():
-        size, n = s.floor_lag[..., 0], s.floor_lag[..., 1:]
-        travel = (x - s.x_prev)[:, :, None]
-        total = total + h2 * (size * slip(travel - n * (n * travel).sum(-1, keepdim=True))).sum((1, 2))
-    points = torch.cat([x, s.collider], 1)
-    if s.listed.pairs.shape[0]:
-        state = pair_lag(x, s.collider, s.kappa, s.origin, s.listed)
-        load, active, n, w = state.split((1, 1, 3, 4), -1)
-        corners, scene = s.listed.pairs[:, :4].long(), s.listed.pairs[:, 5].clamp(min=0).long()
-        at = points[scene[:, None], corners]
-        at = at - at[:, :1].detach()
-        if origin is not None:
-            lifted = torch.cat([s.origin, torch.zeros_like(s.collider)], 1)[scene[:, None], corners]
-            at = at + (lifted - lifted[:, :1])
-        gap = (w * (at * n[:, None]).sum(-1)).sum(-1) - s.listed.constants[:, 1]
-        dhat = s.listed.constants[:, 0]
-        near = active[:, 0] > 0
-        d = torch.where(near, gap, 0.5 * dhat)
-        past, log = d - dhat, torch.log(d / dhat)
-        value = torch.where(near, load[:, 0] * past**2 * log / (2 * past * log + past**2 / d) * -1, torch.zeros_like(d))
-        total = total.index_add(0, scene, -h2 * value * -1)
-    if s.lag.numel():
-        size, rate, n, w = s.lag.split((1, 1, 3, 4), -1)
-        corners, scene = s.lagged.pairs[:, :4].long(), s.lagged.pairs[:, 5].clamp(min=0).long()
-        moved = points[scene[:, None], corners] - torch.cat([s.x_prev, s.collider_prev], 1)[scene[:, None], corners]
-        m = (w[..., None] * moved).sum(1)
-        along = (n * m).sum(-1, keepdim=True)
-        damped = (0.5 * h * rate * along.clamp(max=0) ** 2)[:, 0]
-        total = total.index_add(0, scene, h2 * size[:, 0] * slip(m - along * n) + damped)
-    return total
+def _solved(matrix: Tensor, right: Tensor) -> Tensor:
+    return torch.cholesky_solve(right, torch.linalg.cholesky_ex(matrix)[0])[..., 0]
 
 
-def _displaced(b: _Bodies, z: Tensor) -> Tensor:
-    turn = _rotation(z[..., :3]) - torch.eye(3, dtype=z.dtype, device=z.device)
-    return (turn[:, b.body] @ b.arm[..., None])[..., 0] + z[:, b.body, 3:]
+@torch.no_grad()
+def _share(s: Scenes, bodies: _Bodies, x: Tensor, motion: Tensor) -> Tensor:
+    """What of its motion each body takes [B, bodies]: 1, 1/2, 1/4, ... or 0, so that nothing crosses and no scene's
+    potential rises. It is decided, not differentiated."""
+    x, motion = x.detach(), motion.detach()
+    share, taken = torch.ones_like(bodies.mass), torch.zeros_like(bodies.mass)
+    motion = torch.where(torch.isfinite(motion).all(-1, keepdim=True), motion, 0.0)
+    before = _potential(s, x)
+    touching = _touching(s, bodies, x)
+    for _ in range(TRIES):
+        move = bodies.displaced(share[..., None] * motion)
+        fits = bodies.least(_fits(s, x, move)) >= 1
+        safe = fits.all(1) & (_potential(s, x + move) <= before + RISE * before.abs())
+        taken = torch.where(safe[:, None] & (taken == 0), share, taken)
+        if not x.is_cuda and not torch.compiler.is_compiling() and bool((safe | (taken > 0).all(1)).all()):
+            break
+        low = torch.where(fits & ~(fits.all(1, keepdim=True) & ~safe[:, None]), 1.0, 0.5)
+        for _ in range(SPREADS):
+            for row in touching:
+                pair = low.reshape(-1)[row].amin(1)
+                flat = low.reshape(-1)
+                for side in range(2):
+                    flat = flat.scatter_reduce(0, row[:, side], pair, "amin")
+                low = flat.reshape(low.shape)
+        share = share * low
+    return taken
 
 
-def _share(s: Scene, x: Tensor, z: Tensor, b: _Bodies) -> Tensor:
-    """What of its motion each body may take [B, bodies]: 1, 1/2, 1/4, ... or 0."""
-    with torch.no_grad():
-        x = x.detach()
-        share = torch.ones_like(b.total)
-        none = x.new_zeros((x.shape[0], b.count, 3))
+def _touching(s: Scenes, bodies: _Bodies, x: Tensor) -> list[Tensor]:
+    """Rows of bodies between which a pair acts [n, 2]; where none does, of one body twice."""
+    if not s.listed.pairs.shape[0]:
+        return []
+    state = pair_lag(x, s.collider, s.kappa, s.origin, s.listed)
+    row, _ = _sides(s, bodies, s.listed, state[:, 5:])
+    acts = (state[:, 1] > 0) & (row >= 0).all(1)
+    return [torch.where(acts[:, None], row, 0)]
+
+
+def _fits(s: Scenes, x: Tensor, move: Tensor) -> Tensor:
+    """1 where a vertex may move so [B, V], less elsewhere."""
+    out = torch.ones_like(x[..., 0])
+    if s.surface is not None:
+        none = x.new_zeros((x.shape[0], s.surface.bodies, 3))
         listed = (s.listed.pairs, s.listed.constants, s.listed.ptr, s.listed.entry)
-        still = s.collider.detach()
-        floor = s.model.floor
-        for attempt in range(TRIES):
-            move = _displaced(b, share[..., None] * z.detach())
-            got, _ = ops_contact_start.advance(
-                x,
-                move.contiguous(),
-                none,
-                s.center,
-                s.origin,
-                still,
-                still,
-                s.surface.held,
-                s.surface.body,
-                s.room,
-                listed,
-                False,
-            )
-            if floor is not None:
-                data = s.data[:, : floor.count()].detach()
-                origin = None if s.origin.numel() == 0 else s.origin
-                keeps = floor.admits(x + move, x, data, origin, LEAST_GAP)
-                got = torch.where(keeps, got, 0.5 * torch.ones_like(got))
-            least = torch.ones_like(share).index_reduce_(1, b.body, got, "amin")
-            low = torch.exp2(torch.floor(torch.log2(least.clamp(min=2.0**-8))))
-            if attempt + 1 == TRIES or bool((low == 1).all()):
-                break
-            share = share * low
-        return torch.where(low == 1, share, torch.zeros_like(share)) if bool((low < 1).any()) else share
-
-
-def correct(s: Scene, x: Tensor) -> Tensor:
-    z, b = newton_step(s, x)
-    b = b
-    share = _share(s, x, z, b)
-    return x + _displaced(b, share[..., None] * z)
+        collider = s.collider.detach()
+        out, _ = ops_start.advance(x.contiguous(), move.contiguous(), none, s.center, s.origin, collider, collider,
+                                   s.surface.held, s.surface.body, s.room, listed, careful=False)  # fmt: skip
+    first = 0
+    for energy in s.model.vertex_energies:
+        size = energy.count() * (s.model.num_vertices if energy.per_vertex else 1)
+        data, first = s.data[:, first : first + size].detach(), first + size
+        keeps = energy.admits(x + move, x, data, None if s.origin.numel() == 0 else s.origin, LEAST_GAP)
+        if keeps is not None:
+            out = torch.where(keeps | s.model._pinned, out, torch.zeros_like(out))
+    return out

@@ -230,6 +230,22 @@ def test_capacity_that_does_not_suffice(device: str) -> None:
         assert sorted(got.entry.tolist()) == list(range(4 * capacity))
 
 
+def test_trimmed_list(device: str) -> None:
+    """As many rows as there are pairs, or as fit, on the CPU; on CUDA nothing changes."""
+    s = mixed_scene()
+    full = detect(s, device)
+    needed = int(full.counts[0])
+    for capacity in (0, needed - 1, needed, 60000):
+        got = ops_contact.contact_detect(*s.arguments(device, capacity=capacity), True)
+        rows = min(needed, capacity) if device == "cpu" else capacity
+        assert len(got.pairs) == len(got.constants) == rows and len(got.entry) == 4 * rows
+        whole = ops_contact.contact_detect(*s.arguments(device, capacity=capacity))
+        cut = whole._replace(pairs=whole.pairs[:rows], constants=whole.constants[:rows], entry=whole.entry[: 4 * rows])
+        if device == "cpu" or capacity >= needed:  # else CUDA lists any of them
+            assert all(torch.equal(a, b) for a, b in zip(got, cut, strict=True))
+    assert needed > 100
+
+
 def test_nothing_to_detect(device: str) -> None:
     s = mixed_scene()
     no_scene = replace(s, x=s.x[:0], collider=s.collider[:0], collider_next=s.collider_next[:0])
@@ -305,7 +321,8 @@ def test_bad_input(device: str) -> None:
 
 def test_opcheck_and_no_gradient(device: str) -> None:
     arguments = mixed_scene().arguments(device, capacity=4000)
-    torch.library.opcheck(torch.ops.diffvbd.contact_detect.default, arguments)
+    for trim in (False, True):
+        torch.library.opcheck(torch.ops.diffvbd.contact_detect.default, (*arguments, trim))
     found = ops_contact.contact_detect(arguments[0].clone().requires_grad_(), *arguments[1:])
     with pytest.raises(NotImplementedError, match="call diffvbd.step"):
         found.near_values.sum().backward()

@@ -5,6 +5,7 @@
 #include <tuple>
 
 #include "../../cuda/detect.h"
+#include "../../cuda/intersect.h"
 #include "../../cuda/islands.h"
 #include "../detection.h"
 #include "binding.h"
@@ -22,13 +23,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> conta
     const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& collider_next, const Tensor& rest,
     const Tensor& radius, const Tensor& triangles, const Tensor& edges, const Tensor& points, const Tensor& planes,
     const Tensor& body, const Tensor& held, const Tensor& room, int64_t mesh_bodies, bool self_contact,
-    bool between_bodies, double dhat, int64_t capacity) {
+    bool between_bodies, double dhat, int64_t capacity, bool /* trim: to know the number of pairs would wait */) {
   const DeviceGuard guard(x.get_device_index());
   diffvbd::require_capacity(capacity);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points,
-                                            planes, body, held, room, mesh_bodies, self_contact, between_bodies, dhat);
+    auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points,
+                                      planes, body, held, mesh_bodies, self_contact, between_bodies);
+    diffvbd::set_reach(in, x, room, dhat);
     const int64_t b = in.scenes, n = in.corners;
     Tensor pairs = empty(x, {capacity, contact::kPairRow}, ScalarType::Int);
     Tensor constants = empty(x, {capacity, contact::kConstants});
@@ -44,6 +46,29 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> conta
                           work.data_ptr(), current_stream(x)),
           "detection");
     return std::make_tuple(pairs, constants, ptr, entry, near_corners, near_values, counts, smallest);
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor> contact_intersections(const Tensor& x, const Tensor& origin, const Tensor& collider,
+                                                         const Tensor& rest, const Tensor& radius,
+                                                         const Tensor& triangles, const Tensor& edges,
+                                                         const Tensor& points, const Tensor& planes, const Tensor& body,
+                                                         const Tensor& held, int64_t mesh_bodies, bool self_contact,
+                                                         bool between_bodies, int64_t capacity) {
+  const DeviceGuard guard(x.get_device_index());
+  diffvbd::require_capacity(capacity);
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider, rest, radius, triangles, edges, points,
+                                            planes, body, held, mesh_bodies, self_contact, between_bodies);
+    Tensor pairs = empty(x, {capacity, contact::kCrossingRow}, ScalarType::Int);
+    Tensor first = empty(x, {in.scenes, 2, 2}, ScalarType::Int), counts = empty(x, {in.scenes, 2}, ScalarType::Long);
+    const auto bytes = static_cast<int64_t>(cuda::intersections_workspace_bytes<T>(in, capacity));
+    const Tensor work = empty(x, {bytes}, ScalarType::Byte);
+    check(cuda::find_intersections<T>(in, {capacity, data<int32_t>(pairs), data<int64_t>(counts), data<int32_t>(first)},
+                                      work.data_ptr(), current_stream(x)),
+          "the search for intersections");
+    return std::make_tuple(pairs, counts, first);
   });
 }
 
@@ -82,6 +107,7 @@ Tensor segment_sum(const Tensor& values, const Tensor& order, const Tensor& ptr)
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_detect", TORCH_BOX(&contact_detect));
+  m.impl("contact_intersections", TORCH_BOX(&contact_intersections));
   m.impl("contact_islands", TORCH_BOX(&contact_islands));
   m.impl("segment_sum", TORCH_BOX(&segment_sum));
 }
