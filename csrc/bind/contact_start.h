@@ -13,7 +13,7 @@ struct TranslationTensors {
   const Tensor &move, &mass, &x, &origin, &planes, &held, &body, &body_order, &body_ptr, &island, &lowest;
 };
 struct StartTensors {
-  const Tensor &x, &move, &goal, &u, &near, &origin, &planes, &held, &body;
+  const Tensor &x, &move, &u, &planes, &origin, &held, &body;
 };
 
 inline void require_vectors(const Tensor& t, const Tensor& x) {
@@ -62,23 +62,17 @@ contact::TranslationInputs<T> translation_inputs(const TranslationTensors& t) {
 }
 
 template <class T>
-contact::StartInputs<T> start_inputs(const StartTensors& t, double gamma, double cap, double filter_eta) {
+contact::StartInputs<T> start_inputs(const StartTensors& t, double filter_eta) {
   require_vectors(t.x, t.move);
   require_vectors(t.move, t.x);
-  require_vectors(t.goal, t.x);
   const int64_t b = t.x.size(0), v = t.x.size(1);
   require_of_vertices(t.held, t.body, t.x);
   require(t.u.dim() == 3 && is_like(t.u, t.x) && t.u.size(0) == b && t.u.size(2) == 3,
           "diffvbd::contact_start: expected u like x, [scenes, bodies, 3]");
-  require(t.near.dim() == 3 && is_like(t.near, t.x) && t.near.size(0) == b && t.near.size(1) >= v &&
-              t.near.size(2) == contact::kNearValues,
-          "diffvbd::contact_start: expected near like x, [scenes, corner points, 8]");
   contact::StartInputs<T> in{};
   in.x = data<const T>(t.x);
   in.move = data<const T>(t.move);
-  in.goal = data<const T>(t.goal);
   in.u = data<const T>(t.u);
-  in.near = data<const T>(t.near);
   in.origin = batched_or_null<T>("origin", t.origin, t.x, b, 3 * v);
   if (t.planes.numel() > 0) {
     const int64_t scalars = t.planes.dim() > 0 ? t.planes.numel() / t.planes.size(0) : 0;
@@ -88,14 +82,11 @@ contact::StartInputs<T> start_inputs(const StartTensors& t, double gamma, double
     in.floor_scalars = static_cast<int32_t>(scalars);
     in.floor = batched<T>("planes", t.planes, t.x, b, scalars);
   }
-  in.pinned = data<const bool>(t.held);
+  in.held = data<const bool>(t.held);
   in.body = data<const int32_t>(t.body);
   in.scenes = b;
-  in.corners = t.near.size(1);
   in.vertices = static_cast<int32_t>(v);
   in.bodies = static_cast<int32_t>(t.u.size(1));
-  in.gamma = static_cast<T>(gamma);
-  in.cap = static_cast<T>(cap);
   in.parameters.filter_eta = static_cast<T>(filter_eta);
   in.parameters.time_step = T(1);  // a filter does not read it
   return in;

@@ -25,9 +25,8 @@ struct Surfaces {
   int32_t vertices, corners, num_triangles, num_edges, num_points, num_planes;
   int32_t mesh_bodies;  // labels from here on are colliders
   bool self_contact, between_bodies;
-  T dhat, reach, cap, gamma;
-  const T* room;  // [B, mesh_bodies + 1]  how far a body's vertices may go beside their island [m], and the largest;
-                  // null: as far as their gaps let them
+  T dhat;
+  const T* room;  // [B, mesh_bodies + 1]  how far a body's vertices may go beside their island [m], and the largest
 
   DIFFVBD_FN int64_t key_base() const {
     const int32_t a = num_triangles < num_edges ? num_edges : num_triangles;
@@ -123,22 +122,21 @@ DIFFVBD_FN Box primitive_box(const Surfaces<T>& in, const int32_t* v, int n, int
   return out;
 }
 
-// Squared distance of boxes up to which the primitives may be closer than the reach.
+// How far a corner point may go before its pairs must be found again [m], by its body.
 template <class T>
 DIFFVBD_FN T room_of(const Surfaces<T>& in, int64_t scene, int32_t body) {
   return body < in.mesh_bodies ? in.room[scene * (in.mesh_bodies + 1) + body] : T(0);
 }
-// Of pairs of a scene; of pairs that a primitive of some group may be in.
+// Gap up to which pairs of a scene are looked for; squared distance of boxes up to which a pair of a primitive of some
+// group, -1 where that has several, may be closer.
 template <class T>
 DIFFVBD_FN T reach_of(const Surfaces<T>& in, int64_t scene) {
-  return in.room ? in.dhat + T(2) * in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies] : in.reach;
+  return in.dhat + T(2) * in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
 }
 template <class T>
 DIFFVBD_FN float squared_reach(const Surfaces<T>& in, int64_t scene, int32_t group) {
-  T far = reach_of(in, scene);
-  if (in.room && group >= 0) {
-    far = in.dhat + room_of(in, scene, group) + in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
-  }
+  const T most = in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
+  const T far = in.dhat + most + (group >= 0 ? room_of(in, scene, group) : most);
   const float reach = static_cast<float>(far) * (1.0F + 0x1p-20F);
   return reach * reach * (1.0F + 0x1p-20F);
 }
@@ -255,18 +253,10 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   return out;
 }
 
-// How far a corner point with this near gap may move before its pairs must be found again.
+// Whether a pair with this gap, whose barrier reaches as far as dhat, may become active before the next detection.
 template <class T>
-DIFFVBD_FN T bound_of(const Surfaces<T>& in, int64_t scene, int32_t corner, T near_gap) {
-  if (in.room) return room_of(in, scene, in.body[corner]);
-  const T bound = in.gamma * (T(0) < near_gap ? near_gap : T(0));
-  return bound < in.cap ? bound : in.cap;
-}
-
-// Whether a pair may become active while its sides move by at most a and b [m].
-template <class T>
-DIFFVBD_FN bool is_listed(T gap, T a, T b, T dhat) {
-  return gap - a - b < dhat;
+DIFFVBD_FN bool is_listed(const Surfaces<T>& in, const Candidate& c, T gap, T dhat) {
+  return gap - room_of(in, c.scene, in.body[c.v[0]]) - room_of(in, c.scene, in.body[c.v[c.second()]]) < dhat;
 }
 
 // --- results

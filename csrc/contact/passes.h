@@ -25,13 +25,15 @@ struct ContactInputs {
   const T* constants = nullptr;              // [pairs, 8]  of the listed
   const T* lag = nullptr;                    // [pairs, kLagScalars]  of the lagged
   Batched<const T> kappa;                    // [B]
-  Batched<const T> bounds;                   // [B, V, 4]  center, radius
   Batched<const T> collider, collider_prev;  // [B, Vc, 3]  during the sweeps; at the start of the step
-  const T* room = nullptr;                   // [B, V]  how far a vertex may go from the center of its bound [m]
+  const T* center = nullptr;                 // [B, V, 3]  from where a vertex may go
+  const T* room = nullptr;                   // [B, V]  as far as this [m]
   Batched<const T> floor_lag;                // [B, V, planes, 4]  coefficient times normal force, normal
   int planes = 0;
   Batched<const T> x_prev, origin;  // [B, V, 3]; origin may be null
   T friction_eps = T(0);            // motion in a step below which friction is smoothed [m]
+
+  DIFFVBD_FN Vec3<T> center_of(int64_t scene, int v) const { return point_at(center, scene * num_vertices + v); }
 };
 
 // Where pairs leave what they add; zero at first. Slot 4 pair + i belongs to corner i, its only writer.
@@ -49,13 +51,18 @@ DIFFVBD_FN Vec3<T> vector_at(const T* p) {
   return {p[0], p[1], p[2]};
 }
 template <class T>
+DIFFVBD_FN T length_of(const Vec3<T>& a) {
+  return square_root(dot(a, a));
+}
+template <class T>
 DIFFVBD_FN void add_at(T* p, const Vec3<T>& v) {
   p[0] += v.x;
   p[1] += v.y;
   p[2] += v.z;
 }
 
-// The corner points of one scene; x(v) of a vertex is the backend's.
+// The corner points of one scene. The backend's are x(v) of a vertex, moved(v), which is how far that is from the
+// center of its room, and, where a color has moved, goes(v), whether v was of it; x(v) is then where it was before.
 template <class T, class Positions>
 struct Source {
   const ContactInputs<T>& in;
@@ -86,8 +93,7 @@ struct Source {
   DIFFVBD_FN T moved(int v) const {
     if (v < in.num_vertices) return positions.moved(v);
     const int64_t row = 3 * (v - in.num_vertices);
-    const Vec3<T> d = x(v) - vector_at(in.collider_prev.data + scene * in.collider_prev.scene + row);
-    return square_root(dot(d, d));
+    return length_of(x(v) - vector_at(in.collider_prev.data + scene * in.collider_prev.scene + row));
   }
   // What the gap of a listed pair cannot be below.
   DIFFVBD_FN T least_gap(const int32_t* pair, const T* constants) const {
@@ -101,7 +107,7 @@ struct Source {
     return PairHints<T>(constants).gap - (most[0] + most[1]) * T(1 + 1e-6);
   }
   DIFFVBD_FN bool is_far(const int32_t* pair, const T* constants) const {
-    return in.room != nullptr && PairConstants<T>(constants).dhat < least_gap(pair, constants);
+    return PairConstants<T>(constants).dhat < least_gap(pair, constants);
   }
   DIFFVBD_FN Vec3<T> motion(const int32_t* pair, const Lag<T>& a) const {
     Vec3<T> m = zero3<T>();
@@ -140,14 +146,19 @@ DIFFVBD_FN void add_pairs(const Source<T, Positions>& s, int v, int first, int s
   }
 }
 
-// The exponent of the limit of vertex v, whose update goes by d, over every `stride`-th of its pairs from `first` on;
-// goes(w): whether vertex w moves at the same time.
-template <class T, class Positions, class Goes>
+// The exponent of the limit of vertex v, whose update goes from where it was by d: of its room.
+template <class T, class Positions>
+DIFFVBD_FN int limit_by_room(const Source<T, Positions>& s, int v, const Vec3<T>& from, const Vec3<T>& d) {
+  return limit_by_room(from - s.in.center_of(s.scene, v), d, s.in.room[s.scene * s.in.num_vertices + v]);
+}
+
+// And not below `exponent` of every `stride`-th of its pairs from `first` on.
+template <class T, class Positions>
 DIFFVBD_FN int limit_by_pairs(const Source<T, Positions>& s, int v, const Vec3<T>& d, int first, int stride,
-                              int exponent, const Goes& goes) {
+                              int exponent) {
   const ContactInputs<T>& in = s.in;
   const int64_t row = s.scene * in.corners + v;
-  const T length = square_root(dot(d, d));
+  const T length = length_of(d);
   const Vec3<T> at = s.x(v) + s.origin(v);
   const T guard =
       T(kGuardUlps) * std::numeric_limits<T>::epsilon() * (absolute(at.x) + absolute(at.y) + absolute(at.z));
@@ -158,7 +169,8 @@ DIFFVBD_FN int limit_by_pairs(const Source<T, Positions>& s, int v, const Vec3<T
     const int sides_first = sides(record[4]);
     bool both = false;
     for (int k = 0; k < 4; ++k) {
-      both = both || ((k < sides_first) != (own < sides_first) && record[k] < in.num_vertices && goes(record[k]));
+      both = both ||
+             ((k < sides_first) != (own < sides_first) && record[k] < in.num_vertices && s.positions.goes(record[k]));
     }
     const T share = both ? T(kBothShare) : T(kShare);
     if (limit_of<T>(exponent) * length <= share * (s.least_gap(record, constants) - guard)) continue;

@@ -1,7 +1,6 @@
 #include "contact.h"
 
 #include <algorithm>
-#include <cmath>
 
 namespace diffvbd {
 
@@ -16,40 +15,30 @@ ContactScene<T>::ContactScene(const Plan& plan, const ContactInputs<T>& in, cons
       scene_(scene),
       s_(s),
       h_(time_step),
-      way_(in.room ? int64_t{plan.blocks} * kLanes : 0),
-      before_(in.room && !reverse ? int64_t{plan.blocks} * kLanes * 4 : 0),
+      way_(int64_t{plan.blocks} * kLanes),
+      before_(reverse ? 0 : int64_t{plan.blocks} * kLanes * 4),
       positions_{s.x, position, way_.get()},
       source_{in, scene, positions_} {
   for (int64_t at = 0; at < int64_t{plan.blocks} * kLanes; ++at) {
-    const int32_t own = plan.order[at], v = own < 0 ? plan.order[at / kLanes * kLanes] : own;
-    const T* bound = in.bounds.data + scene * in.bounds.scene + int64_t{4} * v;
-    for (int i = 0; i < kContactScalars; ++i) {
-      *record(at / kLanes, static_cast<int>(at % kLanes), i) = i < 9 ? T(0) : bound[i - 9];
-    }
-    if (in.room) measure(at);
+    for (int i = 0; i < kContactScalars; ++i) *record(at / kLanes, static_cast<int>(at % kLanes), i) = T(0);
+    measure(at);
     if (s.limit) s.limit[at] = T(1);
   }
 }
 
-// How far a vertex is from the center of its bound.
+// How far a vertex is from the center of its room.
 template <class T>
 void ContactScene<T>::measure(int64_t at) const {
-  T square = T(0);
-  for (int i = 0; i < 3; ++i) {
-    const T d = s_.x[4 * at + i] - *record(at / kLanes, static_cast<int>(at % kLanes), 9 + i);
-    square += d * d;
-  }
-  way_.get()[at] = std::sqrt(square);
-}
-
-template <class T>
-void ContactScene<T>::measure_color(int64_t begin, int64_t end) const {
-  for (int64_t at = begin * kLanes; at < end * kLanes; ++at) measure(at);
+  const int32_t v = plan_.order[at];
+  if (v >= 0) way_.get()[at] = length_of(vector_at(s_.x + 4 * at) - in_.center_of(scene_, v));
 }
 
 template <class T>
 void ContactScene<T>::remember(int64_t begin, int64_t end) const {
-  std::copy(s_.x + 4 * begin * kLanes, s_.x + 4 * end * kLanes, before_.get() + 4 * begin * kLanes);
+  for (int64_t at = begin * kLanes; at < end * kLanes; ++at) {
+    std::copy_n(s_.x + 4 * at, 3, before_.get() + 4 * at);
+    before_.get()[4 * at + 3] = way_.get()[at];
+  }
 }
 
 template <class T>
@@ -59,17 +48,15 @@ void ContactScene<T>::limit(int64_t first, int64_t last, int64_t begin, int64_t 
   for (int64_t at = begin * kLanes; at < end * kLanes; ++at) {
     const int32_t v = plan_.order[at];
     if (v < 0) continue;
-    T *x = s_.x + 4 * at, center[3];
+    T* x = s_.x + 4 * at;
     const Vec3<T> from = vector_at(before_.get() + 4 * at), d = vector_at(x) - from;
-    for (int i = 0; i < 3; ++i) center[i] = *record(at / kLanes, static_cast<int>(at % kLanes), 9 + i);
-    int exponent = limit_by_room(from - vector_at(center), d, in_.room[scene_ * in_.num_vertices + v]);
-    exponent = limit_by_pairs(source, v, d, 0, 1, exponent, [&](int w) { return before.goes(w); });
+    const int exponent = limit_by_pairs(source, v, d, 0, 1, limit_by_room(source, v, from, d));
     limits[v] = static_cast<uint8_t>(exponent);
     if (exponent > 0) {
       const Vec3<T> to = from + limit_of<T>(exponent) * d;
       x[0] = to.x, x[1] = to.y, x[2] = to.z;
     }
-    // others of the color look at the positions before, and so at the ways before: these are measured afterwards
+    measure(at);
   }
 }
 
@@ -111,7 +98,6 @@ void ContactScene<T>::prepare(int sweep, int tape_policy, int64_t begin, int64_t
     const T* at = s_.tape + sweep * rows * plan_.num_active + plan_.block_rank[block];
     for (int lane = 0; lane < count; ++lane) {
       for (int c = 0; c < 3; ++c) s_.x[4 * (block * kLanes + lane) + c] = at[c * plan_.num_active + lane];
-      if (!in_.room) continue;
       measure(block * kLanes + lane);
       s_.limit[block * kLanes + lane] = limit_of<T>(limits[plan_.order[block * kLanes + lane]]);
     }
@@ -145,23 +131,6 @@ void ContactScene<T>::finish(T* collider_bar) const {
                                 : collider_bar + 3 * (v - in_.num_vertices),
            now);
     add_at(reverse_->prev + 3 * (scene_ * in_.corners + v), prev);
-  }
-}
-
-template <class T>
-void ContactScene<T>::store_bounds(T* bounds_bar) const {
-  for (int64_t at = 0; at < int64_t{plan_.blocks} * kLanes; ++at) {
-    const int32_t v = plan_.order[at];
-    for (int i = 0; v >= 0 && i < 4; ++i) {
-      bounds_bar[int64_t{4} * v + i] = s_.bound_bar[(at / kLanes * 4 + i) * kLanes + at % kLanes];
-    }
-  }
-}
-
-template <class T>
-void ContactScene<T>::store_cut(uint8_t* cut) const {
-  for (int64_t at = 0; at < int64_t{plan_.blocks} * kLanes; ++at) {
-    if (plan_.order[at] >= 0) cut[plan_.order[at]] = s_.cut[at] > T(0);
   }
 }
 

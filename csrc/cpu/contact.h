@@ -20,7 +20,6 @@ class ContactScene {
   // takes back what planes do not let pass of their motion; limits [V] receives the exponents.
   void remember(int64_t begin, int64_t end) const;
   void limit(int64_t first, int64_t last, int64_t begin, int64_t end, uint8_t* limits) const;
-  void measure_color(int64_t begin, int64_t end) const;
   // Reverse, before a color's turn: its vertices go back to the positions before their update, which `tape` names, and
   // collect what pairs have sent them since their last turn.
   void prepare(int sweep, int tape_policy, int64_t begin, int64_t end, const uint8_t* limits) const;
@@ -28,9 +27,6 @@ class ContactScene {
   void reverse(int64_t begin, int64_t end) const;
   // After the last turn: what is left for vertices, into the rows of x_bar, and for colliders [Vc, 3].
   void finish(T* collider_bar) const;
-  // Adjoint of the bounds [V, 4], and which vertices a bound has held back [V].
-  void store_bounds(T* bounds_bar) const;
-  void store_cut(uint8_t* cut) const;
 
  private:
   struct Positions {
@@ -48,7 +44,7 @@ class ContactScene {
     int64_t first, last;  // of the color
     bool goes(int v) const { return first <= position[v] && position[v] < last; }
     Vec3<T> operator()(int v) const { return contact::vector_at((goes(v) ? before : rows) + int64_t{4} * position[v]); }
-    T moved(int v) const { return way[position[v]]; }
+    T moved(int v) const { return goes(v) ? before[int64_t{4} * position[v] + 3] : way[position[v]]; }
   };
   void measure(int64_t at) const;
   template <class F>
@@ -61,8 +57,8 @@ class ContactScene {
   const int64_t scene_;
   SceneView<T>& s_;
   const T h_;
-  const Buffer<T> way_;     // [blocks kLanes]  how far each vertex is from the center of its bound
-  const Buffer<T> before_;  // [blocks kLanes, 4]  where the vertices of a color were before it moved
+  const Buffer<T> way_;     // [blocks kLanes]  how far each vertex is from the center of its room
+  const Buffer<T> before_;  // [blocks kLanes, 4]  where the vertices of a color were before it moved, and their way
   const Positions positions_;
   const contact::Source<T, Positions> source_;
 };

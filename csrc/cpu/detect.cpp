@@ -21,11 +21,7 @@ struct Near {
 // What a piece of the search finds.
 template <class T>
 struct Finds {
-  struct Pair {
-    uint64_t key;
-    T gap, dhat;
-  };
-  std::vector<Pair> pairs;  // that the list may need
+  std::vector<uint64_t> pairs;  // that the list needs
   int64_t touching = 0;
   uint64_t first_touching = kNoKey;
 };
@@ -66,7 +62,7 @@ class SceneDetection {
         }
       }
     });
-    select();
+    gather();
   }
 
   const std::vector<uint64_t>& listed() const { return listed_; }
@@ -139,17 +135,16 @@ class SceneDetection {
     if (!is_considered(in_, c)) return;
     const T gap = separation(c.kind, corners_of(in_, c)) - offset_of(in_, c);
     if (gap >= reach_) return;
-    // Near gaps only fall while the search goes on: what the list does not need now it never will.
-    const T a = bound(c, 0, c.second(), gap), b = c.kind == kPointPlane ? T(0) : bound(c, c.second(), 4, gap);
+    // near gaps only fall while the search goes on
     const auto improves = [&](int32_t v) { return gap <= near_[v].gap.load(std::memory_order_relaxed); };
-    if (gap > T(0) && !is_listed(gap, a, b, in_.dhat) && std::none_of(c.v, c.v + 4, improves)) return;
+    if (gap > T(0) && !is_listed(in_, c, gap, in_.dhat) && std::none_of(c.v, c.v + 4, improves)) return;
     const Constants<T> constants = constants_of(in_, c);
     if (!constants.admitted) return;
     const uint64_t key = contact::key_of(in_, c);
     if (!(gap > T(0))) ++finds.touching, finds.first_touching = std::min(finds.first_touching, key);
     if (std::isnan(gap)) return;
     for (const int32_t v : c.v) offer(near_[v], v, gap, key);
-    if (is_listed(gap, a, b, constants.dhat)) finds.pairs.push_back({key, gap, constants.dhat});
+    if (is_listed(in_, c, gap, constants.dhat)) finds.pairs.push_back(key);
   }
 
   static void offer(Near<T>& near, int32_t v, T gap, uint64_t key) {
@@ -160,31 +155,12 @@ class SceneDetection {
     near.gap.store(gap, std::memory_order_relaxed), near.key = key;
   }
 
-  // How far the corners from..to may move, given that there is a pair with this gap.
-  T bound(const Candidate& c, int from, int to, T gap) const {
-    T most = T(0);
-    for (int k = from; k < to; ++k) most = std::max(most, near_[c.v[k]].gap.load(std::memory_order_relaxed));
-    return bound_of(in_, scene_, c.v[from], std::min(most, gap));
-  }
-
-  // The list, sorted, now that all near gaps are known.
-  void select() {
-    torch::stable::parallel_for(0, static_cast<int64_t>(finds_.size()), kSearchGrain, [&](int64_t begin, int64_t end) {
-      for (int64_t f = begin; f < end; ++f) {
-        auto& pairs = finds_[f].pairs;
-        const auto needless = [&](const typename Finds<T>::Pair& pair) {
-          const Candidate c = candidate_of_key(in_, pair.key);
-          const T a = bound(c, 0, c.second(), pair.gap);
-          const T b = c.kind == kPointPlane ? T(0) : bound(c, c.second(), 4, pair.gap);
-          return !is_listed(pair.gap, a, b, pair.dhat);
-        };
-        pairs.erase(std::remove_if(pairs.begin(), pairs.end(), needless), pairs.end());
-      }
-    });
+  // What the pieces have found, sorted.
+  void gather() {
     listed_.clear(), touching_ = 0, first_touching_ = kNoKey;
     for (const Finds<T>& finds : finds_) {
       touching_ += finds.touching, first_touching_ = std::min(first_touching_, finds.first_touching);
-      for (const auto& pair : finds.pairs) listed_.push_back(pair.key);
+      listed_.insert(listed_.end(), finds.pairs.begin(), finds.pairs.end());
     }
     sort_by_key(listed_, scratch_, bits_of(in_.keys()));
   }

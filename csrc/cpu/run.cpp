@@ -68,7 +68,7 @@ void unpack_rows(const Plan& plan, const T* rows, T* user) {
 template <class T>
 struct Scene {
   Buffer<T> x, y, x_prev, origin, mass, material;
-  Buffer<T> contact, cut;
+  Buffer<T> contact;
   SceneView<T> view{};
   int64_t data_size;
 
@@ -106,9 +106,7 @@ struct Scene {
     }
     if (in.contact) {
       contact = Buffer<T>(size_t(plan.blocks) * kContactScalars * kLanes);
-      cut = Buffer<T>(size_t(plan.blocks) * kLanes, true);
       view.contact = contact.get();
-      view.cut = cut.get();
     }
     view.rest = in.rest.data + scene * in.rest.scene;
     view.data = in.data.data + scene * in.data.scene;
@@ -187,7 +185,6 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
       int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
   const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
   const int every = in.coarse ? in.coarse->plan.every : 0, begun = in.coarse ? in.coarse->plan.begun : 0;
-  const bool planes = in.contact && in.contact->room;
   // a message thrown inside a parallel region would be lost
   const bool looks = in.debug_step >= 0;
   for_scenes(in.scenes, !looks, [&](int64_t b) {
@@ -213,19 +210,17 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
           if (contact) {
             member.each(first, last, [&](int64_t begin, int64_t end) {
               contact->assemble(begin, end);
-              if (planes) contact->remember(begin, end);
+              contact->remember(begin, end);
             });
             member.barrier();
           }
           member.each(first, last,
                       [&](int64_t begin, int64_t end) { kernel(plan, scene.view, q, k, in.tape_policy, begin, end); });
           member.barrier();
-          if (planes) {
+          if (contact) {
             uint8_t* limits = cut + (b * in.sweeps + k) * plan.num_vertices;
             member.each(first, last,
                         [&](int64_t begin, int64_t end) { contact->limit(first, last, begin, end, limits); });
-            member.barrier();
-            member.each(first, last, [&](int64_t begin, int64_t end) { contact->measure_color(begin, end); });
             member.barrier();
           }
           if (looks) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
@@ -233,7 +228,6 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
       }
     });
     unpack_rows(plan, scene.view.x, x + b * 3 * int64_t{plan.num_vertices});
-    if (contact && !planes) contact->store_cut(cut + b * plan.num_vertices);
   });
 }
 
@@ -265,11 +259,9 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     s.material_bar = material_bar.get();
     s.rest_bar = rest_bar.get();
     s.data_bar = data_bar.get();
-    const Buffer<T> turn(in.contact ? 6 * lanes : 0), bound_bar(in.contact ? 4 * lanes : 0, true),
-        limit(in.contact && in.contact->room ? lanes : 0);
+    const Buffer<T> turn(in.contact ? 6 * lanes : 0), limit(in.contact ? lanes : 0);
     s.turn = turn.get();
     s.limit = limit.get();
-    s.bound_bar = bound_bar.get();
     std::optional<ContactScene<T>> contact;
     if (in.contact) {
       contact.emplace(plan, *in.contact, position.data(), b, s, in.parameters.time_step, out.contact);
@@ -318,10 +310,7 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
       if (coarse) coarse->finish(member);
     });
     collect_last(plan, s.rows, s.x_bar);
-    if (contact) {
-      contact->finish(out.collider + b * 3 * (in.contact->corners - n));
-      contact->store_bounds(out.bounds + b * 4 * n);
-    }
+    if (contact) contact->finish(out.collider + b * 3 * (in.contact->corners - n));
     unpack_rows(plan, s.x_bar, out.x_start + b * 3 * n);
     unpack_vertices(plan, s.y_bar, out.y + b * 3 * n);
     if (s.x_prev) unpack_vertices(plan, s.x_prev_bar, out.x_prev + b * 3 * n);

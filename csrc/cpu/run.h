@@ -36,7 +36,7 @@ struct StepAdjoints {
   T* material[kTetScalars];                    // [B, T] each; null where not wanted, as below
   T *mass, *rest, *data;                       // [B, V], [B, T, kRestScalars], [B, N]
   const contact::ContactAdjoints<T>* contact;  // with contact
-  T *bounds, *collider;                        // [B, V, 4], [B, Vc, 3] with contact
+  T* collider;                                 // [B, Vc, 3] with contact
 };
 
 // The values that a step cannot work with raise std::invalid_argument naming the argument.
@@ -47,8 +47,8 @@ void check_values(const Plan& plan, const StepInputs<T>& in);
 template <class T>
 void check_masses(const T* shares, int64_t scenes, int64_t tets, int64_t stride);
 
-// x [B, V, 3], tape [B, sweeps, tape_rows, active]; cut with contact: [B, V] where a bound has held back or, with
-// planes, [B, sweeps, V] exponents of limits (contact/limit.h)
+// x [B, V, 3], tape [B, sweeps, tape_rows, active]; cut with contact: [B, sweeps, V] exponents of limits
+// (contact/limit.h)
 template <class T>
 void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* cut = nullptr);
 

@@ -77,26 +77,13 @@ __global__ void start_kernel(const Surfaces<T> in, Workspace<T> work, int64_t ca
 // --- search
 // -----------------------------------------------------------------------------------------------------------
 
-// One of two searches: for the near gaps of all corner points, and, when they are known, for the near pairs and the
-// list.
+// One of two searches: for the near gaps of all corner points, and, when they are known, for the near pairs; that one
+// lists.
 template <class T, bool listing>
 struct Search {
   const Surfaces<T>& in;
   const Workspace<T>& work;
   int64_t capacity;
-
-  __device__ T near_gap(const Candidate& c, int k) const {
-    return value_of<T>(work.near_gap[c.scene * in.corners + c.v[k]]);
-  }
-  // How far the corners from..to may move.
-  __device__ T bound(const Candidate& c, int from, int to) const {
-    T most = T(0);
-    for (int k = from; k < to; ++k) {
-      const T gap = near_gap(c, k);
-      most = most < gap ? gap : most;
-    }
-    return bound_of(in, c.scene, c.v[from], most);
-  }
 
   __device__ void touch(uint64_t key) const {
     atomicAdd(&work.touching[0], 1ULL);
@@ -119,12 +106,7 @@ struct Search {
     const T gap = separation(c.kind, corners_of(in, c)) - offset_of(in, c);
     if (gap >= reach_of(in, c.scene)) return;
     const Ordered<T> bits = ordered(gap);
-    bool matters = !(gap > T(0));
-    T a = T(0), b = T(0);
-    if (listing) {
-      a = bound(c, 0, c.second()), b = c.kind == kPointPlane ? T(0) : bound(c, c.second(), 4);
-      matters = matters || is_listed(gap, a, b, in.dhat);
-    }
+    bool matters = !(gap > T(0)) || (listing && is_listed(in, c, gap, in.dhat));
     Ordered<T>* rows = work.near_gap + c.scene * in.corners;
     for (int k = 0; k < 4; ++k) {
       const Ordered<T> known = *static_cast<volatile Ordered<T>*>(rows + c.v[k]);
@@ -145,7 +127,7 @@ struct Search {
         lower(work.near_key + c.scene * in.corners + c.v[k], static_cast<unsigned long long>(key));
       }
     }
-    if (is_listed(gap, a, b, constants.dhat)) append(key);
+    if (is_listed(in, c, gap, constants.dhat)) append(key);
   }
 
   // What query q looks for: those of points come first, in the order of their Morton codes.
@@ -322,6 +304,7 @@ cudaError_t detect(const Surfaces<T>& in, const Detected<T>& out, void* memory, 
       return error;
   }
   corner_kernel<<<blocks_for(rows + 1), kThreads, 0, stream>>>(in, work, out);
+  if (capacity > 0) hint_kernel<<<blocks_for(capacity), kThreads, 0, stream>>>(in, out);
   finish_kernel<<<blocks_for(in.scenes + 1), kThreads, 0, stream>>>(in.scenes, work, out);
   return cudaGetLastError();
 }

@@ -71,14 +71,14 @@ class _Sweep(Function):
     """K sweeps of block updates and, as its backward, the same sweeps transposed in reverse order."""
 
     @staticmethod
-    def forward(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider, collider_prev, kappa,
-                pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, room, corners_prev,
+    def forward(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider, collider_prev, kappa,
+                pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room, corners_prev,
                 coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
                 plan, settings, tape_policy, debug_step, checked):  # fmt: skip
         # torch.compile counts these arguments: *args would get the context as well
-        fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider,
+        fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider,
                                  collider_prev, kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry,
-                                 floor_lag, room, corners_prev, coarse_factor, coarse_mass,
+                                 floor_lag, center, room, corners_prev, coarse_factor, coarse_mass,
                                  coarse_plan, coarse_weights, coarse_rest)  # fmt: skip
         return ops.sweep(fields, packed_rest, plan, settings, tape_policy, debug_step, checked)
 
@@ -112,13 +112,13 @@ class _Sweep(Function):
 
 class _SweepBackward(Function):
     @staticmethod
-    def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider, collider_prev,
-                kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, room, corners_prev,
+    def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider, collider_prev,
+                kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room, corners_prev,
                 coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
                 plan, x, tape, corrections, cut, settings, tape_policy, needs):  # fmt: skip
-        fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider,
+        fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider,
                                  collider_prev, kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry,
-                                 floor_lag, room, corners_prev, coarse_factor, coarse_mass,
+                                 floor_lag, center, room, corners_prev, coarse_factor, coarse_mass,
                                  coarse_plan, coarse_weights, coarse_rest)  # fmt: skip
         wants = _wants(ops.SWEEP_ADJOINTS, fields._fields, needs)
         with backward_memory(x, settings, tape_policy):
@@ -166,7 +166,7 @@ class _SweepBackward(Function):
 
 
 def _plain(fields: ops.SweepFields) -> None:
-    if fields.bounds is not None:
+    if fields.center is not None:
         no_transforms()
     if fields.corners_prev is not None:
         raise NotImplementedError("diffvbd: torch.func transforms of a law that reads x_prev are not supported")
@@ -193,8 +193,9 @@ def _scenes(tensors: Sequence[Tensor | None], in_dims: tuple) -> int:
 
 def sweep(fields: ops.SweepFields, packed_rest: Tensor, plan: Tensor, settings: ops.SweepSettings, *, tape_policy: int,
           debug_step: int = -1, checked: bool = True) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Positions after the sweeps [B, V, 3]; with contact where a bound has held back an update, uint8 [B, 1, V], or the
-    exponents of limits [B, K, V]; and what coarse corrections did [B, corrections, n]: 3 numbers a function, each body's length, with a floor where it began.
+    """Positions after the sweeps [B, V, 3]; with contact the exponents of limits, uint8 [B, K, V] (csrc/contact/limit.h);
+    and what coarse corrections did [B, corrections, n]: 3 numbers a function, each body's length, with a floor where it
+    began.
 
     Args:
         fields: See SweepFields; differentiable in those of SWEEP_ADJOINTS.

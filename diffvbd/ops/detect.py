@@ -28,21 +28,22 @@ class Detection(NamedTuple):
     ptr: Tensor  # [B N + 1]  pairs of corner point i of scene b: entry[ptr[b N + i] : ptr[b N + i + 1]],
     entry: Tensor  # [4 capacity]  each 4 pair + local corner, in ascending order
     near_corners: Tensor  # [B, N, 5]  corner points and kind of the pair with the smallest gap; i four times, -1: none
-    near_values: Tensor  # [B, N, 8]  its weights, normal and gap [m]; without one, zeros and the reach
+    near_values: Tensor  # [B, N, 8]  its weights, normal and gap [m]; without one, zeros and how far was looked
     counts: Tensor  # [4] int64  pairs that the list needs, pairs that touch, smallest key of those or -1, 0
-    smallest: Tensor  # [B]  smallest gap [m], or the reach
+    smallest: Tensor  # [B]  smallest gap, or how far was looked [m]
 
 
 def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
                    triangles: Tensor, edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, held: Tensor,
-                   mesh_bodies: int, self_contact: bool, between_bodies: bool, dhat: float, reach: float, cap: float,
-                   gamma: float, capacity: int, room: Tensor | None = None, trim: bool = False) -> Detection:  # fmt: skip
+                   room: Tensor, mesh_bodies: int, self_contact: bool, between_bodies: bool, dhat: float,
+                   capacity: int, trim: bool = False) -> Detection:  # fmt: skip
     """Near pair of every corner point, and the pairs that may come within reach of the barrier before the next call.
 
-    A corner point may move by ``min(gamma gap, cap)``, gap being that of its near pair. Pairs are considered up to a
-    gap of ``reach``; one is listed if its gap, less the bounds of its two sides, is below the barrier's reach, which is
-    ``dhat`` or, for two sides of one body that are closer at rest, 0.9 times their distance at rest. Two colliders make
-    no pair, nor do four held corner points, nor two sides of one body that are one place at rest.
+    The vertices of a body may go as far as its room beside what its island does; colliders have none. Pairs are looked
+    for up to a gap of ``dhat`` and twice the largest room; one is listed if its gap, less the rooms of its two sides, is
+    below the barrier's reach, which is ``dhat`` or, for two sides of one body that are closer at rest, 0.9 times their
+    distance at rest. Two colliders make no pair, nor do four held corner points, nor two sides of one body that are one
+    place at rest.
 
     A surface point that is not finite counts as touching. Where ``counts[0] > capacity``, the list holds some of the
     pairs that it needs. Not differentiable; results repeat to the bit.
@@ -54,11 +55,10 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         triangles, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique.
         planes: [L, 3] collider points that span each plane, counterclockwise seen from the free side.
         body, held: [N]; labels from ``mesh_bodies`` on are colliders; held: bool, no sweep moves it.
+        room: [B, mesh_bodies + 1] how far the vertices of each body may go [m], and the largest.
         self_contact, between_bodies: Which pairs of mesh bodies to consider.
-        dhat, reach, cap: [m].  gamma: Part of a gap that a corner point may move.
+        dhat: [m].
         capacity: Rows of the list.
-        room: [B, mesh_bodies + 1] how far the vertices of each body may go [m], and the largest; in place of reach,
-            cap and gamma.
         trim: On the CPU, only as many rows as pairs fill: rows that none fills may cost more than the search. CUDA,
             which would wait for their number, does not trim; torch.compile takes longer with sizes that it cannot know.
 
@@ -68,8 +68,7 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
     return Detection(
         *raw.contact_detect(
             x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held,
-            x.new_empty((0,)) if room is None else room, mesh_bodies, self_contact, between_bodies, dhat, reach, cap,
-            gamma, capacity, trim,
+            room, mesh_bodies, self_contact, between_bodies, dhat, capacity, trim,
         )
     )  # fmt: skip
 
@@ -152,7 +151,7 @@ def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
 
 @shapes_of("contact_detect")
 def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, room,
-      mesh_bodies, self_contact, between_bodies, dhat, reach, cap, gamma, capacity, trim):  # fmt: skip
+      mesh_bodies, self_contact, between_bodies, dhat, capacity, trim):  # fmt: skip
     b, n = x.shape[0], body.shape[0]
     rows = torch.library.get_ctx().new_dynamic_size() if trim and x.device.type == "cpu" else capacity
 

@@ -39,7 +39,7 @@ def listed(fields: SweepFields | StepFields, packed_rest: Tensor, plan: Tensor, 
 
 def sweep(fields: SweepFields, packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int,
           debug_step: int = -1, checked: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """x [B, V, 3], tape, with contact where motion was cut, uint8 [B, 1 | K, V], and what coarse corrections did."""
+    """x [B, V, 3], tape, with contact the exponents of limits, uint8 [B, K, V], and what coarse corrections did."""
     given = listed(fields, packed_rest, plan, settings)
     return raw.sweep(*given, plan, *settings, tape_policy, debug_step, checked)
 
@@ -91,7 +91,7 @@ def _(*arguments):
     x, scenes = f.x_start, f.x_start.shape[0] if energies & CONTACT else 0
     tape = x.new_empty(tape_shape(x, sizes, energies, sweeps, launch, tape_policy))
     done = corrections_shape(x, coarse, sweeps, energies) if f.coarse_plan.numel() else (0,)
-    cut = (scenes, sweeps if scenes and f.room.numel() else 1, x.shape[1])
+    cut = (scenes, sweeps, x.shape[1])
     return torch.empty_like(x), tape, x.new_empty(cut, dtype=torch.uint8), x.new_empty(done)
 
 
@@ -117,7 +117,7 @@ def _(*arguments):
         return (*own, *(x.new_empty((0,)) for _ in range(len(SWEEP_ADJOINTS) - len(own) - len(last))), *last)
     colliders = f.collider.shape[1] if f.collider.dim() == 3 else 0
     planes = f.floor_lag.numel() // max(1, f.floor_lag.shape[0] * 4 * v)
-    shapes = [(b, v, 4), (b, colliders, 3), (b, colliders, 3), (b,), (f.lag_pairs.shape[0], LAG_SCALARS),
+    shapes = [(b, colliders, 3), (b, colliders, 3), (b,), (f.lag_pairs.shape[0], LAG_SCALARS),
               (b, v, planes, 4)]  # fmt: skip
     return (*own, *(x.new_empty(shape) for shape in shapes), *last)
 

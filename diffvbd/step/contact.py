@@ -241,9 +241,8 @@ class ContactStep:
     def _sweep(self, x: Tensor, center: Tensor, room: Tensor, collider: Tensor, listed: Pairs, settings: SweepSettings,
                policy: int, debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
         lagged, model = self.lagged, self.model
-        bounds = torch.cat([center, torch.full_like(center[..., :1], FREE)], -1)
         fields = self.fields._replace(
-            x_start=x, bounds=bounds, room=room, collider=collider, collider_prev=self.before, kappa=self.kappa,
+            x_start=x, center=center, room=room, collider=collider, collider_prev=self.before, kappa=self.kappa,
             **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs, lag_ptr=lagged.ptr, lag_entry=lagged.entry,
             floor_lag=self.floor_lag,
         )  # fmt: skip

@@ -23,13 +23,13 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> conta
     const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& collider_next, const Tensor& rest,
     const Tensor& radius, const Tensor& triangles, const Tensor& edges, const Tensor& points, const Tensor& planes,
     const Tensor& body, const Tensor& held, const Tensor& room, int64_t mesh_bodies, bool self_contact,
-    bool between_bodies, double dhat, double reach, double cap, double gamma, int64_t capacity, bool trim) {
+    bool between_bodies, double dhat, int64_t capacity, bool trim) {
   diffvbd::require_capacity(capacity);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in =
-        diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes,
-                                body, held, room, mesh_bodies, self_contact, between_bodies, dhat, reach, cap, gamma);
+    auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points,
+                                      planes, body, held, mesh_bodies, self_contact, between_bodies);
+    diffvbd::set_reach(in, x, room, dhat);
     const int64_t b = in.scenes, n = in.corners;
     Tensor near_corners = integers({b, n, diffvbd::contact::kNearRow}), ptr = integers({b * n + 1});
     Tensor near_values = empty(x, {b, n, diffvbd::contact::kNearValues}), smallest = empty(x, {b});
@@ -59,7 +59,7 @@ std::tuple<Tensor, Tensor, Tensor> contact_intersections(const Tensor& x, const 
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider, rest, radius, triangles, edges, points,
-                                            planes, body, held, empty(x, {0}), mesh_bodies, self_contact, between_bodies, 0, 0, 0, 0);
+                                            planes, body, held, mesh_bodies, self_contact, between_bodies);
     Tensor pairs = integers({capacity, diffvbd::contact::kCrossingRow}), first = integers({in.scenes, 2, 2});
     Tensor counts = torch::stable::empty({in.scenes, 2}, ScalarType::Long);
     diffvbd::find_intersections<T>(in, {capacity, data<int32_t>(pairs), data<int64_t>(counts), data<int32_t>(first)});

@@ -124,7 +124,7 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     Given<T> given(plan, f, x, q, -1);
     const auto& in = given.in;
     diffvbd::check_tape(tape, x, plan, in);
-    const uint8_t* limits = diffvbd::limits_of(cut, in, plan.num_vertices);
+    const uint8_t* limits = diffvbd::limits_of(cut, x, in, plan.num_vertices);
     const auto make = [&](const std::vector<int64_t>& shape, bool zeroed) {
       return zeroed ? zeros(x, shape) : empty(x, shape);
     };
@@ -144,7 +144,7 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     make_contact_bars(bars, given.pairs, in.scenes, plan.num_vertices, f.lag_pairs.numel() / contact::kPairRow, make);
     const auto pointers = slots.pointers(data<T>(bars.floor_lag));
     out.contact = &pointers;
-    out.bounds = data<T>(bars.bounds), out.collider = data<T>(bars.collider);
+    out.collider = data<T>(bars.collider);
     diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), limits, out);
     slots.sum(bars);
     return bars.tensors();

@@ -23,15 +23,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> conta
     const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& collider_next, const Tensor& rest,
     const Tensor& radius, const Tensor& triangles, const Tensor& edges, const Tensor& points, const Tensor& planes,
     const Tensor& body, const Tensor& held, const Tensor& room, int64_t mesh_bodies, bool self_contact,
-    bool between_bodies, double dhat, double reach, double cap, double gamma, int64_t capacity,
-    bool /* trim: to know the number of pairs would wait */) {
+    bool between_bodies, double dhat, int64_t capacity, bool /* trim: to know the number of pairs would wait */) {
   const DeviceGuard guard(x.get_device_index());
   diffvbd::require_capacity(capacity);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in =
-        diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes,
-                                body, held, room, mesh_bodies, self_contact, between_bodies, dhat, reach, cap, gamma);
+    auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points,
+                                      planes, body, held, mesh_bodies, self_contact, between_bodies);
+    diffvbd::set_reach(in, x, room, dhat);
     const int64_t b = in.scenes, n = in.corners;
     Tensor pairs = empty(x, {capacity, contact::kPairRow}, ScalarType::Int);
     Tensor constants = empty(x, {capacity, contact::kConstants});
@@ -61,7 +60,7 @@ std::tuple<Tensor, Tensor, Tensor> contact_intersections(const Tensor& x, const 
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider, rest, radius, triangles, edges, points,
-                                            planes, body, held, empty(x, {0}), mesh_bodies, self_contact, between_bodies, 0, 0, 0, 0);
+                                            planes, body, held, mesh_bodies, self_contact, between_bodies);
     Tensor pairs = empty(x, {capacity, contact::kCrossingRow}, ScalarType::Int);
     Tensor first = empty(x, {in.scenes, 2, 2}, ScalarType::Int), counts = empty(x, {in.scenes, 2}, ScalarType::Long);
     const auto bytes = static_cast<int64_t>(cuda::intersections_workspace_bytes<T>(in, capacity));
