@@ -61,8 +61,8 @@ DIFFVBD_FN void add_at(T* p, const Vec3<T>& v) {
   p[2] += v.z;
 }
 
-// The corner points of one scene. The backend's are x(v) of a vertex, moved(v), which is how far that is from the
-// center of its room, and, where a color has moved, goes(v), whether v was of it; x(v) is then where it was before.
+// The corner points of one scene. The backend's are x(v) of a vertex and, where a color has moved, goes(v), whether v
+// was of it; x(v) is then where it was before.
 template <class T, class Positions>
 struct Source {
   const ContactInputs<T>& in;
@@ -89,25 +89,34 @@ struct Source {
     for (int k = 1; k < 4; ++k) out.x[k] = (x(pair[k]) - x0) + (origin(pair[k]) - o0);
     return out;
   }
-  // How far a corner point is from where the pairs were found, beside its island.
-  DIFFVBD_FN T moved(int v) const {
-    if (v < in.num_vertices) return positions.moved(v);
+  // How a corner point has moved since the pairs were found, beside its island.
+  DIFFVBD_FN Vec3<T> moved(int v) const {
+    if (v < in.num_vertices) return positions(v) - in.center_of(scene, v);
     const int64_t row = 3 * (v - in.num_vertices);
-    return length_of(x(v) - vector_at(in.collider_prev.data + scene * in.collider_prev.scene + row));
+    return x(v) - vector_at(in.collider_prev.data + scene * in.collider_prev.scene + row);
   }
-  // What the gap of a listed pair cannot be below.
-  DIFFVBD_FN T least_gap(const int32_t* pair, const T* constants) const {
-    T most[2] = {T(0), T(0)};
+  // Square of how far the closest points of two sides can have moved relative to each other since then.
+  DIFFVBD_FN T squared_change(const int32_t* pair) const {
     const int first = sides(pair[4]);
-    for (int k = 0; k < 4; ++k) {
-      const T way = moved(pair[k]);
-      T& side = most[k < first ? 0 : 1];
-      side = side < way ? way : side;
+    Vec3<T> way[4];
+    for (int k = 0; k < 4; ++k) way[k] = moved(pair[k]);
+    T most = T(0);
+    for (int i = 0; i < first; ++i) {
+      for (int j = first; j < 4; ++j) {
+        const Vec3<T> d = way[i] - way[j];
+        const T square = dot(d, d);
+        most = most < square ? square : most;
+      }
     }
-    return PairHints<T>(constants).gap - (most[0] + most[1]) * T(1 + 1e-6);
+    return T(1 + 1e-6) * most;
+  }
+  // Whether the gap of a listed pair is above a length for sure.
+  DIFFVBD_FN bool is_above(const int32_t* pair, const T* constants, T length) const {
+    const T room = PairHints<T>(constants).gap - length;
+    return T(0) < room && squared_change(pair) < room * room;
   }
   DIFFVBD_FN bool is_far(const int32_t* pair, const T* constants) const {
-    return PairConstants<T>(constants).dhat < least_gap(pair, constants);
+    return is_above(pair, constants, PairConstants<T>(constants).dhat);
   }
   DIFFVBD_FN Vec3<T> motion(const int32_t* pair, const Lag<T>& a) const {
     Vec3<T> m = zero3<T>();
@@ -173,7 +182,7 @@ DIFFVBD_FN int limit_by_pairs(const Source<T, Positions>& s, int v, const Vec3<T
              ((k < sides_first) != (own < sides_first) && record[k] < in.num_vertices && s.positions.goes(record[k]));
     }
     const T share = both ? T(kBothShare) : T(kShare);
-    if (limit_of<T>(exponent) * length <= share * (s.least_gap(record, constants) - guard)) continue;
+    if (s.is_above(record, constants, limit_of<T>(exponent) * length / share + guard)) continue;
     const Gate<T> gate(record[4], s.corners(record), constants, guard);
     const T shares[4] = {share, share, share, share};
     Vec3<T> way[4] = {zero3<T>(), zero3<T>(), zero3<T>(), zero3<T>()};

@@ -15,35 +15,23 @@ ContactScene<T>::ContactScene(const Plan& plan, const ContactInputs<T>& in, cons
       scene_(scene),
       s_(s),
       h_(time_step),
-      way_(int64_t{plan.blocks} * kLanes),
       before_(reverse ? 0 : int64_t{plan.blocks} * kLanes * 4),
-      positions_{s.x, position, way_.get()},
+      positions_{s.x, position},
       source_{in, scene, positions_} {
   for (int64_t at = 0; at < int64_t{plan.blocks} * kLanes; ++at) {
     for (int i = 0; i < kContactScalars; ++i) *record(at / kLanes, static_cast<int>(at % kLanes), i) = T(0);
-    measure(at);
     if (s.limit) s.limit[at] = T(1);
   }
 }
 
-// How far a vertex is from the center of its room.
-template <class T>
-void ContactScene<T>::measure(int64_t at) const {
-  const int32_t v = plan_.order[at];
-  if (v >= 0) way_.get()[at] = length_of(vector_at(s_.x + 4 * at) - in_.center_of(scene_, v));
-}
-
 template <class T>
 void ContactScene<T>::remember(int64_t begin, int64_t end) const {
-  for (int64_t at = begin * kLanes; at < end * kLanes; ++at) {
-    std::copy_n(s_.x + 4 * at, 3, before_.get() + 4 * at);
-    before_.get()[4 * at + 3] = way_.get()[at];
-  }
+  std::copy(s_.x + 4 * begin * kLanes, s_.x + 4 * end * kLanes, before_.get() + 4 * begin * kLanes);
 }
 
 template <class T>
 void ContactScene<T>::limit(int64_t first, int64_t last, int64_t begin, int64_t end, uint8_t* limits) const {
-  const Before before{s_.x, before_.get(), positions_.position, way_.get(), first * kLanes, last * kLanes};
+  const Before before{s_.x, before_.get(), positions_.position, first * kLanes, last * kLanes};
   const Source<T, Before> source{in_, scene_, before};
   for (int64_t at = begin * kLanes; at < end * kLanes; ++at) {
     const int32_t v = plan_.order[at];
@@ -56,7 +44,6 @@ void ContactScene<T>::limit(int64_t first, int64_t last, int64_t begin, int64_t 
       const Vec3<T> to = from + limit_of<T>(exponent) * d;
       x[0] = to.x, x[1] = to.y, x[2] = to.z;
     }
-    measure(at);
   }
 }
 
@@ -98,7 +85,6 @@ void ContactScene<T>::prepare(int sweep, int tape_policy, int64_t begin, int64_t
     const T* at = s_.tape + sweep * rows * plan_.num_active + plan_.block_rank[block];
     for (int lane = 0; lane < count; ++lane) {
       for (int c = 0; c < 3; ++c) s_.x[4 * (block * kLanes + lane) + c] = at[c * plan_.num_active + lane];
-      measure(block * kLanes + lane);
       s_.limit[block * kLanes + lane] = limit_of<T>(limits[plan_.order[block * kLanes + lane]]);
     }
   }

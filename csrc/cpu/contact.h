@@ -32,21 +32,16 @@ class ContactScene {
   struct Positions {
     const T* rows;
     const int32_t* position;
-    const T* way;
     Vec3<T> operator()(int v) const { return contact::vector_at(rows + int64_t{4} * position[v]); }
-    T moved(int v) const { return way[position[v]]; }
   };
   // Of a color whose vertices have moved, as they were before.
   struct Before {
     const T *rows, *before;
     const int32_t* position;
-    const T* way;
     int64_t first, last;  // of the color
     bool goes(int v) const { return first <= position[v] && position[v] < last; }
     Vec3<T> operator()(int v) const { return contact::vector_at((goes(v) ? before : rows) + int64_t{4} * position[v]); }
-    T moved(int v) const { return goes(v) ? before[int64_t{4} * position[v] + 3] : way[position[v]]; }
   };
-  void measure(int64_t at) const;
   template <class F>
   void each_vertex(int64_t begin, int64_t end, const F& f) const;
   T* record(int64_t block, int lane, int scalar) const;
@@ -57,8 +52,7 @@ class ContactScene {
   const int64_t scene_;
   SceneView<T>& s_;
   const T h_;
-  const Buffer<T> way_;     // [blocks kLanes]  how far each vertex is from the center of its room
-  const Buffer<T> before_;  // [blocks kLanes, 4]  where the vertices of a color were before it moved, and their way
+  const Buffer<T> before_;  // [blocks kLanes, 4]  where the vertices of a color were before it moved
   const Positions positions_;
   const contact::Source<T, Positions> source_;
 };

@@ -15,10 +15,9 @@ constexpr int kShare = 8, kContactThreads = 128;
 
 template <class T>
 struct SweepRows {
-  const T *rows, *way;
+  const T* rows;
   const int32_t* position;
   __device__ __forceinline__ Vec3<T> operator()(int v) const { return load_row(rows, __ldg(position + v)); }
-  __device__ __forceinline__ T moved(int v) const { return way[__ldg(position + v)]; }
 };
 // Of a color whose vertices have moved, as they were before.
 template <class T>
@@ -32,9 +31,6 @@ struct RowsBefore {
   }
   __device__ __forceinline__ Vec3<T> operator()(int v) const {
     return load_row(goes(v) ? before : now.rows, __ldg(now.position + v));
-  }
-  __device__ __forceinline__ T moved(int v) const {
-    return goes(v) ? before[int64_t{kRow} * __ldg(now.position + v) + 3] : now.moved(v);
   }
 };
 template <class T>
@@ -79,16 +75,9 @@ struct Member {
   }
   __device__ __forceinline__ int64_t row(const StepView<T>& s) const { return local * s.positions + position; }
   __device__ __forceinline__ SweepRows<T> rows(const StepView<T>& s) const {
-    return {s.w.x + local * s.positions * kRow, s.w.way + local * s.positions, s.w.position};
+    return {s.w.x + local * s.positions * kRow, s.w.position};
   }
 };
-
-// How far a vertex at x is from the center of its room.
-template <class T>
-__device__ __forceinline__ void measure(const StepView<T>& s, const ContactInputs<T>& in, int64_t row, int64_t scene,
-                                        int vertex, const Vec3<T>& x) {
-  s.w.way[row] = contact::length_of(x - in.center_of(scene, vertex));
-}
 
 template <class T>
 __global__ void load_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in) {
@@ -99,17 +88,13 @@ __global__ void load_contact(const __grid_constant__ StepView<T> s, const __grid
   for (int k = 0; k < kContactScalars; ++k) s.w.contact[i * kContactScalars + k] = T(0);
   if (own < 0) return;
   if (local == 0) s.w.position[own] = static_cast<int32_t>(position);
-  measure(s, in, i, s.base + local, own, load_row(s.w.x, i));
 }
 
 template <class T>
 __global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
                                  int64_t begin, int64_t end) {
   const Member<T> at(s, in, begin, end);
-  if (s.w.before && at.vertex >= 0 && at.lane == 0) {
-    store_row(s.w.before, at.row(s), load_row(s.w.x, at.row(s)));
-    s.w.before[kRow * at.row(s) + 3] = s.w.way[at.row(s)];
-  }
+  if (s.w.before && at.vertex >= 0 && at.lane == 0) store_row(s.w.before, at.row(s), load_row(s.w.x, at.row(s)));
   if (!__any_sync(kWholeWarp, at.touches)) return;
   Vec3<T> g = zero3<T>();
   Sym3<T> H = diagonal(T(0));
@@ -145,12 +130,7 @@ __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __gri
   }
   if (!there || at.lane != 0) return;
   cut[(at.scene * s.sweeps + sweep) * in.num_vertices + at.vertex] = static_cast<uint8_t>(exponent);
-  Vec3<T> to = load_row(s.w.x, at.row(s));
-  if (exponent > 0) {
-    to = from + contact::limit_of<T>(exponent) * d;
-    store_row(s.w.x, at.row(s), to);
-  }
-  measure(s, in, at.row(s), at.scene, at.vertex, to);
+  if (exponent > 0) store_row(s.w.x, at.row(s), from + contact::limit_of<T>(exponent) * d);
 }
 
 template <class T>
@@ -167,9 +147,7 @@ __global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __g
     const int64_t active = s.plan.num_active;
     const int rank = __ldg(s.plan.block_rank + at.position / kSlice) + static_cast<int>(at.position % kSlice);
     const T* from = s.tape + (at.local * s.sweeps + sweep) * rows_of_tape * active + rank;
-    const Vec3<T> x{from[0], from[active], from[2 * active]};
-    store_row(s.w.x, at.row(s), x);
-    measure(s, in, at.row(s), at.scene, at.vertex, x);
+    store_row(s.w.x, at.row(s), Vec3<T>{from[0], from[active], from[2 * active]});
   }
   if (!__any_sync(kWholeWarp, at.touches)) return;
   Vec3<T> now = zero3<T>(), prev = zero3<T>();

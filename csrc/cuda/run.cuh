@@ -69,7 +69,6 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   w.mass = take(true, (in.mass.scene != 0 ? n : 1) * positions);
   w.material = take(elastic && !one, (one_for_scenes(in.material) ? 1 : n) * kTetScalars * pairs);
   w.contact = take(in.contact != nullptr, n * kContactScalars * positions);
-  w.way = take(in.contact != nullptr, n * positions);
   w.before = take(!reverse && in.contact, n * kRow * positions);
   w.turn = take(reverse && in.contact, n * 6 * positions);
   w.position = reinterpret_cast<int32_t*>(take(in.contact != nullptr, plan.num_vertices));

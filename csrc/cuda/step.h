@@ -78,8 +78,7 @@ struct Workspace {
   T* data_bar;        // [scalars, positions]
   // with contact:
   T* contact;         // [positions, kContactScalars]: the pairs' part of the block
-  T* way;             // [positions]: how far each vertex is from the center of its room
-  T* before;          // [positions, 4]: where the vertices of a color were before it moved, and their way
+  T* before;          // [positions, 4]: where the vertices of a color were before it moved
   T* turn;            // [positions, 6]: p and d_raw of the latest reversed update
   int32_t* position;  // [V]: where a vertex stands in sweep order
 };

@@ -16,7 +16,7 @@ from .colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
 
 REACH_PER_EDGE = 0.5  # most pairs of a body at rest are farther apart, so that they cost nothing
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
-MOST_EDGES = 1.5  # mean edges of the surface that a vertex may go beside its island, where no reach is given
+MOST_EDGES = 0.75  # mean edges of the surface that a vertex may go beside its island, where no reach is given
 
 
 @dataclass(frozen=True, eq=False)
