@@ -105,8 +105,8 @@ class VertexEnergy:
         raise NotImplementedError(f"{type(self).__name__} has no value() for Anderson's method")
 
     def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
-        """The blocks [B, V, 3, 3] [kg] that a vertex update adds for it; arguments as of gradient(). The rigid correction
-        of bodies in contact solves with them."""
+        """What it adds to the block of each vertex [B, V, 3, 3] [kg]; arguments as of gradient(). The rigid
+        correction of bodies in contact solves with these."""
         raise NotImplementedError(f"{type(self).__name__} has no blocks() for bodies in contact")
 
     def admits(self, x: Tensor, before: Tensor, data: Tensor, origin: Tensor | None, share: float) -> Tensor | None:

@@ -14,6 +14,7 @@ constexpr double kShare = 0.9;        // of a gap that an update may close where
 constexpr double kBothShare = 0.45;   // and where both move
 constexpr double kStartLeast = 0.05;  // of any gap that what does not minimise the barrier may close
 constexpr double kStartPart = 0.5;    // of dhat: such motion brings no pair closer
+constexpr double kTight = 0.125;      // of that: such motion closes such gaps no further
 constexpr double kGuardUlps = 32;     // roundings of a position, which a gap is not trusted to
 
 template <class T>
@@ -105,7 +106,8 @@ struct Gate {
       const T toward = k < sides(kind) ? -dot(m, d[k]) : dot(m, d[k]);
       T room = share[k] * wide;
       if (careful || !own) {
-        const T outside = share[k] * (wide - least()), some = T(kStartLeast) * wide;
+        const bool tight = careful && wide < T(kTight) * least();
+        const T outside = share[k] * (wide - least()), some = tight ? T(0) : T(kStartLeast) * wide;
         room = some < outside ? outside : some;
       }
       if (!(toward <= s.slack[k] + room)) return false;
@@ -137,7 +139,7 @@ DIFFVBD_FN bool stays_apart(const Gate<T>& g, const Vec3<T> (&d)[4], bool carefu
   if (g.kind == kPointPlane || !(T(0) < wide)) return false;
   // it may come as close as a start may bring it, and a little closer where it is close already
   const T half = T(1 - kBothShare) * wide, most = least < half ? half : least;
-  const T part = wide < T(0.125) * least ? T(1) : T(1 - 2 * kStartLeast);
+  const T part = wide < T(kTight) * least ? T(1) : T(1 - 2 * kStartLeast);
   const T keeps = !careful ? half : part * wide < most ? part * wide : most;
   T time = T(0), now = wide;
   for (int i = 0; i < kAdvances; ++i) {

@@ -135,7 +135,8 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
                 at.detach().contiguous(), (target - at).detach().contiguous(), by.detach(), center, origin,
                 here.detach(), now.detach(), surface.held, surface.body, room, listed,
             )  # fmt: skip
-        shares.append(share), stuck.append(hindered)
+        shares.append(share)
+        stuck.append(hindered)
         base = at + by[:, body]
         at = torch.where(pinned, target, base + share[..., None] * (target - base))
         center = torch.where(pinned, center, center + by.detach()[:, body]).contiguous()

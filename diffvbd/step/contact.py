@@ -227,8 +227,8 @@ class ContactStep:
         """x after the rigid correction of all bodies that are free, and the share of its motion that each took."""
         numbers = self.prepared.settings.numbers
         scenes = Scenes(
-            self.model, self.x_prev, self.begun.y, self.fields.mass, self.begun.data, self.origin, self.before, collider,
-            self.kappa, listed, self.lagged, self.lag, self.floor_lag, start.center, start.room, self.surface,
+            self.model, self.x_prev, self.begun.y, self.fields.mass, self.begun.data, self.origin, self.before,
+            collider, self.kappa, listed, self.lagged, self.lag, self.floor_lag, start.center, start.room, self.surface,
             numbers.time_step, numbers.friction_eps,
         )  # fmt: skip
         return correct(scenes, x)
@@ -322,8 +322,8 @@ class ContactStep:
             )
         if hindered:
             raise ValueError(
-                f"prescribed or colliders: expected motion that leaves bodies a way, got {hindered} pairs in part {r} of "
-                f"{self.parts} that it would bring too close: use more detections or a smaller time_step"
+                f"prescribed or colliders: expected motion that leaves bodies a way, got {hindered} pairs in part {r} "
+                f"of {self.parts} that it would bring too close: use more detections or a smaller time_step"
             )
 
 

@@ -1,7 +1,7 @@
 """The rigid correction of bodies that touch: all bodies of a scene moved, each as a whole, by one Newton step of the
 step's potential over their rigid motions.
 
-    min over (w_b, t_b)   1/2 sum m |x - y|^2 + the energies of single vertices + barriers, friction and damping of pairs
+    min over (w_b, t_b)   1/2 sum m |x - y|^2 + energies of single vertices + barriers, friction and damping of pairs
 
 A rigid motion leaves the energy of the tets as it is, so that this costs sums over vertices and pairs, and six unknowns
 a body. It is what few sweeps do worst: they see neighbours, not the body. docs/method.md, section 18.
@@ -21,7 +21,7 @@ from ..ops import broadcast
 from ..ops import contact_start as ops_start
 
 MOST_COUPLED = 64  # bodies of a scene that are solved for together; with more of them, one side of a pair at a time
-TRIES = 8  # of motions, each half as long
+TRIES = 5  # of motions, each half as long
 LEAST_GAP = 0.1  # of its gap that a vertex keeps above a plane of the floor
 SPREADS = 4  # how often a shorter motion is handed on to the bodies that one touches
 RISE = 1e-9  # of the potential, that counts as none
@@ -223,8 +223,8 @@ def _potential(s: Scenes, x: Tensor) -> Tensor:
 
 
 def _sides(s: Scenes, bodies: _Bodies, listed: Pairs, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows of the bodies of both sides of pairs [n, 2], -1 where one does not move or both are one; and how a side moves
-    with its body [n, 2, 3, 6]."""
+    """Rows of the bodies of both sides of pairs [n, 2], -1 where one does not move or both are one; and how sides move
+    with their bodies [n, 2, 3, 6]."""
     surface = s.surface
     assert surface is not None
     scene, corners = _corners(listed)
