@@ -9,13 +9,13 @@
 
 namespace diffvbd::contact {
 
-constexpr int kNoMove = 8;            // the exponent that stands for a limit of 0
-constexpr double kShare = 0.9;        // of a gap that an update may close where the other side rests
-constexpr double kBothShare = 0.45;   // and where both move
-constexpr double kStartLeast = 0.05;  // of any gap that what does not minimise the barrier may close
-constexpr double kStartPart = 0.5;    // of dhat: such motion brings no pair closer
-constexpr double kTight = 0.125;      // of that: such motion closes such gaps no further
-constexpr double kGuardUlps = 32;     // roundings of a position, which a gap is not trusted to
+constexpr int kNoMove = 8;                 // the exponent that stands for a limit of 0
+constexpr double kBothShare = 0.45;        // of a gap that an update may close where both sides move
+constexpr double kShare = 2 * kBothShare;  // and where the other one rests
+constexpr double kStartLeast = 0.05;       // of any gap that what does not minimise the barrier may close
+constexpr double kStartPart = 0.5;         // of dhat: such motion brings no pair closer
+constexpr double kTight = 0.125;            // of that: such motion closes such gaps no further
+constexpr double kGuardUlps = 32;          // roundings of a position, which a gap is not trusted to
 
 template <class T>
 DIFFVBD_FN T limit_of(int exponent) {

@@ -278,7 +278,9 @@ def _newton_step(s: Scenes, bodies: _Bodies, x: Tensor) -> Tensor:
 
 
 def _solved(matrix: Tensor, right: Tensor) -> Tensor:
-    return torch.cholesky_solve(right, torch.linalg.cholesky_ex(matrix)[0])[..., 0]
+    factor = torch.linalg.cholesky_ex(matrix)[0]  # torch.cholesky_solve cannot be captured in a CUDA graph
+    half = torch.linalg.solve_triangular(factor, right, upper=False)
+    return torch.linalg.solve_triangular(factor.mT, half, upper=True)[..., 0]
 
 
 @torch.no_grad()
