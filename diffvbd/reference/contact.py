@@ -16,9 +16,11 @@ from torch import Tensor
 from .distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
 from .energies import FloorBarrier, StableNeoHookean, build_energies
 from .friction import floor_friction, smoothed, tangential6
-from .layout import build_layout, dot, outer6, take
+from .layout import build_layout, dot, outer6
 from .scene import Scene, build_scene
 from .sweep import check_start, color_masses, predictor, run_sweeps, started
+
+LEAST_STIFFNESS = 1e-12  # of its mass, that keeps the system of a body definite
 
 
 class Part(NamedTuple):
@@ -230,7 +232,9 @@ class Correction:
 
         def state(motion: Tensor) -> Tensor:
             turn = torch.linalg.matrix_exp(_cross_matrix(motion[..., :3]))
-            moved = rows + ((turn[:, self.body] - torch.eye(3).to(x)) @ arm[..., None])[..., 0] + motion[:, self.body, 3:]
+            moved = (
+                rows + ((turn[:, self.body] - torch.eye(3).to(x)) @ arm[..., None])[..., 0] + motion[:, self.body, 3:]
+            )
             return moved.transpose(-1, -2).reshape(x.shape)
 
         z = x.new_zeros(len(share), self.count, 6)
@@ -243,8 +247,8 @@ class Correction:
             g, matrix = self._add(pairs, force, stiffness, jacobian, g, matrix)
         free = self.free.to(x.device)
         both = (free[:, None] & free)[..., None, None]
-        matrix = torch.where(both, matrix, 0.0) + torch.where(
-            (at[:, None] == at)[..., None, None], torch.diag_embed((~free).to(x)[:, None, None].expand(-1, -1, 6))[:, 0][:, None], 0.0)
+        fill = torch.where(free, LEAST_STIFFNESS * total, 1.0)[..., None, None] * torch.eye(6).to(x)
+        matrix = torch.where(both, matrix, 0.0).index_put((slice_of(len(share), at), at, at), fill, accumulate=True)
         system = matrix.permute(0, 1, 3, 2, 4).reshape(len(share), 6 * self.count, -1)
         right = torch.where(free[:, None], -g, 0.0).reshape(len(share), -1, 1)
         motion = torch.linalg.solve(system, right).reshape(z.shape)

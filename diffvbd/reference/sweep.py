@@ -290,8 +290,8 @@ def run_sweeps(
 ) -> Tensor:
     """The state [..., 3, V] after `sweeps` sweeps of all colors toward the predictor y [..., 3, V].
 
-    masses: `color_masses`. x_prev: start of the step, for lagged terms. limits [sweeps, ..., 1, V]: what is let through of
-    each update. relaxation: None for the Model's.
+    masses: `color_masses`. x_prev: start of the step, for lagged terms. limits [sweeps, ..., 1, V]: what is let through
+    of each update. relaxation: None for the Model's.
     """
     targets = [take(y, color.vertices) for color in scene.layout.colors]
     for n in range(sweeps):
