@@ -113,8 +113,8 @@ class _Sweep(Function):
 class _SweepBackward(Function):
     @staticmethod
     def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider, collider_prev,
-                kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room, corners_prev,
-                coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
+                kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room,
+                corners_prev, coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
                 plan, x, tape, corrections, cut, settings, tape_policy, needs):  # fmt: skip
         fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider,
                                  collider_prev, kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry,
@@ -122,8 +122,8 @@ class _SweepBackward(Function):
                                  coarse_plan, coarse_weights, coarse_rest)  # fmt: skip
         wants = _wants(ops.SWEEP_ADJOINTS, fields._fields, needs)
         with backward_memory(x, settings, tape_policy):
-            bars = ops.sweep_backward(x_bar, x, tape, corrections, cut, fields, packed_rest, plan, settings, tape_policy,
-                                      wants)  # fmt: skip
+            bars = ops.sweep_backward(x_bar, x, tape, corrections, cut, fields, packed_rest, plan, settings,
+                                      tape_policy, wants)  # fmt: skip
         return _adjoints(bars, fields, needs)
 
     @staticmethod
@@ -193,7 +193,7 @@ def _scenes(tensors: Sequence[Tensor | None], in_dims: tuple) -> int:
 
 def sweep(fields: ops.SweepFields, packed_rest: Tensor, plan: Tensor, settings: ops.SweepSettings, *, tape_policy: int,
           debug_step: int = -1, checked: bool = True) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Positions after the sweeps [B, V, 3]; with contact the exponents of limits, uint8 [B, K, V] (csrc/contact/limit.h);
+    """Positions after the sweeps [B, V, 3]; with contact the exponents of limits, uint8 [B, K, V], of contact/limit.h;
     and what coarse corrections did [B, corrections, n]: 3 numbers a function, each body's length, with a floor where it
     began.
 

@@ -40,10 +40,10 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
     """Near pair of every corner point, and the pairs that may come within reach of the barrier before the next call.
 
     The vertices of a body may go as far as its room beside what its island does; colliders have none. Pairs are looked
-    for up to a gap of ``dhat`` and twice the largest room; one is listed if its gap, less the rooms of its two sides, is
-    below the barrier's reach, which is ``dhat`` or, for two sides of one body that are closer at rest, 0.9 times their
-    distance at rest. Two colliders make no pair, nor do four held corner points, nor two sides of one body that are one
-    place at rest.
+    for up to a gap of ``dhat`` and twice the largest room. One is listed if its gap, less the rooms of its two sides,
+    is below the barrier's reach, which is ``dhat`` or, for two sides of one body that are closer at rest, 0.9 times
+    their distance at rest. Two colliders make no pair, nor do four held corner points, nor two sides of one body that
+    are one place at rest.
 
     A surface point that is not finite counts as touching. Where ``counts[0] > capacity``, the list holds some of the
     pairs that it needs. Not differentiable; results repeat to the bit.
@@ -117,7 +117,7 @@ def contact_islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, colli
     """Smallest body of the island of bodies in contact that each body is in [B, NB] int32, or -1.
 
     An island moves by the mass-weighted mean of ``move`` over its vertices that are not held. Bodies whose boxes, swept
-    by that and grown by its room and dhat / 2, overlap are of one island. -1: the island holds a held vertex or may reach
+    by that and grown by room and dhat / 2, overlap are of one island. -1: the island holds a held vertex or may reach
     a collider, and must stay. Not differentiable; results repeat to the bit.
 
     Args:
