@@ -55,8 +55,14 @@ def rooms(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tens
 
     falls = largest(fall) + LEAST_ROOM * barrier.dhat
 
+    # What is prescribed goes where it goes: pairs with it are listed however far that is.
+    driven = torch.where(free, 0.0, move.square().sum(-1).sqrt())
+    driven = driven.new_zeros((scenes, surface.bodies)).scatter_reduce(1, rows, driven, "amax")
+    pushed = (now - was).square().sum(-1).sqrt().amax(1, keepdim=True) if was.shape[1] else driven.new_zeros((scenes, 1))
+
     def room_beside(u: Tensor) -> Tensor:
-        return (ROOM * largest(move - u[:, body]) + falls).clamp(max=surface.most_room)
+        room = (ROOM * largest(move - u[:, body]) + falls).clamp(max=surface.most_room)
+        return torch.maximum(room, driven) + pushed
 
     def islands(room: Tensor) -> tuple[Tensor, Tensor]:
         most = room.amax(1, keepdim=True) if surface.bodies else room.new_zeros((scenes, 1))
