@@ -58,7 +58,9 @@ def rooms(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tens
     # What is prescribed goes where it goes: pairs with it are listed however far that is.
     driven = torch.where(free, 0.0, move.square().sum(-1).sqrt())
     driven = driven.new_zeros((scenes, surface.bodies)).scatter_reduce(1, rows, driven, "amax")
-    pushed = (now - was).square().sum(-1).sqrt().amax(1, keepdim=True) if was.shape[1] else driven.new_zeros((scenes, 1))
+    pushed = driven.new_zeros((scenes, 1))
+    if was.shape[1]:
+        pushed = (now - was).square().sum(-1).sqrt().amax(1, keepdim=True)
 
     def room_beside(u: Tensor) -> Tensor:
         room = (ROOM * largest(move - u[:, body]) + falls).clamp(max=surface.most_room)
