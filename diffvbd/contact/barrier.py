@@ -38,7 +38,8 @@ class PairBarrier:
         detections: R >= 1: how often pairs are searched within a step. Sweeps, prescribed vertices and moving colliders
             advance in R parts; what pairs have held up tries again in the next part.
         reach: Distance up to which pairs are searched [m] > dhat; a vertex goes at most (reach - dhat) / 2 between two
-            detections, beside the motion that bodies near each other share. None: that is 0.75 mean edges.
+            detections, beside the motion that bodies near each other share. None: that is 0.75 mean edges
+            of the surface, without self_contact 8.
         capacity: Pairs that fit, per scene on average. None: as many as there are; on CUDA a step that found too little
             room runs again.
 

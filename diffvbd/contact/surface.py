@@ -15,7 +15,9 @@ from .barrier import PairBarrier
 from .colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
 
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
-MOST_EDGES = 0.75  # mean edges of the surface that a vertex may go beside its island, where no reach is given
+# Mean edges of the surface that a vertex may go beside its island, where no reach is given: with self-contact, where a
+# long way lists most pairs of a body's own surface, and without.
+MOST_EDGES_SELF, MOST_EDGES = 0.75, 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +87,8 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     # the mesh's own edges alone: a large obstacle must not widen the search
     lengths = np.linalg.norm(mesh.points[edges[0][:, 0]] - mesh.points[edges[0][:, 1]], axis=1)
     if barrier.reach is None:
-        most_room = MOST_EDGES * float(lengths.mean()) if len(lengths) else 0.0
+        most = MOST_EDGES_SELF if barrier.self_contact else MOST_EDGES
+        most_room = most * float(lengths.mean()) if len(lengths) else 0.0
     else:
         most_room = (barrier.reach - barrier.dhat) / 2
 
