@@ -4,7 +4,7 @@
 #include "../core/frame.h"
 #include "../core/views.h"
 #include "../energies/energies.h"
-#include "contact_term.h"
+#include "bounds.h"
 
 namespace diffvbd {
 
