@@ -32,6 +32,7 @@ INSTRUCTION_SETS = ["baseline"] if QUICK or os.environ.get("DIFFVBD_NO_CLONES") 
 CPU_SOURCES = [
     *(f"csrc/cpu/sweep_{scalar}_{name}.cpp" for scalar in ("double", "float") for name in INSTRUCTION_SETS),
     "csrc/bind/schema.cpp",
+    "csrc/cpu/advance.cpp",
     "csrc/cpu/checks.cpp",
     "csrc/cpu/coarse.cpp",
     "csrc/cpu/contact.cpp",

@@ -104,6 +104,11 @@ class VertexEnergy:
         """h^2 E [kg m^2] of every vertex, [B, V]; arguments as of gradient(). Anderson's method compares it on CUDA."""
         raise NotImplementedError(f"{type(self).__name__} has no value() for Anderson's method")
 
+    def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
+        """What it adds to the block of each vertex [B, V, 3, 3] [kg]; arguments as of gradient(). The rigid
+        correction of bodies in contact solves with these."""
+        raise NotImplementedError(f"{type(self).__name__} has no blocks() for bodies in contact")
+
     def admits(self, x: Tensor, before: Tensor, data: Tensor, origin: Tensor | None, share: float) -> Tensor | None:
         """Where a step from ``before`` to x keeps a share of what limits it, bool [B, V]; None where nothing does."""
         return None
@@ -222,6 +227,16 @@ class FloorBarrier(VertexEnergy):
         total = -h * h * kappa * (d - dhat) ** 2 * torch.log(d / dhat)
         return (total + torch.where(damped, damping * (h / 2) * travel**2, 0)).sum(-1)
 
+    def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
+        normal, kappa, dhat, damping = self._columns(data)
+        gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
+        near = (gap > 0) & (gap < dhat)
+        part = torch.where(near, 1 - dhat / torch.where(near, gap, dhat), 0.0)
+        log = torch.log(torch.where(near, gap, dhat) / dhat)
+        size = h * h * torch.where(near, -kappa * (2 * log + 4 * part - part * part), 0.0)
+        size = size + torch.where(before < dhat, h * damping, 0.0)
+        return (size[..., None, None] * normal[..., None] * normal[..., None, :]).sum(2)
+
     def admits(self, x: Tensor, before: Tensor, data: Tensor, origin: Tensor | None, share: float) -> Tensor:
         gap, was = (self._gaps(at, data, origin) for at in (x, before))
         planes = data.reshape(data.shape[0], 1, self.planes, 7)
@@ -322,6 +337,10 @@ class Anchor(VertexEnergy):
     def gradient(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         stiffness, points = data.reshape(data.shape[0], -1, 4).split((1, 3), -1)
         return h * h * stiffness * (x - points)
+
+    def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
+        spring = data.reshape(data.shape[0], -1, 4)[..., 0]
+        return h * h * spring[..., None, None] * torch.eye(3, dtype=x.dtype, device=x.device)
 
     def value(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         stiffness, points = data.reshape(data.shape[0], -1, 4).split((1, 3), -1)

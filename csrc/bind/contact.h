@@ -34,7 +34,6 @@ contact::ContactInputs<T> contact_inputs(const SweepFields& t, const Tensor& x, 
     in.lag = data<const T>(t.lag);
   }
   in.kappa = batched<T>("kappa", t.kappa, x, b, 1);
-  in.bounds = batched<T>("bounds", t.bounds, x, b, 4 * v);
   in.collider = batched<T>("collider", t.collider, x, b, 3 * colliders);
   in.collider_prev = batched<T>("collider_prev", t.collider_prev, x, b, 3 * colliders);
   if (t.floor_lag.numel() > 0) {
@@ -42,6 +41,9 @@ contact::ContactInputs<T> contact_inputs(const SweepFields& t, const Tensor& x, 
     in.planes = static_cast<int>(t.floor_lag.numel() / t.floor_lag.size(0) / (v * contact::kFloorLag));
     in.floor_lag = batched<T>("floor_lag", t.floor_lag, x, b, v * in.planes * contact::kFloorLag);
   }
+  require_like("center", t.center, x, 3 * b * v);
+  require_like("room", t.room, x, b * v);
+  in.center = data<const T>(t.center), in.room = data<const T>(t.room);
   in.x_prev = x_prev;
   in.origin = origin;
   in.friction_eps = static_cast<T>(friction_eps);

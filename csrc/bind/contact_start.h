@@ -1,6 +1,7 @@
 // The tensors of the start of a part, as the operators of all backends take them.
 #pragma once
 
+#include "../contact/advance.h"
 #include "../contact/start.h"
 #include "../contact/translation.h"
 #include "contact.h"
@@ -12,7 +13,7 @@ struct TranslationTensors {
   const Tensor &move, &mass, &x, &origin, &planes, &held, &body, &body_order, &body_ptr, &island, &lowest;
 };
 struct StartTensors {
-  const Tensor &x, &move, &goal, &u, &near, &origin, &planes, &held, &body;
+  const Tensor &x, &move, &u, &planes, &origin, &held, &body;
 };
 
 inline void require_vectors(const Tensor& t, const Tensor& x) {
@@ -61,23 +62,17 @@ contact::TranslationInputs<T> translation_inputs(const TranslationTensors& t) {
 }
 
 template <class T>
-contact::StartInputs<T> start_inputs(const StartTensors& t, double gamma, double cap, double filter_eta) {
+contact::StartInputs<T> start_inputs(const StartTensors& t, double filter_eta) {
   require_vectors(t.x, t.move);
   require_vectors(t.move, t.x);
-  require_vectors(t.goal, t.x);
   const int64_t b = t.x.size(0), v = t.x.size(1);
   require_of_vertices(t.held, t.body, t.x);
   require(t.u.dim() == 3 && is_like(t.u, t.x) && t.u.size(0) == b && t.u.size(2) == 3,
           "diffvbd::contact_start: expected u like x, [scenes, bodies, 3]");
-  require(t.near.dim() == 3 && is_like(t.near, t.x) && t.near.size(0) == b && t.near.size(1) >= v &&
-              t.near.size(2) == contact::kNearValues,
-          "diffvbd::contact_start: expected near like x, [scenes, corner points, 8]");
   contact::StartInputs<T> in{};
   in.x = data<const T>(t.x);
   in.move = data<const T>(t.move);
-  in.goal = data<const T>(t.goal);
   in.u = data<const T>(t.u);
-  in.near = data<const T>(t.near);
   in.origin = batched_or_null<T>("origin", t.origin, t.x, b, 3 * v);
   if (t.planes.numel() > 0) {
     const int64_t scalars = t.planes.dim() > 0 ? t.planes.numel() / t.planes.size(0) : 0;
@@ -87,16 +82,47 @@ contact::StartInputs<T> start_inputs(const StartTensors& t, double gamma, double
     in.floor_scalars = static_cast<int32_t>(scalars);
     in.floor = batched<T>("planes", t.planes, t.x, b, scalars);
   }
-  in.pinned = data<const bool>(t.held);
+  in.held = data<const bool>(t.held);
   in.body = data<const int32_t>(t.body);
   in.scenes = b;
-  in.corners = t.near.size(1);
   in.vertices = static_cast<int32_t>(v);
   in.bodies = static_cast<int32_t>(t.u.size(1));
-  in.gamma = static_cast<T>(gamma);
-  in.cap = static_cast<T>(cap);
   in.parameters.filter_eta = static_cast<T>(filter_eta);
   in.parameters.time_step = T(1);  // a filter does not read it
+  return in;
+}
+
+struct AdvanceTensors {
+  const Tensor &x, &move, &u, &center, &origin, &collider, &collider_next, &held, &body, &room, &pairs, &constants,
+      &ptr, &entry;
+};
+
+template <class T>
+contact::AdvanceInputs<T> advance_inputs(const AdvanceTensors& t) {
+  require_vectors(t.x, t.move);
+  require_vectors(t.move, t.x);
+  require_vectors(t.center, t.x);
+  require_of_vertices(t.held, t.body, t.x);
+  const int64_t b = t.x.size(0), v = t.x.size(1), colliders = t.collider.dim() == 3 ? t.collider.size(1) : 0;
+  require(t.u.dim() == 3 && is_like(t.u, t.x) && t.u.size(0) == b && t.u.size(2) == 3,
+          "diffvbd::contact_advance: expected u like x, [scenes, bodies, 3]");
+  require(t.held.numel() == v + colliders && t.body.numel() == v + colliders,
+          "diffvbd::contact_advance: expected held and body of all corner points");
+  contact::AdvanceInputs<T> in{};
+  in.x = data<const T>(t.x), in.move = data<const T>(t.move), in.u = data<const T>(t.u);
+  in.center = data<const T>(t.center);
+  in.origin = batched_or_null<T>("origin", t.origin, t.x, b, 3 * v).data;
+  require_like("collider", t.collider, t.x, b * colliders * 3);
+  require_like("collider_next", t.collider_next, t.x, b * colliders * 3);
+  require_like("room", t.room, t.x, b * v);
+  in.collider = data<const T>(t.collider), in.collider_next = data<const T>(t.collider_next);
+  in.held = data<const bool>(t.held), in.body = data<const int32_t>(t.body), in.room = data<const T>(t.room);
+  in.listed = pair_list(t.pairs, t.ptr, t.entry, t.x, v + colliders);
+  require_like("constants", t.constants, t.x, t.pairs.size(0) * contact::kConstants);
+  in.constants = data<const T>(t.constants);
+  in.scenes = b;
+  in.vertices = static_cast<int32_t>(v), in.corners = static_cast<int32_t>(v + colliders);
+  in.bodies = static_cast<int32_t>(t.u.size(1));
   return in;
 }
 

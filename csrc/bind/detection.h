@@ -27,8 +27,7 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
                                  const Tensor& collider_next, const Tensor& rest, const Tensor& radius,
                                  const Tensor& triangles, const Tensor& edges, const Tensor& points,
                                  const Tensor& planes, const Tensor& body, const Tensor& held, int64_t mesh_bodies,
-                                 bool self_contact, bool between_bodies, double dhat, double reach, double cap,
-                                 double gamma) {
+                                 bool self_contact, bool between_bodies) {
   require_positions(x);
   const int64_t b = x.size(0), v = x.size(1), n = body.numel();
   const ScalarType real = x.scalar_type();
@@ -54,7 +53,6 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
   out.body = indices(body, {n}, "contact: expected body [N] int32");
   require_shape(held, x, ScalarType::Bool, {n}, "contact: expected held [N] bool");
   require_countable(b * n + 1, "contact: too large, expected at most 2^31 corner points in all scenes");
-  require(std::isfinite(reach) && reach >= 0 && std::isfinite(dhat), "contact: expected finite dhat and reach >= 0");
   out.x = data<const T>(x), out.origin = origin.numel() > 0 ? data<const T>(origin) : nullptr;
   out.collider = data<const T>(collider), out.collider_next = data<const T>(collider_next);
   out.rest = data<const T>(rest), out.radius = data<const T>(radius), out.held = data<const bool>(held);
@@ -64,11 +62,18 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
   out.num_points = static_cast<int32_t>(points.size(0)), out.num_planes = static_cast<int32_t>(planes.size(0));
   out.mesh_bodies = count_of(mesh_bodies);
   out.self_contact = self_contact, out.between_bodies = between_bodies;
-  out.dhat = static_cast<T>(dhat), out.reach = static_cast<T>(reach);
-  out.cap = static_cast<T>(cap), out.gamma = static_cast<T>(gamma);
   const double base = static_cast<double>(out.key_base());
   require(3.0 * static_cast<double>(b) * base * base < 0x1p63, "contact: too many scenes of this size");
   return out;
+}
+
+// What a detection reads besides: how far to look.
+template <class T>
+void set_reach(contact::Surfaces<T>& surfaces, const Tensor& x, const Tensor& room, double dhat) {
+  require(std::isfinite(dhat), "contact: expected a finite dhat");
+  require_shape(room, x, x.scalar_type(), {surfaces.scenes, int64_t{surfaces.mesh_bodies} + 1},
+                "contact: expected room like x, of shape [B, mesh_bodies + 1]");
+  surfaces.room = data<const T>(room), surfaces.dhat = static_cast<T>(dhat);
 }
 
 inline void require_capacity(int64_t capacity) {
@@ -80,8 +85,8 @@ template <class T>
 contact::IslandInputs<T> island_inputs(const Tensor& x, const Tensor& origin, const Tensor& move, const Tensor& mass,
                                        const Tensor& collider, const Tensor& collider_next, const Tensor& planes,
                                        const Tensor& body, const Tensor& body_order, const Tensor& body_ptr,
-                                       const Tensor& held, const Tensor& radius, int64_t mesh_bodies, double cap,
-                                       double dhat, bool any_direction) {
+                                       const Tensor& held, const Tensor& radius, const Tensor& room,
+                                       int64_t mesh_bodies, double dhat, bool any_direction) {
   require_positions(x);
   const int64_t b = x.size(0), v = x.size(1), n = body.numel();
   const ScalarType real = x.scalar_type();
@@ -112,7 +117,8 @@ contact::IslandInputs<T> island_inputs(const Tensor& x, const Tensor& origin, co
   out.held = data<const bool>(held);
   out.scenes = b, out.vertices = static_cast<int32_t>(v), out.corners = static_cast<int32_t>(n);
   out.num_planes = static_cast<int32_t>(planes.size(0)), out.mesh_bodies = static_cast<int32_t>(mesh_bodies);
-  out.margin = static_cast<T>(cap + dhat / 2);
+  require_shape(room, x, real, {b, mesh_bodies + 1}, "contact_islands: expected room like x, of shape [B, NB + 1]");
+  out.room = data<const T>(room), out.half = static_cast<T>(dhat / 2);
   out.any_direction = any_direction;
   return out;
 }

@@ -28,13 +28,13 @@ void define(torch::stable::detail::StableLibrary& m, const std::string& name, co
 }  // namespace
 
 STABLE_TORCH_LIBRARY(diffvbd, m) {
-  // cut [scenes, vertices]: 1 where a bound has held back an update; empty without contact. corrections [scenes,
-  // corrections, 3 functions + bodies]: what coarse corrections have done; empty without them
+  // cut: [scenes, sweeps, vertices] exponents of limits (contact/limit.h), no scenes without contact. corrections
+  // [scenes, corrections, 3 functions + bodies]: what coarse corrections have done; empty without them
   define(m, "sweep", DIFFVBD_ARGUMENTS(SWEEP), DIFFVBD_SETTINGS ", int debug_step, bool checked",
          "Tensor x, Tensor tape, Tensor cut, Tensor corrections, ");
   // x: the end of the sweeps; wants: material, mass, rest, energy_data
   define(m, "sweep_backward", DIFFVBD_ARGUMENTS(SWEEP),
-         "Tensor x_bar, Tensor x, Tensor tape, Tensor corrections, " DIFFVBD_SETTINGS ", bool[] wants",
+         "Tensor x_bar, Tensor x, Tensor tape, Tensor corrections, Tensor cut, " DIFFVBD_SETTINGS ", bool[] wants",
          DIFFVBD_RETURNS(SWEEP));
   // CUDA only: predictor and velocity in the same launches, for scenes whose only energy is that of the tets.
   // prescribed: where pinned vertices go, or empty.
@@ -57,17 +57,14 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "contact_translation_backward(Tensor u_bar, Tensor move, Tensor mass, Tensor x, Tensor origin, Tensor planes, "
       "Tensor held, Tensor body, Tensor body_order, Tensor body_ptr, Tensor island, Tensor lowest) -> (Tensor move, "
       "Tensor mass, Tensor x, Tensor planes)");
-  // Bounds, start, what is left to go, and 1 where a bound has cut, see contact/start.h. The adjoint: of x, move, goal,
-  // u (for each vertex), the gap of near, and planes (for each vertex).
+  // Where each vertex wants to be, see contact/start.h; planes and origin may be empty. The adjoint: of x, move, u and
+  // planes, the last two for each vertex.
   m.def(
-      "contact_start(Tensor x, Tensor move, Tensor goal, Tensor u, Tensor near, Tensor origin, Tensor planes, Tensor "
-      "held, Tensor body, float gamma, float cap, float filter_eta) -> (Tensor bounds, Tensor start, Tensor move, "
-      "Tensor outside)");
+      "contact_start(Tensor x, Tensor move, Tensor u, Tensor planes, Tensor origin, Tensor held, Tensor body, float "
+      "filter_eta) -> Tensor");
   m.def(
-      "contact_start_backward(Tensor bounds_bar, Tensor start_bar, Tensor move_bar, Tensor x, Tensor move, Tensor "
-      "goal, Tensor u, Tensor near, Tensor origin, Tensor planes, Tensor held, Tensor body, float gamma, float cap, "
-      "float filter_eta, bool wants_planes) -> (Tensor x, Tensor move, Tensor goal, Tensor u, Tensor gap, Tensor "
-      "planes)");
+      "contact_start_backward(Tensor bar, Tensor x, Tensor move, Tensor u, Tensor planes, Tensor origin, Tensor held, "
+      "Tensor body, float filter_eta, bool wants_planes) -> (Tensor x, Tensor move, Tensor u, Tensor planes)");
   // Normal force, 1 where active, normal and weights of each pair [pairs, 9], and the adjoint of x, collider and kappa
   m.def(
       "contact_lag(Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor constants, Tensor ptr, "
@@ -133,14 +130,14 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   m.def("tet_gather(Tensor values, Tensor tets) -> Tensor");
   m.def("star_sum(Tensor values, Tensor star_ptr, Tensor star, bool positive) -> Tensor");
   m.def("row_sum(Tensor values) -> Tensor");
-  // results as in contact/candidates.h; mesh_bodies: body labels from there on are colliders; trim (CPU): the list has
-  // as many rows as there are pairs, and no more than the capacity
+  // results as in contact/candidates.h; mesh_bodies: body labels from there on are colliders; room [scenes, mesh_bodies
+  // + 1]: how far the vertices of a body may go before the next detection, and the largest; trim (CPU): the list has as
+  // many rows as there are pairs, and no more than the capacity
   m.def(
       "contact_detect(Tensor x, Tensor origin, Tensor collider, Tensor collider_next, Tensor rest, Tensor radius, "
-      "Tensor triangles, Tensor edges, Tensor points, Tensor planes, Tensor body, Tensor held, int mesh_bodies, bool "
-      "self_contact, bool between_bodies, float dhat, float reach, float cap, float gamma, int capacity, bool trim) -> "
-      "(Tensor pairs, Tensor constants, Tensor ptr, Tensor entry, Tensor near_corners, Tensor near_values, Tensor "
-      "counts, "
+      "Tensor triangles, Tensor edges, Tensor points, Tensor planes, Tensor body, Tensor held, Tensor room, int "
+      "mesh_bodies, bool self_contact, bool between_bodies, float dhat, int capacity, bool trim) -> (Tensor pairs, "
+      "Tensor constants, Tensor ptr, Tensor entry, Tensor near_corners, Tensor near_values, Tensor counts, "
       "Tensor smallest)");
   // results as in contact/intersect.h
   m.def(
@@ -149,8 +146,14 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "between_bodies, int capacity) -> (Tensor pairs, Tensor counts, Tensor first)");
   m.def(
       "contact_islands(Tensor x, Tensor origin, Tensor move, Tensor mass, Tensor collider, Tensor collider_next, "
-      "Tensor planes, Tensor body, Tensor body_order, Tensor body_ptr, Tensor held, Tensor radius, int mesh_bodies, "
-      "float cap, float dhat, bool any_direction) -> Tensor");
+      "Tensor planes, Tensor body, Tensor body_order, Tensor body_ptr, Tensor held, Tensor radius, Tensor room, int "
+      "mesh_bodies, float dhat, bool any_direction) -> Tensor");
+  // How much of its way each vertex goes at the start, see contact/advance.h: [scenes, vertices]; stuck: how many pairs
+  // what is prescribed brings too close. center: what a vertex may leave by its room at most
+  m.def(
+      "contact_advance(Tensor x, Tensor move, Tensor u, Tensor center, Tensor origin, Tensor collider, Tensor "
+      "collider_next, Tensor held, Tensor body, Tensor room, Tensor pairs, Tensor constants, Tensor ptr, Tensor entry, "
+      "bool careful) -> (Tensor share, Tensor stuck)");
   m.def("segment_sum(Tensor values, Tensor order, Tensor ptr) -> Tensor");
   // points [B, N, 3]; pairs [max_pairs, 3] int32: (scene, i, j), then rows of -1; count [1] int64: how many there are,
   // or -1 where a point is not finite

@@ -114,7 +114,7 @@ SweepBars make_bars(const Tensor& x, const SweepFields& f, const In& in, int64_t
   require(wants.size() == 5, "diffvbd::sweep_backward: expected 5 wishes");
   const auto none = [&] { return make({0}, false); };
   SweepBars bars{none(), none(), none(), none(), none(), none(), none(), none(),
-                 none(), none(), none(), none(), none(), none(), none(), none()};
+                 none(), none(), none(), none(), none(), none(), none()};
   const std::vector<int64_t> state{in.scenes, vertices, 3};
   bars.x_start = make(state, false), bars.x_prev = make(state, zeroed), bars.y = make(state, false);
   make_body_bars(bars, in, vertices, tets, materials, zeroed, {wants[0], wants[1], wants[2]}, make);
@@ -140,12 +140,25 @@ void set_bars(Out& out, const SweepBars& bars, const In& in) {
   out.data = bars.energy_data.numel() > 0 ? data<T>(bars.energy_data) : nullptr;
 }
 
+// Limits of updates, of no scenes without contact.
+template <class In>
+std::vector<int64_t> cut_shape(const In& in, int64_t vertices) {
+  return {in.contact ? in.scenes : 0, int64_t{in.sweeps}, vertices};
+}
+// The same in a reverse; null without contact.
+template <class In>
+const uint8_t* limits_of(const Tensor& cut, const Tensor& x, const In& in, int64_t vertices) {
+  if (!in.contact) return nullptr;
+  require(is_beside(cut, x, ScalarType::Byte) && cut.numel() == in.scenes * in.sweeps * vertices,
+          "diffvbd::sweep_backward: expected cut of the same sweeps");
+  return data<const uint8_t>(cut);
+}
+
 // Adjoints of contact, and where its passes add up what they find; `lagged` pairs.
 template <class T, class Make>
 void make_contact_bars(SweepBars& bars, const contact::ContactInputs<T>& in, int64_t scenes, int64_t vertices,
                        int64_t lagged, const Make& make) {
   const int64_t colliders = in.corners - vertices;
-  bars.bounds = make({scenes, vertices, 4}, true);
   bars.collider = make({scenes, colliders, 3}, true), bars.collider_prev = make({scenes, colliders, 3}, true);
   bars.kappa = make({scenes}, true);
   bars.lag = make({lagged, contact::kLagScalars}, true);

@@ -25,7 +25,8 @@ struct Surfaces {
   int32_t vertices, corners, num_triangles, num_edges, num_points, num_planes;
   int32_t mesh_bodies;  // labels from here on are colliders
   bool self_contact, between_bodies;
-  T dhat, reach, cap, gamma;
+  T dhat;
+  const T* room;  // [B, mesh_bodies + 1]  how far a body's vertices may go beside their island [m], and the largest
 
   DIFFVBD_FN int64_t key_base() const {
     const int32_t a = num_triangles < num_edges ? num_edges : num_triangles;
@@ -45,12 +46,12 @@ struct Surfaces {
 };
 
 // What a detection returns; N corner points a scene. Unused rows of pairs and entries of `entry` are -1.
-constexpr int kPairRow = 6, kConstants = 3, kNearRow = 5, kNearValues = 8, kCounts = 4;
+constexpr int kPairRow = 6, kConstants = 8, kNearRow = 5, kNearValues = 8, kCounts = 4;
 template <class T>
 struct Detected {
   int64_t capacity;
   int32_t* pairs;         // [capacity, 6]  corner points, kind, scene
-  T* constants;           // [capacity, 3]  dhat, offset, threshold
+  T* constants;           // [capacity, 8]  dhat, offset, threshold; what limit.h takes as hints
   int32_t *ptr, *entry;   // [B N + 1], [4 capacity]  pairs of each corner point: 4 pair + local corner
   int32_t* near_corners;  // [B, N, 5]  of the near pair, and its kind; or itself and -1
   T* near_values;         // [B, N, 8]  weights, normal, gap
@@ -121,10 +122,22 @@ DIFFVBD_FN Box primitive_box(const Surfaces<T>& in, const int32_t* v, int n, int
   return out;
 }
 
-// Squared distance of boxes up to which the primitives may be closer than the reach.
+// How far a corner point may go before its pairs must be found again [m], by its body.
 template <class T>
-DIFFVBD_FN float squared_reach(const Surfaces<T>& in) {
-  const float reach = static_cast<float>(in.reach) * (1.0F + 0x1p-20F);
+DIFFVBD_FN T room_of(const Surfaces<T>& in, int64_t scene, int32_t body) {
+  return body < in.mesh_bodies ? in.room[scene * (in.mesh_bodies + 1) + body] : T(0);
+}
+// Gap up to which pairs of a scene are looked for; squared distance of boxes up to which a pair of a primitive of some
+// group, -1 where that has several, may be closer.
+template <class T>
+DIFFVBD_FN T reach_of(const Surfaces<T>& in, int64_t scene) {
+  return in.dhat + T(2) * in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
+}
+template <class T>
+DIFFVBD_FN float squared_reach(const Surfaces<T>& in, int64_t scene, int32_t group) {
+  const T most = in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
+  const T far = in.dhat + most + (group >= 0 ? room_of(in, scene, group) : most);
+  const float reach = static_cast<float>(far) * (1.0F + 0x1p-20F);
   return reach * reach * (1.0F + 0x1p-20F);
 }
 
@@ -240,17 +253,10 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   return out;
 }
 
-// How far a corner point with this near gap may move before its pairs must be found again.
+// Whether a pair with this gap, whose barrier reaches as far as dhat, may become active before the next detection.
 template <class T>
-DIFFVBD_FN T bound_of(const Surfaces<T>& in, T near_gap) {
-  const T bound = in.gamma * (T(0) < near_gap ? near_gap : T(0));
-  return bound < in.cap ? bound : in.cap;
-}
-
-// Whether a pair may become active while its sides move by at most a and b [m].
-template <class T>
-DIFFVBD_FN bool is_listed(T gap, T a, T b, T dhat) {
-  return gap - a - b < dhat;
+DIFFVBD_FN bool is_listed(const Surfaces<T>& in, const Candidate& c, T gap, T dhat) {
+  return gap - room_of(in, c.scene, in.body[c.v[0]]) - room_of(in, c.scene, in.body[c.v[c.second()]]) < dhat;
 }
 
 // --- results
@@ -260,10 +266,11 @@ constexpr uint64_t kNoKey = ~uint64_t{0};  // of no pair
 
 // Rows of near_corners and near_values of corner point i.
 template <class T>
-DIFFVBD_FN void store_near_pair(const Surfaces<T>& in, int32_t i, uint64_t key, int32_t* corners, T* values) {
+DIFFVBD_FN void store_near_pair(const Surfaces<T>& in, int64_t scene, int32_t i, uint64_t key, int32_t* corners,
+                                T* values) {
   if (key == kNoKey) {
     for (int k = 0; k < kNearRow; ++k) corners[k] = k < 4 ? i : -1;
-    for (int k = 0; k < kNearValues; ++k) values[k] = k == kNearValues - 1 ? in.reach : T(0);
+    for (int k = 0; k < kNearValues; ++k) values[k] = k == kNearValues - 1 ? reach_of(in, scene) : T(0);
     return;
   }
   const Candidate c = candidate_of_key(in, key);
@@ -274,12 +281,12 @@ DIFFVBD_FN void store_near_pair(const Surfaces<T>& in, int32_t i, uint64_t key, 
   values[7] = at.d - offset_of(in, c);
 }
 
-// Rows of pairs and constants of a listed pair.
+// Rows of pairs and constants of a listed pair, without the hints.
 template <class T>
 DIFFVBD_FN void store_listed_pair(const Surfaces<T>& in, uint64_t key, int32_t* pair, T* constants) {
+  for (int k = 0; k < kConstants; ++k) constants[k] = T(0);
   if (key == kNoKey) {
     for (int k = 0; k < kPairRow; ++k) pair[k] = -1;
-    for (int k = 0; k < kConstants; ++k) constants[k] = T(0);
     return;
   }
   const Candidate c = candidate_of_key(in, key);
@@ -287,6 +294,26 @@ DIFFVBD_FN void store_listed_pair(const Surfaces<T>& in, uint64_t key, int32_t* 
   pair[4] = c.kind, pair[5] = static_cast<int32_t>(c.scene);
   const Constants<T> a = constants_of(in, c);
   constants[0] = a.dhat, constants[1] = a.offset, constants[2] = a.threshold;
+}
+
+// The hints of a listed pair: of its corners' nearest gaps the smallest, with its direction from the second side of
+// this pair to the first, and the pair's own gap. The rows of near pairs must be there.
+template <class T>
+DIFFVBD_FN void store_hints(const Surfaces<T>& in, const Detected<T>& out, const int32_t* pair, T* constants) {
+  if (pair[4] < 0) return;
+  const Candidate c{pair[5], pair[4], 0, 0, {pair[0], pair[1], pair[2], pair[3]}};
+  const auto row = [&](int k) { return c.scene * in.corners + c.v[k]; };
+  const auto gap = [&](int k) { return out.near_values[kNearValues * row(k) + kNearValues - 1]; };
+  int nearest = 0;
+  for (int k = 1; k < 4; ++k) nearest = gap(k) < gap(nearest) ? k : nearest;
+  const int32_t* near = out.near_corners + kNearRow * row(nearest);
+  const T* values = out.near_values + kNearValues * row(nearest);
+  const int32_t own = c.v[nearest];
+  const bool first = near[0] == own || (near[4] == kEdgeEdge && near[1] == own);
+  const T sign = first == (nearest < c.second()) ? T(1) : T(-1);
+  for (int i = 0; i < 3; ++i) constants[3 + i] = sign * values[4 + i];
+  constants[6] = gap(nearest);
+  constants[7] = separation(c.kind, corners_of(in, c)) - offset_of(in, c);
 }
 
 }  // namespace diffvbd::contact

@@ -21,9 +21,11 @@ struct IslandInputs {
   const bool* held;                            // [N]
   int64_t scenes, mass_scene;                  // stride of scenes in mass
   int32_t vertices, corners, num_planes, mesh_bodies;
-  T margin;            // what each vertex may move beside the translation, and half the reach of the barrier [m]
+  const T* room;  // [B, mesh_bodies + 1]  how far a body's vertices may move beside the translation [m], the largest
+  T half;         // the reach of the barrier [m]
   bool any_direction;  // a floor may turn the translation, which does not become longer by it
 
+  DIFFVBD_FN T margin(int64_t scene, int32_t body) const { return room[scene * (mesh_bodies + 1) + body] + half; }
   DIFFVBD_FN int32_t colliders() const { return corners - vertices; }  // points, and so at most as many objects
 };
 
@@ -98,10 +100,10 @@ DIFFVBD_FN Vec3<T> translation(const BodySum<T>& island) {
   return island.blocked || !(T(0) < island.mass) ? zero3<T>() : (T(1) / island.mass) * island.momentum;
 }
 
-// What a body may reach while its island moves by u.
+// What a body may reach while its island moves by u and its vertices by `margin` from there.
 template <class T>
-DIFFVBD_FN Bounds<T> swept(const IslandInputs<T>& in, const Bounds<T>& body, const Vec3<T>& u) {
-  const T r = in.any_direction ? in.margin + square_root(dot(u, u)) : in.margin;
+DIFFVBD_FN Bounds<T> swept(const IslandInputs<T>& in, const Bounds<T>& body, const Vec3<T>& u, T margin) {
+  const T r = in.any_direction ? margin + square_root(dot(u, u)) : margin;
   Bounds<T> out = body, end{body.lo + u, body.hi + u};
   if (!in.any_direction) include(out, end);
   const Vec3<T> m{r, r, r};
@@ -114,18 +116,18 @@ DIFFVBD_FN bool overlap(const Bounds<T>& a, const Bounds<T>& b) {
          b.lo.z <= a.hi.z;
 }
 
-// Where collider point j = 0, 1, ... is during the sweeps that follow, grown by its radius and the margin.
+// Where collider point j = 0, 1, ... is during the sweeps that follow, grown by its radius and half the reach.
 template <class T>
 DIFFVBD_FN Bounds<T> collider_bounds(const IslandInputs<T>& in, int64_t scene, int32_t j) {
   const int64_t row = scene * in.colliders() + j;
   const auto at = [&](const T* p) { return Vec3<T>{p[3 * row], p[3 * row + 1], p[3 * row + 2]}; };
-  const T r = in.radius[in.vertices + j] + in.margin;
+  const T r = in.radius[in.vertices + j] + in.half;
   Bounds<T> out = around(at(in.collider), zero3<T>(), r);
   include(out, around(at(in.collider_next), zero3<T>(), r));
   return out;
 }
 
-// Whether a swept box comes closer to plane l than the margin.
+// Whether a swept box comes closer to plane l than half the reach.
 template <class T>
 DIFFVBD_FN bool reaches_plane(const IslandInputs<T>& in, int64_t scene, int32_t l, const Bounds<T>& box) {
   const auto at = [&](int k) {
@@ -135,7 +137,7 @@ DIFFVBD_FN bool reaches_plane(const IslandInputs<T>& in, int64_t scene, int32_t 
   const Vec3<T> a = at(0), n = cross(at(1) - a, at(2) - a);
   const Vec3<T> lowest{n.x < T(0) ? box.hi.x : box.lo.x, n.y < T(0) ? box.hi.y : box.lo.y,
                        n.z < T(0) ? box.hi.z : box.lo.z};
-  return dot(n, lowest - a) < in.margin * square_root(dot(n, n));
+  return dot(n, lowest - a) < in.half * square_root(dot(n, n));
 }
 
 }  // namespace diffvbd::contact

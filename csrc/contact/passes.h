@@ -5,7 +5,7 @@
 
 #include "../core/views.h"
 #include "candidates.h"
-#include "pairs.h"
+#include "limit.h"
 
 namespace diffvbd::contact {
 
@@ -22,15 +22,18 @@ struct ContactInputs {
   int64_t corners = 0;
   int32_t num_vertices = 0;
   PairList listed, lagged;                   // of the last detection; of the first one of the step
-  const T* constants = nullptr;              // [pairs, 3]  of the listed
+  const T* constants = nullptr;              // [pairs, 8]  of the listed
   const T* lag = nullptr;                    // [pairs, kLagScalars]  of the lagged
   Batched<const T> kappa;                    // [B]
-  Batched<const T> bounds;                   // [B, V, 4]  center, radius
   Batched<const T> collider, collider_prev;  // [B, Vc, 3]  during the sweeps; at the start of the step
+  const T* center = nullptr;                 // [B, V, 3]  from where a vertex may go
+  const T* room = nullptr;                   // [B, V]  as far as this [m]
   Batched<const T> floor_lag;                // [B, V, planes, 4]  coefficient times normal force, normal
   int planes = 0;
   Batched<const T> x_prev, origin;  // [B, V, 3]; origin may be null
   T friction_eps = T(0);            // motion in a step below which friction is smoothed [m]
+
+  DIFFVBD_FN Vec3<T> center_of(int64_t scene, int v) const { return point_at(center, scene * num_vertices + v); }
 };
 
 // Where pairs leave what they add; zero at first. Slot 4 pair + i belongs to corner i, its only writer.
@@ -48,13 +51,18 @@ DIFFVBD_FN Vec3<T> vector_at(const T* p) {
   return {p[0], p[1], p[2]};
 }
 template <class T>
+DIFFVBD_FN T length_of(const Vec3<T>& a) {
+  return square_root(dot(a, a));
+}
+template <class T>
 DIFFVBD_FN void add_at(T* p, const Vec3<T>& v) {
   p[0] += v.x;
   p[1] += v.y;
   p[2] += v.z;
 }
 
-// The corner points of one scene; x(v) of a vertex is the backend's.
+// The corner points of one scene. The backend's are x(v) of a vertex and, where a color has moved, goes(v), whether v
+// was of it; x(v) is then where it was before.
 template <class T, class Positions>
 struct Source {
   const ContactInputs<T>& in;
@@ -81,6 +89,35 @@ struct Source {
     for (int k = 1; k < 4; ++k) out.x[k] = (x(pair[k]) - x0) + (origin(pair[k]) - o0);
     return out;
   }
+  // How a corner point has moved since the pairs were found, beside its island.
+  DIFFVBD_FN Vec3<T> moved(int v) const {
+    if (v < in.num_vertices) return positions(v) - in.center_of(scene, v);
+    const int64_t row = 3 * (v - in.num_vertices);
+    return x(v) - vector_at(in.collider_prev.data + scene * in.collider_prev.scene + row);
+  }
+  // Square of how far the closest points of two sides can have moved relative to each other since then.
+  DIFFVBD_FN T squared_change(const int32_t* pair) const {
+    const int first = sides(pair[4]);
+    Vec3<T> way[4];
+    for (int k = 0; k < 4; ++k) way[k] = moved(pair[k]);
+    T most = T(0);
+    for (int i = 0; i < first; ++i) {
+      for (int j = first; j < 4; ++j) {
+        const Vec3<T> d = way[i] - way[j];
+        const T square = dot(d, d);
+        most = most < square ? square : most;
+      }
+    }
+    return T(1 + 1e-6) * most;
+  }
+  // Whether the gap of a listed pair is above a length for sure.
+  DIFFVBD_FN bool is_above(const int32_t* pair, const T* constants, T length) const {
+    const T room = PairHints<T>(constants).gap - length;
+    return T(0) < room && squared_change(pair) < room * room;
+  }
+  DIFFVBD_FN bool is_far(const int32_t* pair, const T* constants) const {
+    return is_above(pair, constants, PairConstants<T>(constants).dhat);
+  }
   DIFFVBD_FN Vec3<T> motion(const int32_t* pair, const Lag<T>& a) const {
     Vec3<T> m = zero3<T>();
     for (int k = 0; k < 4; ++k) {
@@ -99,8 +136,9 @@ DIFFVBD_FN void add_pairs(const Source<T, Positions>& s, int v, int first, int s
   for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
     const int entry = in.listed.entry[e], pair = entry >> 2;
     const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
-    const PairConstants<T> constants(in.constants + int64_t{kConstants} * pair);
-    add_barrier(record[4], s.corners(record), entry & 3, constants, kappa, h * h, g, H);
+    const T* constants = in.constants + int64_t{kConstants} * pair;
+    if (s.is_far(record, constants)) continue;
+    add_barrier(record[4], s.corners(record), entry & 3, PairConstants<T>(constants), kappa, h * h, g, H);
   }
   if (in.lag) {
     for (int e = in.lagged.ptr[row] + first; e < in.lagged.ptr[row + 1]; e += stride) {
@@ -115,6 +153,46 @@ DIFFVBD_FN void add_pairs(const Source<T, Positions>& s, int v, int first, int s
     const Lag<T> lag = floor_lag(s, v, k);
     if (lag.active()) add_lagged(lag, 0, s.x(v) - s.x_prev(v), h, in.friction_eps, g, H);
   }
+}
+
+// The exponent of the limit of vertex v, whose update goes from where it was by d: of its room.
+template <class T, class Positions>
+DIFFVBD_FN int limit_by_room(const Source<T, Positions>& s, int v, const Vec3<T>& from, const Vec3<T>& d) {
+  return limit_by_room(from - s.in.center_of(s.scene, v), d, s.in.room[s.scene * s.in.num_vertices + v]);
+}
+
+// And not below `exponent` of every `stride`-th of its pairs from `first` on.
+template <class T, class Positions>
+DIFFVBD_FN int limit_by_pairs(const Source<T, Positions>& s, int v, const Vec3<T>& d, int first, int stride,
+                              int exponent) {
+  const ContactInputs<T>& in = s.in;
+  const int64_t row = s.scene * in.corners + v;
+  const T length = length_of(d);
+  const Vec3<T> at = s.x(v) + s.origin(v);
+  const T guard =
+      T(kGuardUlps) * std::numeric_limits<T>::epsilon() * (absolute(at.x) + absolute(at.y) + absolute(at.z));
+  for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
+    const int entry = in.listed.entry[e], pair = entry >> 2, own = entry & 3;
+    const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
+    const T* constants = in.constants + int64_t{kConstants} * pair;
+    const int sides_first = sides(record[4]);
+    bool both = false;
+    for (int k = 0; k < 4; ++k) {
+      both = both ||
+             ((k < sides_first) != (own < sides_first) && record[k] < in.num_vertices && s.positions.goes(record[k]));
+    }
+    const T share = both ? T(kBothShare) : T(kShare);
+    if (s.is_above(record, constants, limit_of<T>(exponent) * length / share + guard)) continue;
+    const Gate<T> gate(record[4], s.corners(record), constants, guard);
+    const T shares[4] = {share, share, share, share};
+    Vec3<T> way[4] = {zero3<T>(), zero3<T>(), zero3<T>(), zero3<T>()};
+    while (exponent < kNoMove) {
+      way[own] = limit_of<T>(exponent) * d;
+      if (gate.holds(way, shares, false)) break;
+      ++exponent;
+    }
+  }
+  return exponent;
 }
 
 // Friction on a floor plane: the vertex alone, about the plane's normal.
@@ -138,10 +216,10 @@ DIFFVBD_FN void reverse_pairs(const Source<T, Positions>& s, const ContactAdjoin
   for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
     const int64_t entry = in.listed.entry[e], pair = entry >> 2;
     const int32_t* record = in.listed.pairs + kPairRow * pair;
-    const PairConstants<T> constants(in.constants + kConstants * pair);
+    const T* constants = in.constants + kConstants * pair;
     PairAdjoint<T> bar;
-    if (!reverse_barrier(record[4], s.corners(record), static_cast<int>(entry & 3), constants, kappa, h * h, p, d_raw,
-                         bar)) {
+    if (s.is_far(record, constants) || !reverse_barrier(record[4], s.corners(record), static_cast<int>(entry & 3),
+                                                        PairConstants<T>(constants), kappa, h * h, p, d_raw, bar)) {
       continue;
     }
     for (int k = 0; k < 4; ++k) add_at(out.rows + 12 * entry + 3 * k, bar.x[k]);

@@ -1,5 +1,7 @@
 #include "contact.h"
 
+#include <algorithm>
+
 namespace diffvbd {
 
 using namespace contact;
@@ -13,13 +15,34 @@ ContactScene<T>::ContactScene(const Plan& plan, const ContactInputs<T>& in, cons
       scene_(scene),
       s_(s),
       h_(time_step),
+      before_(reverse ? 0 : int64_t{plan.blocks} * kLanes * 4),
       positions_{s.x, position},
       source_{in, scene, positions_} {
   for (int64_t at = 0; at < int64_t{plan.blocks} * kLanes; ++at) {
-    const int32_t own = plan.order[at], v = own < 0 ? plan.order[at / kLanes * kLanes] : own;
-    const T* bound = in.bounds.data + scene * in.bounds.scene + int64_t{4} * v;
-    for (int i = 0; i < kContactScalars; ++i) {
-      *record(at / kLanes, static_cast<int>(at % kLanes), i) = i < 9 ? T(0) : bound[i - 9];
+    for (int i = 0; i < kContactScalars; ++i) *record(at / kLanes, static_cast<int>(at % kLanes), i) = T(0);
+    if (s.limit) s.limit[at] = T(1);
+  }
+}
+
+template <class T>
+void ContactScene<T>::remember(int64_t begin, int64_t end) const {
+  std::copy(s_.x + 4 * begin * kLanes, s_.x + 4 * end * kLanes, before_.get() + 4 * begin * kLanes);
+}
+
+template <class T>
+void ContactScene<T>::limit(int64_t first, int64_t last, int64_t begin, int64_t end, uint8_t* limits) const {
+  const Before before{s_.x, before_.get(), positions_.position, first * kLanes, last * kLanes};
+  const Source<T, Before> source{in_, scene_, before};
+  for (int64_t at = begin * kLanes; at < end * kLanes; ++at) {
+    const int32_t v = plan_.order[at];
+    if (v < 0) continue;
+    T* x = s_.x + 4 * at;
+    const Vec3<T> from = vector_at(before_.get() + 4 * at), d = vector_at(x) - from;
+    const int exponent = limit_by_pairs(source, v, d, 0, 1, limit_by_room(source, v, from, d));
+    limits[v] = static_cast<uint8_t>(exponent);
+    if (exponent > 0) {
+      const Vec3<T> to = from + limit_of<T>(exponent) * d;
+      x[0] = to.x, x[1] = to.y, x[2] = to.z;
     }
   }
 }
@@ -55,13 +78,14 @@ void ContactScene<T>::assemble(int64_t begin, int64_t end) const {
 }
 
 template <class T>
-void ContactScene<T>::prepare(int sweep, int tape_policy, int64_t begin, int64_t end) const {
+void ContactScene<T>::prepare(int sweep, int tape_policy, int64_t begin, int64_t end, const uint8_t* limits) const {
   const int64_t rows = tape_rows(tape_policy, true);
   for (int64_t block = begin; block < end; ++block) {
     const int count = plan_.block_rank[block + 1] - plan_.block_rank[block];
     const T* at = s_.tape + sweep * rows * plan_.num_active + plan_.block_rank[block];
     for (int lane = 0; lane < count; ++lane) {
       for (int c = 0; c < 3; ++c) s_.x[4 * (block * kLanes + lane) + c] = at[c * plan_.num_active + lane];
+      s_.limit[block * kLanes + lane] = limit_of<T>(limits[plan_.order[block * kLanes + lane]]);
     }
   }
   each_vertex(begin, end, [&](int32_t v, int64_t block, int lane) {
@@ -93,23 +117,6 @@ void ContactScene<T>::finish(T* collider_bar) const {
                                 : collider_bar + 3 * (v - in_.num_vertices),
            now);
     add_at(reverse_->prev + 3 * (scene_ * in_.corners + v), prev);
-  }
-}
-
-template <class T>
-void ContactScene<T>::store_bounds(T* bounds_bar) const {
-  for (int64_t at = 0; at < int64_t{plan_.blocks} * kLanes; ++at) {
-    const int32_t v = plan_.order[at];
-    for (int i = 0; v >= 0 && i < 4; ++i) {
-      bounds_bar[int64_t{4} * v + i] = s_.bound_bar[(at / kLanes * 4 + i) * kLanes + at % kLanes];
-    }
-  }
-}
-
-template <class T>
-void ContactScene<T>::store_cut(uint8_t* cut) const {
-  for (int64_t at = 0; at < int64_t{plan_.blocks} * kLanes; ++at) {
-    if (plan_.order[at] >= 0) cut[plan_.order[at]] = s_.cut[at] > T(0);
   }
 }
 

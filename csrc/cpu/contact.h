@@ -16,22 +16,31 @@ class ContactScene {
 
   // The pairs' part of the blocks [begin, end).
   void assemble(int64_t begin, int64_t end) const;
+  // Before and after the updates of the color that is the blocks [first, last): remembers where its vertices were, and
+  // takes back what planes do not let pass of their motion; limits [V] receives the exponents.
+  void remember(int64_t begin, int64_t end) const;
+  void limit(int64_t first, int64_t last, int64_t begin, int64_t end, uint8_t* limits) const;
   // Reverse, before a color's turn: its vertices go back to the positions before their update, which `tape` names, and
   // collect what pairs have sent them since their last turn.
-  void prepare(int sweep, int tape_policy, int64_t begin, int64_t end) const;
+  void prepare(int sweep, int tape_policy, int64_t begin, int64_t end, const uint8_t* limits) const;
   // Reverse, after the turn: the adjoint of assemble().
   void reverse(int64_t begin, int64_t end) const;
   // After the last turn: what is left for vertices, into the rows of x_bar, and for colliders [Vc, 3].
   void finish(T* collider_bar) const;
-  // Adjoint of the bounds [V, 4], and which vertices a bound has held back [V].
-  void store_bounds(T* bounds_bar) const;
-  void store_cut(uint8_t* cut) const;
 
  private:
   struct Positions {
     const T* rows;
     const int32_t* position;
     Vec3<T> operator()(int v) const { return contact::vector_at(rows + int64_t{4} * position[v]); }
+  };
+  // Of a color whose vertices have moved, as they were before.
+  struct Before {
+    const T *rows, *before;
+    const int32_t* position;
+    int64_t first, last;  // of the color
+    bool goes(int v) const { return first <= position[v] && position[v] < last; }
+    Vec3<T> operator()(int v) const { return contact::vector_at((goes(v) ? before : rows) + int64_t{4} * position[v]); }
   };
   template <class F>
   void each_vertex(int64_t begin, int64_t end, const F& f) const;
@@ -43,6 +52,7 @@ class ContactScene {
   const int64_t scene_;
   SceneView<T>& s_;
   const T h_;
+  const Buffer<T> before_;  // [blocks kLanes, 4]  where the vertices of a color were before it moved
   const Positions positions_;
   const contact::Source<T, Positions> source_;
 };

@@ -21,11 +21,7 @@ struct Near {
 // What a piece of the search finds.
 template <class T>
 struct Finds {
-  struct Pair {
-    uint64_t key;
-    T gap, dhat;
-  };
-  std::vector<Pair> pairs;  // that the list may need
+  std::vector<uint64_t> pairs;  // that the list needs
   int64_t touching = 0;
   uint64_t first_touching = kNoKey;
 };
@@ -42,11 +38,11 @@ std::array<std::mutex, 256> locks;  // of near pairs; a lock is taken only where
 template <class T>
 class SceneDetection {
  public:
-  explicit SceneDetection(const Surfaces<T>& in) : in_(in), near_(in.corners), reach2_(squared_reach(in)) {}
+  explicit SceneDetection(const Surfaces<T>& in) : in_(in), near_(in.corners) {}
 
   void run(int64_t scene) {
-    scene_ = scene;
-    for (Near<T>& near : near_) near.gap.store(in_.reach, std::memory_order_relaxed), near.key = kNoKey;
+    scene_ = scene, reach_ = reach_of(in_, scene);
+    for (Near<T>& near : near_) near.gap.store(reach_, std::memory_order_relaxed), near.key = kNoKey;
     build_trees();
     constexpr int32_t each = kChunk / kGroup;
     const int32_t point_chunks = (points_.groups() + each - 1) / each,
@@ -66,7 +62,7 @@ class SceneDetection {
         }
       }
     });
-    select();
+    gather();
   }
 
   const std::vector<uint64_t>& listed() const { return listed_; }
@@ -76,10 +72,10 @@ class SceneDetection {
   void store_near(const Detected<T>& out) const {
     const int64_t row = scene_ * in_.corners;
     for_each(in_.corners, [&](int64_t i) {
-      store_near_pair(in_, static_cast<int32_t>(i), near_[i].key, out.near_corners + kNearRow * (row + i),
+      store_near_pair(in_, scene_, static_cast<int32_t>(i), near_[i].key, out.near_corners + kNearRow * (row + i),
                       out.near_values + kNearValues * (row + i));
     });
-    T smallest = in_.reach;
+    T smallest = reach_;
     for (const Near<T>& near : near_) smallest = std::min(smallest, near.gap.load(std::memory_order_relaxed));
     out.smallest[scene_] = smallest;
   }
@@ -102,10 +98,11 @@ class SceneDetection {
   void search(const Tree& tree, const Tree& others, int32_t g, std::vector<Met>& met, Finds<T>& finds) {
     const int32_t home = tree.groups() + g;
     const Box &around = tree.nodes[home], *nodes = others.nodes.data();
+    const float reach2 = squared_reach(in_, scene_, around.group);
     met.clear();
     if (!is_empty(around)) {
       const auto hits = [&](const Box& node) {
-        return distance2(node, around) <= reach2_ && !in_.ignores(around.group, node.group);
+        return distance2(node, around) <= reach2 && !in_.ignores(around.group, node.group);
       };
       each_leaf(nodes, others.leaves, kind == kEdgeEdge ? home : kRoot, kRoot, hits, [&](int32_t i) {
         met.push_back({nodes[i], i});
@@ -116,7 +113,7 @@ class SceneDetection {
       const Box& own = tree.nodes[leaf];
       if (!is_empty(own)) {
         for (const Met& other : met) {
-          if ((kind == kEdgeEdge && other.node <= leaf) || !(distance2(other.box, own) <= reach2_)) continue;
+          if ((kind == kEdgeEdge && other.node <= leaf) || !(distance2(other.box, own) <= reach2)) continue;
           examine(candidate(in_, scene_, kind, own.item, other.box.item), finds);
         }
       }
@@ -137,18 +134,17 @@ class SceneDetection {
   void examine(const Candidate& c, Finds<T>& finds) {
     if (!is_considered(in_, c)) return;
     const T gap = separation(c.kind, corners_of(in_, c)) - offset_of(in_, c);
-    if (gap >= in_.reach) return;
-    // Near gaps only fall while the search goes on: what the list does not need now it never will.
-    const T a = bound(c, 0, c.second(), gap), b = c.kind == kPointPlane ? T(0) : bound(c, c.second(), 4, gap);
+    if (gap >= reach_) return;
+    // near gaps only fall while the search goes on
     const auto improves = [&](int32_t v) { return gap <= near_[v].gap.load(std::memory_order_relaxed); };
-    if (gap > T(0) && !is_listed(gap, a, b, in_.dhat) && std::none_of(c.v, c.v + 4, improves)) return;
+    if (gap > T(0) && !is_listed(in_, c, gap, in_.dhat) && std::none_of(c.v, c.v + 4, improves)) return;
     const Constants<T> constants = constants_of(in_, c);
     if (!constants.admitted) return;
     const uint64_t key = contact::key_of(in_, c);
     if (!(gap > T(0))) ++finds.touching, finds.first_touching = std::min(finds.first_touching, key);
     if (std::isnan(gap)) return;
     for (const int32_t v : c.v) offer(near_[v], v, gap, key);
-    if (is_listed(gap, a, b, constants.dhat)) finds.pairs.push_back({key, gap, constants.dhat});
+    if (is_listed(in_, c, gap, constants.dhat)) finds.pairs.push_back(key);
   }
 
   static void offer(Near<T>& near, int32_t v, T gap, uint64_t key) {
@@ -159,31 +155,12 @@ class SceneDetection {
     near.gap.store(gap, std::memory_order_relaxed), near.key = key;
   }
 
-  // How far the corners from..to may move, given that there is a pair with this gap.
-  T bound(const Candidate& c, int from, int to, T gap) const {
-    T most = T(0);
-    for (int k = from; k < to; ++k) most = std::max(most, near_[c.v[k]].gap.load(std::memory_order_relaxed));
-    return bound_of(in_, std::min(most, gap));
-  }
-
-  // The list, sorted, now that all near gaps are known.
-  void select() {
-    torch::stable::parallel_for(0, static_cast<int64_t>(finds_.size()), kSearchGrain, [&](int64_t begin, int64_t end) {
-      for (int64_t f = begin; f < end; ++f) {
-        auto& pairs = finds_[f].pairs;
-        const auto needless = [&](const typename Finds<T>::Pair& pair) {
-          const Candidate c = candidate_of_key(in_, pair.key);
-          const T a = bound(c, 0, c.second(), pair.gap);
-          const T b = c.kind == kPointPlane ? T(0) : bound(c, c.second(), 4, pair.gap);
-          return !is_listed(pair.gap, a, b, pair.dhat);
-        };
-        pairs.erase(std::remove_if(pairs.begin(), pairs.end(), needless), pairs.end());
-      }
-    });
+  // What the pieces have found, sorted.
+  void gather() {
     listed_.clear(), touching_ = 0, first_touching_ = kNoKey;
     for (const Finds<T>& finds : finds_) {
       touching_ += finds.touching, first_touching_ = std::min(first_touching_, finds.first_touching);
-      for (const auto& pair : finds.pairs) listed_.push_back(pair.key);
+      listed_.insert(listed_.end(), finds.pairs.begin(), finds.pairs.end());
     }
     sort_by_key(listed_, scratch_, bits_of(in_.keys()));
   }
@@ -197,7 +174,7 @@ class SceneDetection {
   std::vector<uint64_t> listed_, scratch_;
   int64_t touching_ = 0;
   uint64_t first_touching_ = kNoKey;
-  const float reach2_;
+  T reach_ = T(0);
 };
 
 // ptr and entry: a stable counting sort of the pairs' corners.
@@ -255,7 +232,10 @@ template <class T>
 void store_list(const Surfaces<T>& in, const std::vector<uint64_t>& keys, const Detected<T>& out) {
   const auto rows = std::min(static_cast<int64_t>(keys.size()), out.capacity);
   for_each(out.capacity, [&](int64_t i) {
-    store_listed_pair(in, i < rows ? keys[i] : kNoKey, out.pairs + kPairRow * i, out.constants + kConstants * i);
+    int32_t* pair = out.pairs + kPairRow * i;
+    T* constants = out.constants + kConstants * i;
+    store_listed_pair(in, i < rows ? keys[i] : kNoKey, pair, constants);
+    store_hints(in, out, pair, constants);
   });
   store_entries(in, rows, out);
 }

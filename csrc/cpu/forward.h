@@ -20,9 +20,6 @@ __attribute__((flatten)) void forward_color(const Plan& plan, const SceneView<T>
     const NewtonStep<R> newton = newton_step<Set>(b, LaneStar<T>(plan, s, block), q);
     const Update<R> u = safeguarded<Set>(b, newton.d_raw, q);
     store_rows(s.x, block, moved<Set>(b.state.x, u));
-    if constexpr (Set::contact) {
-      LaneStar<T>::accumulate(s.cut + block * kLanes, is_cut(b.state.x, relaxed(u.d_raw, q), b.contact.bound));
-    }
     if (tape == kNoTape) continue;
     const int count = plan.block_rank[block + 1] - plan.block_rank[block];
     T* at = s.tape + static_cast<int64_t>(sweep) * rows * plan.num_active + plan.block_rank[block];

@@ -67,7 +67,7 @@ class SceneIslands {
     std::fill(islands_.begin(), islands_.end(), nothing<T>());
     for (int32_t i = 0; i < in_.mesh_bodies; ++i) islands_[label_[i]].add(bodies_[i]);
     for (int32_t i = 0; i < in_.mesh_bodies; ++i) {
-      box_[i] = swept(in_, bodies_[i].bounds, translation(islands_[label_[i]]));
+      box_[i] = swept(in_, bodies_[i].bounds, translation(islands_[label_[i]]), in_.margin(scene_, i));
     }
     for (int32_t i = 0; i < in_.mesh_bodies; ++i) {
       bool blocked = false;

@@ -29,12 +29,15 @@ __attribute__((flatten)) void reverse_color(const Plan& plan, const SceneView<T>
     const Update<R> u = replayed<Set>(b, star, r, tape == kFullTape, q);
     store_rows(s.x, block, b.state.x);
 
-    const Vec3<R> x_bar = load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block);
-    const BlockAdjoint<R> out = reverse_vertex<Set, kMaterial | kRest>(
+    const Vec3<R> end_bar = load_rows(s.x_bar, block) + pull_rows(plan, s.rows, block);
+    Vec3<R> x_bar = end_bar;
+    if constexpr (Set::contact) x_bar = R::load(s.limit + block * kLanes) * end_bar;
+    BlockAdjoint<R> out = reverse_vertex<Set, kMaterial | kRest>(
         b, star, u, r, x_bar, q, s.data_bar != nullptr, [&](int k, int i, const R& value) {
           const int64_t row = b.data[k] - values + i;
           LaneStar<T>::accumulate(s.data_bar + (row * plan.blocks + block) * kLanes, value);
         });
+    if constexpr (Set::contact) out.x += end_bar - x_bar;  // what a limit holds back stays where it was
     store_rows(s.x_bar, block, out.x);
     add3(s.y_bar, block, out.y);
     LaneStar<T>::accumulate(s.mass_bar + block * kLanes, out.mass);
@@ -42,8 +45,6 @@ __attribute__((flatten)) void reverse_color(const Plan& plan, const SceneView<T>
     if constexpr (Set::contact) {
       const R values[] = {out.p.x, out.p.y, out.p.z, u.d_raw.x, u.d_raw.y, u.d_raw.z};
       for (int i = 0; i < 6; ++i) values[i].store(s.turn + (block * 6 + i) * kLanes);
-      const R bars[] = {out.bound.center.x, out.bound.center.y, out.bound.center.z, out.bound.radius};
-      for (int i = 0; i < 4; ++i) LaneStar<T>::accumulate(s.bound_bar + (block * 4 + i) * kLanes, bars[i]);
     }
   }
 }

@@ -68,7 +68,7 @@ void unpack_rows(const Plan& plan, const T* rows, T* user) {
 template <class T>
 struct Scene {
   Buffer<T> x, y, x_prev, origin, mass, material;
-  Buffer<T> contact, cut;
+  Buffer<T> contact;
   SceneView<T> view{};
   int64_t data_size;
 
@@ -106,9 +106,7 @@ struct Scene {
     }
     if (in.contact) {
       contact = Buffer<T>(size_t(plan.blocks) * kContactScalars * kLanes);
-      cut = Buffer<T>(size_t(plan.blocks) * kLanes, true);
       view.contact = contact.get();
-      view.cut = cut.get();
     }
     view.rest = in.rest.data + scene * in.rest.scene;
     view.data = in.data.data + scene * in.data.scene;
@@ -210,24 +208,32 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
         for (int c = 0; c < plan.colors; ++c) {
           const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
           if (contact) {
-            member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
+            member.each(first, last, [&](int64_t begin, int64_t end) {
+              contact->assemble(begin, end);
+              contact->remember(begin, end);
+            });
             member.barrier();
           }
           member.each(first, last,
                       [&](int64_t begin, int64_t end) { kernel(plan, scene.view, q, k, in.tape_policy, begin, end); });
           member.barrier();
+          if (contact) {
+            uint8_t* limits = cut + (b * in.sweeps + k) * plan.num_vertices;
+            member.each(first, last,
+                        [&](int64_t begin, int64_t end) { contact->limit(first, last, begin, end, limits); });
+            member.barrier();
+          }
           if (looks) look_for_nonfinite(plan, scene.view, in.debug_step, k, c, b);
         }
       }
     });
     unpack_rows(plan, scene.view.x, x + b * 3 * int64_t{plan.num_vertices});
-    if (contact) contact->store_cut(cut + b * plan.num_vertices);
   });
 }
 
 template <class T>
 void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T* x_bar, const T* tape,
-                 const StepAdjoints<T>& out) {
+                 const uint8_t* limits, const StepAdjoints<T>& out) {
   const bool wants_material = out.material[0] != nullptr;
   const auto kernel = reverse_kernel<T>(in.energies);
   const int64_t tape_size =
@@ -253,9 +259,9 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
     s.material_bar = material_bar.get();
     s.rest_bar = rest_bar.get();
     s.data_bar = data_bar.get();
-    const Buffer<T> turn(in.contact ? 6 * lanes : 0), bound_bar(in.contact ? 4 * lanes : 0, true);
+    const Buffer<T> turn(in.contact ? 6 * lanes : 0), limit(in.contact ? lanes : 0);
     s.turn = turn.get();
-    s.bound_bar = bound_bar.get();
+    s.limit = limit.get();
     std::optional<ContactScene<T>> contact;
     if (in.contact) {
       contact.emplace(plan, *in.contact, position.data(), b, s, in.parameters.time_step, out.contact);
@@ -270,8 +276,9 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
       for (int c = plan.colors - 1; c >= 0; --c) {
         const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
         if (contact) {
-          member.each(first, last,
-                      [&](int64_t begin, int64_t end) { contact->prepare(k, in.tape_policy, begin, end); });
+          member.each(first, last, [&](int64_t begin, int64_t end) {
+            contact->prepare(k, in.tape_policy, begin, end, limits + (b * in.sweeps + k) * n);
+          });
           member.barrier();
           if (in.tape_policy != kFullTape) {
             member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
@@ -303,10 +310,7 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
       if (coarse) coarse->finish(member);
     });
     collect_last(plan, s.rows, s.x_bar);
-    if (contact) {
-      contact->finish(out.collider + b * 3 * (in.contact->corners - n));
-      contact->store_bounds(out.bounds + b * 4 * n);
-    }
+    if (contact) contact->finish(out.collider + b * 3 * (in.contact->corners - n));
     unpack_rows(plan, s.x_bar, out.x_start + b * 3 * n);
     unpack_vertices(plan, s.y_bar, out.y + b * 3 * n);
     if (s.x_prev) unpack_vertices(plan, s.x_prev_bar, out.x_prev + b * 3 * n);
@@ -375,10 +379,10 @@ void pack_rest(const Plan& plan, const T* rest, T* packed) {
   }
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                  \
-  template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*, uint8_t*);            \
-  template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*, \
-                               const StepAdjoints<T>&);                                         \
+#define DIFFVBD_INSTANTIATE(T)                                                                                  \
+  template void run_forward<T>(const Plan&, const StepInputs<T>&, T*, T*, uint8_t*);                            \
+  template void run_reverse<T>(const Plan&, const StepInputs<T>&, const T*, const T*, const T*, const uint8_t*, \
+                               const StepAdjoints<T>&);                                                         \
   template void pack_rest<T>(const Plan&, const T*, T*);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

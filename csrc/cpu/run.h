@@ -36,7 +36,7 @@ struct StepAdjoints {
   T* material[kTetScalars];                    // [B, T] each; null where not wanted, as below
   T *mass, *rest, *data;                       // [B, V], [B, T, kRestScalars], [B, N]
   const contact::ContactAdjoints<T>* contact;  // with contact
-  T *bounds, *collider;                        // [B, V, 4], [B, Vc, 3] with contact
+  T* collider;                                 // [B, Vc, 3] with contact
 };
 
 // The values that a step cannot work with raise std::invalid_argument naming the argument.
@@ -47,14 +47,15 @@ void check_values(const Plan& plan, const StepInputs<T>& in);
 template <class T>
 void check_masses(const T* shares, int64_t scenes, int64_t tets, int64_t stride);
 
-// x [B, V, 3], tape [B, sweeps, tape_rows, active], cut [B, V] with contact: where a bound has held back
+// x [B, V, 3], tape [B, sweeps, tape_rows, active]; cut with contact: [B, sweeps, V] exponents of limits
+// (contact/limit.h)
 template <class T>
 void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* cut = nullptr);
 
-// x is what run_forward returned, x_bar its adjoint; both [B, V, 3]
+// x and limits are what run_forward returned, x_bar is the adjoint of x; both [B, V, 3]
 template <class T>
 void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T* x_bar, const T* tape,
-                 const StepAdjoints<T>& out);
+                 const uint8_t* limits, const StepAdjoints<T>& out);
 
 // [T, kRestScalars] -> [slots, kPairRest, kLanes]: the rest shape of each tet, as its four vertices see it
 template <class T>

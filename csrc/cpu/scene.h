@@ -43,8 +43,7 @@ struct SceneView {
   int64_t data_start[kVertexEnergies];
   int data_count[kVertexEnergies];
   T* tape;      // [sweeps, rows, active]
-  T* contact;   // [blocks, kContactScalars, kLanes] or null: what contact adds to the blocks, and the bounds
-  T* cut;       // [blocks, kLanes]: > 0 where a bound has changed an update; or null
+  T* contact;   // [blocks, kContactScalars, kLanes] or null: what contact adds to the blocks
   T* gradient;  // [blocks kLanes, 4] of the potential, for a coarse correction
   T* way;       // [blocks kLanes, 4] along which one goes; in the reverse what the gradient is multiplied with
 
@@ -57,8 +56,8 @@ struct SceneView {
   T* material_bar;  // [slots, kTetScalars, kLanes] or null
   T* rest_bar;      // [slots, kPairRest, kLanes] or null
   T* data_bar;      // [kMaxEnergyData, blocks kLanes] or null
+  T* limit;         // [blocks, kLanes] or null: what limits let through of the update that is reversed
   T* turn;          // [blocks, 6, kLanes]: p and d_raw of the latest reversed update; or null
-  T* bound_bar;     // [blocks, 4, kLanes] or null
 };
 
 template <class T>
@@ -253,7 +252,6 @@ DIFFVBD_FN Block<Lanes<T>> load_block(const Plan& plan, const SceneView<T>& s, i
     ContactTerm<R>& c = out.contact;
     c.g = {get(), get(), get()};
     c.H = {get(), get(), get(), get(), get(), get()};
-    c.bound = {{get(), get(), get()}, get()};
   }
   return out;
 }

@@ -3,7 +3,7 @@
 
 #include "../contact/lag.h"
 #include "contact.h"
-#include "group.cuh"
+#include "contact_rows.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -12,18 +12,6 @@ using contact::ContactAdjoints;
 using contact::ContactInputs;
 
 constexpr int kShare = 8, kContactThreads = 128;
-
-template <class T>
-struct SweepRows {
-  const T* rows;
-  const int32_t* position;
-  __device__ __forceinline__ Vec3<T> operator()(int v) const { return load_row(rows, __ldg(position + v)); }
-};
-template <class T>
-struct UserRows {
-  const T* x;
-  __device__ __forceinline__ Vec3<T> operator()(int v) const { return contact::vector_at(x + int64_t{3} * v); }
-};
 
 template <class T>
 __device__ __forceinline__ void sum_share(T& a) {
@@ -71,17 +59,16 @@ __global__ void load_contact(const __grid_constant__ StepView<T> s, const __grid
   if (i >= s.scenes * s.positions) return;
   const int64_t local = i / s.positions, position = i - local * s.positions;
   const int own = __ldg(s.plan.order + position);
-  const int vertex = own < 0 ? __ldg(s.plan.order + position / kSlice * kSlice) : own;
-  if (local == 0 && own >= 0) s.w.position[own] = static_cast<int32_t>(position);
-  const T* bound = in.bounds.data + (s.base + local) * in.bounds.scene + int64_t{4} * max(0, vertex);
-  T* record = s.w.contact + i * kContactRecord;
-  for (int k = 0; k < kContactScalars; ++k) record[k] = k < 9 || vertex < 0 ? T(0) : bound[k - 9];
+  for (int k = 0; k < kContactScalars; ++k) s.w.contact[i * kContactScalars + k] = T(0);
+  if (own < 0) return;
+  if (local == 0) s.w.position[own] = static_cast<int32_t>(position);
 }
 
 template <class T>
 __global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
                                  int64_t begin, int64_t end) {
   const Member<T> at(s, in, begin, end);
+  if (s.w.before && at.vertex >= 0 && at.lane == 0) store_row(s.w.before, at.row(s), load_row(s.w.x, at.row(s)));
   if (!__any_sync(kWholeWarp, at.touches)) return;
   Vec3<T> g = zero3<T>();
   Sym3<T> H = diagonal(T(0));
@@ -93,7 +80,31 @@ __global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __
   sum_share(g), sum_share(H);
   if (!at.touches || at.lane != 0) return;
   const T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
-  for (int k = 0; k < 9; ++k) s.w.contact[at.row(s) * kContactRecord + k] = values[k];
+  for (int k = 0; k < kContactScalars; ++k) s.w.contact[at.row(s) * kContactScalars + k] = values[k];
+}
+
+// The threads of a vertex look at its pairs in turn; the last one that any of them needs is the limit.
+template <class T>
+__global__ void limit_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
+                              uint8_t* cut, int sweep, int64_t begin, int64_t end) {
+  const Member<T> at(s, in, begin, end);
+  const bool there = at.vertex >= 0;
+  int exponent = 0;
+  Vec3<T> from = zero3<T>(), d = zero3<T>();
+  if (there) {
+    const RowsBefore<T> rows{at.rows(s), s.w.before + at.local * s.positions * kRow, begin * kSlice, end * kSlice};
+    const contact::Source<T, RowsBefore<T>> source{in, at.scene, rows};
+    from = load_row(s.w.before, at.row(s)), d = load_row(s.w.x, at.row(s)) - from;
+    exponent = contact::limit_by_room(source, at.vertex, from, d);
+    exponent = contact::limit_by_pairs(source, at.vertex, d, at.lane, kShare, exponent);
+  }
+#pragma unroll
+  for (int offset = kShare / 2; offset > 0; offset /= 2) {
+    exponent = max(exponent, __shfl_xor_sync(kWholeWarp, exponent, offset));
+  }
+  if (!there || at.lane != 0) return;
+  cut[(at.scene * s.sweeps + sweep) * in.num_vertices + at.vertex] = static_cast<uint8_t>(exponent);
+  if (exponent > 0) store_row(s.w.x, at.row(s), from + contact::limit_of<T>(exponent) * d);
 }
 
 template <class T>
@@ -175,8 +186,6 @@ __global__ void store_contact(const __grid_constant__ StepView<T> s, const __gri
     return;
   }
   contact::add_at(out.x_prev + 3 * (scene * in.num_vertices + corner), own);
-  const T* bar = s.w.bound_bar + 4 * (local * s.positions + s.w.position[corner]);
-  for (int k = 0; k < 4; ++k) out.bounds[4 * (scene * in.num_vertices + corner) + k] = bar[k];
 }
 
 // One scalar of the slots of each scene's pairs, one block a scene, in an order fixed by the number of pairs.
@@ -286,6 +295,11 @@ cudaError_t ContactPasses<T>::load() const {
 template <class T>
 cudaError_t ContactPasses<T>::assemble(int64_t begin, int64_t end) const {
   return launch_contact(assemble_contact<T>, s.scenes * (end - begin) * kSlice * kShare, stream, s, in, begin, end);
+}
+template <class T>
+cudaError_t ContactPasses<T>::limit(int sweep, int64_t begin, int64_t end) const {
+  return launch_contact(limit_contact<T>, s.scenes * (end - begin) * kSlice * kShare, stream, s, in, cut, sweep, begin,
+                        end);
 }
 template <class T>
 cudaError_t ContactPasses<T>::prepare(int sweep, int64_t begin, int64_t end) const {

@@ -12,19 +12,22 @@ struct ContactPasses {
   const StepView<T>& s;
   const contact::ContactInputs<T>& in;
   const StepAdjoints<T>* out;  // null in the forward
+  uint8_t* cut;                // null in the reverse
   cudaStream_t stream;
 
-  // Bounds into sweep order, no pairs yet.
+  // No pairs yet; where vertices are within their rooms.
   cudaError_t load() const;
-  // The pairs' part of the blocks.
+  // The pairs' part of the blocks; in the forward remembers where the color is.
   cudaError_t assemble(int64_t begin, int64_t end) const;
+  // After the update of a color: takes back what planes do not let pass of its motion.
+  cudaError_t limit(int sweep, int64_t begin, int64_t end) const;
   // Reverse, before a color's turn: positions before its update from the tape, and what pairs have sent.
   cudaError_t prepare(int sweep, int64_t begin, int64_t end) const;
   // Reverse, after the turn: the adjoint of assemble().
   cudaError_t reverse(int64_t begin, int64_t end) const;
   // After the last turn, before the adjoints are stored: what is left for vertices and colliders.
   cudaError_t collect() const;
-  // After the adjoints are stored: those of the bounds, of the start of the step, of kappa.
+  // After the adjoints are stored: those of the start of the step, of kappa.
   cudaError_t store() const;
 };
 

@@ -62,10 +62,10 @@ struct Workspace {
 template <class T>
 __global__ void start_kernel(const Surfaces<T> in, Workspace<T> work, int64_t capacity) {
   const int64_t i = own_item();
-  if (i < in.scenes * in.corners) work.near_gap[i] = ordered(in.reach), work.near_key[i] = kNoKey;
+  if (i < in.scenes * in.corners) work.near_gap[i] = ordered(reach_of(in, i / in.corners)), work.near_key[i] = kNoKey;
   if (i < capacity) work.keys[i] = in.keys();
   if (i < in.scenes) {
-    work.smallest[i] = ordered(in.reach);
+    work.smallest[i] = ordered(reach_of(in, i));
     clear_bounds(work.forest, i);
   }
   if (i == 0) {
@@ -77,26 +77,13 @@ __global__ void start_kernel(const Surfaces<T> in, Workspace<T> work, int64_t ca
 // --- search
 // -----------------------------------------------------------------------------------------------------------
 
-// One of two searches: for the near gaps of all corner points, and, when they are known, for the near pairs and the
-// list.
+// One of two searches: for the near gaps of all corner points, and, when they are known, for the near pairs; that one
+// lists.
 template <class T, bool listing>
 struct Search {
   const Surfaces<T>& in;
   const Workspace<T>& work;
   int64_t capacity;
-
-  __device__ T near_gap(const Candidate& c, int k) const {
-    return value_of<T>(work.near_gap[c.scene * in.corners + c.v[k]]);
-  }
-  // How far the corners from..to may move.
-  __device__ T bound(const Candidate& c, int from, int to) const {
-    T most = T(0);
-    for (int k = from; k < to; ++k) {
-      const T gap = near_gap(c, k);
-      most = most < gap ? gap : most;
-    }
-    return bound_of(in, most);
-  }
 
   __device__ void touch(uint64_t key) const {
     atomicAdd(&work.touching[0], 1ULL);
@@ -117,14 +104,9 @@ struct Search {
   __device__ void examine(const Candidate& c) const {
     if (!is_considered(in, c)) return;
     const T gap = separation(c.kind, corners_of(in, c)) - offset_of(in, c);
-    if (gap >= in.reach) return;
+    if (gap >= reach_of(in, c.scene)) return;
     const Ordered<T> bits = ordered(gap);
-    bool matters = !(gap > T(0));
-    T a = T(0), b = T(0);
-    if (listing) {
-      a = bound(c, 0, c.second()), b = c.kind == kPointPlane ? T(0) : bound(c, c.second(), 4);
-      matters = matters || is_listed(gap, a, b, in.dhat);
-    }
+    bool matters = !(gap > T(0)) || (listing && is_listed(in, c, gap, in.dhat));
     Ordered<T>* rows = work.near_gap + c.scene * in.corners;
     for (int k = 0; k < 4; ++k) {
       const Ordered<T> known = *static_cast<volatile Ordered<T>*>(rows + c.v[k]);
@@ -145,7 +127,7 @@ struct Search {
         lower(work.near_key + c.scene * in.corners + c.v[k], static_cast<unsigned long long>(key));
       }
     }
-    if (is_listed(gap, a, b, constants.dhat)) append(key);
+    if (is_listed(in, c, gap, constants.dhat)) append(key);
   }
 
   // What query q looks for: those of points come first, in the order of their Morton codes.
@@ -172,7 +154,7 @@ struct Search {
   template <class Visit>
   __device__ void walk(const Query& q, int32_t from, int32_t end, int32_t first, const Visit& visit) const {
     const Box* nodes = work.forest.tree(q.kind, q.scene);
-    const float reach2 = squared_reach(in);
+    const float reach2 = squared_reach(in, q.scene, q.box.group);
     const auto hits = [&](const Box& node) {
       return distance2(node, q.box) <= reach2 && !in.ignores(q.box.group, node.group);
     };
@@ -264,9 +246,16 @@ __global__ void corner_kernel(const Surfaces<T> in, Workspace<T> work, Detected<
   out.ptr[i] = static_cast<int32_t>(from);
   if (i == rows) return;
   const int64_t scene = i / in.corners;
-  store_near_pair(in, static_cast<int32_t>(i - scene * in.corners), work.near_key[i], out.near_corners + kNearRow * i,
-                  out.near_values + kNearValues * i);
+  store_near_pair(in, scene, static_cast<int32_t>(i - scene * in.corners), work.near_key[i],
+                  out.near_corners + kNearRow * i, out.near_values + kNearValues * i);
   lower(work.smallest + scene, work.near_gap[i]);
+}
+
+// What a pair's neighbourhood suggests, once the near pairs are there.
+template <class T>
+__global__ void hint_kernel(const Surfaces<T> in, Detected<T> out) {
+  const int64_t i = own_item();
+  if (i < out.capacity) store_hints(in, out, out.pairs + kPairRow * i, out.constants + kConstants * i);
 }
 
 template <class T>
@@ -315,6 +304,7 @@ cudaError_t detect(const Surfaces<T>& in, const Detected<T>& out, void* memory, 
       return error;
   }
   corner_kernel<<<blocks_for(rows + 1), kThreads, 0, stream>>>(in, work, out);
+  if (capacity > 0) hint_kernel<<<blocks_for(capacity), kThreads, 0, stream>>>(in, out);
   finish_kernel<<<blocks_for(in.scenes + 1), kThreads, 0, stream>>>(in.scenes, work, out);
   return cudaGetLastError();
 }

@@ -34,11 +34,6 @@ __device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Tu
   const Update<T> u = safeguarded<Set>(b, newton.d_raw, q);
   const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
   if (at.lane == 0) store_row(s.w.x, at.scene * s.positions + position, moved<Set>(b.state.x, u));
-  if constexpr (Set::contact) {
-    if (at.lane == 0 && rank < end_rank && is_cut(b.state.x, relaxed(u.d_raw, q), b.contact.bound) > T(0)) {
-      s.cut[(s.base + at.scene) * s.plan.num_vertices + __ldg(s.plan.order + position)] = 1;
-    }
-  }
   if (s.tape_policy != kNoTape && at.lane == 0 && rank < end_rank) {
     const int rows = tape_rows(s.tape_policy, Set::keeps_positions);
     T* to = s.tape + (at.scene * s.sweeps + turn.sweep) * rows * s.plan.num_active + rank;

@@ -385,8 +385,8 @@ __device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const Place
     });
   }
   if constexpr (Set::contact) {
-    const T* a = s.w.contact + (at.scene * s.positions + position) * kContactRecord;
-    out.contact = {{a[0], a[1], a[2]}, {a[3], a[4], a[5], a[6], a[7], a[8]}, {{a[9], a[10], a[11]}, a[12]}};
+    const T* a = s.w.contact + (at.scene * s.positions + position) * kContactScalars;
+    out.contact = {{a[0], a[1], a[2]}, {a[3], a[4], a[5], a[6], a[7], a[8]}};
   }
   return out;
 }

@@ -128,7 +128,8 @@ __global__ void sweep_kernel(const IslandInputs<T> in, Workspace<T> work) {
   const int64_t i = own_item();
   if (i >= in.scenes * in.mesh_bodies) return;
   const int64_t scene = i / in.mesh_bodies, first = scene * in.mesh_bodies;
-  const Bounds<T> box = swept(in, work.bodies[i].bounds, translation(work.islands[first + work.label[i]]));
+  const Bounds<T> box = swept(in, work.bodies[i].bounds, translation(work.islands[first + work.label[i]]),
+                              in.margin(scene, static_cast<int32_t>(i - first)));
   work.boxes[i] = box;
   bool blocked = false;
   for (int32_t object = 0; object < *work.objects && !blocked; ++object) {
@@ -194,20 +195,18 @@ __global__ void finish_kernel(const IslandInputs<T> in, Workspace<T> work, int32
   island[i] = work.islands[first + work.label[i]].blocked ? -1 : work.label[i];
 }
 
+// A block for each column of each segment.
 template <class T>
 __global__ void segments_sync_kernel(const T* values, const int32_t* order, const int32_t* ptr, int64_t items,
                                      int64_t segments, int64_t c, T* out) {
   __shared__ T part[kThreads];
-  const int64_t scene = blockIdx.x / segments, s = blockIdx.x - scene * segments;
-  for (int64_t k = 0; k < c; ++k) {
-    T own = T(0);
-    for (int64_t e = ptr[s] + int64_t{threadIdx.x}; e < ptr[s + 1]; e += blockDim.x) {
-      own += values[(scene * items + order[e]) * c + k];
-    }
-    const T sum = block_sum(own, part, [](T& a, const T& b) { a += b; });
-    if (threadIdx.x == 0) out[blockIdx.x * c + k] = sum;
-    __syncthreads();
+  const int64_t row = blockIdx.x / c, k = blockIdx.x - row * c, scene = row / segments, s = row - scene * segments;
+  T own = T(0);
+  for (int64_t e = ptr[s] + int64_t{threadIdx.x}; e < ptr[s + 1]; e += blockDim.x) {
+    own += values[(scene * items + order[e]) * c + k];
   }
+  const T sum = block_sum(own, part, [](T& a, const T& b) { a += b; });
+  if (threadIdx.x == 0) out[blockIdx.x] = sum;
 }
 
 }  // namespace
@@ -247,7 +246,7 @@ template <class T>
 cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
                         int64_t segments, int64_t c, T* out, cudaStream_t stream) {
   if (scenes * segments * c == 0) return cudaSuccess;
-  const auto blocks = static_cast<unsigned>(scenes * segments);
+  const auto blocks = static_cast<unsigned>(scenes * segments * c);
   const int threads = threads_for(items, segments);
   segments_sync_kernel<<<blocks, threads, 0, stream>>>(values, order, ptr, items, segments, c, out);
   return cudaGetLastError();

@@ -56,7 +56,13 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
     }
   }
   if (s.has_tets) star.clear_sums(shared);
-  const Vec3<T> x_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
+  const Vec3<T> end_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
+  Vec3<T> x_bar = end_bar;
+  if constexpr (Set::contact) {
+    const int64_t sweep = s.sweeps - 1 - turn.number, step = ((s.base + scene) * s.sweeps + sweep);
+    const int exponent = real ? __ldg(s.limits + step * s.plan.num_vertices + __ldg(s.plan.order + position)) : 0;
+    x_bar = contact::limit_of<T>(exponent) * end_bar;
+  }
   if (s.has_tets) star.fetch_neighbours(false);
   const StepParameters<T> q = of_sweep(s.parameters, turn.number == 0);
   const Update<T> u = replayed<Set>(b, star, r, full, q);
@@ -65,7 +71,7 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   }
   star.repeats = false;
   const bool writes = at.lane == 0 && real;
-  const BlockAdjoint<T> out =
+  BlockAdjoint<T> out =
       reverse_vertex<Set, wanted>(b, star, u, r, x_bar, q, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
         if (writes) s.w.data_bar[(scene * s.data_scalars + s.data_row[k] + i) * s.positions + position] += value;
       });
@@ -82,6 +88,7 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
       }
     }
   }
+  if constexpr (Set::contact) out.x += end_bar - x_bar;  // what a limit holds back stays where it was
   if (writes) {
     store_row(s.w.x, row, b.state.x);
     store_row(s.w.x_bar, row, out.x);
@@ -95,9 +102,6 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
       T* turned = s.w.turn + 6 * row;
       turned[0] = out.p.x, turned[1] = out.p.y, turned[2] = out.p.z;
       turned[3] = u.d_raw.x, turned[4] = u.d_raw.y, turned[5] = u.d_raw.z;
-      T* bound = s.w.bound_bar + 4 * row;
-      contact::add_at(bound, out.bound.center);
-      bound[3] += out.bound.radius;
     }
   }
   return true;

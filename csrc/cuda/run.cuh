@@ -60,7 +60,6 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   w.material_bar = take(elastic && (choice.wanted & kMaterial), n * kTetScalars * (one ? positions : pairs));
   w.rest_bar = take(elastic && (choice.wanted & kRest), n * kPairRest * pairs);
   w.data_bar = take(reverse && adjoints->data, n * scalars * positions);
-  w.bound_bar = take(reverse && in.contact, n * 4 * positions);
   *zeroed = take.used;
   w.x = take(true, n * kRow * positions);
   w.x_bar = take(reverse, n * kRow * positions);
@@ -69,7 +68,8 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   w.origin = take(in.origin.data != nullptr, n * 3 * positions);
   w.mass = take(true, (in.mass.scene != 0 ? n : 1) * positions);
   w.material = take(elastic && !one, (one_for_scenes(in.material) ? 1 : n) * kTetScalars * pairs);
-  w.contact = take(in.contact != nullptr, n * kContactRecord * positions);
+  w.contact = take(in.contact != nullptr, n * kContactScalars * positions);
+  w.before = take(!reverse && in.contact, n * kRow * positions);
   w.turn = take(reverse && in.contact, n * 6 * positions);
   w.position = reinterpret_cast<int32_t*>(take(in.contact != nullptr, plan.num_vertices));
   *spill = nullptr;
@@ -90,6 +90,7 @@ struct Runner {
   const Choice& choice;
   cudaStream_t stream;
   unsigned* barrier;
+  uint8_t* cut = nullptr;  // of the forward
   StepView<T> s{};
   int64_t zeroed = 0;
   T* first = nullptr;
@@ -165,7 +166,7 @@ struct Runner {
     return in.contact ? passes().load() : cudaSuccess;
   }
 
-  ContactPasses<T> passes() const { return {s, *in.contact, adjoints, stream}; }
+  ContactPasses<T> passes() const { return {s, *in.contact, adjoints, cut, stream}; }
 
   int64_t blocks_of(int color) const { return host.color_block[color + 1] - host.color_block[color]; }
 
@@ -247,8 +248,8 @@ struct Runner {
           if (auto error = passes().assemble(begin, end)) return error;
         }
         if (auto error = launch(blocks_for(blocks_of(color) * threads_of(lanes)))) return error;
-        if (in.contact && backward) {
-          if (auto error = passes().reverse(begin, end)) return error;
+        if (in.contact) {
+          if (auto error = backward ? passes().reverse(begin, end) : passes().limit(k, begin, end)) return error;
         }
       }
     }
@@ -330,7 +331,7 @@ cudaError_t run_forward(const HostPlan& host, const StepInputs<T>& in, const Ste
   if (choice.regime == kThread)
     return run_scene_forward(host, in, out, choice, static_cast<uint8_t*>(workspace), stream);
   Runner<T> run(host, in, nullptr, choice, workspace, stream);
-  run.s.cut = out.cut;
+  run.cut = out.cut;
   const int lanes = possible_lanes<T>(host, choice, choice.lanes, false);
   for (int64_t base = 0; base < in.scenes; base += choice.chunk) {
     run.choose(base, std::min(choice.chunk, in.scenes - base), out.tape);
@@ -350,6 +351,7 @@ cudaError_t run_reverse(const HostPlan& host, const StepInputs<T>& in, const T* 
     return run_scene_reverse(host, in, ends, tape, out, choice, static_cast<uint8_t*>(workspace), stream);
   }
   Runner<T> run(host, in, &out, choice, workspace, stream);
+  run.s.limits = out.limits;
   const int lanes = possible_lanes<T>(host, choice, choice.lanes, true);
   for (int64_t base = 0; base < in.scenes; base += choice.chunk) {
     run.choose(base, std::min(choice.chunk, in.scenes - base), const_cast<T*>(tape));

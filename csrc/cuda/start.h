@@ -18,7 +18,7 @@ cudaError_t translation_backward(const contact::TranslationInputs<T>& in, const 
                                  T* move_bar, T* mass_bar, T* x_bar, T* planes_bar, cudaStream_t stream);
 
 template <class T>
-cudaError_t start(const contact::StartInputs<T>& in, const contact::StartOutputs<T>& out, cudaStream_t stream);
+cudaError_t start(const contact::StartInputs<T>& in, T* target, cudaStream_t stream);
 template <class T>
 cudaError_t start_backward(const contact::StartInputs<T>& in, const contact::StartAdjoints<T>& a, cudaStream_t stream);
 

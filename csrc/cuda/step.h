@@ -50,19 +50,20 @@ template <class T>
 struct StepOutputs {
   T *x, *v;      // [B, V, 3]; v only of a fused step
   T* tape;       // [B, sweeps, rows, active] in all; a scene per thread keeps scenes last
-  uint8_t* cut;  // [B, V], zero: where a bound has held back; with contact
+  uint8_t* cut;  // [B, sweeps, V], zero: exponents of limits; with contact
 };
 
 template <class T>
 struct StepAdjoints {
   using Scalar = T;
-  const T *x_bar, *v_bar;                        // of the outputs; v_bar only of a fused step, either may be null there
-  T *x_start, *x_prev, *y;                       // [B, V, 3]
-  T* material[kTetScalars];                      // [B, 1 | T] each; null where not wanted, as below
-  T *mass, *rest, *data;                         // [B, V], [B, T, kRestScalars], [B, N]
-  T *x, *v, *acceleration, *prescribed;          // of a fused step, null where not wanted
-  const contact::ContactAdjoints<T>* contact;    // on the host; with contact
-  T *bounds, *collider, *collider_prev, *kappa;  // [B, V, 4], [B, Vc, 3], [B, Vc, 3], [B] with contact
+  const T *x_bar, *v_bar;                      // of the outputs; v_bar only of a fused step, either may be null there
+  T *x_start, *x_prev, *y;                     // [B, V, 3]
+  T* material[kTetScalars];                    // [B, 1 | T] each; null where not wanted, as below
+  T *mass, *rest, *data;                       // [B, V], [B, T, kRestScalars], [B, N]
+  T *x, *v, *acceleration, *prescribed;        // of a fused step, null where not wanted
+  const contact::ContactAdjoints<T>* contact;  // on the host; with contact, as are the next
+  const uint8_t* limits;                       // what the forward has left in `cut`
+  T *collider, *collider_prev, *kappa;         // [B, Vc, 3], [B, Vc, 3], [B]
 };
 
 // Where the kernels work, for one chunk of scenes in sweep order. Sizes are per scene.
@@ -72,14 +73,15 @@ struct Workspace {
   T *y, *x_prev, *origin, *y_bar, *x_prev_bar;  // [blocks, 3, kSlice]
   T *mass, *mass_bar;                           // [positions]
   T *material,
-      *material_bar;    // [slots, kSlice, kTetScalars]; the bar [positions, ...] if a scene has one material
-  T* rest_bar;          // [slots, kSlice, kPairRest]
-  T* data_bar;          // [scalars, positions]
-  T* contact;           // [positions, kContactRecord]: the pairs' part of the block, and the bound
-  T *turn, *bound_bar;  // [positions, 6]: p and d_raw of the latest reversed update; [positions, 4]
-  int32_t* position;    // [V] with contact: where a vertex stands in sweep order
+      *material_bar;  // [slots, kSlice, kTetScalars]; the bar [positions, ...] if a scene has one material
+  T* rest_bar;        // [slots, kSlice, kPairRest]
+  T* data_bar;        // [scalars, positions]
+  // with contact:
+  T* contact;         // [positions, kContactScalars]: the pairs' part of the block
+  T* before;          // [positions, 4]: where the vertices of a color were before it moved
+  T* turn;            // [positions, 6]: p and d_raw of the latest reversed update
+  int32_t* position;  // [V]: where a vertex stands in sweep order
 };
-constexpr int kContactRecord = 16;
 
 // Everything a sweep's kernels read and write; a chunk of scenes.
 template <class T>
@@ -99,8 +101,8 @@ struct StepView {
   int data_count[kVertexEnergies], data_row[kVertexEnergies];
   int data_scalars;
   Workspace<T> w;
-  uint8_t* cut;  // [B, V] with contact, forward
-  T* spill;      // [warps, shared_scalars] for kSpillLanes
+  const uint8_t* limits;  // [B, sweeps, V] exponents, with contact in the reverse
+  T* spill;               // [warps, shared_scalars] for kSpillLanes
   T* tape;
 };
 

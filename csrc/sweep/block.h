@@ -4,7 +4,7 @@
 #include "../core/frame.h"
 #include "../core/views.h"
 #include "../energies/energies.h"
-#include "bounds.h"
+#include "contact_term.h"
 
 namespace diffvbd {
 

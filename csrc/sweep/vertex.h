@@ -43,7 +43,6 @@ DIFFVBD_FN Vec3<R> relaxed(const Vec3<R>& d_raw, const StepParameters<T>& q) {
 template <class Set, class R, class T>
 DIFFVBD_FN Update<R> safeguarded(const Block<R>& b, const Vec3<R>& d_raw, const StepParameters<T>& q) {
   Update<R> out{d_raw, relaxed(d_raw, q), R(1)};
-  if constexpr (Set::contact) out.step = bounded(b.state.x, out.step, b.contact.bound);
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
     if constexpr (E::has_filter) {
@@ -102,8 +101,7 @@ template <class R>
 struct BlockAdjoint {
   Vec3<R> x, y, x_prev;
   R mass;
-  Vec3<R> p;       // H^-1 of what reaches the Newton step: what the adjoint of pairs starts from
-  Bound<R> bound;  // where the set has contact
+  Vec3<R> p;  // H^-1 of what reaches the Newton step: what the adjoint of pairs starts from
 };
 
 // Transpose of one block update. `b` holds the state before it, `x_bar` the adjoint of the position after it.
@@ -113,7 +111,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
                                           const Vec3<R>& x_bar, const StepParameters<T>& q, bool wants_data,
                                           AddData&& add_data) {
   const R h = R(q.time_step), minus_h2 = -(h * h);
-  BlockAdjoint<R> out{x_bar, zero3<R>(), zero3<R>(), R(0), zero3<R>(), {zero3<R>(), R(0)}};
+  BlockAdjoint<R> out{x_bar, zero3<R>(), zero3<R>(), R(0), zero3<R>()};
   Vec3<R> step_bar = x_bar;
   R alpha_bar = R(0);
   if constexpr (Set::filters) {
@@ -125,9 +123,6 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
         E::filter_vjp(b.state, b.data[k], b.data_count[k], u.step, q, u.alpha, alpha_bar, out.x, step_bar);
       }
     });
-  }
-  if constexpr (Set::contact) {
-    bounded_vjp(b.state.x, relaxed(u.d_raw, q), b.contact.bound, step_bar, out.x, out.bound);
   }
   Vec3<R> z = R(q.relaxation) * step_bar;
   if (q.saturates) z = saturate_vjp(u.d_raw, z, q);
@@ -184,7 +179,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_gradient(const Block<R>& b, const Star& star,
                                             const StepParameters<T>& q, bool wants_data, AddData&& add_data) {
   const R h = R(q.time_step), minus_h2 = -(h * h);
   const Vec3<R> p = -w, none = zero3<R>();
-  BlockAdjoint<R> out{none, b.mass * p, none, -dot(b.state.x - b.y, p), p, {none, R(0)}};
+  BlockAdjoint<R> out{none, b.mass * p, none, -dot(b.state.x - b.y, p), p};
   out.x = -out.y;
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);

@@ -23,6 +23,15 @@ class Pairs(NamedTuple):
     entry: Tensor
 
 
+def some_of(listed: Pairs, rows: Tensor, points: int) -> Pairs:
+    """Those of listed pairs that ``rows`` names in ascending order; points: corner points of a scene."""
+    pairs = listed.pairs[rows]
+    corner = pairs[:, 5:].long() * points + pairs[:, :4].long()
+    ordered, entry = torch.sort(corner.reshape(-1), stable=True)
+    ptr = torch.searchsorted(ordered, torch.arange(listed.ptr.shape[0], device=pairs.device))
+    return Pairs(pairs, listed.constants[rows], ptr.to(torch.int32), entry.to(torch.int32))
+
+
 class _Lag(Function):
     """Normal force, activity, normal and weights of pairs at the start of a step [pairs, 9]."""
 

@@ -71,21 +71,21 @@ class _Sweep(Function):
     """K sweeps of block updates and, as its backward, the same sweeps transposed in reverse order."""
 
     @staticmethod
-    def forward(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider, collider_prev, kappa,
-                pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, corners_prev,
+    def forward(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider, collider_prev, kappa,
+                pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room, corners_prev,
                 coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
                 plan, settings, tape_policy, debug_step, checked):  # fmt: skip
         # torch.compile counts these arguments: *args would get the context as well
-        fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider,
+        fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider,
                                  collider_prev, kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry,
-                                 floor_lag, corners_prev, coarse_factor, coarse_mass,
+                                 floor_lag, center, room, corners_prev, coarse_factor, coarse_mass,
                                  coarse_plan, coarse_weights, coarse_rest)  # fmt: skip
         return ops.sweep(fields, packed_rest, plan, settings, tape_policy, debug_step, checked)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
         *tensors, ctx.settings, ctx.tape_policy, _, _ = inputs
-        ctx.save_for_backward(*tensors, *output[:2], output[3])
+        ctx.save_for_backward(*tensors, *output[:2], output[3], output[2])
         ctx.mark_non_differentiable(*output[1:])
         ctx.set_materialize_grads(False)
 
@@ -112,18 +112,18 @@ class _Sweep(Function):
 
 class _SweepBackward(Function):
     @staticmethod
-    def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider, collider_prev,
-                kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, corners_prev,
-                coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
-                plan, x, tape, corrections, settings, tape_policy, needs):  # fmt: skip
-        fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, bounds, collider,
+    def forward(x_bar, x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider, collider_prev,
+                kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room,
+                corners_prev, coarse_factor, coarse_mass, coarse_plan, coarse_weights, coarse_rest, packed_rest,
+                plan, x, tape, corrections, cut, settings, tape_policy, needs):  # fmt: skip
+        fields = ops.SweepFields(x_start, x_prev, y, mu, lam, mass, rest, energy_data, origin, collider,
                                  collider_prev, kappa, pairs, constants, ptr, entry, lag, lag_pairs, lag_ptr, lag_entry,
-                                 floor_lag, corners_prev, coarse_factor, coarse_mass,
+                                 floor_lag, center, room, corners_prev, coarse_factor, coarse_mass,
                                  coarse_plan, coarse_weights, coarse_rest)  # fmt: skip
         wants = _wants(ops.SWEEP_ADJOINTS, fields._fields, needs)
         with backward_memory(x, settings, tape_policy):
-            bars = ops.sweep_backward(x_bar, x, tape, corrections, fields, packed_rest, plan, settings, tape_policy,
-                                      wants)  # fmt: skip
+            bars = ops.sweep_backward(x_bar, x, tape, corrections, cut, fields, packed_rest, plan, settings,
+                                      tape_policy, wants)  # fmt: skip
         return _adjoints(bars, fields, needs)
 
     @staticmethod
@@ -138,12 +138,12 @@ class _SweepBackward(Function):
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         x_bar, *saved, settings, tape_policy, needs = args
         if settings.launch[:1] == (THREAD,):  # its tape has scenes last: run again, with one that does not
-            settings, tape_policy, saved[-2] = _scenes_first(settings), ops.NO_TAPE, x_bar.new_empty((0,))
+            settings, tape_policy, saved[-3] = _scenes_first(settings), ops.NO_TAPE, x_bar.new_empty((0,))
         fields = ops.SweepFields(*saved[:_FIELDS])
         _plain(fields)
         scenes, size = _scenes((x_bar, *fields), in_dims), info.batch_size
         folded: list[Any] = [_folded(t, d, size, scenes) for t, d in zip(fields, in_dims[1:], strict=False)]
-        packed_rest, plan, x, tape, corrections = saved[_FIELDS:]
+        packed_rest, plan, x, tape, corrections, cut = saved[_FIELDS:]
         x, tape = (
             t if t.numel() == 0 else t.expand(size * scenes, *t.shape[1:]).contiguous()
             for t in (_folded(t, d, size, scenes) for t, d in zip((x, tape), in_dims[_FIELDS + 3 :], strict=False))
@@ -154,7 +154,7 @@ class _SweepBackward(Function):
                   for t, need in zip(folded, needs, strict=True)]  # fmt: skip
         spread[:3] = [t.expand(full).contiguous() for t in spread[:3]]
         out = _SweepBackward.apply(_folded(x_bar, in_dims[0], size, scenes).expand(full), *spread, packed_rest, plan, x,
-                                   tape, corrections, settings, tape_policy, needs)  # fmt: skip
+                                   tape, corrections, cut, settings, tape_policy, needs)  # fmt: skip
         out = out if isinstance(out, tuple) else (out,)
         needed = [(t, d) for t, d, need in zip(fields, in_dims[1:], needs, strict=False) if t is not None and need]
         shapes = [t.shape[0] if d is None else t.movedim(d, 0).shape[1] for t, d in needed]
@@ -166,7 +166,7 @@ class _SweepBackward(Function):
 
 
 def _plain(fields: ops.SweepFields) -> None:
-    if fields.bounds is not None:
+    if fields.center is not None:
         no_transforms()
     if fields.corners_prev is not None:
         raise NotImplementedError("diffvbd: torch.func transforms of a law that reads x_prev are not supported")
@@ -193,8 +193,9 @@ def _scenes(tensors: Sequence[Tensor | None], in_dims: tuple) -> int:
 
 def sweep(fields: ops.SweepFields, packed_rest: Tensor, plan: Tensor, settings: ops.SweepSettings, *, tape_policy: int,
           debug_step: int = -1, checked: bool = True) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Positions after the sweeps [B, V, 3]; with contact where a bound has held back an update, uint8 [B, V]; and what
-    coarse corrections did [B, corrections, n]: 3 numbers a function, each body's length, with a floor where it began.
+    """Positions after the sweeps [B, V, 3]; with contact the exponents of limits, uint8 [B, K, V], of contact/limit.h;
+    and what coarse corrections did [B, corrections, n]: 3 numbers a function, each body's length, with a floor where it
+    began.
 
     Args:
         fields: See SweepFields; differentiable in those of SWEEP_ADJOINTS.

@@ -12,23 +12,26 @@ from .surface import ContactSurface
 
 
 def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: ContactSurface, barrier: PairBarrier,
-           capacity: int) -> tuple[Tensor, ...]:  # fmt: skip
+           capacity: int, room: Tensor | None = None) -> tuple[Tensor, ...]:  # fmt: skip
     """Pairs that may come closer than dhat before the next detection, and the nearest pair of each corner point.
 
     Args:
         x: [B, V, 3] [m], relative to origin [B, V, 3] or empty.  was, now: Collider points [B, Vc, 3] [m].
         capacity: Pairs of all scenes that fit.
+        room: How far the vertices of each body may go, and the largest [B, bodies + 1] [m]; None: nobody moves.
 
     Returns, with ``capacity`` rows, or on the CPU without torch.compile as many as there are pairs:
-        pairs [capacity, 6] int32 (four corner points, kind, scene), constants [capacity, 3] (dhat, offset, threshold of
-        the mollifier), ptr [B N + 1] int32 and entry [4 capacity] int32 (4 pair + corner of each corner point);
+        pairs [capacity, 6] int32 (four corner points, kind, scene), constants [capacity, 8] (dhat, offset, threshold of
+        the mollifier, hints), ptr [B N + 1] int32 and entry [4 capacity] int32 (4 pair + corner of each corner point);
         near_corners [B, N, 5] int32 (corners, kind), near_values [B, N, 8] (weights, normal, gap); counts [4] int64
         (pairs needed, pairs without a gap, key of one, 0); smallest gap [B].
     """
     s = surface
+    if room is None:
+        room = x.new_zeros((x.shape[0], s.bodies + 1))
     return ops_contact.contact_detect(
-        x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.held, s.bodies,
-        barrier.self_contact, barrier.between_bodies, barrier.dhat, s.reach, s.cap, barrier.gamma, capacity,
+        x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.held, room, s.bodies,
+        barrier.self_contact, barrier.between_bodies, barrier.dhat, capacity,
         not torch.compiler.is_compiling(),
     )  # fmt: skip
 
@@ -51,14 +54,14 @@ def intersections(x: Tensor, origin: Tensor, colliders: Tensor, surface: Contact
 
 
 def islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, was: Tensor, now: Tensor, surface: ContactSurface,
-            dhat: float, any_direction: bool) -> Tensor:  # fmt: skip
+            dhat: float, room: Tensor, any_direction: bool) -> Tensor:  # fmt: skip
     """Island of each body [B, bodies] int32, named by its first body; -1 where it must not be translated.
 
     any_direction: Whether the floor has planes across the axes, along which a translation may be turned.
     """
     s = surface
     return ops_contact.contact_islands(x, origin, move, mass, was, now, s.planes, s.body, s.body_order, s.body_ptr,
-                                       s.held, s.radius, s.bodies, s.cap, dhat, any_direction)  # fmt: skip
+                                       s.held, s.radius, room, s.bodies, dhat, any_direction)  # fmt: skip
 
 
 def lowest(x: Tensor, origin: Tensor, data: Tensor, island: Tensor, surface: ContactSurface) -> Tensor:

@@ -80,9 +80,10 @@ def near_pairs(
     with torch.no_grad():
         x, was, now = (t.detach().contiguous() for t in (x, was, now))
         shift = x.new_empty((0,)) if origin is None else origin.detach().contiguous()
+        still = x.new_zeros((x.shape[0], surface.bodies + 1))  # nothing is about to move
         capacity = max(surface.capacity * x.shape[0], LEAST_CAPACITY)
         while True:
-            pairs, constants, *_, counts, _ = detect(x, shift, was, now, surface, barrier, capacity)
+            pairs, constants, *_, counts, _ = detect(x, shift, was, now, surface, barrier, capacity, still)
             needed, touching, key, _ = counts.tolist()
             if needed <= capacity:
                 break
@@ -90,7 +91,7 @@ def near_pairs(
         if touching:
             _raise_touching(surface, touching, key)
         rows, numbers = pairs[:needed].long(), constants[:needed].double()
-        listed = NearPairs(rows[:, :4], rows[:, 4], rows[:, 5], *numbers.unbind(1))
+        listed = NearPairs(rows[:, :4], rows[:, 4], rows[:, 5], *numbers[:, :3].unbind(1))
         gap = distance(listed.kind, listed.positions(corner_points(x, origin, was))) - listed.offset
         near = gap < listed.dhat
         return NearPairs(*(t[near] for t in listed))

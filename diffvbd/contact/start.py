@@ -1,4 +1,5 @@
-"""Where a part of a step with contact starts: smallest gaps, translations of islands, bounds, as autograd functions."""
+"""Where a part of a step with contact starts: translations of islands, what the floor lets through, how far all may go
+at once."""
 
 # pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
@@ -15,47 +16,6 @@ from ..ops import detect as ops_contact
 from ..ops import no_second_derivative, not_batched
 from ..safeguards import FILTER_ETA
 from .surface import ContactSurface
-
-
-class Start(NamedTuple):
-    bounds: Tensor  # [B, V, 4]  center and radius [m]
-    x: Tensor  # [B, V, 3]  where the sweeps start [m]
-    move: Tensor  # [B, V, 3]  what is left to go [m]
-    outside: Tensor  # [B, V] uint8: the bound has cut the motion
-
-
-class _NearGap(Function):
-    """Smallest gap of each vertex [B, V]. The value is the one detection found; by the envelope theorem its derivative
-    is that of the distance with weights and normal held."""
-
-    @staticmethod
-    def forward(x: Tensor, was: Tensor, now: Tensor, corners: Tensor, values: Tensor, plane_points: Tensor) -> Tensor:
-        return values[:, : x.shape[1], 7].clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        x, _, _, *index = inputs
-        ctx.vertices, ctx.index = x.shape[1], index
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple:
-        not_batched(grads[0])
-        corners, values, plane_points = ctx.index
-        own = values[:, : ctx.vertices]
-        rows = (grads[0][..., None] * own[..., :4])[..., None] * own[..., None, 4:7]  # [B, V, 4, 3]
-        count, points = corners.shape[:2]
-        scene = torch.arange(count, device=corners.device)[:, None, None] * points
-        index = (corners[:, : ctx.vertices, :4].to(torch.int64) + scene).reshape(-1)
-        # in float64, which torch adds one after another; float32 it adds by atomics on the CPU
-        sums = values.new_zeros((count * points, 3), dtype=torch.float64)
-        sums = sums.index_put_((index,), rows.reshape(-1, 3).double(), accumulate=True)
-        sums = sums.to(values.dtype).reshape(count, points, 3)
-        x_bar, colliders = sums[:, : ctx.vertices], sums[:, ctx.vertices :]
-        of_plane = plane_points[ctx.vertices :, None]
-        needs = ctx.needs_input_grad
-        was_bar = colliders.masked_fill(of_plane, 0.0) if needs[1] else None
-        now_bar = colliders.masked_fill(~of_plane, 0.0) if needs[2] else None
-        return x_bar, was_bar, now_bar, None, None, None
 
 
 class _Translation(Function):
@@ -99,57 +59,89 @@ class _TranslationBackward(_Last):
         return move_bar, mass_bar, x_bar, planes_bar if planes.numel() else planes.clone()
 
 
-class _Start(Function):
-    @staticmethod
-    def forward(x, move, goal, u, gap, planes, near, origin, surface, gamma):
-        return ops_contact_start.start(x, move, goal, u, near, origin, planes, surface.held, surface.body, gamma,
-                                       surface.cap, FILTER_ETA)  # fmt: skip
+class _Target(Function):
+    """Where each vertex wants to be: its wish, less what the floor takes from the way beside its island's [B, V, 3]."""
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
-        x, move, goal, u, _, planes, near, origin, ctx.surface, ctx.gamma = inputs
-        ctx.save_for_backward(x, move, goal, u, near, origin, planes)
-        ctx.mark_non_differentiable(output[3])
+    def forward(x: Tensor, move: Tensor, u: Tensor, planes: Tensor, origin: Tensor, surface: ContactSurface) -> Tensor:
+        return ops_contact_start.start(x, move, u, planes, origin, surface.held, surface.body, FILTER_ETA)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        *tensors, ctx.surface = inputs
+        ctx.save_for_backward(*tensors)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:
-        for grad in grads[:3]:
-            not_batched(grad)
-        bars = [g.contiguous() for g in grads[:3]]
-        out = _StartBackward.apply(*bars, *ctx.saved_tensors, ctx.surface, ctx.gamma, ctx.needs_input_grad[5])
-        return (*out[:5], out[5] if ctx.needs_input_grad[5] else None, None, None, None, None)
+        not_batched(grads[0])
+        wants_planes = ctx.needs_input_grad[3]
+        out = _TargetBackward.apply(grads[0].contiguous(), *ctx.saved_tensors, ctx.surface, wants_planes)
+        return (*out[:3], out[3] if wants_planes else None, None, None)
 
 
-class _StartBackward(_Last):
+class _TargetBackward(_Last):
     @staticmethod
-    def forward(bounds_bar, start_bar, left_bar, x, move, goal, u, near, origin, planes, surface, gamma, wants_planes):
-        x_bar, move_bar, goal_bar, u_bar, gap_bar, planes_bar = ops_contact_start.start_backward(
-            (bounds_bar, start_bar, left_bar), x, move, goal, u, near, origin, planes, surface.held, surface.body,
-            gamma, surface.cap, FILTER_ETA, wants_planes,
-        )  # fmt: skip
+    def forward(bar, x, move, u, planes, origin, surface, wants_planes):
+        x_bar, move_bar, u_bar, planes_bar = ops_contact_start.start_backward(
+            bar, x, move, u, planes, origin, surface.held, surface.body, FILTER_ETA, wants_planes
+        )
         u_bar = ops_contact.segment_sum(u_bar, surface.body_order, surface.body_ptr)
         if wants_planes:
             planes_bar = ops.sum_to(planes_bar, (planes_bar.shape[0], 1, planes_bar.shape[2]))[:, 0]
             planes_bar = ops.sum_to(planes_bar, planes.shape)
-        return x_bar, move_bar, goal_bar, u_bar, gap_bar, planes_bar
+        return x_bar, move_bar, u_bar, planes_bar
 
 
-def start_part(x: Tensor, move: Tensor, goal: Tensor, mass: Tensor, was: Tensor, now: Tensor, planes: Tensor | None,
-               origin: Tensor, detection: Any, surface: ContactSurface, gamma: float) -> Start:  # fmt: skip
-    """Bounds until the next detection, and every vertex as far toward where it wants to go as bound and floor let it.
+class PartStart(NamedTuple):
+    """Where the sweeps of a part start."""
+
+    x: Tensor  # [B, V, 3] [m]
+    center: Tensor  # [B, V, 3]  from where each vertex has its room [m]; a number, not a function of the start
+    room: Tensor  # [B, V]  how far from there it may go [m]
+    short: Tensor  # [B, V] bool: pairs have held up more than a hundredth of its way
+    stuck: Tensor  # [1] int64: pairs that hinder what is prescribed
+    shares: Tensor  # [2, B, V]: of the two ways, that vertices went
+
+
+SHORT = 0.99  # share of a way that counts as all of it
+
+
+def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
+                         planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface
+                         ) -> PartStart:  # fmt: skip
+    """Every vertex as far along its way as pairs and floor let all go at once: first by ``move``, then by ``fall``.
 
     Args:
-        x, move: [B, V, 3] [m], state and wanted motion; goal: where pinned vertices are put [m].
-        mass: [1 | B, V] [kg].  was, now: Collider points before and during the part, [B, Vc, 3] [m].
-        planes: Data of the FloorBarrier [1 | B, 7 planes], or None; differentiable as all of the above.
-        origin: [B, V, 3] or empty.  detection: of contact_step.  gamma: Share of a gap.
+        x, move, fall: [B, V, 3] [m].  mass: [1 | B, V] [kg].
+        was, now: Collider points before and during the sweeps, [B, Vc, 3] [m].
+        planes: Data of the FloorBarrier [1 | B, 7 planes], or None; differentiable as x, move, fall and mass.
+        origin: [B, V, 3] or empty.  detection: of the step.
     """
-    none = x.new_empty((0,))
-    floor = none if planes is None else planes
+    floor = x.new_empty((0,)) if planes is None else planes
     index = (surface.held, surface.body, surface.body_order, surface.body_ptr, detection.island, detection.lowest)
-    gap = _NearGap.apply(x, was, now, detection.near_corners, detection.near_values, surface.plane_points)
     u = _Translation.apply(move, mass.contiguous(), x, floor, origin, index)
-    return Start(*_Start.apply(x, move, goal, u, gap, floor, detection.near_values, origin, surface, gamma))
+    body = surface.body[: x.shape[1]].long()
+    pinned = surface.held[: x.shape[1], None]
+    room, listed = detection.room[:, body].contiguous(), detection.listed
+    listed = (listed.pairs, listed.constants, listed.ptr, listed.entry)
+    at, center, still = x, x.detach(), torch.zeros_like(u)
+    shares, stuck = [], []
+    for way, by, here in ((move, u, was), (fall, still, now)):
+        target = at + way
+        if floor.numel():
+            target = _Target.apply(at, way, by, floor, origin, surface)
+        with torch.no_grad():
+            share, hindered = ops_contact_start.advance(
+                at.detach().contiguous(), (target - at).detach().contiguous(), by.detach(), center, origin,
+                here.detach(), now.detach(), surface.held, surface.body, room, listed,
+            )  # fmt: skip
+        shares.append(share)
+        stuck.append(hindered)
+        base = at + by[:, body]
+        at = torch.where(pinned, target, base + share[..., None] * (target - base))
+        center = torch.where(pinned, center, center + by.detach()[:, body]).contiguous()
+    short = (torch.minimum(*shares) < SHORT) & ~pinned[:, 0]
+    return PartStart(at, center, room, short, stuck[0] + stuck[1], torch.stack(shares))
 
 
-ops.ready_signature(_NearGap, _Translation, _TranslationBackward, _Start, _StartBackward)
+ops.ready_signature(_Translation, _TranslationBackward, _Target, _TargetBackward)

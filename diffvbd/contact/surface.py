@@ -14,8 +14,10 @@ from ..mesh import TetMesh
 from .barrier import PairBarrier
 from .colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
 
-REACH_PER_EDGE = 0.5  # most pairs of a body at rest are farther apart, so that they cost nothing
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
+# Mean edges of the surface that a vertex may go beside its island, where no reach is given: with self-contact, where a
+# long way lists most pairs of a body's own surface, and without.
+MOST_EDGES_SELF, MOST_EDGES = 0.75, 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +37,7 @@ class ContactSurface:
     body_ptr: Tensor  # [bodies + 1] int32
     bodies: int  # of the mesh
     rows: tuple[slice, ...]  # of each collider in collider_points
-    reach: float  # [m]
-    cap: float  # [m] largest bound
+    most_room: float  # [m] that any vertex is given beside its island
     capacity: int  # pairs, per scene; all scenes together have room for LEAST_CAPACITY at least
 
     @property
@@ -85,7 +86,11 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
             planes.append([first, first + 1, first + 2])
     # the mesh's own edges alone: a large obstacle must not widen the search
     lengths = np.linalg.norm(mesh.points[edges[0][:, 0]] - mesh.points[edges[0][:, 1]], axis=1)
-    reach = barrier.reach or max(2 * barrier.dhat, REACH_PER_EDGE * float(lengths.mean()) if len(lengths) else 0.0)
+    if barrier.reach is None:
+        most = MOST_EDGES_SELF if barrier.self_contact else MOST_EDGES
+        most_room = most * float(lengths.mean()) if len(lengths) else 0.0
+    else:
+        most_room = (barrier.reach - barrier.dhat) / 2
 
     def index_tensor(parts: list[Any], width: int) -> Tensor:
         joined = np.concatenate([np.asarray(p, np.int64).reshape(-1, width) for p in parts] or [np.zeros((0, width))])
@@ -107,8 +112,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         body_ptr=torch.from_numpy(np.searchsorted(label[order], np.arange(bodies + 1)).astype(np.int32)),
         bodies=bodies,
         rows=tuple(rows),
-        reach=reach,
-        cap=min(barrier.gamma * reach, (reach - barrier.dhat) / 2),
+        most_room=most_room,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
     )
 

@@ -78,7 +78,7 @@ def status(model: Model) -> Status:
         capacity=outcome.capacity,
         touching=int(counts[:, 1].sum()),
         above_bounds=int(counts[:, 3].sum()),
-        cut=torch.stack(outcome.cut).amax(0).sum(-1).tolist() if outcome.cut else [],
+        cut=outcome.cut.sum(-1).tolist(),
         smallest_gap=outcome.smallest.min(0).values.tolist(),
     )
 

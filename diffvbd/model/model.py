@@ -218,12 +218,12 @@ class Model:
         return self._mass.new_zeros((0,)) if surface is None else surface.radius[self.num_vertices :].clone()
 
     @property
-    def contact_numbers(self) -> tuple[float, float, float]:
-        """Search distance [m], largest bound [m] and gamma of the PairBarrier."""
+    def most_room(self) -> float:
+        """How far a vertex may at most go beside its island between two detections of the PairBarrier [m]."""
         surface, barrier = self.surface_of_contact, self.contact
         if surface is None or barrier is None:
             fail("model", "a PairBarrier among its energies", "none")
-        return surface.reach, surface.cap, barrier.gamma
+        return surface.most_room
 
     @property
     def parametric_energies(self) -> tuple[VertexEnergy | PairBarrier | Friction, ...]:

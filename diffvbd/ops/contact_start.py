@@ -26,19 +26,38 @@ def translation_backward(u_bar: Tensor, move: Tensor, mass: Tensor, x: Tensor, o
     )
 
 
-def start(x: Tensor, move: Tensor, goal: Tensor, u: Tensor, near: Tensor, origin: Tensor, planes: Tensor, held: Tensor,
-          body: Tensor, gamma: float, cap: float, filter_eta: float) -> tuple[Tensor, ...]:  # fmt: skip
-    """Bounds [B, V, 4], start [B, V, 3], what is left to go [B, V, 3], where the bound has cut, uint8 [B, V]."""
-    return raw.contact_start(x, move, goal, u, near, origin, planes, held, body, gamma, cap, filter_eta)
+def start(x: Tensor, move: Tensor, u: Tensor, planes: Tensor, origin: Tensor, held: Tensor, body: Tensor,
+          filter_eta: float) -> Tensor:  # fmt: skip
+    """Where each vertex wants to be [B, V, 3] [m]: ``x + move``, but of what it goes beside its island's u without what
+    the floor forbids. Held ones are put there. u [B, bodies, 3]; planes and origin may be empty."""
+    return raw.contact_start(x, move, u, planes, origin, held, body, filter_eta)
 
 
-def start_backward(bars: Sequence[Tensor], x: Tensor, move: Tensor, goal: Tensor, u: Tensor, near: Tensor,
-                   origin: Tensor, planes: Tensor, held: Tensor, body: Tensor, gamma: float, cap: float,
-                   filter_eta: float, wants_planes: bool) -> tuple[Tensor, ...]:  # fmt: skip
-    """Adjoints of x, move, goal, u (for each vertex) [B, V, 3], gap [B, V], planes [B, V, 7 planes or 0]."""
-    return raw.contact_start_backward(
-        *bars, x, move, goal, u, near, origin, planes, held, body, gamma, cap, filter_eta, wants_planes
-    )
+def start_backward(bar: Tensor, x: Tensor, move: Tensor, u: Tensor, planes: Tensor, origin: Tensor, held: Tensor,
+                   body: Tensor, filter_eta: float, wants_planes: bool) -> tuple[Tensor, ...]:  # fmt: skip
+    """Adjoints of x, move, u (for each vertex) [B, V, 3], planes [B, V, 7 planes or 0]."""
+    return raw.contact_start_backward(bar, x, move, u, planes, origin, held, body, filter_eta, wants_planes)
+
+
+def advance(x: Tensor, move: Tensor, u: Tensor, center: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor,
+            held: Tensor, body: Tensor, room: Tensor, listed: Sequence[Tensor],
+            careful: bool = True) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Share of ``move - u`` that each vertex may go at once with all others [B, V]; how many pairs hinder what is
+    prescribed, int64 [1]. Not differentiable.
+
+    Args:
+        x, move: [B, V, 3], state and wanted motion [m].  u: Translation of each body's island [B, bodies, 3] [m].
+        center, room: [B, V, 3] and [B, V]: how far from where a vertex may go [m].
+        listed: pairs, constants, ptr, entry of :func:`contact_detect`.
+        careful: Whether the motion does not minimise the barrier.
+    """
+    return raw.contact_advance(x, move, u, center, origin, collider, collider_next, held, body, room, *listed, careful)
+
+
+@shapes_of("contact_advance")
+def _(x, move, u, center, origin, collider, collider_next, held, body, room, pairs, constants, ptr, entry,
+      careful):  # fmt: skip
+    return x.new_empty(x.shape[:2]), x.new_empty((1,), dtype=torch.int64)
 
 
 @shapes_of("contact_translation")
@@ -53,18 +72,21 @@ def _(u_bar, move, mass, x, origin, planes, held, body, body_order, body_ptr, is
 
 
 @shapes_of("contact_start")
-def _(x, move, goal, u, near, origin, planes, held, body, gamma, cap, filter_eta):
-    bounds = x.new_empty((*x.shape[:2], 4))
-    return bounds, torch.empty_like(x), torch.empty_like(x), x.new_empty(x.shape[:2], dtype=torch.uint8)
+def _(x, move, u, planes, origin, held, body, filter_eta):
+    return torch.empty_like(x)
 
 
 @shapes_of("contact_start_backward")
-def _(bounds_bar, start_bar, move_bar, x, move, goal, u, near, origin, planes, held, body, gamma, cap, filter_eta,
-      wants_planes):  # fmt: skip
-    scalars = planes.shape[-1] if wants_planes else 0
-    vectors = (torch.empty_like(x) for _ in range(4))
-    return (*vectors, x.new_empty(x.shape[:2]), x.new_empty((*x.shape[:2], scalars)))
+def _(bar, x, move, u, planes, origin, held, body, filter_eta, wants_planes):
+    scalars = planes.shape[-1] if wants_planes and planes.numel() else 0
+    return (*(torch.empty_like(x) for _ in range(3)), x.new_empty((*x.shape[:2], scalars)))
 
 
-for _name in ("contact_translation", "contact_translation_backward", "contact_start", "contact_start_backward"):
+for _name in (
+    "contact_advance",
+    "contact_translation",
+    "contact_translation_backward",
+    "contact_start",
+    "contact_start_backward",
+):
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

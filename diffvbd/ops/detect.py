@@ -16,7 +16,7 @@ from torch import Tensor
 from .functions import raw_backward, shapes_of
 from .load import raw
 
-PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS = 6, 3, 5, 8, 4  # twins of those in csrc/contact/candidates.h
+PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS = 6, 8, 5, 8, 4  # twins of those in csrc/contact/candidates.h
 CROSSING_ROW = 3  # and in csrc/contact/intersect.h
 
 
@@ -24,25 +24,26 @@ class Detection(NamedTuple):
     """Pairs of primitives that are, or may come, closer than the barrier's reach."""
 
     pairs: Tensor  # [capacity, 6]  corner points, kind (0 point-triangle, 1 edge-edge, 2 point-plane), scene; or -1
-    constants: Tensor  # [capacity, 3]  reach of the barrier [m], sum of the radii [m], mollifier threshold [m^4]
+    constants: Tensor  # [capacity, 8]  reach of the barrier [m], sum of the radii [m], mollifier threshold [m^4]; hints
     ptr: Tensor  # [B N + 1]  pairs of corner point i of scene b: entry[ptr[b N + i] : ptr[b N + i + 1]],
     entry: Tensor  # [4 capacity]  each 4 pair + local corner, in ascending order
     near_corners: Tensor  # [B, N, 5]  corner points and kind of the pair with the smallest gap; i four times, -1: none
-    near_values: Tensor  # [B, N, 8]  its weights, normal and gap [m]; without one, zeros and the reach
+    near_values: Tensor  # [B, N, 8]  its weights, normal and gap [m]; without one, zeros and how far was looked
     counts: Tensor  # [4] int64  pairs that the list needs, pairs that touch, smallest key of those or -1, 0
-    smallest: Tensor  # [B]  smallest gap [m], or the reach
+    smallest: Tensor  # [B]  smallest gap, or how far was looked [m]
 
 
 def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
                    triangles: Tensor, edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, held: Tensor,
-                   mesh_bodies: int, self_contact: bool, between_bodies: bool, dhat: float, reach: float, cap: float,
-                   gamma: float, capacity: int, trim: bool = False) -> Detection:  # fmt: skip
+                   room: Tensor, mesh_bodies: int, self_contact: bool, between_bodies: bool, dhat: float,
+                   capacity: int, trim: bool = False) -> Detection:  # fmt: skip
     """Near pair of every corner point, and the pairs that may come within reach of the barrier before the next call.
 
-    A corner point may move by ``min(gamma gap, cap)``, gap being that of its near pair. Pairs are considered up to a
-    gap of ``reach``; one is listed if its gap, less the bounds of its two sides, is below the barrier's reach, which is
-    ``dhat`` or, for two sides of one body that are closer at rest, 0.9 times their distance at rest. Two colliders make
-    no pair, nor do four held corner points, nor two sides of one body that are one place at rest.
+    The vertices of a body may go as far as its room beside what its island does; colliders have none. Pairs are looked
+    for up to a gap of ``dhat`` and twice the largest room. One is listed if its gap, less the rooms of its two sides,
+    is below the barrier's reach, which is ``dhat`` or, for two sides of one body that are closer at rest, 0.9 times
+    their distance at rest. Two colliders make no pair, nor do four held corner points, nor two sides of one body that
+    are one place at rest.
 
     A surface point that is not finite counts as touching. Where ``counts[0] > capacity``, the list holds some of the
     pairs that it needs. Not differentiable; results repeat to the bit.
@@ -54,8 +55,9 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         triangles, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique.
         planes: [L, 3] collider points that span each plane, counterclockwise seen from the free side.
         body, held: [N]; labels from ``mesh_bodies`` on are colliders; held: bool, no sweep moves it.
+        room: [B, mesh_bodies + 1] how far the vertices of each body may go [m], and the largest.
         self_contact, between_bodies: Which pairs of mesh bodies to consider.
-        dhat, reach, cap: [m].  gamma: Part of a gap that a corner point may move.
+        dhat: [m].
         capacity: Rows of the list.
         trim: On the CPU, only as many rows as pairs fill: rows that none fills may cost more than the search. CUDA,
             which would wait for their number, does not trim; torch.compile takes longer with sizes that it cannot know.
@@ -65,8 +67,8 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
     """
     return Detection(
         *raw.contact_detect(
-            x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies,
-            self_contact, between_bodies, dhat, reach, cap, gamma, capacity, trim,
+            x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held,
+            room, mesh_bodies, self_contact, between_bodies, dhat, capacity, trim,
         )
     )  # fmt: skip
 
@@ -111,15 +113,15 @@ def contact_intersections(x: Tensor, origin: Tensor, collider: Tensor, rest: Ten
 
 def contact_islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, collider: Tensor, collider_next: Tensor,
                     planes: Tensor, body: Tensor, body_order: Tensor, body_ptr: Tensor, held: Tensor, radius: Tensor,
-                    mesh_bodies: int, cap: float, dhat: float, any_direction: bool = False) -> Tensor:  # fmt: skip
+                    room: Tensor, mesh_bodies: int, dhat: float, any_direction: bool = False) -> Tensor:  # fmt: skip
     """Smallest body of the island of bodies in contact that each body is in [B, NB] int32, or -1.
 
     An island moves by the mass-weighted mean of ``move`` over its vertices that are not held. Bodies whose boxes, swept
-    by that and grown by ``cap + dhat / 2``, overlap are of one island. -1: the island holds a held vertex or may reach
+    by that and grown by room and dhat / 2, overlap are of one island. -1: the island holds a held vertex or may reach
     a collider, and must stay. Not differentiable; results repeat to the bit.
 
     Args:
-        x, origin, collider, collider_next, planes, body, held, radius, cap, dhat: As for :func:`contact_detect`.
+        x, origin, collider, collider_next, planes, body, held, radius, room, dhat: As for :func:`contact_detect`.
         move, mass: [B, V, 3] where each vertex wants to go [m], [1 | B, V] [kg].
         any_direction: Whether a floor may turn a translation into any direction, by which it does not become longer.
         body_order, body_ptr: [V] vertices sorted by body, [NB + 1] the first of each body.
@@ -128,7 +130,7 @@ def contact_islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, colli
         ValueError: A tensor with the wrong shape, dtype or device.
     """
     return raw.contact_islands(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr,
-                                held, radius, mesh_bodies, cap, dhat, any_direction)  # fmt: skip
+                                held, radius, room, mesh_bodies, dhat, any_direction)  # fmt: skip
 
 
 def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
@@ -148,8 +150,8 @@ def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
 
 
 @shapes_of("contact_detect")
-def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, mesh_bodies,
-      self_contact, between_bodies, dhat, reach, cap, gamma, capacity, trim):  # fmt: skip
+def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, room,
+      mesh_bodies, self_contact, between_bodies, dhat, capacity, trim):  # fmt: skip
     b, n = x.shape[0], body.shape[0]
     rows = torch.library.get_ctx().new_dynamic_size() if trim and x.device.type == "cpu" else capacity
 
@@ -170,8 +172,8 @@ def _(x, origin, collider, rest, radius, triangles, edges, points, planes, body,
 
 
 @shapes_of("contact_islands")
-def _(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr, held, radius, mesh_bodies,
-      cap, dhat, any_direction):  # fmt: skip
+def _(x, origin, move, mass, collider, collider_next, planes, body, body_order, body_ptr, held, radius, room,
+      mesh_bodies, dhat, any_direction):  # fmt: skip
     return x.new_empty((x.shape[0], mesh_bodies), dtype=torch.int32)
 
 

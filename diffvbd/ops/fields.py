@@ -33,7 +33,6 @@ class SweepFields(NamedTuple):
     energy_data: Tensor  # [1 | B, n], see VertexEnergy.pack
     origin: Tensor | None = None  # [B, V, 3], what positions are relative to
     # contact; the shapes of the index data are those of ops.detect
-    bounds: Tensor | None = None  # center and radius [m], [B, V, 4]
     collider: Tensor | None = None  # during the sweeps [m], [B, Vc, 3]
     collider_prev: Tensor | None = None  # at the start of the step [m], [B, Vc, 3]
     kappa: Tensor | None = None  # [1 | B] [N/m]
@@ -46,6 +45,8 @@ class SweepFields(NamedTuple):
     lag_ptr: Tensor | None = None
     lag_entry: Tensor | None = None
     floor_lag: Tensor | None = None  # [B, V, planes, 4]
+    center: Tensor | None = None  # [B, V, 3] from where a vertex may go,
+    room: Tensor | None = None  # [B, V] as far as this [m]
     corners_prev: Tensor | None = None  # x_prev of the tets' corners, [12, B, T], where their law reads it
     # coarse corrections; see model.coarse_plan for the constants
     coarse_factor: Tensor | None = None  # [B, 9 cells]  Cholesky factors (CUDA: inverses); its adjoint is the matrix's
@@ -56,8 +57,8 @@ class SweepFields(NamedTuple):
 
 
 # What the reverse differentiates: the fields that are ADJOINT in csrc/bind/fields.h.
-SWEEP_ADJOINTS = ("x_start", "x_prev", "y", "mu", "lam", "mass", "rest", "energy_data", "bounds", "collider",
-                  "collider_prev", "kappa", "lag", "floor_lag", "corners_prev", "coarse_factor")  # fmt: skip
+SWEEP_ADJOINTS = ("x_start", "x_prev", "y", "mu", "lam", "mass", "rest", "energy_data", "collider", "collider_prev",
+                   "kappa", "lag", "floor_lag", "corners_prev", "coarse_factor")  # fmt: skip
 
 
 class StepFields(NamedTuple):

@@ -39,22 +39,24 @@ def listed(fields: SweepFields | StepFields, packed_rest: Tensor, plan: Tensor, 
 
 def sweep(fields: SweepFields, packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int,
           debug_step: int = -1, checked: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """x [B, V, 3], tape, with contact where a bound has held back, uint8 [B, V], and what coarse corrections did."""
+    """x [B, V, 3], tape, with contact the exponents of limits, uint8 [B, K, V], and what coarse corrections did."""
     given = listed(fields, packed_rest, plan, settings)
     return raw.sweep(*given, plan, *settings, tape_policy, debug_step, checked)
 
 
-def sweep_backward(x_bar: Tensor, x: Tensor, tape: Tensor, corrections: Tensor, fields: SweepFields,
+def sweep_backward(x_bar: Tensor, x: Tensor, tape: Tensor, corrections: Tensor, cut: Tensor, fields: SweepFields,
                    packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int,
                    wants: dict[str, bool]) -> dict[str, Tensor]:  # fmt: skip
     """Adjoints of the fields by name; an empty tape: the sweeps run again. ``wants``: of SWEEP_ADJOINTS."""
     given = listed(fields, packed_rest, plan, settings)
     if tape_policy == NO_TAPE:
         tape_policy = FULL_TAPE
-        x, tape, _, corrections = raw.sweep(*given, plan, *settings, tape_policy, -1, False)
+        x, tape, cut, corrections = raw.sweep(*given, plan, *settings, tape_policy, -1, False)
     material = wants["mu"] or wants["lam"] or wants["corners_prev"]
     flags = [material, wants["mass"], wants["rest"], wants["energy_data"], wants["coarse_factor"]]
-    bars = raw.sweep_backward(*given, x_bar.contiguous(), x, tape, corrections, plan, *settings, tape_policy, flags)
+    bars = raw.sweep_backward(
+        *given, x_bar.contiguous(), x, tape, corrections, cut, plan, *settings, tape_policy, flags
+    )
     return dict(zip(SWEEP_ADJOINTS, bars, strict=True))
 
 
@@ -89,7 +91,8 @@ def _(*arguments):
     x, scenes = f.x_start, f.x_start.shape[0] if energies & CONTACT else 0
     tape = x.new_empty(tape_shape(x, sizes, energies, sweeps, launch, tape_policy))
     done = corrections_shape(x, coarse, sweeps, energies) if f.coarse_plan.numel() else (0,)
-    return torch.empty_like(x), tape, x.new_empty((scenes, x.shape[1]), dtype=torch.uint8), x.new_empty(done)
+    cut = (scenes, sweeps, x.shape[1])
+    return torch.empty_like(x), tape, x.new_empty(cut, dtype=torch.uint8), x.new_empty(done)
 
 
 def _body_adjoints(x: Tensor, f: Any, num_tets: int, wants: Sequence[bool]) -> list[Tensor]:
@@ -104,7 +107,7 @@ def _body_adjoints(x: Tensor, f: Any, num_tets: int, wants: Sequence[bool]) -> l
 @shapes_of("sweep_backward")
 def _(*arguments):
     f: Any = SweepFields(*arguments[:_FIELDS])
-    _, x, _, _, _, sizes, energies, *_, wants = arguments[_FIELDS:]
+    _, x, _, _, _, _, sizes, energies, *_, wants = arguments[_FIELDS:]
     b, v = x.shape[:2]
     own = [*(torch.empty_like(x) for _ in range(3)), *_body_adjoints(x, f, sizes[1], wants[:3])]
     own.append(x.new_empty((b, f.energy_data.shape[-1]) if wants[3] else (0,)))
@@ -114,7 +117,7 @@ def _(*arguments):
         return (*own, *(x.new_empty((0,)) for _ in range(len(SWEEP_ADJOINTS) - len(own) - len(last))), *last)
     colliders = f.collider.shape[1] if f.collider.dim() == 3 else 0
     planes = f.floor_lag.numel() // max(1, f.floor_lag.shape[0] * 4 * v)
-    shapes = [(b, v, 4), (b, colliders, 3), (b, colliders, 3), (b,), (f.lag_pairs.shape[0], LAG_SCALARS),
+    shapes = [(b, colliders, 3), (b, colliders, 3), (b,), (f.lag_pairs.shape[0], LAG_SCALARS),
               (b, v, planes, 4)]  # fmt: skip
     return (*own, *(x.new_empty(shape) for shape in shapes), *last)
 

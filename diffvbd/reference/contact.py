@@ -1,8 +1,9 @@
-"""One step with contact between bodies, in plain torch: barrier, damping and friction of pairs, bounds on the motion.
+"""One step with contact between bodies, in plain torch: barrier, damping and friction of pairs, starts, limits, rigid
+corrections.
 
-Which pairs touch, which pair is nearest to a vertex and which bodies move together are index data that a detection
-found (`Part`); everything that follows from them is computed here from positions and differentiated by autograd.
-Sources: Li et al. 2020 (barrier, mollifier, friction), Chen et al. 2025 (bounds of offset geometric contact).
+Which pairs there are, which bodies move together and what a step has decided are data (`Part`); everything that follows
+from them is computed here from positions and differentiated by autograd.
+Source: Li et al. 2020 (barrier, mollifier, friction).
 """
 
 from collections.abc import Sequence
@@ -13,22 +14,25 @@ import torch
 from torch import Tensor
 
 from .distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
-from .energies import FloorBarrier, build_energies
+from .energies import FloorBarrier, StableNeoHookean, build_energies
 from .friction import floor_friction, smoothed, tangential6
-from .layout import build_layout, dot, outer6, take
+from .layout import build_layout, dot, outer6
 from .scene import Scene, build_scene
 from .sweep import check_start, color_masses, predictor, run_sweeps, started
 
-GUARD = 32  # ulps of a vertex's coordinates that are taken off its gap before it becomes a bound
+LEAST_STIFFNESS = 1e-12  # of its mass, that keeps the system of a body definite
 
 
 class Part(NamedTuple):
-    """One detection: indices without gradient, of B scenes with N corner points, mesh vertices before colliders."""
+    """One detection and what the part of a step has decided: data without gradient, of B scenes with N corner points,
+    mesh vertices before colliders."""
 
     pairs: Tensor  # [Q, 6] int64: four corners, kind, scene
-    constants: Tensor  # [Q, 3]: dhat of the pair [m], sum of radii [m], threshold of the mollifier [m^4]
-    near_corners: Tensor  # [B, N, 5] int64: four corners and kind of the nearest pair of a corner point; -1: none
+    constants: Tensor  # [Q, 3 or more]: dhat of the pair [m], sum of radii [m], threshold of the mollifier [m^4]
     island: Tensor  # [B, bodies] int64: label of the island of a body; -1: it is not translated
+    shares: Tensor  # [2, B, V]: of the two ways of the start, that each vertex goes
+    corrections: Tensor  # [1 | 2, B, bodies]: of the rigid motions before and after the sweeps, that each body takes
+    limits: Tensor | None = None  # [K, B, V]: of each update, that planes let through
     lowest: Tensor | None = None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
 
 
@@ -42,7 +46,7 @@ class Pairs:
         order = torch.arange(len(part.pairs), device=part.pairs.device) if order is None else order
         rows, constants = part.pairs[order], scene.tensor(part.constants)[order]
         self.corners, self.kind, self.batch = rows[:, :4], rows[:, 4], rows[:, 5]
-        self.dhat, self.offset, self.threshold = constants.unbind(1)
+        self.dhat, self.offset, self.threshold = constants[:, :3].unbind(1)
         self.lead = scene.like.shape[:-2]
         self.points = scene.rest_points.shape[-1] + scene.model.collider_points.shape[-2]
         self.sizes = [len(color.vertices) for color in scene.layout.colors]
@@ -165,42 +169,18 @@ class LaggedPairForces:
         return self.pairs.total(total)
 
 
-class Bounds:
-    """|x_i - center_i| <= b_i for all vertices from one detection to the next, [..., 3, V] and [..., V].
+class Translation:
+    """Of the island of each vertex [..., 3, V]: the mean of where its vertices want to go, above the floor."""
 
-    x: state at the detection; wanted: where each vertex wants to go from there, both [..., 3, V]; colliders
-    [B, Vc, 3] as the detection saw them.
-    """
-
-    def __init__(
-        self, scene: Scene, part: Part, x: Tensor, wanted: Tensor, colliders: Tensor, floor: FloorBarrier | None = None
-    ) -> None:
-        points = corner_points(x, colliders)
-        x_rows = points[:, : x.shape[-1]]
-        bound = self._bound(scene.model, part, points, x_rows)
-        self.radius = bound.reshape(x.shape[:-2] + bound.shape[-1:])
-        rows = wanted.transpose(-1, -2).reshape(x_rows.shape)
-        u = self._translation(scene, part, rows).transpose(-1, -2).reshape(x.shape)
+    def __init__(self, scene: Scene, part: Part, x: Tensor, wanted: Tensor, floor: FloorBarrier | None) -> None:
+        rows = wanted.transpose(-1, -2).reshape(len(part.island), x.shape[-1], 3)
+        u = self._mean(scene, part, rows).transpose(-1, -2).reshape(x.shape)
         if floor is not None and part.lowest is not None:
             u = self._above(floor, u, x, part.lowest[:, scene.model.body].reshape(*x.shape[:-2], x.shape[-1], -1))
-        self.center = x + u
+        self.u = u
 
     @staticmethod
-    def _bound(model: Any, part: Part, points: Tensor, x: Tensor) -> Tensor:
-        """b [B, V] from the gap of the nearest pair of each vertex."""
-        reach, cap, gamma = model.contact_numbers
-        near = part.near_corners[:, : x.shape[1]]
-        scene, vertex = (near[..., 4] >= 0).nonzero(as_tuple=True)
-        corners, kind = near[scene, vertex, :4], near[scene, vertex, 4]
-        radius = model.surface_of_contact.radius.to(x)
-        second = torch.where(kind == EDGE_EDGE, corners[:, 2], corners[:, 1])  # first corner of the second primitive
-        gap = distance(kind, points[scene[:, None], corners]) - (radius[corners[:, 0]] + radius[second])
-        gap = points.new_full(x.shape[:2], reach).index_put((scene, vertex), gap)
-        guard = GUARD * torch.finfo(x.dtype).eps * x.detach().abs().sum(-1)
-        return (gamma * (gap - guard).clamp(min=0)).clamp(max=cap)
-
-    @staticmethod
-    def _translation(scene: Scene, part: Part, wanted: Tensor) -> Tensor:
+    def _mean(scene: Scene, part: Part, wanted: Tensor) -> Tensor:
         """u [B, V, 3]: mean of `wanted` [B, V, 3], weighted by mass, over the vertices of a vertex's island."""
         model = scene.model
         label = part.island[:, model.body]
@@ -229,15 +209,155 @@ class Bounds:
         safe = (down <= room * (1 + 1e-6) + slack).all(-2)
         return torch.where(safe.unsqueeze(-2), u, 0.0)
 
-    def cut(self, x: Tensor, step: Tensor, vertices: Tensor) -> Tensor:
-        """The step [..., 3, n] of some vertices from x [..., 3, n], ended at the closest point of the bound's ball."""
-        center, radius = take(self.center, vertices), take(self.radius.unsqueeze(-2), vertices).squeeze(-2)
-        offset = x + step - center
-        square = dot(offset, offset)
-        moves = square > 0
-        length = torch.where(moves, square, 1.0).sqrt()
-        outside = moves & (length > radius)
-        return torch.where(outside.unsqueeze(-2), (center - x) + (radius / length).unsqueeze(-2) * offset, step)
+
+class Correction:
+    """The rigid correction of bodies that touch: one Newton step over turn and shift of every body without pinned
+    vertices, all of a scene together. The gradient is autograd's, the blocks are those of vertex updates."""
+
+    def __init__(self, scene: Scene, energies: list[Any], barrier: Any, lagged: Any, y: Tensor, x_prev: Tensor) -> None:
+        model, self.scene, self.y, self.x_prev = scene.model, scene, y, x_prev
+        self.single = [e for e in energies if not isinstance(e, StableNeoHookean)]
+        self.barrier, self.lagged = barrier, lagged
+        self.body, self.count = model.body, int(model.body.max()) + 1
+        pinned = torch.zeros(self.count).index_add(0, self.body.cpu(), model.pinned.cpu().float()) > 0
+        self.free = ~pinned.to(y.device)
+
+    def __call__(self, x: Tensor, share: Tensor) -> Tensor:
+        """The state [..., 3, V] after each body [B, bodies] has taken its share of its motion."""
+        lead, rows = x.shape[:-2], x.transpose(-1, -2).reshape(len(share), -1, 3)
+        mass = self.scene.mass.expand(*lead, x.shape[-1]).reshape(len(share), -1)
+        total = mass.new_zeros(len(share), self.count).index_add(1, self.body, mass)
+        center = rows.new_zeros(len(share), self.count, 3).index_add(1, self.body, mass[..., None] * rows)
+        arm = rows - (center / total[..., None])[:, self.body]
+
+        def state(motion: Tensor) -> Tensor:
+            turn = torch.linalg.matrix_exp(_cross_matrix(motion[..., :3]))
+            moved = (
+                rows + ((turn[:, self.body] - torch.eye(3).to(x)) @ arm[..., None])[..., 0] + motion[:, self.body, 3:]
+            )
+            return moved.transpose(-1, -2).reshape(x.shape)
+
+        z = x.new_zeros(len(share), self.count, 6)
+        jacobian = torch.cat([-_cross_matrix(arm), torch.eye(3).to(x).expand(*arm.shape, 3)], -1)  # [B, V, 3, 6]
+        g, blocks = self._single(x, state, z, jacobian, mass)
+        matrix = x.new_zeros(len(share), self.count, self.count, 6, 6)
+        at = torch.arange(self.count, device=x.device)
+        matrix = matrix.index_put((slice_of(len(share), at), at, at), blocks, accumulate=True)
+        for pairs, force, stiffness in self._pairs(x):
+            g, matrix = self._add(pairs, force, stiffness, jacobian, g, matrix)
+        free = self.free.to(x.device)
+        both = (free[:, None] & free)[..., None, None]
+        fill = torch.where(free, LEAST_STIFFNESS * total, 1.0)[..., None, None] * torch.eye(6).to(x)
+        matrix = torch.where(both, matrix, 0.0).index_put((slice_of(len(share), at), at, at), fill, accumulate=True)
+        system = matrix.permute(0, 1, 3, 2, 4).reshape(len(share), 6 * self.count, -1)
+        right = torch.where(free[:, None], -g, 0.0).reshape(len(share), -1, 1)
+        motion = torch.linalg.solve(system, right).reshape(z.shape)
+        return state(share.to(x)[..., None] * motion)
+
+    def _single(self, x: Tensor, state: Any, z: Tensor, jacobian: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient [B, bodies, 6] and blocks [B, bodies, 6, 6] of inertia and the energies of single vertices."""
+        tracked = z.clone().requires_grad_()
+        off = torch.where(self.scene.model.pinned, 0.0, state(tracked) - self.y)
+        value = (self.scene.mass.unsqueeze(-2) / 2 * off**2).sum((-2, -1))
+        for energy in self.single:
+            value = value + energy.energy(state(tracked), self.x_prev)
+        (g,) = torch.autograd.grad(value.sum(), tracked, create_graph=True)
+        total = torch.zeros_like(x).repeat_interleave(3, -2)  # [..., 9, V]
+        for k, color in enumerate(self.scene.layout.colors):
+            for energy in self.single:
+                total = total.index_add(-1, color.vertices, energy.block(k, x, self.x_prev))
+        xx, xy, xz, yy, yz, zz = total[..., 3:, :].unbind(-2)
+        own = torch.stack([torch.stack(r, -1) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))], -2)
+        own = own.reshape(*jacobian.shape[:2], 3, 3) + mass[..., None, None] * torch.eye(3).to(x)
+        blocks = jacobian.mT @ own @ jacobian
+        return g, blocks.new_zeros(len(z), self.count, 6, 6).index_add(1, self.body, blocks)
+
+    def _pairs(self, x: Tensor) -> list[tuple[Any, Tensor, Tensor]]:
+        """Forces on the corners [Q, 4, 3] of barriers and lagged terms, and what their updates add [Q, 4, 4, 3, 3]."""
+        out, h2 = [], self.scene.time_step**2
+        p = self.barrier.pairs
+        every = torch.arange(len(p.kind), device=x.device)
+        gap, slope, e, _ = p.measures(corner_points(x, self.barrier.colliders), every)
+        _, first, second = log_barrier(gap, self.barrier.kappa, p.dhat)
+        across = slope[:, :, None, :, None] * slope[:, None, :, None, :]
+        out.append((p, h2 * (e * first)[:, None, None] * slope, h2 * (e * second)[:, None, None, None, None] * across))
+        lag = self.lagged
+        if lag is not None:
+            every = torch.arange(len(lag.near), device=x.device)
+            along, slip, weights = lag._travel(x, every)
+            rate, n = lag.h * lag.damping, lag.normal
+            force = (rate * along)[:, None] * n
+            outer = n[:, :, None] * n[:, None, :]
+            inner = torch.where(lag.near, rate, 0.0)[:, None, None] * outer
+            if lag.largest is not None:
+                size = lag.h**2 * lag.largest * smoothed(slip, lag.reach)[1]
+                force = force + size[:, None] * slip.T
+                inner = inner + size[:, None, None] * (torch.eye(3).to(x) - outer)
+            weighted = weights[:, :, None, None, None] * weights[:, None, :, None, None] * inner[:, None, None]
+            out.append((lag.pairs, weights[..., None] * force[:, None], weighted))
+        return out
+
+    def _add(self, p: Any, force: Tensor, stiffness: Tensor, jacobian: Tensor, g: Tensor, matrix: Tensor
+             ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        vertices = jacobian.shape[1]
+        mesh = p.corners < vertices
+        corners = torch.where(mesh, p.corners, 0)
+        body = self.body[corners]
+        scene = p.batch[:, None].expand_as(corners)
+        maps = torch.where(mesh[..., None, None], jacobian[scene, corners], 0.0)  # [Q, 4, 3, 6]
+        second = torch.where(p.kind == EDGE_EDGE, 2, 1)
+        lead = body.gather(1, second[:, None])
+        apart = (body[:, :1] != lead) | ~mesh.gather(1, second[:, None])  # a body does not push itself
+        maps = torch.where(apart[..., None, None], maps, 0.0)
+        pull = (maps.mT @ force[..., None])[..., 0]
+        g = g.index_put((scene, body), pull, accumulate=True)
+        pressed = maps.mT[:, :, None] @ stiffness @ maps[:, None]  # [Q, 4, 4, 6, 6]
+        rows = (scene[:, :, None].expand(-1, 4, 4), body[:, :, None].expand(-1, 4, 4), body[:, None].expand(-1, 4, 4))
+        return g, matrix.index_put(rows, pressed, accumulate=True)
+
+
+def slice_of(scenes: int, at: Tensor) -> Tensor:
+    """Scenes [B, 1] beside an index of bodies."""
+    return torch.arange(scenes, device=at.device)[:, None].expand(scenes, len(at))
+
+
+def _cross_matrix(w: Tensor) -> Tensor:
+    """[w]x, [..., 3, 3]."""
+    zero = torch.zeros_like(w[..., 0])
+    x, y, z = w.unbind(-1)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+
+
+def _unsupported(scene: Scene, pairs: Pairs, floor: FloorBarrier | None, x: Tensor, colliders: Tensor, lift: Tensor
+                 ) -> Tensor:  # fmt: skip
+    """What barriers at the start of the step leave of the ways [..., 3, V] that bodies want to fall."""
+    model, scenes, count = scene.model, len(colliders), int(scene.model.body.max()) + 1
+    points = corner_points(x, colliders)
+    gap, slope, e, _ = pairs.measures(points, torch.arange(len(pairs.kind), device=x.device))
+    kappa = pairs.per_pair(scene.parameter("pair_barrier", model.contact, "kappa"))
+    _, first, _ = log_barrier(gap, kappa, pairs.dhat)
+    push = -(e * first)[:, None, None] * slope
+    force = torch.zeros_like(points).index_put((pairs.batch[:, None], pairs.corners), push, accumulate=True)
+    force = force[:, : x.shape[-1]]
+    if floor is not None:
+        _, slope, _ = log_barrier(floor.gap(x), floor.kappa, floor.dhat)
+        lifted = -(slope.unsqueeze(-2) * floor.normal).sum(-3)
+        force = force + lifted.transpose(-1, -2).reshape(force.shape)
+    mass = scene.mass.expand(*x.shape[:-2], x.shape[-1]).reshape(scenes, -1, 1)
+    way = lift.transpose(-1, -2).reshape(force.shape)
+    free = ~model.pinned
+    columns = torch.where(free[:, None], torch.cat([mass * way, scene.time_step**2 * force, mass], -1), 0.0)
+    sums = columns.new_zeros(scenes, count, 7).index_add(1, model.body, columns)
+    own, borne = (sums[..., i : i + 3] / sums[..., 6:].clamp(min=1e-300) for i in (0, 3))
+    square = (borne**2).sum(-1, keepdim=True)
+    share = (-(own * borne).sum(-1, keepdim=True) / square.clamp(min=1e-300)).clamp(0, 1)
+    pinned = torch.zeros(count, device=x.device).index_add(0, model.body, model.pinned.float()) > 0
+    taken = torch.where(pinned[:, None], 0.0, share * borne)[:, model.body]
+    way = torch.where(free[:, None], way + taken, way)
+    return way.transpose(-1, -2).reshape(x.shape)
+
+
+SHORT = 0.99  # share of a way that counts as all of it
 
 
 def contact_step(
@@ -292,27 +412,38 @@ def contact_step(
     masses = color_masses(scene)
     end = _collider_rows(scene, model.collider_points if colliders is None else colliders)
     begin = end if colliders_before is None else _collider_rows(scene, colliders_before)
-    planes = model.plane_points.unsqueeze(-1)
     listed = [Pairs(scene, part, None if order is None else order[r]) for r, part in enumerate(parts)]
 
     y = predictor(scene, x, v, force, gravity, prescribed).transpose(-1, -2)
-    x_prev = x.transpose(-1, -2)
+    x_prev, pinned = x.transpose(-1, -2), model.pinned
     check_start(energies, x_prev)
     start = corner_points(x_prev, begin)
-    every = torch.arange(x.shape[-2], device=x.device)
-    state, wanted = x_prev, y - x_prev
+    coasting = torch.where(pinned, y, x_prev + time_step * v.transpose(-1, -2))
+    way, lift, state = coasting - x_prev, y - coasting, x_prev
+    left = way
     for r, part in enumerate(parts):
         before, now = (begin + (n / count) * (end - begin) for n in (r, r + 1))
-        bounds = Bounds(scene, part, state, wanted, torch.where(planes, now, before), floor)
-        target = state + bounds.cut(state, wanted, every)
-        moved = target
-        if floor is not None:  # from the center: all between it and the target lies in the ball
-            moved = bounds.center + started(energies, bounds.center, target - bounds.center)
-        moved = torch.where(model.pinned, x_prev + ((r + 1) / count) * (y - x_prev), moved)
-        wanted = wanted - (moved - state)
+        move = left if count == 1 else torch.where(pinned, way / count, left)
+        fall = lift if r == 0 else torch.zeros_like(lift)
+        if r == 0:
+            fall = lift = _unsupported(scene, listed[0], floor, x_prev, before, lift)
+        u, at = Translation(scene, part, state, move, floor).u, state
+        for wanted, by, share in ((move, u, part.shares[0]), (fall, torch.zeros_like(u), part.shares[1])):
+            base, share = at + by, share.reshape(*x.shape[:-2], 1, -1).to(at)
+            target = at + wanted
+            if floor is not None:
+                target = base + started(energies, base, target - base)
+            at = torch.where(pinned, at + wanted, base + share * (target - base))
         forces = [PairBarrier(scene, listed[r], now), LaggedPairForces(scene, listed[0], start, now)]
+        correct = Correction(scene, energies, *forces, y, x_prev)
+        state = correct(at, part.corrections[0])
         number = sweeps // count + (1 if r < sweeps % count else 0)
-        state = run_sweeps(scene, [*energies, *forces], masses, y, moved, x_prev, number, bounds.cut)
+        if number:
+            limits = None if part.limits is None else part.limits.reshape(number, *x.shape[:-2], 1, -1).to(at)
+            state = run_sweeps(scene, [*energies, *forces], masses, y, state, x_prev, number, limits)
+            state = correct(state, part.corrections[1])
+        short = (part.shares.amin(0) < SHORT).reshape(*x.shape[:-2], 1, -1) & ~pinned
+        left = torch.where(short, x_prev + way + lift - state, 0.0)
     x_new = state.transpose(-1, -2).contiguous()
     return x_new, (x_new - x) / time_step
 

@@ -285,19 +285,20 @@ def run_sweeps(
     state: Tensor,
     x_prev: Tensor,
     sweeps: int,
-    cut: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None,
+    limits: Tensor | None = None,
     relaxation: float | None = None,
 ) -> Tensor:
     """The state [..., 3, V] after `sweeps` sweeps of all colors toward the predictor y [..., 3, V].
 
-    masses: `color_masses`. x_prev: start of the step, for lagged terms. cut(x, update, vertices): what a bound on the
-    motion leaves of the update [..., 3, n] of some vertices at x [..., 3, n]. relaxation: None for the Model's.
+    masses: `color_masses`. x_prev: start of the step, for lagged terms. limits [sweeps, ..., 1, V]: what is let through
+    of each update. relaxation: None for the Model's.
     """
     targets = [take(y, color.vertices) for color in scene.layout.colors]
-    for _ in range(sweeps):
+    for n in range(sweeps):
+        limit = None if limits is None else limits[n]
         for k, color in enumerate(scene.layout.colors):
             if color.vertices.numel():
-                state = _update_color(scene, energies, k, masses[k], targets[k], state, x_prev, cut, relaxation)
+                state = _update_color(scene, energies, k, masses[k], targets[k], state, x_prev, limit, relaxation)
     return state
 
 
@@ -309,10 +310,10 @@ def _update_color(
     y: Tensor,
     state: Tensor,
     x_prev: Tensor,
-    cut: Callable[[Tensor, Tensor, Tensor], Tensor] | None,
+    limit: Tensor | None,
     relaxation: float | None,
 ) -> Tensor:
-    """Newton update of all vertices of color k: H d = -g, saturate, relax, cut, filter, write."""
+    """Newton update of all vertices of color k: H d = -g, saturate, relax, filter, limit, write."""
     model, vertices = scene.model, scene.layout.colors[k].vertices
     x = take(state, vertices)
     diagonal = (mass + model.regularization).expand_as(x[..., :1, :])
@@ -327,9 +328,10 @@ def _update_color(
     factor = model.relaxation if relaxation is None else relaxation
     if factor != 1.0:
         update = factor * update
-    if cut is not None:
-        update = cut(x, update, vertices)
-    return put(state, vertices, x + filtered(energies, x, update))
+    update = filtered(energies, x, update)
+    if limit is not None:
+        update = take(limit, vertices) * update
+    return put(state, vertices, x + update)
 
 
 def _saturation(update: Tensor, limit: float) -> Tensor:

@@ -38,9 +38,9 @@ def cut_share(model: Model) -> float:
     Bounds say which vertices they cut and not by how much: it is the share of these.
     """
     outcome = outcomes.get(model)
-    if outcome is None or not outcome.cut or model.num_active == 0:
+    if outcome is None or outcome.cut.numel() == 0 or model.num_active == 0:
         return 0.0
-    return float(torch.stack(outcome.cut).amax(0).sum(-1).max()) / model.num_active
+    return float(outcome.cut.sum(-1).max()) / model.num_active
 
 
 def unbalanced_friction(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,

@@ -187,7 +187,7 @@ class _Sweeping:
         if self.where is None:
             return "with the exact block a relaxation between 1.5 and 1.7"
         outcome = outcomes.get(self.model)
-        if outcome is not None and any(bool(cut.any()) for cut in outcome.cut):
+        if outcome is not None and bool(outcome.cut.any()):
             return "more detections or a larger reach of the PairBarrier, whose bounds have cut this step short"
         return "a larger Friction(velocity=)"
 

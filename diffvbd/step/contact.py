@@ -1,29 +1,43 @@
-"""The executed step with contact: R times detection, bounds, start and sweeps (docs/method.md, section 12)."""
+"""The executed step with contact: R times detection, start, correction, sweeps and correction (docs/method.md, sections
+12 and 18)."""
 
 from __future__ import annotations
 
 import weakref
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..adjoint.contact_lag import Pairs, of_scene, pair_lag
+from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
-from ..contact.start import start_part
+from ..contact.start import PartStart, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
+from ..ops.detect import CONSTANTS
 from ..scopes import checking, recorders
 from .intersections import refuse_intersections
+from .rigid_contact import Scenes, correct
+from .rooms import rooms, unsupported
 
 if TYPE_CHECKING:
     from .arguments import Prepared
     from .predict import Begun
 
-FREE = 1e15  # [m] radius of a bound that binds nothing
+FREE = 1e15  # [m] room that nothing fills
+MOST_CAPACITY = 2**26
+
+
+class TooManyPairs(RuntimeError):
+    """More pairs than fit; ``needed`` per scene."""
+
+    def __init__(self, needed: int, message: str) -> None:
+        super().__init__(message)
+        self.needed = needed
 
 
 class Detection(NamedTuple):
@@ -38,17 +52,30 @@ class Detection(NamedTuple):
     smallest: Tensor
     island: Tensor
     lowest: Tensor  # of a Model with a floor, else empty
+    room: Tensor  # [B, bodies + 1] [m]: how far the vertices of each body may go beside its island, and the largest
+    # what the part has decided: the shares of the two ways of its start [2, B, V], of the corrections before and after
+    # its sweeps [1 | 2, B, bodies], and the exponents of limits [B, K, V]
+    shares: Tensor | None = None
+    corrections: Tensor | None = None
+    limits: Tensor | None = None
 
 
 class Outcome(NamedTuple):
     """What the latest step of a Model has met, on its device; read by diffvbd.contact.status."""
 
-    counts: (
-        Tensor  # [R, 4] int64: pairs needed, touching pairs, key of one or -1, corner points moved above their bound
-    )
+    counts: Tensor  # [R, 4] int64: pairs needed, touching pairs, key of one or -1, pairs that hinder what is prescribed
     capacity: int  # pairs of all scenes
-    cut: list[Tensor]  # [B, V] uint8, of each start and of each part's sweeps
+    cut: Tensor  # [B, V] bool: held up by pairs at the last start, or limited in the last sweep
     smallest: Tensor  # [R, B] [m]
+
+
+class Met:
+    """What the parts of a step meet one after another."""
+
+    def __init__(self) -> None:
+        self.found: list[Detection] = []
+        self.counts: list[Tensor] = []
+        self.cut = torch.zeros(())
 
 
 outcomes: weakref.WeakKeyDictionary[Model, Outcome] = weakref.WeakKeyDictionary()
@@ -62,10 +89,9 @@ def sweeps_of_parts(sweeps: int, parts: int) -> list[int]:
 class ContactStep:
     """What the parts of one step share."""
 
-    def __init__(self, model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor,
-                 prescribed: bool) -> None:  # fmt: skip
+    def __init__(self, model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor) -> None:
         begun = begun._replace(x_prev=begun.x_prev.contiguous(), y=begun.y.contiguous())
-        self.model, self.begun, self.prepared, self.prescribed = model, begun, prepared, prescribed
+        self.model, self.begun, self.prepared = model, begun, prepared
         self.x_prev = begun.x_prev
         # [B, Vc, 3] at the end and at the start of the step: one tensor if they rest
         self.before = before.contiguous()
@@ -116,109 +142,135 @@ class ContactStep:
         zero = force.new_zeros((1,))
         coefficient = self._parameter("friction.coefficient", zero)
         damping = self._parameter("pair_barrier.damping", zero)
-        self.lagged = listed
-        self.lag = torch.cat([of_pair(coefficient) * force, of_pair(damping) * active, rest], -1)
+        lag = torch.cat([of_pair(coefficient) * force, of_pair(damping) * active, rest], -1)
+        if self._reads(force):  # most of what is listed does not touch yet
+            rows = (lag[:, :2] != 0).any(-1).nonzero()[:, 0]
+            listed, lag = some_of(listed, rows, self._points), lag[rows]
+        self.lagged, self.lag = listed, lag
+
+    @staticmethod
+    def _reads(x: Tensor) -> bool:
+        """Whether values may decide sizes: on CUDA that would wait, compiled it would compile anew."""
+        return not x.is_cuda and not torch.compiler.is_compiling()
+
+    @property
+    def _points(self) -> int:
+        return self.x_prev.shape[1] + self.before.shape[1]
+
+    def _between(self, listed: Pairs) -> Pairs:
+        """The pairs between bodies, which alone have a say in rigid motions; all where that would have to be read."""
+        surface = self.surface
+        if surface is None or not self._reads(self.x_prev):
+            return listed
+        corners = listed.pairs[:, :4].long()
+        second = torch.where(listed.pairs[:, 4] == 1, corners[:, 2], corners[:, 1])
+        apart = surface.body[corners[:, 0]] != surface.body[second]
+        return some_of(listed, apart.nonzero()[:, 0], self._points)
 
     def run(self, policy: int, debug_step: int) -> Tensor:
         """Positions after all parts [B, V, 3]; raises where detection did not hold."""
-        begun, settings = self.begun, self.prepared.settings
+        settings = self.prepared.settings
         barrier, surface = self.barrier, self.surface
-        if barrier is None or surface is None:  # friction on a floor alone
-            x = begun.x_start
-            bounds = torch.cat([x, torch.full_like(x[..., :1], FREE)], -1)
-            none = no_pairs(x, x.shape[0] * x.shape[1])
-            return self._sweep(x, bounds, self.colliders, none, settings, policy, debug_step)[0]
+        if barrier is None or surface is None:
+            return self._run_on_floor(policy, debug_step)
         if checking():
             refuse_intersections(self.model, self.x_prev, self.origin, self.before)
-        x, way = self.x_prev, begun.y - self.x_prev
-        move = way
-        cut: list[Tensor] = []
-        found: list[Detection] = []
-        counts: list[Tensor] = []
+        pinned = self.model._pinned[:, None]
+        lift = torch.where(pinned, 0.0, broadcast(self.begun.lift, self.begun.y.shape))
+        x, way = self.x_prev, self.begun.y - self.x_prev - lift
+        left, met = way, Met()
         for r, sweeps in enumerate(sweeps_of_parts(settings.sweeps, self.parts)):
             was, now = (self._colliders_at(n / self.parts) for n in (r, r + 1))
-            goal = begun.y if r + 1 == self.parts else self.x_prev + ((r + 1) / self.parts) * way
-            detection = self._detect(x, was, now, move)
-            found.append(detection)
-            counts.append(torch.cat([detection.counts[:3], self._above(way, was, now, detection)]))
+            # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
+            move = left if self.parts == 1 else torch.where(pinned, way / self.parts, left)
+            fall = lift if r == 0 else torch.zeros_like(lift)
+            detection = self._detect(x, was, now, move, fall)
+            met.found.append(detection)
             if not x.is_cuda and not torch.compiler.is_compiling():  # reading is free: before any work
-                self._record(found, counts, cut)
-                self._check(r, counts[-1].tolist())
+                self._check(r, [*detection.counts[:3].tolist(), 0])
             if r == 0:
                 self._set_lag(detection.listed, was)
-            start = start_part(x, move, goal, self.fields.mass, was, now, self.floor_data, self.origin, detection,
-                               surface, barrier.gamma)  # fmt: skip
-            x, move = start.x, start.move
-            cut.append(start.outside)
+                fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
+                                          self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
+            start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
+                                         detection, surface)  # fmt: skip
+            met.counts.append(torch.cat([detection.counts[:3], start.stuck]))
+            if not x.is_cuda and not torch.compiler.is_compiling():
+                self._check(r, met.counts[-1].tolist())
+            between = self._between(detection.listed)
+            x, first = self._corrected(start.x, now, start, between)
+            taken, limits, cut = [first], None, start.short
             if sweeps:
                 part = settings._replace(sweeps=sweeps)
-                x, held_back = self._sweep(x, start.bounds, now, detection.listed, part, policy, debug_step)
-                cut.append(held_back)
-        return self._judged(x, found, counts, cut)
+                x, limits = self._sweep(x, start.center, start.room, now, detection.listed, part, policy, debug_step)
+                x, last = self._corrected(x, now, start, between)
+                taken.append(last)
+                cut = cut | (limits[:, -1] > 0)
+            met.cut = cut
+            for found in recorders():
+                found.append(detection._replace(shares=start.shares, corrections=torch.stack(taken), limits=limits))
+            left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
+        return self._judged(x, met)
+
+    def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
+        """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
+        x = self.begun.x_start
+        room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
+        start = PartStart(x, x.detach(), room, room > 0, none.ptr[:1].long(), x.new_ones((2, *room.shape)))
+        x, _ = self._corrected(x, self.colliders, start, none)
+        if self.prepared.settings.sweeps:
+            x, _ = self._sweep(x, start.center, room, self.colliders, none, self.prepared.settings, policy, debug_step)
+            x, _ = self._corrected(x, self.colliders, start, none)
+        return x
+
+    def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> tuple[Tensor, Tensor]:
+        """x after the rigid correction of all bodies that are free, and the share of its motion that each took."""
+        numbers = self.prepared.settings.numbers
+        scenes = Scenes(
+            self.model, self.x_prev, self.begun.y, self.fields.mass, self.begun.data, self.origin, self.before,
+            collider, self.kappa, listed, self.lagged, self.lag, self.floor_lag, start.center, start.room, self.surface,
+            numbers.time_step, numbers.friction_eps,
+        )  # fmt: skip
+        return correct(scenes, x)
 
     def _colliders_at(self, share: float) -> Tensor:
         if self.colliders is self.before:
             return self.before
         return self.before + share * (self.colliders - self.before)
 
-    def _sweep(self, x: Tensor, bounds: Tensor, collider: Tensor, listed: Pairs, settings: SweepSettings, policy: int,
-               debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
+    def _sweep(self, x: Tensor, center: Tensor, room: Tensor, collider: Tensor, listed: Pairs, settings: SweepSettings,
+               policy: int, debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
         lagged, model = self.lagged, self.model
         fields = self.fields._replace(
-            x_start=x, bounds=bounds, collider=collider, collider_prev=self.before, kappa=self.kappa,
+            x_start=x, center=center, room=room, collider=collider, collider_prev=self.before, kappa=self.kappa,
             **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs, lag_ptr=lagged.ptr, lag_entry=lagged.entry,
             floor_lag=self.floor_lag,
         )  # fmt: skip
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
-    def _detect(self, x: Tensor, was: Tensor, now: Tensor, remaining: Tensor) -> Detection:
+    def _detect(self, x: Tensor, was: Tensor, now: Tensor, move: Tensor, fall: Tensor) -> Detection:
         surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
         with torch.no_grad():
             x, was, now = x.detach(), was.detach(), now.detach()
+            island, room = rooms(surface, barrier, x, self.origin, self.fields.mass, was, now, move, fall,
+                                 self.any_direction)  # fmt: skip
             *index, corners, values, counts, smallest = search.detect(
-                x, self.origin, was, now, surface, barrier, self.capacity
-            )
-            island = search.islands(
-                x,
-                self.origin,
-                remaining.detach(),
-                self.fields.mass.detach(),
-                was,
-                now,
-                surface,
-                barrier.dhat,
-                self.any_direction,
+                x, self.origin, was, now, surface, barrier, self.capacity, room
             )
             lowest = island.new_empty((0,))
             if self.floor_data is not None:
                 lowest = search.lowest(x, self.origin, self.floor_data.detach(), island, surface)
-        detection = Detection(Pairs(*index), corners, values, counts, smallest, island, lowest)
-        for found in recorders():
-            found.append(detection)
-        return detection
+        return Detection(Pairs(*index), corners, values, counts, smallest, island, lowest, room)
 
-    def _above(self, way: Tensor, was: Tensor, now: Tensor, detection: Detection) -> Tensor:
-        """How many pinned vertices and collider points this part moves above their bound, int64 [1]."""
-        surface, barrier = self.surface, self.barrier
-        assert surface is not None and barrier is not None
-        if not self.prescribed and was is now:
-            return detection.counts[3:]  # a zero: nothing that is held moves
-        with torch.no_grad():
-            radius = (barrier.gamma * detection.near_values[..., 7]).clamp(0, surface.cap)
-            moves = torch.cat([way / self.parts, now - was], 1).square().sum(-1).sqrt()
-            above = (moves > radius) & surface.held & ~surface.plane_points
-            return above.sum().reshape(1)
+    def _record(self, met: Met) -> None:
+        smallest = torch.stack([d.smallest for d in met.found])
+        outcomes[self.model] = Outcome(torch.stack(met.counts), self.capacity, met.cut, smallest)
 
-    def _record(self, found: list[Detection], counts: list[Tensor], cut: list[Tensor]) -> None:
-        smallest = torch.stack([d.smallest for d in found])
-        outcomes[self.model] = Outcome(torch.stack(counts), self.capacity, cut, smallest)
-
-    def _judged(self, x: Tensor, found: list[Detection], counts: list[Tensor], cut: list[Tensor]) -> Tensor:
+    def _judged(self, x: Tensor, met: Met) -> Tensor:
         """x, or NaN where a captured or compiled step, which cannot raise, must not be trusted."""
-        self._record(found, counts, cut)
-        outcome = outcomes[self.model]
-        table, capacity = outcome.counts, outcome.capacity
+        self._record(met)
+        table, capacity = torch.stack(met.counts), self.capacity
         if torch.compiler.is_compiling() or (x.is_cuda and torch.cuda.is_current_stream_capturing()):
             good = (table[:, :2] <= torch.stack([table.new_full((), capacity), table.new_zeros(())])).all()
             good = good & (table[:, 3] == 0).all()
@@ -233,19 +285,22 @@ class ContactStep:
         """Pairs of all scenes that fit."""
         surface, barrier, scenes = self.surface, self.barrier, self.x_prev.shape[0]
         assert surface is not None and barrier is not None
+        if barrier.capacity is None and not self.x_prev.is_cuda and not torch.compiler.is_compiling():
+            return MOST_CAPACITY  # the list is as long as it must be
         return max(surface.capacity * scenes, 0 if barrier.capacity is not None else LEAST_CAPACITY)
 
     def _check(self, r: int, counts: list[int]) -> None:
         """Raises where a detection found more than fits, surfaces that touch, or motion above a bound."""
         surface = self.surface
         assert surface is not None
-        needed, touching, pair, above = counts
+        needed, touching, pair, hindered = counts
         scenes = self.x_prev.shape[0]
         if needed > self.capacity:
-            raise RuntimeError(
+            raise TooManyPairs(
+                -(-needed // scenes),
                 f"pair_barrier.capacity: {needed} pairs in part {r} of the step do not fit {self.capacity} "
                 f"({-(-self.capacity // scenes)} per scene): "
-                f"use diffvbd.contact.reserve(model, {2 * -(-needed // scenes)})"
+                f"use diffvbd.contact.reserve(model, {2 * -(-needed // scenes)})",
             )
         if touching:
             finite = all(
@@ -265,28 +320,34 @@ class ContactStep:
                 f"{named}: expected surfaces that do not touch, got {touching} pairs without a gap in part {r} of the "
                 f"step, one of the corner points {corners} in scene {scene}"
             )
-        if above:
+        if hindered:
             raise ValueError(
-                f"prescribed or colliders: expected motion below the bounds of contact, got {above} points moved "
-                f"farther in part {r} of {self.parts}: use a larger reach (now {surface.reach:g} m, which allows "
-                f"{surface.cap:g} m a part), more detections or a smaller time_step"
+                f"prescribed or colliders: expected motion that leaves bodies a way, got {hindered} pairs in part {r} "
+                f"of {self.parts} that it would bring too close: use more detections or a smaller time_step"
             )
 
 
 def no_pairs(like: Tensor, corners: int) -> Pairs:
     """An empty list for so many corner points of all scenes."""
     none = torch.zeros((corners + 1,), dtype=torch.int32, device=like.device)
-    return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, 3)), none, none[:0])
+    return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, CONSTANTS)), none, none[:0])
 
 
-def run_contact(model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor, prescribed: bool,
-                policy: int, debug_step: int) -> Tensor:  # fmt: skip
+def run_contact(model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor, policy: int,
+                debug_step: int) -> Tensor:  # fmt: skip
     """Positions after the sweeps of a step with contact.
 
     Args:
         before, colliders: Where the colliders are at its start and at its end, [B, Vc, 3] [m]; one tensor if they rest.
-        prescribed: Whether pinned vertices are moved.
     """
     if torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore[reportAttributeAccessIssue]
         no_transforms()
-    return ContactStep(model, begun, prepared, before, colliders, prescribed).run(policy, debug_step)
+    while True:
+        try:
+            return ContactStep(model, begun, prepared, before, colliders).run(policy, debug_step)
+        except TooManyPairs as error:
+            barrier, surface = model.contact, model.surface_of_contact
+            if barrier is None or surface is None or barrier.capacity is not None or 2 * error.needed > MOST_CAPACITY:
+                raise
+            # nobody has said how many there may be: again, with room for them
+            model.surface_of_contact = replace(surface, capacity=2 * error.needed)

@@ -40,10 +40,12 @@ class Begun(NamedTuple):
     y: Tensor  # the predictor
     data: Tensor  # [1 | B, n], of the energies
     origin: Tensor | None
+    lift: Tensor  # h^2 times the acceleration [m], [1 | B, 1 | V, 3]; y is x + h v and this
 
     def detached(self) -> Begun:
         origin = None if self.origin is None else self.origin.detach()
-        return Begun(self.x_start.detach(), self.x_prev.detach(), self.y.detach(), self.data.detach(), origin)
+        return Begun(self.x_start.detach(), self.x_prev.detach(), self.y.detach(), self.data.detach(), origin,
+                     self.lift.detach())  # fmt: skip
 
     def fields(self, model: Model, prepared: Prepared) -> ops.SweepFields:
         """What the sweeps read, without contact."""
@@ -107,4 +109,4 @@ def begin(
         model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
         start=model.starts_from, filters=model.floor is not None and model.contact is None,
     )  # fmt: skip
-    return Begun(x_start, start, y, data, origin)
+    return Begun(x_start, start, y, data, origin, (h * h) * acceleration)

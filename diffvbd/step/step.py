@@ -162,8 +162,7 @@ def swept(
     try:
         if colliders is not None:
             with out_of_memory_named(model, begun.x_start, settings, policy):
-                moves = given.get("prescribed") is not None
-                return run_contact(model, begun, prepared, *colliders, moves, policy, debug_step)
+                return run_contact(model, begun, prepared, *colliders, policy, debug_step)
         if checking() and begun.y.is_cuda:
             check_on_cpu(model, fields, settings, index)
         with out_of_memory_named(model, begun.x_start, settings, policy):

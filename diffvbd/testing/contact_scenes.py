@@ -22,6 +22,7 @@ from ..step.step import step
 from .scenes import generator
 
 GRAVITY = (0.3, -9.81, 0.2)
+NO_MOVE = 8  # the exponent of a limit of 0; twin of kNoMove in csrc/contact/limit.h
 
 
 @dataclass
@@ -156,8 +157,13 @@ def part_of(detection: Any) -> reference.Part:
     """Index data of a detection as the reference takes it."""
     count = int(detection.counts[0])
     lowest = detection.lowest.cpu().long() if detection.lowest.numel() else None
+    limits = None
+    if detection.limits is not None:
+        exponents = detection.limits.cpu().double().movedim(1, 0)
+        limits = torch.where(exponents < NO_MOVE, 0.5**exponents, 0.0)
     return reference.Part(detection.listed.pairs[:count].cpu().long(), detection.listed.constants[:count].cpu(),
-                          detection.near_corners.cpu().long(), detection.island.cpu().long(), lowest)  # fmt: skip
+                          detection.island.cpu().long(), detection.shares.cpu(), detection.corrections.cpu(), limits,
+                          lowest)  # fmt: skip
 
 
 def split(leaves: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

@@ -132,27 +132,6 @@ def test_edges_that_cross_do_not_pass(speed: float, detections: int) -> None:
 # --- what bounds cut, and what is reported of it ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("speed", (0.0, 0.5, 20.0))
-def test_no_vertex_leaves_its_ball(device: str, speed: float) -> None:
-    """|x'_i - x_i - u| <= gamma gap_i, u being the mean of where the vertices of its island want to go; K = 3."""
-    model, v = thrown_together(1, detections=1)
-    model, h = model.to(device), 1 / 60
-    x, v = model.rest_points, speed * v.to(device)
-    for _ in range(6):
-        with dv.contact.record() as found:
-            end, after = dv.step(model, x, v, time_step=h, sweeps=3, **MATERIAL)
-        wanted = h * v + torch.tensor([0.0, -GRAVITY * h * h, 0.0], dtype=torch.float64, device=device)
-        label = found[0].island[0].long()[model.body]
-        assert (label >= 0).all()
-        mass, u = model.mass[:, None], torch.zeros_like(x)
-        for island in label.unique():
-            own = label == island
-            u[own] = (mass * wanted)[own].sum(0) / mass[own].sum()
-        allowed = (0.45 * found[0].near_values[0, : len(x), 7]).clamp(max=model.contact_numbers[1])
-        assert ((end - x - u).norm(dim=-1) <= allowed + tolerance("formula")).all()
-        x, v = end, after
-
-
 @pytest.mark.parametrize("detections", (1, 2, 4))
 def test_cut_vertices_are_reported(device: str, detections: int) -> None:
     """By no sweep the step is the predictor, except where a bound has cut: as many vertices as status says. Per scene:

@@ -78,9 +78,7 @@ class Scene:
     self_contact: bool = True
     between_bodies: bool = True
     dhat: float = 0.03
-    reach: float = 0.15
-    cap: float = 0.05
-    gamma: float = 0.45
+    room: float = 0.05  # how far vertices of the first body may go; of the last half as far
     origin: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
     @staticmethod
@@ -113,6 +111,16 @@ class Scene:
             **options,
         )
 
+    @property
+    def rooms(self) -> np.ndarray:
+        """Of each body [mesh_bodies]."""
+        return self.room * np.linspace(1, 0.5, self.mesh_bodies)
+
+    @property
+    def reach(self) -> float:
+        """Gap up to which pairs are looked for."""
+        return self.dhat + 2 * self.room
+
     def alone(self, b: int) -> Scene:
         """Scene b of the batch."""
         one = {n: getattr(self, n)[[b]] for n in ("x", "collider", "collider_next")}
@@ -126,11 +134,12 @@ class Scene:
             return torch.as_tensor(a, device=device)
 
         x = self.x - self.origin if self.origin.size else self.x
+        room = np.tile([*self.rooms, self.room], (len(x), 1))
         return (
             real(x), real(self.origin), real(self.collider), real(self.collider_next), real(self.rest),
             real(self.radius), index(self.triangles), index(self.edges), index(self.points), index(self.planes),
-            index(self.body), index(self.held), self.mesh_bodies, self.self_contact, self.between_bodies, self.dhat,
-            self.reach, self.cap, self.gamma, capacity,
+            index(self.body), index(self.held), real(room), self.mesh_bodies, self.self_contact, self.between_bodies,
+            self.dhat, capacity,
         )  # fmt: skip
 
 
@@ -257,8 +266,7 @@ def all_pairs(s: Scene, b: int) -> Pairs:
     kind, corners, gap, weights, constants, key = (np.concatenate(a) for a in zip(*found, strict=True))
     near = np.full(len(s.body), s.reach)
     np.minimum.at(near, corners, gap[:, None])
-    bound = np.minimum(s.gamma * np.maximum(near, 0), s.cap)[corners]
-    first = np.where(kind[:, None] == EDGE_EDGE, np.arange(4) < 2, np.arange(4) < 1)
-    second = ~first & (kind[:, None] != POINT_PLANE)
-    margin = constants[:, 0] - (gap - np.where(first, bound, 0).max(1) - np.where(second, bound, 0).max(1))
+    room = np.where(s.body < s.mesh_bodies, np.append(s.rooms, 0)[np.minimum(s.body, s.mesh_bodies)], 0.0)
+    second = corners[np.arange(len(kind)), np.where(kind == EDGE_EDGE, 2, 1)]
+    margin = constants[:, 0] - (gap - room[corners[:, 0]] - room[second])
     return Pairs(kind, corners, gap, weights, constants, key, margin, near)

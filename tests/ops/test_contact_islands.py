@@ -13,8 +13,8 @@ import diffvbd as dv
 from diffvbd.ops import detect as ops_contact
 from diffvbd.testing import generator, tolerance
 
-CAP, DHAT = 0.01, 0.02
-MARGIN = CAP + DHAT / 2
+ROOM, DHAT = 0.01, 0.02
+MARGIN = ROOM + DHAT / 2
 CUBE = dv.mesh.cube(2, 1.0)
 
 
@@ -28,7 +28,8 @@ def arguments(
     ptr = np.searchsorted(s.body[order], np.arange(s.mesh_bodies + 1)).astype(np.int32)
     real = [torch.as_tensor(np.array(a), dtype=dtype, device=device) for a in (move, mass)]
     index = [torch.as_tensor(a, device=device) for a in (order, ptr)]
-    return (x, origin, *real, collider, following, planes, body, *index, held, radius, s.mesh_bodies, CAP, DHAT)
+    room = torch.full((len(x), s.mesh_bodies + 1), ROOM, dtype=dtype, device=device)
+    return (x, origin, *real, collider, following, planes, body, *index, held, radius, room, s.mesh_bodies, DHAT)
 
 
 def islands(s: Scene, move: Any, device: str = "cpu", dtype: torch.dtype = torch.float64) -> list[list[int]]:
@@ -221,7 +222,7 @@ def test_opcheck_and_bad_input(device: str) -> None:
     torch.library.opcheck(torch.ops.diffvbd.contact_islands.default, (*good, False))
     order, ptr = good[8], good[9]
     torch.library.opcheck(torch.ops.diffvbd.segment_sum.default, (good[0], order, ptr))
-    for place in (0, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11):
+    for place in (0, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12):
         for bad in (good[place][None], good[place].to(torch.int64)):
             with pytest.raises(ValueError, match="expected"):
                 ops_contact.contact_islands(*good[:place], bad, *good[place + 1 :])

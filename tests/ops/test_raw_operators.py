@@ -21,7 +21,13 @@ NAMES = {
     "contact": ("sweep", "begin", *CONTACT),
 }
 CASES = [(scene, name + end) for scene, names in NAMES.items() for name in names for end in ("", "_backward")]
-CASES += [("contact", "contact_lowest"), ("floor", "pack_rest"), ("floor", "star_sum"), ("floor", "tet_gather")]
+CASES += [
+    ("contact", "contact_lowest"),
+    ("contact", "contact_advance"),
+    ("floor", "pack_rest"),
+    ("floor", "star_sum"),
+    ("floor", "tet_gather"),
+]
 # what an operator takes and does not read, or of which it needs a part
 UNREAD = {
     "sweep_backward": {"x_start"},

@@ -24,6 +24,7 @@ from torch.utils.checkpoint import checkpoint
 
 import diffvbd as dv
 from diffvbd import ops
+from diffvbd.contact.detection import detect
 from diffvbd.model.rest import shape_gradients
 from diffvbd.step.coarse import coarse_parts
 from diffvbd.testing import relative_error, tolerance
@@ -204,7 +205,7 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
                             model._energy_data)  # fmt: skip
     fields = ops.as_list(given, x)
     sweep = (*fields, model._plan, *settings, policy, -1, True)
-    x, tape, _, corrections = torch.ops.diffvbd.sweep(*sweep)
+    x, tape, cut, corrections = torch.ops.diffvbd.sweep(*sweep)
     tets, star_ptr, star = model._topology
     points = model.rest_points[None].contiguous()
     corners = torch.ops.diffvbd.tet_gather(points, tets)
@@ -216,11 +217,36 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
         "row_sum": (inputs["x"],),
     }
     if policy != ops.NO_TAPE:
-        bars = (torch.ones_like(x), x, tape, corrections)
+        bars = (torch.ones_like(x), x, tape, corrections, cut)
         arguments["sweep_backward"] = (*fields, *bars, model._plan, *settings, policy, [True] * 5)
-        arguments |= coarse_arguments(device)
+        arguments |= coarse_arguments(device) | start_arguments(device)
         arguments |= anderson_arguments() if device == "cpu" else {}
     return arguments | (fused_arguments(policy) if device == "cuda" else {})
+
+
+def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
+    """The same of the start of a part of a step with contact: two boxes that go through each other."""
+    boxes = [dv.mesh.box(2, 0.2), dv.mesh.box(2, 0.2).translate((0.02, 0.208, 0.03))]
+    model = dv.Model(dv.mesh.join(boxes), energies=(dv.PairBarrier(dhat=0.02),), device=device)
+    surface, barrier = model.surface_of_contact, model.contact
+    assert surface is not None and barrier is not None
+    x, none = model.rest_points[None].contiguous(), model.rest_points.new_empty((0,))
+    points = x.new_empty((1, 0, 3))
+    room = torch.full((1, surface.bodies + 1), 0.1, dtype=x.dtype, device=device)
+    listed = detect(x, none, points, points, surface, barrier, 2000, room)[:4]
+    move, u = torch.zeros_like(x), x.new_zeros((1, surface.bodies, 3))
+    move[0, 8:, 1] = -0.05
+    held, body, planes = surface.held, surface.body, x.new_tensor([[0.0, 1.0, 0.0, 0.19, 1e3, 0.02, 0.0]])
+    start = (x, move, u, planes, none, held, body, 0.9)
+    own_room = torch.full_like(x[..., 0], 0.1)
+    advance = (x, move, u, x, none, points, points, held, body, own_room, *listed, True)
+    share, _ = torch.ops.diffvbd.contact_advance(*advance)
+    assert 0 < share[0, 8:].min() < 1 and (share[0, :8] == 1).all()
+    return {
+        "contact_start": start,
+        "contact_start_backward": (move, *start, True),
+        "contact_advance": advance,
+    }
 
 
 def coarse_arguments(device: str) -> dict[str, tuple[Any, ...]]:

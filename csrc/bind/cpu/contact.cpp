@@ -22,14 +22,14 @@ Tensor integers(const std::vector<int64_t>& sizes) { return torch::stable::empty
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_detect(
     const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& collider_next, const Tensor& rest,
     const Tensor& radius, const Tensor& triangles, const Tensor& edges, const Tensor& points, const Tensor& planes,
-    const Tensor& body, const Tensor& held, int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat,
-    double reach, double cap, double gamma, int64_t capacity, bool trim) {
+    const Tensor& body, const Tensor& held, const Tensor& room, int64_t mesh_bodies, bool self_contact,
+    bool between_bodies, double dhat, int64_t capacity, bool trim) {
   diffvbd::require_capacity(capacity);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in =
-        diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes,
-                                body, held, mesh_bodies, self_contact, between_bodies, dhat, reach, cap, gamma);
+    auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points,
+                                      planes, body, held, mesh_bodies, self_contact, between_bodies);
+    diffvbd::set_reach(in, x, room, dhat);
     const int64_t b = in.scenes, n = in.corners;
     Tensor near_corners = integers({b, n, diffvbd::contact::kNearRow}), ptr = integers({b * n + 1});
     Tensor near_values = empty(x, {b, n, diffvbd::contact::kNearValues}), smallest = empty(x, {b});
@@ -59,7 +59,7 @@ std::tuple<Tensor, Tensor, Tensor> contact_intersections(const Tensor& x, const 
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider, rest, radius, triangles, edges, points,
-                                            planes, body, held, mesh_bodies, self_contact, between_bodies, 0, 0, 0, 0);
+                                            planes, body, held, mesh_bodies, self_contact, between_bodies);
     Tensor pairs = integers({capacity, diffvbd::contact::kCrossingRow}), first = integers({in.scenes, 2, 2});
     Tensor counts = torch::stable::empty({in.scenes, 2}, ScalarType::Long);
     diffvbd::find_intersections<T>(in, {capacity, data<int32_t>(pairs), data<int64_t>(counts), data<int32_t>(first)});
@@ -70,11 +70,11 @@ std::tuple<Tensor, Tensor, Tensor> contact_intersections(const Tensor& x, const 
 Tensor contact_islands(const Tensor& x, const Tensor& origin, const Tensor& move, const Tensor& mass,
                        const Tensor& collider, const Tensor& collider_next, const Tensor& planes, const Tensor& body,
                        const Tensor& body_order, const Tensor& body_ptr, const Tensor& held, const Tensor& radius,
-                       int64_t mesh_bodies, double cap, double dhat, bool any_direction) {
+                       const Tensor& room, int64_t mesh_bodies, double dhat, bool any_direction) {
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::island_inputs<T>(x, origin, move, mass, collider, collider_next, planes, body, body_order,
-                                              body_ptr, held, radius, mesh_bodies, cap, dhat, any_direction);
+                                              body_ptr, held, radius, room, mesh_bodies, dhat, any_direction);
     Tensor island = integers({in.scenes, in.mesh_bodies});
     diffvbd::find_islands<T>(in, data<int32_t>(island));
     return island;

@@ -3,6 +3,7 @@
 
 #include <torch/csrc/stable/library.h>
 
+#include <cstring>
 #include <tuple>
 #include <vector>
 
@@ -58,7 +59,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const
     if (checked) diffvbd::check_values(plan, in);
     Tensor x = empty(f.x_start, {in.scenes, plan.num_vertices, 3}),
            tape = empty(f.x_start, diffvbd::tape_shape(plan, in));
-    Tensor cut = torch::stable::empty({in.contact ? in.scenes : 0, plan.num_vertices}, ScalarType::Byte);
+    const Tensor cut = torch::stable::empty(diffvbd::cut_shape(in, plan.num_vertices), ScalarType::Byte);
+    if (cut.numel() > 0) std::memset(cut.data_ptr(), 0, cut.numel());
     Tensor corrections = empty(f.x_start, corrections_shape(given.coarse, in));
     given.coarse.tape = data<T>(corrections);
     diffvbd::run_forward<T>(plan, in, data<T>(x), data<T>(tape), data<uint8_t>(cut));
@@ -107,10 +109,11 @@ struct ContactSlots {
 };
 
 diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_bar, const Tensor& x,
-                                      const Tensor& tape, const Tensor& corrections, const Tensor& plan_buffer,
-                                      std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
-                                      std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
-                                      std::vector<int64_t> coarse, int64_t tape_policy, std::vector<bool> wants) {
+                                      const Tensor& tape, const Tensor& corrections, const Tensor& cut,
+                                      const Tensor& plan_buffer, std::vector<int64_t> sizes, int64_t energies,
+                                      std::vector<int64_t> data_count, std::vector<double> numbers, int64_t sweeps,
+                                      std::vector<int64_t> launch, std::vector<int64_t> coarse, int64_t tape_policy,
+                                      std::vector<bool> wants) {
   const diffvbd::Plan plan = plan_of(plan_buffer, sizes);
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, coarse, tape_policy};
@@ -121,6 +124,7 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     Given<T> given(plan, f, x, q, -1);
     const auto& in = given.in;
     diffvbd::check_tape(tape, x, plan, in);
+    const uint8_t* limits = diffvbd::limits_of(cut, x, in, plan.num_vertices);
     const auto make = [&](const std::vector<int64_t>& shape, bool zeroed) {
       return zeroed ? zeros(x, shape) : empty(x, shape);
     };
@@ -133,15 +137,15 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     given.coarse.tape = data<T>(corrections);
     given.coarse.matrix_bar = bars.coarse_factor.numel() > 0 ? data<T>(bars.coarse_factor) : nullptr;
     if (!in.contact) {
-      diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), out);
+      diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), limits, out);
       return bars.tensors();
     }
     const ContactSlots<T> slots(given.pairs, in.scenes);
     make_contact_bars(bars, given.pairs, in.scenes, plan.num_vertices, f.lag_pairs.numel() / contact::kPairRow, make);
     const auto pointers = slots.pointers(data<T>(bars.floor_lag));
     out.contact = &pointers;
-    out.bounds = data<T>(bars.bounds), out.collider = data<T>(bars.collider);
-    diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), out);
+    out.collider = data<T>(bars.collider);
+    diffvbd::run_reverse<T>(plan, in, data<const T>(x), data<const T>(x_bar), data<const T>(tape), limits, out);
     slots.sum(bars);
     return bars.tensors();
   });

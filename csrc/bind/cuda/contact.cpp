@@ -22,15 +22,15 @@ using torch::stable::accelerator::DeviceGuard;
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_detect(
     const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& collider_next, const Tensor& rest,
     const Tensor& radius, const Tensor& triangles, const Tensor& edges, const Tensor& points, const Tensor& planes,
-    const Tensor& body, const Tensor& held, int64_t mesh_bodies, bool self_contact, bool between_bodies, double dhat,
-    double reach, double cap, double gamma, int64_t capacity, bool /* trim: to know the number of pairs would wait */) {
+    const Tensor& body, const Tensor& held, const Tensor& room, int64_t mesh_bodies, bool self_contact,
+    bool between_bodies, double dhat, int64_t capacity, bool /* trim: to know the number of pairs would wait */) {
   const DeviceGuard guard(x.get_device_index());
   diffvbd::require_capacity(capacity);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in =
-        diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes,
-                                body, held, mesh_bodies, self_contact, between_bodies, dhat, reach, cap, gamma);
+    auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points,
+                                      planes, body, held, mesh_bodies, self_contact, between_bodies);
+    diffvbd::set_reach(in, x, room, dhat);
     const int64_t b = in.scenes, n = in.corners;
     Tensor pairs = empty(x, {capacity, contact::kPairRow}, ScalarType::Int);
     Tensor constants = empty(x, {capacity, contact::kConstants});
@@ -60,7 +60,7 @@ std::tuple<Tensor, Tensor, Tensor> contact_intersections(const Tensor& x, const 
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider, rest, radius, triangles, edges, points,
-                                            planes, body, held, mesh_bodies, self_contact, between_bodies, 0, 0, 0, 0);
+                                            planes, body, held, mesh_bodies, self_contact, between_bodies);
     Tensor pairs = empty(x, {capacity, contact::kCrossingRow}, ScalarType::Int);
     Tensor first = empty(x, {in.scenes, 2, 2}, ScalarType::Int), counts = empty(x, {in.scenes, 2}, ScalarType::Long);
     const auto bytes = static_cast<int64_t>(cuda::intersections_workspace_bytes<T>(in, capacity));
@@ -75,12 +75,12 @@ std::tuple<Tensor, Tensor, Tensor> contact_intersections(const Tensor& x, const 
 Tensor contact_islands(const Tensor& x, const Tensor& origin, const Tensor& move, const Tensor& mass,
                        const Tensor& collider, const Tensor& collider_next, const Tensor& planes, const Tensor& body,
                        const Tensor& body_order, const Tensor& body_ptr, const Tensor& held, const Tensor& radius,
-                       int64_t mesh_bodies, double cap, double dhat, bool any_direction) {
+                       const Tensor& room, int64_t mesh_bodies, double dhat, bool any_direction) {
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::island_inputs<T>(x, origin, move, mass, collider, collider_next, planes, body, body_order,
-                                              body_ptr, held, radius, mesh_bodies, cap, dhat, any_direction);
+                                              body_ptr, held, radius, room, mesh_bodies, dhat, any_direction);
     Tensor island = empty(x, {in.scenes, in.mesh_bodies}, ScalarType::Int);
     const auto bytes = static_cast<int64_t>(cuda::islands_workspace_bytes<T>(in));
     const Tensor work = empty(x, {bytes}, ScalarType::Byte);

@@ -7,6 +7,7 @@
 #include <tuple>
 #include <vector>
 
+#include "../../cuda/advance.h"
 #include "../../cuda/start.h"
 #include "binding.h"
 
@@ -15,7 +16,7 @@ namespace {
 namespace contact = diffvbd::contact;
 namespace cuda = diffvbd::cuda;
 using cuda::check, cuda::current_stream, cuda::empty, cuda::zeros;
-using diffvbd::data, diffvbd::dispatch_float, diffvbd::StartTensors, diffvbd::TranslationTensors;
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::TranslationTensors;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
@@ -56,59 +57,65 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_translation_backward(
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor> contact_start(const Tensor& x, const Tensor& move, const Tensor& goal,
-                                                         const Tensor& u, const Tensor& near, const Tensor& origin,
-                                                         const Tensor& planes, const Tensor& held, const Tensor& body,
-                                                         double gamma, double cap, double filter_eta) {
+Tensor contact_start(const Tensor& x, const Tensor& move, const Tensor& u, const Tensor& planes, const Tensor& origin,
+                     const Tensor& held, const Tensor& body, double filter_eta) {
   const DeviceGuard guard(x.get_device_index());
-  const StartTensors given{x, move, goal, u, near, origin, planes, held, body};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::start_inputs<T>(given, gamma, cap, filter_eta);
-    const int64_t b = in.scenes, v = in.vertices;
-    Tensor bounds = empty(x, {b, v, 4}), start = empty(x, {b, v, 3}), left = empty(x, {b, v, 3});
-    Tensor outside = empty(x, {b, v}, ScalarType::Byte);
-    check(
-        cuda::start<T>(in, {data<T>(bounds), data<T>(start), data<T>(left), data<uint8_t>(outside)}, current_stream(x)),
-        "the start of a part");
-    return std::make_tuple(bounds, start, left, outside);
+    const auto in = diffvbd::start_inputs<T>({x, move, u, planes, origin, held, body}, filter_eta);
+    Tensor target = empty(x, {in.scenes, in.vertices, 3});
+    check(cuda::start<T>(in, data<T>(target), current_stream(x)), "the start of a part");
+    return target;
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_start_backward(
-    const Tensor& bounds_bar, const Tensor& start_bar, const Tensor& left_bar, const Tensor& x, const Tensor& move,
-    const Tensor& goal, const Tensor& u, const Tensor& near, const Tensor& origin, const Tensor& planes,
-    const Tensor& held, const Tensor& body, double gamma, double cap, double filter_eta, bool wants_planes) {
+std::tuple<Tensor, Tensor, Tensor, Tensor> contact_start_backward(const Tensor& bar, const Tensor& x,
+                                                                  const Tensor& move, const Tensor& u,
+                                                                  const Tensor& planes, const Tensor& origin,
+                                                                  const Tensor& held, const Tensor& body,
+                                                                  double filter_eta, bool wants_planes) {
   const DeviceGuard guard(x.get_device_index());
-  const StartTensors given{x, move, goal, u, near, origin, planes, held, body};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::start_inputs<T>(given, gamma, cap, filter_eta);
+    const auto in = diffvbd::start_inputs<T>({x, move, u, planes, origin, held, body}, filter_eta);
+    diffvbd::require_like("bar", bar, x, x.numel());
     const int64_t b = in.scenes, v = in.vertices;
-    diffvbd::require_like("bounds_bar", bounds_bar, x, 4 * b * v);
-    diffvbd::require_like("start_bar", start_bar, x, x.numel());
-    diffvbd::require_like("move_bar", left_bar, x, x.numel());
-    const std::vector<int64_t> vectors{b, v, 3};
-    Tensor x_bar = empty(x, vectors), move_bar = empty(x, vectors), goal_bar = empty(x, vectors);
-    Tensor u_bar = empty(x, vectors), gap_bar = empty(x, {b, v});
+    Tensor x_bar = empty(x, {b, v, 3}), move_bar = empty(x, {b, v, 3}), u_bar = empty(x, {b, v, 3});
     Tensor planes_bar = empty(x, {b, v, wants_planes ? int64_t{in.floor_scalars} : 0});
-    const contact::StartAdjoints<T> a{data<const T>(bounds_bar),
-                                      data<const T>(start_bar),
-                                      data<const T>(left_bar),
-                                      data<T>(x_bar),
-                                      data<T>(move_bar),
-                                      data<T>(goal_bar),
-                                      data<T>(u_bar),
-                                      data<T>(gap_bar),
+    const contact::StartAdjoints<T> a{data<const T>(bar), data<T>(x_bar), data<T>(move_bar), data<T>(u_bar),
                                       planes_bar.numel() ? data<T>(planes_bar) : nullptr};
     check(cuda::start_backward<T>(in, a, current_stream(x)), "the start of a part");
-    return std::make_tuple(x_bar, move_bar, goal_bar, u_bar, gap_bar, planes_bar);
+    return std::make_tuple(x_bar, move_bar, u_bar, planes_bar);
+  });
+}
+
+std::tuple<Tensor, Tensor> contact_advance(const Tensor& x, const Tensor& move, const Tensor& u, const Tensor& center,
+                                           const Tensor& origin, const Tensor& collider, const Tensor& collider_next,
+                                           const Tensor& held, const Tensor& body, const Tensor& room,
+                                           const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
+                                           const Tensor& entry, bool careful) {
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    auto in = diffvbd::advance_inputs<T>(
+        {x, move, u, center, origin, collider, collider_next, held, body, room, pairs, constants, ptr, entry});
+    in.careful = careful;
+    Tensor share = empty(x, {in.scenes, in.vertices}), stuck = empty(x, {1}, ScalarType::Long);
+    const Tensor work = empty(x, {cuda::advance_workspace_bytes<T>(in)}, ScalarType::Byte);
+    int multiprocessors = 0;
+    check(cudaDeviceGetAttribute(&multiprocessors, cudaDevAttrMultiProcessorCount, x.get_device_index()),
+          "a device query");
+    check(cuda::advance<T>(in, pairs.size(0), data<T>(share), data<int64_t>(stuck), work.data_ptr(), multiprocessors,
+                           current_stream(x)),
+          "the start of a part");
+    return std::make_tuple(share, stuck);
   });
 }
 
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
+  m.impl("contact_advance", TORCH_BOX(&contact_advance));
   m.impl("contact_translation", TORCH_BOX(&contact_translation));
   m.impl("contact_translation_backward", TORCH_BOX(&contact_translation_backward));
   m.impl("contact_start", TORCH_BOX(&contact_start));

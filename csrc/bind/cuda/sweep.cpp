@@ -89,7 +89,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const
     const int64_t v = host.plan.num_vertices;
     const cudaStream_t stream = current_stream(from);
     Tensor x = empty(from, {in.scenes, v, 3}), tape = empty(from, cuda::tape_shape(host, in, launch));
-    Tensor cut = empty(from, {in.contact ? in.scenes : 0, v}, ScalarType::Byte);
+    const Tensor cut = empty(from, diffvbd::cut_shape(in, v), ScalarType::Byte);
     if (cut.numel()) check(cudaMemsetAsync(cut.data_ptr(), 0, cut.numel(), stream), "memset");
     const Tensor corrections = empty(from, corrections_shape(given));
     given.coarse.tape = data<T>(corrections);
@@ -117,10 +117,11 @@ struct ContactSlots {
 };
 
 diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_bar, const Tensor& x,
-                                      const Tensor& tape, const Tensor& corrections, const Tensor& plan,
-                                      std::vector<int64_t> sizes, int64_t energies, std::vector<int64_t> data_count,
-                                      std::vector<double> numbers, int64_t sweeps, std::vector<int64_t> launch,
-                                      std::vector<int64_t> coarse, int64_t tape_policy, std::vector<bool> wants) {
+                                      const Tensor& tape, const Tensor& corrections, const Tensor& cut,
+                                      const Tensor& plan, std::vector<int64_t> sizes, int64_t energies,
+                                      std::vector<int64_t> data_count, std::vector<double> numbers, int64_t sweeps,
+                                      std::vector<int64_t> launch, std::vector<int64_t> coarse, int64_t tape_policy,
+                                      std::vector<bool> wants) {
   const SweepFields f{DIFFVBD_ITEMS(SWEEP)};
   const SweepSettings q{sizes, energies, data_count, numbers, sweeps, launch, coarse, tape_policy};
   const DeviceGuard guard(x.get_device_index());
@@ -144,6 +145,7 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     cuda::StepAdjoints<T> out{};
     diffvbd::set_bars(out, bars, in);
     out.x_bar = data<const T>(x_bar);
+    out.limits = diffvbd::limits_of(cut, x, in, v);
     given.coarse.tape = data<T>(corrections);
     given.coarse.matrix_bar = bars.coarse_factor.numel() > 0 ? data<T>(bars.coarse_factor) : nullptr;
     const cudaStream_t stream = current_stream(x);
@@ -162,7 +164,7 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     diffvbd::make_contact_bars(bars, given.pairs, in.scenes, v, lagged, make);
     const auto pointers = slots.pointers(bars.floor_lag);
     out.contact = &pointers;
-    out.bounds = data<T>(bars.bounds), out.collider = data<T>(bars.collider);
+    out.collider = data<T>(bars.collider);
     out.collider_prev = data<T>(bars.collider_prev), out.kappa = data<T>(bars.kappa);
     run();
     check(cuda::sum_lag<T>(pointers, lagged, data<T>(bars.lag), stream), "the reverse sweep");

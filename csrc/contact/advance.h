@@ -1,0 +1,172 @@
+// How much of its way each vertex may go at the start of the sweeps, where all move at once: all of it wherever the
+// pairs that it is in stay apart, else a half, a quarter, ... of what is left, and so on from there. The shares are
+// decided, not differentiated (docs/method.md, section 12).
+#pragma once
+
+#include "passes.h"
+
+namespace diffvbd::contact {
+
+constexpr int kMoves = 3;     // one after another, each of what the ones before have left
+constexpr int kRounds = 16;   // of halving in each
+constexpr int kPatience = 8;  // rounds from which on what fails does not move
+constexpr double kLeastTry = 1.0 / 64;
+
+template <class T>
+struct AdvanceInputs {
+  const T *x, *move;                  // [B, V, 3]  at the detection; where each vertex wants to go from there
+  const T* u;                         // [B, bodies, 3]  translation of each body's island
+  const T* center;                    // [B, V, 3]  from where a vertex has its room, less u
+  const T* origin;                    // [B, V, 3] or null
+  const T *collider, *collider_next;  // [B, Vc, 3]
+  const bool* held;                   // [N]
+  const int32_t* body;                // [N]
+  PairList listed;
+  const T* constants;
+  const T* room;  // [B, V]
+  int64_t scenes;
+  int32_t vertices, corners, bodies;
+  bool careful;  // the motion does not minimise the barrier
+};
+
+// What changes while it is worked out.
+template <class T>
+struct AdvanceState {
+  T *share, *now;            // [B, V]  of the whole way after the moves so far; of what is left, tried in this one
+  uint8_t *blocked, *stamp;  // [B, V]  some pair does not let it pass; the round in which it last tried less
+  uint8_t* failed;           // [B]  a scene in which some pair has found no way
+  bool first;                // the move in which colliders and prescribed vertices go
+};
+
+// Written by whoever finds it: all write the same.
+DIFFVBD_FN void mark(uint8_t* flag) {
+#if defined(__CUDA_ARCH__)
+  *flag = 1;
+#else
+  __atomic_store_n(flag, uint8_t{1}, __ATOMIC_RELAXED);
+#endif
+}
+
+template <class T>
+DIFFVBD_FN Vec3<T> way_of(const AdvanceInputs<T>& in, int64_t scene, int32_t v) {
+  const Vec3<T> way = vector_at(in.move + 3 * (scene * in.vertices + v));
+  return in.held[v] ? way : way - vector_at(in.u + 3 * (scene * in.bodies + in.body[v]));
+}
+
+// The corners of a pair as they are, and the ways that they try.
+template <class T>
+struct Attempt {
+  Corners<T> corners;
+  Vec3<T> way[4];
+  bool free[4];
+  T guard;
+};
+
+template <class T>
+DIFFVBD_FN Attempt<T> attempt(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair) {
+  Attempt<T> out;
+  Vec3<T> at[4], from[4];
+  T size = T(0);
+  for (int k = 0; k < 4; ++k) {
+    const int32_t v = pair[k];
+    const int64_t scene = pair[5];
+    if (v >= in.vertices) {
+      const int64_t row = 3 * (scene * (in.corners - in.vertices) + v - in.vertices);
+      const Vec3<T> was = vector_at(in.collider + row), next = vector_at(in.collider_next + row);
+      const bool still = pair[4] == kPointPlane || !s.first;  // planes were looked for where they end
+      at[k] = still ? next : was, from[k] = zero3<T>();
+      out.way[k] = still ? zero3<T>() : next - was;
+      out.free[k] = false;
+    } else {
+      const int64_t row = scene * in.vertices + v;
+      const Vec3<T> whole = way_of(in, scene, v);
+      const T done = in.held[v] ? T(s.first ? 0 : 1) : s.share[row];
+      at[k] = vector_at(in.x + 3 * row) + done * whole;
+      from[k] = in.origin ? vector_at(in.origin + 3 * row) : zero3<T>();
+      out.way[k] = ((T(1) - done) * (in.held[v] ? T(1) : s.now[row])) * whole;
+      out.free[k] = !in.held[v];
+    }
+    const Vec3<T> p = at[k] + from[k];
+    const T own = absolute(p.x) + absolute(p.y) + absolute(p.z);
+    size = size < own ? own : size;
+  }
+  for (int k = 0; k < 4; ++k) out.corners.x[k] = k == 0 ? zero3<T>() : (at[k] - at[0]) + (from[k] - from[0]);
+  out.guard = T(kGuardUlps) * std::numeric_limits<T>::epsilon() * size;
+  return out;
+}
+
+// Marks the corners that keep a pair from being safe; returns whether it is. Round 0 looks at all pairs, later ones at
+// those of which a corner has tried less in the round before.
+template <class T>
+DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair, int round) {
+  const int32_t* record = in.listed.pairs + kPairRow * pair;
+  const auto retried = [&](int k) {
+    return record[k] < in.vertices && s.stamp[int64_t{record[5]} * in.vertices + record[k]] == round;
+  };
+  if (round > 0 && !(retried(0) || retried(1) || retried(2) || retried(3))) return true;
+  const T* constants = in.constants + kConstants * pair;
+  const Attempt<T> a = attempt(in, s, record);
+  const int first = sides(record[4]);
+  bool moves[2] = {false, false};
+  T most[2] = {T(0), T(0)};
+  for (int k = 0; k < 4; ++k) {
+    const T size = dot(a.way[k], a.way[k]);
+    const int side = k < first ? 0 : 1;
+    moves[side] = moves[side] || T(0) < size;
+    most[side] = most[side] < size ? size : most[side];
+  }
+  if (!moves[0] && !moves[1]) return true;
+  const Gate<T> gate(record[4], a.corners, constants, a.guard);
+  const T each = moves[0] && moves[1] ? T(kBothShare) : T(kShare), shares[4] = {each, each, each, each};
+  if (gate.holds(a.way, shares, in.careful) || stays_apart(gate, a.way, in.careful)) return true;
+  bool named = false;
+  for (int pass = 0; pass < 2 && !named; ++pass) {
+    for (int k = 0; k < 4; ++k) {
+      if (!a.free[k] || !(T(0) < dot(a.way[k], a.way[k]))) continue;
+      const T toward = (k < first ? -dot(gate.n, a.way[k]) : dot(gate.n, a.way[k]));
+      if (pass == 0 && !(T(kStartLeast) * gate.gap < toward)) continue;
+      mark(s.blocked + int64_t{record[5]} * in.vertices + record[k]);
+      named = true;
+    }
+  }
+  return false;
+}
+
+// After a round: vertices that are blocked try less.
+template <class T>
+DIFFVBD_FN bool retreat(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row, int round) {
+  if (!s.blocked[row] || in.held[row % in.vertices]) return false;
+  s.blocked[row] = 0;
+  s.stamp[row] = static_cast<uint8_t>(round + 1);
+  s.now[row] = round < kPatience && T(kLeastTry) < s.now[row] ? T(0.5) * s.now[row] : T(0);
+  return true;
+}
+
+// Before the first round: a share with which the vertex stays in its room.
+template <class T>
+DIFFVBD_FN void begin_move(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row) {
+  const int64_t scene = row / in.vertices;
+  const auto v = static_cast<int32_t>(row % in.vertices);
+  if (s.first) s.share[row] = T(0);
+  s.blocked[row] = s.stamp[row] = 0;
+  const Vec3<T> way = way_of(in, scene, v), offset = vector_at(in.x + 3 * row) - vector_at(in.center + 3 * row);
+  const auto fits = [&](T now) {
+    const Vec3<T> end = offset + (s.share[row] + now * (T(1) - s.share[row])) * way;
+    return dot(end, end) <= in.room[row] * in.room[row];
+  };
+  T now = T(1);
+  while (T(kLeastTry) < now && !fits(now)) now = T(0.5) * now;
+  s.now[row] = fits(now) ? now : T(0);
+}
+// A scene that has found no way stays where it is in this move.
+template <class T>
+DIFFVBD_FN void give_up(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row) {
+  if (s.failed[row / in.vertices]) s.now[row] = T(0);
+}
+template <class T>
+DIFFVBD_FN void end_move(const AdvanceState<T>& s, int64_t row) {
+  const T done = s.share[row], now = s.now[row];
+  s.share[row] = now == T(1) ? T(1) : done + now * (T(1) - done);
+}
+
+}  // namespace diffvbd::contact

@@ -1,0 +1,156 @@
+// How far a vertex may go without that two surfaces cross: as long as a plane keeps the sides of a pair apart, with the
+// pair's own closest points, or with a direction that the neighbourhood suggests. A limit is a power of two, from 1
+// down to 2^-7, or 0: it is decided, not differentiated (docs/method.md, section 12).
+#pragma once
+
+#include <limits>
+
+#include "pairs.h"
+
+namespace diffvbd::contact {
+
+constexpr int kNoMove = 8;                 // the exponent that stands for a limit of 0
+constexpr double kBothShare = 0.45;        // of a gap that an update may close where both sides move
+constexpr double kShare = 2 * kBothShare;  // and where the other one rests
+constexpr double kStartLeast = 0.05;       // of any gap that what does not minimise the barrier may close
+constexpr double kStartPart = 0.5;         // of dhat: such motion brings no pair closer
+constexpr double kTight = 0.125;            // of that: such motion closes such gaps no further
+constexpr double kGuardUlps = 32;          // roundings of a position, which a gap is not trusted to
+
+template <class T>
+DIFFVBD_FN T limit_of(int exponent) {
+  return exponent >= kNoMove ? T(0) : T(1) / T(1 << exponent);
+}
+
+// Corner k of a pair is of the first side if k is below this.
+DIFFVBD_FN int sides(int kind) { return kind == kEdgeEdge ? 2 : 1; }
+
+// How two sides lie along a direction m that points from the second to the first.
+template <class T>
+struct Separation {
+  T gap;       // between the lowest corner of the first and the highest of the second, less the radii [m]
+  T slack[4];  // how far behind that one each corner lies [m]
+  DIFFVBD_FN Separation(int kind, const Corners<T>& c, const Vec3<T>& m, T offset) {
+    const int first = sides(kind);
+    T h[4], lowest = std::numeric_limits<T>::infinity(), highest = -lowest;
+    for (int k = 0; k < 4; ++k) {
+      h[k] = dot(m, c.x[k]);
+      if (k < first) lowest = h[k] < lowest ? h[k] : lowest;
+      if (k >= first) highest = highest < h[k] ? h[k] : highest;
+    }
+    for (int k = 0; k < 4; ++k) slack[k] = k < first ? h[k] - lowest : highest - h[k];
+    gap = lowest - highest - offset;
+  }
+};
+
+// The exponent of a limit that keeps a vertex `offset` from the center of its room within the room.
+template <class T>
+DIFFVBD_FN int limit_by_room(const Vec3<T>& offset, const Vec3<T>& d, T room) {
+  int exponent = 0;
+  while (exponent < kNoMove) {
+    const Vec3<T> end = offset + limit_of<T>(exponent) * d;
+    if (dot(end, end) <= room * room) break;
+    ++exponent;
+  }
+  return exponent;
+}
+
+// What a listed pair knows beside its constants: the direction of the nearest gap around it and that gap, and the gap
+// of the pair itself, when it was found.
+template <class T>
+struct PairHints {
+  Vec3<T> star;
+  T nearest, gap;
+  DIFFVBD_FN explicit PairHints(const T* a) : star{a[3], a[4], a[5]}, nearest(a[6]), gap(a[7]) {}
+};
+
+// A direction across both sides that does not depend on where they end.
+template <class T>
+DIFFVBD_FN Vec3<T> across(int kind, const Corners<T>& c) {
+  const Vec3<T> n =
+      kind == kEdgeEdge ? cross(c.x[1] - c.x[0], c.x[3] - c.x[2]) : cross(c.x[2] - c.x[1], c.x[3] - c.x[1]);
+  const T size2 = dot(n, n), scale = T(0) < size2 ? T(1) / square_root(size2) : T(0);
+  const T toward = dot(n, c.x[0] - c.x[2]);
+  return (toward < T(0) ? -scale : scale) * n;
+}
+
+// One pair as it is now, and what motions of its corners it lets pass.
+template <class T>
+struct Gate {
+  int kind;
+  Corners<T> corners;
+  PairConstants<T> constants;
+  PairHints<T> hints;
+  Vec3<T> n;
+  T gap, guard;
+
+  // guard: what rounding may make of a height [m]
+  DIFFVBD_FN Gate(int pair_kind, const Corners<T>& c, const T* a, T rounding)
+      : kind(pair_kind), corners(c), constants(a), hints(a), guard(rounding) {
+    const Distance<T> at = distance(kind, c);
+    n = at.n;
+    gap = at.d - constants.offset;
+  }
+  DIFFVBD_FN T least() const { return T(kStartPart) * constants.dhat; }
+
+  // Whether corners that move by d[k], each as far as its share of the gap lets it, keep the sides apart along m.
+  // careful: the motion does not minimise the barrier.
+  DIFFVBD_FN bool holds(const Vec3<T>& m, const Vec3<T> (&d)[4], const T (&share)[4], bool careful, bool own) const {
+    const Separation<T> s(kind, corners, m, constants.offset);
+    const T wide = s.gap - guard;
+    if (!(T(0) < wide)) return false;
+    // other directions than that of the closest points must keep what is near
+    const T near = hints.nearest < least() ? hints.nearest : least();
+    if (!own && !(T(0.5) * near < wide)) return false;
+    for (int k = 0; k < 4; ++k) {
+      const T toward = k < sides(kind) ? -dot(m, d[k]) : dot(m, d[k]);
+      T room = share[k] * wide;
+      if (careful || !own) {
+        const bool tight = careful && wide < T(kTight) * least();
+        const T outside = share[k] * (wide - least()), some = tight ? T(0) : T(kStartLeast) * wide;
+        room = some < outside ? outside : some;
+      }
+      if (!(toward <= s.slack[k] + room)) return false;
+    }
+    return true;
+  }
+  DIFFVBD_FN bool holds(const Vec3<T> (&d)[4], const T (&share)[4], bool careful) const {
+    if (holds(n, d, share, careful, true)) return true;
+    if (kind == kPointPlane) return false;  // which ends nowhere
+    return holds(hints.star, d, share, careful, false) || holds(across(kind, corners), d, share, careful, false);
+  }
+};
+
+// Whether corners that move along straight lines, all at once, by d[k], stay apart: steps that the gap proves safe, one
+// after another.
+constexpr int kAdvances = 8;
+template <class T>
+DIFFVBD_FN bool stays_apart(const Gate<T>& g, const Vec3<T> (&d)[4], bool careful) {
+  Vec3<T> mean = zero3<T>(), relative[4];
+  for (int k = 0; k < 4; ++k) mean += T(0.25) * d[k];
+  T speed[2] = {T(0), T(0)};
+  for (int k = 0; k < 4; ++k) {
+    relative[k] = d[k] - mean;
+    const T size = square_root(dot(relative[k], relative[k]));
+    T& most = speed[k < sides(g.kind) ? 0 : 1];
+    most = most < size ? size : most;
+  }
+  const T total = speed[0] + speed[1], wide = g.gap - g.guard, least = g.least();
+  if (g.kind == kPointPlane || !(T(0) < wide)) return false;
+  // it may come as close as a start may bring it, and a little closer where it is close already
+  const T half = T(1 - kBothShare) * wide, most = least < half ? half : least;
+  const T part = wide < T(kTight) * least ? T(1) : T(1 - 2 * kStartLeast);
+  const T keeps = !careful ? half : part * wide < most ? part * wide : most;
+  T time = T(0), now = wide;
+  for (int i = 0; i < kAdvances; ++i) {
+    if (!(keeps < now)) return total * (T(1) - time) <= T(0);
+    time = time + (now - keeps) / total;
+    if (!(time < T(1))) return true;
+    Corners<T> moved = g.corners;
+    for (int k = 0; k < 4; ++k) moved.x[k] += time * relative[k];
+    now = distance(g.kind, moved).d - g.constants.offset - g.guard;
+  }
+  return false;
+}
+
+}  // namespace diffvbd::contact

@@ -1,0 +1,65 @@
+#include "advance.h"
+
+#include <torch/csrc/stable/ops.h>
+
+#include <atomic>
+#include <vector>
+
+#include "grain.h"
+
+namespace diffvbd {
+
+using namespace contact;
+
+namespace {
+
+constexpr int64_t kPairGrain = 256;  // pairs that are worth one more thread
+
+// How many of n items f says yes to.
+template <class F>
+int64_t count(int64_t n, int64_t grain, const F& f) {
+  std::atomic<int64_t> total{0};
+  torch::stable::parallel_for(0, n, grain, [&](int64_t begin, int64_t end) {
+    int64_t own = 0;
+    for (int64_t i = begin; i < end; ++i) own += f(i);
+    total += own;
+  });
+  return total;
+}
+
+}  // namespace
+
+template <class T>
+int64_t advance(const AdvanceInputs<T>& in, T* share) {
+  const int64_t rows = in.scenes * in.vertices, pairs = in.listed.ptr[in.scenes * in.corners] / 4;
+  std::vector<T> now(rows);
+  std::vector<uint8_t> blocked(rows), stamp(rows), failed(in.scenes);
+  AdvanceState<T> s{share, now.data(), blocked.data(), stamp.data(), failed.data(), true};
+  const auto scene_of = [&](int64_t pair) { return in.listed.pairs[kPairRow * pair + 5]; };
+  int64_t stuck = 0;
+  for (int move = 0; move < kMoves; ++move) {
+    s.first = move == 0;
+    std::fill(failed.begin(), failed.end(), 0);
+    count(rows, kGrain, [&](int64_t i) { return begin_move(in, s, i), 0; });
+    for (int round = 0; round < kRounds; ++round) {
+      const bool last = round + 1 == kRounds;
+      const auto fails = [&](int64_t pair) {
+        const bool passes = try_pair(in, s, pair, last ? 0 : round);
+        if (!passes && last) mark(failed.data() + scene_of(pair));
+        return !passes;
+      };
+      if (count(pairs, kPairGrain, fails) == 0 || last) break;
+      if (count(rows, kGrain, [&](int64_t i) { return retreat(in, s, i, round); }) == 0) break;
+    }
+    count(rows, kGrain, [&](int64_t i) { return give_up(in, s, i), 0; });
+    if (s.first) stuck = count(pairs, kPairGrain, [&](int64_t pair) { return !try_pair(in, s, pair, 0); });
+    count(rows, kGrain, [&](int64_t i) { return end_move(s, i), 0; });
+    if (count(rows, kGrain, [&](int64_t i) { return !in.held[i % in.vertices] && share[i] < T(1); }) == 0) break;
+  }
+  return stuck;
+}
+
+template int64_t advance<float>(const AdvanceInputs<float>&, float*);
+template int64_t advance<double>(const AdvanceInputs<double>&, double*);
+
+}  // namespace diffvbd

@@ -1,0 +1,121 @@
+#include <cooperative_groups.h>
+
+#include <algorithm>
+
+#include "advance.h"
+
+namespace diffvbd::cuda {
+namespace {
+
+using namespace contact;
+
+constexpr int kThreads = 128;
+constexpr int kFlags = kMoves * (2 * kRounds + 1);  // one for each question that the whole grid is asked
+
+// Out of line: whoever asks gets the same bits.
+template <class T>
+__device__ __noinline__ bool passes(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair, int round) {
+  return try_pair(in, s, pair, round);
+}
+
+// One cooperative launch for all moves and rounds: most are over after the first round, and only the device knows.
+// flags [kFlags] and stuck [1] are zero.
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    advance_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, unsigned* flags,
+                   unsigned long long* stuck) {
+  const auto grid = cooperative_groups::this_grid();
+  const auto each = [](int64_t n, const auto& f) {
+    for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < n;
+         i += static_cast<int64_t>(gridDim.x) * kThreads) {
+      f(i);
+    }
+  };
+  // Whether any thread says yes, once all have come here.
+  const auto any = [&](bool own) {
+    if (own) *flags = 1;
+    grid.sync();
+    return *static_cast<volatile unsigned*>(flags++) != 0;
+  };
+  const int64_t rows = in.scenes * in.vertices, pairs = in.listed.ptr[in.scenes * in.corners] / 4;
+  for (int move = 0; move < kMoves; ++move) {
+    s.first = move == 0;
+    each(in.scenes, [&](int64_t i) { s.failed[i] = 0; });
+    each(rows, [&](int64_t i) { begin_move(in, s, i); });
+    grid.sync();
+    for (int round = 0; round < kRounds; ++round) {
+      const bool last = round + 1 == kRounds;
+      bool fails = false, goes_less = false;
+      each(pairs, [&](int64_t pair) {
+        if (passes(in, s, pair, last ? 0 : round)) return;
+        fails = true;
+        if (last) mark(s.failed + in.listed.pairs[kPairRow * pair + 5]);
+      });
+      if (!any(fails) || last) break;
+      each(rows, [&](int64_t i) { goes_less = retreat(in, s, i, round) || goes_less; });
+      if (!any(goes_less)) break;
+    }
+    each(rows, [&](int64_t i) { give_up(in, s, i); });
+    if (s.first) {
+      grid.sync();
+      each(pairs, [&](int64_t pair) {
+        if (!passes(in, s, pair, 0)) atomicAdd(stuck, 1ULL);
+      });
+      grid.sync();
+    }
+    bool open = false;
+    each(rows, [&](int64_t i) {
+      end_move(s, i);
+      open = open || (!in.held[i % in.vertices] && s.share[i] < T(1));
+    });
+    if (!any(open)) break;
+  }
+}
+
+// Bytes of each part of the workspace, rounded up to what any type needs.
+constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
+
+}  // namespace
+
+template <class T>
+int64_t advance_workspace_bytes(const AdvanceInputs<T>& in) {
+  const int64_t rows = in.scenes * in.vertices;
+  return aligned(kFlags * sizeof(unsigned)) + aligned(rows * sizeof(T)) + 2 * aligned(rows) + aligned(in.scenes);
+}
+
+template <class T>
+cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* stuck, void* workspace,
+                    int multiprocessors, cudaStream_t stream) {
+  if (auto error = cudaMemsetAsync(stuck, 0, sizeof(*stuck), stream)) return error;
+  const int64_t rows = in.scenes * in.vertices;
+  if (rows == 0) return cudaSuccess;
+  auto* at = static_cast<uint8_t*>(workspace);
+  const auto take = [&](int64_t bytes) {
+    uint8_t* here = at;
+    at += aligned(bytes);
+    return here;
+  };
+  auto* flags = reinterpret_cast<unsigned*>(take(kFlags * sizeof(unsigned)));
+  auto* now = reinterpret_cast<T*>(take(rows * sizeof(T)));
+  uint8_t *blocked = take(rows), *stamp = take(rows), *failed = take(in.scenes);
+  if (auto error = cudaMemsetAsync(flags, 0, kFlags * sizeof(unsigned), stream)) return error;
+  AdvanceInputs<T> inputs = in;
+  AdvanceState<T> state{share, now, blocked, stamp, failed, true};
+  auto* found = reinterpret_cast<unsigned long long*>(stuck);
+  const void* kernel = reinterpret_cast<const void*>(advance_kernel<T>);
+  int resident = 0;
+  if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, kernel, kThreads, 0)) return error;
+  const int64_t wanted = (std::max(rows, capacity) + kThreads - 1) / kThreads;
+  const auto blocks = static_cast<unsigned>(std::min<int64_t>(wanted, int64_t{resident} * multiprocessors));
+  void* arguments[] = {&inputs, &state, &flags, &found};
+  return cudaLaunchCooperativeKernel(kernel, dim3(blocks), dim3(kThreads), arguments, 0, stream);
+}
+
+#define DIFFVBD_INSTANTIATE(T)                                          \
+  template int64_t advance_workspace_bytes<T>(const AdvanceInputs<T>&); \
+  template cudaError_t advance<T>(const AdvanceInputs<T>&, int64_t, T*, int64_t*, void*, int, cudaStream_t);
+DIFFVBD_INSTANTIATE(float)
+DIFFVBD_INSTANTIATE(double)
+#undef DIFFVBD_INSTANTIATE
+
+}  // namespace diffvbd::cuda

@@ -1,0 +1,19 @@
+// How much of its way each vertex goes at the start of the sweeps (contact/advance.h), on the device.
+#pragma once
+
+#include <cuda_runtime_api.h>
+
+#include "../contact/advance.h"
+
+namespace diffvbd::cuda {
+
+// Bytes of memory that it works in.
+template <class T>
+int64_t advance_workspace_bytes(const contact::AdvanceInputs<T>& in);
+
+// share [B, V], stuck [1] as cpu/advance.h. capacity: pairs that the list has room for.
+template <class T>
+cudaError_t advance(const contact::AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* stuck, void* workspace,
+                    int multiprocessors, cudaStream_t stream);
+
+}  // namespace diffvbd::cuda

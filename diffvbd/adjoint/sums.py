@@ -1,0 +1,43 @@
+"""Sums of rows by an index, with the same bits on every run and device."""
+
+# pyright: reportIncompatibleMethodOverride=false
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from ..ops import detect as ops_contact
+from ..ops import ready_signature
+
+
+class _SumBy(Function):
+    @staticmethod
+    def forward(values: Tensor, index: Tensor, count: int) -> Tensor:
+        if not values.is_cuda:  # there they are added one after another
+            return values.new_zeros((count, values.shape[1])).index_add_(0, index, values)
+        ordered, order = torch.sort(index, stable=True)
+        ptr = torch.searchsorted(ordered, torch.arange(count + 1, device=index.device))
+        rows = values.contiguous()[None]
+        return ops_contact.segment_sum(rows, order.to(torch.int32), ptr.to(torch.int32))[0]
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        _, ctx.index, _ = inputs
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        return grads[0][ctx.index], None, None
+
+
+def sum_by(values: Tensor, index: Tensor, count: int) -> Tensor:
+    """Rows of ``values`` [n, ...] added up by ``index`` [n], [count, ...]; differentiable in the values."""
+    if values.numel() == 0 or count == 0:
+        return values.new_zeros((count, *values.shape[1:]))
+    flat = values.reshape(values.shape[0], -1)
+    return _SumBy.apply(flat, index, count).reshape(count, *values.shape[1:])
+
+
+ready_signature(_SumBy)

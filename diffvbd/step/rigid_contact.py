@@ -1,0 +1,340 @@
+"""The rigid correction of bodies that touch: all bodies of a scene moved, each as a whole, by one Newton step of the
+step's potential over their rigid motions.
+
+    min over (w_b, t_b)   1/2 sum m |x - y|^2 + energies of single vertices + barriers, friction and damping of pairs
+
+A rigid motion leaves the energy of the tets as it is, so that this costs sums over vertices and pairs, and six unknowns
+a body. It is what few sweeps do worst: they see neighbours, not the body. docs/method.md, section 18.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..adjoint.contact_lag import Pairs, pair_lag
+from ..adjoint.sums import sum_by
+from ..contact.surface import ContactSurface
+from ..ops import broadcast
+from ..ops import contact_start as ops_start
+
+MOST_COUPLED = 64  # bodies of a scene that are solved for together; with more of them, one side of a pair at a time
+TRIES = 5  # of motions, each half as long
+LEAST_GAP = 0.1  # of its gap that a vertex keeps above a plane of the floor
+SPREADS = 4  # how often a shorter motion is handed on to the bodies that one touches
+RISE = 1e-9  # of the potential, that counts as none
+LEAST_STIFFNESS = 1e-12  # of its mass, that keeps the system of a body definite
+RESTING = 1e-6  # of the motion below which friction is smoothed; twin of kRestingMotion in csrc/contact/pairs.h
+
+
+class Scenes(NamedTuple):
+    """What the correction reads; positions [B, V, 3] [m]."""
+
+    model: Any
+    x_prev: Tensor
+    y: Tensor
+    mass: Tensor  # [1 | B, V] [kg]
+    data: Tensor  # of the energies
+    origin: Tensor  # [B, V, 3] or empty
+    collider_prev: Tensor  # at the start of the step, [B, Vc, 3]
+    collider: Tensor  # and now
+    kappa: Tensor
+    listed: Pairs
+    lagged: Pairs
+    lag: Tensor  # [pairs, 9]
+    floor_lag: Tensor  # [B, V, planes, 4] or empty
+    center: Tensor  # from where each vertex has its room
+    room: Tensor  # [B, V] [m]
+    surface: ContactSurface | None
+    time_step: float
+    friction_eps: float  # [m]
+
+
+class _PairTerms(NamedTuple):
+    """What pairs add: force [n, 3] on the first side's motion, its derivative [n, 3, 3], weights [n, 4], and the
+    potential [n] of which they are."""
+
+    listed: Pairs
+    force: Tensor
+    stiffness: Tensor
+    weights: Tensor
+    value: Tensor
+
+
+def correct(s: Scenes, x: Tensor) -> tuple[Tensor, Tensor]:
+    """x [B, V, 3] after every free body has been moved, as far as pairs, floors and the potential let it; and the share
+    of its motion that each took [B, bodies]."""
+    bodies = _Bodies(s, x)
+    motion = _newton_step(s, bodies, x)
+    share = _share(s, bodies, x, motion)
+    return x + bodies.displaced(share[..., None] * motion), share
+
+
+class _Bodies:
+    """The bodies of all scenes, which of them move, and where their vertices are from their centers of mass."""
+
+    def __init__(self, s: Scenes, x: Tensor) -> None:
+        self.body = s.model.body
+        self.count = s.model.mesh.num_bodies
+        self.scenes = x.shape[0]
+        rows = self.body + self.count * torch.arange(self.scenes, device=x.device)[:, None]
+        self.rows = rows.reshape(-1)  # of the body of each vertex
+        mass = broadcast(s.mass, x.shape[:2])
+        self.mass = self.sum(mass[..., None])[..., 0]
+        held = self.sum(broadcast(s.model._pinned.to(x.dtype)[None, :, None], (*x.shape[:2], 1)))[..., 0]
+        self.free = (held == 0) & (self.mass > 0)
+        whole = self.mass.clamp(min=torch.finfo(x.dtype).tiny)[..., None]
+        self.arm = x - (self.sum(mass[..., None] * x) / whole)[:, self.body]
+
+    def sum(self, values: Tensor) -> Tensor:
+        """[B, V, ...] -> [B, bodies, ...]"""
+        return sum_by(values.flatten(0, 1), self.rows, self.scenes * self.count).unflatten(0, (self.scenes, self.count))
+
+    def least(self, values: Tensor) -> Tensor:
+        """[B, V] -> [B, bodies]"""
+        out = torch.ones_like(self.mass).reshape(-1)
+        return out.scatter_reduce(0, self.rows, values.reshape(-1), "amin").reshape(self.mass.shape)
+
+    def displaced(self, motion: Tensor) -> Tensor:
+        """What a turn and a shift of each body [B, bodies, 6] do to its vertices, exactly, [B, V, 3]."""
+        turn = _rotation(motion[..., :3]) - torch.eye(3, dtype=motion.dtype, device=motion.device)
+        return (turn[:, self.body] @ self.arm[..., None])[..., 0] + motion[:, self.body, 3:]
+
+
+def _turning(r: Tensor) -> Tensor:
+    """[..., 3] -> [..., 3, 6]: how a point at r from the center moves with a turn and a shift."""
+    zero, eye = torch.zeros_like(r[..., 0]), torch.eye(3, dtype=r.dtype, device=r.device)
+    x, y, z = r.unbind(-1)
+    turn = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).unflatten(-1, (3, 3))
+    return torch.cat([turn, eye.expand(turn.shape)], -1)
+
+
+def _rotation(w: Tensor) -> Tensor:
+    """The rotation by |w| about w, [..., 3, 3]."""
+    square = (w * w).sum(-1)[..., None, None]
+    small = square < 1e-8
+    safe = torch.where(small, torch.ones_like(square), square)
+    angle = safe.sqrt()
+    first = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)
+    second = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / safe)
+    k = _turning(w)[..., :3].mT
+    return torch.eye(3, dtype=w.dtype, device=w.device) + first * k + second * (k @ k)
+
+
+def _outer(n: Tensor) -> Tensor:
+    return n[..., None] * n[..., None, :]
+
+
+def _slip(u: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+    """Friction's potential f0 of slips u [..., 3], and f0'(|u|) / |u|."""
+    square = (u * u).sum(-1)
+    moves = square > (RESTING * eps) ** 2
+    length = torch.where(moves, torch.where(moves, square, torch.ones_like(square)).sqrt(), square.detach().sqrt())
+    slow = length < eps
+    value = torch.where(slow, length**2 / eps - length**3 / (3 * eps**2) + eps / 3, length)
+    return value, torch.where(slow, (2 - length / eps) / eps, 1 / torch.where(slow, torch.ones_like(length), length))
+
+
+def _log_barrier(gap: Tensor, dhat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """b / kappa and its first two derivatives, of gaps in (0, dhat)."""
+    past, log = gap - dhat, torch.log(gap / dhat)
+    part = past / gap
+    return -past * past * log, -past * (2 * log + part), -(2 * log + 4 * part - part * part)
+
+
+def _vertex_terms(s: Scenes, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of inertia, energies of single vertices and friction on a floor: gradient [B, V, 3], blocks [B, V, 3, 3] that are
+    at least its derivative, and the potential of each scene [B]."""
+    h, h2, model = s.time_step, s.time_step**2, s.model
+    eye = torch.eye(3, dtype=x.dtype, device=x.device)
+    mass = broadcast(s.mass, x.shape[:2])
+    off = torch.where(model._pinned[:, None], torch.zeros_like(x), x - s.y)
+    force, stiffness = mass[..., None] * off, mass[..., None, None] * eye
+    value = (0.5 * mass * (off * off).sum(-1)).sum(1)
+    origin = None if s.origin.numel() == 0 else s.origin
+    first = 0
+    for energy in model.vertex_energies:
+        size = energy.count() * (model.num_vertices if energy.per_vertex else 1)
+        data, first = s.data[:, first : first + size], first + size
+        force = force + energy.gradient(x, s.x_prev, data, h, origin)
+        stiffness = stiffness + energy.blocks(x, s.x_prev, data, h, origin)
+        value = value + energy.value(x, s.x_prev, data, h, origin).sum(1)
+    if s.floor_lag.numel():
+        load, n = s.floor_lag[..., 0], s.floor_lag[..., 1:]
+        travel = (x - s.x_prev)[:, :, None]
+        u = travel - n * (n * travel).sum(-1, keepdim=True)
+        potential, rate = _slip(u, s.friction_eps)
+        force = force + h2 * ((load * rate)[..., None] * u).sum(2)
+        stiffness = stiffness + h2 * ((load * rate)[..., None, None] * (eye - _outer(n))).sum(2)
+        value = value + h2 * (load * potential).sum((1, 2))
+    return force, stiffness, value
+
+
+def _corners(listed: Pairs) -> tuple[Tensor, Tensor]:
+    """Scene [n, 1] and corner points [n, 4] of pairs; of rows that no pair fills, the first."""
+    rows = listed.pairs.long().clamp(min=0)
+    return rows[:, 5:], rows[:, :4]
+
+
+def _pair_terms(s: Scenes, x: Tensor) -> list[_PairTerms]:
+    """Of barriers, and of lagged friction and damping."""
+    h, h2 = s.time_step, s.time_step**2
+    points = torch.cat([x, s.collider], 1)
+    out = []
+    if s.listed.pairs.shape[0]:
+        force, active, n, w = pair_lag(x, s.collider, s.kappa, s.origin, s.listed).split((1, 1, 3, 4), -1)
+        scene, corners = _corners(s.listed)
+        at = points[scene, corners]
+        if s.origin.numel():
+            at = at + torch.cat([s.origin, torch.zeros_like(s.collider)], 1)[scene, corners]
+        dhat, offset = s.listed.constants[:, 0], s.listed.constants[:, 1]
+        near = active[:, 0] > 0
+        height = ((at - at[:, :1].detach()) * n[:, None]).sum(-1)
+        gap = torch.where(near, (w * height).sum(-1) - offset, 0.5)
+        b, slope, curvature = _log_barrier(gap, torch.where(near, dhat, 1.0))
+        # the force carries stiffness and mollifier: what is left are ratios of the barrier's derivatives
+        load = h2 * torch.where(near, force[:, 0] / -slope, 0.0)
+        out.append(_PairTerms(s.listed, -h2 * force * n, (load * curvature)[:, None, None] * _outer(n), w, load * b))
+    if s.lag.numel():
+        load, rate, n, w = s.lag.split((1, 1, 3, 4), -1)
+        scene, corners = _corners(s.lagged)
+        moved = points[scene, corners] - torch.cat([s.x_prev, s.collider_prev], 1)[scene, corners]
+        m = (w[..., None] * moved).sum(1)
+        along = (n * m).sum(-1, keepdim=True)
+        approach, u = along.clamp(max=0), m - along * n
+        potential, slip = _slip(u, s.friction_eps)
+        slip = h2 * load * slip[:, None]
+        eye = torch.eye(3, dtype=x.dtype, device=x.device)
+        stiffness = slip[..., None] * (eye - _outer(n)) + (h * rate)[..., None] * _outer(n)
+        value = h2 * load[:, 0] * potential + 0.5 * h * (rate * approach**2)[:, 0]
+        out.append(_PairTerms(s.lagged, slip * u + h * rate * approach * n, stiffness, w, value))
+    return out
+
+
+def _potential(s: Scenes, x: Tensor) -> Tensor:
+    """Of each scene [B] [kg m^2], without tets."""
+    value = _vertex_terms(s, x)[2]
+    for terms in _pair_terms(s, x):
+        scene = _corners(terms.listed)[0][:, 0]
+        value = value + sum_by(terms.value[:, None], scene, x.shape[0])[:, 0]
+    return value
+
+
+def _sides(s: Scenes, bodies: _Bodies, listed: Pairs, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows of the bodies of both sides of pairs [n, 2], -1 where one does not move or both are one; and how sides move
+    with their bodies [n, 2, 3, 6]."""
+    surface = s.surface
+    assert surface is not None
+    scene, corners = _corners(listed)
+    kind = listed.pairs[:, 4:5]
+    sides = torch.where(kind == 1, 2, 1)
+    first = sides > torch.arange(4, device=kind.device)
+    lead = torch.cat([corners[:, :1], corners.gather(1, sides)], 1)
+    body = surface.body.long()[lead]
+    mesh = body < bodies.count
+    rows = scene * bodies.count + body.clamp(max=bodies.count - 1)
+    there = mesh & bodies.free.reshape(-1)[rows] & (body[:, :1] != body[:, 1:]) & (kind >= 0)
+    arms = bodies.arm[scene, corners.clamp(max=bodies.arm.shape[1] - 1)]
+    one = weights[..., None, None] * _turning(arms)
+    maps = torch.stack([torch.where(side[..., None, None], one, 0.0).sum(1) for side in (first, ~first)], 1)
+    return torch.where(there, rows, -1), torch.where(there[..., None, None], maps, 0.0)
+
+
+def _newton_step(s: Scenes, bodies: _Bodies, x: Tensor) -> Tensor:
+    """Turn and shift of each body [B, bodies, 6]."""
+    n, rows = bodies.count, bodies.scenes * bodies.count
+    together = n <= MOST_COUPLED
+    force, stiffness, _ = _vertex_terms(s, x)
+    maps = _turning(bodies.arm)
+    g = bodies.sum((maps.mT @ force[..., None])[..., 0]).reshape(rows, 6)
+    own = bodies.sum(maps.mT @ stiffness @ maps).reshape(rows, 6, 6)
+    across = []
+    for terms in _pair_terms(s, x):
+        row, maps = _sides(s, bodies, terms.listed, terms.weights)
+        at = row.clamp(min=0)
+        pulled = (maps.mT @ terms.force[:, None, :, None])[..., 0]
+        g = g + sum_by(pulled.flatten(0, 1), at.flatten(), rows)
+        pressed = terms.stiffness[:, None] @ maps
+        # where sides are not solved for together, each bears what both would: then no step is too long
+        twice = 1.0 if together else torch.where((row >= 0).all(1), 2.0, 1.0)[:, None, None, None]
+        own = own + sum_by((maps.mT @ (twice * pressed)).flatten(0, 1), at.flatten(), rows)
+        if together:
+            cell = at[:, 0] * n + at[:, 1] % n
+            across.append(sum_by(maps[:, 0].mT @ pressed[:, 1], cell, rows * n))
+    free = bodies.free.reshape(-1)
+    six = torch.eye(6, dtype=x.dtype, device=x.device)
+    fill = torch.where(free, LEAST_STIFFNESS * bodies.mass.reshape(-1), 1.0)
+    own = torch.where(free[:, None, None], own, 0.0) + fill[:, None, None] * six
+    g = torch.where(free[:, None], -g, 0.0)
+    if not together or not across:
+        return _solved(own, g[..., None]).reshape(bodies.scenes, n, 6)
+    between = sum(across[1:], across[0]).reshape(bodies.scenes, n, n, 6, 6)
+    matrix = between + between.permute(0, 2, 1, 4, 3)
+    matrix = matrix + torch.diag_embed(own.reshape(bodies.scenes, n, 6, 6).permute(0, 2, 3, 1), dim1=1, dim2=2)
+    matrix = matrix.permute(0, 1, 3, 2, 4).reshape(bodies.scenes, 6 * n, 6 * n)
+    return _solved(matrix, g.reshape(bodies.scenes, 6 * n, 1)).reshape(bodies.scenes, n, 6)
+
+
+def _solved(matrix: Tensor, right: Tensor) -> Tensor:
+    factor = torch.linalg.cholesky_ex(matrix)[0]  # torch.cholesky_solve cannot be captured in a CUDA graph
+    half = torch.linalg.solve_triangular(factor, right, upper=False)
+    return torch.linalg.solve_triangular(factor.mT, half, upper=True)[..., 0]
+
+
+@torch.no_grad()
+def _share(s: Scenes, bodies: _Bodies, x: Tensor, motion: Tensor) -> Tensor:
+    """What of its motion each body takes [B, bodies]: 1, 1/2, 1/4, ... or 0, so that nothing crosses and no scene's
+    potential rises. It is decided, not differentiated."""
+    x, motion = x.detach(), motion.detach()
+    share, taken = torch.ones_like(bodies.mass), torch.zeros_like(bodies.mass)
+    motion = torch.where(torch.isfinite(motion).all(-1, keepdim=True), motion, 0.0)
+    before = _potential(s, x)
+    touching = _touching(s, bodies, x)
+    for _ in range(TRIES):
+        move = bodies.displaced(share[..., None] * motion)
+        fits = bodies.least(_fits(s, x, move)) >= 1
+        safe = fits.all(1) & (_potential(s, x + move) <= before + RISE * before.abs())
+        taken = torch.where(safe[:, None] & (taken == 0), share, taken)
+        if not x.is_cuda and not torch.compiler.is_compiling() and bool((safe | (taken > 0).all(1)).all()):
+            break
+        low = torch.where(fits & ~(fits.all(1, keepdim=True) & ~safe[:, None]), 1.0, 0.5)
+        for _ in range(SPREADS):
+            for row in touching:
+                pair = low.reshape(-1)[row].amin(1)
+                flat = low.reshape(-1)
+                for side in range(2):
+                    flat = flat.scatter_reduce(0, row[:, side], pair, "amin")
+                low = flat.reshape(low.shape)
+        share = share * low
+    return taken
+
+
+def _touching(s: Scenes, bodies: _Bodies, x: Tensor) -> list[Tensor]:
+    """Rows of bodies between which a pair acts [n, 2]; where none does, of one body twice."""
+    if not s.listed.pairs.shape[0]:
+        return []
+    state = pair_lag(x, s.collider, s.kappa, s.origin, s.listed)
+    row, _ = _sides(s, bodies, s.listed, state[:, 5:])
+    acts = (state[:, 1] > 0) & (row >= 0).all(1)
+    return [torch.where(acts[:, None], row, 0)]
+
+
+def _fits(s: Scenes, x: Tensor, move: Tensor) -> Tensor:
+    """1 where a vertex may move so [B, V], less elsewhere."""
+    out = torch.ones_like(x[..., 0])
+    if s.surface is not None:
+        none = x.new_zeros((x.shape[0], s.surface.bodies, 3))
+        listed = (s.listed.pairs, s.listed.constants, s.listed.ptr, s.listed.entry)
+        collider = s.collider.detach()
+        out, _ = ops_start.advance(x.contiguous(), move.contiguous(), none, s.center, s.origin, collider, collider,
+                                   s.surface.held, s.surface.body, s.room, listed, careful=False)  # fmt: skip
+    first = 0
+    for energy in s.model.vertex_energies:
+        size = energy.count() * (s.model.num_vertices if energy.per_vertex else 1)
+        data, first = s.data[:, first : first + size].detach(), first + size
+        keeps = energy.admits(x + move, x, data, None if s.origin.numel() == 0 else s.origin, LEAST_GAP)
+        if keeps is not None:
+            out = torch.where(keeps | s.model._pinned, out, torch.zeros_like(out))
+    return out
