@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..adjoint.contact_lag import Pairs, pair_lag
+from ..adjoint.contact_lag import Pairs, pair_lag, some_of
 from ..adjoint.sums import sum_by
 from ..contact.surface import ContactSurface
 from ..ops import broadcast
@@ -67,7 +67,7 @@ def correct(s: Scenes, x: Tensor) -> tuple[Tensor, Tensor]:
     """x [B, V, 3] after every free body has been moved, as far as pairs, floors and the potential let it; and the share
     of its motion that each took [B, bodies]."""
     bodies = _Bodies(s, x)
-    motion = _newton_step(s, bodies, x)
+    motion = _newton_step(s._replace(listed=_active(s, x)), bodies, x)
     share = _share(s, bodies, x, motion)
     return x + bodies.displaced(share[..., None] * motion), share
 
@@ -178,6 +178,16 @@ def _corners(listed: Pairs) -> tuple[Tensor, Tensor]:
     return rows[:, 5:], rows[:, :4]
 
 
+def _active(s: Scenes, x: Tensor) -> Pairs:
+    """The listed pairs that push where the vertices are at x: few of them, and the others add nothing. All of them
+    where values must not decide sizes."""
+    if not s.listed.pairs.shape[0] or x.is_cuda or torch.compiler.is_compiling():
+        return s.listed
+    with torch.no_grad():
+        acts = pair_lag(x.detach(), s.collider.detach(), s.kappa.detach(), s.origin, s.listed)[:, 1] > 0
+    return some_of(s.listed, acts.nonzero()[:, 0], x.shape[1] + s.collider.shape[1])
+
+
 def _pair_terms(s: Scenes, x: Tensor) -> list[_PairTerms]:
     """Of barriers, and of lagged friction and damping."""
     h, h2 = s.time_step, s.time_step**2
@@ -215,6 +225,7 @@ def _pair_terms(s: Scenes, x: Tensor) -> list[_PairTerms]:
 
 def _potential(s: Scenes, x: Tensor) -> Tensor:
     """Of each scene [B] [kg m^2], without tets."""
+    s = s._replace(listed=_active(s, x))
     value = _vertex_terms(s, x)[2]
     for terms in _pair_terms(s, x):
         scene = _corners(terms.listed)[0][:, 0]
@@ -313,6 +324,7 @@ def _share(s: Scenes, bodies: _Bodies, x: Tensor, motion: Tensor) -> Tensor:
 
 def _touching(s: Scenes, bodies: _Bodies, x: Tensor) -> list[Tensor]:
     """Rows of bodies between which a pair acts [n, 2]; where none does, of one body twice."""
+    s = s._replace(listed=_active(s, x))
     if not s.listed.pairs.shape[0]:
         return []
     state = pair_lag(x, s.collider, s.kappa, s.origin, s.listed)
