@@ -107,18 +107,17 @@ DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, i
   const T* constants = in.constants + kConstants * pair;
   const Attempt<T> a = attempt(in, s, record);
   const int first = sides(record[4]);
-  bool moves[2] = {false, false};
-  T most[2] = {T(0), T(0)};
+  bool moves[2] = {false, false}, careful = false;
   for (int k = 0; k < 4; ++k) {
     const T size = dot(a.way[k], a.way[k]);
     const int side = k < first ? 0 : 1;
     moves[side] = moves[side] || T(0) < size;
-    most[side] = most[side] < size ? size : most[side];
+    careful = careful || (in.careful && a.free[k] && T(0) < size);  // what is prescribed may come closer
   }
   if (!moves[0] && !moves[1]) return true;
   const Gate<T> gate(record[4], a.corners, constants, a.guard);
   const T each = moves[0] && moves[1] ? T(kBothShare) : T(kShare), shares[4] = {each, each, each, each};
-  if (gate.holds(a.way, shares, in.careful) || stays_apart(gate, a.way, in.careful)) return true;
+  if (gate.holds(a.way, shares, careful) || stays_apart(gate, a.way, careful)) return true;
   bool named = false;
   for (int pass = 0; pass < 2 && !named; ++pass) {
     for (int k = 0; k < 4; ++k) {

@@ -243,8 +243,8 @@ class Correction:
         matrix = x.new_zeros(len(share), self.count, self.count, 6, 6)
         at = torch.arange(self.count, device=x.device)
         matrix = matrix.index_put((slice_of(len(share), at), at, at), blocks, accumulate=True)
-        for pairs, force, stiffness in self._pairs(x):
-            g, matrix = self._add(pairs, force, stiffness, jacobian, g, matrix)
+        for pairs, within, force, stiffness in self._pairs(x):
+            g, matrix = self._add(pairs, within, force, stiffness, jacobian, g, matrix)
         free = self.free.to(x.device)
         both = (free[:, None] & free)[..., None, None]
         fill = torch.where(free, LEAST_STIFFNESS * total, 1.0)[..., None, None] * torch.eye(6).to(x)
@@ -272,15 +272,17 @@ class Correction:
         blocks = jacobian.mT @ own @ jacobian
         return g, blocks.new_zeros(len(z), self.count, 6, 6).index_add(1, self.body, blocks)
 
-    def _pairs(self, x: Tensor) -> list[tuple[Any, Tensor, Tensor]]:
-        """Forces on the corners [Q, 4, 3] of barriers and lagged terms, and what their updates add [Q, 4, 4, 3, 3]."""
+    def _pairs(self, x: Tensor) -> list[tuple[Any, bool, Tensor, Tensor]]:
+        """Forces on the corners [Q, 4, 3] of barriers and lagged terms, and what their updates add [Q, 4, 4, 3, 3]; and
+        whether pairs of one body turn it."""
         out, h2 = [], self.scene.time_step**2
         p = self.barrier.pairs
         every = torch.arange(len(p.kind), device=x.device)
-        gap, slope, e, _ = p.measures(corner_points(x, self.barrier.colliders), every)
-        _, first, second = log_barrier(gap, self.barrier.kappa, p.dhat)
+        gap, slope, e, turned = p.measures(corner_points(x, self.barrier.colliders), every)
+        value, first, second = log_barrier(gap, self.barrier.kappa, p.dhat)
+        force = (e * first)[:, None, None] * slope + value[:, None, None] * turned
         across = slope[:, :, None, :, None] * slope[:, None, :, None, :]
-        out.append((p, h2 * (e * first)[:, None, None] * slope, h2 * (e * second)[:, None, None, None, None] * across))
+        out.append((p, False, h2 * force, h2 * (e * second)[:, None, None, None, None] * across))
         lag = self.lagged
         if lag is not None:
             every = torch.arange(len(lag.near), device=x.device)
@@ -294,10 +296,10 @@ class Correction:
                 force = force + size[:, None] * slip.T
                 inner = inner + size[:, None, None] * (torch.eye(3).to(x) - outer)
             weighted = weights[:, :, None, None, None] * weights[:, None, :, None, None] * inner[:, None, None]
-            out.append((lag.pairs, weights[..., None] * force[:, None], weighted))
+            out.append((lag.pairs, True, weights[..., None] * force[:, None], weighted))
         return out
 
-    def _add(self, p: Any, force: Tensor, stiffness: Tensor, jacobian: Tensor, g: Tensor, matrix: Tensor
+    def _add(self, p: Any, within: bool, force: Tensor, stiffness: Tensor, jacobian: Tensor, g: Tensor, matrix: Tensor
              ) -> tuple[Tensor, Tensor]:  # fmt: skip
         vertices = jacobian.shape[1]
         mesh = p.corners < vertices
@@ -307,8 +309,9 @@ class Correction:
         maps = torch.where(mesh[..., None, None], jacobian[scene, corners], 0.0)  # [Q, 4, 3, 6]
         second = torch.where(p.kind == EDGE_EDGE, 2, 1)
         lead = body.gather(1, second[:, None])
-        apart = (body[:, :1] != lead) | ~mesh.gather(1, second[:, None])  # a body does not push itself
-        maps = torch.where(apart[..., None, None], maps, 0.0)
+        if not within:
+            apart = (body[:, :1] != lead) | ~mesh.gather(1, second[:, None])
+            maps = torch.where(apart[..., None, None], maps, 0.0)
         pull = (maps.mT @ force[..., None])[..., 0]
         g = g.index_put((scene, body), pull, accumulate=True)
         pressed = maps.mT[:, :, None] @ stiffness @ maps[:, None]  # [Q, 4, 4, 6, 6]

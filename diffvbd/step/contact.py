@@ -72,10 +72,10 @@ class Outcome(NamedTuple):
 class Met:
     """What the parts of a step meet one after another."""
 
-    def __init__(self) -> None:
+    def __init__(self, x: Tensor) -> None:
         self.found: list[Detection] = []
         self.counts: list[Tensor] = []
-        self.cut = torch.zeros(())
+        self.cut = torch.zeros_like(x[..., 0], dtype=torch.bool)
 
 
 outcomes: weakref.WeakKeyDictionary[Model, Outcome] = weakref.WeakKeyDictionary()
@@ -144,7 +144,7 @@ class ContactStep:
         damping = self._parameter("pair_barrier.damping", zero)
         lag = torch.cat([of_pair(coefficient) * force, of_pair(damping) * active, rest], -1)
         if self._reads(force):  # most of what is listed does not touch yet
-            rows = (lag[:, :2] != 0).any(-1).nonzero()[:, 0]
+            rows = (active[:, 0] != 0).nonzero()[:, 0]
             listed, lag = some_of(listed, rows, self._points), lag[rows]
         self.lagged, self.lag = listed, lag
 
@@ -178,7 +178,7 @@ class ContactStep:
         pinned = self.model._pinned[:, None]
         lift = torch.where(pinned, 0.0, broadcast(self.begun.lift, self.begun.y.shape))
         x, way = self.x_prev, self.begun.y - self.x_prev - lift
-        left, met = way, Met()
+        left, met = way, Met(x)
         for r, sweeps in enumerate(sweeps_of_parts(settings.sweeps, self.parts)):
             was, now = (self._colliders_at(n / self.parts) for n in (r, r + 1))
             # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
@@ -196,6 +196,7 @@ class ContactStep:
                                          detection, surface)  # fmt: skip
             met.counts.append(torch.cat([detection.counts[:3], start.stuck]))
             if not x.is_cuda and not torch.compiler.is_compiling():
+                self._record(met)  # what is refused can be looked at
                 self._check(r, met.counts[-1].tolist())
             between = self._between(detection.listed)
             x, first = self._corrected(start.x, now, start, between)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..adjoint.contact_lag import Pairs, pair_lag, some_of
+from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
 from ..adjoint.sums import sum_by
 from ..contact.surface import ContactSurface
 from ..ops import broadcast
@@ -53,7 +53,7 @@ class Scenes(NamedTuple):
 
 
 class _PairTerms(NamedTuple):
-    """What pairs add: force [n, 3] on the first side's motion, its derivative [n, 3, 3], weights [n, 4], and the
+    """What pairs add: gradient [n, 3] by the first side's motion, its derivative [n, 3, 3], weights [n, 4], and the
     potential [n] of which they are."""
 
     listed: Pairs
@@ -61,6 +61,8 @@ class _PairTerms(NamedTuple):
     stiffness: Tensor
     weights: Tensor
     value: Tensor
+    within: bool  # whether pairs of one body turn it: friction acts along a gap, at an arm of it
+    at_corners: Tensor | None = None  # what is added to the gradient at each corner [n, 4, 3]
 
 
 def correct(s: Scenes, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -206,7 +208,10 @@ def _pair_terms(s: Scenes, x: Tensor) -> list[_PairTerms]:
         b, slope, curvature = _log_barrier(gap, torch.where(near, dhat, 1.0))
         # the force carries stiffness and mollifier: what is left are ratios of the barrier's derivatives
         load = h2 * torch.where(near, force[:, 0] / -slope, 0.0)
-        out.append(_PairTerms(s.listed, -h2 * force * n, (load * curvature)[:, None, None] * _outer(n), w, load * b))
+        kappa = s.kappa if s.kappa.shape[0] == 1 else of_scene(s.kappa, s.listed)
+        turned = torch.where(near, h2 * kappa * b, 0.0)[:, None, None] * _mollifier_gradient(at, s.listed)
+        stiffness = (load * curvature)[:, None, None] * _outer(n)
+        out.append(_PairTerms(s.listed, -h2 * force * n, stiffness, w, load * b, False, turned))
     if s.lag.numel():
         load, rate, n, w = s.lag.split((1, 1, 3, 4), -1)
         scene, corners = _corners(s.lagged)
@@ -219,8 +224,22 @@ def _pair_terms(s: Scenes, x: Tensor) -> list[_PairTerms]:
         eye = torch.eye(3, dtype=x.dtype, device=x.device)
         stiffness = slip[..., None] * (eye - _outer(n)) + (h * rate)[..., None] * _outer(n)
         value = h2 * load[:, 0] * potential + 0.5 * h * (rate * approach**2)[:, 0]
-        out.append(_PairTerms(s.lagged, slip * u + h * rate * approach * n, stiffness, w, value))
+        out.append(_PairTerms(s.lagged, slip * u + h * rate * approach * n, stiffness, w, value, True))
     return out
+
+
+def _mollifier_gradient(at: Tensor, listed: Pairs) -> Tensor:
+    """Of e = s (2 - s) by the corners [n, 4, 3] at ``at``; zero where nothing is mollified. Twin of
+    csrc/contact/geometry.h."""
+    threshold = listed.constants[:, 2]
+    u, v = at[:, 1] - at[:, 0], at[:, 3] - at[:, 2]
+    c = torch.linalg.cross(u, v)
+    square = (c * c).sum(-1)
+    close = (listed.pairs[:, 4] == 1) & (square < threshold)
+    safe = torch.where(close, threshold, 1.0)
+    slope = torch.where(close, 4 * (1 - square / safe) / safe, 0.0)[:, None]
+    by_u, by_v = slope * torch.linalg.cross(v, c), slope * torch.linalg.cross(c, u)
+    return torch.stack([-by_u, by_u, -by_v, by_v], 1)
 
 
 def _potential(s: Scenes, x: Tensor) -> Tensor:
@@ -233,9 +252,9 @@ def _potential(s: Scenes, x: Tensor) -> Tensor:
     return value
 
 
-def _sides(s: Scenes, bodies: _Bodies, listed: Pairs, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows of the bodies of both sides of pairs [n, 2], -1 where one does not move or both are one; and how sides move
-    with their bodies [n, 2, 3, 6]."""
+def _sides(s: Scenes, bodies: _Bodies, listed: Pairs, within: bool) -> tuple[Tensor, Tensor]:
+    """Rows of the bodies of both sides of pairs [n, 2], -1 where one does not move or, unless ``within``, both are one;
+    and how corners move with the body of each side [n, 2, 4, 3, 6], zero where they are of the other."""
     surface = s.surface
     assert surface is not None
     scene, corners = _corners(listed)
@@ -246,11 +265,12 @@ def _sides(s: Scenes, bodies: _Bodies, listed: Pairs, weights: Tensor) -> tuple[
     body = surface.body.long()[lead]
     mesh = body < bodies.count
     rows = scene * bodies.count + body.clamp(max=bodies.count - 1)
-    there = mesh & bodies.free.reshape(-1)[rows] & (body[:, :1] != body[:, 1:]) & (kind >= 0)
+    there = mesh & bodies.free.reshape(-1)[rows] & (kind >= 0)
+    if not within:
+        there = there & (body[:, :1] != body[:, 1:])
     arms = bodies.arm[scene, corners.clamp(max=bodies.arm.shape[1] - 1)]
-    one = weights[..., None, None] * _turning(arms)
-    maps = torch.stack([torch.where(side[..., None, None], one, 0.0).sum(1) for side in (first, ~first)], 1)
-    return torch.where(there, rows, -1), torch.where(there[..., None, None], maps, 0.0)
+    of_side = torch.stack([first, ~first], 1) & there[..., None]
+    return torch.where(there, rows, -1), torch.where(of_side[..., None, None], _turning(arms)[:, None], 0.0)
 
 
 def _newton_step(s: Scenes, bodies: _Bodies, x: Tensor) -> Tensor:
@@ -263,9 +283,12 @@ def _newton_step(s: Scenes, bodies: _Bodies, x: Tensor) -> Tensor:
     own = bodies.sum(maps.mT @ stiffness @ maps).reshape(rows, 6, 6)
     across = []
     for terms in _pair_terms(s, x):
-        row, maps = _sides(s, bodies, terms.listed, terms.weights)
+        row, corners = _sides(s, bodies, terms.listed, terms.within)
+        maps = (terms.weights[:, None, :, None, None] * corners).sum(2)
         at = row.clamp(min=0)
         pulled = (maps.mT @ terms.force[:, None, :, None])[..., 0]
+        if terms.at_corners is not None:
+            pulled = pulled + (corners.mT @ terms.at_corners[:, None, ..., None])[..., 0].sum(2)
         g = g + sum_by(pulled.flatten(0, 1), at.flatten(), rows)
         pressed = terms.stiffness[:, None] @ maps
         # where sides are not solved for together, each bears what both would: then no step is too long
@@ -328,7 +351,7 @@ def _touching(s: Scenes, bodies: _Bodies, x: Tensor) -> list[Tensor]:
     if not s.listed.pairs.shape[0]:
         return []
     state = pair_lag(x, s.collider, s.kappa, s.origin, s.listed)
-    row, _ = _sides(s, bodies, s.listed, state[:, 5:])
+    row, _ = _sides(s, bodies, s.listed, within=False)
     acts = (state[:, 1] > 0) & (row >= 0).all(1)
     return [torch.where(acts[:, None], row, 0)]
 
