@@ -81,7 +81,7 @@ def test_another_thread_is_not_recorded() -> None:
             dv.step(model, x, torch.zeros_like(x), **OPTIONS)
         dv.step(model, x, torch.zeros_like(x), **OPTIONS)
     dv.step(model, x, torch.zeros_like(x), **OPTIONS)
-    assert (len(mine), len(inner)) == (4, 2)
+    assert (len(mine), len(inner)) == (2, 1)
 
 
 def test_tasks_are_apart() -> None:
@@ -121,9 +121,9 @@ def test_a_checkpointed_backward_in_another_thread_is_recorded() -> None:
     v = torch.zeros_like(x, requires_grad=True)
     with dv.contact.record() as found:
         end = dv.rollout(model, x, v, steps=4, checkpoint_every=2, save="last", **OPTIONS)
-        assert len(found) == 8
+        assert len(found) == 4
         assert not in_thread(end.x[-1].sum().backward)
-    assert len(found) == 16 and v.grad is not None and v.grad.abs().max() > 0
+    assert len(found) == 8 and v.grad is not None and v.grad.abs().max() > 0
 
 
 def test_a_compiled_step_sees_the_switch() -> None:

@@ -186,17 +186,19 @@ class ContactStep:
             fall = lift if r == 0 else torch.zeros_like(lift)
             detection = self._detect(x, was, now, move, fall)
             met.found.append(detection)
+            met.counts.append(torch.cat([detection.counts[:3], torch.zeros_like(detection.counts[:1])]))
             if not x.is_cuda and not torch.compiler.is_compiling():  # reading is free: before any work
-                self._check(r, [*detection.counts[:3].tolist(), 0])
+                self._record(met)  # what is refused can be looked at
+                self._check(r, met.counts[-1].tolist())
             if r == 0:
                 self._set_lag(detection.listed, was)
                 fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
                                           self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
                                          detection, surface)  # fmt: skip
-            met.counts.append(torch.cat([detection.counts[:3], start.stuck]))
+            met.counts[-1] = torch.cat([detection.counts[:3], start.stuck])
             if not x.is_cuda and not torch.compiler.is_compiling():
-                self._record(met)  # what is refused can be looked at
+                self._record(met)
                 self._check(r, met.counts[-1].tolist())
             between = self._between(detection.listed)
             x, first = self._corrected(start.x, now, start, between)

@@ -14,7 +14,7 @@ from ..model.model import Model
 from ..ops import broadcast
 
 ROOM = 1.5  # how far a vertex may go, over how far the farthest of its body wants to
-LEAST_ROOM = 0.25  # of dhat, beside that
+LEAST_ROOM = 1.0  # of dhat, beside that: as far as a barrier that starts compressed may push
 
 
 def _tiny(x: Tensor) -> float:

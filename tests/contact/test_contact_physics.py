@@ -25,7 +25,7 @@ def pair_forces(model: dv.Model, x: Tensor, detection: dv.contact.Detection) -> 
     """Force of the barrier on every corner point at the state x [N], by autograd, and e b' of each listed pair."""
     count = int(detection.counts[0])
     pairs, (dhat, offset, threshold) = detection.listed.pairs[:count].cpu().long(), (
-        detection.listed.constants[:count].cpu().unbind(1)
+        detection.listed.constants[:count, :3].cpu().unbind(1)
     )  # fmt: skip
     points = torch.cat([x, model.collider_points]).detach().cpu().requires_grad_()
     corners, kappa = points[pairs[:, :4]], torch.tensor(model.contact.kappa).double()
@@ -132,8 +132,9 @@ def test_pair_forces_are_equal_and_opposite() -> None:
 @pytest.mark.parametrize("detections", (1, 2))
 @pytest.mark.parametrize("lagged", (False, True), ids=("barrier", "with_friction_and_damping"))
 def test_collision_conserves_momentum(lagged: bool, detections: int) -> None:
-    """Without gravity sum m v is kept by every step: to rounding at K = 400, not at K = 1. The barrier keeps
-    L_{n+1} - L_n = h sum m v_{n+1} x v_n, too; friction acts along the gap, at an arm of it."""
+    """Without gravity sum m v is kept by every step, to rounding, at K = 1 as at K = 400: bodies that touch are corrected
+    together. The barrier keeps L_{n+1} - L_n = h sum m v_{n+1} x v_n, too; friction acts along the gap, at an arm of
+    it."""
     options: dict[str, Any] = {"damping": 3.0, "friction": (dv.Friction(0.4, 0.05),)} if lagged else {}
     h, drift = 5e-3, {}
     for sweeps in (1, 400):
@@ -150,8 +151,7 @@ def test_collision_conserves_momentum(lagged: bool, detections: int) -> None:
         assert float((per_body(model, mass * v) - first)[0, 0]) < -0.5 * size / 2  # they did collide
         drift[sweeps] = linear / size, angular / size
     print(f"{lagged=} {detections=} drift (linear, angular) by K: {drift}")
-    assert drift[400][0] <= tolerance("momentum")
-    assert drift[1][0] > 1e-4  # sweeps that have not converged drift: documented, not hidden
+    assert max(drift[1][0], drift[400][0]) <= tolerance("momentum")
     if lagged:
         assert drift[400][1] <= tolerance("friction_torque")
     else:

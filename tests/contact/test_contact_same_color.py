@@ -99,6 +99,8 @@ def test_the_color_moves_as_one(device: str, name: str, sweeps: int) -> None:
     _, parts = compiled(scene, steps, sweeps)
     expected = unrolled(scene, steps, sweeps, parts)
     permuted = unrolled(scene, steps, sweeps, parts, seed=1)
+    # what one rounding of the start makes of the same executed sequence
+    moved = unrolled(replace(scene, x=torch.nextafter(scene.x, scene.x + 1)), steps, sweeps, parts)
     start = scene.x.reshape(-1, *scene.x.shape[-2:])
     inside, third = met(scene.model, parts[0], start)
     assert inside > 0 and (third > 0 or name == "two_tets"), (inside, third)
@@ -107,7 +109,7 @@ def test_the_color_moves_as_one(device: str, name: str, sweeps: int) -> None:
         assert [len(p.pairs) for p in found] == [len(p.pairs) for p in parts]
         assert result.keys() == expected.keys()
         for key, value in result.items():
-            spread = relative_error(permuted[key], expected[key])
+            spread = max(relative_error(other[key], expected[key]) for other in (permuted, moved))
             floor = tolerance("contact_adjoint") if key.startswith("grad") else tolerance("contact_forward")
             floor = floor / scene.time_step if key == "v" else floor
             error = relative_error(value, expected[key])

@@ -24,15 +24,16 @@ def timeless(history: list[Row]) -> list[Row]:
     return [{key: value for key, value in row.items() if key != "seconds"} for row in history]
 
 
-def check_fall(name: str, out: Path, factor: float, iterations: int | None = None, **options: Any) -> Result:
-    """The last stage of a quick run ends with at most `factor` of the loss that the stage began with."""
+def check_fall(name: str, out: Path, factor: float, iterations: int | None = None, whole: bool = False,
+               **options: Any) -> Result:  # fmt: skip
+    """The last stage of a quick run ends with at most `factor` of the loss that the stage began with, or the run."""
     problem, settings = quick(name, out, **options)
     if iterations is not None:
         for stage in problem.stages:
             stage.iterations = min(stage.iterations, iterations)
     result = solve(problem, settings)
     last = [row for row in result.history if row.get("stage", 0) == len(problem.stages) - 1]
-    assert result.best["loss"] <= factor * last[0]["loss"]
+    assert result.best["loss"] <= factor * (result.history if whole else last)[0]["loss"]
     # the best parameters are back in place
     stage = problem.stages[-1]
     if stage.before:

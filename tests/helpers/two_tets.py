@@ -17,7 +17,7 @@ from diffvbd.testing import generator
 
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 EDGES = np.array(list(itertools.combinations(range(4), 2)))
-DHAT, REACH, CAP, GAMMA = 0.6, 0.8, 0.25, 0.4
+DHAT = 0.6
 
 
 def two_tets(gap: float = 0.03) -> dv.TetMesh:
@@ -48,7 +48,6 @@ def stand_in(model: dv.Model, **changes: Any) -> Any:
     values |= {
         "body": torch.tensor([0] * 4 + [1] * 4),
         "contact": SimpleNamespace(**barrier),
-        "contact_numbers": (REACH, CAP, GAMMA),
         "friction": SimpleNamespace(coefficient=0.4, velocity=0.05),
         "collider_points": COLLIDERS,
         "surface_of_contact": SimpleNamespace(radius=RADII),
@@ -81,7 +80,7 @@ def detect(model: Any, x: Tensor, before: Tensor, now: Tensor, island: list[list
     rest = torch.cat((model.rest_points, model.collider_points))[corners]
     edges = ((rest[:, 1] - rest[:, 0]) ** 2).sum(-1), ((rest[:, 3] - rest[:, 2]) ** 2).sum(-1)
     threshold = torch.where(kind == distance.EDGE_EDGE, 1e-3 * edges[0] * edges[1], 0.0)
-    rows, constants, near = [], [], torch.full((len(x), 14, 5), -1)
+    rows, constants = [], []
     for b in range(len(x)):
         points = torch.cat((x[b], torch.where(model.plane_points[:, None], now[b], before[b])))
         gap = distance.distance(kind, points[corners]) - offset
@@ -89,12 +88,8 @@ def detect(model: Any, x: Tensor, before: Tensor, now: Tensor, island: list[list
         tail = torch.stack((kind, torch.full_like(kind, b)), 1)
         rows.append(torch.cat((corners, tail), 1)[listed])
         constants.append(torch.stack((torch.full_like(gap, model.contact.dhat), offset, threshold), 1)[listed])
-        for i in range(14):
-            own = torch.where((corners == i).any(1), gap, torch.inf)
-            best = int(own.argmin())
-            if own[best] < REACH:
-                near[b, i] = torch.tensor([*corners[best].tolist(), int(kind[best])])
-    return reference.Part(torch.cat(rows), torch.cat(constants), near, torch.tensor(island))
+    shares, corrections = torch.ones((2, *x.shape[:2])), torch.ones((2, len(x), 2))
+    return reference.Part(torch.cat(rows), torch.cat(constants), torch.tensor(island), shares, corrections)
 
 
 def scene_of(model: Any, x: Tensor, parameters: dict[str, Any] | None = None) -> Any:

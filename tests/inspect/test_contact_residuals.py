@@ -47,7 +47,7 @@ def grip() -> tuple[dv.Model, dict[str, Any], torch.Tensor, torch.Tensor]:
 
 def test_friction_that_has_not_converged_is_named() -> None:
     model, options, x, v = grip()
-    few, _ = dv.step(model, x, v, sweeps=4, **options)
+    few, _ = dv.step(model, x, v, sweeps=1, **options)
     with pytest.warns(UserWarning) as warned:
         bad = dv.diagnose(model, few, previous=(x, v), **options)
     texts = [str(w.message) for w in warned]
@@ -68,7 +68,7 @@ def test_a_body_is_not_hidden_by_the_forces_of_others() -> None:
     model, options, x, v = grip()
     few, _ = dv.step(model, x, v, sweeps=4, **options)
     told = dv.diagnose(model, few, previous=(x, v), warn=False, **options)
-    assert told.residuals.argmax() == 0 and told.unbalanced <= float(told.residuals.max())
+    assert told.residuals.argmax() == 0 and told.unbalanced <= float(told.residuals.max()) * (1 + tolerance("formula"))
 
 
 def test_float32_has_the_residual_of_float64(device: str) -> None:
