@@ -7,6 +7,7 @@ read both before either moves, and the reverse must know both adjoints before it
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
