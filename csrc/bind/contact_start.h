@@ -2,6 +2,7 @@
 #pragma once
 
 #include "../contact/advance.h"
+#include "../contact/narrow.h"
 #include "../contact/start.h"
 #include "../contact/translation.h"
 #include "contact.h"
@@ -123,6 +124,24 @@ contact::AdvanceInputs<T> advance_inputs(const AdvanceTensors& t) {
   in.scenes = b;
   in.vertices = static_cast<int32_t>(v), in.corners = static_cast<int32_t>(v + colliders);
   in.bodies = static_cast<int32_t>(t.u.size(1));
+  return in;
+}
+
+template <class T>
+contact::NarrowInputs<T> narrow_inputs(const Tensor& x, const Tensor& origin, const Tensor& collider,
+                                       const Tensor& room, const Tensor& pairs, const Tensor& constants) {
+  require_vectors(x, x);
+  const int64_t b = x.size(0), v = x.size(1), colliders = collider.dim() == 3 ? collider.size(1) : 0;
+  require_like("collider", collider, x, b * colliders * 3);
+  require_like("room", room, x, b * v);
+  require(pairs.dim() == 2 && pairs.size(1) == contact::kPairRow && is_index(pairs, x),
+          "diffvbd::contact_narrow: expected pairs int32 [pairs, 6]");
+  require_like("constants", constants, x, pairs.size(0) * contact::kConstants);
+  contact::NarrowInputs<T> in{};
+  in.x = data<const T>(x), in.collider = data<const T>(collider), in.room = data<const T>(room);
+  in.origin = batched_or_null<T>("origin", origin, x, b, 3 * v).data;
+  in.pairs = data<const int32_t>(pairs), in.constants = data<const T>(constants);
+  in.vertices = static_cast<int32_t>(v), in.colliders = static_cast<int32_t>(colliders);
   return in;
 }
 

@@ -57,6 +57,10 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "contact_translation_backward(Tensor u_bar, Tensor move, Tensor mass, Tensor x, Tensor origin, Tensor planes, "
       "Tensor held, Tensor body, Tensor body_order, Tensor body_ptr, Tensor island, Tensor lowest) -> (Tensor move, "
       "Tensor mass, Tensor x, Tensor planes)");
+  // constants with the gaps of the pairs where the vertices are now, see contact/narrow.h
+  m.def(
+      "contact_narrow(Tensor x, Tensor origin, Tensor collider, Tensor room, Tensor pairs, Tensor constants) -> "
+      "Tensor");
   // Where each vertex wants to be, see contact/start.h; planes and origin may be empty. The adjoint: of x, move, u and
   // planes, the last two for each vertex.
   m.def(

@@ -57,7 +57,7 @@ DIFFVBD_FN Vec3<T> way_of(const AdvanceInputs<T>& in, int64_t scene, int32_t v) 
 template <class T>
 struct Attempt {
   Corners<T> corners;
-  Vec3<T> way[4];
+  Vec3<T> way[4], since[4];  // since the gaps of pairs were taken they have moved by `since`
   bool free[4];
   T guard;
 };
@@ -74,7 +74,7 @@ DIFFVBD_FN Attempt<T> attempt(const AdvanceInputs<T>& in, const AdvanceState<T>&
       const int64_t row = 3 * (scene * (in.corners - in.vertices) + v - in.vertices);
       const Vec3<T> was = vector_at(in.collider + row), next = vector_at(in.collider_next + row);
       const bool still = pair[4] == kPointPlane || !s.first;  // planes were looked for where they end
-      at[k] = still ? next : was, from[k] = zero3<T>();
+      at[k] = still ? next : was, from[k] = out.since[k] = zero3<T>();
       out.way[k] = still ? zero3<T>() : next - was;
       out.free[k] = false;
     } else {
@@ -82,6 +82,7 @@ DIFFVBD_FN Attempt<T> attempt(const AdvanceInputs<T>& in, const AdvanceState<T>&
       const Vec3<T> whole = way_of(in, scene, v);
       const T done = in.held[v] ? T(s.first ? 0 : 1) : s.share[row];
       at[k] = vector_at(in.x + 3 * row) + done * whole;
+      out.since[k] = at[k] - vector_at(in.center + 3 * row);
       from[k] = in.origin ? vector_at(in.origin + 3 * row) : zero3<T>();
       out.way[k] = ((T(1) - done) * (in.held[v] ? T(1) : s.now[row])) * whole;
       out.free[k] = !in.held[v];
@@ -93,6 +94,29 @@ DIFFVBD_FN Attempt<T> attempt(const AdvanceInputs<T>& in, const AdvanceState<T>&
   for (int k = 0; k < 4; ++k) out.corners.x[k] = k == 0 ? zero3<T>() : (at[k] - at[0]) + (from[k] - from[0]);
   out.guard = T(kGuardUlps) * std::numeric_limits<T>::epsilon() * size;
   return out;
+}
+
+// Whether a pair stays out of the barrier's reach all the way, however its corners go: by its gap when that was taken.
+template <class T>
+DIFFVBD_FN bool stays_far(const AdvanceInputs<T>& in, const Attempt<T>& a, const int32_t* pair, const T* constants) {
+  Vec3<T> was[4], end[4];
+  for (int k = 0; k < 4; ++k) {
+    if (pair[k] >= in.vertices) return false;  // whose gap may be of another time
+    was[k] = a.since[k];
+    end[k] = was[k] + a.way[k];
+  }
+  const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - a.guard;
+  if (!(T(0) < room)) return false;
+  T most = T(0);
+  for (int i = 0; i < sides(pair[4]); ++i) {
+    for (int j = sides(pair[4]); j < 4; ++j) {
+      for (const Vec3<T>& d : {was[i] - was[j], end[i] - end[j]}) {
+        const T square = dot(d, d);
+        most = most < square ? square : most;
+      }
+    }
+  }
+  return most < room * room;
 }
 
 // Marks the corners that keep a pair from being safe; returns whether it is. Round 0 looks at all pairs, later ones at
@@ -115,6 +139,7 @@ DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, i
     careful = careful || (in.careful && a.free[k] && T(0) < size);  // what is prescribed may come closer
   }
   if (!moves[0] && !moves[1]) return true;
+  if (stays_far(in, a, record, constants)) return true;
   const Gate<T> gate(record[4], a.corners, constants, a.guard);
   const T each = moves[0] && moves[1] ? T(kBothShare) : T(kShare), shares[4] = {each, each, each, each};
   if (gate.holds(a.way, shares, careful) || stays_apart(gate, a.way, careful)) return true;

@@ -51,7 +51,7 @@ template <class T>
 struct Detected {
   int64_t capacity;
   int32_t* pairs;         // [capacity, 6]  corner points, kind, scene
-  T* constants;           // [capacity, 8]  dhat, offset, threshold; what limit.h takes as hints
+  T* constants;           // [capacity, 8]  dhat, offset, threshold; what limit.h takes as hints, the pair's gap last
   int32_t *ptr, *entry;   // [B N + 1], [4 capacity]  pairs of each corner point: 4 pair + local corner
   int32_t* near_corners;  // [B, N, 5]  of the near pair, and its kind; or itself and -1
   T* near_values;         // [B, N, 8]  weights, normal, gap

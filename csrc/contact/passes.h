@@ -26,8 +26,8 @@ struct ContactInputs {
   const T* lag = nullptr;                    // [pairs, kLagScalars]  of the lagged
   Batched<const T> kappa;                    // [B]
   Batched<const T> collider, collider_prev;  // [B, Vc, 3]  during the sweeps; at the start of the step
-  const T* center = nullptr;                 // [B, V, 3]  from where a vertex may go
-  const T* room = nullptr;                   // [B, V]  as far as this [m]
+  const T* center = nullptr;                 // [B, V, 3]  where it starts
+  const T* room = nullptr;                   // [B, V]  how far from there it may go [m]
   Batched<const T> floor_lag;                // [B, V, planes, 4]  coefficient times normal force, normal
   int planes = 0;
   Batched<const T> x_prev, origin;  // [B, V, 3]; origin may be null
@@ -89,11 +89,9 @@ struct Source {
     for (int k = 1; k < 4; ++k) out.x[k] = (x(pair[k]) - x0) + (origin(pair[k]) - o0);
     return out;
   }
-  // How a corner point has moved since the pairs were found, beside its island.
+  // How a corner point has moved since the start of the part, at which the gaps of pairs were taken.
   DIFFVBD_FN Vec3<T> moved(int v) const {
-    if (v < in.num_vertices) return positions(v) - in.center_of(scene, v);
-    const int64_t row = 3 * (v - in.num_vertices);
-    return x(v) - vector_at(in.collider_prev.data + scene * in.collider_prev.scene + row);
+    return v < in.num_vertices ? positions(v) - in.center_of(scene, v) : zero3<T>();
   }
   // Square of how far the closest points of two sides can have moved relative to each other since then.
   DIFFVBD_FN T squared_change(const int32_t* pair) const {

@@ -2,11 +2,16 @@
 #pragma once
 
 #include "../contact/advance.h"
+#include "../contact/narrow.h"
 
 namespace diffvbd {
 
 // share [B, V]; returns how many pairs what is prescribed would bring too close.
 template <class T>
 int64_t advance(const contact::AdvanceInputs<T>& in, T* share);
+
+// constants [pairs, 8] (contact/narrow.h).
+template <class T>
+void narrow(const contact::NarrowInputs<T>& in, int64_t pairs, T* constants);
 
 }  // namespace diffvbd

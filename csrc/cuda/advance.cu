@@ -72,6 +72,13 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    narrow_kernel(const __grid_constant__ NarrowInputs<T> in, int64_t pairs, T* constants) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < pairs) narrow_pair(in, i, constants + kConstants * i);
+}
+
 // Bytes of each part of the workspace, rounded up to what any type needs.
 constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
 
@@ -111,8 +118,17 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
   return cudaLaunchCooperativeKernel(kernel, dim3(blocks), dim3(kThreads), arguments, 0, stream);
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                          \
-  template int64_t advance_workspace_bytes<T>(const AdvanceInputs<T>&); \
+template <class T>
+cudaError_t narrow(const NarrowInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream) {
+  if (pairs == 0) return cudaSuccess;
+  const auto blocks = static_cast<unsigned>((pairs + kThreads - 1) / kThreads);
+  narrow_kernel<T><<<blocks, kThreads, 0, stream>>>(in, pairs, constants);
+  return cudaGetLastError();
+}
+
+#define DIFFVBD_INSTANTIATE(T)                                                       \
+  template cudaError_t narrow<T>(const NarrowInputs<T>&, int64_t, T*, cudaStream_t); \
+  template int64_t advance_workspace_bytes<T>(const AdvanceInputs<T>&);              \
   template cudaError_t advance<T>(const AdvanceInputs<T>&, int64_t, T*, int64_t*, void*, int, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

@@ -4,6 +4,7 @@
 #include <cuda_runtime_api.h>
 
 #include "../contact/advance.h"
+#include "../contact/narrow.h"
 
 namespace diffvbd::cuda {
 
@@ -15,5 +16,9 @@ int64_t advance_workspace_bytes(const contact::AdvanceInputs<T>& in);
 template <class T>
 cudaError_t advance(const contact::AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* stuck, void* workspace,
                     int multiprocessors, cudaStream_t stream);
+
+// constants [pairs, 8] (contact/narrow.h).
+template <class T>
+cudaError_t narrow(const contact::NarrowInputs<T>& in, int64_t pairs, T* constants, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -54,6 +54,17 @@ def advance(x: Tensor, move: Tensor, u: Tensor, center: Tensor, origin: Tensor, 
     return raw.contact_advance(x, move, u, center, origin, collider, collider_next, held, body, room, *listed, careful)
 
 
+def narrow(x: Tensor, origin: Tensor, collider: Tensor, room: Tensor, pairs: Tensor, constants: Tensor) -> Tensor:
+    """``constants`` of listed pairs with their gaps at x in the last column, infinite where sides cannot come within
+    reach as long as no vertex goes farther than its room [B, V] [m]. Not differentiable."""
+    return raw.contact_narrow(x, origin, collider, room, pairs, constants)
+
+
+@shapes_of("contact_narrow")
+def _(x, origin, collider, room, pairs, constants):
+    return torch.empty_like(constants)
+
+
 @shapes_of("contact_advance")
 def _(x, move, u, center, origin, collider, collider_next, held, body, room, pairs, constants, ptr, entry,
       careful):  # fmt: skip
@@ -84,6 +95,7 @@ def _(bar, x, move, u, planes, origin, held, body, filter_eta, wants_planes):
 
 for _name in (
     "contact_advance",
+    "contact_narrow",
     "contact_translation",
     "contact_translation_backward",
     "contact_start",

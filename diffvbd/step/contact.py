@@ -18,11 +18,12 @@ from ..contact.start import PartStart, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
+from ..ops import contact_start as ops_start
 from ..ops.detect import CONSTANTS
 from ..scopes import checking, recorders
 from .intersections import refuse_intersections
 from .rigid_contact import Scenes, correct
-from .rooms import rooms, unsupported
+from .rooms import rooms, rooms_of_sweeps, unsupported
 
 if TYPE_CHECKING:
     from .arguments import Prepared
@@ -58,6 +59,7 @@ class Detection(NamedTuple):
     shares: Tensor | None = None
     corrections: Tensor | None = None
     limits: Tensor | None = None
+    kept: Tensor | None = None  # rows of listed pairs that its sweeps can reach; all where that would have to be read
 
 
 class Outcome(NamedTuple):
@@ -157,6 +159,18 @@ class ContactStep:
     def _points(self) -> int:
         return self.x_prev.shape[1] + self.before.shape[1]
 
+    def _narrowed(self, listed: Pairs, x: Tensor, collider: Tensor, room: Tensor) -> tuple[Pairs, Tensor | None]:
+        """The pairs that can matter as long as no vertex goes farther than its room [B, V] from x, with their gaps
+        there; and which of the listed these are. All, with infinite gaps, where that would have to be read."""
+        with torch.no_grad():
+            constants = ops_start.narrow(x.detach().contiguous(), self.origin, collider.detach().contiguous(), room,
+                                         listed.pairs, listed.constants)  # fmt: skip
+        near = listed._replace(constants=constants)
+        if not self._reads(x):
+            return near, None
+        rows = (constants[:, -1] < torch.inf).nonzero()[:, 0]
+        return some_of(near, rows, self._points), rows
+
     def _between(self, listed: Pairs) -> Pairs:
         """The pairs between bodies, which alone have a say in rigid motions; all where that would have to be read."""
         surface = self.surface
@@ -200,18 +214,22 @@ class ContactStep:
             if not x.is_cuda and not torch.compiler.is_compiling():
                 self._record(met)
                 self._check(r, met.counts[-1].tolist())
-            between = self._between(detection.listed)
+            room = rooms_of_sweeps(surface, barrier, start, self.fields.mass, x, move, fall)
+            near, kept = self._narrowed(detection.listed, start.x, now, room)
+            start = start._replace(center=start.x.detach(), room=room)
+            between = self._between(near)
             x, first = self._corrected(start.x, now, start, between)
             taken, limits, cut = [first], None, start.short
             if sweeps:
                 part = settings._replace(sweeps=sweeps)
-                x, limits = self._sweep(x, start.center, start.room, now, detection.listed, part, policy, debug_step)
+                x, limits = self._sweep(x, start.center, start.room, now, near, part, policy, debug_step)
                 x, last = self._corrected(x, now, start, between)
                 taken.append(last)
                 cut = cut | (limits[:, -1] > 0)
             met.cut = cut
             for found in recorders():
-                found.append(detection._replace(shares=start.shares, corrections=torch.stack(taken), limits=limits))
+                taken_all = torch.stack(taken)
+                found.append(detection._replace(shares=start.shares, corrections=taken_all, limits=limits, kept=kept))
             left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
         return self._judged(x, met)
 

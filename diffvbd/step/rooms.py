@@ -9,6 +9,7 @@ from ..adjoint.contact_lag import Pairs, pair_lag
 from ..adjoint.sums import sum_by
 from ..contact import detection as search
 from ..contact.barrier import PairBarrier
+from ..contact.start import PartStart
 from ..contact.surface import ContactSurface
 from ..model.model import Model
 from ..ops import broadcast
@@ -27,6 +28,33 @@ def _by_body(values: Tensor, surface: ContactSurface) -> Tensor:
     scene = surface.bodies * torch.arange(scenes, device=values.device)[:, None]
     rows = (scene + surface.body[:vertices].long()).reshape(-1)
     return sum_by(values.flatten(0, 1), rows, scenes * surface.bodies).unflatten(0, (scenes, surface.bodies))
+
+
+@torch.no_grad()
+def rooms_of_sweeps(surface: ContactSurface, barrier: PairBarrier, start: PartStart, mass: Tensor, begin: Tensor,
+                    move: Tensor, fall: Tensor) -> Tensor:  # fmt: skip
+    """How far the sweeps may carry a vertex from its start [B, V] [m]: as far as a barrier pushes, weight pulls,
+    elasticity takes back what its body deforms by on the way and, of what pairs have held up, all. Index data.
+
+    Args:
+        start: The part's; its rooms bound the whole way.  mass: [1 | B, V].
+        begin: Where the part began.  move, fall: Where each vertex wanted to go from there. All [B, V, 3] [m].
+    """
+    mass, begin, move, fall, at = (t.detach() for t in (mass, begin, move, fall, start.x))
+    scenes, vertices = at.shape[:2]
+    body, free = surface.body[:vertices].long(), ~surface.held[:vertices]
+    weight = torch.where(free, broadcast(mass, (scenes, vertices)), 0.0)[..., None]
+    sums = _by_body(torch.cat([weight * move, weight], -1), surface)
+    mean = (sums[..., :3] / sums[..., 3:].clamp(min=_tiny(at)))[:, body]
+    rows = broadcast(body[None], (scenes, vertices))
+
+    def largest(way: Tensor) -> Tensor:
+        length = torch.where(free, way.square().sum(-1).sqrt(), 0.0)
+        return length.new_zeros((scenes, surface.bodies)).scatter_reduce(1, rows, length, "amax")
+
+    wish = largest(fall) + largest(move - mean) + ROOM * largest(begin + move + fall - at) + LEAST_ROOM * barrier.dhat
+    left = (start.room - (at - start.center).square().sum(-1).sqrt()).clamp(min=0)
+    return torch.where(free, torch.minimum(left, wish[:, body]), 0.0)
 
 
 @torch.no_grad()

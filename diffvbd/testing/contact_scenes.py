@@ -161,9 +161,13 @@ def part_of(detection: Any) -> reference.Part:
     if detection.limits is not None:
         exponents = detection.limits.cpu().double().movedim(1, 0)
         limits = torch.where(exponents < NO_MOVE, 0.5**exponents, 0.0)
-    return reference.Part(detection.listed.pairs[:count].cpu().long(), detection.listed.constants[:count].cpu(),
-                          detection.island.cpu().long(), detection.shares.cpu(), detection.corrections.cpu(), limits,
-                          lowest)  # fmt: skip
+    pairs, constants = detection.listed.pairs[:count].cpu().long(), detection.listed.constants[:count].cpu()
+    if detection.kept is not None:  # those that the sweeps can reach, and those that friction at the start is of
+        rows = constants[:, -1] < constants[:, 0]
+        rows[detection.kept] = True
+        pairs, constants = pairs[rows], constants[rows]
+    return reference.Part(pairs, constants, detection.island.cpu().long(), detection.shares.cpu(),
+                          detection.corrections.cpu(), limits, lowest)  # fmt: skip
 
 
 def split(leaves: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

@@ -132,8 +132,8 @@ def test_pair_forces_are_equal_and_opposite() -> None:
 @pytest.mark.parametrize("detections", (1, 2))
 @pytest.mark.parametrize("lagged", (False, True), ids=("barrier", "with_friction_and_damping"))
 def test_collision_conserves_momentum(lagged: bool, detections: int) -> None:
-    """Without gravity sum m v is kept by every step, to rounding, at K = 1 as at K = 400: touching bodies move together. The
-    barrier keeps L_{n+1} - L_n = h sum m v_{n+1} x v_n, too; friction acts along the gap, at an arm of it."""
+    """Without gravity sum m v is kept by every step, to rounding, at K = 1 as at K = 400: touching bodies move
+    together. The barrier keeps L_{n+1} - L_n = h sum m v_{n+1} x v_n, too; friction acts along the gap, at an arm."""
     options: dict[str, Any] = {"damping": 3.0, "friction": (dv.Friction(0.4, 0.05),)} if lagged else {}
     h, drift = 5e-3, {}
     for sweeps in (1, 400):

@@ -24,6 +24,7 @@ CASES = [(scene, name + end) for scene, names in NAMES.items() for name in names
 CASES += [
     ("contact", "contact_lowest"),
     ("contact", "contact_advance"),
+    ("contact", "contact_narrow"),
     ("floor", "pack_rest"),
     ("floor", "star_sum"),
     ("floor", "tet_gather"),

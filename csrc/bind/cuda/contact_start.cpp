@@ -112,10 +112,23 @@ std::tuple<Tensor, Tensor> contact_advance(const Tensor& x, const Tensor& move, 
   });
 }
 
+Tensor contact_narrow(const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& room,
+                      const Tensor& pairs, const Tensor& constants) {
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::narrow_inputs<T>(x, origin, collider, room, pairs, constants);
+    Tensor out = empty(x, {pairs.size(0), contact::kConstants});
+    check(cuda::narrow<T>(in, pairs.size(0), data<T>(out), current_stream(x)), "what a list can still reach");
+    return out;
+  });
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_advance", TORCH_BOX(&contact_advance));
+  m.impl("contact_narrow", TORCH_BOX(&contact_narrow));
   m.impl("contact_translation", TORCH_BOX(&contact_translation));
   m.impl("contact_translation_backward", TORCH_BOX(&contact_translation_backward));
   m.impl("contact_start", TORCH_BOX(&contact_start));
