@@ -17,7 +17,7 @@ from .colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
 # Mean edges of the surface that a vertex may go beside its island, where no reach is given: with self-contact, where a
 # long way lists most pairs of a body's own surface, and without.
-MOST_EDGES_SELF, MOST_EDGES = 0.75, 8.0
+MOST_EDGES_SELF, MOST_EDGES = 0.2, 8.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,10 +99,36 @@ class _Bodies:
         out = torch.ones_like(self.mass).reshape(-1)
         return out.scatter_reduce(0, self.rows, values.reshape(-1), "amin").reshape(self.mass.shape)
 
+    def stiffness(self, s: Scenes, blocks: Tensor | None) -> Tensor:
+        """Of inertia and of blocks [B, V, 3, 3] against turns and shifts of each body [B, bodies, 6, 6]."""
+        mass = broadcast(s.mass, self.arm.shape[:2])
+        spread = self.sum((mass[..., None] * self.arm)[..., None] * self.arm[..., None, :])
+        eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
+        inertia = spread.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * eye - spread
+        zero = torch.zeros_like(inertia)
+        upper, lower = torch.cat([inertia, zero], -1), torch.cat([zero, self.mass[..., None, None] * eye], -1)
+        out = torch.cat([upper, lower], -2)
+        if blocks is None:
+            return out
+        flat, arm, rows = blocks.flatten(0, 1), self.arm.flatten(0, 1), self.rows
+        if not arm.is_cuda and not torch.compiler.is_compiling():  # few vertices are near a floor
+            used = (flat != 0).any(-1).any(-1).nonzero()[:, 0]
+            flat, arm, rows = flat[used], arm[used], rows[used]
+        maps = _turning(arm)
+        return out + sum_by(maps.mT @ flat @ maps, rows, self.scenes * self.count).reshape(out.shape)
+
     def displaced(self, motion: Tensor) -> Tensor:
         """What a turn and a shift of each body [B, bodies, 6] do to its vertices, exactly, [B, V, 3]."""
-        turn = _rotation(motion[..., :3]) - torch.eye(3, dtype=motion.dtype, device=motion.device)
-        return (turn[:, self.body] @ self.arm[..., None])[..., 0] + motion[:, self.body, 3:]
+        w, shift = motion.split(3, -1)
+        square = (w * w).sum(-1, keepdim=True)
+        small = square < 1e-8
+        safe = torch.where(small, torch.ones_like(square), square)
+        angle = safe.sqrt()
+        first = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)
+        second = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / safe)
+        w, first, second, shift = (t[:, self.body] for t in (w, first, second, shift))
+        turned = torch.linalg.cross(w, self.arm)
+        return first * turned + second * torch.linalg.cross(w, turned) + shift
 
 
 def _turning(r: Tensor) -> Tensor:
@@ -111,18 +137,6 @@ def _turning(r: Tensor) -> Tensor:
     x, y, z = r.unbind(-1)
     turn = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).unflatten(-1, (3, 3))
     return torch.cat([turn, eye.expand(turn.shape)], -1)
-
-
-def _rotation(w: Tensor) -> Tensor:
-    """The rotation by |w| about w, [..., 3, 3]."""
-    square = (w * w).sum(-1)[..., None, None]
-    small = square < 1e-8
-    safe = torch.where(small, torch.ones_like(square), square)
-    angle = safe.sqrt()
-    first = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)
-    second = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / safe)
-    k = _turning(w)[..., :3].mT
-    return torch.eye(3, dtype=w.dtype, device=w.device) + first * k + second * (k @ k)
 
 
 def _outer(n: Tensor) -> Tensor:
@@ -146,32 +160,58 @@ def _log_barrier(gap: Tensor, dhat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return -past * past * log, -past * (2 * log + part), -(2 * log + 4 * part - part * part)
 
 
-def _vertex_terms(s: Scenes, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of inertia, energies of single vertices and friction on a floor: gradient [B, V, 3], blocks [B, V, 3, 3] that are
-    at least its derivative, and the potential of each scene [B]."""
-    h, h2, model = s.time_step, s.time_step**2, s.model
-    eye = torch.eye(3, dtype=x.dtype, device=x.device)
-    mass = broadcast(s.mass, x.shape[:2])
-    off = torch.where(model._pinned[:, None], torch.zeros_like(x), x - s.y)
-    force, stiffness = mass[..., None] * off, mass[..., None, None] * eye
-    value = (0.5 * mass * (off * off).sum(-1)).sum(1)
-    origin = None if s.origin.numel() == 0 else s.origin
-    first = 0
-    for energy in model.vertex_energies:
-        size = energy.count() * (model.num_vertices if energy.per_vertex else 1)
-        data, first = s.data[:, first : first + size], first + size
-        force = force + energy.gradient(x, s.x_prev, data, h, origin)
-        stiffness = stiffness + energy.blocks(x, s.x_prev, data, h, origin)
-        value = value + energy.value(x, s.x_prev, data, h, origin).sum(1)
+def _vertex_energies(s: Scenes) -> list[tuple[Any, tuple[Tensor, float, Tensor | None]]]:
+    """The energies of single vertices, each with its data, the time step and the origin."""
+    out, first = [], 0
+    for energy in s.model.vertex_energies:
+        size = energy.count() * (s.model.num_vertices if energy.per_vertex else 1)
+        out.append((energy, (s.data[:, first : first + size], s.time_step, s.origin if s.origin.numel() else None)))
+        first += size
+    return out
+
+
+def _off_target(s: Scenes, x: Tensor) -> Tensor:
+    return torch.where(s.model._pinned[:, None], torch.zeros_like(x), x - s.y)
+
+
+def _floor_slip(s: Scenes, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of friction on a floor: load [N] and motion along each plane, and what _slip says of it."""
+    load, n = s.floor_lag[..., 0], s.floor_lag[..., 1:]
+    travel = (x - s.x_prev)[:, :, None]
+    u = travel - n * (n * travel).sum(-1, keepdim=True)
+    return load, u, *_slip(u, s.friction_eps)
+
+
+def _vertex_value(s: Scenes, x: Tensor) -> Tensor:
+    """The potential of inertia, energies of single vertices and friction on a floor, of each scene [B]."""
+    value = (0.5 * broadcast(s.mass, x.shape[:2]) * (_off_target(s, x) ** 2).sum(-1)).sum(1)
+    for energy, rest in _vertex_energies(s):
+        value = value + energy.value(x, s.x_prev, *rest).sum(1)
     if s.floor_lag.numel():
-        load, n = s.floor_lag[..., 0], s.floor_lag[..., 1:]
-        travel = (x - s.x_prev)[:, :, None]
-        u = travel - n * (n * travel).sum(-1, keepdim=True)
-        potential, rate = _slip(u, s.friction_eps)
-        force = force + h2 * ((load * rate)[..., None] * u).sum(2)
-        stiffness = stiffness + h2 * ((load * rate)[..., None, None] * (eye - _outer(n))).sum(2)
-        value = value + h2 * (load * potential).sum((1, 2))
-    return force, stiffness, value
+        load, _, potential, _ = _floor_slip(s, x)
+        value = value + s.time_step**2 * (load * potential).sum((1, 2))
+    return value
+
+
+def _vertex_gradient(s: Scenes, x: Tensor) -> Tensor:
+    """Its gradient [B, V, 3]."""
+    force = broadcast(s.mass, x.shape[:2])[..., None] * _off_target(s, x)
+    for energy, rest in _vertex_energies(s):
+        force = force + energy.gradient(x, s.x_prev, *rest)
+    if s.floor_lag.numel():
+        load, u, _, rate = _floor_slip(s, x)
+        force = force + s.time_step**2 * ((load * rate)[..., None] * u).sum(2)
+    return force
+
+
+def _vertex_blocks(s: Scenes, x: Tensor) -> Tensor | None:
+    """Blocks [B, V, 3, 3] that are at least its derivative, without those of inertia; None where there are none."""
+    parts = [energy.blocks(x, s.x_prev, *rest) for energy, rest in _vertex_energies(s)]
+    if s.floor_lag.numel():
+        load, _, _, rate = _floor_slip(s, x)
+        across = torch.eye(3, dtype=x.dtype, device=x.device) - _outer(s.floor_lag[..., 1:])
+        parts.append(s.time_step**2 * ((load * rate)[..., None, None] * across).sum(2))
+    return None if not parts else broadcast(sum(parts[1:], parts[0]), (*x.shape, 3))
 
 
 def _corners(listed: Pairs) -> tuple[Tensor, Tensor]:
@@ -245,7 +285,7 @@ def _mollifier_gradient(at: Tensor, listed: Pairs) -> Tensor:
 def _potential(s: Scenes, x: Tensor) -> Tensor:
     """Of each scene [B] [kg m^2], without tets."""
     s = s._replace(listed=_active(s, x))
-    value = _vertex_terms(s, x)[2]
+    value = _vertex_value(s, x)
     for terms in _pair_terms(s, x):
         scene = _corners(terms.listed)[0][:, 0]
         value = value + sum_by(terms.value[:, None], scene, x.shape[0])[:, 0]
@@ -277,11 +317,9 @@ def _newton_step(s: Scenes, bodies: _Bodies, x: Tensor) -> Tensor:
     """Turn and shift of each body [B, bodies, 6]."""
     n, rows = bodies.count, bodies.scenes * bodies.count
     together = n <= MOST_COUPLED
-    force, stiffness, _ = _vertex_terms(s, x)
-    maps = _turning(bodies.arm)
-    g = bodies.sum((maps.mT @ force[..., None])[..., 0]).reshape(rows, 6)
-    own = bodies.sum(maps.mT @ stiffness @ maps).reshape(rows, 6, 6)
-    across = []
+    force = _vertex_gradient(s, x)
+    g = bodies.sum(torch.cat([torch.linalg.cross(bodies.arm, force), force], -1)).reshape(rows, 6)
+    own, across = bodies.stiffness(s, _vertex_blocks(s, x)).reshape(rows, 6, 6), []
     for terms in _pair_terms(s, x):
         row, corners = _sides(s, bodies, terms.listed, terms.within)
         maps = (terms.weights[:, None, :, None, None] * corners).sum(2)
@@ -326,14 +364,16 @@ def _share(s: Scenes, bodies: _Bodies, x: Tensor, motion: Tensor) -> Tensor:
     motion = torch.where(torch.isfinite(motion).all(-1, keepdim=True), motion, 0.0)
     before = _potential(s, x)
     touching = _touching(s, bodies, x)
-    for _ in range(TRIES):
+    for attempt in range(TRIES):
         move = bodies.displaced(share[..., None] * motion)
         fits = bodies.least(_fits(s, x, move)) >= 1
         safe = fits.all(1) & (_potential(s, x + move) <= before + RISE * before.abs())
         taken = torch.where(safe[:, None] & (taken == 0), share, taken)
         if not x.is_cuda and not torch.compiler.is_compiling() and bool((safe | (taken > 0).all(1)).all()):
             break
-        low = torch.where(fits & ~(fits.all(1, keepdim=True) & ~safe[:, None]), 1.0, 0.5)
+        # what is blocked moves half as far, and then not at all; what raises the potential, all half as far
+        held = torch.where(fits, 1.0, 0.5 if attempt == 0 else 0.0)
+        low = torch.where(fits.all(1, keepdim=True) & ~safe[:, None], 0.5, held)
         for _ in range(SPREADS):
             for row in touching:
                 pair = low.reshape(-1)[row].amin(1)
