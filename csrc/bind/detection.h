@@ -69,11 +69,15 @@ contact::Surfaces<T> surfaces_of(const Tensor& x, const Tensor& origin, const Te
 
 // What a detection reads besides: how far to look.
 template <class T>
-void set_reach(contact::Surfaces<T>& surfaces, const Tensor& x, const Tensor& room, double dhat) {
+void set_reach(contact::Surfaces<T>& surfaces, const Tensor& x, const Tensor& room, const Tensor& own_room,
+               double dhat) {
   require(std::isfinite(dhat), "contact: expected a finite dhat");
   require_shape(room, x, x.scalar_type(), {surfaces.scenes, int64_t{surfaces.mesh_bodies} + 1},
                 "contact: expected room like x, of shape [B, mesh_bodies + 1]");
-  surfaces.room = data<const T>(room), surfaces.dhat = static_cast<T>(dhat);
+  require_shape(own_room, x, x.scalar_type(), {surfaces.scenes, int64_t{surfaces.mesh_bodies} + 1},
+                "contact: expected own_room like x, of shape [B, mesh_bodies + 1]");
+  surfaces.room = data<const T>(room), surfaces.own_room = data<const T>(own_room),
+  surfaces.dhat = static_cast<T>(dhat);
 }
 
 inline void require_capacity(int64_t capacity) {

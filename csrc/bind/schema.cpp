@@ -139,8 +139,8 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   // many rows as there are pairs, and no more than the capacity
   m.def(
       "contact_detect(Tensor x, Tensor origin, Tensor collider, Tensor collider_next, Tensor rest, Tensor radius, "
-      "Tensor triangles, Tensor edges, Tensor points, Tensor planes, Tensor body, Tensor held, Tensor room, int "
-      "mesh_bodies, bool self_contact, bool between_bodies, float dhat, int capacity, bool trim) -> (Tensor pairs, "
+      "Tensor triangles, Tensor edges, Tensor points, Tensor planes, Tensor body, Tensor held, Tensor room, "
+      "Tensor own_room, int mesh_bodies, bool self_contact, bool between_bodies, float dhat, int capacity, bool trim) -> (Tensor pairs, "
       "Tensor constants, Tensor ptr, Tensor entry, Tensor near_corners, Tensor near_values, Tensor counts, "
       "Tensor smallest)");
   // results as in contact/intersect.h
@@ -152,12 +152,13 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "contact_islands(Tensor x, Tensor origin, Tensor move, Tensor mass, Tensor collider, Tensor collider_next, "
       "Tensor planes, Tensor body, Tensor body_order, Tensor body_ptr, Tensor held, Tensor radius, Tensor room, int "
       "mesh_bodies, float dhat, bool any_direction) -> Tensor");
-  // How much of its way each vertex goes at the start, see contact/advance.h: [scenes, vertices]; stuck: how many pairs
-  // what is prescribed brings too close. center: what a vertex may leave by its room at most
+  // How much of its way each vertex goes at the start, see contact/advance.h: [scenes, vertices]; frames: the same of
+  // the rigid motions of bodies [scenes, bodies]; stuck: how many pairs what is prescribed brings too close. center:
+  // what a vertex may leave by its room at most; frame: where the rigid motion of its body takes it, or empty
   m.def(
       "contact_advance(Tensor x, Tensor move, Tensor u, Tensor center, Tensor origin, Tensor collider, Tensor "
-      "collider_next, Tensor held, Tensor body, Tensor room, Tensor pairs, Tensor constants, Tensor ptr, Tensor entry, "
-      "bool careful) -> (Tensor share, Tensor stuck)");
+      "collider_next, Tensor held, Tensor body, Tensor room, Tensor frame, Tensor frame_center, Tensor frame_room, Tensor "
+      "pairs, Tensor constants, Tensor ptr, Tensor entry, bool careful) -> (Tensor share, Tensor frames, Tensor stuck)");
   m.def("segment_sum(Tensor values, Tensor order, Tensor ptr) -> Tensor");
   // points [B, N, 3]; pairs [max_pairs, 3] int32: (scene, i, j), then rows of -1; count [1] int64: how many there are,
   // or -1 where a point is not finite

@@ -1,6 +1,7 @@
 // How much of its way each vertex may go at the start of the sweeps, where all move at once: all of it wherever the
-// pairs that it is in stay apart, else a half, a quarter, ... of what is left, and so on from there. The shares are
-// decided, not differentiated (docs/method.md, section 12).
+// pairs that it is in stay apart, else a half, a quarter, ... of what is left, and so on from there. Vertices of one
+// body stay near its rigid motion, of which it goes a share as well: that is why few pairs within a body must be known.
+// The shares are decided, not differentiated (docs/method.md, section 12).
 #pragma once
 
 #include "passes.h"
@@ -23,7 +24,10 @@ struct AdvanceInputs {
   const int32_t* body;                // [N]
   PairList listed;
   const T* constants;
-  const T* room;  // [B, V]
+  const T* room;          // [B, V]
+  const T* frame;         // [B, V, 3] or null: where the rigid motion of its body takes a vertex, beside u
+  const T* frame_center;  // [B, V, 3]  where its share of that begins
+  const T* frame_room;    // [B, V]  how far from there a vertex may be
   int64_t scenes;
   int32_t vertices, corners, bodies;
   bool careful;  // the motion does not minimise the barrier
@@ -33,6 +37,8 @@ struct AdvanceInputs {
 template <class T>
 struct AdvanceState {
   T *share, *now;            // [B, V]  of the whole way after the moves so far; of what is left, tried in this one
+  T *frame, *frame_now;      // [B, bodies]  the same of the rigid motions
+  uint8_t* unfit;            // [B, bodies]  some vertex cannot be as near as it must be
   uint8_t *blocked, *stamp;  // [B, V]  some pair does not let it pass; the round in which it last tried less
   uint8_t* failed;           // [B]  a scene in which some pair has found no way
   bool first;                // the move in which colliders and prescribed vertices go
@@ -156,31 +162,76 @@ DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, i
   return false;
 }
 
-// After a round: vertices that are blocked try less.
+template <class T>
+DIFFVBD_FN T total(T done, T now) {
+  return now == T(1) ? T(1) : done + now * (T(1) - done);
+}
+
+// Whether a vertex that goes `now` of what is left stays in its rooms.
+template <class T>
+DIFFVBD_FN bool fits(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row, T now) {
+  const int64_t scene = row / in.vertices;
+  const auto v = static_cast<int32_t>(row % in.vertices);
+  const Vec3<T> x = vector_at(in.x + 3 * row), gone = total(s.share[row], now) * way_of(in, scene, v);
+  const Vec3<T> off = x - vector_at(in.center + 3 * row) + gone;
+  if (!(dot(off, off) <= in.room[row] * in.room[row])) return false;
+  if (!in.frame) return true;
+  const int64_t body = scene * in.bodies + in.body[v];
+  const Vec3<T> turned = total(s.frame[body], s.frame_now[body]) * vector_at(in.frame + 3 * row);
+  const Vec3<T> own = x - vector_at(in.frame_center + 3 * row) + gone - turned;
+  return dot(own, own) <= in.frame_room[row] * in.frame_room[row];
+}
+
+// Reduces what a vertex tries until it stays in its rooms; returns whether it tries less. Where nothing helps, its body
+// must go less of its rigid motion.
+template <class T>
+DIFFVBD_FN bool refit(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row) {
+  T now = s.now[row];
+  while (T(0) < now && !fits(in, s, row, now)) now = T(kLeastTry) < now ? T(0.5) * now : T(0);
+  if (in.frame && !fits(in, s, row, now)) {
+    mark(s.unfit + row / in.vertices * in.bodies + in.body[row % in.vertices]);
+    return false;
+  }
+  const bool less = now < s.now[row];
+  s.now[row] = now;
+  return less;
+}
+
+// After a round: vertices that are blocked try less, and all stay near the rigid motions of their bodies.
 template <class T>
 DIFFVBD_FN bool retreat(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row, int round) {
-  if (!s.blocked[row] || in.held[row % in.vertices]) return false;
+  if (in.held[row % in.vertices]) return false;
+  const bool blocked = s.blocked[row];
   s.blocked[row] = 0;
-  s.stamp[row] = static_cast<uint8_t>(round + 1);
-  s.now[row] = round < kPatience && T(kLeastTry) < s.now[row] ? T(0.5) * s.now[row] : T(0);
+  if (blocked) s.now[row] = round < kPatience && T(kLeastTry) < s.now[row] ? T(0.5) * s.now[row] : T(0);
+  const bool less = refit(in, s, row) || blocked;
+  if (less) s.stamp[row] = static_cast<uint8_t>(round + 1);
+  return less;
+}
+
+// And after that: bodies whose vertices cannot follow go less. Returns whether this one does.
+template <class T>
+DIFFVBD_FN bool slow_down(const AdvanceState<T>& s, int64_t body, int round) {
+  if (!s.unfit[body]) return false;
+  s.unfit[body] = 0;
+  s.frame_now[body] = round < kPatience && T(kLeastTry) < s.frame_now[body] ? T(0.5) * s.frame_now[body] : T(0);
   return true;
 }
 
-// Before the first round: a share with which the vertex stays in its room.
 template <class T>
-DIFFVBD_FN void begin_move(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row) {
-  const int64_t scene = row / in.vertices;
-  const auto v = static_cast<int32_t>(row % in.vertices);
+DIFFVBD_FN void begin_body(const AdvanceState<T>& s, int64_t body) {
+  if (s.first) s.frame[body] = T(0);
+  s.frame_now[body] = T(1), s.unfit[body] = 0;
+}
+// Returns whether the vertex does not stay in its rooms before its body goes less.
+template <class T>
+DIFFVBD_FN bool begin_move(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row) {
   if (s.first) s.share[row] = T(0);
   s.blocked[row] = s.stamp[row] = 0;
-  const Vec3<T> way = way_of(in, scene, v), offset = vector_at(in.x + 3 * row) - vector_at(in.center + 3 * row);
-  const auto fits = [&](T now) {
-    const Vec3<T> end = offset + (s.share[row] + now * (T(1) - s.share[row])) * way;
-    return dot(end, end) <= in.room[row] * in.room[row];
-  };
-  T now = T(1);
-  while (T(kLeastTry) < now && !fits(now)) now = T(0.5) * now;
-  s.now[row] = fits(now) ? now : T(0);
+  s.now[row] = T(1);
+  if (in.held[row % in.vertices]) return false;
+  refit(in, s, row);
+  return !fits(in, s, row, s.now[row]);
 }
 // A scene that has found no way stays where it is in this move.
 template <class T>
@@ -188,9 +239,13 @@ DIFFVBD_FN void give_up(const AdvanceInputs<T>& in, const AdvanceState<T>& s, in
   if (s.failed[row / in.vertices]) s.now[row] = T(0);
 }
 template <class T>
+DIFFVBD_FN void end_body(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t body) {
+  if (s.failed[body / in.bodies]) s.frame_now[body] = T(0);
+  s.frame[body] = total(s.frame[body], s.frame_now[body]);
+}
+template <class T>
 DIFFVBD_FN void end_move(const AdvanceState<T>& s, int64_t row) {
-  const T done = s.share[row], now = s.now[row];
-  s.share[row] = now == T(1) ? T(1) : done + now * (T(1) - done);
+  s.share[row] = total(s.share[row], s.now[row]);
 }
 
 }  // namespace diffvbd::contact

@@ -26,7 +26,8 @@ struct Surfaces {
   int32_t mesh_bodies;  // labels from here on are colliders
   bool self_contact, between_bodies;
   T dhat;
-  const T* room;  // [B, mesh_bodies + 1]  how far a body's vertices may go beside their island [m], and the largest
+  const T* room;      // [B, mesh_bodies + 1]  how far a body's vertices may go beside their island [m], and the largest
+  const T* own_room;  // [B, mesh_bodies + 1]  and beside what a shift and a turn of their body do
 
   DIFFVBD_FN int64_t key_base() const {
     const int32_t a = num_triangles < num_edges ? num_edges : num_triangles;
@@ -127,18 +128,36 @@ template <class T>
 DIFFVBD_FN T room_of(const Surfaces<T>& in, int64_t scene, int32_t body) {
   return body < in.mesh_bodies ? in.room[scene * (in.mesh_bodies + 1) + body] : T(0);
 }
-// Gap up to which pairs of a scene are looked for; squared distance of boxes up to which a pair of a primitive of some
-// group, -1 where that has several, may be closer.
+// Up to which gap two sides of one body, with a barrier of this reach, are looked for; of all for body mesh_bodies.
+template <class T>
+DIFFVBD_FN T own_reach_of(const Surfaces<T>& in, int64_t scene, int32_t body, T dhat) {
+  return dhat + T(2) * in.own_room[scene * (in.mesh_bodies + 1) + body];
+}
+// Largest gap that may be found in a scene.
 template <class T>
 DIFFVBD_FN T reach_of(const Surfaces<T>& in, int64_t scene) {
-  return in.dhat + T(2) * in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
+  const T other = in.dhat + T(2) * in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
+  const T own = own_reach_of(in, scene, in.mesh_bodies, in.dhat);
+  return own < other ? other : own;
 }
+
+// Squared distances of boxes up to which a pair of a primitive of some group may be listed.
+struct Reach {
+  float own, other;  // with one of the same group; with any
+  int32_t group;     // -1: it has several
+  DIFFVBD_FN float to(int32_t to_group) const { return group >= 0 && group == to_group ? own : other; }
+};
 template <class T>
-DIFFVBD_FN float squared_reach(const Surfaces<T>& in, int64_t scene, int32_t group) {
+DIFFVBD_FN Reach squared_reach(const Surfaces<T>& in, int64_t scene, int32_t group) {
   const T most = in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
-  const T far = in.dhat + most + (group >= 0 ? room_of(in, scene, group) : most);
-  const float reach = static_cast<float>(far) * (1.0F + 0x1p-20F);
-  return reach * reach * (1.0F + 0x1p-20F);
+  const T own = own_reach_of(in, scene, group >= 0 && group < in.mesh_bodies ? group : in.mesh_bodies, in.dhat);
+  T other = in.dhat + most + (group >= 0 ? room_of(in, scene, group) : most);
+  other = other < own ? own : other;
+  const auto square = [](T far) {
+    const float reach = static_cast<float>(far) * (1.0F + 0x1p-20F);
+    return reach * reach * (1.0F + 0x1p-20F);
+  };
+  return {square(own), square(other), group};
 }
 
 // --- pairs
@@ -256,7 +275,9 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
 // Whether a pair with this gap, whose barrier reaches as far as dhat, may become active before the next detection.
 template <class T>
 DIFFVBD_FN bool is_listed(const Surfaces<T>& in, const Candidate& c, T gap, T dhat) {
-  return gap - room_of(in, c.scene, in.body[c.v[0]]) - room_of(in, c.scene, in.body[c.v[c.second()]]) < dhat;
+  const int32_t first = in.body[c.v[0]], second = in.body[c.v[c.second()]];
+  if (first == second && first < in.mesh_bodies) return gap < own_reach_of(in, c.scene, first, dhat);
+  return gap - room_of(in, c.scene, first) - room_of(in, c.scene, second) < dhat;
 }
 
 // --- results

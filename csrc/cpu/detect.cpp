@@ -98,11 +98,11 @@ class SceneDetection {
   void search(const Tree& tree, const Tree& others, int32_t g, std::vector<Met>& met, Finds<T>& finds) {
     const int32_t home = tree.groups() + g;
     const Box &around = tree.nodes[home], *nodes = others.nodes.data();
-    const float reach2 = squared_reach(in_, scene_, around.group);
+    const Reach reach = squared_reach(in_, scene_, around.group);
     met.clear();
     if (!is_empty(around)) {
       const auto hits = [&](const Box& node) {
-        return distance2(node, around) <= reach2 && !in_.ignores(around.group, node.group);
+        return distance2(node, around) <= reach.to(node.group) && !in_.ignores(around.group, node.group);
       };
       each_leaf(nodes, others.leaves, kind == kEdgeEdge ? home : kRoot, kRoot, hits, [&](int32_t i) {
         met.push_back({nodes[i], i});
@@ -113,7 +113,8 @@ class SceneDetection {
       const Box& own = tree.nodes[leaf];
       if (!is_empty(own)) {
         for (const Met& other : met) {
-          if ((kind == kEdgeEdge && other.node <= leaf) || !(distance2(other.box, own) <= reach2)) continue;
+          if ((kind == kEdgeEdge && other.node <= leaf) || !(distance2(other.box, own) <= reach.to(other.box.group)))
+            continue;
           examine(candidate(in_, scene_, kind, own.item, other.box.item), finds);
         }
       }
@@ -134,10 +135,7 @@ class SceneDetection {
   void examine(const Candidate& c, Finds<T>& finds) {
     if (!is_considered(in_, c)) return;
     const T gap = separation(c.kind, corners_of(in_, c)) - offset_of(in_, c);
-    if (gap >= reach_) return;
-    // near gaps only fall while the search goes on
-    const auto improves = [&](int32_t v) { return gap <= near_[v].gap.load(std::memory_order_relaxed); };
-    if (gap > T(0) && !is_listed(in_, c, gap, in_.dhat) && std::none_of(c.v, c.v + 4, improves)) return;
+    if (gap >= reach_ || (gap > T(0) && !is_listed(in_, c, gap, in_.dhat))) return;
     const Constants<T> constants = constants_of(in_, c);
     if (!constants.admitted) return;
     const uint64_t key = contact::key_of(in_, c);

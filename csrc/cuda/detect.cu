@@ -104,9 +104,9 @@ struct Search {
   __device__ void examine(const Candidate& c) const {
     if (!is_considered(in, c)) return;
     const T gap = separation(c.kind, corners_of(in, c)) - offset_of(in, c);
-    if (gap >= reach_of(in, c.scene)) return;
+    if (gap >= reach_of(in, c.scene) || (gap > T(0) && !is_listed(in, c, gap, in.dhat))) return;
     const Ordered<T> bits = ordered(gap);
-    bool matters = !(gap > T(0)) || (listing && is_listed(in, c, gap, in.dhat));
+    bool matters = listing || !(gap > T(0));
     Ordered<T>* rows = work.near_gap + c.scene * in.corners;
     for (int k = 0; k < 4; ++k) {
       const Ordered<T> known = *static_cast<volatile Ordered<T>*>(rows + c.v[k]);
@@ -154,9 +154,9 @@ struct Search {
   template <class Visit>
   __device__ void walk(const Query& q, int32_t from, int32_t end, int32_t first, const Visit& visit) const {
     const Box* nodes = work.forest.tree(q.kind, q.scene);
-    const float reach2 = squared_reach(in, q.scene, q.box.group);
+    const Reach reach = squared_reach(in, q.scene, q.box.group);
     const auto hits = [&](const Box& node) {
-      return distance2(node, q.box) <= reach2 && !in.ignores(q.box.group, node.group);
+      return distance2(node, q.box) <= reach.to(node.group) && !in.ignores(q.box.group, node.group);
     };
     each_leaf(nodes, work.forest.leaves[q.kind], from, end, hits, [&](int32_t leaf) {
       if (leaf < first) return true;

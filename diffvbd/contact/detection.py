@@ -12,13 +12,15 @@ from .surface import ContactSurface
 
 
 def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: ContactSurface, barrier: PairBarrier,
-           capacity: int, room: Tensor | None = None) -> tuple[Tensor, ...]:  # fmt: skip
+           capacity: int, room: Tensor | None = None, own_room: Tensor | None = None
+           ) -> tuple[Tensor, ...]:  # fmt: skip
     """Pairs that may come closer than dhat before the next detection, and the nearest pair of each corner point.
 
     Args:
         x: [B, V, 3] [m], relative to origin [B, V, 3] or empty.  was, now: Collider points [B, Vc, 3] [m].
         capacity: Pairs of all scenes that fit.
-        room: How far the vertices of each body may go, and the largest [B, bodies + 1] [m]; None: nobody moves.
+        room, own_room: How far the vertices of each body may go beside its island and beside its own rigid motion, and
+            the largest [B, bodies + 1] [m]; None: nobody moves.
 
     Returns, with ``capacity`` rows, or on the CPU without torch.compile as many as there are pairs:
         pairs [capacity, 6] int32 (four corner points, kind, scene), constants [capacity, 8] (dhat, offset, threshold of
@@ -27,11 +29,11 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
         (pairs needed, pairs without a gap, key of one, 0); smallest gap [B].
     """
     s = surface
-    if room is None:
-        room = x.new_zeros((x.shape[0], s.bodies + 1))
+    nowhere = x.new_zeros((x.shape[0], s.bodies + 1))
+    room, own_room = (nowhere if r is None else r for r in (room, own_room))
     return ops_contact.contact_detect(
-        x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.held, room, s.bodies,
-        barrier.self_contact, barrier.between_bodies, barrier.dhat, capacity,
+        x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.held, room,
+        own_room, s.bodies, barrier.self_contact, barrier.between_bodies, barrier.dhat, capacity,
         not torch.compiler.is_compiling(),
     )  # fmt: skip
 

@@ -98,6 +98,8 @@ class PartStart(NamedTuple):
     x: Tensor  # [B, V, 3] [m]
     center: Tensor  # [B, V, 3]  from where each vertex has its room [m]; a number, not a function of the start
     room: Tensor  # [B, V]  how far from there it may go [m]
+    own_center: Tensor  # [B, V, 3]  where the rigid motion of its body has taken it [m], a number as well
+    own_room: Tensor | None  # [B, V]  how far from there it may go; None: bodies have no pairs of their own
     short: Tensor  # [B, V] bool: pairs have held up more than a hundredth of its way
     stuck: Tensor  # [1] int64: pairs that hinder what is prescribed
     shares: Tensor  # [2, B, V]: of the two ways, that vertices went
@@ -107,8 +109,8 @@ SHORT = 0.99  # share of a way that counts as all of it
 
 
 def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
-                         planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface
-                         ) -> PartStart:  # fmt: skip
+                         planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface,
+                         rigid: Tensor | None) -> PartStart:  # fmt: skip
     """Every vertex as far along its way as pairs and floor let all go at once: first by ``move``, then by ``fall``.
 
     Args:
@@ -116,6 +118,8 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         was, now: Collider points before and during the sweeps, [B, Vc, 3] [m].
         planes: Data of the FloorBarrier [1 | B, 7 planes], or None; differentiable as x, move, fall and mass.
         origin: [B, V, 3] or empty.  detection: of the step.
+        rigid: Where rigid motions of bodies would take their vertices, as a way [B, V, 3] [m]; None without
+            self-contact.
     """
     floor = x.new_empty((0,)) if planes is None else planes
     index = (surface.held, surface.body, surface.body_order, surface.body_ptr, detection.island, detection.lowest)
@@ -125,23 +129,30 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
     room, listed = detection.room[:, body].contiguous(), detection.listed
     listed = (listed.pairs, listed.constants, listed.ptr, listed.entry)
     at, center, still = x, x.detach(), torch.zeros_like(u)
+    own_center = center
+    own_room = None if rigid is None else detection.own_room[:, body].contiguous()
+    frame = None if rigid is None else (rigid - u.detach()[:, body]).contiguous()
     shares, stuck = [], []
     for way, by, here in ((move, u, was), (fall, still, now)):
         target = at + way
         if floor.numel():
             target = _Target.apply(at, way, by, floor, origin, surface)
         with torch.no_grad():
-            share, hindered = ops_contact_start.advance(
+            share, frames, hindered = ops_contact_start.advance(
                 at.detach().contiguous(), (target - at).detach().contiguous(), by.detach(), center, origin,
                 here.detach(), now.detach(), surface.held, surface.body, room, listed,
+                frame=() if frame is None or own_room is None else (frame, own_center, own_room),
             )  # fmt: skip
+            if frame is not None:
+                own_center = (own_center + by[:, body] + frames[:, body, None] * frame).contiguous()
+                frame = torch.zeros_like(frame)
         shares.append(share)
         stuck.append(hindered)
         base = at + by[:, body]
         at = torch.where(pinned, target, base + share[..., None] * (target - base))
         center = torch.where(pinned, center, center + by.detach()[:, body]).contiguous()
     short = (torch.minimum(*shares) < SHORT) & ~pinned[:, 0]
-    return PartStart(at, center, room, short, stuck[0] + stuck[1], torch.stack(shares))
+    return PartStart(at, center, room, own_center, own_room, short, stuck[0] + stuck[1], torch.stack(shares))
 
 
 ops.ready_signature(_Translation, _TranslationBackward, _Target, _TargetBackward)

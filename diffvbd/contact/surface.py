@@ -15,9 +15,10 @@ from .barrier import PairBarrier
 from .colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
 
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
-# Mean edges of the surface that a vertex may go beside its island, where no reach is given: with self-contact, where a
-# long way lists most pairs of a body's own surface, and without.
-MOST_EDGES_SELF, MOST_EDGES = 0.2, 8.0
+# Mean edges of the surface that a vertex may go where no reach is given: beside its island, alone and where several
+# bodies may meet, and beside the rigid motion of its body, at least and at most. The farther, the more pairs there are.
+MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 2.0
+LEAST_EDGES_OWN, MOST_EDGES_OWN = 0.2, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,8 @@ class ContactSurface:
     bodies: int  # of the mesh
     rows: tuple[slice, ...]  # of each collider in collider_points
     most_room: float  # [m] that any vertex is given beside its island
+    most_own_room: float  # and beside the rigid motion of its body
+    least_own_room: float  # and is given there in any case, because hardly any two sides of a body are so close
     capacity: int  # pairs, per scene; all scenes together have room for LEAST_CAPACITY at least
 
     @property
@@ -86,10 +89,9 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
             planes.append([first, first + 1, first + 2])
     # the mesh's own edges alone: a large obstacle must not widen the search
     lengths = np.linalg.norm(mesh.points[edges[0][:, 0]] - mesh.points[edges[0][:, 1]], axis=1)
-    if barrier.reach is None:
-        most = MOST_EDGES_SELF if barrier.self_contact else MOST_EDGES
-        most_room = most * float(lengths.mean()) if len(lengths) else 0.0
-    else:
+    mean_edge = float(lengths.mean()) if len(lengths) else 0.0
+    most_room = (MOST_EDGES if bodies == 1 or not barrier.between_bodies else MOST_EDGES_BETWEEN) * mean_edge
+    if barrier.reach is not None:
         most_room = (barrier.reach - barrier.dhat) / 2
 
     def index_tensor(parts: list[Any], width: int) -> Tensor:
@@ -113,6 +115,8 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         bodies=bodies,
         rows=tuple(rows),
         most_room=most_room,
+        most_own_room=MOST_EDGES_OWN * mean_edge,
+        least_own_room=LEAST_EDGES_OWN * mean_edge,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
     )
 

@@ -35,15 +35,15 @@ class Detection(NamedTuple):
 
 def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor, rest: Tensor, radius: Tensor,
                    triangles: Tensor, edges: Tensor, points: Tensor, planes: Tensor, body: Tensor, held: Tensor,
-                   room: Tensor, mesh_bodies: int, self_contact: bool, between_bodies: bool, dhat: float,
-                   capacity: int, trim: bool = False) -> Detection:  # fmt: skip
+                   room: Tensor, own_room: Tensor, mesh_bodies: int, self_contact: bool, between_bodies: bool,
+                   dhat: float, capacity: int, trim: bool = False) -> Detection:  # fmt: skip
     """Near pair of every corner point, and the pairs that may come within reach of the barrier before the next call.
 
-    The vertices of a body may go as far as its room beside what its island does; colliders have none. Pairs are looked
-    for up to a gap of ``dhat`` and twice the largest room. One is listed if its gap, less the rooms of its two sides,
-    is below the barrier's reach, which is ``dhat`` or, for two sides of one body that are closer at rest, 0.9 times
-    their distance at rest. Two colliders make no pair, nor do four held corner points, nor two sides of one body that
-    are one place at rest.
+    The vertices of a body may go as far as its room beside what its island does, and as far as its own room beside a
+    turn of at most a radian and a shift of the body; colliders have none. A pair is listed if its gap, less the rooms
+    of its two sides, is below the barrier's reach, which is ``dhat`` or, for two sides of one body that are closer at
+    rest, 0.9 times their distance at rest; two sides of one body if it is below 1.15 times reach and both own rooms.
+    Two colliders make no pair, nor do four held corner points, nor two sides of one body that are one place at rest.
 
     A surface point that is not finite counts as touching. Where ``counts[0] > capacity``, the list holds some of the
     pairs that it needs. Not differentiable; results repeat to the bit.
@@ -55,7 +55,7 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
         triangles, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique.
         planes: [L, 3] collider points that span each plane, counterclockwise seen from the free side.
         body, held: [N]; labels from ``mesh_bodies`` on are colliders; held: bool, no sweep moves it.
-        room: [B, mesh_bodies + 1] how far the vertices of each body may go [m], and the largest.
+        room, own_room: [B, mesh_bodies + 1] how far the vertices of each body may go [m], and the largest.
         self_contact, between_bodies: Which pairs of mesh bodies to consider.
         dhat: [m].
         capacity: Rows of the list.
@@ -68,7 +68,7 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
     return Detection(
         *raw.contact_detect(
             x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held,
-            room, mesh_bodies, self_contact, between_bodies, dhat, capacity, trim,
+            room, own_room, mesh_bodies, self_contact, between_bodies, dhat, capacity, trim,
         )
     )  # fmt: skip
 
@@ -150,7 +150,7 @@ def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
 
 
 @shapes_of("contact_detect")
-def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, room,
+def _(x, origin, collider, collider_next, rest, radius, triangles, edges, points, planes, body, held, room, own_room,
       mesh_bodies, self_contact, between_bodies, dhat, capacity, trim):  # fmt: skip
     b, n = x.shape[0], body.shape[0]
     rows = torch.library.get_ctx().new_dynamic_size() if trim and x.device.type == "cpu" else capacity

@@ -54,6 +54,7 @@ class Detection(NamedTuple):
     island: Tensor
     lowest: Tensor  # of a Model with a floor, else empty
     room: Tensor  # [B, bodies + 1] [m]: how far the vertices of each body may go beside its island, and the largest
+    own_room: Tensor  # [B, bodies + 1] [m]: and beside the rigid motion of the body
     # what the part has decided: the shares of the two ways of its start [2, B, V], of the corrections before and after
     # its sweeps [1 | 2, B, bodies], and the exponents of limits [B, K, V]
     shares: Tensor | None = None
@@ -198,7 +199,7 @@ class ContactStep:
             # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
             move = left if self.parts == 1 else torch.where(pinned, way / self.parts, left)
             fall = lift if r == 0 else torch.zeros_like(lift)
-            detection = self._detect(x, was, now, move, fall)
+            detection, rigid = self._detect(x, was, now, move, fall)
             met.found.append(detection)
             met.counts.append(torch.cat([detection.counts[:3], torch.zeros_like(detection.counts[:1])]))
             if not x.is_cuda and not torch.compiler.is_compiling():  # reading is free: before any work
@@ -209,21 +210,22 @@ class ContactStep:
                 fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
                                           self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
-                                         detection, surface)  # fmt: skip
+                                         detection, surface, rigid if barrier.self_contact else None)  # fmt: skip
             met.counts[-1] = torch.cat([detection.counts[:3], start.stuck])
             if not x.is_cuda and not torch.compiler.is_compiling():
                 self._record(met)
                 self._check(r, met.counts[-1].tolist())
-            room = rooms_of_sweeps(surface, barrier, start, self.fields.mass, x, move, fall)
-            near, kept = self._narrowed(detection.listed, start.x, now, room)
-            start = start._replace(center=start.x.detach(), room=room)
-            between = self._between(near)
+            begin, between = x, self._between(detection.listed)
             x, first = self._corrected(start.x, now, start, between)
+            start = start._replace(own_center=start.own_center + (x - start.x).detach())
+            room = rooms_of_sweeps(surface, barrier, start, x, self.fields.mass, begin, move, fall, rigid)
+            near, kept = self._narrowed(detection.listed, x, now, room)
+            start = start._replace(center=x.detach(), room=room)
             taken, limits, cut = [first], None, start.short
             if sweeps:
                 part = settings._replace(sweeps=sweeps)
                 x, limits = self._sweep(x, start.center, start.room, now, near, part, policy, debug_step)
-                x, last = self._corrected(x, now, start, between)
+                x, last = self._corrected(x, now, start, self._between(near))
                 taken.append(last)
                 cut = cut | (limits[:, -1] > 0)
             met.cut = cut
@@ -237,7 +239,8 @@ class ContactStep:
         """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
         x = self.begun.x_start
         room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
-        start = PartStart(x, x.detach(), room, room > 0, none.ptr[:1].long(), x.new_ones((2, *room.shape)))
+        start = PartStart(x, x.detach(), room, x.detach(), None, room > 0, none.ptr[:1].long(),
+                          x.new_ones((2, *room.shape)))  # fmt: skip
         x, _ = self._corrected(x, self.colliders, start, none)
         if self.prepared.settings.sweeps:
             x, _ = self._sweep(x, start.center, room, self.colliders, none, self.prepared.settings, policy, debug_step)
@@ -269,20 +272,22 @@ class ContactStep:
         )  # fmt: skip
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
-    def _detect(self, x: Tensor, was: Tensor, now: Tensor, move: Tensor, fall: Tensor) -> Detection:
+    def _detect(self, x: Tensor, was: Tensor, now: Tensor, move: Tensor, fall: Tensor) -> tuple[Detection, Tensor]:
+        """The part's detection, and the rigid motions of its bodies (rooms.Rooms)."""
         surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
         with torch.no_grad():
             x, was, now = x.detach(), was.detach(), now.detach()
-            island, room = rooms(surface, barrier, x, self.origin, self.fields.mass, was, now, move, fall,
-                                 self.any_direction)  # fmt: skip
+            island, room, own_room, rigid = rooms(surface, barrier, x, self.origin, self.fields.mass, was, now, move,
+                                                  fall, self.any_direction)  # fmt: skip
             *index, corners, values, counts, smallest = search.detect(
-                x, self.origin, was, now, surface, barrier, self.capacity, room
+                x, self.origin, was, now, surface, barrier, self.capacity, room, own_room
             )
             lowest = island.new_empty((0,))
             if self.floor_data is not None:
                 lowest = search.lowest(x, self.origin, self.floor_data.detach(), island, surface)
-        return Detection(Pairs(*index), corners, values, counts, smallest, island, lowest, room)
+        found = Detection(Pairs(*index), corners, values, counts, smallest, island, lowest, room, own_room)
+        return found, rigid
 
     def _record(self, met: Met) -> None:
         smallest = torch.stack([d.smallest for d in met.found])

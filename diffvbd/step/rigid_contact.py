@@ -403,7 +403,7 @@ def _fits(s: Scenes, x: Tensor, move: Tensor) -> Tensor:
         none = x.new_zeros((x.shape[0], s.surface.bodies, 3))
         listed = (s.listed.pairs, s.listed.constants, s.listed.ptr, s.listed.entry)
         collider = s.collider.detach()
-        out, _ = ops_start.advance(x.contiguous(), move.contiguous(), none, s.center, s.origin, collider, collider,
+        out, *_ = ops_start.advance(x.contiguous(), move.contiguous(), none, s.center, s.origin, collider, collider,
                                    s.surface.held, s.surface.body, s.room, listed, careful=False)  # fmt: skip
     first = 0
     for energy in s.model.vertex_energies:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -30,83 +32,124 @@ def _by_body(values: Tensor, surface: ContactSurface) -> Tensor:
     return sum_by(values.flatten(0, 1), rows, scenes * surface.bodies).unflatten(0, (scenes, surface.bodies))
 
 
+class _Motion:
+    """The ways that vertices want to go, and what of them is a shift and a turn of each body. Index data."""
+
+    def __init__(self, surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor) -> None:
+        self.surface, self.move = surface, move
+        self.scenes, vertices = x.shape[:2]
+        self.body, self.free = surface.body[:vertices].long(), ~surface.held[:vertices]
+        self.rows = broadcast(self.body[None], (self.scenes, vertices))
+        self.weight = torch.where(self.free, broadcast(mass, (self.scenes, vertices)), 0.0)[..., None]
+        at = x + origin if origin.numel() else x
+        self.sums = _by_body(torch.cat([self.weight * move, self.weight, self.weight * at], -1), surface)
+        whole = self.sums[..., 3:4].clamp(min=_tiny(x))
+        self.mean, self.arm = self.sums[..., :3] / whole, at - (self.sums[..., 4:] / whole)[:, self.body]
+
+    def largest(self, way: Tensor) -> Tensor:
+        """The longest way [B, V, 3] of a free vertex of each body [B, bodies]."""
+        return self.longest(torch.where(self.free, way.square().sum(-1).sqrt(), 0.0))
+
+    def longest(self, length: Tensor) -> Tensor:
+        out = length.new_zeros((self.scenes, self.surface.bodies))
+        return out.scatter_reduce(1, self.rows, length, "amax")
+
+    def rigid(self) -> Tensor:
+        """Where t + w x r takes each vertex, as a way [B, V, 3] [m], with the body's linear and angular momentum: it
+        brings no two points closer, nor does a share of it. Zero for bodies of which something is held."""
+        arm, (scenes, bodies) = self.arm, self.mean.shape[:2]
+        moment = torch.cat([torch.linalg.cross(arm, self.move), (arm[..., None] * arm[..., None, :]).flatten(-2)], -1)
+        sums = _by_body(self.weight * moment, self.surface)
+        spread = sums[..., 3:].unflatten(-1, (3, 3))
+        size = spread.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        eye = torch.eye(3, dtype=arm.dtype, device=arm.device)
+        a, b, c = ((1 + 1e-9) * size * eye - spread).unbind(-2)  # of the inertia, which is symmetric
+        adjugate = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2)
+        determinant = (a * adjugate[..., 0, :]).sum(-1, keepdim=True)
+        turn = (adjugate * sums[..., :3, None]).sum(-2) / determinant.clamp(min=_tiny(arm))
+        held = self.longest(broadcast((~self.free).to(arm.dtype), arm.shape[:2])) > 0
+        keep = (~held & (determinant[..., 0] > 0)).reshape(scenes, bodies, 1)
+        turn, mean = (torch.where(keep, t, 0.0)[:, self.body] for t in (turn, self.mean))
+        return mean + torch.linalg.cross(turn, arm)
+
+
 @torch.no_grad()
-def rooms_of_sweeps(surface: ContactSurface, barrier: PairBarrier, start: PartStart, mass: Tensor, begin: Tensor,
-                    move: Tensor, fall: Tensor) -> Tensor:  # fmt: skip
-    """How far the sweeps may carry a vertex from its start [B, V] [m]: as far as a barrier pushes, weight pulls,
-    elasticity takes back what its body deforms by on the way and, of what pairs have held up, all. Index data.
+def rooms_of_sweeps(surface: ContactSurface, barrier: PairBarrier, start: PartStart, x: Tensor, mass: Tensor,
+                    begin: Tensor, move: Tensor, fall: Tensor, rigid: Tensor) -> Tensor:  # fmt: skip
+    """How far the sweeps may carry a vertex from where they find it [B, V] [m]: as far as a barrier pushes, weight
+    pulls, elasticity takes back what its body deforms by on the way and, of what pairs have held up, all. Index data.
 
     Args:
-        start: The part's; its rooms bound the whole way.  mass: [1 | B, V].
-        begin: Where the part began.  move, fall: Where each vertex wanted to go from there. All [B, V, 3] [m].
+        start: The part's; its rooms bound the whole way.  x: Where the sweeps begin.  mass: [1 | B, V].
+        begin: Where the part began.  move, fall: Where each vertex wanted to go from there.
+        rigid: As start_between_planes takes it. All [B, V, 3] [m].
     """
-    mass, begin, move, fall, at = (t.detach() for t in (mass, begin, move, fall, start.x))
-    scenes, vertices = at.shape[:2]
-    body, free = surface.body[:vertices].long(), ~surface.held[:vertices]
-    weight = torch.where(free, broadcast(mass, (scenes, vertices)), 0.0)[..., None]
-    sums = _by_body(torch.cat([weight * move, weight], -1), surface)
-    mean = (sums[..., :3] / sums[..., 3:].clamp(min=_tiny(at)))[:, body]
-    rows = broadcast(body[None], (scenes, vertices))
+    mass, begin, move, fall, x = (t.detach() for t in (mass, begin, move, fall, x))
+    motion = _Motion(surface, x, x.new_empty((0,)), mass, move)
+    held_up = motion.largest(begin + move + fall - start.x.detach())
+    wish = motion.largest(fall) + motion.largest(move - rigid) + ROOM * held_up + LEAST_ROOM * barrier.dhat
+    left = start.room - (x - start.center).square().sum(-1).sqrt()
+    if start.own_room is not None:
+        left = torch.minimum(left, start.own_room - (x - start.own_center).square().sum(-1).sqrt())
+    return torch.where(motion.free, torch.minimum(left, wish[:, motion.body]).clamp(min=0), 0.0)
 
-    def largest(way: Tensor) -> Tensor:
-        length = torch.where(free, way.square().sum(-1).sqrt(), 0.0)
-        return length.new_zeros((scenes, surface.bodies)).scatter_reduce(1, rows, length, "amax")
 
-    wish = largest(fall) + largest(move - mean) + ROOM * largest(begin + move + fall - at) + LEAST_ROOM * barrier.dhat
-    left = (start.room - (at - start.center).square().sum(-1).sqrt()).clamp(min=0)
-    return torch.where(free, torch.minimum(left, wish[:, body]), 0.0)
+class Rooms(NamedTuple):
+    """How far the vertices of bodies may go until pairs are found again."""
+
+    island: Tensor  # of each body [B, bodies] int32
+    room: Tensor  # beside the island's translation, and the largest of the scene [B, bodies + 1] [m]
+    own_room: Tensor  # beside the rigid motion of their own body, [B, bodies + 1] [m]
+    rigid: Tensor  # which takes each vertex that way [B, V, 3] [m]
 
 
 @torch.no_grad()
 def rooms(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor, was: Tensor,
-          now: Tensor, move: Tensor, fall: Tensor, any_direction: bool) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Island of each body [B, bodies], and how far its vertices may go beside the island's translation, with the
-    largest of a scene in the last column [B, bodies + 1] [m]. Index data.
-
-    Room follows from where a body wants to go: pairs that could meet within it are listed, and what does not want to
-    move relative to its neighbours lists few.
+          now: Tensor, move: Tensor, fall: Tensor, any_direction: bool) -> Rooms:  # fmt: skip
+    """Rooms follow from where a body wants to go: pairs that could meet within them are listed, and what does not want
+    to move relative to its neighbours lists few. Index data.
 
     Args:
         x, origin: As the sweeps take them.  mass: [1 | B, V].  was, now: Collider points [B, Vc, 3] [m].
         move, fall: Where each vertex wants to go, [B, V, 3] [m] both.  any_direction: As for detection.islands.
     """
     x, mass, was, now, move, fall = (t.detach() for t in (x, mass, was, now, move, fall))
-    scenes, vertices = x.shape[:2]
-    body, free = surface.body[:vertices].long(), ~surface.held[:vertices]
-    weight = torch.where(free, broadcast(mass, (scenes, vertices)), 0.0)[..., None]
-    sums = _by_body(torch.cat([weight * move, weight], -1), surface)
-    rows = broadcast(body[None], (scenes, vertices))
-
-    def largest(way: Tensor) -> Tensor:
-        length = torch.where(free, way.square().sum(-1).sqrt(), 0.0)
-        return length.new_zeros((scenes, surface.bodies)).scatter_reduce(1, rows, length, "amax")
-
-    falls = largest(fall) + LEAST_ROOM * barrier.dhat
+    motion = _Motion(surface, x, origin, mass, move)
+    body, sums = motion.body, motion.sums
+    falls = motion.largest(fall) + LEAST_ROOM * barrier.dhat
 
     # What is prescribed goes where it goes: pairs with it are listed however far that is.
-    driven = torch.where(free, 0.0, move.square().sum(-1).sqrt())
-    driven = driven.new_zeros((scenes, surface.bodies)).scatter_reduce(1, rows, driven, "amax")
-    pushed = driven.new_zeros((scenes, 1))
+    driven = motion.longest(torch.where(motion.free, 0.0, move.square().sum(-1).sqrt()))
+    pushed = driven.new_zeros((motion.scenes, 1))
     if was.shape[1]:
         pushed = (now - was).square().sum(-1).sqrt().amax(1, keepdim=True)
 
+    def with_largest(room: Tensor) -> Tensor:
+        most = room.amax(1, keepdim=True) if surface.bodies else room.new_zeros((motion.scenes, 1))
+        return torch.cat([room, most], 1)
+
     def room_beside(u: Tensor) -> Tensor:
-        room = (ROOM * largest(move - u[:, body]) + falls).clamp(max=surface.most_room)
+        room = (ROOM * motion.largest(move - u[:, body]) + falls).clamp(max=surface.most_room)
         return torch.maximum(room, driven) + pushed
 
-    def islands(room: Tensor) -> tuple[Tensor, Tensor]:
-        most = room.amax(1, keepdim=True) if surface.bodies else room.new_zeros((scenes, 1))
-        room = torch.cat([room, most], 1)
-        found = search.islands(x, origin, move, mass.contiguous(), was, now, surface, barrier.dhat, room, any_direction)
-        return found, room
+    def islands(room: Tensor) -> Tensor:
+        return search.islands(
+            x, origin, move, mass.contiguous(), was, now, surface, barrier.dhat, with_largest(room), any_direction
+        )
 
     # Islands depend on the rooms, and rooms on what an island leaves of a motion: hence twice.
-    room = room_beside(sums[..., :3] / sums[..., 3:].clamp(min=_tiny(x)))
-    island = islands(room)[0].long()
+    room = room_beside(motion.mean)
+    island = islands(room).long()
     same = (island[:, :, None] == island[:, None]) & (island >= 0)[:, None]
-    joined = same.to(x.dtype) @ sums
+    joined = same.to(x.dtype) @ sums[..., :4]
     u = joined[..., :3] / joined[..., 3:].clamp(min=_tiny(x))
-    return islands(torch.maximum(room, room_beside(torch.where((island >= 0)[..., None], u, 0.0))))
+    room = torch.maximum(room, room_beside(torch.where((island >= 0)[..., None], u, 0.0)))
+    rigid, own = motion.rigid(), torch.zeros_like(room)
+    if barrier.self_contact:
+        least = room.clamp(max=surface.least_own_room)
+        own = (ROOM * motion.largest(move - rigid) + falls).clamp(max=surface.most_own_room)
+        own = torch.maximum(torch.maximum(own, least), driven)
+    return Rooms(islands(room), with_largest(room), with_largest(own), rigid)
 
 
 def unsupported(model: Model, x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor, mass: Tensor, lift: Tensor,

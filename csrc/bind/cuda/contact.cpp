@@ -22,15 +22,16 @@ using torch::stable::accelerator::DeviceGuard;
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_detect(
     const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& collider_next, const Tensor& rest,
     const Tensor& radius, const Tensor& triangles, const Tensor& edges, const Tensor& points, const Tensor& planes,
-    const Tensor& body, const Tensor& held, const Tensor& room, int64_t mesh_bodies, bool self_contact,
-    bool between_bodies, double dhat, int64_t capacity, bool /* trim: to know the number of pairs would wait */) {
+    const Tensor& body, const Tensor& held, const Tensor& room, const Tensor& own_room, int64_t mesh_bodies,
+    bool self_contact, bool between_bodies, double dhat, int64_t capacity,
+    bool /* trim: to know the number of pairs would wait */) {
   const DeviceGuard guard(x.get_device_index());
   diffvbd::require_capacity(capacity);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     auto in = diffvbd::surfaces_of<T>(x, origin, collider, collider_next, rest, radius, triangles, edges, points,
                                       planes, body, held, mesh_bodies, self_contact, between_bodies);
-    diffvbd::set_reach(in, x, room, dhat);
+    diffvbd::set_reach(in, x, room, own_room, dhat);
     const int64_t b = in.scenes, n = in.corners;
     Tensor pairs = empty(x, {capacity, contact::kPairRow}, ScalarType::Int);
     Tensor constants = empty(x, {capacity, contact::kConstants});
