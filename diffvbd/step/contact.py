@@ -68,7 +68,7 @@ class Outcome(NamedTuple):
 
     counts: Tensor  # [R, 4] int64: pairs needed, touching pairs, key of one or -1, pairs that hinder what is prescribed
     capacity: int  # pairs of all scenes
-    cut: Tensor  # [B, V] bool: held up by pairs at the last start, or limited in the last sweep
+    cut: Tensor  # [B, V] bool: limited in the last sweep; without any, held up at the start
     smallest: Tensor  # [R, B] [m]
 
 
@@ -227,7 +227,7 @@ class ContactStep:
                 x, limits = self._sweep(x, start.center, start.room, now, near, part, policy, debug_step)
                 x, last = self._corrected(x, now, start, self._between(near))
                 taken.append(last)
-                cut = cut | (limits[:, -1] > 0)
+                cut = limits[:, -1] > 0  # what the start has held up, sweeps may have made good
             met.cut = cut
             for found in recorders():
                 taken_all = torch.stack(taken)

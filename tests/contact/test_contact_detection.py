@@ -309,8 +309,9 @@ def test_bad_input(device: str) -> None:
         "planes",
         "held",
         "room",
+        "own_room",
     )
-    places = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12)
+    places = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13)
     for place, name in zip(places, names, strict=True):
         for bad in (good[place][None], good[place].to(torch.int64)):
             arguments = [*good[:place], torch.ones_like(bad) if name == "origin" else bad, *good[place + 1 :]]
@@ -318,7 +319,7 @@ def test_bad_input(device: str) -> None:
                 arguments[place] = torch.ones((2, 2), dtype=bad.dtype, device=device)
             with pytest.raises(ValueError, match="expected"):
                 ops_contact.contact_detect(*arguments)
-    for place, bad in ((16, float("nan")), (16, float("inf")), (17, -1), (17, 2**29)):
+    for place, bad in ((17, float("nan")), (17, float("inf")), (18, -1), (18, 2**29)):
         with pytest.raises(ValueError, match="expected"):
             ops_contact.contact_detect(*good[:place], bad, *good[place + 1 :])
 

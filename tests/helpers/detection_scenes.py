@@ -79,6 +79,7 @@ class Scene:
     between_bodies: bool = True
     dhat: float = 0.03
     room: float = 0.05  # how far vertices of the first body may go; of the last half as far
+    own_share: float = 0.8  # of that, that they may go beside the rigid motion of their body
     origin: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
     @staticmethod
@@ -118,8 +119,8 @@ class Scene:
 
     @property
     def reach(self) -> float:
-        """Gap up to which pairs are looked for."""
-        return self.dhat + 2 * self.room
+        """Largest gap that may be found."""
+        return self.dhat + 2 * max(1.0, self.own_share) * self.room
 
     def alone(self, b: int) -> Scene:
         """Scene b of the batch."""
@@ -138,7 +139,7 @@ class Scene:
         return (
             real(x), real(self.origin), real(self.collider), real(self.collider_next), real(self.rest),
             real(self.radius), index(self.triangles), index(self.edges), index(self.points), index(self.planes),
-            index(self.body), index(self.held), real(room), self.mesh_bodies, self.self_contact, self.between_bodies,
+            index(self.body), index(self.held), real(room), real(self.own_share * room), self.mesh_bodies, self.self_contact, self.between_bodies,
             self.dhat, capacity,
         )  # fmt: skip
 
@@ -217,7 +218,7 @@ def closest(kind: int, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass
 class Pairs:
-    """All pairs of one scene that are considered and closer than the reach, in the order of their keys."""
+    """All pairs of one scene that are considered and within the reach of their sides, in the order of their keys."""
 
     kind: np.ndarray
     corners: np.ndarray
@@ -259,7 +260,9 @@ def all_pairs(s: Scene, b: int) -> Pairs:
         edges = [np.linalg.norm(rest[:, n] - rest[:, m], axis=-1) for m, n in ((0, 1), (1, 2), (2, 3), (3, 1))]
         threshold = 1e-3 * (edges[0] * edges[2]) ** 2 if kind == EDGE_EDGE else np.zeros(len(d))
         dhat = np.where(at_rest < s.dhat, 0.9 * at_rest, s.dhat)
-        keep = (d - offset < s.reach) & (at_rest > 1e-9 * np.maximum(*edges[1:3]))
+        rooms = np.append(s.rooms, 0)[np.minimum(np.stack([one, other], 1), s.mesh_bodies)].sum(1)
+        rooms = np.where(one == other, s.own_share * rooms, rooms)
+        keep = (d - offset < np.maximum(s.dhat + rooms, 1e-300)) & (at_rest > 1e-9 * np.maximum(*edges[1:3]))
         columns = (np.full(len(d), kind), corners, d - offset, weights, np.stack([dhat, offset, threshold], -1),
                    ((b * 3 + kind) * base + i) * base + j)  # fmt: skip
         found.append([a[keep] for a in columns])
@@ -268,5 +271,6 @@ def all_pairs(s: Scene, b: int) -> Pairs:
     np.minimum.at(near, corners, gap[:, None])
     room = np.where(s.body < s.mesh_bodies, np.append(s.rooms, 0)[np.minimum(s.body, s.mesh_bodies)], 0.0)
     second = corners[np.arange(len(kind)), np.where(kind == EDGE_EDGE, 2, 1)]
-    margin = constants[:, 0] - (gap - room[corners[:, 0]] - room[second])
+    own = np.where(s.body[corners[:, 0]] == s.body[second], s.own_share, 1.0)
+    margin = constants[:, 0] - (gap - own * (room[corners[:, 0]] + room[second]))
     return Pairs(kind, corners, gap, weights, constants, key, margin, near)
