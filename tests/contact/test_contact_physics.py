@@ -25,7 +25,7 @@ def pair_forces(model: dv.Model, x: Tensor, detection: dv.contact.Detection) -> 
     """Force of the barrier on every corner point at the state x [N], by autograd, and e b' of each listed pair."""
     count = int(detection.counts[0])
     pairs, (dhat, offset, threshold) = detection.listed.pairs[:count].cpu().long(), (
-        detection.listed.constants[:count].cpu().unbind(1)
+        detection.listed.constants[:count, :3].cpu().unbind(1)
     )  # fmt: skip
     points = torch.cat([x, model.collider_points]).detach().cpu().requires_grad_()
     corners, kappa = points[pairs[:, :4]], torch.tensor(model.contact.kappa).double()

@@ -17,7 +17,7 @@ from diffvbd.testing import generator
 
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 EDGES = np.array(list(itertools.combinations(range(4), 2)))
-DHAT, REACH, CAP, GAMMA = 0.6, 0.8, 0.25, 0.4
+DHAT = 0.6
 
 
 def two_tets(gap: float = 0.03) -> dv.TetMesh:
@@ -48,7 +48,6 @@ def stand_in(model: dv.Model, **changes: Any) -> Any:
     values |= {
         "body": torch.tensor([0] * 4 + [1] * 4),
         "contact": SimpleNamespace(**barrier),
-        "contact_numbers": (REACH, CAP, GAMMA),
         "friction": SimpleNamespace(coefficient=0.4, velocity=0.05),
         "collider_points": COLLIDERS,
         "surface_of_contact": SimpleNamespace(radius=RADII),
@@ -72,7 +71,8 @@ def considered() -> list[tuple[list[int], int]]:
 
 
 def detect(model: Any, x: Tensor, before: Tensor, now: Tensor, island: list[list[int]]) -> reference.Part:
-    """Brute force over `considered`, x [B, V, 3], colliders [B, Vc, 3]; lists what may come closer than dhat, too."""
+    """Brute force over `considered`, x [B, V, 3], colliders [B, Vc, 3]; lists what may come closer than dhat, too.
+    Nothing holds anything back: starts and corrections go all of their way."""
     pairs = considered()
     corners, kind = torch.tensor(np.array([c for c, _ in pairs])), torch.tensor([k for _, k in pairs])
     radius = model.surface_of_contact.radius
@@ -81,20 +81,15 @@ def detect(model: Any, x: Tensor, before: Tensor, now: Tensor, island: list[list
     rest = torch.cat((model.rest_points, model.collider_points))[corners]
     edges = ((rest[:, 1] - rest[:, 0]) ** 2).sum(-1), ((rest[:, 3] - rest[:, 2]) ** 2).sum(-1)
     threshold = torch.where(kind == distance.EDGE_EDGE, 1e-3 * edges[0] * edges[1], 0.0)
-    rows, constants, near = [], [], torch.full((len(x), 14, 5), -1)
+    rows, constants = [], []
     for b in range(len(x)):
         points = torch.cat((x[b], torch.where(model.plane_points[:, None], now[b], before[b])))
-        gap = distance.distance(kind, points[corners]) - offset
-        listed = gap < model.contact.dhat + 0.1
+        listed = distance.distance(kind, points[corners]) - offset < model.contact.dhat + 0.1
         tail = torch.stack((kind, torch.full_like(kind, b)), 1)
         rows.append(torch.cat((corners, tail), 1)[listed])
-        constants.append(torch.stack((torch.full_like(gap, model.contact.dhat), offset, threshold), 1)[listed])
-        for i in range(14):
-            own = torch.where((corners == i).any(1), gap, torch.inf)
-            best = int(own.argmin())
-            if own[best] < REACH:
-                near[b, i] = torch.tensor([*corners[best].tolist(), int(kind[best])])
-    return reference.Part(torch.cat(rows), torch.cat(constants), near, torch.tensor(island))
+        constants.append(torch.stack((torch.full_like(offset, model.contact.dhat), offset, threshold), 1)[listed])
+    shares, corrections = x.new_ones(2, *x.shape[:2]), x.new_ones(2, len(x), len(island[0]))
+    return reference.Part(torch.cat(rows), torch.cat(constants), torch.tensor(island), shares, corrections)
 
 
 def scene_of(model: Any, x: Tensor, parameters: dict[str, Any] | None = None) -> Any:

@@ -130,7 +130,7 @@ def test_without_friction_forces_are_minus_the_gradient_of_the_barrier() -> None
         dv.step(scene.model, scene.x, 0 * scene.x, mu=1.0, lam=1.0, time_step=1e-6, sweeps=0)
     part = contact_scenes.part_of(listed[0])
     x = scene.x.clone().requires_grad_()
-    corners, kind, (dhat, offset, threshold) = x[part.pairs[:, :4]], part.pairs[:, 4], part.constants.unbind(1)
+    corners, kind, (dhat, offset, threshold) = x[part.pairs[:, :4]], part.pairs[:, 4], part.constants[:, :3].unbind(1)
     b, _, _ = log_barrier(distance(kind, corners) - offset, x.new_tensor(scene.model.contact.kappa), dhat)
     (slope,) = torch.autograd.grad((mollifier(kind, corners, threshold) * b).sum(), x)
     found = dv.contact.forces(scene.model, scene.x)
