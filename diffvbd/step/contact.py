@@ -72,10 +72,10 @@ class Outcome(NamedTuple):
 class Met:
     """What the parts of a step meet one after another."""
 
-    def __init__(self) -> None:
+    def __init__(self, x: Tensor) -> None:
         self.found: list[Detection] = []
         self.counts: list[Tensor] = []
-        self.cut = torch.zeros(())
+        self.cut = torch.zeros_like(x[..., 0], dtype=torch.bool)
 
 
 outcomes: weakref.WeakKeyDictionary[Model, Outcome] = weakref.WeakKeyDictionary()
@@ -178,7 +178,7 @@ class ContactStep:
         pinned = self.model._pinned[:, None]
         lift = torch.where(pinned, 0.0, broadcast(self.begun.lift, self.begun.y.shape))
         x, way = self.x_prev, self.begun.y - self.x_prev - lift
-        left, met = way, Met()
+        left, met = way, Met(x)
         for r, sweeps in enumerate(sweeps_of_parts(settings.sweeps, self.parts)):
             was, now = (self._colliders_at(n / self.parts) for n in (r, r + 1))
             # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
@@ -186,17 +186,18 @@ class ContactStep:
             fall = lift if r == 0 else torch.zeros_like(lift)
             detection = self._detect(x, was, now, move, fall)
             met.found.append(detection)
-            if not x.is_cuda and not torch.compiler.is_compiling():  # reading is free: before any work
-                self._check(r, [*detection.counts[:3].tolist(), 0])
+            met.counts.append(torch.cat([detection.counts[:3], detection.counts.new_zeros(1)]))
+            if self._reads(x):  # before any work
+                self._check(r, met.counts[r].tolist(), met)
             if r == 0:
                 self._set_lag(detection.listed, was)
                 fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
                                           self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
                                          detection, surface)  # fmt: skip
-            met.counts.append(torch.cat([detection.counts[:3], start.stuck]))
-            if not x.is_cuda and not torch.compiler.is_compiling():
-                self._check(r, met.counts[-1].tolist())
+            met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
+            if self._reads(x):
+                self._check(r, met.counts[r].tolist(), met)
             between = self._between(detection.listed)
             x, first = self._corrected(start.x, now, start, between)
             taken, limits, cut = [first], None, start.short
@@ -277,7 +278,7 @@ class ContactStep:
             return torch.where(good, x, torch.nan)
         if x.is_cuda:
             for r, row in enumerate(table.tolist()):
-                self._check(r, row)
+                self._check(r, row, met)
         return x
 
     @property
@@ -289,11 +290,14 @@ class ContactStep:
             return MOST_CAPACITY  # the list is as long as it must be
         return max(surface.capacity * scenes, 0 if barrier.capacity is not None else LEAST_CAPACITY)
 
-    def _check(self, r: int, counts: list[int]) -> None:
-        """Raises where a detection found more than fits, surfaces that touch, or motion above a bound."""
+    def _check(self, r: int, counts: list[int], met: Met) -> None:
+        """Raises where a detection found more than fits, surfaces that touch, or a way that pairs close to what is
+        prescribed."""
         surface = self.surface
         assert surface is not None
         needed, touching, pair, hindered = counts
+        if needed > self.capacity or touching or hindered:
+            self._record(met)  # the status of a step that raises says why
         scenes = self.x_prev.shape[0]
         if needed > self.capacity:
             raise TooManyPairs(

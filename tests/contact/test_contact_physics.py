@@ -132,8 +132,9 @@ def test_pair_forces_are_equal_and_opposite() -> None:
 @pytest.mark.parametrize("detections", (1, 2))
 @pytest.mark.parametrize("lagged", (False, True), ids=("barrier", "with_friction_and_damping"))
 def test_collision_conserves_momentum(lagged: bool, detections: int) -> None:
-    """Without gravity sum m v is kept by every step: to rounding at K = 400, not at K = 1. The barrier keeps
-    L_{n+1} - L_n = h sum m v_{n+1} x v_n, too; friction acts along the gap, at an arm of it."""
+    """Without gravity sum m v is kept by every step: to rounding at any K, by the rigid correction after the
+    sweeps. At K = 400 the barrier keeps L_{n+1} - L_n = h sum m v_{n+1} x v_n, too, and not at K = 1; friction acts
+    along the gap, at an arm of it."""
     options: dict[str, Any] = {"damping": 3.0, "friction": (dv.Friction(0.4, 0.05),)} if lagged else {}
     h, drift = 5e-3, {}
     for sweeps in (1, 400):
@@ -150,8 +151,8 @@ def test_collision_conserves_momentum(lagged: bool, detections: int) -> None:
         assert float((per_body(model, mass * v) - first)[0, 0]) < -0.5 * size / 2  # they did collide
         drift[sweeps] = linear / size, angular / size
     print(f"{lagged=} {detections=} drift (linear, angular) by K: {drift}")
-    assert drift[400][0] <= tolerance("momentum")
-    assert drift[1][0] > 1e-4  # sweeps that have not converged drift: documented, not hidden
+    assert max(drift[1][0], drift[400][0]) <= tolerance("momentum")
+    assert drift[1][1] > 1e-7  # sweeps that have not converged drift: documented, not hidden
     if lagged:
         assert drift[400][1] <= tolerance("friction_torque")
     else:

@@ -92,7 +92,7 @@ ENERGIES: list[tuple[str, Callable[[], Any], str]] = [
     ("stiffness", lambda: dv.Anchor(ones(8).to("meta")), "meta"),
     ("points", lambda: dv.Anchor(1.0, points=ones(8, 3).to_sparse()), "sparse"),
     *((n, lambda n=n: dv.FloorBarrier(**{n: 10**400}), "float|bits") for n in ("kappa", "dhat", "damping", "height")),
-    *((n, lambda n=n: dv.PairBarrier(**{n: 10**400}), "bits") for n in ("kappa", "dhat", "damping", "reach", "gamma")),
+    *((n, lambda n=n: dv.PairBarrier(**{n: 10**400}), "bits") for n in ("kappa", "dhat", "damping", "reach")),
     *((n, lambda n=n: dv.Friction(**{n: 10**400}), "bits") for n in ("coefficient", "velocity")),
     ("vertices", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, vertices=torch.zeros(7, dtype=torch.bool)),)), "7"),
     ("tape", lambda: dv.ReverseSweep("half"), "half"),
