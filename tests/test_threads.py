@@ -22,8 +22,9 @@ def overflowing(run: Callable[..., Any] = dv.step) -> None:
 
 
 def touching() -> tuple[dv.Model, Tensor]:
+    """Two cubes that are near each other, for which a step searches twice."""
     mesh = dv.mesh.join([dv.mesh.cube(2, size=0.2), dv.mesh.cube(2, size=0.2).translate((0.0, 0.21, 0.0))])
-    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier()))
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier(detections=2)))
     return model, model.rest_points
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.contact.start import _Start
+from diffvbd.contact.start import _Target
 from diffvbd.model.bodies import Bodies, OtherBodies
 from diffvbd.reference.energies import FloorBarrier
 from diffvbd.safeguards import FILTER_ETA
@@ -85,18 +85,15 @@ def by_reference(a: dict[str, Tensor]) -> Tensor:
 
 
 def by_contact(a: dict[str, Tensor]) -> Tensor:
-    """A part of a step with contact where no bound cuts and no island moves."""
+    """A part of a step with contact where no pair holds anything up and no island moves."""
     scenes, vertices = a["x"].shape[:2]
-    planes = packed(a)
-    near = a["x"].new_full((scenes, vertices, 8), 1e6)
     free = torch.zeros(vertices, dtype=torch.bool)
     body = torch.zeros(vertices, dtype=torch.int32)
-    surface = types.SimpleNamespace(held=free, body=body, cap=1e6, body_order=torch.arange(vertices, dtype=torch.int32),
+    surface = types.SimpleNamespace(held=free, body=body, body_order=torch.arange(vertices, dtype=torch.int32),
                                     body_ptr=torch.tensor([0, vertices], dtype=torch.int32))  # fmt: skip
     u = a["x"].new_zeros((scenes, 1, 3))
-    start: Any = _Start.apply(a["x"], a["step"], a["x"].detach(), u, near[..., 7], planes, near, a["x"].new_empty((0,)),
-                              surface, 0.45)  # fmt: skip
-    return start[1] - a["x"]
+    target: Any = _Target.apply(a["x"], a["step"], u, packed(a), a["x"].new_empty((0,)), surface)
+    return target - a["x"]
 
 
 CODES = {"begin": by_begin, "reference": by_reference, "contact": by_contact}
