@@ -82,7 +82,7 @@ def test_strides_do_not_matter(device: str) -> None:
 
 
 def test_scenes_do_not_mix(one_regime: None, device: str) -> None:
-    """Each scene of [2, 3, V, 3] as if alone, to the bit: pairs, islands, bounds and parameters."""
+    """Each scene of [2, 3, V, 3] as if alone, to the bit: pairs, islands, limits and parameters."""
     model = two_boxes(device, things=[ball()])
     noise = contact_scenes.noise("scenes", shape=(2, 3, 16, 3), size=0.3).to(device)
     kappa = 400.0 * torch.arange(1, 7, dtype=torch.float64, device=device).reshape(2, 3)
