@@ -47,7 +47,8 @@ class Correction:
         at = torch.arange(self.count, device=x.device)
         matrix = matrix.index_put((_scenes(len(share), at), at, at), blocks, accumulate=True)
         for term in self.forces:
-            g, matrix = self._add(term.pairs, *term.on_corners(x), jacobian, g, matrix)
+            force, stiffness = term.on_corners(x)
+            g, matrix = self._add(term.pairs, force, stiffness, jacobian, g, matrix)
         free = self.free.to(x.device)
         both = (free[:, None] & free)[..., None, None]
         fill = torch.where(free, LEAST_STIFFNESS * total, 1.0)[..., None, None] * torch.eye(6).to(x)

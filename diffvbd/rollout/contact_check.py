@@ -72,8 +72,8 @@ def warn_of_contact(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prep
         model._derived[WARNED] = True
     if cut > CUT:
         warnings.warn(
-            f"pair_barrier: pairs held up {100 * cut:.2g} % of the vertices in the last step, which lost velocity; take "
-            "a smaller time_step, more detections or a larger reach of the PairBarrier (docs/contact.md)",
+            f"pair_barrier: pairs held up {100 * cut:.2g} % of the vertices in the last step, which lost velocity; "
+            "take a smaller time_step, more detections or a larger reach of the PairBarrier (docs/contact.md)",
             UserWarning,
             stacklevel=3,
         )

@@ -1,4 +1,4 @@
-"""Claim: no executed step lets surfaces cross, at any speed and any K, and the bounds that see to it cost nothing in
+"""Claim: no executed step lets surfaces cross, at any speed and any K, and what sees to it costs nothing in
 common motion. The independent check compares every edge with every triangle (dv.contact.intersections)."""
 
 import math
@@ -96,7 +96,7 @@ def test_a_stack_at_rest_keeps_its_height() -> None:
 @pytest.mark.parametrize("detections", (1, 2, 4))
 @pytest.mark.parametrize("sweeps", (0, 1, 5))
 def test_boxes_side_by_side_fall_freely(device: str, sweeps: int, detections: int) -> None:
-    """Eight boxes 1 mm apart at 10 m/s and faster: no bound cuts anything, x_n = x_0 + n h v + g h^2 n (n + 1) / 2."""
+    """Eight boxes 1 mm apart at 10 m/s and faster: nothing is held up, x_n = x_0 + n h v + g h^2 n (n + 1) / 2."""
     offsets = [0.101 * np.array([i, j, k]) for i in range(2) for j in range(2) for k in range(2)]
     tets = join([box(2, 0.1).translate(offset) for offset in offsets])
     model = dv.Model(tets, energies=(dv.StableNeoHookean(), barrier(dhat=5e-4, detections=detections)), device=device)
@@ -106,7 +106,8 @@ def test_boxes_side_by_side_fall_freely(device: str, sweeps: int, detections: in
     for _ in range(n):
         x, v = dv.step(model, x, v, time_step=h, sweeps=sweeps, **MATERIAL)
         status = dv.contact.status(model)
-        assert status.cut == [0] and status.smallest_gap[0] == pytest.approx(1e-3)
+        # the gap, or how far has been searched where that is less
+        assert status.cut == [0] and 5e-4 < status.smallest_gap[0] <= 1e-3 + 1e-9
     gravity = torch.tensor([0.0, -GRAVITY, 0.0], dtype=torch.float64, device=device)
     assert relative_error(x, start + n * h * velocity + gravity * h**2 * n * (n + 1) / 2) <= tolerance("free_fall")
 
@@ -129,12 +130,12 @@ def test_edges_that_cross_do_not_pass(speed: float, detections: int) -> None:
         assert apart(model, x)
 
 
-# --- what bounds cut, and what is reported of it ---------------------------------------------------------------------
+# --- what pairs hold up, and what is reported of it ------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("detections", (1, 2, 4))
 def test_cut_vertices_are_reported(device: str, detections: int) -> None:
-    """By no sweep the step is the predictor, except where a bound has cut: as many vertices as status says. Per scene:
+    """By no sweep the step is the predictor, except where pairs hold up: as many vertices as status says. Per scene:
     the second one stands still."""
     model, v = thrown_together(0, detections=detections)
     model = model.to(device)
@@ -151,12 +152,13 @@ def test_cut_vertices_are_reported(device: str, detections: int) -> None:
         assert 0 < int(moved[0].sum()) <= cut[0]
     # what is cut is lost as velocity
     assert float((after - (end - x) * 60).abs().max()) <= tolerance("cancelling") * float(v.abs().max())
-    dv.step(model, end, 0.01 * v, sweeps=4, **still)
+    for _ in range(4):  # until they are near
+        end, _ = dv.step(model, end, v, sweeps=0, **still)
     assert dv.contact.status(model).smallest_gap[0] < dv.contact.status(model).smallest_gap[1]
 
 
 def test_a_cut_update_is_reported() -> None:
-    """Without motion only the barrier moves vertices: by more than a bound where kappa is absurd."""
+    """Without motion only the barrier moves vertices: farther than they may go where kappa is absurd."""
     tets = join([box(2, 0.2), box(2, 0.1).translate((0.05, 0.203, 0.05))])
     for kappa, expected in ((1e2, False), (1e9, True)):
         model = dv.Model(tets, energies=(dv.StableNeoHookean(), barrier(kappa=kappa, detections=1)))
@@ -207,16 +209,16 @@ def test_a_prescribed_body_pushes() -> None:
 
 
 @pytest.mark.parametrize(("detections", "height"), ((1, 0.004), (2, 0.006), (4, 0.007)))
-def test_prescribed_motion_above_a_bound(device: str, value_checks: None, detections: int, height: float) -> None:
-    """gamma gap is 4.5 mm at first; every part may use that share of what the parts before have left."""
+def test_prescribed_motion_that_leaves_no_way(device: str, value_checks: None, detections: int, height: float) -> None:
+    """The box above cannot get out of the way of 8 mm and more at once: 2.5 mm of the gap of 10 mm are to be left."""
     model, x, v = falling_on(0.0, detections=detections)
     model, x, v = model.to(device), x.to(device), v.to(device)
     step: dict[str, Any] = {"time_step": 1 / 100, "sweeps": 4, "gravity": WEIGHTLESS, **MATERIAL}
     up = torch.tensor([0.0, height, 0.0], dtype=torch.float64, device=device) * model.pinned[:, None]
     end, _ = dv.step(model, x, v, prescribed=x + up, **step)
     assert dv.contact.status(model).hindered == 0 and apart(model, end)
-    with pytest.raises(ValueError, match=r"prescribed or colliders: expected motion below .* got \d+ points .*"
-                                         rf"in part \d of {detections}: .*detections"):  # fmt: skip
+    with pytest.raises(ValueError, match=r"prescribed or colliders: expected motion that leaves bodies a way, got "
+                                         rf"\d+ pairs in part \d of {detections} .*: use more detections"):  # fmt: skip
         dv.step(model, x, v, prescribed=x + 2 * up, **step)
     assert dv.contact.status(model).hindered > 0
 
@@ -228,21 +230,22 @@ def ball(detections: int, dhat: float = 5e-3, device: str = "cpu") -> dv.Model:
     return dv.Model(box(3, 0.2), energies=energies, colliders=[sphere], device=device)
 
 
-def test_a_collider_above_its_bound_raises_and_in_smaller_parts_does_not(device: str) -> None:
-    """gamma gap is 2.25 cm: 3 cm are too far in one part, and not in several."""
-    up = torch.tensor([0.0, 0.03, 0.0], dtype=torch.float64, device=device)
-    for detections in (1, 2, 4):
-        model = ball(detections, device=device)
+def test_a_collider_that_leaves_no_way_raises_and_in_smaller_parts_does_not(device: str) -> None:
+    """Of the gap of 5 cm 1 cm, half of dhat, is to be left: 4.5 cm are too far in one part, and not in several, between
+    which the box is pushed away."""
+    up = torch.tensor([0.0, 0.045, 0.0], dtype=torch.float64, device=device)
+    for detections in (1, 8):
+        model = ball(detections, dhat=0.02, device=device)
         x, before = model.rest_points, model.collider_points
-        options: dict[str, Any] = {"time_step": 0.01, "sweeps": 4, "gravity": WEIGHTLESS, **MATERIAL}
+        options: dict[str, Any] = {"time_step": 0.01, "sweeps": 16, "gravity": WEIGHTLESS, **MATERIAL}
         options |= {"colliders": before + up, "colliders_before": before}
         if detections == 1:
-            with pytest.raises(ValueError, match="prescribed or colliders: .* got 1 points .*in part 0 of 1"):
+            with pytest.raises(ValueError, match=r"prescribed or colliders: .* got \d+ pairs in part 0 of 1"):
                 dv.step(model, x, torch.zeros_like(x), **options)
         else:
             end, _ = dv.step(model, x, torch.zeros_like(x), **options)
             assert float((end - before - up).norm(dim=-1).min()) > 0.2
-        assert dv.contact.status(model).hindered == int(detections == 1)
+        assert (dv.contact.status(model).hindered > 0) == (detections == 1)
 
 
 @pytest.mark.parametrize("detections", (1, 2, 4))

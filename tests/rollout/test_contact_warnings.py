@@ -1,4 +1,4 @@
-"""Claim: a rollout warns once of motion that pairs held up and of friction that has not converged, and says what helps."""
+"""Claim: a rollout warns once of what pairs held up and of friction that has not converged, and says what helps."""
 
 import warnings
 from typing import Any
@@ -66,7 +66,7 @@ def test_it_is_said_once_by_any_schedule_and_changes_nothing() -> None:
             start = v.clone().requires_grad_()
 
             def run(start: torch.Tensor = start, every: Any = every, check: bool = check) -> None:
-                end = dv.rollout(model, x, start, steps=5, checkpoint_every=every, check_contact=check, **FAST)
+                end = dv.rollout(model, x, start, steps=3, checkpoint_every=every, check_contact=check, **FAST)
                 ends.append((end.x[-1].detach(), torch.autograd.grad(end.x[-1].square().sum(), start)[0]))
 
             assert sum("pairs held up" in text for text in messages(run)) == int(check)
