@@ -1,9 +1,9 @@
 """Contact under stress, and what contact costs: crossings, gaps, cut motion and energy; step times.
 
-Crossings are counted by `dv.contact.intersections`, which knows nothing of distances and bounds: signs of volumes, for
+Crossings are counted by `dv.contact.intersections`, which knows nothing of distances and planes: signs of volumes, for
 every edge of the surfaces and the triangles whose boxes it meets, at the start and after every n-th step ("check
 every"). Energy is kinetic, elastic and of gravity (relative to the start), without barriers. A vertex is cut in a step
-when a bound has shortened its motion.
+when pairs have held it up.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from bench.cpu import kept_bytes, least
 from bench.gpu_measure import Card
 from diffvbd import mesh
 from diffvbd.contact import detection
+from diffvbd.step.rooms import rooms
 
 DHAT = 2e-3  # [m]
 CLOSE = 0.5 * DHAT  # gap of bodies that touch [m]
@@ -55,17 +56,20 @@ def stepping(model: dv.Model, reverse: bool) -> Callable[[], Any]:
 
 
 def searching(model: dv.Model) -> Callable[[], Any]:
-    """The detections and islands of one step."""
+    """The rooms, islands and detections of one step from rest."""
     surface, barrier = model.surface_of_contact, model.contact
     assert surface is not None and barrier is not None
     x = model.rest_points[None].contiguous()
     none, points, mass = x.new_empty((0,)), surface.collider_points[None].contiguous(), model.mass[None].contiguous()
     move = torch.zeros_like(x)
+    fall = move + TIME_STEP**2 * move.new_tensor([0.0, -9.81, 0.0])
 
     def work() -> list[Any]:
-        return [(detection.detect(x, none, points, points, surface, barrier, surface.capacity),
-                 detection.islands(x, none, move, mass, points, points, surface, barrier.dhat, False))
-                for _ in range(DETECTIONS)]  # fmt: skip
+        out = []
+        for _ in range(DETECTIONS):
+            island, room = rooms(surface, barrier, x, none, mass, points, points, move, fall, False)
+            out.append((island, detection.detect(x, none, points, points, surface, barrier, surface.capacity, room)))
+        return out
 
     return work
 

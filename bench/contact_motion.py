@@ -1,8 +1,8 @@
 """Motion beside contact, where the answer is known: closed forms, the same scene without contact, or steps of h / 50.
 
 Braking of a thin sheet and of a spin, sliding and its derivative, bodies at rest, stacks, grips, crowds and impacts.
-Each row has a value, its reference, a target and whether it is met. "cut" is the mean share of vertices whose motion
-a bound has shortened; crossings are edges through triangles and vertices below a plane, counted at ten times of each
+Each row has a value, its reference, a target and whether it is met. "cut" is the mean share of vertices that
+pairs have held up; crossings are edges through triangles and vertices below a plane, counted at ten times of each
 rollout; "not finite" are coordinates and velocities. Milliseconds are of a step without its backward, one thread.
 """
 

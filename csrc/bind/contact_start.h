@@ -94,8 +94,8 @@ contact::StartInputs<T> start_inputs(const StartTensors& t, double filter_eta) {
 }
 
 struct AdvanceTensors {
-  const Tensor &x, &move, &u, &center, &origin, &collider, &collider_next, &held, &body, &room, &frame, &frame_center,
-      &frame_room, &pairs, &constants, &ptr, &entry;
+  const Tensor &x, &move, &u, &center, &origin, &collider, &collider_next, &held, &body, &room, &own_center, &own_room,
+      &pairs, &constants, &ptr, &entry;
 };
 
 template <class T>
@@ -118,12 +118,10 @@ contact::AdvanceInputs<T> advance_inputs(const AdvanceTensors& t) {
   require_like("room", t.room, t.x, b * v);
   in.collider = data<const T>(t.collider), in.collider_next = data<const T>(t.collider_next);
   in.held = data<const bool>(t.held), in.body = data<const int32_t>(t.body), in.room = data<const T>(t.room);
-  if (t.frame.numel() > 0) {
-    require_vectors(t.frame, t.x);
-    require_vectors(t.frame_center, t.x);
-    require_like("frame_room", t.frame_room, t.x, b * v);
-    in.frame = data<const T>(t.frame), in.frame_center = data<const T>(t.frame_center);
-    in.frame_room = data<const T>(t.frame_room);
+  if (t.own_room.numel() > 0) {
+    require_vectors(t.own_center, t.x);
+    require_like("own_room", t.own_room, t.x, b * v);
+    in.own_center = data<const T>(t.own_center), in.own_room = data<const T>(t.own_room);
   }
   in.listed = pair_list(t.pairs, t.ptr, t.entry, t.x, v + colliders);
   require_like("constants", t.constants, t.x, t.pairs.size(0) * contact::kConstants);

@@ -152,13 +152,13 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "contact_islands(Tensor x, Tensor origin, Tensor move, Tensor mass, Tensor collider, Tensor collider_next, "
       "Tensor planes, Tensor body, Tensor body_order, Tensor body_ptr, Tensor held, Tensor radius, Tensor room, int "
       "mesh_bodies, float dhat, bool any_direction) -> Tensor");
-  // How much of its way each vertex goes at the start, see contact/advance.h: [scenes, vertices]; frames: the same of
-  // the rigid motions of bodies [scenes, bodies]; stuck: how many pairs what is prescribed brings too close. center:
-  // what a vertex may leave by its room at most; frame: where the rigid motion of its body takes it, or empty
+  // How much of its way each vertex goes at the start, see contact/advance.h: [scenes, vertices], or all of a body
+  // [scenes, bodies] where it goes as a whole; stuck: how many pairs what is prescribed brings too close. center: what a
+  // vertex may leave by its room at most, and own_center by its own_room, unless empty
   m.def(
       "contact_advance(Tensor x, Tensor move, Tensor u, Tensor center, Tensor origin, Tensor collider, Tensor "
-      "collider_next, Tensor held, Tensor body, Tensor room, Tensor frame, Tensor frame_center, Tensor frame_room, Tensor "
-      "pairs, Tensor constants, Tensor ptr, Tensor entry, bool careful) -> (Tensor share, Tensor frames, Tensor stuck)");
+      "collider_next, Tensor held, Tensor body, Tensor room, Tensor own_center, Tensor own_room, Tensor pairs, Tensor "
+      "constants, Tensor ptr, Tensor entry, bool careful, bool whole) -> (Tensor share, Tensor stuck)");
   m.def("segment_sum(Tensor values, Tensor order, Tensor ptr) -> Tensor");
   // points [B, N, 3]; pairs [max_pairs, 3] int32: (scene, i, j), then rows of -1; count [1] int64: how many there are,
   // or -1 where a point is not finite

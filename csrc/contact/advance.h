@@ -1,7 +1,6 @@
-// How much of its way each vertex may go at the start of the sweeps, where all move at once: all of it wherever the
-// pairs that it is in stay apart, else a half, a quarter, ... of what is left, and so on from there. Vertices of one
-// body stay near its rigid motion, of which it goes a share as well: that is why few pairs within a body must be known.
-// The shares are decided, not differentiated (docs/method.md, section 12).
+// How much of its way each vertex, or each body as a whole, may go at the start of the sweeps, where all move at once:
+// all of it wherever the pairs that it is in stay apart, else a half, a quarter, ... of what is left, and so on from
+// there. The shares are decided, not differentiated (docs/method.md, section 12).
 #pragma once
 
 #include "passes.h"
@@ -24,23 +23,25 @@ struct AdvanceInputs {
   const int32_t* body;                // [N]
   PairList listed;
   const T* constants;
-  const T* room;          // [B, V]
-  const T* frame;         // [B, V, 3] or null: where the rigid motion of its body takes a vertex, beside u
-  const T* frame_center;  // [B, V, 3]  where its share of that begins
-  const T* frame_room;    // [B, V]  how far from there a vertex may be
+  const T* room;                   // [B, V]
+  const T *own_center, *own_room;  // the same beside the rigid motion of its body; or null
   int64_t scenes;
   int32_t vertices, corners, bodies;
   bool careful;  // the motion does not minimise the barrier
+  bool whole;    // all vertices of a body go the same share
+
+  // What goes a share of its own: vertices, or bodies.
+  DIFFVBD_FN int64_t units() const { return scenes * (whole ? bodies : vertices); }
+  DIFFVBD_FN int64_t unit(int64_t row) const { return whole ? row / vertices * bodies + body[row % vertices] : row; }
+  DIFFVBD_FN int64_t scene_of_unit(int64_t unit) const { return unit / (whole ? bodies : vertices); }
 };
 
-// What changes while it is worked out.
+// What changes while it is worked out, of each unit.
 template <class T>
 struct AdvanceState {
-  T *share, *now;            // [B, V]  of the whole way after the moves so far; of what is left, tried in this one
-  T *frame, *frame_now;      // [B, bodies]  the same of the rigid motions
-  uint8_t* unfit;            // [B, bodies]  some vertex cannot be as near as it must be
-  uint8_t *blocked, *stamp;  // [B, V]  some pair does not let it pass; the round in which it last tried less
-  uint8_t* failed;           // [B]  a scene in which some pair has found no way
+  T *share, *now;            // of the whole way after the moves so far; of what is left, tried in this one
+  uint8_t *blocked, *stamp;  // something does not let it pass; the round in which it last tried less
+  uint8_t* failed;           // [B]  a scene in which something has found no way
   bool first;                // the move in which colliders and prescribed vertices go
 };
 
@@ -86,11 +87,12 @@ DIFFVBD_FN Attempt<T> attempt(const AdvanceInputs<T>& in, const AdvanceState<T>&
     } else {
       const int64_t row = scene * in.vertices + v;
       const Vec3<T> whole = way_of(in, scene, v);
-      const T done = in.held[v] ? T(s.first ? 0 : 1) : s.share[row];
+      const int64_t unit = in.unit(row);
+      const T done = in.held[v] ? T(s.first ? 0 : 1) : s.share[unit];
       at[k] = vector_at(in.x + 3 * row) + done * whole;
       out.since[k] = at[k] - vector_at(in.center + 3 * row);
       from[k] = in.origin ? vector_at(in.origin + 3 * row) : zero3<T>();
-      out.way[k] = ((T(1) - done) * (in.held[v] ? T(1) : s.now[row])) * whole;
+      out.way[k] = ((T(1) - done) * (in.held[v] ? T(1) : s.now[unit])) * whole;
       out.free[k] = !in.held[v];
     }
     const Vec3<T> p = at[k] + from[k];
@@ -131,7 +133,7 @@ template <class T>
 DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair, int round) {
   const int32_t* record = in.listed.pairs + kPairRow * pair;
   const auto retried = [&](int k) {
-    return record[k] < in.vertices && s.stamp[int64_t{record[5]} * in.vertices + record[k]] == round;
+    return record[k] < in.vertices && s.stamp[in.unit(int64_t{record[5]} * in.vertices + record[k])] == round;
   };
   if (round > 0 && !(retried(0) || retried(1) || retried(2) || retried(3))) return true;
   const T* constants = in.constants + kConstants * pair;
@@ -155,7 +157,7 @@ DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, i
       if (!a.free[k] || !(T(0) < dot(a.way[k], a.way[k]))) continue;
       const T toward = (k < first ? -dot(gate.n, a.way[k]) : dot(gate.n, a.way[k]));
       if (pass == 0 && !(T(kStartLeast) * gate.gap < toward)) continue;
-      mark(s.blocked + int64_t{record[5]} * in.vertices + record[k]);
+      mark(s.blocked + in.unit(int64_t{record[5]} * in.vertices + record[k]));
       named = true;
     }
   }
@@ -167,85 +169,46 @@ DIFFVBD_FN T total(T done, T now) {
   return now == T(1) ? T(1) : done + now * (T(1) - done);
 }
 
-// Whether a vertex that goes `now` of what is left stays in its rooms.
+// Marks a vertex that leaves its rooms by what it tries; returns whether it stays. Rounds as of try_pair().
 template <class T>
-DIFFVBD_FN bool fits(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row, T now) {
-  const int64_t scene = row / in.vertices;
+DIFFVBD_FN bool stay(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row, int round) {
   const auto v = static_cast<int32_t>(row % in.vertices);
-  const Vec3<T> x = vector_at(in.x + 3 * row), gone = total(s.share[row], now) * way_of(in, scene, v);
-  const Vec3<T> off = x - vector_at(in.center + 3 * row) + gone;
-  if (!(dot(off, off) <= in.room[row] * in.room[row])) return false;
-  if (!in.frame) return true;
-  const int64_t body = scene * in.bodies + in.body[v];
-  const Vec3<T> turned = total(s.frame[body], s.frame_now[body]) * vector_at(in.frame + 3 * row);
-  const Vec3<T> own = x - vector_at(in.frame_center + 3 * row) + gone - turned;
-  return dot(own, own) <= in.frame_room[row] * in.frame_room[row];
+  const int64_t unit = in.unit(row);
+  if (in.held[v] || (round > 0 && s.stamp[unit] != round) || s.now[unit] == T(0)) return true;
+  const Vec3<T> x = vector_at(in.x + 3 * row);
+  const Vec3<T> end = x + total(s.share[unit], s.now[unit]) * way_of(in, row / in.vertices, v);
+  const auto within = [&](const T* center, const T* room) {
+    const Vec3<T> off = end - vector_at(center + 3 * row);
+    return dot(off, off) <= room[row] * room[row];
+  };
+  if (within(in.center, in.room) && (!in.own_room || within(in.own_center, in.own_room))) return true;
+  mark(s.blocked + unit);
+  return false;
 }
 
-// Reduces what a vertex tries until it stays in its rooms; returns whether it tries less. Where nothing helps, its body
-// must go less of its rigid motion.
+// After a round: what is blocked tries less.
 template <class T>
-DIFFVBD_FN bool refit(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row) {
-  T now = s.now[row];
-  while (T(0) < now && !fits(in, s, row, now)) now = T(kLeastTry) < now ? T(0.5) * now : T(0);
-  if (in.frame && !fits(in, s, row, now)) {
-    mark(s.unfit + row / in.vertices * in.bodies + in.body[row % in.vertices]);
-    return false;
-  }
-  const bool less = now < s.now[row];
-  s.now[row] = now;
-  return less;
-}
-
-// After a round: vertices that are blocked try less, and all stay near the rigid motions of their bodies.
-template <class T>
-DIFFVBD_FN bool retreat(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row, int round) {
-  if (in.held[row % in.vertices]) return false;
-  const bool blocked = s.blocked[row];
-  s.blocked[row] = 0;
-  if (blocked) s.now[row] = round < kPatience && T(kLeastTry) < s.now[row] ? T(0.5) * s.now[row] : T(0);
-  const bool less = refit(in, s, row) || blocked;
-  if (less) s.stamp[row] = static_cast<uint8_t>(round + 1);
-  return less;
-}
-
-// And after that: bodies whose vertices cannot follow go less. Returns whether this one does.
-template <class T>
-DIFFVBD_FN bool slow_down(const AdvanceState<T>& s, int64_t body, int round) {
-  if (!s.unfit[body]) return false;
-  s.unfit[body] = 0;
-  s.frame_now[body] = round < kPatience && T(kLeastTry) < s.frame_now[body] ? T(0.5) * s.frame_now[body] : T(0);
+DIFFVBD_FN bool retreat(const AdvanceState<T>& s, int64_t unit, int round) {
+  if (!s.blocked[unit]) return false;
+  s.blocked[unit] = 0;
+  s.stamp[unit] = static_cast<uint8_t>(round + 1);
+  s.now[unit] = round < kPatience && T(kLeastTry) < s.now[unit] ? T(0.5) * s.now[unit] : T(0);
   return true;
 }
 
 template <class T>
-DIFFVBD_FN void begin_body(const AdvanceState<T>& s, int64_t body) {
-  if (s.first) s.frame[body] = T(0);
-  s.frame_now[body] = T(1), s.unfit[body] = 0;
-}
-// Returns whether the vertex does not stay in its rooms before its body goes less.
-template <class T>
-DIFFVBD_FN bool begin_move(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row) {
-  if (s.first) s.share[row] = T(0);
-  s.blocked[row] = s.stamp[row] = 0;
-  s.now[row] = T(1);
-  if (in.held[row % in.vertices]) return false;
-  refit(in, s, row);
-  return !fits(in, s, row, s.now[row]);
+DIFFVBD_FN void begin_move(const AdvanceState<T>& s, int64_t unit) {
+  if (s.first) s.share[unit] = T(0);
+  s.now[unit] = T(1), s.blocked[unit] = s.stamp[unit] = 0;
 }
 // A scene that has found no way stays where it is in this move.
 template <class T>
-DIFFVBD_FN void give_up(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row) {
-  if (s.failed[row / in.vertices]) s.now[row] = T(0);
+DIFFVBD_FN void give_up(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t unit) {
+  if (s.failed[in.scene_of_unit(unit)]) s.now[unit] = T(0);
 }
 template <class T>
-DIFFVBD_FN void end_body(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t body) {
-  if (s.failed[body / in.bodies]) s.frame_now[body] = T(0);
-  s.frame[body] = total(s.frame[body], s.frame_now[body]);
-}
-template <class T>
-DIFFVBD_FN void end_move(const AdvanceState<T>& s, int64_t row) {
-  s.share[row] = total(s.share[row], s.now[row]);
+DIFFVBD_FN void end_move(const AdvanceState<T>& s, int64_t unit) {
+  s.share[unit] = total(s.share[unit], s.now[unit]);
 }
 
 }  // namespace diffvbd::contact

@@ -30,42 +30,39 @@ int64_t count(int64_t n, int64_t grain, const F& f) {
 }  // namespace
 
 template <class T>
-int64_t advance(const AdvanceInputs<T>& in, T* share, T* frame) {
-  const int64_t rows = in.scenes * in.vertices, pairs = in.listed.ptr[in.scenes * in.corners] / 4;
-  const int64_t bodies = in.scenes * in.bodies;
-  std::vector<T> now(rows), frame_now(bodies);
-  std::vector<uint8_t> blocked(rows), stamp(rows), unfit(bodies), failed(in.scenes);
-  AdvanceState<T> s{share,        now.data(),    frame, frame_now.data(), unfit.data(), blocked.data(),
-                    stamp.data(), failed.data(), true};
-  const auto scene_of = [&](int64_t pair) { return in.listed.pairs[kPairRow * pair + 5]; };
+int64_t advance(const AdvanceInputs<T>& in, T* share) {
+  const int64_t rows = in.scenes * in.vertices, units = in.units();
+  const int64_t pairs = in.listed.ptr[in.scenes * in.corners] / 4;
+  std::vector<T> now(units);
+  std::vector<uint8_t> blocked(units), stamp(units), failed(in.scenes);
+  AdvanceState<T> s{share, now.data(), blocked.data(), stamp.data(), failed.data(), true};
   int64_t stuck = 0;
   for (int move = 0; move < kMoves; ++move) {
     s.first = move == 0;
     std::fill(failed.begin(), failed.end(), 0);
-    for (int64_t i = 0; i < bodies; ++i) begin_body(s, i);
-    bool open = count(rows, kGrain, [&](int64_t i) { return begin_move(in, s, i); }) > 0;
+    for (int64_t i = 0; i < units; ++i) begin_move(s, i);
     for (int round = 0; round < kRounds; ++round) {
       const bool last = round + 1 == kRounds;
-      const auto fails = [&](int64_t pair) {
-        const bool passes = try_pair(in, s, pair, last ? 0 : round);
-        if (!passes && last) mark(failed.data() + scene_of(pair));
+      const auto fails = [&](int64_t scene, bool passes) {
+        if (!passes && last) mark(failed.data() + scene);
         return !passes;
       };
-      const bool blocks = count(pairs, kPairGrain, fails) > 0;
-      if (last || (!blocks && !open)) break;
-      open = count(rows, kGrain, [&](int64_t i) { return retreat(in, s, i, round); }) > 0;
-      for (int64_t i = 0; i < bodies; ++i) open = slow_down(s, i, round) || open;
-      if (!open) break;
+      const int64_t found = count(pairs, kPairGrain, [&](int64_t i) {
+        return fails(in.listed.pairs[kPairRow * i + 5], try_pair(in, s, i, last ? 0 : round));
+      });
+      const int64_t left =
+          count(rows, kGrain, [&](int64_t i) { return fails(i / in.vertices, stay(in, s, i, last ? 0 : round)); });
+      if (found + left == 0 || last) break;
+      if (count(units, kGrain, [&](int64_t i) { return retreat(s, i, round); }) == 0) break;
     }
-    count(rows, kGrain, [&](int64_t i) {
-      if (!in.held[i % in.vertices] && !fits(in, s, i, s.now[i])) mark(failed.data() + i / in.vertices);
-      return 0;
-    });
-    count(rows, kGrain, [&](int64_t i) { return give_up(in, s, i), 0; });
+    for (int64_t i = 0; i < units; ++i) give_up(in, s, i);
     if (s.first) stuck = count(pairs, kPairGrain, [&](int64_t pair) { return !try_pair(in, s, pair, 0); });
-    count(rows, kGrain, [&](int64_t i) { return end_move(s, i), 0; });
-    for (int64_t i = 0; i < bodies; ++i) end_body(in, s, i);
-    if (count(rows, kGrain, [&](int64_t i) { return !in.held[i % in.vertices] && share[i] < T(1); }) == 0) break;
+    bool open = false;
+    for (int64_t i = 0; i < units; ++i) {
+      end_move(s, i);
+      open = open || share[i] < T(1);
+    }
+    if (!open) break;
   }
   return stuck;
 }
@@ -79,7 +76,7 @@ void narrow(const NarrowInputs<T>& in, int64_t pairs, T* constants) {
 
 template void narrow<float>(const NarrowInputs<float>&, int64_t, float*);
 template void narrow<double>(const NarrowInputs<double>&, int64_t, double*);
-template int64_t advance<float>(const AdvanceInputs<float>&, float*, float*);
-template int64_t advance<double>(const AdvanceInputs<double>&, double*, double*);
+template int64_t advance<float>(const AdvanceInputs<float>&, float*);
+template int64_t advance<double>(const AdvanceInputs<double>&, double*);
 
 }  // namespace diffvbd

@@ -6,9 +6,9 @@
 
 namespace diffvbd {
 
-// share [B, V], frame [B, bodies]; returns how many pairs what is prescribed would bring too close.
+// share of each unit; returns how many pairs what is prescribed would bring too close.
 template <class T>
-int64_t advance(const contact::AdvanceInputs<T>& in, T* share, T* frame);
+int64_t advance(const contact::AdvanceInputs<T>& in, T* share);
 
 // constants [pairs, 8] (contact/narrow.h).
 template <class T>

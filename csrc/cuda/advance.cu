@@ -10,7 +10,7 @@ namespace {
 using namespace contact;
 
 constexpr int kThreads = 128;
-constexpr int kFlags = kMoves * (2 * kRounds + 2);  // one for each question that the whole grid is asked
+constexpr int kFlags = kMoves * (2 * kRounds + 1);  // one for each question that the whole grid is asked
 
 // Out of line: whoever asks gets the same bits.
 template <class T>
@@ -37,38 +37,27 @@ __global__ void __launch_bounds__(kThreads)
     grid.sync();
     return *static_cast<volatile unsigned*>(flags++) != 0;
   };
-  const int64_t rows = in.scenes * in.vertices, pairs = in.listed.ptr[in.scenes * in.corners] / 4;
-  const int64_t bodies = in.scenes * in.bodies;
+  const int64_t rows = in.scenes * in.vertices, units = in.units();
+  const int64_t pairs = in.listed.ptr[in.scenes * in.corners] / 4;
   for (int move = 0; move < kMoves; ++move) {
     s.first = move == 0;
     each(in.scenes, [&](int64_t i) { s.failed[i] = 0; });
-    each(bodies, [&](int64_t i) { begin_body(s, i); });
+    each(units, [&](int64_t i) { begin_move(s, i); });
     grid.sync();
-    bool less = false;
-    each(rows, [&](int64_t i) { less = begin_move(in, s, i) || less; });
-    bool open = any(less);
     for (int round = 0; round < kRounds; ++round) {
       const bool last = round + 1 == kRounds;
-      bool fails = false;
-      each(pairs, [&](int64_t pair) {
-        if (passes(in, s, pair, last ? 0 : round)) return;
-        fails = true;
-        if (last) mark(s.failed + in.listed.pairs[kPairRow * pair + 5]);
-      });
-      const bool blocks = any(fails);
-      if (last || (!blocks && !open)) break;
-      less = false;
-      each(rows, [&](int64_t i) { less = retreat(in, s, i, round) || less; });
-      grid.sync();
-      each(bodies, [&](int64_t i) { less = slow_down(s, i, round) || less; });
-      open = any(less);
-      if (!open) break;
+      bool found = false, less = false;
+      const auto note = [&](int64_t scene, bool passed) {
+        if (!passed && last) mark(s.failed + scene);
+        found = found || !passed;
+      };
+      each(pairs, [&](int64_t i) { note(in.listed.pairs[kPairRow * i + 5], passes(in, s, i, last ? 0 : round)); });
+      each(rows, [&](int64_t i) { note(i / in.vertices, stay(in, s, i, last ? 0 : round)); });
+      if (!any(found) || last) break;
+      each(units, [&](int64_t i) { less = retreat(s, i, round) || less; });
+      if (!any(less)) break;
     }
-    each(rows, [&](int64_t i) {
-      if (!in.held[i % in.vertices] && !fits(in, s, i, s.now[i])) mark(s.failed + i / in.vertices);
-    });
-    grid.sync();
-    each(rows, [&](int64_t i) { give_up(in, s, i); });
+    each(units, [&](int64_t i) { give_up(in, s, i); });
     if (s.first) {
       grid.sync();
       each(pairs, [&](int64_t pair) {
@@ -76,13 +65,12 @@ __global__ void __launch_bounds__(kThreads)
       });
       grid.sync();
     }
-    less = false;
-    each(rows, [&](int64_t i) {
+    bool open = false;
+    each(units, [&](int64_t i) {
       end_move(s, i);
-      less = less || (!in.held[i % in.vertices] && s.share[i] < T(1));
+      open = open || s.share[i] < T(1);
     });
-    each(bodies, [&](int64_t i) { end_body(in, s, i); });
-    if (!any(less)) break;
+    if (!any(open)) break;
   }
 }
 
@@ -100,13 +88,12 @@ constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
 
 template <class T>
 int64_t advance_workspace_bytes(const AdvanceInputs<T>& in) {
-  const int64_t rows = in.scenes * in.vertices, bodies = in.scenes * in.bodies;
-  return aligned(kFlags * sizeof(unsigned)) + aligned(rows * sizeof(T)) + 2 * aligned(rows) + aligned(in.scenes) +
-         aligned(bodies * sizeof(T)) + aligned(bodies);
+  const int64_t units = in.units();
+  return aligned(kFlags * sizeof(unsigned)) + aligned(units * sizeof(T)) + 2 * aligned(units) + aligned(in.scenes);
 }
 
 template <class T>
-cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, T* frame, int64_t* stuck, void* workspace,
+cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* stuck, void* workspace,
                     int multiprocessors, cudaStream_t stream) {
   if (auto error = cudaMemsetAsync(stuck, 0, sizeof(*stuck), stream)) return error;
   const int64_t rows = in.scenes * in.vertices;
@@ -118,14 +105,12 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, T* f
     return here;
   };
   auto* flags = reinterpret_cast<unsigned*>(take(kFlags * sizeof(unsigned)));
-  auto* now = reinterpret_cast<T*>(take(rows * sizeof(T)));
-  uint8_t *blocked = take(rows), *stamp = take(rows), *failed = take(in.scenes);
-  const int64_t bodies = in.scenes * in.bodies;
-  auto* frame_now = reinterpret_cast<T*>(take(bodies * sizeof(T)));
-  uint8_t* unfit = take(bodies);
+  const int64_t units = in.units();
+  auto* now = reinterpret_cast<T*>(take(units * sizeof(T)));
+  uint8_t *blocked = take(units), *stamp = take(units), *failed = take(in.scenes);
   if (auto error = cudaMemsetAsync(flags, 0, kFlags * sizeof(unsigned), stream)) return error;
   AdvanceInputs<T> inputs = in;
-  AdvanceState<T> state{share, now, frame, frame_now, unfit, blocked, stamp, failed, true};
+  AdvanceState<T> state{share, now, blocked, stamp, failed, true};
   auto* found = reinterpret_cast<unsigned long long*>(stuck);
   const void* kernel = reinterpret_cast<const void*>(advance_kernel<T>);
   int resident = 0;
@@ -147,7 +132,7 @@ cudaError_t narrow(const NarrowInputs<T>& in, int64_t pairs, T* constants, cudaS
 #define DIFFVBD_INSTANTIATE(T)                                                       \
   template cudaError_t narrow<T>(const NarrowInputs<T>&, int64_t, T*, cudaStream_t); \
   template int64_t advance_workspace_bytes<T>(const AdvanceInputs<T>&);              \
-  template cudaError_t advance<T>(const AdvanceInputs<T>&, int64_t, T*, T*, int64_t*, void*, int, cudaStream_t);
+  template cudaError_t advance<T>(const AdvanceInputs<T>&, int64_t, T*, int64_t*, void*, int, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

@@ -12,10 +12,10 @@ namespace diffvbd::cuda {
 template <class T>
 int64_t advance_workspace_bytes(const contact::AdvanceInputs<T>& in);
 
-// share [B, V], frame [B, bodies], stuck [1] as cpu/advance.h. capacity: pairs that the list has room for.
+// share, stuck [1] as cpu/advance.h. capacity: pairs that the list has room for.
 template <class T>
-cudaError_t advance(const contact::AdvanceInputs<T>& in, int64_t capacity, T* share, T* frame, int64_t* stuck,
-                    void* workspace, int multiprocessors, cudaStream_t stream);
+cudaError_t advance(const contact::AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* stuck, void* workspace,
+                    int multiprocessors, cudaStream_t stream);
 
 // constants [pairs, 8] (contact/narrow.h).
 template <class T>

@@ -62,8 +62,7 @@ def _corners(points: Any, triangles: Any = None, edges: Any = None, lone: Any = 
 class Plane:
     """The half-space below a plane. Three corner points span it: ``point`` and two at 1 m from it.
 
-    A bound cuts motion along a Plane, too; vertices that slide fast over a fixed plane are better served by a
-    :class:`diffvbd.FloorBarrier`, whose step filter looks at the normal direction alone.
+    A fixed plane costs less as a :class:`diffvbd.FloorBarrier`, which needs no detection.
 
     Args:
         point: On the plane [m], 3 numbers.  normal: Toward the free side, 3 numbers, not zero.

@@ -98,61 +98,87 @@ class PartStart(NamedTuple):
     x: Tensor  # [B, V, 3] [m]
     center: Tensor  # [B, V, 3]  from where each vertex has its room [m]; a number, not a function of the start
     room: Tensor  # [B, V]  how far from there it may go [m]
-    own_center: Tensor  # [B, V, 3]  where the rigid motion of its body has taken it [m], a number as well
-    own_room: Tensor | None  # [B, V]  how far from there it may go; None: bodies have no pairs of their own
+    own: tuple  # the same beside the rigid motion of its body; empty where bodies have no pairs of their own
+    frames: Tensor | None  # [B, bodies]: share of its rigid motion that each body has gone
     short: Tensor  # [B, V] bool: pairs have held up more than a hundredth of its way
     stuck: Tensor  # [1] int64: pairs that hinder what is prescribed
     shares: Tensor  # [2, B, V]: of the two ways, that vertices went
 
 
 SHORT = 0.99  # share of a way that counts as all of it
+KEPT = 0.9  # share of a gap above a floor that rigid motion may close
+PLANE = 7  # numbers of a plane of a FloorBarrier
 
 
 def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
                          planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface,
                          rigid: Tensor | None) -> PartStart:  # fmt: skip
-    """Every vertex as far along its way as pairs and floor let all go at once: first by ``move``, then by ``fall``.
+    """Every vertex as far along its way as pairs and floor let all go at once: by ``rigid`` each body as a whole, then
+    by what is left of ``move``, then by ``fall``.
 
     Args:
         x, move, fall: [B, V, 3] [m].  mass: [1 | B, V] [kg].
         was, now: Collider points before and during the sweeps, [B, Vc, 3] [m].
         planes: Data of the FloorBarrier [1 | B, 7 planes], or None; differentiable as x, move, fall and mass.
         origin: [B, V, 3] or empty.  detection: of the step.
-        rigid: Where rigid motions of bodies would take their vertices, as a way [B, V, 3] [m]; None without
-            self-contact.
+        rigid: Where rigid motions of bodies would take their vertices, as a way [B, V, 3] [m], differentiable; None
+            without self-contact.
     """
     floor = x.new_empty((0,)) if planes is None else planes
     index = (surface.held, surface.body, surface.body_order, surface.body_ptr, detection.island, detection.lowest)
     u = _Translation.apply(move, mass.contiguous(), x, floor, origin, index)
-    body = surface.body[: x.shape[1]].long()
-    pinned = surface.held[: x.shape[1], None]
+    body, pinned = surface.body[: x.shape[1]].long(), surface.held[: x.shape[1], None]
     room, listed = detection.room[:, body].contiguous(), detection.listed
     listed = (listed.pairs, listed.constants, listed.ptr, listed.entry)
-    at, center, still = x, x.detach(), torch.zeros_like(u)
-    own_center = center
-    own_room = None if rigid is None else detection.own_room[:, body].contiguous()
-    frame = None if rigid is None else (rigid - u.detach()[:, body]).contiguous()
+    still, carried = torch.zeros_like(u), u[:, body]
+    center = torch.where(pinned, x, x + carried).detach()
     shares, stuck = [], []
-    for way, by, here in ((move, u, was), (fall, still, now)):
-        target = at + way
-        if floor.numel():
-            target = _Target.apply(at, way, by, floor, origin, surface)
-        with torch.no_grad():
-            share, frames, hindered = ops_contact_start.advance(
-                at.detach().contiguous(), (target - at).detach().contiguous(), by.detach(), center, origin,
-                here.detach(), now.detach(), surface.held, surface.body, room, listed,
-                frame=() if frame is None or own_room is None else (frame, own_center, own_room),
-            )  # fmt: skip
-            if frame is not None:
-                own_center = (own_center + by[:, body] + frames[:, body, None] * frame).contiguous()
-                frame = torch.zeros_like(frame)
-        shares.append(share)
+
+    def advance(at: Tensor, way: Tensor, by: Tensor, center: Tensor, **options: Any) -> Tensor:
+        """Shares of a way; colliders and what is prescribed go in the first."""
+        here = now if stuck else was
+        share, hindered = ops_contact_start.advance(
+            at.detach().contiguous(), way.contiguous(), by, center.contiguous(), origin, here.detach(), now.detach(),
+            surface.held, surface.body, room, listed, **options,
+        )  # fmt: skip
         stuck.append(hindered)
-        base = at + by[:, body]
-        at = torch.where(pinned, target, base + share[..., None] * (target - base))
-        center = torch.where(pinned, center, center + by.detach()[:, body]).contiguous()
+        return share
+
+    def target_of(at: Tensor, way: Tensor, by: Tensor) -> Tensor:
+        return _Target.apply(at, way, by, floor, origin, surface) if floor.numel() else at + way
+
+    target, base, frames, own = target_of(x, move, u), torch.where(pinned, x, x + carried), None, ()
+    if rigid is not None:  # bodies first, each as a whole
+        with torch.no_grad():
+            beside = rigid - carried
+            above = share_above_floor(floor, origin, base, beside, surface)
+            way = torch.where(pinned, move, carried + above[:, body, None] * beside)
+            frames = above * advance(x, way, u.detach(), x.detach(), whole=True)
+        base = torch.where(pinned, target, base + frames[:, body, None] * (rigid - carried))
+        own = (base.detach().contiguous(), detection.own_room[:, body].contiguous())
+    at = base
+    for number in range(2):
+        if number:
+            target = target_of(at, fall, still)
+        with torch.no_grad():
+            shares.append(advance(at, target - at, still, center, own=own))
+        at = torch.where(pinned, target, at + shares[-1][..., None] * (target - at))
     short = (torch.minimum(*shares) < SHORT) & ~pinned[:, 0]
-    return PartStart(at, center, room, own_center, own_room, short, stuck[0] + stuck[1], torch.stack(shares))
+    return PartStart(at, center, room, own, frames, short, sum(stuck[1:], stuck[0]), torch.stack(shares))
+
+
+def share_above_floor(floor: Tensor, origin: Tensor, at: Tensor, way: Tensor, surface: ContactSurface) -> Tensor:
+    """How much of a way [B, V, 3] the vertices of each body can go together above a floor, [B, bodies]. Not
+    differentiable."""
+    out = at.new_ones((at.shape[0], surface.bodies))
+    if not floor.numel():
+        return out
+    planes = floor.detach().reshape(floor.shape[0], 1, -1, PLANE)
+    normal, p = planes[..., :3].transpose(-1, -2), (at + origin if origin.numel() else at).detach()
+    gap, toward = (p[:, :, None] @ normal)[:, :, 0] - planes[..., 3], -(way.detach()[:, :, None] @ normal)[:, :, 0]
+    share = torch.where(toward > 0, KEPT * gap / toward, 1.0).amin(-1).clamp(0, 1)
+    share = torch.where(surface.held[: at.shape[1]], 1.0, share)
+    return out.scatter_reduce(1, surface.body[: at.shape[1]].long().expand(share.shape), share, "amin")
 
 
 ops.ready_signature(_Translation, _TranslationBackward, _Target, _TargetBackward)

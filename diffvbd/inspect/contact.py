@@ -43,15 +43,16 @@ class Status:
         pairs: The most pairs of one detection, of all scenes.
         capacity: Pairs that fit, of all scenes; with more, an eager step has raised, a captured one returned NaN.
         touching: Pairs without a gap that detections found (the step has raised or returned NaN).
-        above_bounds: Prescribed vertices and collider points moved above their bound (likewise).
-        cut: Vertices whose motion a bound has cut: they lost velocity that no force took, [scenes].
+        hindered: Pairs that prescribed vertices and moving colliders would bring too close (likewise).
+        cut: Vertices that pairs held up at the start of the last part or in its last sweep: they lost velocity that no
+            force took, [scenes].
         smallest_gap: The smallest gap that a detection found [m], or the search distance, [scenes].
     """
 
     pairs: int
     capacity: int
     touching: int
-    above_bounds: int
+    hindered: int
     cut: list[int]
     smallest_gap: list[float]
 
@@ -77,7 +78,7 @@ def status(model: Model) -> Status:
         pairs=int(counts[:, 0].max()),
         capacity=outcome.capacity,
         touching=int(counts[:, 1].sum()),
-        above_bounds=int(counts[:, 3].sum()),
+        hindered=int(counts[:, 3].sum()),
         cut=outcome.cut.sum(-1).tolist(),
         smallest_gap=outcome.smallest.min(0).values.tolist(),
     )

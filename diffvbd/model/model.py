@@ -55,7 +55,7 @@ class Model:
         rigid: Whether each step moves every free body as a whole to where the step's potential is least, before and
             after the sweeps (docs/method.md, section 14): it rests, falls and spins right at any number of sweeps. The
             last sweep of a step then has a relaxation of at most 1. None: where there is no contact of pairs and no
-            friction, which it does not see yet.
+            friction, which have a correction of their own.
         start: Where the sweeps of the other bodies start: ``"predictor"`` (y, with gravity and forces), ``"inertia"``
             (x + h v, right for stiff pinned bodies that few sweeps hardly move) or ``"auto"``: for each body and step
             the one of lower incremental potential; beside pairs and friction the predictor, with coarse x + h v.

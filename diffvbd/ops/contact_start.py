@@ -41,22 +41,22 @@ def start_backward(bar: Tensor, x: Tensor, move: Tensor, u: Tensor, planes: Tens
 
 def advance(x: Tensor, move: Tensor, u: Tensor, center: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor,
             held: Tensor, body: Tensor, room: Tensor, listed: Sequence[Tensor], careful: bool = True,
-            frame: Sequence[Tensor] = ()) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Share of ``move - u`` that each vertex may go at once with all others [B, V]; the share of the rigid motion that
-    each body goes [B, bodies]; how many pairs hinder what is prescribed, int64 [1]. Not differentiable.
+            whole: bool = False, own: Sequence[Tensor] = ()) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Share of ``move - u`` that each vertex may go at once with all others [B, V], or each body [B, bodies]; how many
+    pairs hinder what is prescribed, int64 [1]. Not differentiable.
 
     Args:
         x, move: [B, V, 3], state and wanted motion [m].  u: Translation of each body's island [B, bodies, 3] [m].
         center, room: [B, V, 3] and [B, V]: how far from where a vertex may go [m].
         listed: pairs, constants, ptr, entry of :func:`contact_detect`.
         careful: Whether the motion does not minimise the barrier.
-        frame: Where the rigid motion of its body takes a vertex beside u, where its share of that begins [B, V, 3], and
-            how far from there a vertex may be [B, V] [m]; empty where bodies have no pairs of their own.
+        whole: Whether all vertices of a body go the same share.
+        own: As center and room, beside the rigid motion of the vertex's body; empty where bodies have no own pairs.
     """
     none = x.new_empty((0,))
     return raw.contact_advance(
-        x, move, u, center, origin, collider, collider_next, held, body, room, *(frame or (none, none, none)), *listed,
-        careful,
+        x, move, u, center, origin, collider, collider_next, held, body, room, *(own or (none, none)), *listed, careful,
+        whole,
     )  # fmt: skip
 
 
@@ -72,9 +72,9 @@ def _(x, origin, collider, room, pairs, constants):
 
 
 @shapes_of("contact_advance")
-def _(x, move, u, center, origin, collider, collider_next, held, body, room, frame, frame_center, frame_room, pairs,
-      constants, ptr, entry, careful):  # fmt: skip
-    return x.new_empty(x.shape[:2]), x.new_empty(u.shape[:2]), x.new_empty((1,), dtype=torch.int64)
+def _(x, move, u, center, origin, collider, collider_next, held, body, room, own_center, own_room, pairs, constants,
+      ptr, entry, careful, whole):  # fmt: skip
+    return x.new_empty(u.shape[:2] if whole else x.shape[:2]), x.new_empty((1,), dtype=torch.int64)
 
 
 @shapes_of("contact_translation")

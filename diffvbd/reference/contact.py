@@ -14,13 +14,12 @@ import torch
 from torch import Tensor
 
 from .distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
-from .energies import FloorBarrier, StableNeoHookean, build_energies
+from .energies import FloorBarrier, build_energies
 from .friction import floor_friction, smoothed, tangential6
 from .layout import build_layout, dot, outer6
+from .rigid_contact import Correction
 from .scene import Scene, build_scene
 from .sweep import check_start, color_masses, predictor, run_sweeps, started
-
-LEAST_STIFFNESS = 1e-12  # of its mass, that keeps the system of a body definite
 
 
 class Part(NamedTuple):
@@ -33,6 +32,7 @@ class Part(NamedTuple):
     shares: Tensor  # [2, B, V]: of the two ways of the start, that each vertex goes
     corrections: Tensor  # [1 | 2, B, bodies]: of the rigid motions before and after the sweeps, that each body takes
     limits: Tensor | None = None  # [K, B, V]: of each update, that planes let through
+    frames: Tensor | None = None  # [B, bodies]: of the rigid motions of the start; None: there are none
     lowest: Tensor | None = None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
 
 
@@ -106,6 +106,19 @@ class PairBarrier:
         columns = torch.cat((e * first * slope + b * turn, e * second * outer6(slope)))
         return self.pairs.assemble(k, self.weight * columns)
 
+    turns_its_body = False  # by pairs of one body; friction acts along a gap, at an arm of it, and does
+
+    def on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the rigid correction: forces on the corners [Q, 4, 3] and what their updates add [Q, 4, 4, 3, 3]."""
+        p = self.pairs
+        gap, slope, e, turn = p.measures(corner_points(x, self.colliders), torch.arange(len(p.kind), device=x.device))
+        b, first, second = log_barrier(gap, self.kappa, p.dhat)
+        b = self.weight * b
+        across = slope[:, :, None, :, None] * slope[:, None, :, None, :]
+        first, second = self.weight * e * first, self.weight * e * second
+        force = first[:, None, None] * slope + b[:, None, None] * turn
+        return force, second[:, None, None, None, None] * across
+
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
         p = self.pairs
         corners = p.positions(corner_points(x, self.colliders), torch.arange(len(p.kind), device=x.device))
@@ -161,6 +174,22 @@ class LaggedPairForces:
             columns = columns + size * weight * friction
         return self.pairs.assemble(k, columns)
 
+    turns_its_body = True
+
+    def on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """As those of the barrier."""
+        along, slip, weights = self._travel(x, torch.arange(len(self.near), device=x.device))
+        rate, n = self.h * self.damping, self.normal
+        outer = n[:, :, None] * n[:, None, :]
+        force = (rate * along)[:, None] * n
+        inner = torch.where(self.near, rate, 0.0)[:, None, None] * outer
+        if self.largest is not None:
+            size = self.h**2 * self.largest * smoothed(slip, self.reach)[1]
+            force = force + size[:, None] * slip.T
+            inner = inner + size[:, None, None] * (torch.eye(3).to(x) - outer)
+        weighted = weights[:, :, None, None, None] * weights[:, None, :, None, None] * inner[:, None, None]
+        return weights[..., None] * force[:, None], weighted
+
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
         along, slip, _ = self._travel(x, torch.arange(len(self.near), device=x.device))
         total = self.h * self.damping / 2 * along**2
@@ -210,127 +239,6 @@ class Translation:
         return torch.where(safe.unsqueeze(-2), u, 0.0)
 
 
-class Correction:
-    """The rigid correction of bodies that touch: one Newton step over turn and shift of every body without pinned
-    vertices, all of a scene together. The gradient is autograd's, the blocks are those of vertex updates."""
-
-    def __init__(self, scene: Scene, energies: list[Any], barrier: Any, lagged: Any, y: Tensor, x_prev: Tensor) -> None:
-        model, self.scene, self.y, self.x_prev = scene.model, scene, y, x_prev
-        self.single = [e for e in energies if not isinstance(e, StableNeoHookean)]
-        self.barrier, self.lagged = barrier, lagged
-        self.body, self.count = model.body, int(model.body.max()) + 1
-        pinned = torch.zeros(self.count).index_add(0, self.body.cpu(), model.pinned.cpu().float()) > 0
-        self.free = ~pinned.to(y.device)
-
-    def __call__(self, x: Tensor, share: Tensor) -> Tensor:
-        """The state [..., 3, V] after each body [B, bodies] has taken its share of its motion."""
-        lead, rows = x.shape[:-2], x.transpose(-1, -2).reshape(len(share), -1, 3)
-        mass = self.scene.mass.expand(*lead, x.shape[-1]).reshape(len(share), -1)
-        total = mass.new_zeros(len(share), self.count).index_add(1, self.body, mass)
-        center = rows.new_zeros(len(share), self.count, 3).index_add(1, self.body, mass[..., None] * rows)
-        arm = rows - (center / total[..., None])[:, self.body]
-
-        def state(motion: Tensor) -> Tensor:
-            turn = torch.linalg.matrix_exp(_cross_matrix(motion[..., :3]))
-            moved = (
-                rows + ((turn[:, self.body] - torch.eye(3).to(x)) @ arm[..., None])[..., 0] + motion[:, self.body, 3:]
-            )
-            return moved.transpose(-1, -2).reshape(x.shape)
-
-        z = x.new_zeros(len(share), self.count, 6)
-        jacobian = torch.cat([-_cross_matrix(arm), torch.eye(3).to(x).expand(*arm.shape, 3)], -1)  # [B, V, 3, 6]
-        g, blocks = self._single(x, state, z, jacobian, mass)
-        matrix = x.new_zeros(len(share), self.count, self.count, 6, 6)
-        at = torch.arange(self.count, device=x.device)
-        matrix = matrix.index_put((slice_of(len(share), at), at, at), blocks, accumulate=True)
-        for pairs, within, force, stiffness in self._pairs(x):
-            g, matrix = self._add(pairs, within, force, stiffness, jacobian, g, matrix)
-        free = self.free.to(x.device)
-        both = (free[:, None] & free)[..., None, None]
-        fill = torch.where(free, LEAST_STIFFNESS * total, 1.0)[..., None, None] * torch.eye(6).to(x)
-        matrix = torch.where(both, matrix, 0.0).index_put((slice_of(len(share), at), at, at), fill, accumulate=True)
-        system = matrix.permute(0, 1, 3, 2, 4).reshape(len(share), 6 * self.count, -1)
-        right = torch.where(free[:, None], -g, 0.0).reshape(len(share), -1, 1)
-        motion = torch.linalg.solve(system, right).reshape(z.shape)
-        return state(share.to(x)[..., None] * motion)
-
-    def _single(self, x: Tensor, state: Any, z: Tensor, jacobian: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient [B, bodies, 6] and blocks [B, bodies, 6, 6] of inertia and the energies of single vertices."""
-        tracked = z.clone().requires_grad_()
-        off = torch.where(self.scene.model.pinned, 0.0, state(tracked) - self.y)
-        value = (self.scene.mass.unsqueeze(-2) / 2 * off**2).sum((-2, -1))
-        for energy in self.single:
-            value = value + energy.energy(state(tracked), self.x_prev)
-        (g,) = torch.autograd.grad(value.sum(), tracked, create_graph=True)
-        total = torch.zeros_like(x).repeat_interleave(3, -2)  # [..., 9, V]
-        for k, color in enumerate(self.scene.layout.colors):
-            for energy in self.single:
-                total = total.index_add(-1, color.vertices, energy.block(k, x, self.x_prev))
-        xx, xy, xz, yy, yz, zz = total[..., 3:, :].unbind(-2)
-        own = torch.stack([torch.stack(r, -1) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))], -2)
-        own = own.reshape(*jacobian.shape[:2], 3, 3) + mass[..., None, None] * torch.eye(3).to(x)
-        blocks = jacobian.mT @ own @ jacobian
-        return g, blocks.new_zeros(len(z), self.count, 6, 6).index_add(1, self.body, blocks)
-
-    def _pairs(self, x: Tensor) -> list[tuple[Any, bool, Tensor, Tensor]]:
-        """Forces on the corners [Q, 4, 3] of barriers and lagged terms, and what their updates add [Q, 4, 4, 3, 3]; and
-        whether pairs of one body turn it."""
-        out, h2 = [], self.scene.time_step**2
-        p = self.barrier.pairs
-        every = torch.arange(len(p.kind), device=x.device)
-        gap, slope, e, turned = p.measures(corner_points(x, self.barrier.colliders), every)
-        value, first, second = log_barrier(gap, self.barrier.kappa, p.dhat)
-        force = (e * first)[:, None, None] * slope + value[:, None, None] * turned
-        across = slope[:, :, None, :, None] * slope[:, None, :, None, :]
-        out.append((p, False, h2 * force, h2 * (e * second)[:, None, None, None, None] * across))
-        lag = self.lagged
-        if lag is not None:
-            every = torch.arange(len(lag.near), device=x.device)
-            along, slip, weights = lag._travel(x, every)
-            rate, n = lag.h * lag.damping, lag.normal
-            force = (rate * along)[:, None] * n
-            outer = n[:, :, None] * n[:, None, :]
-            inner = torch.where(lag.near, rate, 0.0)[:, None, None] * outer
-            if lag.largest is not None:
-                size = lag.h**2 * lag.largest * smoothed(slip, lag.reach)[1]
-                force = force + size[:, None] * slip.T
-                inner = inner + size[:, None, None] * (torch.eye(3).to(x) - outer)
-            weighted = weights[:, :, None, None, None] * weights[:, None, :, None, None] * inner[:, None, None]
-            out.append((lag.pairs, True, weights[..., None] * force[:, None], weighted))
-        return out
-
-    def _add(self, p: Any, within: bool, force: Tensor, stiffness: Tensor, jacobian: Tensor, g: Tensor, matrix: Tensor
-             ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        vertices = jacobian.shape[1]
-        mesh = p.corners < vertices
-        corners = torch.where(mesh, p.corners, 0)
-        body = self.body[corners]
-        scene = p.batch[:, None].expand_as(corners)
-        maps = torch.where(mesh[..., None, None], jacobian[scene, corners], 0.0)  # [Q, 4, 3, 6]
-        second = torch.where(p.kind == EDGE_EDGE, 2, 1)
-        lead = body.gather(1, second[:, None])
-        if not within:
-            apart = (body[:, :1] != lead) | ~mesh.gather(1, second[:, None])
-            maps = torch.where(apart[..., None, None], maps, 0.0)
-        pull = (maps.mT @ force[..., None])[..., 0]
-        g = g.index_put((scene, body), pull, accumulate=True)
-        pressed = maps.mT[:, :, None] @ stiffness @ maps[:, None]  # [Q, 4, 4, 6, 6]
-        rows = (scene[:, :, None].expand(-1, 4, 4), body[:, :, None].expand(-1, 4, 4), body[:, None].expand(-1, 4, 4))
-        return g, matrix.index_put(rows, pressed, accumulate=True)
-
-
-def slice_of(scenes: int, at: Tensor) -> Tensor:
-    """Scenes [B, 1] beside an index of bodies."""
-    return torch.arange(scenes, device=at.device)[:, None].expand(scenes, len(at))
-
-
-def _cross_matrix(w: Tensor) -> Tensor:
-    """[w]x, [..., 3, 3]."""
-    zero = torch.zeros_like(w[..., 0])
-    x, y, z = w.unbind(-1)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-
-
 def _unsupported(scene: Scene, pairs: Pairs, floor: FloorBarrier | None, x: Tensor, colliders: Tensor, lift: Tensor
                  ) -> Tensor:  # fmt: skip
     """What barriers at the start of the step leave of the ways [..., 3, V] that bodies want to fall."""
@@ -358,6 +266,26 @@ def _unsupported(scene: Scene, pairs: Pairs, floor: FloorBarrier | None, x: Tens
     taken = torch.where(pinned[:, None], 0.0, share * borne)[:, model.body]
     way = torch.where(free[:, None], way + taken, way)
     return way.transpose(-1, -2).reshape(x.shape)
+
+
+def _rigid(scene: Scene, x: Tensor, move: Tensor) -> Tensor:
+    """The shift and the linearised turn of each body that have the momenta of the ways [..., 3, V]."""
+    model, way, at = scene.model, move.transpose(-1, -2), x.transpose(-1, -2)
+    mass = scene.mass.expand(at.shape[:-1])[..., None]
+    eye, out = torch.eye(3).to(x), torch.zeros_like(at)
+    for body in range(int(model.body.max()) + 1):
+        own = model.body == body
+        if bool(model.pinned[own].any()):
+            continue
+        m, d, p = mass[..., own, :], way[..., own, :], at[..., own, :]
+        whole = m.sum(-2, keepdim=True)
+        arm, shift = p - (m * p).sum(-2, keepdim=True) / whole, (m * d).sum(-2, keepdim=True) / whole
+        spread = (m[..., None] * arm[..., None] * arm[..., None, :]).sum(-3)
+        size = spread.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        momentum = (m * torch.linalg.cross(arm, d)).sum(-2)
+        turn = torch.linalg.solve((1 + 1e-9) * size * eye - spread, momentum)
+        out = out.index_add(-2, own.nonzero()[:, 0], shift + torch.linalg.cross(turn[..., None, :].expand_as(arm), arm))
+    return out.transpose(-1, -2)
 
 
 SHORT = 0.99  # share of a way that counts as all of it
@@ -436,9 +364,12 @@ def contact_step(
             target = at + wanted
             if floor is not None:
                 target = base + started(energies, base, target - base)
+            if by is u and part.frames is not None:
+                frames = part.frames.to(at)[:, model.body].reshape(*x.shape[:-2], 1, -1)
+                base = base + frames * (_rigid(scene, state, move) - u)
             at = torch.where(pinned, at + wanted, base + share * (target - base))
-        forces = [PairBarrier(scene, listed[r], now), LaggedPairForces(scene, listed[0], start, now)]
-        correct = Correction(scene, energies, *forces, y, x_prev)
+        forces: list[Any] = [PairBarrier(scene, listed[r], now), LaggedPairForces(scene, listed[0], start, now)]
+        correct = Correction(scene, energies, forces, y, x_prev)
         state = correct(at, part.corrections[0])
         number = sweeps // count + (1 if r < sweeps % count else 0)
         if number:

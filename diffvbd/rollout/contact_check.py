@@ -1,4 +1,4 @@
-"""What a rollout says of its contact: motion that bounds have cut, friction that has not converged."""
+"""What a rollout says of its contact: motion that pairs have held up, friction that has not converged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..step.balance import UNBALANCED_FRICTION, contact_of_step, friction_left_o
 from ..step.contact import outcomes
 from ..step.predict import begin
 
-CUT = 0.01  # share of the motion that bounds may cut before a rollout warns
+CUT = 0.01  # share of the vertices that pairs may hold up before a rollout warns
 WARNED = "warned_of_contact"  # of a Model's _derived: unasked, one warning is enough for all of its rollouts
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: the look costs about as much as a step
 
@@ -33,10 +33,7 @@ def checks_contact(asked: bool | None, model: Model, x: Tensor, steps: int) -> b
 
 
 def cut_share(model: Model) -> float:
-    """Share of the motion of the Model's latest step that bounds have cut [-], of the worst scene.
-
-    Bounds say which vertices they cut and not by how much: it is the share of these.
-    """
+    """Share of the vertices that pairs held up in the Model's latest step [-], of the worst scene."""
     outcome = outcomes.get(model)
     if outcome is None or outcome.cut.numel() == 0 or model.num_active == 0:
         return 0.0
@@ -75,8 +72,8 @@ def warn_of_contact(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prep
         model._derived[WARNED] = True
     if cut > CUT:
         warnings.warn(
-            f"pair_barrier: bounds cut {100 * cut:.2g} % of the motion in the last step, which is lost as velocity; "
-            "take a smaller time_step, more detections, or a larger reach or dhat of the PairBarrier (docs/contact.md)",
+            f"pair_barrier: pairs held up {100 * cut:.2g} % of the vertices in the last step, which lost velocity; "
+            "take a smaller time_step, more detections or a larger reach of the PairBarrier (docs/contact.md)",
             UserWarning,
             stacklevel=3,
         )

@@ -73,7 +73,7 @@ def solve(
 
     With a PairBarrier or Friction the residual has the forces of pairs, damping and friction, and every body has to
     meet the tolerance. Such a step is taken anew with more and more sweeps, because its parts do not go on from where
-    others ended. Where bounds cut it short no number of sweeps converges.
+    others ended. Where pairs hold it up no number of sweeps converges.
 
     Args:
         model, x, v, mu, lam, young, poisson, time_step, force, gravity, prescribed, colliders, colliders_before,
@@ -188,7 +188,7 @@ class _Sweeping:
             return "with the exact block a relaxation between 1.5 and 1.7"
         outcome = outcomes.get(self.model)
         if outcome is not None and bool(outcome.cut.any()):
-            return "more detections or a larger reach of the PairBarrier, whose bounds have cut this step short"
+            return "more detections or a larger reach of the PairBarrier, whose pairs have held this step up"
         return "a larger Friction(velocity=)"
 
     def run(self, max_sweeps: int, check_every: int) -> None:

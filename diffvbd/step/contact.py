@@ -23,7 +23,7 @@ from ..ops.detect import CONSTANTS
 from ..scopes import checking, recorders
 from .intersections import refuse_intersections
 from .rigid_contact import Scenes, correct
-from .rooms import rooms, rooms_of_sweeps, unsupported
+from .rooms import rigid_motions, rooms, rooms_of_sweeps, unsupported
 
 if TYPE_CHECKING:
     from .arguments import Prepared
@@ -60,6 +60,7 @@ class Detection(NamedTuple):
     shares: Tensor | None = None
     corrections: Tensor | None = None
     limits: Tensor | None = None
+    frames: Tensor | None = None  # and of the rigid motions of its start [B, bodies]
     kept: Tensor | None = None  # rows of listed pairs that its sweeps can reach; all where that would have to be read
 
 
@@ -199,26 +200,26 @@ class ContactStep:
             # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
             move = left if self.parts == 1 else torch.where(pinned, way / self.parts, left)
             fall = lift if r == 0 else torch.zeros_like(lift)
-            detection, rigid = self._detect(x, was, now, move, fall)
+            rigid = rigid_motions(surface, x, self.origin, self.fields.mass, move)
+            detection = self._detect(x, was, now, move, fall, rigid)
             met.found.append(detection)
-            met.counts.append(torch.cat([detection.counts[:3], torch.zeros_like(detection.counts[:1])]))
-            if not x.is_cuda and not torch.compiler.is_compiling():  # reading is free: before any work
-                self._record(met)  # what is refused can be looked at
-                self._check(r, met.counts[-1].tolist())
+            met.counts.append(torch.cat([detection.counts[:3], detection.counts.new_zeros(1)]))
+            if self._reads(x):  # before any work
+                self._check(r, met.counts[r].tolist(), met)
             if r == 0:
                 self._set_lag(detection.listed, was)
                 fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
                                           self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
                                          detection, surface, rigid if barrier.self_contact else None)  # fmt: skip
-            met.counts[-1] = torch.cat([detection.counts[:3], start.stuck])
-            if not x.is_cuda and not torch.compiler.is_compiling():
-                self._record(met)
-                self._check(r, met.counts[-1].tolist())
+            met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
+            if self._reads(x):
+                self._check(r, met.counts[r].tolist(), met)
             begin, between = x, self._between(detection.listed)
             x, first = self._corrected(start.x, now, start, between)
-            start = start._replace(own_center=start.own_center + (x - start.x).detach())
-            room = rooms_of_sweeps(surface, barrier, start, x, self.fields.mass, begin, move, fall, rigid)
+            if start.own:
+                start = start._replace(own=(start.own[0] + (x - start.x).detach(), start.own[1]))
+            room = rooms_of_sweeps(surface, barrier, start, x, self.fields.mass, begin, move, fall, rigid.detach())
             near, kept = self._narrowed(detection.listed, x, now, room)
             start = start._replace(center=x.detach(), room=room)
             taken, limits, cut = [first], None, start.short
@@ -231,7 +232,8 @@ class ContactStep:
             met.cut = cut
             for found in recorders():
                 taken_all = torch.stack(taken)
-                found.append(detection._replace(shares=start.shares, corrections=taken_all, limits=limits, kept=kept))
+                found.append(detection._replace(shares=start.shares, corrections=taken_all, limits=limits, kept=kept,
+                                                frames=start.frames))  # fmt: skip
             left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
         return self._judged(x, met)
 
@@ -239,7 +241,7 @@ class ContactStep:
         """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
         x = self.begun.x_start
         room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
-        start = PartStart(x, x.detach(), room, x.detach(), None, room > 0, none.ptr[:1].long(),
+        start = PartStart(x, x.detach(), room, (), None, room > 0, none.ptr[:1].long(),
                           x.new_ones((2, *room.shape)))  # fmt: skip
         x, _ = self._corrected(x, self.colliders, start, none)
         if self.prepared.settings.sweeps:
@@ -272,22 +274,20 @@ class ContactStep:
         )  # fmt: skip
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
-    def _detect(self, x: Tensor, was: Tensor, now: Tensor, move: Tensor, fall: Tensor) -> tuple[Detection, Tensor]:
-        """The part's detection, and the rigid motions of its bodies (rooms.Rooms)."""
+    def _detect(self, x: Tensor, was: Tensor, now: Tensor, move: Tensor, fall: Tensor, rigid: Tensor) -> Detection:
         surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
         with torch.no_grad():
             x, was, now = x.detach(), was.detach(), now.detach()
-            island, room, own_room, rigid = rooms(surface, barrier, x, self.origin, self.fields.mass, was, now, move,
-                                                  fall, self.any_direction)  # fmt: skip
+            island, room, own_room = rooms(surface, barrier, x, self.origin, self.fields.mass, was, now, move, fall,
+                                           rigid, self.floor_data, self.any_direction)  # fmt: skip
             *index, corners, values, counts, smallest = search.detect(
                 x, self.origin, was, now, surface, barrier, self.capacity, room, own_room
             )
             lowest = island.new_empty((0,))
             if self.floor_data is not None:
                 lowest = search.lowest(x, self.origin, self.floor_data.detach(), island, surface)
-        found = Detection(Pairs(*index), corners, values, counts, smallest, island, lowest, room, own_room)
-        return found, rigid
+        return Detection(Pairs(*index), corners, values, counts, smallest, island, lowest, room, own_room)
 
     def _record(self, met: Met) -> None:
         smallest = torch.stack([d.smallest for d in met.found])
@@ -303,7 +303,7 @@ class ContactStep:
             return torch.where(good, x, torch.nan)
         if x.is_cuda:
             for r, row in enumerate(table.tolist()):
-                self._check(r, row)
+                self._check(r, row, met)
         return x
 
     @property
@@ -315,11 +315,14 @@ class ContactStep:
             return MOST_CAPACITY  # the list is as long as it must be
         return max(surface.capacity * scenes, 0 if barrier.capacity is not None else LEAST_CAPACITY)
 
-    def _check(self, r: int, counts: list[int]) -> None:
-        """Raises where a detection found more than fits, surfaces that touch, or motion above a bound."""
+    def _check(self, r: int, counts: list[int], met: Met) -> None:
+        """Raises where a detection found more than fits, surfaces that touch, or a way that pairs close to what is
+        prescribed."""
         surface = self.surface
         assert surface is not None
         needed, touching, pair, hindered = counts
+        if needed > self.capacity or touching or hindered:
+            self._record(met)  # the status of a step that raises says why
         scenes = self.x_prev.shape[0]
         if needed > self.capacity:
             raise TooManyPairs(

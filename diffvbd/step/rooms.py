@@ -11,7 +11,7 @@ from ..adjoint.contact_lag import Pairs, pair_lag
 from ..adjoint.sums import sum_by
 from ..contact import detection as search
 from ..contact.barrier import PairBarrier
-from ..contact.start import PartStart
+from ..contact.start import PartStart, share_above_floor
 from ..contact.surface import ContactSurface
 from ..model.model import Model
 from ..ops import broadcast
@@ -33,7 +33,7 @@ def _by_body(values: Tensor, surface: ContactSurface) -> Tensor:
 
 
 class _Motion:
-    """The ways that vertices want to go, and what of them is a shift and a turn of each body. Index data."""
+    """The ways that vertices want to go, and what of them is a shift and a turn of each body; differentiable."""
 
     def __init__(self, surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor) -> None:
         self.surface, self.move = surface, move
@@ -73,6 +73,11 @@ class _Motion:
         return mean + torch.linalg.cross(turn, arm)
 
 
+def rigid_motions(surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor) -> Tensor:
+    """Where rigid motions take the vertices of bodies that want to ``move``, as a way [B, V, 3] [m]; differentiable."""
+    return _Motion(surface, x, origin, mass, move).rigid()
+
+
 @torch.no_grad()
 def rooms_of_sweeps(surface: ContactSurface, barrier: PairBarrier, start: PartStart, x: Tensor, mass: Tensor,
                     begin: Tensor, move: Tensor, fall: Tensor, rigid: Tensor) -> Tensor:  # fmt: skip
@@ -89,8 +94,9 @@ def rooms_of_sweeps(surface: ContactSurface, barrier: PairBarrier, start: PartSt
     held_up = motion.largest(begin + move + fall - start.x.detach())
     wish = motion.largest(fall) + motion.largest(move - rigid) + ROOM * held_up + LEAST_ROOM * barrier.dhat
     left = start.room - (x - start.center).square().sum(-1).sqrt()
-    if start.own_room is not None:
-        left = torch.minimum(left, start.own_room - (x - start.own_center).square().sum(-1).sqrt())
+    if start.own:
+        center, room = start.own
+        left = torch.minimum(left, room - (x - center).square().sum(-1).sqrt())
     return torch.where(motion.free, torch.minimum(left, wish[:, motion.body]).clamp(min=0), 0.0)
 
 
@@ -100,20 +106,21 @@ class Rooms(NamedTuple):
     island: Tensor  # of each body [B, bodies] int32
     room: Tensor  # beside the island's translation, and the largest of the scene [B, bodies + 1] [m]
     own_room: Tensor  # beside the rigid motion of their own body, [B, bodies + 1] [m]
-    rigid: Tensor  # which takes each vertex that way [B, V, 3] [m]
 
 
 @torch.no_grad()
 def rooms(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor, was: Tensor,
-          now: Tensor, move: Tensor, fall: Tensor, any_direction: bool) -> Rooms:  # fmt: skip
+          now: Tensor, move: Tensor, fall: Tensor, rigid: Tensor, floor: Tensor | None, any_direction: bool
+          ) -> Rooms:  # fmt: skip
     """Rooms follow from where a body wants to go: pairs that could meet within them are listed, and what does not want
     to move relative to its neighbours lists few. Index data.
 
     Args:
         x, origin: As the sweeps take them.  mass: [1 | B, V].  was, now: Collider points [B, Vc, 3] [m].
-        move, fall: Where each vertex wants to go, [B, V, 3] [m] both.  any_direction: As for detection.islands.
+        move, fall, rigid: Where each vertex wants to go, and what of move is rigid, [B, V, 3] [m].
+        floor: Data of the FloorBarrier, or None.  any_direction: As for detection.islands.
     """
-    x, mass, was, now, move, fall = (t.detach() for t in (x, mass, was, now, move, fall))
+    x, mass, was, now, move, fall, rigid = (t.detach() for t in (x, mass, was, now, move, fall, rigid))
     motion = _Motion(surface, x, origin, mass, move)
     body, sums = motion.body, motion.sums
     falls = motion.largest(fall) + LEAST_ROOM * barrier.dhat
@@ -144,12 +151,13 @@ def rooms(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tens
     joined = same.to(x.dtype) @ sums[..., :4]
     u = joined[..., :3] / joined[..., 3:].clamp(min=_tiny(x))
     room = torch.maximum(room, room_beside(torch.where((island >= 0)[..., None], u, 0.0)))
-    rigid, own = motion.rigid(), torch.zeros_like(room)
+    own = torch.zeros_like(room)
     if barrier.self_contact:
         least = room.clamp(max=surface.least_own_room)
-        own = (ROOM * motion.largest(move - rigid) + falls).clamp(max=surface.most_own_room)
+        above = share_above_floor(x.new_empty((0,)) if floor is None else floor, origin, x, rigid, surface)
+        own = (ROOM * motion.largest(move - above[:, body, None] * rigid) + falls).clamp(max=surface.most_own_room)
         own = torch.maximum(torch.maximum(own, least), driven)
-    return Rooms(islands(room), with_largest(room), with_largest(own), rigid)
+    return Rooms(islands(room), with_largest(room), with_largest(own))
 
 
 def unsupported(model: Model, x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor, mass: Tensor, lift: Tensor,

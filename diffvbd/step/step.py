@@ -90,7 +90,7 @@ def step(
 
     Raises:
         ValueError, TypeError: Naming the argument, what was expected and what came, before any work. With contact also
-            for surfaces that touch at the start, and for prescribed motion above the bounds.
+            for surfaces that touch at the start, and for prescribed motion that leaves bodies no way.
         RuntimeError: Where more pairs are near than the PairBarrier has capacity for.
         NotImplementedError: In the backward, for second derivatives and forward mode (which Unrolled has).
 

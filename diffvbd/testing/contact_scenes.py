@@ -83,7 +83,7 @@ def stacked() -> Scene:
 
 
 def crossed() -> Scene:
-    """Two beams that cross like the sticks of a fire: edges meet edges, inside a bounded motion."""
+    """Two beams that cross like the sticks of a fire: edges meet edges, inside a short motion."""
     tets = mesh.join([mesh.box((5, 2, 2), (0.4, 0.08, 0.08)),
                       mesh.box((2, 2, 5), (0.08, 0.08, 0.4)).translate((0.163, 0.094, -0.157))])  # fmt: skip
     scene = build("crossed", tets, (PairBarrier(kappa=1e4, dhat=0.03, damping=1.0), Friction(0.3, 0.1)),
@@ -93,7 +93,7 @@ def crossed() -> Scene:
 
 
 def fast() -> Scene:
-    """Two boxes at 12 m/s against each other, with spin: bounds hold most vertices back."""
+    """Two boxes at 12 m/s against each other, with spin: pairs hold most vertices up."""
     scene = build("fast", boxes((0, 0, 0), (0.05, 0.23, 0.03)), (PairBarrier(kappa=1e4, dhat=0.02, detections=3),
                                                                 Friction(0.2, 0.1)))  # fmt: skip
     turning = torch.linalg.cross(
@@ -167,7 +167,8 @@ def part_of(detection: Any) -> reference.Part:
         rows[detection.kept] = True
         pairs, constants = pairs[rows], constants[rows]
     return reference.Part(pairs, constants, detection.island.cpu().long(), detection.shares.cpu(),
-                          detection.corrections.cpu(), limits, lowest)  # fmt: skip
+                          detection.corrections.cpu(), limits,
+                          None if detection.frames is None else detection.frames.cpu(), lowest)  # fmt: skip
 
 
 def split(leaves: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

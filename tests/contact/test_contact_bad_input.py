@@ -208,7 +208,7 @@ def test_status_before_any_step() -> None:
     dv.step(model, x, 0 * x, **STEP)
     status = dv.contact.status(model)
     assert 0 < status.pairs <= status.capacity and not status.overflowed
-    assert status.touching == status.above_bounds == 0 and status.cut == [0]
+    assert status.touching == status.hindered == 0 and status.cut == [0]
     assert status.smallest_gap == [pytest.approx(0.008)]
     plain = dv.Model(box(2))
     dv.step(plain, plain.rest_points, 0 * plain.rest_points, **STEP)

@@ -205,7 +205,7 @@ def test_a_prescribed_body_pushes() -> None:
         )
         assert apart(model, x)
         assert relative_error(x[:8], start[:8] + (n + 1) * rise) <= tolerance("formula")
-        assert dv.contact.status(model).above_bounds == 0
+        assert dv.contact.status(model).hindered == 0
     assert float(v[8:, 1].mean()) == pytest.approx(0.2, rel=tolerance("carried"))
 
 
@@ -217,11 +217,11 @@ def test_prescribed_motion_above_a_bound(device: str, value_checks: None, detect
     step: dict[str, Any] = {"time_step": 1 / 100, "sweeps": 4, "gravity": WEIGHTLESS, **MATERIAL}
     up = torch.tensor([0.0, height, 0.0], dtype=torch.float64, device=device) * model.pinned[:, None]
     end, _ = dv.step(model, x, v, prescribed=x + up, **step)
-    assert dv.contact.status(model).above_bounds == 0 and apart(model, end)
+    assert dv.contact.status(model).hindered == 0 and apart(model, end)
     with pytest.raises(ValueError, match=r"prescribed or colliders: expected motion that leaves .* got \d+ pairs .*"
                                          rf"in part \d of {detections} .*detections"):  # fmt: skip
         dv.step(model, x, v, prescribed=x + 2 * up, **step)
-    assert dv.contact.status(model).above_bounds > 0
+    assert dv.contact.status(model).hindered > 0
 
 
 def ball(detections: int, dhat: float = 5e-3, device: str = "cpu") -> dv.Model:
@@ -245,7 +245,7 @@ def test_a_collider_above_its_bound_raises_and_in_smaller_parts_does_not(device:
         else:
             end, _ = dv.step(model, x, torch.zeros_like(x), **options)
             assert float((end - before - up).norm(dim=-1).min()) > 0.2
-        assert (dv.contact.status(model).above_bounds > 0) == (detections == 1)
+        assert (dv.contact.status(model).hindered > 0) == (detections == 1)
 
 
 @pytest.mark.parametrize("detections", (1, 2, 4))

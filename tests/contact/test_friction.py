@@ -81,7 +81,7 @@ def settle(block: Block, angle: float, shear: float) -> None:
 
 def slide(block: Block, angle: float, h: float, duration: float, speed: float = 0.0, coefficient: Any = None
           ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Positions and velocities after ``duration``; no bound may have cut the motion."""
+    """Positions and velocities after ``duration``; no pair may have held anything up."""
     model, x, v = block.model, block.x, torch.zeros_like(block.x)
     v[block.free, 0] = speed
     gravity = (GRAVITY * math.sin(angle), -GRAVITY * math.cos(angle), 0.0)

@@ -139,8 +139,8 @@ class Scene:
         return (
             real(x), real(self.origin), real(self.collider), real(self.collider_next), real(self.rest),
             real(self.radius), index(self.triangles), index(self.edges), index(self.points), index(self.planes),
-            index(self.body), index(self.held), real(room), real(self.own_share * room), self.mesh_bodies, self.self_contact, self.between_bodies,
-            self.dhat, capacity,
+            index(self.body), index(self.held), real(room), real(self.own_share * room),
+            self.mesh_bodies, self.self_contact, self.between_bodies, self.dhat, capacity,
         )  # fmt: skip
 
 

@@ -30,7 +30,7 @@ def test_more_sweeps_leave_less(device: str) -> None:
         assert (more.residuals < less.residuals).all() and more.unbalanced < less.unbalanced
         assert (more.friction_residuals < less.friction_residuals).all()
     assert found[0].residuals.shape == found[0].friction_residuals.shape == (3, 2)
-    # scene 0 is cut by no bound, so that its sweeps converge
+    # scene 0 is held up by no pair, so that its sweeps converge
     assert float(found[-1].residuals[0].max()) <= tolerance("closed_form")
     assert float(found[-1].friction_residuals[0].max()) <= tolerance("closed_form")
 

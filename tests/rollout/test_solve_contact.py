@@ -14,7 +14,7 @@ SOFT: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "time_step": 0.005}
 
 
 def pushed(device: str = "cpu", dtype: torch.dtype = torch.float64) -> tuple[dv.Model, dict[str, Any]]:
-    """A sliding box on a ball that moves, another on top of it, in two scenes; no bound cuts anything."""
+    """A sliding box on a ball that moves, another on top of it, in two scenes; no pair holds anything up."""
     model = two_boxes(device, things=[ball()], damping=2.0, reach=0.2, detections=1).to(dtype=dtype)
     x = model.rest_points.expand(2, -1, -1).contiguous()
     v = torch.zeros_like(x)

@@ -239,9 +239,8 @@ def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     held, body, planes = surface.held, surface.body, x.new_tensor([[0.0, 1.0, 0.0, 0.19, 1e3, 0.02, 0.0]])
     start = (x, move, u, planes, none, held, body, 0.9)
     own_room = torch.full_like(x[..., 0], 0.1)
-    frame = (0.1 * move, x, own_room)
-    advance = (x, move, u, x, none, points, points, held, body, own_room, *frame, *listed, True)
-    share, _, _ = torch.ops.diffvbd.contact_advance(*advance)
+    advance = (x, move, u, x, none, points, points, held, body, own_room, x, own_room, *listed, True, False)
+    share, _ = torch.ops.diffvbd.contact_advance(*advance)
     assert 0 < share[0, 8:].min() < 1 and (share[0, :8] == 1).all()
     return {
         "contact_start": start,

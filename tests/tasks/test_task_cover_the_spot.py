@@ -24,7 +24,7 @@ def test_quick_run_covers_more(tmp_path: Path) -> None:
 
 
 def test_gradient_matches_central_differences(tmp_path: Path) -> None:
-    # bounds, saturation and the nearest line of an outline have kinks; differences step over some
+    # limits, saturation and the nearest line of an outline have kinks; differences step over some
     check_gradient("cover-the-spot", tmp_path, step=1e-6, rel=tolerance("kinked_difference"))
 
 

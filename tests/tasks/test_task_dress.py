@@ -26,7 +26,7 @@ def test_quick_run_recovers_the_material(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("stage", [0, 1, 2])
 @pytest.mark.parametrize("name", ["dress-mu-lam", "dress-silhouette"])
 def test_gradient_matches_central_differences(name: str, stage: int, tmp_path: Path) -> None:
-    # bounds and closest points have kinks; differences step over some
+    # limits and closest points have kinks; differences step over some
     check_gradient(name, tmp_path, step=1e-6, rel=tolerance("kinked_difference"), stage=stage)
 
 

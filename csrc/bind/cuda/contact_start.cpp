@@ -89,29 +89,28 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_start_backward(const Tensor& 
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor> contact_advance(const Tensor& x, const Tensor& move, const Tensor& u,
-                                                   const Tensor& center, const Tensor& origin, const Tensor& collider,
-                                                   const Tensor& collider_next, const Tensor& held, const Tensor& body,
-                                                   const Tensor& room, const Tensor& frame, const Tensor& frame_center,
-                                                   const Tensor& frame_room, const Tensor& pairs,
-                                                   const Tensor& constants, const Tensor& ptr, const Tensor& entry,
-                                                   bool careful) {
+std::tuple<Tensor, Tensor> contact_advance(const Tensor& x, const Tensor& move, const Tensor& u, const Tensor& center,
+                                           const Tensor& origin, const Tensor& collider, const Tensor& collider_next,
+                                           const Tensor& held, const Tensor& body, const Tensor& room,
+                                           const Tensor& own_center, const Tensor& own_room, const Tensor& pairs,
+                                           const Tensor& constants, const Tensor& ptr, const Tensor& entry,
+                                           bool careful, bool whole) {
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    auto in = diffvbd::advance_inputs<T>({x, move, u, center, origin, collider, collider_next, held, body, room, frame,
-                                          frame_center, frame_room, pairs, constants, ptr, entry});
-    in.careful = careful;
-    Tensor share = empty(x, {in.scenes, in.vertices}), frames = empty(x, {in.scenes, in.bodies});
+    auto in = diffvbd::advance_inputs<T>({x, move, u, center, origin, collider, collider_next, held, body, room,
+                                          own_center, own_room, pairs, constants, ptr, entry});
+    in.careful = careful, in.whole = whole;
+    Tensor share = empty(x, {in.scenes, whole ? in.bodies : in.vertices});
     Tensor stuck = empty(x, {1}, ScalarType::Long);
     const Tensor work = empty(x, {cuda::advance_workspace_bytes<T>(in)}, ScalarType::Byte);
     int multiprocessors = 0;
     check(cudaDeviceGetAttribute(&multiprocessors, cudaDevAttrMultiProcessorCount, x.get_device_index()),
           "a device query");
-    check(cuda::advance<T>(in, pairs.size(0), data<T>(share), data<T>(frames), data<int64_t>(stuck), work.data_ptr(),
-                           multiprocessors, current_stream(x)),
+    check(cuda::advance<T>(in, pairs.size(0), data<T>(share), data<int64_t>(stuck), work.data_ptr(), multiprocessors,
+                           current_stream(x)),
           "the start of a part");
-    return std::make_tuple(share, frames, stuck);
+    return std::make_tuple(share, stuck);
   });
 }
 

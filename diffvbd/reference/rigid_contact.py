@@ -1,0 +1,107 @@
+"""The rigid correction of bodies that touch, in plain torch; the twin of diffvbd/step/rigid_contact.py."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .distance import EDGE_EDGE
+from .energies import StableNeoHookean
+from .scene import Scene
+
+LEAST_STIFFNESS = 1e-12  # of its mass, that keeps the system of a body definite
+
+
+class Correction:
+    """The rigid correction of bodies that touch: one Newton step over turn and shift of every body without pinned
+    vertices, all of a scene together. The gradient is autograd's, the blocks are those of vertex updates."""
+
+    def __init__(self, scene: Scene, energies: list[Any], forces: list[Any], y: Tensor, x_prev: Tensor) -> None:
+        """forces: terms of pairs, each with its `on_corners`."""
+        model, self.scene, self.y, self.x_prev = scene.model, scene, y, x_prev
+        self.single = [e for e in energies if not isinstance(e, StableNeoHookean)]
+        self.forces = forces
+        self.body, self.count = model.body, int(model.body.max()) + 1
+        pinned = torch.zeros(self.count).index_add(0, self.body.cpu(), model.pinned.cpu().float()) > 0
+        self.free = ~pinned.to(y.device)
+
+    def __call__(self, x: Tensor, share: Tensor) -> Tensor:
+        """The state [..., 3, V] after each body [B, bodies] has taken its share of its motion."""
+        lead, rows = x.shape[:-2], x.transpose(-1, -2).reshape(len(share), -1, 3)
+        mass = self.scene.mass.expand(*lead, x.shape[-1]).reshape(len(share), -1)
+        total = mass.new_zeros(len(share), self.count).index_add(1, self.body, mass)
+        center = rows.new_zeros(len(share), self.count, 3).index_add(1, self.body, mass[..., None] * rows)
+        arm = rows - (center / total[..., None])[:, self.body]
+
+        def state(motion: Tensor) -> Tensor:
+            turn = torch.linalg.matrix_exp(_cross_matrix(motion[..., :3]))
+            moved = (
+                rows + ((turn[:, self.body] - torch.eye(3).to(x)) @ arm[..., None])[..., 0] + motion[:, self.body, 3:]
+            )
+            return moved.transpose(-1, -2).reshape(x.shape)
+
+        z = x.new_zeros(len(share), self.count, 6)
+        jacobian = torch.cat([-_cross_matrix(arm), torch.eye(3).to(x).expand(*arm.shape, 3)], -1)  # [B, V, 3, 6]
+        g, blocks = self._single(x, state, z, jacobian, mass)
+        matrix = x.new_zeros(len(share), self.count, self.count, 6, 6)
+        at = torch.arange(self.count, device=x.device)
+        matrix = matrix.index_put((_scenes(len(share), at), at, at), blocks, accumulate=True)
+        for term in self.forces:
+            force, stiffness = term.on_corners(x)
+            g, matrix = self._add(term.pairs, term.turns_its_body, force, stiffness, jacobian, g, matrix)
+        free = self.free.to(x.device)
+        both = (free[:, None] & free)[..., None, None]
+        fill = torch.where(free, LEAST_STIFFNESS * total, 1.0)[..., None, None] * torch.eye(6).to(x)
+        matrix = torch.where(both, matrix, 0.0).index_put((_scenes(len(share), at), at, at), fill, accumulate=True)
+        system = matrix.permute(0, 1, 3, 2, 4).reshape(len(share), 6 * self.count, -1)
+        right = torch.where(free[:, None], -g, 0.0).reshape(len(share), -1, 1)
+        motion = torch.linalg.solve(system, right).reshape(z.shape)
+        return state(share.to(x)[..., None] * motion)
+
+    def _single(self, x: Tensor, state: Any, z: Tensor, jacobian: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient [B, bodies, 6] and blocks [B, bodies, 6, 6] of inertia and the energies of single vertices."""
+        tracked = z.clone().requires_grad_()
+        off = torch.where(self.scene.model.pinned, 0.0, state(tracked) - self.y)
+        value = (self.scene.mass.unsqueeze(-2) / 2 * off**2).sum((-2, -1))
+        for energy in self.single:
+            value = value + energy.energy(state(tracked), self.x_prev)
+        (g,) = torch.autograd.grad(value.sum(), tracked, create_graph=True)
+        total = torch.zeros_like(x).repeat_interleave(3, -2)  # [..., 9, V]
+        for k, color in enumerate(self.scene.layout.colors):
+            for energy in self.single:
+                total = total.index_add(-1, color.vertices, energy.block(k, x, self.x_prev))
+        xx, xy, xz, yy, yz, zz = total[..., 3:, :].unbind(-2)
+        own = torch.stack([torch.stack(r, -1) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))], -2)
+        own = own.reshape(*jacobian.shape[:2], 3, 3) + mass[..., None, None] * torch.eye(3).to(x)
+        blocks = jacobian.mT @ own @ jacobian
+        return g, blocks.new_zeros(len(z), self.count, 6, 6).index_add(1, self.body, blocks)
+
+    def _add(self, p: Any, within: bool, force: Tensor, stiffness: Tensor, jacobian: Tensor, g: Tensor, matrix: Tensor
+             ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        vertices = jacobian.shape[1]
+        mesh = p.corners < vertices
+        corners = torch.where(mesh, p.corners, 0)
+        body = self.body[corners]
+        scene = p.batch[:, None].expand_as(corners)
+        maps = torch.where(mesh[..., None, None], jacobian[scene, corners], 0.0)  # [Q, 4, 3, 6]
+        if not within:
+            second = torch.where(p.kind == EDGE_EDGE, 2, 1)
+            apart = (body[:, :1] != body.gather(1, second[:, None])) | ~mesh.gather(1, second[:, None])
+            maps = torch.where(apart[..., None, None], maps, 0.0)
+        pull = (maps.mT @ force[..., None])[..., 0]
+        g = g.index_put((scene, body), pull, accumulate=True)
+        pressed = maps.mT[:, :, None] @ stiffness @ maps[:, None]  # [Q, 4, 4, 6, 6]
+        rows = (scene[:, :, None].expand(-1, 4, 4), body[:, :, None].expand(-1, 4, 4), body[:, None].expand(-1, 4, 4))
+        return g, matrix.index_put(rows, pressed, accumulate=True)
+
+
+def _scenes(scenes: int, at: Tensor) -> Tensor:
+    """Scenes [B, 1] beside an index of bodies."""
+    return torch.arange(scenes, device=at.device)[:, None].expand(scenes, len(at))
+
+
+def _cross_matrix(w: Tensor) -> Tensor:
+    """[w]x, [..., 3, 3]."""
+    zero = torch.zeros_like(w[..., 0])
+    x, y, z = w.unbind(-1)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
