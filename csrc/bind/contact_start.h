@@ -134,13 +134,15 @@ contact::AdvanceInputs<T> advance_inputs(const AdvanceTensors& t) {
 
 template <class T>
 contact::NarrowInputs<T> narrow_inputs(const Tensor& x, const Tensor& origin, const Tensor& collider,
-                                       const Tensor& room, const Tensor& pairs, const Tensor& constants) {
+                                       const Tensor& room, const Tensor& pairs, const Tensor& constants,
+                                       const Tensor& ptr) {
   require_vectors(x, x);
   const int64_t b = x.size(0), v = x.size(1), colliders = collider.dim() == 3 ? collider.size(1) : 0;
   require_like("collider", collider, x, b * colliders * 3);
   require_like("room", room, x, b * v);
-  require(pairs.dim() == 2 && pairs.size(1) == contact::kPairRow && is_index(pairs, x),
-          "diffvbd::contact_narrow: expected pairs int32 [pairs, 6]");
+  require(pairs.dim() == 2 && pairs.size(1) == contact::kPairRow && is_index(pairs, x) && is_index(ptr, x) &&
+              ptr.numel() == b * (v + colliders) + 1,
+          "diffvbd::contact_narrow: expected pairs and ptr made by contact_detect for this batch");
   require_like("constants", constants, x, pairs.size(0) * contact::kConstants);
   contact::NarrowInputs<T> in{};
   in.x = data<const T>(x), in.collider = data<const T>(collider), in.room = data<const T>(room);

@@ -59,7 +59,7 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "Tensor mass, Tensor x, Tensor planes)");
   // constants with the gaps of the pairs where the vertices are now, see contact/narrow.h
   m.def(
-      "contact_narrow(Tensor x, Tensor origin, Tensor collider, Tensor room, Tensor pairs, Tensor constants) -> "
+      "contact_narrow(Tensor x, Tensor origin, Tensor collider, Tensor room, Tensor pairs, Tensor constants, Tensor ptr) -> "
       "Tensor");
   // Where each vertex wants to be, see contact/start.h; planes and origin may be empty. The adjoint: of x, move, u and
   // planes, the last two for each vertex.

@@ -60,14 +60,15 @@ def advance(x: Tensor, move: Tensor, u: Tensor, center: Tensor, origin: Tensor, 
     )  # fmt: skip
 
 
-def narrow(x: Tensor, origin: Tensor, collider: Tensor, room: Tensor, pairs: Tensor, constants: Tensor) -> Tensor:
+def narrow(x: Tensor, origin: Tensor, collider: Tensor, room: Tensor, pairs: Tensor, constants: Tensor, ptr: Tensor
+           ) -> Tensor:  # fmt: skip
     """``constants`` of listed pairs with their gaps at x in the last column, infinite where sides cannot come within
     reach as long as no vertex goes farther than its room [B, V] [m]. Not differentiable."""
-    return raw.contact_narrow(x, origin, collider, room, pairs, constants)
+    return raw.contact_narrow(x, origin, collider, room, pairs, constants, ptr)
 
 
 @shapes_of("contact_narrow")
-def _(x, origin, collider, room, pairs, constants):
+def _(x, origin, collider, room, pairs, constants, ptr):
     return torch.empty_like(constants)
 
 

@@ -22,7 +22,8 @@ from ..ops import contact_start as ops_start
 from ..ops.detect import CONSTANTS
 from ..scopes import checking, recorders
 from .intersections import refuse_intersections
-from .rigid_contact import Scenes, correct
+from .rigid_contact import correct
+from .rigid_terms import Scenes
 from .rooms import rigid_motions, rooms, rooms_of_sweeps, unsupported
 
 if TYPE_CHECKING:
@@ -166,7 +167,7 @@ class ContactStep:
         there; and which of the listed these are. All, with infinite gaps, where that would have to be read."""
         with torch.no_grad():
             constants = ops_start.narrow(x.detach().contiguous(), self.origin, collider.detach().contiguous(), room,
-                                         listed.pairs, listed.constants)  # fmt: skip
+                                         listed.pairs, listed.constants, listed.ptr)  # fmt: skip
         near = listed._replace(constants=constants)
         if not self._reads(x):
             return near, None

@@ -135,8 +135,13 @@ def rooms(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tens
         most = room.amax(1, keepdim=True) if surface.bodies else room.new_zeros((motion.scenes, 1))
         return torch.cat([room, most], 1)
 
+    # What a floor stops on its way is left to the sweeps: they press and bend it.
+    planes = x.new_empty((0,)) if floor is None else floor
+    above, above_rigid = (share_above_floor(planes, origin, x, way, surface)[:, body, None] for way in (move, rigid))
+    stopped = motion.largest((1 - above) * move).clamp(max=surface.most_own_room)
+
     def room_beside(u: Tensor) -> Tensor:
-        room = (ROOM * motion.largest(move - u[:, body]) + falls).clamp(max=surface.most_room)
+        room = (ROOM * motion.largest(move - u[:, body]) + falls + stopped).clamp(max=surface.most_room)
         return torch.maximum(room, driven) + pushed
 
     def islands(room: Tensor) -> Tensor:
@@ -154,8 +159,7 @@ def rooms(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tens
     own = torch.zeros_like(room)
     if barrier.self_contact:
         least = room.clamp(max=surface.least_own_room)
-        above = share_above_floor(x.new_empty((0,)) if floor is None else floor, origin, x, rigid, surface)
-        own = (ROOM * motion.largest(move - above[:, body, None] * rigid) + falls).clamp(max=surface.most_own_room)
+        own = (ROOM * motion.largest(move - above_rigid * rigid) + falls).clamp(max=surface.most_own_room)
         own = torch.maximum(torch.maximum(own, least), driven)
     return Rooms(islands(room), with_largest(room), with_largest(own))
 

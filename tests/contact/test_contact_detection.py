@@ -256,7 +256,9 @@ def test_nothing_to_detect(device: str) -> None:
         got = detect(empty, device, capacity=3)
         assert got.counts.tolist() == [0, 0, -1, 0] and (got.pairs == -1).all() and not got.ptr.any()
         assert (got.near_values[..., 7] == s.reach).all() and (got.smallest == s.reach).all()
-    points_only = Scene.of([Surface(np.zeros((3, 3)), lone=[0, 1])], [plane((0, -0.1, 0), (0, -0.1, 1), (1, -0.1, 0))])
+    points_only = Scene.of(
+        [Surface(np.zeros((3, 3)), lone=[0, 1])], [plane((0, -0.07, 0), (0, -0.07, 1), (1, -0.07, 0))]
+    )
     assert len(check(points_only, device)[0][0].gap) == 2
 
 

@@ -22,7 +22,7 @@ TRIANGLE = Surface.of(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[
 
 def arguments(s: Scene, device: str, dtype: torch.dtype, capacity: int) -> tuple:
     of_detection = s.arguments(device, dtype, capacity)
-    return (*of_detection[:3], *of_detection[4:12], *of_detection[13:16], capacity)
+    return (*of_detection[:3], *of_detection[4:12], *of_detection[14:17], capacity)
 
 
 def find(s: Scene, device: str = "cpu", dtype: torch.dtype = torch.float64, capacity: int = 5000) -> Any:

@@ -79,7 +79,7 @@ class Scene:
     between_bodies: bool = True
     dhat: float = 0.03
     room: float = 0.05  # how far vertices of the first body may go; of the last half as far
-    own_share: float = 0.8  # of that, that they may go beside the rigid motion of their body
+    own_share: float = 0.79  # of that, that they may go beside the rigid motion of their body
     origin: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
     @staticmethod

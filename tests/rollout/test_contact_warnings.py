@@ -18,7 +18,7 @@ def thrown() -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
     """Two boxes that meet at speed."""
     model = two_boxes(detections=1)
     v = torch.zeros_like(model.rest_points)
-    v[8:, 1] = -20.0
+    v[8:, 1] = -60.0
     return model, model.rest_points, v
 
 

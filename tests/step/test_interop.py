@@ -246,7 +246,7 @@ def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
         "contact_start": start,
         "contact_start_backward": (move, *start, True),
         "contact_advance": advance,
-        "contact_narrow": (x, none, points, own_room, *listed[:2]),
+        "contact_narrow": (x, none, points, own_room, *listed[:3]),
     }
 
 

@@ -24,8 +24,8 @@ def test_quick_run_covers_more(tmp_path: Path) -> None:
 
 
 def test_gradient_matches_central_differences(tmp_path: Path) -> None:
-    # limits, saturation and the nearest line of an outline have kinks; differences step over some
-    check_gradient("cover-the-spot", tmp_path, step=1e-6, rel=tolerance("kinked_difference"))
+    # limits and shares are decided, and so jump; the nearest line of an outline has kinks: a short step meets none
+    check_gradient("cover-the-spot", tmp_path, step=1e-7, rel=tolerance("kinked_difference"))
 
 
 def test_radius_decides_whether_there_is_a_solution(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -115,11 +115,11 @@ std::tuple<Tensor, Tensor> contact_advance(const Tensor& x, const Tensor& move, 
 }
 
 Tensor contact_narrow(const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& room,
-                      const Tensor& pairs, const Tensor& constants) {
+                      const Tensor& pairs, const Tensor& constants, const Tensor& ptr) {
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::narrow_inputs<T>(x, origin, collider, room, pairs, constants);
+    const auto in = diffvbd::narrow_inputs<T>(x, origin, collider, room, pairs, constants, ptr);
     Tensor out = empty(x, {pairs.size(0), contact::kConstants});
     check(cuda::narrow<T>(in, pairs.size(0), data<T>(out), current_stream(x)), "what a list can still reach");
     return out;
