@@ -118,7 +118,8 @@ DIFFVBD_FN bool stays_far(const AdvanceInputs<T>& in, const Attempt<T>& a, const
   T most = T(0);
   for (int i = 0; i < sides(pair[4]); ++i) {
     for (int j = sides(pair[4]); j < 4; ++j) {
-      for (const Vec3<T>& d : {was[i] - was[j], end[i] - end[j]}) {
+      const Vec3<T> ways[] = {was[i] - was[j], end[i] - end[j]};
+      for (const Vec3<T>& d : ways) {
         const T square = dot(d, d);
         most = most < square ? square : most;
       }

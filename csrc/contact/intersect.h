@@ -17,6 +17,7 @@ struct Intersections {
 
 // A determinant of differences is off by less than this times the sizes of its terms (Shewchuk 1997).
 constexpr double kVolumeError = (7 + 56 * 0x1p-53) * 0x1p-53;
+constexpr double kPositionUlps = 8 * 0x1p-53;  // of a position, that rounding may have moved it by
 
 // u x v, and the sizes of its terms.
 struct Normal {
@@ -27,10 +28,12 @@ DIFFVBD_FN Normal normal_of(const Vec3<double>& u, const Vec3<double>& v) {
   return {{yz - zy, zx - xz, xy - yx},
           {absolute(yz) + absolute(zy), absolute(zx) + absolute(xz), absolute(xy) + absolute(yx)}};
 }
-// Sign of (u x v) . w, all three differences of positions, or 0 where rounding could change it.
-DIFFVBD_FN int side(const Normal& uv, const Vec3<double>& w) {
-  const double volume = dot(uv.n, w);
-  const double bound = kVolumeError * dot(uv.size, Vec3<double>{absolute(w.x), absolute(w.y), absolute(w.z)});
+// Sign of (u x v) . w, all three differences of positions, or 0 where rounding could change it, or what is less than
+// `off` [m] from the plane.
+DIFFVBD_FN int side(const Normal& uv, const Vec3<double>& w, double off = 0.0) {
+  const double volume = dot(uv.n, w), area = absolute(uv.n.x) + absolute(uv.n.y) + absolute(uv.n.z);
+  const double bound =
+      off * area + kVolumeError * dot(uv.size, Vec3<double>{absolute(w.x), absolute(w.y), absolute(w.z)});
   return bound < volume ? 1 : volume < -bound ? -1 : 0;
 }
 
@@ -40,7 +43,15 @@ DIFFVBD_FN int side(const Normal& uv, const Vec3<double>& w) {
 DIFFVBD_FN bool crosses(const Vec3<double>& p, const Vec3<double>& q, const Vec3<double>& a, const Vec3<double>& b,
                         const Vec3<double>& c) {
   const Normal plane = normal_of(b - a, c - a);
-  if (side(plane, p - a) * side(plane, q - a) >= 0) return false;
+  // Corners of a flat face are in one plane but for the rounding of their positions, which says nothing.
+  double size = 0.0;
+  const Vec3<double> all[] = {p, q, a, b, c};
+  for (const Vec3<double>& x : all) {
+    const double own = absolute(x.x) + absolute(x.y) + absolute(x.z);
+    size = size < own ? own : size;
+  }
+  const double off = kPositionUlps * size;
+  if (side(plane, p - a, off) * side(plane, q - a, off) >= 0) return false;
   // Else what cannot be told of a degenerate triangle would count as a crossing far away.
   const auto apart = [](double p, double q, double a, double b, double c) {
     const double lo = p < q ? p : q, hi = p < q ? q : p;

@@ -16,9 +16,10 @@ from .colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
 
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
 # Mean edges of the surface that a vertex may go where no reach is given: beside its island, alone and where several
-# bodies may meet, and beside the rigid motion of its body, at least and at most. The farther, the more pairs there are.
+# bodies may meet; beside the rigid motion of its body, at least and at most; and that of a body which is held somewhere,
+# whose every motion is a deformation. The farther, the more pairs there are.
 MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 1.0
-LEAST_EDGES_OWN, MOST_EDGES_OWN = 0.2, 0.3
+LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_HELD = 0.2, 0.3, 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,7 @@ class ContactSurface:
     bodies: int  # of the mesh
     rows: tuple[slice, ...]  # of each collider in collider_points
     most_room: float  # [m] that any vertex is given beside its island
-    most_own_room: float  # and beside the rigid motion of its body
+    most_own_room: Tensor  # [bodies] [m]: and beside the rigid motion of its body
     least_own_room: float  # and is given there in any case, because hardly any two sides of a body are so close
     capacity: int  # pairs, per scene; all scenes together have room for LEAST_CAPACITY at least
 
@@ -100,6 +101,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
 
     held = torch.cat([pinned.cpu(), torch.ones(sum(map(len, rest)) - count, dtype=torch.bool)])
     order = np.argsort(label, kind="stable")
+    fixed = torch.from_numpy(np.bincount(label, weights=pinned.cpu().numpy(), minlength=bodies) > 0)
     return ContactSurface(
         rest=torch.from_numpy(np.concatenate(rest)),
         radius=torch.from_numpy(np.concatenate(radius)),
@@ -115,7 +117,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         bodies=bodies,
         rows=tuple(rows),
         most_room=most_room,
-        most_own_room=MOST_EDGES_OWN * mean_edge,
+        most_own_room=torch.where(fixed, MOST_EDGES_HELD * mean_edge, MOST_EDGES_OWN * mean_edge),
         least_own_room=LEAST_EDGES_OWN * mean_edge,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
     )
