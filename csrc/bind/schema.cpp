@@ -59,8 +59,8 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "Tensor mass, Tensor x, Tensor planes)");
   // constants with the gaps of the pairs where the vertices are now, see contact/narrow.h
   m.def(
-      "contact_narrow(Tensor x, Tensor origin, Tensor collider, Tensor room, Tensor pairs, Tensor constants, Tensor ptr) -> "
-      "Tensor");
+      "contact_narrow(Tensor x, Tensor origin, Tensor collider, Tensor room, Tensor pairs, Tensor constants, Tensor "
+      "ptr) -> Tensor");
   // Where each vertex wants to be, see contact/start.h; planes and origin may be empty. The adjoint: of x, move, u and
   // planes, the last two for each vertex.
   m.def(
@@ -140,7 +140,8 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   m.def(
       "contact_detect(Tensor x, Tensor origin, Tensor collider, Tensor collider_next, Tensor rest, Tensor radius, "
       "Tensor triangles, Tensor edges, Tensor points, Tensor planes, Tensor body, Tensor held, Tensor room, "
-      "Tensor own_room, int mesh_bodies, bool self_contact, bool between_bodies, float dhat, int capacity, bool trim) -> (Tensor pairs, "
+      "Tensor own_room, int mesh_bodies, bool self_contact, bool between_bodies, float dhat, int capacity, bool trim) "
+      "-> (Tensor pairs, "
       "Tensor constants, Tensor ptr, Tensor entry, Tensor near_corners, Tensor near_values, Tensor counts, "
       "Tensor smallest)");
   // results as in contact/intersect.h
@@ -153,8 +154,8 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "Tensor planes, Tensor body, Tensor body_order, Tensor body_ptr, Tensor held, Tensor radius, Tensor room, int "
       "mesh_bodies, float dhat, bool any_direction) -> Tensor");
   // How much of its way each vertex goes at the start, see contact/advance.h: [scenes, vertices], or all of a body
-  // [scenes, bodies] where it goes as a whole; stuck: how many pairs what is prescribed brings too close. center: what a
-  // vertex may leave by its room at most, and own_center by its own_room, unless empty
+  // [scenes, bodies] where it goes as a whole; stuck: how many pairs what is prescribed brings too close. center: what
+  // a vertex may leave by its room at most, and own_center by its own_room, unless empty
   m.def(
       "contact_advance(Tensor x, Tensor move, Tensor u, Tensor center, Tensor origin, Tensor collider, Tensor "
       "collider_next, Tensor held, Tensor body, Tensor room, Tensor own_center, Tensor own_room, Tensor pairs, Tensor "

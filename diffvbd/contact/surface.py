@@ -16,8 +16,8 @@ from .colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
 
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
 # Mean edges of the surface that a vertex may go where no reach is given: beside its island, alone and where several
-# bodies may meet; beside the rigid motion of its body, at least and at most; and that of a body which is held somewhere,
-# whose every motion is a deformation. The farther, the more pairs there are.
+# bodies may meet; beside the rigid motion of its body, at least and at most; and that of a body which is held, whose
+# every motion is a deformation. The farther, the more pairs there are.
 MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 1.0
 LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_HELD = 0.2, 0.3, 0.75
 

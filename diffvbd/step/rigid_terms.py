@@ -124,7 +124,10 @@ def vertex_blocks(s: Scenes, x: Tensor) -> Tensor | None:
         load, _, _, rate = _floor_slip(s, x)
         across = torch.eye(3, dtype=x.dtype, device=x.device) - outer(s.floor_lag[..., 1:])
         parts.append(s.time_step**2 * ((load * rate)[..., None, None] * across).sum(2))
-    return None if not parts else broadcast(sum(parts[1:], parts[0]), (*x.shape, 3))
+    out = None
+    for part in parts:
+        out = part if out is None else out + part
+    return None if out is None else broadcast(out, (*x.shape, 3))
 
 
 def corners_of(listed: Pairs) -> tuple[Tensor, Tensor]:

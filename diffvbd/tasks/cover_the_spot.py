@@ -10,10 +10,11 @@ evaluation 21, counted from 0. The rest of the 600, which is the paper's count, 
 rises again now and then on the way and ends at 0.0 %.
 
 Choices the paper leaves open: disks are 6 cm thick with three rings of vertices (74 vertices, 162 tets each), of 1000
-kg/m^3 and mu = lam = 2e4 Pa; h = 1/150 s; K = 2 sweeps; one search for pairs per step, up to 10 cm. Disks start 0.35 m from the target's axis, 25 cm above one another, and move away from it
-at 0.4 m/s, to which a seed adds noise: some nine tenths of the target stay uncovered. Above one another, because disks
-that fall side by side meet rim to rim on the floor, and no small change lifts one over the other. Offsets are at most
-0.1 m along each axis. Lighter disks and longer slides cover the target too, but bounce, and their gradient is rough.
+kg/m^3 and mu = lam = 2e4 Pa; h = 1/150 s; K = 2 sweeps; one search for pairs per step, up to 10 cm. Disks start 0.35 m
+from the target's axis, 25 cm above one another, and move away from it at 0.4 m/s, to which a seed adds noise: some nine
+tenths of the target stay uncovered. Above one another, because disks that fall side by side meet rim to rim on the
+floor, and no small change lifts one over the other. Offsets are at most 0.1 m along each axis. Lighter disks and longer
+slides cover the target too, but bounce, and their gradient is rough.
 """
 
 import math

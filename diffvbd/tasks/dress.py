@@ -17,8 +17,8 @@ Choices the paper leaves open: a gown 0.8 m tall whose hem starts 5 cm above the
 and of 100 kg/m^3, so that it stretches by a tenth or two at 1500 Pa; a mannequin of 13 cm, 2.5 cm less than the waist's
 inner layer; 80 steps of 1/60 s. No friction, as in the paper's other task with contact, and no self-contact. K = 20
 sweeps for target and fit alike: with 10 the alternation on outlines no longer contracts at the solution. One search for
-pairs a step, up to 10 cm. Both objectives are mean squared distances [m^2], added as they are. Newton's steps are damped by a limit, and a solve makes
-two of them. The sweeps start from the predictor, as in the paper.
+pairs a step, up to 10 cm. Both objectives are mean squared distances [m^2], added as they are. Newton's steps are
+damped by a limit, and a solve makes two of them. The sweeps start from the predictor, as in the paper.
 """
 
 from collections.abc import Callable
