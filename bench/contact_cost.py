@@ -16,7 +16,7 @@ from bench.cpu import kept_bytes, least
 from bench.gpu_measure import Card
 from diffvbd import mesh
 from diffvbd.contact import detection
-from diffvbd.step.rooms import rooms
+from diffvbd.step.rooms import rigid_motions, rooms
 
 DHAT = 2e-3  # [m]
 CLOSE = 0.5 * DHAT  # gap of bodies that touch [m]
@@ -67,8 +67,10 @@ def searching(model: dv.Model) -> Callable[[], Any]:
     def work() -> list[Any]:
         out = []
         for _ in range(DETECTIONS):
-            island, room = rooms(surface, barrier, x, none, mass, points, points, move, fall, False)
-            out.append((island, detection.detect(x, none, points, points, surface, barrier, surface.capacity, room)))
+            rigid = rigid_motions(surface, x, none, mass, move)
+            found = rooms(surface, barrier, x, none, mass, points, points, move, fall, rigid, None, False)
+            given = (x, none, points, points, surface, barrier, surface.capacity, found.room, found.own_room)
+            out.append((found.island, detection.detect(*given)))
         return out
 
     return work

@@ -15,8 +15,8 @@ from .barrier import PairBarrier
 from .colliders import Capsule, Collider, Obstacle, Plane, Sphere, unique_edges
 
 CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
-# Mean edges of the surface that a vertex may go where no reach is given: beside its island, alone and where several
-# bodies may meet; beside the rigid motion of its body, at least and at most; and that of a body which is held, whose
+# Mean edges of its body that a vertex may go where no reach is given: beside its island, where one body moves and where
+# several do; beside the rigid motion of its body, at least and at most; and that of a body which is held, whose
 # every motion is a deformation. The farther, the more pairs there are.
 MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 1.0
 LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_HELD = 0.2, 0.3, 0.75
@@ -39,9 +39,11 @@ class ContactSurface:
     body_ptr: Tensor  # [bodies + 1] int32
     bodies: int  # of the mesh
     rows: tuple[slice, ...]  # of each collider in collider_points
-    most_room: float  # [m] that any vertex is given beside its island
+    most_room: Tensor  # [bodies] [m]: that any vertex is given beside its island
     most_own_room: Tensor  # [bodies] [m]: and beside the rigid motion of its body
-    least_own_room: float  # and is given there in any case, because hardly any two sides of a body are so close
+    least_own_room: (
+        Tensor  # [bodies] [m]: and is given there in any case, because hardly any two sides of a body are so close
+    )
     capacity: int  # pairs, per scene; all scenes together have room for LEAST_CAPACITY at least
 
     @property
@@ -88,12 +90,16 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         points.append(part.lone + first)
         if part.plane:
             planes.append([first, first + 1, first + 2])
-    # the mesh's own edges alone: a large obstacle must not widen the search
-    lengths = np.linalg.norm(mesh.points[edges[0][:, 0]] - mesh.points[edges[0][:, 1]], axis=1)
-    mean_edge = float(lengths.mean()) if len(lengths) else 0.0
-    most_room = (MOST_EDGES if bodies == 1 or not barrier.between_bodies else MOST_EDGES_BETWEEN) * mean_edge
+    # of each body: neither a large obstacle nor a coarse neighbour widens a search
+    first, second = edges[0].T
+    lengths = np.linalg.norm(mesh.points[first] - mesh.points[second], axis=1)
+    total, number = (np.bincount(label[first], weights, minlength=bodies) for weights in (lengths, None))
+    edge = torch.from_numpy(total / np.maximum(number, 1))
+    held_vertices = np.bincount(label, weights=pinned.cpu().numpy(), minlength=bodies)
+    alone = (held_vertices < np.bincount(label, minlength=bodies)).sum() <= 1 or not barrier.between_bodies
+    most_room = (MOST_EDGES if alone else MOST_EDGES_BETWEEN) * edge
     if barrier.reach is not None:
-        most_room = (barrier.reach - barrier.dhat) / 2
+        most_room = torch.full_like(edge, (barrier.reach - barrier.dhat) / 2)
 
     def index_tensor(parts: list[Any], width: int) -> Tensor:
         joined = np.concatenate([np.asarray(p, np.int64).reshape(-1, width) for p in parts] or [np.zeros((0, width))])
@@ -101,7 +107,6 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
 
     held = torch.cat([pinned.cpu(), torch.ones(sum(map(len, rest)) - count, dtype=torch.bool)])
     order = np.argsort(label, kind="stable")
-    fixed = torch.from_numpy(np.bincount(label, weights=pinned.cpu().numpy(), minlength=bodies) > 0)
     return ContactSurface(
         rest=torch.from_numpy(np.concatenate(rest)),
         radius=torch.from_numpy(np.concatenate(radius)),
@@ -117,8 +122,8 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         bodies=bodies,
         rows=tuple(rows),
         most_room=most_room,
-        most_own_room=torch.where(fixed, MOST_EDGES_HELD * mean_edge, MOST_EDGES_OWN * mean_edge),
-        least_own_room=LEAST_EDGES_OWN * mean_edge,
+        most_own_room=torch.where(torch.from_numpy(held_vertices > 0), MOST_EDGES_HELD, MOST_EDGES_OWN) * edge,
+        least_own_room=LEAST_EDGES_OWN * edge,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
     )
 

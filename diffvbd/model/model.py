@@ -223,7 +223,7 @@ class Model:
         surface, barrier = self.surface_of_contact, self.contact
         if surface is None or barrier is None:
             fail("model", "a PairBarrier among its energies", "none")
-        return surface.most_room
+        return float(surface.most_room.max())
 
     @property
     def parametric_energies(self) -> tuple[VertexEnergy | PairBarrier | Friction, ...]:
