@@ -138,6 +138,7 @@ DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, i
   };
   if (round > 0 && !(retried(0) || retried(1) || retried(2) || retried(3))) return true;
   const T* constants = in.constants + kConstants * pair;
+  if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (contact/narrow.h)
   const Attempt<T> a = attempt(in, s, record);
   const int first = sides(record[4]);
   bool moves[2] = {false, false}, careful = false;

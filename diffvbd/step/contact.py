@@ -175,14 +175,17 @@ class ContactStep:
         return some_of(near, rows, self._points), rows
 
     def _between(self, listed: Pairs) -> Pairs:
-        """The pairs between bodies, which alone have a say in rigid motions; all where that would have to be read."""
+        """The pairs between bodies, which alone have a say in rigid motions; all, the others with infinite gaps, where
+        that would have to be read."""
         surface = self.surface
-        if surface is None or not self._reads(self.x_prev):
-            return listed
+        assert surface is not None
         corners = listed.pairs[:, :4].long()
         second = torch.where(listed.pairs[:, 4] == 1, corners[:, 2], corners[:, 1])
         apart = surface.body[corners[:, 0]] != surface.body[second]
-        return some_of(listed, apart.nonzero()[:, 0], self._points)
+        if self._reads(self.x_prev):
+            return some_of(listed, apart.nonzero()[:, 0], self._points)
+        gap = torch.where(apart, listed.constants[:, -1], torch.inf)
+        return listed._replace(constants=torch.cat([listed.constants[:, :-1], gap[:, None]], 1))
 
     def run(self, policy: int, debug_step: int) -> Tensor:
         """Positions after all parts [B, V, 3]; raises where detection did not hold."""

@@ -54,7 +54,7 @@ class Version(NamedTuple):
     rate: float  # of Adam
 
 
-FULL, QUICK = Version(9, 7, TIME_STEP, 60, 0.05), Version(7, 5, 1 / 150, 8, 0.1)
+FULL, QUICK = Version(9, 7, TIME_STEP, 60, 0.05), Version(7, 5, 1 / 150, 8, 0.2)
 
 
 def problem(settings: Settings) -> Problem:
