@@ -48,10 +48,10 @@ def check(name: str, steps: int, sweeps: int, device: str, tape: str = "full") -
     def bar_of(key: str, value: torch.Tensor, seeds: int) -> float:
         return max(tolerance("contact_adjoint"), spread_of(key, value, seeds))
 
-    floor = steps * tolerance("contact_forward")
-    for key, floor in (("x", floor), ("v", floor / scene.time_step)):
+    rounding = steps * tolerance("contact_forward")
+    for key, bar in (("x", rounding), ("v", rounding / scene.time_step)):
         error = relative_error(result[key], expected[key])
-        assert error <= floor or error <= spread_of(key, expected[key], 3), key
+        assert error <= bar or error <= spread_of(key, expected[key], 3), key
     for key, value in expected.items():
         if not key.startswith("grad_"):
             continue
