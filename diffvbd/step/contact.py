@@ -203,7 +203,7 @@ class ContactStep:
             was, now = (self._colliders_at(n / self.parts) for n in (r, r + 1))
             # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
             move = left if self.parts == 1 else torch.where(pinned, way / self.parts, left)
-            fall = lift if r == 0 else torch.zeros_like(lift)
+            wanted = fall = lift if r == 0 else torch.zeros_like(lift)
             rigid = rigid_motions(surface, x, self.origin, self.fields.mass, move)
             detection = self._detect(x, was, now, move, fall, rigid)
             met.found.append(detection)
@@ -223,7 +223,7 @@ class ContactStep:
             x, first = self._corrected(start.x, now, start, between)
             if start.own:
                 start = start._replace(own=(start.own[0] + (x - start.x).detach(), start.own[1]))
-            room = rooms_of_sweeps(surface, barrier, start, x, self.fields.mass, begin, move, fall, rigid.detach())
+            room = rooms_of_sweeps(surface, barrier, start, x, self.fields.mass, begin, move, wanted, rigid.detach())
             near, kept = self._narrowed(detection.listed, x, now, room)
             start = start._replace(center=x.detach(), room=room)
             taken, limits, cut = [first], None, start.short

@@ -82,7 +82,8 @@ def rigid_motions(surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tens
 def rooms_of_sweeps(surface: ContactSurface, barrier: PairBarrier, start: PartStart, x: Tensor, mass: Tensor,
                     begin: Tensor, move: Tensor, fall: Tensor, rigid: Tensor) -> Tensor:  # fmt: skip
     """How far the sweeps may carry a vertex from where they find it [B, V] [m]: as far as a barrier pushes, weight
-    pulls, elasticity takes back what its body deforms by on the way and, of what pairs have held up, all. Index data.
+    pulls, elasticity takes back what bodies deform by on the way and, of what pairs have held up, all; the most of a
+    scene, since bodies push one another. Index data.
 
     Args:
         start: The part's; its rooms bound the whole way.  x: Where the sweeps begin.  mass: [1 | B, V].
@@ -92,7 +93,8 @@ def rooms_of_sweeps(surface: ContactSurface, barrier: PairBarrier, start: PartSt
     mass, begin, move, fall, x = (t.detach() for t in (mass, begin, move, fall, x))
     motion = _Motion(surface, x, x.new_empty((0,)), mass, move)
     held_up = motion.largest(begin + move + fall - start.x.detach())
-    wish = motion.largest(fall) + motion.largest(move - rigid) + ROOM * held_up + LEAST_ROOM * barrier.dhat
+    wish = motion.largest(fall) + motion.largest(move - rigid) + ROOM * held_up + motion.largest(x - start.x.detach())
+    wish = LEAST_ROOM * barrier.dhat + (wish.amax(1, keepdim=True).expand_as(wish) if surface.bodies else wish)
     left = start.room - (x - start.center).square().sum(-1).sqrt()
     if start.own:
         center, room = start.own
@@ -123,7 +125,9 @@ def rooms(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tens
     x, mass, was, now, move, fall, rigid = (t.detach() for t in (x, mass, was, now, move, fall, rigid))
     motion = _Motion(surface, x, origin, mass, move)
     body, sums = motion.body, motion.sums
-    falls = motion.largest(fall) + LEAST_ROOM * barrier.dhat
+    # The sweeps may take back all that the start has let fall and bent.
+    falls = 2 * motion.largest(fall) + LEAST_ROOM * barrier.dhat
+    bends = motion.largest(move - motion.mean[:, body])
 
     # What is prescribed goes where it goes: pairs with it are listed however far that is.
     driven = motion.longest(torch.where(motion.free, 0.0, move.square().sum(-1).sqrt()))
@@ -141,7 +145,8 @@ def rooms(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tens
     stopped = motion.largest((1 - above) * move).clamp(max=surface.most_own_room)
 
     def room_beside(u: Tensor) -> Tensor:
-        room = (ROOM * motion.largest(move - u[:, body]) + falls + stopped).clamp(max=surface.most_room)
+        room = ROOM * motion.largest(move - u[:, body]) + bends + falls + stopped
+        room = room.clamp(max=surface.most_room)
         return torch.maximum(room, driven) + pushed
 
     def islands(room: Tensor) -> Tensor:
@@ -159,7 +164,8 @@ def rooms(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tens
     own = torch.zeros_like(room)
     if barrier.self_contact:
         least = room.clamp(max=surface.least_own_room)
-        own = (ROOM * motion.largest(move - above_rigid * rigid) + falls).clamp(max=surface.most_own_room)
+        own = (ROOM + 1) * motion.largest(move - above_rigid * rigid) + falls
+        own = own.clamp(max=surface.most_own_room)
         own = torch.maximum(torch.maximum(own, least), driven)
     return Rooms(islands(room), with_largest(room), with_largest(own))
 

@@ -37,6 +37,10 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "energy_gain": (1e-9, "share of its energy that a drop may gain: rounding of a sum of large terms"),
     "finite_difference": (1e-6, "central differences in float64: error h^2 + eps/h is about 1e-10, times curvature"),
     "contact_motion": (0.03, "motion in contact at few sweeps beside its reference: 3 % is what users are promised"),
+    "dented_rest": (
+        5e-3,
+        "[m/s] sideways, of a block on a soft block at K = 5 beside K = 400; measured 2.4e-3, and 1.7 where it sank",
+    ),
     "contact_forward": (1e-13, "a step with contact: normals and weights lose eps L / gap, here a few digits"),
     "contact_adjoint": (1e-11, "floor of the bar on gradients of steps with contact; above it 10 times the spread"),
     "contact_finite_difference": (1e-5, "fifty steps in which features and limits switch: kinks within the difference"),

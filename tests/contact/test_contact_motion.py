@@ -63,6 +63,29 @@ def test_a_body_that_flies_and_spins_beside_others_lists_no_pairs_of_its_own() -
     assert relative_error(ends[0] - model.rest_points, ends[1] - model.rest_points) <= tolerance("contact_motion")
 
 
+def test_a_soft_body_that_stands_does_not_creep() -> None:
+    """In long steps, each begun at rest: its weight bends it as far as without contact, and no farther in time."""
+    body = box((3, 4, 3), (0.2, 0.3, 0.2))
+    ends = []
+    for barrier in ((dv.PairBarrier(1e4, 0.01, self_contact=False),), (dv.PairBarrier(1e4, 0.01),), ()):
+        model = dv.Model(body, pinned=torch.from_numpy(body.points[:, 1] < 1e-9),
+                         energies=(dv.StableNeoHookean(), *barrier))  # fmt: skip
+        x = model.rest_points
+        for _ in range(20):
+            x, _ = dv.step(model, x, 0 * x, mu=2e4, lam=4e4, time_step=0.05, sweeps=300)
+        ends.append(x - model.rest_points)
+    for end in ends[:2]:
+        assert relative_error(end, ends[2]) <= tolerance("contact_motion")
+    assert 0.005 < float(-ends[0].min()) < 0.05
+
+
+def test_a_block_on_a_soft_block_does_not_sink() -> None:
+    """Which long steps let fall a part of every step's fall, where sweeps had too little room to take it back."""
+    row = piles.rest("box", sweeps=5)
+    assert row["crossings"] == 0 and row["cut"] == 0.0
+    assert abs(row["value"] - row["reference"]) <= tolerance("dented_rest")
+
+
 @pytest.mark.slow
 def test_a_pinned_sheet_swings_as_without_contact() -> None:
     row = scenes.sheet(sweeps=10)
