@@ -24,7 +24,7 @@ from ..scopes import checking, recorders
 from .intersections import refuse_intersections
 from .rigid_contact import correct
 from .rigid_terms import Scenes
-from .rooms import rigid_motions, rooms, rooms_of_sweeps, unsupported
+from .rooms import Motion, rooms, rooms_of_sweeps, unsupported
 
 if TYPE_CHECKING:
     from .arguments import Prepared
@@ -204,8 +204,9 @@ class ContactStep:
             # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
             move = left if self.parts == 1 else torch.where(pinned, way / self.parts, left)
             wanted = fall = lift if r == 0 else torch.zeros_like(lift)
-            rigid = rigid_motions(surface, x, self.origin, self.fields.mass, move)
-            detection = self._detect(x, was, now, move, fall, rigid)
+            motion = Motion(surface, x, self.origin, self.fields.mass, move)
+            rigid = motion.rigid()
+            detection = self._detect(x, was, now, motion, fall, rigid)
             met.found.append(detection)
             met.counts.append(torch.cat([detection.counts[:3], detection.counts.new_zeros(1)]))
             if self._reads(x):  # before any work
@@ -223,7 +224,7 @@ class ContactStep:
             x, first = self._corrected(start.x, now, start, between)
             if start.own:
                 start = start._replace(own=(start.own[0] + (x - start.x).detach(), start.own[1]))
-            room = rooms_of_sweeps(surface, barrier, start, x, self.fields.mass, begin, move, wanted, rigid.detach())
+            room = rooms_of_sweeps(motion, barrier, start, x, begin, wanted, rigid)
             near, kept = self._narrowed(detection.listed, x, now, room)
             start = start._replace(center=x.detach(), room=room)
             taken, limits, cut = [first], None, start.short
@@ -278,13 +279,14 @@ class ContactStep:
         )  # fmt: skip
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
-    def _detect(self, x: Tensor, was: Tensor, now: Tensor, move: Tensor, fall: Tensor, rigid: Tensor) -> Detection:
+    def _detect(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion, fall: Tensor, rigid: Tensor
+                ) -> Detection:  # fmt: skip
         surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
         with torch.no_grad():
             x, was, now = x.detach(), was.detach(), now.detach()
-            island, room, own_room = rooms(surface, barrier, x, self.origin, self.fields.mass, was, now, move, fall,
-                                           rigid, self.floor_data, self.any_direction)  # fmt: skip
+            island, room, own_room = rooms(motion, barrier, x, self.origin, self.fields.mass, was, now, fall, rigid,
+                                           self.floor_data, self.any_direction)  # fmt: skip
             *index, corners, values, counts, smallest = search.detect(
                 x, self.origin, was, now, surface, barrier, self.capacity, room, own_room
             )

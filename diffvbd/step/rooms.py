@@ -32,8 +32,12 @@ def _by_body(values: Tensor, surface: ContactSurface) -> Tensor:
     return sum_by(values.flatten(0, 1), rows, scenes * surface.bodies).unflatten(0, (scenes, surface.bodies))
 
 
-class _Motion:
-    """The ways that vertices want to go, and what of them is a shift and a turn of each body; differentiable."""
+class Motion:
+    """The ways [B, V, 3] [m] that vertices want to go, and what of them is a shift and a turn of each body;
+    differentiable.
+
+    x, origin: As the sweeps take them.  mass: [1 | B, V] [kg].
+    """
 
     def __init__(self, surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor) -> None:
         self.surface, self.move = surface, move
@@ -73,25 +77,18 @@ class _Motion:
         return mean + torch.linalg.cross(turn, arm)
 
 
-def rigid_motions(surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor) -> Tensor:
-    """Where rigid motions take the vertices of bodies that want to ``move``, as a way [B, V, 3] [m]; differentiable."""
-    return _Motion(surface, x, origin, mass, move).rigid()
-
-
 @torch.no_grad()
-def rooms_of_sweeps(surface: ContactSurface, barrier: PairBarrier, start: PartStart, x: Tensor, mass: Tensor,
-                    begin: Tensor, move: Tensor, fall: Tensor, rigid: Tensor) -> Tensor:  # fmt: skip
+def rooms_of_sweeps(motion: Motion, barrier: PairBarrier, start: PartStart, x: Tensor, begin: Tensor, fall: Tensor,
+                    rigid: Tensor) -> Tensor:  # fmt: skip
     """How far the sweeps may carry a vertex from where they find it [B, V] [m]: as far as a barrier pushes, weight
     pulls, elasticity takes back what bodies deform by on the way and, of what pairs have held up, all; the most of a
     scene, since bodies push one another. Index data.
 
     Args:
-        start: The part's; its rooms bound the whole way.  x: Where the sweeps begin.  mass: [1 | B, V].
-        begin: Where the part began.  move, fall: Where each vertex wanted to go from there.
-        rigid: As start_between_planes takes it. All [B, V, 3] [m].
+        motion, fall: What the part wanted.  start: Its start, whose rooms bound the whole way.
+        x, begin: Where the sweeps begin, and where the part began.  rigid: Motion.rigid(). All [B, V, 3] [m].
     """
-    mass, begin, move, fall, x = (t.detach() for t in (mass, begin, move, fall, x))
-    motion = _Motion(surface, x, x.new_empty((0,)), mass, move)
+    surface, move = motion.surface, motion.move
     held_up = motion.largest(begin + move + fall - start.x.detach())
     wish = motion.largest(fall) + motion.largest(move - rigid) + ROOM * held_up + motion.largest(x - start.x.detach())
     wish = LEAST_ROOM * barrier.dhat + (wish.amax(1, keepdim=True).expand_as(wish) if surface.bodies else wish)
@@ -111,20 +108,18 @@ class Rooms(NamedTuple):
 
 
 @torch.no_grad()
-def rooms(surface: ContactSurface, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor, was: Tensor,
-          now: Tensor, move: Tensor, fall: Tensor, rigid: Tensor, floor: Tensor | None, any_direction: bool
-          ) -> Rooms:  # fmt: skip
+def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass: Tensor, was: Tensor, now: Tensor,
+          fall: Tensor, rigid: Tensor, floor: Tensor | None, any_direction: bool) -> Rooms:  # fmt: skip
     """Rooms follow from where a body wants to go: pairs that could meet within them are listed, and what does not want
     to move relative to its neighbours lists few. Index data.
 
     Args:
         x, origin: As the sweeps take them.  mass: [1 | B, V].  was, now: Collider points [B, Vc, 3] [m].
-        move, fall, rigid: Where each vertex wants to go, and what of move is rigid, [B, V, 3] [m].
+        motion, fall: Where each vertex wants to go.  rigid: Motion.rigid(), [B, V, 3] [m].
         floor: Data of the FloorBarrier, or None.  any_direction: As for detection.islands.
     """
-    x, mass, was, now, move, fall, rigid = (t.detach() for t in (x, mass, was, now, move, fall, rigid))
-    motion = _Motion(surface, x, origin, mass, move)
-    body, sums = motion.body, motion.sums
+    x, mass, was, now, rigid = (t.detach() for t in (x, mass, was, now, rigid))
+    surface, move, body, sums = motion.surface, motion.move.detach(), motion.body, motion.sums
     # The sweeps may take back all that the start has let fall and bent.
     falls = 2 * motion.largest(fall) + LEAST_ROOM * barrier.dhat
     bends = motion.largest(move - motion.mean[:, body])

@@ -48,8 +48,7 @@ def test_float32_is_close(device: str, name: str) -> None:
     for key, value in expected.items():
         allowed = tolerance("contact_float32" if key.startswith("grad") else "contact_float32_forward")
         allowed = allowed / scene.time_step if key == "v" else allowed
-        # where approach is next to nothing, a rounding decides whether damping acts
-        allowed = max(allowed, 200 * relative_error(moved[key], expected[key]))
+        allowed = max(allowed, tolerance("float32_of_inputs") * relative_error(moved[key], expected[key]))
         assert relative_error(result[key], value) <= allowed, key
 
 

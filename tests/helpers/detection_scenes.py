@@ -262,7 +262,7 @@ def all_pairs(s: Scene, b: int) -> Pairs:
         dhat = np.where(at_rest < s.dhat, 0.9 * at_rest, s.dhat)
         rooms = np.append(s.rooms, 0)[np.minimum(np.stack([one, other], 1), s.mesh_bodies)].sum(1)
         rooms = np.where(one == other, s.own_share * rooms, rooms)
-        keep = (d - offset < np.maximum(s.dhat + rooms, 1e-300)) & (at_rest > 1e-9 * np.maximum(*edges[1:3]))
+        keep = (d - offset < s.dhat + rooms) & (at_rest > 1e-9 * np.maximum(*edges[1:3]))
         columns = (np.full(len(d), kind), corners, d - offset, weights, np.stack([dhat, offset, threshold], -1),
                    ((b * 3 + kind) * base + i) * base + j)  # fmt: skip
         found.append([a[keep] for a in columns])
