@@ -235,12 +235,13 @@ class ContactStep:
                 taken.append(last)
                 cut = limits[:, -1] > 0  # what the start has held up, sweeps may have made good
             met.cut = cut
-            for found in recorders():
-                taken_all = torch.stack(taken)
-                found.append(detection._replace(shares=start.shares, corrections=taken_all, limits=limits, kept=kept,
-                                                frames=start.frames))  # fmt: skip
+            met.found[r] = detection._replace(shares=start.shares, corrections=torch.stack(taken), limits=limits,
+                                              kept=kept, frames=start.frames)  # fmt: skip
             left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
-        return self._judged(x, met)
+        x = self._judged(x, met)
+        for found in recorders():  # a step that is done again, with room for more pairs, counts once
+            found.extend(met.found)
+        return x
 
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
         """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
