@@ -39,6 +39,15 @@
   ADJOINT(x) ADJOINT(x_prev) ADJOINT(y) ADJOINT(mass) ADJOINT(energy_data) INDEX(origin) \
   INDEX(order) INDEX(ptr) INDEX(spread) INDEX(other)
 
+// The rigid correction of bodies that touch (contact/rigid.h): vertices by body; free [bodies] bool: nothing of it is
+// pinned; held and body of all corner points; contact as of the sweeps.
+#define DIFFVBD_TOUCHING_FIELDS(ADJOINT, INDEX) \
+  ADJOINT(x) ADJOINT(x_prev) ADJOINT(y) ADJOINT(mass) ADJOINT(energy_data) INDEX(origin) \
+  INDEX(order) INDEX(ptr) INDEX(free) INDEX(held) INDEX(body) \
+  ADJOINT(collider) ADJOINT(collider_prev) ADJOINT(kappa) \
+  INDEX(pairs) INDEX(constants) INDEX(pair_ptr) INDEX(pair_entry) \
+  ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag) INDEX(center) INDEX(room)
+
 // The beginning of a step (start/begin.h): as of the correction, and the other bodies. other [vertices]: which of them
 // a vertex is in, -1: none, -2: it is corrected; other_tets [listed, 5]: a tet and its corners; rest [1 | scenes, tets,
 // kRestScalars], empty where tets have no energy.
@@ -79,6 +88,7 @@ namespace diffvbd {
 DIFFVBD_STRUCT(SweepFields, SWEEP)
 DIFFVBD_STRUCT(StepFields, STEP)
 DIFFVBD_STRUCT(RigidFields, RIGID)
+DIFFVBD_STRUCT(TouchingFields, TOUCHING)
 DIFFVBD_STRUCT(BeginFields, BEGIN)
 DIFFVBD_STRUCT(CoarseFields, COARSE)
 DIFFVBD_BARS(SweepBars, SWEEP)

@@ -15,7 +15,7 @@ constexpr double kLeastTry = 1.0 / 64;
 template <class T>
 struct AdvanceInputs {
   const T *x, *move;                  // [B, V, 3]  at the detection; where each vertex wants to go from there
-  const T* u;                         // [B, bodies, 3]  translation of each body's island
+  const T* u;                         // [B, bodies, 3]  translation of each body's island; or null
   const T* center;                    // [B, V, 3]  from where a vertex has its room, less u
   const T* origin;                    // [B, V, 3] or null
   const T *collider, *collider_next;  // [B, Vc, 3]
@@ -57,7 +57,7 @@ DIFFVBD_FN void mark(uint8_t* flag) {
 template <class T>
 DIFFVBD_FN Vec3<T> way_of(const AdvanceInputs<T>& in, int64_t scene, int32_t v) {
   const Vec3<T> way = vector_at(in.move + 3 * (scene * in.vertices + v));
-  return in.held[v] ? way : way - vector_at(in.u + 3 * (scene * in.bodies + in.body[v]));
+  return in.held[v] || !in.u ? way : way - vector_at(in.u + 3 * (scene * in.bodies + in.body[v]));
 }
 
 // The corners of a pair as they are, and the ways that they try.

@@ -92,6 +92,51 @@ class RigidFields(NamedTuple):
     other: Tensor  # OtherBodies.of
 
 
+class TouchingFields(NamedTuple):
+    """What the rigid correction of bodies that touch reads, in the order of DIFFVBD_TOUCHING_FIELDS; differentiable:
+    TOUCHING_ADJOINTS. Empty where a scene lacks something."""
+
+    x: Tensor  # [B, V, 3] [m], as are the next two
+    x_prev: Tensor
+    y: Tensor
+    mass: Tensor  # [1 | B, V] [kg]
+    energy_data: Tensor
+    origin: Tensor
+    order: Tensor  # [V] int32, vertices by body
+    ptr: Tensor  # [bodies + 1] int32
+    free: Tensor  # [bodies] bool: nothing of it is pinned
+    held: Tensor  # [N] bool, of all corner points: pinned, or of a collider
+    body: Tensor  # [N] int32
+    collider: Tensor  # as in SweepFields, as are the rest
+    collider_prev: Tensor
+    kappa: Tensor
+    pairs: Tensor
+    constants: Tensor
+    pair_ptr: Tensor
+    pair_entry: Tensor
+    lag: Tensor
+    lag_pairs: Tensor
+    lag_ptr: Tensor
+    lag_entry: Tensor
+    floor_lag: Tensor
+    center: Tensor
+    room: Tensor
+
+
+TOUCHING_ADJOINTS = (
+    "x",
+    "x_prev",
+    "y",
+    "mass",
+    "energy_data",
+    "collider",
+    "collider_prev",
+    "kappa",
+    "lag",
+    "floor_lag",
+)
+
+
 class CoarseFields(NamedTuple):
     """What the matrix of a coarse space reads, in the order of DIFFVBD_COARSE_FIELDS; the first three are
     differentiable."""

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .. import ops
 from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
@@ -22,8 +23,7 @@ from ..ops import contact_start as ops_start
 from ..ops.detect import CONSTANTS
 from ..scopes import checking, recorders
 from .intersections import refuse_intersections
-from .rigid_contact import correct
-from .rigid_terms import Scenes
+from .rigid_contact import bodies_of, correct
 from .rooms import Motion, rooms, rooms_of_sweeps, unsupported
 
 if TYPE_CHECKING:
@@ -257,13 +257,13 @@ class ContactStep:
 
     def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> tuple[Tensor, Tensor]:
         """x after the rigid correction of all bodies that are free, and the share of its motion that each took."""
-        numbers = self.prepared.settings.numbers
-        scenes = Scenes(
-            self.model, self.x_prev, self.begun.y, self.fields.mass, self.begun.data, self.origin, self.before,
-            collider, self.kappa, listed, self.lagged, self.lag, self.floor_lag, start.center, start.room, self.surface,
-            numbers.time_step, numbers.friction_eps,
+        numbers, lagged = self.prepared.settings.numbers, self.lagged
+        fields = ops.TouchingFields(
+            x, self.x_prev, self.begun.y, self.fields.mass, self.begun.data, self.origin, *bodies_of(self.model),
+            collider, self.before, self.kappa, *listed, self.lag, lagged.pairs, lagged.ptr, lagged.entry,
+            self.floor_lag, start.center, start.room,
         )  # fmt: skip
-        return correct(scenes, x)
+        return correct(self.model, fields, numbers.time_step, numbers.friction_eps)
 
     def _colliders_at(self, share: float) -> Tensor:
         if self.colliders is self.before:

@@ -1,5 +1,6 @@
-"""What the rigid correction of bodies that touch is made of: inertia, energies of single vertices, friction on a floor,
-and barriers, friction and damping of pairs, each with gradient, blocks and potential. Twin of csrc/contact/pairs.h."""
+"""What the adjoint of the rigid correction of bodies that touch is made of, differentiable: gradient and blocks of
+inertia, energies of single vertices, friction on a floor, and barriers, friction and damping of pairs. Twin of
+csrc/contact/rigid.h."""
 
 from __future__ import annotations
 
@@ -8,47 +9,30 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .. import ops
 from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
-from ..adjoint.sums import sum_by
-from ..contact.surface import ContactSurface
 from ..ops import broadcast
 
 RESTING = 1e-6  # of the motion below which friction is smoothed; twin of kRestingMotion in csrc/contact/pairs.h
 
 
 class Scenes(NamedTuple):
-    """What the correction reads; positions [B, V, 3] [m]."""
+    """What the correction reads."""
 
     model: Any
-    x_prev: Tensor
-    y: Tensor
-    mass: Tensor  # [1 | B, V] [kg]
-    data: Tensor  # of the energies
-    origin: Tensor  # [B, V, 3] or empty
-    collider_prev: Tensor  # at the start of the step, [B, Vc, 3]
-    collider: Tensor  # and now
-    kappa: Tensor
-    listed: Pairs
-    lagged: Pairs
-    lag: Tensor  # [pairs, 9]
-    floor_lag: Tensor  # [B, V, planes, 4] or empty
-    center: Tensor  # from where each vertex has its room
-    room: Tensor  # [B, V] [m]
-    surface: ContactSurface | None
+    fields: ops.TouchingFields
     time_step: float
     friction_eps: float  # [m]
 
 
 class PairTerms(NamedTuple):
-    """What pairs add: gradient [n, 3] by the first side's motion, its derivative [n, 3, 3], weights [n, 4], and the
-    potential [n] of which they are."""
+    """What pairs add: gradient [n, 3] by the motion of their weighted corners, its derivative [n, 3, 3] and weights
+    [n, 4]."""
 
     listed: Pairs
     force: Tensor
     stiffness: Tensor
     weights: Tensor
-    value: Tensor
-    within: bool  # whether pairs of one body turn it: friction acts along a gap, at an arm of it
     at_corners: Tensor | None = None  # what is added to the gradient at each corner [n, 4, 3]
 
 
@@ -56,14 +40,13 @@ def outer(n: Tensor) -> Tensor:
     return n[..., None] * n[..., None, :]
 
 
-def _slip(u: Tensor, eps: float) -> tuple[Tensor, Tensor]:
-    """Friction's potential f0 of slips u [..., 3], and f0'(|u|) / |u|."""
+def _slip_rate(u: Tensor, eps: float) -> Tensor:
+    """f0'(|u|) / |u| of friction's potential, of slips u [..., 3]."""
     square = (u * u).sum(-1)
     moves = square > (RESTING * eps) ** 2
     length = torch.where(moves, torch.where(moves, square, torch.ones_like(square)).sqrt(), square.detach().sqrt())
     slow = length < eps
-    value = torch.where(slow, length**2 / eps - length**3 / (3 * eps**2) + eps / 3, length)
-    return value, torch.where(slow, (2 - length / eps) / eps, 1 / torch.where(slow, torch.ones_like(length), length))
+    return torch.where(slow, (2 - length / eps) / eps, 1 / torch.where(slow, torch.ones_like(length), length))
 
 
 def _log_barrier(gap: Tensor, dhat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -73,61 +56,49 @@ def _log_barrier(gap: Tensor, dhat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return -past * past * log, -past * (2 * log + part), -(2 * log + 4 * part - part * part)
 
 
-def vertex_energies(s: Scenes) -> list[tuple[Any, tuple[Tensor, float, Tensor | None]]]:
+def _vertex_energies(s: Scenes) -> list[tuple[Any, tuple[Tensor, float, Tensor | None]]]:
     """The energies of single vertices, each with its data, the time step and the origin."""
-    out, first = [], 0
+    f = s.fields
+    out, first, origin = [], 0, f.origin if f.origin.numel() else None
     for energy in s.model.vertex_energies:
         size = energy.count() * (s.model.num_vertices if energy.per_vertex else 1)
-        out.append((energy, (s.data[:, first : first + size], s.time_step, s.origin if s.origin.numel() else None)))
+        out.append((energy, (f.energy_data[:, first : first + size], s.time_step, origin)))
         first += size
     return out
 
 
-def _off_target(s: Scenes, x: Tensor) -> Tensor:
-    return torch.where(s.model._pinned[:, None], torch.zeros_like(x), x - s.y)
-
-
-def _floor_slip(s: Scenes, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of friction on a floor: load [N] and motion along each plane, and what _slip says of it."""
-    load, n = s.floor_lag[..., 0], s.floor_lag[..., 1:]
-    travel = (x - s.x_prev)[:, :, None]
+def _floor_slip(s: Scenes) -> tuple[Tensor, Tensor]:
+    """Of friction on a floor: motion along each plane, and load [N] times _slip_rate."""
+    load, n = s.fields.floor_lag[..., 0], s.fields.floor_lag[..., 1:]
+    travel = (s.fields.x - s.fields.x_prev)[:, :, None]
     u = travel - n * (n * travel).sum(-1, keepdim=True)
-    return load, u, *_slip(u, s.friction_eps)
+    return u, load * _slip_rate(u, s.friction_eps)
 
 
-def _vertex_value(s: Scenes, x: Tensor) -> Tensor:
-    """The potential of inertia, energies of single vertices and friction on a floor, of each scene [B]."""
-    value = (0.5 * broadcast(s.mass, x.shape[:2]) * (_off_target(s, x) ** 2).sum(-1)).sum(1)
-    for energy, rest in vertex_energies(s):
-        value = value + energy.value(x, s.x_prev, *rest).sum(1)
-    if s.floor_lag.numel():
-        load, _, potential, _ = _floor_slip(s, x)
-        value = value + s.time_step**2 * (load * potential).sum((1, 2))
-    return value
-
-
-def vertex_gradient(s: Scenes, x: Tensor) -> Tensor:
-    """Its gradient [B, V, 3]."""
-    force = broadcast(s.mass, x.shape[:2])[..., None] * _off_target(s, x)
-    for energy, rest in vertex_energies(s):
-        force = force + energy.gradient(x, s.x_prev, *rest)
-    if s.floor_lag.numel():
-        load, u, _, rate = _floor_slip(s, x)
-        force = force + s.time_step**2 * ((load * rate)[..., None] * u).sum(2)
+def vertex_gradient(s: Scenes) -> Tensor:
+    """Of inertia, energies of single vertices and friction on a floor [B, V, 3]; of inertia not at pinned vertices."""
+    f = s.fields
+    off = torch.where(s.model._pinned[:, None], torch.zeros_like(f.x), f.x - f.y)
+    force = broadcast(f.mass, f.x.shape[:2])[..., None] * off
+    for energy, rest in _vertex_energies(s):
+        force = force + energy.gradient(f.x, f.x_prev, *rest)
+    if f.floor_lag.numel():
+        u, rate = _floor_slip(s)
+        force = force + s.time_step**2 * (rate[..., None] * u).sum(2)
     return force
 
 
-def vertex_blocks(s: Scenes, x: Tensor) -> Tensor | None:
+def vertex_blocks(s: Scenes) -> Tensor | None:
     """Blocks [B, V, 3, 3] that are at least its derivative, without those of inertia; None where there are none."""
-    parts = [energy.blocks(x, s.x_prev, *rest) for energy, rest in vertex_energies(s)]
-    if s.floor_lag.numel():
-        load, _, _, rate = _floor_slip(s, x)
-        across = torch.eye(3, dtype=x.dtype, device=x.device) - outer(s.floor_lag[..., 1:])
-        parts.append(s.time_step**2 * ((load * rate)[..., None, None] * across).sum(2))
+    f = s.fields
+    parts = [energy.blocks(f.x, f.x_prev, *rest) for energy, rest in _vertex_energies(s)]
+    if f.floor_lag.numel():
+        across = torch.eye(3, dtype=f.x.dtype, device=f.x.device) - outer(f.floor_lag[..., 1:])
+        parts.append(s.time_step**2 * (_floor_slip(s)[1][..., None, None] * across).sum(2))
     out = None
     for part in parts:
         out = part if out is None else out + part
-    return None if out is None else broadcast(out, (*x.shape, 3))
+    return None if out is None else broadcast(out, (*f.x.shape, 3))
 
 
 def corners_of(listed: Pairs) -> tuple[Tensor, Tensor]:
@@ -136,51 +107,53 @@ def corners_of(listed: Pairs) -> tuple[Tensor, Tensor]:
     return rows[:, 5:], rows[:, :4]
 
 
-def active_pairs(s: Scenes, x: Tensor) -> Pairs:
-    """The listed pairs that push where the vertices are at x: few of them, and the others add nothing. All of them
-    where values must not decide sizes."""
-    if not s.listed.pairs.shape[0] or x.is_cuda or torch.compiler.is_compiling():
-        return s.listed
+def _listed(s: Scenes) -> Pairs:
+    """The pairs that push: few of those that are listed, and the others add nothing. All of them where values must not
+    decide sizes."""
+    f = s.fields
+    listed = Pairs(f.pairs, f.constants, f.pair_ptr, f.pair_entry)
+    if not f.pairs.shape[0] or f.x.is_cuda or torch.compiler.is_compiling():
+        return listed
     with torch.no_grad():
-        acts = pair_lag(x.detach(), s.collider.detach(), s.kappa.detach(), s.origin, s.listed)[:, 1] > 0
-    return some_of(s.listed, acts.nonzero()[:, 0], x.shape[1] + s.collider.shape[1])
+        acts = pair_lag(f.x.detach(), f.collider.detach(), f.kappa.detach(), f.origin, listed)[:, 1] > 0
+    return some_of(listed, acts.nonzero()[:, 0], f.x.shape[1] + f.collider.shape[1])
 
 
-def pair_terms(s: Scenes, x: Tensor) -> list[PairTerms]:
+def pair_terms(s: Scenes) -> list[PairTerms]:
     """Of barriers, and of lagged friction and damping."""
-    h, h2 = s.time_step, s.time_step**2
-    points = torch.cat([x, s.collider], 1)
+    f, h, h2 = s.fields, s.time_step, s.time_step**2
+    points = torch.cat([f.x, f.collider], 1)
     out = []
-    if s.listed.pairs.shape[0]:
-        force, active, n, w = pair_lag(x, s.collider, s.kappa, s.origin, s.listed).split((1, 1, 3, 4), -1)
-        scene, corners = corners_of(s.listed)
+    if f.pairs.shape[0]:
+        listed = _listed(s)
+        force, active, n, w = pair_lag(f.x, f.collider, f.kappa, f.origin, listed).split((1, 1, 3, 4), -1)
+        scene, corners = corners_of(listed)
         at = points[scene, corners]
-        if s.origin.numel():
-            at = at + torch.cat([s.origin, torch.zeros_like(s.collider)], 1)[scene, corners]
-        dhat, offset = s.listed.constants[:, 0], s.listed.constants[:, 1]
+        if f.origin.numel():
+            at = at + torch.cat([f.origin, torch.zeros_like(f.collider)], 1)[scene, corners]
+        dhat, offset = listed.constants[:, 0], listed.constants[:, 1]
         near = active[:, 0] > 0
         height = ((at - at[:, :1].detach()) * n[:, None]).sum(-1)
         gap = torch.where(near, (w * height).sum(-1) - offset, 0.5)
         b, slope, curvature = _log_barrier(gap, torch.where(near, dhat, 1.0))
         # the force carries stiffness and mollifier: what is left are ratios of the barrier's derivatives
         load = h2 * torch.where(near, force[:, 0] / -slope, 0.0)
-        kappa = s.kappa if s.kappa.shape[0] == 1 else of_scene(s.kappa, s.listed)
-        turned = torch.where(near, h2 * kappa * b, 0.0)[:, None, None] * _mollifier_gradient(at, s.listed)
+        kappa = f.kappa if f.kappa.shape[0] == 1 else of_scene(f.kappa, listed)
+        turned = torch.where(near, h2 * kappa * b, 0.0)[:, None, None] * _mollifier_gradient(at, listed)
         stiffness = (load * curvature)[:, None, None] * outer(n)
-        out.append(PairTerms(s.listed, -h2 * force * n, stiffness, w, load * b, False, turned))
-    if s.lag.numel():
-        load, rate, n, w = s.lag.split((1, 1, 3, 4), -1)
-        scene, corners = corners_of(s.lagged)
-        moved = points[scene, corners] - torch.cat([s.x_prev, s.collider_prev], 1)[scene, corners]
+        out.append(PairTerms(listed, -h2 * force * n, stiffness, w, turned))
+    if f.lag.numel():
+        load, rate, n, w = f.lag.split((1, 1, 3, 4), -1)
+        lagged = Pairs(f.lag_pairs, f.constants, f.lag_ptr, f.lag_entry)
+        scene, corners = corners_of(lagged)
+        moved = points[scene, corners] - torch.cat([f.x_prev, f.collider_prev], 1)[scene, corners]
         m = (w[..., None] * moved).sum(1)
         along = (n * m).sum(-1, keepdim=True)
         approach, u = along.clamp(max=0), m - along * n
-        potential, slip = _slip(u, s.friction_eps)
-        slip = h2 * load * slip[:, None]
-        eye = torch.eye(3, dtype=x.dtype, device=x.device)
+        slip = h2 * load * _slip_rate(u, s.friction_eps)[:, None]
+        eye = torch.eye(3, dtype=f.x.dtype, device=f.x.device)
         stiffness = slip[..., None] * (eye - outer(n)) + (h * rate)[..., None] * outer(n)
-        value = h2 * load[:, 0] * potential + 0.5 * h * (rate * approach**2)[:, 0]
-        out.append(PairTerms(s.lagged, slip * u + h * rate * approach * n, stiffness, w, value, True))
+        out.append(PairTerms(lagged, slip * u + h * rate * approach * n, stiffness, w))
     return out
 
 
@@ -196,13 +169,3 @@ def _mollifier_gradient(at: Tensor, listed: Pairs) -> Tensor:
     slope = torch.where(close, 4 * (1 - square / safe) / safe, 0.0)[:, None]
     by_u, by_v = slope * torch.linalg.cross(v, c), slope * torch.linalg.cross(c, u)
     return torch.stack([-by_u, by_u, -by_v, by_v], 1)
-
-
-def potential(s: Scenes, x: Tensor) -> Tensor:
-    """Of each scene [B] [kg m^2], without tets."""
-    s = s._replace(listed=active_pairs(s, x))
-    value = _vertex_value(s, x)
-    for terms in pair_terms(s, x):
-        scene = corners_of(terms.listed)[0][:, 0]
-        value = value + sum_by(terms.value[:, None], scene, x.shape[0])[:, 0]
-    return value

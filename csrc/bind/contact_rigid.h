@@ -1,0 +1,73 @@
+// The tensors of the rigid correction of bodies that touch, as the operators of all backends take them.
+#pragma once
+
+#include <vector>
+
+#include "../contact/rigid.h"
+#include "contact_start.h"
+#include "rigid.h"
+
+namespace diffvbd {
+
+// move [B, V, 3]: what is tried, memory of the operator; empty where nothing is.
+template <class T>
+contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const std::vector<int64_t>& data_count,
+                                        double time_step, double friction_eps, const Tensor& move) {
+  contact::RigidInputs<T> in{};
+  const int64_t b = t.x.size(0), v = t.x.size(1), colliders = t.collider.dim() == 3 ? t.collider.size(1) : 0;
+  const int64_t bodies = t.ptr.numel() - 1, corners = v + colliders;
+  in.scene = rigid_inputs<T>({t.x, t.x_prev, t.y, t.mass, t.energy_data, t.origin, t.order, t.ptr, t.x, t.order},
+                             data_count, time_step, false);
+  require(is_beside(t.free, t.x, ScalarType::Bool) && t.free.numel() == bodies,
+          "diffvbd::contact_rigid: expected free bool [bodies]");
+  require(is_beside(t.held, t.x, ScalarType::Bool) && is_index(t.body, t.x) && t.held.numel() == corners &&
+              t.body.numel() == corners,
+          "diffvbd::contact_rigid: expected held and body of all corner points");
+  in.free = data<const bool>(t.free);
+  contact::AdvanceInputs<T>& gate = in.gate;
+  gate.x = data<const T>(t.x), gate.move = move.numel() > 0 ? data<const T>(move) : nullptr;
+  gate.origin = in.scene.origin.data;
+  require_like("center", t.center, t.x, 3 * b * v);
+  require_like("room", t.room, t.x, b * v);
+  gate.center = data<const T>(t.center), gate.room = data<const T>(t.room);
+  require_like("collider", t.collider, t.x, 3 * b * colliders);
+  require_like("collider_prev", t.collider_prev, t.x, 3 * b * colliders);
+  gate.collider = gate.collider_next = data<const T>(t.collider);
+  in.collider_prev = data<const T>(t.collider_prev);
+  gate.held = data<const bool>(t.held), gate.body = data<const int32_t>(t.body);
+  gate.listed = pair_list(t.pairs, t.pair_ptr, t.pair_entry, t.x, corners);
+  require_like("constants", t.constants, t.x, t.pairs.size(0) * contact::kConstants);
+  gate.constants = data<const T>(t.constants);
+  gate.scenes = b;
+  gate.vertices = static_cast<int32_t>(v), gate.corners = static_cast<int32_t>(corners);
+  gate.bodies = static_cast<int32_t>(bodies);
+  gate.whole = true;
+  if (t.lag.numel() > 0) {
+    in.lagged = pair_list(t.lag_pairs, t.lag_ptr, t.lag_entry, t.x, corners);
+    require_like("lag", t.lag, t.x, t.lag_pairs.size(0) * contact::kLagScalars);
+    in.lag = data<const T>(t.lag);
+  }
+  in.kappa = batched<T>("kappa", t.kappa, t.x, b, 1);
+  if (t.floor_lag.numel() > 0) {
+    in.planes = static_cast<int32_t>(t.floor_lag.numel() / t.floor_lag.size(0) / (v * contact::kFloorLag));
+    in.floor_lag = batched<T>("floor_lag", t.floor_lag, t.x, b, v * in.planes * contact::kFloorLag);
+  }
+  in.friction_eps = friction_eps;
+  return in;
+}
+
+template <class T>
+std::vector<int64_t> matrix_shape(const contact::RigidInputs<T>& in) {
+  const int64_t b = in.scene.scenes, n = in.bodies(), six = contact::kUnknowns;
+  return in.together() ? std::vector<int64_t>{b, six * n, six * n} : std::vector<int64_t>{b, n, six, six};
+}
+
+template <class T>
+void require_motion(const contact::RigidInputs<T>& in, const Tensor& centers, const Tensor& motion, const Tensor& x) {
+  const int64_t rows = in.scene.scenes * in.bodies();
+  require(is_beside(centers, x, ScalarType::Double) && centers.numel() == 3 * rows &&
+              is_beside(motion, x, ScalarType::Double) && motion.numel() == contact::kUnknowns * rows,
+          "diffvbd::contact_rigid_move: expected float64 centers [scenes, bodies, 3] and motion [scenes, bodies, 6]");
+}
+
+}  // namespace diffvbd

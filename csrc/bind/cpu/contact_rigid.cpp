@@ -1,0 +1,55 @@
+// CPU implementations of the rigid correction of bodies that touch.
+#include "../contact_rigid.h"
+
+#include <torch/csrc/stable/library.h>
+
+#include <tuple>
+#include <vector>
+
+#include "../../cpu/contact_rigid.h"
+#include "sweep.h"
+
+namespace {
+
+namespace contact = diffvbd::contact;
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::TouchingFields;
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+
+Tensor doubles(const std::vector<int64_t>& sizes) { return torch::stable::empty(sizes, ScalarType::Double); }
+
+std::tuple<Tensor, Tensor, Tensor> contact_rigid_system(DIFFVBD_PARAMETERS(TOUCHING) std::vector<int64_t> data_count,
+                                                        double time_step, double friction_eps) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    const int64_t b = in.scene.scenes, n = in.bodies();
+    Tensor centers = doubles({b, n, 3}), gradient = doubles({b, n, contact::kUnknowns});
+    Tensor matrix = doubles(diffvbd::matrix_shape(in));
+    diffvbd::rigid_system<T>(in, data<double>(centers), data<double>(gradient), data<double>(matrix));
+    return std::make_tuple(centers, gradient, matrix);
+  });
+}
+
+std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& centers, const Tensor& motion,
+                                              std::vector<int64_t> data_count, double time_step, double friction_eps) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const Tensor way = empty(x, {x.size(0), x.size(1), 3});
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, way);
+    diffvbd::require_motion(in, centers, motion, x);
+    Tensor out = empty(x, {in.scene.scenes, in.scene.vertices, 3}), share = doubles({in.scene.scenes, in.bodies()});
+    diffvbd::rigid_move<T>(in, data<const double>(centers), data<const double>(motion), data<T>(way),
+                           data<double>(share), data<T>(out));
+    return std::make_tuple(out, share);
+  });
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
+  m.impl("contact_rigid_system", TORCH_BOX(&contact_rigid_system));
+  m.impl("contact_rigid_move", TORCH_BOX(&contact_rigid_move));
+}

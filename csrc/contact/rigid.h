@@ -1,0 +1,315 @@
+// The rigid correction of bodies that touch (docs/method.md, section 18): what vertices and pairs add to the gradient
+// and the matrix of the step's potential over a turn and a shift of every body, and which share of the Newton step each
+// body may take. In double, whatever the dtype of the scene.
+#pragma once
+
+#include "../rigid/body.h"
+#include "advance.h"
+#include "lag.h"
+
+namespace diffvbd::contact {
+
+using rigid::Vector;
+
+constexpr int kMostCoupled = 64;  // bodies of a scene that are solved for together; else one side of a pair at a time
+constexpr int kTries = 5;         // of motions, each half as long for some bodies, or none for them
+constexpr int kSpreads = 4;       // how often a shorter motion is handed on to the bodies that one touches
+constexpr double kRise = 1e-9;    // of the potential, that counts as none
+constexpr double kLeastMass = 1e-12;  // of a body's mass, that keeps its system definite
+constexpr int kUnknowns = 6;          // of a body: a turn and a shift
+
+template <class T>
+struct RigidInputs {
+  rigid::Inputs<T> scene;  // x, x_prev, y, mass, energies, and the vertices of all bodies
+  AdvanceInputs<T> gate;   // pairs that repel, rooms; `move` is what is tried
+  PairList lagged;
+  const T* lag;                       // [pairs, 9] or null
+  const T* collider_prev;             // [B, Vc, 3]
+  Batched<const T> kappa, floor_lag;  // floor_lag [1 | B, V, planes, 4]
+  const bool* free;                   // [bodies]: nothing of it is pinned
+  int32_t planes;
+  double friction_eps;
+
+  DIFFVBD_FN int32_t bodies() const { return scene.bodies; }
+  DIFFVBD_FN bool together() const { return scene.bodies <= kMostCoupled; }
+  // Scalars of the matrices of a scene: of all bodies together, or of one after another.
+  DIFFVBD_FN int64_t matrix_size() const {
+    const int64_t n = scene.bodies;
+    return (together() ? n * n : n) * kUnknowns * kUnknowns;
+  }
+  DIFFVBD_FN int64_t first_listed(int64_t s) const { return gate.listed.ptr[s * gate.corners] / 4; }
+  DIFFVBD_FN int64_t first_lagged(int64_t s) const { return lag ? lagged.ptr[s * gate.corners] / 4 : 0; }
+};
+
+// The body that a corner point moves with, or -1.
+template <class T>
+DIFFVBD_FN int32_t moving_body(const RigidInputs<T>& in, int32_t corner) {
+  const int32_t body = in.gate.body[corner];
+  return body < in.bodies() && in.free[body] ? body : -1;
+}
+
+// Where corner points are: of the mesh at x, or where they would go.
+template <class T>
+struct CornerPoints {
+  const RigidInputs<T>& in;
+  bool moved;
+  DIFFVBD_FN Vector relative(int64_t scene, int32_t v) const {  // to origin
+    if (v >= in.gate.vertices) {
+      return rigid::Body<T>::at(in.gate.collider +
+                                3 * (scene * (in.gate.corners - in.gate.vertices) + v - in.gate.vertices));
+    }
+    const int64_t row = 3 * (scene * in.gate.vertices + v);
+    const Vector x = rigid::Body<T>::at(in.scene.x + row);
+    return moved ? x + rigid::Body<T>::at(in.gate.move + row) : x;
+  }
+  DIFFVBD_FN Vector operator()(int64_t scene, int32_t v) const {
+    const Vector x = relative(scene, v);
+    if (v >= in.gate.vertices || !in.scene.origin.data) return x;
+    return x + rigid::Body<T>::at(in.scene.origin.data + scene * in.scene.origin.scene + 3 * int64_t{v});
+  }
+};
+
+// What one pair adds: gradient and its derivative by the motion of the first side relative to the second, and what the
+// mollifier adds at corners. Moments are about the origin of x.
+struct PairPress {
+  int32_t body[2];  // what moves on either side, or -1; a pair within one body has it on the first
+  Vector force;
+  Sym3<double> stiffness;
+  double weight[2];
+  Vector at[2], pull[2], torque[2];
+  double value;
+
+  // What the body of a side does to the pair by its k-th unknown, about its center.
+  DIFFVBD_FN Vector map(int side, int k, const Vector& center) const {
+    const Vector r = at[side] - weight[side] * center;
+    const Vector e = {double(k % 3 == 0), double(k % 3 == 1), double(k % 3 == 2)};
+    return k < 3 ? cross(e, r) : weight[side] * e;
+  }
+  DIFFVBD_FN double gradient(int side, int k, const Vector& center) const {
+    const Vector moment = torque[side] - cross(center, pull[side]);
+    const Vector& own = k < 3 ? moment : pull[side];
+    return dot(map(side, k, center), force) + (k % 3 == 0 ? own.x : k % 3 == 1 ? own.y : own.z);
+  }
+  DIFFVBD_FN double block(int side, int i, int j, const Vector& center) const {
+    return dot(map(side, i, center), stiffness * map(side, j, center));
+  }
+};
+constexpr int kPressDoubles = 29;  // of a PairPress without its bodies and its value
+
+DIFFVBD_FN void store_press(const PairPress& a, double* to) {
+  int i = 0;
+  const auto put = [&](const Vector& v) { to[i] = v.x, to[i + 1] = v.y, to[i + 2] = v.z, i += 3; };
+  put(a.force);
+  const Sym3<double>& s = a.stiffness;
+  const double entries[] = {s.xx, s.xy, s.xz, s.yy, s.yz, s.zz, a.weight[0], a.weight[1]};
+  for (const double entry : entries) to[i++] = entry;
+  for (int side = 0; side < 2; ++side) put(a.at[side]), put(a.pull[side]), put(a.torque[side]);
+}
+DIFFVBD_FN PairPress load_press(const double* from, const int32_t* body) {
+  PairPress a;
+  int i = 0;
+  const auto get = [&] { return i += 3, Vector{from[i - 3], from[i - 2], from[i - 1]}; };
+  a.body[0] = body[0], a.body[1] = body[1];
+  a.force = get();
+  a.stiffness = {from[3], from[4], from[5], from[6], from[7], from[8]};
+  a.weight[0] = from[9], a.weight[1] = from[10];
+  i = 11;
+  for (int side = 0; side < 2; ++side) a.at[side] = get(), a.pull[side] = get(), a.torque[side] = get();
+  a.value = 0;
+  return a;
+}
+
+template <class T>
+DIFFVBD_FN void sides_of(const RigidInputs<T>& in, const int32_t* record, PairPress& out) {
+  out.body[0] = moving_body(in, record[0]);
+  out.body[1] = moving_body(in, record[sides(record[4])]);
+  for (int side = 0; side < 2; ++side) {
+    out.weight[side] = 0;
+    out.at[side] = out.pull[side] = out.torque[side] = Vector{};
+  }
+}
+
+// The barrier of a listed pair between bodies; false where it does not push, or moves with one body.
+template <class T, class At>
+DIFFVBD_FN bool barrier_press(const RigidInputs<T>& in, int64_t pair, const At& at, PairPress& out) {
+  const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
+  const T* constants = in.gate.constants + kConstants * pair;
+  const int64_t scene = record[5];
+  const int first = sides(record[4]);
+  const double listed = PairHints<T>(constants).gap, dhat = PairConstants<T>(constants).dhat;
+  if (listed == std::numeric_limits<double>::infinity()) return false;  // left out (contact/narrow.h)
+  if (in.gate.body[record[0]] == in.gate.body[record[first]]) return false;
+  sides_of(in, record, out);
+  if (out.body[0] < 0 && out.body[1] < 0) return false;
+  // a gap shrinks by no more than its corners have moved since it was taken
+  double moved[2] = {0, 0};
+  bool known = true;
+  Vector relative[4];
+  for (int k = 0; k < 4; ++k) {
+    relative[k] = at.relative(scene, record[k]);
+    known = known && record[k] < in.gate.vertices;
+    if (!known) continue;
+    const Vector d = relative[k] - rigid::Body<T>::at(in.gate.center + 3 * (scene * in.gate.vertices + record[k]));
+    double& most = moved[k < first ? 0 : 1];
+    most = most < dot(d, d) ? dot(d, d) : most;
+  }
+  if (known) {
+    const double room = (listed - dhat) * (1 - 1e-6);
+    if (0 < room && moved[0] < 0.25 * room * room && moved[1] < 0.25 * room * room) return false;
+  }
+  Corners<double> c;
+  Vector points[4];
+  for (int k = 0; k < 4; ++k) points[k] = at(scene, record[k]);
+  for (int k = 0; k < 4; ++k) c.x[k] = points[k] - points[0];
+  const PairConstants<T> a(constants);
+  const Distance<double> near = distance(record[4], c);
+  const double gap = near.d - a.offset, h = in.scene.time_step;
+  if (!(gap < dhat)) return false;
+  const LogBarrier<double> b(gap, dhat, h * h * in.kappa.data[scene * in.kappa.scene]);
+  double e = 1;
+  Mollifier<double> m{};
+  const bool mollified = is_mollified(record[4], c, a.threshold);
+  if (mollified) m = mollifier(c, a.threshold), e = m.e;
+  out.value = e * b.value;
+  out.force = (e * b.first) * near.n;
+  out.stiffness = Sym3<double>{};
+  add_outer(out.stiffness, e * b.second, near.n);
+  for (int k = 0; k < 4; ++k) {
+    const int side = k < first ? 0 : 1;
+    if (out.body[side] < 0) continue;
+    out.weight[side] += near.w[k];
+    out.at[side] += near.w[k] * relative[k];
+    if (!mollified) continue;
+    const Vector pull = b.value * m.gradient[k];
+    out.pull[side] += pull;
+    out.torque[side] += cross(relative[k], pull);
+  }
+  return true;
+}
+
+// f0 of smoothed friction, whose slope over |u| is FrictionRate.
+DIFFVBD_FN double slip_value(double length, double eps) {
+  return length < eps ? length * length * (1 / eps - length / (3 * eps * eps)) + eps / 3 : length;
+}
+
+// Lagged friction and damping of a pair; it acts along a gap, so that it turns a body even by itself.
+template <class T, class At>
+DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, PairPress& out) {
+  const int32_t* record = in.lagged.pairs + kPairRow * pair;
+  const Lag<T> lag(in.lag + kLagScalars * pair);
+  if (!lag.active()) return false;
+  const int64_t scene = record[5];
+  const int first = sides(record[4]);
+  sides_of(in, record, out);
+  if (out.body[0] < 0 && out.body[1] < 0) return false;
+  const bool within = out.body[0] == out.body[1];
+  if (within) out.body[1] = -1;
+  Vector m{};
+  for (int k = 0; k < 4; ++k) {
+    const int32_t v = record[k];
+    const Vector x = at.relative(scene, v);
+    const T* before =
+        v < in.gate.vertices
+            ? in.scene.x_prev.data + scene * in.scene.x_prev.scene + 3 * int64_t{v}
+            : in.collider_prev + 3 * (scene * (in.gate.corners - in.gate.vertices) + v - in.gate.vertices);
+    m += double(lag.w[k]) * (x - rigid::Body<T>::at(before));
+    const int side = within || k < first ? 0 : 1;
+    if (out.body[side] < 0) continue;
+    out.weight[side] += lag.w[k];
+    out.at[side] += double(lag.w[k]) * x;
+  }
+  const Vector n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
+  const double h = in.scene.time_step, along = dot(n, m), c = h * double(lag.damping),
+               size = h * h * double(lag.friction);
+  const Vector u = m - along * n;
+  const double length = square_root(dot(u, u)), approach = along < 0 ? along : 0;
+  const FrictionRate<double> f(length, in.friction_eps);
+  out.value = size * slip_value(length, in.friction_eps) + 0.5 * c * approach * approach;
+  out.force = (size * f.value) * u + (c * approach) * n;
+  out.stiffness = diagonal(size * f.value);
+  add_outer(out.stiffness, c - size * f.value, n);
+  return true;
+}
+
+// Gradient and block of what acts on a vertex alone, at where it is.
+template <class T>
+DIFFVBD_FN void vertex_press(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, Vector& g, Sym3<double>& H) {
+  const double mass = b.mass(v), h = in.scene.time_step;
+  const Vector x = b.position(v);
+  const VertexState<double> s = b.state(v, x);
+  g = mass * (x - b.target(v));
+  H = diagonal(mass);
+  b.energies(v,
+             [&](auto energy, int, const double* data, int count) { decltype(energy)::block(s, data, count, g, H); });
+  for (int k = 0; k < in.planes; ++k) {
+    const T* lag = in.floor_lag.data + b.scene * in.floor_lag.scene + (int64_t{v} * in.planes + k) * 4;
+    const Vector n = rigid::Body<T>::at(lag + 1), travel = x - s.x_prev, u = travel - dot(n, travel) * n;
+    const double size = h * h * double(lag[0]) * FrictionRate<double>(square_root(dot(u, u)), in.friction_eps).value;
+    g += size * u;
+    add_diagonal(H, size);
+    add_outer(H, -size, n);
+  }
+}
+
+// The potential of a vertex where it is, or would go.
+template <class T>
+DIFFVBD_FN double vertex_value(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, bool moved) {
+  const Vector x = CornerPoints<T>{in, moved}.relative(b.scene, v), off = x - b.target(v);
+  const VertexState<double> s = b.state(v, x);
+  const double h = in.scene.time_step;
+  double value = 0.5 * b.mass(v) * dot(off, off);
+  b.energies(
+      v, [&](auto energy, int, const double* data, int count) { value += decltype(energy)::value(s, data, count); });
+  for (int k = 0; k < in.planes; ++k) {
+    const T* lag = in.floor_lag.data + b.scene * in.floor_lag.scene + (int64_t{v} * in.planes + k) * 4;
+    const Vector n = rigid::Body<T>::at(lag + 1), travel = x - s.x_prev, u = travel - dot(n, travel) * n;
+    value += h * h * double(lag[0]) * slip_value(square_root(dot(u, u)), in.friction_eps);
+  }
+  return value;
+}
+
+// Whether the energies of a vertex admit what it tries.
+template <class T>
+DIFFVBD_FN bool admitted(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v) {
+  const VertexState<double> s = b.state(v, CornerPoints<T>{in, true}.relative(b.scene, v));
+  bool out = true;
+  b.energies(v, [&](auto energy, int, const double* data, int count) {
+    using E = decltype(energy);
+    if constexpr (E::has_filter) out = out && E::template admits<T>(s, b.position(v), data, count, rigid::kLeastShare);
+  });
+  return out;
+}
+
+// How far a turn and a shift take a point at r from the center.
+DIFFVBD_FN Vector displaced(const double* motion, double share, const Vector& r) {
+  const Vector w = share * Vector{motion[0], motion[1], motion[2]}, turned = cross(w, r);
+  const rigid::Angles s(w);
+  return s.a * turned + s.b * cross(w, turned) + share * Vector{motion[3], motion[4], motion[5]};
+}
+
+// A part of the matrix of all bodies of a scene, 6 x 6 at (row, column).
+struct MatrixPart {
+  double* at;
+  int64_t stride;
+  DIFFVBD_FN MatrixPart(double* matrix, int32_t bodies, bool together, int32_t row, int32_t column)
+      : at(together ? matrix + kUnknowns * (int64_t{kUnknowns} * bodies * row + column) : matrix + 36 * int64_t{row}),
+        stride(together ? kUnknowns * int64_t{bodies} : kUnknowns) {}
+  DIFFVBD_FN double& operator()(int i, int j) const { return at[i * stride + j]; }
+};
+
+// Where sides are not solved for together, each bears what both would: then no step is too long.
+DIFFVBD_FN double borne(const PairPress& a, bool together) {
+  return !together && a.body[0] >= 0 && a.body[1] >= 0 ? 2 : 1;
+}
+
+// Whether a scene may go as it tries: all fit, and its potential does not rise.
+DIFFVBD_FN bool is_safe(double before, double after, bool fits) {
+  return fits && after <= before + kRise * absolute(before);
+}
+// The factor of what a body tries next, before it is handed on.
+DIFFVBD_FN double shortened(bool blocked, bool fits, int attempt) {
+  if (fits) return 0.5;  // the potential rises: all go half as far
+  return !blocked ? 1.0 : attempt == 0 ? 0.5 : 0.0;
+}
+
+}  // namespace diffvbd::contact

@@ -1,0 +1,19 @@
+// The rigid correction of bodies that touch (contact/rigid.h), on the CPU.
+#pragma once
+
+#include "../contact/rigid.h"
+
+namespace diffvbd {
+
+// The Newton system of each scene: center of mass [B, bodies, 3], gradient [B, bodies, 6] and matrix
+// [B, RigidInputs::matrix_size()] over a turn and a shift of each body.
+template <class T>
+void rigid_system(const contact::RigidInputs<T>& in, double* center, double* gradient, double* matrix);
+
+// The share of its motion [B, bodies, 6] that each body takes [B, bodies], so that nothing crosses and the potential
+// of no scene rises; and where that leads, x [B, V, 3]. move [B, V, 3] is that of `in`, to be written.
+template <class T>
+void rigid_move(const contact::RigidInputs<T>& in, const double* center, const double* motion, T* move, double* share,
+                T* x);
+
+}  // namespace diffvbd

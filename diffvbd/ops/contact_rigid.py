@@ -1,0 +1,48 @@
+"""The compiled operators of the rigid correction of bodies that touch, as in sweep.py."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from .fields import TouchingFields
+from .functions import raw_backward, shapes_of
+from .load import raw
+
+UNKNOWNS = 6  # of a body: a turn and a shift
+MOST_COUPLED = 64  # bodies that are solved for together; twin of kMostCoupled in csrc/contact/rigid.h
+_FIELDS = len(TouchingFields._fields)
+
+
+def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float
+                 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """The Newton system over a turn and a shift of each body, float64: centers of mass [B, bodies, 3] [m], gradient
+    [B, bodies, 6], and matrix [B, 6 bodies, 6 bodies], or [B, bodies, 6, 6] of more than MOST_COUPLED bodies."""
+    return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps)
+
+
+def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_count: Sequence[int], time_step: float,
+               friction_eps: float) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """The state after each body has taken what it may of its motion [B, bodies, 6], [B, V, 3], and that share,
+    float64 [B, bodies]."""
+    return raw.contact_rigid_move(*fields, centers, motion, data_count, time_step, friction_eps)
+
+
+@shapes_of("contact_rigid_system")
+def _(*arguments):
+    f = TouchingFields(*arguments[:_FIELDS])
+    b, n = f.x.shape[0], f.free.shape[0]
+    shape = (b, UNKNOWNS * n, UNKNOWNS * n) if n <= MOST_COUPLED else (b, n, UNKNOWNS, UNKNOWNS)
+    return tuple(f.x.new_empty(size, dtype=torch.float64) for size in ((b, n, 3), (b, n, UNKNOWNS), shape))
+
+
+@shapes_of("contact_rigid_move")
+def _(*arguments):
+    f = TouchingFields(*arguments[:_FIELDS])
+    return torch.empty_like(f.x), f.x.new_empty((f.x.shape[0], f.free.shape[0]), dtype=torch.float64)
+
+
+for _name in ("contact_rigid_system", "contact_rigid_move"):
+    torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)
