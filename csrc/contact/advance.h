@@ -137,6 +137,14 @@ DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, i
     return record[k] < in.vertices && s.stamp[in.unit(int64_t{record[5]} * in.vertices + record[k])] == round;
   };
   if (round > 0 && !(retried(0) || retried(1) || retried(2) || retried(3))) return true;
+  if (!s.first && round == 0) {  // what the moves before have taken all the way does not move again
+    bool open = false;
+    for (int k = 0; k < 4; ++k) {
+      open = open || (record[k] < in.vertices && !in.held[record[k]] &&
+                      s.share[in.unit(int64_t{record[5]} * in.vertices + record[k])] < T(1));
+    }
+    if (!open) return true;
+  }
   const T* constants = in.constants + kConstants * pair;
   if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (contact/narrow.h)
   const Attempt<T> a = attempt(in, s, record);

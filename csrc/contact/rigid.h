@@ -15,7 +15,7 @@ constexpr int kMostCoupled = 64;  // bodies of a scene that are solved for toget
 constexpr int kTries = 5;         // of motions, each half as long for some bodies, or none for them
 constexpr int kSpreads = 4;       // how often a shorter motion is handed on to the bodies that one touches
 constexpr double kRise = 1e-9;    // of the potential, that counts as none
-constexpr double kLeastMass = 1e-12;  // of a body's mass, that keeps its system definite
+constexpr double kLeastMass = 1e-11;  // of a body's mass, that keeps its system definite
 constexpr int kUnknowns = 6;          // of a body: a turn and a shift
 
 template <class T>
@@ -46,6 +46,13 @@ template <class T>
 DIFFVBD_FN int32_t moving_body(const RigidInputs<T>& in, int32_t corner) {
   const int32_t body = in.gate.body[corner];
   return body < in.bodies() && in.free[body] ? body : -1;
+}
+
+// Whether a listed pair has a say in rigid motions: a body's own keep their distance.
+template <class T>
+DIFFVBD_FN bool is_between(const RigidInputs<T>& in, int64_t pair) {
+  const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
+  return in.gate.body[record[0]] != in.gate.body[record[sides(record[4])]];
 }
 
 // Where corner points are: of the mesh at x, or where they would go.
@@ -137,8 +144,7 @@ DIFFVBD_FN bool barrier_press(const RigidInputs<T>& in, int64_t pair, const At& 
   const int64_t scene = record[5];
   const int first = sides(record[4]);
   const double listed = PairHints<T>(constants).gap, dhat = PairConstants<T>(constants).dhat;
-  if (listed == std::numeric_limits<double>::infinity()) return false;  // left out (contact/narrow.h)
-  if (in.gate.body[record[0]] == in.gate.body[record[first]]) return false;
+  if (listed == std::numeric_limits<double>::infinity() || !is_between(in, pair)) return false;  // contact/narrow.h
   sides_of(in, record, out);
   if (out.body[0] < 0 && out.body[1] < 0) return false;
   // a gap shrinks by no more than its corners have moved since it was taken

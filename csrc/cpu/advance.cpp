@@ -40,6 +40,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
   for (int move = 0; move < kMoves; ++move) {
     s.first = move == 0;
     std::fill(failed.begin(), failed.end(), 0);
+    bool clean = false;  // everything passes as it goes
     for (int64_t i = 0; i < units; ++i) begin_move(s, i);
     for (int round = 0; round < kRounds; ++round) {
       const bool last = round + 1 == kRounds;
@@ -52,11 +53,12 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
       });
       const int64_t left =
           count(rows, kGrain, [&](int64_t i) { return fails(i / in.vertices, stay(in, s, i, last ? 0 : round)); });
-      if (found + left == 0 || last) break;
+      clean = found + left == 0;
+      if (clean || last) break;
       if (count(units, kGrain, [&](int64_t i) { return retreat(s, i, round); }) == 0) break;
     }
     for (int64_t i = 0; i < units; ++i) give_up(in, s, i);
-    if (s.first) stuck = count(pairs, kPairGrain, [&](int64_t pair) { return !try_pair(in, s, pair, 0); });
+    if (s.first && !clean) stuck = count(pairs, kPairGrain, [&](int64_t pair) { return !try_pair(in, s, pair, 0); });
     bool open = false;
     for (int64_t i = 0; i < units; ++i) {
       end_move(s, i);

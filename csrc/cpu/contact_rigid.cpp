@@ -143,7 +143,12 @@ class Tries {
       if (is_safe(before_, after, fits)) return;
       for (int32_t k = 0; k < n; ++k) low_[k] = shortened(blocked_[k], fits, attempt);
       for (int spread = 0; spread < kSpreads; ++spread) {
-        for (const auto& [a, b] : touching_) low_[a] = low_[b] = std::min(low_[a], low_[b]);
+        std::vector<double> next = low_;  // from one to the next only, whatever their order
+        for (const auto& [a, b] : touching_) {
+          const double both = std::min(low_[a], low_[b]);
+          next[a] = std::min(next[a], both), next[b] = std::min(next[b], both);
+        }
+        low_ = next;
       }
       for (int32_t k = 0; k < n; ++k) share_[k] *= low_[k];
     }
@@ -166,7 +171,9 @@ class Tries {
   bool test(const AdvanceState<T>& state) {
     uint8_t* blocked = state.blocked + scene_ * in_.bodies();
     std::fill_n(blocked, in_.bodies(), uint8_t{0});
-    for (int64_t i = in_.first_listed(scene_); i < in_.first_listed(scene_ + 1); ++i) try_pair(in_.gate, state, i, 0);
+    for (int64_t i = in_.first_listed(scene_); i < in_.first_listed(scene_ + 1); ++i) {
+      if (is_between(in_, i)) try_pair(in_.gate, state, i, 0);
+    }
     for (int32_t k = 0; k < in_.bodies(); ++k) {
       const Body<T> body{in_.scene, scene_, k};
       for (int32_t i = 0; in_.free[k] && i < body.size(); ++i) {

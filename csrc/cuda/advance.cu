@@ -44,6 +44,7 @@ __global__ void __launch_bounds__(kThreads)
     each(in.scenes, [&](int64_t i) { s.failed[i] = 0; });
     each(units, [&](int64_t i) { begin_move(s, i); });
     grid.sync();
+    bool clean = false;  // everything passes as it goes
     for (int round = 0; round < kRounds; ++round) {
       const bool last = round + 1 == kRounds;
       bool found = false, less = false;
@@ -53,12 +54,13 @@ __global__ void __launch_bounds__(kThreads)
       };
       each(pairs, [&](int64_t i) { note(in.listed.pairs[kPairRow * i + 5], passes(in, s, i, last ? 0 : round)); });
       each(rows, [&](int64_t i) { note(i / in.vertices, stay(in, s, i, last ? 0 : round)); });
-      if (!any(found) || last) break;
+      clean = !any(found);
+      if (clean || last) break;
       each(units, [&](int64_t i) { less = retreat(s, i, round) || less; });
       if (!any(less)) break;
     }
     each(units, [&](int64_t i) { give_up(in, s, i); });
-    if (s.first) {
+    if (s.first && !clean) {
       grid.sync();
       each(pairs, [&](int64_t pair) {
         if (!passes(in, s, pair, 0)) atomicAdd(stuck, 1ULL);

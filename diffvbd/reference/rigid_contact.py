@@ -9,7 +9,7 @@ from .distance import EDGE_EDGE
 from .energies import StableNeoHookean
 from .scene import Scene
 
-LEAST_STIFFNESS = 1e-12  # of its mass, that keeps the system of a body definite
+LEAST_STIFFNESS = 1e-11  # of its mass, that keeps the system of a body definite
 
 
 class Correction:

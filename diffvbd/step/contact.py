@@ -174,19 +174,6 @@ class ContactStep:
         rows = (constants[:, -1] < torch.inf).nonzero()[:, 0]
         return some_of(near, rows, self._points), rows
 
-    def _between(self, listed: Pairs) -> Pairs:
-        """The pairs between bodies, which alone have a say in rigid motions; all, the others with infinite gaps, where
-        that would have to be read."""
-        surface = self.surface
-        assert surface is not None
-        corners = listed.pairs[:, :4].long()
-        second = torch.where(listed.pairs[:, 4] == 1, corners[:, 2], corners[:, 1])
-        apart = surface.body[corners[:, 0]] != surface.body[second]
-        if self._reads(self.x_prev):
-            return some_of(listed, apart.nonzero()[:, 0], self._points)
-        gap = torch.where(apart, listed.constants[:, -1], torch.inf)
-        return listed._replace(constants=torch.cat([listed.constants[:, :-1], gap[:, None]], 1))
-
     def run(self, policy: int, debug_step: int) -> Tensor:
         """Positions after all parts [B, V, 3]; raises where detection did not hold."""
         settings = self.prepared.settings
@@ -220,8 +207,8 @@ class ContactStep:
             met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
             if self._reads(x):
                 self._check(r, met.counts[r].tolist(), met)
-            begin, between = x, self._between(detection.listed)
-            x, first = self._corrected(start.x, now, start, between)
+            begin = x
+            x, first = self._corrected(start.x, now, start, detection.listed)
             if start.own:
                 start = start._replace(own=(start.own[0] + (x - start.x).detach(), start.own[1]))
             room = rooms_of_sweeps(motion, barrier, start, x, begin, wanted, rigid)
@@ -231,7 +218,7 @@ class ContactStep:
             if sweeps:
                 part = settings._replace(sweeps=sweeps)
                 x, limits = self._sweep(x, start.center, start.room, now, near, part, policy, debug_step)
-                x, last = self._corrected(x, now, start, self._between(near))
+                x, last = self._corrected(x, now, start, near)
                 taken.append(last)
                 cut = limits[:, -1] > 0  # what the start has held up, sweeps may have made good
             met.cut = cut

@@ -25,7 +25,7 @@ from ..ops import broadcast, no_second_derivative, no_transforms, of_inputs
 from ..ops import contact_rigid as ops_rigid
 from .rigid_terms import Scenes, corners_of, pair_terms, vertex_blocks, vertex_gradient
 
-LEAST_MASS = 1e-12  # of a body's mass, that keeps its system definite; twin of kLeastMass in csrc/contact/rigid.h
+LEAST_MASS = 1e-11  # of a body's mass, that keeps its system definite; twin of kLeastMass in csrc/contact/rigid.h
 _FIELDS = len(ops.TouchingFields._fields)
 
 

@@ -107,16 +107,19 @@ def corners_of(listed: Pairs) -> tuple[Tensor, Tensor]:
     return rows[:, 5:], rows[:, :4]
 
 
-def _listed(s: Scenes) -> Pairs:
-    """The pairs that push: few of those that are listed, and the others add nothing. All of them where values must not
-    decide sizes."""
+def _listed(s: Scenes) -> tuple[Pairs, Tensor]:
+    """The pairs that push bodies apart, and which of them do: few of those that are listed. All of them where values
+    must not decide sizes."""
     f = s.fields
     listed = Pairs(f.pairs, f.constants, f.pair_ptr, f.pair_entry)
-    if not f.pairs.shape[0] or f.x.is_cuda or torch.compiler.is_compiling():
-        return listed
+    corners, kind = corners_of(listed)[1], f.pairs[:, 4]
+    apart = f.body[corners[:, 0]] != f.body[torch.where(kind == 1, corners[:, 2], corners[:, 1])]
+    if f.x.is_cuda or torch.compiler.is_compiling():
+        return listed, apart
     with torch.no_grad():
         acts = pair_lag(f.x.detach(), f.collider.detach(), f.kappa.detach(), f.origin, listed)[:, 1] > 0
-    return some_of(listed, acts.nonzero()[:, 0], f.x.shape[1] + f.collider.shape[1])
+    rows = (acts & apart).nonzero()[:, 0]
+    return some_of(listed, rows, f.x.shape[1] + f.collider.shape[1]), apart[rows]
 
 
 def pair_terms(s: Scenes) -> list[PairTerms]:
@@ -125,14 +128,14 @@ def pair_terms(s: Scenes) -> list[PairTerms]:
     points = torch.cat([f.x, f.collider], 1)
     out = []
     if f.pairs.shape[0]:
-        listed = _listed(s)
+        listed, apart = _listed(s)
         force, active, n, w = pair_lag(f.x, f.collider, f.kappa, f.origin, listed).split((1, 1, 3, 4), -1)
         scene, corners = corners_of(listed)
         at = points[scene, corners]
         if f.origin.numel():
             at = at + torch.cat([f.origin, torch.zeros_like(f.collider)], 1)[scene, corners]
         dhat, offset = listed.constants[:, 0], listed.constants[:, 1]
-        near = active[:, 0] > 0
+        near = (active[:, 0] > 0) & apart
         height = ((at - at[:, :1].detach()) * n[:, None]).sum(-1)
         gap = torch.where(near, (w * height).sum(-1) - offset, 0.5)
         b, slope, curvature = _log_barrier(gap, torch.where(near, dhat, 1.0))
@@ -141,7 +144,7 @@ def pair_terms(s: Scenes) -> list[PairTerms]:
         kappa = f.kappa if f.kappa.shape[0] == 1 else of_scene(f.kappa, listed)
         turned = torch.where(near, h2 * kappa * b, 0.0)[:, None, None] * _mollifier_gradient(at, listed)
         stiffness = (load * curvature)[:, None, None] * outer(n)
-        out.append(PairTerms(listed, -h2 * force * n, stiffness, w, turned))
+        out.append(PairTerms(listed, torch.where(near[:, None], -h2 * force * n, 0.0), stiffness, w, turned))
     if f.lag.numel():
         load, rate, n, w = f.lag.split((1, 1, 3, 4), -1)
         lagged = Pairs(f.lag_pairs, f.constants, f.lag_ptr, f.lag_entry)

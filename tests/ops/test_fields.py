@@ -58,5 +58,15 @@ def test_there_are_four_sweep_operators() -> None:
                                               ("begin", ops.BeginFields)])  # fmt: skip
 @pytest.mark.parametrize("end", ("", "_backward"))
 def test_schemas_begin_with_the_fields(name: str, fields: type, end: str) -> None:
-    arguments = [a.name for a in getattr(torch.ops.diffvbd, name + end).default._schema.arguments]
-    assert tuple(arguments[: len(fields._fields)]) == fields._fields
+    assert begins_with(name + end, fields)
+
+
+@pytest.mark.parametrize("name", ["contact_rigid_system", "contact_rigid_move"])
+def test_schemas_of_the_rigid_contact_begin_with_the_fields(name: str) -> None:
+    assert begins_with(name, ops.TouchingFields)
+    assert set(ops.TOUCHING_ADJOINTS) < set(ops.TouchingFields._fields)
+
+
+def begins_with(name: str, fields: type) -> bool:
+    arguments = [a.name for a in getattr(torch.ops.diffvbd, name).default._schema.arguments]
+    return tuple(arguments[: len(fields._fields)]) == fields._fields

@@ -27,6 +27,8 @@ from diffvbd import ops
 from diffvbd.contact.detection import detect
 from diffvbd.model.rest import shape_gradients
 from diffvbd.step.coarse import coarse_parts
+from diffvbd.step.contact import no_pairs
+from diffvbd.step.rigid_contact import bodies_of
 from diffvbd.testing import relative_error, tolerance
 
 # --- torch.compile ----------------------------------------------------------------------------------------------------
@@ -242,7 +244,15 @@ def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     advance = (x, move, u, x, none, points, points, held, body, own_room, x, own_room, *listed, True, False)
     share, _ = torch.ops.diffvbd.contact_advance(*advance)
     assert 0 < share[0, 8:].min() < 1 and (share[0, :8] == 1).all()
+    mass, data = model.mass[None], model._energy_data
+    own = (x, x, x + move, mass, data, none, *bodies_of(model), points, points, x.new_ones((1,)), *listed)
+    touching = (*own, none, *no_pairs(x, 0)[:1], *no_pairs(x, 0)[2:], none, x, own_room)
+    numbers = (model._data_count, 0.01, 1e-3)
+    centers, gradient, matrix = torch.ops.diffvbd.contact_rigid_system(*touching, *numbers)
+    assert gradient.abs().max() > 0 and (matrix == matrix.mT).all()
     return {
+        "contact_rigid_system": (*touching, *numbers),
+        "contact_rigid_move": (*touching, centers, 1e-4 * torch.ones_like(gradient), *numbers),
         "contact_start": start,
         "contact_start_backward": (move, *start, True),
         "contact_advance": advance,

@@ -1,0 +1,70 @@
+// CUDA implementations of the rigid correction of bodies that touch.
+#include "../contact_rigid.h"
+
+#include <torch/csrc/stable/accelerator.h>
+#include <torch/csrc/stable/library.h>
+
+#include <tuple>
+#include <vector>
+
+#include "../../cuda/contact_rigid.h"
+#include "binding.h"
+
+namespace {
+
+namespace contact = diffvbd::contact;
+namespace cuda = diffvbd::cuda;
+using cuda::check, cuda::current_stream, cuda::empty;
+using diffvbd::data, diffvbd::dispatch_float, diffvbd::TouchingFields;
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+using torch::stable::accelerator::DeviceGuard;
+
+cuda::PairRoom room_of(const TouchingFields& f) {
+  return {f.pairs.size(0), f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0};
+}
+
+std::tuple<Tensor, Tensor, Tensor> contact_rigid_system(DIFFVBD_PARAMETERS(TOUCHING) std::vector<int64_t> data_count,
+                                                        double time_step, double friction_eps) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    const int64_t b = in.scene.scenes, n = in.bodies();
+    const auto doubles = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes, ScalarType::Double); };
+    Tensor centers = doubles({b, n, 3}), gradient = doubles({b, n, contact::kUnknowns});
+    Tensor matrix = doubles(diffvbd::matrix_shape(in));
+    const Tensor work = empty(x, {cuda::rigid_system_bytes(in, room_of(f))}, ScalarType::Byte);
+    check(cuda::rigid_system<T>(in, room_of(f), data<double>(centers), data<double>(gradient), data<double>(matrix),
+                                work.data_ptr(), current_stream(x)),
+          "the rigid correction of bodies that touch");
+    return std::make_tuple(centers, gradient, matrix);
+  });
+}
+
+std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& centers, const Tensor& motion,
+                                              std::vector<int64_t> data_count, double time_step, double friction_eps) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const Tensor way = empty(x, {x.size(0), x.size(1), 3});
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, way);
+    diffvbd::require_motion(in, centers, motion, x);
+    Tensor out = empty(x, {in.scene.scenes, in.scene.vertices, 3});
+    Tensor share = empty(x, {in.scene.scenes, in.bodies()}, ScalarType::Double);
+    const Tensor work = empty(x, {cuda::rigid_move_bytes(in, room_of(f))}, ScalarType::Byte);
+    check(cuda::rigid_move<T>(in, room_of(f), data<const double>(centers), data<const double>(motion), data<T>(way),
+                              data<double>(share), data<T>(out), work.data_ptr(), current_stream(x)),
+          "the rigid correction of bodies that touch");
+    return std::make_tuple(out, share);
+  });
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
+  m.impl("contact_rigid_system", TORCH_BOX(&contact_rigid_system));
+  m.impl("contact_rigid_move", TORCH_BOX(&contact_rigid_move));
+}

@@ -1,0 +1,30 @@
+// The rigid correction of bodies that touch (contact/rigid.h), on the device.
+#pragma once
+
+#include <cuda_runtime_api.h>
+
+#include "../contact/rigid.h"
+
+namespace diffvbd::cuda {
+
+// Rows that the lists of a correction have room for.
+struct PairRoom {
+  int64_t listed, lagged;
+  int64_t rows() const { return listed + lagged; }
+};
+
+// Bytes that each works in.
+template <class T>
+int64_t rigid_system_bytes(const contact::RigidInputs<T>& in, const PairRoom& room);
+template <class T>
+int64_t rigid_move_bytes(const contact::RigidInputs<T>& in, const PairRoom& room);
+
+// As cpu/contact_rigid.h.
+template <class T>
+cudaError_t rigid_system(const contact::RigidInputs<T>& in, const PairRoom& room, double* center, double* gradient,
+                         double* matrix, void* workspace, cudaStream_t stream);
+template <class T>
+cudaError_t rigid_move(const contact::RigidInputs<T>& in, const PairRoom& room, const double* center,
+                       const double* motion, T* move, double* share, T* x, void* workspace, cudaStream_t stream);
+
+}  // namespace diffvbd::cuda
