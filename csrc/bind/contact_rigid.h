@@ -13,6 +13,7 @@ namespace diffvbd {
 template <class T>
 contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const std::vector<int64_t>& data_count,
                                         double time_step, double friction_eps, const Tensor& move) {
+  require_positions(t.x);
   contact::RigidInputs<T> in{};
   const int64_t b = t.x.size(0), v = t.x.size(1), colliders = t.collider.dim() == 3 ? t.collider.size(1) : 0;
   const int64_t bodies = t.ptr.numel() - 1, corners = v + colliders;

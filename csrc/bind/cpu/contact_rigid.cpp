@@ -37,6 +37,7 @@ std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
+    diffvbd::require_positions(x);
     const Tensor way = empty(x, {x.size(0), x.size(1), 3});
     const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, way);
     diffvbd::require_motion(in, centers, motion, x);
