@@ -71,4 +71,16 @@ void require_motion(const contact::RigidInputs<T>& in, const Tensor& centers, co
           "diffvbd::contact_rigid_move: expected float64 centers [scenes, bodies, 3] and motion [scenes, bodies, 6]");
 }
 
+// Of contact_rigid_solve: the number of systems, and their size.
+struct RigidSystems {
+  int64_t count, size;
+};
+inline RigidSystems systems_of(const Tensor& factor, const Tensor& right) {
+  const int64_t size = factor.dim() > 2 ? factor.size(factor.dim() - 1) : 0;
+  require(size > 0 && factor.is_contiguous() && factor.scalar_type() == ScalarType::Double &&
+              factor.size(factor.dim() - 2) == size && is_like(right, factor) && right.numel() * size == factor.numel(),
+          "diffvbd::contact_rigid_solve: expected float64 factor [..., n, n] and right of n scalars for each");
+  return {factor.numel() / (size * size), size};
+}
+
 }  // namespace diffvbd

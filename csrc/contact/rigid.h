@@ -37,6 +37,9 @@ struct RigidInputs {
     const int64_t n = scene.bodies;
     return (together() ? n * n : n) * kUnknowns * kUnknowns;
   }
+  // and of each that is solved by itself
+  DIFFVBD_FN int64_t system_size() const { return together() ? int64_t{kUnknowns} * scene.bodies : kUnknowns; }
+  DIFFVBD_FN int64_t systems() const { return together() ? scene.scenes : scene.scenes * scene.bodies; }
   DIFFVBD_FN int64_t first_listed(int64_t s) const { return gate.listed.ptr[s * gate.corners] / 4; }
   DIFFVBD_FN int64_t first_lagged(int64_t s) const { return lag ? lagged.ptr[s * gate.corners] / 4 : 0; }
 };
@@ -291,6 +294,14 @@ DIFFVBD_FN Vector displaced(const double* motion, double share, const Vector& r)
   const Vector w = share * Vector{motion[0], motion[1], motion[2]}, turned = cross(w, r);
   const rigid::Angles s(w);
   return s.a * turned + s.b * cross(w, turned) + share * Vector{motion[3], motion[4], motion[5]};
+}
+
+// The Newton step of a body, where `solution` is of its gradient; none where a matrix was not positive definite.
+DIFFVBD_FN void keep_finite(double* solution) {
+  bool finite = true;
+  for (int i = 0; i < kUnknowns; ++i)
+    finite = finite && absolute(solution[i]) < std::numeric_limits<double>::infinity();
+  for (int i = 0; i < kUnknowns; ++i) solution[i] = finite ? -solution[i] : 0.0;
 }
 
 // A part of the matrix of all bodies of a scene, 6 x 6 at (row, column).

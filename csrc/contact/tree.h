@@ -113,9 +113,9 @@ DIFFVBD_FN uint64_t morton_code(const Box& a, const Box& bounds, int axis_bits) 
   return spread_bits(x) << 2 | spread_bits(y) << 1 | spread_bits(z);
 }
 
-// Power of two that holds n leaves.
+// Power of two that holds n leaves; at least two, so that the root, where a traversal ends, is none of them.
 inline int32_t padded_leaves(int64_t n) {
-  int32_t leaves = 1;
+  int32_t leaves = 2;
   while (leaves < n) leaves *= 2;
   return leaves;
 }

@@ -3,6 +3,7 @@
 #include <torch/csrc/stable/ops.h>
 
 #include <algorithm>
+#include <cmath>
 #include <utility>
 #include <vector>
 
@@ -197,15 +198,51 @@ class Tries {
 
 }  // namespace
 
+void cholesky(int64_t count, int64_t size, double* matrices) {
+  torch::stable::parallel_for(0, count, 1, [&](int64_t begin, int64_t end) {
+    std::vector<int64_t> first(size);  // of each row, before which it is zero: bodies touch few others
+    for (int64_t n = begin; n < end; ++n) {
+      double* a = matrices + size * size * n;
+      for (int64_t i = 0; i < size; ++i) {
+        first[i] = 0;
+        while (first[i] < i && a[size * i + first[i]] == 0) ++first[i];
+        for (int64_t j = first[i]; j <= i; ++j) {
+          double sum = a[size * i + j];
+          for (int64_t k = std::max(first[i], first[j]); k < j; ++k) sum -= a[size * i + k] * a[size * j + k];
+          a[size * i + j] = i == j ? std::sqrt(sum) : sum / a[size * j + j];
+        }
+      }
+    }
+  });
+}
+
+void cholesky_solve(int64_t count, int64_t size, const double* factors, double* x) {
+  for (int64_t n = 0; n < count; ++n) {
+    const double* a = factors + size * size * n;
+    double* b = x + size * n;
+    for (int64_t i = 0; i < size; ++i) {
+      for (int64_t k = 0; k < i; ++k) b[i] -= a[size * i + k] * b[k];
+      b[i] /= a[size * i + i];
+    }
+    for (int64_t i = size - 1; i >= 0; --i) {
+      b[i] /= a[size * i + i];
+      for (int64_t k = 0; k < i; ++k) b[k] -= a[size * i + k] * b[i];
+    }
+  }
+}
+
 template <class T>
-void rigid_system(const RigidInputs<T>& in, double* center, double* gradient, double* matrix) {
+void rigid_system(const RigidInputs<T>& in, double* center, double* motion, double* factor) {
   const int64_t n = in.bodies(), size = in.matrix_size();
   torch::stable::parallel_for(0, in.scene.scenes, 1, [&](int64_t begin, int64_t end) {
     for (int64_t s = begin; s < end; ++s) {
-      std::fill_n(matrix + size * s, size, 0.0);
-      system_of_scene(in, s, center + 3 * n * s, gradient + kUnknowns * n * s, matrix + size * s);
+      std::fill_n(factor + size * s, size, 0.0);
+      system_of_scene(in, s, center + 3 * n * s, motion + kUnknowns * n * s, factor + size * s);
     }
   });
+  cholesky(in.systems(), in.system_size(), factor);
+  cholesky_solve(in.systems(), in.system_size(), factor, motion);
+  for (int64_t row = 0; row < in.scene.scenes * n; ++row) keep_finite(motion + kUnknowns * row);
 }
 
 template <class T>

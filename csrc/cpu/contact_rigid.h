@@ -5,15 +5,20 @@
 
 namespace diffvbd {
 
-// The Newton system of each scene: center of mass [B, bodies, 3], gradient [B, bodies, 6] and matrix
-// [B, RigidInputs::matrix_size()] over a turn and a shift of each body.
+// The Newton system of each scene, its factor and its solution: center of mass [B, bodies, 3], motion
+// [B, bodies, 6] and factor [B, RigidInputs::matrix_size()] over a turn and a shift of each body.
 template <class T>
-void rigid_system(const contact::RigidInputs<T>& in, double* center, double* gradient, double* matrix);
+void rigid_system(const contact::RigidInputs<T>& in, double* center, double* motion, double* factor);
 
 // The share of its motion [B, bodies, 6] that each body takes [B, bodies], so that nothing crosses and the potential
 // of no scene rises; and where that leads, x [B, V, 3]. move [B, V, 3] is that of `in`, to be written.
 template <class T>
 void rigid_move(const contact::RigidInputs<T>& in, const double* center, const double* motion, T* move, double* share,
                 T* x);
+
+// Cholesky factors of `count` matrices [size, size], in their lower triangles; what is no number says that one is not
+// positive definite. And x [size] = factor^-T factor^-1 x of each.
+void cholesky(int64_t count, int64_t size, double* matrices);
+void cholesky_solve(int64_t count, int64_t size, const double* factors, double* x);
 
 }  // namespace diffvbd

@@ -21,10 +21,13 @@ int64_t rigid_move_bytes(const contact::RigidInputs<T>& in, const PairRoom& room
 
 // As cpu/contact_rigid.h.
 template <class T>
-cudaError_t rigid_system(const contact::RigidInputs<T>& in, const PairRoom& room, double* center, double* gradient,
-                         double* matrix, void* workspace, cudaStream_t stream);
+cudaError_t rigid_system(const contact::RigidInputs<T>& in, const PairRoom& room, double* center, double* motion,
+                         double* factor, void* workspace, cudaStream_t stream);
 template <class T>
 cudaError_t rigid_move(const contact::RigidInputs<T>& in, const PairRoom& room, const double* center,
                        const double* motion, T* move, double* share, T* x, void* workspace, cudaStream_t stream);
+
+cudaError_t cholesky(int64_t count, int64_t size, double* matrices, cudaStream_t stream);
+cudaError_t cholesky_solve(int64_t count, int64_t size, const double* factors, double* x, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

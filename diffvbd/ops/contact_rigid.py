@@ -18,9 +18,15 @@ _FIELDS = len(TouchingFields._fields)
 
 def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float
                  ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """The Newton system over a turn and a shift of each body, float64: centers of mass [B, bodies, 3] [m], gradient
-    [B, bodies, 6], and matrix [B, 6 bodies, 6 bodies], or [B, bodies, 6, 6] of more than MOST_COUPLED bodies."""
+    """The Newton step over a turn and a shift of each body, float64: centers of mass [B, bodies, 3] [m], motion
+    [B, bodies, 6], and Cholesky factor [B, 6 bodies, 6 bodies], or [B, bodies, 6, 6] of more than MOST_COUPLED
+    bodies."""
     return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps)
+
+
+def rigid_solve(factor: Tensor, right: Tensor) -> Tensor:
+    """Solutions for right [B, bodies, 6] with the factor of :func:`rigid_system`."""
+    return raw.contact_rigid_solve(factor, right.contiguous())
 
 
 def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_count: Sequence[int], time_step: float,
@@ -38,11 +44,16 @@ def _(*arguments):
     return tuple(f.x.new_empty(size, dtype=torch.float64) for size in ((b, n, 3), (b, n, UNKNOWNS), shape))
 
 
+@shapes_of("contact_rigid_solve")
+def _(factor, right):
+    return torch.empty_like(right)
+
+
 @shapes_of("contact_rigid_move")
 def _(*arguments):
     f = TouchingFields(*arguments[:_FIELDS])
     return torch.empty_like(f.x), f.x.new_empty((f.x.shape[0], f.free.shape[0]), dtype=torch.float64)
 
 
-for _name in ("contact_rigid_system", "contact_rigid_move"):
+for _name in ("contact_rigid_system", "contact_rigid_solve", "contact_rigid_move"):
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

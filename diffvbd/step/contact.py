@@ -181,6 +181,7 @@ class ContactStep:
         if barrier is None or surface is None:
             return self._run_on_floor(policy, debug_step)
         if checking():
+            self._refuse_what_is_not_finite()
             refuse_intersections(self.model, self.x_prev, self.origin, self.before)
         pinned = self.model._pinned[:, None]
         lift = torch.where(pinned, 0.0, broadcast(self.begun.lift, self.begun.y.shape))
@@ -326,11 +327,7 @@ class ContactStep:
                 f"use diffvbd.contact.reserve(model, {2 * -(-needed // scenes)})",
             )
         if touching:
-            finite = all(
-                bool(torch.isfinite(t).all()) for t in (self.x_prev, self.begun.y, self.colliders, self.before)
-            )
-            if not finite:  # which argument, finds arguments.name_argument
-                raise ValueError("start (x, v, force, gravity, prescribed, colliders): expected finite values")
+            self._refuse_what_is_not_finite()
             if pair < 0:
                 raise RuntimeError(
                     f"x: positions became non-finite before part {r} of the step: look with diffvbd.debug_checks(), "
@@ -348,6 +345,12 @@ class ContactStep:
                 f"prescribed or colliders: expected motion that leaves bodies a way, got {hindered} pairs in part {r} "
                 f"of {self.parts} that it would bring too close: use more detections or a smaller time_step"
             )
+
+    def _refuse_what_is_not_finite(self) -> None:
+        """Which argument it was, finds arguments.name_argument."""
+        given = (self.x_prev, self.begun.y, self.colliders, self.before)
+        if not all(bool(torch.isfinite(t).all()) for t in given):
+            raise ValueError("start (x, v, force, gravity, prescribed, colliders): expected finite values")
 
 
 def no_pairs(like: Tensor, corners: int) -> Pairs:

@@ -61,10 +61,7 @@ class _Correct(Function):
                                     collider_prev, kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs,
                                     lag_ptr, lag_entry, floor_lag, center, room)  # fmt: skip
         counts = model._data_count
-        centers, gradient, matrix = ops_rigid.rigid_system(fields, counts, time_step, friction_eps)
-        factor = torch.linalg.cholesky_ex(matrix)[0]  # torch.cholesky_solve cannot be captured in a CUDA graph
-        motion = -_solved(factor, gradient)
-        motion = torch.where(torch.isfinite(motion).all(-1, keepdim=True), motion, 0.0).contiguous()
+        centers, motion, factor = ops_rigid.rigid_system(fields, counts, time_step, friction_eps)
         end, share = ops_rigid.rigid_move(fields, centers, motion, counts, time_step, friction_eps)
         return end, share, motion, factor
 
@@ -107,13 +104,6 @@ class _CorrectBackward(Function):
         no_second_derivative()
 
 
-def _solved(factor: Tensor, right: Tensor) -> Tensor:
-    """right [B, bodies, 6]; factor of all bodies together or of each."""
-    rows = right.reshape(*factor.shape[:-1], 1)
-    half = torch.linalg.solve_triangular(factor, rows, upper=False)
-    return torch.linalg.solve_triangular(factor.mT, half, upper=True).reshape(right.shape)
-
-
 def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: Tensor, needs: Sequence[bool]
               ) -> tuple[Tensor, ...]:  # fmt: skip
     """Of the fields that need one. With H d = -g, the adjoint of d is that of -l . (g + H d), where H l is the adjoint
@@ -125,7 +115,7 @@ def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: T
     end = f.x + _displaced(share.to(f.x.dtype)[..., None] * leaf, arm, body)
     wanted = [t for t, need in zip(f, needs, strict=True) if need]
     *first, bar = torch.autograd.grad(end, (*wanted, leaf), x_bar, allow_unused=True, retain_graph=True)
-    solution = torch.where(f.free[:, None], _solved(factor, bar.to(factor.dtype)), 0.0).to(f.x.dtype)
+    solution = torch.where(f.free[:, None], ops_rigid.rigid_solve(factor, bar.to(factor.dtype)), 0.0).to(f.x.dtype)
     virtual = -_virtual_work(s, solution, leaf.detach(), arm, whole, body)
     second = torch.autograd.grad(virtual, wanted, allow_unused=True)
     return tuple(_sum(pair, t) for pair, t in zip(zip(first, second, strict=True), wanted, strict=True))

@@ -108,7 +108,9 @@ def test_the_color_moves_as_one(device: str, name: str, sweeps: int) -> None:
     assert inside > 0 and (third > 0 or name == "two_tets"), (inside, third)
     for tape in ("full", "recompute"):
         result, found = compiled(scene, steps, sweeps, tape, model)
-        assert [len(p.pairs) for p in found] == [len(p.pairs) for p in parts]
+        assert len(found) == len(parts)
+        if device == "cpu":  # elsewhere lists keep what is out of reach
+            assert [len(p.pairs) for p in found] == [len(p.pairs) for p in parts]
         assert result.keys() == expected.keys()
         for key, value in result.items():
             spread = max(relative_error(other[key], expected[key]) for other in others)

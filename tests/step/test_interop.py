@@ -248,11 +248,12 @@ def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     own = (x, x, x + move, mass, data, none, *bodies_of(model), points, points, x.new_ones((1,)), *listed)
     touching = (*own, none, *no_pairs(x, 0)[:1], *no_pairs(x, 0)[2:], none, x, own_room)
     numbers = (model._data_count, 0.01, 1e-3)
-    centers, gradient, matrix = torch.ops.diffvbd.contact_rigid_system(*touching, *numbers)
-    assert gradient.abs().max() > 0 and (matrix == matrix.mT).all()
+    centers, motion, factor = torch.ops.diffvbd.contact_rigid_system(*touching, *numbers)
+    assert motion.abs().max() > 0 and torch.isfinite(factor).all()
     return {
         "contact_rigid_system": (*touching, *numbers),
-        "contact_rigid_move": (*touching, centers, 1e-4 * torch.ones_like(gradient), *numbers),
+        "contact_rigid_solve": (factor, torch.ones_like(motion)),
+        "contact_rigid_move": (*touching, centers, motion, *numbers),
         "contact_start": start,
         "contact_start_backward": (move, *start, True),
         "contact_advance": advance,

@@ -25,11 +25,19 @@ std::tuple<Tensor, Tensor, Tensor> contact_rigid_system(DIFFVBD_PARAMETERS(TOUCH
     using T = decltype(scalar);
     const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
     const int64_t b = in.scene.scenes, n = in.bodies();
-    Tensor centers = doubles({b, n, 3}), gradient = doubles({b, n, contact::kUnknowns});
-    Tensor matrix = doubles(diffvbd::matrix_shape(in));
-    diffvbd::rigid_system<T>(in, data<double>(centers), data<double>(gradient), data<double>(matrix));
-    return std::make_tuple(centers, gradient, matrix);
+    Tensor centers = doubles({b, n, 3}), motion = doubles({b, n, contact::kUnknowns});
+    Tensor factor = doubles(diffvbd::matrix_shape(in));
+    diffvbd::rigid_system<T>(in, data<double>(centers), data<double>(motion), data<double>(factor));
+    return std::make_tuple(centers, motion, factor);
   });
+}
+
+Tensor contact_rigid_solve(const Tensor& factor, const Tensor& right) {
+  if (right.numel() == 0) return torch::stable::clone(right);
+  const auto systems = diffvbd::systems_of(factor, right);
+  Tensor out = torch::stable::clone(right);
+  diffvbd::cholesky_solve(systems.count, systems.size, data<const double>(factor), data<double>(out));
+  return out;
 }
 
 std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& centers, const Tensor& motion,
@@ -52,5 +60,6 @@ std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
   m.impl("contact_rigid_system", TORCH_BOX(&contact_rigid_system));
+  m.impl("contact_rigid_solve", TORCH_BOX(&contact_rigid_solve));
   m.impl("contact_rigid_move", TORCH_BOX(&contact_rigid_move));
 }

@@ -33,14 +33,30 @@ std::tuple<Tensor, Tensor, Tensor> contact_rigid_system(DIFFVBD_PARAMETERS(TOUCH
     const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
     const int64_t b = in.scene.scenes, n = in.bodies();
     const auto doubles = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes, ScalarType::Double); };
-    Tensor centers = doubles({b, n, 3}), gradient = doubles({b, n, contact::kUnknowns});
-    Tensor matrix = doubles(diffvbd::matrix_shape(in));
+    Tensor centers = doubles({b, n, 3}), motion = doubles({b, n, contact::kUnknowns});
+    Tensor factor = doubles(diffvbd::matrix_shape(in));
     const Tensor work = empty(x, {cuda::rigid_system_bytes(in, room_of(f))}, ScalarType::Byte);
-    check(cuda::rigid_system<T>(in, room_of(f), data<double>(centers), data<double>(gradient), data<double>(matrix),
+    check(cuda::rigid_system<T>(in, room_of(f), data<double>(centers), data<double>(motion), data<double>(factor),
                                 work.data_ptr(), current_stream(x)),
           "the rigid correction of bodies that touch");
-    return std::make_tuple(centers, gradient, matrix);
+    return std::make_tuple(centers, motion, factor);
   });
+}
+
+Tensor contact_rigid_solve(const Tensor& factor, const Tensor& right) {
+  const DeviceGuard guard(factor.get_device_index());
+  std::vector<int64_t> shape;
+  for (int64_t k = 0; k < right.dim(); ++k) shape.push_back(right.size(k));
+  Tensor out = empty(right, shape);
+  if (right.numel() == 0) return out;
+  const auto systems = diffvbd::systems_of(factor, right);
+  check(cudaMemcpyAsync(out.data_ptr(), right.data_ptr(), right.numel() * sizeof(double), cudaMemcpyDeviceToDevice,
+                        current_stream(right)),
+        "a copy");
+  check(cuda::cholesky_solve(systems.count, systems.size, data<const double>(factor), data<double>(out),
+                             current_stream(right)),
+        "a solution of rigid motions");
+  return out;
 }
 
 std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& centers, const Tensor& motion,
@@ -67,5 +83,6 @@ std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_rigid_system", TORCH_BOX(&contact_rigid_system));
+  m.impl("contact_rigid_solve", TORCH_BOX(&contact_rigid_solve));
   m.impl("contact_rigid_move", TORCH_BOX(&contact_rigid_move));
 }

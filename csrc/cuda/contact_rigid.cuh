@@ -1,0 +1,43 @@
+// What the kernels of the rigid correction of bodies that touch share.
+#pragma once
+
+#include "bodies.cuh"
+#include "contact_rigid.h"
+
+namespace diffvbd::cuda {
+
+using namespace contact;
+using rigid::Body;
+
+constexpr int kOne = 128;  // threads of a block where each has an item of its own
+
+inline unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kOne - 1) / kOne); }
+__device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; }
+__device__ __forceinline__ Vector vector_of(const double* a) { return {a[0], a[1], a[2]}; }
+
+// Bytes of a part of a workspace, rounded up to what any type needs.
+constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
+
+// What the pairs of all scenes press: bodies [rows, 2], -1 where nothing moves, and the rest, unless null. The listed
+// come first.
+template <class T>
+__global__ void __launch_bounds__(kOne)
+    press_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, int32_t* sides, double* press) {
+  const int64_t row = own_item();
+  if (row >= room.listed + room.lagged) return;
+  const CornerPoints<T> at{in, false};
+  PairPress a;
+  a.body[0] = a.body[1] = -1;
+  bool acts = false;
+  if (row < room.listed) {
+    acts = row < in.first_listed(in.scene.scenes) && barrier_press(in, row, at, a);
+  } else {
+    const int64_t pair = row - room.listed;
+    acts = pair < in.first_lagged(in.scene.scenes) && lagged_press(in, pair, at, a);
+  }
+  sides[2 * row] = acts ? a.body[0] : -1;
+  sides[2 * row + 1] = acts ? a.body[1] : -1;
+  if (acts && press) store_press(a, press + kPressDoubles * row);
+}
+
+}  // namespace diffvbd::cuda

@@ -1,0 +1,209 @@
+#include <algorithm>
+
+#include "contact_rigid.cuh"
+#include "ordered.cuh"
+
+namespace diffvbd::cuda {
+namespace {
+
+constexpr int64_t kItemsOfBlock = 2048;  // of the potential of a scene, that one block adds up
+constexpr int64_t kMostBlocks = 64;      // that add up one scene
+
+// What the tries of all scenes have in common.
+template <class T>
+struct Tried {
+  const double *center, *motion;
+  double *share, *low, *next;  // [B, bodies]
+  double *before, *after;      // [B, blocks]  parts of the potential
+  const int32_t* sides;        // [listed, 2]
+  AdvanceState<T> state;
+  uint8_t* done;  // [B]
+  T* move;
+  int64_t blocks;
+};
+
+template <class T>
+__global__ void __launch_bounds__(kOne)
+    begin_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t) {
+  const int64_t i = own_item();
+  if (i < in.scene.scenes) t.done[i] = 0;
+  if (i >= in.scene.scenes * in.bodies()) return;
+  t.share[i] = 1;
+  t.state.share[i] = T(0), t.state.now[i] = T(1);
+  t.state.blocked[i] = t.state.stamp[i] = 0;
+}
+
+template <class T>
+__global__ void __launch_bounds__(kOne)
+    displace_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t, T* x) {
+  const int64_t row = own_item();
+  if (row >= in.scene.scenes * in.scene.vertices) return;
+  const int64_t scene = row / in.scene.vertices;
+  const auto v = static_cast<int32_t>(row % in.scene.vertices);
+  const int64_t body = scene * in.bodies() + in.gate.body[v];
+  const Vector r = Body<T>::at(in.scene.x + 3 * row) - vector_of(t.center + 3 * body);
+  rigid::put(t.move + 3 * row, displaced(t.motion + kUnknowns * body, t.share[body], r));
+  if (!x) return;
+  for (int c = 0; c < 3; ++c) x[3 * row + c] = in.scene.x[3 * row + c] + t.move[3 * row + c];
+}
+
+// Marks the bodies that a pair, a room or an energy does not let pass.
+template <class T>
+__global__ void __launch_bounds__(kOne)
+    test_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t) {
+  const int64_t item = own_item(), rows = in.scene.scenes * in.scene.vertices;
+  if (item < rows) {
+    const int64_t scene = item / in.scene.vertices;
+    const auto v = static_cast<int32_t>(item % in.scene.vertices);
+    const int32_t body = in.gate.body[v];
+    if (t.done[scene] || !in.free[body]) return;
+    stay(in.gate, t.state, item, 0);
+    if (!admitted(in, Body<T>{in.scene, scene, body}, v)) mark(t.state.blocked + scene * in.bodies() + body);
+    return;
+  }
+  const int64_t pair = item - rows;
+  if (pair >= in.first_listed(in.scene.scenes) || t.done[in.gate.listed.pairs[kPairRow * pair + 5]]) return;
+  if (is_between(in, pair)) try_pair(in.gate, t.state, pair, 0);
+}
+
+// A block of the potential of a scene.
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    potential_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t, bool moved,
+                     double* out) {
+  __shared__ double part[kWarps][kMostSums];
+  const int64_t scene = blockIdx.y;
+  if (t.done[scene]) return;
+  const BlockTeam team{part};
+  const CornerPoints<T> at{in, moved};
+  const int64_t step = gridDim.x, vertices = in.scene.vertices, listed = in.first_listed(scene);
+  const int64_t lagged = in.first_lagged(scene), repelling = in.first_listed(scene + 1) - listed;
+  const int64_t items = vertices + repelling + in.first_lagged(scene + 1) - lagged;
+  const auto own = static_cast<int32_t>((items + step - 1 - blockIdx.x) / step);
+  double sum[1];
+  team.template sum<1>(own, sum, [&](int32_t i, double* to) {
+    const int64_t item = blockIdx.x + step * i;
+    if (item < vertices) {
+      const auto v = static_cast<int32_t>(item);
+      const int32_t body = in.gate.body[v];
+      if (in.free[body]) to[0] += vertex_value(in, Body<T>{in.scene, scene, body}, v, moved);
+      return;
+    }
+    PairPress a;
+    const int64_t pair = item - vertices;
+    const bool acts =
+        pair < repelling ? barrier_press(in, listed + pair, at, a) : lagged_press(in, lagged + pair - repelling, at, a);
+    if (acts) to[0] += a.value;
+  });
+  if (threadIdx.x == 0) out[scene * step + blockIdx.x] = sum[0];
+}
+
+// A block for each scene: whether it may go as it has tried, and what each body tries next.
+template <class T>
+__global__ void __launch_bounds__(kOne)
+    decide_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t, int attempt) {
+  const int64_t scene = blockIdx.x, n = in.bodies(), first = scene * n;
+  if (t.done[scene]) return;
+  const auto each = [&](int64_t count, const auto& f) {
+    for (int64_t i = threadIdx.x; i < count; i += kOne) f(i);
+  };
+  bool stopped = false;
+  each(n, [&](int64_t k) { stopped = stopped || t.state.blocked[first + k]; });
+  const bool fits = !__syncthreads_or(stopped);
+  double before = 0, after = 0;
+  for (int64_t i = 0; i < t.blocks; ++i) {
+    before += t.before[scene * t.blocks + i];
+    after += t.after[scene * t.blocks + i];
+  }
+  if (is_safe(before, after, fits)) {
+    __syncthreads();  // everyone has asked whether it is done
+    if (threadIdx.x == 0) t.done[scene] = 1;
+    return;
+  }
+  const bool last = attempt + 1 == kTries;
+  each(n, [&](int64_t k) {
+    t.low[first + k] = last ? 0.0 : shortened(t.state.blocked[first + k], fits, attempt);
+    t.state.blocked[first + k] = 0;
+  });
+  const int64_t begin = in.first_listed(scene), pairs = in.first_listed(scene + 1) - begin;
+  for (int spread = 0; spread < kSpreads && !last; ++spread) {
+    __syncthreads();
+    each(n, [&](int64_t k) { t.next[first + k] = t.low[first + k]; });
+    __syncthreads();
+    each(pairs, [&](int64_t i) {
+      const int32_t a = t.sides[2 * (begin + i)], b = t.sides[2 * (begin + i) + 1];
+      if (a < 0 || b < 0) return;
+      const double both = fmin(t.low[first + a], t.low[first + b]);
+      // not negative: their bits are in their order
+      for (const int32_t k : {a, b}) {
+        lower(reinterpret_cast<unsigned long long*>(t.next + first + k),
+              static_cast<unsigned long long>(__double_as_longlong(both)));
+      }
+    });
+    __syncthreads();
+    each(n, [&](int64_t k) { t.low[first + k] = t.next[first + k]; });
+  }
+  __syncthreads();
+  each(n, [&](int64_t k) { t.share[first + k] *= t.low[first + k]; });
+}
+
+template <class T>
+int64_t potential_blocks(const RigidInputs<T>& in, const PairRoom& room) {
+  const int64_t items = in.scene.vertices + room.rows() / std::max<int64_t>(1, in.scene.scenes);
+  return std::clamp<int64_t>((items + kItemsOfBlock - 1) / kItemsOfBlock, 1, kMostBlocks);
+}
+
+}  // namespace
+
+template <class T>
+int64_t rigid_move_bytes(const RigidInputs<T>& in, const PairRoom& room) {
+  const int64_t units = in.scene.scenes * in.bodies(), parts = in.scene.scenes * potential_blocks(in, room);
+  return aligned(room.rows() * 2 * sizeof(int32_t)) + 2 * aligned(units * sizeof(double)) +
+         2 * aligned(parts * sizeof(double)) + 2 * aligned(units * sizeof(T)) + 2 * aligned(units) +
+         aligned(in.scene.scenes);
+}
+
+template <class T>
+cudaError_t rigid_move(const RigidInputs<T>& in, const PairRoom& room, const double* center, const double* motion,
+                       T* move, double* share, T* x, void* workspace, cudaStream_t stream) {
+  const int64_t scenes = in.scene.scenes, units = scenes * in.bodies(), rows = scenes * in.scene.vertices;
+  if (rows == 0 || units == 0) return cudaSuccess;
+  auto* next = static_cast<uint8_t*>(workspace);
+  const auto take = [&](int64_t bytes) {
+    uint8_t* here = next;
+    next += aligned(bytes);
+    return here;
+  };
+  const auto numbers = [&](int64_t count) { return reinterpret_cast<double*>(take(count * sizeof(double))); };
+  auto* sides = reinterpret_cast<int32_t*>(take(room.rows() * 2 * sizeof(int32_t)));
+  Tried<T> t{};
+  t.center = center, t.motion = motion, t.share = share, t.sides = sides, t.move = move;
+  t.blocks = potential_blocks(in, room);
+  t.low = numbers(units), t.next = numbers(units);
+  t.before = numbers(scenes * t.blocks), t.after = numbers(scenes * t.blocks);
+  t.state.share = reinterpret_cast<T*>(take(units * sizeof(T)));
+  t.state.now = reinterpret_cast<T*>(take(units * sizeof(T)));
+  t.state.blocked = take(units), t.state.stamp = take(units), t.done = take(scenes);
+  if (room.rows() > 0) press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, sides, nullptr);
+  begin_kernel<T><<<blocks_for(std::max(units, scenes)), kOne, 0, stream>>>(in, t);
+  const dim3 sums(static_cast<unsigned>(t.blocks), static_cast<unsigned>(scenes));
+  potential_kernel<T><<<sums, kThreads, 0, stream>>>(in, t, false, t.before);
+  for (int attempt = 0; attempt < kTries; ++attempt) {
+    displace_kernel<T><<<blocks_for(rows), kOne, 0, stream>>>(in, t, nullptr);
+    test_kernel<T><<<blocks_for(rows + room.listed), kOne, 0, stream>>>(in, t);
+    potential_kernel<T><<<sums, kThreads, 0, stream>>>(in, t, true, t.after);
+    decide_kernel<T><<<static_cast<unsigned>(scenes), kOne, 0, stream>>>(in, t, attempt);
+  }
+  displace_kernel<T><<<blocks_for(rows), kOne, 0, stream>>>(in, t, x);
+  return cudaGetLastError();
+}
+
+#define DIFFVBD_INSTANTIATE(T)                                                                                 \
+  template int64_t rigid_move_bytes<T>(const RigidInputs<T>&, const PairRoom&);                                \
+  template cudaError_t rigid_move<T>(const RigidInputs<T>&, const PairRoom&, const double*, const double*, T*, \
+                                     double*, T*, void*, cudaStream_t);
+DIFFVBD_INSTANTIATE(float)
+DIFFVBD_INSTANTIATE(double)
+#undef DIFFVBD_INSTANTIATE
+
+}  // namespace diffvbd::cuda
