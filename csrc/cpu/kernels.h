@@ -1,6 +1,7 @@
 // The two hot loops of the CPU backend, chosen by a scene's energies and by what the processor can do.
 #pragma once
 
+#include "pair_kernels.h"
 #include "scene.h"
 
 namespace diffvbd {
@@ -40,12 +41,15 @@ struct CoarseKernels {
 };
 template <class T>
 CoarseKernels<T> coarse_kernels(int energies);
+template <class T>
+PairKernels<T> pair_kernels();
 
 // The loops of one instruction set: each is compiled in files of its own, sweep_<scalar>_<set>.cpp.
 template <class T>
 struct Kernels {
   SweepKernel<T> (*forward)(int energies), (*reverse)(int energies);
   CoarseKernels<T> (*coarse)(int energies);
+  PairKernels<T> pairs;
 };
 namespace baseline {
 template <class T>
