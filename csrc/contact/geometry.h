@@ -1,7 +1,8 @@
 // Distance of a pair of primitives, its gradient, and the mollifier of almost parallel edges (Li et al. 2020). A pair
 // has four corners; by the envelope theorem the gradient of the distance toward corner k is w_k n, with the weights w
 // of the closest points (they sum to 0) and the unit vector n between them, whatever features are closest. Scalars may
-// be Dual: the features are chosen by values, so that a derivative is that of the executed branch.
+// be Dual: the features are chosen by values, so that a derivative is that of the executed branch. Or packs of lanes,
+// of pairs of one kind: what one pair needs is worked out for all, and chosen.
 #pragma once
 
 #include "../core/dual.h"
@@ -34,8 +35,7 @@ template <class R>
 DIFFVBD_FN R closest_on_segment(const Vec3<R>& p, const Vec3<R>& a, const Vec3<R>& b) {
   const Vec3<R> ab = b - a;
   const R length2 = dot(ab, ab);
-  const auto degenerate = !(R(0) < length2);
-  return degenerate ? R(0) : clamped(dot(p - a, ab) / length2);
+  return select(R(0) < length2, clamped(dot(p - a, ab) / length2), R(0));
 }
 
 template <class R>
@@ -69,10 +69,16 @@ DIFFVBD_FN void keep_closer(Distance<R>& best, R& best2, const Corners<R>& c, co
   const R w[4] = {w0, w1, w2, w3};
   const Vec3<R> r = weighted(w, c);
   const R r2 = dot(r, r);
-  if (r2 < best2) {
-    best2 = r2;
-    for (int k = 0; k < 4; ++k) best.w[k] = w[k];
-  }
+  const auto closer = r2 < best2;
+  best2 = select(closer, r2, best2);
+  for (int k = 0; k < 4; ++k) best.w[k] = select(closer, w[k], best.w[k]);
+}
+
+template <class M, class R>
+DIFFVBD_FN Distance<R> chosen(const M& condition, const Distance<R>& a, const Distance<R>& b) {
+  Distance<R> out{select(condition, a.d, b.d), {}, select(condition, a.n, b.n)};
+  for (int k = 0; k < 4; ++k) out.w[k] = select(condition, a.w[k], b.w[k]);
+  return out;
 }
 
 // Below this squared sine two directions count as parallel.
@@ -84,15 +90,14 @@ DIFFVBD_FN Distance<R> point_triangle(const Corners<R>& c) {
   const Vec3<R>&p = c.x[0], &a = c.x[1], &b = c.x[2], &e = c.x[3];
   const Vec3<R> ab = b - a, ac = e - a, ap = p - a, normal = cross(ab, ac);
   const R size2 = dot(normal, normal), bound = dot(ab, ab) * dot(ac, ac);
-  Distance<R> out{};
-  if (R(parallel()) * bound < size2) {
-    const R inverse = R(1) / size2;
-    const R v = inverse * dot(cross(ap, ac), normal), w = inverse * dot(cross(ab, ap), normal), u = R(1) - v - w;
-    if (R(0) < u && R(0) < v && R(0) < w) {
-      out.w[0] = R(1), out.w[1] = -u, out.w[2] = -v, out.w[3] = -w;
-      measure_across(out, c, normal, size2);
-      return out;
-    }
+  const R inverse = R(1) / size2;
+  const R v = inverse * dot(cross(ap, ac), normal), w = inverse * dot(cross(ab, ap), normal), u = R(1) - v - w;
+  const auto inside = both(R(parallel()) * bound < size2, both(R(0) < u, both(R(0) < v, R(0) < w)));
+  Distance<R> face{}, out{};
+  if (any(inside)) {
+    face.w[0] = R(1), face.w[1] = -u, face.w[2] = -v, face.w[3] = -w;
+    measure_across(face, c, normal, size2);
+    if (all(inside)) return face;
   }
   R best2 = R(std::numeric_limits<float>::infinity());
   const R s = closest_on_segment(p, a, b), t = closest_on_segment(p, b, e), q = closest_on_segment(p, e, a);
@@ -100,7 +105,7 @@ DIFFVBD_FN Distance<R> point_triangle(const Corners<R>& c) {
   keep_closer(out, best2, c, R(1), R(0), t - R(1), -t);
   keep_closer(out, best2, c, R(1), -q, R(0), q - R(1));
   measure_along(out, c);
-  return out;
+  return chosen(inside, face, out);
 }
 
 // corners: the ends of the first edge, then of the second
@@ -108,15 +113,14 @@ template <class R>
 DIFFVBD_FN Distance<R> edge_edge(const Corners<R>& c) {
   const Vec3<R> u = c.x[1] - c.x[0], v = c.x[3] - c.x[2], r = c.x[0] - c.x[2], normal = cross(u, v);
   const R size2 = dot(normal, normal), bound = dot(u, u) * dot(v, v);
-  Distance<R> out{};
-  if (R(parallel()) * bound < size2) {
-    const R inverse = R(1) / size2;
-    const R s = inverse * dot(cross(v, r), normal), t = inverse * dot(cross(u, r), normal);
-    if (R(0) < s && s < R(1) && R(0) < t && t < R(1)) {
-      out.w[0] = R(1) - s, out.w[1] = s, out.w[2] = t - R(1), out.w[3] = -t;
-      measure_across(out, c, normal, size2);
-      return out;
-    }
+  const R inverse = R(1) / size2;
+  const R s = inverse * dot(cross(v, r), normal), t = inverse * dot(cross(u, r), normal);
+  const auto inside = both(R(parallel()) * bound < size2, both(both(R(0) < s, s < R(1)), both(R(0) < t, t < R(1))));
+  Distance<R> across{}, out{};
+  if (any(inside)) {
+    across.w[0] = R(1) - s, across.w[1] = s, across.w[2] = t - R(1), across.w[3] = -t;
+    measure_across(across, c, normal, size2);
+    if (all(inside)) return across;
   }
   R best2 = R(std::numeric_limits<float>::infinity());
   const R a = closest_on_segment(c.x[0], c.x[2], c.x[3]), b = closest_on_segment(c.x[1], c.x[2], c.x[3]);
@@ -126,7 +130,7 @@ DIFFVBD_FN Distance<R> edge_edge(const Corners<R>& c) {
   keep_closer(out, best2, c, R(1) - d, d, R(-1), R(0));
   keep_closer(out, best2, c, R(1) - e, e, R(0), R(-1));
   measure_along(out, c);
-  return out;
+  return chosen(inside, across, out);
 }
 
 // corners: the point, then three points of the plane, counterclockwise seen from the side that is free
@@ -173,8 +177,9 @@ DIFFVBD_FN Mollifier<R> mollifier(const Corners<R>& c, const T& threshold) {
 
 // Whether a pair of edges is close enough to parallel for its mollifier to differ from 1. threshold 0: no mollifier.
 template <class R, class T>
-DIFFVBD_FN bool is_mollified(int kind, const Corners<R>& c, const T& threshold) {
-  return kind == kEdgeEdge && squared_cross(c) < R(threshold);
+DIFFVBD_FN auto is_mollified(int kind, const Corners<R>& c, const T& threshold) {
+  const auto close = squared_cross(c) < R(threshold);
+  return kind == kEdgeEdge ? close : R(0) < R(0);
 }
 
 }  // namespace diffvbd::contact

@@ -43,6 +43,8 @@ DIFFVBD_FN int side(const Normal& uv, const Vec3<double>& w, double off = 0.0) {
 DIFFVBD_FN bool crosses(const Vec3<double>& p, const Vec3<double>& q, const Vec3<double>& a, const Vec3<double>& b,
                         const Vec3<double>& c) {
   const Normal plane = normal_of(b - a, c - a);
+  // Most edges that are tried do not reach the plane, whatever rounding did.
+  if ((dot(plane.n, p - a) < 0.0) == (dot(plane.n, q - a) < 0.0)) return false;
   // Corners of a flat face are in one plane but for the rounding of their positions, which says nothing.
   double size = 0.0;
   const Vec3<double> all[] = {p, q, a, b, c};
@@ -93,11 +95,11 @@ DIFFVBD_FN bool shares_vertex(const Surfaces<T>& in, int32_t edge, int32_t trian
 template <class T>
 DIFFVBD_FN bool is_crossing(const Surfaces<T>& in, int64_t scene, int32_t edge, int32_t triangle) {
   const int32_t *e = in.edges + int64_t{2} * edge, *t = in.triangles + int64_t{3} * triangle;
-  if (in.held[e[0]] && in.held[e[1]] && in.held[t[0]] && in.held[t[1]] && in.held[t[2]]) return false;
-  if (in.ignores(in.group(e[0]), in.group(t[0]))) return false;
+  // positions first: of what is tried they rule out nearly all
   return crosses(position(in, scene, e[0]), position(in, scene, e[1]), position(in, scene, t[0]),
                  position(in, scene, t[1]), position(in, scene, t[2])) &&
-         !is_one_place(in, e, t);
+         !(in.held[e[0]] && in.held[e[1]] && in.held[t[0]] && in.held[t[1]] && in.held[t[2]]) &&
+         !in.ignores(in.group(e[0]), in.group(t[0])) && !is_one_place(in, e, t);
 }
 
 // Whether a point that may move lies behind a plane; a point of a collider does not count.

@@ -13,25 +13,38 @@ template <class T>
 struct PairConstants {
   T dhat, offset, threshold;  // [m], radii that the gap is less than the distance [m], of the mollifier [m^4]
   DIFFVBD_FN explicit PairConstants(const T* a) : dhat(a[0]), offset(a[1]), threshold(a[2]) {}
+  DIFFVBD_FN PairConstants(const T& dhat, const T& offset, const T& threshold)
+      : dhat(dhat), offset(offset), threshold(threshold) {}
 };
 
-// Adds the barrier's part of the block of corner i.
-template <class T>
-DIFFVBD_FN void add_barrier(int kind, const Corners<T>& c, int i, const PairConstants<T>& a, T kappa, T h2, Vec3<T>& g,
-                            Sym3<T>& H) {
-  const Distance<T> at = distance(kind, c);
-  const T gap = at.d - a.offset;
-  if (!(gap < a.dhat)) return;
-  const LogBarrier<T> b(gap, a.dhat, h2 * kappa);
-  T e = T(1);
-  if (is_mollified(kind, c, a.threshold)) {
-    const Mollifier<T> m = mollifier(c, a.threshold);
-    e = m.e;
-    g += b.value * m.gradient[i];
+// What belongs to corner i; in a pack of lanes each has an i of its own.
+template <class A>
+DIFFVBD_FN const A& of_corner(const A (&a)[4], int i) {
+  return a[i];
+}
+DIFFVBD_FN bool is_corner(int i, int k) { return i == k; }
+
+// Adds the barrier's part of the block of corner i; returns whether the pair is active.
+template <class R, class Index>
+DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Index& i, const PairConstants<R>& a, const R& kappa,
+                            const R& h2, Vec3<R>& g, Sym3<R>& H) {
+  const Distance<R> at = distance(kind, c);
+  const R gap = at.d - a.offset;
+  const auto active = gap < a.dhat;
+  if (!any(active)) return active;
+  const LogBarrier<R> b(gap, a.dhat, h2 * kappa);
+  R e = R(1);
+  Vec3<R> own = zero3<R>();
+  const auto mollified = is_mollified(kind, c, a.threshold);
+  if (any(mollified)) {
+    const Mollifier<R> m = mollifier(c, a.threshold);
+    e = select(mollified, m.e, e);
+    own = select(mollified, b.value * of_corner(m.gradient, i), own);
   }
-  const T w = at.w[i];
-  g += (e * b.first * w) * at.n;
+  const R w = of_corner(at.w, i);
+  g += own + (e * b.first * w) * at.n;
   add_outer(H, e * b.second * w * w, at.n);
+  return active;
 }
 
 // Adjoint of phi = p . (g + H d_raw) of corner i, negated: what the corners and kappa receive.
@@ -42,11 +55,11 @@ struct PairAdjoint {
 };
 
 // The Hessians of gap and mollifier are needed only times vectors that sit at corner i: one Dual evaluation each.
-template <class T>
-DIFFVBD_FN Corners<Dual<T>> moved_along(const Corners<T>& c, int i, const Vec3<T>& z) {
+template <class T, class Index>
+DIFFVBD_FN Corners<Dual<T>> moved_along(const Corners<T>& c, const Index& i, const Vec3<T>& z) {
   Corners<Dual<T>> out;
   for (int k = 0; k < 4; ++k) {
-    const T on = k == i ? T(1) : T(0);
+    const T on = select(is_corner(i, k), T(1), T(0));
     out.x[k] = {Dual<T>(c.x[k].x, on * z.x), Dual<T>(c.x[k].y, on * z.y), Dual<T>(c.x[k].z, on * z.z)};
   }
   return out;
@@ -57,39 +70,44 @@ DIFFVBD_FN Vec3<T> derivative(const Vec3<Dual<T>>& a) {
 }
 
 // Returns whether the pair is active; if not, it receives nothing.
-template <class T>
-DIFFVBD_FN bool reverse_barrier(int kind, const Corners<T>& c, int i, const PairConstants<T>& a, T kappa, T h2,
-                                const Vec3<T>& p, const Vec3<T>& d_raw, PairAdjoint<T>& out) {
-  const Distance<T> at = distance(kind, c);
-  const T gap = at.d - a.offset;
-  if (!(gap < a.dhat)) return false;
-  const LogBarrier<T> b(gap, a.dhat, h2);  // kappa scales everything: it comes last
-  const T s = at.w[i] * dot(at.n, p), t = at.w[i] * dot(at.n, d_raw);
-  T e = T(1), phi = T(0), by_gap = T(0);
-  const bool mollified = is_mollified(kind, c, a.threshold);
-  Mollifier<T> m{};
-  if (mollified) {
+template <class R, class Index>
+DIFFVBD_FN auto reverse_barrier(int kind, const Corners<R>& c, const Index& i, const PairConstants<R>& a,
+                                const R& kappa, const R& h2, const Vec3<R>& p, const Vec3<R>& d_raw,
+                                PairAdjoint<R>& out) {
+  const Distance<R> at = distance(kind, c);
+  const R gap = at.d - a.offset;
+  const auto active = gap < a.dhat;
+  if (!any(active)) return active;
+  const LogBarrier<R> b(gap, a.dhat, h2);  // kappa scales everything: it comes last
+  const R w = of_corner(at.w, i), s = w * dot(at.n, p), t = w * dot(at.n, d_raw);
+  R e = R(1), phi = R(0), by_gap = R(0);
+  const auto mollified = is_mollified(kind, c, a.threshold);
+  Mollifier<R> m{};
+  if (any(mollified)) {
     m = mollifier(c, a.threshold);
-    e = m.e;
-    const T toward = dot(m.gradient[i], p);
-    phi = b.value * toward;
-    by_gap = b.first * toward;
+    e = select(mollified, m.e, e);
+    const R toward = dot(of_corner(m.gradient, i), p);
+    phi = select(mollified, b.value * toward, phi);
+    by_gap = select(mollified, b.first * toward, by_gap);
   }
-  const T by_e = b.first * s + b.second * s * t;
+  const R by_e = b.first * s + b.second * s * t;
   phi = phi + e * by_e;
   by_gap = by_gap + e * (b.second * s + b.third * s * t);
-  const Vec3<T> z = (e * (b.first + b.second * t)) * p + (e * b.second * s) * d_raw;
-  const Distance<Dual<T>> turned = distance(kind, moved_along(c, i, z));
+  const Vec3<R> z = (e * (b.first + b.second * t)) * p + (e * b.second * s) * d_raw;
+  const Distance<Dual<R>> turned = distance(kind, moved_along(c, i, z));
   for (int k = 0; k < 4; ++k) {
-    const Vec3<Dual<T>> row = turned.w[k] * turned.n;
+    const Vec3<Dual<R>> row = turned.w[k] * turned.n;
     out.x[k] = (-kappa) * ((by_gap * at.w[k]) * at.n + derivative(row));
   }
-  if (mollified) {
-    const Mollifier<Dual<T>> curved = mollifier(moved_along(c, i, b.value * p), a.threshold);
-    for (int k = 0; k < 4; ++k) out.x[k] -= kappa * (by_e * m.gradient[k] + derivative(curved.gradient[k]));
+  if (any(mollified)) {
+    const Mollifier<Dual<R>> curved = mollifier(moved_along(c, i, b.value * p), a.threshold);
+    for (int k = 0; k < 4; ++k) {
+      const Vec3<R> own = kappa * (by_e * m.gradient[k] + derivative(curved.gradient[k]));
+      out.x[k] -= select(mollified, own, zero3<R>());
+    }
   }
   out.kappa = -phi;
-  return true;
+  return active;
 }
 
 // A pair as it was at the start of the step, in the order in which tensors keep it.
@@ -145,11 +163,17 @@ template <class T>
 DIFFVBD_FN Vec3<T> reverse_lagged(const Lag<T>& a, int i, const Vec3<T>& m, T h, T eps, const Vec3<T>& p,
                                   const Vec3<T>& d_raw, Lag<T>& bar) {
   const T w = a.w[i], along = dot(a.n, m), n_p = dot(a.n, p), n_d = dot(a.n, d_raw);
-  const Vec3<T> crossed = n_d * p + n_p * d_raw;
   Vec3<T> m_bar = zero3<T>();
-  bar.friction = bar.damping = T(0);
   bar.n = zero3<T>();
   for (int k = 0; k < 4; ++k) bar.w[k] = T(0);
+  if (!a.active()) {  // nothing but its two coefficients can tell: floors that nothing touches are many
+    const Vec3<T> u = m - along * a.n;
+    const FrictionRate<T> f(square_root(dot(u, u)), eps);
+    bar.friction = -h * h * w * f.value * (dot(u, p) + w * dot(p - n_p * a.n, d_raw));
+    bar.damping = -h * w * ((along < T(0) ? along : T(0)) * n_p + w * n_p * n_d);
+    return m_bar;
+  }
+  const Vec3<T> crossed = n_d * p + n_p * d_raw;
   const T c = h * a.damping, approach = along < T(0) ? along : T(0);
   bar.n -= (c * w * w) * crossed;
   if (along < T(0)) {

@@ -14,6 +14,19 @@ struct PairList {
   const int32_t* pairs = nullptr;  // [pairs, 6]  four corner points, kind, scene
   const int32_t* ptr = nullptr;    // [scenes corners + 1]
   const int32_t* entry = nullptr;  // [4 pairs]  4 pair + corner, for each corner point in ascending order
+  // Where a backend keeps account of what is near (cpu/near.h), the entries of one scene that are: of each corner point
+  // the first near_count[row - near_row], from where `entry` has them, less the near_start entries of scenes before.
+  const int32_t *near = nullptr, *near_count = nullptr;
+  int64_t near_row = 0, near_start = 0;
+
+  struct Entries {
+    const int32_t* first;
+    int count;
+  };
+  DIFFVBD_FN Entries of(int64_t row) const {
+    if (near) return {near + (ptr[row] - near_start), near_count[row - near_row]};
+    return {entry + ptr[row], ptr[row + 1] - ptr[row]};
+  }
 };
 constexpr int kFloorLag = 4;
 
@@ -44,6 +57,9 @@ struct ContactAdjoints {
   T* lag = nullptr;                        // [4 pairs, kLagScalars]
   T* floor_lag = nullptr;                  // [B, V, planes, 4]
   T* prev = nullptr;                       // [B, corners, 3]  toward the start of the step
+  // [4 pairs, 4], zero at first, or null: for each corner, whose slots hold something for it; of the others `rows` may
+  // then hold anything
+  uint8_t* sent = nullptr;
 };
 
 template <class T>
@@ -125,22 +141,29 @@ struct Source {
   }
 };
 
-// Sums the pairs of vertex v, every `stride`-th from `first` on, into g and H.
+// Sums the barriers of the pairs of vertex v, every `stride`-th from `first` on, into g and H.
 template <class T, class Positions>
-DIFFVBD_FN void add_pairs(const Source<T, Positions>& s, int v, int first, int stride, T h, Vec3<T>& g, Sym3<T>& H) {
+DIFFVBD_FN void add_barriers(const Source<T, Positions>& s, int v, int first, int stride, T h, Vec3<T>& g, Sym3<T>& H) {
   const ContactInputs<T>& in = s.in;
-  const int64_t row = s.scene * in.corners + v;
   const T kappa = in.kappa.data[s.scene * in.kappa.scene];
-  for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
-    const int entry = in.listed.entry[e], pair = entry >> 2;
+  const PairList::Entries all = in.listed.of(s.scene * in.corners + v);
+  for (int e = first; e < all.count; e += stride) {
+    const int entry = all.first[e], pair = entry >> 2;
     const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
     const T* constants = in.constants + int64_t{kConstants} * pair;
     if (s.is_far(record, constants)) continue;
     add_barrier(record[4], s.corners(record), entry & 3, PairConstants<T>(constants), kappa, h * h, g, H);
   }
+}
+
+// And what rubs: lagged pairs and floors.
+template <class T, class Positions>
+DIFFVBD_FN void add_lags(const Source<T, Positions>& s, int v, int first, int stride, T h, Vec3<T>& g, Sym3<T>& H) {
+  const ContactInputs<T>& in = s.in;
   if (in.lag) {
-    for (int e = in.lagged.ptr[row] + first; e < in.lagged.ptr[row + 1]; e += stride) {
-      const int entry = in.lagged.entry[e], pair = entry >> 2;
+    const PairList::Entries lagged = in.lagged.of(s.scene * in.corners + v);
+    for (int e = first; e < lagged.count; e += stride) {
+      const int entry = lagged.first[e], pair = entry >> 2;
       const Lag<T> lag(in.lag + int64_t{kLagScalars} * pair);
       if (!lag.active()) continue;
       const int32_t* record = in.lagged.pairs + int64_t{kPairRow} * pair;
@@ -153,10 +176,24 @@ DIFFVBD_FN void add_pairs(const Source<T, Positions>& s, int v, int first, int s
   }
 }
 
+// Both.
+template <class T, class Positions>
+DIFFVBD_FN void add_pairs(const Source<T, Positions>& s, int v, int first, int stride, T h, Vec3<T>& g, Sym3<T>& H) {
+  add_barriers(s, v, first, stride, h, g, H);
+  add_lags(s, v, first, stride, h, g, H);
+}
+
 // The exponent of the limit of vertex v, whose update goes from where it was by d: of its room.
 template <class T, class Positions>
 DIFFVBD_FN int limit_by_room(const Source<T, Positions>& s, int v, const Vec3<T>& from, const Vec3<T>& d) {
   return limit_by_room(from - s.in.center_of(s.scene, v), d, s.in.room[s.scene * s.in.num_vertices + v]);
+}
+
+// What rounding may make of a height of vertex v [m].
+template <class T, class Positions>
+DIFFVBD_FN T guard_of(const Source<T, Positions>& s, int v) {
+  const Vec3<T> at = s.x(v) + s.origin(v);
+  return T(kGuardUlps) * std::numeric_limits<T>::epsilon() * (absolute(at.x) + absolute(at.y) + absolute(at.z));
 }
 
 // And not below `exponent` of every `stride`-th of its pairs from `first` on.
@@ -165,12 +202,10 @@ DIFFVBD_FN int limit_by_pairs(const Source<T, Positions>& s, int v, const Vec3<T
                               int exponent) {
   const ContactInputs<T>& in = s.in;
   const int64_t row = s.scene * in.corners + v;
-  const T length = length_of(d);
-  const Vec3<T> at = s.x(v) + s.origin(v);
-  const T guard =
-      T(kGuardUlps) * std::numeric_limits<T>::epsilon() * (absolute(at.x) + absolute(at.y) + absolute(at.z));
-  for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
-    const int entry = in.listed.entry[e], pair = entry >> 2, own = entry & 3;
+  const T length = length_of(d), guard = guard_of(s, v);
+  const PairList::Entries all = in.listed.of(row);
+  for (int e = first; e < all.count; e += stride) {
+    const int entry = all.first[e], pair = entry >> 2, own = entry & 3;
     const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
     const T* constants = in.constants + int64_t{kConstants} * pair;
     const int sides_first = sides(record[4]);
@@ -204,15 +239,27 @@ DIFFVBD_FN Lag<T> floor_lag(const Source<T, Positions>& s, int v, int plane) {
   return out;
 }
 
-// The adjoint of what add_pairs summed: into the slots of the pairs, and toward v itself where it is alone.
+// Leaves in the slot of an entry what it adds to corner k.
+template <class T>
+DIFFVBD_FN void send(const ContactAdjoints<T>& out, int64_t entry, int k, const Vec3<T>& bar) {
+  T* slot = out.rows + 12 * entry + 3 * k;
+  if (out.sent) {
+    uint8_t& flag = out.sent[16 * (entry >> 2) + 4 * k + (entry & 3)];
+    if (!flag) slot[0] = slot[1] = slot[2] = T(0);
+    flag = 1;
+  }
+  add_at(slot, bar);
+}
+
+// The adjoint of what add_barriers summed, into the slots of the pairs.
 template <class T, class Positions>
-DIFFVBD_FN void reverse_pairs(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int v, int first,
-                              int stride, T h, const Vec3<T>& p, const Vec3<T>& d_raw, Vec3<T>& own) {
+DIFFVBD_FN void reverse_barriers(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int v, int first,
+                                 int stride, T h, const Vec3<T>& p, const Vec3<T>& d_raw) {
   const ContactInputs<T>& in = s.in;
-  const int64_t row = s.scene * in.corners + v;
   const T kappa = in.kappa.data[s.scene * in.kappa.scene];
-  for (int e = in.listed.ptr[row] + first; e < in.listed.ptr[row + 1]; e += stride) {
-    const int64_t entry = in.listed.entry[e], pair = entry >> 2;
+  const PairList::Entries all = in.listed.of(s.scene * in.corners + v);
+  for (int e = first; e < all.count; e += stride) {
+    const int64_t entry = all.first[e], pair = entry >> 2;
     const int32_t* record = in.listed.pairs + kPairRow * pair;
     const T* constants = in.constants + kConstants * pair;
     PairAdjoint<T> bar;
@@ -220,12 +267,20 @@ DIFFVBD_FN void reverse_pairs(const Source<T, Positions>& s, const ContactAdjoin
                                                         PairConstants<T>(constants), kappa, h * h, p, d_raw, bar)) {
       continue;
     }
-    for (int k = 0; k < 4; ++k) add_at(out.rows + 12 * entry + 3 * k, bar.x[k]);
+    for (int k = 0; k < 4; ++k) send(out, entry, k, bar.x[k]);
     out.kappa[entry] += bar.kappa;
   }
+}
+
+// And of what add_lags summed: also toward v itself where it is alone.
+template <class T, class Positions>
+DIFFVBD_FN void reverse_lags(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int v, int first, int stride,
+                             T h, const Vec3<T>& p, const Vec3<T>& d_raw, Vec3<T>& own) {
+  const ContactInputs<T>& in = s.in;
   if (in.lag) {
-    for (int e = in.lagged.ptr[row] + first; e < in.lagged.ptr[row + 1]; e += stride) {
-      const int64_t entry = in.lagged.entry[e], pair = entry >> 2;
+    const PairList::Entries lagged = in.lagged.of(s.scene * in.corners + v);
+    for (int e = first; e < lagged.count; e += stride) {
+      const int64_t entry = lagged.first[e], pair = entry >> 2;
       const Lag<T> lag(in.lag + kLagScalars * pair);
       const int32_t* record = in.lagged.pairs + kPairRow * pair;
       const Vec3<T> m = s.motion(record, lag);
@@ -252,10 +307,27 @@ DIFFVBD_FN void reverse_pairs(const Source<T, Positions>& s, const ContactAdjoin
   }
 }
 
+// Of both.
+template <class T, class Positions>
+DIFFVBD_FN void reverse_pairs(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int v, int first,
+                              int stride, T h, const Vec3<T>& p, const Vec3<T>& d_raw, Vec3<T>& own) {
+  reverse_barriers(s, out, v, first, stride, h, p, d_raw);
+  reverse_lags(s, out, v, first, stride, h, p, d_raw, own);
+}
+
 template <class T>
-DIFFVBD_FN void take(T* rows, const PairList& list, int64_t row, int first, int stride, Vec3<T>& sum) {
-  for (int e = list.ptr[row] + first; e < list.ptr[row + 1]; e += stride) {
-    const int64_t entry = list.entry[e], pair = entry >> 2, k = entry & 3;
+DIFFVBD_FN void take(T* rows, uint8_t* sent, const PairList& list, int64_t row, int first, int stride, Vec3<T>& sum) {
+  const PairList::Entries all = list.of(row);
+  for (int e = first; e < all.count; e += stride) {
+    const int64_t entry = all.first[e], pair = entry >> 2, k = entry & 3;
+    if (sent) {
+      uint8_t* flags = sent + 4 * entry;
+      for (int i = 0; i < 4; ++i) {
+        if (flags[i]) sum += vector_at(rows + (16 * pair + 4 * i + k) * 3);
+        flags[i] = 0;
+      }
+      continue;
+    }
     for (int i = 0; i < 4; ++i) {
       T* from = rows + (16 * pair + 4 * i + k) * 3;
       sum += vector_at(from);
@@ -269,10 +341,10 @@ template <class T>
 DIFFVBD_FN void take_pairs(const ContactInputs<T>& in, const ContactAdjoints<T>& out, int64_t scene, int v, int first,
                            int stride, Vec3<T>& now, Vec3<T>& prev) {
   const int64_t row = scene * in.corners + v;
-  take(out.rows, in.listed, row, first, stride, now);
+  take(out.rows, out.sent, in.listed, row, first, stride, now);
   if (!in.lag) return;
   Vec3<T> moved = zero3<T>();
-  take(out.lag_rows, in.lagged, row, first, stride, moved);
+  take(out.lag_rows, nullptr, in.lagged, row, first, stride, moved);
   now += moved;
   prev -= moved;
 }

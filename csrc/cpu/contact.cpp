@@ -2,6 +2,8 @@
 
 #include <algorithm>
 
+#include "pair_batches.h"
+
 namespace diffvbd {
 
 using namespace contact;
@@ -10,14 +12,18 @@ template <class T>
 ContactScene<T>::ContactScene(const Plan& plan, const ContactInputs<T>& in, const int32_t* position, int64_t scene,
                               SceneView<T>& s, T time_step, const ContactAdjoints<T>* reverse)
     : plan_(plan),
+      given_(in),
       in_(in),
       reverse_(reverse),
       scene_(scene),
       s_(s),
       h_(time_step),
+      kernels_(pair_kernels<T>()),
       before_(reverse ? 0 : int64_t{plan.blocks} * kLanes * 4),
       positions_{s.x, position},
-      source_{in, scene, positions_} {
+      near_(given_, scene, [&](int v) { return Source<T, Positions>{in, scene, positions_}.moved(v); }),
+      source_{in_, scene, positions_} {
+  in_.listed = near_.view();
   for (int64_t at = 0; at < int64_t{plan.blocks} * kLanes; ++at) {
     for (int i = 0; i < kContactScalars; ++i) *record(at / kLanes, static_cast<int>(at % kLanes), i) = T(0);
     if (s.limit) s.limit[at] = T(1);
@@ -30,15 +36,51 @@ void ContactScene<T>::remember(int64_t begin, int64_t end) const {
 }
 
 template <class T>
+void ContactScene<T>::propose(int64_t first, int64_t last, int64_t begin, int64_t end, uint8_t* limits) const {
+  const Before before{s_.x, before_.get(), positions_.position, first * kLanes, last * kLanes};
+  const Source<T, Before> source{in_, scene_, before};
+  for (int64_t at = begin * kLanes; at < end * kLanes; ++at) {
+    const int32_t v = plan_.order[at];
+    if (v < 0) continue;
+    const Vec3<T> from = vector_at(before_.get() + 4 * at), d = vector_at(s_.x + 4 * at) - from;
+    const int exponent = limit_by_room(source, v, from, d);
+    limits[v] = static_cast<uint8_t>(exponent);
+    if (!near_.has_pairs(v)) continue;
+    const Vec3<T> motion = source.moved(v), way = limit_of<T>(exponent) * d;
+    near_.go(v, motion, motion + way, length_of(way) / T(kBothShare) + guard_of(source, v));
+  }
+}
+
+template <class T>
+void ContactScene<T>::search(int64_t begin, int64_t end) const {
+  for (int64_t at = begin * kLanes; at < end * kLanes; ++at) {
+    if (plan_.order[at] >= 0) near_.search(plan_.order[at]);
+  }
+}
+
+template <class T>
+void ContactScene<T>::settle(Team::Member& member) const {
+  member.each(0, in_.num_vertices, [&](int64_t begin, int64_t end) {
+    for (auto v = static_cast<int>(begin); v < end; ++v) near_.settle(v, source_.moved(v));
+  });
+  member.barrier();
+  member.each(0, near_.pairs(), [&](int64_t begin, int64_t end) { near_.sort(begin, end); });
+  member.barrier();
+}
+
+template <class T>
 void ContactScene<T>::limit(int64_t first, int64_t last, int64_t begin, int64_t end, uint8_t* limits) const {
   const Before before{s_.x, before_.get(), positions_.position, first * kLanes, last * kLanes};
   const Source<T, Before> source{in_, scene_, before};
   for (int64_t at = begin * kLanes; at < end * kLanes; ++at) {
     const int32_t v = plan_.order[at];
     if (v < 0) continue;
+    const bool near = near_.refresh(v);
+    if (!near && limits[v] == 0) continue;
     T* x = s_.x + 4 * at;
     const Vec3<T> from = vector_at(before_.get() + 4 * at), d = vector_at(x) - from;
-    const int exponent = limit_by_pairs(source, v, d, 0, 1, limit_by_room(source, v, from, d));
+    int exponent = limits[v];
+    if (near) exponent = limit_by_pairs(source, v, d, 0, 1, exponent);
     limits[v] = static_cast<uint8_t>(exponent);
     if (exponent > 0) {
       const Vec3<T> to = from + limit_of<T>(exponent) * d;
@@ -60,20 +102,57 @@ void ContactScene<T>::each_vertex(int64_t begin, int64_t end, const F& f) const 
     const int32_t v = plan_.order[at];
     if (v < 0) continue;
     const int64_t row = scene_ * in_.corners + v;
-    const bool touches = in_.listed.ptr[row] < in_.listed.ptr[row + 1] || in_.planes > 0 ||
-                         (in_.lag && in_.lagged.ptr[row] < in_.lagged.ptr[row + 1]);
+    near_.refresh(v);
+    const bool touches =
+        near_.has_pairs(v) || in_.planes > 0 || (in_.lag && in_.lagged.ptr[row] < in_.lagged.ptr[row + 1]);
     if (touches) f(v, at / kLanes, static_cast<int>(at % kLanes));
   }
 }
 
 template <class T>
+void put(T* column, int row, const Vec3<T>& a) {
+  column[row * kLanes] = a.x, column[(row + 1) * kLanes] = a.y, column[(row + 2) * kLanes] = a.z;
+}
+
+// Fills the columns column_of(entry, kind) with the near pairs of vertex v that are not out of reach.
+template <class T>
+template <class F>
+void ContactScene<T>::each_pair(int32_t v, const F& column_of) const {
+  const PairList::Entries all = in_.listed.of(scene_ * in_.corners + v);
+  for (int e = 0; e < all.count; ++e) {
+    const int64_t entry = all.first[e], pair = entry >> 2;
+    const int32_t* record = in_.listed.pairs + kPairRow * pair;
+    const T* constants = in_.constants + kConstants * pair;
+    if (source_.is_far(record, constants)) continue;
+    const Corners<T> c = source_.corners(record);
+    T* column = column_of(entry, record[4]);
+    for (int k = 1; k < 4; ++k) put(column, 3 * (k - 1), c.x[k]);
+    for (int i = 0; i < 3; ++i) column[(9 + i) * kLanes] = constants[i];
+    column[12 * kLanes] = static_cast<T>(entry & 3);
+  }
+}
+
+template <class T>
 void ContactScene<T>::assemble(int64_t begin, int64_t end) const {
+  const auto deliver = [](T* to, const T* result) {
+    for (int i = 0; i < kContactScalars; ++i) to[i * kLanes] += result[i];
+  };
+  PairBatches<T, T*, kPairGiven, kPairBlock, decltype(deliver)> batches(kernels_.add, kappa(), h_ * h_, deliver);
   each_vertex(begin, end, [&](int32_t v, int64_t block, int lane) {
-    Vec3<T> g = zero3<T>();
-    Sym3<T> H = diagonal(T(0));
-    add_pairs(source_, v, 0, 1, h_, g, H);
+    T* to = record(block, lane, 0);
+    for (int i = 0; i < kContactScalars; ++i) to[i * kLanes] = T(0);
+    each_pair(v, [&](int64_t, int kind) { return batches.add(kind, to); });
+  });
+  batches.flush();
+  if (!in_.lag && in_.planes == 0) return;
+  each_vertex(begin, end, [&](int32_t v, int64_t block, int lane) {
+    T* to = record(block, lane, 0);
+    const auto at = [&](int i) { return to[i * kLanes]; };
+    Vec3<T> g{at(0), at(1), at(2)};
+    Sym3<T> H{at(3), at(4), at(5), at(6), at(7), at(8)};
+    add_lags(source_, v, 0, 1, h_, g, H);
     const T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
-    for (int i = 0; i < 9; ++i) *record(block, lane, i) = values[i];
+    for (int i = 0; i < kContactScalars; ++i) to[i * kLanes] = values[i];
   });
 }
 
@@ -84,8 +163,14 @@ void ContactScene<T>::prepare(int sweep, int tape_policy, int64_t begin, int64_t
     const int count = plan_.block_rank[block + 1] - plan_.block_rank[block];
     const T* at = s_.tape + sweep * rows * plan_.num_active + plan_.block_rank[block];
     for (int lane = 0; lane < count; ++lane) {
+      const int32_t v = plan_.order[block * kLanes + lane];
+      const Vec3<T> after = vector_at(s_.x + 4 * (block * kLanes + lane));
       for (int c = 0; c < 3; ++c) s_.x[4 * (block * kLanes + lane) + c] = at[c * plan_.num_active + lane];
-      s_.limit[block * kLanes + lane] = limit_of<T>(limits[plan_.order[block * kLanes + lane]]);
+      if (near_.has_pairs(v)) {
+        const Vec3<T> center = in_.center_of(scene_, v);
+        near_.go(v, after - center, vector_at(s_.x + 4 * (block * kLanes + lane)) - center, T(0));
+      }
+      s_.limit[block * kLanes + lane] = limit_of<T>(limits[v]);
     }
   }
   each_vertex(begin, end, [&](int32_t v, int64_t block, int lane) {
@@ -98,19 +183,33 @@ void ContactScene<T>::prepare(int sweep, int tape_policy, int64_t begin, int64_t
 
 template <class T>
 void ContactScene<T>::reverse(int64_t begin, int64_t end) const {
+  const auto deliver = [&](int64_t entry, const T* result) {
+    for (int k = 0; k < 4; ++k) send(*reverse_, entry, k, vector_at(result + 3 * k));
+    reverse_->kappa[entry] += result[12];
+  };
+  PairBatches<T, int64_t, kTurnGiven, kPairBars, decltype(deliver)> batches(kernels_.reverse, kappa(), h_ * h_,
+                                                                            deliver);
   each_vertex(begin, end, [&](int32_t v, int64_t block, int lane) {
     const T* turn = s_.turn + block * 6 * kLanes + lane;
     const auto at = [&](int i) { return turn[i * kLanes]; };
+    const Vec3<T> p{at(0), at(1), at(2)}, d_raw{at(3), at(4), at(5)};
+    each_pair(v, [&](int64_t entry, int kind) {
+      T* column = batches.add(kind, entry);
+      put(column, kPairGiven, p), put(column, kPairGiven + 3, d_raw);
+      return column;
+    });
     Vec3<T> own = zero3<T>();
-    reverse_pairs(source_, *reverse_, v, 0, 1, h_, {at(0), at(1), at(2)}, {at(3), at(4), at(5)}, own);
+    reverse_lags(source_, *reverse_, v, 0, 1, h_, p, d_raw, own);
     add_at(s_.x_bar + 4 * (block * kLanes + lane), own);
     add_at(reverse_->prev + 3 * (scene_ * in_.corners + v), -own);
   });
+  batches.flush();
 }
 
 template <class T>
 void ContactScene<T>::finish(T* collider_bar) const {
   for (int32_t v = 0; v < in_.corners; ++v) {
+    near_.refresh(v);
     Vec3<T> now = zero3<T>(), prev = zero3<T>();
     take_pairs(in_, *reverse_, scene_, v, 0, 1, now, prev);
     add_at(v < in_.num_vertices ? s_.x_bar + int64_t{4} * positions_.position[v]

@@ -1,8 +1,9 @@
 // Contact on the CPU: the passes of contact/passes.h over the blocks of a color.
 #pragma once
 
-#include "../contact/passes.h"
-#include "scene.h"
+#include "kernels.h"
+#include "near.h"
+#include "team.h"
 
 namespace diffvbd {
 
@@ -16,10 +17,15 @@ class ContactScene {
 
   // The pairs' part of the blocks [begin, end).
   void assemble(int64_t begin, int64_t end) const;
-  // Before and after the updates of the color that is the blocks [first, last): remembers where its vertices were, and
-  // takes back what planes do not let pass of their motion; limits [V] receives the exponents.
+  // Before and after the updates of the color that is the blocks [first, last): remembers where its vertices were; says
+  // where they want to go, so that search() finds what comes near; and takes back what planes do not let pass of their
+  // motion; limits [V] receives the exponents.
   void remember(int64_t begin, int64_t end) const;
+  void propose(int64_t first, int64_t last, int64_t begin, int64_t end, uint8_t* limits) const;
+  void search(int64_t begin, int64_t end) const;
   void limit(int64_t first, int64_t last, int64_t begin, int64_t end, uint8_t* limits) const;
+  // After the first sweep, which goes farthest: what is near by the ways that are left.
+  void settle(Team::Member& member) const;
   // Reverse, before a color's turn: its vertices go back to the positions before their update, which `tape` names, and
   // collect what pairs have sent them since their last turn.
   void prepare(int sweep, int tape_policy, int64_t begin, int64_t end, const uint8_t* limits) const;
@@ -44,16 +50,22 @@ class ContactScene {
   };
   template <class F>
   void each_vertex(int64_t begin, int64_t end, const F& f) const;
+  template <class F>
+  void each_pair(int32_t v, const F& column_of) const;
   T* record(int64_t block, int lane, int scalar) const;
+  T kappa() const { return in_.kappa.data[scene_ * in_.kappa.scene]; }
 
   const Plan& plan_;
-  const contact::ContactInputs<T>& in_;
+  const contact::ContactInputs<T>& given_;
+  contact::ContactInputs<T> in_;  // the same with what is near
   const contact::ContactAdjoints<T>* reverse_;
   const int64_t scene_;
   SceneView<T>& s_;
   const T h_;
+  const PairKernels<T> kernels_;
   const Buffer<T> before_;  // [blocks kLanes, 4]  where the vertices of a color were before it moved
   const Positions positions_;
+  mutable NearPairs<T> near_;
   const contact::Source<T, Positions> source_;
 };
 

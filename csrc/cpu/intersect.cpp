@@ -1,5 +1,6 @@
 #include "intersect.h"
 
+#include "kernels.h"
 #include "tree.h"
 
 namespace diffvbd {
@@ -7,59 +8,48 @@ namespace {
 
 using namespace contact;
 
-// Triangles near a group of edges, one number of all of them after the other: four at a time are compared with an edge.
+// Triangles near a group of edges, in rows for the kernel that compares them with an edge.
 class Met {
  public:
-  void clear() {
-    for (auto& side : sides_) side.clear();
-    for (auto& corner : corners_) corner.clear();
-    items_.clear();
-  }
+  void clear() { count_ = 0; }
   void add(const Box& box, const int32_t* corners) {
+    if (count_ == stride_) grow();
     const float sides[] = {box.lo.x, box.lo.y, box.lo.z, box.hi.x, box.hi.y, box.hi.z};
-    for (int k = 0; k < 6; ++k) sides_[k].push_back(sides[k]);
-    for (int k = 0; k < 3; ++k) corners_[k].push_back(corners[k]);
-    items_.push_back(box.item);
-  }
-  // Up to a whole number of fours.
-  void fill_up() {
-    const int32_t none[] = {-1, -1, -1};
-    while (items_.size() % kLanes != 0) add(empty_box(), none);
+    for (int k = 0; k < 6; ++k) sides_[k * stride_ + count_] = sides[k];
+    for (int k = 0; k < 3; ++k) corners_[k * stride_ + count_] = corners[k];
+    items_[count_++] = box.item;
   }
   // visit(triangle) for those whose boxes overlap that of an edge with which they share no vertex.
   template <class Visit>
-  void each_near(const Box& own, const int32_t* ends, const Visit& visit) const {
-    const float lo[] = {own.lo.x, own.lo.y, own.lo.z}, hi[] = {own.hi.x, own.hi.y, own.hi.z};
-    for (size_t i = 0; i < items_.size(); i += kLanes) {
-      Bits out{};
-      for (int k = 0; k < 3; ++k) {
-        out |= (four<Floats>(sides_[k], i) > hi[k]) | (lo[k] > four<Floats>(sides_[3 + k], i));
-        const Bits corner = four<Bits>(corners_[k], i);
-        out |= (corner == ends[0]) | (corner == ends[1]);
-      }
-      const Halves halves = reinterpret_cast<Halves>(out);
-      if ((halves[0] & halves[1]) == -1) continue;
-      for (size_t lane = 0; lane < kLanes; ++lane) {
-        if (out[lane] == 0) visit(items_[i + lane]);
-      }
-    }
+  void each_near(const Box& own, const int32_t* ends, const Visit& visit) {
+    const float box[] = {own.lo.x, own.lo.y, own.lo.z, own.hi.x, own.hi.y, own.hi.z};
+    const int found = meet_(BoxRows{sides_.data(), corners_.data(), stride_, count_}, box, ends, near_.data());
+    for (int i = 0; i < found; ++i) visit(items_[near_[i]]);
+  }
+  // Up to a whole number of packs.
+  void fill_up() {
+    const int32_t none[] = {-1, -1, -1};
+    while (count_ % kBoxLanes != 0) add(empty_box(), none);
   }
 
  private:
-  static constexpr size_t kLanes = 4;
-  using Floats = float __attribute__((vector_size(16)));
-  using Bits = int32_t __attribute__((vector_size(16)));
-  using Halves = int64_t __attribute__((vector_size(16)));
-  template <class Four, class Number>
-  static Four four(const std::vector<Number>& from, size_t i) {
-    Four out;
-    __builtin_memcpy(&out, from.data() + i, sizeof out);
-    return out;
+  void grow() {
+    const int stride = stride_ == 0 ? 8 * kBoxLanes : 2 * stride_;
+    const auto widen = [&](auto& rows, int count) {
+      rows.resize(static_cast<size_t>(count) * stride);
+      for (int k = count - 1; k > 0; --k) {
+        std::copy_backward(rows.begin() + k * stride_, rows.begin() + (k + 1) * stride_,
+                           rows.begin() + k * stride + stride_);
+      }
+    };
+    widen(sides_, 6), widen(corners_, 3), widen(items_, 1), widen(near_, 1);
+    stride_ = stride;
   }
 
-  std::array<std::vector<float>, 6> sides_;
-  std::array<std::vector<int32_t>, 3> corners_;
-  std::vector<int32_t> items_;
+  const MeetKernel meet_ = meet_kernel();
+  int stride_ = 0, count_ = 0;
+  std::vector<float> sides_;
+  std::vector<int32_t> corners_, items_, near_;
 };
 
 // The search in one scene after the other, with the same memory.

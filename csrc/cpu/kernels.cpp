@@ -72,11 +72,19 @@ CoarseKernels<T> coarse_kernels(int energies) {
   return out;
 }
 
+template <class T>
+PairKernels<T> pair_kernels() {
+  return kernels<T>().pairs;
+}
+MeetKernel meet_kernel() { return kernels<float>().meet; }
+
 template SweepKernel<float> forward_kernel<float>(int);
 template SweepKernel<double> forward_kernel<double>(int);
 template SweepKernel<float> reverse_kernel<float>(int);
 template SweepKernel<double> reverse_kernel<double>(int);
 template CoarseKernels<float> coarse_kernels<float>(int);
 template CoarseKernels<double> coarse_kernels<double>(int);
+template PairKernels<float> pair_kernels<float>();
+template PairKernels<double> pair_kernels<double>();
 
 }  // namespace diffvbd

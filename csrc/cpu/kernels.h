@@ -1,6 +1,8 @@
 // The two hot loops of the CPU backend, chosen by a scene's energies and by what the processor can do.
 #pragma once
 
+#include "box_lanes.h"
+#include "pair_kernels.h"
 #include "scene.h"
 
 namespace diffvbd {
@@ -40,12 +42,17 @@ struct CoarseKernels {
 };
 template <class T>
 CoarseKernels<T> coarse_kernels(int energies);
+template <class T>
+PairKernels<T> pair_kernels();
+MeetKernel meet_kernel();
 
 // The loops of one instruction set: each is compiled in files of its own, sweep_<scalar>_<set>.cpp.
 template <class T>
 struct Kernels {
   SweepKernel<T> (*forward)(int energies), (*reverse)(int energies);
   CoarseKernels<T> (*coarse)(int energies);
+  PairKernels<T> pairs;
+  MeetKernel meet;
 };
 namespace baseline {
 template <class T>

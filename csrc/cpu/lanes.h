@@ -91,6 +91,16 @@ DIFFVBD_FN bool any(const Mask<I>& condition) {
   for (int l = 0; l < kLanes; ++l) found |= condition.v[l];
   return found != 0;
 }
+template <class I>
+DIFFVBD_FN bool all(const Mask<I>& condition) {
+  int64_t kept = -1;
+  for (int l = 0; l < kLanes; ++l) kept &= condition.v[l];
+  return kept != 0;
+}
+template <class I>
+DIFFVBD_FN Mask<I> both(const Mask<I>& a, const Mask<I>& b) {
+  return {a.v & b.v};
+}
 template <class T>
 DIFFVBD_FN Lanes<T> square_root(const Lanes<T>& a) {
   Lanes<T> r;

@@ -205,6 +205,7 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
         }
         if (k == in.sweeps) break;
         const StepParameters<T> q = of_sweep(in.parameters, k + 1 == in.sweeps);
+        if (contact && k == 1) contact->settle(member);
         for (int c = 0; c < plan.colors; ++c) {
           const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
           if (contact) {
@@ -214,11 +215,15 @@ void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8
             });
             member.barrier();
           }
-          member.each(first, last,
-                      [&](int64_t begin, int64_t end) { kernel(plan, scene.view, q, k, in.tape_policy, begin, end); });
+          member.each(first, last, [&](int64_t begin, int64_t end) {
+            kernel(plan, scene.view, q, k, in.tape_policy, begin, end);
+            if (contact) contact->propose(first, last, begin, end, cut + (b * in.sweeps + k) * plan.num_vertices);
+          });
           member.barrier();
           if (contact) {
             uint8_t* limits = cut + (b * in.sweeps + k) * plan.num_vertices;
+            member.each(first, last, [&](int64_t begin, int64_t end) { contact->search(begin, end); });
+            member.barrier();
             member.each(first, last,
                         [&](int64_t begin, int64_t end) { contact->limit(first, last, begin, end, limits); });
             member.barrier();
@@ -280,7 +285,9 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
             contact->prepare(k, in.tape_policy, begin, end, limits + (b * in.sweeps + k) * n);
           });
           member.barrier();
+          member.each(first, last, [&](int64_t begin, int64_t end) { contact->search(begin, end); });
           if (in.tape_policy != kFullTape) {
+            member.barrier();
             member.each(first, last, [&](int64_t begin, int64_t end) { contact->assemble(begin, end); });
             member.barrier();
           }

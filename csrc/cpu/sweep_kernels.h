@@ -23,7 +23,7 @@ CoarseKernels<T> coarse(int energies) {
 
 template <class T>
 Kernels<T> sweep_kernels() {
-  return {forward<T>, reverse<T>, coarse<T>};
+  return {forward<T>, reverse<T>, coarse<T>, {add_lanes<T>, reverse_lanes<T>}, meet_boxes};
 }
 
 }  // namespace diffvbd::DIFFVBD_SET

@@ -74,20 +74,22 @@ struct ContactSlots {
   const contact::ContactInputs<T>& in;
   int64_t scenes, listed, lagged;
   diffvbd::Buffer<T> rows, lag_rows, kappa, lag, prev;
+  diffvbd::Buffer<uint8_t> sent;
 
   ContactSlots(const contact::ContactInputs<T>& pairs, int64_t scenes)
       : in(pairs),
         scenes(scenes),
         listed(pairs.listed.ptr[scenes * pairs.corners] / 4),
         lagged(pairs.lag ? pairs.lagged.ptr[scenes * pairs.corners] / 4 : 0),
-        rows(48 * listed, true),
+        rows(48 * listed),
         lag_rows(48 * lagged, true),
         kappa(4 * listed, true),
         lag(4 * lagged * contact::kLagScalars, true),
-        prev(3 * scenes * pairs.corners, true) {}
+        prev(3 * scenes * pairs.corners, true),
+        sent(16 * listed, true) {}
 
   contact::ContactAdjoints<T> pointers(T* floor_lag) const {
-    return {rows.get(), lag_rows.get(), kappa.get(), lag.get(), floor_lag, prev.get()};
+    return {rows.get(), lag_rows.get(), kappa.get(), lag.get(), floor_lag, prev.get(), sent.get()};
   }
   // in a fixed order
   void sum(const diffvbd::SweepBars& bars) const {

@@ -1,0 +1,171 @@
+// Which listed pairs can matter in a sweep, kept from one color to the next: most of a list is out of reach of what its
+// vertices do, and to look at each pair of it in every color takes longer than the updates themselves.
+//
+// A vertex keeps an anchor: a motion since the start of the part, a radius around it that its motion stays within, and
+// the longest update that it may try. By those of its corners a pair is far if its gap exceeds dhat and what updates
+// may close: the passes would leave it out at every visit. A vertex that leaves its radius takes a new anchor and looks
+// at its far pairs anew. What is near stays near, until settle().
+#pragma once
+
+#include <atomic>
+#include <vector>
+
+#include "../contact/passes.h"
+#include "scene.h"
+
+namespace diffvbd {
+
+template <class T>
+class NearPairs {
+ public:
+  // motion(v): of corner point v since the start of the part
+  template <class Motion>
+  NearPairs(const contact::ContactInputs<T>& in, int64_t scene, const Motion& motion)
+      : in_(in),
+        row_(scene * in.corners),
+        start_(in.listed.ptr[row_]),
+        first_pair_(start_ / 4),
+        anchors_(in.corners),
+        clear_(in.corners, std::numeric_limits<T>::infinity()),
+        due_(in.corners),
+        stale_(in.corners, 1),
+        near_((in.listed.ptr[row_ + in.corners] - start_) / 4),
+        count_(in.corners),
+        entries_(4 * near_.size()) {
+    for (int v = 0; v < in.corners; ++v) {
+      anchors_[v] = {motion(v), T(0), T(0)};
+      extend(anchors_[v]);
+    }
+    for (int64_t p = 0; p < pairs(); ++p) {
+      const T slack = slack_of(first_pair_ + p);
+      near_[p] = !is_far(first_pair_ + p);
+      for (int k = 0; k < 4 && T(0) < slack; ++k) {
+        T& least = clear_[in.listed.pairs[contact::kPairRow * (first_pair_ + p) + k]];
+        least = slack < least ? slack : least;
+      }
+    }
+  }
+
+  int64_t pairs() const { return static_cast<int64_t>(near_.size()); }
+  // Of the pairs [begin, end) those that are near; the lists of all corner points are stale then.
+  void sort(int64_t begin, int64_t end) {
+    for (int64_t p = begin; p < end; ++p) near_[p] = !is_far(first_pair_ + p);
+  }
+  // A new anchor with a smaller radius, before all pairs are sorted again.
+  void settle(int v, const Vec3<T>& motion) {
+    anchors_[v] = {motion, T(kLeft) * anchors_[v].radius, T(kLeft) * anchors_[v].length};
+    stale_[v] = 1;
+  }
+  bool has_pairs(int v) const { return in_.listed.ptr[row_ + v] < in_.listed.ptr[row_ + v + 1]; }
+
+  // The list with what is near.
+  contact::PairList view() const {
+    contact::PairList out = in_.listed;
+    out.near = entries_.data(), out.near_count = count_.data(), out.near_row = row_, out.near_start = start_;
+    return out;
+  }
+
+  // Vertex v goes from one motion to another, or a part of the way, in an update of this length, guard included; 0 in
+  // the reverse. Its pairs are looked at in search(), once all vertices of its color have said so.
+  void go(int v, const Vec3<T>& from, const Vec3<T>& to, T length) {
+    Anchor& a = anchors_[v];
+    const bool leaves =
+        !(contact::length_of(to - a.motion) <= a.radius) || !(contact::length_of(from - a.motion) <= a.radius);
+    due_[v] = leaves || a.length < length;
+    if (!due_[v]) return;
+    if (leaves) {
+      a.motion = to;
+      a.radius = T(kAhead) * contact::length_of(to - from) + T(kRounded) * contact::length_of(to);
+    }
+    if (a.length < length) a.length = T(kAhead) * length;
+    extend(a);
+  }
+  void search(int v) {
+    if (!due_[v]) return;
+    due_[v] = 0;
+    const T reach = reach_.load(std::memory_order_relaxed);
+    if (reach < clear_[v]) return;
+    const int32_t* entry = in_.listed.entry + in_.listed.ptr[row_ + v];
+    const int count = in_.listed.ptr[row_ + v + 1] - in_.listed.ptr[row_ + v];
+    for (int e = 0; e < count; ++e) {
+      const int64_t pair = entry[e] >> 2;
+      uint8_t* near = near_.data() + (pair - first_pair_);
+      if (load(near) || reach < slack_of(pair) || is_far(pair)) continue;
+      store(near);
+      for (int k = 0; k < 4; ++k) store(stale_.data() + in_.listed.pairs[contact::kPairRow * pair + k]);
+    }
+  }
+  // Whether v has near pairs; after this view() has them.
+  bool refresh(int v) {
+    if (!stale_[v]) return count_[v] > 0;
+    stale_[v] = 0;
+    const int32_t *from = in_.listed.entry + in_.listed.ptr[row_ + v],
+                  *end = in_.listed.entry + in_.listed.ptr[row_ + v + 1];
+    int32_t *out = entries_.data() + (in_.listed.ptr[row_ + v] - start_), *begin = out;
+    for (; from < end; ++from) {
+      *out = *from;
+      out += near_[(*from >> 2) - first_pair_];
+    }
+    count_[v] = static_cast<int32_t>(out - begin);
+    return count_[v] > 0;
+  }
+
+ private:
+  static constexpr double kAhead = 2.0;     // of what a vertex does, up to where it keeps its anchor
+  static constexpr double kLeft = 0.25;     // of that, for what comes after the first sweep
+  static constexpr double kRounded = 1e-6;  // of lengths, that rounding cannot reach
+
+  struct alignas(4 * sizeof(T)) Anchor {
+    Vec3<T> motion;
+    T radius, length;
+  };
+
+  // Several threads may find the same pair.
+  static bool load(const uint8_t* flag) { return __atomic_load_n(flag, __ATOMIC_RELAXED) != 0; }
+  static void store(uint8_t* flag) { __atomic_store_n(flag, uint8_t{1}, __ATOMIC_RELAXED); }
+
+  // What no two anchors can be apart, with all around them, and no update can close: most of what is far is so by that.
+  void extend(const Anchor& a) {
+    const T own = T(2 + kRounded) * (contact::length_of(a.motion) + a.radius + a.length);
+    T most = reach_.load(std::memory_order_relaxed);
+    while (most < own && !reach_.compare_exchange_weak(most, own, std::memory_order_relaxed)) {
+    }
+  }
+  T slack_of(int64_t pair) const {
+    const T* constants = in_.constants + contact::kConstants * pair;
+    return contact::PairHints<T>(constants).gap - contact::PairConstants<T>(constants).dhat;
+  }
+  bool is_far(int64_t pair) const {
+    const int32_t* record = in_.listed.pairs + contact::kPairRow * pair;
+    const T* constants = in_.constants + contact::kConstants * pair;
+    const int first = contact::sides(record[4]);
+    const Anchor* a[4];
+    T radius[2] = {T(0), T(0)}, length = contact::PairConstants<T>(constants).dhat, most = T(0);
+    for (int k = 0; k < 4; ++k) {
+      a[k] = anchors_.data() + record[k];
+      T& of_side = radius[k < first ? 0 : 1];
+      of_side = of_side < a[k]->radius ? a[k]->radius : of_side;
+      length = length < a[k]->length ? a[k]->length : length;
+    }
+    const T room = contact::PairHints<T>(constants).gap - length - T(1 + kRounded) * (radius[0] + radius[1]);
+    if (!(T(0) < room)) return false;
+    for (int i = 0; i < first; ++i) {
+      for (int j = first; j < 4; ++j) {
+        const Vec3<T> d = a[i]->motion - a[j]->motion;
+        const T square = dot(d, d);
+        most = most < square ? square : most;
+      }
+    }
+    return T(1 + 4 * kRounded) * most < room * room;
+  }
+
+  const contact::ContactInputs<T>& in_;
+  const int64_t row_, start_, first_pair_;
+  std::vector<Anchor> anchors_;
+  std::atomic<T> reach_{T(0)};
+  std::vector<T> clear_;  // of the pairs of a corner point that may be far, the least gap less dhat
+  std::vector<uint8_t> due_, stale_, near_;
+  std::vector<int32_t> count_, entries_;
+};
+
+}  // namespace diffvbd
