@@ -21,6 +21,7 @@ from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
 from ..ops.detect import CONSTANTS
 from ..scopes import checking, recorders
+from .contact_cycles import Combined, record_combined, swept_part
 from .intersections import refuse_intersections
 from .rigid_contact import correct
 from .rigid_terms import Scenes
@@ -62,6 +63,7 @@ class Detection(NamedTuple):
     corrections: Tensor | None = None
     limits: Tensor | None = None
     frames: Tensor | None = None  # and of the rigid motions of its start [B, bodies]
+    combined: Combined | None = None  # which combinations of its iterates were taken; None where there are none
     kept: Tensor | None = None  # rows of listed pairs that its sweeps can reach; all where that would have to be read
 
 
@@ -80,6 +82,7 @@ class Met:
     def __init__(self, x: Tensor) -> None:
         self.found: list[Detection] = []
         self.counts: list[Tensor] = []
+        self.combined: list[Combined | None] = []
         self.cut = torch.zeros_like(x[..., 0], dtype=torch.bool)
 
 
@@ -227,10 +230,10 @@ class ContactStep:
             room = rooms_of_sweeps(motion, barrier, start, x, begin, wanted, rigid)
             near, kept = self._narrowed(detection.listed, x, now, room)
             start = start._replace(center=x.detach(), room=room)
-            taken, limits, cut = [first], None, start.short
+            taken, limits, combined, cut = [first], None, None, start.short
             if sweeps:
                 part = settings._replace(sweeps=sweeps)
-                x, limits = self._sweep(x, start.center, start.room, now, near, part, policy, debug_step)
+                x, limits, combined = swept_part(self, x, start, now, near, part, policy, debug_step)
                 x, last = self._corrected(x, now, start, self._between(near))
                 taken.append(last)
                 cut = limits[:, -1] > 0  # what the start has held up, sweeps may have made good
@@ -238,7 +241,8 @@ class ContactStep:
             for found in recorders():
                 taken_all = torch.stack(taken)
                 found.append(detection._replace(shares=start.shares, corrections=taken_all, limits=limits, kept=kept,
-                                                frames=start.frames))  # fmt: skip
+                                                frames=start.frames, combined=combined))  # fmt: skip
+            met.combined.append(combined)
             left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
         return self._judged(x, met)
 
@@ -250,8 +254,10 @@ class ContactStep:
                           x.new_ones((2, *room.shape)))  # fmt: skip
         x, _ = self._corrected(x, self.colliders, start, none)
         if self.prepared.settings.sweeps:
-            x, _ = self._sweep(x, start.center, room, self.colliders, none, self.prepared.settings, policy, debug_step)
+            settings = self.prepared.settings
+            x, _, combined = swept_part(self, x, start, self.colliders, none, settings, policy, debug_step)
             x, _ = self._corrected(x, self.colliders, start, none)
+            record_combined(self.model, x, [combined])
         return x
 
     def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> tuple[Tensor, Tensor]:
@@ -302,6 +308,7 @@ class ContactStep:
     def _judged(self, x: Tensor, met: Met) -> Tensor:
         """x, or NaN where a captured or compiled step, which cannot raise, must not be trusted."""
         self._record(met)
+        record_combined(self.model, x, met.combined)
         table, capacity = torch.stack(met.counts), self.capacity
         if torch.compiler.is_compiling() or (x.is_cuda and torch.cuda.is_current_stream_capturing()):
             good = (table[:, :2] <= torch.stack([table.new_full((), capacity), table.new_zeros(())])).all()
