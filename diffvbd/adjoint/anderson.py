@@ -13,24 +13,45 @@ and autograd joins them with this.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, Protocol
 
 import torch
 from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..model.anderson import MovingBodies
 from ..model.model import Model
 from ..ops import no_second_derivative, of_inputs
 from ..ops.anderson import anderson_combine
 from ..ops.detect import segment_sum
-from .rise import RiseParts, rise_parts, rises
+from .rise import rise_parts
 from .sweep import sweep
 
 REGULARIZATION = 1e-6  # of the diagonal: bounds the condition of the small system, and with it rounding in gradients
 NOISE = 100  # ulps of the positions: differences of residuals that small are rounding, and so are the weights from them
 COARSE_FIELDS = ("coarse_factor", "coarse_mass", "coarse_plan", "coarse_weights", "coarse_rest")
+
+
+class Combining(Protocol):
+    """What combines iterates of its own: the fields of MovingBodies that say which vertices belong together."""
+
+    @property
+    def order(self) -> Tensor: ...
+    @property
+    def ptr(self) -> Tensor: ...
+    @property
+    def of(self) -> Tensor: ...
+
+
+class Judge(Protocol):
+    """Says which bodies may take a combination."""
+
+    @property
+    def bodies(self) -> Combining: ...
+
+    def admits(self, x: Tensor, to: Tensor) -> Tensor:
+        """Whether each body may go from x to ``to`` [B, V, 3], bool [B, bodies]; a constant."""
+        ...
 
 
 class Swept(NamedTuple):
@@ -108,9 +129,7 @@ def none_taken(model: Model, x: Tensor) -> Tensor:
     return x.new_empty((len(x), 0, model._moving.number), dtype=torch.bool)
 
 
-def _combined(
-    moving: MovingBodies, mass: Tensor, states: tuple[Tensor, ...], count: int
-) -> tuple[Tensor, Tensor, Tensor]:
+def _combined(moving: Combining, mass: Tensor, states: tuple[Tensor, ...], count: int) -> tuple[Tensor, Tensor, Tensor]:
     """The combination, and of each body's small system the inverse and the solution, as ops.anderson_combine."""
     noise = NOISE * torch.finfo(mass.dtype).eps
     if not mass.is_cuda:
@@ -119,7 +138,7 @@ def _combined(
     return _combined_in_torch(moving, mass, states, count, noise)
 
 
-def _combined_in_torch(moving: MovingBodies, mass: Tensor, states: tuple[Tensor, ...], count: int,
+def _combined_in_torch(moving: Combining, mass: Tensor, states: tuple[Tensor, ...], count: int,
                        noise: float) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """_combined() for CUDA."""
     residual, of_residuals, of_ends = _differences(states, count)
@@ -144,12 +163,12 @@ def _differences(states: tuple[Tensor, ...], count: int) -> tuple[Tensor, Tensor
     return residuals[-1], of_residuals, of_ends
 
 
-def _sums(moving: MovingBodies, values: Tensor) -> Tensor:
+def _sums(moving: Combining, values: Tensor) -> Tensor:
     """Values of vertices [B, V, C] summed over each body, [B, bodies, C]."""
     return segment_sum(values.contiguous(), moving.order, moving.ptr)
 
 
-def _of_vertices(moving: MovingBodies, values: Tensor) -> Tensor:
+def _of_vertices(moving: Combining, values: Tensor) -> Tensor:
     """Values of bodies [B, bodies, ...] at their vertices, [B, V, ...]; 0 elsewhere."""
     return torch.cat((values, values.new_zeros((len(values), 1, *values.shape[2:]))), 1)[:, moving.of]
 
@@ -161,20 +180,20 @@ def _weighted(vectors: Tensor, weights: Tensor) -> Tensor:
 
 class _Combine(Function):
     """The next iterate [B, V, 3]; whether each body's is the combination, bool [B, bodies]; and its system, as of
-    _combined(). Arguments: masses [1 | B, V], of the comparison, the number of iterates, these, and what a cycle made
-    of each."""
+    _combined(). Arguments: masses [1 | B, V], who admits it, the number of iterates, these, and what a cycle made of
+    each."""
 
     @staticmethod
-    def forward(mass: Tensor, parts: RiseParts, count: int, *states: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        last, moving = states[-1], parts.model._moving
+    def forward(mass: Tensor, judge: Judge, count: int, *states: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        last, moving = states[-1], judge.bodies
         to, inverse, gamma = _combined(moving, mass, states, count)
-        taken = ~rises(parts, last, to)
+        taken = judge.admits(last, to)
         return torch.where(_of_vertices(moving, taken)[..., None], to, last), taken, inverse, gamma
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        mass, parts, ctx.count, *states = inputs
-        ctx.moving = parts.model._moving
+        mass, judge, ctx.count, *states = inputs
+        ctx.moving = judge.bodies
         ctx.save_for_backward(mass, *output[1:], *states)
         ctx.mark_non_differentiable(*output[1:])
         ctx.set_materialize_grads(False)
@@ -195,7 +214,7 @@ class _Combine(Function):
 
 class _CombineBackward(Function):
     @staticmethod
-    def forward(bar: Tensor, moving: MovingBodies, count: int, needs: tuple[bool, ...], mass: Tensor, taken: Tensor,
+    def forward(bar: Tensor, moving: Combining, count: int, needs: tuple[bool, ...], mass: Tensor, taken: Tensor,
                 inverse: Tensor, gamma: Tensor, *states: Tensor) -> tuple[Tensor, ...]:  # fmt: skip
         f, of_f, of_ends = _differences(states, count)
         # a combination that was not taken may be no number

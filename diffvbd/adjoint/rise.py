@@ -27,6 +27,14 @@ class RiseParts(NamedTuple):
     rest: Tensor  # [1 | B, blocks, 7, 8]
     time_step: float
 
+    @property
+    def bodies(self) -> MovingBodies:
+        return self.model._moving
+
+    def admits(self, x: Tensor, to: Tensor) -> Tensor:
+        """Whether the potential of each body lets it go from x to ``to``, bool [B, bodies]."""
+        return ~rises(self, x, to)
+
 
 def rise_parts(model: Model, fields: ops.SweepFields, time_step: float) -> RiseParts:
     """fields: of the step's sweeps."""
@@ -45,14 +53,19 @@ def rise_parts(model: Model, fields: ops.SweepFields, time_step: float) -> RiseP
 def rises(parts: RiseParts, x: Tensor, to: Tensor) -> Tensor:
     """Whether each body's potential at ``to`` is above that at x by more than rounding, or no number, or ``to`` is
     too near a plane, bool [B, bodies]; x, to [B, V, 3]."""
+    rise, size = rise_of_bodies(parts, x, to).unbind(-1)
+    return ~(rise <= ROUNDINGS * torch.finfo(x.dtype).eps * size)  # true of what is no number
+
+
+def rise_of_bodies(parts: RiseParts, x: Tensor, to: Tensor) -> Tensor:
+    """By how much the potential of each body rises, and the sizes of its terms, float64 [B, bodies, 2]; infinite where
+    a vertex comes too near a plane."""
     model, moving = parts.model, parts.model._moving
-    if not x.is_cuda:
-        index = (moving.order, moving.ptr, model._other_bodies.of, moving.corner, moving.block_ptr)
-        out = potential_rise(parts.fields, x, to.contiguous(), parts.material, parts.rest, index, model._data_count,
-                             parts.time_step)  # fmt: skip
-    else:
-        out = _rise(parts, x, to)
-    return ~(out[..., 0] <= ROUNDINGS * torch.finfo(x.dtype).eps * out[..., 1])  # true of what is no number
+    if x.is_cuda:
+        return _rise(parts, x, to)
+    index = (moving.order, moving.ptr, model._other_bodies.of, moving.corner, moving.block_ptr)
+    return potential_rise(parts.fields, x, to.contiguous(), parts.material, parts.rest, index, model._data_count,
+                          parts.time_step)  # fmt: skip
 
 
 def _rise(parts: RiseParts, x: Tensor, to: Tensor) -> Tensor:

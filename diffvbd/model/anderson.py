@@ -22,7 +22,8 @@ class Anderson:
 
     An iterate is a coarse correction with its sweeps, or without coarse corrections one sweep; its residual is the way
     that it goes. Each body combines its own. What would raise a body's incremental potential, or leave a vertex less
-    than a tenth of its gap to a plane, is not taken. The first two iterates and the last are left as they are.
+    than a tenth of its gap to a plane, is not taken. Bodies that contact joins combine and decide together, and nothing
+    crosses. The first two iterates and the last are left as they are.
 
     Args:
         window: Differences of iterates that are combined, 1 to 10: 2 or 3 with coarse corrections, 5 without.

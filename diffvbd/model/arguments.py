@@ -132,8 +132,6 @@ def checked_acceleration(acceleration: Any, energies: tuple[Energy, ...], satura
         return None
     if not isinstance(acceleration, Anderson):
         raise TypeError(f"acceleration: expected a diffvbd.Anderson or None, got {acceleration!r}")
-    if any(isinstance(e, (PairBarrier, Friction)) for e in energies):
-        fail("acceleration", "None beside a PairBarrier or Friction, which its checks do not see", repr(acceleration))
     if any(isinstance(e, StableNeoHookean) and e.block != "exact" for e in energies):
         fail("acceleration", "None without the exact block", repr(acceleration))
     if saturation is not None:

@@ -39,23 +39,42 @@ class Anderson:
         cycles = [min(every, left - begun) for begun in range(0, left, every)]
         return [*alone, *cycles] if len(cycles) > 2 else [sweeps]
 
-    def combine(self, before: list[Tensor], after: list[Tensor], y: Tensor, x_prev: Tensor, taken: Tensor | None
-                ) -> Tensor:  # fmt: skip
+    def combine(
+        self,
+        before: list[Tensor],
+        after: list[Tensor],
+        y: Tensor,
+        x_prev: Tensor,
+        taken: Tensor | None,
+        sets: Tensor | None = None,
+    ) -> Tensor:
         """The next iterate from the last ones and what a cycle made of each [..., 3, V]; taken [..., bodies]: which
-        bodies take the combination, which is decided if it is not given."""
+        bodies take the combination, which is decided if it is not given; sets [..., bodies]: equal for bodies that have
+        one combination, each its own if not given."""
         before, after = before[-self.window - 1 :], after[-self.window - 1 :]
         residuals = [g - x for x, g in zip(before, after, strict=True)]
-        state = after[-1]
-        for b, body in enumerate(self.bodies):
+        systems, ways = [], []
+        for body in self.bodies:
             f = [take(r, body) for r in residuals]
             g = [take(a, body) for a in after]
             of_f, of_g = (torch.stack([q - p for p, q in zip(v[:-1], v[1:], strict=True)], -1) for v in (f, g))
             weighted = self.scene.mass[..., None, body, None] * of_f
-            normal = torch.einsum("...cvi,...cvj->...ij", weighted, of_f)
-            diagonal = normal.diagonal(dim1=-2, dim2=-1)
-            normal = normal + torch.diag_embed(torch.where(diagonal > 0, REGULARIZATION * diagonal, 1.0))
-            gamma = torch.linalg.solve(normal, torch.einsum("...cvi,...cv->...i", weighted, f[-1])[..., None])
-            moved = put(state, body, g[-1] - (of_g @ gamma.unsqueeze(-3))[..., 0])
+            right = torch.einsum("...cvi,...cv->...i", weighted, f[-1])
+            systems.append(torch.cat((torch.einsum("...cvi,...cvj->...ij", weighted, of_f), right[..., None]), -1))
+            ways.append(of_g)
+        system = torch.stack(systems, -3)
+        if sets is not None:
+            together = (sets[..., :, None] == sets[..., None, :]).to(system)
+            system = torch.einsum("...bc,...cij->...bij", together, system)
+        normal, right = system[..., :-1], system[..., -1:]
+        diagonal = normal.diagonal(dim1=-2, dim2=-1)
+        gamma = torch.linalg.solve(
+            normal + torch.diag_embed(torch.where(diagonal > 0, REGULARIZATION * diagonal, 1.0)), right
+        )
+        state = after[-1]
+        for b, body in enumerate(self.bodies):
+            way = (ways[b] @ gamma[..., b, :, :].unsqueeze(-3))[..., 0]
+            moved = put(state, body, take(after[-1], body) - way)
             good = self._falls(b, state, moved, y, x_prev) if taken is None else taken[..., b]
             state = torch.where(good[..., None, None], moved, state)
         return state

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .contact_cycles import in_cycles
 from .distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
 from .energies import FloorBarrier, build_energies
 from .friction import floor_friction, smoothed, tangential6
@@ -33,6 +34,8 @@ class Part(NamedTuple):
     corrections: Tensor  # [1 | 2, B, bodies]: of the rigid motions before and after the sweeps, that each body takes
     limits: Tensor | None = None  # [K, B, V]: of each update, that planes let through
     frames: Tensor | None = None  # [B, bodies]: of the rigid motions of the start; None: there are none
+    # sets of bodies [B, moving bodies], and which of these took combinations, bool [combinations, B, moving bodies]
+    combined: Any = None
     lowest: Tensor | None = None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
 
 
@@ -373,8 +376,8 @@ def contact_step(
         state = correct(at, part.corrections[0])
         number = sweeps // count + (1 if r < sweeps % count else 0)
         if number:
-            limits = None if part.limits is None else part.limits.reshape(number, *x.shape[:-2], 1, -1).to(at)
-            state = run_sweeps(scene, [*energies, *forces], masses, y, state, x_prev, number, limits)
+            swept = partial(run_sweeps, scene, [*energies, *forces], masses, y)
+            state = in_cycles(scene, energies, swept, state, y, x_prev, number, part.limits, part.combined)
             state = correct(state, part.corrections[1])
         short = (part.shares.amin(0) < SHORT).reshape(*x.shape[:-2], 1, -1) & ~pinned
         left = torch.where(short, x_prev + way + lift - state, 0.0)

@@ -14,6 +14,7 @@ from ..adjoint.routes import ReverseSweep
 from ..checks import check_count
 from ..mask import KEEPS_POSITIONS
 from ..model.model import Model
+from ..step.contact import sweeps_of_parts
 from ..step.memory import cuda_scratch
 from .checkpoints import BinomialCheckpoints, _left, choose_schedule
 
@@ -132,8 +133,8 @@ def coarse_scalars(model: Model, sweeps: int) -> int:
 
 def accelerated_states(model: Model, sweeps: int) -> int:
     """States that an accelerated step keeps besides its own start and end: of each cycle, and each combination."""
-    combinations = combinations_of(model, sweeps)
-    return len(cycles_of(model, sweeps)) - 1 + combinations if combinations else 0
+    return sum(len(cycles_of(model, n)) - 1 + combinations_of(model, n)
+               for n in _parts(model, sweeps) if combinations_of(model, n))  # fmt: skip
 
 
 def accelerated_scalars(model: Model, sweeps: int) -> int:
@@ -141,8 +142,13 @@ def accelerated_scalars(model: Model, sweeps: int) -> int:
     if model.acceleration is None:
         return 0
     window = model.acceleration.window
-    sizes = [min(n + 1, window) for n in range(combinations_of(model, sweeps))]
+    sizes = [min(n + 1, window) for part in _parts(model, sweeps) for n in range(combinations_of(model, part))]
     return model._moving.number * sum(n * (n + 1) for n in sizes)
+
+
+def _parts(model: Model, sweeps: int) -> list[int]:
+    """Sweeps of each part of a step: one for each detection of pairs."""
+    return sweeps_of_parts(sweeps, 1 if model.contact is None else model.contact.detections)
 
 
 def _cpu_scratch(model: Model, scenes: int, material: bool, rest: bool) -> int:

@@ -22,6 +22,7 @@ from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
 from ..ops.detect import CONSTANTS
 from ..scopes import checking, recorders
+from .contact_cycles import Combined, record_combined, swept_part
 from .intersections import refuse_intersections
 from .rigid_contact import bodies_of, correct
 from .rooms import Motion, rooms, rooms_of_sweeps, unsupported
@@ -62,6 +63,7 @@ class Detection(NamedTuple):
     corrections: Tensor | None = None
     limits: Tensor | None = None
     frames: Tensor | None = None  # and of the rigid motions of its start [B, bodies]
+    combined: Combined | None = None  # which combinations of its iterates were taken; None where there are none
     kept: Tensor | None = None  # rows of listed pairs that its sweeps can reach; all where that would have to be read
 
 
@@ -80,6 +82,7 @@ class Met:
     def __init__(self, x: Tensor) -> None:
         self.found: list[Detection] = []
         self.counts: list[Tensor] = []
+        self.combined: list[Combined | None] = []
         self.cut = torch.zeros_like(x[..., 0], dtype=torch.bool)
 
 
@@ -215,16 +218,17 @@ class ContactStep:
             room = rooms_of_sweeps(motion, barrier, start, x, begin, wanted, rigid)
             near, kept = self._narrowed(detection.listed, x, now, room)
             start = start._replace(center=x.detach(), room=room)
-            taken, limits, cut = [first], None, start.short
+            taken, limits, combined, cut = [first], None, None, start.short
             if sweeps:
                 part = settings._replace(sweeps=sweeps)
-                x, limits = self._sweep(x, start.center, start.room, now, near, part, policy, debug_step)
+                x, limits, combined = swept_part(self, x, start, now, near, part, policy, debug_step)
                 x, last = self._corrected(x, now, start, near)
                 taken.append(last)
                 cut = limits[:, -1] > 0  # what the start has held up, sweeps may have made good
             met.cut = cut
             met.found[r] = detection._replace(shares=start.shares, corrections=torch.stack(taken), limits=limits,
-                                              kept=kept, frames=start.frames)  # fmt: skip
+                                              kept=kept, frames=start.frames, combined=combined)  # fmt: skip
+            met.combined.append(combined)
             left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
         x = self._judged(x, met)
         for found in recorders():  # a step that is done again, with room for more pairs, counts once
@@ -239,19 +243,26 @@ class ContactStep:
                           x.new_ones((2, *room.shape)))  # fmt: skip
         x, _ = self._corrected(x, self.colliders, start, none)
         if self.prepared.settings.sweeps:
-            x, _ = self._sweep(x, start.center, room, self.colliders, none, self.prepared.settings, policy, debug_step)
+            settings = self.prepared.settings
+            x, _, combined = swept_part(self, x, start, self.colliders, none, settings, policy, debug_step)
             x, _ = self._corrected(x, self.colliders, start, none)
+            record_combined(self.model, x, [combined])
         return x
 
     def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> tuple[Tensor, Tensor]:
         """x after the rigid correction of all bodies that are free, and the share of its motion that each took."""
-        numbers, lagged = self.prepared.settings.numbers, self.lagged
-        fields = ops.TouchingFields(
+        numbers = self.prepared.settings.numbers
+        fields = self.touching(x, collider, start, listed)
+        return correct(self.model, fields, numbers.time_step, numbers.friction_eps)
+
+    def touching(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> ops.TouchingFields:
+        """What all potentials of bodies as wholes are made of, at x [B, V, 3]."""
+        lagged = self.lagged
+        return ops.TouchingFields(
             x, self.x_prev, self.begun.y, self.fields.mass, self.begun.data, self.origin, *bodies_of(self.model),
             collider, self.before, self.kappa, *listed, self.lag, lagged.pairs, lagged.ptr, lagged.entry,
             self.floor_lag, start.center, start.room,
         )  # fmt: skip
-        return correct(self.model, fields, numbers.time_step, numbers.friction_eps)
 
     def _colliders_at(self, share: float) -> Tensor:
         if self.colliders is self.before:
@@ -291,6 +302,7 @@ class ContactStep:
     def _judged(self, x: Tensor, met: Met) -> Tensor:
         """x, or NaN where a captured or compiled step, which cannot raise, must not be trusted."""
         self._record(met)
+        record_combined(self.model, x, met.combined)
         table, capacity = torch.stack(met.counts), self.capacity
         if torch.compiler.is_compiling() or (x.is_cuda and torch.cuda.is_current_stream_capturing()):
             good = (table[:, :2] <= torch.stack([table.new_full((), capacity), table.new_zeros(())])).all()

@@ -24,6 +24,16 @@ class Scenes(NamedTuple):
     time_step: float
     friction_eps: float  # [m]
 
+    @property
+    def listed(self) -> Pairs:
+        f = self.fields
+        return Pairs(f.pairs, f.constants, f.pair_ptr, f.pair_entry)
+
+    @property
+    def lagged(self) -> Pairs:
+        f = self.fields
+        return Pairs(f.lag_pairs, f.constants, f.lag_ptr, f.lag_entry)
+
 
 class PairTerms(NamedTuple):
     """What pairs add: gradient [n, 3] by the motion of their weighted corners, its derivative [n, 3, 3] and weights
@@ -49,7 +59,7 @@ def _slip_rate(u: Tensor, eps: float) -> Tensor:
     return torch.where(slow, (2 - length / eps) / eps, 1 / torch.where(slow, torch.ones_like(length), length))
 
 
-def _log_barrier(gap: Tensor, dhat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def log_barrier(gap: Tensor, dhat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """b / kappa and its first two derivatives, of gaps in (0, dhat)."""
     past, log = gap - dhat, torch.log(gap / dhat)
     part = past / gap
@@ -111,7 +121,7 @@ def _listed(s: Scenes) -> tuple[Pairs, Tensor]:
     """The pairs that push bodies apart, and which of them do: few of those that are listed. All of them where values
     must not decide sizes."""
     f = s.fields
-    listed = Pairs(f.pairs, f.constants, f.pair_ptr, f.pair_entry)
+    listed = s.listed
     corners, kind = corners_of(listed)[1], f.pairs[:, 4]
     apart = f.body[corners[:, 0]] != f.body[torch.where(kind == 1, corners[:, 2], corners[:, 1])]
     if f.x.is_cuda or torch.compiler.is_compiling():
@@ -138,7 +148,7 @@ def pair_terms(s: Scenes) -> list[PairTerms]:
         near = (active[:, 0] > 0) & apart
         height = ((at - at[:, :1].detach()) * n[:, None]).sum(-1)
         gap = torch.where(near, (w * height).sum(-1) - offset, 0.5)
-        b, slope, curvature = _log_barrier(gap, torch.where(near, dhat, 1.0))
+        b, slope, curvature = log_barrier(gap, torch.where(near, dhat, 1.0))
         # the force carries stiffness and mollifier: what is left are ratios of the barrier's derivatives
         load = h2 * torch.where(near, force[:, 0] / -slope, 0.0)
         kappa = f.kappa if f.kappa.shape[0] == 1 else of_scene(f.kappa, listed)
@@ -147,8 +157,7 @@ def pair_terms(s: Scenes) -> list[PairTerms]:
         out.append(PairTerms(listed, torch.where(near[:, None], -h2 * force * n, 0.0), stiffness, w, turned))
     if f.lag.numel():
         load, rate, n, w = f.lag.split((1, 1, 3, 4), -1)
-        lagged = Pairs(f.lag_pairs, f.constants, f.lag_ptr, f.lag_entry)
-        scene, corners = corners_of(lagged)
+        scene, corners = corners_of(s.lagged)
         moved = points[scene, corners] - torch.cat([f.x_prev, f.collider_prev], 1)[scene, corners]
         m = (w[..., None] * moved).sum(1)
         along = (n * m).sum(-1, keepdim=True)
@@ -156,7 +165,7 @@ def pair_terms(s: Scenes) -> list[PairTerms]:
         slip = h2 * load * _slip_rate(u, s.friction_eps)[:, None]
         eye = torch.eye(3, dtype=f.x.dtype, device=f.x.device)
         stiffness = slip[..., None] * (eye - outer(n)) + (h * rate)[..., None] * outer(n)
-        out.append(PairTerms(lagged, slip * u + h * rate * approach * n, stiffness, w))
+        out.append(PairTerms(s.lagged, slip * u + h * rate * approach * n, stiffness, w))
     return out
 
 

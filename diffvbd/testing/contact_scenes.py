@@ -168,7 +168,9 @@ def part_of(detection: Any) -> reference.Part:
         pairs, constants = pairs[rows], constants[rows]
     return reference.Part(pairs, constants, detection.island.cpu().long(), detection.shares.cpu(),
                           detection.corrections.cpu(), limits,
-                          None if detection.frames is None else detection.frames.cpu(), lowest)  # fmt: skip
+                          None if detection.frames is None else detection.frames.cpu(), lowest=lowest,
+                          combined=None if detection.combined is None else tuple(t.cpu() for t in detection.combined)
+                          )  # fmt: skip
 
 
 def split(leaves: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

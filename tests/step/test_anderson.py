@@ -249,7 +249,6 @@ def test_solve_and_the_equation() -> None:
         ({"acceleration": "anderson"}, "acceleration: expected a diffvbd.Anderson or None"),
         ({"saturation": 0.1}, "acceleration: expected None with saturation"),
         ({"energies": dv.StableNeoHookean("paper")}, "the exact block"),
-        ({"energies": (dv.StableNeoHookean(), dv.PairBarrier(1e3, 0.01))}, "beside a PairBarrier"),
     ],
 )
 def test_refused(options: dict[str, Any], message: str) -> None:
