@@ -36,13 +36,21 @@ struct AdvanceInputs {
   DIFFVBD_FN int64_t scene_of_unit(int64_t unit) const { return unit / (whole ? bodies : vertices); }
 };
 
+// How a vertex has moved since the gaps of pairs were taken, and where it would be if it went on as it tries.
+template <class T>
+struct Motion {
+  Vec3<T> since, end;
+  T size;  // of its position, which rounding is measured by
+};
+
 // What changes while it is worked out, of each unit.
 template <class T>
 struct AdvanceState {
-  T *share, *now;            // of the whole way after the moves so far; of what is left, tried in this one
-  uint8_t *blocked, *stamp;  // something does not let it pass; the round in which it last tried less
-  uint8_t* failed;           // [B]  a scene in which something has found no way
-  bool first;                // the move in which colliders and prescribed vertices go
+  T *share, *now;                     // of the whole way after the moves so far; of what is left, tried in this one
+  uint8_t *blocked, *stamp;           // something does not let it pass; the round in which it last tried less
+  uint8_t* failed;                    // [B]  a scene in which something has found no way
+  bool first;                         // the move in which colliders and prescribed vertices go
+  const Motion<T>* motion = nullptr;  // [B, V]  in this round, where a backend keeps them; or null
 };
 
 // Written by whoever finds it: all write the same.
@@ -60,11 +68,48 @@ DIFFVBD_FN Vec3<T> way_of(const AdvanceInputs<T>& in, int64_t scene, int32_t v) 
   return in.held[v] || !in.u ? way : way - vector_at(in.u + 3 * (scene * in.bodies + in.body[v]));
 }
 
+// A vertex as it is, relative to `from`, and the way that it tries.
+template <class T>
+struct Trial {
+  Vec3<T> at, from, since, way;
+  T size;
+};
+
+template <class T>
+DIFFVBD_FN T size_of(const Vec3<T>& p) {
+  return absolute(p.x) + absolute(p.y) + absolute(p.z);
+}
+
+template <class T>
+DIFFVBD_FN Trial<T> trial(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t scene, int32_t v) {
+  Trial<T> out;
+  const int64_t row = scene * in.vertices + v;
+  const Vec3<T> whole = way_of(in, scene, v);
+  const int64_t unit = in.unit(row);
+  const T done = in.held[v] ? T(s.first ? 0 : 1) : s.share[unit];
+  out.at = vector_at(in.x + 3 * row) + done * whole;
+  out.since = out.at - vector_at(in.center + 3 * row);
+  out.from = in.origin ? vector_at(in.origin + 3 * row) : zero3<T>();
+  out.way = ((T(1) - done) * (in.held[v] ? T(1) : s.now[unit])) * whole;
+  out.size = size_of(out.at + out.from);
+  return out;
+}
+template <class T>
+DIFFVBD_FN Motion<T> motion_of(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row) {
+  const Trial<T> t = trial(in, s, row / in.vertices, static_cast<int32_t>(row % in.vertices));
+  return {t.since, t.since + t.way, t.size};
+}
+
+template <class T>
+DIFFVBD_FN T guard_of_size(T size) {
+  return T(kGuardUlps) * std::numeric_limits<T>::epsilon() * size;
+}
+
 // The corners of a pair as they are, and the ways that they try.
 template <class T>
 struct Attempt {
   Corners<T> corners;
-  Vec3<T> way[4], since[4];  // since the gaps of pairs were taken they have moved by `since`
+  Vec3<T> way[4];
   bool free[4];
   T guard;
 };
@@ -81,44 +126,32 @@ DIFFVBD_FN Attempt<T> attempt(const AdvanceInputs<T>& in, const AdvanceState<T>&
       const int64_t row = 3 * (scene * (in.corners - in.vertices) + v - in.vertices);
       const Vec3<T> was = vector_at(in.collider + row), next = vector_at(in.collider_next + row);
       const bool still = pair[4] == kPointPlane || !s.first;  // planes were looked for where they end
-      at[k] = still ? next : was, from[k] = out.since[k] = zero3<T>();
+      at[k] = still ? next : was, from[k] = zero3<T>();
       out.way[k] = still ? zero3<T>() : next - was;
       out.free[k] = false;
     } else {
-      const int64_t row = scene * in.vertices + v;
-      const Vec3<T> whole = way_of(in, scene, v);
-      const int64_t unit = in.unit(row);
-      const T done = in.held[v] ? T(s.first ? 0 : 1) : s.share[unit];
-      at[k] = vector_at(in.x + 3 * row) + done * whole;
-      out.since[k] = at[k] - vector_at(in.center + 3 * row);
-      from[k] = in.origin ? vector_at(in.origin + 3 * row) : zero3<T>();
-      out.way[k] = ((T(1) - done) * (in.held[v] ? T(1) : s.now[unit])) * whole;
+      const Trial<T> t = trial(in, s, scene, v);
+      at[k] = t.at, from[k] = t.from, out.way[k] = t.way;
       out.free[k] = !in.held[v];
     }
-    const Vec3<T> p = at[k] + from[k];
-    const T own = absolute(p.x) + absolute(p.y) + absolute(p.z);
+    const T own = size_of(at[k] + from[k]);
     size = size < own ? own : size;
   }
   for (int k = 0; k < 4; ++k) out.corners.x[k] = k == 0 ? zero3<T>() : (at[k] - at[0]) + (from[k] - from[0]);
-  out.guard = T(kGuardUlps) * std::numeric_limits<T>::epsilon() * size;
+  out.guard = guard_of_size(size);
   return out;
 }
 
 // Whether a pair stays out of the barrier's reach all the way, however its corners go: by its gap when that was taken.
 template <class T>
-DIFFVBD_FN bool stays_far(const AdvanceInputs<T>& in, const Attempt<T>& a, const int32_t* pair, const T* constants) {
-  Vec3<T> was[4], end[4];
-  for (int k = 0; k < 4; ++k) {
-    if (pair[k] >= in.vertices) return false;  // whose gap may be of another time
-    was[k] = a.since[k];
-    end[k] = was[k] + a.way[k];
-  }
-  const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - a.guard;
+DIFFVBD_FN bool stays_far(const Motion<T> (&m)[4], const int32_t* pair, const T* constants) {
+  T size = T(0), most = T(0);
+  for (const Motion<T>& own : m) size = size < own.size ? own.size : size;
+  const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - guard_of_size(size);
   if (!(T(0) < room)) return false;
-  T most = T(0);
   for (int i = 0; i < sides(pair[4]); ++i) {
     for (int j = sides(pair[4]); j < 4; ++j) {
-      const Vec3<T> ways[] = {was[i] - was[j], end[i] - end[j]};
+      const Vec3<T> ways[] = {m[i].since - m[j].since, m[i].end - m[j].end};
       for (const Vec3<T>& d : ways) {
         const T square = dot(d, d);
         most = most < square ? square : most;
@@ -126,6 +159,17 @@ DIFFVBD_FN bool stays_far(const AdvanceInputs<T>& in, const Attempt<T>& a, const
     }
   }
   return most < room * room;
+}
+template <class T>
+DIFFVBD_FN bool stays_far(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair,
+                          const T* constants) {
+  Motion<T> m[4];
+  for (int k = 0; k < 4; ++k) {
+    if (pair[k] >= in.vertices) return false;  // whose gap may be of another time
+    const int64_t row = int64_t{pair[5]} * in.vertices + pair[k];
+    m[k] = s.motion ? s.motion[row] : motion_of(in, s, row);
+  }
+  return stays_far(m, pair, constants);
 }
 
 // Marks the corners that keep a pair from being safe; returns whether it is. Round 0 looks at all pairs, later ones at
@@ -147,6 +191,7 @@ DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, i
   }
   const T* constants = in.constants + kConstants * pair;
   if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (contact/narrow.h)
+  if (stays_far(in, s, record, constants)) return true;                                // as do most
   const Attempt<T> a = attempt(in, s, record);
   const int first = sides(record[4]);
   bool moves[2] = {false, false}, careful = false;
@@ -157,7 +202,6 @@ DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, i
     careful = careful || (in.careful && a.free[k] && T(0) < size);  // what is prescribed may come closer
   }
   if (!moves[0] && !moves[1]) return true;
-  if (stays_far(in, a, record, constants)) return true;
   const Gate<T> gate(record[4], a.corners, constants, a.guard);
   const T each = moves[0] && moves[1] ? T(kBothShare) : T(kShare), shares[4] = {each, each, each, each};
   if (gate.holds(a.way, shares, careful) || stays_apart(gate, a.way, careful)) return true;

@@ -37,6 +37,14 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
   std::vector<uint8_t> blocked(units), stamp(units), failed(in.scenes);
   AdvanceState<T> s{share, now.data(), blocked.data(), stamp.data(), failed.data(), true};
   int64_t stuck = 0;
+  // Of a vertex all pairs ask the same.
+  std::vector<Motion<T>> motion(rows);
+  s.motion = motion.data();
+  const auto look = [&] {
+    torch::stable::parallel_for(0, rows, kPairGrain, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) motion[i] = motion_of(in, s, i);
+    });
+  };
   for (int move = 0; move < kMoves; ++move) {
     s.first = move == 0;
     std::fill(failed.begin(), failed.end(), 0);
@@ -48,6 +56,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
         if (!passes && last) mark(failed.data() + scene);
         return !passes;
       };
+      look();
       const int64_t found = count(pairs, kPairGrain, [&](int64_t i) {
         return fails(in.listed.pairs[kPairRow * i + 5], try_pair(in, s, i, last ? 0 : round));
       });
@@ -58,7 +67,10 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
       if (count(units, kGrain, [&](int64_t i) { return retreat(s, i, round); }) == 0) break;
     }
     for (int64_t i = 0; i < units; ++i) give_up(in, s, i);
-    if (s.first && !clean) stuck = count(pairs, kPairGrain, [&](int64_t pair) { return !try_pair(in, s, pair, 0); });
+    if (s.first && !clean) {
+      look();
+      stuck = count(pairs, kPairGrain, [&](int64_t pair) { return !try_pair(in, s, pair, 0); });
+    }
     bool open = false;
     for (int64_t i = 0; i < units; ++i) {
       end_move(s, i);

@@ -54,6 +54,7 @@ class NearPairs {
   // A new anchor with a smaller radius, before all pairs are sorted again.
   void settle(int v, const Vec3<T>& motion) {
     anchors_[v] = {motion, T(kLeft) * anchors_[v].radius, T(kLeft) * anchors_[v].length};
+    extend(anchors_[v]);
     stale_[v] = 1;
   }
   bool has_pairs(int v) const { return in_.listed.ptr[row_ + v] < in_.listed.ptr[row_ + v + 1]; }
