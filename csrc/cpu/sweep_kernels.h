@@ -21,9 +21,16 @@ CoarseKernels<T> coarse(int energies) {
   return pick_coarse<T>(free_index(energies), std::make_integer_sequence<int, kFreeSets>{});
 }
 
+// Boxes are single precision: of the scalars one has the kernel, and it costs the other no room for inlining.
+template <class T>
+MeetKernel meet() {
+  if constexpr (std::is_same_v<T, float>) return meet_boxes;
+  return nullptr;
+}
+
 template <class T>
 Kernels<T> sweep_kernels() {
-  return {forward<T>, reverse<T>, coarse<T>, {add_lanes<T>, reverse_lanes<T>}, meet_boxes};
+  return {forward<T>, reverse<T>, coarse<T>, {add_lanes<T>, reverse_lanes<T>}, meet<T>()};
 }
 
 }  // namespace diffvbd::DIFFVBD_SET
