@@ -1,7 +1,10 @@
 // The tensors of the start of a part, as the operators of all backends take them.
 #pragma once
 
+#include <tuple>
+
 #include "../contact/advance.h"
+#include "../contact/keep.h"
 #include "../contact/narrow.h"
 #include "../contact/start.h"
 #include "../contact/translation.h"
@@ -150,6 +153,41 @@ contact::NarrowInputs<T> narrow_inputs(const Tensor& x, const Tensor& origin, co
   in.pairs = data<const int32_t>(pairs), in.constants = data<const T>(constants);
   in.vertices = static_cast<int32_t>(v), in.colliders = static_cast<int32_t>(colliders);
   return in;
+}
+
+// The lists of a call of contact_keep, in room for `capacity` pairs, where make(shape, dtype) allocates.
+struct KeptLists {
+  Tensor rows, pairs, constants, ptr, entry;
+
+  template <class Make>
+  KeptLists(const Tensor& ptr_of_all, ScalarType scalar, int64_t capacity, const Make& make)
+      : rows(make({capacity}, ScalarType::Long)),
+        pairs(make({capacity, contact::kPairRow}, ScalarType::Int)),
+        constants(make({capacity, contact::kConstants}, scalar)),
+        ptr(make({ptr_of_all.numel()}, ScalarType::Int)),
+        entry(make({4 * capacity}, ScalarType::Int)) {}
+  template <class T>
+  contact::Kept<T> pointers() const {
+    return {data<int64_t>(rows),  data<int32_t>(pairs), data<int32_t>(ptr),
+            data<int32_t>(entry), data<T>(constants),   pairs.size(0)};
+  }
+  std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> tensors() const { return {rows, pairs, constants, ptr, entry}; }
+};
+
+template <class T>
+contact::KeepInputs<T> keep_inputs(const Tensor& keep, const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
+                                   const Tensor& entry) {
+  require(pairs.dim() == 2 && pairs.size(1) == contact::kPairRow && is_index(pairs, constants) &&
+              is_index(ptr, constants) && is_index(entry, constants) && ptr.numel() > 0 &&
+              entry.numel() == 4 * pairs.size(0),
+          "diffvbd::contact_keep: expected pairs made by contact_detect");
+  require(is_beside(keep, constants, ScalarType::Bool) && keep.numel() == pairs.size(0),
+          "diffvbd::contact_keep: expected keep bool [pairs]");
+  require_like("constants", constants, constants, pairs.size(0) * contact::kConstants);
+  return {data<const bool>(keep),   data<const int32_t>(pairs),
+          data<const int32_t>(ptr), data<const int32_t>(entry),
+          data<const T>(constants), pairs.size(0),
+          ptr.numel() - 1};
 }
 
 }  // namespace diffvbd

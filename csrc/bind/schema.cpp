@@ -61,6 +61,12 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   m.def(
       "contact_narrow(Tensor x, Tensor origin, Tensor collider, Tensor room, Tensor pairs, Tensor constants, Tensor "
       "ptr) -> Tensor");
+  // The pairs of a list that `keep` names, and which they are (contact/keep.h); exact: in lists as long as they are
+  // many, on the CPU, else in room for all, with -1 where there is none
+  m.def(
+      "contact_keep(Tensor keep, Tensor pairs, Tensor constants, Tensor ptr, Tensor entry, bool exact) -> (Tensor "
+      "rows, "
+      "Tensor pairs, Tensor constants, Tensor ptr, Tensor entry)");
   // Where each vertex wants to be, see contact/start.h; planes and origin may be empty. The adjoint: of x, move, u and
   // planes, the last two for each vertex.
   m.def(

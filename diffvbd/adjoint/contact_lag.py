@@ -11,6 +11,7 @@ from torch.autograd import Function
 
 from .. import ops
 from ..ops import contact_lag as ops_lag
+from ..ops import contact_start as ops_start
 from ..ops import detect as ops_contact
 
 
@@ -23,13 +24,12 @@ class Pairs(NamedTuple):
     entry: Tensor
 
 
-def some_of(listed: Pairs, rows: Tensor, points: int) -> Pairs:
-    """Those of listed pairs that ``rows`` names in ascending order; points: corner points of a scene."""
-    pairs = listed.pairs[rows]
-    corner = pairs[:, 5:].long() * points + pairs[:, :4].long()
-    ordered, entry = torch.sort(corner.reshape(-1), stable=True)
-    ptr = torch.searchsorted(ordered, torch.arange(listed.ptr.shape[0], device=pairs.device))
-    return Pairs(pairs, listed.constants[rows], ptr.to(torch.int32), entry.to(torch.int32))
+def some_of(listed: Pairs, keep: Tensor) -> tuple[Pairs, Tensor]:
+    """Those of listed pairs that ``keep`` names, bool [pairs], and which they are. Where values must not decide sizes,
+    on CUDA and compiled, in lists of the same length, with -1 where there is none."""
+    exact = not keep.is_cuda and not torch.compiler.is_compiling()
+    rows, *kept = ops_start.keep(keep, listed, exact)
+    return Pairs(*kept), rows
 
 
 class _Lag(Function):

@@ -67,6 +67,21 @@ def narrow(x: Tensor, origin: Tensor, collider: Tensor, room: Tensor, pairs: Ten
     return raw.contact_narrow(x, origin, collider, room, pairs, constants, ptr)
 
 
+def keep(rows: Tensor, listed: Sequence[Tensor], exact: bool) -> tuple[Tensor, ...]:
+    """The pairs of a list (pairs, constants, ptr, entry of :func:`contact_detect`) that ``rows`` names, bool [pairs]:
+    their indices, int64, and their list. exact: as long as they are many, which the CPU alone can say; else in room for
+    all, with -1 where there is none."""
+    return raw.contact_keep(rows, *listed, exact)
+
+
+@shapes_of("contact_keep")
+def _(keep, pairs, constants, ptr, entry, exact):
+    count = torch.library.get_ctx().new_dynamic_size() if exact else pairs.shape[0]
+    sizes = ((count,), (count, pairs.shape[1]), (count, constants.shape[1]), ptr.shape, (4 * count,))
+    dtypes = (torch.int64, torch.int32, constants.dtype, torch.int32, torch.int32)
+    return tuple(constants.new_empty(size, dtype=dtype) for size, dtype in zip(sizes, dtypes, strict=True))
+
+
 @shapes_of("contact_narrow")
 def _(x, origin, collider, room, pairs, constants, ptr):
     return torch.empty_like(constants)
@@ -102,6 +117,7 @@ def _(bar, x, move, u, planes, origin, held, body, filter_eta, wants_planes):
 
 for _name in (
     "contact_advance",
+    "contact_keep",
     "contact_narrow",
     "contact_translation",
     "contact_translation_backward",

@@ -151,9 +151,8 @@ class ContactStep:
         coefficient = self._parameter("friction.coefficient", zero)
         damping = self._parameter("pair_barrier.damping", zero)
         lag = torch.cat([of_pair(coefficient) * force, of_pair(damping) * active, rest], -1)
-        if self._reads(force):  # most of what is listed does not touch yet
-            rows = (active[:, 0] != 0).nonzero()[:, 0]
-            listed, lag = some_of(listed, rows, self._points), lag[rows]
+        listed, rows = some_of(listed, (active[:, 0] != 0).contiguous())  # most of what is listed does not touch yet
+        lag = torch.where((rows >= 0)[:, None], lag[rows.clamp(min=0)], 0.0) if lag.shape[0] else lag
         self.lagged, self.lag = listed, lag
 
     @staticmethod
@@ -161,21 +160,14 @@ class ContactStep:
         """Whether values may decide sizes: on CUDA that would wait, compiled it would compile anew."""
         return not x.is_cuda and not torch.compiler.is_compiling()
 
-    @property
-    def _points(self) -> int:
-        return self.x_prev.shape[1] + self.before.shape[1]
-
     def _narrowed(self, listed: Pairs, x: Tensor, collider: Tensor, room: Tensor) -> tuple[Pairs, Tensor | None]:
         """The pairs that can matter as long as no vertex goes farther than its room [B, V] from x, with their gaps
-        there; and which of the listed these are. All, with infinite gaps, where that would have to be read."""
+        there; and which of the listed these are, where that may be read."""
         with torch.no_grad():
             constants = ops_start.narrow(x.detach().contiguous(), self.origin, collider.detach().contiguous(), room,
                                          listed.pairs, listed.constants, listed.ptr)  # fmt: skip
-        near = listed._replace(constants=constants)
-        if not self._reads(x):
-            return near, None
-        rows = (constants[:, -1] < torch.inf).nonzero()[:, 0]
-        return some_of(near, rows, self._points), rows
+        near, rows = some_of(listed._replace(constants=constants), (constants[:, -1] < torch.inf).contiguous())
+        return near, rows if self._reads(x) else None
 
     def run(self, policy: int, debug_step: int) -> Tensor:
         """Positions after all parts [B, V, 3]; raises where detection did not hold."""

@@ -128,8 +128,8 @@ def _listed(s: Scenes) -> tuple[Pairs, Tensor]:
         return listed, apart
     with torch.no_grad():
         acts = pair_lag(f.x.detach(), f.collider.detach(), f.kappa.detach(), f.origin, listed)[:, 1] > 0
-    rows = (acts & apart).nonzero()[:, 0]
-    return some_of(listed, rows, f.x.shape[1] + f.collider.shape[1]), apart[rows]
+    listed, rows = some_of(listed, acts & apart)
+    return listed, apart[rows]
 
 
 def pair_terms(s: Scenes) -> list[PairTerms]:

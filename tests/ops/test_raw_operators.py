@@ -25,6 +25,7 @@ CASES += [
     ("contact", "contact_lowest"),
     ("contact", "contact_advance"),
     ("contact", "contact_narrow"),
+    ("contact", "contact_keep"),
     ("contact", "contact_rigid_system"),
     ("contact", "contact_rigid_move"),
     ("floor", "pack_rest"),
@@ -35,6 +36,7 @@ CASES += [
 UNREAD = {
     "sweep_backward": {"x_start"},
     "begin": {"order", "other_order"},
+    "contact_keep": {"ptr"},
     "begin_backward": {"order", "other_order", "other_tets"},
     "rigid": {"order"},
     "rigid_backward": {"order"},
@@ -44,7 +46,7 @@ OF_CHOICE = {"mu", "lam", "rest", "other_tets"}  # between starts, which other s
 SHARED = ("mu", "lam", "kappa")  # one value for all is legal
 # Empty where a scene lacks them; which it does, no tensor can tell.
 OPTIONAL = ("planes", "floor_lag", "lag", "own_room", "v_bar")
-ONE_KIND = ("pack_rest", "star_sum", "tet_gather")  # with one floating tensor, which may be either
+ONE_KIND = ("pack_rest", "star_sum", "tet_gather", "contact_keep")  # with one floating tensor, which may be either
 ERRORS = (ValueError, RuntimeError)
 
 
@@ -142,7 +144,9 @@ def test_tensors_of_another_kind_or_place(device: str, recorded: Any, scene: str
         else:
             other = value.to(torch.int64 if value.dtype != torch.int64 else torch.int32)
         alone = sum(isinstance(v, Tensor) and v.numel() > 0 for v in given.values()) == 1
-        if not (alone or key in ("x", "values", "rest") and value.is_floating_point() and name in ONE_KIND):
+        if not (
+            alone or key in ("x", "values", "rest", "constants") and value.is_floating_point() and name in ONE_KIND
+        ):
             wrong += attempt(name, given, key, other)
         if not alone:
             wrong += attempt(name, given, key, value.to("meta"))

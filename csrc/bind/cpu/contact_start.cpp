@@ -147,10 +147,37 @@ Tensor contact_narrow(const Tensor& x, const Tensor& origin, const Tensor& colli
   });
 }
 
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_keep(const Tensor& keep, const Tensor& pairs,
+                                                                const Tensor& constants, const Tensor& ptr,
+                                                                const Tensor& entry, bool exact) {
+  return dispatch_float(constants, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::keep_inputs<T>(keep, pairs, constants, ptr, entry);
+    std::vector<int32_t> kept(in.count + 1);
+    for (int64_t i = 0; i < in.count; ++i) kept[i + 1] = kept[i] + contact::stays(in, i);
+    const diffvbd::KeptLists lists(
+        ptr, constants.scalar_type(), exact ? kept.back() : in.count,
+        [](const std::vector<int64_t>& shape, ScalarType dtype) { return torch::stable::empty(shape, dtype); });
+    const auto out = lists.pointers<T>();
+    for (int64_t i = 0; i < in.count; ++i) {
+      if (contact::stays(in, i)) contact::copy_pair(in, i, kept[i], out);
+    }
+    for (int64_t i = kept.back(); i < out.capacity; ++i) contact::leave_empty(i, out);
+    int32_t at = 0;
+    for (int64_t i = 0; i < in.corners; ++i) {
+      out.ptr[i] = at;
+      contact::each_entry(in, kept.data(), i, [&](int32_t own) { out.entry[at++] = own; });
+    }
+    out.ptr[in.corners] = at;
+    return lists.tensors();
+  });
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
   m.impl("contact_advance", TORCH_BOX(&contact_advance));
+  m.impl("contact_keep", TORCH_BOX(&contact_keep));
   m.impl("contact_narrow", TORCH_BOX(&contact_narrow));
   m.impl("contact_translation", TORCH_BOX(&contact_translation));
   m.impl("contact_translation_backward", TORCH_BOX(&contact_translation_backward));

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "../../cuda/advance.h"
+#include "../../cuda/keep.h"
 #include "../../cuda/start.h"
 #include "binding.h"
 
@@ -126,10 +127,27 @@ Tensor contact_narrow(const Tensor& x, const Tensor& origin, const Tensor& colli
   });
 }
 
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_keep(const Tensor& keep, const Tensor& pairs,
+                                                                const Tensor& constants, const Tensor& ptr,
+                                                                const Tensor& entry, bool /*exact*/) {
+  const DeviceGuard guard(constants.get_device_index());
+  return dispatch_float(constants, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::keep_inputs<T>(keep, pairs, constants, ptr, entry);
+    const diffvbd::KeptLists lists(
+        ptr, constants.scalar_type(), in.count,
+        [&](const std::vector<int64_t>& shape, ScalarType dtype) { return empty(constants, shape, dtype); });
+    const Tensor work = empty(constants, {cuda::keep_bytes(in)}, ScalarType::Byte);
+    check(cuda::keep<T>(in, lists.pointers<T>(), work.data_ptr(), current_stream(constants)), "a part of a list");
+    return lists.tensors();
+  });
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_advance", TORCH_BOX(&contact_advance));
+  m.impl("contact_keep", TORCH_BOX(&contact_keep));
   m.impl("contact_narrow", TORCH_BOX(&contact_narrow));
   m.impl("contact_translation", TORCH_BOX(&contact_translation));
   m.impl("contact_translation_backward", TORCH_BOX(&contact_translation_backward));
