@@ -362,6 +362,8 @@ def contact_step(
         fall = lift if r == 0 else torch.zeros_like(lift)
         if r == 0:
             fall = lift = _unsupported(scene, listed[0], floor, x_prev, before, lift)
+        if model.starts_from == "inertia":
+            fall = torch.zeros_like(fall)
         u, at = Translation(scene, part, state, move, floor).u, state
         for wanted, by, share in ((move, u, part.shares[0]), (fall, torch.zeros_like(u), part.shares[1])):
             base, share = at + by, share.reshape(*x.shape[:-2], 1, -1).to(at)

@@ -161,12 +161,11 @@ class _Press(NamedTuple):
         dense = torch.zeros((vertices, space.functions), dtype=space.weight.dtype, device=space.weight.device)
         dense[space.vertex, space.function] = space.weight
         moved = (self.weights[..., None] * dense[self.rows % vertices]).sum(1)  # [n, F]
-        scene = self.rows[:, 0] // vertices
-        out = []
+        scene, out = self.rows[:, 0] // vertices, []
         for n in range(scenes):
             own = torch.where((scene == n)[:, None], moved, 0.0) if scenes > 1 else moved
-            pressed = torch.einsum("pf,pij->pfij", own, self.stiffness)
-            out.append(torch.einsum("pfij,pg->figj", pressed, own).reshape(3 * space.functions, -1))
+            blocks = [[own.mT @ (self.stiffness[:, i, j, None] * own) for j in range(3)] for i in range(3)]
+            out.append(torch.stack([torch.stack(row, -1) for row in blocks], 1).reshape(3 * space.functions, -1))
         return torch.stack(out)
 
 

@@ -221,6 +221,7 @@ class ContactStep:
                 self._set_lag(detection.listed, was)
                 fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
                                           self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
+            fall = fall if self.model.starts_from == "predictor" else torch.zeros_like(fall)  # corrections do it
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
                                          detection, surface, rigid if barrier.self_contact else None)  # fmt: skip
             met.counts[r] = torch.cat([detection.counts[:3], start.stuck])

@@ -98,3 +98,23 @@ def test_more_functions_than_can_be_solved_for_together_are_refused() -> None:
     energies = (dv.StableNeoHookean(), dv.PairBarrier(1e3, 0.01))
     with pytest.raises(ValueError, match="at most 512 functions of all bodies"):
         dv.Model(tets, energies=energies, coarse=dv.CoarseSpace(functions=600))
+
+
+def test_gradients_of_the_rest_shape() -> None:
+    """Against central differences, for which decisions stay as they were."""
+    model, given = stack(coarse=SPACE)
+    x = model.rest_points
+    v = torch.zeros_like(x)
+    v[:, 1] = -0.1 * x[:, 1]
+    way = torch.linspace(-1, 1, x.numel(), dtype=x.dtype).reshape(x.shape).sin()
+
+    def end(size: Any) -> Tensor:
+        return (way * dv.step(model, x, v, sweeps=7, rest_points=x + size * way, **given)[0]).sum()
+
+    with dv.coarse.record() as lengths:
+        size = torch.zeros((), dtype=x.dtype, requires_grad=True)
+        (slope,) = torch.autograd.grad(end(size), size)
+    assert lengths[0].any() and slope.abs() > 0
+    with torch.no_grad():
+        errors = [abs(float((end(h) - end(-h)) / (2 * h) - slope)) for h in (1e-6, 1e-7, 1e-8)]
+    assert min(errors) <= tolerance("contact_finite_difference") * abs(float(slope))
