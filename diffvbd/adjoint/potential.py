@@ -97,13 +97,16 @@ class IncrementalPotential:
 
     def product(self, w: Tensor) -> Tensor:
         """Hessian times w, [B, V, 3], rows of pinned vertices included."""
+        out = self.elastic_product(w) + self.mass * w
+        blocks = self.vertex_blocks()
+        return out if blocks is None else out + (blocks * w[..., None, :]).sum(-1)
+
+    def elastic_product(self, w: Tensor) -> Tensor:
+        """The part of product() that is that of the tets."""
         f = self._edges_of(w)
         turned = _cross(_rolled(f, 1), self._last) + _cross(self._next, _rolled(f, 2))
         stretched = self._bulk * (self.normals * f).sum((0, 1))
-        out = self._summed(self._sheared(f) + self._pressure * turned + stretched * self.normals)
-        out = out + self.mass * w
-        blocks = self.vertex_blocks()
-        return out if blocks is None else out + (blocks * w[..., None, :]).sum(-1)
+        return self._summed(self._sheared(f) + self._pressure * turned + stretched * self.normals)
 
     def vertex_blocks(self) -> Tensor | None:
         """3x3 blocks of the energies of single vertices, [B, V, 3, 3], or None where there are none."""

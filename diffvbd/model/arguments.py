@@ -117,8 +117,6 @@ def checked_coarse(coarse: Any, energies: tuple[Energy, ...], saturation: float 
     elastic = next((e for e in energies if isinstance(e, StableNeoHookean)), None)
     if elastic is None or elastic.block != "exact":
         fail("coarse", "None without StableNeoHookean and its exact block", repr(coarse))
-    if any(isinstance(e, (PairBarrier, Friction)) for e in energies):
-        fail("coarse", "None beside a PairBarrier or Friction, which its corrections do not see", repr(coarse))
     if ops.TET_READS_X_PREV:
         fail("coarse", "None with a law of tets that reads where a step began", repr(coarse))
     if saturation is not None:

@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 from .. import ops
+from ..checks import fail
 from ..ops.coarse_arrays import PACK as LANES
 from ..ops.coarse_arrays import ROW, lengths
 from .bodies import connected
 from .coarse import CoarseGeometry, CoarseSpace, build_coarse
 
 TILE = 32  # unknowns of a body beyond which it counts as large; twin of kTile in csrc/coarse/views.h
+MOST_COUPLED = 512  # functions of all bodies beside contact: one dense system of three times as many unknowns
 PART = 32  # most blocks of a part of a body
 
 
@@ -46,6 +48,13 @@ def plan_of(space: CoarseSpace, points: Tensor, tets: Tensor, pinned: Tensor, ma
     geometry = build_coarse(*arrays, pinned.numpy(), connected(tets, len(points)).numpy(), space)
     order = ops.plan_order(plan, ops.LANES[device]).numpy()
     return geometry, arrange_coarse(geometry, space.every, *arrays, mass.numpy(), rest[0].numpy(), order)
+
+
+def check_coupled(geometry: CoarseGeometry, touches: bool) -> None:
+    """Beside contact, raises where the bodies of a scene have more functions than can be solved for together."""
+    if touches and geometry.functions > MOST_COUPLED:
+        fail("coarse", f"at most {MOST_COUPLED} functions of all bodies beside a PairBarrier or Friction, which couple "
+             "them: use a CoarseSpace with fewer, or None", f"{geometry.functions} of {geometry.bodies}")  # fmt: skip
 
 
 def arrange_coarse(geometry: CoarseGeometry, every: int, points: np.ndarray, tets: np.ndarray, mass: np.ndarray,

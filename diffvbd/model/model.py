@@ -24,7 +24,7 @@ from .anderson import Anderson, moving_bodies
 from .arguments import Energy, check_isolated, checked_device, checked_energies, checked_steps, per_tet_density
 from .bodies import find_bodies, first_of_body
 from .coarse import CoarseSpace
-from .coarse_plan import plan_of
+from .coarse_plan import check_coupled, plan_of
 from .describe import describe
 from .rest import lumped_mass, rest_metric
 from .warnings import warn_of
@@ -260,7 +260,8 @@ class Model:
         if self.coarse is not None:
             given = (self._rest_points, self._topology[0], self._pinned, self._mass, self._rest, self._plan)
             self.coarse_geometry, self._coarse_plan = plan_of(self.coarse, *given, device.type)
-        if self.acceleration is not None:
+            check_coupled(self.coarse_geometry, self.touches)
+        if self.acceleration is not None or (self.coarse is not None and self.touches):  # whose decisions read it
             elastic = bool(self.energy_mask & ELASTIC)
             self._moving = moving_bodies(self._rest_points, self._topology[0], self._pinned, elastic)
 
@@ -283,7 +284,7 @@ class Model:
             self.surface_of_contact = self.surface_of_contact.to(device, dtype)
         if self.coarse is not None:
             self._coarse_plan = self._coarse_plan.to(device, dtype)
-        if self.acceleration is not None:
+        if hasattr(self, "_moving"):
             self._moving = self._moving.to(device, dtype)
         for energy in self.parametric_energies:
             self.constants(energy)

@@ -36,6 +36,7 @@ class Part(NamedTuple):
     frames: Tensor | None = None  # [B, bodies]: of the rigid motions of the start; None: there are none
     # sets of bodies [B, moving bodies], and which of these took combinations, bool [combinations, B, moving bodies]
     combined: Any = None
+    lengths: Tensor | None = None  # [corrections, B, bodies of the coarse space]: of coarse corrections
     lowest: Tensor | None = None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
 
 
@@ -361,6 +362,8 @@ def contact_step(
         fall = lift if r == 0 else torch.zeros_like(lift)
         if r == 0:
             fall = lift = _unsupported(scene, listed[0], floor, x_prev, before, lift)
+        if model.starts_from == "inertia":
+            fall = torch.zeros_like(fall)
         u, at = Translation(scene, part, state, move, floor).u, state
         for wanted, by, share in ((move, u, part.shares[0]), (fall, torch.zeros_like(u), part.shares[1])):
             base, share = at + by, share.reshape(*x.shape[:-2], 1, -1).to(at)
@@ -377,7 +380,7 @@ def contact_step(
         number = sweeps // count + (1 if r < sweeps % count else 0)
         if number:
             swept = partial(run_sweeps, scene, [*energies, *forces], masses, y)
-            state = in_cycles(scene, energies, swept, state, y, x_prev, number, part.limits, part.combined)
+            state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, part)
             state = correct(state, part.corrections[1])
         short = (part.shares.amin(0) < SHORT).reshape(*x.shape[:-2], 1, -1) & ~pinned
         left = torch.where(short, x_prev + way + lift - state, 0.0)

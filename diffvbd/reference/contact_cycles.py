@@ -1,39 +1,95 @@
-"""The sweeps of a part of a step with contact, with the combinations of iterates that it has taken."""
+"""The sweeps of a part of a step with contact, with the coarse corrections and combinations of iterates that it has
+made."""
 
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from .anderson import Anderson
+from .coarse import Coarse
+from .energies import StableNeoHookean
 from .scene import Scene
 
 
 def in_cycles(
     scene: Scene,
     energies: list[Any],
+    forces: list[Any],
     swept: Callable[..., Tensor],
     state: Tensor,
     y: Tensor,
     x_prev: Tensor,
     number: int,
-    limits: Tensor | None,
-    combined: tuple[Tensor, Tensor] | None,
+    part: Any,
 ) -> Tensor:
     """The state [..., 3, V] after so many sweeps.
 
-    swept(state, x_prev, sweeps, limits): the state after some of them. limits, combined: of the Part.
+    swept(state, x_prev, sweeps, limits, relaxation): the state after some of them. forces: terms of pairs, each with
+    its `on_corners`. part: what has been decided, the Part of a detection.
     """
-    lead = state.shape[:-2]
-    limits = None if limits is None else limits.reshape(number, *lead, 1, -1).to(state)
-    if combined is None:
-        return swept(state, x_prev, number, limits)
-    anderson, before, after = Anderson(scene, energies), [], []
-    sets, taken = (t.reshape(*t.shape[:-2], *lead, -1) for t in combined)
-    for n in range(number):
-        before.append(state)
-        state = swept(state, x_prev, 1, None if limits is None else limits[n : n + 1])
+    lead, model = state.shape[:-2], scene.model
+    limits = None if part.limits is None else part.limits.reshape(number, *lead, 1, -1).to(state)
+    last = None if getattr(model, "coarse", None) is None else min(model.relaxation, 1.0)
+    sets, taken = (
+        (None, None) if part.combined is None else (t.reshape(*t.shape[:-2], *lead, -1) for t in part.combined)
+    )
+    anderson = None if taken is None else Anderson(scene, energies)
+    corrections = None if part.lengths is None else Corrections(scene, energies, forces, y, x_prev)
+    every = 1 if corrections is None else model.coarse.every
+    lengths: Any = part.lengths
+    before, after, done, corrected = [], [], 0, 0
+    while done < number:
+        begun = state
+        if corrections is not None and done:
+            state = corrections(state, lengths[corrected].reshape(*lead, -1))
+            corrected += 1
+        alone = corrections is not None and done == 0  # a sweep that is no cycle
+        count = 1 if alone else min(every, number - done)
+        for _ in range(count):
+            own = None if limits is None else limits[done : done + 1]
+            done += 1
+            state = swept(state, x_prev, 1, own, last if done == number else None)
+        if taken is None or anderson is None or alone or done == number:
+            continue
+        before.append(begun)
         after.append(state)
-        if 0 < n < number - 1:
-            state = anderson.combine(before, after, y, x_prev, taken[n - 1], sets)
+        if len(before) > 1:
+            state = anderson.combine(before, after, y, x_prev, taken[len(before) - 2], sets)
     return state
+
+
+class Corrections:
+    """Coarse corrections of all bodies of a scene together, against which pairs, friction and vertex energies press."""
+
+    def __init__(self, scene: Scene, energies: list[Any], forces: list[Any], y: Tensor, x_prev: Tensor) -> None:
+        self.coarse = Coarse(scene, [*energies, *forces])
+        self.single = [e for e in energies if not isinstance(e, StableNeoHookean)]
+        self.forces, self.y, self.x_prev = forces, y, x_prev
+        self.matrix = self.coarse.begin(x_prev)
+
+    def __call__(self, state: Tensor, lengths: Tensor) -> Tensor:
+        matrix = self.matrix + self._pressed(state)
+        return self.coarse.correct(state, self.y, self.x_prev, matrix, lengths.to(state))[0]
+
+    def _pressed(self, state: Tensor) -> Tensor:
+        """What presses back against the functions [..., 3F, 3F]."""
+        weight, scene = self.coarse.weight, self.coarse.scene
+        total = torch.zeros_like(state).repeat_interleave(3, -2)  # [..., 9, V]
+        for k, color in enumerate(scene.layout.colors):
+            for energy in self.single:
+                total = total.index_add(-1, color.vertices, energy.block(k, state, self.x_prev))
+        xx, xy, xz, yy, yz, zz = total[..., 3:, :].unbind(-2)
+        rows = [torch.stack(r, -2) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
+        out = torch.einsum("vf,...ijv,vg->...figj", weight, torch.stack(rows, -3), weight)
+        out = out.reshape(-1, *out.shape[-4:])
+        for force in self.forces:
+            pairs, (_, stiffness) = force.pairs, force.on_corners(state)
+            mesh = pairs.corners < len(weight)
+            moved = torch.where(mesh[..., None], weight[torch.where(mesh, pairs.corners, 0)], 0.0)
+            for n in range(len(out)):
+                own = pairs.batch == n
+                part = torch.einsum("qaf,qabij,qbg->figj", moved[own], stiffness[own], moved[own])
+                out = out.index_add(0, torch.tensor([n]), part[None])
+        return out.flatten(-4, -3).flatten(-2, -1).reshape(*state.shape[:-2], *self.matrix.shape[-2:])

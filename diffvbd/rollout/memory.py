@@ -126,6 +126,9 @@ def coarse_scalars(model: Model, sweeps: int) -> int:
     if model.coarse is None or not model.coarse_geometry.bodies:
         return 0
     geometry, plan = model.coarse_geometry, model._coarse_plan
+    if model.touches:  # all bodies together: the factor of each correction, its forces and ways
+        count = sum(-(-max(0, n - 1) // model.coarse.every) for n in _parts(model, sweeps))
+        return 9 * plan.mass.numel() + count * (9 * geometry.functions**2 + 12 * model.num_vertices)
     positions = 3 * plan.sizes.positions if model.energy_mask & KEEPS_POSITIONS else 0
     of_one = 3 * geometry.functions + geometry.bodies + positions
     return 9 * plan.mass.numel() + model.coarse.corrections(sweeps) * of_one

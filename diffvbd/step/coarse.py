@@ -114,10 +114,17 @@ class _FactorBackward(Function):
 def with_corrections(model: Model, parts: CoarseParts, fields: ops.SweepFields, time_step: float) -> ops.SweepFields:
     """What the sweeps read, with the corrections between them."""
     plan = model._coarse_plan
-    tensors = distinct(fields.x_prev, parts.stiffness.contiguous(), parts.mass)
-    factor = _Factor.apply(*tensors, plan.plan, plan.moments, plan.volume, plan.sizes, time_step)
+    factor = factor_of(model, parts, fields.x_prev, time_step)
     return fields._replace(coarse_factor=factor, coarse_mass=parts.mass.detach(), coarse_plan=plan.plan,
                            coarse_weights=plan.weights, coarse_rest=parts.rest)  # fmt: skip
+
+
+def factor_of(model: Model, parts: CoarseParts | None, x_prev: Tensor, time_step: float) -> Tensor | None:
+    """The factors of the matrices of a step from x_prev, None without corrections; see SweepFields.coarse_factor."""
+    if parts is None:
+        return None
+    plan, tensors = model._coarse_plan, distinct(x_prev, parts.stiffness.contiguous(), parts.mass)
+    return _Factor.apply(*tensors, plan.plan, plan.moments, plan.volume, plan.sizes, time_step)
 
 
 def lengths_of(model: Model, corrections: Tensor) -> Tensor:

@@ -22,7 +22,8 @@ from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
 from ..ops.detect import CONSTANTS
 from ..scopes import checking, recorders
-from .contact_cycles import Combined, record_combined, swept_part
+from .coarse import factor_of
+from .contact_cycles import Combined, SweptPart, record_parts, swept_part
 from .intersections import refuse_intersections
 from .rigid_contact import bodies_of, correct
 from .rooms import Motion, rooms, rooms_of_sweeps, unsupported
@@ -64,6 +65,7 @@ class Detection(NamedTuple):
     limits: Tensor | None = None
     frames: Tensor | None = None  # and of the rigid motions of its start [B, bodies]
     combined: Combined | None = None  # which combinations of its iterates were taken; None where there are none
+    lengths: Tensor | None = None  # of its coarse corrections [corrections, B, bodies of the coarse space]
     kept: Tensor | None = None  # rows of listed pairs that its sweeps can reach; all where that would have to be read
 
 
@@ -82,7 +84,7 @@ class Met:
     def __init__(self, x: Tensor) -> None:
         self.found: list[Detection] = []
         self.counts: list[Tensor] = []
-        self.combined: list[Combined | None] = []
+        self.swept: list[SweptPart] = []
         self.cut = torch.zeros_like(x[..., 0], dtype=torch.bool)
 
 
@@ -116,6 +118,7 @@ class ContactStep:
         self.kappa = self._parameter("pair_barrier.kappa", like.new_zeros((1,)))
         self.lagged, self.lag = no_pairs(like, 0), like.new_zeros((0, 9))
         self.floor_lag = self._floor_lag()
+        self.factor = factor_of(model, prepared.coarse, self.x_prev, prepared.settings.numbers.time_step)
 
     def _parameter(self, name: str, default: Tensor) -> Tensor:
         """A parameter [1 | B]."""
@@ -198,6 +201,7 @@ class ContactStep:
                 self._set_lag(detection.listed, was)
                 fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
                                           self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
+            fall = fall if self.model.starts_from == "predictor" else torch.zeros_like(fall)  # corrections do it
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
                                          detection, surface, rigid if barrier.self_contact else None)  # fmt: skip
             met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
@@ -210,17 +214,19 @@ class ContactStep:
             room = rooms_of_sweeps(motion, barrier, start, x, begin, wanted, rigid)
             near, kept = self._narrowed(detection.listed, x, now, room)
             start = start._replace(center=x.detach(), room=room)
-            taken, limits, combined, cut = [first], None, None, start.short
+            taken, limits, combined, lengths, cut = [first], None, None, None, start.short
             if sweeps:
                 part = settings._replace(sweeps=sweeps)
-                x, limits, combined = swept_part(self, x, start, now, near, part, policy, debug_step)
+                swept = swept_part(self, x, start, now, near, part, policy, debug_step)
+                met.swept.append(swept)
+                x, limits, combined, lengths = swept
                 x, last = self._corrected(x, now, start, near)
                 taken.append(last)
                 cut = limits[:, -1] > 0  # what the start has held up, sweeps may have made good
             met.cut = cut
             met.found[r] = detection._replace(shares=start.shares, corrections=torch.stack(taken), limits=limits,
-                                              kept=kept, frames=start.frames, combined=combined)  # fmt: skip
-            met.combined.append(combined)
+                                              kept=kept, frames=start.frames, combined=combined,
+                                              lengths=lengths)  # fmt: skip
             left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
         x = self._judged(x, met)
         for found in recorders():  # a step that is done again, with room for more pairs, counts once
@@ -236,9 +242,9 @@ class ContactStep:
         x, _ = self._corrected(x, self.colliders, start, none)
         if self.prepared.settings.sweeps:
             settings = self.prepared.settings
-            x, _, combined = swept_part(self, x, start, self.colliders, none, settings, policy, debug_step)
-            x, _ = self._corrected(x, self.colliders, start, none)
-            record_combined(self.model, x, [combined])
+            swept = swept_part(self, x, start, self.colliders, none, settings, policy, debug_step)
+            x, _ = self._corrected(swept.x, self.colliders, start, none)
+            record_parts(self.model, x, [swept])
         return x
 
     def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> tuple[Tensor, Tensor]:
@@ -294,7 +300,7 @@ class ContactStep:
     def _judged(self, x: Tensor, met: Met) -> Tensor:
         """x, or NaN where a captured or compiled step, which cannot raise, must not be trusted."""
         self._record(met)
-        record_combined(self.model, x, met.combined)
+        record_parts(self.model, x, met.swept)
         table, capacity = torch.stack(met.counts), self.capacity
         if torch.compiler.is_compiling() or (x.is_cuda and torch.cuda.is_current_stream_capturing()):
             good = (table[:, :2] <= torch.stack([table.new_full((), capacity), table.new_zeros(())])).all()

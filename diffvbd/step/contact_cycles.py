@@ -1,4 +1,5 @@
-"""The sweeps of a part of a step with pairs or friction, in cycles, and what Model.acceleration does between these."""
+"""The sweeps of a part of a step with pairs or friction, in cycles, and what Model.coarse and Model.acceleration do
+between these."""
 
 from __future__ import annotations
 
@@ -14,6 +15,7 @@ from ..adjoint.rise import rise_parts
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
 from ..scopes import recorders
+from .coarse_contact import Corrections
 from .rigid_terms import Scenes
 from .trials import Trials
 
@@ -37,6 +39,7 @@ class SweptPart(NamedTuple):
     x: Tensor  # [B, V, 3]
     limits: Tensor  # uint8 [B, K, V]
     combined: Combined | None = None
+    lengths: Tensor | None = None  # of coarse corrections [corrections, B, bodies of the coarse space]
 
 
 def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, listed: Pairs, settings: SweepSettings,
@@ -47,42 +50,89 @@ def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, l
     def sweep(x: Tensor, settings: SweepSettings) -> tuple[Tensor, Tensor]:
         return of._sweep(x, start.center, start.room, collider, listed, settings, policy, debug_step)
 
-    cycles = cycles_of(model, settings.sweeps) if model.acceleration is not None else [settings.sweeps]
+    settings = settings._replace(coarse=())  # which the operator would make, without pairs
+    cycles = _cycles(model, settings.sweeps)
     if len(cycles) <= 1:
         return SweptPart(*sweep(x, settings))
     if torch.compiler.is_compiling():
-        raise NotImplementedError("diffvbd: torch.compile of a step with Anderson acceleration is not supported")
-    assert model.acceleration is not None
-    judge, window = _trials(of, start, collider, listed), model.acceleration.window
-    combine = _Combine.apply if torch.is_grad_enabled() else _Combine.forward
-    whole, mass = (1, x.shape[0] * x.shape[1], 3), broadcast(mass, x.shape[:2]).reshape(1, -1)
-    before, after, limits, taken = [], [], [], []
+        raise NotImplementedError("diffvbd: torch.compile of contact with cycles of sweeps is not supported")
+    judge, corrections = _trials(of, start, collider, listed), None
+    if of.factor is not None:
+        corrections = Corrections(judge, of.fields, of.factor, _scenes(of, start, collider, listed))
+    numbers = settings.numbers
+    within = settings._replace(numbers=numbers._replace(last_relaxation=numbers.relaxation))
+    iterates = _Iterates(model, judge, broadcast(mass, x.shape[:2]).reshape(1, -1), len(cycles))
+    limits, lengths = [], []
     for n, count in enumerate(cycles):
         ends = n + 1 == len(cycles)
-        before.append(x.reshape(whole))
-        x, limit = sweep(x, settings._replace(sweeps=count))
+        before = x
+        if corrections is not None and n:
+            x, length = corrections.correct(x)
+            lengths.append(length)
+        x, limit = sweep(x, (settings if ends else within)._replace(sweeps=count))
         limits.append(limit)
-        after.append(x.reshape(whole))
-        if n and not ends:
-            before, after = before[-window - 1 :], after[-window - 1 :]
-            to, kept, *_ = combine(mass, judge, len(before), *before, *after)
-            x = to.reshape(x.shape)
-            taken.append(judge.of_bodies(kept))
-    return SweptPart(x, torch.cat(limits, 1), Combined(judge.bodies.of_body[:, :-1], torch.stack(taken)))
+        if not ends and (corrections is None or n):  # the sweep before the first correction is no cycle
+            x = iterates.next(before, x)
+    return SweptPart(x, torch.cat(limits, 1), iterates.combined(), torch.stack(lengths) if lengths else None)
+
+
+def _cycles(model: Model, sweeps: int) -> list[int]:
+    """Sweeps of each cycle of a part, with corrections the first sweep alone; [sweeps] where nothing is done between
+    them."""
+    if model.coarse is None or not model.coarse_geometry.bodies:
+        return cycles_of(model, sweeps) if model.acceleration is not None else [sweeps]
+    every, after = model.coarse.every, sweeps - 1
+    return [1, *(min(every, after - begun) for begun in range(0, after, every))]
+
+
+class _Iterates:
+    """The last iterates of a part, and what was combined of them."""
+
+    def __init__(self, model: Model, judge: Trials, mass: Tensor, cycles: int) -> None:
+        self.window = 0 if model.acceleration is None else model.acceleration.window
+        self.judge, self.mass = judge, mass
+        self.before: list[Tensor] = []
+        self.after: list[Tensor] = []
+        self.taken: list[Tensor] = []
+
+    def next(self, before: Tensor, after: Tensor) -> Tensor:
+        """Where the next cycle begins, after one from ``before`` to ``after`` [B, V, 3]."""
+        if not self.window:
+            return after
+        whole = (1, after.shape[0] * after.shape[1], 3)
+        self.before = [*self.before[-self.window :], before.reshape(whole)]
+        self.after = [*self.after[-self.window :], after.reshape(whole)]
+        if len(self.before) < 2:
+            return after
+        combine = _Combine.apply if torch.is_grad_enabled() else _Combine.forward
+        to, kept, *_ = combine(self.mass, self.judge, len(self.before), *self.before, *self.after)
+        self.taken.append(self.judge.of_bodies(kept))
+        return to.reshape(after.shape)
+
+    def combined(self) -> Combined | None:
+        return Combined(self.judge.bodies.of_body[:, :-1], torch.stack(self.taken)) if self.taken else None
+
+
+def _scenes(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) -> Scenes:
+    numbers = of.prepared.settings.numbers
+    fields = of.touching(of.x_prev, collider, start, listed)
+    return Scenes(of.model, fields, numbers.time_step, numbers.friction_eps)
 
 
 def _trials(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) -> Trials:
-    numbers = of.prepared.settings.numbers
-    fields = of.touching(of.x_prev, collider, start, listed)
-    scenes = Scenes(of.model, ops.TouchingFields(*(t.detach() for t in fields)), numbers.time_step,
-                    numbers.friction_eps)  # fmt: skip
-    return Trials(scenes, rise_parts(of.model, of.fields, numbers.time_step))
+    s = _scenes(of, start, collider, listed)
+    s = s._replace(fields=ops.TouchingFields(*(t.detach() for t in s.fields)))
+    return Trials(s, rise_parts(of.model, of.fields, s.time_step))
 
 
-def record_combined(model: Model, x: Tensor, parts: Sequence[Combined | None]) -> None:
-    """For acceleration.record(): what the parts of a step that ends at x have combined."""
-    if model.acceleration is None:
-        return
-    for found in recorders("anderson"):
-        taken = [part.taken for part in parts if part is not None]
-        found.append(torch.cat(taken).movedim(0, 1) if taken else none_taken(model, x))
+def record_parts(model: Model, x: Tensor, parts: Sequence[SweptPart]) -> None:
+    """For acceleration.record() and coarse.record(): what the parts of a step that ends at x have done."""
+    if model.acceleration is not None:
+        for found in recorders("anderson"):
+            taken = [part.combined.taken for part in parts if part.combined is not None]
+            found.append(torch.cat(taken).movedim(0, 1) if taken else none_taken(model, x))
+    if model.coarse is not None:
+        for found in recorders("coarse"):
+            lengths = [part.lengths for part in parts if part.lengths is not None]
+            empty = x.new_empty((0, len(x), model.coarse_geometry.bodies))
+            found.append(torch.cat([empty, *lengths]).movedim(0, 1))

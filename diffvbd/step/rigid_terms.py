@@ -117,13 +117,13 @@ def corners_of(listed: Pairs) -> tuple[Tensor, Tensor]:
     return rows[:, 5:], rows[:, :4]
 
 
-def _listed(s: Scenes) -> tuple[Pairs, Tensor]:
-    """The pairs that push bodies apart, and which of them do: few of those that are listed. All of them where values
-    must not decide sizes."""
+def _listed(s: Scenes, own: bool) -> tuple[Pairs, Tensor]:
+    """The pairs that push, of bodies apart or also of one body, and which of them do: few of those that are listed. All
+    of them where values must not decide sizes."""
     f = s.fields
     listed = s.listed
     corners, kind = corners_of(listed)[1], f.pairs[:, 4]
-    apart = f.body[corners[:, 0]] != f.body[torch.where(kind == 1, corners[:, 2], corners[:, 1])]
+    apart = own | (f.body[corners[:, 0]] != f.body[torch.where(kind == 1, corners[:, 2], corners[:, 1])])
     if f.x.is_cuda or torch.compiler.is_compiling():
         return listed, apart
     with torch.no_grad():
@@ -132,13 +132,14 @@ def _listed(s: Scenes) -> tuple[Pairs, Tensor]:
     return listed, apart[rows]
 
 
-def pair_terms(s: Scenes) -> list[PairTerms]:
-    """Of barriers, and of lagged friction and damping."""
+def pair_terms(s: Scenes, own: bool = False) -> list[PairTerms]:
+    """Of barriers, and of lagged friction and damping. own: with the barriers of pairs of one body, which do nothing to
+    its rigid motion."""
     f, h, h2 = s.fields, s.time_step, s.time_step**2
     points = torch.cat([f.x, f.collider], 1)
     out = []
     if f.pairs.shape[0]:
-        listed, apart = _listed(s)
+        listed, apart = _listed(s, own)
         force, active, n, w = pair_lag(f.x, f.collider, f.kappa, f.origin, listed).split((1, 1, 3, 4), -1)
         scene, corners = corners_of(listed)
         at = points[scene, corners]

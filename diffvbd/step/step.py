@@ -154,7 +154,7 @@ def swept(
     """Positions after the sweeps, with the backward of an adjoint route. ``given``: arguments that errors may name;
     ``colliders``: where they are at the start and at the end, of a Model with contact."""
     fields, settings, adjoint = begun.fields(model, prepared), prepared.settings, check_adjoint(adjoint)
-    if prepared.coarse is not None:
+    if prepared.coarse is not None and colliders is None:  # contact makes corrections of its own
         fields = with_corrections(model, prepared.coarse, fields, settings.numbers.time_step)
     more = (*(colliders or ()), *prepared.parameters.values())
     policy = _tape_policy(model, (*fields, *more), settings, adjoint)

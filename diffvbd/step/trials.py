@@ -21,6 +21,8 @@ from ..ops import contact_start as ops_start
 from .pair_values import barrier_values, floor_friction_values, lagged_values
 from .rigid_terms import Scenes, corners_of
 
+LENGTHS = 8  # 1, 1/2, ..., 1/128; twin of kLengths in csrc/coarse/length.h, as the next
+DECREASE = 1e-4  # share of what the slope promises
 EDGES = 1  # the kind of a pair of two edges
 
 
@@ -98,11 +100,29 @@ class Trials:
     def admits(self, x: Tensor, to: Tensor) -> Tensor:
         """Whether each set may go from x to ``to`` [1, B V, 3], bool [1, sets]. What does not move must stay."""
         x, to = (t.reshape(self.scenes.fields.x_prev.shape) for t in (x, to))
+        return self._admits(x, to, 0.0)[None, :-1]
+
+    @torch.no_grad()
+    def lengths(self, x: Tensor, way: Tensor, slope: Tensor) -> Tensor:
+        """What of a way [B, V, 3] each set goes: the first of 1, 1/2, ..., 1/128 that lowers its potential by enough of
+        what the slope [sets] promises, else 0; [1, sets]."""
+        found = torch.zeros_like(slope, dtype=x.dtype)
+        for trial in range(LENGTHS):
+            share = 0.5**trial
+            enough = torch.cat([DECREASE * share * slope, slope.new_zeros(1)])
+            good = self._admits(x, x + share * way, enough)[:-1] & (slope <= 0)
+            found = torch.where((found == 0) & good, share, found)
+            if not x.is_cuda and bool((found > 0).all()):
+                break
+        return found[None]
+
+    def _admits(self, x: Tensor, to: Tensor, most: Tensor | float) -> Tensor:
+        """Whether the potential of each set rises at most so much, and nothing crosses, bool [sets + 1]."""
         rise, size = self.rise(x, to).unbind(-1)
         fits = torch.ones_like(rise, dtype=x.dtype)
         fits = fits.scatter_reduce(0, self.bodies.of, self._fits(x, to).reshape(-1), "amin")
-        good = (rise <= ROUNDINGS * torch.finfo(x.dtype).eps * size) & (fits >= 1)  # never of what is no number
-        return good[None, :-1]
+        # never of what is no number
+        return (rise <= most + ROUNDINGS * torch.finfo(x.dtype).eps * size) & (fits >= 1)
 
     def of_bodies(self, values: Tensor) -> Tensor:
         """Values of sets [1, sets] of each body that moves [B, bodies]."""

@@ -169,6 +169,7 @@ def part_of(detection: Any) -> reference.Part:
     return reference.Part(pairs, constants, detection.island.cpu().long(), detection.shares.cpu(),
                           detection.corrections.cpu(), limits,
                           None if detection.frames is None else detection.frames.cpu(), lowest=lowest,
+                          lengths=None if detection.lengths is None else detection.lengths.cpu(),
                           combined=None if detection.combined is None else tuple(t.cpu() for t in detection.combined)
                           )  # fmt: skip
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from conftest import DEVICES
 from helpers.marks import slow
+from helpers.touching import pressed, rebuilt, stack
 from torch import Tensor
 
 import diffvbd as dv
@@ -22,10 +23,6 @@ from diffvbd.testing.contact_scenes import GRAVITY, SCENES, Scene, boxes, compil
 def accelerated(name: str, window: int = 2) -> Scene:
     scene = SCENES[name]()
     return replace(scene, model=rebuilt(scene.model, acceleration=dv.Anderson(window)))
-
-
-def rebuilt(model: dv.Model, **options: Any) -> dv.Model:
-    return dv.Model(model.mesh, energies=model.energies, pinned=model.pinned, colliders=model.colliders, **options)
 
 
 def taken_in(detections: list[Any]) -> list[Tensor]:
@@ -74,25 +71,6 @@ def test_same_as_without_where_nothing_is_combined() -> None:
         ends = [dv.step(m, scene.x, scene.v, time_step=scene.time_step, sweeps=sweeps, **scene.inputs)[0]
                 for m in (plain, scene.model)]  # fmt: skip
         assert torch.equal(*ends) == (sweeps < 3)
-
-
-def pressed(**options: Any) -> tuple[dv.Model, dict[str, Any]]:
-    """A stiff beam, held at one end, that its load presses on a plane stiffer than itself."""
-    mesh = dv.mesh.box((9, 3, 5), (1.0, 0.15, 0.4))
-    barrier = dv.PairBarrier(kappa=2e6, dhat=0.01, self_contact=False)
-    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, energies=(dv.StableNeoHookean(), barrier),
-                     colliders=(dv.colliders.Plane((0, -0.009, 0), (0, 1, 0)),), **options)  # fmt: skip
-    force = torch.zeros(model.num_vertices, 3, dtype=torch.float64)
-    force[torch.from_numpy(mesh.points[:, 1] > 0.14), 1] = -200.0
-    return model, {"mu": 1e6, "lam": 2e6, "time_step": 1 / 60, "force": force}
-
-
-def stack(**options: Any) -> tuple[dv.Model, dict[str, Any]]:
-    """Three boxes on a floor, one on the other."""
-    tets = boxes((0, 0, 0), (0.01, 0.2035, 0), (0, 0.407, 0.013))
-    energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.0035, kappa=1e5, dhat=0.005),
-                dv.PairBarrier(1e5, 0.005), dv.Friction(0.4, 0.05))  # fmt: skip
-    return dv.Model(tets, energies=energies, **options), {"mu": 1e6, "lam": 2e6, "time_step": 1 / 60}
 
 
 @pytest.mark.parametrize(("build", "sweeps", "window"), [(pressed, 60, 5), (stack, 40, 5)])
@@ -145,22 +123,23 @@ def test_records_and_refusals() -> None:
         rebuilt(scene.model, acceleration=dv.Anderson(), saturation=0.1)
 
 
-def test_gradients_on_a_floor_with_friction_alone() -> None:
-    """Against central differences at the decisions that were made."""
+@pytest.mark.parametrize("coarse", [None, dv.CoarseSpace(functions=4, every=2)])
+def test_gradients_on_a_floor_with_friction_alone(coarse: dv.CoarseSpace | None) -> None:
+    """Against central differences, for which decisions stay as they were."""
     tets = boxes((0, 0, 0))
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.01, kappa=1e4, dhat=0.02), dv.Friction(0.4, 0.05))
-    model = dv.Model(tets, energies=energies, acceleration=dv.Anderson(2))
+    model = dv.Model(tets, energies=energies, coarse=coarse, acceleration=dv.Anderson(2))
     x = model.rest_points
     v = torch.zeros_like(x) + torch.tensor([0.5, -0.2, 0.1], dtype=x.dtype)
     way = torch.linspace(-1, 1, x.numel(), dtype=x.dtype).reshape(x.shape).sin()
 
     def end(size: Any) -> Tensor:
-        return (way * dv.step(model, x, v + size * way, mu=2e4, lam=4e4, time_step=0.01, sweeps=7)[0]).sum()
+        return (way * dv.step(model, x, v + size * way, mu=2e4, lam=4e4, time_step=0.01, sweeps=9)[0]).sum()
 
-    with dv.acceleration.record() as taken:
+    with dv.acceleration.record() as taken, dv.coarse.record() as lengths:
         size = torch.zeros((), dtype=x.dtype, requires_grad=True)
         (slope,) = torch.autograd.grad(end(size), size)
-    assert taken[0].any() and slope.abs() > 0
+    assert taken[0].any() and slope.abs() > 0 and (coarse is None or lengths[0].any())
     with torch.no_grad():
         errors = [abs(float((end(h) - end(-h)) / (2 * h) - slope)) for h in (1e-4, 1e-5, 1e-6)]
     assert min(errors) <= tolerance("contact_finite_difference") * abs(float(slope))

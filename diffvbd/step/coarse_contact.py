@@ -1,0 +1,240 @@
+"""The coarse correction of bodies that touch: the functions of all bodies of a scene moved together by one Newton step,
+whose matrix has, beside inertia and stiffness at rest, what pairs and floors press back with.
+
+    (P'MP + h^2 sum of R_g K_g R_g' + P'(blocks of pairs, friction and vertex energies)P) a = P' dG,    x <- x - s P a
+
+Without those blocks stiff contact leaves lengths s next to nothing (docs/method.md, section 15).
+"""
+
+# pyright: reportIncompatibleMethodOverride=false
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from .. import ops
+from ..adjoint.potential import IncrementalPotential
+from ..adjoint.sums import sum_by
+from ..model.model import Model
+from .rigid_terms import Scenes, corners_of, pair_terms, vertex_blocks, vertex_gradient
+from .trials import Trials
+
+REFUSALS = 2  # corrections of a set without an admissible length, after which a part makes no more of it
+
+
+class Space(NamedTuple):
+    """The functions W [V, F] of a Model, row by row, and of which body they are; constants."""
+
+    vertex: Tensor  # int64 [entries]
+    function: Tensor  # int64 [entries]
+    weight: Tensor  # [entries]
+    body: Tensor  # int64 [F], of those that move; their number where a function only fills up
+    of_coarse: Tensor  # int64 [coarse bodies], the moving body of each
+    dense: Tensor  # int64 [9 cells], where the packed matrices of all bodies stand in one [3F, 3F]
+    functions: int
+
+    def restricted(self, g: Tensor) -> Tensor:
+        """P' g: [B, V, 3] -> [B, F, 3]."""
+        return sum_by((self.weight[:, None] * g[:, self.vertex]).movedim(1, 0), self.function, self.functions).movedim(
+            0, 1
+        )
+
+    def prolonged(self, a: Tensor, vertices: int) -> Tensor:
+        """P a: [B, F, 3] -> [B, V, 3]."""
+        rows = (self.weight[:, None] * a[:, self.function]).movedim(1, 0)
+        return sum_by(rows, self.vertex, vertices).movedim(0, 1)
+
+
+def space_of(model: Model) -> Space:
+    return model.derived("contact_space", lambda: _space(model))
+
+
+def _space(model: Model) -> Space:
+    g, moving = model.coarse_geometry, model._moving
+    vertex, function = (torch.from_numpy(a).to(model.device, torch.int64) for a in (g.vertex, g.function))
+    weight = torch.from_numpy(g.weight).to(model.device, model.dtype)
+    body = torch.full((g.functions,), moving.number, device=model.device)
+    body[function] = moving.of[vertex]
+    ptr = torch.from_numpy(g.function_ptr).to(model.device, torch.int64)
+    dense = []
+    for first, last in zip(g.function_ptr[:-1].tolist(), g.function_ptr[1:].tolist(), strict=True):
+        rows = torch.arange(3 * first, 3 * last)
+        dense.append((3 * g.functions * rows[:, None] + rows).reshape(-1))
+    return Space(vertex, function, weight, body, body[ptr[:-1]], torch.cat(dense).to(model.device), g.functions)
+
+
+class Corrections:
+    """The coarse corrections of one part of a step; ``factor``: fields.coarse_factor, differentiable."""
+
+    def __init__(self, trials: Trials, fields: ops.SweepFields, factor: Tensor, scenes: Scenes) -> None:
+        self.trials, self.fields, self.factor, self.scenes = trials, fields, factor, scenes
+        self.space = space_of(scenes.model)
+        self.matrix = _dense(factor.detach(), self.space)
+        self.refused = torch.zeros_like(trials.bodies.ptr[:-1])[None]
+        self.set_of = trials.bodies.of_body[:, self.space.body]  # of each function [B, F]
+
+    def correct(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """x [B, V, 3] after a correction, and its length for each body of the coarse space [B, bodies]."""
+        over = self.refused >= REFUSALS
+        if not x.is_cuda and bool(over.all()):
+            return x, self._of_bodies(torch.zeros_like(over, dtype=x.dtype))
+        r, presses = self._gradient(x)
+        with torch.no_grad():
+            a = self._solved(presses, r)
+            way = -self.space.prolonged(a, x.shape[1])
+            slope = sum_by(-(r * a).sum(-1).reshape(-1, 1).double(), self.set_of.reshape(-1), over.shape[1] + 1)[:-1, 0]
+            length = torch.where(over, 0.0, self.trials.lengths(x, way, slope))
+            self.refused = self.refused + (length == 0)
+        if torch.is_grad_enabled():
+            way = -self.space.prolonged(self._differentiable(a, r, presses), x.shape[1])
+        of_vertex = torch.cat([length, length.new_zeros((1, 1))], 1)[0][self.trials.bodies.of].reshape(*x.shape[:2], 1)
+        return torch.where(of_vertex > 0, x + of_vertex * way, x), self._of_bodies(length)
+
+    def _of_bodies(self, length: Tensor) -> Tensor:
+        return length[0][self.trials.bodies.of_body[:, self.space.of_coarse]]
+
+    def _gradient(self, x: Tensor) -> tuple[Tensor, list[_Press]]:
+        """P' dG [B, F, 3], and what presses back."""
+        s, f = self.scenes._replace(fields=self.scenes.fields._replace(x=x)), self.fields
+        force = _Elastic.apply(x, f.mu, f.lam, f.rest, f, s.model, s.time_step) + vertex_gradient(s)
+        scenes, vertices = x.shape[:2]
+        presses = []
+        blocks = vertex_blocks(s)
+        if blocks is not None:
+            presses.append(_at_vertices(blocks))
+        for terms in pair_terms(s, own=True):
+            scene, corners = corners_of(terms.listed)
+            moves = corners < vertices
+            rows = torch.where(moves, vertices * scene + corners, 0)
+            weights = torch.where(moves, terms.weights, 0.0)
+            pulled = weights[..., None] * terms.force[:, None]
+            if terms.at_corners is not None:
+                pulled = pulled + torch.where(moves[..., None], terms.at_corners, 0.0)
+            force = force + sum_by(pulled.reshape(-1, 3), rows.reshape(-1), scenes * vertices).reshape(x.shape)
+            presses.append(_Press(rows, weights, terms.stiffness))
+        return self.space.restricted(force), presses
+
+    def _solved(self, presses: list[_Press], r: Tensor) -> Tensor:
+        """a [B, F, 3]; keeps the factor."""
+        scenes, unknowns = r.shape[0], 3 * self.space.functions
+        matrix = self.matrix.expand(scenes, unknowns, unknowns).clone()
+        for press in presses:
+            matrix = matrix + press.assembled(self.space, scenes, self.scenes.fields.x_prev.shape[1])
+        self.cholesky = torch.linalg.cholesky_ex(matrix)[0]
+        return self._back(r)
+
+    def _back(self, r: Tensor) -> Tensor:
+        half = torch.linalg.solve_triangular(self.cholesky, r.reshape(r.shape[0], -1, 1), upper=False)
+        return torch.linalg.solve_triangular(self.cholesky.mT, half, upper=True).reshape(r.shape)
+
+    def _differentiable(self, a: Tensor, r: Tensor, presses: list[_Press]) -> Tensor:
+        """a with its derivatives: one more step of no length, r - A a being zero, with the matrix as it was."""
+        vertices = self.scenes.fields.x_prev.shape[1]
+        pushed = _Product.apply(self.factor, a, self.space)
+        way = self.space.prolonged(a, vertices)
+        for press in presses:
+            pushed = pushed + self.space.restricted(press.product(way))
+        return a + self._back(r - pushed)
+
+
+class _Press(NamedTuple):
+    """What presses back against motions sum_k w_k x_k of some vertices."""
+
+    rows: Tensor  # int64 [n, k], among the vertices of all scenes
+    weights: Tensor  # [n, k]
+    stiffness: Tensor  # [n, 3, 3], times h^2
+
+    def product(self, way: Tensor) -> Tensor:
+        """[B, V, 3] -> [B, V, 3]"""
+        flat = way.flatten(0, 1)
+        moved = (self.weights[..., None] * flat[self.rows]).sum(1)
+        force = (self.stiffness @ moved[..., None])[..., 0]
+        pulled = self.weights[..., None] * force[:, None]
+        return sum_by(pulled.reshape(-1, 3), self.rows.reshape(-1), len(flat)).reshape(way.shape)
+
+    def assembled(self, space: Space, scenes: int, vertices: int) -> Tensor:
+        """P' H P [B, 3F, 3F]."""
+        dense = torch.zeros((vertices, space.functions), dtype=space.weight.dtype, device=space.weight.device)
+        dense[space.vertex, space.function] = space.weight
+        moved = (self.weights[..., None] * dense[self.rows % vertices]).sum(1)  # [n, F]
+        scene, out = self.rows[:, 0] // vertices, []
+        for n in range(scenes):
+            own = torch.where((scene == n)[:, None], moved, 0.0) if scenes > 1 else moved
+            blocks = [[own.mT @ (self.stiffness[:, i, j, None] * own) for j in range(3)] for i in range(3)]
+            out.append(torch.stack([torch.stack(row, -1) for row in blocks], 1).reshape(3 * space.functions, -1))
+        return torch.stack(out)
+
+
+def _at_vertices(blocks: Tensor) -> _Press:
+    """Of blocks [B, V, 3, 3]; where values may decide sizes, of those that are not zero."""
+    flat = blocks.flatten(0, 1)
+    rows = torch.arange(len(flat), device=flat.device)
+    if not flat.is_cuda:
+        rows = (flat != 0).flatten(1).any(1).nonzero()[:, 0]
+        flat = flat[rows]
+    return _Press(rows[:, None], torch.ones_like(flat[:, :1, 0]), flat)
+
+
+def _dense(factor: Tensor, space: Space) -> Tensor:
+    """The matrices of all bodies as one [B, 3F, 3F], from their factors (on CUDA their inverses)."""
+    unknowns = 3 * space.functions
+    out = factor.new_zeros((len(factor), unknowns * unknowns))
+    out[:, space.dense] = factor
+    out = out.reshape(-1, unknowns, unknowns)
+    if factor.is_cuda:
+        return torch.linalg.inv_ex(out)[0]
+    lower = out.tril()
+    return lower @ lower.mT
+
+
+class _Product(Function):
+    """A a [B, F, 3] of the matrices without presses, whose factors pass on the adjoint of the matrices themselves."""
+
+    @staticmethod
+    def forward(factor: Tensor, a: Tensor, space: Space) -> Tensor:
+        return (_dense(factor, space) @ a.reshape(len(a), -1, 1)).reshape(a.shape)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        factor, a, ctx.space = inputs
+        ctx.shape = factor.shape
+        ctx.save_for_backward(a)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        (a,) = ctx.saved_tensors
+        unknowns = 3 * ctx.space.functions
+        row, column = ctx.space.dense // unknowns, ctx.space.dense % unknowns
+        bar = grads[0].reshape(len(a), -1)[:, row] * a.reshape(len(a), -1)[:, column]
+        return ops.sum_to(bar, ctx.shape), None, None
+
+
+class _Elastic(Function):
+    """The gradient of the tets' energy times h^2 [B, V, 3]."""
+
+    @staticmethod
+    def forward(x: Tensor, mu: Tensor, lam: Tensor, rest: Tensor | None, fields: Any, model: Model, h: float) -> Tensor:
+        return IncrementalPotential(model, x, fields, h).elastic()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        x, mu, lam, rest, fields, ctx.model, ctx.h = inputs
+        ctx.fields = fields._replace(**{k: None if t is None else t.detach() for k, t in fields._asdict().items()})
+        ctx.shapes = [None if t is None else t.shape for t in (mu, lam, rest)]
+        ctx.save_for_backward(x)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        (x,) = ctx.saved_tensors
+        w, needs = grads[0].contiguous(), ctx.needs_input_grad
+        potential = IncrementalPotential(ctx.model, x, ctx.fields, ctx.h)
+        bars = potential.dependence(w, (False, False, False, needs[1], needs[2], False, needs[3], False))
+        bars = [None if bar is None else ops.sum_to(-bar, shape)
+                for bar, shape in zip((bars[3], bars[4], bars[6]), ctx.shapes, strict=True)]  # fmt: skip
+        return potential.elastic_product(w) if needs[0] else None, *bars, None, None, None
+
+
+ops.ready_signature(_Product, _Elastic)

@@ -1,0 +1,120 @@
+"""Claim: beside pairs and friction, coarse corrections bring steps nearer to converged ones in as many sweeps, their
+gradients are those of the executed step, and nothing crosses."""
+
+import functools
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from conftest import DEVICES
+from helpers.marks import slow
+from helpers.touching import pressed, rebuilt, stack
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd.testing import relative_error, tolerance
+from diffvbd.testing.contact_scenes import GRAVITY, SCENES, Scene, compiled, noise, unrolled
+
+SPACE = dv.CoarseSpace(functions=6, groups=2, every=2)
+
+
+@functools.cache
+def corrected(name: str, window: int | None = None) -> Scene:
+    scene = SCENES[name]()
+    acceleration = None if window is None else dv.Anderson(window)
+    return replace(scene, model=rebuilt(scene.model, coarse=SPACE, acceleration=acceleration))
+
+
+def lengths_in(detections: list[Any]) -> list[Tensor]:
+    return [d.lengths for d in detections if d.lengths is not None]
+
+
+def check(scene: Scene, steps: int, sweeps: int, device: str) -> Tensor:
+    """Lengths of all corrections."""
+    result, parts = compiled(scene, steps, sweeps, "full", scene.model.to(device))
+    expected, other = (unrolled(scene, steps, sweeps, parts, seed=seed) for seed in (None, 1))
+    for key, value in expected.items():
+        spread = tolerance("spread_factor") * relative_error(other[key], value)
+        floor = tolerance("contact_adjoint" if key.startswith("grad_") else "contact_forward") * steps
+        floor *= 1 / scene.time_step if key == "v" else 1
+        assert relative_error(result[key], value) <= max(floor, spread), key
+        if key in ("grad_x", "grad_v", "grad_mu", "grad_density"):
+            assert value.abs().max() > 0, key
+    return torch.cat([part.lengths.reshape(-1) for part in parts if part.lengths is not None])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("steps", "sweeps", "window"), [(1, 7, None), slow(1, 9, 2), slow(3, 6, None)])
+@pytest.mark.parametrize("name", list(SCENES))
+def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int, window: int | None,
+                                                  device: str) -> None:  # fmt: skip
+    lengths = check(corrected(name, window), steps, sweeps, device)
+    assert (lengths == 1).any() or name == "fast"
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_gradients_of_shortened_and_refused_corrections(device: str) -> None:
+    scene = corrected("batched")
+    scene = replace(scene, v=scene.v + noise("violent", "batched", shape=scene.v.shape, size=2.0))
+    lengths = check(scene, 1, 7, device)
+    assert (lengths == 1).any() and ((lengths > 0) & (lengths < 1)).any() and (lengths == 0).any(), lengths
+
+
+@pytest.mark.parametrize("build", [pressed, stack])
+def test_nearer_in_as_many_sweeps(build: Any) -> None:
+    plain, given = build()
+    x = plain.rest_points
+    v = torch.zeros_like(x)
+    goal = dv.step(plain, x, v, sweeps=4000, **given)[0]
+    errors = [float((dv.step(m, x, v, sweeps=16, **given)[0] - goal).norm() / (goal - x).norm())
+              for m in (plain, build(coarse="auto")[0])]  # fmt: skip
+    assert errors[1] < errors[0] / 10, errors
+
+
+@pytest.mark.parametrize("name", ["fast", "crossed", "stacked"])
+def test_nothing_crosses(name: str) -> None:
+    """Every step looks for intersections at its start."""
+    scene = corrected(name, 2)
+    x, v, lengths = scene.x, scene.v, []
+    for _ in range(12):
+        with dv.debug_checks(), dv.contact.record() as found:
+            x, v = dv.step(scene.model, x, v, time_step=scene.time_step, sweeps=9, gravity=GRAVITY, **scene.inputs)
+        lengths += [t.reshape(-1) for t in lengths_in(found)]
+        assert min(dv.contact.status(scene.model).smallest_gap) > 0
+    assert torch.cat(lengths).any()
+
+
+def test_records() -> None:
+    scene = corrected("stacked")
+    with dv.coarse.record() as lengths:
+        for sweeps in (0, 1, 2, 6):
+            dv.step(scene.model, scene.x, scene.v, time_step=scene.time_step, sweeps=sweeps, **scene.inputs)
+    assert [t.shape for t in lengths] == [(1, n, 2) for n in (0, 0, 1, 3)] and lengths[-1].any()
+
+
+def test_more_functions_than_can_be_solved_for_together_are_refused() -> None:
+    tets = dv.mesh.box((9, 9, 9), (1.0, 1.0, 1.0))
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(1e3, 0.01))
+    with pytest.raises(ValueError, match="at most 512 functions of all bodies"):
+        dv.Model(tets, energies=energies, coarse=dv.CoarseSpace(functions=600))
+
+
+def test_gradients_of_the_rest_shape() -> None:
+    """Against central differences, for which decisions stay as they were."""
+    model, given = stack(coarse=SPACE)
+    x = model.rest_points
+    v = torch.zeros_like(x)
+    v[:, 1] = -0.1 * x[:, 1]
+    way = torch.linspace(-1, 1, x.numel(), dtype=x.dtype).reshape(x.shape).sin()
+
+    def end(size: Any) -> Tensor:
+        return (way * dv.step(model, x, v, sweeps=7, rest_points=x + size * way, **given)[0]).sum()
+
+    with dv.coarse.record() as lengths:
+        size = torch.zeros((), dtype=x.dtype, requires_grad=True)
+        (slope,) = torch.autograd.grad(end(size), size)
+    assert lengths[0].any() and slope.abs() > 0
+    with torch.no_grad():
+        errors = [abs(float((end(h) - end(-h)) / (2 * h) - slope)) for h in (1e-6, 1e-7, 1e-8)]
+    assert min(errors) <= tolerance("contact_finite_difference") * abs(float(slope))
