@@ -40,4 +40,24 @@ def sum_by(values: Tensor, index: Tensor, count: int) -> Tensor:
     return _SumBy.apply(flat, index, count).reshape(count, *values.shape[1:])
 
 
-ready_signature(_SumBy)
+class _SumSegments(Function):
+    @staticmethod
+    def forward(values: Tensor, order: Tensor, ptr: Tensor, index: Tensor) -> Tensor:
+        return ops_contact.segment_sum(values.contiguous(), order, ptr)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        ctx.index = inputs[3]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        return grads[0][:, ctx.index], None, None, None
+
+
+def sum_segments(values: Tensor, order: Tensor, ptr: Tensor, index: Tensor) -> Tensor:
+    """Sums of rows of ``values`` [B, V, n] by ``index`` [V], whose order is known: order, ptr int32. Differentiable in
+    the values; [B, segments, n]."""
+    return _SumSegments.apply(values, order, ptr, index)
+
+
+ready_signature(_SumBy, _SumSegments)

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..adjoint.sums import sum_by
+from ..adjoint.sums import sum_segments
 from ..model.model import Model
 from ..ops import broadcast, no_second_derivative, no_transforms, of_inputs
 from ..ops import contact_rigid as ops_rigid
@@ -130,10 +130,8 @@ def _sum(parts: tuple[Tensor | None, ...], like: Tensor) -> Tensor:
 
 def _arms(f: ops.TouchingFields, body: Tensor) -> tuple[Tensor, Tensor]:
     """Where vertices are from the centers of mass of their bodies [B, V, 3], and the masses of these [B, bodies]."""
-    scenes, count = f.x.shape[0], f.free.shape[0]
-    rows = (body + count * torch.arange(scenes, device=body.device)[:, None]).reshape(-1)
     mass = broadcast(f.mass, f.x.shape[:2])[..., None]
-    sums = sum_by(torch.cat([mass, mass * f.x], -1).flatten(0, 1), rows, scenes * count).unflatten(0, (scenes, count))
+    sums = sum_segments(torch.cat([mass, mass * f.x], -1), f.order, f.ptr, body)
     whole = sums[..., :1].clamp(min=torch.finfo(f.x.dtype).tiny)
     return f.x - (sums[..., 1:] / whole)[:, body], sums[..., 0]
 

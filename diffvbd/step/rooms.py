@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..adjoint.contact_lag import Pairs, pair_lag
-from ..adjoint.sums import sum_by
+from ..adjoint.sums import sum_by, sum_segments
 from ..contact import detection as search
 from ..contact.barrier import PairBarrier
 from ..contact.start import PartStart, share_above_floor
@@ -26,10 +26,7 @@ def _tiny(x: Tensor) -> float:
 
 def _by_body(values: Tensor, surface: ContactSurface) -> Tensor:
     """Sums over the vertices of each body, [B, V, n] -> [B, bodies, n]."""
-    scenes, vertices, _ = values.shape
-    scene = surface.bodies * torch.arange(scenes, device=values.device)[:, None]
-    rows = (scene + surface.body[:vertices].long()).reshape(-1)
-    return sum_by(values.flatten(0, 1), rows, scenes * surface.bodies).unflatten(0, (scenes, surface.bodies))
+    return sum_segments(values, surface.body_order, surface.body_ptr, surface.body[: values.shape[1]].long())
 
 
 class Motion:
