@@ -43,7 +43,7 @@ class CoarseSpace:
         degree: Of the splines on the body's rest box, 1 to 3. ``"auto"``: 1, in the plane of a sheet 3.
         groups: Sets of neighbouring tets of a body with one rotation each. ``"auto"``: a quarter of its functions.
         every: Sweeps after each correction. A step is: one sweep, then a correction and up to ``every`` sweeps, again
-            until ``sweeps`` are done; without sweeps it is one correction.
+            until ``sweeps`` are done; without sweeps it is one correction, beside pairs and friction none.
 
     Source: docs/method.md, section 15.
     """

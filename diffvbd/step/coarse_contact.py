@@ -163,8 +163,9 @@ class _Press(NamedTuple):
         scene, out = self.rows[:, 0] // vertices, []
         for n in range(scenes):
             own = torch.where((scene == n)[:, None], moved, 0.0) if scenes > 1 else moved
-            blocks = [[own.mT @ (self.stiffness[:, i, j, None] * own) for j in range(3)] for i in range(3)]
-            out.append(torch.stack([torch.stack(row, -1) for row in blocks], 1).reshape(3 * space.functions, -1))
+            upper = {(i, j): own.mT @ (self.stiffness[:, i, j, None] * own) for i in range(3) for j in range(i, 3)}
+            blocks = [torch.stack([upper[min(i, j), max(i, j)] for j in range(3)], -1) for i in range(3)]
+            out.append(torch.stack(blocks, 1).reshape(3 * space.functions, -1))
         return torch.stack(out)
 
 

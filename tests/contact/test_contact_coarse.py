@@ -118,3 +118,27 @@ def test_gradients_of_the_rest_shape() -> None:
     with torch.no_grad():
         errors = [abs(float((end(h) - end(-h)) / (2 * h) - slope)) for h in (1e-6, 1e-7, 1e-8)]
     assert min(errors) <= tolerance("contact_finite_difference") * abs(float(slope))
+
+
+def test_float32_is_near_float64() -> None:
+    model, given = stack(coarse="auto", acceleration=dv.Anderson(2))
+    ends = []
+    for dtype in (torch.float64, torch.float32):
+        own = model.to(dtype=dtype)
+        x = own.rest_points
+        ends.append(dv.step(own, x, torch.zeros_like(x), sweeps=11, **given)[0])
+    assert ends[1].dtype == torch.float32 and relative_error(*ends[::-1]) <= tolerance("float32_forward")
+
+
+def test_checkpoints_and_threads_change_no_bit() -> None:
+    model, given = stack(coarse="auto", acceleration=dv.Anderson(2))
+    x, found, threads = model.rest_points, [], torch.get_num_threads()
+    try:
+        for every, count in ((None, 1), (2, 2)):
+            torch.set_num_threads(count)
+            v = torch.zeros_like(x).requires_grad_()
+            run = dv.rollout(model, x, v, steps=3, sweeps=8, save="last", checkpoint_every=every, **given)
+            found.append((run.x[-1].detach(), torch.autograd.grad(run.x[-1].square().sum(), v)[0]))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(*pair) for pair in zip(*found, strict=True)) and found[0][1].abs().max() > 0
