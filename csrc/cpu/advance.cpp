@@ -48,7 +48,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
   for (int move = 0; move < kMoves; ++move) {
     s.first = move == 0;
     std::fill(failed.begin(), failed.end(), 0);
-    bool clean = false;  // everything passes as it goes
+    bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
     for (int64_t i = 0; i < units; ++i) begin_move(s, i);
     for (int round = 0; round < kRounds; ++round) {
       const bool last = round + 1 == kRounds;
@@ -62,8 +62,8 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
       });
       const int64_t left =
           count(rows, kGrain, [&](int64_t i) { return fails(i / in.vertices, stay(in, s, i, last ? 0 : round)); });
-      clean = found + left == 0;
-      if (clean || last) break;
+      clean = round == 0 && found + left == 0;
+      if (found + left == 0 || last) break;
       if (count(units, kGrain, [&](int64_t i) { return retreat(s, i, round); }) == 0) break;
     }
     for (int64_t i = 0; i < units; ++i) give_up(in, s, i);

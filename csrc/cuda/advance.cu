@@ -44,7 +44,7 @@ __global__ void __launch_bounds__(kThreads)
     each(in.scenes, [&](int64_t i) { s.failed[i] = 0; });
     each(units, [&](int64_t i) { begin_move(s, i); });
     grid.sync();
-    bool clean = false;  // everything passes as it goes
+    bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
     for (int round = 0; round < kRounds; ++round) {
       const bool last = round + 1 == kRounds;
       bool found = false, less = false;
@@ -54,8 +54,9 @@ __global__ void __launch_bounds__(kThreads)
       };
       each(pairs, [&](int64_t i) { note(in.listed.pairs[kPairRow * i + 5], passes(in, s, i, last ? 0 : round)); });
       each(rows, [&](int64_t i) { note(i / in.vertices, stay(in, s, i, last ? 0 : round)); });
-      clean = !any(found);
-      if (clean || last) break;
+      const bool passed = !any(found);
+      clean = round == 0 && passed;
+      if (passed || last) break;
       each(units, [&](int64_t i) { less = retreat(s, i, round) || less; });
       if (!any(less)) break;
     }
