@@ -52,6 +52,48 @@ class _Lag(Function):
         return (*(ops.sum_to(b, t.shape) for b, t in zip(bars, given, strict=True)), None, None)
 
 
+class _AtCorners(Function):
+    @staticmethod
+    def forward(points: Tensor, listed: Pairs) -> Tensor:
+        rows = listed.pairs.clamp(min=0).long()
+        return points[rows[:, 5:], rows[:, :4]]
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        ctx.shape, ctx.listed = inputs[0].shape[:2], inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        return sum_at_corners(grads[0], ctx.listed, *ctx.shape), None
+
+
+class _SumAtCorners(Function):
+    @staticmethod
+    def forward(values: Tensor, listed: Pairs, scenes: int, points: int) -> Tensor:
+        rows = values.flatten(0, 1)[None].contiguous()
+        return ops_contact.segment_sum(rows, listed.entry, listed.ptr).reshape(scenes, points, values.shape[-1])
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        ctx.listed = inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        return at_corners(grads[0], ctx.listed), None, None, None
+
+
+def at_corners(points: Tensor, listed: Pairs) -> Tensor:
+    """points [B, N, n] of all corner points at those of each pair [pairs, 4, n]; those of a row that no pair fills are
+    any, and pass no gradient on."""
+    return _AtCorners.apply(points, listed)
+
+
+def sum_at_corners(values: Tensor, listed: Pairs, scenes: int, points: int) -> Tensor:
+    """Sums of values at the corners of pairs [pairs, 4, n] over the pairs of each corner point, [B, N, n] of so many
+    scenes and corner points."""
+    return _SumAtCorners.apply(values, listed, scenes, points)
+
+
 class _OfScene(Function):
     """A value of each scene [B] for each pair of a list [pairs]."""
 
@@ -85,4 +127,4 @@ def pair_lag(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed:
     return _Lag.apply(x.contiguous(), collider.contiguous(), kappa.contiguous(), origin, listed)
 
 
-ops.ready_signature(_Lag, _OfScene)
+ops.ready_signature(_Lag, _OfScene, _AtCorners, _SumAtCorners)

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
+from ..adjoint.contact_lag import sum_at_corners
 from ..adjoint.potential import IncrementalPotential
 from ..adjoint.sums import sum_by
 from ..model.model import Model
@@ -110,10 +111,10 @@ class Corrections:
             moves = corners < vertices
             rows = torch.where(moves, vertices * scene + corners, 0)
             weights = torch.where(moves, terms.weights, 0.0)
-            pulled = weights[..., None] * terms.force[:, None]
+            pulled = terms.weights[..., None] * terms.force[:, None]
             if terms.at_corners is not None:
-                pulled = pulled + torch.where(moves[..., None], terms.at_corners, 0.0)
-            force = force + sum_by(pulled.reshape(-1, 3), rows.reshape(-1), scenes * vertices).reshape(x.shape)
+                pulled = pulled + terms.at_corners
+            force = force + sum_at_corners(pulled, terms.listed, scenes, s.fields.body.shape[0])[:, :vertices]
             presses.append(_Press(rows, weights, terms.stiffness))
         return self.space.restricted(force), presses
 

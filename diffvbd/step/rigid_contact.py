@@ -19,11 +19,12 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
+from ..adjoint.contact_lag import at_corners
 from ..adjoint.sums import sum_segments
 from ..model.model import Model
 from ..ops import broadcast, no_second_derivative, no_transforms, of_inputs
 from ..ops import contact_rigid as ops_rigid
-from .rigid_terms import Scenes, corners_of, pair_terms, vertex_blocks, vertex_gradient
+from .rigid_terms import Scenes, pair_terms, vertex_blocks, vertex_gradient
 
 LEAST_MASS = 1e-11  # of a body's mass, that keeps its system definite; twin of kLeastMass in csrc/contact/rigid.h
 _FIELDS = len(ops.TouchingFields._fields)
@@ -162,8 +163,7 @@ def _virtual_work(s: Scenes, p: Tensor, q: Tensor, arm: Tensor, whole: Tensor, b
     rest = torch.zeros_like(f.collider)
     at_p, at_q = torch.cat([at_p, rest], 1), torch.cat([at_q, rest], 1)
     for terms in pair_terms(s):
-        scene, corners = corners_of(terms.listed)
-        moved = torch.stack([at_p[scene, corners], at_q[scene, corners]])  # [2, n, 4, 3]
+        moved = torch.stack([at_corners(at_p, terms.listed), at_corners(at_q, terms.listed)])  # [2, n, 4, 3]
         if terms.at_corners is not None:
             work = work + (terms.at_corners * moved[0]).sum()
         moved = terms.weights[..., None] * moved

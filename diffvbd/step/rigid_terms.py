@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
+from ..adjoint.contact_lag import Pairs, at_corners, of_scene, pair_lag, some_of
 from ..ops import broadcast
 
 RESTING = 1e-6  # of the motion below which friction is smoothed; twin of kRestingMotion in csrc/contact/pairs.h
@@ -141,10 +141,9 @@ def pair_terms(s: Scenes, own: bool = False) -> list[PairTerms]:
     if f.pairs.shape[0]:
         listed, apart = _listed(s, own)
         force, active, n, w = pair_lag(f.x, f.collider, f.kappa, f.origin, listed).split((1, 1, 3, 4), -1)
-        scene, corners = corners_of(listed)
-        at = points[scene, corners]
+        at = at_corners(points, listed)
         if f.origin.numel():
-            at = at + torch.cat([f.origin, torch.zeros_like(f.collider)], 1)[scene, corners]
+            at = at + at_corners(torch.cat([f.origin, torch.zeros_like(f.collider)], 1), listed)
         dhat, offset = listed.constants[:, 0], listed.constants[:, 1]
         near = (active[:, 0] > 0) & apart
         height = ((at - at[:, :1].detach()) * n[:, None]).sum(-1)
@@ -158,8 +157,7 @@ def pair_terms(s: Scenes, own: bool = False) -> list[PairTerms]:
         out.append(PairTerms(listed, torch.where(near[:, None], -h2 * force * n, 0.0), stiffness, w, turned))
     if f.lag.numel():
         load, rate, n, w = f.lag.split((1, 1, 3, 4), -1)
-        scene, corners = corners_of(s.lagged)
-        moved = points[scene, corners] - torch.cat([f.x_prev, f.collider_prev], 1)[scene, corners]
+        moved = at_corners(points - torch.cat([f.x_prev, f.collider_prev], 1), s.lagged)
         m = (w[..., None] * moved).sum(1)
         along = (n * m).sum(-1, keepdim=True)
         approach, u = along.clamp(max=0), m - along * n

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..adjoint.contact_lag import Pairs, pair_lag
-from ..adjoint.sums import sum_by, sum_segments
+from ..adjoint.contact_lag import Pairs, pair_lag, sum_at_corners
+from ..adjoint.sums import sum_segments
 from ..contact import detection as search
 from ..contact.barrier import PairBarrier
 from ..contact.start import PartStart, share_above_floor
@@ -173,11 +173,8 @@ def unsupported(model: Model, x: Tensor, origin: Tensor, collider: Tensor, kappa
     assert surface is not None
     scenes, vertices = x.shape[:2]
     force, _, n, w = pair_lag(x, collider, kappa, origin, listed).split((1, 1, 3, 4), -1)
-    used = listed.pairs[:, 5:] >= 0
-    pushes = torch.where(used, force * w, 0.0)[..., None] * n[:, None]  # [pairs, 4, 3]
     points = vertices + collider.shape[1]
-    index = (points * listed.pairs[:, 5:].long() + listed.pairs[:, :4].long()).clamp(min=0)
-    total = sum_by(pushes.flatten(0, 1), index.flatten(), scenes * points).unflatten(0, (scenes, points))[:, :vertices]
+    total = sum_at_corners((force * w)[..., None] * n[:, None], listed, scenes, points)[:, :vertices]
     if floor_data is not None and model.floor is not None:
         size, normal = model.floor.normal_force(x, floor_data, origin if origin.numel() else None)
         total = total + (size[..., None] * broadcast(normal[:, None], (*size.shape, 3))).sum(2)
