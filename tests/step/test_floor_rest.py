@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.bearing import bearing_gap
 from torch import Tensor
 
 import diffvbd as dv
@@ -19,16 +20,6 @@ GRAVITY = 9.81
 DIRECTIONS = torch.nn.functional.normalize(
     torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [0.48, 0.8, -0.36]], dtype=torch.float64), dim=-1
 )
-
-
-def bearing_gap(force: float) -> float:
-    """d* with |b'(d*)| = force [N], by bisection."""
-    low, high = 0.0, DHAT
-    for _ in range(200):
-        d = (low + high) / 2
-        borne = KAPPA * (2 * (d - DHAT) * torch.log(torch.tensor(d / DHAT).double()) + (d - DHAT) ** 2 / d)
-        low, high = (d, high) if float(borne) > force else (low, d)
-    return low
 
 
 def scenes(
@@ -66,7 +57,7 @@ def check_rest(model: dv.Model, x: Tensor, options: dict[str, Any], steps: int, 
 
 
 def least_gap(density: float = DENSITY) -> float:
-    return (1 - FILTER_ETA) * bearing_gap(density * 0.2**3 * GRAVITY)
+    return (1 - FILTER_ETA) * bearing_gap(density * 0.2**3 * GRAVITY, KAPPA, DHAT)
 
 
 CASES = [(k, omega) for k in range(6) for omega in (0.5, 1.0, 1.6) if k != 1 or omega <= 1]
