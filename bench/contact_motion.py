@@ -43,7 +43,8 @@ GROUPS: dict[str, Group] = {
         for gap, steps in (((0.002, 1),) if quick else ((0.002, 1), (0.002, 10), (0.01, 10)))
     ],
     "grip": lambda quick, device: [piles.grip(20, seconds=0.15, device=device)] if quick else [
-        piles.grip(k, device=device) for k in (20, 40, 100, 400)
+        *(piles.grip(k, device=device) for k in (20, 40, 100, 400)),
+        *(piles.grip(k, device=device, coarse=True) for k in (8, 20, 40)),
     ],
     "gradient": lambda quick, device: [
         scenes.slide_gradient(surface, speed, device=device)

@@ -207,7 +207,8 @@ def impact(speed: float = 10.0, sweeps: int = 20, parts: int = 50, time_step: fl
 
 
 def grip(sweeps: int = 40, friction: float = 0.6, squeeze: float = 6e-4, seconds: float = 0.5,
-         time_step: float = 1 / 240, device: str = "cpu", barrier: Options = None) -> Row:  # fmt: skip
+         time_step: float = 1 / 240, device: str = "cpu", barrier: Options = None,
+         coarse: bool = False) -> Row:  # fmt: skip
     """Vertical force that a cube of 5 cm and 0.103 kg, held by friction alone, puts on its two clamps.
 
     The clamps are plates whose outer faces are pinned and move inward in 0.1 s, by squeeze beyond the start of the
@@ -227,7 +228,8 @@ def grip(sweeps: int = 40, friction: float = 0.6, squeeze: float = 6e-4, seconds
     density[: cube.num_tets] = 0.103 / size**3
     energies = (dv.StableNeoHookean(), pairs(barrier, kappa=KAPPA, dhat=dhat, self_contact=False),
                 dv.Friction(friction))  # fmt: skip
-    model = dv.Model(body, density=density, pinned=outer, energies=energies, device=device)
+    space = dv.CoarseSpace() if coarse else None
+    model = dv.Model(body, density=density, pinned=outer, energies=energies, coarse=space, device=device)
     rest = model.rest_points
     inward = torch.zeros_like(rest)
     inward[n : n + m, 0], inward[n + m :, 0] = squeeze, -squeeze
@@ -246,8 +248,9 @@ def grip(sweeps: int = 40, friction: float = 0.6, squeeze: float = 6e-4, seconds
     fallen = float(course.center(-1, slice(n))[1] - course.center(0, slice(n))[1])
     weight = 0.103 * GRAVITY
     note = f"{up.min():.3g} to {up.max():.3g} N; pressed with {pressed:.3g} N; cube moved {1e3 * fallen:.3g} mm"
-    found = relative(course, "vertical force on the clamps [N]", "steady grip", float(up.mean()), weight, 0.05, note)
-    return found if sweeps >= 40 else found | {"target": "", "met": None}  # fewer are not expected to do
+    case = "steady grip, with corrections" if coarse else "steady grip"
+    found = relative(course, "vertical force on the clamps [N]", case, float(up.mean()), weight, 0.05, note)
+    return found if sweeps >= 40 or coarse else found | {"target": "", "met": None}  # fewer are not expected to do
 
 
 def _pinned_load(model: dv.Model, x: Tensor) -> Array:

@@ -329,8 +329,9 @@ def _state_messages(model: Model, result: Diagnosis) -> list[str]:
                    f"smaller time step{faster}")  # fmt: skip
     slip = result.friction_residuals
     if slip is not None and _largest(slip) > UNBALANCED_FRICTION:
+        faster = ', coarse="auto"' if model.coarse is None else ""
         out.append(f"friction has not converged: {100 * _largest(slip):.2g} % of it on {_place(slip)} is not balanced; "
-                   "take more sweeps, a smaller time step or a larger Friction(velocity=)")  # fmt: skip
+                   f"take more sweeps, a smaller time step{faster} or a larger Friction(velocity=)")  # fmt: skip
     return out
 
 

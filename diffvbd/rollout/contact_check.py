@@ -78,9 +78,10 @@ def warn_of_contact(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prep
             stacklevel=3,
         )
     if left > UNBALANCED_FRICTION:
+        faster = ', coarse="auto"' if model.coarse is None else ""
         warnings.warn(
             f"friction: {100 * left:.2g} % of it is not balanced in the last step: the sweeps have not converged; take "
-            "more sweeps, a smaller time_step or a larger Friction(velocity=) (docs/contact.md)",
+            f"more sweeps, a smaller time_step{faster} or a larger Friction(velocity=) (docs/contact.md)",
             UserWarning,
             stacklevel=3,
         )
