@@ -4,6 +4,7 @@ at once."""
 # pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -112,9 +113,10 @@ PLANE = 7  # numbers of a plane of a FloorBarrier
 
 def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
                          planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface,
-                         rigid: Tensor | None) -> PartStart:  # fmt: skip
+                         rigid: Tensor | None, raises: Callable[[Tensor, Tensor], Tensor]) -> PartStart:  # fmt: skip
     """Every vertex as far along its way as pairs and floor let all go at once: by ``rigid`` each body as a whole, then
-    by what is left of ``move``, then by ``fall``.
+    by what is left of ``move``, then by ``fall``. What pairs hold up bends a body: a free one that they hold up goes
+    its own way only where that does not raise its potential.
 
     Args:
         x, move, fall: [B, V, 3] [m].  mass: [1 | B, V] [kg].
@@ -123,6 +125,7 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         origin: [B, V, 3] or empty.  detection: of the step.
         rigid: Where rigid motions of bodies would take their vertices, as a way [B, V, 3] [m], differentiable; None
             without self-contact.
+        raises: Of two states [B, V, 3], which vertices are of a body whose potential is higher in the second [B, V].
     """
     floor = x.new_empty((0,)) if planes is None else planes
     index = (surface.held, surface.body, surface.body_order, surface.body_ptr, detection.island, detection.lowest)
@@ -147,6 +150,13 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
     def target_of(at: Tensor, way: Tensor, by: Tensor) -> Tensor:
         return _Target.apply(at, way, by, floor, origin, surface) if floor.numel() else at + way
 
+    def held_up(share: Tensor) -> Tensor:
+        """Vertices of free bodies of which pairs have held something up."""
+        free = torch.where(surface.held[: x.shape[1]], 0.0, 1.0).to(share)
+        rows, ones = body.expand(share.shape), share.new_ones((share.shape[0], surface.bodies))
+        least, free = (ones.scatter_reduce(1, rows, t.expand(share.shape), "amin") for t in (share, free))
+        return ((least < SHORT) & (free > 0))[:, body]
+
     target, base, frames, own = target_of(x, move, u), torch.where(pinned, x, x + carried), None, ()
     if rigid is not None:  # bodies first, each as a whole
         with torch.no_grad():
@@ -161,7 +171,16 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         if number:
             target = target_of(at, fall, still)
         with torch.no_grad():
-            shares.append(advance(at, target - at, still, center, own=own))
+            way = target - at
+            share = advance(at, way, still, center, own=own)
+            if number == 0:
+                here = torch.where(pinned, target, at)
+                bent = raises(here, torch.where(pinned, target, at + share[..., None] * way)) & held_up(share)
+                if at.is_cuda or torch.compiler.is_compiling() or bool(bent.any()):
+                    stuck.pop()  # once more, with those at rest: what let the others pass may have been their motion
+                    way = torch.where(bent[..., None], 0.0, way)
+                    share = torch.where(bent, 0.0, advance(at, way, still, center, own=own))
+            shares.append(share)
         at = torch.where(pinned, target, at + shares[-1][..., None] * (target - at))
     short = (torch.minimum(*shares) < SHORT) & ~pinned[:, 0]
     return PartStart(at, center, room, own, frames, short, sum(stuck[1:], stuck[0]), torch.stack(shares))

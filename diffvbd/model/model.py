@@ -261,7 +261,8 @@ class Model:
             given = (self._rest_points, self._topology[0], self._pinned, self._mass, self._rest, self._plan)
             self.coarse_geometry, self._coarse_plan = plan_of(self.coarse, *given, device.type)
             check_coupled(self.coarse_geometry, self.touches)
-        if self.acceleration is not None or (self.coarse is not None and self.touches):  # whose decisions read it
+        decides = self.contact is not None or (self.coarse is not None and self.touches)
+        if self.acceleration is not None or decides:  # by potentials of bodies
             elastic = bool(self.energy_mask & ELASTIC)
             self._moving = moving_bodies(self._rest_points, self._topology[0], self._pinned, elastic)
 

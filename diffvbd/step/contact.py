@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .. import ops
 from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
+from ..adjoint.rise import rise_parts, rises
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
 from ..contact.start import PartStart, start_between_planes
@@ -203,7 +204,8 @@ class ContactStep:
                                           self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
             fall = fall if self.model.starts_from == "predictor" else torch.zeros_like(fall)  # corrections do it
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
-                                         detection, surface, rigid if barrier.self_contact else None)  # fmt: skip
+                                         detection, surface, rigid if barrier.self_contact else None,
+                                         self._raises)  # fmt: skip
             met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
             if self._reads(x):
                 self._check(r, met.counts[r].tolist(), met)
@@ -232,6 +234,13 @@ class ContactStep:
         for found in recorders():  # a step that is done again, with room for more pairs, counts once
             found.extend(met.found)
         return x
+
+    def _raises(self, x: Tensor, to: Tensor) -> Tensor:
+        """Which vertices are of a body whose own potential is higher at ``to`` than at x [B, V], bool."""
+        parts = rise_parts(self.model, self.fields, self.prepared.settings.numbers.time_step)
+        rising = rises(parts, x.detach().contiguous(), to.detach())
+        none = torch.zeros_like(rising[:, :1])
+        return torch.cat([rising, none], 1)[:, self.model._moving.of]
 
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
         """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
