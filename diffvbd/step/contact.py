@@ -239,7 +239,7 @@ class ContactStep:
         """Which vertices are of a body whose own potential is higher at ``to`` than at x [B, V], bool."""
         parts = rise_parts(self.model, self.fields, self.prepared.settings.numbers.time_step)
         rising = rises(parts, x.detach().contiguous(), to.detach())
-        none = torch.zeros_like(rising[:, :1])
+        none = rising.new_zeros((len(rising), 1))
         return torch.cat([rising, none], 1)[:, self.model._moving.of]
 
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:

@@ -45,7 +45,8 @@ def bodies_of(model: Model) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
 
 def _bodies_of(model: Model) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     surface, count = model.surface_of_contact, model.mesh.num_bodies
-    free = torch.zeros((count,), device=model.device).index_add(0, model.body, model._pinned.float()) == 0
+    pins = torch.zeros((count,), dtype=torch.int64, device=model.device).index_add(0, model.body, model._pinned.long())
+    free = pins == 0
     if surface is not None:
         return surface.body_order, surface.body_ptr, free, surface.held, surface.body
     body, order = torch.sort(model.body, stable=True)
