@@ -66,13 +66,9 @@ def rest(support: str = "Plane", sweeps: int = 5, time_step: float = 1 / 100, de
                abs(value - goal) <= 1e-3)  # fmt: skip
 
 
-def stack(count: int = 5, sweeps: int = 5, height: float = 0.2, friction: float = 0.5, seconds: float = 2.0,
-          time_step: float = 1 / 100, device: str = "cpu", barrier: Options = None) -> Row:  # fmt: skip
-    """Sway of a stack of boxes 0.2 m wide: the largest distance that a box's center has moved sideways in 2 s.
-
-    It stands if no box sways by half its width, and the top one keeps 0.9 of its height. A column of this
-    material buckles under its weight from about 1.1 m on, so ten boxes have to be flat.
-    """
+def tower(count: int = 5, sweeps: int = 5, height: float = 0.2, friction: float = 0.5, time_step: float = 1 / 100,
+          device: str = "cpu", barrier: Options = None) -> Scene:  # fmt: skip
+    """Boxes 0.2 m wide on each other, not quite in line."""
     box, gap, rng = mesh.box(2, (BOX[0], height, BOX[2])), 0.3 * DHAT, np.random.default_rng(0)
     lifts = gap + np.arange(count) * (height + gap)
     body = mesh.join([box.translate((x, y, z)) for y, (x, z) in zip(lifts, rng.uniform(-0.005, 0.005, (count, 2)),
@@ -80,9 +76,19 @@ def stack(count: int = 5, sweeps: int = 5, height: float = 0.2, friction: float 
     energies = (dv.StableNeoHookean(), pairs(barrier, self_contact=False), dv.Friction(friction),
                 dv.FloorBarrier(0.0, UP, kappa=KAPPA, dhat=DHAT))  # fmt: skip
     model = dv.Model(body, energies=energies, device=device)
-    course = march(Scene(model, 2 * MODULUS, time_step, sweeps, walls=((UP, 0.0),)), round(seconds / time_step), keep=5)
-    size = box.num_vertices
-    centers = torch.stack([x.reshape(count, size, 3).mean(1) for x in course.x])
+    return Scene(model, 2 * MODULUS, time_step, sweeps, walls=((UP, 0.0),))
+
+
+def stack(count: int = 5, sweeps: int = 5, height: float = 0.2, friction: float = 0.5, seconds: float = 2.0,
+          time_step: float = 1 / 100, device: str = "cpu", barrier: Options = None) -> Row:  # fmt: skip
+    """Sway of a :func:`tower`: the largest distance that a box's center has moved sideways in 2 s.
+
+    It stands if no box sways by half its width, and the top one keeps 0.9 of its height. A column of this
+    material buckles under its weight from about 1.1 m on, so ten boxes have to be flat.
+    """
+    scene = tower(count, sweeps, height, friction, time_step, device, barrier)
+    course = march(scene, round(seconds / time_step), keep=5)
+    centers = torch.stack([x.reshape(count, -1, 3).mean(1) for x in course.x])
     sway = float((centers - centers[0])[..., [0, 2]].norm(dim=-1).max())
     top = float(centers[-1, -1, 1] / centers[0, -1, 1])
     stands = sway < 0.5 * BOX[0] and top > 0.9

@@ -37,12 +37,12 @@ def draw(name: str, results: dict[str, Any], path: Path) -> bool:
     return True
 
 
-def keep_picture(drawn: Path | io.BytesIO, to: Path) -> None:
-    """A picture for the repository: at most 1,200 pixels wide and in 64 colors, an eighth of the bytes."""
+def keep_picture(drawn: Path | io.BytesIO, to: Path, width: int = 1200) -> None:
+    """A picture for the repository: at most so many pixels wide and in 64 colors, an eighth of the bytes."""
     from PIL import Image  # matplotlib needs it, too
 
     picture = Image.open(drawn).convert("RGB")
-    picture.thumbnail((1200, 1200))
+    picture.thumbnail((width, width))
     picture.quantize(64).save(to, optimize=True)
 
 
