@@ -151,7 +151,9 @@ def test_nothing_crosses_and_a_fall_stays_free(quick: Callable[[str], dict[str, 
     for row in results["rows"]:
         assert row["done"] == row["steps"] and row["error"] is None, row["name"]
         assert row["intersections"] == row["nonfinite"] == 0 and row["smallest_gap_over_dhat"] > 0, row["name"]
-    assert rows["50 m/s"]["pairs"] > 0 and rows["50 m/s"]["cut_max"] > 0 and rows["free fall"]["cut_max"] == 0
+    fast = [row for row in results["rows"] if row["group"] == "50 m/s"]
+    assert all(row["pairs"] > 0 for row in fast) and max(row["cut_max"] for row in fast) > 0
+    assert rows["free fall"]["cut_max"] == 0
     assert "check every" in (folder / "contact.md").read_text()
     cost = results["cost"]
     assert cost["contact_operators"]["without"] == [] != cost["contact_operators"]["with"]
