@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
+from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 
 from .. import ops
 from ..adjoint.routes import Adjoint, ReverseSweep, Unrolled
@@ -110,8 +110,12 @@ def _again(run: Callable[..., Segment], *args: Any) -> Segment:
     capturing = (
         not torch.compiler.is_compiling() and torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
     )
-    again = run if torch.compiler.is_compiling() else _resuming(run, Scope())
-    return checkpoint(again, *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
+    if torch.compiler.is_compiling():
+        return checkpoint(run, *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
+    scope = Scope()
+    # A run that stops once the last tensor is saved does not reach the end of its last step, which records it.
+    with set_checkpoint_early_stop(not scope.recorders):
+        return checkpoint(_resuming(run, scope), *args, use_reentrant=False, preserve_rng_state=not capturing)  # type: ignore[return-value]
 
 
 def _resuming(run: Callable[..., Segment], scope: Scope) -> Callable[..., Segment]:
