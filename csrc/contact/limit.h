@@ -26,20 +26,31 @@ DIFFVBD_FN T limit_of(int exponent) {
 DIFFVBD_FN int sides(int kind) { return kind == kEdgeEdge ? 2 : 1; }
 
 // How two sides lie along a direction m that points from the second to the first.
-template <class T>
+template <class R>
 struct Separation {
-  T gap;       // between the lowest corner of the first and the highest of the second, less the radii [m]
-  T slack[4];  // how far behind that one each corner lies [m]
-  DIFFVBD_FN Separation(int kind, const Corners<T>& c, const Vec3<T>& m, T offset) {
+  R gap;       // between the lowest corner of the first and the highest of the second, less the radii [m]
+  R slack[4];  // how far behind that one each corner lies [m]
+  DIFFVBD_FN Separation(int kind, const Corners<R>& c, const Vec3<R>& m, const R& offset) {
     const int first = sides(kind);
-    T h[4], lowest = std::numeric_limits<T>::infinity(), highest = -lowest;
+    R h[4], lowest = R(std::numeric_limits<float>::infinity()), highest = -lowest;
     for (int k = 0; k < 4; ++k) {
       h[k] = dot(m, c.x[k]);
-      if (k < first) lowest = h[k] < lowest ? h[k] : lowest;
-      if (k >= first) highest = highest < h[k] ? h[k] : highest;
+      if (k < first) lowest = select(h[k] < lowest, h[k], lowest);
+      if (k >= first) highest = select(highest < h[k], h[k], highest);
     }
     for (int k = 0; k < 4; ++k) slack[k] = k < first ? h[k] - lowest : highest - h[k];
     gap = lowest - highest - offset;
+  }
+};
+
+// What one corner of a pair may do while the others rest: the first of the questions that a Gate asks.
+template <class T>
+struct Clearance {
+  Vec3<T> toward;  // in which direction the corner closes the gap
+  T gap, slack;    // along that direction [m]
+  DIFFVBD_FN bool holds(const Vec3<T>& d, T share, T guard) const {
+    const T wide = gap - guard;
+    return T(0) < wide && dot(toward, d) <= slack + share * wide;
   }
 };
 

@@ -24,11 +24,10 @@ DIFFVBD_FN const A& of_corner(const A (&a)[4], int i) {
 }
 DIFFVBD_FN bool is_corner(int i, int k) { return i == k; }
 
-// Adds the barrier's part of the block of corner i; returns whether the pair is active.
+// Adds the barrier's part of the block of corner i of a pair whose distance is `at`; returns whether it is active.
 template <class R, class Index>
-DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Index& i, const PairConstants<R>& a, const R& kappa,
-                            const R& h2, Vec3<R>& g, Sym3<R>& H) {
-  const Distance<R> at = distance(kind, c);
+DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Distance<R>& at, const Index& i,
+                            const PairConstants<R>& a, const R& kappa, const R& h2, Vec3<R>& g, Sym3<R>& H) {
   const R gap = at.d - a.offset;
   const auto active = gap < a.dhat;
   if (!any(active)) return active;

@@ -77,6 +77,26 @@ DIFFVBD_FN void add_at(T* p, const Vec3<T>& v) {
   p[2] += v.z;
 }
 
+// Whether the gap of a listed pair is above a length for sure, whose corner k has gone moved(k) since the gap was
+// taken: the closest points of two sides move apart no farther than some corners of theirs.
+template <class T, class Moved>
+DIFFVBD_FN bool is_above(int kind, const Moved& moved, const T* constants, T length) {
+  const T room = PairHints<T>(constants).gap - length;
+  if (!(T(0) < room)) return false;
+  const int first = sides(kind);
+  Vec3<T> way[4];
+  for (int k = 0; k < 4; ++k) way[k] = moved(k);
+  T most = T(0);
+  for (int i = 0; i < first; ++i) {
+    for (int j = first; j < 4; ++j) {
+      const Vec3<T> d = way[i] - way[j];
+      const T square = dot(d, d);
+      most = most < square ? square : most;
+    }
+  }
+  return T(1 + 1e-6) * most < room * room;
+}
+
 // The corner points of one scene. The backend's are x(v) of a vertex and, where a color has moved, goes(v), whether v
 // was of it; x(v) is then where it was before.
 template <class T, class Positions>
@@ -109,25 +129,9 @@ struct Source {
   DIFFVBD_FN Vec3<T> moved(int v) const {
     return v < in.num_vertices ? positions(v) - in.center_of(scene, v) : zero3<T>();
   }
-  // Square of how far the closest points of two sides can have moved relative to each other since then.
-  DIFFVBD_FN T squared_change(const int32_t* pair) const {
-    const int first = sides(pair[4]);
-    Vec3<T> way[4];
-    for (int k = 0; k < 4; ++k) way[k] = moved(pair[k]);
-    T most = T(0);
-    for (int i = 0; i < first; ++i) {
-      for (int j = first; j < 4; ++j) {
-        const Vec3<T> d = way[i] - way[j];
-        const T square = dot(d, d);
-        most = most < square ? square : most;
-      }
-    }
-    return T(1 + 1e-6) * most;
-  }
   // Whether the gap of a listed pair is above a length for sure.
   DIFFVBD_FN bool is_above(const int32_t* pair, const T* constants, T length) const {
-    const T room = PairHints<T>(constants).gap - length;
-    return T(0) < room && squared_change(pair) < room * room;
+    return contact::is_above(pair[4], [&](int k) { return moved(pair[k]); }, constants, length);
   }
   DIFFVBD_FN bool is_far(const int32_t* pair, const T* constants) const {
     return is_above(pair, constants, PairConstants<T>(constants).dhat);
@@ -152,7 +156,8 @@ DIFFVBD_FN void add_barriers(const Source<T, Positions>& s, int v, int first, in
     const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
     const T* constants = in.constants + int64_t{kConstants} * pair;
     if (s.is_far(record, constants)) continue;
-    add_barrier(record[4], s.corners(record), entry & 3, PairConstants<T>(constants), kappa, h * h, g, H);
+    const Corners<T> c = s.corners(record);
+    add_barrier(record[4], c, distance(record[4], c), entry & 3, PairConstants<T>(constants), kappa, h * h, g, H);
   }
 }
 
@@ -196,34 +201,41 @@ DIFFVBD_FN T guard_of(const Source<T, Positions>& s, int v) {
   return T(kGuardUlps) * std::numeric_limits<T>::epsilon() * (absolute(at.x) + absolute(at.y) + absolute(at.z));
 }
 
-// And not below `exponent` of every `stride`-th of its pairs from `first` on.
+// And not below `exponent` of one of its pairs, by the length of d and the guard of v.
+template <class T, class Positions>
+DIFFVBD_FN int limit_by_pair(const Source<T, Positions>& s, int entry, const Vec3<T>& d, T length, T guard,
+                             int exponent) {
+  const ContactInputs<T>& in = s.in;
+  const int pair = entry >> 2, own = entry & 3;
+  const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
+  const T* constants = in.constants + int64_t{kConstants} * pair;
+  const int sides_first = sides(record[4]);
+  bool both = false;
+  for (int k = 0; k < 4; ++k) {
+    both = both ||
+           ((k < sides_first) != (own < sides_first) && record[k] < in.num_vertices && s.positions.goes(record[k]));
+  }
+  const T share = both ? T(kBothShare) : T(kShare);
+  if (s.is_above(record, constants, limit_of<T>(exponent) * length / share + guard)) return exponent;
+  const Gate<T> gate(record[4], s.corners(record), constants, guard);
+  const T shares[4] = {share, share, share, share};
+  Vec3<T> way[4] = {zero3<T>(), zero3<T>(), zero3<T>(), zero3<T>()};
+  while (exponent < kNoMove) {
+    way[own] = limit_of<T>(exponent) * d;
+    if (gate.holds(way, shares, false)) break;
+    ++exponent;
+  }
+  return exponent;
+}
+
+// Of every `stride`-th of its pairs from `first` on.
 template <class T, class Positions>
 DIFFVBD_FN int limit_by_pairs(const Source<T, Positions>& s, int v, const Vec3<T>& d, int first, int stride,
                               int exponent) {
-  const ContactInputs<T>& in = s.in;
-  const int64_t row = s.scene * in.corners + v;
   const T length = length_of(d), guard = guard_of(s, v);
-  const PairList::Entries all = in.listed.of(row);
+  const PairList::Entries all = s.in.listed.of(s.scene * s.in.corners + v);
   for (int e = first; e < all.count; e += stride) {
-    const int entry = all.first[e], pair = entry >> 2, own = entry & 3;
-    const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
-    const T* constants = in.constants + int64_t{kConstants} * pair;
-    const int sides_first = sides(record[4]);
-    bool both = false;
-    for (int k = 0; k < 4; ++k) {
-      both = both ||
-             ((k < sides_first) != (own < sides_first) && record[k] < in.num_vertices && s.positions.goes(record[k]));
-    }
-    const T share = both ? T(kBothShare) : T(kShare);
-    if (s.is_above(record, constants, limit_of<T>(exponent) * length / share + guard)) continue;
-    const Gate<T> gate(record[4], s.corners(record), constants, guard);
-    const T shares[4] = {share, share, share, share};
-    Vec3<T> way[4] = {zero3<T>(), zero3<T>(), zero3<T>(), zero3<T>()};
-    while (exponent < kNoMove) {
-      way[own] = limit_of<T>(exponent) * d;
-      if (gate.holds(way, shares, false)) break;
-      ++exponent;
-    }
+    exponent = limit_by_pair(s, all.first[e], d, length, guard, exponent);
   }
   return exponent;
 }

@@ -21,7 +21,8 @@ ContactScene<T>::ContactScene(const Plan& plan, const ContactInputs<T>& in, cons
       kernels_(pair_kernels<T>()),
       before_(reverse ? 0 : int64_t{plan.blocks} * kLanes * 4),
       positions_{s.x, position},
-      near_(given_, scene, [&](int v) { return Source<T, Positions>{in, scene, positions_}.moved(v); }),
+      rows_(plan, in, scene, position, s.x),
+      near_(given_, scene, rows_, [&](int v) { return Source<T, Positions>{in, scene, positions_}.moved(v); }),
       source_{in_, scene, positions_} {
   in_.listed = near_.view();
   for (int64_t at = 0; at < int64_t{plan.blocks} * kLanes; ++at) {
@@ -80,7 +81,7 @@ void ContactScene<T>::limit(int64_t first, int64_t last, int64_t begin, int64_t 
     T* x = s_.x + 4 * at;
     const Vec3<T> from = vector_at(before_.get() + 4 * at), d = vector_at(x) - from;
     int exponent = limits[v];
-    if (near) exponent = limit_by_pairs(source, v, d, 0, 1, exponent);
+    if (near) exponent = limit_by_near(source, v, d, exponent);
     limits[v] = static_cast<uint8_t>(exponent);
     if (exponent > 0) {
       const Vec3<T> to = from + limit_of<T>(exponent) * d;
@@ -109,39 +110,67 @@ void ContactScene<T>::each_vertex(int64_t begin, int64_t end, const F& f) const 
   }
 }
 
-template <class T>
-void put(T* column, int row, const Vec3<T>& a) {
-  column[row * kLanes] = a.x, column[(row + 1) * kLanes] = a.y, column[(row + 2) * kLanes] = a.z;
-}
-
-// Fills the columns column_of(entry, kind) with the near pairs of vertex v that are not out of reach.
+// Calls look(e, constants) for the near entries e of vertex v that are not far.
 template <class T>
 template <class F>
-void ContactScene<T>::each_pair(int32_t v, const F& column_of) const {
-  const PairList::Entries all = in_.listed.of(scene_ * in_.corners + v);
-  for (int e = 0; e < all.count; ++e) {
-    const int64_t entry = all.first[e], pair = entry >> 2;
-    const int32_t* record = in_.listed.pairs + kPairRow * pair;
-    const T* constants = in_.constants + kConstants * pair;
-    if (source_.is_far(record, constants)) continue;
-    const Corners<T> c = source_.corners(record);
-    T* column = column_of(entry, record[4]);
-    for (int k = 1; k < 4; ++k) put(column, 3 * (k - 1), c.x[k]);
-    for (int i = 0; i < 3; ++i) column[(9 + i) * kLanes] = constants[i];
-    column[12 * kLanes] = static_cast<T>(entry & 3);
+void ContactScene<T>::each_pair(int32_t v, const F& look) const {
+  const auto all = near_.of(v);
+  for (int64_t e = all.first; e < all.first + all.count; ++e) {
+    const T* constants = in_.constants + kConstants * int64_t{near_.entry(e) >> 2};
+    // what touched a sweep ago most often touches again
+    if (near_.state(e) != kTouching && rows_.is_far(near_.site(e), constants)) {
+      near_.state(e) = kFar;
+      near_.clearance(e).gap = PairConstants<T>(constants).dhat;
+      continue;
+    }
+    look(e, constants);
   }
+}
+
+// As limit_by_pairs(), of what assemble() has seen at the same positions; looks closer only where that does not settle
+// it.
+template <class T>
+int ContactScene<T>::limit_by_near(const Source<T, Before>& source, int32_t v, const Vec3<T>& d, int exponent) const {
+  const T length = length_of(d), guard = guard_of(source, v);
+  const int64_t begin = 4 * source.positions.first, end = 4 * source.positions.last;
+  const auto all = near_.of(v);
+  for (int64_t e = all.first; e < all.first + all.count; ++e) {
+    const PairSite& site = near_.site(e);
+    const bool first = site.is_first(site.own);
+    bool both = false;
+    for (int k = 0; k < 4; ++k) {
+      both = both || (site.is_first(k) != first && begin <= site.at[k] && site.at[k] < end);
+    }
+    const T share = both ? T(kBothShare) : T(kShare);
+    const Clearance<T>& room = near_.clearance(e);
+    const uint8_t state = near_.state(e);
+    const T part = limit_of<T>(exponent);
+    if (state == kFar && part * length / share + guard < room.gap) continue;
+    if (state >= kApart && room.holds(part * d, share, guard)) continue;
+    exponent = limit_by_pair(source, near_.entry(e), d, length, guard, exponent);
+  }
+  return exponent;
 }
 
 template <class T>
 void ContactScene<T>::assemble(int64_t begin, int64_t end) const {
-  const auto deliver = [](T* to, const T* result) {
-    for (int i = 0; i < kContactScalars; ++i) to[i * kLanes] += result[i];
+  struct Mark {
+    int64_t e;
+    T* to;
   };
-  PairBatches<T, T*, kPairGiven, kPairBlock, decltype(deliver)> batches(kernels_.add, kappa(), h_ * h_, deliver);
+  const auto deliver = [&](const Mark& mark, bool active, const T* result) {
+    near_.state(mark.e) = active ? kTouching : kApart;
+    near_.clearance(mark.e) = {vector_at(result + kPairToward), result[kPairGap], result[kPairSlack]};
+    if (!active) return;
+    for (int row = 0; row < 3; ++row) {
+      for (int i = 0; i < 3; ++i) mark.to[(3 * row + i) * kLanes] += result[kPairBlock + 4 * row + i];
+    }
+  };
+  PairBatches<T, Mark, decltype(deliver)> batches(kernels_.add, rows_, kappa(), h_ * h_, deliver);
   each_vertex(begin, end, [&](int32_t v, int64_t block, int lane) {
     T* to = record(block, lane, 0);
     for (int i = 0; i < kContactScalars; ++i) to[i * kLanes] = T(0);
-    each_pair(v, [&](int64_t, int kind) { return batches.add(kind, to); });
+    each_pair(v, [&](int64_t e, const T* constants) { batches.add(near_.site(e), constants, nullptr, Mark{e, to}); });
   });
   batches.flush();
   if (!in_.lag && in_.planes == 0) return;
@@ -183,21 +212,19 @@ void ContactScene<T>::prepare(int sweep, int tape_policy, int64_t begin, int64_t
 
 template <class T>
 void ContactScene<T>::reverse(int64_t begin, int64_t end) const {
-  const auto deliver = [&](int64_t entry, const T* result) {
-    for (int k = 0; k < 4; ++k) send(*reverse_, entry, k, vector_at(result + 3 * k));
-    reverse_->kappa[entry] += result[12];
+  const auto deliver = [&](int64_t e, bool active, const T* result) {
+    near_.state(e) = active ? kTouching : kApart;
+    if (!active) return;
+    const int64_t entry = near_.entry(e);
+    for (int k = 0; k < 4; ++k) send(*reverse_, entry, k, vector_at(result + 4 * k));
+    reverse_->kappa[entry] += result[kPairKappa];
   };
-  PairBatches<T, int64_t, kTurnGiven, kPairBars, decltype(deliver)> batches(kernels_.reverse, kappa(), h_ * h_,
-                                                                            deliver);
+  PairBatches<T, int64_t, decltype(deliver)> batches(kernels_.reverse, rows_, kappa(), h_ * h_, deliver);
   each_vertex(begin, end, [&](int32_t v, int64_t block, int lane) {
     const T* turn = s_.turn + block * 6 * kLanes + lane;
+    each_pair(v, [&](int64_t e, const T* constants) { batches.add(near_.site(e), constants, turn, e); });
     const auto at = [&](int i) { return turn[i * kLanes]; };
     const Vec3<T> p{at(0), at(1), at(2)}, d_raw{at(3), at(4), at(5)};
-    each_pair(v, [&](int64_t entry, int kind) {
-      T* column = batches.add(kind, entry);
-      put(column, kPairGiven, p), put(column, kPairGiven + 3, d_raw);
-      return column;
-    });
     Vec3<T> own = zero3<T>();
     reverse_lags(source_, *reverse_, v, 0, 1, h_, p, d_raw, own);
     add_at(s_.x_bar + 4 * (block * kLanes + lane), own);

@@ -51,7 +51,8 @@ class ContactScene {
   template <class F>
   void each_vertex(int64_t begin, int64_t end, const F& f) const;
   template <class F>
-  void each_pair(int32_t v, const F& column_of) const;
+  void each_pair(int32_t v, const F& look) const;
+  int limit_by_near(const contact::Source<T, Before>& source, int32_t v, const Vec3<T>& d, int exponent) const;
   T* record(int64_t block, int lane, int scalar) const;
   T kappa() const { return in_.kappa.data[scene_ * in_.kappa.scene]; }
 
@@ -65,6 +66,7 @@ class ContactScene {
   const PairKernels<T> kernels_;
   const Buffer<T> before_;  // [blocks kLanes, 4]  where the vertices of a color were before it moved
   const Positions positions_;
+  const PairRows<T> rows_;
   mutable NearPairs<T> near_;
   const contact::Source<T, Positions> source_;
 };

@@ -10,18 +10,32 @@
 #include <atomic>
 #include <vector>
 
-#include "../contact/passes.h"
-#include "scene.h"
+#include "pair_sites.h"
 
 namespace diffvbd {
+
+// What was found of a near entry when it was last looked at.
+enum PairState : uint8_t {
+  kNotSeen,  // nothing, in this list
+  kFar,      // its gap is above dhat for sure; the Clearance has dhat for a gap
+  kApart,    // its gap is above dhat, and the Clearance holds
+  kTouching  // its gap is below
+};
 
 template <class T>
 class NearPairs {
  public:
+  // The near entries of one corner point, one after another.
+  struct Entries {
+    int64_t first;
+    int count;
+  };
+
   // motion(v): of corner point v since the start of the part
   template <class Motion>
-  NearPairs(const contact::ContactInputs<T>& in, int64_t scene, const Motion& motion)
+  NearPairs(const contact::ContactInputs<T>& in, int64_t scene, const PairRows<T>& rows, const Motion& motion)
       : in_(in),
+        rows_(rows),
         row_(scene * in.corners),
         start_(in.listed.ptr[row_]),
         first_pair_(start_ / 4),
@@ -31,7 +45,10 @@ class NearPairs {
         stale_(in.corners, 1),
         near_((in.listed.ptr[row_ + in.corners] - start_) / 4),
         count_(in.corners),
-        entries_(4 * near_.size()) {
+        entries_(4 * near_.size()),
+        sites_(4 * near_.size()),
+        states_(4 * near_.size()),
+        clearances_(4 * near_.size()) {
     for (int v = 0; v < in.corners; ++v) {
       anchors_[v] = {motion(v), T(0), T(0)};
       extend(anchors_[v]);
@@ -62,7 +79,7 @@ class NearPairs {
   // The list with what is near.
   contact::PairList view() const {
     contact::PairList out = in_.listed;
-    out.near = entries_.data(), out.near_count = count_.data(), out.near_row = row_, out.near_start = start_;
+    out.near = entries_.get(), out.near_count = count_.data(), out.near_row = row_, out.near_start = start_;
     return out;
   }
 
@@ -102,14 +119,24 @@ class NearPairs {
     stale_[v] = 0;
     const int32_t *from = in_.listed.entry + in_.listed.ptr[row_ + v],
                   *end = in_.listed.entry + in_.listed.ptr[row_ + v + 1];
-    int32_t *out = entries_.data() + (in_.listed.ptr[row_ + v] - start_), *begin = out;
+    const int64_t first = in_.listed.ptr[row_ + v] - start_;
+    int32_t *out = entries_.get() + first, *begin = out;
     for (; from < end; ++from) {
       *out = *from;
       out += near_[(*from >> 2) - first_pair_];
     }
     count_[v] = static_cast<int32_t>(out - begin);
+    for (int64_t e = first; e < first + count_[v]; ++e) {
+      sites_.get()[e] = rows_.site(entries_.get()[e]);
+      states_.get()[e] = kNotSeen;
+    }
     return count_[v] > 0;
   }
+  Entries of(int v) const { return {in_.listed.ptr[row_ + v] - start_, count_[v]}; }
+  int32_t entry(int64_t e) const { return entries_.get()[e]; }
+  const PairSite& site(int64_t e) const { return sites_.get()[e]; }
+  uint8_t& state(int64_t e) { return states_.get()[e]; }
+  contact::Clearance<T>& clearance(int64_t e) { return clearances_.get()[e]; }
 
  private:
   static constexpr double kAhead = 2.0;     // of what a vertex does, up to where it keeps its anchor
@@ -161,12 +188,18 @@ class NearPairs {
   }
 
   const contact::ContactInputs<T>& in_;
+  const PairRows<T>& rows_;
   const int64_t row_, start_, first_pair_;
   std::vector<Anchor> anchors_;
   std::atomic<T> reach_{T(0)};
   std::vector<T> clear_;  // of the pairs of a corner point that may be far, the least gap less dhat
   std::vector<uint8_t> due_, stale_, near_;
-  std::vector<int32_t> count_, entries_;
+  std::vector<int32_t> count_;
+  // with room for all entries; a corner point's begin where its listed ones do
+  const Buffer<int32_t> entries_;
+  const Buffer<PairSite> sites_;
+  const Buffer<uint8_t> states_;
+  const Buffer<contact::Clearance<T>> clearances_;
 };
 
 }  // namespace diffvbd

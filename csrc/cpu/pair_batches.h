@@ -1,67 +1,75 @@
-// Pairs gathered into packs of one kind for the kernels of pair_kernels.h, and their results in the order in which the
-// pairs came, so that sums do not depend on what shared a pack.
+// Entries of pairs gathered into packs of one kind for the kernels of pair_kernels.h, and their results in the order in
+// which the entries came, so that sums do not depend on what shared a pack.
 #pragma once
 
 #include "pair_kernels.h"
+#include "pair_sites.h"
 
 namespace diffvbd {
 
-// deliver(mark, result) is called for each pair that is active; `mark` says what the caller wants to know of it.
-template <class T, class Mark, int given_rows, int out_rows, class Deliver>
+// deliver(mark, active, result) is called for each entry; `mark` says what the caller wants to know of it. The result
+// of a pair that is not active has a Clearance alone.
+template <class T, class Mark, class Deliver>
 class PairBatches {
  public:
-  PairBatches(PairKernel<T> kernel, T kappa, T h2, const Deliver& deliver)
-      : kernel_(kernel), kappa_(kappa), h2_(h2), deliver_(deliver) {}
+  PairBatches(PairKernel<T> kernel, const PairRows<T>& rows, T kappa, T h2, const Deliver& deliver)
+      : kernel_(kernel), rows_(rows), kappa_(kappa), h2_(h2), deliver_(deliver) {}
 
-  // Column of `given` for one more pair, to be filled before the next call: its rows are kLanes apart.
-  T* add(int kind, const Mark& mark) {
+  // turn: in the reverse p and d_raw of the corner
+  void add(const PairSite& site, const T* constants, const T* turn, const Mark& mark) {
     if (size_ == kMost) flush();
-    Pack& pack = packs_[kind];
-    if (pack.count == kLanes) run(kind);
+    Waiting& waiting = waiting_[site.kind];
+    if (waiting.count == kLanes) run(site.kind);
     marks_[size_] = mark;
-    pack.item[pack.count] = size_++;
-    return pack.given + pack.count++;
+    const int lane = waiting.count++;
+    waiting.item[lane] = size_++;
+    PairPack<T>& pack = waiting.pack;
+    for (int k = 0; k < 4; ++k) {
+      pack.x[k][lane] = rows_.x(site.at[k]);
+      pack.origin[k][lane] = rows_.origin(site.at[k]);
+    }
+    pack.constants[lane] = constants;
+    pack.own[lane] = static_cast<T>(site.own);
+    pack.turn[lane] = turn;
   }
   void flush() {
     for (int kind = 0; kind < kKinds; ++kind) run(kind);
-    for (int i = 0; i < size_; ++i) {
-      if (results_[i][0] != T(0)) deliver_(marks_[i], results_[i] + 1);
-    }
+    for (int i = 0; i < size_; ++i) deliver_(marks_[i], results_[i][kPairActive] != T(0), results_[i]);
     size_ = 0;
   }
 
  private:
   static constexpr int kKinds = 3, kMost = 16 * kLanes;
-  struct Pack {
-    alignas(64) T given[given_rows * kLanes];
+  struct Waiting {
+    PairPack<T> pack;
     int item[kLanes];
     int count = 0;
   };
 
   void run(int kind) {
-    Pack& pack = packs_[kind];
-    if (pack.count == 0) return;
-    for (int row = 0; row < given_rows; ++row) {
-      T* lanes = pack.given + row * kLanes;
-      for (int l = pack.count; l < kLanes; ++l) lanes[l] = lanes[0];
+    Waiting& waiting = waiting_[kind];
+    if (waiting.count == 0) return;
+    PairPack<T>& pack = waiting.pack;
+    T* out[kLanes];
+    for (int l = 0; l < kLanes; ++l) {
+      out[l] = l < waiting.count ? results_[waiting.item[l]] : unused_;
+      if (l < waiting.count) continue;
+      for (int k = 0; k < 4; ++k) pack.x[k][l] = pack.x[k][0], pack.origin[k][l] = pack.origin[k][0];
+      pack.constants[l] = pack.constants[0];
+      pack.own[l] = pack.own[0];
+      pack.turn[l] = pack.turn[0];
     }
-    alignas(64) T out[out_rows * kLanes];
-    kernel_(kind, pack.given, kappa_, h2_, out);
-    for (int l = 0; l < pack.count; ++l) {
-      T* result = results_[pack.item[l]];
-      result[0] = out[l];
-      if (out[l] == T(0)) continue;
-      for (int i = 1; i < out_rows; ++i) result[i] = out[i * kLanes + l];
-    }
-    pack.count = 0;
+    kernel_(kind, pack, kappa_, h2_, out);
+    waiting.count = 0;
   }
 
   const PairKernel<T> kernel_;
+  const PairRows<T>& rows_;
   const T kappa_, h2_;
   const Deliver& deliver_;
-  Pack packs_[kKinds];
+  Waiting waiting_[kKinds];
   Mark marks_[kMost];
-  T results_[kMost][out_rows];
+  T results_[kMost][kPairResult], unused_[kPairResult];
   int size_ = 0;
 };
 

@@ -1,18 +1,28 @@
 // Barriers of pairs, kLanes of one kind at a time (contact/pairs.h): the same arithmetic for each as for one alone.
 #pragma once
 
-#include "../contact/pairs.h"
+#include "../contact/limit.h"
 #include "lanes.h"
 
 namespace diffvbd {
 
-// Rows of kLanes scalars that a kernel takes: corners 1 to 3 less corner 0, dhat, offset, threshold, the corner whose
-// block it is; in the reverse also p and d_raw of that one. What it gives: whether the pair is active (0 or 1), then
-// g, H; or the adjoints of the corners and of kappa.
-constexpr int kPairGiven = 13, kTurnGiven = kPairGiven + 6, kPairBlock = 1 + 9, kPairBars = 1 + 13;
+// What a kernel takes: of each lane the rows of four scalars that hold its corners and, unless null, their origins; the
+// pair's constants; the corner whose block it is; in the reverse p and d_raw of that one, kLanes apart.
+template <class T>
+struct PairPack {
+  const T *x[4][kLanes], *origin[4][kLanes];
+  const T* constants[kLanes];
+  T own[kLanes];
+  const T* turn[kLanes];
+};
+// What it gives for each lane, in rows of four scalars: g; H, in two rows; the Clearance of the corner: toward; then 1
+// if the pair is active, else 0, and gap and slack. Or, in the reverse, the adjoints of the corners; then active and
+// the adjoint of kappa.
+constexpr int kPairResult = 5 * 4;
+enum PairResult { kPairBlock = 0, kPairToward = 12, kPairActive = 16, kPairGap = 17, kPairSlack = 18, kPairKappa = 17 };
 
 template <class T>
-using PairKernel = void (*)(int kind, const T* given, T kappa, T h2, T* out);
+using PairKernel = void (*)(int kind, const PairPack<T>& pack, T kappa, T h2, T* const* out);
 
 template <class T>
 struct PairKernels {
@@ -38,55 +48,76 @@ DIFFVBD_FN A of_corner(const A (&a)[4], const LaneCorner<T>& i) {
   return out;
 }
 
-// The rows of `given` as the functions of pairs take them.
+template <class T>
+DIFFVBD_FN Vec3<Lanes<T>> gathered(const T* const (&rows)[kLanes]) {
+  Row<T> r[kLanes];
+  for (int l = 0; l < kLanes; ++l) r[l] = Row<T>::load(rows[l]);
+  return to_lanes(r);
+}
+template <class T>
+DIFFVBD_FN void store_row(const Vec3<Lanes<T>>& v, T* const* out, int at) {
+  Row<T> r[kLanes];
+  to_rows(v, r);
+  for (int l = 0; l < kLanes; ++l) r[l].store(out[l] + at);
+}
+
+// A pack as the functions of pairs take it.
 template <class T>
 struct LanePairs {
   using R = Lanes<T>;
   contact::Corners<R> corners;
-  contact::PairConstants<R> constants;
+  Vec3<R> constants;
   LaneCorner<T> own;
 
-  DIFFVBD_FN static R row(const T* given, int i) { return R::load(given + i * kLanes); }
-  DIFFVBD_FN static Vec3<R> rows(const T* given, int i) {
-    return {row(given, i), row(given, i + 1), row(given, i + 2)};
+  DIFFVBD_FN explicit LanePairs(const PairPack<T>& pack) : constants(gathered(pack.constants)), own{R::load(pack.own)} {
+    const Vec3<R> x0 = gathered(pack.x[0]);
+    corners.x[0] = zero3<R>();
+    for (int k = 1; k < 4; ++k) corners.x[k] = gathered(pack.x[k]) - x0;
+    if (pack.origin[0][0] == nullptr) return;
+    const Vec3<R> o0 = gathered(pack.origin[0]);
+    for (int k = 1; k < 4; ++k) corners.x[k] += gathered(pack.origin[k]) - o0;
   }
-  DIFFVBD_FN explicit LanePairs(const T* given)
-      : corners{{zero3<R>(), rows(given, 0), rows(given, 3), rows(given, 6)}},
-        constants(row(given, 9), row(given, 10), row(given, 11)),
-        own{row(given, 12)} {}
+  DIFFVBD_FN contact::PairConstants<R> of_pairs() const { return {constants.x, constants.y, constants.z}; }
 };
 
 template <class M, class T>
-DIFFVBD_FN void store_active(const M& active, T* out) {
-  select(active, Lanes<T>(T(1)), Lanes<T>(T(0))).store(out);
+DIFFVBD_FN Lanes<T> one_where(const M& active) {
+  return select(active, Lanes<T>(T(1)), Lanes<T>(T(0)));
 }
 
 template <class T>
-__attribute__((flatten)) void add_lanes(int kind, const T* given, T kappa, T h2, T* out) {
+__attribute__((flatten)) void add_lanes(int kind, const PairPack<T>& pack, T kappa, T h2, T* const* out) {
   using R = Lanes<T>;
-  const LanePairs<T> pairs(given);
+  const LanePairs<T> pairs(pack);
+  const contact::PairConstants<R> constants = pairs.of_pairs();
+  const contact::Distance<R> at = contact::distance(kind, pairs.corners);
   Vec3<R> g = zero3<R>();
   Sym3<R> H = diagonal(R(0));
-  const auto active = contact::add_barrier(kind, pairs.corners, pairs.own, pairs.constants, R(kappa), R(h2), g, H);
-  store_active(active, out);
-  const R values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
-  for (int i = 0; i < 9; ++i) values[i].store(out + (1 + i) * kLanes);
+  const auto active = contact::add_barrier(kind, pairs.corners, at, pairs.own, constants, R(kappa), R(h2), g, H);
+  const contact::Separation<R> s(kind, pairs.corners, at.n, constants.offset);
+  const R side = select(pairs.own.own < R(T(contact::sides(kind)) - T(0.5)), R(T(-1)), R(T(1)));
+  store_row(g, out, kPairBlock);
+  store_row(Vec3<R>{H.xx, H.xy, H.xz}, out, kPairBlock + 4);
+  store_row(Vec3<R>{H.yy, H.yz, H.zz}, out, kPairBlock + 8);
+  store_row(side * at.n, out, kPairToward);
+  store_row(Vec3<R>{one_where<decltype(active), T>(active), s.gap, of_corner(s.slack, pairs.own)}, out, kPairActive);
 }
 
 template <class T>
-__attribute__((flatten)) void reverse_lanes(int kind, const T* given, T kappa, T h2, T* out) {
+__attribute__((flatten)) void reverse_lanes(int kind, const PairPack<T>& pack, T kappa, T h2, T* const* out) {
   using R = Lanes<T>;
-  const LanePairs<T> pairs(given);
-  contact::PairAdjoint<R> bar{};
-  const auto active = contact::reverse_barrier(kind, pairs.corners, pairs.own, pairs.constants, R(kappa), R(h2),
-                                               pairs.rows(given, kPairGiven), pairs.rows(given, kPairGiven + 3), bar);
-  store_active(active, out);
-  if (!any(active)) return;
-  for (int k = 0; k < 4; ++k) {
-    const R values[] = {bar.x[k].x, bar.x[k].y, bar.x[k].z};
-    for (int i = 0; i < 3; ++i) values[i].store(out + (1 + 3 * k + i) * kLanes);
+  const LanePairs<T> pairs(pack);
+  R turn[6];
+  for (int i = 0; i < 6; ++i) {
+    for (int l = 0; l < kLanes; ++l) turn[i].v[l] = pack.turn[l][i * kLanes];
   }
-  bar.kappa.store(out + 13 * kLanes);
+  contact::PairAdjoint<R> bar{};
+  const auto active =
+      contact::reverse_barrier(kind, pairs.corners, pairs.own, pairs.of_pairs(), R(kappa), R(h2),
+                               Vec3<R>{turn[0], turn[1], turn[2]}, Vec3<R>{turn[3], turn[4], turn[5]}, bar);
+  store_row(Vec3<R>{one_where<decltype(active), T>(active), bar.kappa, R(0)}, out, kPairActive);
+  if (!any(active)) return;
+  for (int k = 0; k < 4; ++k) store_row(bar.x[k], out, 4 * k);
 }
 
 }  // namespace DIFFVBD_SET
