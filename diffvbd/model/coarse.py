@@ -19,7 +19,7 @@ from .. import ops
 from ..checks import check_count
 
 FEWEST, MOST = 32, 128  # functions of a body under "auto"
-MOST_OF_ANY = 2**20  # that a CoarseSpace may ask for
+MOST_FUNCTIONS, MOST_OF_ANY = 4096, 2**20  # that a CoarseSpace may ask for
 PER_FUNCTION = 25  # vertices of a large body for each function
 PER_FUNCTION_SMALL = 6  # and of a small one
 PER_FUNCTION_SHEET = 18
@@ -38,8 +38,8 @@ class CoarseSpace:
     """Coarse correction between sweeps: what few sweeps do badly, the motion of large parts, done by one small system.
 
     Args:
-        functions: Of each body, at most. ``"auto"``: a 25th of its vertices, 32 to 128; small bodies fewer, down to
-            affine functions and constants.
+        functions: Of each body, at most; up to 4096, one dense system. ``"auto"``: a 25th of its vertices, 32 to
+            128; small bodies fewer, down to affine functions and constants.
         degree: Of the splines on the body's rest box, 1 to 3. ``"auto"``: 1, in the plane of a sheet 3.
         groups: Sets of neighbouring tets of a body with one rotation each. ``"auto"``: a quarter of its functions.
         every: Sweeps after each correction. A step is: one sweep, then a correction and up to ``every`` sweeps, again
@@ -54,9 +54,9 @@ class CoarseSpace:
     every: int = 3
 
     def __post_init__(self) -> None:
-        for name in ("functions", "groups"):
+        for name, most in (("functions", MOST_FUNCTIONS), ("groups", MOST_OF_ANY)):
             if getattr(self, name) != "auto":
-                object.__setattr__(self, name, check_count(name, getattr(self, name), 1, maximum=MOST_OF_ANY))
+                object.__setattr__(self, name, check_count(name, getattr(self, name), 1, maximum=most))
         if self.degree != "auto":
             object.__setattr__(self, "degree", check_count("degree", self.degree, 1, maximum=3))
         object.__setattr__(self, "every", check_count("every", self.every, 1, maximum=MOST_OF_ANY))

@@ -354,10 +354,15 @@ class ContactStep:
                 )
             scene, corners = surface.corners_of(pair)
             vertices = self.x_prev.shape[1]
-            named = "x or colliders" if any(corner >= vertices for corner in corners) else "x"
+            got = f"got {touching} pairs without a gap in part {r} of the step, one of the corner points {corners} in "
+            got += f"scene {scene}"
+            if all(corner < vertices for corner in corners):
+                raise ValueError(f"x: expected surfaces that do not touch, {got}")
+            if self.colliders is self.before:
+                raise ValueError(f"x or colliders: expected surfaces that do not touch, {got}")
             raise ValueError(
-                f"{named}: expected surfaces that do not touch, got {touching} pairs without a gap in part {r} of the "
-                f"step, one of the corner points {corners} in scene {scene}"
+                f"x or colliders: expected surfaces that do not touch and colliders that close no gap in one of the "
+                f"step's {self.parts} parts, {got}: use more detections or a smaller time_step"
             )
         if hindered:
             raise ValueError(

@@ -1,5 +1,7 @@
 """Claim: the coarse spaces of many bodies, which are built together, are those of each body alone, and copies of a body
-have the same functions."""
+have the same functions; bad numbers are refused."""
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -84,3 +86,19 @@ def test_copies_have_the_same_functions() -> None:
                 one_entries, other = (np.stack((f.vertex, f.function)) for f in (found[0], found[b]))
                 assert np.array_equal(one_entries, other)
                 assert np.abs(found[0].weight - found[b].weight).max() <= tolerance("closed_form")
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "got"),
+    [
+        ({"functions": 0}, "functions", "0"),
+        ({"functions": 4097}, "functions", "4097"),
+        ({"functions": 2.5}, "functions", "2.5"),
+        ({"degree": 4}, "degree", "4"),
+        ({"groups": -1}, "groups", "-1"),
+        ({"every": 0}, "every", "0"),
+    ],
+)
+def test_a_space_refuses(options: dict[str, Any], name: str, got: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=f"^{name}: expected an integer.* {got}"):
+        CoarseSpace(**options)
