@@ -27,10 +27,13 @@ from .rollout.checkpoints import BinomialCheckpoints
 from .rollout.converge import Solution, solve
 from .rollout.rollout import Trajectory, per_step, rollout
 from .step.estimate import ErrorEstimate
+from .step.integrators import BDF2, SDIRK2, History, ImplicitEuler
 from .step.manual import Tape, step_backward, step_forward
 from .step.step import step
 
 __all__ = [
+    "BDF2",
+    "SDIRK2",
     "Anchor",
     "Anderson",
     "BinomialCheckpoints",
@@ -41,6 +44,8 @@ __all__ = [
     "Friction",
     "GlobalAdjoint",
     "GradientCheck",
+    "History",
+    "ImplicitEuler",
     "LinearSolve",
     "Model",
     "PairBarrier",

@@ -218,6 +218,11 @@ class FloorBarrier(VertexEnergy):
             height = height - (normal * origin[:, :, None]).sum(-1)
         return (normal * x[:, :, None]).sum(-1) - height
 
+    def gaps(self, x: Tensor, data: Tensor, origin: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Gaps [m], [B, V, P], normals [1 | B, 1, P, 3] and dhat [m], [1 | B, 1, P]."""
+        normal, _, dhat, _ = self._columns(data)
+        return self._gaps(x, data, origin), normal, dhat
+
     def value(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         normal, kappa, dhat, damping = self._columns(data)
         gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))

@@ -107,6 +107,7 @@ class PartStart(NamedTuple):
 
 
 SHORT = 0.99  # share of a way that counts as all of it
+BENT = 0.1  # share of the room of its own that a body may bend by, whatever that does to its potential
 KEPT = 0.9  # share of a gap above a floor that rigid motion may close
 PLANE = 7  # numbers of a plane of a FloorBarrier
 
@@ -115,8 +116,9 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
                          planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface,
                          rigid: Tensor | None, raises: Callable[[Tensor, Tensor], Tensor]) -> PartStart:  # fmt: skip
     """Every vertex as far along its way as pairs and floor let all go at once: by ``rigid`` each body as a whole, then
-    by what is left of ``move``, then by ``fall``. What pairs hold up bends a body: a free one that they hold up goes
-    its own way only where that does not raise its potential.
+    by what is left of ``move``, then by ``fall``. A way of its own bends a body. A free one goes it only where that
+    does not raise its potential, if pairs hold some of it up or, with self-contact, if it takes much of the room in
+    which the sweeps may take it back.
 
     Args:
         x, move, fall: [B, V, 3] [m].  mass: [1 | B, V] [kg].
@@ -150,12 +152,14 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
     def target_of(at: Tensor, way: Tensor, by: Tensor) -> Tensor:
         return _Target.apply(at, way, by, floor, origin, surface) if floor.numel() else at + way
 
-    def held_up(share: Tensor) -> Tensor:
-        """Vertices of free bodies of which pairs have held something up."""
-        free = torch.where(surface.held[: x.shape[1]], 0.0, 1.0).to(share)
-        rows, ones = body.expand(share.shape), share.new_ones((share.shape[0], surface.bodies))
-        least, free = (ones.scatter_reduce(1, rows, t.expand(share.shape), "amin") for t in (share, free))
-        return ((least < SHORT) & (free > 0))[:, body]
+    def least_of_body(value: Tensor) -> Tensor:
+        value = value.expand(x.shape[:2])
+        out = value.new_ones((value.shape[0], surface.bodies)).scatter_reduce(
+            1, body.expand(value.shape), value, "amin"
+        )
+        return out[:, body]
+
+    free = least_of_body((~pinned[:, 0]).to(x.dtype)) > 0
 
     target, base, frames, own = target_of(x, move, u), torch.where(pinned, x, x + carried), None, ()
     if rigid is not None:  # bodies first, each as a whole
@@ -171,17 +175,21 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         if number:
             target = target_of(at, fall, still)
         with torch.no_grad():
-            way = target - at
-            share = advance(at, way, still, center, own=own)
+            way, here, rests = target - at, torch.where(pinned, target, at), torch.zeros_like(free)
+            if number == 0 and own:
+                far = way.square().sum(-1) > (BENT * own[1]) ** 2
+                rests = free & (least_of_body((~far).to(x.dtype)) == 0) & raises(here, target)
+                way = torch.where(rests[..., None], 0.0, way)
+            share = torch.where(rests, 0.0, advance(at, way, still, center, own=own))
             if number == 0:
-                here = torch.where(pinned, target, at)
-                bent = raises(here, torch.where(pinned, target, at + share[..., None] * way)) & held_up(share)
+                bent = raises(here, torch.where(pinned, target, at + share[..., None] * way))
+                bent = bent & free & ~rests & (least_of_body(share) < SHORT)
                 if at.is_cuda or torch.compiler.is_compiling() or bool(bent.any()):
                     stuck.pop()  # once more, with those at rest: what let the others pass may have been their motion
                     way = torch.where(bent[..., None], 0.0, way)
-                    share = torch.where(bent, 0.0, advance(at, way, still, center, own=own))
+                    share = torch.where(bent | rests, 0.0, advance(at, way, still, center, own=own))
             shares.append(share)
-        at = torch.where(pinned, target, at + shares[-1][..., None] * (target - at))
+        at = torch.where(pinned, target, at + share[..., None] * (target - at))
     short = (torch.minimum(*shares) < SHORT) & ~pinned[:, 0]
     return PartStart(at, center, room, own, frames, short, sum(stuck[1:], stuck[0]), torch.stack(shares))
 

@@ -37,16 +37,20 @@ class BinomialCheckpoints:
         check_count("snapshots", self.snapshots, 1)
 
 
-class Segment(NamedTuple):
-    """State after some steps, the frames (step, x, v) saved on the way, and what was observed."""
+# x, v, and what an integrator knows of the step before. A checkpoint takes the tensors one by one: of those that lie in
+# other arguments autograd would keep copies alive.
+State = tuple[Tensor, ...]
 
-    x: Tensor
-    v: Tensor
+
+class Segment(NamedTuple):
+    """The state after some steps, the frames (step, x, v) saved on the way, and what was observed."""
+
+    end: State
     frames: list[tuple[int, Tensor, Tensor]]
     observed: list[Any]
 
 
-Run = Callable[[int, int, Tensor, Tensor], Segment]
+Run = Callable[..., Segment]  # of the first step, the one after the last, and a State's tensors
 
 
 def choose_schedule(
@@ -89,19 +93,19 @@ def choose_schedule(
     return max(1, math.isqrt(steps)), adjoint
 
 
-def run_segments(run: Run, steps: int, x: Tensor, v: Tensor, every: int | BinomialCheckpoints | None) -> Segment:
+def run_segments(run: Run, steps: int, state: State, every: int | BinomialCheckpoints | None) -> Segment:
     """Runs all steps under a schedule."""
     if isinstance(every, BinomialCheckpoints):
-        return _binomial(run, 0, steps, x, v, every.snapshots)
+        return _binomial(run, 0, steps, every.snapshots, *state)
     if every is None:
-        return run(0, steps, x, v)
+        return run(0, steps, *state)
     frames, observed = [], []
     for first in range(0, steps, every):
-        part = _again(run, first, min(first + every, steps), x, v)
-        x, v = part.x, part.v
+        part = _again(run, first, min(first + every, steps), *state)
+        state = part.end
         frames += part.frames
         observed += part.observed
-    return Segment(x, v, frames, observed)
+    return Segment(state, frames, observed)
 
 
 def _again(run: Callable[..., Segment], *args: Any) -> Segment:
@@ -126,14 +130,14 @@ def _resuming(run: Callable[..., Segment], scope: Scope) -> Callable[..., Segmen
     return resumed
 
 
-def _binomial(run: Run, first: int, end: int, x: Tensor, v: Tensor, snapshots: int) -> Segment:
+def _binomial(run: Run, first: int, end: int, snapshots: int, *state: Tensor) -> Segment:
     length = end - first
     if length <= 1:
-        return run(first, end, x, v)
+        return run(first, end, *state)
     middle = first + _left(length, snapshots)
-    left = _again(_binomial, run, first, middle, x, v, snapshots)
-    right = _binomial(run, middle, end, left.x, left.v, max(snapshots - 1, 0))
-    return Segment(right.x, right.v, left.frames + right.frames, left.observed + right.observed)
+    left = _again(_binomial, run, first, middle, snapshots, *state)
+    right = _binomial(run, middle, end, max(snapshots - 1, 0), *left.end)
+    return Segment(right.end, left.frames + right.frames, left.observed + right.observed)
 
 
 def _left(length: int, snapshots: int) -> int:

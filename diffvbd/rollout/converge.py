@@ -16,11 +16,12 @@ from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
 from ..checks import check_count, check_positive, fail
 from ..model.model import Model
 from ..ops import SweepSettings
+from ..step.advance import advance, swept
 from ..step.arguments import GRAVITY, Prepared, acceleration_of, check_prescribed, check_state, collider_state, prepare
 from ..step.balance import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
 from ..step.contact import outcomes
+from ..step.integrators import BDF2, History, Integrator, check_history, check_integrator, check_staged, take
 from ..step.predict import Begun, begin
-from ..step.step import advance, swept
 
 
 @dataclass(frozen=True)
@@ -29,9 +30,11 @@ class Solution:
 
     Attributes:
         x, v: Positions [m] and velocities [m/s] after the step, shape [..., V, 3].
-        sweeps: Executed sweeps.
-        residual: Left-over force over the forces of the step [-], the largest over scenes, with contact over bodies.
+        sweeps: Executed sweeps, of all solves of the step.
+        residual: Left-over force over the forces of the step [-], the largest over scenes, with contact over bodies,
+            and over the solves of the step.
         converged: Whether in every scene that meets the tolerance, or is no more than rounding leaves.
+        history: With BDF2(), what the next step takes; else None.
     """
 
     x: Tensor
@@ -39,6 +42,7 @@ class Solution:
     sweeps: int
     residual: float
     converged: bool
+    history: History | None = None
 
 
 def solve(
@@ -57,15 +61,17 @@ def solve(
     on_failure: Literal["raise", "warn"] = "raise",
     force: Tensor | None = None,
     gravity: Sequence[float] | Tensor = GRAVITY,
-    prescribed: Tensor | None = None,
-    colliders: Tensor | None = None,
+    prescribed: Tensor | tuple[Tensor, Tensor] | None = None,
+    colliders: Tensor | tuple[Tensor, Tensor] | None = None,
     colliders_before: Tensor | None = None,
     rest_points: Tensor | None = None,
     density: float | Tensor | None = None,
     parameters: dict[str, Any] | None = None,
     adjoint: Adjoint | None = None,
+    integrator: Integrator | None = None,
+    history: History | None = None,
 ) -> Solution:
-    """One implicit Euler step, swept until it has converged in every scene.
+    """One implicit step, swept until it has converged in every scene.
 
     The residual is |M (x - y) + h^2 dE/dx| over |M (x - y)| + |h^2 dE/dx|, 2-norms over the vertices that are not
     pinned: the part of the step's forces that is not balanced. A scene where no more is left than rounding leaves
@@ -86,6 +92,7 @@ def solve(
         on_failure: ``"raise"`` a RuntimeError, or ``"warn"`` and go on, where max_sweeps do not meet the tolerance.
         adjoint: None: GlobalAdjoint(), which sees a converged state and no sweeps. ReverseSweep() or Unrolled() run
             the same sweeps again and differentiate them. With contact ReverseSweep(), and no other.
+        integrator, history: As in :func:`diffvbd.step`; each solve of the step is swept until it has converged.
 
     Returns:
         A :class:`Solution`.
@@ -97,7 +104,8 @@ def solve(
 
     Source: paper, eq. 1; docs/adjoints.md.
     """
-    lead = check_state(model, x, v)
+    lead, scheme = check_state(model, x, v), check_integrator(integrator)
+    check_history(scheme, history, x)
     if adjoint is None:
         adjoint = ReverseSweep() if model.touches else GlobalAdjoint()
     adjoint = check_adjoint(adjoint)
@@ -108,32 +116,55 @@ def solve(
         fail("on_failure", '"raise" or "warn"', repr(on_failure))
     options: dict[str, Any] = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "time_step": time_step,
                                "rest_points": rest_points, "density": density, "parameters": parameters}  # fmt: skip
-    prepared = prepare(model, lead, sweeps=0, adjoint=adjoint if model.touches else None, **options)
-    check_prescribed(model, prescribed, x)
-    settings, where = prepared.settings, collider_state(model, x, colliders, colliders_before)
+    prepared = prepare(model, lead, sweeps=0, adjoint=adjoint, **options)
+    for value in prescribed if isinstance(prescribed, tuple) else (prescribed,):
+        check_prescribed(model, value, x)
     loads: dict[str, Any] = {"force": force, "gravity": gravity, "prescribed": prescribed, "colliders": colliders,
                              "colliders_before": colliders_before}  # fmt: skip
-    begun = begin(model, x, v, prepared, force, acceleration_of(gravity, x), prescribed)
+    check_staged(scheme, loads)
+    run = _Converging(adjoint, tolerance, max_sweeps, check_every, on_failure)
+    taken = take(scheme, model, x, v, history, prepared, loads, run)
+    return Solution(taken.x, taken.v, run.count, run.residual, run.converged,
+                    taken.history if isinstance(scheme, BDF2) else None)  # fmt: skip
 
-    with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-        done = _Sweeping(model, begun.detached(), prepared, {"x": x, "v": v, **loads}, where, tolerance)
-        done.run(max_sweeps, check_every)
-    _judge(done, tolerance, on_failure)
-    if isinstance(adjoint, GlobalAdjoint):
-        # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph
-        begun = begun._replace(x_start=torch.where(model._pinned[:, None], begun.x_start, done.end))
-        x_end, v_end = begun.finish(
-            global_sweep(model, begun.fields(model, prepared), settings, adjoint), model, prepared, corrects=False
-        )
-    else:
-        again = prepare(model, lead, sweeps=done.count, adjoint=adjoint, **options)
-        x_end, v_end = advance(model, x, v, again, adjoint=adjoint, **loads)
-        if model.coarse is not None:  # the parts above had corrections of their own
-            with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-                end = x_end.detach().reshape(begun.y.shape)
-                done.look_at(end if begun.origin is None else end - begun.origin)
-            _judge(done, tolerance, on_failure)
-    return Solution(x_end.reshape(x.shape), v_end.reshape(x.shape), done.count, done.residual, done.converged)
+
+class _Converging:
+    """Solves that are swept until they have converged.
+
+    Attributes:
+        count, residual, converged: As in :class:`Solution`, of all solves so far.
+    """
+
+    def __init__(self, adjoint: Adjoint, tolerance: float, max_sweeps: int, check_every: int, on_failure: str) -> None:
+        self.adjoint, self.tolerance, self.on_failure = adjoint, tolerance, on_failure
+        self.most = max_sweeps, check_every
+        self.count, self.residual, self.converged = 0, 0.0, True
+
+    def __call__(self, model: Model, x: Tensor, v: Tensor, prepared: Prepared, **loads: Any) -> tuple[Tensor, Tensor]:
+        where = collider_state(model, x, loads["colliders"], loads["colliders_before"])
+        begun = begin(model, x, v, prepared, loads["force"], acceleration_of(loads["gravity"], x), loads["prescribed"])
+        with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+            swept_only = prepared._replace(unrolled=None)
+            done = _Sweeping(model, begun.detached(), swept_only, {"x": x, "v": v, **loads}, where, self.tolerance)
+            done.run(*self.most)
+        _judge(done, self.tolerance, self.on_failure)
+        if isinstance(self.adjoint, GlobalAdjoint):
+            # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph
+            begun = begun._replace(x_start=torch.where(model._pinned[:, None], begun.x_start, done.end))
+            end = global_sweep(model, begun.fields(model, prepared), prepared.settings, self.adjoint)
+            x_end, v_end = begun.finish(end, model, prepared, corrects=False)
+        else:
+            again = prepared._replace(settings=prepared.settings._replace(sweeps=done.count))
+            x_end, v_end = advance(model, x, v, again, adjoint=self.adjoint, **loads)
+            if model.coarse is not None:  # the parts above had corrections of their own
+                with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+                    end = x_end.detach().reshape(begun.y.shape)
+                    done.look_at(end if begun.origin is None else end - begun.origin)
+                _judge(done, self.tolerance, self.on_failure)
+        self.count += done.count
+        self.residual = max(self.residual, done.residual)
+        self.converged = self.converged and done.converged
+        return x_end.reshape(x.shape), v_end.reshape(x.shape)
 
 
 def _judge(done: _Sweeping, tolerance: float, on_failure: str) -> None:

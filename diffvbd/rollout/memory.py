@@ -15,6 +15,7 @@ from ..checks import check_count
 from ..mask import KEEPS_POSITIONS
 from ..model.model import Model
 from ..step.contact import sweeps_of_parts
+from ..step.integrators import BDF2, Integrator, check_integrator, solves_of
 from ..step.memory import cuda_scratch
 from .checkpoints import BinomialCheckpoints, _left, choose_schedule
 
@@ -30,6 +31,7 @@ def predict(
     save: Any = "last",
     material: bool = True,
     rest: bool = False,
+    integrator: Integrator | None = None,
 ) -> dict[str, int]:
     """Bytes that a differentiated rollout keeps and works with (default arguments otherwise, no force). The lists of
     contact are not counted: about 0.2 KB for each pair, step and detection, and 1 KB in the backward of one step.
@@ -37,6 +39,7 @@ def predict(
     Args:
         sweeps, steps, scenes: K, number of steps, product of x's leading dimensions.
         tape, checkpoint_every, save: As in ReverseSweep and rollout.
+        integrator: As in rollout.
         material, rest: Whether material and rest-shape gradients are wanted (they take scratch in the backward).
 
     Returns:
@@ -54,7 +57,9 @@ def predict(
     """
     item = model._mass.element_size()
     steps, scenes = check_count("steps", steps), check_count("scenes", scenes)
-    schedule, adjoint = choose_schedule(checkpoint_every, ReverseSweep(tape), model, scenes, steps, sweeps)  # type: ignore[arg-type]
+    scheme = check_integrator(integrator)
+    solves = solves_of(scheme)
+    schedule, adjoint = choose_schedule(checkpoint_every, ReverseSweep(tape), model, scenes, steps, solves * sweeps)  # type: ignore[arg-type]
     assert isinstance(adjoint, ReverseSweep)
     scalars = scenes * sweeps * model.num_active
     policy = adjoint.policy(scalars, item, model.energy_mask)
@@ -66,6 +71,7 @@ def predict(
     per_step += scenes * sum(model._data_count) * item if local else 0
     per_step += scenes * coarse_scalars(model, sweeps) * item
     per_step += accelerated_states(model, sweeps) * state + scenes * accelerated_scalars(model, sweeps) * item
+    per_step = solves * per_step + (2 * state if isinstance(scheme, BDF2) else 0)
     # of the state before a step, which a step alone is given: v, and x where the sweeps before did not end at it
     between = state * (2 if model.corrects and not local else 1)
     if save in ("all", "last"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -15,10 +16,20 @@ from ..checks import check_count, fail
 from ..model.model import Model
 from ..model.warnings import warn_of_thin_tets
 from ..scopes import looks_at
+from ..step.advance import advance
 from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
 from ..step.estimate import ErrorEstimate, check_estimable, error_of, of_steps
+from ..step.integrators import (
+    BDF2,
+    History,
+    Integrator,
+    check_history,
+    check_integrator,
+    check_staged,
+    solves_of,
+    take,
+)
 from ..step.intersections import check_start as refuse_start
-from ..step.step import advance
 from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
 from .contact_check import checks_contact, warn_of_contact
 
@@ -50,6 +61,7 @@ class Trajectory:
         steps: Step number of each frame (0: the initial state); the last frame is the final state.
         observations: What ``observe`` returned, stacked over steps (a tensor, or a tuple or dict of them), or None.
         errors: With ``estimate_errors`` those of each step, its tensors of shape [steps, ..., bodies]; else None.
+        history: With BDF2() that of the last frame, for a rollout that continues; else None.
     """
 
     x: Tensor
@@ -57,6 +69,7 @@ class Trajectory:
     steps: list[int]
     observations: Any = None
     errors: ErrorEstimate | None = None
+    history: History | None = None
 
 
 def rollout(
@@ -80,6 +93,8 @@ def rollout(
     density: Any = None,
     parameters: dict[str, Any] | None = None,
     adjoint: Adjoint | None = None,
+    integrator: Integrator | None = None,
+    history: History | None = None,
     checkpoint_every: int | BinomialCheckpoints | Literal["auto"] | None = "auto",
     save: Literal["all", "last"] | int = "all",
     observe: Callable[[Tensor, Tensor, int], Any] | None = None,
@@ -91,7 +106,8 @@ def rollout(
     """Runs ``steps`` steps; the gradient is that of calling :func:`diffvbd.step` in a loop.
 
     Args:
-        model, x, v, time_step, sweeps, adjoint: As in :func:`diffvbd.step`.
+        model, x, v, time_step, sweeps, adjoint, integrator: As in :func:`diffvbd.step`. With BDF2() the rollout keeps
+            the history; ``history`` continues an earlier one, whose Trajectory has it.
         steps: Number of steps >= 0.
         colliders: Corner points of the Model's colliders [m]: constant, they rest there; in :func:`per_step`, where
             they are at the end of each step.
@@ -134,7 +150,8 @@ def rollout(
         raise TypeError(f"check_contact: expected a bool or None, got {type(check_contact).__name__}")
     if not isinstance(check_start, bool):
         raise TypeError(f"check_start: expected a bool, got {type(check_start).__name__}")
-    lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
+    lead, adjoint, scheme = check_state(model, x, v), check_adjoint(adjoint), check_integrator(integrator)
+    check_history(scheme, history, x)
     options = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "rest_points": rest_points,
                "density": density, "force": force, "gravity": gravity, "prescribed": prescribed,
                "colliders": colliders}  # fmt: skip
@@ -155,7 +172,7 @@ def rollout(
         refuse_start(model, x, options["colliders"], colliders_before, _changes(options["colliders"]))
 
     scenes = x.numel() // max(1, 3 * model.num_vertices)
-    every, adjoint = choose_schedule(checkpoint_every, adjoint, model, scenes, steps, sweeps)
+    every, adjoint = choose_schedule(checkpoint_every, adjoint, model, scenes, steps, solves_of(scheme) * sweeps)
     # A segment that runs again reads these anew: autograd cannot see that they were changed in between.
     versions = [] if every is None or torch.compiler.is_compiling() else _versions(options, own)
     bar = _Progress(steps) if progress else None
@@ -163,26 +180,32 @@ def rollout(
     last: list[Any] = []  # what the last step went from, and to
     looks = checks_contact(check_contact, model, x, steps)
 
-    def segment(first: int, end: int, x: Tensor, v: Tensor, start: Tensor = x) -> Segment:  # start: the outer x
+    outer, remembers = x, isinstance(scheme, BDF2)
+
+    def segment(first: int, end: int, x: Tensor, v: Tensor, *before: Tensor) -> Segment:
         _check_versions(versions)
         frames, observed = [], []
+        past = History(*before) if before else None
         for k in range(first, end):
             now = prepare(model, lead, **chosen, **_to_prepare(options, own, k, x, v)) if fixed is None else fixed
-            given = _to_advance(model, options, k, x, v, start, colliders_before)
-            before, (x, v) = (x, v), advance(model, x, v, now, adjoint=adjoint, index=k, **given)
+            given = _to_advance(model, options, k, x, v, outer, colliders_before)
+            check_staged(scheme, given)
+            run = partial(advance, adjoint=adjoint, index=k)
+            x, v, past, solve = take(scheme, model, x, v, past, now, given, run)
             if estimate_errors and k not in errors:
-                errors[k] = error_of(model, *before, now, **{name: given[name] for name in _LOADS})
+                loads = {name: solve.given[name] for name in _LOADS}
+                errors[k] = error_of(model, solve.x, solve.v, solve.prepared, **loads)
             if looks and k + 1 == steps and not last:
-                last.extend((before, x, now, given))
+                last.extend(((solve.x, solve.v), x, solve.prepared, solve.given))
             if save == "all" or k + 1 == steps or (save != "last" and (k + 1) % save == 0):
                 frames.append((k + 1, x, v))
             if observe is not None:
                 observed.append(observe(x, v, k + 1))
             if bar is not None:
                 bar.show(k + 1)
-        return Segment(x, v, frames, observed)
+        return Segment((x, v, *(past if remembers and past else ())), frames, observed)
 
-    done = run_segments(segment, steps, x, v, every if torch.is_grad_enabled() else None)
+    done = run_segments(segment, steps, (x, v, *(history or ())), every if torch.is_grad_enabled() else None)
     if last:
         warn_of_contact(model, *last)
         last[:] = [None]  # of no use any more: no tape is held, and a segment that runs again keeps nothing
@@ -193,6 +216,7 @@ def rollout(
         steps=[f[0] for f in frames],
         observations=_stacked(done.observed),
         errors=of_steps([errors[k] for k in range(steps)], model, x, sweeps) if estimate_errors else None,
+        history=History(*done.end[2:]) if len(done.end) > 2 else None,
     )
 
 
@@ -239,6 +263,7 @@ def _to_advance(model: Model, options: dict[str, Any], k: int, x: Tensor, v: Ten
     now = {name: _at(options[name], k, x, v) for name in (*_LOADS, "colliders")}
     if _changes(options["prescribed"]) and not isinstance(options["prescribed"], _Steps):
         check_prescribed(model, now["prescribed"], x, start)
+    now["colliders_before"] = None
     if isinstance(options["colliders"], _Steps):
         first = model.collider_points if colliders_before is None else colliders_before
         now["colliders_before"] = options["colliders"][k - 1] if k else first

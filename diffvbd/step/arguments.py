@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -36,7 +37,8 @@ class Prepared(NamedTuple):
     parameters: dict[str, Tensor]  # differentiable energy parameters, [1 | B, ...]
     settings: ops.SweepSettings
     coarse: CoarseParts | None = None  # what the coarse corrections of all steps have in common
-    unrolled: Callable[..., tuple[Tensor, Tensor]] | None = None  # the reference's step, where autograd unrolls it
+    # of a time step and sweeps, the reference's step, where autograd unrolls it
+    unrolled: Callable[[float, int], Callable[..., tuple[Tensor, Tensor]]] | None = None
 
     @property
     def time_step_and_sweeps(self) -> tuple[float, int]:
@@ -143,8 +145,7 @@ def prepare(
     unrolled = None
     if isinstance(adjoint, Unrolled):
         layout = model.derived("layout", lambda: reference.build_layout(model))
-        h, count = settings.numbers.time_step, settings.sweeps
-        unrolled = reference.stepper(model, like, mu, lam, h, count, rest_points, given_density, parameters, layout)
+        unrolled = partial(_unrolled, model, like, mu, lam, rest_points, given_density, parameters, layout)
     coarse = None
     if model.coarse is not None and model.coarse_geometry.bodies:
         given_mass = None if given_density is None and rest_points is None else mass
@@ -159,6 +160,11 @@ def prepare(
         coarse=coarse,
         unrolled=unrolled,
     )
+
+
+def _unrolled(model: Model, like: Tensor, mu: Any, lam: Any, rest_points: Any, density: Any, parameters: Any,
+              layout: Any, time_step: float, sweeps: int) -> Callable[..., tuple[Tensor, Tensor]]:  # fmt: skip
+    return reference.stepper(model, like, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
 
 
 def check_prescribed(model: Model, prescribed: Any, x: Tensor, *others: Tensor) -> None:

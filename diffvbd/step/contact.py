@@ -193,7 +193,7 @@ class ContactStep:
             wanted = fall = lift if r == 0 else torch.zeros_like(lift)
             motion = Motion(surface, x, self.origin, self.fields.mass, move)
             rigid = motion.rigid()
-            detection = self._detect(x, was, now, motion, fall, rigid)
+            detection = self.detect(x, was, now, motion, fall, rigid)
             met.found.append(detection)
             met.counts.append(torch.cat([detection.counts[:3], detection.counts.new_zeros(1)]))
             if self._reads(x):  # before any work
@@ -286,8 +286,7 @@ class ContactStep:
         )  # fmt: skip
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
-    def _detect(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion, fall: Tensor, rigid: Tensor
-                ) -> Detection:  # fmt: skip
+    def detect(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion, fall: Tensor, rigid: Tensor) -> Detection:
         surface, barrier = self.surface, self.barrier
         assert surface is not None and barrier is not None
         with torch.no_grad():
@@ -354,15 +353,13 @@ class ContactStep:
                 )
             scene, corners = surface.corners_of(pair)
             vertices = self.x_prev.shape[1]
-            got = f"got {touching} pairs without a gap in part {r} of the step, one of the corner points {corners} in "
-            got += f"scene {scene}"
-            if all(corner < vertices for corner in corners):
-                raise ValueError(f"x: expected surfaces that do not touch, {got}")
-            if self.colliders is self.before:
-                raise ValueError(f"x or colliders: expected surfaces that do not touch, {got}")
+            named = "x or colliders" if any(corner >= vertices for corner in corners) else "x"
+            moved = named != "x" and self.colliders is not self.before  # through something, it may be
             raise ValueError(
-                f"x or colliders: expected surfaces that do not touch and colliders that close no gap in one of the "
-                f"step's {self.parts} parts, {got}: use more detections or a smaller time_step"
+                f"{named}: expected surfaces that do not touch, got {touching} pairs without a gap in part {r} of the "
+                f"step, one of the corner points {corners} in scene {scene}"
+                + moved
+                * ": move colliders less, or use more detections or a smaller time_step"
             )
         if hindered:
             raise ValueError(

@@ -14,6 +14,7 @@ from torch import Tensor
 from ..checks import check_tensor, fail, to_float
 from ..model.model import Model
 from .arguments import check_state
+from .integrators import History
 from .step import step
 
 _ARGUMENTS = ("x", "v", "mu", "lam", "young", "poisson", "force", "gravity", "prescribed", "rest_points", "density",
@@ -31,6 +32,7 @@ class Tape:
     inputs: dict[str, Tensor]
     outputs: tuple[Tensor, Tensor]
     constant: bool = False  # a step that nothing of ``inputs`` moves: no graph, and gradients of zero
+    history: History | None = None  # with BDF2(), detached: what the next step takes
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:  # of copy, deepcopy, pickle and torch.save
         raise TypeError(
@@ -50,10 +52,12 @@ def step_forward(
     Args:
         model, x, v, options: As in :func:`diffvbd.step`; works under torch.no_grad() too.
         wrt: Names of the arguments to differentiate: x, v, mu, lam, young, poisson, force, gravity, prescribed,
-            rest_points, density, colliders, colliders_before, or a name in ``parameters``. Only these leave a tape.
+            rest_points, density, colliders, colliders_before, history.moved, history.v, or a name in ``parameters``.
+            Only these leave a tape.
 
     Returns:
-        Positions, velocities (both detached) and the tape.
+        Positions, velocities (both detached) and the tape, which with BDF2() has the history for the next step: its
+        ``moved`` is x' - x and its ``v`` is v.
     """
     wrt = (wrt,) if isinstance(wrt, str) else wrt
     if not isinstance(wrt, Sequence) or not all(isinstance(name, str) for name in wrt):
@@ -69,20 +73,27 @@ def step_forward(
     if "density" in wrt and values.get("density") is None:
         values["density"] = model.density
     inputs: dict[str, Tensor] = {}
-    for name in wrt:
-        place = values if name in _ARGUMENTS else parameters
+    history = values.get("history")
+    before: dict[str, Any] = history._asdict() if isinstance(history, History) else {}
+    for full in wrt:
+        of_history = full.startswith("history.")
+        name = full.removeprefix("history.")
+        place = before if of_history else values if name in _ARGUMENTS else parameters
         value = place.get(name)
         if isinstance(value, (int, float)) and not isinstance(value, bool):
             value = torch.tensor(to_float(name, value), dtype=model.dtype, device=model.device)
         if not isinstance(value, Tensor):
-            fail("wrt", "names of given tensors", f"{name!r}, which is {type(value).__name__}")
-        check_tensor(name, value, model._mass)
-        place[name] = inputs[name] = value.detach().requires_grad_()
+            fail("wrt", "names of given tensors", f"{full!r}, which is {type(value).__name__}")
+        check_tensor(full, value, model._mass)
+        place[name] = inputs[full] = value.detach().requires_grad_()
     values["parameters"] = parameters or None
+    if before:
+        values["history"] = History(**before)
     with torch.enable_grad():
-        outputs = step(model, **values)
-    constant = not any(out.requires_grad for out in outputs)
-    return outputs[0].detach(), outputs[1].detach(), Tape(inputs, outputs, constant)
+        x_end, v_end, *more = step(model, **values)
+    constant = not (x_end.requires_grad or v_end.requires_grad)
+    after = more[0]._replace(moved=more[0].moved.detach(), v=more[0].v.detach()) if more else None
+    return x_end.detach(), v_end.detach(), Tape(inputs, (x_end, v_end), constant, after)
 
 
 def step_backward(tape: Tape, grad_x: Tensor | None = None, grad_v: Tensor | None = None) -> dict[str, Tensor]:

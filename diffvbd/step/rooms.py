@@ -73,6 +73,13 @@ class Motion:
         turn, mean = (torch.where(keep, t, 0.0)[:, self.body] for t in (turn, self.mean))
         return mean + torch.linalg.cross(turn, arm)
 
+    def stretched(self, rigid: Tensor) -> Tensor:
+        """How far the ways of a turn, which are straight, bring a vertex of each body [B, bodies] away from the turned
+        body: by r (sqrt(1 + angle^2) - 1) at a distance r from the axis. rigid: of rigid(), or a share of it."""
+        turn, arm = ((a.square().sum(-1)).sqrt() for a in (rigid - self.mean[:, self.body], self.arm))
+        angle = self.longest(torch.where(self.free, turn / arm.clamp(min=_tiny(turn)), 0.0))
+        return self.longest(torch.where(self.free, turn, 0.0)) * angle / (1 + (1 + angle * angle).sqrt())
+
 
 @torch.no_grad()
 def rooms_of_sweeps(motion: Motion, barrier: PairBarrier, start: PartStart, x: Tensor, begin: Tensor, fall: Tensor,
@@ -88,6 +95,7 @@ def rooms_of_sweeps(motion: Motion, barrier: PairBarrier, start: PartStart, x: T
     surface, move = motion.surface, motion.move
     held_up = motion.largest(begin + move + fall - start.x.detach())
     wish = motion.largest(fall) + motion.largest(move - rigid) + ROOM * held_up + motion.largest(x - start.x.detach())
+    wish = wish + ROOM * motion.stretched(rigid)
     wish = LEAST_ROOM * barrier.dhat + (wish.amax(1, keepdim=True).expand_as(wish) if surface.bodies else wish)
     left = start.room - (x - start.center).square().sum(-1).sqrt()
     if start.own:
@@ -156,7 +164,7 @@ def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass:
     own = torch.zeros_like(room)
     if barrier.self_contact:
         least = room.clamp(max=surface.least_own_room)
-        own = (ROOM + 1) * motion.largest(move - above_rigid * rigid) + falls
+        own = (ROOM + 1) * (motion.largest(move - above_rigid * rigid) + motion.stretched(rigid)) + falls
         own = own.clamp(max=surface.most_own_room)
         own = torch.maximum(torch.maximum(own, least), driven)
     return Rooms(islands(room), with_largest(room), with_largest(own))

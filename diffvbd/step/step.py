@@ -1,44 +1,56 @@
-"""One implicit time step: beginning (predictor, start, first correction), sweeps, correction, velocity.
-
-Beginning, sweeps and correction are compiled operators; with pairs so are detection, islands, the start of a part and
-the sweeps of contact, R times a step. Where one operator can do all of it on CUDA, it does. What is left to torch are
-small sums: loads to accelerations, rest shape to masses, packing of energies, the velocity of bodies not corrected."""
+"""A step of a Model: its arguments, and the solves that its integrator takes."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
+from typing import Any, overload
 
-import torch
 from torch import Tensor
 
-from .. import ops
-from ..adjoint.anderson import none_taken, run_sweeps
-from ..adjoint.implicit import global_sweep
-from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
-from ..adjoint.sweep import fused_step
+from ..adjoint.routes import Adjoint, check_adjoint
 from ..model.model import Model
 from ..model.warnings import warn_of_thin_tets
-from ..scopes import checking, looks_at, recorders
-from .arguments import (
-    GRAVITY,
-    Prepared,
-    acceleration_of,
-    broadcastable,
-    check_prescribed,
-    check_state,
-    collider_state,
-    name_argument,
-    prepare,
+from ..scopes import looks_at
+from .advance import advance
+from .arguments import GRAVITY, check_prescribed, check_state, prepare
+from .integrators import (
+    BDF2,
+    SDIRK2,
+    History,
+    ImplicitEuler,
+    Integrator,
+    check_history,
+    check_integrator,
+    check_staged,
+    take,
 )
-from .check import check_on_cpu
-from .coarse import lengths_of, with_corrections
-from .contact import run_contact
-from .memory import out_of_memory_named
-from .predict import Begun, begin
 
 
+@overload
+def step(
+    model: Model,
+    x: Tensor,
+    v: Tensor,
+    *,
+    mu: float | Tensor | None = None,
+    lam: float | Tensor | None = None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
+    time_step: float,
+    sweeps: int,
+    force: Tensor | None = None,
+    gravity: Sequence[float] | Tensor = GRAVITY,
+    prescribed: Tensor | tuple[Tensor, Tensor] | None = None,
+    colliders: Tensor | tuple[Tensor, Tensor] | None = None,
+    colliders_before: Tensor | None = None,
+    rest_points: Tensor | None = None,
+    density: float | Tensor | None = None,
+    parameters: dict[str, Any] | None = None,
+    adjoint: Adjoint | None = None,
+    integrator: ImplicitEuler | SDIRK2 | None = None,
+) -> tuple[Tensor, Tensor]: ...
+@overload
 def step(
     model: Model,
     x: Tensor,
@@ -59,8 +71,33 @@ def step(
     density: float | Tensor | None = None,
     parameters: dict[str, Any] | None = None,
     adjoint: Adjoint | None = None,
-) -> tuple[Tensor, Tensor]:
-    """One implicit Euler step by Vertex Block Descent, differentiable, by default by the exact reverse sweep.
+    integrator: BDF2,
+    history: History | None = None,
+) -> tuple[Tensor, Tensor, History]: ...
+def step(
+    model: Model,
+    x: Tensor,
+    v: Tensor,
+    *,
+    mu: float | Tensor | None = None,
+    lam: float | Tensor | None = None,
+    young: float | Tensor | None = None,
+    poisson: float | Tensor | None = None,
+    time_step: float,
+    sweeps: int,
+    force: Tensor | None = None,
+    gravity: Sequence[float] | Tensor = GRAVITY,
+    prescribed: Tensor | tuple[Tensor, Tensor] | None = None,
+    colliders: Tensor | tuple[Tensor, Tensor] | None = None,
+    colliders_before: Tensor | None = None,
+    rest_points: Tensor | None = None,
+    density: float | Tensor | None = None,
+    parameters: dict[str, Any] | None = None,
+    adjoint: Adjoint | None = None,
+    integrator: Integrator | None = None,
+    history: History | None = None,
+) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, History]:
+    """One implicit step by Vertex Block Descent, differentiable, by default by the exact reverse sweep.
 
     Args:
         model: The scene; x, v and the other tensors must have its dtype and device.
@@ -84,9 +121,14 @@ def step(
         parameters: Energy parameters by name, as {"floor_barrier.kappa": tensor}; each broadcasts to
             x.shape[:-2] + its own shape.
         adjoint: How the backward is computed: ReverseSweep(), which None stands for, Unrolled() or GlobalAdjoint().
+        integrator: ImplicitEuler(), which None stands for, SDIRK2() or BDF2(). SDIRK2 solves twice, the first time up
+            to 0.29 of the step: ``prescribed`` and ``colliders`` move evenly to where they end, or are a tuple of two,
+            at the end of each solve.
+        history: With BDF2(), what it returned of the step before; None: there is none, as after a jump of the state.
 
     Returns:
-        Positions and velocities after the step, shape of x. Inputs are untouched.
+        Positions and velocities after the step, shape of x; with BDF2() also the history that the next step takes.
+        Inputs are untouched.
 
     Raises:
         ValueError, TypeError: Naming the argument, what was expected and what came, before any work. With contact also
@@ -97,133 +139,19 @@ def step(
     Source: paper, eqs. 1-3 and section 3; docs/method.md.
     """
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
+    scheme = check_integrator(integrator)
+    check_history(scheme, history, x)
+    given = {"force": force, "gravity": gravity, "prescribed": prescribed, "colliders": colliders,
+             "colliders_before": colliders_before}  # fmt: skip
+    check_staged(scheme, given)
     prepared = prepare(model, lead, mu=mu, lam=lam, young=young, poisson=poisson, time_step=time_step, sweeps=sweeps,
                        rest_points=rest_points, density=density, parameters=parameters, adjoint=adjoint)  # fmt: skip
-    check_prescribed(model, prescribed, x)
+    for value in prescribed if isinstance(prescribed, tuple) else (prescribed,):
+        check_prescribed(model, value, x)
     if looks_at(prepared.mu) and looks_at(prepared.lam):
         warn_of_thin_tets(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps)
-    return advance(model, x, v, prepared, force=force, gravity=gravity, prescribed=prescribed, colliders=colliders,
-                   colliders_before=colliders_before, adjoint=adjoint)  # fmt: skip
-
-
-def advance(
-    model: Model,
-    x: Tensor,
-    v: Tensor,
-    prepared: Prepared,
-    *,
-    force: Tensor | None,
-    gravity: Sequence[float] | Tensor,
-    prescribed: Tensor | None,
-    adjoint: Adjoint | None,
-    colliders: Tensor | None = None,
-    colliders_before: Tensor | None = None,
-    index: int = 0,
-) -> tuple[Tensor, Tensor]:
-    """The step itself; ``index`` is its number in a rollout, for debug_checks()."""
-    adjoint = check_adjoint(adjoint)
-    gravity = acceleration_of(gravity, x)
-    where = collider_state(model, x, colliders, colliders_before)
-    if isinstance(adjoint, ReverseSweep) and x.is_cuda and _fuses(model, force, gravity):
-        prescribed = None if prescribed is None else broadcastable("prescribed", prescribed, x)
-        return _fused(model, x, v, gravity, prescribed, prepared, adjoint)
-    begun = begin(model, x, v, prepared, force, gravity, prescribed)
-    given = {"x": x, "v": v, "force": force, "gravity": gravity, "prescribed": prescribed, "colliders": colliders,
-             "colliders_before": colliders_before}  # fmt: skip
-    if prepared.unrolled is not None:
-        with torch.no_grad():  # for what it raises: the values are looked at even by no sweep
-            count = prepared.settings.sweeps if checking() else 0
-            looked_at = prepared._replace(settings=prepared.settings._replace(sweeps=count), coarse=None)
-            swept(model, begun.detached(), looked_at, given, index=index)
-        return prepared.unrolled(x, v, force, gravity, prescribed)
-    x_end = swept(model, begun, prepared, given, adjoint, index, where)
-    # GlobalAdjoint corrects before it takes the end as the solution
-    x_end, v_end = begun.finish(x_end, model, prepared, corrects=not isinstance(adjoint, GlobalAdjoint))
-    return x_end.reshape(x.shape), v_end.reshape(x.shape)
-
-
-def swept(
-    model: Model,
-    begun: Begun,
-    prepared: Prepared,
-    given: dict[str, Any],
-    adjoint: Adjoint | None = None,
-    index: int = 0,
-    colliders: tuple[Tensor, Tensor] | None = None,
-) -> Tensor:
-    """Positions after the sweeps, with the backward of an adjoint route. ``given``: arguments that errors may name;
-    ``colliders``: where they are at the start and at the end, of a Model with contact."""
-    fields, settings, adjoint = begun.fields(model, prepared), prepared.settings, check_adjoint(adjoint)
-    if prepared.coarse is not None and colliders is None:  # contact makes corrections of its own
-        fields = with_corrections(model, prepared.coarse, fields, settings.numbers.time_step)
-    more = (*(colliders or ()), *prepared.parameters.values())
-    policy = _tape_policy(model, (*fields, *more), settings, adjoint)
-    debug_step = index if checking() else -1
-    try:
-        if colliders is not None:
-            with out_of_memory_named(model, begun.x_start, settings, policy):
-                return run_contact(model, begun, prepared, *colliders, policy, debug_step)
-        if checking() and begun.y.is_cuda:
-            check_on_cpu(model, fields, settings, index)
-        with out_of_memory_named(model, begun.x_start, settings, policy):
-            if isinstance(adjoint, GlobalAdjoint):
-                return global_sweep(model, fields, settings, adjoint, debug_step,
-                                    lambda x: begun.corrected(x, model, prepared))  # fmt: skip
-            done = run_sweeps(model, fields, settings, tape_policy=policy, debug_step=debug_step)
-            if done.corrections:
-                for found in recorders("coarse"):
-                    found.append(lengths_of(model, torch.cat(done.corrections, 1)))
-            if model.acceleration is not None and prepared.unrolled is None:
-                for found in recorders("anderson"):
-                    found.append(torch.stack(done.taken, 1) if done.taken else none_taken(model, begun.x_start))
-            return done.x
-    except ValueError as error:
-        name_argument(model, error, given)
-        raise
-
-
-def _fuses(model: Model, force: Tensor | None, gravity: Tensor) -> bool:
-    """Whether one operator can do the whole step on CUDA. Forces, vertex energies, float32's local origin, function
-    transforms and checks take the parts."""
-    simple = force is None and not model.vertex_energies and not model.touches and model.dtype == torch.float64
-    simple = (
-        simple
-        and not model.corrects
-        and model.coarse is None
-        and model.acceleration is None
-        and model.starts_from == "predictor"
-        and not ops.TET_READS_X_PREV
-    )
-    if not simple or checking() or torch.compiler.is_compiling() or gravity.dim() > 1:
-        return False
-    return torch._C._functorch.peek_interpreter_stack() is None  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def _fused(
-    model: Model,
-    x: Tensor,
-    v: Tensor,
-    gravity: Tensor,
-    prescribed: Tensor | None,
-    prepared: Prepared,
-    adjoint: ReverseSweep,
-) -> tuple[Tensor, Tensor]:
-    shape, flat = x.shape, (math.prod(x.shape[:-2]), *x.shape[-2:])
-    prescribed = None if prescribed is None else ops.broadcast(prescribed, shape).reshape(flat)
-    acceleration = ops.broadcast(gravity, (1, 1, 3))
-    x, v = x.reshape(flat), v.reshape(flat)
-    fields = ops.StepFields(x, v, acceleration, prescribed, prepared.mu, prepared.lam, prepared.mass, prepared.rest)
-    policy = _tape_policy(model, fields, prepared.settings, adjoint)
-    with out_of_memory_named(model, x, prepared.settings, policy):
-        x_end, v_end = fused_step(fields, model._packed_rest, model._plan, prepared.settings, tape_policy=policy)
-    return x_end.reshape(shape), v_end.reshape(shape)
-
-
-def _tape_policy(model: Model, tensors: Sequence[Tensor | None], settings: ops.SweepSettings, adjoint: Adjoint) -> int:
-    if not isinstance(adjoint, ReverseSweep):
-        return ops.NO_TAPE
-    if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)):
-        return ops.NO_TAPE
-    x = tensors[0]
-    assert x is not None
-    return adjoint.policy(x.shape[0] * settings.sweeps * model.num_active, x.element_size(), model.energy_mask)
+    taken = take(scheme, model, x, v, history, prepared, given, partial(advance, adjoint=adjoint))
+    if isinstance(scheme, BDF2):
+        assert taken.history is not None
+        return taken.x, taken.v, taken.history
+    return taken.x, taken.v

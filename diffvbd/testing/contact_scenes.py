@@ -191,6 +191,7 @@ def compiled(scene: Scene, steps: int, sweeps: int, tape: Any = "full", model: M
     """End state and gradients of the package's steps, and the detections of all of them."""
     model = scene.model if model is None else model
     leaves = {k: v.detach().to(model.device, model.dtype).requires_grad_() for k, v in scene.leaves().items()}
+    options: dict[str, Any]
     options, parameters = split(leaves)
     x, v = options.pop("x"), options.pop("v")
     with record() as found:

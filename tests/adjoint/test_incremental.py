@@ -12,8 +12,8 @@ import diffvbd as dv
 from diffvbd import reference
 from diffvbd.adjoint.implicit import Assembled, conjugate_gradients
 from diffvbd.adjoint.potential import IncrementalPotential
+from diffvbd.step.advance import begin
 from diffvbd.step.arguments import acceleration_of, prepare
-from diffvbd.step.step import begin
 from diffvbd.testing import build_scene, relative_error, tolerance
 
 CASES = ("plain", "paper", "inverted", "contrast", "no_shear", "floor_damped", "floor_corner", "anchored", "batch")

@@ -1,0 +1,236 @@
+"""Time integrators: how implicit solves make up a step (docs/method.md, section 19).
+
+Every solve is that of implicit Euler, over a time and from a state of its own: S(h; x, v) minimises
+1/2 |x' - y|^2_M + h^2 E(x') with y = x + h v + h^2 a, and v' = (x' - x) / h. An integrator asks for a solve about a
+reference (r, w), which is extrapolated and may lie inside something. The solve starts at a state x that is feasible,
+with the velocity w + (r - x) / h: its y is that of the reference.
+
+Forces of contact change within a step, and a scheme that extrapolates them gains energy at an impact. So a body that
+may touch something in a step takes implicit Euler for that step (approach.py): in a solve over c h instead of h this is
+the same problem with c^2 times the mass, gravity over c^2 and velocity over c.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..checks import fail
+from ..model.model import Model
+from ..scopes import looks_at, recorders
+from .approach import may_touch
+from .arguments import Prepared, acceleration_of, broadcastable, collider_state
+from .coarse_sums import coarse_mass
+from .predict import begin
+
+GAMMA = 1 - 1 / math.sqrt(2)
+STAGED = ("prescribed", "colliders")  # where motion is given: at the end of a step, or of each of its solves
+
+
+@dataclass(frozen=True)
+class ImplicitEuler:
+    """One solve over the whole step: first order, and damps what vibrates faster than about the step."""
+
+
+@dataclass(frozen=True)
+class SDIRK2:
+    """Two solves over 0.29 of the step each: second order, exact in free fall, L-stable. Twice the work of a step.
+
+    A body that may touch a floor, a collider, another body or itself in a step takes implicit Euler for it.
+
+    Source: Alexander (1977); docs/method.md, section 19.
+    """
+
+
+@dataclass(frozen=True)
+class BDF2:
+    """One solve over 2/3 of the step, from the last two states: second order, exact in free fall, L-stable.
+
+    The first step is one of :class:`SDIRK2`. A body that may touch a floor, a collider, another body or itself in a
+    step takes implicit Euler for it and for the next.
+
+    Source: Curtiss and Hirschfelder (1952); docs/method.md, section 19.
+    """
+
+
+Integrator = ImplicitEuler | SDIRK2 | BDF2
+
+
+class History(NamedTuple):
+    """What :class:`BDF2` knows of the step before a state: by how much it moved every vertex [m], the velocity before
+    it [m/s], both [..., V, 3], and whether it is smooth, bool [..., V]: False where a body may have touched something.
+    """
+
+    moved: Tensor
+    v: Tensor
+    smooth: Tensor
+
+
+class Solve(NamedTuple):
+    """One implicit Euler solve that was executed, with its arguments as advance() takes them."""
+
+    x: Tensor
+    v: Tensor
+    prepared: Prepared
+    given: dict[str, Any]
+
+
+class Taken(NamedTuple):
+    """A step: the state after it, what the next one needs of it, and the solve that it ended with."""
+
+    x: Tensor
+    v: Tensor
+    history: History | None  # None with ImplicitEuler
+    last: Solve
+
+
+def check_integrator(integrator: Any) -> Integrator:
+    if integrator is None:
+        return ImplicitEuler()
+    if isinstance(integrator, type) and issubclass(integrator, Integrator):
+        fail("integrator", f"an object, {integrator.__name__}()", "the class")
+    if not isinstance(integrator, Integrator):
+        raise TypeError(f"integrator: expected ImplicitEuler(), SDIRK2() or BDF2(), got {type(integrator).__name__}")
+    return integrator
+
+
+def check_history(integrator: Integrator, history: Any, x: Tensor) -> None:
+    if history is None:
+        return
+    if not isinstance(integrator, BDF2):
+        fail("history", f"None beside {type(integrator).__name__}(), which has none", type(history).__name__)
+    if not isinstance(history, History):
+        raise TypeError(f"history: expected what a step with BDF2() returns, got {type(history).__name__}")
+    for name, value, shape in (("moved", history.moved, x.shape), ("v", history.v, x.shape),
+                               ("smooth", history.smooth, x.shape[:-1])):  # fmt: skip
+        if not isinstance(value, Tensor) or value.shape != shape:
+            got = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            fail(f"history.{name}", f"shape {list(shape)}, that of x", got)
+
+
+def solves_of(integrator: Integrator) -> int:
+    """Solves of a step, each of all its sweeps."""
+    return 2 if isinstance(integrator, SDIRK2) else 1
+
+
+def check_staged(integrator: Integrator, given: dict[str, Any]) -> None:
+    """Raises where motion is given for other solves than those of a step."""
+    for name in STAGED:
+        value = given[name]
+        if isinstance(value, tuple) and not (isinstance(integrator, SDIRK2) and len(value) == 2):
+            fail(name, "a tensor, or with SDIRK2() one for each of its two solves",
+                 f"{len(value)} with {integrator}")  # fmt: skip
+
+
+def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: History | None, whole: Prepared,
+         given: dict[str, Any], run: Callable[..., tuple[Tensor, Tensor]]) -> Taken:  # fmt: skip
+    """One step.
+
+    Args:
+        whole: The arguments of a solve over all of it.
+        given: force, gravity, prescribed, colliders, colliders_before, as of step().
+        run: A solve: advance(), or one that sweeps until it has converged.
+    """
+    end = _at_end(given)
+
+    def solve(x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any]) -> tuple[Tensor, Tensor, Solve]:
+        return *run(model, x, v, prepared, **given), Solve(x, v, prepared, given)
+
+    if isinstance(integrator, ImplicitEuler):
+        x_end, v_end, last = solve(x, v, whole, end)
+        return Taken(x_end, v_end, None, last)
+    touching = _touching(model, x, v, whole, end)
+    if touching is not None:
+        if whole.unrolled is not None:
+            raise NotImplementedError(f"adjoint: expected ReverseSweep or GlobalAdjoint with {integrator} and a "
+                                      "FloorBarrier, got Unrolled")  # fmt: skip
+        for found in recorders("integrator"):
+            found.append(touching)
+    smooth = torch.ones_like(x[..., 0], dtype=torch.bool) if touching is None else ~touching
+    euler = touching
+    if history is not None and touching is not None:
+        euler = touching | ~history.smooth
+    if euler is not None and looks_at(euler) and bool(euler.all()):
+        x_end, v_end, last = solve(x, v, whole, end)
+        return Taken(x_end, v_end, History(x_end - x, v, smooth), last)
+
+    def last_solve(feasible: Tensor, reference: Tensor, carried: Tensor, share: float) -> Taken:
+        """From a feasible state, about a velocity w and a position that is h_solve times ``carried`` away from it."""
+        start, weights = reference + carried, _over(whole, share)
+        if euler is not None:
+            one = euler[..., None]
+            feasible, start = torch.where(one, x, feasible), torch.where(one, v / share, start)
+            weights, loads = _of_euler(model, weights, end, x, euler, share)
+        else:
+            loads = end
+        x_end, v_end, last = solve(feasible, start, weights, loads)
+        v_end = v_end - carried if euler is None else torch.where(euler[..., None], share * v_end, v_end - carried)
+        return Taken(x_end, v_end, History(x_end - x, v, smooth), last)
+
+    if isinstance(integrator, BDF2) and history is not None:
+        carried = history.moved / (2 * whole.settings.numbers.time_step)
+        return last_solve(x, v + (v - history.v) / 3, carried, 2 / 3)
+    x1, v1, _ = solve(x, v, _over(whole, GAMMA), _at_share(given, x, GAMMA))
+    return last_solve(x1, v + (1 + math.sqrt(2)) * (v1 - v), math.sqrt(2) * v1, GAMMA)
+
+
+def _over(whole: Prepared, share: float) -> Prepared:
+    """The arguments of a solve over a share of the step."""
+    numbers = whole.settings.numbers
+    numbers = numbers._replace(time_step=share * numbers.time_step, friction_eps=share * numbers.friction_eps)
+    return whole._replace(settings=whole.settings._replace(numbers=numbers))
+
+
+def _touching(model: Model, x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any]) -> Tensor | None:
+    """Whether the body of each vertex may touch something in the step, bool [..., V]."""
+    if model.floor is None and model.contact is None:
+        return None
+    with torch.no_grad():
+        x, v = x.detach(), v.detach()
+        begun = begin(model, x, v, prepared, given["force"], acceleration_of(given["gravity"], x), given["prescribed"])
+        where = collider_state(model, x, given["colliders"], given["colliders_before"])
+        touching = may_touch(model, begun, prepared, where)
+    return None if touching is None else touching.reshape(x.shape[:-1])
+
+
+def _of_euler(model: Model, prepared: Prepared, given: dict[str, Any], x: Tensor, euler: Tensor, share: float
+              ) -> tuple[Prepared, dict[str, Any]]:  # fmt: skip
+    """Arguments of a solve over a share of the step in which some bodies take all of it. ``euler``: bool [..., V]."""
+    factor = torch.where(euler, share * share, 1.0).to(x.dtype)
+    mass = prepared.mass * factor.reshape(-1, factor.shape[-1])
+    numbers = prepared.settings.numbers
+    settings = prepared.settings._replace(numbers=numbers._replace(friction_eps=numbers.friction_eps / share))
+    coarse = prepared.coarse
+    if coarse is not None:
+        coarse = coarse._replace(mass=coarse_mass(model._coarse_plan, mass))
+    parameters = dict(prepared.parameters)
+    for energy in (model.floor, model.contact):  # who damps touches something
+        if energy is not None:
+            name = f"{energy.name}.damping"
+            value = parameters[name] if name in parameters else model.constants(energy)["damping"][None]
+            if name in parameters or energy.damping > 0:
+                parameters[name] = share * value
+    gravity = acceleration_of(given["gravity"], x) / factor[..., None]
+    return (prepared._replace(mass=mass, settings=settings, coarse=coarse, parameters=parameters),
+            {**given, "gravity": gravity})  # fmt: skip
+
+
+def _at_end(given: dict[str, Any]) -> dict[str, Any]:
+    """The arguments of a solve up to the end of the step, of arguments that may be given for each solve."""
+    return {k: v[-1] if k in STAGED and isinstance(v, tuple) else v for k, v in given.items()}
+
+
+def _at_share(given: dict[str, Any], x: Tensor, share: float) -> dict[str, Any]:
+    """Of a solve up to a share of the step, to which what is prescribed moves evenly unless that is given."""
+    out = {k: v[0] if k in STAGED and isinstance(v, tuple) else v for k, v in given.items()}
+    prescribed, colliders, before = (given[k] for k in ("prescribed", "colliders", "colliders_before"))
+    if isinstance(prescribed, Tensor):
+        out["prescribed"] = x + share * (broadcastable("prescribed", prescribed, x) - x)
+    if isinstance(colliders, Tensor) and before is not None:
+        out["colliders"] = before + share * (colliders - before)
+    return out
