@@ -86,7 +86,7 @@ def status(model: Model) -> Status:
 
 def reserve(model: Model, pairs: int) -> None:
     """Gives a Model room for ``pairs`` pairs per scene, from its next step on. A captured graph keeps the room that it
-    was captured with.
+    was captured with. Without a ``capacity`` of the PairBarrier an eager step still takes more where it needs more.
 
     Raises:
         ValueError, TypeError: If the Model has no PairBarrier, or for a number < 1.
@@ -98,6 +98,8 @@ def reserve(model: Model, pairs: int) -> None:
         fail("model", "a PairBarrier among its energies", "none")
     pairs = check_count("pairs", pairs, 1, 2**26)
     model.surface_of_contact = replace(surface, capacity=pairs)
+    if model.contact.capacity is None:  # it still grows by itself
+        return
     barrier = replace(model.contact, capacity=pairs)
     model._set_energies(tuple(barrier if e is model.contact else e for e in model.energies))
     for energy in model.parametric_energies:  # here, so that a step that is captured copies nothing from the host

@@ -295,7 +295,7 @@ def _worst(values: Tensor | None) -> float | None:
 
 def _place(values: Tensor) -> str:
     """The body of the largest of values [..., bodies]."""
-    *scene, body = (values == values.max()).nonzero()[0].tolist()
+    *scene, body = (torch.isnan(values) | (values == values.max())).nonzero()[0].tolist()
     return f"body {body}" + (f" of scene {scene}" if scene else "")
 
 
@@ -322,13 +322,13 @@ def _state_messages(model: Model, result: Diagnosis) -> list[str]:
     # beside contact one body may be far from converged while the forces of others hide it
     body = result.residuals if model.touches else None
     worst = result.unbalanced if body is None else _largest(body)
-    if worst is not None and worst > UNBALANCED:
+    if worst is not None and not worst <= UNBALANCED:
         faster = ", or relaxation between 1.5 and 1.7" if model.relaxation < 1.5 and model.friction is None else ""
         of = "its forces" if body is None else f"the forces of {_place(body)}"
         out.append(f"the step left {100 * worst:.2g} % of {of} unbalanced: take more sweeps or a "
                    f"smaller time step{faster}")  # fmt: skip
     slip = result.friction_residuals
-    if slip is not None and _largest(slip) > UNBALANCED_FRICTION:
+    if slip is not None and not _largest(slip) <= UNBALANCED_FRICTION:
         faster = ', coarse="auto"' if model.coarse is None else ""
         out.append(f"friction has not converged: {100 * _largest(slip):.2g} % of it on {_place(slip)} is not balanced; "
                    f"take more sweeps, a smaller time step{faster} or a larger Friction(velocity=)")  # fmt: skip

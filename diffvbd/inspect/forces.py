@@ -13,11 +13,12 @@ from torch.linalg import cross
 from .. import ops
 from ..adjoint.contact_potential import ContactState, StepContact
 from ..adjoint.potential import IncrementalPotential
-from ..checks import fail
+from ..checks import fail, name_value
 from ..contact.pair_forces import NearPairs
 from ..energies import StableNeoHookean
 from ..model.model import Model
 from ..model.rest import shape_gradients
+from ..scopes import looks_at
 from ..step.arguments import GRAVITY, acceleration_of, broadcastable, check_state
 from .wide import Wide, check_previous, wide, widen
 
@@ -281,14 +282,17 @@ def stress(
     f = (edges[..., :, None] * gradients[..., 1:, None, :]).sum(-3)  # F_ij = sum_a e_ai (grad N_a)_j
     det = (f[..., 0, :] * cross(f[..., 1, :], f[..., 2, :])).sum(-1)
     shear, second = (
-        t.expand(lead.numel(), t.shape[1]).reshape(*lead, -1) for t in (given.prepared.mu, given.prepared.lam)
+        t.expand(lead.numel(), t.shape[1]).reshape(*lead, t.shape[1]) for t in (given.prepared.mu, given.prepared.lam)
     )
+    if looks_at(shear) and looks_at(second):
+        name_value("mu", "finite values >= 0 Pa", shear, shear >= 0)
+        name_value("lam", "finite values with mu + lam >= 0 Pa", second, shear + second >= 0)
     eye = torch.eye(3, dtype=f.dtype, device=f.device)
     left = (f[..., :, None, :] * f[..., None, :, :]).sum(-1)
     pressure = (shear + second) * (det - 1) - shear
     cauchy = (shear / det)[..., None, None] * left + pressure[..., None, None] * eye
     trace = cauchy.diagonal(dim1=-2, dim2=-1).sum(-1)
     square = 1.5 * (cauchy - (trace / 3)[..., None, None] * eye).square().sum((-2, -1))
-    loaded = square > 0  # a root has no derivative at zero
-    von_mises = torch.where(loaded, torch.where(loaded, square, 1.0).sqrt(), 0.0)
+    unloaded = square == 0  # a root has no derivative at zero
+    von_mises = torch.where(unloaded, 0.0, torch.where(unloaded, 1.0, square).sqrt())
     return Stress(cauchy.to(x.dtype), von_mises.to(x.dtype))

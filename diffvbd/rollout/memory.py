@@ -14,7 +14,7 @@ from ..adjoint.routes import ReverseSweep
 from ..checks import check_count
 from ..mask import KEEPS_POSITIONS
 from ..model.model import Model
-from ..step.contact import sweeps_of_parts
+from ..step.contact_cycles import sweeps_of_parts
 from ..step.integrators import BDF2, Integrator, check_integrator, solves_of
 from ..step.memory import cuda_scratch
 from .checkpoints import BinomialCheckpoints, _left, choose_schedule

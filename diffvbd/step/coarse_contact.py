@@ -72,6 +72,7 @@ class Corrections:
 
     def __init__(self, trials: Trials, fields: ops.SweepFields, factor: Tensor, scenes: Scenes) -> None:
         self.trials, self.fields, self.factor, self.scenes = trials, fields, factor, scenes
+        self.constants = fields._replace(**{k: None if t is None else t.detach() for k, t in fields._asdict().items()})
         self.space = space_of(scenes.model)
         self.matrix = _dense(factor.detach(), self.space)
         self.refused = torch.zeros_like(trials.bodies.ptr[:-1])[None]
@@ -87,7 +88,7 @@ class Corrections:
             a = self._solved(presses, r)
             way = -self.space.prolonged(a, x.shape[1])
             slope = sum_by(-(r * a).sum(-1).reshape(-1, 1).double(), self.set_of.reshape(-1), over.shape[1] + 1)[:-1, 0]
-            length = torch.where(over, 0.0, self.trials.lengths(x, way, slope))
+            length = torch.where(over | self._lost(), 0.0, self.trials.lengths(x, way, slope))
             self.refused = self.refused + (length == 0)
         if torch.is_grad_enabled():
             way = -self.space.prolonged(self._differentiable(a, r, presses), x.shape[1])
@@ -100,7 +101,7 @@ class Corrections:
     def _gradient(self, x: Tensor) -> tuple[Tensor, list[_Press]]:
         """P' dG [B, F, 3], and what presses back."""
         s, f = self.scenes._replace(fields=self.scenes.fields._replace(x=x)), self.fields
-        force = _Elastic.apply(x, f.mu, f.lam, f.rest, f, s.model, s.time_step) + vertex_gradient(s)
+        force = _Elastic.apply(x, f.mu, f.lam, f.rest, self.constants, s.model, s.time_step) + vertex_gradient(s)
         scenes, vertices = x.shape[:2]
         presses = []
         blocks = vertex_blocks(s)
@@ -119,17 +120,26 @@ class Corrections:
         return self.space.restricted(force), presses
 
     def _solved(self, presses: list[_Press], r: Tensor) -> Tensor:
-        """a [B, F, 3]; keeps the factor."""
+        """a [B, F, 3]; keeps the factor, in double precision: single has no room for the range of stiffnesses."""
         scenes, unknowns = r.shape[0], 3 * self.space.functions
-        matrix = self.matrix.expand(scenes, unknowns, unknowns).clone()
+        matrix = self.matrix.expand(scenes, unknowns, unknowns).double()
         for press in presses:
             matrix = matrix + press.assembled(self.space, scenes, self.scenes.fields.x_prev.shape[1])
-        self.cholesky = torch.linalg.cholesky_ex(matrix)[0]
+        factor = torch.linalg.cholesky_ex(matrix)[0]
+        # of a matrix that is not positive definite no correction comes, and nothing goes back through it
+        self.solved = torch.isfinite(factor).flatten(1).all(1)[:, None, None]
+        self.cholesky = torch.where(self.solved, factor, torch.eye(unknowns, dtype=factor.dtype, device=r.device))
         return self._back(r)
 
+    def _lost(self) -> Tensor:
+        """The sets of scenes without a correction, bool [sets]."""
+        lost = (~self.solved[:, :, 0]).expand(self.set_of.shape).double()
+        return sum_by(lost.reshape(-1, 1), self.set_of.reshape(-1), self.refused.shape[1] + 1)[:-1, 0] > 0
+
     def _back(self, r: Tensor) -> Tensor:
-        half = torch.linalg.solve_triangular(self.cholesky, r.reshape(r.shape[0], -1, 1), upper=False)
-        return torch.linalg.solve_triangular(self.cholesky.mT, half, upper=True).reshape(r.shape)
+        right = torch.where(self.solved, r, 0.0).double().reshape(r.shape[0], -1, 1)
+        half = torch.linalg.solve_triangular(self.cholesky, right, upper=False)
+        return torch.linalg.solve_triangular(self.cholesky.mT, half, upper=True).reshape(r.shape).to(r.dtype)
 
     def _differentiable(self, a: Tensor, r: Tensor, presses: list[_Press]) -> Tensor:
         """a with its derivatives: one more step of no length, r - A a being zero, with the matrix as it was."""
@@ -223,8 +233,7 @@ class _Elastic(Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        x, mu, lam, rest, fields, ctx.model, ctx.h = inputs
-        ctx.fields = fields._replace(**{k: None if t is None else t.detach() for k, t in fields._asdict().items()})
+        x, mu, lam, rest, ctx.fields, ctx.model, ctx.h = inputs
         ctx.shapes = [None if t is None else t.shape for t in (mu, lam, rest)]
         ctx.save_for_backward(x)
 

@@ -24,7 +24,7 @@ from ..ops import contact_start as ops_start
 from ..ops.detect import CONSTANTS
 from ..scopes import checking, recorders
 from .coarse import factor_of
-from .contact_cycles import Combined, SweptPart, record_parts, swept_part
+from .contact_cycles import Combined, SweptPart, record_parts, sweeps_of_parts, swept_part
 from .intersections import refuse_intersections
 from .rigid_contact import bodies_of, correct
 from .rooms import Motion, rooms, rooms_of_sweeps, unsupported
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 FREE = 1e15  # [m] room that nothing fills
 MOST_CAPACITY = 2**26
+LOST = ("x: positions became non-finite {}: look with diffvbd.debug_checks(), use a smaller time_step or softer "
+        "materials")  # fmt: skip
 
 
 class TooManyPairs(RuntimeError):
@@ -90,11 +92,6 @@ class Met:
 
 
 outcomes: weakref.WeakKeyDictionary[Model, Outcome] = weakref.WeakKeyDictionary()
-
-
-def sweeps_of_parts(sweeps: int, parts: int) -> list[int]:
-    """How K sweeps are spread over R parts: evenly, the first ones taking what is left."""
-    return [sweeps // parts + (1 if r < sweeps % parts else 0) for r in range(parts)]
 
 
 class ContactStep:
@@ -317,6 +314,9 @@ class ContactStep:
         if x.is_cuda:
             for r, row in enumerate(table.tolist()):
                 self._check(r, row, met)
+        elif not bool(torch.isfinite(x).all()):
+            self._refuse_what_is_not_finite()
+            raise RuntimeError(LOST.format("in the step"))
         return x
 
     @property
@@ -347,10 +347,7 @@ class ContactStep:
         if touching:
             self._refuse_what_is_not_finite()
             if pair < 0:
-                raise RuntimeError(
-                    f"x: positions became non-finite before part {r} of the step: look with diffvbd.debug_checks(), "
-                    "use a smaller time_step or softer materials"
-                )
+                raise RuntimeError(LOST.format(f"before part {r} of the step"))
             scene, corners = surface.corners_of(pair)
             vertices = self.x_prev.shape[1]
             named = "x or colliders" if any(corner >= vertices for corner in corners) else "x"

@@ -42,6 +42,11 @@ class SweptPart(NamedTuple):
     lengths: Tensor | None = None  # of coarse corrections [corrections, B, bodies of the coarse space]
 
 
+def sweeps_of_parts(sweeps: int, parts: int) -> list[int]:
+    """How K sweeps are spread over R parts: evenly, the first ones taking what is left."""
+    return [sweeps // parts + (1 if r < sweeps % parts else 0) for r in range(parts)]
+
+
 def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, listed: Pairs, settings: SweepSettings,
                policy: int, debug_step: int) -> SweptPart:  # fmt: skip
     """Positions [B, V, 3] after the sweeps of a part that begin at x, in the rooms of its start."""
@@ -54,8 +59,6 @@ def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, l
     cycles = _cycles(model, settings.sweeps)
     if len(cycles) <= 1:
         return SweptPart(*sweep(x, settings))
-    if torch.compiler.is_compiling():
-        raise NotImplementedError("diffvbd: torch.compile of contact with cycles of sweeps is not supported")
     judge, corrections = _trials(of, start, collider, listed), None
     if of.factor is not None:
         corrections = Corrections(judge, of.fields, of.factor, _scenes(of, start, collider, listed))

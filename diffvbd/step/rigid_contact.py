@@ -117,7 +117,10 @@ def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: T
     end = f.x + _displaced(share.to(f.x.dtype)[..., None] * leaf, arm, body)
     wanted = [t for t, need in zip(f, needs, strict=True) if need]
     *first, bar = torch.autograd.grad(end, (*wanted, leaf), x_bar, allow_unused=True, retain_graph=True)
-    solution = torch.where(f.free[:, None], ops_rigid.rigid_solve(factor, bar.to(factor.dtype)), 0.0).to(f.x.dtype)
+    solution = ops_rigid.rigid_solve(factor, bar.to(factor.dtype))
+    # of a matrix that was not positive definite no motion came, and nothing goes back through it
+    moved = f.free & torch.isfinite(solution).all(-1)
+    solution = torch.where(moved[..., None], solution, 0.0).to(f.x.dtype)
     virtual = -_virtual_work(s, solution, leaf.detach(), arm, whole, body)
     second = torch.autograd.grad(virtual, wanted, allow_unused=True)
     return tuple(_sum(pair, t) for pair, t in zip(zip(first, second, strict=True), wanted, strict=True))

@@ -148,12 +148,11 @@ def pair_terms(s: Scenes, own: bool = False) -> list[PairTerms]:
         near = (active[:, 0] > 0) & apart
         height = ((at - at[:, :1].detach()) * n[:, None]).sum(-1)
         gap = torch.where(near, (w * height).sum(-1) - offset, 0.5)
-        b, slope, curvature = log_barrier(gap, torch.where(near, dhat, 1.0))
-        # the force carries stiffness and mollifier: what is left are ratios of the barrier's derivatives
-        load = h2 * torch.where(near, force[:, 0] / -slope, 0.0)
+        b, _, curvature = log_barrier(gap, torch.where(near, dhat, 1.0))
         kappa = f.kappa if f.kappa.shape[0] == 1 else of_scene(f.kappa, listed)
-        turned = torch.where(near, h2 * kappa * b, 0.0)[:, None, None] * _mollifier_gradient(at, listed)
-        stiffness = (load * curvature)[:, None, None] * outer(n)
+        e, by_corners = _mollifier(at, listed)
+        turned = torch.where(near, h2 * kappa * b, 0.0)[:, None, None] * by_corners
+        stiffness = torch.where(near, h2 * kappa * e * curvature, 0.0)[:, None, None] * outer(n)
         out.append(PairTerms(listed, torch.where(near[:, None], -h2 * force * n, 0.0), stiffness, w, turned))
     if f.lag.numel():
         load, rate, n, w = f.lag.split((1, 1, 3, 4), -1)
@@ -168,15 +167,16 @@ def pair_terms(s: Scenes, own: bool = False) -> list[PairTerms]:
     return out
 
 
-def _mollifier_gradient(at: Tensor, listed: Pairs) -> Tensor:
-    """Of e = s (2 - s) by the corners [n, 4, 3] at ``at``; zero where nothing is mollified. Twin of
-    csrc/contact/geometry.h."""
+def _mollifier(at: Tensor, listed: Pairs) -> tuple[Tensor, Tensor]:
+    """e = s (2 - s) of pairs [n] with corners [n, 4, 3], and its gradient by these; 1 and zero where nothing is
+    mollified. Twin of csrc/contact/geometry.h."""
     threshold = listed.constants[:, 2]
     u, v = at[:, 1] - at[:, 0], at[:, 3] - at[:, 2]
     c = torch.linalg.cross(u, v)
     square = (c * c).sum(-1)
     close = (listed.pairs[:, 4] == 1) & (square < threshold)
     safe = torch.where(close, threshold, 1.0)
-    slope = torch.where(close, 4 * (1 - square / safe) / safe, 0.0)[:, None]
+    part = square / safe
+    slope = torch.where(close, 4 * (1 - part) / safe, 0.0)[:, None]
     by_u, by_v = slope * torch.linalg.cross(v, c), slope * torch.linalg.cross(c, u)
-    return torch.stack([-by_u, by_u, -by_v, by_v], 1)
+    return torch.where(close, part * (2 - part), 1.0), torch.stack([-by_u, by_u, -by_v, by_v], 1)

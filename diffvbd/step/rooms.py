@@ -192,7 +192,12 @@ def unsupported(model: Model, x: Tensor, origin: Tensor, collider: Tensor, kappa
     sums = _by_body(torch.where(free[:, None], columns, held), surface)
     whole = sums[..., 6:7].clamp(min=_tiny(x))
     own, borne = sums[..., :3] / whole, sums[..., 3:6] / whole
-    square = (borne * borne).sum(-1, keepdim=True)
-    share = (-(own * borne).sum(-1, keepdim=True) / square.clamp(min=_tiny(x))).clamp(0, 1)
+    # what bears less than rounding of the body's own acceleration bears nothing: its square may be no number
+    size = borne.detach().abs().amax(-1, keepdim=True)
+    bears = size > torch.finfo(x.dtype).eps * own.detach().abs().amax(-1, keepdim=True)
+    size = torch.where(bears, size, 1.0)
+    unit = torch.where(bears, borne / size, 1.0)
+    share = -(own / size * unit).sum(-1, keepdim=True) / (unit * unit).sum(-1, keepdim=True)
+    share = torch.where(bears, share.clamp(0, 1), 0.0)
     taken = torch.where(sums[..., 7:] > 0, 0.0, share * borne)  # a body with pinned vertices hangs from them
     return torch.where(free[:, None], lift + taken[:, surface.body[:vertices].long()], lift)

@@ -238,7 +238,7 @@ def test_overflow_names_the_size_and_reserve_helps() -> None:
 
 
 def test_exactly_as_many_pairs_as_fit() -> None:
-    model = two_boxes(detections=1)
+    model = two_boxes(detections=1, capacity=1000)
     x = model.rest_points
     expected = dv.step(model, x, 0 * x, **STEP)
     needed = dv.contact.status(model).pairs
@@ -248,6 +248,10 @@ def test_exactly_as_many_pairs_as_fit() -> None:
     dv.contact.reserve(model, needed - 1)
     with pytest.raises(RuntimeError, match=rf"{needed} pairs .* do not fit {needed - 1}"):
         dv.step(model, x, 0 * x, **STEP)
+    grows = two_boxes(detections=1)
+    dv.contact.reserve(grows, 1)  # a beginning, where nobody has said how many there may be
+    for a, b in zip(dv.step(grows, x, 0 * x, **STEP), expected, strict=True):
+        assert torch.equal(a, b)
 
 
 # --- what cannot be differentiated -----------------------------------------------------------------------------------
@@ -297,3 +301,40 @@ def test_function_transforms_raise() -> None:
         torch.func.vmap(lambda v: speed_of(model, v))(v)
     with pytest.raises(NotImplementedError, match="contact"):
         torch.func.jacrev(lambda v: dv.step(model, model.rest_points, v, **STEP)[0])(v[0])
+
+
+@pytest.mark.parametrize("speed", (1e60, 1e100))
+def test_motion_that_overflows_raises(speed: float) -> None:
+    model = two_boxes()
+    x = model.rest_points
+    with pytest.raises(RuntimeError, match="x: positions became non-finite in the step"):
+        dv.step(model, x, torch.full_like(x, speed), **STEP)
+
+
+@pytest.mark.parametrize("coarse", (None, "auto"))
+@pytest.mark.parametrize("inside", (1e-3, 1e-5, 1e-7))
+@pytest.mark.parametrize("dtype", (torch.float32, torch.float64))
+def test_gradients_of_pairs_that_hardly_touch_are_finite(dtype: torch.dtype, inside: float, coarse: Any) -> None:
+    """Forces of next to nothing, whose squares single precision does not hold."""
+    dhat = 0.01
+    mesh = dv.mesh.join([box(2, 0.2), box(2, 0.2).translate((0.03, 0.2 + dhat * (1 - inside), 0.02))])
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(kappa=1.0, dhat=dhat, damping=2.0), dv.Friction(0.4))
+    model = dv.Model(mesh, energies=energies, coarse=coarse).to(dtype=dtype)
+    x = model.rest_points.clone().requires_grad_()
+    v = torch.zeros_like(x, requires_grad=True)
+    end, speed = dv.step(model, x, v, **STEP)
+    for grad in torch.autograd.grad(end.sum() + speed.sum(), (x, v)):
+        assert torch.isfinite(grad).all() and grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("gap", (1e-11, 1e-14))
+def test_gradients_beside_gaps_of_nothing_are_finite(gap: float) -> None:
+    """No rigid correction is made of a matrix that is not positive definite, and nothing goes back through it."""
+    mesh = dv.mesh.join([box(2, 0.2), box(2, 0.2).translate((0.03, 0.2 + gap, 0.02))])
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=0.01), dv.Friction(0.4))
+    model = dv.Model(mesh, energies=energies, coarse="auto")
+    x = model.rest_points
+    v = torch.zeros_like(x, requires_grad=True)
+    end, _ = dv.step(model, x, v, **STEP)
+    (grad,) = torch.autograd.grad(end.sum(), v)
+    assert torch.isfinite(grad).all() and grad.abs().max() > 0

@@ -206,6 +206,8 @@ Tensor potential_rise(const Tensor& x, const Tensor& to, const Tensor& x_prev, c
     require(is_index(corner, x) && corner.dim() == 3 && corner.size(1) == 4 && corner.size(2) == kLanes &&
                 is_index(block_ptr, x) && block_ptr.numel() == in.bodies + 1,
             "diffvbd::potential_rise: expected corner [blocks, 4, lanes] and block_ptr [bodies + 1], int32");
+    require(data<const int32_t>(ptr)[in.bodies] <= order.numel(),
+            "diffvbd::potential_rise: expected order with all vertices of ptr");
     const int64_t scenes = in.scenes, vertices = in.vertices, blocks = corner.size(0);
     Tets<T> tets{data<const int32_t>(corner), data<const int32_t>(block_ptr), {}, {}};
     tets.rest = batched<T>("rest", rest, x, scenes, blocks * kRestScalars * kLanes);

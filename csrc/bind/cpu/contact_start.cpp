@@ -15,7 +15,7 @@ namespace {
 
 namespace contact = diffvbd::contact;
 using diffvbd::data, diffvbd::dispatch_float, diffvbd::empty, diffvbd::kGrain;
-using diffvbd::TranslationTensors, diffvbd::zeros;
+using diffvbd::require, diffvbd::TranslationTensors, diffvbd::zeros;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
@@ -153,6 +153,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_keep(const Tensor& ke
   return dispatch_float(constants, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::keep_inputs<T>(keep, pairs, constants, ptr, entry);
+    const int32_t* first = data<const int32_t>(ptr);
+    require(std::is_sorted(first, first + ptr.numel()) && *first >= 0 && first[ptr.numel() - 1] <= entry.numel(),
+            "diffvbd::contact_keep: expected ptr that ascends up to the number of entries");
     std::vector<int32_t> kept(in.count + 1);
     for (int64_t i = 0; i < in.count; ++i) kept[i + 1] = kept[i] + contact::stays(in, i);
     const diffvbd::KeptLists lists(

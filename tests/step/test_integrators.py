@@ -1,0 +1,287 @@
+"""Claim: SDIRK2 and BDF2 are of second order between contacts, exact in free fall, damp what is stiff, gain no energy
+at an impact, and are differentiated as executed."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import colliders
+from diffvbd.testing import generator, relative_error, tolerance
+
+SECOND = (dv.SDIRK2(), dv.BDF2())
+EVERY = (dv.ImplicitEuler(), *SECOND)
+MATERIAL: dict[str, Any] = {"mu": 1e5, "lam": 2e5}
+GRAVITY = torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64)
+
+
+def random(*key: Any, shape: Any) -> Tensor:
+    return torch.from_numpy(generator("integrators", *key).standard_normal(tuple(shape)))
+
+
+def beam(**options: Any) -> dv.Model:
+    mesh = dv.mesh.beam(7, 3, 3, size=(0.6, 0.15, 0.15))
+    return dv.Model(mesh, pinned=mesh.points[:, 0] < 0.01, relaxation=1.5, **options)
+
+
+def marched(
+    model: dv.Model, x: Tensor, v: Tensor, steps: int, integrator: Any, **options: Any
+) -> tuple[Tensor, Tensor]:
+    end = dv.rollout(model, x, v, steps=steps, save="last", integrator=integrator, **options)
+    return end.x[-1], end.v[-1]
+
+
+@pytest.mark.parametrize("integrator", EVERY, ids=str)
+def test_order_of_a_vibration(integrator: Any) -> None:
+    model = beam()
+    x, v, seconds = model.rest_points, torch.zeros_like(model.rest_points), 0.08
+
+    def end(steps: int, scheme: Any) -> Tensor:
+        options = {"time_step": seconds / steps, "sweeps": 60, **MATERIAL}
+        return marched(model, x, v, steps, scheme, **options)[0]
+
+    exact = end(640, dv.SDIRK2())
+    coarse, fine = (float((end(n, integrator) - exact).norm()) for n in (40, 80))
+    order = 1 if isinstance(integrator, dv.ImplicitEuler) else 2
+    assert order - 0.35 < math.log2(coarse / fine) < order + 0.35
+    if order == 2:
+        assert coarse < 0.2 * float((end(40, dv.ImplicitEuler()) - exact).norm())
+
+
+@pytest.mark.parametrize("integrator", SECOND, ids=str)
+@pytest.mark.parametrize("rigid", (True, False))
+def test_free_fall_is_exact(device: str, integrator: Any, rigid: bool) -> None:
+    model = dv.Model(dv.mesh.cube(3), rigid=rigid, device=device)
+    x, v, h = model.rest_points, torch.full_like(model.rest_points, 0.7), 0.05
+    end, speed = marched(model, x, v, 10, integrator, time_step=h, sweeps=2, **MATERIAL)
+    t = 10 * h
+    g = GRAVITY.to(device)
+    assert relative_error(end, x + t * v + 0.5 * t * t * g) <= tolerance("free_fall")
+    assert relative_error(speed, v + t * g) <= tolerance("free_fall")
+
+
+@pytest.mark.parametrize("integrator", EVERY, ids=str)
+def test_momentum_and_energy_of_a_free_body(integrator: Any) -> None:
+    """A stretched cube that vibrates: its momentum stays, and what it has in energy never grows."""
+    model = dv.Model(dv.mesh.cube(3, size=0.2), rigid=False)
+    x = model.rest_points * torch.tensor([1.1, 0.95, 0.97], dtype=torch.float64)
+    v = 0.1 * random("momentum", shape=x.shape)
+    options: dict[str, Any] = {"time_step": 0.004, "sweeps": 60, "gravity": (0.0, 0.0, 0.0), **MATERIAL}
+    end = dv.rollout(model, x, v, steps=50, integrator=integrator, **options)
+    mass = model.mass[:, None]
+    before, after = (mass * end.v[0]).sum(0), (mass * end.v[-1]).sum(0)
+    assert relative_error(after, before) <= tolerance("momentum")
+    speed = (mass * end.v.square()).sum((-1, -2))
+    assert float(speed[25:].max()) <= float(speed.max())
+    least = {dv.ImplicitEuler: 0.0, dv.SDIRK2: 0.2, dv.BDF2: 0.02}[type(integrator)]
+    assert float(speed[-10:].max()) > least * float(speed.max())
+
+
+@pytest.mark.parametrize("integrator", SECOND, ids=str)
+def test_a_stiff_body_decays(integrator: Any) -> None:
+    """Far above its frequencies a step leaves next to nothing of a vibration."""
+    model = beam(coarse="auto")
+    x = model.rest_points.clone()
+    x[:, 1] += 0.05 * x[:, 0] ** 2
+    end, speed = marched(model, x, torch.zeros_like(x), 12, integrator, time_step=0.5, sweeps=100,
+                         gravity=(0.0, 0.0, 0.0), mu=1e7, lam=1e7)  # fmt: skip
+    assert float((end - model.rest_points).norm()) < 0.02 * float((x - model.rest_points).norm())
+    assert float(speed.abs().max()) < 1e-2
+
+
+def falling(count: int, kind: str, **options: Any) -> tuple[dv.Model, Tensor, Tensor]:
+    """Cubes that turn and fall on a floor, a scene each."""
+    energies: list[Any] = [dv.StableNeoHookean()]
+    if kind == "floor":
+        energies.append(dv.FloorBarrier(height=-0.3, kappa=1e4, dhat=0.01, damping=2.0))
+    else:
+        energies += [dv.PairBarrier(kappa=1e4, dhat=0.01, self_contact=False), dv.Friction(0.3)]
+        options["colliders"] = [colliders.Plane((0.0, -0.3, 0.0), (0.0, 1.0, 0.0))]
+    model = dv.Model(dv.mesh.cube(2, size=0.2), energies=tuple(energies), **options)
+    x = model.rest_points.expand(count, -1, -1).clone()
+    x[..., 1] += 0.2 * random("height", shape=(count, 1)).abs().clamp(max=1)
+    arm = x - x.mean(1, keepdim=True)
+    v = torch.linalg.cross((6 * random("spin", shape=(count, 1, 3))).expand_as(arm), arm)
+    v = v + random("speed", shape=(count, 1, 3))
+    v[..., 1] -= 4
+    return model, x, v
+
+
+def energy_of(model: dv.Model, x: Tensor, v: Tensor, mu: float, lam: float) -> Tensor:
+    """Kinetic, elastic and of weight [B], from deformation gradients."""
+    rest, deformed = model.rest_points[model.tets], x[:, model.tets]
+    edges = (rest[:, 1:] - rest[:, :1]).mT
+    f = (deformed[:, :, 1:] - deformed[:, :, :1]).mT @ torch.linalg.inv(edges)
+    det, above = torch.linalg.det(f), 1 + mu / lam
+    density = mu / 2 * (f.square().sum((-1, -2)) - 3) + lam / 2 * ((det - above) ** 2 - (1 - above) ** 2)
+    elastic = (density * torch.linalg.det(edges) / 6).sum(-1)
+    mass = model.mass[:, None]
+    return 0.5 * (mass * v.square()).sum((-1, -2)) + (mass[:, 0] * 9.81 * x[..., 1]).sum(-1) + elastic
+
+
+@pytest.mark.parametrize("time_step", (0.02, 0.005))
+@pytest.mark.parametrize("kind", ("floor", "plane"))
+@pytest.mark.parametrize("integrator", SECOND, ids=str)
+def test_impacts_gain_no_energy(integrator: Any, kind: str, time_step: float) -> None:
+    """125 impacts each, at any phase of a step; the barrier itself gives back what it took."""
+    model, x, v = falling(125, kind)
+    start = energy_of(model, x, v, 3e4, 3e4)
+    scale = start + float(model.mass.sum()) * 9.81 * 0.3
+    history, most, lowest = None, torch.zeros_like(start), torch.ones_like(start)
+    for _ in range(round(0.3 / time_step)):
+        options: dict[str, Any] = {"time_step": time_step, "sweeps": 15, "mu": 3e4, "lam": 3e4}
+        if isinstance(integrator, dv.BDF2):
+            x, v, history = dv.step(model, x, v, integrator=integrator, history=history, **options)
+        else:
+            x, v = dv.step(model, x, v, integrator=integrator, **options)
+        lowest = torch.minimum(lowest, (x[..., 1] + 0.3).amin(-1))
+        most = torch.maximum(most, (energy_of(model, x, v, 3e4, 3e4) - start) / scale)
+    assert float(most.max()) <= 0.02 and float(lowest.min()) > 0
+    assert float(lowest.median()) < 0.01, "few have landed"
+
+
+@pytest.mark.parametrize("integrator", SECOND, ids=str)
+@pytest.mark.parametrize("case", ("free", "pinned", "floor", "plane", "coarse"))
+def test_gradients_are_those_of_what_ran(integrator: Any, case: str) -> None:
+    """Against central differences, for a state, a material and a coefficient of the contact."""
+    extra: dict[str, Tensor] = {}
+    if case in ("floor", "plane"):
+        model, x, v = falling(2, case)
+        x = x.clone()
+        x[0, :, 1] -= x[0, :, 1].min() + 0.3 - 0.02  # lands at once; the other flies on
+        name = "floor_barrier.kappa" if case == "floor" else "friction.coefficient"
+        extra[name] = torch.tensor(1e4 if case == "floor" else 0.3, dtype=torch.float64, requires_grad=True)
+    else:
+        model = (
+            dv.Model(dv.mesh.cube(3, size=0.2)) if case == "free" else beam(coarse="auto" if case == "coarse" else None)
+        )
+        x = model.rest_points
+        v = 0.3 * random("gradients", case, shape=x.shape)
+    weight = random("weight", case, shape=x.shape)
+    mu = torch.tensor(3e4, dtype=x.dtype, requires_grad=True)
+    push = torch.zeros((), dtype=x.dtype, requires_grad=True)
+
+    def loss(push: Tensor, mu: Tensor, *more: Tensor) -> Tensor:
+        parameters = dict(zip(extra, more, strict=True))
+        end, speed = marched(model, x + 1e-3 * push * weight, v + push * weight, 4, integrator, mu=mu, lam=4e4,
+                             time_step=0.01, sweeps=3, parameters=parameters)  # fmt: skip
+        return (weight * end).sum() + 1e-2 * (weight * speed).sum()
+
+    given = [push, mu, *extra.values()]
+    for k, (t, grad) in enumerate(zip(given, torch.autograd.grad(loss(*given), given), strict=True)):
+        d = 1e-6 * max(1.0, abs(t.item()))
+        with torch.no_grad():
+            sides = [loss(*(u + s * d if i == k else u for i, u in enumerate(given))) for s in (1, -1)]
+        assert grad.abs() > 0
+        assert abs(float((sides[0] - sides[1]) / (2 * d) - grad)) <= tolerance("finite_difference") * abs(
+            float(grad)
+        ), k
+
+
+@pytest.mark.parametrize("integrator", SECOND, ids=str)
+def test_a_scene_is_the_same_alone_in_steps_and_in_checkpoints(integrator: Any) -> None:
+    model, x, v = falling(3, "plane")
+    v = v.requires_grad_()
+    options: Any = {"steps": 8, "time_step": 0.01, "sweeps": 4, "mu": 3e4, "lam": 3e4}
+    whole = dv.rollout(model, x, v, integrator=integrator, checkpoint_every=None, **options)
+    (grad,) = torch.autograd.grad(whole.x[-1].sum(), v)
+    assert grad.abs().max() > 0
+    for every in (3, dv.BinomialCheckpoints(2)):
+        again = dv.rollout(model, x, v, integrator=integrator, checkpoint_every=every, **options)
+        assert torch.equal(again.x, whole.x)
+        assert torch.equal(torch.autograd.grad(again.x[-1].sum(), v)[0], grad)
+    alone = dv.rollout(model, x[1], v[1], integrator=integrator, **options)
+    assert torch.equal(alone.x, whole.x[:, 1])
+    first = dv.rollout(model, x, v, integrator=integrator, **options | {"steps": 5})
+    rest = dv.rollout(model, first.x[-1], first.v[-1], integrator=integrator, history=first.history,
+                      **options | {"steps": 3})  # fmt: skip
+    assert torch.equal(rest.x[-1], whole.x[-1])
+
+
+def test_implicit_euler_is_what_a_step_does_unasked() -> None:
+    model, x, v = falling(2, "plane")
+    options: dict[str, Any] = {"time_step": 0.01, "sweeps": 3, **MATERIAL}
+    for a, b in zip(dv.step(model, x, v, **options), dv.step(model, x, v, integrator=dv.ImplicitEuler(), **options),
+                    strict=True):  # fmt: skip
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("integrator", EVERY, ids=str)
+def test_what_is_held_moves_evenly(integrator: Any) -> None:
+    model = beam()
+    x, pinned = model.rest_points, model.pinned
+    speed = torch.tensor([0.1, 0.2, -0.3], dtype=torch.float64)
+    v, steps, h = torch.where(pinned[:, None], speed, 0.0), 5, 0.02
+    where = torch.stack([x + (n + 1) * h * v for n in range(steps)])
+    end, after = marched(
+        model, x, v, steps, integrator, prescribed=dv.per_step(where), time_step=h, sweeps=5, **MATERIAL
+    )
+    assert torch.equal(end[pinned], where[-1][pinned])
+    assert relative_error(after[pinned], v[pinned]) <= tolerance("travel")
+    if isinstance(integrator, dv.SDIRK2):
+        share = 1 - 1 / math.sqrt(2)
+        even = dv.step(model, x, v, prescribed=where[0], time_step=h, sweeps=5, integrator=integrator, **MATERIAL)
+        halves = (x + share * (where[0] - x), where[0])
+        given = dv.step(model, x, v, prescribed=halves, time_step=h, sweeps=5, integrator=integrator, **MATERIAL)
+        assert all(torch.equal(a, b) for a, b in zip(even, given, strict=True))
+
+
+@pytest.mark.parametrize("integrator", SECOND, ids=str)
+def test_a_converged_step(integrator: Any) -> None:
+    model = beam()
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    mu = torch.tensor(1e5, dtype=x.dtype, requires_grad=True)
+    solved = dv.solve(model, x, v, mu=mu, lam=2e5, time_step=0.02, integrator=integrator)
+    swept, _ = marched(model, x, v, 1, integrator, mu=1e5, lam=2e5, time_step=0.02, sweeps=600)
+    assert solved.converged and relative_error(solved.x, swept) <= tolerance("global_converged")
+    (grad,) = torch.autograd.grad(solved.x.square().sum(), mu)
+    assert grad.abs() > 0
+
+
+@pytest.mark.parametrize("integrator", SECOND, ids=str)
+def test_single_precision(integrator: Any) -> None:
+    """Far from the origin it is as near to double precision as implicit Euler is."""
+    model = beam()
+    single = model.to(dtype=torch.float32)
+    x = model.rest_points + 20
+    ends = [marched(m, x.to(m.dtype), torch.zeros_like(x).to(m.dtype), 10, integrator, time_step=0.01, sweeps=10,
+                    **MATERIAL)[0].double() for m in (model, single)]  # fmt: skip
+    assert relative_error(ends[1] - x, ends[0] - x) <= tolerance("float32_gradient")
+
+
+def test_a_tape_of_bdf2() -> None:
+    """Its history is an argument like others, and what follows from a state needs no name."""
+    model = beam()
+    x = model.rest_points
+    v = torch.zeros_like(x)
+    options: dict[str, Any] = {"time_step": 0.01, "sweeps": 3, **MATERIAL}
+    x1, v1, history = dv.step(model, x, v, integrator=dv.BDF2(), **options)
+    moved = history.moved.clone().requires_grad_()
+    x2, _, _ = dv.step(model, x1, v1, integrator=dv.BDF2(), history=history._replace(moved=moved), **options)
+    (wanted,) = torch.autograd.grad(x2.sum(), moved)
+    _, _, tape = dv.step_forward(model, x1, v1, wrt=("x", "history.moved"), integrator=dv.BDF2(), history=history,
+                                 **options)  # fmt: skip
+    found = dv.step_backward(tape, torch.ones_like(x))
+    assert torch.equal(found["history.moved"], wanted) and wanted.abs().max() > 0
+    assert tape.history is not None and torch.equal(tape.history.v, v1)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"integrator": "sdirk2"}, "integrator: expected .* got str"),
+        ({"integrator": dv.BDF2}, "integrator: expected an object, BDF2"),
+        ({"integrator": dv.SDIRK2(), "history": (1, 2)}, "history: expected None beside SDIRK2"),
+        ({"integrator": dv.BDF2(), "history": (1, 2)}, "history: expected what a step with BDF2"),
+        ({"integrator": dv.BDF2(), "history": dv.History(*[torch.zeros(1)] * 3)}, r"history.moved: expected shape"),
+        ({"prescribed": (torch.zeros(3), torch.zeros(3))}, "prescribed: expected a tensor"),
+    ],
+)
+def test_bad_input(options: dict[str, Any], match: str) -> None:
+    model = beam()
+    x = model.rest_points
+    with pytest.raises((TypeError, ValueError), match=match):
+        dv.step(model, x, torch.zeros_like(x), time_step=0.01, sweeps=1, **MATERIAL, **options)
