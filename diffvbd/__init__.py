@@ -12,7 +12,7 @@ from ._version import __version__ as __version__
 from .adjoint.routes import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
 from .contact.barrier import Friction, PairBarrier
 from .energies import Anchor, FloorBarrier, StableNeoHookean
-from .inspect import acceleration, coarse
+from .inspect import acceleration, coarse, integrators
 from .inspect.debug import debug_checks
 from .inspect.diagnose import Diagnosis, diagnose
 from .inspect.forces import Stress, reactions, stress
@@ -64,6 +64,7 @@ __all__ = [
     "contact",
     "debug_checks",
     "diagnose",
+    "integrators",
     "lame",
     "mesh",
     "per_step",

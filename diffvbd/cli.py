@@ -14,7 +14,7 @@ import diffvbd as dv
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
 from diffvbd.tasks.problem import Result, check_device
 from diffvbd.tasks.progress import versions
-from diffvbd.tasks.scene import MOST_STEPS, Array, Observation, Scene
+from diffvbd.tasks.scene import INTEGRATORS, MOST_STEPS, Array, Observation, Scene
 
 DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Units: m, kg, s, Pa; y points up."
 EXAMPLES = """examples:
@@ -37,7 +37,7 @@ TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here re
   steps      time steps after which each was observed, shape [N]; default 0, 1, 2, ...
   x0, v0     initial positions [m] and velocities [m/s], shape [V, 3]; default: the mesh, at rest
   pinned     vertices that are held, bool, shape [V]; default none
-  time_step [s], sweeps, density [kg/m^3], gravity [m/s^2], floor [m], kappa, dhat [m], friction, relaxation
+  time_step [s], sweeps, density [kg/m^3], gravity [m/s^2], floor [m], kappa, dhat [m], friction, relaxation, integrator
   mu, lam    the true material [Pa], if known: only used to report the error
 `diffvbd simulate --save-target TARGET.npz` writes such a file.
 """
@@ -143,6 +143,7 @@ def _add_scene_options(parser: argparse.ArgumentParser) -> None:
     scene.add_argument("--dhat", type=float, help=f"distance where the barrier begins [m] (default {Scene.dhat:g})")
     scene.add_argument("--friction", type=float, help="coefficient of friction on the floor (default: none)")
     scene.add_argument("--relaxation", type=float, help="1.5 to 1.7 needs fewer sweeps (default 1; not with friction)")
+    scene.add_argument("--integrator", choices=[*INTEGRATORS], help=f"of time (default {Scene.integrator})")
     scene.add_argument(
         "--pin",
         action="append",
@@ -205,7 +206,7 @@ def _simulate(options: argparse.Namespace) -> None:
             f"warning: --pin holds {count} vertices; a fraction takes more, for example --pin x-:0.05", file=sys.stderr
         )
     if len(steps) > 1 and options.stride == 1:
-        previous = motion.x[-2], motion.v[-2]
+        previous = (motion.x[-2], motion.v[-2]) if scene.integrator == Scene.integrator else None
         found = dv.diagnose(model, motion.x[-1], mu=mu, lam=lam, time_step=scene.time_step, previous=previous,
                             gravity=scene.gravity, warn=False)  # fmt: skip
         for message in found.messages:
@@ -309,7 +310,8 @@ def _material(options: argparse.Namespace) -> tuple[float, float]:
 
 
 def _given_scene_options(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
-    names = ("time_step", "sweeps", "density", "gravity", "floor", "kappa", "dhat", "friction", "relaxation")
+    names = ("time_step", "sweeps", "density", "gravity", "floor", "kappa", "dhat", "friction", "relaxation",
+             "integrator")  # fmt: skip
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     if options.pin:
         given["pinned"] = np.logical_or.reduce([_side(mesh.points, text) for text in options.pin])

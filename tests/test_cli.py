@@ -236,6 +236,21 @@ def test_friction_and_relaxation_are_part_of_the_scene(mesh_file: Path, tmp_path
     assert not np.array_equal(ends["relaxed"], ends["smooth"])
 
 
+def test_the_integrator_is_part_of_the_scene(mesh_file: Path, tmp_path: Path) -> None:
+    """Of free fall, which second order has exactly."""
+    falls = {}
+    for name in ("implicit-euler", "sdirk2", "bdf2"):
+        target = tmp_path / f"{name}.npz"
+        out = ["--out", tmp_path / f"{name}.pvd", "--save-target", target]
+        assert run("simulate", mesh_file, *out, "--steps", 5, "--time-step", 0.02, "--integrator", name) == 0
+        found = Observation.load(target, dv.mesh.load(mesh_file))
+        assert found.scene.integrator == name
+        falls[name] = float((found.x[-1] - found.x[0])[:, 1].mean())
+    exact = -0.5 * 9.81 * 0.1**2
+    assert abs(falls["implicit-euler"] - exact) > 0.1 * abs(exact)
+    assert all(abs(falls[name] - exact) < 1e-6 * abs(exact) for name in ("sdirk2", "bdf2"))
+
+
 def test_identify_starts_from_young_and_poisson(mesh_file: Path, tmp_path: Path, capsys) -> None:
     target = tmp_path / "target.npz"
     material = ["--young", 1e5, "--poisson", 0.3]

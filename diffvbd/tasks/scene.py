@@ -17,6 +17,9 @@ MOST_STEPS = 10**7  # beyond, a typing error is likelier than patience
 Array = NDArray[np.float64]
 
 
+INTEGRATORS = {"implicit-euler": dv.ImplicitEuler, "sdirk2": dv.SDIRK2, "bdf2": dv.BDF2}
+
+
 @dataclass(frozen=True)
 class Scene:
     """A mesh and everything else that a simulation needs, except the material.
@@ -35,6 +38,7 @@ class Scene:
         dhat: Distance at which the barrier begins [m].
         friction: Coefficient of the floor's friction; None: none.
         relaxation: Multiplies every update, as in `diffvbd.Model`.
+        integrator: One of INTEGRATORS.
     """
 
     mesh: dv.TetMesh
@@ -50,6 +54,7 @@ class Scene:
     dhat: float = 0.02
     friction: float | None = None
     relaxation: float = 1.0
+    integrator: str = "implicit-euler"
 
     def model(self, device: str = "cpu") -> dv.Model:
         energies: tuple[Any, ...] = (dv.StableNeoHookean(),)
@@ -75,6 +80,7 @@ class Scene:
             time_step=self.time_step,
             sweeps=self.sweeps,
             gravity=self.gravity,
+            integrator=INTEGRATORS[self.integrator](),
             **options,
         )
 
@@ -106,6 +112,8 @@ class Observation:
             values["friction"] = s.friction
         if s.relaxation != 1.0:
             values["relaxation"] = s.relaxation
+        if s.integrator != Scene.integrator:
+            values["integrator"] = s.integrator
         values |= self.truth
         with open(path, "wb") as file:
             np.savez_compressed(file, **values)
@@ -118,7 +126,7 @@ class Observation:
         * steps: steps after which each was observed, shape [N] (default 0, 1, ...; required for one shape);
         * x0, v0: initial positions [m] and velocities [m/s], shape [V, 3] (default: the mesh, at rest);
         * pinned: bool [V]; time_step [s]; sweeps; density [kg/m^3]; gravity [3]; floor, kappa, dhat,
-          friction, relaxation: as in `Scene`;
+          friction, relaxation, integrator: as in `Scene`;
         * mu, lam: the true material [Pa], only to report the error.
 
         Args:
@@ -134,7 +142,7 @@ class Observation:
         values |= {key: value for key, value in overrides.items() if value is not None}
         known = {"x", "steps", "x0", "v0", "pinned", "mu", "lam"}
         numbers = {"time_step", "density", "floor", "kappa", "dhat", "friction", "relaxation"}
-        unknown = sorted(set(values) - known - numbers - {"sweeps", "gravity"})
+        unknown = sorted(set(values) - known - numbers - {"sweeps", "gravity", "integrator"})
         if unknown or "x" not in values:
             raise ValueError(f"{path}: {f'unknown keys {unknown}' if unknown else 'the key x is missing'}")
 
@@ -151,6 +159,10 @@ class Observation:
             fields["sweeps"] = int(_number(path, "sweeps", values["sweeps"], whole=True))
         if "gravity" in values:
             fields["gravity"] = tuple(_array(path, "gravity", values["gravity"], (3,)).tolist())
+        if "integrator" in values:
+            fields["integrator"] = str(np.asarray(values["integrator"]))
+            if fields["integrator"] not in INTEGRATORS:
+                raise ValueError(f"{path}: integrator: expected one of {[*INTEGRATORS]}, got {fields['integrator']!r}")
         scene = Scene(
             mesh=mesh,
             x0=_checked(path, "x0", values.get("x0", mesh.points), shape),

@@ -1,0 +1,98 @@
+"""Integrators of time: error and time of a motion over the time step, and what impacts do to energy."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from bench.common import markdown_table
+from diffvbd import colliders, reference
+
+INTEGRATORS = {"implicit Euler": dv.ImplicitEuler(), "SDIRK2": dv.SDIRK2(), "BDF2": dv.BDF2()}
+SECONDS = 0.4
+MATERIAL: dict[str, Any] = {"mu": 1e5, "lam": 2e5}
+
+
+def run(quick: bool) -> dict[str, Any]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return {"beam": beam(quick), "impacts": impacts(quick)}
+    finally:
+        torch.set_num_threads(threads)
+
+
+def beam(quick: bool) -> list[dict[str, Any]]:
+    """A cantilever of 0.6 m released from rest: error of its end state over its motion after 0.4 s, and the time that
+    takes, of ladders of steps. Sweeps fall with the step, so that each ladder does about the same number of them."""
+    mesh = dv.mesh.beam(7, 3, 3, size=(0.6, 0.15, 0.15)) if quick else dv.mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15))
+    model = dv.Model(mesh, pinned=mesh.points[:, 0] < 0.01, relaxation=1.6)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+
+    def end(steps: int, sweeps: int, integrator: Any) -> Tensor:
+        options = {"steps": steps, "time_step": SECONDS / steps, "sweeps": sweeps, "save": "last", **MATERIAL}
+        with torch.no_grad():
+            return dv.rollout(model, x, v, integrator=integrator, **options).x[-1]
+
+    exact = end(200 if quick else 3200, 40, dv.SDIRK2())
+    motion, out = float((exact - x).norm()), []
+    for steps in (25,) if quick else (25, 50, 100, 200, 400, 800):
+        sweeps = max(10, 10_000 // steps)
+        row: dict[str, Any] = {"time step [ms]": 1e3 * SECONDS / steps, "sweeps": sweeps}
+        for name, integrator in INTEGRATORS.items():
+            begun = time.perf_counter()
+            error = float((end(steps, sweeps, integrator) - exact).norm()) / motion
+            row |= {f"{name}, error": error, f"{name} [s]": time.perf_counter() - begun}
+        out.append(row)
+    return out
+
+
+def impacts(quick: bool) -> list[dict[str, Any]]:
+    """Cubes of 0.2 m, a scene each, that turn and fall on a plane at some 4 m/s, at any phase of a step: by how much the
+    energy of the worst of them exceeds that at its start, what the median has left, and the lowest gap."""
+    count, mu, lam, out = (40 if quick else 1000), 1e5, 1e5, []
+    cube = dv.mesh.cube(2, size=0.2)
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=0.01), dv.Friction(0.3))
+    model = dv.Model(cube, energies=energies, colliders=[colliders.Plane((0.0, -0.3, 0.0), (0.0, 1.0, 0.0))])
+    body = dv.Model(cube)
+    random = torch.Generator().manual_seed(0)
+    x = model.rest_points.expand(count, -1, -1).clone()
+    x[..., 1] += 0.2 * torch.rand((count, 1), generator=random, dtype=x.dtype)
+    arm = x - x.mean(1, keepdim=True)
+    spin, v = (torch.randn((count, 1, 3), generator=random, dtype=x.dtype) for _ in range(2))
+    v = v + torch.linalg.cross((6 * spin).expand_as(arm), arm)
+    v[..., 1] -= 4
+
+    def energy(x: Tensor, v: Tensor) -> Tensor:
+        elastic = torch.stack([reference.incremental_potential(body, a, a, mu, lam, 1.0) for a in x])
+        mass = model.mass[:, None]
+        return elastic + (mass * (0.5 * v.square() + 9.81 * (x + 0.3) * torch.tensor([0.0, 1.0, 0.0]))).sum((-1, -2))
+
+    start = energy(x, v)
+    for time_step in (0.02, 0.005):
+        for name, integrator in INTEGRATORS.items():
+            with torch.no_grad():
+                steps = round((0.1 if quick else 0.4) / time_step)
+                motion = dv.rollout(model, x, v, steps=steps, time_step=time_step, sweeps=15, mu=mu, lam=lam,
+                                    integrator=integrator)  # fmt: skip
+                over = torch.stack([energy(a, b) for a, b in zip(motion.x[1:], motion.v[1:], strict=True)]) / start - 1
+            out.append({"integrator": name, "time step [s]": time_step, "impacts": count,
+                        "most gained": float(over.max()), "left": float(over[-1].median()) + 1,
+                        "lowest gap [m]": float(motion.x[..., 1].min()) + 0.3})  # fmt: skip
+    return out
+
+
+def markdown(results: dict[str, Any]) -> str:
+    titles = {
+        "beam": "Cantilever of 0.6 m after 0.4 s: error over motion, and seconds on one thread",
+        "impacts": "Cubes that fall on a plane: energy over that at the start, worst and median scene",
+    }
+    parts = []
+    for name, title in titles.items():
+        rows = results[name]
+        parts.append(f"## {title}\n\n{markdown_table([*rows[0]], [list(r.values()) for r in rows])}")
+    return "\n".join(parts)
