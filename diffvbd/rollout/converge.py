@@ -105,7 +105,7 @@ def solve(
     Source: paper, eq. 1; docs/adjoints.md.
     """
     lead, scheme = check_state(model, x, v), check_integrator(integrator)
-    check_history(scheme, history, x)
+    check_history(scheme, history, x, time_step)
     if adjoint is None:
         adjoint = ReverseSweep() if model.touches else GlobalAdjoint()
     adjoint = check_adjoint(adjoint)

@@ -151,7 +151,7 @@ def rollout(
     if not isinstance(check_start, bool):
         raise TypeError(f"check_start: expected a bool, got {type(check_start).__name__}")
     lead, adjoint, scheme = check_state(model, x, v), check_adjoint(adjoint), check_integrator(integrator)
-    check_history(scheme, history, x)
+    check_history(scheme, history, x, time_step)
     options = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "rest_points": rest_points,
                "density": density, "force": force, "gravity": gravity, "prescribed": prescribed,
                "colliders": colliders}  # fmt: skip
@@ -185,7 +185,7 @@ def rollout(
     def segment(first: int, end: int, x: Tensor, v: Tensor, *before: Tensor) -> Segment:
         _check_versions(versions)
         frames, observed = [], []
-        past = History(*before) if before else None
+        past = History(before[0], before[1], before[2], time_step) if before else None
         for k in range(first, end):
             now = prepare(model, lead, **chosen, **_to_prepare(options, own, k, x, v)) if fixed is None else fixed
             given = _to_advance(model, options, k, x, v, outer, colliders_before)
@@ -203,9 +203,11 @@ def rollout(
                 observed.append(observe(x, v, k + 1))
             if bar is not None:
                 bar.show(k + 1)
-        return Segment((x, v, *(past if remembers and past else ())), frames, observed)
+        return Segment((x, v, *(past[:3] if remembers and past else ())), frames, observed)
 
-    done = run_segments(segment, steps, (x, v, *(history or ())), every if torch.is_grad_enabled() else None)
+    done = run_segments(
+        segment, steps, (x, v, *(history[:3] if history else ())), every if torch.is_grad_enabled() else None
+    )
     if last:
         warn_of_contact(model, *last)
         last[:] = [None]  # of no use any more: no tape is held, and a segment that runs again keeps nothing
@@ -216,7 +218,7 @@ def rollout(
         steps=[f[0] for f in frames],
         observations=_stacked(done.observed),
         errors=of_steps([errors[k] for k in range(steps)], model, x, sweeps) if estimate_errors else None,
-        history=History(*done.end[2:]) if len(done.end) > 2 else None,
+        history=History(done.end[2], done.end[3], done.end[4], time_step) if len(done.end) > 2 else None,
     )
 
 

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from ..checks import fail
 from ..model.model import Model
+from ..ops import TET_READS_X_PREV
 from ..scopes import looks_at, recorders
 from .approach import may_touch
 from .arguments import Prepared, acceleration_of, broadcastable, collider_state
@@ -63,12 +64,14 @@ Integrator = ImplicitEuler | SDIRK2 | BDF2
 
 class History(NamedTuple):
     """What :class:`BDF2` knows of the step before a state: by how much it moved every vertex [m], the velocity before
-    it [m/s], both [..., V, 3], and whether it is smooth, bool [..., V]: False where a body may have touched something.
+    it [m/s], both [..., V, 3], whether it is smooth, bool [..., V]: False where a body may have touched something; and
+    its time step [s].
     """
 
     moved: Tensor
     v: Tensor
     smooth: Tensor
+    time_step: float
 
 
 class Solve(NamedTuple):
@@ -99,7 +102,7 @@ def check_integrator(integrator: Any) -> Integrator:
     return integrator
 
 
-def check_history(integrator: Integrator, history: Any, x: Tensor) -> None:
+def check_history(integrator: Integrator, history: Any, x: Tensor, time_step: Any) -> None:
     if history is None:
         return
     if not isinstance(integrator, BDF2):
@@ -111,6 +114,8 @@ def check_history(integrator: Integrator, history: Any, x: Tensor) -> None:
         if not isinstance(value, Tensor) or value.shape != shape:
             got = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             fail(f"history.{name}", f"shape {list(shape)}, that of x", got)
+    if history.time_step != time_step:
+        fail("history", f"one of a step of time_step {time_step} s (None begins anew)", f"{history.time_step} s")
 
 
 def solves_of(integrator: Integrator) -> int:
@@ -144,6 +149,10 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
     if isinstance(integrator, ImplicitEuler):
         x_end, v_end, last = solve(x, v, whole, end)
         return Taken(x_end, v_end, None, last)
+    if TET_READS_X_PREV:  # whose rate is that of the reference
+        raise NotImplementedError(f"integrator: expected ImplicitEuler() with a law of tets that reads x_prev, got "
+                                  f"{integrator}")  # fmt: skip
+    time_step = whole.settings.numbers.time_step
     touching = _touching(model, x, v, whole, end)
     if touching is not None:
         if whole.unrolled is not None:
@@ -157,7 +166,7 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
         euler = touching | ~history.smooth
     if euler is not None and looks_at(euler) and bool(euler.all()):
         x_end, v_end, last = solve(x, v, whole, end)
-        return Taken(x_end, v_end, History(x_end - x, v, smooth), last)
+        return Taken(x_end, v_end, History(x_end - x, v, smooth, time_step), last)
 
     def last_solve(feasible: Tensor, reference: Tensor, carried: Tensor, share: float) -> Taken:
         """From a feasible state, about a velocity w and a position that is h_solve times ``carried`` away from it."""
@@ -170,10 +179,10 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
             loads = end
         x_end, v_end, last = solve(feasible, start, weights, loads)
         v_end = v_end - carried if euler is None else torch.where(euler[..., None], share * v_end, v_end - carried)
-        return Taken(x_end, v_end, History(x_end - x, v, smooth), last)
+        return Taken(x_end, v_end, History(x_end - x, v, smooth, time_step), last)
 
     if isinstance(integrator, BDF2) and history is not None:
-        carried = history.moved / (2 * whole.settings.numbers.time_step)
+        carried = history.moved / (2 * time_step)
         return last_solve(x, v + (v - history.v) / 3, carried, 2 / 3)
     x1, v1, _ = solve(x, v, _over(whole, GAMMA), _at_share(given, x, GAMMA))
     return last_solve(x1, v + (1 + math.sqrt(2)) * (v1 - v), math.sqrt(2) * v1, GAMMA)

@@ -140,7 +140,7 @@ def step(
     """
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
     scheme = check_integrator(integrator)
-    check_history(scheme, history, x)
+    check_history(scheme, history, x, time_step)
     given = {"force": force, "gravity": gravity, "prescribed": prescribed, "colliders": colliders,
              "colliders_before": colliders_before}  # fmt: skip
     check_staged(scheme, given)

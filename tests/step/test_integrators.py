@@ -252,6 +252,29 @@ def test_single_precision(integrator: Any) -> None:
     assert relative_error(ends[1] - x, ends[0] - x) <= tolerance("float32_gradient")
 
 
+def test_a_history_is_of_one_time_step() -> None:
+    model = beam()
+    x = model.rest_points
+    *_, history = dv.step(model, x, 0 * x, integrator=dv.BDF2(), time_step=0.01, sweeps=1, **MATERIAL)
+    with pytest.raises(ValueError, match=r"history: expected one of a step of time_step 0.02 s .* got 0.01 s"):
+        dv.rollout(
+            model, x, 0 * x, integrator=dv.BDF2(), history=history, steps=1, time_step=0.02, sweeps=1, **MATERIAL
+        )
+
+
+def test_a_compiled_step() -> None:
+    torch.compiler.reset()
+    model = beam()
+    x = model.rest_points
+    v = torch.zeros_like(x)
+
+    def step(x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        return dv.step(model, x, v, integrator=dv.SDIRK2(), time_step=0.01, sweeps=2, **MATERIAL)
+
+    found = torch.compile(step, backend="aot_eager", fullgraph=True)(x, v)
+    assert all(torch.equal(a, b) for a, b in zip(found, step(x, v), strict=True))
+
+
 def test_a_tape_of_bdf2() -> None:
     """Its history is an argument like others, and what follows from a state needs no name."""
     model = beam()
@@ -276,7 +299,10 @@ def test_a_tape_of_bdf2() -> None:
         ({"integrator": dv.BDF2}, "integrator: expected an object, BDF2"),
         ({"integrator": dv.SDIRK2(), "history": (1, 2)}, "history: expected None beside SDIRK2"),
         ({"integrator": dv.BDF2(), "history": (1, 2)}, "history: expected what a step with BDF2"),
-        ({"integrator": dv.BDF2(), "history": dv.History(*[torch.zeros(1)] * 3)}, r"history.moved: expected shape"),
+        (
+            {"integrator": dv.BDF2(), "history": dv.History(torch.zeros(1), torch.zeros(1), torch.zeros(1), 0.01)},
+            r"history.moved: expected shape",
+        ),
         ({"prescribed": (torch.zeros(3), torch.zeros(3))}, "prescribed: expected a tensor"),
     ],
 )
