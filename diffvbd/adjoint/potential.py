@@ -49,6 +49,7 @@ class IncrementalPotential:
         self.origin = fields.origin
         rest = fields.rest
         self.rest = model.rest_scalars if rest is None else rest  # [1 | B, T, 7]
+        self.free = (~model._pinned)[:, None].to(x.dtype)
 
         k = dict(zip(PAIRS, self.rest[..., :6].unbind(-1), strict=True))
         k |= {(b, a): value for (a, b), value in k.items()}
@@ -64,11 +65,6 @@ class IncrementalPotential:
         total = self.mu + self.lam
         self._pressure = (h2 / 6) * (total * (self.ratio - 1) - self.mu)
         self._bulk = (h2 / 6) * total * self.c6
-
-    @property
-    def free(self) -> Tensor:
-        """1 at vertices that are not pinned, else 0 [V, 1]."""
-        return (~self.model._pinned)[:, None].to(self.x.dtype)
 
     def _edges_of(self, x: Tensor) -> Tensor:
         corners = ops.tet_gather(x, *self.model._topology).permute(2, 3, 0, 1).contiguous()

@@ -20,7 +20,7 @@ from ..step.advance import advance, swept
 from ..step.arguments import GRAVITY, Prepared, acceleration_of, check_prescribed, check_state, collider_state, prepare
 from ..step.balance import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
 from ..step.contact import outcomes
-from ..step.integrators import BDF2, History, Integrator, check_history, check_integrator, check_staged, take
+from ..step.integrators import History, Integrator, check_history, check_integrator, check_staged, take
 from ..step.predict import Begun, begin
 
 
@@ -124,8 +124,7 @@ def solve(
     check_staged(scheme, loads)
     run = _Converging(adjoint, tolerance, max_sweeps, check_every, on_failure)
     taken = take(scheme, model, x, v, history, prepared, loads, run)
-    return Solution(taken.x, taken.v, run.count, run.residual, run.converged,
-                    taken.history if isinstance(scheme, BDF2) else None)  # fmt: skip
+    return Solution(taken.x, taken.v, run.count, run.residual, run.converged, taken.history)
 
 
 class _Converging:

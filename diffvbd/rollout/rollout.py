@@ -20,7 +20,6 @@ from ..step.advance import advance
 from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
 from ..step.estimate import ErrorEstimate, check_estimable, error_of, of_steps
 from ..step.integrators import (
-    BDF2,
     History,
     Integrator,
     check_history,
@@ -180,7 +179,7 @@ def rollout(
     last: list[Any] = []  # what the last step went from, and to
     looks = checks_contact(check_contact, model, x, steps)
 
-    outer, remembers = x, isinstance(scheme, BDF2)
+    outer = x
 
     def segment(first: int, end: int, x: Tensor, v: Tensor, *before: Tensor) -> Segment:
         _check_versions(versions)
@@ -203,7 +202,7 @@ def rollout(
                 observed.append(observe(x, v, k + 1))
             if bar is not None:
                 bar.show(k + 1)
-        return Segment((x, v, *(past[:3] if remembers and past else ())), frames, observed)
+        return Segment((x, v, *(past[:3] if past else ())), frames, observed)
 
     done = run_segments(
         segment, steps, (x, v, *(history[:3] if history else ())), every if torch.is_grad_enabled() else None

@@ -17,15 +17,13 @@ LEAST = 0.25  # of dhat
 
 
 @torch.no_grad()
-def may_touch(model: Model, begun: Begun, prepared: Prepared, where: tuple[Tensor, Tensor] | None) -> Tensor | None:
-    """Whether the body of each vertex may touch something on its way from begun.x_prev to begun.y, bool [B, V]; None
-    for a Model without floor and contact. It may where a gap is below dhat, or its sides may go that close.
+def may_touch(model: Model, begun: Begun, prepared: Prepared, where: tuple[Tensor, Tensor] | None) -> Tensor:
+    """Whether the body of each vertex may touch something on its way from begun.x_prev to begun.y, bool [B, V]: where a
+    gap is below dhat, or its sides may go that close.
 
     Args:
         where: Colliders at the start and at the end of the step [B, Vc, 3] [m], of a Model with contact.
     """
-    if model.floor is None and model.contact is None:
-        return None
     begun = begun.detached()
     way = begun.y - begun.x_prev
     near = torch.zeros_like(way[..., 0], dtype=torch.bool)

@@ -88,7 +88,7 @@ class Taken(NamedTuple):
 
     x: Tensor
     v: Tensor
-    history: History | None  # None with ImplicitEuler
+    history: History | None  # of BDF2
     last: Solve
 
 
@@ -160,13 +160,19 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
                                       "FloorBarrier, got Unrolled")  # fmt: skip
         for found in recorders("integrator"):
             found.append(touching)
-    smooth = torch.ones_like(x[..., 0], dtype=torch.bool) if touching is None else ~touching
     euler = touching
     if history is not None and touching is not None:
         euler = touching | ~history.smooth
+
+    def remembered(x_end: Tensor) -> History | None:
+        if not isinstance(integrator, BDF2):
+            return None
+        smooth = torch.ones_like(x[..., 0], dtype=torch.bool) if touching is None else ~touching
+        return History(x_end - x, v, smooth, time_step)
+
     if euler is not None and looks_at(euler) and bool(euler.all()):
         x_end, v_end, last = solve(x, v, whole, end)
-        return Taken(x_end, v_end, History(x_end - x, v, smooth, time_step), last)
+        return Taken(x_end, v_end, remembered(x_end), last)
 
     def last_solve(feasible: Tensor, reference: Tensor, carried: Tensor, share: float) -> Taken:
         """From a feasible state, about a velocity w and a position that is h_solve times ``carried`` away from it."""
@@ -179,7 +185,7 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
             loads = end
         x_end, v_end, last = solve(feasible, start, weights, loads)
         v_end = v_end - carried if euler is None else torch.where(euler[..., None], share * v_end, v_end - carried)
-        return Taken(x_end, v_end, History(x_end - x, v, smooth, time_step), last)
+        return Taken(x_end, v_end, remembered(x_end), last)
 
     if isinstance(integrator, BDF2) and history is not None:
         carried = history.moved / (2 * time_step)
@@ -203,8 +209,7 @@ def _touching(model: Model, x: Tensor, v: Tensor, prepared: Prepared, given: dic
         x, v = x.detach(), v.detach()
         begun = begin(model, x, v, prepared, given["force"], acceleration_of(given["gravity"], x), given["prescribed"])
         where = collider_state(model, x, given["colliders"], given["colliders_before"])
-        touching = may_touch(model, begun, prepared, where)
-    return None if touching is None else touching.reshape(x.shape[:-1])
+        return may_touch(model, begun, prepared, where).reshape(x.shape[:-1])
 
 
 def _of_euler(model: Model, prepared: Prepared, given: dict[str, Any], x: Tensor, euler: Tensor, share: float

@@ -151,7 +151,4 @@ def step(
     if looks_at(prepared.mu) and looks_at(prepared.lam):
         warn_of_thin_tets(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps)
     taken = take(scheme, model, x, v, history, prepared, given, partial(advance, adjoint=adjoint))
-    if isinstance(scheme, BDF2):
-        assert taken.history is not None
-        return taken.x, taken.v, taken.history
-    return taken.x, taken.v
+    return (taken.x, taken.v) if taken.history is None else (taken.x, taken.v, taken.history)

@@ -65,19 +65,21 @@ def test_free_fall_is_exact(device: str, integrator: Any, rigid: bool) -> None:
 
 @pytest.mark.parametrize("integrator", EVERY, ids=str)
 def test_momentum_and_energy_of_a_free_body(integrator: Any) -> None:
-    """A stretched cube that vibrates: its momentum stays, and what it has in energy never grows."""
+    """A stretched cube vibrates: its momentum stays, and in 1,000 steps its energy never rises above its start."""
     model = dv.Model(dv.mesh.cube(3, size=0.2), rigid=False)
     x = model.rest_points * torch.tensor([1.1, 0.95, 0.97], dtype=torch.float64)
     v = 0.1 * random("momentum", shape=x.shape)
     options: dict[str, Any] = {"time_step": 0.004, "sweeps": 60, "gravity": (0.0, 0.0, 0.0), **MATERIAL}
-    end = dv.rollout(model, x, v, steps=50, integrator=integrator, **options)
+    end = dv.rollout(model, x, v, steps=1000, integrator=integrator, **options)
     mass = model.mass[:, None]
-    before, after = (mass * end.v[0]).sum(0), (mass * end.v[-1]).sum(0)
+    before, after = (mass * end.v[0]).sum(0), (mass * end.v[50]).sum(0)  # what sweeps leave adds up later
     assert relative_error(after, before) <= tolerance("momentum")
     speed = (mass * end.v.square()).sum((-1, -2))
-    assert float(speed[25:].max()) <= float(speed.max())
+    energy = energy_of(model, end.x, end.v, 1e5, 2e5, weight=0.0)
+    gain = tolerance("energy_gain" if isinstance(integrator, dv.ImplicitEuler) else "second_order_energy")
+    assert float(energy.max()) <= (1 + gain) * float(energy[0]) and float(energy[-1]) < 0.5 * float(energy[0])
     least = {dv.ImplicitEuler: 0.0, dv.SDIRK2: 0.2, dv.BDF2: 0.02}[type(integrator)]
-    assert float(speed[-10:].max()) > least * float(speed.max())
+    assert float(speed[40:50].max()) > least * float(speed.max())
 
 
 @pytest.mark.parametrize("integrator", SECOND, ids=str)
@@ -110,7 +112,7 @@ def falling(count: int, kind: str, **options: Any) -> tuple[dv.Model, Tensor, Te
     return model, x, v
 
 
-def energy_of(model: dv.Model, x: Tensor, v: Tensor, mu: float, lam: float) -> Tensor:
+def energy_of(model: dv.Model, x: Tensor, v: Tensor, mu: float, lam: float, weight: float = 9.81) -> Tensor:
     """Kinetic, elastic and of weight [B], from deformation gradients."""
     rest, deformed = model.rest_points[model.tets], x[:, model.tets]
     edges = (rest[:, 1:] - rest[:, :1]).mT
@@ -119,7 +121,7 @@ def energy_of(model: dv.Model, x: Tensor, v: Tensor, mu: float, lam: float) -> T
     density = mu / 2 * (f.square().sum((-1, -2)) - 3) + lam / 2 * ((det - above) ** 2 - (1 - above) ** 2)
     elastic = (density * torch.linalg.det(edges) / 6).sum(-1)
     mass = model.mass[:, None]
-    return 0.5 * (mass * v.square()).sum((-1, -2)) + (mass[:, 0] * 9.81 * x[..., 1]).sum(-1) + elastic
+    return 0.5 * (mass * v.square()).sum((-1, -2)) + (mass[:, 0] * weight * x[..., 1]).sum(-1) + elastic
 
 
 @pytest.mark.parametrize("time_step", (0.02, 0.005))
