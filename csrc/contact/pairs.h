@@ -1,4 +1,6 @@
 // What one pair adds to the block of one of its corners, and the adjoint of exactly that (docs/method.md, section 12).
+// `together`: how many corners of the pair move at once with this one, itself included. The block takes so many times
+// the pair's stiffness along its normal, so that together they do not overshoot.
 // Barrier: gradient of e b(gap) and the part e b'' grad_gap grad_gap^T of its Hessian. Lagged terms: damping of
 // approach and smoothed friction, about a normal, weights and a normal force of the start of the step.
 #pragma once
@@ -26,7 +28,7 @@ DIFFVBD_FN bool is_corner(int i, int k) { return i == k; }
 
 // Adds the barrier's part of the block of corner i of a pair whose distance is `at`; returns whether it is active.
 template <class R, class Index>
-DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Distance<R>& at, const Index& i,
+DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Distance<R>& at, const Index& i, const R& together,
                             const PairConstants<R>& a, const R& kappa, const R& h2, Vec3<R>& g, Sym3<R>& H) {
   const R gap = at.d - a.offset;
   const auto active = gap < a.dhat;
@@ -42,11 +44,12 @@ DIFFVBD_FN auto add_barrier(int kind, const Corners<R>& c, const Distance<R>& at
   }
   const R w = of_corner(at.w, i);
   g += own + (e * b.first * w) * at.n;
-  add_outer(H, e * b.second * w * w, at.n);
+  add_outer(H, together * e * b.second * w * w, at.n);
   return active;
 }
 
-// Adjoint of phi = p . (g + H d_raw) of corner i, negated: what the corners and kappa receive.
+// Adjoint of phi = p . (g + H d_raw) of corner i, negated: what the corners and kappa receive. H is linear in
+// `together`, so it multiplies d_raw.
 template <class T>
 struct PairAdjoint {
   Vec3<T> x[4];
@@ -70,9 +73,10 @@ DIFFVBD_FN Vec3<T> derivative(const Vec3<Dual<T>>& a) {
 
 // Returns whether the pair is active; if not, it receives nothing.
 template <class R, class Index>
-DIFFVBD_FN auto reverse_barrier(int kind, const Corners<R>& c, const Index& i, const PairConstants<R>& a,
-                                const R& kappa, const R& h2, const Vec3<R>& p, const Vec3<R>& d_raw,
-                                PairAdjoint<R>& out) {
+DIFFVBD_FN auto reverse_barrier(int kind, const Corners<R>& c, const Index& i, const R& together,
+                                const PairConstants<R>& a, const R& kappa, const R& h2, const Vec3<R>& p,
+                                const Vec3<R>& d, PairAdjoint<R>& out) {
+  const Vec3<R> d_raw = together * d;
   const Distance<R> at = distance(kind, c);
   const R gap = at.d - a.offset;
   const auto active = gap < a.dhat;
@@ -138,13 +142,13 @@ struct FrictionRate {
 
 // Adds the lagged part of the block of corner i; m [m] is the relative motion since the start of the step.
 template <class T>
-DIFFVBD_FN void add_lagged(const Lag<T>& a, int i, const Vec3<T>& m, T h, T eps, Vec3<T>& g, Sym3<T>& H) {
+DIFFVBD_FN void add_lagged(const Lag<T>& a, int i, T together, const Vec3<T>& m, T h, T eps, Vec3<T>& g, Sym3<T>& H) {
   const T w = a.w[i], along = dot(a.n, m);
   if (a.damping != T(0)) {
     // the block damps both directions, the force approach alone: what rests must not depend on the sign of a rounding
     const T c = h * a.damping * w;
     if (along < T(0)) g += (c * along) * a.n;
-    add_outer(H, c * w, a.n);
+    add_outer(H, together * c * w, a.n);
   }
   if (a.friction != T(0)) {
     const Vec3<T> u = m - along * a.n;
@@ -159,9 +163,9 @@ DIFFVBD_FN void add_lagged(const Lag<T>& a, int i, const Vec3<T>& m, T h, T eps,
 // Adjoint of phi = p . (g + H d_raw) of corner i, negated: toward m, and toward the lag at fixed m (a.w[k] also moves
 // m).
 template <class T>
-DIFFVBD_FN Vec3<T> reverse_lagged(const Lag<T>& a, int i, const Vec3<T>& m, T h, T eps, const Vec3<T>& p,
+DIFFVBD_FN Vec3<T> reverse_lagged(const Lag<T>& a, int i, T together, const Vec3<T>& m, T h, T eps, const Vec3<T>& p,
                                   const Vec3<T>& d_raw, Lag<T>& bar) {
-  const T w = a.w[i], along = dot(a.n, m), n_p = dot(a.n, p), n_d = dot(a.n, d_raw);
+  const T w = a.w[i], along = dot(a.n, m), n_p = dot(a.n, p), n_d = dot(a.n, d_raw), stiff = together * w * n_d;
   Vec3<T> m_bar = zero3<T>();
   bar.n = zero3<T>();
   for (int k = 0; k < 4; ++k) bar.w[k] = T(0);
@@ -169,18 +173,18 @@ DIFFVBD_FN Vec3<T> reverse_lagged(const Lag<T>& a, int i, const Vec3<T>& m, T h,
     const Vec3<T> u = m - along * a.n;
     const FrictionRate<T> f(square_root(dot(u, u)), eps);
     bar.friction = -h * h * w * f.value * (dot(u, p) + w * dot(p - n_p * a.n, d_raw));
-    bar.damping = -h * w * ((along < T(0) ? along : T(0)) * n_p + w * n_p * n_d);
+    bar.damping = -h * w * ((along < T(0) ? along : T(0)) + stiff) * n_p;
     return m_bar;
   }
   const Vec3<T> crossed = n_d * p + n_p * d_raw;
   const T c = h * a.damping, approach = along < T(0) ? along : T(0);
-  bar.n -= (c * w * w) * crossed;
+  bar.n -= (together * c * w * w) * crossed;
   if (along < T(0)) {
     m_bar -= (c * w * n_p) * a.n;
     bar.n -= (c * w) * (n_p * m + along * p);
   }
-  bar.w[i] = bar.w[i] - c * (approach * n_p + T(2) * w * n_p * n_d);
-  bar.damping = -h * w * (approach * n_p + w * n_p * n_d);
+  bar.w[i] = bar.w[i] - c * (approach + T(2) * stiff) * n_p;
+  bar.damping = -h * w * (approach + stiff) * n_p;
   const Vec3<T> u = m - along * a.n, p_t = p - n_p * a.n;
   const FrictionRate<T> f(square_root(dot(u, u)), eps);
   const T size = h * h * a.friction * w, slid = dot(u, p), pushed = dot(p_t, d_raw), both = slid + w * pushed;

@@ -97,8 +97,8 @@ DIFFVBD_FN bool is_above(int kind, const Moved& moved, const T* constants, T len
   return T(1 + 1e-6) * most < room * room;
 }
 
-// The corner points of one scene. The backend's are x(v) of a vertex and, where a color has moved, goes(v), whether v
-// was of it; x(v) is then where it was before.
+// The corner points of one scene. The backend's are x(v) of a vertex; in a sum over pairs together(v, u), whether both
+// are of one color; and, where a color has moved, goes(v), whether v was of it: x(v) is then where it was before.
 template <class T, class Positions>
 struct Source {
   const ContactInputs<T>& in;
@@ -124,6 +124,12 @@ struct Source {
     out.x[0] = zero3<T>();
     for (int k = 1; k < 4; ++k) out.x[k] = (x(pair[k]) - x0) + (origin(pair[k]) - o0);
     return out;
+  }
+  // How many corners of a pair move at once with vertex v, which is one of them.
+  DIFFVBD_FN T together(const int32_t* pair, int v) const {
+    int count = 0;
+    for (int k = 0; k < 4; ++k) count += pair[k] < in.num_vertices && positions.together(pair[k], v);
+    return T(count);
   }
   // How a corner point has moved since the start of the part, at which the gaps of pairs were taken.
   DIFFVBD_FN Vec3<T> moved(int v) const {
@@ -157,7 +163,8 @@ DIFFVBD_FN void add_barriers(const Source<T, Positions>& s, int v, int first, in
     const T* constants = in.constants + int64_t{kConstants} * pair;
     if (s.is_far(record, constants)) continue;
     const Corners<T> c = s.corners(record);
-    add_barrier(record[4], c, distance(record[4], c), entry & 3, PairConstants<T>(constants), kappa, h * h, g, H);
+    add_barrier(record[4], c, distance(record[4], c), entry & 3, s.together(record, v), PairConstants<T>(constants),
+                kappa, h * h, g, H);
   }
 }
 
@@ -172,12 +179,12 @@ DIFFVBD_FN void add_lags(const Source<T, Positions>& s, int v, int first, int st
       const Lag<T> lag(in.lag + int64_t{kLagScalars} * pair);
       if (!lag.active()) continue;
       const int32_t* record = in.lagged.pairs + int64_t{kPairRow} * pair;
-      add_lagged(lag, entry & 3, s.motion(record, lag), h, in.friction_eps, g, H);
+      add_lagged(lag, entry & 3, s.together(record, v), s.motion(record, lag), h, in.friction_eps, g, H);
     }
   }
   for (int k = first; k < in.planes; k += stride) {
     const Lag<T> lag = floor_lag(s, v, k);
-    if (lag.active()) add_lagged(lag, 0, s.x(v) - s.x_prev(v), h, in.friction_eps, g, H);
+    if (lag.active()) add_lagged(lag, 0, T(1), s.x(v) - s.x_prev(v), h, in.friction_eps, g, H);
   }
 }
 
@@ -275,8 +282,9 @@ DIFFVBD_FN void reverse_barriers(const Source<T, Positions>& s, const ContactAdj
     const int32_t* record = in.listed.pairs + kPairRow * pair;
     const T* constants = in.constants + kConstants * pair;
     PairAdjoint<T> bar;
-    if (s.is_far(record, constants) || !reverse_barrier(record[4], s.corners(record), static_cast<int>(entry & 3),
-                                                        PairConstants<T>(constants), kappa, h * h, p, d_raw, bar)) {
+    if (s.is_far(record, constants)) continue;
+    if (!reverse_barrier(record[4], s.corners(record), static_cast<int>(entry & 3), s.together(record, v),
+                         PairConstants<T>(constants), kappa, h * h, p, d_raw, bar)) {
       continue;
     }
     for (int k = 0; k < 4; ++k) send(out, entry, k, bar.x[k]);
@@ -297,7 +305,8 @@ DIFFVBD_FN void reverse_lags(const Source<T, Positions>& s, const ContactAdjoint
       const int32_t* record = in.lagged.pairs + kPairRow * pair;
       const Vec3<T> m = s.motion(record, lag);
       Lag<T> bar;
-      const Vec3<T> m_bar = reverse_lagged(lag, static_cast<int>(entry & 3), m, h, in.friction_eps, p, d_raw, bar);
+      const Vec3<T> m_bar =
+          reverse_lagged(lag, static_cast<int>(entry & 3), s.together(record, v), m, h, in.friction_eps, p, d_raw, bar);
       T* to = out.lag + kLagScalars * entry;
       to[0] += bar.friction;
       to[1] += bar.damping;
@@ -311,7 +320,7 @@ DIFFVBD_FN void reverse_lags(const Source<T, Positions>& s, const ContactAdjoint
   for (int k = first; k < in.planes; k += stride) {
     Lag<T> bar;
     const Vec3<T> m_bar =
-        reverse_lagged(floor_lag(s, v, k), 0, s.x(v) - s.x_prev(v), h, in.friction_eps, p, d_raw, bar);
+        reverse_lagged(floor_lag(s, v, k), 0, T(1), s.x(v) - s.x_prev(v), h, in.friction_eps, p, d_raw, bar);
     T* to = out.floor_lag + ((s.scene * in.num_vertices + v) * in.planes + k) * kFloorLag;
     to[0] += bar.friction;
     add_at(to + 1, bar.n);

@@ -20,7 +20,7 @@ ContactScene<T>::ContactScene(const Plan& plan, const ContactInputs<T>& in, cons
       h_(time_step),
       kernels_(pair_kernels<T>()),
       before_(reverse ? 0 : int64_t{plan.blocks} * kLanes * 4),
-      positions_{s.x, position},
+      positions_{s.x, position, &rows_},
       rows_(plan, in, scene, position, s.x),
       near_(given_, scene, rows_, [&](int v) { return Source<T, Positions>{in, scene, positions_}.moved(v); }),
       source_{in_, scene, positions_} {

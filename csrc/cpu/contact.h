@@ -38,7 +38,9 @@ class ContactScene {
   struct Positions {
     const T* rows;
     const int32_t* position;
+    const PairRows<T>* colors;
     Vec3<T> operator()(int v) const { return contact::vector_at(rows + int64_t{4} * position[v]); }
+    bool together(int v, int u) const { return colors->are_together(v, u); }
   };
   // Of a color whose vertices have moved, as they were before.
   struct Before {

@@ -30,6 +30,7 @@ class PairBatches {
     }
     pack.constants[lane] = constants;
     pack.own[lane] = static_cast<T>(site.own);
+    pack.together[lane] = static_cast<T>(site.together);
     pack.turn[lane] = turn;
   }
   void flush() {
@@ -57,6 +58,7 @@ class PairBatches {
       for (int k = 0; k < 4; ++k) pack.x[k][l] = pack.x[k][0], pack.origin[k][l] = pack.origin[k][0];
       pack.constants[l] = pack.constants[0];
       pack.own[l] = pack.own[0];
+      pack.together[l] = pack.together[0];
       pack.turn[l] = pack.turn[0];
     }
     kernel_(kind, pack, kappa_, h2_, out);

@@ -7,12 +7,13 @@
 namespace diffvbd {
 
 // What a kernel takes: of each lane the rows of four scalars that hold its corners and, unless null, their origins; the
-// pair's constants; the corner whose block it is; in the reverse p and d_raw of that one, kLanes apart.
+// pair's constants; the corner whose block it is and how many move together with it; in the reverse p and d_raw of that
+// one, kLanes apart.
 template <class T>
 struct PairPack {
   const T *x[4][kLanes], *origin[4][kLanes];
   const T* constants[kLanes];
-  T own[kLanes];
+  T own[kLanes], together[kLanes];
   const T* turn[kLanes];
 };
 // What it gives for each lane, in rows of four scalars: g; H, in two rows; the Clearance of the corner: toward; then 1
@@ -93,7 +94,8 @@ __attribute__((flatten)) void add_lanes(int kind, const PairPack<T>& pack, T kap
   const contact::Distance<R> at = contact::distance(kind, pairs.corners);
   Vec3<R> g = zero3<R>();
   Sym3<R> H = diagonal(R(0));
-  const auto active = contact::add_barrier(kind, pairs.corners, at, pairs.own, constants, R(kappa), R(h2), g, H);
+  const auto active = contact::add_barrier(kind, pairs.corners, at, pairs.own, R::load(pack.together), constants,
+                                           R(kappa), R(h2), g, H);
   const contact::Separation<R> s(kind, pairs.corners, at.n, constants.offset);
   const R side = select(pairs.own.own < R(T(contact::sides(kind)) - T(0.5)), R(T(-1)), R(T(1)));
   store_row(g, out, kPairBlock);
@@ -113,8 +115,8 @@ __attribute__((flatten)) void reverse_lanes(int kind, const PairPack<T>& pack, T
   }
   contact::PairAdjoint<R> bar{};
   const auto active =
-      contact::reverse_barrier(kind, pairs.corners, pairs.own, pairs.of_pairs(), R(kappa), R(h2),
-                               Vec3<R>{turn[0], turn[1], turn[2]}, Vec3<R>{turn[3], turn[4], turn[5]}, bar);
+      contact::reverse_barrier(kind, pairs.corners, pairs.own, R::load(pack.together), pairs.of_pairs(), R(kappa),
+                               R(h2), Vec3<R>{turn[0], turn[1], turn[2]}, Vec3<R>{turn[3], turn[4], turn[5]}, bar);
   store_row(Vec3<R>{one_where<decltype(active), T>(active), bar.kappa, R(0)}, out, kPairActive);
   if (!any(active)) return;
   for (int k = 0; k < 4; ++k) store_row(bar.x[k], out, 4 * k);

@@ -33,7 +33,9 @@ struct Member {
   int lane, vertex = -1;  // -1: a phantom, or beyond the end
   int64_t local = 0, scene = 0, position = 0;
   bool touches = false;
-  __device__ __forceinline__ Member(const StepView<T>& s, const ContactInputs<T>& in, int64_t begin, int64_t end) {
+  int64_t first, last;  // positions of the blocks
+  __device__ __forceinline__ Member(const StepView<T>& s, const ContactInputs<T>& in, int64_t begin, int64_t end)
+      : first(begin * kSlice), last(end * kSlice) {
     const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x, item = i / kShare;
     const int64_t size = (end - begin) * kSlice;
     lane = static_cast<int>(i % kShare);
@@ -49,7 +51,7 @@ struct Member {
   }
   __device__ __forceinline__ int64_t row(const StepView<T>& s) const { return local * s.positions + position; }
   __device__ __forceinline__ SweepRows<T> rows(const StepView<T>& s) const {
-    return {s.w.x + local * s.positions * kRow, s.w.position};
+    return {s.w.x + local * s.positions * kRow, s.w.position, first, last};
   }
 };
 
@@ -92,7 +94,7 @@ __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __gri
   int exponent = 0;
   Vec3<T> from = zero3<T>(), d = zero3<T>();
   if (there) {
-    const RowsBefore<T> rows{at.rows(s), s.w.before + at.local * s.positions * kRow, begin * kSlice, end * kSlice};
+    const RowsBefore<T> rows{at.rows(s), s.w.before + at.local * s.positions * kRow};
     const contact::Source<T, RowsBefore<T>> source{in, at.scene, rows};
     from = load_row(s.w.before, at.row(s)), d = load_row(s.w.x, at.row(s)) - from;
     exponent = contact::limit_by_room(source, at.vertex, from, d);

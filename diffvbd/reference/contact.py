@@ -56,13 +56,15 @@ class Pairs:
         self.sizes = [len(color.vertices) for color in scene.layout.colors]
         self.entries = [self._entries(color.vertices) for color in scene.layout.colors]
 
-    def _entries(self, vertices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Pair and local corner of each entry of a color, and the column of its vertex among those of all scenes."""
+    def _entries(self, vertices: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Pair and local corner of each entry of a color, the column of its vertex among those of all scenes, and how many
+        corners of the pair are of the color."""
         position = vertices.new_full((self.points,), -1)
         position[vertices] = torch.arange(len(vertices), device=vertices.device)
         owner = position[self.corners]
         pair, local = (owner >= 0).nonzero(as_tuple=True)
-        return pair, local, self.batch[pair] * len(vertices) + owner[pair, local]
+        together = (owner >= 0).sum(1)[pair]
+        return pair, local, self.batch[pair] * len(vertices) + owner[pair, local], together
 
     def per_pair(self, value: Tensor) -> Tensor:
         """A parameter, one number or one for each scene, as one for each pair."""
@@ -81,7 +83,7 @@ class Pairs:
 
     def assemble(self, k: int, columns: Tensor) -> Tensor:
         """Sums columns [9, entries] of color k over the entries of each vertex: [..., 9, n]."""
-        (_, _, owner), scenes, n = self.entries[k], self.lead.numel(), self.sizes[k]
+        (_, _, owner, _), scenes, n = self.entries[k], self.lead.numel(), self.sizes[k]
         total = columns.new_zeros(9, scenes * n).index_add(1, owner, columns)
         return total.reshape(9, scenes, n).movedim(0, 1).reshape(*self.lead, 9, n)
 
@@ -96,18 +98,19 @@ def corner_points(x: Tensor, colliders: Tensor) -> Tensor:
 
 
 class PairBarrier:
-    """e b(d - offset) over the pairs of a part; the block drops b' Hess d and the curvature of the mollifier e."""
+    """e b(d - offset) over the pairs of a part; the block drops b' Hess d and the curvature of the mollifier e, and takes
+    the stiffness of a pair once for each of its corners of the color: they move at once."""
 
     def __init__(self, scene: Scene, pairs: Pairs, colliders: Tensor) -> None:
         self.weight, self.pairs, self.colliders = scene.time_step**2, pairs, colliders
         self.kappa = pairs.per_pair(scene.parameter("pair_barrier", scene.model.contact, "kappa"))
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
-        pair, local, _ = self.pairs.entries[k]
+        pair, local, _, together = self.pairs.entries[k]
         gap, slope, e, turn = self.pairs.measures(corner_points(x, self.colliders), pair)
         slope, turn = (g[torch.arange(len(pair), device=pair.device), local].T for g in (slope, turn))
         b, first, second = log_barrier(gap, self.kappa[pair], self.pairs.dhat[pair])
-        columns = torch.cat((e * first * slope + b * turn, e * second * outer6(slope)))
+        columns = torch.cat((e * first * slope + b * turn, together * e * second * outer6(slope)))
         return self.pairs.assemble(k, self.weight * columns)
 
     turns_its_body = False  # by pairs of one body; friction acts along a gap, at an arm of it, and does
@@ -165,12 +168,12 @@ class LaggedPairForces:
         return torch.where(damped, along, 0.0), (m - along[:, None] * normal).T, weights
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
-        pair, local, _ = self.pairs.entries[k]
+        pair, local, _, together = self.pairs.entries[k]
         entry = torch.arange(len(pair), device=pair.device)
         along, slip, weights = self._travel(x, pair)
         own = self.slope[pair, local].T
         rate = self.h * self.damping[pair]
-        columns = torch.cat((rate * along * own, torch.where(self.near[pair], rate, 0.0) * outer6(own)))
+        columns = torch.cat((rate * along * own, torch.where(self.near[pair], together * rate, 0.0) * outer6(own)))
         if self.largest is not None:
             weight = weights[entry, local]
             size = self.h**2 * self.largest[pair] * smoothed(slip, self.reach)[1]

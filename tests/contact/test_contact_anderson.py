@@ -42,10 +42,10 @@ def recorded(scene: Scene, sweeps: int) -> list[Any]:
 def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int, window: int, device: str) -> None:
     scene = accelerated(name, window)
     result, parts = compiled(scene, steps, sweeps, "full", scene.model.to(device))
-    expected, other = (unrolled(scene, steps, sweeps, parts, seed=seed) for seed in (None, 1))
+    expected, *others = (unrolled(scene, steps, sweeps, parts, seed=seed) for seed in (None, 1, 2))
     assert any(part.combined is not None for part in parts)
     for key, value in expected.items():
-        spread = tolerance("spread_factor") * relative_error(other[key], value)
+        spread = tolerance("spread_factor") * max(relative_error(other[key], value) for other in others)
         floor = tolerance("contact_adjoint" if key.startswith("grad_") else "contact_forward") * steps
         floor *= 1 / scene.time_step if key == "v" else 1
         assert relative_error(result[key], value) <= max(floor, spread), key
@@ -67,7 +67,7 @@ def test_combinations_that_are_taken_and_that_are_not_occur() -> None:
 def test_same_as_without_where_nothing_is_combined() -> None:
     scene = accelerated("stacked")
     plain = rebuilt(scene.model)
-    for sweeps in (0, 1, 2, 3):
+    for sweeps in (0, 1, 2, 7):
         ends = [dv.step(m, scene.x, scene.v, time_step=scene.time_step, sweeps=sweeps, **scene.inputs)[0]
                 for m in (plain, scene.model)]  # fmt: skip
         assert torch.equal(*ends) == (sweeps < 3)
