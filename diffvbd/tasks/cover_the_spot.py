@@ -43,7 +43,6 @@ DENSITY = 1000.0  # [kg/m^3]
 MU = LAM = 2e4  # [Pa]
 KAPPA, DHAT, DAMPING = 400.0, 0.02, 8.0  # [N/m], [m], [N s/m]
 REACH = 0.1  # [m]
-CAPACITY = 8192  # pairs; a landing needs some 2,100 at once
 SHARPNESS = (4.0, 25.0)  # at the first and the last iteration [1 / R]
 SAMPLES, FINE_SAMPLES = 400, 4000  # points of the target: of the loss, of the result
 
@@ -159,7 +158,7 @@ def model_of(disk: dv.TetMesh, centers: np.ndarray) -> dv.Model:
     energies = (
         dv.StableNeoHookean(),
         dv.FloorBarrier(kappa=KAPPA, dhat=DHAT, damping=DAMPING),
-        dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, detections=1, reach=REACH, capacity=CAPACITY),
+        dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, detections=1, reach=REACH),
     )
     return dv.Model(dv.mesh.join([disk.translate(c) for c in centers]), density=DENSITY, energies=energies)
 
