@@ -73,6 +73,8 @@ class Corrections:
     def __init__(self, trials: Trials, fields: ops.SweepFields, factor: Tensor, scenes: Scenes) -> None:
         self.trials, self.fields, self.factor, self.scenes = trials, fields, factor, scenes
         self.constants = fields._replace(**{k: None if t is None else t.detach() for k, t in fields._asdict().items()})
+        if fields.rest is None:  # the Model makes them on first use, which a backward that is being compiled must not do
+            self.constants = self.constants._replace(rest=scenes.model.rest_scalars)
         self.space = space_of(scenes.model)
         self.matrix = _dense(factor.detach(), self.space)
         self.refused = torch.zeros_like(trials.bodies.ptr[:-1])[None]
@@ -81,7 +83,7 @@ class Corrections:
     def correct(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """x [B, V, 3] after a correction, and its length for each body of the coarse space [B, bodies]."""
         over = self.refused >= REFUSALS
-        if not x.is_cuda and bool(over.all()):
+        if not (x.is_cuda or torch.compiler.is_compiling()) and bool(over.all()):
             return x, self._of_bodies(torch.zeros_like(over, dtype=x.dtype))
         r, presses = self._gradient(x)
         with torch.no_grad():

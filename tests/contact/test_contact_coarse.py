@@ -142,3 +142,17 @@ def test_checkpoints_and_threads_change_no_bit() -> None:
     finally:
         torch.set_num_threads(threads)
     assert all(torch.equal(*pair) for pair in zip(*found, strict=True)) and found[0][1].abs().max() > 0
+
+
+def test_compiled_from_the_first_call() -> None:
+    """With a gradient, and before anything has been derived from the Model."""
+    found = []
+    for run in (torch.compile(dv.step, backend="eager"), dv.step):
+        torch._dynamo.reset()
+        model, given = stack(coarse="auto")
+        x = model.rest_points
+        v = torch.zeros_like(x).requires_grad_()
+        end, _ = run(model, x, v, sweeps=6, **given)
+        found.append((end.detach(), torch.autograd.grad(end.square().sum(), v)[0]))
+    assert found[1][1].abs().max() > 0
+    assert all(relative_error(*pair) <= tolerance("contact_forward") for pair in zip(*found, strict=True))
