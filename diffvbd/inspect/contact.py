@@ -129,7 +129,12 @@ def intersections(model: Model, x: Tensor) -> Tensor:
 
     Raises:
         ValueError: For another shape, or positions that are not finite.
+        TypeError: For anything but a tensor of real numbers.
     """
+    if not isinstance(x, Tensor):
+        raise TypeError(f"x: expected a tensor, got {type(x).__name__}")
+    if not x.is_floating_point():
+        raise TypeError(f"x: expected real numbers, got dtype {x.dtype}")
     if x.shape[-2:] != (model.num_vertices, 3):
         fail("x", f"shape [..., {model.num_vertices}, 3]", f"shape {list(x.shape)}")
     points = x.detach().reshape(-1, model.num_vertices, 3).to(torch.float64)

@@ -16,7 +16,7 @@ from ..checks import check_positive, fail
 from ..model.model import Model
 from ..model.moduli import moduli_of
 from ..model.warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
-from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare
+from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare, refuse_non_finite
 from ..step.balance import (
     UNBALANCED_FRICTION,
     contact_of_step,
@@ -160,6 +160,7 @@ def diagnose(
     if previous is not None:
         check_prescribed(model, prescribed, previous[0])
         loads = {"force": force, "gravity": gravity, "prescribed": prescribed}
+        refuse_non_finite(model, loads)
         where = {"colliders": colliders, "colliders_before": colliders_before}
         material = {"mu": mu, "lam": lam, "parameters": parameters}
         unbalanced, residuals, friction = _balance(model, x, previous, time_step, loads, where, material)
@@ -266,7 +267,8 @@ def _balance(
     double, prepared = given.model, given.prepared
     norm, lead = of_bodies(double), x.shape[:-2]
     if not all(bool(torch.isfinite(t).all()) for t in (x, *previous)):
-        unknown = norm(x.reshape(lead.numel(), *x.shape[-2:])).double().reshape(*lead, -1).fill_(torch.nan)
+        unknown = norm(x.reshape(lead.numel(), *x.shape[-2:])).double().fill_(torch.nan)
+        unknown = unknown.reshape(*lead, *unknown.shape[1:])
         return float("nan"), unknown, None
     with torch.no_grad():
         x0, v0 = (t.detach().double() for t in previous)
@@ -276,8 +278,10 @@ def _balance(
         at = potential_of_step(double, x.detach().double().reshape(begun.y.shape), begun, prepared, contact)
         left, whole = left_over(at, norm)
         left = torch.where(left <= rounding(at, norm, torch.finfo(model.dtype).eps), 0, left)
-        friction = None if model.friction is None else friction_left_over(at).reshape(*lead, -1)
-        return _largest(share(*left_over(at, of_scenes))), share(left, whole).reshape(*lead, -1), friction
+        bodies = share(left, whole)
+        shape = (*lead, *bodies.shape[1:])
+        friction = None if model.friction is None else friction_left_over(at).reshape(shape)
+        return _largest(share(*left_over(at, of_scenes))), bodies.reshape(shape), friction
 
 
 def _as(value: Any, like: Tensor) -> Tensor:

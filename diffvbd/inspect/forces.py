@@ -19,7 +19,7 @@ from ..energies import StableNeoHookean
 from ..model.model import Model
 from ..model.rest import shape_gradients
 from ..scopes import looks_at
-from ..step.arguments import GRAVITY, acceleration_of, broadcastable, check_state
+from ..step.arguments import GRAVITY, acceleration_of, broadcastable, check_state, refuse_non_finite
 from .wide import Wide, check_previous, wide, widen
 
 # --- contact ----------------------------------------------------------------------------------------------------------
@@ -92,6 +92,12 @@ def forces(
     """
     check_state(model, x, x)
     check_previous(model, previous, x, time_step)
+    start = None if previous is None else previous[0]
+    where = {"x": x, "previous: x": start, "colliders": colliders, "colliders_before": colliders_before}
+    for value in where.values():
+        if isinstance(value, Tensor):
+            ops.not_batched(value)
+    refuse_non_finite(model, where)
     given = widen(model, x, time_step, colliders, colliders_before, mu=0.0, lam=0.0, parameters=parameters)
     state = _contact_at(given, x, previous)
     lead, dtype = x.shape[:-2], x.dtype

@@ -57,8 +57,8 @@ class Pairs:
         self.entries = [self._entries(color.vertices) for color in scene.layout.colors]
 
     def _entries(self, vertices: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Of each entry of a color: pair, local corner, the column of its vertex among those of all scenes, and how many
-        corners of the pair are of the color."""
+        """Of each entry of a color: pair, local corner, the column of its vertex among those of all scenes, and how
+        many corners of the pair are of the color."""
         position = vertices.new_full((self.points,), -1)
         position[vertices] = torch.arange(len(vertices), device=vertices.device)
         owner = position[self.corners]
@@ -100,8 +100,8 @@ def corner_points(x: Tensor, colliders: Tensor) -> Tensor:
 class PairBarrier:
     """e b(d - offset) over the pairs of a part.
 
-    The block drops b' Hess d and the curvature of the mollifier e, and takes the stiffness of a pair once for each of its
-    corners of the color: they move at once.
+    The block drops b' Hess d and the curvature of the mollifier e, and takes the stiffness of a pair once for each of
+    its corners of the color: they move at once.
     """
 
     def __init__(self, scene: Scene, pairs: Pairs, colliders: Tensor) -> None:

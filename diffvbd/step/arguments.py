@@ -224,8 +224,12 @@ def collider_state(model: Model, x: Tensor, end: Any, start: Any) -> tuple[Tenso
 
 def name_argument(model: Model, error: ValueError, arguments: dict[str, Any]) -> None:
     """Raises an error that names the argument, where the operator could name only what was made of several."""
-    if not str(error).startswith(("predictor", "start")):
-        return
+    if str(error).startswith(("predictor", "start")):
+        refuse_non_finite(model, arguments)
+
+
+def refuse_non_finite(model: Model, arguments: dict[str, Any]) -> None:
+    """Raises for the first tensor among arguments of a step that holds a value that is not finite."""
     for name, value in arguments.items():
         if isinstance(value, Tensor):
             good = torch.isfinite(value)

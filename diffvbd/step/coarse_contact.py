@@ -73,7 +73,7 @@ class Corrections:
     def __init__(self, trials: Trials, fields: ops.SweepFields, factor: Tensor, scenes: Scenes) -> None:
         self.trials, self.fields, self.factor, self.scenes = trials, fields, factor, scenes
         self.constants = fields._replace(**{k: None if t is None else t.detach() for k, t in fields._asdict().items()})
-        if fields.rest is None:  # the Model makes them on first use, which a backward that is being compiled must not do
+        if fields.rest is None:  # made on first use, which must not be in a backward that is being compiled
             self.constants = self.constants._replace(rest=scenes.model.rest_scalars)
         self.space = space_of(scenes.model)
         self.matrix = _dense(factor.detach(), self.space)

@@ -199,6 +199,8 @@ def test_rollout_and_contact_functions() -> None:
     raises(lambda: dv.contact.reserve(model, 0), "pairs", "0")
     raises(lambda: dv.contact.reserve(model, 1.5), "pairs", "float")
     raises(lambda: dv.contact.intersections(model, x[:5]), "x", r"\[5, 3\]")
+    raises(lambda: dv.contact.intersections(model, x.long()), "x", "int64")
+    raises(lambda: dv.contact.intersections(model, x.tolist()), "x", "list")
 
 
 def test_status_before_any_step() -> None:

@@ -232,7 +232,8 @@ def test_more_pairs_than_a_step_has_room_for() -> None:
         ({"colliders": torch.zeros(1, 3).double()}, "colliders: expected a Model with colliders"),
         ({"parameters": {"pair_barrier.kapa": 1.0}}, "parameters: expected names among"),
         ({"parameters": {"pair_barrier.kappa": torch.tensor(-1.0).double()}}, "pair_barrier.kappa: expected finite"),
-        ({"x": torch.full((16, 3), torch.nan).double()}, "x: expected finite positions"),
+        ({"x": torch.full((16, 3), torch.nan).double()}, "x: expected finite values, got nan"),
+        ({"previous": (torch.full((16, 3), torch.nan).double(),) * 2, "time_step": 0.1}, "previous: x: .* finite"),
         ({"x": torch.zeros(16, 3).double()}, "x: expected surfaces that do not touch, got .* pairs without a gap"),
     ],
 )
@@ -240,3 +241,9 @@ def test_bad_input(change: dict[str, Any], message: str) -> None:
     model = stack("floor", dv.Friction(0.3))
     with pytest.raises((ValueError, TypeError), match=message):
         dv.contact.forces(model, **({"x": model.rest_points} | change))
+
+
+def test_no_vmap() -> None:
+    model = stack("floor", dv.Friction(0.3))
+    with pytest.raises(NotImplementedError, match="torch.func transforms"):
+        torch.func.vmap(lambda x: dv.contact.forces(model, x).vertices.total)(model.rest_points[None])

@@ -102,6 +102,22 @@ def test_states_that_are_lost_are_still_diagnosed() -> None:
     assert told.nonfinite.sum() == 1 and bool(told.residuals.isnan().all()) and "NaN" in told.messages[0]
 
 
+def test_no_scenes() -> None:
+    model = two_boxes()
+    none = model.rest_points[None][:0]
+    told = dv.diagnose(model, none, previous=(none, none), warn=False, **SOFT)
+    assert told.residuals.shape == (0, 2) and told.unbalanced == 0
+
+
+@pytest.mark.parametrize("name", ["force", "gravity"])
+def test_loads_that_are_not_finite_are_named(name: str) -> None:
+    model = two_boxes()
+    x = model.rest_points
+    load = torch.full((3,), torch.nan, dtype=x.dtype)
+    with pytest.raises(ValueError, match=f"{name}: expected finite values, got nan"):
+        dv.diagnose(model, x, previous=(x, 0 * x), **{name: load}, **SOFT)
+
+
 def test_the_estimate_of_an_error_raises_with_contact() -> None:
     model = two_boxes()
     x = model.rest_points
