@@ -137,25 +137,28 @@ def balls(count: int = 20, rise: float = 1.0, sweeps: int = 10, seconds: float =
 
 
 def crowd(per_side: int = 3, layers: int = 2, sweeps: int = 10, seconds: float = 0.5, parts: int = 50,
-          time_step: float = 1 / 60, device: str = "cpu", barrier: Options = None) -> list[Row]:  # fmt: skip
+          time_step: float = 1 / 60, device: str = "cpu", detections: int = 1) -> list[Row]:  # fmt: skip
     """The crowd of `bench contact`, of fewer bodies: the share of cut vertices, and the mean energy over that of steps
-    of h / parts. Energy is kinetic, elastic and of gravity above the floor."""
+    of h / parts with one detection. Energy is kinetic, elastic and of gravity above the floor."""
     start = contact.crowd(per_side, layers)
     surface = start.mesh.surface
     edges = start.mesh.points[surface] - start.mesh.points[surface[:, [1, 2, 0]]]
     dhat = 0.05 * float(np.linalg.norm(edges, axis=-1).mean())
     walls = tuple((tuple(float(c) for c in n), float(h)) for n, h in start.walls)
     floor = dv.FloorBarrier([h for _, h in walls], [n for n, _ in walls], kappa=KAPPA, dhat=dhat)
-    energies = (dv.StableNeoHookean(), pairs(barrier, dhat=dhat), floor, dv.Friction(0.3))
-    model = dv.Model(start.mesh, energies=energies, device=device)
+    model, single = (
+        dv.Model(start.mesh, device=device, energies=(
+            dv.StableNeoHookean(), pairs({"detections": count}, dhat=dhat), floor, dv.Friction(0.3)))
+        for count in (detections, 1)
+    )  # fmt: skip
     v = torch.from_numpy(start.velocity).to(model.rest_points)
     scene, steps = Scene(model, MODULUS, time_step, sweeps, v=v, walls=walls), round(seconds / time_step)
     course = march(scene, steps)
-    case = f"{int(model.body.max()) + 1} bodies"
+    case = f"{int(model.body.max()) + 1} bodies" + (f", {detections} detections" if detections > 1 else "")
     cut = float(np.mean(course.cut))
     rows = [row(course, "share of cut vertices", case, cut, 0.0, "<= 0.05", cut <= 0.05)]
     if parts > 1:
-        fine = march(scene.finer(parts), parts * steps, keep=parts)
+        fine = march(replace(scene, model=single).finer(parts), parts * steps, keep=parts)
         lift = float((GRAVITY * model.mass * model.rest_points[:, 1]).sum())
         own, goal = ([e + lift for e in energy(c.scene, c)] for c in (course, fine))
         ratio = float(np.mean(own) / np.mean(goal))
