@@ -58,10 +58,14 @@ def test_barrier_force_is_the_gradient_of_its_energy(mollified: bool) -> None:
 
 
 def test_barrier_block_is_the_curvature_along_the_normals() -> None:
-    """Of one pair at a time, H is h^2 e (Hess b - b' Hess d)."""
+    """Of one pair at a time, H is N h^2 e (Hess b - b' Hess d): N of its corners share the vertex's color."""
     model, x, _ = setup()
     part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None], [[0, 1]])
     vertex = 4
+    sizes = model.color_ptr.diff()
+    color = torch.full((len(x) + len(COLLIDERS),), -1)  # no sweep moves colliders
+    color[model.color_vertices] = torch.arange(len(sizes)).repeat_interleave(sizes)
+    counts = []
     for row in (part.pairs[:, :4] == vertex).any(1).nonzero()[:, 0].tolist():
         one = part._replace(pairs=part.pairs[row : row + 1], constants=part.constants[row : row + 1].clone())
         one.constants[:, 2] = 0
@@ -78,7 +82,8 @@ def test_barrier_block_is_the_curvature_along_the_normals() -> None:
         full = torch.autograd.functional.hessian(potential, x[vertex])
         bent = torch.autograd.functional.hessian(gap, x[vertex])
         _, hessian = blocks(model, barrier, x, x)
-        difference = hessian[vertex] - (full - 1e-4 * first * bent)
+        counts.append(int((color[one.pairs[0, :4]] == color[vertex]).sum()))
+        difference = hessian[vertex] - counts[-1] * (full - 1e-4 * first * bent)
         assert difference.abs().max() <= tolerance("cancelling") * hessian[vertex].abs().max()
         if one.pairs[0, 4] == distance.EDGE_EDGE:
             a, b, c, d = torch.cat((x, COLLIDERS))[one.pairs[0, :4]]
@@ -86,6 +91,7 @@ def test_barrier_block_is_the_curvature_along_the_normals() -> None:
             barrier = PairBarrier(scene_of(model, x), Pairs(scene_of(model, x), one, None), COLLIDERS[None])
             _, mollified = blocks(model, barrier, x, x)
             assert torch.allclose(mollified, 0.75 * hessian, rtol=tolerance("cancelling"), atol=0)
+    assert set(counts) == {1, 2}
 
 
 @pytest.mark.parametrize("travel", (1e-4, 1e-2))
