@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.colors import colors
 from torch import Tensor
 
 import diffvbd as dv
@@ -63,19 +64,10 @@ def folded() -> Scene:
 SCENES: dict[str, Callable[[], Scene]] = {f.__name__: f for f in (two_tets, two_on_one, twins, batch_of_stacks, folded)}
 
 
-def colors(model: dv.Model) -> Tensor:
-    """Color of each corner point, -1 where no sweep moves it, [V + Vc]."""
-    out = torch.full((model.num_vertices + len(model.collider_points),), -1)
-    bounds = model.color_ptr.tolist()
-    for color, (first, end) in enumerate(itertools.pairwise(bounds)):
-        out[model.color_vertices[first:end].cpu()] = color
-    return out
-
-
 def met(model: dv.Model, part: Part, x: Tensor) -> tuple[int, int]:
     """How often listed pairs hold two vertices of one color, and how many third vertices see two vertices of one color
     through different pairs; pairs farther apart than dhat do nothing and do not count."""
-    color, inside, third = colors(model), 0, 0
+    color, inside, third = colors(model, model.num_vertices + len(model.collider_points)), 0, 0
     points = torch.cat([x, model.collider_points.expand(len(x), -1, -1)], 1)
     corners = points[part.pairs[:, 5:6], part.pairs[:, :4]]
     active = distance(part.pairs[:, 4], corners) - part.constants[:, 1] < part.constants[:, 0]
@@ -169,7 +161,7 @@ def corner_on_corner() -> dv.Model:
 def test_corners_of_one_color_do_not_overshoot(device: str) -> None:
     """With the stiffness that one corner alone needs, 3 % of the forces stayed unbalanced for good."""
     model = corner_on_corner().to(device)
-    same = colors(model)
+    same = colors(model, model.num_vertices)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     half = len(x) // 2
     assert same[x[:half, 0].argmax()] == same[half + x[half:, 0].argmin()]

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.colors import colors
 from helpers.two_tets import COLLIDERS, DHAT, detect, moved_state, scene_of, stand_in, two_tets
 from torch import Tensor
 
@@ -62,10 +63,7 @@ def test_barrier_block_is_the_curvature_along_the_normals() -> None:
     model, x, _ = setup()
     part = detect(model, x[None], COLLIDERS[None], COLLIDERS[None], [[0, 1]])
     vertex = 4
-    sizes = model.color_ptr.diff()
-    color = torch.full((len(x) + len(COLLIDERS),), -1)  # no sweep moves colliders
-    color[model.color_vertices] = torch.arange(len(sizes)).repeat_interleave(sizes)
-    counts = []
+    color, counts = colors(model, len(x) + len(COLLIDERS)), []
     for row in (part.pairs[:, :4] == vertex).any(1).nonzero()[:, 0].tolist():
         one = part._replace(pairs=part.pairs[row : row + 1], constants=part.constants[row : row + 1].clone())
         one.constants[:, 2] = 0
