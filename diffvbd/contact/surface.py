@@ -20,6 +20,8 @@ CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
 # every motion is a deformation. The farther, the more pairs there are.
 MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 1.0
 LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_HELD = 0.2, 0.3, 0.75
+# Bodies of so few triangles may deform further: each of their edges is long beside the body, and has few neighbors.
+COARSE_TRIANGLES, MOST_EDGES_COARSE = 24, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +99,8 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     edge = torch.from_numpy(total / np.maximum(number, 1))
     held_vertices = np.bincount(label, weights=pinned.cpu().numpy(), minlength=bodies)
     alone = (held_vertices < np.bincount(label, minlength=bodies)).sum() <= 1 or not barrier.between_bodies
+    own = torch.where(torch.from_numpy(np.bincount(label[surface[:, 0]], minlength=bodies)) <= COARSE_TRIANGLES,
+                      MOST_EDGES_COARSE, MOST_EDGES_OWN)  # fmt: skip
     most_room = (MOST_EDGES if alone else MOST_EDGES_BETWEEN) * edge
     if barrier.reach is not None:
         most_room = torch.full_like(edge, (barrier.reach - barrier.dhat) / 2)
@@ -122,7 +126,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         bodies=bodies,
         rows=tuple(rows),
         most_room=most_room,
-        most_own_room=torch.where(torch.from_numpy(held_vertices > 0), MOST_EDGES_HELD, MOST_EDGES_OWN) * edge,
+        most_own_room=torch.where(torch.from_numpy(held_vertices > 0), MOST_EDGES_HELD, own) * edge,
         least_own_room=LEAST_EDGES_OWN * edge,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
     )

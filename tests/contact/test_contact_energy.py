@@ -59,3 +59,21 @@ def test_a_body_that_turns_in_the_air_gains_no_energy(spin: float, self_contact:
         now = float((model.mass[:, None] * v.square()).sum())
         assert 0 < now <= speed * (1 + tolerance("energy_gain"))
         speed = now
+
+
+def test_a_soft_coarse_body_gains_no_energy_from_a_floor() -> None:
+    model = dv.Model(
+        dv.mesh.box(2, 0.1),
+        energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=1e-2)),
+        colliders=dv.colliders.Plane(),
+    )
+    turn = torch.tensor([[-0.1896, 0.1298, 0.9732], [-0.3140, -0.9472, 0.0652], [0.9303, -0.2933, 0.2203]])
+    velocity, spin = torch.tensor([-0.989, -1.111, -0.933]).double(), torch.tensor([9.89, 8.30, -7.39]).double()
+    arm = (model.rest_points - model.rest_points.mean(0)) @ torch.linalg.qr(turn.double().T)[0]
+    x = arm + torch.tensor([0.0, 0.12, 0.0], dtype=torch.float64)
+    v = velocity + torch.linalg.cross(spin.expand_as(arm), arm)
+    start = float((model.mass[:, None] * v.square()).sum())
+    for _ in range(12):
+        x, v = dv.step(model, x, v, mu=3e3, lam=6e3, time_step=0.02, sweeps=20, gravity=(0, 0, 0))
+        assert float((model.mass[:, None] * v.square()).sum()) <= start * (1 + tolerance("energy_gain"))
+    assert x[:, 1].min() < 0.01  # it has met the floor
