@@ -109,7 +109,9 @@ class PartStart(NamedTuple):
 SHORT = 0.99  # share of a way that counts as all of it
 BENT = 0.1  # share of the room of its own that a body may bend by, whatever that does to its potential
 KEPT = 0.9  # share of a gap above a floor that rigid motion may close
-PLANE = 7  # numbers of a plane of a FloorBarrier
+DEEP, KEPT_DEEP = 0.1, 0.1  # part of dhat below which that is less, because sweeps open such a gap slowly
+ROUNDINGS = 8  # of the terms of a gap, below which its sign is not safe (Plane::guard in csrc/energies/floor_barrier.h)
+PLANE, DHAT = 7, 5  # numbers of a plane of a FloorBarrier, and which of them is dhat
 
 
 def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
@@ -203,7 +205,10 @@ def share_above_floor(floor: Tensor, origin: Tensor, at: Tensor, way: Tensor, su
     planes = floor.detach().reshape(floor.shape[0], 1, -1, PLANE)
     normal, p = planes[..., :3].transpose(-1, -2), (at + origin if origin.numel() else at).detach()
     gap, toward = (p[:, :, None] @ normal)[:, :, 0] - planes[..., 3], -(way.detach()[:, :, None] @ normal)[:, :, 0]
-    share = torch.where(toward > 0, KEPT * gap / toward, 1.0).amin(-1).clamp(0, 1)
+    size = (p.abs()[:, :, None] @ normal.abs())[:, :, 0] + planes[..., 3].abs()
+    gap, deep = (gap - ROUNDINGS * torch.finfo(at.dtype).eps * size).clamp(min=0), DEEP * planes[..., DHAT]
+    gap = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
+    share = torch.where(toward > 0, gap / toward, 1.0).amin(-1).clamp(0, 1)
     share = torch.where(surface.held[: at.shape[1]], 1.0, share)
     return out.scatter_reduce(1, surface.body[: at.shape[1]].long().expand(share.shape), share, "amin")
 

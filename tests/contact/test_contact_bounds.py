@@ -81,6 +81,21 @@ def test_nothing_crosses_above_a_floor(speed: float, detections: int) -> None:
         assert apart(model, x), f"step {step}"
 
 
+@pytest.mark.parametrize("coarse", (None, "auto"))
+@pytest.mark.parametrize("dtype", (torch.float64, torch.float32))
+def test_starts_leave_a_gap_above_a_floor_that_one_sweep_a_part_can_open(dtype: torch.dtype, coarse: Any) -> None:
+    model, v = thrown_together(3, floor=True, detections=4)
+    floor = model.energies[-1]
+    assert isinstance(floor, dv.FloorBarrier)
+    model = dv.Model(model.mesh, energies=model.energies, dtype=dtype, coarse=coarse)
+    x, v, least = model.rest_points, 20 * (v + torch.tensor([0.0, -1.0, 0.0])).to(dtype), math.inf
+    for _ in range(6):
+        x, v = dv.step(model, x, v, time_step=5e-3, sweeps=1, **MATERIAL)
+        assert apart(model, x)
+        least = min(least, float(x[:, 1].min()) - floor.height[0])
+    assert 1e-2 * 5e-3 < least < 5e-3  # [m], of dhat
+
+
 def test_a_stack_at_rest_keeps_its_height() -> None:
     """Also where a step's fall h^2 g is longer than the gaps: the floor holds what stands on it."""
     tets = join([box(2, 0.2), box(2, 0.1).translate((0.06, 0.21, 0.04))])
