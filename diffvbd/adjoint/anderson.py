@@ -24,6 +24,7 @@ from ..model.model import Model
 from ..ops import no_second_derivative, of_inputs
 from ..ops.anderson import anderson_combine
 from ..ops.detect import segment_sum
+from ..tuples import replaced
 from .rise import rise_parts
 from .sweep import sweep
 
@@ -97,23 +98,23 @@ def run_sweeps(model: Model, fields: ops.SweepFields, settings: ops.SweepSetting
         raise NotImplementedError("diffvbd: torch.compile of a step with Anderson acceleration is not supported")
 
     numbers = settings.numbers
-    within = settings._replace(numbers=numbers._replace(last_relaxation=numbers.relaxation))
+    within = replaced(settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
     x, corrections, first = fields.x_start, [], True
     if model.coarse is not None:  # a sweep alone: iterates begin after it
-        alone = fields._replace(**dict.fromkeys(COARSE_FIELDS))
-        x, _ = run(alone, within._replace(sweeps=cycles[0], coarse=()))
+        alone = replaced(fields, **dict.fromkeys(COARSE_FIELDS))
+        x, _ = run(alone, replaced(within, sweeps=cycles[0], coarse=()))
         cycles, first = cycles[1:], False
         if settings.coarse:
-            within = within._replace(coarse=settings.coarse._replace(begun=1))
+            within = replaced(within, coarse=replaced(settings.coarse, begun=1))
     parts = rise_parts(model, fields, numbers.time_step)
     assert model.acceleration is not None
     before, after, taken = [], [], []
     combine = _Combine.apply if torch.is_grad_enabled() else _Combine.forward  # whose call costs a sweep
     for n, count in enumerate(cycles):
         ends = n + 1 == len(cycles)
-        now = within._replace(sweeps=count, numbers=numbers if ends else within.numbers)
+        now = replaced(within, sweeps=count, numbers=numbers if ends else within.numbers)
         before.append(x)
-        x, done = run(fields._replace(x_start=x), now, first)
+        x, done = run(replaced(fields, x_start=x), now, first)
         first = False
         corrections += [done] if done.numel() else []
         after.append(x)

@@ -14,6 +14,7 @@ from torch.autograd import Function
 from .. import ops
 from ..ops import distinct, no_second_derivative, no_transforms, of_inputs, one_by_one, ready_signature
 from ..ops.regimes import BLOCK, FEW_LANES, THREAD
+from ..tuples import replaced
 
 _FAILED_ALLOCATION = (
     "out of memory", "can't allocate memory", "bad_alloc", "Storage size calculation overflowed", '"aten::new_'
@@ -46,7 +47,7 @@ def backward_memory(x: Tensor, settings: ops.SweepSettings, tape_policy: int) ->
 
 def _scenes_first(settings: ops.SweepSettings) -> ops.SweepSettings:
     """The same sweeps with a tape that can be split and repeated by scenes, for vmap."""
-    return settings._replace(launch=(BLOCK, FEW_LANES, FEW_LANES)) if settings.launch[:1] == (THREAD,) else settings
+    return replaced(settings, launch=(BLOCK, FEW_LANES, FEW_LANES)) if settings.launch[:1] == (THREAD,) else settings
 
 
 _FIELDS = len(ops.SweepFields._fields)

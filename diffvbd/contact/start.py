@@ -186,7 +186,7 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
             if number == 0:
                 bent = raises(here, torch.where(pinned, target, at + share[..., None] * way))
                 bent = bent & free & ~rests & (least_of_body(share) < SHORT)
-                if at.is_cuda or torch.compiler.is_compiling() or bool(bent.any()):
+                if at.is_cuda or bool(bent.any()):
                     stuck.pop()  # once more, with those at rest: what let the others pass may have been their motion
                     way = torch.where(bent[..., None], 0.0, way)
                     share = torch.where(bent | rests, 0.0, advance(at, way, still, center, own=own))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..checks import check_count
+from ..tuples import replaced
 from .bodies import connected
 from .coarse_plan import ROW, in_blocks
 from .rest import rest_metric
@@ -57,7 +58,7 @@ class MovingBodies(NamedTuple):
 
     def to(self, device: torch.device, dtype: torch.dtype) -> MovingBodies:
         placed = MovingBodies(*(t.to(device) for t in self))
-        return placed._replace(rest=placed.rest.to(dtype))
+        return replaced(placed, rest=placed.rest.to(dtype))
 
 
 class MovingVertices(NamedTuple):

@@ -12,6 +12,7 @@ from .. import ops
 from ..checks import fail
 from ..ops.coarse_arrays import PACK as LANES
 from ..ops.coarse_arrays import ROW, lengths
+from ..tuples import replaced
 from .bodies import connected
 from .coarse import CoarseGeometry, CoarseSpace, build_coarse
 
@@ -37,7 +38,7 @@ class CoarsePlan(NamedTuple):
             return t.to(device, dtype) if t.is_floating_point() else t.to(device)
 
         sizes, *tensors = self
-        return CoarsePlan(sizes, *map(placed, tensors))._replace(volume=self.volume.to(device))
+        return replaced(CoarsePlan(sizes, *map(placed, tensors)), volume=self.volume.to(device))
 
 
 def plan_of(space: CoarseSpace, points: Tensor, tets: Tensor, pinned: Tensor, mass: Tensor, rest: Tensor, plan: Tensor,

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..mask import CONTACT
+from ..tuples import replaced
 from .fields import (
     FULL_TAPE,
     NO_TAPE,
@@ -34,7 +35,7 @@ def listed(fields: SweepFields | StepFields, packed_rest: Tensor, plan: Tensor, 
            ) -> list[Tensor]:  # fmt: skip
     """Fields as the operators take them, with the rest shape packed."""
     rest = packed_rest if fields.rest is None else pack_rest(fields.rest, plan, settings.sizes)
-    return as_list(fields._replace(rest=rest), fields.mass)
+    return as_list(replaced(fields, rest=rest), fields.mass)
 
 
 def sweep(fields: SweepFields, packed_rest: Tensor, plan: Tensor, settings: SweepSettings, tape_policy: int,

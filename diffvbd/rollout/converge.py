@@ -22,6 +22,7 @@ from ..step.balance import contact_of_step, left_over, of_bodies, of_scenes, pot
 from ..step.contact import outcomes
 from ..step.integrators import History, Integrator, check_history, check_integrator, check_staged, take
 from ..step.predict import Begun, begin
+from ..tuples import replaced
 
 
 @dataclass(frozen=True)
@@ -143,17 +144,17 @@ class _Converging:
         where = collider_state(model, x, loads["colliders"], loads["colliders_before"])
         begun = begin(model, x, v, prepared, loads["force"], acceleration_of(loads["gravity"], x), loads["prescribed"])
         with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-            swept_only = prepared._replace(unrolled=None)
+            swept_only = replaced(prepared, unrolled=None)
             done = _Sweeping(model, begun.detached(), swept_only, {"x": x, "v": v, **loads}, where, self.tolerance)
             done.run(*self.most)
         _judge(done, self.tolerance, self.on_failure)
         if isinstance(self.adjoint, GlobalAdjoint):
             # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph
-            begun = begun._replace(x_start=torch.where(model._pinned[:, None], begun.x_start, done.end))
+            begun = replaced(begun, x_start=torch.where(model._pinned[:, None], begun.x_start, done.end))
             end = global_sweep(model, begun.fields(model, prepared), prepared.settings, self.adjoint)
             x_end, v_end = begun.finish(end, model, prepared, corrects=False)
         else:
-            again = prepared._replace(settings=prepared.settings._replace(sweeps=done.count))
+            again = replaced(prepared, settings=replaced(prepared.settings, sweeps=done.count))
             x_end, v_end = advance(model, x, v, again, adjoint=self.adjoint, **loads)
             if model.coarse is not None:  # the parts above had corrections of their own
                 with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
@@ -205,7 +206,7 @@ class _Sweeping:
         # is what further sweeps go on from.
         self.before, self.count = begun.x_start, 0
         numbers = prepared.settings.numbers
-        self.over = prepared.settings._replace(numbers=numbers._replace(last_relaxation=numbers.relaxation))
+        self.over = replaced(prepared.settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
         self.rounding: Tensor | None = None
         self.residual, self.converged = math.inf, False
         if where is None:
@@ -232,21 +233,21 @@ class _Sweeping:
             # a look costs many sweeps: at first after check_every, later after a quarter of what there were
             some = min(max(check_every, self.count // 4), max_sweeps - self.count)
             # one of `count` is the last sweep, which each part makes anew
-            self.before = self._swept(self.over._replace(sweeps=some - (self.count == 0)))
+            self.before = self._swept(replaced(self.over, sweeps=some - (self.count == 0)))
             self.count += some
-            self._end_at(self._swept(self.prepared.settings._replace(sweeps=1)))
+            self._end_at(self._swept(replaced(self.prepared.settings, sweeps=1)))
 
     def _run_anew(self, max_sweeps: int, check_every: int) -> None:
         """The same for steps with contact, each from the beginning: half as many sweeps more each time."""
         self.count = min(check_every, max_sweeps)
-        self._end_at(self._swept(self.prepared.settings._replace(sweeps=self.count)))
+        self._end_at(self._swept(replaced(self.prepared.settings, sweeps=self.count)))
         while not self.converged and self.count < max_sweeps and math.isfinite(self.residual):
             self.count = min(self.count + max(check_every, self.count // 2), max_sweeps)
-            self._end_at(self._swept(self.prepared.settings._replace(sweeps=self.count)))
+            self._end_at(self._swept(replaced(self.prepared.settings, sweeps=self.count)))
 
     def _swept(self, settings: SweepSettings) -> Tensor:
-        part = self.prepared._replace(settings=settings)
-        return swept(self.model, self.begun._replace(x_start=self.before), part, self.given, colliders=self.where)
+        part = replaced(self.prepared, settings=settings)
+        return swept(self.model, replaced(self.begun, x_start=self.before), part, self.given, colliders=self.where)
 
     def _end_at(self, x: Tensor) -> None:
         """Corrects what the last sweep left, and looks at it."""

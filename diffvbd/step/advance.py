@@ -20,6 +20,7 @@ from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
 from ..adjoint.sweep import fused_step
 from ..model.model import Model
 from ..scopes import checking, recorders
+from ..tuples import replaced
 from .arguments import (
     Prepared,
     acceleration_of,
@@ -61,7 +62,7 @@ def advance(
     if prepared.unrolled is not None:
         with torch.no_grad():  # for what it raises: the values are looked at even by no sweep
             count = prepared.settings.sweeps if checking() else 0
-            looked_at = prepared._replace(settings=prepared.settings._replace(sweeps=count), coarse=None)
+            looked_at = replaced(prepared, settings=replaced(prepared.settings, sweeps=count), coarse=None)
             swept(model, begun.detached(), looked_at, given, index=index)
         return prepared.unrolled(*prepared.time_step_and_sweeps)(x, v, force, gravity, prescribed)
     x_end = swept(model, begun, prepared, given, adjoint, index, where)

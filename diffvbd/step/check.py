@@ -7,16 +7,17 @@ import torch
 from .. import ops
 from ..adjoint.anderson import run_sweeps
 from ..model.model import Model
+from ..tuples import replaced
 
 
 def check_on_cpu(model: Model, fields: ops.SweepFields, settings: ops.SweepSettings, index: int) -> None:
     """The CPU repeats a step and names what is wrong with it."""
     twin = model._on_cpu()
-    settings = settings._replace(sizes=twin._sizes, launch=())
+    settings = replaced(settings, sizes=twin._sizes, launch=())
     with torch.no_grad():
         here = ops.SweepFields(*(t if t is None else t.detach().cpu() for t in fields))  # pyright: ignore
         if settings.coarse:
             plan = twin._coarse_plan  # whose positions are those of the CPU
-            settings = settings._replace(coarse=plan.sizes._replace(begun=settings.coarse.begun))
-            here = here._replace(coarse_plan=plan.plan, coarse_weights=plan.weights)
+            settings = replaced(settings, coarse=replaced(plan.sizes, begun=settings.coarse.begun))
+            here = replaced(here, coarse_plan=plan.plan, coarse_weights=plan.weights)
         run_sweeps(twin, here, settings, tape_policy=ops.NO_TAPE, debug_step=index)

@@ -18,6 +18,7 @@ from ..model.model import Model
 from ..model.rest import shape_gradients
 from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
 from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
+from ..tuples import replaced
 from .coarse_sums import coarse_mass, coarse_stiffness
 
 _TENSORS = 3  # differentiable fields
@@ -115,7 +116,7 @@ def with_corrections(model: Model, parts: CoarseParts, fields: ops.SweepFields, 
     """What the sweeps read, with the corrections between them."""
     plan = model._coarse_plan
     factor = factor_of(model, parts, fields.x_prev, time_step)
-    return fields._replace(coarse_factor=factor, coarse_mass=parts.mass.detach(), coarse_plan=plan.plan,
+    return replaced(fields, coarse_factor=factor, coarse_mass=parts.mass.detach(), coarse_plan=plan.plan,
                            coarse_weights=plan.weights, coarse_rest=parts.rest)  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from ..adjoint.contact_lag import sum_at_corners
 from ..adjoint.potential import IncrementalPotential
 from ..adjoint.sums import sum_by
 from ..model.model import Model
+from ..tuples import replaced
 from .rigid_terms import Scenes, corners_of, pair_terms, vertex_blocks, vertex_gradient
 from .trials import Trials
 
@@ -72,9 +73,9 @@ class Corrections:
 
     def __init__(self, trials: Trials, fields: ops.SweepFields, factor: Tensor, scenes: Scenes) -> None:
         self.trials, self.fields, self.factor, self.scenes = trials, fields, factor, scenes
-        self.constants = fields._replace(**{k: None if t is None else t.detach() for k, t in fields._asdict().items()})
+        self.constants = replaced(fields, **{k: None if t is None else t.detach() for k, t in fields._asdict().items()})
         if fields.rest is None:  # made on first use, which must not be in a backward that is being compiled
-            self.constants = self.constants._replace(rest=scenes.model.rest_scalars)
+            self.constants = replaced(self.constants, rest=scenes.model.rest_scalars)
         self.space = space_of(scenes.model)
         self.matrix = _dense(factor.detach(), self.space)
         self.refused = torch.zeros_like(trials.bodies.ptr[:-1])[None]
@@ -83,7 +84,7 @@ class Corrections:
     def correct(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """x [B, V, 3] after a correction, and its length for each body of the coarse space [B, bodies]."""
         over = self.refused >= REFUSALS
-        if not (x.is_cuda or torch.compiler.is_compiling()) and bool(over.all()):
+        if not x.is_cuda and bool(over.all()):
             return x, self._of_bodies(torch.zeros_like(over, dtype=x.dtype))
         r, presses = self._gradient(x)
         with torch.no_grad():
@@ -102,7 +103,7 @@ class Corrections:
 
     def _gradient(self, x: Tensor) -> tuple[Tensor, list[_Press]]:
         """P' dG [B, F, 3], and what presses back."""
-        s, f = self.scenes._replace(fields=self.scenes.fields._replace(x=x)), self.fields
+        s, f = replaced(self.scenes, fields=replaced(self.scenes.fields, x=x)), self.fields
         force = _Elastic.apply(x, f.mu, f.lam, f.rest, self.constants, s.model, s.time_step) + vertex_gradient(s)
         scenes, vertices = x.shape[:2]
         presses = []

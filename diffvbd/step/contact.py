@@ -23,6 +23,7 @@ from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
 from ..ops.detect import CONSTANTS
 from ..scopes import checking, recorders
+from ..tuples import replaced
 from .coarse import factor_of
 from .contact_cycles import Combined, SweptPart, record_parts, sweeps_of_parts, swept_part
 from .intersections import refuse_intersections
@@ -98,7 +99,7 @@ class ContactStep:
     """What the parts of one step share."""
 
     def __init__(self, model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor) -> None:
-        begun = begun._replace(x_prev=begun.x_prev.contiguous(), y=begun.y.contiguous())
+        begun = replaced(begun, x_prev=begun.x_prev.contiguous(), y=begun.y.contiguous())
         self.model, self.begun, self.prepared = model, begun, prepared
         self.x_prev = begun.x_prev
         # [B, Vc, 3] at the end and at the start of the step: one tensor if they rest
@@ -158,8 +159,8 @@ class ContactStep:
 
     @staticmethod
     def _reads(x: Tensor) -> bool:
-        """Whether values may decide sizes: on CUDA that would wait, compiled it would compile anew."""
-        return not x.is_cuda and not torch.compiler.is_compiling()
+        """Whether values may decide sizes: on CUDA that would wait."""
+        return not x.is_cuda
 
     def _narrowed(self, listed: Pairs, x: Tensor, collider: Tensor, room: Tensor) -> tuple[Pairs, Tensor | None]:
         """The pairs that can matter as long as no vertex goes farther than its room [B, V] from x, with their gaps
@@ -167,7 +168,7 @@ class ContactStep:
         with torch.no_grad():
             constants = ops_start.narrow(x.detach().contiguous(), self.origin, collider.detach().contiguous(), room,
                                          listed.pairs, listed.constants, listed.ptr)  # fmt: skip
-        near, rows = some_of(listed._replace(constants=constants), (constants[:, -1] < torch.inf).contiguous())
+        near, rows = some_of(replaced(listed, constants=constants), (constants[:, -1] < torch.inf).contiguous())
         return near, rows if self._reads(x) else None
 
     def run(self, policy: int, debug_step: int) -> Tensor:
@@ -209,13 +210,13 @@ class ContactStep:
             begin = x
             x, first = self._corrected(start.x, now, start, detection.listed)
             if start.own:
-                start = start._replace(own=(start.own[0] + (x - start.x).detach(), start.own[1]))
+                start = replaced(start, own=(start.own[0] + (x - start.x).detach(), start.own[1]))
             room = rooms_of_sweeps(motion, barrier, start, x, begin, wanted, rigid)
             near, kept = self._narrowed(detection.listed, x, now, room)
-            start = start._replace(center=x.detach(), room=room)
+            start = replaced(start, center=x.detach(), room=room)
             taken, limits, combined, lengths, cut = [first], None, None, None, start.short
             if sweeps:
-                part = settings._replace(sweeps=sweeps)
+                part = replaced(settings, sweeps=sweeps)
                 swept = swept_part(self, x, start, now, near, part, policy, debug_step)
                 met.swept.append(swept)
                 x, limits, combined, lengths = swept
@@ -223,7 +224,7 @@ class ContactStep:
                 taken.append(last)
                 cut = limits[:, -1] > 0  # what the start has held up, sweeps may have made good
             met.cut = cut
-            met.found[r] = detection._replace(shares=start.shares, corrections=torch.stack(taken), limits=limits,
+            met.found[r] = replaced(detection, shares=start.shares, corrections=torch.stack(taken), limits=limits,
                                               kept=kept, frames=start.frames, combined=combined,
                                               lengths=lengths)  # fmt: skip
             left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
@@ -276,7 +277,7 @@ class ContactStep:
     def _sweep(self, x: Tensor, center: Tensor, room: Tensor, collider: Tensor, listed: Pairs, settings: SweepSettings,
                policy: int, debug_step: int) -> tuple[Tensor, Tensor]:  # fmt: skip
         lagged, model = self.lagged, self.model
-        fields = self.fields._replace(
+        fields = replaced(self.fields,
             x_start=x, center=center, room=room, collider=collider, collider_prev=self.before, kappa=self.kappa,
             **listed._asdict(), lag=self.lag, lag_pairs=lagged.pairs, lag_ptr=lagged.ptr, lag_entry=lagged.entry,
             floor_lag=self.floor_lag,
@@ -303,11 +304,11 @@ class ContactStep:
         outcomes[self.model] = Outcome(torch.stack(met.counts), self.capacity, met.cut, smallest)
 
     def _judged(self, x: Tensor, met: Met) -> Tensor:
-        """x, or NaN where a captured or compiled step, which cannot raise, must not be trusted."""
+        """x, or NaN where a captured step, which cannot raise, must not be trusted."""
         self._record(met)
         record_parts(self.model, x, met.swept)
         table, capacity = torch.stack(met.counts), self.capacity
-        if torch.compiler.is_compiling() or (x.is_cuda and torch.cuda.is_current_stream_capturing()):
+        if x.is_cuda and torch.cuda.is_current_stream_capturing():
             good = (table[:, :2] <= torch.stack([table.new_full((), capacity), table.new_zeros(())])).all()
             good = good & (table[:, 3] == 0).all()
             return torch.where(good, x, torch.nan)
@@ -324,7 +325,7 @@ class ContactStep:
         """Pairs of all scenes that fit."""
         surface, barrier, scenes = self.surface, self.barrier, self.x_prev.shape[0]
         assert surface is not None and barrier is not None
-        if barrier.capacity is None and not self.x_prev.is_cuda and not torch.compiler.is_compiling():
+        if barrier.capacity is None and not self.x_prev.is_cuda:
             return MOST_CAPACITY  # the list is as long as it must be
         return max(surface.capacity * scenes, 0 if barrier.capacity is not None else LEAST_CAPACITY)
 
@@ -377,6 +378,7 @@ def no_pairs(like: Tensor, corners: int) -> Pairs:
     return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, CONSTANTS)), none, none[:0])
 
 
+@torch.compiler.disable()  # sizes, checks and lists depend on values, and torch 2.11 compiled wrong gradients
 def run_contact(model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor, policy: int,
                 debug_step: int) -> Tensor:  # fmt: skip
     """Positions after the sweeps of a step with contact.

@@ -15,6 +15,7 @@ from ..adjoint.rise import rise_parts
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
 from ..scopes import recorders
+from ..tuples import replaced
 from .coarse_contact import Corrections
 from .rigid_terms import Scenes
 from .trials import Trials
@@ -55,7 +56,7 @@ def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, l
     def sweep(x: Tensor, settings: SweepSettings) -> tuple[Tensor, Tensor]:
         return of._sweep(x, start.center, start.room, collider, listed, settings, policy, debug_step)
 
-    settings = settings._replace(coarse=())  # which the operator would make, without pairs
+    settings = replaced(settings, coarse=())  # which the operator would make, without pairs
     cycles = _cycles(model, settings.sweeps)
     if len(cycles) <= 1:
         return SweptPart(*sweep(x, settings))
@@ -63,7 +64,7 @@ def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, l
     if of.factor is not None:
         corrections = Corrections(judge, of.fields, of.factor, _scenes(of, start, collider, listed))
     numbers = settings.numbers
-    within = settings._replace(numbers=numbers._replace(last_relaxation=numbers.relaxation))
+    within = replaced(settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
     iterates = _Iterates(model, judge, broadcast(mass, x.shape[:2]).reshape(1, -1), len(cycles))
     limits, lengths = [], []
     for n, count in enumerate(cycles):
@@ -72,7 +73,7 @@ def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, l
         if corrections is not None and n:
             x, length = corrections.correct(x)
             lengths.append(length)
-        x, limit = sweep(x, (settings if ends else within)._replace(sweeps=count))
+        x, limit = sweep(x, replaced(settings if ends else within, sweeps=count))
         limits.append(limit)
         if not ends and (corrections is None or n):  # the sweep before the first correction is no cycle
             x = iterates.next(before, x)
@@ -124,7 +125,7 @@ def _scenes(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) 
 
 def _trials(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) -> Trials:
     s = _scenes(of, start, collider, listed)
-    s = s._replace(fields=ops.TouchingFields(*(t.detach() for t in s.fields)))
+    s = replaced(s, fields=ops.TouchingFields(*(t.detach() for t in s.fields)))
     return Trials(s, rise_parts(of.model, of.fields, s.time_step))
 
 

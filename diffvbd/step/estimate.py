@@ -13,6 +13,7 @@ from ..adjoint.sweep import sweep
 from ..model.anderson import moving_vertices
 from ..model.model import Model
 from ..ops.detect import segment_sum
+from ..tuples import replaced
 from .arguments import Prepared, acceleration_of
 from .coarse import lengths_of, with_corrections
 from .predict import Begun, begin
@@ -108,7 +109,7 @@ def _iterates(model: Model, begun: Begun, prepared: Prepared) -> tuple[list[Tens
 
     coarse = settings.coarse if prepared.coarse is not None else ()
     before, parts = _parts(settings.sweeps, coarse.every if coarse else None)
-    over = settings._replace(numbers=settings.numbers._replace(last_relaxation=settings.numbers.relaxation))
+    over = replaced(settings, numbers=replaced(settings.numbers, last_relaxation=settings.numbers.relaxation))
     x, corrections, states = fields.x_start, [], []
 
     def run(fields: ops.SweepFields, settings: ops.SweepSettings) -> Tensor:
@@ -119,17 +120,17 @@ def _iterates(model: Model, begun: Begun, prepared: Prepared) -> tuple[list[Tens
         return end
 
     if before == 1 and parts and coarse:  # a sweep alone would be corrected
-        x = run(fields._replace(**dict.fromkeys(COARSE_FIELDS)), over._replace(sweeps=1, coarse=()))
+        x = run(replaced(fields, **dict.fromkeys(COARSE_FIELDS)), replaced(over, sweeps=1, coarse=()))
     elif before or not parts:
-        x = run(fields, (over if parts else settings)._replace(sweeps=before))
+        x = run(fields, replaced(over if parts else settings, sweeps=before))
     if coarse:
-        on = coarse._replace(begun=1)
-        settings, over = settings._replace(coarse=on), over._replace(coarse=on)
+        on = replaced(coarse, begun=1)
+        settings, over = replaced(settings, coarse=on), replaced(over, coarse=on)
     states.append(x)
     for n, count in enumerate(parts):
         # the relaxation of the step's last sweep is its own
         now = settings if n + 1 == len(parts) else over
-        x = run(fields._replace(x_start=x), now._replace(sweeps=count))
+        x = run(replaced(fields, x_start=x), replaced(now, sweeps=count))
         states.append(x)
     return states, corrections
 

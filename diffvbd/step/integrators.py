@@ -24,6 +24,7 @@ from ..checks import fail
 from ..model.model import Model
 from ..ops import TET_READS_X_PREV
 from ..scopes import looks_at, recorders
+from ..tuples import replaced
 from .approach import may_touch
 from .arguments import Prepared, acceleration_of, broadcastable, collider_state
 from .coarse_sums import coarse_mass
@@ -197,8 +198,8 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
 def _over(whole: Prepared, share: float) -> Prepared:
     """The arguments of a solve over a share of the step."""
     numbers = whole.settings.numbers
-    numbers = numbers._replace(time_step=share * numbers.time_step, friction_eps=share * numbers.friction_eps)
-    return whole._replace(settings=whole.settings._replace(numbers=numbers))
+    numbers = replaced(numbers, time_step=share * numbers.time_step, friction_eps=share * numbers.friction_eps)
+    return replaced(whole, settings=replaced(whole.settings, numbers=numbers))
 
 
 def _touching(model: Model, x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any]) -> Tensor | None:
@@ -218,10 +219,10 @@ def _of_euler(model: Model, prepared: Prepared, given: dict[str, Any], x: Tensor
     factor = torch.where(euler, share * share, 1.0).to(x.dtype)
     mass = prepared.mass * factor.reshape(-1, factor.shape[-1])
     numbers = prepared.settings.numbers
-    settings = prepared.settings._replace(numbers=numbers._replace(friction_eps=numbers.friction_eps / share))
+    settings = replaced(prepared.settings, numbers=replaced(numbers, friction_eps=numbers.friction_eps / share))
     coarse = prepared.coarse
     if coarse is not None:
-        coarse = coarse._replace(mass=coarse_mass(model._coarse_plan, mass))
+        coarse = replaced(coarse, mass=coarse_mass(model._coarse_plan, mass))
     parameters = dict(prepared.parameters)
     for energy in (model.floor, model.contact):  # who damps touches something
         if energy is not None:
@@ -230,7 +231,7 @@ def _of_euler(model: Model, prepared: Prepared, given: dict[str, Any], x: Tensor
             if name in parameters or energy.damping > 0:
                 parameters[name] = share * value
     gravity = acceleration_of(given["gravity"], x) / factor[..., None]
-    return (prepared._replace(mass=mass, settings=settings, coarse=coarse, parameters=parameters),
+    return (replaced(prepared, mass=mass, settings=settings, coarse=coarse, parameters=parameters),
             {**given, "gravity": gravity})  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..checks import check_tensor, fail, to_float
 from ..model.model import Model
+from ..tuples import replaced
 from .arguments import check_state
 from .integrators import History
 from .step import step
@@ -92,7 +93,7 @@ def step_forward(
     with torch.enable_grad():
         x_end, v_end, *more = step(model, **values)
     constant = not (x_end.requires_grad or v_end.requires_grad)
-    after = more[0]._replace(moved=more[0].moved.detach(), v=more[0].v.detach()) if more else None
+    after = replaced(more[0], moved=more[0].moved.detach(), v=more[0].v.detach()) if more else None
     return x_end.detach(), v_end.detach(), Tape(inputs, (x_end, v_end), constant, after)
 
 

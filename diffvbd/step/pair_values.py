@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ..adjoint.contact_lag import Pairs, pair_lag
+from ..tuples import replaced
 from .rigid_terms import Scenes, corners_of, log_barrier
 
 
@@ -16,7 +17,7 @@ def barrier_values(s: Scenes, x: Tensor) -> Tensor:
     near = state[:, 1] > 0
     if not x.is_cuda:  # few of them push
         rows = near.nonzero()[:, 0]
-        listed = listed._replace(pairs=listed.pairs[rows], constants=listed.constants[rows])
+        listed = replaced(listed, pairs=listed.pairs[rows], constants=listed.constants[rows])
         values = _barrier_values(s, x, listed, state[rows], near[rows])
         return values.new_zeros(len(near)).index_copy_(0, rows, values)
     return _barrier_values(s, x, listed, state, near)

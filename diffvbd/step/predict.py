@@ -11,6 +11,7 @@ from torch import Tensor
 from .. import ops
 from ..mask import ELASTIC
 from ..model.model import Model
+from ..tuples import replaced
 from .arguments import Prepared, broadcastable
 from .rigid import correct
 from .start import begin as start_of
@@ -54,7 +55,7 @@ class Begun(NamedTuple):
         if not ops.TET_READS_X_PREV:
             return fields
         corners = self.x_prev[:, model.tets].flatten(2).permute(2, 0, 1).contiguous()
-        return fields._replace(corners_prev=corners)
+        return replaced(fields, corners_prev=corners)
 
     def corrected(self, x: Tensor, model: Model, prepared: Prepared) -> Tensor:
         """x [B, V, 3] after the rigid correction, where the Model has one."""

@@ -124,7 +124,7 @@ def _listed(s: Scenes, own: bool) -> tuple[Pairs, Tensor]:
     listed = s.listed
     corners, kind = corners_of(listed)[1], f.pairs[:, 4]
     apart = own | (f.body[corners[:, 0]] != f.body[torch.where(kind == 1, corners[:, 2], corners[:, 1])])
-    if f.x.is_cuda or torch.compiler.is_compiling():
+    if f.x.is_cuda:
         return listed, apart
     with torch.no_grad():
         acts = pair_lag(f.x.detach(), f.collider.detach(), f.kappa.detach(), f.origin, listed)[:, 1] > 0

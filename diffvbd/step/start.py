@@ -21,6 +21,7 @@ from ..ops import distinct, no_second_derivative, of_inputs, one_by_one
 from ..ops import rigid as ops_rigid
 from ..ops.begin import STARTS
 from ..safeguards import FILTER_ETA
+from ..tuples import replaced
 from .rigid import folded, needed
 
 _TENSORS = 6  # differentiable fields: x, v, acceleration, prescribed, mass, energy_data
@@ -40,7 +41,7 @@ class _Begin(Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
-        read = ops.BeginFields(*inputs[:_FIELDS])._replace(mu=None, lam=None, rest=None)  # by the backward
+        read = replaced(ops.BeginFields(*inputs[:_FIELDS]), mu=None, lam=None, rest=None)  # by the backward
         ctx.save_for_backward(output[2], *read)
         ctx.options = (inputs[_FIELDS], *inputs[-1])
         ctx.mark_non_differentiable(output[2])

@@ -100,8 +100,10 @@ def test_scenes_do_not_mix(one_regime: None, device: str) -> None:
     for i in range(2):
         for j in range(3):
             alone = run(x[i, j], noise[i, j], points[i, j], kappa[i, j])
-            for a, b in zip(together, alone, strict=True):
+            for a, b in zip(together[:-1], alone[:-1], strict=True):
                 assert torch.equal(a[i, j], b)
+            # what kappa gets is a sum over pairs, and processors differ in its order
+            assert relative_error(together[-1][i, j], alone[-1]) <= tolerance("contact_adjoint")
             own = dv.contact.status(model)
             assert own.cut[0] == status.cut[3 * i + j] and own.smallest_gap[0] == status.smallest_gap[3 * i + j]
     assert len(set(status.smallest_gap)) > 1

@@ -25,7 +25,7 @@ def test_quick_run_covers_more(tmp_path: Path) -> None:
 
 def test_gradient_matches_central_differences(tmp_path: Path) -> None:
     # limits and shares are decided, and so jump; the nearest line of an outline has kinks: a short step meets none
-    check_gradient("cover-the-spot", tmp_path, step=1e-7, rel=tolerance("kinked_difference"))
+    check_gradient("cover-the-spot", tmp_path, step=1e-8, rel=tolerance("kinked_difference"))
 
 
 def test_radius_decides_whether_there_is_a_solution(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
