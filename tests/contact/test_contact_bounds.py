@@ -93,7 +93,7 @@ def test_starts_leave_a_gap_above_a_floor_that_one_sweep_a_part_can_open(dtype: 
         x, v = dv.step(model, x, v, time_step=5e-3, sweeps=1, **MATERIAL)
         assert apart(model, x)
         least = min(least, float(x[:, 1].min()) - floor.height[0])
-    dhat = floor.dhat[0]
+    dhat = floor.dhat
     assert dhat / 100 < least < dhat
 
 
