@@ -104,6 +104,16 @@ def rooms_of_sweeps(motion: Motion, barrier: PairBarrier, start: PartStart, x: T
     return torch.where(motion.free, torch.minimum(left, wish[:, motion.body]).clamp(min=0), 0.0)
 
 
+def _plane_colliders(surface: ContactSurface, points: Tensor, dhat: float) -> Tensor:
+    """Plane colliders as data of a FloorBarrier, [B, 7 planes]. points: Of all colliders [B, Vc, 3] [m]."""
+    first = surface.planes.long() - surface.body_order.shape[0]
+    a, b, c = (points[:, corner] for corner in first.unbind(1))
+    normal = torch.linalg.cross(b - a, c - a)
+    normal = normal / normal.square().sum(-1, keepdim=True).sqrt().clamp(min=_tiny(points))
+    rest = torch.zeros_like(normal[..., :1])
+    return torch.cat([normal, (normal * a).sum(-1, keepdim=True), rest, rest + dhat, rest], -1).flatten(1)
+
+
 class Rooms(NamedTuple):
     """How far the vertices of bodies may go until pairs are found again."""
 
@@ -139,8 +149,9 @@ def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass:
         most = room.amax(1, keepdim=True) if surface.bodies else room.new_zeros((motion.scenes, 1))
         return torch.cat([room, most], 1)
 
-    # What a floor stops on its way is left to the sweeps: they press and bend it.
-    planes = x.new_empty((0,)) if floor is None else floor
+    # What a plane stops on its way is left to the sweeps: they press and bend it.
+    planes = torch.cat([_plane_colliders(surface, now, barrier.dhat), *([] if floor is None else [
+        broadcast(floor.detach(), (motion.scenes, floor.shape[1]))])], 1)  # fmt: skip
     above, above_rigid = (share_above_floor(planes, origin, x, way, surface)[:, body, None] for way in (move, rigid))
     stopped = motion.largest((1 - above) * move).clamp(max=surface.most_own_room)
 
