@@ -153,6 +153,8 @@ class FloorBarrier(VertexEnergy):
     def __post_init__(self) -> None:
         normal, height = _numbers("normal", self.normal), _numbers("height", self.height).reshape(-1)
         normal = normal[None] if normal.dim() == 1 else normal
+        if height.shape[0] == 0:
+            fail("height", "at least one value", "none")
         if normal.dim() != 2 or normal.shape[-1] != 3 or normal.shape[0] == 0:
             fail("normal", "3 numbers, or a sequence of such triples", f"shape {tuple(normal.shape)}")
         if bool((normal.norm(dim=-1) == 0).any()):

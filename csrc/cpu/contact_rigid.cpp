@@ -69,7 +69,7 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, double* center, do
   const int32_t n = in.bodies();
   for (int32_t k = 0; k < n; ++k) {
     const Body<T> body{in.scene, scene, k};
-    double mass = 0, g6[kUnknowns] = {}, block[rigid::kSix] = {};
+    double mass = 0, spread = 0, g6[kUnknowns] = {}, block[rigid::kSix] = {};
     Vector sum{};
     for (int32_t i = 0; i < body.size(); ++i) {
       const double m = body.mass(body.vertex(i));
@@ -84,13 +84,15 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, double* center, do
       Vector g;
       Sym3<double> H;
       vertex_press(in, body, v, g, H);
-      rigid::add_vertex(body.position(v) - c, g, H, g6, block);
+      const Vector arm = body.position(v) - c;
+      rigid::add_vertex(arm, g, H, g6, block);
+      spread += body.mass(v) * dot(arm, arm);
     }
     const MatrixPart own(matrix, n, together, k, k);
     std::copy_n(g6, kUnknowns, gradient + kUnknowns * k);
     for (int i = 0; i < kUnknowns; ++i) {
       for (int j = 0; j < kUnknowns; ++j) own(i, j) = block[rigid::at6(std::max(i, j), std::min(i, j))];
-      own(i, i) += free ? kLeastMass * mass : 1;
+      own(i, i) += free ? kLeastInertia * (i < 3 ? spread : mass) : 1;
     }
   }
   each_press(in, scene, false, [&](const PairPress& a, bool) { add_press(a, n, together, center, gradient, matrix); });

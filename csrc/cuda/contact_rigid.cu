@@ -51,13 +51,16 @@ __global__ void __launch_bounds__(kThreads)
   const double mass = sums[0];
   const bool free = in.free[k] && 0 < mass, together = in.together();
   const Vector c = 0 < mass ? (1 / mass) * Vector{sums[1], sums[2], sums[3]} : Vector{};
-  double total[kUnknowns + rigid::kSix];
-  team.template sum<kUnknowns + rigid::kSix>(free ? body.size() : 0, total, [&](int32_t i, double* out) {
+  constexpr int kOwn = kUnknowns + rigid::kSix;
+  double total[kOwn + 1];  // and the sum of m r^2
+  team.template sum<kOwn + 1>(free ? body.size() : 0, total, [&](int32_t i, double* out) {
     const int32_t v = body.vertex(i);
     Vector g;
     Sym3<double> H;
     vertex_press(in, body, v, g, H);
-    rigid::add_vertex(body.position(v) - c, g, H, out, out + kUnknowns);
+    const Vector arm = body.position(v) - c;
+    rigid::add_vertex(arm, g, H, out, out + kUnknowns);
+    out[kOwn] += body.mass(v) * dot(arm, arm);
   });
   // each lane has one number of the pairs' part
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
@@ -72,18 +75,18 @@ __global__ void __launch_bounds__(kThreads)
           const int side = a.body[0] == k ? 0 : 1;
           if (lane < kUnknowns) {
             own += a.gradient(side, lane, c);
-          } else if (lane < kUnknowns + rigid::kSix) {
+          } else if (lane < kOwn) {
             own += borne(a, together) * a.block(side, i, j, c);
           }
         });
   }
   __syncthreads();
-  if (lane < kUnknowns + rigid::kSix) part[warp][lane] = own;
+  if (lane < kOwn) part[warp][lane] = own;
   __syncthreads();
-  if (threadIdx.x >= kUnknowns + rigid::kSix) return;
+  if (threadIdx.x >= kOwn) return;
   double sum = 0;
 #pragma unroll
-  for (int e = 0; e < kUnknowns + rigid::kSix; ++e) {
+  for (int e = 0; e < kOwn; ++e) {
     if (e == lane) sum = total[e];
   }
   for (int w = 0; w < kWarps; ++w) sum += part[w][lane];
@@ -93,7 +96,7 @@ __global__ void __launch_bounds__(kThreads)
     return;
   }
   const MatrixPart to(matrix + in.matrix_size() * scene, n, together, k, k);
-  if (i == j) sum += free ? kLeastMass * mass : 1;
+  if (i == j) sum += free ? kLeastInertia * (i < 3 ? total[kOwn] : mass) : 1;
   to(i, j) = to(j, i) = sum;
 }
 

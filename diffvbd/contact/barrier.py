@@ -12,6 +12,7 @@ from ..checks import check_count, check_number, check_positive, fail
 from ..mask import CONTACT
 
 MOST_REACH = 1e6  # [m]; its square must be a number in float32
+LEAST_VELOCITY = 1e-12  # [m/s]; its square times that of a time step must be a number in float32
 
 
 def _scalars(energy: PairBarrier | Friction, like: Tensor) -> dict[str, Tensor]:
@@ -38,8 +39,8 @@ class PairBarrier:
         detections: R >= 1: how often pairs are searched within a step. Sweeps, prescribed vertices and moving colliders
             advance in R parts; what pairs have held up tries again in the next part.
         reach: Distance up to which pairs are searched [m] > dhat; a vertex goes at most (reach - dhat) / 2 between two
-            detections, beside the motion that bodies near each other share. None: that is 0.75 mean edges
-            of the surface, without self_contact 8.
+            detections, beside the motion that bodies near each other share. None: that is one mean edge of its body,
+            or 8 where a single body moves.
         capacity: Pairs that fit, per scene on average. None: as many as there are; on CUDA a step that found too little
             room runs again.
 
@@ -112,6 +113,8 @@ class Friction:
     def __post_init__(self) -> None:
         object.__setattr__(self, "coefficient", check_number("coefficient", self.coefficient))
         object.__setattr__(self, "velocity", check_positive("velocity", self.velocity, "m/s"))
+        if self.velocity < LEAST_VELOCITY:
+            fail("velocity", f"at least {LEAST_VELOCITY:g} m/s", self.velocity)
 
     def constants(self, like: Tensor) -> dict[str, Tensor]:
         return _scalars(self, like)

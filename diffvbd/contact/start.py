@@ -100,7 +100,7 @@ class PartStart(NamedTuple):
     center: Tensor  # [B, V, 3]  from where each vertex has its room [m]; a number, not a function of the start
     room: Tensor  # [B, V]  how far from there it may go [m]
     own: tuple  # the same beside the rigid motion of its body; empty where bodies have no pairs of their own
-    frames: Tensor | None  # [B, bodies]: share of its rigid motion that each body has gone
+    frames: Tensor | None  # [B, bodies]: share that pairs let each body go of its rigid motion above the floor
     short: Tensor  # [B, V] bool: pairs have held up more than a hundredth of its way
     stuck: Tensor  # [1] int64: pairs that hinder what is prescribed
     shares: Tensor  # [2, B, V]: of the two ways, that vertices went
@@ -108,6 +108,7 @@ class PartStart(NamedTuple):
 
 SHORT = 0.99  # share of a way that counts as all of it
 BENT = 0.1  # share of the room of its own that a body may bend by, whatever that does to its potential
+DEEP_BENT = 0.5  # the same of a body that planes or pairs hold up on its way as a whole, even if its potential falls
 KEPT = 0.9  # share of a gap above a floor that rigid motion may close
 DEEP, KEPT_DEEP = 0.1, 0.1  # part of dhat below which that is less, because sweeps open such a gap slowly
 ROUNDINGS = 8  # of the terms of a gap, below which its sign is not safe (Plane::guard in csrc/energies/floor_barrier.h)
@@ -116,11 +117,12 @@ PLANE, DHAT = 7, 5  # numbers of a plane of a FloorBarrier, and which of them is
 
 def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
                          planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface,
-                         rigid: Tensor | None, raises: Callable[[Tensor, Tensor], Tensor]) -> PartStart:  # fmt: skip
+                         rigid: Tensor | None, raises: Callable[[Tensor, Tensor], Tensor],
+                         own_pairs: bool) -> PartStart:  # fmt: skip
     """Every vertex as far along its way as pairs and floor let all go at once: by ``rigid`` each body as a whole, then
-    by what is left of ``move``, then by ``fall``. A way of its own bends a body. A free one goes it only where that
-    does not raise its potential, if pairs hold some of it up or, with self-contact, if it takes much of the room in
-    which the sweeps may take it back.
+    by what is left of ``move``, then by ``fall``. A way of its own bends a body. A free one does not go it where a floor
+    stops the body, and only where that does not raise its potential if pairs hold some of it up or, with self-contact,
+    if it takes much of the room in which the sweeps may take it back.
 
     Args:
         x, move, fall: [B, V, 3] [m].  mass: [1 | B, V] [kg].
@@ -128,8 +130,9 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         planes: Data of the FloorBarrier [1 | B, 7 planes], or None; differentiable as x, move, fall and mass.
         origin: [B, V, 3] or empty.  detection: of the step.
         rigid: Where rigid motions of bodies would take their vertices, as a way [B, V, 3] [m], differentiable; None
-            without self-contact.
+            without self-contact and floor.
         raises: Of two states [B, V, 3], which vertices are of a body whose potential is higher in the second [B, V].
+        own_pairs: Whether bodies have pairs of their own, and rooms for them.
     """
     floor = x.new_empty((0,)) if planes is None else planes
     index = (surface.held, surface.body, surface.body_order, surface.body_ptr, detection.island, detection.lowest)
@@ -161,17 +164,23 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         )
         return out[:, body]
 
-    free = least_of_body((~pinned[:, 0]).to(x.dtype)) > 0
+    def any_of_body(vertices: Tensor) -> Tensor:
+        return least_of_body((~vertices).to(x.dtype)) == 0
 
+    free = ~any_of_body(pinned[:, 0])
     target, base, frames, own = target_of(x, move, u), torch.where(pinned, x, x + carried), None, ()
+    stopped = held_up = torch.zeros_like(free)
     if rigid is not None:  # bodies first, each as a whole
+        beside = rigid - carried
+        above = above_floor(floor, origin, base, beside, pinned[:, 0], body, surface.bodies)
+        beside = above.way(beside, body)
         with torch.no_grad():
-            beside = rigid - carried
-            above = share_above_floor(floor, origin, base, beside, surface)
-            way = torch.where(pinned, move, carried + above[:, body, None] * beside)
-            frames = above * advance(x, way, u.detach(), x.detach(), whole=True)
-        base = torch.where(pinned, target, base + frames[:, body, None] * (rigid - carried))
-        own = (base.detach().contiguous(), detection.own_room[:, body].contiguous())
+            frames = advance(x, torch.where(pinned, move, carried + beside), u.detach(), x.detach(), whole=True)
+            stopped = above.stopped[:, body]
+            held_up = stopped | (frames[:, body] < SHORT)
+        base = torch.where(pinned, target, base + frames[:, body, None] * beside)
+        if own_pairs:
+            own = (base.detach().contiguous(), detection.own_room[:, body].contiguous())
     at = base
     for number in range(2):
         if number:
@@ -179,8 +188,11 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         with torch.no_grad():
             way, here, rests = target - at, torch.where(pinned, target, at), torch.zeros_like(free)
             if number == 0 and own:
-                far = way.square().sum(-1) > (BENT * own[1]) ** 2
-                rests = free & (least_of_body((~far).to(x.dtype)) == 0) & raises(here, target)
+                square = way.square().sum(-1)
+                bends, deep = (any_of_body(square > (part * own[1]) ** 2) for part in (BENT, DEEP_BENT))
+                rests = (bends & raises(here, target)) | (deep & held_up)
+            if number == 0 and rigid is not None:
+                rests = free & (rests | stopped)
                 way = torch.where(rests[..., None], 0.0, way)
             share = torch.where(rests, 0.0, advance(at, way, still, center, own=own))
             if number == 0:
@@ -192,25 +204,51 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
                     share = torch.where(bent | rests, 0.0, advance(at, way, still, center, own=own))
             shares.append(share)
         at = torch.where(pinned, target, at + share[..., None] * (target - at))
-    short = (torch.minimum(*shares) < SHORT) & ~pinned[:, 0]
+    short = (torch.minimum(*shares) < SHORT) & ~pinned[:, 0] & ~(free & stopped)  # what a floor stops does not try again
     return PartStart(at, center, room, own, frames, short, sum(stuck[1:], stuck[0]), torch.stack(shares))
 
 
-def share_above_floor(floor: Tensor, origin: Tensor, at: Tensor, way: Tensor, surface: ContactSurface) -> Tensor:
-    """How much of a way [B, V, 3] the vertices of each body can go together above a floor, [B, bodies]. Not
-    differentiable."""
-    out = at.new_ones((at.shape[0], surface.bodies))
+class AboveFloor(NamedTuple):
+    """What a floor leaves of the way of each body as a whole: ``share`` of it, and beside that a ``shift`` off the floor."""
+
+    share: Tensor  # [B, bodies]; 1 but between planes that a shift does not suit
+    shift: Tensor  # [B, bodies, 3] [m]
+    stopped: Tensor  # [B, bodies] bool: it loses more than a hundredth of what a vertex moves toward a plane
+
+    def way(self, way: Tensor, body: Tensor) -> Tensor:
+        """What is left of ways [B, V, 3] of vertices of these bodies [V]."""
+        return self.share[:, body, None] * way + self.shift[:, body]
+
+
+def above_floor(floor: Tensor, origin: Tensor, at: Tensor, way: Tensor, held: Tensor, body: Tensor, bodies: int
+                ) -> AboveFloor:  # fmt: skip
+    """How bodies go ways [B, V, 3] as wholes above a floor: shifted along its normals until no vertex closes more than a
+    part of its gap, which leaves sliding and turning as they are. Differentiable, evenly where several vertices decide.
+
+    held, body: Of each vertex [V], whether something else moves it, and the number of its body.
+    """
+    scenes, ones = at.shape[0], at.new_ones((at.shape[0], bodies))
     if not floor.numel():
-        return out
-    planes = floor.detach().reshape(floor.shape[0], 1, -1, PLANE)
-    normal, p = planes[..., :3].transpose(-1, -2), (at + origin if origin.numel() else at).detach()
-    gap, toward = (p[:, :, None] @ normal)[:, :, 0] - planes[..., 3], -(way.detach()[:, :, None] @ normal)[:, :, 0]
-    size = (p.abs()[:, :, None] @ normal.abs())[:, :, 0] + planes[..., 3].abs()
+        return AboveFloor(ones, ones[..., None].expand(-1, -1, 3) * 0, ones < 1)
+    planes = floor.reshape(floor.shape[0], 1, -1, PLANE)
+    normal, p = planes[:, 0, :, :3], at + origin if origin.numel() else at
+    gap, toward = p @ normal.mT - planes[..., 3], -(way @ normal.mT)  # [B, V, P]
+    size = (p.abs() @ normal.abs().mT + planes[..., 3].abs()).detach()
     gap, deep = (gap - ROUNDINGS * torch.finfo(at.dtype).eps * size).clamp(min=0), DEEP * planes[..., DHAT]
-    gap = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
-    share = torch.where(toward > 0, gap / toward, 1.0).amin(-1).clamp(0, 1)
-    share = torch.where(surface.held[: at.shape[1]], 1.0, share)
-    return out.scatter_reduce(1, surface.body[: at.shape[1]].long().expand(share.shape), share, "amin")
+    room = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
+    index = body[:, None].expand(gap.shape)
+
+    def of_bodies(values: Tensor, start: float, reduction: str) -> Tensor:
+        return values.new_full((scenes, bodies, values.shape[-1]), start).scatter_reduce(1, index, values, reduction)
+
+    closes = (toward > room) & ~held[:, None]
+    shift = of_bodies(torch.where(closes, toward - room, 0.0), 0.0, "amax") @ normal
+    share = of_bodies(torch.where(closes, room / torch.where(closes, toward, 1.0), 1.0), 1.0, "amin").amin(-1)
+    with torch.no_grad():
+        left, least = toward - (shift @ normal.mT)[:, body], 8 * torch.finfo(at.dtype).eps * toward.abs()
+        good = of_bodies(((left <= room + least) | held[:, None]).to(at.dtype), 1.0, "amin").amin(-1) > 0
+        stopped = share < SHORT
+    return AboveFloor(torch.where(good, 1.0, share), torch.where(good[..., None], shift, 0.0), stopped)
 
 
 ops.ready_signature(_Translation, _TranslationBackward, _Target, _TargetBackward)

@@ -21,7 +21,7 @@ CAPACITY_PER_VERTEX, LEAST_CAPACITY = 16, 8192
 MOST_EDGES, MOST_EDGES_BETWEEN = 8.0, 1.0
 LEAST_EDGES_OWN, MOST_EDGES_OWN, MOST_EDGES_HELD = 0.2, 0.3, 0.75
 # Bodies of so few triangles may deform further: each of their edges is long beside the body, and has few neighbors.
-COARSE_TRIANGLES, MOST_EDGES_COARSE = 24, 0.5
+COARSE_TRIANGLES, MOST_EDGES_COARSE = 24, 2.0
 
 
 @dataclass(frozen=True, eq=False)

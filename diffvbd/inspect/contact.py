@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ..checks import check_count, fail
+from ..checks import check_count, check_readable, fail
 from ..contact.barrier import PairBarrier
 from ..contact.detection import intersections as find
 from ..contact.surface import build_surface
@@ -129,10 +129,11 @@ def intersections(model: Model, x: Tensor) -> Tensor:
 
     Raises:
         ValueError: For another shape, or positions that are not finite.
-        TypeError: For anything but a tensor of real numbers.
+        TypeError: For anything but a dense tensor of real numbers.
     """
     if not isinstance(x, Tensor):
         raise TypeError(f"x: expected a tensor, got {type(x).__name__}")
+    check_readable("x", x)
     if not x.is_floating_point():
         raise TypeError(f"x: expected real numbers, got dtype {x.dtype}")
     if x.shape[-2:] != (model.num_vertices, 3):

@@ -93,11 +93,8 @@ def forces(
     check_state(model, x, x)
     check_previous(model, previous, x, time_step)
     start = None if previous is None else previous[0]
-    where = {"x": x, "previous: x": start, "colliders": colliders, "colliders_before": colliders_before}
-    for value in where.values():
-        if isinstance(value, Tensor):
-            ops.not_batched(value)
-    refuse_non_finite(model, where)
+    _refuse_non_finite(model, {"x": x, "previous: x": start, "colliders": colliders,
+                               "colliders_before": colliders_before})  # fmt: skip
     given = widen(model, x, time_step, colliders, colliders_before, mu=0.0, lam=0.0, parameters=parameters)
     state = _contact_at(given, x, previous)
     lead, dtype = x.shape[:-2], x.dtype
@@ -118,6 +115,13 @@ def forces(
         colliders=shaped(*sums.colliders()),
         floors=shaped(*floors),
     )
+
+
+def _refuse_non_finite(model: Model, where: dict[str, Tensor | None]) -> None:
+    for value in where.values():
+        if isinstance(value, Tensor):
+            ops.not_batched(value)
+    refuse_non_finite(model, where)
 
 
 def _contact_at(given: Wide, x: Tensor, previous: tuple[Tensor, Tensor] | None) -> ContactState:
@@ -216,6 +220,8 @@ def reactions(
     """
     check_state(model, x, x)
     check_previous(model, previous, x, time_step)
+    state = {} if previous is None else {"previous: x": previous[0], "previous: v": previous[1]}
+    _refuse_non_finite(model, {"x": x, **state, "colliders": colliders, "colliders_before": colliders_before})
     given = widen(model, x, time_step, colliders, colliders_before, mu=mu, lam=lam, young=young, poisson=poisson,
                   rest_points=rest_points, density=density, parameters=parameters)  # fmt: skip
     prepared, h = given.prepared, given.prepared.settings.numbers.time_step
@@ -279,6 +285,7 @@ def stress(
     lead = x.shape[:-2]
     if not any(isinstance(energy, StableNeoHookean) for energy in model.energies):
         fail("model", "StableNeoHookean among its energies", "none")
+    _refuse_non_finite(model, {"x": x})
     given = widen(model, x, None, None, None, mu=mu, lam=lam, young=young, poisson=poisson, rest_points=rest_points)
     tets = given.model._topology[0]
     points = given.model._rest_points if rest_points is None else wide(rest_points)

@@ -33,7 +33,7 @@ class Part(NamedTuple):
     shares: Tensor  # [2, B, V]: of the two ways of the start, that each vertex goes
     corrections: Tensor  # [1 | 2, B, bodies]: of the rigid motions before and after the sweeps, that each body takes
     limits: Tensor | None = None  # [K, B, V]: of each update, that planes let through
-    frames: Tensor | None = None  # [B, bodies]: of the rigid motions of the start; None: there are none
+    frames: Tensor | None = None  # [B, bodies]: that pairs let go of the rigid motions of the start; None: none
     # sets of bodies [B, moving bodies], and which of these took combinations, bool [combinations, B, moving bodies]
     combined: Any = None
     lengths: Tensor | None = None  # [corrections, B, bodies of the coarse space]: of coarse corrections
@@ -299,6 +299,30 @@ def _rigid(scene: Scene, x: Tensor, move: Tensor) -> Tensor:
 
 
 SHORT = 0.99  # share of a way that counts as all of it
+KEPT, DEEP, KEPT_DEEP = 0.9, 0.1, 0.1  # of a gap; of dhat, and of a gap below that
+
+
+def above_floor(floor: FloorBarrier, model: Any, x: Tensor, way: Tensor) -> tuple[Tensor, Tensor]:
+    """What the floor leaves of the ways [..., 3, V] of bodies as wholes, and which vertices are of bodies that it stops
+    [..., V]."""
+    lead, out, stopped = x.shape[:-2], way, torch.zeros_like(x[..., 0, :], dtype=torch.bool)
+    deep, gap = DEEP * floor.dhat, floor.gap(x)  # [..., planes, V]
+    room = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
+    normal = floor.normal.expand(*lead, *floor.normal.shape[-3:])  # [..., planes, 3, 1]
+    toward = -(normal * way.unsqueeze(-3)).sum(-2)
+    for number in range(int(model.body.max()) + 1):
+        own = (model.body == number) & ~model.pinned
+        if not bool(own.any()):
+            continue
+        off, left = toward[..., own] - room[..., own], room[..., own] / toward[..., own].clamp(min=1e-300)
+        shift = (off.amax(-1).clamp(min=0)[..., None, None] * normal).sum(-3)  # [..., 3, 1]
+        share = torch.where(off > 0, left, 1.0).amin((-2, -1))
+        past = off - (normal * shift.unsqueeze(-3)).sum(-2)
+        good = (past <= 1e-12 * toward[..., own].abs()).all(-1).all(-1)[..., None, None]
+        mine = torch.where(good, way + shift, share[..., None, None] * way)
+        out = torch.where(model.body == number, mine, out)
+        stopped = stopped | ((model.body == number) & (share < SHORT)[..., None])
+    return out, stopped
 
 
 def contact_step(
@@ -361,6 +385,7 @@ def contact_step(
     start = corner_points(x_prev, begin)
     coasting = torch.where(pinned, y, x_prev + time_step * v.transpose(-1, -2))
     way, lift, state = coasting - x_prev, y - coasting, x_prev
+    free = torch.zeros(int(model.body.max()) + 1).to(x).index_add(0, model.body, pinned.to(x))[model.body] == 0
     left = way
     for r, part in enumerate(parts):
         before, now = (begin + (n / count) * (end - begin) for n in (r, r + 1))
@@ -371,6 +396,7 @@ def contact_step(
         if model.starts_from == "inertia":
             fall = torch.zeros_like(fall)
         u, at = Translation(scene, part, state, move, floor).u, state
+        stopped = torch.zeros_like(x[..., 0], dtype=torch.bool)
         for wanted, by, share in ((move, u, part.shares[0]), (fall, torch.zeros_like(u), part.shares[1])):
             base, share = at + by, share.reshape(*x.shape[:-2], 1, -1).to(at)
             target = at + wanted
@@ -378,7 +404,10 @@ def contact_step(
                 target = base + started(energies, base, target - base)
             if by is u and part.frames is not None:
                 frames = part.frames.to(at)[:, model.body].reshape(*x.shape[:-2], 1, -1)
-                base = base + frames * (_rigid(scene, state, move) - u)
+                beside = _rigid(scene, state, move) - u
+                if floor is not None:
+                    beside, stopped = above_floor(floor, model, base, beside)
+                base = base + frames * beside
             at = torch.where(pinned, at + wanted, base + share * (target - base))
         forces: list[Any] = [PairBarrier(scene, listed[r], now), LaggedPairForces(scene, listed[0], start, now)]
         correct = Correction(scene, energies, forces, y, x_prev)
@@ -388,7 +417,7 @@ def contact_step(
             swept = partial(run_sweeps, scene, [*energies, *forces], masses, y)
             state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, part)
             state = correct(state, part.corrections[1])
-        short = (part.shares.amin(0) < SHORT).reshape(*x.shape[:-2], 1, -1) & ~pinned
+        short = (part.shares.amin(0) < SHORT).reshape(*x.shape[:-2], 1, -1) & ~pinned & ~(stopped & free).unsqueeze(-2)
         left = torch.where(short, x_prev + way + lift - state, 0.0)
     x_new = state.transpose(-1, -2).contiguous()
     return x_new, (x_new - x) / time_step

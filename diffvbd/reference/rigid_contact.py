@@ -9,7 +9,7 @@ from .distance import EDGE_EDGE
 from .energies import StableNeoHookean
 from .scene import Scene
 
-LEAST_STIFFNESS = 1e-11  # of its mass, that keeps the system of a body definite
+LEAST_INERTIA = 1e-11  # of its mass and sum of m r^2, that keeps the system of a body definite
 
 
 class Correction:
@@ -51,7 +51,9 @@ class Correction:
             g, matrix = self._add(term.pairs, term.turns_its_body, force, stiffness, jacobian, g, matrix)
         free = self.free.to(x.device)
         both = (free[:, None] & free)[..., None, None]
-        fill = torch.where(free, LEAST_STIFFNESS * total, 1.0)[..., None, None] * torch.eye(6).to(x)
+        spread = torch.zeros_like(total).index_add(1, self.body, mass * arm.square().sum(-1))
+        least = torch.stack([spread] * 3 + [total] * 3, -1)  # turn, shift
+        fill = torch.where(free[:, None], LEAST_INERTIA * least, 1.0)[..., None] * torch.eye(6).to(x)
         matrix = torch.where(both, matrix, 0.0).index_put((_scenes(len(share), at), at, at), fill, accumulate=True)
         system = matrix.permute(0, 1, 3, 2, 4).reshape(len(share), 6 * self.count, -1)
         right = torch.where(free[:, None], -g, 0.0).reshape(len(share), -1, 1)

@@ -32,12 +32,13 @@ def checks_contact(asked: bool | None, model: Model, x: Tensor, steps: int) -> b
     return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and WARNED not in model._derived
 
 
-def cut_share(model: Model) -> float:
-    """Share of the vertices that pairs held up in the Model's latest step [-], of the worst scene."""
+def cut_share(model: Model) -> Tensor:
+    """Share of the vertices that pairs held up in the Model's latest step [-], of the worst scene; a number on the
+    Model's device, which is not waited for."""
     outcome = outcomes.get(model)
     if outcome is None or outcome.cut.numel() == 0 or model.num_active == 0:
-        return 0.0
-    return float(outcome.cut.sum(-1).max()) / model.num_active
+        return torch.zeros((), device=model.device)
+    return outcome.cut.sum(-1).amax() / model.num_active
 
 
 def unbalanced_friction(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
@@ -63,17 +64,22 @@ def unbalanced_friction(model: Model, before: tuple[Tensor, Tensor], x: Tensor, 
             return 0.0
 
 
-def warn_of_contact(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared, given: dict[str, Any]
-                    ) -> None:  # fmt: skip
-    """Warns (UserWarning) of the step that a rollout ended with; the caller's caller is shown. Arguments as above."""
-    cut = cut_share(model)
+def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
+                    given: dict[str, Any]) -> None:  # fmt: skip
+    """Warns (UserWarning) of the steps of a rollout; the caller's caller is shown.
+
+    cuts: cut_share() after each step. The others: of the last step, as above.
+    """
+    shares = torch.stack(cuts).tolist()
+    cut = max(shares)
     left = unbalanced_friction(model, before, x, prepared, given)
     if cut > CUT or left > UNBALANCED_FRICTION:
         model._derived[WARNED] = True
     if cut > CUT:
         warnings.warn(
-            f"pair_barrier: pairs held up {100 * cut:.2g} % of the vertices in the last step, which lost velocity; "
-            "take a smaller time_step, more detections or a larger reach of the PairBarrier (docs/contact.md)",
+            f"pair_barrier: pairs held up {100 * cut:.2g} % of the vertices in step {shares.index(cut)}, which lost "
+            f"velocity and momentum, and more than {100 * CUT:.2g} % in {sum(s > CUT for s in shares)} of {len(shares)} "
+            "steps; take a smaller time_step, more detections or a larger reach of the PairBarrier (docs/contact.md)",
             UserWarning,
             stacklevel=3,
         )

@@ -30,7 +30,7 @@ from ..step.integrators import (
 )
 from ..step.intersections import check_start as refuse_start
 from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
-from .contact_check import checks_contact, warn_of_contact
+from .contact_check import checks_contact, cut_share, warn_of_contact
 
 # these enter through prepare(), the others through advance()
 _STATIC = ("mu", "lam", "young", "poisson", "rest_points", "density")
@@ -177,6 +177,7 @@ def rollout(
     bar = _Progress(steps) if progress else None
     errors: dict[int, ErrorEstimate] = {}  # by step: a segment that runs again finds them
     last: list[Any] = []  # what the last step went from, and to
+    cuts: list[Tensor] = []  # of each step, for the warning of contact
     looks = checks_contact(check_contact, model, x, steps)
 
     outer = x
@@ -194,6 +195,8 @@ def rollout(
             if estimate_errors and k not in errors:
                 loads = {name: solve.given[name] for name in _LOADS}
                 errors[k] = error_of(model, solve.x, solve.v, solve.prepared, **loads)
+            if looks and not last:  # not in a segment that runs again
+                cuts.append(cut_share(model))
             if looks and k + 1 == steps and not last:
                 last.extend(((solve.x, solve.v), x, solve.prepared, solve.given))
             if save == "all" or k + 1 == steps or (save != "last" and (k + 1) % save == 0):
@@ -208,7 +211,7 @@ def rollout(
         segment, steps, (x, v, *(history[:3] if history else ())), every if torch.is_grad_enabled() else None
     )
     if last:
-        warn_of_contact(model, *last)
+        warn_of_contact(model, cuts, *last)
         last[:] = [None]  # of no use any more: no tape is held, and a segment that runs again keeps nothing
     frames = ([] if save == "last" and steps > 0 else [(0, x, v)]) + done.frames
     return Trajectory(

@@ -54,7 +54,7 @@ def _near_pairs(model: Model, begun: Begun, prepared: Prepared, way: Tensor, bef
     rows = torch.arange(len(kind), device=way.device)
     w = [ways[scene, c] for c in corner]
     edges = kind == EDGE_EDGE
-    most = torch.zeros_like(way[0, 0, 0]).expand(len(kind))
+    most = way.new_zeros(len(kind))
     for i, j, of in ((0, 1, ~edges), (0, 2, None), (0, 3, None), (1, 2, edges), (1, 3, edges)):  # across the sides
         square = (w[i] - w[j]).square().sum(-1)
         most = torch.maximum(most, square if of is None else torch.where(of, square, 0))

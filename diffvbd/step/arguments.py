@@ -15,6 +15,7 @@ from .. import ops, reference
 from ..adjoint.routes import Adjoint, ReverseSweep, Unrolled
 from ..checks import check_broadcast, check_count, check_tensor, check_time_step, fail, name_value, to_float
 from ..contact.barrier import Friction, PairBarrier
+from ..contact.colliders import MOST_LENGTH
 from ..energies import VERTEX_ENERGIES
 from ..model.model import Model
 from ..model.moduli import moduli_of
@@ -215,6 +216,9 @@ def collider_state(model: Model, x: Tensor, end: Any, start: Any) -> tuple[Tenso
         if count == 0:
             fail(name, "a Model with colliders", "one without")
         value = check_broadcast(name, check_tensor(name, value, x), (*lead, count, 3), len(lead))
+        if looks_at(value):
+            far = torch.isfinite(value) & (value.abs() > MOST_LENGTH)
+            name_value(name, f"coordinates of at most {MOST_LENGTH:g} m", torch.where(far, value, 0.0), ~far)
         given[name] = ops.broadcast(value, (*lead, count, 3)).reshape(flat)
     if not model.touches:
         return None

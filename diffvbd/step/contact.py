@@ -16,7 +16,7 @@ from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
 from ..adjoint.rise import rise_parts, rises
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
-from ..contact.start import PartStart, start_between_planes
+from ..contact.start import PartStart, above_floor, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
@@ -184,6 +184,7 @@ class ContactStep:
         lift = torch.where(pinned, 0.0, broadcast(self.begun.lift, self.begun.y.shape))
         x, way = self.x_prev, self.begun.y - self.x_prev - lift
         left, met = way, Met(x)
+        whole_first = barrier.self_contact or self.floor_data is not None
         for r, sweeps in enumerate(sweeps_of_parts(settings.sweeps, self.parts)):
             was, now = (self._colliders_at(n / self.parts) for n in (r, r + 1))
             # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
@@ -202,8 +203,8 @@ class ContactStep:
                                           self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
             fall = fall if self.model.starts_from == "predictor" else torch.zeros_like(fall)  # corrections do it
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
-                                         detection, surface, rigid if barrier.self_contact else None,
-                                         self._raises)  # fmt: skip
+                                         detection, surface, rigid if whole_first else None, self._raises,
+                                         barrier.self_contact)  # fmt: skip
             met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
             if self._reads(x):
                 self._check(r, met.counts[r].tolist(), met)
@@ -242,7 +243,7 @@ class ContactStep:
 
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
         """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
-        x = self.begun.x_start
+        x = self._start_on_floor()
         room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
         start = PartStart(x, x.detach(), room, (), None, room > 0, none.ptr[:1].long(),
                           x.new_ones((2, *room.shape)))  # fmt: skip
@@ -253,6 +254,19 @@ class ContactStep:
             x, _ = self._corrected(swept.x, self.colliders, start, none)
             record_parts(self.model, x, [swept])
         return x
+
+    def _start_on_floor(self) -> Tensor:
+        """Where the sweeps start [B, V, 3]: free bodies go as wholes, above the floor. If each vertex went as far as
+        the floor lets it by itself, the start would press a body that hits the floor."""
+        x, start = self.x_prev, self.begun.x_start
+        if self.floor_data is None:
+            return start
+        _, _, free, held, body = bodies_of(self.model)
+        body, way = body[: x.shape[1]].long(), self.begun.y - x
+        if self.model.starts_from == "inertia":
+            way = way - self.begun.lift
+        left = above_floor(self.floor_data, self.origin, x, way, held[: x.shape[1]], body, len(free))
+        return torch.where(free[body, None], x + left.way(way, body), start)
 
     def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> tuple[Tensor, Tensor]:
         """x after the rigid correction of all bodies that are free, and the share of its motion that each took."""

@@ -192,7 +192,13 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
         carried = history.moved / (2 * time_step)
         return last_solve(x, v + (v - history.v) / 3, carried, 2 / 3)
     x1, v1, _ = solve(x, v, _over(whole, GAMMA), _at_share(given, x, GAMMA))
-    return last_solve(x1, v + (1 + math.sqrt(2)) * (v1 - v), math.sqrt(2) * v1, GAMMA)
+    feasible, carried = x1, math.sqrt(2) * v1
+    if euler is not None:
+        # x1 keeps bodies apart that all are there; beside one that is still at x, all begin at x
+        mixed = euler.any(-1)[..., None, None]
+        feasible = torch.where(mixed, x, x1)
+        carried = torch.where(mixed, carried + (x1 - x) / (GAMMA * time_step), carried)
+    return last_solve(feasible, v + (1 + math.sqrt(2)) * (v1 - v), carried, GAMMA)
 
 
 def _over(whole: Prepared, share: float) -> Prepared:

@@ -20,7 +20,7 @@ def check_start(model: Model, x: Tensor, colliders: Any, colliders_before: Tenso
         x: [..., V, 3] [m].  colliders, colliders_before: As given to the rollout.
         moving: Whether ``colliders`` change from step to step, so that the first of them are not the start.
     """
-    if model.surface_of_contact is None or torch.compiler.is_compiling():
+    if model.surface_of_contact is None or x.numel() == 0 or torch.compiler.is_compiling():
         return
     if torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore[reportAttributeAccessIssue]
         return  # the step says that there are no transforms of it

@@ -84,7 +84,10 @@ def step_forward(
         if isinstance(value, (int, float)) and not isinstance(value, bool):
             value = torch.tensor(to_float(name, value), dtype=model.dtype, device=model.device)
         if not isinstance(value, Tensor):
-            fail("wrt", "names of given tensors", f"{full!r}, which is {type(value).__name__}")
+            named = {**{k: values[k] for k in _ARGUMENTS if k in values}, **parameters}
+            known = [k for k, v in named.items() if isinstance(v, (Tensor, float)) or type(v) is int]
+            known += [f"history.{k}" for k, v in before.items() if isinstance(v, Tensor)]
+            fail("wrt", f"names of given tensors ({', '.join(known)})", f"{full!r}, which is {type(value).__name__}")
         check_tensor(full, value, model._mass)
         place[name] = inputs[full] = value.detach().requires_grad_()
     values["parameters"] = parameters or None

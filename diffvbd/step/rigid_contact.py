@@ -26,7 +26,8 @@ from ..ops import broadcast, no_second_derivative, no_transforms, of_inputs
 from ..ops import contact_rigid as ops_rigid
 from .rigid_terms import Scenes, pair_terms, vertex_blocks, vertex_gradient
 
-LEAST_MASS = 1e-11  # of a body's mass, that keeps its system definite; twin of kLeastMass in csrc/contact/rigid.h
+# of a body's mass and sum of m r^2, that keeps its system definite; twin of kLeastInertia in csrc/contact/rigid.h
+LEAST_INERTIA = 1e-11
 _FIELDS = len(ops.TouchingFields._fields)
 
 
@@ -163,7 +164,9 @@ def _virtual_work(s: Scenes, p: Tensor, q: Tensor, arm: Tensor, whole: Tensor, b
     own, blocks = vertex_gradient(s) + mass * at_q, vertex_blocks(s)
     if blocks is not None:
         own = own + (blocks @ at_q[..., None])[..., 0]
-    work = (at_p * own).sum() + LEAST_MASS * (whole * (p * q).sum(-1)).sum()
+    spread = sum_segments(mass * arm.square().sum(-1, keepdim=True), f.order, f.ptr, body)
+    least = (p * q * torch.cat([spread.expand(*whole.shape, 3), whole[..., None].expand(*whole.shape, 3)], -1)).sum()
+    work = (at_p * own).sum() + LEAST_INERTIA * least
     rest = torch.zeros_like(f.collider)
     at_p, at_q = torch.cat([at_p, rest], 1), torch.cat([at_q, rest], 1)
     for terms in pair_terms(s):

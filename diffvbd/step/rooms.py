@@ -11,13 +11,16 @@ from ..adjoint.contact_lag import Pairs, pair_lag, sum_at_corners
 from ..adjoint.sums import sum_segments
 from ..contact import detection as search
 from ..contact.barrier import PairBarrier
-from ..contact.start import PartStart, share_above_floor
+from ..contact.start import PartStart, above_floor
 from ..contact.surface import ContactSurface
 from ..model.model import Model
 from ..ops import broadcast
 
 ROOM = 1.5  # how far a vertex may go, over how far the farthest of its body wants to
 LEAST_ROOM = 1.0  # of dhat, beside that: as far as a barrier that starts compressed may push
+
+
+LEAST_INERTIA = 1e-9  # added to the inertia of a body, over its trace, lest one collapsed to a line has none across it
 
 
 def _tiny(x: Tensor) -> float:
@@ -61,15 +64,17 @@ class Motion:
         arm, (scenes, bodies) = self.arm, self.mean.shape[:2]
         moment = torch.cat([torch.linalg.cross(arm, self.move), (arm[..., None] * arm[..., None, :]).flatten(-2)], -1)
         sums = _by_body(self.weight * moment, self.surface)
-        spread = sums[..., 3:].unflatten(-1, (3, 3))
-        size = spread.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        # over its size, since the determinant of an inertia in kg m^2 may be no number in single precision
+        size = sums[..., 3::4].sum(-1, keepdim=True)
+        sums = sums / torch.where(size > 0, size, 1.0)
         eye = torch.eye(3, dtype=arm.dtype, device=arm.device)
-        a, b, c = ((1 + 1e-9) * size * eye - spread).unbind(-2)  # of the inertia, which is symmetric
+        least = max(LEAST_INERTIA, torch.finfo(arm.dtype).eps)
+        a, b, c = ((1 + least) * eye - sums[..., 3:].unflatten(-1, (3, 3))).unbind(-2)  # of the inertia: symmetric
         adjugate = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2)
         determinant = (a * adjugate[..., 0, :]).sum(-1, keepdim=True)
         turn = (adjugate * sums[..., :3, None]).sum(-2) / determinant.clamp(min=_tiny(arm))
         held = self.longest(broadcast((~self.free).to(arm.dtype), arm.shape[:2])) > 0
-        keep = (~held & (determinant[..., 0] > 0)).reshape(scenes, bodies, 1)
+        keep = (~held & (determinant[..., 0] > 0) & (size[..., 0] > 0)).reshape(scenes, bodies, 1)
         turn, mean = (torch.where(keep, t, 0.0)[:, self.body] for t in (turn, self.mean))
         return mean + torch.linalg.cross(turn, arm)
 
@@ -152,8 +157,10 @@ def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass:
     # What a plane stops on its way is left to the sweeps: they press and bend it.
     planes = torch.cat([_plane_colliders(surface, now, barrier.dhat), *([] if floor is None else [
         broadcast(floor.detach(), (motion.scenes, floor.shape[1]))])], 1)  # fmt: skip
-    above, above_rigid = (share_above_floor(planes, origin, x, way, surface)[:, body, None] for way in (move, rigid))
-    stopped = motion.largest((1 - above) * move).clamp(max=surface.most_own_room)
+    left, left_rigid = (
+        above_floor(planes, origin, x, way, ~motion.free, body, surface.bodies).way(way, body) for way in (move, rigid)
+    )
+    stopped = motion.largest(move - left).clamp(max=surface.most_own_room)
 
     def room_beside(u: Tensor) -> Tensor:
         room = ROOM * motion.largest(move - u[:, body]) + bends + falls + stopped
@@ -175,7 +182,7 @@ def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass:
     own = torch.zeros_like(room)
     if barrier.self_contact:
         least = room.clamp(max=surface.least_own_room)
-        own = (ROOM + 1) * (motion.largest(move - above_rigid * rigid) + motion.stretched(rigid)) + falls
+        own = (ROOM + 1) * (motion.largest(move - left_rigid) + motion.stretched(rigid)) + falls
         own = own.clamp(max=surface.most_own_room)
         own = torch.maximum(torch.maximum(own, least), driven)
     return Rooms(islands(room), with_largest(room), with_largest(own))

@@ -46,6 +46,22 @@ def test_motion_that_pairs_held_up_is_warned_of() -> None:
     assert contact_check.cut_share(model) > contact_check.CUT
 
 
+def test_motion_that_pairs_held_up_in_any_step_is_warned_of() -> None:
+    """An impact is over in a step or two, and the momentum that it lost is lost."""
+    large, small = dv.mesh.cube(4, size=0.2), dv.mesh.cube(4, size=0.12).translate((0.21, 0.03, 0.05))
+    model = dv.Model(dv.mesh.join([large, small]), energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e3)))
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    v[64:, 0] = -5.0
+    options: dict[str, Any] = {"mu": 8e3, "lam": 1e4, "time_step": 1 / 60, "sweeps": 10, "gravity": (0.0, 0.0, 0.0)}
+    shares, end = [], (x, v)
+    for _ in range(10):
+        end = dv.step(model, *end, **options)
+        shares.append(float(contact_check.cut_share(model)))
+    assert max(shares) > contact_check.CUT > shares[-1]
+    (text,) = messages(lambda: dv.rollout(model, x, v, steps=10, **options))
+    assert f"in step {shares.index(max(shares))}, which lost velocity and momentum" in text
+
+
 def test_friction_that_has_not_converged_is_warned_of() -> None:
     model, x, v = sliding(coefficient=0.5, velocity=1e-4)
     stiff: dict[str, Any] = {"mu": 1e5, "lam": 2e5, "time_step": 0.01}
