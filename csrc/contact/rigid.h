@@ -16,7 +16,7 @@ constexpr int kTries = 5;         // of motions, each half as long for some bodi
 constexpr int kSpreads = 4;       // how often a shorter motion is handed on to the bodies that one touches
 constexpr double kRise = 1e-9;    // of the potential, that counts as none
 constexpr double kLeastInertia = 1e-11;  // of a body's mass and sum of m r^2, that keeps its system definite
-constexpr int kUnknowns = 6;          // of a body: a turn and a shift
+constexpr int kUnknowns = 6;             // of a body: a turn and a shift
 
 template <class T>
 struct RigidInputs {

@@ -16,6 +16,7 @@ from ..ops import contact_start as ops_contact_start
 from ..ops import detect as ops_contact
 from ..ops import no_second_derivative, not_batched
 from ..safeguards import FILTER_ETA
+from .above_floor import SHORT, above_floor
 from .surface import ContactSurface
 
 
@@ -106,13 +107,8 @@ class PartStart(NamedTuple):
     shares: Tensor  # [2, B, V]: of the two ways, that vertices went
 
 
-SHORT = 0.99  # share of a way that counts as all of it
 BENT = 0.1  # share of the room of its own that a body may bend by, whatever that does to its potential
 DEEP_BENT = 0.5  # the same of a body that planes or pairs hold up on its way as a whole, even if its potential falls
-KEPT = 0.9  # share of a gap above a floor that rigid motion may close
-DEEP, KEPT_DEEP = 0.1, 0.1  # part of dhat below which that is less, because sweeps open such a gap slowly
-ROUNDINGS = 8  # of the terms of a gap, below which its sign is not safe (Plane::guard in csrc/energies/floor_barrier.h)
-PLANE, DHAT = 7, 5  # numbers of a plane of a FloorBarrier, and which of them is dhat
 
 
 def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
@@ -120,9 +116,9 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
                          rigid: Tensor | None, raises: Callable[[Tensor, Tensor], Tensor],
                          own_pairs: bool) -> PartStart:  # fmt: skip
     """Every vertex as far along its way as pairs and floor let all go at once: by ``rigid`` each body as a whole, then
-    by what is left of ``move``, then by ``fall``. A way of its own bends a body. A free one does not go it where a floor
-    stops the body, and only where that does not raise its potential if pairs hold some of it up or, with self-contact,
-    if it takes much of the room in which the sweeps may take it back.
+    by what is left of ``move``, then by ``fall``. A way of its own bends a body. A free one that a floor stops does not
+    go it; one of which pairs hold some up, or that with self-contact takes much of the room in which the sweeps may
+    take it back, goes it only where that does not raise its potential.
 
     Args:
         x, move, fall: [B, V, 3] [m].  mass: [1 | B, V] [kg].
@@ -204,51 +200,10 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
                     share = torch.where(bent | rests, 0.0, advance(at, way, still, center, own=own))
             shares.append(share)
         at = torch.where(pinned, target, at + share[..., None] * (target - at))
-    short = (torch.minimum(*shares) < SHORT) & ~pinned[:, 0] & ~(free & stopped)  # what a floor stops does not try again
+    short = (
+        (torch.minimum(*shares) < SHORT) & ~pinned[:, 0] & ~(free & stopped)
+    )  # what a floor stops does not try again
     return PartStart(at, center, room, own, frames, short, sum(stuck[1:], stuck[0]), torch.stack(shares))
-
-
-class AboveFloor(NamedTuple):
-    """What a floor leaves of the way of each body as a whole: ``share`` of it, and beside that a ``shift`` off the floor."""
-
-    share: Tensor  # [B, bodies]; 1 but between planes that a shift does not suit
-    shift: Tensor  # [B, bodies, 3] [m]
-    stopped: Tensor  # [B, bodies] bool: it loses more than a hundredth of what a vertex moves toward a plane
-
-    def way(self, way: Tensor, body: Tensor) -> Tensor:
-        """What is left of ways [B, V, 3] of vertices of these bodies [V]."""
-        return self.share[:, body, None] * way + self.shift[:, body]
-
-
-def above_floor(floor: Tensor, origin: Tensor, at: Tensor, way: Tensor, held: Tensor, body: Tensor, bodies: int
-                ) -> AboveFloor:  # fmt: skip
-    """How bodies go ways [B, V, 3] as wholes above a floor: shifted along its normals until no vertex closes more than a
-    part of its gap, which leaves sliding and turning as they are. Differentiable, evenly where several vertices decide.
-
-    held, body: Of each vertex [V], whether something else moves it, and the number of its body.
-    """
-    scenes, ones = at.shape[0], at.new_ones((at.shape[0], bodies))
-    if not floor.numel():
-        return AboveFloor(ones, ones[..., None].expand(-1, -1, 3) * 0, ones < 1)
-    planes = floor.reshape(floor.shape[0], 1, -1, PLANE)
-    normal, p = planes[:, 0, :, :3], at + origin if origin.numel() else at
-    gap, toward = p @ normal.mT - planes[..., 3], -(way @ normal.mT)  # [B, V, P]
-    size = (p.abs() @ normal.abs().mT + planes[..., 3].abs()).detach()
-    gap, deep = (gap - ROUNDINGS * torch.finfo(at.dtype).eps * size).clamp(min=0), DEEP * planes[..., DHAT]
-    room = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
-    index = body[:, None].expand(gap.shape)
-
-    def of_bodies(values: Tensor, start: float, reduction: str) -> Tensor:
-        return values.new_full((scenes, bodies, values.shape[-1]), start).scatter_reduce(1, index, values, reduction)
-
-    closes = (toward > room) & ~held[:, None]
-    shift = of_bodies(torch.where(closes, toward - room, 0.0), 0.0, "amax") @ normal
-    share = of_bodies(torch.where(closes, room / torch.where(closes, toward, 1.0), 1.0), 1.0, "amin").amin(-1)
-    with torch.no_grad():
-        left, least = toward - (shift @ normal.mT)[:, body], 8 * torch.finfo(at.dtype).eps * toward.abs()
-        good = of_bodies(((left <= room + least) | held[:, None]).to(at.dtype), 1.0, "amin").amin(-1) > 0
-        stopped = share < SHORT
-    return AboveFloor(torch.where(good, 1.0, share), torch.where(good[..., None], shift, 0.0), stopped)
 
 
 ops.ready_signature(_Translation, _TranslationBackward, _Target, _TargetBackward)

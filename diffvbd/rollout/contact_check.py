@@ -78,8 +78,9 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
     if cut > CUT:
         warnings.warn(
             f"pair_barrier: pairs held up {100 * cut:.2g} % of the vertices in step {shares.index(cut)}, which lost "
-            f"velocity and momentum, and more than {100 * CUT:.2g} % in {sum(s > CUT for s in shares)} of {len(shares)} "
-            "steps; take a smaller time_step, more detections or a larger reach of the PairBarrier (docs/contact.md)",
+            f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
+            f"{100 * CUT:.2g} %); take a smaller time_step, more detections or a larger reach of the PairBarrier "
+            "(docs/contact.md)",
             UserWarning,
             stacklevel=3,
         )

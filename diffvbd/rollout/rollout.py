@@ -129,10 +129,10 @@ def rollout(
         estimate_errors: Also return how far from converged each step ends (:class:`diffvbd.ErrorEstimate`). Each step
             is swept twice for it, the second time without a tape, once under every schedule; states and gradients are
             the same.
-        check_contact: Whether to warn (UserWarning) where pairs held up more than 1 % of vertices in the last step, or
-            it left more than 5 % of its friction unbalanced. None: on the CPU, after ten steps or more, until the Model
-            has warned. A look costs about a step and on CUDA waits for the device; nothing that is compiled or captured
-            is looked at.
+        check_contact: Whether to warn (UserWarning) where pairs held up more than 1 % of vertices in a step, or the
+            last one left more than 5 % of its friction unbalanced. None: on the CPU, after ten steps or more, until the
+            Model has warned. A look costs about a step and on CUDA waits for the device; nothing that is compiled or
+            captured is looked at.
         check_start: With a PairBarrier, raise where surfaces intersect at the start: edges through triangles, or
             vertices behind a Plane. Contact keeps apart what is apart, and no step notices what is not. It costs
             half of one detection and, on CUDA, waits for the device once. Under torch.compile, and while a CUDA graph

@@ -16,7 +16,7 @@ from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
 from ..adjoint.rise import rise_parts, rises
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
-from ..contact.start import PartStart, above_floor, start_between_planes
+from ..contact.start import PartStart, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
@@ -26,6 +26,7 @@ from ..scopes import checking, recorders
 from ..tuples import replaced
 from .coarse import factor_of
 from .contact_cycles import Combined, SweptPart, record_parts, sweeps_of_parts, swept_part
+from .floor_start import start_on_floor
 from .intersections import refuse_intersections
 from .rigid_contact import bodies_of, correct
 from .rooms import Motion, rooms, rooms_of_sweeps, unsupported
@@ -214,20 +215,19 @@ class ContactStep:
                 start = replaced(start, own=(start.own[0] + (x - start.x).detach(), start.own[1]))
             room = rooms_of_sweeps(motion, barrier, start, x, begin, wanted, rigid)
             near, kept = self._narrowed(detection.listed, x, now, room)
-            start = replaced(start, center=x.detach(), room=room)
+            swept_from = replaced(start, center=x.detach(), room=room)
             taken, limits, combined, lengths, cut = [first], None, None, None, start.short
             if sweeps:
                 part = replaced(settings, sweeps=sweeps)
-                swept = swept_part(self, x, start, now, near, part, policy, debug_step)
+                swept = swept_part(self, x, swept_from, now, near, part, policy, debug_step)
                 met.swept.append(swept)
                 x, limits, combined, lengths = swept
-                x, last = self._corrected(x, now, start, near)
+                x, last = self._corrected(x, now, start, detection.listed)
                 taken.append(last)
                 cut = limits[:, -1] > 0  # what the start has held up, sweeps may have made good
             met.cut = cut
             met.found[r] = replaced(detection, shares=start.shares, corrections=torch.stack(taken), limits=limits,
-                                              kept=kept, frames=start.frames, combined=combined,
-                                              lengths=lengths)  # fmt: skip
+                                    kept=kept, frames=start.frames, combined=combined, lengths=lengths)  # fmt: skip
             left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
         x = self._judged(x, met)
         for found in recorders():  # a step that is done again, with room for more pairs, counts once
@@ -243,7 +243,7 @@ class ContactStep:
 
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
         """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
-        x = self._start_on_floor()
+        x = start_on_floor(self.model, self.begun, self.floor_data)
         room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
         start = PartStart(x, x.detach(), room, (), None, room > 0, none.ptr[:1].long(),
                           x.new_ones((2, *room.shape)))  # fmt: skip
@@ -254,19 +254,6 @@ class ContactStep:
             x, _ = self._corrected(swept.x, self.colliders, start, none)
             record_parts(self.model, x, [swept])
         return x
-
-    def _start_on_floor(self) -> Tensor:
-        """Where the sweeps start [B, V, 3]: free bodies go as wholes, above the floor. If each vertex went as far as
-        the floor lets it by itself, the start would press a body that hits the floor."""
-        x, start = self.x_prev, self.begun.x_start
-        if self.floor_data is None:
-            return start
-        _, _, free, held, body = bodies_of(self.model)
-        body, way = body[: x.shape[1]].long(), self.begun.y - x
-        if self.model.starts_from == "inertia":
-            way = way - self.begun.lift
-        left = above_floor(self.floor_data, self.origin, x, way, held[: x.shape[1]], body, len(free))
-        return torch.where(free[body, None], x + left.way(way, body), start)
 
     def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> tuple[Tensor, Tensor]:
         """x after the rigid correction of all bodies that are free, and the share of its motion that each took."""

@@ -10,8 +10,9 @@ from torch import Tensor
 from ..adjoint.contact_lag import Pairs, pair_lag, sum_at_corners
 from ..adjoint.sums import sum_segments
 from ..contact import detection as search
+from ..contact.above_floor import above_floor
 from ..contact.barrier import PairBarrier
-from ..contact.start import PartStart, above_floor
+from ..contact.start import PartStart
 from ..contact.surface import ContactSurface
 from ..model.model import Model
 from ..ops import broadcast

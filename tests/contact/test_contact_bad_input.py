@@ -38,6 +38,7 @@ def raises(run: Callable[[], Any], name: str, got: str) -> None:
         ("kappa", -1.0, "-1"),
         ("kappa", NAN, "nan"),
         ("kappa", "stiff", "str"),
+        ("kappa", torch.tensor(3.0, requires_grad=True), "requires grad"),
         ("dhat", 0.0, "0"),
         ("dhat", -1.0, "-1"),
         ("dhat", INF, "inf"),
@@ -66,7 +67,7 @@ def test_pair_barrier(name: str, value: Any, got: str) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "got"),
     [("coefficient", -0.1, "-0.1"), ("coefficient", NAN, "nan"), ("coefficient", "rough", "str"),
-     ("velocity", 0.0, "0"), ("velocity", -1.0, "-1"), ("velocity", True, "bool")],
+     ("velocity", 0.0, "0"), ("velocity", -1.0, "-1"), ("velocity", True, "bool"), ("velocity", 1e-320, "1e-320")],
 )  # fmt: skip
 def test_friction(name: str, value: Any, got: str) -> None:
     raises(lambda: dv.Friction(**{name: value}), name, got)
@@ -98,6 +99,7 @@ def test_friction(name: str, value: Any, got: str) -> None:
         (lambda: colliders.Obstacle(TRIANGLE, [[0.0, 1.0, 2.0]]), "triangles", "float"),
         (lambda: colliders.Obstacle([[0.0, 0.0]], [[0, 0, 0]]), "points", "2"),
         (lambda: colliders.Obstacle(), "points", "object"),
+        (lambda: colliders.Sphere(torch.zeros(3, requires_grad=True)), "center", "requires grad"),
     ],
 )
 def test_colliders(make: Callable[[], Any], name: str, got: str) -> None:
@@ -143,6 +145,7 @@ def test_model(options: dict[str, Any], name: str, got: str) -> None:
         ({"colliders": [[0.0, 0.0, 0.0]]}, "colliders", "list"),
         ({"colliders_before": torch.zeros(4, 1, 3).double()}, "colliders_before", r"\[4, 1, 3\]"),
         ({"colliders_before": torch.zeros(1, 3).int()}, "colliders_before", "int32"),
+        ({"colliders_before": torch.full((1, 3), 1e10).double()}, "colliders_before", r"1e\+10"),
         ({"parameters": {"pair_barrier.dhat": 0.1}}, "parameters", "pair_barrier.dhat"),
         ({"parameters": {"friction.velocity": 0.1}}, "parameters", "friction.velocity"),
         ({"parameters": {"friction.coefficient": torch.ones(2).double()}}, "friction.coefficient", r"\[2\]"),
@@ -201,6 +204,8 @@ def test_rollout_and_contact_functions() -> None:
     raises(lambda: dv.contact.intersections(model, x[:5]), "x", r"\[5, 3\]")
     raises(lambda: dv.contact.intersections(model, x.long()), "x", "int64")
     raises(lambda: dv.contact.intersections(model, x.tolist()), "x", "list")
+    raises(lambda: dv.contact.intersections(model, x.to_sparse()), "x", "sparse")
+    raises(lambda: dv.contact.intersections(model, x.to("meta")), "x", "meta")
 
 
 def test_status_before_any_step() -> None:

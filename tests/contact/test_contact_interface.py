@@ -8,6 +8,7 @@ import pickle
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers.two_boxes import STEP, ball, two_boxes
@@ -115,6 +116,13 @@ def test_no_scenes_no_pairs_no_sweeps() -> None:
     none = x.new_zeros(0, 16, 3)
     assert dv.step(model, none, none, **STEP)[0].shape == (0, 16, 3)
     assert dv.contact.status(model).cut == []
+    for integrator in (dv.SDIRK2(), dv.BDF2()):
+        assert dv.step(model, none, none, integrator=integrator, **STEP)[0].shape == (0, 16, 3)
+    mu = none.new_ones((0, 1)).requires_grad_()
+    ran = dv.rollout(model, none, none, steps=2, **(STEP | {"mu": mu}))
+    assert torch.autograd.grad(ran.x.sum(), mu)[0].shape == (0, 1)
+    empty = dv.Model(dv.TetMesh(np.zeros((0, 3)), np.zeros((0, 4), np.int64)), energies=model.energies)
+    assert dv.rollout(empty, x[:0], x[:0], steps=1, **STEP).x.shape == (2, 0, 3)
     held = dv.Model(model.mesh, energies=model.energies, colliders=model.colliders, pinned=range(16))
     assert torch.equal(dv.step(held, x, 0 * x, **STEP)[0], x)
     assert dv.contact.status(held).pairs == 0

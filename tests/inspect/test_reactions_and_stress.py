@@ -153,6 +153,7 @@ def test_batches_and_float32(device: str, what: str) -> None:
         (lambda m, x: dv.reactions(m, x), "mu: expected"),
         (lambda m, x: dv.reactions(m, x[:3], **SOFT), r"x: expected shape \[..., 27, 3\]"),
         (lambda m, x: dv.reactions(m, x, previous=(x, 0 * x), **SOFT), "time_step: expected"),
+        (lambda m, x: dv.reactions(m, x, previous=(x, x / 0), time_step=0.1, **SOFT), "previous: v: expected finite"),
         (lambda m, x: dv.reactions(m, x, force=x[:3], **SOFT), "force: expected"),
         (lambda m, x: dv.reactions(m, x, gravity=(1.0, 2.0), **SOFT), "gravity: expected 3 numbers"),
         (lambda m, x: dv.reactions(m, x.float(), **SOFT), "x: expected dtype"),

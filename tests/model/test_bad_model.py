@@ -74,6 +74,7 @@ ENERGIES: list[tuple[str, Callable[[], Any], str]] = [
     *((n, lambda n=n: dv.FloorBarrier(**{n: True}), "bool|True") for n in ("kappa", "dhat", "damping")),
     *((n, lambda n=n: dv.FloorBarrier(**{n: None}), "None") for n in ("kappa", "dhat", "damping", "height", "normal")),
     ("dhat", lambda: dv.FloorBarrier(dhat=0.0), "0"),
+    ("height", lambda: dv.FloorBarrier(height=[]), "none"),
     ("normal", lambda: dv.FloorBarrier(normal=(0.0, 0.0, 0.0)), "0"),
     ("normal", lambda: dv.FloorBarrier(normal=(0.0, NAN, 0.0)), "nan"),
     ("normal", lambda: dv.FloorBarrier(normal=(0.0, 1.0)), "2"),

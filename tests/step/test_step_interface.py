@@ -261,7 +261,7 @@ def test_step_forward_keeps_a_tape_for_wrt_only(device: str) -> None:
         dv.step_backward(tape, torch.ones(2, 3, dtype=torch.float64, device=device))
     with pytest.raises((ValueError, TypeError), match="wrt.*force"):
         dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=("force",), **STEP)
-    with pytest.raises((ValueError, TypeError), match="wrt.*stiffness"):
+    with pytest.raises((ValueError, TypeError), match="wrt.*x, v, mu.*stiffness"):
         dv.step_forward(model, x, v, mu=1e4, lam=2e4, wrt=("stiffness",), **STEP)
 
 
