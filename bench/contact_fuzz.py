@@ -2,8 +2,8 @@
 
 Bodies of a mesh start at random turns, thrown at each other at up to 60 m/s, with vertices that move on their own, on a
 floor, among colliders that move, with anything between one sweep and eight; every fifth batch in single precision,
-every fourth with coarse corrections. Every step of every scene is looked at by the exact test of
-`dv.contact.intersections`.
+every fourth with coarse corrections, every seventh with SDIRK2 and another with BDF2. Every step of every scene is
+looked at by the exact test of `dv.contact.intersections`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from diffvbd import mesh
 SCENES, BATCH, STEPS = 2000, 40, 6
 SPEEDS = (2.0, 10.0, 60.0)  # [m/s]
 DHAT = 2e-3  # [m]
+INTEGRATORS = {1: dv.SDIRK2(), 4: dv.BDF2()}  # by seed modulo 7
 
 
 def _bodies(rng: np.random.Generator) -> list[dv.TetMesh]:
@@ -72,14 +73,16 @@ def _crossings(seed: int, device: str) -> tuple[int, int, int, float]:
     model, x, v = s["model"], s["x"], s["v"]
     crossings = lost = 0
     cut, points = [], model.collider_points
+    integrator, history = INTEGRATORS.get(seed % 7, dv.ImplicitEuler()), None
     for step in range(STEPS):
         given: dict[str, Any] = {}
         if len(points):  # it comes down on them
             before, points = points, points - points.new_tensor([0.0, 0.01 * (step % 3), 0.0])
             given = {"colliders": points, "colliders_before": before}
         try:
-            x, v = dv.step(model, x, v, mu=s["modulus"], lam=s["modulus"], time_step=s["time_step"], sweeps=s["sweeps"],
-                           **given)  # fmt: skip
+            x, v, *past = dv.step(model, x, v, mu=s["modulus"], lam=s["modulus"], time_step=s["time_step"],
+                                  sweeps=s["sweeps"], integrator=integrator, history=history, **given)  # fmt: skip
+            history = past[0] if past else None
         except ValueError as error:  # what is prescribed leaves bodies no way: said, not done
             if "leaves bodies a way" not in str(error):
                 raise

@@ -85,9 +85,7 @@ def check_count(name: str, value: Any, minimum: int = 0, maximum: int | None = N
 
 
 def check_number(name: str, value: Any) -> float:
-    """A finite number >= 0. A tensor that requires grad is no number: its gradient would be lost."""
-    if isinstance(value, Tensor) and value.requires_grad:
-        raise TypeError(f"{name}: expected a number, got a tensor that requires grad: here it is not differentiable")
+    """A finite number >= 0."""
     if isinstance(value, Tensor) and value.numel() == 1:
         value = value.detach().item()
     if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
@@ -108,6 +106,8 @@ def check_positive(name: str, value: Any, unit: str = "") -> float:
 
 def check_time_step(value: Any, dtype: torch.dtype) -> float:
     """h [s] > 0, with an h^2 that dtype can hold: with less, forces and masses would vanish from a step."""
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise TypeError("time_step: expected a number, got a tensor that requires grad: it is not differentiable")
     h, limits = check_positive("time_step", value, "s"), torch.finfo(dtype)
     if not limits.tiny <= h * h <= limits.max:
         fail("time_step", f"a number of seconds whose square lies between {limits.tiny:.1e} and {limits.max:.1e}", h)

@@ -36,8 +36,6 @@ _NONE = np.zeros(0, np.int64)
 
 def _place(name: str, value: Any, shape: tuple[int | None, ...] = (3,)) -> NDArray[np.float64]:
     """Coordinates [m]."""
-    if getattr(value, "requires_grad", False):
-        raise TypeError(f"{name}: expected numbers, got a tensor that requires grad: give step(colliders=) its points")
     out = float_array(name, value, shape)
     if out.size and np.abs(out).max() > MOST_LENGTH:
         fail(name, f"coordinates of at most {MOST_LENGTH:g} m", f"{out.flat[np.abs(out).argmax()]:g}")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..contact.above_floor import above_floor
+from ..contact.above_floor import DHAT, PLANE, above_floor
 from ..model.model import Model
+from ..ops import broadcast
 from .predict import Begun
 from .rigid_contact import bodies_of
 
@@ -21,9 +22,22 @@ def start_on_floor(model: Model, begun: Begun, floor: Tensor | None) -> Tensor:
     if floor is None:
         return start
     _, _, free, held, body = bodies_of(model)
-    body, way = body.long(), begun.y - x
-    if model.starts_from == "inertia":
-        way = way - begun.lift
+    body, lift = body.long(), broadcast(begun.lift, x.shape)
+    way = begun.y - x - lift
+    if model.starts_from != "inertia":
+        way = way + _borne(floor, x if begun.origin is None else x + begun.origin, lift, body, len(free))
     origin = x.new_empty((0,)) if begun.origin is None else begun.origin
     left = above_floor(floor, origin, x, way, held, body, len(free))
     return torch.where(free[body, None], x + left.way(way, body), start)
+
+
+def _borne(floor: Tensor, x: Tensor, lift: Tensor, body: Tensor, bodies: int) -> Tensor:
+    """``lift`` = h^2 a [B, V, 3] without what pushes a body into a plane within dhat, which bears it. Of a body at rest
+    nothing is left, on a slope what draws it down the slope."""
+    planes = floor.reshape(floor.shape[0], 1, -1, PLANE)
+    normal = planes[:, 0, :, :3]
+    with torch.no_grad():
+        close = (x @ normal.mT - planes[..., 3] < planes[..., DHAT]).to(x.dtype)
+        near = close.new_zeros((len(x), bodies, close.shape[-1]))
+        near = near.scatter_reduce(1, body[:, None].expand(close.shape), close, "amax")[:, body]
+    return lift - (near * (lift @ normal.mT).clamp(max=0)) @ normal

@@ -181,7 +181,7 @@ BAD_FORWARD: list[tuple[dict[str, Any], str]] = [
     ({"wrt": "mu", "mu": 10**400}, "mu: .*1329 bits"),
     ({"wrt": "mu", "mu": torch.ones(48).double().to_sparse()}, "mu: .*to_dense"),
     ({"wrt": 3}, "wrt: expected names of arguments, got 3"),
-    ({"wrt": ("young",)}, "wrt: expected names of given tensors, got 'young'"),
+    ({"wrt": ("young",)}, r"wrt: expected names of given tensors \(x, v, mu, lam\), got 'young'"),
     ({"wrt": ("heat",)}, "wrt: .*'heat'"),
     ({"parameters": [1]}, "parameters: expected a dict of tensors by name, got list"),
 ]
