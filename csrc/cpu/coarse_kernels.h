@@ -21,9 +21,10 @@ __attribute__((flatten)) void gradient_of_blocks(const Plan& plan, const SceneVi
   }
 }
 
+// GCC 12 crashes where it vectorizes straight-line code of this function.
 template <class T, int mask>
-__attribute__((flatten)) void reverse_gradient_of_blocks(const Plan& plan, const SceneView<T>& s,
-                                                         const StepParameters<T>& q, int64_t begin, int64_t end) {
+__attribute__((flatten, optimize("no-tree-slp-vectorize"))) void reverse_gradient_of_blocks(
+    const Plan& plan, const SceneView<T>& s, const StepParameters<T>& q, int64_t begin, int64_t end) {
   using R = Lanes<T>;
   using Set = EnergySet<mask>;
   for (int64_t block = begin; block < end; ++block) {

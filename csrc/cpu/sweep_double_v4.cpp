@@ -3,6 +3,7 @@
 #ifdef DIFFVBD_HAS_SETS
 #pragma GCC target("arch=x86-64-v4")
 #define DIFFVBD_SET v4
+#define DIFFVBD_UPPER_HALVES
 #include "sweep_kernels.h"
 
 template diffvbd::Kernels<double> diffvbd::v4::sweep_kernels<double>();

@@ -3,6 +3,7 @@
 #ifdef DIFFVBD_HAS_SETS
 #pragma GCC target("arch=x86-64-v3")
 #define DIFFVBD_SET v3
+#define DIFFVBD_UPPER_HALVES
 #include "sweep_kernels.h"
 
 template diffvbd::Kernels<float> diffvbd::v3::sweep_kernels<float>();
