@@ -86,6 +86,7 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
         )
     if left > UNBALANCED_FRICTION:
         faster = ', coarse="auto"' if model.coarse is None else ""
+        faster += ", acceleration=dv.Anderson(5)" if model.acceleration is None else ""
         warnings.warn(
             f"friction: {100 * left:.2g} % of it is not balanced in the last step: the sweeps have not converged; take "
             f"more sweeps, a smaller time_step{faster} or a larger Friction(velocity=) (docs/contact.md)",
