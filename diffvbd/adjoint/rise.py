@@ -42,7 +42,8 @@ def rise_parts(model: Model, fields: ops.SweepFields, time_step: float) -> RiseP
     fields = ops.SweepFields(*(t if t is None else t.detach().contiguous() for t in fields))  # pyright: ignore
     moving: MovingBodies = model._moving
     blocks, lanes = moving.tet.shape
-    scenes = min(fields.mu.shape[0], fields.lam.shape[0]) and max(fields.mu.shape[0], fields.lam.shape[0])
+    counts = fields.mu.shape[0], fields.lam.shape[0]
+    scenes = max(counts) if min(counts) else 0  # a modulus of no scenes leaves none
     material = fields.mu.new_empty((scenes, blocks, 2, lanes))
     for i, modulus in enumerate((fields.mu, fields.lam)):
         material[:, :, i] = modulus[..., None] if modulus.shape[1] == 1 else modulus[:, moving.tet]

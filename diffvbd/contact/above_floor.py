@@ -38,7 +38,7 @@ def above_floor(floor: Tensor, origin: Tensor, at: Tensor, way: Tensor, held: Te
     """
     scenes, ones = at.shape[0], at.new_ones((at.shape[0], bodies))
     if not floor.numel():
-        return AboveFloor(ones, ones[..., None].expand(-1, -1, 3) * 0, ones < 1)
+        return AboveFloor(ones, at.new_zeros((scenes, bodies, 3)), ones < 1)
     planes = floor.reshape(floor.shape[0], 1, -1, PLANE)
     normal, p = planes[:, 0, :, :3], at + origin if origin.numel() else at
     gap, toward = p @ normal.mT - planes[..., 3], -(way @ normal.mT)  # [B, V, P]

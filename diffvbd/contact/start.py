@@ -200,9 +200,8 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
                     share = torch.where(bent | rests, 0.0, advance(at, way, still, center, own=own))
             shares.append(share)
         at = torch.where(pinned, target, at + share[..., None] * (target - at))
-    short = (
-        (torch.minimum(*shares) < SHORT) & ~pinned[:, 0] & ~(free & stopped)
-    )  # what a floor stops does not try again
+    again = ~pinned[:, 0] & ~(free & stopped)  # what a floor stops does not try again
+    short = (torch.minimum(*shares) < SHORT) & again
     return PartStart(at, center, room, own, frames, short, sum(stuck[1:], stuck[0]), torch.stack(shares))
 
 

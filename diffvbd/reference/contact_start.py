@@ -58,7 +58,7 @@ class Translation:
 
 
 def unsupported(scene: Scene, pairs: Any, floor: FloorBarrier | None, x: Tensor, colliders: Tensor, lift: Tensor
-                 ) -> Tensor:  # fmt: skip
+                ) -> Tensor:  # fmt: skip
     """What barriers at the start of the step leave of the ways [..., 3, V] that bodies want to fall."""
     model, scenes, count = scene.model, len(colliders), int(scene.model.body.max()) + 1
     points = corner_points(x, colliders)

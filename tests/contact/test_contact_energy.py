@@ -105,7 +105,7 @@ def test_impacts_on_a_floor_gain_no_energy(young: float, time_step: float, sweep
     generator, floor = torch.Generator().manual_seed(0), dv.FloorBarrier(kappa=1e4, dhat=0.02)
     for _ in range(3):
         turn = torch.linalg.qr(torch.randn((3, 3), generator=generator, dtype=torch.float64))[0]
-        points = torch.from_numpy(cube.points) @ (turn * turn.det())
+        points = torch.tensor(cube.points) @ (turn * turn.det())
         mesh = dv.TetMesh((points + (0.05 - points[:, 1].min()) * up).numpy(), cube.tets)
         model, body = dv.Model(mesh, energies=(dv.StableNeoHookean(), floor, *SUPPORTED[beside])), dv.Model(mesh)
         x, v = model.rest_points, (-3.0 * up).expand(model.num_vertices, 3)
