@@ -52,7 +52,7 @@ GROUPS: dict[str, Group] = {
         for speed in (SPEEDS[1:2] if quick else SPEEDS)
     ],
     "crowd": lambda quick, device: [piles.crowd(2, 1, seconds=0.1, parts=2, device=device)] if quick else [
-        *(piles.crowd(device=device, detections=n) for n in (1, 2, 4)),
+        *(piles.crowd(device=device, detections=n) for n in (None, 1, 2, 4)),
         piles.crowd(seconds=2.5, parts=1, device=device),
     ],
     "balls": lambda quick, device: [piles.balls(2, seconds=0.2, device=device)] if quick else [

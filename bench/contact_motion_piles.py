@@ -137,7 +137,7 @@ def balls(count: int = 20, rise: float = 1.0, sweeps: int = 10, seconds: float =
 
 
 def crowd(per_side: int = 3, layers: int = 2, sweeps: int = 10, seconds: float = 0.5, parts: int = 50,
-          time_step: float = 1 / 60, device: str = "cpu", detections: int = 1) -> list[Row]:  # fmt: skip
+          time_step: float = 1 / 60, device: str = "cpu", detections: int | None = None) -> list[Row]:  # fmt: skip
     """The crowd of `bench contact`, of fewer bodies: the share of cut vertices, and the mean energy over that of steps
     of h / parts with one detection. Energy is kinetic, elastic and of gravity above the floor."""
     start = contact.crowd(per_side, layers)
@@ -154,7 +154,7 @@ def crowd(per_side: int = 3, layers: int = 2, sweeps: int = 10, seconds: float =
     v = torch.from_numpy(start.velocity).to(model.rest_points)
     scene, steps = Scene(model, MODULUS, time_step, sweeps, v=v, walls=walls), round(seconds / time_step)
     course = march(scene, steps)
-    case = f"{int(model.body.max()) + 1} bodies" + (f", {detections} detections" if detections > 1 else "")
+    case = f"{int(model.body.max()) + 1} bodies" + ("" if detections is None else f", detections={detections}")
     cut = float(np.mean(course.cut))
     rows = [row(course, "share of cut vertices", case, cut, 0.0, "<= 0.05", cut <= 0.05)]
     if parts > 1:

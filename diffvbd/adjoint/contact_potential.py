@@ -75,7 +75,7 @@ class StepContact:
         self.lag = None
         surface, barrier = model.surface_of_contact, model.contact
         if x_prev is not None and self.start is not None and surface is not None and barrier is not None:
-            first = before + (colliders - before) / barrier.detections
+            first = before + (colliders - before) / (barrier.detections or 1)
             near = near_pairs(x_prev, origin, before, first, surface, barrier)
             self.lag = lag_of(near, self.start, self._number("pair_barrier.kappa"))
 

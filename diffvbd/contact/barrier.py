@@ -37,7 +37,9 @@ class PairBarrier:
         between_bodies: Pairs of different bodies. Pairs with colliders always count.
         damping: Damping of approaching motion of pairs that started the step closer than dhat [N s/m].
         detections: R >= 1: how often pairs are searched within a step. Sweeps, prescribed vertices and moving colliders
-            advance in R parts; what pairs have held up tries again in the next part.
+            advance in R parts; what pairs have held up tries again in the next part. None: one, and up to
+            MOST_DETECTIONS in steps in which bodies want to go farther beside each other than ``reach`` lets them
+            (docs/contact.md); what is prescribed then moves in the first part.
         reach: Distance up to which pairs are searched [m] > dhat; a vertex goes at most (reach - dhat) / 2 between two
             detections, beside the motion that bodies near each other share. None: that is one mean edge of its body,
             or 8 where a single body moves.
@@ -62,7 +64,7 @@ class PairBarrier:
     self_contact: bool = True
     between_bodies: bool = True
     damping: float = 0.0
-    detections: int = 1
+    detections: int | None = None
     reach: float | None = None
     capacity: int | None = None
 
@@ -73,7 +75,8 @@ class PairBarrier:
         for name in ("self_contact", "between_bodies"):
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name}: expected a bool, got {type(getattr(self, name)).__name__}")
-        check_count("detections", self.detections, 1, 1000)
+        if self.detections is not None:
+            check_count("detections", self.detections, 1, 1000)
         if self.reach is not None and check_positive("reach", self.reach, "m") <= self.dhat:
             fail("reach", f"more than dhat = {self.dhat:g} m", self.reach)
         for name, length in (("dhat", self.dhat), ("reach", self.reach or 0.0)):

@@ -16,7 +16,7 @@ from ..contact.detection import intersections as find
 from ..contact.surface import build_surface
 from ..model.model import Model
 from ..scopes import record_to
-from ..step.contact import Detection, outcomes
+from ..step.met import Detection, outcomes
 from .forces import ForceParts, Forces, forces
 from .penalty import Bodies, center_of_mass_penalty
 

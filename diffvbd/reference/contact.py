@@ -227,7 +227,7 @@ def contact_step(
 ) -> tuple[Tensor, Tensor]:
     """One time step of a model with `model.contact`; every tensor argument is differentiable by autograd.
 
-    Arguments of `step`, and: parts, one for each of the `model.contact.detections` detections, scenes counted in
+    Arguments of `step`, and: parts, one for each detection, scenes counted in
     row-major order of x's leading dimensions; colliders and colliders_before: positions [..., Vc, 3] [m] of collider
     points at the end and at the start of the step, by default `model.collider_points` and `colliders`; order: one
     permutation of the pairs for each part, tet_order one of the tets: they change only the order of summation.
@@ -235,7 +235,8 @@ def contact_step(
     Raises ValueError when an unpinned vertex starts below a floor plane, or when parts or order have another length.
     Returns (x', v').
     """
-    count = model.contact.detections
+    count = model.contact.detections or len(parts)
+    stages = model.contact.detections or 1  # of what is prescribed
     for name, value in (("parts", parts), ("order", order)):
         if value is not None and len(value) != count:
             raise ValueError(f"{name}: expected one for each of {count} detections, got {len(value)}")
@@ -267,8 +268,8 @@ def contact_step(
     free = torch.zeros(int(model.body.max()) + 1).to(x).index_add(0, model.body, pinned.to(x))[model.body] == 0
     left = way
     for r, part in enumerate(parts):
-        before, now = (begin + (n / count) * (end - begin) for n in (r, r + 1))
-        move = left if count == 1 else torch.where(pinned, way / count, left)
+        before, now = (begin + min(1.0, n / stages) * (end - begin) for n in (r, r + 1))
+        move = left if stages == 1 else torch.where(pinned, way / stages, left)
         fall = lift if r == 0 else torch.zeros_like(lift)
         if r == 0:
             fall = lift = unsupported(scene, listed[0], floor, x_prev, before, lift)

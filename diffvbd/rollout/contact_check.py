@@ -12,7 +12,7 @@ from ..model.model import Model
 from ..scopes import looks_at
 from ..step.arguments import Prepared, acceleration_of, collider_state
 from ..step.balance import UNBALANCED_FRICTION, contact_of_step, friction_left_over, potential_of_step
-from ..step.contact import outcomes
+from ..step.met import outcomes
 from ..step.predict import begin
 
 CUT = 0.01  # share of the vertices that pairs may hold up before a rollout warns

@@ -19,8 +19,8 @@ from ..ops import SweepSettings
 from ..step.advance import advance, swept
 from ..step.arguments import GRAVITY, Prepared, acceleration_of, check_prescribed, check_state, collider_state, prepare
 from ..step.balance import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
-from ..step.contact import outcomes
 from ..step.integrators import History, Integrator, check_history, check_integrator, check_staged, take
+from ..step.met import outcomes
 from ..step.predict import Begun, begin
 from ..tuples import replaced
 

@@ -156,8 +156,8 @@ def accelerated_scalars(model: Model, sweeps: int) -> int:
 
 
 def _parts(model: Model, sweeps: int) -> list[int]:
-    """Sweeps of each part of a step: one for each detection of pairs."""
-    return sweeps_of_parts(sweeps, 1 if model.contact is None else model.contact.detections)
+    """Sweeps of each part of a step: one for each detection of pairs. More parts have fewer cycles, and need less."""
+    return sweeps_of_parts(sweeps, 1 if model.contact is None else model.contact.detections or 1)
 
 
 def _cpu_scratch(model: Model, scenes: int, material: bool, rest: bool) -> int:

@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -25,11 +24,12 @@ from ..ops.detect import CONSTANTS
 from ..scopes import checking, recorders
 from ..tuples import replaced
 from .coarse import factor_of
-from .contact_cycles import Combined, SweptPart, record_parts, sweeps_of_parts, swept_part
+from .contact_cycles import parts_of, record_parts, sweeps_of_parts, swept_part
 from .floor_start import start_on_floor
 from .intersections import refuse_intersections
+from .met import Detection, Met, Outcome, outcomes
 from .rigid_contact import bodies_of, correct
-from .rooms import Motion, rooms, rooms_of_sweeps, unsupported
+from .rooms import Motion, Rooms, rooms, rooms_of_sweeps, unsupported
 
 if TYPE_CHECKING:
     from .arguments import Prepared
@@ -49,53 +49,6 @@ class TooManyPairs(RuntimeError):
         self.needed = needed
 
 
-class Detection(NamedTuple):
-    """One search: which pairs are listed (``listed.pairs`` [capacity, 6]: four corner points, kind, scene), the nearest
-    pair of each corner point (``near_corners`` [B, N, 5], ``near_values`` [B, N, 8]: weights, normal, gap [m]), which
-    bodies move together (``island`` [B, bodies]). Index data; the step differentiates the values anew."""
-
-    listed: Pairs
-    near_corners: Tensor
-    near_values: Tensor
-    counts: Tensor
-    smallest: Tensor
-    island: Tensor
-    lowest: Tensor  # of a Model with a floor, else empty
-    room: Tensor  # [B, bodies + 1] [m]: how far the vertices of each body may go beside its island, and the largest
-    own_room: Tensor  # [B, bodies + 1] [m]: and beside the rigid motion of the body
-    # what the part has decided: the shares of the two ways of its start [2, B, V], of the corrections before and after
-    # its sweeps [1 | 2, B, bodies], and the exponents of limits [B, K, V]
-    shares: Tensor | None = None
-    corrections: Tensor | None = None
-    limits: Tensor | None = None
-    frames: Tensor | None = None  # and of the rigid motions of its start [B, bodies]
-    combined: Combined | None = None  # which combinations of its iterates were taken; None where there are none
-    lengths: Tensor | None = None  # of its coarse corrections [corrections, B, bodies of the coarse space]
-    kept: Tensor | None = None  # rows of listed pairs that its sweeps can reach; all where that would have to be read
-
-
-class Outcome(NamedTuple):
-    """What the latest step of a Model has met, on its device; read by diffvbd.contact.status."""
-
-    counts: Tensor  # [R, 4] int64: pairs needed, touching pairs, key of one or -1, pairs that hinder what is prescribed
-    capacity: int  # pairs of all scenes
-    cut: Tensor  # [B, V] bool: limited in the last sweep; without any, held up at the start
-    smallest: Tensor  # [R, B] [m]
-
-
-class Met:
-    """What the parts of a step meet one after another."""
-
-    def __init__(self, x: Tensor) -> None:
-        self.found: list[Detection] = []
-        self.counts: list[Tensor] = []
-        self.swept: list[SweptPart] = []
-        self.cut = torch.zeros_like(x[..., 0], dtype=torch.bool)
-
-
-outcomes: weakref.WeakKeyDictionary[Model, Outcome] = weakref.WeakKeyDictionary()
-
-
 class ContactStep:
     """What the parts of one step share."""
 
@@ -113,7 +66,7 @@ class ContactStep:
         floor = model.floor
         oblique = floor is not None and bool((np.count_nonzero(floor.normal, axis=-1) > 1).any())
         self.any_direction = oblique or "floor_barrier.normal" in prepared.parameters
-        self.parts = 1 if self.barrier is None else self.barrier.detections
+        self.parts: int | None = None if self.barrier is None else self.barrier.detections  # None: not decided yet
         like = begun.x_prev
         self.kappa = self._parameter("pair_barrier.kappa", like.new_zeros((1,)))
         self.lagged, self.lag = no_pairs(like, 0), like.new_zeros((0, 9))
@@ -186,14 +139,19 @@ class ContactStep:
         x, way = self.x_prev, self.begun.y - self.x_prev - lift
         left, met = way, Met(x)
         whole_first = barrier.self_contact or self.floor_data is not None
-        for r, sweeps in enumerate(sweeps_of_parts(settings.sweeps, self.parts)):
-            was, now = (self._colliders_at(n / self.parts) for n in (r, r + 1))
+        stages, r = self.parts or 1, 0  # of what is prescribed
+        while r < (self.parts or 1):
+            was, now = (self._colliders_at(min(1.0, n / stages)) for n in (r, r + 1))
             # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
-            move = left if self.parts == 1 else torch.where(pinned, way / self.parts, left)
+            move = left if stages == 1 else torch.where(pinned, way / stages, left)
             wanted = fall = lift if r == 0 else torch.zeros_like(lift)
             motion = Motion(surface, x, self.origin, self.fields.mass, move)
             rigid = motion.rigid()
-            detection = self.detect(x, was, now, motion, fall, rigid)
+            within = self._rooms(x, was, now, motion, fall, rigid)
+            if self.parts is None:
+                self.parts = 1 if x.is_cuda and torch.cuda.is_current_stream_capturing() else parts_of(within.over)
+            detection = self._detect(x, was, now, within)
+            sweeps = sweeps_of_parts(settings.sweeps, self.parts)[r]
             met.found.append(detection)
             met.counts.append(torch.cat([detection.counts[:3], detection.counts.new_zeros(1)]))
             if self._reads(x):  # before any work
@@ -229,6 +187,7 @@ class ContactStep:
             met.found[r] = replaced(detection, shares=start.shares, corrections=torch.stack(taken), limits=limits,
                                     kept=kept, frames=start.frames, combined=combined, lengths=lengths)  # fmt: skip
             left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
+            r += 1
         x = self._judged(x, met)
         for found in recorders():  # a step that is done again, with room for more pairs, counts once
             found.extend(met.found)
@@ -286,18 +245,25 @@ class ContactStep:
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
     def detect(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion, fall: Tensor, rigid: Tensor) -> Detection:
-        surface, barrier = self.surface, self.barrier
+        """The pairs that can matter on the way ``motion`` and ``fall`` from x."""
+        return self._detect(x, was, now, self._rooms(x, was, now, motion, fall, rigid))
+
+    def _rooms(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion, fall: Tensor, rigid: Tensor) -> Rooms:
+        assert self.barrier is not None
+        return rooms(motion, self.barrier, x, self.origin, self.fields.mass, was, now, fall, rigid, self.floor_data,
+                     self.any_direction)  # fmt: skip
+
+    @torch.no_grad()
+    def _detect(self, x: Tensor, was: Tensor, now: Tensor, within: Rooms) -> Detection:
+        surface, barrier, island = self.surface, self.barrier, within.island
         assert surface is not None and barrier is not None
-        with torch.no_grad():
-            x, was, now = x.detach(), was.detach(), now.detach()
-            island, room, own_room = rooms(motion, barrier, x, self.origin, self.fields.mass, was, now, fall, rigid,
-                                           self.floor_data, self.any_direction)  # fmt: skip
-            *index, corners, values, counts, smallest = search.detect(
-                x, self.origin, was, now, surface, barrier, self.capacity, room, own_room
-            )
-            lowest = island.new_empty((0,))
-            if self.floor_data is not None:
-                lowest = search.lowest(x, self.origin, self.floor_data.detach(), island, surface)
+        x, room, own_room = x.detach(), within.room, within.own_room
+        *index, corners, values, counts, smallest = search.detect(
+            x, self.origin, was.detach(), now.detach(), surface, barrier, self.capacity, room, own_room
+        )
+        lowest = island.new_empty((0,))
+        if self.floor_data is not None:
+            lowest = search.lowest(x, self.origin, self.floor_data.detach(), island, surface)
         return Detection(Pairs(*index), corners, values, counts, smallest, island, lowest, room, own_room)
 
     def _record(self, met: Met) -> None:

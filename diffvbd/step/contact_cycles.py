@@ -3,6 +3,7 @@ between these."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     from .contact import ContactStep
 
 
+MOST_DETECTIONS = 4  # in a step that nobody has given a number
+
+
 class Combined(NamedTuple):
     """What was combined in a part: the set of each body that moves [B, bodies], and which bodies took each combination,
     bool [combinations, B, bodies]. Index data."""
@@ -46,6 +50,13 @@ class SweptPart(NamedTuple):
 def sweeps_of_parts(sweeps: int, parts: int) -> list[int]:
     """How K sweeps are spread over R parts: evenly, the first ones taking what is left."""
     return [sweeps // parts + (1 if r < sweeps % parts else 0) for r in range(parts)]
+
+
+def parts_of(over: Tensor) -> int:
+    """How many parts a step takes that nobody has given a number: one, and one more each time that bodies want to go
+    twice as far as the most room that they get. over: of Rooms."""
+    most = float(over.max()) if over.numel() else 0.0
+    return min(MOST_DETECTIONS, 1 + math.ceil(math.log2(most))) if 1 < most < math.inf else 1
 
 
 def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, listed: Pairs, settings: SweepSettings,

@@ -126,6 +126,7 @@ class Rooms(NamedTuple):
     island: Tensor  # of each body [B, bodies] int32
     room: Tensor  # beside the island's translation, and the largest of the scene [B, bodies + 1] [m]
     own_room: Tensor  # beside the rigid motion of their own body, [B, bodies + 1] [m]
+    over: Tensor  # how far they want to go beside their island, over the most room that they get [B, bodies]
 
 
 @torch.no_grad()
@@ -179,14 +180,16 @@ def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass:
     same = (island[:, :, None] == island[:, None]) & (island >= 0)[:, None]
     joined = same.to(x.dtype) @ sums[..., :4]
     u = joined[..., :3] / joined[..., 3:].clamp(min=_tiny(x))
-    room = torch.maximum(room, room_beside(torch.where((island >= 0)[..., None], u, 0.0)))
+    u = torch.where((island >= 0)[..., None], u, 0.0)
+    room = torch.maximum(room, room_beside(u))
+    over = motion.largest(move - u[:, body]) / surface.most_room
     own = torch.zeros_like(room)
     if barrier.self_contact:
         least = room.clamp(max=surface.least_own_room)
         own = (ROOM + 1) * (motion.largest(move - left_rigid) + motion.stretched(rigid)) + falls
         own = own.clamp(max=surface.most_own_room)
         own = torch.maximum(torch.maximum(own, least), driven)
-    return Rooms(islands(room), with_largest(room), with_largest(own))
+    return Rooms(islands(room), with_largest(room), with_largest(own), over)
 
 
 def unsupported(model: Model, x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor, mass: Tensor, lift: Tensor,

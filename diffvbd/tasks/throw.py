@@ -9,7 +9,7 @@ simulated for twice the time with the walls of the box and the floor; the ball i
 
 Choices: the sheet is 3 cm thick, of 1e5 Pa, and stretched by 15 % along x: without that the ball sinks 3 cm deeper, and
 where it lands depends three times as strongly on the motion. The ball has a radius of 0.12 m and 3e4 Pa; both have 200
-kg/m^3. h = 1/200 s; K = 10 sweeps. dhat is 5 cm, more than contact itself needs, with two searches per step. The throw
+kg/m^3. h = 1/200 s; K = 10 sweeps. dhat is 5 cm, more than contact itself needs. The throw
 begins at once: where the ball first rests on the sheet for 0.3 s, without damping, 2 mm of the control points move the
 landing by 6 cm, and Adam gets no closer than 0.8 m. Walls are left out of the optimisation: the loss does not ask what
 comes after the opening. The sweeps start from the predictor, as in the paper's tasks.
