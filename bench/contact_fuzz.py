@@ -51,7 +51,7 @@ def _scenes(seed: int, device: str) -> dict[str, Any]:
     energies: tuple[Any, ...] = (
         dv.StableNeoHookean(),
         dv.PairBarrier(kappa=float(10 ** rng.uniform(2, 5)), dhat=DHAT, damping=float(rng.choice([0.0, 5.0])),
-                       detections=int(rng.integers(1, 3))),
+                       detections=(None, 1, 2)[rng.integers(3)]),
     )  # fmt: skip
     energies += (dv.Friction(float(rng.uniform(0, 0.8))),) if rng.random() < 0.6 else ()
     energies += (dv.FloorBarrier(kappa=1e4, dhat=DHAT),) if rng.random() < 0.6 else ()

@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+import diffvbd as dv
 from bench import contact_motion_piles as piles
 from bench import contact_motion_scenes as scenes
 from bench.common import markdown_table
@@ -44,7 +45,8 @@ GROUPS: dict[str, Group] = {
     ],
     "grip": lambda quick, device: [piles.grip(20, seconds=0.15, device=device)] if quick else [
         *(piles.grip(k, device=device) for k in (20, 40, 100, 400)),
-        *(piles.grip(k, device=device, coarse=True) for k in (8, 20, 40)),
+        *(piles.grip(k, device=device, faster={"coarse": "auto"}) for k in (8, 20, 40)),
+        *(piles.grip(k, device=device, faster={"acceleration": dv.Anderson(5)}) for k in (20, 40)),
     ],
     "gradient": lambda quick, device: [
         scenes.slide_gradient(surface, speed, device=device)
@@ -53,6 +55,8 @@ GROUPS: dict[str, Group] = {
     ],
     "crowd": lambda quick, device: [piles.crowd(2, 1, seconds=0.1, parts=2, device=device)] if quick else [
         *(piles.crowd(device=device, detections=n) for n in (None, 1, 2, 4)),
+        piles.crowd(sweeps=200, detections=8, device=device),
+        *(piles.crowd(parts=n, time_step=n / 3000, device=device) for n in (10, 5, 2)),
         piles.crowd(seconds=2.5, parts=1, device=device),
     ],
     "balls": lambda quick, device: [piles.balls(2, seconds=0.2, device=device)] if quick else [

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from dataclasses import replace
@@ -139,34 +140,43 @@ def balls(count: int = 20, rise: float = 1.0, sweeps: int = 10, seconds: float =
 def crowd(per_side: int = 3, layers: int = 2, sweeps: int = 10, seconds: float = 0.5, parts: int = 50,
           time_step: float = 1 / 60, device: str = "cpu", detections: int | None = None) -> list[Row]:  # fmt: skip
     """The crowd of `bench contact`, of fewer bodies: the share of cut vertices, and the mean energy over that of steps
-    of h / parts with one detection. Energy is kinetic, elastic and of gravity above the floor."""
-    start = contact.crowd(per_side, layers)
-    surface = start.mesh.surface
-    edges = start.mesh.points[surface] - start.mesh.points[surface[:, [1, 2, 0]]]
-    dhat = 0.05 * float(np.linalg.norm(edges, axis=-1).mean())
-    walls = tuple((tuple(float(c) for c in n), float(h)) for n, h in start.walls)
-    floor = dv.FloorBarrier([h for _, h in walls], [n for n, _ in walls], kappa=KAPPA, dhat=dhat)
-    model, single = (
-        dv.Model(start.mesh, device=device, energies=(
-            dv.StableNeoHookean(), pairs({"detections": count}, dhat=dhat), floor, dv.Friction(0.3)))
-        for count in (detections, 1)
-    )  # fmt: skip
-    v = torch.from_numpy(start.velocity).to(model.rest_points)
-    scene, steps = Scene(model, MODULUS, time_step, sweeps, v=v, walls=walls), round(seconds / time_step)
+    of h / parts with K = 10 and one detection. Energy is kinetic, elastic and of gravity above the floor."""
+    scene = replace(_crowd(per_side, layers, detections, device), time_step=time_step, sweeps=sweeps)
+    model, steps = scene.model, round(seconds / time_step)
     course = march(scene, steps)
     case = f"{int(model.body.max()) + 1} bodies" + ("" if detections is None else f", detections={detections}")
     cut = float(np.mean(course.cut))
     rows = [row(course, "share of cut vertices", case, cut, 0.0, "<= 0.05", cut <= 0.05)]
     if parts > 1:
-        fine = march(replace(scene, model=single).finer(parts), parts * steps, keep=parts)
+        fine = _fine_crowd(per_side, layers, round(parts / time_step), parts * steps, device)
         lift = float((GRAVITY * model.mass * model.rest_points[:, 1]).sum())
-        own, goal = ([e + lift for e in energy(c.scene, c)] for c in (course, fine))
+        same_times = replace(fine, x=fine.x[::parts], v=fine.v[::parts])
+        own, goal = ([e + lift for e in energy(c.scene, c)] for c in (course, same_times))
         ratio = float(np.mean(own) / np.mean(goal))
         rows.append(relative(course, f"mean energy / that of h / {parts}", case, ratio, 1.0, 0.1,
                              f"at the end {own[-1]:.4g} J beside {goal[-1]:.4g} J of {own[0]:.4g} J"))  # fmt: skip
         rows[-1]["crossings"] += fine.crossings
         rows[-1]["error"] = rows[-1]["error"] or fine.error
     return rows
+
+
+def _crowd(per_side: int, layers: int, detections: int | None, device: str) -> Scene:
+    start = contact.crowd(per_side, layers)
+    surface = start.mesh.surface
+    edges = start.mesh.points[surface] - start.mesh.points[surface[:, [1, 2, 0]]]
+    dhat = 0.05 * float(np.linalg.norm(edges, axis=-1).mean())
+    walls = tuple((tuple(float(c) for c in n), float(h)) for n, h in start.walls)
+    floor = dv.FloorBarrier([h for _, h in walls], [n for n, _ in walls], kappa=KAPPA, dhat=dhat)
+    barrier = pairs({"detections": detections}, dhat=dhat)
+    model = dv.Model(start.mesh, device=device, energies=(dv.StableNeoHookean(), barrier, floor, dv.Friction(0.3)))
+    v = torch.from_numpy(start.velocity).to(model.rest_points)
+    return Scene(model, MODULUS, 1 / 60, 10, v=v, walls=walls)
+
+
+@functools.cache
+def _fine_crowd(per_side: int, layers: int, rate: int, steps: int, device: str) -> Course:
+    """In steps of 1 / rate seconds."""
+    return march(replace(_crowd(per_side, layers, 1, device), time_step=1 / rate), steps)
 
 
 # --- flight and impact ------------------------------------------------------------------------------------------------
@@ -217,12 +227,12 @@ def impact(speed: float = 10.0, sweeps: int = 20, parts: int = 50, time_step: fl
 
 def grip(sweeps: int = 40, friction: float = 0.6, squeeze: float = 6e-4, seconds: float = 0.5,
          time_step: float = 1 / 240, device: str = "cpu", barrier: Options = None,
-         coarse: bool = False) -> Row:  # fmt: skip
+         faster: Options = None) -> Row:  # fmt: skip
     """Vertical force that a cube of 5 cm and 0.103 kg, held by friction alone, puts on its two clamps.
 
     The clamps are plates whose outer faces are pinned and move inward in 0.1 s, by squeeze beyond the start of the
     barrier. Gravity pulls the cube alone, so that the elastic force on the pinned faces is its weight, once at rest:
-    its mean over the last 0.1 s.
+    its mean over the last 0.1 s. faster: arguments of the Model.
     """
     size, thick, dhat = 0.05, 0.02, 2e-3
     cube, plate = mesh.box(3, size), mesh.box((2, 3, 3), (thick, 0.06, 0.06))
@@ -237,8 +247,7 @@ def grip(sweeps: int = 40, friction: float = 0.6, squeeze: float = 6e-4, seconds
     density[: cube.num_tets] = 0.103 / size**3
     energies = (dv.StableNeoHookean(), pairs(barrier, kappa=KAPPA, dhat=dhat, self_contact=False),
                 dv.Friction(friction))  # fmt: skip
-    space = dv.CoarseSpace() if coarse else None
-    model = dv.Model(body, density=density, pinned=outer, energies=energies, coarse=space, device=device)
+    model = dv.Model(body, density=density, pinned=outer, energies=energies, device=device, **(faster or {}))
     rest = model.rest_points
     inward = torch.zeros_like(rest)
     inward[n : n + m, 0], inward[n + m :, 0] = squeeze, -squeeze
@@ -257,9 +266,11 @@ def grip(sweeps: int = 40, friction: float = 0.6, squeeze: float = 6e-4, seconds
     fallen = float(course.center(-1, slice(n))[1] - course.center(0, slice(n))[1])
     weight = 0.103 * GRAVITY
     note = f"{up.min():.3g} to {up.max():.3g} N; pressed with {pressed:.3g} N; cube moved {1e3 * fallen:.3g} mm"
-    case = "steady grip, with corrections" if coarse else "steady grip"
+    case = ", with ".join(["steady grip", *(faster or {})])
     found = relative(course, "vertical force on the clamps [N]", case, float(up.mean()), weight, 0.05, note)
-    return found if sweeps >= 40 or coarse else found | {"target": "", "met": None}  # fewer are not expected to do
+    return (
+        found if sweeps >= 40 or (faster and "coarse" in faster) else found | {"target": "", "met": None}
+    )  # fewer are not expected to do
 
 
 def _pinned_load(model: dv.Model, x: Tensor) -> Array:
