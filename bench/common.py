@@ -104,6 +104,16 @@ def write(
     return path
 
 
+def earlier(path: Path | None, quick: bool, device: str, commit: str | None = None) -> dict[str, Any]:
+    """Groups that runs of the same kind on the same device, and of a commit if one is given, have left in a file."""
+    if path is None or not path.exists():
+        return {}
+    content = json.loads(path.read_text(encoding="utf-8"))
+    own = content["environment"]
+    same = content["quick"] == quick and own["device"] == device and commit in (None, own["commit"])
+    return content["results"] if same else {}
+
+
 def as_json(content: Any) -> str:
     """JSON with a line for each row of a table, so that it is short and a change of it can be read."""
     return _lines(content, "") + "\n"

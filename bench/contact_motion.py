@@ -4,6 +4,7 @@ Braking of a thin sheet and of a spin, sliding and its derivative, bodies at res
 Each row has a value, its reference, a target and whether it is met. "cut" is the mean share of vertices that
 pairs have held up; crossings are edges through triangles and vertices below a plane, counted at ten times of each
 rollout; "not finite" are coordinates and velocities. Milliseconds are of a step without its backward, one thread.
+`--only NAME,...` runs some groups; each is written as it ends, beside what earlier runs of the same commit have left.
 """
 
 from __future__ import annotations
@@ -11,11 +12,13 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
 
 import diffvbd as dv
+from bench import common
 from bench import contact_motion_piles as piles
 from bench import contact_motion_scenes as scenes
 from bench.common import markdown_table
@@ -82,22 +85,26 @@ GROUPS: dict[str, Group] = {
 }  # fmt: skip
 
 
-def run(quick: bool, device: str = "cpu", only: str | None = None) -> dict[str, Any]:
+def run(quick: bool, device: str = "cpu", only: str | None = None, out: Path | None = None) -> dict[str, Any]:
     chosen = list(GROUPS) if only is None else [name.strip() for name in only.split(",")]
     if unknown := [name for name in chosen if name not in GROUPS]:
         raise ValueError(f"only: expected groups among {', '.join(GROUPS)}, got {', '.join(unknown)}")
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the scenes are too small for two
-    out: dict[str, Any] = {}
+    suffix, environment = common.device_suffix(device), common.environment(device)
+    path = None if out is None else out / f"contact_motion{suffix}.json"
+    results = common.earlier(path, quick, environment["device"], environment["commit"])
     try:
         for name in chosen:
             began = time.perf_counter()
             rows = [row for made in GROUPS[name](quick, device) for row in (made if isinstance(made, list) else [made])]
-            out[name] = {"rows": rows, "seconds": time.perf_counter() - began}
-            print(f"{name}: {out[name]['seconds']:.1f} s", file=sys.stderr, flush=True)
+            results[name] = {"rows": rows, "seconds": time.perf_counter() - began}
+            print(f"{name}: {results[name]['seconds']:.1f} s", file=sys.stderr, flush=True)
+            if out is not None:
+                common.write("contact_motion", results, out, quick=quick, device=device, suffix=suffix)
     finally:
         torch.set_num_threads(threads)
-    return out
+    return {name: results[name] for name in GROUPS if name in results}
 
 
 def markdown(results: dict[str, Any]) -> str:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -51,7 +50,7 @@ def run(quick: bool, *, device: str = DEVICE, only: str = "", out: Path | None =
         raise SystemExit(f"device: no CUDA device here; `--device {device}` needs one, `--device cpu --quick` does not")
     card = Card(torch.device(device), quick)
     environment = common.environment(device)
-    results = earlier(out, quick, environment["device"])
+    results = common.earlier(None if out is None else out / "gpu.json", quick, environment["device"])
     rate = card.copy_rate()
     card.tidy()
     for name in names:
@@ -71,16 +70,6 @@ def run(quick: bool, *, device: str = DEVICE, only: str = "", out: Path | None =
         if out is not None:
             common.write("gpu", results, out, quick=quick, device=device)
     return {name: results[name] for name in GROUPS if name in results}
-
-
-def earlier(out: Path | None, quick: bool, device: str) -> dict[str, Any]:
-    """Groups that runs of the same kind on the same device have left in a folder."""
-    path = None if out is None else out / "gpu.json"
-    if path is None or not path.exists():
-        return {}
-    content = json.loads(path.read_text(encoding="utf-8"))
-    same = content["quick"] == quick and content["environment"]["device"] == device
-    return content["results"] if same else {}
 
 
 # --- text -------------------------------------------------------------------------------------------------------------
