@@ -12,6 +12,8 @@ from torch.autograd import Function
 from ..ops import detect as ops_contact
 from ..ops import ready_signature
 
+Order = tuple[Tensor, Tensor, Tensor]  # of rows by segment: order, ptr (int32) and the segment of each row
+
 
 class _SumBy(Function):
     @staticmethod
@@ -60,4 +62,23 @@ def sum_segments(values: Tensor, order: Tensor, ptr: Tensor, index: Tensor) -> T
     return _SumSegments.apply(values, order, ptr, index)
 
 
-ready_signature(_SumBy, _SumSegments)
+class _OfSegments(Function):
+    @staticmethod
+    def forward(values: Tensor, order: Tensor, ptr: Tensor, index: Tensor) -> Tensor:
+        return values.index_select(1, index)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        _, ctx.order, ctx.ptr, ctx.index = inputs
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        return sum_segments(grads[0], ctx.order, ctx.ptr, ctx.index), None, None, None
+
+
+def of_segments(values: Tensor, order: Tensor, ptr: Tensor, index: Tensor) -> Tensor:
+    """``values`` [B, segments, n] of the segment of each row, [B, V, n]; arguments and order of sums as above."""
+    return _OfSegments.apply(values, order, ptr, index)
+
+
+ready_signature(_SumBy, _SumSegments, _OfSegments)

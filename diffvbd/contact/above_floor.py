@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..adjoint.sums import Order, of_segments
+
 SHORT = 0.99  # share of a way that counts as all of it
 KEPT = 0.9  # share of a gap above a floor that rigid motion may close
 DEEP, KEPT_DEEP = 0.1, 0.1  # part of dhat below which that is less, because sweeps open such a gap slowly
@@ -21,12 +23,13 @@ class AboveFloor(NamedTuple):
     shift: Tensor  # [B, bodies, 3] [m]
     stopped: Tensor  # [B, bodies] bool: it loses more than a hundredth of what a vertex moves toward a plane
 
-    def way(self, way: Tensor, body: Tensor) -> Tensor:
-        """What is left of ways [B, V, 3] of vertices of these bodies [V]."""
-        return self.share[:, body, None] * way + self.shift[:, body]
+    def way(self, way: Tensor, of: Order) -> Tensor:
+        """What is left of ways [B, V, 3] of vertices."""
+        share, shift = of_segments(torch.cat([self.share[..., None], self.shift], -1), *of).split((1, 3), -1)
+        return share * way + shift
 
 
-def above_floor(floor: Tensor, origin: Tensor, at: Tensor, way: Tensor, held: Tensor, body: Tensor, bodies: int
+def above_floor(floor: Tensor, origin: Tensor, at: Tensor, way: Tensor, held: Tensor, of: Order, bodies: int
                 ) -> AboveFloor:  # fmt: skip
     """How bodies go ways [B, V, 3] as wholes above a floor: shifted along its normals until no vertex closes more than
     a part of its gap, which leaves sliding and turning as they are. Differentiable, evenly where several vertices
@@ -34,8 +37,9 @@ def above_floor(floor: Tensor, origin: Tensor, at: Tensor, way: Tensor, held: Te
 
     Args:
         floor: Data of a FloorBarrier [1 | B, 7 planes], or empty.  origin: [B, V, 3] or empty.  at: [B, V, 3] [m].
-        held, body: Of each vertex [V], whether something else moves it, and the number of its body.
+        held: Of each vertex [V], whether something else moves it.  of: Vertices by body, see of_segments.
     """
+    body = of[2]
     scenes, ones = at.shape[0], at.new_ones((at.shape[0], bodies))
     if not floor.numel():
         return AboveFloor(ones, at.new_zeros((scenes, bodies, 3)), ones < 1)

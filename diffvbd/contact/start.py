@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
+from ..adjoint.sums import of_segments
 from ..ops import contact_start as ops_contact_start
 from ..ops import detect as ops_contact
 from ..ops import no_second_derivative, not_batched
@@ -136,7 +137,8 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
     body, pinned = surface.body[: x.shape[1]].long(), surface.held[: x.shape[1], None]
     room, listed = detection.room[:, body].contiguous(), detection.listed
     listed = (listed.pairs, listed.constants, listed.ptr, listed.entry)
-    still, carried = torch.zeros_like(u), u[:, body]
+    order = (surface.body_order, surface.body_ptr, body)
+    still, carried = torch.zeros_like(u), of_segments(u, *order)
     center = torch.where(pinned, x, x + carried).detach()
     shares, stuck = [], []
 
@@ -168,8 +170,8 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
     stopped = held_up = torch.zeros_like(free)
     if rigid is not None:  # bodies first, each as a whole
         beside = rigid - carried
-        above = above_floor(floor, origin, base, beside, pinned[:, 0], body, surface.bodies)
-        beside = above.way(beside, body)
+        above = above_floor(floor, origin, base, beside, pinned[:, 0], order, surface.bodies)
+        beside = above.way(beside, order)
         with torch.no_grad():
             frames = advance(x, torch.where(pinned, move, carried + beside), u.detach(), x.detach(), whole=True)
             stopped = above.stopped[:, body]

@@ -119,7 +119,7 @@ class Corrections:
             if terms.at_corners is not None:
                 pulled = pulled + terms.at_corners
             force = force + sum_at_corners(pulled, terms.listed, scenes, s.fields.body.shape[0])[:, :vertices]
-            presses.append(_Press(rows, weights, terms.stiffness))
+            presses.append(_Press(rows, weights, terms.stiffness()))
         return self.space.restricted(force), presses
 
     def _solved(self, presses: list[_Press], r: Tensor) -> Tensor:
@@ -165,7 +165,7 @@ class _Press(NamedTuple):
         """[B, V, 3] -> [B, V, 3]"""
         flat = way.flatten(0, 1)
         moved = (self.weights[..., None] * flat[self.rows]).sum(1)
-        force = (self.stiffness @ moved[..., None])[..., 0]
+        force = (self.stiffness * moved[:, None]).sum(-1)
         pulled = self.weights[..., None] * force[:, None]
         return sum_by(pulled.reshape(-1, 3), self.rows.reshape(-1), len(flat)).reshape(way.shape)
 

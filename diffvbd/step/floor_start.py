@@ -21,14 +21,15 @@ def start_on_floor(model: Model, begun: Begun, floor: Tensor | None) -> Tensor:
     x, start = begun.x_prev, begun.x_start
     if floor is None:
         return start
-    _, _, free, held, body = bodies_of(model)
-    body, lift = body.long(), broadcast(begun.lift, x.shape)
+    order, ptr, free, held, body = bodies_of(model)
+    body, lift = body[: x.shape[1]].long(), broadcast(begun.lift, x.shape)
     way = begun.y - x - lift
     if model.starts_from != "inertia":
         way = way + _borne(floor, x if begun.origin is None else x + begun.origin, lift, body, len(free))
     origin = x.new_empty((0,)) if begun.origin is None else begun.origin
-    left = above_floor(floor, origin, x, way, held, body, len(free))
-    return torch.where(free[body, None], x + left.way(way, body), start)
+    of = (order, ptr, body)
+    left = above_floor(floor, origin, x, way, held, of, len(free))
+    return torch.where(free[body, None], x + left.way(way, of), start)
 
 
 def _borne(floor: Tensor, x: Tensor, lift: Tensor, body: Tensor, bodies: int) -> Tensor:

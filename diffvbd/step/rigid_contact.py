@@ -20,7 +20,7 @@ from torch.autograd import Function
 
 from .. import ops
 from ..adjoint.contact_lag import at_corners
-from ..adjoint.sums import sum_segments
+from ..adjoint.sums import Order, of_segments, sum_segments
 from ..model.model import Model
 from ..ops import broadcast, no_second_derivative, no_transforms, of_inputs
 from ..ops import contact_rigid as ops_rigid
@@ -115,7 +115,7 @@ def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: T
     body = f.body[: f.x.shape[1]].long()
     leaf = motion.to(f.x.dtype).requires_grad_()
     arm, whole = _arms(f, body)
-    end = f.x + _displaced(share.to(f.x.dtype)[..., None] * leaf, arm, body)
+    end = f.x + _displaced(share.to(f.x.dtype)[..., None] * leaf, arm, (f.order, f.ptr, body))
     wanted = [t for t, need in zip(f, needs, strict=True) if need]
     *first, bar = torch.autograd.grad(end, (*wanted, leaf), x_bar, allow_unused=True, retain_graph=True)
     solution = ops_rigid.rigid_solve(factor, bar.to(factor.dtype))
@@ -139,10 +139,10 @@ def _arms(f: ops.TouchingFields, body: Tensor) -> tuple[Tensor, Tensor]:
     mass = broadcast(f.mass, f.x.shape[:2])[..., None]
     sums = sum_segments(torch.cat([mass, mass * f.x], -1), f.order, f.ptr, body)
     whole = sums[..., :1].clamp(min=torch.finfo(f.x.dtype).tiny)
-    return f.x - (sums[..., 1:] / whole)[:, body], sums[..., 0]
+    return f.x - of_segments(sums[..., 1:] / whole, f.order, f.ptr, body), sums[..., 0]
 
 
-def _displaced(motion: Tensor, arm: Tensor, body: Tensor) -> Tensor:
+def _displaced(motion: Tensor, arm: Tensor, of: Order) -> Tensor:
     """What a turn and a shift of each body [B, bodies, 6] do to its vertices, exactly, [B, V, 3]."""
     w, shift = motion.split(3, -1)
     square = (w * w).sum(-1, keepdim=True)
@@ -151,7 +151,7 @@ def _displaced(motion: Tensor, arm: Tensor, body: Tensor) -> Tensor:
     angle = safe.sqrt()
     first = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)
     second = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / safe)
-    w, first, second, shift = (t[:, body] for t in (w, first, second, shift))
+    w, first, second, shift = of_segments(torch.cat([w, first, second, shift], -1), *of).split((3, 1, 1, 3), -1)
     turned = torch.linalg.cross(w, arm)
     return first * turned + second * torch.linalg.cross(w, turned) + shift
 
@@ -163,7 +163,7 @@ def _virtual_work(s: Scenes, p: Tensor, q: Tensor, arm: Tensor, whole: Tensor, b
     mass = broadcast(f.mass, f.x.shape[:2])[..., None]
     own, blocks = vertex_gradient(s) + mass * at_q, vertex_blocks(s)
     if blocks is not None:
-        own = own + (blocks @ at_q[..., None])[..., 0]
+        own = own + (blocks * at_q[..., None, :]).sum(-1)
     spread = sum_segments(mass * arm.square().sum(-1, keepdim=True), f.order, f.ptr, body)
     least = (p * q * torch.cat([spread.expand(*whole.shape, 3), whole[..., None].expand(*whole.shape, 3)], -1)).sum()
     work = (at_p * own).sum() + LEAST_INERTIA * least
@@ -176,7 +176,7 @@ def _virtual_work(s: Scenes, p: Tensor, q: Tensor, arm: Tensor, whole: Tensor, b
         moved = terms.weights[..., None] * moved
         work = work + (terms.force * moved[0].sum(1)).sum()
         for part, share in _parts(s, terms.listed, moved):
-            work = work + (share * part[0] * (terms.stiffness @ part[1][..., None])[..., 0]).sum()
+            work = work + (share * part[0] * terms.pressed(part[1])).sum()
     return work
 
 

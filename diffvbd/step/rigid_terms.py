@@ -36,14 +36,27 @@ class Scenes(NamedTuple):
 
 
 class PairTerms(NamedTuple):
-    """What pairs add: gradient [n, 3] by the motion of their weighted corners, its derivative [n, 3, 3] and weights
-    [n, 4]."""
+    """What pairs add: gradient [n, 3] by the motion of their weighted corners, its derivative, and weights [n, 4]."""
 
     listed: Pairs
     force: Tensor
-    stiffness: Tensor
+    normal: Tensor  # [n, 3]
+    along: Tensor  # derivative along the normal [n, 1]
+    across: Tensor | None  # and across it; None: zero
     weights: Tensor
     at_corners: Tensor | None = None  # what is added to the gradient at each corner [n, 4, 3]
+
+    def pressed(self, moved: Tensor) -> Tensor:
+        """The derivative times motions [n, 3]."""
+        slope = self.along if self.across is None else self.along - self.across
+        out = slope * (self.normal * moved).sum(-1, keepdim=True) * self.normal
+        return out if self.across is None else out + self.across * moved
+
+    def stiffness(self) -> Tensor:
+        """The derivative as a matrix [n, 3, 3]."""
+        across = torch.zeros_like(self.along) if self.across is None else self.across
+        eye = torch.eye(3, dtype=self.along.dtype, device=self.along.device)
+        return across[..., None] * eye + (self.along - across)[..., None] * outer(self.normal)
 
 
 def outer(n: Tensor) -> Tensor:
@@ -152,8 +165,8 @@ def pair_terms(s: Scenes, own: bool = False) -> list[PairTerms]:
         kappa = f.kappa if f.kappa.shape[0] == 1 else of_scene(f.kappa, listed)
         e, by_corners = _mollifier(at, listed)
         turned = torch.where(near, h2 * kappa * b, 0.0)[:, None, None] * by_corners
-        stiffness = torch.where(near, h2 * kappa * e * curvature, 0.0)[:, None, None] * outer(n)
-        out.append(PairTerms(listed, torch.where(near[:, None], -h2 * force * n, 0.0), stiffness, w, turned))
+        along = torch.where(near, h2 * kappa * e * curvature, 0.0)[:, None]
+        out.append(PairTerms(listed, torch.where(near[:, None], -h2 * force * n, 0.0), n, along, None, w, turned))
     if f.lag.numel():
         load, rate, n, w = f.lag.split((1, 1, 3, 4), -1)
         moved = at_corners(points - torch.cat([f.x_prev, f.collider_prev], 1), s.lagged)
@@ -161,9 +174,7 @@ def pair_terms(s: Scenes, own: bool = False) -> list[PairTerms]:
         along = (n * m).sum(-1, keepdim=True)
         approach, u = along.clamp(max=0), m - along * n
         slip = h2 * load * _slip_rate(u, s.friction_eps)[:, None]
-        eye = torch.eye(3, dtype=f.x.dtype, device=f.x.device)
-        stiffness = slip[..., None] * (eye - outer(n)) + (h * rate)[..., None] * outer(n)
-        out.append(PairTerms(s.lagged, slip * u + h * rate * approach * n, stiffness, w))
+        out.append(PairTerms(s.lagged, slip * u + h * rate * approach * n, n, h * rate, slip, w))
     return out
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..adjoint.contact_lag import Pairs, pair_lag, sum_at_corners
-from ..adjoint.sums import sum_segments
+from ..adjoint.sums import of_segments, sum_segments
 from ..contact import detection as search
 from ..contact.above_floor import above_floor
 from ..contact.barrier import PairBarrier
@@ -44,12 +44,17 @@ class Motion:
         self.surface, self.move = surface, move
         self.scenes, vertices = x.shape[:2]
         self.body, self.free = surface.body[:vertices].long(), ~surface.held[:vertices]
+        self.order = (surface.body_order, surface.body_ptr, self.body)
         self.rows = broadcast(self.body[None], (self.scenes, vertices))
         self.weight = torch.where(self.free, broadcast(mass, (self.scenes, vertices)), 0.0)[..., None]
         at = x + origin if origin.numel() else x
         self.sums = _by_body(torch.cat([self.weight * move, self.weight, self.weight * at], -1), surface)
         whole = self.sums[..., 3:4].clamp(min=_tiny(x))
-        self.mean, self.arm = self.sums[..., :3] / whole, at - (self.sums[..., 4:] / whole)[:, self.body]
+        self.mean, self.arm = self.sums[..., :3] / whole, at - self.of_vertices(self.sums[..., 4:] / whole)
+
+    def of_vertices(self, values: Tensor) -> Tensor:
+        """Values of bodies [B, bodies, n] for their vertices [B, V, n]."""
+        return of_segments(values, *self.order)
 
     def largest(self, way: Tensor) -> Tensor:
         """The longest way [B, V, 3] of a free vertex of each body [B, bodies]."""
@@ -76,7 +81,7 @@ class Motion:
         turn = (adjugate * sums[..., :3, None]).sum(-2) / determinant.clamp(min=_tiny(arm))
         held = self.longest(broadcast((~self.free).to(arm.dtype), arm.shape[:2])) > 0
         keep = (~held & (determinant[..., 0] > 0) & (size[..., 0] > 0)).reshape(scenes, bodies, 1)
-        turn, mean = (torch.where(keep, t, 0.0)[:, self.body] for t in (turn, self.mean))
+        turn, mean = self.of_vertices(torch.where(keep, torch.cat([turn, self.mean], -1), 0.0)).split(3, -1)
         return mean + torch.linalg.cross(turn, arm)
 
     def stretched(self, rigid: Tensor) -> Tensor:
@@ -160,7 +165,8 @@ def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass:
     planes = torch.cat([_plane_colliders(surface, now, barrier.dhat), *([] if floor is None else [
         broadcast(floor.detach(), (motion.scenes, floor.shape[1]))])], 1)  # fmt: skip
     left, left_rigid = (
-        above_floor(planes, origin, x, way, ~motion.free, body, surface.bodies).way(way, body) for way in (move, rigid)
+        above_floor(planes, origin, x, way, ~motion.free, motion.order, surface.bodies).way(way, motion.order)
+        for way in (move, rigid)
     )
     stopped = motion.largest(move - left).clamp(max=surface.most_own_room)
 
@@ -222,4 +228,5 @@ def unsupported(model: Model, x: Tensor, origin: Tensor, collider: Tensor, kappa
     share = -(own / size * unit).sum(-1, keepdim=True) / (unit * unit).sum(-1, keepdim=True)
     share = torch.where(bears, share.clamp(0, 1), 0.0)
     taken = torch.where(sums[..., 7:] > 0, 0.0, share * borne)  # a body with pinned vertices hangs from them
-    return torch.where(free[:, None], lift + taken[:, surface.body[:vertices].long()], lift)
+    taken = of_segments(taken, surface.body_order, surface.body_ptr, surface.body[:vertices].long())
+    return torch.where(free[:, None], lift + taken, lift)
