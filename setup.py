@@ -37,6 +37,7 @@ CPU_SOURCES = [
     "csrc/cpu/coarse.cpp",
     "csrc/cpu/contact.cpp",
     "csrc/cpu/contact_rigid.cpp",
+    "csrc/cpu/contact_rigid_backward.cpp",
     "csrc/cpu/detect.cpp",
     "csrc/cpu/intersect.cpp",
     "csrc/cpu/islands.cpp",

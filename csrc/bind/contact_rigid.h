@@ -1,9 +1,10 @@
 // The tensors of the rigid correction of bodies that touch, as the operators of all backends take them.
 #pragma once
 
+#include <tuple>
 #include <vector>
 
-#include "../contact/rigid.h"
+#include "../contact/rigid_backward.h"
 #include "contact_start.h"
 #include "rigid.h"
 
@@ -70,6 +71,31 @@ void require_motion(const contact::RigidInputs<T>& in, const Tensor& centers, co
               is_beside(motion, x, ScalarType::Double) && motion.numel() == contact::kUnknowns * rows,
           "diffvbd::contact_rigid_move: expected float64 centers [scenes, bodies, 3] and motion [scenes, bodies, 6]");
 }
+
+template <class T>
+contact::VirtualMotions<T> virtual_motions(const contact::RigidInputs<T>& in, const Tensor& p, const Tensor& q,
+                                           const Tensor& x) {
+  const int64_t size = 3 * in.scene.scenes * in.gate.corners;
+  require_like("p", p, x, size);
+  require_like("q", q, x, size);
+  return {data<const T>(p), data<const T>(q)};
+}
+
+// What contact_rigid_backward returns, made by `make`(sizes).
+struct RigidWorkTensors {
+  Tensor barrier, by_kappa, friction, by_lag;
+  template <class Make>
+  RigidWorkTensors(const TouchingFields& f, const Make& make)
+      : barrier(make({f.pairs.size(0), 4, contact::kWorkScalars})),
+        by_kappa(make({f.pairs.size(0)})),
+        friction(make({f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0, 4, contact::kWorkScalars})),
+        by_lag(make({friction.size(0), contact::kLagScalars})) {}
+  template <class T>
+  contact::RigidWork<T> view() const {
+    return {data<T>(barrier), data<T>(by_kappa), data<T>(friction), data<T>(by_lag), barrier.size(0), friction.size(0)};
+  }
+  std::tuple<Tensor, Tensor, Tensor, Tensor> all() const { return {barrier, by_kappa, friction, by_lag}; }
+};
 
 // Of contact_rigid_solve: the number of systems, and their size.
 struct RigidSystems {

@@ -101,6 +101,12 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   define(m, "contact_rigid_move", DIFFVBD_ARGUMENTS(TOUCHING),
          "Tensor centers, Tensor motion, int[] data_count, float time_step, float friction_eps",
          "Tensor x, Tensor share, ");
+  // Of the virtual work of two motions p and q of all corner points [scenes, N, 3], for each listed pair: derivatives
+  // by the position, p and q of each corner [pairs, 4, 9] and by kappa [pairs]; and for each lagged pair, by corners
+  // and by what is lagged [pairs, 9]
+  define(m, "contact_rigid_backward", DIFFVBD_ARGUMENTS(TOUCHING),
+         "Tensor p, Tensor q, int[] data_count, float time_step, float friction_eps",
+         "Tensor barrier, Tensor by_kappa, Tensor friction, Tensor by_lag, ");
   // Predictor and start of the sweeps. start: of the bodies that are not corrected, 0 x + h v, 1 y, 2 the lower
   // potential of the two; falls [scenes, other bodies]: 1 where that is y
   define(m, "begin", DIFFVBD_ARGUMENTS(BEGIN),

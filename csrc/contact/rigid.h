@@ -196,6 +196,14 @@ DIFFVBD_FN bool barrier_press(const RigidInputs<T>& in, int64_t pair, const At& 
   return true;
 }
 
+// Where a corner point was at the start of the step, relative to origin.
+template <class T>
+DIFFVBD_FN Vector before(const RigidInputs<T>& in, int64_t scene, int32_t v) {
+  const int32_t mesh = in.gate.vertices;
+  return rigid::Body<T>::at(v < mesh ? in.scene.x_prev.data + scene * in.scene.x_prev.scene + 3 * int64_t{v}
+                                     : in.collider_prev + 3 * (scene * (in.gate.corners - mesh) + v - mesh));
+}
+
 // f0 of smoothed friction, whose slope over |u| is FrictionRate.
 DIFFVBD_FN double slip_value(double length, double eps) {
   return length < eps ? length * length * (1 / eps - length / (3 * eps * eps)) + eps / 3 : length;
@@ -217,11 +225,7 @@ DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& a
   for (int k = 0; k < 4; ++k) {
     const int32_t v = record[k];
     const Vector x = at.relative(scene, v);
-    const T* before =
-        v < in.gate.vertices
-            ? in.scene.x_prev.data + scene * in.scene.x_prev.scene + 3 * int64_t{v}
-            : in.collider_prev + 3 * (scene * (in.gate.corners - in.gate.vertices) + v - in.gate.vertices);
-    m += double(lag.w[k]) * (x - rigid::Body<T>::at(before));
+    m += double(lag.w[k]) * (x - before(in, scene, v));
     const int side = within || k < first ? 0 : 1;
     if (out.body[side] < 0) continue;
     out.weight[side] += lag.w[k];

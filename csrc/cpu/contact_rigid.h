@@ -1,7 +1,7 @@
 // The rigid correction of bodies that touch (contact/rigid.h), on the CPU.
 #pragma once
 
-#include "../contact/rigid.h"
+#include "../contact/rigid_backward.h"
 
 namespace diffvbd {
 
@@ -15,6 +15,11 @@ void rigid_system(const contact::RigidInputs<T>& in, double* center, double* mot
 template <class T>
 void rigid_move(const contact::RigidInputs<T>& in, const double* center, const double* motion, T* move, double* share,
                 T* x);
+
+// The derivatives that the adjoint needs of pairs.
+template <class T>
+void rigid_backward(const contact::RigidInputs<T>& in, const contact::VirtualMotions<T>& given,
+                    const contact::RigidWork<T>& out);
 
 // Cholesky factors of `count` matrices [size, size], in their lower triangles; what is no number says that one is not
 // positive definite. And x [size] = factor^-T factor^-1 x of each.

@@ -3,7 +3,7 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../contact/rigid.h"
+#include "../contact/rigid_backward.h"
 
 namespace diffvbd::cuda {
 
@@ -26,6 +26,10 @@ cudaError_t rigid_system(const contact::RigidInputs<T>& in, const PairRoom& room
 template <class T>
 cudaError_t rigid_move(const contact::RigidInputs<T>& in, const PairRoom& room, const double* center,
                        const double* motion, T* move, double* share, T* x, void* workspace, cudaStream_t stream);
+
+template <class T>
+cudaError_t rigid_backward(const contact::RigidInputs<T>& in, const contact::VirtualMotions<T>& given,
+                           const contact::RigidWork<T>& out, cudaStream_t stream);
 
 cudaError_t cholesky(int64_t count, int64_t size, double* matrices, cudaStream_t stream);
 cudaError_t cholesky_solve(int64_t count, int64_t size, const double* factors, double* x, cudaStream_t stream);

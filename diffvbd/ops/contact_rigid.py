@@ -36,6 +36,14 @@ def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_cou
     return raw.contact_rigid_move(*fields, centers, motion, data_count, time_step, friction_eps)
 
 
+def rigid_backward(fields: TouchingFields, p: Tensor, q: Tensor, data_count: Sequence[int], time_step: float,
+                   friction_eps: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """What pairs add to the derivatives of p . (gradient + matrix q) of the Newton step, p and q being motions of all
+    corner points [B, N, 3]. For each listed pair: by the positions, p and q of its corners [pairs, 4, 9] and by kappa
+    [pairs]; for each lagged pair likewise, and by its lag [pairs, 9]."""
+    return raw.contact_rigid_backward(*fields, p.contiguous(), q.contiguous(), data_count, time_step, friction_eps)
+
+
 @shapes_of("contact_rigid_system")
 def _(*arguments):
     f = TouchingFields(*arguments[:_FIELDS])
@@ -55,5 +63,12 @@ def _(*arguments):
     return torch.empty_like(f.x), f.x.new_empty((f.x.shape[0], f.free.shape[0]), dtype=torch.float64)
 
 
-for _name in ("contact_rigid_system", "contact_rigid_solve", "contact_rigid_move"):
+@shapes_of("contact_rigid_backward")
+def _(*arguments):
+    f = TouchingFields(*arguments[:_FIELDS])
+    listed, lagged = f.pairs.shape[0], f.lag_pairs.shape[0] if f.lag.numel() else 0
+    return tuple(f.x.new_empty(shape) for shape in ((listed, 4, 9), (listed,), (lagged, 4, 9), (lagged, 9)))
+
+
+for _name in ("contact_rigid_system", "contact_rigid_solve", "contact_rigid_move", "contact_rigid_backward"):
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

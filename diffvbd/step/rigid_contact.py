@@ -19,12 +19,12 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..adjoint.contact_lag import at_corners
+from ..adjoint.contact_lag import Pairs, of_scene, sum_at_corners
 from ..adjoint.sums import Order, of_segments, sum_segments
 from ..model.model import Model
 from ..ops import broadcast, no_second_derivative, no_transforms, of_inputs
 from ..ops import contact_rigid as ops_rigid
-from .rigid_terms import Scenes, pair_terms, vertex_blocks, vertex_gradient
+from .rigid_terms import Scenes, vertex_blocks, vertex_gradient
 
 # of a body's mass and sum of m r^2, that keeps its system definite; twin of kLeastInertia in csrc/contact/rigid.h
 LEAST_INERTIA = 1e-11
@@ -167,35 +167,32 @@ def _virtual_work(s: Scenes, p: Tensor, q: Tensor, arm: Tensor, whole: Tensor, b
     spread = sum_segments(mass * arm.square().sum(-1, keepdim=True), f.order, f.ptr, body)
     least = (p * q * torch.cat([spread.expand(*whole.shape, 3), whole[..., None].expand(*whole.shape, 3)], -1)).sum()
     work = (at_p * own).sum() + LEAST_INERTIA * least
-    rest = torch.zeros_like(f.collider)
-    at_p, at_q = torch.cat([at_p, rest], 1), torch.cat([at_q, rest], 1)
-    for terms in pair_terms(s):
-        moved = torch.stack([at_corners(at_p, terms.listed), at_corners(at_q, terms.listed)])  # [2, n, 4, 3]
-        if terms.at_corners is not None:
-            work = work + (terms.at_corners * moved[0]).sum()
-        moved = terms.weights[..., None] * moved
-        work = work + (terms.force * moved[0].sum(1)).sum()
-        for part, share in _parts(s, terms.listed, moved):
-            work = work + (share * part[0] * terms.pressed(part[1])).sum()
+    return work + _work_of_pairs(s, at_p, at_q)
+
+
+def _work_of_pairs(s: Scenes, at_p: Tensor, at_q: Tensor) -> Tensor:
+    """A scalar with the derivatives of what pairs add to the virtual work, but another value."""
+    f, rest = s.fields, torch.zeros_like(s.fields.collider)
+    at_p, at_q, points = (torch.cat([t, u], 1) for t, u in ((at_p, rest), (at_q, rest), (f.x, f.collider)))
+    found = ops_rigid.rigid_backward(
+        ops.TouchingFields(*(t.detach() for t in f)), at_p.detach(), at_q.detach(), s.model._data_count, s.time_step,
+        s.friction_eps,
+    )  # fmt: skip
+    barrier, by_kappa, friction, by_lag = found
+
+    def at_all(rows: Tensor, listed: Pairs) -> tuple[Tensor, ...]:
+        return sum_at_corners(rows, listed, *points.shape[:2]).split(3, -1)
+
+    work = points.new_zeros(())
+    if len(barrier):
+        by_x, by_p, by_q = at_all(barrier, s.listed)
+        kappa = f.kappa if f.kappa.shape[0] == 1 else of_scene(f.kappa, s.listed)
+        work = work + (by_x * points + by_p * at_p + by_q * at_q).sum() + (kappa * by_kappa).sum()
+    if len(friction):
+        by_x, by_p, by_q = at_all(friction, s.lagged)
+        since = points - torch.cat([f.x_prev, f.collider_prev], 1)
+        work = work + (by_x * since + by_p * at_p + by_q * at_q).sum() + (f.lag * by_lag).sum()
     return work
-
-
-def _parts(s: Scenes, listed: Any, moved: Tensor) -> list[tuple[Tensor, Tensor | float]]:
-    """Of how corners move [2, n, 4, 3], what is solved for at once, with its weight: a pair, or each of its sides."""
-    f = s.fields
-    if f.free.shape[0] <= ops_rigid.MOST_COUPLED:
-        return [(moved.sum(2), 1.0)]
-    kind, corners = listed.pairs[:, 4:5].long(), listed.pairs[:, :4].long().clamp(min=0)
-    sides = torch.where(kind == 1, 2, 1)
-    lead = f.body.long()[torch.cat([corners[:, :1], corners.gather(1, sides)], 1)]
-    moves = (lead < f.free.shape[0]) & f.free[lead.clamp(max=f.free.shape[0] - 1)]
-    both = moves.all(1) & (lead[:, 0] != lead[:, 1])
-    first = (torch.arange(4, device=kind.device) < sides)[..., None]
-    # each side bears what both would: then no step is too long; a pair within one body is one side
-    apart, whole = both[:, None, None], torch.where(both, 2.0, 1.0)[:, None]
-    one = torch.where(apart, torch.where(first, moved, 0.0), moved).sum(2)
-    other = torch.where(apart, torch.where(first, 0.0, moved), 0.0).sum(2)
-    return [(one, whole), (other, whole)]
 
 
 ops.ready_signature(_Correct)

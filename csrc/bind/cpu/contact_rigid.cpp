@@ -56,10 +56,25 @@ std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const
   });
 }
 
+std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_backward(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& p,
+                                                                  const Tensor& q, std::vector<int64_t> data_count,
+                                                                  double time_step, double friction_eps) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    const auto make = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes); };
+    const diffvbd::RigidWorkTensors out(f, make);
+    diffvbd::rigid_backward<T>(in, diffvbd::virtual_motions(in, p, q, x), out.view<T>());
+    return out.all();
+  });
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
   m.impl("contact_rigid_system", TORCH_BOX(&contact_rigid_system));
   m.impl("contact_rigid_solve", TORCH_BOX(&contact_rigid_solve));
   m.impl("contact_rigid_move", TORCH_BOX(&contact_rigid_move));
+  m.impl("contact_rigid_backward", TORCH_BOX(&contact_rigid_backward));
 }

@@ -1,0 +1,202 @@
+// What the adjoint of the rigid correction needs of pairs: of their part of the virtual work
+//
+//     W = p . (gradient + matrix q)
+//
+// of two motions p and q of all corner points, the derivatives by p, q, positions, kappa and what is lagged. A pair is
+// derived in twelve directions by Dual, once for each correction. docs/method.md, section 18.
+#pragma once
+
+#include "rigid.h"
+
+namespace diffvbd::contact {
+
+constexpr int kWorkScalars = 9;  // of a corner: derivatives by its position, by p and by q
+
+// Two motions of all corner points [B, N, 3].
+template <class T>
+struct VirtualMotions {
+  const T *p, *q;
+};
+
+// Derivatives of the virtual work of all pairs, of lists with so many rows.
+template <class T>
+struct RigidWork {
+  T *barrier, *by_kappa;  // [listed, 4, 9], [listed]
+  T *friction, *by_lag;   // [lagged, 4, 9], [lagged, 9]
+  int64_t listed, lagged;
+};
+
+// What the corners of a pair do by p and q, and which of them move together: all, or each side by itself.
+struct PairMotions {
+  Vector p[4], q[4];
+  int sides, first;  // how many move by themselves; corners of the first
+  double share;      // of the stiffness that each bears
+
+  DIFFVBD_FN bool is_of(int side, int corner) const { return sides == 1 || (corner < first) == (side == 0); }
+};
+
+template <class T>
+DIFFVBD_FN PairMotions motions_of(const RigidInputs<T>& in, const VirtualMotions<T>& given, const int32_t* record) {
+  PairMotions out;
+  for (int k = 0; k < 4; ++k) {
+    const int64_t row = 3 * (int64_t{record[5]} * in.gate.corners + record[k]);
+    out.p[k] = rigid::Body<T>::at(given.p + row), out.q[k] = rigid::Body<T>::at(given.q + row);
+  }
+  out.first = sides(record[4]);
+  const int32_t one = moving_body(in, record[0]), two = moving_body(in, record[out.first]);
+  const bool apart = !in.together() && one >= 0 && two >= 0 && one != two;
+  out.sides = apart ? 2 : 1, out.share = apart ? 2 : 1;
+  return out;
+}
+
+// Gradient and matrix of a pair by the motion of its weighted corners, and what a mollifier adds at corners.
+template <class R>
+struct PressTerms {
+  Vec3<R> force, n, at_corner[4];
+  R w[4], along, across;  // stiffness along the normal and across it
+};
+
+template <class R>
+DIFFVBD_FN Vec3<R> weighted(const R* w, const Vector* moved, const PairMotions& m, int side) {
+  Vec3<R> out{R(0), R(0), R(0)};
+  for (int k = 0; k < 4; ++k) {
+    if (m.is_of(side, k)) out = out + Vec3<R>{w[k] * R(moved[k].x), w[k] * R(moved[k].y), w[k] * R(moved[k].z)};
+  }
+  return out;
+}
+
+template <class R>
+DIFFVBD_FN R virtual_work(const PressTerms<R>& a, const PairMotions& m) {
+  R out(0);
+  for (int k = 0; k < 4; ++k) {
+    const Vec3<R> p = {R(m.p[k].x), R(m.p[k].y), R(m.p[k].z)};
+    out = out + a.w[k] * dot(a.force, p) + dot(a.at_corner[k], p);
+  }
+  for (int side = 0; side < m.sides; ++side) {
+    const Vec3<R> p = weighted(a.w, m.p, m, side), q = weighted(a.w, m.q, m, side);
+    out = out + R(m.share) * ((a.along - a.across) * dot(a.n, p) * dot(a.n, q) + a.across * dot(p, q));
+  }
+  return out;
+}
+
+// Adds the derivatives by p and q, to each corner's row.
+template <class T>
+DIFFVBD_FN void add_by_motions(const PressTerms<double>& a, const PairMotions& m, T* rows) {
+  const auto pressed = [&](const Vector& u) { return ((a.along - a.across) * dot(a.n, u)) * a.n + a.across * u; };
+  for (int side = 0; side < m.sides; ++side) {
+    const Vector by_p = m.share * pressed(weighted(a.w, m.q, m, side));
+    const Vector by_q = m.share * pressed(weighted(a.w, m.p, m, side));
+    for (int k = 0; k < 4; ++k) {
+      if (!m.is_of(side, k)) continue;
+      rigid::put(rows + kWorkScalars * k + 3, a.w[k] * (a.force + by_p) + a.at_corner[k]);
+      rigid::put(rows + kWorkScalars * k + 6, a.w[k] * by_q);
+    }
+  }
+}
+
+// size: h^2 kappa.
+template <class R, class T>
+DIFFVBD_FN PressTerms<R> barrier_terms(int kind, const Corners<R>& c, const PairConstants<T>& a, double size) {
+  const Distance<R> near = distance(kind, c);
+  const LogBarrier<R> b(near.d - R(a.offset), R(a.dhat), R(size));
+  PressTerms<R> out{};
+  R e(1);
+  if (is_mollified(kind, c, a.threshold)) {
+    const Mollifier<R> m = mollifier(c, a.threshold);
+    e = m.e;
+    for (int k = 0; k < 4; ++k) out.at_corner[k] = b.value * m.gradient[k];
+  }
+  out.force = (e * b.first) * near.n, out.n = near.n, out.along = e * b.second, out.across = R(0);
+  for (int k = 0; k < 4; ++k) out.w[k] = near.w[k];
+  return out;
+}
+
+// The rows of the corners [4, 9] of a listed pair and the derivative by kappa; zero where it does not push.
+template <class T>
+DIFFVBD_FN void barrier_work(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair, T* rows,
+                             T* by_kappa) {
+  for (int i = 0; i < 4 * kWorkScalars; ++i) rows[i] = T(0);
+  *by_kappa = T(0);
+  PairPress press;
+  const CornerPoints<T> at{in, false};
+  if (pair >= in.first_listed(in.scene.scenes) || !barrier_press(in, pair, at, press)) return;
+  const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
+  const PairConstants<T> a(in.gate.constants + kConstants * pair);
+  const int64_t scene = record[5];
+  const PairMotions m = motions_of(in, given, record);
+  Corners<double> c;
+  const Vector origin = at(scene, record[0]);
+  for (int k = 0; k < 4; ++k) c.x[k] = at(scene, record[k]) - origin;
+  const double h = in.scene.time_step, kappa = in.kappa.data[scene * in.kappa.scene];
+  *by_kappa = T(virtual_work(barrier_terms(record[4], c, a, h * h), m));
+  for (int k = 0; k < 4; ++k) {
+    double by_x[3];
+    for (int i = 0; i < 3; ++i) {
+      const Vector z = {double(i == 0), double(i == 1), double(i == 2)};
+      by_x[i] = virtual_work(barrier_terms(record[4], moved_along(c, k, z), a, h * h * kappa), m).derivative;
+    }
+    rigid::put(rows + kWorkScalars * k, Vector{by_x[0], by_x[1], by_x[2]});
+  }
+  add_by_motions(barrier_terms(record[4], c, a, h * h * kappa), m, rows);
+}
+
+// f1(|u|) / |u|, which is taken as constant below what rounding makes of rest.
+DIFFVBD_FN double slip_rate(const Vector& u, double eps) {
+  return FrictionRate<double>(square_root(dot(u, u)), eps).value;
+}
+DIFFVBD_FN Dual<double> slip_rate(const Vec3<Dual<double>>& u, double eps) {
+  const Dual<double> square = dot(u, u);
+  const double length = square_root(square.value), rate = FrictionRate<double>(length, eps).value;
+  if (!(kRestingMotion * eps < length)) return Dual<double>(rate);
+  return FrictionRate<Dual<double>>(square_root(square), Dual<double>(eps)).value;
+}
+
+// lag: as Lag reads it; since: how corners have moved since the start of the step; beside: added to what they make.
+template <class R>
+DIFFVBD_FN PressTerms<R> lagged_terms(const R* lag, const Vector* since, const Vec3<R>& beside, double h, double eps) {
+  PressTerms<R> out{};
+  out.n = {lag[2], lag[3], lag[4]};
+  Vec3<R> m = beside;
+  for (int k = 0; k < 4; ++k) {
+    out.w[k] = lag[5 + k];
+    m = m + Vec3<R>{out.w[k] * R(since[k].x), out.w[k] * R(since[k].y), out.w[k] * R(since[k].z)};
+    out.at_corner[k] = {R(0), R(0), R(0)};
+  }
+  const R along = dot(out.n, m), approach = select(along < R(0), along, R(0));
+  const Vec3<R> u = m - along * out.n;
+  out.along = R(h) * lag[1], out.across = R(h * h) * lag[0] * slip_rate(u, eps);
+  out.force = out.across * u + (out.along * approach) * out.n;
+  return out;
+}
+
+// The rows of the corners [4, 9] of a lagged pair and the derivatives by what is lagged [9]. Positions at the start of
+// the step take the derivatives by x with the other sign.
+template <class T>
+DIFFVBD_FN void lagged_work(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair, T* rows,
+                            T* by_lag) {
+  for (int i = 0; i < 4 * kWorkScalars; ++i) rows[i] = T(0);
+  for (int i = 0; i < kLagScalars; ++i) by_lag[i] = T(0);
+  if (pair >= in.first_lagged(in.scene.scenes)) return;
+  const int32_t* record = in.lagged.pairs + kPairRow * pair;
+  if (moving_body(in, record[0]) < 0 && moving_body(in, record[sides(record[4])]) < 0) return;
+  const CornerPoints<T> at{in, false};  // also of pairs without a force, which a coefficient of zero has made so
+  const PairMotions m = motions_of(in, given, record);
+  Vector since[4];
+  for (int k = 0; k < 4; ++k) since[k] = at.relative(record[5], record[k]) - before(in, record[5], record[k]);
+  const double h = in.scene.time_step, eps = in.friction_eps;
+  double lag[kLagScalars];
+  for (int i = 0; i < kLagScalars; ++i) lag[i] = in.lag[kLagScalars * pair + i];
+  const auto derived = [&](int direction) {
+    Dual<double> turned[kLagScalars];
+    for (int i = 0; i < kLagScalars; ++i) turned[i] = {lag[i], double(i + 3 == direction)};
+    const Vec3<Dual<double>> beside = {
+        {0.0, double(direction == 0)}, {0.0, double(direction == 1)}, {0.0, double(direction == 2)}};
+    return virtual_work(lagged_terms(turned, since, beside, h, eps), m).derivative;
+  };
+  const Vector by_m = {derived(0), derived(1), derived(2)};
+  for (int i = 0; i < kLagScalars; ++i) by_lag[i] = T(derived(3 + i));
+  for (int k = 0; k < 4; ++k) rigid::put(rows + kWorkScalars * k, lag[5 + k] * by_m);
+  add_by_motions(lagged_terms(lag, since, Vector{}, h, eps), m, rows);
+}
+
+}  // namespace diffvbd::contact
