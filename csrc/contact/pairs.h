@@ -136,7 +136,8 @@ struct FrictionRate {
     value = sticks ? (T(2) - length / eps) / eps : T(1) / length;
     const T slope = sticks ? -T(1) / (eps * eps) : -value * value;
     // At rest value has a kink; below what rounding makes of zero its slope is taken as that of both sides together.
-    curvature = T(kRestingMotion) * eps < length ? slope / length : T(0);
+    const double resting = kRestingMotion;  // a device has no namespace's constant that a Dual could refer to
+    curvature = T(resting) * eps < length ? slope / length : T(0);
   }
 };
 
