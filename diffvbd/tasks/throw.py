@@ -105,7 +105,7 @@ class Throw:
         along = sheet.points[:, 0] / SIZE[0]
         self.pinned = np.zeros(self.mesh.num_vertices, bool)
         self.pinned[: sheet.num_vertices] = (along == 0.0) | (along == 1.0)
-        self.barrier = dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, reach=REACH)
+        self.barrier = dv.PairBarrier(KAPPA, DHAT, self_contact=False, damping=DAMPING, detections=1, reach=REACH)
         self.model = self.model_of()
         like = {"dtype": self.model.dtype, "device": self.model.device}
 
