@@ -104,14 +104,30 @@ def write(
     return path
 
 
-def earlier(path: Path | None, quick: bool, device: str, commit: str | None = None) -> dict[str, Any]:
-    """Groups that runs of the same kind on the same device, and of a commit if one is given, have left in a file."""
+def stamp(environment: dict[str, Any]) -> dict[str, Any]:
+    """What a group says of its run, where those of one file may be of several."""
+    return {key: environment.get(key) for key in ("date", "device", "driver", "torch", "cuda", "commit", "dirty")}
+
+
+def of_several_runs(groups: dict[str, Any]) -> str:
+    """A line of when and where each group was measured, if not all were at once."""
+    when = {name: (r.get("date"), (r.get("commit") or "")[:10], r.get("dirty"), r.get("device"))
+            for name, r in groups.items()}  # fmt: skip
+    if len({values[1:] for values in when.values()}) < 2:
+        return ""
+    runs = [f"{name} {date} at {commit}{' with changes' if dirty else ''}{f', on {device}' if device else ''}"
+            for name, (date, commit, dirty, device) in when.items()]  # fmt: skip
+    return f"Measured: {'; '.join(runs)}.\n"
+
+
+def earlier(path: Path | None, quick: bool, device: str) -> dict[str, Any]:
+    """Groups that runs of the same kind on the same device have left in a file, each with the stamp of its run."""
     if path is None or not path.exists():
         return {}
     content = json.loads(path.read_text(encoding="utf-8"))
     own = content["environment"]
-    same = content["quick"] == quick and own["device"] == device and commit in (None, own["commit"])
-    return content["results"] if same else {}
+    same = content["quick"] == quick and own["device"] == device
+    return {name: stamp(own) | group for name, group in content["results"].items()} if same else {}
 
 
 def as_json(content: Any) -> str:

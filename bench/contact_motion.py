@@ -4,7 +4,7 @@ Braking of a thin sheet and of a spin, sliding and its derivative, bodies at res
 Each row has a value, its reference, a target and whether it is met. "cut" is the mean share of vertices that
 pairs have held up; crossings are edges through triangles and vertices below a plane, counted at ten times of each
 rollout; "not finite" are coordinates and velocities. Milliseconds are of a step without its backward, one thread.
-`--only NAME,...` runs some groups; each is written as it ends, beside what earlier runs of the same commit have left.
+`--only NAME,...` runs some groups; each is written as it ends, beside what earlier runs on the same device have left.
 """
 
 from __future__ import annotations
@@ -93,12 +93,12 @@ def run(quick: bool, device: str = "cpu", only: str | None = None, out: Path | N
     torch.set_num_threads(1)  # the scenes are too small for two
     suffix, environment = common.device_suffix(device), common.environment(device)
     path = None if out is None else out / f"contact_motion{suffix}.json"
-    results = common.earlier(path, quick, environment["device"], environment["commit"])
+    results = common.earlier(path, quick, environment["device"])
     try:
         for name in chosen:
             began = time.perf_counter()
             rows = [row for made in GROUPS[name](quick, device) for row in (made if isinstance(made, list) else [made])]
-            results[name] = {"rows": rows, "seconds": time.perf_counter() - began}
+            results[name] = {"rows": rows, "seconds": time.perf_counter() - began, **common.stamp(environment)}
             print(f"{name}: {results[name]['seconds']:.1f} s", file=sys.stderr, flush=True)
             if out is not None:
                 common.write("contact_motion", results, out, quick=quick, device=device, suffix=suffix)
@@ -114,7 +114,9 @@ def markdown(results: dict[str, Any]) -> str:
               "not finite", "vertices", "ms per step")  # fmt: skip
     rows = [(name, row) for name, group in results.items() for row in group["rows"]]
     aimed = [row["met"] for _, row in rows if row["met"] is not None]
-    text = f"## Against known answers\n\nTargets met: {sum(aimed)} of {len(aimed)}.\n\n"
+    text = (
+        f"## Against known answers\n\nTargets met: {sum(aimed)} of {len(aimed)}. {common.of_several_runs(results)}\n\n"
+    )
     text += markdown_table(header, ([name, *(row[key] for key in keys)] for name, row in rows))
     notes = [f"- {name}, {row['quantity']}, {row['case']}, K = {row['sweeps']}: {remark}."
              for name, row in rows if (remark := "; ".join(filter(None, (row["error"], row["note"]))))]  # fmt: skip

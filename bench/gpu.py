@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import datetime
 import sys
 import time
 from collections.abc import Callable
@@ -60,8 +59,7 @@ def run(quick: bool, *, device: str = DEVICE, only: str = "", out: Path | None =
             "rows": rows,
             "copy_GB_per_s": rate / 1e9,
             "seconds": time.perf_counter() - start,
-            "date": datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
-            **{key: environment.get(key) for key in ("device", "driver", "torch", "cuda", "commit", "dirty")},
+            **common.stamp(common.environment(device)),
         }
         failed = sum("error" in row for row in rows)
         print(
@@ -88,14 +86,8 @@ cache may beat their floor. Regimes are the median of up to 10 replays of graphs
 def markdown(results: dict[str, Any]) -> str:
     first = next(iter(results.values()), {})
     parts = [NOTE.format(rate=float(first.get("copy_GB_per_s", 0.0)))]
-    when = {name: (r.get("date"), (r.get("commit") or "")[:10], r.get("dirty"), r.get("device"))
-            for name, r in results.items()}  # fmt: skip
-    if len(set(when.values())) > 1:  # groups of several runs
-        runs = [
-            f"{name} {date} at {commit}{' with changes' if dirty else ''}{f', on {device}' if device else ''}"
-            for name, (date, commit, dirty, device) in when.items()
-        ]
-        parts.append(f"Measured: {'; '.join(runs)}.\n")
+    if several := common.of_several_runs(results):
+        parts.append(several)
     for name, table in TABLES.items():
         if name in results:
             rows = results[name]["rows"]
