@@ -110,7 +110,7 @@ class _CorrectBackward(Function):
 def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: Tensor, needs: Sequence[bool]
               ) -> tuple[Tensor, ...]:  # fmt: skip
     """Of the fields that need one. With H d = -g, the adjoint of d is that of -l . (g + H d), where H l is the adjoint
-    of d: a sum over vertices and pairs, whose derivatives autograd takes."""
+    of d: a sum over vertices, derived by autograd, and over pairs, derived by the compiled operator."""
     f = s.fields
     body = f.body[: f.x.shape[1]].long()
     leaf = motion.to(f.x.dtype).requires_grad_()

@@ -1,6 +1,6 @@
-"""What the adjoint of the rigid correction of bodies that touch is made of, differentiable: gradient and blocks of
-inertia, energies of single vertices, friction on a floor, and barriers, friction and damping of pairs. Twin of
-csrc/contact/rigid.h."""
+"""What corrections of bodies that touch are made of, differentiable. Gradient and blocks of inertia, energies of single
+vertices and friction on a floor: for the adjoint of rigid corrections, and for coarse ones. Barriers, friction and
+damping of pairs: for coarse ones. Twin of csrc/contact/rigid.h."""
 
 from __future__ import annotations
 

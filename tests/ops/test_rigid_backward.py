@@ -1,0 +1,127 @@
+"""Claim: the derivatives that the adjoint of rigid corrections takes of pairs are those of their virtual work.
+
+The work is written out in torch here, of the same forces and stiffnesses that coarse corrections use, and derived by
+autograd. More than MOST_COUPLED bodies are solved for one by one: each side bears twice the stiffness.
+"""
+
+import importlib
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import DEVICES
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import mesh, ops
+from diffvbd.adjoint.contact_lag import at_corners
+from diffvbd.ops import contact_rigid
+from diffvbd.step.rigid_terms import PairTerms, Scenes, pair_terms
+from diffvbd.testing import relative_error, tolerance
+from diffvbd.testing.contact_scenes import SCENES, compiled, noise
+
+contact_step = importlib.import_module("diffvbd.step.contact")
+DIFFERENTIABLE = ("x", "x_prev", "collider", "collider_prev", "kappa", "lag")
+
+
+def many() -> Any:
+    """Thirty-six pairs of boxes that touch, with friction; one box is pinned."""
+    box = mesh.box(2, 0.1)
+    places = np.array([[0.3 * (k % 6), 0.0, 0.3 * (k // 6)] for k in range(36)])
+    tets = mesh.replicate(box, np.concatenate([places, places + [0.013, 0.105, 0.017]]))
+    model = dv.Model(tets, pinned=range(8), energies=(dv.StableNeoHookean(), dv.PairBarrier(1e3, 0.01, damping=2.0),
+                                                      dv.Friction(0.4, 0.05)))  # fmt: skip
+    x = model.rest_points + noise("many", shape=model.rest_points.shape, size=5e-4)
+    return model, x, noise("many", "v", shape=x.shape, size=0.2)
+
+
+def fields_of(monkeypatch: pytest.MonkeyPatch, name: str) -> Scenes:
+    """What a correction in a step of a scene reads: the last that has pairs."""
+    seen: list[Scenes] = []
+
+    def correct(model: dv.Model, fields: ops.TouchingFields, time_step: float, eps: float) -> Any:
+        if fields.pairs.shape[0]:
+            seen.append(Scenes(model, ops.TouchingFields(*(t.detach().contiguous() for t in fields)), time_step, eps))
+        return original(model, fields, time_step, eps)
+
+    original = contact_step.correct
+    monkeypatch.setattr(contact_step, "correct", correct)
+    if name == "many":
+        model, x, v = many()
+        dv.step(model, x, v, mu=1e5, lam=1e5, time_step=0.01, sweeps=2)
+    else:
+        compiled(SCENES[name](), 2, 2)
+    return seen[-1]
+
+
+def parts_of(s: Scenes, terms: PairTerms, moved: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Of how corners move [2, n, 4, 3], what is solved for at once, with its share of the stiffness [n, 1]."""
+    f, count = s.fields, s.fields.free.shape[0]
+    corners, kind = terms.listed.pairs[:, :4].long(), terms.listed.pairs[:, 4:5].long()
+    sides = torch.where(kind == 1, 2, 1)
+    lead = f.body.long()[torch.cat([corners[:, :1], corners.gather(1, sides)], 1)]
+    moves = (lead < count) & f.free[lead.clamp(max=count - 1)]
+    apart = moves.all(1) & (lead[:, 0] != lead[:, 1]) & (count > contact_rigid.MOST_COUPLED)
+    first = (torch.arange(4) < sides)[..., None]
+    share = torch.where(apart, 2.0, 1.0)[:, None]
+    one = torch.where(apart[:, None, None] & ~first, 0.0, moved).sum(2)
+    other = torch.where(apart[:, None, None] & ~first, moved, 0.0).sum(2)
+    return [(one, share), (other, share)]
+
+
+def work(s: Scenes, p: Tensor, q: Tensor) -> Tensor:
+    total = p.new_zeros(())
+    for terms in pair_terms(s):
+        moved = torch.stack([at_corners(p, terms.listed), at_corners(q, terms.listed)])
+        if terms.at_corners is not None:
+            total = total + (terms.at_corners * moved[0]).sum()
+        moved = terms.weights[..., None] * moved
+        total = total + (terms.force * moved[0].sum(1)).sum()
+        for part, share in parts_of(s, terms, moved):
+            total = total + (share * part[0] * terms.pressed(part[1])).sum()
+    return total
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", ("stacked", "crossed", "batched", "many"))
+def test_derivatives_are_those_of_the_virtual_work(name: str, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    s = fields_of(monkeypatch, name)
+    f = s.fields
+    points = (f.x.shape[0], f.body.shape[0], 3)
+    body = f.body.long()
+    moves = torch.cat([f.free, f.free.new_zeros(int(body.max()) + 1 - len(f.free))])[body][:, None]
+    p, q = (torch.where(moves, noise(name, key, shape=points, size=0.1), 0.0) for key in ("p", "q"))
+
+    given = {key: getattr(f, key) for key in DIFFERENTIABLE} | {"p": p, "q": q}
+    leaves = {key: value.clone().requires_grad_() for key, value in given.items()}
+    own: Any = {key: leaves[key] for key in DIFFERENTIABLE}
+    total = work(s._replace(fields=f._replace(**own)), leaves["p"], leaves["q"])
+    grads = torch.autograd.grad(total, list(leaves.values()), allow_unused=True, materialize_grads=True)
+    expected = dict(zip(leaves, grads, strict=True))
+
+    found = contact_rigid.rigid_backward(
+        ops.TouchingFields(*(t.to(device) for t in f)), p.to(device), q.to(device), s.model._data_count, s.time_step,
+        s.friction_eps,
+    )  # fmt: skip
+    barrier, by_kappa, friction, by_lag = (t.cpu() for t in found)
+
+    def at_all(rows: Tensor, pairs: Tensor) -> Tensor:
+        out = torch.zeros((*points[:2], rows.shape[-1]), dtype=rows.dtype)
+        return out.index_put((pairs[:, 5:].long(), pairs[:, :4].long()), rows, accumulate=True)
+
+    vertices = f.x.shape[1]
+    pushed = at_all(barrier, f.pairs)
+    rubbed = at_all(friction, f.lag_pairs) if len(friction) else torch.zeros_like(pushed)
+    by_x, since = (pushed + rubbed)[..., :3], -rubbed[..., :3]
+    scene = f.pairs[:, 5].long() if f.kappa.shape[0] > 1 else torch.zeros_like(f.pairs[:, 5]).long()
+    result = {"x": by_x[:, :vertices], "x_prev": since[:, :vertices], "collider": by_x[:, vertices:],
+              "collider_prev": since[:, vertices:], "kappa": torch.zeros_like(f.kappa).index_add(0, scene, by_kappa),
+              "lag": by_lag, "p": (pushed + rubbed)[..., 3:6], "q": (pushed + rubbed)[..., 6:]}  # fmt: skip
+    for key in ("x", "kappa", "p", "q", *(("x_prev", "lag") if f.lag.numel() else ())):
+        assert float(expected[key].abs().max()) > 0, key
+    for key, value in expected.items():
+        # p and q are zero at corners that do not move, and their derivatives are not used there
+        used = moves if key in ("p", "q") else torch.ones_like(moves[:1, 0])
+        error = relative_error(torch.where(used, result[key], 0.0), torch.where(used, value, 0.0))
+        assert error <= tolerance("contact_adjoint"), key
