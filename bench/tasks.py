@@ -82,8 +82,8 @@ module in `diffvbd/tasks/`, written on the public interface alone, and its docst
 protocol. Figures in the tables come from the logs in `bench/results/tasks`, which `python -m bench tasks` writes and
 `python -m bench report` turns into this page; those of the paper stand in `bench/paper.py`.
 
-The logs of tasks with contact (cloths, dresses, cover-the-spot) are older than contact by planes. Throw's on the GPU was
-measured beside three other runs, which made it some six times as long.
+Older than contact by planes are the logs of capes, flag, dress-size, cover-the-spot, and those of dresses on the GPU.
+Throw's on the GPU was measured beside three other runs, which made it some six times as long.
 
 Times are those of the optimisation, without pictures. Runs are repeatable: on one device the same seed gives the same
 numbers, bit by bit; only what runs for a given time, as CMA-ES in learn-controller, depends on the machine's speed.

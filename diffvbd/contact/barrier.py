@@ -76,14 +76,14 @@ class PairBarrier:
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name}: expected a bool, got {type(getattr(self, name)).__name__}")
         if self.detections is not None:
-            check_count("detections", self.detections, 1, 1000)
+            object.__setattr__(self, "detections", check_count("detections", self.detections, 1, 1000))
         if self.reach is not None and check_positive("reach", self.reach, "m") <= self.dhat:
             fail("reach", f"more than dhat = {self.dhat:g} m", self.reach)
         for name, length in (("dhat", self.dhat), ("reach", self.reach or 0.0)):
             if length > MOST_REACH:
                 fail(name, f"at most {MOST_REACH:g} m", length)
         if self.capacity is not None:
-            check_count("capacity", self.capacity, 1, 2**26)
+            object.__setattr__(self, "capacity", check_count("capacity", self.capacity, 1, 2**26))
 
     def constants(self, like: Tensor) -> dict[str, Tensor]:
         return _scalars(self, like)

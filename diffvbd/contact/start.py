@@ -108,13 +108,20 @@ class PartStart(NamedTuple):
     shares: Tensor  # [2, B, V]: of the two ways, that vertices went
 
 
+def share_within(way: Tensor, stretch: Tensor, room: Tensor) -> Tensor:
+    """The largest share s of a rigid motion, at most 1, with s way + s^2 stretch <= room: so sweeps have the room to
+    take back what the straight ways of a turn stretch a body by. Of each body [B, bodies] [m]."""
+    root = (way * way + 4 * stretch * room).sqrt()
+    return (2 * room / (way + root).clamp(min=torch.finfo(way.dtype).tiny)).clamp(max=1)
+
+
 BENT = 0.1  # share of the room of its own that a body may bend by, whatever that does to its potential
 DEEP_BENT = 0.5  # the same of a body that planes or pairs hold up on its way as a whole, even if its potential falls
 
 
 def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
                          planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface,
-                         rigid: Tensor | None, raises: Callable[[Tensor, Tensor], Tensor],
+                         rigid: Tensor | None, stretch: Tensor, raises: Callable[[Tensor, Tensor], Tensor],
                          own_pairs: bool) -> PartStart:  # fmt: skip
     """Every vertex as far along its way as pairs and floor let all go at once: by ``rigid`` each body as a whole, then
     by what is left of ``move``, then by ``fall``. A way of its own bends a body. A free one that a floor stops does not
@@ -162,19 +169,29 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         )
         return out[:, body]
 
+    def largest_of_body(way: Tensor) -> Tensor:
+        length = torch.where(pinned[:, 0], 0.0, way.square().sum(-1).sqrt())
+        out = length.new_zeros((len(length), surface.bodies))
+        return out.scatter_reduce(1, body.expand(length.shape), length, "amax")
+
     def any_of_body(vertices: Tensor) -> Tensor:
         return least_of_body((~vertices).to(x.dtype)) == 0
 
     free = ~any_of_body(pinned[:, 0])
     target, base, frames, own = target_of(x, move, u), torch.where(pinned, x, x + carried), None, ()
-    stopped = held_up = torch.zeros_like(free)
+    stopped = held_up = limited = torch.zeros_like(free)
     if rigid is not None:  # bodies first, each as a whole
         beside = rigid - carried
+        limit = share_within(largest_of_body(beside.detach()), stretch, detection.room[:, :-1])
+        if own_pairs:
+            limit = torch.minimum(limit, share_within(torch.zeros_like(stretch), stretch, detection.own_room[:, :-1]))
         above = above_floor(floor, origin, base, beside, pinned[:, 0], order, surface.bodies)
         beside = above.way(beside, order)
         with torch.no_grad():
-            frames = advance(x, torch.where(pinned, move, carried + beside), u.detach(), x.detach(), whole=True)
+            ways = carried + limit[:, body, None] * beside
+            frames = limit * advance(x, torch.where(pinned, move, ways), u.detach(), x.detach(), whole=True)
             stopped = above.stopped[:, body]
+            limited = (limit < SHORT)[:, body] & free
             held_up = stopped | (frames[:, body] < SHORT)
         base = torch.where(pinned, target, base + frames[:, body, None] * beside)
         if own_pairs:
@@ -190,7 +207,7 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
                 bends, deep = (any_of_body(square > (part * own[1]) ** 2) for part in (BENT, DEEP_BENT))
                 rests = (bends & raises(here, target)) | (deep & held_up)
             if number == 0 and rigid is not None:
-                rests = free & (rests | stopped)
+                rests = free & (rests | stopped | limited)
                 way = torch.where(rests[..., None], 0.0, way)
             share = torch.where(rests, 0.0, advance(at, way, still, center, own=own))
             if number == 0:

@@ -42,6 +42,7 @@ class ContactSurface:
     bodies: int  # of the mesh
     rows: tuple[slice, ...]  # of each collider in collider_points
     most_room: Tensor  # [bodies] [m]: that any vertex is given beside its island
+    most_room_alone: Tensor  # [bodies] [m]: and where no other body is in reach of that
     most_own_room: Tensor  # [bodies] [m]: and beside the rigid motion of its body
     least_own_room: (
         Tensor  # [bodies] [m]: and is given there in any case, because hardly any two sides of a body are so close
@@ -101,9 +102,10 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     alone = (held_vertices < np.bincount(label, minlength=bodies)).sum() <= 1 or not barrier.between_bodies
     own = torch.where(torch.from_numpy(np.bincount(label[surface[:, 0]], minlength=bodies)) <= COARSE_TRIANGLES,
                       MOST_EDGES_COARSE, MOST_EDGES_OWN)  # fmt: skip
-    most_room = (MOST_EDGES if alone else MOST_EDGES_BETWEEN) * edge
+    most_room_alone = MOST_EDGES * edge
+    most_room = most_room_alone if alone else MOST_EDGES_BETWEEN * edge
     if barrier.reach is not None:
-        most_room = torch.full_like(edge, (barrier.reach - barrier.dhat) / 2)
+        most_room = most_room_alone = torch.full_like(edge, (barrier.reach - barrier.dhat) / 2)
 
     def index_tensor(parts: list[Any], width: int) -> Tensor:
         joined = np.concatenate([np.asarray(p, np.int64).reshape(-1, width) for p in parts] or [np.zeros((0, width))])
@@ -126,6 +128,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         bodies=bodies,
         rows=tuple(rows),
         most_room=most_room,
+        most_room_alone=most_room_alone,
         most_own_room=torch.where(torch.from_numpy(held_vertices > 0), MOST_EDGES_HELD, own) * edge,
         least_own_room=LEAST_EDGES_OWN * edge,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),

@@ -29,7 +29,7 @@ from .floor_start import start_on_floor
 from .intersections import refuse_intersections
 from .met import Detection, Met, Outcome, outcomes
 from .rigid_contact import bodies_of, correct
-from .rooms import Motion, Rooms, rooms, rooms_of_sweeps, unsupported
+from .rooms import ROOM, Motion, Rooms, rooms, rooms_of_sweeps, unsupported
 
 if TYPE_CHECKING:
     from .arguments import Prepared
@@ -138,7 +138,6 @@ class ContactStep:
         lift = torch.where(pinned, 0.0, broadcast(self.begun.lift, self.begun.y.shape))
         x, way = self.x_prev, self.begun.y - self.x_prev - lift
         left, met = way, Met(x)
-        whole_first = barrier.self_contact or self.floor_data is not None
         stages, r = self.parts or 1, 0  # of what is prescribed
         while r < (self.parts or 1):
             was, now = (self._colliders_at(min(1.0, n / stages)) for n in (r, r + 1))
@@ -162,8 +161,8 @@ class ContactStep:
                                           self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
             fall = fall if self.model.starts_from == "predictor" else torch.zeros_like(fall)  # corrections do it
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
-                                         detection, surface, rigid if whole_first else None, self._raises,
-                                         barrier.self_contact)  # fmt: skip
+                                         detection, surface, rigid, ROOM * motion.stretched(rigid).detach(),
+                                         self._raises, barrier.self_contact)  # fmt: skip
             met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
             if self._reads(x):
                 self._check(r, met.counts[r].tolist(), met)
@@ -329,7 +328,8 @@ class ContactStep:
         if hindered:
             raise ValueError(
                 f"prescribed or colliders: expected motion that leaves bodies a way, got {hindered} pairs in part {r} "
-                f"of {self.parts} that it would bring too close: use more detections or a smaller time_step"
+                f"of {self.parts} that it would bring too close: give PairBarrier a number of detections, a larger one, "
+                "or use a smaller time_step"
             )
 
     def _refuse_what_is_not_finite(self) -> None:

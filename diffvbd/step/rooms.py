@@ -131,7 +131,7 @@ class Rooms(NamedTuple):
     island: Tensor  # of each body [B, bodies] int32
     room: Tensor  # beside the island's translation, and the largest of the scene [B, bodies + 1] [m]
     own_room: Tensor  # beside the rigid motion of their own body, [B, bodies + 1] [m]
-    over: Tensor  # how far they want to go beside their island, over the most room that they get [B, bodies]
+    over: Tensor  # the room beside their island that they ask for, over the most that they get [B, bodies]
 
 
 @torch.no_grad()
@@ -170,25 +170,36 @@ def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass:
     )
     stopped = motion.largest(move - left).clamp(max=surface.most_own_room)
 
-    def room_beside(u: Tensor) -> Tensor:
-        room = ROOM * motion.largest(move - u[:, body]) + bends + falls + stopped
-        room = room.clamp(max=surface.most_room)
-        return torch.maximum(room, driven) + pushed
+    def asked_beside(u: Tensor) -> Tensor:
+        return ROOM * motion.largest(move - u[:, body]) + bends + falls + stopped
+
+    def room_beside(u: Tensor, most: Tensor) -> Tensor:
+        return torch.maximum(torch.minimum(asked_beside(u), most), driven) + pushed
 
     def islands(room: Tensor) -> Tensor:
         return search.islands(
             x, origin, move, mass.contiguous(), was, now, surface, barrier.dhat, with_largest(room), any_direction
         )
 
+    def together(room: Tensor) -> tuple[Tensor, Tensor]:
+        island = islands(room).long()
+        return island, (island[:, :, None] == island[:, None]) & (island >= 0)[:, None]
+
+    # A body that meets nothing in a larger room has it: it costs no pairs.
+    most = surface.most_room.expand(motion.scenes, -1)
+    wish = room_beside(motion.mean, surface.most_room_alone)
+    if x.is_cuda or bool((wish > room_beside(motion.mean, most)).any()):
+        island, same = together(wish)
+        most = torch.where((island >= 0) & (same.sum(-1) == 1), surface.most_room_alone, most)
+
     # Islands depend on the rooms, and rooms on what an island leaves of a motion: hence twice.
-    room = room_beside(motion.mean)
-    island = islands(room).long()
-    same = (island[:, :, None] == island[:, None]) & (island >= 0)[:, None]
+    room = room_beside(motion.mean, most)
+    island, same = together(room)
     joined = same.to(x.dtype) @ sums[..., :4]
     u = joined[..., :3] / joined[..., 3:].clamp(min=_tiny(x))
     u = torch.where((island >= 0)[..., None], u, 0.0)
-    room = torch.maximum(room, room_beside(u))
-    over = motion.largest(move - u[:, body]) / surface.most_room
+    room = torch.maximum(room, room_beside(u, most))
+    over = (asked_beside(u) + ROOM * motion.stretched(rigid)) / most
     own = torch.zeros_like(room)
     if barrier.self_contact:
         least = room.clamp(max=surface.least_own_room)

@@ -56,8 +56,7 @@ def test_only_fast_motion_beside_others_takes_more_than_one(dtype: torch.dtype, 
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("sweeps", (1, 10))
-@pytest.mark.parametrize("speed", (5.0, 7.0))
+@pytest.mark.parametrize(("speed", "sweeps"), ((5.0, 1), (5.0, 10), (7.0, 1), (7.0, 10), (10.0, 10)))
 def test_an_impact_keeps_its_momentum(speed: float, sweeps: int, device: str) -> None:
     def lost(**options: Any) -> float:
         model, x, v = meeting(speed, device, **options)
@@ -68,6 +67,6 @@ def test_an_impact_keeps_its_momentum(speed: float, sweeps: int, device: str) ->
         assert float((mass * v)[: len(v) - 64].sum(0).norm()) > 0.2 * float(first.norm())  # they did collide
         return float(((mass * v).sum(0) - first).norm() / first.norm())
 
-    assert lost() <= STEPS * tolerance("momentum")
-    if speed == 7.0:
+    assert lost() <= MOST_DETECTIONS * STEPS * tolerance("momentum")
+    if speed == 10.0:
         assert lost(detections=1) > 0.05

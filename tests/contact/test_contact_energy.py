@@ -61,6 +61,24 @@ def test_a_body_that_turns_in_the_air_gains_no_energy(spin: float, self_contact:
         speed = now
 
 
+@pytest.mark.parametrize("self_contact", (False, True))
+@pytest.mark.parametrize("gap", (1.0, 0.03, 0.01))
+@pytest.mark.parametrize("spin", (35.0, 60.0))
+def test_nor_does_one_that_turns_beside_another(spin: float, gap: float, self_contact: bool) -> None:
+    """Whose room is short where the other is near: it turns as far as the sweeps can take back what that stretches."""
+    box, modulus = dv.mesh.box(3, 0.1), 1e6
+    mesh, n = dv.mesh.join([box, box.translate((0.1 + gap, 0.0, 0.0))]), box.num_vertices
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier(dhat=2e-3, self_contact=self_contact)))
+    axis = torch.nn.functional.normalize(torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64), dim=0)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    v[:n] = spin * torch.linalg.cross(axis.expand(n, 3), x[:n] - x[:n].mean(0))
+    start = float((model.mass[:, None] * v.square()).sum())
+    for _ in range(10):
+        x, v = dv.step(model, x, v, mu=modulus, lam=modulus, time_step=1 / 60, sweeps=10, gravity=(0, 0, 0))
+        assert 0 < float((model.mass[:, None] * v.square()).sum()) <= start * (1 + tolerance("energy_gain"))
+        assert len(dv.contact.intersections(model, x)) == 0
+
+
 @pytest.mark.parametrize(("points", "count", "seed", "chosen"), [
     (2, 1000, 0, [446, 603, 952, 956]), (2, 40, 0, [35]), (3, 300, 0, [190, 257]), (3, 300, 1, [194, 227, 291])
 ])  # fmt: skip
