@@ -131,7 +131,7 @@ class Rooms(NamedTuple):
     island: Tensor  # of each body [B, bodies] int32
     room: Tensor  # beside the island's translation, and the largest of the scene [B, bodies + 1] [m]
     own_room: Tensor  # beside the rigid motion of their own body, [B, bodies + 1] [m]
-    over: Tensor  # the room beside their island that they ask for, over the most that they get [B, bodies]
+    over: Tensor  # how far they want to go, or up to 2 what they ask for, over the most room they get [B, bodies]
 
 
 @torch.no_grad()
@@ -199,7 +199,9 @@ def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass:
     u = joined[..., :3] / joined[..., 3:].clamp(min=_tiny(x))
     u = torch.where((island >= 0)[..., None], u, 0.0)
     room = torch.maximum(room, room_beside(u, most))
-    over = (asked_beside(u) + ROOM * motion.stretched(rigid)) / most
+    stretch = ROOM * motion.stretched(rigid)
+    way, asked = motion.largest(move - u[:, body]) + stretch, asked_beside(u) + stretch
+    over = torch.maximum(way / most, (asked / most).clamp(max=2.0))  # which makes two parts, a longer way more
     own = torch.zeros_like(room)
     if barrier.self_contact:
         least = room.clamp(max=surface.least_own_room)
