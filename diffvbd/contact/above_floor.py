@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..adjoint.sums import Order, of_segments
+from ..ops.segments import Order, of_segments
 
 SHORT = 0.99  # share of a way that counts as all of it
 KEPT = 0.9  # share of a gap above a floor that rigid motion may close

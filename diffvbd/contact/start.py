@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..adjoint.sums import of_segments
 from ..ops import contact_start as ops_contact_start
 from ..ops import detect as ops_contact
 from ..ops import no_second_derivative, not_batched
+from ..ops.segments import of_segments
 from ..safeguards import FILTER_ETA
 from .above_floor import SHORT, above_floor
 from .surface import ContactSurface

@@ -18,8 +18,8 @@ from torch.autograd import Function
 from .. import ops
 from ..adjoint.contact_lag import sum_at_corners
 from ..adjoint.potential import IncrementalPotential
-from ..adjoint.sums import sum_by
 from ..model.model import Model
+from ..ops.segments import sum_by
 from ..tuples import replaced
 from .rigid_terms import Scenes, corners_of, pair_terms, vertex_blocks, vertex_gradient
 from .trials import Trials

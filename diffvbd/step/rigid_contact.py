@@ -20,10 +20,10 @@ from torch.autograd import Function
 
 from .. import ops
 from ..adjoint.contact_lag import Pairs, of_scene, sum_at_corners
-from ..adjoint.sums import Order, of_segments, sum_segments
 from ..model.model import Model
 from ..ops import broadcast, no_second_derivative, no_transforms, of_inputs
 from ..ops import contact_rigid as ops_rigid
+from ..ops.segments import Order, of_segments, sum_segments
 from .rigid_terms import Scenes, vertex_blocks, vertex_gradient
 
 # of a body's mass and sum of m r^2, that keeps its system definite; twin of kLeastInertia in csrc/contact/rigid.h

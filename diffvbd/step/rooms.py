@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from ..adjoint.contact_lag import Pairs, pair_lag, sum_at_corners
-from ..adjoint.sums import of_segments, sum_segments
 from ..contact import detection as search
 from ..contact.above_floor import above_floor
 from ..contact.barrier import PairBarrier
@@ -16,6 +15,7 @@ from ..contact.start import PartStart
 from ..contact.surface import ContactSurface
 from ..model.model import Model
 from ..ops import broadcast
+from ..ops.segments import of_segments, sum_segments
 
 ROOM = 1.5  # how far a vertex may go, over how far the farthest of its body wants to
 LEAST_ROOM = 1.0  # of dhat, beside that: as far as a barrier that starts compressed may push

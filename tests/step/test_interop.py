@@ -248,12 +248,14 @@ def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     own = (x, x, x + move, mass, data, none, *bodies_of(model), points, points, x.new_ones((1,)), *listed)
     touching = (*own, none, *no_pairs(x, 0)[:1], *no_pairs(x, 0)[2:], none, x, own_room)
     numbers = (model._data_count, 0.01, 1e-3)
+    points_of = torch.cat([move, torch.zeros_like(points)], 1)
     centers, motion, factor = torch.ops.diffvbd.contact_rigid_system(*touching, *numbers)
     assert motion.abs().max() > 0 and torch.isfinite(factor).all()
     return {
         "contact_rigid_system": (*touching, *numbers),
         "contact_rigid_solve": (factor, torch.ones_like(motion)),
         "contact_rigid_move": (*touching, centers, motion, *numbers),
+        "contact_rigid_backward": (*touching, points_of, points_of, *numbers),
         "contact_start": start,
         "contact_start_backward": (move, *start, True),
         "contact_advance": advance,

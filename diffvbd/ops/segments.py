@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from ..ops import detect as ops_contact
-from ..ops import ready_signature
+from . import detect as ops_contact
+from .functions import ready_signature
 
 Order = tuple[Tensor, Tensor, Tensor]  # of rows by segment: order, ptr (int32) and the segment of each row
 
