@@ -121,8 +121,8 @@ DEEP_BENT = 0.5  # the same of a body that planes or pairs hold up on its way as
 
 def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
                          planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface,
-                         rigid: Tensor | None, stretch: Tensor, raises: Callable[[Tensor, Tensor], Tensor],
-                         own_pairs: bool) -> PartStart:  # fmt: skip
+                         rigid: Tensor, stretch: Tensor, largest: Callable[[Tensor], Tensor],
+                         raises: Callable[[Tensor, Tensor], Tensor], own_pairs: bool) -> PartStart:  # fmt: skip
     """Every vertex as far along its way as pairs and floor let all go at once: by ``rigid`` each body as a whole, then
     by what is left of ``move``, then by ``fall``. A way of its own bends a body. A free one that a floor stops does not
     go it; one of which pairs hold some up, or that with self-contact takes much of the room in which the sweeps may
@@ -133,8 +133,9 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         was, now: Collider points before and during the sweeps, [B, Vc, 3] [m].
         planes: Data of the FloorBarrier [1 | B, 7 planes], or None; differentiable as x, move, fall and mass.
         origin: [B, V, 3] or empty.  detection: of the step.
-        rigid: Where rigid motions of bodies would take their vertices, as a way [B, V, 3] [m], differentiable; None
-            without self-contact and floor.
+        rigid: Where rigid motions of bodies would take their vertices, as a way [B, V, 3] [m], differentiable.
+        stretch: By how much the straight ways of that stretch each body, and what sweeps need to take it back
+            [B, bodies] [m].  largest: Of ways [B, V, 3], the longest of a free vertex of each body.
         raises: Of two states [B, V, 3], which vertices are of a body whose potential is higher in the second [B, V].
         own_pairs: Whether bodies have pairs of their own, and rooms for them.
     """
@@ -169,33 +170,27 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         )
         return out[:, body]
 
-    def largest_of_body(way: Tensor) -> Tensor:
-        length = torch.where(pinned[:, 0], 0.0, way.square().sum(-1).sqrt())
-        out = length.new_zeros((len(length), surface.bodies))
-        return out.scatter_reduce(1, body.expand(length.shape), length, "amax")
-
     def any_of_body(vertices: Tensor) -> Tensor:
         return least_of_body((~vertices).to(x.dtype)) == 0
 
     free = ~any_of_body(pinned[:, 0])
-    target, base, frames, own = target_of(x, move, u), torch.where(pinned, x, x + carried), None, ()
-    stopped = held_up = limited = torch.zeros_like(free)
-    if rigid is not None:  # bodies first, each as a whole
-        beside = rigid - carried
-        limit = share_within(largest_of_body(beside.detach()), stretch, detection.room[:, :-1])
-        if own_pairs:
-            limit = torch.minimum(limit, share_within(torch.zeros_like(stretch), stretch, detection.own_room[:, :-1]))
-        above = above_floor(floor, origin, base, beside, pinned[:, 0], order, surface.bodies)
-        beside = above.way(beside, order)
-        with torch.no_grad():
-            ways = carried + limit[:, body, None] * beside
-            frames = limit * advance(x, torch.where(pinned, move, ways), u.detach(), x.detach(), whole=True)
-            stopped = above.stopped[:, body]
-            limited = (limit < SHORT)[:, body] & free
-            held_up = stopped | (frames[:, body] < SHORT)
-        base = torch.where(pinned, target, base + frames[:, body, None] * beside)
-        if own_pairs:
-            own = (base.detach().contiguous(), detection.own_room[:, body].contiguous())
+    # bodies first, each as a whole
+    target, base, own = target_of(x, move, u), torch.where(pinned, x, x + carried), ()
+    beside = rigid - carried
+    limit = share_within(largest(beside.detach()), stretch, detection.room[:, :-1])
+    if own_pairs:
+        limit = torch.minimum(limit, share_within(torch.zeros_like(stretch), stretch, detection.own_room[:, :-1]))
+    above = above_floor(floor, origin, base, beside, pinned[:, 0], order, surface.bodies)
+    beside = above.way(beside, order)
+    with torch.no_grad():
+        ways = carried + limit[:, body, None] * beside
+        frames = limit * advance(x, torch.where(pinned, move, ways), u.detach(), x.detach(), whole=True)
+        stopped = above.stopped[:, body]
+        limited = (limit < SHORT)[:, body] & free
+        held_up = stopped | (frames[:, body] < SHORT)
+    base = torch.where(pinned, target, base + frames[:, body, None] * beside)
+    if own_pairs:
+        own = (base.detach().contiguous(), detection.own_room[:, body].contiguous())
     at = base
     for number in range(2):
         if number:
@@ -206,7 +201,7 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
                 square = way.square().sum(-1)
                 bends, deep = (any_of_body(square > (part * own[1]) ** 2) for part in (BENT, DEEP_BENT))
                 rests = (bends & raises(here, target)) | (deep & held_up)
-            if number == 0 and rigid is not None:
+            if number == 0:
                 rests = free & (rests | stopped | limited)
                 way = torch.where(rests[..., None], 0.0, way)
             share = torch.where(rests, 0.0, advance(at, way, still, center, own=own))

@@ -110,7 +110,7 @@ class Corrections:
         blocks = vertex_blocks(s)
         if blocks is not None:
             presses.append(_at_vertices(blocks))
-        for terms in pair_terms(s, own=True):
+        for terms in pair_terms(s):
             scene, corners = corners_of(terms.listed)
             moves = corners < vertices
             rows = torch.where(moves, vertices * scene + corners, 0)
@@ -119,7 +119,7 @@ class Corrections:
             if terms.at_corners is not None:
                 pulled = pulled + terms.at_corners
             force = force + sum_at_corners(pulled, terms.listed, scenes, s.fields.body.shape[0])[:, :vertices]
-            presses.append(_Press(rows, weights, terms.stiffness()))
+            presses.append(_Press(rows, weights, terms.stiffness))
         return self.space.restricted(force), presses
 
     def _solved(self, presses: list[_Press], r: Tensor) -> Tensor:

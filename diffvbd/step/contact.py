@@ -162,7 +162,7 @@ class ContactStep:
             fall = fall if self.model.starts_from == "predictor" else torch.zeros_like(fall)  # corrections do it
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
                                          detection, surface, rigid, ROOM * motion.stretched(rigid).detach(),
-                                         self._raises, barrier.self_contact)  # fmt: skip
+                                         motion.largest, self._raises, barrier.self_contact)  # fmt: skip
             met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
             if self._reads(x):
                 self._check(r, met.counts[r].tolist(), met)

@@ -36,27 +36,14 @@ class Scenes(NamedTuple):
 
 
 class PairTerms(NamedTuple):
-    """What pairs add: gradient [n, 3] by the motion of their weighted corners, its derivative, and weights [n, 4]."""
+    """What pairs add: gradient [n, 3] by the motion of their weighted corners, its derivative [n, 3, 3] and weights
+    [n, 4]."""
 
     listed: Pairs
     force: Tensor
-    normal: Tensor  # [n, 3]
-    along: Tensor  # derivative along the normal [n, 1]
-    across: Tensor | None  # and across it; None: zero
+    stiffness: Tensor
     weights: Tensor
     at_corners: Tensor | None = None  # what is added to the gradient at each corner [n, 4, 3]
-
-    def pressed(self, moved: Tensor) -> Tensor:
-        """The derivative times motions [n, 3]."""
-        slope = self.along if self.across is None else self.along - self.across
-        out = slope * (self.normal * moved).sum(-1, keepdim=True) * self.normal
-        return out if self.across is None else out + self.across * moved
-
-    def stiffness(self) -> Tensor:
-        """The derivative as a matrix [n, 3, 3]."""
-        across = torch.zeros_like(self.along) if self.across is None else self.across
-        eye = torch.eye(3, dtype=self.along.dtype, device=self.along.device)
-        return across[..., None] * eye + (self.along - across)[..., None] * outer(self.normal)
 
 
 def outer(n: Tensor) -> Tensor:
@@ -130,43 +117,37 @@ def corners_of(listed: Pairs) -> tuple[Tensor, Tensor]:
     return rows[:, 5:], rows[:, :4]
 
 
-def _listed(s: Scenes, own: bool) -> tuple[Pairs, Tensor]:
-    """The pairs that push, of bodies apart or also of one body, and which of them do: few of those that are listed. All
-    of them where values must not decide sizes."""
-    f = s.fields
-    listed = s.listed
-    corners, kind = corners_of(listed)[1], f.pairs[:, 4]
-    apart = own | (f.body[corners[:, 0]] != f.body[torch.where(kind == 1, corners[:, 2], corners[:, 1])])
+def _listed(s: Scenes) -> Pairs:
+    """The pairs that push: few of those that are listed. All of them where values must not decide sizes."""
+    f, listed = s.fields, s.listed
     if f.x.is_cuda:
-        return listed, apart
+        return listed
     with torch.no_grad():
         acts = pair_lag(f.x.detach(), f.collider.detach(), f.kappa.detach(), f.origin, listed)[:, 1] > 0
-    listed, rows = some_of(listed, acts & apart)
-    return listed, apart[rows]
+    return some_of(listed, acts)[0]
 
 
-def pair_terms(s: Scenes, own: bool = False) -> list[PairTerms]:
-    """Of barriers, and of lagged friction and damping. own: with the barriers of pairs of one body, which do nothing to
-    its rigid motion."""
+def pair_terms(s: Scenes) -> list[PairTerms]:
+    """Of barriers, and of lagged friction and damping."""
     f, h, h2 = s.fields, s.time_step, s.time_step**2
     points = torch.cat([f.x, f.collider], 1)
     out = []
     if f.pairs.shape[0]:
-        listed, apart = _listed(s, own)
+        listed = _listed(s)
         force, active, n, w = pair_lag(f.x, f.collider, f.kappa, f.origin, listed).split((1, 1, 3, 4), -1)
         at = at_corners(points, listed)
         if f.origin.numel():
             at = at + at_corners(torch.cat([f.origin, torch.zeros_like(f.collider)], 1), listed)
         dhat, offset = listed.constants[:, 0], listed.constants[:, 1]
-        near = (active[:, 0] > 0) & apart
+        near = active[:, 0] > 0
         height = ((at - at[:, :1].detach()) * n[:, None]).sum(-1)
         gap = torch.where(near, (w * height).sum(-1) - offset, 0.5)
         b, _, curvature = log_barrier(gap, torch.where(near, dhat, 1.0))
         kappa = f.kappa if f.kappa.shape[0] == 1 else of_scene(f.kappa, listed)
         e, by_corners = _mollifier(at, listed)
         turned = torch.where(near, h2 * kappa * b, 0.0)[:, None, None] * by_corners
-        along = torch.where(near, h2 * kappa * e * curvature, 0.0)[:, None]
-        out.append(PairTerms(listed, torch.where(near[:, None], -h2 * force * n, 0.0), n, along, None, w, turned))
+        stiffness = torch.where(near, h2 * kappa * e * curvature, 0.0)[:, None, None] * outer(n)
+        out.append(PairTerms(listed, torch.where(near[:, None], -h2 * force * n, 0.0), stiffness, w, turned))
     if f.lag.numel():
         load, rate, n, w = f.lag.split((1, 1, 3, 4), -1)
         moved = at_corners(points - torch.cat([f.x_prev, f.collider_prev], 1), s.lagged)
@@ -174,7 +155,9 @@ def pair_terms(s: Scenes, own: bool = False) -> list[PairTerms]:
         along = (n * m).sum(-1, keepdim=True)
         approach, u = along.clamp(max=0), m - along * n
         slip = h2 * load * _slip_rate(u, s.friction_eps)[:, None]
-        out.append(PairTerms(s.lagged, slip * u + h * rate * approach * n, n, h * rate, slip, w))
+        eye = torch.eye(3, dtype=f.x.dtype, device=f.x.device)
+        stiffness = slip[..., None] * (eye - outer(n)) + (h * rate)[..., None] * outer(n)
+        out.append(PairTerms(s.lagged, slip * u + h * rate * approach * n, stiffness, w))
     return out
 
 

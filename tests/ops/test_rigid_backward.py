@@ -73,13 +73,19 @@ def parts_of(s: Scenes, terms: PairTerms, moved: Tensor) -> list[tuple[Tensor, T
 def work(s: Scenes, p: Tensor, q: Tensor) -> Tensor:
     total = p.new_zeros(())
     for terms in pair_terms(s):
+        if terms.at_corners is not None:  # barriers within a body do nothing to its rigid motion
+            corners, second = terms.listed.pairs[:, :4].long(), torch.where(terms.listed.pairs[:, 4:5] == 1, 2, 1)
+            body = s.fields.body
+            apart = (body[corners[:, :1]] != body[corners.gather(1, second)]).to(p)
+            terms = PairTerms(terms.listed, apart * terms.force, apart[..., None] * terms.stiffness, terms.weights,
+                              apart[..., None] * terms.at_corners)  # fmt: skip
         moved = torch.stack([at_corners(p, terms.listed), at_corners(q, terms.listed)])
         if terms.at_corners is not None:
             total = total + (terms.at_corners * moved[0]).sum()
         moved = terms.weights[..., None] * moved
         total = total + (terms.force * moved[0].sum(1)).sum()
         for part, share in parts_of(s, terms, moved):
-            total = total + (share * part[0] * terms.pressed(part[1])).sum()
+            total = total + (share * part[0] * (terms.stiffness @ part[1][..., None])[..., 0]).sum()
     return total
 
 
