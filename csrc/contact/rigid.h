@@ -12,7 +12,8 @@ namespace diffvbd::contact {
 using rigid::Vector;
 
 constexpr int kMostCoupled = 64;  // bodies of a scene that are solved for together; else one side of a pair at a time
-constexpr int kTries = 5;         // of motions, each half as long for some bodies, or none for them
+constexpr int kTries = 6;         // of motions, each shorter for some bodies, or none for them
+constexpr int kShorter = 3;       // of these: how often a body whose way is blocked tries a shorter one before it stays
 constexpr int kSpreads = 4;       // how often a shorter motion is handed on to the bodies that one touches
 constexpr double kRise = 1e-9;    // of the potential, that counts as none
 constexpr double kLeastInertia = 1e-11;  // of a body's mass and sum of m r^2, that keeps its system definite
@@ -330,7 +331,8 @@ DIFFVBD_FN bool is_safe(double before, double after, bool fits) {
 // The factor of what a body tries next, before it is handed on.
 DIFFVBD_FN double shortened(bool blocked, bool fits, int attempt) {
   if (fits) return 0.5;  // the potential rises: all go half as far
-  return !blocked ? 1.0 : attempt == 0 ? 0.5 : 0.0;
+  if (!blocked) return 1.0;
+  return attempt == 0 ? 0.5 : attempt < kShorter ? 0.25 : 0.0;
 }
 
 }  // namespace diffvbd::contact
