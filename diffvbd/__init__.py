@@ -25,7 +25,9 @@ from .model.moduli import lame, young_poisson
 from .ops.regimes import regime
 from .rollout.checkpoints import BinomialCheckpoints
 from .rollout.converge import Solution, solve
-from .rollout.rollout import Trajectory, per_step, rollout
+from .rollout.refine import Refinement, refine
+from .rollout.rollout import rollout
+from .rollout.trajectory import Trajectory, per_step
 from .step.estimate import ErrorEstimate
 from .step.integrators import BDF2, SDIRK2, History, ImplicitEuler
 from .step.manual import Tape, step_backward, step_forward
@@ -49,6 +51,7 @@ __all__ = [
     "LinearSolve",
     "Model",
     "PairBarrier",
+    "Refinement",
     "ReverseSweep",
     "Solution",
     "StableNeoHookean",
@@ -69,6 +72,7 @@ __all__ = [
     "mesh",
     "per_step",
     "reactions",
+    "refine",
     "regime",
     "rollout",
     "solve",

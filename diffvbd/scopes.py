@@ -1,4 +1,4 @@
-"""What holds inside a ``with``, for the thread or task that is in it: debug_checks() and contact.record().
+"""What holds inside a ``with``, for the thread or task that is in it: debug_checks(), contact.record() and refine().
 
 Each is a context variable. A compiled step cannot read one; it reads a plain global beside it, which torch.compile
 guards, and so sees what any thread is inside of.
@@ -17,10 +17,12 @@ from torch import Tensor
 
 _checking: ContextVar[bool] = ContextVar("diffvbd.debug_checks", default=False)
 _recording: ContextVar[tuple[tuple[str, list[Any]], ...]] = ContextVar("diffvbd.record", default=())
+_refining: ContextVar[tuple[int, int, list[int]] | None] = ContextVar("diffvbd.refine", default=None)
 _lock = threading.Lock()
 _checked_by = 0  # threads and tasks inside debug_checks()
 _any_checking = False
 _recorders: tuple[tuple[str, list[Any]], ...] = ()  # of all threads and tasks
+_any_refining: tuple[int, int, list[int]] | None = None  # the last that any thread or task has begun
 
 
 def checking() -> bool:
@@ -40,6 +42,19 @@ def recorders(kind: str = "contact") -> tuple[list[Any], ...]:
     """The lists that contact.record(), or coarse.record(), has given."""
     given = _recorders if torch.compiler.is_compiling() else _recording.get()
     return tuple(found for of, found in given if of == kind)
+
+
+def refinement() -> tuple[int, int, list[int]] | None:
+    """Inside dv.refine: the factors of steps and of sweeps, and a list of what rollouts ran."""
+    return _any_refining if torch.compiler.is_compiling() else _refining.get()
+
+
+def refuse_refinement(name: str) -> None:
+    """Raises inside dv.refine, which follows rollouts only."""
+    if refinement() is not None:
+        raise NotImplementedError(
+            f"refine: expected a loss that steps by dv.rollout, which is refined; it calls {name}"
+        )
 
 
 def _count(change: int) -> None:
@@ -75,6 +90,33 @@ def record_to(found: list[Any], kind: str = "contact") -> Iterator[None]:
         with _lock:
             _recorders = tuple(r for r in _recorders if r[1] is not found)
         _recording.reset(token)
+
+
+@contextlib.contextmanager
+def refined(steps: int, sweeps: int, ran: list[int]) -> Iterator[None]:
+    """Inside, rollouts take so many times the steps and sweeps, and add their steps to ``ran``."""
+    global _any_refining
+    found = (steps, sweeps, ran)
+    token, outer = _refining.set(found), _any_refining
+    _any_refining = found
+    try:
+        yield
+    finally:
+        _any_refining = outer
+        _refining.reset(token)
+
+
+@contextlib.contextmanager
+def unrefined() -> Iterator[None]:
+    """Inside, refinement() is None: a refined rollout runs as it stands."""
+    global _any_refining
+    token, outer = _refining.set(None), _any_refining
+    _any_refining = None
+    try:
+        yield
+    finally:
+        _any_refining = outer
+        _refining.reset(token)
 
 
 class Scope:

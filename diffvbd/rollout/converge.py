@@ -16,6 +16,7 @@ from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
 from ..checks import check_count, check_positive, fail
 from ..model.model import Model
 from ..ops import SweepSettings
+from ..scopes import refuse_refinement
 from ..step.advance import advance, swept
 from ..step.arguments import GRAVITY, Prepared, acceleration_of, check_prescribed, check_state, collider_state, prepare
 from ..step.balance import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
@@ -105,6 +106,7 @@ def solve(
 
     Source: paper, eq. 1; docs/adjoints.md.
     """
+    refuse_refinement("dv.solve")
     lead, scheme = check_state(model, x, v), check_integrator(integrator)
     check_history(scheme, history, x, time_step)
     if adjoint is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
@@ -15,7 +14,7 @@ from ..adjoint.routes import Adjoint, check_adjoint
 from ..checks import check_count, fail
 from ..model.model import Model
 from ..model.warnings import warn_of_thin_tets
-from ..scopes import looks_at
+from ..scopes import looks_at, refinement
 from ..step.advance import advance
 from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
 from ..step.estimate import ErrorEstimate, check_estimable, error_of, of_steps
@@ -31,44 +30,12 @@ from ..step.integrators import (
 from ..step.intersections import check_start as refuse_start
 from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
 from .contact_check import checks_contact, cut_share, warn_of_contact
+from .finer import rollout_finer
+from .trajectory import PerStep, Trajectory, check_save, stacked
 
 # these enter through prepare(), the others through advance()
 _STATIC = ("mu", "lam", "young", "poisson", "rest_points", "density")
 _LOADS = ("force", "gravity", "prescribed")
-
-
-@dataclass(frozen=True)
-class PerStep:
-    """A value that changes from step to step, see :func:`per_step`."""
-
-    values: Tensor
-
-
-def per_step(values: Tensor) -> PerStep:
-    """Marks a tensor whose leading dimension counts the steps of a rollout, shape [steps, ...]."""
-    if not isinstance(values, Tensor) or values.dim() == 0:
-        raise TypeError(f"values: expected a tensor of shape [steps, ...], got {type(values).__name__}")
-    return PerStep(values)
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """Saved states of a rollout.
-
-    Attributes:
-        x, v: Positions [m] and velocities [m/s] of the saved frames, shape [frames, ..., V, 3].
-        steps: Step number of each frame (0: the initial state); the last frame is the final state.
-        observations: What ``observe`` returned, stacked over steps (a tensor, or a tuple or dict of them), or None.
-        errors: With ``estimate_errors`` those of each step, its tensors of shape [steps, ..., bodies]; else None.
-        history: With BDF2() that of the last frame, for a rollout that continues; else None.
-    """
-
-    x: Tensor
-    v: Tensor
-    steps: list[int]
-    observations: Any = None
-    errors: ErrorEstimate | None = None
-    history: History | None = None
 
 
 def rollout(
@@ -142,8 +109,10 @@ def rollout(
         ValueError, TypeError: As step; also where a per_step value has another number of steps, or surfaces intersect.
         NotImplementedError: ``estimate_errors`` with contact or friction.
     """
+    if (factors := refinement()) is not None:
+        return rollout_finer(rollout, **locals())
     steps = check_count("steps", steps)
-    _check_save(save)
+    check_save(save)
     _check_estimates(estimate_errors, model)
     if not isinstance(check_contact, bool | None):
         raise TypeError(f"check_contact: expected a bool or None, got {type(check_contact).__name__}")
@@ -218,18 +187,13 @@ def rollout(
         x=torch.stack([f[1] for f in frames]),
         v=torch.stack([f[2] for f in frames]),
         steps=[f[0] for f in frames],
-        observations=_stacked(done.observed),
+        observations=stacked(done.observed),
         errors=of_steps([errors[k] for k in range(steps)], model, x, sweeps) if estimate_errors else None,
         history=History(done.end[2], done.end[3], done.end[4], time_step) if len(done.end) > 2 else None,
     )
 
 
 # --- values of each step ----------------------------------------------------------------------------------------------
-
-
-def _check_save(save: Any) -> None:
-    if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
-        fail("save", '"all", "last" or an integer > 0', repr(save))
 
 
 def _check_estimates(asked: Any, model: Any) -> None:
@@ -315,20 +279,7 @@ def _at(value: Any, k: int, x: Tensor, v: Tensor) -> Any:
     return value(k, x, v) if _changes(value) else value
 
 
-# --- what a rollout returns and prints --------------------------------------------------------------------------------
-
-
-def _stacked(observed: list[Any]) -> Any:
-    if not observed or observed[0] is None:
-        return None
-    first = observed[0]
-    if isinstance(first, dict):
-        return {k: _stacked([o[k] for o in observed]) for k in first}
-    if isinstance(first, (tuple, list)):
-        return tuple(_stacked([o[i] for o in observed]) for i in range(len(first)))
-    if not isinstance(first, Tensor):
-        raise TypeError(f"observe: expected tensors, or tuples or dicts of them, got {type(first).__name__}")
-    return torch.stack(observed)
+# --- what a rollout prints --------------------------------------------------------------------------------------------
 
 
 class _Progress:

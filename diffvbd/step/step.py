@@ -11,7 +11,7 @@ from torch import Tensor
 from ..adjoint.routes import Adjoint, check_adjoint
 from ..model.model import Model
 from ..model.warnings import warn_of_thin_tets
-from ..scopes import looks_at
+from ..scopes import looks_at, refuse_refinement
 from .advance import advance
 from .arguments import GRAVITY, check_prescribed, check_state, prepare
 from .integrators import (
@@ -138,6 +138,7 @@ def step(
 
     Source: paper, eqs. 1-3 and section 3; docs/method.md.
     """
+    refuse_refinement("dv.step")
     lead, adjoint = check_state(model, x, v), check_adjoint(adjoint)
     scheme = check_integrator(integrator)
     check_history(scheme, history, x, time_step)

@@ -23,7 +23,8 @@ from diffvbd.tasks import (
     throw,
 )
 from diffvbd.tasks.problem import Problem, Result, Settings, Stage
-from diffvbd.tasks.runner import solve, table
+from diffvbd.tasks.report import table
+from diffvbd.tasks.runner import solve
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffvbd import Refinement
 from diffvbd.tasks.progress import Row
 
 OWN_KEYS = ("iteration", "stage", "loss", "gradient_norm", "seconds")  # of a row; the others are estimates
@@ -112,6 +113,7 @@ class Result:
     """What `solve` found: the best row of the last stage, and every row; their "iteration" counts from 0.
 
     `converged` and `stalled` are about the last stage: it met a tolerance; its optimiser moved no parameter any more.
+    `refined`: what dv.refine says of the result, or why it was not asked.
     """
 
     best: Row
@@ -122,6 +124,7 @@ class Result:
     stalled: bool
     files: list[Path]
     findings: dict[str, Any] = field(default_factory=dict)
+    refined: Refinement | str = ""
 
 
 def estimates_of(row: Row) -> Row:

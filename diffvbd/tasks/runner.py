@@ -28,7 +28,8 @@ from diffvbd.tasks.problem import (
     check_row,
     estimates_of,
 )
-from diffvbd.tasks.progress import Progress, Row, summary, table_of, versions
+from diffvbd.tasks.progress import Progress, Row, summary, versions
+from diffvbd.tasks.report import survival
 
 LISTED = 1000  # numbers of a parameter that log.json lists; larger ones go to parameters.pt
 
@@ -314,6 +315,7 @@ class _Run:
         errors = {name: abs(estimates[name] / true - 1) for name, true in problem.truth.items()}
         memory = self._memory()  # before findings, which may run other things
         findings = problem.findings(self.history) if problem.findings else {}
+        refined = survival(problem, self.settings, self.history[0]["loss"])
         listed = {name: p.tolist() for name, p in problem.parameters.items() if p.numel() <= LISTED}
         log = self.write_log(
             converged=self.last_converged,
@@ -325,10 +327,13 @@ class _Run:
             units=problem.units,
             relative_error=errors,
             findings=findings,
+            refined=str(refined),
             variables=sum(p.numel() for p in problem.parameters.values()),
             **memory,
         )
-        result = Result(best, self.history, estimates, errors, self.last_converged, self.last_stalled, [log], findings)
+        result = Result(
+            best, self.history, estimates, errors, self.last_converged, self.last_stalled, [log], findings, refined
+        )
         if listed.keys() != problem.parameters.keys():
             path = self.settings.out / "parameters.pt"
             replace(path, lambda new: torch.save({k: p.detach().cpu() for k, p in problem.parameters.items()}, new))
@@ -354,17 +359,6 @@ class _Run:
                 result.files.append(self.settings.out / name)
             except Exception as error:
                 print(f"no {name}: {error or type(error).__name__}", file=sys.stderr)
-
-
-def table(problem: Problem, result: Result) -> str:
-    """Start, true and recovered values as aligned text, and how the run ended."""
-    seconds, first = result.history[-1]["seconds"], result.history[0]["loss"]
-    how = "converged" if result.converged else "stalled" if result.stalled else "stopped"
-    start = estimates_of(result.history[0])
-    return table_of(start, result.estimates, problem.truth, result.errors, problem.units) + (
-        f"\n{how} after {len(result.history)} evaluations in {seconds:.0f} s; "
-        f"loss {first:.3g} -> {result.best['loss']:.3g} (lowest at evaluation {result.best['iteration'] + 1:.0f})"
-    )
 
 
 def _norm(parameters: list[Tensor]) -> float:

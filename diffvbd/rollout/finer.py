@@ -1,0 +1,130 @@
+"""A rollout over the same time with smaller steps and more sweeps, as dv.refine runs it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..checks import check_count, check_positive, fail
+from ..model.model import Model
+from ..scopes import unrefined
+from .trajectory import PerStep, Trajectory, check_save, stacked
+
+# given at the steps of the caller and held over the smaller ones; `prescribed` and `colliders` move in between
+_HELD = ("mu", "lam", "young", "poisson", "force", "gravity", "rest_points", "density")
+
+
+def rollout_finer(rollout: Callable[..., Trajectory], *, factors: tuple[int, int, list[int]],
+                  **given: Any) -> Trajectory:  # fmt: skip
+    """``rollout`` of the arguments ``given``, with factors[0] times the steps and factors[1] times the sweeps.
+
+    The result looks like that of ``rollout(**given)``: the same frames, and observations at the same times. What is
+    given per step, or by a callable, is asked at the steps of ``given`` and held in between; prescribed vertices and
+    colliders go in straight lines between the ends of these.
+    """
+    parts, more_sweeps, ran = factors
+    steps, sweeps = check_count("steps", given["steps"]), check_count("sweeps", given["sweeps"])
+    check_save(given["save"])
+    model, x = given["model"], given["x"]
+    if not isinstance(model, Model) or not isinstance(x, Tensor):
+        return rollout(**given)  # which says what is wrong
+    ran.append(steps)
+    if parts == 1:
+        with unrefined():
+            return rollout(**given | {"sweeps": more_sweeps * sweeps})
+    if given["estimate_errors"]:
+        raise NotImplementedError("refine: expected rollouts without estimate_errors")
+    if given["history"] is not None:
+        raise NotImplementedError("refine: expected rollouts that begin without a history, which is of other steps")
+    finer = dict(given)
+    for name in _HELD:
+        finer[name] = _held(given[name], parts, steps, name)
+    own = given["parameters"]
+    if isinstance(own, dict):
+        finer["parameters"] = {name: _held(value, parts, steps, f'parameters["{name}"]') for name, value in own.items()}
+    finer["prescribed"] = _moving(given["prescribed"], parts, steps, model)
+    if isinstance(given["colliders"], PerStep):
+        first = model.collider_points if given["colliders_before"] is None else given["colliders_before"]
+        finer["colliders"] = _between(given["colliders"], first, parts, steps)
+    observe, observed = given["observe"], []
+
+    def observe_some(x: Tensor, v: Tensor, step: int) -> None:
+        if step % parts == 0:
+            observed.append(observe(x, v, step // parts))
+
+    save = given["save"]
+    finer |= {
+        "steps": parts * steps,
+        "time_step": check_positive("time_step", given["time_step"]) / parts,
+        "sweeps": more_sweeps * sweeps,
+        "save": save if save == "last" else parts * (1 if save == "all" else save),
+        "observe": None if observe is None else observe_some,
+        "progress": False,
+    }
+    with unrefined():
+        found = rollout(**finer)
+    return Trajectory(found.x, found.v, [step // parts for step in found.steps], stacked(observed), None, found.history)
+
+
+def _check_steps(name: str, values: Tensor, steps: int) -> None:
+    if values.shape[0] != steps:
+        fail(name, f"{steps} steps in per_step", f"shape {list(values.shape)}")
+
+
+def _asked(value: Any, parts: int) -> Callable[[int, Tensor, Tensor], Any]:
+    """A callable of smaller steps that asks ``value`` at the first of each of its steps only."""
+    last: list[Any] = []
+
+    def ask(step: int, x: Tensor, v: Tensor) -> Any:
+        if step % parts == 0:
+            last[:] = [value(step // parts, x, v)]
+        return last[0]
+
+    return ask
+
+
+def _held(value: Any, parts: int, steps: int, name: str) -> Any:
+    if isinstance(value, PerStep):
+        _check_steps(name, value.values, steps)
+        return PerStep(value.values.repeat_interleave(parts, 0))
+    return _asked(value, parts) if callable(value) and not isinstance(value, Tensor) else value
+
+
+def _moving(value: Any, parts: int, steps: int, model: Model) -> Any:
+    """Where pinned vertices are at the end of each smaller step."""
+    if value is None:
+        return None
+    if isinstance(value, PerStep):
+        _check_steps("prescribed", value.values, steps)
+    ends = _asked(value, parts) if callable(value) and not isinstance(value, (Tensor, PerStep)) else None
+    begun: list[Tensor] = []
+    pinned = model.pinned[:, None]
+
+    def now(step: int, x: Tensor, v: Tensor) -> Tensor:
+        if step % parts == 0:
+            begun[:] = [x]
+        if ends is not None:
+            end = ends(step, x, v)
+        else:
+            end = value.values[step // parts] if isinstance(value, PerStep) else value
+        if not isinstance(end, Tensor):
+            raise NotImplementedError("refine: expected prescribed positions without those of stages")
+        way = begun[0] + (end - begun[0]) * ((step % parts + 1) / parts)
+        return torch.where(pinned, way, end)
+
+    return now
+
+
+def _between(colliders: PerStep, first: Tensor, parts: int, steps: int) -> PerStep:
+    """Where colliders are at the end of each smaller step."""
+    _check_steps("colliders", colliders.values, steps)
+    if steps == 0:
+        return colliders
+    ends = colliders.values
+    begins = torch.cat([first.expand_as(ends[0])[None], ends[:-1]])
+    shares = torch.arange(1, parts + 1, dtype=ends.dtype, device=ends.device) / parts
+    ways = torch.stack([begins + share * (ends - begins) for share in shares], dim=1)
+    return PerStep(ways.flatten(0, 1))

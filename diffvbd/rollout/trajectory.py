@@ -1,0 +1,66 @@
+"""What goes into a rollout, and comes out of it, step by step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..checks import fail
+from ..step.estimate import ErrorEstimate
+from ..step.integrators import History
+
+
+@dataclass(frozen=True)
+class PerStep:
+    """A value that changes from step to step, see :func:`per_step`."""
+
+    values: Tensor
+
+
+def per_step(values: Tensor) -> PerStep:
+    """Marks a tensor whose leading dimension counts the steps of a rollout, shape [steps, ...]."""
+    if not isinstance(values, Tensor) or values.dim() == 0:
+        raise TypeError(f"values: expected a tensor of shape [steps, ...], got {type(values).__name__}")
+    return PerStep(values)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Saved states of a rollout.
+
+    Attributes:
+        x, v: Positions [m] and velocities [m/s] of the saved frames, shape [frames, ..., V, 3].
+        steps: Step number of each frame (0: the initial state); the last frame is the final state.
+        observations: What ``observe`` returned, stacked over steps (a tensor, or a tuple or dict of them), or None.
+        errors: With ``estimate_errors`` those of each step, its tensors of shape [steps, ..., bodies]; else None.
+        history: With BDF2() that of the last frame, for a rollout that continues; else None.
+    """
+
+    x: Tensor
+    v: Tensor
+    steps: list[int]
+    observations: Any = None
+    errors: ErrorEstimate | None = None
+    history: History | None = None
+
+
+def check_save(save: Any) -> None:
+    if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
+        fail("save", '"all", "last" or an integer > 0', repr(save))
+
+
+def stacked(observed: list[Any]) -> Any:
+    """The results of ``observe`` over steps."""
+    if not observed or observed[0] is None:
+        return None
+    first = observed[0]
+    if isinstance(first, dict):
+        return {k: stacked([o[k] for o in observed]) for k in first}
+    if isinstance(first, (tuple, list)):
+        return tuple(stacked([o[i] for o in observed]) for i in range(len(first)))
+    if not isinstance(first, Tensor):
+        raise TypeError(f"observe: expected tensors, or tuples or dicts of them, got {type(first).__name__}")
+    return torch.stack(observed)

@@ -1,0 +1,200 @@
+"""Claim: dv.refine runs a loss with smaller steps and more sweeps over the same motion, and tells what survives."""
+
+import math
+from collections.abc import Callable
+from typing import Any, cast
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd.testing.tolerances import tolerance
+
+H, K, STEPS = 1 / 50, 4, 6
+LOADS: dict[str, Any] = {"mu": 2e4, "lam": 2e4, "time_step": H, "sweeps": K, "steps": STEPS}
+
+
+def beam() -> tuple[dv.Model, Tensor, Tensor]:
+    mesh = dv.mesh.box((3, 2, 2), 0.1)
+    model = dv.Model(mesh, pinned=torch.tensor(mesh.points[:, 0] < 1e-9))
+    return model, model.rest_points, torch.zeros_like(model.rest_points)
+
+
+def results_of(loss: Any) -> tuple[dv.Refinement, list[Any]]:
+    """What a loss that keeps its trajectories gave at (h, K), (h, 2K), (h/2, K), (h/2, 2K)."""
+    seen: list[Any] = []
+    found = dv.refine(lambda: loss(seen))
+    return found, seen
+
+
+def by_hand(parts: int, sweeps: int, **given: Any) -> dv.Trajectory:
+    model, x, v = beam()
+    finer = LOADS | {"time_step": H / parts, "sweeps": sweeps * K, "steps": parts * STEPS}
+    return dv.rollout(model, x, v, **finer, **given)
+
+
+FACTORS = ((1, 1), (1, 2), (2, 1), (2, 2))
+
+
+@pytest.mark.parametrize("integrator", [dv.ImplicitEuler(), dv.SDIRK2(), dv.BDF2()])
+def test_a_rollout_is_that_of_smaller_steps_and_more_sweeps(integrator: Any) -> None:
+    def loss(seen: list[Any]) -> Tensor:
+        seen.append(dv.rollout(*beam(), **LOADS, integrator=integrator, observe=lambda x, v, step: x.mean() * step))
+        return seen[-1].x[-1].square().sum()
+
+    found, seen = results_of(loss)
+    for (parts, sweeps), got in zip(FACTORS, seen, strict=True):
+        want = by_hand(parts, sweeps, integrator=integrator)
+        assert got.steps == list(range(STEPS + 1)) and got.observations.shape == (STEPS,)
+        assert torch.equal(got.x, want.x[::parts]) and torch.equal(got.v, want.v[::parts])
+        assert torch.equal(got.observations[-1], got.x[-1].mean() * STEPS)
+    values = (found.loss, found.more_sweeps, found.smaller_steps, found.both)
+    assert len(set(values)) == 4 and values == tuple(float(t.x[-1].square().sum()) for t in seen)
+
+
+@pytest.mark.parametrize(("save", "steps"), [("last", [6]), (4, [0, 4, 6]), ("all", list(range(7)))])
+def test_frames_are_those_of_the_same_times(save: Any, steps: list[int]) -> None:
+    def loss(seen: list[Any]) -> Tensor:
+        seen.append(dv.rollout(*beam(), **LOADS, save=save))
+        return seen[-1].x.sum()
+
+    for got in results_of(loss)[1]:
+        assert got.steps == steps and len(got.x) == len(steps)
+
+
+def test_loads_and_materials_are_held_and_policies_asked_at_the_same_steps() -> None:
+    generator = torch.Generator().manual_seed(0)
+    force = torch.randn(STEPS, 3, dtype=torch.float64, generator=generator) * 1e-2
+    mu = torch.linspace(1e4, 3e4, STEPS, dtype=torch.float64)
+    asked: list[int] = []
+
+    def policy(step: int, x: Tensor, v: Tensor) -> Tensor:
+        asked.append(step)
+        return force[step] - 0.1 * v.mean(0)
+
+    def loss(seen: list[Any]) -> Tensor:
+        asked.clear()
+        given = LOADS | {"mu": dv.per_step(mu), "force": policy}
+        seen.append(dv.rollout(*beam(), **given))
+        assert asked == list(range(STEPS))
+        return seen[-1].x.sum()
+
+    _, seen = results_of(loss)
+    model, x, v = beam()
+    for k in range(STEPS):  # the finest, by hand
+        now = force[k] - 0.1 * v.mean(0)
+        for _ in range(2):
+            x, v = dv.step(model, x, v, mu=float(mu[k]), lam=2e4, time_step=H / 2, sweeps=2 * K, force=now)
+    assert torch.allclose(seen[3].x[-1], x, rtol=0, atol=tolerance("sum")) and not torch.equal(
+        seen[3].x[-1], seen[0].x[-1]
+    )
+
+
+@pytest.mark.parametrize("kind", ["per_step", "callable", "constant"])
+def test_prescribed_vertices_go_straight(kind: str) -> None:
+    model, x, v = beam()
+    pinned, shift = model.pinned, torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64)
+    shares = torch.arange(STEPS + 1, dtype=torch.float64) / STEPS
+    if kind == "constant":  # there after the first step
+        shares = (shares > 0).to(torch.float64)
+    ways = shares[:, None, None] * shift
+    ends = torch.where(pinned[:, None], x + ways[1:], math.nan)
+    given = {"per_step": dv.per_step(ends), "callable": lambda k, x, v: ends[k], "constant": ends[0]}[kind]
+    velocities: list[Tensor] = []
+
+    def loss(seen: list[Any]) -> Tensor:
+        seen.append(dv.rollout(model, x, v, **LOADS, prescribed=given))
+        velocities.append(seen[-1].v[1, pinned])
+        return seen[-1].x[-1].sum()
+
+    for got in results_of(loss)[1]:
+        assert torch.allclose(
+            got.x[:, pinned] - x[pinned], ways.expand(-1, int(pinned.sum()), 3), rtol=0, atol=tolerance("forward")
+        )
+    for found in velocities:  # the smaller steps share the way
+        assert torch.allclose(found, (ways[1] / H).expand_as(found), rtol=tolerance("travel"))
+
+
+def test_colliders_go_straight() -> None:
+    mesh = dv.mesh.box(2, 0.1)
+    plane = dv.colliders.Plane((0, 0, -0.008), (0, 0, 1))
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier(dhat=5e-3)), colliders=[plane])
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    first = model.collider_points
+    still: dict[str, Any] = {**LOADS, "gravity": (0, 0, 0)}
+    lift = torch.tensor([0.0, 0.0, 0.012], dtype=torch.float64)
+    ends = torch.stack([first + lift * (k + 1) / STEPS for k in range(STEPS)])
+
+    def loss(seen: list[Any]) -> Tensor:
+        seen.append(dv.rollout(model, x, v, **still, colliders=dv.per_step(ends)))
+        return seen[-1].x[-1].mean()
+
+    _, seen = results_of(loss)
+    halves = torch.stack([first + lift * (k + 1) / (2 * STEPS) for k in range(2 * STEPS)])
+    finer = still | {"time_step": H / 2, "steps": 2 * STEPS, "sweeps": 2 * K}
+    want = dv.rollout(model, x, v, **finer, colliders=dv.per_step(halves))
+    assert torch.allclose(seen[3].x, want.x[::2], rtol=0, atol=tolerance("through_a_bounce"))
+    assert float((seen[3].x[-1] - x)[:, 2].min()) > 0.004  # it was lifted
+
+
+def test_a_result_that_few_sweeps_invented_does_not_survive() -> None:
+    """A stiff beam hardly sags in a few sweeps: a loss that wants it straight is met by the solver, not by the beam."""
+    mesh = dv.mesh.box((9, 2, 2), (0.8, 0.1, 0.1))
+    model = dv.Model(mesh, pinned=torch.tensor(mesh.points[:, 0] < 1e-9))
+    x = model.rest_points
+
+    def loss_with(sweeps: int, mu: float) -> Callable[[], Tensor]:
+        def loss() -> Tensor:
+            end = dv.rollout(model, x, torch.zeros_like(x), mu=mu, lam=mu, time_step=1 / 50, sweeps=sweeps, steps=40,
+                             save="last")  # fmt: skip
+            return (end.x[-1] - x).square().sum()
+
+        return loss
+
+    invented = dv.refine(loss_with(1, 1e6))
+    assert invented.both > 5 * invented.loss
+    assert not invented.survives and str(invented).startswith("does not survive")
+    gain = dv.refine(loss_with(60, 1e7), before=0.2)
+    assert gain.survives and str(gain).startswith("survives") and "began at 0.2" in str(gain)
+    strict = tolerance("minimum")
+    assert not dv.refine(loss_with(60, 1e7), before=0.2, tolerance=strict).survives
+
+
+def test_nothing_is_refined_afterwards() -> None:
+    want = dv.rollout(*beam(), **LOADS).x
+    dv.refine(lambda: dv.rollout(*beam(), **LOADS).x.sum())
+    with pytest.raises(ZeroDivisionError):
+        dv.refine(lambda: dv.rollout(*beam(), **LOADS).x.sum() / (1 // 0))
+    assert torch.equal(dv.rollout(*beam(), **LOADS).x, want)
+
+
+def loss_of(**given: Any) -> Any:
+    return lambda: dv.rollout(*beam(), **LOADS | given).x.sum()
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: dv.refine(cast(Any, 1.0)), TypeError, "loss: expected a function"),
+        (lambda: dv.refine(lambda: 1.0), ValueError, "loss: expected a function that runs dv.rollout"),
+        (lambda: dv.refine(lambda: dv.rollout(*beam(), **LOADS).x), ValueError, r"loss: expected a scalar, got shape"),
+        (lambda: dv.refine(cast(Any, lambda: dv.rollout(*beam(), **LOADS))), TypeError, "loss: expected a scalar"),
+        (lambda: dv.refine(loss_of(), tolerance=1.5), ValueError, "tolerance: expected a share"),
+        (lambda: dv.refine(loss_of(), tolerance=0), ValueError, "tolerance: expected"),
+        (lambda: dv.refine(loss_of(), before=-1e9), ValueError, "before: expected a loss above"),
+        (lambda: dv.refine(loss_of(estimate_errors=True)), NotImplementedError, "estimate_errors"),
+        (lambda: dv.refine(loss_of(steps=-1)), ValueError, "steps: expected"),
+        (lambda: dv.refine(loss_of(sweeps=1.5)), TypeError, "sweeps: expected"),
+        (lambda: dv.refine(loss_of(save=0)), ValueError, "save: expected"),
+        (lambda: dv.refine(loss_of(time_step=-1.0)), ValueError, "time_step: expected"),
+        (lambda: dv.refine(loss_of(force=dv.per_step(torch.zeros(5, 3)))), ValueError, "force: expected 6 steps"),
+        (lambda: dv.refine(lambda: dv.step(*beam(), mu=1e4, lam=1e4, time_step=H, sweeps=1)[0].sum()),
+         NotImplementedError, "dv.step"),
+        (lambda: dv.refine(lambda: dv.solve(*beam(), mu=1e4, lam=1e4, time_step=H).x.sum()),
+         NotImplementedError, "dv.solve"),
+    ],
+)  # fmt: skip
+def test_bad_input(call: Any, error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        call()
