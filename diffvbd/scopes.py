@@ -22,7 +22,6 @@ _lock = threading.Lock()
 _checked_by = 0  # threads and tasks inside debug_checks()
 _any_checking = False
 _recorders: tuple[tuple[str, list[Any]], ...] = ()  # of all threads and tasks
-_any_refining: tuple[int, int, list[int]] | None = None  # the last that any thread or task has begun
 
 
 def checking() -> bool:
@@ -45,8 +44,8 @@ def recorders(kind: str = "contact") -> tuple[list[Any], ...]:
 
 
 def refinement() -> tuple[int, int, list[int]] | None:
-    """Inside dv.refine: the factors of steps and of sweeps, and a list of what rollouts ran."""
-    return _any_refining if torch.compiler.is_compiling() else _refining.get()
+    """Inside dv.refine: the factors of steps and of sweeps, and a list of what rollouts ran. It compiles nothing."""
+    return None if torch.compiler.is_compiling() else _refining.get()
 
 
 def refuse_refinement(name: str) -> None:
@@ -93,29 +92,12 @@ def record_to(found: list[Any], kind: str = "contact") -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def refined(steps: int, sweeps: int, ran: list[int]) -> Iterator[None]:
-    """Inside, rollouts take so many times the steps and sweeps, and add their steps to ``ran``."""
-    global _any_refining
-    found = (steps, sweeps, ran)
-    token, outer = _refining.set(found), _any_refining
-    _any_refining = found
+def refined(factors: tuple[int, int, list[int]] | None) -> Iterator[None]:
+    """Inside, refinement() is ``factors``; None: a refined rollout runs as it stands."""
+    token = _refining.set(factors)
     try:
         yield
     finally:
-        _any_refining = outer
-        _refining.reset(token)
-
-
-@contextlib.contextmanager
-def unrefined() -> Iterator[None]:
-    """Inside, refinement() is None: a refined rollout runs as it stands."""
-    global _any_refining
-    token, outer = _refining.set(None), _any_refining
-    _any_refining = None
-    try:
-        yield
-    finally:
-        _any_refining = outer
         _refining.reset(token)
 
 

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ..checks import check_count, check_positive, fail
 from ..model.model import Model
-from ..scopes import unrefined
+from ..scopes import refined
+from ..step.integrators import History
 from .trajectory import PerStep, Trajectory, check_save, stacked
 
 # given at the steps of the caller and held over the smaller ones; `prescribed` and `colliders` move in between
@@ -33,12 +34,13 @@ def rollout_finer(rollout: Callable[..., Trajectory], *, factors: tuple[int, int
         return rollout(**given)  # which says what is wrong
     ran.append(steps)
     if parts == 1:
-        with unrefined():
+        with refined(None):
             return rollout(**given | {"sweeps": more_sweeps * sweeps})
     if given["estimate_errors"]:
         raise NotImplementedError("refine: expected rollouts without estimate_errors")
-    if given["history"] is not None:
-        raise NotImplementedError("refine: expected rollouts that begin without a history, which is of other steps")
+    time_step, history = check_positive("time_step", given["time_step"]) / parts, given["history"]
+    if isinstance(history, History) and history.time_step != time_step:  # but that of a refined rollout before
+        raise NotImplementedError("refine: expected rollouts that begin without a history of larger steps")
     finer = dict(given)
     for name in _HELD:
         finer[name] = _held(given[name], parts, steps, name)
@@ -58,13 +60,13 @@ def rollout_finer(rollout: Callable[..., Trajectory], *, factors: tuple[int, int
     save = given["save"]
     finer |= {
         "steps": parts * steps,
-        "time_step": check_positive("time_step", given["time_step"]) / parts,
+        "time_step": time_step,
         "sweeps": more_sweeps * sweeps,
         "save": save if save == "last" else parts * (1 if save == "all" else save),
         "observe": None if observe is None else observe_some,
         "progress": False,
     }
-    with unrefined():
+    with refined(None):
         found = rollout(**finer)
     return Trajectory(found.x, found.v, [step // parts for step in found.steps], stacked(observed), None, found.history)
 

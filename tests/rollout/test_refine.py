@@ -53,6 +53,23 @@ def test_a_rollout_is_that_of_smaller_steps_and_more_sweeps(integrator: Any) -> 
     assert len(set(values)) == 4 and values == tuple(float(t.x[-1].square().sum()) for t in seen)
 
 
+def test_a_rollout_continues_another() -> None:
+    model, x, v = beam()
+    given: dict[str, Any] = LOADS | {"integrator": dv.BDF2()}
+
+    def loss(seen: list[Any]) -> Tensor:
+        first = dv.rollout(model, x, v, **given)
+        seen.append(dv.rollout(model, first.x[-1], first.v[-1], **given, history=first.history))
+        return seen[-1].x.sum()
+
+    for (parts, sweeps), got in zip(FACTORS, results_of(loss)[1], strict=True):
+        finer = given | {"time_step": H / parts, "sweeps": sweeps * K, "steps": 2 * parts * STEPS}
+        assert torch.equal(got.x[-1], dv.rollout(model, x, v, **finer).x[-1])
+    outer = dv.rollout(model, x, v, **given)
+    with pytest.raises(NotImplementedError, match="history of larger steps"):
+        dv.refine(lambda: dv.rollout(model, outer.x[-1], outer.v[-1], **given, history=outer.history).x.sum())
+
+
 @pytest.mark.parametrize(("save", "steps"), [("last", [6]), (4, [0, 4, 6]), ("all", list(range(7)))])
 def test_frames_are_those_of_the_same_times(save: Any, steps: list[int]) -> None:
     def loss(seen: list[Any]) -> Tensor:
@@ -159,6 +176,17 @@ def test_a_result_that_few_sweeps_invented_does_not_survive() -> None:
     assert gain.survives and str(gain).startswith("survives") and "began at 0.2" in str(gain)
     strict = tolerance("minimum")
     assert not dv.refine(loss_with(60, 1e7), before=0.2, tolerance=strict).survives
+
+
+def test_a_compiled_loss_is_refined_and_stays_compiled() -> None:
+    def loss() -> Tensor:
+        return dv.rollout(*start, **LOADS, save="last").x[-1].square().sum()
+
+    start = beam()
+    compiled = torch.compile(loss, backend="eager")
+    value = float(compiled())
+    assert dv.refine(compiled) == dv.refine(loss)
+    assert float(compiled()) == value == dv.refine(loss).loss
 
 
 def test_nothing_is_refined_afterwards() -> None:
