@@ -109,7 +109,7 @@ def rollout(
         ValueError, TypeError: As step; also where a per_step value has another number of steps, or surfaces intersect.
         NotImplementedError: ``estimate_errors`` with contact or friction.
     """
-    if (factors := refinement()) is not None:
+    if (factors := refinement()) is not None:  # inside dv.refine
         return rollout_finer(rollout, **locals())
     steps = check_count("steps", steps)
     check_save(save)
