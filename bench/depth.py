@@ -101,7 +101,7 @@ class Batch:
         return squared.sum()
 
     def problem(self, iterations: int) -> Problem:
-        stage = Stage(loss=self.loss, iterations=iterations, learning_rate=cube_bounce.LEARNING_RATE)
+        stage = Stage(loss=self.loss, iterations=iterations, learning_rate=cube_bounce.LEARNING_RATE, refinable=False)
         return Problem(
             name=f"cube-bounce, {self.scene.sweeps} sweeps",
             parameters={"states": self.states},

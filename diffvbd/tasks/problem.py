@@ -53,6 +53,7 @@ class Stage:
             then; 0: never.
         gradient_tolerance: It also ends once the norm of the gradient is at most this fraction of the first one; 0:
             never.
+        refinable: False where the loss keeps what it finds: then a run ends without `dv.refine`, which calls it again.
         before: Called with the number of each iteration of the stage before its loss, to change tensors that it reads;
             the first number may come more than once.
         criterion: Key of the history by whose lowest value the best iteration is chosen, and by the loss among equals;
@@ -75,6 +76,7 @@ class Stage:
     clip: float | None = None
     capturable: bool = False
     name: str = ""
+    refinable: bool = True
 
 
 @dataclass

@@ -12,6 +12,8 @@ def survival(problem: Problem, settings: Settings, first: float) -> dv.Refinemen
     stage = problem.stages[-1]
     if settings.quick:
         return "not refined: a quick run"
+    if not stage.refinable:
+        return "not refined: its loss keeps what it finds"
     if stage.before or len(problem.stages) > 1:
         return "not refined: what its loss reads changes during the run"
     state = {name: value.clone() for name, value in problem.state.items()}
