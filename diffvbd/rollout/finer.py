@@ -8,11 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import check_count, check_positive, fail
 from ..model.model import Model
 from ..scopes import refined
 from ..step.integrators import History
-from .trajectory import PerStep, Trajectory, check_save, stacked
+from .trajectory import PerStep, Trajectory, stacked
 
 # given at the steps of the caller and held over the smaller ones; `prescribed` and `colliders` move in between
 _HELD = ("mu", "lam", "young", "poisson", "force", "gravity", "rest_points", "density")
@@ -27,30 +26,25 @@ def rollout_finer(rollout: Callable[..., Trajectory], *, factors: tuple[int, int
     colliders go in straight lines between the ends of these.
     """
     parts, more_sweeps, ran = factors
-    steps, sweeps = check_count("steps", given["steps"]), check_count("sweeps", given["sweeps"])
-    check_save(given["save"])
-    model, x = given["model"], given["x"]
-    if not isinstance(model, Model) or not isinstance(x, Tensor):
-        return rollout(**given)  # which says what is wrong
-    ran.append(steps)
+    ran.append(given["steps"])
     if parts == 1:
         with refined(None):
-            return rollout(**given | {"sweeps": more_sweeps * sweeps})
+            return rollout(**given | {"sweeps": more_sweeps * given["sweeps"]})
+    # dv.refine has run this as it stands before, which has checked the arguments
+    model, steps = given["model"], given["steps"]
     if given["estimate_errors"]:
         raise NotImplementedError("refine: expected rollouts without estimate_errors")
-    time_step, history = check_positive("time_step", given["time_step"]) / parts, given["history"]
+    time_step, history = given["time_step"] / parts, given["history"]
     if isinstance(history, History) and history.time_step != time_step:  # but that of a refined rollout before
         raise NotImplementedError("refine: expected rollouts that begin without a history of larger steps")
     finer = dict(given)
     for name in _HELD:
-        finer[name] = _held(given[name], parts, steps, name)
-    own = given["parameters"]
-    if isinstance(own, dict):
-        finer["parameters"] = {name: _held(value, parts, steps, f'parameters["{name}"]') for name, value in own.items()}
-    finer["prescribed"] = _moving(given["prescribed"], parts, steps, model)
+        finer[name] = _held(given[name], parts)
+    finer["parameters"] = {name: _held(value, parts) for name, value in (given["parameters"] or {}).items()}
+    finer["prescribed"] = _moving(given["prescribed"], parts, model)
     if isinstance(given["colliders"], PerStep):
         first = model.collider_points if given["colliders_before"] is None else given["colliders_before"]
-        finer["colliders"] = _between(given["colliders"], first, parts, steps)
+        finer["colliders"] = _between(given["colliders"].values, first, parts)
     observe, observed = given["observe"], []
 
     def observe_some(x: Tensor, v: Tensor, step: int) -> None:
@@ -61,7 +55,7 @@ def rollout_finer(rollout: Callable[..., Trajectory], *, factors: tuple[int, int
     finer |= {
         "steps": parts * steps,
         "time_step": time_step,
-        "sweeps": more_sweeps * sweeps,
+        "sweeps": more_sweeps * given["sweeps"],
         "save": save if save == "last" else parts * (1 if save == "all" else save),
         "observe": None if observe is None else observe_some,
         "progress": False,
@@ -69,11 +63,6 @@ def rollout_finer(rollout: Callable[..., Trajectory], *, factors: tuple[int, int
     with refined(None):
         found = rollout(**finer)
     return Trajectory(found.x, found.v, [step // parts for step in found.steps], stacked(observed), None, found.history)
-
-
-def _check_steps(name: str, values: Tensor, steps: int) -> None:
-    if values.shape[0] != steps:
-        fail(name, f"{steps} steps in per_step", f"shape {list(values.shape)}")
 
 
 def _asked(value: Any, parts: int) -> Callable[[int, Tensor, Tensor], Any]:
@@ -88,19 +77,16 @@ def _asked(value: Any, parts: int) -> Callable[[int, Tensor, Tensor], Any]:
     return ask
 
 
-def _held(value: Any, parts: int, steps: int, name: str) -> Any:
+def _held(value: Any, parts: int) -> Any:
     if isinstance(value, PerStep):
-        _check_steps(name, value.values, steps)
         return PerStep(value.values.repeat_interleave(parts, 0))
     return _asked(value, parts) if callable(value) and not isinstance(value, Tensor) else value
 
 
-def _moving(value: Any, parts: int, steps: int, model: Model) -> Any:
+def _moving(value: Any, parts: int, model: Model) -> Any:
     """Where pinned vertices are at the end of each smaller step."""
     if value is None:
         return None
-    if isinstance(value, PerStep):
-        _check_steps("prescribed", value.values, steps)
     ends = _asked(value, parts) if callable(value) and not isinstance(value, (Tensor, PerStep)) else None
     begun: list[Tensor] = []
     pinned = model.pinned[:, None]
@@ -120,12 +106,10 @@ def _moving(value: Any, parts: int, steps: int, model: Model) -> Any:
     return now
 
 
-def _between(colliders: PerStep, first: Tensor, parts: int, steps: int) -> PerStep:
+def _between(ends: Tensor, first: Tensor, parts: int) -> PerStep:
     """Where colliders are at the end of each smaller step."""
-    _check_steps("colliders", colliders.values, steps)
-    if steps == 0:
-        return colliders
-    ends = colliders.values
+    if len(ends) == 0:
+        return PerStep(ends)
     begins = torch.cat([first.expand_as(ends[0])[None], ends[:-1]])
     shares = torch.arange(1, parts + 1, dtype=ends.dtype, device=ends.device) / parts
     ways = torch.stack([begins + share * (ends - begins) for share in shares], dim=1)

@@ -31,7 +31,7 @@ from ..step.intersections import check_start as refuse_start
 from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
 from .contact_check import checks_contact, cut_share, warn_of_contact
 from .finer import rollout_finer
-from .trajectory import PerStep, Trajectory, check_save, stacked
+from .trajectory import PerStep, Trajectory, stacked
 
 # these enter through prepare(), the others through advance()
 _STATIC = ("mu", "lam", "young", "poisson", "rest_points", "density")
@@ -112,7 +112,7 @@ def rollout(
     if (factors := refinement()) is not None:  # inside dv.refine
         return rollout_finer(rollout, **locals())
     steps = check_count("steps", steps)
-    check_save(save)
+    _check_save(save)
     _check_estimates(estimate_errors, model)
     if not isinstance(check_contact, bool | None):
         raise TypeError(f"check_contact: expected a bool or None, got {type(check_contact).__name__}")
@@ -194,6 +194,11 @@ def rollout(
 
 
 # --- values of each step ----------------------------------------------------------------------------------------------
+
+
+def _check_save(save: Any) -> None:
+    if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
+        fail("save", '"all", "last" or an integer > 0', repr(save))
 
 
 def _check_estimates(asked: Any, model: Any) -> None:

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import fail
 from ..step.estimate import ErrorEstimate
 from ..step.integrators import History
 
@@ -45,11 +44,6 @@ class Trajectory:
     observations: Any = None
     errors: ErrorEstimate | None = None
     history: History | None = None
-
-
-def check_save(save: Any) -> None:
-    if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
-        fail("save", '"all", "last" or an integer > 0', repr(save))
 
 
 def stacked(observed: list[Any]) -> Any:
