@@ -43,6 +43,7 @@ CPU_SOURCES = [
     "csrc/cpu/islands.cpp",
     "csrc/cpu/kernels.cpp",
     "csrc/cpu/layout.cpp",
+    "csrc/cpu/longest.cpp",
     "csrc/cpu/neighbors.cpp",
     "csrc/cpu/plan.cpp",
     "csrc/bind/cpu/sweep.cpp",

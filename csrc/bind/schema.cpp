@@ -183,6 +183,9 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "collider_next, Tensor held, Tensor body, Tensor room, Tensor own_center, Tensor own_room, Tensor pairs, Tensor "
       "constants, Tensor ptr, Tensor entry, bool careful, bool whole) -> (Tensor share, Tensor stuck)");
   m.def("segment_sum(Tensor values, Tensor order, Tensor ptr) -> Tensor");
+  // Of each body the longest way of a vertex that counts and, with arms, the largest angle [1 | 2, scenes, bodies];
+  // beside, which is subtracted from the ways of a body, and arm may be empty, see contact/longest.h
+  m.def("longest_ways(Tensor way, Tensor beside, Tensor arm, Tensor counts, Tensor order, Tensor ptr) -> Tensor");
   // points [B, N, 3]; pairs [max_pairs, 3] int32: (scene, i, j), then rows of -1; count [1] int64: how many there are,
   // or -1 where a point is not finite
   m.def("neighbor_pairs(Tensor points, float radius, int max_pairs) -> (Tensor pairs, Tensor count)");

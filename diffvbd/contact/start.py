@@ -135,7 +135,8 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         origin: [B, V, 3] or empty.  detection: of the step.
         rigid: Where rigid motions of bodies would take their vertices, as a way [B, V, 3] [m], differentiable.
         stretch: By how much the straight ways of that stretch each body, and what sweeps need to take it back
-            [B, bodies] [m].  largest: Of ways [B, V, 3], the longest of a free vertex of each body.
+            [B, bodies] [m].  largest: Of ways [B, V, 3], the longest of a free vertex of each body, not
+            differentiated.
         raises: Of two states [B, V, 3], which vertices are of a body whose potential is higher in the second [B, V].
         own_pairs: Whether bodies have pairs of their own, and rooms for them.
     """
@@ -177,7 +178,7 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
     # bodies first, each as a whole
     target, base, own = target_of(x, move, u), torch.where(pinned, x, x + carried), ()
     beside = rigid - carried
-    limit = share_within(largest(beside.detach()), stretch, detection.room[:, :-1])
+    limit = share_within(largest(beside), stretch, detection.room[:, :-1])
     if own_pairs:
         limit = torch.minimum(limit, share_within(torch.zeros_like(stretch), stretch, detection.own_room[:, :-1]))
     above = above_floor(floor, origin, base, beside, pinned[:, 0], order, surface.bodies)

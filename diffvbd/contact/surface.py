@@ -36,6 +36,7 @@ class ContactSurface:
     planes: Tensor  # [L, 3] int32
     body: Tensor  # [N] int32: those of the mesh, then one for each collider
     held: Tensor  # [N] bool: pinned, or of a collider
+    held_bodies: Tensor  # [bodies] bool: a vertex of it is pinned
     plane_points: Tensor  # [N] bool: spans a plane
     body_order: Tensor  # [V] int32: vertices by body
     body_ptr: Tensor  # [bodies + 1] int32
@@ -99,6 +100,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     total, number = (np.bincount(label[first], weights, minlength=bodies) for weights in (lengths, None))
     edge = torch.from_numpy(total / np.maximum(number, 1))
     held_vertices = np.bincount(label, weights=pinned.cpu().numpy(), minlength=bodies)
+    held_bodies = torch.from_numpy(held_vertices > 0)
     alone = (held_vertices < np.bincount(label, minlength=bodies)).sum() <= 1 or not barrier.between_bodies
     own = torch.where(torch.from_numpy(np.bincount(label[surface[:, 0]], minlength=bodies)) <= COARSE_TRIANGLES,
                       MOST_EDGES_COARSE, MOST_EDGES_OWN)  # fmt: skip
@@ -122,6 +124,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         planes=index_tensor(planes, 3),
         body=torch.from_numpy(np.concatenate(body).astype(np.int32)),
         held=held,
+        held_bodies=held_bodies,
         plane_points=torch.from_numpy(np.concatenate(flat)),
         body_order=torch.from_numpy(order.astype(np.int32)),
         body_ptr=torch.from_numpy(np.searchsorted(label[order], np.arange(bodies + 1)).astype(np.int32)),
@@ -129,7 +132,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         rows=tuple(rows),
         most_room=most_room,
         most_room_alone=most_room_alone,
-        most_own_room=torch.where(torch.from_numpy(held_vertices > 0), MOST_EDGES_HELD, own) * edge,
+        most_own_room=torch.where(held_bodies, MOST_EDGES_HELD, own) * edge,
         least_own_room=LEAST_EDGES_OWN * edge,
         capacity=barrier.capacity or CAPACITY_PER_VERTEX * len(points[0]),
     )

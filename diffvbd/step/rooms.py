@@ -15,6 +15,7 @@ from ..contact.start import PartStart
 from ..contact.surface import ContactSurface
 from ..model.model import Model
 from ..ops import broadcast
+from ..ops import detect as ops_contact
 from ..ops.segments import of_segments, sum_segments
 
 ROOM = 1.5  # how far a vertex may go, over how far the farthest of its body wants to
@@ -43,9 +44,9 @@ class Motion:
     def __init__(self, surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, move: Tensor) -> None:
         self.surface, self.move = surface, move
         self.scenes, vertices = x.shape[:2]
-        self.body, self.free = surface.body[:vertices].long(), ~surface.held[:vertices]
+        self.body, self.held = surface.body[:vertices].long(), surface.held[:vertices]
+        self.free = ~self.held
         self.order = (surface.body_order, surface.body_ptr, self.body)
-        self.rows = broadcast(self.body[None], (self.scenes, vertices))
         self.weight = torch.where(self.free, broadcast(mass, (self.scenes, vertices)), 0.0)[..., None]
         at = x + origin if origin.numel() else x
         self.sums = _by_body(torch.cat([self.weight * move, self.weight, self.weight * at], -1), surface)
@@ -56,13 +57,18 @@ class Motion:
         """Values of bodies [B, bodies, n] for their vertices [B, V, n]."""
         return of_segments(values, *self.order)
 
-    def largest(self, way: Tensor) -> Tensor:
-        """The longest way [B, V, 3] of a free vertex of each body [B, bodies]."""
-        return self.longest(torch.where(self.free, way.square().sum(-1).sqrt(), 0.0))
+    def largest(self, way: Tensor, beside: Tensor | None = None) -> Tensor:
+        """The longest way [B, V, 3] of a free vertex of each body [B, bodies], beside one of the body [B, bodies, 3].
+        Index data."""
+        return self._longest(way, self.free, beside)
 
-    def longest(self, length: Tensor) -> Tensor:
-        out = length.new_zeros((self.scenes, self.surface.bodies))
-        return out.scatter_reduce(1, self.rows, length, "amax")
+    def driven(self) -> Tensor:
+        """The longest way of a vertex that is held [B, bodies]. Index data."""
+        return self._longest(self.move, self.held)
+
+    def _longest(self, way: Tensor, counts: Tensor, beside: Tensor | None = None) -> Tensor:
+        way, beside = way.detach().contiguous(), None if beside is None else beside.detach().contiguous()
+        return ops_contact.longest_ways(way, counts, *self.order[:2], beside)
 
     def rigid(self) -> Tensor:
         """Where t + w x r takes each vertex, as a way [B, V, 3] [m], with the body's linear and angular momentum: it
@@ -79,17 +85,17 @@ class Motion:
         adjugate = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2)
         determinant = (a * adjugate[..., 0, :]).sum(-1, keepdim=True)
         turn = (adjugate * sums[..., :3, None]).sum(-2) / determinant.clamp(min=_tiny(arm))
-        held = self.longest(broadcast((~self.free).to(arm.dtype), arm.shape[:2])) > 0
-        keep = (~held & (determinant[..., 0] > 0) & (size[..., 0] > 0)).reshape(scenes, bodies, 1)
+        keep = (~self.surface.held_bodies & (determinant[..., 0] > 0) & (size[..., 0] > 0)).reshape(scenes, bodies, 1)
         turn, mean = self.of_vertices(torch.where(keep, torch.cat([turn, self.mean], -1), 0.0)).split(3, -1)
         return mean + torch.linalg.cross(turn, arm)
 
     def stretched(self, rigid: Tensor) -> Tensor:
         """How far the ways of a turn, which are straight, bring a vertex of each body [B, bodies] away from the turned
-        body: by r (sqrt(1 + angle^2) - 1) at a distance r from the axis. rigid: of rigid(), or a share of it."""
-        turn, arm = ((a.square().sum(-1)).sqrt() for a in (rigid - self.mean[:, self.body], self.arm))
-        angle = self.longest(torch.where(self.free, turn / arm.clamp(min=_tiny(turn)), 0.0))
-        return self.longest(torch.where(self.free, turn, 0.0)) * angle / (1 + (1 + angle * angle).sqrt())
+        body: by r (sqrt(1 + angle^2) - 1) at a distance r from the axis. rigid: of rigid(), or a share of it. Index
+        data."""
+        rigid, arm, mean = (a.detach().contiguous() for a in (rigid, self.arm, self.mean))
+        turn, angle = ops_contact.longest_turns(rigid, arm, self.free, *self.order[:2], mean)
+        return turn * angle / (1 + (1 + angle * angle).sqrt())
 
 
 @torch.no_grad()
@@ -146,13 +152,13 @@ def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass:
         floor: Data of the FloorBarrier, or None.  any_direction: As for detection.islands.
     """
     x, mass, was, now, rigid = (t.detach() for t in (x, mass, was, now, rigid))
-    surface, move, body, sums = motion.surface, motion.move.detach(), motion.body, motion.sums
+    surface, move, sums = motion.surface, motion.move.detach(), motion.sums
     # The sweeps may take back all that the start has let fall and bent.
     falls = 2 * motion.largest(fall) + LEAST_ROOM * barrier.dhat
-    bends = motion.largest(move - motion.mean[:, body])
+    bends = motion.largest(move, motion.mean)
 
     # What is prescribed goes where it goes: pairs with it are listed however far that is.
-    driven = motion.longest(torch.where(motion.free, 0.0, move.square().sum(-1).sqrt()))
+    driven = motion.driven()
     pushed = driven.new_zeros((motion.scenes, 1))
     if was.shape[1]:
         pushed = (now - was).square().sum(-1).sqrt().amax(1, keepdim=True)
@@ -170,11 +176,11 @@ def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass:
     )
     stopped = motion.largest(move - left).clamp(max=surface.most_own_room)
 
-    def asked_beside(u: Tensor) -> Tensor:
-        return ROOM * motion.largest(move - u[:, body]) + bends + falls + stopped
+    def asked(beside: Tensor) -> Tensor:
+        return ROOM * beside + bends + falls + stopped
 
-    def room_beside(u: Tensor, most: Tensor) -> Tensor:
-        return torch.maximum(torch.minimum(asked_beside(u), most), driven) + pushed
+    def room_of(beside: Tensor, most: Tensor) -> Tensor:
+        return torch.maximum(torch.minimum(asked(beside), most), driven) + pushed
 
     def islands(room: Tensor) -> Tensor:
         return search.islands(
@@ -187,25 +193,25 @@ def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass:
 
     # A body that meets nothing in a larger room has it: it costs no pairs.
     most = surface.most_room.expand(motion.scenes, -1)
-    wish = room_beside(motion.mean, surface.most_room_alone)
-    if x.is_cuda or bool((wish > room_beside(motion.mean, most)).any()):
+    wish = room_of(bends, surface.most_room_alone)
+    if x.is_cuda or bool((wish > room_of(bends, most)).any()):
         island, same = together(wish)
         most = torch.where((island >= 0) & (same.sum(-1) == 1), surface.most_room_alone, most)
 
     # Islands depend on the rooms, and rooms on what an island leaves of a motion: hence twice.
-    room = room_beside(motion.mean, most)
+    room = room_of(bends, most)
     island, same = together(room)
     joined = same.to(x.dtype) @ sums[..., :4]
     u = joined[..., :3] / joined[..., 3:].clamp(min=_tiny(x))
     u = torch.where((island >= 0)[..., None], u, 0.0)
-    room = torch.maximum(room, room_beside(u, most))
-    stretch = ROOM * motion.stretched(rigid)
-    way, asked = motion.largest(move - u[:, body]) + stretch, asked_beside(u) + stretch
-    over = torch.maximum(way / most, (asked / most).clamp(max=2.0))  # which makes two parts, a longer way more
+    beside, stretched = motion.largest(move, u), motion.stretched(rigid)
+    room = torch.maximum(room, room_of(beside, most))
+    way, wanted = beside + ROOM * stretched, asked(beside) + ROOM * stretched
+    over = torch.maximum(way / most, (wanted / most).clamp(max=2.0))  # which makes two parts, a longer way more
     own = torch.zeros_like(room)
     if barrier.self_contact:
         least = room.clamp(max=surface.least_own_room)
-        own = (ROOM + 1) * (motion.largest(move - left_rigid) + motion.stretched(rigid)) + falls
+        own = (ROOM + 1) * (motion.largest(move - left_rigid) + stretched) + falls
         own = own.clamp(max=surface.most_own_room)
         own = torch.maximum(torch.maximum(own, least), driven)
     return Rooms(islands(room), with_largest(room), with_largest(own), over)

@@ -26,6 +26,7 @@ CASES += [
     ("contact", "contact_advance"),
     ("contact", "contact_narrow"),
     ("contact", "contact_keep"),
+    ("contact", "longest_ways"),
     ("contact", "contact_rigid_system"),
     ("contact", "contact_rigid_move"),
     ("floor", "pack_rest"),
@@ -45,7 +46,7 @@ UNREAD = {
 OF_CHOICE = {"mu", "lam", "rest", "other_tets"}  # between starts, which other scenes do not have
 SHARED = ("mu", "lam", "kappa")  # one value for all is legal
 # Empty where a scene lacks them; which it does, no tensor can tell.
-OPTIONAL = ("planes", "floor_lag", "lag", "own_room", "v_bar")
+OPTIONAL = ("planes", "floor_lag", "lag", "own_room", "v_bar", "beside", "arm")
 ONE_KIND = ("pack_rest", "star_sum", "tet_gather", "contact_keep")  # with one floating tensor, which may be either
 ERRORS = (ValueError, RuntimeError)
 
