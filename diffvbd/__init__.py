@@ -23,10 +23,13 @@ from .model.coarse import CoarseSpace
 from .model.model import Model
 from .model.moduli import lame, young_poisson
 from .ops.regimes import regime
+from .rollout.advise import advise
+from .rollout.budget import ErrorBudget, Share, error_budget
 from .rollout.checkpoints import BinomialCheckpoints
 from .rollout.converge import Solution, solve
 from .rollout.refine import Refinement, refine
 from .rollout.rollout import rollout
+from .rollout.settings import Candidate, Prediction, Settings
 from .rollout.trajectory import Trajectory, per_step
 from .step.estimate import ErrorEstimate
 from .step.integrators import BDF2, SDIRK2, History, ImplicitEuler
@@ -39,8 +42,10 @@ __all__ = [
     "Anchor",
     "Anderson",
     "BinomialCheckpoints",
+    "Candidate",
     "CoarseSpace",
     "Diagnosis",
+    "ErrorBudget",
     "ErrorEstimate",
     "FloorBarrier",
     "Friction",
@@ -52,7 +57,10 @@ __all__ = [
     "Model",
     "PairBarrier",
     "Refinement",
+    "Prediction",
     "ReverseSweep",
+    "Settings",
+    "Share",
     "Solution",
     "StableNeoHookean",
     "Stress",
@@ -61,12 +69,14 @@ __all__ = [
     "Trajectory",
     "Unrolled",
     "acceleration",
+    "advise",
     "check_gradients",
     "coarse",
     "colliders",
     "contact",
     "debug_checks",
     "diagnose",
+    "error_budget",
     "integrators",
     "lame",
     "mesh",

@@ -27,10 +27,12 @@ EXAMPLES = """examples:
   diffvbd simulate part.msh --out part.pvd --pin x- --mu 4e4 --lam 6e4 --save-target target.npz
   diffvbd identify part.msh target.npz --start 1e4 1e4
                                                    recover (mu, lam) from the observed motion
+  diffvbd advise part.msh --pin x- --duration 0.5 --error 0.01
+                                                   time step, sweeps and the like that keep an error of 1 %
 
 `diffvbd COMMAND --help` explains each command. Errors are one line, with exit status 2. `identify` ends with status 1
-where it stalled, and warns wherever it did not converge. An interrupted `run` or `identify` continues where it stopped
-when the same command is given again.
+where it stalled, and warns wherever it did not converge; `advise` where the error cannot be had. An interrupted `run`
+or `identify` continues where it stopped when the same command is given again.
 """
 TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here replaces the file's value):
   x          observed positions [m], shape [N, V, 3], or [V, 3] for one final shape
@@ -44,7 +46,7 @@ TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here re
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status: 0, 1 where `identify` stalled, 2 after an error, 130 if interrupted."""
+    """Run one command; returns the exit status: 0, 1 as EXAMPLES says, 2 after an error, 130 if interrupted."""
     options = _parser().parse_args(arguments)
     try:
         return options.command(options) or 0
@@ -87,14 +89,20 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("--stride", type=int, default=1, help="write every n-th frame (default 1)")
     simulate.add_argument("--device", default="cpu", help="torch device (default cpu)")
     simulate.add_argument("--save-target", type=Path, metavar="FILE.npz", help="also write what `identify` reads")
-    material = simulate.add_argument_group("material (default: mu = lam = 1e5 Pa)")
-    for name, text in (("mu", "shear modulus [Pa]"), ("lam", "first Lame parameter [Pa]")):
-        material.add_argument(f"--{name}", type=float, help=text)
-    material.add_argument("--young", type=float, help="Young's modulus [Pa], together with --poisson")
-    material.add_argument("--poisson", type=float, help="Poisson's ratio, below 0.5")
+    _add_material(simulate)
     _add_scene_options(simulate)
-    simulate.add_argument("--velocity", type=float, nargs=3, metavar=("VX", "VY", "VZ"), help="initial velocity [m/s]")
     simulate.set_defaults(command=_simulate)
+
+    advice = commands.add_parser("advise", help="find time step, sweeps and the like that keep a wanted error")
+    advice.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra")
+    advice.add_argument("--duration", type=float, required=True, help="of the motion [s]")
+    advice.add_argument("--error", type=float, default=0.01, help="share of the motion, in (0, 1) (default 0.01)")
+    advice.add_argument("--gradient", action="store_true", help="keep it for gradients, too")
+    advice.add_argument("--patience", type=float, default=120.0, help="how long pilots may run [s] (default 120)")
+    advice.add_argument("--device", default="cpu", help="torch device (default cpu)")
+    _add_material(advice)
+    _add_scene_options(advice)
+    advice.set_defaults(command=_advise)
 
     identification = commands.add_parser(
         "identify", help="recover mu and lam from observed shapes", epilog=TARGET_KEYS, formatter_class=raw
@@ -126,6 +134,15 @@ def _add_run_options(parser: argparse.ArgumentParser, directory: str) -> None:
     parser.add_argument("--device", default="cpu", help="torch device (default cpu)")
     parser.add_argument("--seed", type=int, default=0, help="seed of torch's generators (default 0)")
     parser.add_argument("--out", type=Path, metavar="DIR", help=f"for log and picture (default {directory})")
+
+
+def _add_material(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--velocity", type=float, nargs=3, metavar=("VX", "VY", "VZ"), help="initial velocity [m/s]")
+    material = parser.add_argument_group("material (default: mu = lam = 1e5 Pa)")
+    for name, text in (("mu", "shear modulus [Pa]"), ("lam", "first Lame parameter [Pa]")):
+        material.add_argument(f"--{name}", type=float, help=text)
+    material.add_argument("--young", type=float, help="Young's modulus [Pa], together with --poisson")
+    material.add_argument("--poisson", type=float, help="Poisson's ratio, below 0.5")
 
 
 def _add_scene_options(parser: argparse.ArgumentParser) -> None:
@@ -187,10 +204,7 @@ def _simulate(options: argparse.Namespace) -> None:
     check_device(options.device)
     mesh = _mesh(options)
     mu, lam = _material(options)
-    v0 = np.broadcast_to(np.asarray(options.velocity or (0.0, 0.0, 0.0)), mesh.points.shape)
-    given = _given_scene_options(options, mesh)
-    pinned = given.pop("pinned", np.zeros(mesh.num_vertices, dtype=bool))
-    scene = Scene(mesh, mesh.points, np.where(pinned[:, None], 0.0, v0), pinned, **given)
+    scene = _scene(options, mesh)
     _make_place(options)
     with torch.no_grad():
         model, progress = scene.model(options.device), sys.stderr.isatty()
@@ -199,7 +213,7 @@ def _simulate(options: argparse.Namespace) -> None:
                                 check_contact=said_below)  # fmt: skip
     frames, steps = motion.x.cpu().numpy(), np.asarray(motion.steps)
     dv.mesh.write_series(options.out, mesh, frames, steps * scene.time_step)
-    count = int(pinned.sum())
+    count = int(scene.pinned.sum())
     print(f"wrote {options.out} ({len(steps)} frames of {mesh.num_vertices} vertices, {count} pinned)")
     if options.pin and count < 3:
         print(
@@ -214,6 +228,39 @@ def _simulate(options: argparse.Namespace) -> None:
     if options.save_target:
         Observation(scene, frames, steps, {"mu": mu, "lam": lam}).save(options.save_target)
         print(f"wrote {options.save_target}")
+
+
+def _scene(options: argparse.Namespace, mesh: dv.TetMesh) -> Scene:
+    v0 = np.broadcast_to(np.asarray(options.velocity or (0.0, 0.0, 0.0)), mesh.points.shape)
+    given = _given_scene_options(options, mesh)
+    pinned = given.pop("pinned", np.zeros(mesh.num_vertices, dtype=bool))
+    return Scene(mesh, mesh.points, np.where(pinned[:, None], 0.0, v0), pinned, **given)
+
+
+def _advise(options: argparse.Namespace) -> int:
+    for name in ("time_step", "sweeps", "relaxation", "integrator"):
+        if getattr(options, name) is not None:
+            raise ValueError(f"--{name.replace('_', '-')}: expected none, since it is what advise chooses")
+    check_device(options.device)
+    mesh = _mesh(options)
+    mu, lam = _material(options)
+    scene = _scene(options, mesh)
+    model = scene.model(options.device)
+    x, v = (torch.tensor(a, dtype=model.dtype, device=model.device) for a in (scene.x0, scene.v0))
+    settings = dv.advise(model, x, v, duration=options.duration, error=options.error, gradient=options.gradient,
+                         patience=options.patience, mu=mu, lam=lam, gravity=scene.gravity)  # fmt: skip
+    print(settings)
+    print(f"\nin Python: settings=dv.Settings({_in_python(settings)})")
+    return 0 if settings.predicted is not None and settings.predicted.reached else 1
+
+
+def _in_python(settings: dv.Settings) -> str:
+    """The arguments of dv.Settings that are not left at their defaults."""
+    given = [f"{settings.time_step!r}, {settings.sweeps}, dv.{settings.integrator!r}"]
+    given += [f"relaxation={settings.relaxation!r}"] if settings.relaxation != 1 else []
+    given += [f"coarse={settings.coarse!r}"] if settings.coarse is not None else []
+    given += [f"acceleration=dv.{settings.acceleration!r}"] if settings.acceleration is not None else []
+    return ", ".join(given)
 
 
 def _make_place(options: argparse.Namespace) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -304,3 +305,17 @@ def test_wrong_usage_has_status_2() -> None:
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 2
+
+
+def test_advise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "part.msh"
+    dv.mesh.save(path, dv.mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1)))
+    common = ["advise", str(path), "--pin", "x-", "--duration", "0.1", "--error", "0.1"]
+    assert main(common) == 0
+    told = capsys.readouterr().out
+    made = re.search(r"in Python: settings=(dv\.Settings\(.*\))", told)
+    assert made is not None and "pilot runs took" in told
+    settings = eval(made[1])
+    assert isinstance(settings, dv.Settings) and 0 < settings.time_step <= 0.1
+    assert main([*common, "--sweeps", "3"]) == 2
+    assert "--sweeps: expected none" in capsys.readouterr().err

@@ -26,6 +26,7 @@ from .bodies import find_bodies, first_of_body
 from .coarse import CoarseSpace
 from .coarse_plan import check_coupled, plan_of
 from .describe import describe
+from .replaced import replaced_arguments
 from .rest import lumped_mass, rest_metric
 from .warnings import warn_of
 
@@ -120,6 +121,7 @@ class Model:
             self.energy_mask |= energy.bit
         checked = checked_steps(rigid, start, coarse, acceleration, self.energies, self.saturation)
         self.rigid, self.start, self.coarse, self.acceleration = checked
+        self._asked_rigid = rigid
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)
 
@@ -253,7 +255,8 @@ class Model:
         # what "auto" asks for in every step
         chooses = self.starts_from == "auto" and self.energy_mask & ELASTIC
         self._rest_scalars = rest if chooses else rest.new_empty((0,))
-        data = [e.pack(self._parameters(e, points), None) for e in self.vertex_energies]
+        constants = [(e, e.constants(points)) for e in self.vertex_energies]
+        data = [e.pack({name: value[None] for name, value in own.items()}, None) for e, own in constants]
         self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
 
     def _arrange_coarse(self, device: torch.device) -> None:
@@ -265,9 +268,6 @@ class Model:
         if self.acceleration is not None or decides:  # by potentials of bodies
             elastic = bool(self.energy_mask & ELASTIC)
             self._moving = moving_bodies(self._rest_points, self._topology[0], self._pinned, elastic)
-
-    def _parameters(self, energy: VertexEnergy, rest_points: Tensor) -> dict[str, Tensor]:
-        return {name: value[None] for name, value in energy.constants(rest_points).items()}
 
     def _place(self, dtype: torch.dtype, device: torch.device) -> None:
         self.dtype, self.device = dtype, device
@@ -323,6 +323,10 @@ class Model:
         out._place(dtype, device)
         return out
 
+    def replace(self, **changes: Any) -> Model:
+        """A new Model of the same mesh with other arguments of the constructor; other names raise TypeError."""
+        return Model(self.mesh, **replaced_arguments(self, changes))
+
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_derived": {}}
 
@@ -371,7 +375,7 @@ class Model:
 
     @property
     def num_colors(self) -> int:
-        """Groups of vertices that a sweep updates one after another."""
+        """Groups of vertices that are updated one after another."""
         return self._color_ptr.shape[0] - 1
 
     def settings(self, time_step: float, sweeps: int, scenes: int = 1) -> ops.SweepSettings:

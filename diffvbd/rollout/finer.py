@@ -26,6 +26,7 @@ def rollout_finer(rollout: Callable[..., Trajectory], *, factors: tuple[int, int
     colliders go in straight lines between the ends of these.
     """
     parts, more_sweeps, ran = factors
+    given = {name: value for name, value in given.items() if name not in ("settings", "duration")}  # none
     ran.append(given["steps"])
     if parts == 1:
         with refined(None):

@@ -29,8 +29,10 @@ from ..step.integrators import (
 )
 from ..step.intersections import check_start as refuse_start
 from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
+from .chosen import rollout_with
 from .contact_check import checks_contact, cut_share, warn_of_contact
 from .finer import rollout_finer
+from .settings import Settings
 from .trajectory import PerStep, Trajectory, stacked
 
 # these enter through prepare(), the others through advance()
@@ -43,13 +45,15 @@ def rollout(
     x: Tensor,
     v: Tensor,
     *,
-    steps: int,
+    steps: int | None = None,
     mu: Any = None,
     lam: Any = None,
     young: Any = None,
     poisson: Any = None,
-    time_step: float,
-    sweeps: int,
+    time_step: float | None = None,
+    sweeps: int | None = None,
+    settings: Settings | Literal["auto"] | None = None,
+    duration: float | None = None,
     force: Any = None,
     gravity: Any = GRAVITY,
     prescribed: Any = None,
@@ -75,6 +79,10 @@ def rollout(
         model, x, v, time_step, sweeps, adjoint, integrator: As in :func:`diffvbd.step`. With BDF2() the rollout keeps
             the history; ``history`` continues an earlier one, whose Trajectory has it.
         steps: Number of steps >= 0.
+        settings: In place of time_step, sweeps, integrator and of the Model's relaxation, coarse and acceleration: what
+            :func:`diffvbd.advise` returned, or a :class:`diffvbd.Settings` of your own. ``"auto"`` asks for an error of
+            0.01 first, which takes some four to eight rollouts each time: for one call, not for a training loop.
+        duration: With settings, the time [s] in place of steps: as many equal steps as their time_step asks for.
         colliders: Corner points of the Model's colliders [m]: constant, they rest there; in :func:`per_step`, where
             they are at the end of each step.
         colliders_before: Where per_step colliders are at the start; None: the Model's collider_points.
@@ -109,8 +117,14 @@ def rollout(
         ValueError, TypeError: As step; also where a per_step value has another number of steps, or surfaces intersect.
         NotImplementedError: ``estimate_errors`` with contact or friction.
     """
+    if settings is not None:
+        return rollout_with(rollout, **locals())
+    if duration is not None:
+        raise TypeError("duration: expected it beside settings only; without them give steps and time_step")
     if (factors := refinement()) is not None:  # inside dv.refine
         return rollout_finer(rollout, **locals())
+    if time_step is None or sweeps is None:
+        raise TypeError(f"{'time_step' if time_step is None else 'sweeps'}: expected a number, or settings, got None")
     steps = check_count("steps", steps)
     _check_save(save)
     _check_estimates(estimate_errors, model)
@@ -128,8 +142,8 @@ def rollout(
     # functions of them: torch.compile takes no object of ours along.
     options, own = ({k: _frozen(v) for k, v in given.items()} for given in (options, parameters or {}))
     # once: what a checkpoint runs again must run as it did, whatever dv.regime says by then
-    settings = step_settings(model, lead, time_step, sweeps)
-    chosen: dict[str, Any] = {"time_step": time_step, "sweeps": sweeps, "adjoint": adjoint, "settings": settings}
+    execution = step_settings(model, lead, time_step, sweeps)
+    chosen: dict[str, Any] = {"time_step": time_step, "sweeps": sweeps, "adjoint": adjoint, "settings": execution}
     anew = any(_changes(value) for value in (*(options[k] for k in _STATIC), *own.values()))
     fixed = None if anew else prepare(model, lead, **chosen, **_to_prepare(options, own, 0, x, v))
     if fixed is not None and looks_at(fixed.mu) and looks_at(fixed.lam):

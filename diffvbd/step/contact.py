@@ -339,13 +339,19 @@ class ContactStep:
             raise ValueError("start (x, v, force, gravity, prescribed, colliders): expected finite values")
 
 
+try:  # as torch.compiler.disable, which takes a second of every import of diffvbd to load the compiler
+    from torch._compile import _disable_dynamo as not_compiled
+except ImportError:
+    not_compiled = torch.compiler.disable
+
+
 def no_pairs(like: Tensor, corners: int) -> Pairs:
     """An empty list for so many corner points of all scenes."""
     none = torch.zeros((corners + 1,), dtype=torch.int32, device=like.device)
     return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, CONSTANTS)), none, none[:0])
 
 
-@torch.compiler.disable()  # sizes, checks and lists depend on values, and torch 2.11 compiled wrong gradients
+@not_compiled  # sizes, checks and lists depend on values, and torch 2.11 compiled wrong gradients
 def run_contact(model: Model, begun: Begun, prepared: Prepared, before: Tensor, colliders: Tensor, policy: int,
                 debug_step: int) -> Tensor:  # fmt: skip
     """Positions after the sweeps of a step with contact.

@@ -1,0 +1,108 @@
+"""Settings that keep an error: dv.advise, and what dv.rollout does with settings."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..checks import check_positive, fail
+from ..model.model import Model
+from ..step.arguments import check_state
+from .pilots import LOADS, MOVING, OTHERS, Pilots, Quantity
+from .rollout import rollout
+from .search import found
+from .settings import Settings
+
+PATIENCE = 120.0  # [s]
+
+
+@torch.no_grad()
+def advise(
+    model: Model,
+    x: Tensor,
+    v: Tensor,
+    *,
+    duration: float,
+    error: float = 0.01,
+    quantity: Quantity | None = None,
+    gradient: bool = False,
+    device: torch.device | str | None = None,
+    patience: float = PATIENCE,
+    **given: Any,
+) -> Settings:
+    """Finds settings whose error is at most ``error`` and that take the least time, by pilot runs of the scene itself.
+
+    Time step, integrator, sweeps, relaxation, coarse corrections and acceleration are chosen; mesh, energies, dtype and
+    tapes stay as they are. Pass the result on: ``dv.rollout(model, x, v, duration=..., settings=s, ...)``. Print it:
+    it says what it promises, what the runners-up take and what the advice has cost, usually four to eight of the
+    rollouts that it advises; below half a second of pilot runs that may be more.
+
+    The error is one of time: of the motion of this mesh with these energies, contact included, against the limit of
+    small steps and many sweeps. That of the mesh is not in it (:func:`diffvbd.error_budget` has it). What chaos leaves
+    no limit of, as piles that topple, has no settings: ``predicted.reached`` is False then and ``predicted.why`` says
+    why; the settings are the best that were run.
+
+    Args:
+        model, x, v: As in :func:`diffvbd.rollout`. relaxation, coarse and acceleration of the Model play no part.
+        duration: Of the motion [s].
+        error: Wanted relative error, in (0, 1): of positions, root mean square over vertices and four times, over that
+            of the way from the start.
+        quantity: A function of the last x and v, [..., V, 3], that returns a scalar whose error shall be kept, too.
+        gradient: Whether that of the gradient of ``quantity`` shall be kept, and its time counted: with respect to
+            each modulus and to a velocity that is added to all vertices. Without a quantity it is the mean squared way.
+        device: Where the pilots run; None: the Model's.
+        patience: How long pilots may run [s]; the search ends with the one that exceeds it.
+        given: mu and lam or young and poisson, force, gravity, prescribed, colliders, rest_points, density, parameters,
+            as in rollout, constant or a function of the time [s]: loads at the middle of each step, prescribed
+            vertices and colliders at its end.
+
+    Returns:
+        Settings with a :class:`diffvbd.Prediction`.
+
+    Raises:
+        ValueError, TypeError: As rollout; an error outside (0, 1), per_step values.
+    """
+    check_state(model, x, v)
+    error = check_positive("error", error)
+    if error >= 1:
+        fail("error", "a share of the motion in (0, 1)", repr(error))
+    if not isinstance(gradient, bool):
+        raise TypeError(f"gradient: expected a bool, got {type(gradient).__name__}")
+    if quantity is not None and not callable(quantity):
+        raise TypeError(f"quantity: expected a function of x and v, got {type(quantity).__name__}")
+    patience = check_positive("patience", patience, "s")
+    check_given(given)
+    if device is not None:
+        model = model.to(device)
+        x, v, given = x.to(device), v.to(device), {k: _moved(value, device) for k, value in given.items()}
+    pilots = pilots_of(model, x, v, duration, quantity, gradient, given)
+    pilots.check()
+    return found(pilots, error, patience)
+
+
+def pilots_of(model: Model, x: Tensor, v: Tensor, duration: float, quantity: Quantity | None, gradient: bool,
+              given: dict[str, Any]) -> Pilots:  # fmt: skip
+    """Pilot runs of a scene, with the gradients that are asked for."""
+    x, v = x.detach(), v.detach()
+    if gradient and quantity is None:
+        quantity = _mean_squared_way(x)
+    material = [name for name in ("mu", "lam", "young", "poisson") if given.get(name) is not None]
+    wrt = [name for name in material if not callable(given[name]) or isinstance(given[name], Tensor)]
+    given = {name: value.detach() if isinstance(value, Tensor) else value for name, value in given.items()}
+    return Pilots(rollout, model, x, v, duration, given, quantity, wrt if gradient else None)
+
+
+def _mean_squared_way(start: Tensor) -> Quantity:
+    return lambda x, v: (x - start).square().sum(-1).mean()
+
+
+def check_given(given: dict[str, Any]) -> None:
+    names = (*OTHERS, *LOADS, *MOVING)
+    if unknown := sorted(set(given) - set(names)):
+        raise TypeError(f"{unknown[0]}: expected an argument among {', '.join(names)}")
+
+
+def _moved(value: Any, device: torch.device | str) -> Any:
+    return value.to(device) if isinstance(value, Tensor) else value

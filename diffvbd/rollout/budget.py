@@ -1,0 +1,297 @@
+"""Where the error of a rollout comes from: sweeps, time step, precision, contact, mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..checks import check_number, check_positive, check_time_step, fail
+from ..contact.barrier import PairBarrier
+from ..energies import Anchor
+from ..mesh import subdivide
+from ..model.model import Model
+from ..step.arguments import check_state, prepare
+from ..step.integrators import SDIRK2, ImplicitEuler, Integrator
+from .advise import check_given, pilots_of
+from .contact_check import cut_share, unbalanced_friction
+from .pilots import FRAMES, Pilot, Pilots, Quantity, relative
+from .search import start_of
+from .settings import Settings
+
+FINER = 4  # times the steps of the finest run
+MOST_SWEEPS = 1300
+ENOUGH = 0.1  # of what more sweeps have changed so far: below it they have converged
+DETECTIONS = 8  # of the run that is held up least
+
+
+@dataclass(frozen=True)
+class Share:
+    """What one cause contributes to an error.
+
+    Attributes:
+        cause: "sweeps", "time step", "precision", "contact", "mesh" or "all but mesh".
+        motion: Root mean square distance of positions, over vertices and four times, over the way from the start [-].
+        quantity: Relative difference of the quantity [-]; None without one.
+        gradient: That of its gradient [-]; None where none was asked for.
+        seconds: What the pilot runs took that tell it [s].
+        note: With what was compared.
+    """
+
+    cause: str
+    motion: float
+    quantity: float | None
+    gradient: float | None
+    seconds: float
+    note: str
+
+
+@dataclass(frozen=True)
+class ErrorBudget:
+    """The error of a rollout by cause, see :func:`error_budget`. As text: a table.
+
+    Attributes:
+        settings: Whose error it is.
+        shares: One for each cause, the largest first, then "all but mesh" together, which need not be their sum.
+        duration: Of the motion that was looked at [s].
+        cut: The largest share of vertices that pairs held up in a step [-]; None without pairs.
+        friction: The share of the friction that the last step left unbalanced [-]; None without friction.
+    """
+
+    settings: Settings
+    shares: tuple[Share, ...]
+    duration: float
+    cut: float | None
+    friction: float | None
+
+    @property
+    def largest(self) -> Share:
+        return self.shares[0]
+
+    @property
+    def total(self) -> float:
+        """Of the motion, all causes but the mesh together [-]."""
+        return next(s.motion for s in self.shares if s.cause == "all but mesh")
+
+    def __str__(self) -> str:
+        def shown(value: float | None) -> str:
+            return "-" if value is None else f"{value:.1e}"
+
+        header = ("cause", "motion", "quantity", "gradient", "s", "compared with")
+        rows = [(s.cause, shown(s.motion), shown(s.quantity), shown(s.gradient), f"{s.seconds:.2g}", s.note)
+                for s in self.shares]  # fmt: skip
+        widths = [max(len(row[k]) for row in (header, *rows)) for k in range(6)]
+        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+                 for row in (header, *rows)]  # fmt: skip
+        lines.insert(0, f"{self.settings}, {self.duration:.3g} s of motion")
+        if self.cut is not None:
+            lines.append(f"pairs held up at most {100 * self.cut:.2g} % of the vertices in a step")
+        if self.friction is not None:
+            lines.append(f"{100 * self.friction:.2g} % of the friction is not balanced in the last step")
+        return "\n".join(lines)
+
+
+@torch.no_grad()
+def error_budget(
+    model: Model,
+    x: Tensor,
+    v: Tensor,
+    *,
+    duration: float,
+    time_step: float,
+    sweeps: int,
+    integrator: Integrator | None = None,
+    part: float = 1.0,
+    quantity: Quantity | None = None,
+    gradient: bool = False,
+    mesh: bool = False,
+    **given: Any,
+) -> ErrorBudget:
+    """Splits the error of a rollout by cause, by pilot runs that have less of one error at a time.
+
+    sweeps: the same steps with sweeps until more change nothing. time step: those against SDIRK2 with up to four times
+    the steps. precision: the same run in double precision. contact: the same with more detections in each step.
+    mesh: the converged run on a mesh of eight tets for each. Look at the largest: nothing else is worth improving.
+
+    Args:
+        model, x, v: As in :func:`diffvbd.rollout`.
+        duration, time_step, sweeps, integrator: Of the rollout that is judged.
+        part: The share of the duration that pilots run, from its start, in (0, 1]. Errors mostly grow with time: a part
+            says which is largest sooner than how large it will be.
+        quantity, gradient: As in :func:`diffvbd.advise`.
+        mesh: Whether to compare with a subdivided mesh, which takes some eight to sixteen times a run.
+        given: As in :func:`diffvbd.advise`.
+
+    Raises:
+        ValueError, TypeError: As rollout; a part outside (0, 1]; ``mesh`` with what belongs to single vertices.
+        RuntimeError: The rollout itself does not run to its end.
+    """
+    check_state(model, x, v)
+    h = check_time_step(time_step, model.dtype)
+    part = check_number("part", part)
+    if not 0 < part <= 1:
+        fail("part", "a number in (0, 1]", repr(part))
+    check_given(given)
+    steps = FRAMES * max(1, round(part * check_positive("duration", duration, "s") / (h * FRAMES)))
+    pilots = pilots_of(model, x, v, steps * h, quantity, gradient, given)
+    pilots.check()
+    own = Settings(h, sweeps, integrator or ImplicitEuler(), model.relaxation, model.coarse,
+                   model.acceleration)  # fmt: skip
+    return _Budget(pilots, own, steps).run(mesh)
+
+
+class _Budget:
+    def __init__(self, pilots: Pilots, own: Settings, steps: int) -> None:
+        self.pilots, self.own, self.steps = pilots, own, steps
+        self.shares: list[Share] = []
+
+    def run(self, mesh: bool) -> ErrorBudget:
+        p = self.pilots
+        run = self._run(self.own, self.steps)
+        cut, friction = self._contact_of()
+        self._precision(run)
+        self._contact(run)
+        converged = self._sweeps(run)
+        best = self._time(run, converged)
+        if mesh:
+            self._mesh(converged)
+        shares = sorted(self.shares, key=lambda s: -s.motion)
+        whole = self._share("all but mesh", run, best, 0.0, f"{best.settings}")
+        return ErrorBudget(self.own, (*shares, whole), p.duration, cut, friction)
+
+    def _run(self, settings: Settings, steps: int) -> Pilot:
+        done = self.pilots.run(settings, steps)
+        if done.x is None:
+            raise RuntimeError(f"error_budget: expected a rollout that runs to its end; {done.failure}")
+        return done
+
+    def _share(self, cause: str, a: Pilot, b: Pilot, seconds: float, note: str) -> Share:
+        assert a.x is not None and b.x is not None
+        quantity = None if a.quantity is None or b.quantity is None else relative(a.quantity, b.quantity)
+        gradients = [relative(u, w) for u, w in zip(a.gradient, b.gradient, strict=True)]
+        motion = self.pilots.apart(a.x, b.x)
+        return Share(cause, motion, quantity, max(gradients) if gradients else None, seconds, note)
+
+    def _other(self, pilots: Pilots) -> tuple[Pilot, float]:
+        """The rollout by other pilot runs, and the time it took [s]."""
+        before = pilots.spent
+        done = _Budget(pilots, self.own, self.steps)._run(self.own, self.steps)
+        self.pilots.spent, self.pilots.runs = pilots.spent, pilots.runs
+        return done, pilots.spent - before
+
+    def _precision(self, run: Pilot) -> None:
+        p = self.pilots
+        if p.model.dtype == torch.float64:
+            return
+        given = {k: w.double() if isinstance(w, Tensor) and w.is_floating_point() else w for k, w in p.given.items()}
+        double = replace(p, model=p.model.to(dtype=torch.float64), x=p.x.double(), v=p.v.double(), given=given)
+        done, seconds = self._other(double)
+        assert run.x is not None
+        single = replace(run, x=run.x.double(), gradient=tuple(g.double() for g in run.gradient),
+                         quantity=None if run.quantity is None else run.quantity.double())  # fmt: skip
+        self.shares.append(self._share("precision", single, done, seconds, "the same in float64"))
+
+    def _contact(self, run: Pilot) -> None:
+        model = self.pilots.model
+        if model.contact is None:
+            return
+        energies = [replace(e, detections=DETECTIONS) if isinstance(e, PairBarrier) else e for e in model.energies]
+        done, seconds = self._other(replace(self.pilots, model=model.replace(energies=energies)))
+        self.shares.append(self._share("contact", run, done, seconds, f"detections={DETECTIONS}"))
+
+    def _contact_of(self) -> tuple[float | None, float | None]:
+        """The largest share of vertices that pairs held up in a step, and of friction left unbalanced by the last one;
+        None where there are no pairs, no friction, or it cannot be told."""
+        p, model = self.pilots, self.pilots.model
+        if not model.touches:
+            return None, None
+        settings, cuts, before = self.own, list[Tensor](), [(p.x, p.v)]
+
+        def look(x: Tensor, v: Tensor, step: int) -> None:
+            cuts.append(cut_share(model))
+            if step == self.steps - 1:
+                before[0] = (x, v)
+
+        given = p.at_steps(dict(p.given), settings.time_step, self.steps, 0.0)
+        end = p.rollout(model, p.x, p.v, steps=self.steps, time_step=settings.time_step, sweeps=settings.sweeps,
+                        integrator=settings.integrator, save="last", observe=look, check_contact=False,
+                        check_start=False, **given)  # fmt: skip
+        cut = None if model.contact is None else float(torch.stack(cuts).max())
+        moves = any(callable(value) and not isinstance(value, Tensor) for value in p.given.values())
+        if model.friction is None or moves or not isinstance(settings.integrator, ImplicitEuler):
+            return cut, None
+        static: dict[str, Any] = {
+            name: p.given.get(name) for name in ("mu", "lam", "young", "poisson", "rest_points", "density")
+        }
+        prepared = prepare(model, tuple(p.x.shape[:-2]), time_step=settings.time_step, sweeps=settings.sweeps,
+                           parameters=p.given.get("parameters"), **static)  # fmt: skip
+        loads = {name: p.given.get(name) for name in ("force", "prescribed", "colliders", "colliders_before")}
+        return cut, unbalanced_friction(model, before[0], end.x[-1], prepared, loads | {"gravity": p.gravity})
+
+    def _sweeps(self, run: Pilot) -> Pilot:
+        """The same steps with sweeps enough that more change little."""
+        began = self.pilots.spent
+        settings = replace(start_of(self.pilots.model), integrator=self.own.integrator)
+        settings = replace(settings, sweeps=max(17, 2 * self.own.sweeps))
+        now = self._run(settings, self.steps)
+        while True:
+            settings = replace(settings, sweeps=2 * settings.sweeps + 1)
+            before, now = now, self._run(settings, self.steps)
+            assert before.x is not None and now.x is not None and run.x is not None
+            left = self.pilots.apart(before.x, now.x)
+            if left <= ENOUGH * self.pilots.apart(run.x, now.x) or left < 1e-9 or settings.sweeps > MOST_SWEEPS:
+                break
+        note = f"{now.settings}" + ("" if settings.sweeps <= MOST_SWEEPS else f", which still move it by {left:.1e}")
+        self.shares.append(self._share("sweeps", run, now, self.pilots.spent - began, note))
+        return now
+
+    def _time(self, run: Pilot, converged: Pilot) -> Pilot:
+        """SDIRK2 with more steps; their sweeps are as many as converge here."""
+        began = self.pilots.spent
+        settings = replace(
+            converged.settings, integrator=SDIRK2(), sweeps=min(converged.settings.sweeps, 2 * MOST_SWEEPS)
+        )
+        fine = self._run(settings, FINER * self.steps)
+        share = self._share("time step", converged, fine, 0.0, "")
+        note = f"SDIRK2, h = {fine.settings.time_step:.3g} s"
+        half = self._run(settings, FINER // 2 * self.steps)
+        assert half.x is not None and fine.x is not None
+        left = self.pilots.apart(half.x, fine.x)
+        note += f", itself off by some {left:.0e}" if left > 0.3 * share.motion else ""
+        self.shares.append(replace(share, seconds=self.pilots.spent - began, note=note))
+        return fine
+
+    def _mesh(self, converged: Pilot) -> None:
+        p, vertices = self.pilots, self.pilots.model.num_vertices
+        finer = finer_mesh(p)
+        before = finer.spent
+        fine = _Budget(finer, self.own, self.steps)._run(converged.settings, self.steps)
+        p.spent, p.runs = finer.spent, finer.runs
+        assert fine.x is not None
+        cut = replace(fine, x=fine.x[..., :vertices, :], gradient=(), quantity=None)
+        note = f"{finer.model.num_tets} tets"
+        self.shares.append(self._share("mesh", replace(converged, gradient=()), cut, finer.spent - before, note))
+
+
+def finer_mesh(p: Pilots) -> Pilots:
+    """Pilot runs on the subdivided mesh, whose first vertices are those of the mesh."""
+    model, given = p.model, dict(p.given)
+    for name in ("force", "prescribed", "rest_points", "parameters"):
+        if given.get(name) is not None:
+            fail(name, "None beside mesh=True, which has other vertices", type(given[name]).__name__)
+    if any(isinstance(e, Anchor) for e in model.energies):
+        fail("mesh", "False beside an Anchor, which holds single vertices", "True")
+    tets, pinned = model.tets.cpu(), model.pinned.cpu()
+    ends = torch.cat([tets[:, [i, j]] for i in range(4) for j in range(i)]).sort(1).values.unique(dim=0)
+    options = {"pinned": torch.cat([pinned, pinned[ends].all(1)]), "energies": model.energies,
+               "saturation": model.saturation, "regularization": model.regularization,
+               "colliders": model.colliders, "dtype": model.dtype, "device": model.device}  # fmt: skip
+    fine = Model(subdivide(model.mesh), density=model.density.cpu().repeat_interleave(8), **options)
+    x, v = (torch.cat([t, t[..., ends.to(t.device), :].mean(-2)], -2) for t in (p.x, p.v))
+    for name in ("mu", "lam", "young", "poisson", "density"):
+        value = given.get(name)
+        if isinstance(value, Tensor) and value.dim() and value.shape[-1] == model.num_tets:
+            given[name] = value.repeat_interleave(8, -1)
+    return replace(p, model=fine, x=x, v=v, given=given, quantity=None, wrt=None)

@@ -1,0 +1,62 @@
+"""A rollout whose time step, sweeps and the like come from settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..adjoint.routes import ReverseSweep
+from ..checks import check_count, check_positive, fail
+from .pilots import Pilots
+from .search import found
+from .settings import Settings
+from .trajectory import PerStep, Trajectory
+
+ERROR, PATIENCE = 0.01, 120.0  # of "auto" [-], [s]
+_OWN = ("time_step", "sweeps", "integrator")  # which settings have
+_FIXED = ("mu", "lam", "young", "poisson", "rest_points", "density", "parameters", "force", "gravity", "prescribed",
+          "colliders")  # fmt: skip
+
+
+def rollout_with(rollout: Callable[..., Trajectory], *, settings: Any, duration: Any, **given: Any) -> Trajectory:
+    """``rollout`` of the arguments ``given`` with the settings, or with those that "auto" finds for them."""
+    for name in _OWN:
+        if given[name] is not None:
+            raise TypeError(f"{name}: expected None beside settings, which have it, got {given[name]!r}")
+    if (given["steps"] is None) == (duration is None):
+        raise TypeError("duration: expected either duration or steps beside settings")
+    if settings == "auto":
+        if duration is None:
+            raise TypeError('duration: expected it beside settings="auto", which chooses the steps')
+        settings = _found(rollout, check_positive("duration", duration, "s"), given)
+    if not isinstance(settings, Settings):
+        raise TypeError(f'settings: expected diffvbd.Settings or "auto", got {type(settings).__name__}')
+    if duration is None:
+        steps, time_step = check_count("steps", given["steps"]), settings.time_step
+    else:
+        duration = check_positive("duration", duration, "s")
+        steps = settings.steps(duration)
+        time_step = duration / steps
+    chosen = {"model": settings.applied(given["model"]), "steps": steps, "time_step": time_step,
+              "sweeps": settings.sweeps, "integrator": settings.integrator}  # fmt: skip
+    if given["adjoint"] is None:
+        chosen["adjoint"] = ReverseSweep(settings.tape)
+    if given["checkpoint_every"] == "auto":
+        chosen["checkpoint_every"] = settings.checkpoint_every
+    return rollout(**given | chosen)
+
+
+@torch.no_grad()
+def _found(rollout: Callable[..., Trajectory], duration: float, given: dict[str, Any]) -> Settings:
+    fixed = {name: given[name] for name in _FIXED if given[name] is not None}
+    for name, value in fixed.items():
+        if isinstance(value, PerStep) or (callable(value) and not isinstance(value, Tensor)):
+            fail(name, 'a value beside settings="auto", which tries many time steps: use dv.advise, which takes '
+                 "functions of time", type(value).__name__)  # fmt: skip
+    fixed = {name: value.detach() if isinstance(value, Tensor) else value for name, value in fixed.items()}
+    pilots = Pilots(rollout, given["model"], given["x"].detach(), given["v"].detach(), duration, fixed)
+    pilots.check()
+    return found(pilots, ERROR, PATIENCE)

@@ -1,0 +1,246 @@
+"""Pilot runs: the same motion with other settings, and how far apart two of them are."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..adjoint.routes import ReverseSweep
+from ..checks import check_positive, fail
+from ..model.model import Model
+from ..model.moduli import moduli_of
+from ..ops import tet_gather
+from ..step.arguments import GRAVITY
+from .settings import Settings
+from .trajectory import PerStep, Trajectory
+
+FRAMES = 4  # at which two runs are compared, equally spaced over the duration
+STILL = 1e-4  # of the size of the scene: a motion below it counts as one of this size
+LOADS = ("force", "gravity")
+MOVING = ("prescribed", "colliders")
+OTHERS = ("mu", "lam", "young", "poisson", "rest_points", "density", "parameters")
+Quantity = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass
+class Pilot:
+    """A run: its frames, and what it took."""
+
+    settings: Settings
+    steps: int
+    x: Tensor | None  # [FRAMES + 1, ..., V, 3], the first is the start; None: it failed
+    v: Tensor | None
+    seconds: float
+    quantity: Tensor | None = None
+    gradient: tuple[Tensor, ...] = ()
+    failure: str = ""
+
+
+@dataclass
+class Pilots:
+    """Runs of one scene. ``rollout`` is diffvbd.rollout.
+
+    What changes in time is a function of the time [s]: it is asked for loads at the middle of each step, for prescribed
+    vertices and colliders at its end.
+    """
+
+    rollout: Callable[..., Trajectory]
+    model: Model
+    x: Tensor
+    v: Tensor
+    duration: float
+    given: dict[str, Any]
+    quantity: Quantity | None = None
+    wrt: Sequence[str] | None = None  # of the material: gradients with respect to them and a velocity of the whole
+    spent: float = 0.0  # [s]
+    runs: int = 0
+    _ready: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self.duration = check_positive("duration", self.duration, "s")
+        for name in (*OTHERS, *LOADS, *MOVING):
+            value = self.given.get(name)
+            if isinstance(value, PerStep):
+                fail(name, "a value or a function of the time [s], since time steps vary", "per_step")
+
+    # --- running ------------------------------------------------------------------------------------------------------
+
+    def check(self) -> None:
+        """One short step: raises what rollout raises of the arguments."""
+        h = 1e-3 * self.duration
+        given = self.at_steps(dict(self.given), h, 1, 0.0)
+        end = self.rollout(self.model, self.x, self.v, steps=1, time_step=h, sweeps=1, save="last", **given)
+        value = None if self.quantity is None else self.quantity(end.x[-1], end.v[-1])
+        if self.quantity is not None and not (isinstance(value, Tensor) and value.numel() == 1):
+            got = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            fail("quantity", "a function that returns a scalar tensor", got)
+
+    def run(self, settings: Settings, steps: int, quarter: int | None = None, start: Pilot | None = None) -> Pilot:
+        """``steps`` steps over the whole duration, or a quarter of them from frame ``quarter`` of ``start``."""
+        settings = settings.on(steps, self.duration)
+        part, first = (steps, 0) if quarter is None else (steps // FRAMES, quarter)
+        x, v = (self.x, self.v) if start is None or quarter is None else (start.x[quarter], start.v[quarter])  # type: ignore[index]
+        began = first * self.duration / FRAMES
+        differentiate = self.wrt is not None and quarter is None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                model = settings.applied(self.model)
+                self._warm(settings, model, x, v, began)
+                clock = time.perf_counter()
+                out = self._rollout(settings, model, x, v, part, began, FRAMES if quarter is None else 1, differentiate)
+                self._wait()
+            except (RuntimeError, ValueError, torch.OutOfMemoryError) as error:
+                return Pilot(settings, steps, None, None, math.inf, failure=f"{settings}: {error}")
+        seconds = time.perf_counter() - clock
+        self.spent += seconds
+        self.runs += 1
+        traj, value, gradient = out
+        x, v = traj.x.detach(), traj.v.detach()
+        if not bool(torch.isfinite(x[-1]).all()):
+            return Pilot(settings, steps, None, None, seconds, failure=f"{settings}: positions that are not finite")
+        return Pilot(settings, steps, x, v, seconds * steps / part, value, gradient)
+
+    def _rollout(self, settings: Settings, model: Model, x: Tensor, v: Tensor, steps: int, began: float, frames: int,
+                 differentiate: bool) -> tuple[Trajectory, Tensor | None, tuple[Tensor, ...]]:  # fmt: skip
+        given, leaves = dict(self.given), []
+        if differentiate:
+            # one velocity for all: those of single vertices excite what no time step resolves
+            leaves = [torch.zeros(3, dtype=model.dtype, device=model.device, requires_grad=True)]
+            for name in self.wrt or ():
+                leaf = torch.as_tensor(given[name], dtype=model.dtype, device=model.device).detach().clone()
+                leaves.append(leaf.requires_grad_())
+                given[name] = leaf
+            with torch.enable_grad():
+                v = torch.where(model.pinned[:, None], v, v + leaves[0])
+        given = self.at_steps(given, settings.time_step, steps, began)
+        with torch.set_grad_enabled(differentiate):
+            out = self.rollout(
+                model, x, v, steps=steps, time_step=settings.time_step, sweeps=settings.sweeps,
+                integrator=settings.integrator, adjoint=ReverseSweep(settings.tape),
+                checkpoint_every=settings.checkpoint_every, save=max(1, steps // frames), check_contact=False,
+                check_start=False, **given,
+            )  # fmt: skip
+            value = None if self.quantity is None else self.quantity(out.x[-1], out.v[-1])
+            gradient = torch.autograd.grad(value, leaves) if leaves else ()  # type: ignore[arg-type]
+        return out, None if value is None else value.detach(), gradient
+
+    def _warm(self, settings: Settings, model: Model, x: Tensor, v: Tensor, began: float) -> None:
+        """The first step of a Model arranges what later ones find: it is not timed."""
+        key = f"{id(model)} {settings.integrator}"
+        if key not in self._ready:
+            self._ready.add(key)
+            with torch.no_grad():
+                self._rollout(settings, model, x, v, 1, began, 1, False)
+            self._wait()
+
+    def _wait(self) -> None:
+        if self.x.is_cuda:
+            torch.cuda.synchronize(self.x.device)
+
+    def at_steps(self, given: dict[str, Any], h: float, steps: int, began: float) -> dict[str, Any]:
+        """Functions of time as the rollout takes them."""
+
+        def timed(function: Callable[[float], Any], share: float) -> Callable[[int, Tensor, Tensor], Any]:
+            return lambda step, x, v: function(began + (step + share) * h)
+
+        out = {name: value for name, value in given.items() if value is not None}
+        for name, value in given.items():
+            if not callable(value) or isinstance(value, Tensor):
+                continue
+            function: Callable[[float], Any] = value
+            if name == "colliders":
+                out[name] = PerStep(torch.stack([function(began + (k + 1) * h) for k in range(steps)]))
+                out["colliders_before"] = function(began)
+            else:
+                out[name] = timed(function, 0.5 if name in LOADS else 1.0)
+        return out
+
+    # --- comparing ----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def size(self) -> float:
+        """Extent of the scene at its start [m]."""
+        flat = self.x.detach().reshape(-1, 3)
+        return float((flat.amax(0) - flat.amin(0)).norm())
+
+    def motion(self, frames: Tensor) -> Tensor:
+        """Root mean square way from the start of each scene [...] [m], over vertices and frames."""
+        way = (frames[1:] - self.x.detach()).square().sum(-1).mean((0, -1)).sqrt()
+        return way.clamp(min=STILL * self.size)
+
+    def apart(self, a: Tensor, b: Tensor) -> float:
+        """Root mean square distance of two runs over the motion of the second, in the worst scene."""
+        distance = (a[1:] - b[1:]).square().sum(-1).mean((0, -1)).sqrt()
+        worst = float((distance / self.motion(b)).max())
+        return worst if math.isfinite(worst) else math.inf
+
+    def hardest(self, a: Tensor, b: Tensor) -> int:
+        """The quarter of the duration in which two runs part most."""
+        distance = (a - b).square().sum(-1).flatten(1).mean(1).sqrt()
+        return int(distance.diff().argmax())
+
+    @property
+    def gravity(self) -> Any:
+        return GRAVITY if self.given.get("gravity") is None else self.given["gravity"]
+
+    # --- energy -------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def conserves(self) -> bool:
+        """Whether the exact motion keeps its energy, so that what a run loses is what it damps."""
+        changing = any(callable(v) and not isinstance(v, Tensor) for v in self.given.values())
+        other = any(self.given.get(name) is not None for name in ("rest_points", "density", "prescribed", "colliders"))
+        damped = self.model.friction is not None or any(
+            bool((torch.as_tensor(getattr(e, "damping", 0.0)) > 0).any()) for e in self.model.energies
+        )
+        return not (changing or other or damped)
+
+    @cached_property
+    def _rest_inverse(self) -> Tensor:
+        corners = tet_gather(self.model.rest_points[None].double(), *self.model._topology)[0]
+        return torch.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(-1, -2))
+
+    def energy(self, x: Tensor, v: Tensor) -> Tensor:
+        """Kinetic, elastic and of loads [...] [J] of each scene; contact, which is short, counts as none."""
+        model, given = self.model, self.given
+        lead = x.shape[:-2]
+        x, v = (t.double().reshape(-1, *t.shape[-2:]) for t in (x, v))
+        mu, lam = moduli_of(model, lead, *(given.get(n) for n in ("mu", "lam", "young", "poisson")))
+        mu, lam = (torch.as_tensor(m, device=x.device).detach().double() for m in (mu, lam))
+        corners = tet_gather(x, *model._topology)
+        f = (corners[..., 1:, :] - corners[..., :1, :]).transpose(-1, -2) @ self._rest_inverse
+        strain = torch.linalg.det(f) - 1
+        psi = mu * ((f.square().sum((-1, -2)) - 3) / 2 - strain) + (mu + lam) / 2 * strain.square()
+        volume = 1 / (6 * torch.linalg.det(self._rest_inverse).abs())
+        mass = model.mass.double()[:, None]
+        load = mass * torch.as_tensor(self.gravity, device=x.device).double()
+        if given.get("force") is not None:
+            load = load + given["force"].double()
+        total = (psi * volume).sum(-1) + (0.5 * mass * v.square() - load * x).sum((-1, -2))
+        return total.reshape(lead)
+
+    def damped(self, run: Pilot) -> float:
+        """An upper bound of the motion that a run has damped away, over its motion: that of vibrations which steps of
+        this length do not resolve, a <= sqrt(2 E / m) / w with w >= 1 / h. Zero where energy says nothing."""
+        if not self.conserves or run.x is None or run.v is None:
+            return 0.0
+        lost = (self.energy(run.x[0], run.v[0]) - self.energy(run.x[-1], run.v[-1])).clamp(min=0)
+        mass = float(self.model.mass[~self.model.pinned].sum())
+        way = (2 * lost / max(mass, 1e-300)).sqrt() * (self.duration / run.steps)
+        return float((way / self.motion(run.x)).max())
+
+
+def relative(a: Tensor, b: Tensor) -> float:
+    """|a - b| / |b|"""
+    size = float(b.norm())
+    apart = float((a - b).norm())
+    return 0.0 if apart == 0 else apart / size if size > 0 else math.inf

@@ -1,0 +1,265 @@
+"""The search for settings that keep an error: a ladder of time steps, then cheaper candidates that are run to be sure.
+
+1. Ladder: settings that converge well run with ever more steps, twice as many each time, until two runs and the order
+   that three show (Richardson) say that half of the wanted error is reached. Its last two runs give the reference.
+2. Ranking: candidates run the quarter of the duration in which the ladder's runs part most, from the reference's own
+   state there. Error and time of each, and the order, predict with how many steps it meets the wanted error.
+3. Proof: the one that should take the least time runs the whole duration and is compared with the reference; with more
+   steps if it misses the error, with fewer if it is far below, or the next one. The ladder's last run always meets it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+from torch import Tensor
+
+from ..energies import StableNeoHookean
+from ..model.anderson import Anderson
+from ..model.model import Model
+from ..step.integrators import SDIRK2, ImplicitEuler
+from .pilots import FRAMES, Pilot, Pilots, relative
+from .settings import Candidate, Prediction, Settings
+
+LONGEST = 0.1  # [s] of the first time step of the ladder
+MOST_STEPS = 2**17
+FEWEST_THAT_RUN = 256  # steps: fewer than these may fail
+ORDERS = (0.5, 2.0)  # that are believed
+AIM = 0.6  # of the wanted error that a candidate is given
+COSTS = 8.0  # times the advised rollout that all runs may take,
+FREE = 0.5  # [s] or so long
+TOO_FINE = 0.1  # of the wanted error: candidates below it try fewer steps
+STUCK = 5  # levels of the ladder that do not come closer: there is no limit to find
+
+
+def found(pilots: Pilots, error: float, patience: float) -> Settings:
+    """The settings that take the least time and keep the error, with their Prediction."""
+    return _Search(pilots, error, patience).run()
+
+
+def start_of(model: Model) -> Settings:
+    """What the ladder runs with: well converged and never far from the fastest."""
+    if not _exact(model):
+        return Settings(1.0, 40, SDIRK2())
+    if model.contact is not None or model.friction is not None:
+        return Settings(1.0, 20, SDIRK2())
+    return Settings(1.0, 8, SDIRK2(), relaxation=1.5, coarse="auto")
+
+
+def candidates_of(model: Model) -> list[Settings]:
+    sdirk, euler = SDIRK2(), ImplicitEuler()
+    touches = model.contact is not None or model.friction is not None
+    over = 1.0 if touches or not _exact(model) else 1.6
+    out = [Settings(1.0, k, scheme, relaxation=over) for scheme in (sdirk, euler) for k in (5, 10, 20)]
+    if _exact(model) and not touches:
+        out += [Settings(1.0, k, sdirk, relaxation=1.5, coarse="auto") for k in (2, 5)]
+        out += [Settings(1.0, 2, euler, relaxation=1.5, coarse="auto")]
+    elif _exact(model):
+        out += [Settings(1.0, 20, euler, acceleration=Anderson(5))]
+    return out
+
+
+def _exact(model: Model) -> bool:
+    """Whether coarse corrections and acceleration are defined."""
+    elastic = next((e for e in model.energies if isinstance(e, StableNeoHookean)), None)
+    return elastic is not None and elastic.block == "exact" and model.saturation is None
+
+
+class _Search:
+    def __init__(self, pilots: Pilots, error: float, patience: float = 120.0) -> None:
+        self.pilots, self.error, self.patience = pilots, error, patience
+        self.order = 1.0
+        # impacts come early or late by up to a step: nothing can be extrapolated
+        self.smooth = not (pilots.model.touches or pilots.model.floor is not None)
+        self.ladder: list[Pilot] = []
+        self.estimates: list[float] = []  # of each level from the third on, of what is asked for
+        self.proven: list[Candidate] = []
+        self.predicted: list[Candidate] = []
+
+    def run(self) -> Settings:
+        reached, why = self._climb()
+        if reached:
+            self._rank()
+            self._prove()
+            self.proven.sort(key=lambda c: c.seconds)
+            best = next(c for c in self.proven if c.error <= self.error)
+            why = self._reason(best)
+        else:
+            error = self.estimates[-1] if self.estimates else math.inf
+            now = self.ladder[-1] if self.ladder else None
+            settings = start_of(self.pilots.model).on(FRAMES, self.pilots.duration) if now is None else now.settings
+            best = Candidate(settings, error, math.inf if now is None else now.seconds, now is not None)
+        tried = {str(c.settings) for c in self.proven}
+        rest = [c for c in self.proven if c is not best] + [c for c in self.predicted if str(c.settings) not in tried]
+        others = tuple(sorted(rest, key=lambda c: c.seconds))
+        p = self.pilots
+        told = Prediction(self.error, best.error, best.seconds, p.duration, reached, why, others, p.spent, p.runs)
+        return replace(best.settings, dtype=p.model.dtype, predicted=told)
+
+    def _reason(self, best: Candidate) -> str:
+        last = self.ladder[-1]
+        return (
+            f"these take the least time of those that were run to the end or predicted; the error is the distance to "
+            f"{last.settings}, and what that may be off itself"
+        )
+
+    # --- the ladder ---------------------------------------------------------------------------------------------------
+
+    def _climb(self) -> tuple[bool, str]:
+        """Runs with more steps each time until the last one has half of the wanted error, or why that cannot be had."""
+        p, settings = self.pilots, start_of(self.pilots.model)
+        steps = FRAMES * max(1, math.ceil(p.duration / (FRAMES * LONGEST)))
+        apart: list[float] = []
+        while True:
+            if steps > MOST_STEPS:
+                return False, f"{MOST_STEPS} steps are not enough"
+            if p.spent > self.patience:
+                return False, f"{self.patience:g} s of pilot runs were not enough (patience)"
+            now = p.run(settings, steps)
+            if now.x is None and not self.ladder and steps < FEWEST_THAT_RUN:  # long steps may fail where short do not
+                steps *= 2
+                continue
+            if now.x is None:
+                return False, f"a run failed: {now.failure}"
+            self.ladder.append(now)
+            if len(self.ladder) > 1:
+                apart.append(self._distance(self.ladder[-2], now))
+            if len(apart) > 1:
+                self.order = self._order(apart)
+                self.estimates.append(max(self._remaining(apart), self._unresolved()))
+                if self.estimates[-1] <= 0.5 * self.error:
+                    more = self._with_more_sweeps(settings)
+                    if more is None:
+                        return True, ""
+                    settings = more.settings
+                    apart[-1] = self._distance(self.ladder[-3], more)
+                    self.ladder[-2:] = [more]
+                    apart.pop()
+                    continue
+                if self._is_stuck(apart):
+                    return False, self._why(apart[-1])
+            steps *= 2
+
+    def _remaining(self, apart: list[float]) -> float:
+        """The error of the last run."""
+        return apart[-1] / (2**self.order - 1) if self.smooth else max(apart[-2:])
+
+    def _order(self, apart: list[float]) -> float:
+        low, high = ORDERS
+        return min(max(math.log2(max(apart[-2], 1e-300) / max(apart[-1], 1e-300)), low), high)
+
+    def _unresolved(self) -> float:
+        """Motion that is lost to damping, unless halving the step halves what is lost."""
+        last, before = (self.pilots.damped(run) for run in (self.ladder[-1], self.ladder[-2]))
+        # damped() is the root of the energy times the step: sqrt(2) x 2 where the energy halves
+        return 0.0 if last < before / (2 * math.sqrt(2)) else last
+
+    def _with_more_sweeps(self, settings: Settings) -> Pilot | None:
+        """The run before the last once more with twice the sweeps, if those move it by more than a quarter of the
+        error. With the sweeps of the ladder it might come close to a limit of its own."""
+        before = self.ladder[-2]
+        more = self.pilots.run(replace(settings, sweeps=2 * settings.sweeps + 1), before.steps)
+        if more.x is None or self._distance(before, more) <= 0.25 * self.error:
+            return None
+        return more
+
+    @staticmethod
+    def _is_stuck(apart: list[float]) -> bool:
+        """Whether runs have come no closer to one another over several levels."""
+        return len(apart) > STUCK and min(apart[-2:]) > 0.7 * max(apart[-STUCK:])
+
+    def _why(self, apart: float) -> str:
+        cause = "the motion through contact depends on every digit" if self.pilots.model.touches else "rounding"
+        return f"runs of h and h/2 stay {apart:.2g} of the motion apart however small h is: {cause}"
+
+    def _distance(self, a: Pilot, b: Pilot) -> float:
+        """Of motion, quantity and gradient, the largest."""
+        assert a.x is not None and b.x is not None
+        out = [self.pilots.apart(a.x, b.x)]
+        out += [relative(u, w) for u, w in zip(a.gradient, b.gradient, strict=True)]
+        if a.quantity is not None and b.quantity is not None:
+            out.append(relative(a.quantity, b.quantity))
+        return max(out)
+
+    @property
+    def reference(self) -> Pilot:
+        """The last run of the ladder; where the motion is smooth, extrapolated from the last two."""
+        a, b = self.ladder[-2], self.ladder[-1]
+        assert a.x is not None and b.x is not None
+        share = 1 / (2**self.order - 1) if self.smooth else 0.0
+
+        def beyond(u: Any, w: Any) -> Any:
+            return None if u is None else w + share * (w - u)
+
+        gradient = tuple(beyond(u, w) for u, w in zip(a.gradient, b.gradient, strict=True))
+        return replace(b, x=beyond(a.x, b.x), quantity=beyond(a.quantity, b.quantity), gradient=gradient)
+
+    # --- candidates ---------------------------------------------------------------------------------------------------
+
+    def _rank(self) -> None:
+        p, last = self.pilots, self.ladder[-1]
+        reference = self.reference
+        uncertain = (0.5 if self.smooth else 1.0) * self.estimates[-1]
+        self.aim = AIM * (self.error - uncertain)
+        for run in self.ladder[-2:]:
+            self.proven.append(Candidate(run.settings, self._distance(run, reference) + uncertain, run.seconds, True))
+        self.uncertain, self.truth = uncertain, reference
+        assert last.x is not None and self.ladder[-2].x is not None
+        quarter = p.hardest(self.ladder[-2].x, last.x)
+        # with as many steps as the ladder would take for the wanted error
+        steps = self.ladder[-2].steps
+        own = p.run(self.ladder[-2].settings, steps, quarter, last)
+        target = last.x[quarter + 1]
+        scale = self._of_quarter(own, target)
+        level = max(self._distance(self.ladder[-2], reference), 1e-300)
+        self.plans: list[tuple[float, int, Settings]] = []
+        for settings in candidates_of(p.model):
+            if p.spent > max(0.6 * COSTS * self._least(), FREE):
+                break
+            run = p.run(settings, steps, quarter, last)
+            if run.x is None:
+                continue
+            error = level * self._of_quarter(run, target) / max(scale, 1e-300)
+            self._plan(settings, steps, error, run.seconds / steps)
+
+    def _of_quarter(self, run: Pilot, target: Tensor) -> float:
+        return math.inf if run.x is None else float((run.x[-1] - target).square().mean().sqrt())
+
+    def _plan(self, settings: Settings, steps: int, error: float, per_step: float) -> None:
+        order = self.order if isinstance(settings.integrator, SDIRK2) else min(self.order, 1.0)
+        more = (max(error, 1e-300) / self.aim) ** (1 / order)
+        wanted = self._rounded(steps * more)
+        if wanted <= MOST_STEPS:
+            self.plans.append((wanted * per_step, wanted, settings))
+            planned = settings.on(wanted, self.pilots.duration)
+            self.predicted.append(Candidate(planned, self.aim + self.uncertain, wanted * per_step, False))
+
+    @staticmethod
+    def _rounded(steps: float) -> int:
+        return FRAMES * max(1, math.ceil(min(steps, 2.0 * MOST_STEPS) / FRAMES))
+
+    def _least(self) -> float:
+        """Time of the fastest proven candidate that keeps the error."""
+        return min((c.seconds for c in self.proven if c.error <= self.error), default=math.inf)
+
+    def _prove(self) -> None:
+        p = self.pilots
+        for seconds, steps, settings in sorted(self.plans, key=lambda plan: plan[0]):
+            for _ in range(3):
+                if seconds > 0.9 * self._least() or p.spent + seconds > max(COSTS * min(self._least(), seconds), FREE):
+                    break
+                run = p.run(settings, steps)
+                if run.x is None:
+                    break
+                error = self._distance(run, self.truth) + self.uncertain
+                self.proven.append(Candidate(run.settings, error, run.seconds, True))
+                if error <= self.error and error - self.uncertain >= TOO_FINE * self.error:
+                    break
+                order = self.order if isinstance(settings.integrator, SDIRK2) else min(self.order, 1.0)
+                more = ((error - self.uncertain) / self.aim) ** (1 / order)
+                steps, before = self._rounded(steps * min(max(more, 0.25), 4.0)), steps
+                if steps == before:
+                    break
+                seconds = run.seconds * steps / before

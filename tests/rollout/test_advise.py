@@ -1,0 +1,121 @@
+"""Advised settings keep the error that was asked for, and say so where none do."""
+
+import math
+
+import pytest
+import torch
+
+import diffvbd as dv
+from diffvbd import mesh
+from diffvbd.rollout.pilots import Pilots
+from diffvbd.testing.tolerances import tolerance
+
+DURATION = 0.3
+
+
+def cantilever(modulus: float) -> tuple[dv.Model, dict[str, float]]:
+    body = mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1))
+    return dv.Model(body, pinned=torch.tensor(body.points[:, 0] < 1e-9)), {"mu": modulus, "lam": modulus}
+
+
+def off(model: dv.Model, settings: dv.Settings, material: dict[str, float], duration: float, **options) -> float:
+    """The true error: against a run of very many steps and sweeps."""
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    runs = Pilots(dv.rollout, model, x, v, duration, {**material, **options})
+    given = runs.run(settings, settings.steps(duration))
+    exact = runs.run(dv.Settings(1.0, 40, dv.SDIRK2()), 4 * max(256, settings.steps(duration)))
+    assert given.x is not None and exact.x is not None
+    return runs.apart(given.x, exact.x)
+
+
+@pytest.mark.parametrize("modulus", [2e4, 1e6])
+@pytest.mark.parametrize("error", [0.1, 0.01])
+def test_the_true_error_is_at_most_what_was_asked(modulus: float, error: float) -> None:
+    model, material = cantilever(modulus)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    settings = dv.advise(model, x, v, duration=DURATION, error=error, **material)
+    told = settings.predicted
+    assert told is not None and told.reached and told.error <= error and told.asked == error
+    true = off(model, settings, material, DURATION)
+    assert 0.02 * error < true <= error
+    assert settings.dtype == model.dtype and told.seconds > 0 and told.spent > 0
+    text = str(settings)
+    assert "of the motion" in text and "s per second of motion" in text and len(text.splitlines()) > 6
+
+
+def test_stiff_scenes_are_not_taken_for_resting_ones() -> None:
+    """At long steps an L-stable integrator damps all of a vibration away, and runs of h and h/2 agree: on rest."""
+    model, material = cantilever(1e8)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    settings = dv.advise(model, x, v, duration=0.1, error=0.1, **material)
+    assert settings.time_step < tolerance("resolved_vibration")
+    assert off(model, settings, material, 0.1) <= 0.1
+
+
+def test_gradients_are_kept_too() -> None:
+    model, material = cantilever(1e5)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    settings = dv.advise(model, x, v, duration=0.2, error=0.05, gradient=True, **material)
+
+    def gradient(settings: dv.Settings, duration: float = 0.2) -> torch.Tensor:
+        mu = torch.tensor(material["mu"], dtype=torch.float64, requires_grad=True)
+        end = dv.rollout(model, x, v, duration=duration, settings=settings, mu=mu, lam=material["lam"], save="last")
+        return torch.autograd.grad((end.x[-1] - x).square().sum(-1).mean(), mu)[0]
+
+    exact = gradient(dv.Settings(0.2 / 512, 40, dv.SDIRK2()))
+    assert exact != 0
+    assert abs(gradient(settings) - exact) <= 0.05 * abs(exact)
+
+
+def test_loads_may_be_functions_of_time() -> None:
+    model, material = cantilever(1e5)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+
+    def gravity(t: float) -> torch.Tensor:
+        return x.new_tensor([0.0, -9.81 * math.cos(20 * t), 0.0])
+
+    settings = dv.advise(model, x, v, duration=0.2, error=0.05, gravity=gravity, **material)
+    assert settings.predicted is not None and settings.predicted.reached
+    assert off(model, settings, material, 0.2, gravity=gravity) <= 0.05
+
+
+def test_an_error_that_cannot_be_had_is_said() -> None:
+    model, material = cantilever(1e8)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    settings = dv.advise(model, x, v, duration=1.0, error=1e-3, patience=0.2, **material)
+    told = settings.predicted
+    assert told is not None and not told.reached and told.error > 1e-3
+    assert "patience" in told.why and "cannot be had" in str(settings)
+
+
+def test_auto_in_a_rollout() -> None:
+    model, material = cantilever(2e4)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    mu = torch.tensor(material["mu"], dtype=torch.float64, requires_grad=True)
+    end = dv.rollout(model, x, v, duration=0.1, settings="auto", mu=mu, lam=material["lam"])
+    assert end.x.shape[1:] == x.shape
+    assert torch.autograd.grad(end.x[-1].square().sum(), mu)[0] != 0
+    with pytest.raises(ValueError, match='mu: expected a value beside settings="auto"'):
+        dv.rollout(model, x, v, duration=0.1, settings="auto", mu=lambda step, x, v: 1e4, lam=1e4)
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "text"),
+    [
+        ({"error": 0.0}, ValueError, "error: expected"),
+        ({"error": 1.0}, ValueError, r"error: expected a share of the motion in \(0, 1\)"),
+        ({"duration": 0.0}, ValueError, "duration: expected"),
+        ({"gradient": 1}, TypeError, "gradient: expected a bool"),
+        ({"quantity": 3}, TypeError, "quantity: expected a function"),
+        ({"quantity": lambda x, v: x}, ValueError, "quantity: expected a function that returns a scalar"),
+        ({"patience": 0}, ValueError, "patience: expected"),
+        ({"sweeps": 3}, TypeError, "sweeps: expected an argument among"),
+        ({"mu": -1.0}, ValueError, "mu: expected"),
+        ({"gravity": dv.per_step(torch.zeros(4, 3, dtype=torch.float64))}, ValueError, "gravity: expected a value or"),
+    ],
+)
+def test_bad_input(given, error, text) -> None:
+    model, material = cantilever(1e5)
+    x = model.rest_points
+    with pytest.raises(error, match=text):
+        dv.advise(model, x, torch.zeros_like(x), **{"duration": 0.1, **material} | given)

@@ -1,0 +1,88 @@
+"""The budget of an error names the cause that is largest."""
+
+import pytest
+import torch
+
+import diffvbd as dv
+from diffvbd import mesh
+from diffvbd.testing.tolerances import tolerance
+
+
+def cantilever(dtype: torch.dtype = torch.float64) -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
+    body = mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1))
+    model = dv.Model(body, pinned=torch.tensor(body.points[:, 0] < 1e-9), dtype=dtype)
+    return model, model.rest_points, torch.zeros_like(model.rest_points)
+
+
+def shares(budget: dv.ErrorBudget) -> dict[str, dv.Share]:
+    return {share.cause: share for share in budget.shares}
+
+
+SCENE = {"duration": 0.2, "mu": 2e5, "lam": 2e5}
+
+
+def test_few_sweeps_are_the_cause() -> None:
+    model, x, v = cantilever()
+    budget = dv.error_budget(model, x, v, time_step=1 / 200, sweeps=3, **SCENE)
+    assert budget.largest.cause == "sweeps"
+    true = dv.rollout(model, x, v, steps=40, time_step=1 / 200, sweeps=1000, mu=2e5, lam=2e5, save=10)
+    own = dv.rollout(model, x, v, steps=40, time_step=1 / 200, sweeps=3, mu=2e5, lam=2e5, save=10)
+    expected = (own.x - true.x).square().sum(-1)[1:].mean().sqrt() / (true.x - x).square().sum(-1)[1:].mean().sqrt()
+    assert budget.largest.motion == pytest.approx(float(expected), rel=tolerance("cause_of_error"))
+    assert budget.cut is None and budget.friction is None and budget.duration == pytest.approx(0.2)
+
+
+def test_long_steps_are_the_cause() -> None:
+    model, x, v = cantilever()
+    budget = dv.error_budget(model, x, v, time_step=1 / 100, sweeps=400, quantity=lambda x, v: x[-1, 1], **SCENE)
+    found = shares(budget)
+    assert budget.largest.cause == "time step" and 10 * found["sweeps"].motion < found["time step"].motion
+    assert found["time step"].quantity is not None and found["time step"].gradient is None
+    assert budget.total == pytest.approx(found["time step"].motion, rel=tolerance("one_cause_of_error"))
+    better = dv.error_budget(model, x, v, time_step=1 / 100, sweeps=400, integrator=dv.SDIRK2(), **SCENE)
+    assert 5 * shares(better)["time step"].motion < found["time step"].motion
+
+
+def test_precision_mesh_and_gradients() -> None:
+    model, x, v = cantilever(torch.float32)
+    budget = dv.error_budget(model, x, v, time_step=1 / 100, sweeps=20, part=0.5, mesh=True, gradient=True, **SCENE)
+    found = shares(budget)
+    assert set(found) == {"sweeps", "time step", "precision", "mesh", "all but mesh"}
+    assert 0 < found["precision"].motion < tolerance("precision_of_error")
+    assert found["mesh"].motion > 0.01  # a beam of one cell is too stiff
+    assert all(found[cause].gradient > 0 for cause in ("sweeps", "time step", "precision"))
+    assert budget.duration == pytest.approx(0.08) or budget.duration == pytest.approx(0.12)
+    assert [s.motion for s in budget.shares[:-1]] == sorted((s.motion for s in budget.shares[:-1]), reverse=True)
+    assert all(cause in str(budget) for cause in found)
+
+
+def test_contact_and_friction() -> None:
+    one = mesh.box(2, 0.1)
+    body = mesh.join([one, one.translate((0.013, 0.102, 0.011))])
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(kappa=1e3, dhat=2e-3), dv.Friction(0.4),
+                dv.FloorBarrier(-0.002, kappa=1e3, dhat=2e-3))  # fmt: skip
+    model = dv.Model(body, energies=energies)
+    v = torch.zeros_like(model.rest_points)
+    v[8:, 0] = 0.5
+    budget = dv.error_budget(model, model.rest_points, v, duration=0.08, time_step=1 / 100, sweeps=5, mu=1e5, lam=1e5)
+    assert {"sweeps", "time step", "contact", "all but mesh"} == set(shares(budget))
+    assert budget.cut is not None and 0 <= budget.cut <= 1
+    assert budget.friction is not None and budget.friction >= 0
+    assert "of the friction" in str(budget) and "held up" in str(budget)
+    assert 0 < budget.total < 1
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "text"),
+    [
+        ({"part": 0.0}, ValueError, "part: expected"),
+        ({"part": 1.5}, ValueError, "part: expected"),
+        ({"time_step": -1.0}, ValueError, "time_step: expected"),
+        ({"steps": 3}, TypeError, "steps: expected an argument among"),
+        ({"mesh": True, "force": torch.zeros(28, 3, dtype=torch.float64)}, ValueError, "force: expected None beside"),
+    ],
+)
+def test_bad_input(given, error, text) -> None:
+    model, x, v = cantilever()
+    with pytest.raises(error, match=text):
+        dv.error_budget(model, x, v, **{"time_step": 0.05, "sweeps": 3, **SCENE} | given)
