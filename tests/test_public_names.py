@@ -13,9 +13,9 @@ SPELLINGS = (
     "from diffvbd import mesh, solvers, testing, energies, losses; assert mesh.cube and testing.evaluate",
     "import diffvbd; assert all(hasattr(diffvbd, name) for name in diffvbd.__all__)",
 )
-# torch is loaded once, which takes seconds; each child process is the first to import anything of the package
+# other packages are loaded once, which takes seconds; each child process is the first to import anything of this one
 SCRIPT = """
-import os, sys, torch, warnings
+import os, sys, warnings, meshio, torch, torch._dynamo
 failed = []
 for statement in sys.argv[1:]:
     assert "diffvbd" not in sys.modules

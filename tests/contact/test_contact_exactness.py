@@ -12,6 +12,7 @@ import pytest
 import torch
 from conftest import DEVICES
 from helpers.marks import slow
+from helpers.spreads import assert_near_contact
 
 import diffvbd as dv
 from diffvbd.testing import relative_error
@@ -20,6 +21,7 @@ from diffvbd.testing.tolerances import tolerance
 
 # (steps, sweeps)
 RUNS = [(1, 1), (1, 5), (4, 5)]
+COSTLY = {"fast", "folded"}  # several steps of these are slow
 SLOW = [(1, 0), (1, 20), (4, 1), (4, 20)]
 LONG = [(20, 2)]
 SHORT = {"thrown"}  # scenes that are like the others after a few steps
@@ -38,36 +40,20 @@ def check(name: str, steps: int, sweeps: int, device: str, tape: str = "full") -
     model = scene.model if device == "cpu" else scene.model.to(device)
     result, parts = compiled(scene, steps, sweeps, tape, model)
     expected = unrolled(scene, steps, sweeps, parts)
-    others: dict[int, Any] = {}
-
-    def spread_of(key: str, value: torch.Tensor, seeds: int) -> float:
-        for seed in range(1, seeds + 1):
-            if seed not in others:
-                others[seed] = unrolled(scene, steps, sweeps, parts, seed=seed)
-        return tolerance("spread_factor") * max(
-            relative_error(others[seed][key], value) for seed in range(1, seeds + 1)
-        )
-
-    def bar_of(key: str, value: torch.Tensor, seeds: int) -> float:
-        return max(tolerance("contact_adjoint"), spread_of(key, value, seeds))
-
-    rounding = steps * tolerance("contact_forward")
-    for key, bar in (("x", rounding), ("v", rounding / scene.time_step)):
-        error = relative_error(result[key], expected[key])
-        assert error <= bar or error <= spread_of(key, expected[key], 3), key
+    # one sample of rounding is at times too kind
+    others = [lambda seed=seed: unrolled(scene, steps, sweeps, parts, seed=seed) for seed in (1, 2, 3)]
+    forward, adjoint = steps * tolerance("contact_forward"), tolerance("contact_adjoint")
+    assert_near_contact(result, expected, forward, adjoint, scene.time_step, others)
     for key, value in expected.items():
-        if not key.startswith("grad_"):
-            continue
-        error = relative_error(result[key], value)
-        # one sample of rounding is at times too kind
-        assert error <= bar_of(key, value, 1) or error <= bar_of(key, value, 3), key
-        if sweeps > 0 and key not in ZERO.get((name, steps), set()):
+        if key.startswith("grad_") and sweeps > 0 and key not in ZERO.get((name, steps), set()):
             assert float(value.abs().max()) > 0, key
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("steps", "sweeps"), RUNS)
-@pytest.mark.parametrize("name", list(SCENES))
+@pytest.mark.parametrize(
+    ("name", "steps", "sweeps"),
+    [slow(name, *run) if name in COSTLY and run[0] > 1 else (name, *run) for name in SCENES for run in RUNS],
+)
 def test_gradients_are_those_of_the_executed_step(name: str, steps: int, sweeps: int, device: str) -> None:
     check(name, steps, sweeps, device)
 
@@ -144,6 +130,6 @@ def test_central_differences_over_fifty_steps(name: str) -> None:
     size = torch.zeros((), dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(run(size), size)
     with torch.no_grad():
-        errors = [abs(float((run(h) - run(-h)) / (2 * h) - slope)) for h in (1e-4, 1e-5, 1e-6, 1e-7)]
-    assert abs(float(slope)) > 0
-    assert min(errors) <= tolerance("contact_finite_difference") * abs(float(slope))
+        errors = (abs(float((run(h) - run(-h)) / (2 * h) - slope)) for h in (1e-5, 1e-6, 1e-4, 1e-7))
+        assert abs(float(slope)) > 0
+        assert any(error <= tolerance("contact_finite_difference") * abs(float(slope)) for error in errors)

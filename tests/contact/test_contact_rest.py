@@ -7,6 +7,7 @@ the barrier bears the largest force F that presses a corner on it. These tests t
 import pytest
 import torch
 from helpers.bearing import bearing_gap
+from helpers.marks import slow
 
 import diffvbd as dv
 
@@ -25,8 +26,14 @@ def tower(first_gap: float, bodies: int, detections: int) -> dv.Model:
     return dv.Model(mesh, density=DENSITY, energies=(dv.StableNeoHookean(), barrier), pinned=mesh.body == 0)
 
 
-@pytest.mark.parametrize("bodies", (2, 4))
-@pytest.mark.parametrize(("sweeps", "detections"), ((0, 1), (0, 2), (1, 1), (1, 2), (2, 1), (5, 2)))
+RUNS = ((0, 1), (0, 2), (1, 1), (1, 2), (2, 1), (5, 2))  # sweeps and detections
+QUICK = (4, 2, 4, 2, 2, 2)  # bodies of the quick tower of each
+
+
+@pytest.mark.parametrize(
+    ("sweeps", "detections", "bodies"),
+    [(*run, n) if n == quick else slow(*run, n) for run, quick in zip(RUNS, QUICK, strict=True) for n in (2, 4)],
+)
 def test_a_tower_keeps_its_gaps(sweeps: int, detections: int, bodies: int) -> None:
     first = 0.5 * DHAT
     model = tower(first, bodies, detections)

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.bearing import bearing_gap
+from helpers.marks import slow
 from torch import Tensor
 
 import diffvbd as dv
@@ -76,8 +77,11 @@ def test_a_cube_at_rest_for_long(sweeps: int, relaxation: float) -> None:
     check_rest(model, x, options, 1500, sweeps, min(START, least_gap()) * (1 - 1e-9))
 
 
-@pytest.mark.parametrize("friction", (None, 0.3))
-@pytest.mark.parametrize(("sweeps", "detections"), ((0, 2), (1, 2), (1, 4), (2, 1), (4, 2)))
+PARTS = [(*run, friction) for run in ((0, 2), (1, 2), (1, 4), (2, 1), (4, 2)) for friction in (None, 0.3)]
+QUICK = [(0, 2, 0.3), (1, 2, None), (2, 1, 0.3)]
+
+
+@pytest.mark.parametrize(("sweeps", "detections", "friction"), [a if a in QUICK else slow(*a) for a in PARTS])
 def test_a_cube_at_rest_in_parts(sweeps: int, detections: int, friction: float | None) -> None:
     """Floor and pairs: each of R parts has a start, and some no sweep."""
     pairs = dv.PairBarrier(kappa=KAPPA, dhat=DHAT, detections=detections, self_contact=False)
@@ -86,7 +90,7 @@ def test_a_cube_at_rest_in_parts(sweeps: int, detections: int, friction: float |
     check_rest(model, x, options, 240, sweeps, min(START, least_gap()) * (1 - 1e-9))
 
 
-@pytest.mark.parametrize(("sweeps", "detections"), ((1, None), (4, 2), (1, 2)))
+@pytest.mark.parametrize(("sweeps", "detections"), ((1, None), slow(4, 2), (1, 2)))
 def test_a_heavy_cube(sweeps: int, detections: int | None) -> None:
     more = () if detections is None else (dv.PairBarrier(dhat=DHAT, detections=detections, self_contact=False),)
     model, x, options = scenes(*more, density=2e4)

@@ -57,6 +57,7 @@ def test_compile_of_a_plain_step(device: str, fresh_compiler: None) -> None:
     compiled_gradients(device, "aot_eager", ("x", "v", "mu", "lam"), plain=True)
 
 
+@pytest.mark.slow  # the next one has them all, too
 def test_compile_of_a_step_with_every_argument(device: str, fresh_compiler: None) -> None:
     compiled_gradients(device, "aot_eager", ARGUMENTS, plain=False)
 
@@ -221,6 +222,7 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
     if policy != ops.NO_TAPE:
         bars = (torch.ones_like(x), x, tape, corrections, cut)
         arguments["sweep_backward"] = (*fields, *bars, model._plan, *settings, policy, [True] * 5)
+    if policy == ops.FULL_TAPE:  # those that know no tape, once
         arguments |= coarse_arguments(device) | start_arguments(device)
         arguments |= anderson_arguments() if device == "cpu" else {}
     return arguments | (fused_arguments(policy) if device == "cuda" else {})

@@ -105,18 +105,22 @@ def test_finite_and_equal_to_the_reference(examples: int) -> None:
         assert all(torch.equal(a.nan_to_num(), inputs[name].nan_to_num()) for name, a in before.items())
         assert all(bool(torch.isfinite(a).all()) for a in result.values())
         expected = testing.reference_result(model, inputs, sweeps)
-        spread = rounding(model, inputs, sweeps, expected)
-        compared.append(spread < 1e-3)
-        if not compared[-1]:
-            return  # a block is singular to rounding: finite is all that can be asked
-        bar = max(tolerance("adjoint"), tolerance("property_factor") * spread)
-        assert relative_error(result["x"], expected["x"]) <= bar
         predictor = evaluated(model, inputs, 0, "auto")
-        for name, value in expected.items():
-            if name.startswith("grad_"):
-                # stiff sweeps cancel most of what the predictor alone would pass on: its rounding stays
-                scale = bar * float(value.abs().max()) + tolerance("forward") * float(predictor[name].abs().max())
-                assert float((result[name] - value).abs().max()) <= scale, name
+
+        def beyond(bar: float) -> list[str]:
+            names = [] if relative_error(result["x"], expected["x"]) <= bar else ["x"]
+            for name, value in expected.items():
+                if name.startswith("grad_"):
+                    # stiff sweeps cancel most of what the predictor alone would pass on: its rounding stays
+                    scale = bar * float(value.abs().max()) + tolerance("forward") * float(predictor[name].abs().max())
+                    names += [] if float((result[name] - value).abs().max()) <= scale else [name]
+            return names
+
+        compared.append(True)
+        if beyond(tolerance("adjoint")):  # executes the reference some more times
+            spread = rounding(model, inputs, sweeps, expected)
+            compared[-1] = spread < 1e-3  # otherwise a block is singular to rounding: finite is all that can be asked
+            assert not compared[-1] or not beyond(tolerance("property_factor") * spread)
 
     check()
     assert np.mean(compared) > 0.8

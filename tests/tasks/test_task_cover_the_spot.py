@@ -17,7 +17,7 @@ DISK = dv.mesh.disk(0.42, 0.06, 6)
 
 
 def test_quick_run_covers_more(tmp_path: Path) -> None:
-    result = check_fall("cover-the-spot", tmp_path, factor=0.7, iterations=12)
+    result = check_fall("cover-the-spot", tmp_path, factor=0.7, iterations=5)
     assert result.history[0]["uncovered"] > 0.2
     assert result.estimates["uncovered"] < 0.7 * result.history[0]["uncovered"]
     assert result.estimates["uncovered"] == min(row["uncovered"] for row in result.history)
