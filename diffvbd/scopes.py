@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 _checking: ContextVar[bool] = ContextVar("diffvbd.debug_checks", default=False)
 _recording: ContextVar[tuple[tuple[str, list[Any]], ...]] = ContextVar("diffvbd.record", default=())
@@ -35,6 +37,15 @@ def looks_at(value: Tensor) -> bool:
         return False
     transformed = torch._C._functorch.peek_interpreter_stack()  # pyright: ignore[reportAttributeAccessIssue]
     return transformed is None and (checking() or not value.is_cuda)
+
+
+def not_compiled(function: F) -> F:
+    """torch.compiler.disable, which loads the compiler: a second of every import, so it waits for the first call."""
+    try:
+        from torch._compile import _disable_dynamo as disable
+    except ImportError:
+        disable = torch.compiler.disable
+    return disable(function)  # pyright: ignore[reportReturnType]
 
 
 def recorders(kind: str = "contact") -> tuple[list[Any], ...]:

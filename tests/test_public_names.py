@@ -12,10 +12,11 @@ SPELLINGS = (
     "import diffvbd.colliders as c; from diffvbd.colliders import Sphere; assert c.Sphere is Sphere",
     "from diffvbd import mesh, solvers, testing, energies, losses; assert mesh.cube and testing.evaluate",
     "import diffvbd; assert all(hasattr(diffvbd, name) for name in diffvbd.__all__)",
+    "import diffvbd, sys; assert 'torch._dynamo' not in sys.modules",  # which takes a second to load
 )
 # other packages are loaded once, which takes seconds; each child process is the first to import anything of this one
 SCRIPT = """
-import os, sys, warnings, meshio, torch, torch._dynamo
+import os, sys, warnings, meshio, torch
 failed = []
 for statement in sys.argv[1:]:
     assert "diffvbd" not in sys.modules

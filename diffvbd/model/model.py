@@ -255,8 +255,7 @@ class Model:
         # what "auto" asks for in every step
         chooses = self.starts_from == "auto" and self.energy_mask & ELASTIC
         self._rest_scalars = rest if chooses else rest.new_empty((0,))
-        constants = [(e, e.constants(points)) for e in self.vertex_energies]
-        data = [e.pack({name: value[None] for name, value in own.items()}, None) for e, own in constants]
+        data = [e.pack({k: t[None] for k, t in e.constants(points).items()}, None) for e in self.vertex_energies]
         self._energy_data = torch.cat(data, -1) if data else points.new_zeros((1, 0))
 
     def _arrange_coarse(self, device: torch.device) -> None:

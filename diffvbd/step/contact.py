@@ -21,7 +21,7 @@ from ..model.model import Model
 from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
 from ..ops.detect import CONSTANTS
-from ..scopes import checking, recorders
+from ..scopes import checking, not_compiled, recorders
 from ..tuples import replaced
 from .coarse import factor_of
 from .contact_cycles import parts_of, record_parts, sweeps_of_parts, swept_part
@@ -337,12 +337,6 @@ class ContactStep:
         given = (self.x_prev, self.begun.y, self.colliders, self.before)
         if not all(bool(torch.isfinite(t).all()) for t in given):
             raise ValueError("start (x, v, force, gravity, prescribed, colliders): expected finite values")
-
-
-try:  # as torch.compiler.disable, which takes a second of every import of diffvbd to load the compiler
-    from torch._compile import _disable_dynamo as not_compiled
-except ImportError:
-    not_compiled = torch.compiler.disable
 
 
 def no_pairs(like: Tensor, corners: int) -> Pairs:
