@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -31,7 +32,8 @@ AIM = 0.6  # of the wanted error that a candidate is given
 COSTS = 8.0  # times the advised rollout that all runs may take,
 FREE = 0.5  # [s] or so long
 TOO_FINE = 0.1  # of the wanted error: candidates below it try fewer steps
-STUCK = 5  # levels of the ladder that do not come closer: there is no limit to find
+REGULAR = 1.5  # by which two distances of runs shrink where impacts converge as they should, with the step
+STUCK = 6  # levels of the ladder that do not come closer: there is no limit to find
 
 
 def found(pilots: Pilots, error: float, patience: float) -> Settings:
@@ -144,7 +146,10 @@ class _Search:
 
     def _remaining(self, apart: list[float]) -> float:
         """The error of the last run."""
-        return apart[-1] / (2**self.order - 1) if self.smooth else max(apart[-2:])
+        if self.smooth:
+            return apart[-1] / (2**self.order - 1)
+        regular = len(apart) > 2 and all(a > REGULAR * b for a, b in itertools.pairwise(apart[-3:]))
+        return apart[-1] if regular else max(apart[-2:])
 
     def _order(self, apart: list[float]) -> float:
         low, high = ORDERS
@@ -171,7 +176,9 @@ class _Search:
         return len(apart) > STUCK and min(apart[-2:]) > 0.7 * max(apart[-STUCK:])
 
     def _why(self, apart: float) -> str:
-        cause = "the motion through contact depends on every digit" if self.pilots.model.touches else "rounding"
+        cause = "it holds vibrations down to the shortest that the mesh can carry"
+        if not self.smooth:
+            cause = "what touches when, and what sticks, depends on ever smaller differences"
         return f"runs of h and h/2 stay {apart:.2g} of the motion apart however small h is: {cause}"
 
     def _distance(self, a: Pilot, b: Pilot) -> float:
