@@ -20,8 +20,7 @@ import diffvbd as dv
 from bench import common
 from bench.advice_scenes import Scene, drawn
 from bench.common import markdown_table
-from diffvbd.rollout.advise import pilots_of
-from diffvbd.rollout.pilots import FRAMES, Pilot, Pilots
+from diffvbd.rollout.pilots import FRAMES, Pilot, Pilots, pilots_of
 
 ERRORS = (0.1, 0.01, 0.001)
 SCENES, GRADIENTS, EXHAUSTIVE = 30, 12, 12  # of the drawn scenes, from the first
@@ -42,7 +41,8 @@ GRID = [
 
 
 def pilots(scene: Scene, gradient: bool = False) -> Pilots:
-    return pilots_of(scene.model, scene.model.rest_points, scene.v, scene.duration, None, gradient, scene.given)
+    state = scene.model.rest_points, scene.v
+    return pilots_of(dv.rollout, scene.model, *state, scene.duration, None, gradient, scene.given)
 
 
 def exact(runs: Pilots, settings: dv.Settings) -> tuple[Pilot, float]:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 import diffvbd as dv
+from diffvbd.rollout.search import ERROR, PATIENCE
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
 from diffvbd.tasks.problem import Result, check_device
 from diffvbd.tasks.progress import versions
@@ -96,9 +97,9 @@ def _parser() -> argparse.ArgumentParser:
     advice = commands.add_parser("advise", help="find time step, sweeps and the like that keep a wanted error")
     advice.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra")
     advice.add_argument("--duration", type=float, required=True, help="of the motion [s]")
-    advice.add_argument("--error", type=float, default=0.01, help="share of the motion, in (0, 1) (default 0.01)")
+    advice.add_argument("--error", type=float, default=ERROR, help=f"share of the motion, below 1 (default {ERROR:g})")
     advice.add_argument("--gradient", action="store_true", help="keep it for gradients, too")
-    advice.add_argument("--patience", type=float, default=120.0, help="how long pilots may run [s] (default 120)")
+    advice.add_argument("--patience", type=float, default=PATIENCE, help=f"pilots may run so long [s] ({PATIENCE:g})")
     advice.add_argument("--device", default="cpu", help="torch device (default cpu)")
     _add_material(advice)
     _add_scene_options(advice)

@@ -374,7 +374,7 @@ class Model:
 
     @property
     def num_colors(self) -> int:
-        """Groups of vertices that are updated one after another."""
+        """Groups of vertices that a sweep updates one after another."""
         return self._color_ptr.shape[0] - 1
 
     def settings(self, time_step: float, sweeps: int, scenes: int = 1) -> ops.SweepSettings:

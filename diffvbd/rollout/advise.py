@@ -10,12 +10,10 @@ from torch import Tensor
 from ..checks import check_positive, fail
 from ..model.model import Model
 from ..step.arguments import check_state
-from .pilots import LOADS, MOVING, OTHERS, Pilots, Quantity
+from .pilots import Quantity, converted, pilots_of
 from .rollout import rollout
-from .search import found
+from .search import ERROR, PATIENCE, found
 from .settings import Settings
-
-PATIENCE = 120.0  # [s]
 
 
 @torch.no_grad()
@@ -25,7 +23,7 @@ def advise(
     v: Tensor,
     *,
     duration: float,
-    error: float = 0.01,
+    error: float = ERROR,
     quantity: Quantity | None = None,
     gradient: bool = False,
     device: torch.device | str | None = None,
@@ -73,36 +71,7 @@ def advise(
     if quantity is not None and not callable(quantity):
         raise TypeError(f"quantity: expected a function of x and v, got {type(quantity).__name__}")
     patience = check_positive("patience", patience, "s")
-    check_given(given)
     if device is not None:
         model = model.to(device)
-        x, v, given = x.to(device), v.to(device), {k: _moved(value, device) for k, value in given.items()}
-    pilots = pilots_of(model, x, v, duration, quantity, gradient, given)
-    pilots.check()
-    return found(pilots, error, patience)
-
-
-def pilots_of(model: Model, x: Tensor, v: Tensor, duration: float, quantity: Quantity | None, gradient: bool,
-              given: dict[str, Any]) -> Pilots:  # fmt: skip
-    """Pilot runs of a scene, with the gradients that are asked for."""
-    x, v = x.detach(), v.detach()
-    if gradient and quantity is None:
-        quantity = _mean_squared_way(x)
-    material = [name for name in ("mu", "lam", "young", "poisson") if given.get(name) is not None]
-    wrt = [name for name in material if not callable(given[name]) or isinstance(given[name], Tensor)]
-    given = {name: value.detach() if isinstance(value, Tensor) else value for name, value in given.items()}
-    return Pilots(rollout, model, x, v, duration, given, quantity, wrt if gradient else None)
-
-
-def _mean_squared_way(start: Tensor) -> Quantity:
-    return lambda x, v: (x - start).square().sum(-1).mean()
-
-
-def check_given(given: dict[str, Any]) -> None:
-    names = (*OTHERS, *LOADS, *MOVING)
-    if unknown := sorted(set(given) - set(names)):
-        raise TypeError(f"{unknown[0]}: expected an argument among {', '.join(names)}")
-
-
-def _moved(value: Any, device: torch.device | str) -> Any:
-    return value.to(device) if isinstance(value, Tensor) else value
+        x, v, given = (converted(value, device=model.device) for value in (x, v, given))
+    return found(pilots_of(rollout, model, x, v, duration, quantity, gradient, given), error, patience)

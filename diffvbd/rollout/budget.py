@@ -15,11 +15,11 @@ from ..mesh import subdivide
 from ..model.model import Model
 from ..step.arguments import check_state, prepare
 from ..step.integrators import SDIRK2, ImplicitEuler, Integrator
-from .advise import check_given, pilots_of
 from .contact_check import cut_share, unbalanced_friction
-from .pilots import FRAMES, Pilot, Pilots, Quantity, relative
+from .pilots import FRAMES, Pilot, Pilots, Quantity, converted, pilots_of, relative
+from .rollout import rollout
 from .search import start_of
-from .settings import Settings
+from .settings import Settings, aligned
 
 FINER = 4  # times the steps of the finest run
 MOST_SWEEPS = 1300
@@ -82,10 +82,7 @@ class ErrorBudget:
         header = ("cause", "motion", "quantity", "gradient", "s", "compared with")
         rows = [(s.cause, shown(s.motion), shown(s.quantity), shown(s.gradient), f"{s.seconds:.2g}", s.note)
                 for s in self.shares]  # fmt: skip
-        widths = [max(len(row[k]) for row in (header, *rows)) for k in range(6)]
-        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-                 for row in (header, *rows)]  # fmt: skip
-        lines.insert(0, f"{self.settings}, {self.duration:.3g} s of motion")
+        lines = [f"{self.settings}, {self.duration:.3g} s of motion", *aligned([header, *rows])]
         if self.cut is not None:
             lines.append(f"pairs held up at most {100 * self.cut:.2g} % of the vertices in a step")
         if self.friction is not None:
@@ -111,8 +108,8 @@ def error_budget(
 ) -> ErrorBudget:
     """Splits the error of a rollout by cause, by pilot runs that have less of one error at a time.
 
-    sweeps: the same steps with sweeps until more change nothing. time step: those against SDIRK2 with up to four times
-    the steps. precision: the same run in double precision. contact: the same with more detections in each step.
+    sweeps: the same steps with sweeps until more change nothing. time step: those against SDIRK2 with four times the
+    steps. precision: the same run in double precision. contact: the same with more detections in each step.
     mesh: the converged run on a mesh of eight tets for each. Look at the largest: nothing else is worth improving.
 
     Args:
@@ -133,10 +130,8 @@ def error_budget(
     part = check_number("part", part)
     if not 0 < part <= 1:
         fail("part", "a number in (0, 1]", repr(part))
-    check_given(given)
     steps = FRAMES * max(1, round(part * check_positive("duration", duration, "s") / (h * FRAMES)))
-    pilots = pilots_of(model, x, v, steps * h, quantity, gradient, given)
-    pilots.check()
+    pilots = pilots_of(rollout, model, x, v, steps * h, quantity, gradient, given)
     own = Settings(h, sweeps, integrator or ImplicitEuler(), model.relaxation, model.coarse,
                    model.acceleration)  # fmt: skip
     return _Budget(pilots, own, steps).run(mesh)
@@ -185,7 +180,7 @@ class _Budget:
         p = self.pilots
         if p.model.dtype == torch.float64:
             return
-        given = {k: w.double() if isinstance(w, Tensor) and w.is_floating_point() else w for k, w in p.given.items()}
+        given = converted(p.given, dtype=torch.float64)
         double = replace(p, model=p.model.to(dtype=torch.float64), x=p.x.double(), v=p.v.double(), given=given)
         done, seconds = self._other(double)
         assert run.x is not None
@@ -215,7 +210,7 @@ class _Budget:
                 before[0] = (x, v)
 
         given = p.at_steps(dict(p.given), settings.time_step, self.steps, 0.0)
-        end = p.rollout(model, p.x, p.v, steps=self.steps, time_step=settings.time_step, sweeps=settings.sweeps,
+        end = p.execute(model, p.x, p.v, steps=self.steps, time_step=settings.time_step, sweeps=settings.sweeps,
                         integrator=settings.integrator, save="last", observe=look, check_contact=False,
                         check_start=False, **given)  # fmt: skip
         cut = None if model.contact is None else float(torch.stack(cuts).max())
@@ -250,9 +245,7 @@ class _Budget:
     def _time(self, run: Pilot, converged: Pilot) -> Pilot:
         """SDIRK2 with more steps; their sweeps are as many as converge here."""
         began = self.pilots.spent
-        settings = replace(
-            converged.settings, integrator=SDIRK2(), sweeps=min(converged.settings.sweeps, 2 * MOST_SWEEPS)
-        )
+        settings = replace(converged.settings, integrator=SDIRK2())
         fine = self._run(settings, FINER * self.steps)
         share = self._share("time step", converged, fine, 0.0, "")
         note = f"SDIRK2, h = {fine.settings.time_step:.3g} s"

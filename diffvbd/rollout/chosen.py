@@ -10,19 +10,18 @@ from torch import Tensor
 
 from ..adjoint.routes import ReverseSweep
 from ..checks import check_count, check_positive, fail
-from .pilots import Pilots
-from .search import found
+from ..step.arguments import check_state
+from .pilots import GIVEN, pilots_of
+from .search import ERROR, PATIENCE, found
 from .settings import Settings
 from .trajectory import PerStep, Trajectory
 
-ERROR, PATIENCE = 0.01, 120.0  # of "auto" [-], [s]
 _OWN = ("time_step", "sweeps", "integrator")  # which settings have
-_FIXED = ("mu", "lam", "young", "poisson", "rest_points", "density", "parameters", "force", "gravity", "prescribed",
-          "colliders")  # fmt: skip
 
 
 def rollout_with(rollout: Callable[..., Trajectory], *, settings: Any, duration: Any, **given: Any) -> Trajectory:
     """``rollout`` of the arguments ``given`` with the settings, or with those that "auto" finds for them."""
+    check_state(given["model"], given["x"], given["v"])
     for name in _OWN:
         if given[name] is not None:
             raise TypeError(f"{name}: expected None beside settings, which have it, got {given[name]!r}")
@@ -51,12 +50,10 @@ def rollout_with(rollout: Callable[..., Trajectory], *, settings: Any, duration:
 
 @torch.no_grad()
 def _found(rollout: Callable[..., Trajectory], duration: float, given: dict[str, Any]) -> Settings:
-    fixed = {name: given[name] for name in _FIXED if given[name] is not None}
+    fixed = {name: given[name] for name in GIVEN if given[name] is not None}
     for name, value in fixed.items():
         if isinstance(value, PerStep) or (callable(value) and not isinstance(value, Tensor)):
             fail(name, 'a value beside settings="auto", which tries many time steps: use dv.advise, which takes '
                  "functions of time", type(value).__name__)  # fmt: skip
-    fixed = {name: value.detach() if isinstance(value, Tensor) else value for name, value in fixed.items()}
-    pilots = Pilots(rollout, given["model"], given["x"].detach(), given["v"].detach(), duration, fixed)
-    pilots.check()
+    pilots = pilots_of(rollout, given["model"], given["x"], given["v"], duration, None, False, fixed)
     return found(pilots, ERROR, PATIENCE)

@@ -18,6 +18,7 @@ from ..checks import check_positive, fail
 from ..model.model import Model
 from ..model.moduli import moduli_of
 from ..ops import tet_gather
+from ..scopes import refined
 from ..step.arguments import GRAVITY
 from .settings import Settings
 from .trajectory import PerStep, Trajectory
@@ -27,6 +28,7 @@ STILL = 1e-4  # of the size of the scene: a motion below it counts as one of thi
 LOADS = ("force", "gravity")
 MOVING = ("prescribed", "colliders")
 OTHERS = ("mu", "lam", "young", "poisson", "rest_points", "density", "parameters")
+GIVEN = (*OTHERS, *LOADS, *MOVING)
 Quantity = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -66,18 +68,23 @@ class Pilots:
 
     def __post_init__(self) -> None:
         self.duration = check_positive("duration", self.duration, "s")
-        for name in (*OTHERS, *LOADS, *MOVING):
+        for name in GIVEN:
             value = self.given.get(name)
             if isinstance(value, PerStep):
                 fail(name, "a value or a function of the time [s], since time steps vary", "per_step")
 
     # --- running ------------------------------------------------------------------------------------------------------
 
+    def execute(self, *arguments: Any, **options: Any) -> Trajectory:
+        """A rollout as it stands, also inside dv.refine."""
+        with refined(None):
+            return self.rollout(*arguments, **options)
+
     def check(self) -> None:
         """One short step: raises what rollout raises of the arguments."""
         h = 1e-3 * self.duration
         given = self.at_steps(dict(self.given), h, 1, 0.0)
-        end = self.rollout(self.model, self.x, self.v, steps=1, time_step=h, sweeps=1, save="last", **given)
+        end = self.execute(self.model, self.x, self.v, steps=1, time_step=h, sweeps=1, save="last", **given)
         value = None if self.quantity is None else self.quantity(end.x[-1], end.v[-1])
         if self.quantity is not None and not (isinstance(value, Tensor) and value.numel() == 1):
             got = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
@@ -123,7 +130,7 @@ class Pilots:
                 v = torch.where(model.pinned[:, None], v, v + leaves[0])
         given = self.at_steps(given, settings.time_step, steps, began)
         with torch.set_grad_enabled(differentiate):
-            out = self.rollout(
+            out = self.execute(
                 model, x, v, steps=steps, time_step=settings.time_step, sweeps=settings.sweeps,
                 integrator=settings.integrator, adjoint=ReverseSweep(settings.tape),
                 checkpoint_every=settings.checkpoint_every, save=max(1, steps // frames), check_contact=False,
@@ -211,12 +218,12 @@ class Pilots:
 
     def energy(self, x: Tensor, v: Tensor) -> Tensor:
         """Kinetic, elastic and of loads [...] [J] of each scene; contact, which is short, counts as none."""
-        model, given = self.model, self.given
-        lead = x.shape[:-2]
-        x, v = (t.double().reshape(-1, *t.shape[-2:]) for t in (x, v))
+        model, given, lead = self.model, self.given, x.shape[:-2]
+        x, v = x.double(), v.double()
         mu, lam = moduli_of(model, lead, *(given.get(n) for n in ("mu", "lam", "young", "poisson")))
         mu, lam = (torch.as_tensor(m, device=x.device).detach().double() for m in (mu, lam))
-        corners = tet_gather(x, *model._topology)
+        corners = tet_gather(x.reshape(-1, *x.shape[-2:]), *model._topology).unflatten(0, lead or (1,))
+        corners = corners if lead else corners[0]
         f = (corners[..., 1:, :] - corners[..., :1, :]).transpose(-1, -2) @ self._rest_inverse
         strain = torch.linalg.det(f) - 1
         psi = mu * ((f.square().sum((-1, -2)) - 3) / 2 - strain) + (mu + lam) / 2 * strain.square()
@@ -225,18 +232,48 @@ class Pilots:
         load = mass * torch.as_tensor(self.gravity, device=x.device).double()
         if given.get("force") is not None:
             load = load + given["force"].double()
-        total = (psi * volume).sum(-1) + (0.5 * mass * v.square() - load * x).sum((-1, -2))
-        return total.reshape(lead)
+        return (psi * volume).sum(-1) + (0.5 * mass * v.square() - load * x).sum((-1, -2))
 
-    def damped(self, run: Pilot) -> float:
-        """An upper bound of the motion that a run has damped away, over its motion: that of vibrations which steps of
-        this length do not resolve, a <= sqrt(2 E / m) / w with w >= 1 / h. Zero where energy says nothing."""
+    def lost(self, run: Pilot, seconds: float) -> float:
+        """How far the energy E that a run has lost would carry the scene in some seconds, sqrt(2 E / m) t, over its
+        motion. Zero where energy says nothing."""
         if not self.conserves or run.x is None or run.v is None:
             return 0.0
         lost = (self.energy(run.x[0], run.v[0]) - self.energy(run.x[-1], run.v[-1])).clamp(min=0)
         mass = float(self.model.mass[~self.model.pinned].sum())
-        way = (2 * lost / max(mass, 1e-300)).sqrt() * (self.duration / run.steps)
+        way = (2 * lost / max(mass, 1e-300)).sqrt() * seconds
         return float((way / self.motion(run.x)).max())
+
+
+def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Tensor, duration: float,
+              quantity: Quantity | None, gradient: bool, given: dict[str, Any]) -> Pilots:  # fmt: skip
+    """Pilot runs of a scene, with the gradients that are asked for. A first short step has raised what rollout raises
+    of the arguments."""
+    if unknown := sorted(set(given) - set(GIVEN)):
+        raise TypeError(f"{unknown[0]}: expected an argument among {', '.join(GIVEN)}")
+    x, v = x.detach(), v.detach()
+    if gradient and quantity is None:
+        quantity = _mean_squared_way(x)
+    material = [name for name in ("mu", "lam", "young", "poisson") if given.get(name) is not None]
+    wrt = [name for name in material if not callable(given[name]) or isinstance(given[name], Tensor)]
+    given = {name: value.detach() if isinstance(value, Tensor) else value for name, value in given.items()}
+    pilots = Pilots(rollout, model, x, v, duration, given, quantity, wrt if gradient else None)
+    pilots.check()
+    return pilots
+
+
+def _mean_squared_way(start: Tensor) -> Quantity:
+    return lambda x, v: (x - start).square().sum(-1).mean()
+
+
+def converted(value: Any, **to: Any) -> Any:
+    """Tensors, those in a dict and what functions of time return, on another device or of another floating dtype."""
+    if isinstance(value, Tensor):
+        floats = value.is_floating_point()
+        return value.to(**{name: kind for name, kind in to.items() if floats or name != "dtype"})
+    if isinstance(value, dict):
+        return {name: converted(part, **to) for name, part in value.items()}
+    return (lambda t: converted(value(t), **to)) if callable(value) else value
 
 
 def relative(a: Tensor, b: Tensor) -> float:

@@ -121,10 +121,10 @@ def rollout(
         return rollout_with(rollout, **locals())
     if duration is not None:
         raise TypeError("duration: expected it beside settings only; without them give steps and time_step")
-    if (factors := refinement()) is not None:  # inside dv.refine
-        return rollout_finer(rollout, **locals())
     if time_step is None or sweeps is None:
         raise TypeError(f"{'time_step' if time_step is None else 'sweeps'}: expected a number, or settings, got None")
+    if (factors := refinement()) is not None:  # inside dv.refine
+        return rollout_finer(rollout, **locals())
     steps = check_count("steps", steps)
     _check_save(save)
     _check_estimates(estimate_errors, model)

@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -32,7 +31,8 @@ AIM = 0.6  # of the wanted error that a candidate is given
 COSTS = 8.0  # times the advised rollout that all runs may take,
 FREE = 0.5  # [s] or so long
 TOO_FINE = 0.1  # of the wanted error: candidates below it try fewer steps
-REGULAR = 1.5  # by which two distances of runs shrink where impacts converge as they should, with the step
+WHOLE = 0.95  # of what the longest steps lose at an impact: runs that lose as much do not resolve it
+ERROR, PATIENCE = 0.01, 120.0  # what is asked for where nothing else is [-], [s]
 STUCK = 6  # levels of the ladder that do not come closer: there is no limit to find
 
 
@@ -70,7 +70,7 @@ def _exact(model: Model) -> bool:
 
 
 class _Search:
-    def __init__(self, pilots: Pilots, error: float, patience: float = 120.0) -> None:
+    def __init__(self, pilots: Pilots, error: float, patience: float) -> None:
         self.pilots, self.error, self.patience = pilots, error, patience
         self.order = 1.0
         # impacts come early or late by up to a step: nothing can be extrapolated
@@ -136,9 +136,8 @@ class _Search:
                     if more is None:
                         return True, ""
                     settings = more.settings
-                    apart[-1] = self._distance(self.ladder[-3], more)
                     self.ladder[-2:] = [more]
-                    apart.pop()
+                    apart[-2:] = [self._distance(self.ladder[-2], more)]
                     continue
                 if self._is_stuck(apart):
                     return False, self._why(apart[-1])
@@ -148,18 +147,23 @@ class _Search:
         """The error of the last run."""
         if self.smooth:
             return apart[-1] / (2**self.order - 1)
-        regular = len(apart) > 2 and all(a > REGULAR * b for a, b in itertools.pairwise(apart[-3:]))
-        return apart[-1] if regular else max(apart[-2:])
+        return max(apart[-2:]) / (2 ** min(self.order, 1.0) - 1)  # one pair of runs may agree by luck
 
     def _order(self, apart: list[float]) -> float:
         low, high = ORDERS
         return min(max(math.log2(max(apart[-2], 1e-300) / max(apart[-1], 1e-300)), low), high)
 
     def _unresolved(self) -> float:
-        """Motion that is lost to damping, unless halving the step halves what is lost."""
-        last, before = (self.pilots.damped(run) for run in (self.ladder[-1], self.ladder[-2]))
-        # damped() is the root of the energy times the step: sqrt(2) x 2 where the energy halves
-        return 0.0 if last < before / (2 * math.sqrt(2)) else last
+        """Motion that is lost with energy, and that runs which agree may therefore both lack. Vibrations swing within a
+        step: they are resolved once halving it halves the energy lost. A rebound lasts: none is resolved while as much
+        is lost as in the longest steps."""
+        p, last = self.pilots, self.ladder[-1]
+        if self.smooth:
+            # the root of the energy times the step: sqrt(2) x 2 where the energy halves
+            now, before = (p.lost(run, p.duration / run.steps) for run in (last, self.ladder[-2]))
+            return 0.0 if now < before / (2 * math.sqrt(2)) else now
+        now, first = (p.lost(run, 0.5 * p.duration) for run in (last, self.ladder[0]))
+        return 0.0 if now < WHOLE * first else now
 
     def _with_more_sweeps(self, settings: Settings) -> Pilot | None:
         """The run before the last once more with twice the sweeps, if those move it by more than a quarter of the

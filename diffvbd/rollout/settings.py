@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -146,6 +147,12 @@ class Settings:
         return line if self.predicted is None else f"{line}\n{_told(line, self.predicted)}"
 
 
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table whose columns are as wide as their widest cell."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+
+
 def _told(line: str, told: Prediction) -> str:
     """The lines below the settings: what they promise, why, and the runners-up."""
     verdict = f"error {told.error:.2g} of the motion" + ("" if told.reached else f": {told.asked:g} cannot be had")
@@ -153,8 +160,6 @@ def _told(line: str, told: Prediction) -> str:
     rows += [(str(c.settings), f"{c.error:.1e}", f"{c.seconds / told.duration:.3g}",
               "measured" if c.proven else "predicted") for c in told.others]  # fmt: skip
     header = ("settings", "error", "s per s of motion", "")
-    widths = [max(len(row[k]) for row in (header, *rows)) for k in range(4)]
-    table = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-             for row in (header, *rows)]  # fmt: skip
     cost = f"{told.runs} pilot runs took {told.spent:.2g} s, {told.cost:.1f} rollouts of these settings"
-    return "\n".join([f"{verdict}, {told.seconds_per_second:.3g} s per second of motion", told.why, cost, "", *table])
+    first = f"{verdict}, {told.seconds_per_second:.3g} s per second of motion"
+    return "\n".join([first, told.why, cost, "", *aligned([header, *rows])])

@@ -119,3 +119,39 @@ def test_bad_input(given, error, text) -> None:
     x = model.rest_points
     with pytest.raises(error, match=text):
         dv.advise(model, x, torch.zeros_like(x), **{"duration": 0.1, **material} | given)
+
+
+def test_scenes_over_two_dimensions_with_a_material_each() -> None:
+    model, material = cantilever(1e5)
+    x = model.rest_points.expand(2, 3, -1, -1)
+    mu = torch.tensor([[5e4, 1e5, 2e5], [1e5, 1e5, 4e5]], dtype=torch.float64)[..., None]
+    settings = dv.advise(model, x, torch.zeros_like(x), duration=0.1, error=0.1, mu=mu, lam=material["lam"])
+    assert settings.predicted is not None and settings.predicted.reached
+
+
+def test_an_impact_that_long_steps_lose_is_not_taken_for_motion() -> None:
+    """In long steps a cube that meets another one loses its rebound, and runs of h and h/2 agree on that."""
+    one = mesh.box(2, 0.1)
+    model = dv.Model(mesh.join([one, one.translate((0.104, 0.007, 0.003))]),
+                     energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e3, dhat=2e-3)))  # fmt: skip
+    v = torch.zeros_like(model.rest_points)
+    v[: one.num_vertices, 0] = 1.0
+    given = {"mu": 2e5, "lam": 2e5, "gravity": (0.0, 0.0, 0.0)}
+    settings = dv.advise(model, model.rest_points, v, duration=0.04, error=0.2, patience=20.0, **given)
+    assert settings.predicted is not None and settings.predicted.reached
+    runs = Pilots(dv.rollout, model, model.rest_points, v, 0.04, given)
+    a = runs.run(settings, settings.steps(0.04))
+    b = runs.run(settings, 4 * max(64, settings.steps(0.04)))
+    assert a.x is not None and b.x is not None and runs.apart(a.x, b.x) <= 0.2
+
+
+def test_auto_inside_refine() -> None:
+    model, material = cantilever(2e4)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+
+    def loss() -> torch.Tensor:
+        return dv.rollout(model, x, v, duration=0.1, settings="auto", save="last", **material).x[-1].square().sum()
+
+    assert dv.refine(loss).survives
+    with pytest.raises(TypeError, match="sweeps: expected a number"):
+        dv.refine(lambda: dv.rollout(model, x, v, steps=2, time_step=0.01, **material).x.sum())

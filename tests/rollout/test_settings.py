@@ -43,7 +43,7 @@ def test_a_model_that_fits_is_taken_as_it_is(beam) -> None:
     assert dv.Settings(0.01, 5).applied(model) is model
     other = dv.Settings(0.01, 5, relaxation=1.5, block="paper").applied(model)
     assert other is dv.Settings(0.02, 9, relaxation=1.5, block="paper").applied(model)
-    assert other.relaxation == 1.5 and other.energies[0].block == "paper" and not other.corrects == (not model.corrects)
+    assert other.relaxation == 1.5 and other.energies[0].block == "paper" and other.corrects == model.corrects
 
 
 def test_refine_refines_a_rollout_with_settings(beam) -> None:
