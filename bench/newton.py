@@ -5,9 +5,11 @@ from __future__ import annotations
 import importlib
 import statistics
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import diffvbd as dv
 
@@ -74,8 +76,51 @@ def _measure(warp: Any, newton: Any, device: str, n: int, quick: bool, sweeps: i
     }
 
 
-def build(newton: Any, mesh: dv.TetMesh, device: str) -> Any:
-    """Newton's model of a mesh, held by the face at y = 0.
+def ladder(
+    mesh: dv.TetMesh,
+    pinned: NDArray[np.bool_],
+    material: tuple[float, float],
+    duration: float,
+    sweeps: tuple[int, ...],
+    rungs: int,
+    frames: int,
+    distance: Callable[[NDArray[np.float64]], float],
+    device: str = "cpu",
+) -> list[dict[str, Any]]:
+    """Time and error of a motion from rest under gravity with ever more steps; `distance` is of its frames [F, V, 3].
+
+    Raises ImportError where Newton is not installed.
+    """
+    warp, newton = importlib.import_module("warp"), importlib.import_module("newton")
+    model = build(newton, mesh, device, pinned, material)
+    rows = []
+    for count in sweeps:
+        solver = newton.solvers.SolverVBD(model, iterations=count)
+        for rung in range(-1, rungs):  # the first compiles
+            steps, states, seen = frames * 2 ** max(rung, 0), [model.state(), model.state()], []
+            warp.synchronize_device(device)
+            start = time.perf_counter()
+            for n in range(1, steps + 1):
+                solver.step(states[0], states[1], model.control(), None, duration / steps)
+                states.reverse()
+                if n % (steps // frames) == 0:
+                    seen.append(states[0].particle_q.numpy())
+            seconds = time.perf_counter() - start
+            if rung >= 0:
+                rows.append({"solver": f"Newton {newton.__version__} SolverVBD", "iterations": count, "steps": steps,
+                             "ms": 1e3 * seconds, "error": distance(np.stack(seen).astype(float)),
+                             "note": "implicit Euler in float32"})  # fmt: skip
+    return rows
+
+
+def build(
+    newton: Any,
+    mesh: dv.TetMesh,
+    device: str,
+    pinned: NDArray[np.bool_] | None = None,
+    material: tuple[float, float] = (1e5, 1e5),
+) -> Any:
+    """Newton's model of a mesh with mu and lam [Pa], held where it is pinned; None: by the face at y = 0.
 
     Fills the builder's lists, because its own loop over tets takes a minute for the largest mesh. Surface triangles are
     left out: without stiffness or contact they would only cost memory.
@@ -84,7 +129,7 @@ def build(newton: Any, mesh: dv.TetMesh, device: str) -> Any:
     shape = (points[tets[:, 1:]] - points[tets[:, :1]]).swapaxes(1, 2)  # columns are edges
     weight = 1000.0 * np.linalg.det(shape) / 24
     mass = np.bincount(tets.ravel(), np.repeat(weight, 4), len(points))
-    pinned = points[:, 1] < 1e-9
+    pinned = points[:, 1] < 1e-9 if pinned is None else pinned
     mass[pinned] = 0.0
     flags = np.where(pinned, 0, int(newton.ParticleFlags.ACTIVE))
     builder = newton.ModelBuilder(gravity=(0.0, -9.81, 0.0))
@@ -93,7 +138,7 @@ def build(newton: Any, mesh: dv.TetMesh, device: str) -> Any:
     builder.tet_indices.extend(map(tuple, tets.tolist()))
     builder.tet_poses.extend(np.linalg.inv(shape).tolist())
     builder.tet_activations.extend([0.0] * len(tets))
-    builder.tet_materials.extend([(1e5, 1e5, 0.0)] * len(tets))
+    builder.tet_materials.extend([(*material, 0.0)] * len(tets))
     builder.color()
     return builder.finalize(device=device)
 

@@ -8,7 +8,7 @@ import torch
 
 import diffvbd as dv
 from bench.common import markdown_table
-from bench.tradeoff import STEP, bar, beam, swing
+from bench.sweeps import STEP, bar, beam, swing
 
 STARTS = ("predictor", "inertia", "auto")
 
@@ -18,7 +18,7 @@ def run(quick: bool) -> dict[str, Any]:
 
 
 def cantilever(quick: bool) -> list[dict[str, Any]]:
-    """Error over motion after 0.5 s of the cantilever of `tradeoff`, against converged steps of the same h."""
+    """Error over motion after 0.5 s of the cantilever of `sweeps`, against converged steps of the same h."""
     steps, out = (5 if quick else 30), []
     for mu in (1e5,) if quick else (1e3, 1e4, 1e5, 1e6, 1e7):
         material = {"mu": mu, "lam": 1.5 * mu}
@@ -35,7 +35,7 @@ def cantilever(quick: bool) -> list[dict[str, Any]]:
 
 
 def hanging_bar(quick: bool) -> list[dict[str, Any]]:
-    """The bar of `tradeoff` begins at rest in equilibrium: its elongation over that of equilibrium 1 s later."""
+    """The bar of `sweeps` begins at rest in equilibrium: its elongation over that of equilibrium 1 s later."""
     out = []
     for mu in (1e5,):
         material = {"mu": mu, "lam": 1.5 * mu}

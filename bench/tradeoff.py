@@ -1,158 +1,289 @@
-"""Speed against accuracy: time of a step and error of its result over sweeps K and relaxation."""
+"""Speed against accuracy: error of a motion and of its gradient over the time that they take, for each choice there is.
+
+Nine scenes from soft to extreme. Each way runs with ever shorter steps and several numbers of sweeps; its error is the
+distance to a reference of much shorter steps and more sweeps (root mean square over vertices and four frames, over the
+motion), and that of the gradient of the mean squared way with respect to each modulus and a velocity of all vertices.
+Times are those of one rollout, and of one with its backward. Scenes run side by side, one thread each.
+"""
 
 from __future__ import annotations
 
+import math
+import multiprocessing
+import os
+import sys
 import time
+import warnings
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
 import diffvbd as dv
+from bench import common
+from bench.advice_scenes import Scene
 from bench.common import markdown_table
-from diffvbd.inspect.diagnose import diagnose
+from bench.tradeoff_peers import peers
+from bench.tradeoff_scenes import SCENES, gripper, pile
+from diffvbd.rollout.pilots import FRAMES, Pilot, Pilots, converted, pilots_of
+from diffvbd.rollout.search import start_of
 
-SWEEPS = (5, 10, 20, 50, 100, 200, 500, 1000)
-RELAXATIONS = (1.0, 1.6)
-MATERIAL = {"mu": 1e5, "lam": 1.5e5}
-STEP = 1 / 60
-
-
-def run(quick: bool) -> dict[str, Any]:
-    sweeps = (5, 50) if quick else SWEEPS
-    return {
-        "hanging_bar": hanging_bar(sweeps, quick),
-        "equal_work": equal_work(quick),
-        "swinging_beam": swinging_beam(sweeps, quick),
-    }
+LONGEST = 1 / 30  # [s], the first step
+ERRORS = (0.1, 0.01, 0.001)
+Row = dict[str, Any]
 
 
-def bar(relaxation: float = 1.0, start: Any = "predictor") -> dv.Model:
-    """A bar of 1 m, 11 layers of vertices, held at its upper end. What `start` does, `bench starts` measures."""
-    mesh = dv.mesh.beam(11, 3, 3, size=(1.0, 0.2, 0.2))
-    # x is the long axis of beam(); turned so that it hangs down
-    points = np.stack([mesh.points[:, 1], -mesh.points[:, 0], mesh.points[:, 2]], -1)
-    mesh = dv.TetMesh(points, mesh.tets, orient=True)
-    return dv.Model(mesh, pinned=points[:, 1] > -1e-9, relaxation=relaxation, start=start)
+@dataclass(frozen=True)
+class Effort:
+    """How long a run may take."""
+
+    rung: float  # [s]: runs longer than this end a way
+    reference: float  # [s]: as long as all runs toward the reference
+    patience: float  # [s] of dv.advise
+    finest: float  # an error below which no shorter step is tried
 
 
-def hanging_bar(sweeps: tuple[int, ...], quick: bool) -> list[dict[str, Any]]:
-    """Elongation at which the executed steps come to rest, against equilibrium, for two time steps.
-
-    Unconverged sweeps leave part of each step's fall h^2 g, so the bar settles too low: a bias, not noise.
-    """
-    start = _equilibrium(MATERIAL, quick)
-    cases = [(h, omega, k) for h in ((STEP,) if quick else (STEP, 0.1)) for omega in RELAXATIONS for k in sweeps]
-    return [_at_rest(bar(omega), start, h, k, MATERIAL, quick) for h, omega, k in cases]
+FULL, QUICK = Effort(1.0, 60.0, 60.0, 3e-4), Effort(0.05, 1.0, 1.0, 2e-2)
 
 
-def equal_work(quick: bool) -> list[dict[str, Any]]:
-    """The bar made 100 times stiffer, 100 sweeps per 1/60 s: few long steps or many short ones."""
-    material = {k: 100 * value for k, value in MATERIAL.items()}
-    start = _equilibrium(material, quick)
-    return [
-        _at_rest(bar(), start, STEP / n, 100 // n, material, quick) for n in ((1, 20) if quick else (1, 2, 5, 20, 100))
-    ]
+@dataclass(frozen=True)
+class Way:
+    """Settings but for the step, and numbers of sweeps; `changes` are arguments of Model.replace."""
+
+    name: str
+    settings: dv.Settings
+    sweeps: tuple[int, ...]
+    changes: tuple[tuple[str, Any], ...] = ()
+    elastic: bool = True  # whether it is for scenes without contact
+    contact: bool = True  # and with it
+    gradient_only: bool = False  # what changes no motion
 
 
-def _equilibrium(material: dict[str, float], quick: bool) -> Tensor:
-    """Positions of the bar at rest, by steps whose sweeps have converged."""
-    return _settle(bar(1.6), bar().rest_points, 0.1, 500 if quick else 20_000, 20 if quick else 100, material)[1]
+def _plain(**options: Any) -> dv.Settings:
+    return dv.Settings(1.0, 1, **options)
 
 
-def _at_rest(
-    model: dv.Model, start: Tensor, h: float, sweeps: int, material: dict[str, float], quick: bool
-) -> dict[str, Any]:
-    before, after = _settle(model, start, h, sweeps, 60 if quick else 5000, material)
-    state = (before, torch.zeros_like(before))
-    left = diagnose(model, after, time_step=h, previous=state, warn=False, **material)
-    return {
-        "mu": material["mu"],
-        "time_step": h,
-        "relaxation": model.relaxation,
-        "sweeps": sweeps,
-        "ms_per_step": _milliseconds(model, h, sweeps, **material),
-        "elongation": float(-1.0 - after[:, 1].min()),
-        "error": float((1.0 + after[:, 1].min()) / (1.0 + start[:, 1].min())) - 1,
-        "unbalanced": left.unbalanced,
-        "courant": left.courant,
-    }
+COARSE: dict[str, Any] = {"relaxation": 1.5, "coarse": "auto"}
+SDIRK2, BDF2 = dv.SDIRK2(), dv.BDF2()
+WAYS = [
+    Way("implicit Euler", _plain(), (5, 20, 80)),
+    Way("implicit Euler, relaxation 1.6", _plain(relaxation=1.6), (20, 80), contact=False),
+    Way("implicit Euler, start at y", _plain(), (20,), (("start", "predictor"),)),
+    Way("implicit Euler, start at x + h v", _plain(), (20,), (("start", "inertia"),)),
+    Way("implicit Euler, Anderson(5)", _plain(acceleration=dv.Anderson(5)), (20,)),
+    Way("implicit Euler, coarse", _plain(**COARSE), (2, 8)),
+    Way("implicit Euler, block of the paper", _plain(block="paper"), (20,)),
+    Way("SDIRK2", _plain(integrator=SDIRK2), (5, 20, 80)),
+    Way("SDIRK2, relaxation 1.6", _plain(integrator=SDIRK2, relaxation=1.6), (20, 80), contact=False),
+    Way("SDIRK2, coarse", _plain(integrator=SDIRK2, **COARSE), (2, 8)),
+    Way("SDIRK2, coarse, float32", _plain(integrator=SDIRK2, dtype=torch.float32, **COARSE), (8,), contact=False),
+    Way("SDIRK2, float32", _plain(integrator=SDIRK2, dtype=torch.float32), (20,), elastic=False),
+    Way("BDF2", _plain(integrator=BDF2), (20,)),
+    Way("BDF2, coarse", _plain(integrator=BDF2, **COARSE), (2, 8)),
+    Way("SDIRK2, full tape", _plain(integrator=SDIRK2, tape="full"), (20,), gradient_only=True),
+    Way("SDIRK2, compact tape", _plain(integrator=SDIRK2, tape="compact"), (20,), gradient_only=True),
+    Way("SDIRK2, recomputed tape", _plain(integrator=SDIRK2, tape="recompute"), (20,), gradient_only=True),
+    Way("SDIRK2, a checkpoint every 8 steps", _plain(integrator=SDIRK2, checkpoint_every=8), (20,),
+        gradient_only=True),
+]  # fmt: skip
+BARRIERS: list[tuple[str, dict[str, Any]]] = [
+    ("1 detection", {"detections": 1}),
+    ("4 detections", {"detections": 4}),
+    ("dhat / 2", {"dhat": 1e-3}),
+    ("dhat x 2", {"dhat": 4e-3}),
+    ("kappa / 10", {"kappa": 1e3}),
+    ("kappa x 10", {"kappa": 1e5}),
+]
 
 
-def _settle(
-    model: dv.Model, start: Tensor, h: float, sweeps: int, steps: int, material: dict[str, float]
-) -> tuple[Tensor, Tensor]:
-    """The last two positions of up to `steps` steps without inertia."""
-    before = after = checked = start
-    for n in range(1, steps + 1):
-        before = after
-        after, _ = dv.step(model, before, torch.zeros_like(before), time_step=h, sweeps=sweeps, **material)
-        if n % 20 == 0:
-            if float((after - checked).abs().max()) < 1e-9:
+class Front:
+    """Runs of one scene, held against its reference."""
+
+    def __init__(self, scene: Scene, effort: Effort, device: str) -> None:
+        self.effort, self.device = effort, device
+        model = scene.model.to(device)
+        self.scene = replace(scene, model=model, v=scene.v.to(device), given=converted(scene.given, device=device))
+        self.truth, self.unsure = self.reference()
+
+    def pilots(self, gradient: bool, model: dv.Model | None = None) -> Pilots:
+        scene = self.scene
+        model = scene.model if model is None else model
+        v, given = converted(scene.v, dtype=model.dtype), converted(scene.given, dtype=model.dtype)
+        return pilots_of(dv.rollout, model, model.rest_points, v, scene.duration, None, gradient, given)
+
+    def reference(self) -> tuple[Pilot, tuple[float, float]]:
+        """The last of ever finer runs, and how far its motion and its gradient may be off."""
+        runs = self.pilots(gradient=True)
+        own = start_of(self.scene.model)
+        settings = replace(own, sweeps=20 if own.coarse else 80)
+        steps, last, off = FRAMES * math.ceil(self.scene.duration / (FRAMES * LONGEST)), None, (math.inf, math.inf)
+        while True:
+            now = runs.run(settings, steps)
+            if last is not None and now.x is not None:
+                off = self.errors(now, last)
+            last = now if now.x is not None else last
+            if max(off) < 0.3 * self.effort.finest or runs.spent + 2 * now.seconds > self.effort.reference:
                 break
-            checked = after
-    return before, after
+            steps *= 2
+        if last is None:
+            raise RuntimeError(f"{self.scene.name}: no reference: {now.failure}")
+        return last, off
+
+    def errors(self, truth: Pilot, run: Pilot) -> tuple[float, float]:
+        """Of motion and gradient."""
+        if run.x is None or truth.x is None:
+            return math.inf, math.inf
+        runs = self._runs
+        motion = runs.apart(run.x.to(truth.x), truth.x)
+        apart = [float((a.to(b) - b).norm() / b.norm().clamp(min=1e-300))
+                 for a, b in zip(run.gradient, truth.gradient, strict=False)]  # fmt: skip
+        return motion, max(apart, default=math.inf)
+
+    def distance(self, frames: torch.Tensor) -> float:
+        """Of frames [FRAMES, V, 3] to the reference."""
+        assert self.truth.x is not None
+        return self._runs.apart(torch.cat([self.truth.x[:1], frames.to(self.truth.x)]), self.truth.x)
+
+    @property
+    def _runs(self) -> Pilots:
+        return Pilots(dv.rollout, self.scene.model, self.scene.model.rest_points, self.scene.v, self.scene.duration,
+                      self.scene.given)  # fmt: skip
+
+    def way(self, way: Way) -> list[Row]:
+        model = self.scene.model
+        if way.changes:
+            model = model.replace(**dict(way.changes))
+        if way.settings.dtype is not None:
+            model = model.to(dtype=way.settings.dtype)
+        forward, both = self.pilots(False, model), self.pilots(True, model)
+        out = []
+        for sweeps in way.sweeps:
+            settings = replace(way.settings, sweeps=sweeps)
+            steps = FRAMES * math.ceil(self.scene.duration / (FRAMES * LONGEST))
+            while True:
+                run, back = forward.run(settings, steps), both.run(settings, steps)
+                motion, gradient = self.errors(self.truth, back if back.gradient else run)
+                out.append({"way": way.name, "sweeps": sweeps, "steps": steps, "ms": 1e3 * run.seconds,
+                            "error": motion, "both_ms": 1e3 * back.seconds, "gradient_error": gradient})  # fmt: skip
+                slow = max(run.seconds, 0.3 * back.seconds) if run.x is not None else 0.0
+                if way.gradient_only or slow > self.effort.rung or motion < self.effort.finest or steps > 2**13:
+                    break
+                steps *= 2
+        return out
+
+    def advised(self) -> list[Row]:
+        """What dv.advise says, run against the same reference."""
+        runs, out, s = self.pilots(False), [], self.scene
+        for error in ERRORS:
+            told = dv.advise(s.model, s.model.rest_points, s.v, duration=s.duration, error=error,
+                             patience=self.effort.patience, **s.given)  # fmt: skip
+            assert told.predicted is not None
+            reached = told.predicted.reached
+            run = runs.run(told, told.steps(s.duration))
+            out.append({"asked": error, "settings": str(replace(told, predicted=None)), "reached": reached,
+                        "ms": 1e3 * run.seconds, "error": self.errors(self.truth, run)[0],
+                        "spent": told.predicted.spent, "why": "" if reached else told.predicted.why})  # fmt: skip
+        return out
 
 
-def _milliseconds(model: dv.Model, h: float, sweeps: int, mu: float, lam: float) -> float:
-    """Least time of a step [ms] in a few repetitions."""
-    x = model.rest_points
-    times = []
-    for _ in range(7):
-        begun = time.perf_counter()
-        dv.step(model, x, torch.zeros_like(x), time_step=h, sweeps=sweeps, mu=mu, lam=lam)
-        times.append(time.perf_counter() - begun)
-    return 1e3 * min(times)
+def measured(name: str, quick: bool, device: str) -> Row:
+    """All ways on one scene."""
+    torch.set_num_threads(1)
+    effort, began = QUICK if quick else FULL, time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        front = Front(SCENES[name](), effort, device)
+        model = front.scene.model
+        rows = []
+        for way in WAYS[:1] if quick else WAYS:
+            if not (way.contact if model.touches or model.floor is not None else way.elastic):
+                continue
+            try:
+                rows += front.way(way)
+            except (ValueError, NotImplementedError) as error:  # what this scene does not support
+                rows.append({"way": way.name, "why": str(error)[:160]})
+        for label, options in [] if quick else BARRIERS:
+            if (make := {"pile": pile, "gripper": gripper}.get(name)) is not None:
+                changed = (("energies", make(**options).model.energies),)
+                rows += front.way(Way(f"SDIRK2, {label}", _plain(integrator=SDIRK2), (20,), changed))
+        others = peers(front.scene, front.distance, quick) if name in ("soft", "stiff") and device == "cpu" else []
+        advised = front.advised()
+    print(f"{name}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
+    return {"scene": front.scene.name, "vertices": model.num_vertices, "duration": front.scene.duration,
+            "unsure": front.unsure[0], "gradient_unsure": front.unsure[1], "rows": rows, "advised": advised,
+            "peers": others}  # fmt: skip
 
 
-def swinging_beam(sweeps: tuple[int, ...], quick: bool) -> list[dict[str, Any]]:
-    """Position error after 0.5 s of a cantilever falling from rest, against converged steps of the same h."""
-    steps = 5 if quick else 30
-    out = []
-    for stiffness in (1.0,) if quick else (1.0, 100.0):
-        material = {k: stiffness * value for k, value in MATERIAL.items()}
-        goal = swing(beam(1.6), 500 if quick else 5000, steps, material)
-        moved = float((goal - beam().rest_points).norm(dim=-1).max())
-        for relaxation in RELAXATIONS:
-            for k in sweeps:
-                model = beam(relaxation)
-                error = float((swing(model, k, steps, material) - goal).norm(dim=-1).max())
-                out.append(
-                    {
-                        "mu": material["mu"],
-                        "relaxation": relaxation,
-                        "sweeps": k,
-                        "ms_per_step": _milliseconds(model, STEP, k, **material),
-                        "error": error,
-                        "error_over_motion": error / moved,
-                    }
-                )
+def run(quick: bool, device: str = "cpu", only: str | None = None, out: Path | None = None) -> dict[str, Any]:
+    chosen = list(SCENES) if only is None else [name.strip() for name in only.split(",")]
+    if unknown := [name for name in chosen if name not in SCENES]:
+        raise ValueError(f"only: expected scenes among {', '.join(SCENES)}, got {', '.join(unknown)}")
+    environment = common.environment(device)
+    path = None if out is None else out / f"tradeoff{common.device_suffix(device)}.json"
+    results = common.earlier(path, quick, environment["device"])
+    if device == "cpu" and len(chosen) > 1 and not quick:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(min(len(chosen), os.cpu_count() or 1), context) as pool:
+            found = list(pool.map(measured, chosen, [quick] * len(chosen), [device] * len(chosen)))
+    else:
+        found = [measured(name, quick, device) for name in chosen]
+    for name, group in zip(chosen, found, strict=True):
+        results[name] = group | common.stamp(environment)
+    return {name: results[name] for name in SCENES if name in results}
+
+
+def best(rows: list[Row], error: float, by: str = "error", time: str = "ms") -> Row | None:
+    """The row that takes the least time of those within an error."""
+    within = [r for r in rows if isinstance(r.get(by), float) and r[by] <= error and isinstance(r[time], float)]
+    return min(within, key=lambda r: r[time], default=None)
+
+
+def front_of(rows: list[Row], by: str = "error", time: str = "ms") -> list[Row]:
+    """Those that no other beats in both time and error, fastest first."""
+    out: list[Row] = []
+    for row in sorted((r for r in rows if isinstance(r.get(by), float)), key=lambda r: r[time]):
+        if not out or row[by] < out[-1][by]:
+            out.append(row)
     return out
 
 
-def beam(relaxation: float = 1.0, start: Any = "predictor") -> dv.Model:
-    mesh = dv.mesh.beam(11, 3, 3, size=(1.0, 0.2, 0.2))
-    return dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=relaxation, start=start)
-
-
-def swing(model: dv.Model, sweeps: int, steps: int, material: dict[str, float]) -> Tensor:
-    """Positions after the last of `steps` steps."""
-    x = model.rest_points
-    options = {"steps": steps, "time_step": STEP, "sweeps": sweeps, "save": "last", **material}
-    return dv.rollout(model, x, torch.zeros_like(x), **options).x[-1]
+def _said(row: Row | None, time: str = "ms") -> str:
+    return "-" if row is None else f"{row['way']}, K = {row['sweeps']}, {row['steps']} steps: {row[time]:.3g} ms"
 
 
 def markdown(results: dict[str, Any]) -> str:
-    titles = {
-        "hanging_bar": "Hanging bar of 1 m: elongation at rest against equilibrium",
-        "equal_work": "The same bar 100 times stiffer, 100 sweeps per 1/60 s",
-        "swinging_beam": "Cantilever of 1 m released from rest: position after 0.5 s against converged steps",
-    }
-    parts = []
-    for name, title in titles.items():
-        rows = results[name]
-        parts.append(
-            f"## {title}\n\n" + markdown_table([k.replace("_", " ") for k in rows[0]], [r.values() for r in rows])
-        )
-    return "\n".join(parts)
+    """The fastest way to each error, what the default does, and what is advised."""
+    text, header = [], ("error", "fastest motion", "implicit Euler alone", "fastest gradient", "advised")
+    for group in results.values():
+        rows = [r for r in group["rows"] if "steps" in r]
+        own = [r for r in rows if not any(label in r["way"] for label, _ in BARRIERS)]
+        euler = [r for r in own if r["way"] == "implicit Euler"]
+        table = []
+        for error in ERRORS:
+            told = next((a for a in group["advised"] if a["asked"] == error), None)
+            said = "-" if told is None else f"{told['settings']}: {told['ms']:.3g} ms, error {told['error']:.2g}"
+            if told is not None and not told["reached"]:
+                said = f"cannot be had: {told['why']}"
+            table.append((error, _said(best(own, error)), _said(best(euler, error)),
+                          _said(best(own, error, "gradient_error", "both_ms"), "both_ms"), said))  # fmt: skip
+        unsure = f"{group['unsure']:.1g} (gradient {group['gradient_unsure']:.1g})" if isinstance(
+            group["unsure"], float) else "unknown"  # fmt: skip
+        text.append(f"## {group['scene']}, {group['vertices']} vertices, {group['duration']:.3g} s\n\n"
+                    f"The reference may be off by {unsure}.\n\n{markdown_table(header, table)}")  # fmt: skip
+        ways = []
+        for name in dict.fromkeys(r["way"] for r in rows):
+            of_way = [r for r in rows if r["way"] == name and isinstance(r["error"], float)]
+            if not of_way:
+                continue
+            cells = [best(of_way, e) for e in ERRORS]
+            least = min(of_way, key=lambda r: r["error"])
+            ways.append([name, *(None if c is None else c["ms"] for c in cells), least["error"], least["ms"],
+                         least["both_ms"]])  # fmt: skip
+        text.append(markdown_table(("way", *(f"ms to {e:g}" for e in ERRORS), "least error", "in ms",
+                                    "with backward"), ways))  # fmt: skip
+        if group["peers"]:
+            keys = ("solver", "iterations", "steps", "ms", "error", "note")
+            text.append(markdown_table(keys, ([row.get(key) for key in keys] for row in group["peers"])))
+    return "\n".join(text) + common.of_several_runs(results)

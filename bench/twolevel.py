@@ -134,7 +134,7 @@ def first_below(rows: list[dict[str, Any]], level: float) -> dict[str, Any] | No
 
 
 def at_rest(quick: bool) -> list[dict[str, Any]]:
-    """Error of the elongation at which steps without inertia come to rest, as `bench tradeoff` measures it."""
+    """Error of the elongation at which steps without inertia come to rest, as `bench sweeps` measures it."""
     scene, out, ends = hanging_bar(), [], {}
     for k in (10,) if quick else (500, 5, 10, 20):
         model, (x, v) = scene.model(), scene.state()

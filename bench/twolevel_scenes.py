@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench import tradeoff
+from bench import sweeps
 
 RELAXATION = 1.5  # with corrections
 
@@ -66,8 +66,8 @@ def cantilever(counts: tuple[int, int, int]) -> Scene:
 
 
 def hanging_bar() -> Scene:
-    model = tradeoff.bar()
-    return Scene("hanging bar", model.mesh, model.pinned.numpy(), dict(tradeoff.MATERIAL))
+    model = sweeps.bar()
+    return Scene("hanging bar", model.mesh, model.pinned.numpy(), dict(sweeps.MATERIAL))
 
 
 def sheet(ratio: float, target: float, cells: int = 20) -> Scene:
