@@ -116,7 +116,7 @@ class Front:
     def reference(self) -> tuple[Pilot, tuple[float, float]]:
         """The last of ever finer runs, and how far its motion and its gradient may be off."""
         runs = self.pilots(gradient=True)
-        own = start_of(self.scene.model)
+        own = start_of(runs)
         settings = replace(own, sweeps=20 if own.coarse else 80)
         steps, last, off = FRAMES * math.ceil(self.scene.duration / (FRAMES * LONGEST)), None, (math.inf, math.inf)
         while True:

@@ -14,6 +14,7 @@ from ..mesh import TetMesh
 if TYPE_CHECKING:
     from .model import Model
 
+INCOMPRESSIBLE = 60.0  # lam / mu (nu = 0.492) above which over-relaxed rollouts grew; 49 did not
 STABLE_RELAXATION = 1.7  # largest omega that never grew in the rollouts of docs/numerics.md
 HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
 THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
@@ -45,19 +46,46 @@ def warn_of(model: Model) -> None:
         )
 
 
-def warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
-    """Warns, once for each Model, where tets are so thin that few sweeps leave a sheet without stiffness; the caller's
-    caller is shown.
-
-    The two faces of a sheet are coupled (w / t)^2 times as stiffly as neighbours in its plane, w wide and t thick, and
-    sweeps move them together by that much less; inertia helps where a wave crosses fewer elements than w / t. Coarse
-    corrections move them together.
+def warn_of_material(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
+    """Warns, once for each Model, of moduli that its settings do not suit; the caller's caller is shown.
 
     Args:
         mu, lam: [Pa], [1 | B, 1 | T]; on CUDA they are not looked at outside debug_checks().
         time_step, sweeps: Of the step.
     """
-    if "thin" in model._derived or sweeps == 0 or not model.mesh.num_tets or model.coarse is not None:
+    if sweeps == 0 or not model.mesh.num_tets:
+        return
+    _warn_of_thin_tets(model, mu, lam, time_step, sweeps)
+    _warn_of_over_relaxation(model, mu, lam)
+
+
+def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
+    """Whether over-relaxed sweeps of some tet may gain energy from step to step."""
+    return bool((lam.detach() > INCOMPRESSIBLE * mu.detach()).any())
+
+
+def _warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> None:
+    if "over-relaxed" in model._derived or model.relaxation <= 1:
+        return
+    model._derived["over-relaxed"] = True
+    if any(isinstance(e, StableNeoHookean) for e in model.energies) and is_nearly_incompressible(mu, lam):
+        warnings.warn(
+            f"relaxation: {model.relaxation:g} where lam is more than {INCOMPRESSIBLE:g} times mu (Poisson's ratio "
+            "above 0.492): such rollouts were seen to gain energy without bound; take relaxation=1, with "
+            'coarse="auto" in place of it',
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def _warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
+    """Tets so thin that few sweeps leave a sheet without stiffness.
+
+    The two faces of a sheet are coupled (w / t)^2 times as stiffly as neighbours in its plane, w wide and t thick, and
+    sweeps move them together by that much less; inertia helps where a wave crosses fewer elements than w / t. Coarse
+    corrections move them together.
+    """
+    if "thin" in model._derived or model.coarse is not None:
         return
     model._derived["thin"] = True
     tets = model.mesh.tets[:: max(1, model.mesh.num_tets // SAMPLED)]
@@ -82,7 +110,7 @@ def warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, s
             f"shorter time step, more sweeps with relaxation up to {STABLE_RELAXATION}, or a thicker body of softer "
             "material. Linear tets this thin are also much too stiff in bending (docs/numerics.md)",
             UserWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

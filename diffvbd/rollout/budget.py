@@ -228,7 +228,7 @@ class _Budget:
     def _sweeps(self, run: Pilot) -> Pilot:
         """The same steps with sweeps enough that more change little."""
         began = self.pilots.spent
-        settings = replace(start_of(self.pilots.model), integrator=self.own.integrator)
+        settings = replace(start_of(self.pilots), integrator=self.own.integrator)
         settings = replace(settings, sweeps=max(17, 2 * self.own.sweeps))
         now = self._run(settings, self.steps)
         while True:

@@ -216,12 +216,20 @@ class Pilots:
         corners = tet_gather(self.model.rest_points[None].double(), *self.model._topology)[0]
         return torch.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(-1, -2))
 
+    def moduli(self) -> tuple[Tensor, Tensor]:
+        """mu and lam [Pa], at the start where they change."""
+        names = ("mu", "lam", "young", "poisson")
+        given = self.at_steps({name: self.given.get(name) for name in names}, 0.0, 0, 0.0)
+        values = (v(0, self.x, self.v) if callable(v) and not isinstance(v, Tensor) else v
+                  for v in (given.get(name) for name in names))  # fmt: skip
+        mu, lam = moduli_of(self.model, self.x.shape[:-2], *values)
+        return tuple(torch.as_tensor(m, device=self.x.device).detach().double() for m in (mu, lam))  # type: ignore[return-value]
+
     def energy(self, x: Tensor, v: Tensor) -> Tensor:
         """Kinetic, elastic and of loads [...] [J] of each scene; contact, which is short, counts as none."""
         model, given, lead = self.model, self.given, x.shape[:-2]
         x, v = x.double(), v.double()
-        mu, lam = moduli_of(model, lead, *(given.get(n) for n in ("mu", "lam", "young", "poisson")))
-        mu, lam = (torch.as_tensor(m, device=x.device).detach().double() for m in (mu, lam))
+        mu, lam = self.moduli()
         corners = tet_gather(x.reshape(-1, *x.shape[-2:]), *model._topology).unflatten(0, lead or (1,))
         corners = corners if lead else corners[0]
         f = (corners[..., 1:, :] - corners[..., :1, :]).transpose(-1, -2) @ self._rest_inverse

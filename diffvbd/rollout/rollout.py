@@ -13,7 +13,7 @@ from torch import Tensor
 from ..adjoint.routes import Adjoint, check_adjoint
 from ..checks import check_count, fail
 from ..model.model import Model
-from ..model.warnings import warn_of_thin_tets
+from ..model.warnings import warn_of_material
 from ..scopes import looks_at, refinement
 from ..step.advance import advance
 from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
@@ -147,7 +147,7 @@ def rollout(
     anew = any(_changes(value) for value in (*(options[k] for k in _STATIC), *own.values()))
     fixed = None if anew else prepare(model, lead, **chosen, **_to_prepare(options, own, 0, x, v))
     if fixed is not None and looks_at(fixed.mu) and looks_at(fixed.lam):
-        warn_of_thin_tets(model, fixed.mu, fixed.lam, *fixed.time_step_and_sweeps)
+        warn_of_material(model, fixed.mu, fixed.lam, *fixed.time_step_and_sweeps)
     for value in _tensors(options["prescribed"]):
         check_prescribed(model, value, x)
     if check_start and steps:

@@ -19,6 +19,7 @@ from torch import Tensor
 from ..energies import StableNeoHookean
 from ..model.anderson import Anderson
 from ..model.model import Model
+from ..model.warnings import is_nearly_incompressible
 from ..step.integrators import SDIRK2, ImplicitEuler
 from .pilots import FRAMES, Pilot, Pilots, relative
 from .settings import Candidate, Prediction, Settings
@@ -41,26 +42,32 @@ def found(pilots: Pilots, error: float, patience: float) -> Settings:
     return _Search(pilots, error, patience).run()
 
 
-def start_of(model: Model) -> Settings:
+def start_of(pilots: Pilots) -> Settings:
     """What the ladder runs with: well converged and never far from the fastest."""
+    model = pilots.model
     if not _exact(model):
         return Settings(1.0, 40, SDIRK2())
     if model.contact is not None or model.friction is not None:
         return Settings(1.0, 20, SDIRK2())
-    return Settings(1.0, 8, SDIRK2(), relaxation=1.5, coarse="auto")
+    return Settings(1.0, 8, SDIRK2(), relaxation=1.5 if _may_over_relax(pilots) else 1.0, coarse="auto")
 
 
-def candidates_of(model: Model) -> list[Settings]:
-    sdirk, euler = SDIRK2(), ImplicitEuler()
+def candidates_of(pilots: Pilots) -> list[Settings]:
+    model, sdirk, euler = pilots.model, SDIRK2(), ImplicitEuler()
     touches = model.contact is not None or model.friction is not None
-    over = 1.0 if touches or not _exact(model) else 1.6
+    free = not touches and _exact(model) and _may_over_relax(pilots)
+    over, over_coarse = (1.6, 1.5) if free else (1.0, 1.0)
     out = [Settings(1.0, k, scheme, relaxation=over) for scheme in (sdirk, euler) for k in (5, 10, 20)]
     if _exact(model) and not touches:
-        out += [Settings(1.0, k, sdirk, relaxation=1.5, coarse="auto") for k in (2, 5)]
-        out += [Settings(1.0, 2, euler, relaxation=1.5, coarse="auto")]
+        out += [Settings(1.0, k, sdirk, relaxation=over_coarse, coarse="auto") for k in (2, 5)]
+        out += [Settings(1.0, 2, euler, relaxation=over_coarse, coarse="auto")]
     elif _exact(model):
         out += [Settings(1.0, 20, euler, acceleration=Anderson(5))]
     return out
+
+
+def _may_over_relax(pilots: Pilots) -> bool:
+    return pilots.model.mesh.num_tets == 0 or not is_nearly_incompressible(*pilots.moduli())
 
 
 def _exact(model: Model) -> bool:
@@ -91,7 +98,7 @@ class _Search:
         else:
             error = self.estimates[-1] if self.estimates else math.inf
             now = self.ladder[-1] if self.ladder else None
-            settings = start_of(self.pilots.model).on(FRAMES, self.pilots.duration) if now is None else now.settings
+            settings = start_of(self.pilots).on(FRAMES, self.pilots.duration) if now is None else now.settings
             best = Candidate(settings, error, math.inf if now is None else now.seconds, now is not None)
         tried = {str(c.settings) for c in self.proven}
         rest = [c for c in self.proven if c is not best] + [c for c in self.predicted if str(c.settings) not in tried]
@@ -111,7 +118,7 @@ class _Search:
 
     def _climb(self) -> tuple[bool, str]:
         """Runs with more steps each time until the last one has half of the wanted error, or why that cannot be had."""
-        p, settings = self.pilots, start_of(self.pilots.model)
+        p, settings = self.pilots, start_of(self.pilots)
         steps = FRAMES * max(1, math.ceil(p.duration / (FRAMES * LONGEST)))
         apart: list[float] = []
         while True:
@@ -226,7 +233,7 @@ class _Search:
         scale = self._of_quarter(own, target)
         level = max(self._distance(self.ladder[-2], reference), 1e-300)
         self.plans: list[tuple[float, int, Settings]] = []
-        for settings in candidates_of(p.model):
+        for settings in candidates_of(p):
             if p.spent > max(0.6 * COSTS * self._least(), FREE):
                 break
             run = p.run(settings, steps, quarter, last)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..adjoint.routes import Adjoint, check_adjoint
 from ..model.model import Model
-from ..model.warnings import warn_of_thin_tets
+from ..model.warnings import warn_of_material
 from ..scopes import looks_at, refuse_refinement
 from .advance import advance
 from .arguments import GRAVITY, check_prescribed, check_state, prepare
@@ -150,6 +150,6 @@ def step(
     for value in prescribed if isinstance(prescribed, tuple) else (prescribed,):
         check_prescribed(model, value, x)
     if looks_at(prepared.mu) and looks_at(prepared.lam):
-        warn_of_thin_tets(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps)
+        warn_of_material(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps)
     taken = take(scheme, model, x, v, history, prepared, given, partial(advance, adjoint=adjoint))
     return (taken.x, taken.v) if taken.history is None else (taken.x, taken.v, taken.history)

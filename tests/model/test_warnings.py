@@ -106,3 +106,32 @@ def test_the_warning_is_right() -> None:
         errors[name] = float((few - converged).norm() / (converged - x).norm())
         assert bool(found) == (name == "thin")
     assert errors["thin"] > 10 * errors["thick"]
+
+
+@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize(("relaxation", "poisson", "warned"), [(1.5, 0.495, 1), (1.0, 0.495, 0), (1.5, 0.49, 0)])
+def test_over_relaxation_of_nearly_incompressible_material(
+    run: Callable[..., Any], relaxation: float, poisson: float, warned: int
+) -> None:
+    model = dv.Model(dv.mesh.box(3, 0.1), relaxation=relaxation)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            run(model, model.rest_points, time_step=1e-3, sweeps=5, young=1e5, poisson=poisson)
+    assert len(found) == warned
+    if warned:
+        assert "take relaxation=1" in str(found[0].message) and found[0].filename == __file__
+
+
+def test_what_it_warns_of_grows_and_the_remedy_does_not() -> None:
+    mesh = dv.mesh.beam(7, 3, 3, size=(0.6, 0.15, 0.15))
+    fastest = {}
+    for relaxation, coarse in ((1.6, None), (1.0, "auto")):
+        model = dv.Model(mesh, pinned=mesh.points[:, 0] < 1e-9, relaxation=relaxation, coarse=coarse)
+        x = model.rest_points
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            end = dv.rollout(model, x, torch.zeros_like(x), steps=400, time_step=1e-3, sweeps=8, young=3e5,
+                             poisson=0.4999)  # fmt: skip
+        fastest[relaxation] = float(end.v.norm(dim=-1).max())
+    assert fastest[1.6] > 20 and fastest[1.0] < 3
