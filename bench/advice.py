@@ -2,7 +2,8 @@
 
 Scenes drawn by a seed; for each wanted error the true one of the advised settings, against runs of eight times the
 steps and five times the sweeps; the time of the advised settings over that of the best of a grid; and what the advice
-cost. Then the cantilever and the drop of docs/numerics.md beside the best settings of implicit Euler. One thread.
+cost. Then the cantilever and the drop of docs/numerics.md beside the best settings of implicit
+Euler, and a fit of a material with steps that are too long and with short ones. One thread each.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import torch
 
 import diffvbd as dv
 from bench import common
+from bench.advice_fit import fit
 from bench.advice_scenes import Scene, drawn
 from bench.common import markdown_table
 from diffvbd.rollout.pilots import FRAMES, Pilot, Pilots, pilots_of
@@ -103,18 +105,22 @@ def best(scene: Scene, error: float, advised: dv.Settings, truth: Pilot) -> Row:
     return {"ms": 1e3 * own, "best_ms": 1e3 * min(own, least), "best": name or "the advised"}
 
 
-def kept(quick: bool) -> list[Row]:
-    rows = []
-    for number in range(2 if quick else SCENES):
-        scene = drawn(number)
-        for error in ERRORS[:1] if quick else ERRORS:
-            row, settings, truth = asked(scene, error, False)
-            compare = truth is not None and number < EXHAUSTIVE and error == 0.01
-            rows.append(row | (best(scene, error, settings, truth) if compare and truth is not None else {}))
-        if number < GRADIENTS and not quick:
-            rows.append(asked(scene, 0.01, True)[0])
-        print(f"scene {number}", file=sys.stderr, flush=True)
+def kept_of(number: int, quick: bool) -> list[Row]:
+    """The rows of one scene."""
+    rows, scene = [], drawn(number)
+    for error in ERRORS[:1] if quick else ERRORS:
+        row, settings, truth = asked(scene, error, False)
+        compare = truth is not None and number < EXHAUSTIVE and error == 0.01
+        rows.append(row | (best(scene, error, settings, truth) if compare and truth is not None else {}))
+    if number < GRADIENTS and not quick:
+        rows.append(asked(scene, 0.01, True)[0])
+    print(f"scene {number}", file=sys.stderr, flush=True)
     return rows
+
+
+def kept(quick: bool) -> list[Row]:
+    found = common.side_by_side(kept_of, range(2 if quick else SCENES), quick, at_once=not quick)
+    return [row for rows in found for row in rows]
 
 
 def beam(quick: bool) -> list[Row]:
@@ -160,7 +166,7 @@ def against_euler(scene: Scene, error: float) -> Row:
     return row | {"euler_ms": 1e3 * least, "euler": name}
 
 
-GROUPS = {"kept": kept, "beam": beam, "drop": drop}
+GROUPS = {"kept": kept, "beam": beam, "drop": drop, "fit": fit}
 
 
 def run(quick: bool, only: str | None = None, out: Path | None = None) -> dict[str, Any]:
@@ -222,4 +228,10 @@ def markdown(results: dict[str, Any]) -> str:
                       "why not")  # fmt: skip
             rows = results[name]["rows"]
             text += [f"## {name}\n", markdown_table(header, ([row.get(key) for key in keys] for row in rows))]
+    if "fit" in results:
+        keys = ("fit", "young", "poisson", "left", "evaluations", "seconds", "over_first")
+        header = ("fit of E = 50,000 Pa, nu = 0.3", "E [Pa]", "nu", "left of the shapes", "evaluations", "s",
+                  "over the first")  # fmt: skip
+        rows = results["fit"]["rows"]
+        text += ["## fit\n", markdown_table(header, ([row.get(key) for key in keys] for row in rows))]
     return "\n".join(text)

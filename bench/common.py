@@ -5,10 +5,12 @@ from __future__ import annotations
 import datetime
 import json
 import math
+import multiprocessing
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +108,18 @@ def write(
 
 def stamp(environment: dict[str, Any]) -> dict[str, Any]:
     """What a group says of its run, where those of one file may be of several."""
-    return {key: environment.get(key) for key in ("date", "device", "driver", "torch", "cuda", "commit", "dirty")}
+    return {
+        key: environment.get(key) for key in ("date", "device", "cpu", "driver", "torch", "cuda", "commit", "dirty")
+    }
+
+
+def side_by_side(measure: Callable[..., Any], cases: Iterable[Any], *arguments: Any, at_once: bool) -> list[Any]:
+    """measure(case, *arguments) of each case, with one thread each; at once: on as many cores as there are."""
+    if not at_once:
+        return [measure(case, *arguments) for case in cases]
+    os.environ["OMP_NUM_THREADS"] = "1"  # read when a process starts
+    with ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn")) as pool:
+        return [task.result() for task in [pool.submit(measure, case, *arguments) for case in cases]]
 
 
 def of_several_runs(groups: dict[str, Any]) -> str:

@@ -104,7 +104,7 @@ def ladder(
                 solver.step(states[0], states[1], model.control(), None, duration / steps)
                 states.reverse()
                 if n % (steps // frames) == 0:
-                    seen.append(states[0].particle_q.numpy())
+                    seen.append(states[0].particle_q.numpy().copy())  # on the CPU it is a view
             seconds = time.perf_counter() - start
             if rung >= 0:
                 rows.append({"solver": f"Newton {newton.__version__} SolverVBD", "iterations": count, "steps": steps,

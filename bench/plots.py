@@ -12,6 +12,7 @@ CAPTIONS = {
     "cost": "Iterations and time of the backward over stiffness, by route",
     "ablation": "Gradient error without each exactness term, over mesh refinement",
     "fd": "Error of the gradients over the step of the difference",
+    "tradeoff": "Error of the motion over the time of a rollout: each point is a way, a number of sweeps and a step",
     "twolevel": "Error over motion against the time of a step, with coarse corrections and with plain sweeps",
 }
 LABELS = {"reverse sweep": ("o", "C0"), "global, assembled": ("s", "C1"), "global, matrix-free": ("x", "C2"),
@@ -130,10 +131,44 @@ def two_level(figure: Any, results: dict[str, Any]) -> None:
     all_axes[min(2, len(rows) - 1)].legend(fontsize="x-small", loc="lower left")
 
 
+def tradeoff(figure: Any, results: dict[str, Any]) -> None:
+    """Points of the common ways, the front of all, and what dv.advise says."""
+    from bench.tradeoff import BARRIERS, front_of
+
+    drawn = {"implicit Euler": ("o", "C1"), "implicit Euler, coarse": ("s", "C3"), "SDIRK2": ("^", "C0"),
+             "SDIRK2, coarse": ("D", "C2"), "BDF2, coarse": ("v", "C4")}  # fmt: skip
+    groups = list(results.values())
+    columns = min(3, len(groups))
+    figure.set_size_inches(10, 3.0 * -(-len(groups) // columns))
+    all_axes = figure.subplots(-(-len(groups) // columns), columns, squeeze=False).ravel()
+    for ax, group in zip(all_axes, groups, strict=False):
+        rows = [r for r in group["rows"] if isinstance(r.get("error"), float) and isinstance(r["ms"], float)]
+        rows = [r for r in rows if not any(label in r["way"] for label, _ in BARRIERS)]
+        for name, (marker, color) in drawn.items():
+            shown = [r for r in rows if r["way"] == name]
+            ax.loglog([r["ms"] for r in shown], [r["error"] for r in shown], marker, color=color, markersize=3,
+                      alpha=0.7, label=name)  # fmt: skip
+        front = front_of(rows)
+        ax.loglog([r["ms"] for r in front], [r["error"] for r in front], "k-", linewidth=0.8, label="front of all")
+        told = [a for a in group["advised"] if a["reached"] and isinstance(a["error"], float)]
+        ax.loglog([a["ms"] for a in told], [a["error"] for a in told], "*", color="k", label="dv.advise")
+        if isinstance(group["unsure"], float):
+            ax.axhline(group["unsure"], color="0.6", linestyle=":", label="the reference's own error")
+        ax.set_title(group["scene"], fontsize="small")
+        ax.set_ylim(1e-5, 3)
+        ax.grid(alpha=0.3)
+    for ax in all_axes[len(groups) :]:
+        ax.axis("off")
+    figure.supxlabel("ms of a rollout")
+    figure.supylabel("error over motion")
+    figure.legend(*all_axes[0].get_legend_handles_labels(), fontsize="x-small", loc="outside lower center", ncols=4)
+
+
 FIGURES: dict[str, Callable[[Any, dict[str, Any]], None]] = {
     "exactness": exactness,
     "ablation": ablation,
     "cost": cost,
     "fd": finite_differences,
+    "tradeoff": tradeoff,
     "twolevel": two_level,
 }

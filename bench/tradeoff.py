@@ -9,12 +9,9 @@ Times are those of one rollout, and of one with its backward. Scenes run side by
 from __future__ import annotations
 
 import math
-import multiprocessing
-import os
 import sys
 import time
 import warnings
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -223,12 +220,7 @@ def run(quick: bool, device: str = "cpu", only: str | None = None, out: Path | N
     environment = common.environment(device)
     path = None if out is None else out / f"tradeoff{common.device_suffix(device)}.json"
     results = common.earlier(path, quick, environment["device"])
-    if device == "cpu" and len(chosen) > 1 and not quick:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(len(chosen), os.cpu_count() or 1), context) as pool:
-            found = list(pool.map(measured, chosen, [quick] * len(chosen), [device] * len(chosen)))
-    else:
-        found = [measured(name, quick, device) for name in chosen]
+    found = common.side_by_side(measured, chosen, quick, device, at_once=device == "cpu" and not quick)
     for name, group in zip(chosen, found, strict=True):
         results[name] = group | common.stamp(environment)
     return {name: results[name] for name in SCENES if name in results}
