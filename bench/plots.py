@@ -155,12 +155,13 @@ def tradeoff(figure: Any, results: dict[str, Any]) -> None:
         if isinstance(group["unsure"], float):
             ax.axhline(group["unsure"], color="0.6", linestyle=":", label="the reference's own error")
         ax.set_title(group["scene"], fontsize="small")
-        ax.set_ylim(1e-5, 3)
+        ax.set(ylim=(1e-5, 3), xlabel="ms of a rollout")
+        ax.xaxis.set_minor_formatter("")
+        ax.set_xlabel("ms of a rollout", fontsize="small")
         ax.grid(alpha=0.3)
     for ax in all_axes[len(groups) :]:
         ax.axis("off")
-    figure.supxlabel("ms of a rollout")
-    figure.supylabel("error over motion")
+    all_axes[0].set_ylabel("error over motion")
     figure.legend(*all_axes[0].get_legend_handles_labels(), fontsize="x-small", loc="outside lower center", ncols=4)
 
 
