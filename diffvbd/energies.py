@@ -120,6 +120,13 @@ def _barrier_slope(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     return -kappa * (2 * (d - dhat) * torch.log(d / dhat) + (d - dhat) ** 2 / d)
 
 
+def barrier_curvature(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
+    """b''(gap) [N/m] of the log barrier; 0 where a gap is not in (0, dhat)."""
+    d = torch.where((gap > 0) & (gap < dhat), gap, dhat)
+    part = 1 - dhat / d
+    return -kappa * (2 * torch.log(d / dhat) + 4 * part - part * part)
+
+
 @dataclass(frozen=True, eq=False)
 class FloorBarrier(VertexEnergy):
     """IPC log barrier above planes: b(d) = -kappa (d - dhat)^2 log(d / dhat) for a gap 0 < d < dhat.
@@ -220,10 +227,10 @@ class FloorBarrier(VertexEnergy):
             height = height - (normal * origin[:, :, None]).sum(-1)
         return (normal * x[:, :, None]).sum(-1) - height
 
-    def gaps(self, x: Tensor, data: Tensor, origin: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Gaps [m], [B, V, P], normals [1 | B, 1, P, 3] and dhat [m], [1 | B, 1, P]."""
-        normal, _, dhat, _ = self._columns(data)
-        return self._gaps(x, data, origin), normal, dhat
+    def gaps(self, x: Tensor, data: Tensor, origin: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Gaps [m], [B, V, P], normals [1 | B, 1, P, 3], kappa [N/m] and dhat [m], [1 | B, 1, P]."""
+        normal, kappa, dhat, _ = self._columns(data)
+        return self._gaps(x, data, origin), normal, kappa, dhat
 
     def value(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         normal, kappa, dhat, damping = self._columns(data)
@@ -237,10 +244,7 @@ class FloorBarrier(VertexEnergy):
     def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         normal, kappa, dhat, damping = self._columns(data)
         gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
-        near = (gap > 0) & (gap < dhat)
-        part = torch.where(near, 1 - dhat / torch.where(near, gap, dhat), 0.0)
-        log = torch.log(torch.where(near, gap, dhat) / dhat)
-        size = h * h * torch.where(near, -kappa * (2 * log + 4 * part - part * part), 0.0)
+        size = h * h * barrier_curvature(gap, kappa, dhat)
         size = size + torch.where(before < dhat, h * damping, 0.0)
         return (size[..., None, None] * normal[..., None] * normal[..., None, :]).sum(2)
 

@@ -1,10 +1,12 @@
-"""Which bodies may touch something in a step: a floor, a collider, another body, themselves."""
+"""Which bodies may touch something in a step that a scheme must not extrapolate: a floor, a collider, another body,
+themselves."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from ..energies import barrier_curvature
 from ..model.model import Model
 from ..reference.distance import EDGE_EDGE
 from .arguments import Prepared
@@ -14,12 +16,15 @@ from .rooms import Motion
 
 MARGIN = 2.0  # of the ways that vertices want to go, which forces within bodies change
 LEAST = 0.25  # of dhat
+# What a step resolves. Of 1,200 impacts none gained energy up to twice and three times these (docs/method.md, 19).
+SLOW = 1.0  # of a gap: ways of its sides
+SOFT = 10.0  # of the mass: h^2 times a barrier's curvature
 
 
 @torch.no_grad()
 def may_touch(model: Model, begun: Begun, prepared: Prepared, where: tuple[Tensor, Tensor] | None) -> Tensor:
     """Whether the body of each vertex may touch something on its way from begun.x_prev to begun.y, bool [B, V]: where a
-    gap is below dhat, or its sides may go that close.
+    gap is below dhat, or its sides may go that close, unless the step resolves the barrier.
 
     Args:
         where: Colliders at the start and at the end of the step [B, Vc, 3] [m], of a Model with contact.
@@ -28,7 +33,7 @@ def may_touch(model: Model, begun: Begun, prepared: Prepared, where: tuple[Tenso
     way = begun.y - begun.x_prev
     near = torch.zeros_like(way[..., 0], dtype=torch.bool)
     if model.floor is not None:
-        near = _near_floor(model, begun, way)
+        near = _near_floor(model, begun, prepared, way)
     if model.contact is not None and where is not None:
         near = near | _near_pairs(model, begun, prepared, way, *where)
     first = model._first_of_body.expand(near.shape)
@@ -36,12 +41,29 @@ def may_touch(model: Model, begun: Begun, prepared: Prepared, where: tuple[Tenso
     return of_body.gather(1, first) > 0
 
 
-def _near_floor(model: Model, begun: Begun, way: Tensor) -> Tensor:
+def _extrapolates(model: Model, prepared: Prepared) -> bool:
+    """Whether contact has forces of gaps alone: those of velocities are measured from the start of a solve."""
+    damped = (f"{e.name}.damping" in prepared.parameters or e.damping > 0 for e in (model.floor, model.contact) if e)
+    return model.friction is None and not any(damped)
+
+
+def _resolved(gap: Tensor, kappa: Tensor, dhat: Tensor, way: Tensor, mass: Tensor, h: float) -> Tensor:
+    """Whether a step of h resolves a barrier, so that its force may be extrapolated: its sides move by less than the
+    gap [m], and its curvature, over masses [kg], vibrates slowly."""
+    slow = way < SLOW * torch.minimum(gap, dhat)
+    return slow & (h * h * barrier_curvature(gap, kappa, dhat) < SOFT * mass)
+
+
+def _near_floor(model: Model, begun: Begun, prepared: Prepared, way: Tensor) -> Tensor:
     assert model.floor is not None
     data = begun.data[:, : model.floor.count()]
-    gap, normal, dhat = model.floor.gaps(begun.x_prev, data, begun.origin)
-    approach = -(normal * way[:, :, None]).sum(-1).clamp(max=0)
-    return (gap - MARGIN * approach < (1 + LEAST) * dhat).any(-1) & ~model._pinned
+    gap, normal, kappa, dhat = model.floor.gaps(begun.x_prev, data, begun.origin)
+    along = (normal * way[:, :, None]).sum(-1)
+    near = gap - MARGIN * (-along).clamp(min=0) < (1 + LEAST) * dhat
+    if _extrapolates(model, prepared):
+        h = prepared.settings.numbers.time_step
+        near = near & ~_resolved(gap, kappa, dhat, along.abs(), prepared.mass[..., None], h)
+    return near.any(-1) & ~model._pinned
 
 
 def _near_pairs(model: Model, begun: Begun, prepared: Prepared, way: Tensor, before: Tensor, after: Tensor) -> Tensor:
@@ -61,6 +83,13 @@ def _near_pairs(model: Model, begun: Begun, prepared: Prepared, way: Tensor, bef
     constants = found.listed.constants
     near = constants[:, -1] - MARGIN * most.sqrt() < (1 + LEAST) * constants[:, 0]
     near = near & (rows < found.listed.ptr[-1] // 4)  # that pairs fill
+    if _extrapolates(model, prepared):
+        # colliders do not give way: their masses count as infinite
+        mass = torch.cat([prepared.mass.expand(way.shape[:2]), torch.full_like(after[..., 0], torch.inf)], 1)
+        lightest = torch.stack([mass[scene, c] for c in corner]).amin(0)
+        kappa, h = step.kappa.expand(way.shape[0])[scene], prepared.settings.numbers.time_step
+        resolved = _resolved(constants[:, -1], kappa, constants[:, 0], most.sqrt(), lightest, h)
+        near = near & ~resolved
     total = ways.shape[0] * ways.shape[1]
     out = near.new_zeros(total + len(kind))
     for c in corner:  # a row that is not near has a place of its own

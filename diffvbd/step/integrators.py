@@ -5,9 +5,9 @@ Every solve is that of implicit Euler, over a time and from a state of its own: 
 reference (r, w), which is extrapolated and may lie inside something. The solve starts at a state x that is feasible,
 with the velocity w + (r - x) / h: its y is that of the reference.
 
-Forces of contact change within a step, and a scheme that extrapolates them gains energy at an impact. So a body that
-may touch something in a step takes implicit Euler for that step (approach.py): in a solve over c h instead of h this is
-the same problem with c^2 times the mass, gravity over c^2 and velocity over c.
+Forces of contact may change within a step, and a scheme that extrapolates them gains energy at an impact. So a body
+that may touch something takes implicit Euler for a step that does not resolve it (approach.py): in a solve over c h
+instead of h this is the same problem with c^2 times the mass, gravity over c^2 and velocity over c.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ class ImplicitEuler:
 class SDIRK2:
     """Two solves over 0.29 of the step each: second order, exact in free fall, L-stable. Twice the work of a step.
 
-    A body that may touch a floor, a collider, another body or itself in a step takes implicit Euler for it.
+    A body that may touch a floor, a collider, another body or itself takes implicit Euler for a step that does not
+    resolve the barrier, and wherever there is friction or damping of contact.
 
     Source: Alexander (1977); docs/method.md, section 19.
     """
@@ -53,8 +54,8 @@ class SDIRK2:
 class BDF2:
     """One solve over 2/3 of the step, from the last two states: second order, exact in free fall, L-stable.
 
-    The first step is one of :class:`SDIRK2`. A body that may touch a floor, a collider, another body or itself in a
-    step takes implicit Euler for it and for the next.
+    The first step is one of :class:`SDIRK2`. A body takes implicit Euler where it does with that, and for the next
+    step.
 
     Source: Curtiss and Hirschfelder (1952); docs/method.md, section 19.
     """

@@ -13,4 +13,4 @@ def test_a_quick_run() -> None:
     for row in results["impacts"]:
         assert row["most gained"] <= tolerance("energy_gain") and 0 < row["left"] < 1 and row["lowest gap [m]"] > 0
     text = integrators.markdown(results)
-    assert text.count("## ") == 2 and "| SDIRK2 |" in text
+    assert text.count("## ") == 3 and "| SDIRK2 |" in text
