@@ -146,7 +146,9 @@ def test_impacts_gain_no_energy(integrator: Any, kind: str, time_step: float) ->
             x, v = dv.step(model, x, v, integrator=integrator, **options)
         lowest = torch.minimum(lowest, (x[..., 1] + 0.3).amin(-1))
         most = torch.maximum(most, (energy_of(model, x, v, 3e4, 3e4) - start) / scale)
-    assert float(most.max()) <= (tolerance("energy_gain") if time_step < 0.005 else 0.02) and float(lowest.min()) > 0
+    # after longer steps a shape may be in the air that a barrier has just pushed there
+    bound = tolerance("energy_gain") if time_step < 0.005 else 0.02
+    assert float(most.max()) <= bound and float(lowest.min()) > 0
     assert float(lowest.median()) < 0.01, "few have landed"
 
 
