@@ -13,6 +13,7 @@ from ..mask import CONTACT
 
 MOST_REACH = 1e6  # [m]; its square must be a number in float32
 LEAST_VELOCITY = 1e-12  # [m/s]; its square times that of a time step must be a number in float32
+FADE = 0.1  # of kappa dhat: the normal force from which a pair has half of its damping; twin in reference/contact.py
 
 
 def _scalars(energy: PairBarrier | Friction, like: Tensor) -> dict[str, Tensor]:
@@ -35,7 +36,9 @@ class PairBarrier:
         dhat: Activation distance [m]. Pairs of one body that are closer at rest use 0.9 of their rest distance.
         self_contact: Pairs within a body.
         between_bodies: Pairs of different bodies. Pairs with colliders always count.
-        damping: Damping of approaching motion of pairs that started the step closer than dhat [N s/m].
+        damping: Damping of approaching motion of pairs that started the step closer than dhat [N s/m]. It fades in with
+            their normal force N there, by N / (N + kappa dhat / 10), lest a motion jump where a pair comes to be that
+            close one step sooner.
         detections: R >= 1: how often pairs are searched within a step. Sweeps, prescribed vertices and moving colliders
             advance in R parts; what pairs have held up tries again in the next part. None: one, and up to
             MOST_DETECTIONS in steps in which bodies want to go farther beside each other than ``reach`` lets them
@@ -121,3 +124,9 @@ class Friction:
 
     def constants(self, like: Tensor) -> dict[str, Tensor]:
         return _scalars(self, like)
+
+
+def damped_share(force: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
+    """What share of its damping a pair has, from 0 to 1, by its normal force at the start of the step [N]."""
+    whole = force + FADE * kappa * dhat
+    return force / whole.clamp(min=torch.finfo(force.dtype).tiny)  # without a barrier there is no damping

@@ -23,6 +23,8 @@ from .rigid_contact import Correction
 from .scene import Scene, build_scene
 from .sweep import check_start, color_masses, predictor, run_sweeps, started
 
+FADE = 0.1  # of kappa dhat: the normal force from which a pair has half of its damping
+
 
 class Part(NamedTuple):
     """One detection and what the part of a step has decided: data without gradient, of B scenes with N corner points,
@@ -146,10 +148,11 @@ class LaggedPairForces:
         # Weights of the first primitive sum to 1, so the gradients w_k n of its corners sum to the normal.
         both = (pairs.kind == EDGE_EDGE)[:, None]
         self.normal = self.slope[:, 0] + torch.where(both, self.slope[:, 1], 0.0)
-        self.near = gap < pairs.dhat
-        self.damping = pairs.per_pair(scene.parameter("pair_barrier", model.contact, "damping"))
         kappa = pairs.per_pair(scene.parameter("pair_barrier", model.contact, "kappa"))
         _, first, _ = log_barrier(gap, kappa, pairs.dhat)
+        force = -e * first
+        share = force / (force + FADE * kappa * pairs.dhat).clamp(min=torch.finfo(force.dtype).tiny)
+        self.damping = share * pairs.per_pair(scene.parameter("pair_barrier", model.contact, "damping"))
         friction = getattr(model, "friction", None)
         self.largest, self.reach = None, 0.0  # mu_f lambda [N], and the slip [m] from which friction is that large
         if friction is not None:
@@ -157,14 +160,13 @@ class LaggedPairForces:
             self.reach = scene.time_step * friction.velocity
 
     def _travel(self, x: Tensor, pair: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Approach n.m [n] where it is damped (else 0), slip u [3, n] and weights [n, 4] of some pairs."""
+        """Approach n.m [n], which is damped (else 0), slip u [3, n] and weights [n, 4] of some pairs."""
         slope, normal = self.slope[pair], self.normal[pair]
         weights = (slope * normal[:, None]).sum(-1)
         moved = self.pairs.positions(corner_points(x, self.colliders) - self.start, pair)
         m = (weights[..., None] * moved).sum(1)
         along = (normal * m).sum(-1)
-        damped = self.near[pair] & (along < 0)
-        return torch.where(damped, along, 0.0), (m - along[:, None] * normal).T, weights
+        return along.clamp(max=0.0), (m - along[:, None] * normal).T, weights
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         pair, local, _, together = self.pairs.entries[k]
@@ -172,7 +174,7 @@ class LaggedPairForces:
         along, slip, weights = self._travel(x, pair)
         own = self.slope[pair, local].T
         rate = self.h * self.damping[pair]
-        columns = torch.cat((rate * along * own, torch.where(self.near[pair], together * rate, 0.0) * outer6(own)))
+        columns = torch.cat((rate * along * own, together * rate * outer6(own)))
         if self.largest is not None:
             weight = weights[entry, local]
             size = self.h**2 * self.largest[pair] * smoothed(slip, self.reach)[1]
@@ -184,11 +186,11 @@ class LaggedPairForces:
 
     def on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """As those of the barrier."""
-        along, slip, weights = self._travel(x, torch.arange(len(self.near), device=x.device))
+        along, slip, weights = self._travel(x, torch.arange(len(self.normal), device=x.device))
         rate, n = self.h * self.damping, self.normal
         outer = n[:, :, None] * n[:, None, :]
         force = (rate * along)[:, None] * n
-        inner = torch.where(self.near, rate, 0.0)[:, None, None] * outer
+        inner = rate[:, None, None] * outer
         if self.largest is not None:
             size = self.h**2 * self.largest * smoothed(slip, self.reach)[1]
             force = force + size[:, None] * slip.T
@@ -197,7 +199,7 @@ class LaggedPairForces:
         return weights[..., None] * force[:, None], weighted
 
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
-        along, slip, _ = self._travel(x, torch.arange(len(self.near), device=x.device))
+        along, slip, _ = self._travel(x, torch.arange(len(self.normal), device=x.device))
         total = self.h * self.damping / 2 * along**2
         if self.largest is not None:
             total = total + self.h**2 * self.largest * smoothed(slip, self.reach)[0]

@@ -15,6 +15,7 @@ from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
 from ..adjoint.rise import rise_parts, rises
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
+from ..contact.barrier import damped_share
 from ..contact.start import PartStart, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
 from ..model.model import Model
@@ -99,6 +100,7 @@ class ContactStep:
             return
         state = pair_lag(self.begun.x_prev, collider, self.kappa, self.origin, listed)
         force, active, rest = state.split((1, 1, 7), -1)
+        dhat = listed.constants[:, :1]
 
         def of_pair(value: Tensor) -> Tensor:
             return broadcast(value[:, None], force.shape) if value.shape[0] == 1 else of_scene(value, listed)[:, None]
@@ -106,7 +108,8 @@ class ContactStep:
         zero = force.new_zeros((1,))
         coefficient = self._parameter("friction.coefficient", zero)
         damping = self._parameter("pair_barrier.damping", zero)
-        lag = torch.cat([of_pair(coefficient) * force, of_pair(damping) * active, rest], -1)
+        share = damped_share(force, of_pair(self.kappa), dhat)
+        lag = torch.cat([of_pair(coefficient) * force, of_pair(damping) * share, rest], -1)
         listed, rows = some_of(listed, (active[:, 0] != 0).contiguous())  # most of what is listed does not touch yet
         lag = torch.where((rows >= 0)[:, None], lag[rows.clamp(min=0)], 0.0) if lag.shape[0] else lag
         self.lagged, self.lag = listed, lag
