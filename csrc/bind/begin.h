@@ -4,8 +4,7 @@
 #include <tuple>
 #include <vector>
 
-#include "../start/begin.h"
-#include "../start/lower.h"
+#include "../start/part.h"
 #include "material.h"
 #include "rigid.h"
 
@@ -14,10 +13,13 @@ namespace diffvbd {
 // Before anything is read of them: the shape of x, and the lists of the other bodies.
 inline void require_states(const BeginFields& f) {
   require_positions(f.x);
-  require(is_index(f.other_ptr, f.x) && is_index(f.other_tet_ptr, f.x) && f.other_ptr.numel() > 0 &&
-              f.other_tet_ptr.numel() == f.other_ptr.numel(),
-          "diffvbd::begin: expected other_ptr and other_tet_ptr int32 [bodies + 1]");
+  const auto agree = [&](const Tensor& ptr, const Tensor& tet_ptr) {
+    return is_index(ptr, f.x) && is_index(tet_ptr, f.x) && ptr.numel() > 0 && tet_ptr.numel() == ptr.numel();
+  };
+  require(agree(f.ptr, f.tet_ptr) && agree(f.other_ptr, f.other_tet_ptr),
+          "diffvbd::begin: expected ptr, tet_ptr, other_ptr and other_tet_ptr int32 [bodies + 1]");
 }
+inline int64_t corrected_bodies(const BeginFields& f) { return f.ptr.numel() - 1; }
 inline int32_t other_bodies(const BeginFields& f) { return static_cast<int32_t>(f.other_ptr.numel() - 1); }
 struct BeginSettings {
   const std::vector<int64_t>& data_count;
@@ -29,7 +31,7 @@ struct BeginSettings {
 // x_start and y: [B, V, 3] that the bodies read and the kernels write.
 template <class T>
 start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, const Tensor& x_start, const Tensor& y,
-                              const Tensor& falls) {
+                              const Tensor& falls, const Tensor& alone) {
   const int32_t others = other_bodies(t);
   start::Inputs<T> in{};
   in.bodies = rigid_inputs<T>({x_start, t.x, y, t.mass, t.energy_data, t.origin, t.order, t.ptr, t.spread, t.other},
@@ -44,11 +46,15 @@ start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, cons
   require(q.from >= start::kInertia && q.from <= start::kLower, "diffvbd::begin: expected start 0, 1 or 2");
   require(q.from != start::kLower || (is_beside(falls, t.x, ScalarType::Byte) && falls.numel() == b * others),
           "diffvbd::begin: expected falls [scenes, bodies]");
+  require(alone.numel() == 0 ||
+              (q.filters && is_beside(alone, t.x, ScalarType::Byte) && alone.numel() == b * corrected_bodies(t)),
+          "diffvbd::begin: expected alone [scenes, bodies] with filters, or empty");
   require(!q.filters || (in.bodies.data_count[0] > 0 &&
                          in.bodies.data_count[0] <= FloorStart::kMostPlanes * FloorBarrier::stride),
           "diffvbd::begin: expected 1 to 8 planes");
   in.pinned = data<const bool>(t.pinned);
   in.falls = data<const uint8_t>(falls);
+  in.alone = alone.numel() > 0 ? data<const uint8_t>(alone) : nullptr;
   in.others = others;
   in.from = static_cast<int>(q.from);
   in.some_alone = t.order.numel() < v;
@@ -58,22 +64,23 @@ start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, cons
   return in;
 }
 
-// x_start: the states from x + h v; from_y: those from y
+// Two states of the bodies that are corrected, or of the others.
 template <class T>
-start::Candidates<T> candidates(const BeginFields& t, const BeginSettings& q, const Tensor& x_start,
-                                const Tensor& from_y, const Tensor& y) {
+start::Candidates<T> candidates(const BeginFields& t, const BeginSettings& q, bool corrected, const Tensor& x_start,
+                                const Tensor& other, const Tensor& y) {
   start::Candidates<T> in{};
-  const RigidFields bodies{x_start,  t.x,           y,           t.mass,   t.energy_data,
-                           t.origin, t.other_order, t.other_ptr, t.spread, t.other};
+  const Tensor &order = corrected ? t.order : t.other_order, &ptr = corrected ? t.ptr : t.other_ptr;
+  const Tensor &listed = corrected ? t.tets : t.other_tets, &tet_ptr = corrected ? t.tet_ptr : t.other_tet_ptr;
+  const RigidFields bodies{x_start, t.x, y, t.mass, t.energy_data, t.origin, order, ptr, t.spread, t.other};
   in.bodies = rigid_inputs<T>(bodies, q.data_count, q.time_step, false);
   const int64_t b = in.bodies.scenes, tets = t.rest.dim() == 3 ? t.rest.size(1) : 0;
-  require(is_index(t.other_tets, t.x) && t.other_tets.dim() == 2 && t.other_tets.size(1) == 5,
-          "diffvbd::begin: expected the tets of the other bodies int32 [listed, 5]");
+  require(is_index(listed, t.x) && listed.dim() == 2 && listed.size(1) == 5,
+          "diffvbd::begin: expected tets and other_tets int32 [listed, 5]");
   require(t.rest.numel() == 0 || (t.rest.dim() == 3 && t.rest.size(2) == kRestScalars),
           "diffvbd::begin: expected rest [scenes, tets, 7], or empty");
-  in.other = data<const T>(from_y);
-  in.tets = data<const int32_t>(t.other_tets);
-  in.tet_ptr = data<const int32_t>(t.other_tet_ptr);
+  in.other = data<const T>(other);
+  in.tets = data<const int32_t>(listed);
+  in.tet_ptr = data<const int32_t>(tet_ptr);
   if (tets > 0) {
     const auto material = material_of(t);
     for (int m = 0; m < kMaterialScalars; ++m) {

@@ -49,12 +49,12 @@
   ADJOINT(lag) INDEX(lag_pairs) INDEX(lag_ptr) INDEX(lag_entry) ADJOINT(floor_lag) INDEX(center) INDEX(room)
 
 // The beginning of a step (start/begin.h): as of the correction, and the other bodies. other [vertices]: which of them
-// a vertex is in, -1: none, -2: it is corrected; other_tets [listed, 5]: a tet and its corners; rest [1 | scenes, tets,
-// kRestScalars], empty where tets have no energy.
+// a vertex is in, -1: none, -2: it is corrected; tets, other_tets [listed, 5]: a tet and its corners; rest [1 | scenes,
+// tets, kRestScalars], empty where tets have no energy.
 #define DIFFVBD_BEGIN_FIELDS(ADJOINT, INDEX) \
   ADJOINT(x) ADJOINT(v) ADJOINT(acceleration) ADJOINT(prescribed) ADJOINT(mass) ADJOINT(energy_data) INDEX(origin) \
   INDEX(mu) INDEX(lam) INDEX(rest) INDEX(pinned) \
-  INDEX(order) INDEX(ptr) INDEX(spread) INDEX(other) \
+  INDEX(order) INDEX(ptr) INDEX(spread) INDEX(tets) INDEX(tet_ptr) INDEX(other) \
   INDEX(other_order) INDEX(other_ptr) INDEX(other_tets) INDEX(other_tet_ptr)
 // clang-format on
 

@@ -108,16 +108,17 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "Tensor p, Tensor q, int[] data_count, float time_step, float friction_eps",
          "Tensor barrier, Tensor by_kappa, Tensor friction, Tensor by_lag, ");
   // Predictor and start of the sweeps. start: of the bodies that are not corrected, 0 x + h v, 1 y, 2 the lower
-  // potential of the two; falls [scenes, other bodies]: 1 where that is y
+  // potential of the two; falls [scenes, other bodies]: 1 where that is y; alone [scenes, bodies]: with parts, 1
+  // where the vertices of a body that is corrected start each by itself
   define(m, "begin", DIFFVBD_ARGUMENTS(BEGIN),
          "int[] groups, int[] other_groups, int[] data_count, float time_step, float filter_eta, int start, bool "
-         "filters",
-         "Tensor x_start, Tensor y, Tensor falls, ");
+         "filters, bool parts",
+         "Tensor x_start, Tensor y, Tensor falls, Tensor alone, ");
   // wants: acceleration, prescribed, energy_data. Of data: from corrections as of rigid_backward(), and of the planes
   // by vertex [scenes, vertices, scalars of the planes]
   define(m, "begin_backward", DIFFVBD_ARGUMENTS(BEGIN),
-         "Tensor x_start_bar, Tensor y_bar, Tensor falls, int[] groups, int[] data_count, float time_step, float "
-         "filter_eta, int start, bool filters, bool[] wants",
+         "Tensor x_start_bar, Tensor y_bar, Tensor falls, Tensor alone, int[] groups, int[] data_count, float "
+         "time_step, float filter_eta, int start, bool filters, bool[] wants",
          "Tensor x, Tensor v, Tensor acceleration, Tensor prescribed, Tensor mass, Tensor shared, Tensor own, Tensor "
          "planes, ");
   // The Cholesky factors (CUDA: inverses) of the matrices of all bodies, one after the other; adjoints of x_prev,

@@ -31,7 +31,7 @@ struct Choose {
   uint8_t* falls;
   template <class Team>
   __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration*) const {
-    const double rise = start::rise(two, body, team);
+    const double rise = start::way_between(two, body, team).rise;
     if (team.leads()) falls[body.scene * two.bodies.bodies + body.body] = rise <= 0;
   }
 };
@@ -40,9 +40,22 @@ struct Begin {
   static constexpr bool keeps_record = false, computes = energies;
   start::Inputs<T> in;
   T *x_start, *y;
+  uint8_t* held;
   template <class Team>
   __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration*) const {
-    start::begin_body<energies>(in, body, team, x_start, y);
+    start::begin_body<energies>(in, body, team, x_start, y, held);
+  }
+};
+template <class T>
+struct Part {
+  static constexpr bool keeps_record = false, computes = true;
+  start::Inputs<T> in;
+  start::Candidates<T> two;
+  T *x_start, *apart;
+  uint8_t* alone;
+  template <class Team>
+  __device__ void operator()(const rigid::Body<T>& body, const Team& team, rigid::Iteration*) const {
+    start::part_body(in, two, body, team, x_start, apart, alone);
   }
 };
 template <class T, bool energies>
@@ -60,21 +73,28 @@ struct ReverseBegin {
 }  // namespace
 
 template <class T>
-cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const start::Candidates<T>* two,
-                  const BodyGroups& two_groups, T* x_start, T* from_y, T* y, uint8_t* falls, double* workspace,
+cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const Choice<T>& of_corrected,
+                  const BodyGroups& other_groups, const Choice<T>& of_others, T* x_start, T* y, double* workspace,
                   cudaStream_t stream) {
   if (in.bodies.scenes * in.bodies.vertices == 0) return cudaSuccess;
   if (in.some_alone) {
-    T* second = two != nullptr && from_y != y ? from_y : nullptr;
+    T* second = of_others.two != nullptr && of_others.second != y ? of_others.second : nullptr;
     begin_vertices<T><<<blocks_of(in.bodies), kVertexThreads, 0, stream>>>(in, x_start, second, y);
   }
-  if (two != nullptr) {
-    const auto error = run_bodies(two->bodies, two_groups, Choose<T>{*two, falls}, workspace, stream);
+  if (of_others.two != nullptr) {
+    const Choose<T> act{*of_others.two, of_others.taken};
+    const auto error = run_bodies(act.two.bodies, other_groups, act, workspace, stream);
     if (error != cudaSuccess) return error;
-    choose_vertices<T><<<blocks_of(in.bodies), kVertexThreads, 0, stream>>>(in, x_start, from_y);
+    choose_vertices<T><<<blocks_of(in.bodies), kVertexThreads, 0, stream>>>(in, x_start, of_others.second);
   }
-  if (in.bodies.data.data) return run_bodies(in.bodies, groups, Begin<T, true>{in, x_start, y}, workspace, stream);
-  return run_bodies(in.bodies, groups, Begin<T, false>{in, x_start, y}, workspace, stream);
+  if (in.bodies.data.data == nullptr) {
+    return run_bodies(in.bodies, groups, Begin<T, false>{in, x_start, y, nullptr}, workspace, stream);
+  }
+  uint8_t* held = of_corrected.two != nullptr ? of_corrected.taken : nullptr;
+  const auto error = run_bodies(in.bodies, groups, Begin<T, true>{in, x_start, y, held}, workspace, stream);
+  if (error != cudaSuccess || of_corrected.two == nullptr) return error;
+  const Part<T> act{in, *of_corrected.two, x_start, of_corrected.second, of_corrected.taken};
+  return run_bodies(act.two.bodies, groups, act, workspace, stream);
 }
 
 template <class T>
@@ -89,8 +109,8 @@ cudaError_t begin_backward(const start::Inputs<T>& in, const BodyGroups& groups,
 }
 
 #define DIFFVBD_INSTANTIATE(T)                                                                                      \
-  template cudaError_t begin<T>(const start::Inputs<T>&, const BodyGroups&, const start::Candidates<T>*,            \
-                                const BodyGroups&, T*, T*, T*, uint8_t*, double*, cudaStream_t);                    \
+  template cudaError_t begin<T>(const start::Inputs<T>&, const BodyGroups&, const Choice<T>&, const BodyGroups&,    \
+                                const Choice<T>&, T*, T*, double*, cudaStream_t);                                   \
   template cudaError_t begin_backward<T>(const start::Inputs<T>&, const BodyGroups&, const start::Adjoints<T>&, T*, \
                                          T*, double*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)

@@ -3,16 +3,22 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../start/begin.h"
-#include "../start/lower.h"
+#include "../start/part.h"
 #include "bodies.h"
 
 namespace diffvbd::cuda {
 
-// `two`: the bodies whose start is chosen, or null; falls receives the choice. from_y: where they start from y.
+// Bodies whose start is chosen, null for none; their second state; and what receives whether they take it.
 template <class T>
-cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const start::Candidates<T>* two,
-                  const BodyGroups& two_groups, T* x_start, T* from_y, T* y, uint8_t* falls, double* workspace,
+struct Choice {
+  const start::Candidates<T>* two;
+  T* second;
+  uint8_t* taken;
+};
+
+template <class T>
+cudaError_t begin(const start::Inputs<T>& in, const BodyGroups& groups, const Choice<T>& of_corrected,
+                  const BodyGroups& other_groups, const Choice<T>& of_others, T* x_start, T* y, double* workspace,
                   cudaStream_t stream);
 template <class T>
 cudaError_t begin_backward(const start::Inputs<T>& in, const BodyGroups& groups, const start::Adjoints<T>& a,

@@ -1,6 +1,7 @@
 // Where a step begins: the predictor y = x + h v + h^2 a, and where the sweeps start. The vertices of a body that is
 // corrected coast together, x + s h v with one share s, as far as planes let them, and are corrected; every other
-// vertex goes toward x + h v or y as far as planes let it alone (docs/method.md, sections 6 and 14). With the adjoint.
+// vertex, and in short steps those of a body that planes hold back (part.h), goes toward x + h v or y as far as planes
+// let it alone (docs/method.md, sections 6 and 14). With the adjoint.
 #pragma once
 
 #include "../energies/floor_start.h"
@@ -20,6 +21,7 @@ struct Inputs {
       prescribed;        // [B, V, 3]; acceleration also [B, 1, 3] (item 0); prescribed may be null
   const bool* pinned;    // [V]
   const uint8_t* falls;  // [B, others]  with kLower: whether a body starts from y
+  const uint8_t* alone;  // [B, bodies]  whether the vertices of a corrected body start each by itself; null: none
   int32_t others;
   int from;
   bool some_alone;  // whether some vertices are in no body that is corrected
@@ -98,9 +100,9 @@ DIFFVBD_FN Vec3<T> vector_of(const T* p, int64_t row) {
   return {p[3 * row], p[3 * row + 1], p[3 * row + 2]};
 }
 
+// A vertex that goes alone, to y or to x + h v.
 template <class T>
-DIFFVBD_FN void reverse_vertex(const Inputs<T>& in, const Adjoints<T>& a, int64_t scene, int32_t v) {
-  if (in.bodies.other[v] == kCorrected) return;
+DIFFVBD_FN void reverse_alone(const Inputs<T>& in, const Adjoints<T>& a, int64_t scene, int32_t v, bool from_y) {
   const int64_t row = in.row(scene, v);
   const auto store = [&](T* to, const Vec3<T>& value) {
     if (to) to[3 * row] = value.x, to[3 * row + 1] = value.y, to[3 * row + 2] = value.z;
@@ -114,7 +116,6 @@ DIFFVBD_FN void reverse_vertex(const Inputs<T>& in, const Adjoints<T>& a, int64_
     return;
   }
   const double h = in.bodies.time_step;
-  const bool from_y = in.starts_from_y(scene, v);
   Vec3<T> goal_bar = start_bar, x_bar = start_bar + y_bar;
   if (in.filters) {
     const Motion<T> m(in, scene, v);
@@ -126,6 +127,10 @@ DIFFVBD_FN void reverse_vertex(const Inputs<T>& in, const Adjoints<T>& a, int64_
   store(a.prescribed, none);
   store(a.v, T(h) * (goal_bar + y_bar));
   store(a.acceleration, T(h * h) * (from_y ? goal_bar + y_bar : y_bar));
+}
+template <class T>
+DIFFVBD_FN void reverse_vertex(const Inputs<T>& in, const Adjoints<T>& a, int64_t scene, int32_t v) {
+  if (in.bodies.other[v] != kCorrected) reverse_alone(in, a, scene, v, in.starts_from_y(scene, v));
 }
 
 // What planes leave of the share 1 of h v that a vertex of a body coasts.
@@ -201,9 +206,11 @@ DIFFVBD_FN double coast(const Inputs<T>& in, const Body<T>& b, const Team& team,
   return share;
 }
 
+// held, if not null, receives whether planes hold the body back.
 template <bool energies, class T, class Team>
-DIFFVBD_FN void begin_body(const Inputs<T>& in, const Body<T>& b, const Team& team, T* x_start, T* y) {
-  coast<energies>(in, b, team, x_start, y);
+DIFFVBD_FN void begin_body(const Inputs<T>& in, const Body<T>& b, const Team& team, T* x_start, T* y, uint8_t* held) {
+  const double share = coast<energies>(in, b, team, x_start, y);
+  if (held != nullptr && team.leads()) held[b.scene * in.bodies.bodies + b.body] = share < 1;
   rigid::correct<energies>(b, team, nullptr, x_start);
 }
 
@@ -243,10 +250,18 @@ DIFFVBD_FN void reverse_share(const Inputs<T>& in, const Body<T>& b, const Team&
   });
 }
 
-// Transpose of begin_body(). x and y, [B, V, 3], receive what b reads; a.v holds what the correction sends to y first.
+// Transpose of begin_body() and part_body(). x and y, [B, V, 3], receive what b reads; a.v holds what the correction
+// sends to y first.
 template <bool energies, class T, class Team>
 DIFFVBD_FN void reverse_body(const Inputs<T>& in, const Body<T>& b, const Team& team, rigid::Iteration* record, T* x,
                              T* y, const Adjoints<T>& a) {
+  if (in.alone != nullptr && in.alone[b.scene * in.bodies.bodies + b.body] != 0) {
+    team.each(b.size(), [&](int32_t i) {
+      reverse_alone(in, a, b.scene, b.vertex(i), true);
+      a.mass[b.row(b.vertex(i))] = T(0);
+    });
+    return;
+  }
   const double share = coast<energies>(in, b, team, x, y), h = in.bodies.time_step;
   rigid::reverse<energies>(b, team, record,
                            {a.x_start, nullptr, a.x, energies ? a.x_prev : nullptr, a.v, a.mass, a.shared, a.own,

@@ -13,9 +13,19 @@ struct Candidates {
   Batched<const T> material[kMaterialScalars], rest;  // [B, T] or [B, 1] each, [B, T, kRestScalars]; null: no tets
 };
 
-// By how much the potential of `other` lies above that of x.
+// From which ratio of Way on tets resist. Each corner has all of its mass in each of its tets, some 24, so that this is
+// where h^2 times the stiffness of a layer of vertices is half of their mass.
+constexpr double kSoft = 0.02;
+
+// What happens to a body on the straight way d from x to `other`.
+struct Way {
+  double rise;   // of the potential
+  double ratio;  // h^2 d . K d over the d . M d of its corners, of each tet; their mean, weighted by d . K d
+  // Whether tets hardly turn vertices back within a step. Over the whole body d . M d would hide a few that do.
+  DIFFVBD_FN bool is_soft() const { return ratio < kSoft; }
+};
 template <class T, class Team>
-DIFFVBD_FN double rise(const Candidates<T>& in, const rigid::Body<T>& b, const Team& team) {
+DIFFVBD_FN Way way_between(const Candidates<T>& in, const rigid::Body<T>& b, const Team& team) {
   const auto other = [&](int32_t v) { return rigid::Body<T>::at(in.other + 3 * b.row(v)); };
   double vertices[1];
   team.template sum<1>(b.size(), vertices, [&](int32_t i, double* to) {
@@ -28,13 +38,13 @@ DIFFVBD_FN double rise(const Candidates<T>& in, const rigid::Body<T>& b, const T
       to[0] += E::value(b.state(v, two), data, count) - E::value(b.state(v, one), data, count);
     });
   });
-  if (in.rest.data == nullptr) return vertices[0];
-  double tets[1];
+  if (in.rest.data == nullptr) return {vertices[0], 0};
+  double tets[3];  // rise, size of bends, what their ratios weigh
   const int32_t first = in.tet_ptr[b.body];
-  team.template sum<1>(in.tet_ptr[b.body + 1] - first, tets, [&](int32_t i, double* to) {
+  team.template sum<3>(in.tet_ptr[b.body + 1] - first, tets, [&](int32_t i, double* to) {
     const int32_t* tet = in.tets + 5 * int64_t{first + i};
-    rigid::Vector one[4], two[4];
-    for (int c = 0; c < 4; ++c) one[c] = b.position(tet[1 + c]), two[c] = other(tet[1 + c]);
+    rigid::Vector one[4], way[4];
+    for (int c = 0; c < 4; ++c) one[c] = b.position(tet[1 + c]), way[c] = other(tet[1 + c]) - one[c];
     double rest[kRestScalars], material[kTetScalars];
     const T* of_tet = in.rest.data + b.scene * in.rest.scene + kRestScalars * int64_t{tet[0]};
     for (int c = 0; c < kRestScalars; ++c) rest[c] = of_tet[c];
@@ -48,9 +58,16 @@ DIFFVBD_FN double rise(const Candidates<T>& in, const rigid::Body<T>& b, const T
         at[0] = before.x, at[1] = before.y, at[2] = before.z;
       }
     }
-    to[0] += TetLaw::value(two, rest, material) - TetLaw::value(one, rest, material);
+    double rise[TetLayout::line_degree]{};
+    TetLaw::line(one, way, rest, material, rise);
+    double bend = 0, inertia = 0;  // half of d . K d, K averaged over the way: what the energy rises beyond its slope
+    for (int k = 1; k < TetLayout::line_degree; ++k) bend += rise[k];
+    for (int c = 0; c < 4; ++c) inertia += b.mass(tet[1 + c]) * dot(way[c], way[c]);
+    to[0] += rise[0] + bend;
+    if (inertia > 0) to[1] += std::abs(bend), to[2] += bend * bend / inertia;
   });
-  return vertices[0] + b.in.time_step * b.in.time_step * tets[0];
+  const double h2 = b.in.time_step * b.in.time_step;
+  return {vertices[0] + h2 * tets[0], tets[1] > 0 ? 2 * h2 * tets[2] / tets[1] : 0};
 }
 
 }  // namespace diffvbd::start

@@ -19,6 +19,8 @@ class Bodies(NamedTuple):
     order: Tensor  # int32 [listed], their vertices
     ptr: Tensor  # int32 [bodies + 1]
     spread: Tensor  # float64 [bodies], squared radius of gyration at rest [m^2]
+    tets: Tensor  # as of OtherBodies; none without a floor, on which alone a start asks for them
+    tet_ptr: Tensor
     groups: Groups
 
     @property
@@ -26,8 +28,8 @@ class Bodies(NamedTuple):
         return self.ptr.shape[0] - 1
 
     def to(self, device: torch.device) -> Bodies:
-        order, ptr, spread = (t.to(device) for t in self[:3])
-        return Bodies(order, ptr, spread, self.groups)
+        order, ptr, spread, tets, tet_ptr = (t.to(device) for t in self[:5])
+        return Bodies(order, ptr, spread, tets, tet_ptr, self.groups)
 
 
 class OtherBodies(NamedTuple):
@@ -71,10 +73,10 @@ def connected(tets: Tensor, count: int) -> Tensor:
         label = new
 
 
-def find_bodies(points: Tensor, tets: Tensor, pinned: Tensor, correct: bool) -> tuple[Bodies, OtherBodies]:
+def find_bodies(points: Tensor, tets: Tensor, pinned: Tensor, correct: bool, floor: bool) -> tuple[Bodies, OtherBodies]:
     """Connected sets of tets: those without a pinned vertex, if they are to be corrected, and the others.
 
-    points [V, 3], tets int64 [T, 4], pinned bool [V]; all on the CPU.
+    points [V, 3], tets int64 [T, 4], pinned bool [V]; all on the CPU. floor: whether there are planes.
     """
     label = connected(tets, points.shape[0])
     count = len(label)
@@ -89,18 +91,19 @@ def find_bodies(points: Tensor, tets: Tensor, pinned: Tensor, correct: bool) -> 
     square = (points[free.order] - center[of_row]).square().sum(-1)
     spread = points.new_zeros(len(size)).index_add_(0, of_row, square) / size[:, 0]
 
-    of_tet = other.of[tets[:, 0]] if len(tets) else other.of[:0]
-    listed = (of_tet >= 0).nonzero().reshape(-1)
-    listed = listed[torch.argsort(of_tet[listed], stable=True)]
-    tet_ptr = _starts(torch.bincount(of_tet[listed], minlength=len(other.ptr) - 1))
     return (
-        Bodies(free.order.int(), free.ptr.int(), spread.double(), free.groups),
+        Bodies(
+            free.order.int(),
+            free.ptr.int(),
+            spread.double(),
+            *_tets_of(free, tets if floor else tets[:0]),
+            free.groups,
+        ),
         OtherBodies(
             torch.where(free.of >= 0, CORRECTED, other.of).int(),
             other.order.int(),
             other.ptr.int(),
-            torch.cat([listed[:, None], tets[listed]], 1).int(),
-            tet_ptr.int(),
+            *_tets_of(other, tets),
             other.groups,
         ),
     )
@@ -112,6 +115,15 @@ def first_of_body(body: Tensor) -> Tensor:
     order = torch.arange(body.shape[0])
     first = torch.full((labels.shape[0],), body.shape[0]).scatter_reduce(0, inverse, order, "amin")
     return first[inverse]
+
+
+def _tets_of(bodies: _Grouped, tets: Tensor) -> tuple[Tensor, Tensor]:
+    """The tets of bodies [listed, 5] as OtherBodies has them, and where those of each begin."""
+    of_tet = bodies.of[tets[:, 0]] if len(tets) else bodies.of[:0]
+    listed = (of_tet >= 0).nonzero().reshape(-1)
+    listed = listed[torch.argsort(of_tet[listed], stable=True)]
+    tet_ptr = _starts(torch.bincount(of_tet[listed], minlength=len(bodies.ptr) - 1))
+    return torch.cat([listed[:, None], tets[listed]], 1).int(), tet_ptr.int()
 
 
 def _starts(sizes: Tensor) -> Tensor:

@@ -133,7 +133,7 @@ class Model:
         self._pinned = mask
         body = torch.from_numpy(mesh.body.copy())
         self._first_of_body = first_of_body(body)
-        self._bodies, self._other_bodies = find_bodies(points, tets, mask, self.rigid)
+        self._bodies, self._other_bodies = find_bodies(points, tets, mask, self.rigid, self.floor is not None)
         self.surface_of_contact = self._build_surface(check_colliders(colliders))
         device = checked_device(device)
         self._arrange(points, tets, device)

@@ -17,16 +17,19 @@ _FIELDS = len(BeginFields._fields)
 @shapes_of("begin")
 def _(*arguments):
     f = BeginFields(*arguments[:_FIELDS])
-    *_, start, _ = arguments[_FIELDS:]
-    scenes = f.x.shape[0] if start == STARTS["auto"] else 0
-    falls = f.x.new_empty((scenes, f.other_ptr.shape[0] - 1), dtype=torch.uint8)
-    return torch.empty_like(f.x), torch.empty_like(f.x), falls
+    *_, start, _, parts = arguments[_FIELDS:]
+
+    def decisions(made, ptr):
+        return f.x.new_empty((f.x.shape[0] if made else 0, ptr.shape[0] - 1), dtype=torch.uint8)
+
+    falls, alone = decisions(start == STARTS["auto"], f.other_ptr), decisions(parts, f.ptr)
+    return torch.empty_like(f.x), torch.empty_like(f.x), falls, alone
 
 
 @shapes_of("begin_backward")
 def _(*arguments):
     f = BeginFields(*arguments[:_FIELDS])
-    _, _, _, _, data_count, _, _, _, filters, wants = arguments[_FIELDS:]
+    _, _, _, _, _, data_count, _, _, _, filters, wants = arguments[_FIELDS:]
     x, (b, v) = f.x, f.x.shape[:2]
     shared, own = scalars_of_data(data_count)
 

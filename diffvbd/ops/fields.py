@@ -166,6 +166,8 @@ class BeginFields(NamedTuple):
     order: Tensor
     ptr: Tensor
     spread: Tensor
+    tets: Tensor  # of model.bodies.Bodies, as is the next one
+    tet_ptr: Tensor
     other: Tensor
     other_order: Tensor  # of model.bodies.OtherBodies, as are the next three
     other_ptr: Tensor

@@ -73,11 +73,15 @@ class StableNeoHookean:
         norm = dot(f[0], f[0]) + dot(f[1], f[1]) + dot(f[2], f[2])
         return norm, dot(f[0], cross(f[1], f[2])) - 1
 
-    def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+    def of_tets(self, x: Tensor) -> Tensor:
+        """The energy of each tet, h^2-scaled, [..., T]."""
         s = self.scene
         norm, strain = self._measures(x)
         psi = s.mu * ((norm - 3) / 2 - strain) + (s.mu + s.lam) / 2 * strain**2
-        return s.time_step**2 * (s.volume * psi).sum(-1)
+        return s.time_step**2 * (s.volume * psi)
+
+    def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
+        return self.of_tets(x).sum(-1)
 
     def terms(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
         s = self.scene

@@ -61,8 +61,9 @@ class Correction:
             x = self._corrected(body, x, y, x_prev)
         return x
 
-    def coasted(self, x: Tensor, goal: Tensor) -> Tensor:
-        """The vertices of one body on the way from x to goal [..., 3, n], as far as all of them may go together."""
+    def coasted(self, x: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """The vertices of one body on the way from x to goal [..., 3, n], as far as all of them may go together; and
+        the share of it that this is [...]."""
         step = goal - x
         share, good = torch.ones_like(x[..., :1, :1]), torch.ones_like(x[..., :1, :1], dtype=torch.bool)
         floors = [e for e in self.energies if hasattr(e, "gap")]
@@ -76,7 +77,8 @@ class Correction:
         for energy in floors:
             moved = (x + share * step).detach()
             good = good & clear(energy, moved).all((-2, -1))[..., None, None]
-        return x + torch.where(good, share, 0.0) * step
+        share = torch.where(good, share, 0.0)
+        return x + share * step, share.detach()[..., 0, 0]
 
     def _load(self, state: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient [..., 3, V] and block [..., V, 3, 3] of the vertex energies."""

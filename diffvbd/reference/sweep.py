@@ -8,13 +8,14 @@ from torch import Tensor
 
 from .anderson import Anderson
 from .coarse import REFUSALS, Coarse
-from .energies import build_energies
+from .energies import StableNeoHookean, build_energies
 from .friction import floor_friction
 from .layout import Layout, build_layout, dot, put, solve6, take
 from .rigid import Correction
 from .scene import Scene, build_scene
 
 SATURATION_EPS = 1e-12  # [m] keeps s finite at a zero step
+SOFT = 0.02  # h^2 times a tet's stiffness over the mass of its corners, below which it hardly acts within a step
 
 
 class Trajectory(NamedTuple):
@@ -148,9 +149,13 @@ def stepper(
         begun = _start(scene, energies, x_prev, coasting if model.starts_from == "inertia" else y)
         if model.starts_from == "auto":
             begun = _lower(scene, energies, begun, _start(scene, energies, x_prev, coasting), y, x_prev, correct.others)
+        held = []
         for body in correct.bodies:
-            begun = put(begun, body, correct.coasted(take(x_prev, body), take(coasting, body)))
+            coasted, share = correct.coasted(take(x_prev, body), take(coasting, body))
+            begun, held = put(begun, body, coasted), [*held, share < 1]
         state = correct(begun, y, x_prev)
+        if sweeps * min(model.relaxation, 1.0) >= 1 and any(bool(h.any()) for h in held):
+            state = _apart(scene, energies, state, _start(scene, energies, x_prev, y), y, x_prev, correct.bodies, held)
 
         def swept(state: Tensor, count: int, ends: bool) -> Tensor:
             usual = max(count - 1, 0) if ends else count
@@ -246,18 +251,43 @@ def _lower(scene: Scene, energies: list[Any], one: Tensor, two: Tensor, y: Tenso
            ) -> Tensor:  # fmt: skip
     """Of two states the one that has, for each body, the lower incremental potential; the first where they are equal.
     Bodies do not see each other, so the whole scene's potential with one body exchanged decides."""
+    out = one
+    for body in bodies:
+        with torch.no_grad():
+            lower = _rise(scene, energies, one, put(one, body, take(two, body)), y, x_prev) < 0
+        out = torch.where(lower[..., None, None], put(out, body, take(two, body)), out)
+    return out
+
+
+def _apart(scene: Scene, energies: list[Any], one: Tensor, two: Tensor, y: Tensor, x_prev: Tensor,
+           bodies: list[Tensor], held: list[Tensor]) -> Tensor:  # fmt: skip
+    """Two for each body that planes hold back, is soft within a step and has the lower potential there, else one."""
+    elastic, out = [energy for energy in energies if isinstance(energy, StableNeoHookean)], one
+    for body, back in zip(bodies, held, strict=True):
+        with torch.no_grad():
+            exchanged = put(one, body, take(two, body))
+            way, none = exchanged - one, torch.zeros_like(one[..., 0, 0])
+            square = scene.mass * (way**2).sum(-2)
+            inertia = torch.stack([square[..., corner] for corner in scene.layout.tets]).sum(0)
+            size = weighed = none
+            for energy in elastic:
+                line = torch.func.jvp(energy.of_tets, (one.detach(),), (way,))  # the energy at one, and its slope
+                bend = 2 * (energy.of_tets(exchanged) - line[0] - line[1])  # d . K d, K averaged over the way
+                size = size + bend.abs().sum(-1)
+                weighed = weighed + torch.where(inertia > 0, bend**2 / inertia, 0.0).sum(-1)
+            parts = back & (weighed <= SOFT * size) & (_rise(scene, energies, one, exchanged, y, x_prev) < 0)
+        out = torch.where(parts[..., None, None], put(out, body, take(two, body)), out)
+    return out
+
+
+def _rise(scene: Scene, energies: list[Any], one: Tensor, two: Tensor, y: Tensor, x_prev: Tensor) -> Tensor:
+    """By how much the incremental potential of the state two lies above that of one, [...]."""
 
     def potential(x: Tensor) -> Tensor:
         total = (scene.mass / 2 * ((x - y) ** 2).sum(-2)).sum(-1)
         return total + sum(energy.energy(x, x_prev) for energy in energies)
 
-    out = one
-    for body in bodies:
-        with torch.no_grad():
-            exchanged = put(one, body, take(two, body))
-            lower = potential(exchanged) < potential(one)
-        out = torch.where(lower[..., None, None], put(out, body, take(two, body)), out)
-    return out
+    return potential(two) - potential(one)
 
 
 def started(energies: list[Any], x: Tensor, step: Tensor) -> Tensor:

@@ -102,12 +102,16 @@ def begin(
         prescribed = ops.broadcast(broadcastable("prescribed", prescribed, x), shape).reshape(flat)
         prescribed = prescribed if origin is None else prescribed - origin
     data = energy_data(model, prepared, origin)
+    filters = model.floor is not None and model.contact is None
+    # half a sweep would not bring the vertices of a body together again
+    sweeps = prepared.settings.sweeps * min(model.relaxation, 1.0)
+    parts = filters and model.corrects and sweeps >= 1
     rest = None
-    if model.starts_from == "auto" and model.energy_mask & ELASTIC:
+    if (model.starts_from == "auto" or parts) and model.energy_mask & ELASTIC:
         rest = model.rest_scalars if prepared.rest is None else prepared.rest
     x_start, y = start_of(
         start, velocity, acceleration, prescribed, prepared.mass, data, origin, prepared.mu, prepared.lam, rest,
         model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
-        start=model.starts_from, filters=model.floor is not None and model.contact is None,
+        start=model.starts_from, filters=filters, parts=parts,
     )  # fmt: skip
     return Begun(x_start, start, y, data, origin, (h * h) * acceleration)

@@ -109,8 +109,8 @@ def correct(
     """Positions after every listed body was moved rigidly to the least potential, and the velocities (x - x_prev) / h,
     [B, V, 3]; differentiable in the first five tensors, whose shapes are those of ops.SweepFields."""
     tensors = distinct(x, x_prev, y, mass, energy_data, origin)
-    *listed, groups = bodies
-    return _Correct.apply(*tensors, *listed, others.of, groups, data_count, time_step)
+    listed = (bodies.order, bodies.ptr, bodies.spread, others.of)
+    return _Correct.apply(*tensors, *listed, bodies.groups, data_count, time_step)
 
 
 ops.ready_signature(_Correct, _CorrectBackward)

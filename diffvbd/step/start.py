@@ -1,9 +1,10 @@
 """Where a step begins: the predictor y = x + h v + h^2 a, and where its sweeps start.
 
 A body that is corrected coasts: x + s h v with one share s for all its vertices, as far as planes let it, and is
-corrected there (rigid.py). Any other body starts from y or from x + h v, every vertex as far as planes let it. Few
-sweeps hardly move a stiff body away from its start, so "auto" takes, for each body and step, the one of lower
-incremental potential: y where a body is soft or flies, x + h v where its pins carry it. docs/method.md, sections 6, 14.
+corrected there (rigid.py). Where planes hold it back and steps are short, its vertices go each by itself instead. Any
+other body starts from y or from x + h v, every vertex as far as planes let it. Few sweeps hardly move a stiff body away
+from its start, so "auto" takes, for each body and step, the one of lower incremental potential: y where a body is soft
+or flies, x + h v where its pins carry it. docs/method.md, sections 6, 14.
 """
 
 # pyright: reportIncompatibleMethodOverride=false
@@ -32,19 +33,20 @@ _FIELDS = len(ops.BeginFields._fields)
 class _Begin(Function):
     @staticmethod
     def forward(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest, pinned, order, ptr, spread,
-                other, other_order, other_ptr, other_tets, other_tet_ptr, groups, other_groups, options):  # fmt: skip
+                tets, tet_ptr, other, other_order, other_ptr, other_tets, other_tet_ptr, groups, other_groups,
+                options):  # fmt: skip
         # torch.compile counts these arguments: *args would get the context as well
         fields = ops.BeginFields(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest, pinned,
-                                 order, ptr, spread, other, other_order, other_ptr, other_tets,
+                                 order, ptr, spread, tets, tet_ptr, other, other_order, other_ptr, other_tets,
                                  other_tet_ptr)  # fmt: skip
         return ops.raw.begin(*ops.as_list(fields, x), groups, other_groups, *options)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor]) -> None:
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
         read = replaced(ops.BeginFields(*inputs[:_FIELDS]), mu=None, lam=None, rest=None)  # by the backward
-        ctx.save_for_backward(output[2], *read)
-        ctx.options = (inputs[_FIELDS], *inputs[-1])
-        ctx.mark_non_differentiable(output[2])
+        ctx.save_for_backward(*output[2:], *read)
+        ctx.options = (inputs[_FIELDS], *inputs[-1][:-1])  # `parts` shows in what was decided
+        ctx.mark_non_differentiable(*output[2:])
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:
@@ -54,23 +56,23 @@ class _Begin(Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        tensors, scenes = folded(info.batch_size, args[:_SCENES], in_dims, 2)
-        x_start, y, falls = _Begin.apply(*tensors, *args[_SCENES:])
-        shape = (info.batch_size, falls.shape[0] // info.batch_size)
-        return (x_start.unflatten(0, (-1, scenes)), y.unflatten(0, (-1, scenes)), falls.unflatten(0, shape)), (0, 0, 0)
+        tensors, _ = folded(info.batch_size, args[:_SCENES], in_dims, 2)
+        out = _Begin.apply(*tensors, *args[_SCENES:])
+        shapes = [(info.batch_size, t.shape[0] // info.batch_size) for t in out]  # decisions may have no scene
+        return tuple(t.unflatten(0, shape) for t, shape in zip(out, shapes, strict=True)), (0,) * len(out)
 
 
 class _BeginBackward(Function):
     @staticmethod
-    def forward(x_start_bar, y_bar, falls, x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest,
-                pinned, order, ptr, spread, other, other_order, other_ptr, other_tets, other_tet_ptr, options,
-                needs):  # fmt: skip
+    def forward(x_start_bar, y_bar, falls, alone, x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam,
+                rest, pinned, order, ptr, spread, tets, tet_ptr, other, other_order, other_ptr, other_tets,
+                other_tet_ptr, options, needs):  # fmt: skip
         fields = ops.BeginFields(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest, pinned,
-                                 order, ptr, spread, other, other_order, other_ptr, other_tets,
+                                 order, ptr, spread, tets, tet_ptr, other, other_order, other_ptr, other_tets,
                                  other_tet_ptr)  # fmt: skip
         wants = (needs[2], needs[3], needs[5])
         *bars, shared, own, planes = ops.raw.begin_backward(
-            *ops.as_list(fields, x), x_start_bar.contiguous(), y_bar.contiguous(), falls, *options, wants
+            *ops.as_list(fields, x), x_start_bar.contiguous(), y_bar.contiguous(), falls, alone, *options, wants
         )
         data_out = energy_data
         if needs[5]:
@@ -99,7 +101,7 @@ class _BeginBackward(Function):
 def begin(
     x: Tensor, v: Tensor, acceleration: Tensor, prescribed: Tensor | None, mass: Tensor, energy_data: Tensor,
     origin: Tensor | None, mu: Tensor, lam: Tensor, rest: Tensor | None, pinned: Tensor, bodies: Bodies,
-    others: OtherBodies, data_count: tuple[int, ...], time_step: float, *, start: str, filters: bool,
+    others: OtherBodies, data_count: tuple[int, ...], time_step: float, *, start: str, filters: bool, parts: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Where the sweeps start and the predictor [m], both [B, V, 3]; differentiable in the first six tensors.
 
@@ -107,15 +109,16 @@ def begin(
         x, v: State [m, m/s], [B, V, 3].  acceleration: [1 | B, 1 | V, 3] [m/s^2].
         prescribed: Where pinned vertices go [m], [1 | B, V, 3]; None: they stay.
         mass, energy_data, origin, mu, lam: As in ops.SweepFields.  pinned: bool [V].
-        rest: [1 | B, T, 7], or None where tets have no energy; like mu and lam looked at by "auto" only.
+        rest: [1 | B, T, 7], or None where tets have no energy; like mu and lam looked at by choices alone.
         start: "auto", "predictor" or "inertia", of the bodies that are not corrected.
         filters: Whether the planes of a floor hold back a start.
+        parts: Whether bodies that are held back may start vertex by vertex, for which there must be filters.
     """
     tensors = distinct(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest)
     *listed, groups = bodies
     *listed_others, other_groups = others
     options = (data_count, time_step, FILTER_ETA, STARTS[start], filters)
-    x_start, y, _ = _Begin.apply(*tensors, pinned, *listed, *listed_others, groups, other_groups, options)
+    x_start, y, *_ = _Begin.apply(*tensors, pinned, *listed, *listed_others, groups, other_groups, (*options, parts))
     return x_start, y
 
 

@@ -38,15 +38,15 @@ UNREAD = {
     "sweep_backward": {"x_start"},
     "begin": {"order", "other_order"},
     "contact_keep": {"ptr"},
-    "begin_backward": {"order", "other_order", "other_tets"},
+    "begin_backward": {"order", "tets", "other_order", "other_tets"},
     "rigid": {"order"},
     "rigid_backward": {"order"},
     "star_sum": {"star_ptr", "star"},
 }
-OF_CHOICE = {"mu", "lam", "rest", "other_tets"}  # between starts, which other scenes do not have
+OF_CHOICE = {"mu", "lam", "rest", "other_tets"}  # between starts, which this scene does not have
 SHARED = ("mu", "lam", "kappa")  # one value for all is legal
 # Empty where a scene lacks them; which it does, no tensor can tell.
-OPTIONAL = ("planes", "floor_lag", "lag", "own_room", "v_bar", "beside", "arm")
+OPTIONAL = ("planes", "alone", "floor_lag", "lag", "own_room", "v_bar", "beside", "arm")
 ONE_KIND = ("pack_rest", "star_sum", "tet_gather", "contact_keep")  # with one floating tensor, which may be either
 ERRORS = (ValueError, RuntimeError)
 
@@ -104,7 +104,7 @@ def refused(name: str, given: dict[str, Any], **changes: Any) -> None:
 
 def tensors(scene: str, name: str, given: dict[str, Any]) -> Iterator[tuple[str, Tensor]]:
     """Those that the operator was given and reads."""
-    unread = UNREAD.get(name, set()) | (OF_CHOICE if name == "begin" and scene != "pinned" else set())
+    unread = UNREAD.get(name, set()) | (OF_CHOICE if name == "begin" and scene == "contact" else set())
     for key, value in given.items():
         if isinstance(value, Tensor) and value.numel() and key not in unread:
             yield key, value

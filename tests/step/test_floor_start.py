@@ -67,13 +67,13 @@ def by_begin(a: dict[str, Tensor]) -> Tensor:
     x, none = a["x"].contiguous(), a["x"].new_empty((0,))
     vertices, planes = x.shape[1], packed(a)
     empty, one = torch.empty(0, dtype=torch.int32), torch.zeros(1, dtype=torch.int32)
-    bodies = Bodies(empty, one, torch.empty(0, dtype=torch.float64), (0, 0, 0, 0))
-    others = OtherBodies(torch.full((vertices,), -1, dtype=torch.int32), empty, one,
-                         torch.empty((0, 5), dtype=torch.int32), one, (0, 0, 0, 0))  # fmt: skip
+    tets = torch.empty((0, 5), dtype=torch.int32)
+    bodies = Bodies(empty, one, torch.empty(0, dtype=torch.float64), tets, one, (0, 0, 0, 0))
+    others = OtherBodies(torch.full((vertices,), -1, dtype=torch.int32), empty, one, tets, one, (0, 0, 0, 0))
     step = a["step"].expand_as(x).contiguous()
     start, _ = begin(x, step, x.new_zeros((1, 1, 3)), none, x.new_ones((1, vertices)), planes, none, none, none, none,
                      torch.zeros(vertices, dtype=torch.bool), bodies, others, (planes.shape[1], 0), 1.0,
-                     start="inertia", filters=True)  # fmt: skip
+                     start="inertia", filters=True, parts=False)  # fmt: skip
     return start - x
 
 

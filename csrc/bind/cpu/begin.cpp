@@ -17,9 +17,10 @@ using diffvbd::BeginSettings, diffvbd::BeginFields, diffvbd::data, diffvbd::disp
     diffvbd::for_bodies, diffvbd::for_vertices, diffvbd::Threads, diffvbd::zeros;
 using torch::stable::Tensor;
 
-std::tuple<Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::vector<int64_t> /*groups*/,
-                                         std::vector<int64_t> /*other_groups*/, std::vector<int64_t> data_count,
-                                         double time_step, double filter_eta, int64_t from, bool filters) {
+std::tuple<Tensor, Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::vector<int64_t> /*groups*/,
+                                                 std::vector<int64_t> /*other_groups*/, std::vector<int64_t> data_count,
+                                                 double time_step, double filter_eta, int64_t from, bool filters,
+                                                 bool parts) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
   diffvbd::require_states(f);
   const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
@@ -29,35 +30,46 @@ std::tuple<Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::vector<i
     const bool chooses = from == start::kLower && diffvbd::other_bodies(f) > 0;
     const Tensor x_start = empty(x, shape), y = empty(x, shape);
     const Tensor from_y = chooses && filters ? empty(x, shape) : y;
-    const Tensor falls = torch::stable::new_empty(x, {from == start::kLower ? x.size(0) : 0, diffvbd::other_bodies(f)},
-                                                  std::make_optional(diffvbd::ScalarType::Byte));
-    const auto in = diffvbd::begin_inputs<T>(f, settings, x_start, y, falls);
+    const auto decisions = [&](bool made, int64_t bodies) {
+      return torch::stable::new_empty(x, {made ? x.size(0) : 0, bodies}, std::make_optional(diffvbd::ScalarType::Byte));
+    };
+    const Tensor falls = decisions(from == start::kLower, diffvbd::other_bodies(f));
+    const Tensor alone = decisions(parts, diffvbd::corrected_bodies(f));
+    const auto in = diffvbd::begin_inputs<T>(f, settings, x_start, y, falls, alone);
     T *to = data<T>(x_start), *to_y = data<T>(y), *to_other = data<T>(from_y);
     if (in.some_alone) {
       T* second = chooses && filters ? to_other : nullptr;
       for_vertices(in.bodies, [&](int64_t scene, int32_t i) { begin_vertex(in, to, second, to_y, scene, i); });
     }
     if (chooses) {
-      const auto two = diffvbd::candidates<T>(f, settings, x_start, from_y, y);
+      const auto two = diffvbd::candidates<T>(f, settings, false, x_start, from_y, y);
       uint8_t* chosen = data<uint8_t>(falls);
       for_bodies(two.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
-        chosen[body.scene * in.others + body.body] = start::rise(two, body, team) <= 0;
+        chosen[body.scene * in.others + body.body] = start::way_between(two, body, team).rise <= 0;
       });
       for_vertices(in.bodies, [&](int64_t scene, int32_t i) { choose_vertex(in, to, to_other, scene, i); });
     }
+    uint8_t* parted = parts ? data<uint8_t>(alone) : nullptr;
     for_bodies(in.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
       if (in.bodies.data.data != nullptr) {
-        start::begin_body<true>(in, body, team, to, to_y);
+        start::begin_body<true>(in, body, team, to, to_y, parted);
       } else {
-        start::begin_body<false>(in, body, team, to, to_y);
+        start::begin_body<false>(in, body, team, to, to_y, parted);
       }
     });
-    return std::make_tuple(x_start, y, falls);
+    if (parts && diffvbd::corrected_bodies(f) > 0) {
+      const Tensor apart = empty(x, shape);
+      const auto two = diffvbd::candidates<T>(f, settings, true, x_start, apart, y);
+      for_bodies(two.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
+        start::part_body(in, two, body, team, to, data<T>(apart), parted);
+      });
+    }
+    return std::make_tuple(x_start, y, falls, alone);
   });
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin_backward(
-    DIFFVBD_PARAMETERS(BEGIN) const Tensor& x_start_bar, const Tensor& y_bar, const Tensor& falls,
+    DIFFVBD_PARAMETERS(BEGIN) const Tensor& x_start_bar, const Tensor& y_bar, const Tensor& falls, const Tensor& alone,
     std::vector<int64_t> /*groups*/, std::vector<int64_t> data_count, double time_step, double filter_eta, int64_t from,
     bool filters, std::vector<bool> wants) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
@@ -68,7 +80,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin
     // where the bodies that are corrected coast to, and their predictor, once more
     const std::vector<int64_t> shape{x.size(0), x.size(1), 3};
     const Tensor coasted = order.numel() > 0 ? empty(x, shape) : x, y = order.numel() > 0 ? empty(x, shape) : x;
-    const auto in = diffvbd::begin_inputs<T>(f, settings, coasted, y, falls);
+    const auto in = diffvbd::begin_inputs<T>(f, settings, coasted, y, falls, alone);
     const diffvbd::BeginBars bars(f, in, wants, [&](const std::vector<int64_t>& sizes, bool zeroed) {
       return zeroed ? zeros(x, sizes) : empty(x, sizes);
     });

@@ -20,9 +20,10 @@ using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
 
-std::tuple<Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::vector<int64_t> groups,
-                                         std::vector<int64_t> other_groups, std::vector<int64_t> data_count,
-                                         double time_step, double filter_eta, int64_t from, bool filters) {
+std::tuple<Tensor, Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::vector<int64_t> groups,
+                                                 std::vector<int64_t> other_groups, std::vector<int64_t> data_count,
+                                                 double time_step, double filter_eta, int64_t from, bool filters,
+                                                 bool parts) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
   diffvbd::require_states(f);
   const DeviceGuard guard(x.get_device_index());
@@ -33,23 +34,29 @@ std::tuple<Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::vector<i
     const bool chooses = from == start::kLower && diffvbd::other_bodies(f) > 0;
     const Tensor x_start = empty(x, shape), y = empty(x, shape);
     const Tensor from_y = chooses && filters ? empty(x, shape) : y;
+    const bool may_part = parts && diffvbd::corrected_bodies(f) > 0;
+    const Tensor apart = may_part ? empty(x, shape) : y;
     const Tensor falls = empty(x, {from == start::kLower ? x.size(0) : 0, diffvbd::other_bodies(f)}, ScalarType::Byte);
-    const auto in = diffvbd::begin_inputs<T>(f, settings, x_start, y, falls);
+    const Tensor alone = empty(x, {parts ? x.size(0) : 0, diffvbd::corrected_bodies(f)}, ScalarType::Byte);
+    const auto in = diffvbd::begin_inputs<T>(f, settings, x_start, y, falls, alone);
     const auto teams = groups_of(groups, f.spread.numel());
     const auto other_teams = groups_of(other_groups, diffvbd::other_bodies(f));
     const Tensor workspace = workspace_of(teams, x), other_workspace = workspace_of(other_teams, x);
     const Tensor& shared = workspace.numel() > 0 ? workspace : other_workspace;
-    start::Candidates<T> two{};
-    if (chooses) two = diffvbd::candidates<T>(f, settings, x_start, from_y, y);
-    check(cuda::begin<T>(in, teams, chooses ? &two : nullptr, other_teams, data<T>(x_start), data<T>(from_y),
-                         data<T>(y), data<uint8_t>(falls), data<double>(shared), current_stream(x)),
+    start::Candidates<T> two{}, parting{};
+    if (chooses) two = diffvbd::candidates<T>(f, settings, false, x_start, from_y, y);
+    if (may_part) parting = diffvbd::candidates<T>(f, settings, true, x_start, apart, y);
+    const cuda::Choice<T> of_others{chooses ? &two : nullptr, data<T>(from_y), data<uint8_t>(falls)};
+    const cuda::Choice<T> of_corrected{may_part ? &parting : nullptr, data<T>(apart), data<uint8_t>(alone)};
+    check(cuda::begin<T>(in, teams, of_corrected, other_teams, of_others, data<T>(x_start), data<T>(y),
+                         data<double>(shared), current_stream(x)),
           "the beginning of a step");
-    return std::make_tuple(x_start, y, falls);
+    return std::make_tuple(x_start, y, falls, alone);
   });
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin_backward(
-    DIFFVBD_PARAMETERS(BEGIN) const Tensor& x_start_bar, const Tensor& y_bar, const Tensor& falls,
+    DIFFVBD_PARAMETERS(BEGIN) const Tensor& x_start_bar, const Tensor& y_bar, const Tensor& falls, const Tensor& alone,
     std::vector<int64_t> groups, std::vector<int64_t> data_count, double time_step, double filter_eta, int64_t from,
     bool filters, std::vector<bool> wants) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
@@ -61,7 +68,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin
     // where the bodies that are corrected coast to, and their predictor, once more
     const std::vector<int64_t> shape{x.size(0), x.size(1), 3};
     const Tensor coasted = order.numel() > 0 ? empty(x, shape) : x, y = order.numel() > 0 ? empty(x, shape) : x;
-    const auto in = diffvbd::begin_inputs<T>(f, settings, coasted, y, falls);
+    const auto in = diffvbd::begin_inputs<T>(f, settings, coasted, y, falls, alone);
     const auto teams = groups_of(groups, f.spread.numel());
     const Tensor workspace = workspace_of(teams, x);
     const diffvbd::BeginBars bars(f, in, wants, [&](const std::vector<int64_t>& sizes, bool zeroed) {
