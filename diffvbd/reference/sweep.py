@@ -154,7 +154,7 @@ def stepper(
             coasted, share = correct.coasted(take(x_prev, body), take(coasting, body))
             begun, held = put(begun, body, coasted), [*held, share < 1]
         state = correct(begun, y, x_prev)
-        if sweeps * min(model.relaxation, 1.0) >= 1 and any(bool(h.any()) for h in held):
+        if sweeps * min(model.relaxation, 1.0) >= 2 and any(bool(h.any()) for h in held):
             state = _apart(scene, energies, state, _start(scene, energies, x_prev, y), y, x_prev, correct.bodies, held)
 
         def swept(state: Tensor, count: int, ends: bool) -> Tensor:

@@ -103,9 +103,9 @@ def begin(
         prescribed = prescribed if origin is None else prescribed - origin
     data = energy_data(model, prepared, origin)
     filters = model.floor is not None and model.contact is None
-    # half a sweep would not bring the vertices of a body together again
+    # one sweep would not bring the vertices of a body together again
     sweeps = prepared.settings.sweeps * min(model.relaxation, 1.0)
-    parts = filters and model.corrects and sweeps >= 1
+    parts = filters and model.corrects and sweeps >= 2
     rest = None
     if (model.starts_from == "auto" or parts) and model.energy_mask & ELASTIC:
         rest = model.rest_scalars if prepared.rest is None else prepared.rest
