@@ -21,6 +21,7 @@ GAIN = 0.05  # of the energy that a scene had and that gravity gave it, which a 
 GAIN_TOUCHING = 1.0  # the same where barriers are: what is pressed together at the start may come apart
 WARNED = "warned_of_energy"  # of a Model's _derived: one warning is enough for all of its rollouts
 ENDED = "ended"  # the same, on CUDA: whether its latest rollout ended finite, on its way to the host
+LOOKS, LOOKS_TOUCHING = 3, 64  # at a rollout, unasked
 SEEN = "rollouts_seen"  # the same: its rollouts that could have been looked at
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: its looks cost as much as some steps
 CHUNKS, LEAST_CHUNK = 4, 256  # of the tets, one after another, so that a look needs little memory
@@ -79,7 +80,7 @@ def _warn_not_finite(which: str) -> None:
 
 @dataclass
 class EnergyLook:
-    """Energy of a rollout that nothing but gravity drives, at its start and after three of its steps, [B] each."""
+    """Energy of a rollout that nothing but gravity drives, at its start and after some of its steps, [B] each."""
 
     model: Model
     prepared: Prepared
@@ -145,7 +146,14 @@ def look_at_energy(asked: bool | None, model: Model, x: Tensor, v: Tensor, steps
         room = _free_mass(model, prepared).sum(-1) * pull.double().norm(dim=-1).amax() * size
         begun = mechanical_energy(model, prepared, start, v.detach())
         had = torch.stack([begun, (room + _rounding(model, prepared, start)).expand_as(begun)])
-        return EnergyLook(model, prepared, pull, start, had, frozenset({1, (steps + 1) // 2, steps}))
+        return EnergyLook(model, prepared, pull, start, had, _looked_at(asked, model, steps))
+
+
+def _looked_at(asked: bool | None, model: Model, steps: int) -> frozenset[int]:
+    """Which of so many steps: all where one asks; where bodies may hit something, whose gain may be over in a step, as
+    many as cost little beside steps with contact."""
+    count = steps if asked else min(steps, LOOKS_TOUCHING) if model.touches else LOOKS
+    return frozenset(round(1 + k * (steps - 1) / max(1, count - 1)) for k in range(count))
 
 
 def _free_mass(model: Model, prepared: Prepared) -> Tensor:
