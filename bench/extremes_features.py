@@ -2,8 +2,9 @@
 
 Rollouts of 20 steps with coarse corrections, Anderson acceleration, integrators, floors, colliders, pairs and friction,
 each over the extremes of `AXES`. Nothing drives them but gravity, so none may gain energy. A case is *silent* where its
-end is of no use - not finite, or with more than 5 % more energy - and nothing was raised and nothing warned of. The
-gradient of a loss of the end, along a random direction of velocity and stiffness, is held against central differences.
+end is of no use - not finite, with more than 5 % more energy, a gradient that is not finite - and nothing was raised
+and nothing warned of. The gradient of a loss of the end, along a random direction of velocity and stiffness, is held
+against central differences.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ from bench.common import markdown_table
 from diffvbd import mesh, reference, testing
 
 GAIN = 0.05  # share of the energy that came in, beyond which a result counts as useless
-SMALL_GAIN = 1e-3  # worth a column
 DIFFERENCES = (1e-5, 1e-7)  # relative steps of central differences; the best one counts
 ALIKE = 1e-3  # error against differences below which a gradient counts as matching them
 GRAVITY = 9.81
@@ -202,9 +202,14 @@ def check(case: Extreme) -> dict[str, Any]:
         try:
             row |= _run(case)
         except (ValueError, RuntimeError) as error:
-            row |= {"raised": str(error).split("\n")[0][:200], "finite": False, "gain": math.nan}
+            row |= {
+                "raised": str(error).split("\n")[0][:200],
+                "finite": False,
+                "gain": math.nan,
+                "gradient_finite": False,
+            }
     row["warned"] = sorted({str(w.message).split(":")[0] for w in found if issubclass(w.category, UserWarning)})
-    useless = not row["finite"] or not row["gain"] <= GAIN
+    useless = not row["finite"] or not row["gain"] <= GAIN or not row["gradient_finite"]
     row["useless"] = useless
     row["silent"] = useless and not row["raised"] and not row["warned"]
     return row
@@ -252,11 +257,11 @@ def gained(case: Extreme, motion: dv.Trajectory, material: dict[str, Tensor]) ->
 
 
 def _crossings(case: Extreme, model: dv.Model, motion: dv.Trajectory) -> int:
-    """Edges through triangles at the end, and vertices at or below the floor or plane."""
+    """Edges through triangles at the end, and vertices of the surface at or below the floor, plane or obstacle."""
     kind = FEATURES[case.feature][0]
     end = motion.x[-1]
     if kind in ("floor", "plane", "obstacle"):
-        return int((end[:, 1] <= 0).sum())
+        return int((end[np.unique(model.mesh.surface), 1] <= 0).sum())
     if kind not in ("pairs", "horseshoe"):
         return 0
     found = dv.contact.intersections(model, end)

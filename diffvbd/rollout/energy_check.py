@@ -24,7 +24,7 @@ ENDED = "ended"  # the same, on CUDA: whether its latest rollout ended finite, o
 LOOKS, LOOKS_TOUCHING = 3, 64  # at a rollout, unasked
 SEEN = "rollouts_seen"  # the same: its rollouts that could have been looked at
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: its looks cost as much as some steps
-CHUNKS, LEAST_CHUNK = 4, 256  # of the tets, one after another, so that a look needs little memory
+CHUNKS, LEAST_CHUNK = 8, 256  # of the tets, one after another, so that a look needs little memory
 ROUNDING = 64.0  # times the energy of strains that are rounding
 
 
