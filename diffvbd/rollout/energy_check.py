@@ -114,9 +114,9 @@ class EnergyLook:
         faster = "" if self.model.coarse is not None else ', coarse="auto"'
         pressed = ", unless bodies were pressed together at the start" if touching else ""
         warnings.warn(
-            f"sweeps: after step {step} the scene has {most:.2g} times more energy than it had and gravity gave it: "
-            f"the sweeps do not follow so stiff a body so far{pressed}; take more sweeps{faster} or a smaller "
-            "time_step (docs/numerics.md)",
+            f"sweeps: after step {step} the scene has gained {100 * most:.2g} % of the energy that it had and that "
+            f"gravity gave it: the sweeps have not converged{pressed}; take more sweeps{faster} or a smaller time_step "
+            "(docs/numerics.md)",
             UserWarning,
             stacklevel=3,
         )

@@ -56,7 +56,7 @@ def test_energy_is_that_of_the_reference() -> None:
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_energy_from_nowhere_is_warned_of_once(dtype: torch.dtype) -> None:
     model, x, v = bent(dtype=dtype)
-    with pytest.warns(UserWarning, match=r'times more energy .* coarse="auto"') as found:
+    with pytest.warns(UserWarning, match=r'has gained .* coarse="auto"') as found:
         dv.rollout(model, x, v, steps=10, **STIFF)
     assert [w.filename for w in found] == [__file__]
     assert messages(lambda: dv.rollout(model, x, v, steps=10, **STIFF)) == []
