@@ -22,8 +22,12 @@ CALLED = {  # operators that tell of a feature
 
 
 def test_a_plain_step_calls_two_operators_of_the_package() -> None:
-    found = absent.counted(absent.scene(absent.Feature(), True, "cpu")[1])
-    assert found.own() == {"diffvbd::begin": 1, "diffvbd::sweep": 1}
+    model, once = absent.scene(absent.Feature(), True, "cpu")
+    assert absent.counted(once).own() == {"diffvbd::begin": 1, "diffvbd::sweep": 1}
+    kept = ("_moving", "_coarse_plan")  # of acceleration and coarse corrections
+    assert model.surface_of_contact is None and not any(hasattr(model, name) for name in kept)
+    assert all(hasattr(absent.scene(absent.FEATURES[f], True, "cpu")[0], name)
+               for f, name in zip(("acceleration", "coarse corrections"), kept, strict=True))  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["SDIRK2", "floor", "anchors", "coarse corrections"])
