@@ -212,7 +212,7 @@ class _Budget:
         given = p.at_steps(dict(p.given), settings.time_step, self.steps, 0.0)
         end = p.execute(model, p.x, p.v, steps=self.steps, time_step=settings.time_step, sweeps=settings.sweeps,
                         integrator=settings.integrator, save="last", observe=look, check_contact=False,
-                        check_start=False, **given)  # fmt: skip
+                        check_energy=False, check_start=False, **given)  # fmt: skip
         cut = None if model.contact is None else float(torch.stack(cuts).max())
         moves = any(callable(value) and not isinstance(value, Tensor) for value in p.given.values())
         if model.friction is None or moves or not isinstance(settings.integrator, ImplicitEuler):

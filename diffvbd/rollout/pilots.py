@@ -134,7 +134,7 @@ class Pilots:
                 model, x, v, steps=steps, time_step=settings.time_step, sweeps=settings.sweeps,
                 integrator=settings.integrator, adjoint=ReverseSweep(settings.tape),
                 checkpoint_every=settings.checkpoint_every, save=max(1, steps // frames), check_contact=False,
-                check_start=False, **given,
+                check_energy=False, check_start=False, **given,
             )  # fmt: skip
             value = None if self.quantity is None else self.quantity(out.x[-1], out.v[-1])
             gradient = torch.autograd.grad(value, leaves) if leaves else ()  # type: ignore[arg-type]

@@ -1,0 +1,203 @@
+"""What a rollout says of its end and of its energy: numbers that are not finite, more energy than there can be."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..energies import Anchor
+from ..mask import ELASTIC
+from ..model.model import Model
+from ..model.rest import rest_metric
+from ..scopes import looks_at
+from ..step.arguments import Prepared, acceleration_of
+
+GAIN = 0.05  # of the energy that a scene had and that gravity gave it, which a rollout may gain without a word
+GAIN_TOUCHING = 1.0  # the same where barriers are: what is pressed together at the start may come apart
+WARNED = "warned_of_energy"  # of a Model's _derived: one warning is enough for all of its rollouts
+ENDED = "ended"  # the same, on CUDA: whether its latest rollout ended finite, on its way to the host
+LOOKS, LOOKS_TOUCHING = 3, 64  # at a rollout, unasked
+SEEN = "rollouts_seen"  # the same: its rollouts that could have been looked at
+LEAST_STEPS = 10  # of a rollout that is looked at unasked: its looks cost as much as some steps
+CHUNKS, LEAST_CHUNK = 8, 256  # of the tets, one after another, so that a look needs little memory
+ROUNDING = 64.0  # times the energy of strains that are rounding
+
+
+# --- a state that is not finite ---------------------------------------------------------------------------------------
+
+
+def warn_of_end(model: Model, x: Tensor, v: Tensor) -> None:
+    """Warns (UserWarning) of a rollout that ended with numbers that are not finite; the caller's caller is shown.
+
+    On CUDA, where looking waits for the device, the answer is copied to the host meanwhile, and the Model's next
+    rollout says what it was. Nothing that is compiled, transformed or captured is looked at.
+    """
+    if looks_at(x):
+        if not (bool(torch.isfinite(x).all()) and bool(torch.isfinite(v).all())):
+            _warn_not_finite("the rollout")
+    elif _copies(x):
+        good = torch.isfinite(x.detach()).all() & torch.isfinite(v.detach()).all()
+        said = torch.empty((), dtype=torch.bool, pin_memory=True)
+        said.copy_(good, non_blocking=True)
+        done = torch.cuda.Event()
+        done.record(torch.cuda.current_stream(x.device))
+        model._derived[ENDED] = (said, done)
+
+
+def warn_of_last_end(model: Model, x: Tensor) -> None:
+    """Warns of the Model's rollout before this one, on CUDA; the caller's caller is shown."""
+    if ENDED not in model._derived or not _copies(x):
+        return
+    said, done = model._derived[ENDED]
+    if done.query():
+        del model._derived[ENDED]
+        if not bool(said):
+            _warn_not_finite("the rollout of this Model before this one")
+
+
+def _copies(x: Tensor) -> bool:
+    if not x.is_cuda or torch.compiler.is_compiling() or torch.cuda.is_current_stream_capturing():
+        return False
+    return torch._C._functorch.peek_interpreter_stack() is None  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _warn_not_finite(which: str) -> None:
+    warnings.warn(
+        f"x: {which} ended with positions or velocities that are not finite; dv.debug_checks() says in which step, "
+        "sweep and vertex they began. Take a smaller time_step, more sweeps, or float64 (docs/numerics.md)",
+        UserWarning,
+        stacklevel=4,
+    )
+
+
+# --- energy from nowhere ----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class EnergyLook:
+    """Energy of a rollout that nothing but gravity drives, at its start and after some of its steps, [B] each."""
+
+    model: Model
+    prepared: Prepared
+    gravity: Tensor
+    start: Tensor
+    had: Tensor  # at the start: kinetic and elastic energy, and what gravity does over the scene's length [J]
+    at: frozenset[int]  # numbers of steps that are looked at
+    found: dict[int, Tensor] = field(default_factory=dict)
+
+    def see(self, step: int, x: Tensor, v: Tensor) -> None:
+        """After a step; one that runs again is not seen twice."""
+        if step in self.at and step not in self.found:
+            with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+                energy = mechanical_energy(self.model, self.prepared, x.detach(), v.detach())
+                way = (x.detach().double() - self.start.double()) * self.gravity.double()
+                mass = _free_mass(self.model, self.prepared)
+                fallen = (mass * way.sum(-1).reshape(-1, mass.shape[-1])).sum(-1)  # what gravity has done [J]
+                self.found[step] = torch.stack([energy, fallen])
+
+    def warn(self) -> None:
+        """Warns (UserWarning) of a gain; the caller's caller is shown."""
+        energy, fallen = torch.stack(list(self.found.values())).unbind(1)  # [looks, B]
+        begun, room = self.had[:2]
+        gain = (energy - begun - fallen) / (begun + room + fallen.abs().amax(0)).clamp(min=math.ulp(0.0))
+        most = float(gain.max())
+        touching = self.model.touches or self.model.floor is not None
+        if not most > (GAIN_TOUCHING if touching else GAIN):
+            return
+        self.model._derived[WARNED] = True
+        step = list(self.found)[int(gain.amax(-1).argmax())]
+        faster = "" if self.model.coarse is not None else ', coarse="auto"'
+        pressed = ", unless bodies were pressed together at the start" if touching else ""
+        warnings.warn(
+            f"sweeps: after step {step} the scene has gained {100 * most:.2g} % of the energy that it had and that "
+            f"gravity gave it: the sweeps have not converged{pressed}; take more sweeps{faster} or a smaller time_step "
+            "(docs/numerics.md)",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
+def look_at_energy(asked: bool | None, model: Model, x: Tensor, v: Tensor, steps: int, prepared: Prepared | None,
+                   gravity: Any) -> EnergyLook | None:  # fmt: skip
+    """A look at a rollout of so many steps that nothing but gravity drives, or None where nobody asks for one.
+
+    prepared: Arguments that all steps share; None: there are none, and nothing is looked at.
+    """
+    if asked is False or steps == 0 or x.numel() == 0 or prepared is None or not model.energy_mask & ELASTIC:
+        return None
+    if any(isinstance(e, Anchor) for e in model.energies):  # springs
+        return None
+    if asked is None:
+        if x.is_cuda or not looks_at(x) or steps < LEAST_STEPS or WARNED in model._derived:
+            return None
+        model._derived[SEEN] = seen = model._derived.get(SEEN, 0) + 1
+        if seen & (seen - 1):  # not the 1st, 2nd, 4th, 8th: those of a training loop are looked at for next to nothing
+            return None
+    if not looks_at(x) and not _copies(x):
+        return None
+    with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+        start, pull = x.detach(), acceleration_of(gravity, x).detach()
+        size = (start.amax(-2) - start.amin(-2)).double().norm(dim=-1).reshape(-1)  # [B]
+        room = _free_mass(model, prepared).sum(-1) * pull.double().norm(dim=-1).amax() * size
+        begun = mechanical_energy(model, prepared, start, v.detach())
+        had = torch.stack([begun, (room + _rounding(model, prepared, start)).expand_as(begun)])
+        return EnergyLook(model, prepared, pull, start, had, _looked_at(asked, model, steps))
+
+
+def _looked_at(asked: bool | None, model: Model, steps: int) -> frozenset[int]:
+    """Which of so many steps: all where one asks; where bodies may hit something, whose gain may be over in a step, as
+    many as cost little beside steps with contact."""
+    count = steps if asked else min(steps, LOOKS_TOUCHING) if model.touches else LOOKS
+    return frozenset(round(1 + k * (steps - 1) / max(1, count - 1)) for k in range(count))
+
+
+def _free_mass(model: Model, prepared: Prepared) -> Tensor:
+    """Mass of what can move [kg], float64 [1 | B, V]."""
+    return torch.where(model._pinned, 0.0, prepared.mass.double())
+
+
+def mechanical_energy(model: Model, prepared: Prepared, x: Tensor, v: Tensor) -> Tensor:
+    """Kinetic and elastic energy of each scene [J], float64 [B]; the rest shape has none of the latter.
+
+    With the rest scalars k_ab and c6 of docs/method.md, section 2, E = -mu/2 sum_ab k_ab |x_a - x_b|^2
+    + V [(mu + lam)/2 (J - 1)^2 - mu (J - 1) - 3/2 mu], J = c6 det(x_1 - x_0, x_2 - x_0, x_3 - x_0), V = 1/(6 c6).
+    """
+    x, v = (t.reshape(-1, *t.shape[-2:]).double() for t in (x, v))
+    moving = 0.5 * (_free_mass(model, prepared) * v.square().sum(-1)).sum(-1)
+    total, chunk = torch.zeros_like(moving), max(LEAST_CHUNK, -(-model.num_tets // CHUNKS))
+    for first in range(0, model.num_tets, chunk):
+        rows = slice(first, first + chunk)
+        mu, lam = (m[:, rows].double() if m.shape[1] > 1 else m.double() for m in (prepared.mu, prepared.lam))
+        rest = _rest_of(model, prepared, rows).double().movedim(-1, 0)  # [7, 1 | B, t]
+        corners = x[:, model.tets[rows]].permute(3, 2, 0, 1).contiguous()  # [3, 4, B, t]: long rows are quick
+        edges = corners[:, 1:] - corners[:, :1]
+        others = edges[:, [1, 2, 2]] - edges[:, [0, 0, 1]]  # from 1 and 2 to 2 and 3
+        shear = -(rest[:6] * torch.cat([edges, others], 1).square_().sum(0)).sum(0)
+        c6 = rest[6]
+        change = c6 * (edges[:, 0] * torch.linalg.cross(edges[:, 1], edges[:, 2], dim=0)).sum(0) - 1
+        volume = 1 / (6 * c6)
+        elastic = 0.5 * mu * (shear - 3 * volume) + volume * (0.5 * (mu + lam) * change.square() - mu * change)
+        total = total + elastic.sum(-1)
+    return moving + total
+
+
+def _rest_of(model: Model, prepared: Prepared, rows: slice) -> Tensor:
+    """Rest scalars of some tets, [1 | B, t, 7]. A Model that does not keep them is not made to."""
+    if prepared.rest is not None:
+        return prepared.rest[:, rows]
+    if model._rest_scalars.numel() or "rest" in model._derived:
+        return model.rest_scalars[:, rows]
+    return rest_metric(model._rest_points[None, model.tets[rows]])[0]
+
+
+def _rounding(model: Model, prepared: Prepared, x: Tensor) -> Tensor:
+    """Elastic energy of strains that rounding of the positions makes [J], float64 [1 | B]."""
+    volume = torch.tensor(model.mesh.volume, device=x.device)
+    strain = torch.finfo(x.dtype).eps * x.abs().amax().double() / volume.pow(1 / 3)
+    modulus = prepared.lam.double() + 2 * prepared.mu.double()
+    return ROUNDING * (volume * modulus * (strain.square() + torch.finfo(torch.float64).eps)).sum(-1)
