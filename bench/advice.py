@@ -119,8 +119,8 @@ def kept_of(number: int, quick: bool) -> list[Row]:
 
 
 def kept(quick: bool) -> list[Row]:
-    found = common.side_by_side(kept_of, range(2 if quick else SCENES), quick, at_once=not quick)
-    return [row for rows in found for row in rows]
+    found = dict(common.side_by_side(kept_of, range(2 if quick else SCENES), quick, at_once=not quick))
+    return [row for number in sorted(found) for row in found[number]]
 
 
 def beam(quick: bool) -> list[Row]:

@@ -9,8 +9,8 @@ import multiprocessing
 import os
 import platform
 import subprocess
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -113,13 +113,19 @@ def stamp(environment: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def side_by_side(measure: Callable[..., Any], cases: Iterable[Any], *arguments: Any, at_once: bool) -> list[Any]:
-    """measure(case, *arguments) of each case, with one thread each; at once: on as many cores as there are."""
+def side_by_side(measure: Callable[..., Any], cases: Iterable[Any], *arguments: Any, at_once: bool
+                 ) -> Iterator[tuple[Any, Any]]:  # fmt: skip
+    """Each case with measure(case, *arguments), as they are done, with one thread each; at once: on as many cores as
+    there are."""
     if not at_once:
-        return [measure(case, *arguments) for case in cases]
+        for case in cases:
+            yield case, measure(case, *arguments)
+        return
     os.environ["OMP_NUM_THREADS"] = "1"  # read when a process starts
     with ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn")) as pool:
-        return [task.result() for task in [pool.submit(measure, case, *arguments) for case in cases]]
+        tasks = {pool.submit(measure, case, *arguments): case for case in cases}
+        for task in as_completed(tasks):
+            yield tasks[task], task.result()
 
 
 def of_several_runs(groups: dict[str, Any]) -> str:

@@ -42,7 +42,7 @@ class Effort:
     finest: float  # an error below which no shorter step is tried
 
 
-FULL, QUICK = Effort(1.0, 60.0, 60.0, 3e-4), Effort(0.05, 1.0, 1.0, 2e-2)
+FULL, QUICK = Effort(0.5, 40.0, 40.0, 3e-4), Effort(0.05, 1.0, 1.0, 2e-2)
 
 
 @dataclass(frozen=True)
@@ -220,9 +220,11 @@ def run(quick: bool, device: str = "cpu", only: str | None = None, out: Path | N
     environment = common.environment(device)
     path = None if out is None else out / f"tradeoff{common.device_suffix(device)}.json"
     results = common.earlier(path, quick, environment["device"])
-    found = common.side_by_side(measured, chosen, quick, device, at_once=device == "cpu" and not quick)
-    for name, group in zip(chosen, found, strict=True):
+    at_once = device == "cpu" and not quick
+    for name, group in common.side_by_side(measured, chosen, quick, device, at_once=at_once):
         results[name] = group | common.stamp(environment)
+        if out is not None:
+            common.write("tradeoff", results, out, quick=quick, device=device, suffix=common.device_suffix(device))
     return {name: results[name] for name in SCENES if name in results}
 
 

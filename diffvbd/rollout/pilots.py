@@ -16,10 +16,9 @@ from torch import Tensor
 from ..adjoint.routes import ReverseSweep
 from ..checks import check_positive, fail
 from ..model.model import Model
-from ..model.moduli import moduli_of
-from ..ops import tet_gather
 from ..scopes import refined
-from ..step.arguments import GRAVITY
+from ..step.arguments import GRAVITY, Prepared, prepare
+from .energy_check import mechanical_energy
 from .settings import Settings
 from .trajectory import PerStep, Trajectory
 
@@ -27,7 +26,8 @@ FRAMES = 4  # at which two runs are compared, equally spaced over the duration
 STILL = 1e-4  # of the size of the scene: a motion below it counts as one of this size
 LOADS = ("force", "gravity")
 MOVING = ("prescribed", "colliders")
-OTHERS = ("mu", "lam", "young", "poisson", "rest_points", "density", "parameters")
+MODULI = ("mu", "lam", "young", "poisson")
+OTHERS = (*MODULI, "rest_points", "density", "parameters")
 GIVEN = (*OTHERS, *LOADS, *MOVING)
 Quantity = Callable[[Tensor, Tensor], Tensor]
 
@@ -212,35 +212,22 @@ class Pilots:
         return not (changing or other or damped)
 
     @cached_property
-    def _rest_inverse(self) -> Tensor:
-        corners = tet_gather(self.model.rest_points[None].double(), *self.model._topology)[0]
-        return torch.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(-1, -2))
-
-    def moduli(self) -> tuple[Tensor, Tensor]:
-        """mu and lam [Pa], at the start where they change."""
-        names = ("mu", "lam", "young", "poisson")
-        given = self.at_steps({name: self.given.get(name) for name in names}, 0.0, 0, 0.0)
-        values = (v(0, self.x, self.v) if callable(v) and not isinstance(v, Tensor) else v
-                  for v in (given.get(name) for name in names))  # fmt: skip
-        mu, lam = moduli_of(self.model, self.x.shape[:-2], *values)
-        return tuple(torch.as_tensor(m, device=self.x.device).detach().double() for m in (mu, lam))  # type: ignore[return-value]
+    def prepared(self) -> Prepared:
+        """The material of the scene, at the start where it changes."""
+        given = self.at_steps({name: self.given.get(name) for name in MODULI}, 0.0, 0, 0.0)
+        values = {name: value(0, self.x, self.v) if callable(value) and not isinstance(value, Tensor) else value
+                  for name, value in given.items()}  # fmt: skip
+        moduli: dict[str, Any] = {name: values.get(name) for name in MODULI}
+        return prepare(self.model, tuple(self.x.shape[:-2]), time_step=1.0, sweeps=1, rest_points=None, density=None,
+                       parameters=None, **moduli)  # fmt: skip
 
     def energy(self, x: Tensor, v: Tensor) -> Tensor:
         """Kinetic, elastic and of loads [...] [J] of each scene; contact, which is short, counts as none."""
-        model, given, lead = self.model, self.given, x.shape[:-2]
-        x, v = x.double(), v.double()
-        mu, lam = self.moduli()
-        corners = tet_gather(x.reshape(-1, *x.shape[-2:]), *model._topology).unflatten(0, lead or (1,))
-        corners = corners if lead else corners[0]
-        f = (corners[..., 1:, :] - corners[..., :1, :]).transpose(-1, -2) @ self._rest_inverse
-        strain = torch.linalg.det(f) - 1
-        psi = mu * ((f.square().sum((-1, -2)) - 3) / 2 - strain) + (mu + lam) / 2 * strain.square()
-        volume = 1 / (6 * torch.linalg.det(self._rest_inverse).abs())
-        mass = model.mass.double()[:, None]
-        load = mass * torch.as_tensor(self.gravity, device=x.device).double()
-        if given.get("force") is not None:
-            load = load + given["force"].double()
-        return (psi * volume).sum(-1) + (0.5 * mass * v.square() - load * x).sum((-1, -2))
+        load = self.model.mass.double()[:, None] * torch.as_tensor(self.gravity, device=x.device).double()
+        if self.given.get("force") is not None:
+            load = load + self.given["force"].double()
+        stored = mechanical_energy(self.model, self.prepared, x, v).reshape(x.shape[:-2])
+        return stored - (load * x.double()).sum((-1, -2))
 
     def lost(self, run: Pilot, seconds: float) -> float:
         """How far the energy E that a run has lost would carry the scene in some seconds, sqrt(2 E / m) t, over its
@@ -262,7 +249,7 @@ def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Te
     x, v = x.detach(), v.detach()
     if gradient and quantity is None:
         quantity = _mean_squared_way(x)
-    material = [name for name in ("mu", "lam", "young", "poisson") if given.get(name) is not None]
+    material = [name for name in MODULI if given.get(name) is not None]
     wrt = [name for name in material if not callable(given[name]) or isinstance(given[name], Tensor)]
     given = {name: value.detach() if isinstance(value, Tensor) else value for name, value in given.items()}
     pilots = Pilots(rollout, model, x, v, duration, given, quantity, wrt if gradient else None)

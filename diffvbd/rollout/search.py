@@ -67,7 +67,7 @@ def candidates_of(pilots: Pilots) -> list[Settings]:
 
 
 def _may_over_relax(pilots: Pilots) -> bool:
-    return pilots.model.mesh.num_tets == 0 or not is_nearly_incompressible(*pilots.moduli())
+    return pilots.model.mesh.num_tets == 0 or not is_nearly_incompressible(pilots.prepared.mu, pilots.prepared.lam)
 
 
 def _exact(model: Model) -> bool:
