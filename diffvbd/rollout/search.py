@@ -28,6 +28,7 @@ LONGEST = 0.1  # [s] of the first time step of the ladder
 MOST_STEPS = 2**17
 FEWEST_THAT_RUN = 256  # steps: fewer than these may fail
 ORDERS = (0.5, 2.0)  # that are believed
+CLEAN = 0.6  # least order of two levels in a row from which contact counts as resolved
 AIM = 0.6  # of the wanted error that a candidate is given
 COSTS = 8.0  # times the advised rollout that all runs may take,
 FREE = 0.5  # [s] or so long
@@ -80,8 +81,9 @@ class _Search:
     def __init__(self, pilots: Pilots, error: float, patience: float) -> None:
         self.pilots, self.error, self.patience = pilots, error, patience
         self.order = 1.0
-        # impacts come early or late by up to a step: nothing can be extrapolated
+        # impacts come early or late by up to a step: nothing can be extrapolated until steps resolve them
         self.smooth = not (pilots.model.touches or pilots.model.floor is not None)
+        self.clean = self.smooth  # whether the last two runs can be extrapolated
         self.ladder: list[Pilot] = []
         self.estimates: list[float] = []  # of each level from the third on, of what is asked for
         self.proven: list[Candidate] = []
@@ -136,7 +138,7 @@ class _Search:
             if len(self.ladder) > 1:
                 apart.append(self._distance(self.ladder[-2], now))
             if len(apart) > 1:
-                self.order = self._order(apart)
+                self._see_order(apart)
                 self.estimates.append(max(self._remaining(apart), self._unresolved()))
                 if self.estimates[-1] <= 0.5 * self.error:
                     more = self._with_more_sweeps(settings)
@@ -152,13 +154,17 @@ class _Search:
 
     def _remaining(self, apart: list[float]) -> float:
         """The error of the last run."""
-        if self.smooth:
+        if self.clean:
             return apart[-1] / (2**self.order - 1)
         return max(apart[-2:]) / (2 ** min(self.order, 1.0) - 1)  # one pair of runs may agree by luck
 
-    def _order(self, apart: list[float]) -> float:
+    def _see_order(self, apart: list[float]) -> None:
+        """The order that the last runs show; with contact it is believed where two levels in a row agree on one."""
         low, high = ORDERS
-        return min(max(math.log2(max(apart[-2], 1e-300) / max(apart[-1], 1e-300)), low), high)
+        last = [max(a, 1e-300) for a in apart[-3:]]
+        shown = [math.log2(a / b) for a, b in zip(last, last[1:], strict=False)]
+        self.order = min(max(shown[-1] if self.smooth else min(shown), low), high)
+        self.clean = self.smooth or (len(shown) > 1 and min(shown) >= CLEAN)
 
     def _unresolved(self) -> float:
         """Motion that is lost with energy, and that runs which agree may therefore both lack. Vibrations swing within a
@@ -203,10 +209,10 @@ class _Search:
 
     @property
     def reference(self) -> Pilot:
-        """The last run of the ladder; where the motion is smooth, extrapolated from the last two."""
+        """The last run of the ladder; where the motion is smooth or resolved, extrapolated from the last two."""
         a, b = self.ladder[-2], self.ladder[-1]
         assert a.x is not None and b.x is not None
-        share = 1 / (2**self.order - 1) if self.smooth else 0.0
+        share = 1 / (2**self.order - 1) if self.clean else 0.0
 
         def beyond(u: Any, w: Any) -> Any:
             return None if u is None else w + share * (w - u)
@@ -219,9 +225,9 @@ class _Search:
     def _rank(self) -> None:
         p, last = self.pilots, self.ladder[-1]
         reference = self.reference
-        uncertain = (0.5 if self.smooth else 1.0) * self.estimates[-1]
+        uncertain = (0.5 if self.clean else 1.0) * self.estimates[-1]
         self.aim = AIM * (self.error - uncertain)
-        for run in self.ladder[-2:]:
+        for run in self.ladder[-4:]:
             self.proven.append(Candidate(run.settings, self._distance(run, reference) + uncertain, run.seconds, True))
         self.uncertain, self.truth = uncertain, reference
         assert last.x is not None and self.ladder[-2].x is not None
