@@ -155,3 +155,23 @@ def test_auto_inside_refine() -> None:
     assert dv.refine(loss).survives
     with pytest.raises(TypeError, match="sweeps: expected a number"):
         dv.refine(lambda: dv.rollout(model, x, v, steps=2, time_step=0.01, **material).x.sum())
+
+
+def test_a_bounce_that_steps_resolve() -> None:
+    """Contact converges with the second power of h once steps resolve it: 1 % can be had, and is kept."""
+    body = mesh.box(2, 0.1).translate((0, 4e-3, 0))
+    model = dv.Model(body, energies=(dv.StableNeoHookean(), dv.FloorBarrier(kappa=1e5, dhat=2e-3)))
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    v[:, 1] = -1.0
+    material, duration = {"young": 1e6, "poisson": 0.3}, 0.03
+    settings = dv.advise(model, x, v, duration=duration, error=0.01, **material)
+    assert settings.predicted is not None and settings.predicted.reached
+    runs = Pilots(dv.rollout, model, x, v, duration, dict(material))
+    steps = settings.steps(duration)
+    given, exact = (
+        runs.run(settings if n == steps else dv.Settings(1.0, 20, dv.SDIRK2()), n) for n in (steps, 6 * steps)
+    )
+    assert given.x is not None and exact.x is not None and given.v is not None
+    error = runs.apart(given.x, exact.x)
+    assert 0.01 / 20 < error <= 0.01
+    assert float(given.v[-1, :, 1].mean()) > 0.3  # it has been thrown back
