@@ -133,7 +133,7 @@ def two_level(figure: Any, results: dict[str, Any]) -> None:
 
 def tradeoff(figure: Any, results: dict[str, Any]) -> None:
     """Points of the common ways, the front of all, and what dv.advise says."""
-    from bench.tradeoff import BARRIERS, front_of
+    from bench.tradeoff import ASIDE, front_of
 
     drawn = {"implicit Euler": ("o", "C1"), "implicit Euler, coarse": ("s", "C3"), "SDIRK2": ("^", "C0"),
              "SDIRK2, coarse": ("D", "C2"), "BDF2, coarse": ("v", "C4")}  # fmt: skip
@@ -143,7 +143,7 @@ def tradeoff(figure: Any, results: dict[str, Any]) -> None:
     all_axes = figure.subplots(-(-len(groups) // columns), columns, squeeze=False).ravel()
     for ax, group in zip(all_axes, groups, strict=False):
         rows = [r for r in group["rows"] if isinstance(r.get("error"), float) and isinstance(r["ms"], float)]
-        rows = [r for r in rows if not any(label in r["way"] for label, _ in BARRIERS)]
+        rows = [r for r in rows if r["way"] not in ASIDE]
         for name, (marker, color) in drawn.items():
             shown = [r for r in rows if r["way"] == name]
             ax.loglog([r["ms"] for r in shown], [r["error"] for r in shown], marker, color=color, markersize=3,

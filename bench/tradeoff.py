@@ -95,6 +95,10 @@ BARRIERS: list[tuple[str, dict[str, Any]]] = [
 ]
 
 
+# ways that are no others for the motion of the scene: they differ in the backward, or move in another scene
+ASIDE = {f"SDIRK2, {label}" for label, _ in BARRIERS} | {way.name for way in WAYS if way.gradient_only}
+
+
 class Front:
     """Runs of one scene, held against its reference."""
 
@@ -247,12 +251,26 @@ def _said(row: Row | None, time: str = "ms") -> str:
     return "-" if row is None else f"{row['way']}, K = {row['sweeps']}, {row['steps']} steps: {row[time]:.3g} ms"
 
 
+def others_of(rows: list[Row]) -> list[list[Any]]:
+    """A line for each other solver."""
+    out = []
+    for name in dict.fromkeys(row["solver"] for row in rows):
+        own = [row for row in rows if row["solver"] == name]
+        cells = [best(own, e) for e in ERRORS]
+        least = min(
+            (row for row in own if isinstance(row.get("error"), float)), key=lambda r: r["error"], default=own[0]
+        )
+        out.append([name, *(None if c is None else c["ms"] for c in cells), least.get("error"), least.get("ms"),
+                    least["note"]])  # fmt: skip
+    return out
+
+
 def markdown(results: dict[str, Any]) -> str:
     """The fastest way to each error, what the default does, and what is advised."""
     text, header = [], ("error", "fastest motion", "implicit Euler alone", "fastest gradient", "advised")
     for group in results.values():
         rows = [r for r in group["rows"] if "steps" in r]
-        own = [r for r in rows if not any(label in r["way"] for label, _ in BARRIERS)]
+        own = [r for r in rows if r["way"] not in ASIDE]
         euler = [r for r in own if r["way"] == "implicit Euler"]
         table = []
         for error in ERRORS:
@@ -278,6 +296,6 @@ def markdown(results: dict[str, Any]) -> str:
         text.append(markdown_table(("way", *(f"ms to {e:g}" for e in ERRORS), "least error", "in ms",
                                     "with backward"), ways))  # fmt: skip
         if group["peers"]:
-            keys = ("solver", "iterations", "steps", "ms", "error", "note")
-            text.append(markdown_table(keys, ([row.get(key) for key in keys] for row in group["peers"])))
+            text.append(markdown_table(("solver", *(f"ms to {e:g}" for e in ERRORS), "least error", "in ms", "note"),
+                                       others_of(group["peers"])))  # fmt: skip
     return "\n".join(text) + common.of_several_runs(results)
