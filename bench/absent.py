@@ -127,10 +127,9 @@ def scene(feature: Feature, quick: bool, device: str) -> tuple[dv.Model, Callabl
     if parameters:
         options["parameters"] = parameters
 
-    def once() -> list[Tensor]:
-        with torch.set_grad_enabled(bool(leaves)):
-            end = dv.step(model, **given, **options)
-            return list(torch.autograd.grad(end[0].sum() + end[1].sum(), leaves)) if leaves else list(end[:2])
+    def once() -> list[Tensor]:  # with gradients enabled, so that what is kept without a leaf would be seen
+        end = dv.step(model, **given, **options)
+        return list(torch.autograd.grad(end[0].sum() + end[1].sum(), leaves)) if leaves else list(end[:2])
 
     return model, once
 
