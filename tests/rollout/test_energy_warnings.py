@@ -38,7 +38,9 @@ def messages(run: Any) -> list[str]:
 # --- energy -----------------------------------------------------------------------------------------------------------
 
 
-def test_energy_is_that_of_the_reference() -> None:
+@pytest.mark.parametrize("chunk", [3, energy_check.LEAST_CHUNK])  # tets that are looked at together
+def test_energy_is_that_of_the_reference(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+    monkeypatch.setattr(energy_check, "LEAST_CHUNK", chunk)
     model, x, v = bent()
     x = x + 0.01 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
     mu, lam = (torch.linspace(1e4, k, model.num_tets, dtype=x.dtype) for k in (2e4, 5e4))
