@@ -129,4 +129,5 @@ class Friction:
 def damped_share(force: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     """What share of its damping a pair has, from 0 to 1, by its normal force at the start of the step [N]."""
     whole = force + FADE * kappa * dhat
-    return force / whole.clamp(min=torch.finfo(force.dtype).tiny)  # without a barrier there is no damping
+    some = whole > 0  # without a barrier there is no damping, and no derivative of a quotient of zeros
+    return torch.where(some, force / torch.where(some, whole, 1.0), 0.0)

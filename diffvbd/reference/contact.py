@@ -151,7 +151,8 @@ class LaggedPairForces:
         kappa = pairs.per_pair(scene.parameter("pair_barrier", model.contact, "kappa"))
         _, first, _ = log_barrier(gap, kappa, pairs.dhat)
         force = -e * first
-        share = force / (force + FADE * kappa * pairs.dhat).clamp(min=torch.finfo(force.dtype).tiny)
+        whole = force + FADE * kappa * pairs.dhat
+        share = torch.where(whole > 0, force / torch.where(whole > 0, whole, 1.0), 0.0)
         self.damping = share * pairs.per_pair(scene.parameter("pair_barrier", model.contact, "damping"))
         friction = getattr(model, "friction", None)
         self.largest, self.reach = None, 0.0  # mu_f lambda [N], and the slip [m] from which friction is that large

@@ -20,7 +20,7 @@ from ..step.arguments import Prepared, acceleration_of
 GAIN = 0.05  # of the energy that a scene had and that gravity gave it, which a rollout may gain without a word
 GAIN_TOUCHING = 1.0  # the same where barriers are: what is pressed together at the start may come apart
 WARNED = "warned_of_energy"  # of a Model's _derived: one warning is enough for all of its rollouts
-ENDED = "ended"  # the same, on CUDA: whether its latest rollout ended finite, on its way to the host
+ENDED = "ended"  # the same, on CUDA: whether its latest rollouts ended finite, on the way to the host
 LOOKS, LOOKS_TOUCHING = 3, 64  # at a rollout, unasked
 SEEN = "rollouts_seen"  # the same: its rollouts that could have been looked at
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: its looks cost as much as some steps
@@ -35,7 +35,7 @@ def warn_of_end(model: Model, x: Tensor, v: Tensor) -> None:
     """Warns (UserWarning) of a rollout that ended with numbers that are not finite; the caller's caller is shown.
 
     On CUDA, where looking waits for the device, the answer is copied to the host meanwhile, and the Model's next
-    rollout says what it was. Nothing that is compiled, transformed or captured is looked at.
+    rollout that finds it there says what it was. Nothing that is compiled, transformed or captured is looked at.
     """
     if looks_at(x):
         if not (bool(torch.isfinite(x).all()) and bool(torch.isfinite(v).all())):
@@ -46,18 +46,17 @@ def warn_of_end(model: Model, x: Tensor, v: Tensor) -> None:
         said.copy_(good, non_blocking=True)
         done = torch.cuda.Event()
         done.record(torch.cuda.current_stream(x.device))
-        model._derived[ENDED] = (said, done)
+        model._derived.setdefault(ENDED, []).append((said, done))
 
 
 def warn_of_last_end(model: Model, x: Tensor) -> None:
-    """Warns of the Model's rollout before this one, on CUDA; the caller's caller is shown."""
-    if ENDED not in model._derived or not _copies(x):
+    """Warns of the Model's rollouts before this one, on CUDA, as far as they are done; the caller's caller is shown."""
+    if not model._derived.get(ENDED) or not _copies(x):
         return
-    said, done = model._derived[ENDED]
-    if done.query():
-        del model._derived[ENDED]
-        if not bool(said):
-            _warn_not_finite("the rollout of this Model before this one")
+    ends = [(said, done.query()) for said, done in model._derived[ENDED]]
+    model._derived[ENDED] = [end for end, (_, there) in zip(model._derived[ENDED], ends, strict=True) if not there]
+    if not all(bool(said) for said, there in ends if there):
+        _warn_not_finite("a rollout of this Model before this one")
 
 
 def _copies(x: Tensor) -> bool:

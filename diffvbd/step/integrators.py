@@ -66,8 +66,8 @@ Integrator = ImplicitEuler | SDIRK2 | BDF2
 
 class History(NamedTuple):
     """What :class:`BDF2` knows of the step before a state: by how much it moved every vertex [m], the velocity before
-    it [m/s], both [..., V, 3], whether it is smooth, bool [..., V]: False where a body may have touched something; and
-    its time step [s].
+    it [m/s], both [..., V, 3], whether it is smooth, bool [..., V]: False where contact made a body take implicit
+    Euler; and its time step [s].
     """
 
     moved: Tensor
@@ -210,7 +210,8 @@ def _over(whole: Prepared, share: float) -> Prepared:
 
 
 def _touching(model: Model, x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any]) -> Tensor | None:
-    """Whether the body of each vertex may touch something in the step, bool [..., V]."""
+    """Whether the body of each vertex may touch something that the step does not resolve, bool [..., V]; None: there is
+    nothing to touch."""
     if model.floor is None and model.contact is None:
         return None
     with torch.no_grad():

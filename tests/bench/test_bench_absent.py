@@ -45,7 +45,7 @@ def test_quick(tmp_path: Path) -> None:
     results = json.loads((tmp_path / "absent.json").read_text())["results"]
     rows = {row["feature"]: row for row in results["rows"]}
     assert results["plain"]["kept"] == 0
-    assert {name: row["in_plain"] for name, row in rows.items()} == dict.fromkeys(absent.FEATURES, 0)
+    assert list(rows) == list(absent.FEATURES) and set(results["plain"]["own"]) == {"diffvbd::begin", "diffvbd::sweep"}
     for name, operators in CALLED.items():
         assert operators <= {key.split("::")[1] for key in rows[name]["own"]}, name
     assert all((row["kept"] > 0) == name.startswith("gradient") for name, row in rows.items())

@@ -129,6 +129,19 @@ def test_scenes_over_two_dimensions_with_a_material_each() -> None:
     assert settings.predicted is not None and settings.predicted.reached
 
 
+@pytest.mark.parametrize(("poisson", "over"), [(0.3, True), (0.4999, False)])
+def test_nothing_is_over_relaxed_where_a_tet_is_nearly_incompressible(poisson: float, over: bool) -> None:
+    """Moduli of each tet, and as functions of time."""
+    model, _ = cantilever(1e5)
+    x = model.rest_points
+    young = torch.linspace(1e5, 2e5, model.num_tets, dtype=x.dtype)
+    ratios = torch.full_like(young, 0.3)
+    ratios[3] = poisson
+    for given in ({"young": young, "poisson": ratios}, {"young": lambda t: young, "poisson": lambda t: ratios}):
+        settings = dv.advise(model, x, torch.zeros_like(x), duration=0.02, error=0.3, patience=2.0, **given)
+        assert ("relaxation" in str(settings)) == over
+
+
 def test_an_impact_that_long_steps_lose_is_not_taken_for_motion() -> None:
     """In long steps a cube that meets another one loses its rebound, and runs of h and h/2 agree on that."""
     one = mesh.box(2, 0.1)

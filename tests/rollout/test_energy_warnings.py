@@ -38,7 +38,9 @@ def messages(run: Any) -> list[str]:
 # --- energy -----------------------------------------------------------------------------------------------------------
 
 
-def test_energy_is_that_of_the_reference() -> None:
+@pytest.mark.parametrize("chunk", [3, energy_check.LEAST_CHUNK])  # tets that are looked at together
+def test_energy_is_that_of_the_reference(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+    monkeypatch.setattr(energy_check, "LEAST_CHUNK", chunk)
     model, x, v = bent()
     x = x + 0.01 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
     mu, lam = (torch.linspace(1e4, k, model.num_tets, dtype=x.dtype) for k in (2e4, 5e4))
@@ -134,15 +136,15 @@ def test_an_end_that_is_no_number_is_warned_of() -> None:
 
 
 def test_the_next_rollout_says_it_where_the_device_was_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on CUDA: a copy that is not there yet is asked for again later."""
+    """As on CUDA: a copy that is not there yet is asked for again later, whatever ends meanwhile."""
     model, x, v = bent()
     monkeypatch.setattr(energy_check, "_copies", lambda x: True)
     ready = SimpleNamespace(query=lambda: there)
-    model._derived[energy_check.ENDED] = (torch.tensor(False), ready)
+    model._derived[energy_check.ENDED] = [(torch.tensor(good), ready) for good in (True, False, True)]
     there = False
     assert messages(lambda: dv.rollout(model, x, v, steps=1, **SOFT)) == []
     there = True
-    with pytest.warns(UserWarning, match="the rollout of this Model before this one ended") as found:
+    with pytest.warns(UserWarning, match="a rollout of this Model before this one ended") as found:
         dv.rollout(model, x, v, steps=1, **SOFT)
     assert found[0].filename == __file__
     assert messages(lambda: dv.rollout(model, x, v, steps=1, **SOFT)) == []
