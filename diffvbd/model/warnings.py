@@ -65,10 +65,15 @@ def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
 
 
 def _warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> None:
-    if "over-relaxed" in model._derived or model.relaxation <= 1:
+    """Moduli may change from step to step: those of the 1st, 2nd, 4th, 8th, ... are looked at."""
+    seen = model._derived.get("over-relaxed", 0) + 1  # 0: it has warned
+    if seen == 1 and "over-relaxed" in model._derived or model.relaxation <= 1:
         return
-    model._derived["over-relaxed"] = True
-    if any(isinstance(e, StableNeoHookean) for e in model.energies) and is_nearly_incompressible(mu, lam):
+    model._derived["over-relaxed"] = seen
+    if seen & (seen - 1) or not any(isinstance(e, StableNeoHookean) for e in model.energies):
+        return
+    if is_nearly_incompressible(mu, lam):
+        model._derived["over-relaxed"] = 0
         warnings.warn(
             f"relaxation: {model.relaxation:g} where lam is more than {INCOMPRESSIBLE:g} times mu (Poisson's ratio "
             "above 0.492): such rollouts were seen to gain energy without bound; take relaxation=1, with "

@@ -123,6 +123,19 @@ def test_over_relaxation_of_nearly_incompressible_material(
         assert "take relaxation=1" in str(found[0].message) and found[0].filename == __file__
 
 
+def test_a_fit_that_comes_to_be_nearly_incompressible_is_warned_of_once() -> None:
+    model = dv.Model(dv.mesh.box(3, 0.1), relaxation=1.5)
+    said = []
+    for poisson in (0.3, 0.499, 0.499, 0.499, 0.499):
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            dv.step(
+                model, model.rest_points, 0 * model.rest_points, time_step=1e-3, sweeps=5, young=1e5, poisson=poisson
+            )
+        said.append(len(found))
+    assert said == [0, 1, 0, 0, 0]
+
+
 def test_what_it_warns_of_grows_and_the_remedy_does_not() -> None:
     mesh = dv.mesh.beam(7, 3, 3, size=(0.6, 0.15, 0.15))
     fastest = {}
