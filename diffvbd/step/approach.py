@@ -49,9 +49,9 @@ def _extrapolates(model: Model, prepared: Prepared) -> bool:
 
 def _resolved(gap: Tensor, kappa: Tensor, dhat: Tensor, way: Tensor, mass: Tensor, h: float) -> Tensor:
     """Whether a step of h resolves a barrier, so that its force may be extrapolated: its sides move by less than the
-    gap [m], and its curvature, over masses [kg], vibrates slowly."""
+    gap [m], and its curvature where they may end, over masses [kg], vibrates slowly."""
     slow = way < SLOW * torch.minimum(gap, dhat)
-    return slow & (h * h * barrier_curvature(gap, kappa, dhat) < SOFT * mass)
+    return slow & (h * h * barrier_curvature(gap - way, kappa, dhat) < SOFT * mass)
 
 
 def _near_floor(model: Model, begun: Begun, prepared: Prepared, way: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from helpers.marks import slow
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import colliders
+from diffvbd import colliders, reference
 from diffvbd.testing import generator, relative_error, tolerance
 
 SECOND = (dv.SDIRK2(), dv.BDF2())
@@ -150,6 +150,27 @@ def test_impacts_gain_no_energy(integrator: Any, kind: str, time_step: float) ->
     bound = tolerance("energy_gain") if time_step < 0.005 else 0.02
     assert float(most.max()) <= bound and float(lowest.min()) > 0
     assert float(lowest.median()) < 0.01, "few have landed"
+
+
+def test_a_stiff_barrier_that_begins_within_a_step_is_not_extrapolated() -> None:
+    """Tilted cubes at 1 m/s, whose gaps close from dhat, where the barrier has no curvature yet, to far below it."""
+    dhat, count = 5e-3, 6
+    model = dv.Model(dv.mesh.cube(5, size=0.2), energies=(dv.StableNeoHookean(), dv.FloorBarrier(kappa=2e6, dhat=dhat)))
+    c, s = math.cos(0.2), math.sin(0.2)
+    x = model.rest_points @ torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    x = x.repeat(count, 1, 1)
+    x[..., 1] += 1.4 * dhat - x[..., 1].min() + torch.linspace(0, 4e-3, count, dtype=x.dtype)[:, None]
+    v = torch.zeros_like(x)
+    v[..., 1] = -1.0
+    end = dv.rollout(model, x, v, mu=1e5, lam=2e5, time_step=1e-3, sweeps=5, steps=20, gravity=(0.0, 0.0, 0.0),
+                     integrator=dv.SDIRK2())  # fmt: skip
+
+    def energy(x: Tensor, v: Tensor) -> Tensor:
+        stored = torch.stack([reference.incremental_potential(model, a, a, 1e5, 2e5, 1.0) for a in x])
+        return stored + 0.5 * (model.mass[:, None] * v.square()).sum((-1, -2))
+
+    found = torch.stack([energy(*state) for state in zip(end.x, end.v, strict=True)])
+    assert float((found / found[0]).max()) <= 1 + tolerance("energy_gain")
 
 
 @pytest.mark.parametrize("kind", ("bare floor", slow("bare plane")))
