@@ -85,9 +85,11 @@ def ladder(
     rungs: int,
     frames: int,
     distance: Callable[[NDArray[np.float64]], float],
+    v: NDArray[np.float64],
     device: str = "cpu",
 ) -> list[dict[str, Any]]:
-    """Time and error of a motion from rest under gravity with ever more steps; `distance` is of its frames [F, V, 3].
+    """Time and error of a motion under gravity with ever more steps; `distance` is of its frames [F, V, 3], v the
+    velocity at first [V, 3].
 
     Raises ImportError where Newton is not installed.
     """
@@ -98,6 +100,7 @@ def ladder(
         solver = newton.solvers.SolverVBD(model, iterations=count)
         for rung in range(-1, rungs):  # the first compiles
             steps, states, seen = frames * 2 ** max(rung, 0), [model.state(), model.state()], []
+            states[0].particle_qd.assign(v.astype(np.float32))
             warp.synchronize_device(device)
             start = time.perf_counter()
             for n in range(1, steps + 1):

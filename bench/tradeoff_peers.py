@@ -126,6 +126,6 @@ def newtons(scene: Scene, distance: Distance, quick: bool) -> list[Row]:
         material = float(scene.given["mu"]), float(scene.given["lam"])
         return newton.ladder(scene.model.mesh, scene.model.pinned.numpy(), material, scene.duration,
                              (2,) if quick else (5, 20, 80), 1 if quick else 6, FRAMES,
-                             lambda x: distance(torch.as_tensor(x)))  # fmt: skip
+                             lambda x: distance(torch.as_tensor(x)), scene.v.numpy())  # fmt: skip
     except ImportError as error:
         return [{"solver": "Newton SolverVBD", "note": f"not available ({error})"}]

@@ -18,8 +18,9 @@ DHAT = 2e-3  # [m]
 ELASTIC = dv.StableNeoHookean()
 
 
-def cantilever(mu: float, poisson: float = 1 / 3, contrast: float = 1.0, name: str = "") -> Scene:
-    """A beam of 0.6 m held at one end, some swings of it; `contrast`: of its two halves' stiffness, in layers."""
+def cantilever(mu: float, poisson: float = 1 / 3, contrast: float = 1.0, speed: float = 0.0, name: str = "") -> Scene:
+    """A beam of 0.6 m held at one end, some swings of it. contrast: of its two halves' stiffness, in layers; speed:
+    of its free end at first [m/s], where it would hardly sag."""
     body = mesh.beam(13, 4, 4, size=(0.6, 0.15, 0.15))
     model = dv.Model(body, pinned=torch.tensor(body.points[:, 0] < 1e-9))
     lam = 2 * mu * poisson / (1 - 2 * poisson)
@@ -27,8 +28,10 @@ def cantilever(mu: float, poisson: float = 1 / 3, contrast: float = 1.0, name: s
     scale = torch.tensor(share) if contrast > 1 else torch.tensor(1.0, dtype=torch.float64)
     swing = math.sqrt(1e5 / mu)
     duration = float(np.clip(0.4 * swing, 0.02, 0.4))
-    return Scene(name or f"cantilever, mu = {mu:.0e} Pa", model, torch.zeros_like(model.rest_points), duration,
-                 {"mu": mu * scale, "lam": lam * scale})  # fmt: skip
+    v = torch.zeros_like(model.rest_points)
+    v[:, 1] = speed * (model.rest_points[:, 0] / 0.6) ** 2
+    material = {"mu": mu * scale, "lam": lam * scale}
+    return Scene(name or f"cantilever, mu = {mu:.0e} Pa", model, v, duration, material)
 
 
 def cloth() -> Scene:
@@ -106,7 +109,7 @@ def gripper(**barrier: Any) -> Scene:
 
 SCENES: dict[str, Callable[[], Scene]] = {
     "soft": lambda: cantilever(1e4),
-    "stiff": lambda: cantilever(1e8),
+    "stiff": lambda: cantilever(1e8, speed=5.0),
     "cloth": cloth,
     "contrast": lambda: cantilever(1e5, contrast=1e6, name="contrast 1e6"),
     "incompressible": lambda: cantilever(1e5, poisson=0.4999, name="nu = 0.4999"),
