@@ -16,7 +16,7 @@ from .rooms import Motion
 
 MARGIN = 2.0  # of the ways that vertices want to go, which forces within bodies change
 LEAST = 0.25  # of dhat
-# What a step resolves. Of 1,200 impacts none gained energy up to twice and three times these (docs/method.md, 19).
+# What a step resolves: bounds within which no impact of bench/integrators.py gains energy (docs/method.md, 19).
 SLOW = 1.0  # of a gap: ways of its sides
 SOFT = 10.0  # of the mass: h^2 times a barrier's curvature
 
