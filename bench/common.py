@@ -24,10 +24,12 @@ RESULTS = Path(__file__).parent / "results"
 
 def environment(device: str = "cpu") -> dict[str, Any]:
     """Machine and versions of a run. Names only: no host, user or path."""
-    # a copy of the tree without its history is told by this variable what it is a copy of
-    commit = _git("rev-parse", "HEAD") or os.environ.get("DIFFVBD_COMMIT")
+    # a copy of the tree is told by this variable what it is a copy of, whatever history it has
+    told = os.environ.get("DIFFVBD_COMMIT")
+    commit = told or _git("rev-parse", "HEAD")
     # what benchmarks and pages write changes nothing that the next benchmark measures
-    status = _git("status", "--porcelain", "--", ":/", ":(top,exclude)bench/results", ":(top,exclude)docs")
+    status = None if told else _git("status", "--porcelain", "--", ":/", ":(top,exclude)bench/results",
+                                    ":(top,exclude)docs")  # fmt: skip
     gpu = {} if device == "cpu" else {"driver": driver(), "cuda": torch.version.cuda}
     return {
         "device": device if device == "cpu" else torch.cuda.get_device_name(device),
