@@ -32,6 +32,7 @@ CLEAN = 0.6  # least order of two levels in a row from which contact counts as r
 AIM = 0.6  # of the wanted error that a candidate is given
 COSTS = 8.0  # times the advised rollout that all runs may take,
 FREE = 0.5  # [s] or so long
+NEAR = 10.0  # times the wanted error: runs of the ladder that are shown
 TOO_FINE = 0.1  # of the wanted error: candidates below it try fewer steps
 WHOLE = 0.95  # of what the longest steps lose at an impact: runs that lose as much do not resolve it
 ERROR, PATIENCE = 0.01, 120.0  # what is asked for where nothing else is [-], [s]
@@ -227,8 +228,10 @@ class _Search:
         reference = self.reference
         uncertain = (0.5 if self.clean else 1.0) * self.estimates[-1]
         self.aim = AIM * (self.error - uncertain)
-        for run in self.ladder[-4:]:
-            self.proven.append(Candidate(run.settings, self._distance(run, reference) + uncertain, run.seconds, True))
+        for run in self.ladder:
+            error = self._distance(run, reference) + uncertain
+            if error <= NEAR * self.error or run is last:
+                self.proven.append(Candidate(run.settings, error, run.seconds, True))
         self.uncertain, self.truth = uncertain, reference
         assert last.x is not None and self.ladder[-2].x is not None
         quarter = p.hardest(self.ladder[-2].x, last.x)
