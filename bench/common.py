@@ -204,6 +204,16 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
+def titled_tables(results: dict[str, list[dict[str, Any]]], titles: dict[str, str]) -> str:
+    """A table below its title for each group of rows that are alike."""
+    parts = []
+    for name, title in titles.items():
+        rows = results[name]
+        table = markdown_table([key.replace("_", " ") for key in rows[0]], [row.values() for row in rows])
+        parts.append(f"## {title}\n\n{table}")
+    return "\n".join(parts)
+
+
 def place(environment: dict[str, Any]) -> str:
     """The GPU of a run, or its processor."""
     device = environment.get("device") or "cpu"

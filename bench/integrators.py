@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import markdown_table
+from bench.common import titled_tables
 from diffvbd import colliders, reference
 
 INTEGRATORS = {"implicit Euler": dv.ImplicitEuler(), "SDIRK2": dv.SDIRK2(), "BDF2": dv.BDF2()}
@@ -127,8 +127,4 @@ def markdown(results: dict[str, Any]) -> str:
         "bounce": "Ball that bounces on a FloorBarrier for 0.1 s: error over motion, K = 8, coarse corrections",
         "impacts": "Cubes that fall on a plane: energy over that at the start, worst and median scene",
     }
-    parts = []
-    for name, title in titles.items():
-        rows = results[name]
-        parts.append(f"## {title}\n\n{markdown_table([*rows[0]], [list(r.values()) for r in rows])}")
-    return "\n".join(parts)
+    return titled_tables(results, titles)

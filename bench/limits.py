@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import markdown_table
+from bench.common import titled_tables
 from diffvbd import testing
 from diffvbd.inspect.diagnose import collapse_stretch
 
@@ -236,9 +236,4 @@ def markdown(results: dict[str, Any]) -> str:
         "paper_preset": "The paper's preset on a cube of another size: error of one step after 20 sweeps",
         "momentum": "Momentum that one unconverged step adds without the rigid correction, relative",
     }
-    parts = []
-    for name, title in titles.items():
-        rows = results[name]
-        header = [k.replace("_", " ") for k in rows[0]]
-        parts.append(f"## {title}\n\n" + markdown_table(header, [list(r.values()) for r in rows]))
-    return "\n".join(parts)
+    return titled_tables(results, titles)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from bench.common import markdown_table
+from bench.common import titled_tables
 from diffvbd.inspect.diagnose import diagnose
 
 SWEEPS = (5, 10, 20, 50, 100, 200, 500, 1000)
@@ -149,10 +149,4 @@ def markdown(results: dict[str, Any]) -> str:
         "equal_work": "The same bar 100 times stiffer, 100 sweeps per 1/60 s",
         "swinging_beam": "Cantilever of 1 m released from rest: position after 0.5 s against converged steps",
     }
-    parts = []
-    for name, title in titles.items():
-        rows = results[name]
-        parts.append(
-            f"## {title}\n\n" + markdown_table([k.replace("_", " ") for k in rows[0]], [r.values() for r in rows])
-        )
-    return "\n".join(parts)
+    return titled_tables(results, titles)

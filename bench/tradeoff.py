@@ -159,6 +159,8 @@ class Front:
         if way.settings.dtype is not None:
             model = model.to(dtype=way.settings.dtype)
         forward, both = self.pilots(False, model), self.pilots(True, model)
+        # not timed: the first checkpointed backward of a process loads torch's compiler, for seconds
+        both.run(replace(way.settings, sweeps=1), 4 * FRAMES)
         out = []
         for sweeps in way.sweeps:
             settings = replace(way.settings, sweeps=sweeps)

@@ -83,7 +83,7 @@ def rollout(
         steps: Number of steps >= 0.
         settings: In place of time_step, sweeps, integrator and of the Model's relaxation, coarse and acceleration: what
             :func:`diffvbd.advise` returned, or a :class:`diffvbd.Settings` of your own. ``"auto"`` asks for an error of
-            0.01 first, which takes some four to eight rollouts each time: for one call, not for a training loop.
+            0.01 first, which takes some rollouts, up to tens, each time: for one call, not for a training loop.
         duration: With settings, the time [s] in place of steps: as many equal steps as their time_step asks for.
         colliders: Corner points of the Model's colliders [m]: constant, they rest there; in :func:`per_step`, where
             they are at the end of each step.
