@@ -14,6 +14,8 @@ using namespace contact;
 namespace {
 
 constexpr int64_t kPairGrain = 256;  // pairs that are worth one more thread
+constexpr int64_t kRowGrain = 16;    // vertices whose pairs are
+constexpr double kRounded = 4e-6;    // of squares of lengths, that rounding cannot reach
 
 // How many of n items f says yes to.
 template <class F>
@@ -27,6 +29,35 @@ int64_t count(int64_t n, int64_t grain, const F& f) {
   return total;
 }
 
+// Whether a pair stays out of the barrier's reach whatever shares of their ways its corners go: then no round has to
+// look at it. As stays_far(), of the ends of all those ways.
+template <class T>
+bool stays_far_at_any_share(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
+  const int32_t* record = in.listed.pairs + kPairRow * pair;
+  const T* constants = in.constants + kConstants * pair;
+  const Motion<T>* m[4];
+  T size = T(0), most = T(0);
+  for (int k = 0; k < 4; ++k) {
+    if (record[k] >= in.vertices) return false;
+    m[k] = s.motion + int64_t{record[5]} * in.vertices + record[k];
+    size = size < m[k]->size ? m[k]->size : size;
+  }
+  const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - guard_of_size(size);
+  if (!(T(0) < room)) return false;
+  for (int i = 0; i < sides(record[4]); ++i) {
+    for (int j = sides(record[4]); j < 4; ++j) {
+      for (const Vec3<T>& a : {m[i]->since, m[i]->end}) {
+        for (const Vec3<T>& b : {m[j]->since, m[j]->end}) {
+          const Vec3<T> d = a - b;
+          const T square = dot(d, d);
+          most = most < square ? square : most;
+        }
+      }
+    }
+  }
+  return T(1 + kRounded) * most < room * room;
+}
+
 }  // namespace
 
 template <class T>
@@ -35,6 +66,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
   const int64_t pairs = in.listed.ptr[in.scenes * in.corners] / 4;
   std::vector<T> now(units);
   std::vector<uint8_t> blocked(units), stamp(units), failed(in.scenes);
+  std::vector<uint8_t> far(pairs);  // in all rounds of a move
   AdvanceState<T> s{share, now.data(), blocked.data(), stamp.data(), failed.data(), true};
   int64_t stuck = 0;
   // Of a vertex all pairs ask the same.
@@ -45,8 +77,27 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
       for (int64_t i = begin; i < end; ++i) motion[i] = motion_of(in, s, i);
     });
   };
+  // How many pairs of the vertices that `goes` names do not pass; each is looked at once.
+  const auto failing = [&](const auto& goes, const auto& passes) {
+    return count(rows, kRowGrain, [&](int64_t row) {
+      if (!goes(row)) return int64_t{0};
+      const int64_t scene = row / in.vertices, corner = scene * in.corners + row % in.vertices;
+      int64_t found = 0;
+      for (int32_t e = in.listed.ptr[corner]; e < in.listed.ptr[corner + 1]; ++e) {
+        const int64_t pair = in.listed.entry[e] >> 2;
+        const int32_t* record = in.listed.pairs + kPairRow * pair;
+        bool looked = far[pair];
+        for (int k = 0; k < (in.listed.entry[e] & 3) && !looked; ++k) {
+          looked = record[k] < in.vertices && goes(scene * in.vertices + record[k]);
+        }
+        if (!looked) found += !passes(pair);
+      }
+      return found;
+    });
+  };
   for (int move = 0; move < kMoves; ++move) {
     s.first = move == 0;
+    std::fill(far.begin(), far.end(), 0);
     std::fill(failed.begin(), failed.end(), 0);
     bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
     for (int64_t i = 0; i < units; ++i) begin_move(s, i);
@@ -57,9 +108,19 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
         return !passes;
       };
       look();
-      const int64_t found = count(pairs, kPairGrain, [&](int64_t i) {
-        return fails(in.listed.pairs[kPairRow * i + 5], try_pair(in, s, i, last ? 0 : round));
-      });
+      const auto passes = [&](int64_t i) {
+        far[i] = far[i] || (round == 0 && stays_far_at_any_share(in, s, i));
+        return far[i] || !fails(in.listed.pairs[kPairRow * i + 5], try_pair(in, s, i, last ? 0 : round));
+      };
+      int64_t found;
+      if (last || (s.first && round == 0)) {
+        found = count(pairs, kPairGrain, [&](int64_t i) { return !passes(i); });
+      } else if (round == 0) {  // what the moves before have taken all the way does not move again
+        const auto open = [&](int64_t row) { return !in.held[row % in.vertices] && share[in.unit(row)] < T(1); };
+        found = failing(open, passes);
+      } else {
+        found = failing([&](int64_t row) { return stamp[in.unit(row)] == round; }, passes);
+      }
       const int64_t left =
           count(rows, kGrain, [&](int64_t i) { return fails(i / in.vertices, stay(in, s, i, last ? 0 : round)); });
       clean = round == 0 && found + left == 0;
@@ -69,7 +130,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
     for (int64_t i = 0; i < units; ++i) give_up(in, s, i);
     if (s.first && !clean) {
       look();
-      stuck = count(pairs, kPairGrain, [&](int64_t pair) { return !try_pair(in, s, pair, 0); });
+      stuck = count(pairs, kPairGrain, [&](int64_t i) { return !far[i] && !try_pair(in, s, i, 0); });
     }
     bool open = false;
     for (int64_t i = 0; i < units; ++i) {
