@@ -118,13 +118,14 @@ def stamp(environment: dict[str, Any]) -> dict[str, Any]:
 def side_by_side(measure: Callable[..., Any], cases: Iterable[Any], *arguments: Any, at_once: bool
                  ) -> Iterator[tuple[Any, Any]]:  # fmt: skip
     """Each case with measure(case, *arguments), as they are done, with one thread each; at once: on as many cores as
-    there are."""
+    this process may use."""
     if not at_once:
         for case in cases:
             yield case, measure(case, *arguments)
         return
     os.environ["OMP_NUM_THREADS"] = "1"  # read when a process starts
-    with ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn")) as pool:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    with ProcessPoolExecutor(cores, multiprocessing.get_context("spawn")) as pool:
         tasks = {pool.submit(measure, case, *arguments): case for case in cases}
         for task in as_completed(tasks):
             yield tasks[task], task.result()

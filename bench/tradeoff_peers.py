@@ -1,6 +1,7 @@
-"""Other solvers on the cantilevers of `bench tradeoff`: converged steps, unrolled autograd, XPBD, projective dynamics.
+"""Other solvers on the cantilevers of `bench tradeoff`: converged steps, steps in other precisions, unrolled autograd,
+XPBD, projective dynamics.
 
-The first two have the law of the scene and its reference. XPBD (springs along edges) and projective dynamics (tets that
+The first three have the law of the scene and its reference. XPBD (springs along edges) and projective dynamics (tets that
 resist rotation-free change) have laws of their own, so each is held against its own limit of short steps and many
 iterations: what it takes to resolve what it models. Newton's SolverVBD takes part where it is installed.
 """
@@ -61,6 +62,7 @@ def peers(scene: Scene, distance: Distance, quick: bool) -> list[Row]:
     mu = float(torch.as_tensor(scene.given["mu"]))
     return [
         *converged(scene, distance, rungs),
+        *precisions(scene, distance, rungs),
         *unrolled(scene, quick),
         *against_itself("XPBD, springs", _xpbd(model, mu), scene, (2,) if quick else (5, 20), rungs),
         *against_itself("projective dynamics", _projective(model, mu), scene, (2,) if quick else (5, 20), rungs),
@@ -83,6 +85,33 @@ def converged(scene: Scene, distance: Distance, rungs: int) -> list[Row]:
             frames, seconds = framed(step, scene.model.rest_points, scene.v, steps, scene.duration, 5000)
             rows.append({"solver": "dv.solve", "iterations": "to 1e-4", "steps": steps, "ms": 1e3 * seconds,
                          "error": distance(frames), "note": "implicit Euler"})  # fmt: skip
+    return rows
+
+
+def precisions(scene: Scene, distance: Distance, rungs: int) -> list[Row]:
+    """The same steps in double, in single, and in single precision with a state that is kept in double."""
+    double = scene.model.replace(relaxation=1.5, coarse=dv.CoarseSpace())
+    single = double.to(dtype=torch.float32)
+    given = {name: value.float() if isinstance(value, Tensor) else value for name, value in scene.given.items()}
+
+    def stepped(model: dv.Model, material: dict[str, Any], keeps: bool) -> Step:
+        def step(x: Tensor, v: Tensor, h: float, sweeps: int) -> tuple[Tensor, Tensor]:
+            at, speed = x.to(model.dtype), v.to(model.dtype)
+            end = dv.step(model, at, speed, time_step=h, sweeps=sweeps, integrator=dv.SDIRK2(), **material)
+            return (x + (end[0] - at).to(x), v + (end[1] - speed).to(v)) if keeps else end
+
+        return step
+
+    ways = [("float64", stepped(double, scene.given, False)), ("float32", stepped(single, given, False)),
+            ("float32 sweeps, float64 state", stepped(single, given, True))]  # fmt: skip
+    rows = []
+    with torch.no_grad():
+        for name, step in ways:
+            for rung in range(rungs):
+                steps = FRAMES * 2**rung
+                frames, seconds = framed(step, scene.model.rest_points, scene.v, steps, scene.duration, 8)
+                rows.append({"solver": name, "iterations": 8, "steps": steps, "ms": 1e3 * seconds,
+                             "error": distance(frames.double()), "note": "SDIRK2, coarse"})  # fmt: skip
     return rows
 
 

@@ -3,7 +3,8 @@
 1. Ladder: settings that converge well run with ever more steps, twice as many each time, until two runs and the order
    that three show (Richardson) say that half of the wanted error is reached. Its last two runs give the reference.
 2. Ranking: candidates run the quarter of the duration in which the ladder's runs part most, from the reference's own
-   state there. Error and time of each, and the order, predict with how many steps it meets the wanted error.
+   state there; with contact all of it. Error and time of each, and the order, predict with how many steps it meets the
+   wanted error.
 3. Proof: the one that should take the least time runs the whole duration and is compared with the reference; with more
    steps if it misses the error, with fewer if it is far below, or the next one. The ladder's last run always meets it.
 """
@@ -11,6 +12,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +22,7 @@ from ..energies import StableNeoHookean
 from ..model.anderson import Anderson
 from ..model.model import Model
 from ..model.warnings import is_nearly_incompressible
-from ..step.integrators import SDIRK2, ImplicitEuler
+from ..step.integrators import BDF2, SDIRK2, ImplicitEuler, Integrator
 from .pilots import FRAMES, Pilot, Pilots, relative
 from .settings import Candidate, Prediction, Settings
 
@@ -31,8 +33,10 @@ ORDERS = (0.5, 2.0)  # that are believed
 CLEAN = 0.6  # least order of two levels in a row from which contact counts as resolved
 AIM = 0.6  # of the wanted error that a candidate is given
 COSTS = 8.0  # times the advised rollout that all runs may take,
-FREE = 0.5  # [s] or so long
+FREE = 0.5  # [s] or so long,
+MORE = 2.0  # or so many times what the ladder has taken: where that is long, faster settings are worth looking for
 NEAR = 10.0  # times the wanted error: runs of the ladder that are shown
+SAFE = 0.8  # of the wanted error that a run with impacts may show: the runs it is held against show less than there is
 TOO_FINE = 0.1  # of the wanted error: candidates below it try fewer steps
 WHOLE = 0.95  # of what the longest steps lose at an impact: runs that lose as much do not resolve it
 ERROR, PATIENCE = 0.01, 120.0  # what is asked for where nothing else is [-], [s]
@@ -55,15 +59,23 @@ def start_of(pilots: Pilots) -> Settings:
 
 
 def candidates_of(pilots: Pilots) -> list[Settings]:
-    model, sdirk, euler = pilots.model, SDIRK2(), ImplicitEuler()
+    """What might be faster than the ladder's settings, the likeliest first."""
+    model, second, euler = pilots.model, (SDIRK2(), BDF2()), ImplicitEuler()
     touches = model.contact is not None or model.friction is not None
     free = not touches and _exact(model) and _may_over_relax(pilots)
     over, over_coarse = (1.6, 1.5) if free else (1.0, 1.0)
-    out = [Settings(1.0, k, scheme, relaxation=over) for scheme in (sdirk, euler) for k in (5, 10, 20)]
+
+    def plain(scheme: Integrator, *sweeps: int) -> list[Settings]:
+        return [Settings(1.0, k, scheme, relaxation=over) for k in sweeps]
+
+    def coarse(scheme: Integrator, *sweeps: int) -> list[Settings]:
+        return [Settings(1.0, k, scheme, relaxation=over_coarse, coarse="auto") for k in sweeps]
+
+    out = []
     if _exact(model) and not touches:
-        out += [Settings(1.0, k, sdirk, relaxation=over_coarse, coarse="auto") for k in (2, 5)]
-        out += [Settings(1.0, 2, euler, relaxation=over_coarse, coarse="auto")]
-    elif _exact(model):
+        out += [*coarse(second[0], 2, 5), *coarse(second[1], 2), *coarse(euler, 2)]
+    out += [*plain(second[0], 10, 5, 20), *plain(second[1], 10, 5), *plain(euler, 5, 10, 20), *plain(second[1], 20)]
+    if _exact(model) and touches:
         out += [Settings(1.0, 20, euler, acceleration=Anderson(5))]
     return out
 
@@ -84,6 +96,7 @@ class _Search:
         self.order = 1.0
         # impacts come early or late by up to a step: nothing can be extrapolated until steps resolve them
         self.smooth = not (pilots.model.touches or pilots.model.floor is not None)
+        self.most = error if self.smooth else SAFE * error  # that a run may show
         self.clean = self.smooth  # whether the last two runs can be extrapolated
         self.ladder: list[Pilot] = []
         self.estimates: list[float] = []  # of each level from the third on, of what is asked for
@@ -96,7 +109,7 @@ class _Search:
             self._rank()
             self._prove()
             self.proven.sort(key=lambda c: c.seconds)
-            best = next(c for c in self.proven if c.error <= self.error)
+            best = next(c for c in self.proven if c.error <= self.most)
             why = self._reason(best)
         else:
             error = self.estimates[-1] if self.estimates else math.inf
@@ -233,29 +246,51 @@ class _Search:
             if error <= NEAR * self.error or run is last:
                 self.proven.append(Candidate(run.settings, error, run.seconds, True))
         self.uncertain, self.truth = uncertain, reference
-        assert last.x is not None and self.ladder[-2].x is not None
-        quarter = p.hardest(self.ladder[-2].x, last.x)
-        # with as many steps as the ladder would take for the wanted error
-        steps = self.ladder[-2].steps
-        own = p.run(self.ladder[-2].settings, steps, quarter, last)
-        target = last.x[quarter + 1]
-        scale = self._of_quarter(own, target)
-        level = max(self._distance(self.ladder[-2], reference), 1e-300)
+        self.climbed = p.spent
+        # with as many steps as the ladder takes for an error as wanted
+        level, near = self._level_near(reference)
+        predict = self._by_quarter(level, near) if self.smooth else self._by_whole
         self.plans: list[tuple[float, int, Settings]] = []
         for settings in candidates_of(p):
-            if p.spent > max(0.6 * COSTS * self._least(), FREE):
+            if p.spent - self.climbed > 0.6 * (self._allowed(self._least()) - self.climbed):
                 break
+            error, per_step = predict(settings, near.steps)
+            if math.isfinite(error):
+                self._plan(settings, near.steps, error, per_step)
+
+    def _by_quarter(self, level: float, near: Pilot) -> Callable[[Settings, int], tuple[float, float]]:
+        """The error of settings, and the time of a step, by the quarter of the duration in which steps matter most."""
+        p, last, before = self.pilots, self.ladder[-1], self.ladder[-2]
+        assert last.x is not None and before.x is not None
+        quarter = p.hardest(before.x, last.x)
+        target = last.x[quarter + 1]
+        scale = self._of_quarter(p.run(near.settings, near.steps, quarter, last), target)
+
+        def predict(settings: Settings, steps: int) -> tuple[float, float]:
             run = p.run(settings, steps, quarter, last)
-            if run.x is None:
-                continue
-            error = level * self._of_quarter(run, target) / max(scale, 1e-300)
-            self._plan(settings, steps, error, run.seconds / steps)
+            return level * self._of_quarter(run, target) / max(scale, 1e-300), run.seconds / steps
+
+        return predict
+
+    def _by_whole(self, settings: Settings, steps: int) -> tuple[float, float]:
+        """The same by the whole duration: after an impact that no step resolves a quarter says nothing of the rest."""
+        run = self.pilots.run(settings, steps)
+        if run.x is None:
+            return math.inf, 0.0
+        error = self._distance(run, self.truth)
+        self.proven.append(Candidate(run.settings, error + self.uncertain, run.seconds, True))
+        return error, run.seconds / steps
+
+    def _level_near(self, reference: Pilot) -> tuple[float, Pilot]:
+        """The error nearest to the wanted one of a run of the ladder before its last, and that run."""
+        levels = [(max(self._distance(run, reference), 1e-300), run) for run in self.ladder[:-1]]
+        return min(levels, key=lambda level: abs(math.log(level[0] / self.error)))
 
     def _of_quarter(self, run: Pilot, target: Tensor) -> float:
         return math.inf if run.x is None else float((run.x[-1] - target).square().mean().sqrt())
 
     def _plan(self, settings: Settings, steps: int, error: float, per_step: float) -> None:
-        order = self.order if isinstance(settings.integrator, SDIRK2) else min(self.order, 1.0)
+        order = self._order_of(settings)
         more = (max(error, 1e-300) / self.aim) ** (1 / order)
         wanted = self._rounded(steps * more)
         if wanted <= MOST_STEPS:
@@ -263,28 +298,35 @@ class _Search:
             planned = settings.on(wanted, self.pilots.duration)
             self.predicted.append(Candidate(planned, self.aim + self.uncertain, wanted * per_step, False))
 
+    def _order_of(self, settings: Settings) -> float:
+        return min(self.order, 1.0) if isinstance(settings.integrator, ImplicitEuler) else self.order
+
     @staticmethod
     def _rounded(steps: float) -> int:
         return FRAMES * max(1, math.ceil(min(steps, 2.0 * MOST_STEPS) / FRAMES))
 
     def _least(self) -> float:
         """Time of the fastest proven candidate that keeps the error."""
-        return min((c.seconds for c in self.proven if c.error <= self.error), default=math.inf)
+        return min((c.seconds for c in self.proven if c.error <= self.most), default=math.inf)
+
+    def _allowed(self, seconds: float) -> float:
+        """How long all runs may take [s] for settings that take ``seconds``."""
+        return max(COSTS * seconds, FREE, MORE * self.climbed)
 
     def _prove(self) -> None:
         p = self.pilots
         for seconds, steps, settings in sorted(self.plans, key=lambda plan: plan[0]):
             for _ in range(3):
-                if seconds > 0.9 * self._least() or p.spent + seconds > max(COSTS * min(self._least(), seconds), FREE):
+                if seconds > 0.9 * self._least() or p.spent + seconds > self._allowed(min(self._least(), seconds)):
                     break
                 run = p.run(settings, steps)
                 if run.x is None:
                     break
                 error = self._distance(run, self.truth) + self.uncertain
                 self.proven.append(Candidate(run.settings, error, run.seconds, True))
-                if error <= self.error and error - self.uncertain >= TOO_FINE * self.error:
+                if error <= self.most and error - self.uncertain >= TOO_FINE * self.error:
                     break
-                order = self.order if isinstance(settings.integrator, SDIRK2) else min(self.order, 1.0)
+                order = self._order_of(settings)
                 more = ((error - self.uncertain) / self.aim) ** (1 / order)
                 steps, before = self._rounded(steps * min(max(more, 0.25), 4.0)), steps
                 if steps == before:
