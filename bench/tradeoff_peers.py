@@ -1,8 +1,8 @@
 """Other solvers on the cantilevers of `bench tradeoff`: converged steps, steps in other precisions, unrolled autograd,
 XPBD, projective dynamics.
 
-The first three have the law of the scene and its reference. XPBD (springs along edges) and projective dynamics (tets that
-resist rotation-free change) have laws of their own, so each is held against its own limit of short steps and many
+The first three have the law of the scene and its reference. XPBD (springs along edges) and projective dynamics (tets
+that resist rotation-free change) have laws of their own, so each is held against its own limit of short steps and many
 iterations: what it takes to resolve what it models. Newton's SolverVBD takes part where it is installed.
 """
 
