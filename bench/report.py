@@ -24,8 +24,6 @@ ORDER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's com
 BEGIN, END = "<!-- figures: begin, written by python -m bench report -->", "<!-- figures: end -->"
 # Files of bench/results that `report` would refuse, and why they stand all the same; run again, they come off the list.
 KNOWN = {
-    "absent-cuda.json": "Measured on a copy of 545e1bdd1f whose history named another commit.",
-    "tradeoff.json": "All but soft and stiff were measured on a copy of b01ccf1c4d whose history named another commit.",
     "gpu.json": "The groups grid and newton were measured at 77dba6f90b beside changes that were not committed, on an "
     "H100; to be run again.",
 }

@@ -33,7 +33,7 @@ ORDERS = (0.5, 2.0)  # that are believed
 CLEAN = 0.6  # least order of two levels in a row from which contact counts as resolved
 AIM = 0.6  # of the wanted error that a candidate is given
 COSTS = 8.0  # times the advised rollout that all runs may take,
-FREE = 0.5  # [s] or so long,
+FREE = 1.0  # [s] or so long,
 MORE = 2.0  # or so many times what the ladder has taken: where that is long, faster settings are worth looking for
 NEAR = 10.0  # times the wanted error: runs of the ladder that are shown
 SAFE = 0.8  # of the wanted error that a run with impacts may show: the runs it is held against show less than there is
@@ -311,7 +311,7 @@ class _Search:
 
     def _allowed(self, seconds: float) -> float:
         """How long all runs may take [s] for settings that take ``seconds``."""
-        return max(COSTS * seconds, FREE, MORE * self.climbed)
+        return min(max(COSTS * seconds, FREE, MORE * self.climbed), self.patience)
 
     def _prove(self) -> None:
         p = self.pilots
