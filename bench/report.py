@@ -1,5 +1,5 @@
 """`python -m bench report`: every result of bench/results as docs/results.md, logs of inverse problems as
-docs/tasks.md, and figures into docs/performance.md."""
+docs/tasks.md, and figures into docs/performance.md and docs/choosing.md."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bench import paper, plots, tasks
+from bench import paper, plots, tasks, tradeoff
 from bench.common import RESULTS, commit, is_ancestor, markdown_table, place
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "performance.md"
 RESULTS_PAGE = ROOT / "docs" / "results.md"
+CHOOSING_PAGE = ROOT / "docs" / "choosing.md"
 TASKS_PAGE = ROOT / "docs" / "tasks.md"
 BENCHMARKS = ("cpu", "gpu")  # whose figures docs/performance.md shows, in this order
 ORDER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's come first, the others by name
@@ -53,7 +54,8 @@ def main(out: Path | None = None) -> int:
     RESULTS_PAGE.write_text(results_page(RESULTS, ROOT / "docs" / "images"), encoding="utf-8")
     TASKS_PAGE.write_text(tasks.page(RESULTS / "tasks", tasks.IMAGES, ROOT / "docs"), encoding="utf-8")
     PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), section(RESULTS)), encoding="utf-8")
-    for page in (RESULTS_PAGE, TASKS_PAGE, PAGE):
+    CHOOSING_PAGE.write_text(filled(CHOOSING_PAGE.read_text(encoding="utf-8"), fronts(RESULTS)), encoding="utf-8")
+    for page in (RESULTS_PAGE, TASKS_PAGE, PAGE, CHOOSING_PAGE):
         print(f"wrote {page.relative_to(ROOT)}")
     return 0
 
@@ -121,6 +123,15 @@ def section(results: Path) -> str:
             content = json.loads(path.read_text(encoding="utf-8"))
             tables = importlib.import_module(f"bench.{name}").markdown(content["results"])
             parts.append(machine(content["environment"]) + "\n\n" + tables)
+    return "\n".join(parts) or EMPTY
+
+
+def fronts(results: Path) -> str:
+    """Machine and table of the fastest way to an error in each scene, on each device that was measured."""
+    parts = []
+    for path in sorted(results.glob("tradeoff*.json"), key=lambda path: len(path.stem)):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        parts.append(machine(content["environment"]) + "\n\n" + tradeoff.summary(content["results"]))
     return "\n".join(parts) or EMPTY
 
 

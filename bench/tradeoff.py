@@ -301,3 +301,19 @@ def markdown(results: dict[str, Any]) -> str:
             text.append(markdown_table(("solver", *(f"ms to {e:g}" for e in ERRORS), "least error", "in ms", "note"),
                                        others_of(group["peers"])))  # fmt: skip
     return "\n".join(text) + common.of_several_runs(results)
+
+
+def summary(results: dict[str, Any], error: float = 0.01) -> str:
+    """A line for each scene: the fastest way to an error of the motion, implicit Euler alone, what dv.advise says."""
+    table = []
+    for group in results.values():
+        own = [r for r in group["rows"] if "steps" in r and r["way"] not in ASIDE]
+        euler = [r for r in own if r["way"] == "implicit Euler" and isinstance(r["error"], float)]
+        least, fastest = min(r["error"] for r in euler), best(euler, error)
+        told = next(a for a in group["advised"] if a["asked"] == error)
+        table.append((group["scene"], f"{group['vertices']}, {group['duration']:.3g} s", _said(best(own, error)),
+                      f"not in the time allowed (least {least:.1g})" if fastest is None else f"{fastest['ms']:.3g} ms",
+                      f"{told['ms']:.3g} ms: {told['error']:.1g}" if told["reached"] else "cannot be had"))  # fmt: skip
+    header = ("scene", "vertices, duration", "the fastest way", "implicit Euler alone",
+              f"`dv.advise` for {100 * error:g} %: its true error")  # fmt: skip
+    return markdown_table(header, table) + common.of_several_runs(results)
