@@ -22,9 +22,12 @@ class AboveFloor(NamedTuple):
     share: Tensor  # [B, bodies]; 1 but between planes that a shift does not suit
     shift: Tensor  # [B, bodies, 3] [m]
     stopped: Tensor  # [B, bodies] bool: it loses more than a hundredth of what a vertex moves toward a plane
+    takes: bool = True  # False where it is known to take nothing
 
     def way(self, way: Tensor, of: Order) -> Tensor:
         """What is left of ways [B, V, 3] of vertices."""
+        if not self.takes:
+            return way
         share, shift = of_segments(torch.cat([self.share[..., None], self.shift], -1), *of).split((1, 3), -1)
         return share * way + shift
 
@@ -40,9 +43,14 @@ def above_floor(floor: Tensor, origin: Tensor, at: Tensor, way: Tensor, held: Te
         held: Of each vertex [V], whether something else moves it.  of: Vertices by body, see of_segments.
     """
     body = of[2]
-    scenes, ones = at.shape[0], at.new_ones((at.shape[0], bodies))
+    scenes = at.shape[0]
+
+    def nothing() -> AboveFloor:
+        ones = at.new_ones((scenes, bodies))
+        return AboveFloor(ones, at.new_zeros((scenes, bodies, 3)), ones < 1, takes=False)
+
     if not floor.numel():
-        return AboveFloor(ones, at.new_zeros((scenes, bodies, 3)), ones < 1)
+        return nothing()
     planes = floor.reshape(floor.shape[0], 1, -1, PLANE)
     normal, p = planes[:, 0, :, :3], at + origin if origin.numel() else at
     gap, toward = p @ normal.mT - planes[..., 3], -(way @ normal.mT)  # [B, V, P]
@@ -55,6 +63,8 @@ def above_floor(floor: Tensor, origin: Tensor, at: Tensor, way: Tensor, held: Te
         return values.new_full((scenes, bodies, values.shape[-1]), start).scatter_reduce(1, index, values, reduction)
 
     closes = (toward > room) & ~held[:, None]
+    if not (at.is_cuda or bool(closes.any())):  # on CUDA to know would mean to wait
+        return nothing()
     shift = of_bodies(torch.where(closes, toward - room, 0.0), 0.0, "amax") @ normal
     share = of_bodies(torch.where(closes, room / torch.where(closes, toward, 1.0), 1.0), 1.0, "amin").amin(-1)
     with torch.no_grad():

@@ -174,6 +174,9 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
     def any_of_body(vertices: Tensor) -> Tensor:
         return least_of_body((~vertices).to(x.dtype)) == 0
 
+    def any_at_all(vertices: Tensor) -> bool:
+        return vertices.is_cuda or bool(vertices.any())  # on CUDA to know would mean to wait
+
     free = ~any_of_body(pinned[:, 0])
     # bodies first, each as a whole
     target, base, own = target_of(x, move, u), torch.where(pinned, x, x + carried), ()
@@ -201,15 +204,18 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
             if number == 0 and own:
                 square = way.square().sum(-1)
                 bends, deep = (any_of_body(square > (part * own[1]) ** 2) for part in (BENT, DEEP_BENT))
-                rests = (bends & raises(here, target)) | (deep & held_up)
+                rests = deep & held_up
+                if any_at_all(bends & free & ~rests):
+                    rests = rests | (bends & raises(here, target))
             if number == 0:
                 rests = free & (rests | stopped | limited)
                 way = torch.where(rests[..., None], 0.0, way)
             share = torch.where(rests, 0.0, advance(at, way, still, center, own=own))
             if number == 0:
-                bent = raises(here, torch.where(pinned, target, at + share[..., None] * way))
-                bent = bent & free & ~rests & (least_of_body(share) < SHORT)
-                if at.is_cuda or bool(bent.any()):
+                bent = free & ~rests & (least_of_body(share) < SHORT)
+                if any_at_all(bent):
+                    bent = bent & raises(here, torch.where(pinned, target, at + share[..., None] * way))
+                if any_at_all(bent):
                     stuck.pop()  # once more, with those at rest: what let the others pass may have been their motion
                     way = torch.where(bent[..., None], 0.0, way)
                     share = torch.where(bent | rests, 0.0, advance(at, way, still, center, own=own))
