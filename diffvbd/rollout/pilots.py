@@ -161,7 +161,7 @@ class Pilots:
 
         out = {name: value for name, value in given.items() if value is not None}
         for name, value in given.items():
-            if not callable(value) or isinstance(value, Tensor):
+            if not _is_function(value):
                 continue
             function: Callable[[float], Any] = value
             if name == "colliders":
@@ -204,19 +204,26 @@ class Pilots:
     @cached_property
     def conserves(self) -> bool:
         """Whether the exact motion keeps its energy, so that what a run loses is what it damps."""
-        changing = any(callable(v) and not isinstance(v, Tensor) for v in self.given.values())
+        changing = any(map(_is_function, self.given.values()))
         other = any(self.given.get(name) is not None for name in ("rest_points", "density", "prescribed", "colliders"))
         damped = self.model.friction is not None or any(
             bool((torch.as_tensor(getattr(e, "damping", 0.0)) > 0).any()) for e in self.model.energies
         )
         return not (changing or other or damped)
 
+    @property
+    def material_changes(self) -> bool:
+        return any(_is_function(self.given.get(name)) for name in MODULI)
+
     @cached_property
     def prepared(self) -> Prepared:
         """The material of the scene, at the start where it changes."""
-        given = self.at_steps({name: self.given.get(name) for name in MODULI}, 0.0, 0, 0.0)
-        values = {name: value(0, self.x, self.v) if callable(value) and not isinstance(value, Tensor) else value
-                  for name, value in given.items()}  # fmt: skip
+        return self.prepared_at(0.0)
+
+    def prepared_at(self, time: float) -> Prepared:
+        """The material of the scene at a time [s]."""
+        given = self.at_steps({name: self.given.get(name) for name in MODULI}, 0.0, 0, time)
+        values = {name: value(0, self.x, self.v) if _is_function(value) else value for name, value in given.items()}
         moduli: dict[str, Any] = {name: values.get(name) for name in MODULI}
         return prepare(self.model, tuple(self.x.shape[:-2]), time_step=1.0, sweeps=1, rest_points=None, density=None,
                        parameters=None, **moduli)  # fmt: skip
@@ -238,6 +245,10 @@ class Pilots:
         mass = float(self.model.mass[~self.model.pinned].sum())
         way = (2 * lost / max(mass, 1e-300)).sqrt() * seconds
         return float((way / self.motion(run.x)).max())
+
+
+def _is_function(value: Any) -> bool:
+    return callable(value) and not isinstance(value, Tensor)
 
 
 def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Tensor, duration: float,

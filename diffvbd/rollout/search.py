@@ -81,7 +81,11 @@ def candidates_of(pilots: Pilots) -> list[Settings]:
 
 
 def _may_over_relax(pilots: Pilots) -> bool:
-    return pilots.model.mesh.num_tets == 0 or not is_nearly_incompressible(pilots.prepared.mu, pilots.prepared.lam)
+    """Whether no tet comes near incompressible, at any of some times where moduli change."""
+    if pilots.model.mesh.num_tets == 0:
+        return True
+    times = [pilots.duration * k / FRAMES for k in range(FRAMES + 1)] if pilots.material_changes else [0.0]
+    return not any(is_nearly_incompressible(p.mu, p.lam) for p in map(pilots.prepared_at, times))
 
 
 def _exact(model: Model) -> bool:
