@@ -60,6 +60,7 @@ GROUPS: dict[str, Group] = {
         *(piles.crowd(device=device, detections=n) for n in (None, 1, 2, 4)),
         piles.crowd(sweeps=200, detections=8, device=device),
         *(piles.crowd(parts=n, time_step=n / 3000, device=device) for n in (10, 5, 2)),
+        *(piles.crowd(integrator=dv.SDIRK2(), parts=n, time_step=n / 3000, device=device) for n in (50, 2)),
         piles.crowd(seconds=2.5, parts=1, device=device),
     ],
     "balls": lambda quick, device: [piles.balls(2, seconds=0.2, device=device)] if quick else [

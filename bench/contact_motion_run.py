@@ -36,6 +36,7 @@ class Scene:
     gravity: Any = (0.0, -GRAVITY, 0.0)  # [3] or [V, 3] [m/s^2]
     walls: tuple[tuple[Sequence[float], float], ...] = ()  # normal and height [m] of planes that nothing may be below
     prescribed: Callable[[int], Tensor] | None = None  # pinned vertices at the end of step n
+    integrator: dv.ImplicitEuler | dv.SDIRK2 = dv.ImplicitEuler()
 
     def state(self) -> tuple[Tensor, Tensor]:
         x = self.model.rest_points if self.x is None else self.x
@@ -44,7 +45,7 @@ class Scene:
     def arguments(self, **changed: Any) -> dict[str, Any]:
         """Those of a step or rollout beside Model and state."""
         own = {"mu": self.mu, "lam": 2 * self.mu, "time_step": self.time_step, "sweeps": self.sweeps,
-               "gravity": self.gravity}  # fmt: skip
+               "gravity": self.gravity, "integrator": self.integrator}  # fmt: skip
         return own | changed
 
     def finer(self, parts: int) -> Scene:
