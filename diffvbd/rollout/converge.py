@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -16,6 +15,7 @@ from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
 from ..checks import check_count, check_positive, fail
 from ..model.model import Model
 from ..ops import SweepSettings
+from ..said import warn
 from ..scopes import refuse_refinement
 from ..step.advance import advance, swept
 from ..step.arguments import GRAVITY, Prepared, acceleration_of, check_prescribed, check_state, collider_state, prepare
@@ -178,7 +178,7 @@ def _judge(done: _Sweeping, tolerance: float, on_failure: str) -> None:
     )
     if on_failure == "raise":
         raise RuntimeError(text)
-    warnings.warn(text, RuntimeWarning, stacklevel=3)
+    warn(text, RuntimeWarning)
 
 
 class _Sweeping:
