@@ -237,7 +237,7 @@ def refuse_non_finite(model: Model, arguments: dict[str, Any]) -> None:
     for name, value in arguments.items():
         if isinstance(value, Tensor):
             good = torch.isfinite(value)
-            if name == "prescribed":  # read only where pinned
+            if name.startswith("prescribed"):  # read only where pinned
                 value, good = torch.where(model._pinned[:, None], value, 0.0), good | ~model._pinned[:, None]
             name_value(name, "finite values", value, good)
 
