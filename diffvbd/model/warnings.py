@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import warnings
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +23,8 @@ HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
 THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
 SAMPLED = 10_000  # tets that are looked at: a sheet's are all alike
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
+
+ONCE = THIN_SEEN, OVER_RELAXED = "thin", "over-relaxed"  # of a Model's _derived: what is said once, or ever more seldom
 
 
 def warn_of(model: Model) -> None:
@@ -59,6 +64,26 @@ def warn_of_material(model: Model, mu: Tensor, lam: Tensor, time_step: float, sw
     _warn_of_over_relaxation(model, mu, lam)
 
 
+@contextlib.contextmanager
+def silent(model: Model) -> Iterator[None]:
+    """Inside, nothing is warned of, and what would have been said once of this Model is still to be said after it."""
+    before = {id(m): {name: m._derived[name] for name in ONCE if name in m._derived} for m in _with_settings(model)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            yield
+        finally:
+            for m in _with_settings(model):
+                for name in ONCE:
+                    m._derived.pop(name, None)
+                m._derived.update(before.get(id(m), {}))
+
+
+def _with_settings(model: Model) -> list[Model]:
+    """A Model and those that run in its place with settings."""
+    return [model, *(m for m in model._derived.values() if isinstance(m, type(model)))]
+
+
 def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
     """Whether over-relaxed sweeps of some tet may gain energy from step to step."""
     return bool((lam.detach() > INCOMPRESSIBLE * mu.detach()).any())
@@ -66,14 +91,14 @@ def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
 
 def _warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> None:
     """Moduli may change from step to step: those of the 1st, 2nd, 4th, 8th, ... are looked at."""
-    seen = model._derived.get("over-relaxed", 0) + 1  # 0: it has warned
-    if seen == 1 and "over-relaxed" in model._derived or model.relaxation <= 1:
+    seen = model._derived.get(OVER_RELAXED, 0) + 1  # 0: it has warned
+    if seen == 1 and OVER_RELAXED in model._derived or model.relaxation <= 1:
         return
-    model._derived["over-relaxed"] = seen
+    model._derived[OVER_RELAXED] = seen
     if seen & (seen - 1) or not any(isinstance(e, StableNeoHookean) for e in model.energies):
         return
     if is_nearly_incompressible(mu, lam):
-        model._derived["over-relaxed"] = 0
+        model._derived[OVER_RELAXED] = 0
         warn(
             f"relaxation: {model.relaxation:g} where lam is more than {INCOMPRESSIBLE:g} times mu (Poisson's ratio "
             "above 0.492): such rollouts were seen to gain energy without bound; take relaxation=1, with "
@@ -88,9 +113,9 @@ def _warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, 
     sweeps move them together by that much less; inertia helps where a wave crosses fewer elements than w / t. Coarse
     corrections move them together.
     """
-    if "thin" in model._derived or model.coarse is not None:
+    if THIN_SEEN in model._derived or model.coarse is not None:
         return
-    model._derived["thin"] = True
+    model._derived[THIN_SEEN] = True
     tets = model.mesh.tets[:: max(1, model.mesh.num_tets // SAMPLED)]
     corners = model.mesh.points[tets]
     edges = corners[:, 1:] - corners[:, :1]

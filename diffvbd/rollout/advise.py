@@ -53,14 +53,15 @@ def advise(
         device: Where the pilots run; None: the Model's.
         patience: How long pilots may run [s]; the search ends with the one that exceeds it.
         given: mu and lam or young and poisson, force, gravity, prescribed, colliders, rest_points, density, parameters,
-            as in rollout, constant or a function of the time [s]: loads at the middle of each step, prescribed
-            vertices and colliders at its end.
+            as in rollout, constant or a function of the time [s], of parameters each of them: loads at the middle of
+            each step, all else at its end.
 
     Returns:
         Settings with a :class:`diffvbd.Prediction`.
 
     Raises:
-        ValueError, TypeError: As rollout; an error outside (0, 1), per_step values.
+        ValueError, TypeError: As rollout; an error outside (0, 1), per_step values, a quantity that is no finite scalar
+            or, beside ``gradient``, has no derivative.
     """
     check_state(model, x, v)
     error = check_positive("error", error)

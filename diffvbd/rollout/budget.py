@@ -16,7 +16,7 @@ from ..model.model import Model
 from ..step.arguments import check_state, prepare
 from ..step.integrators import SDIRK2, ImplicitEuler, Integrator
 from .contact_check import cut_share, unbalanced_friction
-from .pilots import FRAMES, Pilot, Pilots, Quantity, converted, pilots_of, relative
+from .pilots import FRAMES, Pilot, Pilots, Quantity, changes, converted, pilots_of, relative
 from .rollout import rollout
 from .search import start_of
 from .settings import Settings, aligned
@@ -214,8 +214,7 @@ class _Budget:
                         integrator=settings.integrator, save="last", observe=look, check_contact=False,
                         check_energy=False, check_start=False, **given)  # fmt: skip
         cut = None if model.contact is None else float(torch.stack(cuts).max())
-        moves = any(callable(value) and not isinstance(value, Tensor) for value in p.given.values())
-        if model.friction is None or moves or not isinstance(settings.integrator, ImplicitEuler):
+        if model.friction is None or changes(p.given) or not isinstance(settings.integrator, ImplicitEuler):
             return cut, None
         static: dict[str, Any] = {
             name: p.given.get(name) for name in ("mu", "lam", "young", "poisson", "rest_points", "density")

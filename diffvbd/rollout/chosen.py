@@ -11,6 +11,7 @@ from torch import Tensor
 from ..adjoint.routes import ReverseSweep
 from ..checks import check_count, check_positive, fail
 from ..step.arguments import check_state
+from ..step.met import outcomes
 from .pilots import GIVEN, pilots_of
 from .search import ERROR, PATIENCE, found
 from .settings import Settings
@@ -45,7 +46,11 @@ def rollout_with(rollout: Callable[..., Trajectory], *, settings: Any, duration:
         chosen["adjoint"] = ReverseSweep(settings.tape)
     if given["checkpoint_every"] == "auto":
         chosen["checkpoint_every"] = settings.checkpoint_every
-    return rollout(**given | chosen)
+    try:
+        return rollout(**given | chosen)
+    finally:  # the caller asks his own Model for the status of its steps
+        if (outcome := outcomes.get(chosen["model"])) is not None:
+            outcomes[given["model"]] = outcome
 
 
 @torch.no_grad()

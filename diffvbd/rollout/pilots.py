@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,6 +15,7 @@ from torch import Tensor
 from ..adjoint.routes import ReverseSweep
 from ..checks import check_positive, fail
 from ..model.model import Model
+from ..model.warnings import silent
 from ..scopes import refined
 from ..step.arguments import GRAVITY, Prepared, prepare
 from .energy_check import mechanical_energy
@@ -68,8 +68,9 @@ class Pilots:
 
     def __post_init__(self) -> None:
         self.duration = check_positive("duration", self.duration, "s")
-        for name in GIVEN:
-            value = self.given.get(name)
+        parameters = self.given.get("parameters")
+        named = {f'parameters["{k}"]': v for k, v in parameters.items()} if isinstance(parameters, dict) else {}
+        for name, value in {**self.given, **named}.items():
             if isinstance(value, PerStep):
                 fail(name, "a value or a function of the time [s], since time steps vary", "per_step")
 
@@ -84,11 +85,23 @@ class Pilots:
         """One short step: raises what rollout raises of the arguments."""
         h = 1e-3 * self.duration
         given = self.at_steps(dict(self.given), h, 1, 0.0)
-        end = self.execute(self.model, self.x, self.v, steps=1, time_step=h, sweeps=1, save="last", **given)
-        value = None if self.quantity is None else self.quantity(end.x[-1], end.v[-1])
-        if self.quantity is not None and not (isinstance(value, Tensor) and value.numel() == 1):
+        with silent(self.model):
+            end = self.execute(self.model, self.x, self.v, steps=1, time_step=h, sweeps=1, save="last", **given)
+        if self.quantity is None:
+            return
+        leaves = [t[-1].detach().requires_grad_(self.wrt is not None) for t in (end.x, end.v)]
+        with torch.set_grad_enabled(self.wrt is not None):
+            value = self.quantity(*leaves)
+        if not (isinstance(value, Tensor) and value.numel() == 1):
             got = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             fail("quantity", "a function that returns a scalar tensor", got)
+        if not bool(torch.isfinite(value)):
+            fail("quantity", "a finite value after the first step", float(value))
+        if self.wrt is None:
+            return
+        found = torch.autograd.grad(value, leaves, allow_unused=True) if value.requires_grad else (None, None)
+        if all(gradient is None for gradient in found):
+            fail("quantity", "a function that torch can differentiate, beside gradient=True", "one without a graph")
 
     def run(self, settings: Settings, steps: int, quarter: int | None = None, start: Pilot | None = None) -> Pilot:
         """``steps`` steps over the whole duration, or a quarter of them from frame ``quarter`` of ``start``."""
@@ -97,8 +110,7 @@ class Pilots:
         x, v = (self.x, self.v) if start is None or quarter is None else (start.x[quarter], start.v[quarter])  # type: ignore[index]
         began = first * self.duration / FRAMES
         differentiate = self.wrt is not None and quarter is None
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with silent(self.model):
             try:
                 model = settings.applied(self.model)
                 self._warm(settings, model, x, v, began)
@@ -160,8 +172,11 @@ class Pilots:
             return lambda step, x, v: function(began + (step + share) * h)
 
         out = {name: value for name, value in given.items() if value is not None}
+        if isinstance(given.get("parameters"), dict):
+            out["parameters"] = {name: timed(value, 1.0) if _of_time(value) else value
+                                 for name, value in given["parameters"].items()}  # fmt: skip
         for name, value in given.items():
-            if not callable(value) or isinstance(value, Tensor):
+            if not _of_time(value):
                 continue
             function: Callable[[float], Any] = value
             if name == "colliders":
@@ -204,7 +219,7 @@ class Pilots:
     @cached_property
     def conserves(self) -> bool:
         """Whether the exact motion keeps its energy, so that what a run loses is what it damps."""
-        changing = any(callable(v) and not isinstance(v, Tensor) for v in self.given.values())
+        changing = changes(self.given)
         other = any(self.given.get(name) is not None for name in ("rest_points", "density", "prescribed", "colliders"))
         damped = self.model.friction is not None or any(
             bool((torch.as_tensor(getattr(e, "damping", 0.0)) > 0).any()) for e in self.model.energies
@@ -215,8 +230,7 @@ class Pilots:
     def prepared(self) -> Prepared:
         """The material of the scene, at the start where it changes."""
         given = self.at_steps({name: self.given.get(name) for name in MODULI}, 0.0, 0, 0.0)
-        values = {name: value(0, self.x, self.v) if callable(value) and not isinstance(value, Tensor) else value
-                  for name, value in given.items()}  # fmt: skip
+        values = {name: value(0, self.x, self.v) if _of_time(value) else value for name, value in given.items()}
         moduli: dict[str, Any] = {name: values.get(name) for name in MODULI}
         return prepare(self.model, tuple(self.x.shape[:-2]), time_step=1.0, sweeps=1, rest_points=None, density=None,
                        parameters=None, **moduli)  # fmt: skip
@@ -250,11 +264,22 @@ def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Te
     if gradient and quantity is None:
         quantity = _mean_squared_way(x)
     material = [name for name in MODULI if given.get(name) is not None]
-    wrt = [name for name in material if not callable(given[name]) or isinstance(given[name], Tensor)]
+    wrt = [name for name in material if not _of_time(given[name])]
     given = {name: value.detach() if isinstance(value, Tensor) else value for name, value in given.items()}
     pilots = Pilots(rollout, model, x, v, duration, given, quantity, wrt if gradient else None)
     pilots.check()
     return pilots
+
+
+def _of_time(value: Any) -> bool:
+    return callable(value) and not isinstance(value, Tensor)
+
+
+def changes(given: dict[str, Any]) -> bool:
+    """Whether anything that is given changes in time."""
+    parameters = given.get("parameters")
+    values = [*given.values(), *(parameters.values() if isinstance(parameters, dict) else ())]
+    return any(map(_of_time, values))
 
 
 def _mean_squared_way(start: Tensor) -> Quantity:

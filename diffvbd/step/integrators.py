@@ -164,8 +164,12 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
         """``begun``: where a solve before this one has ended."""
         try:
             return *run(model, x, v, prepared, **given), Solve(x, v, prepared, given)
-        except ValueError:  # of what this solve was given, which is made of several arguments
-            refuse_non_finite(model, outer)
+        except ValueError:  # perhaps of what was made of several arguments for this solve
+            if isinstance(integrator, ImplicitEuler):
+                raise
+            # what is wrong with x or v themselves has been said with vertex and scene
+            others = {name: t for name, t in outer.items() if isinstance(t, Tensor) and t is not x and t is not v}
+            refuse_non_finite(model, {name: t for name, t in others.items() if not t.is_meta})
             if begun is not None and not bool(torch.isfinite(begun).all()):
                 fail("x, v", f"a state from which the first solve of a step of {integrator} ends finite (a smaller "
                      "time_step, more sweeps or float64 may help)", "positions that are not")  # fmt: skip
