@@ -23,7 +23,7 @@ from torch import Tensor
 from ..checks import check_tensor, fail
 from ..model.model import Model
 from ..ops import TET_READS_X_PREV
-from ..scopes import looks_at, recorders
+from ..scopes import looks_at, recorders, refuse_transforms
 from ..tuples import replaced
 from .approach import may_touch
 from .arguments import Prepared, acceleration_of, broadcastable, collider_state, refuse_non_finite
@@ -182,6 +182,8 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
         raise NotImplementedError(f"integrator: expected ImplicitEuler() with a law of tets that reads x_prev, got "
                                   f"{integrator}")  # fmt: skip
     time_step = whole.settings.numbers.time_step
+    if model.touches:
+        refuse_transforms("a step with contact")
     touching = _touching(model, x, v, whole, end)
     if touching is not None:
         if whole.unrolled is not None:

@@ -116,3 +116,11 @@ def test_prescribed_positions_of_two_solves_are_watched() -> None:
     ends[0].add_(1)
     with pytest.raises(RuntimeError, match="prescribed: changed in place"):
         end.x.sum().backward()
+
+
+@pytest.mark.parametrize("name", ["history.time_step", "history.smooth", "history.other"])
+def test_a_tape_has_no_gradient_of_what_is_not_differentiable(name: str) -> None:
+    model, x, v = held()
+    x1, v1, history = dv.step(model, x, v, integrator=dv.BDF2(), **STEP)
+    run = lambda: dv.step_forward(model, x1, v1, wrt=(name,), integrator=dv.BDF2(), history=history, **STEP)  # noqa: E731
+    raises(run, "wrt", f"history.moved, history.v.*got '{name}'")
