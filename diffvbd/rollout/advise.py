@@ -67,10 +67,6 @@ def advise(
     error = check_positive("error", error)
     if error >= 1:
         fail("error", "a share of the motion in (0, 1)", repr(error))
-    if not isinstance(gradient, bool):
-        raise TypeError(f"gradient: expected a bool, got {type(gradient).__name__}")
-    if quantity is not None and not callable(quantity):
-        raise TypeError(f"quantity: expected a function of x and v, got {type(quantity).__name__}")
     patience = check_positive("patience", patience, "s")
     if device is not None:
         model = model.to(device)

@@ -173,10 +173,10 @@ class Pilots:
 
         out = {name: value for name, value in given.items() if value is not None}
         if isinstance(given.get("parameters"), dict):
-            out["parameters"] = {name: timed(value, 1.0) if _of_time(value) else value
+            out["parameters"] = {name: timed(value, 1.0) if of_time(value) else value
                                  for name, value in given["parameters"].items()}  # fmt: skip
         for name, value in given.items():
-            if not _of_time(value):
+            if not of_time(value):
                 continue
             function: Callable[[float], Any] = value
             if name == "colliders":
@@ -230,7 +230,7 @@ class Pilots:
     def prepared(self) -> Prepared:
         """The material of the scene, at the start where it changes."""
         given = self.at_steps({name: self.given.get(name) for name in MODULI}, 0.0, 0, 0.0)
-        values = {name: value(0, self.x, self.v) if _of_time(value) else value for name, value in given.items()}
+        values = {name: value(0, self.x, self.v) if of_time(value) else value for name, value in given.items()}
         moduli: dict[str, Any] = {name: values.get(name) for name in MODULI}
         return prepare(self.model, tuple(self.x.shape[:-2]), time_step=1.0, sweeps=1, rest_points=None, density=None,
                        parameters=None, **moduli)  # fmt: skip
@@ -260,18 +260,24 @@ def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Te
     of the arguments."""
     if unknown := sorted(set(given) - set(GIVEN)):
         raise TypeError(f"{unknown[0]}: expected an argument among {', '.join(GIVEN)}")
+    if not isinstance(gradient, bool):
+        raise TypeError(f"gradient: expected a bool, got {type(gradient).__name__}")
+    if quantity is not None and not callable(quantity):
+        raise TypeError(f"quantity: expected a function of x and v, got {type(quantity).__name__}")
+    if x.numel() == 0:
+        fail("x", "a scene with a vertex, whose motion can be judged", f"shape {list(x.shape)}")
     x, v = x.detach(), v.detach()
     if gradient and quantity is None:
         quantity = _mean_squared_way(x)
     material = [name for name in MODULI if given.get(name) is not None]
-    wrt = [name for name in material if not _of_time(given[name])]
+    wrt = [name for name in material if not of_time(given[name])]
     given = {name: value.detach() if isinstance(value, Tensor) else value for name, value in given.items()}
     pilots = Pilots(rollout, model, x, v, duration, given, quantity, wrt if gradient else None)
     pilots.check()
     return pilots
 
 
-def _of_time(value: Any) -> bool:
+def of_time(value: Any) -> bool:
     return callable(value) and not isinstance(value, Tensor)
 
 
@@ -279,7 +285,7 @@ def changes(given: dict[str, Any]) -> bool:
     """Whether anything that is given changes in time."""
     parameters = given.get("parameters")
     values = [*given.values(), *(parameters.values() if isinstance(parameters, dict) else ())]
-    return any(map(_of_time, values))
+    return any(map(of_time, values))
 
 
 def _mean_squared_way(start: Tensor) -> Quantity:

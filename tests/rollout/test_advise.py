@@ -239,3 +239,6 @@ def test_parameters_may_be_functions_of_time() -> None:
     per_step = dv.per_step(kappa.expand(4))
     with pytest.raises(ValueError, match=r"parameters\[.*kappa.*\]: expected a value or a function of the time"):
         dv.advise(model, x, v, duration=0.04, mu=1e4, lam=1e4, parameters={"floor_barrier.kappa": per_step})
+    with pytest.raises(ValueError, match=r'parameters\[.*kappa.*\]: expected a value beside settings="auto"'):
+        dv.rollout(model, x, v, duration=0.04, settings="auto", mu=1e4, lam=1e4,
+                   parameters={"floor_barrier.kappa": lambda step, x, v: kappa})  # fmt: skip
