@@ -137,6 +137,8 @@ def rollout(
     for name, asked in (("check_contact", check_contact), ("check_energy", check_energy)):
         if not isinstance(asked, bool | None):
             raise TypeError(f"{name}: expected a bool or None, got {type(asked).__name__}")
+    if observe is not None and not callable(observe):
+        raise TypeError(f"observe: expected a function of x, v and the step or None, got {type(observe).__name__}")
     if not isinstance(check_start, bool):
         raise TypeError(f"check_start: expected a bool, got {type(check_start).__name__}")
     lead, adjoint, scheme = check_state(model, x, v), check_adjoint(adjoint), check_integrator(integrator)
