@@ -168,7 +168,7 @@ class _Budget:
     def _share(self, cause: str, a: Pilot, b: Pilot, seconds: float, note: str) -> Share:
         assert a.x is not None and b.x is not None
         quantity = None if a.quantity is None or b.quantity is None else relative(a.quantity, b.quantity)
-        gradients = [relative(u, w) for u, w in zip(a.gradient, b.gradient, strict=True)]
+        gradients = self.pilots.gradients_apart(a, b)
         motion = self.pilots.apart(a.x, b.x)
         return Share(cause, motion, quantity, max(gradients) if gradients else None, seconds, note)
 

@@ -24,6 +24,7 @@ from .trajectory import PerStep, Trajectory
 
 FRAMES = 4  # at which two runs are compared, equally spaced over the duration
 STILL = 1e-4  # of the size of the scene: a motion below it counts as one of this size
+NO_PART = 1e-8  # of quantity over modulus: a gradient below it counts as one of this size
 LOADS = ("force", "gravity")
 MOVING = ("prescribed", "colliders")
 MODULI = ("mu", "lam", "young", "poisson")
@@ -205,6 +206,18 @@ class Pilots:
         worst = float((distance / self.motion(b)).max())
         return worst if math.isfinite(worst) else math.inf
 
+    def gradients_apart(self, a: Pilot, b: Pilot) -> list[float]:
+        """Relative distances of the gradients of two runs. With respect to moduli that have no part in the motion, as
+        of a body in free fall, they are rounding: what is below a tiny part of quantity over modulus counts as that."""
+        out = []
+        for name, u, w in zip((None, *(self.wrt or ())), a.gradient, b.gradient, strict=False):
+            least = 0.0
+            if name is not None and b.quantity is not None:
+                modulus = float(torch.as_tensor(self.given[name]).double().norm())
+                least = NO_PART * abs(float(b.quantity)) / modulus if modulus > 0 else 0.0
+            out.append(relative(u, w, least))
+        return out
+
     def hardest(self, a: Tensor, b: Tensor) -> int:
         """The quarter of the duration in which two runs part most."""
         distance = (a - b).square().sum(-1).flatten(1).mean(1).sqrt()
@@ -302,8 +315,8 @@ def converted(value: Any, **to: Any) -> Any:
     return (lambda t: converted(value(t), **to)) if callable(value) else value
 
 
-def relative(a: Tensor, b: Tensor) -> float:
-    """|a - b| / |b|"""
-    size = float(b.norm())
+def relative(a: Tensor, b: Tensor, least: float = 0.0) -> float:
+    """|a - b| / |b|, of which |b| counts as ``least`` at least."""
+    size = max(float(b.norm()), least)
     apart = float((a - b).norm())
     return 0.0 if apart == 0 else apart / size if size > 0 else math.inf

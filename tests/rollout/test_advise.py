@@ -242,3 +242,11 @@ def test_parameters_may_be_functions_of_time() -> None:
     with pytest.raises(ValueError, match=r'parameters\[.*kappa.*\]: expected a value beside settings="auto"'):
         dv.rollout(model, x, v, duration=0.04, settings="auto", mu=1e4, lam=1e4,
                    parameters={"floor_barrier.kappa": lambda step, x, v: kappa})  # fmt: skip
+
+
+def test_gradients_by_moduli_that_have_no_part_in_the_motion_are_no_error() -> None:
+    """Those of a body in free fall are rounding, which no time step makes smaller."""
+    model = dv.Model(mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1)))
+    x = model.rest_points
+    settings = dv.advise(model, x, 0 * x, duration=0.05, gradient=True, patience=20.0, mu=1e5, lam=1e5)
+    assert settings.predicted is not None and settings.predicted.reached and settings.steps(0.05) < 32
