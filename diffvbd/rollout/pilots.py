@@ -16,7 +16,7 @@ from ..adjoint.routes import ReverseSweep
 from ..checks import check_positive, fail
 from ..model.model import Model
 from ..model.warnings import silent
-from ..scopes import refined
+from ..scopes import refined, refuse_transforms
 from ..step.arguments import GRAVITY, Prepared, prepare
 from .energy_check import mechanical_energy
 from .settings import Settings
@@ -271,10 +271,13 @@ def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Te
               quantity: Quantity | None, gradient: bool, given: dict[str, Any]) -> Pilots:  # fmt: skip
     """Pilot runs of a scene, with the gradients that are asked for. A first short step has raised what rollout raises
     of the arguments."""
+    refuse_transforms('dv.advise, dv.error_budget and settings="auto", which look at values')
     if unknown := sorted(set(given) - set(GIVEN)):
         raise TypeError(f"{unknown[0]}: expected an argument among {', '.join(GIVEN)}")
     if not isinstance(gradient, bool):
         raise TypeError(f"gradient: expected a bool, got {type(gradient).__name__}")
+    if gradient and torch.is_inference_mode_enabled():
+        fail("gradient", "False inside torch.inference_mode(), which records nothing", "True")
     if quantity is not None and not callable(quantity):
         raise TypeError(f"quantity: expected a function of x and v, got {type(quantity).__name__}")
     if x.numel() == 0:

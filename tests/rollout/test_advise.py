@@ -214,6 +214,17 @@ def test_a_quantity_that_cannot_be_judged_is_named(quantity, gradient: bool, got
             dv.error_budget(model, x, v, time_step=0.01, sweeps=2, **given)
 
 
+def test_advice_needs_values_and_graphs() -> None:
+    model, _ = cantilever(1e5)
+    x = model.rest_points
+    given = {"duration": 0.02, "lam": 1e5}
+    with torch.inference_mode(), pytest.raises(ValueError, match=r"gradient: expected False inside torch\.inference_m"):
+        dv.advise(model, x, 0 * x, gradient=True, mu=1e5, **given)
+    with pytest.raises(NotImplementedError, match=r"torch\.func transforms of dv\.advise"):
+        auto = lambda mu: dv.rollout(model, x, 0 * x, settings="auto", mu=mu, **given).x  # noqa: E731
+        torch.func.vmap(auto)(torch.full((2,), 1e5, dtype=x.dtype))
+
+
 def test_advice_leaves_warnings_to_the_rollouts_that_follow() -> None:
     body = mesh.sheet(8, 8, (0.14, 0.14), 1e-3)
     model = dv.Model(body, pinned=body.points[:, 0] == 0)
