@@ -93,7 +93,7 @@ def step_forward(
         check_tensor(full, value, model._mass)
         place[name] = inputs[full] = value.detach().requires_grad_()
     values["parameters"] = parameters or None
-    if before:
+    if isinstance(history, History):
         values["history"] = replaced(history, **before)
     with torch.enable_grad():
         x_end, v_end, *more = step(model, **values)
