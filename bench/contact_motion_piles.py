@@ -142,7 +142,8 @@ def crowd(per_side: int = 3, layers: int = 2, sweeps: int = 10, seconds: float =
           time_step: float = 1 / 60, device: str = "cpu", detections: int | None = None,
           integrator: dv.ImplicitEuler | dv.SDIRK2 = EULER) -> list[Row]:  # fmt: skip
     """The crowd of `bench contact`, of fewer bodies: the share of cut vertices, and the mean energy over that of steps
-    of h / parts by implicit Euler with K = 10 and one detection. Energy is kinetic, elastic and of gravity above the floor."""
+    of h / parts by implicit Euler with K = 10 and one detection. Energy is kinetic, elastic and of gravity above the
+    floor."""
     scene = replace(_crowd(per_side, layers, detections, device), time_step=time_step, sweeps=sweeps,
                     integrator=integrator)  # fmt: skip
     model, steps = scene.model, round(seconds / time_step)

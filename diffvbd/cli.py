@@ -3,6 +3,7 @@
 import argparse
 import re
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,7 @@ TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here re
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, 1 as EXAMPLES says, 2 after an error, 130 if interrupted."""
     options = _parser().parse_args(arguments)
+    shown, warnings.formatwarning = warnings.formatwarning, _one_line
     try:
         return options.command(options) or 0
     except KeyboardInterrupt:
@@ -57,6 +59,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, TypeError, OSError, ImportError, ArithmeticError, MemoryError, torch.OutOfMemoryError) as error:
         print(f"diffvbd: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    finally:
+        warnings.formatwarning = shown
+
+
+def _one_line(message: Warning | str, *where: Any, **line: Any) -> str:
+    """A warning as the command line shows it: no line of a program is its cause."""
+    return f"warning: {' '.join(str(message).split())}\n"
 
 
 def _parser() -> argparse.ArgumentParser:

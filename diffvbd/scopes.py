@@ -35,8 +35,20 @@ def looks_at(value: Tensor) -> bool:
     """Whether values may be looked at now. On CUDA that waits for the device; compiled and transformed ones cannot."""
     if torch.compiler.is_compiling():
         return False
-    transformed = torch._C._functorch.peek_interpreter_stack()  # pyright: ignore[reportAttributeAccessIssue]
-    return transformed is None and (checking() or not value.is_cuda)
+    return not transformed() and (checking() or not value.is_cuda)
+
+
+def transformed() -> bool:
+    """Whether a transform of torch.func is under way. Under torch.compile one may be, unseen."""
+    if torch.compiler.is_compiling():
+        return False
+    return torch._C._functorch.peek_interpreter_stack() is not None  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def refuse_transforms(name: str) -> None:
+    """Raises inside torch.func.grad, vmap and the like, before torch says what it means to itself."""
+    if transformed():
+        raise NotImplementedError(f"diffvbd: torch.func transforms of {name} are not supported")
 
 
 def not_compiled(function: F) -> F:

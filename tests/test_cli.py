@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+import warnings
 import xml.etree.ElementTree as ElementTree
 import zipfile
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 import torch
 
 import diffvbd as dv
+from diffvbd import cli
 from diffvbd.cli import main
 from diffvbd.tasks import archive
 from diffvbd.tasks.folder import alone_in
@@ -305,6 +307,17 @@ def test_wrong_usage_has_status_2() -> None:
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 2
+
+
+def test_a_warning_is_one_line_without_a_place(mesh_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No line of a program is its cause, and Python's own would be that of its start."""
+    said: list[str] = []
+    shown = warnings.formatwarning
+    monkeypatch.setattr(
+        cli, "_simulate", lambda options: said.append(warnings.formatwarning("sweeps:\n few", UserWarning, "a.py", 3))
+    )
+    assert run("simulate", mesh_file, "--out", "part.pvd") == 0
+    assert said == ["warning: sweeps: few\n"] and warnings.formatwarning is shown
 
 
 def test_advise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

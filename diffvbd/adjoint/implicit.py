@@ -22,6 +22,7 @@ from torch.autograd import Function
 from .. import ops
 from ..model.model import Model
 from ..ops import no_second_derivative, of_inputs
+from ..said import warn
 from .anderson import run_sweeps
 from .potential import PAIRS, IncrementalPotential
 from .routes import GlobalAdjoint, LinearSolve
@@ -111,7 +112,7 @@ def _solve(potential: IncrementalPotential, x_bar: Tensor, adjoint: GlobalAdjoin
             )
         if adjoint.on_failure == "raise":
             raise RuntimeError(text)
-        warnings.warn(text, RuntimeWarning, stacklevel=2)
+        warn(text, RuntimeWarning)
     return found.x * size
 
 

@@ -97,6 +97,9 @@ def reserve(model: Model, pairs: int) -> None:
     if surface is None or model.contact is None:
         fail("model", "a PairBarrier among its energies", "none")
     pairs = check_count("pairs", pairs, 1, 2**26)
+    for other in model._derived.values():  # what runs in its place with settings
+        if isinstance(other, Model) and other.contact is not None:
+            reserve(other, pairs)
     model.surface_of_contact = replace(surface, capacity=pairs)
     if model.contact.capacity is None:  # it still grows by itself
         return

@@ -3,7 +3,6 @@ where the error of the step is asked for."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +15,7 @@ from ..checks import check_positive, fail
 from ..model.model import Model
 from ..model.moduli import moduli_of
 from ..model.warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
+from ..said import warn as say
 from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare, refuse_non_finite
 from ..step.balance import (
     UNBALANCED_FRICTION,
@@ -211,7 +211,7 @@ def diagnose(
     result.messages.extend(_setting_messages(model, mu, lam, edge))
     if warn:
         for message in result.messages:
-            warnings.warn(f"diffvbd: {message}", stacklevel=2)
+            say(f"diffvbd: {message}")
     return result
 
 

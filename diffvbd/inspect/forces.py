@@ -85,8 +85,8 @@ def forces(
         A :class:`Forces`, of x's dtype.
 
     Raises:
-        ValueError, TypeError: As :func:`diffvbd.step`; also where surfaces touch, and for ``previous`` without
-            ``time_step``.
+        ValueError, TypeError: As :func:`diffvbd.step`; also where surfaces touch, for vertices on or below a floor, and
+            for ``previous`` without ``time_step``.
 
     Source: Li et al. (2020); docs/method.md, sections 6 and 12.
     """
@@ -96,6 +96,7 @@ def forces(
     _refuse_non_finite(model, {"x": x, "previous: x": start, "colliders": colliders,
                                "colliders_before": colliders_before})  # fmt: skip
     given = widen(model, x, time_step, colliders, colliders_before, mu=0.0, lam=0.0, parameters=parameters)
+    _refuse_below(given, {"x": x, "previous: x": start})
     state = _contact_at(given, x, previous)
     lead, dtype = x.shape[:-2], x.dtype
 
@@ -122,6 +123,21 @@ def _refuse_non_finite(model: Model, where: dict[str, Tensor | None]) -> None:
         if isinstance(value, Tensor):
             ops.not_batched(value)
     refuse_non_finite(model, where)
+
+
+def _refuse_below(given: Wide, where: dict[str, Tensor | None]) -> None:
+    """Raises for a vertex on or below a plane of the floor, where its barrier has no force."""
+    floor = given.model.floor
+    for name, x in where.items():
+        if floor is None or x is None:
+            continue
+        flat = x.detach().double().reshape(-1, *x.shape[-2:])
+        gaps = floor.gaps(flat, given.data()[:, : floor.count()].detach().double(), None)[0]
+        below = (~(gaps > 0) & ~given.model._pinned[:, None]).nonzero()
+        if len(below):
+            scene, vertex, plane = below[0].tolist()
+            fail(name, "every unpinned vertex above the floor", f"vertex {vertex} on or below plane {plane} in scene "
+                 f"{scene}")  # fmt: skip
 
 
 def _contact_at(given: Wide, x: Tensor, previous: tuple[Tensor, Tensor] | None) -> ContactState:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import check_readable, fail, to_float
+from ..checks import check_positive, check_readable, fail, to_float
 from ..contact.barrier import Friction, PairBarrier
 from ..energies import VERTEX_ENERGIES, StableNeoHookean, VertexEnergy
 from .anderson import Anderson
@@ -81,13 +81,22 @@ def per_tet_density(density: Any, num_tets: int) -> Tensor:
 
 
 def checked_steps(
-    rigid: Any, start: Any, coarse: Any, acceleration: Any, energies: tuple[Energy, ...], saturation: float | None
-) -> tuple[bool, str, CoarseSpace | None, Anderson | None]:
-    """What steps do besides sweeps: whether free bodies are corrected, where the sweeps of the others start, the coarse
-    space and the acceleration."""
+    relaxation: Any, rigid: Any, start: Any, coarse: Any, acceleration: Any, energies: tuple[Energy, ...],
+    saturation: float | None,
+) -> tuple[float, bool, str, CoarseSpace | None, Anderson | None]:  # fmt: skip
+    """What steps do besides plain sweeps: the relaxation, whether free bodies are corrected, where the sweeps of the
+    others start, the coarse space and the acceleration."""
     rigid, start = checked_correction(rigid, start, energies)
     coarse = checked_coarse(coarse, energies, saturation)
-    return rigid, start, coarse, checked_acceleration(acceleration, energies, saturation)
+    acceleration = checked_acceleration(acceleration, energies, saturation)
+    return checked_relaxation(relaxation), rigid, start, coarse, acceleration
+
+
+def checked_relaxation(relaxation: Any) -> float:
+    number = check_positive("relaxation", relaxation)
+    if number >= 2:
+        fail("relaxation", "a number in (0, 2): from 2 on the updates raise the potential", relaxation)
+    return number
 
 
 def checked_correction(rigid: Any, start: Any, energies: tuple[Energy, ...]) -> tuple[bool, str]:

@@ -112,15 +112,12 @@ class Model:
         self._derived: dict[str, Any] = {}
         self.saturation = None if saturation is None else check_positive("saturation", saturation, "m")
         self.regularization = check_number("regularization", regularization)
-        self.relaxation = check_positive("relaxation", relaxation, "")
-        if self.relaxation >= 2:
-            fail("relaxation", "a number in (0, 2): from 2 on the updates raise the potential", relaxation)
         self._set_energies(checked_energies(energies, mesh.num_vertices))
         self.energy_mask = 0
         for energy in self.energies:
             self.energy_mask |= energy.bit
-        checked = checked_steps(rigid, start, coarse, acceleration, self.energies, self.saturation)
-        self.rigid, self.start, self.coarse, self.acceleration = checked
+        checked = checked_steps(relaxation, rigid, start, coarse, acceleration, self.energies, self.saturation)
+        self.relaxation, self.rigid, self.start, self.coarse, self.acceleration = checked
         self._asked_rigid = rigid
         kinds = {type(e): e for e in self.vertex_energies}
         self._data_count = tuple(kinds[k].count() if k in kinds else 0 for k in VERTEX_ENERGIES)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +12,7 @@ from torch import Tensor
 
 from ..energies import StableNeoHookean
 from ..mesh import TetMesh
+from ..said import warn
 
 if TYPE_CHECKING:
     from .model import Model
@@ -21,33 +24,35 @@ THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
 SAMPLED = 10_000  # tets that are looked at: a sheet's are all alike
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 
+ONCE = THIN_SEEN, OVER_RELAXED = "thin", "over-relaxed"  # of a Model's _derived: what is said once, or ever more seldom
+
 
 def warn_of(model: Model) -> None:
     """Warns (UserWarning) of what is legal and seldom meant."""
     if size := _size_message(model.mesh):
-        _warn(size)
+        warn(size)
     if not any(isinstance(e, StableNeoHookean) for e in model.energies) and model.mesh.num_tets:
-        _warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
+        warn("energies: no StableNeoHookean among them, so the tets have mass but no stiffness")
     if model.relaxation > STABLE_RELAXATION:
-        _warn(f"relaxation: rollouts were seen to gain energy above {STABLE_RELAXATION}, got {model.relaxation:g}")
+        warn(f"relaxation: rollouts were seen to gain energy above {STABLE_RELAXATION}, got {model.relaxation:g}")
     if model.relaxation > 1 and model.friction is not None:
-        _warn(
+        warn(
             f"relaxation: {model.relaxation:g} with Friction: above 1 gradients were seen to grow by ten decades while "
             "vertices stick; take relaxation=1 and more sweeps where gradients matter"
         )
     paper = any(isinstance(e, StableNeoHookean) and e.block == "paper" for e in model.energies)
     if paper and model.relaxation > 1 and model.saturation is None:
-        _warn('relaxation: block="paper" with relaxation > 1 and no saturation may diverge')
+        warn('relaxation: block="paper" with relaxation > 1 and no saturation may diverge')
     active = model._mass[~model._pinned]
     if active.numel() and model.regularization > HEAVY_REGULARIZATION * float(active.min()):
-        _warn(
+        warn(
             f"regularization: {model.regularization:g} kg is {model.regularization / float(active.min()):.2g} of the "
             "lightest vertex; the sweeps converge that much more slowly"
         )
 
 
 def warn_of_material(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
-    """Warns, once for each Model, of moduli that its settings do not suit; the caller's caller is shown.
+    """Warns, once for each Model, of moduli that its settings do not suit.
 
     Args:
         mu, lam: [Pa], [1 | B, 1 | T]; on CUDA they are not looked at outside debug_checks().
@@ -59,6 +64,26 @@ def warn_of_material(model: Model, mu: Tensor, lam: Tensor, time_step: float, sw
     _warn_of_over_relaxation(model, mu, lam)
 
 
+@contextlib.contextmanager
+def silent(model: Model) -> Iterator[None]:
+    """Inside, nothing is warned of, and what would have been said once of this Model is still to be said after it."""
+    before = {id(m): {name: m._derived[name] for name in ONCE if name in m._derived} for m in _with_settings(model)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            yield
+        finally:
+            for m in _with_settings(model):
+                for name in ONCE:
+                    m._derived.pop(name, None)
+                m._derived.update(before.get(id(m), {}))
+
+
+def _with_settings(model: Model) -> list[Model]:
+    """A Model and those that run in its place with settings."""
+    return [model, *(m for m in model._derived.values() if isinstance(m, type(model)))]
+
+
 def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
     """Whether over-relaxed sweeps of some tet may gain energy from step to step."""
     return bool((lam.detach() > INCOMPRESSIBLE * mu.detach()).any())
@@ -66,20 +91,18 @@ def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
 
 def _warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> None:
     """Moduli may change from step to step: those of the 1st, 2nd, 4th, 8th, ... are looked at."""
-    seen = model._derived.get("over-relaxed", 0) + 1  # 0: it has warned
-    if seen == 1 and "over-relaxed" in model._derived or model.relaxation <= 1:
+    seen = model._derived.get(OVER_RELAXED, 0) + 1  # 0: it has warned
+    if seen == 1 and OVER_RELAXED in model._derived or model.relaxation <= 1:
         return
-    model._derived["over-relaxed"] = seen
+    model._derived[OVER_RELAXED] = seen
     if seen & (seen - 1) or not any(isinstance(e, StableNeoHookean) for e in model.energies):
         return
     if is_nearly_incompressible(mu, lam):
-        model._derived["over-relaxed"] = 0
-        warnings.warn(
+        model._derived[OVER_RELAXED] = 0
+        warn(
             f"relaxation: {model.relaxation:g} where lam is more than {INCOMPRESSIBLE:g} times mu (Poisson's ratio "
             "above 0.492): such rollouts were seen to gain energy without bound; take relaxation=1, with "
             'coarse="auto" in place of it',
-            UserWarning,
-            stacklevel=4,
         )
 
 
@@ -90,9 +113,9 @@ def _warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, 
     sweeps move them together by that much less; inertia helps where a wave crosses fewer elements than w / t. Coarse
     corrections move them together.
     """
-    if "thin" in model._derived or model.coarse is not None:
+    if THIN_SEEN in model._derived or model.coarse is not None:
         return
-    model._derived["thin"] = True
+    model._derived[THIN_SEEN] = True
     tets = model.mesh.tets[:: max(1, model.mesh.num_tets // SAMPLED)]
     corners = model.mesh.points[tets]
     edges = corners[:, 1:] - corners[:, :1]
@@ -109,13 +132,11 @@ def _warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, 
     crossed = time_step * (max(0.0, modulus) / density) ** 0.5 / float(np.median(height))
     needed = min(aspect, crossed) ** 2 * (2 - model.relaxation) / model.relaxation
     if sweeps < needed:
-        warnings.warn(
+        warn(
             f"sweeps: {sweeps} at time_step = {time_step:.3g} s are too few for tets {aspect:.2g} times as wide as "
             f"thick, which need about {needed:.0f} or more: the body moves as if it had little stiffness; take a "
             f"shorter time step, more sweeps with relaxation up to {STABLE_RELAXATION}, or a thicker body of softer "
             "material. Linear tets this thin are also much too stiff in bending (docs/numerics.md)",
-            UserWarning,
-            stacklevel=4,
         )
 
 
@@ -143,7 +164,3 @@ def _largest_body(mesh: TetMesh) -> float:
     points = mesh.points[order]
     high, low = np.maximum.reduceat(points, first), np.minimum.reduceat(points, first)
     return float((high - low).max())
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, UserWarning, stacklevel=5)  # _warn, warn_of, Model.__init__, its decorator, the caller

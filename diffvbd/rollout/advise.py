@@ -53,23 +53,20 @@ def advise(
         device: Where the pilots run; None: the Model's.
         patience: How long pilots may run [s]; the search ends with the one that exceeds it.
         given: mu and lam or young and poisson, force, gravity, prescribed, colliders, rest_points, density, parameters,
-            as in rollout, constant or a function of the time [s]: loads at the middle of each step, prescribed
-            vertices and colliders at its end.
+            as in rollout, constant or a function of the time [s], of parameters each of them: loads at the middle of
+            each step, all else at its end.
 
     Returns:
         Settings with a :class:`diffvbd.Prediction`.
 
     Raises:
-        ValueError, TypeError: As rollout; an error outside (0, 1), per_step values.
+        ValueError, TypeError: As rollout; an error outside (0, 1), per_step values, a quantity that is no finite scalar
+            or, beside ``gradient``, has no derivative.
     """
     check_state(model, x, v)
     error = check_positive("error", error)
     if error >= 1:
         fail("error", "a share of the motion in (0, 1)", repr(error))
-    if not isinstance(gradient, bool):
-        raise TypeError(f"gradient: expected a bool, got {type(gradient).__name__}")
-    if quantity is not None and not callable(quantity):
-        raise TypeError(f"quantity: expected a function of x and v, got {type(quantity).__name__}")
     patience = check_positive("patience", patience, "s")
     if device is not None:
         model = model.to(device)

@@ -14,9 +14,9 @@ from ..energies import Anchor
 from ..mesh import subdivide
 from ..model.model import Model
 from ..step.arguments import check_state, prepare
-from ..step.integrators import SDIRK2, ImplicitEuler, Integrator
+from ..step.integrators import SAME_TIME_STEP, SDIRK2, ImplicitEuler, Integrator, check_integrator
 from .contact_check import cut_share, unbalanced_friction
-from .pilots import FRAMES, Pilot, Pilots, Quantity, converted, pilots_of, relative
+from .pilots import FRAMES, Pilot, Pilots, Quantity, changes, converted, of_time, pilots_of, relative
 from .rollout import rollout
 from .search import start_of
 from .settings import Settings, aligned
@@ -114,7 +114,7 @@ def error_budget(
 
     Args:
         model, x, v: As in :func:`diffvbd.rollout`.
-        duration, time_step, sweeps, integrator: Of the rollout that is judged.
+        duration, time_step, sweeps, integrator: Of the rollout that is judged; pilots take a multiple of four steps.
         part: The share of the duration that pilots run, from its start, in (0, 1]. Errors mostly grow with time: a part
             says which is largest sooner than how large it will be.
         quantity, gradient: As in :func:`diffvbd.advise`.
@@ -126,14 +126,17 @@ def error_budget(
         RuntimeError: The rollout itself does not run to its end.
     """
     check_state(model, x, v)
-    h = check_time_step(time_step, model.dtype)
+    h, duration = check_time_step(time_step, model.dtype), check_positive("duration", duration, "s")
+    if not h <= (1 + SAME_TIME_STEP) * duration:
+        fail("time_step", f"at most the duration, {duration:g} s", f"{h:g} s")
+    if not isinstance(mesh, bool):
+        raise TypeError(f"mesh: expected a bool, got {type(mesh).__name__}")
     part = check_number("part", part)
     if not 0 < part <= 1:
         fail("part", "a number in (0, 1]", repr(part))
-    steps = FRAMES * max(1, round(part * check_positive("duration", duration, "s") / (h * FRAMES)))
+    steps = FRAMES * max(1, round(part * duration / (h * FRAMES)))
     pilots = pilots_of(rollout, model, x, v, steps * h, quantity, gradient, given)
-    own = Settings(h, sweeps, integrator or ImplicitEuler(), model.relaxation, model.coarse,
-                   model.acceleration)  # fmt: skip
+    own = Settings(h, sweeps, check_integrator(integrator), model.relaxation, model.coarse, model.acceleration)
     return _Budget(pilots, own, steps).run(mesh)
 
 
@@ -165,7 +168,7 @@ class _Budget:
     def _share(self, cause: str, a: Pilot, b: Pilot, seconds: float, note: str) -> Share:
         assert a.x is not None and b.x is not None
         quantity = None if a.quantity is None or b.quantity is None else relative(a.quantity, b.quantity)
-        gradients = [relative(u, w) for u, w in zip(a.gradient, b.gradient, strict=True)]
+        gradients = self.pilots.gradients_apart(a, b)
         motion = self.pilots.apart(a.x, b.x)
         return Share(cause, motion, quantity, max(gradients) if gradients else None, seconds, note)
 
@@ -214,8 +217,7 @@ class _Budget:
                         integrator=settings.integrator, save="last", observe=look, check_contact=False,
                         check_energy=False, check_start=False, **given)  # fmt: skip
         cut = None if model.contact is None else float(torch.stack(cuts).max())
-        moves = any(callable(value) and not isinstance(value, Tensor) for value in p.given.values())
-        if model.friction is None or moves or not isinstance(settings.integrator, ImplicitEuler):
+        if model.friction is None or changes(p.given) or not isinstance(settings.integrator, ImplicitEuler):
             return cut, None
         static: dict[str, Any] = {
             name: p.given.get(name) for name in ("mu", "lam", "young", "poisson", "rest_points", "density")
@@ -268,6 +270,14 @@ class _Budget:
         self.shares.append(self._share("mesh", replace(converged, gradient=()), cut, finer.spent - before, note))
 
 
+def _of_parts(value: Any, tets: int) -> Any:
+    """A value of each tet, or a function of time that returns one, for its eight parts."""
+    if of_time(value):
+        return lambda t: _of_parts(value(t), tets)
+    each = isinstance(value, Tensor) and value.dim() and value.shape[-1] == tets
+    return value.repeat_interleave(8, -1) if each else value
+
+
 def finer_mesh(p: Pilots) -> Pilots:
     """Pilot runs on the subdivided mesh, whose first vertices are those of the mesh."""
     model, given = p.model, dict(p.given)
@@ -284,7 +294,5 @@ def finer_mesh(p: Pilots) -> Pilots:
     fine = Model(subdivide(model.mesh), density=model.density.cpu().repeat_interleave(8), **options)
     x, v = (torch.cat([t, t[..., ends.to(t.device), :].mean(-2)], -2) for t in (p.x, p.v))
     for name in ("mu", "lam", "young", "poisson", "density"):
-        value = given.get(name)
-        if isinstance(value, Tensor) and value.dim() and value.shape[-1] == model.num_tets:
-            given[name] = value.repeat_interleave(8, -1)
+        given[name] = _of_parts(given.get(name), model.num_tets)
     return replace(p, model=fine, x=x, v=v, given=given, quantity=None, wrt=None)

@@ -53,6 +53,15 @@ class Segment(NamedTuple):
 Run = Callable[..., Segment]  # of the first step, the one after the last, and a State's tensors
 
 
+def checked_schedule(given: Any) -> Any:
+    """A schedule whose kind and numbers are right."""
+    if given is None or given == "auto" or isinstance(given, BinomialCheckpoints):
+        return given
+    if isinstance(given, str):
+        fail("checkpoint_every", '"auto", None, an integer > 0 or BinomialCheckpoints(snapshots)', repr(given))
+    return check_count("checkpoint_every", given, 1)
+
+
 def choose_schedule(
     checkpoint_every: int | BinomialCheckpoints | Literal["auto"] | None,
     adjoint: Adjoint,
@@ -62,6 +71,7 @@ def choose_schedule(
     sweeps: int,
 ) -> tuple[int | BinomialCheckpoints | None, Adjoint]:
     """Resolves ``"auto"`` for schedule and tape from the bytes they would keep."""
+    checkpoint_every = checked_schedule(checkpoint_every)
     if isinstance(checkpoint_every, BinomialCheckpoints):
         snapshots = checkpoint_every.snapshots
         while _repeats(steps, snapshots) > MAX_REPEATS:
@@ -75,13 +85,7 @@ def choose_schedule(
     if checkpoint_every is None or isinstance(checkpoint_every, BinomialCheckpoints):
         return checkpoint_every, adjoint
     if checkpoint_every != "auto":
-        if isinstance(checkpoint_every, str):
-            fail(
-                "checkpoint_every",
-                '"auto", None, an integer > 0 or BinomialCheckpoints(snapshots)',
-                repr(checkpoint_every),
-            )
-        return check_count("checkpoint_every", checkpoint_every, 1), adjoint
+        return checkpoint_every, adjoint
     row = scenes * check_count("sweeps", sweeps) * model.num_active * model._mass.element_size()
     if not isinstance(adjoint, ReverseSweep):  # a step of GlobalAdjoint keeps a few states and no tape
         kept = UNROLLED_SCALARS * row if isinstance(adjoint, Unrolled) else 0

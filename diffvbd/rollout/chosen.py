@@ -6,12 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from ..adjoint.routes import ReverseSweep
 from ..checks import check_count, check_positive, fail
 from ..step.arguments import check_state
-from .pilots import GIVEN, pilots_of
+from ..step.met import outcomes
+from .pilots import GIVEN, of_time, pilots_of
 from .search import ERROR, PATIENCE, found
 from .settings import Settings
 from .trajectory import PerStep, Trajectory
@@ -45,14 +45,20 @@ def rollout_with(rollout: Callable[..., Trajectory], *, settings: Any, duration:
         chosen["adjoint"] = ReverseSweep(settings.tape)
     if given["checkpoint_every"] == "auto":
         chosen["checkpoint_every"] = settings.checkpoint_every
-    return rollout(**given | chosen)
+    try:
+        return rollout(**given | chosen)
+    finally:  # the caller asks his own Model for the status of its steps
+        if (outcome := outcomes.get(chosen["model"])) is not None:
+            outcomes[given["model"]] = outcome
 
 
 @torch.no_grad()
 def _found(rollout: Callable[..., Trajectory], duration: float, given: dict[str, Any]) -> Settings:
     fixed = {name: given[name] for name in GIVEN if given[name] is not None}
-    for name, value in fixed.items():
-        if isinstance(value, PerStep) or (callable(value) and not isinstance(value, Tensor)):
+    parameters = given["parameters"]
+    named = {f'parameters["{k}"]': v for k, v in parameters.items()} if isinstance(parameters, dict) else {}
+    for name, value in {**fixed, **named}.items():
+        if isinstance(value, PerStep) or of_time(value):
             fail(name, 'a value beside settings="auto", which tries many time steps: use dv.advise, which takes '
                  "functions of time", type(value).__name__)  # fmt: skip
     pilots = pilots_of(rollout, given["model"], given["x"], given["v"], duration, None, False, fixed)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..model.model import Model
+from ..said import warn
 from ..scopes import looks_at
 from ..step.arguments import Prepared, acceleration_of, collider_state
 from ..step.balance import UNBALANCED_FRICTION, contact_of_step, friction_left_over, potential_of_step
@@ -66,7 +66,7 @@ def unbalanced_friction(model: Model, before: tuple[Tensor, Tensor], x: Tensor, 
 
 def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
                     given: dict[str, Any]) -> None:  # fmt: skip
-    """Warns (UserWarning) of the steps of a rollout; the caller's caller is shown.
+    """Warns (UserWarning) of the steps of a rollout.
 
     cuts: cut_share() after each step. The others: of the last step, as above.
     """
@@ -76,20 +76,16 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
     if cut > CUT or left > UNBALANCED_FRICTION:
         model._derived[WARNED] = True
     if cut > CUT:
-        warnings.warn(
+        warn(
             f"pair_barrier: pairs held up {100 * cut:.2g} % of the vertices in step {shares.index(cut)}, which lost "
             f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
             f"{100 * CUT:.2g} %); take a smaller time_step, more detections or a larger reach of the PairBarrier "
             "(docs/contact.md)",
-            UserWarning,
-            stacklevel=3,
         )
     if left > UNBALANCED_FRICTION:
         faster = ', coarse="auto"' if model.coarse is None else ""
         faster += ", acceleration=dv.Anderson(5)" if model.acceleration is None else ""
-        warnings.warn(
+        warn(
             f"friction: {100 * left:.2g} % of it is not balanced in the last step: the sweeps have not converged; take "
             f"more sweeps, a smaller time_step{faster} or a larger Friction(velocity=) (docs/contact.md)",
-            UserWarning,
-            stacklevel=3,
         )

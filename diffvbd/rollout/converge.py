@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -16,7 +15,8 @@ from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
 from ..checks import check_count, check_positive, fail
 from ..model.model import Model
 from ..ops import SweepSettings
-from ..scopes import refuse_refinement
+from ..said import warn
+from ..scopes import refuse_refinement, refuse_transforms
 from ..step.advance import advance, swept
 from ..step.arguments import GRAVITY, Prepared, acceleration_of, check_prescribed, check_state, collider_state, prepare
 from ..step.balance import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
@@ -107,6 +107,7 @@ def solve(
     Source: paper, eq. 1; docs/adjoints.md.
     """
     refuse_refinement("dv.solve")
+    refuse_transforms("dv.solve, which looks at values (dv.step has them)")
     lead, scheme = check_state(model, x, v), check_integrator(integrator)
     check_history(scheme, history, x, time_step)
     if adjoint is None:
@@ -178,7 +179,7 @@ def _judge(done: _Sweeping, tolerance: float, on_failure: str) -> None:
     )
     if on_failure == "raise":
         raise RuntimeError(text)
-    warnings.warn(text, RuntimeWarning, stacklevel=3)
+    warn(text, RuntimeWarning)
 
 
 class _Sweeping:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +13,7 @@ from ..energies import Anchor
 from ..mask import ELASTIC
 from ..model.model import Model
 from ..model.rest import rest_metric
+from ..said import warn
 from ..scopes import looks_at
 from ..step.arguments import Prepared, acceleration_of
 
@@ -32,7 +32,7 @@ ROUNDING = 64.0  # times the energy of strains that are rounding
 
 
 def warn_of_end(model: Model, x: Tensor, v: Tensor) -> None:
-    """Warns (UserWarning) of a rollout that ended with numbers that are not finite; the caller's caller is shown.
+    """Warns (UserWarning) of a rollout that ended with numbers that are not finite.
 
     On CUDA, where looking waits for the device, the answer is copied to the host meanwhile, and the Model's next
     rollout that finds it there says what it was. Nothing that is compiled, transformed or captured is looked at.
@@ -50,7 +50,7 @@ def warn_of_end(model: Model, x: Tensor, v: Tensor) -> None:
 
 
 def warn_of_last_end(model: Model, x: Tensor) -> None:
-    """Warns of the Model's rollouts before this one, on CUDA, as far as they are done; the caller's caller is shown."""
+    """Warns of the Model's rollouts before this one, on CUDA, as far as they are done."""
     if not model._derived.get(ENDED) or not _copies(x):
         return
     ends = [(said, done.query()) for said, done in model._derived[ENDED]]
@@ -66,11 +66,9 @@ def _copies(x: Tensor) -> bool:
 
 
 def _warn_not_finite(which: str) -> None:
-    warnings.warn(
+    warn(
         f"x: {which} ended with positions or velocities that are not finite; dv.debug_checks() says in which step, "
         "sweep and vertex they began. Take a smaller time_step, more sweeps, or float64 (docs/numerics.md)",
-        UserWarning,
-        stacklevel=4,
     )
 
 
@@ -100,7 +98,7 @@ class EnergyLook:
                 self.found[step] = torch.stack([energy, fallen])
 
     def warn(self) -> None:
-        """Warns (UserWarning) of a gain; the caller's caller is shown."""
+        """Warns (UserWarning) of a gain."""
         energy, fallen = torch.stack(list(self.found.values())).unbind(1)  # [looks, B]
         begun, room = self.had[:2]
         gain = (energy - begun - fallen) / (begun + room + fallen.abs().amax(0)).clamp(min=math.ulp(0.0))
@@ -112,12 +110,10 @@ class EnergyLook:
         step = list(self.found)[int(gain.amax(-1).argmax())]
         faster = "" if self.model.coarse is not None else ', coarse="auto"'
         pressed = ", unless bodies were pressed together at the start" if touching else ""
-        warnings.warn(
+        warn(
             f"sweeps: after step {step} the scene has gained {100 * most:.2g} % of the energy that it had and that "
             f"gravity gave it: the sweeps have not converged{pressed}; take more sweeps{faster} or a smaller time_step "
             "(docs/numerics.md)",
-            UserWarning,
-            stacklevel=3,
         )
 
 

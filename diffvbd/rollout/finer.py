@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..model.model import Model
 from ..scopes import refined
-from ..step.integrators import History
+from ..step.integrators import History, is_step_of
 from .trajectory import PerStep, Trajectory, stacked
 
 # given at the steps of the caller and held over the smaller ones; `prescribed` and `colliders` move in between
@@ -36,7 +36,7 @@ def rollout_finer(rollout: Callable[..., Trajectory], *, factors: tuple[int, int
     if given["estimate_errors"]:
         raise NotImplementedError("refine: expected rollouts without estimate_errors")
     time_step, history = given["time_step"] / parts, given["history"]
-    if isinstance(history, History) and history.time_step != time_step:  # but that of a refined rollout before
+    if isinstance(history, History) and not is_step_of(history, time_step):  # but that of a refined rollout before
         raise NotImplementedError("refine: expected rollouts that begin without a history of larger steps")
     finer = dict(given)
     for name in _HELD:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,7 +15,8 @@ from torch import Tensor
 from ..adjoint.routes import ReverseSweep
 from ..checks import check_positive, fail
 from ..model.model import Model
-from ..scopes import refined
+from ..model.warnings import silent
+from ..scopes import refined, refuse_transforms
 from ..step.arguments import GRAVITY, Prepared, prepare
 from .energy_check import mechanical_energy
 from .settings import Settings
@@ -24,6 +24,7 @@ from .trajectory import PerStep, Trajectory
 
 FRAMES = 4  # at which two runs are compared, equally spaced over the duration
 STILL = 1e-4  # of the size of the scene: a motion below it counts as one of this size
+NO_PART = 1e-8  # of quantity over modulus: a gradient below it counts as one of this size
 LOADS = ("force", "gravity")
 MOVING = ("prescribed", "colliders")
 MODULI = ("mu", "lam", "young", "poisson")
@@ -68,8 +69,9 @@ class Pilots:
 
     def __post_init__(self) -> None:
         self.duration = check_positive("duration", self.duration, "s")
-        for name in GIVEN:
-            value = self.given.get(name)
+        parameters = self.given.get("parameters")
+        named = {f'parameters["{k}"]': v for k, v in parameters.items()} if isinstance(parameters, dict) else {}
+        for name, value in {**self.given, **named}.items():
             if isinstance(value, PerStep):
                 fail(name, "a value or a function of the time [s], since time steps vary", "per_step")
 
@@ -84,11 +86,23 @@ class Pilots:
         """One short step: raises what rollout raises of the arguments."""
         h = 1e-3 * self.duration
         given = self.at_steps(dict(self.given), h, 1, 0.0)
-        end = self.execute(self.model, self.x, self.v, steps=1, time_step=h, sweeps=1, save="last", **given)
-        value = None if self.quantity is None else self.quantity(end.x[-1], end.v[-1])
-        if self.quantity is not None and not (isinstance(value, Tensor) and value.numel() == 1):
+        with silent(self.model):
+            end = self.execute(self.model, self.x, self.v, steps=1, time_step=h, sweeps=1, save="last", **given)
+        if self.quantity is None:
+            return
+        leaves = [t[-1].detach().requires_grad_(self.wrt is not None) for t in (end.x, end.v)]
+        with torch.set_grad_enabled(self.wrt is not None):
+            value = self.quantity(*leaves)
+        if not (isinstance(value, Tensor) and value.numel() == 1):
             got = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             fail("quantity", "a function that returns a scalar tensor", got)
+        if not bool(torch.isfinite(value)):
+            fail("quantity", "a finite value after the first step", float(value))
+        if self.wrt is None:
+            return
+        found = torch.autograd.grad(value, leaves, allow_unused=True) if value.requires_grad else (None, None)
+        if all(gradient is None for gradient in found):
+            fail("quantity", "a function that torch can differentiate, beside gradient=True", "one without a graph")
 
     def run(self, settings: Settings, steps: int, quarter: int | None = None, start: Pilot | None = None) -> Pilot:
         """``steps`` steps over the whole duration, or a quarter of them from frame ``quarter`` of ``start``."""
@@ -97,8 +111,7 @@ class Pilots:
         x, v = (self.x, self.v) if start is None or quarter is None else (start.x[quarter], start.v[quarter])  # type: ignore[index]
         began = first * self.duration / FRAMES
         differentiate = self.wrt is not None and quarter is None
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with silent(self.model):
             try:
                 model = settings.applied(self.model)
                 self._warm(settings, model, x, v, began)
@@ -160,8 +173,11 @@ class Pilots:
             return lambda step, x, v: function(began + (step + share) * h)
 
         out = {name: value for name, value in given.items() if value is not None}
+        if isinstance(given.get("parameters"), dict):
+            out["parameters"] = {name: timed(value, 1.0) if of_time(value) else value
+                                 for name, value in given["parameters"].items()}  # fmt: skip
         for name, value in given.items():
-            if not _is_function(value):
+            if not of_time(value):
                 continue
             function: Callable[[float], Any] = value
             if name == "colliders":
@@ -190,6 +206,18 @@ class Pilots:
         worst = float((distance / self.motion(b)).max())
         return worst if math.isfinite(worst) else math.inf
 
+    def gradients_apart(self, a: Pilot, b: Pilot) -> list[float]:
+        """Relative distances of the gradients of two runs. With respect to moduli that have no part in the motion, as
+        of a body in free fall, they are rounding: what is below a tiny part of quantity over modulus counts as that."""
+        out = []
+        for name, u, w in zip((None, *(self.wrt or ())), a.gradient, b.gradient, strict=False):
+            least = 0.0
+            if name is not None and b.quantity is not None:
+                modulus = float(torch.as_tensor(self.given[name]).double().norm())
+                least = NO_PART * abs(float(b.quantity)) / modulus if modulus > 0 else 0.0
+            out.append(relative(u, w, least))
+        return out
+
     def hardest(self, a: Tensor, b: Tensor) -> int:
         """The quarter of the duration in which two runs part most."""
         distance = (a - b).square().sum(-1).flatten(1).mean(1).sqrt()
@@ -204,7 +232,7 @@ class Pilots:
     @cached_property
     def conserves(self) -> bool:
         """Whether the exact motion keeps its energy, so that what a run loses is what it damps."""
-        changing = any(map(_is_function, self.given.values()))
+        changing = changes(self.given)
         other = any(self.given.get(name) is not None for name in ("rest_points", "density", "prescribed", "colliders"))
         damped = self.model.friction is not None or any(
             bool((torch.as_tensor(getattr(e, "damping", 0.0)) > 0).any()) for e in self.model.energies
@@ -213,7 +241,7 @@ class Pilots:
 
     @property
     def material_changes(self) -> bool:
-        return any(_is_function(self.given.get(name)) for name in MODULI)
+        return any(of_time(self.given.get(name)) for name in MODULI)
 
     @cached_property
     def prepared(self) -> Prepared:
@@ -223,7 +251,7 @@ class Pilots:
     def prepared_at(self, time: float) -> Prepared:
         """The material of the scene at a time [s]."""
         given = self.at_steps({name: self.given.get(name) for name in MODULI}, 0.0, 0, time)
-        values = {name: value(0, self.x, self.v) if _is_function(value) else value for name, value in given.items()}
+        values = {name: value(0, self.x, self.v) if of_time(value) else value for name, value in given.items()}
         moduli: dict[str, Any] = {name: values.get(name) for name in MODULI}
         return prepare(self.model, tuple(self.x.shape[:-2]), time_step=1.0, sweeps=1, rest_points=None, density=None,
                        parameters=None, **moduli)  # fmt: skip
@@ -247,25 +275,41 @@ class Pilots:
         return float((way / self.motion(run.x)).max())
 
 
-def _is_function(value: Any) -> bool:
-    return callable(value) and not isinstance(value, Tensor)
-
-
 def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Tensor, duration: float,
               quantity: Quantity | None, gradient: bool, given: dict[str, Any]) -> Pilots:  # fmt: skip
     """Pilot runs of a scene, with the gradients that are asked for. A first short step has raised what rollout raises
     of the arguments."""
+    refuse_transforms('dv.advise, dv.error_budget and settings="auto", which look at values')
     if unknown := sorted(set(given) - set(GIVEN)):
         raise TypeError(f"{unknown[0]}: expected an argument among {', '.join(GIVEN)}")
+    if not isinstance(gradient, bool):
+        raise TypeError(f"gradient: expected a bool, got {type(gradient).__name__}")
+    if gradient and torch.is_inference_mode_enabled():
+        fail("gradient", "False inside torch.inference_mode(), which records nothing", "True")
+    if quantity is not None and not callable(quantity):
+        raise TypeError(f"quantity: expected a function of x and v, got {type(quantity).__name__}")
+    if x.numel() == 0:
+        fail("x", "a scene with a vertex, whose motion can be judged", f"shape {list(x.shape)}")
     x, v = x.detach(), v.detach()
     if gradient and quantity is None:
         quantity = _mean_squared_way(x)
     material = [name for name in MODULI if given.get(name) is not None]
-    wrt = [name for name in material if not callable(given[name]) or isinstance(given[name], Tensor)]
+    wrt = [name for name in material if not of_time(given[name])]
     given = {name: value.detach() if isinstance(value, Tensor) else value for name, value in given.items()}
     pilots = Pilots(rollout, model, x, v, duration, given, quantity, wrt if gradient else None)
     pilots.check()
     return pilots
+
+
+def of_time(value: Any) -> bool:
+    return callable(value) and not isinstance(value, Tensor)
+
+
+def changes(given: dict[str, Any]) -> bool:
+    """Whether anything that is given changes in time."""
+    parameters = given.get("parameters")
+    values = [*given.values(), *(parameters.values() if isinstance(parameters, dict) else ())]
+    return any(map(of_time, values))
 
 
 def _mean_squared_way(start: Tensor) -> Quantity:
@@ -282,8 +326,8 @@ def converted(value: Any, **to: Any) -> Any:
     return (lambda t: converted(value(t), **to)) if callable(value) else value
 
 
-def relative(a: Tensor, b: Tensor) -> float:
-    """|a - b| / |b|"""
-    size = float(b.norm())
+def relative(a: Tensor, b: Tensor, least: float = 0.0) -> float:
+    """|a - b| / |b|, of which |b| counts as ``least`` at least."""
+    size = max(float(b.norm()), least)
     apart = float((a - b).norm())
     return 0.0 if apart == 0 else apart / size if size > 0 else math.inf

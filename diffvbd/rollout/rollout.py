@@ -137,6 +137,8 @@ def rollout(
     for name, asked in (("check_contact", check_contact), ("check_energy", check_energy)):
         if not isinstance(asked, bool | None):
             raise TypeError(f"{name}: expected a bool or None, got {type(asked).__name__}")
+    if observe is not None and not callable(observe):
+        raise TypeError(f"observe: expected a function of x, v and the step or None, got {type(observe).__name__}")
     if not isinstance(check_start, bool):
         raise TypeError(f"check_start: expected a bool, got {type(check_start).__name__}")
     lead, adjoint, scheme = check_state(model, x, v), check_adjoint(adjoint), check_integrator(integrator)
@@ -150,6 +152,7 @@ def rollout(
     options, own = ({k: _frozen(v) for k, v in given.items()} for given in (options, parameters or {}))
     # once: what a checkpoint runs again must run as it did, whatever dv.regime says by then
     execution = step_settings(model, lead, time_step, sweeps)
+    h = execution.numbers.time_step
     chosen: dict[str, Any] = {"time_step": time_step, "sweeps": sweeps, "adjoint": adjoint, "settings": execution}
     anew = any(_changes(value) for value in (*(options[k] for k in _STATIC), *own.values()))
     fixed = None if anew else prepare(model, lead, **chosen, **_to_prepare(options, own, 0, x, v))
@@ -178,7 +181,7 @@ def rollout(
     def segment(first: int, end: int, x: Tensor, v: Tensor, *before: Tensor) -> Segment:
         _check_versions(versions)
         frames, observed = [], []
-        past = History(before[0], before[1], before[2], time_step) if before else None
+        past = History(before[0], before[1], before[2], h) if before else None
         for k in range(first, end):
             now = prepare(model, lead, **chosen, **_to_prepare(options, own, k, x, v)) if fixed is None else fixed
             given = _to_advance(model, options, k, x, v, outer, colliders_before)
@@ -218,7 +221,7 @@ def rollout(
         steps=[f[0] for f in frames],
         observations=stacked(done.observed),
         errors=of_steps([errors[k] for k in range(steps)], model, x, sweeps) if estimate_errors else None,
-        history=History(done.end[2], done.end[3], done.end[4], time_step) if len(done.end) > 2 else None,
+        history=History(done.end[2], done.end[3], done.end[4], h) if len(done.end) > 2 else None,
     )
 
 
@@ -264,7 +267,8 @@ def _to_advance(model: Model, options: dict[str, Any], k: int, x: Tensor, v: Ten
     """What enters step k through advance(); ``start``: x before the first step."""
     now = {name: _at(options[name], k, x, v) for name in (*_LOADS, "colliders")}
     if _changes(options["prescribed"]) and not isinstance(options["prescribed"], _Steps):
-        check_prescribed(model, now["prescribed"], x, start)
+        for value in _tensors(now["prescribed"]):
+            check_prescribed(model, value, x, start)
     now["colliders_before"] = None
     if isinstance(options["colliders"], _Steps):
         first = model.collider_points if colliders_before is None else colliders_before
@@ -294,7 +298,9 @@ class _Steps(tuple):
 
 
 def _tensors(value: Any) -> list[Tensor]:
-    return [value] if isinstance(value, Tensor) else list(value) if isinstance(value, _Steps) else []
+    """Those of a value, which may be that of each step, or a tuple of one for each solve of a step."""
+    parts = value if isinstance(value, tuple) else (value,)
+    return [part for part in parts if isinstance(part, Tensor)]
 
 
 def _frozen(value: Any) -> Any:

@@ -220,7 +220,7 @@ class _Search:
         """Of motion, quantity and gradient, the largest."""
         assert a.x is not None and b.x is not None
         out = [self.pilots.apart(a.x, b.x)]
-        out += [relative(u, w) for u, w in zip(a.gradient, b.gradient, strict=True)]
+        out += self.pilots.gradients_apart(a, b)
         if a.quantity is not None and b.quantity is not None:
             out.append(relative(a.quantity, b.quantity))
         return max(out)

@@ -13,10 +13,11 @@ from ..adjoint.routes import ReverseSweep
 from ..checks import check_count, check_positive, fail
 from ..energies import StableNeoHookean
 from ..model.anderson import Anderson
+from ..model.arguments import checked_acceleration, checked_coarse, checked_relaxation
 from ..model.coarse import CoarseSpace
 from ..model.model import Model
 from ..step.integrators import ImplicitEuler, Integrator, check_integrator
-from .checkpoints import BinomialCheckpoints
+from .checkpoints import BinomialCheckpoints, checked_schedule
 
 
 @dataclass(frozen=True)
@@ -106,17 +107,27 @@ class Settings:
         object.__setattr__(self, "time_step", check_positive("time_step", self.time_step, "s"))
         object.__setattr__(self, "sweeps", check_count("sweeps", self.sweeps))
         object.__setattr__(self, "integrator", check_integrator(self.integrator))
-        ReverseSweep(self.tape)  # raises
+        object.__setattr__(self, "relaxation", checked_relaxation(self.relaxation))
+        checked_coarse(self.coarse, (StableNeoHookean(),), None)  # this and what follows raises
+        checked_acceleration(self.acceleration, (), None)
+        ReverseSweep(self.tape)
+        checked_schedule(self.checkpoint_every)
         if self.block not in (None, "exact", "paper"):
             fail("block", '"exact", "paper" or None', repr(self.block))
+        if self.dtype not in (None, torch.float64, torch.float32):
+            fail("dtype", "torch.float64, torch.float32 or None", repr(self.dtype))
+        if not isinstance(self.predicted, Prediction | None):
+            raise TypeError(f"predicted: expected a diffvbd.Prediction or None, got {type(self.predicted).__name__}")
 
     def steps(self, duration: float) -> int:
         """How many steps a rollout over so long [s] takes; what exceeds a whole number by rounding is none."""
-        return max(1, math.ceil(duration / self.time_step - 1e-6))
+        return max(1, math.ceil(check_positive("duration", duration, "s") / self.time_step - 1e-6))
 
     def applied(self, model: Model) -> Model:
         """The Model that runs: ``model`` with relaxation, coarse, acceleration and block of these settings. It is
         made once for each Model and kept with it."""
+        if not isinstance(model, Model):
+            raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
         if self.dtype is not None and self.dtype != model.dtype:
             fail("settings", f"those of a Model of {model.dtype}", f"of {self.dtype}: take model.to(dtype=...)")
         changes: dict[str, Any] = {
@@ -132,7 +143,7 @@ class Settings:
         if all(same.values()) and self.block in (None, own):
             return model
         key = f"settings {self.relaxation} {changes['coarse']} {self.acceleration} {self.block}"
-        return model.derived(key, lambda: model.replace(**changes))
+        return model.derived(key, lambda: _replaced(model, changes))
 
     def on(self, steps: int, duration: float) -> Settings:
         """The same with ``steps`` steps over ``duration`` [s], without a prediction."""
@@ -145,6 +156,14 @@ class Settings:
         parts += [f"Anderson({self.acceleration.window})"] if self.acceleration is not None else []
         line = ", ".join(parts)
         return line if self.predicted is None else f"{line}\n{_told(line, self.predicted)}"
+
+
+def _replaced(model: Model, changes: dict[str, Any]) -> Model:
+    """``model`` with other arguments and the room for pairs that it has by now."""
+    out, own = model.replace(**changes), model.surface_of_contact
+    if own is not None and out.surface_of_contact is not None:
+        out.surface_of_contact = replace(out.surface_of_contact, capacity=own.capacity)
+    return out
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..checks import fail
 from ..step.estimate import ErrorEstimate
 from ..step.integrators import History
 
@@ -22,7 +23,8 @@ class PerStep:
 def per_step(values: Tensor) -> PerStep:
     """Marks a tensor whose leading dimension counts the steps of a rollout, shape [steps, ...]."""
     if not isinstance(values, Tensor) or values.dim() == 0:
-        raise TypeError(f"values: expected a tensor of shape [steps, ...], got {type(values).__name__}")
+        got = "shape []" if isinstance(values, Tensor) else type(values).__name__
+        raise TypeError(f"values: expected a tensor of shape [steps, ...], got {got}")
     return PerStep(values)
 
 
@@ -57,4 +59,9 @@ def stacked(observed: list[Any]) -> Any:
         return tuple(stacked([o[i] for o in observed]) for i in range(len(first)))
     if not isinstance(first, Tensor):
         raise TypeError(f"observe: expected tensors, or tuples or dicts of them, got {type(first).__name__}")
+    for step, value in enumerate(observed, start=1):
+        if not isinstance(value, Tensor) or value.shape != first.shape:
+            got = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            fail("observe", f"a tensor of shape {list(first.shape)} after each step, as after the first",
+                 f"{got} after step {step}")  # fmt: skip
     return torch.stack(observed)

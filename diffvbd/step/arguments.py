@@ -15,7 +15,7 @@ from .. import ops, reference
 from ..adjoint.routes import Adjoint, ReverseSweep, Unrolled
 from ..checks import check_broadcast, check_count, check_tensor, check_time_step, fail, name_value, to_float
 from ..contact.barrier import Friction, PairBarrier
-from ..contact.colliders import MOST_LENGTH
+from ..contact.colliders import MOST_LENGTH, Plane
 from ..energies import VERTEX_ENERGIES
 from ..model.model import Model
 from ..model.moduli import moduli_of
@@ -219,11 +219,24 @@ def collider_state(model: Model, x: Tensor, end: Any, start: Any) -> tuple[Tenso
         if looks_at(value):
             far = torch.isfinite(value) & (value.abs() > MOST_LENGTH)
             name_value(name, f"coordinates of at most {MOST_LENGTH:g} m", torch.where(far, value, 0.0), ~far)
+            _refuse_lines(model, name, value.detach())
         given[name] = ops.broadcast(value, (*lead, count, 3)).reshape(flat)
     if not model.touches:
         return None
     after = given.get("colliders", model.collider_points.expand(flat).contiguous())
     return given.get("colliders_before", after), after
+
+
+def _refuse_lines(model: Model, name: str, points: Tensor) -> None:
+    """Raises for a Plane whose three corner points lie on one line: it has no normal."""
+    points = points.expand(*points.shape[:-2], model.collider_points.shape[0], 3)  # perhaps one place for all
+    for number, (thing, rows) in enumerate(zip(model.colliders, model.collider_rows, strict=True)):
+        if isinstance(thing, Plane):
+            corners = points[..., rows, :].double()
+            one, two = (corners[..., k, :] - corners[..., 0, :] for k in (1, 2))
+            size = torch.finfo(points.dtype).eps * one.norm(dim=-1) * two.norm(dim=-1)
+            if bool((torch.linalg.cross(one, two).norm(dim=-1) <= size).any()):
+                fail(name, "three corner points of each Plane that span it", f"those of collider {number} on a line")
 
 
 def name_argument(model: Model, error: ValueError, arguments: dict[str, Any]) -> None:
@@ -237,7 +250,7 @@ def refuse_non_finite(model: Model, arguments: dict[str, Any]) -> None:
     for name, value in arguments.items():
         if isinstance(value, Tensor):
             good = torch.isfinite(value)
-            if name == "prescribed":  # read only where pinned
+            if name.startswith("prescribed"):  # read only where pinned
                 value, good = torch.where(model._pinned[:, None], value, 0.0), good | ~model._pinned[:, None]
             name_value(name, "finite values", value, good)
 

@@ -69,7 +69,8 @@ def left_over(at: IncrementalPotential, norm: Norm) -> tuple[Tensor, Tensor]:
 def rounding(at: IncrementalPotential, norm: Norm, eps: float | None = None) -> Tensor:
     """What rounding alone may leave of it [kg m], [B, groups]: a block times what rounds a position."""
     eps = torch.finfo(at.x.dtype).eps if eps is None else eps
-    return ROUNDINGS * eps * at.x.abs().amax((-2, -1))[:, None] * norm(at.free * at.stiffness())
+    largest = at.x.abs().amax((-2, -1)) if at.x.shape[-2] else at.x.new_zeros(len(at.x))
+    return ROUNDINGS * eps * largest[:, None] * norm(at.free * at.stiffness())
 
 
 def share(part: Tensor, whole: Tensor) -> Tensor:

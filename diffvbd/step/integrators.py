@@ -20,17 +20,18 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import fail
+from ..checks import check_tensor, fail
 from ..model.model import Model
 from ..ops import TET_READS_X_PREV
-from ..scopes import looks_at, recorders
+from ..scopes import looks_at, recorders, refuse_transforms
 from ..tuples import replaced
 from .approach import may_touch
-from .arguments import Prepared, acceleration_of, broadcastable, collider_state
+from .arguments import Prepared, acceleration_of, broadcastable, collider_state, refuse_non_finite
 from .coarse_sums import coarse_mass
 from .predict import begin
 
 GAMMA = 1 - 1 / math.sqrt(2)
+SAME_TIME_STEP = 1e-9  # relative: two durations divided into steps give the same h but for rounding
 STAGED = ("prescribed", "colliders")  # where motion is given: at the end of a step, or of each of its solves
 
 
@@ -111,13 +112,24 @@ def check_history(integrator: Integrator, history: Any, x: Tensor, time_step: An
         fail("history", f"None beside {type(integrator).__name__}(), which has none", type(history).__name__)
     if not isinstance(history, History):
         raise TypeError(f"history: expected what a step with BDF2() returns, got {type(history).__name__}")
-    for name, value, shape in (("moved", history.moved, x.shape), ("v", history.v, x.shape),
-                               ("smooth", history.smooth, x.shape[:-1])):  # fmt: skip
+    flags = torch.empty(x.shape[:-1], dtype=torch.bool, device=x.device)
+    for name, value, like, owner in (("moved", history.moved, x, "that of x"), ("v", history.v, x, "that of x"),
+                                     ("smooth", history.smooth, flags, "a history's")):  # fmt: skip
+        shape = like.shape
         if not isinstance(value, Tensor) or value.shape != shape:
             got = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             fail(f"history.{name}", f"shape {list(shape)}, that of x", got)
-    if history.time_step != time_step:
+        check_tensor(f"history.{name}", value, like, owner=owner)
+    if not is_step_of(history, time_step):
         fail("history", f"one of a step of time_step {time_step} s (None begins anew)", f"{history.time_step} s")
+
+
+def is_step_of(history: History, time_step: Any) -> bool:
+    """Whether a history is that of a time step, but for the rounding with which a duration was divided."""
+    try:
+        return math.isclose(history.time_step, time_step, rel_tol=SAME_TIME_STEP)
+    except (TypeError, ValueError):  # what is no number, prepare() says
+        return False
 
 
 def solves_of(integrator: Integrator) -> int:
@@ -145,8 +157,23 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
     """
     end = _at_end(given)
 
-    def solve(x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any]) -> tuple[Tensor, Tensor, Solve]:
-        return *run(model, x, v, prepared, **given), Solve(x, v, prepared, given)
+    outer = {"x": x, "v": v, **_named(history, given)}
+
+    def solve(x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any], begun: Tensor | None = None
+              ) -> tuple[Tensor, Tensor, Solve]:  # fmt: skip
+        """``begun``: where a solve before this one has ended."""
+        try:
+            return *run(model, x, v, prepared, **given), Solve(x, v, prepared, given)
+        except ValueError:  # perhaps of what was made of several arguments for this solve
+            if isinstance(integrator, ImplicitEuler):
+                raise
+            # what is wrong with x or v themselves has been said with vertex and scene
+            others = {name: t for name, t in outer.items() if isinstance(t, Tensor) and t is not x and t is not v}
+            refuse_non_finite(model, {name: t for name, t in others.items() if not t.is_meta})
+            if begun is not None and not bool(torch.isfinite(begun).all()):
+                fail("x, v", f"a state from which the first solve of a step of {integrator} ends finite (a smaller "
+                     "time_step, more sweeps or float64 may help)", "positions that are not")  # fmt: skip
+            raise
 
     if isinstance(integrator, ImplicitEuler):
         x_end, v_end, last = solve(x, v, whole, end)
@@ -155,6 +182,8 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
         raise NotImplementedError(f"integrator: expected ImplicitEuler() with a law of tets that reads x_prev, got "
                                   f"{integrator}")  # fmt: skip
     time_step = whole.settings.numbers.time_step
+    if model.touches:
+        refuse_transforms("a step with contact")
     touching = _touching(model, x, v, whole, end)
     if touching is not None:
         if whole.unrolled is not None:
@@ -176,7 +205,8 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
         x_end, v_end, last = solve(x, v, whole, end)
         return Taken(x_end, v_end, remembered(x_end), last)
 
-    def last_solve(feasible: Tensor, reference: Tensor, carried: Tensor, share: float) -> Taken:
+    def last_solve(feasible: Tensor, reference: Tensor, carried: Tensor, share: float, begun: Tensor | None = None
+                   ) -> Taken:  # fmt: skip
         """From a feasible state, about a velocity w and a position that is h_solve times ``carried`` away from it."""
         start, weights = reference + carried, _over(whole, share)
         if euler is not None:
@@ -185,7 +215,7 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
             weights, loads = _of_euler(model, weights, end, x, euler, share)
         else:
             loads = end
-        x_end, v_end, last = solve(feasible, start, weights, loads)
+        x_end, v_end, last = solve(feasible, start, weights, loads, begun)
         v_end = v_end - carried if euler is None else torch.where(euler[..., None], share * v_end, v_end - carried)
         return Taken(x_end, v_end, remembered(x_end), last)
 
@@ -199,7 +229,16 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
         mixed = euler.any(-1)[..., None, None]
         feasible = torch.where(mixed, x, x1)
         carried = torch.where(mixed, carried + (x1 - x) / (GAMMA * time_step), carried)
-    return last_solve(feasible, v + (1 + math.sqrt(2)) * (v1 - v), carried, GAMMA)
+    return last_solve(feasible, v + (1 + math.sqrt(2)) * (v1 - v), carried, GAMMA, x1)
+
+
+def _named(history: History | None, given: dict[str, Any]) -> dict[str, Any]:
+    """The tensors of a step by the names that errors give them."""
+    out: dict[str, Any] = {} if history is None else {"history.moved": history.moved, "history.v": history.v}
+    for name, value in given.items():
+        several = isinstance(value, tuple) and name in STAGED
+        out |= {f"{name}[{i}]": part for i, part in enumerate(value)} if several else {name: value}
+    return out
 
 
 def _over(whole: Prepared, share: float) -> Prepared:

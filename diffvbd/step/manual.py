@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..checks import check_tensor, fail, to_float
 from ..model.model import Model
+from ..scopes import refuse_transforms
 from ..tuples import replaced
 from .arguments import check_state
 from .integrators import History
@@ -63,6 +64,7 @@ def step_forward(
     wrt = (wrt,) if isinstance(wrt, str) else wrt
     if not isinstance(wrt, Sequence) or not all(isinstance(name, str) for name in wrt):
         raise TypeError(f"wrt: expected names of arguments, got {wrt!r}")
+    refuse_transforms("dv.step_forward, which keeps a graph of its own (dv.step has them)")
     check_state(model, x, v)
     if not isinstance(options.get("parameters"), dict | None):
         got = type(options["parameters"]).__name__
@@ -75,7 +77,7 @@ def step_forward(
         values["density"] = model.density
     inputs: dict[str, Tensor] = {}
     history = values.get("history")
-    before: dict[str, Any] = history._asdict() if isinstance(history, History) else {}
+    before: dict[str, Any] = {k: getattr(history, k) for k in ("moved", "v")} if isinstance(history, History) else {}
     for full in wrt:
         of_history = full.startswith("history.")
         name = full.removeprefix("history.")
@@ -91,8 +93,8 @@ def step_forward(
         check_tensor(full, value, model._mass)
         place[name] = inputs[full] = value.detach().requires_grad_()
     values["parameters"] = parameters or None
-    if before:
-        values["history"] = History(**before)
+    if isinstance(history, History):
+        values["history"] = replaced(history, **before)
     with torch.enable_grad():
         x_end, v_end, *more = step(model, **values)
     constant = not (x_end.requires_grad or v_end.requires_grad)

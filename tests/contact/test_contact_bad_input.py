@@ -343,3 +343,17 @@ def test_gradients_beside_gaps_of_nothing_are_finite(gap: float) -> None:
     end, _ = dv.step(model, x, v, **STEP)
     (grad,) = torch.autograd.grad(end.sum(), v)
     assert torch.isfinite(grad).all() and grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("name", ["colliders", "colliders_before"])
+@pytest.mark.parametrize("integrator", [dv.ImplicitEuler(), dv.SDIRK2()], ids=str)
+def test_a_plane_whose_corner_points_lie_on_a_line_is_named(name: str, integrator: Any) -> None:
+    things = [colliders.Sphere((5.0, 0.0, 0.0), 0.1), colliders.Plane((0.0, -0.1, 0.0), (0.0, 1.0, 0.0))]
+    model = dv.Model(box(2, 0.1), energies=(dv.StableNeoHookean(), dv.PairBarrier()), colliders=things)
+    x, points = model.rest_points, model.collider_points
+    line = points.clone()
+    line[3] = 2 * line[2] - line[1]
+    options: dict[str, Any] = {"mu": 1e4, "lam": 1e4, "time_step": 0.01, "sweeps": 1, "integrator": integrator}
+    for wrong in (line, points[:1], points[0]):
+        given = {"colliders": points, "colliders_before": points} | {name: wrong}
+        raises(lambda g=given: dv.step(model, x, 0 * x, **options, **g), name, "collider 1 on a line")

@@ -235,6 +235,14 @@ def test_more_pairs_than_a_step_has_room_for() -> None:
         ({"parameters": {"pair_barrier.kappa": torch.tensor(-1.0).double()}}, "pair_barrier.kappa: expected finite"),
         ({"x": torch.full((16, 3), torch.nan).double()}, "x: expected finite values, got nan"),
         ({"previous": (torch.full((16, 3), torch.nan).double(),) * 2, "time_step": 0.1}, "previous: x: .* finite"),
+        (
+            {"x": torch.full((16, 3), -9.0).double()},
+            "x: expected every unpinned vertex above the floor, got vertex 0",
+        ),
+        (
+            {"previous": (torch.full((16, 3), -9.0).double(),) * 2, "time_step": 0.1},
+            "previous: x: expected every",
+        ),
         ({"x": torch.zeros(16, 3).double()}, "x: expected surfaces that do not touch, got .* pairs without a gap"),
     ],
 )

@@ -142,4 +142,8 @@ def test_bad_arguments() -> None:
 
 def test_empty_mesh() -> None:
     model = dv.Model(dv.TetMesh([], []))
-    assert diagnose(model, torch.zeros(0, 3, dtype=torch.float64), mu=1.0, lam=1.0, time_step=0.1).ok
+    none = torch.zeros(0, 3, dtype=torch.float64)
+    assert diagnose(model, none, mu=1.0, lam=1.0, time_step=0.1).ok
+    touching = model.replace(energies=(dv.StableNeoHookean(), dv.PairBarrier()))
+    for each in (model, touching):
+        assert diagnose(each, none, mu=1.0, lam=1.0, time_step=0.1, previous=(none, none)).ok

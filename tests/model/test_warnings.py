@@ -148,3 +148,57 @@ def test_what_it_warns_of_grows_and_the_remedy_does_not() -> None:
                              poisson=0.4999)  # fmt: skip
         fastest[relaxation] = float(end.v.norm(dim=-1).max())
     assert fastest[1.6] > 20 and fastest[1.0] < 3
+
+
+def bent() -> tuple[dv.Model, torch.Tensor, dict[str, Any]]:
+    """A stiff bar whose velocities bend it, and how it gains energy."""
+    model = dv.Model(dv.mesh.box((5, 2, 2), (0.4, 0.1, 0.1)))
+    v = torch.zeros_like(model.rest_points)
+    v[:, 1] = 20 * model.rest_points[:, 0].square()
+    return model, v, {"mu": 1e9, "lam": 1e9}
+
+
+def gains_with_settings() -> None:
+    model, v, material = bent()
+    dv.rollout(model, model.rest_points, v, steps=10, settings=dv.Settings(0.01, 2, relaxation=1.2), **material)
+
+
+def gains_inside_refine() -> None:
+    model, v, material = bent()
+    x = model.rest_points
+    dv.refine(lambda: dv.rollout(model, x, v, steps=10, time_step=0.01, sweeps=2, **material).x.square().sum())
+
+
+def does_not_converge() -> None:
+    model, v, material = bent()
+    dv.solve(model, model.rest_points, v, time_step=0.01, max_sweeps=1, on_failure="warn", **material)
+
+
+def has_no_derivative() -> None:
+    model, v, material = bent()
+    given = {"time_step": 0.01, "sweeps": 1, "adjoint": dv.GlobalAdjoint(max_iterations=1, on_failure="warn")}
+    x, _ = dv.step(model, model.rest_points, v.requires_grad_(), **given, **material)
+    x.sum().backward()
+
+
+def is_thin_in_step_forward() -> None:
+    model = sheet(1e-3)
+    dv.step_forward(model, model.rest_points, 0 * model.rest_points, sweeps=20, **STEP)
+
+
+@pytest.mark.parametrize(
+    ("run", "message"),
+    [
+        (gains_with_settings, "has gained"),
+        (gains_inside_refine, "has gained"),
+        (does_not_converge, "solve: expected a residual"),
+        (has_no_derivative, "GlobalAdjoint: expected conjugate gradients"),
+        (is_thin_in_step_forward, "too few for tets"),
+        (lambda: dv.Settings(0.01, 2, relaxation=1.8).applied(sheet(0.05)), "seen to gain energy above 1.7"),
+        (lambda: dv.diagnose(bent()[0], 1e3 * bent()[0].rest_points, mu=1e5, lam=1e5), "Green strain"),
+    ],
+)
+def test_a_warning_points_at_the_line_that_called_the_package(run: Callable[[], Any], message: str) -> None:
+    with pytest.warns(match=message) as found:
+        run()
+    assert [w.filename for w in found if message in str(w.message)] == [__file__]

@@ -1,6 +1,7 @@
 """Advised settings keep the error that was asked for, and say so where none do."""
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -190,3 +191,75 @@ def test_a_bounce_that_steps_resolve() -> None:
     error = runs.apart(given.x, exact.x)
     assert 0.01 / 20 < error <= 0.01
     assert float(given.v[-1, :, 1].mean()) > 0.3  # it has been thrown back
+
+
+@pytest.mark.parametrize(
+    ("quantity", "gradient", "got"),
+    [
+        (lambda x, v: x, False, r"scalar tensor, got shape \[28, 3\]"),
+        (lambda x, v: 1.0, False, "scalar tensor, got float"),
+        (lambda x, v: math.nan * x.sum(), False, "finite value after the first step, got nan"),
+        (lambda x, v: x.detach().sum(), True, "beside gradient=True, got one without a graph"),
+        (lambda x, v: torch.ones((), requires_grad=True), True, "beside gradient=True, got one without a graph"),
+    ],
+)
+@pytest.mark.parametrize("judge", ["advise", "budget"])
+def test_a_quantity_that_cannot_be_judged_is_named(quantity, gradient: bool, got: str, judge: str) -> None:
+    """Before the search: it would run until its patience ends, and blame the steps."""
+    model, material = cantilever(1e5)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    given = {"duration": 0.1, "quantity": quantity, "gradient": gradient, **material}
+    with pytest.raises(ValueError, match=f"quantity: expected .*{got}"):
+        if judge == "advise":
+            dv.advise(model, x, v, **given)
+        else:
+            dv.error_budget(model, x, v, time_step=0.01, sweeps=2, **given)
+
+
+def test_advice_needs_values_and_graphs() -> None:
+    model, _ = cantilever(1e5)
+    x = model.rest_points
+    given = {"duration": 0.02, "lam": 1e5}
+    with torch.inference_mode(), pytest.raises(ValueError, match=r"gradient: expected False inside torch\.inference_m"):
+        dv.advise(model, x, 0 * x, gradient=True, mu=1e5, **given)
+    with pytest.raises(NotImplementedError, match=r"torch\.func transforms of dv\.advise"):
+        auto = lambda mu: dv.rollout(model, x, 0 * x, settings="auto", mu=mu, **given).x  # noqa: E731
+        torch.func.vmap(auto)(torch.full((2,), 1e5, dtype=x.dtype))
+
+
+def test_advice_leaves_warnings_to_the_rollouts_that_follow() -> None:
+    body = mesh.sheet(8, 8, (0.14, 0.14), 1e-3)
+    model = dv.Model(body, pinned=body.points[:, 0] == 0)
+    x = model.rest_points
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dv.advise(model, x, 0 * x, duration=1 / 60, error=0.5, patience=1e-9, mu=1e5, lam=1e5)
+    with pytest.warns(UserWarning, match="too few for tets"):
+        dv.rollout(model, x, 0 * x, steps=1, time_step=1 / 60, sweeps=20, mu=1e5, lam=1e5)
+
+
+def test_parameters_may_be_functions_of_time() -> None:
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.01))
+    model = dv.Model(mesh.box(2, 0.1), energies=energies)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    given = {"duration": 0.04, "time_step": 0.01, "sweeps": 2, "mu": 1e4, "lam": 1e4}
+    kappa = torch.tensor(1e3, dtype=x.dtype)
+    asked: list[float] = []
+    of_time = lambda t: asked.append(t) or kappa  # noqa: E731
+    ends = [dv.error_budget(model, x, v, parameters={"floor_barrier.kappa": k}, **given) for k in (kappa, of_time)]
+    assert [s.motion for s in ends[0].shares] == [s.motion for s in ends[1].shares]
+    assert max(asked) == pytest.approx(0.04)
+    per_step = dv.per_step(kappa.expand(4))
+    with pytest.raises(ValueError, match=r"parameters\[.*kappa.*\]: expected a value or a function of the time"):
+        dv.advise(model, x, v, duration=0.04, mu=1e4, lam=1e4, parameters={"floor_barrier.kappa": per_step})
+    with pytest.raises(ValueError, match=r'parameters\[.*kappa.*\]: expected a value beside settings="auto"'):
+        dv.rollout(model, x, v, duration=0.04, settings="auto", mu=1e4, lam=1e4,
+                   parameters={"floor_barrier.kappa": lambda step, x, v: kappa})  # fmt: skip
+
+
+def test_gradients_by_moduli_that_have_no_part_in_the_motion_are_no_error() -> None:
+    """Those of a body in free fall are rounding, which no time step makes smaller."""
+    model = dv.Model(mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1)))
+    x = model.rest_points
+    settings = dv.advise(model, x, 0 * x, duration=0.05, gradient=True, patience=20.0, mu=1e5, lam=1e5)
+    assert settings.predicted is not None and settings.predicted.reached and settings.steps(0.05) < 32

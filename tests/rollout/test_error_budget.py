@@ -78,6 +78,11 @@ def test_contact_and_friction() -> None:
         ({"part": 0.0}, ValueError, "part: expected"),
         ({"part": 1.5}, ValueError, "part: expected"),
         ({"time_step": -1.0}, ValueError, "time_step: expected"),
+        ({"time_step": 1.0}, ValueError, "time_step: expected at most the duration"),
+        ({"integrator": 0}, TypeError, "integrator: expected ImplicitEuler"),
+        ({"quantity": 3}, TypeError, "quantity: expected a function of x and v, got int"),
+        ({"gradient": 1}, TypeError, "gradient: expected a bool, got int"),
+        ({"mesh": "yes"}, TypeError, "mesh: expected a bool, got str"),
         ({"steps": 3}, TypeError, "steps: expected an argument among"),
         ({"mesh": True, "force": torch.zeros(28, 3, dtype=torch.float64)}, ValueError, "force: expected None beside"),
     ],
@@ -86,3 +91,19 @@ def test_bad_input(given, error, text) -> None:
     model, x, v = cantilever()
     with pytest.raises(error, match=text):
         dv.error_budget(model, x, v, **{"time_step": 0.05, "sweeps": 3, **SCENE} | given)
+
+
+def test_a_scene_without_a_vertex_has_no_motion_to_judge() -> None:
+    model, x, v = cantilever()
+    none = x.expand(0, -1, -1)
+    for judge in (dv.advise, lambda *state, **given: dv.error_budget(*state, time_step=0.01, sweeps=1, **given)):
+        with pytest.raises(ValueError, match=r"x: expected a scene with a vertex, .* got shape \[0, 28, 3\]"):
+            judge(model, none, none, duration=0.1, mu=1e5, lam=1e5)
+
+
+def test_moduli_of_each_tet_that_change_in_time_are_those_of_its_parts() -> None:
+    model, x, v = cantilever()
+    mu = torch.linspace(1e5, 2e5, model.num_tets, dtype=x.dtype)
+    given = {"duration": 0.04, "time_step": 0.01, "sweeps": 2, "mesh": True, "lam": 1e5}
+    one, two = (dv.error_budget(model, x, v, mu=value, **given) for value in (mu, lambda t: mu))
+    assert shares(one)["mesh"].motion == shares(two)["mesh"].motion

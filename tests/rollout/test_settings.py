@@ -107,8 +107,42 @@ def test_what_does_not_go_together_raises(beam, given, error, text) -> None:
         ({"integrator": dv.SDIRK2}, ValueError, "integrator: expected an object"),
         ({"tape": "some"}, ValueError, "tape: expected"),
         ({"block": "other"}, ValueError, "block: expected"),
+        ({"relaxation": 2.0}, ValueError, "relaxation: expected a number in"),
+        ({"relaxation": None}, TypeError, "relaxation: expected a number, got NoneType"),
+        ({"coarse": "yes"}, TypeError, "coarse: expected a diffvbd.CoarseSpace"),
+        ({"acceleration": 5}, TypeError, "acceleration: expected a diffvbd.Anderson"),
+        ({"dtype": "float64"}, ValueError, "dtype: expected torch.float64"),
+        ({"checkpoint_every": 0}, ValueError, "checkpoint_every: expected an integer >= 1"),
+        ({"checkpoint_every": "all"}, ValueError, 'checkpoint_every: expected "auto"'),
+        ({"predicted": 3}, TypeError, "predicted: expected a diffvbd.Prediction"),
     ],
 )
 def test_settings_are_checked_where_they_are_made(given, error, text) -> None:
     with pytest.raises(error, match=text):
         dv.Settings(**{"time_step": 0.01, "sweeps": 5} | given)
+
+
+@pytest.mark.parametrize("duration", [0.0, -1.0, float("nan"), float("inf"), "1", None])
+def test_steps_of_what_is_no_duration_raise(duration) -> None:
+    with pytest.raises((ValueError, TypeError), match="duration: expected"):
+        dv.Settings(0.01, 5).steps(duration)
+
+
+def test_settings_are_applied_to_a_model_only() -> None:
+    with pytest.raises(TypeError, match="model: expected a diffvbd.Model, got int"):
+        dv.Settings(0.01, 5).applied(3)
+
+
+def test_a_model_knows_what_contact_did_in_its_rollouts_with_settings() -> None:
+    """Another Model takes their steps where settings change it; its status and its room are those of the caller's."""
+    body = mesh.box(2, 0.1)
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(kappa=1e3, dhat=0.01))
+    model = dv.Model(body, energies=energies, colliders=[dv.colliders.Plane((0.0, -0.005, 0.0), (0.0, 1.0, 0.0))])
+    x, settings = model.rest_points, dv.Settings(1e-3, 2, relaxation=1.3)
+    dv.contact.reserve(model, 1000)
+    dv.rollout(model, x, 0 * x, steps=1, settings=settings, **MATERIAL)
+    assert dv.contact.status(model).pairs > 0
+    other = settings.applied(model)
+    assert other is not model and other.surface_of_contact.capacity == 1000
+    dv.contact.reserve(model, 2000)
+    assert settings.applied(model) is other and other.surface_of_contact.capacity == 2000

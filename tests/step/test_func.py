@@ -208,3 +208,24 @@ def test_forward_mode_raises(device: str, name: str) -> None:
     with forward_ad.dual_level():
         with pytest.raises((NotImplementedError, RuntimeError), match="(?i)forward.mode|jvp|forward AD"):
             one(forward_ad.make_dual(inputs[name], tangent))
+
+
+@pytest.mark.parametrize("integrator", [dv.ImplicitEuler(), dv.SDIRK2(), dv.BDF2()], ids=str)
+def test_what_has_no_transforms_says_so(device: str, integrator: Any) -> None:
+    """Steps with contact, dv.solve and step_forward: torch would name functions of ours that nobody has called."""
+    plain = dv.Model(dv.mesh.cube(), device=device)
+    touching = plain.replace(energies=(dv.StableNeoHookean(), dv.PairBarrier()))
+    x = plain.rest_points
+    given = {"lam": 1e4, "time_step": 0.01, "integrator": integrator}
+    ends = [
+        lambda mu: dv.step(touching, x, 0 * x, mu=mu, sweeps=2, **given)[0],
+        lambda mu: dv.rollout(touching, x, 0 * x, mu=mu, sweeps=2, steps=2, **given).x[-1],
+        lambda mu: dv.solve(plain, x, 0 * x, mu=mu, **given).x,
+        lambda mu: dv.step_forward(plain, x, 0 * x, mu=mu, sweeps=2, **given)[0],
+    ]
+    mu = torch.full((2,), 1e4, dtype=x.dtype, device=device)
+    for end in ends:
+        with pytest.raises(NotImplementedError, match=r"torch\.func transforms"):
+            torch.func.vmap(end)(mu)
+        with pytest.raises(NotImplementedError, match=r"torch\.func transforms"):
+            torch.func.grad(lambda mu, end=end: end(mu).sum())(mu[0])
