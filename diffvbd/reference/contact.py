@@ -16,14 +16,12 @@ from torch import Tensor
 from .contact_cycles import in_cycles
 from .contact_start import SHORT, Translation, above_floor, corner_points, rigid_way, unsupported
 from .distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
-from .energies import FloorBarrier, build_energies
+from .energies import FADE, FloorBarrier, build_energies
 from .friction import floor_friction, smoothed, tangential6
 from .layout import build_layout, outer6
 from .rigid_contact import Correction
 from .scene import Scene, build_scene
 from .sweep import check_start, color_masses, predictor, run_sweeps, started
-
-FADE = 0.1  # of kappa dhat: the normal force from which a pair has half of its damping
 
 
 class Part(NamedTuple):

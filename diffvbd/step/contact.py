@@ -15,9 +15,9 @@ from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
 from ..adjoint.rise import rise_parts, rises
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
-from ..contact.barrier import damped_share
 from ..contact.start import PartStart, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
+from ..energies import damped_share
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
