@@ -32,7 +32,8 @@ class Part(NamedTuple):
     constants: Tensor  # [Q, 3 or more]: dhat of the pair [m], sum of radii [m], threshold of the mollifier [m^4]
     island: Tensor  # [B, bodies] int64: label of the island of a body; -1: it is not translated
     shares: Tensor  # [2, B, V]: of the two ways of the start, that each vertex goes
-    corrections: Tensor  # [1 | 2, B, bodies]: of the rigid motions before and after the sweeps, that each body takes
+    # [1 to 3, B, bodies]: of the rigid motions before and after the sweeps, that each body takes
+    corrections: Tensor
     limits: Tensor | None = None  # [K, B, V]: of each update, that planes let through
     frames: Tensor | None = None  # [B, bodies]: that pairs let go of the rigid motions of the start; None: none
     # sets of bodies [B, moving bodies], and which of these took combinations, bool [combinations, B, moving bodies]
@@ -297,7 +298,8 @@ def contact_step(
         if number:
             swept = partial(run_sweeps, scene, [*energies, *forces], masses, y)
             state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, part)
-            state = correct(state, part.corrections[1])
+            for shares in part.corrections[1:]:
+                state = correct(state, shares)
         short = (part.shares.amin(0) < SHORT).reshape(*x.shape[:-2], 1, -1) & ~pinned & ~(stopped & free).unsqueeze(-2)
         left = torch.where(short, x_prev + way + lift - state, 0.0)
     x_new = state.transpose(-1, -2).contiguous()
