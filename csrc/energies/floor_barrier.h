@@ -117,9 +117,9 @@ struct FloorBarrier {
   struct Share {
     R value, slope;
   };
-  static constexpr double kFade = 0.1;  // twin of FADE in diffvbd/energies.py
   template <class R>
   DIFFVBD_FN static Share<R> share(const Plane<R>& plane, const R& gap) {
+    constexpr double kFade = 0.1;  // twin of FADE in diffvbd/energies.py; device code has no address of a member
     const LogBarrier<R> b(gap, plane.dhat, R(1));
     const R half = R(kFade) * plane.dhat, inv = R(1) / (half - b.first);
     const auto acts = R(0) < plane.kappa;
