@@ -19,6 +19,7 @@ from .checks import check_number, check_positive, check_readable, fail, mask_or_
 from .mask import EXACT_BLOCK, FIRST_VERTEX_BIT, PAPER_BLOCK
 
 MAX_PLANES = 8
+FADE = 0.1  # of kappa dhat: the normal force from which a contact has half of its damping; twins in csrc and reference
 
 
 def _numbers(name: str, value: Any) -> Tensor:
@@ -120,11 +121,23 @@ def _barrier_slope(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     return -kappa * (2 * (d - dhat) * torch.log(d / dhat) + (d - dhat) ** 2 / d)
 
 
+def damped_share(force: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
+    """What share of its damping a contact has, from 0 to 1, by its normal force at the start of the step [N]."""
+    whole = force + FADE * kappa * dhat
+    some = whole > 0  # without a barrier there is no damping, and no derivative of a quotient of zeros
+    return torch.where(some, force / torch.where(some, whole, 1.0), 0.0)
+
+
 def barrier_curvature(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     """b''(gap) [N/m] of the log barrier; 0 where a gap is not in (0, dhat)."""
     d = torch.where((gap > 0) & (gap < dhat), gap, dhat)
     part = 1 - dhat / d
     return -kappa * (2 * torch.log(d / dhat) + 4 * part - part * part)
+
+
+def _share(before: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
+    """Of its damping that a vertex has which began the step at a gap ``before`` [m]."""
+    return damped_share(-_barrier_slope(before, kappa, dhat), kappa, dhat)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +152,9 @@ class FloorBarrier(VertexEnergy):
         normal: Normal (normalised), or a sequence of normals: several planes are one energy.
         kappa: Barrier stiffness [N/m].
         dhat: Activation distance [m].
-        damping: Damping of approaching motion of a vertex that started the step closer than dhat [N s/m].
+        damping: Damping of approaching motion of a vertex that started the step closer than dhat [N s/m]. It fades in
+            with the normal force N of the plane there, by N / (N + kappa dhat / 10), lest a motion jump where a vertex
+            comes to be that close one step sooner.
 
     Differentiable as ``floor_barrier.kappa``, ``.dhat``, ``.damping`` (scalars), ``.height`` [planes] and ``.normal``
     [planes, 3].
@@ -209,9 +224,8 @@ class FloorBarrier(VertexEnergy):
         normal, kappa, dhat, damping = self._columns(data)
         gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
         travel = (normal * (x - x_prev)[:, :, None]).sum(-1)
-        first = _barrier_slope(gap, kappa, dhat)
-        damped = (before < dhat) & (travel < 0)
-        return h * h * first + h * torch.where(damped, damping * travel, torch.zeros_like(travel)), normal
+        damping = damping * _share(before, kappa, dhat)
+        return h * h * _barrier_slope(gap, kappa, dhat) + h * damping * travel.clamp(max=0), normal
 
     def _columns(self, data: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Normal [1 | B, 1, P, 3], kappa, dhat, damping [1 | B, 1, P]."""
@@ -236,16 +250,14 @@ class FloorBarrier(VertexEnergy):
         normal, kappa, dhat, damping = self._columns(data)
         gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
         d = torch.where((gap > 0) & (gap < dhat), gap, dhat)
-        travel = (normal * (x - x_prev)[:, :, None]).sum(-1)
-        damped = (before < dhat) & (travel < 0)
+        travel = (normal * (x - x_prev)[:, :, None]).sum(-1).clamp(max=0)
         total = -h * h * kappa * (d - dhat) ** 2 * torch.log(d / dhat)
-        return (total + torch.where(damped, damping * (h / 2) * travel**2, 0)).sum(-1)
+        return (total + damping * _share(before, kappa, dhat) * (h / 2) * travel**2).sum(-1)
 
     def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         normal, kappa, dhat, damping = self._columns(data)
         gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
-        size = h * h * barrier_curvature(gap, kappa, dhat)
-        size = size + torch.where(before < dhat, h * damping, 0.0)
+        size = h * h * barrier_curvature(gap, kappa, dhat) + h * damping * _share(before, kappa, dhat)
         return (size[..., None, None] * normal[..., None] * normal[..., None, :]).sum(2)
 
     def admits(self, x: Tensor, before: Tensor, data: Tensor, origin: Tensor | None, share: float) -> Tensor:

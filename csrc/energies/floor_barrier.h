@@ -4,6 +4,7 @@
 
 #include <limits>
 
+#include "../core/dual.h"
 #include "../core/frame.h"
 #include "../core/safeguards.h"
 #include "../core/views.h"
@@ -108,6 +109,32 @@ struct FloorBarrier {
     return Frame<R>::template along<T>(select(turns, n1, zero3<R>()), select(turns, n2, zero3<R>()));
   }
 
+  // What share of its damping a vertex has that began the step at a gap, and the share's derivative by the gap. It fades
+  // in with the normal force A there, A / (A + kappa dhat / 10), as that of pairs does (diffvbd/energies.py): switched on
+  // at dhat, it would let a motion jump where a vertex comes there a step sooner, and gradients miss what jumps add up
+  // to. kappa cancels; without a barrier there is no damping.
+  template <class R>
+  struct Share {
+    R value, slope;
+  };
+  template <class R>
+  DIFFVBD_FN static Share<R> share(const Plane<R>& plane, const R& gap) {
+    constexpr double kFade = 0.1;  // twin of FADE in diffvbd/energies.py; device code has no address of a member
+    const LogBarrier<R> b(gap, plane.dhat, R(1));
+    const R half = R(kFade) * plane.dhat, inv = R(1) / (half - b.first);
+    const auto acts = R(0) < plane.kappa;
+    return {select(acts, -b.first * inv, R(0)), select(acts, -b.second * inv * (half * inv), R(0))};
+  }
+  // whether a plane damps, or has a derivative by its damping
+  template <class R>
+  DIFFVBD_FN static bool damps(const R& damping) {
+    return any(R(0) < damping);
+  }
+  template <class R>
+  DIFFVBD_FN static bool damps(const Dual<R>&) {
+    return true;
+  }
+
   // What one plane adds to the block: slope n to g, curvature n n^T to H.
   template <class R>
   struct Push {
@@ -117,12 +144,14 @@ struct FloorBarrier {
   template <class R>
   DIFFVBD_FN static Push<R> push(const VertexState<R>& s, const R* record, const Frame<R>& axes) {
     const Plane<R> plane(record, s);
-    const R d = plane.gap(s.x), h2 = s.h * s.h;
-    const R approach = dot(plane.n, s.x - s.x_prev);
-    const auto near = plane.gap(s.x_prev) < plane.dhat;
-    // H has it for both directions, as for pairs: where a start has left no approach, rounding would switch it.
-    const R c = select(near, plane.damping * s.h, R(0));
-    Push<R> out{axes.normal(plane.n), c * select(approach < R(0), approach, R(0)), c};
+    const R d = plane.gap(s.x), before = plane.gap(s.x_prev), h2 = s.h * s.h;
+    Push<R> out{axes.normal(plane.n), R(0), R(0)};
+    if (damps(plane.damping) && any(before < plane.dhat)) {
+      const R approach = dot(plane.n, s.x - s.x_prev);
+      // H has it for both directions, as for pairs: where a start has left no approach, rounding would switch it.
+      out.curvature = plane.damping * s.h * share(plane, before).value;
+      out.slope = out.curvature * select(approach < R(0), approach, R(0));
+    }
     if (any(d < plane.dhat)) {
       const LogBarrier<R> b(d, plane.dhat, plane.kappa);
       out.slope = out.slope + h2 * b.first;
@@ -150,10 +179,10 @@ struct FloorBarrier {
       const Plane<R> plane(data + k, s);
       const R d = plane.gap(s.x);
       if (any(d < plane.dhat)) sum = sum + s.h * s.h * LogBarrier<R>(d, plane.dhat, plane.kappa).value;
-      const R approach = dot(plane.n, s.x - s.x_prev);
-      const auto near = plane.gap(s.x_prev) < plane.dhat;
-      const R c = select(near, select(approach < R(0), plane.damping * s.h, R(0)), R(0));
-      sum = sum + R(0.5) * c * approach * approach;
+      const R before = plane.gap(s.x_prev), travel = dot(plane.n, s.x - s.x_prev);
+      if (!damps(plane.damping) || !any(before < plane.dhat)) continue;
+      const R approach = select(travel < R(0), travel, R(0));
+      sum = sum + R(0.5) * plane.damping * s.h * share(plane, before).value * approach * approach;
     }
     return sum;
   }
@@ -184,12 +213,14 @@ struct FloorBarrier {
         const LogBarrier<R> b(d, plane.dhat, plane.kappa);
         x_bar -= h2 * (b.second * n_p + b.third * n_d * n_p) * plane.n;
       }
-      const R approach = dot(plane.n, s.x - s.x_prev);
-      const auto near = plane.gap(s.x_prev) < plane.dhat;
-      const R c = select(near, select(approach < R(0), plane.damping * s.h, R(0)), R(0));
-      const Vec3<R> pull = c * n_p * plane.n;
+      const R before = plane.gap(s.x_prev);
+      if (!damps(plane.damping) || !any(before < plane.dhat)) continue;
+      const R travel = dot(plane.n, s.x - s.x_prev), c = plane.damping * s.h;
+      const auto nearer = travel < R(0);
+      const Share<R> acts = share(plane, before);
+      const Vec3<R> pull = select(nearer, c * acts.value, R(0)) * n_p * plane.n;
       x_bar -= pull;
-      x_prev_bar += pull;
+      x_prev_bar += pull - c * acts.slope * (select(nearer, travel, R(0)) + n_d) * n_p * plane.n;
     }
   }
 

@@ -13,7 +13,6 @@ from ..mask import CONTACT
 
 MOST_REACH = 1e6  # [m]; its square must be a number in float32
 LEAST_VELOCITY = 1e-12  # [m/s]; its square times that of a time step must be a number in float32
-FADE = 0.1  # of kappa dhat: the normal force from which a pair has half of its damping; twin in reference/contact.py
 
 
 def _scalars(energy: PairBarrier | Friction, like: Tensor) -> dict[str, Tensor]:
@@ -124,10 +123,3 @@ class Friction:
 
     def constants(self, like: Tensor) -> dict[str, Tensor]:
         return _scalars(self, like)
-
-
-def damped_share(force: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
-    """What share of its damping a pair has, from 0 to 1, by its normal force at the start of the step [N]."""
-    whole = force + FADE * kappa * dhat
-    some = whole > 0  # without a barrier there is no damping, and no derivative of a quotient of zeros
-    return torch.where(some, force / torch.where(some, whole, 1.0), 0.0)

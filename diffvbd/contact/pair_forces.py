@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from ..checks import fail
+from ..energies import damped_share
 from ..reference.distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
 from ..reference.friction import smoothed
-from .barrier import PairBarrier, damped_share
+from .barrier import PairBarrier
 from .detection import detect
 from .surface import LEAST_CAPACITY, ContactSurface
 

@@ -16,14 +16,12 @@ from torch import Tensor
 from .contact_cycles import in_cycles
 from .contact_start import SHORT, Translation, above_floor, corner_points, rigid_way, unsupported
 from .distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
-from .energies import FloorBarrier, build_energies
+from .energies import FADE, FloorBarrier, build_energies
 from .friction import floor_friction, smoothed, tangential6
 from .layout import build_layout, outer6
 from .rigid_contact import Correction
 from .scene import Scene, build_scene
 from .sweep import check_start, color_masses, predictor, run_sweeps, started
-
-FADE = 0.1  # of kappa dhat: the normal force from which a pair has half of its damping
 
 
 class Part(NamedTuple):
@@ -34,7 +32,8 @@ class Part(NamedTuple):
     constants: Tensor  # [Q, 3 or more]: dhat of the pair [m], sum of radii [m], threshold of the mollifier [m^4]
     island: Tensor  # [B, bodies] int64: label of the island of a body; -1: it is not translated
     shares: Tensor  # [2, B, V]: of the two ways of the start, that each vertex goes
-    corrections: Tensor  # [1 | 2, B, bodies]: of the rigid motions before and after the sweeps, that each body takes
+    # [1 to 3, B, bodies]: of the rigid motions before and after the sweeps, that each body takes
+    corrections: Tensor
     limits: Tensor | None = None  # [K, B, V]: of each update, that planes let through
     frames: Tensor | None = None  # [B, bodies]: that pairs let go of the rigid motions of the start; None: none
     # sets of bodies [B, moving bodies], and which of these took combinations, bool [combinations, B, moving bodies]
@@ -299,7 +298,8 @@ def contact_step(
         if number:
             swept = partial(run_sweeps, scene, [*energies, *forces], masses, y)
             state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, part)
-            state = correct(state, part.corrections[1])
+            for shares in part.corrections[1:]:
+                state = correct(state, shares)
         short = (part.shares.amin(0) < SHORT).reshape(*x.shape[:-2], 1, -1) & ~pinned & ~(stopped & free).unsqueeze(-2)
         left = torch.where(short, x_prev + way + lift - state, 0.0)
     x_new = state.transpose(-1, -2).contiguous()

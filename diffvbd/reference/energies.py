@@ -18,11 +18,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .distance import log_barrier
 from .layout import Color, add_at, cross, dot, outer6, take
 from .scene import Scene
 
 ETA = 0.9  # a filtered step closes at most this fraction of a gap
 GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
+FADE = 0.1  # of kappa dhat: the normal force from which a contact has half of its damping
 PARALLEL = 1e-6  # squared sine below which a plane counts as parallel to those that bind
 
 
@@ -121,10 +123,12 @@ class FloorBarrier:
     def gap(self, x: Tensor) -> Tensor:
         return dot(self.normal, x.unsqueeze(-3)) - self.height
 
-    def _approach(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Normal travel since x_prev [..., planes, n], where it is damped, and where its approach would be."""
-        travel, near = dot(self.normal, (x - x_prev).unsqueeze(-3)), self.gap(x_prev) < self.dhat
-        return travel, near & (travel < 0), near
+    def _approach(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
+        """Approach since x_prev, at most 0, and the rate of its damping, h c q [kg], both [..., planes, n]."""
+        force = -log_barrier(self.gap(x_prev), torch.ones_like(self.dhat), self.dhat)[1]  # kappa cancels
+        share = torch.where(self.kappa > 0, force / (force + FADE * self.dhat), 0.0)
+        travel = dot(self.normal, (x - x_prev).unsqueeze(-3))
+        return travel.clamp(max=0.0), self.damping * self.scene.time_step * share
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         vertices = self.scene.layout.colors[k].vertices
@@ -138,9 +142,8 @@ class FloorBarrier:
         second = torch.where(active, -self.kappa * (2 * log + 4 * past / d - (past / d) ** 2), 0.0)
         first, second = h**2 * first, h**2 * second
         if self.damped:
-            travel, damped, near = self._approach(x, take(x_prev, vertices))
-            first = first + torch.where(damped, self.damping * h * travel, 0.0)
-            second = second + torch.where(near, self.damping * h, 0.0)
+            approach, rate = self._approach(x, take(x_prev, vertices))
+            first, second = first + rate * approach, second + rate
         gradient = (first.unsqueeze(-2) * self.normal).sum(-3)
         return torch.cat((gradient, (second.unsqueeze(-2) * self.outer).sum(-3)), -2)
 
@@ -156,8 +159,8 @@ class FloorBarrier:
         total = h**2 * torch.where(active, -self.kappa * (d - self.dhat) ** 2 * torch.log(d / self.dhat), 0.0)
         total = torch.where(gap > 0, total, torch.inf)
         if self.damped:
-            travel, damped, _ = self._approach(x[..., free], x_prev[..., free])
-            total = total + torch.where(damped, self.damping * h / 2 * travel**2, 0.0)
+            approach, rate = self._approach(x[..., free], x_prev[..., free])
+            total = total + rate / 2 * approach**2
         return total.flatten(-2), free.nonzero()[:, 0].repeat(total.shape[-2])
 
     def limit(self, x: Tensor, step: Tensor) -> Tensor:

@@ -44,6 +44,9 @@ class ImplicitEuler:
 class SDIRK2:
     """Two solves over 0.29 of the step each: second order, exact in free fall, L-stable. Twice the work of a step.
 
+    Of the first order in the turn of a body whose vibrations the step does not resolve: it loses half of the spin that
+    implicit Euler does. :class:`BDF2` keeps its order there.
+
     A body that may touch a floor, a collider, another body or itself takes implicit Euler for a step that does not
     resolve the barrier, and wherever there is friction or damping of contact.
 

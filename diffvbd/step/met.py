@@ -28,7 +28,7 @@ class Detection(NamedTuple):
     room: Tensor  # [B, bodies + 1] [m]: how far the vertices of each body may go beside its island, and the largest
     own_room: Tensor  # [B, bodies + 1] [m]: and beside the rigid motion of the body
     # what the part has decided: the shares of the two ways of its start [2, B, V], of the corrections before and after
-    # its sweeps [1 | 2, B, bodies], and the exponents of limits [B, K, V]
+    # its sweeps [1 to 3, B, bodies], and the exponents of limits [B, K, V]
     shares: Tensor | None = None
     corrections: Tensor | None = None
     limits: Tensor | None = None

@@ -222,10 +222,17 @@ class _Floor:
             log, past = _log(safe / self.dhat), safe - self.dhat
             first = -self.kappa * (2 * past * log + past * past / safe)
             second = -self.kappa * (2 * log + 4 * past / safe - (past / safe) * (past / safe))
-            c = np.where(_dot(n, x_prev) - height < self.dhat, self.damping * self.h, 0 * self.damping)
+            c = self.damping * self.h * self._share(_dot(n, x_prev) - height)
             approach = np.where(travel < 0, travel, 0 * travel)
             out.append((n, self.h * self.h * first + c * approach, self.h * self.h * second + c))
         return out
+
+    def _share(self, before: np.ndarray) -> np.ndarray:
+        """Of its damping that a vertex has which began the step at this gap."""
+        d = np.where(before < self.dhat, before, self.dhat)
+        past = d - self.dhat
+        force = self.kappa * (2 * past * _log(d / self.dhat) + past * past / d)
+        return force / (force + self.kappa * self.dhat / 10)
 
     def started(self, x: Vector, move: Vector) -> Vector:
         """Where a step starts: the motion less what approaches a plane too closely, of at most two planes the one that
