@@ -24,7 +24,8 @@ def test_case_is_finite_descends_and_keeps_its_gradient(case: extremes.Extreme) 
 
 @pytest.mark.parametrize("floor", [False, True], ids=["cantilever", "drop"])
 def test_rollout_of_hundreds_of_steps(floor: bool) -> None:
-    row = extremes.check_rollout(extremes.Rollout("short", 300, floor=floor))
+    # later on the floor the loss hardly depends on the stiffness, and differences of it are rounding
+    row = extremes.check_rollout(extremes.Rollout("short", 200 if floor else 300, floor=floor))
     assert row["finite"] and row["gradient"] != 0.0
     assert row["difference_error"] < tolerance("long_difference")
     if floor:
