@@ -60,7 +60,7 @@ def start_of(pilots: Pilots) -> Settings:
 
 def candidates_of(pilots: Pilots) -> list[Settings]:
     """What might be faster than the ladder's settings, the likeliest first."""
-    model, second, euler = pilots.model, (SDIRK2(), BDF2()), ImplicitEuler()
+    model, sdirk, bdf, euler = pilots.model, SDIRK2(), BDF2(), ImplicitEuler()
     touches = model.contact is not None or model.friction is not None
     free = not touches and _exact(model) and _may_over_relax(pilots)
     over, over_coarse = (1.6, 1.5) if free else (1.0, 1.0)
@@ -73,8 +73,8 @@ def candidates_of(pilots: Pilots) -> list[Settings]:
 
     out = []
     if _exact(model) and not touches:
-        out += [*coarse(second[0], 2, 5), *coarse(second[1], 2), *coarse(euler, 2)]
-    out += [*plain(second[0], 10, 5, 20), *plain(second[1], 10, 5), *plain(euler, 5, 10, 20), *plain(second[1], 20)]
+        out += [*coarse(sdirk, 2, 5), *coarse(bdf, 2), *coarse(euler, 2)]
+    out += [*plain(sdirk, 10, 5, 20), *plain(bdf, 10, 5), *plain(euler, 5, 10, 20), *plain(bdf, 20)]
     if _exact(model) and touches:
         out += [Settings(1.0, 20, euler, acceleration=Anderson(5))]
     return out
