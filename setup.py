@@ -38,6 +38,7 @@ CPU_SOURCES = [
     "csrc/cpu/contact.cpp",
     "csrc/cpu/contact_rigid.cpp",
     "csrc/cpu/contact_rigid_backward.cpp",
+    "csrc/cpu/contact_rigid_reverse.cpp",
     "csrc/cpu/detect.cpp",
     "csrc/cpu/intersect.cpp",
     "csrc/cpu/islands.cpp",

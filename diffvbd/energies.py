@@ -135,6 +135,12 @@ def barrier_curvature(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     return -kappa * (2 * torch.log(d / dhat) + 4 * part - part * part)
 
 
+def _approach(normal: Tensor, x: Tensor, x_prev: Tensor) -> Tensor:
+    """Motion toward planes [m], at most 0, of which one of none has no derivative, as in csrc."""
+    travel = (normal * (x - x_prev)[:, :, None]).sum(-1)
+    return torch.where(travel < 0, travel, 0.0)
+
+
 def _share(before: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
     """Of its damping that a vertex has which began the step at a gap ``before`` [m]."""
     return damped_share(-_barrier_slope(before, kappa, dhat), kappa, dhat)
@@ -223,9 +229,8 @@ class FloorBarrier(VertexEnergy):
         """The gradient along each plane's normal, h^2 dE/dx.n [kg m], [B, V, P], and the normals [1 | B, 1, P, 3]."""
         normal, kappa, dhat, damping = self._columns(data)
         gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
-        travel = (normal * (x - x_prev)[:, :, None]).sum(-1)
         damping = damping * _share(before, kappa, dhat)
-        return h * h * _barrier_slope(gap, kappa, dhat) + h * damping * travel.clamp(max=0), normal
+        return h * h * _barrier_slope(gap, kappa, dhat) + h * damping * _approach(normal, x, x_prev), normal
 
     def _columns(self, data: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Normal [1 | B, 1, P, 3], kappa, dhat, damping [1 | B, 1, P]."""
@@ -250,9 +255,9 @@ class FloorBarrier(VertexEnergy):
         normal, kappa, dhat, damping = self._columns(data)
         gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
         d = torch.where((gap > 0) & (gap < dhat), gap, dhat)
-        travel = (normal * (x - x_prev)[:, :, None]).sum(-1).clamp(max=0)
         total = -h * h * kappa * (d - dhat) ** 2 * torch.log(d / dhat)
-        return (total + damping * _share(before, kappa, dhat) * (h / 2) * travel**2).sum(-1)
+        approach = _approach(normal, x, x_prev)
+        return (total + damping * _share(before, kappa, dhat) * (h / 2) * approach**2).sum(-1)
 
     def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         normal, kappa, dhat, damping = self._columns(data)

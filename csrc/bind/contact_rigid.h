@@ -73,6 +73,13 @@ void require_motion(const contact::RigidInputs<T>& in, const Tensor& centers, co
 }
 
 template <class T>
+void require_of_bodies(const contact::RigidInputs<T>& in, const Tensor& t, const Tensor& x, int64_t each) {
+  require(
+      is_beside(t, x, ScalarType::Double) && t.numel() == each * in.scene.scenes * in.bodies(),
+      "diffvbd::contact_rigid: expected float64 motion and solution [scenes, bodies, 6] and share [scenes, bodies]");
+}
+
+template <class T>
 contact::VirtualMotions<T> virtual_motions(const contact::RigidInputs<T>& in, const Tensor& p, const Tensor& q,
                                            const Tensor& x) {
   const int64_t size = 3 * in.scene.scenes * in.gate.corners;

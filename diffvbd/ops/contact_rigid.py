@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -44,6 +45,44 @@ def rigid_backward(fields: TouchingFields, p: Tensor, q: Tensor, data_count: Seq
     return raw.contact_rigid_backward(*fields, p.contiguous(), q.contiguous(), data_count, time_step, friction_eps)
 
 
+class EndAdjoint(NamedTuple):
+    """What :func:`rigid_end_backward` finds."""
+
+    solution: Tensor  # [B, bodies, 6] float64, for the adjoint of the motion; zero where nothing moved
+    p: Tensor  # [B, N, 3]: how corner points move by it,
+    q: Tensor  # and by the motion
+    x: Tensor  # [B, V, 3]: what goes back by the way itself
+    mass: Tensor  # [B, V]
+
+
+def rigid_end_backward(fields: TouchingFields, motion: Tensor, share: Tensor, factor: Tensor, x_bar: Tensor,
+                       data_count: Sequence[int], time_step: float, friction_eps: float) -> EndAdjoint:  # fmt: skip
+    """The first part of the adjoint of a correction, of that of where it led [B, V, 3]. On the CPU."""
+    return EndAdjoint(*raw.contact_rigid_end_backward(*fields, motion, share, factor, x_bar.contiguous(), data_count,
+                                                      time_step, friction_eps))  # fmt: skip
+
+
+class VertexAdjoints(NamedTuple):
+    """What :func:`rigid_vertices_backward` finds, of each scene."""
+
+    x: Tensor  # [B, V, 3], as are the next two
+    x_prev: Tensor
+    y: Tensor
+    mass: Tensor  # [B, V]
+    energy_data: Tensor  # [B, n], or empty
+    floor_lag: Tensor  # [B, V, planes, 4], or empty
+
+
+def rigid_vertices_backward(fields: TouchingFields, motion: Tensor, solution: Tensor, by_p: Tensor, by_q: Tensor,
+                            data_count: Sequence[int], time_step: float, friction_eps: float, wants_data: bool
+                            ) -> VertexAdjoints:  # fmt: skip
+    """The adjoints of what vertices add to -p . (gradient + matrix q), p and q being the motions of
+    :func:`rigid_end_backward`; by_p, by_q [B, N, 3]: what pairs add to the work's derivatives by them. On the CPU."""
+    return VertexAdjoints(*raw.contact_rigid_vertices_backward(
+        *fields, motion, solution, by_p.contiguous(), by_q.contiguous(), data_count, time_step, friction_eps,
+        wants_data))  # fmt: skip
+
+
 @shapes_of("contact_rigid_system")
 def _(*arguments):
     f = TouchingFields(*arguments[:_FIELDS])
@@ -70,5 +109,23 @@ def _(*arguments):
     return tuple(f.x.new_empty(shape) for shape in ((listed, 4, 9), (listed,), (lagged, 4, 9), (lagged, 9)))
 
 
-for _name in ("contact_rigid_system", "contact_rigid_solve", "contact_rigid_move", "contact_rigid_backward"):
+@shapes_of("contact_rigid_end_backward")
+def _(*arguments):
+    f = TouchingFields(*arguments[:_FIELDS])
+    points = (f.x.shape[0], f.body.shape[0], 3)
+    motion = f.x.new_empty((f.x.shape[0], f.free.shape[0], UNKNOWNS), dtype=torch.float64)
+    return motion, f.x.new_empty(points), f.x.new_empty(points), torch.empty_like(f.x), f.x.new_empty(f.x.shape[:2])
+
+
+@shapes_of("contact_rigid_vertices_backward")
+def _(*arguments):
+    f, wants_data = TouchingFields(*arguments[:_FIELDS]), arguments[-1]
+    b, v = f.x.shape[:2]
+    planes = f.floor_lag.numel() // max(1, f.floor_lag.shape[0] * v * 4)
+    data, floor = (b if wants_data else 0, f.energy_data.shape[-1]), (b if planes else 0, v, planes, 4)
+    return (*(torch.empty_like(f.x) for _ in range(3)), *(f.x.new_empty(size) for size in ((b, v), data, floor)))
+
+
+for _name in ("contact_rigid_system", "contact_rigid_solve", "contact_rigid_move", "contact_rigid_backward",
+              "contact_rigid_end_backward", "contact_rigid_vertices_backward"):  # fmt: skip
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

@@ -128,7 +128,7 @@ class FloorBarrier:
         force = -log_barrier(self.gap(x_prev), torch.ones_like(self.dhat), self.dhat)[1]  # kappa cancels
         share = torch.where(self.kappa > 0, force / (force + FADE * self.dhat), 0.0)
         travel = dot(self.normal, (x - x_prev).unsqueeze(-3))
-        return travel.clamp(max=0.0), self.damping * self.scene.time_step * share
+        return torch.where(travel < 0, travel, 0.0), self.damping * self.scene.time_step * share
 
     def block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
         vertices = self.scene.layout.colors[k].vertices

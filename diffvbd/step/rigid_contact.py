@@ -93,6 +93,9 @@ class _CorrectBackward(Function):
     @staticmethod
     def forward(x_bar, *saved):
         *tensors, share, motion, factor, model, time_step, friction_eps, needs = saved
+        if not x_bar.is_cuda:
+            s = Scenes(model, ops.TouchingFields(*(t.detach() for t in tensors)), time_step, friction_eps)
+            return _compiled_adjoints(s, x_bar, share, motion, factor, needs)
         with torch.enable_grad():
             fields = ops.TouchingFields(*(t.detach().requires_grad_(need and t.is_floating_point())
                                           for t, need in zip(tensors, needs, strict=True)))  # fmt: skip
@@ -125,6 +128,45 @@ def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: T
     virtual = -_virtual_work(s, solution, leaf.detach(), arm, whole, body)
     second = torch.autograd.grad(virtual, wanted, allow_unused=True)
     return tuple(_sum(pair, t) for pair, t in zip(zip(first, second, strict=True), wanted, strict=True))
+
+
+def _compiled_adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: Tensor, needs: Sequence[bool]
+                       ) -> tuple[Tensor, ...]:  # fmt: skip
+    """The same by compiled operators, which the CPU has."""
+    f, (scenes, vertices) = s.fields, s.fields.x.shape[:2]
+    wants = dict(zip(ops.TouchingFields._fields, needs, strict=True))
+    options = s.model._data_count, s.time_step, s.friction_eps
+    end = ops_rigid.rigid_end_backward(f, motion, share, factor, x_bar, *options)
+    barrier, by_kappa, friction, by_lag = ops_rigid.rigid_backward(f, end.p, end.q, *options)
+    # of corner points: by where they are, by how they have moved, by p and by q
+    by_x, by_way, by_p, by_q = (torch.zeros_like(end.p) for _ in range(4))
+    if len(barrier):
+        by_x, by_p, by_q = sum_at_corners(barrier, s.listed, *end.p.shape[:2]).split(3, -1)
+    if len(friction):
+        by_way, also_p, also_q = sum_at_corners(friction, s.lagged, *end.p.shape[:2]).split(3, -1)
+        by_p, by_q = by_p + also_p, by_q + also_q
+    own = ops_rigid.rigid_vertices_backward(f, motion, end.solution, by_p, by_q, *options, wants["energy_data"])
+    to_points = by_x + by_way
+    out = {
+        "x": end.x + own.x - to_points[:, :vertices],
+        "x_prev": own.x_prev + by_way[:, :vertices],
+        "y": own.y,
+        "mass": end.mass + own.mass,
+        "energy_data": own.energy_data,
+        "collider": -to_points[:, vertices:],
+        "collider_prev": by_way[:, vertices:],
+        "kappa": -_of_scenes(by_kappa, s.listed, scenes),
+        "lag": -by_lag,
+        "floor_lag": own.floor_lag,
+    }
+    none = f.x.new_empty((0,))
+    bars = [(out.get(name, none), t) for name, t in zip(f._fields, f, strict=True) if wants[name]]
+    return tuple(ops.sum_to(bar, t.shape) if bar.numel() else torch.zeros_like(t) for bar, t in bars)
+
+
+def _of_scenes(values: Tensor, listed: Pairs, scenes: int) -> Tensor:
+    """Sums over the pairs of each scene [B]; values are zero in rows that no pair fills."""
+    return values.new_zeros((scenes,)).index_add_(0, listed.pairs[:, 5].long().clamp(min=0), values)
 
 
 def _sum(parts: tuple[Tensor | None, ...], like: Tensor) -> Tensor:
