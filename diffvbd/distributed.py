@@ -57,8 +57,8 @@ def gathered(values: Tensor, count: int) -> Tensor:
     """The rows of all ranks, in their order, on every rank.
 
     What follows must be the same computation on every rank, as that of one loss from all rows: then the gradient of a
-    rank's rows is what the rank itself has found for them, and nothing is summed. All ranks have to call it, and to call
-    ``backward`` if one does.
+    rank's rows is what the rank itself has found for them, and nothing is summed. All ranks have to call it, and to
+    call ``backward`` if one does.
 
     Args:
         values: The rows of this rank, shape [n, ...] with n those of `share`.
@@ -80,10 +80,10 @@ def backward(loss: Callable[[slice], Tensor], parameters: Iterable[Tensor], scen
     """Adds the gradient of a loss over all scenes to ``.grad`` of the parameters, with the same bits on any number of
     ranks.
 
-    The scenes are cut into parts, and the parts are dealt to the ranks. A part is evaluated in one go wherever it is, so
-    whatever depends on the size of a batch depends on ``parts`` alone: how steps are spread over a CUDA device, how often
-    a step looks for contact, sums over scenes in the loss, products of matrices in a network. Gradients of the parts
-    are gathered and added in the order of the parts.
+    The scenes are cut into parts, and the parts are dealt to the ranks. A part is evaluated in one go wherever it is,
+    so whatever depends on the size of a batch depends on ``parts`` alone: how steps are spread over a CUDA device, how
+    often a step looks for contact, sums over scenes in the loss, products of matrices in a network. Gradients of the
+    parts are gathered and added in the order of the parts.
 
     Args:
         loss: Given a slice of the scenes, the share that they have in the loss: a scalar. The loss is the sum of the
@@ -96,8 +96,8 @@ def backward(loss: Callable[[slice], Tensor], parameters: Iterable[Tensor], scen
     Returns:
         The loss, a scalar, the same on every rank.
 
-    Memory: each rank holds ``parts`` gradients. For networks of very many parameters take DistributedDataParallel, whose
-    bits depend on the number of ranks.
+    Memory: each rank holds ``parts`` gradients. For networks of very many parameters take DistributedDataParallel,
+    whose bits depend on the number of ranks.
 
     Raises:
         TypeError, ValueError: naming the argument; a loss that is no scalar, or does not depend on a parameter.

@@ -26,13 +26,13 @@ SCENES, PARTS = 7, 3  # which two ranks cannot share evenly
 KILL = """
 import os, signal
 import diffvbd as dv
-begun = dv.distributed.backward
+original = dv.distributed.backward
 calls = iter(range(100))
 def backward(*arguments, **options):
     if next(calls) == 4 and os.environ.get("RANK") == "1" and not os.path.exists("killed"):
         open("killed", "w").close()
         os.kill(os.getpid(), signal.SIGKILL)
-    return begun(*arguments, **options)
+    return original(*arguments, **options)
 dv.distributed.backward = backward
 """
 
@@ -239,6 +239,9 @@ def test_bad_input_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_gradients_add_to_what_is_there() -> None:
     leaf = torch.ones(2, requires_grad=True)
-    for _ in range(2):
-        total = distributed.backward(lambda part: (part.stop - part.start) * leaf.square().sum(), [leaf], 10, 4)
-    assert total.item() == 20.0 and leaf.grad is not None and leaf.grad.tolist() == [40.0, 40.0]
+
+    def loss(part: slice) -> Tensor:
+        return (part.stop - part.start) * leaf.square().sum()
+
+    assert [distributed.backward(loss, [leaf], 10, 4).item() for _ in range(2)] == [20.0, 20.0]
+    assert leaf.grad is not None and leaf.grad.tolist() == [40.0, 40.0]

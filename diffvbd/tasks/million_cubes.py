@@ -154,7 +154,8 @@ class Cubes:
         self.group = 1 if torch.device(settings.device).type == "cuda" else math.gcd(bodies, version.group)
         self.scenes = bodies // self.group
         part = dv.distributed.share(self.scenes)  # of this rank
-        self.bodies, mine = self.group * (part.stop - part.start), slice(part.start * self.group, part.stop * self.group)
+        mine = slice(part.start * self.group, part.stop * self.group)
+        self.bodies = mine.stop - mine.start
         self.shape = (part.stop - part.start, self.group * cube.num_vertices, 3)
         model = dv.Model(dv.mesh.replicate(cube, np.zeros((self.group, 3))), density=DENSITY, dtype=version.dtype,
                          rigid=False, start="predictor")  # fmt: skip
@@ -181,9 +182,7 @@ class Cubes:
         if step >= self.version.target_step:
             return None
         centers = self.all_of(self.mine.centers(x.reshape(1, -1, 3))[0])
-        force = dv.contact.center_of_mass_penalty(
-            centers, self.together, RADIUS, STIFFNESS, max_pairs=self.max_pairs
-        )
+        force = dv.contact.center_of_mass_penalty(centers, self.together, RADIUS, STIFFNESS, max_pairs=self.max_pairs)
         return self.mine.forces(self.own(force)[None]).view_as(x)
 
     def own(self, values: Tensor) -> Tensor:

@@ -14,6 +14,11 @@ from diffvbd.tasks.folder import STATE
 from diffvbd.tasks.problem import Settings
 
 
+def is_first() -> bool:
+    """Whether this process keeps files: alone, or the first of its group."""
+    return not dist.is_initialized() or dist.get_rank() == 0
+
+
 @contextlib.contextmanager
 def joined(device: str, splits: bool) -> Iterator[None]:
     """Inside, the processes that torchrun has started are one group; a process on its own stays so.
@@ -26,7 +31,7 @@ def joined(device: str, splits: bool) -> Iterator[None]:
         yield
         return
     if not splits:
-        raise ValueError("torchrun: expected a task that ranks can share (million-cubes); run this one without torchrun")
+        raise ValueError("torchrun: expected a task that ranks can share (million-cubes): run this one without it")
     cuda = torch.device(device).type == "cuda"
     if cuda:
         if torch.device(device).index is not None:
@@ -44,10 +49,10 @@ def with_own_folder(settings: Settings) -> Iterator[Settings]:
     if not dist.is_initialized() or dist.get_world_size() == 1:
         yield settings
         return
-    first, state = dist.get_rank() == 0, settings.out / STATE
-    found = [state.read_bytes() if first and state.exists() else None]
+    state = settings.out / STATE
+    found = [state.read_bytes() if is_first() and state.exists() else None]
     dist.broadcast_object_list(found, src=0)
-    if first:
+    if is_first():
         yield settings
         return
     with tempfile.TemporaryDirectory() as folder:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
 from diffvbd.tasks.capture import captured
@@ -31,7 +30,7 @@ from diffvbd.tasks.problem import (
     estimates_of,
 )
 from diffvbd.tasks.progress import Progress, Row, summary, versions
-from diffvbd.tasks.ranks import with_own_folder
+from diffvbd.tasks.ranks import is_first, with_own_folder
 from diffvbd.tasks.report import survival
 
 LISTED = 1000  # numbers of a parameter that log.json lists; larger ones go to parameters.pt
@@ -58,8 +57,7 @@ def solve(problem: Problem, settings: Settings) -> Result:
     """
     check(problem)
     check_device(settings.device)
-    first = not dist.is_initialized() or dist.get_rank() == 0
-    with alone_in(settings.out) if first else nullcontext(), with_own_folder(settings) as own:
+    with alone_in(settings.out) if is_first() else nullcontext(), with_own_folder(settings) as own:
         return _solve(problem, own)
 
 
@@ -218,6 +216,8 @@ class _Run:
             self.save()
 
     def save(self) -> None:
+        if not is_first():
+            return
         state = {
             "fingerprint": self.fingerprint,
             "history": self.history,
