@@ -88,7 +88,7 @@ def backward(loss: Callable[[slice], Tensor], parameters: Iterable[Tensor], scen
     Args:
         loss: Given a slice of the scenes, the share that they have in the loss: a scalar. The loss is the sum of the
             shares of all parts, so a mean has to be divided by ``scenes``.
-        parameters: Leaves that the loss of each part depends on; the same values on every rank.
+        parameters: Leaves of any shape that the loss of each part depends on; the same values on every rank.
         scenes: Number of scenes.
         parts: Number of parts, at least that of the ranks and at most that of the scenes. Few make large batches, many
             can be dealt to many ranks; a multiple of the number of ranks deals evenly. Bits depend on it.

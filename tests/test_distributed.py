@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 import diffvbd as dv
 from diffvbd import distributed
+from diffvbd.cli import main
 from diffvbd.tasks import Problem, Settings, solve
 from diffvbd.tasks.million_cubes import launch_pad
 from diffvbd.testing import relative_error, tolerance
@@ -211,6 +212,18 @@ def test_shares_are_even_and_leave_nothing_out(count: int, ranks: int, monkeypat
     assert {s.stop - s.start for s in found} <= {count // ranks, -(-count // ranks)}
     with pytest.raises(ValueError, match=f"count: expected at least one row for each of {ranks} ranks"):
         distributed.share(ranks - 1)
+
+
+def test_what_ranks_cannot_share_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                             capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    for task, device, message in (
+        ("beam-mu", "cpu", "torchrun: expected a task that ranks can share"),
+        ("million-cubes", "cuda:1", "device: expected cuda, of which each rank takes its own, got cuda:1"),
+    ):
+        assert main(["run", task, "--quick", "--device", device, "--out", str(tmp_path)]) == 2
+        assert message in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
 
 
 def test_bad_input_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
