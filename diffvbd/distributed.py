@@ -37,7 +37,9 @@ def own(values: Tensor) -> Tensor:
     """The rows of this rank of a tensor that all ranks have alike.
 
     The gradient is that of all rows: every rank gets all of it. With `gathered` after it, each rank works on its rows
-    and all go on with the same numbers and the same gradient.
+    and all go on with the same numbers and the same gradient. Whatever a rank's work depends on has to come through
+    here if it needs a gradient, one number for all rows as ``own(number.expand(N))``: used as it is, it would get the
+    gradient of this rank's rows alone.
 
     Args:
         values: Shape [N, ...], the same on every rank.

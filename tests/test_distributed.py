@@ -113,9 +113,12 @@ def launch(out: Path) -> dict[str, Any]:
 
 def rows() -> dict[str, Any]:
     """Values and gradients through both changes of who has what."""
-    given = torch.arange(15.0).reshape(5, 3).requires_grad_()
-    everything = distributed.gathered(distributed.own(given) ** 2, 5)
+    given, shared = torch.arange(15.0).reshape(5, 3).requires_grad_(), torch.tensor(2.0, requires_grad=True)
+    factor = distributed.own(shared.expand(5))[:, None]
+    everything = distributed.gathered(factor * distributed.own(given) ** 2, 5)
     (weighted := everything * torch.arange(1.0, 6.0)[:, None]).sum().backward()
+    assert shared.grad is not None and given.grad is not None
+    assert shared.grad == (weighted / shared).sum() and torch.equal(given.grad[1:], (2 * weighted / given)[1:])
     return {"weighted": weighted.detach(), "gradient": given.grad}
 
 
