@@ -16,6 +16,7 @@ from diffvbd.rollout.search import ERROR, PATIENCE
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
 from diffvbd.tasks.problem import Result, check_device
 from diffvbd.tasks.progress import versions
+from diffvbd.tasks.ranks import joined
 from diffvbd.tasks.scene import INTEGRATORS, MOST_STEPS, Array, Observation, Scene
 
 DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Units: m, kg, s, Pa; y points up."
@@ -182,13 +183,13 @@ def _add_scene_options(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     out = options.out or Path("runs") / (options.name + ("-quick" if options.quick else ""))
-    check_device(options.device)
-    settings = Settings(out, options.device, options.seed, options.quick)
-    task = TASKS[options.name]
+    settings, task = Settings(out, options.device, options.seed, options.quick), TASKS[options.name]
     chosen = {name: getattr(options, name.replace("-", "_")) for name in _task_options()}
     given = {name: value for name, value in chosen.items() if value is not None}
     given = task.chosen(given)
-    _solve(task.build(settings, **given), settings)
+    with joined(options.device, task.splits):
+        check_device(options.device)
+        _solve(task.build(settings, **given), settings)
 
 
 def _solve(problem: Problem, settings: Settings) -> Result:

@@ -37,11 +37,12 @@ class Option:
 
 @dataclass(frozen=True)
 class Task:
-    """A summary in one line, the function that builds the problem, and its options by name."""
+    """A summary in one line, the function that builds the problem, its options by name, and whether ranks share it."""
 
     summary: str
     build: Callable[..., Problem]
     options: dict[str, Option] = field(default_factory=dict)
+    splits: bool = False
 
     def chosen(self, texts: dict[str, str]) -> dict[str, Any]:
         """Keywords of `build` from options as they are written on a command line.
@@ -100,6 +101,7 @@ TASKS = {
             "steps": Option(int, "steps of a rollout, at least 120 (default 240; not with --quick)"),
             "iterations": Option(int, "of each of the two stages (default 40)"),
         },
+        splits=True,
     ),
     "throw": Task("throw a soft ball into a box with a stretched sheet", throw.problem),
 }

@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from torch import Tensor
 
 import diffvbd as dv
@@ -53,7 +54,7 @@ PAD_SPACING, RING_SPACING = 8e-3, 8e-3  # of places [m]
 LAYERS = 16
 HEIGHT = 1.77  # of the middle of the ring [m]
 RADIUS, STIFFNESS = math.sqrt(3) * EDGE, 3e-3  # [m], [N/m]
-GROUP = 64  # most bodies in a scene on the CPU
+GROUP, QUICK_GROUP = 64, 16  # most bodies in a scene on the CPU
 PAIRS = 2  # room for pairs, for each body
 MIXED = 8  # bodies whose places are mixed
 LAUNCH = 3.0  # first guess, upwards [m/s]
@@ -72,10 +73,11 @@ class Version(NamedTuple):
     dtype: torch.dtype = torch.float32
     counts: tuple[int, int] = ITERATIONS
     rates: tuple[float, float] = RATES
+    group: int = GROUP
 
 
 # a flight of a sixth of the time
-QUICK = Version(QUICK_BODIES, 24, 20, 0.05, 0.6, torch.float64, (15, 10), (0.5, 0.02))
+QUICK = Version(QUICK_BODIES, 24, 20, 0.05, 0.6, torch.float64, (15, 10), (0.5, 0.02), QUICK_GROUP)
 
 
 def problem(
@@ -104,7 +106,7 @@ def problem(
                 learning_rate=rate,
                 before=partial(cubes.begin, touching=touching),
                 criterion="mean_error",
-                capturable=True,
+                capturable=not dist.is_initialized(),  # what ranks exchange is not captured
                 name=name,
             )
             for name, count, rate, touching in zip(STAGES, version.counts, version.rates, (False, True), strict=True)
@@ -138,26 +140,35 @@ def chosen(quick: bool, bodies: int | None, steps: int | None, iterations: int |
 
 
 class Cubes:
-    """The bodies, their places, and the four numbers of each that are looked for."""
+    """The bodies, their places, and the four numbers of each that are looked for.
+
+    Under torchrun each rank moves its share of the bodies. What is small is whole on every rank: parameters, their
+    gradients and optimiser, centers of mass, pushes.
+    """
 
     def __init__(self, settings: Settings, version: Version) -> None:
         self.version, bodies = version, version.bodies
         place = matched(ring(bodies, version.height), np.random.default_rng(settings.seed))
         self.cube = cube = dv.mesh.cube(2, EDGE).translate((-EDGE / 2,) * 3)
         # a GPU has one thread sweep a whole cube; a CPU sweeps eight vertices of a color at once, and wants more cubes
-        self.group = 1 if torch.device(settings.device).type == "cuda" else math.gcd(bodies, GROUP)
-        self.shape = (bodies // self.group, self.group * cube.num_vertices, 3)
+        self.group = 1 if torch.device(settings.device).type == "cuda" else math.gcd(bodies, version.group)
+        self.scenes = bodies // self.group
+        part = dv.distributed.share(self.scenes)  # of this rank
+        mine = slice(part.start * self.group, part.stop * self.group)
+        self.bodies = mine.stop - mine.start
+        self.shape = (part.stop - part.start, self.group * cube.num_vertices, 3)
         model = dv.Model(dv.mesh.replicate(cube, np.zeros((self.group, 3))), density=DENSITY, dtype=version.dtype,
                          rigid=False, start="predictor")  # fmt: skip
         self.model = model.to(settings.device)
         device = self.model.device
         like = {"dtype": version.dtype, "device": device}
-        self.target, pad = torch.as_tensor(place, **like), torch.as_tensor(launch_pad(bodies), **like)
+        self.target, pad = torch.as_tensor(place, **like), torch.as_tensor(launch_pad(bodies)[mine], **like)
         corners, self.mass = (each[: cube.num_vertices] for each in (self.model.rest_points, self.model.mass))
         self.x = (pad[:, None] + torch.tensor([1.0, SQUEEZE, 1.0], **like) * corners).reshape(self.shape)
-        # all bodies see each other: to the penalty they are one scene
-        labels = torch.arange(bodies, device=device).repeat_interleave(cube.num_vertices)
-        self.together = dv.contact.Bodies(labels, self.mass.repeat(bodies))
+        labels = torch.arange(bodies, device=device)
+        self.mine = dv.contact.Bodies(labels[mine].repeat_interleave(cube.num_vertices), self.mass.repeat(self.bodies))
+        # all bodies see each other: to the penalty they are one scene, of a point for each
+        self.together = dv.contact.Bodies(labels, self.mine.mass[:1].repeat(bodies))
         self.contact, self.max_pairs = False, PAIRS * bodies + 256
 
         self.velocity = torch.tensor([0.0, version.launch, 0.0], **like).repeat(bodies, 1).requires_grad_()
@@ -170,18 +181,25 @@ class Cubes:
     def push(self, step: int, x: Tensor, v: Tensor) -> Tensor | None:
         if step >= self.version.target_step:
             return None
-        force = dv.contact.center_of_mass_penalty(
-            x.flatten(0, 1), self.together, RADIUS, STIFFNESS, max_pairs=self.max_pairs
-        )
-        return force.view_as(x)
+        centers = self.all_of(self.mine.centers(x.reshape(1, -1, 3))[0])
+        force = dv.contact.center_of_mass_penalty(centers, self.together, RADIUS, STIFFNESS, max_pairs=self.max_pairs)
+        return self.mine.forces(self.own(force)[None]).view_as(x)
+
+    def own(self, values: Tensor) -> Tensor:
+        """Of all bodies [N, ...] -> of those of this rank."""
+        return dv.distributed.own(values.unflatten(0, (self.scenes, self.group))).flatten(0, 1)
+
+    def all_of(self, values: Tensor) -> Tensor:
+        """Of the bodies of this rank [n, ...] -> of all."""
+        return dv.distributed.gathered(values.unflatten(0, (-1, self.group)), self.scenes).flatten(0, 1)
 
     def simulate(self, save: int) -> Tensor:
         """Centers of mass [m] of every n-th frame, shape [frames, bodies, 3]."""
-        cube, mu = self.cube, MU[0] + (MU[1] - MU[0]) * self.material.sigmoid()
+        cube, mu = self.cube, MU[0] + (MU[1] - MU[0]) * self.own(self.material).sigmoid()
         motion = dv.rollout(
             self.model,
             self.x,
-            self.velocity[:, None].expand(-1, cube.num_vertices, -1).reshape(self.shape),
+            self.own(self.velocity)[:, None].expand(-1, cube.num_vertices, -1).reshape(self.shape),
             steps=self.version.steps,
             mu=mu.view(-1, self.group, 1).expand(-1, -1, cube.num_tets).flatten(1),
             lam=LAM,
@@ -191,7 +209,8 @@ class Cubes:
             save=save,
             checkpoint_every=CHECKPOINT_EVERY,
         )
-        return losses.center_of_mass(motion.x.view(-1, self.version.bodies, cube.num_vertices, 3), self.mass)
+        centers = losses.center_of_mass(motion.x.view(-1, self.bodies, cube.num_vertices, 3), self.mass)
+        return self.all_of(centers.transpose(0, 1)).transpose(0, 1)
 
     def begin(self, iteration: int, touching: bool) -> None:
         self.contact = touching

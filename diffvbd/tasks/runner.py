@@ -5,6 +5,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -29,6 +30,7 @@ from diffvbd.tasks.problem import (
     estimates_of,
 )
 from diffvbd.tasks.progress import Progress, Row, summary, versions
+from diffvbd.tasks.ranks import is_first, with_own_folder
 from diffvbd.tasks.report import survival
 
 LISTED = 1000  # numbers of a parameter that log.json lists; larger ones go to parameters.pt
@@ -42,7 +44,8 @@ def solve(problem: Problem, settings: Settings) -> Result:
 
     After every step of an optimiser the whole state is on disk, so the same call continues an interrupted run with the
     very numbers the uninterrupted one would have had. A state of other settings, of another protocol or of a first loss
-    that is no longer the same number is put aside.
+    that is no longer the same number is put aside. In a process group every rank has to call it, with the same problem
+    and settings; files are those of the first rank.
 
     Returns:
         The result; log.json, picture.png and animation.gif (where matplotlib is installed) are in settings.out.
@@ -54,8 +57,8 @@ def solve(problem: Problem, settings: Settings) -> Result:
     """
     check(problem)
     check_device(settings.device)
-    with alone_in(settings.out):
-        return _solve(problem, settings)
+    with alone_in(settings.out) if is_first() else nullcontext(), with_own_folder(settings) as own:
+        return _solve(problem, own)
 
 
 def _solve(problem: Problem, settings: Settings) -> Result:
@@ -213,6 +216,8 @@ class _Run:
             self.save()
 
     def save(self) -> None:
+        if not is_first():
+            return
         state = {
             "fingerprint": self.fingerprint,
             "history": self.history,

@@ -1,0 +1,179 @@
+"""Scenes and a million cubes over one and two GPUs: time, memory of each rank, and whether the bits are the same.
+
+On CUDA with nccl, a GPU for each rank; with `--device cpu --quick` two processes with gloo try the script out. All
+steps are called eagerly. Times are the median of several iterations of forward and reverse, from when all ranks begin
+until all have ended.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import resource
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+import torch.multiprocessing as mp
+from torch import Tensor
+
+import diffvbd as dv
+from bench.common import markdown_table
+from diffvbd.tasks import Settings, million_cubes
+
+DEVICE = "cuda"
+RANKS = (1, 2)
+SCENES, QUICK_SCENES = 2_048, 8
+PARTS, QUICK_PARTS = 8, 4
+STEPS, SWEEPS = 10, 10
+MODULUS, STEP = 1e5, 5e-3  # [Pa], [s]
+Row = dict[str, Any]
+
+
+def run(quick: bool, *, device: str = DEVICE) -> dict[str, Any]:
+    cuda = torch.device(device).type == "cuda"
+    if cuda and not torch.cuda.is_available():
+        raise SystemExit(f"device: no CUDA device here; `--device {device}` needs one, `--device cpu --quick` does not")
+    if not cuda and not quick:
+        raise SystemExit("device: the CPU only tries the script out; give --quick")
+    here = torch.cuda.device_count() if cuda else max(RANKS)
+    found: dict[str, list[Row]] = {"scenes": [], "cubes": []}
+    for ranks in (n for n in RANKS if n <= here):
+        with tempfile.TemporaryDirectory() as folder:
+            mp.spawn(_rank, args=(ranks, Path(folder), cuda, quick), nprocs=ranks)  # pyright: ignore
+            each = [json.loads((Path(folder) / f"{rank}.json").read_text()) for rank in range(ranks)]
+        for group, rows in found.items():
+            rows += [_together(list(same)) for same in zip(*(one[group] for one in each), strict=True)]
+    for rows in found.values():
+        for row in rows:
+            first = next(r for r in rows if r["parts"] == row["parts"])
+            row["same_bits"] = None if first is row else row["digest"] == first["digest"]
+    return found
+
+
+def _rank(rank: int, ranks: int, folder: Path, cuda: bool, quick: bool) -> None:
+    if cuda:
+        torch.cuda.set_device(rank)
+    else:
+        torch.set_num_threads(max(1, (os.cpu_count() or 1) // ranks))
+    backend = "nccl" if cuda else "gloo"
+    dist.init_process_group(backend, init_method=f"file://{folder / 'meeting'}", rank=rank, world_size=ranks)
+    found = {"scenes": _scenes(ranks, cuda, quick), "cubes": _cubes(ranks, cuda, quick)}
+    (folder / f"{rank}.json").write_text(json.dumps(found))
+    dist.destroy_process_group()
+
+
+def _together(rows: list[Row]) -> Row:
+    """One row of those of all ranks."""
+    assert len({row["digest"] for row in rows}) == 1, "ranks differ"
+    return rows[0] | {"peak_bytes": [row["peak_bytes"] for row in rows]}
+
+
+def _measured(work: Callable[[], Iterable[Tensor]], cuda: bool, quick: bool) -> Row:
+    """Seconds and peak of a work that all ranks do, after a first time that does not count, and a hash of its end."""
+
+    def once() -> float:
+        dist.barrier()
+        if cuda:
+            torch.cuda.synchronize()
+        start = time.perf_counter()
+        work()
+        if cuda:
+            torch.cuda.synchronize()
+        dist.barrier()
+        return time.perf_counter() - start
+
+    found = b"".join(tensor.detach().cpu().numpy().tobytes() for tensor in work())
+    if cuda:
+        torch.cuda.reset_peak_memory_stats()
+    seconds = statistics.median(once() for _ in range(2 if quick else 5))
+    # of a process on the CPU all that it ever had, libraries included
+    peak = torch.cuda.max_memory_allocated() if cuda else 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {"seconds": seconds, "peak_bytes": peak, "digest": hashlib.sha256(found).hexdigest()[:16]}
+
+
+def _scenes(ranks: int, cuda: bool, quick: bool) -> list[Row]:
+    """Gradients of a small network and of mu through scenes that fly and vibrate, in parts; and in one part for each
+    rank, which is what fixed parts cost."""
+    scenes, parts = (QUICK_SCENES, QUICK_PARTS) if quick else (SCENES, PARTS)
+    device = "cuda" if cuda else "cpu"
+    model = dv.Model(dv.mesh.cube(3 if quick else 11, split="five"), device=device)
+    torch.manual_seed(0)
+    network = torch.nn.Linear(3, 3).to(device, model.dtype)
+    log_mu = torch.full((), MODULUS, dtype=model.dtype, device=device).log().requires_grad_()
+    goals = torch.rand(scenes, 3, dtype=model.dtype).to(device)
+    leaves = [*network.parameters(), log_mu]
+    stretched = model.rest_points * model.rest_points.new_tensor([1.0, 0.95, 1.0])
+
+    def loss(part: slice) -> Tensor:
+        v = network(goals[part])[:, None].expand(-1, model.num_vertices, -1)
+        end = dv.rollout(model, stretched.expand_as(v), v, steps=STEPS, mu=log_mu.exp(), lam=MODULUS, time_step=STEP,
+                         sweeps=SWEEPS, save="last")  # fmt: skip
+        return (end.x[-1] - goals[part, None]).square().sum() / scenes
+
+    def work(parts: int) -> list[Tensor]:
+        for leaf in leaves:
+            leaf.grad = None
+        total = dv.distributed.backward(loss, leaves, scenes, parts)
+        return [total, *(leaf.grad for leaf in leaves if leaf.grad is not None)]
+
+    rows = []
+    for count in (parts, ranks):
+        row = _measured(lambda count=count: work(count), cuda, quick)
+        rows.append({"ranks": ranks, "scenes": scenes, "parts": count, "vertices": model.num_vertices,
+                     "scenes_per_s": scenes / row["seconds"], **row})  # fmt: skip
+    return rows
+
+
+def _cubes(ranks: int, cuda: bool, quick: bool) -> list[Row]:
+    """Loss and gradient of the task million-cubes, with pushes, from velocities that take each body to its place."""
+    settings = Settings(Path("unused"), "cuda" if cuda else "cpu", quick=quick)
+    version = million_cubes.chosen(quick, None, None if quick else million_cubes.TARGET_STEP, None)
+    cubes = million_cubes.Cubes(settings, version)
+    cubes.begin(0, touching=True)
+    cubes.max_pairs = 16 * version.bodies
+    duration = version.target_step * million_cubes.TIME_STEP
+    with torch.no_grad():
+        way = cubes.target - torch.as_tensor(million_cubes.launch_pad(version.bodies)).to(cubes.target)
+        cubes.velocity.copy_(way / duration + way.new_tensor([0.0, 9.81 * duration / 2, 0.0]))
+
+    def work() -> list[Tensor]:
+        cubes.velocity.grad = cubes.material.grad = None
+        total = cubes.loss()
+        total.backward()
+        return [total, *(p.grad for p in (cubes.velocity, cubes.material) if p.grad is not None)]
+
+    row = _measured(work, cuda, quick)
+    return [{"ranks": ranks, "bodies": version.bodies, "parts": None, "steps": version.steps, **row}]
+
+
+def markdown(results: dict[str, Any]) -> str:
+    def memory(row: Row) -> str:
+        return ", ".join(f"{peak / 1e9:.2f}" for peak in row["peak_bytes"])
+
+    one = {(row["parts"], row.get("scenes")): row["seconds"] for rows in results.values() for row in rows
+           if row["ranks"] == 1}  # fmt: skip
+
+    def times(row: Row) -> float | None:
+        """How much faster than one rank: with as many parts, or for a part for each rank with one part."""
+        base = one.get((1 if row["parts"] == row["ranks"] else row["parts"], row.get("scenes")))
+        return None if base is None else base / row["seconds"]
+
+    scenes = markdown_table(
+        ("ranks", "parts", "scenes", "vertices of each", "scenes/s, forward and reverse", "times one rank",
+         "peak of each rank [GB]", "bits of one rank"),
+        [(r["ranks"], r["parts"], r["scenes"], r["vertices"], r["scenes_per_s"], times(r), memory(r), r["same_bits"])
+         for r in results["scenes"]])  # fmt: skip
+    cubes = markdown_table(
+        ("ranks", "bodies", "steps", "forward and reverse [s]", "times one rank", "peak of each rank [GB]",
+         "bits of one rank"),
+        [(r["ranks"], r["bodies"], r["steps"], r["seconds"], times(r), memory(r), r["same_bits"])
+         for r in results["cubes"]])  # fmt: skip
+    text = f"{STEPS} steps, K = {SWEEPS}, gradients of a network and of mu, `dv.distributed.backward`.\n\n"
+    return f"## Scenes\n\n{text}{scenes}\n## The task million-cubes, with pushes\n\n{cubes}"
