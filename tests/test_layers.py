@@ -52,7 +52,7 @@ ROOMS = (
     "_version", "safeguards", "mask", "checks", "tuples", "said", "lasting", "scopes", "reference", "energies", "mesh",
     "ops", "contact",
     "model", "adjoint", "step", "rollout", "inspect", "colliders", "solvers", "losses", "viz", "testing", "", "tasks",
-    "cli", "__main__",
+    "cli_mesh", "cli", "__main__",
 )  # fmt: skip
 OPTIONAL = {"matplotlib", "mpl_toolkits", "pxr", "pytetwild", "pyvista", "scipy", "trimesh"}  # packages of extras
 # Both only when they are asked: Model.memory() for what a rollout would take, diffvbd.contact for what users call.

@@ -4,6 +4,7 @@ from diffvbd.mesh.bodies import blob, bunny, capsule
 from diffvbd.mesh.compose import join, replicate, subdivide
 from diffvbd.mesh.implicit import fill
 from diffvbd.mesh.io import Fields, load, load_fields
+from diffvbd.mesh.repair import Repair, repair
 from diffvbd.mesh.series import write_series
 from diffvbd.mesh.shapes import beam, box, cube, disk, dress, sheet, shell
 from diffvbd.mesh.tet_mesh import TetMesh
@@ -12,6 +13,7 @@ from diffvbd.mesh.write import save
 
 __all__ = [
     "Fields",
+    "Repair",
     "TetMesh",
     "beam",
     "blob",
@@ -25,6 +27,7 @@ __all__ = [
     "join",
     "load",
     "load_fields",
+    "repair",
     "replicate",
     "save",
     "sheet",

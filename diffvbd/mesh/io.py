@@ -61,7 +61,7 @@ def load_fields(path: str | PathLike[str], *, orient: bool = True) -> Fields:
     """Read the tets of a mesh file and the values that it has for vertices and tets, as `save` writes them.
 
     Rows follow the vertices and tets of the mesh: values of dropped vertices and of other cells are left out. Units are
-    those of the file. Cell data `body` is not repeated here: it is `TetMesh.body`, where it keeps to whole bodies.
+    those of the file. Cell data `body` is not repeated here where it has become `TetMesh.body`.
 
     Args:
         path, orient: As in `load`.
@@ -81,7 +81,7 @@ def load_fields(path: str | PathLike[str], *, orient: bool = True) -> Fields:
         points[name] = _rows(path, f"point_data[{name!r}]", values, len(content.points))[vertices]
     cells: dict[str, NDArray[Any]] = {}
     for name, values in content.cell_data.items():
-        if name != "body":
+        if name != "body" or mesh.num_bodies == 1:
             label = f"cell_data[{name!r}]"
             cells[name] = np.concatenate([_rows(path, label, values[k], len(content.cells[k].data)) for k in blocks])
     return Fields(mesh, points, cells)

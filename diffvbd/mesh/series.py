@@ -15,7 +15,7 @@ from diffvbd.mesh.arrays import FloatArray, float_array
 from diffvbd.mesh.gltf import write_gltf
 from diffvbd.mesh.parts import parts_of
 from diffvbd.mesh.tet_mesh import TetMesh
-from diffvbd.mesh.usd import write_usd
+from diffvbd.mesh.usd import require_usd, write_usd
 from diffvbd.mesh.write import checked_fields, content_of, quiet
 
 USD = (".usd", ".usda", ".usdc")
@@ -60,9 +60,7 @@ def write_series(
     Source: OpenUSD's schema UsdGeomMesh; Khronos, "glTF 2.0 Specification", 2021, section 3.7.2.2, morph targets.
     """
     path = Path(path)
-    extension = path.suffix.lower()
-    if extension not in EXTENSIONS:
-        raise ValueError(f"path: expected a name that ends in {', '.join(EXTENSIONS)}, got {path.name!r}")
+    extension = check_extension(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"directory {path.parent} does not exist")
     if mesh.num_tets == 0:
@@ -88,6 +86,16 @@ def write_series(
     if of_vertices:
         raise ValueError(f"point_data: expected none, because {extension} files hold no values that change in time")
     write_gltf(path, parts_of(mesh), positions, moments)
+
+
+def check_extension(path: Path, name: str = "path") -> str:
+    """The extension of a motion that can be written here: a ValueError names the argument, an ImportError the extra."""
+    extension = path.suffix.lower()
+    if extension not in EXTENSIONS:
+        raise ValueError(f"{name}: expected a name that ends in {', '.join(EXTENSIONS)}, got {path.name!r}")
+    if extension in USD:
+        require_usd(extension)
+    return extension
 
 
 def _write_pvd(

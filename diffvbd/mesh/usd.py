@@ -29,10 +29,9 @@ def write_usd(
         ValueError: `velocities` of another shape than [N, V, 3].
         ImportError: usd-core is not installed.
     """
-    try:
-        from pxr import Sdf, Usd, UsdGeom, Vt
-    except ImportError:
-        raise ImportError(f"writing {path.suffix} needs usd-core: pip install 'diffvbd[exchange]'") from None
+    require_usd(path.suffix)
+    from pxr import Sdf, Usd, UsdGeom, Vt
+
     velocities = point_data.get("velocities")
     if velocities is not None and velocities.shape != frames.shape:
         shape = list(frames.shape)
@@ -74,6 +73,14 @@ def write_usd(
                 primvar.Set(vectors(rows) if is_vector else Vt.FloatArray.FromNumpy(flat), code)
     if not stage.GetRootLayer().Export(str(path)):
         raise OSError(f"cannot write {path}")
+
+
+def require_usd(extension: str) -> None:
+    """Raises ImportError that names the extra, where usd-core is not installed."""
+    try:
+        import pxr.UsdGeom  # noqa: F401
+    except ImportError:
+        raise ImportError(f"writing {extension} needs usd-core: pip install 'diffvbd[exchange]'") from None
 
 
 def time_codes(times: NDArray[Any]) -> tuple[float, list[float]]:

@@ -54,7 +54,7 @@ def save(
     Raises:
         TypeError: values that are no real numbers.
         ValueError: a mesh without tets, an unknown extension, a format that holds no tets or no values, values of
-            another shape, NaN or Inf among them, an empty name, cell data named `body`, or meshio fails.
+            another shape, NaN or Inf among them, an empty name, cell data `body` beside labels, or meshio fails.
         ImportError: the format needs a package that is not installed (h5py for .xdmf and .med).
         FileNotFoundError: the directory does not exist.
     """
@@ -88,6 +88,8 @@ def content_of(
         raise ValueError("mesh: expected at least one tet to write, got none")
     of_tets: dict[str, Any] = {name: [values] for name, values in (cell_data or {}).items()}
     if mesh.num_bodies > 1:
+        if "body" in of_tets:
+            raise ValueError("cell_data: expected another name than 'body', which has the labels of this mesh's bodies")
         of_tets["body"] = [mesh.body[mesh.tets[:, 0]]]
     return meshio.Mesh(points, [("tetra", mesh.tets)], point_data=dict(point_data or {}), cell_data=of_tets)
 
@@ -99,16 +101,17 @@ def checked_fields(
     found = {}
     for name, given in (fields or {}).items():
         label = f"{kind}[{name!r}]"
-        if not isinstance(name, str) or not name.strip() or (kind, name) == ("cell_data", "body"):
-            raise ValueError(f"{kind}: expected names of values, and not 'body', which holds labels; got {name!r}")
+        if not isinstance(name, str) or not name.strip():
+            raise ValueError(f"{kind}: expected names of values, got {name!r}")
         values = to_numpy(given)
         if values.dtype.kind not in "biuf":
             raise TypeError(f"{label}: expected real numbers, got dtype {values.dtype}")
         rows, columns = values.shape[: len(leading)], values.shape[len(leading) :]
         if rows != leading or len(columns) > 1 or 0 in columns:
             raise ValueError(f"{label}: expected shape {[*leading]} or {[*leading, 'C']}, got {list(values.shape)}")
-        if widths is not None and (*columns, 1)[0] not in widths:
-            raise ValueError(f"{label}: expected {' or '.join(map(str, widths))} columns, got {columns[0]}")
+        width = columns[0] if columns else 1
+        if widths is not None and width not in widths:
+            raise ValueError(f"{label}: expected {' or '.join(map(str, widths))} columns, got {width}")
         if not np.isfinite(values).all():
             bad = np.unique(np.nonzero(~np.isfinite(values))[0])
             raise ValueError(f"{label}: expected finite numbers, got NaN or Inf in {listed(bad, 'row')}")

@@ -79,6 +79,15 @@ def test_moduli_of_a_file_drive_a_step(tmp_path: Path) -> None:
     assert mu.grad is not None and mu.grad.shape == (mesh.num_tets,) and (mu.grad != 0).all()
 
 
+def test_labels_that_are_no_bodies_stay_values(tmp_path: Path) -> None:
+    cells = [("tetra", [[0, 1, 2, 3], [1, 2, 3, 5]])]
+    meshio.Mesh(POINTS, cells, cell_data={"body": [np.array([4, 5])]}).write(tmp_path / "glued.vtu")
+    found = dm.load_fields(tmp_path / "glued.vtu")
+    assert found.mesh.num_bodies == 1 and found.cell_data["body"].tolist() == [4, 5]
+    dm.save(tmp_path / "again.vtu", *found)
+    assert dm.load_fields(tmp_path / "again.vtu").cell_data["body"].tolist() == [4, 5]
+
+
 def test_series_has_values_of_tets(tmp_path: Path) -> None:
     mesh = dm.cube()
     frames = np.stack([mesh.points] * 2)
@@ -102,7 +111,7 @@ def test_series_has_values_of_tets(tmp_path: Path) -> None:
         ),
         ("a.vtu", {"cell_data": {"F": np.zeros((T, 3, 3))}}, rf"got \[{T}, 3, 3\]"),
         ("a.vtu", {"point_data": {"s": np.full(V, np.nan)}}, r"point_data\['s'\]: expected finite numbers, got NaN"),
-        ("a.vtu", {"cell_data": {"body": np.zeros(T)}}, "cell_data: expected names of values, and not 'body'"),
+        ("a.vtu", {"cell_data": {"body": np.zeros(T)}}, "cell_data: expected another name than 'body'"),
         ("a.vtu", {"point_data": {" ": np.zeros(V)}}, "point_data: expected names of values"),
         ("a.vtk", {"point_data": {"a b": np.zeros(V)}}, "expected names without spaces in a .vtk file, got 'a b'"),
         ("a.msh", {"point_data": {"uv": np.zeros((V, 2))}}, r"point_data\['uv'\]: expected 1 or 3 or 9 columns, got 2"),
