@@ -48,6 +48,8 @@ def run(options: argparse.Namespace) -> None:
         raise FileNotFoundError(f"directory {out.parent} does not exist")
     repaired = dm.repair(options.surface, options.size, options.scale, options.up)
     print(repaired)
+    if len(repaired.triangles) > options.max_triangles:
+        print(f"{'decimated':9} to {options.max_triangles} triangles; --max-triangles keeps more, and takes longer")
     start = time.perf_counter()
     mesh = dm.tetrahedralize(repaired.surface, options.edge, options.epsilon, options.max_triangles)
     print(report(mesh, repaired.volume, time.perf_counter() - start))

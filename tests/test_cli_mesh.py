@@ -43,8 +43,18 @@ def test_a_scan_becomes_tets(scan: Path, tmp_path: Path, capsys: pytest.CaptureF
     mesh = dm.load(part)
     assert np.ptp(mesh.points, axis=0) == pytest.approx([0.1, 0.2, 0.1], rel=tolerance("meshed_anew"))
     np.testing.assert_allclose(mesh.volume.sum(), 2e-3, rtol=tolerance("meshed_anew"))
+    assert "decimated" not in told
     assert run("mesh", scan, "-o", part) == 2
     assert "would be overwritten; give --force, or another name" in capsys.readouterr().err
+
+
+def test_what_is_left_out_of_a_large_scan_is_said(
+    scan: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("trimesh", reason="needs the extra [mesh]")
+    monkeypatch.setattr(dm, "tetrahedralize", lambda surface, edge, epsilon, most: dm.cube(3))
+    assert run("mesh", scan, "--scale", 0.01, "--max-triangles", 20, "-o", scan.with_name("part.vtu")) == 0
+    assert "decimated to 20 triangles; --max-triangles keeps more" in capsys.readouterr().out
 
 
 def test_quality_is_shown() -> None:

@@ -97,7 +97,7 @@ def repair(
     if up not in _TO_Y:
         raise ValueError(f"up: expected one of {', '.join(_TO_Y)}, got {up!r}")
     if size is not None and scale is not None:
-        raise ValueError(f"size: expected none beside scale = {scale:g}, got {size:g}")
+        raise ValueError(f"size: expected none beside scale = {scale!r}, got {size!r}")
     points, triangles = surface_arrays(Path(surface) if isinstance(surface, (str, PathLike)) else surface)
     factor = positive("scale", 1.0 if scale is None else scale)
     if size is not None:
@@ -153,11 +153,20 @@ def _turn_outwards(content: Any, graph: Any) -> int:
     groups = graph.connected_components(content.face_adjacency, nodes=np.arange(len(faces)), min_len=1)
     corners = [np.asarray(content.vertices)[faces[group]] for group in groups]
     low, high = (np.array([edge(c, axis=(0, 1)) for c in corners]) for edge in (np.min, np.max))
-    # inside[i, j]: piece j lies in piece i
-    inside = np.asarray(np.all((low[:, None] < low) & (high[:, None] > high), axis=-1))
-    outer = np.flatnonzero(~np.any(inside, axis=0))
-    inverted = [k for k in outer if _volume(corners[k]) < 0]
-    for group in (groups[k] for k in {*inverted, *np.flatnonzero(np.any(inside[inverted], axis=0))}):
+
+    def within(k: int) -> NDArray[np.bool_]:
+        """Which pieces lie in piece k; one at a time, because noisy scans have thousands."""
+        return np.asarray(np.all((low > low[k]) & (high < high[k]), axis=1))
+
+    inner = np.zeros(len(groups), dtype=bool)
+    for k in range(len(groups)):
+        inner |= within(k)
+    turned = np.zeros(len(groups), dtype=bool)
+    for k in np.flatnonzero(~inner).tolist():
+        if _volume(corners[k]) < 0:
+            turned[k] = True
+            turned |= within(k)
+    for group in (groups[k] for k in np.flatnonzero(turned)):
         faces[group] = faces[group][:, ::-1]
     content.faces = faces
     return len(groups)
