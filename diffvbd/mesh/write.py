@@ -52,7 +52,7 @@ def save(
         cell_data: The same for tets, shape [T] or [T, C].
 
     Raises:
-        TypeError: values that are no real numbers.
+        TypeError: values that are no real numbers, or have no names.
         ValueError: a mesh without tets, an unknown extension, a format that holds no tets or no values, values of
             another shape, NaN or Inf among them, an empty name, cell data `body` beside labels, or meshio fails.
         ImportError: the format needs a package that is not installed (h5py for .xdmf and .med).
@@ -98,6 +98,8 @@ def checked_fields(
     kind: str, fields: Mapping[str, Any] | None, leading: tuple[int, ...], widths: tuple[int, ...] | None = None
 ) -> dict[str, NDArray[Any]]:
     """Copies of values by name, each of shape [*leading] or [*leading, C], finite; `widths` limits C."""
+    if fields is not None and not isinstance(fields, Mapping):
+        raise TypeError(f"{kind}: expected values by name, as in a dict, got {type(fields).__name__}")
     found = {}
     for name, given in (fields or {}).items():
         label = f"{kind}[{name!r}]"

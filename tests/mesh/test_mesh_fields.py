@@ -127,3 +127,5 @@ def test_values_that_would_be_lost_are_refused(tmp_path: Path, name: str, data: 
 def test_values_are_real_numbers(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match=r"cell_data\['c'\]: expected real numbers, got dtype complex128"):
         dm.save(tmp_path / "a.vtu", MESH, cell_data={"c": np.zeros(T, dtype=complex)})
+    with pytest.raises(TypeError, match="point_data: expected values by name, as in a dict, got list"):
+        dm.save(tmp_path / "a.vtu", MESH, [1.0])  # pyright: ignore[reportArgumentType]
