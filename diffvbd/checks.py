@@ -20,13 +20,20 @@ def check_tensor(name: str, value: Any, like: Tensor, what: str = "a tensor", ow
     if not isinstance(value, Tensor):
         if isinstance(value, (int, float, np.floating, np.integer)) and not isinstance(value, bool):
             return torch.full((), to_float(name, value), dtype=like.dtype, device=like.device)
-        raise TypeError(f"{name}: expected {what}, got {type(value).__name__}")
+        raise TypeError(f"{name}: expected {what}, got {kind_of(value)}")
     check_dense(name, value)
     if value.dtype != like.dtype:
         raise TypeError(f"{name}: expected dtype {like.dtype} ({owner}), got {value.dtype}")
     if value.device != like.device:
         raise ValueError(f"{name}: expected device {like.device} ({owner}), got {value.device}")
     return value
+
+
+def kind_of(value: Any) -> str:
+    """The name of a value's type, and how arrays of other libraries become tensors."""
+    shared = hasattr(value, "__dlpack__") and not isinstance(value, (Tensor, np.ndarray))
+    hint = ": torch.from_dlpack(array) is a tensor in the same memory" if shared else ""
+    return type(value).__name__ + hint
 
 
 def check_dense(name: str, value: Tensor) -> None:

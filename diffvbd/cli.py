@@ -12,6 +12,8 @@ import numpy as np
 import torch
 
 import diffvbd as dv
+from diffvbd import cli_mesh
+from diffvbd.mesh.series import EXTENSIONS, check_extension
 from diffvbd.rollout.search import ERROR, PATIENCE
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
 from diffvbd.tasks.problem import Result, check_device
@@ -23,6 +25,8 @@ DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Unit
 EXAMPLES = """examples:
   diffvbd run beam-mu                              identify a beam's shear modulus: log, table and picture in runs/
   diffvbd run beam-mu --quick                      the same on a small beam, in seconds
+  diffvbd mesh scan.ply --size 0.2 --up z -o part.msh
+                                                   repair a scan, make it 0.2 m large and fill it with tets
   diffvbd simulate part.msh --out part.pvd --pin x- --young 1e5 --poisson 0.3
                                                    hang a part by its left side and open part.pvd in ParaView
   diffvbd simulate part.msh --out drop.pvd --floor -0.5 --velocity 1 0 0
@@ -90,10 +94,12 @@ def _parser() -> argparse.ArgumentParser:
     listing = commands.add_parser("list", help="list the shipped inverse problems")
     listing.set_defaults(command=lambda options: print(_task_list()))
 
-    simulate = commands.add_parser("simulate", help="simulate a mesh and write a series for ParaView")
+    cli_mesh.add(commands)
+
+    simulate = commands.add_parser("simulate", help="simulate a mesh and write its motion")
     simulate.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra (.msh, .vtu, .vtk, ...)")
     simulate.add_argument(
-        "--out", type=Path, required=True, metavar="PART.pvd", help="the series to write; missing folders are made"
+        "--out", type=Path, required=True, metavar="PART.pvd", help=f"{', '.join(EXTENSIONS)}; missing folders are made"
     )
     simulate.add_argument("--force", action="store_true", help="overwrite without asking")
     simulate.add_argument("--steps", type=int, default=100, help="time steps (default 100)")
@@ -207,8 +213,7 @@ def _mesh(options: argparse.Namespace) -> dv.TetMesh:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    if options.out.suffix != ".pvd":
-        raise ValueError(f"--out: expected a name that ends in .pvd, got {options.out}")
+    check_extension(options.out, "--out")
     if options.stride < 1:
         raise ValueError(f"--stride: expected at least 1, got {options.stride}")
     _check_steps(options.steps)
@@ -277,7 +282,8 @@ def _in_python(settings: dv.Settings) -> str:
 def _make_place(options: argparse.Namespace) -> None:
     """Folders for the files of a simulation, and leave to write over those that are there; the mesh stays."""
     out, target = options.out, options.save_target
-    frames = re.compile(re.escape(out.stem) + r"_\d+\.vtu")
+    series = out.suffix.lower() == ".pvd"
+    frames = re.compile(re.escape(out.stem) + r"_\d+\.vtu" if series else "(?!)")  # which nothing matches
     mesh = options.mesh.resolve()
     if mesh.parent == out.parent.resolve() and frames.fullmatch(mesh.name):
         raise ValueError(f"--out: expected another name than {out}, whose frames would overwrite {options.mesh}")

@@ -52,8 +52,9 @@ ROOMS = (
     "_version", "safeguards", "mask", "checks", "distributed", "tuples", "said", "lasting", "scopes", "reference",
     "energies", "mesh", "ops", "contact",
     "model", "adjoint", "step", "rollout", "inspect", "colliders", "solvers", "losses", "viz", "testing", "", "tasks",
-    "cli", "__main__",
+    "cli_mesh", "cli", "__main__",
 )  # fmt: skip
+OPTIONAL = {"matplotlib", "mpl_toolkits", "pxr", "pytetwild", "pyvista", "scipy", "trimesh"}  # packages of extras
 # Both only when they are asked: Model.memory() for what a rollout would take, diffvbd.contact for what users call.
 UPWARD = {("model.model", "rollout.memory"), ("contact", "inspect.contact")}
 
@@ -145,9 +146,9 @@ def test_tasks_use_the_public_interface() -> None:
 def test_nothing_imports_tests_or_benchmarks_and_dependencies_are_declared() -> None:
     roots = {(m, i.split(".")[0]) for m, imports in PYTHON.items() for i in imports}
     assert not {(m, i) for m, i in roots if i in ("tests", "bench", "pytest", "hypothesis", "conftest")}
-    optional = {"matplotlib", "mpl_toolkits", "pyvista", "pytetwild", "scipy"}
-    importers = {m for m, i in roots if i in optional}
-    assert {m for m in importers if not m.startswith("viz.")} <= {"mesh.tetrahedralize", "testing.scenes"}
+    importers = {m for m, i in roots if i in OPTIONAL}
+    allowed = {"mesh.repair", "mesh.tetrahedralize", "mesh.usd", "testing.scenes"}
+    assert {m for m in importers if not m.startswith("viz.")} <= allowed
 
 
 def test_optional_packages_are_imported_where_they_are_used() -> None:
@@ -158,7 +159,7 @@ def test_optional_packages_are_imported_where_they_are_used() -> None:
         ]
         names = {a.name.split(".")[0] for n in top if isinstance(n, ast.Import) for a in n.names}
         names |= {(n.module or "").split(".")[0] for n in top if isinstance(n, ast.ImportFrom)}
-        assert not names & {"matplotlib", "mpl_toolkits", "pyvista", "pytetwild", "scipy"}, path.name
+        assert not names & OPTIONAL, path.name
 
 
 def test_only_ops_names_the_compiled_operators() -> None:

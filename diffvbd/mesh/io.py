@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import meshio
 import numpy as np
@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from diffvbd.mesh.arrays import IntArray, float_array
 from diffvbd.mesh.tet_mesh import TetMesh, oriented
 from diffvbd.mesh.write import PREFERRED_FORMAT, quiet
-
-Result = TypeVar("Result")
 
 # Cell data that may hold body labels: ours, and the integer labels of Gmsh and Medit files.
 _BODY_DATA = ("body", "gmsh:physical", "medit:ref")
@@ -47,7 +45,59 @@ def load(
         ValueError: unreadable or truncated file, unknown format, no tets in it, or tets that TetMesh refuses.
         ImportError: the format needs a package that is not installed.
     """
+    _, mesh, vertices, _ = _tets_of(Path(path), orient)
+    return (mesh, vertices) if return_vertices else mesh
+
+
+class Fields(NamedTuple):
+    """A mesh file with its values: the mesh, values of vertices [V] or [V, C] and of tets [T] or [T, C], by name."""
+
+    mesh: TetMesh
+    point_data: dict[str, NDArray[Any]]
+    cell_data: dict[str, NDArray[Any]]
+
+
+def load_fields(path: str | PathLike[str], *, orient: bool = True) -> Fields:
+    """Read the tets of a mesh file and the values that it has for vertices and tets, as `save` writes them.
+
+    Rows follow the vertices and tets of the mesh: values of dropped vertices and of other cells are left out. Units are
+    those of the file. Cell data `body` is not repeated here where it has become `TetMesh.body`.
+
+    Args:
+        path, orient: As in `load`.
+
+    Returns:
+        `Fields`: the mesh, point_data of shape [V] or [V, C] and cell_data of shape [T] or [T, C], by name.
+
+    Raises:
+        As `load`, and ValueError for values of another number of rows, or that are no numbers.
+    """
     path = Path(path)
+    content, mesh, vertices, blocks = _tets_of(path, orient)
+    points: dict[str, NDArray[Any]] = {}
+    for name, values in content.point_data.items():
+        if name == "gmsh:dim_tags":  # bookkeeping of meshio, which .msh files have always
+            continue
+        points[name] = _rows(path, f"point_data[{name!r}]", values, len(content.points))[vertices]
+    cells: dict[str, NDArray[Any]] = {}
+    for name, values in content.cell_data.items():
+        if name != "body" or mesh.num_bodies == 1:
+            label = f"cell_data[{name!r}]"
+            cells[name] = np.concatenate([_rows(path, label, values[k], len(content.cells[k].data)) for k in blocks])
+    return Fields(mesh, points, cells)
+
+
+def _rows(path: Path, label: str, values: Any, rows: int) -> NDArray[Any]:
+    array = np.asarray(values)
+    if array.dtype.kind not in "iuf" or array.ndim == 0 or len(array) != rows:
+        got = f"shape {list(array.shape)} of dtype {array.dtype}"
+        raise ValueError(f"mesh file {path}: {label}: expected {rows} rows of numbers, got {got}")
+    # torch takes no numbers in the byte order of .vtk files
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+def _tets_of(path: Path, orient: bool) -> tuple[meshio.Mesh, TetMesh, IntArray, list[int]]:
+    """A file's content, its mesh, the index in the file of each vertex [V], and the blocks of tets."""
     content = _read(path)
     blocks = [k for k, cells in enumerate(content.cells) if cells.type in ("tetra", "tetra10")]
     found = [content.cells[k].data[:, :4] for k in blocks]
@@ -58,7 +108,7 @@ def load(
         mesh, vertices = _mesh_of_used_vertices(content, np.concatenate(found), blocks, orient)
     except (TypeError, ValueError) as failure:
         raise ValueError(f"mesh file {path}: {failure}") from None
-    return (mesh, vertices) if return_vertices else mesh
+    return content, mesh, vertices, blocks
 
 
 def _read(path: Path) -> meshio.Mesh:

@@ -27,7 +27,7 @@ def tetrahedralize(
     fTetWild accepts surfaces with holes and self-intersections; what it returns stays within `epsilon` of the input.
     Its time grows with the input triangles more than with the output: a scan of 100,000 triangles does not end in
     minutes, 3,000 take about ten seconds, 12,000 three quarters of a minute. Surfaces above `max_triangles` are
-    therefore decimated first, which needs pyvista (`pip install diffvbd[viz]`).
+    therefore decimated first.
 
     Args:
         surface: A file that meshio reads (STL, PLY, OBJ, ...), or (points [P, 3] in metres, triangles [F, 3]).
@@ -36,38 +36,23 @@ def tetrahedralize(
         max_triangles: Decimate larger surfaces to this many triangles; None never does.
 
     Raises:
-        ImportError: pytetwild is missing, or pyvista where decimation is due.
+        ImportError: pytetwild or pyvista is missing.
         FileNotFoundError: no such file.
         TypeError, ValueError: bad arrays, an unreadable file, one without triangles, lengths that are not positive;
             no tets came out.
 
     Source: Hu et al., "Fast tetrahedral meshing in the wild", ACM TOG 39(4), 2020.
     """
-    if isinstance(surface, (str, PathLike)):
-        points, triangles = read_triangles(Path(surface))
-    else:
-        try:
-            points, triangles = surface
-        except (TypeError, ValueError):
-            raise TypeError(f"surface: expected a path or (points, triangles), got {type(surface).__name__}") from None
-    points = float_array("points", points, (None, 3))
-    triangles = int_array("triangles", triangles, (None, 3))
-    if len(triangles) == 0:
-        raise ValueError("surface: expected triangles, got none")
-    if triangles.min() < 0 or triangles.max() >= len(points):
-        raise ValueError(
-            f"triangles: expected vertex indices from 0 to {len(points) - 1}, got {triangles.min()}..{triangles.max()}"
-        )
+    points, triangles = surface_arrays(surface)
     diagonal = float(np.linalg.norm(np.ptp(points[triangles].reshape(-1, 3), axis=0)))
-    if diagonal == 0:
-        raise ValueError("surface: expected an extended body, got a single point")
     edge = diagonal / 20 if edge_length is None else positive("edge_length", edge_length)
     tolerance = edge / 20 if epsilon is None else positive("epsilon", epsilon)
     limit = None if max_triangles is None else count("max_triangles", max_triangles, 4)
     try:
         import pytetwild
     except ImportError:
-        raise ImportError("tetrahedralize needs pytetwild: pip install diffvbd[mesh]") from None
+        # pytetwild 0.4 cannot be imported without pyvista
+        raise ImportError("tetrahedralize needs pytetwild and pyvista: pip install diffvbd[mesh]") from None
     if limit is not None and len(triangles) > limit:
         points, triangles = _decimated(points, triangles, limit)
     # fTetWild leaves a file in the working directory, so it gets one of its own.
@@ -86,12 +71,34 @@ def tetrahedralize(
     return TetMesh(vertices[used], compact.reshape(-1, 4), orient=True)
 
 
+def surface_arrays(surface: str | PathLike[str] | tuple[Any, Any]) -> tuple[FloatArray, IntArray]:
+    """Points [P, 3] and triangles [F, 3] of a file or of a pair of arrays; raises as `tetrahedralize` does."""
+    if isinstance(surface, (str, PathLike)):
+        points, triangles = read_triangles(Path(surface))
+    else:
+        try:
+            points, triangles = surface
+        except (TypeError, ValueError):
+            raise TypeError(f"surface: expected a path or (points, triangles), got {type(surface).__name__}") from None
+    points = float_array("points", points, (None, 3))
+    triangles = int_array("triangles", triangles, (None, 3))
+    if len(triangles) == 0:
+        raise ValueError("surface: expected triangles, got none")
+    if triangles.min() < 0 or triangles.max() >= len(points):
+        raise ValueError(
+            f"triangles: expected vertex indices from 0 to {len(points) - 1}, got {triangles.min()}..{triangles.max()}"
+        )
+    if np.ptp(points[triangles].reshape(-1, 3), axis=0).max() == 0:
+        raise ValueError("surface: expected an extended body, got a single point")
+    return points, triangles
+
+
 def _decimated(points: FloatArray, triangles: IntArray, limit: int) -> tuple[FloatArray, IntArray]:
     try:
         import pyvista
     except ImportError:
         raise ImportError(
-            f"decimating {len(triangles)} triangles to max_triangles = {limit} needs pyvista: pip install diffvbd[viz]"
+            f"decimating {len(triangles)} triangles to max_triangles = {limit} needs pyvista: pip install diffvbd[mesh]"
         ) from None
     # Welding first: STL-like input without shared vertices cannot be decimated.
     surface = pyvista.PolyData.from_regular_faces(points, triangles).clean()

@@ -1,4 +1,4 @@
-"""Mesh files written through meshio, and time series that ParaView opens."""
+"""Mesh files written through meshio, with values per vertex and per tet."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from contextlib import redirect_stderr, redirect_stdout
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
-from xml.sax.saxutils import quoteattr
 
 import meshio
 import numpy as np
+from numpy.typing import NDArray
 
-from diffvbd.mesh.arrays import FloatArray, float_array, to_numpy
+from diffvbd.mesh.arrays import FloatArray, listed, to_numpy
 
 if TYPE_CHECKING:
     from diffvbd.mesh.tet_mesh import TetMesh
@@ -26,31 +26,100 @@ PREFERRED_FORMAT = {".msh": "gmsh"}
 _NO_TETS = (".obj", ".off", ".ply", ".stl", ".svg", ".wkt")
 
 
-def save(path: str | PathLike[str], mesh: TetMesh) -> None:
+# What meshio writes values per vertex and per tet to. Into other formats it would write the mesh without them.
+_WITH_FIELDS = (".msh", ".vtk", ".vtu", ".xdmf")
+# How many columns values may have where not any number comes back: .vtk makes three of two.
+_COLUMNS = {".msh": (1, 3, 9), ".vtk": (1, 3, 4, 5, 6, 7, 8, 9)}
+
+
+def save(
+    path: str | PathLike[str],
+    mesh: TetMesh,
+    point_data: Mapping[str, Any] | None = None,
+    cell_data: Mapping[str, Any] | None = None,
+) -> None:
     """Write a mesh through meshio; the extension tells the format (.vtu, .vtk, .msh, .mesh, .inp, .xdmf, ...).
 
     With more than one body the label of each tet is written as cell data `body`, in formats that hold cell data.
+    `load_fields` reads point_data and cell_data back.
+
+    Args:
+        path: The file.
+        mesh: What to write.
+        point_data: Values of vertices by name, shape [V] or [V, C], in any unit; arrays or tensors, numbers or bool
+            (written as 0 and 1). Only .vtu, .vtk, .msh and .xdmf hold them. In .msh all become float64 and C is 1, 3 or
+            9; in .vtk C is 1 or 3 to 9.
+        cell_data: The same for tets, shape [T] or [T, C].
 
     Raises:
-        ValueError: a mesh without tets, an unknown extension, a format that holds no tets, or meshio fails.
+        TypeError: values that are no real numbers, or have no names.
+        ValueError: a mesh without tets, an unknown extension, a format that holds no tets or no values, values of
+            another shape, NaN or Inf among them, an empty name, cell data `body` beside labels, or meshio fails.
         ImportError: the format needs a package that is not installed (h5py for .xdmf and .med).
         FileNotFoundError: the directory does not exist.
     """
     path = Path(path)
-    if path.suffix.lower() in _NO_TETS:
+    extension = path.suffix.lower()
+    if extension in _NO_TETS:
         raise ValueError(f"cannot write {path}: {path.suffix} files hold no tets; use .vtu, .msh, ...")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"directory {path.parent} does not exist")
-    content = _content(mesh, mesh.points)
-    quiet(lambda: content.write(path, file_format=PREFERRED_FORMAT.get(path.suffix.lower())), f"write {path}")
+    given = {"point_data": (point_data, mesh.num_vertices), "cell_data": (cell_data, mesh.num_tets)}
+    fields = {
+        kind: checked_fields(kind, values, (rows,), _COLUMNS.get(extension)) for kind, (values, rows) in given.items()
+    }
+    for kind, values in fields.items():
+        if values and extension not in _WITH_FIELDS:
+            raise ValueError(f"{kind}: expected none, because {extension} files hold no values; use .vtu, .msh, ...")
+        if extension == ".vtk" and (spaced := [name for name in values if name.split() != [name]]):
+            raise ValueError(f"{kind}: expected names without spaces in a .vtk file, got {spaced[0]!r}")
+    content = content_of(mesh, mesh.points, **fields)
+    quiet(lambda: content.write(path, file_format=PREFERRED_FORMAT.get(extension)), f"write {path}")
 
 
-def _content(mesh: TetMesh, points: FloatArray, point_data: dict[str, Any] | None = None) -> meshio.Mesh:
+def content_of(
+    mesh: TetMesh,
+    points: FloatArray,
+    point_data: Mapping[str, NDArray[Any]] | None = None,
+    cell_data: Mapping[str, NDArray[Any]] | None = None,
+) -> meshio.Mesh:
+    """What meshio writes of a mesh whose vertices are at `points`, with values that `checked_fields` has seen."""
     if mesh.num_tets == 0:
         raise ValueError("mesh: expected at least one tet to write, got none")
-    cells: list[Any] = [("tetra", mesh.tets)]
-    cell_data: dict[str, Any] = {"body": [mesh.body[mesh.tets[:, 0]]]} if mesh.num_bodies > 1 else {}
-    return meshio.Mesh(points, cells, point_data=point_data, cell_data=cell_data)
+    of_tets: dict[str, Any] = {name: [values] for name, values in (cell_data or {}).items()}
+    if mesh.num_bodies > 1:
+        if "body" in of_tets:
+            raise ValueError("cell_data: expected another name than 'body', which has the labels of this mesh's bodies")
+        of_tets["body"] = [mesh.body[mesh.tets[:, 0]]]
+    return meshio.Mesh(points, [("tetra", mesh.tets)], point_data=dict(point_data or {}), cell_data=of_tets)
+
+
+def checked_fields(
+    kind: str, fields: Mapping[str, Any] | None, leading: tuple[int, ...], widths: tuple[int, ...] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Copies of values by name, each of shape [*leading] or [*leading, C], finite; `widths` limits C."""
+    if fields is not None and not isinstance(fields, Mapping):
+        raise TypeError(f"{kind}: expected values by name, as in a dict, got {type(fields).__name__}")
+    found = {}
+    for name, given in (fields or {}).items():
+        label = f"{kind}[{name!r}]"
+        if not isinstance(name, str) or not name.strip():
+            raise ValueError(f"{kind}: expected names of values, got {name!r}")
+        values = to_numpy(given)
+        if values.dtype.kind not in "biuf":
+            raise TypeError(f"{label}: expected real numbers, got dtype {values.dtype}")
+        rows, columns = values.shape[: len(leading)], values.shape[len(leading) :]
+        if rows != leading or len(columns) > 1 or 0 in columns:
+            raise ValueError(f"{label}: expected shape {[*leading]} or {[*leading, 'C']}, got {list(values.shape)}")
+        width = columns[0] if columns else 1
+        if widths is not None and width not in widths:
+            raise ValueError(f"{label}: expected {' or '.join(map(str, widths))} columns, got {width}")
+        if not np.isfinite(values).all():
+            bad = np.unique(np.nonzero(~np.isfinite(values))[0])
+            raise ValueError(f"{label}: expected finite numbers, got NaN or Inf in {listed(bad, 'row')}")
+        narrow = {"b": np.uint8, "f": np.float64 if values.dtype.itemsize not in (4, 8) else values.dtype}
+        found[name] = np.array(values, dtype=narrow.get(values.dtype.kind, values.dtype), order="C")
+    return found
 
 
 def quiet(action: Callable[[], Result], purpose: str) -> Result:
@@ -75,59 +144,3 @@ def quiet(action: Callable[[], Result], purpose: str) -> Result:
             raise
         reason = f"damaged or truncated ({type(failure).__name__}: {failure})"
     raise ValueError(f"cannot {purpose}: {' '.join(reason.split())[:300] or 'damaged or truncated'}")
-
-
-def write_series(
-    path: str | PathLike[str],
-    mesh: TetMesh,
-    frames: Any,
-    times: Any = None,
-    point_data: Mapping[str, Any] | None = None,
-) -> None:
-    """Write a time series for ParaView: `path` (.pvd) and one .vtu per frame next to it.
-
-    Args:
-        path: The .pvd file; frame k goes to `<stem>_<k>.vtu` in the same directory.
-        mesh: The mesh whose tets connect the frames.
-        frames: Positions [m], shape [N, V, 3]; array or tensor.
-        times: Time of each frame [s], shape [N], never decreasing; default 0, 1, 2, ...
-        point_data: Further values per vertex by name, shape [N, V] or [N, V, C].
-
-    Raises:
-        TypeError, ValueError: wrong shape or dtype, NaN or Inf, decreasing times, a path that does not end in .pvd.
-        FileNotFoundError: the directory does not exist.
-    """
-    path = Path(path)
-    if path.suffix.lower() != ".pvd":
-        raise ValueError(f"path: expected a name that ends in .pvd, got {path.name!r}")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"directory {path.parent} does not exist")
-    positions = float_array("frames", frames, (None, mesh.num_vertices, 3))
-    moments = np.arange(len(positions)) if times is None else float_array("times", times, (len(positions),))
-    if (np.diff(moments) < 0).any():
-        raise ValueError("times: expected times that never decrease")
-    data = {name: _per_vertex(name, values, positions) for name, values in (point_data or {}).items()}
-    digits = max(4, len(str(len(positions) - 1)))
-    entries = []
-    for k, (time, points) in enumerate(zip(moments, positions, strict=True)):
-        name = f"{path.stem}_{k:0{digits}d}.vtu"
-        content = _content(mesh, points, {key: series[k] for key, series in data.items()})
-        target = path.with_name(name)
-        quiet(lambda content=content, target=target: content.write(target), f"write {target}")
-        entries.append(f'    <DataSet timestep="{time:.17g}" part="0" file={quoteattr(name)}/>\n')
-    path.write_text(
-        '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
-        + "".join(entries)
-        + "  </Collection>\n</VTKFile>\n",
-        encoding="utf-8",
-    )
-
-
-def _per_vertex(name: str, values: Any, positions: FloatArray) -> FloatArray:
-    array = to_numpy(values)
-    wanted = positions.shape[:2]
-    if array.ndim not in (2, 3) or array.shape[:2] != wanted:
-        raise ValueError(
-            f"point_data[{name!r}]: expected shape {list(wanted)} or {[*wanted, 'C']}, got {list(array.shape)}"
-        )
-    return float_array(f"point_data[{name!r}]", array, array.shape)

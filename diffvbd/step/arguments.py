@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .. import ops, reference
 from ..adjoint.routes import Adjoint, ReverseSweep, Unrolled
-from ..checks import check_broadcast, check_count, check_tensor, check_time_step, fail, name_value, to_float
+from ..checks import check_broadcast, check_count, check_tensor, check_time_step, fail, kind_of, name_value, to_float
 from ..contact.barrier import Friction, PairBarrier
 from ..contact.colliders import MOST_LENGTH, Plane
 from ..energies import VERTEX_ENERGIES
@@ -52,9 +52,7 @@ def check_state(model: Model, x: Tensor, v: Tensor) -> tuple[int, ...]:
         raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
     for name, value in (("x", x), ("v", v)):
         if not isinstance(value, Tensor):
-            raise TypeError(
-                f"{name}: expected a tensor of shape [..., {model.num_vertices}, 3], got {type(value).__name__}"
-            )
+            raise TypeError(f"{name}: expected a tensor of shape [..., {model.num_vertices}, 3], got {kind_of(value)}")
         check_tensor(name, value, model._mass)
         if value.dim() < 2 or value.shape[-2:] != (model.num_vertices, 3):
             fail(name, f"shape [..., {model.num_vertices}, 3]", f"shape {list(value.shape)}")
