@@ -58,6 +58,8 @@ def check_gradients(
     Raises:
         ValueError: If an argument is not float64 or the loss is not a scalar.
     """
+    if not isinstance(arguments, dict):
+        raise TypeError(f"arguments: expected a dict of tensors by name, got {type(arguments).__name__}")
     for name, value in arguments.items():
         if not isinstance(value, Tensor) or value.dtype != torch.float64:
             fail(name, "a float64 tensor", getattr(value, "dtype", type(value).__name__))

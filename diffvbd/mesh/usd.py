@@ -1,5 +1,7 @@
 """Moving surfaces as a scene of Universal Scene Description (the optional package usd-core)."""
 
+# names of pxr are made when it is loaded
+# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence

@@ -36,6 +36,7 @@ COSTS = 8.0  # times the advised rollout that all runs may take,
 FREE = 1.0  # [s] or so long,
 MORE = 2.0  # or so many times what the ladder has taken: where that is long, faster settings are worth looking for
 NEAR = 10.0  # times the wanted error: runs of the ladder that are shown
+ROUNDING = 1e-3  # of the wanted error: runs of the ladder below that, as of a free fall, compare with nothing
 SAFE = 0.8  # of the wanted error that a run with impacts may show: the runs it is held against show less than there is
 TOO_FINE = 0.1  # of the wanted error: candidates below it try fewer steps
 WHOLE = 0.95  # of what the longest steps lose at an impact: runs that lose as much do not resolve it
@@ -114,7 +115,7 @@ class _Search:
             self._prove()
             self.proven.sort(key=lambda c: c.seconds)
             best = next(c for c in self.proven if c.error <= self.most)
-            why = self._reason(best)
+            why = self._reason()
         else:
             error = self.estimates[-1] if self.estimates else math.inf
             now = self.ladder[-1] if self.ladder else None
@@ -127,12 +128,14 @@ class _Search:
         told = Prediction(self.error, best.error, best.seconds, p.duration, reached, why, others, p.spent, p.runs)
         return replace(best.settings, dtype=p.model.dtype, predicted=told)
 
-    def _reason(self, best: Candidate) -> str:
-        last = self.ladder[-1]
-        return (
-            f"these take the least time of those that were run to the end or predicted; the error is the distance to "
-            f"{last.settings}, and what that may be off itself"
+    def _reason(self) -> str:
+        why = (
+            f"the fastest of the runs below that keep the error; their errors are distances to {self.ladder[-1].settings}"
+            f", and {self.uncertain:.1g} by which that may be off"
         )
+        if self.pilots.spent > 0.9 * self.patience:
+            why += f"; {self.patience:g} s of pilot runs (patience) ended the search for faster ones"
+        return why
 
     # --- the ladder ---------------------------------------------------------------------------------------------------
 
@@ -253,7 +256,11 @@ class _Search:
         self.climbed = p.spent
         # with as many steps as the ladder takes for an error as wanted
         level, near = self._level_near(reference)
-        predict = self._by_quarter(level, near) if self.smooth else self._by_whole
+        # a quarter says what a candidate's error is over that of the ladder, which must be an error then, no rounding
+        compares = self.smooth and level > ROUNDING * self.error
+        predict = self._by_quarter(level, near) if compares else self._by_whole
+        if self.smooth and not compares:
+            self.order = max(ORDERS)  # that of rounding means nothing
         self.plans: list[tuple[float, int, Settings]] = []
         for settings in candidates_of(p):
             if p.spent - self.climbed > 0.6 * (self._allowed(self._least()) - self.climbed):

@@ -172,12 +172,19 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
 
 
+def _status(candidate: Candidate, told: Prediction) -> str:
+    if not candidate.proven:
+        return "predicted"
+    misses = told.reached and candidate.seconds < told.seconds
+    return "measured, misses the error" if misses else "measured"
+
+
 def _told(line: str, told: Prediction) -> str:
     """The lines below the settings: what they promise, why, and the runners-up."""
     verdict = f"error {told.error:.2g} of the motion" + ("" if told.reached else f": {told.asked:g} cannot be had")
     rows = [(line, f"{told.error:.1e}", f"{told.seconds / told.duration:.3g}", "measured")]
-    rows += [(str(c.settings), f"{c.error:.1e}", f"{c.seconds / told.duration:.3g}",
-              "measured" if c.proven else "predicted") for c in told.others]  # fmt: skip
+    rows += [(str(c.settings), f"{c.error:.1e}", f"{c.seconds / told.duration:.3g}", _status(c, told))
+             for c in told.others]  # fmt: skip
     header = ("settings", "error", "s per s of motion", "")
     cost = f"{told.runs} pilot runs took {told.spent:.2g} s, {told.cost:.1f} rollouts of these settings"
     first = f"{verdict}, {told.seconds_per_second:.3g} s per second of motion"

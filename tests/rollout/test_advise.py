@@ -263,3 +263,23 @@ def test_gradients_by_moduli_that_have_no_part_in_the_motion_are_no_error() -> N
     x = model.rest_points
     settings = dv.advise(model, x, 0 * x, duration=0.05, gradient=True, patience=20.0, mu=1e5, lam=1e5)
     assert settings.predicted is not None and settings.predicted.reached and settings.steps(0.05) < 32
+
+
+def test_what_is_exact_in_the_ladder_says_nothing_absurd_of_others() -> None:
+    """Free fall: SDIRK2 is exact, so errors of others are no multiple of its own. Implicit Euler is off by h / t."""
+    model = dv.Model(mesh.beam(3, 2, 2, size=(0.3, 0.1, 0.1)))
+    x = model.rest_points
+    told = dv.advise(model, x, torch.zeros_like(x), duration=0.3, error=0.01, mu=1e5, lam=1e5).predicted
+    assert told is not None and told.reached
+    steps = [c.settings.time_step for c in told.others if isinstance(c.settings.integrator, dv.ImplicitEuler)]
+    assert steps and min(steps) > 1e-4
+
+
+def test_runs_that_miss_the_error_are_marked() -> None:
+    model, material = cantilever(1e5)
+    x = model.rest_points
+    settings = dv.advise(model, x, torch.zeros_like(x), duration=0.2, error=0.01, **material)
+    assert settings.predicted is not None
+    missed = [c for c in settings.predicted.others if c.proven and c.seconds < settings.predicted.seconds]
+    assert missed and str(settings).count("misses the error") == len(missed)
+    assert all(c.error > 0.01 for c in missed)

@@ -268,6 +268,11 @@ def test_step_forward_keeps_a_tape_for_wrt_only(device: str) -> None:
 # --- check_gradients --------------------------------------------------------------------------------------------------
 
 
+def test_check_gradients_takes_arguments_by_name() -> None:
+    with pytest.raises(TypeError, match="arguments: expected a dict of tensors by name, got tuple"):
+        dv.check_gradients(lambda a: a.sum(), (torch.ones(3, dtype=torch.float64),))  # pyright: ignore[reportArgumentType]
+
+
 class WrongBackward(torch.autograd.Function):
     """The identity with a gradient that is 1 % too large."""
 
