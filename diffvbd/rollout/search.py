@@ -130,8 +130,8 @@ class _Search:
 
     def _reason(self) -> str:
         why = (
-            f"the fastest of the runs below that keep the error; their errors are distances to {self.ladder[-1].settings}"
-            f", and {self.uncertain:.1g} by which that may be off"
+            f"the fastest of the runs below that keep the error; their errors are distances to "
+            f"{self.ladder[-1].settings}, and {self.uncertain:.1g} by which that may be off"
         )
         if self.pilots.spent > 0.9 * self.patience:
             why += f"; {self.patience:g} s of pilot runs (patience) ended the search for faster ones"
