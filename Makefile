@@ -2,6 +2,7 @@
 # make test    the quick tests, a process for each core (ARGS='-k floor' and the like are passed to pytest)
 # make test-all  the slow tests, too; ARGS='-m hours' instead: what is run by hand before a release
 # make lint    ruff, pyright and clang-format in check mode
+# make wheels  sdist and CPU wheel into dist/ (minutes); make try-wheels  the wheel in new environments (ARGS='--torch 2.13.0')
 # make clean   remove what the build made; `make distclean` removes the environment too
 PYTHON ?= python3
 VENV := .venv
@@ -17,7 +18,7 @@ ENVIRONMENT := $(VENV)/environment.stamp
 NATIVE := diffvbd/_C.abi3.so
 SOURCES := $(shell find csrc -type f -name '*.h' -o -type f -name '*.cpp' -o -type f -name '*.cu*')
 
-.PHONY: run build test test-all lint clean distclean
+.PHONY: run build test test-all lint wheels try-wheels clean distclean
 
 run: build
 	$(BIN)/python -m diffvbd run beam-mu $(ARGS)
@@ -35,6 +36,12 @@ lint: $(ENVIRONMENT)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/clang-format --dry-run -Werror $(SOURCES)
+
+wheels:
+	$(PYTHON) .ci/wheels.py build $(ARGS)
+
+try-wheels:
+	$(PYTHON) .ci/wheels.py try $(ARGS)
 
 $(ENVIRONMENT): .ci/bootstrap.py pyproject.toml
 	$(PYTHON) .ci/bootstrap.py $(VENV)
