@@ -2,7 +2,7 @@
 # make test    the quick tests, a process for each core (ARGS='-k floor' and the like are passed to pytest)
 # make test-all  the slow tests, too; ARGS='-m hours' instead: what is run by hand before a release
 # make lint    ruff, pyright and clang-format in check mode
-# make wheels  sdist and CPU wheel into dist/ (minutes); make try-wheels  the wheel in new environments (ARGS='--torch 2.13.0')
+# make wheels  sdist and CPU wheel into dist/ (minutes); `make try-wheels` runs the wheel in new environments
 # make clean   remove what the build made; `make distclean` removes the environment too
 PYTHON ?= python3
 VENV := .venv
