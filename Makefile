@@ -56,7 +56,7 @@ $(NATIVE): $(SOURCES) setup.py diffvbd/ops/build_cuda.py | $(ENVIRONMENT)
 	@touch $@
 
 clean:
-	rm -rf build diffvbd/*.so *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf build dist diffvbd/*.so *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find diffvbd tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean
