@@ -2,6 +2,7 @@
 # make test    the quick tests, a process for each core (ARGS='-k floor' and the like are passed to pytest)
 # make test-all  the slow tests, too; ARGS='-m hours' instead: what is run by hand before a release
 # make lint    ruff, pyright and clang-format in check mode
+# make wheels  sdist and CPU wheel into dist/ (minutes); `make try-wheels` runs the wheel in new environments
 # make clean   remove what the build made; `make distclean` removes the environment too
 PYTHON ?= python3
 VENV := .venv
@@ -17,7 +18,7 @@ ENVIRONMENT := $(VENV)/environment.stamp
 NATIVE := diffvbd/_C.abi3.so
 SOURCES := $(shell find csrc -type f -name '*.h' -o -type f -name '*.cpp' -o -type f -name '*.cu*')
 
-.PHONY: run build test test-all lint clean distclean
+.PHONY: run build test test-all lint wheels try-wheels clean distclean
 
 run: build
 	$(BIN)/python -m diffvbd run beam-mu $(ARGS)
@@ -36,6 +37,12 @@ lint: $(ENVIRONMENT)
 	$(BIN)/pyright
 	$(BIN)/clang-format --dry-run -Werror $(SOURCES)
 
+wheels:
+	$(PYTHON) .ci/wheels.py build $(ARGS)
+
+try-wheels:
+	$(PYTHON) .ci/wheels.py try $(ARGS)
+
 $(ENVIRONMENT): .ci/bootstrap.py pyproject.toml
 	$(PYTHON) .ci/bootstrap.py $(VENV)
 	@echo "building diffvbd and installing its tools (minutes)"
@@ -49,7 +56,7 @@ $(NATIVE): $(SOURCES) setup.py diffvbd/ops/build_cuda.py | $(ENVIRONMENT)
 	@touch $@
 
 clean:
-	rm -rf build diffvbd/*.so *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf build dist diffvbd/*.so *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find diffvbd tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean

@@ -6,6 +6,7 @@ Environment:
     DIFFVBD_NO_CUDA=1    leave the CUDA object out; without it, it is built where torch has CUDA and nvcc is found
     TORCH_CUDA_ARCH_LIST what the CUDA object runs on (default: the visible devices, or 8.0 9.0 10.0 12.0+PTX)
     CUDA_HOME, MAX_JOBS  read by torch
+    DIFFVBD_LOCAL_VERSION  e.g. cu130: the version of the package becomes X.Y.Z+cu130 (.ci/wheels.py sets it)
 """
 
 import os
@@ -99,8 +100,14 @@ cuda = runpy.run_path("diffvbd/ops/build_cuda.py")
 if cuda["has_compiler"]() and not os.environ.get("DIFFVBD_NO_CUDA") and not QUICK:
     extensions.append(cuda["extension"]())
 
+# Wheels with and without CUDA stand side by side, so their names must differ.
+local_version = os.environ.get("DIFFVBD_LOCAL_VERSION")
+
 setup(
     ext_modules=extensions,
     cmdclass={"build_ext": BuildExtension, "build_py": BuildPy},
-    options={"bdist_wheel": {"py_limited_api": "cp310"}},
+    options={
+        "bdist_wheel": {"py_limited_api": "cp310"},
+        "egg_info": {"tag_build": f"+{local_version}" if local_version else ""},
+    },
 )

@@ -1,0 +1,65 @@
+"""Claim: the version stands in one place, what describes the package agrees, and an sdist has all that builds it."""
+
+import re
+import runpy
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from helpers.copied_sources import copy_sources
+from helpers.paths import ROOT, needs_csrc
+
+import diffvbd
+
+WHEELS = runpy.run_path(str(ROOT / ".ci" / "wheels.py"))
+BOOTSTRAP = runpy.run_path(str(ROOT / ".ci" / "bootstrap.py"))
+
+
+def text(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def test_the_version_stands_in_one_place() -> None:
+    version = diffvbd.__version__
+    assert re.fullmatch(r"\d+\.\d+\.\d+(-[\w.]+)?", version)
+    assert text("diffvbd/_version.py").count(f'"{version}"') == 1
+    for name in ("pyproject.toml", "CITATION.cff", "setup.py", ".github/workflows/release.yml"):
+        assert not re.search(rf"(?<![\d.]){re.escape(version)}(?![\d.])", text(name)), name
+
+
+def test_the_changelog_begins_with_the_version() -> None:
+    headings = re.findall(r"^## (\S+)", text("CHANGELOG.md"), re.MULTILINE)
+    assert headings[0] == diffvbd.__version__
+
+
+def test_the_citation_agrees_with_the_project() -> None:
+    project = dict(re.findall(r'^(name|license|description) = "(.*)"$', text("pyproject.toml"), re.MULTILINE))
+    citation = text("CITATION.cff")
+    assert f"title: {project['name']}\n" in citation
+    assert f"license: {project['license']}\n" in citation
+    assert project["description"] in citation
+    (author,) = re.findall(r'^authors = \[\{ name = "(.*)" \}\]$', text("pyproject.toml"), re.MULTILINE)
+    assert f"  - name: {author}\n" in citation
+
+
+def test_the_oldest_torch_and_python_are_the_same_everywhere() -> None:
+    oldest, workflow = WHEELS["OLDEST_TORCH"], text(".github/workflows/release.yml")
+    short = ".".join(map(str, BOOTSTRAP["MINIMUM_TORCH"]))
+    assert oldest.startswith(f"{short}.")
+    assert f'"torch>={short}"' in text("pyproject.toml")
+    assert set(re.findall(r"\d+\.\d+\.\d+\+cpu", workflow)) == {f"{oldest}+cpu"}
+    (python,) = re.findall(r'requires-python = ">=(.*)"', text("pyproject.toml"))
+    assert f'python: ["{python}", ' in workflow
+
+
+@needs_csrc
+def test_an_sdist_has_what_builds_it(tmp_path: Path) -> None:
+    copy_sources(tmp_path)
+    for name in ("LICENSE", "CHANGELOG.md", "CITATION.cff", "MANIFEST.in"):
+        shutil.copy(ROOT / name, tmp_path)
+    done = subprocess.run([sys.executable, "setup.py", "-q", "sdist"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    (sdist,) = (tmp_path / "dist").glob("*.tar.gz")
+    assert sdist.name == f"diffvbd-{diffvbd.__version__}.tar.gz"
+    WHEELS["check_sdist"](sdist)
