@@ -5,7 +5,7 @@
     python3 .ci/wheels.py try [--python P] [--torch V]     the wheel in new environments (`make try-wheels`)
 
 `build` works in an environment of its own, made by bootstrap.py, which knows TORCH_SPEC. The tag says the oldest glibc
-that the wheel runs on; it follows from the system that builds, so releases are built in manylinux_2_28.
+that the wheel runs on; it follows from the system that builds, so releases are built on the oldest that is kept.
 `try` takes --python and --torch more than once. An environment is kept in build/wheels and used again.
 """
 
