@@ -34,7 +34,9 @@ CLEAN = 0.6  # least order of two levels in a row from which contact counts as r
 AIM = 0.6  # of the wanted error that a candidate is given
 COSTS = 8.0  # times the advised rollout that all runs may take,
 FREE = 1.0  # [s] or so long,
-MORE = 2.0  # or so many times what the ladder has taken: where that is long, faster settings are worth looking for
+MORE = 2.0  # or so many times what the ladder has taken: where that is long, much faster settings are worth a look
+LIKELY = 4  # of the candidates, at which that much is spent
+MUCH = 0.5  # of the time of the fastest proven, that what is run to the end beyond the usual may take
 NEAR = 10.0  # times the wanted error: runs of the ladder that are shown
 ROUNDING = 1e-3  # of the wanted error: runs of the ladder below that, as of a free fall, compare with nothing
 SAFE = 0.8  # of the wanted error that a run with impacts may show: the runs it is held against show less than there is
@@ -74,8 +76,9 @@ def candidates_of(pilots: Pilots) -> list[Settings]:
 
     out = []
     if _exact(model) and not touches:
-        out += [*coarse(sdirk, 2, 5), *coarse(bdf, 2), *coarse(euler, 2)]
-    out += [*plain(sdirk, 10, 5, 20), *plain(bdf, 10, 5), *plain(euler, 5, 10, 20), *plain(bdf, 20)]
+        out += [*coarse(sdirk, 2), *coarse(euler, 2), *coarse(bdf, 2), *coarse(sdirk, 5)]
+    out += [*plain(sdirk, 10), *plain(euler, 5), *plain(bdf, 5), *plain(sdirk, 5, 20), *plain(bdf, 10, 20),
+            *plain(euler, 10, 20)]  # fmt: skip
     if _exact(model) and touches:
         out += [Settings(1.0, 20, euler, acceleration=Anderson(5))]
     return out
@@ -262,8 +265,9 @@ class _Search:
         if self.smooth and not compares:
             self.order = max(ORDERS)  # that of rounding means nothing
         self.plans: list[tuple[float, int, Settings]] = []
-        for settings in candidates_of(p):
-            if p.spent - self.climbed > 0.6 * (self._allowed(self._least()) - self.climbed):
+        for number, settings in enumerate(candidates_of(p)):
+            allowed = self._allowed(self._least(), more=number < LIKELY)
+            if p.spent - self.climbed > 0.6 * (allowed - self.climbed):
                 break
             error, per_step = predict(settings, near.steps)
             if math.isfinite(error):
@@ -320,15 +324,17 @@ class _Search:
         """Time of the fastest proven candidate that keeps the error."""
         return min((c.seconds for c in self.proven if c.error <= self.most), default=math.inf)
 
-    def _allowed(self, seconds: float) -> float:
+    def _allowed(self, seconds: float, more: bool) -> float:
         """How long all runs may take [s] for settings that take ``seconds``."""
-        return min(max(COSTS * seconds, FREE, MORE * self.climbed), self.patience)
+        return min(max(COSTS * seconds, FREE, MORE * self.climbed if more else 0.0), self.patience)
 
     def _prove(self) -> None:
         p = self.pilots
         for seconds, steps, settings in sorted(self.plans, key=lambda plan: plan[0]):
             for _ in range(3):
-                if seconds > 0.9 * self._least() or p.spent + seconds > self._allowed(min(self._least(), seconds)):
+                least = self._least()
+                allowed = self._allowed(min(least, seconds), more=seconds < MUCH * least)
+                if seconds > 0.9 * least or p.spent + seconds > allowed:
                     break
                 run = p.run(settings, steps)
                 if run.x is None:
