@@ -217,10 +217,11 @@ DIFFVBD_FN int limit_by_pair(const Source<T, Positions>& s, int entry, const Vec
   const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
   const T* constants = in.constants + int64_t{kConstants} * pair;
   const int sides_first = sides(record[4]);
-  bool both = false;
+  bool both = false, alone = true;
   for (int k = 0; k < 4; ++k) {
-    both = both ||
-           ((k < sides_first) != (own < sides_first) && record[k] < in.num_vertices && s.positions.goes(record[k]));
+    if (k == own || record[k] >= in.num_vertices || !s.positions.goes(record[k])) continue;
+    alone = false;
+    both = both || (k < sides_first) != (own < sides_first);
   }
   const T share = both ? T(kBothShare) : T(kShare);
   if (s.is_above(record, constants, limit_of<T>(exponent) * length / share + guard)) return exponent;
@@ -229,7 +230,8 @@ DIFFVBD_FN int limit_by_pair(const Source<T, Positions>& s, int entry, const Vec
   Vec3<T> way[4] = {zero3<T>(), zero3<T>(), zero3<T>(), zero3<T>()};
   while (exponent < kNoMove) {
     way[own] = limit_of<T>(exponent) * d;
-    if (gate.holds(way, shares, false)) break;
+    // corners that go at once are limited one by one: what proves them safe together is one plane for all of them
+    if (alone ? gate.holds(way, shares, false) : gate.holds(gate.n, way, shares, false, true)) break;
     ++exponent;
   }
   return exponent;

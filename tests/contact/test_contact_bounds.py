@@ -12,7 +12,7 @@ from helpers.marks import slow
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd import colliders
+from diffvbd import colliders, mesh
 from diffvbd.mesh import TetMesh, box, join
 from diffvbd.testing import generator, relative_error, tolerance
 
@@ -336,3 +336,22 @@ def test_a_plane_moved_through_a_body_raises() -> None:
     with pytest.raises(ValueError, match="x or colliders: .* not touch.* move colliders less, or use more detections"):
         dv.step(model, x, torch.zeros_like(x), time_step=0.01, sweeps=1, colliders=model.collider_points + up,
                 colliders_before=model.collider_points, **MATERIAL)  # fmt: skip
+
+
+def test_a_barrier_that_hardly_pushes_lets_nothing_through() -> None:
+    """Corners of a pair that move in one color are limited one by one, and must keep to the same plane."""
+    cube, ball = box(3, 0.2), mesh.blob(4, 3, 0.09)
+    rotation, upper = np.linalg.qr(np.random.default_rng(5).standard_normal((3, 3)))
+    rotation *= np.sign(np.diag(upper))
+    rotation[0] *= np.sign(np.linalg.det(rotation))  # this one, and dhat to its digits, made a vertex go through
+    askew = TetMesh((cube.points - cube.points.mean(0)) @ rotation.T, cube.tets)
+    body = join([cube.translate([0, 0.02, 0]), askew.translate([0.1, 0.45, 0.08]), ball.translate([0.25, 0.75, 0.1])])
+    edges = body.points[body.surface] - body.points[body.surface[:, [1, 2, 0]]]
+    dhat = 0.05 * float(np.linalg.norm(edges, axis=-1).mean())
+    weak = (dv.PairBarrier(kappa=1.0, dhat=dhat, detections=2), dv.FloorBarrier(kappa=1.0, dhat=dhat))
+    model = dv.Model(body, energies=(dv.StableNeoHookean(), *weak))
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    v[cube.num_vertices :, 1] = -3.0
+    for _ in range(45):
+        x, v = dv.step(model, x, v, mu=1e5, lam=2e5, time_step=1 / 60, sweeps=10)
+        assert apart(model, x)
