@@ -109,10 +109,10 @@ struct FloorBarrier {
     return Frame<R>::template along<T>(select(turns, n1, zero3<R>()), select(turns, n2, zero3<R>()));
   }
 
-  // What share of its damping a vertex has that began the step at a gap, and the share's derivative by the gap. It fades
-  // in with the normal force A there, A / (A + kappa dhat / 10), as that of pairs does (diffvbd/energies.py): switched on
-  // at dhat, it would let a motion jump where a vertex comes there a step sooner, and gradients miss what jumps add up
-  // to. kappa cancels; without a barrier there is no damping.
+  // What share of its damping a vertex has that began the step at a gap, and the share's derivative by the gap. It
+  // fades in with the normal force A there, A / (A + kappa dhat / 10), as that of pairs does (diffvbd/energies.py):
+  // switched on at dhat, it would let a motion jump where a vertex comes there a step sooner, and gradients miss what
+  // jumps add up to. kappa cancels; without a barrier there is no damping.
   template <class R>
   struct Share {
     R value, slope;
