@@ -221,8 +221,8 @@ class ContactStep:
 
     @property
     def last_corrections(self) -> int:
-        """How many rigid corrections follow the sweeps. Coarse ones of a stiff body leave it turned by up to a sixth of
-        the turn of a step, of which one Newton step leaves so much that a free body gained spin."""
+        """How many rigid corrections follow the sweeps. Coarse ones leave a stiff body turned, and one Newton step
+        leaves so much of that that a free body gained spin."""
         return 1 if self.prepared.coarse is None else 2
 
     def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> tuple[Tensor, Tensor]:
