@@ -242,6 +242,7 @@ DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& a
   out.force = (size * f.value) * u + (c * approach) * n;
   out.stiffness = diagonal(size * f.value);
   add_outer(out.stiffness, c - size * f.value, n);
+  add_outer(out.stiffness, size * f.curvature, u);  // exact, where sweeps have a bound (docs/method.md, section 18)
   return true;
 }
 
@@ -258,10 +259,12 @@ DIFFVBD_FN void vertex_press(const RigidInputs<T>& in, const rigid::Body<T>& b, 
   for (int k = 0; k < in.planes; ++k) {
     const T* lag = in.floor_lag.data + b.scene * in.floor_lag.scene + (int64_t{v} * in.planes + k) * 4;
     const Vector n = rigid::Body<T>::at(lag + 1), travel = x - s.x_prev, u = travel - dot(n, travel) * n;
-    const double size = h * h * double(lag[0]) * FrictionRate<double>(square_root(dot(u, u)), in.friction_eps).value;
+    const FrictionRate<double> f(square_root(dot(u, u)), in.friction_eps);
+    const double load = h * h * double(lag[0]), size = load * f.value;
     g += size * u;
     add_diagonal(H, size);
     add_outer(H, -size, n);
+    add_outer(H, load * f.curvature, u);
   }
 }
 

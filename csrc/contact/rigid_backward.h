@@ -52,8 +52,8 @@ DIFFVBD_FN PairMotions motions_of(const RigidInputs<T>& in, const VirtualMotions
 // Gradient and matrix of a pair by the motion of its weighted corners, and what a mollifier adds at corners.
 template <class R>
 struct PressTerms {
-  Vec3<R> force, n, at_corner[4];
-  R w[4], along, across;  // stiffness along the normal and across it
+  Vec3<R> force, n, slip, at_corner[4];
+  R w[4], along, across, bend;  // stiffness along the normal, across it, and what is added to it along the slip
 };
 
 template <class R>
@@ -74,7 +74,8 @@ DIFFVBD_FN R virtual_work(const PressTerms<R>& a, const PairMotions& m) {
   }
   for (int side = 0; side < m.sides; ++side) {
     const Vec3<R> p = weighted(a.w, m.p, m, side), q = weighted(a.w, m.q, m, side);
-    out = out + R(m.share) * ((a.along - a.across) * dot(a.n, p) * dot(a.n, q) + a.across * dot(p, q));
+    out = out + R(m.share) * ((a.along - a.across) * dot(a.n, p) * dot(a.n, q) + a.across * dot(p, q) +
+                              a.bend * dot(a.slip, p) * dot(a.slip, q));
   }
   return out;
 }
@@ -82,7 +83,9 @@ DIFFVBD_FN R virtual_work(const PressTerms<R>& a, const PairMotions& m) {
 // Adds the derivatives by p and q, to each corner's row.
 template <class T>
 DIFFVBD_FN void add_by_motions(const PressTerms<double>& a, const PairMotions& m, T* rows) {
-  const auto pressed = [&](const Vector& u) { return ((a.along - a.across) * dot(a.n, u)) * a.n + a.across * u; };
+  const auto pressed = [&](const Vector& u) {
+    return ((a.along - a.across) * dot(a.n, u)) * a.n + a.across * u + (a.bend * dot(a.slip, u)) * a.slip;
+  };
   for (int side = 0; side < m.sides; ++side) {
     const Vector by_p = m.share * pressed(weighted(a.w, m.q, m, side));
     const Vector by_q = m.share * pressed(weighted(a.w, m.p, m, side));
@@ -99,7 +102,7 @@ template <class R, class T>
 DIFFVBD_FN PressTerms<R> barrier_terms(int kind, const Corners<R>& c, const PairConstants<T>& a, double size) {
   const Distance<R> near = distance(kind, c);
   const LogBarrier<R> b(near.d - R(a.offset), R(a.dhat), R(size));
-  PressTerms<R> out{};
+  PressTerms<R> out{};  // no slip
   R e(1);
   if (is_mollified(kind, c, a.threshold)) {
     const Mollifier<R> m = mollifier(c, a.threshold);
@@ -140,15 +143,15 @@ DIFFVBD_FN void barrier_work(const RigidInputs<T>& in, const VirtualMotions<T>& 
   add_by_motions(barrier_terms(record[4], c, a, h * h * kappa), m, rows);
 }
 
-// f1(|u|) / |u|, which is taken as constant below what rounding makes of rest.
-DIFFVBD_FN double slip_rate(const Vector& u, double eps) {
-  return FrictionRate<double>(square_root(dot(u, u)), eps).value;
+// f1(|u|) / |u| and its derivative over |u|, which are taken as constant below what rounding makes of rest.
+DIFFVBD_FN FrictionRate<double> slip_rate(const Vector& u, double eps) {
+  return FrictionRate<double>(square_root(dot(u, u)), eps);
 }
-DIFFVBD_FN Dual<double> slip_rate(const Vec3<Dual<double>>& u, double eps) {
+DIFFVBD_FN FrictionRate<Dual<double>> slip_rate(const Vec3<Dual<double>>& u, double eps) {
   const Dual<double> square = dot(u, u);
-  const double length = square_root(square.value), rate = FrictionRate<double>(length, eps).value;
-  if (!(kRestingMotion * eps < length)) return Dual<double>(rate);
-  return FrictionRate<Dual<double>>(square_root(square), Dual<double>(eps)).value;
+  const double length = square_root(square.value);
+  const Dual<double> known = kRestingMotion * eps < length ? square_root(square) : Dual<double>(length);
+  return FrictionRate<Dual<double>>(known, Dual<double>(eps));
 }
 
 // lag: as Lag reads it; since: how corners have moved since the start of the step; beside: added to what they make.
@@ -164,7 +167,9 @@ DIFFVBD_FN PressTerms<R> lagged_terms(const R* lag, const Vector* since, const V
   }
   const R along = dot(out.n, m), approach = select(along < R(0), along, R(0));
   const Vec3<R> u = m - along * out.n;
-  out.along = R(h) * lag[1], out.across = R(h * h) * lag[0] * slip_rate(u, eps);
+  const FrictionRate<R> f = slip_rate(u, eps);
+  const R load = R(h * h) * lag[0];
+  out.along = R(h) * lag[1], out.across = load * f.value, out.bend = load * f.curvature, out.slip = u;
   out.force = out.across * u + (out.along * approach) * out.n;
   return out;
 }

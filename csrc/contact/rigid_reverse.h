@@ -38,7 +38,8 @@ template <class R>
 DIFFVBD_FN R slip_work(const R* lag, const Vec3<R>& travel, const Vector& P, const Vector& Q, double h2, double eps) {
   const Vec3<R> n = {lag[1], lag[2], lag[3]}, p = {R(P.x), R(P.y), R(P.z)}, q = {R(Q.x), R(Q.y), R(Q.z)};
   const Vec3<R> u = travel - dot(n, travel) * n;
-  return R(h2) * lag[0] * slip_rate(u, eps) * dot(p, u + (q - dot(n, q) * n));
+  const FrictionRate<R> f = slip_rate(u, eps);
+  return R(h2) * lag[0] * (f.value * dot(p, u + (q - dot(n, q) * n)) + f.curvature * dot(u, p) * dot(u, q));
 }
 
 // Its derivatives: by travel, and by what is lagged [4].

@@ -192,9 +192,11 @@ class LaggedPairForces:
         force = (rate * along)[:, None] * n
         inner = rate[:, None, None] * outer
         if self.largest is not None:
-            size = self.h**2 * self.largest * smoothed(slip, self.reach)[1]
+            _, rate, bend = smoothed(slip, self.reach)
+            size, bend = self.h**2 * self.largest * rate, self.h**2 * self.largest * bend
             force = force + size[:, None] * slip.T
             inner = inner + size[:, None, None] * (torch.eye(3).to(x) - outer)
+            inner = inner + bend[:, None, None] * (slip.T[:, :, None] * slip.T[:, None, :])
         weighted = weights[:, :, None, None, None] * weights[:, None, :, None, None] * inner[:, None, None]
         return weights[..., None] * force[:, None], weighted
 

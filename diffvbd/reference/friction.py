@@ -13,15 +13,18 @@ from .scene import Scene
 RESTING = 1e-6  # of the motion below which friction is smoothed
 
 
-def smoothed(slip: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-    """f0(|u|) [m] of slips u [..., 3, n] and f = f0'(|u|) / |u| [1/m]: quadratic below `reach`, Coulomb's |u| above."""
+def smoothed(slip: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
+    """f0(|u|) [m] of slips u [..., 3, n], f = f0'(|u|) / |u| [1/m] and f'(|u|) / |u|: quadratic below `reach`, Coulomb's
+    |u| above."""
     square = dot(slip, slip)
     moves = square > (RESTING * reach) ** 2
     # |u| has a kink at 0: where only rounding moves, its derivative is taken as 0
     length = torch.where(moves, torch.where(moves, square, 1.0).sqrt(), square.detach().sqrt())
     slow = length < reach
     potential = torch.where(slow, length**2 / reach - length**3 / (3 * reach**2) + reach / 3, length)
-    return potential, torch.where(slow, (2 - length / reach) / reach, 1 / torch.where(slow, 1.0, length))
+    rate = torch.where(slow, (2 - length / reach) / reach, 1 / torch.where(slow, 1.0, length))
+    slope = torch.where(slow, -1 / reach**2, -rate * rate)
+    return potential, rate, torch.where(moves, slope / torch.where(moves, length, 1.0), 0.0)
 
 
 def tangential6(normal: Tensor) -> Tensor:
@@ -53,6 +56,13 @@ class FloorFriction:
         weight = (weight * smoothed(slip, self.reach)[1]).unsqueeze(-2)
         across = tangential6(self.floor.normal)
         return torch.cat(((weight * slip).sum(-3), (weight * across).sum(-3)), -2)
+
+    def exact_block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
+        """With the exact second derivative, which corrections of whole bodies take."""
+        vertices = self.scene.layout.colors[k].vertices
+        weight, slip = self._full(take(x, vertices), take(x_prev, vertices))
+        bend = ((weight * smoothed(slip, self.reach)[2]).unsqueeze(-2) * outer6(slip)).sum(-3)
+        return self.block(k, x, x_prev) + torch.cat((torch.zeros_like(slip[..., 0, :, :]), bend), -2)
 
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
         return self.terms(x, x_prev)[0].sum(-1)

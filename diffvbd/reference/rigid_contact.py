@@ -14,7 +14,7 @@ LEAST_INERTIA = 1e-11  # of its mass and sum of m r^2, that keeps the system of 
 
 class Correction:
     """The rigid correction of bodies that touch: one Newton step over turn and shift of every body without pinned
-    vertices, all of a scene together. The gradient is autograd's, the blocks are those of vertex updates."""
+    vertices, all of a scene together. The gradient is autograd's, the blocks are those of vertex updates, but of friction exact."""
 
     def __init__(self, scene: Scene, energies: list[Any], forces: list[Any], y: Tensor, x_prev: Tensor) -> None:
         """forces: terms of pairs, each with its `on_corners`."""
@@ -71,7 +71,7 @@ class Correction:
         total = torch.zeros_like(x).repeat_interleave(3, -2)  # [..., 9, V]
         for k, color in enumerate(self.scene.layout.colors):
             for energy in self.single:
-                total = total.index_add(-1, color.vertices, energy.block(k, x, self.x_prev))
+                total = total.index_add(-1, color.vertices, getattr(energy, "exact_block", energy.block)(k, x, self.x_prev))
         xx, xy, xz, yy, yz, zz = total[..., 3:, :].unbind(-2)
         own = torch.stack([torch.stack(r, -1) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))], -2)
         own = own.reshape(*jacobian.shape[:2], 3, 3) + mass[..., None, None] * torch.eye(3).to(x)

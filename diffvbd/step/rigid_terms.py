@@ -50,13 +50,21 @@ def outer(n: Tensor) -> Tensor:
     return n[..., None] * n[..., None, :]
 
 
-def _slip_rate(u: Tensor, eps: float) -> Tensor:
-    """f0'(|u|) / |u| of friction's potential, of slips u [..., 3]."""
+def _slip(u: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+    """f1(|u|) / |u| of friction, and that quotient's derivative over |u|, of slips u [..., 3]."""
     square = (u * u).sum(-1)
     moves = square > (RESTING * eps) ** 2
     length = torch.where(moves, torch.where(moves, square, torch.ones_like(square)).sqrt(), square.detach().sqrt())
-    slow = length < eps
-    return torch.where(slow, (2 - length / eps) / eps, 1 / torch.where(slow, torch.ones_like(length), length))
+    sticks = length < eps
+    rate = torch.where(sticks, (2 - length / eps) / eps, 1 / torch.where(sticks, torch.ones_like(length), length))
+    slope = torch.where(sticks, -1 / eps**2, -rate * rate)
+    return rate, torch.where(moves, slope / torch.where(moves, length, torch.ones_like(length)), 0.0)
+
+
+def _slip_stiffness(rate: Tensor, bend: Tensor, n: Tensor, u: Tensor) -> Tensor:
+    """Friction's exact derivative by the motion across n [..., 3, 3], of load times what _slip returns."""
+    eye = torch.eye(3, dtype=n.dtype, device=n.device)
+    return rate[..., None, None] * (eye - outer(n)) + bend[..., None, None] * outer(u)
 
 
 def log_barrier(gap: Tensor, dhat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -77,12 +85,13 @@ def _vertex_energies(s: Scenes) -> list[tuple[Any, tuple[Tensor, float, Tensor |
     return out
 
 
-def _floor_slip(s: Scenes) -> tuple[Tensor, Tensor]:
-    """Of friction on a floor: motion along each plane, and load [N] times _slip_rate."""
+def _floor_slip(s: Scenes) -> tuple[Tensor, Tensor, Tensor]:
+    """Of friction on a floor: motion along each plane, and load [N] times what _slip returns."""
     load, n = s.fields.floor_lag[..., 0], s.fields.floor_lag[..., 1:]
     travel = (s.fields.x - s.fields.x_prev)[:, :, None]
     u = travel - n * (n * travel).sum(-1, keepdim=True)
-    return u, load * _slip_rate(u, s.friction_eps)
+    rate, bend = _slip(u, s.friction_eps)
+    return u, load * rate, load * bend
 
 
 def vertex_gradient(s: Scenes) -> Tensor:
@@ -93,7 +102,7 @@ def vertex_gradient(s: Scenes) -> Tensor:
     for energy, rest in _vertex_energies(s):
         force = force + energy.gradient(f.x, f.x_prev, *rest)
     if f.floor_lag.numel():
-        u, rate = _floor_slip(s)
+        u, rate, _ = _floor_slip(s)
         force = force + s.time_step**2 * (rate[..., None] * u).sum(2)
     return force
 
@@ -103,8 +112,8 @@ def vertex_blocks(s: Scenes) -> Tensor | None:
     f = s.fields
     parts = [energy.blocks(f.x, f.x_prev, *rest) for energy, rest in _vertex_energies(s)]
     if f.floor_lag.numel():
-        across = torch.eye(3, dtype=f.x.dtype, device=f.x.device) - outer(f.floor_lag[..., 1:])
-        parts.append(s.time_step**2 * (_floor_slip(s)[1][..., None, None] * across).sum(2))
+        u, rate, bend = _floor_slip(s)
+        parts.append(s.time_step**2 * _slip_stiffness(rate, bend, f.floor_lag[..., 1:], u).sum(2))
     out = None
     for part in parts:
         out = part if out is None else out + part
@@ -154,10 +163,9 @@ def pair_terms(s: Scenes) -> list[PairTerms]:
         m = (w[..., None] * moved).sum(1)
         along = (n * m).sum(-1, keepdim=True)
         approach, u = along.clamp(max=0), m - along * n
-        slip = h2 * load * _slip_rate(u, s.friction_eps)[:, None]
-        eye = torch.eye(3, dtype=f.x.dtype, device=f.x.device)
-        stiffness = slip[..., None] * (eye - outer(n)) + (h * rate)[..., None] * outer(n)
-        out.append(PairTerms(s.lagged, slip * u + h * rate * approach * n, stiffness, w))
+        slip, bend = (h2 * load[:, 0] * part for part in _slip(u, s.friction_eps))
+        stiffness = _slip_stiffness(slip, bend, n, u) + (h * rate)[..., None] * outer(n)
+        out.append(PairTerms(s.lagged, slip[:, None] * u + h * rate * approach * n, stiffness, w))
     return out
 
 

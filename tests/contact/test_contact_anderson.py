@@ -132,7 +132,7 @@ def test_gradients_on_a_floor_with_friction_alone(coarse: dv.CoarseSpace | None)
     way = torch.linspace(-1, 1, x.numel(), dtype=x.dtype).reshape(x.shape).sin()
 
     def end(size: Any) -> Tensor:
-        return (way * dv.step(model, x, v + size * way, mu=2e4, lam=4e4, time_step=0.01, sweeps=9)[0]).sum()
+        return (way * dv.step(model, x, v + size * way, mu=2e4, lam=4e4, time_step=0.01, sweeps=12)[0]).sum()
 
     with dv.acceleration.record() as taken, dv.coarse.record() as lengths:
         size = torch.zeros((), dtype=x.dtype, requires_grad=True)
