@@ -1,8 +1,8 @@
 """Claim: scenes and bodies that ranks share have the bits that they have on one, gradients too, and a killed rank costs
 nothing but time."""
 
-import re
 import os
+import re
 import subprocess
 import sys
 from itertools import pairwise
@@ -195,7 +195,9 @@ def run(folder: Path, text: str, *launcher: str) -> dict[str, Tensor]:
     folder.mkdir()
     (folder / "train.py").write_text(text)
     command = [sys.executable, *launcher, "train.py"]
-    done = subprocess.run(command, cwd=folder, env=os.environ | ENVIRONMENT, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        command, cwd=folder, env=os.environ | ENVIRONMENT, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return torch.load(folder / "state.pt")["network"]
 

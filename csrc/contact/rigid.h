@@ -32,6 +32,7 @@ struct RigidInputs {
   double friction_eps;
 
   DIFFVBD_FN int32_t bodies() const { return scene.bodies; }
+  DIFFVBD_FN bool rubs() const { return (lag || planes > 0) && 0 < friction_eps; }  // whether there is friction
   DIFFVBD_FN bool together() const { return scene.bodies <= kMostCoupled; }
   // Scalars of the matrices of a scene: of all bodies together, or of one after another.
   DIFFVBD_FN int64_t matrix_size() const {
@@ -80,6 +81,12 @@ struct CornerPoints {
   }
 };
 
+DIFFVBD_FN Vector shift_of(const double* motion) { return {motion[3], motion[4], motion[5]}; }
+// How far a point at r from the center goes by a motion, to the first order.
+DIFFVBD_FN Vector moved_by(const double* motion, const Vector& r) {
+  return cross(Vector{motion[0], motion[1], motion[2]}, r) + shift_of(motion);
+}
+
 // What one pair adds: gradient and its derivative by the motion of the first side relative to the second, and what the
 // mollifier adds at corners. Moments are about the origin of x.
 struct PairPress {
@@ -89,12 +96,18 @@ struct PairPress {
   double weight[2];
   Vector at[2], pull[2], torque[2];
   double value;
+  Vector slip;  // of friction: where it is linear about,
+  double rubs;  // and h^2 times the load [N] if it is exact there
 
   // What the body of a side does to the pair by its k-th unknown, about its center.
   DIFFVBD_FN Vector map(int side, int k, const Vector& center) const {
     const Vector r = at[side] - weight[side] * center;
     const Vector e = {double(k % 3 == 0), double(k % 3 == 1), double(k % 3 == 2)};
     return k < 3 ? cross(e, r) : weight[side] * e;
+  }
+  // And by all of its unknowns.
+  DIFFVBD_FN Vector moved(int side, const Vector& center, const double* motion) const {
+    return moved_by(motion, at[side] - weight[side] * center) + (weight[side] - 1) * shift_of(motion);
   }
   DIFFVBD_FN double gradient(int side, int k, const Vector& center) const {
     const Vector moment = torque[side] - cross(center, pull[side]);
@@ -105,7 +118,7 @@ struct PairPress {
     return dot(map(side, i, center), stiffness * map(side, j, center));
   }
 };
-constexpr int kPressDoubles = 29;  // of a PairPress without its bodies and its value
+constexpr int kPressDoubles = 29;  // of a PairPress without its bodies, its value and its slip
 
 DIFFVBD_FN void store_press(const PairPress& a, double* to) {
   int i = 0;
@@ -138,6 +151,7 @@ DIFFVBD_FN void sides_of(const RigidInputs<T>& in, const int32_t* record, PairPr
     out.weight[side] = 0;
     out.at[side] = out.pull[side] = out.torque[side] = Vector{};
   }
+  out.rubs = 0;
 }
 
 // The barrier of a listed pair between bodies; false where it does not push, or moves with one body.
@@ -210,9 +224,16 @@ DIFFVBD_FN double slip_value(double length, double eps) {
   return length < eps ? length * length * (1 / eps - length / (3 * eps * eps)) + eps / 3 : length;
 }
 
-// Lagged friction and damping of a pair; it acts along a gap, so that it turns a body even by itself.
+// Motions of all bodies of a scene, about which friction is linear; about none where they are null.
+struct Slid {
+  const double *center, *motion;  // [bodies, 3], [bodies, 6]
+};
+
+// Lagged friction and damping of a pair; it acts along a gap, so that it turns a body even by itself. The gradient is
+// that of a matrix which holds where bodies have gone as `slid` says: there both are exact. Of a pair whose sides are
+// not solved for together the matrix is a bound, wherever they go.
 template <class T, class At>
-DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, PairPress& out) {
+DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, const Slid& slid, PairPress& out) {
   const int32_t* record = in.lagged.pairs + kPairRow * pair;
   const Lag<T> lag(in.lag + kLagScalars * pair);
   if (!lag.active()) return false;
@@ -235,36 +256,65 @@ DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& a
   const Vector n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
   const double h = in.scene.time_step, along = dot(n, m), c = h * double(lag.damping),
                size = h * h * double(lag.friction);
+  const bool exact = in.together() || out.body[0] < 0 || out.body[1] < 0;
+  Vector way{};
+  for (int side = 0; slid.motion && exact && side < 2; ++side) {
+    const int32_t body = out.body[side];
+    if (body < 0) continue;
+    way += out.moved(side, rigid::Body<double>::at(slid.center + 3 * body), slid.motion + kUnknowns * body);
+  }
   const Vector u = m - along * n;
-  const double length = square_root(dot(u, u)), approach = along < 0 ? along : 0;
+  out.slip = u + (way - dot(n, way) * n);
+  const double length = square_root(dot(out.slip, out.slip)), approach = along < 0 ? along : 0;
   const FrictionRate<double> f(length, in.friction_eps);
+  const double bend = exact ? f.curvature : 0;
+  out.rubs = exact ? size : 0;
   out.value = size * slip_value(length, in.friction_eps) + 0.5 * c * approach * approach;
-  out.force = (size * f.value) * u + (c * approach) * n;
+  out.force = size * (f.value * u - (bend * dot(out.slip, way)) * out.slip) + (c * approach) * n;
   out.stiffness = diagonal(size * f.value);
   add_outer(out.stiffness, c - size * f.value, n);
-  add_outer(out.stiffness, size * f.curvature, u);  // exact, where sweeps have a bound (docs/method.md, section 18)
+  add_outer(out.stiffness, size * bend, out.slip);
   return true;
 }
 
-// Gradient and block of what acts on a vertex alone, at where it is.
+// Gradient and block of what acts on a vertex alone, at where it is, without friction.
 template <class T>
 DIFFVBD_FN void vertex_press(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, Vector& g, Sym3<double>& H) {
-  const double mass = b.mass(v), h = in.scene.time_step;
+  const double mass = b.mass(v);
   const Vector x = b.position(v);
   const VertexState<double> s = b.state(v, x);
   g = mass * (x - b.target(v));
   H = diagonal(mass);
   b.energies(v,
              [&](auto energy, int, const double* data, int count) { decltype(energy)::block(s, data, count, g, H); });
+}
+
+// Friction of a vertex on one plane of a floor.
+struct FloorSlip {
+  Vector n, slip;  // since the start of the step
+  double size;     // h^2 times the load [N]
+};
+template <class T>
+DIFFVBD_FN FloorSlip floor_slip(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane,
+                                const Vector& moved) {
+  const T* lag = in.floor_lag.data + b.scene * in.floor_lag.scene + (int64_t{v} * in.planes + plane) * 4;
+  const Vector n = rigid::Body<T>::at(lag + 1), x = b.position(v), travel = x - b.state(v, x).x_prev + moved;
+  const double h = in.scene.time_step;
+  return {n, travel - dot(n, travel) * n, h * h * double(lag[0])};
+}
+
+// Adds that of all planes, linear about where the vertex would be after `way`.
+template <class T>
+DIFFVBD_FN void add_floor_friction(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, const Vector& way,
+                                   Vector& g, Sym3<double>& H) {
   for (int k = 0; k < in.planes; ++k) {
-    const T* lag = in.floor_lag.data + b.scene * in.floor_lag.scene + (int64_t{v} * in.planes + k) * 4;
-    const Vector n = rigid::Body<T>::at(lag + 1), travel = x - s.x_prev, u = travel - dot(n, travel) * n;
-    const FrictionRate<double> f(square_root(dot(u, u)), in.friction_eps);
-    const double load = h * h * double(lag[0]), size = load * f.value;
-    g += size * u;
-    add_diagonal(H, size);
-    add_outer(H, -size, n);
-    add_outer(H, load * f.curvature, u);
+    const FloorSlip a = floor_slip(in, b, v, k, way);
+    const FrictionRate<double> f(square_root(dot(a.slip, a.slip)), in.friction_eps);
+    const Vector along = way - dot(a.n, way) * a.n;
+    g += a.size * (f.value * (a.slip - along) - (f.curvature * dot(a.slip, along)) * a.slip);
+    add_diagonal(H, a.size * f.value);
+    add_outer(H, -a.size * f.value, a.n);
+    add_outer(H, a.size * f.curvature, a.slip);
   }
 }
 
@@ -278,9 +328,8 @@ DIFFVBD_FN double vertex_value(const RigidInputs<T>& in, const rigid::Body<T>& b
   b.energies(
       v, [&](auto energy, int, const double* data, int count) { value += decltype(energy)::value(s, data, count); });
   for (int k = 0; k < in.planes; ++k) {
-    const T* lag = in.floor_lag.data + b.scene * in.floor_lag.scene + (int64_t{v} * in.planes + k) * 4;
-    const Vector n = rigid::Body<T>::at(lag + 1), travel = x - s.x_prev, u = travel - dot(n, travel) * n;
-    value += h * h * double(lag[0]) * slip_value(square_root(dot(u, u)), in.friction_eps);
+    const FloorSlip a = floor_slip(in, b, v, k, x - b.position(v));
+    value += a.size * slip_value(square_root(dot(a.slip, a.slip)), in.friction_eps);
   }
   return value;
 }

@@ -52,8 +52,12 @@ DIFFVBD_FN PairMotions motions_of(const RigidInputs<T>& in, const VirtualMotions
 // Gradient and matrix of a pair by the motion of its weighted corners, and what a mollifier adds at corners.
 template <class R>
 struct PressTerms {
-  Vec3<R> force, n, slip, at_corner[4];
-  R w[4], along, across, bend;  // stiffness along the normal, across it, and what is added to it along the slip
+  Vec3<R> force, n, at_corner[4];
+  R w[4], along, across;  // stiffness along the normal and across it
+  // Of friction that is exact at the end of q, which `force` has: its derivative there, and what that has along the
+  // slip
+  Vec3<R> slip;
+  R rate, bend;
 };
 
 template <class R>
@@ -74,8 +78,7 @@ DIFFVBD_FN R virtual_work(const PressTerms<R>& a, const PairMotions& m) {
   }
   for (int side = 0; side < m.sides; ++side) {
     const Vec3<R> p = weighted(a.w, m.p, m, side), q = weighted(a.w, m.q, m, side);
-    out = out + R(m.share) * ((a.along - a.across) * dot(a.n, p) * dot(a.n, q) + a.across * dot(p, q) +
-                              a.bend * dot(a.slip, p) * dot(a.slip, q));
+    out = out + R(m.share) * ((a.along - a.across) * dot(a.n, p) * dot(a.n, q) + a.across * dot(p, q));
   }
   return out;
 }
@@ -83,12 +86,13 @@ DIFFVBD_FN R virtual_work(const PressTerms<R>& a, const PairMotions& m) {
 // Adds the derivatives by p and q, to each corner's row.
 template <class T>
 DIFFVBD_FN void add_by_motions(const PressTerms<double>& a, const PairMotions& m, T* rows) {
-  const auto pressed = [&](const Vector& u) {
-    return ((a.along - a.across) * dot(a.n, u)) * a.n + a.across * u + (a.bend * dot(a.slip, u)) * a.slip;
+  const auto pressed = [&](const Vector& u) { return ((a.along - a.across) * dot(a.n, u)) * a.n + a.across * u; };
+  const auto rubbed = [&](const Vector& u) {
+    return a.rate * (u - dot(a.n, u) * a.n) + (a.bend * dot(a.slip, u)) * a.slip;
   };
   for (int side = 0; side < m.sides; ++side) {
     const Vector by_p = m.share * pressed(weighted(a.w, m.q, m, side));
-    const Vector by_q = m.share * pressed(weighted(a.w, m.p, m, side));
+    const Vector P = weighted(a.w, m.p, m, side), by_q = m.share * pressed(P) + rubbed(P);
     for (int k = 0; k < 4; ++k) {
       if (!m.is_of(side, k)) continue;
       rigid::put(rows + kWorkScalars * k + 3, a.w[k] * (a.force + by_p) + a.at_corner[k]);
@@ -102,7 +106,7 @@ template <class R, class T>
 DIFFVBD_FN PressTerms<R> barrier_terms(int kind, const Corners<R>& c, const PairConstants<T>& a, double size) {
   const Distance<R> near = distance(kind, c);
   const LogBarrier<R> b(near.d - R(a.offset), R(a.dhat), R(size));
-  PressTerms<R> out{};  // no slip
+  PressTerms<R> out{};  // no friction
   R e(1);
   if (is_mollified(kind, c, a.threshold)) {
     const Mollifier<R> m = mollifier(c, a.threshold);
@@ -156,7 +160,8 @@ DIFFVBD_FN FrictionRate<Dual<double>> slip_rate(const Vec3<Dual<double>>& u, dou
 
 // lag: as Lag reads it; since: how corners have moved since the start of the step; beside: added to what they make.
 template <class R>
-DIFFVBD_FN PressTerms<R> lagged_terms(const R* lag, const Vector* since, const Vec3<R>& beside, double h, double eps) {
+DIFFVBD_FN PressTerms<R> lagged_terms(const R* lag, const Vector* since, const PairMotions& motions,
+                                      const Vec3<R>& beside, double h, double eps) {
   PressTerms<R> out{};
   out.n = {lag[2], lag[3], lag[4]};
   Vec3<R> m = beside;
@@ -166,11 +171,21 @@ DIFFVBD_FN PressTerms<R> lagged_terms(const R* lag, const Vector* since, const V
     out.at_corner[k] = {R(0), R(0), R(0)};
   }
   const R along = dot(out.n, m), approach = select(along < R(0), along, R(0));
-  const Vec3<R> u = m - along * out.n;
-  const FrictionRate<R> f = slip_rate(u, eps);
   const R load = R(h * h) * lag[0];
-  out.along = R(h) * lag[1], out.across = load * f.value, out.bend = load * f.curvature, out.slip = u;
-  out.force = out.across * u + (out.along * approach) * out.n;
+  out.along = R(h) * lag[1], out.across = out.rate = out.bend = R(0);
+  out.slip = m - along * out.n;
+  const bool exact = motions.sides == 1;  // contact/rigid.h, lagged_press
+  if (exact) {
+    const Vec3<R> way = weighted(out.w, motions.q, motions, 0);
+    out.slip = out.slip + (way - dot(out.n, way) * out.n);
+  }
+  const FrictionRate<R> f = slip_rate(out.slip, eps);
+  out.force = (load * f.value) * out.slip + (out.along * approach) * out.n;
+  if (exact) {
+    out.rate = load * f.value, out.bend = load * f.curvature;
+  } else {
+    out.across = load * f.value;
+  }
   return out;
 }
 
@@ -196,12 +211,12 @@ DIFFVBD_FN void lagged_work(const RigidInputs<T>& in, const VirtualMotions<T>& g
     for (int i = 0; i < kLagScalars; ++i) turned[i] = {lag[i], double(i + 3 == direction)};
     const Vec3<Dual<double>> beside = {
         {0.0, double(direction == 0)}, {0.0, double(direction == 1)}, {0.0, double(direction == 2)}};
-    return virtual_work(lagged_terms(turned, since, beside, h, eps), m).derivative;
+    return virtual_work(lagged_terms(turned, since, m, beside, h, eps), m).derivative;
   };
   const Vector by_m = {derived(0), derived(1), derived(2)};
   for (int i = 0; i < kLagScalars; ++i) by_lag[i] = T(derived(3 + i));
   for (int k = 0; k < 4; ++k) rigid::put(rows + kWorkScalars * k, lag[5 + k] * by_m);
-  add_by_motions(lagged_terms(lag, since, Vector{}, h, eps), m, rows);
+  add_by_motions(lagged_terms(lag, since, m, Vector{}, h, eps), m, rows);
 }
 
 }  // namespace diffvbd::contact

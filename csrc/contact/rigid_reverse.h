@@ -12,11 +12,6 @@
 
 namespace diffvbd::contact {
 
-// How far a point at r from the center goes by a motion, to the first order.
-DIFFVBD_FN Vector moved_by(const double* motion, const Vector& r) {
-  return cross(Vector{motion[0], motion[1], motion[2]}, r) + Vector{motion[3], motion[4], motion[5]};
-}
-
 // What displaced() sends back to r, of an adjoint g of the way.
 DIFFVBD_FN Vector arm_adjoint(const Vector& w, const rigid::Angles& s, const Vector& g) {
   const Vector turned = cross(w, g);
@@ -33,13 +28,12 @@ DIFFVBD_FN void motion_adjoint(const double* motion, double share, const Vector&
   for (int i = 0; i < 2; ++i) rigid::put(out + 3 * i, parts[i]);
 }
 
-// P . (g + H Q) of friction on one plane of a floor. lag: load [N], normal; travel: since the start of the step.
+// P . g of friction on one plane of a floor after Q. lag: load [N], normal; travel: since the start of the step.
 template <class R>
 DIFFVBD_FN R slip_work(const R* lag, const Vec3<R>& travel, const Vector& P, const Vector& Q, double h2, double eps) {
   const Vec3<R> n = {lag[1], lag[2], lag[3]}, p = {R(P.x), R(P.y), R(P.z)}, q = {R(Q.x), R(Q.y), R(Q.z)};
-  const Vec3<R> u = travel - dot(n, travel) * n;
-  const FrictionRate<R> f = slip_rate(u, eps);
-  return R(h2) * lag[0] * (f.value * dot(p, u + (q - dot(n, q) * n)) + f.curvature * dot(u, p) * dot(u, q));
+  const Vec3<R> way = travel + q, u = way - dot(n, way) * n;
+  return R(h2) * lag[0] * slip_rate(u, eps).value * dot(p, u);
 }
 
 // Its derivatives: by travel, and by what is lagged [4].
@@ -74,6 +68,7 @@ DIFFVBD_FN VertexAdjoint vertex_adjoint(const RigidInputs<T>& in, const rigid::B
   Vector g;
   Sym3<double> H;
   vertex_press(in, b, v, g, H);
+  add_floor_friction(in, b, v, Q, g, H);
   VertexAdjoint out{-mass * P, Vector{}, mass * P, Vector{}, -dot(P, x - b.target(v) + Q)};
   b.energies(v, [&](auto energy, int, const double* data, int count) {
     vertex_energy_vjp<decltype(energy)>(s, data, count, P, Q, out.x, out.x_prev);

@@ -7,6 +7,8 @@
 #include <utility>
 #include <vector>
 
+#include "../contact/rigid_slip.h"
+
 namespace diffvbd {
 
 using namespace contact;
@@ -23,7 +25,7 @@ void each_press(const RigidInputs<T>& in, int64_t scene, bool moved, const F& f)
     if (barrier_press(in, i, at, press)) f(press, false);
   }
   for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
-    if (lagged_press(in, i, at, press)) f(press, true);
+    if (lagged_press(in, i, at, Slid{}, press)) f(press, true);
   }
 }
 
@@ -95,7 +97,122 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, double* center, do
       own(i, i) += free ? kLeastInertia * (i < 3 ? spread : mass) : 1;
     }
   }
-  each_press(in, scene, false, [&](const PairPress& a, bool) { add_press(a, n, together, center, gradient, matrix); });
+  const CornerPoints<T> at{in, false};
+  PairPress press;
+  for (int64_t i = in.first_listed(scene); i < in.first_listed(scene + 1); ++i) {
+    if (barrier_press(in, i, at, press)) add_press(press, n, together, center, gradient, matrix);
+  }
+}
+
+// What friction and damping add, linear about the motions of bodies.
+template <class T>
+void add_lagged_of_scene(const RigidInputs<T>& in, int64_t scene, const Slid& slid, double* gradient, double* matrix) {
+  const int32_t n = in.bodies();
+  const CornerPoints<T> at{in, false};
+  PairPress press;
+  for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
+    if (lagged_press(in, i, at, slid, press)) add_press(press, n, in.together(), slid.center, gradient, matrix);
+  }
+  for (int32_t k = 0; in.planes && k < n; ++k) {
+    if (!in.free[k]) continue;
+    const Body<T> body{in.scene, scene, k};
+    double* g6 = gradient + kUnknowns * k;
+    double block[rigid::kSix] = {};
+    for (int32_t i = 0; i < body.size(); ++i) {
+      const int32_t v = body.vertex(i);
+      const Vector arm = body.position(v) - vector_of(slid.center + 3 * k);
+      Vector g{};
+      Sym3<double> H{};
+      add_floor_friction(in, body, v, moved_by(slid.motion + kUnknowns * k, arm), g, H);
+      rigid::add_vertex(arm, g, H, g6, block);
+    }
+    const MatrixPart own(matrix, n, in.together(), k, k);
+    for (int i = 0; i < kUnknowns; ++i) {
+      for (int j = 0; j < kUnknowns; ++j) own(i, j) += block[rigid::at6(std::max(i, j), std::min(i, j))];
+    }
+  }
+}
+
+// Slips along a step, and which system each has a say in.
+template <class T>
+std::vector<std::vector<SlipLine>> lines_of_scene(const RigidInputs<T>& in, int64_t scene, const Slid& slid,
+                                                  const double* step) {
+  std::vector<std::vector<SlipLine>> out(in.together() ? 1 : in.bodies());
+  const CornerPoints<T> at{in, false};
+  PairPress press;
+  for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
+    if (!lagged_press(in, i, at, slid, press) || press.rubs == 0) continue;
+    const int32_t body = press.body[0] < 0 ? press.body[1] : press.body[0];
+    out[in.together() ? 0 : body].push_back(slip_line(in, i, press, slid.center, step));
+  }
+  for (int32_t k = 0; in.planes && k < in.bodies(); ++k) {
+    const Body<T> body{in.scene, scene, k};
+    const int64_t own = kUnknowns * k;
+    for (int32_t i = 0; in.free[k] && i < body.size(); ++i) {
+      const int32_t v = body.vertex(i);
+      const Vector arm = body.position(v) - vector_of(slid.center + 3 * k);
+      for (int plane = 0; plane < in.planes; ++plane)
+        out[in.together() ? 0 : k].push_back(slip_line(in, body, v, plane, arm, slid.motion + own, step + own));
+    }
+  }
+  return out;
+}
+
+// x' A x of a matrix with the Cholesky factor.
+double energy_of(const double* factor, int64_t size, const double* x) {
+  double total = 0;
+  for (int64_t j = 0; j < size; ++j) {
+    double sum = 0;
+    for (int64_t i = j; i < size; ++i) sum += factor[size * i + j] * x[i];
+    total += sum * sum;
+  }
+  return total;
+}
+
+// y += A x for each of some matrices.
+void add_product(const double* matrices, int64_t count, int64_t size, const double* x, double* y) {
+  for (int64_t row = 0; row < count * size; ++row) {
+    const double *a = matrices + size * row, *own = x + row / size * size;
+    for (int64_t j = 0; j < size; ++j) y[row] += a[j] * own[j];
+  }
+}
+
+// Motions of the bodies of a scene, zero at first, and the factor of the matrix there.
+template <class T>
+void solve_scene(const RigidInputs<T>& in, int64_t scene, double* center, double* motion, double* factor) {
+  const int64_t n = in.bodies(), unknowns = kUnknowns * n, size = in.system_size(), systems = unknowns / size;
+  std::vector<double> gradient(unknowns), matrix(in.matrix_size(), 0.0), next(unknowns), step(unknowns);
+  system_of_scene(in, scene, center, gradient.data(), matrix.data());
+  std::fill_n(motion, unknowns, 0.0);
+  bool settled = false;
+  for (int iteration = 0; iteration < kSlipIterations; ++iteration) {
+    step = gradient;
+    std::copy(matrix.begin(), matrix.end(), factor);
+    const Slid slid{center, motion};
+    add_lagged_of_scene(in, scene, slid, step.data(), factor);
+    if (iteration > 0) add_product(factor, systems, size, motion, step.data());
+    cholesky(systems, size, factor);
+    cholesky_solve(systems, size, factor, step.data());
+    for (int64_t k = 0; k < n; ++k) keep_finite(step.data() + kUnknowns * k);
+    for (int64_t i = 0; i < unknowns; ++i) next[i] = motion[i] + step[i];
+    if (settled || !in.rubs()) break;  // the matrix is that of where the motion ends
+    const auto lines = lines_of_scene(in, scene, slid, step.data());
+    settled = true;
+    for (int64_t s = 0; s < systems; ++s) {
+      const double* own = factor + size * size * s;
+      const double fall = energy_of(own, size, step.data() + size * s);
+      if (fall <= kSettled * kSettled * energy_of(own, size, next.data() + size * s)) continue;
+      settled = false;
+      const double share = slip_share(fall, [&](double tried) {
+        double sum = 0;
+        for (const SlipLine& line : lines[s]) sum += line.excess(tried);
+        return sum;
+      });
+      for (int64_t i = size * s; i < size * (s + 1); ++i) next[i] = motion[i] + share * step[i];
+    }
+    std::copy(next.begin(), next.end(), motion);
+  }
+  std::copy(next.begin(), next.end(), motion);
 }
 
 template <class T>
@@ -235,16 +352,11 @@ void cholesky_solve(int64_t count, int64_t size, const double* factors, double* 
 
 template <class T>
 void rigid_system(const RigidInputs<T>& in, double* center, double* motion, double* factor) {
-  const int64_t n = in.bodies(), size = in.matrix_size();
+  const int64_t n = in.bodies();
   torch::stable::parallel_for(0, in.scene.scenes, 1, [&](int64_t begin, int64_t end) {
-    for (int64_t s = begin; s < end; ++s) {
-      std::fill_n(factor + size * s, size, 0.0);
-      system_of_scene(in, s, center + 3 * n * s, motion + kUnknowns * n * s, factor + size * s);
-    }
+    for (int64_t s = begin; s < end; ++s)
+      solve_scene(in, s, center + 3 * n * s, motion + kUnknowns * n * s, factor + in.matrix_size() * s);
   });
-  cholesky(in.systems(), in.system_size(), factor);
-  cholesky_solve(in.systems(), in.system_size(), factor, motion);
-  for (int64_t row = 0; row < in.scene.scenes * n; ++row) keep_finite(motion + kUnknowns * row);
 }
 
 template <class T>

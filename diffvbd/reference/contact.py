@@ -185,20 +185,26 @@ class LaggedPairForces:
     turns_its_body = True
 
     def on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """As those of the barrier."""
-        along, slip, weights = self._travel(x, torch.arange(len(self.normal), device=x.device))
+        """As those of the barrier, of friction exactly."""
+        parts = self.damping_on_corners(x), self.friction_on_corners(x)
+        return parts[0][0] + parts[1][0], parts[0][1] + parts[1][1]
+
+    def damping_on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        along, _, weights = self._travel(x, torch.arange(len(self.normal), device=x.device))
         rate, n = self.h * self.damping, self.normal
-        outer = n[:, :, None] * n[:, None, :]
-        force = (rate * along)[:, None] * n
-        inner = rate[:, None, None] * outer
-        if self.largest is not None:
-            _, rate, bend = smoothed(slip, self.reach)
-            size, bend = self.h**2 * self.largest * rate, self.h**2 * self.largest * bend
-            force = force + size[:, None] * slip.T
-            inner = inner + size[:, None, None] * (torch.eye(3).to(x) - outer)
-            inner = inner + bend[:, None, None] * (slip.T[:, :, None] * slip.T[:, None, :])
-        weighted = weights[:, :, None, None, None] * weights[:, None, :, None, None] * inner[:, None, None]
-        return weights[..., None] * force[:, None], weighted
+        return self._at_corners(weights, (rate * along)[:, None] * n, rate[:, None, None] * n[:, :, None] * n[:, None])
+
+    def friction_on_corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        _, slip, weights = self._travel(x, torch.arange(len(self.normal), device=x.device))
+        load, n = self.h**2 * (0.0 * self.damping if self.largest is None else self.largest), self.normal
+        _, rate, bend = smoothed(slip, self.reach or 1.0)
+        u, rate, bend = slip.T, (load * rate)[:, None, None], (load * bend)[:, None, None]
+        across = torch.eye(3).to(x) - n[:, :, None] * n[:, None]
+        return self._at_corners(weights, rate[..., 0] * u, rate * across + bend * u[:, :, None] * u[:, None])
+
+    def _at_corners(self, weights: Tensor, force: Tensor, stiffness: Tensor) -> tuple[Tensor, Tensor]:
+        both = weights[:, :, None, None, None] * weights[:, None, :, None, None]
+        return weights[..., None] * force[:, None], both * stiffness[:, None, None]
 
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
         along, slip, _ = self._travel(x, torch.arange(len(self.normal), device=x.device))

@@ -79,7 +79,9 @@ class Corrections:
         total = torch.zeros_like(state).repeat_interleave(3, -2)  # [..., 9, V]
         for k, color in enumerate(scene.layout.colors):
             for energy in self.single:
-                total = total.index_add(-1, color.vertices, getattr(energy, "exact_block", energy.block)(k, state, self.x_prev))
+                total = total.index_add(
+                    -1, color.vertices, getattr(energy, "exact_block", energy.block)(k, state, self.x_prev)
+                )
         xx, xy, xz, yy, yz, zz = total[..., 3:, :].unbind(-2)
         rows = [torch.stack(r, -2) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
         out = torch.einsum("vf,...ijv,vg->...figj", weight, torch.stack(rows, -3), weight)

@@ -57,12 +57,18 @@ class FloorFriction:
         across = tangential6(self.floor.normal)
         return torch.cat(((weight * slip).sum(-3), (weight * across).sum(-3)), -2)
 
+    def on_vertices(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient [..., 3, V] and its exact derivative [..., 6, V]."""
+        weight, slip = self._full(x, x_prev)
+        _, rate, bend = smoothed(slip, self.reach)
+        across, along = tangential6(self.floor.normal), outer6(slip)
+        rate, bend = (weight * rate).unsqueeze(-2), (weight * bend).unsqueeze(-2)
+        return (rate * slip).sum(-3), (rate * across + bend * along).sum(-3)
+
     def exact_block(self, k: int, x: Tensor, x_prev: Tensor) -> Tensor:
-        """With the exact second derivative, which corrections of whole bodies take."""
+        """As block, with that derivative, which corrections take."""
         vertices = self.scene.layout.colors[k].vertices
-        weight, slip = self._full(take(x, vertices), take(x_prev, vertices))
-        bend = ((weight * smoothed(slip, self.reach)[2]).unsqueeze(-2) * outer6(slip)).sum(-3)
-        return self.block(k, x, x_prev) + torch.cat((torch.zeros_like(slip[..., 0, :, :]), bend), -2)
+        return torch.cat(self.on_vertices(take(x, vertices), take(x_prev, vertices)), -2)
 
     def energy(self, x: Tensor, x_prev: Tensor) -> Tensor:
         return self.terms(x, x_prev)[0].sum(-1)

@@ -1,5 +1,6 @@
 """The rigid correction of bodies that touch, in plain torch; the twin of diffvbd/step/rigid_contact.py."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -7,19 +8,24 @@ from torch import Tensor
 
 from .distance import EDGE_EDGE
 from .energies import StableNeoHookean
+from .friction import FloorFriction
 from .scene import Scene
 
 LEAST_INERTIA = 1e-11  # of its mass and sum of m r^2, that keeps the system of a body definite
+ITERATIONS, HALVINGS = 40, 20  # at most, of Newton's method, and of its steps
+SETTLED = 1e-9  # a step over the whole motion, which the next one squares
 
 
 class Correction:
-    """The rigid correction of bodies that touch: one Newton step over turn and shift of every body without pinned
-    vertices, all of a scene together. The gradient is autograd's, the blocks are those of vertex updates, but of friction exact."""
+    """The rigid correction of bodies that touch: turn and shift of every body without pinned vertices, all of a scene
+    together, to where a potential is least that is quadratic but for friction. Of the quadratic part the gradient is
+    autograd's and the blocks are those of vertex updates."""
 
     def __init__(self, scene: Scene, energies: list[Any], forces: list[Any], y: Tensor, x_prev: Tensor) -> None:
         """forces: terms of pairs, each with its `on_corners`."""
         model, self.scene, self.y, self.x_prev = scene.model, scene, y, x_prev
-        self.single = [e for e in energies if not isinstance(e, StableNeoHookean)]
+        self.single = [e for e in energies if not isinstance(e, (StableNeoHookean, FloorFriction))]
+        self.floors = [e for e in energies if isinstance(e, FloorFriction)]
         self.forces = forces
         self.body, self.count = model.body, int(model.body.max()) + 1
         pinned = torch.zeros(self.count).index_add(0, self.body.cpu(), model.pinned.cpu().float()) > 0
@@ -43,22 +49,49 @@ class Correction:
         z = x.new_zeros(len(share), self.count, 6)
         jacobian = torch.cat([-_cross_matrix(arm), torch.eye(3).to(x).expand(*arm.shape, 3)], -1)  # [B, V, 3, 6]
         g, blocks = self._single(x, state, z, jacobian, mass)
-        matrix = x.new_zeros(len(share), self.count, self.count, 6, 6)
         at = torch.arange(self.count, device=x.device)
+        matrix = x.new_zeros(len(share), self.count, self.count, 6, 6)
         matrix = matrix.index_put((_scenes(len(share), at), at, at), blocks, accumulate=True)
         for term in self.forces:
-            force, stiffness = term.on_corners(x)
-            g, matrix = self._add(term.pairs, term.turns_its_body, force, stiffness, jacobian, g, matrix)
-        free = self.free.to(x.device)
-        both = (free[:, None] & free)[..., None, None]
+            lagged = term.turns_its_body
+            force, stiffness = term.damping_on_corners(x) if lagged else term.on_corners(x)
+            g, matrix = self._add(term.pairs, lagged, force, stiffness, jacobian, g, matrix)
         spread = torch.zeros_like(total).index_add(1, self.body, mass * arm.square().sum(-1))
         least = torch.stack([spread] * 3 + [total] * 3, -1)  # turn, shift
-        fill = torch.where(free[:, None], LEAST_INERTIA * least, 1.0)[..., None] * torch.eye(6).to(x)
-        matrix = torch.where(both, matrix, 0.0).index_put((_scenes(len(share), at), at, at), fill, accumulate=True)
-        system = matrix.permute(0, 1, 3, 2, 4).reshape(len(share), 6 * self.count, -1)
-        right = torch.where(free[:, None], -g, 0.0).reshape(len(share), -1, 1)
-        motion = torch.linalg.solve(system, right).reshape(z.shape)
-        return state(share.to(x)[..., None] * motion)
+
+        def system(motion: Tensor) -> tuple[Tensor, Tensor]:
+            """Gradient and matrix [B, bodies 6, bodies 6] after a motion [B, bodies, 6]."""
+            moved = rows + (jacobian @ motion[:, self.body, :, None])[..., 0]
+            turning = g + torch.einsum("bnmij,bmj->bni", matrix, motion) + LEAST_INERTIA * least * motion
+            turning, stiff = self._rubbed(moved.transpose(-1, -2).reshape(x.shape), jacobian, turning, matrix)
+            return self._of_free(turning, stiff, least)
+
+        return state(share.to(x)[..., None] * _least(system, z))
+
+    def _rubbed(self, x: Tensor, jacobian: Tensor, g: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
+        """With friction at x."""
+        for term in self.forces:
+            if term.turns_its_body:
+                g, matrix = self._add(term.pairs, True, *term.friction_on_corners(x), jacobian, g, matrix)
+        at = torch.arange(self.count, device=x.device)
+        for floor in self.floors:
+            force, stiffness = floor.on_vertices(x, self.x_prev)
+            pull = jacobian.mT @ force.transpose(-1, -2).reshape(*jacobian.shape[:2], 3, 1)
+            g = g.index_add(1, self.body, pull[..., 0])
+            blocks = jacobian.mT @ _full(stiffness).reshape(*jacobian.shape[:2], 3, 3) @ jacobian
+            own = blocks.new_zeros(len(g), self.count, 6, 6).index_add(1, self.body, blocks)
+            matrix = matrix.index_put((_scenes(len(g), at), at, at), own, accumulate=True)
+        return g, matrix
+
+    def _of_free(self, g: Tensor, matrix: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
+        """What others have is zero, and their part of the matrix the identity."""
+        free = self.free.to(g.device)
+        both = (free[:, None] & free)[..., None, None]
+        at = torch.arange(self.count, device=g.device)
+        fill = torch.where(free[:, None], LEAST_INERTIA * least, 1.0)[..., None] * torch.eye(6).to(g)
+        matrix = torch.where(both, matrix, 0.0).index_put((_scenes(len(g), at), at, at), fill, accumulate=True)
+        g = torch.where(free[:, None], g, 0.0).reshape(len(g), -1, 1)
+        return g, matrix.permute(0, 1, 3, 2, 4).reshape(len(g), 6 * self.count, -1)
 
     def _single(self, x: Tensor, state: Any, z: Tensor, jacobian: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient [B, bodies, 6] and blocks [B, bodies, 6, 6] of inertia and the energies of single vertices."""
@@ -71,10 +104,8 @@ class Correction:
         total = torch.zeros_like(x).repeat_interleave(3, -2)  # [..., 9, V]
         for k, color in enumerate(self.scene.layout.colors):
             for energy in self.single:
-                total = total.index_add(-1, color.vertices, getattr(energy, "exact_block", energy.block)(k, x, self.x_prev))
-        xx, xy, xz, yy, yz, zz = total[..., 3:, :].unbind(-2)
-        own = torch.stack([torch.stack(r, -1) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))], -2)
-        own = own.reshape(*jacobian.shape[:2], 3, 3) + mass[..., None, None] * torch.eye(3).to(x)
+                total = total.index_add(-1, color.vertices, energy.block(k, x, self.x_prev))
+        own = _full(total[..., 3:, :]).reshape(*jacobian.shape[:2], 3, 3) + mass[..., None, None] * torch.eye(3).to(x)
         blocks = jacobian.mT @ own @ jacobian
         return g, blocks.new_zeros(len(z), self.count, 6, 6).index_add(1, self.body, blocks)
 
@@ -95,6 +126,38 @@ class Correction:
         pressed = maps.mT[:, :, None] @ stiffness @ maps[:, None]  # [Q, 4, 4, 6, 6]
         rows = (scene[:, :, None].expand(-1, 4, 4), body[:, :, None].expand(-1, 4, 4), body[:, None].expand(-1, 4, 4))
         return g, matrix.index_put(rows, pressed, accumulate=True)
+
+
+def _least(system: Callable[[Tensor], tuple[Tensor, Tensor]], motion: Tensor) -> Tensor:
+    """Where the gradient vanishes: by Newton's method, of which the last step, of no length, carries the derivative."""
+
+    def newton(motion: Tensor) -> tuple[Tensor, Tensor]:
+        g, matrix = system(motion)
+        return g, -torch.linalg.solve(matrix, g)
+
+    def slope(motion: Tensor, step: Tensor) -> Tensor:
+        return (system(motion)[0] * step).sum((-2, -1))
+
+    with torch.no_grad():
+        for _ in range(ITERATIONS):
+            g, step = newton(motion)
+            fall, low, high = -(g * step).sum((-2, -1)), torch.zeros(len(g)).to(g), torch.ones(len(g)).to(g)
+            way = step.reshape(motion.shape)
+            over = slope(motion + way, step) > 0.1 * fall
+            for _ in range(HALVINGS if over.any() else 0):
+                middle = (low + high) / 2
+                falls = slope(motion + middle[:, None, None] * way, step) < 0
+                low, high = torch.where(falls, middle, low), torch.where(falls, high, middle)
+            motion = motion + torch.where(over, high, 1.0)[:, None, None] * way
+            if way.abs().amax() <= SETTLED * motion.abs().amax():
+                break
+    return motion + newton(motion)[1].reshape(motion.shape)
+
+
+def _full(six: Tensor) -> Tensor:
+    """Symmetric [..., 6, n] as [..., n, 3, 3]."""
+    xx, xy, xz, yy, yz, zz = six.unbind(-2)
+    return torch.stack([torch.stack(r, -1) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))], -2)
 
 
 def _scenes(scenes: int, at: Tensor) -> Tensor:

@@ -199,11 +199,11 @@ def _displaced(motion: Tensor, arm: Tensor, of: Order) -> Tensor:
 
 
 def _virtual_work(s: Scenes, p: Tensor, q: Tensor, arm: Tensor, whole: Tensor, body: Tensor) -> Tensor:
-    """p . (gradient + matrix q) of the Newton system, for motions p and q of all bodies [B, bodies, 6]."""
+    """p . (gradient + matrix q + friction after q), for motions p and q of all bodies [B, bodies, 6]."""
     f = s.fields
     at_p, at_q = (torch.linalg.cross(m[:, body, :3], arm) + m[:, body, 3:] for m in (p, q))
     mass = broadcast(f.mass, f.x.shape[:2])[..., None]
-    own, blocks = vertex_gradient(s) + mass * at_q, vertex_blocks(s)
+    own, blocks = vertex_gradient(s, at_q) + mass * at_q, vertex_blocks(s, friction=False)
     if blocks is not None:
         own = own + (blocks * at_q[..., None, :]).sum(-1)
     spread = sum_segments(mass * arm.square().sum(-1, keepdim=True), f.order, f.ptr, body)

@@ -1,7 +1,7 @@
 """Claim: the derivatives that the adjoint of rigid corrections takes of pairs are those of their virtual work.
 
-The work is written out in torch here, of the same forces and stiffnesses that coarse corrections use, and derived by
-autograd. More than MOST_COUPLED bodies are solved for one by one: each side bears twice the stiffness.
+The work is written out in torch here and derived by autograd. More than MOST_COUPLED bodies are solved for one by one:
+each side bears twice the stiffness, and friction between two of them has a bound for it. Other friction is that after q.
 """
 
 import importlib
@@ -15,9 +15,9 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import mesh, ops
-from diffvbd.adjoint.contact_lag import at_corners
+from diffvbd.adjoint.contact_lag import Pairs, at_corners
 from diffvbd.ops import contact_rigid
-from diffvbd.step.rigid_terms import PairTerms, Scenes, pair_terms
+from diffvbd.step.rigid_terms import Scenes, pair_terms
 from diffvbd.testing import relative_error, tolerance
 from diffvbd.testing.contact_scenes import SCENES, compiled, noise
 
@@ -55,10 +55,10 @@ def fields_of(monkeypatch: pytest.MonkeyPatch, name: str) -> Scenes:
     return seen[-1]
 
 
-def parts_of(s: Scenes, terms: PairTerms, moved: Tensor) -> list[tuple[Tensor, Tensor]]:
+def parts_of(s: Scenes, listed: Pairs, moved: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Of how corners move [2, n, 4, 3], what is solved for at once, with its share of the stiffness [n, 1]."""
     f, count = s.fields, s.fields.free.shape[0]
-    corners, kind = terms.listed.pairs[:, :4].long(), terms.listed.pairs[:, 4:5].long()
+    corners, kind = listed.pairs[:, :4].long(), listed.pairs[:, 4:5].long()
     sides = torch.where(kind == 1, 2, 1)
     lead = f.body.long()[torch.cat([corners[:, :1], corners.gather(1, sides)], 1)]
     moves = (lead < count) & f.free[lead.clamp(max=count - 1)]
@@ -71,22 +71,51 @@ def parts_of(s: Scenes, terms: PairTerms, moved: Tensor) -> list[tuple[Tensor, T
 
 
 def work(s: Scenes, p: Tensor, q: Tensor) -> Tensor:
-    total = p.new_zeros(())
+    total = work_of_lagged(s, p, q) if s.fields.lag.numel() else p.new_zeros(())
     for terms in pair_terms(s):
-        if terms.at_corners is not None:  # barriers within a body do nothing to its rigid motion
-            corners, second = terms.listed.pairs[:, :4].long(), torch.where(terms.listed.pairs[:, 4:5] == 1, 2, 1)
-            body = s.fields.body
-            apart = (body[corners[:, :1]] != body[corners.gather(1, second)]).to(p)
-            terms = PairTerms(terms.listed, apart * terms.force, apart[..., None] * terms.stiffness, terms.weights,
-                              apart[..., None] * terms.at_corners)  # fmt: skip
+        if terms.at_corners is None:
+            continue
+        # barriers within a body do nothing to its rigid motion
+        corners, second = terms.listed.pairs[:, :4].long(), torch.where(terms.listed.pairs[:, 4:5] == 1, 2, 1)
+        body = s.fields.body
+        apart = (body[corners[:, :1]] != body[corners.gather(1, second)]).to(p)
         moved = torch.stack([at_corners(p, terms.listed), at_corners(q, terms.listed)])
-        if terms.at_corners is not None:
-            total = total + (terms.at_corners * moved[0]).sum()
+        total = total + (apart[..., None] * terms.at_corners * moved[0]).sum()
         moved = terms.weights[..., None] * moved
-        total = total + (terms.force * moved[0].sum(1)).sum()
-        for part, share in parts_of(s, terms, moved):
-            total = total + (share * part[0] * (terms.stiffness @ part[1][..., None])[..., 0]).sum()
+        total = total + (apart * terms.force * moved[0].sum(1)).sum()
+        for part, share in parts_of(s, terms.listed, moved):
+            pressed = (terms.stiffness @ part[1][..., None])[..., 0]
+            total = total + (apart * share * part[0] * pressed).sum()
     return total
+
+
+def work_of_lagged(s: Scenes, p: Tensor, q: Tensor) -> Tensor:
+    """Of friction and damping."""
+    f, h = s.fields, s.time_step
+    load, damping, n, w = f.lag.split((1, 1, 3, 4), -1)
+
+    def across(u: Tensor) -> Tensor:
+        return u - n * (n * u).sum(-1, keepdim=True)
+
+    def rate(u: Tensor) -> Tensor:
+        length = u.square().sum(-1, keepdim=True).sqrt()
+        sticks = length < s.friction_eps
+        return h**2 * load * torch.where(sticks, (2 - length / s.friction_eps) / s.friction_eps, 1 / length)
+
+    since = torch.cat([f.x, f.collider], 1) - torch.cat([f.x_prev, f.collider_prev], 1)
+    moved = torch.stack([at_corners(t, s.lagged) for t in (p, q, since)])
+    whole = (w[..., None] * moved).sum(2)
+    approach = (n * whole[2]).sum(-1, keepdim=True).clamp(max=0)
+    slip, end = across(whole[2]), across(whole[2] + whole[1])
+    (first, share), (second, _) = parts_of(s, s.lagged, w[..., None] * moved[:2])
+    bound = (whole[0] * rate(slip) * slip).sum(-1, keepdim=True)
+    damped = h * damping * approach * (n * whole[0]).sum(-1, keepdim=True)
+    for part in (first, second):
+        bound = bound + share * (part[0] * rate(slip) * across(part[1])).sum(-1, keepdim=True)
+        along = (n * part).sum(-1, keepdim=True)
+        damped = damped + h * damping * share * along[0] * along[1]
+    exact = (whole[0] * rate(end) * end).sum(-1, keepdim=True)
+    return (damped + torch.where(share == 2, bound, exact)).sum()
 
 
 @pytest.mark.parametrize("device", DEVICES)

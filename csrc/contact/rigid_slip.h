@@ -1,0 +1,66 @@
+// Friction in the rigid correction of bodies that touch (docs/method.md, section 18): all but friction is linear in the
+// motions of bodies, friction is taken as it is. Newton's method finds where they come to rest, with shorter steps
+// where a full one would take a slip past that.
+#pragma once
+
+#include "rigid.h"
+
+namespace diffvbd::contact {
+
+constexpr int kSlipIterations = 12;  // of Newton's method
+constexpr int kHalvings = 10;        // in the search for the length of a step
+constexpr double kOvershoot = 0.1;   // slope at the end of a step over that at its start, that is none
+constexpr double kSettled = 1e-9;    // of the whole, a step after which there is but one more
+
+// A slip along a step of Newton's method.
+struct SlipLine {
+  Vector slip, change;
+  double size, eps;
+
+  // The slope of the potential after a share of the step, over what that takes it for.
+  DIFFVBD_FN double excess(double share) const {
+    const Vector now = slip + share * change;
+    const FrictionRate<double> first(square_root(dot(slip, slip)), eps), last(square_root(dot(now, now)), eps);
+    const Vector taken = first.value * now + (share * first.curvature * dot(slip, change)) * slip;
+    return size * dot(last.value * now - taken, change);
+  }
+};
+
+// Of a lagged pair that rubs, and its press.
+template <class T>
+DIFFVBD_FN SlipLine slip_line(const RigidInputs<T>& in, int64_t pair, const PairPress& a, const double* center,
+                              const double* step) {
+  const Lag<T> lag(in.lag + kLagScalars * pair);
+  const Vector n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
+  Vector way{};
+  for (int side = 0; side < 2; ++side) {
+    const int32_t body = a.body[side];
+    if (body < 0) continue;
+    way += a.moved(side, rigid::Body<double>::at(center + 3 * body), step + kUnknowns * body);
+  }
+  return {a.slip, way - dot(n, way) * n, a.rubs, in.friction_eps};
+}
+
+// Of a vertex at r from its body's center on one plane of a floor, with that body's motion so far and its step.
+template <class T>
+DIFFVBD_FN SlipLine slip_line(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane, const Vector& r,
+                              const double* motion, const double* step) {
+  const FloorSlip a = floor_slip(in, b, v, plane, moved_by(motion, r));
+  const Vector way = moved_by(step, r);
+  return {a.slip, way - dot(a.n, way) * a.n, a.size, in.friction_eps};
+}
+
+// The share of a step that is taken. fall: twice by how much it lowers what it takes the potential for; `excess` of a
+// share: that of all that slips.
+template <class Excess>
+DIFFVBD_FN double slip_share(double fall, const Excess& excess) {
+  if (!(kOvershoot * fall < excess(1.0))) return 1;
+  double low = 0, high = 1;
+  for (int i = 0; i < kHalvings; ++i) {
+    const double middle = 0.5 * (low + high);
+    (excess(middle) < fall * (1 - middle) ? low : high) = middle;
+  }
+  return high;
+}
+
+}  // namespace diffvbd::contact
