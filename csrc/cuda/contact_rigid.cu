@@ -1,3 +1,4 @@
+#include "../contact/rigid_slip.h"
 #include "contact_rigid.cuh"
 
 namespace diffvbd::cuda {
@@ -35,7 +36,7 @@ __device__ __forceinline__ void unpack(int packed, int& i, int& j) {
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     body_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const int32_t* sides, const double* press,
-                double* center, double* gradient, double* matrix) {
+                const double* slid, double* center, double* gradient, double* matrix) {
   __shared__ double part[kWarps][kMostSums];
   const int32_t n = in.bodies(), k = static_cast<int32_t>(blockIdx.x % n);
   const int64_t scene = blockIdx.x / n, row = blockIdx.x;
@@ -59,6 +60,7 @@ __global__ void __launch_bounds__(kThreads)
     Sym3<double> H;
     vertex_press(in, body, v, g, H);
     const Vector arm = body.position(v) - c;
+    add_floor_friction(in, body, v, slid ? moved_by(slid + kUnknowns * row, arm) : Vector{}, g, H);
     rigid::add_vertex(arm, g, H, out, out + kUnknowns);
     out[kOwn] += body.mass(v) * dot(arm, arm);
   });
@@ -136,6 +138,66 @@ __global__ void __launch_bounds__(32)
   }
 }
 
+// y += A x for each of the systems.
+template <class T>
+__global__ void __launch_bounds__(kOne)
+    product_kernel(const __grid_constant__ RigidInputs<T> in, const double* matrix, const double* x, double* y) {
+  const int64_t row = own_item(), size = in.system_size();
+  if (row >= in.systems() * size) return;
+  const double *a = matrix + size * row, *own = x + row / size * size;
+  double sum = 0;
+  for (int64_t j = 0; j < size; ++j) sum += a[j] * own[j];
+  y[row] += sum;
+}
+
+// A block for each system: adds a share of a step of Newton's method to motions.
+template <class T>
+__global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ RigidInputs<T> in, const double* center,
+                                                        const double* factor, const double* step, double* motion) {
+  __shared__ double part[kWarps][kMostSums];
+  const BlockTeam team{part};
+  const int64_t size = in.system_size(), n = in.bodies();
+  const bool together = in.together();
+  const int64_t scene = together ? blockIdx.x : blockIdx.x / n;
+  const auto k = static_cast<int32_t>(together ? 0 : blockIdx.x % n);  // the body, if it is one
+  const double *own = factor + size * size * blockIdx.x, *to = step + size * blockIdx.x;
+  double fall[1];
+  team.template sum<1>(static_cast<int32_t>(size), fall, [&](int32_t j, double* out) {
+    double sum = 0;
+    for (int64_t i = j; i < size; ++i) sum += own[size * i + j] * to[i];
+    out[0] += sum * sum;
+  });
+  const Slid slid = of_scene({center, motion}, scene, n);
+  const double* steps = step + kUnknowns * scene * n;
+  const CornerPoints<T> at{in, false};
+  const int64_t lagged = in.first_lagged(scene);
+  const auto rubbing = static_cast<int32_t>(in.first_lagged(scene + 1) - lagged);
+  const Body<T> one{in.scene, scene, k};
+  const int32_t planes = in.planes * (together ? static_cast<int32_t>(in.scene.vertices) : one.size());
+  const double share = slip_share(fall[0], [&](double tried) {
+    double sum[1];
+    team.template sum<1>(planes + rubbing, sum, [&](int32_t i, double* out) {
+      if (i < planes) {
+        const int32_t v = together ? i / in.planes : one.vertex(i / in.planes);
+        const int32_t b = together ? in.gate.body[v] : k;
+        if (!in.free[b]) return;
+        const Body<T> body{in.scene, scene, b};
+        const Vector arm = body.position(v) - vector_of(slid.center + 3 * b);
+        const int64_t first = int64_t{kUnknowns} * b;
+        out[0] += slip_line(in, body, v, i % in.planes, arm, slid.motion + first, steps + first).excess(tried);
+        return;
+      }
+      PairPress a;
+      const int64_t pair = lagged + i - planes;
+      if (!lagged_press(in, pair, at, slid, a) || a.rubs == 0) return;
+      if (!together && (a.body[0] < 0 ? a.body[1] : a.body[0]) != k) return;
+      out[0] += slip_line(in, pair, a, slid.center, steps).excess(tried);
+    });
+    return sum[0];
+  });
+  for (int64_t i = threadIdx.x; i < size; i += kThreads) motion[size * blockIdx.x + i] += share * to[i];
+}
+
 template <class T>
 __global__ void __launch_bounds__(kOne) keep_finite_kernel(const __grid_constant__ RigidInputs<T> in, double* motion) {
   const int64_t row = own_item();
@@ -145,28 +207,50 @@ __global__ void __launch_bounds__(kOne) keep_finite_kernel(const __grid_constant
 }  // namespace
 
 template <class T>
-int64_t rigid_system_bytes(const RigidInputs<T>&, const PairRoom& room) {
-  return aligned(room.rows() * 2 * sizeof(int32_t)) + aligned(room.rows() * kPressDoubles * sizeof(double));
+int64_t rigid_system_bytes(const RigidInputs<T>& in, const PairRoom& room) {
+  return aligned(room.rows() * 2 * sizeof(int32_t)) + aligned(room.rows() * kPressDoubles * sizeof(double)) +
+         aligned(in.scene.scenes * in.bodies() * kUnknowns * sizeof(double));
 }
 
 template <class T>
 cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double* center, double* motion, double* factor,
                          void* workspace, cudaStream_t stream) {
-  const int64_t bodies = in.scene.scenes * in.bodies();
+  const int64_t bodies = in.scene.scenes * in.bodies(), unknowns = bodies * kUnknowns;
   if (bodies == 0) return cudaSuccess;
-  auto* sides = static_cast<int32_t*>(workspace);
-  auto* press =
-      reinterpret_cast<double*>(static_cast<uint8_t*>(workspace) + aligned(room.rows() * 2 * sizeof(int32_t)));
-  if (room.rows() > 0) press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, sides, press);
-  const auto blocks = static_cast<unsigned>(bodies);
-  body_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room, sides, press, center, motion, factor);
-  if (in.together() && in.bodies() > 1) {
-    const size_t cells = 36 * in.bodies() * sizeof(double);
-    between_kernel<T><<<blocks, 32, cells, stream>>>(in, room, sides, press, center, factor);
+  auto* next = static_cast<uint8_t*>(workspace);
+  const auto take = [&](int64_t bytes) {
+    uint8_t* here = next;
+    next += aligned(bytes);
+    return here;
+  };
+  auto* sides = reinterpret_cast<int32_t*>(take(room.rows() * 2 * sizeof(int32_t)));
+  auto* press = reinterpret_cast<double*>(take(room.rows() * kPressDoubles * sizeof(double)));
+  auto* step = reinterpret_cast<double*>(take(unknowns * sizeof(double)));
+  const bool rubs = in.rubs();
+  if (rubs) {
+    if (auto error = cudaMemsetAsync(motion, 0, unknowns * sizeof(double), stream)) return error;
+  } else {
+    step = motion;
   }
-  if (auto error = cholesky(in.systems(), in.system_size(), factor, stream)) return error;
-  if (auto error = cholesky_solve(in.systems(), in.system_size(), factor, motion, stream)) return error;
-  keep_finite_kernel<T><<<blocks_for(bodies), kOne, 0, stream>>>(in, motion);
+  // As often as the CPU may: whether all have settled would have to be waited for.
+  for (int iteration = 0; iteration < (rubs ? kSlipIterations : 1); ++iteration) {
+    const Slid slid = iteration > 0 ? Slid{center, motion} : Slid{};
+    if (room.rows() > 0) press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, slid, sides, press);
+    const auto blocks = static_cast<unsigned>(bodies);
+    body_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room, sides, press, slid.motion, center, step, factor);
+    if (in.together() && in.bodies() > 1) {
+      const size_t cells = 36 * in.bodies() * sizeof(double);
+      between_kernel<T><<<blocks, 32, cells, stream>>>(in, room, sides, press, center, factor);
+    }
+    if (iteration > 0) product_kernel<T><<<blocks_for(unknowns), kOne, 0, stream>>>(in, factor, motion, step);
+    if (auto error = cholesky(in.systems(), in.system_size(), factor, stream)) return error;
+    if (auto error = cholesky_solve(in.systems(), in.system_size(), factor, step, stream)) return error;
+    keep_finite_kernel<T><<<blocks_for(bodies), kOne, 0, stream>>>(in, step);
+    if (rubs) {
+      const auto systems = static_cast<unsigned>(in.systems());
+      step_kernel<T><<<systems, kThreads, 0, stream>>>(in, center, factor, step, motion);
+    }
+  }
   return cudaGetLastError();
 }
 

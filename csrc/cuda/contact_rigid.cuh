@@ -18,11 +18,17 @@ __device__ __forceinline__ Vector vector_of(const double* a) { return {a[0], a[1
 // Bytes of a part of a workspace, rounded up to what any type needs.
 constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
 
+// Of a scene, what `slid` has of all.
+__device__ __forceinline__ Slid of_scene(const Slid& slid, int64_t scene, int64_t bodies) {
+  if (!slid.motion) return slid;
+  return {slid.center + 3 * scene * bodies, slid.motion + kUnknowns * scene * bodies};
+}
+
 // What the pairs of all scenes press: bodies [rows, 2], -1 where nothing moves, and the rest, unless null. The listed
 // come first.
 template <class T>
 __global__ void __launch_bounds__(kOne)
-    press_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, int32_t* sides, double* press) {
+    press_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, Slid slid, int32_t* sides, double* press) {
   const int64_t row = own_item();
   if (row >= room.listed + room.lagged) return;
   const CornerPoints<T> at{in, false};
@@ -33,7 +39,8 @@ __global__ void __launch_bounds__(kOne)
     acts = row < in.first_listed(in.scene.scenes) && barrier_press(in, row, at, a);
   } else {
     const int64_t pair = row - room.listed;
-    acts = pair < in.first_lagged(in.scene.scenes) && lagged_press(in, pair, at, a);
+    acts = pair < in.first_lagged(in.scene.scenes) &&
+           lagged_press(in, pair, at, of_scene(slid, in.lagged.pairs[kPairRow * pair + 5], in.bodies()), a);
   }
   sides[2 * row] = acts ? a.body[0] : -1;
   sides[2 * row + 1] = acts ? a.body[1] : -1;
