@@ -14,8 +14,8 @@ RESTING = 1e-6  # of the motion below which friction is smoothed
 
 
 def smoothed(slip: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
-    """f0(|u|) [m] of slips u [..., 3, n], f = f0'(|u|) / |u| [1/m] and f'(|u|) / |u|: quadratic below `reach`, Coulomb's
-    |u| above."""
+    """f0(|u|) [m] of slips u [..., 3, n], f = f0'(|u|) / |u| [1/m] and f'(|u|) / |u|: below `reach` quadratic, above it
+    Coulomb's |u|."""
     square = dot(slip, slip)
     moves = square > (RESTING * reach) ** 2
     # |u| has a kink at 0: where only rounding moves, its derivative is taken as 0

@@ -1,7 +1,8 @@
 """Claim: the derivatives that the adjoint of rigid corrections takes of pairs are those of their virtual work.
 
 The work is written out in torch here and derived by autograd. More than MOST_COUPLED bodies are solved for one by one:
-each side bears twice the stiffness, and friction between two of them has a bound for it. Other friction is that after q.
+each side bears twice the stiffness, and friction between two of them has a bound for it. Other friction is that after
+q.
 """
 
 import importlib
