@@ -54,7 +54,8 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const std::vect
     in.planes = static_cast<int32_t>(t.floor_lag.numel() / t.floor_lag.size(0) / (v * contact::kFloorLag));
     in.floor_lag = batched<T>("floor_lag", t.floor_lag, t.x, b, v * in.planes * contact::kFloorLag);
   }
-  in.friction_eps = friction_eps;
+  in.has_friction = 0 < friction_eps;
+  in.friction_eps = in.has_friction ? friction_eps : 1;
   return in;
 }
 

@@ -30,9 +30,10 @@ struct RigidInputs {
   const bool* free;                   // [bodies]: nothing of it is pinned
   int32_t planes;
   double friction_eps;
+  bool has_friction;
 
   DIFFVBD_FN int32_t bodies() const { return scene.bodies; }
-  DIFFVBD_FN bool rubs() const { return (lag || planes > 0) && 0 < friction_eps; }  // whether there is friction
+  DIFFVBD_FN bool rubs() const { return (lag || planes > 0) && has_friction; }
   DIFFVBD_FN bool together() const { return scene.bodies <= kMostCoupled; }
   // Scalars of the matrices of a scene: of all bodies together, or of one after another.
   DIFFVBD_FN int64_t matrix_size() const {

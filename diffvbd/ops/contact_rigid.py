@@ -19,9 +19,9 @@ _FIELDS = len(TouchingFields._fields)
 
 def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float
                  ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """The Newton step over a turn and a shift of each body, float64: centers of mass [B, bodies, 3] [m], motion
-    [B, bodies, 6], and Cholesky factor [B, 6 bodies, 6 bodies], or [B, bodies, 6, 6] of more than MOST_COUPLED
-    bodies."""
+    """The turn and the shift of each body to where the step's potential is least, float64: centers of mass
+    [B, bodies, 3] [m], motion [B, bodies, 6], and Cholesky factor [B, 6 bodies, 6 bodies], or [B, bodies, 6, 6] of more
+    than MOST_COUPLED bodies. friction_eps: [m], 0 without friction."""
     return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps)
 
 

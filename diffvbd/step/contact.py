@@ -229,7 +229,8 @@ class ContactStep:
         """x after the rigid correction of all bodies that are free, and the share of its motion that each took."""
         numbers = self.prepared.settings.numbers
         fields = self.touching(x, collider, start, listed)
-        return correct(self.model, fields, numbers.time_step, numbers.friction_eps)
+        eps = 0.0 if self.model.friction is None else numbers.friction_eps
+        return correct(self.model, fields, numbers.time_step, eps)
 
     def touching(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> ops.TouchingFields:
         """What all potentials of bodies as wholes are made of, at x [B, V, 3]."""

@@ -33,7 +33,8 @@ _FIELDS = len(ops.TouchingFields._fields)
 
 def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction_eps: float) -> tuple[Tensor, Tensor]:
     """x [B, V, 3] after every free body has been moved, as far as pairs, floors and the potential let it; and the share
-    of its motion that each took [B, bodies]. Differentiable in ops.TOUCHING_ADJOINTS."""
+    of its motion that each took [B, bodies]. friction_eps: [m], 0 without friction. Differentiable in
+    ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
     x, share, *_ = _Correct.apply(*fields, model, time_step, friction_eps)
     return x, share.to(x.dtype)
@@ -93,6 +94,7 @@ class _CorrectBackward(Function):
     @staticmethod
     def forward(x_bar, *saved):
         *tensors, share, motion, factor, model, time_step, friction_eps, needs = saved
+        friction_eps = friction_eps or 1.0  # of loads that are zero
         if not x_bar.is_cuda:
             s = Scenes(model, ops.TouchingFields(*(t.detach() for t in tensors)), time_step, friction_eps)
             return _compiled_adjoints(s, x_bar, share, motion, factor, needs)

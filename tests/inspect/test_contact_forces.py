@@ -141,7 +141,7 @@ def test_without_friction_forces_are_minus_the_gradient_of_the_barrier() -> None
 @pytest.mark.parametrize("name", ("stacked", "crossed", "obstacles", "batched"))
 def test_gradients_agree_with_differences(name: str) -> None:
     scene = contact_scenes.SCENES[name]()
-    model, options = run(scene, 5)
+    model, options = run(scene, 6)
     options.pop("speed")
     x, (before, v), parameters = options.pop("x"), options.pop("previous"), options.pop("parameters")
     h = options.pop("time_step")
