@@ -2,12 +2,15 @@
 # make test    the quick tests, a process for each core (ARGS='-k floor' and the like are passed to pytest)
 # make test-all  the slow tests, too; ARGS='-m hours' instead: what is run by hand before a release
 # make lint    ruff, pyright and clang-format in check mode
+# make docs    the site into build/docs, warnings are errors; tutorials are executed (NOTEBOOKS=off: not)
+# make linkcheck  addresses of other sites in docs/ (needs the internet)
 # make wheels  sdist and CPU wheel into dist/ (minutes); `make try-wheels` runs the wheel in new environments
 # make clean   remove what the build made; `make distclean` removes the environment too
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+NOTEBOOKS ?= cache
 
 # Idle OpenMP threads sleep instead of spinning; read when torch is loaded, so it is set here.
 export OMP_WAIT_POLICY ?= PASSIVE
@@ -18,7 +21,7 @@ ENVIRONMENT := $(VENV)/environment.stamp
 NATIVE := diffvbd/_C.abi3.so
 SOURCES := $(shell find csrc -type f -name '*.h' -o -type f -name '*.cpp' -o -type f -name '*.cu*')
 
-.PHONY: run build test test-all lint wheels try-wheels clean distclean
+.PHONY: run build test test-all lint docs linkcheck wheels try-wheels clean distclean
 
 run: build
 	$(BIN)/python -m diffvbd run beam-mu $(ARGS)
@@ -36,6 +39,12 @@ lint: $(ENVIRONMENT)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/clang-format --dry-run -Werror $(SOURCES)
+
+docs: build
+	$(BIN)/python -m sphinx -q -W --keep-going -b html -D nb_execution_mode=$(NOTEBOOKS) docs build/docs $(ARGS)
+
+linkcheck: build
+	$(BIN)/python -m sphinx -q -b linkcheck docs build/linkcheck $(ARGS)
 
 wheels:
 	$(PYTHON) .ci/wheels.py build $(ARGS)

@@ -2,8 +2,8 @@
 
 A benchmark is a module of this package with a function run(quick) that returns a dict, and optionally markdown(results)
 that turns it into text. A run that also takes `device`, `only` or `out` gets them from the command line. Results go to
-NAME.json and NAME.md, of a run on CUDA to NAME-cuda.json and NAME-cuda.md; `report` makes docs/results.md of all,
-and docs/tasks.md of the logs of inverse problems, which `tasks` runs.
+NAME.json and NAME.md, of a run on CUDA to NAME-cuda.json and NAME-cuda.md; `report` makes docs/results of all, and
+docs/tasks.md of the logs of inverse problems, which `tasks` runs.
 """
 
 from __future__ import annotations

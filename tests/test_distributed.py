@@ -1,8 +1,8 @@
 """Claim: scenes and bodies that ranks share have the bits that they have on one, gradients too, and a killed rank costs
 nothing but time."""
 
-import re
 import os
+import re
 import subprocess
 import sys
 from itertools import pairwise
@@ -24,7 +24,7 @@ from diffvbd.tasks import Problem, Settings, solve
 from diffvbd.tasks.million_cubes import launch_pad
 from diffvbd.testing import relative_error, tolerance
 
-ENVIRONMENT = {"TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}  # what docs/scale.md tells users to set
+ENVIRONMENT = {"TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}  # what docs/guides/scale-out.md tells users to set
 SCENES, PARTS = 7, 3  # which two ranks cannot share evenly
 KILL = """
 import os, signal
@@ -185,8 +185,10 @@ def test_the_gradient_is_that_of_distributed_data_parallel(tmp_path: Path) -> No
 
 
 def script() -> str:
-    """The program of docs/scale.md that users are told to save."""
-    (first, *_) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "scale.md").read_text(), re.M | re.S)
+    """The program of docs/guides/scale-out.md that users are told to save."""
+    (first, *_) = re.findall(
+        r"^```python\n(.*?)^```$", (ROOT / "docs" / "guides" / "scale-out.md").read_text(), re.M | re.S
+    )
     return first
 
 
@@ -195,7 +197,9 @@ def run(folder: Path, text: str, *launcher: str) -> dict[str, Tensor]:
     folder.mkdir()
     (folder / "train.py").write_text(text)
     command = [sys.executable, *launcher, "train.py"]
-    done = subprocess.run(command, cwd=folder, env=os.environ | ENVIRONMENT, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        command, cwd=folder, env=os.environ | ENVIRONMENT, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return torch.load(folder / "state.pt")["network"]
 

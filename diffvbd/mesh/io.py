@@ -70,7 +70,8 @@ def load_fields(path: str | PathLike[str], *, orient: bool = True) -> Fields:
         `Fields`: the mesh, point_data of shape [V] or [V, C] and cell_data of shape [T] or [T, C], by name.
 
     Raises:
-        As `load`, and ValueError for values of another number of rows, or that are no numbers.
+        FileNotFoundError, ImportError: As `load`.
+        ValueError: As `load`, and for values of another number of rows, or that are no numbers.
     """
     path = Path(path)
     content, mesh, vertices, blocks = _tets_of(path, orient)

@@ -88,8 +88,8 @@ def rollout(
         colliders: Corner points of the Model's colliders [m]: constant, they rest there; in :func:`per_step`, where
             they are at the end of each step.
         colliders_before: Where per_step colliders are at the start; None: the Model's collider_points.
-        mu, lam (or young, poisson), force, gravity, prescribed, rest_points, density, parameters: As in step, constant
-            in time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step.
+        mu, lam, young, poisson, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in
+            time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step.
             A callable may close over tensors and modules that require grad: they get gradients under every schedule. It
             must be deterministic, because a checkpointed segment calls it again in the backward. ``prescribed`` may
             also have the initial x where a vertex is not pinned.

@@ -73,7 +73,10 @@ def test_every_task_is_on_the_page_and_the_page_is_made_of_the_logs() -> None:
     assert text == tasks.page(report.RESULTS / "tasks", tasks.IMAGES, report.ROOT / "docs"), (
         "run `python -m bench report`"
     )
+    cards = report.GALLERY_PAGE.read_text(encoding="utf-8")
+    assert cards == report.filled(cards, tasks.gallery(report.RESULTS / "tasks")), "run `python -m bench report`"
     for name in PAPER:
         assert f"\n## {name}\n" in text
+        assert f"}} {name}\n" in cards
         assert tasks.picture_of(name, tasks.IMAGES).exists()
         assert (report.RESULTS / "tasks" / f"{name}.json").exists() or name == "million-cubes"
