@@ -181,7 +181,7 @@ def result(name: str, stem: str, content: dict[str, Any], images: Path) -> list[
     e = content["environment"]
     parts = [f"## {stem}, on {place(e)}\n\n{machine(e)} Commit {commit(e)}.\n"]
     if name in BENCHMARKS:
-        return [*parts, "Its tables stand in [performance.md](../performance.md#figures).\n"]
+        return [*parts, "Its tables stand in [performance](../performance.md#figures).\n"]
     try:
         if plots.draw(name, content["results"], images / f"results_{stem}.png"):
             parts.append(f"![{plots.CAPTIONS[name]}](../{images.name}/results_{stem}.png)\n")
