@@ -71,7 +71,7 @@ def adapt(app: object, docname: str, source: list[str]) -> None:
     text = source[0]
     if docname in ("results/index", "reference/index"):
         text += CONTENTS
-    if docname == "index":  # tutorials and the viewer may be absent
+    if docname == "index":  # pages that may be absent
         text = re.sub(r"^((?:tutorials/|viewer)\S*)\n", present, text, flags=re.MULTILINE)
     if docname in ("index", "gallery"):  # the animation of a task, where there is one, in place of its picture
         text = re.sub(r"images/tasks/(\w+)\.png", animated, text)
@@ -86,6 +86,11 @@ def escape(app: object, what: str, name: str, obj: object, options: object, line
         lines[i] = "".join(part if k % 2 else part.replace("|", r"\|") for k, part in enumerate(outside))
 
 
+def skip(app: object, what: str, name: str, obj: object, is_skipped: bool, options: object) -> bool | None:
+    """Fields of named tuples: the docstring of the class has them."""
+    return True if str(getattr(obj, "__doc__", "")).startswith("Alias for field number") else None
+
+
 def present(found: re.Match[str]) -> str:
     return found[0] if any(DOCS.glob(found[1])) else ""
 
@@ -98,3 +103,4 @@ def animated(found: re.Match[str]) -> str:
 def setup(app: Any) -> None:
     app.connect("source-read", adapt)
     app.connect("autodoc-process-docstring", escape)
+    app.connect("autodoc-skip-member", skip)
