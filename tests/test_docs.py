@@ -183,3 +183,10 @@ def test_the_operators_of_a_backend_are_listed() -> None:
     text = schema.read_text(encoding="utf-8")
     defined = set(re.findall(r'"([a-z_]+)\(Tensor', text)) | set(re.findall(r'define\(m, "([a-z_]+)"', text))
     assert len(defined) > 20 and listed == defined - {"build_plan"}
+
+
+def test_workflows_and_ci_call_targets_that_exist() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    callers = [*(ROOT / ".github" / "workflows").glob("*.yml"), ROOT / ".ci" / "run"]
+    called = [name for path in callers for name in re.findall(r"\bmake ([a-z-]+)", path.read_text(encoding="utf-8"))]
+    assert {"docs", "lint", "test-all"} <= set(called) <= targets
