@@ -41,7 +41,7 @@ lint: $(ENVIRONMENT)
 	$(BIN)/clang-format --dry-run -Werror $(SOURCES)
 
 docs: build
-	$(BIN)/python -m sphinx -q -E -W --keep-going -b html -D nb_execution_mode=$(NOTEBOOKS) docs build/docs $(ARGS)
+	$(BIN)/python -m sphinx -q -E -W --keep-going -b html -d build/doctrees -D nb_execution_mode=$(NOTEBOOKS) docs build/docs $(ARGS)
 
 linkcheck: build
 	$(BIN)/python -m sphinx -q -b linkcheck docs build/linkcheck $(ARGS)
