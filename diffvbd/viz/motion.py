@@ -119,6 +119,17 @@ def positions(name: str, x: Any, vertices: int) -> NDArray[np.float64]:
     return points
 
 
+def components(triangles: NDArray[np.int64], vertices: int) -> NDArray[np.int64]:
+    """Labels [V] of the parts of a surface [F, 3] that are connected: the lowest vertex of each."""
+    label = np.arange(vertices)
+    while True:
+        before = label.copy()
+        np.minimum.at(label, triangles, label[triangles].min(1, keepdims=True))
+        label = label[label]
+        if np.array_equal(label, before):
+            return label
+
+
 # --- files ------------------------------------------------------------------------------------------------------------
 
 MOST_VALUES = 30_000_000  # numbers of a kept motion; longer ones keep every n-th frame
@@ -168,7 +179,8 @@ def load_motions(path: str | PathLike[str]) -> dict[str, Motion]:
             if points.ndim != 3 or points.shape[-1] != 3 or times.shape != points.shape[:1]:
                 raise ValueError(f"positions of shape {list(points.shape)}")
             check_surface(triangles, points.shape[1])
-            motions[str(name)] = Motion(points, triangles, times, scenery=things)
+            body = components(triangles, points.shape[1])
+            motions[str(name)] = Motion(points, triangles, times, body, scenery=things)
     except FileNotFoundError:
         raise
     except Exception as error:  # numpy raises errors of many kinds
