@@ -9,6 +9,7 @@ from diffvbd.viz.landing import landing
 from diffvbd.viz.learning import learning
 from diffvbd.viz.live import live
 from diffvbd.viz.paths import paths
+from diffvbd.viz.render import render
 from diffvbd.viz.viewer import Viewer
 
 __all__ = [
@@ -28,4 +29,5 @@ __all__ = [
     "learning",
     "live",
     "paths",
+    "render",
 ]

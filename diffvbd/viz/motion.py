@@ -70,6 +70,8 @@ def motions_of(source: Any, mesh: Mesh | None = None, time_step: float | None = 
     Raises:
         TypeError, ValueError: something else, a shape that is not the mesh's, positions that are not finite.
     """
+    if isinstance(source, Motion):
+        return {"motion": source}
     if isinstance(source, Mapping):
         found: dict[str, Motion] = {}
         for name, value in source.items():

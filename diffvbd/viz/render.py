@@ -13,6 +13,7 @@ from ..checks import check_positive, fail
 from ..model.model import Model
 from .drawing import Scenery, as_array
 from .motion import Mesh, Motion, mesh_of, motions_of
+from .opened import opened
 from .scenery import scenery_of
 from .values import Values, rgb
 
@@ -51,7 +52,7 @@ def render(
 
     Args:
         path: The file; the suffix tells which.
-        source, mesh, time_step, color, mu, lam, scenery, colliders: As in :func:`live`, except for files and functions.
+        source, mesh, time_step, color, mu, lam, scenery, colliders: As in :func:`live`, except for functions.
             Motions of a dict, and scenes, are drawn into one picture.
         view: Elevation and azimuth of the eye [degrees]; at azimuth 0 it looks along -x, at 90 along -z.
         zoom: Above 1 closer.
@@ -73,7 +74,12 @@ def render(
     offset = as_array(apart)
     if offset.shape != (3,):
         fail("apart", "shape [3]", f"shape {list(offset.shape)}")
-    motions = [*motions_of(source, mesh, time_step).values()]
+    if isinstance(source, (str, Path)):
+        found = opened(Path(source), time_step)
+        motions, mesh = [*found.motions.values()], found.mesh if mesh is None else mesh
+    else:
+        motions = [*motions_of(source, mesh, time_step).values()]
+    things = [*scenery, *(thing for thing in motions[0].scenery)]
     body, model = mesh_of(mesh), mesh if isinstance(mesh, Model) else None
     if model is None and body is not None and mu is not None and lam is not None:
         model = Model(body)
@@ -81,16 +87,17 @@ def render(
     places = [k * offset for k in range(len(motions))]
     low = np.min([motion.bounds[0] + place for motion, place in zip(motions, places, strict=True)], 0)
     high = np.max([motion.bounds[1] + place for motion, place in zip(motions, places, strict=True)], 0)
-    things, height = [*scenery], None if ground is None or ground == "auto" else float(ground)
-    for thing in scenery_of(mesh, low, high, colliders) if isinstance(mesh, Model) else ():
-        level = np.ptp(as_array(thing.points)[..., 1]) == 0
-        if level and ground == "auto" and height is None:  # the ground stands for it
-            height = float(thing.points[0, 1])
-        else:
-            things.append(thing)
-    everything = [low, high, *(as_array(thing.points).reshape(-1, 3) for thing in things)]
+    height = None if ground is None or ground == "auto" else float(ground)
+    things += scenery_of(mesh, low, high, colliders) if isinstance(mesh, Model) else ()
+    level = [thing for thing in things if np.ptp(as_array(thing.points)[..., 1]) == 0]
+    if ground == "auto" and level:
+        height = float(level[0].points[0, 1])
+    if height is not None:  # the ground stands for floors
+        things = [thing for thing in things if not any(thing is floor for floor in level)]
+    for points in (as_array(thing.points).reshape(-1, 3) for thing in things if np.ptp(as_array(thing.points)[..., 1])):
+        low, high = np.minimum(low, points.min(0)), np.maximum(high, points.max(0))
     if height is None and ground == "auto":
-        height = min(float(np.min(np.atleast_2d(part)[:, 1])) for part in everything)
+        height = float(low[1])
     colored = [values.colors(color, motion) for motion in motions]
     shift = _shift(motions) if color == "body" else [0] * len(motions)
 
@@ -194,7 +201,7 @@ class _Stage:
         surface.cell_data["color"] = np.broadcast_to(colors, (len(triangles), 3)).copy()
         if smooth:
             surface = surface.compute_normals(split_vertices=True, feature_angle=SHARP, cell_normals=False)
-        self.plotter.add_mesh(surface, name=name, scalars="color", rgb=True, ambient=0.28, diffuse=0.85, specular=0.12,
+        self.plotter.add_mesh(surface, name=name, scalars="color", rgb=True, ambient=0.36, diffuse=0.9, specular=0.12,
                               specular_power=15, smooth_shading=smooth, reset_camera=False, render=False)  # fmt: skip
         if self.height is not None:
             above = np.maximum(points[:, 1] - self.height, 0.0)

@@ -264,7 +264,7 @@ class Viewer:
         except (ValueError, TypeError) as failure:
             error, colors = f"{failure}", self.values.colors("body", motion)
         things = (*self._scenery, *motion.scenery)
-        if things != self._things:
+        if [*map(id, things)] != [*map(id, self._things or ())] or self._things is None:
             self._stage.set_scenery(things)
             self._things = things
         if reframe:
