@@ -74,7 +74,7 @@ def twisted_beam(path: Path) -> None:
 
 def throw(path: Path) -> None:
     """A ball thrown into a box by the motion of a sheet that L-BFGS has found."""
-    task(path, "throw", seconds=3.4, view=(38.0, 62.0), zoom=1.15, ground=0.0)
+    task(path, "throw", seconds=3.4, view=(38.0, 62.0), zoom=1.05, ground=0.0)
 
 
 def bounce(path: Path) -> None:

@@ -47,7 +47,7 @@ class Clock:
         """Begins at the start if it stands at the end."""
         if not self.loop and self._now >= self.end:
             self._now = 0.0
-        self.playing = len(self.times) > 1
+        self.playing = True
 
     def advance(self, seconds: float) -> int:
         """Moves on by so many seconds of the viewer; returns the frame."""

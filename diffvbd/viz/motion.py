@@ -16,6 +16,7 @@ from ..mesh.tet_mesh import TetMesh, boundary_faces
 from ..model.model import Model
 from ..rollout.trajectory import Trajectory
 from .drawing import SCENERY, Scenery, as_array, check_surface
+from .surfaces import bodies
 
 Mesh = Model | TetMesh
 
@@ -121,17 +122,6 @@ def positions(name: str, x: Any, vertices: int) -> NDArray[np.float64]:
     return points
 
 
-def components(triangles: NDArray[np.int64], vertices: int) -> NDArray[np.int64]:
-    """Labels [V] of the parts of a surface [F, 3] that are connected: the lowest vertex of each."""
-    label = np.arange(vertices)
-    while True:
-        before = label.copy()
-        np.minimum.at(label, triangles, label[triangles].min(1, keepdims=True))
-        label = label[label]
-        if np.array_equal(label, before):
-            return label
-
-
 # --- files ------------------------------------------------------------------------------------------------------------
 
 MOST_VALUES = 30_000_000  # numbers of a kept motion; longer ones keep every n-th frame
@@ -181,7 +171,7 @@ def load_motions(path: str | PathLike[str]) -> dict[str, Motion]:
             if points.ndim != 3 or points.shape[-1] != 3 or times.shape != points.shape[:1]:
                 raise ValueError(f"positions of shape {list(points.shape)}")
             check_surface(triangles, points.shape[1])
-            body = components(triangles, points.shape[1])
+            body = bodies(triangles, points.shape[1])
             motions[str(name)] = Motion(points, triangles, times, body, scenery=things)
     except FileNotFoundError:
         raise

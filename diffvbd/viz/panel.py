@@ -38,13 +38,14 @@ class Panel:
     ) -> None:
         self.gui = server.gui
         self.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 111, 159))
+        self.gui.main_panel.dock_right()
         self._tell, self._setting = tell, False
         with self.gui.add_folder("Motion"):
             self.motion = self.gui.add_dropdown("show", tuple(names), initial_value=names[0], visible=len(names) > 1)
             self.play = self.gui.add_button("Play")
             self.frame = self.gui.add_slider("frame", 0, 1, 1, 0)
             self.time = self.gui.add_markdown("")
-            self.speed = self.gui.add_dropdown("speed", SPEEDS, initial_value="1")
+            self.speed = self.gui.add_dropdown("playback", SPEEDS, initial_value="1")
             self.loop = self.gui.add_checkbox("loop", True)
             camera = self.gui.add_button("Frame the scene")
         with self.gui.add_folder("Color"):
@@ -63,6 +64,7 @@ class Panel:
         if sliders:
             self._add_sliders(sliders)
         self._chart: Any = None
+        self._label = "loss"
         self._table: Any = None
 
     def _say(self, what: str, value: Any) -> None:
@@ -109,7 +111,7 @@ class Panel:
         text = f"frame {frame} of {frames - 1}{when}"
         if self.time.content != text:
             self.time.content = text
-        label = "Pause" if playing else "Play"
+        label = "Pause" if playing and frames > 1 else "Play"
         if self.play.label != label:
             self.play.label = label
 
@@ -142,13 +144,16 @@ class Panel:
         self._table.content = f"<table style='width:100%;padding:4px 12px;font-size:13px'>{cells}</table>"
 
     def _show_curve(self, iterations: np.ndarray, losses: np.ndarray) -> None:
+        if self._chart is None:
+            self._label = "log10 of the loss" if (losses > 0).all() else "loss"
+        if self._label != "loss":
+            losses = np.log10(np.maximum(losses, 1e-300))
         if self._chart is not None:
             self._chart.data = (iterations, losses)
             return
         from viser import uplot
 
-        logarithmic = bool((losses > 0).all())
-        series = (uplot.Series(label="iteration"), uplot.Series(label="loss", stroke="#2f6f9f", width=2))
-        scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(distr=3 if logarithmic else 1)}
+        series = (uplot.Series(label="iteration"), uplot.Series(label=self._label, stroke="#2f6f9f", width=2))
+        scales = {"x": uplot.Scale(time=False)}
         with self.gui.add_folder("Loss", order=0):
             self._chart = self.gui.add_uplot((iterations, losses), series, scales=scales, aspect=1.6)

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from .drawing import Scenery, as_array
 from .motion import Motion
+from .surfaces import smooth_parts
 from .values import Colors, rgb
 
 EYE = np.array([0.55, 0.4, 1.0])  # direction from the scene to the camera
+ROOM = 1.15  # around the scene, in its radii
 VIEW_ANGLE = 0.7  # [rad] from the lowest to the highest that the camera sees
 
 
@@ -35,7 +37,7 @@ class Stage:
     def look_at(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
         """Puts the camera where it sees all between two corners [m]."""
         middle, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-6)
-        eye = middle + EYE / np.linalg.norm(EYE) * radius / np.sin(0.5 * VIEW_ANGLE)
+        eye = middle + EYE / np.linalg.norm(EYE) * ROOM * radius / np.sin(0.5 * VIEW_ANGLE)
         cameras = [self.server.initial_camera, *(c.camera for c in self.server.get_clients().values())]
         for camera in cameras:
             camera.fov, camera.near, camera.far = VIEW_ANGLE, radius / 100, radius * 100
@@ -55,6 +57,7 @@ class Stage:
                 color=rgb(thing.color),
                 side="double",
                 flat_shading=len(thing.triangles) <= 12,
+                receive_shadow=len(thing.triangles) > 2,  # the map of viser's light ends on a large plane
             )
             self._scenery.append(handle)
             if points.ndim == 3:
@@ -78,6 +81,7 @@ class Stage:
             handle.remove()
         self._bins, self._layers, self._shown = [], [], (motion.triangles, colors)
         start, none = motion.points[0], (np.zeros((3, 3), np.float32), np.array([[0, 1, 2]]))
+        part = smooth_parts(start, motion.triangles)[:, None]
         for k, color in enumerate(colors.palette):
             tint = tuple(int(c) for c in color)
             if colors.unit:
@@ -87,10 +91,12 @@ class Stage:
                     )
                 )
                 continue
-            mine = motion.triangles[colors.levels == k]
-            if len(mine) == 0:
+            rows = colors.levels == k
+            if not rows.any():
                 continue
-            vertices, faces = np.unique(mine, return_inverse=True)
+            # a vertex on a sharp edge is one for each side, lest it be shaded as if it were round
+            of_parts, faces = np.unique(part[rows] * len(start) + motion.triangles[rows], return_inverse=True)
+            vertices = of_parts % len(start)
             handle = self.server.scene.add_mesh_simple(
                 f"/body/{k}", start[vertices], faces.reshape(-1, 3), color=tint, side="double"
             )

@@ -57,6 +57,7 @@ class Viewer:
         self._heard: list[Any] = []
         self._things: Any = None
         self._dirty, self._stopped, self._reframe, self._error = True, False, True, ""
+        self._followed = False  # whether a shape of an optimisation has been shown
         self._changed = threading.Condition(threading.RLock())
         first = motions[self._name]
         self.clock = Clock(first.times, len(first))
@@ -293,6 +294,8 @@ class Viewer:
             return
         self._error = ""
         with self._changed:
+            self._reframe |= not self._followed
+            self._followed = True
             self.motions = found
             self._choose(self._name if self._name in found else next(iter(found)))
 

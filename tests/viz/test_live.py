@@ -160,10 +160,12 @@ def test_the_clock_plays_scrubs_loops_and_ends() -> None:
     assert ticking.end == 1 / clock.RATE
 
 
-def test_a_single_frame_does_not_play() -> None:
+def test_a_single_frame_stays_and_what_follows_plays() -> None:
     alone = clock.Clock(None, 1)
     alone.play()
-    assert not alone.playing and alone.advance(1.0) == 0
+    assert alone.advance(1.0) == 0
+    alone.set_times(None, 3)
+    assert alone.advance(1.5 / clock.RATE) == 1
 
 
 @pytest.fixture

@@ -130,7 +130,7 @@ def test_a_browser_draws_plays_and_reruns() -> None:
 
         def shot() -> np.ndarray:
             """The left part of the page, which the controls do not cover."""
-            raw = page.screenshot(clip={"x": 320, "y": 160, "width": 340, "height": 480})
+            raw = page.screenshot(clip={"x": 20, "y": 160, "width": 620, "height": 480})
             return np.asarray(images.open(io.BytesIO(raw)).convert("RGB"), dtype=int)
 
         def blue() -> np.ndarray:
