@@ -94,8 +94,7 @@ def optimisation(picture: Callable[[dv.viz.Viewer], None]) -> None:
             loss.backward()
             viewer.update(x, loss=loss, mu=log_mu.exp(), gradient=log_mu.grad)
             optimizer.step()
-        time.sleep(0.5)  # until the last shape is drawn, which has the frame
-        viewer.frame = 20
+        viewer.play()
         picture(viewer)
 
 

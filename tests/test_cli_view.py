@@ -40,6 +40,7 @@ def test_view_says_what_is_wrong(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     dv.mesh.cube(3, 0.2).save("part.vtu")
+    monkeypatch.setattr(dv.viz.Viewer, "wait", lambda viewer: None)
     assert cli.main(["view", *arguments]) == 2
     assert expected in capsys.readouterr().err
 

@@ -84,7 +84,7 @@ def motions_of(source: Any, mesh: Mesh | None = None, time_step: float | None = 
     if isinstance(source, (Model, TetMesh)):
         body = mesh_of(source)
         assert body is not None
-        return motions_of(body.points, source)
+        return motions_of(body.points, source, time_step)
     body, step = mesh_of(mesh), None if time_step is None else check_positive("time_step", time_step, "s")
     if body is None:
         raise TypeError(f"mesh: expected a dv.Model or a dv.TetMesh beside {type(source).__name__}, got None")
