@@ -86,7 +86,7 @@ def live(
     body, model = mesh_of(mesh), mesh if isinstance(mesh, Model) else None
     if model is None and body is not None and mu is not None and lam is not None:
         model = Model(body)  # for stresses
-    values = Values(model, mu, lam)
+    values = Values(model, mu, lam, colliders)
     if simulate is not None:
         simulate = _with_material(simulate, values)
         values.mu, values.lam = (_first(ranges, name, value) for name, value in (("mu", mu), ("lam", lam)))

@@ -83,7 +83,7 @@ def render(
     body, model = mesh_of(mesh), mesh if isinstance(mesh, Model) else None
     if model is None and body is not None and mu is not None and lam is not None:
         model = Model(body)
-    values = Values(model, mu, lam)
+    values = Values(model, mu, lam, colliders)
     places = [k * offset for k in range(len(motions))]
     low = np.min([motion.bounds[0] + place for motion, place in zip(motions, places, strict=True)], 0)
     high = np.max([motion.bounds[1] + place for motion, place in zip(motions, places, strict=True)], 0)

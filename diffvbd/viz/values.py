@@ -70,11 +70,13 @@ class Values:
     Attributes:
         model: Scene of the motions; None: there is no stress and no contact.
         mu, lam: Material [Pa], a number or [T] or [B, T]; None: there is no stress and no stiffness.
+        colliders: Where the corner points of the colliders are in each frame [m], shape [N, Vc, 3]; None: at rest.
     """
 
     model: Model | None = None
     mu: Any = None
     lam: Any = None
+    colliders: Any = None
     _kept: dict[tuple[int, str], tuple[Motion, Colors]] = field(default_factory=dict, repr=False)
 
     def colors(self, name: str, motion: Motion) -> Colors:
@@ -164,10 +166,16 @@ class Values:
         found = np.zeros(motion.points.shape[:2])
         x = _like(model, motion.points)
         step = _step_between(motion)
+        places = None if self.colliders is None else _like(model, as_array(self.colliders))
+        if places is not None and len(places) != len(motion):
+            fail("colliders", f"{len(motion)} frames", f"shape {list(places.shape)}")
         for k in range(len(motion)):
-            previous = {"previous": (x[k - 1], x[k - 1]), "time_step": step} if step is not None and k else {}
+            given: dict[str, Any] = {} if places is None else {"colliders": places[k]}
+            if step is not None and k:
+                given |= {"previous": (x[k - 1], x[k - 1]), "time_step": step}
+                given |= {} if places is None else {"colliders_before": places[k - 1]}
             with torch.no_grad():
-                total = forces(model, x[k], **previous).vertices.total
+                total = forces(model, x[k], **given).vertices.total
             found[k] = as_array(total.norm(dim=-1))
         return found[:, motion.triangles].mean(-1)
 

@@ -87,6 +87,17 @@ def test_colors_are_the_quantities() -> None:
     assert known.values("contact", low)[0] == pytest.approx(force[MESH.surface].mean(-1))
 
 
+def test_contact_force_follows_colliders_that_move() -> None:
+    energies = (dv.StableNeoHookean(), dv.PairBarrier())
+    model = dv.Model(MESH, energies=energies, colliders=[dv.colliders.Sphere((0.1, -1.0, 0.1), 0.1)])
+    places = model.collider_points + torch.tensor([[[0.0, 0.0, 0.0]], [[0.0, 0.895, 0.0]]])
+    (both,) = motion.motions_of(torch.stack([X, X]), model).values()
+    force = values.Values(model, colliders=places).values("contact", both)
+    assert force[0].max() == 0.0 < force[1].max()
+    with pytest.raises(ValueError, match=r"colliders: expected 2 frames, got shape \[1, 1, 3\]"):
+        values.Values(model, colliders=places[:1]).values("contact", both)
+
+
 def test_speed_between_frames_needs_times_alone() -> None:
     points = X + torch.tensor([3 * STEP, 0.0, 0.0]) * torch.arange(3.0)[:, None, None]
     (moving,) = motion.motions_of(points, MESH, STEP).values()
