@@ -94,14 +94,26 @@ def test_links_lead_somewhere(page: Path) -> None:
     [
         ("dv", dv, n)
         for n in dv.__all__
-        if n not in ("acceleration", "coarse", "colliders", "contact", "distributed", "integrators", "mesh", "solvers")
+        if n
+        not in (
+            "acceleration",
+            "coarse",
+            "colliders",
+            "contact",
+            "distributed",
+            "integrators",
+            "mesh",
+            "solvers",
+            "viz",
+        )
     ]
     + [("dv.coarse", dv.coarse, n) for n in dv.coarse.__all__]
     + [("dv.colliders", dv.colliders, n) for n in dv.colliders.__all__]
     + [("dv.contact", dv.contact, n) for n in dv.contact.__all__]
     + [("dv.distributed", dv.distributed, n) for n in dv.distributed.__all__]
     + [("dv.mesh", dv.mesh, n) for n in dv.mesh.__all__]
-    + [("dv.solvers", dv.solvers, n) for n in dv.solvers.__all__],
+    + [("dv.solvers", dv.solvers, n) for n in dv.solvers.__all__]
+    + [("dv.viz", dv.viz, n) for n in ("Viewer", "live", "render")],
 )
 def test_public_names_are_documented(prefix: str, module: Any, name: str) -> None:
     value = getattr(module, name)

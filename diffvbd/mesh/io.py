@@ -130,6 +130,14 @@ def read_triangles(path: Path) -> tuple[NDArray[Any], IntArray]:
     return content.points, np.concatenate(found).astype(np.int64)
 
 
+def read_points(path: Path) -> NDArray[Any]:
+    """Points [P, 3] of a mesh file, as they stand in it. Raises as `load` does."""
+    try:
+        return float_array("points", _read(path).points, (None, 3))
+    except (TypeError, ValueError) as failure:
+        raise ValueError(f"mesh file {path}: {failure}") from None
+
+
 def _mesh_of_used_vertices(
     content: meshio.Mesh, cells: NDArray[Any], blocks: list[int], orient: bool
 ) -> tuple[TetMesh, IntArray]:
