@@ -63,7 +63,7 @@ def test_faults_are_found() -> None:
 
 @notebooks
 def test_nothing_is_stored_but_text_and_code(path: Path) -> None:
-    assert faults(read(path)) == []
+    assert faults(read(path)) == [], "clear all outputs before you commit"
     assert path.stat().st_size <= LARGEST
 
 
