@@ -18,6 +18,7 @@ export OMP_WAIT_POLICY ?= PASSIVE
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 ENVIRONMENT := $(VENV)/environment.stamp
+TUTORIALS := $(VENV)/tutorials.stamp
 NATIVE := diffvbd/_C.abi3.so
 SOURCES := $(shell find csrc -type f -name '*.h' -o -type f -name '*.cpp' -o -type f -name '*.cu*')
 
@@ -40,7 +41,7 @@ lint: $(ENVIRONMENT)
 	$(BIN)/pyright
 	$(BIN)/clang-format --dry-run -Werror $(SOURCES)
 
-docs: build
+docs: build $(if $(filter off,$(NOTEBOOKS)),,$(TUTORIALS))
 	$(BIN)/python -m sphinx -q -E -W --keep-going -b html -d build/doctrees -D nb_execution_mode=$(NOTEBOOKS) docs build/docs $(ARGS)
 
 linkcheck: build
@@ -56,6 +57,11 @@ $(ENVIRONMENT): .ci/bootstrap.py pyproject.toml
 	$(PYTHON) .ci/bootstrap.py $(VENV)
 	@echo "building diffvbd and installing its tools (minutes)"
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation -e ".[dev]"
+	@touch $@
+
+# What executing the tutorials takes beyond the environment. diffvbd itself is there already: pip adds the extra only.
+$(TUTORIALS): $(ENVIRONMENT)
+	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation "diffvbd[docs]"
 	@touch $@
 
 # pip has just built it in a new environment. Later this recompiles only what an edit concerns (--force: setuptools

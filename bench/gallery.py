@@ -1,6 +1,7 @@
 """Animations of what diffvbd does, rendered into docs/images/gallery: `python -m bench gallery [--only NAME,...]`.
 
-No measurement: small scenes at modest resolution, some minutes in all on one core. Needs the extra [viz].
+Those named after an inverse problem stand on its card in docs/gallery.md, the others below the cards. No measurement:
+small scenes at modest resolution, some minutes in all on one core. Needs the extra [viz].
 """
 
 from __future__ import annotations
@@ -198,13 +199,13 @@ def gripper(path: Path) -> None:
 
 
 SCENES: dict[str, Callable[[Path], None]] = {
-    "beam": twisted_beam,
+    "beam_mu": twisted_beam,
     "throw": throw,
     "boxes": stacked_boxes,
     "cloth": cloth,
-    "dress": gown,
+    "dress_mu_lam": gown,
     "gripper": gripper,
-    "controller": controller,
-    "bounce": bounce,
+    "learn_controller": controller,
+    "bunny_bounce": bounce,
     "cubes": many_cubes,
 }

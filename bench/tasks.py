@@ -117,7 +117,7 @@ def page(folder: Path, images: Path, root: Path) -> str:
 
 
 def gallery(folder: Path) -> str:
-    """A card for each task: its picture, what it does, the figures of its main run, and where its code is."""
+    """A card for each task: its animation or else its picture, what it does, the figures of its main run, and where its code is."""
     cards = []
     for name, paper in PAPER.items():
         logs = {device: folder / f"{name}{suffix}.json" for device, suffix in (("CPU", ""), ("GPU", "-cuda"))}
@@ -130,10 +130,12 @@ def gallery(folder: Path) -> str:
         said = f" The paper: {paper.outcome}." if paper.outcome else ""
         count = main_run["variables"]
         summary = TASKS[name].summary
+        animation = (IMAGES.parent / "gallery" / picture_of(name, IMAGES).name).with_suffix(".webp")
+        shown = animation if animation.exists() else picture_of(name, IMAGES)
         cards.append(f"""\
 :::{{grid-item-card}} {name}
 
-![{summary}](images/tasks/{picture_of(name, IMAGES).name})
+![{summary}]({shown.relative_to(IMAGES.parents[1]).as_posix()})
 
 {summary[0].upper()}{summary[1:]}.
 

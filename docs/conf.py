@@ -1,12 +1,9 @@
 """The site, built by `make docs`: Sphinx with the theme furo; pages in Markdown and notebooks are read by MyST-NB."""
 
 import re
-from pathlib import Path
 from typing import Any
 
 import diffvbd
-
-DOCS = Path(__file__).parent
 
 project = "diffvbd"
 author = copyright = "diffvbd authors"
@@ -35,12 +32,12 @@ html_css_files = ["site.css"]
 html_show_sourcelink = False
 copybutton_exclude = ".linenos, .gp, .go"
 
-myst_enable_extensions = ["colon_fence", "deflist"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 6
 
 # `make docs` executes notebooks, `make docs NOTEBOOKS=off` does not.
 nb_execution_mode = "off"
-nb_execution_timeout = 600
+nb_execution_timeout = 1200  # [s], of one cell, on a busy machine
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 
@@ -71,10 +68,6 @@ def adapt(app: object, docname: str, source: list[str]) -> None:
     text = source[0]
     if docname in ("results/index", "reference/index"):
         text += CONTENTS
-    if docname == "index":  # pages that may be absent
-        text = re.sub(r"^((?:tutorials/|viewer)\S*)\n", present, text, flags=re.MULTILINE)
-    if docname in ("index", "gallery"):  # the animation of a task, where there is one, in place of its picture
-        text = re.sub(r"images/tasks/(\w+)\.png", animated, text)
     # outside of docs/, which Sphinx does not read
     source[0] = re.sub(r"\]\((?:\.\./)+(CONTRIBUTING|CHANGELOG)\.md", lambda m: f"](/{m[1].lower()}.md", text)
 
@@ -89,15 +82,6 @@ def escape(app: object, what: str, name: str, obj: object, options: object, line
 def skip(app: object, what: str, name: str, obj: object, is_skipped: bool, options: object) -> bool | None:
     """Fields of named tuples: the docstring of the class has them."""
     return True if str(getattr(obj, "__doc__", "")).startswith("Alias for field number") else None
-
-
-def present(found: re.Match[str]) -> str:
-    return found[0] if any(DOCS.glob(found[1])) else ""
-
-
-def animated(found: re.Match[str]) -> str:
-    path = f"images/gallery/{found[1]}.webp"
-    return path if (DOCS / path).exists() else found[0]
 
 
 def setup(app: Any) -> None:
