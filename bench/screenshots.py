@@ -64,7 +64,7 @@ def scene() -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
 
 
 def motion(picture: Callable[[dv.viz.Viewer], None]) -> None:
-    """Bodies that land, colored by stress."""
+    """Bodies that land, colored by speed."""
     model, x, v = scene()
     material = {"mu": 4e4, "lam": 4e4}
     run = dv.rollout(model, x, v, steps=60, time_step=0.01, sweeps=12, **material)

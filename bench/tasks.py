@@ -117,7 +117,7 @@ def page(folder: Path, images: Path, root: Path) -> str:
 
 
 def gallery(folder: Path) -> str:
-    """A card for each task: its animation or else its picture, what it does, the figures of its main run, and where its code is."""
+    """A card for each task: animation or picture, what it does, the figures of its main run, and where its code is."""
     cards = []
     for name, paper in PAPER.items():
         logs = {device: folder / f"{name}{suffix}.json" for device, suffix in (("CPU", ""), ("GPU", "-cuda"))}
@@ -127,7 +127,7 @@ def gallery(folder: Path) -> str:
         times = ", ".join(f"{seconds(run):.3g} s on the {device}" for device, run in runs.items())
         main_run = next(iter(runs.values()))
         module = TASKS[name].build.__module__.replace(".", "/")
-        said = f" The paper: {paper.outcome}." if paper.outcome else ""
+        said = f" The paper: {paper.outcome}." if paper.outcome.strip("-") else ""
         count = main_run["variables"]
         summary = TASKS[name].summary
         animation = (IMAGES.parent / "gallery" / picture_of(name, IMAGES).name).with_suffix(".webp")
