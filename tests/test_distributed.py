@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
@@ -171,7 +172,9 @@ def test_a_run_over_ranks_goes_on_and_its_first_rank_alone_writes(tmp_path: Path
     assert len(alone["history"]) == 6
     for found in on_ranks(launch, 2, tmp_path / "ranks", tmp_path / "together"):
         assert leaves(found) == leaves(alone)
-    assert {path.name for path in (tmp_path / "together").iterdir()} == {"log.json"}
+    assert {path.name for path in (tmp_path / "together").iterdir()} == {"log.json", "motion.npz"}
+    whole, gathered = (np.load(tmp_path / name / "motion.npz") for name in ("alone", "together"))
+    assert whole.files == gathered.files and all(np.array_equal(whole[key], gathered[key]) for key in whole.files)
 
 
 @pytest.mark.slow
