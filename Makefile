@@ -2,12 +2,15 @@
 # make test    the quick tests, a process for each core (ARGS='-k floor' and the like are passed to pytest)
 # make test-all  the slow tests, too; ARGS='-m hours' instead: what is run by hand before a release
 # make lint    ruff, pyright and clang-format in check mode
+# make docs    the site into build/docs, warnings are errors; tutorials are executed (NOTEBOOKS=off: not)
+# make linkcheck  addresses of other sites in docs/ (needs the internet)
 # make wheels  sdist and CPU wheel into dist/ (minutes); `make try-wheels` runs the wheel in new environments
 # make clean   remove what the build made; `make distclean` removes the environment too
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+NOTEBOOKS ?= cache
 
 # Idle OpenMP threads sleep instead of spinning; read when torch is loaded, so it is set here.
 export OMP_WAIT_POLICY ?= PASSIVE
@@ -15,10 +18,11 @@ export OMP_WAIT_POLICY ?= PASSIVE
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 ENVIRONMENT := $(VENV)/environment.stamp
+TUTORIALS := $(VENV)/tutorials.stamp
 NATIVE := diffvbd/_C.abi3.so
 SOURCES := $(shell find csrc -type f -name '*.h' -o -type f -name '*.cpp' -o -type f -name '*.cu*')
 
-.PHONY: run build test test-all lint wheels try-wheels clean distclean
+.PHONY: run build test test-all lint docs linkcheck wheels try-wheels clean distclean
 
 run: build
 	$(BIN)/python -m diffvbd run beam-mu $(ARGS)
@@ -37,6 +41,12 @@ lint: $(ENVIRONMENT)
 	$(BIN)/pyright
 	$(BIN)/clang-format --dry-run -Werror $(SOURCES)
 
+docs: build $(if $(filter off,$(NOTEBOOKS)),,$(TUTORIALS))
+	$(BIN)/python -m sphinx -q -E -W --keep-going -b html -d build/doctrees -D nb_execution_mode=$(NOTEBOOKS) docs build/docs $(ARGS)
+
+linkcheck: build
+	$(BIN)/python -m sphinx -q -b linkcheck docs build/linkcheck $(ARGS)
+
 wheels:
 	$(PYTHON) .ci/wheels.py build $(ARGS)
 
@@ -47,6 +57,11 @@ $(ENVIRONMENT): .ci/bootstrap.py pyproject.toml
 	$(PYTHON) .ci/bootstrap.py $(VENV)
 	@echo "building diffvbd and installing its tools (minutes)"
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation -e ".[dev]"
+	@touch $@
+
+# What executing the tutorials takes beyond the environment. diffvbd itself is there already: pip adds the extra only.
+$(TUTORIALS): $(ENVIRONMENT)
+	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation "diffvbd[docs]"
 	@touch $@
 
 # pip has just built it in a new environment. Later this recompiles only what an edit concerns (--force: setuptools

@@ -1,9 +1,10 @@
-"""`python -m bench NAME [--quick] [--device D] [--out DIR]`; NAME may also be list, all, tasks or report.
+"""`python -m bench NAME [--quick] [--device D] [--out DIR]`; NAME may also be list, all, tasks, report, gallery or
+screenshots.
 
 A benchmark is a module of this package with a function run(quick) that returns a dict, and optionally markdown(results)
 that turns it into text. A run that also takes `device`, `only` or `out` gets them from the command line. Results go to
-NAME.json and NAME.md, of a run on CUDA to NAME-cuda.json and NAME-cuda.md; `report` makes docs/results.md of all,
-and docs/tasks.md of the logs of inverse problems, which `tasks` runs.
+NAME.json and NAME.md, of a run on CUDA to NAME-cuda.json and NAME-cuda.md; `report` makes docs/results of all, and
+docs/tasks.md of the logs of inverse problems, which `tasks` runs. `gallery` and `screenshots` make pictures.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from types import ModuleType
 import torch
 
 import bench
-from bench import common, report, tasks
+from bench import common, gallery, report, screenshots, tasks
 
 ASKED = ("bits",)  # only when they are asked for by name: what is written is no result
 PAPER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's own measurements, in its order
@@ -34,7 +35,9 @@ def benchmarks() -> dict[str, ModuleType]:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench", description="Runs a benchmark and writes its results.")
-    parser.add_argument("name", help="a benchmark; all: the paper's, then the others; tasks, report, list")
+    parser.add_argument(
+        "name", help="a benchmark; all: the paper's, then the others; tasks, report, gallery, screenshots, list"
+    )
     parser.add_argument("--quick", action="store_true", help="a few small cases; written only where --out says")
     parser.add_argument("--out", type=Path, help="folder of the results (default: bench/results); report reads it, too")
     parser.add_argument("--device", help="where to measure, if the benchmark lets one choose: cuda, cuda:1, cpu")
@@ -46,6 +49,10 @@ def main(arguments: list[str] | None = None) -> int:
         return report.main(options.out)
     if options.device and torch.device(options.device).type == "cuda" and not torch.cuda.is_available():
         parser.error(f"--device: expected a device of this machine, got {options.device}, and torch sees no CUDA here")
+    if options.name == "gallery":
+        return gallery.main(options.only, options.out)
+    if options.name == "screenshots":
+        return screenshots.main(options.out)
     if options.name == "tasks":
         return tasks.main(
             options.only, options.device or "cpu", options.seeds, options.options, options.out, options.quick
@@ -60,7 +67,8 @@ def main(arguments: list[str] | None = None) -> int:
     if options.name in ASKED and options.out is None:
         parser.error(f"--out: {options.name} is compared between two folders, and needs one")
     if options.name not in known:
-        parser.error(f"name: expected one of {', '.join(known)}, all, tasks, report or list, got {options.name}")
+        others = "all, tasks, report, gallery, screenshots or list"
+        parser.error(f"name: expected one of {', '.join(known)}, {others}, got {options.name}")
     accepted = inspect.signature(known[options.name].run).parameters
     for key in ("device", "only"):
         if getattr(options, key) is not None and key not in accepted:

@@ -1,4 +1,4 @@
-"""Plots of results, for docs/results.md. They need matplotlib."""
+"""Plots of results, for the pages in docs/results. They need matplotlib."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""`python -m bench report`: every result of bench/results as docs/results.md, logs of inverse problems as
-docs/tasks.md, and figures into docs/performance.md and docs/choosing.md."""
+"""`python -m bench report`: every result of bench/results as a page in docs/results, logs of inverse problems as
+docs/tasks.md, and figures into docs/performance.md, docs/guides/choose-settings.md and docs/gallery.md."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from bench.common import RESULTS, commit, is_ancestor, markdown_table, place
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "performance.md"
-RESULTS_PAGE = ROOT / "docs" / "results.md"
-CHOOSING_PAGE = ROOT / "docs" / "choosing.md"
+RESULTS_PAGES = ROOT / "docs" / "results"
+CHOOSING_PAGE = ROOT / "docs" / "guides" / "choose-settings.md"
+GALLERY_PAGE = ROOT / "docs" / "gallery.md"
 TASKS_PAGE = ROOT / "docs" / "tasks.md"
 BENCHMARKS = ("cpu", "gpu")  # whose figures docs/performance.md shows, in this order
 ORDER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's come first, the others by name
@@ -33,29 +34,36 @@ EMPTY = "No figures yet: run `python -m bench cpu` or `python -m bench gpu`, the
 INTRODUCTION = """\
 # Results
 
-Every measurement of `bench/`, written by `python -m bench report` from the JSON files in `bench/results`; no figure
-here was typed. `python -m bench NAME` makes one again, `python -m bench all` all of them; `--device cuda` measures on a
-GPU, `--quick` tries a script out in seconds. Where the paper states a figure for the same thing, it stands beside ours;
-its scenes, meshes and machines are others, as the text of each table says.
+Every measurement of `bench/`, a page for each benchmark. `python -m bench report` writes these pages from the JSON
+files in `bench/results`; no figure here was typed.
+
+    python -m bench NAME                 # measure one again
+    python -m bench all                  # all of them
+    python -m bench NAME --device cuda   # on a GPU
+    python -m bench NAME --quick --out X # try a script out in seconds
+
+Where the paper states a figure for the same thing, it stands beside ours. Its scenes, meshes and machines are others,
+as the text of each table says.
 """
 
 
 def main(out: Path | None = None) -> int:
-    """Fills the pages, if every result says what it was measured on; with a folder, makes results.md there of the
-    results in it, whatever they were measured on, and leaves docs alone."""
+    """Fills the pages, if every result says what it was measured on; with a folder, makes pages there of the results
+    in it, whatever they were measured on, and leaves docs alone."""
     if out is not None:
-        page = out / "results.md"
-        page.write_text(results_page(out, out / "images"), encoding="utf-8")
-        print(f"wrote {page}")
+        write_pages(results_pages(out, out / "images"), out / "results")
+        print(f"wrote {out / 'results'}")
         return 0
     if wrong := refused(RESULTS):
         print("\n".join([*wrong, "nothing written: measure these again on a clean commit"]), file=sys.stderr)
         return 1
-    RESULTS_PAGE.write_text(results_page(RESULTS, ROOT / "docs" / "images"), encoding="utf-8")
+    write_pages(results_pages(RESULTS, ROOT / "docs" / "images"), RESULTS_PAGES)
     TASKS_PAGE.write_text(tasks.page(RESULTS / "tasks", tasks.IMAGES, ROOT / "docs"), encoding="utf-8")
     PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), section(RESULTS)), encoding="utf-8")
     CHOOSING_PAGE.write_text(filled(CHOOSING_PAGE.read_text(encoding="utf-8"), fronts(RESULTS)), encoding="utf-8")
-    for page in (RESULTS_PAGE, TASKS_PAGE, PAGE, CHOOSING_PAGE):
+    cards = tasks.gallery(RESULTS / "tasks")
+    GALLERY_PAGE.write_text(filled(GALLERY_PAGE.read_text(encoding="utf-8"), cards), encoding="utf-8")
+    for page in (RESULTS_PAGES, TASKS_PAGE, PAGE, CHOOSING_PAGE, GALLERY_PAGE):
         print(f"wrote {page.relative_to(ROOT)}")
     return 0
 
@@ -145,38 +153,54 @@ def machine(environment: dict[str, Any]) -> str:
     return f"{where}; {versions}; {known.get('date', 'no date')}."
 
 
-# --- docs/results.md --------------------------------------------------------------------------------------------------
+# --- docs/results -----------------------------------------------------------------------------------------------------
 
 
-def results_page(results: Path, images: Path) -> str:
-    """The page of all results in a folder; its plots are written to `images`, a folder beside the page."""
+def results_pages(results: Path, images: Path) -> dict[str, str]:
+    """The pages of all results in a folder by their names: an index, and one for each benchmark. Their plots are
+    written to `images`, a folder beside that of the pages."""
     found = harvest(results)
     header = ("benchmark", "on", "torch", "date", "commit", "run")
     rows = []
     for name, stem, content in found:
         e = content["environment"]
         run = "quick" if content.get("quick") else "full"
-        rows.append((f"[{stem}](#{name})", place(e), e.get("torch"), e.get("date"), commit(e), run))
+        rows.append((f"[{stem}]({name}.md)", place(e), e.get("torch"), e.get("date"), commit(e), run))
     parts = [INTRODUCTION, markdown_table(header, rows), paper.beside(results)] if rows else [INTRODUCTION, EMPTY]
-    for name in dict.fromkeys(name for name, _, _ in found):
-        module = importlib.import_module(f"bench.{name}")
-        parts.append(f"## {name}\n\n{inspect.cleandoc(module.__doc__ or '')}\n")
-        for _, stem, content in (entry for entry in found if entry[0] == name):
-            e = content["environment"]
-            parts.append(f"### {stem}, on {place(e)}\n\n{machine(e)} Commit {commit(e)}.\n")
-            if name in BENCHMARKS:
-                parts.append("Its tables stand in [performance.md](performance.md#figures).\n")
-                continue
-            try:
-                if plots.draw(name, content["results"], images / f"results_{stem}.png"):
-                    parts.append(f"![{plots.CAPTIONS[name]}]({images.name}/results_{stem}.png)\n")
-                tables = module.markdown(content["results"])
-            except (KeyError, TypeError) as error:
-                raise ValueError(f"{stem}.json: expected results of the present bench.{name}, got older ones; run it "
-                                 "again") from error  # fmt: skip
-            # the page has three levels of its own above those of a benchmark
-            parts.append(re.sub(r"^#", "###", tables, flags=re.MULTILINE))
-    return "\n".join(part for part in parts if part).rstrip() + "\n"
+    pages = {"index": parts}
+    for name, stem, content in found:
+        if name not in pages:
+            module = importlib.import_module(f"bench.{name}")
+            pages[name] = [f"# {name}\n\n{inspect.cleandoc(module.__doc__ or '')}\n"]
+        pages[name] += result(name, stem, content, images)
+    return {name: "\n".join(part for part in parts if part).rstrip() + "\n" for name, parts in pages.items()}
+
+
+def result(name: str, stem: str, content: dict[str, Any], images: Path) -> list[str]:
+    """Machine, plot and tables of one file of results."""
+    e = content["environment"]
+    parts = [f"## {stem}, on {place(e)}\n\n{machine(e)} Commit {commit(e)}.\n"]
+    if name in BENCHMARKS:
+        return [*parts, "Its tables stand in [performance](../performance.md#figures).\n"]
+    try:
+        if plots.draw(name, content["results"], images / f"results_{stem}.png"):
+            parts.append(f"![{plots.CAPTIONS[name]}](../{images.name}/results_{stem}.png)\n")
+        tables = importlib.import_module(f"bench.{name}").markdown(content["results"])
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{stem}.json: expected results of the present bench.{name}, got older ones; run it "
+                         "again") from error  # fmt: skip
+    # the page has two levels of its own above those of a benchmark, which begin at the second
+    return [*parts, re.sub(r"^#", "##", tables, flags=re.MULTILINE)]
+
+
+def write_pages(pages: Mapping[str, str], folder: Path) -> None:
+    """Writes the pages and removes those of results that are gone."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for page in folder.glob("*.md"):
+        if page.stem not in pages:
+            page.unlink()
+    for name, text in pages.items():
+        (folder / f"{name}.md").write_text(text, encoding="utf-8")
 
 
 def harvest(results: Path) -> list[tuple[str, str, dict[str, Any]]]:

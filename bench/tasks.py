@@ -2,7 +2,7 @@
 
 Runs inverse problems and keeps their logs, each with the machine it ran on, as results/tasks/NAME.json, with device,
 options and seed added where they are others; the picture of seed 0 goes to docs/images/tasks. `python -m bench
-report` makes docs/tasks.md of them.
+report` makes docs/tasks.md of them and the cards of docs/gallery.md.
 """
 
 from __future__ import annotations
@@ -114,6 +114,37 @@ def page(folder: Path, images: Path, root: Path) -> str:
                      all(met) if met else None))  # fmt: skip
         parts.append(section(name, runs, main_run, images, root))
     return "\n".join([INTRODUCTION, markdown_table(header, rows), *parts]).rstrip() + "\n"
+
+
+def gallery(folder: Path) -> str:
+    """A card for each task: animation or picture, what it does, the figures of its main run, and where its code is."""
+    cards = []
+    for name, paper in PAPER.items():
+        logs = {device: folder / f"{name}{suffix}.json" for device, suffix in (("CPU", ""), ("GPU", "-cuda"))}
+        runs = {d: json.loads(path.read_text(encoding="utf-8")) for d, path in logs.items() if path.exists()}
+        if not runs:
+            continue
+        times = ", ".join(f"{seconds(run):.3g} s on the {device}" for device, run in runs.items())
+        main_run = next(iter(runs.values()))
+        module = TASKS[name].build.__module__.replace(".", "/")
+        said = f" The paper: {paper.outcome}." if paper.outcome.strip("-") else ""
+        count = main_run["variables"]
+        summary = TASKS[name].summary
+        animation = (IMAGES.parent / "gallery" / picture_of(name, IMAGES).name).with_suffix(".webp")
+        shown = animation if animation.exists() else picture_of(name, IMAGES)
+        cards.append(f"""\
+:::{{grid-item-card}} {name}
+
+![{summary}]({shown.relative_to(IMAGES.parents[1]).as_posix()})
+
+{summary[0].upper()}{summary[1:]}.
+
+{count:,} unknown{"s" if count > 1 else ""}, {len(main_run["history"])} evaluations, {times}: {outcome(main_run)}.{said}
+
+[Figures](tasks.md#{name}) · [code](../{module}.py) · `diffvbd run {name}`
+:::
+""")
+    return "::::{grid} 1 1 2 2\n:gutter: 3\n\n" + "\n".join(cards) + "\n::::\n"
 
 
 def place_on_page(entry: tuple[str, dict[str, Any]]) -> tuple[str, int, int, str]:

@@ -300,7 +300,7 @@ def markdown(results: dict[str, Any]) -> str:
         if group["peers"]:
             text.append(markdown_table(("solver", *(f"ms to {e:g}" for e in ERRORS), "least error", "in ms", "note"),
                                        others_of(group["peers"])))  # fmt: skip
-    return "\n".join(text) + common.of_several_runs(results)
+    return "\n".join(text) + "\n" + common.of_several_runs(results)
 
 
 def summary(results: dict[str, Any], error: float = 0.01) -> str:
@@ -316,4 +316,4 @@ def summary(results: dict[str, Any], error: float = 0.01) -> str:
                       f"{told['ms']:.3g} ms: {told['error']:.1g}" if told["reached"] else "cannot be had"))  # fmt: skip
     header = ("scene", "vertices, duration", "the fastest way", "implicit Euler alone",
               f"`dv.advise` for {100 * error:g} %: its true error")  # fmt: skip
-    return markdown_table(header, table) + common.of_several_runs(results)
+    return markdown_table(header, table) + "\n" + common.of_several_runs(results)

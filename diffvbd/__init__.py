@@ -7,7 +7,7 @@ from typing import Any as _Any
 # Idle threads that spin make a parallel region cost milliseconds on a busy machine; only the first import decides.
 _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from . import colliders, contact, distributed, mesh, solvers
+from . import colliders, contact, distributed, mesh, solvers, viz
 from ._version import __version__ as __version__
 from .adjoint.routes import GlobalAdjoint, LinearSolve, ReverseSweep, Unrolled
 from .contact.barrier import Friction, PairBarrier
@@ -92,6 +92,7 @@ __all__ = [
     "step_backward",
     "step_forward",
     "stress",
+    "viz",
     "young_poisson",
 ]
 

@@ -4,7 +4,8 @@ import argparse
 import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +13,20 @@ import numpy as np
 import torch
 
 import diffvbd as dv
-from diffvbd import cli_mesh
+from diffvbd import cli_mesh, cli_view
 from diffvbd.mesh.series import EXTENSIONS, check_extension
 from diffvbd.rollout.search import ERROR, PATIENCE
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
 from diffvbd.tasks.problem import Result, check_device
-from diffvbd.tasks.progress import versions
+from diffvbd.tasks.progress import Row, versions
 from diffvbd.tasks.ranks import joined
-from diffvbd.tasks.scene import INTEGRATORS, MOST_STEPS, Array, Observation, Scene
+from diffvbd.tasks.scene import INTEGRATORS, MOST_STEPS, Observation, Scene, side
 
 DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Units: m, kg, s, Pa; y points up."
 EXAMPLES = """examples:
   diffvbd run beam-mu                              identify a beam's shear modulus: log, table and picture in runs/
   diffvbd run beam-mu --quick                      the same on a small beam, in seconds
+  diffvbd view runs/beam-mu                        its motions in the browser; also of part.pvd or a mesh
   diffvbd mesh scan.ply --size 0.2 --up z -o part.msh
                                                    repair a scan, make it 0.2 m large and fill it with tets
   diffvbd simulate part.msh --out part.pvd --pin x- --young 1e5 --poisson 0.3
@@ -89,12 +91,15 @@ def _parser() -> argparse.ArgumentParser:
     _add_run_options(run, "runs/NAME, or runs/NAME-quick")
     for name, texts in sorted(_task_options().items()):
         run.add_argument(f"--{name}", help="; ".join(texts))
+    run.add_argument("--view", action="store_true", help="show the run in the browser while it goes on; extra [viz]")
+    cli_view.add_server(run)
     run.set_defaults(command=_run)
 
     listing = commands.add_parser("list", help="list the shipped inverse problems")
     listing.set_defaults(command=lambda options: print(_task_list()))
 
     cli_mesh.add(commands)
+    cli_view.add(commands)
 
     simulate = commands.add_parser("simulate", help="simulate a mesh and write its motion")
     simulate.add_argument("mesh", type=Path, metavar="MESH", help="a file with tetrahedra (.msh, .vtu, .vtk, ...)")
@@ -195,11 +200,12 @@ def _run(options: argparse.Namespace) -> None:
     given = task.chosen(given)
     with joined(options.device, task.splits):
         check_device(options.device)
-        _solve(task.build(settings, **given), settings)
+        with cli_view.watched(options.host, options.port) if options.view else nullcontext() as watch:
+            _solve(task.build(settings, **given), settings, watch)
 
 
-def _solve(problem: Problem, settings: Settings) -> Result:
-    result = solve(problem, settings)
+def _solve(problem: Problem, settings: Settings, watch: Callable[[Row], None] | None = None) -> Result:
+    result = solve(problem, settings, watch)
     print(table(problem, result))
     print("wrote " + ", ".join(str(path) for path in result.files))
     return result
@@ -378,21 +384,5 @@ def _given_scene_options(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[
              "integrator")  # fmt: skip
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     if options.pin:
-        given["pinned"] = np.logical_or.reduce([_side(mesh.points, text) for text in options.pin])
+        given["pinned"] = np.logical_or.reduce([side(mesh.points, text) for text in options.pin])
     return given
-
-
-def _side(points: Array, text: str) -> np.ndarray:
-    """Mask [V] of the vertices at a side of the bounding box, written as in --pin."""
-    side, _, fraction = text.partition(":")
-    try:
-        share = float(fraction or "0.001")
-    except ValueError:
-        share = -1.0
-    if len(side) != 2 or side[0] not in "xyz" or side[1] not in "-+" or not 0.0 <= share <= 1.0:
-        raise ValueError(f"--pin: expected x-, x+, y-, y+, z- or z+, with or without :FRACTION in 0..1, got {text!r}")
-    along = points[:, "xyz".index(side[0])]
-    low, high = along.min(), along.max()
-    # The relative position decides, so rounding cannot leave out vertices that lie exactly in the side.
-    position = (along - low) / (high - low) if side[1] == "-" else (high - along) / (high - low)
-    return position <= share

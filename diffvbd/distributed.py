@@ -20,7 +20,8 @@ from .checks import check_count, fail
 
 if dist.is_available():
     # The first step of an optimiser imports this. Its defaults then keep the process group alive beyond
-    # destroy_process_group, and a program over gloo may abort as it ends. Imported before there is a group, they do not.
+    # destroy_process_group, and a program over gloo may abort as it ends. Imported before there is a group, they do
+    # not.
     import torch.distributed.nn
 
 __all__ = ["backward", "gathered", "own", "share"]

@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
@@ -24,7 +25,7 @@ from diffvbd.tasks import Problem, Settings, solve
 from diffvbd.tasks.million_cubes import launch_pad
 from diffvbd.testing import relative_error, tolerance
 
-ENVIRONMENT = {"TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}  # what docs/scale.md tells users to set
+ENVIRONMENT = {"TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}  # what docs/guides/scale-out.md tells users to set
 SCENES, PARTS = 7, 3  # which two ranks cannot share evenly
 KILL = """
 import os, signal
@@ -171,7 +172,9 @@ def test_a_run_over_ranks_goes_on_and_its_first_rank_alone_writes(tmp_path: Path
     assert len(alone["history"]) == 6
     for found in on_ranks(launch, 2, tmp_path / "ranks", tmp_path / "together"):
         assert leaves(found) == leaves(alone)
-    assert {path.name for path in (tmp_path / "together").iterdir()} == {"log.json"}
+    assert {path.name for path in (tmp_path / "together").iterdir()} == {"log.json", "motion.npz"}
+    whole, gathered = (np.load(tmp_path / name / "motion.npz") for name in ("alone", "together"))
+    assert whole.files == gathered.files and all(np.array_equal(whole[key], gathered[key]) for key in whole.files)
 
 
 @pytest.mark.slow
@@ -185,8 +188,10 @@ def test_the_gradient_is_that_of_distributed_data_parallel(tmp_path: Path) -> No
 
 
 def script() -> str:
-    """The program of docs/scale.md that users are told to save."""
-    (first, *_) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "scale.md").read_text(), re.M | re.S)
+    """The program of docs/guides/scale-out.md that users are told to save."""
+    (first, *_) = re.findall(
+        r"^```python\n(.*?)^```$", (ROOT / "docs" / "guides" / "scale-out.md").read_text(), re.M | re.S
+    )
     return first
 
 

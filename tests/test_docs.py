@@ -8,18 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from helpers.paths import ROOT
 
 import diffvbd as dv
 from diffvbd.testing import tolerance
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 # How a docstring states the shape of an array: "shape [...]", a bracket of sizes, or by reference to another function.
 SHAPE = re.compile(r"shape|\[[^\]]*\b(V|T|F|P|N|B|3)\b[^\]]*\]|[Aa]s in ")
 ARRAYS = {"points", "tets", "body", "triangles", "surface", "offsets", "frames", "low", "high", "pinned", "density"}
 
-pages = pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+pages = pytest.mark.parametrize("page", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
 
 
 def fences(page: Path) -> list[tuple[str, str]]:
@@ -40,7 +41,24 @@ def test_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         if info == "python":
             exec(compile(text, str(page), "exec"), names)
     if page.name == "README.md":
+        check_gradient(names)
+    if page.name == "identify-a-material.md":
         assert names["log_mu"].exp().item() == pytest.approx(1.5e5, rel=tolerance("identified_by_example"))
+
+
+def check_gradient(names: dict[str, Any]) -> None:
+    """The gradient of the first example is that of differences, and of the sign that it says."""
+
+    def height(mu: torch.Tensor) -> torch.Tensor:
+        options = {"steps": 20, "mu": mu, "lam": 2e5, "time_step": 0.01, "sweeps": 15}
+        return dv.rollout(names["model"], names["x"], names["v"], **options).x[-1, :, 1].mean()
+
+    mu = names["mu"].detach()
+    assert torch.equal(height(mu), names["height"])
+    step = 1e-3 * mu
+    difference = (height(mu + step) - height(mu - step)) / (2 * step)
+    assert mu.grad is None and names["mu"].grad > 0
+    assert names["mu"].grad.item() == pytest.approx(difference.item(), rel=tolerance("finite_difference"))
 
 
 @pages
@@ -76,14 +94,26 @@ def test_links_lead_somewhere(page: Path) -> None:
     [
         ("dv", dv, n)
         for n in dv.__all__
-        if n not in ("acceleration", "coarse", "colliders", "contact", "distributed", "integrators", "mesh", "solvers")
+        if n
+        not in (
+            "acceleration",
+            "coarse",
+            "colliders",
+            "contact",
+            "distributed",
+            "integrators",
+            "mesh",
+            "solvers",
+            "viz",
+        )
     ]
     + [("dv.coarse", dv.coarse, n) for n in dv.coarse.__all__]
     + [("dv.colliders", dv.colliders, n) for n in dv.colliders.__all__]
     + [("dv.contact", dv.contact, n) for n in dv.contact.__all__]
     + [("dv.distributed", dv.distributed, n) for n in dv.distributed.__all__]
     + [("dv.mesh", dv.mesh, n) for n in dv.mesh.__all__]
-    + [("dv.solvers", dv.solvers, n) for n in dv.solvers.__all__],
+    + [("dv.solvers", dv.solvers, n) for n in dv.solvers.__all__]
+    + [("dv.viz", dv.viz, n) for n in ("Viewer", "live", "render")],
 )
 def test_public_names_are_documented(prefix: str, module: Any, name: str) -> None:
     value = getattr(module, name)
@@ -94,6 +124,21 @@ def test_public_names_are_documented(prefix: str, module: Any, name: str) -> Non
     parameters = inspect.signature(value).parameters
     takes_arrays = any("Tensor" in str(p.annotation) or key in ARRAYS for key, p in parameters.items())
     assert not takes_arrays or SHAPE.search(doc), f"{prefix}.{name} takes arrays; its docstring states no shape"
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    pages = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs" / "reference").glob("*.md"))
+    modules = set(re.findall(r"automodule:: (\S+)", pages))
+    for name in dv.__all__:
+        value = getattr(dv, name)
+        if inspect.ismodule(value):
+            listed = rf"automodule:: diffvbd\.{name}\b|module:: diffvbd\.{name}\b"
+        else:
+            listed = rf"auto(class|function):: diffvbd\.{name}$"
+        assert re.search(listed, pages, re.MULTILINE), f"docs/reference does not list dv.{name}"
+        if inspect.ismodule(value) and value.__name__ not in modules and f"diffvbd.{name}" not in modules:
+            for member in value.__all__:
+                assert re.search(rf"auto(class|function):: {member}$", pages, re.MULTILINE), f"dv.{name}.{member}"
 
 
 @pytest.mark.parametrize("kind", [dv.Model, dv.TetMesh], ids=lambda kind: kind.__name__)
@@ -121,16 +166,20 @@ def test_report_writes_figures_between_its_markers(tmp_path: Path, monkeypatch: 
     assert text in once and report.filled(once, text) == once
 
 
-def test_results_page_shows_the_results_that_are_there_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_pages_show_the_results_that_are_there_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT))
     report = importlib.import_module("bench.report")
-    page = report.RESULTS_PAGE.read_text(encoding="utf-8")
-    found = {stem: content for _, stem, content in report.harvest(report.RESULTS)}
-    shown = re.findall(r"^### (\S+), on ", page, re.MULTILINE)
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in report.RESULTS_PAGES.glob("*.md")}
+    index = pages.pop("index")
+    found = {stem: (name, content) for name, stem, content in report.harvest(report.RESULTS)}
+    shown = [(name, stem) for name, text in pages.items() for stem in re.findall(r"^## (\S+), on ", text, re.MULTILINE)]
     assert found and len(shown) == len(set(shown))
-    assert set(shown) == set(found), "not made of bench/results: run `python -m bench report`"
-    for stem, content in found.items():
-        assert content["environment"]["date"] in page, f"{stem}.json is newer: run `python -m bench report`"
+    expected = {(name, stem) for stem, (name, _) in found.items()}
+    assert set(shown) == expected, "not made of bench/results: run `python -m bench report`"
+    assert set(pages) == {name for name, _ in expected}
+    for stem, (name, content) in found.items():
+        date = content["environment"]["date"]
+        assert date in pages[name] and date in index, f"{stem}.json is newer: run `python -m bench report`"
 
 
 def test_the_operators_of_a_backend_are_listed() -> None:
@@ -146,3 +195,10 @@ def test_the_operators_of_a_backend_are_listed() -> None:
     text = schema.read_text(encoding="utf-8")
     defined = set(re.findall(r'"([a-z_]+)\(Tensor', text)) | set(re.findall(r'define\(m, "([a-z_]+)"', text))
     assert len(defined) > 20 and listed == defined - {"build_plan"}
+
+
+def test_workflows_and_ci_call_targets_that_exist() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    callers = [*(ROOT / ".github" / "workflows").glob("*.yml"), ROOT / ".ci" / "run"]
+    called = [name for path in callers for name in re.findall(r"\bmake ([a-z-]+)", path.read_text(encoding="utf-8"))]
+    assert {"docs", "lint", "test-all"} <= set(called) <= targets

@@ -52,9 +52,18 @@ ROOMS = (
     "_version", "safeguards", "mask", "checks", "distributed", "tuples", "said", "lasting", "scopes", "reference",
     "energies", "mesh", "ops", "contact",
     "model", "adjoint", "step", "rollout", "inspect", "colliders", "solvers", "losses", "viz", "testing", "", "tasks",
-    "cli_mesh", "cli", "__main__",
+    "cli_mesh", "cli_view", "cli", "__main__",
 )  # fmt: skip
-OPTIONAL = {"matplotlib", "mpl_toolkits", "pxr", "pytetwild", "pyvista", "scipy", "trimesh"}  # packages of extras
+OPTIONAL = {
+    "matplotlib",
+    "mpl_toolkits",
+    "pxr",
+    "pytetwild",
+    "pyvista",
+    "scipy",
+    "trimesh",
+    "viser",
+}  # packages of extras
 # Both only when they are asked: Model.memory() for what a rollout would take, diffvbd.contact for what users call.
 UPWARD = {("model.model", "rollout.memory"), ("contact", "inspect.contact")}
 

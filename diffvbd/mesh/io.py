@@ -70,7 +70,8 @@ def load_fields(path: str | PathLike[str], *, orient: bool = True) -> Fields:
         `Fields`: the mesh, point_data of shape [V] or [V, C] and cell_data of shape [T] or [T, C], by name.
 
     Raises:
-        As `load`, and ValueError for values of another number of rows, or that are no numbers.
+        FileNotFoundError, ImportError: As `load`.
+        ValueError: As `load`, and for values of another number of rows, or that are no numbers.
     """
     path = Path(path)
     content, mesh, vertices, blocks = _tets_of(path, orient)
@@ -127,6 +128,14 @@ def read_triangles(path: Path) -> tuple[NDArray[Any], IntArray]:
     if sum(map(len, found)) == 0:
         raise ValueError(f"surface file {path} has no triangles")
     return content.points, np.concatenate(found).astype(np.int64)
+
+
+def read_points(path: Path) -> NDArray[Any]:
+    """Points [P, 3] of a mesh file, as they stand in it. Raises as `load` does."""
+    try:
+        return float_array("points", _read(path).points, (None, 3))
+    except (TypeError, ValueError) as failure:
+        raise ValueError(f"mesh file {path}: {failure}") from None
 
 
 def _mesh_of_used_vertices(

@@ -173,7 +173,7 @@ class TetMesh:
 
     @property
     def surface(self) -> IntArray:
-        """Boundary triangles, normals outwards, shape [F, 3]: the faces that belong to exactly one tet."""
+        """Boundary triangles, shape [F, 3], normals outwards. They are the faces that belong to exactly one tet."""
         if self._surface is None:
             self._surface, _ = boundary_faces(self._tets, self.num_vertices)
             self._surface.flags.writeable = False

@@ -60,7 +60,8 @@ def tetrahedralize(
     with tempfile.TemporaryDirectory() as scratch:
         try:
             os.chdir(scratch)
-            vertices, tets = pytetwild.tetrahedralize(
+            # pytetwild has a marker of types, and neither __all__ nor `as` on what it exports
+            vertices, tets = pytetwild.tetrahedralize(  # pyright: ignore[reportPrivateImportUsage]
                 points, triangles.astype(np.int32), edge_length_fac=edge / diagonal, epsilon=tolerance / diagonal
             )
         finally:

@@ -161,12 +161,12 @@ class Model:
 
     @property
     def corrects(self) -> bool:
-        """Whether steps have a rigid correction: asked for, and some body is free."""
+        """Whether steps have a rigid correction, which takes that it is asked for and that some body is free."""
         return self._bodies.number > 0
 
     @property
     def starts_from(self) -> str:
-        """Where the sweeps of bodies that are not corrected start: "auto" only where there is something to choose."""
+        """Where the sweeps of bodies that are not corrected start; "auto" only where there is something to choose."""
         if self.start != "auto" or self.coarse is not None:  # corrections do what the predictor is for
             return "inertia" if self.start == "auto" else self.start
         return "predictor" if self.touches or not self._other_bodies.number else "auto"
@@ -182,7 +182,7 @@ class Model:
 
     @property
     def touches(self) -> bool:
-        """Whether steps go through contact: pairs or friction."""
+        """Whether steps go through contact, with pairs or friction."""
         return bool(self.energy_mask & CONTACT)
 
     @property

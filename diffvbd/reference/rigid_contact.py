@@ -72,7 +72,8 @@ class Correction:
         """With friction at x."""
         for term in self.forces:
             if term.turns_its_body:
-                g, matrix = self._add(term.pairs, True, *term.friction_on_corners(x), jacobian, g, matrix)
+                force, stiffness = term.friction_on_corners(x)
+                g, matrix = self._add(term.pairs, True, force, stiffness, jacobian, g, matrix)
         at = torch.arange(self.count, device=x.device)
         for floor in self.floors:
             force, stiffness = floor.on_vertices(x, self.x_prev)

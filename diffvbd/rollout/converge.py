@@ -84,8 +84,8 @@ def solve(
     others ended. Where pairs hold it up no number of sweeps converges.
 
     Args:
-        model, x, v, mu, lam, young, poisson, time_step, force, gravity, prescribed, colliders, colliders_before,
-            rest_points, density, parameters: As in :func:`diffvbd.step`; x, v of shape [..., V, 3].
+        model, x, v, mu, lam, young, poisson, time_step: As in :func:`diffvbd.step`; x, v of shape [..., V, 3].
+        force, gravity, prescribed, colliders, colliders_before, rest_points, density, parameters: As there.
         tolerance: Residual in (0, 1) at which the sweeps end. A gradient of GlobalAdjoint is off by about that, times
             the conditioning of the step.
         max_sweeps: Number of sweeps after which to give up.

@@ -14,7 +14,7 @@ from ..adjoint.routes import Adjoint, check_adjoint
 from ..checks import check_count, fail
 from ..model.model import Model
 from ..model.warnings import warn_of_material
-from ..scopes import looks_at, refinement
+from ..scopes import looks_at, recorders, refinement
 from ..step.advance import advance
 from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
 from ..step.estimate import ErrorEstimate, check_estimable, error_of, of_steps
@@ -88,8 +88,8 @@ def rollout(
         colliders: Corner points of the Model's colliders [m]: constant, they rest there; in :func:`per_step`, where
             they are at the end of each step.
         colliders_before: Where per_step colliders are at the start; None: the Model's collider_points.
-        mu, lam (or young, poisson), force, gravity, prescribed, rest_points, density, parameters: As in step, constant
-            in time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step.
+        mu, lam, young, poisson, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in
+            time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step.
             A callable may close over tensors and modules that require grad: they get gradients under every schedule. It
             must be deterministic, because a checkpointed segment calls it again in the backward. ``prescribed`` may
             also have the initial x where a vertex is not pinned.
@@ -215,7 +215,7 @@ def rollout(
         energy.warn()
     warn_of_end(model, *done.end[:2])
     frames = ([] if save == "last" and steps > 0 else [(0, x, v)]) + done.frames
-    return Trajectory(
+    trajectory = Trajectory(
         x=torch.stack([f[1] for f in frames]),
         v=torch.stack([f[2] for f in frames]),
         steps=[f[0] for f in frames],
@@ -223,6 +223,10 @@ def rollout(
         errors=of_steps([errors[k] for k in range(steps)], model, x, sweeps) if estimate_errors else None,
         history=History(done.end[2], done.end[3], done.end[4], h) if len(done.end) > 2 else None,
     )
+    if not torch.compiler.is_compiling():
+        for heard in recorders("rollout"):  # of a viewer, which has no use for the graph
+            heard[:] = [(model, Trajectory(trajectory.x.detach(), trajectory.v.detach(), trajectory.steps))]
+    return trajectory
 
 
 # --- values of each step ----------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ try:
 except ImportError:  # not on Windows
     fcntl = None
 
-RESULTS = ("log.json", "picture.png", "animation.gif", "parameters.pt")  # files of a run
+RESULTS = ("log.json", "picture.png", "animation.gif", "motion.npz", "parameters.pt")  # files of a run
 STATE = "state.pt"  # of an unfinished one
 
 

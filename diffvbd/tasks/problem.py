@@ -20,8 +20,8 @@ class Settings:
     """What the user chooses about a run.
 
     Attributes:
-        out: Directory for log.json, picture.png, animation.gif, parameters.pt (if there are more than LISTED numbers)
-            and state.pt (which exists only while a run is unfinished).
+        out: Directory for log.json, picture.png, animation.gif, motion.npz (which `diffvbd view` shows), parameters.pt
+            (if there are more than LISTED numbers) and state.pt (which exists only while a run is unfinished).
         device: A torch device.
         seed: Seed of torch's generators.
         quick: Ask the task for a small version that runs in seconds; it leaves the animation out.
@@ -94,7 +94,7 @@ class Problem:
         state: Tensors that `Stage.before` changes and later iterations need: saved and restored, not optimised.
         findings: Called once with the history at the end; what it returns is logged as "findings".
         picture: Draws the result, given a path and the history; needs matplotlib.
-        animation: Writes the motion as a .gif, given a path; needs matplotlib.
+        animation: Writes the motion, given a path: as a .gif, which needs matplotlib, or as an .npz for the viewer.
     """
 
     name: str

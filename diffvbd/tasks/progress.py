@@ -4,7 +4,7 @@ import platform
 import shutil
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -17,8 +17,8 @@ Row = dict[str, float]
 class Progress:
     """A bar that redraws itself on a terminal, and about ten plain lines elsewhere (a log file, a pipe)."""
 
-    def __init__(self, name: str, total: int, done: int = 0) -> None:
-        self.name, self.total, self.done, self.before = name, total, done, done
+    def __init__(self, name: str, total: int, done: int = 0, watch: Callable[["Row"], object] | None = None) -> None:
+        self.name, self.total, self.done, self.before, self.watch = name, total, done, done, watch
         self.terminal = sys.stderr.isatty()
         self.begun = time.perf_counter()
         self.last: Row | None = None
@@ -30,6 +30,8 @@ class Progress:
         self.printed = self.terminal or self.done == 1 or self.done % max(1, self.total // 10) == 0
         if self.printed:
             self._print()
+        if self.watch is not None:
+            self.watch(row)
 
     def _print(self) -> None:
         assert self.last is not None

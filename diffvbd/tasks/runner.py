@@ -36,7 +36,7 @@ from diffvbd.tasks.report import survival
 LISTED = 1000  # numbers of a parameter that log.json lists; larger ones go to parameters.pt
 
 
-def solve(problem: Problem, settings: Settings) -> Result:
+def solve(problem: Problem, settings: Settings, watch: Callable[[Row], object] | None = None) -> Result:
     """Minimise the losses of all stages; of each stage the parameters with the lowest criterion win.
 
     A stage whose optimiser has stalled ends there, and stderr says so: two steps in a row moved no parameter and saw
@@ -45,10 +45,11 @@ def solve(problem: Problem, settings: Settings) -> Result:
     After every step of an optimiser the whole state is on disk, so the same call continues an interrupted run with the
     very numbers the uninterrupted one would have had. A state of other settings, of another protocol or of a first loss
     that is no longer the same number is put aside. In a process group every rank has to call it, with the same problem
-    and settings; files are those of the first rank.
+    and settings; files are those of the first rank. `watch` is called there with each row of the history, at its
+    parameters, which it must not change.
 
     Returns:
-        The result; log.json, picture.png and animation.gif (where matplotlib is installed) are in settings.out.
+        The result; files are in settings.out: log.json, motion.npz and, with matplotlib, picture.png and animation.gif.
 
     Raises:
         ArithmeticError: the loss or a gradient is not finite.
@@ -58,10 +59,10 @@ def solve(problem: Problem, settings: Settings) -> Result:
     check(problem)
     check_device(settings.device)
     with alone_in(settings.out) if is_first() else nullcontext(), with_own_folder(settings) as own:
-        return _solve(problem, own)
+        return _solve(problem, own, watch if is_first() else None)
 
 
-def _solve(problem: Problem, settings: Settings) -> Result:
+def _solve(problem: Problem, settings: Settings, watch: Callable[[Row], object] | None) -> Result:
     torch.manual_seed(settings.seed)
     prepare(settings.out, problem.name)
     run = _Run(problem, settings)
@@ -69,7 +70,7 @@ def _solve(problem: Problem, settings: Settings) -> Result:
     if run.cuda:
         torch.cuda.empty_cache()  # what others have left would count
         torch.cuda.reset_peak_memory_stats(settings.device)
-    progress = Progress(problem.name, sum(stage.iterations for stage in problem.stages), done=len(run.history))
+    progress = Progress(problem.name, sum(stage.iterations for stage in problem.stages), len(run.history), watch)
     begun = time.perf_counter() - (run.history[-1]["seconds"] if run.history else 0.0)
     while run.at < len(problem.stages):
         _minimise(run, progress, begun)
@@ -356,6 +357,8 @@ class _Run:
         problem, draw = self.problem, {}
         if problem.picture:
             draw["picture.png"] = partial(problem.picture, self.settings.out / "picture.png", self.history)
+        if problem.animation:
+            draw["motion.npz"] = partial(problem.animation, self.settings.out / "motion.npz")
         if problem.animation and not self.settings.quick:
             draw["animation.gif"] = partial(problem.animation, self.settings.out / "animation.gif")
         for name, function in draw.items():

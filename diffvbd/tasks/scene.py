@@ -224,3 +224,19 @@ def _checked(path: str | Path, name: str, values: Any, shape: tuple[int, int], l
         expected = f"[{leading}{shape[0]}, {shape[1]}]"
         raise ValueError(f"{path}: {name}: expected finite values of shape {expected}, got shape {list(values.shape)}")
     return values
+
+
+def side(points: Array, text: str) -> np.ndarray:
+    """Mask [V] of the vertices at a side of the bounding box, written as in --pin."""
+    side, _, fraction = text.partition(":")
+    try:
+        share = float(fraction or "0.001")
+    except ValueError:
+        share = -1.0
+    if len(side) != 2 or side[0] not in "xyz" or side[1] not in "-+" or not 0.0 <= share <= 1.0:
+        raise ValueError(f"--pin: expected x-, x+, y-, y+, z- or z+, with or without :FRACTION in 0..1, got {text!r}")
+    along = points[:, "xyz".index(side[0])]
+    low, high = along.min(), along.max()
+    # The relative position decides, so rounding cannot leave out vertices that lie exactly in the side.
+    position = (along - low) / (high - low) if side[1] == "-" else (high - along) / (high - low)
+    return position <= share

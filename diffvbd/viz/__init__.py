@@ -1,4 +1,4 @@
-"""Pictures of soft bodies. Needs matplotlib (extra [viz]), imported only when something is drawn."""
+"""Pictures and a live view of soft bodies. What they need (extra [viz]) is imported only when something is drawn."""
 
 from diffvbd.viz.animation import animation
 from diffvbd.viz.cloud import cloud, cloud_animation
@@ -7,11 +7,15 @@ from diffvbd.viz.drawing import COLORS, Scenery, box, capsule, draw, floor
 from diffvbd.viz.field import field
 from diffvbd.viz.landing import landing
 from diffvbd.viz.learning import learning
+from diffvbd.viz.live import live
 from diffvbd.viz.paths import paths
+from diffvbd.viz.render import render
+from diffvbd.viz.viewer import Viewer
 
 __all__ = [
     "COLORS",
     "Scenery",
+    "Viewer",
     "animation",
     "box",
     "capsule",
@@ -23,5 +27,7 @@ __all__ = [
     "floor",
     "landing",
     "learning",
+    "live",
     "paths",
+    "render",
 ]

@@ -18,6 +18,7 @@ from diffvbd.viz.drawing import (
     new_figure,
     save_motion,
 )
+from diffvbd.viz.motion import save_motions
 
 FRAMES = 40  # of a longer motion so many are shown
 
@@ -31,10 +32,11 @@ def animation(
     view: tuple[float, float] = VIEW,
     color: Any = None,
 ) -> None:
-    """Save motions beside each other as a .gif that runs in real time, or slower where it would last less than 2 s.
+    """Save motions beside each other as a .gif that runs in real time, or slower where it would last less than 2 s; or
+    as an .npz, which :func:`live` shows.
 
     Args:
-        path: The .gif to write.
+        path: The .gif or .npz to write.
         surface: Boundary triangles, shape [F, 3], as `TetMesh.surface`.
         motions: Positions [m] of each motion by name, shape [N, V, 3], array or tensor; y points up.
         time_step: Between frames [s].
@@ -43,9 +45,12 @@ def animation(
         color: Of the body, as in `draw`; default: one for each motion.
 
     Raises:
-        ImportError: matplotlib is not installed.
+        ImportError: matplotlib is not installed, for a .gif.
         ValueError: motions or triangles of another shape.
     """
+    if Path(path).suffix == ".npz":
+        save_motions(path, surface, motions_as_arrays(motions, surface), time_step, scenery)
+        return
     figure = new_figure(3.4 * len(motions), 3.2, dots=70)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 

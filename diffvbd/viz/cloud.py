@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffvbd.mesh.shapes import cube
 from diffvbd.viz.drawing import INK, VIEW, as_array, bounds_of, new_figure, save_motion
+from diffvbd.viz.motion import save_motions
 
 SHOWN = 20_000  # points; of more, so many of them
 
@@ -48,7 +50,11 @@ def cloud(
 
 
 def cloud_animation(path: str | Path, frames: Any, time_step: float) -> None:
-    """Save moving points as a .gif in the time of `animation`; arguments and errors as for `cloud`."""
+    """Save moving points as a .gif in the time of `animation`, or as an .npz of small cubes; arguments and errors
+    as for `cloud`."""
+    if Path(path).suffix == ".npz":
+        save_motions(path, *_cubes(_chosen(frames)), time_step)
+        return
     figure = new_figure(4.5, 4.5, dots=80)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -64,6 +70,15 @@ def cloud_animation(path: str | Path, frames: Any, time_step: float) -> None:
         axes.set_title(f"{1e3 * k * time_step:.0f} ms", fontsize=10, y=1.0)
 
     save_motion(path, figure, show, range(len(shown)), (len(shown) - 1) * time_step)
+
+
+def _cubes(centers: NDArray[np.float64]) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
+    """Triangles and motion of a cube around each point [N, bodies, 3], as wide as a third of their spacing."""
+    count, one = centers.shape[1], cube(2)
+    edge = np.ptp(centers[0], axis=0).max() / max(1.0, np.sqrt(count)) / 3 or 1.0
+    corners = edge * (one.points - one.points.mean(0)) / np.ptp(one.points)
+    triangles = (one.surface + one.num_vertices * np.arange(count)[:, None, None]).reshape(-1, 3)
+    return triangles, {"bodies": (centers[:, :, None] + corners).reshape(len(centers), -1, 3)}
 
 
 def _chosen(frames: Any) -> NDArray[np.float64]:

@@ -104,11 +104,11 @@ def capsule(a: Sequence[float], b: Sequence[float], radius: float, color: str = 
     side /= np.linalg.norm(side)
     around, half = 20, 6
     rise = np.linspace(-np.pi / 2, 0, half)
-    rings = [(start, t) for t in rise] + [(end, -t) for t in rise[::-1]]
+    rings = [(start, t) for t in rise] + [(end, -t) for t in rise[::-1]][int(length == 0) :]  # a ball has one equator
     angle = 2 * np.pi * np.arange(around) / around
     circle = np.outer(np.cos(angle), side) + np.outer(np.sin(angle), np.cross(axis, side))
     points = np.concatenate([c + radius * (np.sin(t) * axis + np.cos(t) * circle) for c, t in rings])
-    i, j = (k.ravel() for k in np.meshgrid(np.arange(2 * half - 1), np.arange(around), indexing="ij"))
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(len(rings) - 1), np.arange(around), indexing="ij"))
     p, q = i * around + j, i * around + (j + 1) % around
     triangles = np.concatenate([np.stack([p, q, q + around], 1), np.stack([p, q + around, p + around], 1)])
     return Scenery(points, triangles, color)

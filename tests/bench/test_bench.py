@@ -170,20 +170,25 @@ def test_report_shows_every_result(quick: Callable[[str], dict[str, Any]], folde
     (folder / "fd-cuda.json").write_text(json.dumps(other))
     (folder / "unrelated.json").write_text("{}")
     assert main(["report", "--out", str(folder)]) == 0
-    page = (folder / "results.md").read_text()
-    for name in sorted({path.stem.removesuffix("-cuda") for path in folder.glob("*.json")} - {"unrelated"}):
-        assert f"\n## {name}\n" in page
-    assert page.index("### fd, on") < page.index("### fd-cuda, on Some GPU")
+    names = {path.stem.removesuffix("-cuda") for path in folder.glob("*.json")} - {"unrelated"}
+    assert {path.stem for path in (folder / "results").glob("*.md")} == {"index", *names}
+    page, index = ((folder / "results" / f"{name}.md").read_text() for name in ("fd", "index"))
+    assert all(f"]({name}.md)" in index for name in names) and "unrelated" not in index
+    assert page.startswith("# fd\n") and page.index("## fd, on") < page.index("## fd-cuda, on Some GPU")
     assert "Some GPU, driver 1.2" in page and "unrelated" not in page
     for image in ("results_fd.png", "results_fd-cuda.png"):
-        assert f"(images/{image})" in page
+        assert f"(../images/{image})" in page
         assert 1000 < (folder / "images" / image).stat().st_size < 60_000
     # every table of the benchmark is there as the benchmark itself writes it
     assert all(line in page for line in benchmarks()["fd"].markdown(content["results"]).splitlines() if "|" in line)
 
 
 def test_report_of_nothing_says_how_to_get_something(tmp_path: Path) -> None:
-    assert report.EMPTY in report.results_page(tmp_path, tmp_path / "images")
+    pages = report.results_pages(tmp_path, tmp_path / "images")
+    assert list(pages) == ["index"] and report.EMPTY in pages["index"]
+    report.write_pages({"index": "", "old": ""}, tmp_path / "results")
+    report.write_pages(pages, tmp_path / "results")
+    assert [path.name for path in (tmp_path / "results").iterdir()] == ["index.md"]
     assert not plots.draw("cpu", {}, tmp_path / "none.png") and not (tmp_path / "none.png").exists()
 
 

@@ -21,8 +21,8 @@ def test_two_groups_run_by_themselves_and_report_shows_them(tmp_path: Path) -> N
         assert row["error"] is None and row["crossings"] == row["nonfinite"] == 0 < row["ms_per_step"]
     assert all(row["met"] for row in results["fall"]["rows"])
     assert results["spin"]["rows"][0]["met"] and 0 < results["spin"]["rows"][0]["reference"] < 1
-    page = report.results_page(tmp_path, tmp_path / "images")
-    assert "\n## contact_motion\n" in page and "a lone box" in page
+    page = report.results_pages(tmp_path, tmp_path / "images")["contact_motion"]
+    assert page.startswith("# contact_motion\n") and "a lone box" in page
 
 
 def test_a_floor_lets_a_block_slide_as_coulomb_says() -> None:

@@ -77,7 +77,7 @@ def test_nothing_is_written_after_a_refusal(
 ) -> None:
     write(tmp_path, lost={"commit": None})
     monkeypatch.setattr(report, "RESULTS", tmp_path)
-    for page in ("RESULTS_PAGE", "TASKS_PAGE", "PAGE"):
+    for page in ("RESULTS_PAGES", "TASKS_PAGE", "PAGE", "CHOOSING_PAGE", "GALLERY_PAGE"):
         monkeypatch.setattr(report, page, tmp_path / f"{page}.md")
     assert main(["report"]) == 1
     assert "lost.json: commit unknown: expected the commit that was measured" in capsys.readouterr().err

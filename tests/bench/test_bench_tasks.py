@@ -1,4 +1,4 @@
-"""Claim: the page of inverse problems says what the logs say, and nothing else."""
+"""Claim: the page of inverse problems says what the logs say, and nothing else; the gallery shows all animations."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from helpers.task_checks import timeless
 
-from bench import report, tasks
+from bench import gallery, report, tasks
 from bench.__main__ import main
 from bench.paper import TASKS as PAPER
 from diffvbd.tasks import TASKS
@@ -73,7 +73,19 @@ def test_every_task_is_on_the_page_and_the_page_is_made_of_the_logs() -> None:
     assert text == tasks.page(report.RESULTS / "tasks", tasks.IMAGES, report.ROOT / "docs"), (
         "run `python -m bench report`"
     )
+    cards = report.GALLERY_PAGE.read_text(encoding="utf-8")
+    assert cards == report.filled(cards, tasks.gallery(report.RESULTS / "tasks")), "run `python -m bench report`"
     for name in PAPER:
         assert f"\n## {name}\n" in text
+        assert f"}} {name}\n" in cards
         assert tasks.picture_of(name, tasks.IMAGES).exists()
         assert (report.RESULTS / "tasks" / f"{name}.json").exists() or name == "million-cubes"
+
+
+def test_every_animation_is_rendered_by_the_bench_and_shown() -> None:
+    shown = {path.stem for path in gallery.FOLDER.glob("*.webp")}
+    assert shown == set(gallery.SCENES)
+    assert {name for name in PAPER if name.replace("-", "_") in shown}, "animations are named after their problems"
+    cards = report.GALLERY_PAGE.read_text(encoding="utf-8")
+    for name in shown:
+        assert f"](images/gallery/{name}.webp)" in cards

@@ -1,0 +1,159 @@
+"""`live`: a motion, a file, an optimisation or a simulation behind sliders, in a browser."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import webbrowser
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..checks import check_count, fail
+from ..model.model import Model
+from .drawing import Scenery
+from .motion import Mesh, Motion, mesh_of, motions_of
+from .opened import opened
+from .panel import Slider
+from .scenery import scenery_of
+from .values import Values
+from .viewer import Viewer
+
+
+def live(
+    source: Any,
+    mesh: Mesh | None = None,
+    *,
+    color: str = "body",
+    time_step: float | None = None,
+    mu: Any = None,
+    lam: Any = None,
+    sliders: Mapping[str, Sequence[float]] | None = None,
+    scenery: Sequence[Scenery] = (),
+    colliders: Any = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    play: bool = True,
+    browser: bool = False,
+) -> Viewer:
+    """Show a motion in a page of a local server: play, scrub, color, watch an optimisation, move sliders.
+
+    Args:
+        source: What to show:
+
+            * a dv.Trajectory, or positions [m], shape [N, V, 3] or [N, B, V, 3], array or tensor; a dict of such things
+              by name;
+            * a dv.Model or dv.TetMesh, for :meth:`Viewer.update`;
+            * a file: a .pvd that `write_series` wrote, a mesh with tets, or the folder of a `diffvbd run`;
+            * a function of the parameters in ``sliders`` that returns a trajectory or positions.
+        mesh: The dv.Model of the motion, or its dv.TetMesh; stress, contact force, floor and colliders need a Model.
+        color: "body", "speed", "stress" (von Mises), "stiffness" (mu) or "contact" (force).
+        time_step: Between steps [s]. Without it motions have no times, and positions no speed.
+        mu, lam: Material [Pa], a number, [T] or [B, T], for stress and stiffness. Those of sliders named so are taken.
+        sliders: Lowest and highest value of each parameter, and the first one, if it is not the middle.
+        scenery: What else stands there, from `diffvbd.viz.floor`, `box`, `capsule`.
+        colliders: Where the corner points of the Model's colliders are in each frame [m], shape [N, Vc, 3].
+        host, port: Of the server. Another free port is taken where this one is in use; ``viewer.url`` has it.
+        play: Whether the motion runs from the beginning.
+        browser: Open the page in the system's browser.
+
+    Returns:
+        A :class:`Viewer`, which runs until it is stopped. In a notebook it shows the page.
+
+    Raises:
+        ImportError: viser is not installed.
+        FileNotFoundError: no such file.
+        ValueError, TypeError: another shape, file, color or range.
+    """
+    check_count("port", port, 0, 65535)
+    if not isinstance(host, str) or not host:
+        raise TypeError(f"host: expected the name or address of a network interface, got {host!r}")
+    ranges, simulate, course = _ranges(sliders or {}), None, None
+    if isinstance(source, (str, Path)):
+        course = opened(Path(source), time_step)
+        motions, mesh = course.motions, course.mesh if mesh is None else mesh
+    elif callable(source) and not isinstance(source, (Model, torch.Tensor)):
+        simulate = _simulation(source, ranges)
+        motions = motions_of(simulate(**{name: first for name, (_, _, first) in ranges.items()}), mesh, time_step)
+    else:
+        mesh = source if mesh is None and isinstance(source, Model) else mesh
+        motions = motions_of(source, mesh, time_step)
+    if ranges and simulate is None:
+        raise TypeError(f"source: expected a function of {', '.join(ranges)} for sliders, got {type(source).__name__}")
+    body, model = mesh_of(mesh), mesh if isinstance(mesh, Model) else None
+    if model is None and body is not None and mu is not None and lam is not None:
+        model = Model(body)  # for stresses
+    values = Values(model, mu, lam, colliders)
+    if simulate is not None:
+        simulate = _with_material(simulate, values)
+        values.mu, values.lam = (_first(ranges, name, value) for name, value in (("mu", mu), ("lam", lam)))
+    things = tuple(scenery)
+    if isinstance(mesh, Model):
+        things += scenery_of(mesh, *_bounds(motions), colliders)
+    elif colliders is not None:
+        fail("mesh", "a dv.Model with colliders beside colliders", type(mesh).__name__)
+    viewer = Viewer(motions, body if mesh is None else mesh, values, color=color, time_step=time_step, scenery=things,
+                    sliders=ranges, simulate=simulate, host=host, port=port)  # fmt: skip
+    if course is not None:
+        viewer.show_course(course.losses, course.parameters)
+    if play:
+        viewer.play()
+    if browser:
+        webbrowser.open(viewer.url)
+    return viewer
+
+
+def _bounds(motions: Mapping[str, Motion]) -> tuple[np.ndarray, np.ndarray]:
+    corners = [motion.bounds for motion in motions.values()]
+    return np.min([low for low, _ in corners], 0), np.max([high for _, high in corners], 0)
+
+
+def _first(ranges: Mapping[str, Slider], name: str, otherwise: Any) -> Any:
+    return ranges[name][2] if name in ranges else otherwise
+
+
+def _ranges(sliders: Mapping[str, Sequence[float]]) -> dict[str, Slider]:
+    if not isinstance(sliders, Mapping):
+        raise TypeError(f"sliders: expected ranges by name, got {type(sliders).__name__}")
+    found = {}
+    for name, given in sliders.items():
+        try:
+            numbers = [float(value) for value in given]
+        except (TypeError, ValueError):
+            numbers = []
+        low, high = numbers[:2] if len(numbers) in (2, 3) else (1.0, 0.0)
+        first = numbers[2] if len(numbers) == 3 else 0.5 * (low + high)
+        if not (all(map(math.isfinite, numbers)) and low < high and low <= first <= high):
+            fail(f"sliders[{name!r}]", "(lowest, highest) or (lowest, highest, first), ascending", repr(given))
+        found[name] = (low, high, first)
+    return found
+
+
+def _simulation(function: Callable[..., Any], ranges: Mapping[str, Slider]) -> Callable[..., Any]:
+    """A user's function without gradients; raises for one that does not take the sliders' names."""
+    if not ranges:
+        fail("sliders", "ranges of the function's parameters by name", "none")
+    try:
+        inspect.signature(function).bind(**dict.fromkeys(ranges))
+    except TypeError as error:
+        raise TypeError(f"source: expected a function of {', '.join(ranges)}: {error}") from None
+    except ValueError:
+        pass  # a builtin without a signature
+
+    def simulate(**values: float) -> Any:
+        with torch.no_grad():
+            return function(**values)
+
+    return simulate
+
+
+def _with_material(simulate: Callable[..., Any], values: Values) -> Callable[..., Any]:
+    def run(**arguments: float) -> Any:
+        result = simulate(**arguments)
+        values.mu, values.lam = (arguments.get(name, getattr(values, name)) for name in ("mu", "lam"))
+        return result
+
+    return run

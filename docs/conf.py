@@ -1,0 +1,90 @@
+"""The site, built by `make docs`: Sphinx with the theme furo; pages in Markdown and notebooks are read by MyST-NB."""
+
+import re
+from typing import Any
+
+import diffvbd
+
+project = "diffvbd"
+author = copyright = "diffvbd authors"
+version = release = diffvbd.__version__
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+    "sphinx_design",
+]
+exclude_patterns = ["images/**"]
+nitpicky = True
+# Other projects' types: their inventories would need the internet at each build. And what is no public name.
+nitpick_ignore_regex = [
+    ("py:.*", r"(torch|numpy|collections|pathlib|typing)\..*"),
+    ("py:.*", r"diffvbd\.\w+\.\w+\.\w+"),
+    ("py:.*", r"projections\.\w+|springs"),
+]
+
+html_theme = "furo"
+html_title = f"diffvbd {release}"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_show_sourcelink = False
+copybutton_exclude = ".linenos, .gp, .go"
+
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 6
+
+# `make docs` executes notebooks, `make docs NOTEBOOKS=off` does not.
+nb_execution_mode = "off"
+nb_execution_timeout = 1200  # [s], of one cell, on a busy machine
+nb_execution_raise_on_error = True
+nb_merge_streams = True
+
+default_role = "code"  # docstrings write names in single backticks
+add_module_names = False
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # docstrings state shapes and units, which types do not
+autodoc_default_options = {"members": True, "undoc-members": False}
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+napoleon_use_param = False  # several names share a line of text
+
+linkcheck_timeout = 20
+linkcheck_anchors = False
+
+CONTENTS = """
+
+```{toctree}
+:hidden:
+:glob:
+*
+```
+"""
+
+
+def adapt(app: object, docname: str, source: list[str]) -> None:
+    """What pages that also have to read well on GitHub leave to the site."""
+    text = source[0]
+    if docname in ("results/index", "reference/index"):
+        text += CONTENTS
+    # outside of docs/, which Sphinx does not read
+    source[0] = re.sub(r"\]\((?:\.\./)+(CONTRIBUTING|CHANGELOG)\.md", lambda m: f"](/{m[1].lower()}.md", text)
+
+
+def escape(app: object, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Bars in docstrings are norms and no substitutions."""
+    for i, line in enumerate(lines):
+        outside = re.split(r"(``.*?``|`[^`]*`)", line)
+        lines[i] = "".join(part if k % 2 else part.replace("|", r"\|") for k, part in enumerate(outside))
+
+
+def skip(app: object, what: str, name: str, obj: object, is_skipped: bool, options: object) -> bool | None:
+    """Fields of named tuples: the docstring of the class has them."""
+    return True if str(getattr(obj, "__doc__", "")).startswith("Alias for field number") else None
+
+
+def setup(app: Any) -> None:
+    app.connect("source-read", adapt)
+    app.connect("autodoc-process-docstring", escape)
+    app.connect("autodoc-skip-member", skip)

@@ -1,0 +1,171 @@
+"""Claim: the viewer serves a page on this machine alone, draws in a real browser, plays, reruns what sliders ask for,
+follows an optimisation without changing it, and stops."""
+
+import io
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.browser import page_of
+
+import diffvbd as dv
+from diffvbd.viz import live
+
+pytest.importorskip("viser")
+MESH = dv.mesh.cube(3, 0.2)
+MODEL = dv.Model(MESH, energies=(dv.StableNeoHookean(), dv.FloorBarrier(-0.3)))
+STEP = 0.02
+
+
+def fall(speed: float = 0.0, steps: int = 8) -> dv.Trajectory:
+    x = MODEL.rest_points
+    v = torch.tensor([0.0, speed, 0.0], dtype=x.dtype).expand_as(x)
+    return dv.rollout(MODEL, x, v, steps=steps, mu=1e4, lam=1e4, time_step=STEP, sweeps=3)
+
+
+def until(true: Callable[[], Any], seconds: float = 60.0) -> bool:
+    """Whether it becomes true, for as long as a busy machine may take."""
+    end = time.monotonic() + seconds
+    while not true() and time.monotonic() < end:
+        time.sleep(0.02)
+    return bool(true())
+
+
+def test_it_serves_this_machine_alone_and_stops() -> None:
+    before = {thread.name for thread in threading.enumerate()}
+    with live(fall(), MODEL, time_step=STEP) as viewer:
+        port = int(viewer.url.rpartition(":")[2])
+        assert viewer.url.startswith("http://127.0.0.1:") and viewer.clock.playing and not viewer.watched
+        with socket.create_connection(("127.0.0.1", port)):
+            pass
+        with live(MESH, play=False) as other:  # another free port
+            assert other.url != viewer.url
+        assert viewer.url in viewer._repr_html_()
+    viewer.stop()
+    with pytest.raises(OSError), socket.create_connection(("127.0.0.1", port)):
+        pass
+    assert not {n for n in {thread.name for thread in threading.enumerate()} - before if n.startswith("diffvbd")}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "expected"),
+    [
+        ({"source": MESH, "color": "heat"}, ValueError, "color: expected one of body, .*, got 'heat'"),
+        ({"source": MESH, "color": "stress"}, ValueError, "color: stress needs a dv.Model"),
+        ({"source": MESH, "port": 70000}, ValueError, "port: expected an integer <= 65535, got 70000"),
+        ({"source": MESH, "host": ""}, TypeError, "host: expected the name"),
+        ({"source": "none.pvd"}, FileNotFoundError, "none.pvd does not exist"),
+        ({"source": MESH, "sliders": {"mu": (0, 1)}}, TypeError, "source: expected a function of mu for sliders"),
+        ({"source": fall, "mesh": MODEL}, ValueError, "sliders: expected ranges of the function's parameters"),
+        ({"source": fall, "mesh": MODEL, "sliders": {"speed": (2, 1)}}, ValueError, r"sliders\['speed'\]: expected"),
+        ({"source": fall, "mesh": MODEL, "sliders": {"speed": (0, 1, 2)}}, ValueError, "ascending, got"),
+        (
+            {"source": fall, "mesh": MODEL, "sliders": {"mass": (0, 1)}},
+            TypeError,
+            "source: expected a function of mass",
+        ),
+        ({"source": MESH, "colliders": np.zeros((1, 3))}, ValueError, "mesh: expected a dv.Model with colliders"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(arguments: dict[str, Any], kind: type, expected: str) -> None:
+    with pytest.raises(kind, match=expected):
+        live(**arguments)
+
+
+def test_without_viser_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "viser", None)
+    with pytest.raises(ImportError, match=r"pip install 'diffvbd\[viz\]'"):
+        live(MESH)
+
+
+def minimised(viewer: dv.viz.Viewer | None) -> list[float]:
+    """Losses of a small optimisation, watched or not."""
+    log_mu = torch.tensor(1e4, dtype=torch.float64).log().requires_grad_()
+    optimizer = torch.optim.Adam([log_mu], 0.1)
+    losses = []
+    for _ in range(4):
+        optimizer.zero_grad()
+        x = dv.rollout(MODEL, MODEL.rest_points, torch.zeros_like(MODEL.rest_points), steps=3, mu=log_mu.exp(),
+                       lam=1e4, time_step=STEP, sweeps=3).x  # fmt: skip
+        loss = x[-1, :, 1].square().sum()
+        loss.backward()
+        if viewer is not None:
+            viewer.update(x, loss=loss, mu=log_mu.exp())
+        optimizer.step()
+        losses.append(loss.item())
+    return losses
+
+
+def test_an_optimisation_is_followed_and_not_changed() -> None:
+    with live(MODEL, time_step=STEP) as viewer:
+        losses = minimised(viewer)
+        assert losses == minimised(None)
+        assert viewer._losses == losses and [*viewer._parameters] == ["mu"]
+        with viewer.listening():
+            run = fall()
+            viewer.update(loss=0.5)
+        assert viewer._losses[-1] == 0.5 and torch.equal(viewer._pending.x, run.x)
+        with pytest.raises(TypeError, match="mu: expected a number or a tensor of one, got Tensor"):
+            viewer.update(mu=torch.zeros(2))
+
+
+@pytest.mark.slow
+def test_a_browser_draws_plays_and_reruns() -> None:
+    images = pytest.importorskip("PIL.Image")
+    speeds: list[float] = []
+
+    def throw(speed: float) -> dv.Trajectory:
+        speeds.append(speed)
+        if speed > 4.0:
+            raise ValueError("too fast")
+        return fall(speed)
+
+    viewer = live(throw, MODEL, time_step=STEP, sliders={"speed": (0.0, 5.0, 1.0)}, play=False, port=8123)
+    with viewer, page_of(viewer.url) as (page, asked):
+
+        def shot() -> np.ndarray:
+            """The left part of the page, which the controls do not cover."""
+            raw = page.screenshot(clip={"x": 20, "y": 160, "width": 620, "height": 480})
+            return np.asarray(images.open(io.BytesIO(raw)).convert("RGB"), dtype=int)
+
+        def blue() -> np.ndarray:
+            """Where the body is: its color is blue."""
+            picture = shot()
+            return picture[..., 2] > picture[..., 0] + 40
+
+        page.wait_for_selector("canvas")
+        assert until(lambda: viewer.watched)
+        assert until(lambda: blue().sum() > 500), "the canvas is blank"
+        first = blue()
+        viewer.frame = 8
+        assert until(lambda: (blue() != first).sum() > 500), "another frame looks the same"
+
+        page.get_by_role("button", name="Play").click()
+        assert until(lambda: viewer.clock.playing)
+        seen = set()
+        assert until(lambda: len(seen.add(viewer.frame) or seen) > 3), "it does not run"
+        page.get_by_role("button", name="Pause").click()
+        assert until(lambda: not viewer.clock.playing)
+
+        box = page.locator("input[type=text]").last  # the number beside the slider, the last control
+        box.fill("3")
+        box.press("Enter")
+        assert until(lambda: speeds[-1] == 3.0), "the slider reran nothing"
+        page.get_by_text("up to date").wait_for()
+        moved = viewer.motions["motion"].points
+        assert np.array_equal(moved, fall(3.0).x.numpy())
+        box.fill("4.5")
+        box.press("Enter")
+        page.get_by_text("too fast").wait_for()
+        assert speeds[-1] == 4.5 and np.array_equal(viewer.motions["motion"].points, moved)
+
+        viewer.color = "speed"
+        page.get_by_text("speed [m/s]").wait_for()
+        viewer.update(loss=2.0, mu=3e4)
+        page.get_by_text("30000").wait_for()
+        assert all("127.0.0.1" in url for url in asked), asked
