@@ -82,10 +82,9 @@ struct CornerPoints {
   }
 };
 
-DIFFVBD_FN Vector shift_of(const double* motion) { return {motion[3], motion[4], motion[5]}; }
 // How far a point at r from the center goes by a motion, to the first order.
 DIFFVBD_FN Vector moved_by(const double* motion, const Vector& r) {
-  return cross(Vector{motion[0], motion[1], motion[2]}, r) + shift_of(motion);
+  return cross(Vector{motion[0], motion[1], motion[2]}, r) + Vector{motion[3], motion[4], motion[5]};
 }
 
 // What one pair adds: gradient and its derivative by the motion of the first side relative to the second, and what the
@@ -108,7 +107,8 @@ struct PairPress {
   }
   // And by all of its unknowns.
   DIFFVBD_FN Vector moved(int side, const Vector& center, const double* motion) const {
-    return moved_by(motion, at[side] - weight[side] * center) + (weight[side] - 1) * shift_of(motion);
+    const Vector turn = {motion[0], motion[1], motion[2]}, shift = {motion[3], motion[4], motion[5]};
+    return cross(turn, at[side] - weight[side] * center) + weight[side] * shift;
   }
   DIFFVBD_FN double gradient(int side, int k, const Vector& center) const {
     const Vector moment = torque[side] - cross(center, pull[side]);
