@@ -101,18 +101,10 @@ class VertexEnergy:
         """
         raise NotImplementedError(f"{type(self).__name__} has no gradient() for GlobalAdjoint and solve")
 
-    def value(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
-        """h^2 E [kg m^2] of every vertex, [B, V]; arguments as of gradient(). Anderson's method compares it on CUDA."""
-        raise NotImplementedError(f"{type(self).__name__} has no value() for Anderson's method")
-
     def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         """What it adds to the block of each vertex [B, V, 3, 3] [kg]; arguments as of gradient(). The rigid
         correction of bodies in contact solves with these."""
         raise NotImplementedError(f"{type(self).__name__} has no blocks() for bodies in contact")
-
-    def admits(self, x: Tensor, before: Tensor, data: Tensor, origin: Tensor | None, share: float) -> Tensor | None:
-        """Where a step from ``before`` to x keeps a share of what limits it, bool [B, V]; None where nothing does."""
-        return None
 
 
 def _barrier_slope(gap: Tensor, kappa: Tensor, dhat: Tensor) -> Tensor:
@@ -251,26 +243,11 @@ class FloorBarrier(VertexEnergy):
         normal, kappa, dhat, _ = self._columns(data)
         return self._gaps(x, data, origin), normal, kappa, dhat
 
-    def value(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
-        normal, kappa, dhat, damping = self._columns(data)
-        gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
-        d = torch.where((gap > 0) & (gap < dhat), gap, dhat)
-        total = -h * h * kappa * (d - dhat) ** 2 * torch.log(d / dhat)
-        approach = _approach(normal, x, x_prev)
-        return (total + damping * _share(before, kappa, dhat) * (h / 2) * approach**2).sum(-1)
-
     def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         normal, kappa, dhat, damping = self._columns(data)
         gap, before = (self._gaps(at, data, origin) for at in (x, x_prev))
         size = h * h * barrier_curvature(gap, kappa, dhat) + h * damping * _share(before, kappa, dhat)
         return (size[..., None, None] * normal[..., None] * normal[..., None, :]).sum(2)
-
-    def admits(self, x: Tensor, before: Tensor, data: Tensor, origin: Tensor | None, share: float) -> Tensor:
-        gap, was = (self._gaps(at, data, origin) for at in (x, before))
-        planes = data.reshape(data.shape[0], 1, self.planes, 7)
-        terms = planes[..., :3] * (x if origin is None else x + origin)[:, :, None]
-        guard = 8 * torch.finfo(x.dtype).eps * (terms.abs().sum(-1) + planes[..., 3].abs())  # twin of guard() there
-        return ((gap > guard) & (gap >= share * was)).all(-1)
 
     def normal_force(self, x: Tensor, data: Tensor, origin: Tensor | None) -> tuple[Tensor, Tensor]:
         """Force of each plane on each vertex [N], [B, V, planes], and the unit normals [1 | B, planes, 3]."""
@@ -369,10 +346,6 @@ class Anchor(VertexEnergy):
     def blocks(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
         spring = data.reshape(data.shape[0], -1, 4)[..., 0]
         return h * h * spring[..., None, None] * torch.eye(3, dtype=x.dtype, device=x.device)
-
-    def value(self, x: Tensor, x_prev: Tensor, data: Tensor, h: float, origin: Tensor | None) -> Tensor:
-        stiffness, points = data.reshape(data.shape[0], -1, 4).split((1, 3), -1)
-        return h * h / 2 * stiffness[..., 0] * (x - points).square().sum(-1)
 
 
 VERTEX_ENERGIES: tuple[type[VertexEnergy], ...] = (FloorBarrier, Anchor)  # order of csrc/energies/energies.h

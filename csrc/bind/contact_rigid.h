@@ -105,6 +105,41 @@ struct RigidWorkTensors {
   std::tuple<Tensor, Tensor, Tensor, Tensor> all() const { return {barrier, by_kappa, friction, by_lag}; }
 };
 
+// What contact_rigid_end_backward returns, but for the solution; zeros(sizes) makes what is zero at first.
+struct RigidEndTensors {
+  Tensor p, q, x, mass;
+  template <class T, class Zeros>
+  RigidEndTensors(const contact::RigidInputs<T>& in, const Zeros& zeros)
+      : p(zeros({in.scene.scenes, in.gate.corners, 3})),
+        q(zeros({in.scene.scenes, in.gate.corners, 3})),
+        x(zeros({in.scene.scenes, in.scene.vertices, 3})),
+        mass(zeros({in.scene.scenes, in.scene.vertices})) {}
+};
+
+// What contact_rigid_vertices_backward returns.
+struct RigidVertexTensors {
+  RigidBars bars;
+  Tensor floor_lag, none;
+  template <class T, class Zeros>
+  RigidVertexTensors(const contact::RigidInputs<T>& in, const std::vector<int64_t>& data_count, bool wants_data,
+                     const Zeros& zeros)
+      : bars(in.scene, data_count, true, wants_data,
+             [&](const std::vector<int64_t>& sizes, bool) { return zeros(sizes); }),
+        floor_lag(zeros({in.planes > 0 ? in.scene.scenes : 0, in.scene.vertices, in.planes, contact::kFloorLag})),
+        none(zeros({0})) {}
+  template <class T>
+  rigid::Adjoints<T> pointers() const {
+    return bars.pointers<T>(bars.x, none);
+  }
+  template <class T>
+  T* floor() const {
+    return floor_lag.numel() > 0 ? data<T>(floor_lag) : nullptr;
+  }
+  std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> all() const {
+    return {bars.x, bars.x_prev, bars.y, bars.mass, bars.shared, bars.own, floor_lag};
+  }
+};
+
 // Of contact_rigid_solve: the number of systems, and their size.
 struct RigidSystems {
   int64_t count, size;

@@ -107,9 +107,9 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   define(m, "contact_rigid_backward", DIFFVBD_ARGUMENTS(TOUCHING),
          "Tensor p, Tensor q, int[] data_count, float time_step, float friction_eps",
          "Tensor barrier, Tensor by_kappa, Tensor friction, Tensor by_lag, ");
-  // The rest of that adjoint on the CPU. Of x_bar [scenes, V, 3] the solution for the adjoint of the motion [scenes,
-  // bodies, 6], how all corner points move by it and by the motion, and what goes back to x and mass by the way itself;
-  // then, of what pairs send to the two motions, what vertices send to the rest
+  // The rest of that adjoint. Of x_bar [scenes, V, 3] the solution for the adjoint of the motion [scenes, bodies, 6],
+  // how all corner points move by it and by the motion, and what goes back to x and mass by the way itself; then, of
+  // what pairs send to the two motions, what vertices send to the rest; of data as of rigid_backward()
   define(m, "contact_rigid_end_backward", DIFFVBD_ARGUMENTS(TOUCHING),
          "Tensor motion, Tensor share, Tensor factor, Tensor x_bar, int[] data_count, float time_step, float "
          "friction_eps",
@@ -117,7 +117,7 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   define(m, "contact_rigid_vertices_backward", DIFFVBD_ARGUMENTS(TOUCHING),
          "Tensor motion, Tensor solution, Tensor by_p, Tensor by_q, int[] data_count, float time_step, float "
          "friction_eps, bool wants_data",
-         "Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor energy_data, Tensor floor_lag, ");
+         "Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own, Tensor floor_lag, ");
   // Predictor and start of the sweeps. start: of the bodies that are not corrected, 0 x + h v, 1 y, 2 the lower
   // potential of the two; falls [scenes, other bodies]: 1 where that is y; alone [scenes, bodies]: with parts, 1
   // where the vertices of a body that is corrected start each by itself
@@ -153,7 +153,7 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "anderson_combine(Tensor states, Tensor mass, Tensor order, Tensor ptr, float regularization, float noise) -> "
       "(Tensor to, "
       "Tensor inverse, Tensor gamma)");
-  // CPU only: by how much the potential of each body rises from x to `to`, and the sum of the sizes of its terms
+  // By how much the potential of each body rises from x to `to`, and the sum of the sizes of its terms
   // [scenes, bodies, 2], float64; infinite where a vertex comes too near a plane. order, ptr: vertices that move, by
   // body; material [1 | scenes, blocks, 2, lanes], rest [1 | scenes, blocks, 7, lanes] and corner (four times a vertex)
   // of the tets, by body

@@ -8,6 +8,7 @@
 // and P and Q are how a vertex moves by l and by d. docs/method.md, section 18.
 #pragma once
 
+#include "../rigid/reverse.h"
 #include "rigid_backward.h"
 
 namespace diffvbd::contact {
@@ -86,6 +87,117 @@ DIFFVBD_FN VertexAdjoint vertex_adjoint(const RigidInputs<T>& in, const rigid::B
   out.arm = -cross(g + H * Q + by_p, turn_p) - cross(H * P + by_q, turn_q) - (2 * kLeastInertia * turns * mass) * r;
   out.mass -= kLeastInertia * (turns * dot(r, r) + shifts);
   return out;
+}
+
+// Loops and sums over the vertices of a body belong to a Team (rigid/body.h).
+
+struct Whole {
+  double mass;
+  Vector center;
+};
+
+template <class T, class Team>
+DIFFVBD_FN Whole whole_of(const rigid::Body<T>& b, const Team& team) {
+  double sum[4];
+  team.template sum<4>(b.size(), sum, [&](int32_t i, double* to) {
+    const int32_t v = b.vertex(i);
+    const double m = b.mass(v);
+    const Vector x = b.position(v);
+    to[0] += m, to[1] += m * x.x, to[2] += m * x.y, to[3] += m * x.z;
+  });
+  return {sum[0], 0 < sum[0] ? (1 / sum[0]) * Vector{sum[1], sum[2], sum[3]} : Vector{}};
+}
+
+// What the center of mass has been sent, c_bar, goes on to positions and masses.
+template <class T, class Team>
+DIFFVBD_FN void send_center(const rigid::Body<T>& b, const Team& team, const Whole& whole, const Vector& c_bar, T* x,
+                            T* mass) {
+  if (!(0 < whole.mass)) return;
+  const Vector common = (1 / whole.mass) * c_bar;
+  team.each(b.size(), [&](int32_t i) {
+    const int32_t v = b.vertex(i);
+    rigid::add_to(x + 3 * b.row(v), b.mass(v) * common);
+    mass[b.row(v)] += T(dot(b.position(v) - whole.center, common));
+  });
+}
+
+// Of the adjoint of where a correction led, end_bar [B, V, 3]: of the way itself those of x and mass, and the adjoint
+// of the motion. All are written but mass, which is added to.
+template <class T, class Team>
+DIFFVBD_FN void reverse_end(const rigid::Body<T>& b, const Team& team, const double* motion, double share,
+                            const T* end_bar, double* motion_bar, T* x, T* mass) {
+  const Whole whole = whole_of(b, team);
+  const Vector w = share * Vector{motion[0], motion[1], motion[2]};
+  const rigid::Angles angles(w);
+  double sum[15];
+  team.template sum<15>(b.size(), sum, [&](int32_t i, double* to) {
+    const int32_t v = b.vertex(i);
+    const Vector g = rigid::Body<T>::at(end_bar + 3 * b.row(v)), r = b.position(v) - whole.center;
+    const Vector arm = arm_adjoint(w, angles, g);
+    rigid::put(x + 3 * b.row(v), g + arm);
+    to[0] -= arm.x, to[1] -= arm.y, to[2] -= arm.z;
+    to[3] += g.x, to[4] += g.y, to[5] += g.z;
+    to[6] += g.x * r.x, to[7] += g.x * r.y, to[8] += g.x * r.z;
+    to[9] += g.y * r.x, to[10] += g.y * r.y, to[11] += g.y * r.z;
+    to[12] += g.z * r.x, to[13] += g.z * r.y, to[14] += g.z * r.z;
+  });
+  const rigid::Matrix turning{{sum[6], sum[7], sum[8]}, {sum[9], sum[10], sum[11]}, {sum[12], sum[13], sum[14]}};
+  if (team.leads()) motion_adjoint(motion, share, Vector{sum[3], sum[4], sum[5]}, turning, motion_bar);
+  send_center(b, team, whole, Vector{sum[0], sum[1], sum[2]}, x, mass);
+}
+
+// How corner points [B, N, 3] move by the solution for that adjoint, and by the motion. The solution of a body that did
+// not move becomes zero: of a matrix that was not positive definite no motion came, and nothing goes back through it.
+template <class T, class Team>
+DIFFVBD_FN void virtual_motion(const RigidInputs<T>& in, const rigid::Body<T>& b, const Team& team,
+                               const double* motion, double* solution, T* p, T* q) {
+  double l[kUnknowns];
+  bool moves = in.free[b.body];
+  for (int i = 0; i < kUnknowns; ++i) {
+    l[i] = solution[i];
+    moves = moves && absolute(l[i]) < std::numeric_limits<double>::infinity();
+  }
+  for (int i = 0; i < kUnknowns && !moves; ++i) l[i] = 0;
+  const Whole whole = whole_of(b, team);  // after which all have read
+  for (int i = 0; i < kUnknowns && team.leads(); ++i) solution[i] = l[i];
+  team.each(b.size(), [&](int32_t i) {
+    const int32_t v = b.vertex(i);
+    const int64_t to = 3 * (b.scene * in.gate.corners + v);
+    const Vector r = b.position(v) - whole.center;
+    rigid::put(p + to, moved_by(l, r));
+    rigid::put(q + to, moved_by(motion, r));
+  });
+}
+
+// What vertices add to the adjoints, all zero at first. sent: by pairs to those two motions; floor_lag
+// [B, V, planes, 4], or null.
+template <class T, class Team>
+DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>& b, const Team& team,
+                                 const double* motion, const double* solution, const VirtualMotions<T>& sent,
+                                 const rigid::Adjoints<T>& out, T* floor_lag) {
+  bool moves = false;
+  for (int i = 0; i < kUnknowns; ++i) moves = moves || solution[i] != 0;
+  if (!moves) return;
+  const Whole whole = whole_of(b, team);
+  double sum[3];
+  team.template sum<3>(b.size(), sum, [&](int32_t i, double* to) {
+    const int32_t v = b.vertex(i);
+    const int64_t row = b.row(v), corner = 3 * (b.scene * in.gate.corners + v);
+    const VertexAdjoint bar = vertex_adjoint(in, b, v, b.position(v) - whole.center, solution, motion,
+                                             rigid::Body<T>::at(sent.p + corner), rigid::Body<T>::at(sent.q + corner),
+                                             floor_lag ? floor_lag + row * in.planes * kFloorLag : nullptr);
+    rigid::put(out.x + 3 * row, bar.x + bar.arm);
+    rigid::put(out.x_prev + 3 * row, bar.x_prev);
+    rigid::put(out.y + 3 * row, bar.y);
+    out.mass[row] = T(bar.mass);
+    to[0] -= bar.arm.x, to[1] -= bar.arm.y, to[2] -= bar.arm.z;
+  });
+  send_center(b, team, whole, Vector{sum[0], sum[1], sum[2]}, out.x, out.mass);
+  if (!out.shared && !out.own) return;
+  rigid::reverse_data(b, team, out, [&](int32_t v) {
+    const Vector x = b.position(v), r = x - whole.center;
+    return rigid::VertexMotions{x, moved_by(solution, r), moved_by(motion, r)};
+  });
 }
 
 }  // namespace diffvbd::contact

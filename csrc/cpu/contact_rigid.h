@@ -21,27 +21,15 @@ template <class T>
 void rigid_backward(const contact::RigidInputs<T>& in, const contact::VirtualMotions<T>& given,
                     const contact::RigidWork<T>& out);
 
-// Of the adjoint of where a correction led [B, V, 3]: of the way itself those of x and mass, and the adjoint of the
-// motion [B, bodies, 6]. All are written but mass [B, V], which is added to.
+// The parts of the adjoint of a correction for all bodies (contact/rigid_reverse.h).
 template <class T>
-void rigid_end_backward(const contact::RigidInputs<T>& in, const double* motion, const double* share, const T* end_bar,
-                        double* motion_bar, T* x, T* mass);
-
-// How corner points [B, N, 3] move by the solution for that adjoint, and by the motion; zero at first. Solutions of
-// bodies that did not move become zero.
+void rigid_end_backward(const contact::RigidInputs<T>& in, const double* motions, const double* shares,
+                        const T* end_bar, double* motion_bar, T* x, T* mass);
 template <class T>
-void rigid_virtual_motions(const contact::RigidInputs<T>& in, const double* motion, double* solution, T* p, T* q);
-
-// What vertices add to the adjoints, all zero at first; sent: by pairs to those two motions.
+void rigid_virtual_motions(const contact::RigidInputs<T>& in, const double* motions, double* solutions, T* p, T* q);
 template <class T>
-struct RigidVertexBars {
-  T *x, *x_prev, *y, *mass;  // [B, V, 3] three times, [B, V]
-  T *data, *floor_lag;       // [B, data_size] and [B, V, planes, 4], or null
-  int64_t data_size;
-};
-template <class T>
-void rigid_vertices_backward(const contact::RigidInputs<T>& in, const double* motion, const double* solution,
-                             const contact::VirtualMotions<T>& sent, const RigidVertexBars<T>& out);
+void rigid_vertices_backward(const contact::RigidInputs<T>& in, const double* motions, const double* solutions,
+                             const contact::VirtualMotions<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag);
 
 // Cholesky factors of `count` matrices [size, size], in their lower triangles; what is no number says that one is not
 // positive definite. And x [size] = factor^-T factor^-1 x of each.

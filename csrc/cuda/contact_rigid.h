@@ -3,7 +3,7 @@
 
 #include <cuda_runtime_api.h>
 
-#include "../contact/rigid_backward.h"
+#include "../contact/rigid_reverse.h"
 
 namespace diffvbd::cuda {
 
@@ -30,6 +30,17 @@ cudaError_t rigid_move(const contact::RigidInputs<T>& in, const PairRoom& room, 
 template <class T>
 cudaError_t rigid_backward(const contact::RigidInputs<T>& in, const contact::VirtualMotions<T>& given,
                            const contact::RigidWork<T>& out, cudaStream_t stream);
+
+// solutions [B, bodies, 6]: memory, too, for what is solved for; x, mass, p, q as of reverse_end() and
+// virtual_motion().
+template <class T>
+cudaError_t rigid_end_backward(const contact::RigidInputs<T>& in, const double* motions, const double* shares,
+                               const T* end_bar, const double* factor, double* solutions, T* x, T* mass, T* p, T* q,
+                               cudaStream_t stream);
+template <class T>
+cudaError_t rigid_vertices_backward(const contact::RigidInputs<T>& in, const double* motions, const double* solutions,
+                                    const contact::VirtualMotions<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag,
+                                    cudaStream_t stream);
 
 cudaError_t cholesky(int64_t count, int64_t size, double* matrices, cudaStream_t stream);
 cudaError_t cholesky_solve(int64_t count, int64_t size, const double* factors, double* x, cudaStream_t stream);

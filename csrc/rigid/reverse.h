@@ -51,10 +51,14 @@ struct VertexShare {
         D(cross(k.turn(), r) + k.shift()) {}
 };
 
-// The adjoints of an energy's data, record by record, through Dual.
-template <class T, class Team>
-DIFFVBD_FN void reverse_data(const Body<T>& b, const Team& team, const Vector& center, const Iteration& k,
-                             const Vector& p_turn, const Vector& p_shift, const Adjoints<T>& a) {
+// What a vertex does by two motions, and where it is: what the adjoint of its energies' data takes.
+struct VertexMotions {
+  Vector x, P, D;
+};
+
+// The adjoints of an energy's data, record by record, through Dual; added. at(v): the VertexMotions of a vertex.
+template <class T, class Team, class At>
+DIFFVBD_FN void reverse_data(const Body<T>& b, const Team& team, const Adjoints<T>& a, const At& at) {
   const StepParameters<double> none{b.in.time_step, 0, 1, -1, 0, 1, 1, false};
   int shared = 0, own = 0;
   each_energy(
@@ -64,11 +68,11 @@ DIFFVBD_FN void reverse_data(const Body<T>& b, const Team& team, const Vector& c
         for (int j = 0; j < count; j += E::stride) {
           const auto bars = [&](int32_t i, double* to) {
             const int32_t v = b.vertex(i);
-            const VertexShare at(b, v, center, k, p_turn, p_shift);
+            const VertexMotions m = at(v);
             b.energies(v, [&](auto other, int which, const double* data, int) {
               if constexpr (std::is_same_v<decltype(other), E>) {
-                record_vjp<E>(b.state(v, at.x), data + j, at.P, at.D, zero3<double>(), none, 0.0, 0.0,
-                              NoFrame<double>{}, to);
+                record_vjp<E>(b.state(v, m.x), data + j, m.P, m.D, zero3<double>(), none, 0.0, 0.0, NoFrame<double>{},
+                              to);
               }
             });
           };
@@ -148,7 +152,12 @@ DIFFVBD_FN void reverse(const Body<T>& b, const Team& team, Iteration* record, c
       const Vector p_turn{p[0], p[1], p[2]}, p_shift{p[3], p[4], p[5]};
       turn_bar = turn_bar + transposed(turned_by(turn_step)) * turn_bar;
       const double damped = kDamping * b.in.spread[b.body] * dot(p_turn, k.turn());
-      if (a.shared != nullptr || a.own != nullptr) reverse_data(b, team, m.center, k, p_turn, p_shift, a);
+      if (a.shared != nullptr || a.own != nullptr) {
+        reverse_data(b, team, a, [&](int32_t v) {
+          const VertexShare at(b, v, m.center, k, p_turn, p_shift);
+          return VertexMotions{at.x, at.P, at.D};
+        });
+      }
       double add[15];
       team.template sum<15>(b.size(), add, [&](int32_t i, double* to) {
         const int32_t v = b.vertex(i);

@@ -30,7 +30,7 @@ def anderson_combine(states: Tensor, mass: Tensor, order: Tensor, ptr: Tensor, r
 def potential_rise(fields: SweepFields, x: Tensor, to: Tensor, material: Tensor, rest: Tensor, index: Sequence[Tensor],
                    data_count: Sequence[int], time_step: float) -> Tensor:  # fmt: skip
     """By how much the potential of each body rises from x to ``to`` [kg m^2, times h^2], and the sum of the sizes of
-    its terms, float64 [B, bodies, 2]; infinite where a vertex would lose more of a gap than a step may. CPU only.
+    its terms, float64 [B, bodies, 2]; infinite where a vertex would lose more of a gap than a step may.
 
     Args:
         fields: Of the step; where its sweeps start does not enter.

@@ -11,6 +11,7 @@ from torch import Tensor
 from .fields import TouchingFields
 from .functions import raw_backward, shapes_of
 from .load import raw
+from .rigid import join_data, scalars_of_data
 
 UNKNOWNS = 6  # of a body: a turn and a shift
 MOST_COUPLED = 64  # bodies that are solved for together; twin of kMostCoupled in csrc/contact/rigid.h
@@ -57,7 +58,7 @@ class EndAdjoint(NamedTuple):
 
 def rigid_end_backward(fields: TouchingFields, motion: Tensor, share: Tensor, factor: Tensor, x_bar: Tensor,
                        data_count: Sequence[int], time_step: float, friction_eps: float) -> EndAdjoint:  # fmt: skip
-    """The first part of the adjoint of a correction, of that of where it led [B, V, 3]. On the CPU."""
+    """The first part of the adjoint of a correction, of that of where it led [B, V, 3]."""
     return EndAdjoint(*raw.contact_rigid_end_backward(*fields, motion, share, factor, x_bar.contiguous(), data_count,
                                                       time_step, friction_eps))  # fmt: skip
 
@@ -77,10 +78,12 @@ def rigid_vertices_backward(fields: TouchingFields, motion: Tensor, solution: Te
                             data_count: Sequence[int], time_step: float, friction_eps: float, wants_data: bool
                             ) -> VertexAdjoints:  # fmt: skip
     """The adjoints of what vertices add to -p . (gradient + matrix q), p and q being the motions of
-    :func:`rigid_end_backward`; by_p, by_q [B, N, 3]: what pairs add to the work's derivatives by them. On the CPU."""
-    return VertexAdjoints(*raw.contact_rigid_vertices_backward(
+    :func:`rigid_end_backward`; by_p, by_q [B, N, 3]: what pairs add to the work's derivatives by them."""
+    *own, shared, each, floor_lag = raw.contact_rigid_vertices_backward(
         *fields, motion, solution, by_p.contiguous(), by_q.contiguous(), data_count, time_step, friction_eps,
-        wants_data))  # fmt: skip
+        wants_data)  # fmt: skip
+    data = join_data(shared, each, data_count) if wants_data else shared
+    return VertexAdjoints(*own, data, floor_lag)
 
 
 @shapes_of("contact_rigid_system")
@@ -122,8 +125,10 @@ def _(*arguments):
     f, wants_data = TouchingFields(*arguments[:_FIELDS]), arguments[-1]
     b, v = f.x.shape[:2]
     planes = f.floor_lag.numel() // max(1, f.floor_lag.shape[0] * v * 4)
-    data, floor = (b if wants_data else 0, f.energy_data.shape[-1]), (b if planes else 0, v, planes, 4)
-    return (*(torch.empty_like(f.x) for _ in range(3)), *(f.x.new_empty(size) for size in ((b, v), data, floor)))
+    shared, own = scalars_of_data(arguments[-4])
+    data = ((b, f.free.shape[0] if wants_data else 0, shared), (b, v if wants_data else 0, own))
+    sizes = ((b, v), *data, (b if planes else 0, v, planes, 4))
+    return (*(torch.empty_like(f.x) for _ in range(3)), *(f.x.new_empty(size) for size in sizes))
 
 
 for _name in ("contact_rigid_system", "contact_rigid_solve", "contact_rigid_move", "contact_rigid_backward",

@@ -10,9 +10,8 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import reference
 from diffvbd.adjoint.anderson import _Combine, _combined, _combined_in_torch, combinations_of, cycles_of
-from diffvbd.adjoint.rise import _rise, rise_parts, rises
+from diffvbd.adjoint.rise import RiseParts, rise_of_bodies, rise_parts, rises
 from diffvbd.adjoint.sweep import sweep
-from diffvbd.ops.anderson import potential_rise
 from diffvbd.reference.anderson import Anderson
 from diffvbd.reference.energies import build_energies
 from diffvbd.reference.layout import build_layout
@@ -146,23 +145,20 @@ def comparison(case: str, dtype: torch.dtype = torch.float64) -> tuple[dv.Model,
 
 
 @pytest.mark.parametrize("case", ("plain", "floor_active", "free_anchored", "free_batch", "violent"))
-def test_the_potential_of_two_states(case: str) -> None:
-    """Compiled, in torch as CUDA has it, and by the reference."""
+def test_the_potential_of_two_states(case: str, device: str) -> None:
+    """Compiled, and by the reference."""
     model, parts, x, to, twin = comparison(case)
-    index = (model._moving.order, model._moving.ptr, model._other_bodies.of, model._moving.corner,
-             model._moving.block_ptr)  # fmt: skip
     rows = [t.transpose(-1, -2) for t in (x, to, parts.fields.y, parts.fields.x_prev)]
     expected, size = twin.rise(*rows)
     assert (expected < 0).any()
-    for found in (
-        potential_rise(parts.fields, x, to, parts.material, parts.rest, index, model._data_count, parts.time_step),
-        _rise(parts, x, to),
-    ):
-        assert found.shape == (*x.shape[:1], model._moving.number, 2)
-        finite = torch.isfinite(found[..., 0])
-        assert finite.any() and (found[..., 1] > 0).all()
-        apart = (found[..., 0] - expected).abs()[finite]
-        assert (apart <= tolerance("sum") * size[finite]).all(), apart / size[finite]
+    there = RiseParts(model.to(device), type(parts.fields)(*(t if t is None else t.to(device) for t in parts.fields)),
+                      parts.material.to(device), parts.rest.to(device), parts.time_step)  # fmt: skip
+    found = rise_of_bodies(there, x.to(device), to.to(device)).to(expected)
+    assert found.shape == (*x.shape[:1], model._moving.number, 2)
+    finite = torch.isfinite(found[..., 0])
+    assert finite.any() and (found[..., 1] > 0).all()
+    apart = (found[..., 0] - expected).abs()[finite]
+    assert (apart <= tolerance("sum") * size[finite]).all(), apart / size[finite]
     assert not rises(parts, x, to)[expected < 0].any() and rises(parts, to, x)[expected < 0].all()
 
 

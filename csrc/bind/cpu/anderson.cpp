@@ -9,10 +9,9 @@
 #include <tuple>
 #include <vector>
 
-#include "../../coarse/length.h"
 #include "../../cpu/bodies.h"
 #include "../../cpu/kernels.h"
-#include "../rigid.h"
+#include "../rise.h"
 #include "sweep.h"
 
 namespace {
@@ -142,12 +141,6 @@ std::tuple<Tensor, Tensor, Tensor> anderson_combine(const Tensor& states, const 
   });
 }
 
-template <class T>
-struct Tets {
-  const int32_t *corner, *ptr;  // [blocks, 4, kLanes]  four times a vertex; [bodies + 1]
-  Batched<const T> rest, material;
-};
-
 // x[i] and to[i] - x[i] as rows of four
 template <class T>
 void pack(const T* x, const T* to, int64_t vertices, T* at, T* way) {
@@ -161,31 +154,20 @@ void pack(const T* x, const T* to, int64_t vertices, T* at, T* way) {
 
 // The rise, and how much of it is rounding at most; infinite where a vertex would be too near a plane.
 template <class T>
-void rise(const rigid::Body<T>& b, const Threads& team, const Tets<T>& tets, const T* to, const T* at, const T* way,
+void rise(const coarse::RiseInputs<T>& in, const rigid::Body<T>& b, const Threads& team, const T* at, const T* way,
           const diffvbd::CoarseKernels<T>& kernels, double* out) {
   double vertices[3];
   team.template sum<3>(b.size(), vertices, [&](int32_t i, double* sum) {
     const int32_t v = b.vertex(i);
-    const Vector one = b.position(v), two = rigid::Body<T>::at(to + 3 * b.row(v)), step = two - one;
-    const double inertial = b.mass(v) * dot(step, 0.5 * (one + two) - b.target(v));
-    sum[0] += inertial, sum[1] += std::abs(inertial);
-    b.energies(v, [&](auto energy, int, const double* values, int count) {
-      using E = decltype(energy);
-      const auto there = b.state(v, two);
-      if constexpr (E::has_filter) {
-        if (!E::template admits<T>(there, one, values, count, rigid::kLeastShare)) sum[2] += 1;
-      }
-      const double before = E::value(b.state(v, one), values, count), after = E::value(there, values, count);
-      sum[0] += after - before, sum[1] += std::abs(before) + std::abs(after);
-    });
+    rigid::add_rise(b, v, rigid::Body<T>::at(in.to + 3 * b.row(v)), sum);
   });
   double change[2 * coarse::kDegree];
-  const int32_t first = tets.ptr[b.body];
-  const T* rest = tets.rest.data + b.scene * tets.rest.scene;
-  const T* material = tets.material.data + b.scene * tets.material.scene;
-  team.template sum<2 * coarse::kDegree>(tets.ptr[b.body + 1] - first, change, [&](int32_t i, double* sum) {
+  const int32_t first = in.block_ptr[b.body];
+  const T* rest = in.rest.data + b.scene * in.rest.scene;
+  const T* material = in.material.data + b.scene * in.material.scene;
+  team.template sum<2 * coarse::kDegree>(in.block_ptr[b.body + 1] - first, change, [&](int32_t i, double* sum) {
     double c[coarse::kDegree] = {};
-    kernels.line(tets.corner, rest, material, at, way, first + i, first + i + 1, c);
+    kernels.line(in.corner, rest, material, at, way, first + i, first + i + 1, c);
     for (int k = 0; k < coarse::kDegree; ++k) sum[k] += c[k], sum[coarse::kDegree + k] += std::abs(c[k]);
   });
   const double h2 = b.in.time_step * b.in.time_step;
@@ -198,28 +180,21 @@ Tensor potential_rise(const Tensor& x, const Tensor& to, const Tensor& x_prev, c
                       const Tensor& energy_data, const Tensor& origin, const Tensor& material, const Tensor& rest,
                       const Tensor& order, const Tensor& ptr, const Tensor& other, const Tensor& corner,
                       const Tensor& block_ptr, std::vector<int64_t> data_count, double time_step) {
+  static_assert(coarse::kBlockTets == diffvbd::kLanes);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const RigidFields fields{x, x_prev, y, mass, energy_data, origin, order, ptr, order, other};
-    const auto in = diffvbd::rigid_inputs<T>(fields, data_count, time_step, false);
-    require_like("to", to, x, x.numel());
-    require(is_index(corner, x) && corner.dim() == 3 && corner.size(1) == 4 && corner.size(2) == kLanes &&
-                is_index(block_ptr, x) && block_ptr.numel() == in.bodies + 1,
-            "diffvbd::potential_rise: expected corner [blocks, 4, lanes] and block_ptr [bodies + 1], int32");
-    require(data<const int32_t>(ptr)[in.bodies] <= order.numel(),
-            "diffvbd::potential_rise: expected order with all vertices of ptr");
-    const int64_t scenes = in.scenes, vertices = in.vertices, blocks = corner.size(0);
-    Tets<T> tets{data<const int32_t>(corner), data<const int32_t>(block_ptr), {}, {}};
-    tets.rest = batched<T>("rest", rest, x, scenes, blocks * kRestScalars * kLanes);
-    tets.material = batched<T>("material", material, x, scenes, blocks * kTetScalars * kLanes);
+    const auto in = diffvbd::rise_inputs<T>({x, x_prev, y, mass, energy_data, origin, order, ptr, order, other}, to,
+                                            material, rest, corner, block_ptr, data_count, time_step);
+    const int64_t scenes = in.bodies.scenes, vertices = in.bodies.vertices, bodies = in.bodies.bodies;
+    require(in.bodies.ptr[bodies] <= in.listed, "diffvbd::potential_rise: expected order with all vertices of ptr");
     const Buffer<T> at(size_t(scenes * vertices) * 4, true), way(size_t(scenes * vertices) * 4, true);
-    pack(data<const T>(x), data<const T>(to), scenes * vertices, at.get(), way.get());
+    pack(in.bodies.x, in.to, scenes * vertices, at.get(), way.get());
     const auto kernels = diffvbd::coarse_kernels<T>(diffvbd::kExactBlock);
-    Tensor out = torch::stable::empty({scenes, in.bodies, 2}, ScalarType::Double);
-    for_bodies(in, [&](const rigid::Body<T>& body, const Threads& team) {
+    Tensor out = torch::stable::empty({scenes, bodies, 2}, ScalarType::Double);
+    for_bodies(in.bodies, [&](const rigid::Body<T>& body, const Threads& team) {
       const int64_t first = 4 * body.scene * vertices;
-      rise(body, team, tets, data<const T>(to), at.get() + first, way.get() + first, kernels,
-           data<double>(out) + 2 * (body.scene * in.bodies + body.body));
+      rise(in, body, team, at.get() + first, way.get() + first, kernels,
+           data<double>(out) + 2 * (body.scene * bodies + body.body));
     });
     return out;
   });

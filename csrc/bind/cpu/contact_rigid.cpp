@@ -79,24 +79,22 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_end_backward(
     const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
     diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
     diffvbd::require_of_bodies(in, share, x, 1);
-    const int64_t b = in.scene.scenes, v = in.scene.vertices;
-    diffvbd::require_like("x_bar", x_bar, x, 3 * b * v);
-    Tensor solution = doubles({b, in.bodies(), contact::kUnknowns});
-    Tensor p = zeros(x, {b, in.gate.corners, 3}), q = zeros(x, {b, in.gate.corners, 3});
-    Tensor to_x = torch::stable::clone(x_bar), to_mass = zeros(x, {b, v});
+    diffvbd::require_like("x_bar", x_bar, x, 3 * in.scene.scenes * in.scene.vertices);
+    const diffvbd::RigidEndTensors out(in, [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
+    Tensor solution = doubles({in.scene.scenes, in.bodies(), contact::kUnknowns});
     auto* l = data<double>(solution);
     diffvbd::rigid_end_backward<T>(in, data<const double>(motion), data<const double>(share), data<const T>(x_bar), l,
-                                   data<T>(to_x), data<T>(to_mass));
+                                   data<T>(out.x), data<T>(out.mass));
     if (solution.numel() > 0) {
       const auto systems = diffvbd::systems_of(factor, solution);
       diffvbd::cholesky_solve(systems.count, systems.size, data<const double>(factor), l);
     }
-    diffvbd::rigid_virtual_motions<T>(in, data<const double>(motion), l, data<T>(p), data<T>(q));
-    return std::make_tuple(solution, p, q, to_x, to_mass);
+    diffvbd::rigid_virtual_motions<T>(in, data<const double>(motion), l, data<T>(out.p), data<T>(out.q));
+    return std::make_tuple(solution, out.p, out.q, out.x, out.mass);
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_vertices_backward(
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_vertices_backward(
     DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& solution, const Tensor& by_p, const Tensor& by_q,
     std::vector<int64_t> data_count, double time_step, double friction_eps, bool wants_data) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
@@ -105,22 +103,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_vertice
     const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
     diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
     diffvbd::require_of_bodies(in, solution, x, contact::kUnknowns);
-    const int64_t b = in.scene.scenes, v = in.scene.vertices;
-    const int64_t size = diffvbd::energy_data_size(data_count, v);
-    const std::vector<int64_t> points = {b, v, 3};
-    Tensor to_x = zeros(x, points), to_prev = zeros(x, points), to_y = zeros(x, points), to_mass = zeros(x, {b, v});
-    Tensor to_data = zeros(x, {wants_data ? b : 0, size}),
-           to_floor = zeros(x, {in.planes > 0 ? b : 0, v, in.planes, 4});
-    const diffvbd::RigidVertexBars<T> out{data<T>(to_x),
-                                          data<T>(to_prev),
-                                          data<T>(to_y),
-                                          data<T>(to_mass),
-                                          to_data.numel() > 0 ? data<T>(to_data) : nullptr,
-                                          to_floor.numel() > 0 ? data<T>(to_floor) : nullptr,
-                                          size};
+    const diffvbd::RigidVertexTensors out(in, data_count, wants_data,
+                                          [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
     diffvbd::rigid_vertices_backward<T>(in, data<const double>(motion), data<const double>(solution),
-                                        diffvbd::virtual_motions(in, by_p, by_q, x), out);
-    return std::make_tuple(to_x, to_prev, to_y, to_mass, to_data, to_floor);
+                                        diffvbd::virtual_motions(in, by_p, by_q, x), out.pointers<T>(), out.floor<T>());
+    return out.all();
   });
 }
 

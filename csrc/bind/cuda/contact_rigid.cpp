@@ -14,7 +14,7 @@ namespace {
 
 namespace contact = diffvbd::contact;
 namespace cuda = diffvbd::cuda;
-using cuda::check, cuda::current_stream, cuda::empty;
+using cuda::check, cuda::current_stream, cuda::empty, cuda::zeros;
 using diffvbd::data, diffvbd::dispatch_float, diffvbd::TouchingFields;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
@@ -95,6 +95,48 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_backward(DIFFVBD_PARAME
   });
 }
 
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_end_backward(
+    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& share, const Tensor& factor, const Tensor& x_bar,
+    std::vector<int64_t> data_count, double time_step, double friction_eps) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
+    diffvbd::require_of_bodies(in, share, x, 1);
+    diffvbd::require_like("x_bar", x_bar, x, 3 * in.scene.scenes * in.scene.vertices);
+    const diffvbd::RigidEndTensors out(in, [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
+    Tensor solution = empty(x, {in.scene.scenes, in.bodies(), contact::kUnknowns}, ScalarType::Double);
+    if (solution.numel() > 0) diffvbd::systems_of(factor, solution);
+    check(cuda::rigid_end_backward<T>(in, data<const double>(motion), data<const double>(share), data<const T>(x_bar),
+                                      data<const double>(factor), data<double>(solution), data<T>(out.x),
+                                      data<T>(out.mass), data<T>(out.p), data<T>(out.q), current_stream(x)),
+          "the adjoint of rigid motions");
+    return std::make_tuple(solution, out.p, out.q, out.x, out.mass);
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_vertices_backward(
+    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& solution, const Tensor& by_p, const Tensor& by_q,
+    std::vector<int64_t> data_count, double time_step, double friction_eps, bool wants_data) {
+  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
+    diffvbd::require_of_bodies(in, solution, x, contact::kUnknowns);
+    const diffvbd::RigidVertexTensors out(in, data_count, wants_data,
+                                          [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
+    check(cuda::rigid_vertices_backward<T>(in, data<const double>(motion), data<const double>(solution),
+                                           diffvbd::virtual_motions(in, by_p, by_q, x), out.pointers<T>(),
+                                           out.floor<T>(), current_stream(x)),
+          "the adjoint of rigid motions");
+    return out.all();
+  });
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
@@ -102,4 +144,6 @@ STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_rigid_solve", TORCH_BOX(&contact_rigid_solve));
   m.impl("contact_rigid_move", TORCH_BOX(&contact_rigid_move));
   m.impl("contact_rigid_backward", TORCH_BOX(&contact_rigid_backward));
+  m.impl("contact_rigid_end_backward", TORCH_BOX(&contact_rigid_end_backward));
+  m.impl("contact_rigid_vertices_backward", TORCH_BOX(&contact_rigid_vertices_backward));
 }
