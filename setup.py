@@ -59,6 +59,7 @@ CPU_SOURCES = [
     "csrc/bind/cpu/mesh.cpp",
     "csrc/bind/cpu/neighbors.cpp",
     "csrc/bind/cpu/rigid.cpp",
+    "csrc/bind/cpu/rise.cpp",
     "csrc/cpu/run.cpp",
 ]
 

@@ -36,10 +36,11 @@ __device__ __forceinline__ void unpack(int packed, int& i, int& j) {
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     body_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const int32_t* sides, const double* press,
-                const double* slid, double* center, double* gradient, double* matrix) {
+                const double* slid, const uint8_t* state, double* center, double* gradient, double* matrix) {
   __shared__ double part[kWarps][kMostSums];
   const int32_t n = in.bodies(), k = static_cast<int32_t>(blockIdx.x % n);
   const int64_t scene = blockIdx.x / n, row = blockIdx.x;
+  if (is_done(state, in.together() ? scene : row)) return;
   const Body<T> body{in.scene, scene, k};
   const BlockTeam team{part};
   double sums[4];
@@ -106,10 +107,11 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 __global__ void __launch_bounds__(32)
     between_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const int32_t* sides, const double* press,
-                   const double* center, double* matrix) {
+                   const uint8_t* state, const double* center, double* matrix) {
   extern __shared__ double cells[];  // [bodies, 36]
   const int32_t n = in.bodies(), k = static_cast<int32_t>(blockIdx.x % n);
   const int64_t scene = blockIdx.x / n;
+  if (is_done(state, scene)) return;
   for (int32_t e = threadIdx.x; e < 36 * n; e += 32) cells[e] = 0;
   __syncwarp();
   each_row(
@@ -140,20 +142,35 @@ __global__ void __launch_bounds__(32)
 
 // y += A x for each of the systems.
 template <class T>
-__global__ void __launch_bounds__(kOne)
-    product_kernel(const __grid_constant__ RigidInputs<T> in, const double* matrix, const double* x, double* y) {
+__global__ void __launch_bounds__(kOne) product_kernel(const __grid_constant__ RigidInputs<T> in, const uint8_t* state,
+                                                       const double* matrix, const double* x, double* y) {
   const int64_t row = own_item(), size = in.system_size();
-  if (row >= in.systems() * size) return;
+  if (row >= in.systems() * size || is_done(state, row / size)) return;
   const double *a = matrix + size * row, *own = x + row / size * size;
   double sum = 0;
   for (int64_t j = 0; j < size; ++j) sum += a[j] * own[j];
   y[row] += sum;
 }
 
+// Of a system, half of which is what a step lowers its potential by.
+__device__ __forceinline__ double energy_of(const BlockTeam& team, const double* factor, int64_t size, const double* x,
+                                            const double* more) {
+  double total[1];
+  team.template sum<1>(static_cast<int32_t>(size), total, [&](int32_t j, double* out) {
+    double sum = 0;
+    for (int64_t i = j; i < size; ++i) sum += factor[size * i + j] * (more ? x[i] + more[i] : x[i]);
+    out[0] += sum * sum;
+  });
+  return total[0];
+}
+
 // A block for each system: adds a share of a step of Newton's method to motions.
 template <class T>
-__global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ RigidInputs<T> in, const double* center,
-                                                        const double* factor, const double* step, double* motion) {
+__global__ void __launch_bounds__(kThreads)
+    step_kernel(const __grid_constant__ RigidInputs<T> in, const double* center, const double* factor,
+                const double* step, uint8_t* state, double* motion) {
+  const uint8_t was = state[blockIdx.x];
+  if (was == kDone) return;
   __shared__ double part[kWarps][kMostSums];
   const BlockTeam team{part};
   const int64_t size = in.system_size(), n = in.bodies();
@@ -161,12 +178,14 @@ __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ 
   const int64_t scene = together ? blockIdx.x : blockIdx.x / n;
   const auto k = static_cast<int32_t>(together ? 0 : blockIdx.x % n);  // the body, if it is one
   const double *own = factor + size * size * blockIdx.x, *to = step + size * blockIdx.x;
-  double fall[1];
-  team.template sum<1>(static_cast<int32_t>(size), fall, [&](int32_t j, double* out) {
-    double sum = 0;
-    for (int64_t i = j; i < size; ++i) sum += own[size * i + j] * to[i];
-    out[0] += sum * sum;
-  });
+  const double fall = energy_of(team, own, size, to, nullptr);
+  const double whole = energy_of(team, own, size, to, motion + size * blockIdx.x);
+  const bool settled = fall <= kSettled * kSettled * whole;
+  if (was == kSettledAt || settled) {
+    for (int64_t i = threadIdx.x; i < size; i += kThreads) motion[size * blockIdx.x + i] += to[i];
+    if (threadIdx.x == 0) state[blockIdx.x] = was == kSettledAt ? kDone : kSettledAt;
+    return;
+  }
   const Slid slid = of_scene({center, motion}, scene, n);
   const double* steps = step + kUnknowns * scene * n;
   const CornerPoints<T> at{in, false};
@@ -174,7 +193,7 @@ __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ 
   const auto rubbing = static_cast<int32_t>(in.first_lagged(scene + 1) - lagged);
   const Body<T> one{in.scene, scene, k};
   const int32_t planes = in.planes * (together ? static_cast<int32_t>(in.scene.vertices) : one.size());
-  const double share = slip_share(fall[0], [&](double tried) {
+  const double share = slip_share(fall, [&](double tried) {
     double sum[1];
     team.template sum<1>(planes + rubbing, sum, [&](int32_t i, double* out) {
       if (i < planes) {
@@ -199,9 +218,11 @@ __global__ void __launch_bounds__(kThreads) step_kernel(const __grid_constant__ 
 }
 
 template <class T>
-__global__ void __launch_bounds__(kOne) keep_finite_kernel(const __grid_constant__ RigidInputs<T> in, double* motion) {
+__global__ void __launch_bounds__(kOne)
+    keep_finite_kernel(const __grid_constant__ RigidInputs<T> in, const uint8_t* state, double* motion) {
   const int64_t row = own_item();
-  if (row < in.scene.scenes * in.bodies()) keep_finite(motion + kUnknowns * row);
+  if (row >= in.scene.scenes * in.bodies() || is_done(state, in.together() ? row / in.bodies() : row)) return;
+  keep_finite(motion + kUnknowns * row);
 }
 
 }  // namespace
@@ -209,7 +230,7 @@ __global__ void __launch_bounds__(kOne) keep_finite_kernel(const __grid_constant
 template <class T>
 int64_t rigid_system_bytes(const RigidInputs<T>& in, const PairRoom& room) {
   return aligned(room.rows() * 2 * sizeof(int32_t)) + aligned(room.rows() * kPressDoubles * sizeof(double)) +
-         aligned(in.scene.scenes * in.bodies() * kUnknowns * sizeof(double));
+         aligned(in.scene.scenes * in.bodies() * kUnknowns * sizeof(double)) + aligned(in.systems());
 }
 
 template <class T>
@@ -226,29 +247,32 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
   auto* sides = reinterpret_cast<int32_t*>(take(room.rows() * 2 * sizeof(int32_t)));
   auto* press = reinterpret_cast<double*>(take(room.rows() * kPressDoubles * sizeof(double)));
   auto* step = reinterpret_cast<double*>(take(unknowns * sizeof(double)));
+  uint8_t* state = take(in.systems());
   const bool rubs = in.rubs();
   if (rubs) {
     if (auto error = cudaMemsetAsync(motion, 0, unknowns * sizeof(double), stream)) return error;
+    if (auto error = cudaMemsetAsync(state, kOnItsWay, in.systems(), stream)) return error;
   } else {
-    step = motion;
+    step = motion, state = nullptr;
   }
-  // As often as the CPU may: whether all have settled would have to be waited for.
+  // As often as the CPU may
   for (int iteration = 0; iteration < (rubs ? kSlipIterations : 1); ++iteration) {
     const Slid slid = iteration > 0 ? Slid{center, motion} : Slid{};
-    if (room.rows() > 0) press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, slid, sides, press);
+    if (room.rows() > 0)
+      press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, slid, state, sides, press);
     const auto blocks = static_cast<unsigned>(bodies);
-    body_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room, sides, press, slid.motion, center, step, factor);
+    body_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room, sides, press, slid.motion, state, center, step, factor);
     if (in.together() && in.bodies() > 1) {
       const size_t cells = 36 * in.bodies() * sizeof(double);
-      between_kernel<T><<<blocks, 32, cells, stream>>>(in, room, sides, press, center, factor);
+      between_kernel<T><<<blocks, 32, cells, stream>>>(in, room, sides, press, state, center, factor);
     }
-    if (iteration > 0) product_kernel<T><<<blocks_for(unknowns), kOne, 0, stream>>>(in, factor, motion, step);
-    if (auto error = cholesky(in.systems(), in.system_size(), factor, stream)) return error;
-    if (auto error = cholesky_solve(in.systems(), in.system_size(), factor, step, stream)) return error;
-    keep_finite_kernel<T><<<blocks_for(bodies), kOne, 0, stream>>>(in, step);
+    if (iteration > 0) product_kernel<T><<<blocks_for(unknowns), kOne, 0, stream>>>(in, state, factor, motion, step);
+    if (auto error = cholesky(in.systems(), in.system_size(), factor, stream, state)) return error;
+    if (auto error = cholesky_solve(in.systems(), in.system_size(), factor, step, stream, state)) return error;
+    keep_finite_kernel<T><<<blocks_for(bodies), kOne, 0, stream>>>(in, state, step);
     if (rubs) {
       const auto systems = static_cast<unsigned>(in.systems());
-      step_kernel<T><<<systems, kThreads, 0, stream>>>(in, center, factor, step, motion);
+      step_kernel<T><<<systems, kThreads, 0, stream>>>(in, center, factor, step, state, motion);
     }
   }
   return cudaGetLastError();

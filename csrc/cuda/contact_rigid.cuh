@@ -18,6 +18,13 @@ __device__ __forceinline__ Vector vector_of(const double* a) { return {a[0], a[1
 // Bytes of a part of a workspace, rounded up to what any type needs.
 constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
 
+// Where Newton's method is with a system: on its way, at the motion it has settled at but not with the matrix there,
+// and done. What is done is left alone: to find out on the host would mean to wait, which a capture cannot.
+enum Settling : uint8_t { kOnItsWay, kSettledAt, kDone };
+__device__ __forceinline__ bool is_done(const uint8_t* state, int64_t system) {
+  return state && state[system] == kDone;
+}
+
 // Of a scene, what `slid` has of all.
 __device__ __forceinline__ Slid of_scene(const Slid& slid, int64_t scene, int64_t bodies) {
   if (!slid.motion) return slid;
@@ -27,10 +34,11 @@ __device__ __forceinline__ Slid of_scene(const Slid& slid, int64_t scene, int64_
 // What the pairs of all scenes press: bodies [rows, 2], -1 where nothing moves, and the rest, unless null. The listed
 // come first.
 template <class T>
-__global__ void __launch_bounds__(kOne)
-    press_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, Slid slid, int32_t* sides, double* press) {
+__global__ void __launch_bounds__(kOne) press_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room,
+                                                     Slid slid, const uint8_t* state, int32_t* sides, double* press) {
   const int64_t row = own_item();
   if (row >= room.listed + room.lagged) return;
+  if (slid.motion && row < room.listed) return;  // barriers press as before
   const CornerPoints<T> at{in, false};
   PairPress a;
   a.body[0] = a.body[1] = -1;
@@ -39,8 +47,11 @@ __global__ void __launch_bounds__(kOne)
     acts = row < in.first_listed(in.scene.scenes) && barrier_press(in, row, at, a);
   } else {
     const int64_t pair = row - room.listed;
-    acts = pair < in.first_lagged(in.scene.scenes) &&
-           lagged_press(in, pair, at, of_scene(slid, in.lagged.pairs[kPairRow * pair + 5], in.bodies()), a);
+    if (pair < in.first_lagged(in.scene.scenes)) {
+      const int64_t scene = in.lagged.pairs[kPairRow * pair + 5];
+      if (in.together() && is_done(state, scene)) return;
+      acts = lagged_press(in, pair, at, of_scene(slid, scene, in.bodies()), a);
+    }
   }
   sides[2 * row] = acts ? a.body[0] : -1;
   sides[2 * row + 1] = acts ? a.body[1] : -1;

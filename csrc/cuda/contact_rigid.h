@@ -42,7 +42,10 @@ cudaError_t rigid_vertices_backward(const contact::RigidInputs<T>& in, const dou
                                     const contact::VirtualMotions<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag,
                                     cudaStream_t stream);
 
-cudaError_t cholesky(int64_t count, int64_t size, double* matrices, cudaStream_t stream);
-cudaError_t cholesky_solve(int64_t count, int64_t size, const double* factors, double* x, cudaStream_t stream);
+// state: of each system, those that are done are left alone; or null.
+cudaError_t cholesky(int64_t count, int64_t size, double* matrices, cudaStream_t stream,
+                     const uint8_t* state = nullptr);
+cudaError_t cholesky_solve(int64_t count, int64_t size, const double* factors, double* x, cudaStream_t stream,
+                           const uint8_t* state = nullptr);
 
 }  // namespace diffvbd::cuda

@@ -184,7 +184,8 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairRoom& room, const dou
   t.state.share = reinterpret_cast<T*>(take(units * sizeof(T)));
   t.state.now = reinterpret_cast<T*>(take(units * sizeof(T)));
   t.state.blocked = take(units), t.state.stamp = take(units), t.done = take(scenes);
-  if (room.rows() > 0) press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, Slid{}, sides, nullptr);
+  if (room.rows() > 0)
+    press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, Slid{}, nullptr, sides, nullptr);
   begin_kernel<T><<<blocks_for(std::max(units, scenes)), kOne, 0, stream>>>(in, t);
   const dim3 sums(static_cast<unsigned>(t.blocks), static_cast<unsigned>(scenes));
   potential_kernel<T><<<sums, kThreads, 0, stream>>>(in, t, false, t.before);

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from .. import ops
 from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
-from ..adjoint.rise import rise_parts, rises
+from ..adjoint.rise import RiseParts, rise_parts, rises
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
 from ..contact.start import PartStart, start_between_planes
@@ -196,10 +197,14 @@ class ContactStep:
             found.extend(met.found)
         return x
 
+    @functools.cached_property
+    def potential_parts(self) -> RiseParts:
+        """What the step's comparisons of potentials have in common."""
+        return rise_parts(self.model, self.fields, self.prepared.settings.numbers.time_step)
+
     def _raises(self, x: Tensor, to: Tensor) -> Tensor:
         """Which vertices are of a body whose own potential is higher at ``to`` than at x [B, V], bool."""
-        parts = rise_parts(self.model, self.fields, self.prepared.settings.numbers.time_step)
-        rising = rises(parts, x.detach().contiguous(), to.detach())
+        rising = rises(self.potential_parts, x.detach().contiguous(), to.detach())
         none = rising.new_zeros((len(rising), 1))
         return torch.cat([rising, none], 1)[:, self.model._moving.of]
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from .. import ops
 from ..adjoint.anderson import _Combine, cycles_of, none_taken
-from ..adjoint.rise import rise_parts
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
 from ..scopes import recorders
@@ -137,7 +136,7 @@ def _scenes(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) 
 def _trials(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) -> Trials:
     s = _scenes(of, start, collider, listed)
     s = replaced(s, fields=ops.TouchingFields(*(t.detach() for t in s.fields)))
-    return Trials(s, rise_parts(of.model, of.fields, s.time_step))
+    return Trials(s, of.potential_parts)
 
 
 def record_parts(model: Model, x: Tensor, parts: Sequence[SweptPart]) -> None:
