@@ -132,12 +132,17 @@ def _scenes(ranks: int, cuda: bool, quick: bool) -> list[Row]:
 
 
 def _cubes(ranks: int, cuda: bool, quick: bool) -> list[Row]:
-    """Loss and gradient of the task million-cubes, with pushes, from velocities that take each body to its place."""
+    """Loss and gradient of the task million-cubes, with pushes, from velocities that take each body to its place.
+
+    Without pushes each body would fly straight to its place and arrive in time, which is close to what the task ends
+    with. Of a million, the most overlap three quarters of the way: 0.9 pairs a body. Bodies of a rank stay beside each
+    other: of those of other ranks, two ranks need one for every 200 of their own.
+    """
     settings = Settings(Path("unused"), "cuda" if cuda else "cpu", quick=quick)
     version = million_cubes.chosen(quick, None, None if quick else million_cubes.TARGET_STEP, None)
     cubes = million_cubes.Cubes(settings, version)
     cubes.begin(0, touching=True)
-    cubes.max_pairs = 16 * version.bodies
+    cubes.max_pairs = 4 * version.bodies
     duration = version.target_step * million_cubes.TIME_STEP
     with torch.no_grad():
         way = cubes.target - torch.as_tensor(million_cubes.launch_pad(version.bodies)).to(cubes.target)

@@ -1,6 +1,7 @@
 """Claim: scenes and bodies that ranks share have the bits that they have on one, gradients too, and a killed rank costs
 nothing but time."""
 
+import math
 import os
 import re
 import subprocess
@@ -22,7 +23,7 @@ import diffvbd as dv
 from diffvbd import distributed
 from diffvbd.cli import main
 from diffvbd.tasks import Problem, Settings, solve
-from diffvbd.tasks.million_cubes import launch_pad
+from diffvbd.tasks.million_cubes import QUICK, Cubes, launch_pad, rows_near
 from diffvbd.testing import relative_error, tolerance
 
 ENVIRONMENT = {"TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}  # what docs/guides/scale-out.md tells users to set
@@ -100,6 +101,29 @@ def push(out: Path) -> dict[str, Any]:
     return {"losses": [loss.detach() for loss in losses], "gradients": gradients}
 
 
+def forces(out: Path) -> dict[str, Any]:
+    """Forces and their gradient where bodies of other ranks are met, and where none is near; the error of a NaN."""
+    cubes = Cubes(Settings(out, quick=True), QUICK)
+    noise = torch.rand(cubes.target.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights = cubes.own(noise.cos())[:, None]  # which a pull on each body has in what the gradient is of
+    found = {"forces": [], "gradients": []}
+    for scale in ((0.5, 0.5, 0.5), (1.0, 0.5, 1.0)):  # of the launch pad; its columns belong to ranks
+        places = torch.from_numpy(launch_pad(64)) * torch.tensor(scale) + 2e-4 * noise
+        x = cubes.own(places)[:, None].expand(-1, 8, -1).reshape(cubes.shape).requires_grad_()
+        force = cubes.push(0, x, x)
+        assert force is not None
+        (gradient,) = torch.autograd.grad((force.view(-1, 8, 3) * weights).sum(), x)
+        found["forces"].append(cubes.all_of(force.detach().view(-1, 8, 3)))
+        found["gradients"].append(cubes.all_of(gradient.view(-1, 8, 3)))
+        if dist.is_initialized():
+            near = len(rows_near(cubes.own(places), places))
+            assert near == cubes.bodies if scale[0] == 1 else near > cubes.bodies
+    broken = places.index_fill(0, torch.tensor([40]), math.nan)  # of one rank; all have to say so
+    with pytest.raises(ValueError, match="expected finite values, got nan") as error:
+        cubes.push(0, cubes.own(broken)[:, None].expand(-1, 8, -1).reshape(cubes.shape), x)
+    return found | {"error": str(error.value)}
+
+
 def launch(out: Path) -> dict[str, Any]:
     """A run that is interrupted and goes on."""
     problem, settings = crowd(out)
@@ -130,7 +154,7 @@ def rows() -> dict[str, Any]:
 
 
 def work(out: Path) -> dict[str, Any]:
-    return {"rows": rows(), "train": train(), "push": push(out)}
+    return {"rows": rows(), "train": train(), "push": push(out), "forces": forces(out)}
 
 
 def by_ddp() -> list[Tensor]:
@@ -156,6 +180,11 @@ def check_not_zero(found: dict[str, Any]) -> None:
     free, pushed = found["push"]["gradients"]
     assert (free[0] - pushed[0]).abs().max() > 0.01 * free[0].abs().max()
     assert found["train"]["losses"][1] < found["train"]["losses"][0]
+    for values in (found["forces"]["forces"], found["forces"]["gradients"]):
+        # of bodies that meet no others both sum to zero: the first 32 meet the others only where all are close
+        close, columns = ((value[:32].sum((0, 1)).norm() / value.norm()).item() for value in values)
+        assert close > 0.1 and columns < tolerance("cancelling") and all(value.any((1, 2)).all() for value in values)
+    assert "at [0, 40, 0]" in found["forces"]["error"]
 
 
 @pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])

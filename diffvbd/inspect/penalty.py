@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad, softplus
 
 from .. import ops
-from ..checks import check_count, check_positive, check_tensor, fail
+from ..checks import check_count, check_dense, check_positive, check_tensor, fail
 from ..lasting import lasting_tensors
 from ..model.model import Model
 from ..ops.neighbors import neighbor_pairs, unread
@@ -116,7 +116,7 @@ class Bodies:
 
 def center_of_mass_penalty(
     x: Tensor,
-    model_or_bodies: Model | Bodies | tuple[Tensor, Tensor],
+    model_or_bodies: Model | Bodies | tuple[Tensor, Tensor] | None,
     radius: float,
     stiffness: float | Tensor,
     sharpness: float | None = None,
@@ -141,7 +141,8 @@ def center_of_mass_penalty(
     Args:
         x: Positions of the vertices [m], shape [..., V, 3]; leading dimensions are scenes, which do not see each other.
         model_or_bodies: A Model, whose bodies are ``model.mesh.body``; or :class:`Bodies`; or what those are made of
-            (labels [V], masses [V] [kg]), which costs a sort at each call and does not work inside a CUDA graph.
+            (labels [V], masses [V] [kg]), which costs a sort at each call and does not work inside a CUDA graph. None
+            if x are the centers of mass themselves: each row is a body, and gets the force on it.
         radius: Distance of the centers below which bodies overlap [m]: of balls, the sum of two radii.
         stiffness: [N/m], a number >= 0 or a tensor with one element.
         sharpness: a [1/m], or None for max(0, o).
@@ -157,7 +158,7 @@ def center_of_mass_penalty(
     Source: the paper's center-of-mass penalty between bodies (section on implementation and its appendix).
     """
     bodies = _bodies_of(model_or_bodies)
-    lead = _check_positions(x, bodies)
+    lead = _check_centers(x) if bodies is None else _check_positions(x, bodies)
     radius = _constant("radius", radius, "m")
     stiffness = _check_stiffness(stiffness, x)
     reach = radius
@@ -166,16 +167,18 @@ def center_of_mass_penalty(
         reach = radius - math.log(torch.finfo(x.dtype).eps) / sharpness
     scenes = math.prod(lead)
     if max_pairs is None:
-        max_pairs = PAIRS_PER_BODY * bodies.count * scenes
+        max_pairs = PAIRS_PER_BODY * (x.shape[-2] if bodies is None else bodies.count) * scenes
     max_pairs = check_count("max_pairs", max_pairs)
-    centers = bodies.centers(x.reshape(scenes, bodies.num_vertices, 3))
+    centers = x.reshape(scenes, x.shape[-2], 3)
+    if bodies is not None:
+        centers = bodies.centers(centers)
     pairs, count = neighbor_pairs(centers, reach, max_pairs, name="x (centers of mass)")
     unit = _unit_forces(centers, pairs, radius, sharpness)
     if unread(x):  # NaN in the forces and, as the centers are in the product, in the gradient too: no silent zeros
         bad = (count < 0) | (count > max_pairs)
         unit = unit + centers * torch.where(bad, math.nan, 0.0).to(unit.dtype)
     force = ops.broadcast(stiffness.reshape(1, 1, 1), unit.shape) * unit
-    return bodies.forces(force).reshape(x.shape)
+    return (force if bodies is None else bodies.forces(force)).reshape(x.shape)
 
 
 def _unit_forces(centers: Tensor, pairs: Tensor, radius: float, sharpness: float | None) -> Tensor:
@@ -197,14 +200,15 @@ def _unit_forces(centers: Tensor, pairs: Tensor, radius: float, sharpness: float
     return rows.sum(torch.stack([force, -force], 1).reshape(1, -1, 3)).reshape(scenes, bodies, 3)
 
 
-def _bodies_of(given: Any) -> Bodies:
-    if isinstance(given, Bodies):
+def _bodies_of(given: Any) -> Bodies | None:
+    if given is None or isinstance(given, Bodies):
         return given
     if isinstance(given, Model):
         return given.derived("bodies", lambda: Bodies(torch.from_numpy(given.mesh.body.copy()), given.mass))
     if isinstance(given, tuple) and len(given) == 2:
         return Bodies(*given)
-    raise TypeError(f"model_or_bodies: expected a Model, Bodies or (labels, masses), got {type(given).__name__}")
+    expected = "a Model, Bodies or (labels, masses), or None for centers of mass"
+    raise TypeError(f"model_or_bodies: expected {expected}, got {type(given).__name__}")
 
 
 def _check_positions(x: Any, bodies: Bodies) -> tuple[int, ...]:
@@ -215,6 +219,16 @@ def _check_positions(x: Any, bodies: Bodies) -> tuple[int, ...]:
     check_tensor("x", x, bodies.mass, owner="the masses'")
     if x.dim() < 2 or x.shape[-2:] != (bodies.num_vertices, 3):
         fail("x", f"shape {shape}", f"shape {list(x.shape)}")
+    return tuple(x.shape[:-2])
+
+
+def _check_centers(x: Any) -> tuple[int, ...]:
+    """The leading shape of x where each row is a body."""
+    if not isinstance(x, Tensor) or x.dtype not in (torch.float64, torch.float32):
+        raise TypeError(f"x: expected a float64 or float32 tensor of shape [..., N, 3], got {_kind(x)}")
+    check_dense("x", x)
+    if x.dim() < 2 or x.shape[-1] != 3:
+        fail("x", "shape [..., N, 3]", f"shape {list(x.shape)}")
     return tuple(x.shape[:-2])
 
 

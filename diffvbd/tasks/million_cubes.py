@@ -142,8 +142,8 @@ def chosen(quick: bool, bodies: int | None, steps: int | None, iterations: int |
 class Cubes:
     """The bodies, their places, and the four numbers of each that are looked for.
 
-    Under torchrun each rank moves its share of the bodies. What is small is whole on every rank: parameters, their
-    gradients and optimiser, centers of mass, pushes.
+    Under torchrun each rank moves its share of the bodies and finds the pushes on them. What is small is whole on every
+    rank: parameters, their gradients and optimiser, centers of mass.
     """
 
     def __init__(self, settings: Settings, version: Version) -> None:
@@ -165,10 +165,9 @@ class Cubes:
         self.target, pad = torch.as_tensor(place, **like), torch.as_tensor(launch_pad(bodies)[mine], **like)
         corners, self.mass = (each[: cube.num_vertices] for each in (self.model.rest_points, self.model.mass))
         self.x = (pad[:, None] + torch.tensor([1.0, SQUEEZE, 1.0], **like) * corners).reshape(self.shape)
-        labels = torch.arange(bodies, device=device)
-        self.mine = dv.contact.Bodies(labels[mine].repeat_interleave(cube.num_vertices), self.mass.repeat(self.bodies))
-        # all bodies see each other: to the penalty they are one scene, of a point for each
-        self.together = dv.contact.Bodies(labels, self.mine.mass[:1].repeat(bodies))
+        labels = torch.arange(self.bodies, device=device).repeat_interleave(cube.num_vertices)
+        self.mine = dv.contact.Bodies(labels, self.mass.repeat(self.bodies))
+        # on each rank room for the pairs of all: where one rank has enough, many have
         self.contact, self.max_pairs = False, PAIRS * bodies + 256
 
         self.velocity = torch.tensor([0.0, version.launch, 0.0], **like).repeat(bodies, 1).requires_grad_()
@@ -181,9 +180,26 @@ class Cubes:
     def push(self, step: int, x: Tensor, v: Tensor) -> Tensor | None:
         if step >= self.version.target_step:
             return None
-        centers = self.all_of(self.mine.centers(x.reshape(1, -1, 3))[0])
-        force = dv.contact.center_of_mass_penalty(centers, self.together, RADIUS, STIFFNESS, max_pairs=self.max_pairs)
-        return self.mine.forces(self.own(force)[None]).view_as(x)
+        centers = self.mine.centers(x.reshape(1, -1, 3))[0]
+        force = self.penalty(centers) if self.bodies == self.version.bodies else self.penalty_by_all(centers)
+        return self.mine.forces(force[None]).view_as(x)
+
+    def penalty(self, centers: Tensor) -> Tensor:
+        """Forces between some bodies [N]. All see each other: they are one scene."""
+        return dv.contact.center_of_mass_penalty(centers, None, RADIUS, STIFFNESS, max_pairs=self.max_pairs)
+
+    def penalty_by_all(self, mine: Tensor) -> Tensor:
+        """Forces on the bodies of this rank by those of all ranks [N], with the bits of one rank.
+
+        The penalty is that of the bodies of this rank and of those of others that are near them. All pairs of a body of
+        this rank are among them, in the order that they have among all bodies, so its sums are the same.
+        """
+        centers = self.all_of(mine)
+        near = rows_near(mine.detach(), centers.detach())
+        force = self.penalty(centers.index_select(0, near))
+        # Forces on bodies of other ranks lack pairs here, and nobody reads them. But these forces depend on the bodies
+        # of this rank, too: the backward of `own` brings the gradient of each, and the penalty's goes on from there.
+        return self.own(force.new_zeros(centers.shape).index_copy(0, near, force))
 
     def own(self, values: Tensor) -> Tensor:
         """Of all bodies [N, ...] -> of those of this rank."""
@@ -239,6 +255,17 @@ class Cubes:
 
     def animation(self, path: Path) -> None:
         viz.cloud_animation(path, self.frames(every=4), 4 * TIME_STEP)
+
+
+def rows_near(points: Tensor, others: Tensor) -> Tensor:
+    """Which of others [M, 3] may be closer to one of the points than RADIUS: indices, ascending.
+
+    All, where a number is not finite: then the search for pairs raises on every rank, as it does on one.
+    """
+    low, high = points.aminmax(dim=0)
+    apart = (others - others.clamp(low, high)).abs().amax(1)  # from the box around the points
+    far = (apart > 1.01 * RADIUS) & others.isfinite().all()  # by more than what rounding can move
+    return (~far).nonzero()[:, 0]
 
 
 def protocol(cube: dv.TetMesh, version: Version) -> dict[str, Any]:

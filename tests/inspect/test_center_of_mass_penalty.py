@@ -242,6 +242,18 @@ def test_a_model_is_its_bodies(device: str) -> None:
     assert center_of_mass_penalty(single.rest_points, single, 0.3, 2.0).dtype == torch.float32
 
 
+def test_centers_are_bodies_without_a_mass(device: str) -> None:
+    x, labels, mass = scene("one vertex each", device)
+    leaves = [x.clone().requires_grad_() for _ in range(2)]
+    forces = [center_of_mass_penalty(leaves[0], None, RADIUS, 2.0, max_pairs=700),
+              center_of_mass_penalty(leaves[1], (labels, mass), RADIUS, 2.0, max_pairs=700)]  # fmt: skip
+    gradients = [torch.autograd.grad(f.square().sum(), a)[0] for f, a in zip(forces, leaves, strict=True)]
+    assert torch.equal(*forces) and torch.equal(*gradients)
+    assert forces[0].abs().max() > 0.01 and gradients[0].abs().max() > 0.01
+    assert center_of_mass_penalty(x[:0], None, RADIUS, 1.0).shape == (0, 25, 3)
+    assert center_of_mass_penalty(x[:, :0], None, RADIUS, 1.0).shape == (2, 0, 3)
+
+
 # --- bad input --------------------------------------------------------------------------------------------------------
 
 X, LABELS, MASS = torch.zeros(4, 3), torch.tensor([0, 0, 1, 1]), torch.ones(4)
@@ -260,6 +272,12 @@ GIVEN: dict[str, Any] = {"x": X, "model_or_bodies": (LABELS, MASS), "radius": 1.
             ValueError,
             r"x \(centers of mass\): expected finite values, got nan at \[0, 0, 0\]",
         ),
+        (
+            {"model_or_bodies": None, "x": LABELS},
+            TypeError,
+            r"x: expected a float64 or float32 tensor of shape \[..., N, 3\], got dtype torch.int64",
+        ),
+        ({"model_or_bodies": None, "x": X[0]}, ValueError, r"x: expected shape \[..., N, 3\], got shape \[3\]"),
         ({"model_or_bodies": MASS}, TypeError, "model_or_bodies: expected a Model, Bodies or .* got Tensor"),
         ({"model_or_bodies": (LABELS, MASS, MASS)}, TypeError, "model_or_bodies: .* got tuple"),
         ({"model_or_bodies": (MASS, MASS)}, TypeError, "body: expected a tensor of integers, got dtype torch.float32"),

@@ -8,7 +8,7 @@ import torch
 from helpers.task_checks import check_fall, check_gradient, quick, timeless
 
 from diffvbd.tasks import Settings, million_cubes, solve
-from diffvbd.tasks.million_cubes import RADIUS, RING_SPACING, launch_pad, matched, ring
+from diffvbd.tasks.million_cubes import RADIUS, RING_SPACING, launch_pad, matched, ring, rows_near
 from diffvbd.testing import tolerance
 
 NAME = "million-cubes"
@@ -82,6 +82,21 @@ def test_places_are_distinct_and_do_not_overlap(bodies: int) -> None:
     mixed = matched(ring(bodies, 1.77), np.random.default_rng(0))
     assert sorted(map(tuple, mixed)) == sorted(map(tuple, ring(bodies, 1.77)))
     assert bodies < 1000 or abs(ring(bodies, 1.77).mean(0) - [0.0, 1.77, 0.0]).max() < 0.2 * RING_SPACING
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("away", [0.0, 1e3])
+def test_bodies_near_others_leave_out_no_pair(away: float, dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(0)
+    points = (away + 0.03 * torch.rand(2000, 3, generator=generator, dtype=torch.float64)).to(dtype)
+    some = points[points[:, 0] < away + 0.01]
+    near = rows_near(some, points)
+    pair = (points[:, None] - some).square().sum(-1) < RADIUS**2
+    assert pair.any(1).nonzero()[:, 0].tolist() == [n for n in near.tolist() if pair[n].any()]
+    assert len(some) < len(near) < 0.7 * len(points) and bool((near.diff() > 0).all())
+    for broken in (torch.nan, torch.inf):
+        points[-1, 1] = broken
+        assert len(rows_near(some, points)) == len(points)
 
 
 def test_bad_options_are_refused(tmp_path: Path) -> None:
