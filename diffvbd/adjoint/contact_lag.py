@@ -107,10 +107,15 @@ class _OfScene(Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:
-        ptr = ctx.listed.ptr  # pairs are sorted by scene, with four entries each
-        first = (ptr[:: (ptr.shape[0] - 1) // ctx.scenes] // 4).contiguous()
-        order = torch.arange(grads[0].shape[0], dtype=torch.int32, device=ptr.device)
-        return ops_contact.segment_sum(grads[0][None, :, None].contiguous(), order, first)[0, :, 0], None
+        return sum_of_scenes(grads[0], ctx.listed, ctx.scenes), None
+
+
+def sum_of_scenes(values: Tensor, listed: Pairs, scenes: int) -> Tensor:
+    """Sums of values of pairs [pairs] over those of each scene [B], in a fixed order."""
+    ptr = listed.ptr  # pairs are sorted by scene, with four entries each
+    first = (ptr[:: (ptr.shape[0] - 1) // scenes] // 4).contiguous()
+    order = torch.arange(values.shape[0], dtype=torch.int32, device=ptr.device)
+    return ops_contact.segment_sum(values[None, :, None].contiguous(), order, first)[0, :, 0]
 
 
 def of_scene(value: Tensor, listed: Pairs) -> Tensor:

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..adjoint.contact_lag import Pairs, sum_at_corners
+from ..adjoint.contact_lag import Pairs, sum_at_corners, sum_of_scenes
 from ..model.model import Model
 from ..ops import contact_rigid as ops_rigid
 from ..ops import no_second_derivative, no_transforms, of_inputs
@@ -140,8 +140,10 @@ def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: T
 
 
 def _of_scenes(values: Tensor, listed: Pairs, scenes: int) -> Tensor:
-    """Sums over the pairs of each scene [B]; values are zero in rows that no pair fills."""
-    return values.new_zeros((scenes,)).index_add_(0, listed.pairs[:, 5].long().clamp(min=0), values)
+    """Sums over the pairs of each scene [B], in a fixed order; values are zero in rows that no pair fills."""
+    if scenes == 1:
+        return values.sum(0, keepdim=True)
+    return sum_of_scenes(values, listed, scenes)
 
 
 ops.ready_signature(_Correct)

@@ -116,6 +116,10 @@ def test_the_color_moves_as_one(device: str, name: str, sweeps: int) -> None:
         assert result.keys() == expected.keys()
         others = [functools.partial(other, seed) for seed in (3, 0, 1, 2)]
         forward, adjoint = tolerance("contact_forward"), tolerance("contact_adjoint")
+        if (
+            name == "two_tets"
+        ):  # which fly apart, in contact, farther than a thousand times what friction is smoothed by
+            adjoint = tolerance("far_slip_adjoint")
         assert_near_contact(result, expected, forward, adjoint, scene.time_step, others)
         assert all(result[key].any() for key in ("grad_x", "grad_v", "grad_pair_barrier.kappa"))
 
