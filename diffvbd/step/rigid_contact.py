@@ -141,8 +141,8 @@ def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: T
 
 def _of_scenes(values: Tensor, listed: Pairs, scenes: int) -> Tensor:
     """Sums over the pairs of each scene [B], in a fixed order; values are zero in rows that no pair fills."""
-    if scenes == 1:
-        return values.sum(0, keepdim=True)
+    if scenes <= 1:
+        return values.sum(0, keepdim=True)[:scenes]
     return sum_of_scenes(values, listed, scenes)
 
 
