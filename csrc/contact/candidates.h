@@ -141,23 +141,31 @@ DIFFVBD_FN T reach_of(const Surfaces<T>& in, int64_t scene) {
   return own < other ? other : own;
 }
 
-// Squared distances of boxes up to which a pair of a primitive of some group may be listed.
-struct Reach {
-  float own, other;  // with one of the same group; with any
-  int32_t group;     // -1: it has several
-  DIFFVBD_FN float to(int32_t to_group) const { return group >= 0 && group == to_group ? own : other; }
-};
+// Squared distances of boxes up to which a pair of a primitive of some group may be listed. Bodies that want to go far
+// have much room: what is near none of them is not to be looked for as far.
 template <class T>
-DIFFVBD_FN Reach squared_reach(const Surfaces<T>& in, int64_t scene, int32_t group) {
-  const T most = in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
-  const T own = own_reach_of(in, scene, group >= 0 && group < in.mesh_bodies ? group : in.mesh_bodies, in.dhat);
-  T other = in.dhat + most + (group >= 0 ? room_of(in, scene, group) : most);
-  other = other < own ? own : other;
-  const auto square = [](T far) {
+struct Reach {
+  const Surfaces<T>& in;
+  int64_t scene;
+  int32_t group;  // -1: it has several
+  float any;      // with a primitive of any group
+
+  DIFFVBD_FN static float squared(T far) {
     const float reach = static_cast<float>(far) * (1.0F + 0x1p-20F);
     return reach * reach * (1.0F + 0x1p-20F);
-  };
-  return {square(own), square(other), group};
+  }
+  DIFFVBD_FN float to(int32_t other) const {
+    if (group < 0 || other < 0) return any;
+    if (group == other && group < in.mesh_bodies) return squared(own_reach_of(in, scene, group, in.dhat));
+    return squared(in.dhat + room_of(in, scene, group) + room_of(in, scene, other));
+  }
+};
+template <class T>
+DIFFVBD_FN Reach<T> squared_reach(const Surfaces<T>& in, int64_t scene, int32_t group) {
+  const T most = in.room[scene * (in.mesh_bodies + 1) + in.mesh_bodies];
+  const T own = own_reach_of(in, scene, group >= 0 && group < in.mesh_bodies ? group : in.mesh_bodies, in.dhat);
+  const T other = in.dhat + most + (group >= 0 ? room_of(in, scene, group) : most);
+  return {in, scene, group, Reach<T>::squared(other < own ? own : other)};
 }
 
 // --- pairs

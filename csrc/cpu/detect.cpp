@@ -98,7 +98,7 @@ class SceneDetection {
   void search(const Tree& tree, const Tree& others, int32_t g, std::vector<Met>& met, Finds<T>& finds) {
     const int32_t home = tree.groups() + g;
     const Box &around = tree.nodes[home], *nodes = others.nodes.data();
-    const Reach reach = squared_reach(in_, scene_, around.group);
+    const Reach<T> reach = squared_reach(in_, scene_, around.group);
     met.clear();
     if (!is_empty(around)) {
       const auto hits = [&](const Box& node) {
@@ -112,9 +112,10 @@ class SceneDetection {
     for (int32_t leaf = home * kGroup; leaf < (home + 1) * kGroup; ++leaf) {
       const Box& own = tree.nodes[leaf];
       if (!is_empty(own)) {
+        const Reach<T> from = squared_reach(in_, scene_, own.group);
         for (const Met& other : met) {
-          if ((kind == kEdgeEdge && other.node <= leaf) || !(distance2(other.box, own) <= reach.to(other.box.group)))
-            continue;
+          if (kind == kEdgeEdge && other.node <= leaf) continue;
+          if (!(distance2(other.box, own) <= from.to(other.box.group))) continue;
           examine(candidate(in_, scene_, kind, own.item, other.box.item), finds);
         }
       }

@@ -154,7 +154,7 @@ struct Search {
   template <class Visit>
   __device__ void walk(const Query& q, int32_t from, int32_t end, int32_t first, const Visit& visit) const {
     const Box* nodes = work.forest.tree(q.kind, q.scene);
-    const Reach reach = squared_reach(in, q.scene, q.box.group);
+    const Reach<T> reach = squared_reach(in, q.scene, q.box.group);
     const auto hits = [&](const Box& node) {
       return distance2(node, q.box) <= reach.to(node.group) && !in.ignores(q.box.group, node.group);
     };
