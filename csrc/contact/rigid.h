@@ -96,8 +96,9 @@ struct PairPress {
   double weight[2];
   Vector at[2], pull[2], torque[2];
   double value;
-  Vector slip;  // of friction: where it is linear about,
-  double rubs;  // and h^2 times the load [N] if it is exact there
+  Vector slip;     // of friction: where it is linear about,
+  double rubs;     // and h^2 times the load [N], over
+  double doubled;  // how often what the body does counts: twice where each side is solved for alone
 
   // What the body of a side does to the pair by its k-th unknown, about its center.
   DIFFVBD_FN Vector map(int side, int k, const Vector& center) const {
@@ -232,9 +233,11 @@ struct Slid {
 
 // Lagged friction and damping of a pair; it acts along a gap, so that it turns a body even by itself. The gradient is
 // that of a matrix which holds where bodies have gone as `slid` says: there both are exact. Of a pair whose sides are
-// not solved for together the matrix is a bound, wherever they go.
+// not solved for together, `alone` says which of them is: it has half of the potential, with twice the motion, and what
+// both lower by themselves, convex as it is, they lower together. -1: only the value is asked for.
 template <class T, class At>
-DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, const Slid& slid, PairPress& out) {
+DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, const Slid& slid, PairPress& out,
+                             int alone) {
   const int32_t* record = in.lagged.pairs + kPairRow * pair;
   const Lag<T> lag(in.lag + kLagScalars * pair);
   if (!lag.active()) return false;
@@ -244,6 +247,9 @@ DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& a
   if (out.body[0] < 0 && out.body[1] < 0) return false;
   const bool within = out.body[0] == out.body[1];
   if (within) out.body[1] = -1;
+  const bool halves = !in.together() && out.body[0] >= 0 && out.body[1] >= 0;
+  if (halves && alone >= 0) out.body[1 - alone] = -1;
+  out.doubled = halves ? 2 : 1;
   Vector m{};
   for (int k = 0; k < 4; ++k) {
     const int32_t v = record[k];
@@ -257,24 +263,24 @@ DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& a
   const Vector n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
   const double h = in.scene.time_step, along = dot(n, m), c = h * double(lag.damping),
                size = h * h * double(lag.friction);
-  const bool exact = in.together() || out.body[0] < 0 || out.body[1] < 0;
   Vector way{};
-  for (int side = 0; slid.motion && exact && side < 2; ++side) {
+  for (int side = 0; slid.motion && side < 2; ++side) {
     const int32_t body = out.body[side];
     if (body < 0) continue;
-    way += out.moved(side, rigid::Body<double>::at(slid.center + 3 * body), slid.motion + kUnknowns * body);
+    way +=
+        out.doubled * out.moved(side, rigid::Body<double>::at(slid.center + 3 * body), slid.motion + kUnknowns * body);
   }
   const Vector u = m - along * n;
   out.slip = u + (way - dot(n, way) * n);
   const double length = square_root(dot(out.slip, out.slip)), approach = along < 0 ? along : 0;
   const FrictionRate<double> f(length, in.friction_eps);
-  const double bend = exact ? f.curvature : 0;
-  out.rubs = exact ? size : 0;
+  out.rubs = size / out.doubled;
   out.value = size * slip_value(length, in.friction_eps) + 0.5 * c * approach * approach;
-  out.force = size * (f.value * u - (bend * dot(out.slip, way)) * out.slip) + (c * approach) * n;
-  out.stiffness = diagonal(size * f.value);
-  add_outer(out.stiffness, c - size * f.value, n);
-  add_outer(out.stiffness, size * bend, out.slip);
+  out.force = size * (f.value * u - (f.curvature * dot(out.slip, way)) * out.slip) + (c * approach) * n;
+  const double borne = out.doubled;
+  out.stiffness = diagonal(borne * size * f.value);
+  add_outer(out.stiffness, borne * (c - size * f.value), n);
+  add_outer(out.stiffness, borne * size * f.curvature, out.slip);
   return true;
 }
 

@@ -53,11 +53,11 @@ DIFFVBD_FN PairMotions motions_of(const RigidInputs<T>& in, const VirtualMotions
 template <class R>
 struct PressTerms {
   Vec3<R> force, n, at_corner[4];
-  R w[4], along, across;  // stiffness along the normal and across it
-  // Of friction that is exact at the end of q, which `force` has: its derivative there, and what that has along the
-  // slip
-  Vec3<R> slip;
-  R rate, bend;
+  R w[4], along;  // stiffness along the normal
+  // Of friction, for each side that moves by itself, where q has taken it: its force, the slip, its derivative there,
+  // and what that has along the slip.
+  Vec3<R> rub[2], slip[2];
+  R rate[2], bend[2];
 };
 
 template <class R>
@@ -78,7 +78,7 @@ DIFFVBD_FN R virtual_work(const PressTerms<R>& a, const PairMotions& m) {
   }
   for (int side = 0; side < m.sides; ++side) {
     const Vec3<R> p = weighted(a.w, m.p, m, side), q = weighted(a.w, m.q, m, side);
-    out = out + R(m.share) * ((a.along - a.across) * dot(a.n, p) * dot(a.n, q) + a.across * dot(p, q));
+    out = out + R(m.share) * a.along * dot(a.n, p) * dot(a.n, q) + dot(a.rub[side], p);
   }
   return out;
 }
@@ -86,13 +86,14 @@ DIFFVBD_FN R virtual_work(const PressTerms<R>& a, const PairMotions& m) {
 // Adds the derivatives by p and q, to each corner's row.
 template <class T>
 DIFFVBD_FN void add_by_motions(const PressTerms<double>& a, const PairMotions& m, T* rows) {
-  const auto pressed = [&](const Vector& u) { return ((a.along - a.across) * dot(a.n, u)) * a.n + a.across * u; };
-  const auto rubbed = [&](const Vector& u) {
-    return a.rate * (u - dot(a.n, u) * a.n) + (a.bend * dot(a.slip, u)) * a.slip;
-  };
+  const auto pressed = [&](const Vector& u) { return (a.along * dot(a.n, u)) * a.n; };
   for (int side = 0; side < m.sides; ++side) {
-    const Vector by_p = m.share * pressed(weighted(a.w, m.q, m, side));
-    const Vector P = weighted(a.w, m.p, m, side), by_q = m.share * pressed(P) + rubbed(P);
+    const Vector& slip = a.slip[side];
+    const auto rubbed = [&](const Vector& u) {
+      return a.rate[side] * (u - dot(a.n, u) * a.n) + (a.bend[side] * dot(slip, u)) * slip;
+    };
+    const Vector P = weighted(a.w, m.p, m, side), Q = weighted(a.w, m.q, m, side);
+    const Vector by_p = a.rub[side] + m.share * pressed(Q), by_q = m.share * (pressed(P) + rubbed(P));
     for (int k = 0; k < 4; ++k) {
       if (!m.is_of(side, k)) continue;
       rigid::put(rows + kWorkScalars * k + 3, a.w[k] * (a.force + by_p) + a.at_corner[k]);
@@ -113,7 +114,7 @@ DIFFVBD_FN PressTerms<R> barrier_terms(int kind, const Corners<R>& c, const Pair
     e = m.e;
     for (int k = 0; k < 4; ++k) out.at_corner[k] = b.value * m.gradient[k];
   }
-  out.force = (e * b.first) * near.n, out.n = near.n, out.along = e * b.second, out.across = R(0);
+  out.force = (e * b.first) * near.n, out.n = near.n, out.along = e * b.second;
   for (int k = 0; k < 4; ++k) out.w[k] = near.w[k];
   return out;
 }
@@ -172,19 +173,14 @@ DIFFVBD_FN PressTerms<R> lagged_terms(const R* lag, const Vector* since, const P
   }
   const R along = dot(out.n, m), approach = select(along < R(0), along, R(0));
   const R load = R(h * h) * lag[0];
-  out.along = R(h) * lag[1], out.across = out.rate = out.bend = R(0);
-  out.slip = m - along * out.n;
-  const bool exact = motions.sides == 1;  // contact/rigid.h, lagged_press
-  if (exact) {
-    const Vec3<R> way = weighted(out.w, motions.q, motions, 0);
-    out.slip = out.slip + (way - dot(out.n, way) * out.n);
-  }
-  const FrictionRate<R> f = slip_rate(out.slip, eps);
-  out.force = (load * f.value) * out.slip + (out.along * approach) * out.n;
-  if (exact) {
-    out.rate = load * f.value, out.bend = load * f.curvature;
-  } else {
-    out.across = load * f.value;
+  out.along = R(h) * lag[1];
+  out.force = (out.along * approach) * out.n;
+  for (int side = 0; side < motions.sides; ++side) {
+    const Vec3<R> way = R(motions.share) * weighted(out.w, motions.q, motions, side);
+    out.slip[side] = m - along * out.n + (way - dot(out.n, way) * out.n);
+    const FrictionRate<R> f = slip_rate(out.slip[side], eps);
+    out.rate[side] = load * f.value, out.bend[side] = load * f.curvature;
+    out.rub[side] = out.rate[side] * out.slip[side];
   }
   return out;
 }

@@ -25,7 +25,7 @@ void each_press(const RigidInputs<T>& in, int64_t scene, bool moved, const F& f)
     if (barrier_press(in, i, at, press)) f(press, false);
   }
   for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
-    if (lagged_press(in, i, at, Slid{}, press)) f(press, true);
+    if (lagged_press(in, i, at, Slid{}, press, -1)) f(press, true);
   }
 }
 
@@ -109,9 +109,10 @@ template <class T>
 void add_lagged_of_scene(const RigidInputs<T>& in, int64_t scene, const Slid& slid, double* gradient, double* matrix) {
   const int32_t n = in.bodies();
   const CornerPoints<T> at{in, false};
-  PairPress press;
   for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
-    if (lagged_press(in, i, at, slid, press)) add_press(press, n, in.together(), slid.center, gradient, matrix);
+    each_lagged_press(in, i, at, slid, [&](const PairPress& press) {
+      add_press(press, n, in.together(), slid.center, gradient, matrix);
+    });
   }
   for (int32_t k = 0; in.planes && k < n; ++k) {
     if (!in.free[k]) continue;
@@ -139,11 +140,11 @@ std::vector<std::vector<SlipLine>> lines_of_scene(const RigidInputs<T>& in, int6
                                                   const double* step) {
   std::vector<std::vector<SlipLine>> out(in.together() ? 1 : in.bodies());
   const CornerPoints<T> at{in, false};
-  PairPress press;
   for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
-    if (!lagged_press(in, i, at, slid, press) || press.rubs == 0) continue;
-    const int32_t body = press.body[0] < 0 ? press.body[1] : press.body[0];
-    out[in.together() ? 0 : body].push_back(slip_line(in, i, press, slid.center, step));
+    each_lagged_press(in, i, at, slid, [&](const PairPress& press) {
+      const int32_t body = press.body[0] < 0 ? press.body[1] : press.body[0];
+      out[in.together() ? 0 : body].push_back(slip_line(in, i, press, slid.center, step));
+    });
   }
   for (int32_t k = 0; in.planes && k < in.bodies(); ++k) {
     const Body<T> body{in.scene, scene, k};

@@ -32,6 +32,14 @@ __device__ __forceinline__ void unpack(int packed, int& i, int& j) {
   j = packed - rigid::at6(i, 0);
 }
 
+// Apart, so that what scenes of few bodies never need takes no registers from them.
+template <class T>
+__device__ __noinline__ PairPress press_alone(const RigidInputs<T>& in, int64_t pair, Slid slid, int side) {
+  PairPress a;
+  lagged_press(in, pair, CornerPoints<T>{in, false}, slid, a, side);
+  return a;
+}
+
 // A block for each body of each scene: center, gradient, and what it adds to the diagonal of the matrix.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
@@ -74,8 +82,12 @@ __global__ void __launch_bounds__(kThreads)
     each_row(
         in, room, scene, warp, kWarps, [&](int64_t at) { return sides[2 * at] == k || sides[2 * at + 1] == k; },
         [&](int64_t at) {
-          const PairPress a = load_press(press + kPressDoubles * at, sides + 2 * at);
+          PairPress a = load_press(press + kPressDoubles * at, sides + 2 * at);
           const int side = a.body[0] == k ? 0 : 1;
+          // of friction the sides have different presses, if each is solved for alone
+          if (!together && room.listed <= at && a.body[1 - side] >= 0) {
+            a = press_alone(in, at - room.listed, of_scene(Slid{center, slid}, scene, n), side);
+          }
           if (lane < kUnknowns) {
             own += a.gradient(side, lane, c);
           } else if (lane < kOwn) {
@@ -206,11 +218,11 @@ __global__ void __launch_bounds__(kThreads)
         out[0] += slip_line(in, body, v, i % in.planes, arm, slid.motion + first, steps + first).excess(tried);
         return;
       }
-      PairPress a;
       const int64_t pair = lagged + i - planes;
-      if (!lagged_press(in, pair, at, slid, a) || a.rubs == 0) return;
-      if (!together && (a.body[0] < 0 ? a.body[1] : a.body[0]) != k) return;
-      out[0] += slip_line(in, pair, a, slid.center, steps).excess(tried);
+      each_lagged_press(in, pair, at, slid, [&](const PairPress& a) {
+        if (!together && (a.body[0] < 0 ? a.body[1] : a.body[0]) != k) return;
+        out[0] += slip_line(in, pair, a, slid.center, steps).excess(tried);
+      });
     });
     return sum[0];
   });

@@ -50,7 +50,7 @@ __global__ void __launch_bounds__(kOne) press_kernel(const __grid_constant__ Rig
     if (pair < in.first_lagged(in.scene.scenes)) {
       const int64_t scene = in.lagged.pairs[kPairRow * pair + 5];
       if (in.together() && is_done(state, scene)) return;
-      acts = lagged_press(in, pair, at, of_scene(slid, scene, in.bodies()), a);
+      acts = lagged_press(in, pair, at, of_scene(slid, scene, in.bodies()), a, -1);
     }
   }
   sides[2 * row] = acts ? a.body[0] : -1;

@@ -92,7 +92,7 @@ __global__ void __launch_bounds__(kThreads)
     PairPress a;
     const int64_t pair = item - vertices;
     const bool acts = pair < repelling ? barrier_press(in, listed + pair, at, a)
-                                       : lagged_press(in, lagged + pair - repelling, at, Slid{}, a);
+                                       : lagged_press(in, lagged + pair - repelling, at, Slid{}, a, -1);
     if (acts) to[0] += a.value;
   });
   if (threadIdx.x == 0) out[scene * step + blockIdx.x] = sum[0];

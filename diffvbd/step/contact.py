@@ -22,6 +22,7 @@ from ..energies import damped_share
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
+from ..ops.contact_rigid import MOST_COUPLED
 from ..ops.detect import CONSTANTS
 from ..scopes import checking, not_compiled, recorders
 from ..tuples import replaced
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from .arguments import Prepared
     from .predict import Begun
 
+APART_CORRECTIONS = 4  # rigid corrections after the sweeps of more than MOST_COUPLED bodies that may touch
 FREE = 1e15  # [m] room that nothing fills
 MOST_CAPACITY = 2**26
 LOST = ("x: positions became non-finite {}: look with diffvbd.debug_checks(), use a smaller time_step or softer "
@@ -227,8 +229,11 @@ class ContactStep:
     @property
     def last_corrections(self) -> int:
         """How many rigid corrections follow the sweeps. Coarse ones leave a stiff body turned, and one Newton step
-        leaves so much of that that a free body gained spin."""
-        return 1 if self.prepared.coarse is None else 2
+        leaves so much of that that a free body gained spin. Of very many bodies each is solved for with the others at
+        rest, which takes several to bear what lies on others."""
+        least = 1 if self.prepared.coarse is None else 2
+        apart = self.barrier is not None and self.model.mesh.num_bodies > MOST_COUPLED
+        return max(least, APART_CORRECTIONS) if apart else least
 
     def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> tuple[Tensor, Tensor]:
         """x after the rigid correction of all bodies that are free, and the share of its motion that each took."""

@@ -63,3 +63,20 @@ def test_each_of_many_bodies_sticks() -> None:
     v = pushed(block("floor", bodies=70), 0.9, 5, 1e6).v[-1, :, 0].reshape(70, -1).mean(1)
     expected = torch.full_like(v, CREEP * (1 - math.sqrt(1 - 0.9)))
     assert relative_error(v, expected) <= tolerance("contact_motion")
+
+
+def test_stacks_of_many_bodies_stand() -> None:
+    """Pairs of cubes, one upon the other, pushed by half of what friction holds: as bodies that are solved for together
+    they creep by less than CREEP, and their tops relative to them. Seventy fell over, when friction between two bodies
+    that both move was bounded, and nearly did so with one correction after the sweeps."""
+    cube = dv.mesh.cube(2, size=0.1)
+    cube = cube.translate((0.0, -float(cube.points[:, 1].min()), 0.0))
+    places = [(0.3 * k, 0.0, 0.0) for k in range(35)] + [(0.3 * k + 0.01, 0.1 - LOW, 0.01) for k in range(35)]
+    model = dv.Model(
+        dv.mesh.join([cube.translate(place) for place in places]),
+        energies=(dv.StableNeoHookean(), dv.FloorBarrier(LOW, kappa=1e4, dhat=1e-3),
+                  dv.PairBarrier(1e4, 1e-3, self_contact=False), dv.Friction(COEFFICIENT, CREEP)),
+    )  # fmt: skip
+    speed = pushed(model, 0.5, 5, 1e6).v[-1, :, 0].reshape(2, 35, -1).mean(-1)
+    assert float(speed.abs().max()) < 3 * CREEP
+    assert float(speed.mean()) > 0.1 * CREEP
