@@ -120,7 +120,7 @@ struct PairPress {
     return dot(map(side, i, center), stiffness * map(side, j, center));
   }
 };
-constexpr int kPressDoubles = 29;  // of a PairPress without its bodies, its value and its slip
+constexpr int kPressDoubles = 29;  // of a PairPress without its bodies, its value and its friction
 
 DIFFVBD_FN void store_press(const PairPress& a, double* to) {
   int i = 0;
