@@ -79,11 +79,11 @@ def rigid_vertices_backward(fields: TouchingFields, motion: Tensor, solution: Te
                             ) -> VertexAdjoints:  # fmt: skip
     """The adjoints of what vertices add to -p . (gradient + matrix q), p and q being the motions of
     :func:`rigid_end_backward`; by_p, by_q [B, N, 3]: what pairs add to the work's derivatives by them."""
-    *own, shared, each, floor_lag = raw.contact_rigid_vertices_backward(
+    x, x_prev, y, mass, shared, own, floor_lag = raw.contact_rigid_vertices_backward(
         *fields, motion, solution, by_p.contiguous(), by_q.contiguous(), data_count, time_step, friction_eps,
         wants_data)  # fmt: skip
-    data = join_data(shared, each, data_count) if wants_data else shared
-    return VertexAdjoints(*own, data, floor_lag)
+    data = join_data(shared, own, data_count) if wants_data else shared
+    return VertexAdjoints(x, x_prev, y, mass, data, floor_lag)
 
 
 @shapes_of("contact_rigid_system")
