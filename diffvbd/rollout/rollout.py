@@ -262,14 +262,14 @@ def _check_values(
 
 def _to_prepare(options: dict[str, Any], parameters: dict[str, Any], k: int, x: Tensor, v: Tensor) -> dict[str, Any]:
     """What enters step k through prepare()."""
-    now = {name: _at(options[name], k, x, v) for name in _STATIC}
-    return now | {"parameters": {name: _at(value, k, x, v) for name, value in parameters.items()}}
+    now = {name: _at(name, options[name], k, x, v) for name in _STATIC}
+    return now | {"parameters": {name: _at(name, value, k, x, v) for name, value in parameters.items()}}
 
 
 def _to_advance(model: Model, options: dict[str, Any], k: int, x: Tensor, v: Tensor, start: Tensor,
                 colliders_before: Tensor | None) -> dict[str, Any]:  # fmt: skip
     """What enters step k through advance(); ``start``: x before the first step."""
-    now = {name: _at(options[name], k, x, v) for name in (*_LOADS, "colliders")}
+    now = {name: _at(name, options[name], k, x, v) for name in (*_LOADS, "colliders")}
     if _changes(options["prescribed"]) and not isinstance(options["prescribed"], _Steps):
         for value in _tensors(now["prescribed"]):
             check_prescribed(model, value, x, start)
@@ -317,10 +317,15 @@ def _changes(value: Any) -> bool:
     return isinstance(value, _Steps) or (callable(value) and not isinstance(value, Tensor))
 
 
-def _at(value: Any, k: int, x: Tensor, v: Tensor) -> Any:
+def _at(name: str, value: Any, k: int, x: Tensor, v: Tensor) -> Any:
     if isinstance(value, _Steps):
         return value[k]
-    return value(k, x, v) if _changes(value) else value
+    if not _changes(value):
+        return value
+    found = value(k, x, v)
+    if found is None:  # it would stand for the default, a force of zero for example
+        raise TypeError(f"{name}: expected a function that returns the value for a step, got None at step {k}")
+    return found
 
 
 # --- what a rollout prints --------------------------------------------------------------------------------------------
