@@ -89,7 +89,8 @@ def rollout(
             they are at the end of each step.
         colliders_before: Where per_step colliders are at the start; None: the Model's collider_points.
         mu, lam, young, poisson, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in
-            time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step.
+            time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step
+            (None only for a step without ``force``).
             A callable may close over tensors and modules that require grad: they get gradients under every schedule. It
             must be deterministic, because a checkpointed segment calls it again in the backward. ``prescribed`` may
             also have the initial x where a vertex is not pinned.
@@ -323,7 +324,7 @@ def _at(name: str, value: Any, k: int, x: Tensor, v: Tensor) -> Any:
     if not _changes(value):
         return value
     found = value(k, x, v)
-    if found is None:  # it would stand for the default, a force of zero for example
+    if found is None and name != "force":  # a forgotten return: None would stand for the default
         raise TypeError(f"{name}: expected a function that returns the value for a step, got None at step {k}")
     return found
 

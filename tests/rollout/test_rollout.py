@@ -181,24 +181,6 @@ def test_wrong_number_of_steps_raises(name: str) -> None:
         dv.rollout(model, **(inputs | {name: value}), steps=STEPS, sweeps=SWEEPS)
 
 
-@pytest.mark.parametrize("name", ["mu", "force", "prescribed"])
-def test_values_of_all_steps_without_per_step_say_what_takes_them(name: str) -> None:
-    scene = build_scene("anchored")
-    model, inputs = scene.model(), scene.inputs()
-    whole = inputs[name].expand(*inputs["x"].shape[:-2], *inputs[name].shape[-1 if name == "mu" else -2 :])
-    with pytest.raises(ValueError, match=rf"{name}: .*in a rollout, per_step\({name}\) takes one for each step"):
-        dv.rollout(model, **(inputs | {name: torch.stack([whole] * STEPS)}), steps=STEPS, sweeps=SWEEPS)
-
-
-@pytest.mark.parametrize("name", ["mu", "force", "prescribed", "rest_points"])
-def test_a_function_that_returns_nothing_raises(name: str) -> None:
-    """A forgotten return would otherwise be a force of zero, or a grip that stays."""
-    scene = build_scene("anchored")
-    model, inputs = scene.model(), scene.inputs()
-    with pytest.raises(TypeError, match=f"{name}: expected a function that returns the value.*got None at step 0"):
-        dv.rollout(model, **(inputs | {name: lambda k, x, v: None}), steps=STEPS, sweeps=SWEEPS)
-
-
 @pytest.mark.parametrize("value", [3.0, [1.0, 2.0], torch.tensor(1.0), None])
 def test_per_step_wants_a_tensor_with_a_leading_dimension(value: Any) -> None:
     with pytest.raises(TypeError, match=r"\[steps, \.\.\.\]"):
