@@ -45,7 +45,8 @@ or `identify` continues where it stopped when the same command is given again.
 """
 TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here replaces the file's value):
   x          observed positions [m], shape [N, V, 3], or [V, 3] for one final shape
-  steps      time steps after which each was observed, shape [N]; default 0, 1, 2, ...
+  steps      time steps after which each was observed, shape [N]; default 0, 1, 2, ...; where the file has a time_step,
+             another --time-step keeps the times
   x0, v0     initial positions [m] and velocities [m/s], shape [V, 3]; default: the mesh, at rest
   pinned     vertices that are held, bool, shape [V]; default none
   time_step [s], sweeps, density [kg/m^3], gravity [m/s^2], floor [m], kappa, dhat [m], friction, relaxation, integrator

@@ -1,5 +1,6 @@
 """The site, built by `make docs`: Sphinx with the theme furo; pages in Markdown and notebooks are read by MyST-NB."""
 
+import json
 import re
 from typing import Any
 
@@ -68,8 +69,19 @@ def adapt(app: object, docname: str, source: list[str]) -> None:
     text = source[0]
     if docname in ("results/index", "reference/index"):
         text += CONTENTS
+    if docname == "tutorials/index":
+        text = re.sub(r"^\| (\[.*?\]\((.*?\.ipynb)\))", r"| \1 ({download}`notebook <\2>`)", text, flags=re.MULTILINE)
+    elif docname.startswith("tutorials/"):
+        text = downloadable(docname.removeprefix("tutorials/") + ".ipynb", text)
     # outside of docs/, which Sphinx does not read
     source[0] = re.sub(r"\]\((?:\.\./)+(CONTRIBUTING|CHANGELOG)\.md", lambda m: f"](/{m[1].lower()}.md", text)
+
+
+def downloadable(name: str, text: str) -> str:
+    """A notebook whose first cell links to its file."""
+    notebook = json.loads(text)
+    notebook["cells"][0]["source"] += ["\n", "\n", f"{{download}}`Download this notebook <{name}>`"]
+    return json.dumps(notebook)
 
 
 def escape(app: object, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:

@@ -107,6 +107,19 @@ def test_identify_recovers_the_material_of_a_motion(mesh_file: Path, tmp_path: P
     assert all(float(error) < 0.01 for error in errors)  # [%]
 
 
+def test_another_time_step_keeps_the_times_of_the_observations(mesh_file: Path, tmp_path: Path) -> None:
+    target = tmp_path / "target.npz"
+    options = [*SCENE, "--stride", 4, "--save-target", target]
+    assert run("simulate", mesh_file, "--out", tmp_path / "a.pvd", *options) == 0
+    mesh = dv.mesh.load(mesh_file)
+    for time_step, steps in ((0.01, [0, 4, 8, 12]), (0.04, [0, 1, 2, 3]), (0.0025, [0, 16, 32, 48])):
+        found = Observation.load(target, mesh, time_step=time_step)
+        assert found.scene.time_step == time_step
+        assert found.steps.tolist() == steps
+    both = Observation.load(target, mesh, time_step=0.02, steps=[0, 1, 2, 3])  # said by who calls
+    assert both.steps.tolist() == [0, 1, 2, 3]
+
+
 def test_identify_from_one_final_shape(mesh_file: Path, tmp_path: Path) -> None:
     target = tmp_path / "target.npz"
     assert run("simulate", mesh_file, "--out", tmp_path / "a.pvd", *SCENE, "--mu", 4e4, "--save-target", target) == 0
@@ -147,6 +160,12 @@ def test_identify_from_one_final_shape(mesh_file: Path, tmp_path: Path) -> None:
         (["identify", "MESH", "SHAPE", "--steps", "3", "--start-young", "1e5", "--start-poisson", "0.6"], "poisson"),
         (["identify", "MESH", "SHAPE", "--steps", "3", "--start", "1", "1", "--start-young", "1"], "--start"),
         (["identify", "MESH", "SHAPE", "--steps", "3", "--start", "nan", "1"], "start"),
+        (["identify", "MESH", "other.npz"], "unknown keys ['positions']: expected x and any of density, dhat"),
+        (["identify", "MESH", "mm.npz"], "x: expected shapes about as large as the mesh, 0.4 m, got 400 m"),
+        (
+            ["identify", "MESH", "timed.npz", "--time-step", "0.04"],
+            "time_step: expected 0.03 s, or that over",
+        ),
         (["identify", "MESH", "none.npz"], "x: expected at least one observed shape, got none"),
         (["identify", "MESH", "decreasing.npz"], "steps: expected 2 increasing integers from 0 to 10000000"),
         (["identify", "MESH", "far.npz"], "the last >= 1, got 1 to 4611686018427387904"),
@@ -188,6 +207,9 @@ def damaged_targets(points: np.ndarray) -> None:
     """Targets that are almost right, in the present folder."""
     two = np.stack([points, points + 0.1])
     np.savez("none.npz", x=two[:0])
+    np.savez("other.npz", positions=two)
+    np.savez("mm.npz", x=1000.0 * two)
+    np.savez("timed.npz", x=two, steps=[3, 6], time_step=0.01)
     np.savez("decreasing.npz", x=two, steps=np.array([5, 3], dtype=np.uint64))
     np.savez("far.npz", x=two, steps=np.array([1, 2**62]))
     np.savez("sweeps.npz", x=two, sweeps=[3, 4])

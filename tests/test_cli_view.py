@@ -31,7 +31,11 @@ def test_view_serves_a_file_until_it_is_stopped(
     ("arguments", "expected"),
     [
         (["none.pvd"], "none.pvd does not exist"),
-        (["part.vtu", "--color", "stress"], "color: stress needs"),
+        (["part.vtu", "--color", "stress"], "color: stress needs a dv.Model, or a mesh with mu and lam"),
+        (
+            ["part.glb"],
+            "a mesh with tets or the folder of a run; .glb is for other programs",
+        ),
         (["part.vtu", "--time-step", "-1"], "time_step: expected"),
     ],
 )
@@ -40,6 +44,7 @@ def test_view_says_what_is_wrong(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     dv.mesh.cube(3, 0.2).save("part.vtu")
+    Path("part.glb").touch()
     monkeypatch.setattr(dv.viz.Viewer, "wait", lambda viewer: None)
     assert cli.main(["view", *arguments]) == 2
     assert expected in capsys.readouterr().err

@@ -1,6 +1,7 @@
 """Claim: the tutorials are stored without outputs, small and portable, all are in the navigation, and the first of them
 finds what it says."""
 
+import importlib.util
 import json
 import os
 import re
@@ -79,6 +80,22 @@ def test_all_are_in_the_navigation() -> None:
     toctree = re.findall(r"^```\{toctree\}.*?^```$", page, re.MULTILINE | re.DOTALL)[0]
     assert NOTEBOOKS and set(re.findall(r"^([\w-]+)$", toctree, re.MULTILINE)) == {path.stem for path in NOTEBOOKS}
     assert all(f"]({path.name})" in page for path in NOTEBOOKS)
+
+
+def test_the_site_links_to_their_files() -> None:
+    """By the first cell of each and by the page that lists them; code stays as it is."""
+    spec = importlib.util.spec_from_file_location("conf", ROOT / "docs" / "conf.py")
+    assert spec is not None and spec.loader is not None
+    spec.loader.exec_module(conf := importlib.util.module_from_spec(spec))
+    for path in NOTEBOOKS:
+        shown = [path.read_text(encoding="utf-8")]
+        conf.adapt(None, f"tutorials/{path.stem}", shown)
+        first, *others = json.loads(shown[0])["cells"]
+        assert f"{{download}}`Download this notebook <{path.name}>`" in source(first).splitlines()
+        assert others == read(path)["cells"][1:]
+    page = [(FOLDER / "index.md").read_text(encoding="utf-8")]
+    conf.adapt(None, "tutorials/index", page)
+    assert all(f"({{download}}`notebook <{path.name}>`)" in page[0] for path in NOTEBOOKS)
 
 
 @pytest.mark.slow

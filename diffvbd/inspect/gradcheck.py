@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -45,7 +46,7 @@ def check_gradients(
     steps truncate, small ones round, and where a contact or filter switches there may be no good step at all.
 
     Args:
-        loss: Any scalar function of tensors, typically a few steps and a sum.
+        loss: Any scalar function of tensors, typically a few steps and a sum. It gets them by name.
         arguments: float64 tensors by name, of any shape.
         relative_steps: Steps relative to the size of the argument (1 where it is zero).
         tolerance: Largest error |adjoint - difference| / max(|adjoint|, |difference|) that counts as agreement.
@@ -57,6 +58,7 @@ def check_gradients(
 
     Raises:
         ValueError: If an argument is not float64 or the loss is not a scalar.
+        TypeError: If the loss does not take the arguments by these names, or returns no tensor.
     """
     if not isinstance(arguments, dict):
         raise TypeError(f"arguments: expected a dict of tensors by name, got {type(arguments).__name__}")
@@ -64,7 +66,10 @@ def check_gradients(
         if not isinstance(value, Tensor) or value.dtype != torch.float64:
             fail(name, "a float64 tensor", getattr(value, "dtype", type(value).__name__))
     leaves = {k: t.detach().clone().requires_grad_() for k, t in arguments.items()}
+    _check_names(loss, arguments)
     value = loss(**leaves)
+    if not isinstance(value, Tensor):
+        raise TypeError(f"loss: expected a function that returns a scalar tensor, got {type(value).__name__}")
     if value.numel() != 1:
         fail("loss", "a scalar", f"shape {list(value.shape)}")
     grads = torch.autograd.grad(value, list(leaves.values()), allow_unused=True, materialize_grads=True)
@@ -90,3 +95,14 @@ def check_gradients(
     if verbose:
         print(result)
     return result
+
+
+def _check_names(loss: Callable[..., Tensor], arguments: dict[str, Tensor]) -> None:
+    try:
+        signature = inspect.signature(loss)
+    except (TypeError, ValueError):  # of a builtin, or no function: calling it will tell
+        return
+    try:
+        signature.bind(**arguments)
+    except TypeError as error:
+        raise TypeError(f"loss: expected a function of {', '.join(arguments)}: {error}") from None

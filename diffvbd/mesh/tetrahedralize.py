@@ -29,23 +29,28 @@ def tetrahedralize(
     minutes, 3,000 take about ten seconds, 12,000 three quarters of a minute. Surfaces above `max_triangles` are
     therefore decimated first.
 
+    Every call makes another mesh, with other vertices and about as many: save the one that results belong to.
+
     Args:
-        surface: A file that meshio reads (STL, PLY, OBJ, ...), or (points [P, 3] in metres, triangles [F, 3]).
-        edge_length: Wanted edge length [m]; default 1/20 of the diagonal of the bounding box.
+        surface: A file that meshio reads (STL, PLY, OBJ, ...), or (points [P, 3] in metres, triangles [F, 3]), such as
+            the `surface` of what `repair` returns.
+        edge_length: Wanted edge length [m], at most the diagonal of the bounding box; default 1/20 of it.
         epsilon: Largest distance from the input surface [m]; default 1/20 of `edge_length`.
         max_triangles: Decimate larger surfaces to this many triangles; None never does.
 
     Raises:
         ImportError: pytetwild or pyvista is missing.
         FileNotFoundError: no such file.
-        TypeError, ValueError: bad arrays, an unreadable file, one without triangles, lengths that are not positive;
-            no tets came out.
+        TypeError, ValueError: bad arrays, an unreadable file, one without triangles, lengths that are not positive,
+            edges longer than the body; no tets came out.
 
     Source: Hu et al., "Fast tetrahedral meshing in the wild", ACM TOG 39(4), 2020.
     """
     points, triangles = surface_arrays(surface)
     diagonal = float(np.linalg.norm(np.ptp(points[triangles].reshape(-1, 3), axis=0)))
     edge = diagonal / 20 if edge_length is None else positive("edge_length", edge_length)
+    if edge > diagonal:
+        raise ValueError(f"edge_length: expected at most the diagonal of the body, {diagonal:.4g} m, got {edge:g}")
     tolerance = edge / 20 if epsilon is None else positive("epsilon", epsilon)
     limit = None if max_triangles is None else count("max_triangles", max_triangles, 4)
     try:
@@ -80,7 +85,9 @@ def surface_arrays(surface: str | PathLike[str] | tuple[Any, Any]) -> tuple[Floa
         try:
             points, triangles = surface
         except (TypeError, ValueError):
-            raise TypeError(f"surface: expected a path or (points, triangles), got {type(surface).__name__}") from None
+            hint = ": give its .surface" if hasattr(surface, "surface") else ""
+            got = f"{type(surface).__name__}{hint}"
+            raise TypeError(f"surface: expected a path or (points, triangles), got {got}") from None
     points = float_array("points", points, (None, 3))
     triangles = int_array("triangles", triangles, (None, 3))
     if len(triangles) == 0:

@@ -89,7 +89,8 @@ def rollout(
             they are at the end of each step.
         colliders_before: Where per_step colliders are at the start; None: the Model's collider_points.
         mu, lam, young, poisson, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in
-            time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step.
+            time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step
+            (None only for a step without ``force``).
             A callable may close over tensors and modules that require grad: they get gradients under every schedule. It
             must be deterministic, because a checkpointed segment calls it again in the backward. ``prescribed`` may
             also have the initial x where a vertex is not pinned.
@@ -262,14 +263,14 @@ def _check_values(
 
 def _to_prepare(options: dict[str, Any], parameters: dict[str, Any], k: int, x: Tensor, v: Tensor) -> dict[str, Any]:
     """What enters step k through prepare()."""
-    now = {name: _at(options[name], k, x, v) for name in _STATIC}
-    return now | {"parameters": {name: _at(value, k, x, v) for name, value in parameters.items()}}
+    now = {name: _at(name, options[name], k, x, v) for name in _STATIC}
+    return now | {"parameters": {name: _at(name, value, k, x, v) for name, value in parameters.items()}}
 
 
 def _to_advance(model: Model, options: dict[str, Any], k: int, x: Tensor, v: Tensor, start: Tensor,
                 colliders_before: Tensor | None) -> dict[str, Any]:  # fmt: skip
     """What enters step k through advance(); ``start``: x before the first step."""
-    now = {name: _at(options[name], k, x, v) for name in (*_LOADS, "colliders")}
+    now = {name: _at(name, options[name], k, x, v) for name in (*_LOADS, "colliders")}
     if _changes(options["prescribed"]) and not isinstance(options["prescribed"], _Steps):
         for value in _tensors(now["prescribed"]):
             check_prescribed(model, value, x, start)
@@ -317,10 +318,15 @@ def _changes(value: Any) -> bool:
     return isinstance(value, _Steps) or (callable(value) and not isinstance(value, Tensor))
 
 
-def _at(value: Any, k: int, x: Tensor, v: Tensor) -> Any:
+def _at(name: str, value: Any, k: int, x: Tensor, v: Tensor) -> Any:
     if isinstance(value, _Steps):
         return value[k]
-    return value(k, x, v) if _changes(value) else value
+    if not _changes(value):
+        return value
+    found = value(k, x, v)
+    if found is None and name != "force":  # a forgotten return: None would stand for the default
+        raise TypeError(f"{name}: expected a function that returns the value for a step, got None at step {k}")
+    return found
 
 
 # --- what a rollout prints --------------------------------------------------------------------------------------------

@@ -47,6 +47,10 @@ class Trajectory:
     errors: ErrorEstimate | None = None
     history: History | None = None
 
+    def __repr__(self) -> str:
+        frames, span = len(self.steps), f"{self.steps[0]} to {self.steps[-1]}" if self.steps else "none"
+        return f"Trajectory({frames} frames of steps {span}, x and v of shape {list(self.x.shape)})"
+
 
 def stacked(observed: list[Any]) -> Any:
     """The results of ``observe`` over steps."""

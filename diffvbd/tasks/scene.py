@@ -123,7 +123,8 @@ class Observation:
         """Read an .npz file with these keys; only x is required.
 
         * x: observed positions [m], shape [N, V, 3], or [V, 3] for one shape;
-        * steps: steps after which each was observed, shape [N] (default 0, 1, ...; required for one shape);
+        * steps: steps of time_step after which each was observed, shape [N] (default 0, 1, ...; required for one
+          shape);
         * x0, v0: initial positions [m] and velocities [m/s], shape [V, 3] (default: the mesh, at rest);
         * pinned: bool [V]; time_step [s]; sweeps; density [kg/m^3]; gravity [3]; floor, kappa, dhat,
           friction, relaxation, integrator: as in `Scene`;
@@ -132,19 +133,25 @@ class Observation:
         Args:
             path: The file.
             mesh: The body; its vertices are those of x.
-            overrides: Values that replace the file's, by key; None means not given.
+            overrides: Values that replace the file's, by key; None means not given. Another time_step than the
+                file's keeps the times of the observations, of which it must be a divisor.
 
         Raises:
             OSError: the file cannot be opened.
-            ValueError: not an .npz file, unknown or missing keys, wrong shapes.
+            ValueError: not an .npz file, unknown or missing keys, wrong shapes; positions that are not in metres, by
+                their size; a time_step that does not meet the times of the observations.
         """
         values = archive.read(path, "an .npz file with the key x")
-        values |= {key: value for key, value in overrides.items() if value is not None}
+        given = {key: value for key, value in overrides.items() if value is not None}
+        recorded = None if {"time_step", "steps"} <= set(given) else values.get("time_step")
+        values |= given
         known = {"x", "steps", "x0", "v0", "pinned", "mu", "lam"}
         numbers = {"time_step", "density", "floor", "kappa", "dhat", "friction", "relaxation"}
-        unknown = sorted(set(values) - known - numbers - {"sweeps", "gravity", "integrator"})
+        known |= numbers | {"sweeps", "gravity", "integrator"}
+        unknown = sorted(set(values) - known)
         if unknown or "x" not in values:
-            raise ValueError(f"{path}: {f'unknown keys {unknown}' if unknown else 'the key x is missing'}")
+            wrong = f"unknown keys {unknown}" if unknown else "the key x is missing"
+            raise ValueError(f"{path}: {wrong}: expected x and any of {', '.join(sorted(known - {'x'}))}")
 
         shape = (mesh.num_vertices, 3)
         x = _checked(path, "x", values["x"], shape, leading="N, ")
@@ -155,6 +162,8 @@ class Observation:
             raise ValueError(f"{path}: x: expected at least one observed shape, got none")
         steps = _steps(path, values.get("steps", np.arange(len(x))), len(x))
         fields: dict[str, Any] = {key: _number(path, key, values[key]) for key in sorted(numbers & set(values))}
+        if recorded is not None and fields["time_step"] > 0:
+            steps = _at_the_same_times(path, steps, _number(path, "time_step", recorded), fields["time_step"])
         if "sweeps" in values:
             fields["sweeps"] = int(_number(path, "sweeps", values["sweeps"], whole=True))
         if "gravity" in values:
@@ -163,6 +172,7 @@ class Observation:
             fields["integrator"] = str(np.asarray(values["integrator"]))
             if fields["integrator"] not in INTEGRATORS:
                 raise ValueError(f"{path}: integrator: expected one of {[*INTEGRATORS]}, got {fields['integrator']!r}")
+        _check_size(path, x[0], mesh)
         scene = Scene(
             mesh=mesh,
             x0=_checked(path, "x0", values.get("x0", mesh.points), shape),
@@ -185,6 +195,30 @@ def _steps(path: str | Path, given: Any, count: int) -> NDArray[np.int64]:
     if (np.diff(steps) <= 0).any() or steps[-1] < 1:
         raise ValueError(f"{expected}, got {_shown(steps)}")
     return steps
+
+
+def _at_the_same_times(path: str | Path, steps: NDArray[np.int64], before: float, after: float) -> NDArray[np.int64]:
+    """Steps of ``after`` seconds that take as long as these of ``before`` seconds."""
+    if before == after:
+        return steps
+    exact = steps * (before / after)
+    whole = np.rint(exact)
+    if (np.abs(exact - whole) > 1e-6 * np.maximum(exact, 1.0)).any():
+        every = np.gcd.reduce(steps) * before
+        raise ValueError(
+            f"{path}: time_step: expected {every:g} s, or that over an integer, so that steps meet the observed times, "
+            f"got {after:g}"
+        )
+    return _steps(path, whole.astype(np.int64), len(steps))
+
+
+def _check_size(path: str | Path, x: Array, mesh: dv.TetMesh) -> None:
+    """Raises for positions in another unit than the mesh."""
+    seen, body = (float(np.ptp(points, axis=0).max()) for points in (x, mesh.points))
+    if not 0.01 * body <= seen <= 100.0 * body:
+        raise ValueError(
+            f"{path}: x: expected shapes about as large as the mesh, {body:.4g} m, got {seen:.4g} m: both are in metres"
+        )
 
 
 def _number(path: str | Path, name: str, given: Any, whole: bool = False) -> float:

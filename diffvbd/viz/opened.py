@@ -19,6 +19,9 @@ MOTION, LOG = "motion.npz", "log.json"  # of the folder of a run
 NOT_SHOWN = {"iteration", "stage", "seconds", "loss"}  # of a row of the log
 
 
+_FOR_OTHERS = (".glb", ".gltf", ".usd", ".usda", ".usdc")  # what `write_series` writes and nothing here reads
+
+
 class Opened(NamedTuple):
     """Motions by name, their mesh if the file has tets, and the course of an optimisation."""
 
@@ -47,6 +50,10 @@ def opened(path: Path, time_step: float | None = None) -> Opened:
         if time_step is None:
             motions = {name: _timed(motion, frames.times) for name, motion in motions.items()}
         return Opened(motions, frames.mesh)
+    if path.suffix.lower() in _FOR_OTHERS:
+        raise ValueError(
+            f"{path}: expected a .pvd, a mesh with tets or the folder of a run; {path.suffix} is for other programs"
+        )
     mesh = load(path)
     return Opened(motions_of(mesh, time_step=time_step), mesh)
 

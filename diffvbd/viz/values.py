@@ -147,7 +147,9 @@ class Values:
 
     def _needed(self, what: str) -> Model:
         if self.model is None:
-            raise ValueError(f"color: {what} needs a dv.Model, got a mesh without one")
+            stress = what == "stress"
+            found = ", or a mesh with mu and lam [Pa], got neither" if stress else ", got a mesh without one"
+            raise ValueError(f"color: {what} needs a dv.Model{found}")
         return self.model
 
     def _stress(self, motion: Motion) -> NDArray[np.float64]:

@@ -159,6 +159,10 @@ def test_tetrahedralize_bad_input(tmp_path):
         dm.tetrahedralize((cube.points, cube.surface + 1))
     with pytest.raises(ValueError, match="edge_length: expected a positive length"):
         dm.tetrahedralize((cube.points, cube.surface), edge_length=0)
+    with pytest.raises(ValueError, match="edge_length: expected at most the diagonal of the body, .* m, got 50"):
+        dm.tetrahedralize((cube.points, cube.surface), edge_length=50)
+    with pytest.raises(TypeError, match=r"surface: .*got TetMesh: give its \.surface"):
+        dm.tetrahedralize(cube)
     meshio.Mesh(POINTS, [("line", [[0, 1]])]).write(tmp_path / "lines.vtu")
     with pytest.raises(ValueError, match=r"lines.vtu has no triangles"):
         dm.tetrahedralize(tmp_path / "lines.vtu")

@@ -273,6 +273,14 @@ def test_check_gradients_takes_arguments_by_name() -> None:
         dv.check_gradients(lambda a: a.sum(), (torch.ones(3, dtype=torch.float64),))  # pyright: ignore[reportArgumentType]
 
 
+def test_check_gradients_names_what_the_loss_must_take_and_return() -> None:
+    given = {"mu": torch.ones((), dtype=torch.float64)}
+    with pytest.raises(TypeError, match="loss: expected a function of mu: .*'m'"):
+        dv.check_gradients(lambda m: m, given)
+    with pytest.raises(TypeError, match="loss: expected a function that returns a scalar tensor, got float"):
+        dv.check_gradients(lambda mu: mu.item(), given)
+
+
 class WrongBackward(torch.autograd.Function):
     """The identity with a gradient that is 1 % too large."""
 

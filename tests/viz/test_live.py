@@ -121,7 +121,7 @@ def test_levels_span_the_legend() -> None:
     [
         ("heat", {}, "color: expected one of body, speed, stress, stiffness, contact, got 'heat'"),
         ("speed", {}, r"color: speed \[m/s\] needs a time_step"),
-        ("stress", {"mu": 1.0, "lam": 1.0}, "color: stress needs a dv.Model"),
+        ("stress", {}, r"color: stress needs a dv.Model, or a mesh with mu and lam \[Pa\], got neither"),
         ("stress", {"model": MODEL, "mu": 1.0}, r"color: stress needs lam \[Pa\], got None"),
         ("stiffness", {"model": MODEL}, r"color: stiffness needs mu \[Pa\]"),
         ("stiffness", {"model": MODEL, "mu": np.ones(3)}, "mu: expected a number or one for each of 12 tets"),
