@@ -267,7 +267,7 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
   } else {
     step = motion, state = nullptr;
   }
-  // As often as the CPU may
+  // As often as the CPU may.
   for (int iteration = 0; iteration < (rubs ? kSlipIterations : 1); ++iteration) {
     const Slid slid = iteration > 0 ? Slid{center, motion} : Slid{};
     if (room.rows() > 0)
