@@ -49,7 +49,8 @@ TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here re
              another --time-step keeps the times
   x0, v0     initial positions [m] and velocities [m/s], shape [V, 3]; default: the mesh, at rest
   pinned     vertices that are held, bool, shape [V]; default none
-  time_step [s], sweeps, density [kg/m^3], gravity [m/s^2], floor [m], kappa, dhat [m], friction, relaxation, integrator
+  time_step [s], sweeps, density [kg/m^3], gravity [m/s^2], floor [m], kappa, dhat [m], friction, relaxation,
+             integrator, coarse (0 or 1)
   mu, lam    the true material [Pa], if known: only used to report the error
 `diffvbd simulate --save-target TARGET.npz` writes such a file.
 """
@@ -183,6 +184,8 @@ def _add_scene_options(parser: argparse.ArgumentParser) -> None:
     scene.add_argument("--dhat", type=float, help=f"distance where the barrier begins [m] (default {Scene.dhat:g})")
     scene.add_argument("--friction", type=float, help="coefficient of friction on the floor (default: none)")
     scene.add_argument("--relaxation", type=float, help="1.5 to 1.7 needs fewer sweeps (default 1; not with friction)")
+    scene.add_argument("--coarse", action="store_const", const=True, help="coarse corrections between the sweeps, for "
+                       "what is stiff, long, thin or finely meshed")  # fmt: skip
     scene.add_argument("--integrator", choices=[*INTEGRATORS], help=f"of time (default {Scene.integrator})")
     scene.add_argument(
         "--pin",
@@ -261,7 +264,7 @@ def _scene(options: argparse.Namespace, mesh: dv.TetMesh) -> Scene:
 
 
 def _advise(options: argparse.Namespace) -> int:
-    for name in ("time_step", "sweeps", "relaxation", "integrator"):
+    for name in ("time_step", "sweeps", "relaxation", "integrator", "coarse"):
         if getattr(options, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')}: expected none, since it is what advise chooses")
     check_device(options.device)
@@ -382,7 +385,7 @@ def _material(options: argparse.Namespace) -> tuple[float, float]:
 
 def _given_scene_options(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
     names = ("time_step", "sweeps", "density", "gravity", "floor", "kappa", "dhat", "friction", "relaxation",
-             "integrator")  # fmt: skip
+             "integrator", "coarse")  # fmt: skip
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     if options.pin:
         given["pinned"] = np.logical_or.reduce([side(mesh.points, text) for text in options.pin])

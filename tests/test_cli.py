@@ -276,6 +276,22 @@ def test_the_integrator_is_part_of_the_scene(mesh_file: Path, tmp_path: Path) ->
     assert all(abs(falls[name] - exact) < tolerance("closed_form") * abs(exact) for name in ("sdirk2", "bdf2"))
 
 
+def test_coarse_corrections_are_part_of_the_scene(mesh_file: Path, tmp_path: Path) -> None:
+    """With two sweeps they change where a stiff body ends, and its file says that they were there."""
+    ends = {}
+    for name, more in {"plain": [], "coarse": ["--coarse"]}.items():
+        target = tmp_path / f"{name}.npz"
+        out = ["--out", tmp_path / f"{name}.pvd", "--save-target", target, "--pin", "x-"]
+        assert (
+            run("simulate", mesh_file, *out, "--young", 1e6, "--poisson", 0.3, "--sweeps", 2, "--steps", 6, *more) == 0
+        )
+        found = Observation.load(target, dv.mesh.load(mesh_file))
+        assert found.scene.coarse == (name == "coarse")
+        ends[name] = found.x[-1]
+    apart = np.abs(ends["coarse"] - ends["plain"]).max()
+    assert apart > 0.05 * np.abs(ends["plain"] - found.x[0]).max()
+
+
 def test_identify_starts_from_young_and_poisson(mesh_file: Path, tmp_path: Path, capsys) -> None:
     target = tmp_path / "target.npz"
     material = ["--young", 1e5, "--poisson", 0.3]

@@ -39,6 +39,7 @@ class Scene:
         friction: Coefficient of the floor's friction; None: none.
         relaxation: Multiplies every update, as in `diffvbd.Model`.
         integrator: One of INTEGRATORS.
+        coarse: Whether coarse corrections, `coarse="auto"` of `diffvbd.Model`, go between the sweeps.
     """
 
     mesh: dv.TetMesh
@@ -55,6 +56,7 @@ class Scene:
     friction: float | None = None
     relaxation: float = 1.0
     integrator: str = "implicit-euler"
+    coarse: bool = False
 
     def model(self, device: str = "cpu") -> dv.Model:
         energies: tuple[Any, ...] = (dv.StableNeoHookean(),)
@@ -63,6 +65,7 @@ class Scene:
         if self.friction is not None:
             energies += (dv.Friction(self.friction),)
         options: dict[str, Any] = {"density": self.density, "pinned": self.pinned, "relaxation": self.relaxation}
+        options |= {"coarse": "auto"} if self.coarse else {}
         return dv.Model(self.mesh, energies=energies, **options).to(device)
 
     def simulate(
@@ -114,6 +117,8 @@ class Observation:
             values["relaxation"] = s.relaxation
         if s.integrator != Scene.integrator:
             values["integrator"] = s.integrator
+        if s.coarse:
+            values["coarse"] = 1.0
         values |= self.truth
         with open(path, "wb") as file:
             np.savez_compressed(file, **values)
@@ -127,7 +132,7 @@ class Observation:
           shape);
         * x0, v0: initial positions [m] and velocities [m/s], shape [V, 3] (default: the mesh, at rest);
         * pinned: bool [V]; time_step [s]; sweeps; density [kg/m^3]; gravity [3]; floor, kappa, dhat,
-          friction, relaxation, integrator: as in `Scene`;
+          friction, relaxation, integrator, coarse: as in `Scene`;
         * mu, lam: the true material [Pa], only to report the error.
 
         Args:
@@ -147,7 +152,7 @@ class Observation:
         values |= given
         known = {"x", "steps", "x0", "v0", "pinned", "mu", "lam"}
         numbers = {"time_step", "density", "floor", "kappa", "dhat", "friction", "relaxation"}
-        known |= numbers | {"sweeps", "gravity", "integrator"}
+        known |= numbers | {"sweeps", "gravity", "integrator", "coarse"}
         unknown = sorted(set(values) - known)
         if unknown or "x" not in values:
             wrong = f"unknown keys {unknown}" if unknown else "the key x is missing"
@@ -166,6 +171,8 @@ class Observation:
             steps = _at_the_same_times(path, steps, _number(path, "time_step", recorded), fields["time_step"])
         if "sweeps" in values:
             fields["sweeps"] = int(_number(path, "sweeps", values["sweeps"], whole=True))
+        if "coarse" in values:
+            fields["coarse"] = bool(_number(path, "coarse", values["coarse"]))
         if "gravity" in values:
             fields["gravity"] = tuple(_array(path, "gravity", values["gravity"], (3,)).tolist())
         if "integrator" in values:
