@@ -160,7 +160,7 @@ def test_identify_from_one_final_shape(mesh_file: Path, tmp_path: Path) -> None:
         (["identify", "MESH", "SHAPE", "--steps", "3", "--start-young", "1e5", "--start-poisson", "0.6"], "poisson"),
         (["identify", "MESH", "SHAPE", "--steps", "3", "--start", "1", "1", "--start-young", "1"], "--start"),
         (["identify", "MESH", "SHAPE", "--steps", "3", "--start", "nan", "1"], "start"),
-        (["identify", "MESH", "other.npz"], "unknown keys ['positions']: expected x and any of density, dhat"),
+        (["identify", "MESH", "other.npz"], "unknown keys ['positions']: expected x and any of coarse, density, dhat"),
         (["identify", "MESH", "mm.npz"], "x: expected shapes about as large as the mesh, 0.4 m, got 400 m"),
         (
             ["identify", "MESH", "timed.npz", "--time-step", "0.04"],
