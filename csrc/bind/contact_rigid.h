@@ -140,7 +140,7 @@ struct RigidVertexTensors {
   }
 };
 
-// Of contact_rigid_solve: the number of systems, and their size.
+// Of rigid motions that are solved for: the number of systems, and their size.
 struct RigidSystems {
   int64_t count, size;
 };
@@ -148,7 +148,7 @@ inline RigidSystems systems_of(const Tensor& factor, const Tensor& right) {
   const int64_t size = factor.dim() > 2 ? factor.size(factor.dim() - 1) : 0;
   require(size > 0 && factor.is_contiguous() && factor.scalar_type() == ScalarType::Double &&
               factor.size(factor.dim() - 2) == size && is_like(right, factor) && right.numel() * size == factor.numel(),
-          "diffvbd::contact_rigid_solve: expected float64 factor [..., n, n] and right of n scalars for each");
+          "diffvbd::contact_rigid: expected float64 factor [..., n, n] of as many systems as the motion has");
   return {factor.numel() / (size * size), size};
 }
 

@@ -92,11 +92,10 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "Tensor x_bar, Tensor v_bar, int[] groups, int[] data_count, float time_step, bool wants_data",
          "Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own, ");
   // The Newton step of the rigid motions of all bodies of a scene, float64: centers of mass [scenes, bodies, 3], motion
-  // [scenes, bodies, 6], and the factor of the matrix [scenes, 6 bodies, 6 bodies], of many bodies [scenes, bodies, 6,
-  // 6]; and solutions with that factor
+  // [scenes, bodies, 6], and the factor of the matrix [scenes, 6 bodies, 6 bodies], of many bodies
+  // [scenes, bodies, 6, 6]
   define(m, "contact_rigid_system", DIFFVBD_ARGUMENTS(TOUCHING),
          "int[] data_count, float time_step, float friction_eps", "Tensor centers, Tensor motion, Tensor factor, ");
-  m.def("contact_rigid_solve(Tensor factor, Tensor right) -> Tensor");
   // The state after each body has taken what it may of its motion [scenes, bodies, 6], and that share [scenes, bodies]
   define(m, "contact_rigid_move", DIFFVBD_ARGUMENTS(TOUCHING),
          "Tensor centers, Tensor motion, int[] data_count, float time_step, float friction_eps",

@@ -96,9 +96,9 @@ struct PairPress {
   double weight[2];
   Vector at[2], pull[2], torque[2];
   double value;
-  Vector slip;     // of friction: where it is linear about,
-  double rubs;     // and h^2 times the load [N], over
-  double doubled;  // how often what the body does counts: twice where each side is solved for alone
+  Vector slip;     // where friction is linear about
+  double rubs;     // h^2 times its load [N], over `doubled`
+  double doubled;  // 2 where a side is solved for alone, which takes twice its body's motion; else 1
 
   // What the body of a side does to the pair by its k-th unknown, about its center.
   DIFFVBD_FN Vector map(int side, int k, const Vector& center) const {
@@ -232,9 +232,9 @@ struct Slid {
 };
 
 // Lagged friction and damping of a pair; it acts along a gap, so that it turns a body even by itself. The gradient is
-// that of a matrix which holds where bodies have gone as `slid` says: there both are exact. Of a pair whose sides are
-// not solved for together, `alone` says which of them is: it has half of the potential, with twice the motion, and what
-// both lower by themselves, convex as it is, they lower together. -1: only the value is asked for.
+// that of a matrix which holds where bodies have gone as `slid` says: there both are exact. Where the sides of a pair
+// are not solved for together, `alone` says which side is meant. It has half of the potential, at twice its motion: the
+// potential is convex, so that what lowers both halves lowers the whole. -1: only the value is asked for.
 template <class T, class At>
 DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, const Slid& slid, PairPress& out,
                              int alone) {

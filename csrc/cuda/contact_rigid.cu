@@ -51,16 +51,9 @@ __global__ void __launch_bounds__(kThreads)
   if (is_done(state, in.together() ? scene : row)) return;
   const Body<T> body{in.scene, scene, k};
   const BlockTeam team{part};
-  double sums[4];
-  team.template sum<4>(body.size(), sums, [&](int32_t i, double* out) {
-    const int32_t v = body.vertex(i);
-    const double m = body.mass(v);
-    const Vector x = body.position(v);
-    out[0] += m, out[1] += m * x.x, out[2] += m * x.y, out[3] += m * x.z;
-  });
-  const double mass = sums[0];
-  const bool free = in.free[k] && 0 < mass, together = in.together();
-  const Vector c = 0 < mass ? (1 / mass) * Vector{sums[1], sums[2], sums[3]} : Vector{};
+  const Whole whole = whole_of(body, team);
+  const bool free = in.free[k] && 0 < whole.mass, together = in.together();
+  const Vector c = whole.center;
   constexpr int kOwn = kUnknowns + rigid::kSix;
   double total[kOwn + 1];  // and the sum of m r^2
   team.template sum<kOwn + 1>(free ? body.size() : 0, total, [&](int32_t i, double* out) {
@@ -111,7 +104,7 @@ __global__ void __launch_bounds__(kThreads)
     return;
   }
   const MatrixPart to(matrix + in.matrix_size() * scene, n, together, k, k);
-  if (i == j) sum += free ? kLeastInertia * (i < 3 ? total[kOwn] : mass) : 1;
+  if (i == j) sum += free ? kLeastInertia * (i < 3 ? total[kOwn] : whole.mass) : 1;
   to(i, j) = to(j, i) = sum;
 }
 

@@ -26,11 +26,6 @@ def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: f
     return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps)
 
 
-def rigid_solve(factor: Tensor, right: Tensor) -> Tensor:
-    """Solutions for right [B, bodies, 6] with the factor of :func:`rigid_system`."""
-    return raw.contact_rigid_solve(factor, right.contiguous())
-
-
 def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_count: Sequence[int], time_step: float,
                friction_eps: float) -> tuple[Tensor, Tensor]:  # fmt: skip
     """The state after each body has taken what it may of its motion [B, bodies, 6], [B, V, 3], and that share,
@@ -94,11 +89,6 @@ def _(*arguments):
     return tuple(f.x.new_empty(size, dtype=torch.float64) for size in ((b, n, 3), (b, n, UNKNOWNS), shape))
 
 
-@shapes_of("contact_rigid_solve")
-def _(factor, right):
-    return torch.empty_like(right)
-
-
 @shapes_of("contact_rigid_move")
 def _(*arguments):
     f = TouchingFields(*arguments[:_FIELDS])
@@ -131,6 +121,6 @@ def _(*arguments):
     return (*(torch.empty_like(f.x) for _ in range(3)), *(f.x.new_empty(size) for size in sizes))
 
 
-for _name in ("contact_rigid_system", "contact_rigid_solve", "contact_rigid_move", "contact_rigid_backward",
+for _name in ("contact_rigid_system", "contact_rigid_move", "contact_rigid_backward",
               "contact_rigid_end_backward", "contact_rigid_vertices_backward"):  # fmt: skip
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

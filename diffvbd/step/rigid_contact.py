@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
-from ..adjoint.contact_lag import Pairs, sum_at_corners, sum_of_scenes
+from ..adjoint.contact_lag import sum_at_corners, sum_of_scenes
 from ..model.model import Model
 from ..ops import contact_rigid as ops_rigid
 from ..ops import no_second_derivative, no_transforms, of_inputs
@@ -130,20 +130,13 @@ def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: T
         "energy_data": own.energy_data,
         "collider": -to_points[:, vertices:],
         "collider_prev": by_way[:, vertices:],
-        "kappa": -_of_scenes(by_kappa, s.listed, scenes),
+        "kappa": -sum_of_scenes(by_kappa, s.listed, scenes),
         "lag": -by_lag,
         "floor_lag": own.floor_lag,
     }
     none = f.x.new_empty((0,))
     bars = [(out.get(name, none), t) for name, t in zip(f._fields, f, strict=True) if wants[name]]
     return tuple(ops.sum_to(bar, t.shape) if bar.numel() else torch.zeros_like(t) for bar, t in bars)
-
-
-def _of_scenes(values: Tensor, listed: Pairs, scenes: int) -> Tensor:
-    """Sums over the pairs of each scene [B], in a fixed order; values are zero in rows that no pair fills."""
-    if scenes <= 1:
-        return values.sum(0, keepdim=True)[:scenes]
-    return sum_of_scenes(values, listed, scenes)
 
 
 ops.ready_signature(_Correct)

@@ -1,6 +1,5 @@
-"""What corrections of bodies that touch are made of, differentiable. Gradient and blocks of inertia, energies of single
-vertices and friction on a floor: for the adjoint of rigid corrections, and for coarse ones. Barriers, friction and
-damping of pairs: for coarse ones. Twin of csrc/contact/rigid.h."""
+"""What coarse corrections of bodies that touch are made of, differentiable: gradient and blocks of inertia, energies of
+single vertices, friction on a floor, and barriers, friction and damping of pairs. Twin of csrc/contact/rigid.h."""
 
 from __future__ import annotations
 
@@ -85,35 +84,33 @@ def _vertex_energies(s: Scenes) -> list[tuple[Any, tuple[Tensor, float, Tensor |
     return out
 
 
-def _floor_slip(s: Scenes, way: Tensor | float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
-    """Of friction on a floor, of vertices that go on by `way`: motion along each plane, and load [N] times what _slip
-    returns."""
+def _floor_slip(s: Scenes) -> tuple[Tensor, Tensor, Tensor]:
+    """Of friction on a floor: motion along each plane, and load [N] times what _slip returns."""
     load, n = s.fields.floor_lag[..., 0], s.fields.floor_lag[..., 1:]
-    travel = (s.fields.x + way - s.fields.x_prev)[:, :, None]
+    travel = (s.fields.x - s.fields.x_prev)[:, :, None]
     u = travel - n * (n * travel).sum(-1, keepdim=True)
     rate, bend = _slip(u, s.friction_eps)
     return u, load * rate, load * bend
 
 
-def vertex_gradient(s: Scenes, way: Tensor | float = 0.0) -> Tensor:
-    """Of inertia, energies of single vertices and, after `way`, friction on a floor [B, V, 3]; of inertia not at pinned
-    vertices."""
+def vertex_gradient(s: Scenes) -> Tensor:
+    """Of inertia, energies of single vertices and friction on a floor [B, V, 3]; of inertia not at pinned vertices."""
     f = s.fields
     off = torch.where(s.model._pinned[:, None], torch.zeros_like(f.x), f.x - f.y)
     force = broadcast(f.mass, f.x.shape[:2])[..., None] * off
     for energy, rest in _vertex_energies(s):
         force = force + energy.gradient(f.x, f.x_prev, *rest)
     if f.floor_lag.numel():
-        u, rate, _ = _floor_slip(s, way)
+        u, rate, _ = _floor_slip(s)
         force = force + s.time_step**2 * (rate[..., None] * u).sum(2)
     return force
 
 
-def vertex_blocks(s: Scenes, friction: bool = True) -> Tensor | None:
+def vertex_blocks(s: Scenes) -> Tensor | None:
     """Blocks [B, V, 3, 3] of its derivative, without those of inertia; None where there are none."""
     f = s.fields
     parts = [energy.blocks(f.x, f.x_prev, *rest) for energy, rest in _vertex_energies(s)]
-    if f.floor_lag.numel() and friction:
+    if f.floor_lag.numel():
         u, rate, bend = _floor_slip(s)
         parts.append(s.time_step**2 * _slip_stiffness(rate, bend, f.floor_lag[..., 1:], u).sum(2))
     out = None

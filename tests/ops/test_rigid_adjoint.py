@@ -61,7 +61,8 @@ def by_autograd(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor:
     end = f.x + _displaced(share.to(f.x.dtype)[..., None] * leaf, arm, (f.order, f.ptr, body))
     wanted = [t for t, need in zip(f, needs, strict=True) if need]
     *first, bar = torch.autograd.grad(end, (*wanted, leaf), x_bar, allow_unused=True, retain_graph=True)
-    solution = ops_rigid.rigid_solve(factor, bar.to(factor.dtype))
+    right = bar.to(factor.dtype).reshape(*factor.shape[:-1], 1)
+    solution = torch.cholesky_solve(right, factor).reshape(bar.shape)
     # of a matrix that was not positive definite no motion came, and nothing goes back through it
     moved = f.free & torch.isfinite(solution).all(-1)
     solution = torch.where(moved[..., None], solution, 0.0).to(f.x.dtype)
@@ -99,12 +100,21 @@ def _displaced(motion: Tensor, arm: Tensor, of: Order) -> Tensor:
     return first * turned + second * torch.linalg.cross(w, turned) + shift
 
 
+def without_friction(s: Scenes) -> Scenes:
+    """On a floor."""
+    return s._replace(fields=s.fields._replace(floor_lag=s.fields.x.new_zeros((0,))))
+
+
 def _virtual_work(s: Scenes, p: Tensor, q: Tensor, arm: Tensor, whole: Tensor, body: Tensor) -> Tensor:
     """p . (gradient + matrix q + friction after q), for motions p and q of all bodies [B, bodies, 6]."""
     f = s.fields
     at_p, at_q = (torch.linalg.cross(m[:, body, :3], arm) + m[:, body, 3:] for m in (p, q))
     mass = broadcast(f.mass, f.x.shape[:2])[..., None]
-    own, blocks = vertex_gradient(s, at_q) + mass * at_q, vertex_blocks(s, friction=False)
+    bare = without_friction(s)
+    # friction is that after q: the same as of vertices that began the step that much farther back
+    after = s._replace(fields=f._replace(x_prev=f.x_prev - at_q))
+    rubbed = vertex_gradient(after) - vertex_gradient(without_friction(after))
+    own, blocks = vertex_gradient(bare) + rubbed + mass * at_q, vertex_blocks(bare)
     if blocks is not None:
         own = own + (blocks * at_q[..., None, :]).sum(-1)
     spread = sum_segments(mass * arm.square().sum(-1, keepdim=True), f.order, f.ptr, body)

@@ -255,7 +255,6 @@ def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     assert motion.abs().max() > 0 and torch.isfinite(factor).all()
     return {
         "contact_rigid_system": (*touching, *numbers),
-        "contact_rigid_solve": (factor, torch.ones_like(motion)),
         "contact_rigid_move": (*touching, centers, motion, *numbers),
         "contact_rigid_backward": (*touching, points_of, points_of, *numbers),
         "contact_start": start,

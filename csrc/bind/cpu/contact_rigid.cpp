@@ -32,14 +32,6 @@ std::tuple<Tensor, Tensor, Tensor> contact_rigid_system(DIFFVBD_PARAMETERS(TOUCH
   });
 }
 
-Tensor contact_rigid_solve(const Tensor& factor, const Tensor& right) {
-  if (right.numel() == 0) return torch::stable::clone(right);
-  const auto systems = diffvbd::systems_of(factor, right);
-  Tensor out = torch::stable::clone(right);
-  diffvbd::cholesky_solve(systems.count, systems.size, data<const double>(factor), data<double>(out));
-  return out;
-}
-
 std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& centers, const Tensor& motion,
                                               std::vector<int64_t> data_count, double time_step, double friction_eps) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
@@ -115,7 +107,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
   m.impl("contact_rigid_system", TORCH_BOX(&contact_rigid_system));
-  m.impl("contact_rigid_solve", TORCH_BOX(&contact_rigid_solve));
   m.impl("contact_rigid_move", TORCH_BOX(&contact_rigid_move));
   m.impl("contact_rigid_backward", TORCH_BOX(&contact_rigid_backward));
   m.impl("contact_rigid_end_backward", TORCH_BOX(&contact_rigid_end_backward));

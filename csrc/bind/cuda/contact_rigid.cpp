@@ -43,22 +43,6 @@ std::tuple<Tensor, Tensor, Tensor> contact_rigid_system(DIFFVBD_PARAMETERS(TOUCH
   });
 }
 
-Tensor contact_rigid_solve(const Tensor& factor, const Tensor& right) {
-  const DeviceGuard guard(factor.get_device_index());
-  std::vector<int64_t> shape;
-  for (int64_t k = 0; k < right.dim(); ++k) shape.push_back(right.size(k));
-  Tensor out = empty(right, shape);
-  if (right.numel() == 0) return out;
-  const auto systems = diffvbd::systems_of(factor, right);
-  check(cudaMemcpyAsync(out.data_ptr(), right.data_ptr(), right.numel() * sizeof(double), cudaMemcpyDeviceToDevice,
-                        current_stream(right)),
-        "a copy");
-  check(cuda::cholesky_solve(systems.count, systems.size, data<const double>(factor), data<double>(out),
-                             current_stream(right)),
-        "a solution of rigid motions");
-  return out;
-}
-
 std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& centers, const Tensor& motion,
                                               std::vector<int64_t> data_count, double time_step, double friction_eps) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
@@ -141,7 +125,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_rigid_system", TORCH_BOX(&contact_rigid_system));
-  m.impl("contact_rigid_solve", TORCH_BOX(&contact_rigid_solve));
   m.impl("contact_rigid_move", TORCH_BOX(&contact_rigid_move));
   m.impl("contact_rigid_backward", TORCH_BOX(&contact_rigid_backward));
   m.impl("contact_rigid_end_backward", TORCH_BOX(&contact_rigid_end_backward));
