@@ -16,7 +16,8 @@ from bench.cpu import kept_bytes, least
 from bench.gpu_measure import Card
 from diffvbd import mesh
 from diffvbd.contact import detection
-from diffvbd.step.rooms import Motion, rooms
+from diffvbd.step.motion import motion_of
+from diffvbd.step.rooms import rooms
 
 DHAT = 2e-3  # [m]
 CLOSE = 0.5 * DHAT  # gap of bodies that touch [m]
@@ -67,8 +68,8 @@ def searching(model: dv.Model) -> Callable[[], Any]:
     def work() -> list[Any]:
         out = []
         for _ in range(DETECTIONS):
-            motion = Motion(surface, x, none, mass, move)
-            found = rooms(motion, barrier, x, none, mass, points, points, fall, motion.rigid(), None, False)
+            motion = motion_of(surface, x, none, mass, move, fall)
+            found = rooms(motion, surface, barrier, x, none, mass, points, points, None, False)
             given = (x, none, points, points, surface, barrier, surface.capacity, found.room, found.own_room)
             out.append((found.island, detection.detect(*given)))
         return out

@@ -186,6 +186,22 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "contact_islands(Tensor x, Tensor origin, Tensor move, Tensor mass, Tensor collider, Tensor collider_next, "
       "Tensor planes, Tensor body, Tensor body_order, Tensor body_ptr, Tensor held, Tensor radius, Tensor room, int "
       "mesh_bodies, float dhat, bool any_direction) -> Tensor");
+  // What of the ways that vertices want to go is a rigid motion of each body [B, V, 3]; the longest ways [5, B, bodies]
+  // and the sums [B, bodies, 4] of contact/motion.h. origin and fall may be empty
+  m.def(
+      "contact_motion(Tensor x, Tensor origin, Tensor mass, Tensor move, Tensor fall, Tensor held, Tensor held_bodies, "
+      "Tensor order, Tensor ptr) -> (Tensor rigid, Tensor ways, Tensor sums)");
+  m.def(
+      "contact_motion_backward(Tensor bar, Tensor x, Tensor origin, Tensor mass, Tensor move, Tensor held, Tensor "
+      "held_bodies, Tensor order, Tensor ptr) -> (Tensor x, Tensor move, Tensor mass)");
+  // How far bodies may go until pairs are found again, see contact/rooms.h: their islands [B, bodies] int32, rooms and
+  // rooms of their own [B, bodies + 1], and how far they want to go over the most room [B, bodies]
+  m.def(
+      "contact_rooms(Tensor x, Tensor origin, Tensor mass, Tensor move, Tensor held, Tensor order, Tensor ptr, Tensor "
+      "rigid, Tensor ways, Tensor sums, Tensor floor, Tensor collider, Tensor collider_next, Tensor planes, Tensor "
+      "body, Tensor radius, Tensor most, Tensor most_alone, Tensor most_own, Tensor least_own, float dhat, float "
+      "share, float least, bool any_direction, bool self_contact) -> (Tensor island, Tensor room, Tensor own_room, "
+      "Tensor over)");
   // How much of its way each vertex goes at the start, see contact/advance.h: [scenes, vertices], or all of a body
   // [scenes, bodies] where it goes as a whole; stuck: how many pairs what is prescribed brings too close. center: what
   // a vertex may leave by its room at most, and own_center by its own_room, unless empty

@@ -17,12 +17,6 @@ struct LongestInputs {
   bool angles;
 };
 
-// The larger of two, or the one that is no number.
-template <class T>
-DIFFVBD_FN T larger(const T& a, const T& b) {
-  return a < b || b != b ? b : a;
-}
-
 template <class T>
 struct Longest {
   T square, angle;  // of the length; length over that of the arm

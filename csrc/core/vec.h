@@ -36,6 +36,16 @@ DIFFVBD_FN R absolute(const R& a) {
   return select(a < R(0), -a, a);
 }
 
+// The larger of two, and the smaller; or the one that is no number.
+template <class T>
+DIFFVBD_FN T larger(const T& a, const T& b) {
+  return a < b || b != b ? b : a;
+}
+template <class T>
+DIFFVBD_FN T smaller(const T& a, const T& b) {
+  return b < a || b != b ? b : a;
+}
+
 // f(0) ... f(n - 1) with indices that are constants (decltype(i)::value): an array that is read in no other way is
 // taken apart into registers before any loop is unrolled.
 template <int n, int i = 0, class F>

@@ -45,6 +45,19 @@ class Threads {
     return part.empty() ? none : *std::min_element(part.begin(), part.end());
   }
 
+  // the largest of each of n numbers >= 0 that f(i, of) gives, or one that is no number
+  template <int n, class F>
+  void most(int32_t count, double* out, const F& f) const {
+    std::vector<double> part((count + kChunk - 1) / kChunk * n, 0.0);
+    each_chunk(count, [&](int64_t chunk, int32_t i) {
+      double own[n];
+      f(i, own);
+      for (int k = 0; k < n; ++k) part[chunk * n + k] = larger(part[chunk * n + k], own[k]);
+    });
+    std::fill_n(out, n, 0.0);
+    for (size_t k = 0; k < part.size(); ++k) out[k % n] = larger(out[k % n], part[k]);
+  }
+
   template <class F>
   void each(int32_t count, const F& f) const {
     each_chunk(count, [&](int64_t, int32_t i) { f(i); });
@@ -73,13 +86,13 @@ class Threads {
 };
 
 // Calls f(body, team) for all bodies of all scenes.
-template <class T, class F>
-void for_bodies(const rigid::Inputs<T>& in, const F& f) {
+template <template <class> class Body = rigid::Body, class In, class F>
+void for_bodies(const In& in, const F& f) {
   const int64_t items = in.scenes * in.bodies;
   if (items == 0) return;
   const int64_t vertices = std::max<int64_t>(1, in.ptr[in.bodies] / in.bodies);
   const auto one = [&](int64_t item, bool many) {
-    f(rigid::Body<T>{in, item / in.bodies, static_cast<int32_t>(item % in.bodies)}, Threads(many));
+    f(Body<typename In::Scalar>{in, item / in.bodies, static_cast<int32_t>(item % in.bodies)}, Threads(many));
   };
   if (items < static_cast<int64_t>(torch::stable::get_num_threads())) {
     for (int64_t i = 0; i < items; ++i) one(i, true);

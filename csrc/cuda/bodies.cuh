@@ -90,6 +90,26 @@ struct BlockTeam {
   __device__ double least(int32_t count, const F& f) const {
     return reduce_least(own_least(static_cast<int32_t>(threadIdx.x), count, kThreads, f));
   }
+  // the largest of each of n numbers >= 0 that f(i, of) gives, or one that is no number
+  template <int n, class F>
+  __device__ void most(int32_t count, double* out, const F& f) const {
+    static_assert(n <= kMostSums);
+    for (int k = 0; k < n; ++k) out[k] = 0;
+    for (int32_t i = static_cast<int32_t>(threadIdx.x); i < count; i += kThreads) {
+      double own[n];
+      f(i, own);
+      for (int k = 0; k < n; ++k) out[k] = larger(out[k], own[k]);
+    }
+    for (int k = 0; k < n; ++k) {
+      for (int d = 16; d > 0; d /= 2) out[k] = larger(out[k], __shfl_xor_sync(0xffffffffu, out[k], d));
+      if (threadIdx.x % 32 == 0) part[threadIdx.x / 32][k] = out[k];
+    }
+    __syncthreads();
+    for (int k = 0; k < n; ++k) {
+      for (int w = 0; w < kWarps; ++w) out[k] = larger(out[k], part[w][k]);
+    }
+    __syncthreads();
+  }
   __device__ void meet() const { __syncthreads(); }
   template <class F>
   __device__ void each(int32_t count, const F& f) const {

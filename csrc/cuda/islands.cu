@@ -12,6 +12,7 @@ using namespace contact;
 constexpr int kThreads = 256;
 constexpr int kWarp = 32, kLongSegment = 512;  // threads for a sum of fewer terms on average; above, kThreads
 constexpr int32_t kTile = 32;                  // bodies that one thread compares with one
+constexpr int32_t kFewBodies = 512;            // of a scene, up to which a block finds all its islands
 constexpr size_t kAlignment = 256;
 
 unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kThreads - 1) / kThreads); }
@@ -25,6 +26,7 @@ struct Workspace {
   BodySum<T>*bodies, *islands;  // [B, bodies]; of islands, at their smallest body
   Bounds<T>* boxes;             // [B, bodies] swept
   int32_t* label;               // [B, bodies] toward the smallest body of the island
+  bool* stays;                  // [B, bodies] bodies that must, as the rooms are
   int32_t* unsettled;           // [B]
   Ordered<T> (*colliders)[6];   // [B, Vc] boxes of collider objects, as ordered bits
   int32_t* objects;             // how many of those there are
@@ -37,7 +39,8 @@ struct Workspace {
       bytes += (items * sizeof(*pointer) + kAlignment - 1) / kAlignment * kAlignment;
     };
     const int64_t n = in.scenes * in.mesh_bodies;
-    take(bodies, n), take(islands, n), take(boxes, n), take(label, n), take(unsettled, in.scenes);
+    take(bodies, n), take(islands, n), take(boxes, n), take(label, n), take(stays, n);
+    take(unsettled, in.scenes);
     take(colliders, in.scenes * in.colliders()), take(objects, 1);
   }
 };
@@ -45,13 +48,22 @@ struct Workspace {
 template <class T>
 __global__ void start_kernel(const IslandInputs<T> in, Workspace<T> work) {
   const int64_t i = own_item();
-  if (i < in.scenes * in.mesh_bodies) work.label[i] = static_cast<int32_t>(i % in.mesh_bodies);
-  if (i < in.scenes) work.unsettled[i] = 0;
   if (i < in.scenes * in.colliders()) {
     const T far = std::numeric_limits<T>::infinity();
     for (int k = 0; k < 6; ++k) work.colliders[i][k] = ordered(k < 3 ? far : -far);
   }
   if (i == 0) *work.objects = 0;
+}
+
+// Each body is an island.
+template <class T>
+__global__ void apart_kernel(const IslandInputs<T> in, Workspace<T> work) {
+  const int64_t i = own_item();
+  if (i < in.scenes * in.mesh_bodies) {
+    work.label[i] = static_cast<int32_t>(i % in.mesh_bodies);
+    work.stays[i] = false;
+  }
+  if (i < in.scenes) work.unsettled[i] = 0;
 }
 
 template <class T>
@@ -107,6 +119,13 @@ __global__ void bodies_sync_kernel(const IslandInputs<T> in, Workspace<T> work) 
   if (threadIdx.x == 0) work.bodies[blockIdx.x] = sum;
 }
 
+template <class T>
+__device__ BodySum<T> body_of(const Workspace<T>& work, int64_t i) {
+  BodySum<T> out = work.bodies[i];
+  out.blocked = out.blocked || work.stays[i];
+  return out;
+}
+
 // A block for each island, those of other bodies have nothing to do.
 template <class T>
 __global__ void islands_sync_kernel(const IslandInputs<T> in, Workspace<T> work) {
@@ -116,17 +135,15 @@ __global__ void islands_sync_kernel(const IslandInputs<T> in, Workspace<T> work)
   if (work.label[blockIdx.x] != body) return;
   BodySum<T> own = nothing<T>();
   for (auto k = static_cast<int32_t>(threadIdx.x); k < in.mesh_bodies; k += static_cast<int32_t>(blockDim.x)) {
-    if (work.label[first + k] == body) own.add(work.bodies[first + k]);
+    if (work.label[first + k] == body) own.add(body_of(work, first + k));
   }
   const BodySum<T> sum = block_sum(own, part, [](BodySum<T>& a, const BodySum<T>& b) { a.add(b); });
   if (threadIdx.x == 0) work.islands[blockIdx.x] = sum;
 }
 
-// What bodies sweep, and which of them must stay from now on.
+// What a body sweeps, and whether it must stay from now on.
 template <class T>
-__global__ void sweep_kernel(const IslandInputs<T> in, Workspace<T> work) {
-  const int64_t i = own_item();
-  if (i >= in.scenes * in.mesh_bodies) return;
+__device__ void sweep_body(const IslandInputs<T>& in, const Workspace<T>& work, int64_t i) {
   const int64_t scene = i / in.mesh_bodies, first = scene * in.mesh_bodies;
   const Bounds<T> box = swept(in, work.bodies[i].bounds, translation(work.islands[first + work.label[i]]),
                               in.margin(scene, static_cast<int32_t>(i - first)));
@@ -138,7 +155,13 @@ __global__ void sweep_kernel(const IslandInputs<T> in, Workspace<T> work) {
     blocked = overlap(box, Bounds<T>{{at(0), at(1), at(2)}, {at(3), at(4), at(5)}});
   }
   for (int32_t l = 0; l < in.num_planes && !blocked; ++l) blocked = reaches_plane(in, scene, l, box);
-  if (blocked) work.bodies[i].blocked = true;
+  if (blocked) work.stays[i] = true;
+}
+
+template <class T>
+__global__ void sweep_kernel(const IslandInputs<T> in, Workspace<T> work) {
+  const int64_t i = own_item();
+  if (i < in.scenes * in.mesh_bodies) sweep_body(in, work, i);
 }
 
 __device__ int32_t root_of(const int32_t* label, int32_t i) {
@@ -195,6 +218,49 @@ __global__ void finish_kernel(const IslandInputs<T> in, Workspace<T> work, int32
   island[i] = work.islands[first + work.label[i]].blocked ? -1 : work.label[i];
 }
 
+// All of it for a scene of few bodies: a block.
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    scene_sync_kernel(const IslandInputs<T> in, Workspace<T> work, int32_t* island) {
+  __shared__ int32_t unsettled;
+  const int32_t n = in.mesh_bodies;
+  const int64_t first = int64_t{blockIdx.x} * n;
+  int32_t* label = work.label + first;
+  const auto each = [&](int32_t count, const auto& f) {
+    for (auto i = static_cast<int32_t>(threadIdx.x); i < count; i += kThreads) f(i);
+    __syncthreads();
+  };
+  const auto sum = [&] {
+    each(n, [&](int32_t i) {
+      if (label[i] != i) return;
+      BodySum<T> own = nothing<T>();
+      for (int32_t j = i; j < n; ++j) {
+        if (label[j] == i) own.add(body_of(work, first + j));
+      }
+      work.islands[first + i] = own;
+    });
+  };
+  const auto sweep = [&] { each(n, [&](int32_t i) { sweep_body(in, work, first + i); }); };
+  if (threadIdx.x == 0) unsettled = 0;
+  each(n, [&](int32_t i) { label[i] = i, work.stays[first + i] = false; });
+  for (int round = 0; round <= kJoins; ++round) {
+    sum(), sweep();
+    each(n * n, [&](int32_t pair) {
+      const int32_t i = pair / n, j = pair % n;
+      if (j <= i || !overlap(work.boxes[first + i], work.boxes[first + j])) return;
+      if (root_of(label, i) == root_of(label, j)) return;
+      if (round < kJoins) {
+        unite(label, i, j);
+      } else {
+        unsettled = 1;
+      }
+    });
+    each(n, [&](int32_t i) { label[i] = unsettled ? 0 : root_of(label, i); });
+  }
+  sum(), sweep(), sum();
+  each(n, [&](int32_t i) { island[first + i] = work.islands[first + label[i]].blocked ? -1 : label[i]; });
+}
+
 // A block for each column of each segment.
 template <class T>
 __global__ void segments_sync_kernel(const T* values, const int32_t* order, const int32_t* ptr, int64_t items,
@@ -217,16 +283,22 @@ size_t islands_workspace_bytes(const IslandInputs<T>& in) {
 }
 
 template <class T>
-cudaError_t find_islands(const IslandInputs<T>& in, int32_t* island, void* memory, cudaStream_t stream) {
+cudaError_t find_islands(const IslandInputs<T>& in, int32_t* island, void* memory, cudaStream_t stream, bool again) {
   const Workspace<T> work(in, memory);
   const int64_t n = in.scenes * in.mesh_bodies, points = in.scenes * in.colliders();
   if (n == 0) return cudaSuccess;
   const auto blocks = static_cast<unsigned>(n);
-  start_kernel<<<blocks_for(n > points ? n : points), kThreads, 0, stream>>>(in, work);
-  if (points > 0) colliders_kernel<<<blocks_for(points), kThreads, 0, stream>>>(in, work);
-  if (in.num_planes > 0) planes_kernel<<<blocks_for(in.scenes * in.num_planes), kThreads, 0, stream>>>(in, work);
-  const int threads = threads_for(in.vertices, in.mesh_bodies);
-  bodies_sync_kernel<<<blocks, threads, 0, stream>>>(in, work);
+  if (!again) {
+    start_kernel<<<blocks_for(points > 0 ? points : 1), kThreads, 0, stream>>>(in, work);
+    if (points > 0) colliders_kernel<<<blocks_for(points), kThreads, 0, stream>>>(in, work);
+    if (in.num_planes > 0) planes_kernel<<<blocks_for(in.scenes * in.num_planes), kThreads, 0, stream>>>(in, work);
+    bodies_sync_kernel<<<blocks, threads_for(in.vertices, in.mesh_bodies), 0, stream>>>(in, work);
+  }
+  if (in.mesh_bodies <= kFewBodies) {
+    scene_sync_kernel<<<static_cast<unsigned>(in.scenes), kThreads, 0, stream>>>(in, work, island);
+    return cudaGetLastError();
+  }
+  apart_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, work);
   const int64_t comparisons = n * ((in.mesh_bodies + kTile - 1) / kTile);
   // One round more than the joins: it finds out whether they have settled, and if not makes one island of the scene.
   for (int round = 0; round <= kJoins; ++round) {
@@ -254,7 +326,7 @@ cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* pt
 
 #define DIFFVBD_INSTANTIATE(T)                                                                                      \
   template size_t islands_workspace_bytes<T>(const IslandInputs<T>&);                                               \
-  template cudaError_t find_islands<T>(const IslandInputs<T>&, int32_t*, void*, cudaStream_t);                      \
+  template cudaError_t find_islands<T>(const IslandInputs<T>&, int32_t*, void*, cudaStream_t, bool);                \
   template cudaError_t segment_sum<T>(const T*, const int32_t*, const int32_t*, int64_t, int64_t, int64_t, int64_t, \
                                       T*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)

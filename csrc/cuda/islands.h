@@ -13,9 +13,10 @@ namespace diffvbd::cuda {
 template <class T>
 size_t islands_workspace_bytes(const contact::IslandInputs<T>& in);
 
-// island [B, mesh_bodies]
+// island [B, mesh_bodies]. again: the workspace is that of a call that differed in its rooms alone.
 template <class T>
-cudaError_t find_islands(const contact::IslandInputs<T>& in, int32_t* island, void* workspace, cudaStream_t stream);
+cudaError_t find_islands(const contact::IslandInputs<T>& in, int32_t* island, void* workspace, cudaStream_t stream,
+                         bool again = false);
 
 // values [B, items, c] -> [B, segments, c]: sums of the rows order[ptr[s]..ptr[s + 1]) in an order that depends on the
 // shapes alone

@@ -23,6 +23,7 @@ constexpr int32_t kCorrected = -2;  // as `other` of a vertex whose body is corr
 
 template <class T>
 struct Inputs {
+  using Scalar = T;
   const T* x;                                      // [B, V, 3]
   Batched<const T> x_prev, y, mass, origin, data;  // origin may be null
   const int32_t *order, *ptr;                      // vertices by body [listed], [bodies + 1]

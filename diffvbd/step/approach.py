@@ -12,7 +12,7 @@ from ..reference.distance import EDGE_EDGE
 from .arguments import Prepared
 from .contact import ContactStep
 from .predict import Begun
-from .rooms import Motion
+from .motion import motion_of
 
 MARGIN = 2.0  # of the ways that vertices want to go, which forces within bodies change
 LEAST = 0.25  # of dhat
@@ -69,8 +69,8 @@ def _near_floor(model: Model, begun: Begun, prepared: Prepared, way: Tensor) -> 
 def _near_pairs(model: Model, begun: Begun, prepared: Prepared, way: Tensor, before: Tensor, after: Tensor) -> Tensor:
     step = ContactStep(model, begun, prepared, before, after)
     assert step.surface is not None
-    motion = Motion(step.surface, step.x_prev, step.origin, step.fields.mass, way)
-    found = step.detect(step.x_prev, step.before, step.colliders, motion, torch.zeros_like(way), motion.rigid())
+    motion = motion_of(step.surface, step.x_prev, step.origin, step.fields.mass, way, torch.zeros_like(way))
+    found = step.detect(step.x_prev, step.before, step.colliders, motion)
     ways = torch.cat([way, after - before], 1)
     *corner, kind, scene = found.listed.pairs.long().unbind(-1)
     rows = torch.arange(len(kind), device=way.device)

@@ -24,6 +24,7 @@ from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
 from ..ops.contact_rigid import MOST_COUPLED
 from ..ops.detect import CONSTANTS
+from ..ops.motion import RoomsOfBodies
 from ..scopes import checking, not_compiled, recorders
 from ..tuples import replaced
 from .coarse import factor_of
@@ -32,7 +33,8 @@ from .floor_start import start_on_floor
 from .intersections import refuse_intersections
 from .met import Detection, Met, Outcome, outcomes
 from .rigid_contact import bodies_of, correct
-from .rooms import ROOM, Motion, Rooms, rooms, rooms_of_sweeps, unsupported
+from .motion import Motion, motion_of
+from .rooms import ROOM, longest, rooms, rooms_of_sweeps, unsupported
 
 if TYPE_CHECKING:
     from .arguments import Prepared
@@ -151,10 +153,9 @@ class ContactStep:
             was, now = (self._colliders_at(min(1.0, n / stages)) for n in (r, r + 1))
             # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
             move = left if stages == 1 else torch.where(pinned, way / stages, left)
-            wanted = fall = lift if r == 0 else torch.zeros_like(lift)
-            motion = Motion(surface, x, self.origin, self.fields.mass, move)
-            rigid = motion.rigid()
-            within = self._rooms(x, was, now, motion, fall, rigid)
+            fall = lift if r == 0 else torch.zeros_like(lift)
+            motion = motion_of(surface, x, self.origin, self.fields.mass, move, fall)
+            within = self._rooms(x, was, now, motion)
             if self.parts is None:
                 self.parts = 1 if x.is_cuda and torch.cuda.is_current_stream_capturing() else parts_of(within.over)
             detection = self._detect(x, was, now, within)
@@ -169,8 +170,9 @@ class ContactStep:
                                           self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
             fall = fall if self.model.starts_from == "predictor" else torch.zeros_like(fall)  # corrections do it
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
-                                         detection, surface, rigid, ROOM * motion.stretched(rigid),
-                                         motion.largest, self._raises, barrier.self_contact)  # fmt: skip
+                                         detection, surface, motion.rigid, ROOM * motion.stretched,
+                                         functools.partial(longest, surface), self._raises,
+                                         barrier.self_contact)  # fmt: skip
             met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
             if self._reads(x):
                 self._check(r, met.counts[r].tolist(), met)
@@ -178,7 +180,7 @@ class ContactStep:
             x, first = self._corrected(start.x, now, start, detection.listed)
             if start.own:
                 start = replaced(start, own=(start.own[0] + (x - start.x).detach(), start.own[1]))
-            room = rooms_of_sweeps(motion, barrier, start, x, begin, wanted, rigid)
+            room = rooms_of_sweeps(motion, surface, barrier, start, x, begin)
             near, kept = self._narrowed(detection.listed, x, now, room)
             swept_from = replaced(start, center=x.detach(), room=room)
             taken, limits, combined, lengths, cut = [first], None, None, None, start.short
@@ -268,17 +270,17 @@ class ContactStep:
         )  # fmt: skip
         return sweep(fields, model._packed_rest, model._plan, settings, tape_policy=policy, debug_step=debug_step)[:2]
 
-    def detect(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion, fall: Tensor, rigid: Tensor) -> Detection:
-        """The pairs that can matter on the way ``motion`` and ``fall`` from x."""
-        return self._detect(x, was, now, self._rooms(x, was, now, motion, fall, rigid))
+    def detect(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion) -> Detection:
+        """The pairs that can matter on the ways from x."""
+        return self._detect(x, was, now, self._rooms(x, was, now, motion))
 
-    def _rooms(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion, fall: Tensor, rigid: Tensor) -> Rooms:
-        assert self.barrier is not None
-        return rooms(motion, self.barrier, x, self.origin, self.fields.mass, was, now, fall, rigid, self.floor_data,
+    def _rooms(self, x: Tensor, was: Tensor, now: Tensor, motion: Motion) -> RoomsOfBodies:
+        assert self.surface is not None and self.barrier is not None
+        return rooms(motion, self.surface, self.barrier, x, self.origin, self.fields.mass, was, now, self.floor_data,
                      self.any_direction)  # fmt: skip
 
     @torch.no_grad()
-    def _detect(self, x: Tensor, was: Tensor, now: Tensor, within: Rooms) -> Detection:
+    def _detect(self, x: Tensor, was: Tensor, now: Tensor, within: RoomsOfBodies) -> Detection:
         surface, barrier, island = self.surface, self.barrier, within.island
         assert surface is not None and barrier is not None
         x, room, own_room = x.detach(), within.room, within.own_room

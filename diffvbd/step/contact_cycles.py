@@ -53,7 +53,7 @@ def sweeps_of_parts(sweeps: int, parts: int) -> list[int]:
 
 def parts_of(over: Tensor) -> int:
     """How many parts a step takes that nobody has given a number: one, and one more each time that bodies want to go
-    twice as far as the most room that they get. over: of Rooms."""
+    twice as far as the most room that they get. over: of RoomsOfBodies."""
     most = float(over.max()) if over.numel() else 0.0
     return min(MOST_DETECTIONS, 1 + math.ceil(math.log2(most))) if 1 < most < math.inf else 1
 

@@ -1,0 +1,88 @@
+// CUDA implementations of motions and rooms of bodies: tensors in, raw pointers on.
+#include "../../cuda/motion.h"
+
+#include <torch/csrc/stable/accelerator.h>
+#include <torch/csrc/stable/library.h>
+
+#include <tuple>
+#include <vector>
+
+#include "../../cuda/islands.h"
+#include "../motion.h"
+#include "binding.h"
+
+namespace {
+
+namespace contact = diffvbd::contact;
+namespace cuda = diffvbd::cuda;
+using cuda::check, cuda::current_stream, cuda::empty, diffvbd::data, diffvbd::dispatch_float;
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+using torch::stable::accelerator::DeviceGuard;
+
+std::tuple<Tensor, Tensor, Tensor> contact_motion(const Tensor& x, const Tensor& origin, const Tensor& mass,
+                                                  const Tensor& move, const Tensor& fall, const Tensor& held,
+                                                  const Tensor& held_bodies, const Tensor& order, const Tensor& ptr) {
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::motion_inputs<T>({x, origin, mass, move, held, order, ptr}, fall, held_bodies);
+    Tensor rigid = empty(x, {in.scenes, in.vertices, 3}), ways = empty(x, {contact::kWays, in.scenes, in.bodies});
+    Tensor sums = empty(x, {in.scenes, in.bodies, 4});
+    check(cuda::find_motion<T>(in, data<T>(rigid), data<T>(ways), data<T>(sums), current_stream(x)),
+          "motions of bodies");
+    return std::make_tuple(rigid, ways, sums);
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor> contact_motion_backward(const Tensor& bar, const Tensor& x, const Tensor& origin,
+                                                           const Tensor& mass, const Tensor& move, const Tensor& held,
+                                                           const Tensor& held_bodies, const Tensor& order,
+                                                           const Tensor& ptr) {
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::motion_inputs<T>({x, origin, mass, move, held, order, ptr}, {}, held_bodies);
+    diffvbd::require_like("bar", bar, x, x.numel());
+    Tensor x_bar = empty(x, {in.scenes, in.vertices, 3}), move_bar = empty(x, {in.scenes, in.vertices, 3});
+    Tensor mass_bar = empty(x, {in.scenes, in.vertices});
+    check(cuda::reverse_motion<T>(in, {data<const T>(bar), data<T>(x_bar), data<T>(move_bar), data<T>(mass_bar)},
+                                  current_stream(x)),
+          "the adjoint of motions of bodies");
+    return std::make_tuple(x_bar, move_bar, mass_bar);
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rooms(
+    const Tensor& x, const Tensor& origin, const Tensor& mass, const Tensor& move, const Tensor& held,
+    const Tensor& order, const Tensor& ptr, const Tensor& rigid, const Tensor& ways, const Tensor& sums,
+    const Tensor& floor, const Tensor& collider, const Tensor& collider_next, const Tensor& planes, const Tensor& body,
+    const Tensor& radius, const Tensor& most, const Tensor& most_alone, const Tensor& most_own, const Tensor& least_own,
+    double dhat, double share, double least, bool any_direction, bool self_contact) {
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto motion = diffvbd::motion_inputs<T>({x, origin, mass, move, held, order, ptr});
+    const diffvbd::RoomResults out(
+        motion.scenes, motion.bodies, planes.size(0) + diffvbd::planes_of(floor),
+        [&](const std::vector<int64_t>& shape) { return empty(x, shape); },
+        [&](const std::vector<int64_t>& shape) { return empty(x, shape, ScalarType::Int); });
+    const auto islands = diffvbd::island_inputs<T>(x, origin, move, mass, collider, collider_next, planes, body, order,
+                                                   ptr, held, radius, out.room, motion.bodies, dhat, any_direction);
+    const auto in =
+        diffvbd::room_inputs<T>(motion, islands, x, {rigid, ways, sums, floor, most, most_alone, most_own, least_own},
+                                {dhat, share, least, self_contact});
+    const auto bytes = static_cast<int64_t>(cuda::islands_workspace_bytes<T>(islands));
+    const Tensor work = empty(x, {bytes}, ScalarType::Byte);
+    check(cuda::find_rooms<T>(in, out.pointers<T>(in), work.data_ptr(), current_stream(x)), "rooms of bodies");
+    return out.tensors();
+  });
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
+  m.impl("contact_motion", TORCH_BOX(&contact_motion));
+  m.impl("contact_motion_backward", TORCH_BOX(&contact_motion_backward));
+  m.impl("contact_rooms", TORCH_BOX(&contact_rooms));
+}

@@ -1,0 +1,18 @@
+// Motion and rooms of bodies on the CPU.
+#pragma once
+
+#include "../contact/rooms.h"
+
+namespace diffvbd {
+
+// Results as contact/motion.h has them.
+template <class T>
+void find_motion(const contact::MotionInputs<T>& in, T* rigid, T* ways, T* sums);
+template <class T>
+void reverse_motion(const contact::MotionInputs<T>& in, const contact::MotionAdjoints<T>& a);
+
+// Fills all that `work` points to.
+template <class T>
+void find_rooms(contact::RoomInputs<T> in, const contact::RoomWork<T>& work);
+
+}  // namespace diffvbd

@@ -1,0 +1,114 @@
+#include "bodies.cuh"
+#include "islands.h"
+#include "motion.h"
+
+namespace diffvbd::cuda {
+namespace {
+
+using namespace contact;
+
+// A block for each body of each scene.
+template <class T, class Act>
+__global__ void __launch_bounds__(kThreads)
+    each_body(const __grid_constant__ MotionInputs<T> in, const __grid_constant__ Act act) {
+  __shared__ double part[kWarps][kMostSums];
+  const int64_t place = blockIdx.x;
+  act(MovingBody<T>{in, place / in.bodies, static_cast<int32_t>(place % in.bodies)}, BlockTeam{part});
+}
+template <class T, class Act>
+cudaError_t for_bodies(const MotionInputs<T>& in, const Act& act, cudaStream_t stream) {
+  const auto blocks = static_cast<unsigned>(in.scenes * in.bodies);
+  if (blocks > 0) each_body<T><<<blocks, kThreads, 0, stream>>>(in, act);
+  return cudaGetLastError();
+}
+
+template <class T>
+struct Find {
+  T *rigid, *ways, *sums;
+  __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
+    contact::find_motion(b, team, rigid, ways, sums);
+  }
+};
+template <class T>
+struct Reverse {
+  MotionAdjoints<T> a;
+  __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
+    contact::reverse_motion(b, team, a);
+  }
+};
+template <class T>
+struct Wish {
+  RoomInputs<T> in;
+  RoomWork<T> work;
+  __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const { wish_of_body(in, b, team, work); }
+};
+template <class T>
+struct BesideIsland {
+  RoomInputs<T> in;
+  RoomWork<T> work;
+  __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
+    room_beside_island(in, b, team, work);
+  }
+};
+
+// A block for each scene.
+template <class T, bool first>
+__global__ void __launch_bounds__(kThreads)
+    each_scene(const __grid_constant__ RoomInputs<T> in, const __grid_constant__ RoomWork<T> work) {
+  __shared__ double part[kWarps][kMostSums];
+  if constexpr (first) {
+    prepare_scene(in, blockIdx.x, BlockTeam{part}, work);
+  } else {
+    largest_of_scene(in, blockIdx.x, BlockTeam{part}, work);
+  }
+}
+
+// A thread for each body.
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    among_others(const __grid_constant__ RoomInputs<T> in, const __grid_constant__ RoomWork<T> work) {
+  const int64_t place = int64_t{blockIdx.x} * kThreads + threadIdx.x, bodies = in.motion.bodies;
+  if (place >= in.motion.scenes * bodies) return;
+  room_among_others(in, work, place / bodies, static_cast<int32_t>(place % bodies), true);
+}
+
+}  // namespace
+
+template <class T>
+cudaError_t find_motion(const MotionInputs<T>& in, T* rigid, T* ways, T* sums, cudaStream_t stream) {
+  return for_bodies(in, Find<T>{rigid, ways, sums}, stream);
+}
+
+template <class T>
+cudaError_t reverse_motion(const MotionInputs<T>& in, const MotionAdjoints<T>& a, cudaStream_t stream) {
+  return for_bodies(in, Reverse<T>{a}, stream);
+}
+
+template <class T>
+cudaError_t find_rooms(RoomInputs<T> in, const RoomWork<T>& work, void* islands, cudaStream_t stream) {
+  const auto scenes = static_cast<unsigned>(in.motion.scenes);
+  const int64_t bodies = in.motion.scenes * in.motion.bodies;
+  if (scenes == 0) return cudaSuccess;
+  in.islands.room = work.room;
+  each_scene<T, true><<<scenes, kThreads, 0, stream>>>(in, work);
+  if (bodies > 0) {
+    if (const auto error = for_bodies(in.motion, Wish<T>{in, work}, stream)) return error;
+    if (const auto error = find_islands(in.islands, work.island, islands, stream)) return error;
+    among_others<T><<<static_cast<unsigned>((bodies + kThreads - 1) / kThreads), kThreads, 0, stream>>>(in, work);
+    if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
+    if (const auto error = for_bodies(in.motion, BesideIsland<T>{in, work}, stream)) return error;
+    if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
+  }
+  each_scene<T, false><<<scenes, kThreads, 0, stream>>>(in, work);
+  return cudaGetLastError();
+}
+
+#define DIFFVBD_INSTANTIATE(T)                                                                            \
+  template cudaError_t find_motion<T>(const MotionInputs<T>&, T*, T*, T*, cudaStream_t);                  \
+  template cudaError_t reverse_motion<T>(const MotionInputs<T>&, const MotionAdjoints<T>&, cudaStream_t); \
+  template cudaError_t find_rooms<T>(RoomInputs<T>, const RoomWork<T>&, void*, cudaStream_t);
+DIFFVBD_INSTANTIATE(float)
+DIFFVBD_INSTANTIATE(double)
+#undef DIFFVBD_INSTANTIATE
+
+}  // namespace diffvbd::cuda

@@ -1,0 +1,20 @@
+// Motion and rooms of bodies on the device; the twin of cpu/motion.h.
+#pragma once
+
+#include <cuda_runtime_api.h>
+
+#include "../contact/rooms.h"
+
+namespace diffvbd::cuda {
+
+template <class T>
+cudaError_t find_motion(const contact::MotionInputs<T>& in, T* rigid, T* ways, T* sums, cudaStream_t stream);
+template <class T>
+cudaError_t reverse_motion(const contact::MotionInputs<T>& in, const contact::MotionAdjoints<T>& a,
+                           cudaStream_t stream);
+
+// islands: memory of islands_workspace_bytes().
+template <class T>
+cudaError_t find_rooms(contact::RoomInputs<T> in, const contact::RoomWork<T>& work, void* islands, cudaStream_t stream);
+
+}  // namespace diffvbd::cuda
