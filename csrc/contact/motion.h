@@ -62,8 +62,7 @@ struct RigidWay {
   double mass;
   Vector mean, center, turn;
   Sym3<double> inverse;  // of the inertia
-  bool moves;            // false: a vertex is held, or the inertia is none
-  DIFFVBD_FN Vector of(const Vector& arm) const { return mean + cross(turn, arm); }
+  bool moves;            // false: a vertex is held, or the body is not finite
 };
 
 DIFFVBD_FN double square(const Vector& a) { return dot(a, a); }
@@ -103,8 +102,8 @@ DIFFVBD_FN RigidWay rigid_way(const MovingBody<T>& b, const Team& team) {
   const Vector d{-scale * sum[5], -scale * sum[7], whole - scale * sum[8]};
   const Vector first = cross(c, d), second = cross(d, a), third = cross(a, c);
   const double determinant = dot(a, first);
-  out.moves = 0 < determinant && 0 < size;
-  if (!out.moves) return out;
+  out.moves = size == size;
+  if (!(0 < determinant && 0 < size)) return out;  // of a point there is no turn
   const double inverse = scale / determinant;
   out.inverse.xx = inverse * first.x, out.inverse.xy = inverse * first.y, out.inverse.xz = inverse * first.z;
   out.inverse.yy = inverse * second.y, out.inverse.yz = inverse * second.z, out.inverse.zz = inverse * third.z;
@@ -118,11 +117,12 @@ DIFFVBD_FN void find_motion(const MovingBody<T>& b, const Team& team, T* rigid, 
   const RigidWay body = rigid_way(b, team);
   double most[6];
   team.template most<6>(b.size(), most, [&](int32_t i, double* of) {
-    const Vector arm = b.position(i) - body.center, way = b.way(i), whole = body.moves ? body.of(arm) : Vector{};
+    const Vector arm = b.position(i) - body.center, way = b.way(i), turn = cross(body.turn, arm);
+    const Vector whole = body.moves ? body.mean + turn : Vector{};
     T* to = rigid + 3 * b.row(i);
     to[0] = T(whole.x), to[1] = T(whole.y), to[2] = T(whole.z);
     const bool free = b.is_free(i);
-    const double turned = free ? length(whole - body.mean) : 0.0;
+    const double turned = length(turn);
     of[kBends] = free ? length(way - body.mean) : 0.0;
     of[kDriven] = free ? 0.0 : length(way);
     of[kApart] = free ? length(way - whole) : 0.0;

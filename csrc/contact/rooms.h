@@ -111,12 +111,12 @@ DIFFVBD_FN void wish_of_body(const RoomInputs<T>& in, const MovingBody<T>& b, co
   room_at(in, work.room, b.scene, b.body) = room_of(in, work, place, bends, in.most_alone[b.body]);
 }
 
-// Whether a body's wish is more than what it gets among others.
+// Whether a body asks for more than it gets among others.
 template <class T>
-DIFFVBD_FN bool wishes_more(const RoomInputs<T>& in, const RoomWork<T>& work, int64_t scene, int32_t body) {
+DIFFVBD_FN bool asks_more(const RoomInputs<T>& in, const RoomWork<T>& work, int64_t scene, int32_t body) {
   const int64_t place = scene * in.motion.bodies + body;
-  const T among = room_of(in, work, place, in.way(kBends, place), in.most[body]);
-  return among < room_at(in, work.room, scene, body);
+  const T asks = asked(in, work, place, in.way(kBends, place)) + in.share * in.way(kStretched, place);
+  return !(asks <= in.most[body]);
 }
 
 // A body that meets nothing in a larger room has it: it costs no pairs.

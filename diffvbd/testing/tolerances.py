@@ -95,6 +95,8 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "memory": (0.1, "predicted against measured bytes: allocator granularity and small buffers"),
     "paper_generality": (2e-14, "the paper's worst is 1.1e-14: PD adds a solve with a factor in each iteration"),
     # two routes to one number, in float64
+    "sums_of_bodies": (1e-11, "sums over the vertices of a body in another order, and a 3x3 inertia of any numbers"),
+    "spin_of_ways": (1e-6, "angular momentum of the motion of a body: 1e-9 of its inertia is added to it"),
     "ulps": (1e-15, "one operation, or a few, on numbers of about that size: 4 ulps"),
     "formula": (1e-14, "a formula of some sums and products by two routes: about 50 ulps of its largest term"),
     "sum": (1e-13, "a sum over a body, or a gradient of one step, by two routes: roundings of many terms add up"),
