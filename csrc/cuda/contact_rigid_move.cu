@@ -8,6 +8,7 @@ namespace {
 
 constexpr int64_t kItemsOfBlock = 2048;  // of the potential of a scene, that one block adds up
 constexpr int64_t kMostBlocks = 64;      // that add up one scene
+constexpr int64_t kSmallScene = 4096;    // vertices up to which a block does all the work on a scene
 
 // What the tries of all scenes have in common.
 template <class T>
@@ -34,10 +35,7 @@ __global__ void __launch_bounds__(kOne)
 }
 
 template <class T>
-__global__ void __launch_bounds__(kOne)
-    displace_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t, T* x) {
-  const int64_t row = own_item();
-  if (row >= in.scene.scenes * in.scene.vertices) return;
+__device__ void displace(const RigidInputs<T>& in, const Tried<T>& t, int64_t row, T* x) {
   const int64_t scene = row / in.scene.vertices;
   const auto v = static_cast<int32_t>(row % in.scene.vertices);
   const int64_t body = scene * in.bodies() + in.gate.body[v];
@@ -47,42 +45,51 @@ __global__ void __launch_bounds__(kOne)
   for (int c = 0; c < 3; ++c) x[3 * row + c] = in.scene.x[3 * row + c] + t.move[3 * row + c];
 }
 
-// Marks the bodies that a pair, a room or an energy does not let pass.
 template <class T>
 __global__ void __launch_bounds__(kOne)
-    test_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t) {
-  const int64_t item = own_item(), rows = in.scene.scenes * in.scene.vertices;
-  if (item < rows) {
-    const int64_t scene = item / in.scene.vertices;
-    const auto v = static_cast<int32_t>(item % in.scene.vertices);
-    const int32_t body = in.gate.body[v];
-    if (t.done[scene] || !in.free[body]) return;
-    stay(in.gate, t.state, item, 0);
-    if (!admitted(in, Body<T>{in.scene, scene, body}, v)) mark(t.state.blocked + scene * in.bodies() + body);
-    return;
-  }
-  const int64_t pair = item - rows;
-  if (pair >= in.first_listed(in.scene.scenes) || t.done[in.gate.listed.pairs[kPairRow * pair + 5]]) return;
+    displace_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t, T* x) {
+  const int64_t row = own_item();
+  if (row < in.scene.scenes * in.scene.vertices) displace(in, t, row, x);
+}
+
+// Marks the body of a vertex that its room or an energy does not let pass, and those of a pair that does not.
+template <class T>
+__device__ void test_vertex(const RigidInputs<T>& in, const Tried<T>& t, int64_t row) {
+  const int64_t scene = row / in.scene.vertices;
+  const auto v = static_cast<int32_t>(row % in.scene.vertices);
+  const int32_t body = in.gate.body[v];
+  if (!in.free[body]) return;
+  stay(in.gate, t.state, row, 0);
+  if (!admitted(in, Body<T>{in.scene, scene, body}, v)) mark(t.state.blocked + scene * in.bodies() + body);
+}
+template <class T>
+__device__ void test_pair(const RigidInputs<T>& in, const Tried<T>& t, int64_t pair) {
   if (is_between(in, pair)) try_pair(in.gate, t.state, pair, 0);
 }
 
-// A block of the potential of a scene.
 template <class T>
-__global__ void __launch_bounds__(kThreads)
-    potential_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t, bool moved,
-                     double* out) {
-  __shared__ double part[kWarps][kMostSums];
-  const int64_t scene = blockIdx.y;
-  if (t.done[scene]) return;
-  const BlockTeam team{part};
+__global__ void __launch_bounds__(kOne)
+    test_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t) {
+  const int64_t item = own_item(), rows = in.scene.scenes * in.scene.vertices, pair = item - rows;
+  if (item < rows) {
+    if (!t.done[item / in.scene.vertices]) test_vertex(in, t, item);
+  } else if (pair < in.first_listed(in.scene.scenes) && !t.done[in.gate.listed.pairs[kPairRow * pair + 5]]) {
+    test_pair(in, t, pair);
+  }
+}
+
+// What the items first, first + step, ... of a scene have of its potential.
+template <class T>
+__device__ double potential_of(const RigidInputs<T>& in, const BlockTeam& team, int64_t scene, bool moved,
+                               int64_t first, int64_t step) {
   const CornerPoints<T> at{in, moved};
-  const int64_t step = gridDim.x, vertices = in.scene.vertices, listed = in.first_listed(scene);
-  const int64_t lagged = in.first_lagged(scene), repelling = in.first_listed(scene + 1) - listed;
+  const int64_t vertices = in.scene.vertices, listed = in.first_listed(scene), lagged = in.first_lagged(scene);
+  const int64_t repelling = in.first_listed(scene + 1) - listed;
   const int64_t items = vertices + repelling + in.first_lagged(scene + 1) - lagged;
-  const auto own = static_cast<int32_t>((items + step - 1 - blockIdx.x) / step);
+  const auto own = static_cast<int32_t>((items + step - 1 - first) / step);
   double sum[1];
   team.template sum<1>(own, sum, [&](int32_t i, double* to) {
-    const int64_t item = blockIdx.x + step * i;
+    const int64_t item = first + step * i;
     if (item < vertices) {
       const auto v = static_cast<int32_t>(item);
       const int32_t body = in.gate.body[v];
@@ -95,31 +102,33 @@ __global__ void __launch_bounds__(kThreads)
                                        : lagged_press(in, lagged + pair - repelling, at, Slid{}, a, -1);
     if (acts) to[0] += a.value;
   });
-  if (threadIdx.x == 0) out[scene * step + blockIdx.x] = sum[0];
+  return sum[0];
 }
 
-// A block for each scene: whether it may go as it has tried, and what each body tries next.
+// A block of the potential of a scene.
 template <class T>
-__global__ void __launch_bounds__(kOne)
-    decide_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t, int attempt) {
-  const int64_t scene = blockIdx.x, n = in.bodies(), first = scene * n;
+__global__ void __launch_bounds__(kThreads)
+    potential_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t, bool moved,
+                     double* out) {
+  __shared__ double part[kWarps][kMostSums];
+  const int64_t scene = blockIdx.y;
   if (t.done[scene]) return;
+  const double sum = potential_of(in, BlockTeam{part}, scene, moved, blockIdx.x, gridDim.x);
+  if (threadIdx.x == 0) out[scene * gridDim.x + blockIdx.x] = sum;
+}
+
+// Whether a scene may go as it has tried, by the block that works on it; if not, what each body tries next.
+template <class T>
+__device__ bool decide(const RigidInputs<T>& in, const Tried<T>& t, int64_t scene, int attempt, double before,
+                       double after) {
+  const int64_t n = in.bodies(), first = scene * n;
   const auto each = [&](int64_t count, const auto& f) {
-    for (int64_t i = threadIdx.x; i < count; i += kOne) f(i);
+    for (int64_t i = threadIdx.x; i < count; i += blockDim.x) f(i);
   };
   bool stopped = false;
   each(n, [&](int64_t k) { stopped = stopped || t.state.blocked[first + k]; });
   const bool fits = !__syncthreads_or(stopped);
-  double before = 0, after = 0;
-  for (int64_t i = 0; i < t.blocks; ++i) {
-    before += t.before[scene * t.blocks + i];
-    after += t.after[scene * t.blocks + i];
-  }
-  if (is_safe(before, after, fits)) {
-    __syncthreads();  // everyone has asked whether it is done
-    if (threadIdx.x == 0) t.done[scene] = 1;
-    return;
-  }
+  if (is_safe(before, after, fits)) return true;
   const bool last = attempt + 1 == kTries;
   each(n, [&](int64_t k) {
     t.low[first + k] = last ? 0.0 : shortened(t.state.blocked[first + k], fits, attempt);
@@ -145,6 +154,45 @@ __global__ void __launch_bounds__(kOne)
   }
   __syncthreads();
   each(n, [&](int64_t k) { t.share[first + k] *= t.low[first + k]; });
+  return false;
+}
+
+// A block for each scene.
+template <class T>
+__global__ void __launch_bounds__(kOne)
+    decide_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t, int attempt) {
+  const int64_t scene = blockIdx.x;
+  if (t.done[scene]) return;
+  double before = 0, after = 0;
+  for (int64_t i = 0; i < t.blocks; ++i) {
+    before += t.before[scene * t.blocks + i];
+    after += t.after[scene * t.blocks + i];
+  }
+  const bool done = decide(in, t, scene, attempt, before, after);
+  __syncthreads();  // everyone has asked whether it is done
+  if (done && threadIdx.x == 0) t.done[scene] = 1;
+}
+
+// All tries of a small scene: a block.
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    scene_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t, T* x) {
+  __shared__ double part[kWarps][kMostSums];
+  const BlockTeam team{part};
+  const int64_t scene = blockIdx.x, first = scene * in.scene.vertices, begin = in.first_listed(scene);
+  const auto vertices = static_cast<int32_t>(in.scene.vertices);
+  const auto pairs = static_cast<int32_t>(in.first_listed(scene + 1) - begin);
+  const double before = potential_of(in, team, scene, false, 0, 1);
+  for (int attempt = 0; attempt < kTries; ++attempt) {
+    team.each(vertices, [&](int32_t v) { displace(in, t, first + v, static_cast<T*>(nullptr)); });
+    team.meet();
+    team.each(vertices, [&](int32_t v) { test_vertex(in, t, first + v); });
+    team.each(pairs, [&](int32_t i) { test_pair(in, t, begin + i); });
+    const double after = potential_of(in, team, scene, true, 0, 1);
+    if (decide(in, t, scene, attempt, before, after)) break;
+    team.meet();
+  }
+  team.each(vertices, [&](int32_t v) { displace(in, t, first + v, x); });
 }
 
 template <class T>
@@ -187,6 +235,10 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairRoom& room, const dou
   if (room.rows() > 0)
     press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, Slid{}, nullptr, sides, nullptr);
   begin_kernel<T><<<blocks_for(std::max(units, scenes)), kOne, 0, stream>>>(in, t);
+  if (in.scene.vertices <= kSmallScene) {
+    scene_kernel<T><<<static_cast<unsigned>(scenes), kThreads, 0, stream>>>(in, t, x);
+    return cudaGetLastError();
+  }
   const dim3 sums(static_cast<unsigned>(t.blocks), static_cast<unsigned>(scenes));
   potential_kernel<T><<<sums, kThreads, 0, stream>>>(in, t, false, t.before);
   for (int attempt = 0; attempt < kTries; ++attempt) {
