@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from .arguments import Prepared
     from .predict import Begun
 
-# Rigid corrections after the sweeps of more than MOST_COUPLED bodies that may touch. In stacks of two that friction
+# Rigid corrections after the last sweeps of more than MOST_COUPLED bodies that may touch. In stacks of two that friction
 # holds, the upper body creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; with 1 it falls.
 APART_CORRECTIONS = 4
 FREE = 1e15  # [m] room that nothing fills
@@ -189,7 +189,7 @@ class ContactStep:
                 swept = swept_part(self, x, swept_from, now, near, part, policy, debug_step)
                 met.swept.append(swept)
                 x, limits, combined, lengths = swept
-                for _ in range(self.last_corrections):
+                for _ in range(self.corrections_after(r + 1 == self.parts)):
                     x, last = self._corrected(x, now, start, detection.listed)
                     taken.append(last)
                 cut = limits[:, -1] > 0  # what the start has held up, sweeps may have made good
@@ -225,18 +225,17 @@ class ContactStep:
             settings = self.prepared.settings
             swept = swept_part(self, x, start, self.colliders, none, settings, policy, debug_step)
             x = swept.x
-            for _ in range(self.last_corrections):
+            for _ in range(self.corrections_after(True)):
                 x, _ = self._corrected(x, self.colliders, start, none)
             record_parts(self.model, x, [swept])
         return x
 
-    @property
-    def last_corrections(self) -> int:
-        """How many rigid corrections follow the sweeps. Coarse ones leave a stiff body turned, and one Newton step
-        leaves so much of that that a free body gained spin. Of very many bodies each is solved for with the others at
-        rest, which takes several to bear what lies on others."""
+    def corrections_after(self, last: bool) -> int:
+        """How many rigid corrections follow the sweeps of a part. Coarse ones leave a stiff body turned, and one Newton
+        step leaves so much of that that a free body gained spin. Of very many bodies each is solved for with the others
+        at rest, which takes several at the end to bear what lies on others."""
         least = 1 if self.prepared.coarse is None else 2
-        apart = self.barrier is not None and self.model.mesh.num_bodies > MOST_COUPLED
+        apart = last and self.barrier is not None and self.model.mesh.num_bodies > MOST_COUPLED
         return max(least, APART_CORRECTIONS) if apart else least
 
     def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> tuple[Tensor, Tensor]:
