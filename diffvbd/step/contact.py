@@ -32,7 +32,9 @@ from .floor_start import start_on_floor
 from .intersections import refuse_intersections
 from .met import Detection, Met, Outcome, outcomes
 from .rigid_contact import bodies_of, correct
-from .rooms import ROOM, Motion, Rooms, rooms, rooms_of_sweeps, unsupported
+from .rooms import ROOM, Motion, Rooms, rooms
+from .sweep_rooms import rooms_of_sweeps
+from .unsupported import unsupported
 
 if TYPE_CHECKING:
     from .arguments import Prepared

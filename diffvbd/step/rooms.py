@@ -7,13 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..adjoint.contact_lag import Pairs, pair_lag, sum_at_corners
 from ..contact import detection as search
 from ..contact.above_floor import above_floor
 from ..contact.barrier import PairBarrier
-from ..contact.start import PartStart
 from ..contact.surface import ContactSurface
-from ..model.model import Model
 from ..ops import broadcast
 from ..ops import detect as ops_contact
 from ..ops.segments import of_segments, sum_segments
@@ -96,29 +93,6 @@ class Motion:
         rigid, arm, mean = (a.detach().contiguous() for a in (rigid, self.arm, self.mean))
         turn, angle = ops_contact.longest_turns(rigid, arm, self.free, *self.order[:2], mean)
         return turn * angle / (1 + (1 + angle * angle).sqrt())
-
-
-@torch.no_grad()
-def rooms_of_sweeps(motion: Motion, barrier: PairBarrier, start: PartStart, x: Tensor, begin: Tensor, fall: Tensor,
-                    rigid: Tensor) -> Tensor:  # fmt: skip
-    """How far the sweeps may carry a vertex from where they find it [B, V] [m]: as far as a barrier pushes, weight
-    pulls, elasticity takes back what bodies deform by on the way and, of what pairs have held up, all; the most of a
-    scene, since bodies push one another. Index data.
-
-    Args:
-        motion, fall: What the part wanted.  start: Its start, whose rooms bound the whole way.
-        x, begin: Where the sweeps begin, and where the part began.  rigid: Motion.rigid(). All [B, V, 3] [m].
-    """
-    surface, move = motion.surface, motion.move
-    held_up = motion.largest(begin + move + fall - start.x.detach())
-    wish = motion.largest(fall) + motion.largest(move - rigid) + ROOM * held_up + motion.largest(x - start.x.detach())
-    wish = wish + ROOM * motion.stretched(rigid)
-    wish = LEAST_ROOM * barrier.dhat + (wish.amax(1, keepdim=True).expand_as(wish) if surface.bodies else wish)
-    left = start.room - (x - start.center).square().sum(-1).sqrt()
-    if start.own:
-        center, room = start.own
-        left = torch.minimum(left, room - (x - center).square().sum(-1).sqrt())
-    return torch.where(motion.free, torch.minimum(left, wish[:, motion.body]).clamp(min=0), 0.0)
 
 
 def _plane_colliders(surface: ContactSurface, points: Tensor, dhat: float) -> Tensor:
@@ -215,37 +189,3 @@ def rooms(motion: Motion, barrier: PairBarrier, x: Tensor, origin: Tensor, mass:
         own = own.clamp(max=surface.most_own_room)
         own = torch.maximum(torch.maximum(own, least), driven)
     return Rooms(islands(room), with_largest(room), with_largest(own), over)
-
-
-def unsupported(model: Model, x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor, mass: Tensor, lift: Tensor,
-                floor_data: Tensor | None, listed: Pairs, time_step: float) -> Tensor:  # fmt: skip
-    """What is left of ``lift`` = h^2 a [B, V, 3] once the contact forces at the start of the step have borne their part
-    of each body's acceleration: for a body at rest nothing, in flight all of it. Differentiable.
-
-    Without it every step would push a supported body into its support, and the sweeps would have to take it back.
-    """
-    surface = model.surface_of_contact
-    assert surface is not None
-    scenes, vertices = x.shape[:2]
-    force, _, n, w = pair_lag(x, collider, kappa, origin, listed).split((1, 1, 3, 4), -1)
-    points = vertices + collider.shape[1]
-    total = sum_at_corners((force * w)[..., None] * n[:, None], listed, scenes, points)[:, :vertices]
-    if floor_data is not None and model.floor is not None:
-        size, normal = model.floor.normal_force(x, floor_data, origin if origin.numel() else None)
-        total = total + (size[..., None] * broadcast(normal[:, None], (*size.shape, 3))).sum(2)
-    free, mass = ~model._pinned, broadcast(mass, (scenes, vertices))[..., None]
-    columns = torch.cat([mass * lift, time_step * time_step * total, mass, torch.zeros_like(mass)], -1)
-    held = torch.cat([torch.zeros_like(columns[..., :-1]), torch.ones_like(mass)], -1)
-    sums = _by_body(torch.where(free[:, None], columns, held), surface)
-    whole = sums[..., 6:7].clamp(min=_tiny(x))
-    own, borne = sums[..., :3] / whole, sums[..., 3:6] / whole
-    # what bears less than rounding of the body's own acceleration bears nothing: its square may be no number
-    size = borne.detach().abs().amax(-1, keepdim=True)
-    bears = size > torch.finfo(x.dtype).eps * own.detach().abs().amax(-1, keepdim=True)
-    size = torch.where(bears, size, 1.0)
-    unit = torch.where(bears, borne / size, 1.0)
-    share = -(own / size * unit).sum(-1, keepdim=True) / (unit * unit).sum(-1, keepdim=True)
-    share = torch.where(bears, share.clamp(0, 1), 0.0)
-    taken = torch.where(sums[..., 7:] > 0, 0.0, share * borne)  # a body with pinned vertices hangs from them
-    taken = of_segments(taken, surface.body_order, surface.body_ptr, surface.body[:vertices].long())
-    return torch.where(free[:, None], lift + taken, lift)
