@@ -62,6 +62,8 @@ CPU_SOURCES = [
     "csrc/bind/cpu/neighbors.cpp",
     "csrc/bind/cpu/rigid.cpp",
     "csrc/bind/cpu/rise.cpp",
+    "csrc/bind/cpu/sweep_rooms.cpp",
+    "csrc/bind/cpu/unsupported.cpp",
     "csrc/cpu/run.cpp",
 ]
 

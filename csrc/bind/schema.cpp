@@ -82,6 +82,22 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   m.def(
       "contact_lag_backward(Tensor bar, Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor "
       "constants, Tensor ptr, Tensor entry) -> (Tensor x, Tensor collider, Tensor kappa)");
+  // What is left of lift once forces have borne their part of each body's acceleration, see contact/unsupported.h;
+  // origin and planes may be empty. The adjoint: of x, empty without planes, lift, force and mass, and of planes by
+  // body [scenes, bodies, 7 planes] where wanted.
+  m.def(
+      "contact_unsupported(Tensor x, Tensor origin, Tensor lift, Tensor force, Tensor mass, Tensor planes, Tensor "
+      "held_bodies, Tensor body_order, Tensor body_ptr, float time_step) -> Tensor");
+  m.def(
+      "contact_unsupported_backward(Tensor bar, Tensor x, Tensor origin, Tensor lift, Tensor force, Tensor mass, "
+      "Tensor planes, Tensor held_bodies, Tensor body_order, Tensor body_ptr, float time_step, bool wants_planes) -> "
+      "(Tensor x, Tensor lift, Tensor force, Tensor mass, Tensor planes)");
+  // How far sweeps may carry each vertex [scenes, vertices], see contact/sweep_rooms.h; own_center and own_room may be
+  // empty. more: factor of what sweeps take back; least: what they are given beside that [m]
+  m.def(
+      "contact_sweep_rooms(Tensor x, Tensor start, Tensor begin, Tensor move, Tensor fall, Tensor apart, Tensor "
+      "stretched, Tensor center, Tensor room, Tensor own_center, Tensor own_room, Tensor held, Tensor body_order, "
+      "Tensor body_ptr, float more, float least) -> Tensor");
   // The rigid correction of each body that is listed, and the velocity (x - x_prev) / h. groups: how many bodies a
   // thread, a part of a warp, a block and the whole device work on (CUDA)
   define(m, "rigid", DIFFVBD_ARGUMENTS(RIGID), "int[] groups, int[] data_count, float time_step",

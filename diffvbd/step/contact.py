@@ -34,7 +34,8 @@ from .intersections import refuse_intersections
 from .met import Detection, Met, Outcome, outcomes
 from .rigid_contact import bodies_of, correct
 from .motion import Motion, motion_of
-from .rooms import ROOM, longest, rooms, rooms_of_sweeps, unsupported
+from .rooms import ROOM, longest, rooms, rooms_of_sweeps
+from .unsupported import unsupported
 
 if TYPE_CHECKING:
     from .arguments import Prepared

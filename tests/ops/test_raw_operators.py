@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import diffvbd as dv
 from diffvbd import ops
 
-CONTACT = ("contact_translation", "contact_start", "contact_lag")
+CONTACT = ("contact_translation", "contact_start", "contact_lag", "contact_unsupported")
 NAMES = {
     "floor": ("sweep", "begin", "rigid"),
     "pinned": ("sweep", "begin"),
@@ -26,6 +26,7 @@ CASES += [
     ("contact", "contact_advance"),
     ("contact", "contact_narrow"),
     ("contact", "contact_keep"),
+    ("contact", "contact_sweep_rooms"),
     ("contact", "longest_ways"),
     ("contact", "contact_rigid_system"),
     ("contact", "contact_rigid_move"),

@@ -1,0 +1,85 @@
+"""What contact at the start of a step leaves of the acceleration of each body."""
+
+# pyright: reportIncompatibleMethodOverride=false
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+from torch.autograd import Function
+
+from .. import ops
+from ..adjoint.contact_lag import Pairs, pair_lag, sum_at_corners
+from ..model.model import Model
+from ..ops import no_second_derivative, not_batched
+from ..ops import unsupported as ops_unsupported
+
+
+class _Unsupported(Function):
+    """The lift that is left [B, V, 3]. constants: held_bodies, body_order, body_ptr and the time step."""
+
+    @staticmethod
+    def forward(x: Tensor, lift: Tensor, force: Tensor, mass: Tensor, planes: Tensor, origin: Tensor,
+                constants: tuple) -> Tensor:  # fmt: skip
+        return ops_unsupported.unsupported(x, origin, lift, force, mass, planes, *constants)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        *tensors, ctx.constants = inputs
+        ctx.save_for_backward(*tensors)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        not_batched(grads[0])
+        wants_planes = ctx.needs_input_grad[4]
+        x_bar, lift_bar, force_bar, mass_bar, planes_bar = _UnsupportedBackward.apply(
+            grads[0].contiguous(), *ctx.saved_tensors, ctx.constants, wants_planes
+        )
+        by_x = x_bar if x_bar.numel() else None  # without a floor only forces know where vertices are
+        return by_x, lift_bar, force_bar, mass_bar, planes_bar if wants_planes else None, None, None
+
+
+class _UnsupportedBackward(Function):
+    @staticmethod
+    def forward(bar, x, lift, force, mass, planes, origin, constants, wants_planes):
+        x_bar, lift_bar, force_bar, mass_bar, planes_bar = ops_unsupported.unsupported_backward(
+            bar, x, origin, lift, force, mass, planes, *constants, wants_planes=wants_planes
+        )
+        lift_bar, mass_bar = ops.sum_to(lift_bar, lift.shape), ops.sum_to(mass_bar, mass.shape)
+        if wants_planes:
+            planes_bar = ops.sum_to(planes_bar, (planes.shape[0], 1, planes_bar.shape[2])).reshape(planes.shape)
+        return x_bar, lift_bar, force_bar, mass_bar, planes_bar
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Any) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        no_second_derivative()
+
+
+ops.ready_signature(_Unsupported, _UnsupportedBackward)
+
+
+def unsupported(model: Model, x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor, mass: Tensor, lift: Tensor,
+                floor_data: Tensor | None, listed: Pairs, time_step: float) -> Tensor:  # fmt: skip
+    """What is left of ``lift`` = h^2 a [1 | B, V, 3] once the contact forces at the start of the step have borne their
+    part of each body's acceleration: for a body at rest nothing, in flight all of it. Differentiable.
+
+    Without it every step would push a supported body into its support, and the sweeps would have to take it back.
+
+    Args:
+        x, origin: As the sweeps take them.  collider: [B, Vc, 3] [m].  kappa: [1 | B] [N/m].  mass: [1 | B, V] [kg].
+        floor_data: Of the FloorBarrier [1 | B, 7 planes], or None.  listed: Of the detection at x.
+        time_step: [s].
+    """
+    surface = model.surface_of_contact
+    assert surface is not None
+    force, _, n, w = pair_lag(x, collider, kappa, origin, listed).split((1, 1, 3, 4), -1)
+    points = x.shape[1] + collider.shape[1]
+    total = sum_at_corners((force * w)[..., None] * n[:, None], listed, x.shape[0], points)
+    planes = x.new_empty((0,)) if floor_data is None else floor_data
+    constants = (surface.held_bodies, surface.body_order, surface.body_ptr, time_step)
+    given = (t.contiguous() for t in (x, lift, total, mass, planes))
+    return _Unsupported.apply(*given, origin, constants)

@@ -1,0 +1,144 @@
+"""Claim: how far sweeps may carry each vertex is what plain torch says."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from diffvbd.ops import sweep_rooms
+from diffvbd.testing import generator, tolerance
+
+MORE, LEAST = 1.5, 0.02
+SIZES = [[0, 3, 0, 1], [1] * 40, [300, 20, 0], [8] * 300, [6000], [0], []]
+
+
+class Case(NamedTuple):
+    x: Tensor
+    start: Tensor
+    begin: Tensor
+    move: Tensor
+    fall: Tensor
+    apart: Tensor
+    stretched: Tensor
+    center: Tensor
+    room: Tensor
+    own_center: Tensor
+    own_room: Tensor
+    held: Tensor
+    order: Tensor
+    ptr: Tensor
+
+    def rooms(self) -> Tensor:
+        return sweep_rooms.sweep_rooms(*self, MORE, LEAST)
+
+
+def case(sizes: list[int], device: str, dtype: torch.dtype = torch.float64, scenes: int = 2, own: bool = True) -> Case:
+    """Bodies of these sizes with any ways, and rooms of which some are left; a third of the vertices is held."""
+    rng, n = generator("rooms", *sizes), sum(sizes)
+    points = [0.02 * rng.standard_normal((scenes, n, 3)) for _ in range(7)]
+    of_bodies = [0.02 * rng.random((scenes, len(sizes))) for _ in range(2)]
+    rooms = [scale * rng.random((scenes, n)) for scale in (1.0, 0.5)]
+    x, start, begin, move, fall, center, own_center, apart, stretched, room, own_room = (
+        torch.as_tensor(a, dtype=dtype, device=device) for a in (*points, *of_bodies, *rooms)
+    )
+    if not own:
+        own_center = own_room = x.new_empty((0,))
+    index = [rng.permutation(n).astype(np.int32), np.cumsum([0, *sizes]).astype(np.int32)]
+    return Case(x, start, begin, move, fall, apart, stretched, center, room, own_center, own_room,
+                torch.as_tensor(rng.random(n + 4) < 1 / 3, device=device),  # and of colliders
+                *(torch.as_tensor(a, device=device) for a in index))  # fmt: skip
+
+
+def by_torch(c: Case) -> Tensor:
+    """As written down."""
+    scenes, vertices, bodies = *c.x.shape[:2], len(c.ptr) - 1
+    body = torch.empty_like(c.order, dtype=torch.int64)
+    body[c.order.long()] = torch.repeat_interleave(torch.arange(bodies, device=c.ptr.device), c.ptr.diff())
+    free = ~c.held[:vertices]
+
+    def length(way: Tensor) -> Tensor:
+        return way.square().sum(-1).sqrt()
+
+    def largest(way: Tensor) -> Tensor:
+        of_vertices, index = torch.where(free, length(way), 0.0), body.expand(scenes, vertices)
+        return way.new_zeros((scenes, bodies)).scatter_reduce(1, index, of_vertices, "amax")
+
+    held_up = largest(c.begin + c.move + c.fall - c.start)
+    wish = largest(c.fall) + c.apart + MORE * held_up + largest(c.x - c.start) + MORE * c.stretched
+    wish = LEAST + (wish.amax(1, keepdim=True).expand_as(wish) if bodies else wish)
+    left = c.room - length(c.x - c.center)
+    if c.own_room.numel():
+        left = torch.minimum(left, c.own_room - length(c.x - c.own_center))
+    return torch.where(free, torch.minimum(left, wish[:, body]).clamp(min=0), 0.0)
+
+
+def check(c: Case) -> Tensor:
+    """The rooms: but for roundings, on the scale of the rooms, those of torch."""
+    got, scale = c.rooms(), torch.finfo(c.x.dtype).eps / torch.finfo(torch.float64).eps
+    torch.testing.assert_close(got, by_torch(c), rtol=0.0, atol=tolerance("ulps") * scale, equal_nan=True)
+    assert got.is_contiguous() and torch.equal(got.nan_to_num(), c.rooms().nan_to_num())
+    return got
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("sizes", SIZES, ids=lambda sizes: f"{len(sizes)}-{sum(sizes)}")
+def test_as_plain_torch_says(device: str, sizes: list[int], own: bool, dtype: torch.dtype) -> None:
+    for scenes in (0, 1, 3):
+        check(case(sizes, device, dtype, scenes, own))
+
+
+def test_all_that_bounds_a_room_does(device: str) -> None:
+    """What is left of either room, what bodies want, and nothing where more than a room is taken or one is held."""
+    c = case([300, 20, 400], device)
+    got, vertices = check(c), c.x.shape[1]
+    left = (c.room - (c.x - c.center).norm(dim=-1), c.own_room - (c.x - c.own_center).norm(dim=-1))
+    free = ~c.held[:vertices].expand_as(got)
+    most = got[0].max()
+    assert bool(((left[0] < 0) & free).any()) and bool((got[free & (left[0] < 0)] == 0).all())
+    assert bool((got[~free] == 0).all()) and bool((got[free] > 0).any())
+    for bound in left:
+        assert bool(((got - bound).abs() < tolerance("ulps")).any())
+    assert int((got[0] == most).sum()) > 1  # those that have room for all that bodies want
+    check(c._replace(held=torch.ones_like(c.held)))
+    check(c._replace(held=torch.zeros_like(c.held)))
+
+
+@pytest.mark.parametrize("field", ["x", "start", "begin", "move", "fall", "apart", "stretched", "center", "room"])
+def test_what_is_not_a_number_shows(device: str, field: str) -> None:
+    """In the room of its vertex or, of what bodies want, of the whole scene, and of no other scene."""
+    c = case([4, 300, 3], device)
+    c = c._replace(held=torch.zeros_like(c.held))
+    values = getattr(c, field).clone()
+    values[(0, 1) if values.ndim == 2 else (0, 1, 2)] = torch.nan
+    lost = check(c._replace(**{field: values})).isnan()
+    assert not bool(lost[1].any()) and bool(lost[0, 1])
+    assert bool(lost[0].all()) == (field not in ("center", "room"))
+
+
+def test_threads_that_share_bodies_change_nothing() -> None:
+    c, threads, found = case([20] * 600, "cpu", scenes=4), torch.get_num_threads(), []
+    try:
+        for n in (1, 2, 4):
+            torch.set_num_threads(n)
+            found.append(c.rooms())
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(other, found[0]) for other in found)
+
+
+def test_opcheck_and_bad_input(device: str) -> None:
+    operator = torch.ops.diffvbd.contact_sweep_rooms.default
+    for own in (False, True):
+        c = case([3, 0, 5], device, own=own)
+        torch.library.opcheck(operator, (*c, MORE, LEAST))
+    for name, value in case([3, 0, 5], device)._asdict().items():
+        other = value.float() if value.is_floating_point() else value.to(torch.uint8)
+        few = value.reshape(-1)[:-1] if name != "held" else value[:7]
+        for bad in (few, other, value.mT if value.ndim > 1 and name != "apart" else few):
+            with pytest.raises(ValueError, match="expected"):
+                operator(*c._replace(**{name: bad}), MORE, LEAST)
