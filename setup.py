@@ -55,6 +55,7 @@ CPU_SOURCES = [
     "csrc/bind/cpu/contact.cpp",
     "csrc/bind/cpu/contact_start.cpp",
     "csrc/bind/cpu/contact_lag.cpp",
+    "csrc/bind/cpu/contact_part.cpp",
     "csrc/bind/cpu/contact_rigid.cpp",
     "csrc/bind/cpu/mesh.cpp",
     "csrc/bind/cpu/neighbors.cpp",

@@ -169,8 +169,8 @@ class ContactStep:
                                           self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
             fall = fall if self.model.starts_from == "predictor" else torch.zeros_like(fall)  # corrections do it
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
-                                         detection, surface, rigid, ROOM * motion.stretched(rigid),
-                                         motion.largest, self._raises, barrier.self_contact)  # fmt: skip
+                                         detection, surface, rigid, ROOM * motion.stretched(rigid), self._raises,
+                                         barrier.self_contact)  # fmt: skip
             met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
             if self._reads(x):
                 self._check(r, met.counts[r].tolist(), met)
