@@ -38,12 +38,13 @@ class _AboveFloor(Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple:
-        bar, planes = grads[0], ctx.saved_tensors[3]
+        bar, saved = grads[0], ctx.saved_tensors
         if bar is None:
             return (None,) * 8
         not_batched(bar)
+        planes = saved[3]
         wants_planes = ctx.needs_input_grad[3] and planes.numel() > 0
-        x, u, way, own = _AboveFloorBackward.apply(bar.contiguous(), *ctx.saved_tensors, wants_planes)
+        x, u, way, own = _AboveFloorBackward.apply(bar.contiguous(), *saved, wants_planes)
         return x, u if ctx.needs_input_grad[1] else None, way, of_planes(own, planes, wants_planes), *(None,) * 4
 
 

@@ -78,12 +78,13 @@ class _Start(Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple:
-        bar, planes = grads[0], ctx.saved_tensors[5]
+        bar, saved = grads[0], ctx.saved_tensors
         if bar is None:
             return (None,) * 7
         not_batched(bar)
+        planes = saved[5]
         wants_planes = ctx.needs_input_grad[5] and planes.numel() > 0
-        *out, own = _StartBackward.apply(bar.contiguous(), *ctx.saved_tensors, ctx.decided, wants_planes)
+        *out, own = _StartBackward.apply(bar.contiguous(), *saved, ctx.decided, wants_planes)
         return *out, of_planes(own, planes, wants_planes), None
 
 
