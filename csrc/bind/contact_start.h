@@ -6,9 +6,8 @@
 #include "../contact/advance.h"
 #include "../contact/keep.h"
 #include "../contact/narrow.h"
-#include "../contact/start.h"
 #include "../contact/translation.h"
-#include "contact.h"
+#include "contact_part.h"
 
 namespace diffvbd {
 
@@ -16,21 +15,11 @@ namespace diffvbd {
 struct TranslationTensors {
   const Tensor &move, &mass, &x, &origin, &planes, &held, &body, &body_order, &body_ptr, &island, &lowest;
 };
-struct StartTensors {
-  const Tensor &x, &move, &u, &planes, &origin, &held, &body;
-};
 
 inline void require_vectors(const Tensor& t, const Tensor& x) {
   require(t.dim() == 3 && x.dim() == 3 && t.size(0) == x.size(0) && t.size(1) == x.size(1) && t.size(2) == 3 &&
               is_like(t, x),
           "diffvbd: expected contiguous vectors like x [scenes, vertices, 3]");
-}
-
-// Of vertices, and then perhaps of colliders: bool, int32.
-inline void require_of_vertices(const Tensor& held, const Tensor& body, const Tensor& x) {
-  require(is_beside(held, x, ScalarType::Bool) && is_index(body, x) && held.numel() >= x.size(1) &&
-              body.numel() >= x.size(1),
-          "diffvbd: expected held bool and body int32 of at least the vertices");
 }
 
 template <class T>
@@ -62,37 +51,6 @@ contact::TranslationInputs<T> translation_inputs(const TranslationTensors& t) {
   in.scenes = b;
   in.vertices = static_cast<int32_t>(v);
   in.bodies = static_cast<int32_t>(bodies);
-  return in;
-}
-
-template <class T>
-contact::StartInputs<T> start_inputs(const StartTensors& t, double filter_eta) {
-  require_vectors(t.x, t.move);
-  require_vectors(t.move, t.x);
-  const int64_t b = t.x.size(0), v = t.x.size(1);
-  require_of_vertices(t.held, t.body, t.x);
-  require(t.u.dim() == 3 && is_like(t.u, t.x) && t.u.size(0) == b && t.u.size(2) == 3,
-          "diffvbd::contact_start: expected u like x, [scenes, bodies, 3]");
-  contact::StartInputs<T> in{};
-  in.x = data<const T>(t.x);
-  in.move = data<const T>(t.move);
-  in.u = data<const T>(t.u);
-  in.origin = batched_or_null<T>("origin", t.origin, t.x, b, 3 * v);
-  if (t.planes.numel() > 0) {
-    const int64_t scalars = t.planes.dim() > 0 ? t.planes.numel() / t.planes.size(0) : 0;
-    require(scalars > 0 && scalars % contact::kPlaneScalars == 0 &&
-                scalars <= contact::kMostPlanes * contact::kPlaneScalars,
-            "diffvbd::contact_start: expected planes [scenes, 7 planes], at most 8");
-    in.floor_scalars = static_cast<int32_t>(scalars);
-    in.floor = batched<T>("planes", t.planes, t.x, b, scalars);
-  }
-  in.held = data<const bool>(t.held);
-  in.body = data<const int32_t>(t.body);
-  in.scenes = b;
-  in.vertices = static_cast<int32_t>(v);
-  in.bodies = static_cast<int32_t>(t.u.size(1));
-  in.parameters.filter_eta = static_cast<T>(filter_eta);
-  in.parameters.time_step = T(1);  // a filter does not read it
   return in;
 }
 

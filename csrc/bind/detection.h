@@ -5,7 +5,6 @@
 
 #include "../contact/candidates.h"
 #include "../contact/islands.h"
-#include "../contact/longest.h"
 #include "arguments.h"
 
 namespace diffvbd {
@@ -133,33 +132,6 @@ inline void check_segments(const Tensor& values, const Tensor& order, const Tens
   require_shape(order, values, ScalarType::Int, {order.numel()}, "segment_sum: expected order [V] int32");
   require_shape(ptr, values, ScalarType::Int, {ptr.numel()}, "segment_sum: expected ptr [S + 1] int32");
   require(ptr.numel() > 0, "segment_sum: expected ptr [S + 1] int32");
-}
-
-template <class T>
-contact::LongestInputs<T> longest_inputs(const Tensor& way, const Tensor& beside, const Tensor& arm,
-                                         const Tensor& counts, const Tensor& order, const Tensor& ptr) {
-  require(way.dim() == 3 && way.size(2) == 3 && way.is_contiguous(),
-          "longest_ways: expected contiguous way of shape [B, V, 3]");
-  require(ptr.numel() > 0, "longest_ways: expected ptr [bodies + 1] int32");
-  const int64_t b = way.size(0), v = way.size(1), bodies = ptr.numel() - 1;
-  const auto is_none = [](const Tensor& t) { return t.dim() == 1 && t.numel() == 0; };
-  if (!is_none(beside)) {
-    require_shape(beside, way, way.scalar_type(), {b, bodies, 3},
-                  "longest_ways: expected beside like way, of shape [B, bodies, 3], or empty");
-  }
-  if (!is_none(arm)) {
-    require_shape(arm, way, way.scalar_type(), {b, v, 3}, "longest_ways: expected arm like way, or empty");
-  }
-  require_shape(counts, way, ScalarType::Bool, {v}, "longest_ways: expected counts [V] bool");
-  require_shape(order, way, ScalarType::Int, {v}, "longest_ways: expected order [V] int32");
-  require_shape(ptr, way, ScalarType::Int, {bodies + 1}, "longest_ways: expected ptr [bodies + 1] int32");
-  require_countable(b * bodies, "longest_ways: too large, expected at most 2^31 bodies in all scenes");
-  contact::LongestInputs<T> out{};
-  out.way = data<const T>(way), out.beside = is_none(beside) ? nullptr : data<const T>(beside);
-  out.arm = data<const T>(arm), out.angles = !is_none(arm), out.counts = data<const bool>(counts);
-  out.order = data<const int32_t>(order), out.ptr = data<const int32_t>(ptr);
-  out.scenes = b, out.vertices = v, out.bodies = bodies;
-  return out;
 }
 
 }  // namespace diffvbd

@@ -67,14 +67,44 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "contact_keep(Tensor keep, Tensor pairs, Tensor constants, Tensor ptr, Tensor entry, bool exact) -> (Tensor "
       "rows, "
       "Tensor pairs, Tensor constants, Tensor ptr, Tensor entry)");
-  // Where each vertex wants to be, see contact/start.h; planes and origin may be empty. The adjoint: of x, move, u and
-  // planes, the last two for each vertex.
+  // What a floor leaves of the ways of bodies as wholes, less u, and which it stops [scenes, bodies], see
+  // contact/above_floor.h; u, planes and origin may be empty. The adjoint: of x, u, way and, of each body, the planes.
   m.def(
-      "contact_start(Tensor x, Tensor move, Tensor u, Tensor planes, Tensor origin, Tensor held, Tensor body, float "
-      "filter_eta) -> Tensor");
+      "contact_above_floor(Tensor x, Tensor u, Tensor way, Tensor planes, Tensor origin, Tensor held, Tensor "
+      "body_order, Tensor body_ptr) -> (Tensor left, Tensor stopped)");
   m.def(
-      "contact_start_backward(Tensor bar, Tensor x, Tensor move, Tensor u, Tensor planes, Tensor origin, Tensor held, "
-      "Tensor body, float filter_eta, bool wants_planes) -> (Tensor x, Tensor move, Tensor u, Tensor planes)");
+      "contact_above_floor_backward(Tensor bar, Tensor x, Tensor u, Tensor way, Tensor planes, Tensor origin, "
+      "Tensor held, Tensor body_order, Tensor body_ptr, bool wants_planes) -> (Tensor x, Tensor u, Tensor way, "
+      "Tensor planes)");
+  // What is decided at the start of a part, see contact/part.h; planes, origin and own_room may be empty. state uint8
+  // [scenes, vertices]: 0 goes, 1 rests, 2 rests unless its body's potential does not rise
+  m.def(
+      "contact_frames(Tensor x, Tensor move, Tensor u, Tensor way, Tensor left, Tensor stretch, Tensor room, "
+      "Tensor own_room, Tensor held, Tensor held_bodies, Tensor body, Tensor body_order, Tensor body_ptr) -> "
+      "(Tensor limit, Tensor ways, Tensor center, Tensor room, Tensor own_room)");
+  m.def(
+      "contact_bends(Tensor x, Tensor move, Tensor u, Tensor left, Tensor frames, Tensor limit, Tensor stopped, "
+      "Tensor own_room, Tensor planes, Tensor origin, Tensor held, Tensor held_bodies, Tensor body, Tensor "
+      "body_order, Tensor body_ptr, float filter_eta) -> (Tensor base, Tensor target, Tensor way, Tensor state)");
+  m.def("contact_hold(Tensor way, Tensor state, Tensor rises) -> (Tensor way, Tensor state)");
+  m.def(
+      "contact_held_up(Tensor base, Tensor way, Tensor share, Tensor state, Tensor held, Tensor held_bodies, "
+      "Tensor body, Tensor body_order, Tensor body_ptr) -> (Tensor to, Tensor state)");
+  m.def(
+      "contact_falls(Tensor x, Tensor move, Tensor fall, Tensor u, Tensor left, Tensor frames, Tensor share, "
+      "Tensor state, Tensor planes, Tensor origin, Tensor held, Tensor held_bodies, Tensor body, Tensor "
+      "body_order, Tensor body_ptr, float filter_eta) -> (Tensor share, Tensor at, Tensor way)");
+  // Where each vertex starts, and whether pairs have held up more than a hundredth of its way, see contact/start.h. The
+  // adjoint: of x, move, fall, u, left and planes, all for each vertex.
+  m.def(
+      "contact_start(Tensor x, Tensor move, Tensor fall, Tensor u, Tensor left, Tensor frames, Tensor share, "
+      "Tensor last_share, Tensor stopped, Tensor planes, Tensor origin, Tensor held, Tensor held_bodies, Tensor "
+      "body, Tensor body_order, Tensor body_ptr, float filter_eta) -> (Tensor x, Tensor short)");
+  m.def(
+      "contact_start_backward(Tensor bar, Tensor x, Tensor move, Tensor fall, Tensor u, Tensor left, Tensor "
+      "frames, Tensor share, Tensor last_share, Tensor planes, Tensor origin, Tensor held, Tensor held_bodies, "
+      "Tensor body, Tensor body_order, Tensor body_ptr, float filter_eta, bool wants_planes) -> (Tensor x, "
+      "Tensor move, Tensor fall, Tensor u, Tensor left, Tensor planes)");
   // Normal force, 1 where active, normal and weights of each pair [pairs, 9], and the adjoint of x, collider and kappa
   m.def(
       "contact_lag(Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor constants, Tensor ptr, "
@@ -226,9 +256,6 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "collider_next, Tensor held, Tensor body, Tensor room, Tensor own_center, Tensor own_room, Tensor pairs, Tensor "
       "constants, Tensor ptr, Tensor entry, bool careful, bool whole) -> (Tensor share, Tensor stuck)");
   m.def("segment_sum(Tensor values, Tensor order, Tensor ptr) -> Tensor");
-  // Of each body the longest way of a vertex that counts and, with arms, the largest angle [1 | 2, scenes, bodies];
-  // beside, which is subtracted from the ways of a body, and arm may be empty, see contact/longest.h
-  m.def("longest_ways(Tensor way, Tensor beside, Tensor arm, Tensor counts, Tensor order, Tensor ptr) -> Tensor");
   // points [B, N, 3]; pairs [max_pairs, 3] int32: (scene, i, j), then rows of -1; count [1] int64: how many there are,
   // or -1 where a point is not finite
   m.def("neighbor_pairs(Tensor points, float radius, int max_pairs) -> (Tensor pairs, Tensor count)");

@@ -58,21 +58,6 @@ __global__ void sum_planes(const T* slots, int64_t scenes, int32_t bodies, int32
   planes_bar[i] = sum;
 }
 
-template <class T>
-__global__ void start_vertices(const __grid_constant__ contact::StartInputs<T> in, T* target) {
-  const int64_t row = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  if (row >= in.scenes * in.vertices) return;
-  contact::start_vertex(in, row / in.vertices, static_cast<int32_t>(row % in.vertices), target);
-}
-
-template <class T>
-__global__ void reverse_starts(const __grid_constant__ contact::StartInputs<T> in,
-                               const __grid_constant__ contact::StartAdjoints<T> a) {
-  const int64_t row = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  if (row >= in.scenes * in.vertices) return;
-  contact::reverse_start(in, a, row / in.vertices, static_cast<int32_t>(row % in.vertices));
-}
-
 }  // namespace
 
 template <class T>
@@ -101,27 +86,10 @@ cudaError_t translation_backward(const contact::TranslationInputs<T>& in, const 
   return cudaGetLastError();
 }
 
-template <class T>
-cudaError_t start(const contact::StartInputs<T>& in, T* target, cudaStream_t stream) {
-  if (in.scenes * in.vertices == 0) return cudaSuccess;
-  start_vertices<<<blocks_for(in.scenes * in.vertices), kThreads, 0, stream>>>(in, target);
-  return cudaGetLastError();
-}
-
-template <class T>
-cudaError_t start_backward(const contact::StartInputs<T>& in, const contact::StartAdjoints<T>& a, cudaStream_t stream) {
-  if (in.scenes * in.vertices == 0) return cudaSuccess;
-  reverse_starts<<<blocks_for(in.scenes * in.vertices), kThreads, 0, stream>>>(in, a);
-  return cudaGetLastError();
-}
-
 #define DIFFVBD_INSTANTIATE(T)                                                                                         \
   template cudaError_t translation<T>(const contact::TranslationInputs<T>&, T*, T*, cudaStream_t);                     \
   template cudaError_t translation_backward<T>(const contact::TranslationInputs<T>&, const T*, T*, T*, T*, T*, T*, T*, \
-                                               cudaStream_t);                                                          \
-  template cudaError_t start<T>(const contact::StartInputs<T>&, T*, cudaStream_t);                                     \
-  template cudaError_t start_backward<T>(const contact::StartInputs<T>&, const contact::StartAdjoints<T>&,             \
-                                         cudaStream_t);
+                                               cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

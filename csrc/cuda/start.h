@@ -1,9 +1,8 @@
-// The start of a part on the device: see contact/translation.h and contact/start.h.
+// The translations of islands on the device, see contact/translation.h.
 #pragma once
 
 #include <cuda_runtime_api.h>
 
-#include "../contact/start.h"
 #include "../contact/translation.h"
 
 namespace diffvbd::cuda {
@@ -16,10 +15,5 @@ cudaError_t translation(const contact::TranslationInputs<T>& in, T* sums, T* u, 
 template <class T>
 cudaError_t translation_backward(const contact::TranslationInputs<T>& in, const T* u_bar, T* sums, T* zeroed,
                                  T* move_bar, T* mass_bar, T* x_bar, T* planes_bar, cudaStream_t stream);
-
-template <class T>
-cudaError_t start(const contact::StartInputs<T>& in, T* target, cudaStream_t stream);
-template <class T>
-cudaError_t start_backward(const contact::StartInputs<T>& in, const contact::StartAdjoints<T>& a, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

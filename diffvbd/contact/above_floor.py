@@ -1,74 +1,79 @@
-"""What floors leave of the ways of bodies that move as wholes."""
+"""What floors leave of the ways of bodies that move as wholes, differentiable."""
 
+# pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any
 
-import torch
 from torch import Tensor
+from torch.autograd import Function
 
-from ..ops.segments import Order, of_segments
-
-SHORT = 0.99  # share of a way that counts as all of it
-KEPT = 0.9  # share of a gap above a floor that rigid motion may close
-DEEP, KEPT_DEEP = 0.1, 0.1  # part of dhat below which that is less, because sweeps open such a gap slowly
-ROUNDINGS = 8  # of the terms of a gap, below which its sign is not safe (Plane::guard in csrc/energies/floor_barrier.h)
-PLANE, DHAT = 7, 5  # numbers of a plane of a FloorBarrier, and which of them is dhat
+from .. import ops
+from ..ops import contact_part, no_second_derivative, not_batched
 
 
-class AboveFloor(NamedTuple):
-    """What a floor leaves of the way of each body as a whole: a share of it, and beside that a shift off the floor."""
+class Last(Function):
+    """A backward that has no derivative of its own."""
 
-    share: Tensor  # [B, bodies]; 1 but between planes that a shift does not suit
-    shift: Tensor  # [B, bodies, 3] [m]
-    stopped: Tensor  # [B, bodies] bool: it loses more than a hundredth of what a vertex moves toward a plane
-    takes: bool = True  # False where it is known to take nothing
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Any) -> None:
+        pass
 
-    def way(self, way: Tensor, of: Order) -> Tensor:
-        """What is left of ways [B, V, 3] of vertices."""
-        if not self.takes:
-            return way
-        share, shift = of_segments(torch.cat([self.share[..., None], self.shift], -1), *of).split((1, 3), -1)
-        return share * way + shift
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        no_second_derivative()
 
 
-def above_floor(floor: Tensor, origin: Tensor, at: Tensor, way: Tensor, held: Tensor, of: Order, bodies: int
-                ) -> AboveFloor:  # fmt: skip
-    """How bodies go ways [B, V, 3] as wholes above a floor: shifted along its normals until no vertex closes more than
-    a part of its gap, which leaves sliding and turning as they are. Differentiable, evenly where several vertices
-    decide. docs/method.md, section 12.
+class _AboveFloor(Function):
+    @staticmethod
+    def forward(x: Tensor, u: Tensor, way: Tensor, planes: Tensor, origin: Tensor, held: Tensor, order: Tensor,
+                ptr: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
+        return contact_part.above_floor(x, u, way, planes, origin, held, order, ptr)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
+        ctx.mark_non_differentiable(output[1])
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple:
+        bar, saved = grads[0], ctx.saved_tensors
+        if bar is None:
+            return (None,) * 8
+        not_batched(bar)
+        planes = saved[3]
+        wants_planes = ctx.needs_input_grad[3] and planes.numel() > 0
+        x, u, way, own = _AboveFloorBackward.apply(bar.contiguous(), *saved, wants_planes)
+        return x, u if ctx.needs_input_grad[1] else None, way, of_planes(own, planes, wants_planes), *(None,) * 4
+
+
+class _AboveFloorBackward(Last):
+    @staticmethod
+    def forward(bar, x, u, way, planes, origin, held, order, ptr, wants_planes):
+        return contact_part.above_floor_backward(bar, x, u, way, planes, origin, held, order, ptr, wants_planes)
+
+
+def of_planes(own: Tensor, planes: Tensor, wanted: bool) -> Tensor | None:
+    """Adjoints of planes [1 | B, 7 planes] from what each body or vertex adds, ``own`` [B, n, 7 planes]."""
+    if not wanted:
+        return None
+    return ops.sum_to(ops.sum_to(own, (own.shape[0], 1, own.shape[2]))[:, 0], planes.shape)
+
+
+def above_floor(x: Tensor, u: Tensor, way: Tensor, planes: Tensor, origin: Tensor, held: Tensor, order: Tensor,
+                ptr: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """What a floor leaves of ways of bodies as wholes, less u [B, V, 3] [m], and which bodies it stops [B, bodies]:
+    they are shifted along its normals until no vertex closes more than a part of its gap, which leaves sliding and
+    turning as they are. Differentiable, evenly where several vertices decide. docs/method.md, section 12.
 
     Args:
-        floor: Data of a FloorBarrier [1 | B, 7 planes], or empty.  origin: [B, V, 3] or empty.  at: [B, V, 3] [m].
-        held: Of each vertex [V], whether something else moves it.  of: Vertices by body, see of_segments.
+        x, way: [B, V, 3] [m].  u: [B, bodies, 3] [m], part of the way, which the floor lets pass; or empty.
+        planes: Data of a FloorBarrier [1 | B, 7 planes], or empty.  origin: [B, V, 3] [m] or empty.
+        held: [V] bool, whether something else moves a vertex.
+        order, ptr: Vertices by body [V], and the first of each [bodies + 1], int32.
     """
-    body = of[2]
-    scenes = at.shape[0]
+    return _AboveFloor.apply(x.contiguous(), u, way.contiguous(), planes.contiguous(), origin, held, order, ptr)
 
-    def nothing() -> AboveFloor:
-        ones = at.new_ones((scenes, bodies))
-        return AboveFloor(ones, at.new_zeros((scenes, bodies, 3)), ones < 1, takes=False)
 
-    if not floor.numel():
-        return nothing()
-    planes = floor.reshape(floor.shape[0], 1, -1, PLANE)
-    normal, p = planes[:, 0, :, :3], at + origin if origin.numel() else at
-    gap, toward = p @ normal.mT - planes[..., 3], -(way @ normal.mT)  # [B, V, P]
-    size = (p.abs() @ normal.abs().mT + planes[..., 3].abs()).detach()
-    gap, deep = (gap - ROUNDINGS * torch.finfo(at.dtype).eps * size).clamp(min=0), DEEP * planes[..., DHAT]
-    room = KEPT * (gap - deep).clamp(min=0) + KEPT_DEEP * torch.minimum(gap, deep)
-    index = body[:, None].expand(gap.shape)
-
-    def of_bodies(values: Tensor, start: float, reduction: str) -> Tensor:
-        return values.new_full((scenes, bodies, values.shape[-1]), start).scatter_reduce(1, index, values, reduction)
-
-    closes = (toward > room) & ~held[:, None]
-    if not (at.is_cuda or bool(closes.any())):  # on CUDA to know would mean to wait
-        return nothing()
-    shift = of_bodies(torch.where(closes, toward - room, 0.0), 0.0, "amax") @ normal
-    share = of_bodies(torch.where(closes, room / torch.where(closes, toward, 1.0), 1.0), 1.0, "amin").amin(-1)
-    with torch.no_grad():
-        left, least = toward - (shift @ normal.mT)[:, body], 8 * torch.finfo(at.dtype).eps * toward.abs()
-        good = of_bodies(((left <= room + least) | held[:, None]).to(at.dtype), 1.0, "amin").amin(-1) > 0
-        stopped = share < SHORT
-    return AboveFloor(torch.where(good, 1.0, share), torch.where(good[..., None], shift, 0.0), stopped)
+ops.ready_signature(_AboveFloor, _AboveFloorBackward)

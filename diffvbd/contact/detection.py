@@ -1,4 +1,4 @@
-"""Detection as a step asks for it: which pairs are near, which bodies move together."""
+"""Detection as a step asks for it: which pairs are near, which vertices lowest."""
 
 from __future__ import annotations
 
@@ -53,17 +53,6 @@ def intersections(x: Tensor, origin: Tensor, colliders: Tensor, surface: Contact
             x.detach().contiguous(), origin, colliders.detach().contiguous(), s.rest, s.radius, s.triangles, s.edges,
             s.points, s.planes, s.body, s.held, s.bodies, self_contact, between_bodies, capacity,
         )  # fmt: skip
-
-
-def islands(x: Tensor, origin: Tensor, move: Tensor, mass: Tensor, was: Tensor, now: Tensor, surface: ContactSurface,
-            dhat: float, room: Tensor, any_direction: bool) -> Tensor:  # fmt: skip
-    """Island of each body [B, bodies] int32, named by its first body; -1 where it must not be translated.
-
-    any_direction: Whether the floor has planes across the axes, along which a translation may be turned.
-    """
-    s = surface
-    return ops_contact.contact_islands(x, origin, move, mass, was, now, s.planes, s.body, s.body_order, s.body_ptr,
-                                       s.held, s.radius, room, s.bodies, dhat, any_direction)  # fmt: skip
 
 
 def lowest(x: Tensor, origin: Tensor, data: Tensor, island: Tensor, surface: ContactSurface) -> Tensor:

@@ -26,19 +26,6 @@ def translation_backward(u_bar: Tensor, move: Tensor, mass: Tensor, x: Tensor, o
     )
 
 
-def start(x: Tensor, move: Tensor, u: Tensor, planes: Tensor, origin: Tensor, held: Tensor, body: Tensor,
-          filter_eta: float) -> Tensor:  # fmt: skip
-    """Where each vertex wants to be [B, V, 3] [m]: ``x + move``, but of what it goes beside its island's u without what
-    the floor forbids. Held ones are put there. u [B, bodies, 3]; planes and origin may be empty."""
-    return raw.contact_start(x, move, u, planes, origin, held, body, filter_eta)
-
-
-def start_backward(bar: Tensor, x: Tensor, move: Tensor, u: Tensor, planes: Tensor, origin: Tensor, held: Tensor,
-                   body: Tensor, filter_eta: float, wants_planes: bool) -> tuple[Tensor, ...]:  # fmt: skip
-    """Adjoints of x, move, u (for each vertex) [B, V, 3], planes [B, V, 7 planes or 0]."""
-    return raw.contact_start_backward(bar, x, move, u, planes, origin, held, body, filter_eta, wants_planes)
-
-
 def advance(x: Tensor, move: Tensor, u: Tensor, center: Tensor, origin: Tensor, collider: Tensor, collider_next: Tensor,
             held: Tensor, body: Tensor, room: Tensor, listed: Sequence[Tensor], careful: bool = True,
             whole: bool = False, own: Sequence[Tensor] = ()) -> tuple[Tensor, Tensor]:  # fmt: skip
@@ -104,24 +91,11 @@ def _(u_bar, move, mass, x, origin, planes, held, body, body_order, body_ptr, is
     return torch.empty_like(move), x.new_empty(x.shape[:2]), torch.empty_like(x), x.new_empty((x.shape[0], scalars))
 
 
-@shapes_of("contact_start")
-def _(x, move, u, planes, origin, held, body, filter_eta):
-    return torch.empty_like(x)
-
-
-@shapes_of("contact_start_backward")
-def _(bar, x, move, u, planes, origin, held, body, filter_eta, wants_planes):
-    scalars = planes.shape[-1] if wants_planes and planes.numel() else 0
-    return (*(torch.empty_like(x) for _ in range(3)), x.new_empty((*x.shape[:2], scalars)))
-
-
 for _name in (
     "contact_advance",
     "contact_keep",
     "contact_narrow",
     "contact_translation",
     "contact_translation_backward",
-    "contact_start",
-    "contact_start_backward",
 ):
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

@@ -1,4 +1,4 @@
-"""The compiled operators of contact: detection, intersections, islands, sums over segments, longest ways. Raw and
+"""The compiled operators of contact: detection, intersections, islands, sums over segments. Raw and
 functional, as in sweep.py.
 
 Sizes: B scenes that never mix, V vertices, Vc collider points, N = V + Vc corner points (vertices first), F triangles,
@@ -146,31 +146,6 @@ def segment_sum(values: Tensor, order: Tensor, ptr: Tensor) -> Tensor:
     return raw.segment_sum(values, order, ptr)
 
 
-def longest_ways(way: Tensor, counts: Tensor, order: Tensor, ptr: Tensor, beside: Tensor | None = None) -> Tensor:
-    """[B, NB] [m]: the longest way of a vertex of each body that counts; 0 where none does, NaN where one is NaN.
-
-    Not differentiable; results repeat to the bit.
-
-    Args:
-        way: [B, V, 3] [m].
-        counts: [V] bool.
-        order, ptr: Vertices by body [V], and the first of each body [NB + 1].
-        beside: [B, NB, 3] [m], subtracted from the ways of each body.
-
-    Raises:
-        ValueError: A tensor with the wrong shape, dtype or device.
-    """
-    none = way.new_empty((0,))
-    return raw.longest_ways(way, none if beside is None else beside, none, counts, order, ptr)[0]
-
-
-def longest_turns(way: Tensor, arm: Tensor, counts: Tensor, order: Tensor, ptr: Tensor, beside: Tensor
-                  ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """The longest way as above, and the largest of a way over the length of its arm [B, V, 3] [m], [B, NB] both."""
-    longest, angle = raw.longest_ways(way, beside, arm, counts, order, ptr).unbind()
-    return longest, angle
-
-
 # --- shapes without execution, no autograd ----------------------------------------------------------------------------
 
 
@@ -207,10 +182,5 @@ def _(values, order, ptr):
     return values.new_empty((values.shape[0], ptr.shape[0] - 1, values.shape[2]))
 
 
-@shapes_of("longest_ways")
-def _(way, beside, arm, counts, order, ptr):
-    return way.new_empty((1 if arm.ndim == 1 else 2, way.shape[0], ptr.shape[0] - 1))
-
-
-for _name in ("contact_detect", "contact_intersections", "contact_islands", "segment_sum", "longest_ways"):
+for _name in ("contact_detect", "contact_intersections", "contact_islands", "segment_sum"):
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

@@ -11,8 +11,8 @@ from ..model.model import Model
 from ..reference.distance import EDGE_EDGE
 from .arguments import Prepared
 from .contact import ContactStep
-from .predict import Begun
 from .motion import motion_of
+from .predict import Begun
 
 MARGIN = 2.0  # of the ways that vertices want to go, which forces within bodies change
 LEAST = 0.25  # of dhat

@@ -32,17 +32,17 @@ from .contact_cycles import parts_of, record_parts, sweeps_of_parts, swept_part
 from .floor_start import start_on_floor
 from .intersections import refuse_intersections
 from .met import Detection, Met, Outcome, outcomes
-from .rigid_contact import bodies_of, correct
 from .motion import Motion, motion_of
-from .rooms import ROOM, longest, rooms, rooms_of_sweeps
+from .rigid_contact import bodies_of, correct
+from .rooms import ROOM, rooms, rooms_of_sweeps
 from .unsupported import unsupported
 
 if TYPE_CHECKING:
     from .arguments import Prepared
     from .predict import Begun
 
-# Rigid corrections after the last sweeps of more than MOST_COUPLED bodies that may touch. In stacks of two that friction
-# holds, the upper body creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; with 1 it falls.
+# Rigid corrections after the last sweeps of more than MOST_COUPLED bodies that may touch. In stacks of two that rub, the
+# upper body creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; with 1 it falls.
 APART_CORRECTIONS = 4
 FREE = 1e15  # [m] room that nothing fills
 MOST_CAPACITY = 2**26
@@ -171,8 +171,7 @@ class ContactStep:
                                           self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
             fall = fall if self.model.starts_from == "predictor" else torch.zeros_like(fall)  # corrections do it
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
-                                         detection, surface, motion.rigid, ROOM * motion.stretched,
-                                         functools.partial(longest, surface), self._raises,
+                                         detection, surface, motion.rigid, ROOM * motion.stretched, self._raises,
                                          barrier.self_contact)  # fmt: skip
             met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
             if self._reads(x):

@@ -5,11 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..contact.above_floor import DHAT, PLANE, above_floor
+from ..contact.above_floor import above_floor
 from ..model.model import Model
 from ..ops import broadcast
 from .predict import Begun
 from .rigid_contact import bodies_of
+
+PLANE, DHAT = 7, 5  # numbers of a plane of a FloorBarrier, and which of them is dhat
 
 
 def start_on_floor(model: Model, begun: Begun, floor: Tensor | None) -> Tensor:
@@ -26,10 +28,10 @@ def start_on_floor(model: Model, begun: Begun, floor: Tensor | None) -> Tensor:
     way = begun.y - x - lift
     if model.starts_from != "inertia":
         way = way + _borne(floor, x if begun.origin is None else x + begun.origin, lift, body, len(free))
-    origin = x.new_empty((0,)) if begun.origin is None else begun.origin
-    of = (order, ptr, body)
-    left = above_floor(floor, origin, x, way, held, of, len(free))
-    return torch.where(free[body, None], x + left.way(way, of), start)
+    none = x.new_empty((0,))
+    origin = none if begun.origin is None else begun.origin
+    left, _ = above_floor(x, none, way, floor, origin, held, order, ptr)
+    return torch.where(free[body, None], x + left, start)
 
 
 def _borne(floor: Tensor, x: Tensor, lift: Tensor, body: Tensor, bodies: int) -> Tensor:

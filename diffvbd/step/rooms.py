@@ -8,18 +8,12 @@ from torch import Tensor
 from ..contact.barrier import PairBarrier
 from ..contact.start import PartStart
 from ..contact.surface import ContactSurface
-from ..ops import detect as ops_contact
 from ..ops.motion import RoomsOfBodies, contact_rooms
 from ..ops.sweep_rooms import sweep_rooms
 from .motion import Motion
 
 ROOM = 1.5  # how far a vertex may go, over how far the farthest of its body wants to
 LEAST_ROOM = 1.0  # of dhat, beside that: as far as a barrier that starts compressed may push
-
-
-def longest(surface: ContactSurface, way: Tensor) -> Tensor:
-    way = way.detach().contiguous()
-    return ops_contact.longest_ways(way, ~surface.held[: way.shape[1]], surface.body_order, surface.body_ptr)
 
 
 @torch.no_grad()

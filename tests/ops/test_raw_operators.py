@@ -14,7 +14,14 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import diffvbd as dv
 from diffvbd import ops
 
-CONTACT = ("contact_translation", "contact_start", "contact_lag", "contact_unsupported")
+CONTACT = (
+    "contact_motion",
+    "contact_translation",
+    "contact_above_floor",
+    "contact_start",
+    "contact_lag",
+    "contact_unsupported",
+)
 NAMES = {
     "floor": ("sweep", "begin", "rigid"),
     "pinned": ("sweep", "begin"),
@@ -25,9 +32,13 @@ CASES += [
     ("contact", "contact_lowest"),
     ("contact", "contact_advance"),
     ("contact", "contact_narrow"),
+    ("contact", "contact_frames"),
+    ("contact", "contact_bends"),
+    ("contact", "contact_held_up"),
+    ("contact", "contact_falls"),
     ("contact", "contact_keep"),
     ("contact", "contact_sweep_rooms"),
-    ("contact", "longest_ways"),
+    ("contact", "contact_rooms"),
     ("contact", "contact_rigid_system"),
     ("contact", "contact_rigid_move"),
     ("floor", "pack_rest"),
@@ -48,6 +59,7 @@ OF_CHOICE = {"mu", "lam", "rest", "other_tets"}  # between starts, which this sc
 SHARED = ("mu", "lam", "kappa")  # one value for all is legal
 # Empty where a scene lacks them; which it does, no tensor can tell.
 OPTIONAL = ("planes", "alone", "floor_lag", "lag", "own_room", "v_bar", "beside", "arm")
+EMPTY_OF = {("begin", "rest"), ("contact_above_floor", "u"), ("contact_above_floor_backward", "u")}
 ONE_KIND = ("pack_rest", "star_sum", "tet_gather", "contact_keep")  # with one floating tensor, which may be either
 ERRORS = (ValueError, RuntimeError)
 
@@ -119,7 +131,7 @@ def test_tensors_that_are_missing_or_too_small(device: str, recorded: Any, scene
         if key in ("held", "body", "values"):  # of which the vertices are a part; whose shape is its own
             continue
         few = [value.reshape(-1)[:-1].clone()]
-        few += [value.new_empty((0,))] if key not in OPTIONAL and (name, key) != ("begin", "rest") else []
+        few += [value.new_empty((0,))] if key not in OPTIONAL and (name, key) not in EMPTY_OF else []
         few += [value.reshape(-1)[:1].reshape(1, 1).clone()] if key not in SHARED else []
         for changed in few:
             if changed.numel() != value.numel():

@@ -5,8 +5,6 @@ step with contact both use the header.
 """
 
 import itertools
-import types
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +12,9 @@ import torch
 from torch import Tensor
 
 import diffvbd as dv
-from diffvbd.contact.start import _Target
+from diffvbd.contact.start import Decided, _Start
 from diffvbd.model.bodies import Bodies, OtherBodies
+from diffvbd.ops.contact_part import PartBodies
 from diffvbd.reference.energies import FloorBarrier
 from diffvbd.safeguards import FILTER_ETA
 from diffvbd.step.start import begin
@@ -86,14 +85,16 @@ def by_reference(a: dict[str, Tensor]) -> Tensor:
 
 def by_contact(a: dict[str, Tensor]) -> Tensor:
     """Where a part of a step with contact wants to go, of an island that does not move."""
-    scenes, vertices = a["x"].shape[:2]
-    free = torch.zeros(vertices, dtype=torch.bool)
-    body = torch.zeros(vertices, dtype=torch.int32)
-    surface = types.SimpleNamespace(held=free, body=body, body_order=torch.arange(vertices, dtype=torch.int32),
-                                    body_ptr=torch.tensor([0, vertices], dtype=torch.int32))  # fmt: skip
-    u, none = a["x"].new_zeros((scenes, 1, 3)), a["x"].new_empty((0,))
-    target: Any = _Target.apply(a["x"].contiguous(), a["step"].contiguous(), u, packed(a), none, surface)
-    return target - a["x"]
+    x, (scenes, vertices) = a["x"].contiguous(), a["x"].shape[:2]
+    free, body = torch.zeros(vertices, dtype=torch.bool), torch.zeros(vertices, dtype=torch.int32)
+    ends = torch.tensor([0, vertices], dtype=torch.int32)
+    bodies = PartBodies(free, free[:1], body, torch.arange(vertices, dtype=torch.int32), ends)
+    none, still, all_of_it = x.new_zeros((0,)), torch.zeros_like(x), torch.ones_like(x[..., 0])
+    decided = Decided(x.new_zeros((scenes, 1)), (all_of_it, all_of_it), torch.zeros((scenes, 1)) > 0, none, bodies)
+    u = x.new_zeros((scenes, 1, 3))
+    target, short = _Start.apply(x, a["step"].contiguous(), still, u, still, packed(a), decided)
+    assert not short.any()
+    return target - x
 
 
 CODES = {"begin": by_begin, "reference": by_reference, "contact": by_contact}

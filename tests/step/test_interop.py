@@ -241,8 +241,14 @@ def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     move, u = torch.zeros_like(x), x.new_zeros((1, surface.bodies, 3))
     move[0, 8:, 1] = -0.05
     held, body, planes = surface.held, surface.body, x.new_tensor([[0.0, 1.0, 0.0, 0.19, 1e3, 0.02, 0.0]])
-    start = (x, move, u, planes, none, held, body, 0.9)
-    own_room = torch.full_like(x[..., 0], 0.1)
+    bodies = (held, surface.held_bodies, body, surface.body_order, surface.body_ptr)
+    filtered, own_room, share = (
+        (planes, none, *bodies, 0.9),
+        torch.full_like(x[..., 0], 0.1),
+        x.new_ones((1, len(held))),
+    )
+    floor, frames, stopped = (x, u, move, planes, none, *bodies[:1], *bodies[3:]), room[:, 1:], room[:, 1:] > 1
+    whole, state = (u, move, frames), torch.zeros_like(own_room, dtype=torch.uint8)
     advance = (x, move, u, x, none, points, points, held, body, own_room, x, own_room, *listed, True, False)
     share, _ = torch.ops.diffvbd.contact_advance(*advance)
     assert 0 < share[0, 8:].min() < 1 and (share[0, :8] == 1).all()
@@ -257,8 +263,15 @@ def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
         "contact_rigid_system": (*touching, *numbers),
         "contact_rigid_move": (*touching, centers, motion, *numbers),
         "contact_rigid_backward": (*touching, points_of, points_of, *numbers),
-        "contact_start": start,
-        "contact_start_backward": (move, *start, True),
+        "contact_above_floor": floor,
+        "contact_above_floor_backward": (move, *floor, True),
+        "contact_frames": (x, move, u, move, move, frames, room, room, *bodies),
+        "contact_bends": (x, move, *whole, frames, stopped, room, *filtered),
+        "contact_hold": (move, state, state > 0),
+        "contact_held_up": (x, move, share, state, *bodies),
+        "contact_falls": (x, move, move, *whole, share, state, *filtered),
+        "contact_start": (x, move, move, *whole, share, share, stopped, *filtered),
+        "contact_start_backward": (move, x, move, move, *whole, share, share, *filtered, True),
         "contact_advance": advance,
         "contact_keep": (torch.arange(len(listed[0]), device=device) % 3 == 0, *listed, False),
         "contact_narrow": (x, none, points, own_room, *listed[:3]),

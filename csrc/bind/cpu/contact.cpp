@@ -1,4 +1,4 @@
-// CPU implementations of detection, islands, sums over segments and longest ways: tensors in, raw pointers on.
+// CPU implementations of detection, islands and sums over segments: tensors in, raw pointers on.
 #include <torch/csrc/stable/library.h>
 
 #include <algorithm>
@@ -8,7 +8,6 @@
 #include "../../cpu/detect.h"
 #include "../../cpu/intersect.h"
 #include "../../cpu/islands.h"
-#include "../../cpu/longest.h"
 #include "../detection.h"
 
 namespace {
@@ -94,17 +93,6 @@ Tensor segment_sum(const Tensor& values, const Tensor& order, const Tensor& ptr)
   });
 }
 
-Tensor longest_ways(const Tensor& way, const Tensor& beside, const Tensor& arm, const Tensor& counts,
-                    const Tensor& order, const Tensor& ptr) {
-  return dispatch_float(way, [&](auto scalar) {
-    using T = decltype(scalar);
-    const auto in = diffvbd::longest_inputs<T>(way, beside, arm, counts, order, ptr);
-    Tensor out = empty(way, {in.angles ? 2 : 1, in.scenes, in.bodies});
-    diffvbd::longest_ways<T>(in, data<T>(out));
-    return out;
-  });
-}
-
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
@@ -112,5 +100,4 @@ STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
   m.impl("contact_intersections", TORCH_BOX(&contact_intersections));
   m.impl("contact_islands", TORCH_BOX(&contact_islands));
   m.impl("segment_sum", TORCH_BOX(&segment_sum));
-  m.impl("longest_ways", TORCH_BOX(&longest_ways));
 }

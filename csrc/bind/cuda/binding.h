@@ -46,6 +46,9 @@ inline Tensor empty(const Tensor& like, const std::vector<int64_t>& sizes, Scala
     case ScalarType::Byte:
       code = aoti_torch_dtype_uint8(), bytes = 1;
       break;
+    case ScalarType::Bool:
+      code = aoti_torch_dtype_bool(), bytes = 1;
+      break;
     default:
       throw std::invalid_argument("diffvbd: no tensors of this dtype");
   }

@@ -1,4 +1,4 @@
-// CUDA implementations of detection, islands, sums over segments and longest ways: tensors in, raw pointers on.
+// CUDA implementations of detection, islands and sums over segments: tensors in, raw pointers on.
 #include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 
@@ -7,7 +7,6 @@
 #include "../../cuda/detect.h"
 #include "../../cuda/intersect.h"
 #include "../../cuda/islands.h"
-#include "../../cuda/longest.h"
 #include "../detection.h"
 #include "binding.h"
 
@@ -105,18 +104,6 @@ Tensor segment_sum(const Tensor& values, const Tensor& order, const Tensor& ptr)
   });
 }
 
-Tensor longest_ways(const Tensor& way, const Tensor& beside, const Tensor& arm, const Tensor& counts,
-                    const Tensor& order, const Tensor& ptr) {
-  const DeviceGuard guard(way.get_device_index());
-  return dispatch_float(way, [&](auto scalar) {
-    using T = decltype(scalar);
-    const auto in = diffvbd::longest_inputs<T>(way, beside, arm, counts, order, ptr);
-    Tensor out = empty(way, {in.angles ? 2 : 1, in.scenes, in.bodies});
-    check(cuda::longest_ways<T>(in, data<T>(out), current_stream(way)), "longest_ways");
-    return out;
-  });
-}
-
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
@@ -124,5 +111,4 @@ STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_intersections", TORCH_BOX(&contact_intersections));
   m.impl("contact_islands", TORCH_BOX(&contact_islands));
   m.impl("segment_sum", TORCH_BOX(&segment_sum));
-  m.impl("longest_ways", TORCH_BOX(&longest_ways));
 }

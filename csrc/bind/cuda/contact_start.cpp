@@ -58,38 +58,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_translation_backward(
   });
 }
 
-Tensor contact_start(const Tensor& x, const Tensor& move, const Tensor& u, const Tensor& planes, const Tensor& origin,
-                     const Tensor& held, const Tensor& body, double filter_eta) {
-  const DeviceGuard guard(x.get_device_index());
-  return dispatch_float(x, [&](auto scalar) {
-    using T = decltype(scalar);
-    const auto in = diffvbd::start_inputs<T>({x, move, u, planes, origin, held, body}, filter_eta);
-    Tensor target = empty(x, {in.scenes, in.vertices, 3});
-    check(cuda::start<T>(in, data<T>(target), current_stream(x)), "the start of a part");
-    return target;
-  });
-}
-
-std::tuple<Tensor, Tensor, Tensor, Tensor> contact_start_backward(const Tensor& bar, const Tensor& x,
-                                                                  const Tensor& move, const Tensor& u,
-                                                                  const Tensor& planes, const Tensor& origin,
-                                                                  const Tensor& held, const Tensor& body,
-                                                                  double filter_eta, bool wants_planes) {
-  const DeviceGuard guard(x.get_device_index());
-  return dispatch_float(x, [&](auto scalar) {
-    using T = decltype(scalar);
-    const auto in = diffvbd::start_inputs<T>({x, move, u, planes, origin, held, body}, filter_eta);
-    diffvbd::require_like("bar", bar, x, x.numel());
-    const int64_t b = in.scenes, v = in.vertices;
-    Tensor x_bar = empty(x, {b, v, 3}), move_bar = empty(x, {b, v, 3}), u_bar = empty(x, {b, v, 3});
-    Tensor planes_bar = empty(x, {b, v, wants_planes ? int64_t{in.floor_scalars} : 0});
-    const contact::StartAdjoints<T> a{data<const T>(bar), data<T>(x_bar), data<T>(move_bar), data<T>(u_bar),
-                                      planes_bar.numel() ? data<T>(planes_bar) : nullptr};
-    check(cuda::start_backward<T>(in, a, current_stream(x)), "the start of a part");
-    return std::make_tuple(x_bar, move_bar, u_bar, planes_bar);
-  });
-}
-
 std::tuple<Tensor, Tensor> contact_advance(const Tensor& x, const Tensor& move, const Tensor& u, const Tensor& center,
                                            const Tensor& origin, const Tensor& collider, const Tensor& collider_next,
                                            const Tensor& held, const Tensor& body, const Tensor& room,
@@ -151,6 +119,4 @@ STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_narrow", TORCH_BOX(&contact_narrow));
   m.impl("contact_translation", TORCH_BOX(&contact_translation));
   m.impl("contact_translation_backward", TORCH_BOX(&contact_translation_backward));
-  m.impl("contact_start", TORCH_BOX(&contact_start));
-  m.impl("contact_start_backward", TORCH_BOX(&contact_start_backward));
 }

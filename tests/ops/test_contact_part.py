@@ -1,0 +1,279 @@
+"""Claim: the operators of the start of a part do what plain torch says, and their adjoints are its derivatives, also
+where several vertices or planes decide alike."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from diffvbd.contact.above_floor import above_floor
+from diffvbd.contact.start import Decided, _Start
+from diffvbd.ops import contact_part as ops_part
+from diffvbd.ops.contact_part import ASKS, PartBodies, Whole
+from diffvbd.reference.energies import FloorBarrier
+from diffvbd.testing import generator, relative_error, tolerance
+
+SHORT, BENT, DEEP_BENT = 0.99, 0.1, 0.5
+SIDE, DHAT = 0.25, 0.125
+PLANES = {
+    "none": (),
+    "flat": (((0.0, 1.0, 0.0), -0.0625),),
+    "valley": (((0.6, 0.8, 0.0), -0.1), ((-0.8, 0.6, 0.0), -0.2)),
+    "slit": (((1.0, 0.0, 0.0), -0.125), ((-1.0, 0.0, 0.0), -0.875), ((0.0, 1.0, 0.0), -2.0)),
+}
+
+
+class Case(NamedTuple):
+    x: Tensor
+    u: Tensor
+    way: Tensor
+    planes: Tensor
+    origin: Tensor
+    bodies: PartBodies
+
+    @property
+    def body(self) -> Tensor:
+        return self.bodies.body.long()
+
+    @property
+    def held(self) -> Tensor:
+        return self.bodies.held
+
+    def leaves(self) -> Case:
+        return self._replace(**{k: getattr(self, k).clone().requires_grad_() for k in ("x", "u", "way", "planes")})
+
+    def by_operator(self) -> tuple[Tensor, Tensor]:
+        c = self
+        return above_floor(c.x, c.u, c.way, c.planes, c.origin, c.held, c.bodies.order, c.bodies.ptr)
+
+
+def case(name: str, device: str, dtype: torch.dtype = torch.float64, scenes_of_planes: int = 1) -> Case:
+    """Two scenes of four cubes of 27 vertices and a lone one. The first cube goes straight, so that its sides decide
+    alike; the second turns as well, as does the third, of which something is held; the last goes nowhere."""
+    rng = generator("part", name)
+    axis = np.arange(3) * SIDE / 2
+    cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    x = np.concatenate([cube + (0.25, 0.0625 * n, n) for n in range(4)] + [np.array([[0.5, 0.25, 5.0]])])
+    body = np.array([0, 1, 2, 3]).repeat(27).tolist() + [4]
+    push = -1.0 if name != "slit" else 0.0
+    straight = np.array([[-0.75, push, 0.125], [0.5, push, 0.0], [-0.5, push, 0.25], [0.0, 0.0, 0.0], [0.5, push, 0.5]])
+    way = straight[body]
+    turns = np.isin(body, (1, 2))[:, None] * rng.normal(size=(3,)) * 0.4
+    way = way + np.cross(turns, x - x.mean(0))
+    if name == "slit":  # against both sides at once: no shift suits
+        way[:27, 0] = np.where(x[:27, 0] < 0.375, -1.0, 1.0) * (x[:27, 0] != 0.375)
+    held = np.array(body) == 2
+    held &= np.arange(len(body)) % 3 == 0
+    planes = [[*n, h - 0.03125 * s, 1e3, DHAT, 0.0] for s in range(scenes_of_planes) for n, h in PLANES[name]]
+    origin = np.zeros((2, len(x), 3)) if name == "flat" else np.zeros((0,))
+    u = rng.normal(size=(2, 5, 3)) * (0.0625 if name == "valley" else 0.0)
+    order = rng.permutation(len(x))
+    order = order[np.argsort(np.array(body)[order], kind="stable")]
+    index = (np.cumsum([0, 27, 27, 27, 27, 1]), order, body)
+    ptr, order, of = (torch.tensor(np.asarray(a), dtype=torch.int32, device=device) for a in index)
+    real = [np.stack([x, x]), u, np.stack([way, 0.75 * way]), np.reshape(planes, (scenes_of_planes, -1)), origin]
+    held_bodies = torch.tensor([False, False, True, False, False], device=device)
+    bodies = PartBodies(torch.tensor(held, device=device), held_bodies, of, order, ptr)
+    return Case(*(torch.tensor(a, dtype=dtype, device=device) for a in real), bodies)
+
+
+def of_bodies(values: Tensor, body: Tensor, reduction: str) -> Tensor:
+    """The largest ("amax", at least 0) or the least ("amin", at most 1) of each body; values [B, V, ...]."""
+    index = body.reshape(-1, *(1,) * (values.dim() - 2)).expand(values.shape)
+    start = values.new_full((len(values), 5, *values.shape[2:]), 0.0 if reduction == "amax" else 1.0)
+    return start.scatter_reduce(1, index, values, reduction)
+
+
+def by_torch(c: Case) -> tuple[Tensor, Tensor]:
+    """What a floor leaves of ways of bodies, and which it stops."""
+    carried = c.u[:, c.body]
+    at, way, held = c.x + carried + (c.origin if c.origin.numel() else 0.0), c.way - carried, c.held[:, None]
+    eps = 8 * torch.finfo(c.x.dtype).eps
+    if not c.planes.numel():
+        return way, torch.zeros(c.u.shape[:2], dtype=torch.bool, device=c.x.device)
+    planes = c.planes.reshape(len(c.planes), 1, -1, 7)
+    normal, height = planes[:, 0, :, :3], planes[..., 3]
+    size = (at.abs() @ normal.abs().mT + height.abs()).detach()
+    gap, deep, toward = (at @ normal.mT - height - eps * size).clamp(min=0), 0.1 * planes[..., 5], -(way @ normal.mT)
+    room = 0.9 * (gap - deep).clamp(min=0) + 0.1 * torch.minimum(gap, deep)
+    closes = (toward > room) & ~held
+    shift = of_bodies(torch.where(closes, toward - room, 0.0), c.body, "amax") @ normal
+    share = of_bodies(torch.where(closes, room / torch.where(closes, toward, 1.0), 1.0), c.body, "amin").amin(-1)
+    clears = (toward - (shift @ normal.mT)[:, c.body] <= room + eps * toward.abs()) | held
+    good = (of_bodies(clears.to(c.x.dtype), c.body, "amin").amin(-1) > 0)[..., None]
+    kept, shifted = torch.where(good, 1.0, share[..., None])[:, c.body], torch.where(good, shift, 0.0)[:, c.body]
+    return kept * way + shifted, share < SHORT
+
+
+@pytest.mark.parametrize("scenes_of_planes", (1, 2))
+@pytest.mark.parametrize("name", PLANES)
+def test_what_a_floor_leaves_of_bodies(device: str, name: str, scenes_of_planes: int) -> None:
+    given = case(name, device, scenes_of_planes=scenes_of_planes)
+    (left, stopped), (expected, stops) = given.by_operator(), by_torch(given)
+    assert relative_error(left, expected) <= tolerance("formula") and torch.equal(stopped, stops)
+    assert stopped[:, :2].all() == (name != "none") and not stopped[:, 3].any()
+    beside = left - (given.way - given.u[:, given.body])
+    assert name == "none" or (beside[:, :54].abs().amax(-1) > 0).any()
+    shifted = (beside[0, :27] - beside[0, :1]).abs().max() <= tolerance("formula")
+    assert shifted == (name != "slit")  # where the first cube is stopped by a share of its way
+
+
+@pytest.mark.parametrize("name", PLANES)
+def test_the_adjoint_of_that(device: str, name: str) -> None:
+    given = case(name, device)
+    weight = torch.tensor(generator("weights", name).normal(size=given.x.shape), device=device)
+    leaves = [given.leaves() for _ in range(2)]
+    grads = []
+    for c, (left, _) in zip(leaves, (leaves[0].by_operator(), by_torch(leaves[1])), strict=True):
+        wanted = [c.x, c.u, c.way, *([c.planes] if name != "none" else [])]
+        grads.append(torch.autograd.grad((weight * left).sum(), wanted, materialize_grads=True))
+    for own, expected in zip(*grads, strict=True):
+        assert relative_error(own, expected) <= tolerance("adjoint")
+    assert name == "none" or all(g.abs().max() > 0 for g in grads[0])
+    none = given.x.new_empty((0,))
+    without = above_floor(given.x, none, given.way, given.planes, given.origin, given.held, *given.bodies[3:])[0]
+    still = given._replace(u=torch.zeros_like(given.u))
+    assert relative_error(without, by_torch(still)[0]) <= tolerance("formula")
+
+
+@pytest.mark.parametrize("name", PLANES)
+def test_single_precision_agrees(device: str, name: str) -> None:
+    (left, stopped), (expected, stops) = case(name, device, torch.float32).by_operator(), by_torch(case(name, device))
+    assert relative_error(left.double(), expected) <= tolerance("float32_forward") and torch.equal(stopped, stops)
+
+
+@pytest.mark.parametrize("name", PLANES)
+def test_a_way_that_is_no_number_stays_one(device: str, name: str) -> None:
+    given = case(name, device)
+    given.way[0, 30], given.x[1, 5] = float("nan"), float("nan")
+    (left, stopped), (expected, stops) = given.by_operator(), by_torch(given)
+    assert torch.equal(left.isnan(), expected.isnan()) and left.isnan().any() and torch.equal(stopped, stops)
+    assert relative_error(left.nan_to_num(), expected.nan_to_num()) <= tolerance("formula")
+
+
+def filtered(c: Case, x: Tensor, way: Tensor) -> Tensor:
+    """Where a floor lets vertices go from x, which something else holds nowhere."""
+    if not c.planes.numel():
+        return x + way
+    planes = c.planes.reshape(len(c.planes), -1, 7)
+    floor = object.__new__(FloorBarrier)
+    floor.normal, floor.height, floor.dhat = planes[..., :3, None], planes[..., 3, None], planes[..., 5, None]
+    return torch.where(c.held[:, None], x + way, x + floor.start(x.mT, way.mT).mT)
+
+
+def path_by_torch(c: Case, fall: Tensor, left: Tensor, decided: Decided) -> Tensor:
+    held, carried = c.held[:, None], c.u[:, c.body]
+    share, last = (s[..., None] for s in decided.shares)
+    at = torch.where(held, c.x, c.x + carried)
+    target = filtered(c, at, torch.where(held, c.way, c.way - carried))
+    base = at + decided.frames[:, c.body, None] * left
+    at = torch.where(held, target, base + share * (target - base))
+    target = filtered(c, at, fall)
+    return torch.where(held, target, at + last * (target - at))
+
+
+@pytest.mark.parametrize("name", PLANES)
+def test_where_a_part_starts(device: str, name: str) -> None:
+    """Above the floor, where gaps are those of starts; with the adjoint."""
+    rng, given = generator("start", name), case(name, device)
+    given = given._replace(
+        x=given.x + torch.tensor([0.03125, 0.25, 0.0], device=device), origin=given.u.new_empty((0,))
+    )
+    fall, left = (torch.tensor(0.125 * rng.normal(size=given.x.shape), device=device) for _ in range(2))
+    shares = tuple(torch.tensor(rng.uniform(size=given.x.shape[:2]), device=device) for _ in range(2))
+    frames = torch.tensor(rng.uniform(size=(2, 5)), device=device)
+    decided = Decided(frames, shares, frames > 0.5, given.origin, given.bodies)
+    weight, out = torch.tensor(rng.normal(size=given.x.shape), device=device), []
+    for by in ("operator", "torch"):
+        c, more = given.leaves(), [t.clone().requires_grad_() for t in (fall, left)]
+        if by == "operator":
+            end, short = _Start.apply(c.x, c.way, more[0], c.u, more[1], c.planes, decided)
+        else:
+            end, again = (
+                path_by_torch(c, *more, decided),
+                ~c.held & ~(~c.bodies.held_bodies & decided.stopped)[:, c.body],
+            )
+            short = again & (torch.minimum(*shares) < SHORT)
+        wanted = [c.x, c.way, c.u, *more, *([c.planes] if name != "none" else [])]
+        out.append((end, short, torch.autograd.grad((weight * end).sum(), wanted)))
+    (end, short, grads), (expected, shorts, expected_grads) = out
+    assert relative_error(end, expected) <= tolerance("formula")
+    assert torch.equal(short, shorts) and 0 < short.sum() < short.numel()
+    for own, other in zip(grads, expected_grads, strict=True):
+        assert relative_error(own, other) <= tolerance("adjoint") and own.abs().max() > 0
+
+
+def share_within(way: Tensor, stretch: Tensor, room: Tensor) -> Tensor:
+    return (2 * room / (way + (way * way + 4 * stretch * room).sqrt()).clamp(min=torch.finfo(way.dtype).tiny)).clamp(
+        max=1
+    )
+
+
+@pytest.mark.parametrize("own_pairs", (False, True))
+def test_how_far_bodies_go_and_who_asks(device: str, own_pairs: bool) -> None:
+    """Decisions of random motions, in the order in which a part takes them."""
+    rng, c = generator("decisions", own_pairs), case("valley", device)
+    body, held, n = c.body, c.held, c.x.shape[1]
+    move, left, fall = (torch.tensor(0.1 * rng.normal(size=c.x.shape), device=device) for _ in range(3))
+    stretch = torch.tensor(rng.uniform(0, 0.1, size=(2, 5)), device=device)
+    room, own_room = (torch.tensor(rng.uniform(0.2, 2.0, size=(2, 6)), device=device) for _ in range(2))
+    none = c.x.new_empty((0,))
+    limit, ways, center, rooms, own_rooms = ops_part.frames(
+        c.x, move, c.u, c.way, left, stretch, room, own_room if own_pairs else none, c.bodies
+    )
+    length = torch.where(held, 0.0, (c.way - c.u[:, body]).square().sum(-1).sqrt())
+    within = share_within(of_bodies(length, body, "amax"), stretch, room[:, :-1])
+    if own_pairs:
+        within = torch.minimum(within, share_within(torch.zeros_like(stretch), stretch, own_room[:, :-1]))
+        assert torch.equal(own_rooms, own_room[:, body])
+    assert relative_error(limit, within) <= tolerance("formula") and 0 < (limit < SHORT).sum() < limit.numel()
+    carried = c.u[:, body]
+    expected = torch.where(held[:, None], move, carried + limit[:, body, None] * left)
+    assert relative_error(ways, expected) <= tolerance("formula") and torch.equal(rooms, room[:, body])
+    assert torch.equal(center, torch.where(held[:, None], c.x, c.x + carried))
+
+    frames = torch.tensor(rng.choice([1.0, 0.5], size=(2, 5)), device=device)
+    stopped = torch.tensor([[False] * 5, [True, False, False, False, False]], device=device)
+    whole = Whole(c.x, move, c.u, left, frames, c.planes, c.origin, c.bodies)
+    own_room = own_room * 0.3
+    base, target, way, state = ops_part.bends(whole, limit, stopped, own_room if own_pairs else none)
+    free = ~c.bodies.held_bodies
+    largest = of_bodies((target - base).square().sum(-1).sqrt(), body, "amax")
+    rests = free & (stopped | (limit < SHORT))
+    if own_pairs:
+        rests |= free & (largest > DEEP_BENT * own_room[:, :-1]) & (frames < SHORT)
+    asks = free & ~rests & (largest > BENT * own_room[:, :-1]) & own_pairs
+    assert torch.equal(state.long(), torch.where(rests, 1, torch.where(asks, ASKS, 0))[:, body])
+    assert rests.any() and asks.any() == own_pairs and (~rests & ~asks).any()
+    assert torch.equal(way, torch.where(rests[:, body, None], 0.0, target - base))
+
+    rises = torch.tensor(rng.uniform(size=(2, n)) < 0.5, device=device)
+    kept, held_back = way, (state == ASKS) & rises
+    way, state = ops_part.hold(way, state, rises)
+    assert torch.equal(way, torch.where(held_back[..., None], 0.0, kept)) and torch.equal(state == ASKS, held_back)
+
+    share = torch.tensor(rng.choice([1.0, 0.25], p=[0.96, 0.04], size=(2, n)), device=device)
+    to, asked = ops_part.held_up(base, way, share, state, c.bodies)
+    went = torch.where(state > 0, 0.0, share)
+    bent = (free & (of_bodies(went, body, "amin") < SHORT))[:, body] & (state == 0)
+    assert torch.equal(asked.long(), torch.where(state > 0, 1, torch.where(bent, ASKS, 0))) and bent.any()
+    assert relative_error(to, base + went[..., None] * way) <= tolerance("formula")
+
+    shared, at, last = ops_part.falls(whole, fall, share, asked)
+    went = torch.where(asked > 0, 0.0, share)
+    ends = [ops_part.start(whole, fall, went, s, stopped)[0] for s in (torch.zeros_like(went), torch.ones_like(went))]
+    free_of_floor = ~held[:, None]
+    assert torch.equal(shared, went)
+    assert relative_error(torch.where(free_of_floor, at, 0.0), torch.where(free_of_floor, ends[0], 0.0)) == 0
+    assert relative_error(at + last, ends[1]) <= tolerance("formula")
+
+
+def test_no_vertices_or_scenes(device: str) -> None:
+    given = case("flat", device)
+    empty = given._replace(**{k: getattr(given, k)[:0] for k in ("x", "u", "way", "origin")})
+    left, stopped = empty.by_operator()
+    assert left.shape == (0, *given.x.shape[1:]) and stopped.shape == (0, 5)
