@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from .arguments import Prepared
     from .predict import Begun
 
-# Rigid corrections after the last sweeps of more than MOST_COUPLED bodies that may touch. In stacks of two that rub, the
-# upper body creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; with 1 it falls.
+# Rigid corrections after the last sweeps of more than MOST_COUPLED bodies that may touch. In stacks of two with friction
+# the upper body creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; with 1 it falls.
 APART_CORRECTIONS = 4
 FREE = 1e15  # [m] room that nothing fills
 MOST_CAPACITY = 2**26
