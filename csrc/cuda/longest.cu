@@ -1,3 +1,4 @@
+#include "body_block.cuh"
 #include "longest.h"
 
 namespace diffvbd::cuda {
@@ -5,16 +6,7 @@ namespace {
 
 using contact::Longest;
 
-constexpr int kWarp = 32, kMostThreads = 1024;
-constexpr int kVertices = 4;  // of a body on average that a thread looks at before the block becomes larger
 constexpr unsigned kWholeWarp = 0xffffffff;
-
-// A power of two.
-int threads_for(int64_t vertices, int64_t bodies) {
-  int threads = kWarp;
-  while (threads < kMostThreads && vertices > kVertices * threads * bodies) threads *= 2;
-  return threads;
-}
 
 // The largest of a warp, at its first thread.
 template <class T>
