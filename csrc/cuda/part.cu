@@ -1,14 +1,14 @@
-#include "bodies.cuh"
+#include "body_block.cuh"
 #include "part.h"
 
 namespace diffvbd::cuda {
 namespace {
 
 template <class T, template <class> class Act>
-__global__ void __launch_bounds__(kThreads) body_kernel(const __grid_constant__ Act<T> act) {
-  __shared__ double part[kWarps][kMostSums];
+__global__ void __launch_bounds__(kMostThreads) body_kernel(const __grid_constant__ Act<T> act) {
+  __shared__ double part[kMostThreads / kWarp][BodyBlock::kSums];
   const int64_t item = blockIdx.x, bodies = act.in.scene.bodies;
-  act(rigid::Body<T>{act.in.scene, item / bodies, static_cast<int32_t>(item % bodies)}, BlockTeam{part});
+  act(rigid::Body<T>{act.in.scene, item / bodies, static_cast<int32_t>(item % bodies)}, BodyBlock{part});
 }
 
 template <class Act>
@@ -23,7 +23,8 @@ template <class Act>
 cudaError_t act_on_bodies(const Act& act, cudaStream_t stream) {
   const int64_t items = act.in.scene.scenes * act.in.scene.bodies;
   if (items == 0) return cudaSuccess;
-  body_kernel<<<static_cast<unsigned>(items), kThreads, 0, stream>>>(act);
+  const int threads = threads_for(act.in.scene.vertices, act.in.scene.bodies);
+  body_kernel<<<static_cast<unsigned>(items), threads, 0, stream>>>(act);
   return cudaGetLastError();
 }
 
