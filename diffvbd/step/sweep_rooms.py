@@ -22,10 +22,10 @@ def rooms_of_sweeps(motion: Motion, barrier: PairBarrier, start: PartStart, x: T
         motion, fall: What the part wanted.  start: Its start, whose rooms bound the whole way.
         x, begin: Where the sweeps begin, and where the part began.  rigid: Motion.rigid(). All [B, V, 3] [m].
     """
-    surface, move, none = motion.surface, motion.move.detach().contiguous(), x.new_empty((0,))
-    points = (t.detach().contiguous() for t in (x, start.x, begin))
+    surface, none = motion.surface, x.new_empty((0,))
+    own_center, own_room = start.own or (none, none)
+    x, led, begin, move, fall = (t.detach().contiguous() for t in (x, start.x, begin, motion.move, fall))
     return sweep_rooms.sweep_rooms(
-        *points, move, fall.detach().contiguous(), motion.largest(move - rigid), motion.stretched(rigid), start.center,
-        start.room, *(start.own or (none, none)), surface.held, surface.body_order, surface.body_ptr, ROOM,
-        LEAST_ROOM * barrier.dhat,
+        x, led, begin, move, fall, motion.largest(move - rigid), motion.stretched(rigid), start.center, start.room,
+        own_center, own_room, surface.held, surface.body_order, surface.body_ptr, ROOM, LEAST_ROOM * barrier.dhat,
     )  # fmt: skip
