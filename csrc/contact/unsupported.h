@@ -1,5 +1,5 @@
 // What is left of each body's acceleration once the contact forces at the start of a step have borne their part of it,
-// and the adjoint of that. In double, whatever the dtype of the scene.
+// and the adjoint of that (docs/method.md, section 18). In double, whatever the dtype of the scene.
 #pragma once
 
 #include "../rigid/body.h"
@@ -73,9 +73,8 @@ DIFFVBD_FN void add_to_support(const UnsupportedInputs<T>& in, const rigid::Body
 struct Support {
   double inverse;       // of the mass
   Vector own, borne;    // [m]
-  double size;          // the largest part of borne
-  Vector unit;          // borne over its size
-  double square;        // of that
+  Vector ratio, unit;   // both over the largest part of borne, or as they are if it bears nothing
+  double square;        // of unit
   double asked, share;  // before and after it is held between 0 and 1
   bool bears;
 
@@ -83,10 +82,12 @@ struct Support {
     inverse = 1 / larger(std::numeric_limits<double>::min(), sum[6]);
     own = inverse * Vector{sum[0], sum[1], sum[2]}, borne = inverse * Vector{sum[3], sum[4], sum[5]};
     // what bears less than rounding of the body's own acceleration bears nothing: its square may be no number
-    size = largest_part(borne);
-    bears = rounding * largest_part(own) < size;
-    unit = (1 / (bears ? size : 1)) * borne, square = bears ? dot(unit, unit) : 1;
-    asked = bears ? -dot((1 / size) * own, unit) / square : 0;
+    const double largest = largest_part(borne);
+    bears = rounding * largest_part(own) < largest;
+    const double size = bears ? largest : 1;
+    ratio = {own.x / size, own.y / size, own.z / size}, unit = {borne.x / size, borne.y / size, borne.z / size};
+    square = dot(unit, unit);
+    asked = bears ? -dot(ratio, unit) / square : 0;
     share = asked < 0 ? 0 : 1 < asked ? 1 : asked;
   }
 };
@@ -120,7 +121,7 @@ struct SupportAdjoint {
     if (s.bears && 0 <= s.asked && s.asked <= 1) {
       const double along = dot(taken, s.unit) / s.square;
       own = -along * s.unit;
-      borne -= along * ((1 / s.size) * s.own + (2 * s.asked) * s.unit);
+      borne -= along * (s.ratio + (2 * s.asked) * s.unit);
     }
     lift = s.inverse * own, push = s.inverse * borne;
     mass = -dot(lift, s.own) - dot(push, s.borne);

@@ -147,13 +147,16 @@ def test_at_the_ends_of_its_share(device: str, force: tuple[float, ...], share: 
 
 
 def test_forces_below_rounding_bear_nothing(device: str) -> None:
-    """Nor does one whose square is no number."""
+    """Nor do those come to nothing whose squares are no numbers."""
     for dtype in (torch.float64, torch.float32):
         c = case(1, floor=False).on(device, dtype)
         tiny = c._replace(force=c.force * torch.finfo(dtype).tiny)
         assert torch.equal(check(tiny)["lift"], check(tiny._replace(force=torch.zeros_like(c.force)))["lift"])
         huge = c._replace(force=c.force * (1e-10 / torch.finfo(dtype).tiny))
-        assert bool(torch.isfinite(huge.lifted()).all())
+        alone = tiny._replace(lift=torch.zeros_like(c.lift))
+        for one in (huge, alone):
+            found = gradients(one, Case.lifted, torch.ones_like(c.x))
+            assert all(bool(torch.isfinite(value).all()) for value in (one.lifted(), found["lift"], found["mass"]))
 
 
 def test_what_is_not_a_number_shows_in_its_body(device: str) -> None:
@@ -169,9 +172,11 @@ def test_what_is_not_a_number_shows_in_its_body(device: str) -> None:
 def test_no_bodies_and_no_scenes(device: str) -> None:
     for c in (case(2, (), ()), case(0)):
         c = c.on(device, torch.float64)
-        lift = c.lift.requires_grad_()
+        given = [c.lift.requires_grad_(), c.planes.requires_grad_()]
         out = c.lifted()
-        assert out.shape == c.x.shape and torch.autograd.grad(out.sum(), lift)[0].shape == lift.shape
+        assert out.shape == c.x.shape
+        for value, found in zip(given, torch.autograd.grad(out.sum(), given), strict=True):
+            assert found.shape == value.shape and not bool(found.any())
 
 
 def test_threads_that_share_bodies_change_nothing() -> None:
