@@ -25,7 +25,8 @@ struct Descent {
   Vector n;
   double safe, gap, deep, room, toward;  // gap less rounding, the same but not below 0, part of dhat
 
-  DIFFVBD_FN Descent(const T* plane, const Vector& at, const Vector& way) : n{plane[0], plane[1], plane[2]} {
+  // Not inlined: who decides is found by comparing bits, and a device compiler may round inlined copies differently.
+  DIFFVBD_APART Descent(const T* plane, const Vector& at, const Vector& way) : n{plane[0], plane[1], plane[2]} {
     const double height = plane[3], size = absolute(n.x) * absolute(at.x) + absolute(n.y) * absolute(at.y) +
                                            absolute(n.z) * absolute(at.z) + absolute(height);
     safe = dot(n, at) - height - kRoundings * std::numeric_limits<T>::epsilon() * size;

@@ -119,34 +119,49 @@ DIFFVBD_FN PressTerms<R> barrier_terms(int kind, const Corners<R>& c, const Pair
   return out;
 }
 
-// The rows of the corners [4, 9] of a listed pair and the derivative by kappa; zero where it does not push.
+// Twelve directions that a pair is derived by, one evaluation each, and what needs none: work that threads share out.
+constexpr int kDirections = 12, kWorkParts = kDirections + 1;
+
+// Of a listed pair.
 template <class T>
-DIFFVBD_FN void barrier_work(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair, T* rows,
-                             T* by_kappa) {
-  for (int i = 0; i < 4 * kWorkScalars; ++i) rows[i] = T(0);
-  *by_kappa = T(0);
-  PairPress press;
-  const CornerPoints<T> at{in, false};
-  if (pair >= in.first_listed(in.scene.scenes) || !barrier_press(in, pair, at, press)) return;
-  const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
-  const PairConstants<T> a(in.gate.constants + kConstants * pair);
-  const int64_t scene = record[5];
-  const PairMotions m = motions_of(in, given, record);
+struct BarrierWork {
+  bool acts;
+  PairMotions m;
   Corners<double> c;
-  const Vector origin = at(scene, record[0]);
-  for (int k = 0; k < 4; ++k) c.x[k] = at(scene, record[k]) - origin;
-  const double h = in.scene.time_step, kappa = in.kappa.data[scene * in.kappa.scene];
-  *by_kappa = T(virtual_work(barrier_terms(record[4], c, a, h * h), m));
-  for (int k = 0; k < 4; ++k) {
-    double by_x[3];
-    for (int i = 0; i < 3; ++i) {
-      const Vector z = {double(i == 0), double(i == 1), double(i == 2)};
-      by_x[i] = virtual_work(barrier_terms(record[4], moved_along(c, k, z), a, h * h * kappa), m).derivative;
-    }
-    rigid::put(rows + kWorkScalars * k, Vector{by_x[0], by_x[1], by_x[2]});
+  PairConstants<T> a;
+  int kind;
+  double h2, kappa;
+
+  DIFFVBD_FN BarrierWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair)
+      : acts(false), m{}, c{}, a(in.gate.constants + kConstants * pair), kind(0), h2(0), kappa(0) {
+    PairPress press;
+    const CornerPoints<T> at{in, false};
+    acts = pair < in.first_listed(in.scene.scenes) && barrier_press(in, pair, at, press);
+    if (!acts) return;
+    const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
+    const int64_t scene = record[5];
+    m = motions_of(in, given, record), kind = record[4];
+    const Vector origin = at(scene, record[0]);
+    for (int k = 0; k < 4; ++k) c.x[k] = at(scene, record[k]) - origin;
+    h2 = in.scene.time_step * in.scene.time_step, kappa = in.kappa.data[scene * in.kappa.scene];
   }
-  add_by_motions(barrier_terms(record[4], c, a, h * h * kappa), m, rows);
-}
+
+  // Of the rows of the corners [4, 9] and the derivative by kappa; zero where the pair does not push.
+  DIFFVBD_FN void store(int part, T* rows, T* by_kappa) const {
+    if (part < kDirections) {
+      const int k = part / 3, i = part % 3;
+      const Vector z = {double(i == 0), double(i == 1), double(i == 2)};
+      const auto terms = [&] { return barrier_terms(kind, moved_along(c, k, z), a, h2 * kappa); };
+      rows[kWorkScalars * k + i] = acts ? T(virtual_work(terms(), m).derivative) : T(0);
+      return;
+    }
+    for (int k = 0; k < 4; ++k) {
+      for (int i = 3; i < kWorkScalars; ++i) rows[kWorkScalars * k + i] = T(0);
+    }
+    *by_kappa = acts ? T(virtual_work(barrier_terms(kind, c, a, h2), m)) : T(0);
+    if (acts) add_by_motions(barrier_terms(kind, c, a, h2 * kappa), m, rows);
+  }
+};
 
 // f1(|u|) / |u| and its derivative over |u|, which are taken as constant below what rounding makes of rest.
 DIFFVBD_FN FrictionRate<double> slip_rate(const Vector& u, double eps) {
@@ -185,34 +200,48 @@ DIFFVBD_FN PressTerms<R> lagged_terms(const R* lag, const Vector* since, const P
   return out;
 }
 
-// The rows of the corners [4, 9] of a lagged pair and the derivatives by what is lagged [9]. Positions at the start of
-// the step take the derivatives by x with the other sign.
+// Of a lagged pair. Positions at the start of the step take the derivatives by x with the other sign.
 template <class T>
-DIFFVBD_FN void lagged_work(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair, T* rows,
-                            T* by_lag) {
-  for (int i = 0; i < 4 * kWorkScalars; ++i) rows[i] = T(0);
-  for (int i = 0; i < kLagScalars; ++i) by_lag[i] = T(0);
-  if (pair >= in.first_lagged(in.scene.scenes)) return;
-  const int32_t* record = in.lagged.pairs + kPairRow * pair;
-  if (moving_body(in, record[0]) < 0 && moving_body(in, record[sides(record[4])]) < 0) return;
-  const CornerPoints<T> at{in, false};  // also of pairs without a force, which a coefficient of zero has made so
-  const PairMotions m = motions_of(in, given, record);
+struct LaggedWork {
+  bool acts;
+  PairMotions m;
   Vector since[4];
-  for (int k = 0; k < 4; ++k) since[k] = at.relative(record[5], record[k]) - before(in, record[5], record[k]);
-  const double h = in.scene.time_step, eps = in.friction_eps;
-  double lag[kLagScalars];
-  for (int i = 0; i < kLagScalars; ++i) lag[i] = in.lag[kLagScalars * pair + i];
-  const auto derived = [&](int direction) {
+  double lag[kLagScalars], h, eps;
+
+  DIFFVBD_FN LaggedWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair)
+      : acts(pair < in.first_lagged(in.scene.scenes)), m{}, h(in.scene.time_step), eps(in.friction_eps) {
+    if (!acts) return;
+    const int32_t* record = in.lagged.pairs + kPairRow * pair;
+    // also of pairs without a force, which a coefficient of zero has made so
+    acts = moving_body(in, record[0]) >= 0 || moving_body(in, record[sides(record[4])]) >= 0;
+    if (!acts) return;
+    const CornerPoints<T> at{in, false};
+    m = motions_of(in, given, record);
+    for (int k = 0; k < 4; ++k) since[k] = at.relative(record[5], record[k]) - before(in, record[5], record[k]);
+    for (int i = 0; i < kLagScalars; ++i) lag[i] = in.lag[kLagScalars * pair + i];
+  }
+
+  DIFFVBD_FN double derived(int direction) const {
     Dual<double> turned[kLagScalars];
     for (int i = 0; i < kLagScalars; ++i) turned[i] = {lag[i], double(i + 3 == direction)};
     const Vec3<Dual<double>> beside = {
         {0.0, double(direction == 0)}, {0.0, double(direction == 1)}, {0.0, double(direction == 2)}};
     return virtual_work(lagged_terms(turned, since, m, beside, h, eps), m).derivative;
-  };
-  const Vector by_m = {derived(0), derived(1), derived(2)};
-  for (int i = 0; i < kLagScalars; ++i) by_lag[i] = T(derived(3 + i));
-  for (int k = 0; k < 4; ++k) rigid::put(rows + kWorkScalars * k, lag[5 + k] * by_m);
-  add_by_motions(lagged_terms(lag, since, m, Vector{}, h, eps), m, rows);
-}
+  }
+
+  // Of the rows of the corners [4, 9] and the derivatives by what is lagged [9].
+  DIFFVBD_FN void store(int part, T* rows, T* by_lag) const {
+    if (part < kDirections) {
+      const double own = acts ? derived(part) : 0;
+      if (part >= 3) by_lag[part - 3] = T(own);
+      for (int k = 0; k < 4 && part < 3; ++k) rows[kWorkScalars * k + part] = acts ? T(lag[5 + k] * own) : T(0);
+      return;
+    }
+    for (int k = 0; k < 4; ++k) {
+      for (int i = 3; i < kWorkScalars; ++i) rows[kWorkScalars * k + i] = T(0);
+    }
+    if (acts) add_by_motions(lagged_terms(lag, since, m, Vector{}, h, eps), m, rows);
+  }
+};
 
 }  // namespace diffvbd::contact

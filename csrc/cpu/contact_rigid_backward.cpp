@@ -10,12 +10,20 @@ using namespace contact;
 template <class T>
 void rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out) {
   torch::stable::parallel_for(0, out.listed, 64, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i)
-      barrier_work(in, given, i, out.barrier + 4 * kWorkScalars * i, out.by_kappa + i);
+    for (int64_t i = begin; i < end; ++i) {
+      const BarrierWork<T> work(in, given, i);
+      for (int part = 0; part < kWorkParts; ++part) {
+        work.store(part, out.barrier + 4 * kWorkScalars * i, out.by_kappa + i);
+      }
+    }
   });
   torch::stable::parallel_for(0, out.lagged, 64, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i)
-      lagged_work(in, given, i, out.friction + 4 * kWorkScalars * i, out.by_lag + kLagScalars * i);
+    for (int64_t i = begin; i < end; ++i) {
+      const LaggedWork<T> work(in, given, i);
+      for (int part = 0; part < kWorkParts; ++part) {
+        work.store(part, out.friction + 4 * kWorkScalars * i, out.by_lag + kLagScalars * i);
+      }
+    }
   });
 }
 

@@ -190,23 +190,34 @@ __global__ void store_contact(const __grid_constant__ StepView<T> s, const __gri
   contact::add_at(out.x_prev + 3 * (scene * in.num_vertices + corner), own);
 }
 
+constexpr int kSumThreads = 1024;
+
 // One scalar of the slots of each scene's pairs, one block a scene, in an order fixed by the number of pairs.
 template <class T>
-__global__ void sum_by_scene(const __grid_constant__ ContactInputs<T> in, int64_t base, const T* slots, int stride,
-                             T* out) {
-  __shared__ T part[kContactThreads];
+__global__ void __launch_bounds__(kSumThreads)
+    sum_by_scene(const __grid_constant__ ContactInputs<T> in, int64_t base, const T* slots, int stride, T* out) {
+  __shared__ T part[kSumThreads];
   const int64_t scene = base + blockIdx.x;
   T sum = T(0);
   for (int64_t i = in.listed.ptr[scene * in.corners] + static_cast<int64_t>(threadIdx.x);
-       i < in.listed.ptr[(scene + 1) * in.corners]; i += kContactThreads) {
+       i < in.listed.ptr[(scene + 1) * in.corners]; i += kSumThreads) {
     sum += slots[i * stride];
   }
   part[threadIdx.x] = sum;
-  for (int half = kContactThreads / 2; half > 0; half /= 2) {
+  for (int half = kSumThreads / 2; half > 0; half /= 2) {
     __syncthreads();
     if (threadIdx.x < half) part[threadIdx.x] += part[threadIdx.x + half];
   }
   if (threadIdx.x == 0) out[scene] = part[0];
+}
+
+template <class T>
+cudaError_t launch_sum(int64_t scenes, cudaStream_t stream, const ContactInputs<T>& in, int64_t base, const T* slots,
+                       int stride, T* out) {
+  if (scenes > 0) {
+    sum_by_scene<T><<<static_cast<unsigned>(scenes), kSumThreads, 0, stream>>>(in, base, slots, stride, out);
+  }
+  return cudaGetLastError();
 }
 
 template <class T>
@@ -322,7 +333,7 @@ template <class T>
 cudaError_t ContactPasses<T>::store() const {
   const T *prev = out->contact->prev, *slots = out->contact->kappa;
   if (auto error = launch_contact(store_contact<T>, s.scenes * in.corners, stream, s, in, *out, prev)) return error;
-  return launch_contact(sum_by_scene<T>, s.scenes * kContactThreads, stream, in, s.base, slots, 1, out->kappa);
+  return launch_sum(s.scenes, stream, in, s.base, slots, 1, out->kappa);
 }
 
 template <class T>
@@ -345,7 +356,7 @@ cudaError_t pair_lag_backward(const ContactInputs<T>& in, const T* x, int64_t sc
   const T* from = slots;
   if (auto error = launch_contact(lag_collect<T>, scenes * in.corners, stream, in, scenes, from, x_bar, collider_bar))
     return error;
-  return launch_contact(sum_by_scene<T>, scenes * kContactThreads, stream, in, int64_t{0}, from + 3, 4, kappa_bar);
+  return launch_sum(scenes, stream, in, int64_t{0}, from + 3, 4, kappa_bar);
 }
 
 }  // namespace diffvbd::cuda

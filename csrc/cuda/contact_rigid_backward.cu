@@ -4,15 +4,22 @@
 namespace diffvbd::cuda {
 namespace {
 
+constexpr int kPartsApart = 16;  // threads of a pair: one for each part of its work, in a half of a warp
+static_assert(kWorkParts <= kPartsApart);
+
 template <class T>
 __global__ void __launch_bounds__(kOne)
     work_kernel(const __grid_constant__ RigidInputs<T> in, VirtualMotions<T> given, RigidWork<T> out) {
-  const int64_t row = own_item();
+  const int64_t row = own_item() / kPartsApart;
+  const int part = static_cast<int>(threadIdx.x % kPartsApart);
+  if (part >= kWorkParts) return;
   if (row < out.listed) {
-    barrier_work(in, given, row, out.barrier + 4 * kWorkScalars * row, out.by_kappa + row);
+    const BarrierWork<T> work(in, given, row);
+    work.store(part, out.barrier + 4 * kWorkScalars * row, out.by_kappa + row);
   } else if (row < out.listed + out.lagged) {
     const int64_t i = row - out.listed;
-    lagged_work(in, given, i, out.friction + 4 * kWorkScalars * i, out.by_lag + kLagScalars * i);
+    const LaggedWork<T> work(in, given, i);
+    work.store(part, out.friction + 4 * kWorkScalars * i, out.by_lag + kLagScalars * i);
   }
 }
 
@@ -77,7 +84,7 @@ template <class T>
 cudaError_t rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out,
                            cudaStream_t stream) {
   const int64_t rows = out.listed + out.lagged;
-  if (rows > 0) work_kernel<T><<<blocks_for(rows), kOne, 0, stream>>>(in, given, out);
+  if (rows > 0) work_kernel<T><<<blocks_for(kPartsApart * rows), kOne, 0, stream>>>(in, given, out);
   return cudaGetLastError();
 }
 

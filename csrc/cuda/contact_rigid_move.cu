@@ -6,8 +6,8 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int64_t kItemsOfBlock = 2048;  // of the potential of a scene, that one block adds up
-constexpr int64_t kMostBlocks = 64;      // that add up one scene
+constexpr int64_t kItemsOfBlock = 1024;  // of the potential of a scene, that one block adds up
+constexpr int64_t kMostBlocks = 128;     // that add up one scene
 constexpr int64_t kSmallScene = 4096;    // vertices up to which a block does all the work on a scene
 
 // What the tries of all scenes have in common.

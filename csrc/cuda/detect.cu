@@ -12,6 +12,7 @@ constexpr size_t kAlignment = 256;
 constexpr int kMostHits = 192;       // leaves that one thread looks at for a query; a block takes over from there
 constexpr int kHeavyBlocks = 512;    // that share the queries with more
 constexpr int32_t kSubtrees = 4096;  // parts of a tree that the threads of such a block share
+constexpr int64_t kCandidates = 2;   // kept by the first search for each pair that fits
 
 // A query whose search goes on at `node`.
 struct Heavy {
@@ -29,9 +30,11 @@ struct Workspace {
   unsigned long long* listed;              // number of pairs that the list needs
   unsigned long long* touching;            // number of pairs that touch, and the first key of those
   unsigned long long *keys, *sorted_keys;  // [capacity]
-  uint32_t *points, *sorted_points;        // [4 capacity] corner points of the list's pairs
-  int32_t* entries;                        // [4 capacity]
-  Heavy* heavy;                            // [queries], and how many, for each of the two searches
+  unsigned long long *found,
+      *candidates;                   // how many pairs the first search found that may be listed; the first of them
+  uint32_t *points, *sorted_points;  // [4 capacity] corner points of the list's pairs
+  int32_t* entries;                  // [4 capacity]
+  Heavy* heavy;                      // [queries], and how many, for each of the two searches
   unsigned* heavy_count;
   void* sort;
   size_t sort_bytes = 0, bytes = 0;
@@ -46,6 +49,7 @@ struct Workspace {
     const int64_t rows = in.scenes * in.corners;
     take(near_gap, rows), take(near_key, rows), take(smallest, in.scenes), take(listed, 1), take(touching, 2);
     take(keys, capacity), take(sorted_keys, capacity);
+    take(found, 1), take(candidates, kCandidates * capacity);
     take(points, 4 * capacity), take(sorted_points, 4 * capacity), take(entries, 4 * capacity);
     take(heavy, in.scenes * (int64_t{in.num_points} + in.num_edges)), take(heavy_count, 2);
     size_t of_pairs = 0, of_points = 0;
@@ -69,13 +73,29 @@ __global__ void start_kernel(const Surfaces<T> in, Workspace<T> work, int64_t ca
     clear_bounds(work.forest, i);
   }
   if (i == 0) {
-    *work.listed = work.touching[0] = 0, work.touching[1] = kNoKey;
+    *work.listed = *work.found = work.touching[0] = 0, work.touching[1] = kNoKey;
     work.heavy_count[0] = work.heavy_count[1] = 0;
   }
 }
 
 // --- search
 // -----------------------------------------------------------------------------------------------------------
+
+// Whether the first search has kept all candidates: then the second need not search.
+template <class T>
+__device__ bool kept_all(const Workspace<T>& work, int64_t capacity) {
+  return *work.found <= static_cast<unsigned long long>(kCandidates * capacity);
+}
+
+// Puts a key into a list of `room`. One addition for all threads that are here together.
+__device__ void append(unsigned long long* count, unsigned long long* list, int64_t room, uint64_t key) {
+  const unsigned together = __activemask(), lane = threadIdx.x % 32;
+  const int leader = __ffs(static_cast<int>(together)) - 1;
+  unsigned long long first = 0;
+  if (static_cast<int>(lane) == leader) first = atomicAdd(count, static_cast<unsigned long long>(__popc(together)));
+  const unsigned long long place = __shfl_sync(together, first, leader) + __popc(together & ((1U << lane) - 1));
+  if (place < static_cast<unsigned long long>(room)) list[place] = key;
+}
 
 // One of two searches: for the near gaps of all corner points, and, when they are known, for the near pairs; that one
 // lists.
@@ -90,44 +110,38 @@ struct Search {
     lower(&work.touching[1], static_cast<unsigned long long>(key));
   }
 
-  __device__ void append(uint64_t key) const {
-    // One addition for all threads that are here together.
-    const unsigned together = __activemask(), lane = threadIdx.x % 32;
-    const int leader = __ffs(static_cast<int>(together)) - 1;
-    unsigned long long first = 0;
-    if (static_cast<int>(lane) == leader)
-      first = atomicAdd(work.listed, static_cast<unsigned long long>(__popc(together)));
-    const unsigned long long place = __shfl_sync(together, first, leader) + __popc(together & ((1U << lane) - 1));
-    if (place < static_cast<unsigned long long>(capacity)) work.keys[place] = key;
-  }
+  __device__ T gap_of(const Candidate& c) const { return separation(c.kind, corners_of(in, c)) - offset_of(in, c); }
 
   __device__ void examine(const Candidate& c) const {
     if (!is_considered(in, c)) return;
-    const T gap = separation(c.kind, corners_of(in, c)) - offset_of(in, c);
+    const T gap = gap_of(c);
     if (gap >= reach_of(in, c.scene) || (gap > T(0) && !is_listed(in, c, gap, in.dhat))) return;
-    const Ordered<T> bits = ordered(gap);
-    bool matters = listing || !(gap > T(0));
-    Ordered<T>* rows = work.near_gap + c.scene * in.corners;
-    for (int k = 0; k < 4; ++k) {
-      const Ordered<T> known = *static_cast<volatile Ordered<T>*>(rows + c.v[k]);
-      matters = matters || (listing ? bits == known : bits < known);
+    if constexpr (listing) {
+      settle(c, gap);
+    } else {
+      append(work.found, work.candidates, kCandidates * capacity, key_of(in, c));
+      const Ordered<T> bits = ordered(gap);
+      bool matters = !(gap > T(0));
+      Ordered<T>* rows = work.near_gap + c.scene * in.corners;
+      for (int k = 0; k < 4; ++k) matters = matters || bits < *static_cast<volatile Ordered<T>*>(rows + c.v[k]);
+      if (!matters || gap != gap || !constants_of(in, c).admitted) return;
+      for (int k = 0; k < 4; ++k) lower(rows + c.v[k], bits);
     }
-    if (!matters) return;
+  }
+
+  // Of a pair that may be listed.
+  __device__ void settle(const Candidate& c, T gap) const {
     const Constants<T> constants = constants_of(in, c);
     if (!constants.admitted) return;
-    if (!listing) {
-      for (int k = 0; gap == gap && k < 4; ++k) lower(rows + c.v[k], bits);
-      return;
-    }
     const uint64_t key = key_of(in, c);
     if (!(gap > T(0))) touch(key);
     if (gap != gap) return;
+    const Ordered<T> bits = ordered(gap);
     for (int k = 0; k < 4; ++k) {
-      if (rows[c.v[k]] == bits) {
-        lower(work.near_key + c.scene * in.corners + c.v[k], static_cast<unsigned long long>(key));
-      }
+      const int64_t row = c.scene * in.corners + c.v[k];
+      if (work.near_gap[row] == bits) lower(work.near_key + row, static_cast<unsigned long long>(key));
     }
-    if (is_listed(in, c, gap, constants.dhat)) append(key);
+    if (is_listed(in, c, gap, constants.dhat)) append(work.listed, work.keys, capacity, key);
   }
 
   // What query q looks for: those of points come first, in the order of their Morton codes.
@@ -170,12 +184,12 @@ struct Search {
 template <class T, bool listing>
 __global__ void search_kernel(const Surfaces<T> in, Workspace<T> work, int64_t capacity, int64_t queries) {
   const int64_t i = own_item();
-  if (i >= queries) return;
+  if (i >= queries || (listing && kept_all(work, capacity))) return;
   const Search<T, listing> search{in, work, capacity};
   const auto q = search.query(i);
   if (is_empty(q.box)) {
     // A point that is not finite meets nothing: it counts as touching, so that nobody takes the scene for a good one.
-    if (listing && q.kind == kPointTriangle) atomicAdd(&work.touching[0], 1ULL);
+    if (!listing && q.kind == kPointTriangle) atomicAdd(&work.touching[0], 1ULL);
     return;
   }
   if (q.kind == kPointTriangle && q.box.group != in.mesh_bodies) {
@@ -207,6 +221,16 @@ __global__ void heavy_kernel(const Surfaces<T> in, Workspace<T> work, int64_t ca
       }
     }
   }
+}
+
+// The second search where the first has kept all candidates.
+template <class T>
+__global__ void settle_kernel(const Surfaces<T> in, Workspace<T> work, int64_t capacity) {
+  const int64_t i = own_item();
+  if (!kept_all(work, capacity) || i >= static_cast<int64_t>(*work.found)) return;
+  const Search<T, true> search{in, work, capacity};
+  const Candidate c = candidate_of_key(in, work.candidates[i]);
+  search.settle(c, search.gap_of(c));
 }
 
 // --- results
@@ -292,6 +316,7 @@ cudaError_t detect(const Surfaces<T>& in, const Detected<T>& out, void* memory, 
   launch_search<T, false>(in, work, capacity, stream);
   launch_search<T, true>(in, work, capacity, stream);
   if (capacity > 0) {
+    settle_kernel<<<blocks_for(kCandidates * capacity), kThreads, 0, stream>>>(in, work, capacity);
     size_t bytes = work.sort_bytes;
     if (auto error = cub::DeviceRadixSort::SortKeys(work.sort, bytes, work.keys, work.sorted_keys, capacity, 0,
                                                     bits_of(in.keys()), stream))

@@ -11,6 +11,7 @@ using namespace contact;
 
 constexpr int kThreads = 256;
 constexpr int kWarp = 32, kLongSegment = 512;  // threads for a sum of fewer terms on average; above, kThreads
+constexpr int64_t kShortSegment = 32;          // terms of a segment that one thread adds up
 constexpr int32_t kTile = 32;                  // bodies that one thread compares with one
 constexpr int32_t kFewBodies = 512;            // of a scene, up to which a block finds all its islands
 constexpr size_t kAlignment = 256;
@@ -143,9 +144,9 @@ __global__ void islands_sync_kernel(const IslandInputs<T> in, Workspace<T> work)
 
 // What a body sweeps, and whether it must stay from now on.
 template <class T>
-__device__ void sweep_body(const IslandInputs<T>& in, const Workspace<T>& work, int64_t i) {
+__device__ void sweep_body(const IslandInputs<T>& in, const Workspace<T>& work, int64_t i, int32_t label) {
   const int64_t scene = i / in.mesh_bodies, first = scene * in.mesh_bodies;
-  const Bounds<T> box = swept(in, work.bodies[i].bounds, translation(work.islands[first + work.label[i]]),
+  const Bounds<T> box = swept(in, work.bodies[i].bounds, translation(work.islands[first + label]),
                               in.margin(scene, static_cast<int32_t>(i - first)));
   work.boxes[i] = box;
   bool blocked = false;
@@ -161,7 +162,7 @@ __device__ void sweep_body(const IslandInputs<T>& in, const Workspace<T>& work, 
 template <class T>
 __global__ void sweep_kernel(const IslandInputs<T> in, Workspace<T> work) {
   const int64_t i = own_item();
-  if (i < in.scenes * in.mesh_bodies) sweep_body(in, work, i);
+  if (i < in.scenes * in.mesh_bodies) sweep_body(in, work, i, work.label[i]);
 }
 
 __device__ int32_t root_of(const int32_t* label, int32_t i) {
@@ -222,10 +223,9 @@ __global__ void finish_kernel(const IslandInputs<T> in, Workspace<T> work, int32
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     scene_sync_kernel(const IslandInputs<T> in, Workspace<T> work, int32_t* island) {
-  __shared__ int32_t unsettled;
+  __shared__ int32_t unsettled, label[kFewBodies];
   const int32_t n = in.mesh_bodies;
   const int64_t first = int64_t{blockIdx.x} * n;
-  int32_t* label = work.label + first;
   const auto each = [&](int32_t count, const auto& f) {
     for (auto i = static_cast<int32_t>(threadIdx.x); i < count; i += kThreads) f(i);
     __syncthreads();
@@ -240,7 +240,7 @@ __global__ void __launch_bounds__(kThreads)
       work.islands[first + i] = own;
     });
   };
-  const auto sweep = [&] { each(n, [&](int32_t i) { sweep_body(in, work, first + i); }); };
+  const auto sweep = [&] { each(n, [&](int32_t i) { sweep_body(in, work, first + i, label[i]); }); };
   if (threadIdx.x == 0) unsettled = 0;
   each(n, [&](int32_t i) { label[i] = i, work.stays[first + i] = false; });
   for (int round = 0; round <= kJoins; ++round) {
@@ -259,6 +259,41 @@ __global__ void __launch_bounds__(kThreads)
   }
   sum(), sweep(), sum();
   each(n, [&](int32_t i) { island[first + i] = work.islands[first + label[i]].blocked ? -1 : label[i]; });
+}
+
+// A block for kThreads segments of a scene: a thread for each column of a short one, all for a long one.
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    short_segments_sync_kernel(const T* values, const int32_t* order, const int32_t* ptr, int64_t items,
+                               int64_t segments, int64_t c, T* out) {
+  __shared__ T part[kThreads];
+  const int64_t tiles = (segments + kThreads - 1) / kThreads, scene = blockIdx.x / tiles;
+  const int64_t first = (blockIdx.x - scene * tiles) * kThreads;
+  const int64_t last = first + kThreads < segments ? first + kThreads : segments;
+  const T* own = values + scene * items * c;
+  T* to = out + scene * segments * c;
+  bool any_long = false;
+  for (int64_t i = threadIdx.x; i < (last - first) * c; i += kThreads) {
+    const int64_t s = first + i / c, k = i % c;
+    if (ptr[s + 1] - ptr[s] > kShortSegment) {
+      any_long = true;
+      continue;
+    }
+    T sum = T(0);
+    for (int32_t e = ptr[s]; e < ptr[s + 1]; ++e) sum += own[order[e] * c + k];
+    to[s * c + k] = sum;
+  }
+  if (!__syncthreads_or(any_long)) return;
+  for (int64_t s = first; s < last; ++s) {
+    if (ptr[s + 1] - ptr[s] <= kShortSegment) continue;
+    for (int64_t k = 0; k < c; ++k) {
+      T sum = T(0);
+      for (int64_t e = ptr[s] + int64_t{threadIdx.x}; e < ptr[s + 1]; e += kThreads) sum += own[order[e] * c + k];
+      sum = block_sum(sum, part, [](T& a, const T& b) { a += b; });
+      if (threadIdx.x == 0) to[s * c + k] = sum;
+      __syncthreads();  // part is read
+    }
+  }
 }
 
 // A block for each column of each segment.
@@ -318,6 +353,11 @@ template <class T>
 cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
                         int64_t segments, int64_t c, T* out, cudaStream_t stream) {
   if (scenes * segments * c == 0) return cudaSuccess;
+  if (items <= kShortSegment * segments) {
+    const auto tiles = static_cast<unsigned>(scenes * ((segments + kThreads - 1) / kThreads));
+    short_segments_sync_kernel<<<tiles, kThreads, 0, stream>>>(values, order, ptr, items, segments, c, out);
+    return cudaGetLastError();
+  }
   const auto blocks = static_cast<unsigned>(scenes * segments * c);
   const int threads = threads_for(items, segments);
   segments_sync_kernel<<<blocks, threads, 0, stream>>>(values, order, ptr, items, segments, c, out);

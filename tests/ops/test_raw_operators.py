@@ -58,8 +58,14 @@ UNREAD = {
 OF_CHOICE = {"mu", "lam", "rest", "other_tets"}  # between starts, which this scene does not have
 SHARED = ("mu", "lam", "kappa")  # one value for all is legal
 # Empty where a scene lacks them; which it does, no tensor can tell.
-OPTIONAL = ("planes", "alone", "floor_lag", "lag", "own_room", "v_bar", "beside", "arm")
-EMPTY_OF = {("begin", "rest"), ("contact_above_floor", "u"), ("contact_above_floor_backward", "u")}
+OPTIONAL = ("planes", "alone", "floor_lag", "lag", "own_room", "v_bar")
+EMPTY_OF = {
+    ("begin", "rest"),
+    ("contact_above_floor", "u"),
+    ("contact_above_floor_backward", "u"),
+    ("contact_motion", "fall"),
+    ("contact_rooms", "floor"),
+}
 ONE_KIND = ("pack_rest", "star_sum", "tet_gather", "contact_keep")  # with one floating tensor, which may be either
 ERRORS = (ValueError, RuntimeError)
 

@@ -98,7 +98,7 @@ def check(c: Case) -> dict[str, Tensor]:
     """Its gradients, after a look at all numbers: those of float32 are rounded once, at the end."""
     single, double = c.x.dtype == torch.float32, c.on(c.x.device, torch.float64)
     got, bound = c.lifted(), tolerance("float32_forward" if single else "adjoint")
-    assert relative_error(got, by_torch(double)[0]) <= tolerance("float32_forward" if single else "formula")
+    assert relative_error(got, by_torch(double)[0]) <= tolerance("float32_forward" if single else "borne")
     assert torch.equal(got, c.lifted())
     bar = torch.as_tensor(generator("bar").standard_normal(got.shape)).to(got)
     found, by_autograd = gradients(c, Case.lifted, bar), gradients(double, lambda c: by_torch(c)[0], bar.double())
