@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from .arguments import Prepared
     from .predict import Begun
 
-# Rigid corrections after the last sweeps of more than MOST_COUPLED bodies that may touch. In stacks of two with friction
+# Rigid corrections after the last sweeps of more than MOST_COUPLED bodies that may touch. In stacks of two that rub
 # the upper body creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; with 1 it falls.
 APART_CORRECTIONS = 4
 FREE = 1e15  # [m] room that nothing fills
@@ -145,15 +145,16 @@ class ContactStep:
         if checking():
             self._refuse_what_is_not_finite()
             refuse_intersections(self.model, self.x_prev, self.origin, self.before)
-        pinned = self.model._pinned[:, None]
-        lift = torch.where(pinned, 0.0, broadcast(self.begun.lift, self.begun.y.shape))
+        pinned, pins = self.model._pinned[:, None], self.model.num_active < self.model.num_vertices
+        lift = broadcast(self.begun.lift, self.begun.y.shape)
+        lift = torch.where(pinned, 0.0, lift) if pins else lift
         x, way = self.x_prev, self.begun.y - self.x_prev - lift
         left, met = way, Met(x)
         stages, r = self.parts or 1, 0  # of what is prescribed
         while r < (self.parts or 1):
             was, now = (self._colliders_at(min(1.0, n / stages)) for n in (r, r + 1))
             # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
-            move = left if stages == 1 else torch.where(pinned, way / stages, left)
+            move = torch.where(pinned, way / stages, left) if pins and stages > 1 else left
             fall = lift if r == 0 else torch.zeros_like(lift)
             motion = motion_of(surface, x, self.origin, self.fields.mass, move, fall)
             within = self._rooms(x, was, now, motion)
@@ -162,7 +163,7 @@ class ContactStep:
             detection = self._detect(x, was, now, within)
             sweeps = sweeps_of_parts(settings.sweeps, self.parts)[r]
             met.found.append(detection)
-            met.counts.append(torch.cat([detection.counts[:3], detection.counts.new_zeros(1)]))
+            met.counts.append(detection.counts)
             if self._reads(x):  # before any work
                 self._check(r, met.counts[r].tolist(), met)
             if r == 0:
@@ -196,8 +197,9 @@ class ContactStep:
             met.cut = cut
             met.found[r] = replaced(detection, shares=start.shares, corrections=torch.stack(taken), limits=limits,
                                     kept=kept, frames=start.frames, combined=combined, lengths=lengths)  # fmt: skip
-            left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
             r += 1
+            if r < self.parts:
+                left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
         x = self._judged(x, met)
         for found in recorders():  # a step that is done again, with room for more pairs, counts once
             found.extend(met.found)
