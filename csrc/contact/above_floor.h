@@ -39,7 +39,8 @@ struct Descent {
   DIFFVBD_FN double excess() const { return closes() ? toward - room : 0; }
   DIFFVBD_FN double share() const { return closes() ? room / toward : 1; }
   DIFFVBD_FN bool clears(const Vector& shift) const {
-    const double rounding = kRoundings * std::numeric_limits<T>::epsilon() * absolute(toward);
+    const double rounding = kRoundings * std::numeric_limits<T>::epsilon() *
+                            (absolute(toward) + absolute(shift.x) + absolute(shift.y) + absolute(shift.z));
     return toward - dot(n, shift) <= room + rounding;
   }
 };

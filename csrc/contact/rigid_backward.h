@@ -132,18 +132,22 @@ struct BarrierWork {
   int kind;
   double h2, kappa;
 
-  DIFFVBD_FN BarrierWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair)
-      : acts(false), m{}, c{}, a(in.gate.constants + kConstants * pair), kind(0), h2(0), kappa(0) {
-    PairPress press;
-    const CornerPoints<T> at{in, false};
-    acts = pair < in.first_listed(in.scene.scenes) && barrier_press(in, pair, at, press);
+  // known: that it acts
+  DIFFVBD_FN BarrierWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair, bool known = false)
+      : acts(known || pushes(in, pair)), m{}, c{}, a(in.gate.constants + kConstants * pair), kind(0), h2(0), kappa(0) {
     if (!acts) return;
+    const CornerPoints<T> at{in, false};
     const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
     const int64_t scene = record[5];
     m = motions_of(in, given, record), kind = record[4];
     const Vector origin = at(scene, record[0]);
     for (int k = 0; k < 4; ++k) c.x[k] = at(scene, record[k]) - origin;
     h2 = in.scene.time_step * in.scene.time_step, kappa = in.kappa.data[scene * in.kappa.scene];
+  }
+
+  DIFFVBD_FN static bool pushes(const RigidInputs<T>& in, int64_t pair) {
+    PairPress press;
+    return pair < in.first_listed(in.scene.scenes) && barrier_press(in, pair, CornerPoints<T>{in, false}, press);
   }
 
   // Of the rows of the corners [4, 9] and the derivative by kappa; zero where the pair does not push.

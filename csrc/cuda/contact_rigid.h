@@ -27,9 +27,10 @@ template <class T>
 cudaError_t rigid_move(const contact::RigidInputs<T>& in, const PairRoom& room, const double* center,
                        const double* motion, T* move, double* share, T* x, void* workspace, cudaStream_t stream);
 
+// pushing: memory of 1 + listed numbers.
 template <class T>
 cudaError_t rigid_backward(const contact::RigidInputs<T>& in, const contact::VirtualMotions<T>& given,
-                           const contact::RigidWork<T>& out, cudaStream_t stream);
+                           const contact::RigidWork<T>& out, int32_t* pushing, cudaStream_t stream);
 
 // solutions [B, bodies, 6]: memory, too, for what is solved for; x, mass, p, q as of reverse_end() and
 // virtual_motion().

@@ -7,20 +7,34 @@ namespace {
 constexpr int kPartsApart = 16;  // threads of a pair: one for each part of its work, in a half of a warp
 static_assert(kWorkParts <= kPartsApart);
 
+// The listed pairs that push, few of them: how many, and which, in any order.
 template <class T>
 __global__ void __launch_bounds__(kOne)
-    work_kernel(const __grid_constant__ RigidInputs<T> in, VirtualMotions<T> given, RigidWork<T> out) {
+    pushing_kernel(const __grid_constant__ RigidInputs<T> in, int64_t listed, int32_t* pushing) {
+  const int64_t row = own_item();
+  if (row < listed && BarrierWork<T>::pushes(in, row)) pushing[1 + atomicAdd(pushing, 1)] = static_cast<int32_t>(row);
+}
+
+template <class T>
+__global__ void __launch_bounds__(kOne)
+    barrier_kernel(const __grid_constant__ RigidInputs<T> in, VirtualMotions<T> given, RigidWork<T> out,
+                   const int32_t* pushing) {
+  const int64_t i = own_item() / kPartsApart;
+  const int part = static_cast<int>(threadIdx.x % kPartsApart);
+  if (part >= kWorkParts || i >= *pushing) return;
+  const int64_t row = pushing[1 + i];
+  const BarrierWork<T> work(in, given, row, true);
+  work.store(part, out.barrier + 4 * kWorkScalars * row, out.by_kappa + row);
+}
+
+template <class T>
+__global__ void __launch_bounds__(kOne)
+    friction_kernel(const __grid_constant__ RigidInputs<T> in, VirtualMotions<T> given, RigidWork<T> out) {
   const int64_t row = own_item() / kPartsApart;
   const int part = static_cast<int>(threadIdx.x % kPartsApart);
-  if (part >= kWorkParts) return;
-  if (row < out.listed) {
-    const BarrierWork<T> work(in, given, row);
-    work.store(part, out.barrier + 4 * kWorkScalars * row, out.by_kappa + row);
-  } else if (row < out.listed + out.lagged) {
-    const int64_t i = row - out.listed;
-    const LaggedWork<T> work(in, given, i);
-    work.store(part, out.friction + 4 * kWorkScalars * i, out.by_lag + kLagScalars * i);
-  }
+  if (part >= kWorkParts || row >= out.lagged) return;
+  const LaggedWork<T> work(in, given, row);
+  work.store(part, out.friction + 4 * kWorkScalars * row, out.by_lag + kLagScalars * row);
 }
 
 // A block for each body of each scene.
@@ -82,9 +96,15 @@ cudaError_t rigid_vertices_backward(const RigidInputs<T>& in, const double* moti
 
 template <class T>
 cudaError_t rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out,
-                           cudaStream_t stream) {
-  const int64_t rows = out.listed + out.lagged;
-  if (rows > 0) work_kernel<T><<<blocks_for(kPartsApart * rows), kOne, 0, stream>>>(in, given, out);
+                           int32_t* pushing, cudaStream_t stream) {
+  if (out.listed > 0) {
+    if (auto error = cudaMemsetAsync(pushing, 0, sizeof(int32_t), stream)) return error;
+    if (auto error = cudaMemsetAsync(out.barrier, 0, 4 * kWorkScalars * out.listed * sizeof(T), stream)) return error;
+    if (auto error = cudaMemsetAsync(out.by_kappa, 0, out.listed * sizeof(T), stream)) return error;
+    pushing_kernel<T><<<blocks_for(out.listed), kOne, 0, stream>>>(in, out.listed, pushing);
+    barrier_kernel<T><<<blocks_for(kPartsApart * out.listed), kOne, 0, stream>>>(in, given, out, pushing);
+  }
+  if (out.lagged > 0) friction_kernel<T><<<blocks_for(kPartsApart * out.lagged), kOne, 0, stream>>>(in, given, out);
   return cudaGetLastError();
 }
 
@@ -95,7 +115,7 @@ cudaError_t rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& gi
                                                   const VirtualMotions<T>&, const rigid::Adjoints<T>&, T*,     \
                                                   cudaStream_t);                                               \
   template cudaError_t rigid_backward<T>(const RigidInputs<T>&, const VirtualMotions<T>&, const RigidWork<T>&, \
-                                         cudaStream_t);
+                                         int32_t*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

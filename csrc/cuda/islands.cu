@@ -11,7 +11,8 @@ using namespace contact;
 
 constexpr int kThreads = 256;
 constexpr int kWarp = 32, kLongSegment = 512;  // threads for a sum of fewer terms on average; above, kThreads
-constexpr int64_t kShortSegment = 32;          // terms of a segment that one thread adds up
+constexpr int64_t kFewTerms = 32;              // of a segment on average, up to which a thread adds one up
+constexpr int32_t kShortSegment = 512;         // terms up to which it may
 constexpr int32_t kTile = 32;                  // bodies that one thread compares with one
 constexpr int32_t kFewBodies = 512;            // of a scene, up to which a block finds all its islands
 constexpr size_t kAlignment = 256;
@@ -353,7 +354,7 @@ template <class T>
 cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
                         int64_t segments, int64_t c, T* out, cudaStream_t stream) {
   if (scenes * segments * c == 0) return cudaSuccess;
-  if (items <= kShortSegment * segments) {
+  if (items <= kFewTerms * segments) {
     const auto tiles = static_cast<unsigned>(scenes * ((segments + kThreads - 1) / kThreads));
     short_segments_sync_kernel<<<tiles, kThreads, 0, stream>>>(values, order, ptr, items, segments, c, out);
     return cudaGetLastError();

@@ -126,7 +126,8 @@ def above_floor(floor: FloorBarrier, model: Any, x: Tensor, way: Tensor) -> tupl
         shift = (off.amax(-1).clamp(min=0)[..., None, None] * normal).sum(-3)  # [..., 3, 1]
         share = torch.where(off > 0, left, 1.0).amin((-2, -1))
         past = off - (normal * shift.unsqueeze(-3)).sum(-2)
-        good = (past <= 1e-12 * toward[..., own].abs()).all(-1).all(-1)[..., None, None]
+        rounding = 1e-12 * (toward[..., own].abs() + shift.abs().sum(-2).unsqueeze(-2))
+        good = (past <= rounding).all(-1).all(-1)[..., None, None]
         mine = torch.where(good, way + shift, share[..., None, None] * way)
         out = torch.where(model.body == number, mine, out)
         stopped = stopped | ((model.body == number) & (share < SHORT)[..., None])

@@ -103,7 +103,8 @@ def by_torch(c: Case) -> tuple[Tensor, Tensor]:
     closes = (toward > room) & ~held
     shift = of_bodies(torch.where(closes, toward - room, 0.0), c.body, "amax") @ normal
     share = of_bodies(torch.where(closes, room / torch.where(closes, toward, 1.0), 1.0), c.body, "amin").amin(-1)
-    clears = (toward - (shift @ normal.mT)[:, c.body] <= room + eps * toward.abs()) | held
+    rounding = eps * (toward.abs() + shift.abs().sum(-1, keepdim=True)[:, c.body])
+    clears = (toward - (shift @ normal.mT)[:, c.body] <= room + rounding) | held
     good = (of_bodies(clears.to(c.x.dtype), c.body, "amin").amin(-1) > 0)[..., None]
     kept, shifted = torch.where(good, 1.0, share[..., None])[:, c.body], torch.where(good, shift, 0.0)[:, c.body]
     return kept * way + shifted, share < SHORT

@@ -73,7 +73,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_backward(DIFFVBD_PARAME
     const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
     const auto make = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes); };
     const diffvbd::RigidWorkTensors out(f, make);
-    check(cuda::rigid_backward<T>(in, diffvbd::virtual_motions(in, p, q, x), out.view<T>(), current_stream(x)),
+    const Tensor pushing = empty(x, {1 + f.pairs.size(0)}, ScalarType::Int);
+    check(cuda::rigid_backward<T>(in, diffvbd::virtual_motions(in, p, q, x), out.view<T>(), data<int32_t>(pushing),
+                                  current_stream(x)),
           "the adjoint of rigid motions");
     return out.all();
   });
