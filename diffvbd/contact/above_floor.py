@@ -6,25 +6,12 @@ from __future__ import annotations
 from typing import Any
 
 from torch import Tensor
-from torch.autograd import Function
 
 from .. import ops
-from ..ops import contact_part, no_second_derivative, not_batched
+from ..ops import Backward, Direct, contact_part, not_batched
 
 
-class Last(Function):
-    """A backward that has no derivative of its own."""
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Any) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> Any:
-        no_second_derivative()
-
-
-class _AboveFloor(Function):
+class _AboveFloor(Direct):
     @staticmethod
     def forward(x: Tensor, u: Tensor, way: Tensor, planes: Tensor, origin: Tensor, held: Tensor, order: Tensor,
                 ptr: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
@@ -48,7 +35,7 @@ class _AboveFloor(Function):
         return x, u if ctx.needs_input_grad[1] else None, way, of_planes(own, planes, wants_planes), *(None,) * 4
 
 
-class _AboveFloorBackward(Last):
+class _AboveFloorBackward(Backward):
     @staticmethod
     def forward(bar, x, u, way, planes, origin, held, order, ptr, wants_planes):
         return contact_part.above_floor_backward(bar, x, u, way, planes, origin, held, order, ptr, wants_planes)
@@ -74,6 +61,3 @@ def above_floor(x: Tensor, u: Tensor, way: Tensor, planes: Tensor, origin: Tenso
         order, ptr: Vertices by body [V], and the first of each [bodies + 1], int32.
     """
     return _AboveFloor.apply(x.contiguous(), u, way.contiguous(), planes.contiguous(), origin, held, order, ptr)
-
-
-ops.ready_signature(_AboveFloor, _AboveFloorBackward)

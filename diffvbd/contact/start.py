@@ -9,19 +9,18 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import Function
 
 from .. import ops
+from ..ops import Backward, Direct, not_batched
 from ..ops import contact_part as ops_part
 from ..ops import contact_start as ops_contact_start
-from ..ops import not_batched
 from ..ops.contact_part import ASKS, PartBodies, Whole
 from ..ops.detect import segment_sum
-from .above_floor import Last, above_floor, of_planes
+from .above_floor import above_floor, of_planes
 from .surface import ContactSurface
 
 
-class _Translation(Function):
+class _Translation(Direct):
     """Translation of each body's island [B, bodies, 3]."""
 
     @staticmethod
@@ -41,7 +40,7 @@ class _Translation(Function):
         return (*(ops.sum_to(bar, t.shape) for bar, t in zip(out, (move, mass, x, planes), strict=True)), None, None)
 
 
-class _TranslationBackward(Last):
+class _TranslationBackward(Backward):
     @staticmethod
     def forward(u_bar, move, mass, x, origin, planes, index):
         move_bar, mass_bar, x_bar, planes_bar = ops_contact_start.translation_backward(
@@ -60,7 +59,7 @@ class Decided(NamedTuple):
     bodies: PartBodies
 
 
-class _Start(Function):
+class _Start(Direct):
     """Where the part starts [B, V, 3], of shares that have been decided, and who is short [B, V]."""
 
     @staticmethod
@@ -88,7 +87,7 @@ class _Start(Function):
         return *out, of_planes(own, planes, wants_planes), None
 
 
-class _StartBackward(Last):
+class _StartBackward(Backward):
     @staticmethod
     def forward(bar, x, move, fall, u, left, planes, decided, wants_planes):
         at = Whole(x, move, u, left, decided.frames, planes, decided.origin, decided.bodies)
@@ -180,6 +179,3 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
     decided = Decided(frames, shares, stopped, origin, bodies)
     start, short = _Start.apply(x, move, fall, u, left, floor, decided)
     return PartStart(start, center, room, own, frames, short, sum(stuck[1:], stuck[0]), torch.stack(shares))
-
-
-ops.ready_signature(_Translation, _TranslationBackward, _Start, _StartBackward)

@@ -33,6 +33,8 @@ from .fields import (
     tape_shape,
 )
 from .functions import (
+    Backward,
+    Direct,
     distinct,
     fold_scenes,
     no_second_derivative,
@@ -49,6 +51,8 @@ from .sums import broadcast, star_sum, sum_to, tet_gather
 from .sweep import fused_step, fused_step_backward, sweep, sweep_backward
 
 __all__ = [
+    "Backward",
+    "Direct",
     "COMPACT_TAPE",
     "FULL_TAPE",
     "LANES",

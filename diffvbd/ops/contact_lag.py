@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .functions import raw_backward, shapes_of
-from .load import raw
+from .load import direct as raw
 from .sweep import LAG_SCALARS
 
 PLANE_SCALARS = 7  # twin of kPlaneScalars in csrc/contact/lowest.h

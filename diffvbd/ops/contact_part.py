@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..safeguards import FILTER_ETA
 from .functions import raw_backward, shapes_of
-from .load import raw
+from .load import direct as raw
 
 ASKS = 2  # state of a vertex that rests unless the potential of its body lets it go; kAsks in csrc/contact/part.h
 

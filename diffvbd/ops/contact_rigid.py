@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .fields import TouchingFields
 from .functions import raw_backward, shapes_of
-from .load import raw
+from .load import direct as raw
 from .rigid import join_data, scalars_of_data
 
 UNKNOWNS = 6  # of a body: a turn and a shift

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .functions import raw_backward, shapes_of
-from .load import raw
+from .load import direct as raw
 
 
 def translation(move: Tensor, mass: Tensor, x: Tensor, origin: Tensor, planes: Tensor, held: Tensor, body: Tensor,

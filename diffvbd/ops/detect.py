@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from .functions import raw_backward, shapes_of
-from .load import raw
+from .load import direct as raw
 
 PAIR_ROW, CONSTANTS, NEAR_ROW, NEAR_VALUES, COUNTS = 6, 8, 5, 8, 4  # twins of those in csrc/contact/candidates.h
 CROSSING_ROW = 3  # and in csrc/contact/intersect.h

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
+from ..scopes import transformed
+
 
 def raw_backward(ctx: Any, *grads: Tensor) -> NoReturn:
     raise NotImplementedError("diffvbd: the raw operators are not differentiable; call diffvbd.step")
@@ -73,6 +75,29 @@ def ready_signature(*functions: type[Function]) -> None:
     for function in functions:
         parameters = inspect.signature(function.forward).parameters.values()
         function.forward.__signature__ = _Ready(list(parameters))  # type: ignore[attr-defined]
+
+
+class Direct(Function):
+    """A Function whose arguments are all given by position, and which torch.compile never meets: apply() does what
+    torch's own does where no transforms are active, but for binding and looking at each argument."""
+
+    @classmethod
+    def apply(cls, *args: Any) -> Any:
+        if transformed():
+            return super().apply(*args)
+        return super(Function, cls).apply(*args)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class Backward(Direct):
+    """The backward of a Function, as one that has no derivative of its own."""
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Any) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        no_second_derivative()
 
 
 def distinct(*tensors: Tensor | None) -> list[Tensor | None]:

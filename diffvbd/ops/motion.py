@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .functions import raw_backward, shapes_of
-from .load import raw
+from .load import direct as raw
 
 WAYS = ("bends", "driven", "apart", "stretched", "falls")  # twins of Way in csrc/contact/motion.h
 

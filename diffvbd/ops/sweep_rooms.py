@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .functions import raw_backward, shapes_of
-from .load import raw
+from .load import direct as raw
 
 
 def sweep_rooms(x: Tensor, start: Tensor, begin: Tensor, move: Tensor, fall: Tensor, apart: Tensor, stretched: Tensor,

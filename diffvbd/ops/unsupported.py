@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .functions import raw_backward, shapes_of
-from .load import raw
+from .load import direct as raw
 
 
 def unsupported(x: Tensor, origin: Tensor, lift: Tensor, force: Tensor, mass: Tensor, planes: Tensor,

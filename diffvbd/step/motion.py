@@ -6,15 +6,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from torch import Tensor
-from torch.autograd import Function
 
 from .. import ops
 from ..contact.surface import ContactSurface
+from ..ops import Backward, Direct, not_batched
 from ..ops import motion as ops_motion
-from ..ops import no_second_derivative, not_batched
 
 
-class _Motion(Function):
+class _Motion(Direct):
     """ops.motion.Ways, differentiable in its rigid motion."""
 
     @staticmethod
@@ -35,19 +34,11 @@ class _Motion(Function):
         return (*(ops.sum_to(bar, t.shape) for bar, t in zip(bars, (x, mass, move), strict=True)), None, None, None)
 
 
-class _MotionBackward(Function):
+class _MotionBackward(Backward):
     @staticmethod
     def forward(bar, x, mass, move, origin, index):
         x_bar, move_bar, mass_bar = ops_motion.contact_motion_backward(bar, x, origin, mass, move, *index)
         return x_bar, mass_bar, move_bar
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Any) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> Any:
-        no_second_derivative()
 
 
 class Motion(NamedTuple):
@@ -80,6 +71,3 @@ def motion_of(surface: ContactSurface, x: Tensor, origin: Tensor, mass: Tensor, 
     index = (surface.held, surface.held_bodies, surface.body_order, surface.body_ptr)
     rigid, longest, sums = _Motion.apply(x, mass, move, origin, fall.detach().contiguous(), index)
     return Motion(move, fall, rigid, ops_motion.Ways(rigid.detach(), longest, sums))
-
-
-ops.ready_signature(_Motion, _MotionBackward)

@@ -16,13 +16,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import Function
 
 from .. import ops
 from ..adjoint.contact_lag import sum_at_corners, sum_of_scenes
 from ..model.model import Model
+from ..ops import Backward, Direct, no_transforms, of_inputs
 from ..ops import contact_rigid as ops_rigid
-from ..ops import no_second_derivative, no_transforms, of_inputs
 from .rigid_terms import Scenes
 
 _FIELDS = len(ops.TouchingFields._fields)
@@ -53,7 +52,7 @@ def _bodies_of(model: Model) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     return order.to(torch.int32), ptr.to(torch.int32), free, model._pinned, model.body.to(torch.int32)
 
 
-class _Correct(Function):
+class _Correct(Direct):
     @staticmethod
     def forward(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider, collider_prev, kappa,
                 pairs, constants, pair_ptr, pair_entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room,
@@ -87,21 +86,13 @@ class _Correct(Function):
         no_transforms()
 
 
-class _CorrectBackward(Function):
+class _CorrectBackward(Backward):
     @staticmethod
     def forward(x_bar, *saved):
         *tensors, share, motion, factor, model, time_step, friction_eps, needs = saved
         friction_eps = friction_eps or 1.0  # of loads that are zero
         s = Scenes(model, ops.TouchingFields(*(t.detach() for t in tensors)), time_step, friction_eps)
         return _adjoints(s, x_bar, share, motion, factor, needs)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> Any:
-        no_second_derivative()
 
 
 def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: Tensor, needs: Sequence[bool]
@@ -137,6 +128,3 @@ def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: T
     none = f.x.new_empty((0,))
     bars = [(out.get(name, none), t) for name, t in zip(f._fields, f, strict=True) if wants[name]]
     return tuple(ops.sum_to(bar, t.shape) if bar.numel() else torch.zeros_like(t) for bar, t in bars)
-
-
-ops.ready_signature(_Correct)

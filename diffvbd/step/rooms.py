@@ -48,8 +48,9 @@ def rooms_of_sweeps(motion: Motion, surface: ContactSurface, barrier: PairBarrie
         x, begin: Where the sweeps begin, and where the part began, [B, V, 3] [m].
     """
     s, none = surface, x.new_empty((0,))
-    points = (t.detach().contiguous() for t in (x, start.x, begin, motion.move, motion.fall))
+    own_center, own_room = start.own or (none, none)
+    x, led, begin, move, fall = (t.detach().contiguous() for t in (x, start.x, begin, motion.move, motion.fall))
     return sweep_rooms(
-        *points, motion.apart, motion.stretched, start.center, start.room, *(start.own or (none, none)), s.held,
-        s.body_order, s.body_ptr, ROOM, LEAST_ROOM * barrier.dhat,
+        x, led, begin, move, fall, motion.apart, motion.stretched, start.center, start.room, own_center, own_room,
+        s.held, s.body_order, s.body_ptr, ROOM, LEAST_ROOM * barrier.dhat,
     )  # fmt: skip

@@ -6,16 +6,15 @@ from __future__ import annotations
 from typing import Any
 
 from torch import Tensor
-from torch.autograd import Function
 
 from .. import ops
 from ..adjoint.contact_lag import Pairs, pair_lag, sum_at_corners
 from ..model.model import Model
-from ..ops import no_second_derivative, not_batched
+from ..ops import Backward, Direct, not_batched
 from ..ops import unsupported as ops_unsupported
 
 
-class _Unsupported(Function):
+class _Unsupported(Direct):
     """The lift that is left [B, V, 3]. constants: held_bodies, body_order, body_ptr and the time step."""
 
     @staticmethod
@@ -39,7 +38,7 @@ class _Unsupported(Function):
         return by_x, lift_bar, force_bar, mass_bar, planes_bar if wants_planes else None, None, None
 
 
-class _UnsupportedBackward(Function):
+class _UnsupportedBackward(Backward):
     @staticmethod
     def forward(bar, x, lift, force, mass, planes, origin, constants, wants_planes):
         x_bar, lift_bar, force_bar, mass_bar, planes_bar = ops_unsupported.unsupported_backward(
@@ -49,17 +48,6 @@ class _UnsupportedBackward(Function):
         if wants_planes:
             planes_bar = ops.sum_to(planes_bar, (planes.shape[0], 1, planes_bar.shape[2])).reshape(planes.shape)
         return x_bar, lift_bar, force_bar, mass_bar, planes_bar
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Any) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> Any:
-        no_second_derivative()
-
-
-ops.ready_signature(_Unsupported, _UnsupportedBackward)
 
 
 def unsupported(model: Model, x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor, mass: Tensor, lift: Tensor,
