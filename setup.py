@@ -39,6 +39,7 @@ CPU_SOURCES = [
     "csrc/cpu/contact.cpp",
     "csrc/cpu/contact_rigid.cpp",
     "csrc/cpu/contact_rigid_backward.cpp",
+    "csrc/cpu/contact_rigid_move.cpp",
     "csrc/cpu/contact_rigid_reverse.cpp",
     "csrc/cpu/detect.cpp",
     "csrc/cpu/intersect.cpp",

@@ -5,6 +5,8 @@
 
 namespace diffvbd {
 
+inline rigid::Vector vector_of(const double* a) { return {a[0], a[1], a[2]}; }
+
 // The Newton system of each scene, its factor and its solution: center of mass [B, bodies, 3], motion
 // [B, bodies, 6] and factor [B, RigidInputs::matrix_size()] over a turn and a shift of each body.
 template <class T>
@@ -31,9 +33,9 @@ template <class T>
 void rigid_vertices_backward(const contact::RigidInputs<T>& in, const double* motions, const double* solutions,
                              const contact::VirtualMotions<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag);
 
-// Cholesky factors of `count` matrices [size, size], in their lower triangles; what is no number says that one is not
-// positive definite. And x [size] = factor^-T factor^-1 x of each.
-void cholesky(int64_t count, int64_t size, double* matrices);
+// The Cholesky factor of a matrix [size, size], in its lower triangle; what is no number says that it is not positive
+// definite. And x [size] = factor^-T factor^-1 x of each of `count`.
+void cholesky(int64_t size, double* matrix);
 void cholesky_solve(int64_t count, int64_t size, const double* factors, double* x);
 
 }  // namespace diffvbd
