@@ -88,8 +88,13 @@ class Direct(Function):
         return super(Function, cls).apply(*args)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-class Backward(Direct):
-    """The backward of a Function, as one that has no derivative of its own."""
+class Backward(Function):
+    """The backward of a Function, as one that has no derivative of its own. Compiled autograd traces through it, which
+    it could not through the apply() of Direct."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        ready_signature(cls)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Any) -> None:

@@ -34,8 +34,15 @@ class _Unsupported(Direct):
         x_bar, lift_bar, force_bar, mass_bar, planes_bar = _UnsupportedBackward.apply(
             grads[0].contiguous(), *ctx.saved_tensors, ctx.constants, wants_planes
         )
-        by_x = x_bar if x_bar.numel() else None  # without a floor only forces know where vertices are
-        return by_x, lift_bar, force_bar, mass_bar, planes_bar if wants_planes else None, None, None
+        return (
+            x_bar if x_bar.numel() else None,
+            lift_bar,
+            force_bar,
+            mass_bar,
+            planes_bar if wants_planes else None,
+            None,
+            None,
+        )
 
 
 class _UnsupportedBackward(Backward):
@@ -69,5 +76,6 @@ def unsupported(model: Model, x: Tensor, origin: Tensor, collider: Tensor, kappa
     total = sum_at_corners((force * w)[..., None] * n[:, None], listed, x.shape[0], points)
     planes = x.new_empty((0,)) if floor_data is None else floor_data
     constants = (surface.held_bodies, surface.body_order, surface.body_ptr, time_step)
-    given = (t.contiguous() for t in (x, lift, total, mass, planes))
+    at = x.detach() if floor_data is None else x  # without a floor only forces know where vertices are
+    given = (t.contiguous() for t in (at, lift, total, mass, planes))
     return _Unsupported.apply(*given, origin, constants)
