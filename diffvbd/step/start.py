@@ -114,7 +114,9 @@ def begin(
         filters: Whether the planes of a floor hold back a start.
         parts: Whether bodies that are held back may start vertex by vertex, for which there must be filters.
     """
-    tensors = distinct(x, v, acceleration, prescribed, mass, energy_data, origin, mu, lam, rest)
+    # what choices look at must not seem to want a gradient: there is none, and compiled autograd adds it up
+    looked_at = (t if t is None else t.detach() for t in (mu, lam, rest))
+    tensors = distinct(x, v, acceleration, prescribed, mass, energy_data, origin, *looked_at)
     *listed, groups = bodies
     *listed_others, other_groups = others
     options = (data_count, time_step, FILTER_ETA, STARTS[start], filters)
