@@ -88,10 +88,14 @@ class _Correct(Direct):
 
 class _CorrectBackward(Backward):
     @staticmethod
-    def forward(x_bar, *saved):
-        *tensors, share, motion, factor, model, time_step, friction_eps, needs = saved
-        friction_eps = friction_eps or 1.0  # of loads that are zero
-        s = Scenes(model, ops.TouchingFields(*(t.detach() for t in tensors)), time_step, friction_eps)
+    def forward(x_bar, x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider, collider_prev,
+                kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center,
+                room, share, motion, factor, model, time_step, friction_eps, needs):  # fmt: skip
+        # torch.compile counts these arguments: *args would get the context as well
+        fields = ops.TouchingFields(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider,
+                                    collider_prev, kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs,
+                                    lag_ptr, lag_entry, floor_lag, center, room)  # fmt: skip
+        s = Scenes(model, fields, time_step, friction_eps or 1.0)  # which loads that are zero do not read
         return _adjoints(s, x_bar, share, motion, factor, needs)
 
 
