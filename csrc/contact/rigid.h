@@ -302,9 +302,18 @@ struct FloorSlip {
   double size;     // h^2 times the load [N]
 };
 template <class T>
+DIFFVBD_FN const T* floor_lag(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane) {
+  return in.floor_lag.data + b.scene * in.floor_lag.scene + (int64_t{v} * in.planes + plane) * 4;
+}
+// Whether a plane bears a vertex: most planes do not, and where there is no load there is no friction.
+template <class T>
+DIFFVBD_FN bool bears(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane) {
+  return *floor_lag(in, b, v, plane) != T(0);
+}
+template <class T>
 DIFFVBD_FN FloorSlip floor_slip(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane,
                                 const Vector& moved) {
-  const T* lag = in.floor_lag.data + b.scene * in.floor_lag.scene + (int64_t{v} * in.planes + plane) * 4;
+  const T* lag = floor_lag(in, b, v, plane);
   const Vector n = rigid::Body<T>::at(lag + 1), x = b.position(v), travel = x - b.state(v, x).x_prev + moved;
   const double h = in.scene.time_step;
   return {n, travel - dot(n, travel) * n, h * h * double(lag[0])};
@@ -315,6 +324,7 @@ template <class T>
 DIFFVBD_FN void add_floor_friction(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, const Vector& way,
                                    Vector& g, Sym3<double>& H) {
   for (int k = 0; k < in.planes; ++k) {
+    if (!bears(in, b, v, k)) continue;
     const FloorSlip a = floor_slip(in, b, v, k, way);
     const FrictionRate<double> f(square_root(dot(a.slip, a.slip)), in.friction_eps);
     const Vector along = way - dot(a.n, way) * a.n;
@@ -335,6 +345,7 @@ DIFFVBD_FN double vertex_value(const RigidInputs<T>& in, const rigid::Body<T>& b
   b.energies(
       v, [&](auto energy, int, const double* data, int count) { value += decltype(energy)::value(s, data, count); });
   for (int k = 0; k < in.planes; ++k) {
+    if (!bears(in, b, v, k)) continue;
     const FloorSlip a = floor_slip(in, b, v, k, x - b.position(v));
     value += a.size * slip_value(square_root(dot(a.slip, a.slip)), in.friction_eps);
   }

@@ -159,8 +159,10 @@ std::vector<std::vector<SlipLine>> lines_of_scene(const RigidInputs<T>& in, int6
     for (int32_t i = 0; in.free[k] && systems.works(k) && i < body.size(); ++i) {
       const int32_t v = body.vertex(i);
       const Vector arm = body.position(v) - vector_of(slid.center + 3 * k);
-      for (int plane = 0; plane < in.planes; ++plane)
-        out[in.together() ? 0 : k].push_back(slip_line(in, body, v, plane, arm, slid.motion + own, step + own));
+      for (int plane = 0; plane < in.planes; ++plane) {
+        if (bears(in, body, v, plane))
+          out[in.together() ? 0 : k].push_back(slip_line(in, body, v, plane, arm, slid.motion + own, step + own));
+      }
     }
   }
   return out;

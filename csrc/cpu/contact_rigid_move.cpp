@@ -1,6 +1,7 @@
 #include <torch/csrc/stable/ops.h>
 
 #include <algorithm>
+#include <cmath>
 #include <utility>
 #include <vector>
 
@@ -14,31 +15,7 @@ using rigid::Body, rigid::Vector;
 
 namespace {
 
-// Calls f(press, pair, whether it is a lagged one) for each pair of a scene that acts.
-template <class T, class F>
-void each_press(const RigidInputs<T>& in, int64_t scene, bool moved, const F& f) {
-  const CornerPoints<T> at{in, moved};
-  PairPress press;
-  for (int64_t i = in.first_listed(scene); i < in.first_listed(scene + 1); ++i) {
-    if (barrier_press(in, i, at, press)) f(press, false);
-  }
-  for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
-    if (lagged_press(in, i, at, Slid{}, press, -1)) f(press, true);
-  }
-}
-
-template <class T>
-double potential_of(const RigidInputs<T>& in, int64_t scene, bool moved) {
-  double value = 0;
-  for (int32_t k = 0; k < in.bodies(); ++k) {
-    const Body<T> body{in.scene, scene, k};
-    double own = 0;
-    for (int32_t i = 0; in.free[k] && i < body.size(); ++i) own += vertex_value(in, body, body.vertex(i), moved);
-    value += own;
-  }
-  each_press(in, scene, moved, [&](const PairPress& a, bool) { value += a.value; });
-  return value;
-}
+constexpr double kRounded = 1e-6;  // of a length, that rounding cannot reach
 
 template <class T>
 class Tries {
@@ -52,26 +29,25 @@ class Tries {
         share_(share),
         low_(in.bodies()),
         blocked_(in.bodies()) {
-    each_press(in, scene, false, [&](const PairPress& a, bool lagged) {
-      before_ += a.value;
-      if (!lagged && a.body[0] >= 0 && a.body[1] >= 0) touching_.emplace_back(a.body[0], a.body[1]);
+    find_near();
+    before_ = potential(false, [&](const PairPress& a) {
+      if (a.body[0] >= 0 && a.body[1] >= 0) touching_.emplace_back(a.body[0], a.body[1]);
     });
   }
 
-  // T shares and flags of all units, as the test of a pair takes them
-  void run(const AdvanceState<T>& state) {
+  // state: shares and flags of all units, as the test of a pair takes them. motions [B, V]: memory.
+  void run(AdvanceState<T> state, std::vector<Motion<T>>& motions) {
     const int32_t n = in_.bodies();
-    for (int32_t k = 0; k < n; ++k) {
-      const Body<T> body{in_.scene, scene_, k};
-      double own = 0;
-      for (int32_t i = 0; in_.free[k] && i < body.size(); ++i) own += vertex_value(in_, body, body.vertex(i), false);
-      before_ += own;
-    }
+    state.motion = motions.data();
     std::fill_n(share_, n, 1.0);
     for (int attempt = 0; attempt < kTries; ++attempt) {
       displace();
+      for (int64_t v = 0; v < in_.scene.vertices; ++v) {
+        const int64_t row = scene_ * in_.scene.vertices + v;
+        motions[row] = motion_of(in_.gate, state, row);
+      }
       const bool fits = test(state);
-      const double after = fits ? potential_of(in_, scene_, true) : 0;
+      const double after = fits ? potential(true, [](const PairPress&) {}) : 0;
       if (is_safe(before_, after, fits)) return;
       for (int32_t k = 0; k < n; ++k) low_[k] = shortened(blocked_[k], fits, attempt);
       for (int spread = 0; spread < kSpreads; ++spread) {
@@ -89,6 +65,54 @@ class Tries {
   }
 
  private:
+  // The listed pairs that some share of the motions may bring within reach of their barrier. A gap shrinks by no more
+  // than its sides have moved since it was taken.
+  void find_near() {
+    std::vector<double> farthest(in_.bodies() + 1, 0.0);  // that a vertex of each body may be from where it was then
+    for (int32_t k = 0; k < in_.bodies(); ++k) {
+      const Body<T> body{in_.scene, scene_, k};
+      const Vector center = vector_of(center_ + 3 * k);
+      const double *turn = motion_ + kUnknowns * k, *shift = turn + 3;
+      const double angle = std::hypot(turn[0], turn[1], turn[2]), way = std::hypot(shift[0], shift[1], shift[2]);
+      for (int32_t i = 0; i < body.size(); ++i) {
+        const Vector x = body.position(body.vertex(i)), arm = x - center;
+        const Vector since = x - Body<T>::at(in_.gate.center + 3 * body.row(body.vertex(i)));
+        const double far = std::sqrt(dot(since, since)) + way + angle * std::sqrt(dot(arm, arm));
+        farthest[k] = std::max(farthest[k], (1 + kRounded) * far);
+      }
+    }
+    for (int64_t i = in_.first_listed(scene_); i < in_.first_listed(scene_ + 1); ++i) {
+      if (!is_between(in_, i)) continue;
+      const int32_t* record = in_.gate.listed.pairs + kPairRow * i;
+      const T* constants = in_.gate.constants + kConstants * i;
+      const int32_t a = in_.gate.body[record[0]], b = in_.gate.body[record[sides(record[4])]];
+      const bool known = a < in_.bodies() && b < in_.bodies();  // whose gap is of the time of the centers
+      const double room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
+      if (!known || !(farthest[a] + farthest[b] < (1 - kRounded) * room)) near_.push_back(i);
+    }
+  }
+  // Of all bodies, where they are or would go; calls f(press) for each listed pair that pushes.
+  template <class F>
+  double potential(bool moved, const F& f) const {
+    double value = 0;
+    for (int32_t k = 0; k < in_.bodies(); ++k) {
+      const Body<T> body{in_.scene, scene_, k};
+      double own = 0;
+      for (int32_t i = 0; in_.free[k] && i < body.size(); ++i) own += vertex_value(in_, body, body.vertex(i), moved);
+      value += own;
+    }
+    const CornerPoints<T> at{in_, moved};
+    PairPress press;
+    for (const int64_t i : near_) {
+      if (!barrier_press(in_, i, at, press)) continue;
+      value += press.value;
+      f(press);
+    }
+    for (int64_t i = in_.first_lagged(scene_); i < in_.first_lagged(scene_ + 1); ++i) {
+      if (lagged_press(in_, i, at, Slid{}, press, -1)) value += press.value;
+    }
+    return value;
+  }
   void displace() const {
     for (int32_t k = 0; k < in_.bodies(); ++k) {
       const Body<T> body{in_.scene, scene_, k};
@@ -103,9 +127,7 @@ class Tries {
   bool test(const AdvanceState<T>& state) {
     uint8_t* blocked = state.blocked + scene_ * in_.bodies();
     std::fill_n(blocked, in_.bodies(), uint8_t{0});
-    for (int64_t i = in_.first_listed(scene_); i < in_.first_listed(scene_ + 1); ++i) {
-      if (is_between(in_, i)) try_pair(in_.gate, state, i, 0);
-    }
+    for (const int64_t i : near_) try_pair(in_.gate, state, i, 0);
     for (int32_t k = 0; k < in_.bodies(); ++k) {
       const Body<T> body{in_.scene, scene_, k};
       for (int32_t i = 0; in_.free[k] && i < body.size(); ++i) {
@@ -122,6 +144,7 @@ class Tries {
   const double *center_, *motion_;
   T* move_;
   double *share_, before_ = 0;
+  std::vector<int64_t> near_;
   std::vector<double> low_;
   std::vector<uint8_t> blocked_;
   std::vector<std::pair<int32_t, int32_t>> touching_;
@@ -134,10 +157,11 @@ void rigid_move(const RigidInputs<T>& in, const double* center, const double* mo
   const int64_t n = in.bodies(), units = in.gate.units();
   std::vector<T> none(units, T(0)), all(units, T(1));
   std::vector<uint8_t> blocked(units), stamp(units), failed(in.scene.scenes);
+  std::vector<Motion<T>> motions(in.scene.scenes * in.scene.vertices);
   const AdvanceState<T> state{none.data(), all.data(), blocked.data(), stamp.data(), failed.data(), false};
   torch::stable::parallel_for(0, in.scene.scenes, 1, [&](int64_t begin, int64_t end) {
     for (int64_t s = begin; s < end; ++s) {
-      Tries<T>(in, s, center + 3 * n * s, motion + kUnknowns * n * s, move, share + n * s).run(state);
+      Tries<T>(in, s, center + 3 * n * s, motion + kUnknowns * n * s, move, share + n * s).run(state, motions);
       for (int64_t i = 3 * s * in.scene.vertices; i < 3 * (s + 1) * in.scene.vertices; ++i)
         x[i] = in.scene.x[i] + move[i];
     }

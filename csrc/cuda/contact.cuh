@@ -1,4 +1,4 @@
-// Kernels of contact: kShare threads for each vertex of a color, for each corner point, or a thread for each pair.
+// Kernels of contact: several threads for each vertex of a color, kShare for each corner point, or one for each pair.
 #pragma once
 
 #include "../contact/lag.h"
@@ -12,23 +12,27 @@ using contact::ContactAdjoints;
 using contact::ContactInputs;
 
 constexpr int kShare = 8, kContactThreads = 128;
+// Of a vertex of a color that has few, which do not fill the device: its pairs are waited for one after another.
+constexpr int kWide = 32;
+constexpr int64_t kFewVertices = 2048;  // of a color, in all scenes
 
-template <class T>
+template <int share, class T>
 __device__ __forceinline__ void sum_share(T& a) {
 #pragma unroll
-  for (int offset = kShare / 2; offset > 0; offset /= 2) a += __shfl_xor_sync(kWholeWarp, a, offset);
+  for (int offset = share / 2; offset > 0; offset /= 2) a += __shfl_xor_sync(kWholeWarp, a, offset);
 }
-template <class T>
+template <int share, class T>
 __device__ __forceinline__ void sum_share(Vec3<T>& a) {
-  sum_share(a.x), sum_share(a.y), sum_share(a.z);
+  sum_share<share>(a.x), sum_share<share>(a.y), sum_share<share>(a.z);
 }
-template <class T>
+template <int share, class T>
 __device__ __forceinline__ void sum_share(Sym3<T>& a) {
-  sum_share(a.xx), sum_share(a.xy), sum_share(a.xz), sum_share(a.yy), sum_share(a.yz), sum_share(a.zz);
+  sum_share<share>(a.xx), sum_share<share>(a.xy), sum_share<share>(a.xz), sum_share<share>(a.yy);
+  sum_share<share>(a.yz), sum_share<share>(a.zz);
 }
 
-// Which of kShare threads of which vertex of the blocks [begin, end) a thread is.
-template <class T>
+// Which of `share` threads of which vertex of the blocks [begin, end) a thread is.
+template <int share, class T>
 struct Member {
   int lane, vertex = -1;  // -1: a phantom, or beyond the end
   int64_t local = 0, scene = 0, position = 0;
@@ -36,9 +40,9 @@ struct Member {
   int64_t first, last;  // positions of the blocks
   __device__ __forceinline__ Member(const StepView<T>& s, const ContactInputs<T>& in, int64_t begin, int64_t end)
       : first(begin * kSlice), last(end * kSlice) {
-    const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x, item = i / kShare;
+    const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x, item = i / share;
     const int64_t size = (end - begin) * kSlice;
-    lane = static_cast<int>(i % kShare);
+    lane = static_cast<int>(i % share);
     local = item / size;
     if (local >= s.scenes) return;
     position = begin * kSlice + (item - local * size);
@@ -66,10 +70,10 @@ __global__ void load_contact(const __grid_constant__ StepView<T> s, const __grid
   if (local == 0) s.w.position[own] = static_cast<int32_t>(position);
 }
 
-template <class T>
+template <int share, class T>
 __global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
                                  int64_t begin, int64_t end) {
-  const Member<T> at(s, in, begin, end);
+  const Member<share, T> at(s, in, begin, end);
   if (s.w.before && at.vertex >= 0 && at.lane == 0) store_row(s.w.before, at.row(s), load_row(s.w.x, at.row(s)));
   if (!__any_sync(kWholeWarp, at.touches)) return;
   Vec3<T> g = zero3<T>();
@@ -77,19 +81,19 @@ __global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __
   if (at.touches) {
     const SweepRows<T> rows = at.rows(s);
     const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
-    contact::add_pairs(source, at.vertex, at.lane, kShare, s.parameters.time_step, g, H);
+    contact::add_pairs(source, at.vertex, at.lane, share, s.parameters.time_step, g, H);
   }
-  sum_share(g), sum_share(H);
+  sum_share<share>(g), sum_share<share>(H);
   if (!at.touches || at.lane != 0) return;
   const T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
   for (int k = 0; k < kContactScalars; ++k) s.w.contact[at.row(s) * kContactScalars + k] = values[k];
 }
 
 // The threads of a vertex look at its pairs in turn; the last one that any of them needs is the limit.
-template <class T>
+template <int share, class T>
 __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
                               uint8_t* cut, int sweep, int64_t begin, int64_t end) {
-  const Member<T> at(s, in, begin, end);
+  const Member<share, T> at(s, in, begin, end);
   const bool there = at.vertex >= 0;
   int exponent = 0;
   Vec3<T> from = zero3<T>(), d = zero3<T>();
@@ -98,10 +102,10 @@ __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __gri
     const contact::Source<T, RowsBefore<T>> source{in, at.scene, rows};
     from = load_row(s.w.before, at.row(s)), d = load_row(s.w.x, at.row(s)) - from;
     exponent = contact::limit_by_room(source, at.vertex, from, d);
-    exponent = contact::limit_by_pairs(source, at.vertex, d, at.lane, kShare, exponent);
+    exponent = contact::limit_by_pairs(source, at.vertex, d, at.lane, share, exponent);
   }
 #pragma unroll
-  for (int offset = kShare / 2; offset > 0; offset /= 2) {
+  for (int offset = share / 2; offset > 0; offset /= 2) {
     exponent = max(exponent, __shfl_xor_sync(kWholeWarp, exponent, offset));
   }
   if (!there || at.lane != 0) return;
@@ -114,11 +118,11 @@ __device__ __forceinline__ void add_row(T* rows, int64_t row, const Vec3<T>& a) 
   contact::add_at(rows + kRow * row, a);
 }
 
-template <class T>
+template <int share, class T>
 __global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
                                 const __grid_constant__ ContactAdjoints<T> slots, int sweep, int rows_of_tape,
                                 int64_t begin, int64_t end) {
-  const Member<T> at(s, in, begin, end);
+  const Member<share, T> at(s, in, begin, end);
   if (at.vertex >= 0 && at.lane == 0) {
     const int64_t active = s.plan.num_active;
     const int rank = __ldg(s.plan.block_rank + at.position / kSlice) + static_cast<int>(at.position % kSlice);
@@ -127,28 +131,28 @@ __global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __g
   }
   if (!__any_sync(kWholeWarp, at.touches)) return;
   Vec3<T> now = zero3<T>(), prev = zero3<T>();
-  if (at.touches) contact::take_pairs(in, slots, at.scene, at.vertex, at.lane, kShare, now, prev);
-  sum_share(now), sum_share(prev);
+  if (at.touches) contact::take_pairs(in, slots, at.scene, at.vertex, at.lane, share, now, prev);
+  sum_share<share>(now), sum_share<share>(prev);
   if (!at.touches || at.lane != 0) return;
   add_row(s.w.x_bar, at.row(s), now);
   contact::add_at(slots.prev + 3 * (at.scene * in.corners + at.vertex), prev);
 }
 
-template <class T>
+template <int share, class T>
 __global__ void reverse_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
                                 const __grid_constant__ ContactAdjoints<T> slots, int64_t begin, int64_t end) {
-  const Member<T> at(s, in, begin, end);
+  const Member<share, T> at(s, in, begin, end);
   if (!__any_sync(kWholeWarp, at.touches)) return;
   Vec3<T> own = zero3<T>();
   if (at.touches) {
     const T* turn = s.w.turn + 6 * at.row(s);
     const SweepRows<T> rows = at.rows(s);
     const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
-    contact::reverse_pairs(source, slots, at.vertex, at.lane, kShare, s.parameters.time_step, contact::vector_at(turn),
+    contact::reverse_pairs(source, slots, at.vertex, at.lane, share, s.parameters.time_step, contact::vector_at(turn),
                            contact::vector_at(turn + 3), own);
   }
   if (in.planes == 0) return;
-  sum_share(own);
+  sum_share<share>(own);
   if (!at.touches || at.lane != 0) return;
   add_row(s.w.x_bar, at.row(s), own);
   contact::add_at(slots.prev + 3 * (at.scene * in.corners + at.vertex), -own);
@@ -164,7 +168,7 @@ __global__ void collect_contact(const __grid_constant__ StepView<T> s, const __g
   if (there) {
     contact::take_pairs(in, slots, scene, static_cast<int>(corner), static_cast<int>(i % kShare), kShare, now, prev);
   }
-  sum_share(now), sum_share(prev);
+  sum_share<kShare>(now), sum_share<kShare>(prev);
   if (!there || i % kShare != 0) return;
   if (corner < in.num_vertices) {
     add_row(s.w.x_bar, local * s.positions + s.w.position[corner], now);
@@ -299,6 +303,17 @@ cudaError_t launch_contact(void (*kernel)(P...), int64_t items, cudaStream_t str
                           stream);
 }
 
+// For the vertices of the blocks [begin, end): with as many threads for each as the whole batch says, so that a scene
+// has the same bits in any chunk of it.
+template <class T, class... P, class... A>
+cudaError_t launch_color(void (*kernel)(P...), void (*wide)(P...), const ContactPasses<T>& passes, int64_t begin,
+                         int64_t end, A... arguments) {
+  const int64_t vertices = (end - begin) * kSlice;
+  const bool few = passes.scenes * vertices <= kFewVertices;
+  return launch_contact(few ? wide : kernel, passes.s.scenes * vertices * (few ? kWide : kShare), passes.stream,
+                        arguments...);
+}
+
 }  // namespace
 
 template <class T>
@@ -307,22 +322,22 @@ cudaError_t ContactPasses<T>::load() const {
 }
 template <class T>
 cudaError_t ContactPasses<T>::assemble(int64_t begin, int64_t end) const {
-  return launch_contact(assemble_contact<T>, s.scenes * (end - begin) * kSlice * kShare, stream, s, in, begin, end);
+  return launch_color<T>(assemble_contact<kShare, T>, assemble_contact<kWide, T>, *this, begin, end, s, in, begin, end);
 }
 template <class T>
 cudaError_t ContactPasses<T>::limit(int sweep, int64_t begin, int64_t end) const {
-  return launch_contact(limit_contact<T>, s.scenes * (end - begin) * kSlice * kShare, stream, s, in, cut, sweep, begin,
-                        end);
+  return launch_color<T>(limit_contact<kShare, T>, limit_contact<kWide, T>, *this, begin, end, s, in, cut, sweep, begin,
+                         end);
 }
 template <class T>
 cudaError_t ContactPasses<T>::prepare(int sweep, int64_t begin, int64_t end) const {
-  return launch_contact(prepare_contact<T>, s.scenes * (end - begin) * kSlice * kShare, stream, s, in, *out->contact,
-                        sweep, tape_rows(s.tape_policy, true), begin, end);
+  return launch_color<T>(prepare_contact<kShare, T>, prepare_contact<kWide, T>, *this, begin, end, s, in, *out->contact,
+                         sweep, tape_rows(s.tape_policy, true), begin, end);
 }
 template <class T>
 cudaError_t ContactPasses<T>::reverse(int64_t begin, int64_t end) const {
-  return launch_contact(reverse_contact<T>, s.scenes * (end - begin) * kSlice * kShare, stream, s, in, *out->contact,
-                        begin, end);
+  return launch_color<T>(reverse_contact<kShare, T>, reverse_contact<kWide, T>, *this, begin, end, s, in, *out->contact,
+                         begin, end);
 }
 template <class T>
 cudaError_t ContactPasses<T>::collect() const {

@@ -13,6 +13,7 @@ struct ContactPasses {
   const contact::ContactInputs<T>& in;
   const StepAdjoints<T>* out;  // null in the forward
   uint8_t* cut;                // null in the reverse
+  int64_t scenes;              // of the batch
   cudaStream_t stream;
 
   // No pairs yet; where vertices are within their rooms.

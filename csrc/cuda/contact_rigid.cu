@@ -1,3 +1,4 @@
+// The rigid correction where many bodies are solved for together: all work on a scene is shared by several blocks.
 #include "../contact/rigid_slip.h"
 #include "contact_rigid.cuh"
 
@@ -6,21 +7,26 @@ namespace {
 
 constexpr unsigned kAll = 0xffffffffu;
 
-// Calls f(row), with all lanes of a warp, for the rows of a scene that `wanted`(row) names; in ascending order for each
-// of the warps that share them.
-template <class T, class Wanted, class F>
-__device__ void each_row(const RigidInputs<T>& in, const PairRoom& room, int64_t scene, int warp, int warps,
-                         const Wanted& wanted, const F& f) {
-  const int64_t begins[] = {in.first_listed(scene), room.listed + in.first_lagged(scene)};
-  const int64_t ends[] = {in.first_listed(scene + 1), room.listed + in.first_lagged(scene + 1)};
-  for (int list = 0; list < 2; ++list) {
-    for (int64_t first = begins[list] + 32 * warp; first < ends[list]; first += 32 * warps) {
-      const int64_t own = first + threadIdx.x % 32;
-      unsigned found = __ballot_sync(kAll, own < ends[list] && wanted(own));
-      while (found != 0) {
-        const int lane = __ffs(static_cast<int>(found)) - 1;
-        found &= found - 1;
-        f(first + lane);
+// Calls f(row, side), with all lanes of a warp, for the sides that a body has of pairs which act; warps share its
+// vertices, and each meets them in ascending order.
+template <class T, class F>
+__device__ void each_row(const RigidInputs<T>& in, const PairRoom& room, const int32_t* bodies, const Body<T>& body,
+                         int warp, int warps, const F& f) {
+  for (int which = 0; which < (in.lag ? 2 : 1); ++which) {
+    const PairList& list = which == 0 ? in.gate.listed : in.lagged;
+    const int64_t before = which == 0 ? 0 : room.listed;
+    for (int32_t i = warp; i < body.size(); i += warps) {
+      const int64_t corner = body.scene * in.gate.corners + body.vertex(i);
+      for (int32_t first = list.ptr[corner]; first < list.ptr[corner + 1]; first += 32) {
+        const int32_t own = first + static_cast<int32_t>(threadIdx.x % 32);
+        const int32_t entry = own < list.ptr[corner + 1] ? list.entry[own] : 3;
+        const int side = side_of(list, bodies + 2 * before, entry, body.body);
+        unsigned found = __ballot_sync(kAll, 0 <= side);
+        while (found != 0) {
+          const int lane = __ffs(static_cast<int>(found)) - 1;
+          found &= found - 1;
+          f(before + __shfl_sync(kAll, entry >> 2, lane), __shfl_sync(kAll, side, lane));
+        }
       }
     }
   }
@@ -32,14 +38,6 @@ __device__ __forceinline__ void unpack(int packed, int& i, int& j) {
   j = packed - rigid::at6(i, 0);
 }
 
-// Apart, so that what scenes of few bodies never need takes no registers from them.
-template <class T>
-__device__ __noinline__ PairPress press_alone(const RigidInputs<T>& in, int64_t pair, Slid slid, int side) {
-  PairPress a;
-  lagged_press(in, pair, CornerPoints<T>{in, false}, slid, a, side);
-  return a;
-}
-
 // A block for each body of each scene: center, gradient, and what it adds to the diagonal of the matrix.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
@@ -48,11 +46,11 @@ __global__ void __launch_bounds__(kThreads)
   __shared__ double part[kWarps][kMostSums];
   const int32_t n = in.bodies(), k = static_cast<int32_t>(blockIdx.x % n);
   const int64_t scene = blockIdx.x / n, row = blockIdx.x;
-  if (is_done(state, in.together() ? scene : row)) return;
+  if (is_done(state, scene)) return;
   const Body<T> body{in.scene, scene, k};
   const BlockTeam team{part};
   const Whole whole = whole_of(body, team);
-  const bool free = in.free[k] && 0 < whole.mass, together = in.together();
+  const bool free = in.free[k] && 0 < whole.mass;
   const Vector c = whole.center;
   constexpr int kOwn = kUnknowns + rigid::kSix;
   double total[kOwn + 1];  // and the sum of m r^2
@@ -72,21 +70,14 @@ __global__ void __launch_bounds__(kThreads)
   if (kUnknowns <= lane && lane < kMostSums - 1) unpack(lane - kUnknowns, i, j);
   double own = 0;
   if (free) {
-    each_row(
-        in, room, scene, warp, kWarps, [&](int64_t at) { return sides[2 * at] == k || sides[2 * at + 1] == k; },
-        [&](int64_t at) {
-          PairPress a = load_press(press + kPressDoubles * at, sides + 2 * at);
-          const int side = a.body[0] == k ? 0 : 1;
-          // of friction the sides have different presses, if each is solved for alone
-          if (!together && room.listed <= at && a.body[1 - side] >= 0) {
-            a = press_alone(in, at - room.listed, of_scene(Slid{center, slid}, scene, n), side);
-          }
-          if (lane < kUnknowns) {
-            own += a.gradient(side, lane, c);
-          } else if (lane < kOwn) {
-            own += borne(a, together) * a.block(side, i, j, c);
-          }
-        });
+    each_row(in, room, sides, body, warp, kWarps, [&](int64_t at, int side) {
+      const PairPress a = load_press(press + kPressDoubles * at, sides + 2 * at);
+      if (lane < kUnknowns) {
+        own += a.gradient(side, lane, c);
+      } else if (lane < kOwn) {
+        own += a.block(side, i, j, c);
+      }
+    });
   }
   __syncthreads();
   if (lane < kOwn) part[warp][lane] = own;
@@ -103,7 +94,7 @@ __global__ void __launch_bounds__(kThreads)
     gradient[kUnknowns * row + lane] = sum;
     return;
   }
-  const MatrixPart to(matrix + in.matrix_size() * scene, n, together, k, k);
+  const MatrixPart to(matrix + in.matrix_size() * scene, n, true, k, k);
   if (i == j) sum += free ? kLeastInertia * (i < 3 ? total[kOwn] : whole.mass) : 1;
   to(i, j) = to(j, i) = sum;
 }
@@ -119,21 +110,16 @@ __global__ void __launch_bounds__(32)
   if (is_done(state, scene)) return;
   for (int32_t e = threadIdx.x; e < 36 * n; e += 32) cells[e] = 0;
   __syncwarp();
-  each_row(
-      in, room, scene, 0, 1,
-      [&](int64_t at) {
-        const int32_t one = sides[2 * at], two = sides[2 * at + 1];
-        return one >= 0 && two >= 0 && min(one, two) == k;
-      },
-      [&](int64_t at) {
-        const PairPress a = load_press(press + kPressDoubles * at, sides + 2 * at);
-        const int side = a.body[0] == k ? 0 : 1;
-        const int32_t other = a.body[1 - side];
-        const Vector c = vector_of(center + 3 * (scene * n + k)), d = vector_of(center + 3 * (scene * n + other));
-        for (int32_t e = threadIdx.x; e < 36; e += 32) {
-          cells[36 * other + e] += dot(a.map(side, e / 6, c), a.stiffness * a.map(1 - side, e % 6, d));
-        }
-      });
+  const Vector c = vector_of(center + 3 * (scene * n + k));
+  each_row(in, room, sides, Body<T>{in.scene, scene, k}, 0, 1, [&](int64_t at, int side) {
+    const int32_t other = sides[2 * at + 1 - side];
+    if (other <= k) return;
+    const PairPress a = load_press(press + kPressDoubles * at, sides + 2 * at);
+    const Vector d = vector_of(center + 3 * (scene * n + other));
+    for (int32_t e = threadIdx.x; e < 36; e += 32) {
+      cells[36 * other + e] += dot(a.map(side, e / 6, c), a.stiffness * a.map(1 - side, e % 6, d));
+    }
+  });
   __syncwarp();
   for (int32_t other = k + 1; other < n; ++other) {
     const MatrixPart upper(matrix + in.matrix_size() * scene, n, true, k, other);
@@ -169,7 +155,7 @@ __device__ __forceinline__ double energy_of(const BlockTeam& team, const double*
   return total[0];
 }
 
-// A block for each system: adds a share of a step of Newton's method to motions.
+// A block for each scene: adds a share of a step of Newton's method to motions.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     step_kernel(const __grid_constant__ RigidInputs<T> in, const double* center, const double* factor,
@@ -178,10 +164,7 @@ __global__ void __launch_bounds__(kThreads)
   if (was == kDone) return;
   __shared__ double part[kWarps][kMostSums];
   const BlockTeam team{part};
-  const int64_t size = in.system_size(), n = in.bodies();
-  const bool together = in.together();
-  const int64_t scene = together ? blockIdx.x : blockIdx.x / n;
-  const auto k = static_cast<int32_t>(together ? 0 : blockIdx.x % n);  // the body, if it is one
+  const int64_t size = in.system_size(), scene = blockIdx.x;
   const double *own = factor + size * size * blockIdx.x, *to = step + size * blockIdx.x;
   const double fall = energy_of(team, own, size, to, nullptr);
   const double whole = energy_of(team, own, size, to, motion + size * blockIdx.x);
@@ -191,31 +174,26 @@ __global__ void __launch_bounds__(kThreads)
     if (threadIdx.x == 0) state[blockIdx.x] = was == kSettledAt ? kDone : kSettledAt;
     return;
   }
-  const Slid slid = of_scene({center, motion}, scene, n);
-  const double* steps = step + kUnknowns * scene * n;
+  const Slid slid = of_scene({center, motion}, scene, in.bodies());
   const CornerPoints<T> at{in, false};
   const int64_t lagged = in.first_lagged(scene);
   const auto rubbing = static_cast<int32_t>(in.first_lagged(scene + 1) - lagged);
-  const Body<T> one{in.scene, scene, k};
-  const int32_t planes = in.planes * (together ? static_cast<int32_t>(in.scene.vertices) : one.size());
+  const auto planes = static_cast<int32_t>(in.planes * in.scene.vertices);
   const double share = slip_share(fall, [&](double tried) {
     double sum[1];
     team.template sum<1>(planes + rubbing, sum, [&](int32_t i, double* out) {
       if (i < planes) {
-        const int32_t v = together ? i / in.planes : one.vertex(i / in.planes);
-        const int32_t b = together ? in.gate.body[v] : k;
-        if (!in.free[b]) return;
+        const int32_t v = i / in.planes, b = in.gate.body[v];
         const Body<T> body{in.scene, scene, b};
+        if (!in.free[b] || !bears(in, body, v, i % in.planes)) return;
         const Vector arm = body.position(v) - vector_of(slid.center + 3 * b);
         const int64_t first = int64_t{kUnknowns} * b;
-        out[0] += slip_line(in, body, v, i % in.planes, arm, slid.motion + first, steps + first).excess(tried);
+        out[0] += slip_line(in, body, v, i % in.planes, arm, slid.motion + first, to + first).excess(tried);
         return;
       }
       const int64_t pair = lagged + i - planes;
-      each_lagged_press(in, pair, at, slid, [&](const PairPress& a) {
-        if (!together && (a.body[0] < 0 ? a.body[1] : a.body[0]) != k) return;
-        out[0] += slip_line(in, pair, a, slid.center, steps).excess(tried);
-      });
+      PairPress a;
+      if (lagged_press(in, pair, at, slid, a, -1)) out[0] += slip_line(in, pair, a, slid.center, to).excess(tried);
     });
     return sum[0];
   });
@@ -226,7 +204,7 @@ template <class T>
 __global__ void __launch_bounds__(kOne)
     keep_finite_kernel(const __grid_constant__ RigidInputs<T> in, const uint8_t* state, double* motion) {
   const int64_t row = own_item();
-  if (row >= in.scene.scenes * in.bodies() || is_done(state, in.together() ? row / in.bodies() : row)) return;
+  if (row >= in.scene.scenes * in.bodies() || is_done(state, row / in.bodies())) return;
   keep_finite(motion + kUnknowns * row);
 }
 
@@ -254,6 +232,11 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
   auto* step = reinterpret_cast<double*>(take(unknowns * sizeof(double)));
   uint8_t* state = take(in.systems());
   const bool rubs = in.rubs();
+  if (in.system_size() <= kUnknowns * kFew) {
+    if (room.rows() > 0)
+      press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, Slid{}, nullptr, sides, press);
+    return solve_few<T>(in, room, sides, press, center, motion, factor, stream);
+  }
   if (rubs) {
     if (auto error = cudaMemsetAsync(motion, 0, unknowns * sizeof(double), stream)) return error;
     if (auto error = cudaMemsetAsync(state, kOnItsWay, in.systems(), stream)) return error;
@@ -267,10 +250,8 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
       press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, slid, state, sides, press);
     const auto blocks = static_cast<unsigned>(bodies);
     body_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room, sides, press, slid.motion, state, center, step, factor);
-    if (in.together() && in.bodies() > 1) {
-      const size_t cells = 36 * in.bodies() * sizeof(double);
-      between_kernel<T><<<blocks, 32, cells, stream>>>(in, room, sides, press, state, center, factor);
-    }
+    const size_t cells = 36 * in.bodies() * sizeof(double);
+    between_kernel<T><<<blocks, 32, cells, stream>>>(in, room, sides, press, state, center, factor);
     if (iteration > 0) product_kernel<T><<<blocks_for(unknowns), kOne, 0, stream>>>(in, state, factor, motion, step);
     if (auto error = cholesky(in.systems(), in.system_size(), factor, stream, state)) return error;
     if (auto error = cholesky_solve(in.systems(), in.system_size(), factor, step, stream, state)) return error;

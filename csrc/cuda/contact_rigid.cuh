@@ -9,6 +9,7 @@ namespace diffvbd::cuda {
 using namespace contact;
 using rigid::Body;
 
+constexpr int kFew = 8;    // bodies that are solved for together, up to which a block does all of it
 constexpr int kOne = 128;  // threads of a block where each has an item of its own
 
 inline unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kOne - 1) / kOne); }
@@ -49,7 +50,7 @@ __global__ void __launch_bounds__(kOne) press_kernel(const __grid_constant__ Rig
     const int64_t pair = row - room.listed;
     if (pair < in.first_lagged(in.scene.scenes)) {
       const int64_t scene = in.lagged.pairs[kPairRow * pair + 5];
-      if (in.together() && is_done(state, scene)) return;
+      if (is_done(state, scene)) return;
       acts = lagged_press(in, pair, at, of_scene(slid, scene, in.bodies()), a, -1);
     }
   }
@@ -57,5 +58,22 @@ __global__ void __launch_bounds__(kOne) press_kernel(const __grid_constant__ Rig
   sides[2 * row + 1] = acts ? a.body[1] : -1;
   if (acts && press) store_press(a, press + kPressDoubles * row);
 }
+
+// The side that a body has of an entry's pair, which acts, at the first corner of that side; or -1. bodies: of the
+// sides of the list, as press_kernel() has them.
+__device__ __forceinline__ int side_of(const PairList& list, const int32_t* bodies, int32_t entry, int32_t body) {
+  const int corner = entry & 3;
+  const int64_t pair = entry >> 2;
+  if (corner == 3) return -1;
+  const int side = corner == 0 ? 0 : 1;
+  if (bodies[2 * pair + side] != body) return -1;
+  return side == 0 || corner == sides(list.pairs[kPairRow * pair + 4]) ? side : -1;
+}
+
+// Motions of bodies and factors of systems, where none is larger than kFew bodies. sides and presses as of
+// press_kernel().
+template <class T>
+cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const int32_t* sides, const double* presses,
+                      double* center, double* motion, double* factor, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -8,7 +8,9 @@ namespace {
 
 constexpr int64_t kItemsOfBlock = 1024;  // of the potential of a scene, that one block adds up
 constexpr int64_t kMostBlocks = 128;     // that add up one scene
-constexpr int64_t kSmallScene = 4096;    // vertices up to which a block does all the work on a scene
+constexpr int64_t kSmallScene = 4096;    // vertices up to which a block does all the work on a scene, and
+constexpr int64_t kFewPairs = 32768;     // pairs that each has room for, unless there are
+constexpr int64_t kManyScenes = 64;      // scenes enough to fill the device
 
 // What the tries of all scenes have in common.
 template <class T>
@@ -235,7 +237,8 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairRoom& room, const dou
   if (room.rows() > 0)
     press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, Slid{}, nullptr, sides, nullptr);
   begin_kernel<T><<<blocks_for(std::max(units, scenes)), kOne, 0, stream>>>(in, t);
-  if (in.scene.vertices <= kSmallScene) {
+  const bool few = room.rows() <= kFewPairs * scenes || kManyScenes <= scenes;
+  if (in.scene.vertices <= kSmallScene && few) {
     scene_kernel<T><<<static_cast<unsigned>(scenes), kThreads, 0, stream>>>(in, t, x);
     return cudaGetLastError();
   }

@@ -166,7 +166,7 @@ struct Runner {
     return in.contact ? passes().load() : cudaSuccess;
   }
 
-  ContactPasses<T> passes() const { return {s, *in.contact, adjoints, cut, stream}; }
+  ContactPasses<T> passes() const { return {s, *in.contact, adjoints, cut, in.scenes, stream}; }
 
   int64_t blocks_of(int color) const { return host.color_block[color + 1] - host.color_block[color]; }
 

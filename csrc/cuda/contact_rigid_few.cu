@@ -1,0 +1,348 @@
+// The rigid correction where few bodies are solved for together, or each alone: all of Newton's method in one launch, a
+// block for each system.
+#include "../contact/rigid_slip.h"
+#include "cholesky.cuh"
+#include "contact_rigid.cuh"
+
+namespace diffvbd::cuda {
+namespace {
+
+static_assert(kSquare == kThreads);
+constexpr int kLanes = 8;  // threads that share the pairs of a vertex
+constexpr int kOwn = kUnknowns + rigid::kSix, kHalf = 3 * kUnknowns;
+
+// A list of pairs, and where the sides of its first one are.
+struct Sides {
+  const PairList& list;
+  const int32_t* bodies;
+};
+
+// The barriers of listed pairs.
+template <class T>
+struct Barriers {
+  const RigidInputs<T>& in;
+  const int32_t* sides;
+  const double* presses;
+  __device__ Sides pairs() const { return {in.gate.listed, sides}; }
+  __device__ PairPress operator()(int64_t pair, int) const {
+    return load_press(presses + kPressDoubles * pair, sides + 2 * pair);
+  }
+};
+// Friction and damping of lagged ones, for a side that may be solved for alone.
+template <class T>
+struct Rubs {
+  const RigidInputs<T>& in;
+  const int32_t* sides;
+  Slid slid;
+  __device__ Sides pairs() const { return {in.lagged, sides}; }
+  __device__ PairPress operator()(int64_t pair, int side) const {
+    PairPress a;
+    lagged_press(in, pair, CornerPoints<T>{in, false}, slid, a, side);
+    return a;
+  }
+};
+
+// A system: all bodies of a scene, or one.
+template <class T>
+struct System {
+  const RigidInputs<T>& in;
+  const BlockTeam& team;
+  int64_t scene;
+  int32_t first, count;
+  double *center, *motion;  // of the scene's bodies
+  double *base, *matrix, *gradient, *step;
+  uint8_t* touching;  // [count, count]
+
+  __device__ Body<T> body(int32_t b) const { return {in.scene, scene, first + b}; }
+  __device__ int32_t size() const { return kUnknowns * count; }
+  __device__ Vector center_of(int32_t b) const { return vector_of(center + 3 * (first + b)); }
+  __device__ double* motion_of(int32_t b) const { return motion + kUnknowns * (first + b); }
+  __device__ double& at(double* of, int32_t b, int i, int32_t c, int j) const {
+    return of[size() * (kUnknowns * b + i) + kUnknowns * c + j];
+  }
+
+  // Calls f(pair, side) for the sides that body b has of pairs which act, for a part of one of its vertices.
+  template <class F>
+  __device__ void each_side(const Sides& pairs, int32_t b, int32_t item, const F& f) const {
+    const PairList& list = pairs.list;
+    const int64_t row = scene * in.gate.corners + body(b).vertex(item / kLanes);
+    for (int32_t e = list.ptr[row] + item % kLanes; e < list.ptr[row + 1]; e += kLanes) {
+      const int side = side_of(list, pairs.bodies, list.entry[e], first + b);
+      if (0 <= side) f(int64_t{list.entry[e] >> 2}, side);
+    }
+  }
+  __device__ int32_t items(int32_t b) const { return kLanes * body(b).size(); }
+
+  // Which bodies press others of the system.
+  template <class Presses>
+  __device__ void find_touching(const Presses& presses) const {
+    for (int32_t b = 0; b < count; ++b) {
+      team.each(items(b), [&](int32_t item) {
+        each_side(presses.pairs(), b, item, [&](int64_t pair, int side) {
+          const int32_t other = presses.pairs().bodies[2 * pair + 1 - side];
+          if (0 <= other) touching[count * b + other - first] = 1;
+        });
+      });
+    }
+  }
+
+  // What pairs add to the gradient of body b and its own part of the matrix.
+  template <class Presses>
+  __device__ void add_own(const Presses& presses, int32_t b, int32_t item, double* out) const {
+    const Vector c = center_of(b);
+    each_side(presses.pairs(), b, item, [&](int64_t pair, int side) {
+      const PairPress a = presses(pair, side);
+      if (a.body[side] < 0) return;
+      const double share = borne(a, in.together());
+#pragma unroll
+      for (int j = 0; j < kUnknowns; ++j) {
+        out[j] += a.gradient(side, j, c);
+        const Vector pressed = share * (a.stiffness * a.map(side, j, c));
+#pragma unroll
+        for (int i = j; i < kUnknowns; ++i) out[kUnknowns + rigid::at6(i, j)] += dot(a.map(side, i, c), pressed);
+      }
+    });
+  }
+  // Adds the sums of all threads.
+  __device__ void put_own(const double* total, int32_t b, double* to, double* gradients) const {
+    if (threadIdx.x == 0) {
+#pragma unroll
+      for (int i = 0; i < kUnknowns; ++i) {
+        gradients[kUnknowns * b + i] += total[i];
+#pragma unroll
+        for (int j = 0; j <= i; ++j) {
+          const double value = total[kUnknowns + rigid::at6(i, j)];
+          at(to, b, i, b, j) += value;
+          if (j < i) at(to, b, j, b, i) += value;
+        }
+      }
+    }
+  }
+  // And to the part between two bodies, half of its rows at a time.
+  template <class Presses>
+  __device__ void add_between(const Presses& presses, double* to) const {
+    for (int32_t b = 0; b < count; ++b) {
+      for (int32_t other = b + 1; other < count; ++other) {
+        if (!touching[count * b + other]) continue;
+        const Vector c = center_of(b), d = center_of(other);
+        for (int half = 0; half < 2; ++half) {
+          double total[kHalf];
+          team.template sum<kHalf>(items(b), total, [&](int32_t item, double* out) {
+            each_side(presses.pairs(), b, item, [&](int64_t pair, int side) {
+              if (presses.pairs().bodies[2 * pair + 1 - side] != first + other) return;
+              const PairPress a = presses(pair, side);
+#pragma unroll
+              for (int j = 0; j < kUnknowns; ++j) {
+                const Vector pressed = a.stiffness * a.map(1 - side, j, d);
+#pragma unroll
+                for (int i = 0; i < 3; ++i) out[kUnknowns * i + j] += dot(a.map(side, 3 * half + i, c), pressed);
+              }
+            });
+          });
+          if (threadIdx.x == 0) {
+#pragma unroll
+            for (int i = 0; i < 3; ++i) {
+#pragma unroll
+              for (int j = 0; j < kUnknowns; ++j) {
+                const double value = total[kUnknowns * i + j];
+                at(to, b, 3 * half + i, other, j) += value, at(to, other, j, b, 3 * half + i) += value;
+              }
+            }
+          }
+        }
+      }
+    }
+  }
+
+  // What does not change as bodies move: all but friction and damping.
+  __device__ void assemble(const Barriers<T>& barriers) const {
+    team.each(size() * size(), [&](int32_t i) { base[i] = 0; });
+    team.each(size(), [&](int32_t i) { gradient[i] = 0; });
+    for (int32_t b = 0; b < count; ++b) {
+      const Body<T> own = body(b);
+      const Whole whole = whole_of(own, team);
+      const Vector c = whole.center;
+      if (threadIdx.x == 0) rigid::put(center + 3 * own.body, c);
+      team.meet();
+      const bool free = in.free[own.body] && 0 < whole.mass;
+      double total[kOwn + 1];  // and the sum of m r^2
+      team.template sum<kOwn + 1>(free ? items(b) : 0, total, [&](int32_t item, double* out) {
+        add_own(barriers, b, item, out);
+        if (item % kLanes != 0) return;
+        const int32_t v = own.vertex(item / kLanes);
+        Vector g;
+        Sym3<double> H;
+        vertex_press(in, own, v, g, H);
+        const Vector arm = own.position(v) - c;
+        rigid::add_vertex(arm, g, H, out, out + kUnknowns);
+        out[kOwn] += own.mass(v) * dot(arm, arm);
+      });
+#pragma unroll
+      for (int i = 0; i < kUnknowns; ++i) {
+        total[kUnknowns + rigid::at6(i, i)] += free ? kLeastInertia * (i < 3 ? total[kOwn] : whole.mass) : 1;
+      }
+      put_own(total, b, base, gradient);
+    }
+    team.meet();
+    add_between(barriers, base);
+    team.meet();
+  }
+  // And these, linear about where bodies have gone.
+  __device__ void add_friction(const Rubs<T>& rubs) const {
+    if (!in.lag && in.planes == 0) return;
+    for (int32_t b = 0; b < count; ++b) {
+      const Body<T> own = body(b);
+      if (!in.free[own.body]) continue;
+      const Vector c = center_of(b);
+      double total[kOwn];
+      team.template sum<kOwn>(items(b), total, [&](int32_t item, double* out) {
+        if (in.lag) add_own(rubs, b, item, out);
+        if (item % kLanes != 0 || in.planes == 0) return;
+        const int32_t v = own.vertex(item / kLanes);
+        const Vector arm = own.position(v) - c;
+        Vector g{};
+        Sym3<double> H{};
+        add_floor_friction(in, own, v, moved_by(motion_of(b), arm), g, H);
+        rigid::add_vertex(arm, g, H, out, out + kUnknowns);
+      });
+      put_own(total, b, matrix, step);
+    }
+    if (in.lag) add_between(rubs, matrix);
+    team.meet();
+  }
+
+  // Of the matrix, half of which is what a step lowers its potential by.
+  __device__ double energy_of(const double* x, const double* more) const {
+    double total[1];
+    team.template sum<1>(size(), total, [&](int32_t j, double* out) {
+      double sum = 0;
+      for (int32_t i = j; i < size(); ++i) sum += matrix[size() * i + j] * (more ? x[i] + more[i] : x[i]);
+      out[0] += sum * sum;
+    });
+    return total[0];
+  }
+  // How far the slope after a share of the step is above what the step takes it for.
+  __device__ double excess(const Rubs<T>& rubs, double share) const {
+    const double* steps = step - kUnknowns * first;  // of the scene's bodies
+    double total = 0;
+    for (int32_t b = 0; b < count; ++b) {
+      const Body<T> own = body(b);
+      if (!in.free[own.body]) continue;
+      double sum[1];
+      team.template sum<1>(items(b), sum, [&](int32_t item, double* out) {
+        if (in.lag) {
+          each_side(rubs.pairs(), b, item, [&](int64_t pair, int side) {
+            const PairPress a = rubs(pair, side);
+            if (side != (a.body[0] < 0 ? 1 : 0)) return;  // once
+            out[0] += slip_line(in, pair, a, center, steps).excess(share);
+          });
+        }
+        if (item % kLanes != 0) return;
+        const int32_t v = own.vertex(item / kLanes);
+        const Vector arm = own.position(v) - center_of(b);
+        for (int k = 0; k < in.planes; ++k) {
+          if (!bears(in, own, v, k)) continue;
+          out[0] += slip_line(in, own, v, k, arm, motion_of(b), step + kUnknowns * b).excess(share);
+        }
+      });
+      total += sum[0];
+    }
+    return total;
+  }
+
+  __device__ void solve(const Rubs<T>& rubs) const {
+    double* own = motion_of(0);
+    Settling state = kOnItsWay;  // the same for all threads
+    for (int iteration = 0; iteration < kSlipIterations && state != kDone; ++iteration) {
+      team.each(size() * size(), [&](int32_t i) { matrix[i] = base[i]; });
+      team.each(size(), [&](int32_t i) { step[i] = gradient[i]; });
+      team.meet();
+      add_friction(rubs);
+      if (iteration > 0) {
+        team.each(size(), [&](int32_t i) {
+          for (int32_t j = 0; j < size(); ++j) step[i] += matrix[size() * i + j] * own[j];
+        });
+        team.meet();
+      }
+      cholesky_of(size(), matrix);
+      solve_with(size(), matrix, step);
+      team.each(count, [&](int32_t b) { keep_finite(step + kUnknowns * b); });
+      team.meet();
+      double share = 1;
+      if (in.rubs()) {
+        const double fall = energy_of(step, nullptr), whole = energy_of(step, own);
+        if (state == kSettledAt) {
+          state = kDone;
+        } else if (fall <= kSettled * kSettled * whole) {
+          state = kSettledAt;
+        } else {
+          share = slip_share(fall, [&](double tried) { return excess(rubs, tried); });
+        }
+      } else {
+        state = kDone;
+      }
+      team.each(size(), [&](int32_t i) { own[i] += share * step[i]; });
+      team.meet();
+    }
+  }
+};
+
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    few_kernel(const __grid_constant__ RigidInputs<T> in, int64_t listed, const int32_t* sides, const double* presses,
+               double* center, double* motion, double* factor) {
+  __shared__ double part[kWarps][kMostSums];
+  __shared__ uint8_t touching[kFew * kFew];
+  extern __shared__ double memory[];
+  const BlockTeam team{part};
+  const int32_t n = in.bodies(), count = in.together() ? n : 1, size = kUnknowns * count;
+  const int64_t scene = in.together() ? blockIdx.x : blockIdx.x / n;
+  double *base = memory, *matrix = base + size * size, *gradient = matrix + size * size;
+  const System<T> system{in,
+                         team,
+                         scene,
+                         in.together() ? 0 : static_cast<int32_t>(blockIdx.x % n),
+                         count,
+                         center + 3 * n * scene,
+                         motion + kUnknowns * n * scene,
+                         base,
+                         matrix,
+                         gradient,
+                         gradient + size,
+                         touching};
+  team.each(size, [&](int32_t i) { system.motion_of(0)[i] = 0; });
+  team.each(count * count, [&](int32_t i) { touching[i] = 0; });
+  team.meet();
+  const Barriers<T> barriers{in, sides, presses};
+  const Rubs<T> rubs{in, sides + 2 * listed, {system.center, system.motion}};
+  if (count > 1) {
+    system.find_touching(barriers);
+    if (in.lag) system.find_touching(rubs);
+    team.meet();
+  }
+  system.assemble(barriers);
+  system.solve(rubs);
+  double* to = factor + static_cast<int64_t>(size) * size * blockIdx.x;
+  team.each(size * size, [&](int32_t i) { to[i] = matrix[i]; });
+}
+
+}  // namespace
+
+template <class T>
+cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const int32_t* sides, const double* presses,
+                      double* center, double* motion, double* factor, cudaStream_t stream) {
+  const int64_t size = in.system_size();
+  const size_t bytes = (2 * size * size + 2 * size) * sizeof(double);
+  few_kernel<T><<<static_cast<unsigned>(in.systems()), kThreads, bytes, stream>>>(in, room.listed, sides, presses,
+                                                                                  center, motion, factor);
+  return cudaGetLastError();
+}
+
+#define DIFFVBD_INSTANTIATE(T)                                                                                      \
+  template cudaError_t solve_few<T>(const RigidInputs<T>&, const PairRoom&, const int32_t*, const double*, double*, \
+                                    double*, double*, cudaStream_t);
+DIFFVBD_INSTANTIATE(float)
+DIFFVBD_INSTANTIATE(double)
+#undef DIFFVBD_INSTANTIATE
+
+}  // namespace diffvbd::cuda
