@@ -151,24 +151,25 @@ struct Source {
   }
 };
 
-// Sums the barriers of the pairs of vertex v, every `stride`-th from `first` on, into g and H.
+// Whether the barrier of an entry's pair may push.
 template <class T, class Positions>
-DIFFVBD_FN void add_barriers(const Source<T, Positions>& s, int v, int first, int stride, T h, Vec3<T>& g, Sym3<T>& H) {
-  const ContactInputs<T>& in = s.in;
-  const T kappa = in.kappa.data[s.scene * in.kappa.scene];
-  const PairList::Entries all = in.listed.of(s.scene * in.corners + v);
-  for (int e = first; e < all.count; e += stride) {
-    const int entry = all.first[e], pair = entry >> 2;
-    const int32_t* record = in.listed.pairs + int64_t{kPairRow} * pair;
-    const T* constants = in.constants + int64_t{kConstants} * pair;
-    if (s.is_far(record, constants)) continue;
-    const Corners<T> c = s.corners(record);
-    add_barrier(record[4], c, distance(record[4], c), entry & 3, s.together(record, v), PairConstants<T>(constants),
-                kappa, h * h, g, H);
-  }
+DIFFVBD_FN bool is_near(const Source<T, Positions>& s, int64_t entry) {
+  const int64_t pair = entry >> 2;
+  return !s.is_far(s.in.listed.pairs + kPairRow * pair, s.in.constants + kConstants * pair);
 }
 
-// And what rubs: lagged pairs and floors.
+// Adds the barrier of a pair of vertex v to g and H.
+template <class T, class Positions>
+DIFFVBD_FN void add_barrier_of(const Source<T, Positions>& s, int64_t entry, int v, T h, Vec3<T>& g, Sym3<T>& H) {
+  const ContactInputs<T>& in = s.in;
+  const int64_t pair = entry >> 2;
+  const int32_t* record = in.listed.pairs + kPairRow * pair;
+  const Corners<T> c = s.corners(record);
+  add_barrier(record[4], c, distance(record[4], c), static_cast<int>(entry & 3), s.together(record, v),
+              PairConstants<T>(in.constants + kConstants * pair), in.kappa.data[s.scene * in.kappa.scene], h * h, g, H);
+}
+
+// Sums what rubs into g and H: lagged pairs of vertex v, every `stride`-th from `first` on, and floors.
 template <class T, class Positions>
 DIFFVBD_FN void add_lags(const Source<T, Positions>& s, int v, int first, int stride, T h, Vec3<T>& g, Sym3<T>& H) {
   const ContactInputs<T>& in = s.in;
@@ -188,13 +189,6 @@ DIFFVBD_FN void add_lags(const Source<T, Positions>& s, int v, int first, int st
   }
 }
 
-// Both.
-template <class T, class Positions>
-DIFFVBD_FN void add_pairs(const Source<T, Positions>& s, int v, int first, int stride, T h, Vec3<T>& g, Sym3<T>& H) {
-  add_barriers(s, v, first, stride, h, g, H);
-  add_lags(s, v, first, stride, h, g, H);
-}
-
 // The exponent of the limit of vertex v, whose update goes from where it was by d: of its room.
 template <class T, class Positions>
 DIFFVBD_FN int limit_by_room(const Source<T, Positions>& s, int v, const Vec3<T>& from, const Vec3<T>& d) {
@@ -206,6 +200,14 @@ template <class T, class Positions>
 DIFFVBD_FN T guard_of(const Source<T, Positions>& s, int v) {
   const Vec3<T> at = s.x(v) + s.origin(v);
   return T(kGuardUlps) * std::numeric_limits<T>::epsilon() * (absolute(at.x) + absolute(at.y) + absolute(at.z));
+}
+
+// Whether a pair may take more from the update of one of its corners than `exponent` does, by the length of d.
+template <class T, class Positions>
+DIFFVBD_FN bool may_limit(const Source<T, Positions>& s, int64_t entry, T length, T guard, int exponent) {
+  const int64_t pair = entry >> 2;
+  return !s.is_above(s.in.listed.pairs + kPairRow * pair, s.in.constants + kConstants * pair,
+                     limit_of<T>(exponent) * length / T(kBothShare) + guard);
 }
 
 // And not below `exponent` of one of its pairs, by the length of d and the guard of v.
@@ -237,18 +239,6 @@ DIFFVBD_FN int limit_by_pair(const Source<T, Positions>& s, int entry, const Vec
   return exponent;
 }
 
-// Of every `stride`-th of its pairs from `first` on.
-template <class T, class Positions>
-DIFFVBD_FN int limit_by_pairs(const Source<T, Positions>& s, int v, const Vec3<T>& d, int first, int stride,
-                              int exponent) {
-  const T length = length_of(d), guard = guard_of(s, v);
-  const PairList::Entries all = s.in.listed.of(s.scene * s.in.corners + v);
-  for (int e = first; e < all.count; e += stride) {
-    exponent = limit_by_pair(s, all.first[e], d, length, guard, exponent);
-  }
-  return exponent;
-}
-
 // Friction on a floor plane: the vertex alone, about the plane's normal.
 template <class T, class Positions>
 DIFFVBD_FN Lag<T> floor_lag(const Source<T, Positions>& s, int v, int plane) {
@@ -272,26 +262,21 @@ DIFFVBD_FN void send(const ContactAdjoints<T>& out, int64_t entry, int k, const 
   add_at(slot, bar);
 }
 
-// The adjoint of what add_barriers summed, into the slots of the pairs.
+// The adjoint of what add_barrier_of() added, into the slots of the pair.
 template <class T, class Positions>
-DIFFVBD_FN void reverse_barriers(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int v, int first,
-                                 int stride, T h, const Vec3<T>& p, const Vec3<T>& d_raw) {
+DIFFVBD_FN void reverse_barrier_of(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int64_t entry, int v,
+                                   T h, const Vec3<T>& p, const Vec3<T>& d_raw) {
   const ContactInputs<T>& in = s.in;
-  const T kappa = in.kappa.data[s.scene * in.kappa.scene];
-  const PairList::Entries all = in.listed.of(s.scene * in.corners + v);
-  for (int e = first; e < all.count; e += stride) {
-    const int64_t entry = all.first[e], pair = entry >> 2;
-    const int32_t* record = in.listed.pairs + kPairRow * pair;
-    const T* constants = in.constants + kConstants * pair;
-    PairAdjoint<T> bar;
-    if (s.is_far(record, constants)) continue;
-    if (!reverse_barrier(record[4], s.corners(record), static_cast<int>(entry & 3), s.together(record, v),
-                         PairConstants<T>(constants), kappa, h * h, p, d_raw, bar)) {
-      continue;
-    }
-    for (int k = 0; k < 4; ++k) send(out, entry, k, bar.x[k]);
-    out.kappa[entry] += bar.kappa;
+  const int64_t pair = entry >> 2;
+  const int32_t* record = in.listed.pairs + kPairRow * pair;
+  PairAdjoint<T> bar;
+  if (!reverse_barrier(record[4], s.corners(record), static_cast<int>(entry & 3), s.together(record, v),
+                       PairConstants<T>(in.constants + kConstants * pair), in.kappa.data[s.scene * in.kappa.scene],
+                       h * h, p, d_raw, bar)) {
+    return;
   }
+  for (int k = 0; k < 4; ++k) send(out, entry, k, bar.x[k]);
+  out.kappa[entry] += bar.kappa;
 }
 
 // And of what add_lags summed: also toward v itself where it is alone.
@@ -328,14 +313,6 @@ DIFFVBD_FN void reverse_lags(const Source<T, Positions>& s, const ContactAdjoint
     add_at(to + 1, bar.n);
     own += m_bar;
   }
-}
-
-// Of both.
-template <class T, class Positions>
-DIFFVBD_FN void reverse_pairs(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int v, int first,
-                              int stride, T h, const Vec3<T>& p, const Vec3<T>& d_raw, Vec3<T>& own) {
-  reverse_barriers(s, out, v, first, stride, h, p, d_raw);
-  reverse_lags(s, out, v, first, stride, h, p, d_raw, own);
 }
 
 template <class T>

@@ -1,7 +1,6 @@
 // Kernels of contact: several threads for each vertex of a color, kShare for each corner point, or one for each pair.
 #pragma once
 
-#include "../contact/lag.h"
 #include "contact.h"
 #include "contact_rows.cuh"
 
@@ -53,11 +52,43 @@ struct Member {
     touches = __ldg(in.listed.ptr + row) < __ldg(in.listed.ptr + row + 1) || in.planes > 0 ||
               (in.lag && __ldg(in.lagged.ptr + row) < __ldg(in.lagged.ptr + row + 1));
   }
+  __device__ __forceinline__ contact::PairList::Entries listed(const ContactInputs<T>& in) const {
+    return in.listed.of(scene * in.corners + vertex);
+  }
   __device__ __forceinline__ int64_t row(const StepView<T>& s) const { return local * s.positions + position; }
   __device__ __forceinline__ SweepRows<T> rows(const StepView<T>& s) const {
     return {s.w.x + local * s.positions * kRow, s.w.position, first, last};
   }
 };
+
+// Calls f(entry) for the entries of a vertex that are near(entry), in the share of `lane`. A whole warp first finds 32
+// of them, so that few of its threads wait for others.
+template <int share, class Near, class F>
+__device__ __forceinline__ void each_near(const contact::PairList::Entries& all, int lane, const Near& near,
+                                          const F& f) {
+  if constexpr (share == kWide) {
+    __shared__ int found[kContactThreads / kWide][2 * kWide];
+    int* own = found[threadIdx.x / kWide];
+    int count = 0;
+    for (int first = 0; first < all.count; first += kWide) {
+      const int entry = first + lane < all.count ? all.first[first + lane] : -1;
+      const bool is_near = entry >= 0 && near(entry);
+      const unsigned lanes = __ballot_sync(kWholeWarp, is_near);
+      if (is_near) own[count + __popc(lanes & ((1u << lane) - 1))] = entry;
+      count += __popc(lanes);
+      __syncwarp();
+      if (count < kWide) continue;
+      count -= kWide;
+      f(own[count + lane]);
+      __syncwarp();
+    }
+    if (lane < count) f(own[lane]);
+  } else {
+    for (int e = lane; e < all.count; e += share) {
+      if (near(all.first[e])) f(all.first[e]);
+    }
+  }
+}
 
 template <class T>
 __global__ void load_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in) {
@@ -81,7 +112,11 @@ __global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __
   if (at.touches) {
     const SweepRows<T> rows = at.rows(s);
     const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
-    contact::add_pairs(source, at.vertex, at.lane, share, s.parameters.time_step, g, H);
+    const T h = s.parameters.time_step;
+    each_near<share>(
+        at.listed(in), at.lane, [&](int64_t entry) { return contact::is_near(source, entry); },
+        [&](int64_t entry) { contact::add_barrier_of(source, entry, at.vertex, h, g, H); });
+    contact::add_lags(source, at.vertex, at.lane, share, h, g, H);
   }
   sum_share<share>(g), sum_share<share>(H);
   if (!at.touches || at.lane != 0) return;
@@ -89,7 +124,7 @@ __global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __
   for (int k = 0; k < kContactScalars; ++k) s.w.contact[at.row(s) * kContactScalars + k] = values[k];
 }
 
-// The threads of a vertex look at its pairs in turn; the last one that any of them needs is the limit.
+// The threads of a vertex look at its pairs; the least that any of them lets pass is the limit.
 template <int share, class T>
 __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
                               uint8_t* cut, int sweep, int64_t begin, int64_t end) {
@@ -102,7 +137,11 @@ __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __gri
     const contact::Source<T, RowsBefore<T>> source{in, at.scene, rows};
     from = load_row(s.w.before, at.row(s)), d = load_row(s.w.x, at.row(s)) - from;
     exponent = contact::limit_by_room(source, at.vertex, from, d);
-    exponent = contact::limit_by_pairs(source, at.vertex, d, at.lane, share, exponent);
+    const T length = contact::length_of(d), guard = contact::guard_of(source, at.vertex);
+    const int least = exponent;
+    each_near<share>(
+        at.listed(in), at.lane, [&](int64_t entry) { return contact::may_limit(source, entry, length, guard, least); },
+        [&](int entry) { exponent = contact::limit_by_pair(source, entry, d, length, guard, exponent); });
   }
 #pragma unroll
   for (int offset = share / 2; offset > 0; offset /= 2) {
@@ -148,8 +187,12 @@ __global__ void reverse_contact(const __grid_constant__ StepView<T> s, const __g
     const T* turn = s.w.turn + 6 * at.row(s);
     const SweepRows<T> rows = at.rows(s);
     const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
-    contact::reverse_pairs(source, slots, at.vertex, at.lane, share, s.parameters.time_step, contact::vector_at(turn),
-                           contact::vector_at(turn + 3), own);
+    const T h = s.parameters.time_step;
+    const Vec3<T> p = contact::vector_at(turn), d_raw = contact::vector_at(turn + 3);
+    each_near<share>(
+        at.listed(in), at.lane, [&](int64_t entry) { return contact::is_near(source, entry); },
+        [&](int64_t entry) { contact::reverse_barrier_of(source, slots, entry, at.vertex, h, p, d_raw); });
+    contact::reverse_lags(source, slots, at.vertex, at.lane, share, h, p, d_raw, own);
   }
   if (in.planes == 0) return;
   sum_share<share>(own);
@@ -234,66 +277,6 @@ __global__ void sum_lag_slots(const T* slots, int64_t items, T* lag) {
   lag[i] = sum;
 }
 
-// A pair that is in the list, with what its lag depends on.
-template <class T>
-struct LagPair {
-  const int32_t* record;
-  contact::PairConstants<T> constants;
-  T kappa;
-  contact::Corners<T> corners;
-  __device__ __forceinline__ LagPair(const ContactInputs<T>& in, const T* x, int64_t pair)
-      : record(in.listed.pairs + contact::kPairRow * pair),
-        constants(in.constants + contact::kConstants * pair),
-        kappa(in.kappa.data[record[5] * in.kappa.scene]) {
-    const UserRows<T> rows{x + static_cast<int64_t>(record[5]) * 3 * in.num_vertices};
-    corners = contact::Source<T, UserRows<T>>{in, record[5], rows}.corners(record);
-  }
-};
-
-template <class T>
-__global__ void lag_forward(const __grid_constant__ ContactInputs<T> in, const T* x, int64_t scenes, int64_t pairs,
-                            T* values) {
-  const int64_t pair = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (pair >= pairs) return;
-  T* to = values + contact::kLagScalars * pair;
-  if (4 * pair >= in.listed.ptr[scenes * in.corners]) {
-    for (int k = 0; k < contact::kLagScalars; ++k) to[k] = T(0);
-    return;
-  }
-  const LagPair<T> at(in, x, pair);
-  contact::store_lag(contact::lag_state(at.record[4], at.corners, at.constants, at.kappa), to);
-}
-
-template <class T>
-__global__ void lag_reverse(const __grid_constant__ ContactInputs<T> in, const T* x, int64_t scenes, int64_t pairs,
-                            const T* bar, T* slots) {
-  const int64_t pair = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (pair >= pairs || 4 * pair >= in.listed.ptr[scenes * in.corners]) return;
-  const LagPair<T> at(in, x, pair);
-  contact::PairAdjoint<T> out;
-  contact::reverse_lag(at.record[4], at.corners, at.constants, at.kappa, bar + contact::kLagScalars * pair, out);
-  for (int k = 0; k < 4; ++k) {
-    T* to = slots + 4 * (4 * pair + k);
-    to[0] = out.x[k].x, to[1] = out.x[k].y, to[2] = out.x[k].z, to[3] = k == 0 ? out.kappa : T(0);
-  }
-}
-
-// By corner point: what its pairs' corners have received.
-template <class T>
-__global__ void lag_collect(const __grid_constant__ ContactInputs<T> in, int64_t scenes, const T* slots, T* x_bar,
-                            T* collider_bar) {
-  const int64_t row = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (row >= scenes * in.corners) return;
-  Vec3<T> sum = zero3<T>();
-  for (int e = in.listed.ptr[row]; e < in.listed.ptr[row + 1]; ++e) {
-    sum += contact::vector_at(slots + int64_t{4} * in.listed.entry[e]);
-  }
-  const int64_t scene = row / in.corners, corner = row - scene * in.corners, colliders = in.corners - in.num_vertices;
-  T* to = corner < in.num_vertices ? x_bar + 3 * (scene * in.num_vertices + corner)
-                                   : collider_bar + 3 * (scene * colliders + corner - in.num_vertices);
-  to[0] = sum.x, to[1] = sum.y, to[2] = sum.z;
-}
-
 template <class... P, class... A>
 cudaError_t launch_contact(void (*kernel)(P...), int64_t items, cudaStream_t stream, A... arguments) {
   if (items == 0) return cudaSuccess;
@@ -358,29 +341,9 @@ cudaError_t sum_lag(const ContactAdjoints<T>& slots, int64_t pairs, T* lag, cuda
   return launch_contact(sum_lag_slots<T>, items, stream, from, items, lag);
 }
 
-template <class T>
-cudaError_t pair_lag(const ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs, T* values,
-                     cudaStream_t stream) {
-  return launch_contact(lag_forward<T>, pairs, stream, in, x, scenes, pairs, values);
-}
-
-template <class T>
-cudaError_t pair_lag_backward(const ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs, const T* bar,
-                              T* slots, T* x_bar, T* collider_bar, T* kappa_bar, cudaStream_t stream) {
-  if (auto error = launch_contact(lag_reverse<T>, pairs, stream, in, x, scenes, pairs, bar, slots)) return error;
-  const T* from = slots;
-  if (auto error = launch_contact(lag_collect<T>, scenes * in.corners, stream, in, scenes, from, x_bar, collider_bar))
-    return error;
-  return launch_sum(scenes, stream, in, int64_t{0}, from + 3, 4, kappa_bar);
-}
-
 }  // namespace diffvbd::cuda
 
-#define DIFFVBD_INSTANTIATE_CONTACT(T)                                                                          \
-  template struct diffvbd::cuda::ContactPasses<T>;                                                              \
-  template cudaError_t diffvbd::cuda::sum_lag<T>(const diffvbd::contact::ContactAdjoints<T>&, int64_t, T*,      \
-                                                 cudaStream_t);                                                 \
-  template cudaError_t diffvbd::cuda::pair_lag<T>(const diffvbd::contact::ContactInputs<T>&, const T*, int64_t, \
-                                                  int64_t, T*, cudaStream_t);                                   \
-  template cudaError_t diffvbd::cuda::pair_lag_backward<T>(const diffvbd::contact::ContactInputs<T>&, const T*, \
-                                                           int64_t, int64_t, const T*, T*, T*, T*, T*, cudaStream_t);
+#define DIFFVBD_INSTANTIATE_CONTACT(T)                                                                     \
+  template struct diffvbd::cuda::ContactPasses<T>;                                                         \
+  template cudaError_t diffvbd::cuda::sum_lag<T>(const diffvbd::contact::ContactAdjoints<T>&, int64_t, T*, \
+                                                 cudaStream_t);

@@ -1,3 +1,4 @@
-#include "contact.cuh"
+#include "contact_lag.cuh"
 
 DIFFVBD_INSTANTIATE_CONTACT(double)
+DIFFVBD_INSTANTIATE_LAG(double)

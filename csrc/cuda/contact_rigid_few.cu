@@ -221,33 +221,63 @@ struct System {
     });
     return total[0];
   }
-  // How far the slope after a share of the step is above what the step takes it for.
-  __device__ double excess(const Rubs<T>& rubs, double share) const {
+  // Adds how far the slopes of all that slips are above what the step takes them for, after each of n shares of it.
+  template <int n>
+  __device__ void excess(const Rubs<T>& rubs, const double* shares, double* total) const {
     const double* steps = step - kUnknowns * first;  // of the scene's bodies
-    double total = 0;
+    for (int k = 0; k < n; ++k) total[k] = 0;
     for (int32_t b = 0; b < count; ++b) {
       const Body<T> own = body(b);
       if (!in.free[own.body]) continue;
-      double sum[1];
-      team.template sum<1>(items(b), sum, [&](int32_t item, double* out) {
+      double sum[n];
+      team.template sum<n>(items(b), sum, [&](int32_t item, double* out) {
+        const auto add = [&](const SlipLine& line) {
+#pragma unroll
+          for (int k = 0; k < n; ++k) out[k] += line.excess(shares[k]);
+        };
         if (in.lag) {
           each_side(rubs.pairs(), b, item, [&](int64_t pair, int side) {
             const PairPress a = rubs(pair, side);
-            if (side != (a.body[0] < 0 ? 1 : 0)) return;  // once
-            out[0] += slip_line(in, pair, a, center, steps).excess(share);
+            if (side == (a.body[0] < 0 ? 1 : 0)) add(slip_line(in, pair, a, center, steps));  // once
           });
         }
         if (item % kLanes != 0) return;
         const int32_t v = own.vertex(item / kLanes);
         const Vector arm = own.position(v) - center_of(b);
         for (int k = 0; k < in.planes; ++k) {
-          if (!bears(in, own, v, k)) continue;
-          out[0] += slip_line(in, own, v, k, arm, motion_of(b), step + kUnknowns * b).excess(share);
+          if (bears(in, own, v, k)) add(slip_line(in, own, v, k, arm, motion_of(b), step + kUnknowns * b));
         }
       });
-      total += sum[0];
+      for (int k = 0; k < n; ++k) total[k] += sum[k];
     }
-    return total;
+  }
+  // As slip_share(), which halves an interval time after time: all shares that kLevels halvings may come to at once.
+  __device__ double share_of_step(const Rubs<T>& rubs, double fall) const {
+    constexpr int kLevels = 4, kShares = (1 << kLevels) - 1;
+    double shares[kShares], over[kShares];
+    shares[0] = 1;
+    excess<1>(rubs, shares, over);
+    if (!(kOvershoot * fall < over[0])) return 1;
+    double low = 0, high = 1;
+    for (int halvings = 0; halvings < kHalvings; halvings += kLevels) {
+      for (int k = 0; k < kShares; ++k) shares[k] = low + (high - low) * (k + 1) / (kShares + 1);
+      excess<kShares>(rubs, shares, over);
+      int at = 0, width = kShares + 1;
+      for (int level = 0; level < kLevels && halvings + level < kHalvings; ++level) {
+        width /= 2;
+        double middle = 0, above = 0;
+#pragma unroll
+        for (int k = 0; k < kShares; ++k) {
+          if (k + 1 == at + width) middle = shares[k], above = over[k];
+        }
+        if (above < fall * (1 - middle)) {
+          low = middle, at += width;
+        } else {
+          high = middle;
+        }
+      }
+    }
+    return high;
   }
 
   __device__ void solve(const Rubs<T>& rubs) const {
@@ -276,7 +306,7 @@ struct System {
         } else if (fall <= kSettled * kSettled * whole) {
           state = kSettledAt;
         } else {
-          share = slip_share(fall, [&](double tried) { return excess(rubs, tried); });
+          share = share_of_step(rubs, fall);
         }
       } else {
         state = kDone;
@@ -333,6 +363,9 @@ cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const int3
                       double* center, double* motion, double* factor, cudaStream_t stream) {
   const int64_t size = in.system_size();
   const size_t bytes = (2 * size * size + 2 * size) * sizeof(double);
+  constexpr size_t kMost = 2 * kUnknowns * kFew * (kUnknowns * kFew + 1) * sizeof(double);
+  const auto limit = cudaFuncAttributeMaxDynamicSharedMemorySize;
+  if (auto error = cudaFuncSetAttribute(few_kernel<T>, limit, kMost)) return error;
   few_kernel<T><<<static_cast<unsigned>(in.systems()), kThreads, bytes, stream>>>(in, room.listed, sides, presses,
                                                                                   center, motion, factor);
   return cudaGetLastError();

@@ -16,9 +16,9 @@ constexpr int64_t kManyScenes = 64;      // scenes enough to fill the device
 template <class T>
 struct Tried {
   const double *center, *motion;
-  double *share, *low, *next;  // [B, bodies]
-  double *before, *after;      // [B, blocks]  parts of the potential
-  const int32_t* sides;        // [listed, 2]
+  double *share, *low, *next;   // [B, bodies]
+  double *before, *after;       // [B, blocks]  parts of the potential
+  int32_t *touching, *touches;  // [listed, 2] bodies that press each other, scene after scene; [B] how many pairs
   AdvanceState<T> state;
   uint8_t* done;  // [B]
   T* move;
@@ -29,11 +29,24 @@ template <class T>
 __global__ void __launch_bounds__(kOne)
     begin_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t) {
   const int64_t i = own_item();
-  if (i < in.scene.scenes) t.done[i] = 0;
+  if (i < in.scene.scenes) t.done[i] = 0, t.touches[i] = 0;
   if (i >= in.scene.scenes * in.bodies()) return;
   t.share[i] = 1;
   t.state.share[i] = T(0), t.state.now[i] = T(1);
   t.state.blocked[i] = t.state.stamp[i] = 0;
+}
+
+// Their order does not matter.
+template <class T>
+__global__ void __launch_bounds__(kOne)
+    touching_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t) {
+  const int64_t pair = own_item();
+  PairPress a;
+  if (pair >= in.first_listed(in.scene.scenes) || !barrier_press(in, pair, CornerPoints<T>{in, false}, a)) return;
+  if (a.body[0] < 0 || a.body[1] < 0) return;
+  const int64_t scene = in.gate.listed.pairs[kPairRow * pair + 5];
+  int32_t* to = t.touching + 2 * (in.first_listed(scene) + atomicAdd(t.touches + scene, 1));
+  to[0] = a.body[0], to[1] = a.body[1];
 }
 
 template <class T>
@@ -136,14 +149,13 @@ __device__ bool decide(const RigidInputs<T>& in, const Tried<T>& t, int64_t scen
     t.low[first + k] = last ? 0.0 : shortened(t.state.blocked[first + k], fits, attempt);
     t.state.blocked[first + k] = 0;
   });
-  const int64_t begin = in.first_listed(scene), pairs = in.first_listed(scene + 1) - begin;
+  const int32_t* touching = t.touching + 2 * in.first_listed(scene);
   for (int spread = 0; spread < kSpreads && !last; ++spread) {
     __syncthreads();
     each(n, [&](int64_t k) { t.next[first + k] = t.low[first + k]; });
     __syncthreads();
-    each(pairs, [&](int64_t i) {
-      const int32_t a = t.sides[2 * (begin + i)], b = t.sides[2 * (begin + i) + 1];
-      if (a < 0 || b < 0) return;
+    each(t.touches[scene], [&](int64_t i) {
+      const int32_t a = touching[2 * i], b = touching[2 * i + 1];
       const double both = fmin(t.low[first + a], t.low[first + b]);
       // not negative: their bits are in their order
       for (const int32_t k : {a, b}) {
@@ -208,9 +220,9 @@ int64_t potential_blocks(const RigidInputs<T>& in, const PairRoom& room) {
 template <class T>
 int64_t rigid_move_bytes(const RigidInputs<T>& in, const PairRoom& room) {
   const int64_t units = in.scene.scenes * in.bodies(), parts = in.scene.scenes * potential_blocks(in, room);
-  return aligned(room.rows() * 2 * sizeof(int32_t)) + 2 * aligned(units * sizeof(double)) +
-         2 * aligned(parts * sizeof(double)) + 2 * aligned(units * sizeof(T)) + 2 * aligned(units) +
-         aligned(in.scene.scenes);
+  return aligned(room.listed * 2 * sizeof(int32_t)) + aligned(in.scene.scenes * sizeof(int32_t)) +
+         2 * aligned(units * sizeof(double)) + 2 * aligned(parts * sizeof(double)) + 2 * aligned(units * sizeof(T)) +
+         2 * aligned(units) + aligned(in.scene.scenes);
 }
 
 template <class T>
@@ -225,18 +237,18 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairRoom& room, const dou
     return here;
   };
   const auto numbers = [&](int64_t count) { return reinterpret_cast<double*>(take(count * sizeof(double))); };
-  auto* sides = reinterpret_cast<int32_t*>(take(room.rows() * 2 * sizeof(int32_t)));
   Tried<T> t{};
-  t.center = center, t.motion = motion, t.share = share, t.sides = sides, t.move = move;
+  t.center = center, t.motion = motion, t.share = share, t.move = move;
+  t.touching = reinterpret_cast<int32_t*>(take(room.listed * 2 * sizeof(int32_t)));
+  t.touches = reinterpret_cast<int32_t*>(take(scenes * sizeof(int32_t)));
   t.blocks = potential_blocks(in, room);
   t.low = numbers(units), t.next = numbers(units);
   t.before = numbers(scenes * t.blocks), t.after = numbers(scenes * t.blocks);
   t.state.share = reinterpret_cast<T*>(take(units * sizeof(T)));
   t.state.now = reinterpret_cast<T*>(take(units * sizeof(T)));
   t.state.blocked = take(units), t.state.stamp = take(units), t.done = take(scenes);
-  if (room.rows() > 0)
-    press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, Slid{}, nullptr, sides, nullptr);
   begin_kernel<T><<<blocks_for(std::max(units, scenes)), kOne, 0, stream>>>(in, t);
+  if (room.listed > 0) touching_kernel<T><<<blocks_for(room.listed), kOne, 0, stream>>>(in, t);
   const bool few = room.rows() <= kFewPairs * scenes || kManyScenes <= scenes;
   if (in.scene.vertices <= kSmallScene && few) {
     scene_kernel<T><<<static_cast<unsigned>(scenes), kThreads, 0, stream>>>(in, t, x);

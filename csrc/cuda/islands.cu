@@ -225,21 +225,30 @@ template <class T>
 __global__ void __launch_bounds__(kThreads)
     scene_sync_kernel(const IslandInputs<T> in, Workspace<T> work, int32_t* island) {
   __shared__ int32_t unsettled, label[kFewBodies];
+  __shared__ BodySum<T> part[kThreads];
   const int32_t n = in.mesh_bodies;
   const int64_t first = int64_t{blockIdx.x} * n;
   const auto each = [&](int32_t count, const auto& f) {
     for (auto i = static_cast<int32_t>(threadIdx.x); i < count; i += kThreads) f(i);
     __syncthreads();
   };
-  const auto sum = [&] {
-    each(n, [&](int32_t i) {
-      if (label[i] != i) return;
+  const auto sum = [&] {  // a warp for each island
+    const auto lane = static_cast<int32_t>(threadIdx.x % kWarp);
+    for (auto i = static_cast<int32_t>(threadIdx.x / kWarp); i < n; i += kThreads / kWarp) {
+      if (label[i] != i) continue;
       BodySum<T> own = nothing<T>();
-      for (int32_t j = i; j < n; ++j) {
+      for (int32_t j = i + lane; j < n; j += kWarp) {
         if (label[j] == i) own.add(body_of(work, first + j));
       }
-      work.islands[first + i] = own;
-    });
+      part[threadIdx.x] = own;
+      for (int32_t half = kWarp / 2; half > 0; half /= 2) {
+        __syncwarp();
+        if (lane < half) part[threadIdx.x].add(part[threadIdx.x + half]);
+      }
+      if (lane == 0) work.islands[first + i] = part[threadIdx.x];
+      __syncwarp();
+    }
+    __syncthreads();
   };
   const auto sweep = [&] { each(n, [&](int32_t i) { sweep_body(in, work, first + i, label[i]); }); };
   if (threadIdx.x == 0) unsettled = 0;

@@ -7,7 +7,7 @@ namespace {
 
 using namespace contact;
 
-constexpr int kThreads = 128;
+constexpr int kThreads = 128, kWarp = 32;
 
 unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kThreads - 1) / kThreads); }
 __device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; }
@@ -17,14 +17,29 @@ __global__ void __launch_bounds__(kThreads) flag_pairs(const __grid_constant__ K
   const int64_t i = own_item();
   if (i <= in.count) kept[i] = i < in.count && stays(in, i) ? 1 : 0;
 }
+// Calls f(entry in the shorter list, its place) for the pairs of a corner point that stay; a warp for each. Returns how
+// many there are.
+template <class T, class F>
+__device__ int32_t each_kept(const KeepInputs<T>& in, const int32_t* kept, int64_t corner, const F& f) {
+  const unsigned lane = threadIdx.x % kWarp;
+  int32_t count = 0;
+  for (int32_t first = in.ptr[corner]; first < in.ptr[corner + 1]; first += kWarp) {
+    const int32_t own = first + static_cast<int32_t>(lane);
+    const int32_t entry = own < in.ptr[corner + 1] ? in.entry[own] : -1;
+    const bool stay = entry >= 0 && in.keep[entry >> 2];
+    const unsigned found = __ballot_sync(0xffffffffu, stay);
+    if (stay) f(4 * kept[entry >> 2] + (entry & 3), count + __popc(found & ((1u << lane) - 1)));
+    count += __popc(found);
+  }
+  return count;
+}
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     count_entries(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, int32_t* counts) {
-  const int64_t i = own_item();
+  const int64_t i = own_item() / kWarp;
   if (i > in.corners) return;
-  int32_t count = 0;
-  if (i < in.corners) each_entry(in, kept, i, [&](int32_t) { ++count; });
-  counts[i] = count;
+  const int32_t count = i < in.corners ? each_kept(in, kept, i, [](int32_t, int32_t) {}) : 0;
+  if (threadIdx.x % kWarp == 0) counts[i] = count;
 }
 template <class T>
 __global__ void __launch_bounds__(kThreads)
@@ -37,10 +52,10 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     copy_entries(const __grid_constant__ KeepInputs<T> in, const int32_t* kept, const __grid_constant__ Kept<T> out) {
-  const int64_t i = own_item();
+  const int64_t i = own_item() / kWarp;
   if (i >= in.corners) return;
-  int32_t at = out.ptr[i];
-  each_entry(in, kept, i, [&](int32_t entry) { out.entry[at++] = entry; });
+  int32_t* to = out.entry + out.ptr[i];
+  each_kept(in, kept, i, [&](int32_t entry, int32_t place) { to[place] = entry; });
 }
 
 constexpr int64_t aligned(int64_t bytes) { return (bytes + 255) / 256 * 256; }
@@ -68,10 +83,10 @@ cudaError_t keep(const KeepInputs<T>& in, const Kept<T>& out, void* workspace, c
   size_t bytes = scan_bytes(in);
   flag_pairs<T><<<blocks_for(in.count + 1), kThreads, 0, stream>>>(in, kept);
   if (auto error = cub::DeviceScan::ExclusiveSum(scan, bytes, kept, kept, in.count + 1, stream)) return error;
-  count_entries<T><<<blocks_for(in.corners + 1), kThreads, 0, stream>>>(in, kept, out.ptr);
+  count_entries<T><<<blocks_for((in.corners + 1) * kWarp), kThreads, 0, stream>>>(in, kept, out.ptr);
   if (auto error = cub::DeviceScan::ExclusiveSum(scan, bytes, out.ptr, out.ptr, in.corners + 1, stream)) return error;
   if (in.count > 0) copy_pairs<T><<<blocks_for(in.count), kThreads, 0, stream>>>(in, kept, out);
-  if (in.corners > 0) copy_entries<T><<<blocks_for(in.corners), kThreads, 0, stream>>>(in, kept, out);
+  if (in.corners > 0) copy_entries<T><<<blocks_for(in.corners * kWarp), kThreads, 0, stream>>>(in, kept, out);
   return cudaGetLastError();
 }
 
