@@ -9,7 +9,8 @@ namespace {
 
 using namespace contact;
 
-constexpr int kThreads = 128;
+constexpr int kThreads = 256;
+constexpr int64_t kManyPairs = 1 << 19;  // that are worth more than a block for each multiprocessor: more wait longer
 constexpr int kFlags = kMoves * (2 * kRounds + 1);  // one for each question that the whole grid is asked
 
 // Out of line: whoever asks gets the same bits.
@@ -119,7 +120,8 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
   int resident = 0;
   if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, kernel, kThreads, 0)) return error;
   const int64_t wanted = (std::max(rows, capacity) + kThreads - 1) / kThreads;
-  const auto blocks = static_cast<unsigned>(std::min<int64_t>(wanted, int64_t{resident} * multiprocessors));
+  const int64_t each = capacity < kManyPairs ? 1 : resident;
+  const auto blocks = static_cast<unsigned>(std::min<int64_t>(wanted, each * multiprocessors));
   void* arguments[] = {&inputs, &state, &flags, &found};
   return cudaLaunchCooperativeKernel(kernel, dim3(blocks), dim3(kThreads), arguments, 0, stream);
 }

@@ -9,7 +9,7 @@ namespace diffvbd::cuda {
 using namespace contact;
 using rigid::Body;
 
-constexpr int kFew = 16;   // bodies that are solved for together, up to which a block does all of it
+constexpr int kFew = 3;    // bodies that are solved for together, up to which one block is fastest
 constexpr int kOne = 128;  // threads of a block where each has an item of its own
 
 inline unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kOne - 1) / kOne); }

@@ -8,7 +8,8 @@ namespace diffvbd::cuda {
 namespace {
 
 static_assert(kSquare == kThreads);
-constexpr int kLanes = 8;  // threads that share the pairs of a vertex
+constexpr int kLanes = 8;                    // threads that share the pairs of a vertex
+constexpr int kSlots = 2, kLineDoubles = 7;  // slips that a thread keeps while a step looks for its length
 constexpr int kOwn = kUnknowns + rigid::kSix, kHalf = 3 * kUnknowns;
 
 // A list of pairs, and where the sides of its first one are.
@@ -52,6 +53,7 @@ struct System {
   double *center, *motion;  // of the scene's bodies
   double *base, *matrix, *gradient, *step;
   uint8_t* touching;  // [count, count]
+  double (*slots)[kLineDoubles][kThreads];
 
   __device__ Body<T> body(int32_t b) const { return {in.scene, scene, first + b}; }
   __device__ int32_t size() const { return kUnknowns * count; }
@@ -199,6 +201,9 @@ struct System {
         if (in.lag) add_own(rubs, b, item, out);
         if (item % kLanes != 0 || in.planes == 0) return;
         const int32_t v = own.vertex(item / kLanes);
+        bool any = false;
+        for (int k = 0; k < in.planes; ++k) any = bears(in, own, v, k) || any;
+        if (!any) return;
         const Vector arm = own.position(v) - c;
         Vector g{};
         Sym3<double> H{};
@@ -221,47 +226,72 @@ struct System {
     });
     return total[0];
   }
-  // Adds how far the slopes of all that slips are above what the step takes them for, after each of n shares of it.
-  template <int n>
-  __device__ void excess(const Rubs<T>& rubs, const double* shares, double* total) const {
+  // Calls f(line) for what slips, in a thread's share.
+  template <class F>
+  __device__ void each_line(const Rubs<T>& rubs, const F& f) const {
     const double* steps = step - kUnknowns * first;  // of the scene's bodies
-    for (int k = 0; k < n; ++k) total[k] = 0;
     for (int32_t b = 0; b < count; ++b) {
       const Body<T> own = body(b);
       if (!in.free[own.body]) continue;
-      double sum[n];
-      team.template sum<n>(items(b), sum, [&](int32_t item, double* out) {
-        const auto add = [&](const SlipLine& line) {
-#pragma unroll
-          for (int k = 0; k < n; ++k) out[k] += line.excess(shares[k]);
-        };
+      for (auto item = static_cast<int32_t>(threadIdx.x); item < items(b); item += kThreads) {
         if (in.lag) {
           each_side(rubs.pairs(), b, item, [&](int64_t pair, int side) {
             const PairPress a = rubs(pair, side);
-            if (side == (a.body[0] < 0 ? 1 : 0)) add(slip_line(in, pair, a, center, steps));  // once
+            if (side == (a.body[0] < 0 ? 1 : 0)) f(slip_line(in, pair, a, center, steps));  // once
           });
         }
-        if (item % kLanes != 0) return;
         const int32_t v = own.vertex(item / kLanes);
-        const Vector arm = own.position(v) - center_of(b);
-        for (int k = 0; k < in.planes; ++k) {
-          if (bears(in, own, v, k)) add(slip_line(in, own, v, k, arm, motion_of(b), step + kUnknowns * b));
+        for (int k = item % kLanes; k < in.planes; k += kLanes) {
+          if (!bears(in, own, v, k)) continue;
+          const Vector arm = own.position(v) - center_of(b);
+          f(slip_line(in, own, v, k, arm, motion_of(b), step + kUnknowns * b));
         }
-      });
-      for (int k = 0; k < n; ++k) total[k] += sum[k];
+      }
     }
+  }
+  // How many lines a thread has, of which it leaves the first ones in its slots.
+  __device__ int keep_lines(const Rubs<T>& rubs) const {
+    int lines = 0;
+    each_line(rubs, [&](const SlipLine& a) {
+      const double values[] = {a.slip.x, a.slip.y, a.slip.z, a.change.x, a.change.y, a.change.z, a.size};
+      for (int i = 0; lines < kSlots && i < kLineDoubles; ++i) slots[lines][i][threadIdx.x] = values[i];
+      ++lines;
+    });
+    return lines;
+  }
+  // How far the slopes of all that slips are above what the step takes them for, after each of n shares of it.
+  template <int n>
+  __device__ void excess(const Rubs<T>& rubs, int lines, const double* shares, double* total) const {
+#pragma unroll
+    for (int k = 0; k < n; ++k) total[k] = 0;
+    const auto add = [&](const SlipLine& line) {
+#pragma unroll
+      for (int k = 0; k < n; ++k) total[k] += line.excess(shares[k]);
+    };
+    for (int l = 0; l < lines && l < kSlots; ++l) {
+      const auto at = [&](int i) { return slots[l][i][threadIdx.x]; };
+      add({{at(0), at(1), at(2)}, {at(3), at(4), at(5)}, at(6), in.friction_eps});
+    }
+    if (lines > kSlots) {
+      int seen = 0;
+      each_line(rubs, [&](const SlipLine& line) {
+        if (seen++ >= kSlots) add(line);
+      });
+    }
+    team.template reduce<n>(total);
   }
   // As slip_share(), which halves an interval time after time: all shares that kLevels halvings may come to at once.
   __device__ double share_of_step(const Rubs<T>& rubs, double fall) const {
     constexpr int kLevels = 4, kShares = (1 << kLevels) - 1;
     double shares[kShares], over[kShares];
     shares[0] = 1;
-    excess<1>(rubs, shares, over);
+    const int lines = keep_lines(rubs);
+    excess<1>(rubs, lines, shares, over);
     if (!(kOvershoot * fall < over[0])) return 1;
     double low = 0, high = 1;
     for (int halvings = 0; halvings < kHalvings; halvings += kLevels) {
       for (int k = 0; k < kShares; ++k) shares[k] = low + (high - low) * (k + 1) / (kShares + 1);
-      excess<kShares>(rubs, shares, over);
+      excess<kShares>(rubs, lines, shares, over);
       int at = 0, width = kShares + 1;
       for (int level = 0; level < kLevels && halvings + level < kHalvings; ++level) {
         width /= 2;
@@ -323,6 +353,7 @@ __global__ void __launch_bounds__(kThreads)
                double* center, double* motion, double* factor) {
   __shared__ double part[kWarps][kMostSums];
   __shared__ uint8_t touching[kFew * kFew];
+  __shared__ double slots[kSlots][kLineDoubles][kThreads];
   extern __shared__ double memory[];
   const BlockTeam team{part};
   const int32_t n = in.bodies(), count = in.together() ? n : 1, size = kUnknowns * count;
@@ -339,7 +370,8 @@ __global__ void __launch_bounds__(kThreads)
                          matrix,
                          gradient,
                          gradient + size,
-                         touching};
+                         touching,
+                         slots};
   team.each(size, [&](int32_t i) { system.motion_of(0)[i] = 0; });
   team.each(count * count, [&](int32_t i) { touching[i] = 0; });
   team.meet();
@@ -363,9 +395,6 @@ cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const int3
                       double* center, double* motion, double* factor, cudaStream_t stream) {
   const int64_t size = in.system_size();
   const size_t bytes = (2 * size * size + 2 * size) * sizeof(double);
-  constexpr size_t kMost = 2 * kUnknowns * kFew * (kUnknowns * kFew + 1) * sizeof(double);
-  const auto limit = cudaFuncAttributeMaxDynamicSharedMemorySize;
-  if (auto error = cudaFuncSetAttribute(few_kernel<T>, limit, kMost)) return error;
   few_kernel<T><<<static_cast<unsigned>(in.systems()), kThreads, bytes, stream>>>(in, room.listed, sides, presses,
                                                                                   center, motion, factor);
   return cudaGetLastError();

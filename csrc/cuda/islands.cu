@@ -225,7 +225,11 @@ template <class T>
 __global__ void __launch_bounds__(kThreads)
     scene_sync_kernel(const IslandInputs<T> in, Workspace<T> work, int32_t* island) {
   __shared__ int32_t unsettled, label[kFewBodies];
-  __shared__ BodySum<T> part[kThreads];
+  // of islands; then what bodies sweep
+  constexpr size_t kBytes = kThreads * sizeof(BodySum<T>), kBoxes = kFewBodies * sizeof(Bounds<T>);
+  __shared__ __align__(16) unsigned char memory[kBytes < kBoxes ? kBoxes : kBytes];
+  auto* part = reinterpret_cast<BodySum<T>*>(memory);
+  auto* boxes = reinterpret_cast<Bounds<T>*>(memory);
   const int32_t n = in.mesh_bodies;
   const int64_t first = int64_t{blockIdx.x} * n;
   const auto each = [&](int32_t count, const auto& f) {
@@ -255,16 +259,18 @@ __global__ void __launch_bounds__(kThreads)
   each(n, [&](int32_t i) { label[i] = i, work.stays[first + i] = false; });
   for (int round = 0; round <= kJoins; ++round) {
     sum(), sweep();
-    each(n * n, [&](int32_t pair) {
-      const int32_t i = pair / n, j = pair % n;
-      if (j <= i || !overlap(work.boxes[first + i], work.boxes[first + j])) return;
-      if (root_of(label, i) == root_of(label, j)) return;
-      if (round < kJoins) {
-        unite(label, i, j);
-      } else {
-        unsettled = 1;
+    each(n, [&](int32_t i) { boxes[i] = work.boxes[first + i]; });
+    for (auto i = static_cast<int32_t>(threadIdx.x / kWarp); i < n; i += kThreads / kWarp) {
+      for (int32_t j = i + 1 + static_cast<int32_t>(threadIdx.x % kWarp); j < n; j += kWarp) {
+        if (!overlap(boxes[i], boxes[j]) || root_of(label, i) == root_of(label, j)) continue;
+        if (round < kJoins) {
+          unite(label, i, j);
+        } else {
+          unsettled = 1;
+        }
       }
-    });
+    }
+    __syncthreads();
     each(n, [&](int32_t i) { label[i] = unsettled ? 0 : root_of(label, i); });
   }
   sum(), sweep(), sum();
