@@ -216,15 +216,17 @@ struct System {
     team.meet();
   }
 
-  // Of the matrix, half of which is what a step lowers its potential by.
-  __device__ double energy_of(const double* x, const double* more) const {
-    double total[1];
-    team.template sum<1>(size(), total, [&](int32_t j, double* out) {
-      double sum = 0;
-      for (int32_t i = j; i < size(); ++i) sum += matrix[size() * i + j] * (more ? x[i] + more[i] : x[i]);
-      out[0] += sum * sum;
+  // Of the matrix, of the step and of the motion after it: half of the first is what the step lowers the potential by.
+  __device__ void energies(double* total) const {
+    const double* own = motion_of(0);
+    team.template sum<2>(size(), total, [&](int32_t j, double* out) {
+      double steps = 0, whole = 0;
+      for (int32_t i = j; i < size(); ++i) {
+        steps += matrix[size() * i + j] * step[i];
+        whole += matrix[size() * i + j] * (step[i] + own[i]);
+      }
+      out[0] += steps * steps, out[1] += whole * whole;
     });
-    return total[0];
   }
   // Calls f(line) for what slips, in a thread's share.
   template <class F>
@@ -330,10 +332,12 @@ struct System {
       team.meet();
       double share = 1;
       if (in.rubs()) {
-        const double fall = energy_of(step, nullptr), whole = energy_of(step, own);
+        double of[2];
+        energies(of);
+        const double fall = of[0];
         if (state == kSettledAt) {
           state = kDone;
-        } else if (fall <= kSettled * kSettled * whole) {
+        } else if (fall <= kSettled * kSettled * of[1]) {
           state = kSettledAt;
         } else {
           share = share_of_step(rubs, fall);

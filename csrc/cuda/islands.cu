@@ -224,7 +224,7 @@ __global__ void finish_kernel(const IslandInputs<T> in, Workspace<T> work, int32
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     scene_sync_kernel(const IslandInputs<T> in, Workspace<T> work, int32_t* island) {
-  __shared__ int32_t unsettled, label[kFewBodies];
+  __shared__ int32_t unsettled, changes, label[kFewBodies];
   // of islands; then what bodies sweep
   constexpr size_t kBytes = kThreads * sizeof(BodySum<T>), kBoxes = kFewBodies * sizeof(Bounds<T>);
   __shared__ __align__(16) unsigned char memory[kBytes < kBoxes ? kBoxes : kBytes];
@@ -254,15 +254,23 @@ __global__ void __launch_bounds__(kThreads)
     }
     __syncthreads();
   };
-  const auto sweep = [&] { each(n, [&](int32_t i) { sweep_body(in, work, first + i, label[i]); }); };
+  const auto sweep = [&] {
+    each(n, [&](int32_t i) {
+      const bool stayed = work.stays[first + i];
+      sweep_body(in, work, first + i, label[i]);
+      if (work.stays[first + i] != stayed) changes = 1;
+    });
+  };
   if (threadIdx.x == 0) unsettled = 0;
   each(n, [&](int32_t i) { label[i] = i, work.stays[first + i] = false; });
   for (int round = 0; round <= kJoins; ++round) {
+    if (threadIdx.x == 0) changes = 0;
     sum(), sweep();
     each(n, [&](int32_t i) { boxes[i] = work.boxes[first + i]; });
     for (auto i = static_cast<int32_t>(threadIdx.x / kWarp); i < n; i += kThreads / kWarp) {
       for (int32_t j = i + 1 + static_cast<int32_t>(threadIdx.x % kWarp); j < n; j += kWarp) {
         if (!overlap(boxes[i], boxes[j]) || root_of(label, i) == root_of(label, j)) continue;
+        changes = 1;
         if (round < kJoins) {
           unite(label, i, j);
         } else {
@@ -270,7 +278,7 @@ __global__ void __launch_bounds__(kThreads)
         }
       }
     }
-    __syncthreads();
+    if (!__syncthreads_or(changes)) break;  // nor will the next round
     each(n, [&](int32_t i) { label[i] = unsettled ? 0 : root_of(label, i); });
   }
   sum(), sweep(), sum();
