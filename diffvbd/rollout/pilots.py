@@ -22,6 +22,7 @@ from .energy_check import mechanical_energy
 from .settings import Settings
 from .trajectory import PerStep, Trajectory
 
+SHORTEST = 1e-3  # of the duration: the step that is taken to see whether arguments are good
 FRAMES = 4  # at which two runs are compared, equally spaced over the duration
 STILL = 1e-4  # of the size of the scene: a motion below it counts as one of this size
 NO_PART = 1e-8  # of quantity over modulus: a gradient below it counts as one of this size
@@ -69,6 +70,9 @@ class Pilots:
 
     def __post_init__(self) -> None:
         self.duration = check_positive("duration", self.duration, "s")
+        limits, h = torch.finfo(self.model.dtype), SHORTEST * self.duration
+        if not limits.tiny <= h * h <= limits.max:
+            fail("duration", f"a number of seconds of which {SHORTEST:g} is a time step", self.duration)
         parameters = self.given.get("parameters")
         named = {f'parameters["{k}"]': v for k, v in parameters.items()} if isinstance(parameters, dict) else {}
         for name, value in {**self.given, **named}.items():
@@ -84,7 +88,7 @@ class Pilots:
 
     def check(self) -> None:
         """One short step: raises what rollout raises of the arguments."""
-        h = 1e-3 * self.duration
+        h = SHORTEST * self.duration
         given = self.at_steps(dict(self.given), h, 1, 0.0)
         with silent(self.model):
             end = self.execute(self.model, self.x, self.v, steps=1, time_step=h, sweeps=1, save="last", **given)

@@ -108,6 +108,7 @@ def test_auto_in_a_rollout() -> None:
         ({"error": 0.0}, ValueError, "error: expected"),
         ({"error": 1.0}, ValueError, r"error: expected a share of the motion in \(0, 1\)"),
         ({"duration": 0.0}, ValueError, "duration: expected"),
+        ({"duration": 1e-300}, ValueError, "duration: expected a number of seconds of which 0.001 is a time step"),
         ({"gradient": 1}, TypeError, "gradient: expected a bool"),
         ({"quantity": 3}, TypeError, "quantity: expected a function"),
         ({"quantity": lambda x, v: x}, ValueError, "quantity: expected a function that returns a scalar"),
