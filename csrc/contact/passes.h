@@ -210,7 +210,7 @@ DIFFVBD_FN bool may_limit(const Source<T, Positions>& s, int64_t entry, T length
                      limit_of<T>(exponent) * length / T(kBothShare) + guard);
 }
 
-// And not below `exponent` of one of its pairs, by the length of d and the guard of v.
+// The exponent of the limit by one of the vertex's pairs, not below `exponent`, by the length of d and the guard of v.
 template <class T, class Positions>
 DIFFVBD_FN int limit_by_pair(const Source<T, Positions>& s, int entry, const Vec3<T>& d, T length, T guard,
                              int exponent) {

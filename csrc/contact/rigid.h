@@ -234,7 +234,7 @@ struct Slid {
 // Lagged friction and damping of a pair; it acts along a gap, so that it turns a body even by itself. The gradient is
 // that of a matrix which holds where bodies have gone as `slid` says: there both are exact. Where the sides of a pair
 // are not solved for together, `alone` says which side is meant. It has half of the potential, at twice its motion: the
-// potential is convex, so that what lowers both halves lowers the whole. -1: only the value is asked for.
+// potential is convex, so that what lowers both halves lowers the whole. -1: both are, or only the value is asked for.
 template <class T, class At>
 DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, const Slid& slid, PairPress& out,
                              int alone) {

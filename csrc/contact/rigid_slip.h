@@ -12,16 +12,6 @@ constexpr int kHalvings = 10;        // in the search for the length of a step
 constexpr double kOvershoot = 0.1;   // slope at the end of a step over that at its start, that is none
 constexpr double kSettled = 1e-9;    // of the whole, a step after which there is but one more
 
-// Calls f(press) for all of a lagged pair that acts, or for each side that is solved for alone.
-template <class T, class At, class F>
-DIFFVBD_FN void each_lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, const Slid& slid, const F& f) {
-  PairPress press;
-  if (!lagged_press(in, pair, at, slid, press, 0)) return;
-  f(press);
-  if (press.doubled == 1 || !lagged_press(in, pair, at, slid, press, 1)) return;
-  f(press);
-}
-
 // A slip along a step of Newton's method.
 struct SlipLine {
   Vector slip, change;

@@ -127,8 +127,8 @@ void ContactScene<T>::each_pair(int32_t v, const F& look) const {
   }
 }
 
-// The exponent of the limit of a vertex by all its pairs, of what assemble() has seen at the same positions; looks closer
-// only where that does not settle it.
+// The exponent of the limit of a vertex by all its pairs, of what assemble() has seen at the same positions; looks
+// closer only where that does not settle it.
 template <class T>
 int ContactScene<T>::limit_by_near(const Source<T, Before>& source, int32_t v, const Vec3<T>& d, int exponent) const {
   const T length = length_of(d), guard = guard_of(source, v);

@@ -102,6 +102,16 @@ struct Systems {
   }
 };
 
+// Calls f(press) for all of a lagged pair that acts, or for each side that is solved for alone.
+template <class T, class At, class F>
+void each_lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, const Slid& slid, const F& f) {
+  PairPress press;
+  if (!lagged_press(in, pair, at, slid, press, 0)) return;
+  f(press);
+  if (press.doubled == 1 || !lagged_press(in, pair, at, slid, press, 1)) return;
+  f(press);
+}
+
 // Calls f(press, pair) for what each lagged pair of a scene presses in systems that are not done.
 template <class T, class F>
 void each_lagged(const RigidInputs<T>& in, int64_t scene, const Slid& slid, const Systems& systems, const F& f) {

@@ -35,16 +35,15 @@ class Tries {
     });
   }
 
-  // state: shares and flags of all units, as the test of a pair takes them. motions [B, V]: memory.
+  // state: shares and flags of all units, as the test of a pair takes them. motions [V]: memory.
   void run(AdvanceState<T> state, std::vector<Motion<T>>& motions) {
     const int32_t n = in_.bodies();
-    state.motion = motions.data();
+    state.motion = motions.data() - scene_ * in_.scene.vertices;
     std::fill_n(share_, n, 1.0);
     for (int attempt = 0; attempt < kTries; ++attempt) {
       displace();
       for (int64_t v = 0; v < in_.scene.vertices; ++v) {
-        const int64_t row = scene_ * in_.scene.vertices + v;
-        motions[row] = motion_of(in_.gate, state, row);
+        motions[v] = motion_of(in_.gate, state, scene_ * in_.scene.vertices + v);
       }
       const bool fits = test(state);
       const double after = fits ? potential(true, [](const PairPress&) {}) : 0;
@@ -68,7 +67,8 @@ class Tries {
   // The listed pairs that some share of the motions may bring within reach of their barrier. A gap shrinks by no more
   // than its sides have moved since it was taken.
   void find_near() {
-    std::vector<double> farthest(in_.bodies() + 1, 0.0);  // that a vertex of each body may be from where it was then
+    std::vector<double> farthest(in_.bodies(), 0.0);  // that a vertex of each body may be from where it was then
+    std::vector<T> size(in_.bodies(), T(0));          // of positions, which rounding is measured by
     for (int32_t k = 0; k < in_.bodies(); ++k) {
       const Body<T> body{in_.scene, scene_, k};
       const Vector center = vector_of(center_ + 3 * k);
@@ -79,6 +79,9 @@ class Tries {
         const Vector since = x - Body<T>::at(in_.gate.center + 3 * body.row(body.vertex(i)));
         const double far = std::sqrt(dot(since, since)) + way + angle * std::sqrt(dot(arm, arm));
         farthest[k] = std::max(farthest[k], (1 + kRounded) * far);
+        const Vec3<T> at = point_at(in_.gate.x, body.row(body.vertex(i)));
+        const Vec3<T> from = in_.gate.origin ? point_at(in_.gate.origin, body.row(body.vertex(i))) : zero3<T>();
+        size[k] = std::max(size[k], size_of(at + from));
       }
     }
     for (int64_t i = in_.first_listed(scene_); i < in_.first_listed(scene_ + 1); ++i) {
@@ -87,7 +90,8 @@ class Tries {
       const T* constants = in_.gate.constants + kConstants * i;
       const int32_t a = in_.gate.body[record[0]], b = in_.gate.body[record[sides(record[4])]];
       const bool known = a < in_.bodies() && b < in_.bodies();  // whose gap is of the time of the centers
-      const double room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
+      const double gap = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
+      const double room = known ? gap - guard_of_size(std::max(size[a], size[b])) : gap;  // as stays_far()
       if (!known || !(farthest[a] + farthest[b] < (1 - kRounded) * room)) near_.push_back(i);
     }
   }
@@ -157,9 +161,9 @@ void rigid_move(const RigidInputs<T>& in, const double* center, const double* mo
   const int64_t n = in.bodies(), units = in.gate.units();
   std::vector<T> none(units, T(0)), all(units, T(1));
   std::vector<uint8_t> blocked(units), stamp(units), failed(in.scene.scenes);
-  std::vector<Motion<T>> motions(in.scene.scenes * in.scene.vertices);
   const AdvanceState<T> state{none.data(), all.data(), blocked.data(), stamp.data(), failed.data(), false};
   torch::stable::parallel_for(0, in.scene.scenes, 1, [&](int64_t begin, int64_t end) {
+    std::vector<Motion<T>> motions(in.scene.vertices);
     for (int64_t s = begin; s < end; ++s) {
       Tries<T>(in, s, center + 3 * n * s, motion + kUnknowns * n * s, move, share + n * s).run(state, motions);
       for (int64_t i = 3 * s * in.scene.vertices; i < 3 * (s + 1) * in.scene.vertices; ++i)

@@ -10,7 +10,7 @@ namespace {
 using namespace contact;
 
 constexpr int kThreads = 256;
-constexpr int64_t kManyPairs = 1 << 19;  // that are worth more than a block for each multiprocessor: more wait longer
+constexpr int64_t kManyPairs = 1 << 19;  // worth more than one block a multiprocessor: more blocks wait longer
 constexpr int kFlags = kMoves * (2 * kRounds + 1);  // one for each question that the whole grid is asked
 
 // Out of line: whoever asks gets the same bits.

@@ -11,7 +11,7 @@ using contact::ContactAdjoints;
 using contact::ContactInputs;
 
 constexpr int kShare = 8, kContactThreads = 128;
-// Of a vertex of a color that has few, which do not fill the device: its pairs are waited for one after another.
+// Threads for a vertex where its color has few, which do not fill the device: its pairs are waited for one by one.
 constexpr int kWide = 32;
 constexpr int64_t kFewVertices = 2048;  // of a color, in all scenes
 

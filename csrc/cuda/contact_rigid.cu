@@ -1,4 +1,4 @@
-// The rigid correction where many bodies are solved for together: all work on a scene is shared by several blocks.
+// The rigid correction where many bodies are solved for together: most work on a scene is shared by several blocks.
 #include "../contact/rigid_slip.h"
 #include "contact_rigid.cuh"
 

@@ -24,6 +24,12 @@ class Pairs(NamedTuple):
     entry: Tensor
 
 
+def no_pairs(like: Tensor, corners: int) -> Pairs:
+    """An empty list for so many corner points of all scenes."""
+    none = torch.zeros((corners + 1,), dtype=torch.int32, device=like.device)
+    return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, ops_contact.CONSTANTS)), none, none[:0])
+
+
 def some_of(listed: Pairs, keep: Tensor) -> tuple[Pairs, Tensor]:
     """Those of listed pairs that ``keep`` names, bool [pairs], and which they are. Where values must not decide sizes,
     on CUDA and compiled, in lists of the same length, with -1 where there is none."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.contact_lag import Pairs, of_scene, pair_lag, some_of
+from ..adjoint.contact_lag import Pairs, no_pairs, of_scene, pair_lag, some_of
 from ..adjoint.rise import RiseParts, rise_parts, rises
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
@@ -23,7 +23,6 @@ from ..model.model import Model
 from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
 from ..ops.contact_rigid import MOST_COUPLED
-from ..ops.detect import CONSTANTS
 from ..ops.motion import RoomsOfBodies
 from ..scopes import checking, not_compiled, recorders
 from ..tuples import replaced
@@ -45,6 +44,8 @@ if TYPE_CHECKING:
 # the upper body creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; with 1 it falls.
 APART_CORRECTIONS = 4
 FREE = 1e15  # [m] room that nothing fills
+CLOSE = 1e-3  # of dhat: pairs whose gap is so much wider do not push, however it is rounded
+LONG_LIST = 1024  # pairs, of which it pays to find those that push
 MOST_CAPACITY = 2**26
 LOST = ("x: positions became non-finite {}: look with diffvbd.debug_checks(), use a smaller time_step or softer "
         "materials")  # fmt: skip
@@ -118,7 +119,7 @@ class ContactStep:
         damping = self._parameter("pair_barrier.damping", zero)
         share = damped_share(force, of_pair(self.kappa), dhat)
         lag = torch.cat([of_pair(coefficient) * force, of_pair(damping) * share, rest], -1)
-        listed, rows = some_of(listed, (active[:, 0] != 0).contiguous())  # most of what is listed does not touch yet
+        listed, rows = some_of(listed, (active[:, 0] != 0).contiguous())
         lag = torch.where((rows >= 0)[:, None], lag[rows.clamp(min=0)], 0.0) if lag.shape[0] else lag
         self.lagged, self.lag = listed, lag
 
@@ -126,6 +127,12 @@ class ContactStep:
     def _reads(x: Tensor) -> bool:
         """Whether values may decide sizes: on CUDA that would wait."""
         return not x.is_cuda
+
+    def _pushing(self, listed: Pairs) -> Pairs:
+        """The pairs of a long list that may push where it was made, if that may be read: most do not."""
+        if listed.pairs.shape[0] < LONG_LIST or not self._reads(self.x_prev):
+            return listed
+        return some_of(listed, (listed.constants[:, -1] < (1 + CLOSE) * listed.constants[:, 0]).contiguous())[0]
 
     def _narrowed(self, listed: Pairs, x: Tensor, collider: Tensor, room: Tensor) -> tuple[Pairs, Tensor | None]:
         """The pairs that can matter as long as no vertex goes farther than its room [B, V] from x, with their gaps
@@ -167,9 +174,10 @@ class ContactStep:
             if self._reads(x):  # before any work
                 self._check(r, met.counts[r].tolist(), met)
             if r == 0:
-                self._set_lag(detection.listed, was)
+                pushing = self._pushing(detection.listed)
+                self._set_lag(pushing, was)
                 fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
-                                          self.floor_data, detection.listed, settings.numbers.time_step)  # fmt: skip
+                                          self.floor_data, pushing, settings.numbers.time_step)  # fmt: skip
             fall = fall if self.model.starts_from == "predictor" else torch.zeros_like(fall)  # corrections do it
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
                                          detection, surface, motion.rigid, ROOM * motion.stretched, self._raises,
@@ -365,12 +373,6 @@ class ContactStep:
         given = (self.x_prev, self.begun.y, self.colliders, self.before)
         if not all(bool(torch.isfinite(t).all()) for t in given):
             raise ValueError("start (x, v, force, gravity, prescribed, colliders): expected finite values")
-
-
-def no_pairs(like: Tensor, corners: int) -> Pairs:
-    """An empty list for so many corner points of all scenes."""
-    none = torch.zeros((corners + 1,), dtype=torch.int32, device=like.device)
-    return Pairs(none[:0].reshape(0, 6), like.new_zeros((0, CONSTANTS)), none, none[:0])
 
 
 @not_compiled  # sizes, checks and lists depend on values, and torch 2.11 compiled wrong gradients

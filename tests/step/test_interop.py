@@ -24,10 +24,10 @@ from torch.utils.checkpoint import checkpoint
 
 import diffvbd as dv
 from diffvbd import ops
+from diffvbd.adjoint.contact_lag import no_pairs
 from diffvbd.contact.detection import detect
 from diffvbd.model.rest import shape_gradients
 from diffvbd.step.coarse import coarse_parts
-from diffvbd.step.contact import no_pairs
 from diffvbd.step.rigid_contact import bodies_of
 from diffvbd.testing import relative_error, tolerance
 
