@@ -102,8 +102,8 @@ def _raise_touching(surface: ContactSurface, touching: int, key: int) -> None:
     if key < 0:
         fail("x", "finite positions of surfaces", "some that are not")
     scene, corners = surface.corners_of(key)
-    fail("x", "surfaces that do not touch", f"{touching} pairs without a gap, one of the corner points {corners} in "
-         f"scene {scene}")  # fmt: skip
+    fail("x", "surfaces that do not touch", f"{touching} pairs without a gap, one of the corner points {corners} of "
+         f"{surface.owners_of(corners[0], corners[3])} in scene {scene}")  # fmt: skip
 
 
 def barrier_forces(pairs: NearPairs, points: Tensor, kappa: Tensor) -> Tensor:

@@ -64,6 +64,12 @@ class ContactSurface:
         corners = [side[row].reshape(-1).tolist() for side, row in zip(sides, (first, second), strict=True)]
         return scene, corners[0] + corners[1]
 
+    def owners_of(self, first: int, second: int) -> str:
+        """What two corner points belong to, for messages."""
+        bodies = [int(self.body[corner]) for corner in (first, second)]
+        named = [f"body {b}" if b < self.bodies else f"collider {b - self.bodies}" for b in bodies]
+        return " and ".join(dict.fromkeys(named))
+
     def to(self, device: torch.device, dtype: torch.dtype) -> ContactSurface:
         changes: dict[str, Any] = {}
         for field in fields(self):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import torch
@@ -54,6 +55,27 @@ class Forces:
     between: ForceParts
     colliders: ForceParts
     floors: ForceParts
+
+    def __str__(self) -> str:
+        """A line for each two bodies, each collider and each plane that press; of batches the shapes alone."""
+        scenes = self.vertices.normal.shape[:-2]
+        if scenes.numel() != 1:
+            return f"Forces of contact in scenes {list(scenes)}, {len(self.body_pairs)} pairs of bodies"
+        lines = []
+
+        def add(name: str, parts: ForceParts, at: tuple[int, ...]) -> None:
+            normal, tangential = (t.detach().reshape(t.shape[len(scenes) :])[at].tolist() for t in parts)
+            if any(normal) or any(tangential):
+                words = (" ".join(f"{value:.4g}" for value in force) for force in (normal, tangential))
+                lines.append(f"{name}: normal ({next(words)}) N, friction ({next(words)}) N")
+
+        for i, (a, b) in enumerate(self.body_pairs.tolist()):
+            add(f"on body {a} by body {b}", self.between, (i,))
+        for parts, by in ((self.colliders, "collider"), (self.floors, "floor plane")):
+            bodies, others = parts.normal.shape[-3:-1]
+            for body, other in product(range(bodies), range(others)):
+                add(f"on body {body} by {by} {other}", parts, (body, other))
+        return "\n".join(lines) or "no forces of contact"
 
 
 def forces(

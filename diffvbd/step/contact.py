@@ -355,11 +355,11 @@ class ContactStep:
             vertices = self.x_prev.shape[1]
             named = "x or colliders" if any(corner >= vertices for corner in corners) else "x"
             moved = named != "x" and self.colliders is not self.before  # through something, it may be
+            owners = surface.owners_of(corners[0], corners[3])
             raise ValueError(
                 f"{named}: expected surfaces that do not touch, got {touching} pairs without a gap in part {r} of the "
-                f"step, one of the corner points {corners} in scene {scene}"
-                + moved
-                * ": move colliders less, or use more detections or a smaller time_step"
+                f"step, one of the corner points {corners} of {owners} in scene {scene}: "
+                + ("move colliders less, or use more detections or a smaller time_step" if moved else "move them apart")
             )
         if hindered:
             raise ValueError(

@@ -61,6 +61,7 @@ def refuse_intersections(model: Model, x: Tensor, origin: Tensor, colliders: Ten
         got = [f"{total} edges through triangles"] * bool(total) + [f"{below} points behind planes"] * bool(below)
         raise ValueError(
             f"{'x' if of_bodies else 'x or colliders'}: expected surfaces that do not intersect, got "
-            f"{' and '.join(got)}: {what} in scene {scene}. Contact keeps apart what is apart and cannot undo this: "
+            f"{' and '.join(got)}: {what} in scene {scene}, of "
+            f"{surface.owners_of(ends[0], corners[0])}. Contact keeps apart what is apart and cannot undo this: "
             f"move the bodies apart (diffvbd.contact.intersections lists what crosses){otherwise}"
         )

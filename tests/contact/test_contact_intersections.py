@@ -196,6 +196,7 @@ def test_a_rollout_refuses_a_start_that_intersects(device: str, dtype: torch.dty
     message = str(error.value)
     assert message.startswith(f"x: expected surfaces that do not intersect, got {len(listed)} edges through triangles")
     assert f"corner points {ends} passes through the triangle {corners} in scene 0" in message
+    assert "in scene 0, of body 0 and body 1. " in message or "in scene 0, of body 1 and body 0. " in message
     assert "move the bodies apart" in message and "check_start=False" in message
     assert run(model, check_start=False).x.isfinite().all()
     assert run(model, steps=0).steps == [0]

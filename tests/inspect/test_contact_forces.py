@@ -72,6 +72,18 @@ def test_at_rest_forces_carry_the_weight(device: str, support: str) -> None:
         assert not borne[:8].any() and float((borne.sum(0) - up).abs().max()) <= least
 
 
+def test_printed_they_say_who_presses_whom() -> None:
+    model = resting("body", "cpu")
+    x = settled(model)
+    found = dv.contact.forces(model, x)
+    weight = float(model.mass[:8].sum()) * GRAVITY
+    text = str(found)
+    assert text.startswith("on body 0 by body 1: normal (") and text.endswith("friction (0 0 0) N")
+    assert f"{weight:.4g}" in text and "\n" not in text
+    assert str(dv.contact.forces(model, x + 10.0 * model.body[:, None])) == "no forces of contact"
+    assert "scenes [2], 1 pairs" in str(dv.contact.forces(model, torch.stack([x, x])))
+
+
 def run(scene: contact_scenes.Scene, sweeps: int, model: dv.Model | None = None) -> tuple[dv.Model, dict[str, Any]]:
     """A Model and a step of it, as `dv.contact.forces` takes it; beside it the velocity after the step."""
     model = scene.model if model is None else model
