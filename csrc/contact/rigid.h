@@ -12,10 +12,6 @@ namespace diffvbd::contact {
 using rigid::Vector;
 
 constexpr int kMostCoupled = 64;  // bodies of a scene that are solved for together; else one side of a pair at a time
-constexpr int kTries = 6;         // of motions, each shorter for some bodies, or none for them
-constexpr int kShorter = 3;       // of these: how often a body whose way is blocked tries a shorter one before it stays
-constexpr int kSpreads = 4;       // how often a shorter motion is handed on to the bodies that one touches
-constexpr double kRise = 1e-9;    // of the potential, that counts as none
 constexpr double kLeastInertia = 1e-11;  // of a body's mass and sum of m r^2, that keeps its system definite
 constexpr int kUnknowns = 6;             // of a body: a turn and a shift
 
@@ -352,18 +348,6 @@ DIFFVBD_FN double vertex_value(const RigidInputs<T>& in, const rigid::Body<T>& b
   return value;
 }
 
-// Whether the energies of a vertex admit what it tries.
-template <class T>
-DIFFVBD_FN bool admitted(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v) {
-  const VertexState<double> s = b.state(v, CornerPoints<T>{in, true}.relative(b.scene, v));
-  bool out = true;
-  b.energies(v, [&](auto energy, int, const double* data, int count) {
-    using E = decltype(energy);
-    if constexpr (E::has_filter) out = out && E::template admits<T>(s, b.position(v), data, count, rigid::kLeastShare);
-  });
-  return out;
-}
-
 // How far a turn and a shift take a point at r from the center.
 DIFFVBD_FN Vector displaced(const double* motion, double share, const Vector& r) {
   const Vector w = share * Vector{motion[0], motion[1], motion[2]}, turned = cross(w, r);
@@ -392,17 +376,6 @@ struct MatrixPart {
 // Where sides are not solved for together, each bears what both would: then no step is too long.
 DIFFVBD_FN double borne(const PairPress& a, bool together) {
   return !together && a.body[0] >= 0 && a.body[1] >= 0 ? 2 : 1;
-}
-
-// Whether a scene may go as it tries: all fit, and its potential does not rise.
-DIFFVBD_FN bool is_safe(double before, double after, bool fits) {
-  return fits && after <= before + kRise * absolute(before);
-}
-// The factor of what a body tries next, before it is handed on.
-DIFFVBD_FN double shortened(bool blocked, bool fits, int attempt) {
-  if (fits) return 0.5;  // the potential rises: all go half as far
-  if (!blocked) return 1.0;
-  return attempt == 0 ? 0.5 : attempt < kShorter ? 0.25 : 0.0;
 }
 
 }  // namespace diffvbd::contact

@@ -5,7 +5,7 @@
 #include <utility>
 #include <vector>
 
-#include "../contact/rigid_slip.h"
+#include "../contact/rigid_tries.h"
 #include "contact_rigid.h"
 
 namespace diffvbd {

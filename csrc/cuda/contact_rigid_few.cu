@@ -2,7 +2,7 @@
 // block for each system.
 #include "../contact/rigid_slip.h"
 #include "cholesky.cuh"
-#include "contact_rigid.cuh"
+#include "contact_rigid_presses.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -11,37 +11,6 @@ static_assert(kSquare == kThreads);
 constexpr int kLanes = 8;                    // threads that share the pairs of a vertex
 constexpr int kSlots = 2, kLineDoubles = 7;  // slips that a thread keeps while a step looks for its length
 constexpr int kOwn = kUnknowns + rigid::kSix, kHalf = 3 * kUnknowns;
-
-// A list of pairs, and where the sides of its first one are.
-struct Sides {
-  const PairList& list;
-  const int32_t* bodies;
-};
-
-// The barriers of listed pairs.
-template <class T>
-struct Barriers {
-  const RigidInputs<T>& in;
-  const int32_t* sides;
-  const double* presses;
-  __device__ Sides pairs() const { return {in.gate.listed, sides}; }
-  __device__ PairPress operator()(int64_t pair, int) const {
-    return load_press(presses + kPressDoubles * pair, sides + 2 * pair);
-  }
-};
-// Friction and damping of lagged ones, for a side that may be solved for alone.
-template <class T>
-struct Rubs {
-  const RigidInputs<T>& in;
-  const int32_t* sides;
-  Slid slid;
-  __device__ Sides pairs() const { return {in.lagged, sides}; }
-  __device__ PairPress operator()(int64_t pair, int side) const {
-    PairPress a;
-    lagged_press(in, pair, CornerPoints<T>{in, false}, slid, a, side);
-    return a;
-  }
-};
 
 // A system: all bodies of a scene, or one.
 template <class T>

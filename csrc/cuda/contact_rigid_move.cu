@@ -1,5 +1,6 @@
 #include <algorithm>
 
+#include "../contact/rigid_tries.h"
 #include "contact_rigid.cuh"
 #include "ordered.cuh"
 
