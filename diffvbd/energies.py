@@ -177,7 +177,7 @@ class FloorBarrier(VertexEnergy):
             fail("height", "at least one value", "none")
         if normal.dim() != 2 or normal.shape[-1] != 3 or normal.shape[0] == 0:
             fail("normal", "3 numbers, or a sequence of such triples", f"shape {tuple(normal.shape)}")
-        if bool((normal.norm(dim=-1) == 0).any()):
+        if bool((normal == 0).all(-1).any()):
             fail("normal", "vectors that are not zero", self.normal)
         if height.shape[0] not in (1, normal.shape[0]):
             if normal.shape[0] != 1:
@@ -199,13 +199,14 @@ class FloorBarrier(VertexEnergy):
         return 7 * self.planes
 
     def constants(self, rest_points: Tensor) -> dict[str, Tensor]:
-        return {
-            k: torch.as_tensor(getattr(self, k), dtype=rest_points.dtype, device=rest_points.device)
-            for k in self.parameters
-        }
+        normal = torch.tensor(self.normal, dtype=torch.float64)
+        values = {k: getattr(self, k) for k in self.parameters}
+        values["normal"] = normal / normal.abs().amax(-1, keepdim=True)  # very long or short ones are out of range
+        return {k: torch.as_tensor(v, dtype=rest_points.dtype, device=rest_points.device) for k, v in values.items()}
 
     def pack(self, values: dict[str, Tensor], origin: Tensor | None) -> Tensor:
         normal = values["normal"]
+        normal = normal / normal.detach().abs().amax(-1, keepdim=True)  # as are their squares
         normal = normal / (normal * normal).sum(-1, keepdim=True).sqrt()
         scenes = max(v.shape[0] for v in values.values())
         shape = (scenes, self.planes)

@@ -7,10 +7,10 @@
 
 namespace diffvbd::contact {
 
-constexpr int kSlipIterations = 12;  // of Newton's method
-constexpr int kHalvings = 10;        // in the search for the length of a step
-constexpr double kOvershoot = 0.1;   // slope at the end of a step over that at its start, that is none
-constexpr double kSettled = 1e-9;    // of the whole, a step after which there is but one more
+constexpr int kSlipIterations = 200;  // of Newton's method at most: mostly it settles within 10 to 30
+constexpr int kHalvings = 10;         // in the search for the length of a step
+constexpr double kOvershoot = 0.1;    // slope at the end of a step over that at its start, that is none
+constexpr double kSettled = 1e-9;     // of the whole, a step after which there is but one more
 
 // A slip along a step of Newton's method.
 struct SlipLine {

@@ -1,4 +1,7 @@
 // The rigid correction where many bodies are solved for together: most work on a scene is shared by several blocks.
+#include <algorithm>
+#include <vector>
+
 #include "../contact/rigid_slip.h"
 #include "contact_rigid.cuh"
 
@@ -6,6 +9,8 @@ namespace diffvbd::cuda {
 namespace {
 
 constexpr unsigned kAll = 0xffffffffu;
+constexpr int kAsked = 12;               // iterations after which the host asks whether all is done,
+constexpr int kCapturedIterations = 32;  // which it cannot while a graph is captured: that has so many
 
 // Calls f(row, side), with all lanes of a warp, for the sides that a body has of pairs which act; warps share its
 // vertices, and each meets them in ascending order.
@@ -243,8 +248,18 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
   } else {
     step = motion, state = nullptr;
   }
-  // As often as the CPU may.
-  for (int iteration = 0; iteration < (rubs ? kSlipIterations : 1); ++iteration) {
+  cudaStreamCaptureStatus capture = cudaStreamCaptureStatusNone;
+  if (auto error = cudaStreamIsCapturing(stream, &capture)) return error;
+  const bool asks = capture == cudaStreamCaptureStatusNone;
+  const int most = !rubs ? 1 : asks ? kSlipIterations : kCapturedIterations;
+  for (int iteration = 0; iteration < most; ++iteration) {
+    if (asks && iteration > 0 && iteration % kAsked == 0) {
+      std::vector<uint8_t> states(in.systems());
+      const auto way = cudaMemcpyDeviceToHost;
+      if (auto error = cudaMemcpyAsync(states.data(), state, states.size(), way, stream)) return error;
+      if (auto error = cudaStreamSynchronize(stream)) return error;
+      if (std::all_of(states.begin(), states.end(), [](uint8_t s) { return s == kDone; })) break;
+    }
     const Slid slid = iteration > 0 ? Slid{center, motion} : Slid{};
     if (room.rows() > 0)
       press_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, slid, state, sides, press);

@@ -79,8 +79,10 @@ class PairBarrier:
                 raise TypeError(f"{name}: expected a bool, got {type(getattr(self, name)).__name__}")
         if self.detections is not None:
             object.__setattr__(self, "detections", check_count("detections", self.detections, 1, 1000))
-        if self.reach is not None and check_positive("reach", self.reach, "m") <= self.dhat:
-            fail("reach", f"more than dhat = {self.dhat:g} m", self.reach)
+        if self.reach is not None:
+            object.__setattr__(self, "reach", check_positive("reach", self.reach, "m"))
+            if self.reach <= self.dhat:
+                fail("reach", f"more than dhat = {self.dhat:g} m", self.reach)
         for name, length in (("dhat", self.dhat), ("reach", self.reach or 0.0)):
             if length > MOST_REACH:
                 fail(name, f"at most {MOST_REACH:g} m", length)

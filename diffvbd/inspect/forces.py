@@ -147,6 +147,12 @@ def _refuse_non_finite(model: Model, where: dict[str, Tensor | None]) -> None:
     refuse_non_finite(model, where)
 
 
+def _refuse_moduli(mu: Tensor, lam: Tensor) -> None:
+    if looks_at(mu) and looks_at(lam):
+        name_value("mu", "finite values >= 0 Pa", mu, (mu >= 0) & torch.isfinite(mu))
+        name_value("lam", "finite values with mu + lam >= 0 Pa", lam, (mu + lam >= 0) & torch.isfinite(lam))
+
+
 def _refuse_below(given: Wide, where: dict[str, Tensor | None]) -> None:
     """Raises for a vertex on or below a plane of the floor, where its barrier has no force."""
     floor = given.model.floor
@@ -259,9 +265,13 @@ def reactions(
     check_state(model, x, x)
     check_previous(model, previous, x, time_step)
     state = {} if previous is None else {"previous: x": previous[0], "previous: v": previous[1]}
-    _refuse_non_finite(model, {"x": x, **state, "colliders": colliders, "colliders_before": colliders_before})
+    pull = acceleration_of(gravity, x)
+    _refuse_non_finite(model, {"x": x, **state, "colliders": colliders, "colliders_before": colliders_before,
+                               "force": force, "gravity": pull})  # fmt: skip
     given = widen(model, x, time_step, colliders, colliders_before, mu=mu, lam=lam, young=young, poisson=poisson,
                   rest_points=rest_points, density=density, parameters=parameters)  # fmt: skip
+    _refuse_moduli(given.prepared.mu, given.prepared.lam)
+    _refuse_below(given, {"x": x})
     prepared, h = given.prepared, given.prepared.settings.numbers.time_step
     flat = (x.shape[:-2].numel(), *x.shape[-2:])
 
@@ -274,7 +284,7 @@ def reactions(
     if given.model.contact is not None:  # planes do not act on pinned vertices
         normal, friction = _contact_at(given, x, previous).on_vertices()
         total = total - normal - friction
-    acceleration = -full(acceleration_of(gravity, x))
+    acceleration = -full(pull)
     if previous is not None:
         start, speed = (full(t) for t in previous)
         acceleration = acceleration + ((at - start) / h - speed) / h
@@ -334,9 +344,7 @@ def stress(
     shear, second = (
         t.expand(lead.numel(), t.shape[1]).reshape(*lead, t.shape[1]) for t in (given.prepared.mu, given.prepared.lam)
     )
-    if looks_at(shear) and looks_at(second):
-        name_value("mu", "finite values >= 0 Pa", shear, shear >= 0)
-        name_value("lam", "finite values with mu + lam >= 0 Pa", second, shear + second >= 0)
+    _refuse_moduli(shear, second)
     eye = torch.eye(3, dtype=f.dtype, device=f.device)
     left = (f[..., :, None, :] * f[..., None, :, :]).sum(-1)
     pressure = (shear + second) * (det - 1) - shear

@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from .predict import Begun
 
 # Rigid corrections after the last sweeps of more than MOST_COUPLED bodies that may touch. In stacks of two that rub
-# the upper body creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; with 1 it falls.
-APART_CORRECTIONS = 4
+# the upper body creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; with 1 it falls. Stacks of four fell with 6.
+APART_CORRECTIONS = 8
 FREE = 1e15  # [m] room that nothing fills
 CLOSE = 1e-3  # of dhat: pairs whose gap is so much wider do not push, however it is rounded
 LONG_LIST = 1024  # pairs, of which it pays to find those that push

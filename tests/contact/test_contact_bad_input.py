@@ -54,6 +54,7 @@ def raises(run: Callable[[], Any], name: str, got: str) -> None:
         ("reach", -1.0, "-1"),
         ("reach", NAN, "nan"),
         ("reach", "far", "str"),
+        ("reach", torch.tensor([0.1, 0.2]), "Tensor"),
         ("capacity", 0, "0"),
         ("capacity", 10.5, "float"),
         ("capacity", 2**27, str(2**27)),

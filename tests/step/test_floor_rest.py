@@ -103,3 +103,17 @@ def test_without_sweeps_a_body_sinks_to_dhat_and_no_deeper() -> None:
     for _ in range(200):
         x, v = dv.step(model, x, v, sweeps=0, **options)
     assert (gaps(x) - DHAT).abs().max() < tolerance("sunk")
+
+
+@pytest.mark.parametrize("dtype", (torch.float64, torch.float32))
+@pytest.mark.parametrize("length", (1e160, 1e-170, 3.0))
+def test_a_normal_of_any_length_is_the_same_plane(length: float, dtype: torch.dtype) -> None:
+    body = dv.mesh.cube(2, size=0.1).translate((0.0, 0.005, 0.0))
+
+    def end(normal: tuple[float, float, float]) -> Tensor:
+        floor = dv.FloorBarrier(normal=normal, kappa=KAPPA, dhat=DHAT)
+        model = dv.Model(body, energies=(dv.StableNeoHookean(), floor), dtype=dtype)
+        x = model.rest_points
+        return dv.step(model, x, 0 * x, mu=1e5, lam=1e5, time_step=0.01, sweeps=2)[0]
+
+    assert torch.equal(end((0.0, length, 0.0)), end((0.0, 1.0, 0.0)))
