@@ -83,7 +83,8 @@ def test_stacks_of_many_bodies_stand() -> None:
 
 def test_stacks_of_four_stand_among_many_bodies() -> None:
     """Seventeen stacks of four cubes: with four corrections after the sweeps they fell."""
-    cube = dv.mesh.cube(2, size=0.1)
+    size = 0.1
+    cube = dv.mesh.cube(2, size=size)
     gaps = (0.0079, 0.0085, 0.0088, 0.0092)  # at which they rest
     parts = []
     for stack in range(17):
@@ -91,7 +92,7 @@ def test_stacks_of_four_stand_among_many_bodies() -> None:
         for level, gap in enumerate(gaps):
             height += gap
             parts.append(cube.translate((0.3 * stack + 0.013 * (level % 2), height, 0.009 * (level % 3))))
-            height += 0.1
+            height += size
     energies = (
         dv.StableNeoHookean(),
         dv.PairBarrier(2e3, 1e-2, self_contact=False, damping=5.0),
@@ -102,4 +103,4 @@ def test_stacks_of_four_stand_among_many_bodies() -> None:
     x = model.rest_points
     end = dv.rollout(model, x, torch.zeros_like(x), steps=100, mu=1e6, lam=1e6, time_step=0.01, sweeps=5, save="last")
     centers = (end.x[-1] - x).reshape(68, 8, 3).mean(1)
-    assert float(centers.abs().max()) < 0.05
+    assert float(centers.abs().max()) < 0.5 * size
