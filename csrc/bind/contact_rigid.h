@@ -10,10 +10,12 @@
 
 namespace diffvbd {
 
-// move [B, V, 3]: what is tried, memory of the operator; empty where nothing is.
+// move [B, V, 3]: what is tried, memory of the operator; empty where nothing is. groups [B, 4, bodies]: as
+// contact/groups.h has them; empty where they do not matter, or all bodies are one.
 template <class T>
 contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const std::vector<int64_t>& data_count,
-                                        double time_step, double friction_eps, const Tensor& move) {
+                                        double time_step, double friction_eps, const Tensor& move,
+                                        const Tensor& groups) {
   require_positions(t.x);
   contact::RigidInputs<T> in{};
   const int64_t b = t.x.size(0), v = t.x.size(1), colliders = t.collider.dim() == 3 ? t.collider.size(1) : 0;
@@ -54,15 +56,25 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const std::vect
     in.planes = static_cast<int32_t>(t.floor_lag.numel() / t.floor_lag.size(0) / (v * contact::kFloorLag));
     in.floor_lag = batched<T>("floor_lag", t.floor_lag, t.x, b, v * in.planes * contact::kFloorLag);
   }
+  if (groups.numel() > 0) {
+    require(is_index(groups, t.x) && groups.numel() == contact::kGroupRows * b * bodies,
+            "diffvbd::contact_rigid: expected groups int32 [scenes, 4, bodies]");
+    in.groups = data<const int32_t>(groups);
+  }
   in.has_friction = 0 < friction_eps;
   in.friction_eps = in.has_friction ? friction_eps : 1;
   return in;
 }
 
-template <class T>
-std::vector<int64_t> matrix_shape(const contact::RigidInputs<T>& in) {
-  const int64_t b = in.scene.scenes, n = in.bodies(), six = contact::kUnknowns;
-  return in.together() ? std::vector<int64_t>{b, six * n, six * n} : std::vector<int64_t>{b, n, six, six};
+// Of the factor, and of the groups.
+inline std::vector<int64_t> matrix_shape(int64_t scenes, int64_t bodies) {
+  const int64_t six = contact::kUnknowns;
+  if (bodies <= contact::kMostCoupled) return {scenes, six * bodies, six * bodies};
+  return {scenes, bodies, six, six * contact::most_grouped(bodies)};
+}
+inline std::vector<int64_t> groups_shape(int64_t scenes, int64_t bodies) {
+  if (bodies <= contact::kMostCoupled) return {0};
+  return {scenes, contact::kGroupRows, bodies};
 }
 
 template <class T>
@@ -140,16 +152,12 @@ struct RigidVertexTensors {
   }
 };
 
-// Of rigid motions that are solved for: the number of systems, and their size.
-struct RigidSystems {
-  int64_t count, size;
-};
-inline RigidSystems systems_of(const Tensor& factor, const Tensor& right) {
-  const int64_t size = factor.dim() > 2 ? factor.size(factor.dim() - 1) : 0;
-  require(size > 0 && factor.is_contiguous() && factor.scalar_type() == ScalarType::Double &&
-              factor.size(factor.dim() - 2) == size && is_like(right, factor) && right.numel() * size == factor.numel(),
-          "diffvbd::contact_rigid: expected float64 factor [..., n, n] of as many systems as the motion has");
-  return {factor.numel() / (size * size), size};
+// What a reverse solves with, of a forward with these groups.
+template <class T>
+void require_factor(const contact::RigidInputs<T>& in, const Tensor& factor, const Tensor& x) {
+  require(is_beside(factor, x, ScalarType::Double) && factor.numel() == in.scene.scenes * in.matrix_size() &&
+              in.together() == (in.groups == nullptr),
+          "diffvbd::contact_rigid: expected factor and groups as contact_rigid_system returns them");
 }
 
 }  // namespace diffvbd

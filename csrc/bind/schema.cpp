@@ -138,10 +138,12 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "Tensor x_bar, Tensor v_bar, int[] groups, int[] data_count, float time_step, bool wants_data",
          "Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own, ");
   // The Newton step of the rigid motions of all bodies of a scene, float64: centers of mass [scenes, bodies, 3], motion
-  // [scenes, bodies, 6], and the factor of the matrix [scenes, 6 bodies, 6 bodies], of many bodies
-  // [scenes, bodies, 6, 6]
+  // [scenes, bodies, 6], and the factor of the matrix [scenes, 6 bodies, 6 bodies]. Of many bodies: the factors of
+  // groups that touch, in the memory [scenes, bodies, 6, 6 most] that contact/groups.h says, and groups
+  // [scenes, 4, bodies]; again: only bodies move that are left alone, because those that touch are too many
   define(m, "contact_rigid_system", DIFFVBD_ARGUMENTS(TOUCHING),
-         "int[] data_count, float time_step, float friction_eps", "Tensor centers, Tensor motion, Tensor factor, ");
+         "int[] data_count, float time_step, float friction_eps, bool again",
+         "Tensor centers, Tensor motion, Tensor factor, Tensor groups, ");
   // The state after each body has taken what it may of its motion [scenes, bodies, 6], and that share [scenes, bodies]
   define(m, "contact_rigid_move", DIFFVBD_ARGUMENTS(TOUCHING),
          "Tensor centers, Tensor motion, int[] data_count, float time_step, float friction_eps",
@@ -150,14 +152,14 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   // by the position, p and q of each corner [pairs, 4, 9] and by kappa [pairs]; and for each lagged pair, by corners
   // and by what is lagged [pairs, 9]
   define(m, "contact_rigid_backward", DIFFVBD_ARGUMENTS(TOUCHING),
-         "Tensor p, Tensor q, int[] data_count, float time_step, float friction_eps",
+         "Tensor p, Tensor q, Tensor groups, int[] data_count, float time_step, float friction_eps",
          "Tensor barrier, Tensor by_kappa, Tensor friction, Tensor by_lag, ");
   // The rest of that adjoint. Of x_bar [scenes, V, 3] the solution for the adjoint of the motion [scenes, bodies, 6],
   // how all corner points move by it and by the motion, and what goes back to x and mass by the way itself; then, of
   // what pairs send to the two motions, what vertices send to the rest; of data as of rigid_backward()
   define(m, "contact_rigid_end_backward", DIFFVBD_ARGUMENTS(TOUCHING),
-         "Tensor motion, Tensor share, Tensor factor, Tensor x_bar, int[] data_count, float time_step, float "
-         "friction_eps",
+         "Tensor motion, Tensor share, Tensor factor, Tensor groups, Tensor x_bar, int[] data_count, float time_step, "
+         "float friction_eps",
          "Tensor solution, Tensor p, Tensor q, Tensor x, Tensor mass, ");
   define(m, "contact_rigid_vertices_backward", DIFFVBD_ARGUMENTS(TOUCHING),
          "Tensor motion, Tensor solution, Tensor by_p, Tensor by_q, int[] data_count, float time_step, float "

@@ -5,15 +5,14 @@
 
 #include "../rigid/body.h"
 #include "advance.h"
+#include "groups.h"
 #include "lag.h"
 
 namespace diffvbd::contact {
 
 using rigid::Vector;
 
-constexpr int kMostCoupled = 64;  // bodies of a scene that are solved for together; else one side of a pair at a time
 constexpr double kLeastInertia = 1e-11;  // of a body's mass and sum of m r^2, that keeps its system definite
-constexpr int kUnknowns = 6;             // of a body: a turn and a shift
 
 template <class T>
 struct RigidInputs {
@@ -24,21 +23,23 @@ struct RigidInputs {
   const T* collider_prev;             // [B, Vc, 3]
   Batched<const T> kappa, floor_lag;  // floor_lag [1 | B, V, planes, 4]
   const bool* free;                   // [bodies]: nothing of it is pinned
+  const int32_t* groups;              // [B, 4, bodies], or null where they do not matter or all are one
   int32_t planes;
   double friction_eps;
   bool has_friction;
 
   DIFFVBD_FN int32_t bodies() const { return scene.bodies; }
   DIFFVBD_FN bool rubs() const { return (lag || planes > 0) && has_friction; }
+  // Whether all bodies of a scene are one group.
   DIFFVBD_FN bool together() const { return scene.bodies <= kMostCoupled; }
-  // Scalars of the matrices of a scene: of all bodies together, or of one after another.
+  DIFFVBD_FN Groups groups_of(int64_t s) const {
+    return {scene.bodies, groups ? groups + kGroupRows * scene.bodies * s : nullptr};
+  }
+  // Scalars of the matrices of a scene.
   DIFFVBD_FN int64_t matrix_size() const {
     const int64_t n = scene.bodies;
-    return (together() ? n * n : n) * kUnknowns * kUnknowns;
+    return kUnknowns * kUnknowns * n * (together() ? n : most_grouped(n));
   }
-  // and of each that is solved by itself
-  DIFFVBD_FN int64_t system_size() const { return together() ? int64_t{kUnknowns} * scene.bodies : kUnknowns; }
-  DIFFVBD_FN int64_t systems() const { return together() ? scene.scenes : scene.scenes * scene.bodies; }
   DIFFVBD_FN int64_t first_listed(int64_t s) const { return gate.listed.ptr[s * gate.corners] / 4; }
   DIFFVBD_FN int64_t first_lagged(int64_t s) const { return lag ? lagged.ptr[s * gate.corners] / 4 : 0; }
 };
@@ -94,7 +95,7 @@ struct PairPress {
   double value;
   Vector slip;     // where friction is linear about
   double rubs;     // h^2 times its load [N], over `doubled`
-  double doubled;  // 2 where a side is solved for alone, which takes twice its body's motion; else 1
+  double doubled;  // 2 where sides are not of one group: each takes twice its body's motion; else 1
 
   // What the body of a side does to the pair by its k-th unknown, about its center.
   DIFFVBD_FN Vector map(int side, int k, const Vector& center) const {
@@ -139,6 +140,17 @@ DIFFVBD_FN PairPress load_press(const double* from, const int32_t* body) {
   for (int side = 0; side < 2; ++side) a.at[side] = get(), a.pull[side] = get(), a.torque[side] = get();
   a.value = 0;
   return a;
+}
+
+// Whether both sides of a pair move, but not as one group.
+template <class T>
+DIFFVBD_FN bool is_apart(const RigidInputs<T>& in, int64_t scene, const PairPress& a) {
+  return a.body[0] >= 0 && a.body[1] >= 0 && !in.groups_of(scene).joined(a.body[0], a.body[1]);
+}
+// Then each bears what both would: so that no step is too long.
+template <class T>
+DIFFVBD_FN double borne(const RigidInputs<T>& in, int64_t scene, const PairPress& a) {
+  return is_apart(in, scene, a) ? 2 : 1;
 }
 
 template <class T>
@@ -229,7 +241,7 @@ struct Slid {
 
 // Lagged friction and damping of a pair; it acts along a gap, so that it turns a body even by itself. The gradient is
 // that of a matrix which holds where bodies have gone as `slid` says: there both are exact. Where the sides of a pair
-// are not solved for together, `alone` says which side is meant. It has half of the potential, at twice its motion: the
+// are not of one group, `alone` says which side is meant. It has half of the potential, at twice its motion: the
 // potential is convex, so that what lowers both halves lowers the whole. -1: both are, or only the value is asked for.
 template <class T, class At>
 DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, const Slid& slid, PairPress& out,
@@ -243,7 +255,7 @@ DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& a
   if (out.body[0] < 0 && out.body[1] < 0) return false;
   const bool within = out.body[0] == out.body[1];
   if (within) out.body[1] = -1;
-  const bool halves = !in.together() && out.body[0] >= 0 && out.body[1] >= 0;
+  const bool halves = is_apart(in, scene, out);
   if (halves && alone >= 0) out.body[1 - alone] = -1;
   out.doubled = halves ? 2 : 1;
   Vector m{};
@@ -336,7 +348,6 @@ template <class T>
 DIFFVBD_FN double vertex_value(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, bool moved) {
   const Vector x = CornerPoints<T>{in, moved}.relative(b.scene, v), off = x - b.target(v);
   const VertexState<double> s = b.state(v, x);
-  const double h = in.scene.time_step;
   double value = 0.5 * b.mass(v) * dot(off, off);
   b.energies(
       v, [&](auto energy, int, const double* data, int count) { value += decltype(energy)::value(s, data, count); });
@@ -361,21 +372,6 @@ DIFFVBD_FN void keep_finite(double* solution) {
   for (int i = 0; i < kUnknowns; ++i)
     finite = finite && absolute(solution[i]) < std::numeric_limits<double>::infinity();
   for (int i = 0; i < kUnknowns; ++i) solution[i] = finite ? -solution[i] : 0.0;
-}
-
-// A part of the matrix of all bodies of a scene, 6 x 6 at (row, column).
-struct MatrixPart {
-  double* at;
-  int64_t stride;
-  DIFFVBD_FN MatrixPart(double* matrix, int32_t bodies, bool together, int32_t row, int32_t column)
-      : at(together ? matrix + kUnknowns * (int64_t{kUnknowns} * bodies * row + column) : matrix + 36 * int64_t{row}),
-        stride(together ? kUnknowns * int64_t{bodies} : kUnknowns) {}
-  DIFFVBD_FN double& operator()(int i, int j) const { return at[i * stride + j]; }
-};
-
-// Where sides are not solved for together, each bears what both would: then no step is too long.
-DIFFVBD_FN double borne(const PairPress& a, bool together) {
-  return !together && a.body[0] >= 0 && a.body[1] >= 0 ? 2 : 1;
 }
 
 }  // namespace diffvbd::contact

@@ -44,7 +44,7 @@ DIFFVBD_FN PairMotions motions_of(const RigidInputs<T>& in, const VirtualMotions
   }
   out.first = sides(record[4]);
   const int32_t one = moving_body(in, record[0]), two = moving_body(in, record[out.first]);
-  const bool apart = !in.together() && one >= 0 && two >= 0 && one != two;
+  const bool apart = one >= 0 && two >= 0 && !in.groups_of(record[5]).joined(one, two);
   out.sides = apart ? 2 : 1, out.share = apart ? 2 : 1;
   return out;
 }

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 #include <vector>
 
 #include "../contact/rigid_slip.h"
@@ -15,21 +16,59 @@ using rigid::Body, rigid::Vector;
 
 namespace {
 
-void add_press(const PairPress& a, int32_t bodies, bool together, const double* center, double* gradient,
+// Those of a scene of many bodies, by what presses them; rows [4, bodies].
+template <class T>
+void find_groups(const RigidInputs<T>& in, int64_t scene, const std::vector<PairPress>& presses, int32_t* rows) {
+  const int32_t n = in.bodies();
+  std::vector<int32_t> root(n), size(n, 0);
+  std::iota(root.begin(), root.end(), 0);
+  const auto root_of = [&](int32_t body) {
+    while (root[body] != body) body = root[body] = root[root[body]];
+    return body;
+  };
+  const auto join = [&](int32_t a, int32_t b) {
+    if (a < 0 || b < 0) return;
+    a = root_of(a), b = root_of(b);
+    root[std::max(a, b)] = std::min(a, b);
+  };
+  for (const PairPress& press : presses) join(press.body[0], press.body[1]);
+  for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
+    if (!Lag<T>(in.lag + kLagScalars * i).active()) continue;
+    const int32_t* record = in.lagged.pairs + kPairRow * i;
+    join(moving_body(in, record[0]), moving_body(in, record[sides(record[4])]));
+  }
+  for (int32_t k = 0; k < n; ++k) ++size[root_of(k)];
+  int32_t *member = rows, *first = rows + n, *rank = rows + 2 * n, *count = rows + 3 * n, place = 0;
+  std::fill_n(count, n, 0);
+  for (int32_t k = 0; k < n; ++k) {
+    const int32_t own = root_of(k);
+    const bool fits = size[own] <= most_grouped(n);
+    const int32_t lead = fits ? own : k;
+    if (lead == k) {
+      first[k] = place;
+      place += fits ? size[own] : 1;
+    }
+    first[k] = first[lead];
+    rank[k] = fits ? count[first[k]]++ : 0;
+    if (!fits) count[first[k]] = kLeft;
+    member[first[k] + rank[k]] = k;
+  }
+}
+
+void add_press(const PairPress& a, double share, const Groups& groups, const double* center, double* gradient,
                double* matrix) {
   double maps[2][kUnknowns][3], pressed[2][kUnknowns][3];
   for (int side = 0; side < 2; ++side) {
     const int32_t body = a.body[side];
     if (body < 0) continue;
     const Vector c = vector_of(center + 3 * body);
-    const MatrixPart own(matrix, bodies, together, body, body);
+    const MatrixPart own(matrix, groups, body, body);
     for (int i = 0; i < kUnknowns; ++i) {
       gradient[kUnknowns * body + i] += a.gradient(side, i, c);
       const Vector m = a.map(side, i, c), q = a.stiffness * m;
       const double values[2][3] = {{m.x, m.y, m.z}, {q.x, q.y, q.z}};
       std::copy_n(values[0], 3, maps[side][i]), std::copy_n(values[1], 3, pressed[side][i]);
     }
-    const double share = borne(a, together);
     for (int i = 0; i < kUnknowns; ++i) {
       for (int j = 0; j < kUnknowns; ++j) {
         double sum = 0;
@@ -38,8 +77,8 @@ void add_press(const PairPress& a, int32_t bodies, bool together, const double* 
       }
     }
   }
-  if (!together || a.body[0] < 0 || a.body[1] < 0) return;
-  const MatrixPart upper(matrix, bodies, true, a.body[0], a.body[1]), lower(matrix, bodies, true, a.body[1], a.body[0]);
+  if (a.body[0] < 0 || a.body[1] < 0 || !groups.joined(a.body[0], a.body[1])) return;
+  const MatrixPart upper(matrix, groups, a.body[0], a.body[1]), lower(matrix, groups, a.body[1], a.body[0]);
   for (int i = 0; i < kUnknowns; ++i) {
     for (int j = 0; j < kUnknowns; ++j) {
       double sum = 0;
@@ -50,10 +89,10 @@ void add_press(const PairPress& a, int32_t bodies, bool together, const double* 
 }
 
 template <class T>
-void system_of_scene(const RigidInputs<T>& in, int64_t scene, double* center, double* gradient, double* matrix) {
-  const bool together = in.together();
-  const int32_t n = in.bodies();
-  for (int32_t k = 0; k < n; ++k) {
+void system_of_scene(const RigidInputs<T>& in, int64_t scene, const std::vector<PairPress>& presses, double* center,
+                     double* gradient, double* matrix) {
+  const Groups groups = in.groups_of(scene);
+  for (int32_t k = 0; k < in.bodies(); ++k) {
     const Body<T> body{in.scene, scene, k};
     double mass = 0, spread = 0, g6[kUnknowns] = {}, block[rigid::kSix] = {};
     Vector sum{};
@@ -74,17 +113,15 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, double* center, do
       rigid::add_vertex(arm, g, H, g6, block);
       spread += body.mass(v) * dot(arm, arm);
     }
-    const MatrixPart own(matrix, n, together, k, k);
+    const MatrixPart own(matrix, groups, k, k);
     std::copy_n(g6, kUnknowns, gradient + kUnknowns * k);
     for (int i = 0; i < kUnknowns; ++i) {
       for (int j = 0; j < kUnknowns; ++j) own(i, j) = block[rigid::at6(std::max(i, j), std::min(i, j))];
       own(i, i) += free ? kLeastInertia * (i < 3 ? spread : mass) : 1;
     }
   }
-  const CornerPoints<T> at{in, false};
-  PairPress press;
-  for (int64_t i = in.first_listed(scene); i < in.first_listed(scene + 1); ++i) {
-    if (barrier_press(in, i, at, press)) add_press(press, n, together, center, gradient, matrix);
+  for (const PairPress& press : presses) {
+    add_press(press, borne(in, scene, press), groups, center, gradient, matrix);
   }
 }
 
@@ -92,13 +129,33 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, double* center, do
 // and done, when it is left alone.
 enum Settling : uint8_t { kOnItsWay, kSettledAt, kDone };
 
-// The systems of a scene, one for all bodies or one for each.
+// The systems of a scene, one for each group.
 struct Systems {
-  bool together;
-  std::vector<Settling> state;
-  bool works(int32_t body) const { return body >= 0 && state[together ? 0 : body] != kDone; }
+  struct System {
+    int32_t first, count;
+    Settling state = kOnItsWay;
+    int64_t size() const { return int64_t{kUnknowns} * count; }
+  };
+  Groups groups;
+  std::vector<System> all;
+  std::vector<int32_t> of;  // [bodies]
+
+  explicit Systems(const Groups& given) : groups(given), of(given.bodies) {
+    for (int32_t place = 0; place < groups.bodies; ++place) {
+      if (0 < groups.count(place)) all.push_back({place, groups.count(place)});
+      of[groups.member(place)] = static_cast<int32_t>(all.size()) - 1;
+    }
+  }
+  bool works(int32_t body) const { return body >= 0 && all[of[body]].state != kDone; }
   bool all_done() const {
-    return std::all_of(state.begin(), state.end(), [](Settling s) { return s == kDone; });
+    return std::all_of(all.begin(), all.end(), [](const System& s) { return s.state == kDone; });
+  }
+  // Calls f(i, k) for the i-th unknown of a system, the k-th of the scene.
+  template <class F>
+  void each_unknown(const System& s, const F& f) const {
+    for (int32_t i = 0; i < s.count; ++i) {
+      for (int k = 0; k < kUnknowns; ++k) f(kUnknowns * i + k, kUnknowns * groups.member(s.first + i) + k);
+    }
   }
 };
 
@@ -130,11 +187,10 @@ void each_lagged(const RigidInputs<T>& in, int64_t scene, const Slid& slid, cons
 template <class T>
 void add_lagged_of_scene(const RigidInputs<T>& in, int64_t scene, const Slid& slid, const Systems& systems,
                          double* gradient, double* matrix) {
-  const int32_t n = in.bodies();
   each_lagged(in, scene, slid, systems, [&](const PairPress& press, int64_t) {
-    add_press(press, n, in.together(), slid.center, gradient, matrix);
+    add_press(press, 1, systems.groups, slid.center, gradient, matrix);
   });
-  for (int32_t k = 0; in.planes && k < n; ++k) {
+  for (int32_t k = 0; in.planes && k < in.bodies(); ++k) {
     if (!in.free[k] || !systems.works(k)) continue;
     const Body<T> body{in.scene, scene, k};
     double* g6 = gradient + kUnknowns * k;
@@ -147,7 +203,7 @@ void add_lagged_of_scene(const RigidInputs<T>& in, int64_t scene, const Slid& sl
       add_floor_friction(in, body, v, moved_by(slid.motion + kUnknowns * k, arm), g, H);
       rigid::add_vertex(arm, g, H, g6, block);
     }
-    const MatrixPart own(matrix, n, in.together(), k, k);
+    const MatrixPart own(matrix, systems.groups, k, k);
     for (int i = 0; i < kUnknowns; ++i) {
       for (int j = 0; j < kUnknowns; ++j) own(i, j) += block[rigid::at6(std::max(i, j), std::min(i, j))];
     }
@@ -158,10 +214,10 @@ void add_lagged_of_scene(const RigidInputs<T>& in, int64_t scene, const Slid& sl
 template <class T>
 std::vector<std::vector<SlipLine>> lines_of_scene(const RigidInputs<T>& in, int64_t scene, const Slid& slid,
                                                   const Systems& systems, const double* step) {
-  std::vector<std::vector<SlipLine>> out(systems.state.size());
+  std::vector<std::vector<SlipLine>> out(systems.all.size());
   each_lagged(in, scene, slid, systems, [&](const PairPress& press, int64_t i) {
     const int32_t body = press.body[0] < 0 ? press.body[1] : press.body[0];
-    out[in.together() ? 0 : body].push_back(slip_line(in, i, press, slid.center, step));
+    out[systems.of[body]].push_back(slip_line(in, i, press, slid.center, step));
   });
   for (int32_t k = 0; in.planes && k < in.bodies(); ++k) {
     const Body<T> body{in.scene, scene, k};
@@ -171,11 +227,37 @@ std::vector<std::vector<SlipLine>> lines_of_scene(const RigidInputs<T>& in, int6
       const Vector arm = body.position(v) - vector_of(slid.center + 3 * k);
       for (int plane = 0; plane < in.planes; ++plane) {
         if (bears(in, body, v, plane))
-          out[in.together() ? 0 : k].push_back(slip_line(in, body, v, plane, arm, slid.motion + own, step + own));
+          out[systems.of[k]].push_back(slip_line(in, body, v, plane, arm, slid.motion + own, step + own));
       }
     }
   }
   return out;
+}
+
+// The Cholesky factor of a matrix, in its lower triangle; what is no number says that it is not positive definite.
+void cholesky(int64_t size, double* a) {
+  std::vector<int64_t> first(size);  // of each row, before which it is zero: bodies touch few others
+  for (int64_t i = 0; i < size; ++i) {
+    first[i] = 0;
+    while (first[i] < i && a[size * i + first[i]] == 0) ++first[i];
+    for (int64_t j = first[i]; j <= i; ++j) {
+      double sum = a[size * i + j];
+      for (int64_t k = std::max(first[i], first[j]); k < j; ++k) sum -= a[size * i + k] * a[size * j + k];
+      a[size * i + j] = i == j ? std::sqrt(sum) : sum / a[size * j + j];
+    }
+  }
+}
+
+// b = factor^-T factor^-1 b
+void cholesky_solve(int64_t size, const double* a, double* b) {
+  for (int64_t i = 0; i < size; ++i) {
+    for (int64_t k = 0; k < i; ++k) b[i] -= a[size * i + k] * b[k];
+    b[i] /= a[size * i + i];
+  }
+  for (int64_t i = size - 1; i >= 0; --i) {
+    b[i] /= a[size * i + i];
+    for (int64_t k = 0; k < i; ++k) b[k] -= a[size * i + k] * b[i];
+  }
 }
 
 // x' A x of a matrix with the Cholesky factor.
@@ -196,97 +278,105 @@ void add_product(const double* matrix, int64_t size, const double* x, double* y)
   }
 }
 
-// Motions of the bodies of a scene, zero at first, and the factor of the matrix there.
+// Motions of the bodies of a scene, zero at first, and the factors of the matrices there. rows [4, bodies] of `in`, or
+// null. again: of those that are left alone; others stay, and have no factor.
 template <class T>
-void solve_scene(const RigidInputs<T>& in, int64_t scene, double* center, double* motion, double* factor) {
-  const int64_t n = in.bodies(), unknowns = kUnknowns * n, size = in.system_size(), count = unknowns / size;
-  const int64_t square = size * size;
-  std::vector<double> gradient(unknowns), matrix(in.matrix_size(), 0.0), step(unknowns);
-  system_of_scene(in, scene, center, gradient.data(), matrix.data());
+void solve_scene(const RigidInputs<T>& in, int64_t scene, bool again, double* center, double* motion, double* factor,
+                 int32_t* rows) {
+  const int64_t unknowns = int64_t{kUnknowns} * in.bodies();
+  std::vector<PairPress> presses(1);
+  for (int64_t i = in.first_listed(scene); i < in.first_listed(scene + 1); ++i) {
+    if (barrier_press(in, i, CornerPoints<T>{in, false}, presses.back())) presses.emplace_back();
+  }
+  presses.pop_back();
+  if (rows) find_groups(in, scene, presses, rows);
+  std::vector<double> gradient(unknowns), matrix(in.matrix_size(), 0.0), step(unknowns), own(unknowns), whole(unknowns);
+  system_of_scene(in, scene, presses, center, gradient.data(), matrix.data());
   std::fill_n(motion, unknowns, 0.0);
   const Slid slid{center, motion};
-  Systems systems{in.together(), std::vector<Settling>(count, kOnItsWay)};
-  const auto each = [&](const auto& f) {
-    for (int64_t s = 0; s < count; ++s) {
-      if (systems.state[s] != kDone) f(s, factor + square * s, motion + size * s, step.data() + size * s);
-    }
-  };
+  Systems systems(in.groups_of(scene));
+  const Groups& groups = systems.groups;
+  for (auto& s : systems.all) {
+    if (!again || groups.is_left(s.first)) continue;
+    s.state = kDone;
+    std::fill_n(factor + groups.matrix(s.first), s.size() * s.size(), std::numeric_limits<double>::quiet_NaN());
+  }
   for (int iteration = 0; iteration < kSlipIterations && !systems.all_done(); ++iteration) {
-    each([&](int64_t s, double* own, double*, double* to) {
-      std::copy_n(gradient.data() + size * s, size, to), std::copy_n(matrix.data() + square * s, square, own);
-    });
+    for (const auto& s : systems.all) {
+      if (s.state == kDone) continue;
+      std::copy_n(matrix.data() + groups.matrix(s.first), s.size() * s.size(), factor + groups.matrix(s.first));
+      systems.each_unknown(s, [&](int, int64_t k) { step[k] = gradient[k]; });
+    }
     add_lagged_of_scene(in, scene, slid, systems, step.data(), factor);
-    each([&](int64_t, double* own, double* at, double* to) {
-      if (iteration > 0) add_product(own, size, at, to);
-      cholesky(size, own);
-      cholesky_solve(1, size, own, to);
-      for (int64_t i = 0; i < size; i += kUnknowns) keep_finite(to + i);
-    });
+    for (const auto& s : systems.all) {
+      if (s.state == kDone) continue;
+      double* a = factor + groups.matrix(s.first);
+      systems.each_unknown(s, [&](int i, int64_t k) { own[i] = step[k], whole[i] = motion[k]; });
+      if (iteration > 0) add_product(a, s.size(), whole.data(), own.data());
+      cholesky(s.size(), a);
+      cholesky_solve(s.size(), a, own.data());
+      for (int64_t i = 0; i < s.size(); i += kUnknowns) keep_finite(own.data() + i);
+      systems.each_unknown(s, [&](int i, int64_t k) { step[k] = own[i]; });
+    }
     if (!in.rubs()) {
-      std::copy(step.begin(), step.end(), motion);
+      for (const auto& s : systems.all) {
+        if (s.state != kDone) systems.each_unknown(s, [&](int, int64_t k) { motion[k] = step[k]; });
+      }
       return;
     }
     const auto lines = lines_of_scene(in, scene, slid, systems, step.data());
-    each([&](int64_t s, double* own, double* at, double* to) {
-      std::vector<double> whole(at, at + size);
-      for (int64_t i = 0; i < size; ++i) whole[i] += to[i];
-      const double fall = energy_of(own, size, to);
-      const bool settled = fall <= kSettled * kSettled * energy_of(own, size, whole.data());
-      if (systems.state[s] == kSettledAt || settled) {
-        systems.state[s] = systems.state[s] == kSettledAt ? kDone : kSettledAt;
-        std::copy(whole.begin(), whole.end(), at);
-        return;
+    for (auto& s : systems.all) {
+      if (s.state == kDone) continue;
+      const double* a = factor + groups.matrix(s.first);
+      systems.each_unknown(s, [&](int i, int64_t k) { own[i] = step[k], whole[i] = motion[k] + step[k]; });
+      const double fall = energy_of(a, s.size(), own.data());
+      const bool settled = fall <= kSettled * kSettled * energy_of(a, s.size(), whole.data());
+      double share = 1;
+      if (s.state == kSettledAt || settled) {
+        s.state = s.state == kSettledAt ? kDone : kSettledAt;
+      } else {
+        share = slip_share(fall, [&](double tried) {
+          double sum = 0;
+          for (const SlipLine& line : lines[&s - systems.all.data()]) sum += line.excess(tried);
+          return sum;
+        });
       }
-      const double share = slip_share(fall, [&](double tried) {
-        double sum = 0;
-        for (const SlipLine& line : lines[s]) sum += line.excess(tried);
-        return sum;
-      });
-      for (int64_t i = 0; i < size; ++i) at[i] += share * to[i];
-    });
+      systems.each_unknown(s, [&](int, int64_t k) { motion[k] += share * step[k]; });
+    }
   }
 }
 
 }  // namespace
 
-void cholesky(int64_t size, double* a) {
-  std::vector<int64_t> first(size);  // of each row, before which it is zero: bodies touch few others
-  for (int64_t i = 0; i < size; ++i) {
-    first[i] = 0;
-    while (first[i] < i && a[size * i + first[i]] == 0) ++first[i];
-    for (int64_t j = first[i]; j <= i; ++j) {
-      double sum = a[size * i + j];
-      for (int64_t k = std::max(first[i], first[j]); k < j; ++k) sum -= a[size * i + k] * a[size * j + k];
-      a[size * i + j] = i == j ? std::sqrt(sum) : sum / a[size * j + j];
-    }
-  }
-}
-
-void cholesky_solve(int64_t count, int64_t size, const double* factors, double* x) {
-  for (int64_t n = 0; n < count; ++n) {
-    const double* a = factors + size * size * n;
-    double* b = x + size * n;
-    for (int64_t i = 0; i < size; ++i) {
-      for (int64_t k = 0; k < i; ++k) b[i] -= a[size * i + k] * b[k];
-      b[i] /= a[size * i + i];
-    }
-    for (int64_t i = size - 1; i >= 0; --i) {
-      b[i] /= a[size * i + i];
-      for (int64_t k = 0; k < i; ++k) b[k] -= a[size * i + k] * b[i];
-    }
-  }
-}
-
 template <class T>
-void rigid_system(const RigidInputs<T>& in, double* center, double* motion, double* factor) {
+void rigid_system(const RigidInputs<T>& in, bool again, double* center, double* motion, double* factor,
+                  int32_t* groups) {
   const int64_t n = in.bodies();
   torch::stable::parallel_for(0, in.scene.scenes, 1, [&](int64_t begin, int64_t end) {
-    for (int64_t s = begin; s < end; ++s)
-      solve_scene(in, s, center + 3 * n * s, motion + kUnknowns * n * s, factor + in.matrix_size() * s);
+    for (int64_t s = begin; s < end; ++s) {
+      solve_scene(in, s, again, center + 3 * n * s, motion + kUnknowns * n * s, factor + in.matrix_size() * s,
+                  groups ? groups + kGroupRows * n * s : nullptr);
+    }
   });
 }
 
-#define DIFFVBD_INSTANTIATE(T) template void rigid_system<T>(const RigidInputs<T>&, double*, double*, double*);
+template <class T>
+void rigid_solve(const RigidInputs<T>& in, const double* factor, double* x) {
+  std::vector<double> own(int64_t{kUnknowns} * in.bodies());
+  for (int64_t scene = 0; scene < in.scene.scenes; ++scene) {
+    const Systems systems(in.groups_of(scene));
+    double* all = x + kUnknowns * in.bodies() * scene;
+    for (const auto& s : systems.all) {
+      systems.each_unknown(s, [&](int i, int64_t k) { own[i] = all[k]; });
+      cholesky_solve(s.size(), factor + in.matrix_size() * scene + systems.groups.matrix(s.first), own.data());
+      systems.each_unknown(s, [&](int i, int64_t k) { all[k] = own[i]; });
+    }
+  }
+}
+
+#define DIFFVBD_INSTANTIATE(T)                                                                     \
+  template void rigid_system<T>(const RigidInputs<T>&, bool, double*, double*, double*, int32_t*); \
+  template void rigid_solve<T>(const RigidInputs<T>&, const double*, double*);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

@@ -7,10 +7,15 @@ namespace diffvbd {
 
 inline rigid::Vector vector_of(const double* a) { return {a[0], a[1], a[2]}; }
 
-// The Newton system of each scene, its factor and its solution: center of mass [B, bodies, 3], motion
-// [B, bodies, 6] and factor [B, RigidInputs::matrix_size()] over a turn and a shift of each body.
+// The Newton systems of each scene, their factors and solutions: center of mass [B, bodies, 3], motion [B, bodies, 6]
+// and factor [B, RigidInputs::matrix_size()] over a turn and a shift of each body. groups: those of `in`, to be
+// written, or null. again: only bodies that are left alone move, because those that touch are too many.
 template <class T>
-void rigid_system(const contact::RigidInputs<T>& in, double* center, double* motion, double* factor);
+void rigid_system(const contact::RigidInputs<T>& in, bool again, double* center, double* motion, double* factor,
+                  int32_t* groups);
+// x [B, bodies, 6] = factor^-T factor^-1 x
+template <class T>
+void rigid_solve(const contact::RigidInputs<T>& in, const double* factor, double* x);
 
 // The share of its motion [B, bodies, 6] that each body takes [B, bodies], so that nothing crosses and the potential
 // of no scene rises; and where that leads, x [B, V, 3]. move [B, V, 3] is that of `in`, to be written.
@@ -32,10 +37,5 @@ void rigid_virtual_motions(const contact::RigidInputs<T>& in, const double* moti
 template <class T>
 void rigid_vertices_backward(const contact::RigidInputs<T>& in, const double* motions, const double* solutions,
                              const contact::VirtualMotions<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag);
-
-// The Cholesky factor of a matrix [size, size], in its lower triangle; what is no number says that it is not positive
-// definite. And x [size] = factor^-T factor^-1 x of each of `count`.
-void cholesky(int64_t size, double* matrix);
-void cholesky_solve(int64_t count, int64_t size, const double* factors, double* x);
 
 }  // namespace diffvbd

@@ -21,8 +21,8 @@ int64_t rigid_move_bytes(const contact::RigidInputs<T>& in, const PairRoom& room
 
 // As cpu/contact_rigid.h.
 template <class T>
-cudaError_t rigid_system(const contact::RigidInputs<T>& in, const PairRoom& room, double* center, double* motion,
-                         double* factor, void* workspace, cudaStream_t stream);
+cudaError_t rigid_system(const contact::RigidInputs<T>& in, const PairRoom& room, bool again, double* center,
+                         double* motion, double* factor, int32_t* groups, void* workspace, cudaStream_t stream);
 template <class T>
 cudaError_t rigid_move(const contact::RigidInputs<T>& in, const PairRoom& room, const double* center,
                        const double* motion, T* move, double* share, T* x, void* workspace, cudaStream_t stream);
@@ -42,11 +42,5 @@ template <class T>
 cudaError_t rigid_vertices_backward(const contact::RigidInputs<T>& in, const double* motions, const double* solutions,
                                     const contact::VirtualMotions<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag,
                                     cudaStream_t stream);
-
-// state: of each system, those that are done are left alone; or null.
-cudaError_t cholesky(int64_t count, int64_t size, double* matrices, cudaStream_t stream,
-                     const uint8_t* state = nullptr);
-cudaError_t cholesky_solve(int64_t count, int64_t size, const double* factors, double* x, cudaStream_t stream,
-                           const uint8_t* state = nullptr);
 
 }  // namespace diffvbd::cuda

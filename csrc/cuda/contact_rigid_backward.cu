@@ -80,7 +80,7 @@ cudaError_t rigid_end_backward(const RigidInputs<T>& in, const double* motions, 
                                cudaStream_t stream) {
   if (blocks_of_bodies(in) == 0) return cudaSuccess;
   end_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, motions, shares, end_bar, solutions, x, mass);
-  if (auto error = cholesky_solve(in.systems(), in.system_size(), factor, solutions, stream)) return error;
+  if (auto error = solve_groups(in, factor, solutions, stream)) return error;
   motion_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, motions, solutions, p, q);
   return cudaGetLastError();
 }

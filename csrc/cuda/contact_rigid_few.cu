@@ -1,5 +1,5 @@
-// The rigid correction where few bodies are solved for together, or each alone: all of Newton's method in one launch, a
-// block for each system.
+// The rigid correction where few bodies are solved for together: all of Newton's method in one launch, a block for each
+// group.
 #include "../contact/rigid_slip.h"
 #include "cholesky.cuh"
 #include "contact_rigid_presses.cuh"
@@ -7,27 +7,33 @@
 namespace diffvbd::cuda {
 namespace {
 
-static_assert(kSquare == kThreads);
 constexpr int kLanes = 8;                    // threads that share the pairs of a vertex
 constexpr int kSlots = 2, kLineDoubles = 7;  // slips that a thread keeps while a step looks for its length
 constexpr int kOwn = kUnknowns + rigid::kSix, kHalf = 3 * kUnknowns;
+constexpr int kSmall = kUnknowns * kFew;  // unknowns of systems that fit into shared memory
 
-// A system: all bodies of a scene, or one.
+// The system of a group.
 template <class T>
 struct System {
   const RigidInputs<T>& in;
   const BlockTeam& team;
   int64_t scene;
+  Groups groups;
   int32_t first, count;
-  double *center, *motion;  // of the scene's bodies
+  double *center, *motion, *steps;  // of the scene's bodies
   double *base, *matrix, *gradient, *step;
   uint8_t* touching;  // [count, count]
+  Pivots& pivots;
   double (*slots)[kLineDoubles][kThreads];
 
-  __device__ Body<T> body(int32_t b) const { return {in.scene, scene, first + b}; }
+  __device__ int32_t member(int32_t b) const { return groups.member(first + b); }
+  __device__ Body<T> body(int32_t b) const { return {in.scene, scene, member(b)}; }
   __device__ int32_t size() const { return kUnknowns * count; }
-  __device__ Vector center_of(int32_t b) const { return vector_of(center + 3 * (first + b)); }
-  __device__ double* motion_of(int32_t b) const { return motion + kUnknowns * (first + b); }
+  __device__ Vector center_of(int32_t b) const { return vector_of(center + 3 * member(b)); }
+  __device__ double* motion_of(int32_t b) const { return motion + kUnknowns * member(b); }
+  __device__ double& unknown(double* of, int32_t i) const {  // of the scene's bodies
+    return of[kUnknowns * member(i / kUnknowns) + i % kUnknowns];
+  }
   __device__ double& at(double* of, int32_t b, int i, int32_t c, int j) const {
     return of[size() * (kUnknowns * b + i) + kUnknowns * c + j];
   }
@@ -38,7 +44,7 @@ struct System {
     const PairList& list = pairs.list;
     const int64_t row = scene * in.gate.corners + body(b).vertex(item / kLanes);
     for (int32_t e = list.ptr[row] + item % kLanes; e < list.ptr[row + 1]; e += kLanes) {
-      const int side = side_of(list, pairs.bodies, list.entry[e], first + b);
+      const int side = side_of(list, pairs.bodies, list.entry[e], member(b));
       if (0 <= side) f(int64_t{list.entry[e] >> 2}, side);
     }
   }
@@ -51,7 +57,7 @@ struct System {
       team.each(items(b), [&](int32_t item) {
         each_side(presses.pairs(), b, item, [&](int64_t pair, int side) {
           const int32_t other = presses.pairs().bodies[2 * pair + 1 - side];
-          if (0 <= other) touching[count * b + other - first] = 1;
+          if (0 <= other && groups.first(other) == first) touching[count * b + groups.rank(other)] = 1;
         });
       });
     }
@@ -64,7 +70,7 @@ struct System {
     each_side(presses.pairs(), b, item, [&](int64_t pair, int side) {
       const PairPress a = presses(pair, side);
       if (a.body[side] < 0) return;
-      const double share = borne(a, in.together());
+      const double share = borne(in, scene, a);
 #pragma unroll
       for (int j = 0; j < kUnknowns; ++j) {
         out[j] += a.gradient(side, j, c);
@@ -100,7 +106,7 @@ struct System {
           double total[kHalf];
           team.template sum<kHalf>(items(b), total, [&](int32_t item, double* out) {
             each_side(presses.pairs(), b, item, [&](int64_t pair, int side) {
-              if (presses.pairs().bodies[2 * pair + 1 - side] != first + other) return;
+              if (presses.pairs().bodies[2 * pair + 1 - side] != member(other)) return;
               const PairPress a = presses(pair, side);
 #pragma unroll
               for (int j = 0; j < kUnknowns; ++j) {
@@ -187,20 +193,18 @@ struct System {
 
   // Of the matrix, of the step and of the motion after it: half of the first is what the step lowers the potential by.
   __device__ void energies(double* total) const {
-    const double* own = motion_of(0);
     team.template sum<2>(size(), total, [&](int32_t j, double* out) {
-      double steps = 0, whole = 0;
+      double one = 0, whole = 0;
       for (int32_t i = j; i < size(); ++i) {
-        steps += matrix[size() * i + j] * step[i];
-        whole += matrix[size() * i + j] * (step[i] + own[i]);
+        one += matrix[size() * i + j] * step[i];
+        whole += matrix[size() * i + j] * (step[i] + unknown(motion, i));
       }
-      out[0] += steps * steps, out[1] += whole * whole;
+      out[0] += one * one, out[1] += whole * whole;
     });
   }
   // Calls f(line) for what slips, in a thread's share.
   template <class F>
   __device__ void each_line(const Rubs<T>& rubs, const F& f) const {
-    const double* steps = step - kUnknowns * first;  // of the scene's bodies
     for (int32_t b = 0; b < count; ++b) {
       const Body<T> own = body(b);
       if (!in.free[own.body]) continue;
@@ -251,38 +255,14 @@ struct System {
     }
     team.template reduce<n>(total);
   }
-  // As slip_share(), which halves an interval time after time: all shares that kLevels halvings may come to at once.
-  __device__ double share_of_step(const Rubs<T>& rubs, double fall) const {
-    constexpr int kLevels = 4, kShares = (1 << kLevels) - 1;
-    double shares[kShares], over[kShares];
-    shares[0] = 1;
+  __device__ double share(const Rubs<T>& rubs, double fall) const {
     const int lines = keep_lines(rubs);
-    excess<1>(rubs, lines, shares, over);
-    if (!(kOvershoot * fall < over[0])) return 1;
-    double low = 0, high = 1;
-    for (int halvings = 0; halvings < kHalvings; halvings += kLevels) {
-      for (int k = 0; k < kShares; ++k) shares[k] = low + (high - low) * (k + 1) / (kShares + 1);
-      excess<kShares>(rubs, lines, shares, over);
-      int at = 0, width = kShares + 1;
-      for (int level = 0; level < kLevels && halvings + level < kHalvings; ++level) {
-        width /= 2;
-        double middle = 0, above = 0;
-#pragma unroll
-        for (int k = 0; k < kShares; ++k) {
-          if (k + 1 == at + width) middle = shares[k], above = over[k];
-        }
-        if (above < fall * (1 - middle)) {
-          low = middle, at += width;
-        } else {
-          high = middle;
-        }
-      }
-    }
-    return high;
+    return share_of_step(fall, [&](auto number, const double* shares, double* total) {
+      excess<decltype(number)::value>(rubs, lines, shares, total);
+    });
   }
 
   __device__ void solve(const Rubs<T>& rubs) const {
-    double* own = motion_of(0);
     Settling state = kOnItsWay;  // the same for all threads
     for (int iteration = 0; iteration < kSlipIterations && state != kDone; ++iteration) {
       team.each(size() * size(), [&](int32_t i) { matrix[i] = base[i]; });
@@ -291,65 +271,72 @@ struct System {
       add_friction(rubs);
       if (iteration > 0) {
         team.each(size(), [&](int32_t i) {
-          for (int32_t j = 0; j < size(); ++j) step[i] += matrix[size() * i + j] * own[j];
+          for (int32_t j = 0; j < size(); ++j) step[i] += matrix[size() * i + j] * unknown(motion, j);
         });
         team.meet();
       }
-      cholesky_of(size(), matrix);
-      solve_with(size(), matrix, step);
+      factor_blocks<kThreads>(count, matrix, pivots);
+      solve_blocks<kThreads>(count, matrix, step);
       team.each(count, [&](int32_t b) { keep_finite(step + kUnknowns * b); });
       team.meet();
-      double share = 1;
-      if (in.rubs()) {
-        double of[2];
-        energies(of);
-        const double fall = of[0];
-        if (state == kSettledAt) {
-          state = kDone;
-        } else if (fall <= kSettled * kSettled * of[1]) {
-          state = kSettledAt;
-        } else {
-          share = share_of_step(rubs, fall);
-        }
-      } else {
-        state = kDone;
-      }
-      team.each(size(), [&](int32_t i) { own[i] += share * step[i]; });
+      team.each(size(), [&](int32_t i) { unknown(steps, i) = step[i]; });
+      team.meet();
+      double of[2] = {0, 0};
+      if (in.rubs()) energies(of);
+      const double taken = settle(state, in.rubs(), of[0], of[1], [&](double fall) { return share(rubs, fall); });
+      team.each(size(), [&](int32_t i) { unknown(motion, i) += taken * step[i]; });
       team.meet();
     }
   }
 };
 
+// A block for each place where a group may begin. again: bodies move only where they are left alone.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    few_kernel(const __grid_constant__ RigidInputs<T> in, int64_t listed, const int32_t* sides, const double* presses,
-               double* center, double* motion, double* factor) {
+    few_kernel(const __grid_constant__ RigidInputs<T> in, int64_t listed, const __grid_constant__ GroupMemory memory,
+               bool again, double* center, double* motion, double* factors) {
   __shared__ double part[kWarps][kMostSums];
   __shared__ uint8_t touching[kFew * kFew];
+  __shared__ Pivots pivots;
   __shared__ double slots[kSlots][kLineDoubles][kThreads];
-  extern __shared__ double memory[];
+  __shared__ double matrices[2][kSmall * kSmall], vectors[2][kSmall];
   const BlockTeam team{part};
-  const int32_t n = in.bodies(), count = in.together() ? n : 1, size = kUnknowns * count;
-  const int64_t scene = in.together() ? blockIdx.x : blockIdx.x / n;
-  double *base = memory, *matrix = base + size * size, *gradient = matrix + size * size;
+  const int32_t n = in.bodies(), places = in.together() ? 1 : n;
+  const int64_t scene = blockIdx.x / places;
+  const auto first = static_cast<int32_t>(blockIdx.x % places);
+  const Groups groups = in.groups_of(scene);
+  const int32_t count = groups.count(first), size = kUnknowns * count;
+  if (count == 0 || (!again && count > kFew)) return;
+  double* factor = factors + in.matrix_size() * scene + groups.matrix(first);
   const System<T> system{in,
                          team,
                          scene,
-                         in.together() ? 0 : static_cast<int32_t>(blockIdx.x % n),
+                         groups,
+                         first,
                          count,
                          center + 3 * n * scene,
                          motion + kUnknowns * n * scene,
-                         base,
-                         matrix,
-                         gradient,
-                         gradient + size,
+                         memory.steps + kUnknowns * n * scene,
+                         matrices[0],
+                         matrices[1],
+                         vectors[0],
+                         vectors[1],
                          touching,
+                         pivots,
                          slots};
-  team.each(size, [&](int32_t i) { system.motion_of(0)[i] = 0; });
+  team.each(size, [&](int32_t i) { system.unknown(system.motion, i) = 0; });
+  if (again && !groups.is_left(first)) {
+    for (int32_t b = 0; b < count; ++b) {
+      const Whole whole = whole_of(system.body(b), team);
+      if (threadIdx.x == 0) rigid::put(system.center + 3 * system.member(b), whole.center);
+    }
+    if (threadIdx.x == 0) *factor = CUDART_NAN;
+    return;
+  }
   team.each(count * count, [&](int32_t i) { touching[i] = 0; });
   team.meet();
-  const Barriers<T> barriers{in, sides, presses};
-  const Rubs<T> rubs{in, sides + 2 * listed, {system.center, system.motion}};
+  const Barriers<T> barriers{in, memory.sides, memory.press};
+  const Rubs<T> rubs{in, memory.sides + 2 * listed, {system.center, system.motion}};
   if (count > 1) {
     system.find_touching(barriers);
     if (in.lag) system.find_touching(rubs);
@@ -357,24 +344,21 @@ __global__ void __launch_bounds__(kThreads)
   }
   system.assemble(barriers);
   system.solve(rubs);
-  double* to = factor + static_cast<int64_t>(size) * size * blockIdx.x;
-  team.each(size * size, [&](int32_t i) { to[i] = matrix[i]; });
+  team.each(size * size, [&](int32_t i) { factor[i] = system.matrix[i]; });
 }
 
 }  // namespace
 
 template <class T>
-cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const int32_t* sides, const double* presses,
-                      double* center, double* motion, double* factor, cudaStream_t stream) {
-  const int64_t size = in.system_size();
-  const size_t bytes = (2 * size * size + 2 * size) * sizeof(double);
-  few_kernel<T><<<static_cast<unsigned>(in.systems()), kThreads, bytes, stream>>>(in, room.listed, sides, presses,
-                                                                                  center, motion, factor);
+cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, bool again,
+                      double* center, double* motion, double* factors, cudaStream_t stream) {
+  const auto blocks = static_cast<unsigned>(in.scene.scenes * (in.together() ? 1 : in.bodies()));
+  few_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room.listed, memory, again, center, motion, factors);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                      \
-  template cudaError_t solve_few<T>(const RigidInputs<T>&, const PairRoom&, const int32_t*, const double*, double*, \
+#define DIFFVBD_INSTANTIATE(T)                                                                                 \
+  template cudaError_t solve_few<T>(const RigidInputs<T>&, const PairRoom&, const GroupMemory&, bool, double*, \
                                     double*, double*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

@@ -3,6 +3,7 @@
 
 #include "islands.h"
 #include "ordered.cuh"
+#include "union.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -164,24 +165,6 @@ template <class T>
 __global__ void sweep_kernel(const IslandInputs<T> in, Workspace<T> work) {
   const int64_t i = own_item();
   if (i < in.scenes * in.mesh_bodies) sweep_body(in, work, i, work.label[i]);
-}
-
-__device__ int32_t root_of(const int32_t* label, int32_t i) {
-  const volatile int32_t* parent = label;
-  while (parent[i] != i) i = parent[i];
-  return i;
-}
-
-// Hangs the larger of two roots under the smaller; whoever comes first, in the end each island's root is its smallest.
-__device__ void unite(int32_t* label, int32_t a, int32_t b) {
-  for (;;) {
-    a = root_of(label, a), b = root_of(label, b);
-    if (a == b) return;
-    const int32_t low = a < b ? a : b, high = a < b ? b : a;
-    const int32_t before = atomicMin(label + high, low);
-    if (before == high) return;
-    a = before, b = low;
-  }
 }
 
 // A thread for each body and each tile of others: joins their islands, or says in the end that they would have to be.

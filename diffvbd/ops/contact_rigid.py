@@ -14,16 +14,20 @@ from .load import direct as raw
 from .rigid import join_data, scalars_of_data
 
 UNKNOWNS = 6  # of a body: a turn and a shift
-MOST_COUPLED = 64  # bodies that are solved for together; twin of kMostCoupled in csrc/contact/rigid.h
+# Twins of the constants in csrc/contact/groups.h
+MOST_COUPLED = 64  # bodies that are solved for together: all of a scene, or a group that touches,
+GROUP_MEMORY = 32 << 10  # of which there are at most so many over the bodies of the scene
 _FIELDS = len(TouchingFields._fields)
 
 
-def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float
-                 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float,
+                 again: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """The turn and the shift of each body to where the step's potential is least, float64: centers of mass
-    [B, bodies, 3] [m], motion [B, bodies, 6], and Cholesky factor [B, 6 bodies, 6 bodies], or [B, bodies, 6, 6] of more
-    than MOST_COUPLED bodies. friction_eps: [m], 0 without friction."""
-    return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps)
+    [B, bodies, 3] [m], motion [B, bodies, 6], Cholesky factor [B, 6 bodies, 6 bodies], and groups: empty. Of more than
+    MOST_COUPLED bodies: factors of groups that touch [B, bodies, 6, 6 most_grouped()], and groups int32 [B, 4, bodies],
+    as csrc/contact/groups.h has them. friction_eps: [m], 0 without friction. again: only bodies move that are left
+    alone, because those that touch are too many."""
+    return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps, again)
 
 
 def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_count: Sequence[int], time_step: float,
@@ -33,12 +37,18 @@ def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_cou
     return raw.contact_rigid_move(*fields, centers, motion, data_count, time_step, friction_eps)
 
 
-def rigid_backward(fields: TouchingFields, p: Tensor, q: Tensor, data_count: Sequence[int], time_step: float,
-                   friction_eps: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+def most_grouped(bodies: int) -> int:
+    """Bodies of a group at most."""
+    return min(max(GROUP_MEMORY // bodies, 1), MOST_COUPLED)
+
+
+def rigid_backward(fields: TouchingFields, p: Tensor, q: Tensor, groups: Tensor, data_count: Sequence[int],
+                   time_step: float, friction_eps: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """What pairs add to the derivatives of p . (gradient + matrix q) of the Newton step, p and q being motions of all
-    corner points [B, N, 3]. For each listed pair: by the positions, p and q of its corners [pairs, 4, 9] and by kappa
-    [pairs]; for each lagged pair likewise, and by its lag [pairs, 9]."""
-    return raw.contact_rigid_backward(*fields, p.contiguous(), q.contiguous(), data_count, time_step, friction_eps)
+    corner points [B, N, 3], groups those of the step. For each listed pair: by the positions, p and q of its corners
+    [pairs, 4, 9] and by kappa [pairs]; for each lagged pair likewise, and by its lag [pairs, 9]."""
+    return raw.contact_rigid_backward(*fields, p.contiguous(), q.contiguous(), groups, data_count, time_step,
+                                      friction_eps)  # fmt: skip
 
 
 class EndAdjoint(NamedTuple):
@@ -51,11 +61,12 @@ class EndAdjoint(NamedTuple):
     mass: Tensor  # [B, V]
 
 
-def rigid_end_backward(fields: TouchingFields, motion: Tensor, share: Tensor, factor: Tensor, x_bar: Tensor,
-                       data_count: Sequence[int], time_step: float, friction_eps: float) -> EndAdjoint:  # fmt: skip
+def rigid_end_backward(fields: TouchingFields, motion: Tensor, share: Tensor, factor: Tensor, groups: Tensor,
+                       x_bar: Tensor, data_count: Sequence[int], time_step: float, friction_eps: float
+                       ) -> EndAdjoint:  # fmt: skip
     """The first part of the adjoint of a correction, of that of where it led [B, V, 3]."""
-    return EndAdjoint(*raw.contact_rigid_end_backward(*fields, motion, share, factor, x_bar.contiguous(), data_count,
-                                                      time_step, friction_eps))  # fmt: skip
+    return EndAdjoint(*raw.contact_rigid_end_backward(*fields, motion, share, factor, groups, x_bar.contiguous(),
+                                                      data_count, time_step, friction_eps))  # fmt: skip
 
 
 class VertexAdjoints(NamedTuple):
@@ -85,8 +96,10 @@ def rigid_vertices_backward(fields: TouchingFields, motion: Tensor, solution: Te
 def _(*arguments):
     f = TouchingFields(*arguments[:_FIELDS])
     b, n = f.x.shape[0], f.free.shape[0]
-    shape = (b, UNKNOWNS * n, UNKNOWNS * n) if n <= MOST_COUPLED else (b, n, UNKNOWNS, UNKNOWNS)
-    return tuple(f.x.new_empty(size, dtype=torch.float64) for size in ((b, n, 3), (b, n, UNKNOWNS), shape))
+    together = n <= MOST_COUPLED
+    shape = (b, UNKNOWNS * n, UNKNOWNS * n) if together else (b, n, UNKNOWNS, UNKNOWNS * most_grouped(n))
+    doubles = (f.x.new_empty(size, dtype=torch.float64) for size in ((b, n, 3), (b, n, UNKNOWNS), shape))
+    return (*doubles, f.x.new_empty((0,) if together else (b, 4, n), dtype=torch.int32))
 
 
 @shapes_of("contact_rigid_move")

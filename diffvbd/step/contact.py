@@ -40,9 +40,10 @@ if TYPE_CHECKING:
     from .arguments import Prepared
     from .predict import Begun
 
-# Rigid corrections after the last sweeps of more than MOST_COUPLED bodies that may touch. In stacks of two that rub
-# the upper body creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; with 1 it falls. Stacks of four fell with 6.
-APART_CORRECTIONS = 8
+# Rigid corrections after the last sweeps of bodies that are left alone, as those that touch are too many. When all
+# were, in stacks of two that rub the upper body crept at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; with 1 it fell.
+# Stacks of four fell with 6.
+LEFT_CORRECTIONS = 8
 FREE = 1e15  # [m] room that nothing fills
 CLOSE = 1e-3  # of dhat: pairs whose gap is so much wider do not push, however it is rounded
 LONG_LIST = 1024  # pairs, of which it pays to find those that push
@@ -198,8 +199,8 @@ class ContactStep:
                 swept = swept_part(self, x, swept_from, now, near, part, policy, debug_step)
                 met.swept.append(swept)
                 x, limits, combined, lengths = swept
-                for _ in range(self.corrections_after(r + 1 == self.parts)):
-                    x, last = self._corrected(x, now, start, detection.listed)
+                for again in self.corrections_after(r + 1 == self.parts):
+                    x, last = self._corrected(x, now, start, detection.listed, again)
                     taken.append(last)
                 cut = limits[:, -1] > 0  # what the start has held up, sweeps may have made good
             met.cut = cut
@@ -235,25 +236,26 @@ class ContactStep:
             settings = self.prepared.settings
             swept = swept_part(self, x, start, self.colliders, none, settings, policy, debug_step)
             x = swept.x
-            for _ in range(self.corrections_after(True)):
+            for _ in self.corrections_after(True):
                 x, _ = self._corrected(x, self.colliders, start, none)
             record_parts(self.model, x, [swept])
         return x
 
-    def corrections_after(self, last: bool) -> int:
-        """How many rigid corrections follow the sweeps of a part. Coarse ones leave a stiff body turned, and one Newton
-        step leaves so much of that that a free body gained spin. Of very many bodies each is solved for with the others
-        at rest, which takes several at the end to bear what lies on others."""
+    def corrections_after(self, last: bool) -> list[bool]:
+        """The rigid corrections that follow the sweeps of a part, by whether they are again of bodies that are left
+        alone. Coarse sweeps leave a stiff body turned, and one Newton step leaves so much of that that a free body
+        gained spin. Bodies left alone take several at the end to bear what lies on others."""
         least = 1 if self.prepared.coarse is None else 2
-        apart = last and self.barrier is not None and self.model.mesh.num_bodies > MOST_COUPLED
-        return max(least, APART_CORRECTIONS) if apart else least
+        leaves = last and self.barrier is not None and self.model.mesh.num_bodies > MOST_COUPLED
+        return [k >= least for k in range(max(least, LEFT_CORRECTIONS) if leaves else least)]
 
-    def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> tuple[Tensor, Tensor]:
+    def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs, again: bool = False
+                   ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """x after the rigid correction of all bodies that are free, and the share of its motion that each took."""
         numbers = self.prepared.settings.numbers
         fields = self.touching(x, collider, start, listed)
         eps = 0.0 if self.model.friction is None else numbers.friction_eps
-        return correct(self.model, fields, numbers.time_step, eps)
+        return correct(self.model, fields, numbers.time_step, eps, again)
 
     def touching(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> ops.TouchingFields:
         """What all potentials of bodies as wholes are made of, at x [B, V, 3]."""

@@ -27,12 +27,14 @@ from .rigid_terms import Scenes
 _FIELDS = len(ops.TouchingFields._fields)
 
 
-def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction_eps: float) -> tuple[Tensor, Tensor]:
+def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction_eps: float, again: bool = False
+            ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """x [B, V, 3] after every free body has been moved, as far as pairs, floors and the potential let it; and the share
-    of its motion that each took [B, bodies]. friction_eps: [m], 0 without friction. Differentiable in
+    of its motion that each took [B, bodies]. friction_eps: [m], 0 without friction. again: only bodies move that are
+    not solved for together with those that they touch, as these are too many. Differentiable in
     ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
-    x, share, *_ = _Correct.apply(*fields, model, time_step, friction_eps)
+    x, share, *_ = _Correct.apply(*fields, model, time_step, friction_eps, again)
     return x, share.to(x.dtype)
 
 
@@ -56,30 +58,30 @@ class _Correct(Direct):
     @staticmethod
     def forward(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider, collider_prev, kappa,
                 pairs, constants, pair_ptr, pair_entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room,
-                model, time_step, friction_eps):  # fmt: skip
+                model, time_step, friction_eps, again):  # fmt: skip
         fields = ops.TouchingFields(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider,
                                     collider_prev, kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs,
                                     lag_ptr, lag_entry, floor_lag, center, room)  # fmt: skip
         counts = model._data_count
-        centers, motion, factor = ops_rigid.rigid_system(fields, counts, time_step, friction_eps)
+        centers, motion, factor, groups = ops_rigid.rigid_system(fields, counts, time_step, friction_eps, again)
         end, share = ops_rigid.rigid_move(fields, centers, motion, counts, time_step, friction_eps)
-        return end, share, motion, factor
+        return end, share, motion, factor, groups
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
         ctx.save_for_backward(*inputs[:_FIELDS], *output[1:])
-        ctx.options = inputs[_FIELDS:]
+        ctx.options = inputs[_FIELDS:-1]
         ctx.mark_non_differentiable(*output[1:])
         ctx.set_materialize_grads(False)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple:
         if grads[0] is None:
-            return (None,) * (_FIELDS + 3)
+            return (None,) * (_FIELDS + 4)
         ops.not_batched(grads[0])
         needs = ctx.needs_input_grad[:_FIELDS]
         out = _CorrectBackward.apply(grads[0], *ctx.saved_tensors, *ctx.options, needs)
-        return of_inputs(out if isinstance(out, tuple) else (out,), needs, 3)
+        return of_inputs(out if isinstance(out, tuple) else (out,), needs, 4)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> Any:
@@ -90,24 +92,24 @@ class _CorrectBackward(Backward):
     @staticmethod
     def forward(x_bar, x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider, collider_prev,
                 kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center,
-                room, share, motion, factor, model, time_step, friction_eps, needs):  # fmt: skip
+                room, share, motion, factor, groups, model, time_step, friction_eps, needs):  # fmt: skip
         # torch.compile counts these arguments: *args would get the context as well
         fields = ops.TouchingFields(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider,
                                     collider_prev, kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs,
                                     lag_ptr, lag_entry, floor_lag, center, room)  # fmt: skip
         s = Scenes(model, fields, time_step, friction_eps or 1.0)  # which loads that are zero do not read
-        return _adjoints(s, x_bar, share, motion, factor, needs)
+        return _adjoints(s, x_bar, share, motion, factor, groups, needs)
 
 
-def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: Tensor, needs: Sequence[bool]
-              ) -> tuple[Tensor, ...]:  # fmt: skip
+def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: Tensor, groups: Tensor,
+              needs: Sequence[bool]) -> tuple[Tensor, ...]:  # fmt: skip
     """Of the fields that need one. With H d = -g, the adjoint of d is that of -l . (g + H d), where H l is the adjoint
     of d: a sum over vertices and pairs."""
     f, (scenes, vertices) = s.fields, s.fields.x.shape[:2]
     wants = dict(zip(ops.TouchingFields._fields, needs, strict=True))
     options = s.model._data_count, s.time_step, s.friction_eps
-    end = ops_rigid.rigid_end_backward(f, motion, share, factor, x_bar, *options)
-    barrier, by_kappa, friction, by_lag = ops_rigid.rigid_backward(f, end.p, end.q, *options)
+    end = ops_rigid.rigid_end_backward(f, motion, share, factor, groups, x_bar, *options)
+    barrier, by_kappa, friction, by_lag = ops_rigid.rigid_backward(f, end.p, end.q, groups, *options)
     # of corner points: by where they are, by how they have moved, by p and by q
     by_x, by_way, by_p, by_q = (torch.zeros_like(end.p) for _ in range(4))
     if len(barrier):

@@ -23,11 +23,12 @@ rigid_contact = importlib.import_module("diffvbd.step.rigid_contact")
 ELASTIC = dv.StableNeoHookean()
 
 
-def pile(*energies: Any, count: int = 2, anchored: bool = False, scenes: int = 1, dtype: torch.dtype = torch.float64
-         ) -> tuple[dv.Model, Tensor, Tensor]:  # fmt: skip
-    """Boxes one above the other over a floor at -5 mm that the lowest touches; x and v [scenes, V, 3]."""
+def pile(*energies: Any, heights: Sequence[int] = (2,), anchored: bool = False, scenes: int = 1,
+         dtype: torch.dtype = torch.float64) -> tuple[dv.Model, Tensor, Tensor]:  # fmt: skip
+    """Boxes one above the other over a floor at -5 mm that the lowest touch; x and v [scenes, V, 3]."""
     box = mesh.box(2, 0.1)
-    places = [[0.013 * k, 0.105 * k, 0.017 * k] for k in range(count)]
+    places = [[0.5 * n + 0.013 * (k % 4), 0.105 * k, 0.017 * (k % 4)] for n, high in enumerate(heights)
+              for k in range(high)]  # fmt: skip
     tets = mesh.join([box.translate(p) for p in places])
     if anchored:
         spring = torch.zeros(tets.num_vertices)
@@ -42,16 +43,32 @@ def pile(*energies: Any, count: int = 2, anchored: bool = False, scenes: int = 1
 FLOOR = dv.FloorBarrier([-0.005, -0.3], [(0.0, 1.0, 0.0), (0.3, 1.0, 0.1)], kappa=1e3, dhat=0.01, damping=3.0)
 PAIRS = dv.PairBarrier(1e3, 0.01, damping=2.0)
 CASES = {
-    "floor": ((FLOOR, dv.Friction(0.4)), {"count": 1}),
+    "floor": ((FLOOR, dv.Friction(0.4)), {"heights": (1,)}),
     "pairs": ((PAIRS, dv.Friction(0.4)), {}),
-    "all": ((FLOOR, PAIRS, dv.Friction(0.4)), {"anchored": True, "count": 3}),
+    "all": ((FLOOR, PAIRS, dv.Friction(0.4)), {"anchored": True, "heights": (3,)}),
     "batched": ((FLOOR, PAIRS, dv.Friction(0.4)), {"scenes": 3}),
+    # more than sixty-four: groups of three and two, and those of a stack that is too high, each alone
+    "many": ((PAIRS, dv.Friction(0.4, 0.05)), {"heights": (3, ops_rigid.MOST_COUPLED + 1, 2, 1), "scenes": 2}),
     "single": ((FLOOR, PAIRS, dv.Friction(0.4)), {"dtype": torch.float32}),
 }
 
 
-def by_autograd(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: Tensor, needs: Sequence[bool]
-                ) -> tuple[Tensor, ...]:  # fmt: skip
+def solved(factor: Tensor, groups: Tensor, right: Tensor) -> Tensor:
+    """[B, bodies, 6] of all systems."""
+    if groups.numel() == 0:
+        return torch.cholesky_solve(right.reshape(*factor.shape[:-1], 1), factor).reshape(right.shape)
+    out = torch.empty_like(right)
+    for scene, (member, _, _, count) in enumerate(groups.long()):
+        for place in count.nonzero()[:, 0].tolist():
+            bodies = member[place : place + abs(int(count[place]))]
+            size = 6 * len(bodies)
+            own = factor[scene, place:].reshape(-1)[: size * size].reshape(size, size)
+            out[scene, bodies] = torch.cholesky_solve(right[scene, bodies].reshape(-1, 1), own).reshape(-1, 6)
+    return out
+
+
+def by_autograd(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: Tensor, groups: Tensor,
+                needs: Sequence[bool]) -> tuple[Tensor, ...]:  # fmt: skip
     """Of the fields that need one. With H d = -g, the adjoint of d is that of -l . (g + H d), where H l is the adjoint
     of d: a sum over vertices, derived by autograd, and over pairs, derived by the compiled operator."""
     f = s.fields
@@ -61,12 +78,11 @@ def by_autograd(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor:
     end = f.x + _displaced(share.to(f.x.dtype)[..., None] * leaf, arm, (f.order, f.ptr, body))
     wanted = [t for t, need in zip(f, needs, strict=True) if need]
     *first, bar = torch.autograd.grad(end, (*wanted, leaf), x_bar, allow_unused=True, retain_graph=True)
-    right = bar.to(factor.dtype).reshape(*factor.shape[:-1], 1)
-    solution = torch.cholesky_solve(right, factor).reshape(bar.shape)
+    solution = solved(factor, groups, bar.to(factor.dtype))
     # of a matrix that was not positive definite no motion came, and nothing goes back through it
     moved = f.free & torch.isfinite(solution).all(-1)
     solution = torch.where(moved[..., None], solution, 0.0).to(f.x.dtype)
-    virtual = -_virtual_work(s, solution, leaf.detach(), arm, whole, body)
+    virtual = -_virtual_work(s, solution, leaf.detach(), arm, whole, body, groups)
     second = torch.autograd.grad(virtual, wanted, allow_unused=True)
     return tuple(_sum(pair, t) for pair, t in zip(zip(first, second, strict=True), wanted, strict=True))
 
@@ -105,7 +121,8 @@ def without_friction(s: Scenes) -> Scenes:
     return s._replace(fields=s.fields._replace(floor_lag=s.fields.x.new_zeros((0,))))
 
 
-def _virtual_work(s: Scenes, p: Tensor, q: Tensor, arm: Tensor, whole: Tensor, body: Tensor) -> Tensor:
+def _virtual_work(s: Scenes, p: Tensor, q: Tensor, arm: Tensor, whole: Tensor, body: Tensor, groups: Tensor
+                  ) -> Tensor:  # fmt: skip
     """p . (gradient + matrix q + friction after q), for motions p and q of all bodies [B, bodies, 6]."""
     f = s.fields
     at_p, at_q = (torch.linalg.cross(m[:, body, :3], arm) + m[:, body, 3:] for m in (p, q))
@@ -120,16 +137,16 @@ def _virtual_work(s: Scenes, p: Tensor, q: Tensor, arm: Tensor, whole: Tensor, b
     spread = sum_segments(mass * arm.square().sum(-1, keepdim=True), f.order, f.ptr, body)
     least = (p * q * torch.cat([spread.expand(*whole.shape, 3), whole[..., None].expand(*whole.shape, 3)], -1)).sum()
     work = (at_p * own).sum() + LEAST_INERTIA * least
-    return work + _work_of_pairs(s, at_p, at_q)
+    return work + _work_of_pairs(s, at_p, at_q, groups)
 
 
-def _work_of_pairs(s: Scenes, at_p: Tensor, at_q: Tensor) -> Tensor:
+def _work_of_pairs(s: Scenes, at_p: Tensor, at_q: Tensor, groups: Tensor) -> Tensor:
     """A scalar with the derivatives of what pairs add to the virtual work, but another value."""
     f, rest = s.fields, torch.zeros_like(s.fields.collider)
     at_p, at_q, points = (torch.cat([t, u], 1) for t, u in ((at_p, rest), (at_q, rest), (f.x, f.collider)))
     found = ops_rigid.rigid_backward(
-        ops.TouchingFields(*(t.detach() for t in f)), at_p.detach(), at_q.detach(), s.model._data_count, s.time_step,
-        s.friction_eps,
+        ops.TouchingFields(*(t.detach() for t in f)), at_p.detach(), at_q.detach(), groups, s.model._data_count,
+        s.time_step, s.friction_eps,
     )  # fmt: skip
     barrier, by_kappa, friction, by_lag = found
 
@@ -162,9 +179,10 @@ def test_compiled_adjoint_is_that_of_autograd(name: str, device: str, monkeypatc
     model, x, v = model.to(device), x.to(device), v.to(device)
     compiled, seen = rigid_contact._adjoints, {}
 
-    def both(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: Tensor, needs: Sequence[bool]) -> Any:
-        found = compiled(s, x_bar, share, motion, factor, needs)
-        expected = derived(s, needs, x_bar, share, motion, factor)
+    def both(s: Scenes, x_bar: Tensor, *given: Any) -> Any:
+        *tensors, needs = given
+        found = compiled(s, x_bar, *given)
+        expected = derived(s, needs, x_bar, *tensors)
         names = [field for field, need in zip(ops.TouchingFields._fields, needs, strict=True) if need]
         for field, own, other in zip(names, found, expected, strict=True):
             size = float(other.norm())

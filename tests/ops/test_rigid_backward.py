@@ -1,7 +1,7 @@
 """Claim: the derivatives that the adjoint of rigid corrections takes of pairs are those of their virtual work.
 
-The work is written out in torch here and derived by autograd. More than MOST_COUPLED bodies are solved for one by one:
-each side bears twice the stiffness. Friction is that after q, and after twice the q of a side that is solved for alone.
+The work is written out in torch here and derived by autograd. Where sides are of two groups, each bears twice the
+stiffness. Friction is that after q, and after twice the q of such a side.
 """
 
 import importlib
@@ -26,10 +26,12 @@ DIFFERENTIABLE = ("x", "x_prev", "collider", "collider_prev", "kappa", "lag")
 
 
 def many() -> Any:
-    """Thirty-six pairs of boxes that touch, with friction; one box is pinned."""
+    """Nine pairs of boxes that touch, and a stack of more than a group may have, with friction; one box is
+    pinned."""
     box = mesh.box(2, 0.1)
-    places = np.array([[0.3 * (k % 6), 0.0, 0.3 * (k // 6)] for k in range(36)])
-    tets = mesh.replicate(box, np.concatenate([places, places + [0.013, 0.105, 0.017]]))
+    places = np.array([[0.3 * (k % 6), 0.0, 0.3 * (k // 6)] for k in range(9)])
+    stack = np.array([[-0.4 + 0.013 * (k % 2), 0.105 * k, 0.0] for k in range(contact_rigid.MOST_COUPLED + 4)])
+    tets = mesh.replicate(box, np.concatenate([places, places + [0.013, 0.105, 0.017], stack]))
     model = dv.Model(tets, pinned=range(8), energies=(dv.StableNeoHookean(), dv.PairBarrier(1e3, 0.01, damping=2.0),
                                                       dv.Friction(0.4, 0.05)))  # fmt: skip
     x = model.rest_points + noise("many", shape=model.rest_points.shape, size=5e-4)
@@ -40,10 +42,10 @@ def fields_of(monkeypatch: pytest.MonkeyPatch, name: str) -> Scenes:
     """What a correction in a step of a scene reads: the last that has pairs."""
     seen: list[Scenes] = []
 
-    def correct(model: dv.Model, fields: ops.TouchingFields, time_step: float, eps: float) -> Any:
+    def correct(model: dv.Model, fields: ops.TouchingFields, time_step: float, eps: float, *again: bool) -> Any:
         if fields.pairs.shape[0]:
             seen.append(Scenes(model, ops.TouchingFields(*(t.detach().contiguous() for t in fields)), time_step, eps))
-        return original(model, fields, time_step, eps)
+        return original(model, fields, time_step, eps, *again)
 
     original = contact_step.correct
     monkeypatch.setattr(contact_step, "correct", correct)
@@ -55,6 +57,11 @@ def fields_of(monkeypatch: pytest.MonkeyPatch, name: str) -> Scenes:
     return seen[-1]
 
 
+def groups_of(s: Scenes) -> Tensor:
+    """[B, 4, bodies], or empty."""
+    return contact_rigid.rigid_system(s.fields, s.model._data_count, s.time_step, s.friction_eps, False)[3]
+
+
 def parts_of(s: Scenes, listed: Pairs, moved: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Of how corners move [2, n, 4, 3], what is solved for at once, with its share of the stiffness [n, 1]."""
     f, count = s.fields, s.fields.free.shape[0]
@@ -62,7 +69,12 @@ def parts_of(s: Scenes, listed: Pairs, moved: Tensor) -> list[tuple[Tensor, Tens
     sides = torch.where(kind == 1, 2, 1)
     lead = f.body.long()[torch.cat([corners[:, :1], corners.gather(1, sides)], 1)]
     moves = (lead < count) & f.free[lead.clamp(max=count - 1)]
-    apart = moves.all(1) & (lead[:, 0] != lead[:, 1]) & (count > contact_rigid.MOST_COUPLED)
+    groups = groups_of(s)
+    apart = moves.all(1) & torch.tensor(groups.numel() > 0)
+    if groups.numel():
+        assert count > contact_rigid.MOST_COUPLED
+        first = groups[listed.pairs[:, 5:].long(), 1, lead.clamp(max=count - 1)]
+        apart = apart & (first[:, 0] != first[:, 1])
     first = (torch.arange(4) < sides)[..., None]
     share = torch.where(apart, 2.0, 1.0)[:, None]
     one = torch.where(apart[:, None, None] & ~first, 0.0, moved).sum(2)
@@ -134,8 +146,8 @@ def test_derivatives_are_those_of_the_virtual_work(name: str, device: str, monke
     expected = dict(zip(leaves, grads, strict=True))
 
     found = contact_rigid.rigid_backward(
-        ops.TouchingFields(*(t.to(device) for t in f)), p.to(device), q.to(device), s.model._data_count, s.time_step,
-        s.friction_eps,
+        ops.TouchingFields(*(t.to(device) for t in f)), p.to(device), q.to(device), groups_of(s).to(device),
+        s.model._data_count, s.time_step, s.friction_eps,
     )  # fmt: skip
     barrier, by_kappa, friction, by_lag = (t.cpu() for t in found)
 

@@ -96,14 +96,14 @@ def gradients(c: Case, lift: Any, bar: Tensor) -> dict[str, Tensor]:
 
 def check(c: Case) -> dict[str, Tensor]:
     """Its gradients, after a look at all numbers: those of float32 are rounded once, at the end."""
-    single, double = c.x.dtype == torch.float32, c.on(c.x.device, torch.float64)
-    got, bound = c.lifted(), tolerance("float32_forward" if single else "adjoint")
-    assert relative_error(got, by_torch(double)[0]) <= tolerance("float32_forward" if single else "borne")
+    single, double = c.x.dtype == torch.float32, c.on("cpu", torch.float64)  # where sums have one order
+    got, bound = c.lifted(), tolerance("float32_forward" if single else "contact_adjoint")
+    assert relative_error(got.cpu(), by_torch(double)[0]) <= tolerance("float32_forward" if single else "borne")
     assert torch.equal(got, c.lifted())
     bar = torch.as_tensor(generator("bar").standard_normal(got.shape)).to(got)
-    found, by_autograd = gradients(c, Case.lifted, bar), gradients(double, lambda c: by_torch(c)[0], bar.double())
+    found, by_autograd = gradients(c, Case.lifted, bar), gradients(double, lambda c: by_torch(c)[0], bar.double().cpu())
     for name, value in found.items():
-        assert value.dtype == c.x.dtype and relative_error(value, by_autograd[name]) <= bound, name
+        assert value.dtype == c.x.dtype and relative_error(value.cpu(), by_autograd[name]) <= bound, name
     again = gradients(c, Case.lifted, bar)
     assert all(torch.equal(again[name], value) for name, value in found.items())
     return found

@@ -257,12 +257,12 @@ def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     touching = (*own, none, *no_pairs(x, 0)[:1], *no_pairs(x, 0)[2:], none, x, own_room)
     numbers = (model._data_count, 0.01, 1e-3)
     points_of = torch.cat([move, torch.zeros_like(points)], 1)
-    centers, motion, factor = torch.ops.diffvbd.contact_rigid_system(*touching, *numbers)
+    centers, motion, factor, groups = torch.ops.diffvbd.contact_rigid_system(*touching, *numbers, False)
     assert motion.abs().max() > 0 and torch.isfinite(factor).all()
     return {
-        "contact_rigid_system": (*touching, *numbers),
+        "contact_rigid_system": (*touching, *numbers, False),
         "contact_rigid_move": (*touching, centers, motion, *numbers),
-        "contact_rigid_backward": (*touching, points_of, points_of, *numbers),
+        "contact_rigid_backward": (*touching, points_of, points_of, groups, *numbers),
         "contact_above_floor": floor,
         "contact_above_floor_backward": (move, *floor, True),
         "contact_frames": (x, move, u, move, move, frames, room, room, *bodies),

@@ -18,17 +18,20 @@ using torch::stable::Tensor;
 
 Tensor doubles(const std::vector<int64_t>& sizes) { return torch::stable::empty(sizes, ScalarType::Double); }
 
-std::tuple<Tensor, Tensor, Tensor> contact_rigid_system(DIFFVBD_PARAMETERS(TOUCHING) std::vector<int64_t> data_count,
-                                                        double time_step, double friction_eps) {
+std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_system(
+    DIFFVBD_PARAMETERS(TOUCHING) std::vector<int64_t> data_count, double time_step, double friction_eps, bool again) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
+  diffvbd::require_positions(x);
+  const int64_t b = x.size(0), n = ptr.numel() - 1;
+  Tensor groups = torch::stable::empty(diffvbd::groups_shape(b, n), ScalarType::Int);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
-    const int64_t b = in.scene.scenes, n = in.bodies();
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
     Tensor centers = doubles({b, n, 3}), motion = doubles({b, n, contact::kUnknowns});
-    Tensor factor = doubles(diffvbd::matrix_shape(in));
-    diffvbd::rigid_system<T>(in, data<double>(centers), data<double>(motion), data<double>(factor));
-    return std::make_tuple(centers, motion, factor);
+    Tensor factor = doubles(diffvbd::matrix_shape(b, n));
+    diffvbd::rigid_system<T>(in, again, data<double>(centers), data<double>(motion), data<double>(factor),
+                             in.groups ? data<int32_t>(groups) : nullptr);
+    return std::make_tuple(centers, motion, factor, groups);
   });
 }
 
@@ -39,7 +42,7 @@ std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const
     using T = decltype(scalar);
     diffvbd::require_positions(x);
     const Tensor way = empty(x, {x.size(0), x.size(1), 3});
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, way);
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, way, empty(x, {0}));
     diffvbd::require_motion(in, centers, motion, x);
     Tensor out = empty(x, {in.scene.scenes, in.scene.vertices, 3}), share = doubles({in.scene.scenes, in.bodies()});
     diffvbd::rigid_move<T>(in, data<const double>(centers), data<const double>(motion), data<T>(way),
@@ -49,12 +52,13 @@ std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_backward(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& p,
-                                                                  const Tensor& q, std::vector<int64_t> data_count,
-                                                                  double time_step, double friction_eps) {
+                                                                  const Tensor& q, const Tensor& groups,
+                                                                  std::vector<int64_t> data_count, double time_step,
+                                                                  double friction_eps) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
     const auto make = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes); };
     const diffvbd::RigidWorkTensors out(f, make);
     diffvbd::rigid_backward<T>(in, diffvbd::virtual_motions(in, p, q, x), out.view<T>());
@@ -63,12 +67,13 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_backward(DIFFVBD_PARAME
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_end_backward(
-    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& share, const Tensor& factor, const Tensor& x_bar,
-    std::vector<int64_t> data_count, double time_step, double friction_eps) {
+    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& share, const Tensor& factor, const Tensor& groups,
+    const Tensor& x_bar, std::vector<int64_t> data_count, double time_step, double friction_eps) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
+    diffvbd::require_factor(in, factor, x);
     diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
     diffvbd::require_of_bodies(in, share, x, 1);
     diffvbd::require_like("x_bar", x_bar, x, 3 * in.scene.scenes * in.scene.vertices);
@@ -77,10 +82,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_end_backward(
     auto* l = data<double>(solution);
     diffvbd::rigid_end_backward<T>(in, data<const double>(motion), data<const double>(share), data<const T>(x_bar), l,
                                    data<T>(out.x), data<T>(out.mass));
-    if (solution.numel() > 0) {
-      const auto systems = diffvbd::systems_of(factor, solution);
-      diffvbd::cholesky_solve(systems.count, systems.size, data<const double>(factor), l);
-    }
+    diffvbd::rigid_solve<T>(in, data<const double>(factor), l);
     diffvbd::rigid_virtual_motions<T>(in, data<const double>(motion), l, data<T>(out.p), data<T>(out.q));
     return std::make_tuple(solution, out.p, out.q, out.x, out.mass);
   });
@@ -92,7 +94,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), empty(x, {0}));
     diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
     diffvbd::require_of_bodies(in, solution, x, contact::kUnknowns);
     const diffvbd::RigidVertexTensors out(in, data_count, wants_data,

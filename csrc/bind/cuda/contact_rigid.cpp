@@ -24,22 +24,25 @@ cuda::PairRoom room_of(const TouchingFields& f) {
   return {f.pairs.size(0), f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0};
 }
 
-std::tuple<Tensor, Tensor, Tensor> contact_rigid_system(DIFFVBD_PARAMETERS(TOUCHING) std::vector<int64_t> data_count,
-                                                        double time_step, double friction_eps) {
+std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_system(
+    DIFFVBD_PARAMETERS(TOUCHING) std::vector<int64_t> data_count, double time_step, double friction_eps, bool again) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const DeviceGuard guard(x.get_device_index());
+  diffvbd::require_positions(x);
+  const int64_t b = x.size(0), n = ptr.numel() - 1;
+  Tensor groups = empty(x, diffvbd::groups_shape(b, n), ScalarType::Int);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
-    const int64_t b = in.scene.scenes, n = in.bodies();
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
     const auto doubles = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes, ScalarType::Double); };
     Tensor centers = doubles({b, n, 3}), motion = doubles({b, n, contact::kUnknowns});
-    Tensor factor = doubles(diffvbd::matrix_shape(in));
+    Tensor factor = doubles(diffvbd::matrix_shape(b, n));
     const Tensor work = empty(x, {cuda::rigid_system_bytes(in, room_of(f))}, ScalarType::Byte);
-    check(cuda::rigid_system<T>(in, room_of(f), data<double>(centers), data<double>(motion), data<double>(factor),
-                                work.data_ptr(), current_stream(x)),
-          "the rigid correction of bodies that touch");
-    return std::make_tuple(centers, motion, factor);
+    check(
+        cuda::rigid_system<T>(in, room_of(f), again, data<double>(centers), data<double>(motion), data<double>(factor),
+                              in.groups ? data<int32_t>(groups) : nullptr, work.data_ptr(), current_stream(x)),
+        "the rigid correction of bodies that touch");
+    return std::make_tuple(centers, motion, factor, groups);
   });
 }
 
@@ -51,7 +54,7 @@ std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const
     using T = decltype(scalar);
     diffvbd::require_positions(x);
     const Tensor way = empty(x, {x.size(0), x.size(1), 3});
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, way);
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, way, empty(x, {0}));
     diffvbd::require_motion(in, centers, motion, x);
     Tensor out = empty(x, {in.scene.scenes, in.scene.vertices, 3});
     Tensor share = empty(x, {in.scene.scenes, in.bodies()}, ScalarType::Double);
@@ -64,13 +67,14 @@ std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_backward(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& p,
-                                                                  const Tensor& q, std::vector<int64_t> data_count,
-                                                                  double time_step, double friction_eps) {
+                                                                  const Tensor& q, const Tensor& groups,
+                                                                  std::vector<int64_t> data_count, double time_step,
+                                                                  double friction_eps) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
     const auto make = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes); };
     const diffvbd::RigidWorkTensors out(f, make);
     const Tensor pushing = empty(x, {1 + f.pairs.size(0)}, ScalarType::Int);
@@ -82,19 +86,19 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_backward(DIFFVBD_PARAME
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_end_backward(
-    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& share, const Tensor& factor, const Tensor& x_bar,
-    std::vector<int64_t> data_count, double time_step, double friction_eps) {
+    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& share, const Tensor& factor, const Tensor& groups,
+    const Tensor& x_bar, std::vector<int64_t> data_count, double time_step, double friction_eps) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
+    diffvbd::require_factor(in, factor, x);
     diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
     diffvbd::require_of_bodies(in, share, x, 1);
     diffvbd::require_like("x_bar", x_bar, x, 3 * in.scene.scenes * in.scene.vertices);
     const diffvbd::RigidEndTensors out(in, [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
     Tensor solution = empty(x, {in.scene.scenes, in.bodies(), contact::kUnknowns}, ScalarType::Double);
-    if (solution.numel() > 0) diffvbd::systems_of(factor, solution);
     check(cuda::rigid_end_backward<T>(in, data<const double>(motion), data<const double>(share), data<const T>(x_bar),
                                       data<const double>(factor), data<double>(solution), data<T>(out.x),
                                       data<T>(out.mass), data<T>(out.p), data<T>(out.q), current_stream(x)),
@@ -110,7 +114,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), empty(x, {0}));
     diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
     diffvbd::require_of_bodies(in, solution, x, contact::kUnknowns);
     const diffvbd::RigidVertexTensors out(in, data_count, wants_data,

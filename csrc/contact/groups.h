@@ -1,0 +1,57 @@
+// Groups of bodies whose rigid motions are solved for together (docs/method.md, section 18): all bodies of a scene of
+// few; in a scene of many those that touch, unless they are too many: then each of them is alone.
+#pragma once
+
+#include <cstdint>
+
+#include "../core/vec.h"
+
+namespace diffvbd::contact {
+
+constexpr int kUnknowns = 6;                // of a body: a turn and a shift
+constexpr int kMostCoupled = 64;            // bodies of a group; scenes of no more are one
+constexpr int64_t kGroupMemory = 32 << 10;  // bodies of a scene times those of a group at most: room for matrices
+constexpr int kGroupRows = 4;
+constexpr int32_t kLeft = -1;  // as the count of a group: a body of too many that touch
+
+// Bodies of a group at most.
+DIFFVBD_FN int64_t most_grouped(int64_t bodies) {
+  const int64_t most = kGroupMemory / bodies;
+  return most < 1 ? 1 : most < kMostCoupled ? most : kMostCoupled;
+}
+
+// Those of a scene. Bodies have places, those of a group in a row, and in the order of their numbers.
+struct Groups {
+  int32_t bodies;
+  const int32_t* rows;  // [4, bodies], or null: all are one group
+
+  DIFFVBD_FN int32_t member(int32_t place) const { return rows ? rows[place] : place; }
+  DIFFVBD_FN int32_t first(int32_t body) const { return rows ? rows[bodies + body] : 0; }
+  DIFFVBD_FN int32_t rank(int32_t body) const { return rows ? rows[2 * bodies + body] : body; }
+  // Of the group that begins at a place, or 0.
+  DIFFVBD_FN int32_t count(int32_t place) const {
+    if (!rows) return place == 0 ? bodies : 0;
+    return is_left(place) ? 1 : rows[3 * bodies + place];
+  }
+  // Whether the body there is alone because those that touch are too many.
+  DIFFVBD_FN bool is_left(int32_t place) const { return rows && rows[3 * bodies + place] == kLeft; }
+  DIFFVBD_FN bool joined(int32_t a, int32_t b) const { return first(a) == first(b); }
+  // Where in the memory of its scene the matrix of the group is that begins at a place.
+  DIFFVBD_FN int64_t matrix(int32_t place) const {
+    return rows ? kUnknowns * kUnknowns * most_grouped(bodies) * place : 0;
+  }
+};
+
+// A part of the matrix of a group, 6 x 6, between two of its bodies; `matrices` of the scene.
+struct MatrixPart {
+  double* at;
+  int64_t stride;
+  DIFFVBD_FN MatrixPart(double* matrices, const Groups& groups, int32_t row, int32_t column) {
+    const int32_t first = groups.first(row);
+    stride = int64_t{kUnknowns} * groups.count(first);
+    at = matrices + groups.matrix(first) + kUnknowns * (stride * groups.rank(row) + groups.rank(column));
+  }
+  DIFFVBD_FN double& operator()(int i, int j) const { return at[i * stride + j]; }
+};
+
+}  // namespace diffvbd::contact

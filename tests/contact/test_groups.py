@@ -1,0 +1,103 @@
+"""Claim: in a scene of more than 64 bodies, those that touch are corrected together, as in a scene of few.
+
+Groups of more than MOST_COUPLED bodies are not: each of their bodies is left alone, and corrected again.
+"""
+
+import importlib
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import mesh, ops
+from diffvbd.ops import contact_rigid
+from diffvbd.ops.contact_rigid import MOST_COUPLED
+from diffvbd.step.rigid_terms import Scenes
+from diffvbd.testing import relative_error, tolerance
+
+contact_step = importlib.import_module("diffvbd.step.contact")
+LOW, HALF_GAP, SPEED = -5e-4, 2.5e-4, 1e-3
+
+
+def stacks(heights: list[int], device: str) -> dv.Model:
+    """Cubes of 0.1 m, one upon the other, on a floor; each is within reach of the next."""
+    cube = mesh.cube(2, size=0.1)
+    cube = cube.translate((0.0, -float(cube.points[:, 1].min()), 0.0))
+    step = 0.1 + 2 * HALF_GAP
+    tets = mesh.join([cube.translate((0.3 * n + 0.003 * (k % 2), step * k, 0.002 * (k % 3)))
+                      for n, high in enumerate(heights) for k in range(high)])  # fmt: skip
+    floor = dv.FloorBarrier(LOW, kappa=1e4, dhat=1e-3)
+    energies = (dv.StableNeoHookean(), floor, dv.PairBarrier(1e4, 1e-3, self_contact=False), dv.Friction(0.5, SPEED))
+    return dv.Model(tets, energies=energies, device=device)
+
+
+def run(model: dv.Model, steps: int, sweeps: int, **options: Any) -> tuple[Tensor, Tensor]:
+    x = model.rest_points
+    out = dv.rollout(model, x, torch.zeros_like(x), steps=steps, mu=1e6, lam=1e6, time_step=0.01, sweeps=sweeps,
+                     **options)  # fmt: skip
+    return out.x[-1], out.v[-1]
+
+
+def groups_of(model: dv.Model, monkeypatch: pytest.MonkeyPatch) -> Tensor:
+    """[1, 4, bodies] of the first correction of a step, or empty."""
+    seen: list[Tensor] = []
+
+    def correct(model: dv.Model, fields: ops.TouchingFields, *options: Any) -> Any:
+        s = Scenes(model, ops.TouchingFields(*(t.detach().contiguous() for t in fields)), *options[:2])
+        seen.append(contact_rigid.rigid_system(s.fields, s.model._data_count, *options)[3])
+        return original(model, fields, *options)
+
+    original = contact_step.correct
+    with monkeypatch.context() as patch:
+        patch.setattr(contact_step, "correct", correct)
+        run(model, 1, 1)
+    return seen[0].cpu()
+
+
+def test_groups_are_those_that_touch(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    heights = [2, MOST_COUPLED, 1, MOST_COUPLED + 1, 3]
+    member, first, rank, count = groups_of(stacks(heights, device), monkeypatch)[0]
+    expected, bodies = [], 0
+    for high in heights:
+        own = list(range(bodies, bodies + high))
+        expected += [own] if high <= MOST_COUPLED else [[body] for body in own]
+        bodies += high
+    places = count.nonzero()[:, 0].tolist()
+    assert [member[p : p + abs(int(count[p]))].tolist() for p in places] == expected
+    left = {body for body in range(bodies) if int(count[first[body]]) == -1}
+    assert left == set(range(2 + MOST_COUPLED + 1, bodies - 3))
+    for place, group in zip(places, expected, strict=True):
+        assert first[group].tolist() == [place] * len(group)
+        assert rank[group].tolist() == list(range(len(group)))
+
+
+def test_scenes_of_few_are_one_group(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert groups_of(stacks([2, 1], device), monkeypatch).numel() == 0
+
+
+def test_a_group_moves_and_is_differentiated_as_alone(device: str) -> None:
+    """Without sweeps, whose order depends on the colors of all vertices."""
+    found = []
+    for heights in ([5, 3], [5, 3, *[1] * (MOST_COUPLED - 7)]):
+        model = stacks(heights, device)
+        force = torch.zeros_like(model.rest_points).requires_grad_()
+        pushed = model.mass[:, None] * model.rest_points.new_tensor([1.0, 0.2, 0.3])
+        x, v = run(model, 3, 0, force=force + pushed)
+        own = 8 * 8  # vertices of those eight
+        weights = torch.linspace(-1.0, 1.0, 3 * own, dtype=x.dtype, device=x.device).reshape(own, 3)
+        (slope,) = torch.autograd.grad((weights * (x[:own] + v[:own])).sum(), force)
+        assert float(slope.abs().max()) > 0
+        found.append((x[:own].detach(), slope[:own]))
+    for one, other, name in zip(*found, ("contact_forward", "contact_adjoint"), strict=True):
+        assert relative_error(other, one) <= tolerance(name), name
+
+
+@pytest.mark.parametrize(("high", "sweeps"), [(5, 5), (10, 10)])
+def test_stacks_stand(high: int, sweeps: int, device: str) -> None:
+    """As wide as a body may be off, far from falling: five at K = 5, ten at K = 10."""
+    model = stacks([high] * 2 + [1] * (MOST_COUPLED - 2 * high + 1), device)
+    x, v = run(model, 50, sweeps)
+    assert float((x - model.rest_points).abs().max()) < 2 * high * HALF_GAP
+    assert float(v.abs().max()) < 20 * SPEED
