@@ -69,11 +69,11 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const std::vect
 // Of the factor, and of the groups.
 inline std::vector<int64_t> matrix_shape(int64_t scenes, int64_t bodies) {
   const int64_t six = contact::kUnknowns;
-  if (bodies <= contact::kMostCoupled) return {scenes, six * bodies, six * bodies};
+  if (bodies <= contact::kFew) return {scenes, six * bodies, six * bodies};
   return {scenes, bodies, six, six * contact::most_grouped(bodies)};
 }
 inline std::vector<int64_t> groups_shape(int64_t scenes, int64_t bodies) {
-  if (bodies <= contact::kMostCoupled) return {0};
+  if (bodies <= contact::kFew) return {0};
   return {scenes, contact::kGroupRows, bodies};
 }
 

@@ -1,5 +1,5 @@
-// Groups of bodies whose rigid motions are solved for together (docs/method.md, section 18): all bodies of a scene of
-// few; in a scene of many those that touch, unless they are too many: then each of them is alone.
+// Groups of bodies whose rigid motions are solved for together (docs/method.md, section 18): those that touch, unless
+// they are too many: then each of them is left alone. Scenes of few bodies are one group.
 #pragma once
 
 #include <cstdint>
@@ -9,18 +9,21 @@
 namespace diffvbd::contact {
 
 constexpr int kUnknowns = 6;                // of a body: a turn and a shift
-constexpr int kMostCoupled = 64;            // bodies of a group; scenes of no more are one
+constexpr int kFew = 3;                     // bodies of scenes that are one group
+constexpr int kMostCoupled = 64;            // bodies of a group
 constexpr int64_t kGroupMemory = 32 << 10;  // bodies of a scene times those of a group at most: room for matrices
 constexpr int kGroupRows = 4;
 constexpr int32_t kLeft = -1;  // as the count of a group: a body of too many that touch
 
 // Bodies of a group at most.
 DIFFVBD_FN int64_t most_grouped(int64_t bodies) {
-  const int64_t most = kGroupMemory / bodies;
-  return most < 1 ? 1 : most < kMostCoupled ? most : kMostCoupled;
+  if (bodies == 0) return 0;
+  const int64_t most = kGroupMemory / bodies < kMostCoupled ? kGroupMemory / bodies : kMostCoupled;
+  return most < 1 ? 1 : most < bodies ? most : bodies;
 }
 
-// Those of a scene. Bodies have places, those of a group in a row, and in the order of their numbers.
+// Those of a scene. Bodies have places, those of a group in a row: of no more than kFew in the order of their numbers,
+// else in that of their elimination.
 struct Groups {
   int32_t bodies;
   const int32_t* rows;  // [4, bodies], or null: all are one group

@@ -31,14 +31,14 @@ struct RigidInputs {
   DIFFVBD_FN int32_t bodies() const { return scene.bodies; }
   DIFFVBD_FN bool rubs() const { return (lag || planes > 0) && has_friction; }
   // Whether all bodies of a scene are one group.
-  DIFFVBD_FN bool together() const { return scene.bodies <= kMostCoupled; }
+  DIFFVBD_FN bool together() const { return scene.bodies <= kFew; }
   DIFFVBD_FN Groups groups_of(int64_t s) const {
     return {scene.bodies, groups ? groups + kGroupRows * scene.bodies * s : nullptr};
   }
   // Scalars of the matrices of a scene.
   DIFFVBD_FN int64_t matrix_size() const {
     const int64_t n = scene.bodies;
-    return kUnknowns * kUnknowns * n * (together() ? n : most_grouped(n));
+    return kUnknowns * kUnknowns * n * most_grouped(n);
   }
   DIFFVBD_FN int64_t first_listed(int64_t s) const { return gate.listed.ptr[s * gate.corners] / 4; }
   DIFFVBD_FN int64_t first_lagged(int64_t s) const { return lag ? lagged.ptr[s * gate.corners] / 4 : 0; }
@@ -221,75 +221,9 @@ DIFFVBD_FN bool barrier_press(const RigidInputs<T>& in, int64_t pair, const At& 
   return true;
 }
 
-// Where a corner point was at the start of the step, relative to origin.
-template <class T>
-DIFFVBD_FN Vector before(const RigidInputs<T>& in, int64_t scene, int32_t v) {
-  const int32_t mesh = in.gate.vertices;
-  return rigid::Body<T>::at(v < mesh ? in.scene.x_prev.data + scene * in.scene.x_prev.scene + 3 * int64_t{v}
-                                     : in.collider_prev + 3 * (scene * (in.gate.corners - mesh) + v - mesh));
-}
-
 // f0 of smoothed friction, whose slope over |u| is FrictionRate.
 DIFFVBD_FN double slip_value(double length, double eps) {
   return length < eps ? length * length * (1 / eps - length / (3 * eps * eps)) + eps / 3 : length;
-}
-
-// Motions of all bodies of a scene, about which friction is linear; about none where they are null.
-struct Slid {
-  const double *center, *motion;  // [bodies, 3], [bodies, 6]
-};
-
-// Lagged friction and damping of a pair; it acts along a gap, so that it turns a body even by itself. The gradient is
-// that of a matrix which holds where bodies have gone as `slid` says: there both are exact. Where the sides of a pair
-// are not of one group, `alone` says which side is meant. It has half of the potential, at twice its motion: the
-// potential is convex, so that what lowers both halves lowers the whole. -1: both are, or only the value is asked for.
-template <class T, class At>
-DIFFVBD_FN bool lagged_press(const RigidInputs<T>& in, int64_t pair, const At& at, const Slid& slid, PairPress& out,
-                             int alone) {
-  const int32_t* record = in.lagged.pairs + kPairRow * pair;
-  const Lag<T> lag(in.lag + kLagScalars * pair);
-  if (!lag.active()) return false;
-  const int64_t scene = record[5];
-  const int first = sides(record[4]);
-  sides_of(in, record, out);
-  if (out.body[0] < 0 && out.body[1] < 0) return false;
-  const bool within = out.body[0] == out.body[1];
-  if (within) out.body[1] = -1;
-  const bool halves = is_apart(in, scene, out);
-  if (halves && alone >= 0) out.body[1 - alone] = -1;
-  out.doubled = halves ? 2 : 1;
-  Vector m{};
-  for (int k = 0; k < 4; ++k) {
-    const int32_t v = record[k];
-    const Vector x = at.relative(scene, v);
-    m += double(lag.w[k]) * (x - before(in, scene, v));
-    const int side = within || k < first ? 0 : 1;
-    if (out.body[side] < 0) continue;
-    out.weight[side] += lag.w[k];
-    out.at[side] += double(lag.w[k]) * x;
-  }
-  const Vector n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
-  const double h = in.scene.time_step, along = dot(n, m), c = h * double(lag.damping),
-               size = h * h * double(lag.friction);
-  Vector way{};
-  for (int side = 0; slid.motion && side < 2; ++side) {
-    const int32_t body = out.body[side];
-    if (body < 0) continue;
-    way +=
-        out.doubled * out.moved(side, rigid::Body<double>::at(slid.center + 3 * body), slid.motion + kUnknowns * body);
-  }
-  const Vector u = m - along * n;
-  out.slip = u + (way - dot(n, way) * n);
-  const double length = square_root(dot(out.slip, out.slip)), approach = along < 0 ? along : 0;
-  const FrictionRate<double> f(length, in.friction_eps);
-  out.rubs = size / out.doubled;
-  out.value = size * slip_value(length, in.friction_eps) + 0.5 * c * approach * approach;
-  out.force = size * (f.value * u - (f.curvature * dot(out.slip, way)) * out.slip) + (c * approach) * n;
-  const double borne = out.doubled;
-  out.stiffness = diagonal(borne * size * f.value);
-  add_outer(out.stiffness, borne * (c - size * f.value), n);
-  add_outer(out.stiffness, borne * size * f.curvature, out.slip);
-  return true;
 }
 
 // Gradient and block of what acts on a vertex alone, at where it is, without friction.

@@ -6,7 +6,7 @@
 // derived in twelve directions by Dual, once for each correction. docs/method.md, section 18.
 #pragma once
 
-#include "rigid.h"
+#include "rigid_rub.h"
 
 namespace diffvbd::contact {
 

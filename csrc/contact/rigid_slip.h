@@ -3,7 +3,7 @@
 // where a full one would take a slip past that.
 #pragma once
 
-#include "rigid.h"
+#include "rigid_rub.h"
 
 namespace diffvbd::contact {
 
@@ -15,14 +15,20 @@ constexpr double kSettled = 1e-9;     // of the whole, a step after which there 
 // A slip along a step of Newton's method.
 struct SlipLine {
   Vector slip, change;
-  double size, eps;
+  double size, eps, rate, bend;  // what the step takes friction for: f1(|u|) / |u| at its start, and its derivative
+
+  SlipLine() = default;
+  DIFFVBD_FN SlipLine(const Vector& from, const Vector& way, double load, double smoothing)
+      : slip(from), change(way), size(load), eps(smoothing) {
+    const FrictionRate<double> first(square_root(dot(slip, slip)), eps);
+    rate = first.value, bend = first.curvature * dot(slip, change);
+  }
 
   // The slope of the potential after a share of the step, over what that takes it for.
   DIFFVBD_FN double excess(double share) const {
     const Vector now = slip + share * change;
-    const FrictionRate<double> first(square_root(dot(slip, slip)), eps), last(square_root(dot(now, now)), eps);
-    const Vector taken = first.value * now + (share * first.curvature * dot(slip, change)) * slip;
-    return size * dot(last.value * now - taken, change);
+    const FrictionRate<double> last(square_root(dot(now, now)), eps);
+    return size * dot((last.value - rate) * now - (share * bend) * slip, change);
   }
 };
 
@@ -32,12 +38,7 @@ DIFFVBD_FN SlipLine slip_line(const RigidInputs<T>& in, int64_t pair, const Pair
                               const double* step) {
   const Lag<T> lag(in.lag + kLagScalars * pair);
   const Vector n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
-  Vector way{};
-  for (int side = 0; side < 2; ++side) {
-    const int32_t body = a.body[side];
-    if (body < 0) continue;
-    way += a.doubled * a.moved(side, rigid::Body<double>::at(center + 3 * body), step + kUnknowns * body);
-  }
+  const Vector way = way_of(a, {center, step});
   return {a.slip, way - dot(n, way) * n, a.rubs, in.friction_eps};
 }
 

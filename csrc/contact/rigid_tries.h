@@ -2,7 +2,7 @@
 // and the potential of the scene does not rise (docs/method.md, section 18).
 #pragma once
 
-#include "rigid.h"
+#include "rigid_rub.h"
 
 namespace diffvbd::contact {
 

@@ -4,10 +4,11 @@
 
 #include <algorithm>
 #include <cmath>
-#include <numeric>
+#include <limits>
 #include <vector>
 
 #include "../contact/rigid_slip.h"
+#include "cholesky.h"
 
 namespace diffvbd {
 
@@ -15,45 +16,6 @@ using namespace contact;
 using rigid::Body, rigid::Vector;
 
 namespace {
-
-// Those of a scene of many bodies, by what presses them; rows [4, bodies].
-template <class T>
-void find_groups(const RigidInputs<T>& in, int64_t scene, const std::vector<PairPress>& presses, int32_t* rows) {
-  const int32_t n = in.bodies();
-  std::vector<int32_t> root(n), size(n, 0);
-  std::iota(root.begin(), root.end(), 0);
-  const auto root_of = [&](int32_t body) {
-    while (root[body] != body) body = root[body] = root[root[body]];
-    return body;
-  };
-  const auto join = [&](int32_t a, int32_t b) {
-    if (a < 0 || b < 0) return;
-    a = root_of(a), b = root_of(b);
-    root[std::max(a, b)] = std::min(a, b);
-  };
-  for (const PairPress& press : presses) join(press.body[0], press.body[1]);
-  for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
-    if (!Lag<T>(in.lag + kLagScalars * i).active()) continue;
-    const int32_t* record = in.lagged.pairs + kPairRow * i;
-    join(moving_body(in, record[0]), moving_body(in, record[sides(record[4])]));
-  }
-  for (int32_t k = 0; k < n; ++k) ++size[root_of(k)];
-  int32_t *member = rows, *first = rows + n, *rank = rows + 2 * n, *count = rows + 3 * n, place = 0;
-  std::fill_n(count, n, 0);
-  for (int32_t k = 0; k < n; ++k) {
-    const int32_t own = root_of(k);
-    const bool fits = size[own] <= most_grouped(n);
-    const int32_t lead = fits ? own : k;
-    if (lead == k) {
-      first[k] = place;
-      place += fits ? size[own] : 1;
-    }
-    first[k] = first[lead];
-    rank[k] = fits ? count[first[k]]++ : 0;
-    if (!fits) count[first[k]] = kLeft;
-    member[first[k] + rank[k]] = k;
-  }
-}
 
 void add_press(const PairPress& a, double share, const Groups& groups, const double* center, double* gradient,
                double* matrix) {
@@ -232,32 +194,6 @@ std::vector<std::vector<SlipLine>> lines_of_scene(const RigidInputs<T>& in, int6
     }
   }
   return out;
-}
-
-// The Cholesky factor of a matrix, in its lower triangle; what is no number says that it is not positive definite.
-void cholesky(int64_t size, double* a) {
-  std::vector<int64_t> first(size);  // of each row, before which it is zero: bodies touch few others
-  for (int64_t i = 0; i < size; ++i) {
-    first[i] = 0;
-    while (first[i] < i && a[size * i + first[i]] == 0) ++first[i];
-    for (int64_t j = first[i]; j <= i; ++j) {
-      double sum = a[size * i + j];
-      for (int64_t k = std::max(first[i], first[j]); k < j; ++k) sum -= a[size * i + k] * a[size * j + k];
-      a[size * i + j] = i == j ? std::sqrt(sum) : sum / a[size * j + j];
-    }
-  }
-}
-
-// b = factor^-T factor^-1 b
-void cholesky_solve(int64_t size, const double* a, double* b) {
-  for (int64_t i = 0; i < size; ++i) {
-    for (int64_t k = 0; k < i; ++k) b[i] -= a[size * i + k] * b[k];
-    b[i] /= a[size * i + i];
-  }
-  for (int64_t i = size - 1; i >= 0; --i) {
-    b[i] /= a[size * i + i];
-    for (int64_t k = 0; k < i; ++k) b[k] -= a[size * i + k] * b[i];
-  }
 }
 
 // x' A x of a matrix with the Cholesky factor.

@@ -1,6 +1,8 @@
 // The rigid correction of bodies that touch (contact/rigid.h), on the CPU.
 #pragma once
 
+#include <vector>
+
 #include "../contact/rigid_reverse.h"
 
 namespace diffvbd {
@@ -13,6 +15,10 @@ inline rigid::Vector vector_of(const double* a) { return {a[0], a[1], a[2]}; }
 template <class T>
 void rigid_system(const contact::RigidInputs<T>& in, bool again, double* center, double* motion, double* factor,
                   int32_t* groups);
+// The groups of a scene, by what presses its bodies; rows [4, bodies].
+template <class T>
+void find_groups(const contact::RigidInputs<T>& in, int64_t scene, const std::vector<contact::PairPress>& presses,
+                 int32_t* rows);
 // x [B, bodies, 6] = factor^-T factor^-1 x
 template <class T>
 void rigid_solve(const contact::RigidInputs<T>& in, const double* factor, double* x);

@@ -13,7 +13,7 @@ constexpr int kBlock = contact::kUnknowns;
 // Memory of a factorization, shared.
 struct Pivots {
   double inverse[kBlock];
-  uint8_t fills[contact::kMostCoupled];
+  uint8_t below[contact::kMostCoupled];  // blocks of a column that are not zero
 };
 
 // The lower half of the block that begins at a.
@@ -50,26 +50,29 @@ __device__ inline void factor_block(int64_t size, double* a, double* inverse) {
   }
 }
 
-// The factor of a matrix of `count` blocks a side, over its lower half.
+// The factor L of a matrix of `count` blocks a side, over its lower half, and L^-1 b over b. columns [count]: a bit for
+// each block of a column below the diagonal that is not zero, in the factor; or null, if none is.
 template <int threads>
-__device__ void factor_blocks(int32_t count, double* a, Pivots& pivots) {
+__device__ void factor_blocks(int32_t count, const uint64_t* columns, double* a, double* b, Pivots& pivots) {
+  static_assert(threads > contact::kMostCoupled);
   const int64_t size = int64_t{kBlock} * count;
   const auto thread = static_cast<int32_t>(threadIdx.x);
   for (int32_t k = 0; k < count; ++k) {
     const double* pivot = a + (size + 1) * kBlock * k;
-    if (thread == 0) factor_block(size, a + (size + 1) * kBlock * k, pivots.inverse);
-    for (int32_t i = k + 1 + thread; i < count; i += threads) pivots.fills[i] = 0;
+    const uint64_t column = columns ? columns[k] : ((uint64_t{1} << count) - 1) >> (k + 1) << (k + 1);
+    const int32_t left = __popcll(column);
+    if (thread == threads - 1) factor_block(size, a + (size + 1) * kBlock * k, pivots.inverse);
+    if (thread < contact::kMostCoupled && (column >> thread & 1)) {
+      pivots.below[__popcll(column & ((uint64_t{1} << thread) - 1))] = static_cast<uint8_t>(thread);
+    }
     __syncthreads();
-    for (auto i = static_cast<int32_t>(kBlock * (k + 1)) + thread; i < size; i += threads) {
-      double* row = a + size * i + kBlock * k;
+    for (int32_t item = thread; item <= kBlock * left; item += threads) {
+      double* row = item == kBlock * left  // the right side is like one more row
+                        ? b + kBlock * k
+                        : a + size * (kBlock * pivots.below[item / kBlock] + item % kBlock) + kBlock * k;
       double x[kBlock];
-      bool any = false;
 #pragma unroll
-      for (int c = 0; c < kBlock; ++c) {
-        x[c] = row[c];
-        any = any || x[c] != 0;
-      }
-      if (!any) continue;  // bodies touch few others
+      for (int c = 0; c < kBlock; ++c) x[c] = row[c];
 #pragma unroll
       for (int c = 0; c < kBlock; ++c) {
         x[c] *= pivots.inverse[c];
@@ -77,25 +80,32 @@ __device__ void factor_blocks(int32_t count, double* a, Pivots& pivots) {
         for (int d = c + 1; d < kBlock; ++d) x[d] -= x[c] * pivot[size * d + c];
         row[c] = x[c];
       }
-      pivots.fills[i / kBlock] = 1;
     }
     __syncthreads();
-    const int32_t left = count - k - 1;
-    for (int32_t item = thread; item < kBlock * left * left; item += threads) {
-      const int32_t i = kBlock * (k + 1) + item / left, column = k + 1 + item % left;
-      if (column > i / kBlock || !pivots.fills[column] || !pivots.fills[i / kBlock]) continue;
+    for (int32_t item = thread; item < kBlock * left * (left + 1); item += threads) {
+      const int32_t r = item / (left + 1) / kBlock, c = item % (left + 1);
+      if (r < c && c < left) continue;
+      const int32_t i = kBlock * pivots.below[r] + item / (left + 1) % kBlock;
       const double* row = a + size * i + kBlock * k;
       double x[kBlock];
 #pragma unroll
-      for (int c = 0; c < kBlock; ++c) x[c] = row[c];
-      const double* other = a + size * kBlock * column + kBlock * k;
-      double* to = a + size * i + kBlock * column;
+      for (int e = 0; e < kBlock; ++e) x[e] = row[e];
+      if (c == left) {
+        double sum = b[i];
 #pragma unroll
-      for (int j = 0; j < kBlock; ++j) {
-        double sum = to[j];
+        for (int e = 0; e < kBlock; ++e) sum -= x[e] * b[kBlock * k + e];
+        b[i] = sum;
+        continue;
+      }
+      const int32_t j = kBlock * pivots.below[c];
+      const double* other = a + size * j + kBlock * k;
+      double* to = a + size * i + j;
 #pragma unroll
-        for (int c = 0; c < kBlock; ++c) sum -= x[c] * other[size * j + c];
-        to[j] = sum;
+      for (int n = 0; n < kBlock; ++n) {
+        double sum = to[n];
+#pragma unroll
+        for (int e = 0; e < kBlock; ++e) sum -= x[e] * other[size * n + e];
+        to[n] = sum;
       }
     }
     __syncthreads();
@@ -123,9 +133,9 @@ __device__ void solve_block(int64_t size, const double* a, double* b) {
   for (int i = 0; i < kBlock; ++i) b[i] = x[i];
 }
 
-// The solution of a system with such a factor, over its right side b.
+// L^-1 b over b, with such a factor L; then L^-T b.
 template <int threads>
-__device__ void solve_blocks(int32_t count, const double* a, double* b) {
+__device__ void solve_forward(int32_t count, const double* a, double* b) {
   const int64_t size = int64_t{kBlock} * count;
   const auto thread = static_cast<int32_t>(threadIdx.x);
   for (int32_t k = 0; k < count; ++k) {
@@ -140,6 +150,11 @@ __device__ void solve_blocks(int32_t count, const double* a, double* b) {
     }
     __syncthreads();
   }
+}
+template <int threads>
+__device__ void solve_backward(int32_t count, const double* a, double* b) {
+  const int64_t size = int64_t{kBlock} * count;
+  const auto thread = static_cast<int32_t>(threadIdx.x);
   for (int32_t k = count - 1; k >= 0; --k) {
     const double* own = b + kBlock * k;
     if (thread == 0) solve_block<true>(size, a + (size + 1) * kBlock * k, b + kBlock * k);

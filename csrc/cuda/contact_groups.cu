@@ -106,7 +106,9 @@ __global__ void __launch_bounds__(kThreads)
   };
   for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads) own[i] = at(i);
   __syncthreads();
-  solve_blocks<kThreads>(count, factor + in.matrix_size() * scene + groups.matrix(first), own);
+  const double* own_factor = factor + in.matrix_size() * scene + groups.matrix(first);
+  solve_forward<kThreads>(count, own_factor, own);
+  solve_backward<kThreads>(count, own_factor, own);
   for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads) at(i) = own[i];
 }
 

@@ -1,4 +1,5 @@
 // The rigid correction of bodies that touch: what pairs press, which bodies are solved for together, and their motions.
+#include "../contact/rigid_rub.h"
 #include "contact_rigid.cuh"
 
 namespace diffvbd::cuda {
@@ -26,7 +27,7 @@ __global__ void __launch_bounds__(kOne)
 // Whether a scene may have groups of more than kFew bodies.
 template <class T>
 bool has_many(const RigidInputs<T>& in) {
-  return (in.together() ? in.bodies() : most_grouped(in.bodies())) > kFew;
+  return most_grouped(in.bodies()) > kFew;
 }
 
 }  // namespace
@@ -39,7 +40,7 @@ int64_t rigid_system_bytes(const RigidInputs<T>& in, const PairRoom& room) {
   if (!in.together()) bytes += aligned(groups_bytes(scenes, in.bodies()));
   if (has_many(in)) {
     bytes += aligned(scenes * in.matrix_size() * sizeof(double)) + aligned(2 * rows * sizeof(int32_t)) +
-             aligned(sizeof(int32_t));
+             aligned(sizeof(int32_t)) + aligned(room.lagged * kRubbing * sizeof(double));
   }
   return bytes;
 }
@@ -64,14 +65,13 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, bool ag
     void* work = take(groups_bytes(scenes, in.bodies()));
     if (auto error = find_groups(in, room, memory.sides, groups, work, stream)) return error;
   }
-  if (!in.together() || !has_many(in)) {
-    if (auto error = solve_few(in, room, memory, again, center, motion, factor, stream)) return error;
-  }
+  if (auto error = solve_few(in, room, memory, again, center, motion, factor, stream)) return error;
   if (!has_many(in) || again) return cudaGetLastError();
   memory.bases = static_cast<double*>(take(scenes * in.matrix_size() * sizeof(double)));
   memory.rows = static_cast<int32_t*>(take(2 * rows * sizeof(int32_t)));
   memory.taken = static_cast<int32_t*>(take(sizeof(int32_t)));
-  return solve_groups_of_many(in, room, memory, center, motion, factor, stream);
+  memory.rubbing = static_cast<double*>(take(room.lagged * kRubbing * sizeof(double)));
+  return solve_groups_of_many(in, room, memory, groups, center, motion, factor, stream);
 }
 
 #define DIFFVBD_INSTANTIATE(T)                                                                                  \

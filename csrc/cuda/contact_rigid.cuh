@@ -9,7 +9,6 @@ namespace diffvbd::cuda {
 using namespace contact;
 using rigid::Body;
 
-constexpr int kFew = 3;             // bodies of a group up to which all threads work on one after the other
 constexpr int kGroupThreads = 256;  // of a block that has a group of more
 constexpr int kOne = 128;           // threads of a block where each has an item of its own
 
@@ -20,11 +19,13 @@ __device__ __forceinline__ Vector vector_of(const double* a) { return {a[0], a[1
 // Bytes of a part of a workspace, rounded up to what any type needs.
 constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
 
+constexpr int kRubbing = 12;  // scalars of a Rubbing, and the slip
 // Memory of a correction. sides and press [rows]: what pairs press, the listed first: bodies, -1 where nothing moves,
 // and the rest.
 struct GroupMemory {
   int32_t* sides;         // [rows, 2]
   double *press, *steps;  // [rows, kPressDoubles], [B, bodies, 6]
+  double* rubbing;        // [lagged, kRubbing]
   double* bases;          // as the factors
   int32_t *rows, *taken;  // [2 rows], one number
 };
@@ -40,13 +41,15 @@ __device__ __forceinline__ int side_of(const PairList& list, const int32_t* bodi
   return side == 0 || corner == sides(list.pairs[kPairRow * pair + 4]) ? side : -1;
 }
 
-// Motions of bodies and factors of groups, where these have up to kFew bodies, or more. again: as of rigid_system().
+// Motions of bodies and factors of groups, where these have up to kFew bodies, or more: then they are ordered, too.
+// again: as of rigid_system().
 template <class T>
 cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, bool again,
                       double* center, double* motion, double* factors, cudaStream_t stream);
 template <class T>
 cudaError_t solve_groups_of_many(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory,
-                                 double* center, double* motion, double* factors, cudaStream_t stream);
+                                 int32_t* ordered, double* center, double* motion, double* factors,
+                                 cudaStream_t stream);
 
 // The groups of scenes of many bodies [B, 4, bodies], by sides as of GroupMemory; and x = factor^-T factor^-1 x.
 int64_t groups_bytes(int64_t scenes, int64_t bodies);

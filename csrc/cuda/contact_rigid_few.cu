@@ -234,31 +234,23 @@ struct System {
     });
     return lines;
   }
-  // How far the slopes of all that slips are above what the step takes them for, after each of n shares of it.
-  template <int n>
-  __device__ void excess(const Rubs<T>& rubs, int lines, const double* shares, double* total) const {
-#pragma unroll
-    for (int k = 0; k < n; ++k) total[k] = 0;
-    const auto add = [&](const SlipLine& line) {
-#pragma unroll
-      for (int k = 0; k < n; ++k) total[k] += line.excess(shares[k]);
-    };
-    for (int l = 0; l < lines && l < kSlots; ++l) {
-      const auto at = [&](int i) { return slots[l][i][threadIdx.x]; };
-      add({{at(0), at(1), at(2)}, {at(3), at(4), at(5)}, at(6), in.friction_eps});
-    }
-    if (lines > kSlots) {
-      int seen = 0;
-      each_line(rubs, [&](const SlipLine& line) {
-        if (seen++ >= kSlots) add(line);
-      });
-    }
-    team.template reduce<n>(total);
-  }
   __device__ double share(const Rubs<T>& rubs, double fall) const {
     const int lines = keep_lines(rubs);
-    return share_of_step(fall, [&](auto number, const double* shares, double* total) {
-      excess<decltype(number)::value>(rubs, lines, shares, total);
+    return slip_share(fall, [&](double tried) {
+      double total[1] = {0};
+      for (int l = 0; l < lines && l < kSlots; ++l) {
+        const auto at = [&](int i) { return slots[l][i][threadIdx.x]; };
+        const SlipLine line({at(0), at(1), at(2)}, {at(3), at(4), at(5)}, at(6), in.friction_eps);
+        total[0] += line.excess(tried);
+      }
+      if (lines > kSlots) {
+        int seen = 0;
+        each_line(rubs, [&](const SlipLine& line) {
+          if (seen++ >= kSlots) total[0] += line.excess(tried);
+        });
+      }
+      team.template reduce<1>(total);
+      return total[0];
     });
   }
 
@@ -275,8 +267,8 @@ struct System {
         });
         team.meet();
       }
-      factor_blocks<kThreads>(count, matrix, pivots);
-      solve_blocks<kThreads>(count, matrix, step);
+      factor_blocks<kThreads>(count, nullptr, matrix, step, pivots);
+      solve_backward<kThreads>(count, matrix, step);
       team.each(count, [&](int32_t b) { keep_finite(step + kUnknowns * b); });
       team.meet();
       team.each(size(), [&](int32_t i) { unknown(steps, i) = step[i]; });

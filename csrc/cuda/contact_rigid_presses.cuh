@@ -2,8 +2,6 @@
 // and how Newton's method goes on.
 #pragma once
 
-#include <type_traits>
-
 #include "../contact/rigid_slip.h"
 #include "contact_rigid.cuh"
 
@@ -40,38 +38,6 @@ struct Rubs {
     return a;
   }
 };
-
-// As slip_share(), which halves an interval time after time: all shares that kLevels halvings may come to at once.
-// excess(n, shares, total), n an integral constant: how far the slopes of all that slips are above what the step takes
-// them for, after each of n shares of it; the same for all threads.
-constexpr int kLevels = 4, kShares = (1 << kLevels) - 1;
-template <class Excess>
-__device__ double share_of_step(double fall, const Excess& excess) {
-  double shares[kShares], over[kShares];
-  shares[0] = 1;
-  excess(std::integral_constant<int, 1>{}, shares, over);
-  if (!(kOvershoot * fall < over[0])) return 1;
-  double low = 0, high = 1;
-  for (int halvings = 0; halvings < kHalvings; halvings += kLevels) {
-    for (int k = 0; k < kShares; ++k) shares[k] = low + (high - low) * (k + 1) / (kShares + 1);
-    excess(std::integral_constant<int, kShares>{}, shares, over);
-    int at = 0, width = kShares + 1;
-    for (int level = 0; level < kLevels && halvings + level < kHalvings; ++level) {
-      width /= 2;
-      double middle = 0, above = 0;
-#pragma unroll
-      for (int k = 0; k < kShares; ++k) {
-        if (k + 1 == at + width) middle = shares[k], above = over[k];
-      }
-      if (above < fall * (1 - middle)) {
-        low = middle, at += width;
-      } else {
-        high = middle;
-      }
-    }
-  }
-  return high;
-}
 
 // Where Newton's method is with a system: on its way, at the motion it has settled at but not with the matrix there,
 // and done.

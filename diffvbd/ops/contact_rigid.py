@@ -15,7 +15,8 @@ from .rigid import join_data, scalars_of_data
 
 UNKNOWNS = 6  # of a body: a turn and a shift
 # Twins of the constants in csrc/contact/groups.h
-MOST_COUPLED = 64  # bodies that are solved for together: all of a scene, or a group that touches,
+FEW = 3  # bodies of scenes that are one group
+MOST_COUPLED = 64  # bodies of a group,
 GROUP_MEMORY = 32 << 10  # of which there are at most so many over the bodies of the scene
 _FIELDS = len(TouchingFields._fields)
 
@@ -23,9 +24,9 @@ _FIELDS = len(TouchingFields._fields)
 def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float,
                  again: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """The turn and the shift of each body to where the step's potential is least, float64: centers of mass
-    [B, bodies, 3] [m], motion [B, bodies, 6], Cholesky factor [B, 6 bodies, 6 bodies], and groups: empty. Of more than
-    MOST_COUPLED bodies: factors of groups that touch [B, bodies, 6, 6 most_grouped()], and groups int32 [B, 4, bodies],
-    as csrc/contact/groups.h has them. friction_eps: [m], 0 without friction. again: only bodies move that are left
+    [B, bodies, 3] [m], motion [B, bodies, 6], Cholesky factors of groups that touch [B, bodies, 6, 6 most_grouped()],
+    and groups int32 [B, 4, bodies], as csrc/contact/groups.h has them. Of no more than FEW bodies: one factor
+    [B, 6 bodies, 6 bodies], and no groups. friction_eps: [m], 0 without friction. again: only bodies move that are left
     alone, because those that touch are too many."""
     return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps, again)
 
@@ -39,7 +40,7 @@ def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_cou
 
 def most_grouped(bodies: int) -> int:
     """Bodies of a group at most."""
-    return min(max(GROUP_MEMORY // bodies, 1), MOST_COUPLED)
+    return min(max(GROUP_MEMORY // max(bodies, 1), 1), MOST_COUPLED, bodies)
 
 
 def rigid_backward(fields: TouchingFields, p: Tensor, q: Tensor, groups: Tensor, data_count: Sequence[int],
@@ -96,7 +97,7 @@ def rigid_vertices_backward(fields: TouchingFields, motion: Tensor, solution: Te
 def _(*arguments):
     f = TouchingFields(*arguments[:_FIELDS])
     b, n = f.x.shape[0], f.free.shape[0]
-    together = n <= MOST_COUPLED
+    together = n <= FEW
     shape = (b, UNKNOWNS * n, UNKNOWNS * n) if together else (b, n, UNKNOWNS, UNKNOWNS * most_grouped(n))
     doubles = (f.x.new_empty(size, dtype=torch.float64) for size in ((b, n, 3), (b, n, UNKNOWNS), shape))
     return (*doubles, f.x.new_empty((0,) if together else (b, 4, n), dtype=torch.int32))

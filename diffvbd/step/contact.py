@@ -22,7 +22,7 @@ from ..energies import damped_share
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
-from ..ops.contact_rigid import MOST_COUPLED
+from ..ops.contact_rigid import most_grouped
 from ..ops.motion import RoomsOfBodies
 from ..scopes import checking, not_compiled, recorders
 from ..tuples import replaced
@@ -246,7 +246,8 @@ class ContactStep:
         alone. Coarse sweeps leave a stiff body turned, and one Newton step leaves so much of that that a free body
         gained spin. Bodies left alone take several at the end to bear what lies on others."""
         least = 1 if self.prepared.coarse is None else 2
-        leaves = last and self.barrier is not None and self.model.mesh.num_bodies > MOST_COUPLED
+        bodies = self.model.mesh.num_bodies
+        leaves = last and self.barrier is not None and bodies > most_grouped(bodies)
         return [k >= least for k in range(max(least, LEFT_CORRECTIONS) if leaves else least)]
 
     def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs, again: bool = False

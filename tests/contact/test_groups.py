@@ -1,4 +1,4 @@
-"""Claim: in a scene of more than 64 bodies, those that touch are corrected together, as in a scene of few.
+"""Claim: bodies that touch are corrected together, however many others a scene has.
 
 Groups of more than MOST_COUPLED bodies are not: each of their bodies is left alone, and corrected again.
 """
@@ -13,12 +13,14 @@ from torch import Tensor
 import diffvbd as dv
 from diffvbd import mesh, ops
 from diffvbd.ops import contact_rigid
-from diffvbd.ops.contact_rigid import MOST_COUPLED
+from diffvbd.ops.contact_rigid import FEW, MOST_COUPLED
 from diffvbd.step.rigid_terms import Scenes
 from diffvbd.testing import relative_error, tolerance
 
 contact_step = importlib.import_module("diffvbd.step.contact")
 LOW, HALF_GAP, SPEED = -5e-4, 2.5e-4, 1e-3
+ENERGIES = (dv.StableNeoHookean(), dv.FloorBarrier(LOW, kappa=1e4, dhat=1e-3),
+            dv.PairBarrier(1e4, 1e-3, self_contact=False), dv.Friction(0.5, SPEED))  # fmt: skip
 
 
 def stacks(heights: list[int], device: str) -> dv.Model:
@@ -28,9 +30,16 @@ def stacks(heights: list[int], device: str) -> dv.Model:
     step = 0.1 + 2 * HALF_GAP
     tets = mesh.join([cube.translate((0.3 * n + 0.003 * (k % 2), step * k, 0.002 * (k % 3)))
                       for n, high in enumerate(heights) for k in range(high)])  # fmt: skip
-    floor = dv.FloorBarrier(LOW, kappa=1e4, dhat=1e-3)
-    energies = (dv.StableNeoHookean(), floor, dv.PairBarrier(1e4, 1e-3, self_contact=False), dv.Friction(0.5, SPEED))
-    return dv.Model(tets, energies=energies, device=device)
+    return dv.Model(tets, energies=ENERGIES, device=device)
+
+
+def wall(wide: int, high: int, device: str) -> dv.Model:
+    """Cubes of which each second row is shifted, and stands on two."""
+    cube = mesh.cube(2, size=0.1)
+    cube = cube.translate((0.0, -float(cube.points[:, 1].min()), 0.0))
+    tets = mesh.join([cube.translate((0.102 * i + 0.02 * (k % 2), (0.1 + 2 * HALF_GAP) * k, 0.0))
+                      for i in range(wide) for k in range(high)])  # fmt: skip
+    return dv.Model(tets, energies=ENERGIES, device=device)
 
 
 def run(model: dv.Model, steps: int, sweeps: int, **options: Any) -> tuple[Tensor, Tensor]:
@@ -65,16 +74,26 @@ def test_groups_are_those_that_touch(device: str, monkeypatch: pytest.MonkeyPatc
         expected += [own] if high <= MOST_COUPLED else [[body] for body in own]
         bodies += high
     places = count.nonzero()[:, 0].tolist()
-    assert [member[p : p + abs(int(count[p]))].tolist() for p in places] == expected
+    found = [member[p : p + abs(int(count[p]))].tolist() for p in places]
+    assert [sorted(group) for group in found] == expected
     left = {body for body in range(bodies) if int(count[first[body]]) == -1}
     assert left == set(range(2 + MOST_COUPLED + 1, bodies - 3))
     for place, group in zip(places, expected, strict=True):
         assert first[group].tolist() == [place] * len(group)
-        assert rank[group].tolist() == list(range(len(group)))
+        assert member[[place + int(rank[body]) for body in group]].tolist() == group
+
+
+def test_the_order_of_elimination_is_the_same_on_all_devices(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a wall, in which bodies touch several others."""
+    found = [groups_of(wall(7, 6, where), monkeypatch) for where in ("cpu", device)]
+    assert torch.equal(*found)
+    assert int(found[0][0, 3].max()) > FEW
+    assert not torch.equal(found[0][0, 0], torch.arange(42))
 
 
 def test_scenes_of_few_are_one_group(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert groups_of(stacks([2, 1], device), monkeypatch).numel() == 0
+    assert groups_of(stacks([1] * FEW, device), monkeypatch).numel() == 0
+    assert groups_of(stacks([1] * (FEW + 1), device), monkeypatch).shape == (1, 4, FEW + 1)
 
 
 def test_a_group_moves_and_is_differentiated_as_alone(device: str) -> None:

@@ -72,7 +72,7 @@ def parts_of(s: Scenes, listed: Pairs, moved: Tensor) -> list[tuple[Tensor, Tens
     groups = groups_of(s)
     apart = moves.all(1) & torch.tensor(groups.numel() > 0)
     if groups.numel():
-        assert count > contact_rigid.MOST_COUPLED
+        assert count > contact_rigid.FEW
         first = groups[listed.pairs[:, 5:].long(), 1, lead.clamp(max=count - 1)]
         apart = apart & (first[:, 0] != first[:, 1])
     first = (torch.arange(4) < sides)[..., None]
