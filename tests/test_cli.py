@@ -290,6 +290,10 @@ def test_coarse_corrections_are_part_of_the_scene(mesh_file: Path, tmp_path: Pat
         ends[name] = found.x[-1]
     apart = np.abs(ends["coarse"] - ends["plain"]).max()
     assert apart > 0.05 * np.abs(ends["plain"] - found.x[0]).max()
+    out = ["--iterations", 1, "--out", tmp_path / "run"]
+    assert run("identify", mesh_file, tmp_path / "plain.npz", "--coarse", *out) in (0, 1)
+    for given in (True, np.bool_(True), 1, 1.0):
+        assert Observation.load(tmp_path / "plain.npz", dv.mesh.load(mesh_file), coarse=given).scene.coarse
 
 
 def test_identify_starts_from_young_and_poisson(mesh_file: Path, tmp_path: Path, capsys) -> None:
