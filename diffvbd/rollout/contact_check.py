@@ -86,6 +86,7 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
         faster = ', coarse="auto"' if model.coarse is None else ""
         faster += ", acceleration=dv.Anderson(5)" if model.acceleration is None else ""
         warn(
-            f"friction: {100 * left:.2g} % of it is not balanced in the last step: the sweeps have not converged; take "
-            f"more sweeps, a smaller time_step{faster} or a larger Friction(velocity=) (documentation: Contact in detail)",
+            f"friction: {100 * left:.2g} % of it is not balanced in the last step: the sweeps have not converged, and "
+            f"the motion may be far off; take more sweeps, a smaller time_step{faster} or a larger Friction(velocity=) "
+            "(documentation: Contact in detail)",
         )
