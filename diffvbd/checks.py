@@ -156,7 +156,7 @@ def vertex_mask(given: Any, num_vertices: int, name: str = "pinned") -> Tensor:
 
 
 def name_value(name: str, expected: str, value: Tensor, good: Tensor, axes: tuple[str, ...] = ()) -> None:
-    """Raises ValueError for the first value that is not good or not finite. axes: what the dimensions count, if known."""
+    """Raises ValueError for the first value that is not good or not finite. axes: what its dimensions count."""
     good = good & torch.isfinite(value)
     if not bool(good.all()):
         at = (~good).nonzero()[0].tolist()

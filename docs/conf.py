@@ -95,7 +95,7 @@ def read_docstring(app: object, what: str, name: str, obj: object, options: obje
 
 def text_of(part: str) -> str:
     """Bars are norms and no substitutions; pages become links."""
-    return re.sub(r"\bdocs/(\w+)\.md", r":doc:`docs/\1.md </\1>`", part.replace("|", r"\|"))
+    return re.sub(r"\bdocs/(\w+)\.md", r":doc:`\1 </\1>`", part.replace("|", r"\|"))
 
 
 def skip(app: object, what: str, name: str, obj: object, is_skipped: bool, options: object) -> bool | None:
