@@ -120,6 +120,12 @@ def test_another_time_step_keeps_the_times_of_the_observations(mesh_file: Path, 
     assert both.steps.tolist() == [0, 1, 2, 3]
 
 
+def test_without_a_command_the_help_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run() == 2
+    told = capsys.readouterr().out
+    assert "identify  recover mu and lam" in told and "examples:" in told
+
+
 def test_identify_from_one_final_shape(mesh_file: Path, tmp_path: Path) -> None:
     target = tmp_path / "target.npz"
     assert run("simulate", mesh_file, "--out", tmp_path / "a.pvd", *SCENE, "--mu", 4e4, "--save-target", target) == 0
@@ -345,7 +351,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_wrong_usage_has_status_2() -> None:
-    for arguments in ([], ["run", "nothing"], ["simulate", "part.msh"]):
+    for arguments in (["run", "nothing"], ["simulate", "part.msh"]):
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 2
