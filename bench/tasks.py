@@ -77,10 +77,11 @@ def picture_of(name: str, images: Path) -> Path:
 INTRODUCTION = """\
 # Inverse problems
 
-`diffvbd run NAME` runs one (after `make`: `. .venv/bin/activate` first); its pictures need matplotlib. Each is a short
-module in `diffvbd/tasks/`, written on the public interface alone, and its docstring, repeated here, states the
-protocol. Figures in the tables come from the logs in `bench/results/tasks`, which `python -m bench tasks` writes and
-`python -m bench report` turns into this page; those of the paper stand in `bench/paper.py`.
+`diffvbd run NAME` runs one (in a checkout `. .venv/bin/activate` first); its pictures need matplotlib, which the extra
+`[viz]` brings. Each is a short module in `diffvbd/tasks/`, written on the public interface alone, and its docstring,
+repeated here, states the protocol. Figures in the tables come from the logs in `bench/results/tasks` of the repository,
+which `python -m bench tasks` writes and `python -m bench report` turns into this page; those of the paper stand in
+`bench/paper.py`.
 
 Older than contact by planes are the logs of capes, flag, dress-size, cover-the-spot, and those of dresses on the GPU.
 Throw's on the GPU was measured beside three other runs, which made it some six times as long.

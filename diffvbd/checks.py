@@ -155,10 +155,11 @@ def vertex_mask(given: Any, num_vertices: int, name: str = "pinned") -> Tensor:
     return torch.zeros(num_vertices, dtype=torch.bool, device="cpu").index_fill(0, index, True)
 
 
-def name_value(name: str, expected: str, value: Tensor, good: Tensor) -> None:
-    """Raises ValueError for the first value that is not good or not finite."""
+def name_value(name: str, expected: str, value: Tensor, good: Tensor, axes: tuple[str, ...] = ()) -> None:
+    """Raises ValueError for the first value that is not good or not finite. axes: what its dimensions count."""
     good = good & torch.isfinite(value)
     if not bool(good.all()):
-        where = (~good).nonzero()[0].tolist()
-        got = float(value.detach()[tuple(where)])  # of a tensor that requires grad float() warns
+        at = (~good).nonzero()[0].tolist()
+        got = float(value.detach()[tuple(at)])  # of a tensor that requires grad float() warns
+        where = " of ".join(f"{axis} {k}" for axis, k in zip(axes[::-1], at[::-1], strict=True)) if axes else at
         raise ValueError(f"{name}: expected {expected}, got {got:g} at {where}")

@@ -80,7 +80,8 @@ def _one_line(message: Warning | str, *where: Any, **line: Any) -> str:
 def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("diffvbd", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=raw)
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    parser.set_defaults(command=lambda options: parser.print_help() or 2)  # where no command is given
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
 
     run = commands.add_parser("run", help="run one of the shipped inverse problems", description=_task_list())
     run.formatter_class = raw

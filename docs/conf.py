@@ -84,11 +84,18 @@ def downloadable(name: str, text: str) -> str:
     return json.dumps(notebook)
 
 
-def escape(app: object, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
-    """Bars in docstrings are norms and no substitutions."""
+def read_docstring(app: object, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """What docstrings write for readers of the text: norms, files of this folder, attributes that share a line."""
     for i, line in enumerate(lines):
+        # of "x, v" Sphinx would take x for the type of v
+        line = re.sub(r"^:ivar (\w+(?:, \w+)+):", lambda m: f":ivar {m[1].replace(' ', '')}:", line)
         outside = re.split(r"(``.*?``|`[^`]*`)", line)
-        lines[i] = "".join(part if k % 2 else part.replace("|", r"\|") for k, part in enumerate(outside))
+        lines[i] = "".join(part if k % 2 else text_of(part) for k, part in enumerate(outside))
+
+
+def text_of(part: str) -> str:
+    """Bars are norms and no substitutions; pages become links."""
+    return re.sub(r"\bdocs/(\w+)\.md", r":doc:`\1 </\1>`", part.replace("|", r"\|"))
 
 
 def skip(app: object, what: str, name: str, obj: object, is_skipped: bool, options: object) -> bool | None:
@@ -98,5 +105,5 @@ def skip(app: object, what: str, name: str, obj: object, is_skipped: bool, optio
 
 def setup(app: Any) -> None:
     app.connect("source-read", adapt)
-    app.connect("autodoc-process-docstring", escape)
+    app.connect("autodoc-process-docstring", read_docstring)
     app.connect("autodoc-skip-member", skip)

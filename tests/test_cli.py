@@ -120,6 +120,12 @@ def test_another_time_step_keeps_the_times_of_the_observations(mesh_file: Path, 
     assert both.steps.tolist() == [0, 1, 2, 3]
 
 
+def test_without_a_command_the_help_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run() == 2
+    told = capsys.readouterr().out
+    assert "identify  recover mu and lam" in told and "examples:" in told
+
+
 def test_identify_from_one_final_shape(mesh_file: Path, tmp_path: Path) -> None:
     target = tmp_path / "target.npz"
     assert run("simulate", mesh_file, "--out", tmp_path / "a.pvd", *SCENE, "--mu", 4e4, "--save-target", target) == 0
@@ -290,6 +296,10 @@ def test_coarse_corrections_are_part_of_the_scene(mesh_file: Path, tmp_path: Pat
         ends[name] = found.x[-1]
     apart = np.abs(ends["coarse"] - ends["plain"]).max()
     assert apart > 0.05 * np.abs(ends["plain"] - found.x[0]).max()
+    out = ["--iterations", 1, "--out", tmp_path / "run"]
+    assert run("identify", mesh_file, tmp_path / "plain.npz", "--coarse", *out) in (0, 1)
+    for given in (True, np.bool_(True), 1, 1.0):
+        assert Observation.load(tmp_path / "plain.npz", dv.mesh.load(mesh_file), coarse=given).scene.coarse
 
 
 def test_identify_starts_from_young_and_poisson(mesh_file: Path, tmp_path: Path, capsys) -> None:
@@ -341,7 +351,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_wrong_usage_has_status_2() -> None:
-    for arguments in ([], ["run", "nothing"], ["simulate", "part.msh"]):
+    for arguments in (["run", "nothing"], ["simulate", "part.msh"]):
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 2

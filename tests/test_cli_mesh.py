@@ -54,7 +54,10 @@ def test_what_is_left_out_of_a_large_scan_is_said(
     pytest.importorskip("trimesh", reason="needs the extra [mesh]")
     monkeypatch.setattr(dm, "tetrahedralize", lambda surface, edge, epsilon, most: dm.cube(3))
     assert run("mesh", scan, "--scale", 0.01, "--max-triangles", 20, "-o", scan.with_name("part.vtu")) == 0
-    assert "decimated to 20 triangles; --max-triangles keeps more" in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert "decimated to 20 triangles; --max-triangles keeps more" in told.out and not told.err
+    assert run("mesh", scan, "-o", scan.with_name("large.vtu")) == 0
+    assert "for a file in mm give --scale 0.001" in capsys.readouterr().err
 
 
 def test_quality_is_shown() -> None:

@@ -77,6 +77,13 @@ def test_quotes_stand_in_the_sources(page: Path) -> None:
 
 
 @pages
+def test_no_line_is_a_comment(page: Path) -> None:
+    """A line that begins with a per cent sign is one to MyST, and would be missing on the site."""
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    assert not re.findall(r"^ *%.*", text, re.MULTILINE)
+
+
+@pages
 def test_links_lead_somewhere(page: Path) -> None:
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     for target in re.findall(r"\]\(([^)\s]+)\)", text):

@@ -104,7 +104,8 @@ def _tets_of(path: Path, orient: bool) -> tuple[meshio.Mesh, TetMesh, IntArray, 
     found = [content.cells[k].data[:, :4] for k in blocks]
     if sum(map(len, found)) == 0:
         others = ", ".join(sorted({cells.type for cells in content.cells})) or "no cells at all"
-        raise ValueError(f"mesh file {path} has no tets (it has {others})")
+        fill = ": a surface is filled by `diffvbd mesh` or dv.mesh.tetrahedralize" if "triangle" in others else ""
+        raise ValueError(f"mesh file {path} has no tets (it has {others}){fill}")
     try:
         mesh, vertices = _mesh_of_used_vertices(content, np.concatenate(found), blocks, orient)
     except (TypeError, ValueError) as failure:

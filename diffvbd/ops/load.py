@@ -60,13 +60,14 @@ def require_cuda() -> None:
         return
     if not torch.version.cuda:
         raise RuntimeError(
-            f"diffvbd: torch {torch.__version__} has no CUDA: install a CUDA build of torch, then run `{_COMMAND}`"
+            f"diffvbd: torch {torch.__version__} has no CUDA: install a CUDA build of torch, then set DIFFVBD_JIT=1 "
+            f"(takes nvcc), or run `{_COMMAND}` in a checkout"
         )
     if os.environ.get("DIFFVBD_JIT", "0") not in ("", "0"):
         _load_cuda(jit_build())
         return
     state = f"has a CUDA object that does not load ({_why_not})" if _why_not else "was built without CUDA"
-    raise RuntimeError(f"diffvbd {state}: run `{_COMMAND}` in its sources where nvcc is, or set DIFFVBD_JIT=1")
+    raise RuntimeError(f"diffvbd {state}: set DIFFVBD_JIT=1 where nvcc is, or run `{_COMMAND}` in a checkout there")
 
 
 def jit_build() -> Path:

@@ -80,12 +80,13 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
             f"pair_barrier: pairs held up {100 * cut:.2g} % of the vertices in step {shares.index(cut)}, which lost "
             f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
             f"{100 * CUT:.2g} %); take a smaller time_step, more detections or a larger reach of the PairBarrier "
-            "(docs/contact.md)",
+            "(documentation: Contact in detail)",
         )
     if left > UNBALANCED_FRICTION:
         faster = ', coarse="auto"' if model.coarse is None else ""
         faster += ", acceleration=dv.Anderson(5)" if model.acceleration is None else ""
         warn(
-            f"friction: {100 * left:.2g} % of it is not balanced in the last step: the sweeps have not converged; take "
-            f"more sweeps, a smaller time_step{faster} or a larger Friction(velocity=) (docs/contact.md)",
+            f"friction: {100 * left:.2g} % of it is not balanced in the last step: the sweeps have not converged, and "
+            f"the motion may be far off; take more sweeps, a smaller time_step{faster} or a larger Friction(velocity=) "
+            "(documentation: Contact in detail)",
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -78,6 +79,11 @@ class Pilots:
         for name, value in {**self.given, **named}.items():
             if isinstance(value, PerStep):
                 fail(name, "a value or a function of the time [s], since time steps vary", "per_step")
+            if of_time(value) and not _takes(value, 1):
+                raise TypeError(
+                    f"{name}: expected a function of the time [s] alone, since time steps vary, got one of other "
+                    "arguments, such as a rollout takes: lambda t: ... can replace one of the step, not of the state"
+                )
 
     # --- running ------------------------------------------------------------------------------------------------------
 
@@ -292,6 +298,8 @@ def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Te
         fail("gradient", "False inside torch.inference_mode(), which records nothing", "True")
     if quantity is not None and not callable(quantity):
         raise TypeError(f"quantity: expected a function of x and v, got {type(quantity).__name__}")
+    if quantity is not None and not _takes(quantity, 2):
+        raise TypeError("quantity: expected a function of x and v, the last of a motion, got one of other arguments")
     if x.numel() == 0:
         fail("x", "a scene with a vertex, whose motion can be judged", f"shape {list(x.shape)}")
     x, v = x.detach(), v.detach()
@@ -307,6 +315,17 @@ def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Te
 
 def of_time(value: Any) -> bool:
     return callable(value) and not isinstance(value, Tensor)
+
+
+def _takes(function: Callable[..., Any], count: int) -> bool:
+    """Whether a function can be called with so many arguments; True where Python does not know."""
+    try:
+        inspect.signature(function).bind(*range(count))
+    except TypeError:
+        return False
+    except ValueError:
+        pass
+    return True
 
 
 def changes(given: dict[str, Any]) -> bool:

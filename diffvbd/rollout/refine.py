@@ -36,17 +36,25 @@ class Refinement:
 
     @property
     def survives(self) -> bool:
+        return all(map(self._keeps, (self.more_sweeps, self.smaller_steps, self.both)))
+
+    def _keeps(self, finer: float) -> bool:
+        """Whether a loss with finer settings has lost no more than may be."""
         scale = abs(self.loss) if self.before is None else self.before - self.loss
-        finer = (self.more_sweeps, self.smaller_steps, self.both)
-        lost = [value - self.loss if self.before is not None else abs(value - self.loss) for value in finer]
-        return all(math.isfinite(value) and value <= self.tolerance * scale for value in lost)
+        lost = finer - self.loss if self.before is not None else abs(finer - self.loss)
+        return math.isfinite(lost) and lost <= self.tolerance * scale
 
     def __str__(self) -> str:
         began = "" if self.before is None else f" (it began at {self.before:.3g})"
-        return (
+        text = (
             f"{'survives' if self.survives else 'does not survive'} refinement: loss {self.loss:.3g}{began}; with 2 K "
             f"{self.more_sweeps:.3g}, with h/2 {self.smaller_steps:.3g}, with both {self.both:.3g}"
         )
+        if self.survives:
+            return text
+        finer = {"more sweeps": self.more_sweeps, "smaller steps": self.smaller_steps}
+        needed = [name for name, value in finer.items() if not self._keeps(value)] or list(finer)
+        return f"{text}: optimise on with {' and '.join(needed)}"
 
 
 @torch.no_grad()

@@ -184,7 +184,7 @@ def rollout(
         frames, observed = [], []
         past = History(before[0], before[1], before[2], h) if before else None
         for k in range(first, end):
-            now = prepare(model, lead, **chosen, **_to_prepare(options, own, k, x, v)) if fixed is None else fixed
+            now = _prepared(model, lead, chosen, _to_prepare(options, own, k, x, v), k) if fixed is None else fixed
             given = _to_advance(model, options, k, x, v, outer, colliders_before)
             check_staged(scheme, given)
             run = partial(advance, adjoint=adjoint, index=k)
@@ -265,6 +265,16 @@ def _to_prepare(options: dict[str, Any], parameters: dict[str, Any], k: int, x: 
     """What enters step k through prepare()."""
     now = {name: _at(name, options[name], k, x, v) for name in _STATIC}
     return now | {"parameters": {name: _at(name, value, k, x, v) for name, value in parameters.items()}}
+
+
+def _prepared(model: Model, lead: Any, chosen: dict[str, Any], values: dict[str, Any], k: int) -> Any:
+    """prepare() of step k; an error says which step it was."""
+    try:
+        return prepare(model, lead, **chosen, **values)
+    except (ValueError, TypeError) as error:
+        if type(error) not in (ValueError, TypeError):  # another one may take other arguments
+            raise
+        raise type(error)(f"{error}, in step {k}") from None
 
 
 def _to_advance(model: Model, options: dict[str, Any], k: int, x: Tensor, v: Tensor, start: Tensor,

@@ -26,6 +26,7 @@ from .coarse import CoarseParts, coarse_parts
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
 
 MAX_SWEEPS = 2**31 - 1
+SCENE_TET = ("scene", "tet")  # what the dimensions of values of tets count
 
 
 class Prepared(NamedTuple):
@@ -116,13 +117,13 @@ def prepare(
             density = model._density[None]
         shape = (max(density.shape[0], volume.shape[0]), model.num_tets)
         if checking() and model.device.type == "cuda":  # where star_sum does not look
-            name_value("density", "finite numbers > 0 kg/m^3", density, density > 0)
-            name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0)
+            name_value("density", "finite numbers > 0 kg/m^3", density, density > 0, SCENE_TET)
+            name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0, SCENE_TET)
         try:
             mass = lumped_mass(ops.broadcast(density, shape), ops.broadcast(volume, shape), *model._topology)
         except ValueError:
-            name_value("density", "finite numbers > 0 kg/m^3", density, density > 0)
-            name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0)
+            name_value("density", "finite numbers > 0 kg/m^3", density, density > 0, SCENE_TET)
+            name_value("rest_points", "tets of positive volume [m^3]", volume, volume > 0, SCENE_TET)
             raise
     given: dict[str, Tensor] = {}
     if parameters is not None and not isinstance(parameters, dict):

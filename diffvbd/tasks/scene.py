@@ -172,7 +172,8 @@ class Observation:
         if "sweeps" in values:
             fields["sweeps"] = int(_number(path, "sweeps", values["sweeps"], whole=True))
         if "coarse" in values:
-            fields["coarse"] = bool(_number(path, "coarse", values["coarse"]))
+            asked = np.asarray(values["coarse"])  # the option gives True
+            fields["coarse"] = bool(_number(path, "coarse", asked.astype(int) if asked.dtype == bool else asked))
         if "gravity" in values:
             fields["gravity"] = tuple(_array(path, "gravity", values["gravity"], (3,)).tolist())
         if "integrator" in values:

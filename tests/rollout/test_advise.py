@@ -111,6 +111,8 @@ def test_auto_in_a_rollout() -> None:
         ({"duration": 1e-300}, ValueError, "duration: expected a number of seconds of which 0.001 is a time step"),
         ({"gradient": 1}, TypeError, "gradient: expected a bool"),
         ({"quantity": 3}, TypeError, "quantity: expected a function"),
+        ({"quantity": lambda motion: 0.0}, TypeError, "quantity: expected a function of x and v, the last"),
+        ({"force": lambda step, x, v: None}, TypeError, r"force: expected a function of the time \[s\] alone"),
         ({"quantity": lambda x, v: x}, ValueError, "quantity: expected a function that returns a scalar"),
         ({"patience": 0}, ValueError, "patience: expected"),
         ({"sweeps": 3}, TypeError, "sweeps: expected an argument among"),

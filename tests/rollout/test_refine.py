@@ -172,8 +172,10 @@ def test_a_result_that_few_sweeps_invented_does_not_survive() -> None:
     invented = dv.refine(loss_with(1, 1e6))
     assert invented.both > 5 * invented.loss
     assert not invented.survives and str(invented).startswith("does not survive")
+    assert "optimise on with more sweeps" in str(invented)
     gain = dv.refine(loss_with(60, 1e7), before=0.2)
     assert gain.survives and str(gain).startswith("survives") and "began at 0.2" in str(gain)
+    assert "optimise" not in str(gain)
     strict = tolerance("minimum")
     assert not dv.refine(loss_with(60, 1e7), before=0.2, tolerance=strict).survives
 

@@ -40,3 +40,13 @@ def test_a_force_of_none_is_no_force() -> None:
     without = dv.rollout(model, **inputs, steps=STEPS, sweeps=SWEEPS)
     none = dv.rollout(model, **inputs, force=lambda k, x, v: None, steps=STEPS, sweeps=SWEEPS)
     assert torch.equal(none.x, without.x)
+
+
+def test_an_error_of_a_step_says_which_step_it_was() -> None:
+    """A muscle that turns a body inside out does so at some moment."""
+    scene = build_scene("anchored")
+    model, inputs = scene.model(), scene.inputs()
+    rest = inputs["rest_points"] if inputs.get("rest_points") is not None else model.rest_points
+    turned = inputs | {"rest_points": lambda k, x, v: rest if k < 2 else -rest}
+    with pytest.raises(ValueError, match=r"rest_points: .*at tet \d+ of scene 0, in step 2$"):
+        dv.rollout(model, **turned, steps=STEPS, sweeps=SWEEPS)
