@@ -10,6 +10,7 @@ Environment:
 """
 
 import os
+import re
 import runpy
 import shutil
 import sys
@@ -76,6 +77,13 @@ if QUICK:
     FLAGS += ["-O1", "-DDIFFVBD_QUICK"]
 
 
+def long_description() -> str:
+    """README.md as a package index shows it, where relative links lead nowhere: they become text, and images go."""
+    text = Path("README.md").read_text(encoding="utf-8")
+    text = re.sub(r"!\[[^\]]*\]\((?![a-z]+:)[^)]*\)\n*", "", text)
+    return re.sub(r"\[([^\]]*)\]\((?![a-z]+:)[^)]*\)", r"\1", text)
+
+
 class BuildPy(build_py):
     """Ships csrc inside the package, where DIFFVBD_JIT=1 finds what it compiles, and in the sdist."""
 
@@ -110,6 +118,8 @@ if cuda["has_compiler"]() and not os.environ.get("DIFFVBD_NO_CUDA") and not QUIC
 local_version = os.environ.get("DIFFVBD_LOCAL_VERSION")
 
 setup(
+    long_description=long_description(),
+    long_description_content_type="text/markdown",
     ext_modules=extensions,
     cmdclass={"build_ext": BuildExtension, "build_py": BuildPy},
     options={

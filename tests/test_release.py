@@ -5,6 +5,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
 
 from helpers.copied_sources import copy_sources
@@ -63,3 +64,12 @@ def test_an_sdist_has_what_builds_it(tmp_path: Path) -> None:
     (sdist,) = (tmp_path / "dist").glob("*.tar.gz")
     assert sdist.name == f"diffvbd-{diffvbd.__version__}.tar.gz"
     WHEELS["check_sdist"](sdist)
+    with tarfile.open(sdist) as archive:
+        information = archive.extractfile(f"{sdist.name.removesuffix('.tar.gz')}/PKG-INFO")
+        assert information is not None
+        described = information.read().decode("utf-8")
+    assert "Description-Content-Type: text/markdown\n" in described
+    # README.md, whose links are text: a package index has no other file of the sources
+    assert "](docs/install.md)" in text("README.md") and "![" in text("README.md")
+    assert "| **Start** | install · first gradient" in described and "\nheight.backward()" in described
+    assert "](" not in described
