@@ -143,7 +143,10 @@ def _warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, 
 def _size_message(mesh: TetMesh) -> str:
     size = _largest_body(mesh)
     if size > LARGE_BODY:
-        return f"mesh: a body is {size:.4g} m long; points are in metres: one in mm needs mesh.transform(1e-3 * I)"
+        return (
+            f"mesh: a body is {size:.4g} m long; points are in metres: one in mm needs "
+            "mesh.transform(1e-3 * numpy.eye(3)), or --scale 0.001 on the command line"
+        )
     if 0 < size < SMALL_BODY:
         return f"mesh: the largest body is {size:.2g} m long; points are in metres: are they in other units?"
     return ""
