@@ -85,6 +85,12 @@ def prose(page: Path) -> str:
     return FENCE.sub("", text)
 
 
+@pytest.mark.parametrize("page", [*PAGES, *NOTEBOOKS], ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_no_line_is_lost(page: Path) -> None:
+    """Where a paragraph is wrapped before a per cent or a plus, MyST takes the line for a comment or a list."""
+    assert re.findall(r"^ *(?:%|\+ ).*$", prose(page), re.MULTILINE) == []
+
+
 def broken_links(page: Path) -> list[str]:
     """Targets of links, pictures and cards that are not there, or have no such heading."""
     text, broken = prose(page), []

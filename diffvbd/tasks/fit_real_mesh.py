@@ -22,9 +22,9 @@ farthest points of the surface above the held part; a pull is a traction on the 
 middle of the base, so that thin parts are not torn off. No gravity; density 1000 kg/m^3. Steps of 5 ms and 20 sweeps
 relaxed by 1.7 are on average 0.06 mm off converged ones, below the noise; ten sweeps are 1.3 mm off, and the map would
 be one for that solver. Finer meshes need more sweeps, so a surface should be filled with edges of a tenth of its
-diagonal (--edge-length), and larger ones more evaluations (--iterations). Total variation is smoothed below jumps of 5
-% in mu. mu stays within a factor 30 of the first guess, because line searches try wild steps. The sweeps start from the
-predictor, as in the paper's tasks.
+diagonal (--edge-length), and larger ones more evaluations (--iterations). Total variation is smoothed below jumps of
+5 % in mu. mu stays within a factor 30 of the first guess, because line searches try wild steps. The sweeps start from
+the predictor, as in the paper's tasks.
 """
 
 import math
