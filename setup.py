@@ -10,6 +10,7 @@ Environment:
 """
 
 import os
+import re
 import runpy
 import shutil
 import sys
@@ -78,18 +79,33 @@ if QUICK:
     FLAGS += ["-O1", "-DDIFFVBD_QUICK"]
 
 
+def long_description() -> str:
+    """README.md as a package index shows it, where relative links lead nowhere: they become text, and images go."""
+    text = Path("README.md").read_text(encoding="utf-8")
+    text = re.sub(r"!\[[^\]]*\]\((?![a-z]+:)[^)]*\)\n*", "", text)
+    return re.sub(r"\[([^\]]*)\]\((?![a-z]+:)[^)]*\)", r"\1", text)
+
+
+# csrc: DIFFVBD_JIT=1 compiles it. docs: messages and docstrings name these pages.
+PACKED = [p for where in ("csrc/**/*", "docs/*.md") for p in glob(where, recursive=True) if os.path.isfile(p)]
+
+
 class BuildPy(build_py):
-    """Ships csrc inside the package, where DIFFVBD_JIT=1 finds what it compiles, and in the sdist."""
+    """Ships csrc and the pages of docs, as text without pictures, inside the package and in the sdist."""
 
     def run(self):
         super().run()
-        if not self.editable_mode:
-            target = Path(self.build_lib, "diffvbd", "csrc")
-            shutil.rmtree(target, ignore_errors=True)  # of an earlier build, with files that are gone since
-            shutil.copytree("csrc", target)
+        if self.editable_mode:
+            return
+        package = Path(self.build_lib, "diffvbd")
+        for folder in ("csrc", "docs"):
+            shutil.rmtree(package / folder, ignore_errors=True)  # of an earlier build, with files that are gone since
+        for path in PACKED:
+            (package / path).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, package / path)
 
     def get_source_files(self):
-        return super().get_source_files() + [p for p in glob("csrc/**/*", recursive=True) if os.path.isfile(p)]
+        return super().get_source_files() + PACKED
 
 
 extensions = [
@@ -112,6 +128,8 @@ if cuda["has_compiler"]() and not os.environ.get("DIFFVBD_NO_CUDA") and not QUIC
 local_version = os.environ.get("DIFFVBD_LOCAL_VERSION")
 
 setup(
+    long_description=long_description(),
+    long_description_content_type="text/markdown",
     ext_modules=extensions,
     cmdclass={"build_ext": BuildExtension, "build_py": BuildPy},
     options={

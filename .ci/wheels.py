@@ -11,6 +11,7 @@ that the wheel runs on; it follows from the system that builds, so releases are 
 
 import argparse
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -100,9 +101,14 @@ def build(cuda: bool) -> None:
 def check_sdist(path: Path) -> None:
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
+        (top,) = {name.partition("/")[0] for name in archive.getnames()}
+        described = archive.extractfile(f"{top}/PKG-INFO").read().decode()
     wanted = {file.relative_to(ROOT).as_posix() for file in (ROOT / "csrc").rglob("*") if file.is_file()}
+    wanted |= {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")}
     wanted |= {"LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "setup.py", "pyproject.toml"}
     demand(not wanted - names, f"{path.name} lacks {sorted(wanted - names)}")
+    relative = re.findall(r"\]\((?![a-z]+:)[^)]*\)", described)
+    demand(not relative, f"{path.name}: its description has links that lead nowhere on a package index: {relative}")
 
 
 def check_wheel(path: Path, cuda: bool) -> None:
@@ -114,6 +120,8 @@ def check_wheel(path: Path, cuda: bool) -> None:
     demand(objects == expected, f"{path.name} has the objects {sorted(objects)}, expected {sorted(expected)}")
     # DIFFVBD_JIT=1 compiles these
     sources = {f"diffvbd/{file.relative_to(ROOT).as_posix()}" for file in (ROOT / "csrc").rglob("*") if file.is_file()}
+    # messages name these
+    sources |= {f"diffvbd/docs/{page.name}" for page in (ROOT / "docs").glob("*.md")}
     demand(sources <= set(names), f"{path.name} lacks {sorted(sources - set(names))}")
     for end in ("licenses/LICENSE", "entry_points.txt"):
         demand(any(name.endswith(end) for name in names), f"{path.name} lacks {end}")

@@ -197,7 +197,14 @@ def cell(value: Any) -> str:
         return "yes" if value else "no"
     if value is None:
         return "-"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return digits(value) if isinstance(value, float) else str(value)
+
+
+def digits(value: float) -> str:
+    """Three digits without an exponent below a million: 1010 and 15100. Round ones stay, from 1e+04 on."""
+    text = f"{value:.3g}"
+    whole = "e+" in text and abs(value) < 1e6 and ("." in text or abs(value) < 1e4)
+    return f"{float(text):.0f}" if whole else text
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

@@ -275,7 +275,7 @@ def kept_bytes(model: dv.Model, x: Tensor, sweeps: int, wants: tuple[str, ...]) 
 def markdown(results: dict[str, Any]) -> str:
     rows = [r for part in ("throughput", "scaling", "unrolled", "building") for r in results[part]]
     text = markdown_table(
-        ("what", "measured", "target", "unit"), [(r["name"], f"{r['value']:.3g}", r["target"], r["unit"]) for r in rows]
+        ("what", "measured", "target", "unit"), [(r["name"], r["value"], r["target"], r["unit"]) for r in rows]
     )
     cells = [
         (r["name"], f"{r['forward_ms']:.2f}", "-" if r["backward_ms"] is None else f"{r['backward_ms']:.2f}",

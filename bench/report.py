@@ -35,14 +35,14 @@ INTRODUCTION = """\
 # Results
 
 Every measurement of `bench/`, a page for each benchmark. `python -m bench report` writes these pages from the JSON
-files in `bench/results`; no figure here was typed.
+files in `bench/results`; no figure here was typed by hand.
 
     python -m bench NAME                 # measure one again
     python -m bench all                  # all of them
     python -m bench NAME --device cuda   # on a GPU
     python -m bench NAME --quick --out X # try a script out in seconds
 
-Where the paper states a figure for the same thing, it stands beside ours. Its scenes, meshes and machines are others,
+Where the paper states a figure for the same quantity, it is shown beside ours. Its scenes, meshes and machines differ,
 as the text of each table says.
 """
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from bench.common import RESULTS, as_json, commit, device_suffix, environment, markdown_table, place
+from bench.common import RESULTS, as_json, cell, commit, device_suffix, digits, environment, markdown_table, place
 from bench.paper import TASKS as PAPER
 from bench.plots import keep_picture
 from diffvbd.tasks import TASKS, Settings, dress, solve
@@ -78,16 +78,18 @@ INTRODUCTION = """\
 # Inverse problems
 
 `diffvbd run NAME` runs one (in a checkout `. .venv/bin/activate` first); its pictures need matplotlib, which the extra
-`[viz]` brings. Each is a short module in `diffvbd/tasks/`, written on the public interface alone, and its docstring,
-repeated here, states the protocol. Figures in the tables come from the logs in `bench/results/tasks` of the repository,
-which `python -m bench tasks` writes and `python -m bench report` turns into this page; those of the paper stand in
+`[viz]` brings. Each is a short module in `diffvbd/tasks/` that uses only the public interface. Its docstring, repeated
+here, states the protocol. Figures in the tables come from the logs in `bench/results/tasks` of the repository, which
+`python -m bench tasks` writes and `python -m bench report` turns into this page; those of the paper are in
 `bench/paper.py`.
 
-Older than contact by planes are the logs of capes, flag, dress-size, cover-the-spot, and those of dresses on the GPU.
-Throw's on the GPU was measured beside three other runs, which made it some six times as long.
+The logs of capes, flag, dress-size and cover-the-spot, and those of dresses on the GPU, are older than contact by
+planes. That of throw on the GPU was measured while three other runs shared the device, which made it about six times as
+long.
 
 Times are those of the optimisation, without pictures. Runs are repeatable: on one device the same seed gives the same
-numbers, bit by bit; only what runs for a given time, as CMA-ES in learn-controller, depends on the machine's speed.
+numbers, bit by bit. Only parts that run for a given time, such as CMA-ES in learn-controller, depend on the speed of
+the machine.
 """
 
 
@@ -125,7 +127,7 @@ def gallery(folder: Path) -> str:
         runs = {d: json.loads(path.read_text(encoding="utf-8")) for d, path in logs.items() if path.exists()}
         if not runs:
             continue
-        times = ", ".join(f"{seconds(run):.3g} s on the {device}" for device, run in runs.items())
+        times = ", ".join(f"{cell(seconds(run))} s on the {device}" for device, run in runs.items())
         main_run = next(iter(runs.values()))
         module = TASKS[name].build.__module__.replace(".", "/")
         said = f" The paper: {paper.outcome}." if paper.outcome.strip("-") else ""
@@ -222,7 +224,7 @@ def outcome(run: dict[str, Any]) -> str:
             shown.append(f"{key} {100 * run['relative_error'][key]:.2g} %")
         elif value is not None:
             first = run["history"][0].get(key)
-            came = f"{first:.3g} -> " if isinstance(first, float) else ""
+            came = f"{digits(first)} -> " if isinstance(first, float) else ""
             unit = next((unit for name, unit in run["units"].items() if key.startswith(name)), "")
-            shown.append(f"{key.replace('_', ' ')} {came}{value:.3g} {unit}".rstrip())
+            shown.append(f"{key.replace('_', ' ')} {came}{cell(value)} {unit}".rstrip())
     return ", ".join(shown)

@@ -21,7 +21,7 @@ import torch
 import diffvbd as dv
 from bench import common
 from bench.advice_scenes import Scene
-from bench.common import markdown_table
+from bench.common import digits, markdown_table
 from bench.tradeoff_peers import peers
 from bench.tradeoff_scenes import SCENES, gripper, pile
 from diffvbd.rollout.pilots import FRAMES, Pilot, Pilots, converted, pilots_of
@@ -250,7 +250,7 @@ def front_of(rows: list[Row], by: str = "error", time: str = "ms") -> list[Row]:
 
 
 def _said(row: Row | None, time: str = "ms") -> str:
-    return "-" if row is None else f"{row['way']}, K = {row['sweeps']}, {row['steps']} steps: {row[time]:.3g} ms"
+    return "-" if row is None else f"{row['way']}, K = {row['sweeps']}, {row['steps']} steps: {digits(row[time])} ms"
 
 
 def others_of(rows: list[Row]) -> list[list[Any]]:
@@ -277,7 +277,7 @@ def markdown(results: dict[str, Any]) -> str:
         table = []
         for error in ERRORS:
             told = next((a for a in group["advised"] if a["asked"] == error), None)
-            said = "-" if told is None else f"{told['settings']}: {told['ms']:.3g} ms, error {told['error']:.2g}"
+            said = "-" if told is None else f"{told['settings']}: {digits(told['ms'])} ms, error {told['error']:.2g}"
             if told is not None and not told["reached"]:
                 said = f"cannot be had: {told['why']}"
             table.append((error, _said(best(own, error)), _said(best(euler, error)),
@@ -312,8 +312,10 @@ def summary(results: dict[str, Any], error: float = 0.01) -> str:
         least, fastest = min(r["error"] for r in euler), best(euler, error)
         told = next(a for a in group["advised"] if a["asked"] == error)
         table.append((group["scene"], f"{group['vertices']}, {group['duration']:.3g} s", _said(best(own, error)),
-                      f"not in the time allowed (least {least:.1g})" if fastest is None else f"{fastest['ms']:.3g} ms",
-                      f"{told['ms']:.3g} ms: {told['error']:.1g}" if told["reached"] else "cannot be had"))  # fmt: skip
+                      f"not in the time allowed (least {least:.1g})" if fastest is None
+                      else f"{digits(fastest['ms'])} ms",
+                      f"{digits(told['ms'])} ms: {told['error']:.1g}" if told["reached"]
+                      else "cannot be had"))  # fmt: skip
     header = ("scene", "vertices, duration", "the fastest way", "implicit Euler alone",
               f"`dv.advise` for {100 * error:g} %: its true error")  # fmt: skip
     return markdown_table(header, table) + "\n" + common.of_several_runs(results)

@@ -16,6 +16,7 @@ import diffvbd as dv
 from diffvbd import cli_mesh, cli_view
 from diffvbd.mesh.series import EXTENSIONS, check_extension
 from diffvbd.rollout.search import ERROR, PATIENCE
+from diffvbd.said import PAGES
 from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
 from diffvbd.tasks.problem import Result, check_device
 from diffvbd.tasks.progress import Row, versions
@@ -354,6 +355,7 @@ def _info(options: argparse.Namespace) -> None:
     package = Path(__file__).parent
     rows["compiled"] = ", ".join(sorted(path.name for path in package.glob("_C*"))) or "nothing"
     rows["package"] = str(package)
+    rows["pages"] = str(PAGES)
     for name, value in rows.items():
         print(f"{name:10} {value}")
 

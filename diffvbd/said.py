@@ -1,4 +1,4 @@
-"""Warnings that point at the user's line, however many calls of the package lie between."""
+"""Warnings that point at the user's line, however many calls of the package lie between, and at pages to read."""
 
 from __future__ import annotations
 
@@ -12,6 +12,16 @@ import torch
 
 # torch's frames are those of its decorators and of its backward, contextlib's those of decorators of ours
 _INSIDE = (*(str(Path(module).parent) + os.sep for module in (__file__, torch.__file__)), contextlib.__file__)
+
+
+_PACKAGE = Path(__file__).parent
+# Inside an installed package, beside the package in a checkout.
+PAGES = next((path for path in (_PACKAGE / "docs", _PACKAGE.parent / "docs") if path.is_dir()), _PACKAGE / "docs")
+
+
+def page(name: str) -> str:
+    """The end of a message: which page of the documentation says more, and where this installation has it."""
+    return f"see {PAGES / name}"
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:

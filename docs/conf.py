@@ -4,6 +4,8 @@ import json
 import re
 from typing import Any
 
+from docutils import nodes
+
 import diffvbd
 
 project = "diffvbd"
@@ -50,6 +52,8 @@ autodoc_default_options = {"members": True, "undoc-members": False}
 napoleon_use_rtype = False
 napoleon_use_ivar = True
 napoleon_use_param = False  # several names share a line of text
+
+CELLS = ((12, "one-line"), (25, "short"), (60, "medium"))  # characters, class
 
 linkcheck_timeout = 20
 linkcheck_anchors = False
@@ -103,7 +107,15 @@ def skip(app: object, what: str, name: str, obj: object, is_skipped: bool, optio
     return True if str(getattr(obj, "__doc__", "")).startswith("Alias for field number") else None
 
 
+def size_cells(app: object, doctree: nodes.document) -> None:
+    """Classes for site.css: browsers break 1e-16 at its sign, and make columns of words as narrow as one word."""
+    for entry in doctree.findall(nodes.entry):
+        length = len(entry.astext())
+        entry["classes"].append(next((name for most, name in CELLS if length <= most), "long"))
+
+
 def setup(app: Any) -> None:
     app.connect("source-read", adapt)
+    app.connect("doctree-read", size_cells)
     app.connect("autodoc-process-docstring", read_docstring)
     app.connect("autodoc-skip-member", skip)

@@ -60,6 +60,15 @@ def test_what_is_left_out_of_a_large_scan_is_said(
     assert "for a file in mm give --scale 0.001" in capsys.readouterr().err
 
 
+def test_a_scan_without_its_unit_is_warned_of(scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("trimesh", reason="needs the extra [mesh]")
+    monkeypatch.setattr(dm, "tetrahedralize", lambda *given: dm.cube(3))
+    with pytest.warns(
+        UserWarning, match=r"largest extent is 20 m.* scale=0\.001 \(--scale 0\.001\), or size= \(--size\)"
+    ):
+        assert run("mesh", scan, "-o", scan.with_name("part.vtu")) == 0
+
+
 def test_quality_is_shown() -> None:
     text = cli_mesh.report(dm.cube(3), 2 * dm.cube(3).volume.sum(), 1.0)
     assert "27 vertices" in text and "(-50.00% of the surface's)" in text and "0 tets below 0.1" in text

@@ -5,6 +5,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
 
 from helpers.copied_sources import copy_sources
@@ -58,8 +59,25 @@ def test_an_sdist_has_what_builds_it(tmp_path: Path) -> None:
     copy_sources(tmp_path)
     for name in ("LICENSE", "CHANGELOG.md", "CITATION.cff", "MANIFEST.in"):
         shutil.copy(ROOT / name, tmp_path)
+    (tmp_path / "docs").mkdir()
+    for page in (ROOT / "docs").glob("*.md"):
+        shutil.copy(page, tmp_path / "docs")
     done = subprocess.run([sys.executable, "setup.py", "-q", "sdist"], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     (sdist,) = (tmp_path / "dist").glob("*.tar.gz")
     assert sdist.name == f"diffvbd-{diffvbd.__version__}.tar.gz"
     WHEELS["check_sdist"](sdist)
+    build = [sys.executable, "setup.py", "-q", "build_py", "--build-lib", "built"]
+    subprocess.run(build, cwd=tmp_path, check=True, capture_output=True)
+    for folder, pattern in (("csrc", "*.h"), ("docs", "*.md")):
+        packed = {path.name for path in (tmp_path / "built" / "diffvbd" / folder).rglob(pattern)}
+        assert packed == {path.name for path in (tmp_path / folder).rglob(pattern)}
+    with tarfile.open(sdist) as archive:
+        information = archive.extractfile(f"{sdist.name.removesuffix('.tar.gz')}/PKG-INFO")
+        assert information is not None
+        described = information.read().decode("utf-8")
+    assert "Description-Content-Type: text/markdown\n" in described
+    # README.md, whose links are text: a package index has no other file of the sources
+    assert "](docs/install.md)" in text("README.md") and "![" in text("README.md")
+    assert "| **Start** | install · first gradient" in described and "\nheight.backward()" in described
+    assert "](" not in described

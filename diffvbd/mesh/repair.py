@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from diffvbd.mesh.arrays import FloatArray, IntArray
 from diffvbd.mesh.shapes import positive
-from diffvbd.mesh.tetrahedralize import surface_arrays
+from diffvbd.mesh.tetrahedralize import surface_arrays, warn_of_unit
 
 # Rows: what becomes x, y, z. All are rotations, and each brings the axis of its name to y.
 _TO_Y = {
@@ -79,7 +79,8 @@ def repair(
     Args:
         surface: A file that meshio reads (STL, PLY, OBJ, ...), or (points [P, 3], triangles [F, 3]).
         size: Largest extent that the surface shall have [m]. Or
-        scale: Metres per unit of the file, 0.001 for mm; default 1.
+        scale: Metres per unit of the file, 0.001 for mm; default 1, with a UserWarning if the surface is then larger
+            than 5 m.
         up: The file's axis that points up: "x", "y", "z", or one of them with a minus. The surface is turned, so that
             it becomes y.
 
@@ -100,6 +101,9 @@ def repair(
         raise ValueError(f"size: expected none beside scale = {scale!r}, got {size!r}")
     points, triangles = surface_arrays(Path(surface) if isinstance(surface, (str, PathLike)) else surface)
     factor = positive("scale", 1.0 if scale is None else scale)
+    if size is None and scale is None:
+        cure = "for one in mm give scale=0.001 (--scale 0.001), or size= (--size), its largest extent in metres"
+        warn_of_unit(points[triangles.ravel()], cure)
     if size is not None:
         factor = positive("size", size) / float(np.ptp(points[triangles.ravel()], axis=0).max())
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import warnings
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from diffvbd.mesh.arrays import FloatArray, IntArray, float_array, int_array
 from diffvbd.mesh.io import read_triangles
 from diffvbd.mesh.shapes import count, positive
 from diffvbd.mesh.tet_mesh import TetMesh
+
+UNLIKELY = 5.0  # [m]; of a surface whose unit nobody gave, millimetres or inches are likelier from here on
 
 
 def tetrahedralize(
@@ -34,6 +37,7 @@ def tetrahedralize(
     Args:
         surface: A file that meshio reads (STL, PLY, OBJ, ...), or (points [P, 3] in metres, triangles [F, 3]), such as
             the `surface` of what `repair` returns.
+            A file is taken to be in metres, with a UserWarning if it is larger than 5.
         edge_length: Wanted edge length [m], at most the diagonal of the bounding box; default 1/20 of it.
         epsilon: Largest distance from the input surface [m]; default 1/20 of `edge_length`.
         max_triangles: Decimate larger surfaces to this many triangles; None never does.
@@ -47,6 +51,8 @@ def tetrahedralize(
     Source: Hu et al., "Fast tetrahedral meshing in the wild", ACM TOG 39(4), 2020.
     """
     points, triangles = surface_arrays(surface)
+    if isinstance(surface, (str, PathLike)):
+        warn_of_unit(points[triangles.ravel()], "dv.mesh.repair(surface, scale=0.001) reads one in mm")
     diagonal = float(np.linalg.norm(np.ptp(points[triangles].reshape(-1, 3), axis=0)))
     edge = diagonal / 20 if edge_length is None else positive("edge_length", edge_length)
     if edge > diagonal:
@@ -75,6 +81,14 @@ def tetrahedralize(
         raise ValueError("surface: fTetWild found no inside; is the surface closed?")
     used, compact = np.unique(tets, return_inverse=True)
     return TetMesh(vertices[used], compact.reshape(-1, 4), orient=True)
+
+
+def warn_of_unit(points: FloatArray, cure: str) -> None:
+    """Warn the caller of a function of this package of points [P, 3] that are hardly in metres."""
+    extent = float(np.ptp(points, axis=0).max())
+    if extent > UNLIKELY:
+        said = f"surface: its largest extent is {extent:.4g} m, if its unit is the metre, which is assumed; {cure}"
+        warnings.warn(said, stacklevel=3)
 
 
 def surface_arrays(surface: str | PathLike[str] | tuple[Any, Any]) -> tuple[FloatArray, IntArray]:

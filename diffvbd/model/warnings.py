@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..energies import StableNeoHookean
 from ..mesh import TetMesh
-from ..said import warn
+from ..said import page, warn
 
 if TYPE_CHECKING:
     from .model import Model
@@ -136,14 +136,17 @@ def _warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, 
             f"sweeps: {sweeps} at time_step = {time_step:.3g} s are too few for tets {aspect:.2g} times as wide as "
             f"thick, which need about {needed:.0f} or more: the body moves as if it had little stiffness; take a "
             f"shorter time step, more sweeps with relaxation up to {STABLE_RELAXATION}, or a thicker body of softer "
-            "material. Linear tets this thin are also much too stiff in bending (documentation: Numerics)",
+            "material. Linear tets this thin are also much too stiff in bending; " + page("numerics.md"),
         )
 
 
 def _size_message(mesh: TetMesh) -> str:
     size = _largest_body(mesh)
     if size > LARGE_BODY:
-        return f"mesh: a body is {size:.4g} m long; points are in metres: one in mm needs mesh.transform(1e-3 * I)"
+        return (
+            f"mesh: a body is {size:.4g} m long; points are in metres: one in mm needs "
+            "mesh.transform(1e-3 * numpy.eye(3)), or --scale 0.001 on the command line"
+        )
     if 0 < size < SMALL_BODY:
         return f"mesh: the largest body is {size:.2g} m long; points are in metres: are they in other units?"
     return ""

@@ -13,7 +13,7 @@ from ..energies import Anchor
 from ..mask import ELASTIC
 from ..model.model import Model
 from ..model.rest import rest_metric
-from ..said import warn
+from ..said import page, warn
 from ..scopes import looks_at
 from ..step.arguments import Prepared, acceleration_of
 
@@ -68,7 +68,7 @@ def _copies(x: Tensor) -> bool:
 def _warn_not_finite(which: str) -> None:
     warn(
         f"x: {which} ended with positions or velocities that are not finite; dv.debug_checks() says in which step, "
-        "sweep and vertex they began. Take a smaller time_step, more sweeps, or float64 (documentation: Numerics)",
+        "sweep and vertex they began. Take a smaller time_step, more sweeps, or float64; " + page("numerics.md"),
     )
 
 
@@ -112,8 +112,8 @@ class EnergyLook:
         pressed = ", unless bodies were pressed together at the start" if touching else ""
         warn(
             f"sweeps: after step {step} the scene has gained {100 * most:.2g} % of the energy that it had and that "
-            f"gravity gave it: the sweeps have not converged{pressed}; take more sweeps{faster} or a smaller time_step "
-            "(documentation: Numerics)",
+            f"gravity gave it: the sweeps have not converged{pressed}; take more sweeps{faster} or a smaller "
+            "time_step; " + page("numerics.md"),
         )
 
 

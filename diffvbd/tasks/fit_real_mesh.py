@@ -28,6 +28,7 @@ the predictor, as in the paper's tasks.
 """
 
 import math
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -242,7 +243,11 @@ def stage_of(fit: Fit, number: int, iterations: int) -> Stage:
 def read(path: Path, edge_length: float | None = None) -> dv.TetMesh:
     """Tets of a file, or those that fill the surface in it; edge_length as in `dv.mesh.tetrahedralize`."""
     surface = path.suffix.lower() in SURFACES
-    return dv.mesh.tetrahedralize(path, edge_length) if surface else dv.mesh.load(path)
+    if not surface:
+        return dv.mesh.load(path)
+    with warnings.catch_warnings():  # the unit of the file does not matter: the body is scaled
+        warnings.filterwarnings("ignore", message="surface: its largest extent")
+        return dv.mesh.tetrahedralize(path, edge_length)
 
 
 def scaled(mesh: dv.TetMesh, height: float) -> dv.TetMesh:

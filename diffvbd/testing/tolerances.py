@@ -180,7 +180,7 @@ TOLERANCE: dict[str, tuple[float, str]] = {
     "recovered_dress": (1e-3, "Lame parameters from a quick run that alternates between them, relative"),
     "quick_fall": (1e-4, "share of its first loss that a quick run of a beam leaves"),
     "identified": (1e-4, "mu from one final shape, relative"),
-    "identified_by_example": (1e-3, "mu after the iterations of the example in docs/guides, relative"),
+    "identified_by_example": (1e-3, "mu after the iterations of the guide's example, relative"),
     "linear_response": (1e-8, "singular values by differences of a linear motion: rounding over the step"),
     "softened": (1e-9, "[m] a soft maximum over vertices whose distances differ by many softnesses"),
     "sampled_area": (2e-3, "share of 2,000 points or more that disks cover, against an area"),

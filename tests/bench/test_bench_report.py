@@ -8,6 +8,7 @@ import pytest
 
 from bench import report
 from bench.__main__ import main
+from bench.common import cell
 
 HERE, ELSEWHERE = "a" * 40, "b" * 40
 
@@ -89,3 +90,21 @@ def test_results_of_this_repository_have_clean_commits_or_are_known() -> None:
     unknown = [line for line in report.refused(report.RESULTS, is_ancestor=lambda commit: True) if "KNOWN" not in line]
     assert unknown == []
     assert all(reason.endswith(".") for reason in report.KNOWN.values())
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.00123, "0.00123"),
+        (999.6, "1000"),
+        (1010.2, "1010"),
+        (-15149.0, "-15100"),
+        (883127.0, "883000"),
+        (2e4, "2e+04"),
+        (1.23e6, "1.23e+06"),
+        (True, "yes"),
+        (None, "-"),
+    ],
+)
+def test_tables_show_thousands_without_an_exponent(value: float | None, text: str) -> None:
+    assert cell(value) == text

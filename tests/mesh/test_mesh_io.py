@@ -147,6 +147,17 @@ def test_tetrahedralize_without_its_extra_says_what_to_install(monkeypatch):
         dm.tetrahedralize((cube.points, cube.surface))
 
 
+def test_tetrahedralize_warns_of_a_file_that_is_hardly_in_metres(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "pytetwild", None)  # warned of before anything takes long
+    cube = dm.cube(size=200.0)
+    meshio.Mesh(cube.points, [("triangle", cube.surface)]).write(tmp_path / "cube.stl")
+    with (
+        pytest.warns(UserWarning, match=r"extent is 200 m, .*repair\(surface, scale=0\.001\)"),
+        pytest.raises(ImportError),
+    ):
+        dm.tetrahedralize(tmp_path / "cube.stl")
+
+
 def test_tetrahedralize_bad_input(tmp_path):
     cube = dm.cube()
     with pytest.raises(FileNotFoundError, match="does not exist"):

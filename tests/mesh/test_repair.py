@@ -1,6 +1,7 @@
 """Claim: what scanners leave becomes a surface that encloses the body, upright and in metres, and it is said how."""
 
 import sys
+import warnings
 from pathlib import Path
 
 import meshio
@@ -69,6 +70,19 @@ def test_size_is_the_largest_extent() -> None:
     assert np.ptp(found.points, axis=0) == pytest.approx([0.05, 0.1, 0.2]) and found.scale == pytest.approx(0.05)
 
 
+@pytest.mark.parametrize(("given", "warns"), [({}, True), ({"scale": 0.001}, False), ({"size": 200.0}, False)])
+def test_a_surface_in_mm_is_warned_of_unless_its_unit_is_given(given: dict[str, float], warns: bool) -> None:
+    body = dm.box(2, (80.0, 120.0, 200.0))
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        dm.repair((body.points, body.surface), **given)
+        dm.repair((1e-3 * body.points, body.surface))
+    assert len(found) == warns
+    for warning in found:
+        assert "200 m" in str(warning.message) and "give scale=0.001 (--scale 0.001), or size=" in str(warning.message)
+        assert warning.filename == __file__
+
+
 @pytest.mark.parametrize("inverted", [False, True])
 def test_cavities_stay_and_pieces_apart_are_turned_by_themselves(inverted: bool) -> None:
     outer, inner, apart = dm.cube(3, size=1.0), dm.cube(2, size=0.5), dm.cube(2, size=1.0)
@@ -87,7 +101,7 @@ def test_holes_and_crowded_edges_are_counted() -> None:
     cube = dm.cube(3)
     found = dm.repair((cube.points, cube.surface[1:, ::-1]))
     assert found.open_edges == 3 and "3 open edges" in str(found) and found.volume > 0
-    fins = np.concatenate([cube.points, [[9.0, 9.0, 9.0]]])
+    fins = np.concatenate([cube.points, [[2.0, 2.0, 2.0]]])
     a, b, _ = cube.surface[0]
     found = dm.repair((fins, np.concatenate([cube.surface, [[a, b, len(cube.points)]]])))
     assert found.crowded_edges == 1 and found.open_edges == 2
