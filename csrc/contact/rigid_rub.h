@@ -31,9 +31,8 @@ DIFFVBD_FN Vector way_of(const PairPress& a, const Slid& slid) {
 
 // Of lagged friction and damping what does not depend on how bodies go.
 struct Rubbing {
-  Vector n, u;  // u: slip since the start of the step
-  double size, damping,
-      approach;  // h^2 times the load [N], h times the coefficient, and how far sides have come closer
+  Vector n, u;                     // u: slip since the start of the step
+  double size, damping, approach;  // h^2 times the load [N]; h times the coefficient; how much closer sides have come
 };
 
 // The sides of a lagged pair, and what it does there; false where it does nothing. It acts along a gap, so that it

@@ -12,7 +12,7 @@ __global__ void __launch_bounds__(kOne) start_kernel(int64_t count, int32_t bodi
   if (i < count) label[i] = static_cast<int32_t>(i % bodies);
 }
 
-// Joins what pairs press; sides as of GroupMemory.
+// Joins what pairs press, or, where no group has more than one body, marks it by -1; sides as of GroupMemory.
 template <class T>
 __global__ void __launch_bounds__(kOne)
     join_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const int32_t* sides, int32_t* label) {
@@ -22,7 +22,22 @@ __global__ void __launch_bounds__(kOne)
   if (a < 0 || b < 0) return;
   const int64_t scene = row < room.listed ? in.gate.listed.pairs[kPairRow * row + 5]
                                           : in.lagged.pairs[kPairRow * (row - room.listed) + 5];
-  unite(label + scene * in.bodies(), a, b);
+  int32_t* own = label + scene * in.bodies();
+  if (most_grouped(in.bodies()) > 1) {
+    unite(own, a, b);
+  } else {
+    own[a] = own[b] = -1;
+  }
+}
+
+// Places where no group has more than one body.
+__global__ void __launch_bounds__(kOne) alone_kernel(int64_t count, int32_t n, const int32_t* label, int32_t* rows) {
+  const int64_t i = own_item();
+  if (i >= count) return;
+  const int64_t scene = i / n, k = i % n;
+  int32_t* member = rows + kGroupRows * n * scene + k;
+  member[0] = member[n] = static_cast<int32_t>(k);
+  member[int64_t{2} * n] = 0, member[int64_t{3} * n] = label[i] < 0 ? kLeft : 1;
 }
 
 // Places of the bodies of a scene: a block. work [scenes, 2, bodies]: memory.
@@ -123,7 +138,11 @@ cudaError_t find_groups(const RigidInputs<T>& in, const PairRoom& room, const in
   auto *label = static_cast<int32_t*>(workspace), *work = label + bodies;
   start_kernel<<<blocks_for(bodies), kOne, 0, stream>>>(bodies, in.bodies(), label);
   if (room.rows() > 0) join_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, room, sides, label);
-  places_kernel<<<static_cast<unsigned>(in.scene.scenes), kThreads, 0, stream>>>(in.bodies(), label, work, groups);
+  if (most_grouped(in.bodies()) > 1) {
+    places_kernel<<<static_cast<unsigned>(in.scene.scenes), kThreads, 0, stream>>>(in.bodies(), label, work, groups);
+  } else {
+    alone_kernel<<<blocks_for(bodies), kOne, 0, stream>>>(bodies, in.bodies(), label, groups);
+  }
   return cudaGetLastError();
 }
 

@@ -31,6 +31,11 @@ def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: f
     return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps, again)
 
 
+def any_left(groups: Tensor) -> bool:
+    """Whether bodies are left alone, because those that touch are too many."""
+    return groups.numel() > 0 and bool((groups[:, 3] < 0).any())
+
+
 def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_count: Sequence[int], time_step: float,
                friction_eps: float) -> tuple[Tensor, Tensor]:  # fmt: skip
     """The state after each body has taken what it may of its motion [B, bodies, 6], [B, V, 3], and that share,

@@ -22,7 +22,7 @@ from ..energies import damped_share
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
-from ..ops.contact_rigid import most_grouped
+from ..ops.contact_rigid import any_left, most_grouped
 from ..ops.motion import RoomsOfBodies
 from ..scopes import checking, not_compiled, recorders
 from ..tuples import replaced
@@ -187,7 +187,7 @@ class ContactStep:
             if self._reads(x):
                 self._check(r, met.counts[r].tolist(), met)
             begin = x
-            x, first = self._corrected(start.x, now, start, detection.listed)
+            x, first, _ = self._corrected(start.x, now, start, detection.listed)
             if start.own:
                 start = replaced(start, own=(start.own[0] + (x - start.x).detach(), start.own[1]))
             room = rooms_of_sweeps(motion, surface, barrier, start, x, begin)
@@ -199,8 +199,11 @@ class ContactStep:
                 swept = swept_part(self, x, swept_from, now, near, part, policy, debug_step)
                 met.swept.append(swept)
                 x, limits, combined, lengths = swept
+                groups = x.new_zeros((0,))
                 for again in self.corrections_after(r + 1 == self.parts):
-                    x, last = self._corrected(x, now, start, detection.listed, again)
+                    if again and self._reads(x) and not any_left(groups):
+                        break
+                    x, last, groups = self._corrected(x, now, start, detection.listed, again)
                     taken.append(last)
                 cut = limits[:, -1] > 0  # what the start has held up, sweeps may have made good
             met.cut = cut
@@ -231,13 +234,13 @@ class ContactStep:
         room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
         start = PartStart(x, x.detach(), room, (), None, room > 0, none.ptr[:1].long(),
                           x.new_ones((2, *room.shape)))  # fmt: skip
-        x, _ = self._corrected(x, self.colliders, start, none)
+        x, *_ = self._corrected(x, self.colliders, start, none)
         if self.prepared.settings.sweeps:
             settings = self.prepared.settings
             swept = swept_part(self, x, start, self.colliders, none, settings, policy, debug_step)
             x = swept.x
             for _ in self.corrections_after(True):
-                x, _ = self._corrected(x, self.colliders, start, none)
+                x, *_ = self._corrected(x, self.colliders, start, none)
             record_parts(self.model, x, [swept])
         return x
 
@@ -251,8 +254,9 @@ class ContactStep:
         return [k >= least for k in range(max(least, LEFT_CORRECTIONS) if leaves else least)]
 
     def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs, again: bool = False
-                   ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """x after the rigid correction of all bodies that are free, and the share of its motion that each took."""
+                   ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+        """x after the rigid correction of all bodies that are free, the share of its motion that each took, and their
+        groups."""
         numbers = self.prepared.settings.numbers
         fields = self.touching(x, collider, start, listed)
         eps = 0.0 if self.model.friction is None else numbers.friction_eps

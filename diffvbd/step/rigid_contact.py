@@ -28,14 +28,14 @@ _FIELDS = len(ops.TouchingFields._fields)
 
 
 def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction_eps: float, again: bool = False
-            ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """x [B, V, 3] after every free body has been moved, as far as pairs, floors and the potential let it; and the share
-    of its motion that each took [B, bodies]. friction_eps: [m], 0 without friction. again: only bodies move that are
-    not solved for together with those that they touch, as these are too many. Differentiable in
-    ops.TOUCHING_ADJOINTS."""
+            ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """x [B, V, 3] after every free body has been moved, as far as pairs, floors and the potential let it; the share of
+    its motion that each took [B, bodies]; and their groups, as ops.contact_rigid has them. friction_eps: [m], 0 without
+    friction. again: only bodies move that are not solved for together with those that they touch, as these are too
+    many. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
-    x, share, *_ = _Correct.apply(*fields, model, time_step, friction_eps, again)
-    return x, share.to(x.dtype)
+    x, share, _, _, groups = _Correct.apply(*fields, model, time_step, friction_eps, again)
+    return x, share.to(x.dtype), groups
 
 
 def bodies_of(model: Model) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
