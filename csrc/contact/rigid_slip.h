@@ -12,18 +12,6 @@ constexpr int kHalvings = 10;         // in the search for the length of a step
 constexpr double kOvershoot = 0.1;    // slope at the end of a step over that at its start, that is none
 constexpr double kSettled = 1e-9;     // of the whole, a step after which there is but one more
 
-// FrictionRate's value for the square of a length, without the divisions that take most of the time of a search.
-DIFFVBD_FN double friction_rate(double square, double eps) {
-#ifdef __CUDA_ARCH__
-  const double inverse = rsqrt(square);
-#else
-  const double inverse = 1 / square_root(square);
-#endif
-  if (!(square < eps * eps)) return inverse;
-  const double over = 1 / eps;
-  return (2 - (0 < square ? square * inverse : 0) * over) * over;
-}
-
 // A slip along a step of Newton's method.
 struct SlipLine {
   Vector slip, change;
@@ -39,7 +27,8 @@ struct SlipLine {
   // The slope of the potential after a share of the step, over what that takes it for.
   DIFFVBD_FN double excess(double share) const {
     const Vector now = slip + share * change;
-    return size * dot((friction_rate(dot(now, now), eps) - rate) * now - (share * bend) * slip, change);
+    const FrictionRate<double> last(square_root(dot(now, now)), eps);
+    return size * dot((last.value - rate) * now - (share * bend) * slip, change);
   }
 };
 
