@@ -1,6 +1,7 @@
 // The tensors of the rigid correction of bodies that touch, as the operators of all backends take them.
 #pragma once
 
+#include <algorithm>
 #include <tuple>
 #include <vector>
 
@@ -61,16 +62,21 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const std::vect
             "diffvbd::contact_rigid: expected groups int32 [scenes, 4, bodies]");
     in.groups = data<const int32_t>(groups);
   }
+  in.room = contact::most_grouped(bodies);
   in.has_friction = 0 < friction_eps;
   in.friction_eps = in.has_friction ? friction_eps : 1;
   return in;
 }
 
+// Bodies of a group that the memory of its factor has room for. again: only those move that are alone.
+inline int64_t room_of_groups(int64_t bodies, bool again) {
+  return again ? std::min<int64_t>(bodies, 1) : contact::most_grouped(bodies);
+}
 // Of the factor, and of the groups.
-inline std::vector<int64_t> matrix_shape(int64_t scenes, int64_t bodies) {
+inline std::vector<int64_t> matrix_shape(int64_t scenes, int64_t bodies, bool again) {
   const int64_t six = contact::kUnknowns;
   if (bodies <= contact::kFew) return {scenes, six * bodies, six * bodies};
-  return {scenes, bodies, six, six * contact::most_grouped(bodies)};
+  return {scenes, bodies, six, six * room_of_groups(bodies, again)};
 }
 inline std::vector<int64_t> groups_shape(int64_t scenes, int64_t bodies) {
   if (bodies <= contact::kFew) return {0};
@@ -152,11 +158,12 @@ struct RigidVertexTensors {
   }
 };
 
-// What a reverse solves with, of a forward with these groups.
+// What a reverse solves with, of a forward with these groups; `in` learns how it is stored.
 template <class T>
-void require_factor(const contact::RigidInputs<T>& in, const Tensor& factor, const Tensor& x) {
+void require_factor(contact::RigidInputs<T>& in, const Tensor& factor, const Tensor& x) {
+  if (!in.together() && factor.dim() == 4) in.room = factor.size(3) / contact::kUnknowns;
   require(is_beside(factor, x, ScalarType::Double) && factor.numel() == in.scene.scenes * in.matrix_size() &&
-              in.together() == (in.groups == nullptr),
+              (in.scene.scenes == 0 || in.together() == (in.groups == nullptr)),
           "diffvbd::contact_rigid: expected factor and groups as contact_rigid_system returns them");
 }
 

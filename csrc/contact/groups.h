@@ -12,8 +12,8 @@ constexpr int kUnknowns = 6;                // of a body: a turn and a shift
 constexpr int kFew = 3;                     // bodies of scenes that are one group
 constexpr int kMostCoupled = 64;            // bodies of a group
 constexpr int64_t kGroupMemory = 32 << 10;  // bodies of a scene times those of a group at most: room for matrices
-constexpr int kGroupRows = 4;
-constexpr int32_t kLeft = -1;  // as the count of a group: a body of too many that touch
+constexpr int kGroupRows = 4;               // member, first, rank and count
+constexpr int32_t kLeft = -1;               // as the count of a group: a body of too many that touch
 
 // Bodies of a group at most.
 DIFFVBD_FN int64_t most_grouped(int64_t bodies) {
@@ -23,9 +23,10 @@ DIFFVBD_FN int64_t most_grouped(int64_t bodies) {
 }
 
 // Those of a scene. Bodies have places, those of a group in a row: of no more than kFew in the order of their numbers,
-// else in that of their elimination.
+// else in that of their elimination, if they are solved for.
 struct Groups {
   int32_t bodies;
+  int64_t room;  // bodies of a group that the memory of its matrix has room for: none is solved for that has more
   const int32_t* rows;  // [4, bodies], or null: all are one group
 
   DIFFVBD_FN int32_t member(int32_t place) const { return rows ? rows[place] : place; }
@@ -40,9 +41,7 @@ struct Groups {
   DIFFVBD_FN bool is_left(int32_t place) const { return rows && rows[3 * bodies + place] == kLeft; }
   DIFFVBD_FN bool joined(int32_t a, int32_t b) const { return first(a) == first(b); }
   // Where in the memory of its scene the matrix of the group is that begins at a place.
-  DIFFVBD_FN int64_t matrix(int32_t place) const {
-    return rows ? kUnknowns * kUnknowns * most_grouped(bodies) * place : 0;
-  }
+  DIFFVBD_FN int64_t matrix(int32_t place) const { return rows ? kUnknowns * kUnknowns * room * place : 0; }
 };
 
 // A part of the matrix of a group, 6 x 6, between two of its bodies; `matrices` of the scene.

@@ -24,6 +24,7 @@ struct RigidInputs {
   Batched<const T> kappa, floor_lag;  // floor_lag [1 | B, V, planes, 4]
   const bool* free;                   // [bodies]: nothing of it is pinned
   const int32_t* groups;              // [B, 4, bodies], or null where they do not matter or all are one
+  int64_t room;                       // bodies of a group that the memory of its matrix has room for
   int32_t planes;
   double friction_eps;
   bool has_friction;
@@ -33,13 +34,10 @@ struct RigidInputs {
   // Whether all bodies of a scene are one group.
   DIFFVBD_FN bool together() const { return scene.bodies <= kFew; }
   DIFFVBD_FN Groups groups_of(int64_t s) const {
-    return {scene.bodies, groups ? groups + kGroupRows * scene.bodies * s : nullptr};
+    return {scene.bodies, room, groups ? groups + kGroupRows * scene.bodies * s : nullptr};
   }
   // Scalars of the matrices of a scene.
-  DIFFVBD_FN int64_t matrix_size() const {
-    const int64_t n = scene.bodies;
-    return kUnknowns * kUnknowns * n * most_grouped(n);
-  }
+  DIFFVBD_FN int64_t matrix_size() const { return kUnknowns * kUnknowns * scene.bodies * room; }
   DIFFVBD_FN int64_t first_listed(int64_t s) const { return gate.listed.ptr[s * gate.corners] / 4; }
   DIFFVBD_FN int64_t first_lagged(int64_t s) const { return lag ? lagged.ptr[s * gate.corners] / 4 : 0; }
 };
@@ -112,9 +110,6 @@ struct PairPress {
     const Vector moment = torque[side] - cross(center, pull[side]);
     const Vector& own = k < 3 ? moment : pull[side];
     return dot(map(side, k, center), force) + (k % 3 == 0 ? own.x : k % 3 == 1 ? own.y : own.z);
-  }
-  DIFFVBD_FN double block(int side, int i, int j, const Vector& center) const {
-    return dot(map(side, i, center), stiffness * map(side, j, center));
   }
 };
 constexpr int kPressDoubles = 29;  // of a PairPress without its bodies, its value and its friction

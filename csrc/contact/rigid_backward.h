@@ -221,6 +221,8 @@ struct LaggedWork {
     if (!acts) return;
     const CornerPoints<T> at{in, false};
     m = motions_of(in, given, record);
+    // what does nothing joined no bodies; with any coefficient it would
+    if (in.lag[kLagScalars * pair] == T(0) && in.lag[kLagScalars * pair + 1] == T(0)) m.sides = 1, m.share = 1;
     for (int k = 0; k < 4; ++k) since[k] = at.relative(record[5], record[k]) - before(in, record[5], record[k]);
     for (int i = 0; i < kLagScalars; ++i) lag[i] = in.lag[kLagScalars * pair + i];
   }

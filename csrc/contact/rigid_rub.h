@@ -51,8 +51,8 @@ DIFFVBD_FN bool lagged_sides(const RigidInputs<T>& in, int64_t pair, const At& a
   if (out.body[0] < 0 && out.body[1] < 0) return false;
   const bool within = out.body[0] == out.body[1];
   if (within) out.body[1] = -1;
-  const bool halves = is_apart(in, scene, out);
-  if (halves && alone >= 0) out.body[1 - alone] = -1;
+  const bool halves = alone >= 0 && is_apart(in, scene, out);
+  if (halves) out.body[1 - alone] = -1;
   out.doubled = halves ? 2 : 1;
   Vector m{};
   for (int k = 0; k < 4; ++k) {

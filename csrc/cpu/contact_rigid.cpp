@@ -51,9 +51,8 @@ void add_press(const PairPress& a, double share, const Groups& groups, const dou
 }
 
 template <class T>
-void system_of_scene(const RigidInputs<T>& in, int64_t scene, const std::vector<PairPress>& presses, double* center,
-                     double* gradient, double* matrix) {
-  const Groups groups = in.groups_of(scene);
+void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& groups,
+                     const std::vector<PairPress>& presses, double* center, double* gradient, double* matrix) {
   for (int32_t k = 0; k < in.bodies(); ++k) {
     const Body<T> body{in.scene, scene, k};
     double mass = 0, spread = 0, g6[kUnknowns] = {}, block[rigid::kSix] = {};
@@ -88,7 +87,7 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, const std::vector<
 }
 
 // Where Newton's method is with a system: on its way, at the motion it has settled at but not with the matrix there,
-// and done, when it is left alone.
+// and done.
 enum Settling : uint8_t { kOnItsWay, kSettledAt, kDone };
 
 // The systems of a scene, one for each group.
@@ -226,27 +225,30 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, bool again, double* ce
   }
   presses.pop_back();
   if (rows) find_groups(in, scene, presses, rows);
-  std::vector<double> gradient(unknowns), matrix(in.matrix_size(), 0.0), step(unknowns), own(unknowns), whole(unknowns);
-  system_of_scene(in, scene, presses, center, gradient.data(), matrix.data());
+  Groups groups = in.groups_of(scene);
+  groups.room = most_grouped(in.bodies());
+  const int64_t size = kUnknowns * unknowns * groups.room;
+  std::vector<double> gradient(unknowns), matrix(size, 0.0), factors(size), step(unknowns), own(unknowns),
+      whole(unknowns);
+  system_of_scene(in, scene, groups, presses, center, gradient.data(), matrix.data());
   std::fill_n(motion, unknowns, 0.0);
   const Slid slid{center, motion};
-  Systems systems(in.groups_of(scene));
-  const Groups& groups = systems.groups;
+  Systems systems(groups);
   for (auto& s : systems.all) {
     if (!again || groups.is_left(s.first)) continue;
     s.state = kDone;
-    std::fill_n(factor + groups.matrix(s.first), s.size() * s.size(), std::numeric_limits<double>::quiet_NaN());
+    factors[groups.matrix(s.first)] = std::numeric_limits<double>::quiet_NaN();
   }
   for (int iteration = 0; iteration < kSlipIterations && !systems.all_done(); ++iteration) {
     for (const auto& s : systems.all) {
       if (s.state == kDone) continue;
-      std::copy_n(matrix.data() + groups.matrix(s.first), s.size() * s.size(), factor + groups.matrix(s.first));
+      std::copy_n(matrix.data() + groups.matrix(s.first), s.size() * s.size(), &factors[groups.matrix(s.first)]);
       systems.each_unknown(s, [&](int, int64_t k) { step[k] = gradient[k]; });
     }
-    add_lagged_of_scene(in, scene, slid, systems, step.data(), factor);
+    add_lagged_of_scene(in, scene, slid, systems, step.data(), factors.data());
     for (const auto& s : systems.all) {
       if (s.state == kDone) continue;
-      double* a = factor + groups.matrix(s.first);
+      double* a = &factors[groups.matrix(s.first)];
       systems.each_unknown(s, [&](int i, int64_t k) { own[i] = step[k], whole[i] = motion[k]; });
       if (iteration > 0) add_product(a, s.size(), whole.data(), own.data());
       cholesky(s.size(), a);
@@ -258,12 +260,12 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, bool again, double* ce
       for (const auto& s : systems.all) {
         if (s.state != kDone) systems.each_unknown(s, [&](int, int64_t k) { motion[k] = step[k]; });
       }
-      return;
+      break;
     }
     const auto lines = lines_of_scene(in, scene, slid, systems, step.data());
     for (auto& s : systems.all) {
       if (s.state == kDone) continue;
-      const double* a = factor + groups.matrix(s.first);
+      const double* a = &factors[groups.matrix(s.first)];
       systems.each_unknown(s, [&](int i, int64_t k) { own[i] = step[k], whole[i] = motion[k] + step[k]; });
       const double fall = energy_of(a, s.size(), own.data());
       const bool settled = fall <= kSettled * kSettled * energy_of(a, s.size(), whole.data());
@@ -279,6 +281,11 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, bool again, double* ce
       }
       systems.each_unknown(s, [&](int, int64_t k) { motion[k] += share * step[k]; });
     }
+  }
+  const Groups kept = in.groups_of(scene);
+  for (const auto& s : systems.all) {
+    const int64_t count = s.count <= kept.room ? s.size() * s.size() : 1;  // of others it says that there is none
+    std::copy_n(&factors[groups.matrix(s.first)], count, factor + kept.matrix(s.first));
   }
 }
 
@@ -303,6 +310,10 @@ void rigid_solve(const RigidInputs<T>& in, const double* factor, double* x) {
     const Systems systems(in.groups_of(scene));
     double* all = x + kUnknowns * in.bodies() * scene;
     for (const auto& s : systems.all) {
+      if (s.count > systems.groups.room) {  // it did not move
+        systems.each_unknown(s, [&](int, int64_t k) { all[k] = 0; });
+        continue;
+      }
       systems.each_unknown(s, [&](int i, int64_t k) { own[i] = all[k]; });
       cholesky_solve(s.size(), factor + in.matrix_size() * scene + systems.groups.matrix(s.first), own.data());
       systems.each_unknown(s, [&](int i, int64_t k) { all[k] = own[i]; });

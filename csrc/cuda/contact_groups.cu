@@ -116,6 +116,12 @@ __global__ void __launch_bounds__(kThreads)
   const int32_t count = groups.count(first), size = kUnknowns * count;
   if (count == 0) return;
   double* all = x + kUnknowns * n * scene;
+  if (count > in.room) {  // it did not move
+    for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads) {
+      all[kUnknowns * groups.member(first + i / kUnknowns) + i % kUnknowns] = 0;
+    }
+    return;
+  }
   const auto at = [&](int32_t i) -> double& {
     return all[kUnknowns * groups.member(first + i / kUnknowns) + i % kUnknowns];
   };

@@ -9,8 +9,7 @@ namespace diffvbd::cuda {
 using namespace contact;
 using rigid::Body;
 
-constexpr int kGroupThreads = 256;  // of a block that has a group of more
-constexpr int kOne = 128;           // threads of a block where each has an item of its own
+constexpr int kOne = 128;  // threads of a block where each has an item of its own
 
 inline unsigned blocks_for(int64_t items) { return static_cast<unsigned>((items + kOne - 1) / kOne); }
 __device__ __forceinline__ int64_t own_item() { return static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; }
@@ -41,8 +40,8 @@ __device__ __forceinline__ int side_of(const PairList& list, const int32_t* bodi
   return side == 0 || corner == sides(list.pairs[kPairRow * pair + 4]) ? side : -1;
 }
 
-// Motions of bodies and factors of groups, where these have up to kFew bodies, or more: then they are ordered, too.
-// again: as of rigid_system().
+// Motions of bodies and factors of groups: of those with up to kFew bodies, and of larger ones, which are put into the
+// order of their elimination first. again: as of rigid_system().
 template <class T>
 cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, bool again,
                       double* center, double* motion, double* factors, cudaStream_t stream);

@@ -69,7 +69,6 @@ struct System {
     const Vector c = center_of(b);
     each_side(presses.pairs(), b, item, [&](int64_t pair, int side) {
       const PairPress a = presses(pair, side);
-      if (a.body[side] < 0) return;
       const double share = borne(in, scene, a);
 #pragma unroll
       for (int j = 0; j < kUnknowns; ++j) {
@@ -322,7 +321,7 @@ __global__ void __launch_bounds__(kThreads)
       const Whole whole = whole_of(system.body(b), team);
       if (threadIdx.x == 0) rigid::put(system.center + 3 * system.member(b), whole.center);
     }
-    if (threadIdx.x == 0) *factor = CUDART_NAN;
+    if (threadIdx.x == 0) *factor = CUDART_NAN;  // which makes no number of all that is solved with it
     return;
   }
   team.each(count * count, [&](int32_t i) { touching[i] = 0; });

@@ -9,12 +9,12 @@ namespace diffvbd::cuda {
 namespace {
 
 constexpr unsigned kAll = 0xffffffffu;
-constexpr int kTeam = kGroupThreads, kTeamWarps = kTeam / 32;
+constexpr int kTeam = 256, kTeamWarps = kTeam / 32;
 constexpr int kOwn = kUnknowns + rigid::kSix;
 constexpr int kLines = 16;  // slips that a thread keeps while a step looks for its length
 constexpr int kMostUnknowns = kUnknowns * kMostCoupled;
 constexpr int64_t kShared = 16;    // bodies up to which their matrix is in shared memory, where there are many groups
-constexpr int kStatic = 16 << 10;  // bytes of shared memory beside the matrix, and some more
+constexpr int kStatic = 16 << 10;  // bytes of shared memory that are not for the matrix, at most
 
 struct Warp {
   int lane = static_cast<int>(threadIdx.x % 32);

@@ -168,8 +168,9 @@ cudaError_t solve_groups_of_many(const RigidInputs<T>& in, const PairRoom& room,
   auto unknowns = static_cast<int32_t>(kUnknowns * (largest < most_shared ? largest : most_shared));
   const auto bytes_of = [](int32_t n) { return static_cast<int>(n * n * sizeof(double)); };
   while (unknowns > 0 && bytes_of(unknowns) + kStatic > room_for) unknowns -= kUnknowns;
+  // the same for all scenes, which other threads may be about to launch
   const auto most = cudaFuncAttributeMaxDynamicSharedMemorySize;
-  if (auto error = cudaFuncSetAttribute(groups_kernel<T>, most, bytes_of(unknowns))) return error;
+  if (auto error = cudaFuncSetAttribute(groups_kernel<T>, most, room_for - kStatic)) return error;
   groups_kernel<T>
       <<<blocks, kTeam, bytes_of(unknowns), stream>>>(in, room, memory, ordered, center, motion, factors, unknowns);
   return cudaGetLastError();

@@ -27,7 +27,7 @@ def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: f
     [B, bodies, 3] [m], motion [B, bodies, 6], Cholesky factors of groups that touch [B, bodies, 6, 6 most_grouped()],
     and groups int32 [B, 4, bodies], as csrc/contact/groups.h has them. Of no more than FEW bodies: one factor
     [B, 6 bodies, 6 bodies], and no groups. friction_eps: [m], 0 without friction. again: only bodies move that are left
-    alone, because those that touch are too many."""
+    alone, because those that touch are too many; factors [B, bodies, 6, 6]."""
     return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps, again)
 
 
@@ -103,7 +103,8 @@ def _(*arguments):
     f = TouchingFields(*arguments[:_FIELDS])
     b, n = f.x.shape[0], f.free.shape[0]
     together = n <= FEW
-    shape = (b, UNKNOWNS * n, UNKNOWNS * n) if together else (b, n, UNKNOWNS, UNKNOWNS * most_grouped(n))
+    room = 1 if arguments[-1] else most_grouped(n)
+    shape = (b, UNKNOWNS * n, UNKNOWNS * n) if together else (b, n, UNKNOWNS, UNKNOWNS * room)
     doubles = (f.x.new_empty(size, dtype=torch.float64) for size in ((b, n, 3), (b, n, UNKNOWNS), shape))
     return (*doubles, f.x.new_empty((0,) if together else (b, 4, n), dtype=torch.int32))
 

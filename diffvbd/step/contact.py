@@ -40,9 +40,8 @@ if TYPE_CHECKING:
     from .arguments import Prepared
     from .predict import Begun
 
-# Rigid corrections after the last sweeps of bodies that are left alone, as those that touch are too many. When all
-# were, in stacks of two that rub the upper body crept at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; with 1 it fell.
-# Stacks of four fell with 6.
+# Rigid corrections after the last sweeps of bodies that are left alone, as those that touch are too many. In stacks of
+# two that rub the upper one creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; stacks of four fell with 6.
 LEFT_CORRECTIONS = 8
 FREE = 1e15  # [m] room that nothing fills
 CLOSE = 1e-3  # of dhat: pairs whose gap is so much wider do not push, however it is rounded
@@ -199,7 +198,7 @@ class ContactStep:
                 swept = swept_part(self, x, swept_from, now, near, part, policy, debug_step)
                 met.swept.append(swept)
                 x, limits, combined, lengths = swept
-                groups = x.new_zeros((0,))
+                groups = x
                 for again in self.corrections_after(r + 1 == self.parts):
                     if again and self._reads(x) and not any_left(groups):
                         break
@@ -245,9 +244,9 @@ class ContactStep:
         return x
 
     def corrections_after(self, last: bool) -> list[bool]:
-        """The rigid corrections that follow the sweeps of a part, by whether they are again of bodies that are left
-        alone. Coarse sweeps leave a stiff body turned, and one Newton step leaves so much of that that a free body
-        gained spin. Bodies left alone take several at the end to bear what lies on others."""
+        """The rigid corrections after the sweeps of a part: whether again of bodies left alone, which takes several at
+        the end to bear what lies on others. Coarse sweeps leave a stiff body turned, and one Newton step leaves so much
+        of that that a free body gained spin."""
         least = 1 if self.prepared.coarse is None else 2
         bodies = self.model.mesh.num_bodies
         leaves = last and self.barrier is not None and bodies > most_grouped(bodies)
@@ -255,8 +254,7 @@ class ContactStep:
 
     def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs, again: bool = False
                    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-        """x after the rigid correction of all bodies that are free, the share of its motion that each took, and their
-        groups."""
+        """x after the rigid correction of all free bodies, the share of its motion that each took, and their groups."""
         numbers = self.prepared.settings.numbers
         fields = self.touching(x, collider, start, listed)
         eps = 0.0 if self.model.friction is None else numbers.friction_eps

@@ -120,3 +120,54 @@ def test_stacks_stand(high: int, sweeps: int, device: str) -> None:
     x, v = run(model, 50, sweeps)
     assert float((x - model.rest_points).abs().max()) < 2 * high * HALF_GAP
     assert float(v.abs().max()) < 20 * SPEED
+
+
+def test_a_coefficient_of_zero_is_differentiated_as_one_next_to_it(device: str) -> None:
+    """One cube slides under another that lifts off, and into a third: without friction nothing joins the first two."""
+    cube = mesh.cube(2, size=0.1)
+    places = [(0.0, 0.0, 0.0), (0.01, 0.1003, 0.0), (0.1003, 0.0, 0.003), (2.0, 0.0, 0.0)]
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(1e3, 1e-3, self_contact=False), dv.Friction(0.0, 0.1))
+    model = dv.Model(mesh.join([cube.translate(place) for place in places]), energies=energies, device=device)
+    x = model.rest_points
+    v = torch.zeros_like(x)
+    v[:8, 0], v[8:16, 1], v[8:16, 2] = 0.3, 0.5, 0.1
+    weights = torch.linspace(-1.0, 1.0, x.numel(), dtype=x.dtype, device=x.device).reshape(x.shape)
+    slopes = []
+    for value in (0.0, 1e-9):
+        coefficient = x.new_tensor(value).requires_grad_()
+        _, end = dv.step(model, x, v, mu=1e6, lam=1e6, time_step=0.01, sweeps=0, gravity=(0.0, 0.0, 0.0),
+                         parameters={"friction.coefficient": coefficient})  # fmt: skip
+        (slope,) = torch.autograd.grad((weights * end).sum(), coefficient)
+        slopes.append(slope)
+    assert float(slopes[0].abs()) > 0
+    assert relative_error(slopes[0], slopes[1]) <= tolerance("finite_difference")
+
+
+def test_no_scenes_of_many_bodies(device: str) -> None:
+    model = stacks([2, 1, 1], device)
+    x = model.rest_points.expand(0, -1, -1).clone().requires_grad_()
+    end, _ = dv.step(model, x, torch.zeros_like(x), mu=1e6, lam=1e6, time_step=0.01, sweeps=2)
+    (slope,) = torch.autograd.grad(end.sum(), x)
+    assert slope.shape == x.shape
+
+
+def test_what_is_kept_of_corrections_again_is_small(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A factor of six unknowns for each body, and none for those that are not left alone."""
+    kept: list[tuple[Tensor, Tensor]] = []
+
+    def rigid_system(*arguments: Any) -> tuple[Tensor, ...]:
+        out = original(*arguments)
+        if arguments[-1]:
+            kept.append((out[2], out[1]))
+        return out
+
+    original = contact_rigid.rigid_system
+    monkeypatch.setattr(contact_rigid, "rigid_system", rigid_system)
+    model = stacks([MOST_COUPLED + 1, 2], device)
+    run(model, 1, 1)
+    bodies = MOST_COUPLED + 3
+    assert len(kept) == contact_step.LEFT_CORRECTIONS - 1
+    for factor, motion in kept:
+        assert factor.shape == (1, bodies, 6, 6)
+        assert float(motion[0, : MOST_COUPLED + 1].abs().max()) > 0
+        assert not motion[0, MOST_COUPLED + 1 :].any()

@@ -57,11 +57,13 @@ def solved(factor: Tensor, groups: Tensor, right: Tensor) -> Tensor:
     """[B, bodies, 6] of all systems."""
     if groups.numel() == 0:
         return torch.cholesky_solve(right.reshape(*factor.shape[:-1], 1), factor).reshape(right.shape)
-    out = torch.empty_like(right)
+    out = torch.zeros_like(right)  # of bodies that do not move, which have no factor
     for scene, (member, _, _, count) in enumerate(groups.long()):
         for place in count.nonzero()[:, 0].tolist():
             bodies = member[place : place + abs(int(count[place]))]
             size = 6 * len(bodies)
+            if size > factor.shape[-1]:
+                continue
             own = factor[scene, place:].reshape(-1)[: size * size].reshape(size, size)
             out[scene, bodies] = torch.cholesky_solve(right[scene, bodies].reshape(-1, 1), own).reshape(-1, 6)
     return out

@@ -26,9 +26,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_system(
   Tensor groups = torch::stable::empty(diffvbd::groups_shape(b, n), ScalarType::Int);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
+    auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
     Tensor centers = doubles({b, n, 3}), motion = doubles({b, n, contact::kUnknowns});
-    Tensor factor = doubles(diffvbd::matrix_shape(b, n));
+    if (!in.together()) in.room = diffvbd::room_of_groups(n, again);
+    Tensor factor = doubles(diffvbd::matrix_shape(b, n, again));
     diffvbd::rigid_system<T>(in, again, data<double>(centers), data<double>(motion), data<double>(factor),
                              in.groups ? data<int32_t>(groups) : nullptr);
     return std::make_tuple(centers, motion, factor, groups);
@@ -72,7 +73,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_end_backward(
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
+    auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
     diffvbd::require_factor(in, factor, x);
     diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
     diffvbd::require_of_bodies(in, share, x, 1);

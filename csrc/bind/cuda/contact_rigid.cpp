@@ -33,10 +33,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_system(
   Tensor groups = empty(x, diffvbd::groups_shape(b, n), ScalarType::Int);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
+    auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
     const auto doubles = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes, ScalarType::Double); };
     Tensor centers = doubles({b, n, 3}), motion = doubles({b, n, contact::kUnknowns});
-    Tensor factor = doubles(diffvbd::matrix_shape(b, n));
+    if (!in.together()) in.room = diffvbd::room_of_groups(n, again);
+    Tensor factor = doubles(diffvbd::matrix_shape(b, n, again));
     const Tensor work = empty(x, {cuda::rigid_system_bytes(in, room_of(f))}, ScalarType::Byte);
     check(
         cuda::rigid_system<T>(in, room_of(f), again, data<double>(centers), data<double>(motion), data<double>(factor),
@@ -92,7 +93,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_end_backward(
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
+    auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
     diffvbd::require_factor(in, factor, x);
     diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
     diffvbd::require_of_bodies(in, share, x, 1);
