@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 LEFT_CORRECTIONS = 8
 FREE = 1e15  # [m] room that nothing fills
 CLOSE = 1e-3  # of dhat: pairs whose gap is so much wider do not push, however it is rounded
-LONG_LIST = 1024  # pairs, of which it pays to find those that push
 MOST_CAPACITY = 2**26
 LOST = ("x: positions became non-finite {}: look with diffvbd.debug_checks(), use a smaller time_step or softer "
         "materials")  # fmt: skip
@@ -129,8 +128,9 @@ class ContactStep:
         return not x.is_cuda
 
     def _pushing(self, listed: Pairs) -> Pairs:
-        """The pairs of a long list that may push where it was made, if that may be read: most do not."""
-        if listed.pairs.shape[0] < LONG_LIST or not self._reads(self.x_prev):
+        """The pairs that may push where the list was made, if that may be read: most do not. However short the list is:
+        a scene alone has the bits that it has in a batch."""
+        if not self._reads(self.x_prev):
             return listed
         return some_of(listed, (listed.constants[:, -1] < (1 + CLOSE) * listed.constants[:, 0]).contiguous())[0]
 

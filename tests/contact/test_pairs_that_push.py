@@ -1,4 +1,4 @@
-"""Claim: of a long list the pairs that push are found first, which changes nothing."""
+"""Claim: finding the pairs that push first changes nothing; a scene alone has the bits that it has in a batch."""
 
 import importlib
 
@@ -20,13 +20,33 @@ def test_a_step_and_its_gradients_are_those_without_it(monkeypatch: pytest.Monke
     v = torch.zeros_like(start)
     v[27:] = torch.tensor([0.5, -0.3, 0.1])
 
-    def results(least: int) -> list[Tensor]:
-        monkeypatch.setattr(step, "LONG_LIST", least)
+    def results(finds: bool) -> list[Tensor]:
+        if not finds:
+            monkeypatch.setattr(step.ContactStep, "_pushing", lambda self, listed: listed)
         x, speed = start.clone().requires_grad_(), v.clone().requires_grad_()
         with dv.contact.record() as parts:
             end, _ = dv.step(model, x, speed, mu=1e5, lam=2e5, time_step=0.01, sweeps=3)
         assert len(parts[0].listed.pairs) > 0
         return [end, *torch.autograd.grad(end.square().sum(), (x, speed))]
 
-    for filtered, whole in zip(results(0), results(1 << 30), strict=True):
+    for filtered, whole in zip(results(True), results(False), strict=True):
         assert filtered.abs().max() > 0 and torch.equal(filtered, whole)
+
+
+def test_a_scene_alone_has_the_bits_that_it_has_in_a_batch() -> None:
+    cube, places = dv.mesh.cube(2, size=0.1), [(0.003 * (k % 2), 0.1005 * k, 0.002 * (k % 3)) for k in range(4)]
+    mesh = dv.mesh.join([cube.translate(place) for place in places])
+    low = float(mesh.points[:, 1].min()) - 5e-4
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(low, kappa=1e4, dhat=1e-3),
+                dv.PairBarrier(1e4, 1e-3, self_contact=False), dv.Friction(0.5))  # fmt: skip
+    model = dv.Model(mesh, energies=energies)
+
+    def end(scenes: int) -> Tensor:
+        x = model.rest_points.expand(scenes, -1, -1).contiguous()
+        motion = dv.rollout(model, x, torch.zeros_like(x), steps=4, mu=1e5, lam=1e5, time_step=0.01, sweeps=1,
+                            check_contact=False)  # fmt: skip
+        return motion.x[-1]
+
+    alone, batch = end(1), end(8)
+    assert not torch.equal(alone[0], model.rest_points)
+    assert torch.equal(batch, alone.expand_as(batch))
