@@ -128,8 +128,7 @@ class ContactStep:
         return not x.is_cuda
 
     def _pushing(self, listed: Pairs) -> Pairs:
-        """The pairs that may push where the list was made, if that may be read: most do not. However short the list is:
-        a scene alone has the bits that it has in a batch."""
+        """The pairs that may push where the list was made, if that may be read: the same of a scene in any batch."""
         if not self._reads(self.x_prev):
             return listed
         return some_of(listed, (listed.constants[:, -1] < (1 + CLOSE) * listed.constants[:, 0]).contiguous())[0]
