@@ -1,7 +1,6 @@
 """`diffvbd mesh`: a scan or a CAD surface to tets."""
 
 import argparse
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -49,8 +48,6 @@ def run(options: argparse.Namespace) -> None:
         raise FileNotFoundError(f"directory {out.parent} does not exist")
     repaired = dm.repair(options.surface, options.size, options.scale, options.up)
     print(repaired)
-    if options.size is None and options.scale is None and np.ptp(repaired.points, axis=0).max() > LARGE:
-        print(f"warning: the body is more than {LARGE:g} m long; for a file in mm give --scale 0.001", file=sys.stderr)
     if len(repaired.triangles) > options.max_triangles:
         print(f"{'decimated':9} to {options.max_triangles} triangles; --max-triangles keeps more, and takes longer")
     start = time.perf_counter()
@@ -62,7 +59,6 @@ def run(options: argparse.Namespace) -> None:
 
 # Formats of meshio that hold tets and need no further package.
 WRITTEN = (".msh", ".vtu", ".vtk", ".mesh", ".inp")
-LARGE = 10.0  # [m]; few bodies are so long, most scans whose millimetres are read as metres are
 POOR = 0.1  # a mean ratio below which a tet is stiffer than its material
 
 

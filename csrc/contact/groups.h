@@ -44,16 +44,4 @@ struct Groups {
   DIFFVBD_FN int64_t matrix(int32_t place) const { return rows ? kUnknowns * kUnknowns * room * place : 0; }
 };
 
-// A part of the matrix of a group, 6 x 6, between two of its bodies; `matrices` of the scene.
-struct MatrixPart {
-  double* at;
-  int64_t stride;
-  DIFFVBD_FN MatrixPart(double* matrices, const Groups& groups, int32_t row, int32_t column) {
-    const int32_t first = groups.first(row);
-    stride = int64_t{kUnknowns} * groups.count(first);
-    at = matrices + groups.matrix(first) + kUnknowns * (stride * groups.rank(row) + groups.rank(column));
-  }
-  DIFFVBD_FN double& operator()(int i, int j) const { return at[i * stride + j]; }
-};
-
 }  // namespace diffvbd::contact

@@ -64,4 +64,22 @@ DIFFVBD_FN double slip_share(double fall, const Excess& excess) {
   return high;
 }
 
+// Where Newton's method is with a system: on its way, at the motion it has settled at but not with the matrix there,
+// and done.
+enum Settling : uint8_t { kOnItsWay, kSettledAt, kDone };
+
+// The share of a step that is taken. fall, whole: twice what the step and the motion after it are worth in potential.
+template <class Share>
+DIFFVBD_FN double settle(Settling& state, bool rubs, double fall, double whole, const Share& share) {
+  if (!rubs || state == kSettledAt) {
+    state = kDone;
+    return 1;
+  }
+  if (fall <= kSettled * kSettled * whole) {
+    state = kSettledAt;
+    return 1;
+  }
+  return share(fall);
+}
+
 }  // namespace diffvbd::contact

@@ -17,6 +17,18 @@ using rigid::Body, rigid::Vector;
 
 namespace {
 
+// A part of the matrix of a group, 6 x 6, between two of its bodies; `matrices` of the scene.
+struct MatrixPart {
+  double* at;
+  int64_t stride;
+  MatrixPart(double* matrices, const Groups& groups, int32_t row, int32_t column) {
+    const int32_t first = groups.first(row);
+    stride = int64_t{kUnknowns} * groups.count(first);
+    at = matrices + groups.matrix(first) + kUnknowns * (stride * groups.rank(row) + groups.rank(column));
+  }
+  double& operator()(int i, int j) const { return at[i * stride + j]; }
+};
+
 void add_press(const PairPress& a, double share, const Groups& groups, const double* center, double* gradient,
                double* matrix) {
   double maps[2][kUnknowns][3], pressed[2][kUnknowns][3];
@@ -85,10 +97,6 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& grou
     add_press(press, borne(in, scene, press), groups, center, gradient, matrix);
   }
 }
-
-// Where Newton's method is with a system: on its way, at the motion it has settled at but not with the matrix there,
-// and done.
-enum Settling : uint8_t { kOnItsWay, kSettledAt, kDone };
 
 // The systems of a scene, one for each group.
 struct Systems {
@@ -268,17 +276,14 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, bool again, double* ce
       const double* a = &factors[groups.matrix(s.first)];
       systems.each_unknown(s, [&](int i, int64_t k) { own[i] = step[k], whole[i] = motion[k] + step[k]; });
       const double fall = energy_of(a, s.size(), own.data());
-      const bool settled = fall <= kSettled * kSettled * energy_of(a, s.size(), whole.data());
-      double share = 1;
-      if (s.state == kSettledAt || settled) {
-        s.state = s.state == kSettledAt ? kDone : kSettledAt;
-      } else {
-        share = slip_share(fall, [&](double tried) {
+      const double all = energy_of(a, s.size(), whole.data());
+      const double share = settle(s.state, true, fall, all, [&](double most) {
+        return slip_share(most, [&](double tried) {
           double sum = 0;
           for (const SlipLine& line : lines[&s - systems.all.data()]) sum += line.excess(tried);
           return sum;
         });
-      }
+      });
       systems.each_unknown(s, [&](int, int64_t k) { motion[k] += share * step[k]; });
     }
   }

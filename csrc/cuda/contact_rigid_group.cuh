@@ -83,13 +83,13 @@ struct GroupSystem {
   __device__ void each_side(int32_t b, bool which, const F& f) const {
     const PairList& list = which ? in.lagged : in.gate.listed;
     const int64_t before = which ? room.listed : 0;
-    const Body<T> own = body(b);
-    for (int32_t i = 0; i < own.size(); ++i) {
-      const int64_t corner = scene * in.gate.corners + own.vertex(i);
+    const Body<T> whose = body(b);
+    for (int32_t i = 0; i < whose.size(); ++i) {
+      const int64_t corner = scene * in.gate.corners + whose.vertex(i);
       for (int32_t from = list.ptr[corner]; from < list.ptr[corner + 1]; from += 32) {
         const int32_t mine = from + static_cast<int32_t>(threadIdx.x % 32);
         const int32_t entry = mine < list.ptr[corner + 1] ? list.entry[mine] : 3;
-        f(before + (entry >> 2), side_of(list, sides + 2 * before, entry, own.body));
+        f(before + (entry >> 2), side_of(list, sides + 2 * before, entry, whose.body));
       }
     }
   }
@@ -202,7 +202,7 @@ struct GroupSystem {
       each_row([&](int64_t row, int64_t pair) {
         PairPress a;
         Rubbing rubs;
-        lagged_sides(in, pair, CornerPoints<T>{in, false}, -1, a, rubs);
+        lagged_sides(in, pair, CornerPoints<T>{in, false}, -1, a, rubs);  // it acts, or had no row
         a.force = Vector{}, a.stiffness = Sym3<double>{};
         store_press(a, press + kPressDoubles * row);
         double* to = rubbing + kRubbing * pair;

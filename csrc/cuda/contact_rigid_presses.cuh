@@ -1,5 +1,4 @@
-// What pairs press in a rigid correction, for whoever adds it up: barriers as they were stored, friction as bodies go;
-// and how Newton's method goes on.
+// What pairs press in a rigid correction, for whoever adds it up: barriers as they were stored, friction as bodies go.
 #pragma once
 
 #include "../contact/rigid_slip.h"
@@ -38,24 +37,6 @@ struct Rubs {
     return a;
   }
 };
-
-// Where Newton's method is with a system: on its way, at the motion it has settled at but not with the matrix there,
-// and done.
-enum Settling : uint8_t { kOnItsWay, kSettledAt, kDone };
-
-// The share of a step that is taken. fall, whole: twice what the step and the motion after it are worth in potential.
-template <class Share>
-__device__ double settle(Settling& state, bool rubs, double fall, double whole, const Share& share) {
-  if (!rubs || state == kSettledAt) {
-    state = kDone;
-    return 1;
-  }
-  if (fall <= kSettled * kSettled * whole) {
-    state = kSettledAt;
-    return 1;
-  }
-  return share(fall);
-}
 
 }  // namespace
 }  // namespace diffvbd::cuda
