@@ -1,5 +1,6 @@
 // Which share of its rigid motion each body may take: it is tried, and tried again shorter, until nothing holds it up
-// and the potential of the scene does not rise (docs/method.md, section 18).
+// and the potential does not rise. Bodies decide this with those that they may come to press, and with no others
+// (docs/method.md, section 18).
 #pragma once
 
 #include "rigid_rub.h"
@@ -10,6 +11,14 @@ constexpr int kTries = 6;       // of motions, each shorter for some bodies, or 
 constexpr int kShorter = 3;     // of these: how often a body whose way is blocked tries a shorter one before it stays
 constexpr int kSpreads = 4;     // how often a shorter motion is handed on to the bodies that one touches
 constexpr double kRise = 1e-9;  // of the potential, that counts as none
+constexpr double kRounded = 1e-6;  // of a length, that rounding cannot reach
+
+// The body that a pair counts for, which decides with all others that it moves: the first of them, or -1.
+template <class T>
+DIFFVBD_FN int32_t owner_of(const RigidInputs<T>& in, const int32_t* record) {
+  const int32_t first = moving_body(in, record[0]);
+  return 0 <= first ? first : moving_body(in, record[sides(record[4])]);
+}
 
 // Whether the energies of a vertex admit what it tries.
 template <class T>
@@ -23,7 +32,39 @@ DIFFVBD_FN bool admitted(const RigidInputs<T>& in, const rigid::Body<T>& b, int3
   return out;
 }
 
-// Whether a scene may go as it tries: all fit, and its potential does not rise.
+// Of a vertex, whatever share of its motion its body takes: how far it may be from where gaps were taken, and the size
+// of its position, which rounding is measured by.
+struct Farthest {
+  double way, size;
+};
+template <class T>
+DIFFVBD_FN Farthest farthest_of(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, const double* center,
+                                const double* motion) {
+  const Vector x = b.position(v), arm = x - rigid::Body<double>::at(center);
+  const Vector since = x - rigid::Body<T>::at(in.gate.center + 3 * b.row(v));
+  const Vector turn = rigid::Body<double>::at(motion), shift = rigid::Body<double>::at(motion + 3);
+  const auto length = [](const Vector& a) { return square_root(dot(a, a)); };
+  const Vec3<T> at = point_at(in.gate.x, b.row(v));
+  const Vec3<T> from = in.gate.origin ? point_at(in.gate.origin, b.row(v)) : zero3<T>();
+  const double way = length(since) + length(shift) + length(turn) * length(arm);
+  return {(1 + kRounded) * way, size_of(at + from)};
+}
+
+// Whether a listed pair may come within reach of its barrier, whatever share of its motion each body takes: a gap
+// shrinks by no more than its sides have moved since it was taken. way, size [bodies]: the farthest of their vertices.
+template <class T>
+DIFFVBD_FN bool may_press(const RigidInputs<T>& in, int64_t pair, const double* way, const double* size) {
+  if (!is_between(in, pair)) return false;
+  const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
+  const T* constants = in.gate.constants + kConstants * pair;
+  const int32_t a = in.gate.body[record[0]], b = in.gate.body[record[sides(record[4])]];
+  if (a >= in.bodies() || b >= in.bodies()) return true;  // its gap is not of the time of the centers
+  const double gap = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
+  const T larger = static_cast<T>(size[a] < size[b] ? size[b] : size[a]);
+  return !(way[a] + way[b] < (1 - kRounded) * (gap - guard_of_size(larger)));  // as stays_far()
+}
+
+// Whether bodies may go as they try: all fit, and their potential does not rise.
 DIFFVBD_FN bool is_safe(double before, double after, bool fits) {
   return fits && after <= before + kRise * absolute(before);
 }

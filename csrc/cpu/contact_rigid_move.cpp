@@ -1,7 +1,7 @@
 #include <torch/csrc/stable/ops.h>
 
 #include <algorithm>
-#include <cmath>
+#include <numeric>
 #include <utility>
 #include <vector>
 
@@ -15,8 +15,6 @@ using rigid::Body, rigid::Vector;
 
 namespace {
 
-constexpr double kRounded = 1e-6;  // of a length, that rounding cannot reach
-
 template <class T>
 class Tries {
  public:
@@ -27,10 +25,12 @@ class Tries {
         motion_(motion),
         move_(move),
         share_(share),
+        lead_(in.bodies()),
         low_(in.bodies()),
-        blocked_(in.bodies()) {
+        decided_(in.bodies(), 0) {
+    std::iota(lead_.begin(), lead_.end(), 0);
     find_near();
-    before_ = potential(false, [&](const PairPress& a) {
+    before_ = potentials(false, [&](const PairPress& a) {
       if (a.body[0] >= 0 && a.body[1] >= 0) touching_.emplace_back(a.body[0], a.body[1]);
     });
   }
@@ -41,14 +41,21 @@ class Tries {
     state.motion = motions.data() - scene_ * in_.scene.vertices;
     std::fill_n(share_, n, 1.0);
     for (int attempt = 0; attempt < kTries; ++attempt) {
-      displace();
-      for (int64_t v = 0; v < in_.scene.vertices; ++v) {
-        motions[v] = motion_of(in_.gate, state, scene_ * in_.scene.vertices + v);
-      }
-      const bool fits = test(state);
-      const double after = fits ? potential(true, [](const PairPress&) {}) : 0;
-      if (is_safe(before_, after, fits)) return;
-      for (int32_t k = 0; k < n; ++k) low_[k] = shortened(blocked_[k], fits, attempt);
+      each_open([&](int32_t k) { displace(k); });
+      each_vertex([&](int64_t row) { motions[row - scene_ * in_.scene.vertices] = motion_of(in_.gate, state, row); });
+      const std::vector<uint8_t> stopped = test(state);
+      const std::vector<double> after = potentials(true, [](const PairPress&) {});
+      const uint8_t* blocked = state.blocked + scene_ * n;
+      bool open = false;
+      each_open([&](int32_t k) {
+        const int32_t of = lead_[k];
+        if (is_safe(before_[of], after[of], !stopped[of])) {
+          decided_[k] = 1;
+        } else {
+          low_[k] = shortened(blocked[k], !stopped[of], attempt), open = true;
+        }
+      });
+      if (!open) return;
       for (int spread = 0; spread < kSpreads; ++spread) {
         std::vector<double> next = low_;  // from one to the next only, whatever their order
         for (const auto& [a, b] : touching_) {
@@ -57,100 +64,123 @@ class Tries {
         }
         low_ = next;
       }
-      for (int32_t k = 0; k < n; ++k) share_[k] *= low_[k];
+      each_open([&](int32_t k) { share_[k] *= low_[k]; });
     }
-    std::fill_n(share_, n, 0.0);
-    displace();
+    each_open([&](int32_t k) { share_[k] = 0, displace(k); });
   }
 
  private:
-  // The listed pairs that some share of the motions may bring within reach of their barrier. A gap shrinks by no more
-  // than its sides have moved since it was taken.
+  // Calls f(body) for those that have not decided yet.
+  template <class F>
+  void each_open(const F& f) const {
+    for (int32_t k = 0; k < in_.bodies(); ++k)
+      if (!decided_[k]) f(k);
+  }
+  template <class F>
+  void each_vertex(const F& f) const {  // of theirs
+    each_open([&](int32_t k) {
+      const Body<T> body{in_.scene, scene_, k};
+      for (int32_t i = 0; i < body.size(); ++i) f(body.row(body.vertex(i)));
+    });
+  }
+  int32_t lead_of(int32_t body) {
+    while (lead_[body] != body) body = lead_[body] = lead_[lead_[body]];
+    return body;
+  }
+  // The bodies that a pair moves with decide together.
+  void join(const int32_t* record) {
+    const int32_t a = moving_body(in_, record[0]), b = moving_body(in_, record[sides(record[4])]);
+    if (a < 0 || b < 0) return;
+    const int32_t first = lead_of(a), second = lead_of(b);
+    lead_[std::max(first, second)] = std::min(first, second);
+  }
+  // The listed pairs that may press, and who decides together.
   void find_near() {
-    std::vector<double> farthest(in_.bodies(), 0.0);  // that a vertex of each body may be from where it was then
-    std::vector<T> size(in_.bodies(), T(0));          // of positions, which rounding is measured by
+    std::vector<double> way(in_.bodies(), 0.0), size(in_.bodies(), 0.0);
     for (int32_t k = 0; k < in_.bodies(); ++k) {
       const Body<T> body{in_.scene, scene_, k};
-      const Vector center = vector_of(center_ + 3 * k);
-      const double *turn = motion_ + kUnknowns * k, *shift = turn + 3;
-      const double angle = std::hypot(turn[0], turn[1], turn[2]), way = std::hypot(shift[0], shift[1], shift[2]);
       for (int32_t i = 0; i < body.size(); ++i) {
-        const Vector x = body.position(body.vertex(i)), arm = x - center;
-        const Vector since = x - Body<T>::at(in_.gate.center + 3 * body.row(body.vertex(i)));
-        const double far = std::sqrt(dot(since, since)) + way + angle * std::sqrt(dot(arm, arm));
-        farthest[k] = std::max(farthest[k], (1 + kRounded) * far);
-        const Vec3<T> at = point_at(in_.gate.x, body.row(body.vertex(i)));
-        const Vec3<T> from = in_.gate.origin ? point_at(in_.gate.origin, body.row(body.vertex(i))) : zero3<T>();
-        size[k] = std::max(size[k], size_of(at + from));
+        const Farthest own = farthest_of(in_, body, body.vertex(i), center_ + 3 * k, motion_ + kUnknowns * k);
+        way[k] = std::max(way[k], own.way), size[k] = std::max(size[k], own.size);
       }
     }
     for (int64_t i = in_.first_listed(scene_); i < in_.first_listed(scene_ + 1); ++i) {
-      if (!is_between(in_, i)) continue;
-      const int32_t* record = in_.gate.listed.pairs + kPairRow * i;
-      const T* constants = in_.gate.constants + kConstants * i;
-      const int32_t a = in_.gate.body[record[0]], b = in_.gate.body[record[sides(record[4])]];
-      const bool known = a < in_.bodies() && b < in_.bodies();  // whose gap is of the time of the centers
-      const double gap = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
-      const double room = known ? gap - guard_of_size(std::max(size[a], size[b])) : gap;  // as stays_far()
-      if (!known || !(farthest[a] + farthest[b] < (1 - kRounded) * room)) near_.push_back(i);
+      if (may_press(in_, i, way.data(), size.data())) near_.push_back(i), join(listed(i));
     }
+    for (int64_t i = in_.first_lagged(scene_); i < in_.first_lagged(scene_ + 1); ++i) {
+      if (Lag<T>(in_.lag + kLagScalars * i).active()) join(lagged(i));
+    }
+    for (int32_t k = 0; k < in_.bodies(); ++k) lead_[k] = lead_of(k);
   }
-  // Of all bodies, where they are or would go; calls f(press) for each listed pair that pushes.
+  const int32_t* listed(int64_t i) const { return in_.gate.listed.pairs + kPairRow * i; }
+  const int32_t* lagged(int64_t i) const { return in_.lagged.pairs + kPairRow * i; }
+  // The first of the bodies that a pair moves with, if they have yet to decide; or -1.
+  int32_t open_lead_of(const int32_t* record) const {
+    const int32_t body = owner_of(in_, record);
+    return body >= 0 && !decided_[body] ? lead_[body] : -1;
+  }
+  // Of bodies that decide together, by their first one: where they are or would go. Calls f(press) for each listed pair
+  // that pushes.
   template <class F>
-  double potential(bool moved, const F& f) const {
-    double value = 0;
-    for (int32_t k = 0; k < in_.bodies(); ++k) {
+  std::vector<double> potentials(bool moved, const F& f) const {
+    std::vector<double> out(in_.bodies(), 0.0);
+    each_open([&](int32_t k) {
       const Body<T> body{in_.scene, scene_, k};
       double own = 0;
       for (int32_t i = 0; in_.free[k] && i < body.size(); ++i) own += vertex_value(in_, body, body.vertex(i), moved);
-      value += own;
-    }
+      out[lead_[k]] += own;
+    });
     const CornerPoints<T> at{in_, moved};
     PairPress press;
     for (const int64_t i : near_) {
-      if (!barrier_press(in_, i, at, press)) continue;
-      value += press.value;
+      const int32_t of = open_lead_of(listed(i));
+      if (of < 0 || !barrier_press(in_, i, at, press)) continue;
+      out[of] += press.value;
       f(press);
     }
     for (int64_t i = in_.first_lagged(scene_); i < in_.first_lagged(scene_ + 1); ++i) {
-      if (lagged_press(in_, i, at, Slid{}, press, -1)) value += press.value;
+      const int32_t of = open_lead_of(lagged(i));
+      if (0 <= of && lagged_press(in_, i, at, Slid{}, press, -1)) out[of] += press.value;
     }
-    return value;
+    return out;
   }
-  void displace() const {
-    for (int32_t k = 0; k < in_.bodies(); ++k) {
-      const Body<T> body{in_.scene, scene_, k};
-      const Vector center = vector_of(center_ + 3 * k);
-      for (int32_t i = 0; i < body.size(); ++i) {
-        const int32_t v = body.vertex(i);
-        const Vector d = displaced(motion_ + kUnknowns * k, share_[k], body.position(v) - center);
-        rigid::put(move_ + 3 * body.row(v), d);
-      }
+  void displace(int32_t k) const {
+    const Body<T> body{in_.scene, scene_, k};
+    const Vector center = vector_of(center_ + 3 * k);
+    for (int32_t i = 0; i < body.size(); ++i) {
+      const int32_t v = body.vertex(i);
+      const Vector d = displaced(motion_ + kUnknowns * k, share_[k], body.position(v) - center);
+      rigid::put(move_ + 3 * body.row(v), d);
     }
   }
-  bool test(const AdvanceState<T>& state) {
+  // Marks the bodies whose way is blocked; and whether any is, of those that decide together, by their first one.
+  std::vector<uint8_t> test(const AdvanceState<T>& state) {
     uint8_t* blocked = state.blocked + scene_ * in_.bodies();
+    std::vector<uint8_t> out(in_.bodies(), 0);
     std::fill_n(blocked, in_.bodies(), uint8_t{0});
-    for (const int64_t i : near_) try_pair(in_.gate, state, i, 0);
-    for (int32_t k = 0; k < in_.bodies(); ++k) {
+    for (const int64_t i : near_) {
+      if (open_lead_of(listed(i)) >= 0) try_pair(in_.gate, state, i, 0);
+    }
+    each_open([&](int32_t k) {
       const Body<T> body{in_.scene, scene_, k};
       for (int32_t i = 0; in_.free[k] && i < body.size(); ++i) {
         stay(in_.gate, state, body.row(body.vertex(i)), 0);
         if (!admitted(in_, body, body.vertex(i))) blocked[k] = 1;
       }
-    }
-    std::copy_n(blocked, in_.bodies(), blocked_.begin());
-    return std::find(blocked_.begin(), blocked_.end(), 1) == blocked_.end();
+      if (blocked[k]) out[lead_[k]] = 1;
+    });
+    return out;
   }
 
   const RigidInputs<T>& in_;
   const int64_t scene_;
   const double *center_, *motion_;
   T* move_;
-  double *share_, before_ = 0;
+  double* share_;
+  std::vector<int32_t> lead_;  // the first of the bodies that decide together
+  std::vector<double> low_, before_;
+  std::vector<uint8_t> decided_;
   std::vector<int64_t> near_;
-  std::vector<double> low_;
-  std::vector<uint8_t> blocked_;
   std::vector<std::pair<int32_t, int32_t>> touching_;
 };
 

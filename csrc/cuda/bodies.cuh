@@ -53,7 +53,7 @@ struct Tile {
   int lane;
   unsigned mask;
   __device__ Tile()
-      : lane(threadIdx.x % width), mask(width == 1 ? 0 : ((1u << width) - 1) << (threadIdx.x % 32 / width * width)) {}
+      : lane(threadIdx.x % width), mask(width == 1 ? 0 : (~0u >> (32 - width)) << (threadIdx.x % 32 / width * width)) {}
   __device__ bool leads() const { return lane == 0; }
   template <int n, class F>
   __device__ void sum(int32_t count, double* out, const F& f) const {

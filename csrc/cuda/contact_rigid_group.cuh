@@ -16,16 +16,7 @@ constexpr int kMostUnknowns = kUnknowns * kMostCoupled;
 constexpr int64_t kShared = 16;    // bodies up to which their matrix is in shared memory, where there are many groups
 constexpr int kStatic = 16 << 10;  // bytes of shared memory that are not for the matrix, at most
 
-struct Warp {
-  int lane = static_cast<int>(threadIdx.x % 32);
-  __device__ bool leads() const { return lane == 0; }
-  __device__ void meet() const { __syncwarp(); }
-  template <int n, class F>
-  __device__ void sum(int32_t count, double* out, const F& f) const {
-    own_sum<n>(lane, count, 32, out, f);
-    butterfly<n, 32>(kAll, out);
-  }
-};
+using Warp = Tile<32>;
 
 // The system of a group.
 template <class T>

@@ -333,7 +333,7 @@ class ContactStep:
         assert surface is not None and barrier is not None
         if barrier.capacity is None and not self.x_prev.is_cuda:
             return MOST_CAPACITY  # the list is as long as it must be
-        return max(surface.capacity * scenes, 0 if barrier.capacity is not None else LEAST_CAPACITY)
+        return max(surface.capacity * scenes, LEAST_CAPACITY if scenes and barrier.capacity is None else 0)
 
     def _check(self, r: int, counts: list[int], met: Met) -> None:
         """Raises where a detection found more than fits, surfaces that touch, or a way that pairs close to what is

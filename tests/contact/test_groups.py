@@ -171,3 +171,34 @@ def test_what_is_kept_of_corrections_again_is_small(device: str, monkeypatch: py
         assert factor.shape == (1, bodies, 6, 6)
         assert float(motion[0, : MOST_COUPLED + 1].abs().max()) > 0
         assert not motion[0, MOST_COUPLED + 1 :].any()
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_what_happens_elsewhere_changes_nothing(friction: float, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """How far corrections go is decided by those that may press each other: a stack that stands does not know of cubes
+    that are thrown at each other far away, whose corrections are shortened."""
+    shares: list[Tensor] = []
+
+    def correct(*arguments: Any) -> Any:
+        out = original(*arguments)
+        shares.append(out[1].clone())
+        return out
+
+    original = contact_step.correct
+    monkeypatch.setattr(contact_step, "correct", correct)
+    model = stacks([5, 1, 1, 1, 2, 2], device)
+    x = model.rest_points.clone()
+    own = 5 * 8
+    x[own + 8 : own + 16, 0] += -0.3 + 0.1 + 5e-3  # next to the one before
+    ends = []
+    for speed in (0.0, 20.0):
+        shares.clear()
+        v = torch.zeros_like(x)
+        v[own : own + 8] = v.new_tensor([speed, 0.0, 0.3 * speed])
+        parameters = {"friction.coefficient": x.new_tensor(friction)}
+        end, after = dv.step(model, x, v, mu=1e6, lam=1e6, time_step=0.01, sweeps=3, parameters=parameters)
+        assert float((after[own : own + 16] - v[own : own + 16]).norm()) > speed / 10
+        ends.append(torch.cat([end[:own], after[:own]]))
+    assert any(bool((share[0, 5:7] < 1).any()) for share in shares)
+    assert all(bool((share[0, :5] == 1).all()) for share in shares)
+    assert torch.equal(*ends)
