@@ -173,32 +173,36 @@ def test_what_is_kept_of_corrections_again_is_small(device: str, monkeypatch: py
         assert not motion[0, MOST_COUPLED + 1 :].any()
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.5])
-def test_what_happens_elsewhere_changes_nothing(friction: float, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """How far corrections go is decided by those that may press each other: a stack that stands does not know of cubes
-    that are thrown at each other far away, whose corrections are shortened."""
+@pytest.mark.parametrize("seed", [76, 220, 275])  # with these the stack moved otherwise when scenes decided as a whole
+def test_what_happens_elsewhere_changes_nothing(seed: int, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """How far corrections go is decided by bodies that may press each other: a stack that stands does not know of three
+    cubes that are thrown far away, whose corrections are shortened."""
     shares: list[Tensor] = []
 
     def correct(*arguments: Any) -> Any:
         out = original(*arguments)
-        shares.append(out[1].clone())
+        shares.append(out[1][0])
         return out
 
     original = contact_step.correct
     monkeypatch.setattr(contact_step, "correct", correct)
-    model = stacks([5, 1, 1, 1, 2, 2], device)
-    x = model.rest_points.clone()
-    own = 5 * 8
-    x[own + 8 : own + 16, 0] += -0.3 + 0.1 + 5e-3  # next to the one before
-    ends = []
-    for speed in (0.0, 20.0):
+    barrier = dv.PairBarrier(1e4, 1e-3, self_contact=False, detections=1)  # whose number faster bodies would raise
+    energies = (*ENERGIES[:2], barrier, dv.Friction(2.0, 1.0))
+    model = dv.Model(stacks([4, 2, 1], device).mesh, energies=energies, device=device)
+    x, own = model.rest_points.clone(), 4 * 8
+    x[own + 2 * 8 :, 0] -= 0.195
+    arm = x[own:].reshape(3, 8, 3) - x[own:].reshape(3, 8, 3).mean(1, keepdim=True)
+    shift, turn = (torch.randn(3, 1, 3, dtype=x.dtype, generator=torch.Generator().manual_seed(seed + k)).to(x.device)
+                   for k in (0, 1000))  # fmt: skip
+    thrown = 3 * shift + 30 * torch.linalg.cross(turn.expand(3, 8, 3), arm)
+    ends, taken = [], []
+    for speed in (0.0, 1.0):
         shares.clear()
         v = torch.zeros_like(x)
-        v[own : own + 8] = v.new_tensor([speed, 0.0, 0.3 * speed])
-        parameters = {"friction.coefficient": x.new_tensor(friction)}
-        end, after = dv.step(model, x, v, mu=1e6, lam=1e6, time_step=0.01, sweeps=3, parameters=parameters)
-        assert float((after[own : own + 16] - v[own : own + 16]).norm()) > speed / 10
+        v[own:] = speed * thrown.reshape(-1, 3)
+        end, after = dv.step(model, x, v, mu=1e6, lam=1e6, time_step=0.01, sweeps=3)
         ends.append(torch.cat([end[:own], after[:own]]))
-    assert any(bool((share[0, 5:7] < 1).any()) for share in shares)
-    assert all(bool((share[0, :5] == 1).all()) for share in shares)
+        taken.append(torch.stack(shares))
+    assert bool((taken[1][:, 4:] < 1).any())
+    assert torch.equal(taken[0][:, :4], taken[1][:, :4])
     assert torch.equal(*ends)
