@@ -173,7 +173,7 @@ def test_what_is_kept_of_corrections_again_is_small(device: str, monkeypatch: py
         assert not motion[0, MOST_COUPLED + 1 :].any()
 
 
-@pytest.mark.parametrize("seed", [76, 220, 275])  # with these the stack moved otherwise when scenes decided as a whole
+@pytest.mark.parametrize("seed", [76, 220, 319])  # with these the stack moved otherwise when scenes decided as a whole
 def test_what_happens_elsewhere_changes_nothing(seed: int, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """How far corrections go is decided by bodies that may press each other: a stack that stands does not know of three
     cubes that are thrown far away, whose corrections are shortened."""
@@ -190,6 +190,7 @@ def test_what_happens_elsewhere_changes_nothing(seed: int, device: str, monkeypa
     energies = (*ENERGIES[:2], barrier, dv.Friction(2.0, 1.0))
     model = dv.Model(stacks([4, 2, 1], device).mesh, energies=energies, device=device)
     x, own = model.rest_points.clone(), 4 * 8
+    x[own:, 0] += 2.0
     x[own + 2 * 8 :, 0] -= 0.195
     arm = x[own:].reshape(3, 8, 3) - x[own:].reshape(3, 8, 3).mean(1, keepdim=True)
     shift, turn = (torch.randn(3, 1, 3, dtype=x.dtype, generator=torch.Generator().manual_seed(seed + k)).to(x.device)
