@@ -8,27 +8,39 @@
 namespace diffvbd::contact {
 
 constexpr int kSlipIterations = 200;  // of Newton's method at most: mostly it settles within 10 to 30
-constexpr int kHalvings = 10;         // in the search for the length of a step
-constexpr double kOvershoot = 0.1;    // slope at the end of a step over that at its start, that is none
+constexpr int kHalvings = 10;         // in the search for the length of a step, at most
+constexpr double kOvershoot = 0.1;    // slope at the end of a step over that at its start, that is small
 constexpr double kSettled = 1e-9;     // of the whole, a step after which there is but one more
 
-// A slip along a step of Newton's method.
+// FrictionRate's value for the square of a length, without the divisions that take most of the time of a search.
+DIFFVBD_FN double friction_rate(double square, double eps) {
+  if (!(0 < square)) return 2 / eps;
+#ifdef __CUDA_ARCH__
+  const double inverse = rsqrt(square);
+#else
+  const double inverse = 1 / square_root(square);
+#endif
+  if (!(square < eps * eps)) return inverse;
+  const double over = 1 / eps;
+  return (2 - square * inverse * over) * over;
+}
+
+// A slip u along a step c of Newton's method, as far as friction depends on it.
 struct SlipLine {
-  Vector slip, change;
-  double size, eps, rate, bend;  // what the step takes friction for: f1(|u|) / |u| at its start, and its derivative
+  double start, along, way;  // u u, u c and c c
+  double size, rate, bend;   // what the step takes friction for: f1(|u|) / |u| at its start, and its derivative
 
   SlipLine() = default;
-  DIFFVBD_FN SlipLine(const Vector& from, const Vector& way, double load, double smoothing)
-      : slip(from), change(way), size(load), eps(smoothing) {
-    const FrictionRate<double> first(square_root(dot(slip, slip)), eps);
-    rate = first.value, bend = first.curvature * dot(slip, change);
+  DIFFVBD_FN SlipLine(const Vector& slip, const Vector& change, double load, double eps)
+      : start(dot(slip, slip)), along(dot(slip, change)), way(dot(change, change)), size(load) {
+    const FrictionRate<double> first(square_root(start), eps);
+    rate = first.value, bend = first.curvature * along;
   }
 
   // The slope of the potential after a share of the step, over what that takes it for.
-  DIFFVBD_FN double excess(double share) const {
-    const Vector now = slip + share * change;
-    const FrictionRate<double> last(square_root(dot(now, now)), eps);
-    return size * dot((last.value - rate) * now - (share * bend) * slip, change);
+  DIFFVBD_FN double excess(double share, double eps) const {
+    const double toward = along + share * way, square = start + share * (along + toward);
+    return size * ((friction_rate(square, eps) - rate) * toward - share * bend * along);
   }
 };
 
@@ -51,15 +63,16 @@ DIFFVBD_FN SlipLine slip_line(const RigidInputs<T>& in, const rigid::Body<T>& b,
   return {a.slip, way - dot(a.n, way) * a.n, a.size, in.friction_eps};
 }
 
-// The share of a step that is taken. fall: twice by how much it lowers what it takes the potential for; `excess` of a
-// share: that of all that slips.
+// The share of a step that is taken, after which the slope of the potential is small or negative. fall: twice by how
+// much the step lowers what it takes the potential for; `excess` of a share: that of all that slips.
 template <class Excess>
 DIFFVBD_FN double slip_share(double fall, const Excess& excess) {
   if (!(kOvershoot * fall < excess(1.0))) return 1;
   double low = 0, high = 1;
   for (int i = 0; i < kHalvings; ++i) {
-    const double middle = 0.5 * (low + high);
-    (excess(middle) < fall * (1 - middle) ? low : high) = middle;
+    const double middle = 0.5 * (low + high), slope = excess(middle) - fall * (1 - middle);
+    if (absolute(slope) <= kOvershoot * fall) return middle;
+    (slope < 0 ? low : high) = middle;
   }
   return high;
 }

@@ -280,7 +280,7 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, bool again, double* ce
       const double share = settle(s.state, true, fall, all, [&](double most) {
         return slip_share(most, [&](double tried) {
           double sum = 0;
-          for (const SlipLine& line : lines[&s - systems.all.data()]) sum += line.excess(tried);
+          for (const SlipLine& line : lines[&s - systems.all.data()]) sum += line.excess(tried, in.friction_eps);
           return sum;
         });
       });
