@@ -256,19 +256,24 @@ DIFFVBD_FN FloorSlip floor_slip(const RigidInputs<T>& in, const rigid::Body<T>& 
   return {n, travel - dot(n, travel) * n, h * h * double(lag[0])};
 }
 
-// Adds that of all planes, linear about where the vertex would be after `way`.
+// Adds that of a plane, linear about where the vertex would be after `way`.
+template <class T>
+DIFFVBD_FN void add_floor_slip(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, int plane,
+                               const Vector& way, Vector& g, Sym3<double>& H) {
+  const FloorSlip a = floor_slip(in, b, v, plane, way);
+  const FrictionRate<double> f(square_root(dot(a.slip, a.slip)), in.friction_eps);
+  const Vector along = way - dot(a.n, way) * a.n;
+  g += a.size * (f.value * (a.slip - along) - (f.curvature * dot(a.slip, along)) * a.slip);
+  add_diagonal(H, a.size * f.value);
+  add_outer(H, -a.size * f.value, a.n);
+  add_outer(H, a.size * f.curvature, a.slip);
+}
+// And of all.
 template <class T>
 DIFFVBD_FN void add_floor_friction(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, const Vector& way,
                                    Vector& g, Sym3<double>& H) {
   for (int k = 0; k < in.planes; ++k) {
-    if (!bears(in, b, v, k)) continue;
-    const FloorSlip a = floor_slip(in, b, v, k, way);
-    const FrictionRate<double> f(square_root(dot(a.slip, a.slip)), in.friction_eps);
-    const Vector along = way - dot(a.n, way) * a.n;
-    g += a.size * (f.value * (a.slip - along) - (f.curvature * dot(a.slip, along)) * a.slip);
-    add_diagonal(H, a.size * f.value);
-    add_outer(H, -a.size * f.value, a.n);
-    add_outer(H, a.size * f.curvature, a.slip);
+    if (bears(in, b, v, k)) add_floor_slip(in, b, v, k, way, g, H);
   }
 }
 

@@ -5,7 +5,7 @@
 namespace diffvbd::cuda {
 namespace {
 
-// What pairs press, as GroupMemory has it; of the lagged only the bodies.
+// What listed pairs press, and the sides of all.
 template <class T>
 __global__ void __launch_bounds__(kOne)
     press_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, int32_t* sides, double* press) {
@@ -30,17 +30,24 @@ bool has_many(const RigidInputs<T>& in) {
   return most_grouped(in.bodies()) > kFew;
 }
 
+// How often vertices may be borne by planes.
+template <class T>
+int64_t floors_of(const RigidInputs<T>& in) {
+  return in.scene.scenes * in.scene.vertices * in.planes;
+}
+
 }  // namespace
 
 template <class T>
 int64_t rigid_system_bytes(const RigidInputs<T>& in, const PairRoom& room) {
   const int64_t scenes = in.scene.scenes, bodies = scenes * in.bodies(), rows = room.rows();
-  int64_t bytes = aligned(2 * rows * sizeof(int32_t)) + aligned(rows * kPressDoubles * sizeof(double)) +
+  int64_t bytes = aligned(2 * rows * sizeof(int32_t)) + aligned(room.listed * kPressDoubles * sizeof(double)) +
                   aligned(bodies * kUnknowns * sizeof(double));
   if (!in.together()) bytes += aligned(groups_bytes(scenes, in.bodies()));
   if (has_many(in)) {
     bytes += aligned(scenes * in.matrix_size() * sizeof(double)) + aligned(2 * rows * sizeof(int32_t)) +
-             aligned(sizeof(int32_t)) + aligned(room.lagged * kRubbing * sizeof(double));
+             aligned(sizeof(int32_t)) + aligned(room.lagged * kRubScalars * sizeof(double)) +
+             aligned(floors_of(in) * sizeof(int32_t));
   }
   return bytes;
 }
@@ -58,7 +65,7 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, bool ag
   };
   GroupMemory memory{};
   memory.sides = static_cast<int32_t*>(take(2 * rows * sizeof(int32_t)));
-  memory.press = static_cast<double*>(take(rows * kPressDoubles * sizeof(double)));
+  memory.press = static_cast<double*>(take(room.listed * kPressDoubles * sizeof(double)));
   memory.steps = static_cast<double*>(take(bodies * kUnknowns * sizeof(double)));
   if (rows > 0) press_kernel<T><<<blocks_for(rows), kOne, 0, stream>>>(in, room, memory.sides, memory.press);
   if (!in.together()) {
@@ -70,7 +77,8 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, bool ag
   memory.bases = static_cast<double*>(take(scenes * in.matrix_size() * sizeof(double)));
   memory.rows = static_cast<int32_t*>(take(2 * rows * sizeof(int32_t)));
   memory.taken = static_cast<int32_t*>(take(sizeof(int32_t)));
-  memory.rubbing = static_cast<double*>(take(room.lagged * kRubbing * sizeof(double)));
+  memory.rubbing = static_cast<double*>(take(room.lagged * kRubScalars * sizeof(double)));
+  memory.floors = static_cast<int32_t*>(take(floors_of(in) * sizeof(int32_t)));
   return solve_groups_of_many(in, room, memory, groups, center, motion, factor, stream);
 }
 

@@ -18,15 +18,28 @@ __device__ __forceinline__ Vector vector_of(const double* a) { return {a[0], a[1
 // Bytes of a part of a workspace, rounded up to what any type needs.
 constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
 
-constexpr int kRubbing = 12;  // scalars of a Rubbing, and the slip
-// Memory of a correction. sides and press [rows]: what pairs press, the listed first: bodies, -1 where nothing moves,
-// and the rest.
+// Scalars of a lagged pair in the memory of a correction: a Rubbing, the slip, and of a PairPress what is not zero.
+enum RubScalar : int {
+  kNormal = 0,
+  kSlipBefore = 3,
+  kLoad = 6,
+  kDamping,
+  kApproach,
+  kSlip,
+  kAt = 12,
+  kWeight = 18,
+  kForce = 20,
+  kStiffness = 23,
+  kRubScalars = 29
+};
+// Memory of a correction. Of rows the listed pairs are the first, then the lagged.
 struct GroupMemory {
-  int32_t* sides;         // [rows, 2]
-  double *press, *steps;  // [rows, kPressDoubles], [B, bodies, 6]
-  double* rubbing;        // [lagged, kRubbing]
+  int32_t* sides;         // [rows, 2]: bodies, -1 where nothing moves
+  double *press, *steps;  // [listed, kPressDoubles], [B, bodies, 6]
+  double* rubbing;        // [kRubScalars, lagged]: threads next to each other read pairs that are
   double* bases;          // as the factors
   int32_t *rows, *taken;  // [2 rows], one number
+  int32_t* floors;        // [B, V, planes]: where the vertices of bodies are borne, body after body
 };
 
 // The side that a body has of an entry's pair, which acts, at the first corner of that side; or -1. bodies: of the

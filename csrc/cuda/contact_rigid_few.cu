@@ -8,7 +8,7 @@ namespace diffvbd::cuda {
 namespace {
 
 constexpr int kLanes = 8;                    // threads that share the pairs of a vertex
-constexpr int kSlots = 2, kLineDoubles = 7;  // slips that a thread keeps while a step looks for its length
+constexpr int kSlots = 2, kLineDoubles = 6;  // slips that a thread keeps while a step looks for its length
 constexpr int kOwn = kUnknowns + rigid::kSix, kHalf = 3 * kUnknowns;
 constexpr int kSmall = kUnknowns * kFew;  // unknowns of systems that fit into shared memory
 
@@ -227,7 +227,7 @@ struct System {
   __device__ int keep_lines(const Rubs<T>& rubs) const {
     int lines = 0;
     each_line(rubs, [&](const SlipLine& a) {
-      const double values[] = {a.slip.x, a.slip.y, a.slip.z, a.change.x, a.change.y, a.change.z, a.size};
+      const double values[] = {a.start, a.along, a.way, a.size, a.rate, a.bend};
       for (int i = 0; lines < kSlots && i < kLineDoubles; ++i) slots[lines][i][threadIdx.x] = values[i];
       ++lines;
     });
@@ -239,13 +239,15 @@ struct System {
       double total[1] = {0};
       for (int l = 0; l < lines && l < kSlots; ++l) {
         const auto at = [&](int i) { return slots[l][i][threadIdx.x]; };
-        const SlipLine line({at(0), at(1), at(2)}, {at(3), at(4), at(5)}, at(6), in.friction_eps);
-        total[0] += line.excess(tried);
+        SlipLine line;
+        line.start = at(0), line.along = at(1), line.way = at(2), line.size = at(3), line.rate = at(4),
+        line.bend = at(5);
+        total[0] += line.excess(tried, in.friction_eps);
       }
       if (lines > kSlots) {
         int seen = 0;
         each_line(rubs, [&](const SlipLine& line) {
-          if (seen++ >= kSlots) total[0] += line.excess(tried);
+          if (seen++ >= kSlots) total[0] += line.excess(tried, in.friction_eps);
         });
       }
       team.template reduce<1>(total);

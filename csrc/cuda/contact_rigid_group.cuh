@@ -28,13 +28,15 @@ struct GroupSystem {
   int32_t first, count;
   const int32_t* sides;
   double *center, *motion, *steps, *press;        // of the scene's bodies; of all rows
-  double* rubbing;                                // [lagged rows, kRubbing]
+  double* rubbing;                                // [kRubScalars, lagged rows]
+  int32_t* floors;                                // of the scene, as of GroupMemory
   double *base, *matrix, *gradient, *step, *own;  // own: the motion of the group
   const uint64_t* touching;                       // [count] a bit for each body that a body touches,
   const uint64_t* columns;  // [count] bits of the blocks of the factor that are not zero, below the diagonal
   int32_t* rows;            // twice the row of a pair, and its side: those of each body
   const int32_t* begin;     // [count + 1] where they begin, and
   const int32_t* lagged;    // [count] those of lagged pairs
+  int32_t* borne;           // [count] how often planes bear vertices of a body
   double (*part)[2];
 
   __device__ int32_t size() const { return kUnknowns * count; }
@@ -85,51 +87,77 @@ struct GroupSystem {
     }
   }
 
-  // Gradient and matrix of what acts on vertices alone, or of friction on planes where bodies have gone.
-  template <bool rubs>
-  __device__ void add_vertices(int32_t b, double* to, double* gradients) const {
-    const Body<T> own = body(b);
-    if (rubs && !in.free[own.body]) return;
-    const Warp warp;
-    Whole whole{};
-    if constexpr (!rubs) {
-      whole = whole_of(own, warp);
-      if (warp.leads()) rigid::put(center + 3 * own.body, whole.center);
-      warp.meet();
-    }
-    const Vector c = rubs ? center_of(b) : whole.center;
-    const bool free = rubs || (in.free[own.body] && 0 < whole.mass);
-    double total[kOwn + 1];  // and the sum of m r^2
-    warp.template sum<kOwn + 1>(free ? own.size() : 0, total, [&](int32_t i, double* out) {
-      const int32_t v = own.vertex(i);
-      const Vector arm = own.position(v) - c;
-      Vector g{};
-      Sym3<double> H{};
-      if constexpr (rubs) {
-        add_floor_friction(in, own, v, moved_by(motion + kUnknowns * own.body, arm), g, H);
-      } else {
-        vertex_press(in, own, v, g, H);
-        out[kOwn] += own.mass(v) * dot(arm, arm);
-      }
-      rigid::add_vertex(arm, g, H, out, out + kUnknowns);
-    });
-    if (!warp.leads()) return;
+  // Adds what a warp has found of a body.
+  __device__ void put_own(const double* total, int32_t b, double* to, double* gradients) const {
 #pragma unroll
     for (int i = 0; i < kUnknowns; ++i) {
       gradients[kUnknowns * b + i] += total[i];
 #pragma unroll
       for (int j = 0; j <= i; ++j) at(to, b, i, b, j) += total[kUnknowns + rigid::at6(i, j)];
-      if constexpr (!rubs) at(to, b, i, b, i) += free ? kLeastInertia * (i < 3 ? total[kOwn] : whole.mass) : 1;
     }
   }
-  // Of the pairs in a part of the rows of a body: what they add to its own part of the matrix, and to those between it
-  // and bodies before it.
-  __device__ void add_pairs(int32_t b, int32_t from, int32_t to, double* of, double* gradients) const {
+  // Gradient and matrix of what acts on vertices alone but for friction; and which vertices planes bear.
+  __device__ void add_vertices(int32_t b) const {
+    const Body<T> own = body(b);
+    const Warp warp;
+    const Whole whole = whole_of(own, warp);
+    if (warp.leads()) rigid::put(center + 3 * own.body, whole.center);
+    warp.meet();
+    const bool free = in.free[own.body] && 0 < whole.mass;
+    double total[kOwn + 1];  // and the sum of m r^2
+    warp.template sum<kOwn + 1>(free ? own.size() : 0, total, [&](int32_t i, double* out) {
+      const int32_t v = own.vertex(i);
+      const Vector arm = own.position(v) - whole.center;
+      Vector g{};
+      Sym3<double> H{};
+      vertex_press(in, own, v, g, H);
+      out[kOwn] += own.mass(v) * dot(arm, arm);
+      rigid::add_vertex(arm, g, H, out, out + kUnknowns);
+    });
+    if (warp.leads()) {
+      put_own(total, b, base, gradient);
+      for (int i = 0; i < kUnknowns; ++i) {
+        at(base, b, i, b, i) += free ? kLeastInertia * (i < 3 ? total[kOwn] : whole.mass) : 1;
+      }
+    }
+    int32_t found = 0;
+    const int32_t places = in.free[own.body] ? own.size() * in.planes : 0;
+    for (int32_t from = 0; from < places; from += 32) {
+      const int32_t i = from + warp.lane;
+      const bool bearing = i < places && bears(in, own, own.vertex(i / in.planes), i % in.planes);
+      const unsigned all = __ballot_sync(kAll, bearing);
+      if (bearing) floors_of(own)[found + __popc(all & ((1u << warp.lane) - 1))] = i;
+      found += __popc(all);
+    }
+    if (warp.leads()) borne[b] = found;
+  }
+  __device__ int32_t* floors_of(const Body<T>& own) const { return floors + in.planes * in.scene.ptr[own.body]; }
+  // Friction on planes, linear about where a body has gone.
+  __device__ void add_floors(int32_t b) const {
+    const Body<T> own = body(b);
+    const Warp warp;
+    const Vector c = center_of(b);
+    double total[kOwn];
+    warp.template sum<kOwn>(borne[b], total, [&](int32_t i, double* out) {
+      const int32_t place = floors_of(own)[i], v = own.vertex(place / in.planes);
+      const Vector arm = own.position(v) - c;
+      Vector g{};
+      Sym3<double> H{};
+      add_floor_slip(in, own, v, place % in.planes, moved_by(motion + kUnknowns * own.body, arm), g, H);
+      rigid::add_vertex(arm, g, H, out, out + kUnknowns);
+    });
+    if (warp.leads()) put_own(total, b, matrix, step);
+  }
+  // Of a body's pairs of a list: what they add to its own part of the matrix, and to those between it and bodies before
+  // it.
+  template <bool rubs>
+  __device__ void add_pairs(int32_t b, double* of, double* gradients) const {
+    const int32_t from = rubs ? lagged[b] : begin[b], to = rubs ? begin[b + 1] : lagged[b];
     const Warp warp;
     const Vector c = center_of(b);
     double own[kOwn];
     warp.template sum<kOwn>(to - from, own, [&](int32_t e, double* out) {
-      const PairPress a = press_of(rows[from + e] >> 1);
+      const PairPress a = press_of<rubs>(rows[from + e] >> 1);
       const int side = rows[from + e] & 1;
 #pragma unroll
       for (int j = 0; j < kUnknowns; ++j) {
@@ -139,14 +167,7 @@ struct GroupSystem {
         for (int i = j; i < kUnknowns; ++i) out[kUnknowns + rigid::at6(i, j)] += dot(a.map(side, i, c), pressed);
       }
     });
-    if (warp.leads()) {
-#pragma unroll
-      for (int i = 0; i < kUnknowns; ++i) {
-        gradients[kUnknowns * b + i] += own[i];
-#pragma unroll
-        for (int j = 0; j <= i; ++j) at(of, b, i, b, j) += own[kUnknowns + rigid::at6(i, j)];
-      }
-    }
+    if (warp.leads()) put_own(own, b, of, gradients);
     for (int32_t other = 0; other < b; ++other) {
       if (!(touching[b] >> other & 1)) continue;
       const int32_t body = member(other);
@@ -156,7 +177,7 @@ struct GroupSystem {
         const int64_t row = rows[from + e] >> 1;
         const int side = rows[from + e] & 1;
         if (sides[2 * row + 1 - side] != body) return;
-        const PairPress a = press_of(row);
+        const PairPress a = press_of<rubs>(row);
 #pragma unroll
         for (int j = 0; j < kUnknowns; ++j) {
           const Vector pressed = a.stiffness * a.map(1 - side, j, d);
@@ -169,7 +190,32 @@ struct GroupSystem {
       for (int k = 0; k < kUnknowns * kUnknowns; ++k) at(of, b, k / kUnknowns, other, k % kUnknowns) += total[k];
     }
   }
-  __device__ PairPress press_of(int64_t row) const { return load_press(press + kPressDoubles * row, sides + 2 * row); }
+  template <bool rubs>
+  __device__ PairPress press_of(int64_t row) const {
+    if constexpr (!rubs) return load_press(press + kPressDoubles * row, sides + 2 * row);
+    PairPress a = sides_of_rub(row);
+    a.force = rub_vector(kForce, row);
+    const auto s = [&](int k) { return rub(kStiffness + k, row); };
+    a.stiffness = {s(0), s(1), s(2), s(3), s(4), s(5)};
+    return a;
+  }
+  // A scalar, or three, of a row that rubs.
+  __device__ double& rub(int k, int64_t row) const { return rubbing[k * room.lagged + row - room.listed]; }
+  __device__ Vector rub_vector(int k, int64_t row) const { return {rub(k, row), rub(k + 1, row), rub(k + 2, row)}; }
+  __device__ void put_rub(int k, int64_t row, const Vector& a) const {
+    rub(k, row) = a.x, rub(k + 1, row) = a.y, rub(k + 2, row) = a.z;
+  }
+  // Where its sides are.
+  __device__ PairPress sides_of_rub(int64_t row) const {
+    PairPress a;
+    for (int side = 0; side < 2; ++side) {
+      a.body[side] = sides[2 * row + side];
+      a.weight[side] = rub(kWeight + side, row), a.at[side] = rub_vector(kAt + 3 * side, row);
+      a.pull[side] = a.torque[side] = Vector{};
+    }
+    a.doubled = 1;  // all that rub a body are of its group
+    return a;
+  }
 
   // Of what does not change, all blocks of a column that may not be zero.
   __device__ void copy_column(int32_t b) const {
@@ -186,37 +232,40 @@ struct GroupSystem {
     each(size() * size(), [&](int32_t i) { base[i] = matrix[i] = 0; });
     each(size(), [&](int32_t i) { gradient[i] = own[i] = unknown(motion, i) = 0; });
     __syncthreads();
-    each_body([&](int32_t b) { add_vertices<false>(b, base, gradient); });
+    each_body([&](int32_t b) { add_vertices(b); });
     __syncthreads();
-    each_body([&](int32_t b) { add_pairs(b, begin[b], lagged[b], base, gradient); });
+    each_body([&](int32_t b) { add_pairs<false>(b, base, gradient); });
     if (in.lag) {
       each_row([&](int64_t row, int64_t pair) {
         PairPress a;
         Rubbing rubs;
         lagged_sides(in, pair, CornerPoints<T>{in, false}, -1, a, rubs);  // it acts, or had no row
-        a.force = Vector{}, a.stiffness = Sym3<double>{};
-        store_press(a, press + kPressDoubles * row);
-        double* to = rubbing + kRubbing * pair;
-        rigid::put(to, rubs.n), rigid::put(to + 3, rubs.u);
-        to[6] = rubs.size, to[7] = rubs.damping, to[8] = rubs.approach;
+        put_rub(kNormal, row, rubs.n), put_rub(kSlipBefore, row, rubs.u);
+        rub(kLoad, row) = rubs.size, rub(kDamping, row) = rubs.damping, rub(kApproach, row) = rubs.approach;
+        for (int side = 0; side < 2; ++side) {
+          put_rub(kAt + 3 * side, row, a.at[side]);
+          rub(kWeight + side, row) = a.weight[side];
+        }
       });
     }
     __syncthreads();
   }
   // And these, linear about where bodies have gone.
   __device__ void add_friction() const {
-    if (in.planes > 0) each_body([&](int32_t b) { add_vertices<true>(b, matrix, step); });
+    if (in.planes > 0) each_body([&](int32_t b) { add_floors(b); });
     if (!in.lag) return;
-    each_row([&](int64_t row, int64_t pair) {
-      PairPress a = press_of(row);
-      a.doubled = 1;
-      double* of = rubbing + kRubbing * pair;
-      rub({vector_of(of), vector_of(of + 3), of[6], of[7], of[8]}, way_of(a, {center, motion}), in.friction_eps, a);
-      store_press(a, press + kPressDoubles * row);
-      rigid::put(of + 9, a.slip);
+    each_row([&](int64_t row, int64_t) {
+      PairPress a = sides_of_rub(row);
+      const Rubbing own = {rub_vector(kNormal, row), rub_vector(kSlipBefore, row), rub(kLoad, row), rub(kDamping, row),
+                           rub(kApproach, row)};
+      contact::rub(own, way_of(a, {center, motion}), in.friction_eps, a);
+      put_rub(kForce, row, a.force), put_rub(kSlip, row, a.slip);
+      const Sym3<double>& s = a.stiffness;
+      const double entries[] = {s.xx, s.xy, s.xz, s.yy, s.yz, s.zz};
+      for (int k = 0; k < 6; ++k) rub(kStiffness + k, row) = entries[k];
     });
     __syncthreads();
-    each_body([&](int32_t b) { add_pairs(b, lagged[b], begin[b + 1], matrix, step); });
+    each_body([&](int32_t b) { add_pairs<true>(b, matrix, step); });
   }
   // Calls f(row, pair) for the lagged pairs, each once, in a thread's share.
   template <class F>
@@ -259,23 +308,19 @@ struct GroupSystem {
   template <class F>
   __device__ void each_line(const F& f) const {
     if (in.lag) {
-      each_row([&](int64_t row, int64_t pair) {
-        PairPress a = press_of(row);
-        a.doubled = 1;
-        const double* of = rubbing + kRubbing * pair;
-        const Vector n = vector_of(of), way = way_of(a, {center, steps});
-        f(SlipLine(vector_of(of + 9), way - dot(n, way) * n, of[6], in.friction_eps));
+      each_row([&](int64_t row, int64_t) {
+        const Vector n = rub_vector(kNormal, row), way = way_of(sides_of_rub(row), {center, steps});
+        f(SlipLine(rub_vector(kSlip, row), way - dot(n, way) * n, rub(kLoad, row), in.friction_eps));
       });
     }
     if (in.planes == 0) return;
     each_body([&](int32_t b) {
       const Body<T> own = body(b);
-      for (auto i = static_cast<int32_t>(threadIdx.x % 32); in.free[own.body] && i < own.size() * in.planes; i += 32) {
-        const int32_t v = own.vertex(i / in.planes), k = i % in.planes;
-        if (!bears(in, own, v, k)) continue;
+      for (auto i = static_cast<int32_t>(threadIdx.x % 32); i < borne[b]; i += 32) {
+        const int32_t place = floors_of(own)[i], v = own.vertex(place / in.planes);
         const Vector arm = own.position(v) - center_of(b);
         const int64_t at = int64_t{kUnknowns} * own.body;
-        f(slip_line(in, own, v, k, arm, motion + at, steps + at));
+        f(slip_line(in, own, v, place % in.planes, arm, motion + at, steps + at));
       }
     });
   }
@@ -288,11 +333,11 @@ struct GroupSystem {
     });
     return slip_share(fall, [&](double tried) {
       double total[1] = {0};
-      for (int l = 0; l < lines && l < kLines; ++l) total[0] += kept[l].excess(tried);
+      for (int l = 0; l < lines && l < kLines; ++l) total[0] += kept[l].excess(tried, in.friction_eps);
       if (lines > kLines) {
         int seen = 0;
         each_line([&](const SlipLine& line) {
-          if (seen++ >= kLines) total[0] += line.excess(tried);
+          if (seen++ >= kLines) total[0] += line.excess(tried, in.friction_eps);
         });
       }
       reduce<1>(total);

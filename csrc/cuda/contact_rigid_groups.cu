@@ -8,7 +8,7 @@ namespace {
 // Memory of a group, shared.
 struct Lists {
   int32_t begin[kMostCoupled + 1], lagged[kMostCoupled];  // as of GroupSystem
-  int32_t listed_rows[kMostCoupled], lagged_rows[kMostCoupled];
+  int32_t listed_rows[kMostCoupled], lagged_rows[kMostCoupled], borne[kMostCoupled];
   int32_t place[kMostCoupled], member[kMostCoupled];
   uint64_t touching[kMostCoupled], columns[kMostCoupled];  // as of GroupSystem
 };
@@ -131,6 +131,7 @@ __global__ void __launch_bounds__(kTeam)
                               memory.steps + kUnknowns * n * scene,
                               memory.press,
                               memory.rubbing,
+                              memory.floors + scene * in.scene.vertices * in.planes,
                               memory.bases + at,
                               size <= fits ? matrix : factors + at,
                               vectors[0],
@@ -141,6 +142,7 @@ __global__ void __launch_bounds__(kTeam)
                               memory.rows,
                               lists.begin,
                               lists.lagged,
+                              lists.borne,
                               part};
   find_rows(system, ordered + int64_t{kGroupRows} * n * scene, lists, memory.taken);
   system.assemble();
