@@ -38,6 +38,11 @@ def looks_at(value: Tensor) -> bool:
     return not transformed() and (checking() or not value.is_cuda)
 
 
+def is_captured(value: Tensor) -> bool:
+    """Whether work on it is being captured into a CUDA graph, which can neither read a value nor raise."""
+    return value.is_cuda and torch.cuda.is_current_stream_capturing()
+
+
 def transformed() -> bool:
     """Whether a transform of torch.func is under way. Under torch.compile one may be, unseen."""
     if torch.compiler.is_compiling():

@@ -38,8 +38,11 @@ struct GroupMemory {
   double *press, *steps;  // [listed, kPressDoubles], [B, bodies, 6]
   double* rubbing;        // [kRubScalars, lagged]: threads next to each other read pairs that are
   double* bases;          // as the factors
-  int32_t *rows, *taken;  // [2 rows], one number
-  int32_t* floors;        // [B, V, planes]: where the vertices of bodies are borne, body after body
+  // twice the row of a pair that acts, and the side that a body has of it, for all bodies of a group in a row: those of
+  // listed pairs, then those of lagged
+  int32_t *found, *rows;                      // [2 rows] twice: as they come, and in order
+  int32_t *counts, *filled, *begins, *taken;  // [B, bodies, 2] twice, [B, bodies], one number
+  int32_t* floors;                            // [B, V, planes]: where the vertices of bodies are borne, body after body
 };
 
 // The side that a body has of an entry's pair, which acts, at the first corner of that side; or -1. bodies: of the

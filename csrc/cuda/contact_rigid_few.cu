@@ -269,7 +269,7 @@ struct System {
         team.meet();
       }
       factor_blocks<kThreads>(count, nullptr, matrix, step, pivots);
-      solve_backward<kThreads>(count, matrix, step);
+      solve_backward(count, nullptr, matrix, pivots.inverse, step);
       team.each(count, [&](int32_t b) { keep_finite(step + kUnknowns * b); });
       team.meet();
       team.each(size(), [&](int32_t i) { unknown(steps, i) = step[i]; });

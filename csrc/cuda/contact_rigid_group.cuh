@@ -18,6 +18,19 @@ constexpr int kStatic = 16 << 10;  // bytes of shared memory that are not for th
 
 using Warp = Tile<32>;
 
+// Sums of 32 numbers over the lanes of a warp, each to the lane of its number: half of them go at each exchange.
+template <int half = 16>
+__device__ __forceinline__ double sums_by_lane(double* of) {
+  const bool upper = Warp().lane & half;
+#pragma unroll
+  for (int k = 0; k < half; ++k) {
+    const double kept = upper ? of[k + half] : of[k], sent = upper ? of[k] : of[k + half];
+    of[k] = kept + __shfl_xor_sync(kAll, sent, half);
+  }
+  if constexpr (half > 1) return sums_by_lane<half / 2>(of);
+  return of[0];
+}
+
 // The system of a group.
 template <class T>
 struct GroupSystem {
@@ -33,11 +46,13 @@ struct GroupSystem {
   double *base, *matrix, *gradient, *step, *own;  // own: the motion of the group
   const uint64_t* touching;                       // [count] a bit for each body that a body touches,
   const uint64_t* columns;  // [count] bits of the blocks of the factor that are not zero, below the diagonal
-  int32_t* rows;            // twice the row of a pair, and its side: those of each body
-  const int32_t* begin;     // [count + 1] where they begin, and
-  const int32_t* lagged;    // [count] those of lagged pairs
+  const int32_t* rows;      // as of GroupMemory
+  const int32_t* begin;     // [count] where those of a body begin,
+  const int32_t* lagged;    // [count] those of lagged pairs among them,
+  const int32_t* end;       // [count] and where they end
   int32_t* borne;           // [count] how often planes bear vertices of a body
   double (*part)[2];
+  int2 all_rows;  // where those of all begin and end
 
   __device__ int32_t size() const { return kUnknowns * count; }
   __device__ int32_t member(int32_t b) const { return groups.member(first + b); }
@@ -71,30 +86,14 @@ struct GroupSystem {
     }
   }
 
-  // Calls f(row, side) for what a body has of pairs of a list that act, in order; the listed come before the lagged.
-  template <class F>
-  __device__ void each_side(int32_t b, bool which, const F& f) const {
-    const PairList& list = which ? in.lagged : in.gate.listed;
-    const int64_t before = which ? room.listed : 0;
-    const Body<T> whose = body(b);
-    for (int32_t i = 0; i < whose.size(); ++i) {
-      const int64_t corner = scene * in.gate.corners + whose.vertex(i);
-      for (int32_t from = list.ptr[corner]; from < list.ptr[corner + 1]; from += 32) {
-        const int32_t mine = from + static_cast<int32_t>(threadIdx.x % 32);
-        const int32_t entry = mine < list.ptr[corner + 1] ? list.entry[mine] : 3;
-        f(before + (entry >> 2), side_of(list, sides + 2 * before, entry, whose.body));
-      }
-    }
-  }
-
-  // Adds what a warp has found of a body.
-  __device__ void put_own(const double* total, int32_t b, double* to, double* gradients) const {
-#pragma unroll
-    for (int i = 0; i < kUnknowns; ++i) {
-      gradients[kUnknowns * b + i] += total[i];
-#pragma unroll
-      for (int j = 0; j <= i; ++j) at(to, b, i, b, j) += total[kUnknowns + rigid::at6(i, j)];
-    }
+  // Adds to a body's gradient and its own part of a matrix, whose entries lanes have one each.
+  __device__ void put_own(double mine, int32_t b, double* to, double* gradients) const {
+    const int32_t entry = Warp().lane - kUnknowns;
+    if (entry < 0) gradients[kUnknowns * b + entry + kUnknowns] += mine;
+    if (entry < 0 || rigid::kSix <= entry) return;
+    int i = 0;
+    while (rigid::at6(i + 1, 0) <= entry) ++i;
+    at(to, b, i, b, entry - rigid::at6(i, 0)) += mine;
   }
   // Gradient and matrix of what acts on vertices alone but for friction; and which vertices planes bear.
   __device__ void add_vertices(int32_t b) const {
@@ -104,21 +103,22 @@ struct GroupSystem {
     if (warp.leads()) rigid::put(center + 3 * own.body, whole.center);
     warp.meet();
     const bool free = in.free[own.body] && 0 < whole.mass;
-    double total[kOwn + 1];  // and the sum of m r^2
-    warp.template sum<kOwn + 1>(free ? own.size() : 0, total, [&](int32_t i, double* out) {
+    double total[32] = {};  // and the sum of m r^2
+    for (int32_t i = warp.lane; free && i < own.size(); i += 32) {
       const int32_t v = own.vertex(i);
       const Vector arm = own.position(v) - whole.center;
       Vector g{};
       Sym3<double> H{};
       vertex_press(in, own, v, g, H);
-      out[kOwn] += own.mass(v) * dot(arm, arm);
-      rigid::add_vertex(arm, g, H, out, out + kUnknowns);
-    });
-    if (warp.leads()) {
-      put_own(total, b, base, gradient);
-      for (int i = 0; i < kUnknowns; ++i) {
-        at(base, b, i, b, i) += free ? kLeastInertia * (i < 3 ? total[kOwn] : whole.mass) : 1;
-      }
+      total[kOwn] += own.mass(v) * dot(arm, arm);
+      rigid::add_vertex(arm, g, H, total, total + kUnknowns);
+    }
+    const double mine = sums_by_lane(total), turning = __shfl_sync(kAll, mine, kOwn);
+    put_own(mine, b, base, gradient);
+    __syncwarp();
+    if (warp.lane < kUnknowns) {
+      const double inertia = warp.lane < 3 ? turning : whole.mass;
+      at(base, b, warp.lane, b, warp.lane) += free ? kLeastInertia * inertia : 1;
     }
     int32_t found = 0;
     const int32_t places = in.free[own.body] ? own.size() * in.planes : 0;
@@ -133,61 +133,65 @@ struct GroupSystem {
   }
   __device__ int32_t* floors_of(const Body<T>& own) const { return floors + in.planes * in.scene.ptr[own.body]; }
   // Friction on planes, linear about where a body has gone.
-  __device__ void add_floors(int32_t b) const {
+  __device__ void add_floors(int32_t b, double* out) const {
     const Body<T> own = body(b);
-    const Warp warp;
     const Vector c = center_of(b);
-    double total[kOwn];
-    warp.template sum<kOwn>(borne[b], total, [&](int32_t i, double* out) {
+    for (int32_t i = Warp().lane; i < borne[b]; i += 32) {
       const int32_t place = floors_of(own)[i], v = own.vertex(place / in.planes);
       const Vector arm = own.position(v) - c;
       Vector g{};
       Sym3<double> H{};
       add_floor_slip(in, own, v, place % in.planes, moved_by(motion + kUnknowns * own.body, arm), g, H);
       rigid::add_vertex(arm, g, H, out, out + kUnknowns);
-    });
-    if (warp.leads()) put_own(total, b, matrix, step);
+    }
   }
-  // Of a body's pairs of a list: what they add to its own part of the matrix, and to those between it and bodies before
-  // it.
+  // What a body's pairs of a list, and friction on planes, add to its own part of the matrix; and what the pairs add to
+  // the parts between it and bodies before it.
   template <bool rubs>
   __device__ void add_pairs(int32_t b, double* of, double* gradients) const {
-    const int32_t from = rubs ? lagged[b] : begin[b], to = rubs ? begin[b + 1] : lagged[b];
-    const Warp warp;
+    const int32_t from = rubs ? lagged[b] : begin[b], to = rubs ? end[b] : lagged[b];
     const Vector c = center_of(b);
-    double own[kOwn];
-    warp.template sum<kOwn>(to - from, own, [&](int32_t e, double* out) {
-      const PairPress a = press_of<rubs>(rows[from + e] >> 1);
-      const int side = rows[from + e] & 1;
+    const int lane = Warp().lane;
+    double own[32] = {};
+    if constexpr (rubs) add_floors(b, own);
+    for (int32_t e = from + lane; e < to; e += 32) {
+      const PairPress a = press_of<rubs>(rows[e] >> 1);
+      const int side = rows[e] & 1;
 #pragma unroll
       for (int j = 0; j < kUnknowns; ++j) {
-        out[j] += a.gradient(side, j, c);
+        own[j] += a.gradient(side, j, c);
         const Vector pressed = a.stiffness * a.map(side, j, c);
 #pragma unroll
-        for (int i = j; i < kUnknowns; ++i) out[kUnknowns + rigid::at6(i, j)] += dot(a.map(side, i, c), pressed);
+        for (int i = j; i < kUnknowns; ++i) own[kUnknowns + rigid::at6(i, j)] += dot(a.map(side, i, c), pressed);
       }
-    });
-    if (warp.leads()) put_own(own, b, of, gradients);
-    for (int32_t other = 0; other < b; ++other) {
-      if (!(touching[b] >> other & 1)) continue;
-      const int32_t body = member(other);
+    }
+    put_own(sums_by_lane(own), b, of, gradients);
+    for (uint64_t others = touching[b] & ((uint64_t{1} << b) - 1); from < to && others != 0; others &= others - 1) {
+      const int32_t other = __ffsll(static_cast<long long>(others)) - 1, number = member(other);
       const Vector d = center_of(other);
-      double total[kUnknowns * kUnknowns];
-      warp.template sum<kUnknowns * kUnknowns>(to - from, total, [&](int32_t e, double* out) {
-        const int64_t row = rows[from + e] >> 1;
-        const int side = rows[from + e] & 1;
-        if (sides[2 * row + 1 - side] != body) return;
-        const PairPress a = press_of<rubs>(row);
+      double most[32] = {}, rest[kUnknowns * kUnknowns - 32] = {};
+      for (int32_t e = from + lane; e < to; e += 32) {
+        const int32_t entry = rows[e];
+        if (sides[entry ^ 1] != number) continue;
+        const PairPress a = press_of<rubs>(entry >> 1);
+        const int side = entry & 1;
 #pragma unroll
         for (int j = 0; j < kUnknowns; ++j) {
           const Vector pressed = a.stiffness * a.map(1 - side, j, d);
 #pragma unroll
-          for (int i = 0; i < kUnknowns; ++i) out[kUnknowns * i + j] += dot(a.map(side, i, c), pressed);
+          for (int i = 0; i < kUnknowns; ++i) {
+            const int k = kUnknowns * i + j;
+            (k < 32 ? most[k % 32] : rest[k - 32 < 0 ? 0 : k - 32]) += dot(a.map(side, i, c), pressed);
+          }
         }
-      });
-      if (!warp.leads()) continue;
+      }
+      const double mine = sums_by_lane(most);
+      at(of, b, lane / kUnknowns, other, lane % kUnknowns) += mine;
+      butterfly<kUnknowns * kUnknowns - 32, 32>(kAll, rest);
 #pragma unroll
-      for (int k = 0; k < kUnknowns * kUnknowns; ++k) at(of, b, k / kUnknowns, other, k % kUnknowns) += total[k];
+      for (int k = 32; k < kUnknowns * kUnknowns; ++k) {
+        if (lane == k - 32) at(of, b, k / kUnknowns, other, k % kUnknowns) += rest[k - 32];
+      }
     }
   }
   template <bool rubs>
@@ -236,10 +240,10 @@ struct GroupSystem {
     __syncthreads();
     each_body([&](int32_t b) { add_pairs<false>(b, base, gradient); });
     if (in.lag) {
-      each_row([&](int64_t row, int64_t pair) {
+      each_row([&](int64_t row) {
         PairPress a;
         Rubbing rubs;
-        lagged_sides(in, pair, CornerPoints<T>{in, false}, -1, a, rubs);  // it acts, or had no row
+        lagged_sides(in, row - room.listed, CornerPoints<T>{in, false}, -1, a, rubs);  // it acts, or had no row
         put_rub(kNormal, row, rubs.n), put_rub(kSlipBefore, row, rubs.u);
         rub(kLoad, row) = rubs.size, rub(kDamping, row) = rubs.damping, rub(kApproach, row) = rubs.approach;
         for (int side = 0; side < 2; ++side) {
@@ -252,42 +256,42 @@ struct GroupSystem {
   }
   // And these, linear about where bodies have gone.
   __device__ void add_friction() const {
-    if (in.planes > 0) each_body([&](int32_t b) { add_floors(b); });
-    if (!in.lag) return;
-    each_row([&](int64_t row, int64_t) {
-      PairPress a = sides_of_rub(row);
-      const Rubbing own = {rub_vector(kNormal, row), rub_vector(kSlipBefore, row), rub(kLoad, row), rub(kDamping, row),
-                           rub(kApproach, row)};
-      contact::rub(own, way_of(a, {center, motion}), in.friction_eps, a);
-      put_rub(kForce, row, a.force), put_rub(kSlip, row, a.slip);
-      const Sym3<double>& s = a.stiffness;
-      const double entries[] = {s.xx, s.xy, s.xz, s.yy, s.yz, s.zz};
-      for (int k = 0; k < 6; ++k) rub(kStiffness + k, row) = entries[k];
-    });
+    if (in.lag)
+      each_row([&](int64_t row) {
+        PairPress a = sides_of_rub(row);
+        const Rubbing own = {rub_vector(kNormal, row), rub_vector(kSlipBefore, row), rub(kLoad, row),
+                             rub(kDamping, row), rub(kApproach, row)};
+        contact::rub(own, way_of(a, {center, motion}), in.friction_eps, a);
+        put_rub(kForce, row, a.force), put_rub(kSlip, row, a.slip);
+        const Sym3<double>& s = a.stiffness;
+        const double entries[] = {s.xx, s.xy, s.xz, s.yy, s.yz, s.zz};
+        for (int k = 0; k < 6; ++k) rub(kStiffness + k, row) = entries[k];
+      });
     __syncthreads();
     each_body([&](int32_t b) { add_pairs<true>(b, matrix, step); });
   }
-  // Calls f(row, pair) for the lagged pairs, each once, in a thread's share.
+  // Calls f(row) for the lagged pairs, each once, in a thread's share.
   template <class F>
   __device__ void each_row(const F& f) const {
-    each(begin[count] - begin[0], [&](int32_t i) {
-      const int64_t row = rows[begin[0] + i] >> 1;
-      const int side = rows[begin[0] + i] & 1;
-      if (row >= room.listed && side == (sides[2 * row] < 0 ? 1 : 0)) f(row, row - room.listed);
+    each(all_rows.y - all_rows.x, [&](int32_t i) {
+      const int64_t row = rows[all_rows.x + i] >> 1;
+      const int side = rows[all_rows.x + i] & 1;
+      if (row >= room.listed && side == (sides[2 * row] < 0 ? 1 : 0)) f(row);
     });
   }
 
   // step += matrix motion
   __device__ void add_product() const {
     each_body([&](int32_t b) {
+      const uint64_t blocks = touching[b] | uint64_t{1} << b;
       for (int i = 0; i < kUnknowns; ++i) {
-        const int32_t row = kUnknowns * b + i;
         double sum = 0;
-        for (auto j = static_cast<int32_t>(threadIdx.x % 32); j < size(); j += 32) {
-          sum += matrix[j <= row ? size() * row + j : size() * j + row] * own[j];
+        for (int32_t j = Warp().lane; j < size(); j += 32) {
+          const int32_t row = kUnknowns * b + i;
+          if (blocks >> (j / kUnknowns) & 1) sum += matrix[j <= row ? size() * row + j : size() * j + row] * own[j];
         }
         butterfly<1, 32>(kAll, &sum);
-        if (threadIdx.x % 32 == 0) step[row] += sum;
+        if (Warp().leads()) step[kUnknowns * b + i] += sum;
       }
     });
   }
@@ -308,7 +312,7 @@ struct GroupSystem {
   template <class F>
   __device__ void each_line(const F& f) const {
     if (in.lag) {
-      each_row([&](int64_t row, int64_t) {
+      each_row([&](int64_t row) {
         const Vector n = rub_vector(kNormal, row), way = way_of(sides_of_rub(row), {center, steps});
         f(SlipLine(rub_vector(kSlip, row), way - dot(n, way) * n, rub(kLoad, row), in.friction_eps));
       });
@@ -356,7 +360,7 @@ struct GroupSystem {
       if (iteration > 0) add_product();
       __syncthreads();
       factor_blocks<kTeam>(count, columns, matrix, step, pivots);
-      solve_backward<kTeam>(count, matrix, step);
+      solve_backward(count, columns, matrix, pivots.inverse, step);
       each(count, [&](int32_t b) { keep_finite(step + kUnknowns * b); });
       __syncthreads();
       each(size(), [&](int32_t i) { unknown(steps, i) = step[i]; });

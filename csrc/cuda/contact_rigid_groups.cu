@@ -7,8 +7,7 @@ namespace {
 
 // Memory of a group, shared.
 struct Lists {
-  int32_t begin[kMostCoupled + 1], lagged[kMostCoupled];  // as of GroupSystem
-  int32_t listed_rows[kMostCoupled], lagged_rows[kMostCoupled], borne[kMostCoupled];
+  int32_t begin[kMostCoupled], lagged[kMostCoupled], end[kMostCoupled], borne[kMostCoupled];  // as of GroupSystem
   int32_t place[kMostCoupled], member[kMostCoupled];
   uint64_t touching[kMostCoupled], columns[kMostCoupled];  // as of GroupSystem
 };
@@ -49,26 +48,28 @@ __device__ void find_order(int32_t count, Lists& lists) {
   }
 }
 
-// Brings the bodies of a group into that order, and finds the rows of each, in memory that a counter shares out.
+// Brings the rows of a group into their order, and its bodies into that of their elimination. Returns where its rows
+// begin and end.
 template <class T>
-__device__ void find_rows(const GroupSystem<T>& system, int32_t* ordered, Lists& lists, int32_t* taken) {
-  const bool any_lagged = system.in.lag != nullptr;
+__device__ int2 find_rows(const GroupSystem<T>& system, const GroupMemory& memory, int32_t* ordered, Lists& lists) {
   const int32_t count = system.count, n = system.groups.bodies;
+  const int64_t before = system.scene * n;
+  const auto unit_of = [&](int32_t b) { return before + lists.member[b]; };
   system.each(count, [&](int32_t b) { lists.touching[b] = 0, lists.member[b] = system.member(b); });
   __syncthreads();
-  const auto count_rows = [&](int32_t b, bool which) {
-    int32_t rows = 0;
-    system.each_side(b, which, [&](int64_t row, int side) {
-      rows += __popc(__ballot_sync(kAll, 0 <= side));
-      const int32_t other = 0 <= side ? system.sides[2 * row + 1 - side] : -1;
-      if (0 <= other)
-        atomicOr(reinterpret_cast<unsigned long long*>(lists.touching + b), 1ull << system.groups.rank(other));
-    });
-    return rows;
-  };
-  system.each_body([&](int32_t b) {
-    const int32_t listed = count_rows(b, false), lagged = any_lagged ? count_rows(b, true) : 0;
-    if (threadIdx.x % 32 == 0) lists.listed_rows[b] = listed, lists.lagged_rows[b] = lagged;
+  const int32_t* last = memory.counts + 2 * unit_of(count - 1);
+  const int2 rows = {memory.begins[unit_of(0)], memory.begins[unit_of(count - 1)] + last[0] + last[1]};
+  system.each(rows.y - rows.x, [&](int32_t e) {
+    const int32_t own = memory.found[rows.x + e], body = memory.sides[own], other = memory.sides[own ^ 1];
+    const int which = own / 2 < system.room.listed ? 0 : 1;
+    const int64_t unit = before + body;
+    const int32_t begin = memory.begins[unit] + which * memory.counts[2 * unit];
+    int32_t rank = 0;
+    for (int32_t i = 0; i < memory.counts[2 * unit + which]; ++i) rank += memory.found[begin + i] < own ? 1 : 0;
+    memory.rows[begin + rank] = own;
+    if (other < 0) return;
+    const uint64_t bit = uint64_t{1} << system.groups.rank(other);
+    atomicOr(reinterpret_cast<unsigned long long*>(lists.touching + system.groups.rank(body)), bit);
   });
   __syncthreads();
   if (threadIdx.x < 32) find_order(count, lists);
@@ -76,31 +77,13 @@ __device__ void find_rows(const GroupSystem<T>& system, int32_t* ordered, Lists&
   system.each(count, [&](int32_t b) {
     const int32_t place = lists.place[b], body = lists.member[b];
     ordered[system.first + place] = body, ordered[2 * n + body] = place;
-    lists.lagged[place] = lists.listed_rows[b];
-    lists.begin[place + 1] = lists.listed_rows[b] + lists.lagged_rows[b];
+    const int32_t* own = memory.counts + 2 * unit_of(b);
+    lists.begin[place] = memory.begins[unit_of(b)];
+    lists.lagged[place] = lists.begin[place] + own[0];
+    lists.end[place] = lists.lagged[place] + own[1];
   });
   __syncthreads();
-  if (threadIdx.x == 0) {
-    lists.begin[0] = 0;
-    for (int32_t b = 0; b < count; ++b) lists.begin[b + 1] += lists.begin[b];
-    const int32_t base = atomicAdd(taken, lists.begin[count]);
-    for (int32_t b = 0; b <= count; ++b) lists.begin[b] += base;
-    for (int32_t b = 0; b < count; ++b) lists.lagged[b] += lists.begin[b];
-  }
-  __syncthreads();
-  const auto write_rows = [&](int32_t b, bool which, int32_t at) {
-    system.each_side(b, which, [&](int64_t row, int side) {
-      const unsigned found = __ballot_sync(kAll, 0 <= side);
-      const unsigned before = found & ((1u << threadIdx.x % 32) - 1);
-      if (0 <= side) system.rows[at + __popc(before)] = static_cast<int32_t>(2 * row) + side;
-      at += __popc(found);
-    });
-  };
-  system.each_body([&](int32_t b) {
-    write_rows(b, false, lists.begin[b]);
-    if (any_lagged) write_rows(b, true, lists.lagged[b]);
-  });
-  __syncthreads();
+  return rows;
 }
 
 // fits: unknowns whose matrix fits into the dynamic shared memory.
@@ -119,32 +102,34 @@ __global__ void __launch_bounds__(kTeam)
   const int32_t count = groups.count(first), size = kUnknowns * count;
   if (count <= kFew) return;
   const int64_t at = in.matrix_size() * scene + groups.matrix(first);
-  const GroupSystem<T> system{in,
-                              room,
-                              scene,
-                              groups,
-                              first,
-                              count,
-                              memory.sides,
-                              center + 3 * n * scene,
-                              motion + kUnknowns * n * scene,
-                              memory.steps + kUnknowns * n * scene,
-                              memory.press,
-                              memory.rubbing,
-                              memory.floors + scene * in.scene.vertices * in.planes,
-                              memory.bases + at,
-                              size <= fits ? matrix : factors + at,
-                              vectors[0],
-                              vectors[1],
-                              vectors[2],
-                              lists.touching,
-                              lists.columns,
-                              memory.rows,
-                              lists.begin,
-                              lists.lagged,
-                              lists.borne,
-                              part};
-  find_rows(system, ordered + int64_t{kGroupRows} * n * scene, lists, memory.taken);
+  GroupSystem<T> system{in,
+                        room,
+                        scene,
+                        groups,
+                        first,
+                        count,
+                        memory.sides,
+                        center + 3 * n * scene,
+                        motion + kUnknowns * n * scene,
+                        memory.steps + kUnknowns * n * scene,
+                        memory.press,
+                        memory.rubbing,
+                        memory.floors + scene * in.scene.vertices * in.planes,
+                        memory.bases + at,
+                        size <= fits ? matrix : factors + at,
+                        vectors[0],
+                        vectors[1],
+                        vectors[2],
+                        lists.touching,
+                        lists.columns,
+                        memory.rows,
+                        lists.begin,
+                        lists.lagged,
+                        lists.end,
+                        lists.borne,
+                        part,
+                        {}};
+  system.all_rows = find_rows(system, memory, ordered + int64_t{kGroupRows} * n * scene, lists);
   system.assemble();
   system.solve(pivots);
   if (size <= fits) system.each(size * size, [&](int32_t i) { factors[at + i] = matrix[i]; });
@@ -156,9 +141,6 @@ template <class T>
 cudaError_t solve_groups_of_many(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory,
                                  int32_t* ordered, double* center, double* motion, double* factors,
                                  cudaStream_t stream) {
-  if (room.rows() > 0) {
-    if (auto error = cudaMemsetAsync(memory.taken, 0, sizeof(int32_t), stream)) return error;
-  }
   int device = 0, room_for = 0, processors = 0;
   if (auto error = cudaGetDevice(&device)) return error;
   if (auto error = cudaDeviceGetAttribute(&room_for, cudaDevAttrMaxSharedMemoryPerBlockOptin, device)) return error;

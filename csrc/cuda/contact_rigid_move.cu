@@ -11,7 +11,7 @@ namespace {
 constexpr int64_t kSmallScene = 4096;  // vertices up to which a block does all the work on a scene, and
 constexpr int64_t kFewPairs = 32768;   // pairs that each has room for, unless there are
 constexpr int64_t kManyScenes = 64;    // scenes enough to fill the device
-constexpr int64_t kLargeBody = 256;    // vertices from which a block adds up a body, and not a warp
+constexpr int64_t kLargeBody = 32;     // vertices from which a block adds up a body, and not a warp
 constexpr double kParts = 0x1p40;      // of the largest number of a sum in whole numbers, which has up to 2^20 of them
 
 using Count = unsigned long long;
@@ -85,6 +85,7 @@ __global__ void __launch_bounds__(kOne)
   const int64_t scene = record[5], first = scene * in.bodies();
   if (repels) {
     t.near[pair] = may_press(in, pair, t.way + first, t.size + first);
+    t.press[pair] = 0;
     if (!t.near[pair]) return;
   } else if (!Lag<T>(in.lag + kLagScalars * pair).active()) {
     return;
@@ -164,18 +165,18 @@ __device__ double potential_of(const RigidInputs<T>& in, const Tried<T>& t, cons
   team.template sum<1>(body.size(), sum, [&](int32_t i, double* to) {
     const int32_t v = body.vertex(i);
     to[0] += t.value[body.row(v)];
-    const auto add = [&](const PairList& list, const double* press, bool repels) {
+    const auto add = [&](const PairList& list, const double* press) {
       const int64_t corner = scene * in.gate.corners + v;
       for (int32_t e = list.ptr[corner]; e < list.ptr[corner + 1]; ++e) {
         const int64_t pair = list.entry[e] >> 2;
         const int place = list.entry[e] & 3;
-        if (place == 3 || (repels && !t.near[pair])) continue;
+        if (place == 3) continue;
         const int32_t* record = list.pairs + kPairRow * pair;
         if (place == 0 || (place == sides(record[4]) && moving_body(in, record[0]) < 0)) to[0] += press[pair];
       }
     };
-    if (listed > 0) add(in.gate.listed, t.press, true);
-    if (in.lag) add(in.lagged, t.press + listed, false);
+    if (listed > 0) add(in.gate.listed, t.press);
+    if (in.lag) add(in.lagged, t.press + listed);
   });
   return sum[0];
 }

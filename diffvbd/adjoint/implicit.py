@@ -23,6 +23,7 @@ from .. import ops
 from ..model.model import Model
 from ..ops import no_second_derivative, of_inputs
 from ..said import warn
+from ..scopes import is_captured
 from .anderson import run_sweeps
 from .potential import PAIRS, IncrementalPotential
 from .routes import GlobalAdjoint, LinearSolve
@@ -66,7 +67,7 @@ class _GlobalBackward(Function):
     @staticmethod
     def forward(ctx: Any, x_bar: Tensor, *args: Any) -> tuple[Tensor, ...]:
         fields, (x, model, h, adjoint, needs) = ops.SweepFields(*args[:_FIELDS]), args[_FIELDS:]
-        if x.is_cuda and torch.cuda.is_current_stream_capturing():
+        if is_captured(x):
             raise RuntimeError("adjoint: expected ReverseSweep while a CUDA graph is captured, got GlobalAdjoint, "
                                "whose solve waits for the device")  # fmt: skip
         with torch.autocast(x.device.type, enabled=False):  # which would take the products in half precision

@@ -7,6 +7,7 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor
 
+from ..scopes import is_captured
 from .functions import shapes_of
 from .load import raw
 
@@ -65,4 +66,4 @@ def neighbor_pairs(points: Tensor, radius: float, max_pairs: int, *, name: str =
 
 def unread(points: Tensor) -> bool:
     """Whether results on the points' device must not be looked at now."""
-    return torch.compiler.is_compiling() or (points.is_cuda and torch.cuda.is_current_stream_capturing())
+    return torch.compiler.is_compiling() or is_captured(points)

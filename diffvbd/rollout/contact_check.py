@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..model.model import Model
 from ..said import page, warn
-from ..scopes import looks_at
+from ..scopes import is_captured, looks_at
 from ..step.arguments import Prepared, acceleration_of, collider_state
 from ..step.balance import UNBALANCED_FRICTION, contact_of_step, friction_left_over, potential_of_step
 from ..step.met import outcomes
@@ -28,7 +28,7 @@ def checks_contact(asked: bool | None, model: Model, x: Tensor, steps: int) -> b
     if torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore[reportAttributeAccessIssue]
         return False
     if asked:
-        return not (x.is_cuda and torch.cuda.is_current_stream_capturing())
+        return not is_captured(x)
     return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and WARNED not in model._derived
 
 

@@ -14,7 +14,7 @@ from ..mask import ELASTIC
 from ..model.model import Model
 from ..model.rest import rest_metric
 from ..said import page, warn
-from ..scopes import looks_at
+from ..scopes import is_captured, looks_at
 from ..step.arguments import Prepared, acceleration_of
 
 GAIN = 0.05  # of the energy that a scene had and that gravity gave it, which a rollout may gain without a word
@@ -60,7 +60,7 @@ def warn_of_last_end(model: Model, x: Tensor) -> None:
 
 
 def _copies(x: Tensor) -> bool:
-    if not x.is_cuda or torch.compiler.is_compiling() or torch.cuda.is_current_stream_capturing():
+    if not x.is_cuda or torch.compiler.is_compiling() or is_captured(x):
         return False
     return torch._C._functorch.peek_interpreter_stack() is None  # pyright: ignore[reportAttributeAccessIssue]
 

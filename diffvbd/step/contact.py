@@ -24,7 +24,7 @@ from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
 from ..ops.contact_rigid import any_left, most_grouped
 from ..ops.motion import RoomsOfBodies
-from ..scopes import checking, not_compiled, recorders
+from ..scopes import checking, is_captured, not_compiled, recorders
 from ..tuples import replaced
 from .coarse import factor_of
 from .contact_cycles import parts_of, record_parts, sweeps_of_parts, swept_part
@@ -165,7 +165,7 @@ class ContactStep:
             motion = motion_of(surface, x, self.origin, self.fields.mass, move, fall)
             within = self._rooms(x, was, now, motion)
             if self.parts is None:
-                self.parts = 1 if x.is_cuda and torch.cuda.is_current_stream_capturing() else parts_of(within.over)
+                self.parts = 1 if is_captured(x) else parts_of(within.over)
             detection = self._detect(x, was, now, within)
             sweeps = sweeps_of_parts(settings.sweeps, self.parts)[r]
             met.found.append(detection)
@@ -199,7 +199,7 @@ class ContactStep:
                 x, limits, combined, lengths = swept
                 groups = x
                 for again in self.corrections_after(r + 1 == self.parts):
-                    if again and self._reads(x) and not any_left(groups):
+                    if again and not is_captured(x) and not any_left(groups):
                         break
                     x, last, groups = self._corrected(x, now, start, detection.listed, again)
                     taken.append(last)
@@ -314,7 +314,7 @@ class ContactStep:
         self._record(met)
         record_parts(self.model, x, met.swept)
         table, capacity = torch.stack(met.counts), self.capacity
-        if x.is_cuda and torch.cuda.is_current_stream_capturing():
+        if is_captured(x):
             good = (table[:, :2] <= torch.stack([table.new_full((), capacity), table.new_zeros(())])).all()
             good = good & (table[:, 3] == 0).all()
             return torch.where(good, x, torch.nan)

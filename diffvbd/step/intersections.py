@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..contact.detection import intersections
 from ..model.model import Model
+from ..scopes import is_captured
 from .arguments import collider_state
 
 
@@ -24,7 +25,7 @@ def check_start(model: Model, x: Tensor, colliders: Any, colliders_before: Tenso
         return
     if torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore[reportAttributeAccessIssue]
         return  # the step says that there are no transforms of it
-    if x.is_cuda and torch.cuda.is_current_stream_capturing():
+    if is_captured(x):
         return
     where = collider_state(model, x, None if moving else colliders, colliders_before)
     if where is not None:
