@@ -13,7 +13,7 @@ __device__ int64_t unit_of(const RigidInputs<T>& in, const PairRoom& room, int64
   return scene * in.bodies() + body;
 }
 
-// What listed pairs press, the sides of all, and how many each body has, if that is asked for.
+// What listed pairs press, the sides of all, and how many each body has.
 template <class T>
 __global__ void __launch_bounds__(kOne) press_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room,
                                                      int32_t* sides, double* press, int32_t* counts) {
@@ -31,11 +31,11 @@ __global__ void __launch_bounds__(kOne) press_kernel(const __grid_constant__ Rig
   for (int side = 0; side < 2; ++side) {
     const int32_t body = acts ? a.body[side] : -1;
     sides[2 * row + side] = body;
-    if (counts && body >= 0) atomicAdd(counts + 2 * unit_of(in, room, row, body) + (row < room.listed ? 0 : 1), 1);
+    if (body >= 0) atomicAdd(counts + 2 * unit_of(in, room, row, body) + (row < room.listed ? 0 : 1), 1);
   }
 }
 
-// Shares memory out for the rows of groups of more than kFew bodies.
+// Shares memory out for the rows of groups.
 template <class T>
 __global__ void __launch_bounds__(kOne)
     share_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ GroupMemory memory) {
@@ -45,7 +45,7 @@ __global__ void __launch_bounds__(kOne)
   const auto first = static_cast<int32_t>(place % n);
   const Groups groups = in.groups_of(scene);
   const int32_t count = groups.count(first);
-  if (count <= kFew) return;
+  if (count == 0) return;
   const auto rows_of = [&](int32_t b) { return memory.counts + 2 * (scene * n + groups.member(first + b)); };
   int32_t rows = 0;
   for (int32_t b = 0; b < count; ++b) rows += rows_of(b)[0] + rows_of(b)[1];
@@ -65,8 +65,6 @@ __global__ void __launch_bounds__(kOne)
     const int32_t body = memory.sides[2 * row + side];
     if (body < 0) continue;
     const int64_t unit = unit_of(in, room, row, body);
-    const Groups groups = in.groups_of(unit / in.bodies());
-    if (groups.count(groups.first(body)) <= kFew) continue;
     const int which = row < room.listed ? 0 : 1;
     const int32_t at = memory.begins[unit] + which * memory.counts[2 * unit];
     memory.found[at + atomicAdd(memory.filled + 2 * unit + which, 1)] = static_cast<int32_t>(2 * row) + side;
@@ -79,6 +77,9 @@ bool has_many(const RigidInputs<T>& in) {
   return most_grouped(in.bodies()) > kFew;
 }
 
+// Numbers that are counted up from zero, of so many bodies.
+int64_t counters(int64_t bodies) { return 5 * bodies + 1; }
+
 // How often vertices may be borne by planes.
 template <class T>
 int64_t floors_of(const RigidInputs<T>& in) {
@@ -90,13 +91,12 @@ int64_t floors_of(const RigidInputs<T>& in) {
 template <class T>
 int64_t rigid_system_bytes(const RigidInputs<T>& in, const PairRoom& room) {
   const int64_t scenes = in.scene.scenes, bodies = scenes * in.bodies(), rows = room.rows();
-  int64_t bytes = aligned(2 * rows * sizeof(int32_t)) + aligned(room.listed * kPressDoubles * sizeof(double)) +
-                  aligned(bodies * kUnknowns * sizeof(double));
+  int64_t bytes = 3 * aligned(2 * rows * sizeof(int32_t)) + aligned(room.listed * kPressDoubles * sizeof(double)) +
+                  aligned(bodies * kUnknowns * sizeof(double)) + aligned(counters(bodies) * sizeof(int32_t));
   if (!in.together()) bytes += aligned(groups_bytes(scenes, in.bodies()));
   if (has_many(in)) {
-    bytes += aligned(scenes * in.matrix_size() * sizeof(double)) + 2 * aligned(2 * rows * sizeof(int32_t)) +
-             2 * aligned(2 * bodies * sizeof(int32_t)) + aligned(bodies * sizeof(int32_t)) + aligned(sizeof(int32_t)) +
-             aligned(room.lagged * kRubScalars * sizeof(double)) + aligned(floors_of(in) * sizeof(int32_t));
+    bytes += aligned(scenes * in.matrix_size() * sizeof(double)) + aligned(room.lagged * kRubScalars * sizeof(double)) +
+             aligned(floors_of(in) * sizeof(int32_t));
   }
   return bytes;
 }
@@ -116,34 +116,27 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, bool ag
   memory.sides = static_cast<int32_t*>(take(2 * rows * sizeof(int32_t)));
   memory.press = static_cast<double*>(take(room.listed * kPressDoubles * sizeof(double)));
   memory.steps = static_cast<double*>(take(bodies * kUnknowns * sizeof(double)));
-  const bool many = has_many(in) && !again;
-  if (many) {
-    memory.bases = static_cast<double*>(take(scenes * in.matrix_size() * sizeof(double)));
-    memory.found = static_cast<int32_t*>(take(2 * rows * sizeof(int32_t)));
-    memory.rows = static_cast<int32_t*>(take(2 * rows * sizeof(int32_t)));
-    memory.counts = static_cast<int32_t*>(take(2 * bodies * sizeof(int32_t)));
-    memory.filled = static_cast<int32_t*>(take(2 * bodies * sizeof(int32_t)));
-    memory.begins = static_cast<int32_t*>(take(bodies * sizeof(int32_t)));
-    memory.taken = static_cast<int32_t*>(take(sizeof(int32_t)));
-    memory.rubbing = static_cast<double*>(take(room.lagged * kRubScalars * sizeof(double)));
-    memory.floors = static_cast<int32_t*>(take(floors_of(in) * sizeof(int32_t)));
-    const auto zero = [&](int32_t* of, int64_t count) {
-      return cudaMemsetAsync(of, 0, count * sizeof(int32_t), stream);
-    };
-    if (auto error = zero(memory.counts, 2 * bodies)) return error;
-    if (auto error = zero(memory.filled, 2 * bodies)) return error;
-    if (auto error = zero(memory.taken, 1)) return error;
-  }
+  memory.found = static_cast<int32_t*>(take(2 * rows * sizeof(int32_t)));
+  memory.rows = static_cast<int32_t*>(take(2 * rows * sizeof(int32_t)));
+  memory.counts = static_cast<int32_t*>(take(counters(bodies) * sizeof(int32_t)));
+  memory.filled = memory.counts + 2 * bodies, memory.begins = memory.filled + 2 * bodies;
+  memory.taken = memory.begins + bodies;
+  if (auto error = cudaMemsetAsync(memory.counts, 0, counters(bodies) * sizeof(int32_t), stream)) return error;
   const unsigned blocks = blocks_for(rows);
   if (rows > 0) press_kernel<T><<<blocks, kOne, 0, stream>>>(in, room, memory.sides, memory.press, memory.counts);
   if (!in.together()) {
     void* work = take(groups_bytes(scenes, in.bodies()));
     if (auto error = find_groups(in, room, memory.sides, groups, work, stream)) return error;
   }
+  if (rows > 0) {
+    share_kernel<T><<<blocks_for(bodies), kOne, 0, stream>>>(in, memory);
+    fill_kernel<T><<<blocks, kOne, 0, stream>>>(in, room, memory);
+  }
   if (auto error = solve_few(in, room, memory, again, center, motion, factor, stream)) return error;
-  if (!many) return cudaGetLastError();
-  share_kernel<T><<<blocks_for(bodies), kOne, 0, stream>>>(in, memory);
-  if (rows > 0) fill_kernel<T><<<blocks, kOne, 0, stream>>>(in, room, memory);
+  if (!has_many(in) || again) return cudaGetLastError();
+  memory.bases = static_cast<double*>(take(scenes * in.matrix_size() * sizeof(double)));
+  memory.rubbing = static_cast<double*>(take(room.lagged * kRubScalars * sizeof(double)));
+  memory.floors = static_cast<int32_t*>(take(floors_of(in) * sizeof(int32_t)));
   return solve_groups_of_many(in, room, memory, groups, center, motion, factor, stream);
 }
 

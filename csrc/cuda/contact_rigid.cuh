@@ -45,17 +45,6 @@ struct GroupMemory {
   int32_t* floors;                            // [B, V, planes]: where the vertices of bodies are borne, body after body
 };
 
-// The side that a body has of an entry's pair, which acts, at the first corner of that side; or -1. bodies: of the
-// sides of the list.
-__device__ __forceinline__ int side_of(const PairList& list, const int32_t* bodies, int32_t entry, int32_t body) {
-  const int corner = entry & 3;
-  const int64_t pair = entry >> 2;
-  if (corner == 3) return -1;
-  const int side = corner == 0 ? 0 : 1;
-  if (bodies[2 * pair + side] != body) return -1;
-  return side == 0 || corner == sides(list.pairs[kPairRow * pair + 4]) ? side : -1;
-}
-
 // Motions of bodies and factors of groups: of those with up to kFew bodies, and of larger ones, which are put into the
 // order of their elimination first. again: as of rigid_system().
 template <class T>

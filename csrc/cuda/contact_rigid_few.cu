@@ -7,7 +7,6 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int kLanes = 8;                    // threads that share the pairs of a vertex
 constexpr int kSlots = 2, kLineDoubles = 6;  // slips that a thread keeps while a step looks for its length
 constexpr int kOwn = kUnknowns + rigid::kSix, kHalf = 3 * kUnknowns;
 constexpr int kSmall = kUnknowns * kFew;  // unknowns of systems that fit into shared memory
@@ -22,6 +21,7 @@ struct System {
   int32_t first, count;
   double *center, *motion, *steps;  // of the scene's bodies
   double *base, *matrix, *gradient, *step;
+  const GroupRows<T>& rows;
   uint8_t* touching;  // [count, count]
   Pivots& pivots;
   double (*slots)[kLineDoubles][kThreads];
@@ -38,46 +38,27 @@ struct System {
     return of[size() * (kUnknowns * b + i) + kUnknowns * c + j];
   }
 
-  // Calls f(pair, side) for the sides that body b has of pairs which act, for a part of one of its vertices.
-  template <class F>
-  __device__ void each_side(const Sides& pairs, int32_t b, int32_t item, const F& f) const {
-    const PairList& list = pairs.list;
-    const int64_t row = scene * in.gate.corners + body(b).vertex(item / kLanes);
-    for (int32_t e = list.ptr[row] + item % kLanes; e < list.ptr[row + 1]; e += kLanes) {
-      const int side = side_of(list, pairs.bodies, list.entry[e], member(b));
-      if (0 <= side) f(int64_t{list.entry[e] >> 2}, side);
-    }
-  }
-  __device__ int32_t items(int32_t b) const { return kLanes * body(b).size(); }
-
-  // Which bodies press others of the system.
+  // The rows of body b of those that press: from where, and how many.
   template <class Presses>
-  __device__ void find_touching(const Presses& presses) const {
-    for (int32_t b = 0; b < count; ++b) {
-      team.each(items(b), [&](int32_t item) {
-        each_side(presses.pairs(), b, item, [&](int64_t pair, int side) {
-          const int32_t other = presses.pairs().bodies[2 * pair + 1 - side];
-          if (0 <= other && groups.first(other) == first) touching[count * b + groups.rank(other)] = 1;
-        });
-      });
-    }
+  __device__ int2 rows_of(const Presses&, int32_t b) const {
+    const int32_t own = member(b), from = Presses::rubs ? rows.lagged(own) : rows.begin(own);
+    return {from, (Presses::rubs ? rows.end(own) : rows.lagged(own)) - from};
   }
 
-  // What pairs add to the gradient of body b and its own part of the matrix.
+  // What a row adds to the gradient of its body b and to that body's own part of the matrix.
   template <class Presses>
-  __device__ void add_own(const Presses& presses, int32_t b, int32_t item, double* out) const {
+  __device__ void add_own(const Presses& presses, int32_t b, int32_t entry, double* out) const {
     const Vector c = center_of(b);
-    each_side(presses.pairs(), b, item, [&](int64_t pair, int side) {
-      const PairPress a = presses(pair, side);
-      const double share = borne(in, scene, a);
+    const int side = entry & 1;
+    const PairPress a = presses(entry >> 1, side);
+    const double share = borne(in, scene, a);
 #pragma unroll
-      for (int j = 0; j < kUnknowns; ++j) {
-        out[j] += a.gradient(side, j, c);
-        const Vector pressed = share * (a.stiffness * a.map(side, j, c));
+    for (int j = 0; j < kUnknowns; ++j) {
+      out[j] += a.gradient(side, j, c);
+      const Vector pressed = share * (a.stiffness * a.map(side, j, c));
 #pragma unroll
-        for (int i = j; i < kUnknowns; ++i) out[kUnknowns + rigid::at6(i, j)] += dot(a.map(side, i, c), pressed);
-      }
-    });
+      for (int i = j; i < kUnknowns; ++i) out[kUnknowns + rigid::at6(i, j)] += dot(a.map(side, i, c), pressed);
+    }
   }
   // Adds the sums of all threads.
   __device__ void put_own(const double* total, int32_t b, double* to, double* gradients) const {
@@ -103,17 +84,18 @@ struct System {
         const Vector c = center_of(b), d = center_of(other);
         for (int half = 0; half < 2; ++half) {
           double total[kHalf];
-          team.template sum<kHalf>(items(b), total, [&](int32_t item, double* out) {
-            each_side(presses.pairs(), b, item, [&](int64_t pair, int side) {
-              if (presses.pairs().bodies[2 * pair + 1 - side] != member(other)) return;
-              const PairPress a = presses(pair, side);
+          const int2 range = rows_of(presses, b);
+          team.template sum<kHalf>(range.y, total, [&](int32_t e, double* out) {
+            const int32_t entry = rows.memory.rows[range.x + e];
+            if (rows.memory.sides[entry ^ 1] != member(other)) return;
+            const int side = entry & 1;
+            const PairPress a = presses(entry >> 1, side);
 #pragma unroll
-              for (int j = 0; j < kUnknowns; ++j) {
-                const Vector pressed = a.stiffness * a.map(1 - side, j, d);
+            for (int j = 0; j < kUnknowns; ++j) {
+              const Vector pressed = a.stiffness * a.map(1 - side, j, d);
 #pragma unroll
-                for (int i = 0; i < 3; ++i) out[kUnknowns * i + j] += dot(a.map(side, 3 * half + i, c), pressed);
-              }
-            });
+              for (int i = 0; i < 3; ++i) out[kUnknowns * i + j] += dot(a.map(side, 3 * half + i, c), pressed);
+            }
           });
           if (threadIdx.x == 0) {
 #pragma unroll
@@ -142,10 +124,10 @@ struct System {
       team.meet();
       const bool free = in.free[own.body] && 0 < whole.mass;
       double total[kOwn + 1];  // and the sum of m r^2
-      team.template sum<kOwn + 1>(free ? items(b) : 0, total, [&](int32_t item, double* out) {
-        add_own(barriers, b, item, out);
-        if (item % kLanes != 0) return;
-        const int32_t v = own.vertex(item / kLanes);
+      const int2 range = rows_of(barriers, b);
+      team.template sum<kOwn + 1>(free ? own.size() + range.y : 0, total, [&](int32_t item, double* out) {
+        if (item >= own.size()) return add_own(barriers, b, rows.memory.rows[range.x + item - own.size()], out);
+        const int32_t v = own.vertex(item);
         Vector g;
         Sym3<double> H;
         vertex_press(in, own, v, g, H);
@@ -171,10 +153,11 @@ struct System {
       if (!in.free[own.body]) continue;
       const Vector c = center_of(b);
       double total[kOwn];
-      team.template sum<kOwn>(items(b), total, [&](int32_t item, double* out) {
-        if (in.lag) add_own(rubs, b, item, out);
-        if (item % kLanes != 0 || in.planes == 0) return;
-        const int32_t v = own.vertex(item / kLanes);
+      const int2 range = rows_of(rubs, b);
+      const int32_t borne = in.planes > 0 ? own.size() : 0;
+      team.template sum<kOwn>(borne + range.y, total, [&](int32_t item, double* out) {
+        if (item >= borne) return add_own(rubs, b, rows.memory.rows[range.x + item - borne], out);
+        const int32_t v = own.vertex(item);
         bool any = false;
         for (int k = 0; k < in.planes; ++k) any = bears(in, own, v, k) || any;
         if (!any) return;
@@ -207,20 +190,19 @@ struct System {
     for (int32_t b = 0; b < count; ++b) {
       const Body<T> own = body(b);
       if (!in.free[own.body]) continue;
-      for (auto item = static_cast<int32_t>(threadIdx.x); item < items(b); item += kThreads) {
-        if (in.lag) {
-          each_side(rubs.pairs(), b, item, [&](int64_t pair, int side) {
-            const PairPress a = rubs(pair, side);
-            if (side == (a.body[0] < 0 ? 1 : 0)) f(slip_line(in, pair, a, center, steps));  // once
-          });
-        }
-        const int32_t v = own.vertex(item / kLanes);
-        for (int k = item % kLanes; k < in.planes; k += kLanes) {
-          if (!bears(in, own, v, k)) continue;
-          const Vector arm = own.position(v) - center_of(b);
-          f(slip_line(in, own, v, k, arm, motion_of(b), step + kUnknowns * b));
-        }
-      }
+      const int2 range = rows_of(rubs, b);
+      team.each(range.y, [&](int32_t e) {
+        const int32_t entry = rows.memory.rows[range.x + e];
+        const PairPress a = rubs(entry >> 1, entry & 1);
+        if ((entry & 1) == (a.body[0] < 0 ? 1 : 0))
+          f(slip_line(in, (entry >> 1) - rubs.listed, a, center, steps));  // once
+      });
+      team.each(own.size() * in.planes, [&](int32_t i) {
+        const int32_t v = own.vertex(i / in.planes), k = i % in.planes;
+        if (!bears(in, own, v, k)) return;
+        const Vector arm = own.position(v) - center_of(b);
+        f(slip_line(in, own, v, k, arm, motion_of(b), step + kUnknowns * b));
+      });
     }
   }
   // How many lines a thread has, of which it leaves the first ones in its slots.
@@ -286,7 +268,7 @@ struct System {
 // A block for each place where a group may begin. again: bodies move only where they are left alone.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    few_kernel(const __grid_constant__ RigidInputs<T> in, int64_t listed, const __grid_constant__ GroupMemory memory,
+    few_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const __grid_constant__ GroupMemory memory,
                bool again, double* center, double* motion, double* factors) {
   __shared__ double part[kWarps][kMostSums];
   __shared__ uint8_t touching[kFew * kFew];
@@ -301,6 +283,7 @@ __global__ void __launch_bounds__(kThreads)
   const int32_t count = groups.count(first), size = kUnknowns * count;
   if (count == 0 || (!again && count > kFew)) return;
   double* factor = factors + in.matrix_size() * scene + groups.matrix(first);
+  const GroupRows<T> rows{in, room, memory, scene, groups, first, count};
   const System<T> system{in,
                          team,
                          scene,
@@ -314,6 +297,7 @@ __global__ void __launch_bounds__(kThreads)
                          matrices[1],
                          vectors[0],
                          vectors[1],
+                         rows,
                          touching,
                          pivots,
                          slots};
@@ -329,12 +313,11 @@ __global__ void __launch_bounds__(kThreads)
   team.each(count * count, [&](int32_t i) { touching[i] = 0; });
   team.meet();
   const Barriers<T> barriers{in, memory.sides, memory.press};
-  const Rubs<T> rubs{in, memory.sides + 2 * listed, {system.center, system.motion}};
-  if (count > 1) {
-    system.find_touching(barriers);
-    if (in.lag) system.find_touching(rubs);
-    team.meet();
-  }
+  const Rubs<T> rubs{in, room.listed, {system.center, system.motion}};
+  rows.template sort<kThreads>([&](int32_t body, int32_t other) {
+    if (groups.first(other) == first) touching[count * groups.rank(body) + groups.rank(other)] = 1;
+  });
+  team.meet();
   system.assemble(barriers);
   system.solve(rubs);
   team.each(size * size, [&](int32_t i) { factor[i] = system.matrix[i]; });
@@ -346,7 +329,7 @@ template <class T>
 cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, bool again,
                       double* center, double* motion, double* factors, cudaStream_t stream) {
   const auto blocks = static_cast<unsigned>(in.scene.scenes * (in.together() ? 1 : in.bodies()));
-  few_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room.listed, memory, again, center, motion, factors);
+  few_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room, memory, again, center, motion, factors);
   return cudaGetLastError();
 }
 

@@ -48,28 +48,15 @@ __device__ void find_order(int32_t count, Lists& lists) {
   }
 }
 
-// Brings the rows of a group into their order, and its bodies into that of their elimination. Returns where its rows
-// begin and end.
+// Brings the rows of a group into their order, and its bodies into that of their elimination.
 template <class T>
-__device__ int2 find_rows(const GroupSystem<T>& system, const GroupMemory& memory, int32_t* ordered, Lists& lists) {
+__device__ void find_order(const GroupSystem<T>& system, const GroupRows<T>& rows, int32_t* ordered, Lists& lists) {
   const int32_t count = system.count, n = system.groups.bodies;
-  const int64_t before = system.scene * n;
-  const auto unit_of = [&](int32_t b) { return before + lists.member[b]; };
   system.each(count, [&](int32_t b) { lists.touching[b] = 0, lists.member[b] = system.member(b); });
   __syncthreads();
-  const int32_t* last = memory.counts + 2 * unit_of(count - 1);
-  const int2 rows = {memory.begins[unit_of(0)], memory.begins[unit_of(count - 1)] + last[0] + last[1]};
-  system.each(rows.y - rows.x, [&](int32_t e) {
-    const int32_t own = memory.found[rows.x + e], body = memory.sides[own], other = memory.sides[own ^ 1];
-    const int which = own / 2 < system.room.listed ? 0 : 1;
-    const int64_t unit = before + body;
-    const int32_t begin = memory.begins[unit] + which * memory.counts[2 * unit];
-    int32_t rank = 0;
-    for (int32_t i = 0; i < memory.counts[2 * unit + which]; ++i) rank += memory.found[begin + i] < own ? 1 : 0;
-    memory.rows[begin + rank] = own;
-    if (other < 0) return;
-    const uint64_t bit = uint64_t{1} << system.groups.rank(other);
-    atomicOr(reinterpret_cast<unsigned long long*>(lists.touching + system.groups.rank(body)), bit);
+  rows.template sort<kTeam>([&](int32_t body, int32_t other) {
+    atomicOr(reinterpret_cast<unsigned long long*>(lists.touching + system.groups.rank(body)),
+             1ull << system.groups.rank(other));
   });
   __syncthreads();
   if (threadIdx.x < 32) find_order(count, lists);
@@ -77,13 +64,9 @@ __device__ int2 find_rows(const GroupSystem<T>& system, const GroupMemory& memor
   system.each(count, [&](int32_t b) {
     const int32_t place = lists.place[b], body = lists.member[b];
     ordered[system.first + place] = body, ordered[2 * n + body] = place;
-    const int32_t* own = memory.counts + 2 * unit_of(b);
-    lists.begin[place] = memory.begins[unit_of(b)];
-    lists.lagged[place] = lists.begin[place] + own[0];
-    lists.end[place] = lists.lagged[place] + own[1];
+    lists.begin[place] = rows.begin(body), lists.lagged[place] = rows.lagged(body), lists.end[place] = rows.end(body);
   });
   __syncthreads();
-  return rows;
 }
 
 // fits: unknowns whose matrix fits into the dynamic shared memory.
@@ -102,34 +85,35 @@ __global__ void __launch_bounds__(kTeam)
   const int32_t count = groups.count(first), size = kUnknowns * count;
   if (count <= kFew) return;
   const int64_t at = in.matrix_size() * scene + groups.matrix(first);
-  GroupSystem<T> system{in,
-                        room,
-                        scene,
-                        groups,
-                        first,
-                        count,
-                        memory.sides,
-                        center + 3 * n * scene,
-                        motion + kUnknowns * n * scene,
-                        memory.steps + kUnknowns * n * scene,
-                        memory.press,
-                        memory.rubbing,
-                        memory.floors + scene * in.scene.vertices * in.planes,
-                        memory.bases + at,
-                        size <= fits ? matrix : factors + at,
-                        vectors[0],
-                        vectors[1],
-                        vectors[2],
-                        lists.touching,
-                        lists.columns,
-                        memory.rows,
-                        lists.begin,
-                        lists.lagged,
-                        lists.end,
-                        lists.borne,
-                        part,
-                        {}};
-  system.all_rows = find_rows(system, memory, ordered + int64_t{kGroupRows} * n * scene, lists);
+  const GroupRows<T> rows{in, room, memory, scene, groups, first, count};
+  const GroupSystem<T> system{in,
+                              room,
+                              scene,
+                              groups,
+                              first,
+                              count,
+                              memory.sides,
+                              center + 3 * n * scene,
+                              motion + kUnknowns * n * scene,
+                              memory.steps + kUnknowns * n * scene,
+                              memory.press,
+                              memory.rubbing,
+                              memory.floors + scene * in.scene.vertices * in.planes,
+                              memory.bases + at,
+                              size <= fits ? matrix : factors + at,
+                              vectors[0],
+                              vectors[1],
+                              vectors[2],
+                              lists.touching,
+                              lists.columns,
+                              memory.rows,
+                              lists.begin,
+                              lists.lagged,
+                              lists.end,
+                              lists.borne,
+                              part,
+                              rows.all()};
+  find_order(system, rows, ordered + int64_t{kGroupRows} * n * scene, lists);
   system.assemble();
   system.solve(pivots);
   if (size <= fits) system.each(size * size, [&](int32_t i) { factors[at + i] = matrix[i]; });

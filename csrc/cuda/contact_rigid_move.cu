@@ -12,6 +12,7 @@ constexpr int64_t kSmallScene = 4096;  // vertices up to which a block does all 
 constexpr int64_t kFewPairs = 32768;   // pairs that each has room for, unless there are
 constexpr int64_t kManyScenes = 64;    // scenes enough to fill the device
 constexpr int64_t kLargeBody = 32;     // vertices from which a block adds up a body, and not a warp
+constexpr int kLanes = 8;              // threads that share the pairs of a vertex
 constexpr double kParts = 0x1p40;      // of the largest number of a sum in whole numbers, which has up to 2^20 of them
 
 using Count = unsigned long long;
@@ -162,17 +163,18 @@ __device__ double potential_of(const RigidInputs<T>& in, const Tried<T>& t, cons
                                int32_t which, int64_t listed) {
   const Body<T> body{in.scene, scene, which};
   double sum[1];
-  team.template sum<1>(body.size(), sum, [&](int32_t i, double* to) {
-    const int32_t v = body.vertex(i);
-    to[0] += t.value[body.row(v)];
+  team.template sum<1>(kLanes * body.size(), sum, [&](int32_t i, double* to) {
+    const int32_t v = body.vertex(i / kLanes), lane = i % kLanes;
+    if (lane == 0) to[0] += t.value[body.row(v)];
     const auto add = [&](const PairList& list, const double* press) {
       const int64_t corner = scene * in.gate.corners + v;
-      for (int32_t e = list.ptr[corner]; e < list.ptr[corner + 1]; ++e) {
+      for (int32_t e = list.ptr[corner] + lane; e < list.ptr[corner + 1]; e += kLanes) {
         const int64_t pair = list.entry[e] >> 2;
         const int place = list.entry[e] & 3;
-        if (place == 3) continue;
+        const double value = place == 3 ? 0.0 : press[pair];
+        if (value == 0) continue;  // as of most
         const int32_t* record = list.pairs + kPairRow * pair;
-        if (place == 0 || (place == sides(record[4]) && moving_body(in, record[0]) < 0)) to[0] += press[pair];
+        if (place == 0 || (place == sides(record[4]) && moving_body(in, record[0]) < 0)) to[0] += value;
       }
     };
     if (listed > 0) add(in.gate.listed, t.press);

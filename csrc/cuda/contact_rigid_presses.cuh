@@ -7,10 +7,37 @@
 namespace diffvbd::cuda {
 namespace {
 
-// A list of pairs, and where the sides of its first one are.
-struct Sides {
-  const PairList& list;
-  const int32_t* bodies;
+// The rows of a group, in memory that they share.
+template <class T>
+struct GroupRows {
+  const RigidInputs<T>& in;
+  PairRoom room;
+  const GroupMemory& memory;
+  int64_t scene;
+  Groups groups;
+  int32_t first, count;
+
+  __device__ int64_t unit(int32_t body) const { return scene * groups.bodies + body; }
+  // Where those of a body begin, those of lagged pairs among them, and where they end.
+  __device__ int32_t begin(int32_t body) const { return memory.begins[unit(body)]; }
+  __device__ int32_t lagged(int32_t body) const { return begin(body) + memory.counts[2 * unit(body)]; }
+  __device__ int32_t end(int32_t body) const { return lagged(body) + memory.counts[2 * unit(body) + 1]; }
+  __device__ int2 all() const { return {begin(groups.member(first)), end(groups.member(first + count - 1))}; }
+
+  // Brings them into their order, by all threads of a block, and calls f(body, other) for each that joins two.
+  template <int threads, class F>
+  __device__ void sort(const F& f) const {
+    const int2 range = all();
+    for (int32_t e = range.x + static_cast<int32_t>(threadIdx.x); e < range.y; e += threads) {
+      const int32_t own = memory.found[e], body = memory.sides[own], other = memory.sides[own ^ 1];
+      const bool repels = own / 2 < room.listed;
+      const int32_t from = repels ? begin(body) : lagged(body), to = repels ? lagged(body) : end(body);
+      int32_t rank = from;
+      for (int32_t i = from; i < to; ++i) rank += memory.found[i] < own ? 1 : 0;
+      memory.rows[rank] = own;
+      if (other >= 0) f(body, other);
+    }
+  }
 };
 
 // The barriers of listed pairs.
@@ -19,21 +46,21 @@ struct Barriers {
   const RigidInputs<T>& in;
   const int32_t* sides;
   const double* presses;
-  __device__ Sides pairs() const { return {in.gate.listed, sides}; }
-  __device__ PairPress operator()(int64_t pair, int) const {
-    return load_press(presses + kPressDoubles * pair, sides + 2 * pair);
+  static constexpr bool rubs = false;
+  __device__ PairPress operator()(int64_t row, int) const {
+    return load_press(presses + kPressDoubles * row, sides + 2 * row);
   }
 };
 // Friction and damping of lagged ones, for a side that may be solved for alone.
 template <class T>
 struct Rubs {
   const RigidInputs<T>& in;
-  const int32_t* sides;
+  int64_t listed;
   Slid slid;
-  __device__ Sides pairs() const { return {in.lagged, sides}; }
-  __device__ PairPress operator()(int64_t pair, int side) const {
+  static constexpr bool rubs = true;
+  __device__ PairPress operator()(int64_t row, int side) const {
     PairPress a;
-    lagged_press(in, pair, CornerPoints<T>{in, false}, slid, a, side);
+    lagged_press(in, row - listed, CornerPoints<T>{in, false}, slid, a, side);
     return a;
   }
 };
