@@ -140,80 +140,91 @@ __device__ void factor_blocks(int32_t count, const uint64_t* columns, double* a,
   }
 }
 
-// x of L x = b, or of L' x = b, over b, by one thread; L the block that begins at a.
-template <bool turned>
-__device__ void solve_block(int64_t size, const double* a, const double* inverse, double* b) {
-  const LowerBlock block(size, a);
-  double x[kBlock];
-#pragma unroll
-  for (int i = 0; i < kBlock; ++i) x[i] = b[i];
-#pragma unroll
-  for (int step = 0; step < kBlock; ++step) {
-    const int i = turned ? kBlock - 1 - step : step;
-    x[i] *= inverse[i];
+// The inverses of the diagonal blocks of a factor, of which solutions are made; of each what is below its diagonal,
+// where m[block k + stride j + i] is in row i and column j.
+struct Inverses {
+  double* m;
+  int64_t block, stride;
+  const double* diagonal;
+
+  // In the upper halves of the blocks, which nobody looks at.
+  __device__ static Inverses within(int32_t count, double* a, const double* diagonal) {
+    const int64_t size = int64_t{kBlock} * count;
+    return {a, (size + 1) * kBlock, size, diagonal};
+  }
+};
+
+// By all threads: one for each block. The diagonals have been inverted.
+template <int threads>
+__device__ void invert_pivots(int32_t count, const double* a, const Inverses& to) {
+  const int64_t size = int64_t{kBlock} * count;
+  for (auto k = static_cast<int32_t>(threadIdx.x); k < count; k += threads) {
+    const LowerBlock b(size, a + (size + 1) * kBlock * k);
+    double inverse[kBlock][kBlock];
 #pragma unroll
     for (int j = 0; j < kBlock; ++j) {
-      if (turned ? j < i : i < j) x[j] -= x[i] * (turned ? block.l[i][j] : block.l[j][i]);
+      inverse[j][j] = to.diagonal[kBlock * k + j];
+#pragma unroll
+      for (int i = j + 1; i < kBlock; ++i) {
+        double sum = 0;
+#pragma unroll
+        for (int n = j; n < i; ++n) sum -= b.l[i][n] * inverse[n][j];
+        inverse[i][j] = sum * to.diagonal[kBlock * k + i];
+        to.m[to.block * k + to.stride * j + i] = inverse[i][j];
+      }
     }
   }
-#pragma unroll
-  for (int i = 0; i < kBlock; ++i) b[i] = x[i];
+  __syncthreads();
 }
 
-// Over the diagonal of a factor, by all threads.
-template <int threads>
-__device__ void invert_diagonal(int32_t count, const double* a, double* inverse) {
-  const int64_t size = int64_t{kBlock} * count;
-  for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += threads) inverse[i] = 1 / a[(size + 1) * i];
-  __syncthreads();
+// The inverse of a diagonal block, or of its transpose, times six numbers over these, by the first warp.
+template <bool turned>
+__device__ void times_inverse(const Inverses& of, int32_t k, double* b) {
+  const auto own = static_cast<int32_t>(threadIdx.x);
+  if (own >= 32) return;
+  double x = 0;
+  if (own < kBlock) {
+    const double* m = of.m + of.block * k;
+    x = of.diagonal[kBlock * k + own] * b[own];
+#pragma unroll
+    for (int i = 0; i < kBlock; ++i) {
+      if (turned ? own < i : i < own) x += (turned ? m[of.stride * own + i] : m[of.stride * i + own]) * b[i];
+    }
+  }
+  __syncwarp();
+  if (own < kBlock) b[own] = x;
 }
 
 // L^-1 b over b, with such a factor L; then L^-T b.
 template <int threads>
-__device__ void solve_forward(int32_t count, const double* a, const double* inverse, double* b) {
+__device__ void solve_forward(int32_t count, const double* a, const Inverses& inverses, double* b) {
   const int64_t size = int64_t{kBlock} * count;
-  const auto thread = static_cast<int32_t>(threadIdx.x);
   for (int32_t k = 0; k < count; ++k) {
-    const double* own = b + kBlock * k;
-    if (thread == 0) solve_block<false>(size, a + (size + 1) * kBlock * k, inverse + kBlock * k, b + kBlock * k);
+    times_inverse<false>(inverses, k, b + kBlock * k);
     __syncthreads();
-    for (auto i = static_cast<int32_t>(kBlock * (k + 1)) + thread; i < size; i += threads) {
+    for (auto i = static_cast<int32_t>(kBlock * (k + 1) + threadIdx.x); i < size; i += threads) {
       double sum = b[i];
 #pragma unroll
-      for (int c = 0; c < kBlock; ++c) sum -= a[size * i + kBlock * k + c] * own[c];
+      for (int c = 0; c < kBlock; ++c) sum -= a[size * i + kBlock * k + c] * b[kBlock * k + c];
       b[i] = sum;
     }
     __syncthreads();
   }
 }
-// By one warp, which has no need to wait for others. columns: as of factor_blocks().
-__device__ inline void solve_backward(int32_t count, const uint64_t* columns, const double* a, const double* inverse,
-                                      double* b) {
-  constexpr unsigned all = 0xffffffffu;
+template <int threads>
+__device__ void solve_backward(int32_t count, const double* a, const Inverses& inverses, double* b) {
   const int64_t size = int64_t{kBlock} * count;
-  const auto lane = static_cast<int32_t>(threadIdx.x);
-  if (lane < 32) {
-    for (int32_t k = count - 1; k >= 0; --k) {
-      const uint64_t column = columns ? columns[k] : ~uint64_t{0};
-      double sum[kBlock] = {};
-      for (int32_t i = kBlock * (k + 1) + lane; i < size; i += 32) {
-        if (!(column >> (i / kBlock) & 1)) continue;
+  for (int32_t k = count - 1; k >= 0; --k) {
+    times_inverse<true>(inverses, k, b + kBlock * k);
+    __syncthreads();
+    for (auto i = static_cast<int32_t>(threadIdx.x); i < kBlock * k; i += threads) {
+      double sum = b[i];
 #pragma unroll
-        for (int c = 0; c < kBlock; ++c) sum[c] += a[size * i + kBlock * k + c] * b[i];
-      }
-#pragma unroll
-      for (int c = 0; c < kBlock; ++c) {
-#pragma unroll
-        for (int d = 16; d > 0; d /= 2) sum[c] += __shfl_xor_sync(all, sum[c], d);
-      }
-      if (lane == 0) {
-        for (int c = 0; c < kBlock; ++c) b[kBlock * k + c] -= sum[c];
-        solve_block<true>(size, a + (size + 1) * kBlock * k, inverse + kBlock * k, b + kBlock * k);
-      }
-      __syncwarp();
+      for (int c = 0; c < kBlock; ++c) sum -= a[size * (kBlock * k + c) + i] * b[kBlock * k + c];
+      b[i] = sum;
     }
+    __syncthreads();
   }
-  __syncthreads();
 }
 
 }  // namespace diffvbd::cuda

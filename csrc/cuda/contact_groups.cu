@@ -108,7 +108,8 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     solve_groups_kernel(const __grid_constant__ RigidInputs<T> in, const double* factor, double* x) {
-  __shared__ double own[kUnknowns * kMostCoupled], inverse[kUnknowns * kMostCoupled];
+  __shared__ double own[kUnknowns * kMostCoupled], diagonal[kUnknowns * kMostCoupled];
+  __shared__ double blocks[kUnknowns * kUnknowns * kMostCoupled];
   const int32_t n = in.bodies(), places = in.together() ? 1 : n;
   const int64_t scene = blockIdx.x / places;
   const auto first = static_cast<int32_t>(blockIdx.x % places);
@@ -128,9 +129,13 @@ __global__ void __launch_bounds__(kThreads)
   for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads) own[i] = at(i);
   __syncthreads();
   const double* own_factor = factor + in.matrix_size() * scene + groups.matrix(first);
-  invert_diagonal<kThreads>(count, own_factor, inverse);
-  solve_forward<kThreads>(count, own_factor, inverse, own);
-  solve_backward(count, nullptr, own_factor, inverse, own);
+  for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads)
+    diagonal[i] = 1 / own_factor[(size + 1) * i];
+  __syncthreads();
+  const Inverses inverses{blocks, kUnknowns * kUnknowns, kUnknowns, diagonal};
+  invert_pivots<kThreads>(count, own_factor, inverses);
+  solve_forward<kThreads>(count, own_factor, inverses, own);
+  solve_backward<kThreads>(count, own_factor, inverses, own);
   for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads) at(i) = own[i];
 }
 

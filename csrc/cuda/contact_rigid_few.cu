@@ -251,7 +251,9 @@ struct System {
         team.meet();
       }
       factor_blocks<kThreads>(count, nullptr, matrix, step, pivots);
-      solve_backward(count, nullptr, matrix, pivots.inverse, step);
+      const auto inverses = Inverses::within(count, matrix, pivots.inverse);
+      invert_pivots<kThreads>(count, matrix, inverses);
+      solve_backward<kThreads>(count, matrix, inverses, step);
       team.each(count, [&](int32_t b) { keep_finite(step + kUnknowns * b); });
       team.meet();
       team.each(size(), [&](int32_t i) { unknown(steps, i) = step[i]; });

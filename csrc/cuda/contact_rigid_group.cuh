@@ -9,7 +9,7 @@ namespace diffvbd::cuda {
 namespace {
 
 constexpr unsigned kAll = 0xffffffffu;
-constexpr int kTeam = 256, kTeamWarps = kTeam / 32;
+constexpr int kTeam = 512, kTeamWarps = kTeam / 32;
 constexpr int kOwn = kUnknowns + rigid::kSix;
 constexpr int kLines = 16;  // slips that a thread keeps while a step looks for its length
 constexpr int kMostUnknowns = kUnknowns * kMostCoupled;
@@ -282,17 +282,18 @@ struct GroupSystem {
 
   // step += matrix motion
   __device__ void add_product() const {
-    each_body([&](int32_t b) {
-      const uint64_t blocks = touching[b] | uint64_t{1} << b;
-      for (int i = 0; i < kUnknowns; ++i) {
-        double sum = 0;
-        for (int32_t j = Warp().lane; j < size(); j += 32) {
-          const int32_t row = kUnknowns * b + i;
-          if (blocks >> (j / kUnknowns) & 1) sum += matrix[j <= row ? size() * row + j : size() * j + row] * own[j];
+    each(size(), [&](int32_t row) {
+      double sum = 0;
+      for (uint64_t blocks = touching[row / kUnknowns] | uint64_t{1} << row / kUnknowns; blocks != 0;
+           blocks &= blocks - 1) {
+        const int32_t first_column = kUnknowns * (__ffsll(static_cast<long long>(blocks)) - 1);
+#pragma unroll
+        for (int k = 0; k < kUnknowns; ++k) {
+          const int32_t j = first_column + k;
+          sum += matrix[j <= row ? size() * row + j : size() * j + row] * own[j];
         }
-        butterfly<1, 32>(kAll, &sum);
-        if (Warp().leads()) step[kUnknowns * b + i] += sum;
       }
+      step[row] += sum;
     });
   }
   // Of the matrix, of the step and of the motion after it: half of the first is what the step lowers the potential by.
@@ -300,9 +301,16 @@ struct GroupSystem {
     total[0] = total[1] = 0;
     each(size(), [&](int32_t j) {
       double one = 0, whole = 0;
-      for (int32_t i = j; i < size(); ++i) {
-        one += matrix[size() * i + j] * step[i];
-        whole += matrix[size() * i + j] * (step[i] + own[i]);
+      const int32_t block = j / kUnknowns;
+      for (uint64_t blocks = columns[block] | uint64_t{1} << block; blocks != 0; blocks &= blocks - 1) {
+        const int32_t first_row = kUnknowns * (__ffsll(static_cast<long long>(blocks)) - 1);
+#pragma unroll
+        for (int k = 0; k < kUnknowns; ++k) {
+          const int32_t i = first_row + k;
+          if (i < j) continue;
+          one += matrix[size() * i + j] * step[i];
+          whole += matrix[size() * i + j] * (step[i] + own[i]);
+        }
       }
       total[0] += one * one, total[1] += whole * whole;
     });
@@ -360,7 +368,9 @@ struct GroupSystem {
       if (iteration > 0) add_product();
       __syncthreads();
       factor_blocks<kTeam>(count, columns, matrix, step, pivots);
-      solve_backward(count, columns, matrix, pivots.inverse, step);
+      const auto inverses = Inverses::within(count, matrix, pivots.inverse);
+      invert_pivots<kTeam>(count, matrix, inverses);
+      solve_backward<kTeam>(count, matrix, inverses, step);
       each(count, [&](int32_t b) { keep_finite(step + kUnknowns * b); });
       __syncthreads();
       each(size(), [&](int32_t i) { unknown(steps, i) = step[i]; });
