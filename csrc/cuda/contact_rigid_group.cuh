@@ -9,9 +9,9 @@ namespace diffvbd::cuda {
 namespace {
 
 constexpr unsigned kAll = 0xffffffffu;
-constexpr int kTeam = 512, kTeamWarps = kTeam / 32;
+constexpr int kTeam = 256, kTeamWarps = kTeam / 32;
 constexpr int kOwn = kUnknowns + rigid::kSix;
-constexpr int kLines = 16;  // slips that a thread keeps while a step looks for its length
+constexpr int kLines = 4;  // slips that a thread keeps while a step looks for its length
 constexpr int kMostUnknowns = kUnknowns * kMostCoupled;
 constexpr int64_t kShared = 16;    // bodies up to which their matrix is in shared memory, where there are many groups
 constexpr int kStatic = 16 << 10;  // bytes of shared memory that are not for the matrix, at most

@@ -86,33 +86,39 @@ __global__ void __launch_bounds__(kTeam)
   if (count <= kFew) return;
   const int64_t at = in.matrix_size() * scene + groups.matrix(first);
   const GroupRows<T> rows{in, room, memory, scene, groups, first, count};
-  const GroupSystem<T> system{in,
-                              room,
-                              scene,
-                              groups,
-                              first,
-                              count,
-                              memory.sides,
-                              center + 3 * n * scene,
-                              motion + kUnknowns * n * scene,
-                              memory.steps + kUnknowns * n * scene,
-                              memory.press,
-                              memory.rubbing,
-                              memory.floors + scene * in.scene.vertices * in.planes,
-                              memory.bases + at,
-                              size <= fits ? matrix : factors + at,
-                              vectors[0],
-                              vectors[1],
-                              vectors[2],
-                              lists.touching,
-                              lists.columns,
-                              memory.rows,
-                              lists.begin,
-                              lists.lagged,
-                              lists.end,
-                              lists.borne,
-                              part,
-                              rows.all()};
+  // shared, as there are not enough registers for it
+  alignas(GroupSystem<T>) __shared__ unsigned char bytes[sizeof(GroupSystem<T>)];
+  if (threadIdx.x == 0) {
+    new (bytes) GroupSystem<T>{in,
+                               room,
+                               scene,
+                               groups,
+                               first,
+                               count,
+                               memory.sides,
+                               center + 3 * n * scene,
+                               motion + kUnknowns * n * scene,
+                               memory.steps + kUnknowns * n * scene,
+                               memory.press,
+                               memory.rubbing,
+                               memory.floors + scene * in.scene.vertices * in.planes,
+                               memory.bases + at,
+                               size <= fits ? matrix : factors + at,
+                               vectors[0],
+                               vectors[1],
+                               vectors[2],
+                               lists.touching,
+                               lists.columns,
+                               memory.rows,
+                               lists.begin,
+                               lists.lagged,
+                               lists.end,
+                               lists.borne,
+                               part,
+                               rows.all()};
+  }
+  __syncthreads();
+  const auto& system = *reinterpret_cast<const GroupSystem<T>*>(bytes);
   find_order(system, rows, ordered + int64_t{kGroupRows} * n * scene, lists);
   system.assemble();
   system.solve(pivots);
