@@ -9,7 +9,7 @@ namespace diffvbd::cuda {
 namespace {
 
 constexpr unsigned kAll = 0xffffffffu;
-constexpr int kTeam = 384, kTeamWarps = kTeam / 32;
+constexpr int kTeam = 256, kTeamWarps = kTeam / 32;
 constexpr int kOwn = kUnknowns + rigid::kSix;
 constexpr int kLines = 4;  // slips that a thread keeps while a step looks for its length
 constexpr int kMostUnknowns = kUnknowns * kMostCoupled;
