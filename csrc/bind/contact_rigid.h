@@ -68,15 +68,25 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const std::vect
   return in;
 }
 
-// Bodies of a group that the memory of its factor has room for. again: only those move that are alone.
-inline int64_t room_of_groups(int64_t bodies, bool again) {
-  return again ? std::min<int64_t>(bodies, 1) : contact::most_grouped(bodies);
+// Bodies of a group that the memory of its factor has room for. alone: only groups of one move.
+inline int64_t room_of_groups(int64_t bodies, bool alone) {
+  return alone ? std::min<int64_t>(bodies, 1) : contact::most_grouped(bodies);
 }
 // Of the factor, and of the groups.
-inline std::vector<int64_t> matrix_shape(int64_t scenes, int64_t bodies, bool again) {
+inline std::vector<int64_t> matrix_shape(int64_t scenes, int64_t bodies, bool alone) {
   const int64_t six = contact::kUnknowns;
   if (bodies <= contact::kFew) return {scenes, six * bodies, six * bodies};
-  return {scenes, bodies, six, six * room_of_groups(bodies, again)};
+  return {scenes, bodies, six, six * room_of_groups(bodies, alone)};
+}
+// Inputs of a system in which the bodies of a mask move, or, if that is empty, all.
+template <class T>
+contact::RigidInputs<T> moving_inputs(contact::RigidInputs<T> in, const Tensor& moving, bool alone, const Tensor& x) {
+  if (!in.together()) in.room = room_of_groups(in.bodies(), alone);
+  if (moving.numel() == 0) return in;
+  require(is_beside(moving, x, ScalarType::Bool) && moving.numel() == in.scene.scenes * in.bodies(),
+          "diffvbd::contact_rigid_system: expected moving bool [scenes, bodies]");
+  in.moving = data<const bool>(moving);
+  return in;
 }
 inline std::vector<int64_t> groups_shape(int64_t scenes, int64_t bodies) {
   if (bodies <= contact::kFew) return {0};

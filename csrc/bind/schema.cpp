@@ -139,11 +139,11 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own, ");
   // The Newton step of the rigid motions of all bodies of a scene, float64: centers of mass [scenes, bodies, 3], motion
   // [scenes, bodies, 6], the factors of groups that touch, in the memory [scenes, bodies, 6, 6 most] that
-  // contact/groups.h says (again: [scenes, bodies, 6, 6]), and groups [scenes, 4, bodies]; of few bodies one factor
-  // [scenes, 6 bodies, 6 bodies], and no groups; again: only bodies move that are left alone, because those that touch
-  // are too many
+  // contact/groups.h says, and groups [scenes, 4, bodies]; of few bodies one factor [scenes, 6 bodies, 6 bodies], and
+  // no groups. moving [scenes, bodies]: only groups of these bodies move; or empty. alone: only groups of one do, with
+  // factors [scenes, bodies, 6, 6]
   define(m, "contact_rigid_system", DIFFVBD_ARGUMENTS(TOUCHING),
-         "int[] data_count, float time_step, float friction_eps, bool again",
+         "int[] data_count, float time_step, float friction_eps, Tensor moving, bool alone",
          "Tensor centers, Tensor motion, Tensor factor, Tensor groups, ");
   // The state after each body has taken what it may of its motion [scenes, bodies, 6], and that share [scenes, bodies]
   define(m, "contact_rigid_move", DIFFVBD_ARGUMENTS(TOUCHING),

@@ -25,6 +25,7 @@ struct RigidInputs {
   const bool* free;                   // [bodies]: nothing of it is pinned
   const int32_t* groups;              // [B, 4, bodies], or null where they do not matter or all are one
   int64_t room;                       // bodies of a group that the memory of its matrix has room for
+  const bool* moving;                 // [B, bodies]: those that do, or null, if all do
   int32_t planes;
   double friction_eps;
   bool has_friction;
@@ -35,6 +36,13 @@ struct RigidInputs {
   DIFFVBD_FN bool together() const { return scene.bodies <= kFew; }
   DIFFVBD_FN Groups groups_of(int64_t s) const {
     return {scene.bodies, room, groups ? groups + kGroupRows * scene.bodies * s : nullptr};
+  }
+  // Whether the group that begins at a place moves: one of it is to, and there is room for its matrix.
+  DIFFVBD_FN bool moves(int64_t s, const Groups& g, int32_t place) const {
+    const int32_t count = g.count(place);
+    bool any = !moving;
+    for (int32_t i = 0; i < count && !any; ++i) any = moving[s * scene.bodies + g.member(place + i)];
+    return any && count <= room;
   }
   // Scalars of the matrices of a scene.
   DIFFVBD_FN int64_t matrix_size() const { return kUnknowns * kUnknowns * scene.bodies * room; }

@@ -9,6 +9,8 @@
 
 namespace diffvbd::contact {
 
+constexpr int kRoomRounds = 3;  // of rooms beside islands, and islands with these: whom one meets gets room as well
+
 template <class T>
 struct RoomInputs {
   MotionInputs<T> motion;

@@ -222,9 +222,9 @@ void add_product(const double* matrix, int64_t size, const double* x, double* y)
 }
 
 // Motions of the bodies of a scene, zero at first, and the factors of the matrices there. rows [4, bodies] of `in`, or
-// null. again: of those that are left alone; others stay, and have no factor.
+// null. Those that do not move have no factor.
 template <class T>
-void solve_scene(const RigidInputs<T>& in, int64_t scene, bool again, double* center, double* motion, double* factor,
+void solve_scene(const RigidInputs<T>& in, int64_t scene, double* center, double* motion, double* factor,
                  int32_t* rows) {
   const int64_t unknowns = int64_t{kUnknowns} * in.bodies();
   std::vector<PairPress> presses(1);
@@ -243,7 +243,7 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, bool again, double* ce
   const Slid slid{center, motion};
   Systems systems(groups);
   for (auto& s : systems.all) {
-    if (!again || groups.is_left(s.first)) continue;
+    if (in.moves(scene, groups, s.first)) continue;
     s.state = kDone;
     factors[groups.matrix(s.first)] = std::numeric_limits<double>::quiet_NaN();
   }
@@ -297,12 +297,11 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, bool again, double* ce
 }  // namespace
 
 template <class T>
-void rigid_system(const RigidInputs<T>& in, bool again, double* center, double* motion, double* factor,
-                  int32_t* groups) {
+void rigid_system(const RigidInputs<T>& in, double* center, double* motion, double* factor, int32_t* groups) {
   const int64_t n = in.bodies();
   torch::stable::parallel_for(0, in.scene.scenes, 1, [&](int64_t begin, int64_t end) {
     for (int64_t s = begin; s < end; ++s) {
-      solve_scene(in, s, again, center + 3 * n * s, motion + kUnknowns * n * s, factor + in.matrix_size() * s,
+      solve_scene(in, s, center + 3 * n * s, motion + kUnknowns * n * s, factor + in.matrix_size() * s,
                   groups ? groups + kGroupRows * n * s : nullptr);
     }
   });
@@ -326,8 +325,8 @@ void rigid_solve(const RigidInputs<T>& in, const double* factor, double* x) {
   }
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                     \
-  template void rigid_system<T>(const RigidInputs<T>&, bool, double*, double*, double*, int32_t*); \
+#define DIFFVBD_INSTANTIATE(T)                                                               \
+  template void rigid_system<T>(const RigidInputs<T>&, double*, double*, double*, int32_t*); \
   template void rigid_solve<T>(const RigidInputs<T>&, const double*, double*);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

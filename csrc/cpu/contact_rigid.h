@@ -11,10 +11,9 @@ inline rigid::Vector vector_of(const double* a) { return {a[0], a[1], a[2]}; }
 
 // The Newton systems of each scene, their factors and solutions: center of mass [B, bodies, 3], motion [B, bodies, 6]
 // and factor [B, RigidInputs::matrix_size()] over a turn and a shift of each body. groups: those of `in`, to be
-// written, or null. again: only bodies that are left alone move, because those that touch are too many.
+// written, or null.
 template <class T>
-void rigid_system(const contact::RigidInputs<T>& in, bool again, double* center, double* motion, double* factor,
-                  int32_t* groups);
+void rigid_system(const contact::RigidInputs<T>& in, double* center, double* motion, double* factor, int32_t* groups);
 // The groups of a scene, by what presses its bodies; rows [4, bodies].
 template <class T>
 void find_groups(const contact::RigidInputs<T>& in, int64_t scene, const std::vector<contact::PairPress>& presses,

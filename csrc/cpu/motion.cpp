@@ -36,9 +36,11 @@ void find_rooms(RoomInputs<T> in, const RoomWork<T>& work) {
   if (looks) find_islands(in.islands, work.island);
   each([&](int64_t scene, int32_t body) { room_among_others(in, work, scene, body, looks); });
   find_islands(in.islands, work.island);
-  for_bodies<MovingBody>(in.motion,
-                         [&](const MovingBody<T>& b, const Threads& team) { room_beside_island(in, b, team, work); });
-  find_islands(in.islands, work.island);
+  for (int round = 0; round < kRoomRounds; ++round) {
+    for_bodies<MovingBody>(in.motion,
+                           [&](const MovingBody<T>& b, const Threads& team) { room_beside_island(in, b, team, work); });
+    find_islands(in.islands, work.island);
+  }
   for (int64_t scene = 0; scene < scenes; ++scene) largest_of_scene(in, scene, one, work);
 }
 

@@ -71,10 +71,10 @@ __global__ void __launch_bounds__(kOne)
   }
 }
 
-// Whether a scene may have groups of more than kFew bodies.
+// Whether groups of more than kFew bodies may move.
 template <class T>
 bool has_many(const RigidInputs<T>& in) {
-  return most_grouped(in.bodies()) > kFew;
+  return !in.together() && in.room > kFew;
 }
 
 // Numbers that are counted up from zero, of so many bodies.
@@ -102,8 +102,8 @@ int64_t rigid_system_bytes(const RigidInputs<T>& in, const PairRoom& room) {
 }
 
 template <class T>
-cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, bool again, double* center, double* motion,
-                         double* factor, int32_t* groups, void* workspace, cudaStream_t stream) {
+cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double* center, double* motion, double* factor,
+                         int32_t* groups, void* workspace, cudaStream_t stream) {
   const int64_t scenes = in.scene.scenes, bodies = scenes * in.bodies(), rows = room.rows();
   if (bodies == 0) return cudaSuccess;
   auto* next = static_cast<uint8_t*>(workspace);
@@ -132,18 +132,18 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, bool ag
     share_kernel<T><<<blocks_for(bodies), kOne, 0, stream>>>(in, memory);
     fill_kernel<T><<<blocks, kOne, 0, stream>>>(in, room, memory);
   }
-  if (auto error = solve_few(in, room, memory, again, center, motion, factor, stream)) return error;
-  if (!has_many(in) || again) return cudaGetLastError();
+  if (auto error = solve_few(in, room, memory, center, motion, factor, stream)) return error;
+  if (!has_many(in)) return cudaGetLastError();
   memory.bases = static_cast<double*>(take(scenes * in.matrix_size() * sizeof(double)));
   memory.rubbing = static_cast<double*>(take(room.lagged * kRubScalars * sizeof(double)));
   memory.floors = static_cast<int32_t*>(take(floors_of(in) * sizeof(int32_t)));
   return solve_groups_of_many(in, room, memory, groups, center, motion, factor, stream);
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                  \
-  template int64_t rigid_system_bytes<T>(const RigidInputs<T>&, const PairRoom&);                               \
-  template cudaError_t rigid_system<T>(const RigidInputs<T>&, const PairRoom&, bool, double*, double*, double*, \
-                                       int32_t*, void*, cudaStream_t);
+#define DIFFVBD_INSTANTIATE(T)                                                                                      \
+  template int64_t rigid_system_bytes<T>(const RigidInputs<T>&, const PairRoom&);                                   \
+  template cudaError_t rigid_system<T>(const RigidInputs<T>&, const PairRoom&, double*, double*, double*, int32_t*, \
+                                       void*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

@@ -46,10 +46,10 @@ struct GroupMemory {
 };
 
 // Motions of bodies and factors of groups: of those with up to kFew bodies, and of larger ones, which are put into the
-// order of their elimination first. again: as of rigid_system().
+// order of their elimination first.
 template <class T>
-cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, bool again,
-                      double* center, double* motion, double* factors, cudaStream_t stream);
+cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, double* center,
+                      double* motion, double* factors, cudaStream_t stream);
 template <class T>
 cudaError_t solve_groups_of_many(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory,
                                  int32_t* ordered, double* center, double* motion, double* factors,

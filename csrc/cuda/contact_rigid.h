@@ -21,8 +21,8 @@ int64_t rigid_move_bytes(const contact::RigidInputs<T>& in, const PairRoom& room
 
 // As cpu/contact_rigid.h.
 template <class T>
-cudaError_t rigid_system(const contact::RigidInputs<T>& in, const PairRoom& room, bool again, double* center,
-                         double* motion, double* factor, int32_t* groups, void* workspace, cudaStream_t stream);
+cudaError_t rigid_system(const contact::RigidInputs<T>& in, const PairRoom& room, double* center, double* motion,
+                         double* factor, int32_t* groups, void* workspace, cudaStream_t stream);
 template <class T>
 cudaError_t rigid_move(const contact::RigidInputs<T>& in, const PairRoom& room, const double* center,
                        const double* motion, T* move, double* share, T* x, void* workspace, cudaStream_t stream);

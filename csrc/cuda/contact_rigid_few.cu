@@ -267,11 +267,11 @@ struct System {
   }
 };
 
-// A block for each place where a group may begin. again: bodies move only where they are left alone.
+// A block for each place where a group may begin.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     few_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const __grid_constant__ GroupMemory memory,
-               bool again, double* center, double* motion, double* factors) {
+               double* center, double* motion, double* factors) {
   __shared__ double part[kWarps][kMostSums];
   __shared__ uint8_t touching[kFew * kFew];
   __shared__ Pivots pivots;
@@ -283,7 +283,7 @@ __global__ void __launch_bounds__(kThreads)
   const auto first = static_cast<int32_t>(blockIdx.x % places);
   const Groups groups = in.groups_of(scene);
   const int32_t count = groups.count(first), size = kUnknowns * count;
-  if (count == 0 || (!again && count > kFew)) return;
+  if (count == 0 || (kFew < count && count <= in.room)) return;
   double* factor = factors + in.matrix_size() * scene + groups.matrix(first);
   const GroupRows<T> rows{in, room, memory, scene, groups, first, count};
   const System<T> system{in,
@@ -304,7 +304,7 @@ __global__ void __launch_bounds__(kThreads)
                          pivots,
                          slots};
   team.each(size, [&](int32_t i) { system.unknown(system.motion, i) = 0; });
-  if (again && !groups.is_left(first)) {
+  if (!in.moves(scene, groups, first)) {
     for (int32_t b = 0; b < count; ++b) {
       const Whole whole = whole_of(system.body(b), team);
       if (threadIdx.x == 0) rigid::put(system.center + 3 * system.member(b), whole.center);
@@ -328,16 +328,16 @@ __global__ void __launch_bounds__(kThreads)
 }  // namespace
 
 template <class T>
-cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, bool again,
-                      double* center, double* motion, double* factors, cudaStream_t stream) {
+cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, double* center,
+                      double* motion, double* factors, cudaStream_t stream) {
   const auto blocks = static_cast<unsigned>(in.scene.scenes * (in.together() ? 1 : in.bodies()));
-  few_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room, memory, again, center, motion, factors);
+  few_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room, memory, center, motion, factors);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                 \
-  template cudaError_t solve_few<T>(const RigidInputs<T>&, const PairRoom&, const GroupMemory&, bool, double*, \
-                                    double*, double*, cudaStream_t);
+#define DIFFVBD_INSTANTIATE(T)                                                                                    \
+  template cudaError_t solve_few<T>(const RigidInputs<T>&, const PairRoom&, const GroupMemory&, double*, double*, \
+                                    double*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

@@ -86,6 +86,15 @@ struct GroupSystem {
     }
   }
 
+  // No motion, and no factor.
+  __device__ void stay(double* factor) const {
+    each(size(), [&](int32_t i) { unknown(motion, i) = 0; });
+    each_body([&](int32_t b) {
+      const Whole whole = whole_of(body(b), Warp());
+      if (Warp().leads()) rigid::put(center + 3 * member(b), whole.center);
+    });
+    if (threadIdx.x == 0) *factor = CUDART_NAN;  // which makes no number of all that is solved with it
+  }
   // Adds to a body's gradient and its own part of a matrix, whose entries lanes have one each.
   __device__ void put_own(double mine, int32_t b, double* to, double* gradients) const {
     const int32_t entry = Warp().lane - kUnknowns;

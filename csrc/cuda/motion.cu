@@ -96,8 +96,10 @@ cudaError_t find_rooms(RoomInputs<T> in, const RoomWork<T>& work, void* islands,
     if (const auto error = find_islands(in.islands, work.island, islands, stream)) return error;
     among_others<T><<<static_cast<unsigned>((bodies + kThreads - 1) / kThreads), kThreads, 0, stream>>>(in, work);
     if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
-    if (const auto error = for_bodies(in.motion, BesideIsland<T>{in, work}, stream)) return error;
-    if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
+    for (int round = 0; round < kRoomRounds; ++round) {
+      if (const auto error = for_bodies(in.motion, BesideIsland<T>{in, work}, stream)) return error;
+      if (const auto error = find_islands(in.islands, work.island, islands, stream, true)) return error;
+    }
   }
   each_scene<T, false><<<scenes, kThreads, 0, stream>>>(in, work);
   return cudaGetLastError();

@@ -22,18 +22,20 @@ _FIELDS = len(TouchingFields._fields)
 
 
 def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: float, friction_eps: float,
-                 again: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+                 moving: Tensor | None = None, alone: bool = False
+                 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """The turn and the shift of each body to where the step's potential is least, float64: centers of mass
     [B, bodies, 3] [m], motion [B, bodies, 6], Cholesky factors of groups that touch [B, bodies, 6, 6 most_grouped()],
     and groups int32 [B, 4, bodies], as csrc/contact/groups.h has them. Of no more than FEW bodies: one factor
-    [B, 6 bodies, 6 bodies], and no groups. friction_eps: [m], 0 without friction. again: only bodies move that are left
-    alone, because those that touch are too many; factors [B, bodies, 6, 6]."""
-    return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps, again)
+    [B, 6 bodies, 6 bodies], and no groups. friction_eps: [m], 0 without friction. moving: bool [B, bodies]: only groups
+    move that one of these is in. alone: only groups of one body do; factors [B, bodies, 6, 6]."""
+    moving = fields.free.new_empty((0,)) if moving is None else moving.contiguous()
+    return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps, moving, alone)
 
 
-def any_left(groups: Tensor) -> bool:
-    """Whether bodies are left alone, because those that touch are too many."""
-    return groups.numel() > 0 and bool((groups[:, 3] < 0).any())
+def left_alone(groups: Tensor) -> Tensor:
+    """Which bodies [B, bodies] are left alone, because those that touch are too many; of groups that are not empty."""
+    return groups[:, 3].gather(1, groups[:, 1].long()) < 0
 
 
 def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_count: Sequence[int], time_step: float,

@@ -306,8 +306,7 @@ def contact_step(
         if number:
             swept = partial(run_sweeps, scene, [*energies, *forces], masses, y)
             state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, part)
-            # of bodies that are left alone, as those that touch are too many, further ones follow
-            for shares in part.corrections[1 : 2 if part.lengths is None else 3]:
+            for shares in part.corrections[1:]:  # of those that do not move again it is 0
                 state = correct(state, shares)
         short = (part.shares.amin(0) < SHORT).reshape(*x.shape[:-2], 1, -1) & ~pinned & ~(stopped & free).unsqueeze(-2)
         left = torch.where(short, x_prev + way + lift - state, 0.0)

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .. import ops
 from ..adjoint.contact_lag import Pairs, no_pairs, of_scene, pair_lag, some_of
 from ..adjoint.rise import RiseParts, rise_parts, rises
 from ..adjoint.sweep import no_transforms, sweep
@@ -22,17 +21,16 @@ from ..energies import damped_share
 from ..model.model import Model
 from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
-from ..ops.contact_rigid import any_left, most_grouped
 from ..ops.motion import RoomsOfBodies
 from ..scopes import checking, is_captured, not_compiled, recorders
 from ..tuples import replaced
 from .coarse import factor_of
 from .contact_cycles import parts_of, record_parts, sweeps_of_parts, swept_part
+from .corrections import corrected, corrected_after, is_cut
 from .floor_start import start_on_floor
 from .intersections import refuse_intersections
 from .met import Detection, Met, Outcome, outcomes
 from .motion import Motion, motion_of
-from .rigid_contact import bodies_of, correct
 from .rooms import ROOM, rooms, rooms_of_sweeps
 from .unsupported import unsupported
 
@@ -40,9 +38,6 @@ if TYPE_CHECKING:
     from .arguments import Prepared
     from .predict import Begun
 
-# Rigid corrections after the last sweeps of bodies that are left alone, as those that touch are too many. In stacks of
-# two that rub the upper one creeps at 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; stacks of four fell with 6.
-LEFT_CORRECTIONS = 8
 FREE = 1e15  # [m] room that nothing fills
 CLOSE = 1e-3  # of dhat: pairs whose gap is so much wider do not push, however it is rounded
 MOST_CAPACITY = 2**26
@@ -185,7 +180,7 @@ class ContactStep:
             if self._reads(x):
                 self._check(r, met.counts[r].tolist(), met)
             begin = x
-            x, first, _ = self._corrected(start.x, now, start, detection.listed)
+            x, first, *_ = corrected(self, start.x, now, start, detection.listed)
             if start.own:
                 start = replaced(start, own=(start.own[0] + (x - start.x).detach(), start.own[1]))
             room = rooms_of_sweeps(motion, surface, barrier, start, x, begin)
@@ -197,13 +192,10 @@ class ContactStep:
                 swept = swept_part(self, x, swept_from, now, near, part, policy, debug_step)
                 met.swept.append(swept)
                 x, limits, combined, lengths = swept
-                groups = x
-                for again in self.corrections_after(r + 1 == self.parts):
-                    if again and not is_captured(x) and not any_left(groups):
-                        break
-                    x, last, groups = self._corrected(x, now, start, detection.listed, again)
-                    taken.append(last)
-                cut = limits[:, -1] > 0  # what the start has held up, sweeps may have made good
+                x, shares, back = corrected_after(self, x, now, start, detection.listed, r + 1 == self.parts)
+                taken.extend(shares)
+                # what the start has held up, sweeps may have made good, and corrections, what these have
+                cut = (limits[:, -1] > 0) | is_cut(self, x, back)
             met.cut = cut
             met.found[r] = replaced(detection, shares=start.shares, corrections=torch.stack(taken), limits=limits,
                                     kept=kept, frames=start.frames, combined=combined, lengths=lengths)  # fmt: skip
@@ -232,41 +224,13 @@ class ContactStep:
         room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
         start = PartStart(x, x.detach(), room, (), None, room > 0, none.ptr[:1].long(),
                           x.new_ones((2, *room.shape)))  # fmt: skip
-        x, *_ = self._corrected(x, self.colliders, start, none)
+        x = corrected(self, x, self.colliders, start, none).x
         if self.prepared.settings.sweeps:
             settings = self.prepared.settings
             swept = swept_part(self, x, start, self.colliders, none, settings, policy, debug_step)
-            x = swept.x
-            for _ in self.corrections_after(True):
-                x, *_ = self._corrected(x, self.colliders, start, none)
+            x, *_ = corrected_after(self, swept.x, self.colliders, start, none, True)
             record_parts(self.model, x, [swept])
         return x
-
-    def corrections_after(self, last: bool) -> list[bool]:
-        """The rigid corrections after the sweeps of a part: whether again of bodies left alone, which takes several at
-        the end to bear what lies on others. Coarse sweeps leave a stiff body turned, and one Newton step leaves so much
-        of that that a free body gained spin."""
-        least = 1 if self.prepared.coarse is None else 2
-        bodies = self.model.mesh.num_bodies
-        leaves = last and self.barrier is not None and bodies > most_grouped(bodies)
-        return [k >= least for k in range(max(least, LEFT_CORRECTIONS) if leaves else least)]
-
-    def _corrected(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs, again: bool = False
-                   ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-        """x after the rigid correction of all free bodies, the share of its motion that each took, and their groups."""
-        numbers = self.prepared.settings.numbers
-        fields = self.touching(x, collider, start, listed)
-        eps = 0.0 if self.model.friction is None else numbers.friction_eps
-        return correct(self.model, fields, numbers.time_step, eps, again)
-
-    def touching(self, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> ops.TouchingFields:
-        """What all potentials of bodies as wholes are made of, at x [B, V, 3]."""
-        lagged = self.lagged
-        return ops.TouchingFields(
-            x, self.x_prev, self.begun.y, self.fields.mass, self.begun.data, self.origin, *bodies_of(self.model),
-            collider, self.before, self.kappa, *listed, self.lag, lagged.pairs, lagged.ptr, lagged.entry,
-            self.floor_lag, start.center, start.room,
-        )  # fmt: skip
 
     def _colliders_at(self, share: float) -> Tensor:
         if self.colliders is self.before:

@@ -17,6 +17,7 @@ from ..ops import SweepSettings, broadcast
 from ..scopes import recorders
 from ..tuples import replaced
 from .coarse_contact import Corrections
+from .corrections import touching
 from .rigid_terms import Scenes
 from .trials import Trials
 
@@ -129,7 +130,7 @@ class _Iterates:
 
 def _scenes(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) -> Scenes:
     numbers = of.prepared.settings.numbers
-    fields = of.touching(of.x_prev, collider, start, listed)
+    fields = touching(of, of.x_prev, collider, start, listed)
     return Scenes(of.model, fields, numbers.time_step, numbers.friction_eps)
 
 

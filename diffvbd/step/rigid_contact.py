@@ -12,7 +12,7 @@ is decided, not differentiated. docs/method.md, section 18.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,15 +27,22 @@ from .rigid_terms import Scenes
 _FIELDS = len(ops.TouchingFields._fields)
 
 
-def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction_eps: float, again: bool = False
-            ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """x [B, V, 3] after every free body has been moved, as far as pairs, floors and the potential let it; the share of
-    its motion that each took [B, bodies]; and their groups, as ops.contact_rigid has them. friction_eps: [m], 0 without
-    friction. again: only bodies move that are not solved for together with those that they touch, as these are too
-    many. Differentiable in ops.TOUCHING_ADJOINTS."""
+class Corrected(NamedTuple):
+    """What a correction returns; all but x is index data."""
+
+    x: Tensor  # [B, V, 3]
+    share: Tensor  # of its motion that each body took [B, bodies]
+    motion: Tensor  # [B, bodies, 6] float64, a turn and a shift
+    groups: Tensor  # as ops.contact_rigid has them
+
+
+def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction_eps: float,
+            moving: Tensor | None = None, alone: bool = False) -> Corrected:  # fmt: skip
+    """After every free body has been moved, as far as pairs, floors and the potential let it. friction_eps: [m], 0
+    without friction. moving, alone: As for ops.contact_rigid.rigid_system. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
-    x, share, _, _, groups = _Correct.apply(*fields, model, time_step, friction_eps, again)
-    return x, share.to(x.dtype), groups
+    x, share, motion, _, groups = _Correct.apply(*fields, model, time_step, friction_eps, moving, alone)
+    return Corrected(x, share.to(x.dtype), motion, groups)
 
 
 def bodies_of(model: Model) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -58,30 +65,30 @@ class _Correct(Direct):
     @staticmethod
     def forward(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider, collider_prev, kappa,
                 pairs, constants, pair_ptr, pair_entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room,
-                model, time_step, friction_eps, again):  # fmt: skip
+                model, time_step, friction_eps, moving, alone):  # fmt: skip
         fields = ops.TouchingFields(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider,
                                     collider_prev, kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs,
                                     lag_ptr, lag_entry, floor_lag, center, room)  # fmt: skip
         counts = model._data_count
-        centers, motion, factor, groups = ops_rigid.rigid_system(fields, counts, time_step, friction_eps, again)
+        centers, motion, factor, groups = ops_rigid.rigid_system(fields, counts, time_step, friction_eps, moving, alone)
         end, share = ops_rigid.rigid_move(fields, centers, motion, counts, time_step, friction_eps)
         return end, share, motion, factor, groups
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
         ctx.save_for_backward(*inputs[:_FIELDS], *output[1:])
-        ctx.options = inputs[_FIELDS:-1]
+        ctx.options = inputs[_FIELDS:-2]
         ctx.mark_non_differentiable(*output[1:])
         ctx.set_materialize_grads(False)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple:
         if grads[0] is None:
-            return (None,) * (_FIELDS + 4)
+            return (None,) * (_FIELDS + 5)
         ops.not_batched(grads[0])
         needs = ctx.needs_input_grad[:_FIELDS]
         out = _CorrectBackward.apply(grads[0], *ctx.saved_tensors, *ctx.options, needs)
-        return of_inputs(out if isinstance(out, tuple) else (out,), needs, 4)
+        return of_inputs(out if isinstance(out, tuple) else (out,), needs, 5)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> Any:

@@ -17,7 +17,7 @@ from diffvbd.ops.contact_rigid import FEW, MOST_COUPLED
 from diffvbd.step.rigid_terms import Scenes
 from diffvbd.testing import relative_error, tolerance
 
-contact_step = importlib.import_module("diffvbd.step.contact")
+corrections = importlib.import_module("diffvbd.step.corrections")
 LOW, HALF_GAP, SPEED = -5e-4, 2.5e-4, 1e-3
 ENERGIES = (dv.StableNeoHookean(), dv.FloorBarrier(LOW, kappa=1e4, dhat=1e-3),
             dv.PairBarrier(1e4, 1e-3, self_contact=False), dv.Friction(0.5, SPEED))  # fmt: skip
@@ -58,9 +58,9 @@ def groups_of(model: dv.Model, monkeypatch: pytest.MonkeyPatch) -> Tensor:
         seen.append(contact_rigid.rigid_system(s.fields, s.model._data_count, *options)[3])
         return original(model, fields, *options)
 
-    original = contact_step.correct
+    original = corrections.correct
     with monkeypatch.context() as patch:
-        patch.setattr(contact_step, "correct", correct)
+        patch.setattr(corrections, "correct", correct)
         run(model, 1, 1)
     return seen[0].cpu()
 
@@ -166,7 +166,7 @@ def test_what_is_kept_of_corrections_again_is_small(device: str, monkeypatch: py
     model = stacks([MOST_COUPLED + 1, 2], device)
     run(model, 1, 1)
     bodies = MOST_COUPLED + 3
-    assert len(kept) == contact_step.LEFT_CORRECTIONS - 1
+    assert len(kept) == corrections.LEFT_CORRECTIONS - 1
     for factor, motion in kept:
         assert factor.shape == (1, bodies, 6, 6)
         assert float(motion[0, : MOST_COUPLED + 1].abs().max()) > 0
@@ -184,8 +184,8 @@ def test_what_happens_elsewhere_changes_nothing(seed: int, device: str, monkeypa
         shares.append(out[1][0])
         return out
 
-    original = contact_step.correct
-    monkeypatch.setattr(contact_step, "correct", correct)
+    original = corrections.correct
+    monkeypatch.setattr(corrections, "correct", correct)
     barrier = dv.PairBarrier(1e4, 1e-3, self_contact=False, detections=1)  # whose number faster bodies would raise
     energies = (*ENERGIES[:2], barrier, dv.Friction(2.0, 1.0))
     model = dv.Model(stacks([4, 2, 1], device).mesh, energies=energies, device=device)
@@ -204,6 +204,6 @@ def test_what_happens_elsewhere_changes_nothing(seed: int, device: str, monkeypa
         end, after = dv.step(model, x, v, mu=1e6, lam=1e6, time_step=0.01, sweeps=3)
         ends.append(torch.cat([end[:own], after[:own]]))
         taken.append(torch.stack(shares))
-    assert bool((taken[1][:, 4:] < 1).any())
-    assert torch.equal(taken[0][:, :4], taken[1][:, :4])
+    assert bool((taken[1][:2, 4:] < 1).any())
+    assert torch.equal(taken[0][:2, :4], taken[1][:2, :4])
     assert torch.equal(*ends)

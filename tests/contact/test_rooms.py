@@ -136,12 +136,13 @@ def by_torch(g: Given) -> RoomsOfBodies:
     alone = (island >= 0) & ((island[:, :, None] == island[:, None]).sum(-1) == 1)
     most = torch.where(alone, s.most_room_alone, s.most_room.expand(2, -1))
     room = room_of(way["bends"], most)
-    island = islands(room).long()
-    same = ((island[:, :, None] == island[:, None]) & (island >= 0)[:, None]).to(g.x)
-    joined = same @ motion.ways.sums
-    u = torch.where((island >= 0)[..., None], joined[..., :3] / joined[..., 3:].clamp(min=1e-300), 0.0)
-    beside = longest(g, g.move - u[:, body])
-    room = torch.maximum(room, room_of(beside, most))
+    for _ in range(3):  # whom a body meets gets room as well
+        island = islands(room).long()
+        same = ((island[:, :, None] == island[:, None]) & (island >= 0)[:, None]).to(g.x)
+        joined = same @ motion.ways.sums
+        u = torch.where((island >= 0)[..., None], joined[..., :3] / joined[..., 3:].clamp(min=1e-300), 0.0)
+        beside = longest(g, g.move - u[:, body])
+        room = torch.maximum(room, room_of(beside, most))
     wanted = beside + ROOM * way["stretched"]
     asks = wanted + (ROOM - 1) * beside + way["bends"] + falls + stopped
     over = torch.maximum(wanted / most, (asks / most).clamp(max=2))

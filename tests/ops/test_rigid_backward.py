@@ -21,7 +21,7 @@ from diffvbd.step.rigid_terms import Scenes, pair_terms
 from diffvbd.testing import relative_error, tolerance
 from diffvbd.testing.contact_scenes import SCENES, compiled, noise
 
-contact_step = importlib.import_module("diffvbd.step.contact")
+corrections = importlib.import_module("diffvbd.step.corrections")
 DIFFERENTIABLE = ("x", "x_prev", "collider", "collider_prev", "kappa", "lag")
 
 
@@ -42,13 +42,13 @@ def fields_of(monkeypatch: pytest.MonkeyPatch, name: str) -> Scenes:
     """What a correction in a step of a scene reads: the last that has pairs."""
     seen: list[Scenes] = []
 
-    def correct(model: dv.Model, fields: ops.TouchingFields, time_step: float, eps: float, *again: bool) -> Any:
+    def correct(model: dv.Model, fields: ops.TouchingFields, time_step: float, eps: float, *options: Any) -> Any:
         if fields.pairs.shape[0]:
             seen.append(Scenes(model, ops.TouchingFields(*(t.detach().contiguous() for t in fields)), time_step, eps))
-        return original(model, fields, time_step, eps, *again)
+        return original(model, fields, time_step, eps, *options)
 
-    original = contact_step.correct
-    monkeypatch.setattr(contact_step, "correct", correct)
+    original = corrections.correct
+    monkeypatch.setattr(corrections, "correct", correct)
     if name == "many":
         model, x, v = many()
         dv.step(model, x, v, mu=1e5, lam=1e5, time_step=0.01, sweeps=2)
@@ -59,7 +59,7 @@ def fields_of(monkeypatch: pytest.MonkeyPatch, name: str) -> Scenes:
 
 def groups_of(s: Scenes) -> Tensor:
     """[B, 4, bodies], or empty."""
-    return contact_rigid.rigid_system(s.fields, s.model._data_count, s.time_step, s.friction_eps, False)[3]
+    return contact_rigid.rigid_system(s.fields, s.model._data_count, s.time_step, s.friction_eps)[3]
 
 
 def parts_of(s: Scenes, listed: Pairs, moved: Tensor) -> list[tuple[Tensor, Tensor]]:

@@ -255,12 +255,12 @@ def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     mass, data = model.mass[None], model._energy_data
     own = (x, x, x + move, mass, data, none, *bodies_of(model), points, points, x.new_ones((1,)), *listed)
     touching = (*own, none, *no_pairs(x, 0)[:1], *no_pairs(x, 0)[2:], none, x, own_room)
-    numbers = (model._data_count, 0.01, 1e-3)
+    numbers, everyone = (model._data_count, 0.01, 1e-3), (body.new_empty((0,), dtype=torch.bool), False)
     points_of = torch.cat([move, torch.zeros_like(points)], 1)
-    centers, motion, factor, groups = torch.ops.diffvbd.contact_rigid_system(*touching, *numbers, False)
+    centers, motion, factor, groups = torch.ops.diffvbd.contact_rigid_system(*touching, *numbers, *everyone)
     assert motion.abs().max() > 0 and torch.isfinite(factor).all()
     return {
-        "contact_rigid_system": (*touching, *numbers, False),
+        "contact_rigid_system": (*touching, *numbers, *everyone),
         "contact_rigid_move": (*touching, centers, motion, *numbers),
         "contact_rigid_backward": (*touching, points_of, points_of, groups, *numbers),
         "contact_above_floor": floor,

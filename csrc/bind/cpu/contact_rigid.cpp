@@ -19,18 +19,19 @@ using torch::stable::Tensor;
 Tensor doubles(const std::vector<int64_t>& sizes) { return torch::stable::empty(sizes, ScalarType::Double); }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_system(
-    DIFFVBD_PARAMETERS(TOUCHING) std::vector<int64_t> data_count, double time_step, double friction_eps, bool again) {
+    DIFFVBD_PARAMETERS(TOUCHING) std::vector<int64_t> data_count, double time_step, double friction_eps,
+    const Tensor& moving, bool alone) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   diffvbd::require_positions(x);
   const int64_t b = x.size(0), n = ptr.numel() - 1;
   Tensor groups = torch::stable::empty(diffvbd::groups_shape(b, n), ScalarType::Int);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
+    const auto all = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
+    const auto in = diffvbd::moving_inputs(all, moving, alone, x);
     Tensor centers = doubles({b, n, 3}), motion = doubles({b, n, contact::kUnknowns});
-    if (!in.together()) in.room = diffvbd::room_of_groups(n, again);
-    Tensor factor = doubles(diffvbd::matrix_shape(b, n, again));
-    diffvbd::rigid_system<T>(in, again, data<double>(centers), data<double>(motion), data<double>(factor),
+    Tensor factor = doubles(diffvbd::matrix_shape(b, n, alone));
+    diffvbd::rigid_system<T>(in, data<double>(centers), data<double>(motion), data<double>(factor),
                              in.groups ? data<int32_t>(groups) : nullptr);
     return std::make_tuple(centers, motion, factor, groups);
   });

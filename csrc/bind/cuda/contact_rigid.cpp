@@ -25,7 +25,8 @@ cuda::PairRoom room_of(const TouchingFields& f) {
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_system(
-    DIFFVBD_PARAMETERS(TOUCHING) std::vector<int64_t> data_count, double time_step, double friction_eps, bool again) {
+    DIFFVBD_PARAMETERS(TOUCHING) std::vector<int64_t> data_count, double time_step, double friction_eps,
+    const Tensor& moving, bool alone) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const DeviceGuard guard(x.get_device_index());
   diffvbd::require_positions(x);
@@ -33,16 +34,15 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_system(
   Tensor groups = empty(x, diffvbd::groups_shape(b, n), ScalarType::Int);
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
+    const auto all = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
+    const auto in = diffvbd::moving_inputs(all, moving, alone, x);
     const auto doubles = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes, ScalarType::Double); };
     Tensor centers = doubles({b, n, 3}), motion = doubles({b, n, contact::kUnknowns});
-    if (!in.together()) in.room = diffvbd::room_of_groups(n, again);
-    Tensor factor = doubles(diffvbd::matrix_shape(b, n, again));
+    Tensor factor = doubles(diffvbd::matrix_shape(b, n, alone));
     const Tensor work = empty(x, {cuda::rigid_system_bytes(in, room_of(f))}, ScalarType::Byte);
-    check(
-        cuda::rigid_system<T>(in, room_of(f), again, data<double>(centers), data<double>(motion), data<double>(factor),
-                              in.groups ? data<int32_t>(groups) : nullptr, work.data_ptr(), current_stream(x)),
-        "the rigid correction of bodies that touch");
+    check(cuda::rigid_system<T>(in, room_of(f), data<double>(centers), data<double>(motion), data<double>(factor),
+                                in.groups ? data<int32_t>(groups) : nullptr, work.data_ptr(), current_stream(x)),
+          "the rigid correction of bodies that touch");
     return std::make_tuple(centers, motion, factor, groups);
   });
 }
