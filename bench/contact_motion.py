@@ -29,6 +29,11 @@ Group = Callable[[bool, str], list[Made]]  # quick, device
 
 SPEEDS = (0.2, 1.0, 3.0, 10.0)  # [m/s]
 MOST_SWEEPS = 320
+STRUCK = (  # cubes in a row, gap [m], speed of the first [m/s], time step [s]
+    *((4, gap, speed, 0.01) for gap in (0.001, 0.005, 0.01, 0.02) for speed in (0.3, 1.0, 3.0, 10.0)),
+    *((10, gap, speed, 0.01) for gap in (0.002, 0.02) for speed in (0.3, 1.0, 3.0, 5.0)),
+    (10, 0.002, 5.0, 0.0025), (10, 0.02, 5.0, 0.0025),
+)  # fmt: skip
 
 
 def _slides(quick: bool, device: str) -> list[Made]:
@@ -82,6 +87,10 @@ GROUPS: dict[str, Group] = {
     "impact": lambda quick, device: [
         piles.impact(speed, parts=2 if quick else 50, device=device)
         for speed in ((10.0,) if quick else (1.0, 10.0, 50.0))
+    ],
+    "struck": lambda quick, device: [
+        piles.struck(count, gap, speed, time_step, device=device)
+        for count, gap, speed, time_step in (STRUCK[:1] if quick else STRUCK)
     ],
 }  # fmt: skip
 

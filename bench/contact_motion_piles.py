@@ -227,6 +227,23 @@ def impact(speed: float = 10.0, sweeps: int = 20, parts: int = 50, time_step: fl
     return row(course, "restitution", f"{speed:g} m/s", restitution(course), fine, "", None)
 
 
+def struck(count: int, gap: float, speed: float, time_step: float = 1 / 100, sweeps: int = 10, device: str = "cpu",
+           barrier: Options = None) -> Row:  # fmt: skip
+    """The most momentum that a row of cubes of 0.1 m gains or loses in a step, of which the first is thrown at the
+    others: over what it had."""
+    cube = mesh.cube(2, size=0.1)
+    body = mesh.join([cube.translate((i * (0.1 + gap), 0.003 * i, 0.002 * i)) for i in range(count)])
+    model = dv.Model(body, energies=(dv.StableNeoHookean(), pairs(barrier, dhat=1e-3)), device=device)
+    v = torch.zeros_like(model.rest_points)
+    v[: cube.num_vertices, 0] = speed
+    scene = Scene(model, 2 * MODULUS, time_step, sweeps, v=v, gravity=(0.0, 0.0, 0.0))
+    course = march(scene, max(10, round(count * gap / speed / time_step) + 10))
+    momentum = [float(course.velocity(n)[0]) for n in range(len(course.v))]
+    worst = max(abs(p - momentum[0]) for p in momentum) / momentum[0]
+    case = f"{count} cubes, {1e3 * gap:g} mm apart, {speed:g} m/s"
+    return row(course, "momentum lost", case, worst, 0.0, "<= 0.01", worst <= 0.01)
+
+
 # --- grip -------------------------------------------------------------------------------------------------------------
 
 

@@ -70,3 +70,56 @@ def test_an_impact_keeps_its_momentum(speed: float, sweeps: int, device: str) ->
     assert lost() <= MOST_DETECTIONS * STEPS * tolerance("momentum")
     if (speed, sweeps) == (7.0, 10):
         assert lost(detections=1) > 0.01
+
+
+def row(count: int, gap: float, speed: float, device: str) -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
+    """Cubes of 0.1 m in a row that are not quite in line, of which the first is thrown at the others."""
+    cubes = [box(2, 0.1).translate((i * (0.1 + gap), 0.003 * i, 0.002 * i)) for i in range(count)]
+    barrier = dv.PairBarrier(kappa=1e5, dhat=1e-3, self_contact=False)
+    model = dv.Model(join(cubes), energies=(dv.StableNeoHookean(), barrier), device=device)
+    v = torch.zeros_like(model.rest_points)
+    v[: cubes[0].num_vertices, 0] = speed
+    return model, model.rest_points, v
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("gap", "speed"), ((0.005, 3.0), (0.01, 1.0), (0.02, 3.0), (0.02, 10.0)))
+def test_a_row_that_is_struck_keeps_its_momentum(gap: float, speed: float, device: str) -> None:
+    """Bodies that come so close to the next within a step that they push it push it within that step, and who is pushed
+    may stay behind the bodies that it was joined with."""
+    model, x, v = row(4, gap, speed, device)
+    mass = model.mass[:, None]
+    first, shares = (mass * v).sum(0), []
+    for _ in range(math.ceil(3 * gap / speed / 0.01) + 4):
+        with dv.contact.record() as found:
+            x, v = dv.step(model, x, v, mu=4e5, lam=4e5, time_step=0.01, sweeps=10, gravity=(0.0, 0.0, 0.0))
+        assert float(((mass * v).sum(0) - first).norm()) <= STEPS * tolerance("momentum") * float(first.norm())
+        shares += [part.corrections for part in found]
+    assert float(v[-1, 0]) > 0.05 * speed
+    assert any(len(taken) > 2 for taken in shares) == (speed > 1)  # held up, and corrected again
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_corrections_of_a_row_that_is_struck_are_differentiated(device: str) -> None:
+    model, x, v = row(4, 0.005, 3.0, device)
+    weights = torch.linspace(-1.0, 1.0, x.numel(), dtype=x.dtype, device=x.device).reshape(x.shape)
+    aside = torch.linspace(1.0, -0.5, x.numel(), dtype=x.dtype, device=x.device).reshape(x.shape).sin()
+
+    def end(v: torch.Tensor) -> torch.Tensor:
+        _, after = dv.step(model, x, v, mu=4e5, lam=4e5, time_step=0.01, sweeps=3, gravity=(0.0, 0.0, 0.0))
+        return (weights * after).sum()
+
+    start = v.clone().requires_grad_()
+    with dv.contact.record() as found:
+        (slope,) = torch.autograd.grad(end(start), start)
+    assert len(found[-1].corrections) > 2
+    eps = 1e-6
+    difference = float(end(v + eps * aside) - end(v - eps * aside)) / (2 * eps)
+    assert abs(difference) > 1e-3
+    assert abs(float((slope * aside).sum()) - difference) <= tolerance("finite_difference") * abs(difference)
+
+
+def test_a_rollout_says_where_a_row_lost_momentum() -> None:
+    model, x, v = row(10, 0.002, 5.0, "cpu")
+    with pytest.warns(UserWarning, match="pairs held up .* lost velocity and momentum .* smaller time_step"):
+        dv.rollout(model, x, v, steps=10, mu=4e5, lam=4e5, time_step=0.01, sweeps=10, gravity=(0.0, 0.0, 0.0))
