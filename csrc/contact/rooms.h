@@ -11,6 +11,8 @@ namespace diffvbd::contact {
 
 constexpr int kRoomRounds = 3;  // of rooms beside islands, and islands with these: whom one meets gets room as well
 
+constexpr double kSpare = 2;  // of dhat, that a body gets beside what it asks for: others may push it
+
 template <class T>
 struct RoomInputs {
   MotionInputs<T> motion;
@@ -77,7 +79,8 @@ DIFFVBD_FN T asked(const RoomInputs<T>& in, const RoomWork<T>& work, int64_t pla
 // And what it gets. What is prescribed goes where it goes: pairs with it are listed however far that is.
 template <class T>
 DIFFVBD_FN T room_of(const RoomInputs<T>& in, const RoomWork<T>& work, int64_t place, T beside, T most) {
-  const T room = larger(smaller(asked(in, work, place, beside), most), in.way(kDriven, place));
+  const T wished = asked(in, work, place, beside) + T(kSpare) * in.dhat;
+  const T room = larger(smaller(wished, most), in.way(kDriven, place));
   return room + work.pushed[place / in.motion.bodies];
 }
 template <class T>

@@ -75,8 +75,12 @@ def corrected_after(of: ContactStep, x: Tensor, collider: Tensor, start: PartSta
             alone = not some_held
         at = corrected(of, at.x, collider, start, listed, left if alone else held | left, alone)
         shares.append(torch.where((at.motion != 0).any(-1), at.share, 0.0))
-    back = (1 - at.share) * at.motion[..., 3:].norm(dim=-1).to(x.dtype)
-    return at.x, shares, back
+    return at.x, shares, not_taken(at)
+
+
+def not_taken(at: Corrected) -> Tensor:
+    """How much of its last shift each body did not take [B, bodies] [m]."""
+    return (1 - at.share) * at.motion[..., 3:].norm(dim=-1).to(at.share)
 
 
 def is_cut(of: ContactStep, x: Tensor, back: Tensor) -> Tensor:

@@ -122,7 +122,7 @@ def by_torch(g: Given) -> RoomsOfBodies:
     bent = longest(g, g.move - left_by(g, every, motion.rigid))
 
     def room_of(beside: Tensor, most: Tensor) -> Tensor:
-        asked = ROOM * beside + way["bends"] + falls + stopped
+        asked = ROOM * beside + way["bends"] + falls + stopped + 2 * DHAT
         return torch.maximum(torch.minimum(asked, most), way["driven"]) + pushed
 
     def last(room: Tensor) -> Tensor:
