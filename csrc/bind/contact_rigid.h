@@ -82,9 +82,11 @@ inline std::vector<int64_t> matrix_shape(int64_t scenes, int64_t bodies, bool al
 template <class T>
 contact::RigidInputs<T> moving_inputs(contact::RigidInputs<T> in, const Tensor& moving, bool alone, const Tensor& x) {
   if (!in.together()) in.room = room_of_groups(in.bodies(), alone);
-  if (moving.numel() == 0) return in;
-  require(is_beside(moving, x, ScalarType::Bool) && moving.numel() == in.scene.scenes * in.bodies(),
-          "diffvbd::contact_rigid_system: expected moving bool [scenes, bodies]");
+  const bool all = moving.dim() == 1 && moving.size(0) == 0;
+  require(is_beside(moving, x, ScalarType::Bool) &&
+              (all || (moving.dim() == 2 && moving.size(0) == in.scene.scenes && moving.size(1) == in.bodies())),
+          "diffvbd::contact_rigid_system: expected moving bool [scenes, bodies], or [0]");
+  if (all || moving.numel() == 0) return in;
   in.moving = data<const bool>(moving);
   return in;
 }

@@ -140,8 +140,8 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   // The Newton step of the rigid motions of all bodies of a scene, float64: centers of mass [scenes, bodies, 3], motion
   // [scenes, bodies, 6], the factors of groups that touch, in the memory [scenes, bodies, 6, 6 most] that
   // contact/groups.h says, and groups [scenes, 4, bodies]; of few bodies one factor [scenes, 6 bodies, 6 bodies], and
-  // no groups. moving [scenes, bodies]: only groups of these bodies move; or empty. alone: only groups of one do, with
-  // factors [scenes, bodies, 6, 6]
+  // no groups. moving [scenes, bodies]: only groups of these bodies move; or [0]: all do. alone: of many bodies only
+  // groups of one do, with factors [scenes, bodies, 6, 6]
   define(m, "contact_rigid_system", DIFFVBD_ARGUMENTS(TOUCHING),
          "int[] data_count, float time_step, float friction_eps, Tensor moving, bool alone",
          "Tensor centers, Tensor motion, Tensor factor, Tensor groups, ");

@@ -50,6 +50,17 @@ struct RigidInputs {
   DIFFVBD_FN int64_t first_lagged(int64_t s) const { return lag ? lagged.ptr[s * gate.corners] / 4 : 0; }
 };
 
+// Of a scene of few, which is one group: the bodies that are to move, and those that touch them, by way of others or
+// not. touching [n, n]: of two, either way.
+DIFFVBD_FN void find_moving(int32_t n, const bool* moving, const uint8_t* touching, bool* out) {
+  for (int32_t k = 0; k < n; ++k) out[k] = moving[k];
+  for (int32_t round = 1; round < n; ++round) {
+    for (int32_t i = 0; i < n * n; ++i) {
+      if (touching[i] && (out[i / n] || out[i % n])) out[i / n] = out[i % n] = true;
+    }
+  }
+}
+
 // The body that a corner point moves with, or -1.
 template <class T>
 DIFFVBD_FN int32_t moving_body(const RigidInputs<T>& in, int32_t corner) {

@@ -1,6 +1,6 @@
 // How far the bodies of a scene may go until pairs are found again: what CPU and CUDA share. Islands depend on the
-// rooms, and the rooms on what an island leaves of a motion, hence in passes: from ways to rooms, islands, rooms beside
-// these, islands (docs/method.md, section 12). Index data, without gradient.
+// rooms, and the rooms on what an island leaves of a motion, hence in passes: from ways to rooms and islands, then some
+// rounds of rooms beside these and islands (docs/method.md, section 12). Index data, without gradient.
 #pragma once
 
 #include "above_floor.h"
@@ -10,8 +10,7 @@
 namespace diffvbd::contact {
 
 constexpr int kRoomRounds = 3;  // of rooms beside islands, and islands with these: whom one meets gets room as well
-
-constexpr double kSpare = 2;  // of dhat, that a body gets beside what it asks for: others may push it
+constexpr double kSpare = 2;    // of dhat, that a body gets beside what it asks for: others may push it
 
 template <class T>
 struct RoomInputs {

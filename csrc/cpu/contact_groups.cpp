@@ -40,15 +40,7 @@ template <class T>
 void find_groups(const RigidInputs<T>& in, int64_t scene, const std::vector<PairPress>& presses, int32_t* rows) {
   const int32_t n = in.bodies();
   std::vector<std::pair<int32_t, int32_t>> touching;
-  const auto touch = [&](int32_t a, int32_t b) {
-    if (0 <= a && 0 <= b && a != b) touching.emplace_back(a, b);
-  };
-  for (const PairPress& press : presses) touch(press.body[0], press.body[1]);
-  for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
-    if (!Lag<T>(in.lag + kLagScalars * i).active()) continue;
-    const int32_t* record = in.lagged.pairs + kPairRow * i;
-    touch(moving_body(in, record[0]), moving_body(in, record[sides(record[4])]));
-  }
+  each_touching(in, scene, presses, [&](int32_t a, int32_t b) { touching.emplace_back(a, b); });
   std::vector<int32_t> root(n), size(n, 0);
   std::iota(root.begin(), root.end(), 0);
   const auto root_of = [&](int32_t body) {

@@ -221,6 +221,19 @@ void add_product(const double* matrix, int64_t size, const double* x, double* y)
   }
 }
 
+// Takes the motion from bodies of a scene of few that touch none that is to move.
+template <class T>
+void keep_few(const RigidInputs<T>& in, int64_t scene, const std::vector<PairPress>& presses, double* motion) {
+  const int32_t n = in.bodies();
+  uint8_t touching[kFew * kFew] = {};
+  bool moves[kFew];
+  each_touching(in, scene, presses, [&](int32_t a, int32_t b) { touching[n * a + b] = 1; });
+  find_moving(n, in.moving + n * scene, touching, moves);
+  for (int32_t k = 0; k < n; ++k) {
+    if (!moves[k]) std::fill_n(motion + kUnknowns * k, kUnknowns, 0.0);
+  }
+}
+
 // Motions of the bodies of a scene, zero at first, and the factors of the matrices there. rows [4, bodies] of `in`, or
 // null. Those that do not move have no factor.
 template <class T>
@@ -287,6 +300,7 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, double* center, double
       systems.each_unknown(s, [&](int, int64_t k) { motion[k] += share * step[k]; });
     }
   }
+  if (in.moving && in.together()) keep_few(in, scene, presses, motion);
   const Groups kept = in.groups_of(scene);
   for (const auto& s : systems.all) {
     const int64_t count = s.count <= kept.room ? s.size() * s.size() : 1;  // of others it says that there is none

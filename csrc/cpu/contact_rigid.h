@@ -14,6 +14,21 @@ inline rigid::Vector vector_of(const double* a) { return {a[0], a[1], a[2]}; }
 // written, or null.
 template <class T>
 void rigid_system(const contact::RigidInputs<T>& in, double* center, double* motion, double* factor, int32_t* groups);
+// Calls f(a, b) for the bodies that pairs of a scene press or rub.
+template <class T, class F>
+void each_touching(const contact::RigidInputs<T>& in, int64_t scene, const std::vector<contact::PairPress>& presses,
+                   const F& f) {
+  const auto touch = [&](int32_t a, int32_t b) {
+    if (0 <= a && 0 <= b && a != b) f(a, b);
+  };
+  for (const contact::PairPress& press : presses) touch(press.body[0], press.body[1]);
+  for (int64_t i = in.first_lagged(scene); i < in.first_lagged(scene + 1); ++i) {
+    if (!contact::Lag<T>(in.lag + contact::kLagScalars * i).active()) continue;
+    const int32_t* record = in.lagged.pairs + contact::kPairRow * i;
+    touch(contact::moving_body(in, record[0]), contact::moving_body(in, record[contact::sides(record[4])]));
+  }
+}
+
 // The groups of a scene, by what presses its bodies; rows [4, bodies].
 template <class T>
 void find_groups(const contact::RigidInputs<T>& in, int64_t scene, const std::vector<contact::PairPress>& presses,

@@ -101,7 +101,7 @@ class Tries {
       const Body<T> body{in_.scene, scene_, k};
       for (int32_t i = 0; i < body.size(); ++i) {
         const Farthest own = farthest_of(in_, body, body.vertex(i), center_ + 3 * k, motion_ + kUnknowns * k);
-        way[k] = std::max(way[k], own.way), size[k] = std::max(size[k], own.size);
+        way[k] = larger(way[k], own.way), size[k] = larger(size[k], own.size);
       }
     }
     for (int64_t i = in_.first_listed(scene_); i < in_.first_listed(scene_ + 1); ++i) {

@@ -314,7 +314,7 @@ __global__ void __launch_bounds__(kThreads)
   }
   team.each(count * count, [&](int32_t i) { touching[i] = 0; });
   team.meet();
-  const Barriers<T> barriers{in, memory.sides, memory.press};
+  const Barriers<T> barriers{memory.sides, memory.press};
   const Rubs<T> rubs{in, room.listed, {system.center, system.motion}};
   rows.template sort<kThreads>([&](int32_t body, int32_t other) {
     if (groups.first(other) == first) touching[count * groups.rank(body) + groups.rank(other)] = 1;
@@ -323,6 +323,12 @@ __global__ void __launch_bounds__(kThreads)
   system.assemble(barriers);
   system.solve(rubs);
   team.each(size * size, [&](int32_t i) { factor[i] = system.matrix[i]; });
+  if (!in.moving || !in.together()) return;
+  bool moves[kFew];
+  find_moving(count, in.moving + n * scene, touching, moves);
+  team.each(size, [&](int32_t i) {
+    if (!moves[i / kUnknowns]) system.unknown(system.motion, i) = 0;
+  });
 }
 
 }  // namespace

@@ -77,6 +77,7 @@ __global__ void __launch_bounds__(kTeam)
   __shared__ double part[kTeamWarps][2], vectors[3][kMostUnknowns];
   __shared__ Lists lists;
   __shared__ Pivots pivots;
+  static_assert(sizeof(part) + sizeof(vectors) + sizeof(lists) + sizeof(pivots) + sizeof(GroupSystem<T>) <= kStatic);
   extern __shared__ double matrix[];
   const int32_t n = in.bodies();
   const int64_t scene = blockIdx.x / n;

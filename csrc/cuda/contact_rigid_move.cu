@@ -219,7 +219,7 @@ __device__ bool decide(const RigidInputs<T>& in, const Tried<T>& t, int64_t scen
   __syncthreads();
   each_open([&](int64_t k, int64_t of) {
     const double own = fmax(fabs(t.before[k]), fabs(t.after[k]));
-    raise(t.largest + of, bits_of(t.after[k] < CUDART_INF ? own : CUDART_INF));
+    raise(t.largest + of, bits_of(isfinite(t.before[k]) && isfinite(t.after[k]) ? own : CUDART_INF));
     if (t.state.blocked[k]) mark(t.stopped + of);
   });
   __syncthreads();

@@ -7,6 +7,8 @@
 namespace diffvbd::cuda {
 namespace {
 
+constexpr int32_t kRanked = 512;  // rows of a body up to which each counts those before it
+
 // The rows of a group, in memory that they share.
 template <class T>
 struct GroupRows {
@@ -32,10 +34,32 @@ struct GroupRows {
       const int32_t own = memory.found[e], body = memory.sides[own], other = memory.sides[own ^ 1];
       const bool repels = own / 2 < room.listed;
       const int32_t from = repels ? begin(body) : lagged(body), to = repels ? lagged(body) : end(body);
-      int32_t rank = from;
-      for (int32_t i = from; i < to; ++i) rank += memory.found[i] < own ? 1 : 0;
+      int32_t rank = to - from > kRanked ? e : from;
+      for (int32_t i = from; to - from <= kRanked && i < to; ++i) rank += memory.found[i] < own ? 1 : 0;
       memory.rows[rank] = own;
       if (other >= 0) f(body, other);
+    }
+    __syncthreads();
+    for (int32_t i = 0; i < count; ++i) {
+      const int32_t body = groups.member(first + i), parts[3] = {begin(body), lagged(body), end(body)};
+      for (int k = 0; k < 2; ++k) {
+        if (parts[k + 1] - parts[k] > kRanked) sort_many<threads>(memory.rows + parts[k], parts[k + 1] - parts[k]);
+      }
+    }
+  }
+  // A bitonic sort, in which the larger of two always goes up: so the end may be anywhere.
+  template <int threads>
+  static __device__ void sort_many(int32_t* rows, int32_t count) {
+    for (int32_t size = 2; size / 2 < count; size *= 2) {
+      for (int32_t half = size / 2; half > 0; half /= 2) {
+        for (auto i = static_cast<int32_t>(threadIdx.x); i < count; i += threads) {
+          const int32_t other = half == size / 2 ? i ^ (size - 1) : i ^ half;
+          if (i >= other || other >= count || rows[i] <= rows[other]) continue;
+          const int32_t larger = rows[i];
+          rows[i] = rows[other], rows[other] = larger;
+        }
+        __syncthreads();
+      }
     }
   }
 };
@@ -43,7 +67,6 @@ struct GroupRows {
 // The barriers of listed pairs.
 template <class T>
 struct Barriers {
-  const RigidInputs<T>& in;
   const int32_t* sides;
   const double* presses;
   static constexpr bool rubs = false;

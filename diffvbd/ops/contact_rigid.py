@@ -27,8 +27,9 @@ def rigid_system(fields: TouchingFields, data_count: Sequence[int], time_step: f
     """The turn and the shift of each body to where the step's potential is least, float64: centers of mass
     [B, bodies, 3] [m], motion [B, bodies, 6], Cholesky factors of groups that touch [B, bodies, 6, 6 most_grouped()],
     and groups int32 [B, 4, bodies], as csrc/contact/groups.h has them. Of no more than FEW bodies: one factor
-    [B, 6 bodies, 6 bodies], and no groups. friction_eps: [m], 0 without friction. moving: bool [B, bodies]: only groups
-    move that one of these is in. alone: only groups of one body do; factors [B, bodies, 6, 6]."""
+    [B, 6 bodies, 6 bodies], and no groups. friction_eps: [m], 0 without friction. moving: bool [B, bodies]: only these
+    move, and what is in a group with one; of scenes without groups, what touches one. alone: in scenes of more than FEW
+    bodies only groups of one do; factors [B, bodies, 6, 6]."""
     moving = fields.free.new_empty((0,)) if moving is None else moving.contiguous()
     return raw.contact_rigid_system(*fields, data_count, time_step, friction_eps, moving, alone)
 

@@ -145,13 +145,15 @@ class Corrections:
         return torch.linalg.solve_triangular(self.cholesky.mT, half, upper=True).reshape(r.shape).to(r.dtype)
 
     def _differentiable(self, a: Tensor, r: Tensor, presses: list[_Press]) -> Tensor:
-        """a with its derivatives: one more step of no length, r - A a being zero, with the matrix as it was."""
+        """a with its derivatives: one more step, r - A a being zero, with the matrix as it was. It has no length, even
+        where it would have one, because the matrix is nearly singular: what was judged is what is done."""
         vertices = self.scenes.fields.x_prev.shape[1]
         pushed = _Product.apply(self.factor, a, self.space)
         way = self.space.prolonged(a, vertices)
         for press in presses:
             pushed = pushed + self.space.restricted(press.product(way))
-        return a + self._back(r - pushed)
+        step = self._back(r - pushed)
+        return a + (step - step.detach())
 
 
 class _Press(NamedTuple):

@@ -48,7 +48,7 @@ def touching(of: ContactStep, x: Tensor, collider: Tensor, start: PartStart, lis
 def corrected_after(of: ContactStep, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs, last: bool
                     ) -> tuple[Tensor, list[Tensor], Tensor]:  # fmt: skip
     """Positions after the corrections that follow the sweeps of a part; the shares that bodies took of each; and how
-    much of the last shift each did not take, [B, bodies] [m]. Index data but for the first.
+    much of its last shift each did not take, [B, bodies] [m]. Index data but for the first.
 
     Args:
         last: Whether these are the last sweeps.
@@ -60,22 +60,27 @@ def corrected_after(of: ContactStep, x: Tensor, collider: Tensor, start: PartSta
     for _ in range(1, least):
         at = corrected(of, at.x, collider, start, listed)
         shares.append(at.share)
+    back = not_taken(at)
+    if not last or of.barrier is None:
+        return at.x, shares, back
     bodies = of.model.mesh.num_bodies
     grouped = bodies <= most_grouped(bodies)
-    most = least if not last or of.barrier is None else HELD_CORRECTIONS if grouped else LEFT_CORRECTIONS
-    for k in range(least, most):
-        moved = (at.motion != 0).any(-1)
-        held = moved & (at.share < 1) if k < HELD_CORRECTIONS else torch.zeros_like(moved)
+    for k in range(least, HELD_CORRECTIONS if grouped else LEFT_CORRECTIONS):
+        # of a scene in which some of those that were held up have gone on: where they are now, others may go on, too
+        held = (at.motion != 0).any(-1) & (at.share < 1)
+        held &= (held & (at.share > 0)).any(-1, keepdim=True) & (k < HELD_CORRECTIONS)
         left = torch.zeros_like(held) if grouped else left_alone(at.groups)
         alone = k >= HELD_CORRECTIONS
         if not is_captured(x):
-            some_held, some_left = torch.stack([(held & (at.share > 0)).any(), left.any()]).tolist()
+            some_held, some_left = torch.stack([held.any(), left.any()]).tolist()
             if not (some_held or some_left):
                 break
             alone = not some_held
         at = corrected(of, at.x, collider, start, listed, left if alone else held | left, alone)
-        shares.append(torch.where((at.motion != 0).any(-1), at.share, 0.0))
-    return at.x, shares, not_taken(at)
+        moved = (at.motion != 0).any(-1)
+        shares.append(at.share)
+        back = torch.where(moved, not_taken(at), back)
+    return at.x, shares, back
 
 
 def not_taken(at: Corrected) -> Tensor:

@@ -72,6 +72,8 @@ class _Correct(Direct):
         counts = model._data_count
         centers, motion, factor, groups = ops_rigid.rigid_system(fields, counts, time_step, friction_eps, moving, alone)
         end, share = ops_rigid.rigid_move(fields, centers, motion, counts, time_step, friction_eps)
+        if moving is not None:  # what stays takes no share, and passes nothing on
+            share = torch.where((motion != 0).any(-1), share, 0.0)
         return end, share, motion, factor, groups
 
     @staticmethod

@@ -207,3 +207,20 @@ def test_what_happens_elsewhere_changes_nothing(seed: int, device: str, monkeypa
     assert bool((taken[1][:2, 4:] < 1).any())
     assert torch.equal(taken[0][:2, :4], taken[1][:2, :4])
     assert torch.equal(*ends)
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_many_pairs_between_two_bodies(count: int, device: str) -> None:
+    """More than are brought into their order one by one; in scenes with and without groups."""
+    boxes = [mesh.box((12, 2, 12), (0.3, 0.05, 0.3)).translate((0.0, (0.05 + 2 * HALF_GAP) * k, 0.0))
+             for k in range(count)]  # fmt: skip
+    ends = []
+    for where in ("cpu", device):
+        model = dv.Model(mesh.join(boxes), energies=ENERGIES, device=where)
+        x = model.rest_points
+        v = torch.zeros_like(x)
+        v[-len(x) // count :, 0] = 0.1
+        with dv.contact.record() as found:
+            ends.append(dv.step(model, x, v, mu=1e6, lam=1e6, time_step=0.01, sweeps=2)[1].cpu())
+        assert int((found[0].listed.constants[:, -1] < 1e-3).sum()) > 512
+    assert relative_error(ends[1], ends[0]) <= tolerance("contact_forward")
