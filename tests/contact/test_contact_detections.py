@@ -101,7 +101,7 @@ def test_a_row_that_is_struck_keeps_its_momentum(gap: float, speed: float, devic
 
 
 def apart(rows: list[tuple[int, float]], device: str) -> tuple[dv.Model, torch.Tensor, list[int]]:
-    """Rows of so many cubes 5 mm apart in one scene, 5 m from each other, and their vertices; velocities [V, 3] of their
+    """Rows of so many cubes 5 mm apart in one scene, 5 m from each other, and their vertices; velocities [V, 3] of the
     first ones."""
     cubes, v, sizes = [], [], []
     for n, (count, speed) in enumerate(rows):
