@@ -27,6 +27,7 @@ GAIN = 0.05  # share of the energy that came in, beyond which a result counts as
 DIFFERENCES = (1e-5, 1e-7)  # relative steps of central differences; the best one counts
 ALIKE = 1e-3  # error against differences below which a gradient counts as matching them
 GRAVITY = 9.81
+OBSTACLE = (-2.0, 3.0)  # over the size: from where to where it lies in both directions
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,8 @@ def build(case: Extreme) -> tuple[dv.Model, Tensor, Tensor, dict[str, Any]]:
     elif kind == "sphere":
         colliders = (dv.colliders.Sphere((0.2 * case.size, -0.5 * case.size, 0.2 * case.size), 0.5 * case.size),)
     elif kind == "obstacle":
-        corners = case.size * np.array([[-2.0, 0.0, -2.0], [-2.0, 0.0, 3.0], [3.0, 0.0, -2.0], [3.0, 0.0, 3.0]])
+        low, high = OBSTACLE
+        corners = case.size * np.array([[low, 0.0, low], [low, 0.0, high], [high, 0.0, low], [high, 0.0, high]])
         colliders = (dv.colliders.Obstacle(corners, np.array([[0, 1, 2], [2, 1, 3]])),)
     if "friction" in options:
         energies.append(dv.Friction(options.pop("friction"), velocity=0.01 * case.speed))
@@ -256,12 +258,35 @@ def gained(case: Extreme, motion: dv.Trajectory, material: dict[str, Tensor]) ->
     return float(((moving + elastic + fallen).max() - moving[0] - elastic[0]) / scale)
 
 
+def _through_obstacle(case: Extreme, model: dv.Model, motion: dv.Trajectory) -> int:
+    low, high = (case.size * bound for bound in OBSTACLE)
+
+    def above_or_below(points: Tensor) -> Tensor:
+        return ((low <= points[..., ::2]) & (points[..., ::2] <= high)).all(-1)
+
+    end = motion.x[-1][np.unique(model.mesh.surface)]
+    found = int((above_or_below(end) & (end[:, 1] <= 0)).sum())
+    surface = model.surface_of_contact
+    assert surface is not None
+    edges = surface.edges.long()
+    edges = edges[(edges < model.num_vertices).all(1)]
+    for x in motion.x:
+        a, b = x[edges].unbind(1)
+        passes = a[:, 1] * b[:, 1] < 0
+        share = a[:, 1:2] / (a[:, 1:2] - b[:, 1:2])
+        found += int((passes & above_or_below(a + share * (b - a))).sum())
+    return found
+
+
 def _crossings(case: Extreme, model: dv.Model, motion: dv.Trajectory) -> int:
-    """Edges through triangles at the end, and vertices of the surface at or below the floor, plane or obstacle."""
+    """Edges through triangles at the end, and vertices of the surface at or below the floor or plane; of an obstacle,
+    off whose edge bodies may slide, vertices below it at the end, and edges through it in any frame."""
     kind = FEATURES[case.feature][0]
     end = motion.x[-1]
-    if kind in ("floor", "plane", "obstacle"):
+    if kind in ("floor", "plane"):
         return int((end[np.unique(model.mesh.surface), 1] <= 0).sum())
+    if kind == "obstacle":
+        return _through_obstacle(case, model, motion)
     if kind not in ("pairs", "horseshoe"):
         return 0
     found = dv.contact.intersections(model, end)
