@@ -44,8 +44,8 @@ class Status:
         capacity: Pairs that fit, of all scenes; with more, an eager step has raised, a captured one returned NaN.
         touching: Pairs without a gap that detections found (the step has raised or returned NaN).
         hindered: Pairs that prescribed vertices and moving colliders would bring too close (likewise).
-        cut: Vertices that pairs held up in the last sweep, and those of bodies that were held up in the last rigid
-            correction: they lost velocity that no force took, [scenes].
+        cut: Vertices that pairs held up in the last sweep, or without sweeps at the start, and those of bodies that
+            were held up in the last rigid correction: they lost velocity that no force took, [scenes].
         smallest_gap: The smallest gap that a detection found [m], or the search distance, [scenes].
     """
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # Rigid corrections after the last sweeps, with the first, as long as bodies were held up on their way: they come close
 # to those that held them up, and then push them. Of a row of four cubes that meet at 3 m/s the motion lost 14 % of its
-# momentum with one correction and nothing with three; at 10 m/s, five.
+# momentum with one correction and nothing with three; at 10 m/s that takes five.
 HELD_CORRECTIONS = 5
 # And where bodies are left alone, as those that touch are too many. In stacks of two that rub the upper one creeps at
 # 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; stacks of four fell with 6.

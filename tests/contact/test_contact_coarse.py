@@ -60,6 +60,15 @@ def test_gradients_of_shortened_and_refused_corrections(device: str) -> None:
     assert (lengths == 1).any() and ((lengths > 0) & (lengths < 1)).any() and (lengths == 0).any(), lengths
 
 
+def test_a_correction_is_the_same_with_gradients_and_without() -> None:
+    """To the bit: what was judged is what is done."""
+    model, given = stack(coarse="auto")
+    x = model.rest_points
+    with torch.no_grad():
+        alone = dv.step(model, x, torch.zeros_like(x), sweeps=7, **given)[0]
+    assert torch.equal(dv.step(model, x, torch.zeros_like(x), sweeps=7, **given)[0], alone)
+
+
 @pytest.mark.parametrize("build", [pressed, stack])
 def test_nearer_in_as_many_sweeps(build: Any) -> None:
     plain, given = build()
