@@ -11,6 +11,7 @@ constexpr int kMoves = 3;     // one after another, each of what the ones before
 constexpr int kRounds = 16;   // of halving in each
 constexpr int kPatience = 8;  // rounds from which on what fails does not move
 constexpr double kLeastTry = 1.0 / 64;
+constexpr double kRoundedSquare = 4e-6;  // of squares of lengths, that rounding cannot reach
 
 template <class T>
 struct AdvanceInputs {
@@ -172,6 +173,47 @@ DIFFVBD_FN bool stays_far(const AdvanceInputs<T>& in, const AdvanceState<T>& s, 
   return stays_far(m, pair, constants);
 }
 
+// Whether it stays so whatever shares of their ways its corners go: then no round of a move has to look at it.
+template <class T>
+DIFFVBD_FN bool stays_far_at_any_share(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
+  const int32_t* record = in.listed.pairs + kPairRow * pair;
+  const T* constants = in.constants + kConstants * pair;
+  if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (contact/narrow.h)
+  Motion<T> m[4];
+  T size = T(0), most = T(0);
+  for (int k = 0; k < 4; ++k) {
+    if (record[k] >= in.vertices) return false;  // whose gap may be of another time
+    const int64_t row = int64_t{record[5]} * in.vertices + record[k];
+    m[k] = s.motion ? s.motion[row] : motion_of(in, s, row);
+    size = size < m[k].size ? m[k].size : size;
+  }
+  const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - guard_of_size(size);
+  if (!(T(0) < room)) return false;
+  for (int i = 0; i < sides(record[4]); ++i) {
+    for (int j = sides(record[4]); j < 4; ++j) {
+      const Vec3<T> ways[] = {m[i].since - m[j].since, m[i].since - m[j].end, m[i].end - m[j].since,
+                              m[i].end - m[j].end};
+      for (const Vec3<T>& d : ways) {
+        const T square = dot(d, d);
+        most = most < square ? square : most;
+      }
+    }
+  }
+  return T(1 + kRoundedSquare) * most < room * room;
+}
+
+// Whether a corner of a pair has yet to go some of its way: what earlier moves have taken all the way moves no more.
+template <class T>
+DIFFVBD_FN bool is_open(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* record) {
+  for (int k = 0; k < 4; ++k) {
+    if (record[k] < in.vertices && !in.held[record[k]] &&
+        s.share[in.unit(int64_t{record[5]} * in.vertices + record[k])] < T(1)) {
+      return true;
+    }
+  }
+  return false;
+}
+
 // Marks the corners that keep a pair from being safe; returns whether it is. Round 0 looks at all pairs, later ones at
 // those of which a corner has tried less in the round before.
 template <class T>
@@ -181,14 +223,7 @@ DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, i
     return record[k] < in.vertices && s.stamp[in.unit(int64_t{record[5]} * in.vertices + record[k])] == round;
   };
   if (round > 0 && !(retried(0) || retried(1) || retried(2) || retried(3))) return true;
-  if (!s.first && round == 0) {  // what the moves before have taken all the way does not move again
-    bool open = false;
-    for (int k = 0; k < 4; ++k) {
-      open = open || (record[k] < in.vertices && !in.held[record[k]] &&
-                      s.share[in.unit(int64_t{record[5]} * in.vertices + record[k])] < T(1));
-    }
-    if (!open) return true;
-  }
+  if (!s.first && round == 0 && !is_open(in, s, record)) return true;
   const T* constants = in.constants + kConstants * pair;
   if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (contact/narrow.h)
   if (stays_far(in, s, record, constants)) return true;                                // as do most

@@ -15,7 +15,6 @@ namespace {
 
 constexpr int64_t kPairGrain = 256;  // pairs that are worth one more thread
 constexpr int64_t kRowGrain = 16;    // vertices whose pairs are
-constexpr double kRounded = 4e-6;    // of squares of lengths, that rounding cannot reach
 
 // How many of n items f says yes to.
 template <class F>
@@ -27,35 +26,6 @@ int64_t count(int64_t n, int64_t grain, const F& f) {
     total += own;
   });
   return total;
-}
-
-// Whether a pair stays out of the barrier's reach whatever shares of their ways its corners go: then no round has to
-// look at it. As stays_far(), of the ends of all those ways.
-template <class T>
-bool stays_far_at_any_share(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
-  const int32_t* record = in.listed.pairs + kPairRow * pair;
-  const T* constants = in.constants + kConstants * pair;
-  const Motion<T>* m[4];
-  T size = T(0), most = T(0);
-  for (int k = 0; k < 4; ++k) {
-    if (record[k] >= in.vertices) return false;
-    m[k] = s.motion + int64_t{record[5]} * in.vertices + record[k];
-    size = size < m[k]->size ? m[k]->size : size;
-  }
-  const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - guard_of_size(size);
-  if (!(T(0) < room)) return false;
-  for (int i = 0; i < sides(record[4]); ++i) {
-    for (int j = sides(record[4]); j < 4; ++j) {
-      for (const Vec3<T>& a : {m[i]->since, m[i]->end}) {
-        for (const Vec3<T>& b : {m[j]->since, m[j]->end}) {
-          const Vec3<T> d = a - b;
-          const T square = dot(d, d);
-          most = most < square ? square : most;
-        }
-      }
-    }
-  }
-  return T(1 + kRounded) * most < room * room;
 }
 
 }  // namespace

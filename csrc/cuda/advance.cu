@@ -20,11 +20,12 @@ __device__ __noinline__ bool passes(const AdvanceInputs<T>& in, const AdvanceSta
 }
 
 // One cooperative launch for all moves and rounds: most are over after the first round, and only the device knows.
-// flags [kFlags] and stuck [1] are zero.
+// Rounds look at the pairs that may matter in their move, listed in any order: few, which would leave most of a warp
+// idle among the others. flags [kFlags], counts [kMoves] and stuck [1] are zero.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    advance_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, unsigned* flags,
-                   unsigned long long* stuck) {
+    advance_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, unsigned* flags, unsigned* counts,
+                   int32_t* near, unsigned long long* stuck) {
   const auto grid = cooperative_groups::this_grid();
   const auto each = [](int64_t n, const auto& f) {
     for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < n;
@@ -45,6 +46,13 @@ __global__ void __launch_bounds__(kThreads)
     each(in.scenes, [&](int64_t i) { s.failed[i] = 0; });
     each(units, [&](int64_t i) { begin_move(s, i); });
     grid.sync();
+    each(pairs, [&](int64_t i) {
+      const int32_t* record = in.listed.pairs + kPairRow * i;
+      if ((s.first || is_open(in, s, record)) && !stays_far_at_any_share(in, s, i))
+        near[atomicAdd(counts + move, 1)] = static_cast<int32_t>(i);
+    });
+    grid.sync();
+    const int64_t looked = *static_cast<volatile unsigned*>(counts + move);
     bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
     for (int round = 0; round < kRounds; ++round) {
       const bool last = round + 1 == kRounds;
@@ -53,7 +61,9 @@ __global__ void __launch_bounds__(kThreads)
         if (!passed && last) mark(s.failed + scene);
         found = found || !passed;
       };
-      each(pairs, [&](int64_t i) { note(in.listed.pairs[kPairRow * i + 5], passes(in, s, i, last ? 0 : round)); });
+      each(looked, [&](int64_t i) {
+        note(in.listed.pairs[kPairRow * int64_t{near[i]} + 5], passes(in, s, near[i], last ? 0 : round));
+      });
       each(rows, [&](int64_t i) { note(i / in.vertices, stay(in, s, i, last ? 0 : round)); });
       const bool passed = !any(found);
       clean = round == 0 && passed;
@@ -64,8 +74,8 @@ __global__ void __launch_bounds__(kThreads)
     each(units, [&](int64_t i) { give_up(in, s, i); });
     if (s.first && !clean) {
       grid.sync();
-      each(pairs, [&](int64_t pair) {
-        if (!passes(in, s, pair, 0)) atomicAdd(stuck, 1ULL);
+      each(looked, [&](int64_t i) {
+        if (!passes(in, s, near[i], 0)) atomicAdd(stuck, 1ULL);
       });
       grid.sync();
     }
@@ -91,9 +101,10 @@ constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
 }  // namespace
 
 template <class T>
-int64_t advance_workspace_bytes(const AdvanceInputs<T>& in) {
+int64_t advance_workspace_bytes(const AdvanceInputs<T>& in, int64_t capacity) {
   const int64_t units = in.units();
-  return aligned(kFlags * sizeof(unsigned)) + aligned(units * sizeof(T)) + 2 * aligned(units) + aligned(in.scenes);
+  return aligned((kFlags + kMoves) * sizeof(unsigned)) + aligned(units * sizeof(T)) + 2 * aligned(units) +
+         aligned(in.scenes) + aligned(capacity * sizeof(int32_t));
 }
 
 template <class T>
@@ -108,11 +119,12 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
     at += aligned(bytes);
     return here;
   };
-  auto* flags = reinterpret_cast<unsigned*>(take(kFlags * sizeof(unsigned)));
+  auto* flags = reinterpret_cast<unsigned*>(take((kFlags + kMoves) * sizeof(unsigned)));
   const int64_t units = in.units();
   auto* now = reinterpret_cast<T*>(take(units * sizeof(T)));
   uint8_t *blocked = take(units), *stamp = take(units), *failed = take(in.scenes);
-  if (auto error = cudaMemsetAsync(flags, 0, kFlags * sizeof(unsigned), stream)) return error;
+  auto* near = reinterpret_cast<int32_t*>(take(capacity * sizeof(int32_t)));
+  if (auto error = cudaMemsetAsync(flags, 0, (kFlags + kMoves) * sizeof(unsigned), stream)) return error;
   AdvanceInputs<T> inputs = in;
   AdvanceState<T> state{share, now, blocked, stamp, failed, true};
   auto* found = reinterpret_cast<unsigned long long*>(stuck);
@@ -122,7 +134,8 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
   const int64_t wanted = (std::max(rows, capacity) + kThreads - 1) / kThreads;
   const int64_t each = capacity < kManyPairs ? 1 : resident;
   const auto blocks = static_cast<unsigned>(std::min<int64_t>(wanted, each * multiprocessors));
-  void* arguments[] = {&inputs, &state, &flags, &found};
+  unsigned* counts = flags + kFlags;
+  void* arguments[] = {&inputs, &state, &flags, &counts, &near, &found};
   return cudaLaunchCooperativeKernel(kernel, dim3(blocks), dim3(kThreads), arguments, 0, stream);
 }
 
@@ -136,7 +149,7 @@ cudaError_t narrow(const NarrowInputs<T>& in, int64_t pairs, T* constants, cudaS
 
 #define DIFFVBD_INSTANTIATE(T)                                                       \
   template cudaError_t narrow<T>(const NarrowInputs<T>&, int64_t, T*, cudaStream_t); \
-  template int64_t advance_workspace_bytes<T>(const AdvanceInputs<T>&);              \
+  template int64_t advance_workspace_bytes<T>(const AdvanceInputs<T>&, int64_t);     \
   template cudaError_t advance<T>(const AdvanceInputs<T>&, int64_t, T*, int64_t*, void*, int, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

@@ -8,9 +8,9 @@
 
 namespace diffvbd::cuda {
 
-// Bytes of memory that it works in.
+// Bytes of memory that it works in, where the list has room for so many pairs.
 template <class T>
-int64_t advance_workspace_bytes(const contact::AdvanceInputs<T>& in);
+int64_t advance_workspace_bytes(const contact::AdvanceInputs<T>& in, int64_t capacity);
 
 // share, stuck [1] as cpu/advance.h. capacity: pairs that the list has room for.
 template <class T>

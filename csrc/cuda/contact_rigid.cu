@@ -1,5 +1,6 @@
 // The rigid correction of bodies that touch: what pairs press, which bodies are solved for together, and their motions.
 #include "../contact/rigid_rub.h"
+#include "beside.h"
 #include "contact_rigid.cuh"
 
 namespace diffvbd::cuda {
@@ -132,12 +133,17 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
     share_kernel<T><<<blocks_for(bodies), kOne, 0, stream>>>(in, memory);
     fill_kernel<T><<<blocks, kOne, 0, stream>>>(in, room, memory);
   }
-  if (auto error = solve_few(in, room, memory, center, motion, factor, stream)) return error;
-  if (!has_many(in)) return cudaGetLastError();
+  if (!has_many(in)) return solve_few(in, room, memory, center, motion, factor, stream);
   memory.bases = static_cast<double*>(take(scenes * in.matrix_size() * sizeof(double)));
   memory.rubbing = static_cast<double*>(take(room.lagged * kRubScalars * sizeof(double)));
   memory.floors = static_cast<int32_t*>(take(floors_of(in) * sizeof(int32_t)));
-  return solve_groups_of_many(in, room, memory, groups, center, motion, factor, stream);
+  // each leaves out the groups that the other solves for
+  Beside* beside = nullptr;
+  if (auto error = Beside::of_device(&beside)) return error;
+  if (auto error = beside->fork(stream)) return error;
+  if (auto error = solve_few(in, room, memory, center, motion, factor, beside->stream())) return error;
+  if (auto error = solve_groups_of_many(in, room, memory, groups, center, motion, factor, stream)) return error;
+  return beside->join(stream);
 }
 
 #define DIFFVBD_INSTANTIATE(T)                                                                                      \

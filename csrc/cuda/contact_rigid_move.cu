@@ -27,8 +27,9 @@ struct Tried {
   Count *largest, *rise, *whole;            // [B, bodies] of bodies that decide together, by their first
   int32_t* lead;                            // [B, bodies] who they are
   int32_t *touching, *touches;  // [listed, 2] bodies that press each other, scene after scene; [B] how many pairs
+  int32_t *near, *nears;        // [listed] pairs that may press, scene after scene, in any order; [B] how many
   AdvanceState<T> state;
-  uint8_t *near, *decided, *stopped, *done;  // [listed], [B, bodies] twice, [B]
+  uint8_t *decided, *stopped, *done;  // [B, bodies] twice, [B]
   T* move;
 };
 
@@ -36,7 +37,7 @@ template <class T>
 __global__ void __launch_bounds__(kOne)
     begin_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t) {
   const int64_t i = own_item();
-  if (i < in.scene.scenes) t.done[i] = 0, t.touches[i] = 0;
+  if (i < in.scene.scenes) t.done[i] = 0, t.touches[i] = t.nears[i] = 0;
   if (i >= in.scene.scenes * in.bodies()) return;
   t.share[i] = 1;
   t.way[i] = t.size[i] = 0;
@@ -85,9 +86,9 @@ __global__ void __launch_bounds__(kOne)
   const int32_t* record = (repels ? in.gate.listed.pairs : in.lagged.pairs) + kPairRow * pair;
   const int64_t scene = record[5], first = scene * in.bodies();
   if (repels) {
-    t.near[pair] = may_press(in, pair, t.way + first, t.size + first);
     t.press[pair] = 0;
-    if (!t.near[pair]) return;
+    if (!may_press(in, pair, t.way + first, t.size + first)) return;
+    if (owner_of(in, record) >= 0) t.near[in.first_listed(scene) + atomicAdd(t.nears + scene, 1)] = static_cast<int32_t>(pair);
   } else if (!Lag<T>(in.lag + kLagScalars * pair).active()) {
     return;
   }
@@ -129,11 +130,10 @@ __device__ void try_vertex(const RigidInputs<T>& in, const Tried<T>& t, int64_t 
   stay(in.gate, t.state, row, 0);
   if (!admitted(in, body, at.v)) mark(t.state.blocked + at.unit);
 }
-// And a pair, of those that it moves with: the listed pairs, then the lagged.
+// And a pair, of those that it moves with: a near one, or a lagged one.
 template <class T>
 __device__ void try_pair_of(const RigidInputs<T>& in, const Tried<T>& t, int64_t pair, bool repels, double& value,
                             bool moved) {
-  if (repels && !t.near[pair]) return;
   const int32_t* record = (repels ? in.gate.listed.pairs : in.lagged.pairs) + kPairRow * pair;
   const int32_t owner = owner_of(in, record);
   if (owner < 0 || t.decided[record[5] * int64_t{in.bodies()} + owner]) return;
@@ -151,7 +151,10 @@ __global__ void __launch_bounds__(kOne) try_kernel(const __grid_constant__ Rigid
   if (item < rows) {
     try_vertex(in, t, item, moved);
   } else if (pair < listed) {
-    if (pair < in.first_listed(in.scene.scenes)) try_pair_of(in, t, pair, true, t.press[pair], moved);
+    if (pair >= in.first_listed(in.scene.scenes)) return;
+    const int64_t scene = in.gate.listed.pairs[kPairRow * pair + 5];
+    if (pair - in.first_listed(scene) >= t.nears[scene]) return;
+    try_pair_of(in, t, t.near[pair], true, t.press[t.near[pair]], moved);
   } else if (pair - listed < in.first_lagged(in.scene.scenes)) {
     try_pair_of(in, t, pair - listed, false, t.press[pair], moved);
   }
@@ -289,10 +292,10 @@ __global__ void __launch_bounds__(kThreads)
     }
     team.each(vertices, [&](int32_t v) { try_vertex(in, t, first + v, moved); });
     const int64_t repelling = in.first_listed(scene), rubbing = in.first_lagged(scene);
-    const auto repel = static_cast<int32_t>(in.first_listed(scene + 1) - repelling);
+    const int32_t repel = t.nears[scene];
     team.each(repel + static_cast<int32_t>(in.first_lagged(scene + 1) - rubbing), [&](int32_t i) {
       const bool repels = i < repel;
-      const int64_t pair = repels ? repelling + i : rubbing + i - repel;
+      const int64_t pair = repels ? t.near[repelling + i] : rubbing + i - repel;
       try_pair_of(in, t, pair, repels, t.press[repels ? pair : listed + pair], moved);
     });
     team.meet();
@@ -317,8 +320,8 @@ int64_t rigid_move_bytes(const RigidInputs<T>& in, const PairRoom& room) {
   const int64_t scenes = in.scene.scenes, units = scenes * in.bodies();
   return 9 * aligned(units * sizeof(double)) + aligned(scenes * in.scene.vertices * sizeof(double)) +
          aligned(room.rows() * sizeof(double)) + aligned(units * sizeof(int32_t)) +
-         aligned(room.listed * 2 * sizeof(int32_t)) + aligned(scenes * sizeof(int32_t)) +
-         2 * aligned(units * sizeof(T)) + 4 * aligned(units) + aligned(room.listed) + aligned(scenes);
+         aligned(room.listed * 2 * sizeof(int32_t)) + aligned(room.listed * sizeof(int32_t)) +
+         2 * aligned(scenes * sizeof(int32_t)) + 2 * aligned(units * sizeof(T)) + 4 * aligned(units) + aligned(scenes);
 }
 
 template <class T>
@@ -342,10 +345,11 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairRoom& room, const dou
   t.largest = counts(units), t.rise = counts(units), t.whole = counts(units);
   t.value = numbers(rows), t.press = numbers(room.rows());
   t.lead = whole(units), t.touching = whole(2 * room.listed), t.touches = whole(scenes);
+  t.near = whole(room.listed), t.nears = whole(scenes);
   t.state.share = reinterpret_cast<T*>(take(units * sizeof(T)));
   t.state.now = reinterpret_cast<T*>(take(units * sizeof(T)));
   t.state.blocked = take(units), t.state.stamp = take(units);
-  t.decided = take(units), t.stopped = take(units), t.near = take(room.listed), t.done = take(scenes);
+  t.decided = take(units), t.stopped = take(units), t.done = take(scenes);
   begin_kernel<T><<<blocks_for(std::max(units, scenes)), kOne, 0, stream>>>(in, t);
   if (room.rows() > 0) {
     way_kernel<T><<<blocks_for(rows), kOne, 0, stream>>>(in, t);

@@ -38,6 +38,31 @@ def some_of(listed: Pairs, keep: Tensor) -> tuple[Pairs, Tensor]:
     return Pairs(*kept), rows
 
 
+class _RowsOf(Function):
+    """Rows of values [n, c] by number, none of them twice, and zeros for -1. Indexing does the same, but its backward
+    adds up rows one after another that come more than once, as all for -1 would."""
+
+    @staticmethod
+    def forward(values: Tensor, rows: Tensor) -> Tensor:
+        if not len(values):
+            return values
+        return torch.where((rows >= 0)[:, None], values[rows.clamp(min=0)], 0.0)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        ctx.count, ctx.rows = len(inputs[0]), inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        out = grads[0].new_zeros((ctx.count + 1, *grads[0].shape[1:]))  # the first is for -1
+        return (out.index_copy(0, ctx.rows.long() + 1, grads[0])[1:] if ctx.count else grads[0]), None
+
+
+def rows_of(values: Tensor, rows: Tensor) -> Tensor:
+    """Rows of values [n, c] by number, none of them twice; zeros for -1. Differentiable."""
+    return _RowsOf.apply(values, rows)
+
+
 class _Lag(Function):
     """Normal force, activity, normal and weights of pairs at the start of a step [pairs, 9]."""
 
@@ -141,4 +166,4 @@ def pair_lag(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed:
     return _Lag.apply(x.contiguous(), collider.contiguous(), kappa.contiguous(), origin, listed)
 
 
-ops.ready_signature(_Lag, _OfScene, _AtCorners, _SumAtCorners)
+ops.ready_signature(_Lag, _RowsOf, _OfScene, _AtCorners, _SumAtCorners)

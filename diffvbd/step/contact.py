@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..adjoint.contact_lag import Pairs, no_pairs, of_scene, pair_lag, some_of
+from ..adjoint.contact_lag import Pairs, no_pairs, of_scene, pair_lag, rows_of, some_of
 from ..adjoint.rise import RiseParts, rise_parts, rises
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
@@ -114,8 +114,7 @@ class ContactStep:
         share = damped_share(force, of_pair(self.kappa), dhat)
         lag = torch.cat([of_pair(coefficient) * force, of_pair(damping) * share, rest], -1)
         listed, rows = some_of(listed, (active[:, 0] != 0).contiguous())
-        lag = torch.where((rows >= 0)[:, None], lag[rows.clamp(min=0)], 0.0) if lag.shape[0] else lag
-        self.lagged, self.lag = listed, lag
+        self.lagged, self.lag = listed, rows_of(lag, rows)
 
     @staticmethod
     def _reads(x: Tensor) -> bool:

@@ -72,7 +72,7 @@ std::tuple<Tensor, Tensor> contact_advance(const Tensor& x, const Tensor& move, 
     in.careful = careful, in.whole = whole;
     Tensor share = empty(x, {in.scenes, whole ? in.bodies : in.vertices});
     Tensor stuck = empty(x, {1}, ScalarType::Long);
-    const Tensor work = empty(x, {cuda::advance_workspace_bytes<T>(in)}, ScalarType::Byte);
+    const Tensor work = empty(x, {cuda::advance_workspace_bytes<T>(in, pairs.size(0))}, ScalarType::Byte);
     int multiprocessors = 0;
     check(cudaDeviceGetAttribute(&multiprocessors, cudaDevAttrMultiProcessorCount, x.get_device_index()),
           "a device query");
