@@ -69,6 +69,14 @@ DIFFVBD_FN Vec3<T> way_of(const AdvanceInputs<T>& in, int64_t scene, int32_t v) 
   return in.held[v] || !in.u ? way : way - vector_at(in.u + 3 * (scene * in.bodies + in.body[v]));
 }
 
+// And the part of it that it tries.
+template <class T>
+DIFFVBD_FN Vec3<T> way_tried(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t scene, int32_t v) {
+  const int64_t unit = in.unit(scene * in.vertices + v);
+  const T done = in.held[v] ? T(s.first ? 0 : 1) : s.share[unit];
+  return ((T(1) - done) * (in.held[v] ? T(1) : s.now[unit])) * way_of(in, scene, v);
+}
+
 // A vertex as it is, relative to `from`, and the way that it tries.
 template <class T>
 struct Trial {
@@ -91,7 +99,7 @@ DIFFVBD_FN Trial<T> trial(const AdvanceInputs<T>& in, const AdvanceState<T>& s, 
   out.at = vector_at(in.x + 3 * row) + done * whole;
   out.since = out.at - vector_at(in.center + 3 * row);
   out.from = in.origin ? vector_at(in.origin + 3 * row) : zero3<T>();
-  out.way = ((T(1) - done) * (in.held[v] ? T(1) : s.now[unit])) * whole;
+  out.way = way_tried(in, s, scene, v);
   out.size = size_of(out.at + out.from);
   return out;
 }
@@ -106,34 +114,34 @@ DIFFVBD_FN T guard_of_size(T size) {
   return T(kGuardUlps) * std::numeric_limits<T>::epsilon() * size;
 }
 
-// The corners of a pair as they are, and the ways that they try.
+// Whether a collider's point is already where it ends: planes were looked for there.
 template <class T>
-struct Attempt {
+DIFFVBD_FN bool is_still(const AdvanceState<T>& s, const int32_t* pair) {
+  return pair[4] == kPointPlane || !s.first;
+}
+template <class T>
+DIFFVBD_FN int64_t row_of_collider(const AdvanceInputs<T>& in, const int32_t* pair, int k) {
+  return 3 * (int64_t{pair[5]} * (in.corners - in.vertices) + pair[k] - in.vertices);
+}
+
+// The corners of a pair as they are where a move begins.
+template <class T>
+struct PairPlace {
   Corners<T> corners;
-  Vec3<T> way[4];
-  bool free[4];
   T guard;
 };
-
 template <class T>
-DIFFVBD_FN Attempt<T> attempt(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair) {
-  Attempt<T> out;
+DIFFVBD_FN PairPlace<T> place_of(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair) {
+  PairPlace<T> out;
   Vec3<T> at[4], from[4];
   T size = T(0);
   for (int k = 0; k < 4; ++k) {
-    const int32_t v = pair[k];
-    const int64_t scene = pair[5];
-    if (v >= in.vertices) {
-      const int64_t row = 3 * (scene * (in.corners - in.vertices) + v - in.vertices);
-      const Vec3<T> was = vector_at(in.collider + row), next = vector_at(in.collider_next + row);
-      const bool still = pair[4] == kPointPlane || !s.first;  // planes were looked for where they end
-      at[k] = still ? next : was, from[k] = zero3<T>();
-      out.way[k] = still ? zero3<T>() : next - was;
-      out.free[k] = false;
+    if (pair[k] >= in.vertices) {
+      at[k] = vector_at((is_still(s, pair) ? in.collider_next : in.collider) + row_of_collider(in, pair, k));
+      from[k] = zero3<T>();
     } else {
-      const Trial<T> t = trial(in, s, scene, v);
-      at[k] = t.at, from[k] = t.from, out.way[k] = t.way;
-      out.free[k] = !in.held[v];
+      const Trial<T> t = trial(in, s, pair[5], pair[k]);
+      at[k] = t.at, from[k] = t.from;
     }
     const T own = size_of(at[k] + from[k]);
     size = size < own ? own : size;
@@ -142,6 +150,54 @@ DIFFVBD_FN Attempt<T> attempt(const AdvanceInputs<T>& in, const AdvanceState<T>&
   out.guard = guard_of_size(size);
   return out;
 }
+
+// The ways that they try.
+template <class T>
+struct Ways {
+  Vec3<T> way[4];
+  T shares[4];  // of a gap that each may close
+  bool free[4], moves, careful;
+  DIFFVBD_FN Ways(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair)
+      : moves(false), careful(false) {
+    bool side[2] = {false, false};
+    for (int k = 0; k < 4; ++k) {
+      if (pair[k] >= in.vertices) {
+        const int64_t row = row_of_collider(in, pair, k);
+        way[k] = is_still(s, pair) ? zero3<T>() : vector_at(in.collider_next + row) - vector_at(in.collider + row);
+        free[k] = false;
+      } else {
+        way[k] = way_tried(in, s, pair[5], pair[k]);
+        free[k] = !in.held[pair[k]];
+      }
+      const bool goes = T(0) < dot(way[k], way[k]);
+      bool& of = side[k < sides(pair[4]) ? 0 : 1];
+      of = of || goes;
+      careful = careful || (in.careful && free[k] && goes);  // what is prescribed may come closer
+    }
+    moves = side[0] || side[1];
+    for (T& own : shares) own = side[0] && side[1] ? T(kBothShare) : T(kShare);
+  }
+};
+
+// What keeps a pair apart along the direction of its closest points in a move: all but the ways that it tries.
+template <class T>
+struct Plane {
+  Vec3<T> n;
+  Separation<T> separation;
+  T wide, least;
+  Plane() = default;
+  DIFFVBD_FN Plane(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
+    const int32_t* record = in.listed.pairs + kPairRow * pair;
+    const PairConstants<T> constants(in.constants + kConstants * pair);
+    const PairPlace<T> at = place_of(in, s, record);
+    n = distance(record[4], at.corners).n;
+    separation = Separation<T>(record[4], at.corners, n, constants.offset);
+    wide = separation.gap - at.guard, least = least_of(constants.dhat);
+  }
+  DIFFVBD_FN bool holds(int kind, const Ways<T>& a) const {
+    return !a.moves || holds_along(kind, n, separation, wide, least, a.way, a.shares, a.careful, a.careful);
+  }
+};
 
 // Whether a pair stays out of the barrier's reach all the way, however its corners go: by its gap when that was taken.
 template <class T>
@@ -214,32 +270,39 @@ DIFFVBD_FN bool is_open(const AdvanceInputs<T>& in, const AdvanceState<T>& s, co
   return false;
 }
 
+// Whether one has tried less in the round before.
+template <class T>
+DIFFVBD_FN bool is_retried(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* record, int round) {
+  for (int k = 0; k < 4; ++k) {
+    if (record[k] < in.vertices && s.stamp[in.unit(int64_t{record[5]} * in.vertices + record[k])] == round) return true;
+  }
+  return false;
+}
+
+// Whether a pair passes by its plane, or need not be looked at in this round: the quick part of try_pair().
+template <class T>
+DIFFVBD_FN bool passes_by(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const Plane<T>& plane, int64_t pair,
+                          int round) {
+  const int32_t* record = in.listed.pairs + kPairRow * pair;
+  return (round > 0 && !is_retried(in, s, record, round)) || plane.holds(record[4], Ways<T>(in, s, record));
+}
+
 // Marks the corners that keep a pair from being safe; returns whether it is. Round 0 looks at all pairs, later ones at
 // those of which a corner has tried less in the round before.
 template <class T>
 DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair, int round) {
   const int32_t* record = in.listed.pairs + kPairRow * pair;
-  const auto retried = [&](int k) {
-    return record[k] < in.vertices && s.stamp[in.unit(int64_t{record[5]} * in.vertices + record[k])] == round;
-  };
-  if (round > 0 && !(retried(0) || retried(1) || retried(2) || retried(3))) return true;
+  if (round > 0 && !is_retried(in, s, record, round)) return true;
   if (!s.first && round == 0 && !is_open(in, s, record)) return true;
   const T* constants = in.constants + kConstants * pair;
   if (PairHints<T>(constants).gap == std::numeric_limits<T>::infinity()) return true;  // left out (contact/narrow.h)
   if (stays_far(in, s, record, constants)) return true;                                // as do most
-  const Attempt<T> a = attempt(in, s, record);
+  const Ways<T> a(in, s, record);
+  if (!a.moves) return true;
   const int first = sides(record[4]);
-  bool moves[2] = {false, false}, careful = false;
-  for (int k = 0; k < 4; ++k) {
-    const T size = dot(a.way[k], a.way[k]);
-    const int side = k < first ? 0 : 1;
-    moves[side] = moves[side] || T(0) < size;
-    careful = careful || (in.careful && a.free[k] && T(0) < size);  // what is prescribed may come closer
-  }
-  if (!moves[0] && !moves[1]) return true;
-  const Gate<T> gate(record[4], a.corners, constants, a.guard);
-  const T each = moves[0] && moves[1] ? T(kBothShare) : T(kShare), shares[4] = {each, each, each, each};
-  if (gate.holds(a.way, shares, careful) || stays_apart(gate, a.way, careful)) return true;
+  const PairPlace<T> at = place_of(in, s, record);
+  const Gate<T> gate(record[4], at.corners, constants, at.guard);
+  if (gate.holds(a.way, a.shares, a.careful) || stays_apart(gate, a.way, a.careful)) return true;
   bool named = false;
   for (int pass = 0; pass < 2 && !named; ++pass) {
     for (int k = 0; k < 4; ++k) {

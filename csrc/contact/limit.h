@@ -18,6 +18,11 @@ constexpr double kTight = 0.125;           // of that: such motion closes such g
 constexpr double kGuardUlps = 32;          // roundings of a position, which a gap is not trusted to
 
 template <class T>
+DIFFVBD_FN T least_of(T dhat) {
+  return T(kStartPart) * dhat;
+}
+
+template <class T>
 DIFFVBD_FN T limit_of(int exponent) {
   return exponent >= kNoMove ? T(0) : T(1) / T(1 << exponent);
 }
@@ -30,6 +35,7 @@ template <class R>
 struct Separation {
   R gap;       // between the lowest corner of the first and the highest of the second, less the radii [m]
   R slack[4];  // how far behind that one each corner lies [m]
+  Separation() = default;
   DIFFVBD_FN Separation(int kind, const Corners<R>& c, const Vec3<R>& m, const R& offset) {
     const int first = sides(kind);
     R h[4], lowest = R(std::numeric_limits<float>::infinity()), highest = -lowest;
@@ -85,6 +91,25 @@ DIFFVBD_FN Vec3<T> across(int kind, const Corners<T>& c) {
   return (toward < T(0) ? -scale : scale) * n;
 }
 
+// Whether corners that move by d[k], each as far as its share of the gap lets it, keep the sides apart along m, where
+// these lie as s says. wide: their gap less the guard; bounded: no closer than `least`, or by but a little.
+template <class T>
+DIFFVBD_FN bool holds_along(int kind, const Vec3<T>& m, const Separation<T>& s, T wide, T least, const Vec3<T> (&d)[4],
+                            const T (&share)[4], bool bounded, bool careful) {
+  if (!(T(0) < wide)) return false;
+  for (int k = 0; k < 4; ++k) {
+    const T toward = k < sides(kind) ? -dot(m, d[k]) : dot(m, d[k]);
+    T room = share[k] * wide;
+    if (bounded) {
+      const bool tight = careful && wide < T(kTight) * least;
+      const T outside = share[k] * (wide - least), some = tight ? T(0) : T(kStartLeast) * wide;
+      room = some < outside ? outside : some;
+    }
+    if (!(toward <= s.slack[k] + room)) return false;
+  }
+  return true;
+}
+
 // One pair as it is now, and what motions of its corners it lets pass.
 template <class T>
 struct Gate {
@@ -102,28 +127,17 @@ struct Gate {
     n = at.n;
     gap = at.d - constants.offset;
   }
-  DIFFVBD_FN T least() const { return T(kStartPart) * constants.dhat; }
+  DIFFVBD_FN T least() const { return least_of(constants.dhat); }
 
   // Whether corners that move by d[k], each as far as its share of the gap lets it, keep the sides apart along m.
   // careful: the motion does not minimise the barrier.
   DIFFVBD_FN bool holds(const Vec3<T>& m, const Vec3<T> (&d)[4], const T (&share)[4], bool careful, bool own) const {
     const Separation<T> s(kind, corners, m, constants.offset);
     const T wide = s.gap - guard;
-    if (!(T(0) < wide)) return false;
     // other directions than that of the closest points must keep what is near
     const T near = hints.nearest < least() ? hints.nearest : least();
     if (!own && !(T(0.5) * near < wide)) return false;
-    for (int k = 0; k < 4; ++k) {
-      const T toward = k < sides(kind) ? -dot(m, d[k]) : dot(m, d[k]);
-      T room = share[k] * wide;
-      if (careful || !own) {
-        const bool tight = careful && wide < T(kTight) * least();
-        const T outside = share[k] * (wide - least()), some = tight ? T(0) : T(kStartLeast) * wide;
-        room = some < outside ? outside : some;
-      }
-      if (!(toward <= s.slack[k] + room)) return false;
-    }
-    return true;
+    return holds_along(kind, m, s, wide, least(), d, share, careful || !own, careful);
   }
   DIFFVBD_FN bool holds(const Vec3<T> (&d)[4], const T (&share)[4], bool careful) const {
     if (holds(n, d, share, careful, true)) return true;

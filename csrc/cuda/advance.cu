@@ -19,13 +19,28 @@ __device__ __noinline__ bool passes(const AdvanceInputs<T>& in, const AdvanceSta
   return try_pair(in, s, pair, round);
 }
 
-// One cooperative launch for all moves and rounds: most are over after the first round, and only the device knows.
-// Rounds look at the pairs that may matter in their move, listed in any order: few, which would leave most of a warp
-// idle among the others. flags [kFlags], counts [kMoves] and stuck [1] are zero.
 template <class T>
-__global__ void __launch_bounds__(kThreads)
-    advance_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, unsigned* flags, unsigned* counts,
-                   int32_t* near, unsigned long long* stuck) {
+__device__ __noinline__ Plane<T> plane_of(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
+  return Plane<T>(in, s, pair);
+}
+
+// The pairs that rounds of a move look at: those that may matter, in any order, and their planes.
+template <class T>
+struct Looked {
+  int32_t* pair;
+  Plane<T>* plane;
+  unsigned* counts;  // [kMoves]
+};
+
+// One cooperative launch for all moves and rounds: most are over after the first round, and only the device knows. What
+// is quick is asked of all pairs first, and then a block asks what is slow of those that are left, so that no warp waits
+// for a few of its threads. flags [kFlags], the counts of `all` and stuck [1] are zero.
+template <class T>
+__global__ void __launch_bounds__(kThreads, 2)
+    advance_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, unsigned* flags, Looked<T> all,
+                   unsigned long long* stuck) {
+  __shared__ int32_t slow[2 * kThreads];
+  __shared__ int slows;
   const auto grid = cooperative_groups::this_grid();
   const auto each = [](int64_t n, const auto& f) {
     for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < n;
@@ -49,10 +64,34 @@ __global__ void __launch_bounds__(kThreads)
     each(pairs, [&](int64_t i) {
       const int32_t* record = in.listed.pairs + kPairRow * i;
       if ((s.first || is_open(in, s, record)) && !stays_far_at_any_share(in, s, i))
-        near[atomicAdd(counts + move, 1)] = static_cast<int32_t>(i);
+        all.pair[atomicAdd(all.counts + move, 1)] = static_cast<int32_t>(i);
     });
     grid.sync();
-    const int64_t looked = *static_cast<volatile unsigned*>(counts + move);
+    const int64_t looked = *static_cast<volatile unsigned*>(all.counts + move);
+    each(looked, [&](int64_t i) { all.plane[i] = plane_of(in, s, all.pair[i]); });
+    // Calls f(pair) for those that do not pass: a thread's own planes, and then what a block has kept.
+    const auto each_failing = [&](int round, const auto& f) {
+      const auto flush = [&] {
+        for (int k = static_cast<int>(threadIdx.x); k < slows; k += kThreads) {
+          if (!passes(in, s, slow[k], round)) f(slow[k]);
+        }
+        __syncthreads();
+        if (threadIdx.x == 0) slows = 0;
+        __syncthreads();
+      };
+      if (threadIdx.x == 0) slows = 0;
+      __syncthreads();
+      for (int64_t first = static_cast<int64_t>(blockIdx.x) * kThreads; first < looked;
+           first += static_cast<int64_t>(gridDim.x) * kThreads) {
+        const int64_t i = first + threadIdx.x;
+        if (i < looked && !passes_by(in, s, all.plane[i], all.pair[i], round)) slow[atomicAdd(&slows, 1)] = all.pair[i];
+        __syncthreads();
+        const bool full = slows > kThreads;  // else there is room for those of one more turn
+        __syncthreads();
+        if (full) flush();
+      }
+      flush();
+    };
     bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
     for (int round = 0; round < kRounds; ++round) {
       const bool last = round + 1 == kRounds;
@@ -61,9 +100,7 @@ __global__ void __launch_bounds__(kThreads)
         if (!passed && last) mark(s.failed + scene);
         found = found || !passed;
       };
-      each(looked, [&](int64_t i) {
-        note(in.listed.pairs[kPairRow * int64_t{near[i]} + 5], passes(in, s, near[i], last ? 0 : round));
-      });
+      each_failing(last ? 0 : round, [&](int64_t pair) { note(in.listed.pairs[kPairRow * pair + 5], false); });
       each(rows, [&](int64_t i) { note(i / in.vertices, stay(in, s, i, last ? 0 : round)); });
       const bool passed = !any(found);
       clean = round == 0 && passed;
@@ -74,9 +111,7 @@ __global__ void __launch_bounds__(kThreads)
     each(units, [&](int64_t i) { give_up(in, s, i); });
     if (s.first && !clean) {
       grid.sync();
-      each(looked, [&](int64_t i) {
-        if (!passes(in, s, near[i], 0)) atomicAdd(stuck, 1ULL);
-      });
+      each_failing(0, [&](int64_t) { atomicAdd(stuck, 1ULL); });
       grid.sync();
     }
     bool open = false;
@@ -104,7 +139,7 @@ template <class T>
 int64_t advance_workspace_bytes(const AdvanceInputs<T>& in, int64_t capacity) {
   const int64_t units = in.units();
   return aligned((kFlags + kMoves) * sizeof(unsigned)) + aligned(units * sizeof(T)) + 2 * aligned(units) +
-         aligned(in.scenes) + aligned(capacity * sizeof(int32_t));
+         aligned(in.scenes) + aligned(capacity * sizeof(int32_t)) + aligned(capacity * sizeof(Plane<T>));
 }
 
 template <class T>
@@ -123,7 +158,8 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
   const int64_t units = in.units();
   auto* now = reinterpret_cast<T*>(take(units * sizeof(T)));
   uint8_t *blocked = take(units), *stamp = take(units), *failed = take(in.scenes);
-  auto* near = reinterpret_cast<int32_t*>(take(capacity * sizeof(int32_t)));
+  Looked<T> all{reinterpret_cast<int32_t*>(take(capacity * sizeof(int32_t))),
+                reinterpret_cast<Plane<T>*>(take(capacity * sizeof(Plane<T>))), flags + kFlags};
   if (auto error = cudaMemsetAsync(flags, 0, (kFlags + kMoves) * sizeof(unsigned), stream)) return error;
   AdvanceInputs<T> inputs = in;
   AdvanceState<T> state{share, now, blocked, stamp, failed, true};
@@ -134,8 +170,7 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
   const int64_t wanted = (std::max(rows, capacity) + kThreads - 1) / kThreads;
   const int64_t each = capacity < kManyPairs ? 1 : resident;
   const auto blocks = static_cast<unsigned>(std::min<int64_t>(wanted, each * multiprocessors));
-  unsigned* counts = flags + kFlags;
-  void* arguments[] = {&inputs, &state, &flags, &counts, &near, &found};
+  void* arguments[] = {&inputs, &state, &flags, &all, &found};
   return cudaLaunchCooperativeKernel(kernel, dim3(blocks), dim3(kThreads), arguments, 0, stream);
 }
 
