@@ -2,8 +2,9 @@
 //
 //     W = p . (gradient + matrix q)
 //
-// of two motions p and q of all corner points, the derivatives by p, q, positions, kappa and what is lagged. A pair is
-// derived in twelve directions by Dual, once for each correction. docs/method.md, section 18.
+// of two motions p and q of all corner points, the derivatives by p, q, positions, kappa and what is lagged. A listed
+// pair is derived in twelve directions by Dual, once for each correction; a lagged one by hand. docs/method.md,
+// section 18.
 #pragma once
 
 #include "rigid_rub.h"
@@ -49,15 +50,11 @@ DIFFVBD_FN PairMotions motions_of(const RigidInputs<T>& in, const VirtualMotions
   return out;
 }
 
-// Gradient and matrix of a pair by the motion of its weighted corners, and what a mollifier adds at corners.
+// Of a listed pair, gradient and matrix by the motion of its weighted corners, and what a mollifier adds at corners.
 template <class R>
 struct PressTerms {
   Vec3<R> force, n, at_corner[4];
   R w[4], along;  // stiffness along the normal
-  // Of friction, for each side that moves by itself, where q has taken it: its force, the slip, its derivative there,
-  // and what that has along the slip.
-  Vec3<R> rub[2], slip[2];
-  R rate[2], bend[2];
 };
 
 template <class R>
@@ -78,7 +75,7 @@ DIFFVBD_FN R virtual_work(const PressTerms<R>& a, const PairMotions& m) {
   }
   for (int side = 0; side < m.sides; ++side) {
     const Vec3<R> p = weighted(a.w, m.p, m, side), q = weighted(a.w, m.q, m, side);
-    out = out + R(m.share) * a.along * dot(a.n, p) * dot(a.n, q) + dot(a.rub[side], p);
+    out = out + R(m.share) * a.along * dot(a.n, p) * dot(a.n, q);
   }
   return out;
 }
@@ -86,14 +83,9 @@ DIFFVBD_FN R virtual_work(const PressTerms<R>& a, const PairMotions& m) {
 // Adds the derivatives by p and q, to each corner's row.
 template <class T>
 DIFFVBD_FN void add_by_motions(const PressTerms<double>& a, const PairMotions& m, T* rows) {
-  const auto pressed = [&](const Vector& u) { return (a.along * dot(a.n, u)) * a.n; };
+  const auto pressed = [&](const Vector& u) { return (m.share * a.along * dot(a.n, u)) * a.n; };
   for (int side = 0; side < m.sides; ++side) {
-    const Vector& slip = a.slip[side];
-    const auto rubbed = [&](const Vector& u) {
-      return a.rate[side] * (u - dot(a.n, u) * a.n) + (a.bend[side] * dot(slip, u)) * slip;
-    };
-    const Vector P = weighted(a.w, m.p, m, side), Q = weighted(a.w, m.q, m, side);
-    const Vector by_p = a.rub[side] + m.share * pressed(Q), by_q = m.share * (pressed(P) + rubbed(P));
+    const Vector by_p = pressed(weighted(a.w, m.q, m, side)), by_q = pressed(weighted(a.w, m.p, m, side));
     for (int k = 0; k < 4; ++k) {
       if (!m.is_of(side, k)) continue;
       rigid::put(rows + kWorkScalars * k + 3, a.w[k] * (a.force + by_p) + a.at_corner[k]);
@@ -107,7 +99,7 @@ template <class R, class T>
 DIFFVBD_FN PressTerms<R> barrier_terms(int kind, const Corners<R>& c, const PairConstants<T>& a, double size) {
   const Distance<R> near = distance(kind, c);
   const LogBarrier<R> b(near.d - R(a.offset), R(a.dhat), R(size));
-  PressTerms<R> out{};  // no friction
+  PressTerms<R> out{};
   R e(1);
   if (is_mollified(kind, c, a.threshold)) {
     const Mollifier<R> m = mollifier(c, a.threshold);
@@ -167,86 +159,76 @@ struct BarrierWork {
   }
 };
 
-// f1(|u|) / |u| and its derivative over |u|, which are taken as constant below what rounding makes of rest.
-DIFFVBD_FN FrictionRate<double> slip_rate(const Vector& u, double eps) {
-  return FrictionRate<double>(square_root(dot(u, u)), eps);
-}
-DIFFVBD_FN FrictionRate<Dual<double>> slip_rate(const Vec3<Dual<double>>& u, double eps) {
-  const Dual<double> square = dot(u, u);
-  const double length = square_root(square.value);
-  const Dual<double> known = kRestingMotion * eps < length ? square_root(square) : Dual<double>(length);
-  return FrictionRate<Dual<double>>(known, Dual<double>(eps));
-}
-
-// lag: as Lag reads it; since: how corners have moved since the start of the step; beside: added to what they make.
-template <class R>
-DIFFVBD_FN PressTerms<R> lagged_terms(const R* lag, const Vector* since, const PairMotions& motions,
-                                      const Vec3<R>& beside, double h, double eps) {
-  PressTerms<R> out{};
-  out.n = {lag[2], lag[3], lag[4]};
-  Vec3<R> m = beside;
-  for (int k = 0; k < 4; ++k) {
-    out.w[k] = lag[5 + k];
-    m = m + Vec3<R>{out.w[k] * R(since[k].x), out.w[k] * R(since[k].y), out.w[k] * R(since[k].z)};
-    out.at_corner[k] = {R(0), R(0), R(0)};
-  }
-  const R along = dot(out.n, m), approach = select(along < R(0), along, R(0));
-  const R load = R(h * h) * lag[0];
-  out.along = R(h) * lag[1];
-  out.force = (out.along * approach) * out.n;
-  for (int side = 0; side < motions.sides; ++side) {
-    const Vec3<R> way = R(motions.share) * weighted(out.w, motions.q, motions, side);
-    out.slip[side] = m - along * out.n + (way - dot(out.n, way) * out.n);
-    const FrictionRate<R> f = slip_rate(out.slip[side], eps);
-    out.rate[side] = load * f.value, out.bend[side] = load * f.curvature;
-    out.rub[side] = out.rate[side] * out.slip[side];
-  }
-  return out;
-}
-
-// Of a lagged pair. Positions at the start of the step take the derivatives by x with the other sign.
+// Of a lagged pair. With m how its weighted corners have moved since the start of the step, P and Q how they move by p
+// and q, n its normal, u the slip after Q and A the damping,
+//
+//     W = A min(n . m, 0) n . P + share A (n . P) (n . Q) + load f1(|u|) / |u| u . P,
+//
+// with the last two for each side that moves by itself. Positions at the start of the step take the derivatives by x
+// with the other sign.
 template <class T>
 struct LaggedWork {
   bool acts;
   PairMotions m;
-  Vector since[4];
-  double lag[kLagScalars], h, eps;
+  Vector since[4], n, moved;
+  double w[4], coefficient, damping, h, eps;  // of h^2 and of h
 
   DIFFVBD_FN LaggedWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair)
-      : acts(pair < in.first_lagged(in.scene.scenes)), m{}, h(in.scene.time_step), eps(in.friction_eps) {
+      : acts(pair < in.first_lagged(in.scene.scenes)), m{}, moved{}, h(in.scene.time_step), eps(in.friction_eps) {
     if (!acts) return;
     const int32_t* record = in.lagged.pairs + kPairRow * pair;
     // also of pairs without a force, which a coefficient of zero has made so
     acts = moving_body(in, record[0]) >= 0 || moving_body(in, record[sides(record[4])]) >= 0;
     if (!acts) return;
     const CornerPoints<T> at{in, false};
+    const Lag<T> lag(in.lag + kLagScalars * pair);
+    coefficient = lag.friction, damping = lag.damping;
     m = motions_of(in, given, record);
     // what does nothing joined no bodies; with any coefficient it would
-    if (in.lag[kLagScalars * pair] == T(0) && in.lag[kLagScalars * pair + 1] == T(0)) m.sides = 1, m.share = 1;
-    for (int k = 0; k < 4; ++k) since[k] = at.relative(record[5], record[k]) - before(in, record[5], record[k]);
-    for (int i = 0; i < kLagScalars; ++i) lag[i] = in.lag[kLagScalars * pair + i];
-  }
-
-  DIFFVBD_FN double derived(int direction) const {
-    Dual<double> turned[kLagScalars];
-    for (int i = 0; i < kLagScalars; ++i) turned[i] = {lag[i], double(i + 3 == direction)};
-    const Vec3<Dual<double>> beside = {
-        {0.0, double(direction == 0)}, {0.0, double(direction == 1)}, {0.0, double(direction == 2)}};
-    return virtual_work(lagged_terms(turned, since, m, beside, h, eps), m).derivative;
+    if (coefficient == 0 && damping == 0) m.sides = 1, m.share = 1;
+    n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
+    for (int k = 0; k < 4; ++k) {
+      w[k] = lag.w[k];
+      since[k] = at.relative(record[5], record[k]) - before(in, record[5], record[k]);
+      moved += w[k] * since[k];
+    }
   }
 
   // Of the rows of the corners [4, 9] and the derivatives by what is lagged [9].
-  DIFFVBD_FN void store(int part, T* rows, T* by_lag) const {
-    if (part < kDirections) {
-      const double own = acts ? derived(part) : 0;
-      if (part >= 3) by_lag[part - 3] = T(own);
-      for (int k = 0; k < 4 && part < 3; ++k) rows[kWorkScalars * k + part] = acts ? T(lag[5 + k] * own) : T(0);
-      return;
+  DIFFVBD_FN void store(T* rows, T* by_lag) const {
+    const double along = dot(n, moved), approach = along < 0 ? along : 0, A = h * damping, load = h * h * coefficient;
+    double by_along = 0, by_load = 0, by_damping = 0, by_w[4] = {0, 0, 0, 0};
+    Vector by_n{}, by_m{};
+    for (int side = 0; side < m.sides; ++side) {
+      const Vector P = weighted(w, m.p, m, side), Q = weighted(w, m.q, m, side), way = m.share * Q;
+      const Vector u = moved - along * n + (way - dot(n, way) * n);
+      const FrictionRate<double> f(square_root(dot(u, u)), eps);
+      const double nP = dot(n, P), nQ = dot(n, Q), slipping = dot(u, P);
+      const Vector by_u = load * (f.value * P + (f.curvature * slipping) * u);
+      const Vector by_way = by_u - dot(n, by_u) * n;
+      by_m += by_u;
+      by_along += (along < 0 ? A * nP : 0) - dot(n, by_u);
+      by_n += (A * approach) * P + (m.share * A) * (nQ * P + nP * Q) - (along + dot(n, way)) * by_u -
+              dot(n, by_u) * way;
+      by_load += f.value * slipping, by_damping += approach * nP + m.share * nP * nQ;
+      const Vector by_p = (A * (approach + m.share * nQ)) * n + (load * f.value) * u;
+      const Vector by_q = m.share * ((A * nP) * n + by_way);
+      for (int k = 0; k < 4; ++k) {
+        if (!m.is_of(side, k)) continue;
+        rigid::put(rows + kWorkScalars * k + 3, w[k] * by_p);
+        rigid::put(rows + kWorkScalars * k + 6, w[k] * by_q);
+        by_w[k] += dot(by_p, m.p[k]) + dot(by_q, m.q[k]);
+      }
     }
-    for (int k = 0; k < 4; ++k) {
-      for (int i = 3; i < kWorkScalars; ++i) rows[kWorkScalars * k + i] = T(0);
-    }
-    if (acts) add_by_motions(lagged_terms(lag, since, m, Vector{}, h, eps), m, rows);
+    by_m += by_along * n, by_n += by_along * moved;
+    for (int k = 0; k < 4; ++k) rigid::put(rows + kWorkScalars * k, w[k] * by_m);
+    by_lag[0] = T(h * h * by_load), by_lag[1] = T(h * by_damping);
+    rigid::put(by_lag + 2, by_n);
+    for (int k = 0; k < 4; ++k) by_lag[5 + k] = T(by_w[k] + dot(by_m, since[k]));
+  }
+  DIFFVBD_FN static void store_none(T* rows, T* by_lag) {
+    for (int i = 0; i < 4 * kWorkScalars; ++i) rows[i] = T(0);
+    for (int i = 0; i < kLagScalars; ++i) by_lag[i] = T(0);
   }
 };
 

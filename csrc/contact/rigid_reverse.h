@@ -29,6 +29,17 @@ DIFFVBD_FN void motion_adjoint(const double* motion, double share, const Vector&
   for (int i = 0; i < 2; ++i) rigid::put(out + 3 * i, parts[i]);
 }
 
+// f1(|u|) / |u| and its derivative over |u|, which are taken as constant below what rounding makes of rest.
+DIFFVBD_FN FrictionRate<double> slip_rate(const Vector& u, double eps) {
+  return FrictionRate<double>(square_root(dot(u, u)), eps);
+}
+DIFFVBD_FN FrictionRate<Dual<double>> slip_rate(const Vec3<Dual<double>>& u, double eps) {
+  const Dual<double> square = dot(u, u);
+  const double length = square_root(square.value);
+  const Dual<double> known = kRestingMotion * eps < length ? square_root(square) : Dual<double>(length);
+  return FrictionRate<Dual<double>>(known, Dual<double>(eps));
+}
+
 // P . g of friction on one plane of a floor after Q. lag: load [N], normal; travel: since the start of the step.
 template <class R>
 DIFFVBD_FN R slip_work(const R* lag, const Vec3<R>& travel, const Vector& P, const Vector& Q, double h2, double eps) {

@@ -20,9 +20,8 @@ void rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& given, co
   torch::stable::parallel_for(0, out.lagged, 64, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       const LaggedWork<T> work(in, given, i);
-      for (int part = 0; part < kWorkParts; ++part) {
-        work.store(part, out.friction + 4 * kWorkScalars * i, out.by_lag + kLagScalars * i);
-      }
+      T *rows = out.friction + 4 * kWorkScalars * i, *by_lag = out.by_lag + kLagScalars * i;
+      work.acts ? work.store(rows, by_lag) : work.store_none(rows, by_lag);
     }
   });
 }

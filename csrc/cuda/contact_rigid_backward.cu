@@ -30,11 +30,11 @@ __global__ void __launch_bounds__(kOne)
 template <class T>
 __global__ void __launch_bounds__(kOne)
     friction_kernel(const __grid_constant__ RigidInputs<T> in, VirtualMotions<T> given, RigidWork<T> out) {
-  const int64_t row = own_item() / kPartsApart;
-  const int part = static_cast<int>(threadIdx.x % kPartsApart);
-  if (part >= kWorkParts || row >= out.lagged) return;
+  const int64_t row = own_item();
+  if (row >= out.lagged) return;
   const LaggedWork<T> work(in, given, row);
-  work.store(part, out.friction + 4 * kWorkScalars * row, out.by_lag + kLagScalars * row);
+  T *rows = out.friction + 4 * kWorkScalars * row, *by_lag = out.by_lag + kLagScalars * row;
+  work.acts ? work.store(rows, by_lag) : work.store_none(rows, by_lag);
 }
 
 // A block for each body of each scene.
@@ -104,7 +104,7 @@ cudaError_t rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& gi
     pushing_kernel<T><<<blocks_for(out.listed), kOne, 0, stream>>>(in, out.listed, pushing);
     barrier_kernel<T><<<blocks_for(kPartsApart * out.listed), kOne, 0, stream>>>(in, given, out, pushing);
   }
-  if (out.lagged > 0) friction_kernel<T><<<blocks_for(kPartsApart * out.lagged), kOne, 0, stream>>>(in, given, out);
+  if (out.lagged > 0) friction_kernel<T><<<blocks_for(out.lagged), kOne, 0, stream>>>(in, given, out);
   return cudaGetLastError();
 }
 
