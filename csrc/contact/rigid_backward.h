@@ -208,8 +208,8 @@ struct LaggedWork {
       const Vector by_way = by_u - dot(n, by_u) * n;
       by_m += by_u;
       by_along += (along < 0 ? A * nP : 0) - dot(n, by_u);
-      by_n += (A * approach) * P + (m.share * A) * (nQ * P + nP * Q) - (along + dot(n, way)) * by_u -
-              dot(n, by_u) * way;
+      by_n +=
+          (A * approach) * P + (m.share * A) * (nQ * P + nP * Q) - (along + dot(n, way)) * by_u - dot(n, by_u) * way;
       by_load += f.value * slipping, by_damping += approach * nP + m.share * nP * nQ;
       const Vector by_p = (A * (approach + m.share * nQ)) * n + (load * f.value) * u;
       const Vector by_q = m.share * ((A * nP) * n + by_way);

@@ -37,7 +37,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
   const int64_t pairs = in.listed.ptr[in.scenes * in.corners] / 4;
   std::vector<T> now(units);
   std::vector<uint8_t> blocked(units), stamp(units), failed(in.scenes);
-  std::vector<uint8_t> far(pairs), seen(pairs);                // in all rounds of a move; with a plane
+  std::vector<uint8_t> far(pairs), seen(pairs);                   // in all rounds of a move; with a plane
   const std::unique_ptr<Plane<T>[]> planes(new Plane<T>[pairs]);  // in a move
   AdvanceState<T> s{share, now.data(), blocked.data(), stamp.data(), failed.data(), true};
   int64_t stuck = 0;

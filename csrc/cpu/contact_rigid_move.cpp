@@ -195,9 +195,15 @@ void rigid_move(const RigidInputs<T>& in, const double* center, const double* mo
   torch::stable::parallel_for(0, in.scene.scenes, 1, [&](int64_t begin, int64_t end) {
     std::vector<Motion<T>> motions(in.scene.vertices);
     for (int64_t s = begin; s < end; ++s) {
-      Tries<T>(in, s, center + 3 * n * s, motion + kUnknowns * n * s, move, share + n * s).run(state, motions);
-      for (int64_t i = 3 * s * in.scene.vertices; i < 3 * (s + 1) * in.scene.vertices; ++i)
-        x[i] = in.scene.x[i] + move[i];
+      const int64_t first = 3 * s * in.scene.vertices, last = first + 3 * in.scene.vertices;
+      const double* own = motion + kUnknowns * n * s;
+      if (std::all_of(own, own + kUnknowns * n, [](double a) { return a == 0; })) {
+        std::fill_n(share + n * s, n, 1.0);
+        std::copy(in.scene.x + first, in.scene.x + last, x + first);
+        continue;
+      }
+      Tries<T>(in, s, center + 3 * n * s, own, move, share + n * s).run(state, motions);
+      for (int64_t i = first; i < last; ++i) x[i] = in.scene.x[i] + move[i];
     }
   });
 }

@@ -33,8 +33,8 @@ struct Looked {
 };
 
 // One cooperative launch for all moves and rounds: most are over after the first round, and only the device knows. What
-// is quick is asked of all pairs first, and then a block asks what is slow of those that are left, so that no warp waits
-// for a few of its threads. flags [kFlags], the counts of `all` and stuck [1] are zero.
+// is quick is asked of all pairs first, and then a block asks what is slow of those that are left, so that no warp
+// waits for a few of its threads. flags [kFlags], the counts of `all` and stuck [1] are zero.
 template <class T>
 __global__ void __launch_bounds__(kThreads, 2)
     advance_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, unsigned* flags, Looked<T> all,

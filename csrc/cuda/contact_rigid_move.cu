@@ -88,7 +88,8 @@ __global__ void __launch_bounds__(kOne)
   if (repels) {
     t.press[pair] = 0;
     if (!may_press(in, pair, t.way + first, t.size + first)) return;
-    if (owner_of(in, record) >= 0) t.near[in.first_listed(scene) + atomicAdd(t.nears + scene, 1)] = static_cast<int32_t>(pair);
+    if (owner_of(in, record) >= 0)
+      t.near[in.first_listed(scene) + atomicAdd(t.nears + scene, 1)] = static_cast<int32_t>(pair);
   } else if (!Lag<T>(in.lag + kLagScalars * pair).active()) {
     return;
   }
@@ -284,6 +285,13 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t scene = blockIdx.x, first = scene * in.scene.vertices;
   const auto vertices = static_cast<int32_t>(in.scene.vertices);
   const bool few = in.bodies() < kWarps;
+  bool moves = false;
+  const double* motions = t.motion + kUnknowns * scene * in.bodies();
+  team.each(kUnknowns * in.bodies(), [&](int32_t i) { moves = moves || motions[i] != 0; });
+  if (!__syncthreads_or(moves)) {  // as most that are captured and not held up
+    team.each(vertices, [&](int32_t v) { displace(in, t, first + v, x); });
+    return;
+  }
   for (int attempt = -1; attempt < kTries; ++attempt) {  // -1: where they are
     const bool moved = 0 <= attempt;
     if (moved) {
