@@ -159,7 +159,7 @@ struct Ways {
   bool free[4], moves, careful;
   DIFFVBD_FN Ways(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair)
       : moves(false), careful(false) {
-    bool side[2] = {false, false};
+    bool one = false, other = false;
     for (int k = 0; k < 4; ++k) {
       if (pair[k] >= in.vertices) {
         const int64_t row = row_of_collider(in, pair, k);
@@ -170,12 +170,11 @@ struct Ways {
         free[k] = !in.held[pair[k]];
       }
       const bool goes = T(0) < dot(way[k], way[k]);
-      bool& of = side[k < sides(pair[4]) ? 0 : 1];
-      of = of || goes;
+      one = one || (goes && k < sides(pair[4])), other = other || (goes && k >= sides(pair[4]));
       careful = careful || (in.careful && free[k] && goes);  // what is prescribed may come closer
     }
-    moves = side[0] || side[1];
-    for (T& own : shares) own = side[0] && side[1] ? T(kBothShare) : T(kShare);
+    moves = one || other;
+    for (T& own : shares) own = one && other ? T(kBothShare) : T(kShare);
   }
 };
 
@@ -206,15 +205,13 @@ DIFFVBD_FN bool stays_far(const Motion<T> (&m)[4], const int32_t* pair, const T*
   for (const Motion<T>& own : m) size = size < own.size ? own.size : size;
   const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - guard_of_size(size);
   if (!(T(0) < room)) return false;
-  for (int i = 0; i < sides(pair[4]); ++i) {
-    for (int j = sides(pair[4]); j < 4; ++j) {
-      const Vec3<T> ways[] = {m[i].since - m[j].since, m[i].end - m[j].end};
-      for (const Vec3<T>& d : ways) {
-        const T square = dot(d, d);
-        most = most < square ? square : most;
-      }
+  each_across(sides(pair[4]), [&](int i, int j) {
+    const Vec3<T> ways[] = {m[i].since - m[j].since, m[i].end - m[j].end};
+    for (const Vec3<T>& d : ways) {
+      const T square = dot(d, d);
+      most = most < square ? square : most;
     }
-  }
+  });
   return most < room * room;
 }
 template <class T>
@@ -245,16 +242,13 @@ DIFFVBD_FN bool stays_far_at_any_share(const AdvanceInputs<T>& in, const Advance
   }
   const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - guard_of_size(size);
   if (!(T(0) < room)) return false;
-  for (int i = 0; i < sides(record[4]); ++i) {
-    for (int j = sides(record[4]); j < 4; ++j) {
-      const Vec3<T> ways[] = {m[i].since - m[j].since, m[i].since - m[j].end, m[i].end - m[j].since,
-                              m[i].end - m[j].end};
-      for (const Vec3<T>& d : ways) {
-        const T square = dot(d, d);
-        most = most < square ? square : most;
-      }
+  each_across(sides(record[4]), [&](int i, int j) {
+    const Vec3<T> ways[] = {m[i].since - m[j].since, m[i].since - m[j].end, m[i].end - m[j].since, m[i].end - m[j].end};
+    for (const Vec3<T>& d : ways) {
+      const T square = dot(d, d);
+      most = most < square ? square : most;
     }
-  }
+  });
   return T(1 + kRoundedSquare) * most < room * room;
 }
 

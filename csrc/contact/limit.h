@@ -30,6 +30,17 @@ DIFFVBD_FN T limit_of(int exponent) {
 // Corner k of a pair is of the first side if k is below this.
 DIFFVBD_FN int sides(int kind) { return kind == kEdgeEdge ? 2 : 1; }
 
+// Calls f(i, j) for corners i of the first side, which has so many, and j of the second. The loops have fixed ends, so
+// that what they index stays in registers.
+template <class F>
+DIFFVBD_FN void each_across(int first, const F& f) {
+  for (int i = 0; i < 2; ++i) {
+    for (int j = 1; j < 4; ++j) {
+      if (i < first && first <= j) f(i, j);
+    }
+  }
+}
+
 // How two sides lie along a direction m that points from the second to the first.
 template <class R>
 struct Separation {
@@ -153,14 +164,15 @@ template <class T>
 DIFFVBD_FN bool stays_apart(const Gate<T>& g, const Vec3<T> (&d)[4], bool careful) {
   Vec3<T> mean = zero3<T>(), relative[4];
   for (int k = 0; k < 4; ++k) mean += T(0.25) * d[k];
-  T speed[2] = {T(0), T(0)};
+  T one = T(0), other = T(0);
   for (int k = 0; k < 4; ++k) {
     relative[k] = d[k] - mean;
     const T size = square_root(dot(relative[k], relative[k]));
-    T& most = speed[k < sides(g.kind) ? 0 : 1];
-    most = most < size ? size : most;
+    const bool is_first = k < sides(g.kind);
+    one = is_first && one < size ? size : one;
+    other = !is_first && other < size ? size : other;
   }
-  const T total = speed[0] + speed[1], wide = g.gap - g.guard, least = g.least();
+  const T total = one + other, wide = g.gap - g.guard, least = g.least();
   if (g.kind == kPointPlane || !(T(0) < wide)) return false;
   // it may come as close as a start may bring it, and a little closer where it is close already
   const T half = T(1 - kBothShare) * wide, most = least < half ? half : least;

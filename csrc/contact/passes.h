@@ -87,13 +87,11 @@ DIFFVBD_FN bool is_above(int kind, const Moved& moved, const T* constants, T len
   Vec3<T> way[4];
   for (int k = 0; k < 4; ++k) way[k] = moved(k);
   T most = T(0);
-  for (int i = 0; i < first; ++i) {
-    for (int j = first; j < 4; ++j) {
-      const Vec3<T> d = way[i] - way[j];
-      const T square = dot(d, d);
-      most = most < square ? square : most;
-    }
-  }
+  each_across(first, [&](int i, int j) {
+    const Vec3<T> d = way[i] - way[j];
+    const T square = dot(d, d);
+    most = most < square ? square : most;
+  });
   return T(1 + 1e-6) * most < room * room;
 }
 

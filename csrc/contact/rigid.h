@@ -114,20 +114,24 @@ struct PairPress {
   double rubs;     // h^2 times its load [N], over `doubled`
   double doubled;  // 2 where sides are not of one group: each takes twice its body's motion; else 1
 
+  // Of a side that is not known when this is compiled: what stands in memory by it would not fit into registers.
+  static DIFFVBD_FN double of(int side, const double (&a)[2]) { return side == 0 ? a[0] : a[1]; }
+  static DIFFVBD_FN Vector of(int side, const Vector (&a)[2]) {
+    return {side == 0 ? a[0].x : a[1].x, side == 0 ? a[0].y : a[1].y, side == 0 ? a[0].z : a[1].z};
+  }
+  DIFFVBD_FN Vector arm(int side, const Vector& center) const { return of(side, at) - of(side, weight) * center; }
   // What the body of a side does to the pair by its k-th unknown, about its center.
   DIFFVBD_FN Vector map(int side, int k, const Vector& center) const {
-    const Vector r = at[side] - weight[side] * center;
     const Vector e = {double(k % 3 == 0), double(k % 3 == 1), double(k % 3 == 2)};
-    return k < 3 ? cross(e, r) : weight[side] * e;
+    return k < 3 ? cross(e, arm(side, center)) : of(side, weight) * e;
   }
   // And by all of its unknowns.
   DIFFVBD_FN Vector moved(int side, const Vector& center, const double* motion) const {
     const Vector turn = {motion[0], motion[1], motion[2]}, shift = {motion[3], motion[4], motion[5]};
-    return cross(turn, at[side] - weight[side] * center) + weight[side] * shift;
+    return cross(turn, arm(side, center)) + of(side, weight) * shift;
   }
   DIFFVBD_FN double gradient(int side, int k, const Vector& center) const {
-    const Vector moment = torque[side] - cross(center, pull[side]);
-    const Vector& own = k < 3 ? moment : pull[side];
+    const Vector by_shift = of(side, pull), own = k < 3 ? of(side, torque) - cross(center, by_shift) : by_shift;
     return dot(map(side, k, center), force) + (k % 3 == 0 ? own.x : k % 3 == 1 ? own.y : own.z);
   }
 };
@@ -178,6 +182,16 @@ DIFFVBD_FN void sides_of(const RigidInputs<T>& in, const int32_t* record, PairPr
   out.rubs = 0;
 }
 
+// Calls f(side, k) for the corners of a pair, of which the first side has so many; as each_across().
+template <class F>
+DIFFVBD_FN void each_corner(int first, const F& f) {
+  for (int side = 0; side < 2; ++side) {
+    for (int k = 0; k < 4; ++k) {
+      if ((k < first) == (side == 0)) f(side, k);
+    }
+  }
+}
+
 // The barrier of a listed pair between bodies; false where it does not push, or moves with one body.
 template <class T, class At>
 DIFFVBD_FN bool barrier_press(const RigidInputs<T>& in, int64_t pair, const At& at, PairPress& out) {
@@ -190,7 +204,7 @@ DIFFVBD_FN bool barrier_press(const RigidInputs<T>& in, int64_t pair, const At& 
   sides_of(in, record, out);
   if (out.body[0] < 0 && out.body[1] < 0) return false;
   // a gap shrinks by no more than its corners have moved since it was taken
-  double moved[2] = {0, 0};
+  double one = 0, other = 0;
   bool known = true;
   Vector relative[4];
   for (int k = 0; k < 4; ++k) {
@@ -198,12 +212,12 @@ DIFFVBD_FN bool barrier_press(const RigidInputs<T>& in, int64_t pair, const At& 
     known = known && record[k] < in.gate.vertices;
     if (!known) continue;
     const Vector d = relative[k] - rigid::Body<T>::at(in.gate.center + 3 * (scene * in.gate.vertices + record[k]));
-    double& most = moved[k < first ? 0 : 1];
-    most = most < dot(d, d) ? dot(d, d) : most;
+    one = k < first && one < dot(d, d) ? dot(d, d) : one;
+    other = k >= first && other < dot(d, d) ? dot(d, d) : other;
   }
   if (known) {
     const double room = (listed - dhat) * (1 - 1e-6);
-    if (0 < room && moved[0] < 0.25 * room * room && moved[1] < 0.25 * room * room) return false;
+    if (0 < room && one < 0.25 * room * room && other < 0.25 * room * room) return false;
   }
   Corners<double> c;
   Vector points[4];
@@ -222,16 +236,15 @@ DIFFVBD_FN bool barrier_press(const RigidInputs<T>& in, int64_t pair, const At& 
   out.force = (e * b.first) * near.n;
   out.stiffness = Sym3<double>{};
   add_outer(out.stiffness, e * b.second, near.n);
-  for (int k = 0; k < 4; ++k) {
-    const int side = k < first ? 0 : 1;
-    if (out.body[side] < 0) continue;
+  each_corner(first, [&](int side, int k) {
+    if (out.body[side] < 0) return;
     out.weight[side] += near.w[k];
     out.at[side] += near.w[k] * relative[k];
-    if (!mollified) continue;
+    if (!mollified) return;
     const Vector pull = b.value * m.gradient[k];
     out.pull[side] += pull;
     out.torque[side] += cross(relative[k], pull);
-  }
+  });
   return true;
 }
 

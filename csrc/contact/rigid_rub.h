@@ -55,15 +55,14 @@ DIFFVBD_FN bool lagged_sides(const RigidInputs<T>& in, int64_t pair, const At& a
   if (halves) out.body[1 - alone] = -1;
   out.doubled = halves ? 2 : 1;
   Vector m{};
-  for (int k = 0; k < 4; ++k) {
+  each_corner(within ? 4 : first, [&](int side, int k) {
     const int32_t v = record[k];
     const Vector x = at.relative(scene, v);
     m += double(lag.w[k]) * (x - before(in, scene, v));
-    const int side = within || k < first ? 0 : 1;
-    if (out.body[side] < 0) continue;
+    if (out.body[side] < 0) return;
     out.weight[side] += lag.w[k];
     out.at[side] += double(lag.w[k]) * x;
-  }
+  });
   rubbing.n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
   const double h = in.scene.time_step, along = dot(rubbing.n, m);
   rubbing.u = m - along * rubbing.n;

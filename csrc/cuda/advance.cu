@@ -11,6 +11,9 @@ using namespace contact;
 
 constexpr int kThreads = 256;
 constexpr int64_t kManyPairs = 1 << 19;  // worth more than one block a multiprocessor: more blocks wait longer
+constexpr int64_t kSmallScene = 4096;    // vertices up to which a block does all the work on a scene, and
+constexpr int64_t kFewPairs = 32768;     // pairs that each has room for, unless there are
+constexpr int64_t kManyScenes = 64;      // scenes enough to fill the device
 constexpr int kFlags = kMoves * (2 * kRounds + 1);  // one for each question that the whole grid is asked
 
 // Out of line: whoever asks gets the same bits.
@@ -18,109 +21,163 @@ template <class T>
 __device__ __noinline__ bool passes(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair, int round) {
   return try_pair(in, s, pair, round);
 }
-
 template <class T>
 __device__ __noinline__ Plane<T> plane_of(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
   return Plane<T>(in, s, pair);
 }
 
-// The pairs that rounds of a move look at: those that may matter, in any order, and their planes.
-template <class T>
-struct Looked {
-  int32_t* pair;
-  Plane<T>* plane;
-  unsigned* counts;  // [kMoves]
+struct Range {
+  int64_t begin, end;
 };
 
-// One cooperative launch for all moves and rounds: most are over after the first round, and only the device knows. What
-// is quick is asked of all pairs first, and then a block asks what is slow of those that are left, so that no warp
-// waits for a few of its threads. flags [kFlags], the counts of `all` and stuck [1] are zero.
-template <class T>
-__global__ void __launch_bounds__(kThreads, 2)
-    advance_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, unsigned* flags, Looked<T> all,
-                   unsigned long long* stuck) {
-  __shared__ int32_t slow[2 * kThreads];
-  __shared__ int slows;
-  const auto grid = cooperative_groups::this_grid();
-  const auto each = [](int64_t n, const auto& f) {
-    for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < n;
+// The whole grid, on all scenes. flags [kFlags]: zero at first.
+struct GridTeam {
+  unsigned* flags;
+  template <class F>
+  __device__ void each(const Range& items, const F& f) const {
+    for (int64_t i = items.begin + static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < items.end;
          i += static_cast<int64_t>(gridDim.x) * kThreads) {
       f(i);
     }
-  };
+  }
+  __device__ void sync() const { cooperative_groups::this_grid().sync(); }
   // Whether any thread says yes, once all have come here.
-  const auto any = [&](bool own) {
+  __device__ bool any(bool own) {
     if (own) *flags = 1;
-    grid.sync();
+    sync();
     return *static_cast<volatile unsigned*>(flags++) != 0;
-  };
-  const int64_t rows = in.scenes * in.vertices, units = in.units();
-  const int64_t pairs = in.listed.ptr[in.scenes * in.corners] / 4;
+  }
+};
+// A block, on its scene.
+struct BlockTeam {
+  template <class F>
+  __device__ void each(const Range& items, const F& f) const {
+    for (int64_t i = items.begin + static_cast<int64_t>(threadIdx.x); i < items.end; i += kThreads) f(i);
+  }
+  __device__ void sync() const { __syncthreads(); }
+  __device__ bool any(bool own) const { return __syncthreads_or(own) != 0; }
+};
+
+// All listed pairs, as the grid looks at them.
+template <class T>
+struct AllPairs {
+  Range pairs;
+  __device__ void begin_move(const GridTeam&, const AdvanceInputs<T>&, const AdvanceState<T>&) const {}
+  // Calls f(pair) for those that do not pass.
+  template <class F>
+  __device__ void each_failing(const GridTeam& team, const AdvanceInputs<T>& in, const AdvanceState<T>& s, int round,
+                               const F& f) const {
+    team.each(pairs, [&](int64_t i) {
+      if (!passes(in, s, i, round)) f(i);
+    });
+  }
+};
+// Those of a scene that may matter in a move, in any order, and their planes, as a block looks at them: first it asks
+// all what is quick, and then what is slow of those that are left, so that no warp waits for a few of its threads.
+template <class T>
+struct NearPairs {
+  Range pairs;
+  int32_t* near;    // from the scene's first pair on
+  Plane<T>* plane;  // as those
+  int *count, *slows;
+  int32_t* slow;  // [2 kThreads]
+
+  __device__ void begin_move(const BlockTeam& team, const AdvanceInputs<T>& in, const AdvanceState<T>& s) const {
+    if (threadIdx.x == 0) *count = *slows = 0;
+    team.sync();
+    team.each(pairs, [&](int64_t i) {
+      const bool open = s.first || is_open(in, s, in.listed.pairs + kPairRow * i);
+      if (open && !stays_far_at_any_share(in, s, i)) near[atomicAdd(count, 1)] = static_cast<int32_t>(i);
+    });
+    team.sync();
+    team.each({0, *count}, [&](int64_t i) { plane[i] = plane_of(in, s, near[i]); });
+  }
+  template <class F>
+  __device__ void each_failing(const BlockTeam& team, const AdvanceInputs<T>& in, const AdvanceState<T>& s, int round,
+                               const F& f) const {
+    for (int first = 0; first < *count; first += kThreads) {
+      const int i = first + static_cast<int>(threadIdx.x);
+      if (i < *count && !passes_by(in, s, plane[i], near[i], round)) slow[atomicAdd(slows, 1)] = near[i];
+      team.sync();
+      const int kept = *slows;
+      team.sync();
+      if (kept <= kThreads && first + kThreads < *count) continue;  // there is room for those of one more turn
+      team.each({0, kept}, [&](int64_t k) {
+        if (!passes(in, s, slow[k], round)) f(slow[k]);
+      });
+      if (threadIdx.x == 0) *slows = 0;
+      team.sync();
+    }
+  }
+};
+
+// All moves and rounds of some scenes: most are over after the first round, and only the device knows.
+template <class T, class Team, class Pairs>
+__device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceState<T> s, const Range& scenes,
+                               const Pairs& pairs, unsigned long long* stuck) {
+  const int64_t of_scene = in.units() / in.scenes;
+  const Range rows = {scenes.begin * in.vertices, scenes.end * in.vertices};
+  const Range units = {scenes.begin * of_scene, scenes.end * of_scene};
   for (int move = 0; move < kMoves; ++move) {
     s.first = move == 0;
-    each(in.scenes, [&](int64_t i) { s.failed[i] = 0; });
-    each(units, [&](int64_t i) { begin_move(s, i); });
-    grid.sync();
-    each(pairs, [&](int64_t i) {
-      const int32_t* record = in.listed.pairs + kPairRow * i;
-      if ((s.first || is_open(in, s, record)) && !stays_far_at_any_share(in, s, i))
-        all.pair[atomicAdd(all.counts + move, 1)] = static_cast<int32_t>(i);
-    });
-    grid.sync();
-    const int64_t looked = *static_cast<volatile unsigned*>(all.counts + move);
-    each(looked, [&](int64_t i) { all.plane[i] = plane_of(in, s, all.pair[i]); });
-    // Calls f(pair) for those that do not pass: a thread's own planes, and then what a block has kept.
-    const auto each_failing = [&](int round, const auto& f) {
-      const auto flush = [&] {
-        for (int k = static_cast<int>(threadIdx.x); k < slows; k += kThreads) {
-          if (!passes(in, s, slow[k], round)) f(slow[k]);
-        }
-        __syncthreads();
-        if (threadIdx.x == 0) slows = 0;
-        __syncthreads();
-      };
-      if (threadIdx.x == 0) slows = 0;
-      __syncthreads();
-      for (int64_t first = static_cast<int64_t>(blockIdx.x) * kThreads; first < looked;
-           first += static_cast<int64_t>(gridDim.x) * kThreads) {
-        const int64_t i = first + threadIdx.x;
-        if (i < looked && !passes_by(in, s, all.plane[i], all.pair[i], round)) slow[atomicAdd(&slows, 1)] = all.pair[i];
-        __syncthreads();
-        const bool full = slows > kThreads;  // else there is room for those of one more turn
-        __syncthreads();
-        if (full) flush();
-      }
-      flush();
-    };
+    team.each(scenes, [&](int64_t i) { s.failed[i] = 0; });
+    team.each(units, [&](int64_t i) { begin_move(s, i); });
+    team.sync();
+    pairs.begin_move(team, in, s);
     bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
     for (int round = 0; round < kRounds; ++round) {
       const bool last = round + 1 == kRounds;
       bool found = false, less = false;
-      const auto note = [&](int64_t scene, bool passed) {
-        if (!passed && last) mark(s.failed + scene);
-        found = found || !passed;
+      const auto note = [&](int64_t scene) {
+        if (last) mark(s.failed + scene);
+        found = true;
       };
-      each_failing(last ? 0 : round, [&](int64_t pair) { note(in.listed.pairs[kPairRow * pair + 5], false); });
-      each(rows, [&](int64_t i) { note(i / in.vertices, stay(in, s, i, last ? 0 : round)); });
-      const bool passed = !any(found);
+      pairs.each_failing(team, in, s, last ? 0 : round, [&](int64_t i) { note(in.listed.pairs[kPairRow * i + 5]); });
+      team.each(rows, [&](int64_t i) {
+        if (!stay(in, s, i, last ? 0 : round)) note(i / in.vertices);
+      });
+      const bool passed = !team.any(found);
       clean = round == 0 && passed;
       if (passed || last) break;
-      each(units, [&](int64_t i) { less = retreat(s, i, round) || less; });
-      if (!any(less)) break;
+      team.each(units, [&](int64_t i) { less = retreat(s, i, round) || less; });
+      if (!team.any(less)) break;
     }
-    each(units, [&](int64_t i) { give_up(in, s, i); });
+    team.each(units, [&](int64_t i) { give_up(in, s, i); });
     if (s.first && !clean) {
-      grid.sync();
-      each_failing(0, [&](int64_t) { atomicAdd(stuck, 1ULL); });
-      grid.sync();
+      team.sync();
+      pairs.each_failing(team, in, s, 0, [&](int64_t) { atomicAdd(stuck, 1ULL); });
+      team.sync();
     }
     bool open = false;
-    each(units, [&](int64_t i) {
+    team.each(units, [&](int64_t i) {
       end_move(s, i);
       open = open || s.share[i] < T(1);
     });
-    if (!any(open)) break;
+    if (!team.any(open)) break;
   }
+}
+
+// One cooperative launch. stuck [1]: zero at first.
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    advance_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, unsigned* flags,
+                   unsigned long long* stuck) {
+  const AllPairs<T> pairs{{0, in.listed.ptr[in.scenes * in.corners] / 4}};
+  advance_scenes(GridTeam{flags}, in, s, {0, in.scenes}, pairs, stuck);
+}
+
+// A block for each small scene. near, planes: memory for all listed pairs.
+template <class T>
+__global__ void __launch_bounds__(kThreads, 2)
+    scene_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, int32_t* near, Plane<T>* planes,
+                 unsigned long long* stuck) {
+  __shared__ int32_t slow[2 * kThreads];
+  __shared__ int count, slows;
+  const int64_t scene = blockIdx.x;
+  const auto first = [&](int64_t of) { return int64_t{in.listed.ptr[of * in.corners] / 4}; };
+  const Range own = {first(scene), first(scene + 1)};
+  const NearPairs<T> pairs{own, near + own.begin, planes + own.begin, &count, &slows, slow};
+  advance_scenes(BlockTeam{}, in, s, {scene, scene + 1}, pairs, stuck);
 }
 
 template <class T>
@@ -133,13 +190,19 @@ __global__ void __launch_bounds__(kThreads)
 // Bytes of each part of the workspace, rounded up to what any type needs.
 constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
 
+template <class T>
+bool has_small_scenes(const AdvanceInputs<T>& in, int64_t capacity) {
+  return in.vertices <= kSmallScene && (capacity <= kFewPairs * in.scenes || kManyScenes <= in.scenes);
+}
+
 }  // namespace
 
 template <class T>
 int64_t advance_workspace_bytes(const AdvanceInputs<T>& in, int64_t capacity) {
   const int64_t units = in.units();
-  return aligned((kFlags + kMoves) * sizeof(unsigned)) + aligned(units * sizeof(T)) + 2 * aligned(units) +
-         aligned(in.scenes) + aligned(capacity * sizeof(int32_t)) + aligned(capacity * sizeof(Plane<T>));
+  const int64_t bytes = aligned(units * sizeof(T)) + 2 * aligned(units) + aligned(in.scenes);
+  if (!has_small_scenes(in, capacity)) return bytes + aligned(kFlags * sizeof(unsigned));
+  return bytes + aligned(capacity * sizeof(int32_t)) + aligned(capacity * sizeof(Plane<T>));
 }
 
 template <class T>
@@ -154,23 +217,27 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
     at += aligned(bytes);
     return here;
   };
-  auto* flags = reinterpret_cast<unsigned*>(take((kFlags + kMoves) * sizeof(unsigned)));
   const int64_t units = in.units();
   auto* now = reinterpret_cast<T*>(take(units * sizeof(T)));
   uint8_t *blocked = take(units), *stamp = take(units), *failed = take(in.scenes);
-  Looked<T> all{reinterpret_cast<int32_t*>(take(capacity * sizeof(int32_t))),
-                reinterpret_cast<Plane<T>*>(take(capacity * sizeof(Plane<T>))), flags + kFlags};
-  if (auto error = cudaMemsetAsync(flags, 0, (kFlags + kMoves) * sizeof(unsigned), stream)) return error;
-  AdvanceInputs<T> inputs = in;
   AdvanceState<T> state{share, now, blocked, stamp, failed, true};
   auto* found = reinterpret_cast<unsigned long long*>(stuck);
+  if (has_small_scenes(in, capacity)) {
+    auto* near = reinterpret_cast<int32_t*>(take(capacity * sizeof(int32_t)));
+    auto* planes = reinterpret_cast<Plane<T>*>(take(capacity * sizeof(Plane<T>)));
+    scene_kernel<T><<<static_cast<unsigned>(in.scenes), kThreads, 0, stream>>>(in, state, near, planes, found);
+    return cudaGetLastError();
+  }
+  auto* flags = reinterpret_cast<unsigned*>(take(kFlags * sizeof(unsigned)));
+  if (auto error = cudaMemsetAsync(flags, 0, kFlags * sizeof(unsigned), stream)) return error;
+  AdvanceInputs<T> inputs = in;
   const void* kernel = reinterpret_cast<const void*>(advance_kernel<T>);
   int resident = 0;
   if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, kernel, kThreads, 0)) return error;
   const int64_t wanted = (std::max(rows, capacity) + kThreads - 1) / kThreads;
   const int64_t each = capacity < kManyPairs ? 1 : resident;
   const auto blocks = static_cast<unsigned>(std::min<int64_t>(wanted, each * multiprocessors));
-  void* arguments[] = {&inputs, &state, &flags, &all, &found};
+  void* arguments[] = {&inputs, &state, &flags, &found};
   return cudaLaunchCooperativeKernel(kernel, dim3(blocks), dim3(kThreads), arguments, 0, stream);
 }
 
