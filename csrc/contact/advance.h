@@ -193,6 +193,8 @@ struct Plane {
     separation = Separation<T>(record[4], at.corners, n, constants.offset);
     wide = separation.gap - at.guard, least = least_of(constants.dhat);
   }
+  DIFFVBD_FN void forget() { least = T(-1); }
+  DIFFVBD_FN bool is_known() const { return T(0) <= least; }
   DIFFVBD_FN bool holds(int kind, const Ways<T>& a) const {
     return !a.moves || holds_along(kind, n, separation, wide, least, a.way, a.shares, a.careful, a.careful);
   }
@@ -273,12 +275,16 @@ DIFFVBD_FN bool is_retried(const AdvanceInputs<T>& in, const AdvanceState<T>& s,
   return false;
 }
 
-// Whether a pair passes by its plane, or need not be looked at in this round: the quick part of try_pair().
-template <class T>
-DIFFVBD_FN bool passes_by(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const Plane<T>& plane, int64_t pair,
-                          int round) {
+// Whether a pair passes by its plane, which is found when it is first asked for, or need not be looked at in this
+// round: the quick part of try_pair(). find(): the plane.
+template <class T, class Find>
+DIFFVBD_FN bool passes_by(const AdvanceInputs<T>& in, const AdvanceState<T>& s, Plane<T>& plane, int64_t pair,
+                          int round, const Find& find) {
   const int32_t* record = in.listed.pairs + kPairRow * pair;
-  return (round > 0 && !is_retried(in, s, record, round)) || plane.holds(record[4], Ways<T>(in, s, record));
+  if (round > 0 && !is_retried(in, s, record, round)) return true;
+  if (stays_far(in, s, record, in.constants + kConstants * pair)) return true;
+  if (!plane.is_known()) plane = find();
+  return plane.holds(record[4], Ways<T>(in, s, record));
 }
 
 // Marks the corners that keep a pair from being safe; returns whether it is. Round 0 looks at all pairs, later ones at

@@ -3,7 +3,6 @@
 #include <torch/csrc/stable/ops.h>
 
 #include <atomic>
-#include <memory>
 #include <vector>
 
 #include "grain.h"
@@ -37,8 +36,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
   const int64_t pairs = in.listed.ptr[in.scenes * in.corners] / 4;
   std::vector<T> now(units);
   std::vector<uint8_t> blocked(units), stamp(units), failed(in.scenes);
-  std::vector<uint8_t> far(pairs), seen(pairs);                   // in all rounds of a move; with a plane
-  const std::unique_ptr<Plane<T>[]> planes(new Plane<T>[pairs]);  // in a move
+  std::vector<uint8_t> far(pairs);  // in all rounds of a move
   AdvanceState<T> s{share, now.data(), blocked.data(), stamp.data(), failed.data(), true};
   int64_t stuck = 0;
   // Of a vertex all pairs ask the same.
@@ -67,14 +65,9 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
       return found;
     });
   };
-  const auto by_plane = [&](int64_t pair, int round) {
-    if (!seen[pair]) planes[pair] = Plane<T>(in, s, pair), seen[pair] = 1;
-    return passes_by(in, s, planes[pair], pair, round);
-  };
   for (int move = 0; move < kMoves; ++move) {
     s.first = move == 0;
     std::fill(far.begin(), far.end(), 0);
-    std::fill(seen.begin(), seen.end(), 0);
     std::fill(failed.begin(), failed.end(), 0);
     bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
     for (int64_t i = 0; i < units; ++i) begin_move(s, i);
@@ -87,8 +80,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
       look();
       const auto passes = [&](int64_t i) {
         far[i] = far[i] || (round == 0 && stays_far_at_any_share(in, s, i));
-        return far[i] || by_plane(i, last ? 0 : round) ||
-               !fails(in.listed.pairs[kPairRow * i + 5], try_pair(in, s, i, last ? 0 : round));
+        return far[i] || !fails(in.listed.pairs[kPairRow * i + 5], try_pair(in, s, i, last ? 0 : round));
       };
       int64_t found;
       if (last || (s.first && round == 0)) {
@@ -108,7 +100,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
     for (int64_t i = 0; i < units; ++i) give_up(in, s, i);
     if (s.first && !clean) {
       look();
-      stuck = count(pairs, kPairGrain, [&](int64_t i) { return !far[i] && !by_plane(i, 0) && !try_pair(in, s, i, 0); });
+      stuck = count(pairs, kPairGrain, [&](int64_t i) { return !far[i] && !try_pair(in, s, i, 0); });
     }
     bool open = false;
     for (int64_t i = 0; i < units; ++i) {

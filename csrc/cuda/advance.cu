@@ -90,14 +90,15 @@ struct NearPairs {
       if (open && !stays_far_at_any_share(in, s, i)) near[atomicAdd(count, 1)] = static_cast<int32_t>(i);
     });
     team.sync();
-    team.each({0, *count}, [&](int64_t i) { plane[i] = plane_of(in, s, near[i]); });
+    team.each({0, *count}, [&](int64_t i) { plane[i].forget(); });
   }
   template <class F>
   __device__ void each_failing(const BlockTeam& team, const AdvanceInputs<T>& in, const AdvanceState<T>& s, int round,
                                const F& f) const {
     for (int first = 0; first < *count; first += kThreads) {
       const int i = first + static_cast<int>(threadIdx.x);
-      if (i < *count && !passes_by(in, s, plane[i], near[i], round)) slow[atomicAdd(slows, 1)] = near[i];
+      const auto find = [&] { return plane_of(in, s, near[i]); };
+      if (i < *count && !passes_by(in, s, plane[i], near[i], round, find)) slow[atomicAdd(slows, 1)] = near[i];
       team.sync();
       const int kept = *slows;
       team.sync();
