@@ -1,4 +1,4 @@
-"""Speed and memory of the CUDA backend: steps, batches, the grid of sweeps and vertices, regimes, peers.
+"""Speed and memory of the CUDA backend: steps, batches, the grid of sweeps and vertices, regimes, peers, contact.
 
 `--only NAME,...` runs some groups; each is written as it ends, beside what earlier runs on the same device have left.
 """
@@ -15,6 +15,8 @@ import torch
 
 from bench import common, newton
 from bench.common import cell, markdown_table
+from bench.gpu_contact import small_contact
+from bench.gpu_contact import table as contact_table
 from bench.gpu_grid import REGIMES, grid, memory, regimes
 from bench.gpu_measure import Card, Row
 from bench.gpu_scenes import batches, bunny, cost, cubes, steps
@@ -37,6 +39,7 @@ GROUPS: dict[str, Callable[[Card, float], list[Row]]] = {
     "grid": grid,
     "regimes": regimes,
     "newton": peers,
+    "contact": small_contact,
 }
 
 
@@ -179,4 +182,5 @@ TABLES: dict[str, Callable[[list[Row]], str]] = {
     "grid": _grid_table,
     "regimes": _regime_table,
     "newton": _peer_table,
+    "contact": contact_table,
 }

@@ -85,10 +85,14 @@ def pile(**barrier: Any) -> Scene:
     return Scene("pile of three boxes", model, torch.zeros_like(model.rest_points), 0.15, {"mu": 1e5, "lam": 2e5})
 
 
-def gripper(**barrier: Any) -> Scene:
-    """A cube between two plates that close in 0.05 s and lift it with the speed that they have reached, by friction."""
+def gripper(n: int = 3, plates: tuple[int, int, int] = (2, 3, 3), **barrier: Any) -> Scene:
+    """A cube between two plates that close in 0.05 s and lift it with the speed that they have reached, by friction.
+
+    Args:
+        n, plates: Vertices along the edges of the cube and of the plates.
+    """
     size, thick = 0.05, 0.02
-    cube, plate = mesh.box(3, size), mesh.box((2, 3, 3), (thick, 0.06, 0.06))
+    cube, plate = mesh.box(n, size), mesh.box(plates, (thick, 0.06, 0.06))
     sides = [plate.translate((x, y, -0.005)) for x, y in ((-thick - DHAT, -0.0052), (size + DHAT, -0.0049))]
     body = mesh.join([cube, *sides])
     x = torch.tensor(body.points)

@@ -108,7 +108,7 @@ def test_loads_and_materials_are_held_and_policies_asked_at_the_same_steps() -> 
     )
 
 
-@pytest.mark.parametrize("kind", ["per_step", "callable", "constant"])
+@pytest.mark.parametrize("kind", ["per_step", "callable", "policy", "constant"])
 def test_prescribed_vertices_go_straight(kind: str) -> None:
     model, x, v = beam()
     pinned, shift = model.pinned, torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64)
@@ -117,7 +117,12 @@ def test_prescribed_vertices_go_straight(kind: str) -> None:
         shares = (shares > 0).to(torch.float64)
     ways = shares[:, None, None] * shift
     ends = torch.where(pinned[:, None], x + ways[1:], math.nan)
-    given = {"per_step": dv.per_step(ends), "callable": lambda k, x, v: ends[k], "constant": ends[0]}[kind]
+    given = {
+        "per_step": dv.per_step(ends),
+        "callable": lambda k, x, v: ends[k],
+        "policy": lambda k, x, v: torch.where(pinned[:, None], ends[k], x),  # elsewhere where vertices are
+        "constant": ends[0],
+    }[kind]
     velocities: list[Tensor] = []
 
     def loss(seen: list[Any]) -> Tensor:
