@@ -24,7 +24,8 @@ def small_contact(card: Card, rate: float) -> list[Row]:
     rows: list[Row] = []
     attempt(card, rows, {"name": "cover-the-spot"}, lambda: _cover(card))
     for scenes in (2,) if card.quick else (1, 64, 1024):
-        attempt(card, rows, {"name": "gripper" if scenes == 1 else f"{scenes} grippers"}, lambda scenes=scenes: _grippers(card, scenes))
+        name = "gripper" if scenes == 1 else f"{scenes} grippers"
+        attempt(card, rows, {"name": name}, lambda scenes=scenes: _grippers(card, scenes))
     return rows
 
 
