@@ -11,7 +11,7 @@ constexpr int kMoves = 3;     // one after another, each of what the ones before
 constexpr int kRounds = 16;   // of halving in each
 constexpr int kPatience = 8;  // rounds from which on what fails does not move
 constexpr double kLeastTry = 1.0 / 64;
-constexpr double kRoundedSquare = 4e-6;  // of squares of lengths, that rounding cannot reach
+constexpr double kRoundedSquare = 4e-6;  // of squares of lengths: more than rounding makes of them
 
 template <class T>
 struct AdvanceInputs {
@@ -114,7 +114,7 @@ DIFFVBD_FN T guard_of_size(T size) {
   return T(kGuardUlps) * std::numeric_limits<T>::epsilon() * size;
 }
 
-// Whether a collider's point is already where it ends: planes were looked for there.
+// Whether a collider's point is already where it ends: pairs with the plane of a triangle were looked for there.
 template <class T>
 DIFFVBD_FN bool is_still(const AdvanceState<T>& s, const int32_t* pair) {
   return pair[4] == kPointPlane || !s.first;
@@ -180,12 +180,11 @@ struct Ways {
 
 // What keeps a pair apart along the direction of its closest points in a move: all but the ways that it tries.
 template <class T>
-struct Plane {
+struct PairPlane {
   Vec3<T> n;
   Separation<T> separation;
   T wide, least;
-  Plane() = default;
-  DIFFVBD_FN Plane(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
+  DIFFVBD_FN PairPlane(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
     const int32_t* record = in.listed.pairs + kPairRow * pair;
     const PairConstants<T> constants(in.constants + kConstants * pair);
     const PairPlace<T> at = place_of(in, s, record);
@@ -278,7 +277,7 @@ DIFFVBD_FN bool is_retried(const AdvanceInputs<T>& in, const AdvanceState<T>& s,
 // Whether a pair passes by its plane, which is found when it is first asked for, or need not be looked at in this
 // round: the quick part of try_pair(). find(): the plane.
 template <class T, class Find>
-DIFFVBD_FN bool passes_by(const AdvanceInputs<T>& in, const AdvanceState<T>& s, Plane<T>& plane, int64_t pair,
+DIFFVBD_FN bool passes_by(const AdvanceInputs<T>& in, const AdvanceState<T>& s, PairPlane<T>& plane, int64_t pair,
                           int round, const Find& find) {
   const int32_t* record = in.listed.pairs + kPairRow * pair;
   if (round > 0 && !is_retried(in, s, record, round)) return true;

@@ -114,7 +114,8 @@ struct PairPress {
   double rubs;     // h^2 times its load [N], over `doubled`
   double doubled;  // 2 where sides are not of one group: each takes twice its body's motion; else 1
 
-  // Of a side that is not known when this is compiled: what stands in memory by it would not fit into registers.
+  // Of one of two sides. Chosen by comparison: an index that is not known when this is compiled would move the arrays
+  // from registers to memory.
   static DIFFVBD_FN double of(int side, const double (&a)[2]) { return side == 0 ? a[0] : a[1]; }
   static DIFFVBD_FN Vector of(int side, const Vector (&a)[2]) {
     return {side == 0 ? a[0].x : a[1].x, side == 0 ? a[0].y : a[1].y, side == 0 ? a[0].z : a[1].z};

@@ -159,22 +159,22 @@ struct BarrierWork {
   }
 };
 
-// Of a lagged pair. With m how its weighted corners have moved since the start of the step, P and Q how they move by p
-// and q, n its normal, u the slip after Q and A the damping,
+// Of a lagged pair. With d how its weighted corners have moved since the start of the step, P and Q how they move by p
+// and q, n its normal, u the slip after Q, A = h damping, L = h^2 load and f1 of smoothed friction,
 //
-//     W = A min(n . m, 0) n . P + share A (n . P) (n . Q) + load f1(|u|) / |u| u . P,
+//     W = A min(n . d, 0) n . P + share A (n . P) (n . Q) + L f1(|u|) / |u| u . P,
 //
-// with the last two for each side that moves by itself. Positions at the start of the step take the derivatives by x
-// with the other sign.
+// with the last two for each side that moves by itself, of which each bears a share of 2. Positions at the start of the
+// step take the derivatives by x with the other sign.
 template <class T>
 struct LaggedWork {
   bool acts;
   PairMotions m;
-  Vector since[4], n, moved;
-  double w[4], coefficient, damping, h, eps;  // of h^2 and of h
+  Vector since[4], n, d;  // since: how each corner has moved
+  double w[4], load, damping, h, eps;
 
   DIFFVBD_FN LaggedWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair)
-      : acts(pair < in.first_lagged(in.scene.scenes)), m{}, moved{}, h(in.scene.time_step), eps(in.friction_eps) {
+      : acts(pair < in.first_lagged(in.scene.scenes)), m{}, d{}, h(in.scene.time_step), eps(in.friction_eps) {
     if (!acts) return;
     const int32_t* record = in.lagged.pairs + kPairRow * pair;
     // also of pairs without a force, which a coefficient of zero has made so
@@ -182,36 +182,36 @@ struct LaggedWork {
     if (!acts) return;
     const CornerPoints<T> at{in, false};
     const Lag<T> lag(in.lag + kLagScalars * pair);
-    coefficient = lag.friction, damping = lag.damping;
+    load = lag.friction, damping = lag.damping;
     m = motions_of(in, given, record);
     // what does nothing joined no bodies; with any coefficient it would
-    if (coefficient == 0 && damping == 0) m.sides = 1, m.share = 1;
+    if (load == 0 && damping == 0) m.sides = 1, m.share = 1;
     n = {double(lag.n.x), double(lag.n.y), double(lag.n.z)};
     for (int k = 0; k < 4; ++k) {
       w[k] = lag.w[k];
       since[k] = at.relative(record[5], record[k]) - before(in, record[5], record[k]);
-      moved += w[k] * since[k];
+      d += w[k] * since[k];
     }
   }
 
   // Of the rows of the corners [4, 9] and the derivatives by what is lagged [9].
   DIFFVBD_FN void store(T* rows, T* by_lag) const {
-    const double along = dot(n, moved), approach = along < 0 ? along : 0, A = h * damping, load = h * h * coefficient;
+    const double along = dot(n, d), approach = along < 0 ? along : 0, A = h * damping, L = h * h * load;
     double by_along = 0, by_load = 0, by_damping = 0, by_w[4] = {0, 0, 0, 0};
-    Vector by_n{}, by_m{};
+    Vector by_n{}, by_d{};
     for (int side = 0; side < m.sides; ++side) {
       const Vector P = weighted(w, m.p, m, side), Q = weighted(w, m.q, m, side), way = m.share * Q;
-      const Vector u = moved - along * n + (way - dot(n, way) * n);
+      const Vector u = d - along * n + (way - dot(n, way) * n);
       const FrictionRate<double> f(square_root(dot(u, u)), eps);
       const double nP = dot(n, P), nQ = dot(n, Q), slipping = dot(u, P);
-      const Vector by_u = load * (f.value * P + (f.curvature * slipping) * u);
+      const Vector by_u = L * (f.value * P + (f.curvature * slipping) * u);
       const Vector by_way = by_u - dot(n, by_u) * n;
-      by_m += by_u;
+      by_d += by_u;
       by_along += (along < 0 ? A * nP : 0) - dot(n, by_u);
       by_n +=
           (A * approach) * P + (m.share * A) * (nQ * P + nP * Q) - (along + dot(n, way)) * by_u - dot(n, by_u) * way;
       by_load += f.value * slipping, by_damping += approach * nP + m.share * nP * nQ;
-      const Vector by_p = (A * (approach + m.share * nQ)) * n + (load * f.value) * u;
+      const Vector by_p = (A * (approach + m.share * nQ)) * n + (L * f.value) * u;
       const Vector by_q = m.share * ((A * nP) * n + by_way);
       for (int k = 0; k < 4; ++k) {
         if (!m.is_of(side, k)) continue;
@@ -220,11 +220,11 @@ struct LaggedWork {
         by_w[k] += dot(by_p, m.p[k]) + dot(by_q, m.q[k]);
       }
     }
-    by_m += by_along * n, by_n += by_along * moved;
-    for (int k = 0; k < 4; ++k) rigid::put(rows + kWorkScalars * k, w[k] * by_m);
+    by_d += by_along * n, by_n += by_along * d;
+    for (int k = 0; k < 4; ++k) rigid::put(rows + kWorkScalars * k, w[k] * by_d);
     by_lag[0] = T(h * h * by_load), by_lag[1] = T(h * by_damping);
     rigid::put(by_lag + 2, by_n);
-    for (int k = 0; k < 4; ++k) by_lag[5 + k] = T(by_w[k] + dot(by_m, since[k]));
+    for (int k = 0; k < 4; ++k) by_lag[5 + k] = T(by_w[k] + dot(by_d, since[k]));
   }
   DIFFVBD_FN static void store_none(T* rows, T* by_lag) {
     for (int i = 0; i < 4 * kWorkScalars; ++i) rows[i] = T(0);

@@ -30,9 +30,6 @@ DIFFVBD_FN void motion_adjoint(const double* motion, double share, const Vector&
 }
 
 // f1(|u|) / |u| and its derivative over |u|, which are taken as constant below what rounding makes of rest.
-DIFFVBD_FN FrictionRate<double> slip_rate(const Vector& u, double eps) {
-  return FrictionRate<double>(square_root(dot(u, u)), eps);
-}
 DIFFVBD_FN FrictionRate<Dual<double>> slip_rate(const Vec3<Dual<double>>& u, double eps) {
   const Dual<double> square = dot(u, u);
   const double length = square_root(square.value);

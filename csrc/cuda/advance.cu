@@ -3,6 +3,7 @@
 #include <algorithm>
 
 #include "advance.h"
+#include "small_scenes.h"
 
 namespace diffvbd::cuda {
 namespace {
@@ -11,9 +12,6 @@ using namespace contact;
 
 constexpr int kThreads = 256;
 constexpr int64_t kManyPairs = 1 << 19;  // worth more than one block a multiprocessor: more blocks wait longer
-constexpr int64_t kSmallScene = 4096;    // vertices up to which a block does all the work on a scene, and
-constexpr int64_t kFewPairs = 32768;     // pairs that each has room for, unless there are
-constexpr int64_t kManyScenes = 64;      // scenes enough to fill the device
 constexpr int kFlags = kMoves * (2 * kRounds + 1);  // one for each question that the whole grid is asked
 
 // Out of line: whoever asks gets the same bits.
@@ -22,8 +20,9 @@ __device__ __noinline__ bool passes(const AdvanceInputs<T>& in, const AdvanceSta
   return try_pair(in, s, pair, round);
 }
 template <class T>
-__device__ __noinline__ Plane<T> plane_of(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
-  return Plane<T>(in, s, pair);
+__device__ __noinline__ bool passes_quickly(const AdvanceInputs<T>& in, const AdvanceState<T>& s, PairPlane<T>& plane,
+                                            int64_t pair, int round) {
+  return passes_by(in, s, plane, pair, round, [&] { return PairPlane<T>(in, s, pair); });
 }
 
 struct Range {
@@ -48,8 +47,8 @@ struct GridTeam {
     return *static_cast<volatile unsigned*>(flags++) != 0;
   }
 };
-// A block, on its scene.
-struct BlockTeam {
+// A block, on a scene of its own.
+struct SceneTeam {
   template <class F>
   __device__ void each(const Range& items, const F& f) const {
     for (int64_t i = items.begin + static_cast<int64_t>(threadIdx.x); i < items.end; i += kThreads) f(i);
@@ -77,12 +76,12 @@ struct AllPairs {
 template <class T>
 struct NearPairs {
   Range pairs;
-  int32_t* near;    // from the scene's first pair on
-  Plane<T>* plane;  // as those
+  int32_t* near;        // from the scene's first pair on
+  PairPlane<T>* plane;  // in the order of `near`
   int *count, *slows;
   int32_t* slow;  // [2 kThreads]
 
-  __device__ void begin_move(const BlockTeam& team, const AdvanceInputs<T>& in, const AdvanceState<T>& s) const {
+  __device__ void begin_move(const SceneTeam& team, const AdvanceInputs<T>& in, const AdvanceState<T>& s) const {
     if (threadIdx.x == 0) *count = *slows = 0;
     team.sync();
     team.each(pairs, [&](int64_t i) {
@@ -93,12 +92,11 @@ struct NearPairs {
     team.each({0, *count}, [&](int64_t i) { plane[i].forget(); });
   }
   template <class F>
-  __device__ void each_failing(const BlockTeam& team, const AdvanceInputs<T>& in, const AdvanceState<T>& s, int round,
+  __device__ void each_failing(const SceneTeam& team, const AdvanceInputs<T>& in, const AdvanceState<T>& s, int round,
                                const F& f) const {
     for (int first = 0; first < *count; first += kThreads) {
       const int i = first + static_cast<int>(threadIdx.x);
-      const auto find = [&] { return plane_of(in, s, near[i]); };
-      if (i < *count && !passes_by(in, s, plane[i], near[i], round, find)) slow[atomicAdd(slows, 1)] = near[i];
+      if (i < *count && !passes_quickly(in, s, plane[i], near[i], round)) slow[atomicAdd(slows, 1)] = near[i];
       team.sync();
       const int kept = *slows;
       team.sync();
@@ -170,7 +168,7 @@ __global__ void __launch_bounds__(kThreads)
 // A block for each small scene. near, planes: memory for all listed pairs.
 template <class T>
 __global__ void __launch_bounds__(kThreads, 2)
-    scene_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, int32_t* near, Plane<T>* planes,
+    scene_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, int32_t* near, PairPlane<T>* planes,
                  unsigned long long* stuck) {
   __shared__ int32_t slow[2 * kThreads];
   __shared__ int count, slows;
@@ -178,7 +176,7 @@ __global__ void __launch_bounds__(kThreads, 2)
   const auto first = [&](int64_t of) { return int64_t{in.listed.ptr[of * in.corners] / 4}; };
   const Range own = {first(scene), first(scene + 1)};
   const NearPairs<T> pairs{own, near + own.begin, planes + own.begin, &count, &slows, slow};
-  advance_scenes(BlockTeam{}, in, s, {scene, scene + 1}, pairs, stuck);
+  advance_scenes(SceneTeam{}, in, s, {scene, scene + 1}, pairs, stuck);
 }
 
 template <class T>
@@ -191,19 +189,14 @@ __global__ void __launch_bounds__(kThreads)
 // Bytes of each part of the workspace, rounded up to what any type needs.
 constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
 
-template <class T>
-bool has_small_scenes(const AdvanceInputs<T>& in, int64_t capacity) {
-  return in.vertices <= kSmallScene && (capacity <= kFewPairs * in.scenes || kManyScenes <= in.scenes);
-}
-
 }  // namespace
 
 template <class T>
 int64_t advance_workspace_bytes(const AdvanceInputs<T>& in, int64_t capacity) {
   const int64_t units = in.units();
   const int64_t bytes = aligned(units * sizeof(T)) + 2 * aligned(units) + aligned(in.scenes);
-  if (!has_small_scenes(in, capacity)) return bytes + aligned(kFlags * sizeof(unsigned));
-  return bytes + aligned(capacity * sizeof(int32_t)) + aligned(capacity * sizeof(Plane<T>));
+  if (!has_block_each(in.vertices, in.scenes, capacity)) return bytes + aligned(kFlags * sizeof(unsigned));
+  return bytes + aligned(capacity * sizeof(int32_t)) + aligned(capacity * sizeof(PairPlane<T>));
 }
 
 template <class T>
@@ -223,9 +216,9 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
   uint8_t *blocked = take(units), *stamp = take(units), *failed = take(in.scenes);
   AdvanceState<T> state{share, now, blocked, stamp, failed, true};
   auto* found = reinterpret_cast<unsigned long long*>(stuck);
-  if (has_small_scenes(in, capacity)) {
+  if (has_block_each(in.vertices, in.scenes, capacity)) {
     auto* near = reinterpret_cast<int32_t*>(take(capacity * sizeof(int32_t)));
-    auto* planes = reinterpret_cast<Plane<T>*>(take(capacity * sizeof(Plane<T>)));
+    auto* planes = reinterpret_cast<PairPlane<T>*>(take(capacity * sizeof(PairPlane<T>)));
     scene_kernel<T><<<static_cast<unsigned>(in.scenes), kThreads, 0, stream>>>(in, state, near, planes, found);
     return cudaGetLastError();
   }

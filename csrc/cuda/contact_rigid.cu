@@ -137,13 +137,15 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
   memory.bases = static_cast<double*>(take(scenes * in.matrix_size() * sizeof(double)));
   memory.rubbing = static_cast<double*>(take(room.lagged * kRubScalars * sizeof(double)));
   memory.floors = static_cast<int32_t*>(take(floors_of(in) * sizeof(int32_t)));
-  // each leaves out the groups that the other solves for
+  // Each leaves out the groups that the other solves for; the larger ones are reordered, each in its own rows of
+  // `groups`, of which the other reads only where groups begin and how many they have.
   Beside* beside = nullptr;
   if (auto error = Beside::of_device(&beside)) return error;
   if (auto error = beside->fork(stream)) return error;
-  if (auto error = solve_few(in, room, memory, center, motion, factor, beside->stream())) return error;
-  if (auto error = solve_groups_of_many(in, room, memory, groups, center, motion, factor, stream)) return error;
-  return beside->join(stream);
+  const cudaError_t few = solve_few(in, room, memory, center, motion, factor, beside->stream());
+  const cudaError_t many = solve_groups_of_many(in, room, memory, groups, center, motion, factor, stream);
+  const cudaError_t joined = beside->join(stream);  // whatever the errors: memory is given back to `stream`
+  return few ? few : many ? many : joined;
 }
 
 #define DIFFVBD_INSTANTIATE(T)                                                                                      \

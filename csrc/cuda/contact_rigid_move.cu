@@ -3,17 +3,15 @@
 #include "../contact/rigid_tries.h"
 #include "contact_rigid.cuh"
 #include "ordered.cuh"
+#include "small_scenes.h"
 #include "union.cuh"
 
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int64_t kSmallScene = 4096;  // vertices up to which a block does all the work on a scene, and
-constexpr int64_t kFewPairs = 32768;   // pairs that each has room for, unless there are
-constexpr int64_t kManyScenes = 64;    // scenes enough to fill the device
-constexpr int64_t kLargeBody = 32;     // vertices from which a block adds up a body, and not a warp
-constexpr int kLanes = 8;              // threads that share the pairs of a vertex
-constexpr double kParts = 0x1p40;      // of the largest number of a sum in whole numbers, which has up to 2^20 of them
+constexpr int64_t kLargeBody = 32;  // vertices from which a block adds up a body, and not a warp
+constexpr int kLanes = 8;           // threads that share the pairs of a vertex
+constexpr double kParts = 0x1p40;   // of the largest number of a sum in whole numbers, which has up to 2^20 of them
 
 using Count = unsigned long long;
 
@@ -288,7 +286,7 @@ __global__ void __launch_bounds__(kThreads)
   bool moves = false;
   const double* motions = t.motion + kUnknowns * scene * in.bodies();
   team.each(kUnknowns * in.bodies(), [&](int32_t i) { moves = moves || motions[i] != 0; });
-  if (!__syncthreads_or(moves)) {  // as most that are captured and not held up
+  if (!__syncthreads_or(moves)) {  // a captured step makes all of its corrections, most of which move nothing
     team.each(vertices, [&](int32_t v) { displace(in, t, first + v, x); });
     return;
   }
@@ -363,8 +361,7 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairRoom& room, const dou
     way_kernel<T><<<blocks_for(rows), kOne, 0, stream>>>(in, t);
     join_kernel<T><<<blocks_for(room.rows()), kOne, 0, stream>>>(in, t, room.listed);
   }
-  const bool few = room.rows() <= kFewPairs * scenes || kManyScenes <= scenes;
-  if (in.scene.vertices <= kSmallScene && few) {
+  if (has_block_each(in.scene.vertices, scenes, room.rows())) {
     scene_kernel<T><<<static_cast<unsigned>(scenes), kThreads, 0, stream>>>(in, t, room.listed, x);
     return cudaGetLastError();
   }
