@@ -7,7 +7,8 @@
 
 namespace diffvbd::cuda {
 
-// A second stream of a device, of the calling thread. In the capture of a graph it is captured as well, until that ends.
+// A second stream of a device, of the calling thread. In the capture of a graph it is captured as well, until that
+// ends.
 class Beside {
  public:
   Beside() = default;
