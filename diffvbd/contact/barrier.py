@@ -39,9 +39,10 @@ class PairBarrier:
             their normal force N there, by N / (N + kappa dhat / 10), lest a motion jump where a pair comes to be that
             close one step sooner.
         detections: R >= 1: how often pairs are searched within a step. Sweeps, prescribed vertices and moving colliders
-            advance in R parts; what pairs have held up tries again in the next part. None: one, and up to
-            MOST_DETECTIONS in steps in which bodies want to go farther beside each other than ``reach`` lets them
-            (docs/contact.md); what is prescribed then moves in the first part.
+            advance in R parts; what pairs have held up tries again in the next part. None: one, and up to four in
+            steps in which bodies want to go farther beside each other than ``reach`` lets them. As long as pairs still
+            hold something up, such a step goes on, with more sweeps, up to eight parts in all (docs/contact.md). What
+            is prescribed then moves in the first part.
         reach: Distance up to which pairs are searched [m] > dhat; a vertex goes at most (reach - dhat) / 2 between two
             detections, beside the motion that bodies near each other share. None: that is one mean edge of its body,
             or 8 where a single body moves.

@@ -112,8 +112,8 @@ class PartStart(NamedTuple):
 
 def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
                          planes: Tensor | None, origin: Tensor, detection: Any, surface: ContactSurface,
-                         rigid: Tensor, stretch: Tensor, raises: Callable[[Tensor, Tensor], Tensor], own_pairs: bool
-                         ) -> PartStart:  # fmt: skip
+                         rigid: Tensor, stretch: Tensor, raises: Callable[[Tensor, Tensor], Tensor], own_pairs: bool,
+                         falls: bool) -> PartStart:  # fmt: skip
     """Every vertex as far along its way as pairs and floor let all go at once: by ``rigid`` each body as a whole, then
     by what is left of ``move``, then by ``fall``. A way of its own bends a body. A free one that a floor stops does not
     go it; one of which pairs hold some up, or that with self-contact takes much of the room in which the sweeps may
@@ -129,6 +129,7 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
             [B, bodies] [m].
         raises: Of two states [B, V, 3], which vertices are of a body whose potential is higher in the second [B, V].
         own_pairs: Whether bodies have pairs of their own, and rooms for them.
+        falls: Whether ``fall`` may be other than zero.
     """
     none = x.new_empty((0,))
     floor = none if planes is None else planes.contiguous()
@@ -175,7 +176,7 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
                 share = advance(base, way, still, center, own=own)
         # then all by their fall
         share, at, way = ops_part.falls(whole, fall, share, state)
-        shares = share, advance(at, way, still, center, own=own)
+        shares = share, advance(at, way, still, center, own=own) if falls else torch.ones_like(share)
     decided = Decided(frames, shares, stopped, origin, bodies)
     start, short = _Start.apply(x, move, fall, u, left, floor, decided)
     return PartStart(start, center, room, own, frames, short, sum(stuck[1:], stuck[0]), torch.stack(shares))

@@ -40,6 +40,8 @@ class Part(NamedTuple):
     combined: Any = None
     lengths: Tensor | None = None  # [corrections, B, bodies of the coarse space]: of coarse corrections
     lowest: Tensor | None = None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
+    sweeps: int | None = None  # None: its share of those of the step
+    going: Tensor | None = None  # bool [B, 1, 1]: scenes that it is for; None: all
 
 
 class Pairs:
@@ -285,7 +287,8 @@ def contact_step(
             fall = lift = unsupported(scene, listed[0], floor, x_prev, before, lift)
         if model.starts_from == "inertia":
             fall = torch.zeros_like(fall)
-        u, at = Translation(scene, part, state, move, floor).u, state
+        begun = at = state
+        u = Translation(scene, part, state, move, floor).u
         stopped = torch.zeros_like(x[..., 0], dtype=torch.bool)
         for wanted, by, share in ((move, u, part.shares[0]), (fall, torch.zeros_like(u), part.shares[1])):
             base, share = at + by, share.reshape(*x.shape[:-2], 1, -1).to(at)
@@ -302,12 +305,14 @@ def contact_step(
         forces: list[Any] = [PairBarrier(scene, listed[r], now), LaggedPairForces(scene, listed[0], start, now)]
         correct = Correction(scene, energies, forces, y, x_prev)
         state = correct(at, part.corrections[0])
-        number = sweeps // count + (1 if r < sweeps % count else 0)
+        number = sweeps // count + (1 if r < sweeps % count else 0) if part.sweeps is None else part.sweeps
         if number:
             swept = partial(run_sweeps, scene, [*energies, *forces], masses, y)
             state = in_cycles(scene, energies, forces, swept, state, y, x_prev, number, part)
             for shares in part.corrections[1:]:  # of those that do not move again it is 0
                 state = correct(state, shares)
+        if part.going is not None:
+            state = torch.where(part.going.reshape(*x.shape[:-2], 1, 1), state, begun)
         short = (part.shares.amin(0) < SHORT).reshape(*x.shape[:-2], 1, -1) & ~pinned & ~(stopped & free).unsqueeze(-2)
         left = torch.where(short, x_prev + way + lift - state, 0.0)
     x_new = state.transpose(-1, -2).contiguous()

@@ -12,10 +12,10 @@ from ..said import page, warn
 from ..scopes import is_captured, looks_at
 from ..step.arguments import Prepared, acceleration_of, collider_state
 from ..step.balance import UNBALANCED_FRICTION, contact_of_step, friction_left_over, potential_of_step
+from ..step.contact_cycles import CUT
 from ..step.met import outcomes
 from ..step.predict import begin
 
-CUT = 0.01  # share of the vertices that pairs may hold up before a rollout warns
 WARNED = "warned_of_contact"  # of a Model's _derived: unasked, one warning is enough for all of its rollouts
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: the look costs about as much as a step
 

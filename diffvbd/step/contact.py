@@ -25,7 +25,7 @@ from ..ops.motion import RoomsOfBodies
 from ..scopes import checking, is_captured, not_compiled, recorders
 from ..tuples import replaced
 from .coarse import factor_of
-from .contact_cycles import parts_of, record_parts, sweeps_of_parts, swept_part
+from .contact_cycles import CUT, MOST_DETECTIONS, parts_of, record_parts, sweeps_of_part, swept_part
 from .corrections import corrected, corrected_after, is_cut
 from .floor_start import start_on_floor
 from .intersections import refuse_intersections
@@ -151,6 +151,7 @@ class ContactStep:
         x, way = self.x_prev, self.begun.y - self.x_prev - lift
         left, met = way, Met(x)
         stages, r = self.parts or 1, 0  # of what is prescribed
+        planned, going = self.parts, None
         while r < (self.parts or 1):
             was, now = (self._colliders_at(min(1.0, n / stages)) for n in (r, r + 1))
             # all of the way in the first part; what is prescribed, and what pairs have held up, goes on in the others
@@ -158,10 +159,11 @@ class ContactStep:
             fall = lift if r == 0 else torch.zeros_like(lift)
             motion = motion_of(surface, x, self.origin, self.fields.mass, move, fall)
             within = self._rooms(x, was, now, motion)
-            if self.parts is None:
-                self.parts = 1 if is_captured(x) else parts_of(within.over)
+            if planned is None:
+                self.parts = planned = 1 if is_captured(x) else parts_of(within.over)
+            assert self.parts is not None
             detection = self._detect(x, was, now, within)
-            sweeps = sweeps_of_parts(settings.sweeps, self.parts)[r]
+            sweeps = sweeps_of_part(settings.sweeps, planned, r)
             met.found.append(detection)
             met.counts.append(detection.counts)
             if self._reads(x):  # before any work
@@ -171,10 +173,11 @@ class ContactStep:
                 self._set_lag(pushing, was)
                 fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
                                           self.floor_data, pushing, settings.numbers.time_step)  # fmt: skip
-            fall = fall if self.model.starts_from == "predictor" else torch.zeros_like(fall)  # corrections do it
+            falls = r == 0 and self.model.starts_from == "predictor"
+            fall = fall if falls else torch.zeros_like(fall)  # corrections do it
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
                                          detection, surface, motion.rigid, ROOM * motion.stretched, self._raises,
-                                         barrier.self_contact)  # fmt: skip
+                                         barrier.self_contact, falls)  # fmt: skip
             met.counts[r] = torch.cat([detection.counts[:3], start.stuck])
             if self._reads(x):
                 self._check(r, met.counts[r].tolist(), met)
@@ -185,7 +188,7 @@ class ContactStep:
             room = rooms_of_sweeps(motion, surface, barrier, start, x, begin)
             near, kept = self._narrowed(detection.listed, x, now, room)
             swept_from = replaced(start, center=x.detach(), room=room)
-            taken, limits, combined, lengths, cut = [first], None, None, None, start.short
+            taken, limits, combined, lengths, held, cut = [first], None, None, None, start.short, start.short
             if sweeps:
                 part = replaced(settings, sweeps=sweeps)
                 swept = swept_part(self, x, swept_from, now, near, part, policy, debug_step)
@@ -194,11 +197,23 @@ class ContactStep:
                 x, shares, back = corrected_after(self, x, now, start, detection.listed, r + 1 == self.parts)
                 taken.extend(shares)
                 # what the start has held up, sweeps may have made good, and corrections, what these have
-                cut = (limits[:, -1] > 0) | is_cut(self, x, back)
+                held = is_cut(self, x, back)
+                cut = (limits[:, -1] > 0) | held
+            if going is not None:  # others stay as they are, so that a scene has the same bits in any batch
+                x, cut, held = (
+                    torch.where(going, x, begin),
+                    torch.where(going[..., 0], cut, met.cut),
+                    held & going[..., 0],
+                )
             met.cut = cut
             met.found[r] = replaced(detection, shares=start.shares, corrections=torch.stack(taken), limits=limits,
-                                    kept=kept, frames=start.frames, combined=combined, lengths=lengths)  # fmt: skip
+                                    kept=kept, frames=start.frames, combined=combined, lengths=lengths,
+                                    sweeps=sweeps, going=going)  # fmt: skip
             r += 1
+            may_go_on = barrier.detections is None and settings.sweeps > 0 and not is_captured(x)
+            if may_go_on and r == self.parts < MOST_DETECTIONS:
+                going = (held.any(-1) | (cut.sum(-1) > CUT * self.model.num_active))[:, None, None]
+                self.parts += int(going.any())  # pairs still hold up some
             if r < self.parts:
                 left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
         x = self._judged(x, met)

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from .contact import ContactStep
 
 
-MOST_DETECTIONS = 4  # in a step that nobody has given a number
+# Of a step that nobody has given a number: by how far bodies want to go, and with more of them while pairs hold some up
+MOST_PLANNED, MOST_DETECTIONS = 4, 8
+CUT = 0.01  # share of the vertices that pairs may hold up, beside whole bodies, before it goes on, and a rollout warns
 
 
 class Combined(NamedTuple):
@@ -52,11 +54,17 @@ def sweeps_of_parts(sweeps: int, parts: int) -> list[int]:
     return [sweeps // parts + (1 if r < sweeps % parts else 0) for r in range(parts)]
 
 
+def sweeps_of_part(sweeps: int, planned: int, part: int) -> int:
+    """And how many a part has; one beyond those that were planned, as many as the last of these, or one."""
+    shared = sweeps_of_parts(sweeps, planned)
+    return shared[part] if part < planned else max(shared[-1], min(sweeps, 1))
+
+
 def parts_of(over: Tensor) -> int:
     """How many parts a step takes that nobody has given a number: one, and one more each time that bodies want to go
     twice as far as the most room that they get. over: of RoomsOfBodies."""
     most = float(over.max()) if over.numel() else 0.0
-    return min(MOST_DETECTIONS, 1 + math.ceil(math.log2(most))) if 1 < most < math.inf else 1
+    return min(MOST_PLANNED, 1 + math.ceil(math.log2(most))) if 1 < most < math.inf else 1
 
 
 def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, listed: Pairs, settings: SweepSettings,

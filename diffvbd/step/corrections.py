@@ -25,7 +25,7 @@ HELD_CORRECTIONS = 5
 # And where bodies are left alone, as those that touch are too many. In stacks of two that rub the upper one creeps at
 # 3.4 mm/s with 3, 2.0 with 4 and 1.1 with 6; stacks of four fell with 6.
 LEFT_CORRECTIONS = 8
-CUT = 0.01  # of its way in the step and of dhat: by more than that a body has been held up
+HELD = 0.01  # of its way in the step and of dhat: by more than that a body has been held up
 
 
 def corrected(of: ContactStep, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs,
@@ -93,4 +93,4 @@ def is_cut(of: ContactStep, x: Tensor, back: Tensor) -> Tensor:
     corrected_after."""
     assert of.barrier is not None
     way = (x.detach() - of.x_prev.detach()).norm(dim=-1)
-    return back[:, of.model.body] > CUT * (way + of.barrier.dhat)
+    return back[:, of.model.body] > HELD * (way + of.barrier.dhat)

@@ -36,6 +36,8 @@ class Detection(NamedTuple):
     combined: Combined | None = None  # which combinations of its iterates were taken; None where there are none
     lengths: Tensor | None = None  # of its coarse corrections [corrections, B, bodies of the coarse space]
     kept: Tensor | None = None  # rows of listed pairs that its sweeps can reach; all where that would have to be read
+    sweeps: int = 0
+    going: Tensor | None = None  # bool [B, 1, 1]: scenes that go on in a part beyond those that were planned
 
 
 class Outcome(NamedTuple):

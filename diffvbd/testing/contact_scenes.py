@@ -166,8 +166,17 @@ def thrown() -> Scene:
     return scene
 
 
+def held_up() -> Scene:
+    """Two scenes of boxes that meet; in one so fast that pairs still hold them up after the parts that were planned."""
+    barrier = PairBarrier(kappa=1e4, dhat=0.02, self_contact=False, damping=1.0)
+    scene = build("held_up", boxes((0, 0, 0), (0.05, 0.23, 0.03), points=2), (barrier, Friction(0.2, 0.1)),
+                  batch=(2,), jitter=2e-3)  # fmt: skip
+    scene.v[0, 8:, 1] -= 80.0
+    return scene
+
+
 SCENES: dict[str, Callable[[], Scene]] = {f.__name__: f for f in (stacked, crossed, fast, folded, obstacles, batched,
-                                                                 thrown)}  # fmt: skip
+                                                                 thrown, held_up)}  # fmt: skip
 
 
 def part_of(detection: Any) -> reference.Part:
@@ -187,7 +196,8 @@ def part_of(detection: Any) -> reference.Part:
                           detection.corrections.cpu(), limits,
                           None if detection.frames is None else detection.frames.cpu(), lowest=lowest,
                           lengths=None if detection.lengths is None else detection.lengths.cpu(),
-                          combined=None if detection.combined is None else tuple(t.cpu() for t in detection.combined)
+                          combined=None if detection.combined is None else tuple(t.cpu() for t in detection.combined),
+                          sweeps=detection.sweeps, going=None if detection.going is None else detection.going.cpu()
                           )  # fmt: skip
 
 

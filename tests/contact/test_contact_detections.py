@@ -73,10 +73,11 @@ def test_an_impact_keeps_its_momentum(speed: float, sweeps: int, device: str) ->
         assert lost(detections=1) > 0.01
 
 
-def row(count: int, gap: float, speed: float, device: str) -> tuple[dv.Model, torch.Tensor, torch.Tensor]:
+def row(count: int, gap: float, speed: float, device: str, detections: int | None = None
+        ) -> tuple[dv.Model, torch.Tensor, torch.Tensor]:  # fmt: skip
     """Cubes of 0.1 m in a row that are not quite in line, of which the first is thrown at the others."""
     cubes = [box(2, 0.1).translate((i * (0.1 + gap), 0.003 * i, 0.002 * i)) for i in range(count)]
-    barrier = dv.PairBarrier(kappa=1e5, dhat=1e-3, self_contact=False)
+    barrier = dv.PairBarrier(kappa=1e5, dhat=1e-3, self_contact=False, detections=detections)
     model = dv.Model(join(cubes), energies=(dv.StableNeoHookean(), barrier), device=device)
     v = torch.zeros_like(model.rest_points)
     v[: cubes[0].num_vertices, 0] = speed
@@ -84,20 +85,42 @@ def row(count: int, gap: float, speed: float, device: str) -> tuple[dv.Model, to
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("gap", "speed"), ((0.005, 3.0), (0.01, 1.0), (0.02, 3.0), (0.02, 10.0)))
-def test_a_row_that_is_struck_keeps_its_momentum(gap: float, speed: float, device: str) -> None:
+@pytest.mark.parametrize(("count", "gap", "speed"), ((4, 0.005, 3.0), (4, 0.01, 1.0), (4, 0.02, 3.0), (4, 0.02, 10.0),
+                                                     (10, 0.002, 5.0), (10, 0.01, 5.0), (10, 0.01, 10.0)))  # fmt: skip
+def test_a_row_that_is_struck_keeps_its_momentum(count: int, gap: float, speed: float, device: str) -> None:
     """Bodies that come so close to the next within a step that they push it push it within that step, and who is pushed
     may stay behind the bodies that it was joined with."""
-    model, x, v = row(4, gap, speed, device)
+    model, x, v = row(count, gap, speed, device)
     mass = model.mass[:, None]
     first, shares = (mass * v).sum(0), []
-    for _ in range(math.ceil(3 * gap / speed / 0.01) + 4):
+    for _ in range(math.ceil((count - 1) * gap / speed / 0.01) + count):
         with dv.contact.record() as found:
             x, v = dv.step(model, x, v, mu=4e5, lam=4e5, time_step=0.01, sweeps=10, gravity=(0.0, 0.0, 0.0))
         assert float(((mass * v).sum(0) - first).norm()) <= STEPS * tolerance("momentum") * float(first.norm())
         shares += [part.corrections for part in found]
     assert float(v[-1, 0]) > 0.05 * speed
     assert any(len(taken) > 2 for taken in shares) == (speed > 1)  # held up, and corrected again
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_step_goes_on_for_the_scenes_of_which_pairs_hold_something_up(device: str) -> None:
+    model, x, v = row(10, 0.002, 5.0, device)
+    scenes = torch.stack([v, 0.1 * v])
+
+    def ends(v: torch.Tensor) -> tuple[torch.Tensor, list[Any]]:
+        with dv.contact.record() as found:
+            _, v = dv.step(model, x.expand_as(v), v, mu=4e5, lam=4e5, time_step=0.01, sweeps=10,
+                           gravity=(0.0, 0.0, 0.0))  # fmt: skip
+        return v, found
+
+    together, found = ends(scenes)
+    extra = [part for part in found if part.going is not None]
+    assert 1 < len(found) <= MOST_DETECTIONS and extra
+    assert extra[0].going.flatten().tolist() == [True, False]
+    assert [part.sweeps for part in found] == [10] * len(found)
+    for one, many in zip(scenes, together, strict=True):
+        assert torch.equal(ends(one)[0], many)
+    assert sum(dv.contact.status(model).cut) == 0
 
 
 def apart(rows: list[tuple[int, float]], device: str) -> tuple[dv.Model, torch.Tensor, list[int]]:
@@ -176,6 +199,6 @@ def test_corrections_of_a_row_that_is_struck_are_differentiated(device: str) -> 
 
 
 def test_a_rollout_says_where_a_row_lost_momentum() -> None:
-    model, x, v = row(10, 0.002, 5.0, "cpu")
+    model, x, v = row(10, 0.002, 5.0, "cpu", detections=1)
     with pytest.warns(UserWarning, match="pairs held up .* lost velocity and momentum .* smaller time_step"):
         dv.rollout(model, x, v, steps=10, mu=4e5, lam=4e5, time_step=0.01, sweeps=10, gravity=(0.0, 0.0, 0.0))

@@ -49,7 +49,8 @@ def test_motion_that_pairs_held_up_is_warned_of() -> None:
 def test_motion_that_pairs_held_up_in_any_step_is_warned_of() -> None:
     """An impact is over in a step or two, and the momentum that it lost is lost."""
     large, small = dv.mesh.cube(4, size=0.2), dv.mesh.cube(4, size=0.12).translate((0.21, 0.03, 0.05))
-    model = dv.Model(dv.mesh.join([large, small]), energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e3)))
+    barrier = dv.PairBarrier(kappa=1e3, detections=1)
+    model = dv.Model(dv.mesh.join([large, small]), energies=(dv.StableNeoHookean(), barrier))
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
     v[64:, 0] = -5.0
     options: dict[str, Any] = {"mu": 8e3, "lam": 1e4, "time_step": 1 / 60, "sweeps": 10, "gravity": (0.0, 0.0, 0.0)}
