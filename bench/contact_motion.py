@@ -92,6 +92,9 @@ GROUPS: dict[str, Group] = {
         piles.struck(count, gap, speed, time_step, device=device)
         for count, gap, speed, time_step in (STRUCK[:1] if quick else STRUCK)
     ],
+    "throws": lambda quick, device: [
+        piles.throws(3 if quick else 150, detections=n, device=device) for n in ((None,) if quick else (None, 1, 4))
+    ],
 }  # fmt: skip
 
 

@@ -244,6 +244,36 @@ def struck(count: int, gap: float, speed: float, time_step: float = 1 / 100, swe
     return row(course, "momentum lost", case, worst, 0.0, "<= 0.01", worst <= 0.01)
 
 
+def throws(count: int = 150, steps: int = 12, detections: int | None = None, device: str = "cpu") -> list[Row]:
+    """Groups of two to six cubes at 0.5 to 16 m/s in any direction, of 4e4 to 1e7 Pa, K = 5 to 20, h = 1/60: how many
+    of them lose 1 % of their momentum, over the sum of that of all vertices, and how many gain 1 % of energy."""
+    courses, lost, gained = [], 0, 0
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        cubes = [mesh.cube(int(rng.integers(2, 4)), size=rng.uniform(0.05, 0.12)) for _ in range(rng.integers(2, 7))]
+        places = [(0.16 * (i % 3), 0.16 * (i // 3), 0.0) + rng.uniform(-0.015, 0.015, 3) for i in range(len(cubes))]
+        body = mesh.join([c.translate(p) for c, p in zip(cubes, places, strict=True)])
+        barrier = pairs({"detections": detections}, dhat=2e-3, self_contact=False)
+        model = dv.Model(body, energies=(dv.StableNeoHookean(), barrier), device=device)
+        speed, modulus = 10 ** rng.uniform(-0.3, 1.2), 10 ** rng.uniform(4, 6.5)
+        velocity = torch.from_numpy(speed / math.sqrt(3) * rng.normal(size=(len(cubes), 3))).to(model.mass)
+        scene = Scene(model, modulus, 1 / 60, int(rng.choice([5, 10, 20])), v=velocity[model.body],
+                      gravity=(0.0, 0.0, 0.0))  # fmt: skip
+        course = march(scene, steps)
+        mass = model.mass.cpu()[:, None]
+        total = float((mass * course.v[0].norm(dim=-1, keepdim=True)).sum())
+        lost += float((mass * (course.v[-1] - course.v[0])).sum(0).norm()) > 0.01 * total
+        energies = energy(scene, course)
+        gained += max(energies) > 1.01 * energies[0]
+        courses.append(course)
+    case = f"{count} throws" + ("" if detections is None else f", detections={detections}")
+    most = count // 50
+    return [
+        row(courses, "lost 1 % of momentum", case, lost, 0.0, f"<= {most}", lost <= most),
+        row(courses, "gained 1 % of energy", case, gained, 0.0, f"<= {most}", gained <= most),
+    ]
+
+
 # --- grip -------------------------------------------------------------------------------------------------------------
 
 
