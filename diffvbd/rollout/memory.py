@@ -34,7 +34,8 @@ def predict(
     integrator: Integrator | None = None,
 ) -> dict[str, int]:
     """Bytes that a differentiated rollout keeps and works with (default arguments otherwise, no force). The lists of
-    contact are not counted: about 0.2 KB for each pair, step and detection, and 1 KB in the backward of one step.
+    contact are not counted: about 0.2 KB for each pair, step and detection, and 1 KB in the backward of one step. Nor
+    are the sweeps that a step takes beyond its K where pairs hold bodies up (docs/contact.md).
 
     Args:
         sweeps, steps, scenes: K, number of steps, product of x's leading dimensions.
