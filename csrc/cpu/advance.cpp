@@ -5,6 +5,7 @@
 #include <atomic>
 #include <vector>
 
+#include "bounds.h"
 #include "grain.h"
 
 namespace diffvbd {
@@ -15,6 +16,17 @@ namespace {
 
 constexpr int64_t kPairGrain = 256;  // pairs that are worth one more thread
 constexpr int64_t kRowGrain = 16;    // vertices whose pairs are
+
+constexpr double kClearly = 1 - 1e-5;  // rounding of the bounds of a pair's way is far below the rest
+
+// As stays_far_at_any_share(), by how far each vertex may be from where gaps were taken, bound [B, V].
+template <class T>
+bool stays_far_by(const AdvanceInputs<T>& in, const T* bound, int64_t pair) {
+  const int32_t* record = in.listed.pairs + kPairRow * pair;
+  const T* constants = in.constants + kConstants * pair;
+  const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
+  return most_closed(record, in.vertices, bound + int64_t{record[5]} * in.vertices) < T(kClearly) * room;
+}
 
 // How many of n items f says yes to.
 template <class F>
@@ -41,6 +53,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
   int64_t stuck = 0;
   // Of a vertex all pairs ask the same.
   std::vector<Motion<T>> motion(rows);
+  std::vector<T> bound(rows);
   s.motion = motion.data();
   const auto look = [&] {
     torch::stable::parallel_for(0, rows, kPairGrain, [&](int64_t begin, int64_t end) {
@@ -72,14 +85,19 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
     bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
     for (int64_t i = 0; i < units; ++i) begin_move(s, i);
     for (int round = 0; round < kRounds; ++round) {
-      const bool last = round + 1 == kRounds;
+      const bool begins = round == 0, last = round + 1 == kRounds;
       const auto fails = [&](int64_t scene, bool passes) {
         if (!passes && last) mark(failed.data() + scene);
         return !passes;
       };
       look();
+      for (int64_t i = 0; i < rows && begins; ++i) {
+        const Motion<T>& m = motion[i];
+        const T since = dot(m.since, m.since), end = dot(m.end, m.end);
+        bound[i] = square_root(since < end ? end : since) + guard_of_size(m.size);
+      }
       const auto passes = [&](int64_t i) {
-        far[i] = far[i] || (round == 0 && stays_far_at_any_share(in, s, i));
+        far[i] = far[i] || (begins && (stays_far_by(in, bound.data(), i) || stays_far_at_any_share(in, s, i)));
         return far[i] || !fails(in.listed.pairs[kPairRow * i + 5], try_pair(in, s, i, last ? 0 : round));
       };
       int64_t found;

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "../contact/rigid_slip.h"
+#include "bounds.h"
 #include "cholesky.h"
 
 namespace diffvbd {
@@ -65,6 +66,8 @@ void add_press(const PairPress& a, double share, const Groups& groups, const dou
 template <class T>
 void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& groups,
                      const std::vector<PairPress>& presses, double* center, double* gradient, double* matrix) {
+  std::vector<uint8_t> moves(in.bodies());  // nobody asks for the system of another
+  for (int32_t k = 0; k < in.bodies(); ++k) moves[k] = in.moves(scene, groups, groups.first(k));
   for (int32_t k = 0; k < in.bodies(); ++k) {
     const Body<T> body{in.scene, scene, k};
     double mass = 0, spread = 0, g6[kUnknowns] = {}, block[rigid::kSix] = {};
@@ -77,6 +80,7 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& grou
     const bool free = in.free[k] && 0 < mass;
     const Vector c = 0 < mass ? (1 / mass) * sum : Vector{};
     rigid::put(center + 3 * k, c);
+    if (!moves[k]) continue;
     for (int32_t i = 0; free && i < body.size(); ++i) {
       const int32_t v = body.vertex(i);
       Vector g;
@@ -94,6 +98,8 @@ void system_of_scene(const RigidInputs<T>& in, int64_t scene, const Groups& grou
     }
   }
   for (const PairPress& press : presses) {
+    const int32_t a = press.body[0], b = press.body[1];
+    if (!(a >= 0 && moves[a]) && !(b >= 0 && moves[b])) continue;
     add_press(press, borne(in, scene, press), groups, center, gradient, matrix);
   }
 }
@@ -234,17 +240,36 @@ void keep_few(const RigidInputs<T>& in, int64_t scene, const std::vector<PairPre
   }
 }
 
+// The listed pairs of a scene that push.
+template <class T>
+std::vector<PairPress> presses_of(const RigidInputs<T>& in, int64_t scene) {
+  const int32_t vertices = in.gate.vertices;
+  const int64_t row = scene * vertices;
+  std::vector<double> since(vertices);  // how far each vertex is from where gaps were taken
+  for (int32_t v = 0; v < vertices; ++v) {
+    const Vector d = Body<T>::at(in.scene.x + 3 * (row + v)) - Body<T>::at(in.gate.center + 3 * (row + v));
+    since[v] = std::sqrt(dot(d, d));
+  }
+  const auto is_far = [&](int64_t pair) {
+    const T* constants = in.gate.constants + kConstants * pair;
+    const double room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
+    return most_closed(in.gate.listed.pairs + kPairRow * pair, vertices, since.data()) < (1 - 1e-6) * room;
+  };
+  std::vector<PairPress> out(1);
+  for (int64_t i = in.first_listed(scene); i < in.first_listed(scene + 1); ++i) {
+    if (!is_far(i) && barrier_press(in, i, CornerPoints<T>{in, false}, out.back())) out.emplace_back();
+  }
+  out.pop_back();
+  return out;
+}
+
 // Motions of the bodies of a scene, zero at first, and the factors of the matrices there. rows [4, bodies] of `in`, or
 // null. Those that do not move have no factor.
 template <class T>
 void solve_scene(const RigidInputs<T>& in, int64_t scene, double* center, double* motion, double* factor,
                  int32_t* rows) {
   const int64_t unknowns = int64_t{kUnknowns} * in.bodies();
-  std::vector<PairPress> presses(1);
-  for (int64_t i = in.first_listed(scene); i < in.first_listed(scene + 1); ++i) {
-    if (barrier_press(in, i, CornerPoints<T>{in, false}, presses.back())) presses.emplace_back();
-  }
-  presses.pop_back();
+  const std::vector<PairPress> presses = presses_of(in, scene);
   if (rows) find_groups(in, scene, presses, rows);
   Groups groups = in.groups_of(scene);
   groups.room = most_grouped(in.bodies());

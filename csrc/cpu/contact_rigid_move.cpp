@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "../contact/rigid_tries.h"
+#include "bounds.h"
 #include "contact_rigid.h"
 
 namespace diffvbd {
@@ -30,6 +31,7 @@ class Tries {
         decided_(in.bodies(), 0) {
     std::iota(lead_.begin(), lead_.end(), 0);
     find_near();
+    leave_what_rests();
     before_ = potentials(false, [&](const PairPress& a) {
       if (a.body[0] >= 0 && a.body[1] >= 0) touching_.emplace_back(a.body[0], a.body[1]);
     });
@@ -96,21 +98,47 @@ class Tries {
   }
   // The listed pairs that may press, and who decides together.
   void find_near() {
-    std::vector<double> way(in_.bodies(), 0.0), size(in_.bodies(), 0.0);
+    std::vector<double> way(in_.bodies(), 0.0), size(in_.bodies(), 0.0), own_way(in_.scene.vertices, 0.0);
     for (int32_t k = 0; k < in_.bodies(); ++k) {
       const Body<T> body{in_.scene, scene_, k};
       for (int32_t i = 0; i < body.size(); ++i) {
         const Farthest own = farthest_of(in_, body, body.vertex(i), center_ + 3 * k, motion_ + kUnknowns * k);
+        own_way[body.vertex(i)] = own.way;
         way[k] = larger(way[k], own.way), size[k] = larger(size[k], own.size);
       }
     }
     for (int64_t i = in_.first_listed(scene_); i < in_.first_listed(scene_ + 1); ++i) {
-      if (may_press(in_, i, way.data(), size.data())) near_.push_back(i), join(listed(i));
+      if (!may_press(in_, i, way.data(), size.data())) continue;
+      join(listed(i));
+      if (may_press_by(i, own_way, size)) near_.push_back(i);
     }
     for (int64_t i = in_.first_lagged(scene_); i < in_.first_lagged(scene_ + 1); ++i) {
       if (Lag<T>(in_.lag + kLagScalars * i).active()) join(lagged(i));
     }
     for (int32_t k = 0; k < in_.bodies(); ++k) lead_[k] = lead_of(k);
+  }
+  // Bodies that decide together and have no motion have decided.
+  void leave_what_rests() {
+    std::vector<uint8_t> moves(in_.bodies(), 0);
+    for (int32_t k = 0; k < in_.bodies(); ++k) {
+      const double* own = motion_ + kUnknowns * k;
+      if (std::any_of(own, own + kUnknowns, [](double a) { return a != 0; })) moves[lead_[k]] = 1;
+    }
+    for (int32_t k = 0; k < in_.bodies(); ++k) {
+      if (moves[lead_[k]]) continue;
+      decided_[k] = 1, share_[k] = 1;
+      displace(k);
+    }
+  }
+  // Whether a pair that may press by what its bodies do may by what its corners do: else nothing looks at it.
+  bool may_press_by(int64_t pair, const std::vector<double>& way, const std::vector<double>& size) const {
+    const int32_t* record = listed(pair);
+    const T* constants = in_.gate.constants + kConstants * pair;
+    const int32_t a = in_.gate.body[record[0]], b = in_.gate.body[record[sides(record[4])]];
+    if (a >= in_.bodies() || b >= in_.bodies()) return true;
+    const double gap = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat;
+    const double room = gap - guard_of_size(static_cast<T>(std::max(size[a], size[b])));
+    return !(most_closed(record, in_.gate.vertices, way.data()) < (1 - kRounded) * room);
   }
   const int32_t* listed(int64_t i) const { return in_.gate.listed.pairs + kPairRow * i; }
   const int32_t* lagged(int64_t i) const { return in_.lagged.pairs + kPairRow * i; }
