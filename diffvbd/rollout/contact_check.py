@@ -76,10 +76,12 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
     if cut > CUT or left > UNBALANCED_FRICTION:
         model._derived[WARNED] = True
     if cut > CUT:
+        numbered = model.contact is not None and model.contact.detections is not None
+        remedy = ", or leave out its number of detections" if numbered else ""
         warn(
             f"pair_barrier: pairs held up {100 * cut:.2g} % of the vertices in step {shares.index(cut)}, which lost "
             f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
-            f"{100 * CUT:.2g} %); take a smaller time_step, more detections or a larger reach of the PairBarrier; "
+            f"{100 * CUT:.2g} %); take a smaller time_step or a larger reach of the PairBarrier{remedy}; "
             + page("contact.md"),
         )
     if left > UNBALANCED_FRICTION:
