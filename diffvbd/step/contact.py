@@ -199,12 +199,11 @@ class ContactStep:
                 # what the start has held up, sweeps may have made good, and corrections, what these have
                 held = is_cut(self, x, back)
                 cut = (limits[:, -1] > 0) | held
-            if going is not None:  # others stay as they are, so that a scene has the same bits in any batch
-                x, cut, held = (
-                    torch.where(going, x, begin),
-                    torch.where(going[..., 0], cut, met.cut),
-                    held & going[..., 0],
-                )
+            if going is not None:  # what it does not help stays as it is; others, too: the same bits in any batch
+                better = ~self._inverted(x)
+                going = going & better[:, None, None]
+                x, cut = torch.where(going, x, begin), torch.where(going[..., 0], cut, met.cut)
+                held = held & going[..., 0]
             met.cut = cut
             met.found[r] = replaced(detection, shares=start.shares, corrections=torch.stack(taken), limits=limits,
                                     kept=kept, frames=start.frames, combined=combined, lengths=lengths,
@@ -212,8 +211,10 @@ class ContactStep:
             r += 1
             may_go_on = barrier.detections is None and settings.sweeps > 0 and not is_captured(x)
             if may_go_on and r == self.parts < MOST_DETECTIONS:
-                going = (held.any(-1) | (cut.sum(-1) > CUT * self.model.num_active))[:, None, None]
-                self.parts += int(going.any())  # pairs still hold up some
+                asked = held.any(-1) | (cut.sum(-1) > CUT * self.model.num_active)  # pairs still hold up some
+                asked = asked & ~self._inverted(x)  # through what is inside out another body might pass
+                going = asked[:, None, None] if going is None else going & asked[:, None, None]
+                self.parts += int(going.any())
             if r < self.parts:
                 left = torch.where(start.short[..., None], self.x_prev + way + lift - x, 0.0)
         x = self._judged(x, met)
@@ -225,6 +226,12 @@ class ContactStep:
     def potential_parts(self) -> RiseParts:
         """What the step's comparisons of potentials have in common."""
         return rise_parts(self.model, self.fields, self.prepared.settings.numbers.time_step)
+
+    def _inverted(self, x: Tensor) -> Tensor:
+        """Which scenes have a tet that is inside out, bool [B]."""
+        corners = (x.detach() if self.begun.origin is None else x.detach() + self.origin)[:, self.model.tets]
+        a, b, c = (corners[:, :, 1:] - corners[:, :, :1]).unbind(2)
+        return (torch.linalg.cross(a, b) * c).sum(-1).le(0).any(-1)
 
     def _raises(self, x: Tensor, to: Tensor) -> Tensor:
         """Which vertices are of a body whose own potential is higher at ``to`` than at x [B, V], bool."""

@@ -123,6 +123,16 @@ def test_a_step_goes_on_for_the_scenes_of_which_pairs_hold_something_up(device: 
     assert sum(dv.contact.status(model).cut) == 0
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_no_body_passes_through_one_that_could_turn_inside_out(device: str) -> None:
+    """In free flight they would have passed each other within the step, with the least potential of all."""
+    model, x, v = meeting(40.0, device)
+    v[:64, 1] = 40.0
+    end, _ = dv.step(model, x, v, time_step=1 / 60, sweeps=20, **MATERIAL)
+    assert dv.contact.status(model).cut[0] > 0
+    assert float((end - (x + v / 60)).abs().max()) > 0.1
+
+
 def apart(rows: list[tuple[int, float]], device: str) -> tuple[dv.Model, torch.Tensor, list[int]]:
     """Rows of so many cubes 5 mm apart in one scene, 5 m from each other, and their vertices; velocities [V, 3] of the
     first ones."""
