@@ -73,6 +73,8 @@ def check_broadcast(name: str, value: Tensor, shape: tuple[int, ...], scenes: in
         each = (*got[:scenes], *(1,) * missing, *got[scenes:])  # as meant by who gives one value for each scene
         if scenes and missing > 0 and got[:scenes] == shape[:scenes] and _fits(each, shape):
             hint = f": one for each scene has shape {list(each)}"
+        elif scenes and got and got[-1] == 1 and _fits(got[:-1], shape):
+            hint = f": one for each scene has shape {list(got[:-1])}"
         elif len(got) > len(shape) and _fits(got[1:], shape):
             hint = f": in a rollout, per_step({name}) takes one for each step"
         fail(name, f"a shape that broadcasts to {list(shape)}", f"shape {list(got)}{hint}")

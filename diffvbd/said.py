@@ -24,6 +24,11 @@ def page(name: str) -> str:
     return f"see {PAGES / name}"
 
 
+def percent(share: float) -> str:
+    """A share [-] with two digits, as "0.52 %", "17 %" or "220 %"."""
+    return f"{100 * share:.2g} %" if 100 * share < 99.5 else f"{100 * share:.0f} %"
+
+
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
     """warnings.warn, for the line outside this package and torch that is being run."""
     level, frame = 1, sys._getframe()

@@ -56,6 +56,17 @@ def refuse_transforms(name: str) -> None:
         raise NotImplementedError(f"diffvbd: torch.func transforms of {name} are not supported")
 
 
+def refuse_forward_mode() -> None:
+    """Raises inside torch.func.jvp, jacfwd and hessian, before torch asks for what no user can write."""
+    if transformed():
+        level = torch._C._functorch.peek_interpreter_stack()  # pyright: ignore[reportAttributeAccessIssue]
+        if level.key() == torch._C._functorch.TransformType.Jvp:  # pyright: ignore[reportAttributeAccessIssue]
+            raise NotImplementedError(
+                "diffvbd: derivatives in forward mode (torch.func.jvp, jacfwd, hessian) are not supported; take "
+                "reverse mode: torch.autograd.grad or backward()"
+            )
+
+
 def not_compiled(function: F) -> F:
     """torch.compiler.disable, which loads the compiler: a second of every import, so it waits for the first call."""
     try:

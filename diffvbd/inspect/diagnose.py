@@ -15,6 +15,7 @@ from ..checks import check_positive, fail
 from ..model.model import Model
 from ..model.moduli import moduli_of
 from ..model.warnings import HEAVY_REGULARIZATION, STABLE_RELAXATION
+from ..said import percent
 from ..said import warn as say
 from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare, refuse_non_finite
 from ..step.balance import (
@@ -329,12 +330,12 @@ def _state_messages(model: Model, result: Diagnosis) -> list[str]:
     if worst is not None and not worst <= UNBALANCED:
         faster = ", or relaxation between 1.5 and 1.7" if model.relaxation < 1.5 and model.friction is None else ""
         of = "its forces" if body is None else f"the forces of {_place(body)}"
-        out.append(f"the step left {100 * worst:.2g} % of {of} unbalanced: take more sweeps or a "
+        out.append(f"the step left {percent(worst)} of {of} unbalanced: take more sweeps or a "
                    f"smaller time step{faster}")  # fmt: skip
     slip = result.friction_residuals
     if slip is not None and not _largest(slip) <= UNBALANCED_FRICTION:
         faster = ', coarse="auto"' if model.coarse is None else ""
-        out.append(f"friction has not converged: {100 * _largest(slip):.2g} % of it on {_place(slip)} is not balanced; "
+        out.append(f"friction has not converged: {percent(_largest(slip))} of it on {_place(slip)} is not balanced; "
                    f"take more sweeps, a smaller time step{faster} or a larger Friction(velocity=)")  # fmt: skip
     return out
 
@@ -355,7 +356,7 @@ def _error_messages(model: Model, result: Diagnosis, edge: Tensor) -> list[str]:
     *scene, body = torch.where(wrong, relative, 0).eq(relative[wrong].max()).nonzero()[0].tolist()
     where = f"body {body}" + (f" of scene {scene}" if scene else "")
     coarse = ', or coarse="auto"' if model.coarse is None else ""
-    return [f"the step ends about {100 * float(relative[(*scene, body)]):.2g} % of its motion from where it would "
+    return [f"the step ends about {percent(float(relative[(*scene, body)]))} of its motion from where it would "
             f"converge, in {where}; often three times as much: take more sweeps{coarse}"]  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from ..contact.barrier import PairBarrier
 from ..energies import Anchor
 from ..mesh import subdivide
 from ..model.model import Model
+from ..said import percent
 from ..step.arguments import check_state, prepare
 from ..step.integrators import SAME_TIME_STEP, SDIRK2, ImplicitEuler, Integrator, check_integrator
 from .contact_check import cut_share, unbalanced_friction
@@ -24,7 +25,7 @@ from .settings import Settings, aligned
 FINER = 4  # times the steps of the finest run
 MOST_SWEEPS = 1300
 ENOUGH = 0.1  # of what more sweeps have changed so far: below it they have converged
-DETECTIONS = 8  # of the run that is held up least
+DETECTIONS = 8  # in each step of the run that is held up least
 
 
 @dataclass(frozen=True)
@@ -84,9 +85,9 @@ class ErrorBudget:
                 for s in self.shares]  # fmt: skip
         lines = [f"{self.settings}, {self.duration:.3g} s of motion", *aligned([header, *rows])]
         if self.cut is not None:
-            lines.append(f"pairs held up at most {100 * self.cut:.2g} % of the vertices in a step")
+            lines.append(f"pairs held up at most {percent(self.cut)} of the vertices in a step")
         if self.friction is not None:
-            lines.append(f"{100 * self.friction:.2g} % of the friction is not balanced in the last step")
+            lines.append(f"{percent(self.friction)} of the friction is not balanced in the last step")
         return "\n".join(lines)
 
 
@@ -109,7 +110,8 @@ def error_budget(
     """Splits the error of a rollout by cause, by pilot runs that have less of one error at a time.
 
     sweeps: the same steps with sweeps until more change nothing. time step: those against SDIRK2 with four times the
-    steps. precision: the same run in double precision. contact: the same with more detections in each step.
+    steps. precision: the same run in double precision. contact: the converged steps with more detections in each, where
+    pairs have held up motion.
     mesh: the converged run on a mesh of eight tets for each. Look at the largest: nothing else is worth improving.
 
     Args:
@@ -150,8 +152,8 @@ class _Budget:
         run = self._run(self.own, self.steps)
         cut, friction = self._contact_of()
         self._precision(run)
-        self._contact(run)
         converged = self._sweeps(run)
+        self._contact(converged, cut)
         best = self._time(run, converged)
         if mesh:
             self._mesh(converged)
@@ -172,10 +174,10 @@ class _Budget:
         motion = self.pilots.apart(a.x, b.x)
         return Share(cause, motion, quantity, max(gradients) if gradients else None, seconds, note)
 
-    def _other(self, pilots: Pilots) -> tuple[Pilot, float]:
-        """The rollout by other pilot runs, and the time it took [s]."""
+    def _other(self, pilots: Pilots, settings: Settings) -> tuple[Pilot, float]:
+        """A rollout by other pilot runs, and the time it took [s]."""
         before = pilots.spent
-        done = _Budget(pilots, self.own, self.steps)._run(self.own, self.steps)
+        done = _Budget(pilots, settings, self.steps)._run(settings, self.steps)
         self.pilots.spent, self.pilots.runs = pilots.spent, pilots.runs
         return done, pilots.spent - before
 
@@ -185,19 +187,23 @@ class _Budget:
             return
         given = converted(p.given, dtype=torch.float64)
         double = replace(p, model=p.model.to(dtype=torch.float64), x=p.x.double(), v=p.v.double(), given=given)
-        done, seconds = self._other(double)
+        done, seconds = self._other(double, self.own)
         assert run.x is not None
         single = replace(run, x=run.x.double(), gradient=tuple(g.double() for g in run.gradient),
                          quantity=None if run.quantity is None else run.quantity.double())  # fmt: skip
         self.shares.append(self._share("precision", single, done, seconds, "the same in float64"))
 
-    def _contact(self, run: Pilot) -> None:
-        model = self.pilots.model
-        if model.contact is None:
+    def _contact(self, converged: Pilot, cut: float | None) -> None:
+        """Detections share the sweeps of a step: only where each has enough do they tell what pairs have held up."""
+        model, seconds, done, note = self.pilots.model, 0.0, converged, "pairs held up nothing"
+        if cut is None:
             return
-        energies = [replace(e, detections=DETECTIONS) if isinstance(e, PairBarrier) else e for e in model.energies]
-        done, seconds = self._other(replace(self.pilots, model=model.replace(energies=energies)))
-        self.shares.append(self._share("contact", run, done, seconds, f"detections={DETECTIONS}"))
+        if cut > 0:
+            energies = [replace(e, detections=DETECTIONS) if isinstance(e, PairBarrier) else e for e in model.energies]
+            others = replace(self.pilots, model=model.replace(energies=energies))
+            done, seconds = self._other(others, converged.settings)
+            note = f"{done.settings}, detections={DETECTIONS}"
+        self.shares.append(self._share("contact", converged, done, seconds, note))
 
     def _contact_of(self) -> tuple[float | None, float | None]:
         """The largest share of vertices that pairs held up in a step, and of friction left unbalanced by the last one;

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..model.model import Model
-from ..said import page, warn
+from ..said import page, percent, warn
 from ..scopes import is_captured, looks_at
 from ..step.arguments import Prepared, acceleration_of, collider_state
 from ..step.balance import UNBALANCED_FRICTION, contact_of_step, friction_left_over, potential_of_step
@@ -79,16 +79,16 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
         numbered = model.contact is not None and model.contact.detections is not None
         remedy = ", or leave out its number of detections" if numbered else ""
         warn(
-            f"pair_barrier: pairs held up {100 * cut:.2g} % of the vertices in step {shares.index(cut)}, which lost "
+            f"pair_barrier: pairs held up {percent(cut)} of the vertices in step {shares.index(cut)}, which lost "
             f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
-            f"{100 * CUT:.2g} %); take a smaller time_step or a larger reach of the PairBarrier{remedy}; "
+            f"{percent(CUT)}); take a smaller time_step or a larger reach of the PairBarrier{remedy}; "
             + page("contact.md"),
         )
     if left > UNBALANCED_FRICTION:
         faster = ', coarse="auto"' if model.coarse is None else ""
         faster += ", acceleration=dv.Anderson(5)" if model.acceleration is None else ""
         warn(
-            f"friction: {100 * left:.2g} % of it is not balanced in the last step: the sweeps have not converged, and "
+            f"friction: {percent(left)} of it is not balanced in the last step: the sweeps have not converged, and "
             f"the motion may be far off; take more sweeps, a smaller time_step{faster} or a larger "
             "Friction(velocity=); " + page("contact.md"),
         )

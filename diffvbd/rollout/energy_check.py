@@ -13,7 +13,7 @@ from ..energies import Anchor
 from ..mask import ELASTIC
 from ..model.model import Model
 from ..model.rest import rest_metric
-from ..said import page, warn
+from ..said import page, percent, warn
 from ..scopes import is_captured, looks_at
 from ..step.arguments import Prepared, acceleration_of
 
@@ -107,12 +107,13 @@ class EnergyLook:
         if not most > (GAIN_TOUCHING if touching else GAIN):
             return
         self.model._derived[WARNED] = True
-        step = list(self.found)[int(gain.amax(-1).argmax())]
+        look, scene = divmod(int(gain.argmax()), gain.shape[-1])
+        of = f"scene {scene}" if gain.shape[-1] > 1 else "the scene"
         faster = "" if self.model.coarse is not None else ', coarse="auto"'
         pressed = ", unless bodies were pressed together at the start" if touching else ""
         warn(
-            f"sweeps: after step {step} the scene has gained {100 * most:.2g} % of the energy that it had and that "
-            f"gravity gave it: the sweeps have not converged{pressed}; take more sweeps{faster} or a smaller "
+            f"sweeps: after step {list(self.found)[look]} {of} has gained {percent(most)} of the energy that it had "
+            f"and that gravity gave it: the sweeps have not converged{pressed}; take more sweeps{faster} or a smaller "
             "time_step; " + page("numerics.md"),
         )
 

@@ -6,6 +6,7 @@ import difflib
 import math
 from collections.abc import Callable
 from functools import partial
+from inspect import signature
 from typing import Any, NamedTuple
 
 import torch
@@ -20,7 +21,7 @@ from ..energies import VERTEX_ENERGIES
 from ..model.model import Model
 from ..model.moduli import moduli_of
 from ..model.rest import lumped_mass, rest_metric
-from ..scopes import checking, looks_at
+from ..scopes import checking, looks_at, refuse_forward_mode
 from .coarse import CoarseParts, coarse_parts
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
@@ -99,6 +100,7 @@ def prepare(
     settings: ops.SweepSettings | None = None,
 ) -> Prepared:
     """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
+    refuse_forward_mode()
     like, tets = model._mass, (model.num_tets,)
     if settings is None:
         settings = step_settings(model, lead, time_step, sweeps)
@@ -190,9 +192,12 @@ def check_prescribed(model: Model, prescribed: Any, x: Tensor, *others: Tensor) 
 
 def _absent(name: Any, model: Model) -> str:
     """Why a Model does not know a parameter: perhaps its energy is missing, or misspelt."""
-    kinds = {
-        f"{kind.name}.{key}": kind for kind in (*VERTEX_ENERGIES, PairBarrier, Friction) for key in kind.parameters
-    }
+    owners = (*VERTEX_ENERGIES, PairBarrier, Friction)
+    kinds = {f"{kind.name}.{key}": kind for kind in owners for key in kind.parameters}
+    for kind in owners:
+        prefix, _, key = str(name).partition(".")
+        if prefix == kind.name and key in signature(kind).parameters and key not in kind.parameters:
+            return f", a constant: {kind.__name__}({key}=...) sets it when a Model is made"
     meant = difflib.get_close_matches(str(name), kinds, 1)
     if not meant:
         return ""

@@ -25,7 +25,7 @@ from ..ops.motion import RoomsOfBodies
 from ..scopes import checking, is_captured, not_compiled, recorders
 from ..tuples import replaced
 from .coarse import factor_of
-from .contact_cycles import CUT, MOST_DETECTIONS, parts_of, record_parts, sweeps_of_part, swept_part
+from .contact_cycles import CUT, MOST_DETECTIONS, of_going, parts_of, record_parts, sweeps_of_part, swept_part
 from .corrections import corrected, corrected_after, is_cut
 from .floor_start import start_on_floor
 from .intersections import refuse_intersections
@@ -200,8 +200,8 @@ class ContactStep:
                 held = is_cut(self, x, back)
                 cut = (limits[:, -1] > 0) | held
             if going is not None:  # what it does not help stays as it is; others, too: the same bits in any batch
-                better = ~self._inverted(x)
-                going = going & better[:, None, None]
+                going = going & ~self._inverted(x)[:, None, None]
+                met.swept[-1] = of_going(met.swept[-1], going)
                 x, cut = torch.where(going, x, begin), torch.where(going[..., 0], cut, met.cut)
                 held = held & going[..., 0]
             met.cut = cut
@@ -324,7 +324,7 @@ class ContactStep:
         """Raises where a detection found more than fits, surfaces that touch, or a way that pairs close to what is
         prescribed."""
         surface = self.surface
-        assert surface is not None
+        assert surface is not None and self.barrier is not None
         needed, touching, pair, hindered = counts
         if needed > self.capacity or touching or hindered:
             self._record(met)  # the status of a step that raises says why
@@ -346,9 +346,14 @@ class ContactStep:
             moved = named != "x" and self.colliders is not self.before  # through something, it may be
             owners = surface.owners_of(corners[0], corners[3])
             raise ValueError(
-                f"{named}: expected surfaces that do not touch, got {touching} pairs without a gap in part {r} of the "
-                f"step, one of the corner points {corners} of {owners} in scene {scene}: "
-                + ("move colliders less, or use more detections or a smaller time_step" if moved else "move them apart")
+                f"{named}: expected surfaces that do not touch, got {touching} pairs without a gap "
+                + (f"in part {r} of the step" if r else "at the start of the step")
+                + f", one of the corner points {corners} of {owners} in scene {scene}: "
+                + (
+                    "move colliders less, or use more detections or a smaller time_step"
+                    if moved
+                    else f"move them apart, best by about dhat, {self.barrier.dhat:g} m"
+                )
             )
         if hindered:
             raise ValueError(

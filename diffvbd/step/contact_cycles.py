@@ -148,6 +148,16 @@ def _trials(of: ContactStep, start: PartStart, collider: Tensor, listed: Pairs) 
     return Trials(s, of.potential_parts)
 
 
+def of_going(part: SweptPart, going: Tensor) -> SweptPart:
+    """What a part has done in the scenes that go on, bool [B, 1, 1]; in others it is thrown away."""
+    combined, lengths, going = part.combined, part.lengths, going[:, 0]
+    return replaced(
+        part,
+        combined=None if combined is None else replaced(combined, taken=combined.taken & going),
+        lengths=None if lengths is None else torch.where(going, lengths, 0.0),
+    )
+
+
 def record_parts(model: Model, x: Tensor, parts: Sequence[SweptPart]) -> None:
     """For acceleration.record() and coarse.record(): what the parts of a step that ends at x have done."""
     if model.acceleration is not None:

@@ -121,6 +121,19 @@ def test_records_and_refusals() -> None:
         rebuilt(scene.model, acceleration=dv.Anderson(), saturation=0.1)
 
 
+def test_records_leave_out_parts_that_a_scene_does_not_take() -> None:
+    scene = SCENES["held_up"]()  # of which one half goes on
+    model = rebuilt(scene.model, acceleration=dv.Anderson(), coarse=dv.CoarseSpace(functions=4, every=2))
+    with dv.acceleration.record() as taken, dv.coarse.record() as lengths, dv.contact.record() as found:
+        dv.step(model, scene.x, scene.v, time_step=scene.time_step, sweeps=20, **scene.inputs)
+    last = found[-1]
+    assert last.going.flatten().tolist() == [True, False] and last.combined.taken.any() and last.lengths[:, 1].all()
+    combined, corrected = (record[0][:, -len(part) :] for record, part in ((taken, last.combined.taken),
+                                                                           (lengths, last.lengths)))  # fmt: skip
+    assert combined[0].any() and corrected[0].all(-1).any()
+    assert not combined[1].any() and not corrected[1].any()
+
+
 @pytest.mark.parametrize("coarse", [None, dv.CoarseSpace(functions=4, every=2)])
 def test_gradients_on_a_floor_with_friction_alone(coarse: dv.CoarseSpace | None) -> None:
     """Against central differences, for which decisions stay as they were."""

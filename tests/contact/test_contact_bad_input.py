@@ -154,6 +154,7 @@ def test_model(options: dict[str, Any], name: str, got: str) -> None:
         ({"parameters": {"pair_barrier.dhat": 0.1}}, "parameters", "pair_barrier.dhat"),
         ({"parameters": {"friction.velocity": 0.1}}, "parameters", "friction.velocity"),
         ({"parameters": {"friction.coefficient": torch.ones(2).double()}}, "friction.coefficient", r"\[2\]"),
+        ({"parameters": {"pair_barrier.dhat": 0.01}}, "parameters", r"a constant: PairBarrier\(dhat=...\) sets it"),
         ({"parameters": {"pair_barrier.kappa": "stiff"}}, "pair_barrier.kappa", "str"),
         ({"parameters": {"pair_barrier.damping": torch.ones(())}}, "pair_barrier.damping", "float32"),
     ],
@@ -302,7 +303,7 @@ def test_second_derivatives_and_forward_mode_raise(device: str) -> None:
     (slope,) = torch.autograd.grad(speed_of(model, v, **named), coefficient, create_graph=True)
     with pytest.raises(NotImplementedError, match="second derivatives"):
         torch.autograd.grad(slope, coefficient)
-    with pytest.raises((NotImplementedError, RuntimeError), match="(?i)forward.mode|jvp|forward AD|contact"):
+    with pytest.raises(NotImplementedError, match="derivatives in forward mode"):
         torch.func.jvp(lambda v: speed_of(model, v), (v.detach(),), (torch.ones_like(v),))
 
 

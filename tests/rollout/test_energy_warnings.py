@@ -1,5 +1,6 @@
 """Claim: a rollout that ends with what is no number says so, and one that gains energy from nowhere does, once."""
 
+import re
 import warnings
 from types import SimpleNamespace
 from typing import Any
@@ -63,6 +64,14 @@ def test_energy_from_nowhere_is_warned_of_once(dtype: torch.dtype) -> None:
     assert [w.filename for w in found] == [__file__]
     assert messages(lambda: dv.rollout(model, x, v, steps=10, **STIFF)) == []
     assert len(messages(lambda: dv.rollout(model, x, v, steps=10, check_energy=True, **STIFF))) == 1
+
+
+def test_the_scene_that_gains_most_is_named() -> None:
+    model, x, v = bent()
+    both = torch.stack([0 * v, v])
+    (said,) = messages(lambda: dv.rollout(model, x.expand_as(both), both, steps=10, check_energy=True, **STIFF))
+    gained = re.search(r"after step \d+ scene 1 has gained (\S+) % of", said)
+    assert gained is not None and float(gained[1]) > 5 and "e+" not in gained[1]
 
 
 def test_what_helps_helps() -> None:

@@ -72,6 +72,22 @@ def test_contact_and_friction() -> None:
     assert 0 < budget.total < 1
 
 
+def test_contact_has_a_share_where_pairs_held_up_motion() -> None:
+    one = mesh.box(2, 0.1)
+    body = mesh.join([one, one.translate((0.013, 0.115, 0.011))])
+    barrier = dv.PairBarrier(kappa=1e3, dhat=2e-3, detections=1)
+    model = dv.Model(body, energies=(dv.StableNeoHookean(), barrier))
+    v = torch.zeros_like(model.rest_points)
+    given = {"duration": 0.04, "time_step": 1 / 100, "mu": 1e5, "lam": 1e5, "gravity": (0.0, 0.0, 0.0), "sweeps": 20}
+    apart = shares(dv.error_budget(model, model.rest_points, v, **given))["contact"]
+    assert apart.motion == 0 and apart.seconds == 0 and apart.note == "pairs held up nothing"
+    v[8:, 1] = -20.0
+    budget = dv.error_budget(model, model.rest_points, v, **given)
+    assert budget.cut is not None and budget.cut > 0
+    share = shares(budget)["contact"]
+    assert share.motion > 0.01 and share.seconds > 0 and share.note.endswith("detections=8")
+
+
 @pytest.mark.parametrize(
     ("given", "error", "text"),
     [

@@ -108,6 +108,7 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
     ("parameters", {"friction.coefficient": 1.0}, "'friction.coefficient': the Model has no Friction among its"),
     ("parameters", {"pair_barier.kappa": 1.0}, r"\(is 'pair_barrier.kappa' meant\?\): the Model has no PairBarrier"),
     ("parameters", {"kappa": 1.0}, "'kappa'$"),
+    ("floor_barrier.kappa", torch.ones(1, 1, dtype=torch.float64), r"shape \[1, 1\]$"),
     ("parameters", {3: 1.0}, "3$"),
     # rest shapes that are no shapes
     ("rest_points", torch.from_numpy(MESH.points * [-1.0, 1.0, 1.0]), r"-0\.16.* at tet 0 of scene 0"),
