@@ -139,7 +139,7 @@ struct RigidWorkTensors {
 struct RigidEndTensors {
   Tensor p, q, x, mass;
   template <class T, class Zeros>
-  RigidEndTensors(const contact::RigidInputs<T>& in, const Zeros& zeros)
+  RigidEndTensors(const contact::RigidInputs<T>& in, Zeros&& zeros)
       : p(zeros({in.scene.scenes, in.gate.corners, 3})),
         q(zeros({in.scene.scenes, in.gate.corners, 3})),
         x(zeros({in.scene.scenes, in.scene.vertices, 3})),
@@ -152,7 +152,7 @@ struct RigidVertexTensors {
   Tensor floor_lag, none;
   template <class T, class Zeros>
   RigidVertexTensors(const contact::RigidInputs<T>& in, const std::vector<int64_t>& data_count, bool wants_data,
-                     const Zeros& zeros)
+                     Zeros&& zeros)
       : bars(in.scene, data_count, true, wants_data,
              [&](const std::vector<int64_t>& sizes, bool) { return zeros(sizes); }),
         floor_lag(zeros({in.planes > 0 ? in.scene.scenes : 0, in.scene.vertices, in.planes, contact::kFloorLag})),

@@ -49,7 +49,7 @@ contact::UnsupportedInputs<T> unsupported_inputs(const UnsupportedTensors& t, do
 struct UnsupportedBars {
   Tensor x, lift, force, mass, planes;
   template <class T, class Empty, class Zeros>
-  UnsupportedBars(const contact::UnsupportedInputs<T>& in, bool wants_planes, const Empty& empty, const Zeros& zeros)
+  UnsupportedBars(const contact::UnsupportedInputs<T>& in, bool wants_planes, const Empty& empty, Zeros&& zeros)
       : x(empty({in.planes > 0 ? in.scene.scenes : 0, in.scene.vertices, 3})),
         lift(empty({in.scene.scenes, in.scene.vertices, 3})),
         force(zeros({in.scene.scenes, in.corners, 3})),

@@ -1,4 +1,5 @@
 #include "../contact/rigid_reverse.h"
+#include "clear.h"
 #include "contact_rigid.cuh"
 
 namespace diffvbd::cuda {
@@ -98,9 +99,11 @@ template <class T>
 cudaError_t rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out,
                            int32_t* pushing, cudaStream_t stream) {
   if (out.listed > 0) {
-    if (auto error = cudaMemsetAsync(pushing, 0, sizeof(int32_t), stream)) return error;
-    if (auto error = cudaMemsetAsync(out.barrier, 0, 4 * kWorkScalars * out.listed * sizeof(T), stream)) return error;
-    if (auto error = cudaMemsetAsync(out.by_kappa, 0, out.listed * sizeof(T), stream)) return error;
+    constexpr auto kBytes = static_cast<int64_t>(sizeof(T));
+    const Span barrier = {out.barrier, 4 * kWorkScalars * out.listed * kBytes};
+    if (auto error = clear({{pushing, sizeof(*pushing)}, barrier, {out.by_kappa, out.listed * kBytes}}, stream)) {
+      return error;
+    }
     pushing_kernel<T><<<blocks_for(out.listed), kOne, 0, stream>>>(in, out.listed, pushing);
     barrier_kernel<T><<<blocks_for(kPartsApart * out.listed), kOne, 0, stream>>>(in, given, out, pushing);
   }

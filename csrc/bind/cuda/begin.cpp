@@ -14,7 +14,7 @@ namespace {
 
 namespace cuda = diffvbd::cuda;
 namespace start = diffvbd::start;
-using cuda::check, cuda::current_stream, cuda::empty, cuda::groups_of, cuda::workspace_of, cuda::zeros;
+using cuda::check, cuda::current_stream, cuda::empty, cuda::groups_of, cuda::workspace_of, cuda::Zeroed;
 using diffvbd::BeginSettings, diffvbd::BeginFields, diffvbd::data, diffvbd::dispatch_float;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
@@ -71,9 +71,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin
     const auto in = diffvbd::begin_inputs<T>(f, settings, coasted, y, falls, alone);
     const auto teams = groups_of(groups, f.spread.numel());
     const Tensor workspace = workspace_of(teams, x);
+    Zeroed zeros(x);
     const diffvbd::BeginBars bars(f, in, wants, [&](const std::vector<int64_t>& sizes, bool zeroed) {
-      return zeroed ? zeros(x, sizes) : empty(x, sizes);
+      return zeroed ? zeros(sizes) : empty(x, sizes);
     });
+    zeros.clear();
     check(cuda::begin_backward<T>(in, teams, bars.pointers<T>(x_start_bar, y_bar), data<T>(coasted), data<T>(y),
                                   data<double>(workspace), current_stream(x)),
           "the adjoint of the beginning of a step");

@@ -9,6 +9,7 @@
 #include <string>
 #include <vector>
 
+#include "../../cuda/clear.h"
 #include "../arguments.h"
 
 namespace diffvbd::cuda {
@@ -75,11 +76,21 @@ inline cudaStream_t current_stream(const Tensor& t) {
   return static_cast<cudaStream_t>(stream);
 }
 
-inline Tensor zeros(const Tensor& like, const std::vector<int64_t>& sizes) {
-  Tensor out = empty(like, sizes);
-  const size_t bytes = out.numel() * (like.scalar_type() == ScalarType::Double ? sizeof(double) : sizeof(float));
-  if (bytes > 0) check(cudaMemsetAsync(out.data_ptr(), 0, bytes, current_stream(like)), "memset");
-  return out;
-}
+// Tensors that are zero at first: several of them for one launch.
+class Zeroed {
+ public:
+  explicit Zeroed(const Tensor& like) : like_(like) {}
+  Tensor operator()(const std::vector<int64_t>& sizes) {
+    Tensor out = empty(like_, sizes);
+    const bool wide = like_.scalar_type() == ScalarType::Double;
+    spans_.push_back({out.data_ptr(), out.numel() * static_cast<int64_t>(wide ? sizeof(double) : sizeof(float))});
+    return out;
+  }
+  void clear() const { check(cuda::clear(spans_, current_stream(like_)), "memory"); }
+
+ private:
+  const Tensor& like_;
+  std::vector<Span> spans_;
+};
 
 }  // namespace diffvbd::cuda

@@ -19,7 +19,12 @@ class Place {
   Tensor like_x() const { return make({x_.size(0), x_.size(1), x_.size(2)}); }
   Tensor make(const std::vector<int64_t>& sizes) const { return cuda::empty(x_, sizes); }
   Tensor make(const std::vector<int64_t>& sizes, ScalarType dtype) const { return cuda::empty(x_, sizes, dtype); }
-  Tensor zeros(const std::vector<int64_t>& sizes) const { return cuda::zeros(x_, sizes); }
+  Tensor zeros(const std::vector<int64_t>& sizes) const {
+    cuda::Zeroed zeros(x_);
+    const Tensor out = zeros(sizes);
+    zeros.clear();
+    return out;
+  }
   template <class Act>
   void bodies(const Act& act) const {
     cuda::check(cuda::act_on_bodies(act, cuda::current_stream(x_)), "the start of a part");

@@ -14,7 +14,7 @@ namespace {
 
 namespace contact = diffvbd::contact;
 namespace cuda = diffvbd::cuda;
-using cuda::check, cuda::current_stream, cuda::empty, cuda::zeros;
+using cuda::check, cuda::current_stream, cuda::empty, cuda::Zeroed;
 using diffvbd::data, diffvbd::dispatch_float, diffvbd::TouchingFields;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
@@ -98,7 +98,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_end_backward(
     diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
     diffvbd::require_of_bodies(in, share, x, 1);
     diffvbd::require_like("x_bar", x_bar, x, 3 * in.scene.scenes * in.scene.vertices);
-    const diffvbd::RigidEndTensors out(in, [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
+    Zeroed zeros(x);
+    const diffvbd::RigidEndTensors out(in, zeros);
+    zeros.clear();
     Tensor solution = empty(x, {in.scene.scenes, in.bodies(), contact::kUnknowns}, ScalarType::Double);
     check(cuda::rigid_end_backward<T>(in, data<const double>(motion), data<const double>(share), data<const T>(x_bar),
                                       data<const double>(factor), data<double>(solution), data<T>(out.x),
@@ -118,8 +120,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid
     const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), empty(x, {0}));
     diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
     diffvbd::require_of_bodies(in, solution, x, contact::kUnknowns);
-    const diffvbd::RigidVertexTensors out(in, data_count, wants_data,
-                                          [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
+    Zeroed zeros(x);
+    const diffvbd::RigidVertexTensors out(in, data_count, wants_data, zeros);
+    zeros.clear();
     check(cuda::rigid_vertices_backward<T>(in, data<const double>(motion), data<const double>(solution),
                                            diffvbd::virtual_motions(in, by_p, by_q, x), out.pointers<T>(),
                                            out.floor<T>(), current_stream(x)),

@@ -16,7 +16,7 @@ namespace {
 
 namespace contact = diffvbd::contact;
 namespace cuda = diffvbd::cuda;
-using cuda::check, cuda::current_stream, cuda::empty, cuda::zeros;
+using cuda::check, cuda::current_stream, cuda::empty, cuda::Zeroed;
 using diffvbd::data, diffvbd::dispatch_float, diffvbd::TranslationTensors;
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
@@ -48,9 +48,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_translation_backward(
     const auto in = diffvbd::translation_inputs<T>(given);
     diffvbd::require_like("u_bar", u_bar, x, 3 * in.scenes * in.bodies);
     const int64_t b = in.scenes, v = in.vertices, scalars = int64_t{in.floor.num_planes} * contact::kPlaneScalars;
-    Tensor move_bar = empty(x, {b, v, 3}), mass_bar = empty(x, {b, v}), x_bar = zeros(x, {b, v, 3});
-    Tensor planes_bar = zeros(x, {b, scalars});
-    const Tensor sums = empty(x, {b, in.bodies, 4}), zeroed = zeros(x, {b, in.bodies, 6 + scalars});
+    Zeroed zeros(x);
+    Tensor move_bar = empty(x, {b, v, 3}), mass_bar = empty(x, {b, v}), x_bar = zeros({b, v, 3});
+    Tensor planes_bar = zeros({b, scalars});
+    const Tensor sums = empty(x, {b, in.bodies, 4}), zeroed = zeros({b, in.bodies, 6 + scalars});
+    zeros.clear();
     check(cuda::translation_backward<T>(in, data<const T>(u_bar), data<T>(sums), data<T>(zeroed), data<T>(move_bar),
                                         data<T>(mass_bar), data<T>(x_bar), data<T>(planes_bar), current_stream(x)),
           "the translation of islands");

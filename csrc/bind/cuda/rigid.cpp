@@ -14,7 +14,7 @@ namespace {
 
 namespace cuda = diffvbd::cuda;
 namespace rigid = diffvbd::rigid;
-using cuda::check, cuda::current_stream, cuda::empty, cuda::groups_of, cuda::workspace_of, cuda::zeros;
+using cuda::check, cuda::current_stream, cuda::empty, cuda::groups_of, cuda::workspace_of, cuda::Zeroed;
 using diffvbd::data, diffvbd::dispatch_float, diffvbd::RigidFields;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
@@ -46,9 +46,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> correct_backward(
     const auto in = diffvbd::rigid_inputs<T>(f, data_count, time_step);
     const auto teams = groups_of(groups, f.spread.numel());
     const Tensor workspace = workspace_of(teams, x);
+    Zeroed zeros(x);
     const diffvbd::RigidBars bars(
         in, data_count, v_bar.numel() > 0, wants_data,
-        [&](const std::vector<int64_t>& shape, bool zeroed) { return zeroed ? zeros(x, shape) : empty(x, shape); });
+        [&](const std::vector<int64_t>& shape, bool zeroed) { return zeroed ? zeros(shape) : empty(x, shape); });
+    zeros.clear();
     check(cuda::rigid_reverse<T>(in, teams, order.numel() < in.vertices, bars.pointers<T>(x_bar, v_bar),
                                  data<double>(workspace), current_stream(x)),
           "the adjoint of the rigid correction");

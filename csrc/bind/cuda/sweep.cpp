@@ -13,7 +13,7 @@ namespace {
 namespace coarse = diffvbd::coarse;
 namespace contact = diffvbd::contact;
 namespace cuda = diffvbd::cuda;
-using cuda::check, cuda::current_stream, cuda::DeviceGuard, cuda::empty, cuda::plan_of, cuda::zeros;
+using cuda::check, cuda::current_stream, cuda::DeviceGuard, cuda::empty, cuda::plan_of, cuda::Zeroed;
 using diffvbd::data, diffvbd::dispatch_float, diffvbd::require;
 using diffvbd::StepFields, diffvbd::SweepFields, diffvbd::SweepSettings;
 using torch::headeronly::ScalarType;
@@ -105,12 +105,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const
 template <class T>
 struct ContactSlots {
   Tensor rows, lag_rows, kappa, lag, prev;
-  ContactSlots(const Tensor& x, const contact::ContactInputs<T>& in, int64_t listed, int64_t lagged)
-      : rows(zeros(x, {listed, 48})),
-        lag_rows(zeros(x, {lagged, 48})),
-        kappa(zeros(x, {listed, 4})),
-        lag(zeros(x, {lagged, 4 * contact::kLagScalars})),
-        prev(zeros(x, {x.size(0), in.corners, 3})) {}
+  ContactSlots(const Tensor& x, const contact::ContactInputs<T>& in, int64_t listed, int64_t lagged, Zeroed& zeros)
+      : rows(zeros({listed, 48})),
+        lag_rows(zeros({lagged, 48})),
+        kappa(zeros({listed, 4})),
+        lag(zeros({lagged, 4 * contact::kLagScalars})),
+        prev(zeros({x.size(0), in.corners, 3})) {}
   contact::ContactAdjoints<T> pointers(const Tensor& floor_lag) const {
     return {data<T>(rows), data<T>(lag_rows), data<T>(kappa), data<T>(lag), data<T>(floor_lag), data<T>(prev)};
   }
@@ -136,8 +136,9 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     int64_t recorded = 1;
     for (const int64_t n : corrections_shape(given)) recorded *= n;
     diffvbd::require_like("corrections", corrections, x, recorded);
+    Zeroed zeros(x);
     const auto make = [&](const std::vector<int64_t>& shape, bool zeroed) {
-      return zeroed ? zeros(x, shape) : empty(x, shape);
+      return zeroed ? zeros(shape) : empty(x, shape);
     };
     const int64_t v = host.plan.num_vertices, t = host.plan.num_tets;
     const int64_t materials = diffvbd::one_for_items(in.material) ? 1 : t;
@@ -150,6 +151,7 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     given.coarse.matrix_bar = bars.coarse_factor.numel() > 0 ? data<T>(bars.coarse_factor) : nullptr;
     const cudaStream_t stream = current_stream(x);
     const auto run = [&] {
+      zeros.clear();
       cuda::Choice choice = choose(in, x, q, true, cuda::wishes(out));
       const Tensor work = cuda::workspace<T>(x, host, in, &out, choice);
       check(cuda::run_reverse<T>(host, in, data<const T>(x), data<const T>(tape), out, choice, work.data_ptr(), stream),
@@ -160,7 +162,7 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
       return bars.tensors();
     }
     const int64_t lagged = given.pairs.lag ? f.lag_pairs.size(0) : 0;
-    const ContactSlots<T> slots(x, given.pairs, f.pairs.size(0), lagged);
+    const ContactSlots<T> slots(x, given.pairs, f.pairs.size(0), lagged, zeros);
     diffvbd::make_contact_bars(bars, given.pairs, in.scenes, v, lagged, make);
     const auto pointers = slots.pointers(bars.floor_lag);
     out.contact = &pointers;
@@ -214,8 +216,9 @@ diffvbd::FusedAdjoints fused_step_backward(DIFFVBD_PARAMETERS(STEP) const Tensor
     const Given<T> given(host, f, q);
     const auto& in = given.in;
     cuda::check_tape(tape, x, host, in, launch);
+    Zeroed zeros(x);
     const auto make = [&](const std::vector<int64_t>& shape, bool zeroed) {
-      return zeroed ? zeros(x, shape) : empty(x, shape);
+      return zeroed ? zeros(shape) : empty(x, shape);
     };
     const int64_t n = host.plan.num_vertices, t = host.plan.num_tets;
     const auto state = [&](int i) {
@@ -233,6 +236,7 @@ diffvbd::FusedAdjoints fused_step_backward(DIFFVBD_PARAMETERS(STEP) const Tensor
     out.acceleration = pointer(bars.acceleration), out.prescribed = pointer(bars.prescribed);
     cuda::Choice choice = choose(in, x, q, true, cuda::wishes(out));
     const Tensor work = cuda::workspace<T>(x, host, in, &out, choice);
+    zeros.clear();
     check(cuda::run_reverse<T>(host, in, data<const T>(x_end), data<const T>(tape), out, choice, work.data_ptr(),
                                current_stream(x)),
           "the reverse step");

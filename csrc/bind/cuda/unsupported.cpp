@@ -13,7 +13,7 @@
 namespace {
 
 namespace cuda = diffvbd::cuda;
-using cuda::check, cuda::current_stream, cuda::empty, cuda::zeros;
+using cuda::check, cuda::current_stream, cuda::empty, cuda::Zeroed;
 using diffvbd::data, diffvbd::dispatch_float;
 using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
@@ -42,9 +42,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_unsupported_backward(
     const auto in = diffvbd::unsupported_inputs<T>(
         {x, origin, lift, force, mass, planes, held_bodies, body_order, body_ptr}, time_step);
     diffvbd::require_like("bar", bar, x, 3 * in.scene.scenes * in.scene.vertices);
+    Zeroed zeros(x);
     const diffvbd::UnsupportedBars bars(
-        in, wants_planes, [&](const std::vector<int64_t>& sizes) { return empty(x, sizes); },
-        [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
+        in, wants_planes, [&](const std::vector<int64_t>& sizes) { return empty(x, sizes); }, zeros);
+    zeros.clear();
     check(cuda::unsupported_backward<T>(in, data<const T>(bar), bars.pointers<T>(), current_stream(x)),
           "what contact leaves of an acceleration");
     return bars.tensors();
