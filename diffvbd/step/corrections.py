@@ -67,25 +67,26 @@ def corrected_after(of: ContactStep, x: Tensor, collider: Tensor, start: PartSta
     grouped = bodies <= most_grouped(bodies)
     for k in range(least, HELD_CORRECTIONS if grouped else LEFT_CORRECTIONS):
         # of a scene in which some of those that were held up have gone on: where they are now, others may go on, too
-        held = (at.motion != 0).any(-1) & (at.share < 1)
-        held &= (held & (at.share > 0)).any(-1, keepdim=True) & (k < HELD_CORRECTIONS)
-        left = torch.zeros_like(held) if grouped else left_alone(at.groups)
+        held = at.moved & (at.share < 1)
+        held &= (held & (at.share > 0)).any(-1, keepdim=True)
         alone = k >= HELD_CORRECTIONS
+        left = None if grouped else left_alone(at.groups)
         if not is_captured(x):
-            some_held, some_left = torch.stack([held.any(), left.any()]).tolist()
-            if not (some_held or some_left):
+            some_held = not alone and bool(held.any())
+            if not some_held and (left is None or not bool(left.any())):
                 break
             alone = not some_held
-        at = corrected(of, at.x, collider, start, listed, left if alone else held | left, alone)
-        moved = (at.motion != 0).any(-1)
+        moving = held if left is None else left if alone else held | left
+        at = corrected(of, at.x, collider, start, listed, moving, alone)
         shares.append(at.share)
-        back = torch.where(moved, not_taken(at), back)
+        back = torch.where(at.moved, not_taken(at), back)
     return at.x, shares, back
 
 
 def not_taken(at: Corrected) -> Tensor:
     """How much of its last shift each body did not take [B, bodies] [m]."""
-    return (1 - at.share) * at.motion[..., 3:].norm(dim=-1).to(at.share)
+    shift = at.motion[..., 3:].norm(dim=-1).to(at.share)
+    return torch.addcmul(shift, shift, at.share, value=-1)
 
 
 def is_cut(of: ContactStep, x: Tensor, back: Tensor) -> Tensor:

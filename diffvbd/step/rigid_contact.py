@@ -11,7 +11,7 @@ is decided, not differentiated. docs/method.md, section 18.
 # pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -32,6 +32,7 @@ class Corrected(NamedTuple):
 
     x: Tensor  # [B, V, 3]
     share: Tensor  # of its motion that each body took [B, bodies]
+    moved: Tensor  # which bodies have a motion, bool [B, bodies]
     motion: Tensor  # [B, bodies, 6] float64, a turn and a shift
     groups: Tensor  # as ops.contact_rigid has them
 
@@ -41,8 +42,8 @@ def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction
     """After every free body has been moved, as far as pairs, floors and the potential let it. friction_eps: [m], 0
     without friction. moving, alone: As for ops.contact_rigid.rigid_system. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
-    x, share, motion, _, groups = _Correct.apply(*fields, model, time_step, friction_eps, moving, alone)
-    return Corrected(x, share.to(x.dtype), motion, groups)
+    x, share, motion, _, groups, moved = _Correct.apply(*fields, model, time_step, friction_eps, moving, alone)
+    return Corrected(x, share.to(x.dtype), moved, motion, groups)
 
 
 def bodies_of(model: Model) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -72,13 +73,14 @@ class _Correct(Direct):
         counts = model._data_count
         centers, motion, factor, groups = ops_rigid.rigid_system(fields, counts, time_step, friction_eps, moving, alone)
         end, share = ops_rigid.rigid_move(fields, centers, motion, counts, time_step, friction_eps)
+        moved = (motion != 0).any(-1)
         if moving is not None:  # what stays takes no share, and passes nothing on
-            share = torch.where((motion != 0).any(-1), share, 0.0)
-        return end, share, motion, factor, groups
+            share = share * moved
+        return end, share, motion, factor, groups, moved
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        ctx.save_for_backward(*inputs[:_FIELDS], *output[1:])
+        ctx.save_for_backward(*inputs[:_FIELDS], *output[1:5])
         ctx.options = inputs[_FIELDS:-2]
         ctx.mark_non_differentiable(*output[1:])
         ctx.set_materialize_grads(False)
@@ -119,27 +121,28 @@ def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: T
     options = s.model._data_count, s.time_step, s.friction_eps
     end = ops_rigid.rigid_end_backward(f, motion, share, factor, groups, x_bar, *options)
     barrier, by_kappa, friction, by_lag = ops_rigid.rigid_backward(f, end.p, end.q, groups, *options)
-    # of corner points: by where they are, by how they have moved, by p and by q
-    by_x, by_way, by_p, by_q = (torch.zeros_like(end.p) for _ in range(4))
-    if len(barrier):
-        by_x, by_p, by_q = sum_at_corners(barrier, s.listed, *end.p.shape[:2]).split(3, -1)
-    if len(friction):
-        by_way, also_p, also_q = sum_at_corners(friction, s.lagged, *end.p.shape[:2]).split(3, -1)
-        by_p, by_q = by_p + also_p, by_q + also_q
+    # sums over the pairs of each corner point: by where it is (friction: by how it has moved), by p and by q
+    points = end.p.shape[:2]
+    sums = [sum_at_corners(values, listed, *points)
+            for values, listed in ((barrier, s.listed), (friction, s.lagged)) if len(values)]  # fmt: skip
+    to_points, by_p, by_q = (sum(sums[1:], sums[0]) if sums else end.p.new_zeros((*points, 9))).split(3, -1)
     own = ops_rigid.rigid_vertices_backward(f, motion, end.solution, by_p, by_q, *options, wants["energy_data"])
-    to_points = by_x + by_way
-    out = {
-        "x": end.x + own.x - to_points[:, :vertices],
-        "x_prev": own.x_prev + by_way[:, :vertices],
-        "y": own.y,
-        "mass": end.mass + own.mass,
-        "energy_data": own.energy_data,
-        "collider": -to_points[:, vertices:],
-        "collider_prev": by_way[:, vertices:],
-        "kappa": -sum_of_scenes(by_kappa, s.listed, scenes),
-        "lag": -by_lag,
-        "floor_lag": own.floor_lag,
+    by_way = sums[-1][..., :3] if len(friction) else None
+    out: dict[str, Callable[[], Tensor]] = {  # few are wanted, and each is a launch
+        "x": lambda: end.x + own.x - to_points[:, :vertices],
+        "x_prev": lambda: own.x_prev if by_way is None else own.x_prev + by_way[:, :vertices],
+        "y": lambda: own.y,
+        "mass": lambda: end.mass + own.mass,
+        "energy_data": lambda: own.energy_data,
+        "collider": lambda: -to_points[:, vertices:],
+        "collider_prev": lambda: torch.zeros_like(f.collider) if by_way is None else by_way[:, vertices:],
+        "kappa": lambda: -sum_of_scenes(by_kappa, s.listed, scenes),
+        "lag": lambda: -by_lag,
+        "floor_lag": lambda: own.floor_lag,
     }
-    none = f.x.new_empty((0,))
-    bars = [(out.get(name, none), t) for name, t in zip(f._fields, f, strict=True) if wants[name]]
-    return tuple(ops.sum_to(bar, t.shape) if bar.numel() else torch.zeros_like(t) for bar, t in bars)
+    bars = []
+    for name, t in zip(f._fields, f, strict=True):
+        if wants[name]:
+            bar = out[name]() if name in out else t.new_empty((0,))
+            bars.append(ops.sum_to(bar, t.shape) if bar.numel() else torch.zeros_like(t))
+    return tuple(bars)
