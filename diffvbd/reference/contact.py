@@ -42,6 +42,7 @@ class Part(NamedTuple):
     lowest: Tensor | None = None  # [B, bodies, planes] int64: lowest vertex of a body's island above each floor plane
     sweeps: int | None = None  # None: its share of those of the step
     going: Tensor | None = None  # bool [B, 1, 1]: scenes that it is for; None: all
+    resting: Tensor | None = None  # bool [B, V]: vertices that begin without gravity's fall; None: none
 
 
 class Pairs:
@@ -285,6 +286,8 @@ def contact_step(
         fall = lift if r == 0 else torch.zeros_like(lift)
         if r == 0:
             fall = lift = unsupported(scene, listed[0], floor, x_prev, before, lift)
+            if part.resting is not None:
+                fall = lift = torch.where(part.resting.reshape(*x.shape[:-2], 1, -1), 0.0, lift)
         if model.starts_from == "inertia":
             fall = torch.zeros_like(fall)
         begun = at = state

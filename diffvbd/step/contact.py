@@ -32,7 +32,7 @@ from .intersections import refuse_intersections
 from .met import Detection, Met, Outcome, outcomes
 from .motion import Motion, motion_of
 from .rooms import ROOM, rooms, rooms_of_sweeps
-from .unsupported import unsupported
+from .unsupported import rests, unsupported
 
 if TYPE_CHECKING:
     from .arguments import Prepared
@@ -173,7 +173,11 @@ class ContactStep:
                 self._set_lag(pushing, was)
                 fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
                                           self.floor_data, pushing, settings.numbers.time_step)  # fmt: skip
-            falls = r == 0 and self.model.starts_from == "predictor"
+            falls, resting = r == 0 and self.model.starts_from == "predictor", None
+            if falls and pins:
+                resting = rests(self.model, (self.x_prev + way).detach(), lift.detach(), self._raises)
+            if resting is not None:
+                fall = lift = torch.where(resting[..., None], 0.0, lift)
             fall = fall if falls else torch.zeros_like(fall)  # corrections do it
             start = start_between_planes(x, move, fall, self.fields.mass, was, now, self.floor_data, self.origin,
                                          detection, surface, motion.rigid, ROOM * motion.stretched, self._raises,
@@ -207,7 +211,7 @@ class ContactStep:
             met.cut = cut
             met.found[r] = replaced(detection, shares=start.shares, corrections=torch.stack(taken), limits=limits,
                                     kept=kept, frames=start.frames, combined=combined, lengths=lengths,
-                                    sweeps=sweeps, going=going)  # fmt: skip
+                                    sweeps=sweeps, going=going, resting=resting)  # fmt: skip
             r += 1
             may_go_on = barrier.detections is None and settings.sweeps > 0 and not is_captured(x)
             if may_go_on and r == self.parts < MOST_DETECTIONS:

@@ -38,6 +38,7 @@ class Detection(NamedTuple):
     kept: Tensor | None = None  # rows of listed pairs that its sweeps can reach; all where that would have to be read
     sweeps: int = 0
     going: Tensor | None = None  # bool [B, 1, 1]: scenes that go on in a part beyond those that were planned
+    resting: Tensor | None = None  # bool [B, V]: vertices of held bodies that begin without gravity's fall; None: none
 
 
 class Outcome(NamedTuple):

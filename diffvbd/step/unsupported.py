@@ -3,8 +3,10 @@
 # pyright: reportIncompatibleMethodOverride=false
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from .. import ops
@@ -79,3 +81,25 @@ def unsupported(model: Model, x: Tensor, origin: Tensor, collider: Tensor, kappa
     at = x.detach() if floor_data is None else x  # without a floor only forces know where vertices are
     given = (t.contiguous() for t in (at, lift, total, mass, planes))
     return _Unsupported.apply(*given, origin, constants)
+
+
+def rests(model: Model, x: Tensor, lift: Tensor, raises: Callable[[Tensor, Tensor], Tensor]) -> Tensor | None:
+    """Which vertices are of bodies that are held somewhere and whose potential ``lift`` would raise, bool [B, V]; None
+    without such bodies. Elasticity bears the weight of a body at rest, and its potential is convex about there: it
+    rises by any fall. Few sweeps do not take the fall back, and what stands on such a body would follow it.
+
+    Args:
+        x: Where vertices are without the fall, [B, V, 3] [m].  lift: As :func:`unsupported` returns it.
+        raises: As for :func:`diffvbd.contact.start.start_between_planes`.
+    """
+    held = model.derived("partly_held", lambda: _partly_held(model))
+    return None if held is None else raises(x, x + lift) & held
+
+
+def _partly_held(model: Model) -> Tensor | None:
+    """The vertices of bodies of which some are pinned and some not, bool [V]."""
+    pinned, body = model._pinned.cpu(), model.body.cpu()
+    count = int(body.max()) + 1
+    some, all_of = (torch.zeros(count, dtype=torch.int64).index_add(0, body, p.long()) for p in (pinned, pinned | True))
+    found = ((0 < some) & (some < all_of))[body]
+    return found.to(model.device) if bool(found.any()) else None

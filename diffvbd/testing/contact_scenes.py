@@ -175,8 +175,19 @@ def held_up() -> Scene:
     return scene
 
 
+def on_held() -> Scene:
+    """Two scenes of a box on one whose bottom is pinned; in the first it is stiff and rests, in the second it falls."""
+    tets = boxes((0, 0, 0), (0.03, 0.213, 0.02), points=2)
+    barrier = PairBarrier(kappa=3e4, dhat=0.02, self_contact=False, damping=1.0)
+    scene = build("on_held", tets, (barrier, Friction(0.4, 0.05)), batch=(2,), speed=0.02, jitter=1e-5,
+                  pinned=(tets.body == 0) & (tets.points[:, 1] < 1e-9))  # fmt: skip
+    for modulus in ("mu", "lam"):
+        scene.inputs[modulus] = scene.inputs[modulus] * torch.tensor([[100.0], [1.0]], dtype=torch.float64)
+    return scene
+
+
 SCENES: dict[str, Callable[[], Scene]] = {f.__name__: f for f in (stacked, crossed, fast, folded, obstacles, batched,
-                                                                 thrown, held_up)}  # fmt: skip
+                                                                 thrown, held_up, on_held)}  # fmt: skip
 
 
 def part_of(detection: Any) -> reference.Part:
@@ -197,8 +208,8 @@ def part_of(detection: Any) -> reference.Part:
                           None if detection.frames is None else detection.frames.cpu(), lowest=lowest,
                           lengths=None if detection.lengths is None else detection.lengths.cpu(),
                           combined=None if detection.combined is None else tuple(t.cpu() for t in detection.combined),
-                          sweeps=detection.sweeps, going=None if detection.going is None else detection.going.cpu()
-                          )  # fmt: skip
+                          sweeps=detection.sweeps, going=None if detection.going is None else detection.going.cpu(),
+                          resting=None if detection.resting is None else detection.resting.cpu())  # fmt: skip
 
 
 def split(leaves: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
