@@ -21,7 +21,7 @@ GAIN = 0.05  # of the energy that a scene had and that gravity gave it, which a 
 GAIN_TOUCHING = 1.0  # the same where barriers are: what is pressed together at the start may come apart
 WARNED = "warned_of_energy"  # of a Model's _derived: one warning is enough for all of its rollouts
 ENDED = "ended"  # the same, on CUDA: whether its latest rollouts ended finite, on the way to the host
-LOOKS, LOOKS_TOUCHING = 3, 64  # at a rollout, unasked
+LOOKS, LOOKS_ON_FLOOR, LOOKS_TOUCHING = 3, 12, 64  # at a rollout, unasked
 SEEN = "rollouts_seen"  # the same: its rollouts that could have been looked at
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: its looks cost as much as some steps
 CHUNKS, LEAST_CHUNK = 8, 256  # of the tets, one after another, so that a look needs little memory
@@ -147,8 +147,9 @@ def look_at_energy(asked: bool | None, model: Model, x: Tensor, v: Tensor, steps
 
 def _looked_at(asked: bool | None, model: Model, steps: int) -> frozenset[int]:
     """Which of so many steps: all where one asks; where bodies may hit something, whose gain may be over in a step, as
-    many as cost little beside steps with contact."""
-    count = steps if asked else min(steps, LOOKS_TOUCHING) if model.touches else LOOKS
+    many as cost little beside such steps."""
+    looks = LOOKS_TOUCHING if model.touches else LOOKS if model.floor is None else LOOKS_ON_FLOOR
+    count = steps if asked else min(steps, looks)
     return frozenset(round(1 + k * (steps - 1) / max(1, count - 1)) for k in range(count))
 
 

@@ -174,7 +174,7 @@ class ContactStep:
                 fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
                                           self.floor_data, pushing, settings.numbers.time_step)  # fmt: skip
             falls, resting = r == 0 and self.model.starts_from == "predictor", None
-            if falls and pins:
+            if falls and pins and self.model.start == "auto":
                 resting = rests(self.model, (self.x_prev + way).detach(), lift.detach(), self._raises)
             if resting is not None:
                 fall = lift = torch.where(resting[..., None], 0.0, lift)
