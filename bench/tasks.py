@@ -83,9 +83,7 @@ here, states the protocol. Figures in the tables come from the logs in `bench/re
 `python -m bench tasks` writes and `python -m bench report` turns into this page; those of the paper are in
 `bench/paper.py`.
 
-The logs of dress-size, dress-silhouette and cover-the-spot on the GPU are older than contact by planes. While that of
-throw on the GPU was made, three other runs shared the device, which made it about six times as long; while that of
-cover-the-spot on the CPU was made, the machine did other work.
+While the log of cover-the-spot on the CPU was made, the machine did other work.
 
 Times are those of the optimisation, without pictures. Runs are repeatable: on one device the same seed gives the same
 numbers, bit by bit. Only parts that run for a given time, such as CMA-ES in learn-controller, depend on the speed of
