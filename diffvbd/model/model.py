@@ -59,7 +59,7 @@ class Model:
             friction, which have a correction of their own.
         start: Where the sweeps of the other bodies start: ``"predictor"`` (y, with gravity and forces), ``"inertia"``
             (x + h v, right for stiff pinned bodies that few sweeps hardly move) or ``"auto"``: for each body and step
-            the one of lower incremental potential; beside pairs and friction the predictor, with coarse x + h v.
+            the one of lower incremental potential; with coarse x + h v. Beside pairs it is decided of gravity alone.
         coarse: Corrections between the sweeps, for what is stiff, long, thin or finely meshed: None, a
             :class:`diffvbd.CoarseSpace`, or ``"auto"``, which is ``CoarseSpace()``.
         acceleration: None, or a :class:`diffvbd.Anderson`, which combines the iterates of each step.
@@ -169,7 +169,8 @@ class Model:
         """Where the sweeps of bodies that are not corrected start; "auto" only where there is something to choose."""
         if self.start != "auto" or self.coarse is not None:  # corrections do what the predictor is for
             return "inertia" if self.start == "auto" else self.start
-        return "predictor" if self.touches or not self._other_bodies.number else "auto"
+        # beside pairs a step decides it itself, of gravity's fall alone: step/unsupported.py
+        return "predictor" if self.contact is not None or not self._other_bodies.number else "auto"
 
     @property
     def rest_scalars(self) -> Tensor:

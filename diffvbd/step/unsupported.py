@@ -100,6 +100,7 @@ def _partly_held(model: Model) -> Tensor | None:
     """The vertices of bodies of which some are pinned and some not, bool [V]."""
     pinned, body = model._pinned.cpu(), model.body.cpu()
     count = int(body.max()) + 1
-    some, all_of = (torch.zeros(count, dtype=torch.int64).index_add(0, body, p.long()) for p in (pinned, pinned | True))
-    found = ((0 < some) & (some < all_of))[body]
+    none = body.new_zeros((count,))
+    some, whole = (none.index_add(0, body, p.to(body)) for p in (pinned, torch.ones_like(pinned)))
+    found = ((0 < some) & (some < whole))[body]
     return found.to(model.device) if bool(found.any()) else None
