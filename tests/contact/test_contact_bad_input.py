@@ -151,7 +151,6 @@ def test_model(options: dict[str, Any], name: str, got: str) -> None:
         ({"colliders_before": torch.zeros(4, 1, 3).double()}, "colliders_before", r"\[4, 1, 3\]"),
         ({"colliders_before": torch.zeros(1, 3).int()}, "colliders_before", "int32"),
         ({"colliders_before": torch.full((1, 3), 1e10).double()}, "colliders_before", r"1e\+10"),
-        ({"parameters": {"pair_barrier.dhat": 0.1}}, "parameters", "pair_barrier.dhat"),
         ({"parameters": {"friction.velocity": 0.1}}, "parameters", "friction.velocity"),
         ({"parameters": {"friction.coefficient": torch.ones(2).double()}}, "friction.coefficient", r"\[2\]"),
         ({"parameters": {"pair_barrier.dhat": 0.01}}, "parameters", r"a constant: PairBarrier\(dhat=...\) sets it"),
