@@ -23,7 +23,7 @@ inline int64_t corrected_bodies(const BeginFields& f) { return f.ptr.numel() - 1
 inline int32_t other_bodies(const BeginFields& f) { return static_cast<int32_t>(f.other_ptr.numel() - 1); }
 struct BeginSettings {
   const std::vector<int64_t>& data_count;
-  double time_step, filter_eta;
+  double time_step, filter_eta, chord;
   int64_t from;
   bool filters;
 };
@@ -59,6 +59,8 @@ start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, cons
   in.from = static_cast<int>(q.from);
   in.some_alone = t.order.numel() < v;
   in.filters = q.filters;
+  require(q.chord > 0, "diffvbd::begin: expected chord > 0");
+  in.chord = q.chord;
   in.parameters.time_step = T(q.time_step);
   in.parameters.filter_eta = T(q.filter_eta);
   return in;

@@ -45,6 +45,14 @@ contact::MotionInputs<T> motion_inputs(const MotionTensors& t, const Tensor& fal
   return in;
 }
 
+// What coasting reads. It asks for no origin, which all vertices of a body have in common.
+template <class T>
+contact::MotionInputs<T> coast_inputs(const Tensor& x, const Tensor& mass, const Tensor& move, const Tensor& held,
+                                      const Tensor& held_bodies, const Tensor& order, const Tensor& ptr, double chord) {
+  require(chord > 0, "diffvbd::contact_coast: expected chord > 0");
+  return motion_inputs<T>({x, {}, mass, move, held, order, ptr}, {}, held_bodies);
+}
+
 // What rooms read beside motions and islands; floor may be empty.
 struct RoomTensors {
   const Tensor &rigid, &ways, &sums, &floor, &most, &most_alone, &most_own, &least_own;

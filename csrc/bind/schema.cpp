@@ -166,18 +166,18 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "Tensor motion, Tensor solution, Tensor by_p, Tensor by_q, int[] data_count, float time_step, float "
          "friction_eps, bool wants_data",
          "Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own, Tensor floor_lag, ");
-  // Predictor and start of the sweeps. start: of the bodies that are not corrected, 0 x + h v, 1 y, 2 the lower
-  // potential of the two; falls [scenes, other bodies]: 1 where that is y; alone [scenes, bodies]: with parts, 1
-  // where the vertices of a body that is corrected start each by itself
+  // Predictor and start of the sweeps. chord: as in rigid/coast.h. start: of the bodies that are not corrected, 0 x + h
+  // v, 1 y, 2 the lower potential of the two; falls [scenes, other bodies]: 1 where that is y; alone [scenes, bodies]:
+  // with parts, 1 where the vertices of a body that is corrected start each by itself
   define(m, "begin", DIFFVBD_ARGUMENTS(BEGIN),
-         "int[] groups, int[] other_groups, int[] data_count, float time_step, float filter_eta, int start, bool "
-         "filters, bool parts",
+         "int[] groups, int[] other_groups, int[] data_count, float time_step, float filter_eta, float chord, "
+         "int start, bool filters, bool parts",
          "Tensor x_start, Tensor y, Tensor falls, Tensor alone, ");
   // wants: acceleration, prescribed, energy_data. Of data: from corrections as of rigid_backward(), and of the planes
   // by vertex [scenes, vertices, scalars of the planes]
   define(m, "begin_backward", DIFFVBD_ARGUMENTS(BEGIN),
          "Tensor x_start_bar, Tensor y_bar, Tensor falls, Tensor alone, int[] groups, int[] data_count, float "
-         "time_step, float filter_eta, int start, bool filters, bool[] wants",
+         "time_step, float filter_eta, float chord, int start, bool filters, bool[] wants",
          "Tensor x, Tensor v, Tensor acceleration, Tensor prescribed, Tensor mass, Tensor shared, Tensor own, Tensor "
          "planes, ");
   // The Cholesky factors (CUDA: inverses) of the matrices of all bodies, one after the other; adjoints of x_prev,
@@ -243,6 +243,13 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   m.def(
       "contact_motion_backward(Tensor bar, Tensor x, Tensor origin, Tensor mass, Tensor move, Tensor held, Tensor "
       "held_bodies, Tensor order, Tensor ptr) -> (Tensor x, Tensor move, Tensor mass)");
+  // The ways of `move`, of free bodies without what stretches them, see contact/coast.h
+  m.def(
+      "contact_coast(Tensor x, Tensor mass, Tensor move, Tensor held, Tensor held_bodies, Tensor order, Tensor ptr, "
+      "float chord) -> Tensor");
+  m.def(
+      "contact_coast_backward(Tensor bar, Tensor x, Tensor mass, Tensor move, Tensor held, Tensor held_bodies, Tensor "
+      "order, Tensor ptr, float chord) -> (Tensor x, Tensor mass, Tensor move)");
   // How far bodies may go until pairs are found again, see contact/rooms.h: their islands [B, bodies] int32, rooms and
   // rooms of their own [B, bodies + 1], and how far they want to go over the most room [B, bodies]
   m.def(

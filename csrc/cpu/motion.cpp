@@ -19,6 +19,18 @@ void reverse_motion(const MotionInputs<T>& in, const MotionAdjoints<T>& a) {
 }
 
 template <class T>
+void coast(const MotionInputs<T>& in, double chord, T* coasted) {
+  for_bodies<MovingBody>(in,
+                         [&](const MovingBody<T>& b, const Threads& team) { contact::coast(b, team, chord, coasted); });
+}
+
+template <class T>
+void reverse_coast(const MotionInputs<T>& in, double chord, const MotionAdjoints<T>& a) {
+  for_bodies<MovingBody>(
+      in, [&](const MovingBody<T>& b, const Threads& team) { contact::reverse_coast(b, team, chord, a); });
+}
+
+template <class T>
 void find_rooms(RoomInputs<T> in, const RoomWork<T>& work) {
   const int64_t scenes = in.motion.scenes;
   const auto each = [&](const auto& f) {
@@ -44,9 +56,11 @@ void find_rooms(RoomInputs<T> in, const RoomWork<T>& work) {
   for (int64_t scene = 0; scene < scenes; ++scene) largest_of_scene(in, scene, one, work);
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                       \
-  template void find_motion<T>(const MotionInputs<T>&, T*, T*, T*);                  \
-  template void reverse_motion<T>(const MotionInputs<T>&, const MotionAdjoints<T>&); \
+#define DIFFVBD_INSTANTIATE(T)                                                              \
+  template void find_motion<T>(const MotionInputs<T>&, T*, T*, T*);                         \
+  template void reverse_motion<T>(const MotionInputs<T>&, const MotionAdjoints<T>&);        \
+  template void coast<T>(const MotionInputs<T>&, double, T*);                               \
+  template void reverse_coast<T>(const MotionInputs<T>&, double, const MotionAdjoints<T>&); \
   template void find_rooms<T>(RoomInputs<T>, const RoomWork<T>&);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

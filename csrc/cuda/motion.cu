@@ -37,6 +37,22 @@ struct Reverse {
   }
 };
 template <class T>
+struct Coast {
+  double chord;
+  T* coasted;
+  __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
+    contact::coast(b, team, chord, coasted);
+  }
+};
+template <class T>
+struct ReverseCoast {
+  double chord;
+  MotionAdjoints<T> a;
+  __device__ void operator()(const MovingBody<T>& b, const BlockTeam& team) const {
+    contact::reverse_coast(b, team, chord, a);
+  }
+};
+template <class T>
 struct Wish {
   RoomInputs<T> in;
   RoomWork<T> work;
@@ -85,6 +101,16 @@ cudaError_t reverse_motion(const MotionInputs<T>& in, const MotionAdjoints<T>& a
 }
 
 template <class T>
+cudaError_t coast(const MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream) {
+  return for_bodies(in, Coast<T>{chord, coasted}, stream);
+}
+
+template <class T>
+cudaError_t reverse_coast(const MotionInputs<T>& in, double chord, const MotionAdjoints<T>& a, cudaStream_t stream) {
+  return for_bodies(in, ReverseCoast<T>{chord, a}, stream);
+}
+
+template <class T>
 cudaError_t find_rooms(RoomInputs<T> in, const RoomWork<T>& work, void* islands, cudaStream_t stream) {
   const auto scenes = static_cast<unsigned>(in.motion.scenes);
   const int64_t bodies = in.motion.scenes * in.motion.bodies;
@@ -105,9 +131,11 @@ cudaError_t find_rooms(RoomInputs<T> in, const RoomWork<T>& work, void* islands,
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                            \
-  template cudaError_t find_motion<T>(const MotionInputs<T>&, T*, T*, T*, cudaStream_t);                  \
-  template cudaError_t reverse_motion<T>(const MotionInputs<T>&, const MotionAdjoints<T>&, cudaStream_t); \
+#define DIFFVBD_INSTANTIATE(T)                                                                                   \
+  template cudaError_t find_motion<T>(const MotionInputs<T>&, T*, T*, T*, cudaStream_t);                         \
+  template cudaError_t reverse_motion<T>(const MotionInputs<T>&, const MotionAdjoints<T>&, cudaStream_t);        \
+  template cudaError_t coast<T>(const MotionInputs<T>&, double, T*, cudaStream_t);                               \
+  template cudaError_t reverse_coast<T>(const MotionInputs<T>&, double, const MotionAdjoints<T>&, cudaStream_t); \
   template cudaError_t find_rooms<T>(RoomInputs<T>, const RoomWork<T>&, void*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

@@ -3,6 +3,7 @@
 
 #include <cuda_runtime_api.h>
 
+#include "../contact/coast.h"
 #include "../contact/rooms.h"
 
 namespace diffvbd::cuda {
@@ -12,6 +13,12 @@ cudaError_t find_motion(const contact::MotionInputs<T>& in, T* rigid, T* ways, T
 template <class T>
 cudaError_t reverse_motion(const contact::MotionInputs<T>& in, const contact::MotionAdjoints<T>& a,
                            cudaStream_t stream);
+
+template <class T>
+cudaError_t coast(const contact::MotionInputs<T>& in, double chord, T* coasted, cudaStream_t stream);
+template <class T>
+cudaError_t reverse_coast(const contact::MotionInputs<T>& in, double chord, const contact::MotionAdjoints<T>& a,
+                          cudaStream_t stream);
 
 // islands: memory of islands_workspace_bytes().
 template <class T>

@@ -1,10 +1,11 @@
 // Where a step begins: the predictor y = x + h v + h^2 a, and where the sweeps start. The vertices of a body that is
-// corrected coast together, x + s h v with one share s, as far as planes let them, and are corrected; every other
-// vertex, and in short steps those of a body that planes hold back (part.h), goes toward x + h v or y as far as planes
-// let it alone (docs/method.md, sections 6 and 14). With the adjoint.
+// corrected coast together, one share s of their ways (rigid/coast.h), as far as planes let them, and are corrected;
+// every other vertex, and in short steps those of a body that planes hold back (part.h), goes toward x + h v or y as
+// far as planes let it alone (docs/method.md, sections 6 and 14). With the adjoint.
 #pragma once
 
 #include "../energies/floor_start.h"
+#include "../rigid/coast.h"
 #include "../rigid/reverse.h"
 
 namespace diffvbd::start {
@@ -26,6 +27,7 @@ struct Inputs {
   int from;
   bool some_alone;  // whether some vertices are in no body that is corrected
   bool filters;     // whether planes hold back a start
+  double chord;     // of rigid/coast.h
   StepParameters<T> parameters;
 
   DIFFVBD_FN static Vec3<T> at(const Batched<const T>& a, int64_t scene, int32_t v) {
@@ -133,7 +135,19 @@ DIFFVBD_FN void reverse_vertex(const Inputs<T>& in, const Adjoints<T>& a, int64_
   if (in.bodies.other[v] != kCorrected) reverse_alone(in, a, scene, v, in.starts_from_y(scene, v));
 }
 
-// What planes leave of the share 1 of h v that a vertex of a body coasts.
+// A body by its state before the step and the ways h v of its vertices.
+template <class T>
+struct Leaving {
+  const Inputs<T>& in;
+  const Body<T>& b;
+  DIFFVBD_FN int32_t size() const { return b.size(); }
+  DIFFVBD_FN double mass(int32_t i) const { return b.mass(b.vertex(i)); }
+  DIFFVBD_FN static Vector wide(const Vec3<T>& a) { return {double(a.x), double(a.y), double(a.z)}; }
+  DIFFVBD_FN Vector position(int32_t i) const { return wide(in.at(in.x, b.scene, b.vertex(i))); }
+  DIFFVBD_FN Vector way(int32_t i) const { return in.bodies.time_step * wide(in.at(in.v, b.scene, b.vertex(i))); }
+};
+
+// What planes leave of the share 1 of its way that a vertex of a body coasts.
 template <class T>
 struct Room {
   using Plane = FloorBarrier::Plane<double>;
@@ -143,11 +157,8 @@ struct Room {
   double slack;  // a motion along a plane is none toward it, however it rounds
   int32_t v;
 
-  DIFFVBD_FN Room(const Inputs<T>& inputs, const Body<T>& body, int32_t vertex) : in(inputs), b(body), v(vertex) {
-    const Motion<T> m(in, b.scene, v);
-    const Vec3<T> way = m.coasting - m.x;
-    x = {double(m.x.x), double(m.x.y), double(m.x.z)};
-    step = {double(way.x), double(way.y), double(way.z)};
+  DIFFVBD_FN Room(const Leaving<T>& body, const rigid::Coasting& coasting, int32_t i)
+      : in(body.in), b(body.b), x(body.position(i)), step(coasting.way(body, i)), v(body.b.vertex(i)) {
     slack = 8 * double(std::numeric_limits<T>::epsilon()) * std::sqrt(dot(step, step));
   }
   // calls f(plane, its number, the share that it leaves)
@@ -176,49 +187,56 @@ struct Room {
   }
 };
 
-// The share of h v that all vertices of a body take; 0 where rounding would close a gap.
+// The share of their ways that all vertices of a body take; 0 where rounding would close a gap.
 template <class T, class Team>
-DIFFVBD_FN double share_of(const Inputs<T>& in, const Body<T>& b, const Team& team) {
+DIFFVBD_FN double share_of(const Leaving<T>& b, const rigid::Coasting& coasting, const Team& team) {
   const double share = team.least(b.size(), [&](int32_t i) {
     double least = 1;
-    Room<T>(in, b, b.vertex(i)).each([&](const auto&, int, double own) { least = own < least ? own : least; });
+    Room<T>(b, coasting, i).each([&](const auto&, int, double own) { least = own < least ? own : least; });
     return least;
   });
   double lost[1];
-  team.template sum<1>(b.size(), lost,
-                       [&](int32_t i, double* to) { to[0] += Room<T>(in, b, b.vertex(i)).lost(share); });
+  team.template sum<1>(b.size(), lost, [&](int32_t i, double* to) { to[0] += Room<T>(b, coasting, i).lost(share); });
   return lost[0] > 0 ? 0 : share;
 }
 
-// Writes y and where a body has coasted to; returns its share. b reads what is written here once the team has met.
+struct Coasted {
+  rigid::Coasting ways;
+  double share;  // of them
+};
+
+// Writes y and where a body has coasted to. b reads what is written here once the team has met.
 template <bool energies, class T, class Team>
-DIFFVBD_FN double coast(const Inputs<T>& in, const Body<T>& b, const Team& team, T* x, T* y) {
-  const double share = energies && in.filters ? share_of(in, b, team) : 1;
+DIFFVBD_FN Coasted coast(const Inputs<T>& in, const Body<T>& b, const Team& team, T* x, T* y) {
+  const Leaving<T> body{in, b};
+  const rigid::Coasting ways = rigid::coasting_of(body, team, in.chord);
+  const double share = energies && in.filters ? share_of(body, ways, team) : 1;
   team.each(b.size(), [&](int32_t i) {
     const int32_t v = b.vertex(i);
     const int64_t at = 3 * b.row(v);
     const Motion<T> m(in, b.scene, v);
-    const Vec3<T> start = share < 1 ? m.x + T(share) * (m.coasting - m.x) : m.coasting;
-    x[at] = start.x, x[at + 1] = start.y, x[at + 2] = start.z;
+    put(x + at, body.position(i) + share * ways.way(body, i));
     y[at] = m.y.x, y[at + 1] = m.y.y, y[at + 2] = m.y.z;
   });
   team.meet();
-  return share;
+  return {ways, share};
 }
 
 // held, if not null, receives whether planes hold the body back.
 template <bool energies, class T, class Team>
 DIFFVBD_FN void begin_body(const Inputs<T>& in, const Body<T>& b, const Team& team, T* x_start, T* y, uint8_t* held) {
-  const double share = coast<energies>(in, b, team, x_start, y);
+  const double share = coast<energies>(in, b, team, x_start, y).share;
   if (held != nullptr && team.leads()) held[b.scene * in.bodies.bodies + b.body] = share < 1;
   rigid::correct<energies>(b, team, nullptr, x_start);
 }
 
-// The adjoint of a share: of x, v and the planes that set it, evenly where several do.
+// The adjoint of a share: of x, the ways [B, V, 3] and the planes that set it, evenly where several do.
 template <class T, class Team>
-DIFFVBD_FN void reverse_share(const Inputs<T>& in, const Body<T>& b, const Team& team, double share, double share_bar,
+DIFFVBD_FN void reverse_share(const Leaving<T>& body, const Team& team, const Coasted& c, double share_bar, T* way_bar,
                               const Adjoints<T>& a) {
-  const double h = in.bodies.time_step;
+  const Inputs<T>& in = body.in;
+  const Body<T>& b = body.b;
+  const double share = c.share;
   const auto ties = [&](const Room<T>& room) {
     int count = 0;
     room.each([&](const auto&, int, double own) { count += own == share; });
@@ -226,11 +244,11 @@ DIFFVBD_FN void reverse_share(const Inputs<T>& in, const Body<T>& b, const Team&
   };
   double binding[1];
   team.template sum<1>(b.size(), binding,
-                       [&](int32_t i, double* to) { to[0] += ties(Room<T>(in, b, b.vertex(i))) > 0 ? 1 : 0; });
+                       [&](int32_t i, double* to) { to[0] += ties(Room<T>(body, c.ways, i)) > 0 ? 1 : 0; });
   team.each(b.size(), [&](int32_t i) {
     const int32_t v = b.vertex(i);
     const int64_t row = b.row(v);
-    const Room<T> room(in, b, v);
+    const Room<T> room(body, c.ways, i);
     const int tied = ties(room);
     if (tied == 0) return;
     const double bar = share_bar / (binding[0] * tied);
@@ -240,7 +258,7 @@ DIFFVBD_FN void reverse_share(const Inputs<T>& in, const Body<T>& b, const Team&
       const double closing_bar = -bar * share / closing;
       const double gap_bar = wide >= 0 ? double(in.parameters.filter_eta) * bar / closing : 0;
       rigid::add_to(a.x + 3 * row, gap_bar * plane.n);
-      rigid::add_to(a.v + 3 * row, (-h * closing_bar) * plane.n);
+      rigid::add_to(way_bar + 3 * row, (-closing_bar) * plane.n);
       if (a.planes == nullptr) return;
       const Vector world = room.x + b.state(v, room.x).origin, n_bar = gap_bar * world + (-closing_bar) * room.step;
       const double values[] = {n_bar.x, n_bar.y, n_bar.z, -gap_bar, 0, -gap_bar};
@@ -250,8 +268,8 @@ DIFFVBD_FN void reverse_share(const Inputs<T>& in, const Body<T>& b, const Team&
   });
 }
 
-// Transpose of begin_body() and part_body(). x and y, [B, V, 3], receive what b reads; a.v holds what the correction
-// sends to y first.
+// Transpose of begin_body() and part_body(). x and y, [B, V, 3], receive what b reads, and then y the adjoint of the
+// ways; a.v holds what the correction sends to y first, and then all that y has.
 template <bool energies, class T, class Team>
 DIFFVBD_FN void reverse_body(const Inputs<T>& in, const Body<T>& b, const Team& team, rigid::Iteration* record, T* x,
                              T* y, const Adjoints<T>& a) {
@@ -262,24 +280,42 @@ DIFFVBD_FN void reverse_body(const Inputs<T>& in, const Body<T>& b, const Team& 
     });
     return;
   }
-  const double share = coast<energies>(in, b, team, x, y), h = in.bodies.time_step;
+  const Leaving<T> body{in, b};
+  const Coasted c = coast<energies>(in, b, team, x, y);
+  const double share = c.share, h = in.bodies.time_step;
   rigid::reverse<energies>(b, team, record,
                            {a.x_start, nullptr, a.x, energies ? a.x_prev : nullptr, a.v, a.mass, a.shared, a.own,
                             a.shared_count, a.own_count});
   double share_bar[1];
+  T* way_bar = y;
+  team.meet();
   team.template sum<1>(b.size(), share_bar, [&](int32_t i, double* to) {
     const int32_t v = b.vertex(i);
     const int64_t row = b.row(v);
     const Vector coasted = Body<T>::at(a.x + 3 * row), y_bar = Body<T>::at(a.v + 3 * row) + Body<T>::at(a.y + 3 * row);
-    if (share < 1) to[0] += dot(coasted, Room<T>(in, b, v).step);
+    if (share < 1) to[0] += dot(coasted, c.ways.way(body, i));
     put(a.x + 3 * row, coasted + y_bar + (energies ? Body<T>::at(a.x_prev + 3 * row) : Vector{}));
-    put(a.v + 3 * row, h * (share * coasted + y_bar));
+    put(way_bar + 3 * row, share * coasted);
+    put(a.v + 3 * row, y_bar);
     if (a.acceleration) put(a.acceleration + 3 * row, (h * h) * y_bar);
     if (a.prescribed) put(a.prescribed + 3 * row, Vector{});
   });
   if constexpr (energies) {
-    if (0 < share && share < 1) reverse_share(in, b, team, share, share_bar[0], a);
+    if (0 < share && share < 1) reverse_share(body, team, c, share_bar[0], way_bar, a);
   }
+  double mean_bar[3];
+  const auto bend_bar = [&](int32_t i) { return Body<T>::at(way_bar + 3 * b.row(b.vertex(i))); };
+  team.template sum<3>(b.size(), mean_bar, [&](int32_t i, double* to) {
+    const Vector bar = bend_bar(i);
+    to[0] += bar.x, to[1] += bar.y, to[2] += bar.z;
+  });
+  rigid::reverse_coasting(body, team, c.ways, {mean_bar[0], mean_bar[1], mean_bar[2]}, bend_bar,
+                          [&](int32_t i, const Vector& x_bar, const Vector& bar, double mass_bar) {
+                            const int64_t row = b.row(b.vertex(i));
+                            rigid::add_to(a.x + 3 * row, x_bar);
+                            put(a.v + 3 * row, h * (bar + Body<T>::at(a.v + 3 * row)));
+                            a.mass[row] = static_cast<T>(a.mass[row] + mass_bar);
+                          });
 }
 
 }  // namespace diffvbd::start

@@ -29,7 +29,7 @@ def _(*arguments):
 @shapes_of("begin_backward")
 def _(*arguments):
     f = BeginFields(*arguments[:_FIELDS])
-    _, _, _, _, _, data_count, _, _, _, filters, wants = arguments[_FIELDS:]
+    _, _, _, _, _, data_count, _, _, _, _, filters, wants = arguments[_FIELDS:]
     x, (b, v) = f.x, f.x.shape[:2]
     shared, own = scalars_of_data(data_count)
 

@@ -49,6 +49,27 @@ def contact_motion_backward(bar: Tensor, x: Tensor, origin: Tensor, mass: Tensor
     return raw.contact_motion_backward(bar, x, origin, mass, move, held, held_bodies, order, ptr)
 
 
+def contact_coast(x: Tensor, mass: Tensor, move: Tensor, held: Tensor, held_bodies: Tensor, order: Tensor, ptr: Tensor,
+                  chord: float) -> Tensor:  # fmt: skip
+    """``move`` [B, V, 3] [m], of free bodies without the stretch of straight lines: their shape goes on by what is not a
+    turn, and the turn is one of the whole body.
+
+    Args:
+        x: [B, V, 3] [m].  mass: [1 | B, V] [kg].  move, held, held_bodies, order, ptr: As for :func:`contact_motion`.
+        chord: How far back along its way a vertex is taken to have been, over that way.
+
+    Raises:
+        ValueError: A tensor with the wrong shape, dtype or device, or chord <= 0.
+    """
+    return raw.contact_coast(x, mass, move, held, held_bodies, order, ptr, chord)
+
+
+def contact_coast_backward(bar: Tensor, x: Tensor, mass: Tensor, move: Tensor, held: Tensor, held_bodies: Tensor,
+                           order: Tensor, ptr: Tensor, chord: float) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Adjoints of x [B, V, 3], of mass [B, V] and of move [B, V, 3]."""
+    return raw.contact_coast_backward(bar, x, mass, move, held, held_bodies, order, ptr, chord)
+
+
 class RoomsOfBodies(NamedTuple):
     """How far the vertices of bodies may go until pairs are found again. Index data."""
 
@@ -95,6 +116,16 @@ def _(bar, x, origin, mass, move, held, held_bodies, order, ptr):
     return torch.empty_like(x), torch.empty_like(x), x.new_empty(x.shape[:2])
 
 
+@shapes_of("contact_coast")
+def _(x, mass, move, held, held_bodies, order, ptr, chord):
+    return torch.empty_like(x)
+
+
+@shapes_of("contact_coast_backward")
+def _(bar, x, mass, move, held, held_bodies, order, ptr, chord):
+    return torch.empty_like(x), x.new_empty(x.shape[:2]), torch.empty_like(x)
+
+
 @shapes_of("contact_rooms")
 def _(x, origin, mass, move, held, order, ptr, rigid, ways, sums, floor, collider, collider_next, planes, body, radius,
       most, most_alone, most_own, least_own, dhat, share, least, any_direction, self_contact):  # fmt: skip
@@ -103,5 +134,5 @@ def _(x, origin, mass, move, held, order, ptr, rigid, ways, sums, floor, collide
     return island, *(x.new_empty((b, bodies + 1)) for _ in range(2)), x.new_empty((b, bodies))
 
 
-for _name in ("contact_motion", "contact_motion_backward", "contact_rooms"):
+for _name in ("contact_motion", "contact_motion_backward", "contact_coast", "contact_coast_backward", "contact_rooms"):
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

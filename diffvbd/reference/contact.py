@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from .contact_cycles import in_cycles
-from .contact_start import SHORT, Translation, above_floor, corner_points, rigid_way, unsupported
+from .contact_start import SHORT, Translation, above_floor, coasted, corner_points, rigid_way, unsupported
 from .distance import EDGE_EDGE, distance, log_barrier, mollifier, with_gradient
 from .energies import FADE, FloorBarrier, build_energies
 from .friction import floor_friction, smoothed, tangential6
@@ -237,13 +237,15 @@ def contact_step(
     colliders_before: Tensor | None = None,
     order: Sequence[Tensor] | None = None,
     tet_order: Tensor | None = None,
+    chord: float = 1.0,
 ) -> tuple[Tensor, Tensor]:
     """One time step of a model with `model.contact`; every tensor argument is differentiable by autograd.
 
     Arguments of `step`, and: parts, one for each detection, scenes counted in
     row-major order of x's leading dimensions; colliders and colliders_before: positions [..., Vc, 3] [m] of collider
     points at the end and at the start of the step, by default `model.collider_points` and `colliders`; order: one
-    permutation of the pairs for each part, tet_order one of the tets: they change only the order of summation.
+    permutation of the pairs for each part, tet_order one of the tets: they change only the order of summation; chord:
+    how far back along its way h v a vertex is taken to have been, 1 where v = (x - x_prev) / h.
     parameters may hold "pair_barrier.kappa" [N/m], "pair_barrier.damping" [N s/m] and "friction.coefficient".
     Raises ValueError when an unpinned vertex starts below a floor plane, or when parts or order have another length.
     Returns (x', v').
@@ -279,7 +281,7 @@ def contact_step(
     coasting = torch.where(pinned, y, x_prev + time_step * v.transpose(-1, -2))
     way, lift, state = coasting - x_prev, y - coasting, x_prev
     free = torch.zeros(int(model.body.max()) + 1).to(x).index_add(0, model.body, pinned.to(x))[model.body] == 0
-    left = way
+    way = left = coasted(scene, x_prev, way, free, chord)
     for r, part in enumerate(parts):
         before, now = (begin + min(1.0, n / stages) * (end - begin) for n in (r, r + 1))
         move = left if stages == 1 else torch.where(pinned, way / stages, left)

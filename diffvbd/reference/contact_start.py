@@ -8,6 +8,7 @@ from torch import Tensor
 from .distance import log_barrier
 from .energies import FloorBarrier
 from .layout import dot
+from .rigid import turned
 from .scene import Scene
 
 
@@ -104,6 +105,17 @@ def rigid_way(scene: Scene, x: Tensor, move: Tensor) -> Tensor:
         turn = torch.linalg.solve((1 + 1e-9) * size * eye - spread, momentum)
         out = out.index_add(-2, own.nonzero()[:, 0], shift + torch.linalg.cross(turn[..., None, :].expand_as(arm), arm))
     return out.transpose(-1, -2)
+
+
+def coasted(scene: Scene, x: Tensor, way: Tensor, free: Tensor, chord: float) -> Tensor:
+    """The ways [..., 3, V] of free bodies without what stretches them. free: bool [V]."""
+    model = scene.model
+    mass = scene.mass.expand(x[..., 0, :].shape).unsqueeze(-2)
+    for number in model.body[free].unique().tolist():
+        own = (model.body == number).nonzero()[:, 0]
+        mine = turned(mass[..., own], x[..., own], way[..., own], chord)
+        way = way.index_copy(-1, own, mine)
+    return way
 
 
 SHORT = 0.99  # share of a way that counts as all of it

@@ -61,10 +61,10 @@ class Correction:
             x = self._corrected(body, x, y, x_prev)
         return x
 
-    def coasted(self, x: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """The vertices of one body on the way from x to goal [..., 3, n], as far as all of them may go together; and
-        the share of it that this is [...]."""
-        step = goal - x
+    def coasted(self, body: Tensor, x: Tensor, way: Tensor, chord: float) -> tuple[Tensor, Tensor]:
+        """The vertices of one body on their ways from x [..., 3, n] without its turn, as far as all of them may go
+        together; and the share of it that this is [...]."""
+        step = bent(self.scene.mass[..., body].unsqueeze(-2), x, way, chord)[0]
         share, good = torch.ones_like(x[..., :1, :1]), torch.ones_like(x[..., :1, :1], dtype=torch.bool)
         floors = [e for e in self.energies if hasattr(e, "gap")]
         slack = 8 * torch.finfo(x.dtype).eps * step.detach().norm(dim=-2).unsqueeze(-2)
@@ -167,6 +167,27 @@ class Correction:
         return torch.where(found, share, 0.0)
 
 
+def bent(mass: Tensor, x: Tensor, way: Tensor, chord: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The ways of the vertices of a body [..., 3, n] without its turn; its new shape, and the ends of its ways, both
+    about the center of mass. mass: [..., 1, n]. Where the ways have no rotation they stay as they are."""
+    total = mass.sum(-1, keepdim=True)
+    center, mean = ((mass * a).sum(-1, keepdim=True) / total for a in (x, way))
+    r, beside = x - center, way - mean
+    before = r - chord * beside
+    turn, turns = _polar_or_none((mass * r) @ before.transpose(-1, -2))
+    change = torch.where(turns, (r - turn @ before) / chord, beside)
+    return mean + change, r + change, r + beside
+
+
+def turned(mass: Tensor, x: Tensor, way: Tensor, chord: float) -> Tensor:
+    """The same, turned as a whole to where the ways point."""
+    total = mass.sum(-1, keepdim=True)
+    center, mean = ((mass * a).sum(-1, keepdim=True) / total for a in (x, way))
+    _, shape, end = bent(mass, x, way, chord)
+    turn, turns = _polar_or_none((mass * end) @ shape.transpose(-1, -2))
+    return torch.where(turns, mean + turn @ shape - (x - center), way)
+
+
 def clear(energy: Any, x: Tensor) -> Tensor:
     """Where a gap is more than rounding, [..., planes, n]."""
     size = (energy.normal * x.unsqueeze(-3)).abs().sum(-2) + energy.height.abs()
@@ -219,8 +240,13 @@ def _turned_by(w: Tensor) -> Tensor:
 
 
 def _polar(b: Tensor) -> Tensor:
+    return _polar_or_none(b)[0]
+
+
+def _polar_or_none(b: Tensor) -> tuple[Tensor, Tensor]:
     """The rotation closest to b [..., 3, 3]: by Newton steps from the identity, the last of which carries
-    the derivative. The identity where b determines none, or one that is too far."""
+    the derivative. The identity where b determines none, or one that is too far; and where it does not
+    [..., 1, 1]."""
     one = torch.eye(3, dtype=b.dtype, device=b.device)
     with torch.no_grad():
         found, good = one.expand_as(b), torch.ones_like(b[..., :1, :1], dtype=torch.bool)
@@ -236,4 +262,4 @@ def _polar(b: Tensor) -> Tensor:
     m = found.transpose(-1, -2) @ b
     stiffness = torch.where(good, turning_stiffness(m), torch.eye(3, dtype=b.dtype, device=b.device))
     w = torch.linalg.solve(stiffness, torch.where(good[..., 0], axial(m), 0.0))
-    return torch.where(good, found + found @ _turned_by(w), torch.eye(3, dtype=b.dtype, device=b.device))
+    return torch.where(good, found + found @ _turned_by(w), torch.eye(3, dtype=b.dtype, device=b.device)), good

@@ -110,10 +110,12 @@ def stepper(
     density: Any,
     parameters: dict[str, Any] | None,
     layout: Layout,
+    chord: float = 1.0,
 ) -> Callable[..., tuple[Tensor, Tensor]]:
     """Do what is common to all steps of a run, and return the function
     (x, v, force, gravity, prescribed, given=(None, None), record=None) -> (x', v') that makes one.
-    Arguments as in `step`; like decides dtype and device; layout is the model's `build_layout`."""
+    Arguments as in `step`; like decides dtype and device; layout is the model's `build_layout`; chord: how far back along
+    its way h v a vertex is taken to have been, 1 where v = (x - x_prev) / h."""
     scene = build_scene(
         model,
         layout,
@@ -151,7 +153,7 @@ def stepper(
             begun = _lower(scene, energies, begun, _start(scene, energies, x_prev, coasting), y, x_prev, correct.others)
         held = []
         for body in correct.bodies:
-            coasted, share = correct.coasted(take(x_prev, body), take(coasting, body))
+            coasted, share = correct.coasted(body, take(x_prev, body), take(coasting - x_prev, body), chord)
             begun, held = put(begun, body, coasted), [*held, share < 1]
         state = correct(begun, y, x_prev)
         if sweeps * min(model.relaxation, 1.0) >= 2 and any(bool(h.any()) for h in held):

@@ -30,6 +30,11 @@ MAX_SWEEPS = 2**31 - 1
 SCENE_TET = ("scene", "tet")  # what the dimensions of values of tets count
 
 
+# How far back along its way h v a vertex has come from: all of it by implicit Euler, whose velocities are
+# (x - x_prev) / h; little where they are tangents. At 0 there would be nothing to measure a turn by.
+CHORD, TANGENT = 1.0, 1 / 16
+
+
 class Prepared(NamedTuple):
     """Arguments of a step that do not depend on x and v, in the shapes of the operator (scenes first)."""
 
@@ -40,8 +45,9 @@ class Prepared(NamedTuple):
     parameters: dict[str, Tensor]  # differentiable energy parameters, [1 | B, ...]
     settings: ops.SweepSettings
     coarse: CoarseParts | None = None  # what the coarse corrections of all steps have in common
-    # of a time step and sweeps, the reference's step, where autograd unrolls it
-    unrolled: Callable[[float, int], Callable[..., tuple[Tensor, Tensor]]] | None = None
+    # of a time step, sweeps and a chord, the reference's step, where autograd unrolls it
+    unrolled: Callable[[float, int, float], Callable[..., tuple[Tensor, Tensor]]] | None = None
+    chord: float = CHORD  # of velocities (csrc/rigid/coast.h)
 
     @property
     def time_step_and_sweeps(self) -> tuple[float, int]:
@@ -165,8 +171,8 @@ def prepare(
 
 
 def _unrolled(model: Model, like: Tensor, mu: Any, lam: Any, rest_points: Any, density: Any, parameters: Any,
-              layout: Any, time_step: float, sweeps: int) -> Callable[..., tuple[Tensor, Tensor]]:  # fmt: skip
-    return reference.stepper(model, like, mu, lam, time_step, sweeps, rest_points, density, parameters, layout)
+              layout: Any, time_step: float, sweeps: int, chord: float) -> Callable[..., tuple[Tensor, Tensor]]:  # fmt: skip
+    return reference.stepper(model, like, mu, lam, time_step, sweeps, rest_points, density, parameters, layout, chord)
 
 
 def check_prescribed(model: Model, prescribed: Any, x: Tensor, *others: Tensor) -> None:

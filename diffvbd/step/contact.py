@@ -30,7 +30,7 @@ from .corrections import corrected, corrected_after, is_cut
 from .floor_start import start_on_floor
 from .intersections import refuse_intersections
 from .met import Detection, Met, Outcome, outcomes
-from .motion import Motion, motion_of
+from .motion import Motion, coasting, motion_of
 from .rooms import ROOM, rooms, rooms_of_sweeps
 from .unsupported import rests, unsupported
 
@@ -148,7 +148,9 @@ class ContactStep:
         pinned, pins = self.model._pinned[:, None], self.model.num_active < self.model.num_vertices
         lift = broadcast(self.begun.lift, self.begun.y.shape)
         lift = torch.where(pinned, 0.0, lift) if pins else lift
-        x, way = self.x_prev, self.begun.y - self.x_prev - lift
+        x = self.x_prev
+        way = coasting(x, self.fields.mass, self.begun.y - x - lift, surface.held, surface.held_bodies,
+                       surface.body_order, surface.body_ptr, self.prepared.chord)  # fmt: skip
         left, met = way, Met(x)
         stages, r = self.parts or 1, 0  # of what is prescribed
         planned, going = self.parts, None
@@ -245,7 +247,7 @@ class ContactStep:
 
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
         """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
-        x = start_on_floor(self.model, self.begun, self.floor_data)
+        x = start_on_floor(self.model, self.begun, self.floor_data, self.fields.mass, self.prepared.chord)
         room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
         start = PartStart(x, x.detach(), room, (), None, room > 0, none.ptr[:1].long(),
                           x.new_ones((2, *room.shape)))  # fmt: skip

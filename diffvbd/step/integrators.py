@@ -26,7 +26,7 @@ from ..ops import TET_READS_X_PREV
 from ..scopes import looks_at, recorders, refuse_transforms
 from ..tuples import replaced
 from .approach import may_touch
-from .arguments import Prepared, acceleration_of, broadcastable, collider_state, refuse_non_finite
+from .arguments import TANGENT, Prepared, acceleration_of, broadcastable, collider_state, refuse_non_finite
 from .coarse_sums import coarse_mass
 from .predict import begin
 
@@ -248,7 +248,7 @@ def _over(whole: Prepared, share: float) -> Prepared:
     """The arguments of a solve over a share of the step."""
     numbers = whole.settings.numbers
     numbers = replaced(numbers, time_step=share * numbers.time_step, friction_eps=share * numbers.friction_eps)
-    return replaced(whole, settings=replaced(whole.settings, numbers=numbers))
+    return replaced(whole, settings=replaced(whole.settings, numbers=numbers), chord=TANGENT)
 
 
 def _touching(model: Model, x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any]) -> Tensor | None:

@@ -41,6 +41,40 @@ class _MotionBackward(Backward):
         return x_bar, mass_bar, move_bar
 
 
+class _Coast(Direct):
+    """constants: held, held_bodies, body_order, body_ptr and the chord."""
+
+    @staticmethod
+    def forward(x: Tensor, mass: Tensor, move: Tensor, constants: tuple) -> Tensor:
+        return ops_motion.contact_coast(x, mass, move, *constants)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        *tensors, ctx.constants = inputs
+        ctx.save_for_backward(*tensors)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple:
+        not_batched(grads[0])
+        saved = ctx.saved_tensors
+        bars = _CoastBackward.apply(grads[0].contiguous(), *saved, ctx.constants)
+        return *(ops.sum_to(bar, t.shape) for bar, t in zip(bars, saved, strict=True)), None
+
+
+class _CoastBackward(Backward):
+    @staticmethod
+    def forward(bar, x, mass, move, constants):
+        return ops_motion.contact_coast_backward(bar, x, mass, move, *constants)
+
+
+def coasting(x: Tensor, mass: Tensor, move: Tensor, held: Tensor, held_bodies: Tensor, order: Tensor, ptr: Tensor,
+             chord: float) -> Tensor:  # fmt: skip
+    """The ways ``move`` [B, V, 3] without what stretches free bodies that turn; differentiable in x, mass and move.
+    Arguments as for :func:`diffvbd.ops.motion.contact_coast`."""
+    given = (t.contiguous() for t in (x, mass, move))
+    return _Coast.apply(*given, (held, held_bodies, order, ptr, chord))
+
+
 class Motion(NamedTuple):
     """The ways that vertices want to go in a part of a step."""
 

@@ -112,6 +112,6 @@ def begin(
     x_start, y = start_of(
         start, velocity, acceleration, prescribed, prepared.mass, data, origin, prepared.mu, prepared.lam, rest,
         model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
-        start=model.starts_from, filters=filters, parts=parts,
+        prepared.chord, start=model.starts_from, filters=filters, parts=parts,
     )  # fmt: skip
     return Begun(x_start, start, y, data, origin, (h * h) * acceleration)

@@ -1,7 +1,7 @@
 """Where a step begins: the predictor y = x + h v + h^2 a, and where its sweeps start.
 
-A body that is corrected coasts: x + s h v with one share s for all its vertices, as far as planes let it, and is
-corrected there (rigid.py). Where planes hold it back and steps are short, its vertices go each by itself instead. Any
+A body that is corrected coasts: without its turn, which straight lines would make a stretch, by one share of their ways
+for all its vertices, as far as planes let it, and is corrected there (rigid.py). Where planes hold it back and steps are short, its vertices go each by itself instead. Any
 other body starts from y or from x + h v, every vertex as far as planes let it. Few sweeps hardly move a stiff body away
 from its start, so "auto" takes, for each body and step, the one of lower incremental potential: y where a body is soft
 or flies, x + h v where its pins carry it. docs/method.md, sections 6, 14.
@@ -101,7 +101,8 @@ class _BeginBackward(Function):
 def begin(
     x: Tensor, v: Tensor, acceleration: Tensor, prescribed: Tensor | None, mass: Tensor, energy_data: Tensor,
     origin: Tensor | None, mu: Tensor, lam: Tensor, rest: Tensor | None, pinned: Tensor, bodies: Bodies,
-    others: OtherBodies, data_count: tuple[int, ...], time_step: float, *, start: str, filters: bool, parts: bool,
+    others: OtherBodies, data_count: tuple[int, ...], time_step: float, chord: float, *, start: str, filters: bool,
+    parts: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Where the sweeps start and the predictor [m], both [B, V, 3]; differentiable in the first six tensors.
 
@@ -110,6 +111,7 @@ def begin(
         prescribed: Where pinned vertices go [m], [1 | B, V, 3]; None: they stay.
         mass, energy_data, origin, mu, lam: As in ops.SweepFields.  pinned: bool [V].
         rest: [1 | B, T, 7], or None where tets have no energy; like mu and lam looked at by choices alone.
+        chord: How far back along its way h v a vertex is taken to have been, over h: 1 where v = (x - x_prev) / h.
         start: "auto", "predictor" or "inertia", of the bodies that are not corrected.
         filters: Whether the planes of a floor hold back a start.
         parts: Whether bodies that are held back may start vertex by vertex, for which there must be filters.
@@ -119,7 +121,7 @@ def begin(
     tensors = distinct(x, v, acceleration, prescribed, mass, energy_data, origin, *looked_at)
     *listed, groups = bodies
     *listed_others, other_groups = others
-    options = (data_count, time_step, FILTER_ETA, STARTS[start], filters)
+    options = (data_count, time_step, FILTER_ETA, chord, STARTS[start], filters)
     x_start, y, *_ = _Begin.apply(*tensors, pinned, *listed, *listed_others, groups, other_groups, (*options, parts))
     return x_start, y
 

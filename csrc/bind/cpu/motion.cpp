@@ -44,6 +44,32 @@ std::tuple<Tensor, Tensor, Tensor> contact_motion_backward(const Tensor& bar, co
   });
 }
 
+Tensor contact_coast(const Tensor& x, const Tensor& mass, const Tensor& move, const Tensor& held,
+                     const Tensor& held_bodies, const Tensor& order, const Tensor& ptr, double chord) {
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::coast_inputs<T>(x, mass, move, held, held_bodies, order, ptr, chord);
+    Tensor coasted = empty(x, {in.scenes, in.vertices, 3});
+    diffvbd::coast<T>(in, chord, data<T>(coasted));
+    return coasted;
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor> contact_coast_backward(const Tensor& bar, const Tensor& x, const Tensor& mass,
+                                                          const Tensor& move, const Tensor& held,
+                                                          const Tensor& held_bodies, const Tensor& order,
+                                                          const Tensor& ptr, double chord) {
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::coast_inputs<T>(x, mass, move, held, held_bodies, order, ptr, chord);
+    diffvbd::require_like("bar", bar, x, x.numel());
+    Tensor x_bar = empty(x, {in.scenes, in.vertices, 3}), move_bar = empty(x, {in.scenes, in.vertices, 3});
+    Tensor mass_bar = empty(x, {in.scenes, in.vertices});
+    diffvbd::reverse_coast<T>(in, chord, {data<const T>(bar), data<T>(x_bar), data<T>(move_bar), data<T>(mass_bar)});
+    return std::make_tuple(x_bar, mass_bar, move_bar);
+  });
+}
+
 std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rooms(
     const Tensor& x, const Tensor& origin, const Tensor& mass, const Tensor& move, const Tensor& held,
     const Tensor& order, const Tensor& ptr, const Tensor& rigid, const Tensor& ways, const Tensor& sums,
@@ -72,5 +98,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rooms(
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
   m.impl("contact_motion", TORCH_BOX(&contact_motion));
   m.impl("contact_motion_backward", TORCH_BOX(&contact_motion_backward));
+  m.impl("contact_coast", TORCH_BOX(&contact_coast));
+  m.impl("contact_coast_backward", TORCH_BOX(&contact_coast_backward));
   m.impl("contact_rooms", TORCH_BOX(&contact_rooms));
 }

@@ -22,12 +22,12 @@ using torch::stable::accelerator::DeviceGuard;
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::vector<int64_t> groups,
                                                  std::vector<int64_t> other_groups, std::vector<int64_t> data_count,
-                                                 double time_step, double filter_eta, int64_t from, bool filters,
-                                                 bool parts) {
+                                                 double time_step, double filter_eta, double chord, int64_t from,
+                                                 bool filters, bool parts) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
   diffvbd::require_states(f);
   const DeviceGuard guard(x.get_device_index());
-  const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
+  const BeginSettings settings{data_count, time_step, filter_eta, chord, from, filters};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const std::vector<int64_t> shape{x.size(0), x.size(1), 3};
@@ -57,12 +57,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> begin(DIFFVBD_PARAMETERS(BEGIN) std::
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> begin_backward(
     DIFFVBD_PARAMETERS(BEGIN) const Tensor& x_start_bar, const Tensor& y_bar, const Tensor& falls, const Tensor& alone,
-    std::vector<int64_t> groups, std::vector<int64_t> data_count, double time_step, double filter_eta, int64_t from,
-    bool filters, std::vector<bool> wants) {
+    std::vector<int64_t> groups, std::vector<int64_t> data_count, double time_step, double filter_eta, double chord,
+    int64_t from, bool filters, std::vector<bool> wants) {
   const BeginFields f{DIFFVBD_ITEMS(BEGIN)};
   diffvbd::require_states(f);
   const DeviceGuard guard(x.get_device_index());
-  const BeginSettings settings{data_count, time_step, filter_eta, from, filters};
+  const BeginSettings settings{data_count, time_step, filter_eta, chord, from, filters};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     // where the bodies that are corrected coast to, and their predictor, once more

@@ -53,6 +53,36 @@ std::tuple<Tensor, Tensor, Tensor> contact_motion_backward(const Tensor& bar, co
   });
 }
 
+Tensor contact_coast(const Tensor& x, const Tensor& mass, const Tensor& move, const Tensor& held,
+                     const Tensor& held_bodies, const Tensor& order, const Tensor& ptr, double chord) {
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::coast_inputs<T>(x, mass, move, held, held_bodies, order, ptr, chord);
+    Tensor coasted = empty(x, {in.scenes, in.vertices, 3});
+    check(cuda::coast<T>(in, chord, data<T>(coasted), current_stream(x)), "where bodies coast to");
+    return coasted;
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor> contact_coast_backward(const Tensor& bar, const Tensor& x, const Tensor& mass,
+                                                          const Tensor& move, const Tensor& held,
+                                                          const Tensor& held_bodies, const Tensor& order,
+                                                          const Tensor& ptr, double chord) {
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::coast_inputs<T>(x, mass, move, held, held_bodies, order, ptr, chord);
+    diffvbd::require_like("bar", bar, x, x.numel());
+    Tensor x_bar = empty(x, {in.scenes, in.vertices, 3}), move_bar = empty(x, {in.scenes, in.vertices, 3});
+    Tensor mass_bar = empty(x, {in.scenes, in.vertices});
+    check(cuda::reverse_coast<T>(in, chord, {data<const T>(bar), data<T>(x_bar), data<T>(move_bar), data<T>(mass_bar)},
+                                 current_stream(x)),
+          "the adjoint of where bodies coast to");
+    return std::make_tuple(x_bar, mass_bar, move_bar);
+  });
+}
+
 std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rooms(
     const Tensor& x, const Tensor& origin, const Tensor& mass, const Tensor& move, const Tensor& held,
     const Tensor& order, const Tensor& ptr, const Tensor& rigid, const Tensor& ways, const Tensor& sums,
@@ -84,5 +114,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rooms(
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_motion", TORCH_BOX(&contact_motion));
   m.impl("contact_motion_backward", TORCH_BOX(&contact_motion_backward));
+  m.impl("contact_coast", TORCH_BOX(&contact_coast));
+  m.impl("contact_coast_backward", TORCH_BOX(&contact_coast_backward));
   m.impl("contact_rooms", TORCH_BOX(&contact_rooms));
 }

@@ -1,0 +1,125 @@
+// Where a free body coasts to. On straight lines x + h v a body that turns grows by its angle squared, and few sweeps
+// leave it so. What of its ways is a turn is therefore taken off, and the shape goes on by the rest alone:
+//     way_i = mean + e_i,    e_i = (r_i - Q (r_i - c (d_i - mean))) / c,    Q = polar(sum m r (r - c (d - mean))^T)
+// with d the ways h v, r from the center of mass, and c the chord: how far back along its way a vertex is taken to have
+// been. With c = 1 that is the state before an implicit Euler step, whose velocities are chords of the turn: a body
+// that only turns keeps its shape to rounding (docs/method.md, section 14). With the adjoint.
+//
+// A View is a body: size(), mass(i), position(i) and way(i) of its i-th vertex.
+#pragma once
+
+#include "rotation.h"
+
+namespace diffvbd::rigid {
+
+struct Coasting {
+  double mass, chord;
+  Vector center, mean;
+  Matrix b, turned;  // sum m r (r - c d)^T, and Q - 1
+  bool turns;        // false: b has no rotation; ways are as they were
+
+  template <class View>
+  DIFFVBD_FN Vector arm(const View& view, int32_t i) const {
+    return view.position(i) - center;
+  }
+  // c (d - mean)
+  template <class View>
+  DIFFVBD_FN Vector back(const View& view, int32_t i) const {
+    return chord * (view.way(i) - mean);
+  }
+  // e: how the shape changes
+  template <class View>
+  DIFFVBD_FN Vector bend(const View& view, int32_t i) const {
+    const Vector d = back(view, i);
+    return 1 / chord * (turns ? d - turned * (arm(view, i) - d) : d);
+  }
+  template <class View>
+  DIFFVBD_FN Vector way(const View& view, int32_t i) const {
+    return mean + bend(view, i);
+  }
+};
+
+template <class View, class Team>
+DIFFVBD_FN Coasting coasting_of(const View& view, const Team& team, double chord) {
+  double sum[16];
+  const Vector about = view.size() > 0 ? view.position(0) : Vector{};  // squares of distances inside the body
+  team.template sum<16>(view.size(), sum, [&](int32_t i, double* to) {
+    const double m = view.mass(i);
+    const Vector way = view.way(i), at = view.position(i) - about, x = m * at, before = at - chord * way;
+    const double values[] = {m,
+                             x.x,
+                             x.y,
+                             x.z,
+                             m * way.x,
+                             m * way.y,
+                             m * way.z,
+                             x.x * before.x,
+                             x.x * before.y,
+                             x.x * before.z,
+                             x.y * before.x,
+                             x.y * before.y,
+                             x.y * before.z,
+                             x.z * before.x,
+                             x.z * before.y,
+                             x.z * before.z};
+    for (int c = 0; c < 16; ++c) to[c] += values[c];
+  });
+  Coasting out{};
+  out.mass = sum[0], out.chord = chord;
+  if (!(sum[0] > 0)) return out;
+  const Vector at = 1 / sum[0] * Vector{sum[1], sum[2], sum[3]};
+  out.mean = 1 / sum[0] * Vector{sum[4], sum[5], sum[6]};
+  out.center = about + at;
+  out.b = Matrix{{sum[7], sum[8], sum[9]}, {sum[10], sum[11], sum[12]}, {sum[13], sum[14], sum[15]}} +
+          (-sum[0]) * outer(at, at - chord * out.mean);
+  Matrix turn = identity();
+  out.turns = polar_rotation(out.b, turn);
+  out.turned = turn + -1.0 * identity();
+  return out;
+}
+
+// Calls write(i, x_bar, way_bar, mass_bar) for each vertex, of ways whose means have the adjoint mean_bar and whose
+// bends have bend_bar(i).
+template <class View, class Team, class BendBar, class Write>
+DIFFVBD_FN void reverse_coasting(const View& view, const Team& team, const Coasting& c, const Vector& mean_bar,
+                                 const BendBar& bend_bar, const Write& write) {
+  double sum[12];
+  team.template sum<12>(view.size(), sum, [&](int32_t i, double* to) {
+    const Vector bar = bend_bar(i), before = c.arm(view, i) - c.back(view, i);
+    const double values[] = {bar.x,
+                             bar.y,
+                             bar.z,
+                             bar.x * before.x,
+                             bar.x * before.y,
+                             bar.x * before.z,
+                             bar.y * before.x,
+                             bar.y * before.y,
+                             bar.y * before.z,
+                             bar.z * before.x,
+                             bar.z * before.y,
+                             bar.z * before.z};
+    for (int k = 0; k < 12; ++k) to[k] += values[k];
+  });
+  const Vector total{sum[0], sum[1], sum[2]};
+  const double per_mass = c.mass > 0 ? 1 / c.mass : 0;
+  Matrix b_bar = 0.0 * identity();
+  Vector held{};  // what vertices send to the center of mass, times the chord: r appears in Q r alone
+  if (c.turns) {
+    const Matrix turn_bar =
+        (-1 / c.chord) * Matrix{{sum[3], sum[4], sum[5]}, {sum[6], sum[7], sum[8]}, {sum[9], sum[10], sum[11]}};
+    b_bar = polar_vjp(c.b, c.turned + identity(), turn_bar);
+    held = transposed_times(c.turned, total);
+  }
+  const Vector to_mean = mean_bar - total - held, to_center = 1 / c.chord * held;
+  team.each(view.size(), [&](int32_t i) {
+    const double m = view.mass(i);
+    const Vector bar = bend_bar(i), arm = c.arm(view, i), d = c.back(view, i), before = arm - d;
+    const Vector turned = c.turns ? transposed_times(c.turned, bar) : Vector{}, pulled = b_bar * before,
+                 pushed = transposed_times(b_bar, arm);
+    const Vector x_bar = (-1 / c.chord) * turned + m * (pulled + pushed) + m * per_mass * to_center;
+    const Vector way_bar = bar + turned - c.chord * m * pushed + m * per_mass * to_mean;
+    write(i, x_bar, way_bar, dot(arm, pulled) + per_mass * (1 / c.chord * dot(d, to_mean) + dot(arm, to_center)));
+  });
+}
+
+}  // namespace diffvbd::rigid
