@@ -59,7 +59,7 @@ start::Inputs<T> begin_inputs(const BeginFields& t, const BeginSettings& q, cons
   in.from = static_cast<int>(q.from);
   in.some_alone = t.order.numel() < v;
   in.filters = q.filters;
-  require(q.chord > 0, "diffvbd::begin: expected chord > 0");
+  require(q.chord != 0, "diffvbd::begin: expected chord other than 0");
   in.chord = q.chord;
   in.parameters.time_step = T(q.time_step);
   in.parameters.filter_eta = T(q.filter_eta);

@@ -49,7 +49,7 @@ contact::MotionInputs<T> motion_inputs(const MotionTensors& t, const Tensor& fal
 template <class T>
 contact::MotionInputs<T> coast_inputs(const Tensor& x, const Tensor& mass, const Tensor& move, const Tensor& held,
                                       const Tensor& held_bodies, const Tensor& order, const Tensor& ptr, double chord) {
-  require(chord > 0, "diffvbd::contact_coast: expected chord > 0");
+  require(chord != 0, "diffvbd::contact_coast: expected chord other than 0");
   return motion_inputs<T>({x, {}, mass, move, held, order, ptr}, {}, held_bodies);
 }
 

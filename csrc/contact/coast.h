@@ -21,7 +21,7 @@ struct TurnedCoasting {
   }
   template <class T>
   DIFFVBD_FN Vector placed(const MovingBody<T>& b_, int32_t i) const {
-    return shape.arm(b_, i) + shape.bend(b_, i);
+    return end(b_, i) - shape.turning(b_, i);
   }
 };
 
@@ -39,9 +39,7 @@ DIFFVBD_FN TurnedCoasting turned_coasting(const MovingBody<T>& b, const Team& te
     for (int c = 0; c < 9; ++c) to[c] += values[c];
   });
   out.b = {{sum[0], sum[1], sum[2]}, {sum[3], sum[4], sum[5]}, {sum[6], sum[7], sum[8]}};
-  rigid::Matrix turn = rigid::identity();
-  out.turns = rigid::polar_rotation(out.b, turn);
-  out.turned = turn + -1.0 * rigid::identity();
+  out.turns = rigid::turn_of(out.b, out.turned);
   return out;
 }
 

@@ -27,17 +27,26 @@ struct Coasting {
   DIFFVBD_FN Vector back(const View& view, int32_t i) const {
     return chord * (view.way(i) - mean);
   }
-  // e: how the shape changes
+  // what a turn has of a way: none to the bit where a body does not turn
   template <class View>
-  DIFFVBD_FN Vector bend(const View& view, int32_t i) const {
-    const Vector d = back(view, i);
-    return 1 / chord * (turns ? d - turned * (arm(view, i) - d) : d);
+  DIFFVBD_FN Vector turning(const View& view, int32_t i) const {
+    return 1 / chord * (turned * (arm(view, i) - back(view, i)));
   }
   template <class View>
   DIFFVBD_FN Vector way(const View& view, int32_t i) const {
-    return mean + bend(view, i);
+    return view.way(i) - turning(view, i);
   }
 };
+
+// turned: polar(b) - 1, zero where that is rounding. False where b has no rotation.
+DIFFVBD_FN bool turn_of(const Matrix& b, Matrix& turned) {
+  constexpr double kNone = 1e-30;  // squared
+  Matrix turn = identity();
+  const bool turns = polar_rotation(b, turn);
+  turned = turn + -1.0 * identity();
+  if (!turns || inner(turned, turned) < kNone) turned = 0.0 * identity();
+  return turns;
+}
 
 template <class View, class Team>
 DIFFVBD_FN Coasting coasting_of(const View& view, const Team& team, double chord) {
@@ -72,9 +81,7 @@ DIFFVBD_FN Coasting coasting_of(const View& view, const Team& team, double chord
   out.center = about + at;
   out.b = Matrix{{sum[7], sum[8], sum[9]}, {sum[10], sum[11], sum[12]}, {sum[13], sum[14], sum[15]}} +
           (-sum[0]) * outer(at, at - chord * out.mean);
-  Matrix turn = identity();
-  out.turns = polar_rotation(out.b, turn);
-  out.turned = turn + -1.0 * identity();
+  out.turns = turn_of(out.b, out.turned);
   return out;
 }
 

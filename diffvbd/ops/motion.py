@@ -51,15 +51,15 @@ def contact_motion_backward(bar: Tensor, x: Tensor, origin: Tensor, mass: Tensor
 
 def contact_coast(x: Tensor, mass: Tensor, move: Tensor, held: Tensor, held_bodies: Tensor, order: Tensor, ptr: Tensor,
                   chord: float) -> Tensor:  # fmt: skip
-    """``move`` [B, V, 3] [m], of free bodies without the stretch of straight lines: their shape goes on by what is not a
-    turn, and the turn is one of the whole body.
+    """``move`` [B, V, 3] [m], of free bodies without the stretch of straight lines: their shape goes on by what is not
+    a turn, and the turn is one of the whole body.
 
     Args:
         x: [B, V, 3] [m].  mass: [1 | B, V] [kg].  move, held, held_bodies, order, ptr: As for :func:`contact_motion`.
         chord: How far back along its way a vertex is taken to have been, over that way.
 
     Raises:
-        ValueError: A tensor with the wrong shape, dtype or device, or chord <= 0.
+        ValueError: A tensor with the wrong shape, dtype or device, or a chord of 0.
     """
     return raw.contact_coast(x, mass, move, held, held_bodies, order, ptr, chord)
 

@@ -30,9 +30,7 @@ MAX_SWEEPS = 2**31 - 1
 SCENE_TET = ("scene", "tet")  # what the dimensions of values of tets count
 
 
-# How far back along its way h v a vertex has come from: all of it by implicit Euler, whose velocities are
-# (x - x_prev) / h; little where they are tangents. At 0 there would be nothing to measure a turn by.
-CHORD, TANGENT = 1.0, 1 / 16
+CHORD = 1.0  # of implicit Euler, whose velocities are (x - x_prev) / h
 
 
 class Prepared(NamedTuple):
@@ -47,7 +45,7 @@ class Prepared(NamedTuple):
     coarse: CoarseParts | None = None  # what the coarse corrections of all steps have in common
     # of a time step, sweeps and a chord, the reference's step, where autograd unrolls it
     unrolled: Callable[[float, int, float], Callable[..., tuple[Tensor, Tensor]]] | None = None
-    chord: float = CHORD  # of velocities (csrc/rigid/coast.h)
+    chord: float = CHORD  # how far back along its way h v a vertex is taken to have been (csrc/rigid/coast.h)
 
     @property
     def time_step_and_sweeps(self) -> tuple[float, int]:
@@ -171,7 +169,8 @@ def prepare(
 
 
 def _unrolled(model: Model, like: Tensor, mu: Any, lam: Any, rest_points: Any, density: Any, parameters: Any,
-              layout: Any, time_step: float, sweeps: int, chord: float) -> Callable[..., tuple[Tensor, Tensor]]:  # fmt: skip
+              layout: Any, time_step: float, sweeps: int, chord: float
+              ) -> Callable[..., tuple[Tensor, Tensor]]:  # fmt: skip
     return reference.stepper(model, like, mu, lam, time_step, sweeps, rest_points, density, parameters, layout, chord)
 
 

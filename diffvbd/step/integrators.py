@@ -26,11 +26,14 @@ from ..ops import TET_READS_X_PREV
 from ..scopes import looks_at, recorders, refuse_transforms
 from ..tuples import replaced
 from .approach import may_touch
-from .arguments import TANGENT, Prepared, acceleration_of, broadcastable, collider_state, refuse_non_finite
+from .arguments import Prepared, acceleration_of, broadcastable, collider_state, refuse_non_finite
 from .coarse_sums import coarse_mass
 from .predict import begin
 
 GAMMA = 1 - 1 / math.sqrt(2)
+# With these a turn leaves the shape of a body to third order in its angle. What the first solve of SDIRK2() goes along are
+# tangents, of chord 0, by which no turn could be measured.
+CHORD_OF_BDF2, CHORDS_OF_SDIRK2 = -1 / 9, (0.01, 3 - 2 * math.sqrt(2))
 SAME_TIME_STEP = 1e-9  # relative: two durations divided into steps give the same h but for rounding
 STAGED = ("prescribed", "colliders")  # where motion is given: at the end of a step, or of each of its solves
 
@@ -208,10 +211,10 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
         x_end, v_end, last = solve(x, v, whole, end)
         return Taken(x_end, v_end, remembered(x_end), last)
 
-    def last_solve(feasible: Tensor, reference: Tensor, carried: Tensor, share: float, begun: Tensor | None = None
-                   ) -> Taken:  # fmt: skip
+    def last_solve(feasible: Tensor, reference: Tensor, carried: Tensor, share: float, chord: float,
+                   begun: Tensor | None = None) -> Taken:  # fmt: skip
         """From a feasible state, about a velocity w and a position that is h_solve times ``carried`` away from it."""
-        start, weights = reference + carried, _over(whole, share)
+        start, weights = reference + carried, _over(whole, share, chord)
         if euler is not None:
             one = euler[..., None]
             feasible, start = torch.where(one, x, feasible), torch.where(one, v / share, start)
@@ -224,15 +227,16 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
 
     if isinstance(integrator, BDF2) and history is not None:
         carried = history.moved / (2 * time_step)
-        return last_solve(x, v + (v - history.v) / 3, carried, 2 / 3)
-    x1, v1, _ = solve(x, v, _over(whole, GAMMA), _at_share(given, x, GAMMA))
+        return last_solve(x, v + (v - history.v) / 3, carried, 2 / 3, CHORD_OF_BDF2)
+    first, second = CHORDS_OF_SDIRK2
+    x1, v1, _ = solve(x, v, _over(whole, GAMMA, first), _at_share(given, x, GAMMA))
     feasible, carried = x1, math.sqrt(2) * v1
     if euler is not None:
         # x1 keeps bodies apart that all are there; beside one that is still at x, all begin at x
         mixed = euler.any(-1)[..., None, None]
         feasible = torch.where(mixed, x, x1)
         carried = torch.where(mixed, carried + (x1 - x) / (GAMMA * time_step), carried)
-    return last_solve(feasible, v + (1 + math.sqrt(2)) * (v1 - v), carried, GAMMA, x1)
+    return last_solve(feasible, v + (1 + math.sqrt(2)) * (v1 - v), carried, GAMMA, second, x1)
 
 
 def _named(history: History | None, given: dict[str, Any]) -> dict[str, Any]:
@@ -244,11 +248,11 @@ def _named(history: History | None, given: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _over(whole: Prepared, share: float) -> Prepared:
-    """The arguments of a solve over a share of the step."""
+def _over(whole: Prepared, share: float, chord: float) -> Prepared:
+    """The arguments of a solve over a share of the step, along ways of a chord."""
     numbers = whole.settings.numbers
     numbers = replaced(numbers, time_step=share * numbers.time_step, friction_eps=share * numbers.friction_eps)
-    return replaced(whole, settings=replaced(whole.settings, numbers=numbers), chord=TANGENT)
+    return replaced(whole, settings=replaced(whole.settings, numbers=numbers), chord=chord)
 
 
 def _touching(model: Model, x: Tensor, v: Tensor, prepared: Prepared, given: dict[str, Any]) -> Tensor | None:

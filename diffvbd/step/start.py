@@ -1,10 +1,11 @@
 """Where a step begins: the predictor y = x + h v + h^2 a, and where its sweeps start.
 
-A body that is corrected coasts: without its turn, which straight lines would make a stretch, by one share of their ways
-for all its vertices, as far as planes let it, and is corrected there (rigid.py). Where planes hold it back and steps are short, its vertices go each by itself instead. Any
-other body starts from y or from x + h v, every vertex as far as planes let it. Few sweeps hardly move a stiff body away
-from its start, so "auto" takes, for each body and step, the one of lower incremental potential: y where a body is soft
-or flies, x + h v where its pins carry it. docs/method.md, sections 6, 14.
+A body that is corrected coasts: all of its vertices go one share of h v less what in h v is a turn (on straight lines
+it would stretch the body), as far as planes let it, and the body is corrected there (rigid.py). Where planes hold it
+back and steps are short, its vertices go each by itself instead. Any other body starts from y or from x + h v, every
+vertex as far as planes let it. Few sweeps hardly move a stiff body away from its start, so "auto" takes, for each body
+and step, the one of lower incremental potential: y where a body is soft or flies, x + h v where its pins carry it.
+docs/method.md, sections 6, 14.
 """
 
 # pyright: reportIncompatibleMethodOverride=false

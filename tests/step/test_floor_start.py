@@ -17,6 +17,7 @@ from diffvbd.model.bodies import Bodies, OtherBodies
 from diffvbd.ops.contact_part import PartBodies
 from diffvbd.reference.energies import FloorBarrier
 from diffvbd.safeguards import FILTER_ETA
+from diffvbd.step.arguments import CHORD
 from diffvbd.step.start import begin
 from diffvbd.testing import generator, relative_error, tolerance
 
@@ -71,7 +72,7 @@ def by_begin(a: dict[str, Tensor]) -> Tensor:
     others = OtherBodies(torch.full((vertices,), -1, dtype=torch.int32), empty, one, tets, one, (0, 0, 0, 0))
     step = a["step"].expand_as(x).contiguous()
     start, _ = begin(x, step, x.new_zeros((1, 1, 3)), none, x.new_ones((1, vertices)), planes, none, none, none, none,
-                     torch.zeros(vertices, dtype=torch.bool), bodies, others, (planes.shape[1], 0), 1.0,
+                     torch.zeros(vertices, dtype=torch.bool), bodies, others, (planes.shape[1], 0), 1.0, CHORD,
                      start="inertia", filters=True, parts=False)  # fmt: skip
     return start - x
 
