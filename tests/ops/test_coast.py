@@ -1,0 +1,139 @@
+"""Claim: where bodies coast to is what the formula says, with the adjoint of it; a turn leaves the shape of a body."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from diffvbd.ops import motion as ops_motion
+from diffvbd.testing import generator, tolerance
+
+SIZES = [[4, 300, 20], [8] * 7, [6000, 5], []]
+CHORDS = (1.0, 0.17, 0.01, -1 / 9)
+
+
+class Case(NamedTuple):
+    x: Tensor
+    mass: Tensor
+    move: Tensor
+    held: Tensor
+    held_bodies: Tensor
+    order: Tensor
+    ptr: Tensor
+
+    def rows(self) -> list[Tensor]:
+        ptr = self.ptr.tolist()
+        return [self.order.long()[a:b] for a, b in zip(ptr[:-1], ptr[1:], strict=True)]
+
+
+def case(sizes: list[int], device: str, dtype: torch.dtype = torch.float64, scenes: int = 2, way: float = 0.05,
+         held: float = 0.0) -> Case:  # fmt: skip
+    rng, n = generator("coast", *sizes), sum(sizes)
+
+    def reals(*shape: int) -> Tensor:
+        return torch.as_tensor(rng.standard_normal(shape), dtype=dtype, device=device)
+
+    order, ptr = rng.permutation(n).astype(np.int32), np.cumsum([0, *sizes]).astype(np.int32)
+    holds = rng.random(n) < held
+    held_bodies = np.array([holds[order[a:b]].any() for a, b in zip(ptr[:-1], ptr[1:], strict=True)], dtype=bool)
+    index = (torch.as_tensor(a, device=device) for a in (holds, held_bodies, order, ptr))
+    return Case(reals(scenes, n, 3), 0.5 + reals(1, n).abs(), way * reals(scenes, n, 3), *index)
+
+
+def rotation(to: Tensor, of: Tensor, mass: Tensor) -> Tensor:
+    """The rotation that takes ``of`` closest to ``to`` [B, n, 3], by the singular values."""
+    u, _, v = torch.linalg.svd((mass[..., None] * to[..., :, None] * of[..., None, :]).sum(-3))
+    return u @ v
+
+
+def by_formula(c: Case, chord: float) -> Tensor:
+    out = c.move.clone()
+    for rows, is_held in zip(c.rows(), c.held_bodies.tolist(), strict=True):
+        if is_held:
+            continue
+        m = c.mass.expand(c.x.shape[:2])[:, rows, None]
+        center, mean = ((m * a[:, rows]).sum(1, keepdim=True) / m.sum(1, keepdim=True) for a in (c.x, c.move))
+        r, d = c.x[:, rows] - center, c.move[:, rows] - mean
+        before = r - chord * d
+        shape = r + (r - before @ rotation(r, before, m).mT) / chord
+        out = out.index_copy(1, rows, mean + shape @ rotation(r + d, shape, m).mT - r)
+    return out
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("sizes", SIZES, ids=lambda sizes: f"{len(sizes)}-{sum(sizes)}")
+def test_as_the_formula_says(device: str, sizes: list[int], dtype: torch.dtype) -> None:
+    scale = torch.finfo(dtype).eps / torch.finfo(torch.float64).eps
+    for scenes, held in ((0, 0.0), (1, 0.05), (3, 0.0)):
+        c = case(sizes, device, dtype, scenes, held=held)
+        for chord in CHORDS:
+            got, again = (ops_motion.contact_coast(*c, chord) for _ in range(2))
+            assert torch.equal(got, again)
+            wide = Case(*(t.double() if t.is_floating_point() else t for t in c))
+            bar = scale * tolerance("sums_of_bodies")
+            torch.testing.assert_close(got.double(), by_formula(wide, chord), rtol=bar, atol=bar)
+
+
+@pytest.mark.parametrize("chord", CHORDS)
+def test_adjoint_is_that_of_autograd(device: str, chord: float) -> None:
+    c = case([5, 40, 12], device, scenes=3, held=0.02)
+    bar = torch.randn(c.x.shape, dtype=c.x.dtype, generator=torch.Generator().manual_seed(0)).to(device)
+    x, mass, move = (t.clone().requires_grad_() for t in (c.x, c.mass.expand(3, -1).contiguous(), c.move))
+    out = by_formula(Case(x, mass, move, *c[3:]), chord)
+    expected = torch.autograd.grad((out * bar).sum(), (x, mass, move))
+    got, again = (ops_motion.contact_coast_backward(bar, *c, chord) for _ in range(2))
+    for one, want, same in zip(got, expected, again, strict=True):
+        torch.testing.assert_close(one, want, rtol=tolerance("sums_of_bodies"), atol=tolerance("sums_of_bodies"))
+        assert torch.equal(one, same) and float(want.abs().max()) > 0
+
+
+def test_a_turn_leaves_the_shape(device: str) -> None:
+    """Of a body that an implicit Euler step has turned, x = R x_before: each edge keeps its length, and the way is that
+    of the nearest rotation, R itself to first order."""
+    c = case([30], device)
+    angle = 0.3
+    turn = torch.tensor([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]],
+                        dtype=c.x.dtype, device=device)  # fmt: skip
+    shift = torch.tensor([0.4, -0.1, 0.2], dtype=c.x.dtype, device=device)
+    move = c.x - (c.x - shift) @ turn  # x_before = R^-1 (x - shift)
+    ends = c.x + ops_motion.contact_coast(*c._replace(move=move), 1.0)
+    straight = c.x + move
+    edges, now, stretched = ((a[:, :, None] - a[:, None]).norm(dim=-1) for a in (c.x, ends, straight))
+    assert float((now - edges).abs().max()) <= tolerance("sums_of_bodies")
+    assert float((stretched - edges).abs().max()) > 0.02
+    assert float((ends - straight).abs().max()) < 0.25 * float(move.abs().max())
+
+
+def test_without_a_turn_ways_stay_to_the_bit(device: str) -> None:
+    """Of bodies that are shifted, of those that are held, and of points and lines, which have no turn."""
+    c = case([20, 1, 6], device, held=0.0)
+    shifted = torch.full_like(c.move, 0.3)
+    assert torch.equal(ops_motion.contact_coast(*c._replace(move=shifted), 1.0), shifted)
+    held = c.held.clone()
+    held[c.order[-1].long()] = True
+    line = c.x * torch.tensor([1.0, 0.0, 0.0], dtype=c.x.dtype, device=device)
+    bent = c._replace(x=line, move=c.move * torch.tensor([1.0, 0.0, 0.0], dtype=c.x.dtype, device=device))
+    assert torch.equal(ops_motion.contact_coast(*bent, 1.0), bent.move)
+    some = c._replace(held=held, held_bodies=torch.tensor([False, False, True], device=device))
+    out, rows = ops_motion.contact_coast(*some, 1.0), some.rows()
+    assert torch.equal(out[:, rows[2]], c.move[:, rows[2]]) and torch.equal(out[:, rows[1]], c.move[:, rows[1]])
+    assert not torch.equal(out[:, rows[0]], c.move[:, rows[0]])
+    bars = ops_motion.contact_coast_backward(torch.ones_like(c.x), *some, 1.0)
+    assert not bars[0][:, rows[2]].any() and torch.equal(bars[2][:, rows[2]], torch.ones_like(c.x)[:, rows[2]])
+
+
+def test_opcheck_and_bad_input(device: str) -> None:
+    c = case([3, 5], device)
+    torch.library.opcheck(torch.ops.diffvbd.contact_coast.default, (*c, 1.0))
+    torch.library.opcheck(torch.ops.diffvbd.contact_coast_backward.default, (c.move, *c, 1.0))
+    for place, value in enumerate(c):
+        other = value.float() if value.is_floating_point() else value.double()
+        for bad in (value[..., :-1], other):
+            with pytest.raises(ValueError, match="expected"):
+                ops_motion.contact_coast(*c[:place], bad, *c[place + 1 :], 1.0)
+    with pytest.raises(ValueError, match="chord"):
+        ops_motion.contact_coast(*c, 0.0)
