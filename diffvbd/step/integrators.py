@@ -31,7 +31,7 @@ from .coarse_sums import coarse_mass
 from .predict import begin
 
 GAMMA = 1 - 1 / math.sqrt(2)
-# With these a turn leaves the shape of a body to third order in its angle. What the first solve of SDIRK2() goes along are
+# With these a turn leaves the shape of a body to third order in its angle. The first solve of SDIRK2() goes along
 # tangents, of chord 0, by which no turn could be measured.
 CHORD_OF_BDF2, CHORDS_OF_SDIRK2 = -1 / 9, (0.01, 3 - 2 * math.sqrt(2))
 SAME_TIME_STEP = 1e-9  # relative: two durations divided into steps give the same h but for rounding
