@@ -39,7 +39,7 @@ DIFFVBD_FN TurnedCoasting turned_coasting(const MovingBody<T>& b, const Team& te
     for (int c = 0; c < 9; ++c) to[c] += values[c];
   });
   out.b = {{sum[0], sum[1], sum[2]}, {sum[3], sum[4], sum[5]}, {sum[6], sum[7], sum[8]}};
-  out.turns = rigid::turn_of(out.b, out.turned);
+  out.turns = rigid::turn_of(out.b, 1.0, out.turned);
   return out;
 }
 

@@ -38,13 +38,16 @@ struct Coasting {
   }
 };
 
-// turned: polar(b) - 1, zero where that is rounding. False where b has no rotation.
-DIFFVBD_FN bool turn_of(const Matrix& b, Matrix& turned) {
-  constexpr double kNone = 1e-30;  // squared
+// turned: polar(b) - 1, zero where that is rounding, or more than a turn in a share `chord` of a step should be: the
+// correction would not find back. False where there is no rotation but 0.
+DIFFVBD_FN bool turn_of(const Matrix& b, double chord, Matrix& turned) {
+  constexpr double kNone = 1e-30, kMostTurn = 0.7;  // squared; [rad]
   Matrix turn = identity();
-  const bool turns = polar_rotation(b, turn);
+  bool turns = polar_rotation(b, turn);
   turned = turn + -1.0 * identity();
-  if (!turns || inner(turned, turned) < kNone) turned = 0.0 * identity();
+  const double square = inner(turned, turned);  // twice that of a small angle
+  turns = turns && square < 2 * kMostTurn * kMostTurn * chord * chord;
+  if (!turns || square < kNone) turned = 0.0 * identity();
   return turns;
 }
 
@@ -81,7 +84,7 @@ DIFFVBD_FN Coasting coasting_of(const View& view, const Team& team, double chord
   out.center = about + at;
   out.b = Matrix{{sum[7], sum[8], sum[9]}, {sum[10], sum[11], sum[12]}, {sum[13], sum[14], sum[15]}} +
           (-sum[0]) * outer(at, at - chord * out.mean);
-  out.turns = turn_of(out.b, out.turned);
+  out.turns = turn_of(out.b, chord, out.turned);
   return out;
 }
 

@@ -16,6 +16,7 @@ from .scene import Scene
 
 ITERATIONS, HALVINGS = 8, 30
 ETA = 0.9  # largest fraction of the way to where a barrier begins that a start may close
+MOST_TURN = 0.7  # [rad] in a step, which the start leaves out
 LEAST_SHARE = 0.1  # of its gap that a vertex keeps in one step
 DAMPING = 1e-9  # of the inertia
 ARRIVED = 1e-24  # squared step over squared radius of gyration from which on two more steps are taken
@@ -25,8 +26,8 @@ DEFINITE = 1e-10  # least eigenvalue of a turning stiffness over its trace
 GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
 
 
-def connected_bodies(model: Any) -> list[Tensor]:
-    """Vertices of each connected set of tets."""
+def connected_bodies(model: Any, order: Tensor | None = None) -> list[Tensor]:
+    """Vertices of each connected set of tets; ``order`` [T] of the tets makes another one of the vertices."""
     parent = list(range(model.rest_points.shape[-2]))
 
     def root(i: int) -> int:
@@ -40,7 +41,10 @@ def connected_bodies(model: Any) -> list[Tensor]:
         for other in tet[1:]:
             parent[root(other)] = root(tet[0])
     members: dict[int, list[int]] = {}
-    for i in sorted({i for tet in tets for i in tet}):
+    listed = sorted({i for tet in tets for i in tet})
+    if order is not None:
+        listed = list(dict.fromkeys(i for n in order.tolist() for i in tets[n]))
+    for i in listed:
         members.setdefault(root(i), []).append(i)
     return [torch.tensor(m, device=model.pinned.device) for m in members.values()]
 
@@ -49,7 +53,7 @@ class Correction:
     """The correction of a run; ``energies``: the reference formulas, of which those of single vertices count."""
 
     def __init__(self, scene: Scene, energies: list[Any]) -> None:
-        model, bodies = scene.model, connected_bodies(scene.model)
+        model, bodies = scene.model, connected_bodies(scene.model, scene.layout.order)
         self.scene = scene
         self.bodies = [b for b in bodies if model.rigid and not bool(model.pinned[b].any())]
         self.others = [b for b in bodies if not any(b is own for own in self.bodies)]
@@ -174,9 +178,16 @@ def bent(mass: Tensor, x: Tensor, way: Tensor, chord: float) -> tuple[Tensor, Te
     center, mean = ((mass * a).sum(-1, keepdim=True) / total for a in (x, way))
     r, beside = x - center, way - mean
     before = r - chord * beside
-    turn, turns = _polar_or_none((mass * r) @ before.transpose(-1, -2))
+    turn, turns = _turn_or_none((mass * r) @ before.transpose(-1, -2), chord)
     change = torch.where(turns, (r - turn @ before) / chord, beside)
     return mean + change, r + change, r + beside
+
+
+def _turn_or_none(b: Tensor, chord: float) -> tuple[Tensor, Tensor]:
+    """The rotation closest to b, and whether there is one that a step may turn by over a share ``chord`` of it."""
+    turn, turns = _polar_or_none(b)
+    square = (turn - torch.eye(3, dtype=b.dtype, device=b.device)).detach().square().sum((-2, -1))
+    return turn, turns & (square < 2 * (MOST_TURN * chord) ** 2)[..., None, None]
 
 
 def turned(mass: Tensor, x: Tensor, way: Tensor, chord: float) -> Tensor:
@@ -184,7 +195,7 @@ def turned(mass: Tensor, x: Tensor, way: Tensor, chord: float) -> Tensor:
     total = mass.sum(-1, keepdim=True)
     center, mean = ((mass * a).sum(-1, keepdim=True) / total for a in (x, way))
     _, shape, end = bent(mass, x, way, chord)
-    turn, turns = _polar_or_none((mass * end) @ shape.transpose(-1, -2))
+    turn, turns = _turn_or_none((mass * end) @ shape.transpose(-1, -2), 1.0)
     return torch.where(turns, mean + turn @ shape - (x - center), way)
 
 

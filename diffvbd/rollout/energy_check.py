@@ -16,12 +16,14 @@ from ..model.rest import rest_metric
 from ..said import page, percent, warn
 from ..scopes import is_captured, looks_at
 from ..step.arguments import Prepared, acceleration_of
+from ..step.met import outcomes
+from ..step.predict import energy_data
 
 GAIN = 0.05  # of the energy that a scene had and that gravity gave it, which a rollout may gain without a word
-GAIN_TOUCHING = 1.0  # the same where barriers are: what is pressed together at the start may come apart
+GAIN_PRESSED = 1.0  # the same where barriers push at the start: what they hold comes in
 WARNED = "warned_of_energy"  # of a Model's _derived: one warning is enough for all of its rollouts
 ENDED = "ended"  # the same, on CUDA: whether its latest rollouts ended finite, on the way to the host
-LOOKS, LOOKS_ON_FLOOR, LOOKS_TOUCHING = 3, 12, 64  # at a rollout, unasked
+LOOKS, LOOKS_ON_FLOOR, LOOKS_TOUCHING = 6, 12, 64  # at a rollout, unasked
 SEEN = "rollouts_seen"  # the same: its rollouts that could have been looked at
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: its looks cost as much as some steps
 CHUNKS, LEAST_CHUNK = 8, 256  # of the tets, one after another, so that a look needs little memory
@@ -75,6 +77,20 @@ def _warn_not_finite(which: str) -> None:
 # --- energy from nowhere ----------------------------------------------------------------------------------------------
 
 
+# What of the tets, chunk by chunk, no look changes: mu, lam, rest scalars [7, 1 | B, t] and corners [4, t].
+_Elastic = list[tuple[Tensor, Tensor, Tensor, Tensor]]
+
+
+def _elastic_of(model: Model, prepared: Prepared) -> _Elastic:
+    out, chunk = [], max(LEAST_CHUNK, -(-model.num_tets // CHUNKS))
+    for first in range(0, model.num_tets, chunk):
+        rows = slice(first, first + chunk)
+        mu, lam = (m[:, rows].double() if m.shape[1] > 1 else m.double() for m in (prepared.mu, prepared.lam))
+        rest = _rest_of(model, prepared, rows).double().movedim(-1, 0).contiguous()
+        out.append((mu, lam, rest, model.tets[rows].T.contiguous()))
+    return out
+
+
 @dataclass
 class EnergyLook:
     """Energy of a rollout that nothing but gravity drives, at its start and after some of its steps, [B] each."""
@@ -84,14 +100,18 @@ class EnergyLook:
     gravity: Tensor
     start: Tensor
     had: Tensor  # at the start: kinetic and elastic energy, and what gravity does over the scene's length [J]
-    at: frozenset[int]  # numbers of steps that are looked at
+    at: frozenset[int]  # numbers of steps that are looked at, the first among them
+    elastic: _Elastic
+    pressed: Tensor  # scenes in which barriers push at the start, bool [B]; of pairs known after a step
     found: dict[int, Tensor] = field(default_factory=dict)
 
     def see(self, step: int, x: Tensor, v: Tensor) -> None:
         """After a step; one that runs again is not seen twice."""
         if step in self.at and step not in self.found:
             with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-                energy = mechanical_energy(self.model, self.prepared, x.detach(), v.detach())
+                if not self.found and self.model.contact is not None and self.model in outcomes:
+                    self.pressed = self.pressed | (outcomes[self.model].smallest[0] < self.model.contact.dhat)
+                energy = mechanical_energy(self.model, self.prepared, x.detach(), v.detach(), self.elastic)
                 way = (x.detach().double() - self.start.double()) * self.gravity.double()
                 mass = _free_mass(self.model, self.prepared)
                 fallen = (mass * way.sum(-1).reshape(-1, mass.shape[-1])).sum(-1)  # what gravity has done [J]
@@ -102,15 +122,15 @@ class EnergyLook:
         energy, fallen = torch.stack(list(self.found.values())).unbind(1)  # [looks, B]
         begun, room = self.had[:2]
         gain = (energy - begun - fallen) / (begun + room + fallen.abs().amax(0)).clamp(min=math.ulp(0.0))
-        most = float(gain.max())
-        touching = self.model.touches or self.model.floor is not None
-        if not most > (GAIN_TOUCHING if touching else GAIN):
+        past = gain - torch.where(self.pressed, GAIN_PRESSED, GAIN)
+        if not float(past.max()) > 0:
             return
         self.model._derived[WARNED] = True
-        look, scene = divmod(int(gain.argmax()), gain.shape[-1])
+        look, scene = divmod(int(past.argmax()), gain.shape[-1])
+        most = float(gain[look, scene])
         of = f"scene {scene}" if gain.shape[-1] > 1 else "the scene"
         faster = "" if self.model.coarse is not None else ', coarse="auto"'
-        pressed = ", unless bodies were pressed together at the start" if touching else ""
+        pressed = ", unless bodies were pressed together at the start" if bool(self.pressed[scene]) else ""
         warn(
             f"sweeps: after step {list(self.found)[look]} {of} has gained {percent(most)} of the energy that it had "
             f"and that gravity gave it: the sweeps have not converged{pressed}; take more sweeps{faster} or a smaller "
@@ -140,9 +160,15 @@ def look_at_energy(asked: bool | None, model: Model, x: Tensor, v: Tensor, steps
         start, pull = x.detach(), acceleration_of(gravity, x).detach()
         size = (start.amax(-2) - start.amin(-2)).double().norm(dim=-1).reshape(-1)  # [B]
         room = _free_mass(model, prepared).sum(-1) * pull.double().norm(dim=-1).amax() * size
-        begun = mechanical_energy(model, prepared, start, v.detach())
+        elastic = _elastic_of(model, prepared)
+        begun = mechanical_energy(model, prepared, start, v.detach(), elastic)
         had = torch.stack([begun, (room + _rounding(model, prepared, start)).expand_as(begun)])
-        return EnergyLook(model, prepared, pull, start, had, _looked_at(asked, model, steps))
+        pressed = torch.zeros_like(begun, dtype=torch.bool)
+        if model.floor is not None:
+            planes = energy_data(model, prepared, None)[:, : model.floor.count()]
+            gap, _, _, dhat = model.floor.gaps(start.reshape(-1, *start.shape[-2:]), planes, None)
+            pressed = pressed | (gap < dhat).flatten(1).any(-1)
+        return EnergyLook(model, prepared, pull, start, had, _looked_at(asked, model, steps), elastic, pressed)
 
 
 def _looked_at(asked: bool | None, model: Model, steps: int) -> frozenset[int]:
@@ -158,7 +184,8 @@ def _free_mass(model: Model, prepared: Prepared) -> Tensor:
     return torch.where(model._pinned, 0.0, prepared.mass.double())
 
 
-def mechanical_energy(model: Model, prepared: Prepared, x: Tensor, v: Tensor) -> Tensor:
+def mechanical_energy(model: Model, prepared: Prepared, x: Tensor, v: Tensor, elastic: _Elastic | None = None
+                      ) -> Tensor:  # fmt: skip
     """Kinetic and elastic energy of each scene [J], float64 [B]; the rest shape has none of the latter.
 
     With the rest scalars k_ab and c6 of docs/method.md, section 2, E = -mu/2 sum_ab k_ab |x_a - x_b|^2
@@ -166,20 +193,17 @@ def mechanical_energy(model: Model, prepared: Prepared, x: Tensor, v: Tensor) ->
     """
     x, v = (t.reshape(-1, *t.shape[-2:]).double() for t in (x, v))
     moving = 0.5 * (_free_mass(model, prepared) * v.square().sum(-1)).sum(-1)
-    total, chunk = torch.zeros_like(moving), max(LEAST_CHUNK, -(-model.num_tets // CHUNKS))
-    for first in range(0, model.num_tets, chunk):
-        rows = slice(first, first + chunk)
-        mu, lam = (m[:, rows].double() if m.shape[1] > 1 else m.double() for m in (prepared.mu, prepared.lam))
-        rest = _rest_of(model, prepared, rows).double().movedim(-1, 0)  # [7, 1 | B, t]
-        corners = x[:, model.tets[rows]].permute(3, 2, 0, 1).contiguous()  # [3, 4, B, t]: long rows are quick
+    total, rows = torch.zeros_like(moving), x.permute(2, 0, 1).contiguous()  # [3, B, V]
+    for mu, lam, rest, tets in _elastic_of(model, prepared) if elastic is None else elastic:
+        corners = rows[:, :, tets].transpose(1, 2)  # [3, 4, B, t]: long rows are quick
         edges = corners[:, 1:] - corners[:, :1]
         others = edges[:, [1, 2, 2]] - edges[:, [0, 0, 1]]  # from 1 and 2 to 2 and 3
         shear = -(rest[:6] * torch.cat([edges, others], 1).square_().sum(0)).sum(0)
         c6 = rest[6]
         change = c6 * (edges[:, 0] * torch.linalg.cross(edges[:, 1], edges[:, 2], dim=0)).sum(0) - 1
         volume = 1 / (6 * c6)
-        elastic = 0.5 * mu * (shear - 3 * volume) + volume * (0.5 * (mu + lam) * change.square() - mu * change)
-        total = total + elastic.sum(-1)
+        density = 0.5 * mu * (shear - 3 * volume) + volume * (0.5 * (mu + lam) * change.square() - mu * change)
+        total = total + density.sum(-1)
     return moving + total
 
 

@@ -245,6 +245,7 @@ def unrolled(scene: Scene, steps: int, sweeps: int, parts: list[list[reference.P
              ) -> dict[str, Tensor]:  # fmt: skip
     """The same by autograd through the reference; ``seed`` permutes pairs and tets, which changes rounding alone."""
     leaves = scene.leaves()
+    options: dict[str, Any]
     options, parameters = split(leaves)
     x, v = options.pop("x"), options.pop("v")
     for own in parts[:steps]:

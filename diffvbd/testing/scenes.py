@@ -340,7 +340,7 @@ def spread(
 ) -> dict[str, float]:
     """How far two references with permuted tets disagree, per entry of `evaluate`: what rounding alone does here.
 
-    The order of the tets changes the sums over a star, the order of a tet's corners the rounding inside it.
+    The order of the tets changes the sums over a star and over a body, that of a tet's corners the rounding inside it.
     `expected`: the unpermuted `reference_result`, when it is at hand.
     """
     order = torch.from_numpy(generator("order").permutation(model.tets.shape[0]))

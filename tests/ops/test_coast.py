@@ -126,6 +126,16 @@ def test_without_a_turn_ways_stay_to_the_bit(device: str) -> None:
     assert not bars[0][:, rows[2]].any() and torch.equal(bars[2][:, rows[2]], torch.ones_like(c.x)[:, rows[2]])
 
 
+def test_a_turn_that_no_step_should_make_stays_as_it_is(device: str) -> None:
+    """Its turn is over 0.7 rad in a step; at twice as short steps the same motion is turned."""
+    c = case([30], device)
+    axis = torch.tensor([0.0, 0.0, 1.0], dtype=c.x.dtype, device=device)
+    move = torch.linalg.cross(axis.expand_as(c.x), c.x)
+    for chord in CHORDS:
+        assert torch.equal(ops_motion.contact_coast(*c._replace(move=move), chord), move)
+        assert not torch.equal(ops_motion.contact_coast(*c._replace(move=0.5 * move), chord), 0.5 * move)
+
+
 def test_opcheck_and_bad_input(device: str) -> None:
     c = case([3, 5], device)
     torch.library.opcheck(torch.ops.diffvbd.contact_coast.default, (*c, 1.0))

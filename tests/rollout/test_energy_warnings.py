@@ -103,7 +103,7 @@ def test_rollouts_are_looked_at_ever_more_seldom(monkeypatch: pytest.MonkeyPatch
     for number in range(1, 10):
         count = number
         dv.rollout(model, x, v, steps=10, **SOFT)
-    assert looks == [1] * 4 + [2] * 4 + [4] * 4 + [8] * 4  # the start, and three steps
+    assert looks == [1] * 7 + [2] * 7 + [4] * 7 + [8] * 7  # the start, and six steps
 
 
 @pytest.mark.parametrize("schedule", [None, 3, dv.BinomialCheckpoints(2)])
