@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -78,17 +79,16 @@ def _warn_not_finite(which: str) -> None:
 
 
 # What of the tets, chunk by chunk, no look changes: mu, lam, rest scalars [7, 1 | B, t] and corners [4, t].
-_Elastic = list[tuple[Tensor, Tensor, Tensor, Tensor]]
+_Chunk = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
-def _elastic_of(model: Model, prepared: Prepared) -> _Elastic:
-    out, chunk = [], max(LEAST_CHUNK, -(-model.num_tets // CHUNKS))
+def _elastic_of(model: Model, prepared: Prepared) -> Iterator[_Chunk]:
+    chunk = max(LEAST_CHUNK, -(-model.num_tets // CHUNKS))
     for first in range(0, model.num_tets, chunk):
         rows = slice(first, first + chunk)
         mu, lam = (m[:, rows].double() if m.shape[1] > 1 else m.double() for m in (prepared.mu, prepared.lam))
         rest = _rest_of(model, prepared, rows).double().movedim(-1, 0).contiguous()
-        out.append((mu, lam, rest, model.tets[rows].T.contiguous()))
-    return out
+        yield mu, lam, rest, model.tets[rows].T.contiguous()
 
 
 @dataclass
@@ -101,7 +101,7 @@ class EnergyLook:
     start: Tensor
     had: Tensor  # at the start: kinetic and elastic energy, and what gravity does over the scene's length [J]
     at: frozenset[int]  # numbers of steps that are looked at, the first among them
-    elastic: _Elastic
+    elastic: list[_Chunk] | None
     pressed: Tensor  # scenes in which barriers push at the start, bool [B]; of pairs known after a step
     found: dict[int, Tensor] = field(default_factory=dict)
 
@@ -156,11 +156,13 @@ def look_at_energy(asked: bool | None, model: Model, x: Tensor, v: Tensor, steps
             return None
     if not looks_at(x) and not _copies(x):
         return None
+    given = (x, v, prepared.mu, prepared.lam, prepared.mass)
+    taped = torch.is_grad_enabled() and any(t.requires_grad for t in given)
     with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
         start, pull = x.detach(), acceleration_of(gravity, x).detach()
         size = (start.amax(-2) - start.amin(-2)).double().norm(dim=-1).reshape(-1)  # [B]
         room = _free_mass(model, prepared).sum(-1) * pull.double().norm(dim=-1).amax() * size
-        elastic = _elastic_of(model, prepared)
+        elastic = None if taped else list(_elastic_of(model, prepared))  # a tape should be all that a rollout keeps
         begun = mechanical_energy(model, prepared, start, v.detach(), elastic)
         had = torch.stack([begun, (room + _rounding(model, prepared, start)).expand_as(begun)])
         pressed = torch.zeros_like(begun, dtype=torch.bool)
@@ -173,10 +175,10 @@ def look_at_energy(asked: bool | None, model: Model, x: Tensor, v: Tensor, steps
 
 def _looked_at(asked: bool | None, model: Model, steps: int) -> frozenset[int]:
     """Which of so many steps: all where one asks; where bodies may hit something, whose gain may be over in a step, as
-    many as cost little beside such steps."""
+    many as cost little beside such steps; else most of them early, when what a start has too much of comes out."""
     looks = LOOKS_TOUCHING if model.touches else LOOKS if model.floor is None else LOOKS_ON_FLOOR
-    count = steps if asked else min(steps, looks)
-    return frozenset(round(1 + k * (steps - 1) / max(1, count - 1)) for k in range(count))
+    count, power = (steps, 1) if asked else (min(steps, looks), 2 if looks == LOOKS else 1)
+    return frozenset(round(1 + (steps - 1) * (k / max(1, count - 1)) ** power) for k in range(count))
 
 
 def _free_mass(model: Model, prepared: Prepared) -> Tensor:
@@ -184,7 +186,7 @@ def _free_mass(model: Model, prepared: Prepared) -> Tensor:
     return torch.where(model._pinned, 0.0, prepared.mass.double())
 
 
-def mechanical_energy(model: Model, prepared: Prepared, x: Tensor, v: Tensor, elastic: _Elastic | None = None
+def mechanical_energy(model: Model, prepared: Prepared, x: Tensor, v: Tensor, elastic: list[_Chunk] | None = None
                       ) -> Tensor:  # fmt: skip
     """Kinetic and elastic energy of each scene [J], float64 [B]; the rest shape has none of the latter.
 

@@ -11,7 +11,7 @@ from diffvbd.testing.tolerances import tolerance
 
 STEP, SPIN = 0.01, 19.0  # 0.19 rad a step
 # beside the kinetic energy at the start: the centrifugal forces' own, and what few sweeps leave
-ELASTIC = {(1e5, 1): 2e-3, (1e5, 2): 2e-3, (4.4e6, 1): 1e-3, (4.4e6, 2): 1e-4}
+ELASTIC = {(1e5, 1): 2e-3, (1e5, 2): 2e-3, (4.4e6, 1): 1e-3, (4.4e6, 2): 2e-4}
 
 
 def scene(device: str, contact: bool) -> tuple[dv.Model, Tensor, Tensor]:
@@ -68,7 +68,7 @@ def test_second_order(device: str, contact: bool) -> None:
     for integrator in (dv.BDF2(), dv.SDIRK2()):
         _, converged = turned(device, contact, 4.4e6, 40, integrator)
         elastic, left = turned(device, contact, 4.4e6, 2, integrator)
-        assert 0 < elastic <= 2e-3
+        assert 0 < elastic <= 5 * ELASTIC[4.4e6, 2]
         assert abs(left - converged) <= tolerance("turning")
 
 
