@@ -112,9 +112,9 @@ def rollout(
             Model has warned. A look costs about a step and on CUDA waits for the device; nothing that is compiled or
             captured is looked at.
         check_energy: Whether to warn (UserWarning) where a scene that only gravity drives has 5 % more energy (where
-            bodies may touch, twice as much) than it began with and gravity gave it. True: after any step. None: on the
-            CPU, after three steps (with contact, up to 64) of the 1st, 2nd, 4th, 8th, ... rollout of ten steps or more
-            of a Model, until one has warned.
+            barriers push at the start, twice as much) than it began with and gravity gave it. True: after any step.
+            None: on the CPU, after six steps, most of them early (with a floor 12, with contact up to 64), of the 1st,
+            2nd, 4th, 8th, ... rollout of ten steps or more of a Model, until one has warned.
         check_start: With a PairBarrier, raise where surfaces intersect at the start: edges through triangles, or
             vertices behind a Plane. Contact keeps apart what is apart, and no step notices what is not. It costs
             half of one detection and, on CUDA, waits for the device once. Under torch.compile, and while a CUDA graph
