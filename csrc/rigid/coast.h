@@ -18,6 +18,9 @@ struct Coasting {
   Matrix b, turned;  // sum m r (r - c d)^T, and Q - 1
   bool turns;        // false: b has no rotation; ways are as they were
 
+  // ways as they were
+  DIFFVBD_FN void keep() { turned = 0.0 * identity(), turns = false; }
+
   template <class View>
   DIFFVBD_FN Vector arm(const View& view, int32_t i) const {
     return view.position(i) - center;

@@ -209,8 +209,12 @@ struct Coasted {
 template <bool energies, class T, class Team>
 DIFFVBD_FN Coasted coast(const Inputs<T>& in, const Body<T>& b, const Team& team, T* x, T* y) {
   const Leaving<T> body{in, b};
-  const rigid::Coasting ways = rigid::coasting_of(body, team, in.chord);
-  const double share = energies && in.filters ? share_of(body, ways, team) : 1;
+  rigid::Coasting ways = rigid::coasting_of(body, team, in.chord);
+  double share = energies && in.filters ? share_of(body, ways, team) : 1;
+  if (share < 1) {  // planes hold it back: the correction would bring the turn in at the plane, to the cost of rebounds
+    ways.keep();
+    share = share_of(body, ways, team);
+  }
   team.each(b.size(), [&](int32_t i) {
     const int32_t v = b.vertex(i);
     const int64_t at = 3 * b.row(v);

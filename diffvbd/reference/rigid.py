@@ -68,7 +68,14 @@ class Correction:
     def coasted(self, body: Tensor, x: Tensor, way: Tensor, chord: float) -> tuple[Tensor, Tensor]:
         """The vertices of one body on their ways from x [..., 3, n] without its turn, as far as all of them may go
         together; and the share of it that this is [...]."""
-        step = bent(self.scene.mass[..., body].unsqueeze(-2), x, way, chord)[0]
+        own = bent(self.scene.mass[..., body].unsqueeze(-2), x, way, chord)[0]
+        to, share = self._toward(x, own)
+        kept, kept_share = self._toward(x, way)  # where planes hold the body back
+        held = share < 1
+        return torch.where(held[..., None, None], kept, to), torch.where(held, kept_share, share)
+
+    def _toward(self, x: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+        """Vertices after their ways, as far as all of them may go together, and the share of these."""
         share, good = torch.ones_like(x[..., :1, :1]), torch.ones_like(x[..., :1, :1], dtype=torch.bool)
         floors = [e for e in self.energies if hasattr(e, "gap")]
         slack = 8 * torch.finfo(x.dtype).eps * step.detach().norm(dim=-2).unsqueeze(-2)
