@@ -32,13 +32,9 @@ DIFFVBD_FN TurnedCoasting turned_coasting(const MovingBody<T>& b, const Team& te
   out.shape = rigid::coasting_of(b, team, chord);
   if (!out.shape.turns) return out;
   double sum[9];
-  team.template sum<9>(b.size(), sum, [&](int32_t i, double* to) {
-    const Vector t = b.mass(i) * out.end(b, i), s = out.placed(b, i);
-    const double values[] = {t.x * s.x, t.x * s.y, t.x * s.z, t.y * s.x, t.y * s.y,
-                             t.y * s.z, t.z * s.x, t.z * s.y, t.z * s.z};
-    for (int c = 0; c < 9; ++c) to[c] += values[c];
-  });
-  out.b = {{sum[0], sum[1], sum[2]}, {sum[3], sum[4], sum[5]}, {sum[6], sum[7], sum[8]}};
+  team.template sum<9>(
+      b.size(), sum, [&](int32_t i, double* to) { rigid::add_outer(to, b.mass(i) * out.end(b, i), out.placed(b, i)); });
+  out.b = rigid::rows_of(sum);
   out.turns = rigid::turn_of(out.b, 1.0, out.turned);
   return out;
 }
@@ -75,13 +71,11 @@ DIFFVBD_FN void reverse_coast(const MovingBody<T>& b, const Team& team, double c
   }
   double sum[12];
   team.template sum<12>(b.size(), sum, [&](int32_t i, double* to) {
-    const Vector g = b.of(a.rigid, i), s = c.placed(b, i);
-    const double values[] = {g.x,       g.y,       g.z,       g.x * s.x, g.x * s.y, g.x * s.z,
-                             g.y * s.x, g.y * s.y, g.y * s.z, g.z * s.x, g.z * s.y, g.z * s.z};
-    for (int k = 0; k < 12; ++k) to[k] += values[k];
+    const Vector g = b.of(a.rigid, i);
+    rigid::add(to, g), rigid::add_outer(to + 3, g, c.placed(b, i));
   });
   const Vector total{sum[0], sum[1], sum[2]};
-  const rigid::Matrix turn_bar{{sum[3], sum[4], sum[5]}, {sum[6], sum[7], sum[8]}, {sum[9], sum[10], sum[11]}};
+  const rigid::Matrix turn_bar = rigid::rows_of(sum + 3);
   const rigid::Matrix b_bar = rigid::polar_vjp(c.b, c.turned + rigid::identity(), turn_bar);
   const double per_mass = 1 / c.shape.mass;
   const Vector to_center = transposed_times(c.turned, total);

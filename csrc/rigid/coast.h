@@ -12,6 +12,15 @@
 
 namespace diffvbd::rigid {
 
+// Sums of vectors and of products a b^T, by rows.
+DIFFVBD_FN void add(double* to, const Vector& a) { to[0] += a.x, to[1] += a.y, to[2] += a.z; }
+DIFFVBD_FN void add_outer(double* to, const Vector& a, const Vector& b) {
+  add(to, a.x * b), add(to + 3, a.y * b), add(to + 6, a.z * b);
+}
+DIFFVBD_FN Matrix rows_of(const double* sum) {
+  return {{sum[0], sum[1], sum[2]}, {sum[3], sum[4], sum[5]}, {sum[6], sum[7], sum[8]}};
+}
+
 struct Coasting {
   double mass, chord;
   Vector center, mean;
@@ -41,8 +50,8 @@ struct Coasting {
   }
 };
 
-// turned: polar(b) - 1, zero where that is rounding, or more than a turn in a share `chord` of a step should be: the
-// correction would not find back. False where there is no rotation but 0.
+// turned: polar(b) - 1, or zero where that is rounding. False, and zero, where b has no rotation, or one over a share
+// `chord` of a step that comes to more than kMostTurn in the step: the correction might not find it.
 DIFFVBD_FN bool turn_of(const Matrix& b, double chord, Matrix& turned) {
   constexpr double kNone = 1e-30, kMostTurn = 0.7;  // squared; [rad]
   Matrix turn = identity();
@@ -61,23 +70,8 @@ DIFFVBD_FN Coasting coasting_of(const View& view, const Team& team, double chord
   team.template sum<16>(view.size(), sum, [&](int32_t i, double* to) {
     const double m = view.mass(i);
     const Vector way = view.way(i), at = view.position(i) - about, x = m * at, before = at - chord * way;
-    const double values[] = {m,
-                             x.x,
-                             x.y,
-                             x.z,
-                             m * way.x,
-                             m * way.y,
-                             m * way.z,
-                             x.x * before.x,
-                             x.x * before.y,
-                             x.x * before.z,
-                             x.y * before.x,
-                             x.y * before.y,
-                             x.y * before.z,
-                             x.z * before.x,
-                             x.z * before.y,
-                             x.z * before.z};
-    for (int c = 0; c < 16; ++c) to[c] += values[c];
+    to[0] += m;
+    add(to + 1, x), add(to + 4, m * way), add_outer(to + 7, x, before);
   });
   Coasting out{};
   out.mass = sum[0], out.chord = chord;
@@ -85,8 +79,7 @@ DIFFVBD_FN Coasting coasting_of(const View& view, const Team& team, double chord
   const Vector at = 1 / sum[0] * Vector{sum[1], sum[2], sum[3]};
   out.mean = 1 / sum[0] * Vector{sum[4], sum[5], sum[6]};
   out.center = about + at;
-  out.b = Matrix{{sum[7], sum[8], sum[9]}, {sum[10], sum[11], sum[12]}, {sum[13], sum[14], sum[15]}} +
-          (-sum[0]) * outer(at, at - chord * out.mean);
+  out.b = rows_of(sum + 7) + (-sum[0]) * outer(at, at - chord * out.mean);
   out.turns = turn_of(out.b, chord, out.turned);
   return out;
 }
@@ -99,27 +92,14 @@ DIFFVBD_FN void reverse_coasting(const View& view, const Team& team, const Coast
   double sum[12];
   team.template sum<12>(view.size(), sum, [&](int32_t i, double* to) {
     const Vector bar = bend_bar(i), before = c.arm(view, i) - c.back(view, i);
-    const double values[] = {bar.x,
-                             bar.y,
-                             bar.z,
-                             bar.x * before.x,
-                             bar.x * before.y,
-                             bar.x * before.z,
-                             bar.y * before.x,
-                             bar.y * before.y,
-                             bar.y * before.z,
-                             bar.z * before.x,
-                             bar.z * before.y,
-                             bar.z * before.z};
-    for (int k = 0; k < 12; ++k) to[k] += values[k];
+    add(to, bar), add_outer(to + 3, bar, before);
   });
   const Vector total{sum[0], sum[1], sum[2]};
   const double per_mass = c.mass > 0 ? 1 / c.mass : 0;
   Matrix b_bar = 0.0 * identity();
   Vector held{};  // what vertices send to the center of mass, times the chord: r appears in Q r alone
   if (c.turns) {
-    const Matrix turn_bar =
-        (-1 / c.chord) * Matrix{{sum[3], sum[4], sum[5]}, {sum[6], sum[7], sum[8]}, {sum[9], sum[10], sum[11]}};
+    const Matrix turn_bar = (-1 / c.chord) * rows_of(sum + 3);
     b_bar = polar_vjp(c.b, c.turned + identity(), turn_bar);
     held = transposed_times(c.turned, total);
   }

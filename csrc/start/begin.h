@@ -211,7 +211,7 @@ DIFFVBD_FN Coasted coast(const Inputs<T>& in, const Body<T>& b, const Team& team
   const Leaving<T> body{in, b};
   rigid::Coasting ways = rigid::coasting_of(body, team, in.chord);
   double share = energies && in.filters ? share_of(body, ways, team) : 1;
-  if (share < 1) {  // planes hold it back: the correction would bring the turn in at the plane, to the cost of rebounds
+  if (share < 1) {  // planes hold it back: the correction would bring the turn in at the plane, at the cost of rebounds
     ways.keep();
     share = share_of(body, ways, team);
   }

@@ -176,8 +176,9 @@ def look_at_energy(asked: bool | None, model: Model, x: Tensor, v: Tensor, steps
 def _looked_at(asked: bool | None, model: Model, steps: int) -> frozenset[int]:
     """Which of so many steps: all where one asks; where bodies may hit something, whose gain may be over in a step, as
     many as cost little beside such steps; else most of them early, when what a start has too much of comes out."""
-    looks = LOOKS_TOUCHING if model.touches else LOOKS if model.floor is None else LOOKS_ON_FLOOR
-    count, power = (steps, 1) if asked else (min(steps, looks), 2 if looks == LOOKS else 1)
+    meets = model.touches or model.floor is not None
+    looks = LOOKS_TOUCHING if model.touches else LOOKS_ON_FLOOR if meets else LOOKS
+    count, power = (steps, 1) if asked else (min(steps, looks), 1 if meets else 2)
     return frozenset(round(1 + (steps - 1) * (k / max(1, count - 1)) ** power) for k in range(count))
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
 import torch
+from helpers.grouped import grouped
 from torch import Tensor
 
 from diffvbd.ops import motion as ops_motion
@@ -56,10 +56,7 @@ def case(sizes: list[int], device: str, dtype: torch.dtype = torch.float64, scen
     def reals(*shape: int) -> Tensor:
         return torch.as_tensor(rng.standard_normal(shape), dtype=dtype, device=device)
 
-    order, ptr = rng.permutation(n).astype(np.int32), np.cumsum([0, *sizes]).astype(np.int32)
-    holds = rng.random(n) < held
-    held_bodies = np.array([holds[order[a:b]].any() for a, b in zip(ptr[:-1], ptr[1:], strict=True)], dtype=bool)
-    index = (torch.as_tensor(a, device=device) for a in (holds, held_bodies, order, ptr))
+    index = grouped(sizes, rng, held, device)
     x, far, move, fall = (reals(scenes, n, 3) for _ in range(4))
     return Case(x, far if origin else x.new_empty((0,)), 0.5 + reals(1, n).abs(), move, fall, *index)
 
