@@ -5,7 +5,8 @@
 #include <tuple>
 #include <vector>
 
-#include "../contact/rigid_backward.h"
+#include "../contact/rigid_reverse.h"
+#include "../contact/rigid_tries.h"
 #include "contact_start.h"
 #include "rigid.h"
 
@@ -119,21 +120,66 @@ contact::VirtualMotions<T> virtual_motions(const contact::RigidInputs<T>& in, co
   return {data<const T>(p), data<const T>(q)};
 }
 
-// What contact_rigid_backward returns, made by `make`(sizes).
+// What contact_rigid_move returns; make(sizes, dtype).
+struct RigidOutcomeTensors {
+  Tensor x, share, moved, held, left;
+  template <class T, class Make>
+  RigidOutcomeTensors(const contact::RigidInputs<T>& in, const Tensor& like, const Make& make)
+      : x(make({in.scene.scenes, in.scene.vertices, 3}, like.scalar_type())),
+        share(make({in.scene.scenes, in.bodies()}, ScalarType::Double)),
+        moved(make({in.scene.scenes, in.bodies()}, ScalarType::Bool)),
+        held(make({in.scene.scenes, in.bodies()}, ScalarType::Bool)),
+        left(make({in.scene.scenes, in.bodies()}, like.scalar_type())) {}
+  template <class T>
+  contact::RigidOutcome<T> view() const {
+    return {data<double>(share), data<bool>(moved), data<bool>(held), data<T>(left)};
+  }
+  std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> all() const { return {x, share, moved, held, left}; }
+};
+
+// What contact_rigid_backward returns, and the rows of pairs, made by `make`(sizes); pushes: bytes.
 struct RigidWorkTensors {
-  Tensor barrier, by_kappa, friction, by_lag;
+  Tensor barrier, pushes, friction, by_x, by_p, by_q, since, by_kappa, lag_bar;
   template <class Make>
-  RigidWorkTensors(const TouchingFields& f, const Make& make)
+  RigidWorkTensors(const TouchingFields& f, const Tensor& pushes, const Make& make)
       : barrier(make({f.pairs.size(0), 4, contact::kWorkScalars})),
-        by_kappa(make({f.pairs.size(0)})),
+        pushes(pushes),
         friction(make({f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0, 4, contact::kWorkScalars})),
-        by_lag(make({friction.size(0), contact::kLagScalars})) {}
+        by_x(make({f.x.size(0), f.body.size(0), 3})),
+        by_p(make({f.x.size(0), f.body.size(0), 3})),
+        by_q(make({f.x.size(0), f.body.size(0), 3})),
+        since(make({friction.size(0) > 0 ? f.x.size(0) : 0, f.body.size(0), 3})),
+        by_kappa(make({f.pairs.size(0)})),
+        lag_bar(make({friction.size(0), contact::kLagScalars})) {}
   template <class T>
   contact::RigidWork<T> view() const {
-    return {data<T>(barrier), data<T>(by_kappa), data<T>(friction), data<T>(by_lag), barrier.size(0), friction.size(0)};
+    return {data<T>(barrier), data<T>(by_kappa), data<uint8_t>(pushes), data<T>(friction),
+            data<T>(lag_bar), barrier.size(0),   friction.size(0)};
   }
-  std::tuple<Tensor, Tensor, Tensor, Tensor> all() const { return {barrier, by_kappa, friction, by_lag}; }
+  template <class T>
+  contact::PointWork<T> sums() const {
+    return {data<T>(by_x), data<T>(by_p), data<T>(by_q), since.numel() > 0 ? data<T>(since) : nullptr};
+  }
+  std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> all() const {
+    return {by_x, by_p, by_q, since, by_kappa, lag_bar};
+  }
 };
+
+// What contact_rigid_vertices_backward adds to; x and mass as contact_rigid_end_backward returns them.
+template <class T>
+contact::SentBack<T> sent_back(const contact::RigidInputs<T>& in, const Tensor& x_bar, const Tensor& mass_bar,
+                               const Tensor& by_x, const Tensor& by_p, const Tensor& by_q, const Tensor& since,
+                               const Tensor& x) {
+  require_like("x_bar", x_bar, x, 3 * in.scene.scenes * in.scene.vertices);
+  require_like("mass_bar", mass_bar, x, in.scene.scenes * in.scene.vertices);
+  const int64_t size = 3 * in.scene.scenes * in.gate.corners;
+  require_like("by_x", by_x, x, size);
+  require_like("by_p", by_p, x, size);
+  require_like("by_q", by_q, x, size);
+  if (since.numel() > 0) require_like("since", since, x, size);
+  return {data<const T>(x_bar), data<const T>(mass_bar), data<const T>(by_x),
+          data<const T>(by_p),  data<const T>(by_q),     since.numel() > 0 ? data<const T>(since) : nullptr};
+}
 
 // What contact_rigid_end_backward returns, but for the solution; zeros(sizes) makes what is zero at first.
 struct RigidEndTensors {
@@ -146,17 +192,16 @@ struct RigidEndTensors {
         mass(zeros({in.scene.scenes, in.scene.vertices})) {}
 };
 
-// What contact_rigid_vertices_backward returns.
+// What contact_rigid_vertices_backward returns; make(sizes, zeroed).
 struct RigidVertexTensors {
   RigidBars bars;
   Tensor floor_lag, none;
-  template <class T, class Zeros>
+  template <class T, class Make>
   RigidVertexTensors(const contact::RigidInputs<T>& in, const std::vector<int64_t>& data_count, bool wants_data,
-                     Zeros&& zeros)
-      : bars(in.scene, data_count, true, wants_data,
-             [&](const std::vector<int64_t>& sizes, bool) { return zeros(sizes); }),
-        floor_lag(zeros({in.planes > 0 ? in.scene.scenes : 0, in.scene.vertices, in.planes, contact::kFloorLag})),
-        none(zeros({0})) {}
+                     const Make& make)
+      : bars(in.scene, data_count, true, wants_data, make),
+        floor_lag(make({in.planes > 0 ? in.scene.scenes : 0, in.scene.vertices, in.planes, contact::kFloorLag}, true)),
+        none(make({0}, false)) {}
   template <class T>
   rigid::Adjoints<T> pointers() const {
     return bars.pointers<T>(bars.x, none);

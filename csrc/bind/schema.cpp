@@ -145,26 +145,28 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   define(m, "contact_rigid_system", DIFFVBD_ARGUMENTS(TOUCHING),
          "int[] data_count, float time_step, float friction_eps, Tensor moving, bool alone",
          "Tensor centers, Tensor motion, Tensor factor, Tensor groups, ");
-  // The state after each body has taken what it may of its motion [scenes, bodies, 6], and that share [scenes, bodies]
+  // The state after each body has taken what it may of its motion [scenes, bodies, 6]; that share [scenes, bodies],
+  // zero of what does not move beside a mask `moving`; whether it has a motion; whether it was held up where others
+  // that were have gone on; and how much of its shift is left [m]
   define(m, "contact_rigid_move", DIFFVBD_ARGUMENTS(TOUCHING),
-         "Tensor centers, Tensor motion, int[] data_count, float time_step, float friction_eps",
-         "Tensor x, Tensor share, ");
-  // Of the virtual work of two motions p and q of all corner points [scenes, N, 3], for each listed pair: derivatives
-  // by the position, p and q of each corner [pairs, 4, 9] and by kappa [pairs]; and for each lagged pair, by corners
-  // and by what is lagged [pairs, 9]
+         "Tensor centers, Tensor motion, int[] data_count, float time_step, float friction_eps, Tensor moving",
+         "Tensor x, Tensor share, Tensor moved, Tensor held, Tensor left, ");
+  // Of the virtual work of two motions p and q of all corner points [scenes, N, 3] that pairs do: its derivatives by
+  // where these points are, by p and by q [scenes, N, 3] each; since [scenes, N, 3]: the first of lagged pairs alone,
+  // or empty; by kappa for each listed pair; and less those by what is lagged [lagged, 9]
   define(m, "contact_rigid_backward", DIFFVBD_ARGUMENTS(TOUCHING),
          "Tensor p, Tensor q, Tensor groups, int[] data_count, float time_step, float friction_eps",
-         "Tensor barrier, Tensor by_kappa, Tensor friction, Tensor by_lag, ");
+         "Tensor by_x, Tensor by_p, Tensor by_q, Tensor since, Tensor by_kappa, Tensor lag_bar, ");
   // The rest of that adjoint. Of x_bar [scenes, V, 3] the solution for the adjoint of the motion [scenes, bodies, 6],
-  // how all corner points move by it and by the motion, and what goes back to x and mass by the way itself; then, of
-  // what pairs send to the two motions, what vertices send to the rest; of data as of rigid_backward()
+  // how all corner points move by it and by the motion, and what goes back to x and mass by the way itself; then, with
+  // these and what pairs have, the adjoints of vertices; of data as of rigid_backward()
   define(m, "contact_rigid_end_backward", DIFFVBD_ARGUMENTS(TOUCHING),
          "Tensor motion, Tensor share, Tensor factor, Tensor groups, Tensor x_bar, int[] data_count, float time_step, "
          "float friction_eps",
          "Tensor solution, Tensor p, Tensor q, Tensor x, Tensor mass, ");
   define(m, "contact_rigid_vertices_backward", DIFFVBD_ARGUMENTS(TOUCHING),
-         "Tensor motion, Tensor solution, Tensor by_p, Tensor by_q, int[] data_count, float time_step, float "
-         "friction_eps, bool wants_data",
+         "Tensor motion, Tensor solution, Tensor x_bar, Tensor mass_bar, Tensor by_x, Tensor by_p, Tensor by_q, Tensor "
+         "since, int[] data_count, float time_step, float friction_eps, bool wants_data",
          "Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own, Tensor floor_lag, ");
   // Predictor and start of the sweeps. chord: as in rigid/coast.h. start: of the bodies that are not corrected, 0 x + h
   // v, 1 y, 2 the lower potential of the two; falls [scenes, other bodies]: 1 where that is y; alone [scenes, bodies]:

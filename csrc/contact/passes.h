@@ -57,8 +57,8 @@ struct ContactAdjoints {
   T* lag = nullptr;                        // [4 pairs, kLagScalars]
   T* floor_lag = nullptr;                  // [B, V, planes, 4]
   T* prev = nullptr;                       // [B, corners, 3]  toward the start of the step
-  // [4 pairs, 4], zero at first, or null: for each corner, whose slots hold something for it; of the others `rows` may
-  // then hold anything
+  // [4 pairs, 4], zero at first: for each corner, whose slots hold something for it; of the others `rows` may hold
+  // anything
   uint8_t* sent = nullptr;
 };
 
@@ -75,6 +75,13 @@ DIFFVBD_FN void add_at(T* p, const Vec3<T>& v) {
   p[0] += v.x;
   p[1] += v.y;
   p[2] += v.z;
+}
+// All are read before any is written: a device waits for memory once.
+template <int n, class T>
+DIFFVBD_FN void add_at(T* p, const T (&values)[n]) {
+  T before[n];
+  for (int i = 0; i < n; ++i) before[i] = p[i];
+  for (int i = 0; i < n; ++i) p[i] = before[i] + values[i];
 }
 
 // Whether the gap of a listed pair is above a length for sure, whose corner k has gone moved(k) since the gap was
@@ -248,16 +255,20 @@ DIFFVBD_FN Lag<T> floor_lag(const Source<T, Positions>& s, int v, int plane) {
   return out;
 }
 
-// Leaves in the slot of an entry what it adds to corner k.
+// Leaves in the slots of an entry what it adds to the corners of its pair. As add_at(), it reads before it writes.
 template <class T>
-DIFFVBD_FN void send(const ContactAdjoints<T>& out, int64_t entry, int k, const Vec3<T>& bar) {
-  T* slot = out.rows + 12 * entry + 3 * k;
-  if (out.sent) {
-    uint8_t& flag = out.sent[16 * (entry >> 2) + 4 * k + (entry & 3)];
-    if (!flag) slot[0] = slot[1] = slot[2] = T(0);
-    flag = 1;
+DIFFVBD_FN void send(const ContactAdjoints<T>& out, int64_t entry, const Vec3<T> (&bar)[4]) {
+  T* slots = out.rows + 12 * entry;
+  uint8_t* flags = out.sent + 16 * (entry >> 2) + (entry & 3);
+  bool holds[4];
+  Vec3<T> before[4];
+  for (int k = 0; k < 4; ++k) holds[k] = flags[4 * k];
+  for (int k = 0; k < 4; ++k) before[k] = holds[k] ? vector_at(slots + 3 * k) : zero3<T>();
+  for (int k = 0; k < 4; ++k) {
+    const Vec3<T> sum = before[k] + bar[k];
+    slots[3 * k] = sum.x, slots[3 * k + 1] = sum.y, slots[3 * k + 2] = sum.z;
+    flags[4 * k] = 1;
   }
-  add_at(slot, bar);
 }
 
 // The adjoint of what add_barrier_of() added, into the slots of the pair.
@@ -273,7 +284,7 @@ DIFFVBD_FN void reverse_barrier_of(const Source<T, Positions>& s, const ContactA
                        h * h, p, d_raw, bar)) {
     return;
   }
-  for (int k = 0; k < 4; ++k) send(out, entry, k, bar.x[k]);
+  send(out, entry, bar.x);
   out.kappa[entry] += bar.kappa;
 }
 
@@ -292,14 +303,14 @@ DIFFVBD_FN void reverse_lags(const Source<T, Positions>& s, const ContactAdjoint
       Lag<T> bar;
       const Vec3<T> m_bar =
           reverse_lagged(lag, static_cast<int>(entry & 3), s.together(record, v), m, h, in.friction_eps, p, d_raw, bar);
-      T* to = out.lag + kLagScalars * entry;
-      to[0] += bar.friction;
-      to[1] += bar.damping;
-      add_at(to + 2, bar.n);
+      T by_lag[kLagScalars] = {bar.friction, bar.damping, bar.n.x, bar.n.y, bar.n.z}, rows[12];
       for (int k = 0; k < 4; ++k) {
-        to[5 + k] += bar.w[k] + dot(m_bar, s.x(record[k]) - s.x_prev(record[k]));
-        add_at(out.lag_rows + 12 * entry + 3 * k, lag.w[k] * m_bar);
+        by_lag[5 + k] = bar.w[k] + dot(m_bar, s.x(record[k]) - s.x_prev(record[k]));
+        const Vec3<T> row = lag.w[k] * m_bar;
+        rows[3 * k] = row.x, rows[3 * k + 1] = row.y, rows[3 * k + 2] = row.z;
       }
+      add_at(out.lag + kLagScalars * entry, by_lag);
+      add_at(out.lag_rows + 12 * entry, rows);
     }
   }
   for (int k = first; k < in.planes; k += stride) {
@@ -313,25 +324,17 @@ DIFFVBD_FN void reverse_lags(const Source<T, Positions>& s, const ContactAdjoint
   }
 }
 
+// Adds up what the slots of all corners of a pair hold for that of an entry, as far as `holds` says.
 template <class T>
-DIFFVBD_FN void take(T* rows, uint8_t* sent, const PairList& list, int64_t row, int first, int stride, Vec3<T>& sum) {
-  const PairList::Entries all = list.of(row);
-  for (int e = first; e < all.count; e += stride) {
-    const int64_t entry = all.first[e], pair = entry >> 2, k = entry & 3;
-    if (sent) {
-      uint8_t* flags = sent + 4 * entry;
-      for (int i = 0; i < 4; ++i) {
-        if (flags[i]) sum += vector_at(rows + (16 * pair + 4 * i + k) * 3);
-        flags[i] = 0;
-      }
-      continue;
-    }
-    for (int i = 0; i < 4; ++i) {
-      T* from = rows + (16 * pair + 4 * i + k) * 3;
-      sum += vector_at(from);
-      from[0] = from[1] = from[2] = T(0);
-    }
+DIFFVBD_FN Vec3<T> held_for(const T* rows, int64_t entry, const bool (&holds)[4], Vec3<T> sum) {
+  Vec3<T> own[4];
+  for (int i = 0; i < 4; ++i) {
+    own[i] = holds[i] ? vector_at(rows + (16 * (entry >> 2) + 4 * i + (entry & 3)) * 3) : zero3<T>();
   }
+  for (int i = 0; i < 4; ++i) {
+    if (holds[i]) sum += own[i];
+  }
+  return sum;
 }
 // Takes out of the slots what pairs have sent to corner point v since it was last asked for: `now` receives what
 // belongs to the state, `prev` what belongs to the start of the step.
@@ -339,10 +342,26 @@ template <class T>
 DIFFVBD_FN void take_pairs(const ContactInputs<T>& in, const ContactAdjoints<T>& out, int64_t scene, int v, int first,
                            int stride, Vec3<T>& now, Vec3<T>& prev) {
   const int64_t row = scene * in.corners + v;
-  take(out.rows, out.sent, in.listed, row, first, stride, now);
+  const PairList::Entries listed = in.listed.of(row);
+  for (int e = first; e < listed.count; e += stride) {
+    const int64_t entry = listed.first[e];
+    uint8_t* flags = out.sent + 4 * entry;
+    const bool holds[4] = {flags[0] != 0, flags[1] != 0, flags[2] != 0, flags[3] != 0};
+    if (!(holds[0] || holds[1] || holds[2] || holds[3])) continue;
+    now = held_for(out.rows, entry, holds, now);
+    flags[0] = flags[1] = flags[2] = flags[3] = 0;
+  }
   if (!in.lag) return;
   Vec3<T> moved = zero3<T>();
-  take(out.lag_rows, nullptr, in.lagged, row, first, stride, moved);
+  const PairList::Entries lagged = in.lagged.of(row);
+  for (int e = first; e < lagged.count; e += stride) {
+    const int64_t entry = lagged.first[e];
+    moved = held_for(out.lag_rows, entry, {true, true, true, true}, moved);
+    for (int i = 0; i < 4; ++i) {
+      T* slot = out.lag_rows + (16 * (entry >> 2) + 4 * i + (entry & 3)) * 3;
+      slot[0] = slot[1] = slot[2] = T(0);
+    }
+  }
   now += moved;
   prev -= moved;
 }

@@ -23,9 +23,42 @@ struct VirtualMotions {
 template <class T>
 struct RigidWork {
   T *barrier, *by_kappa;  // [listed, 4, 9], [listed]
-  T *friction, *by_lag;   // [lagged, 4, 9], [lagged, 9]
+  uint8_t* pushes;        // [listed]: whose rows are written
+  T *friction, *lag_bar;  // [lagged, 4, 9]; [lagged, 9] less the derivatives by what is lagged
   int64_t listed, lagged;
 };
+// And their sums at all corner points [B, N, 3].
+template <class T>
+struct PointWork {
+  T *x, *p, *q;
+  T* since;  // of lagged pairs, by how points have moved since the start of the step, which `x` has in it; or null
+};
+constexpr int kPointScalars = kWorkScalars + 3;
+
+// Adds what every `stride`-th pair of a corner point from `first` on has at it: by x, p, q and since.
+template <class T>
+DIFFVBD_FN void add_at_point(const RigidInputs<T>& in, const RigidWork<T>& work, int64_t point, int first, int stride,
+                             double* sum) {
+  const auto add = [&](const PairList& list, const T* rows, const uint8_t* pushes) {
+    const PairList::Entries all = list.of(point);
+    for (int e = first; e < all.count; e += stride) {
+      const int64_t entry = all.first[e];
+      if (pushes && !pushes[entry >> 2]) continue;
+      const T* row = rows + kWorkScalars * entry;
+      for (int i = 0; i < kWorkScalars; ++i) sum[i] += row[i];
+      for (int i = 0; !pushes && i < 3; ++i) sum[kWorkScalars + i] += row[i];
+    }
+  };
+  if (work.listed > 0) add(in.gate.listed, work.barrier, work.pushes);
+  if (work.lagged > 0) add(in.lagged, work.friction, nullptr);
+}
+template <class T>
+DIFFVBD_FN void store_at_point(const double* sum, int64_t point, const PointWork<T>& out) {
+  T* const to[] = {out.x, out.p, out.q, out.since};
+  for (int k = 0; k < 4; ++k) {
+    if (to[k]) rigid::put(to[k] + 3 * point, Vector{sum[3 * k], sum[3 * k + 1], sum[3 * k + 2]});
+  }
+}
 
 // What the corners of a pair do by p and q, and which of them move together: all, or each side by itself.
 struct PairMotions {
@@ -35,6 +68,16 @@ struct PairMotions {
 
   DIFFVBD_FN bool is_of(int side, int corner) const { return sides == 1 || (corner < first) == (side == 0); }
 };
+
+// Whether a corner of a pair moves by p: else the pair does no virtual work.
+template <class T>
+DIFFVBD_FN bool works(const RigidInputs<T>& in, const VirtualMotions<T>& given, const int32_t* record) {
+  for (int k = 0; k < 4; ++k) {
+    const T* p = given.p + 3 * (int64_t{record[5]} * in.gate.corners + record[k]);
+    if (p[0] != T(0) || p[1] != T(0) || p[2] != T(0)) return true;
+  }
+  return false;
+}
 
 template <class T>
 DIFFVBD_FN PairMotions motions_of(const RigidInputs<T>& in, const VirtualMotions<T>& given, const int32_t* record) {
@@ -126,7 +169,13 @@ struct BarrierWork {
 
   // known: that it acts
   DIFFVBD_FN BarrierWork(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair, bool known = false)
-      : acts(known || pushes(in, pair)), m{}, c{}, a(in.gate.constants + kConstants * pair), kind(0), h2(0), kappa(0) {
+      : acts(known || pushes(in, given, pair)),
+        m{},
+        c{},
+        a(in.gate.constants + kConstants * pair),
+        kind(0),
+        h2(0),
+        kappa(0) {
     if (!acts) return;
     const CornerPoints<T> at{in, false};
     const int32_t* record = in.gate.listed.pairs + kPairRow * pair;
@@ -137,25 +186,23 @@ struct BarrierWork {
     h2 = in.scene.time_step * in.scene.time_step, kappa = in.kappa.data[scene * in.kappa.scene];
   }
 
-  DIFFVBD_FN static bool pushes(const RigidInputs<T>& in, int64_t pair) {
+  DIFFVBD_FN static bool pushes(const RigidInputs<T>& in, const VirtualMotions<T>& given, int64_t pair) {
     PairPress press;
-    return pair < in.first_listed(in.scene.scenes) && barrier_press(in, pair, CornerPoints<T>{in, false}, press);
+    return pair < in.first_listed(in.scene.scenes) && works(in, given, in.gate.listed.pairs + kPairRow * pair) &&
+           barrier_press(in, pair, CornerPoints<T>{in, false}, press);
   }
 
-  // Of the rows of the corners [4, 9] and the derivative by kappa; zero where the pair does not push.
+  // Of the rows of the corners [4, 9] and the derivative by kappa, where the pair pushes.
   DIFFVBD_FN void store(int part, T* rows, T* by_kappa) const {
     if (part < kDirections) {
       const int k = part / 3, i = part % 3;
       const Vector z = {double(i == 0), double(i == 1), double(i == 2)};
-      const auto terms = [&] { return barrier_terms(kind, moved_along(c, k, z), a, h2 * kappa); };
-      rows[kWorkScalars * k + i] = acts ? T(virtual_work(terms(), m).derivative) : T(0);
+      const auto terms = barrier_terms(kind, moved_along(c, k, z), a, h2 * kappa);
+      rows[kWorkScalars * k + i] = T(virtual_work(terms, m).derivative);
       return;
     }
-    for (int k = 0; k < 4; ++k) {
-      for (int i = 3; i < kWorkScalars; ++i) rows[kWorkScalars * k + i] = T(0);
-    }
-    *by_kappa = acts ? T(virtual_work(barrier_terms(kind, c, a, h2), m)) : T(0);
-    if (acts) add_by_motions(barrier_terms(kind, c, a, h2 * kappa), m, rows);
+    *by_kappa = T(virtual_work(barrier_terms(kind, c, a, h2), m));
+    add_by_motions(barrier_terms(kind, c, a, h2 * kappa), m, rows);
   }
 };
 
@@ -178,7 +225,8 @@ struct LaggedWork {
     if (!acts) return;
     const int32_t* record = in.lagged.pairs + kPairRow * pair;
     // also of pairs without a force, which a coefficient of zero has made so
-    acts = moving_body(in, record[0]) >= 0 || moving_body(in, record[sides(record[4])]) >= 0;
+    acts =
+        (moving_body(in, record[0]) >= 0 || moving_body(in, record[sides(record[4])]) >= 0) && works(in, given, record);
     if (!acts) return;
     const CornerPoints<T> at{in, false};
     const Lag<T> lag(in.lag + kLagScalars * pair);
@@ -194,8 +242,8 @@ struct LaggedWork {
     }
   }
 
-  // Of the rows of the corners [4, 9] and the derivatives by what is lagged [9].
-  DIFFVBD_FN void store(T* rows, T* by_lag) const {
+  // Of the rows of the corners [4, 9] and lag_bar [9].
+  DIFFVBD_FN void store(T* rows, T* lag_bar) const {
     const double along = dot(n, d), approach = along < 0 ? along : 0, A = h * damping, L = h * h * load;
     double by_along = 0, by_load = 0, by_damping = 0, by_w[4] = {0, 0, 0, 0};
     Vector by_n{}, by_d{};
@@ -222,13 +270,13 @@ struct LaggedWork {
     }
     by_d += by_along * n, by_n += by_along * d;
     for (int k = 0; k < 4; ++k) rigid::put(rows + kWorkScalars * k, w[k] * by_d);
-    by_lag[0] = T(h * h * by_load), by_lag[1] = T(h * by_damping);
-    rigid::put(by_lag + 2, by_n);
-    for (int k = 0; k < 4; ++k) by_lag[5 + k] = T(by_w[k] + dot(by_d, since[k]));
+    lag_bar[0] = T(-h * h * by_load), lag_bar[1] = T(-h * by_damping);
+    rigid::put(lag_bar + 2, -by_n);
+    for (int k = 0; k < 4; ++k) lag_bar[5 + k] = T(-by_w[k] - dot(by_d, since[k]));
   }
-  DIFFVBD_FN static void store_none(T* rows, T* by_lag) {
+  DIFFVBD_FN static void store_none(T* rows, T* lag_bar) {
     for (int i = 0; i < 4 * kWorkScalars; ++i) rows[i] = T(0);
-    for (int i = 0; i < kLagScalars; ++i) by_lag[i] = T(0);
+    for (int i = 0; i < kLagScalars; ++i) lag_bar[i] = T(0);
   }
 };
 

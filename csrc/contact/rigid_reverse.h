@@ -134,6 +134,14 @@ DIFFVBD_FN void send_center(const rigid::Body<T>& b, const Team& team, const Who
 template <class T, class Team>
 DIFFVBD_FN void reverse_end(const rigid::Body<T>& b, const Team& team, const double* motion, double share,
                             const T* end_bar, double* motion_bar, T* x, T* mass) {
+  if (share == 0) {  // it stayed
+    team.each(b.size(), [&](int32_t i) {
+      const int64_t at = 3 * b.row(b.vertex(i));
+      rigid::put(x + at, rigid::Body<T>::at(end_bar + at));
+    });
+    for (int i = 0; i < kUnknowns && team.leads(); ++i) motion_bar[i] = 0;
+    return;
+  }
   const Whole whole = whole_of(b, team);
   const Vector w = share * Vector{motion[0], motion[1], motion[2]};
   const rigid::Angles angles(w);
@@ -154,17 +162,20 @@ DIFFVBD_FN void reverse_end(const rigid::Body<T>& b, const Team& team, const dou
   send_center(b, team, whole, Vector{sum[0], sum[1], sum[2]}, x, mass);
 }
 
-// How corner points [B, N, 3] move by the solution for that adjoint, and by the motion. The solution of a body that did
-// not move becomes zero: of a matrix that was not positive definite no motion came, and nothing goes back through it.
+// How corner points [B, N, 3] move by the solution for that adjoint, and by the motion; zero at first. The solution of
+// a body that did not move becomes zero: of a matrix that was not positive definite no motion came, and nothing goes
+// back through it.
 template <class T, class Team>
 DIFFVBD_FN void virtual_motion(const RigidInputs<T>& in, const rigid::Body<T>& b, const Team& team,
                                const double* motion, double* solution, T* p, T* q) {
   double l[kUnknowns];
-  bool moves = in.free[b.body];
+  bool moves = in.free[b.body], any = false;
   for (int i = 0; i < kUnknowns; ++i) {
     l[i] = solution[i];
     moves = moves && absolute(l[i]) < std::numeric_limits<double>::infinity();
+    any = any || l[i] != 0 || motion[i] != 0;
   }
+  if (!any) return;
   for (int i = 0; i < kUnknowns && !moves; ++i) l[i] = 0;
   const Whole whole = whole_of(b, team);  // after which all have read
   for (int i = 0; i < kUnknowns && team.leads(); ++i) solution[i] = l[i];
@@ -177,12 +188,28 @@ DIFFVBD_FN void virtual_motion(const RigidInputs<T>& in, const rigid::Body<T>& b
   });
 }
 
-// What vertices add to the adjoints, all zero at first. sent: by pairs to those two motions; floor_lag
-// [B, V, planes, 4], or null.
+// What the adjoints of a body's vertices are made of besides: what goes back by the way itself [B, V, 3] and [B, V],
+// and what pairs have at all corner points [B, N, 3].
+template <class T>
+struct SentBack {
+  const T *x, *mass;
+  const T *by_x, *by_p, *by_q, *since;  // as PointWork
+};
+
+// The adjoints of a body's vertices, but that those of data and floor_lag [B, V, planes, 4], or null, are zero at
+// first.
 template <class T, class Team>
 DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>& b, const Team& team,
-                                 const double* motion, const double* solution, const VirtualMotions<T>& sent,
+                                 const double* motion, const double* solution, const SentBack<T>& sent,
                                  const rigid::Adjoints<T>& out, T* floor_lag) {
+  team.each(b.size(), [&](int32_t i) {
+    const int32_t v = b.vertex(i);
+    const int64_t row = b.row(v), corner = 3 * (b.scene * in.gate.corners + v);
+    rigid::put(out.x + 3 * row, rigid::Body<T>::at(sent.x + 3 * row) - rigid::Body<T>::at(sent.by_x + corner));
+    rigid::put(out.x_prev + 3 * row, sent.since ? rigid::Body<T>::at(sent.since + corner) : Vector{});
+    rigid::put(out.y + 3 * row, Vector{});
+    out.mass[row] = sent.mass[row];
+  });
   bool moves = false;
   for (int i = 0; i < kUnknowns; ++i) moves = moves || solution[i] != 0;
   if (!moves) return;
@@ -191,13 +218,13 @@ DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>&
   team.template sum<3>(b.size(), sum, [&](int32_t i, double* to) {
     const int32_t v = b.vertex(i);
     const int64_t row = b.row(v), corner = 3 * (b.scene * in.gate.corners + v);
-    const VertexAdjoint bar = vertex_adjoint(in, b, v, b.position(v) - whole.center, solution, motion,
-                                             rigid::Body<T>::at(sent.p + corner), rigid::Body<T>::at(sent.q + corner),
-                                             floor_lag ? floor_lag + row * in.planes * kFloorLag : nullptr);
-    rigid::put(out.x + 3 * row, bar.x + bar.arm);
-    rigid::put(out.x_prev + 3 * row, bar.x_prev);
+    const VertexAdjoint bar = vertex_adjoint(
+        in, b, v, b.position(v) - whole.center, solution, motion, rigid::Body<T>::at(sent.by_p + corner),
+        rigid::Body<T>::at(sent.by_q + corner), floor_lag ? floor_lag + row * in.planes * kFloorLag : nullptr);
+    rigid::add_to(out.x + 3 * row, bar.x + bar.arm);
+    rigid::add_to(out.x_prev + 3 * row, bar.x_prev);
     rigid::put(out.y + 3 * row, bar.y);
-    out.mass[row] = T(bar.mass);
+    out.mass[row] += T(bar.mass);
     to[0] -= bar.arm.x, to[1] -= bar.arm.y, to[2] -= bar.arm.z;
   });
   send_center(b, team, whole, Vector{sum[0], sum[1], sum[2]}, out.x, out.mass);

@@ -75,4 +75,28 @@ DIFFVBD_FN double shortened(bool blocked, bool fits, int attempt) {
   return attempt == 0 ? 0.5 : attempt < kShorter ? 0.25 : 0.0;
 }
 
+// What came of the tries, of each body [B, bodies].
+template <class T>
+struct RigidOutcome {
+  double* share;  // of its motion that it took
+  bool* moved;    // whether it had one
+  // whether it was held up on its way, in a scene in which some of those have gone on: where these are now, others may
+  // go on, too
+  bool* held;
+  T* left;  // how much of its shift it did not take [m]
+};
+// Of a body whose share is known; returns whether it was held up after some of its way. `held` is to be confirmed.
+template <class T>
+DIFFVBD_FN bool end_tries(const RigidInputs<T>& in, const double* motions, int64_t unit, const RigidOutcome<T>& out) {
+  const double* motion = motions + kUnknowns * unit;
+  bool moved = false;
+  for (int i = 0; i < kUnknowns; ++i) moved = moved || motion[i] != 0;
+  double& share = out.share[unit];
+  if (in.moving && !moved) share = 0;  // what stays passes nothing on
+  const Vector shift = rigid::Body<double>::at(motion + 3);
+  out.moved[unit] = moved, out.held[unit] = moved && share < 1;
+  out.left[unit] = T((1 - share) * square_root(dot(shift, shift)));
+  return out.held[unit] && 0 < share;
+}
+
 }  // namespace diffvbd::contact

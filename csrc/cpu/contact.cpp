@@ -216,7 +216,7 @@ void ContactScene<T>::reverse(int64_t begin, int64_t end) const {
     near_.state(e) = active ? kTouching : kApart;
     if (!active) return;
     const int64_t entry = near_.entry(e);
-    for (int k = 0; k < 4; ++k) send(*reverse_, entry, k, vector_at(result + 4 * k));
+    send(*reverse_, entry, {vector_at(result), vector_at(result + 4), vector_at(result + 8), vector_at(result + 12)});
     reverse_->kappa[entry] += result[kPairKappa];
   };
   PairBatches<T, int64_t, decltype(deliver)> batches(kernels_.reverse, rows_, kappa(), h_ * h_, deliver);

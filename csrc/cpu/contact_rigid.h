@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "../contact/rigid_reverse.h"
+#include "../contact/rigid_tries.h"
 
 namespace diffvbd {
 
@@ -37,16 +38,16 @@ void find_groups(const contact::RigidInputs<T>& in, int64_t scene, const std::ve
 template <class T>
 void rigid_solve(const contact::RigidInputs<T>& in, const double* factor, double* x);
 
-// The share of its motion [B, bodies, 6] that each body takes [B, bodies], so that nothing crosses and the potential
-// of no scene rises; and where that leads, x [B, V, 3]. move [B, V, 3] is that of `in`, to be written.
+// What comes of the motion [B, bodies, 6] of each body, so that nothing crosses and the potential of no scene rises;
+// and where that leads, x [B, V, 3]. move [B, V, 3] is that of `in`, to be written.
 template <class T>
-void rigid_move(const contact::RigidInputs<T>& in, const double* center, const double* motion, T* move, double* share,
-                T* x);
+void rigid_move(const contact::RigidInputs<T>& in, const double* center, const double* motion, T* move,
+                const contact::RigidOutcome<T>& out, T* x);
 
-// The derivatives that the adjoint needs of pairs.
+// The derivatives that the adjoint needs of pairs, and their sums.
 template <class T>
 void rigid_backward(const contact::RigidInputs<T>& in, const contact::VirtualMotions<T>& given,
-                    const contact::RigidWork<T>& out);
+                    const contact::RigidWork<T>& out, const contact::PointWork<T>& sums);
 
 // The parts of the adjoint of a correction for all bodies (contact/rigid_reverse.h).
 template <class T>
@@ -56,6 +57,6 @@ template <class T>
 void rigid_virtual_motions(const contact::RigidInputs<T>& in, const double* motions, double* solutions, T* p, T* q);
 template <class T>
 void rigid_vertices_backward(const contact::RigidInputs<T>& in, const double* motions, const double* solutions,
-                             const contact::VirtualMotions<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag);
+                             const contact::SentBack<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag);
 
 }  // namespace diffvbd

@@ -215,7 +215,8 @@ class Tries {
 }  // namespace
 
 template <class T>
-void rigid_move(const RigidInputs<T>& in, const double* center, const double* motion, T* move, double* share, T* x) {
+void rigid_move(const RigidInputs<T>& in, const double* center, const double* motion, T* move,
+                const RigidOutcome<T>& out, T* x) {
   const int64_t n = in.bodies(), units = in.gate.units();
   std::vector<T> none(units, T(0)), all(units, T(1));
   std::vector<uint8_t> blocked(units), stamp(units), failed(in.scene.scenes);
@@ -226,18 +227,21 @@ void rigid_move(const RigidInputs<T>& in, const double* center, const double* mo
       const int64_t first = 3 * s * in.scene.vertices, last = first + 3 * in.scene.vertices;
       const double* own = motion + kUnknowns * n * s;
       if (std::all_of(own, own + kUnknowns * n, [](double a) { return a == 0; })) {
-        std::fill_n(share + n * s, n, 1.0);
+        std::fill_n(out.share + n * s, n, 1.0);
         std::copy(in.scene.x + first, in.scene.x + last, x + first);
-        continue;
+      } else {
+        Tries<T>(in, s, center + 3 * n * s, own, move, out.share + n * s).run(state, motions);
+        for (int64_t i = first; i < last; ++i) x[i] = in.scene.x[i] + move[i];
       }
-      Tries<T>(in, s, center + 3 * n * s, own, move, share + n * s).run(state, motions);
-      for (int64_t i = first; i < last; ++i) x[i] = in.scene.x[i] + move[i];
+      bool some = false;
+      for (int64_t unit = n * s; unit < n * (s + 1); ++unit) some = end_tries(in, motion, unit, out) || some;
+      if (!some) std::fill_n(out.held + n * s, n, false);
     }
   });
 }
 
 #define DIFFVBD_INSTANTIATE(T) \
-  template void rigid_move<T>(const RigidInputs<T>&, const double*, const double*, T*, double*, T*);
+  template void rigid_move<T>(const RigidInputs<T>&, const double*, const double*, T*, const RigidOutcome<T>&, T*);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

@@ -26,7 +26,7 @@ void rigid_virtual_motions(const RigidInputs<T>& in, const double* motions, doub
 
 template <class T>
 void rigid_vertices_backward(const RigidInputs<T>& in, const double* motions, const double* solutions,
-                             const VirtualMotions<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag) {
+                             const SentBack<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag) {
   for_bodies(in.scene, [&](const Body<T>& b, const Threads& team) {
     const int64_t at = kUnknowns * (b.scene * in.bodies() + b.body);
     reverse_vertices(in, b, team, motions + at, solutions + at, sent, out, floor_lag);
@@ -36,8 +36,8 @@ void rigid_vertices_backward(const RigidInputs<T>& in, const double* motions, co
 #define DIFFVBD_INSTANTIATE(T)                                                                                         \
   template void rigid_end_backward<T>(const RigidInputs<T>&, const double*, const double*, const T*, double*, T*, T*); \
   template void rigid_virtual_motions<T>(const RigidInputs<T>&, const double*, double*, T*, T*);                       \
-  template void rigid_vertices_backward<T>(const RigidInputs<T>&, const double*, const double*,                        \
-                                           const VirtualMotions<T>&, const rigid::Adjoints<T>&, T*);
+  template void rigid_vertices_backward<T>(const RigidInputs<T>&, const double*, const double*, const SentBack<T>&,    \
+                                           const rigid::Adjoints<T>&, T*);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

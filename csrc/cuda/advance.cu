@@ -1,8 +1,7 @@
-#include <cooperative_groups.h>
-
 #include <algorithm>
 
 #include "advance.h"
+#include "cluster.cuh"
 #include "small_scenes.h"
 
 namespace diffvbd::cuda {
@@ -47,14 +46,19 @@ struct GridTeam {
     return *static_cast<volatile unsigned*>(flags++) != 0;
   }
 };
-// A block, on a scene of its own.
+// A cluster, on a scene of its own.
 struct SceneTeam {
+  Answers& answers;
+  int turn = 0;
   template <class F>
   __device__ void each(const Range& items, const F& f) const {
-    for (int64_t i = items.begin + static_cast<int64_t>(threadIdx.x); i < items.end; i += kThreads) f(i);
+    for (int64_t i = items.begin + Cluster::rank() * kThreads + static_cast<int64_t>(threadIdx.x); i < items.end;
+         i += Cluster::size() * kThreads) {
+      f(i);
+    }
   }
-  __device__ void sync() const { __syncthreads(); }
-  __device__ bool any(bool own) const { return __syncthreads_or(own) != 0; }
+  __device__ void sync() const { Cluster::meet(); }
+  __device__ bool any(bool own) { return any_of_cluster(answers, turn, own); }
 };
 
 // All listed pairs, as the grid looks at them.
@@ -71,41 +75,48 @@ struct AllPairs {
     });
   }
 };
-// Those of a scene that may matter in a move, in any order, and their planes, as a block looks at them: first it asks
-// all what is quick, and then what is slow of those that are left, so that no warp waits for a few of its threads.
+// Those of a scene that may matter in a move, in any order, and their planes, as the blocks of its cluster look at
+// them, each at its own: first at what is quick of all, and then at what is slow of those that are left, so that no
+// warp waits for a few of its threads.
 template <class T>
 struct NearPairs {
   Range pairs;
-  int32_t* near;        // from the scene's first pair on
+  int32_t* near;        // as long as the list
   PairPlane<T>* plane;  // in the order of `near`
-  int *count, *slows;
-  int32_t* slow;  // [2 kThreads]
+  int *count, *slows;   // of the block
+  int32_t* slow;        // [2 kThreads]
 
-  __device__ void begin_move(const SceneTeam& team, const AdvanceInputs<T>& in, const AdvanceState<T>& s) const {
+  // Where the block has its i-th pair, and keeps the i-th of those that may matter.
+  __device__ int64_t place(int i) const {
+    return pairs.begin + int64_t{i / kThreads * Cluster::size() + Cluster::rank()} * kThreads + i % kThreads;
+  }
+  __device__ void begin_move(const SceneTeam&, const AdvanceInputs<T>& in, const AdvanceState<T>& s) const {
     if (threadIdx.x == 0) *count = *slows = 0;
-    team.sync();
-    team.each(pairs, [&](int64_t i) {
+    __syncthreads();
+    for (int k = static_cast<int>(threadIdx.x); place(k) < pairs.end; k += kThreads) {
+      const int64_t i = place(k);
       const bool open = s.first || is_open(in, s, in.listed.pairs + kPairRow * i);
-      if (open && !stays_far_at_any_share(in, s, i)) near[atomicAdd(count, 1)] = static_cast<int32_t>(i);
-    });
-    team.sync();
-    team.each({0, *count}, [&](int64_t i) { plane[i].forget(); });
+      if (open && !stays_far_at_any_share(in, s, i)) near[place(atomicAdd(count, 1))] = static_cast<int32_t>(i);
+    }
+    __syncthreads();
+    for (int k = static_cast<int>(threadIdx.x); k < *count; k += kThreads) plane[place(k)].forget();
   }
   template <class F>
-  __device__ void each_failing(const SceneTeam& team, const AdvanceInputs<T>& in, const AdvanceState<T>& s, int round,
+  __device__ void each_failing(const SceneTeam&, const AdvanceInputs<T>& in, const AdvanceState<T>& s, int round,
                                const F& f) const {
     for (int first = 0; first < *count; first += kThreads) {
-      const int i = first + static_cast<int>(threadIdx.x);
-      if (i < *count && !passes_quickly(in, s, plane[i], near[i], round)) slow[atomicAdd(slows, 1)] = near[i];
-      team.sync();
+      const int k = first + static_cast<int>(threadIdx.x);
+      const int64_t i = place(k);
+      if (k < *count && !passes_quickly(in, s, plane[i], near[i], round)) slow[atomicAdd(slows, 1)] = near[i];
+      __syncthreads();
       const int kept = *slows;
-      team.sync();
+      __syncthreads();
       if (kept <= kThreads && first + kThreads < *count) continue;  // there is room for those of one more turn
-      team.each({0, kept}, [&](int64_t k) {
-        if (!passes(in, s, slow[k], round)) f(slow[k]);
-      });
+      for (int of = static_cast<int>(threadIdx.x); of < kept; of += kThreads) {
+        if (!passes(in, s, slow[of], round)) f(slow[of]);
+      }
       if (threadIdx.x == 0) *slows = 0;
-      team.sync();
+      __syncthreads();
     }
   }
 };
@@ -165,18 +176,19 @@ __global__ void __launch_bounds__(kThreads)
   advance_scenes(GridTeam{flags}, in, s, {0, in.scenes}, pairs, stuck);
 }
 
-// A block for each small scene. near, planes: memory for all listed pairs.
+// A cluster for each small scene. near, planes: memory for all listed pairs.
 template <class T>
 __global__ void __launch_bounds__(kThreads, 2)
     scene_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, int32_t* near, PairPlane<T>* planes,
                  unsigned long long* stuck) {
   __shared__ int32_t slow[2 * kThreads];
   __shared__ int count, slows;
-  const int64_t scene = blockIdx.x;
+  __shared__ Answers answers;
+  const int64_t scene = blockIdx.x / Cluster::size();
   const auto first = [&](int64_t of) { return int64_t{in.listed.ptr[of * in.corners] / 4}; };
   const Range own = {first(scene), first(scene + 1)};
-  const NearPairs<T> pairs{own, near + own.begin, planes + own.begin, &count, &slows, slow};
-  advance_scenes(SceneTeam{}, in, s, {scene, scene + 1}, pairs, stuck);
+  const NearPairs<T> pairs{own, near, planes, &count, &slows, slow};
+  advance_scenes(SceneTeam{answers}, in, s, {scene, scene + 1}, pairs, stuck);
 }
 
 template <class T>
@@ -219,8 +231,8 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
   if (has_block_each(in.vertices, in.scenes, capacity)) {
     auto* near = reinterpret_cast<int32_t*>(take(capacity * sizeof(int32_t)));
     auto* planes = reinterpret_cast<PairPlane<T>*>(take(capacity * sizeof(PairPlane<T>)));
-    scene_kernel<T><<<static_cast<unsigned>(in.scenes), kThreads, 0, stream>>>(in, state, near, planes, found);
-    return cudaGetLastError();
+    return launch_clusters(scene_kernel<T>, in.scenes, blocks_of_scene(in.scenes, capacity), kThreads, stream, in,
+                           state, near, planes, found);
   }
   auto* flags = reinterpret_cast<unsigned*>(take(kFlags * sizeof(unsigned)));
   if (auto error = cudaMemsetAsync(flags, 0, kFlags * sizeof(unsigned), stream)) return error;

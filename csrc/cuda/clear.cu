@@ -16,9 +16,11 @@ struct Spans {
 __global__ void __launch_bounds__(kThreads) clear_kernel(const __grid_constant__ Spans spans) {
   const Span& own = spans.of[blockIdx.y];
   const int64_t first = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  const int64_t step = static_cast<int64_t>(gridDim.x) * kThreads, wide = own.bytes / sizeof(uint4);
+  const int64_t used = own.entries ? *own.entries / 4 * own.row : own.bytes,
+                bytes = used < own.bytes ? used : own.bytes;
+  const int64_t step = static_cast<int64_t>(gridDim.x) * kThreads, wide = bytes / static_cast<int64_t>(sizeof(uint4));
   for (int64_t i = first; i < wide; i += step) static_cast<uint4*>(own.data)[i] = uint4{};
-  const int64_t words = own.bytes / sizeof(uint32_t);
+  const int64_t words = bytes / static_cast<int64_t>(sizeof(uint32_t));
   for (int64_t i = 4 * wide + first; i < words; i += step) static_cast<uint32_t*>(own.data)[i] = 0;
 }
 

@@ -11,6 +11,10 @@ namespace diffvbd::cuda {
 struct Span {
   void* data;
   int64_t bytes;  // a multiple of four
+  // Of the rows of pairs, where only the device knows how many there are: entries / 4 rows of so many bytes, the rest
+  // is left as it is.
+  const int32_t* entries = nullptr;
+  int64_t row = 0;
 };
 
 cudaError_t clear(const std::vector<Span>& spans, cudaStream_t stream);

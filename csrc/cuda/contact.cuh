@@ -268,12 +268,12 @@ cudaError_t launch_sum(int64_t scenes, cudaStream_t stream, const ContactInputs<
 }
 
 template <class T>
-__global__ void sum_lag_slots(const T* slots, int64_t items, T* lag) {
+__global__ void sum_lag_slots(const int32_t* entries, const T* slots, int64_t items, T* lag) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
   if (i >= items) return;
   const int64_t pair = i / contact::kLagScalars, scalar = i - pair * contact::kLagScalars;
   T sum = T(0);
-  for (int k = 0; k < 4; ++k) sum += slots[(4 * pair + k) * contact::kLagScalars + scalar];
+  for (int k = 0; k < 4 && 4 * pair < *entries; ++k) sum += slots[(4 * pair + k) * contact::kLagScalars + scalar];
   lag[i] = sum;
 }
 
@@ -335,15 +335,19 @@ cudaError_t ContactPasses<T>::store() const {
 }
 
 template <class T>
-cudaError_t sum_lag(const ContactAdjoints<T>& slots, int64_t pairs, T* lag, cudaStream_t stream) {
+cudaError_t sum_lag(const ContactInputs<T>& in, int64_t scenes, const ContactAdjoints<T>& slots, int64_t pairs, T* lag,
+                    cudaStream_t stream) {
+  if (pairs == 0) return cudaSuccess;
   const int64_t items = pairs * contact::kLagScalars;
+  const int32_t* entries = in.lagged.ptr + scenes * in.corners;
   const T* from = slots.lag;
-  return launch_contact(sum_lag_slots<T>, items, stream, from, items, lag);
+  return launch_contact(sum_lag_slots<T>, items, stream, entries, from, items, lag);
 }
 
 }  // namespace diffvbd::cuda
 
 #define DIFFVBD_INSTANTIATE_CONTACT(T)                                                                     \
   template struct diffvbd::cuda::ContactPasses<T>;                                                         \
-  template cudaError_t diffvbd::cuda::sum_lag<T>(const diffvbd::contact::ContactAdjoints<T>&, int64_t, T*, \
+  template cudaError_t diffvbd::cuda::sum_lag<T>(const diffvbd::contact::ContactInputs<T>&, int64_t,       \
+                                                 const diffvbd::contact::ContactAdjoints<T>&, int64_t, T*, \
                                                  cudaStream_t);

@@ -32,9 +32,10 @@ struct ContactPasses {
   cudaError_t store() const;
 };
 
-// After all scenes: the slots of each pair's corners added up.
+// After all scenes: the slots of the corners of each lagged pair added up; zero where there is none.
 template <class T>
-cudaError_t sum_lag(const contact::ContactAdjoints<T>& slots, int64_t pairs, T* lag, cudaStream_t stream);
+cudaError_t sum_lag(const contact::ContactInputs<T>& in, int64_t scenes, const contact::ContactAdjoints<T>& slots,
+                    int64_t pairs, T* lag, cudaStream_t stream);
 
 // contact_lag and its adjoint; `pairs` that the list has room for, `count` on the device at ptr[scenes corners]. The
 // reverse writes `slots` [4 pairs, 4] (x, y, z and kappa of each corner) and then adds them up by corner point.

@@ -126,8 +126,9 @@ __global__ void __launch_bounds__(kThreads)
   const auto at = [&](int32_t i) -> double& {
     return all[kUnknowns * groups.member(first + i / kUnknowns) + i % kUnknowns];
   };
-  for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads) own[i] = at(i);
-  __syncthreads();
+  bool any = false;
+  for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads) own[i] = at(i), any = any || own[i] != 0;
+  if (!__syncthreads_or(any)) return;
   const double* own_factor = factor + in.matrix_size() * scene + groups.matrix(first);
   for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads)
     diagonal[i] = 1 / own_factor[(size + 1) * i];

@@ -4,6 +4,7 @@
 #include <cuda_runtime_api.h>
 
 #include "../contact/rigid_reverse.h"
+#include "../contact/rigid_tries.h"
 
 namespace diffvbd::cuda {
 
@@ -25,12 +26,14 @@ cudaError_t rigid_system(const contact::RigidInputs<T>& in, const PairRoom& room
                          double* factor, int32_t* groups, void* workspace, cudaStream_t stream);
 template <class T>
 cudaError_t rigid_move(const contact::RigidInputs<T>& in, const PairRoom& room, const double* center,
-                       const double* motion, T* move, double* share, T* x, void* workspace, cudaStream_t stream);
+                       const double* motion, T* move, const contact::RigidOutcome<T>& out, T* x, void* workspace,
+                       cudaStream_t stream);
 
 // pushing: memory of 1 + listed numbers.
 template <class T>
 cudaError_t rigid_backward(const contact::RigidInputs<T>& in, const contact::VirtualMotions<T>& given,
-                           const contact::RigidWork<T>& out, int32_t* pushing, cudaStream_t stream);
+                           const contact::RigidWork<T>& out, const contact::PointWork<T>& sums, int32_t* pushing,
+                           cudaStream_t stream);
 
 // solutions [B, bodies, 6]: memory, too, for what is solved for; x, mass, p, q as of reverse_end() and
 // virtual_motion().
@@ -40,7 +43,7 @@ cudaError_t rigid_end_backward(const contact::RigidInputs<T>& in, const double* 
                                cudaStream_t stream);
 template <class T>
 cudaError_t rigid_vertices_backward(const contact::RigidInputs<T>& in, const double* motions, const double* solutions,
-                                    const contact::VirtualMotions<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag,
+                                    const contact::SentBack<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag,
                                     cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

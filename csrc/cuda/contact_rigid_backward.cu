@@ -1,5 +1,6 @@
+#include <algorithm>
+
 #include "../contact/rigid_reverse.h"
-#include "clear.h"
 #include "contact_rigid.cuh"
 
 namespace diffvbd::cuda {
@@ -8,24 +9,30 @@ namespace {
 constexpr int kPartsApart = 16;  // threads of a pair: one for each part of its work, in a half of a warp
 static_assert(kWorkParts <= kPartsApart);
 
+constexpr int64_t kBlocksOfPushing = 2048;  // which share the pairs that push, whose number only the device knows
+
 // The listed pairs that push, few of them: how many, and which, in any order.
 template <class T>
-__global__ void __launch_bounds__(kOne)
-    pushing_kernel(const __grid_constant__ RigidInputs<T> in, int64_t listed, int32_t* pushing) {
+__global__ void __launch_bounds__(kOne) pushing_kernel(const __grid_constant__ RigidInputs<T> in,
+                                                       VirtualMotions<T> given, RigidWork<T> out, int32_t* pushing) {
   const int64_t row = own_item();
-  if (row < listed && BarrierWork<T>::pushes(in, row)) pushing[1 + atomicAdd(pushing, 1)] = static_cast<int32_t>(row);
+  if (row >= out.listed) return;
+  const bool pushes = BarrierWork<T>::pushes(in, given, row);
+  out.pushes[row] = pushes, out.by_kappa[row] = T(0);
+  if (pushes) pushing[1 + atomicAdd(pushing, 1)] = static_cast<int32_t>(row);
 }
 
 template <class T>
 __global__ void __launch_bounds__(kOne)
     barrier_kernel(const __grid_constant__ RigidInputs<T> in, VirtualMotions<T> given, RigidWork<T> out,
                    const int32_t* pushing) {
-  const int64_t i = own_item() / kPartsApart;
   const int part = static_cast<int>(threadIdx.x % kPartsApart);
-  if (part >= kWorkParts || i >= *pushing) return;
-  const int64_t row = pushing[1 + i];
-  const BarrierWork<T> work(in, given, row, true);
-  work.store(part, out.barrier + 4 * kWorkScalars * row, out.by_kappa + row);
+  const int64_t count = *pushing, stride = static_cast<int64_t>(gridDim.x) * (kOne / kPartsApart);
+  for (int64_t i = own_item() / kPartsApart; part < kWorkParts && i < count; i += stride) {
+    const int64_t row = pushing[1 + i];
+    const BarrierWork<T> work(in, given, row, true);
+    work.store(part, out.barrier + 4 * kWorkScalars * row, out.by_kappa + row);
+  }
 }
 
 template <class T>
@@ -33,9 +40,26 @@ __global__ void __launch_bounds__(kOne)
     friction_kernel(const __grid_constant__ RigidInputs<T> in, VirtualMotions<T> given, RigidWork<T> out) {
   const int64_t row = own_item();
   if (row >= out.lagged) return;
+  T *rows = out.friction + 4 * kWorkScalars * row, *lag_bar = out.lag_bar + kLagScalars * row;
+  if (row >= in.first_lagged(in.scene.scenes)) {  // most: nobody reads their rows
+    for (int i = 0; i < kLagScalars; ++i) lag_bar[i] = T(0);
+    return;
+  }
   const LaggedWork<T> work(in, given, row);
-  T *rows = out.friction + 4 * kWorkScalars * row, *by_lag = out.by_lag + kLagScalars * row;
-  work.acts ? work.store(rows, by_lag) : work.store_none(rows, by_lag);
+  work.acts ? work.store(rows, lag_bar) : work.store_none(rows, lag_bar);
+}
+
+// A warp for each corner point.
+template <class T>
+__global__ void __launch_bounds__(kOne)
+    point_kernel(const __grid_constant__ RigidInputs<T> in, RigidWork<T> work, PointWork<T> out) {
+  const int64_t point = own_item() / 32;
+  const int lane = static_cast<int>(threadIdx.x % 32);
+  if (point >= in.scene.scenes * in.gate.corners) return;
+  double sum[kPointScalars] = {};
+  add_at_point(in, work, point, lane, 32, sum);
+  butterfly<kPointScalars, 32>(0xffffffffu, sum);
+  if (lane == 0) store_at_point(sum, point, out);
 }
 
 // A block for each body of each scene.
@@ -61,7 +85,7 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     vertices_kernel(const __grid_constant__ RigidInputs<T> in, const double* motions, const double* solutions,
-                    VirtualMotions<T> sent, const __grid_constant__ rigid::Adjoints<T> out, T* floor_lag) {
+                    SentBack<T> sent, const __grid_constant__ rigid::Adjoints<T> out, T* floor_lag) {
   __shared__ double part[kWarps][kMostSums];
   const int64_t item = blockIdx.x, at = kUnknowns * item;
   const Body<T> body{in.scene, item / in.bodies(), static_cast<int32_t>(item % in.bodies())};
@@ -88,7 +112,7 @@ cudaError_t rigid_end_backward(const RigidInputs<T>& in, const double* motions, 
 
 template <class T>
 cudaError_t rigid_vertices_backward(const RigidInputs<T>& in, const double* motions, const double* solutions,
-                                    const VirtualMotions<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag,
+                                    const SentBack<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag,
                                     cudaStream_t stream) {
   if (blocks_of_bodies(in) == 0) return cudaSuccess;
   vertices_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, motions, solutions, sent, out, floor_lag);
@@ -97,28 +121,27 @@ cudaError_t rigid_vertices_backward(const RigidInputs<T>& in, const double* moti
 
 template <class T>
 cudaError_t rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out,
-                           int32_t* pushing, cudaStream_t stream) {
+                           const PointWork<T>& sums, int32_t* pushing, cudaStream_t stream) {
   if (out.listed > 0) {
-    constexpr auto kBytes = static_cast<int64_t>(sizeof(T));
-    const Span barrier = {out.barrier, 4 * kWorkScalars * out.listed * kBytes};
-    if (auto error = clear({{pushing, sizeof(*pushing)}, barrier, {out.by_kappa, out.listed * kBytes}}, stream)) {
-      return error;
-    }
-    pushing_kernel<T><<<blocks_for(out.listed), kOne, 0, stream>>>(in, out.listed, pushing);
-    barrier_kernel<T><<<blocks_for(kPartsApart * out.listed), kOne, 0, stream>>>(in, given, out, pushing);
+    if (auto error = cudaMemsetAsync(pushing, 0, sizeof(*pushing), stream)) return error;
+    pushing_kernel<T><<<blocks_for(out.listed), kOne, 0, stream>>>(in, given, out, pushing);
+    const auto blocks =
+        static_cast<unsigned>(std::min<int64_t>(blocks_for(kPartsApart * out.listed), kBlocksOfPushing));
+    barrier_kernel<T><<<blocks, kOne, 0, stream>>>(in, given, out, pushing);
   }
   if (out.lagged > 0) friction_kernel<T><<<blocks_for(out.lagged), kOne, 0, stream>>>(in, given, out);
+  const int64_t points = in.scene.scenes * in.gate.corners;
+  if (points > 0) point_kernel<T><<<blocks_for(32 * points), kOne, 0, stream>>>(in, out, sums);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                 \
-  template cudaError_t rigid_end_backward<T>(const RigidInputs<T>&, const double*, const double*, const T*,    \
-                                             const double*, double*, T*, T*, T*, T*, cudaStream_t);            \
-  template cudaError_t rigid_vertices_backward<T>(const RigidInputs<T>&, const double*, const double*,         \
-                                                  const VirtualMotions<T>&, const rigid::Adjoints<T>&, T*,     \
-                                                  cudaStream_t);                                               \
-  template cudaError_t rigid_backward<T>(const RigidInputs<T>&, const VirtualMotions<T>&, const RigidWork<T>&, \
-                                         int32_t*, cudaStream_t);
+#define DIFFVBD_INSTANTIATE(T)                                                                                      \
+  template cudaError_t rigid_end_backward<T>(const RigidInputs<T>&, const double*, const double*, const T*,         \
+                                             const double*, double*, T*, T*, T*, T*, cudaStream_t);                 \
+  template cudaError_t rigid_vertices_backward<T>(const RigidInputs<T>&, const double*, const double*,              \
+                                                  const SentBack<T>&, const rigid::Adjoints<T>&, T*, cudaStream_t); \
+  template cudaError_t rigid_backward<T>(const RigidInputs<T>&, const VirtualMotions<T>&, const RigidWork<T>&,      \
+                                         const PointWork<T>&, int32_t*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

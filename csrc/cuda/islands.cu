@@ -1,6 +1,7 @@
 #include <cstring>
 #include <type_traits>
 
+#include "block_sum.cuh"
 #include "islands.h"
 #include "ordered.cuh"
 #include "union.cuh"
@@ -12,8 +13,6 @@ using namespace contact;
 
 constexpr int kThreads = 256;
 constexpr int kWarp = 32, kLongSegment = 512;  // threads for a sum of fewer terms on average; above, kThreads
-constexpr int64_t kFewTerms = 32;              // of a segment on average, up to which a thread adds one up
-constexpr int32_t kShortSegment = 512;         // terms up to which it may
 constexpr int32_t kTile = 32;                  // bodies that one thread compares with one
 constexpr int32_t kFewBodies = 512;            // of a scene, up to which a block finds all its islands
 constexpr size_t kAlignment = 256;
@@ -92,19 +91,6 @@ __global__ void planes_kernel(const IslandInputs<T> in, Workspace<T> work) {
   const int32_t object = in.body[in.planes[3 * (i - scene * in.num_planes)]] - in.mesh_bodies;
   const T far = std::numeric_limits<T>::infinity();
   for (int k = 0; k < 6; ++k) work.colliders[scene * in.colliders() + object][k] = ordered(k < 3 ? far : -far);
-}
-
-// Sum of what the threads of a block have, at thread 0, always in the same order.
-template <class Term, class Add>
-__device__ Term block_sum(Term own, Term* part, const Add& add) {
-  const unsigned t = threadIdx.x;
-  part[t] = own;
-  for (unsigned half = blockDim.x / 2; half > 0; half /= 2) {
-    __syncthreads();
-    if (t < half) add(part[t], part[t + half]);
-  }
-  __syncthreads();
-  return part[0];
 }
 
 // A block for each body.
@@ -268,55 +254,6 @@ __global__ void __launch_bounds__(kThreads)
   each(n, [&](int32_t i) { island[first + i] = work.islands[first + label[i]].blocked ? -1 : label[i]; });
 }
 
-// A block for kThreads segments of a scene: a thread for each column of a short one, all for a long one.
-template <class T>
-__global__ void __launch_bounds__(kThreads)
-    short_segments_sync_kernel(const T* values, const int32_t* order, const int32_t* ptr, int64_t items,
-                               int64_t segments, int64_t c, T* out) {
-  __shared__ T part[kThreads];
-  const int64_t tiles = (segments + kThreads - 1) / kThreads, scene = blockIdx.x / tiles;
-  const int64_t first = (blockIdx.x - scene * tiles) * kThreads;
-  const int64_t last = first + kThreads < segments ? first + kThreads : segments;
-  const T* own = values + scene * items * c;
-  T* to = out + scene * segments * c;
-  bool any_long = false;
-  for (int64_t i = threadIdx.x; i < (last - first) * c; i += kThreads) {
-    const int64_t s = first + i / c, k = i % c;
-    if (ptr[s + 1] - ptr[s] > kShortSegment) {
-      any_long = true;
-      continue;
-    }
-    T sum = T(0);
-    for (int32_t e = ptr[s]; e < ptr[s + 1]; ++e) sum += own[order[e] * c + k];
-    to[s * c + k] = sum;
-  }
-  if (!__syncthreads_or(any_long)) return;
-  for (int64_t s = first; s < last; ++s) {
-    if (ptr[s + 1] - ptr[s] <= kShortSegment) continue;
-    for (int64_t k = 0; k < c; ++k) {
-      T sum = T(0);
-      for (int64_t e = ptr[s] + int64_t{threadIdx.x}; e < ptr[s + 1]; e += kThreads) sum += own[order[e] * c + k];
-      sum = block_sum(sum, part, [](T& a, const T& b) { a += b; });
-      if (threadIdx.x == 0) to[s * c + k] = sum;
-      __syncthreads();  // part is read
-    }
-  }
-}
-
-// A block for each column of each segment.
-template <class T>
-__global__ void segments_sync_kernel(const T* values, const int32_t* order, const int32_t* ptr, int64_t items,
-                                     int64_t segments, int64_t c, T* out) {
-  __shared__ T part[kThreads];
-  const int64_t row = blockIdx.x / c, k = blockIdx.x - row * c, scene = row / segments, s = row - scene * segments;
-  T own = T(0);
-  for (int64_t e = ptr[s] + int64_t{threadIdx.x}; e < ptr[s + 1]; e += blockDim.x) {
-    own += values[(scene * items + order[e]) * c + k];
-  }
-  const T sum = block_sum(own, part, [](T& a, const T& b) { a += b; });
-  if (threadIdx.x == 0) out[blockIdx.x] = sum;
-}
-
 }  // namespace
 
 template <class T>
@@ -356,26 +293,9 @@ cudaError_t find_islands(const IslandInputs<T>& in, int32_t* island, void* memor
   return cudaGetLastError();
 }
 
-template <class T>
-cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
-                        int64_t segments, int64_t c, T* out, cudaStream_t stream) {
-  if (scenes * segments * c == 0) return cudaSuccess;
-  if (items <= kFewTerms * segments) {
-    const auto tiles = static_cast<unsigned>(scenes * ((segments + kThreads - 1) / kThreads));
-    short_segments_sync_kernel<<<tiles, kThreads, 0, stream>>>(values, order, ptr, items, segments, c, out);
-    return cudaGetLastError();
-  }
-  const auto blocks = static_cast<unsigned>(scenes * segments * c);
-  const int threads = threads_for(items, segments);
-  segments_sync_kernel<<<blocks, threads, 0, stream>>>(values, order, ptr, items, segments, c, out);
-  return cudaGetLastError();
-}
-
-#define DIFFVBD_INSTANTIATE(T)                                                                                      \
-  template size_t islands_workspace_bytes<T>(const IslandInputs<T>&);                                               \
-  template cudaError_t find_islands<T>(const IslandInputs<T>&, int32_t*, void*, cudaStream_t, bool);                \
-  template cudaError_t segment_sum<T>(const T*, const int32_t*, const int32_t*, int64_t, int64_t, int64_t, int64_t, \
-                                      T*, cudaStream_t);
+#define DIFFVBD_INSTANTIATE(T)                                        \
+  template size_t islands_workspace_bytes<T>(const IslandInputs<T>&); \
+  template cudaError_t find_islands<T>(const IslandInputs<T>&, int32_t*, void*, cudaStream_t, bool);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

@@ -1,4 +1,4 @@
-// Islands of bodies in contact, and sums over segments, on the device; the twin of cpu/islands.h.
+// Islands of bodies in contact, on the device; the twin of cpu/islands.h.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -17,11 +17,5 @@ size_t islands_workspace_bytes(const contact::IslandInputs<T>& in);
 template <class T>
 cudaError_t find_islands(const contact::IslandInputs<T>& in, int32_t* island, void* workspace, cudaStream_t stream,
                          bool again = false);
-
-// values [B, items, c] -> [B, segments, c]: sums of the rows order[ptr[s]..ptr[s + 1]) in an order that depends on the
-// shapes alone
-template <class T>
-cudaError_t segment_sum(const T* values, const int32_t* order, const int32_t* ptr, int64_t scenes, int64_t items,
-                        int64_t segments, int64_t c, T* out, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -39,11 +39,21 @@ def left_alone(groups: Tensor) -> Tensor:
     return groups[:, 3].gather(1, groups[:, 1].long()) < 0
 
 
+class Moved(NamedTuple):
+    """What :func:`rigid_move` returns."""
+
+    x: Tensor  # [B, V, 3]
+    share: Tensor  # of its motion that each body took [B, bodies], as are the next, float64; zero of what `moving` left
+    moved: Tensor  # bool: whether it has a motion
+    held: Tensor  # bool: whether it was held up, in a scene in which some of those that were have gone on
+    left: Tensor  # how much of its shift it did not take [m]
+
+
 def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_count: Sequence[int], time_step: float,
-               friction_eps: float) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """The state after each body has taken what it may of its motion [B, bodies, 6], [B, V, 3], and that share,
-    float64 [B, bodies]."""
-    return raw.contact_rigid_move(*fields, centers, motion, data_count, time_step, friction_eps)
+               friction_eps: float, moving: Tensor | None = None) -> Moved:  # fmt: skip
+    """After each body has taken what it may of its motion [B, bodies, 6]. moving: As for :func:`rigid_system`."""
+    moving = fields.free.new_empty((0,)) if moving is None else moving.contiguous()
+    return Moved(*raw.contact_rigid_move(*fields, centers, motion, data_count, time_step, friction_eps, moving))
 
 
 def most_grouped(bodies: int) -> int:
@@ -51,13 +61,23 @@ def most_grouped(bodies: int) -> int:
     return min(max(GROUP_MEMORY // max(bodies, 1), 1), MOST_COUPLED, bodies)
 
 
+class PairWork(NamedTuple):
+    """What :func:`rigid_backward` finds."""
+
+    by_x: Tensor  # [B, N, 3]: by where corner points are,
+    by_p: Tensor  # by p,
+    by_q: Tensor  # and by q
+    since: Tensor  # by_x of lagged pairs alone, which have it by how points have moved since the start; or empty
+    by_kappa: Tensor  # [pairs], of each listed pair
+    lag_bar: Tensor  # [lagged, 9]: less the derivatives by what is lagged
+
+
 def rigid_backward(fields: TouchingFields, p: Tensor, q: Tensor, groups: Tensor, data_count: Sequence[int],
-                   time_step: float, friction_eps: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+                   time_step: float, friction_eps: float) -> PairWork:  # fmt: skip
     """What pairs add to the derivatives of p . (gradient + matrix q) of the Newton step, p and q being motions of all
-    corner points [B, N, 3], groups those of the step. For each listed pair: by the positions, p and q of its corners
-    [pairs, 4, 9] and by kappa [pairs]; for each lagged pair likewise, and by its lag [pairs, 9]."""
-    return raw.contact_rigid_backward(*fields, p.contiguous(), q.contiguous(), groups, data_count, time_step,
-                                      friction_eps)  # fmt: skip
+    corner points [B, N, 3], groups those of the step."""
+    return PairWork(*raw.contact_rigid_backward(*fields, p.contiguous(), q.contiguous(), groups, data_count, time_step,
+                                                friction_eps))  # fmt: skip
 
 
 class EndAdjoint(NamedTuple):
@@ -89,14 +109,13 @@ class VertexAdjoints(NamedTuple):
     floor_lag: Tensor  # [B, V, planes, 4], or empty
 
 
-def rigid_vertices_backward(fields: TouchingFields, motion: Tensor, solution: Tensor, by_p: Tensor, by_q: Tensor,
+def rigid_vertices_backward(fields: TouchingFields, motion: Tensor, end: EndAdjoint, pairs: PairWork,
                             data_count: Sequence[int], time_step: float, friction_eps: float, wants_data: bool
                             ) -> VertexAdjoints:  # fmt: skip
-    """The adjoints of what vertices add to -p . (gradient + matrix q), p and q being the motions of
-    :func:`rigid_end_backward`; by_p, by_q [B, N, 3]: what pairs add to the work's derivatives by them."""
+    """The adjoints of vertices: of -p . (gradient + matrix q), p and q being the motions of ``end``, with what pairs
+    have in it, and of the way itself."""
     x, x_prev, y, mass, shared, own, floor_lag = raw.contact_rigid_vertices_backward(
-        *fields, motion, solution, by_p.contiguous(), by_q.contiguous(), data_count, time_step, friction_eps,
-        wants_data)  # fmt: skip
+        *fields, motion, end.solution, end.x, end.mass, *pairs[:4], data_count, time_step, friction_eps, wants_data)
     data = join_data(shared, own, data_count) if wants_data else shared
     return VertexAdjoints(x, x_prev, y, mass, data, floor_lag)
 
@@ -115,14 +134,18 @@ def _(*arguments):
 @shapes_of("contact_rigid_move")
 def _(*arguments):
     f = TouchingFields(*arguments[:_FIELDS])
-    return torch.empty_like(f.x), f.x.new_empty((f.x.shape[0], f.free.shape[0]), dtype=torch.float64)
+    of_bodies = (f.x.new_empty((f.x.shape[0], f.free.shape[0]), dtype=dtype)
+                 for dtype in (torch.float64, torch.bool, torch.bool, f.x.dtype))  # fmt: skip
+    return torch.empty_like(f.x), *of_bodies
 
 
 @shapes_of("contact_rigid_backward")
 def _(*arguments):
     f = TouchingFields(*arguments[:_FIELDS])
     listed, lagged = f.pairs.shape[0], f.lag_pairs.shape[0] if f.lag.numel() else 0
-    return tuple(f.x.new_empty(shape) for shape in ((listed, 4, 9), (listed,), (lagged, 4, 9), (lagged, 9)))
+    b, n = f.x.shape[0], f.body.shape[0]
+    since = (b if lagged else 0, n, 3)
+    return tuple(f.x.new_empty(shape) for shape in (*[(b, n, 3)] * 3, since, (listed,), (lagged, 9)))
 
 
 @shapes_of("contact_rigid_end_backward")

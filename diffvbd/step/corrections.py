@@ -60,33 +60,24 @@ def corrected_after(of: ContactStep, x: Tensor, collider: Tensor, start: PartSta
     for _ in range(1, least):
         at = corrected(of, at.x, collider, start, listed)
         shares.append(at.share)
-    back = not_taken(at)
+    back = at.left
     if not last or of.barrier is None:
         return at.x, shares, back
     bodies = of.model.mesh.num_bodies
     grouped = bodies <= most_grouped(bodies)
     for k in range(least, HELD_CORRECTIONS if grouped else LEFT_CORRECTIONS):
-        # of a scene in which some of those that were held up have gone on: where they are now, others may go on, too
-        held = at.moved & (at.share < 1)
-        held &= (held & (at.share > 0)).any(-1, keepdim=True)
         alone = k >= HELD_CORRECTIONS
         left = None if grouped else left_alone(at.groups)
         if not is_captured(x):
-            some_held = not alone and bool(held.any())
+            some_held = not alone and bool(at.held.any())
             if not some_held and (left is None or not bool(left.any())):
                 break
             alone = not some_held
-        moving = held if left is None else left if alone else held | left
+        moving = at.held if left is None else left if alone else at.held | left
         at = corrected(of, at.x, collider, start, listed, moving, alone)
         shares.append(at.share)
-        back = torch.where(at.moved, not_taken(at), back)
+        back = torch.where(at.moved, at.left, back)
     return at.x, shares, back
-
-
-def not_taken(at: Corrected) -> Tensor:
-    """How much of its last shift each body did not take [B, bodies] [m]."""
-    shift = at.motion[..., 3:].norm(dim=-1).to(at.share)
-    return torch.addcmul(shift, shift, at.share, value=-1)
 
 
 def is_cut(of: ContactStep, x: Tensor, back: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.contact_lag import sum_at_corners, sum_of_scenes
+from ..adjoint.contact_lag import sum_of_scenes
 from ..model.model import Model
 from ..ops import Backward, Direct, no_transforms, of_inputs
 from ..ops import contact_rigid as ops_rigid
@@ -31,9 +31,10 @@ class Corrected(NamedTuple):
     """What a correction returns; all but x is index data."""
 
     x: Tensor  # [B, V, 3]
-    share: Tensor  # of its motion that each body took [B, bodies]
-    moved: Tensor  # which bodies have a motion, bool [B, bodies]
-    motion: Tensor  # [B, bodies, 6] float64, a turn and a shift
+    share: Tensor  # of its motion that each body took [B, bodies]; this and the next as ops.contact_rigid.Moved
+    moved: Tensor
+    held: Tensor
+    left: Tensor
     groups: Tensor  # as ops.contact_rigid has them
 
 
@@ -42,8 +43,8 @@ def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction
     """After every free body has been moved, as far as pairs, floors and the potential let it. friction_eps: [m], 0
     without friction. moving, alone: As for ops.contact_rigid.rigid_system. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
-    x, share, motion, _, groups, moved = _Correct.apply(*fields, model, time_step, friction_eps, moving, alone)
-    return Corrected(x, share.to(x.dtype), moved, motion, groups)
+    x, share, _, _, groups, *rest = _Correct.apply(*fields, model, time_step, friction_eps, moving, alone)
+    return Corrected(x, share.to(x.dtype), *rest, groups)
 
 
 def bodies_of(model: Model) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -72,11 +73,8 @@ class _Correct(Direct):
                                     lag_ptr, lag_entry, floor_lag, center, room)  # fmt: skip
         counts = model._data_count
         centers, motion, factor, groups = ops_rigid.rigid_system(fields, counts, time_step, friction_eps, moving, alone)
-        end, share = ops_rigid.rigid_move(fields, centers, motion, counts, time_step, friction_eps)
-        moved = (motion != 0).any(-1)
-        if moving is not None:  # what stays takes no share, and passes nothing on
-            share = share * moved
-        return end, share, motion, factor, groups, moved
+        end = ops_rigid.rigid_move(fields, centers, motion, counts, time_step, friction_eps, moving)
+        return end.x, end.share, motion, factor, groups, end.moved, end.held, end.left
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
@@ -120,24 +118,18 @@ def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: T
     wants = dict(zip(ops.TouchingFields._fields, needs, strict=True))
     options = s.model._data_count, s.time_step, s.friction_eps
     end = ops_rigid.rigid_end_backward(f, motion, share, factor, groups, x_bar, *options)
-    barrier, by_kappa, friction, by_lag = ops_rigid.rigid_backward(f, end.p, end.q, groups, *options)
-    # sums over the pairs of each corner point: by where it is (friction: by how it has moved), by p and by q
-    points = end.p.shape[:2]
-    sums = [sum_at_corners(values, listed, *points)
-            for values, listed in ((barrier, s.listed), (friction, s.lagged)) if len(values)]  # fmt: skip
-    to_points, by_p, by_q = (sum(sums[1:], sums[0]) if sums else end.p.new_zeros((*points, 9))).split(3, -1)
-    own = ops_rigid.rigid_vertices_backward(f, motion, end.solution, by_p, by_q, *options, wants["energy_data"])
-    by_way = sums[-1][..., :3] if len(friction) else None
+    pairs = ops_rigid.rigid_backward(f, end.p, end.q, groups, *options)
+    own = ops_rigid.rigid_vertices_backward(f, motion, end, pairs, *options, wants["energy_data"])
     out: dict[str, Callable[[], Tensor]] = {  # few are wanted, and each is a launch
-        "x": lambda: end.x + own.x - to_points[:, :vertices],
-        "x_prev": lambda: own.x_prev if by_way is None else own.x_prev + by_way[:, :vertices],
+        "x": lambda: own.x,
+        "x_prev": lambda: own.x_prev,
         "y": lambda: own.y,
-        "mass": lambda: end.mass + own.mass,
+        "mass": lambda: own.mass,
         "energy_data": lambda: own.energy_data,
-        "collider": lambda: -to_points[:, vertices:],
-        "collider_prev": lambda: torch.zeros_like(f.collider) if by_way is None else by_way[:, vertices:],
-        "kappa": lambda: -sum_of_scenes(by_kappa, s.listed, scenes),
-        "lag": lambda: -by_lag,
+        "collider": lambda: -pairs.by_x[:, vertices:],
+        "collider_prev": lambda: pairs.since[:, vertices:] if len(pairs.since) else torch.zeros_like(f.collider),
+        "kappa": lambda: -sum_of_scenes(pairs.by_kappa, s.listed, scenes),
+        "lag": lambda: pairs.lag_bar,
         "floor_lag": lambda: own.floor_lag,
     }
     bars = []

@@ -10,7 +10,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import mesh, ops
-from diffvbd.adjoint.contact_lag import Pairs, of_scene, sum_at_corners
+from diffvbd.adjoint.contact_lag import of_scene
 from diffvbd.ops import broadcast
 from diffvbd.ops import contact_rigid as ops_rigid
 from diffvbd.ops.segments import Order, of_segments, sum_segments
@@ -150,20 +150,13 @@ def _work_of_pairs(s: Scenes, at_p: Tensor, at_q: Tensor, groups: Tensor) -> Ten
         ops.TouchingFields(*(t.detach() for t in f)), at_p.detach(), at_q.detach(), groups, s.model._data_count,
         s.time_step, s.friction_eps,
     )  # fmt: skip
-    barrier, by_kappa, friction, by_lag = found
-
-    def at_all(rows: Tensor, listed: Pairs) -> tuple[Tensor, ...]:
-        return sum_at_corners(rows, listed, *points.shape[:2]).split(3, -1)
-
-    work = points.new_zeros(())
-    if len(barrier):
-        by_x, by_p, by_q = at_all(barrier, s.listed)
+    work = (found.by_x * points + found.by_p * at_p + found.by_q * at_q).sum()
+    if len(found.by_kappa):
         kappa = f.kappa if f.kappa.shape[0] == 1 else of_scene(f.kappa, s.listed)
-        work = work + (by_x * points + by_p * at_p + by_q * at_q).sum() + (kappa * by_kappa).sum()
-    if len(friction):
-        by_x, by_p, by_q = at_all(friction, s.lagged)
-        since = points - torch.cat([f.x_prev, f.collider_prev], 1)
-        work = work + (by_x * since + by_p * at_p + by_q * at_q).sum() + (f.lag * by_lag).sum()
+        work = work + (kappa * found.by_kappa).sum()
+    if len(found.since):
+        before = torch.cat([f.x_prev, f.collider_prev], 1)
+        work = work - (found.since * before).sum() - (f.lag * found.lag_bar).sum()
     return work
 
 

@@ -149,20 +149,14 @@ def test_derivatives_are_those_of_the_virtual_work(name: str, device: str, monke
         ops.TouchingFields(*(t.to(device) for t in f)), p.to(device), q.to(device), groups_of(s).to(device),
         s.model._data_count, s.time_step, s.friction_eps,
     )  # fmt: skip
-    barrier, by_kappa, friction, by_lag = (t.cpu() for t in found)
-
-    def at_all(rows: Tensor, pairs: Tensor) -> Tensor:
-        out = torch.zeros((*points[:2], rows.shape[-1]), dtype=rows.dtype)
-        return out.index_put((pairs[:, 5:].long(), pairs[:, :4].long()), rows, accumulate=True)
+    by_x, by_p, by_q, since, by_kappa, lag_bar = (t.cpu() for t in found)
 
     vertices = f.x.shape[1]
-    pushed = at_all(barrier, f.pairs)
-    rubbed = at_all(friction, f.lag_pairs) if len(friction) else torch.zeros_like(pushed)
-    by_x, since = (pushed + rubbed)[..., :3], -rubbed[..., :3]
+    before = -since if len(since) else torch.zeros_like(by_x)
     scene = f.pairs[:, 5].long() if f.kappa.shape[0] > 1 else torch.zeros_like(f.pairs[:, 5]).long()
-    result = {"x": by_x[:, :vertices], "x_prev": since[:, :vertices], "collider": by_x[:, vertices:],
-              "collider_prev": since[:, vertices:], "kappa": torch.zeros_like(f.kappa).index_add(0, scene, by_kappa),
-              "lag": by_lag, "p": (pushed + rubbed)[..., 3:6], "q": (pushed + rubbed)[..., 6:]}  # fmt: skip
+    result = {"x": by_x[:, :vertices], "x_prev": before[:, :vertices], "collider": by_x[:, vertices:],
+              "collider_prev": before[:, vertices:], "kappa": torch.zeros_like(f.kappa).index_add(0, scene, by_kappa),
+              "lag": -lag_bar, "p": by_p, "q": by_q}  # fmt: skip
     for key in ("x", "kappa", "p", "q", *(("x_prev", "lag") if f.lag.numel() else ())):
         assert float(expected[key].abs().max()) > 0, key
     for key, value in expected.items():

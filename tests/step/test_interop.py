@@ -261,7 +261,7 @@ def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     assert motion.abs().max() > 0 and torch.isfinite(factor).all()
     return {
         "contact_rigid_system": (*touching, *numbers, *everyone),
-        "contact_rigid_move": (*touching, centers, motion, *numbers),
+        "contact_rigid_move": (*touching, centers, motion, *numbers, everyone[0]),
         "contact_rigid_backward": (*touching, points_of, points_of, groups, *numbers),
         "contact_above_floor": floor,
         "contact_above_floor_backward": (move, *floor, True),

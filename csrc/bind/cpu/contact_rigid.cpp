@@ -37,33 +37,39 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_system(
   });
 }
 
-std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& centers, const Tensor& motion,
-                                              std::vector<int64_t> data_count, double time_step, double friction_eps) {
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING)
+                                                                          const Tensor& centers,
+                                                                      const Tensor& motion,
+                                                                      std::vector<int64_t> data_count, double time_step,
+                                                                      double friction_eps, const Tensor& moving) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     diffvbd::require_positions(x);
     const Tensor way = empty(x, {x.size(0), x.size(1), 3});
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, way, empty(x, {0}));
+    const auto all = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, way, empty(x, {0}));
+    const auto in = diffvbd::moving_inputs(all, moving, false, x);
     diffvbd::require_motion(in, centers, motion, x);
-    Tensor out = empty(x, {in.scene.scenes, in.scene.vertices, 3}), share = doubles({in.scene.scenes, in.bodies()});
-    diffvbd::rigid_move<T>(in, data<const double>(centers), data<const double>(motion), data<T>(way),
-                           data<double>(share), data<T>(out));
-    return std::make_tuple(out, share);
+    const auto make = [&](const std::vector<int64_t>& sizes, ScalarType dtype) {
+      return torch::stable::empty(sizes, dtype);
+    };
+    const diffvbd::RigidOutcomeTensors out(in, x, make);
+    diffvbd::rigid_move<T>(in, data<const double>(centers), data<const double>(motion), data<T>(way), out.view<T>(),
+                           data<T>(out.x));
+    return out.all();
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_backward(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& p,
-                                                                  const Tensor& q, const Tensor& groups,
-                                                                  std::vector<int64_t> data_count, double time_step,
-                                                                  double friction_eps) {
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_backward(
+    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& p, const Tensor& q, const Tensor& groups,
+    std::vector<int64_t> data_count, double time_step, double friction_eps) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
     const auto make = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes); };
-    const diffvbd::RigidWorkTensors out(f, make);
-    diffvbd::rigid_backward<T>(in, diffvbd::virtual_motions(in, p, q, x), out.view<T>());
+    const diffvbd::RigidWorkTensors out(f, torch::stable::empty({f.pairs.size(0)}, ScalarType::Byte), make);
+    diffvbd::rigid_backward<T>(in, diffvbd::virtual_motions(in, p, q, x), out.view<T>(), out.sums<T>());
     return out.all();
   });
 }
@@ -91,7 +97,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_end_backward(
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_vertices_backward(
-    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& solution, const Tensor& by_p, const Tensor& by_q,
+    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& solution, const Tensor& x_bar,
+    const Tensor& mass_bar, const Tensor& by_x, const Tensor& by_p, const Tensor& by_q, const Tensor& since,
     std::vector<int64_t> data_count, double time_step, double friction_eps, bool wants_data) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   return dispatch_float(x, [&](auto scalar) {
@@ -99,10 +106,13 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid
     const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), empty(x, {0}));
     diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
     diffvbd::require_of_bodies(in, solution, x, contact::kUnknowns);
-    const diffvbd::RigidVertexTensors out(in, data_count, wants_data,
-                                          [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
+    const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed) {
+      return zeroed ? zeros(x, sizes) : empty(x, sizes);
+    };
+    const diffvbd::RigidVertexTensors out(in, data_count, wants_data, make);
     diffvbd::rigid_vertices_backward<T>(in, data<const double>(motion), data<const double>(solution),
-                                        diffvbd::virtual_motions(in, by_p, by_q, x), out.pointers<T>(), out.floor<T>());
+                                        diffvbd::sent_back(in, x_bar, mass_bar, by_x, by_p, by_q, since, x),
+                                        out.pointers<T>(), out.floor<T>());
     return out.all();
   });
 }

@@ -82,13 +82,26 @@ class Zeroed {
   explicit Zeroed(const Tensor& like) : like_(like) {}
   Tensor operator()(const std::vector<int64_t>& sizes) {
     Tensor out = empty(like_, sizes);
-    const bool wide = like_.scalar_type() == ScalarType::Double;
-    spans_.push_back({out.data_ptr(), out.numel() * static_cast<int64_t>(wide ? sizeof(double) : sizeof(float))});
+    spans_.push_back({out.data_ptr(), out.numel() * scalar()});
+    return out;
+  }
+  // Rows of pairs [pairs, each], zero as far as the list has pairs; entries: their number, on the device.
+  Tensor rows(int64_t pairs, int64_t each, const int32_t* entries) {
+    Tensor out = empty(like_, {pairs, each});
+    spans_.push_back({out.data_ptr(), out.numel() * scalar(), entries, each * scalar()});
+    return out;
+  }
+  // The same of bytes, a multiple of four each.
+  Tensor bytes(int64_t pairs, int64_t each, const int32_t* entries) {
+    Tensor out = empty(like_, {pairs, each}, ScalarType::Byte);
+    spans_.push_back({out.data_ptr(), out.numel(), entries, each});
     return out;
   }
   void clear() const { check(cuda::clear(spans_, current_stream(like_)), "memory"); }
 
  private:
+  int64_t scalar() const { return like_.scalar_type() == ScalarType::Double ? sizeof(double) : sizeof(float); }
+
   const Tensor& like_;
   std::vector<Span> spans_;
 };

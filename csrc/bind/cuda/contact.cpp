@@ -7,6 +7,7 @@
 #include "../../cuda/detect.h"
 #include "../../cuda/intersect.h"
 #include "../../cuda/islands.h"
+#include "../../cuda/segments.h"
 #include "../detection.h"
 #include "binding.h"
 

@@ -47,40 +47,43 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_system(
   });
 }
 
-std::tuple<Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& centers, const Tensor& motion,
-                                              std::vector<int64_t> data_count, double time_step, double friction_eps) {
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_move(DIFFVBD_PARAMETERS(TOUCHING)
+                                                                          const Tensor& centers,
+                                                                      const Tensor& motion,
+                                                                      std::vector<int64_t> data_count, double time_step,
+                                                                      double friction_eps, const Tensor& moving) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     diffvbd::require_positions(x);
     const Tensor way = empty(x, {x.size(0), x.size(1), 3});
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, way, empty(x, {0}));
+    const auto all = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, way, empty(x, {0}));
+    const auto in = diffvbd::moving_inputs(all, moving, false, x);
     diffvbd::require_motion(in, centers, motion, x);
-    Tensor out = empty(x, {in.scene.scenes, in.scene.vertices, 3});
-    Tensor share = empty(x, {in.scene.scenes, in.bodies()}, ScalarType::Double);
+    const auto make = [&](const std::vector<int64_t>& sizes, ScalarType dtype) { return empty(x, sizes, dtype); };
+    const diffvbd::RigidOutcomeTensors out(in, x, make);
     const Tensor work = empty(x, {cuda::rigid_move_bytes(in, room_of(f))}, ScalarType::Byte);
     check(cuda::rigid_move<T>(in, room_of(f), data<const double>(centers), data<const double>(motion), data<T>(way),
-                              data<double>(share), data<T>(out), work.data_ptr(), current_stream(x)),
+                              out.view<T>(), data<T>(out.x), work.data_ptr(), current_stream(x)),
           "the rigid correction of bodies that touch");
-    return std::make_tuple(out, share);
+    return out.all();
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rigid_backward(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& p,
-                                                                  const Tensor& q, const Tensor& groups,
-                                                                  std::vector<int64_t> data_count, double time_step,
-                                                                  double friction_eps) {
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_backward(
+    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& p, const Tensor& q, const Tensor& groups,
+    std::vector<int64_t> data_count, double time_step, double friction_eps) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
     const auto make = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes); };
-    const diffvbd::RigidWorkTensors out(f, make);
+    const diffvbd::RigidWorkTensors out(f, empty(x, {f.pairs.size(0)}, ScalarType::Byte), make);
     const Tensor pushing = empty(x, {1 + f.pairs.size(0)}, ScalarType::Int);
-    check(cuda::rigid_backward<T>(in, diffvbd::virtual_motions(in, p, q, x), out.view<T>(), data<int32_t>(pushing),
-                                  current_stream(x)),
+    check(cuda::rigid_backward<T>(in, diffvbd::virtual_motions(in, p, q, x), out.view<T>(), out.sums<T>(),
+                                  data<int32_t>(pushing), current_stream(x)),
           "the adjoint of rigid motions");
     return out.all();
   });
@@ -111,7 +114,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_end_backward(
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_vertices_backward(
-    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& solution, const Tensor& by_p, const Tensor& by_q,
+    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& solution, const Tensor& x_bar,
+    const Tensor& mass_bar, const Tensor& by_x, const Tensor& by_p, const Tensor& by_q, const Tensor& since,
     std::vector<int64_t> data_count, double time_step, double friction_eps, bool wants_data) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const DeviceGuard guard(x.get_device_index());
@@ -121,11 +125,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid
     diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
     diffvbd::require_of_bodies(in, solution, x, contact::kUnknowns);
     Zeroed zeros(x);
-    const diffvbd::RigidVertexTensors out(in, data_count, wants_data, zeros);
+    const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed) {
+      return zeroed ? zeros(sizes) : empty(x, sizes);
+    };
+    const diffvbd::RigidVertexTensors out(in, data_count, wants_data, make);
     zeros.clear();
     check(cuda::rigid_vertices_backward<T>(in, data<const double>(motion), data<const double>(solution),
-                                           diffvbd::virtual_motions(in, by_p, by_q, x), out.pointers<T>(),
-                                           out.floor<T>(), current_stream(x)),
+                                           diffvbd::sent_back(in, x_bar, mass_bar, by_x, by_p, by_q, since, x),
+                                           out.pointers<T>(), out.floor<T>(), current_stream(x)),
           "the adjoint of rigid motions");
     return out.all();
   });

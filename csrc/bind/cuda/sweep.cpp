@@ -104,15 +104,17 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const
 // What the reverse of contact adds up pair by pair and corner by corner.
 template <class T>
 struct ContactSlots {
-  Tensor rows, lag_rows, kappa, lag, prev;
+  Tensor rows, lag_rows, kappa, lag, prev, sent;
   ContactSlots(const Tensor& x, const contact::ContactInputs<T>& in, int64_t listed, int64_t lagged, Zeroed& zeros)
-      : rows(zeros({listed, 48})),
-        lag_rows(zeros({lagged, 48})),
-        kappa(zeros({listed, 4})),
-        lag(zeros({lagged, 4 * contact::kLagScalars})),
-        prev(zeros({x.size(0), in.corners, 3})) {}
+      : rows(empty(x, {listed, 48})),
+        lag_rows(zeros.rows(lagged, 48, in.lag ? in.lagged.ptr + x.size(0) * in.corners : nullptr)),
+        kappa(zeros.rows(listed, 4, in.listed.ptr + x.size(0) * in.corners)),
+        lag(zeros.rows(lagged, 4 * contact::kLagScalars, in.lag ? in.lagged.ptr + x.size(0) * in.corners : nullptr)),
+        prev(zeros({x.size(0), in.corners, 3})),
+        sent(zeros.bytes(listed, 16, in.listed.ptr + x.size(0) * in.corners)) {}
   contact::ContactAdjoints<T> pointers(const Tensor& floor_lag) const {
-    return {data<T>(rows), data<T>(lag_rows), data<T>(kappa), data<T>(lag), data<T>(floor_lag), data<T>(prev)};
+    return {data<T>(rows),      data<T>(lag_rows), data<T>(kappa),     data<T>(lag),
+            data<T>(floor_lag), data<T>(prev),     data<uint8_t>(sent)};
   }
 };
 
@@ -169,7 +171,7 @@ diffvbd::SweepAdjoints sweep_backward(DIFFVBD_PARAMETERS(SWEEP) const Tensor& x_
     out.collider = data<T>(bars.collider);
     out.collider_prev = data<T>(bars.collider_prev), out.kappa = data<T>(bars.kappa);
     run();
-    check(cuda::sum_lag<T>(pointers, lagged, data<T>(bars.lag), stream), "the reverse sweep");
+    check(cuda::sum_lag<T>(given.pairs, in.scenes, pointers, lagged, data<T>(bars.lag), stream), "the reverse sweep");
     return bars.tensors();
   });
 }

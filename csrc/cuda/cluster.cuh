@@ -1,0 +1,89 @@
+// The blocks of a cluster share a small scene: they meet in less time than a launch takes, and see each other's shared
+// memory. Before compute capability 9 a cluster is one block.
+#pragma once
+
+#include <cooperative_groups.h>
+
+#include <cstdint>
+
+namespace diffvbd::cuda {
+
+constexpr int kMostBlocks = 8;           // of a cluster, on every device that has them
+constexpr int64_t kPairsOfBlock = 1024;  // worth a block of their own
+constexpr int64_t kBlocksAtOnce = 128;   // of all scenes: more do not run side by side
+
+struct Cluster {
+#if __CUDA_ARCH__ >= 900
+  __device__ static int rank() { return static_cast<int>(cooperative_groups::this_cluster().block_rank()); }
+  __device__ static int size() { return static_cast<int>(cooperative_groups::this_cluster().num_blocks()); }
+  // What blocks have written before is seen by all after.
+  __device__ static void meet() {
+    if (size() == 1) {
+      __syncthreads();
+    } else {
+      cooperative_groups::this_cluster().sync();
+    }
+  }
+  // Where another block has what is at `own` in this one's shared memory.
+  template <class U>
+  __device__ static U* of(U* own, int block) {
+    return cooperative_groups::this_cluster().map_shared_rank(own, block);
+  }
+#else
+  __device__ static int rank() { return 0; }
+  __device__ static int size() { return 1; }
+  __device__ static void meet() { __syncthreads(); }
+  template <class U>
+  __device__ static U* of(U* own, int) {
+    return own;
+  }
+#endif
+};
+
+// Answers of blocks to questions that all of them are asked, two in turn: one meeting each. In shared memory.
+struct Answers {
+  int of[2][kMostBlocks];
+};
+// Whether any thread of the cluster says yes, once all have come here. turn: 0 at first, the same for all threads.
+__device__ inline bool any_of_cluster(Answers& answers, int& turn, bool own) {
+  const int here = __syncthreads_or(own), size = Cluster::size();
+  if (size == 1) return here != 0;
+  const auto block = static_cast<int>(threadIdx.x);
+  if (block < size) Cluster::of(&answers, block)->of[turn][Cluster::rank()] = here;
+  Cluster::meet();
+  bool out = false;
+  for (int b = 0; b < size; ++b) out = out || answers.of[turn][b] != 0;
+  turn = 1 - turn;
+  return out;
+}
+
+// Blocks for each scene: a power of two.
+inline int blocks_of_scene(int64_t scenes, int64_t pairs) {
+  int device = 0, has_clusters = 0;
+  cudaGetDevice(&device);
+  cudaDeviceGetAttribute(&has_clusters, cudaDevAttrClusterLaunch, device);
+  int blocks = 1;
+  while (has_clusters && blocks < kMostBlocks && blocks * kPairsOfBlock * scenes < pairs &&
+         2 * blocks * scenes <= kBlocksAtOnce)
+    blocks *= 2;
+  return blocks;
+}
+
+// A cluster for each scene.
+template <class... P, class... A>
+cudaError_t launch_clusters(void (*kernel)(P...), int64_t scenes, int blocks, int threads, cudaStream_t stream,
+                            A... arguments) {
+  cudaLaunchAttribute attribute{};
+  attribute.id = cudaLaunchAttributeClusterDimension;
+  attribute.val.clusterDim.x = static_cast<unsigned>(blocks);
+  attribute.val.clusterDim.y = attribute.val.clusterDim.z = 1;
+  cudaLaunchConfig_t config{};
+  config.gridDim = dim3(static_cast<unsigned>(scenes * blocks));
+  config.blockDim = dim3(static_cast<unsigned>(threads));
+  config.stream = stream;
+  config.attrs = &attribute;
+  config.numAttrs = blocks > 1 ? 1 : 0;
+  return cudaLaunchKernelEx(&config, kernel, static_cast<P>(arguments)...);
+}
+
+}  // namespace diffvbd::cuda
