@@ -33,7 +33,9 @@ struct AdvanceInputs {
 
   // What goes a share of its own: vertices, or bodies.
   DIFFVBD_FN int64_t units() const { return scenes * (whole ? bodies : vertices); }
-  DIFFVBD_FN int64_t unit(int64_t row) const { return whole ? row / vertices * bodies + body[row % vertices] : row; }
+  DIFFVBD_FN int64_t unit(int64_t scene, int32_t v) const {
+    return whole ? scene * bodies + body[v] : scene * vertices + v;
+  }
   DIFFVBD_FN int64_t scene_of_unit(int64_t unit) const { return unit / (whole ? bodies : vertices); }
 };
 
@@ -72,7 +74,7 @@ DIFFVBD_FN Vec3<T> way_of(const AdvanceInputs<T>& in, int64_t scene, int32_t v) 
 // And the part of it that it tries.
 template <class T>
 DIFFVBD_FN Vec3<T> way_tried(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t scene, int32_t v) {
-  const int64_t unit = in.unit(scene * in.vertices + v);
+  const int64_t unit = in.unit(scene, v);
   const T done = in.held[v] ? T(s.first ? 0 : 1) : s.share[unit];
   return ((T(1) - done) * (in.held[v] ? T(1) : s.now[unit])) * way_of(in, scene, v);
 }
@@ -94,7 +96,7 @@ DIFFVBD_FN Trial<T> trial(const AdvanceInputs<T>& in, const AdvanceState<T>& s, 
   Trial<T> out;
   const int64_t row = scene * in.vertices + v;
   const Vec3<T> whole = way_of(in, scene, v);
-  const int64_t unit = in.unit(row);
+  const int64_t unit = in.unit(scene, v);
   const T done = in.held[v] ? T(s.first ? 0 : 1) : s.share[unit];
   out.at = vector_at(in.x + 3 * row) + done * whole;
   out.since = out.at - vector_at(in.center + 3 * row);
@@ -104,9 +106,14 @@ DIFFVBD_FN Trial<T> trial(const AdvanceInputs<T>& in, const AdvanceState<T>& s, 
   return out;
 }
 template <class T>
-DIFFVBD_FN Motion<T> motion_of(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row) {
-  const Trial<T> t = trial(in, s, row / in.vertices, static_cast<int32_t>(row % in.vertices));
+DIFFVBD_FN Motion<T> motion_of(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t scene, int32_t v) {
+  const Trial<T> t = trial(in, s, scene, v);
   return {t.since, t.since + t.way, t.size};
+}
+// That of a corner of a pair that is a vertex.
+template <class T>
+DIFFVBD_FN Motion<T> motion_at(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair, int k) {
+  return s.motion ? s.motion[int64_t{pair[5]} * in.vertices + pair[k]] : motion_of(in, s, pair[5], pair[k]);
 }
 
 template <class T>
@@ -221,8 +228,7 @@ DIFFVBD_FN bool stays_far(const AdvanceInputs<T>& in, const AdvanceState<T>& s, 
   Motion<T> m[4];
   for (int k = 0; k < 4; ++k) {
     if (pair[k] >= in.vertices) return false;  // whose gap may be of another time
-    const int64_t row = int64_t{pair[5]} * in.vertices + pair[k];
-    m[k] = s.motion ? s.motion[row] : motion_of(in, s, row);
+    m[k] = motion_at(in, s, pair, k);
   }
   return stays_far(m, pair, constants);
 }
@@ -237,8 +243,7 @@ DIFFVBD_FN bool stays_far_at_any_share(const AdvanceInputs<T>& in, const Advance
   T size = T(0), most = T(0);
   for (int k = 0; k < 4; ++k) {
     if (record[k] >= in.vertices) return false;  // whose gap may be of another time
-    const int64_t row = int64_t{record[5]} * in.vertices + record[k];
-    m[k] = s.motion ? s.motion[row] : motion_of(in, s, row);
+    m[k] = motion_at(in, s, record, k);
     size = size < m[k].size ? m[k].size : size;
   }
   const T room = PairHints<T>(constants).gap - PairConstants<T>(constants).dhat - guard_of_size(size);
@@ -257,8 +262,7 @@ DIFFVBD_FN bool stays_far_at_any_share(const AdvanceInputs<T>& in, const Advance
 template <class T>
 DIFFVBD_FN bool is_open(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* record) {
   for (int k = 0; k < 4; ++k) {
-    if (record[k] < in.vertices && !in.held[record[k]] &&
-        s.share[in.unit(int64_t{record[5]} * in.vertices + record[k])] < T(1)) {
+    if (record[k] < in.vertices && !in.held[record[k]] && s.share[in.unit(record[5], record[k])] < T(1)) {
       return true;
     }
   }
@@ -269,7 +273,7 @@ DIFFVBD_FN bool is_open(const AdvanceInputs<T>& in, const AdvanceState<T>& s, co
 template <class T>
 DIFFVBD_FN bool is_retried(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* record, int round) {
   for (int k = 0; k < 4; ++k) {
-    if (record[k] < in.vertices && s.stamp[in.unit(int64_t{record[5]} * in.vertices + record[k])] == round) return true;
+    if (record[k] < in.vertices && s.stamp[in.unit(record[5], record[k])] == round) return true;
   }
   return false;
 }
@@ -308,7 +312,7 @@ DIFFVBD_FN bool try_pair(const AdvanceInputs<T>& in, const AdvanceState<T>& s, i
       if (!a.free[k] || !(T(0) < dot(a.way[k], a.way[k]))) continue;
       const T toward = (k < first ? -dot(gate.n, a.way[k]) : dot(gate.n, a.way[k]));
       if (pass == 0 && !(T(kStartLeast) * gate.gap < toward)) continue;
-      mark(s.blocked + in.unit(int64_t{record[5]} * in.vertices + record[k]));
+      mark(s.blocked + in.unit(record[5], record[k]));
       named = true;
     }
   }
@@ -322,12 +326,11 @@ DIFFVBD_FN T total(T done, T now) {
 
 // Marks a vertex that leaves its rooms by what it tries; returns whether it stays. Rounds as of try_pair().
 template <class T>
-DIFFVBD_FN bool stay(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t row, int round) {
-  const auto v = static_cast<int32_t>(row % in.vertices);
-  const int64_t unit = in.unit(row);
+DIFFVBD_FN bool stay(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t scene, int32_t v, int round) {
+  const int64_t row = scene * in.vertices + v, unit = in.unit(scene, v);
   if (in.held[v] || (round > 0 && s.stamp[unit] != round) || s.now[unit] == T(0)) return true;
   const Vec3<T> x = vector_at(in.x + 3 * row);
-  const Vec3<T> end = x + total(s.share[unit], s.now[unit]) * way_of(in, row / in.vertices, v);
+  const Vec3<T> end = x + total(s.share[unit], s.now[unit]) * way_of(in, scene, v);
   const auto within = [&](const T* center, const T* room) {
     const Vec3<T> off = end - vector_at(center + 3 * row);
     return dot(off, off) <= room[row] * room[row];

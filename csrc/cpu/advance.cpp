@@ -55,9 +55,11 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
   std::vector<Motion<T>> motion(rows);
   std::vector<T> bound(rows);
   s.motion = motion.data();
+  const auto vertex = [&](int64_t row) { return static_cast<int32_t>(row % in.vertices); };
+  const auto unit = [&](int64_t row) { return in.unit(row / in.vertices, vertex(row)); };
   const auto look = [&] {
     torch::stable::parallel_for(0, rows, kPairGrain, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) motion[i] = motion_of(in, s, i);
+      for (int64_t i = begin; i < end; ++i) motion[i] = motion_of(in, s, i / in.vertices, vertex(i));
     });
   };
   // How many pairs of the vertices that `goes` names do not pass; each is looked at once.
@@ -104,13 +106,14 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
       if (last || (s.first && round == 0)) {
         found = count(pairs, kPairGrain, [&](int64_t i) { return !passes(i); });
       } else if (round == 0) {  // what the moves before have taken all the way does not move again
-        const auto open = [&](int64_t row) { return !in.held[row % in.vertices] && share[in.unit(row)] < T(1); };
+        const auto open = [&](int64_t row) { return !in.held[vertex(row)] && share[unit(row)] < T(1); };
         found = failing(open, passes);
       } else {
-        found = failing([&](int64_t row) { return stamp[in.unit(row)] == round; }, passes);
+        found = failing([&](int64_t row) { return stamp[unit(row)] == round; }, passes);
       }
-      const int64_t left =
-          count(rows, kGrain, [&](int64_t i) { return fails(i / in.vertices, stay(in, s, i, last ? 0 : round)); });
+      const int64_t left = count(rows, kGrain, [&](int64_t i) {
+        return fails(i / in.vertices, stay(in, s, i / in.vertices, vertex(i), last ? 0 : round));
+      });
       clean = round == 0 && found + left == 0;
       if (found + left == 0 || last) break;
       if (count(units, kGrain, [&](int64_t i) { return retreat(s, i, round); }) == 0) break;

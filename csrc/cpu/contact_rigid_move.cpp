@@ -44,7 +44,10 @@ class Tries {
     std::fill_n(share_, n, 1.0);
     for (int attempt = 0; attempt < kTries; ++attempt) {
       each_open([&](int32_t k) { displace(k); });
-      each_vertex([&](int64_t row) { motions[row - scene_ * in_.scene.vertices] = motion_of(in_.gate, state, row); });
+      each_vertex([&](int64_t row) {
+        const auto v = static_cast<int32_t>(row - scene_ * in_.scene.vertices);
+        motions[v] = motion_of(in_.gate, state, scene_, v);
+      });
       const std::vector<uint8_t> stopped = test(state);
       const std::vector<double> after = potentials(true, [](const PairPress&) {});
       const uint8_t* blocked = state.blocked + scene_ * n;
@@ -192,7 +195,7 @@ class Tries {
     each_open([&](int32_t k) {
       const Body<T> body{in_.scene, scene_, k};
       for (int32_t i = 0; in_.free[k] && i < body.size(); ++i) {
-        stay(in_.gate, state, body.row(body.vertex(i)), 0);
+        stay(in_.gate, state, scene_, body.vertex(i), 0);
         if (!admitted(in_, body, body.vertex(i))) blocked[k] = 1;
       }
       if (blocked[k]) out[lead_[k]] = 1;

@@ -122,17 +122,29 @@ struct NearPairs {
 };
 
 // All moves and rounds of some scenes: most are over after the first round, and only the device knows.
+// motions: memory for all vertices.
 template <class T, class Team, class Pairs>
-__device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceState<T> s, const Range& scenes,
-                               const Pairs& pairs, unsigned long long* stuck) {
+__device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceState<T> s, Motion<T>* motions,
+                               const Range& scenes, const Pairs& pairs, unsigned long long* stuck) {
   const int64_t of_scene = in.units() / in.scenes;
   const Range rows = {scenes.begin * in.vertices, scenes.end * in.vertices};
   const Range units = {scenes.begin * of_scene, scenes.end * of_scene};
+  s.motion = motions;
+  // of what tries less in a round, or of all
+  const auto look = [&](int round) {
+    team.each(rows, [&](int64_t i) {
+      const int64_t scene = i / in.vertices;
+      const auto v = static_cast<int32_t>(i - scene * in.vertices);
+      if (round == 0 || s.stamp[in.unit(scene, v)] == round) motions[i] = motion_of(in, s, scene, v);
+    });
+    team.sync();
+  };
   for (int move = 0; move < kMoves; ++move) {
     s.first = move == 0;
     team.each(scenes, [&](int64_t i) { s.failed[i] = 0; });
     team.each(units, [&](int64_t i) { begin_move(s, i); });
     team.sync();
+    look(0);
     pairs.begin_move(team, in, s);
     bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
     for (int round = 0; round < kRounds; ++round) {
@@ -142,9 +154,11 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
         if (last) mark(s.failed + scene);
         found = true;
       };
+      if (round > 0) look(round);
       pairs.each_failing(team, in, s, last ? 0 : round, [&](int64_t i) { note(in.listed.pairs[kPairRow * i + 5]); });
       team.each(rows, [&](int64_t i) {
-        if (!stay(in, s, i, last ? 0 : round)) note(i / in.vertices);
+        const int64_t scene = i / in.vertices;
+        if (!stay(in, s, scene, static_cast<int32_t>(i - scene * in.vertices), last ? 0 : round)) note(scene);
       });
       const bool passed = !team.any(found);
       clean = round == 0 && passed;
@@ -155,6 +169,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
     team.each(units, [&](int64_t i) { give_up(in, s, i); });
     if (s.first && !clean) {
       team.sync();
+      look(0);
       pairs.each_failing(team, in, s, 0, [&](int64_t) { atomicAdd(stuck, 1ULL); });
       team.sync();
     }
@@ -170,17 +185,17 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
 // One cooperative launch. stuck [1]: zero at first.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    advance_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, unsigned* flags,
+    advance_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, Motion<T>* motions, unsigned* flags,
                    unsigned long long* stuck) {
   const AllPairs<T> pairs{{0, in.listed.ptr[in.scenes * in.corners] / 4}};
-  advance_scenes(GridTeam{flags}, in, s, {0, in.scenes}, pairs, stuck);
+  advance_scenes(GridTeam{flags}, in, s, motions, {0, in.scenes}, pairs, stuck);
 }
 
 // A cluster for each small scene. near, planes: memory for all listed pairs.
 template <class T>
 __global__ void __launch_bounds__(kThreads, 2)
-    scene_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, int32_t* near, PairPlane<T>* planes,
-                 unsigned long long* stuck) {
+    scene_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, Motion<T>* motions, int32_t* near,
+                 PairPlane<T>* planes, unsigned long long* stuck) {
   __shared__ int32_t slow[2 * kThreads];
   __shared__ int count, slows;
   __shared__ Answers answers;
@@ -188,7 +203,7 @@ __global__ void __launch_bounds__(kThreads, 2)
   const auto first = [&](int64_t of) { return int64_t{in.listed.ptr[of * in.corners] / 4}; };
   const Range own = {first(scene), first(scene + 1)};
   const NearPairs<T> pairs{own, near, planes, &count, &slows, slow};
-  advance_scenes(SceneTeam{answers}, in, s, {scene, scene + 1}, pairs, stuck);
+  advance_scenes(SceneTeam{answers}, in, s, motions, {scene, scene + 1}, pairs, stuck);
 }
 
 template <class T>
@@ -206,7 +221,8 @@ constexpr int64_t aligned(int64_t bytes) { return (bytes + 15) / 16 * 16; }
 template <class T>
 int64_t advance_workspace_bytes(const AdvanceInputs<T>& in, int64_t capacity) {
   const int64_t units = in.units();
-  const int64_t bytes = aligned(units * sizeof(T)) + 2 * aligned(units) + aligned(in.scenes);
+  const int64_t bytes = aligned(units * sizeof(T)) + 2 * aligned(units) + aligned(in.scenes) +
+                        aligned(in.scenes * in.vertices * sizeof(Motion<T>));
   if (!has_block_each(in.vertices, in.scenes, capacity)) return bytes + aligned(kFlags * sizeof(unsigned));
   return bytes + aligned(capacity * sizeof(int32_t)) + aligned(capacity * sizeof(PairPlane<T>));
 }
@@ -226,13 +242,14 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
   const int64_t units = in.units();
   auto* now = reinterpret_cast<T*>(take(units * sizeof(T)));
   uint8_t *blocked = take(units), *stamp = take(units), *failed = take(in.scenes);
+  auto* motions = reinterpret_cast<Motion<T>*>(take(rows * sizeof(Motion<T>)));
   AdvanceState<T> state{share, now, blocked, stamp, failed, true};
   auto* found = reinterpret_cast<unsigned long long*>(stuck);
   if (has_block_each(in.vertices, in.scenes, capacity)) {
     auto* near = reinterpret_cast<int32_t*>(take(capacity * sizeof(int32_t)));
     auto* planes = reinterpret_cast<PairPlane<T>*>(take(capacity * sizeof(PairPlane<T>)));
     return launch_clusters(scene_kernel<T>, in.scenes, blocks_of_scene(in.scenes, capacity), kThreads, stream, in,
-                           state, near, planes, found);
+                           state, motions, near, planes, found);
   }
   auto* flags = reinterpret_cast<unsigned*>(take(kFlags * sizeof(unsigned)));
   if (auto error = cudaMemsetAsync(flags, 0, kFlags * sizeof(unsigned), stream)) return error;
@@ -243,7 +260,7 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
   const int64_t wanted = (std::max(rows, capacity) + kThreads - 1) / kThreads;
   const int64_t each = capacity < kManyPairs ? 1 : resident;
   const auto blocks = static_cast<unsigned>(std::min<int64_t>(wanted, each * multiprocessors));
-  void* arguments[] = {&inputs, &state, &flags, &found};
+  void* arguments[] = {&inputs, &state, &motions, &flags, &found};
   return cudaLaunchCooperativeKernel(kernel, dim3(blocks), dim3(kThreads), arguments, 0, stream);
 }
 

@@ -17,7 +17,7 @@ template <class T>
 __global__ void __launch_bounds__(kOne)
     join_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const int32_t* sides, int32_t* label) {
   const int64_t row = own_item();
-  if (row >= room.listed + room.lagged) return;
+  if (!is_row(in, room, row)) return;
   const int32_t a = sides[2 * row], b = sides[2 * row + 1];
   if (a < 0 || b < 0) return;
   const int64_t scene = row < room.listed ? in.gate.listed.pairs[kPairRow * row + 5]

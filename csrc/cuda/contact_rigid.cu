@@ -19,14 +19,14 @@ template <class T>
 __global__ void __launch_bounds__(kOne) press_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room,
                                                      int32_t* sides, double* press, int32_t* counts) {
   const int64_t row = own_item();
-  if (row >= room.listed + room.lagged) return;
+  if (!is_row(in, room, row)) return;
   const CornerPoints<T> at{in, false};
   PairPress a;
   bool acts = false;
   if (row < room.listed) {
-    acts = row < in.first_listed(in.scene.scenes) && barrier_press(in, row, at, a);
+    acts = barrier_press(in, row, at, a);
     if (acts) store_press(a, press + kPressDoubles * row);
-  } else if (row - room.listed < in.first_lagged(in.scene.scenes)) {
+  } else {
     acts = lagged_press(in, row - room.listed, at, Slid{}, a, -1);
   }
   for (int side = 0; side < 2; ++side) {
@@ -61,7 +61,7 @@ template <class T>
 __global__ void __launch_bounds__(kOne)
     fill_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const __grid_constant__ GroupMemory memory) {
   const int64_t row = own_item();
-  if (row >= room.listed + room.lagged) return;
+  if (!is_row(in, room, row)) return;
   for (int side = 0; side < 2; ++side) {
     const int32_t body = memory.sides[2 * row + side];
     if (body < 0) continue;

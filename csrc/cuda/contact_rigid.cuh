@@ -45,6 +45,13 @@ struct GroupMemory {
   int32_t* floors;                            // [B, V, planes]: where the vertices of bodies are borne, body after body
 };
 
+// Whether a list has a row: most have room for many more, whose memory nobody reads.
+template <class T>
+__device__ bool is_row(const RigidInputs<T>& in, const PairRoom& room, int64_t row) {
+  return row < room.listed ? row < in.first_listed(in.scene.scenes)
+                           : row - room.listed < in.first_lagged(in.scene.scenes) && row < room.rows();
+}
+
 // Motions of bodies and factors of groups: of those with up to kFew bodies, and of larger ones, which are put into the
 // order of their elimination first.
 template <class T>

@@ -11,7 +11,7 @@ namespace diffvbd::cuda {
 // Rows that the lists of a correction have room for.
 struct PairRoom {
   int64_t listed, lagged;
-  int64_t rows() const { return listed + lagged; }
+  DIFFVBD_FN int64_t rows() const { return listed + lagged; }
 };
 
 // Bytes that each works in.

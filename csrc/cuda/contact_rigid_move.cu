@@ -188,7 +188,8 @@ int64_t rigid_move_bytes(const RigidInputs<T>& in, const PairRoom& room) {
   return 9 * aligned(units * sizeof(double)) + aligned(scenes * in.scene.vertices * sizeof(double)) +
          aligned(room.rows() * sizeof(double)) + aligned(units * sizeof(int32_t)) +
          aligned(room.listed * 2 * sizeof(int32_t)) + aligned(room.listed * sizeof(int32_t)) +
-         2 * aligned(scenes * sizeof(int32_t)) + 2 * aligned(units * sizeof(T)) + 4 * aligned(units) + aligned(scenes);
+         2 * aligned(scenes * sizeof(int32_t)) + 2 * aligned(units * sizeof(T)) + 4 * aligned(units) + aligned(scenes) +
+         aligned(scenes * in.scene.vertices * sizeof(Motion<T>));
 }
 
 template <class T>
@@ -217,6 +218,8 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairRoom& room, const dou
   t.state.now = reinterpret_cast<T*>(take(units * sizeof(T)));
   t.state.blocked = take(units), t.state.stamp = take(units);
   t.decided = take(units), t.stopped = take(units), t.done = take(scenes);
+  t.motions = reinterpret_cast<Motion<T>*>(take(rows * sizeof(Motion<T>)));
+  t.state.motion = t.motions;
   if (has_block_each(in.scene.vertices, scenes, room.rows())) {
     return launch_clusters(scene_kernel<T>, scenes, blocks_of_scene(scenes, room.rows()), kThreads, stream, in, t,
                            room.listed, out, x);

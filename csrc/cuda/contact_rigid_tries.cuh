@@ -28,6 +28,7 @@ struct Tried {
   int32_t *touching, *touches;  // [listed, 2] bodies that press each other, scene after scene; [B] how many pairs
   int32_t *near, *nears;        // [listed] pairs that may press, scene after scene, in any order; [B] how many
   AdvanceState<T> state;
+  Motion<T>* motions;                 // [B, V], those of `state`
   uint8_t *decided, *stopped, *done;  // [B, bodies] twice, [B]
   T* move;
 };
@@ -96,7 +97,10 @@ __device__ void displace(const RigidInputs<T>& in, const Tried<T>& t, int64_t ro
   if (!x && t.decided[at.unit]) return;
   const Vector r = Body<T>::at(in.scene.x + 3 * row) - vector_of(t.center + 3 * at.unit);
   rigid::put(t.move + 3 * row, displaced(t.motion + kUnknowns * at.unit, t.share[at.unit], r));
-  if (!x) return;
+  if (!x) {
+    t.motions[row] = motion_of(in.gate, t.state, at.scene, at.v);
+    return;
+  }
   for (int c = 0; c < 3; ++c) x[3 * row + c] = in.scene.x[3 * row + c] + t.move[3 * row + c];
 }
 
@@ -109,7 +113,7 @@ __device__ void try_vertex(const RigidInputs<T>& in, const Tried<T>& t, int64_t 
   const Body<T> body{in.scene, at.scene, at.body};
   t.value[row] = vertex_value(in, body, at.v, moved);
   if (!moved) return;
-  stay(in.gate, t.state, row, 0);
+  stay(in.gate, t.state, at.scene, at.v, 0);
   if (!admitted(in, body, at.v)) mark(t.state.blocked + at.unit);
 }
 
@@ -129,7 +133,6 @@ __device__ void try_pair_of(const RigidInputs<T>& in, const Tried<T>& t, int64_t
 
 // The potential of a body, with that of the pairs that count for it.
 template <class T, class Team>
-
 __device__ double potential_of(const RigidInputs<T>& in, const Tried<T>& t, const Team& team, int64_t scene,
                                int32_t which, int64_t listed) {
   const Body<T> body{in.scene, scene, which};

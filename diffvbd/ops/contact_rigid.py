@@ -115,7 +115,8 @@ def rigid_vertices_backward(fields: TouchingFields, motion: Tensor, end: EndAdjo
     """The adjoints of vertices: of -p . (gradient + matrix q), p and q being the motions of ``end``, with what pairs
     have in it, and of the way itself."""
     x, x_prev, y, mass, shared, own, floor_lag = raw.contact_rigid_vertices_backward(
-        *fields, motion, end.solution, end.x, end.mass, *pairs[:4], data_count, time_step, friction_eps, wants_data)
+        *fields, motion, end.solution, end.x, end.mass, *pairs[:4], data_count, time_step, friction_eps, wants_data
+    )
     data = join_data(shared, own, data_count) if wants_data else shared
     return VertexAdjoints(x, x_prev, y, mass, data, floor_lag)
 
