@@ -24,6 +24,7 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const std::vect
   const int64_t bodies = t.ptr.numel() - 1, corners = v + colliders;
   in.scene = rigid_inputs<T>({t.x, t.x_prev, t.y, t.mass, t.energy_data, t.origin, t.order, t.ptr, t.x, t.order},
                              data_count, time_step, false);
+  require(t.order.numel() == v, "diffvbd::contact_rigid: expected order of all vertices");
   require(is_beside(t.free, t.x, ScalarType::Bool) && t.free.numel() == bodies,
           "diffvbd::contact_rigid: expected free bool [bodies]");
   require(is_beside(t.held, t.x, ScalarType::Bool) && is_index(t.body, t.x) && t.held.numel() == corners &&
@@ -86,7 +87,7 @@ contact::RigidInputs<T> moving_inputs(contact::RigidInputs<T> in, const Tensor& 
   const bool all = moving.dim() == 1 && moving.size(0) == 0;
   require(is_beside(moving, x, ScalarType::Bool) &&
               (all || (moving.dim() == 2 && moving.size(0) == in.scene.scenes && moving.size(1) == in.bodies())),
-          "diffvbd::contact_rigid_system: expected moving bool [scenes, bodies], or [0]");
+          "diffvbd::contact_rigid: expected moving bool [scenes, bodies], or [0]");
   if (all || moving.numel() == 0) return in;
   in.moving = data<const bool>(moving);
   return in;

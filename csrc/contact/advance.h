@@ -53,7 +53,7 @@ struct AdvanceState {
   uint8_t *blocked, *stamp;           // something does not let it pass; the round in which it last tried less
   uint8_t* failed;                    // [B]  a scene in which something has found no way
   bool first;                         // the move in which colliders and prescribed vertices go
-  const Motion<T>* motion = nullptr;  // [B, V]  in this round, where a backend keeps them; or null
+  const Motion<T>* motion = nullptr;  // [B, V]  in this round; set before pairs are looked at
 };
 
 // Written by whoever finds it: all write the same.
@@ -113,7 +113,7 @@ DIFFVBD_FN Motion<T> motion_of(const AdvanceInputs<T>& in, const AdvanceState<T>
 // That of a corner of a pair that is a vertex.
 template <class T>
 DIFFVBD_FN Motion<T> motion_at(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair, int k) {
-  return s.motion ? s.motion[int64_t{pair[5]} * in.vertices + pair[k]] : motion_of(in, s, pair[5], pair[k]);
+  return s.motion[int64_t{pair[5]} * in.vertices + pair[k]];
 }
 
 template <class T>

@@ -30,8 +30,8 @@ struct RigidWork {
 // And their sums at all corner points [B, N, 3].
 template <class T>
 struct PointWork {
-  T *x, *p, *q;
-  T* since;  // of lagged pairs, by how points have moved since the start of the step, which `x` has in it; or null
+  T *x, *p, *q;  // p: without pairs of which no corner moves by p
+  T* since;      // of lagged pairs, by how points have moved since the start of the step, which `x` has in it; or null
 };
 constexpr int kPointScalars = kWorkScalars + 3;
 
@@ -69,7 +69,7 @@ struct PairMotions {
   DIFFVBD_FN bool is_of(int side, int corner) const { return sides == 1 || (corner < first) == (side == 0); }
 };
 
-// Whether a corner of a pair moves by p: else the pair does no virtual work.
+// Whether a corner of a pair moves by p: else the pair does no virtual work, and nobody needs its derivative by p.
 template <class T>
 DIFFVBD_FN bool works(const RigidInputs<T>& in, const VirtualMotions<T>& given, const int32_t* record) {
   for (int k = 0; k < 4; ++k) {

@@ -196,8 +196,8 @@ struct SentBack {
   const T *by_x, *by_p, *by_q, *since;  // as PointWork
 };
 
-// The adjoints of a body's vertices, but that those of data and floor_lag [B, V, planes, 4], or null, are zero at
-// first.
+// Writes x, x_prev, y and mass of a body's vertices, and where it moves those of data and floor_lag [B, V, planes, 4],
+// or null: these are zero at first.
 template <class T, class Team>
 DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>& b, const Team& team,
                                  const double* motion, const double* solution, const SentBack<T>& sent,

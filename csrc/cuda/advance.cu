@@ -130,7 +130,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
   const Range rows = {scenes.begin * in.vertices, scenes.end * in.vertices};
   const Range units = {scenes.begin * of_scene, scenes.end * of_scene};
   s.motion = motions;
-  // of what tries less in a round, or of all
+  // works out the motions of what tries less in a round; in round 0 of all
   const auto look = [&](int round) {
     team.each(rows, [&](int64_t i) {
       const int64_t scene = i / in.vertices;
@@ -248,8 +248,8 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
   if (has_block_each(in.vertices, in.scenes, capacity)) {
     auto* near = reinterpret_cast<int32_t*>(take(capacity * sizeof(int32_t)));
     auto* planes = reinterpret_cast<PairPlane<T>*>(take(capacity * sizeof(PairPlane<T>)));
-    return launch_clusters(scene_kernel<T>, in.scenes, blocks_of_scene(in.scenes, capacity), kThreads, stream, in,
-                           state, motions, near, planes, found);
+    return launch_clusters(scene_kernel<T>, in.scenes, capacity, kThreads, stream, in, state, motions, near, planes,
+                           found);
   }
   auto* flags = reinterpret_cast<unsigned*>(take(kFlags * sizeof(unsigned)));
   if (auto error = cudaMemsetAsync(flags, 0, kFlags * sizeof(unsigned), stream)) return error;

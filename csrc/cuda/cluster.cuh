@@ -57,22 +57,22 @@ __device__ inline bool any_of_cluster(Answers& answers, int& turn, bool own) {
   return out;
 }
 
-// Blocks for each scene: a power of two.
-inline int blocks_of_scene(int64_t scenes, int64_t pairs) {
-  int device = 0, has_clusters = 0;
-  cudaGetDevice(&device);
-  cudaDeviceGetAttribute(&has_clusters, cudaDevAttrClusterLaunch, device);
+// Blocks for each scene, a power of two. What a kernel was compiled for decides: a newer device may run it as well.
+inline int blocks_of_scene(const void* kernel, int64_t scenes, int64_t pairs) {
+  cudaFuncAttributes of{};
+  if (cudaFuncGetAttributes(&of, kernel) != cudaSuccess || of.ptxVersion < 90) return 1;
   int blocks = 1;
-  while (has_clusters && blocks < kMostBlocks && blocks * kPairsOfBlock * scenes < pairs &&
-         2 * blocks * scenes <= kBlocksAtOnce)
+  while (blocks < kMostBlocks && blocks * kPairsOfBlock * scenes < pairs && 2 * blocks * scenes <= kBlocksAtOnce) {
     blocks *= 2;
+  }
   return blocks;
 }
 
-// A cluster for each scene.
+// A cluster for each scene, of lists with room for so many pairs.
 template <class... P, class... A>
-cudaError_t launch_clusters(void (*kernel)(P...), int64_t scenes, int blocks, int threads, cudaStream_t stream,
+cudaError_t launch_clusters(void (*kernel)(P...), int64_t scenes, int64_t pairs, int threads, cudaStream_t stream,
                             A... arguments) {
+  const int blocks = blocks_of_scene(reinterpret_cast<const void*>(kernel), scenes, pairs);
   cudaLaunchAttribute attribute{};
   attribute.id = cudaLaunchAttributeClusterDimension;
   attribute.val.clusterDim.x = static_cast<unsigned>(blocks);

@@ -117,7 +117,8 @@ template <class T>
 __global__ void __launch_bounds__(kThreads)
     scene_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t, int64_t listed,
                  const __grid_constant__ RigidOutcome<T> out, T* x) {
-  __shared__ double part[kWarps][kMostSums], potentials[kMostBlocks][kWarps];  // parts of those of few bodies
+  // potentials: parts of those of few bodies, whose last bits depend on the number of blocks; decisions allow for that
+  __shared__ double part[kWarps][kMostSums], potentials[kMostBlocks][kWarps];
   __shared__ Answers answers;
   const BlockOfScene team{{part}};
   const int64_t scene = blockIdx.x / team.size, first = scene * in.scene.vertices, unit = scene * in.bodies();
@@ -177,7 +178,7 @@ __global__ void __launch_bounds__(kThreads)
     if (moved && any_of_cluster(answers, turn, leads && decide(in, t, scene, attempt))) break;
   }
   team.each(vertices, [&](int32_t v) { displace(in, t, first + v, x); });
-  if (leads) end_scene(in, t.motion, out, scene);
+  if (leads) end_scene(in, t.motion, out, scene);  // which changes no share of what moves
 }
 
 }  // namespace
@@ -221,8 +222,7 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairRoom& room, const dou
   t.motions = reinterpret_cast<Motion<T>*>(take(rows * sizeof(Motion<T>)));
   t.state.motion = t.motions;
   if (has_block_each(in.scene.vertices, scenes, room.rows())) {
-    return launch_clusters(scene_kernel<T>, scenes, blocks_of_scene(scenes, room.rows()), kThreads, stream, in, t,
-                           room.listed, out, x);
+    return launch_clusters(scene_kernel<T>, scenes, room.rows(), kThreads, stream, in, t, room.listed, out, x);
   }
   begin_kernel<T><<<blocks_for(std::max(units, scenes)), kOne, 0, stream>>>(in, t);
   if (room.rows() > 0) {

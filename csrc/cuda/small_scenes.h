@@ -1,4 +1,5 @@
-// Which scenes are decided by a block each, where otherwise the whole device works on one question after another.
+// Which scenes are decided by a block or a cluster each (cluster.cuh), where otherwise the whole device works on one
+// question after another.
 #pragma once
 
 #include <cstdint>

@@ -43,10 +43,10 @@ class Moved(NamedTuple):
     """What :func:`rigid_move` returns."""
 
     x: Tensor  # [B, V, 3]
-    share: Tensor  # of its motion that each body took [B, bodies], as are the next, float64; zero of what `moving` left
-    moved: Tensor  # bool: whether it has a motion
-    held: Tensor  # bool: whether it was held up, in a scene in which some of those that were have gone on
-    left: Tensor  # how much of its shift it did not take [m]
+    share: Tensor  # float64 [B, bodies]: of its motion that each body took; beside `moving` zero where it has none
+    moved: Tensor  # bool [B, bodies]: whether it has a motion
+    held: Tensor  # bool [B, bodies]: whether it was held up, in a scene in which some of those that were have gone on
+    left: Tensor  # [B, bodies]: how much of its shift it did not take [m]
 
 
 def rigid_move(fields: TouchingFields, centers: Tensor, motion: Tensor, data_count: Sequence[int], time_step: float,
@@ -65,7 +65,7 @@ class PairWork(NamedTuple):
     """What :func:`rigid_backward` finds."""
 
     by_x: Tensor  # [B, N, 3]: by where corner points are,
-    by_p: Tensor  # by p,
+    by_p: Tensor  # by p, without pairs of which no corner moves by p,
     by_q: Tensor  # and by q
     since: Tensor  # by_x of lagged pairs alone, which have it by how points have moved since the start; or empty
     by_kappa: Tensor  # [pairs], of each listed pair

@@ -31,7 +31,7 @@ class Corrected(NamedTuple):
     """What a correction returns; all but x is index data."""
 
     x: Tensor  # [B, V, 3]
-    share: Tensor  # of its motion that each body took [B, bodies]; this and the next as ops.contact_rigid.Moved
+    share: Tensor  # of its motion that each body took [B, bodies]; the next as ops.contact_rigid.Moved has them
     moved: Tensor
     held: Tensor
     left: Tensor
@@ -43,8 +43,9 @@ def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction
     """After every free body has been moved, as far as pairs, floors and the potential let it. friction_eps: [m], 0
     without friction. moving, alone: As for ops.contact_rigid.rigid_system. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
-    x, share, _, _, groups, *rest = _Correct.apply(*fields, model, time_step, friction_eps, moving, alone)
-    return Corrected(x, share.to(x.dtype), *rest, groups)
+    out = _Correct.apply(*fields, model, time_step, friction_eps, moving, alone)
+    x, share, _, _, groups, moved, held, left = out
+    return Corrected(x, share.to(x.dtype), moved, held, left, groups)
 
 
 def bodies_of(model: Model) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

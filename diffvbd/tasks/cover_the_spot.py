@@ -13,8 +13,8 @@ kg/m^3 and mu = lam = 2e4 Pa; h = 1/150 s; K = 2 sweeps; one search for pairs pe
 from the target's axis, 25 cm above one another, and move away from it at 0.4 m/s, to which a seed adds noise: some nine
 tenths of the target stay uncovered. Above one another, because disks that fall side by side meet rim to rim on the
 floor, and no small change lifts one over the other. Offsets are at most 0.1 m along each axis. Lighter disks and longer
-slides cover the target too, but bounce, and their gradient is rough. Without clipping, bounces on the way leave Adam
-with steps that are too short: one run in some ended with 1 % of the target uncovered.
+slides cover the target too, but bounce, and their gradient is rough. Without clipping, bounces on the way may leave
+Adam with steps that are too short: such a run ended with 1 % of the target uncovered.
 """
 
 import math

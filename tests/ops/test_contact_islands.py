@@ -181,7 +181,7 @@ def test_bodies_that_are_not_finite_stay(device: str, value: float) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("sizes", [[0, 3, 0, 1], [1] * 40, [5000, 20], [2048]])
+@pytest.mark.parametrize("sizes", [[0, 3, 0, 1], [1] * 40, [5000, 20], [2048], [100] * 6, [2000] + [30] * 9])
 def test_segment_sum(device: str, sizes: list[int], dtype: torch.dtype) -> None:
     rng = generator("segments", *sizes)
     values = torch.as_tensor(rng.standard_normal((2, sum(sizes), 3)), dtype=dtype, device=device)
@@ -193,6 +193,18 @@ def test_segment_sum(device: str, sizes: list[int], dtype: torch.dtype) -> None:
     atol = tolerance("long_sum" if dtype == torch.float64 else "long_sum_float32")
     torch.testing.assert_close(got.double().cpu(), expected, rtol=0, atol=atol)
     assert torch.equal(got, ops_contact.segment_sum(values, order, ptr))
+
+
+@pytest.mark.parametrize("sizes", [[100] * 6, [2000] + [30] * 9])
+def test_segment_sum_of_a_scene_is_that_of_many(device: str, sizes: list[int]) -> None:
+    rng, scenes = generator("segments of many", *sizes), 2000
+    values = torch.as_tensor(rng.standard_normal((1, sum(sizes), 3)), device=device)
+    order = torch.as_tensor(rng.permutation(sum(sizes)).astype(np.int32), device=device)
+    ptr = torch.as_tensor(np.cumsum([0, *sizes]).astype(np.int32), device=device)
+    alone = ops_contact.segment_sum(values, order, ptr)
+    assert float(alone.abs().min()) > 0
+    together = ops_contact.segment_sum(values.expand(scenes, -1, -1).contiguous(), order, ptr)
+    assert torch.equal(together, alone.expand(scenes, -1, -1))
 
 
 def test_threads_that_share_scenes_and_segments_change_nothing() -> None:

@@ -85,7 +85,7 @@ class Zeroed {
     spans_.push_back({out.data_ptr(), out.numel() * scalar()});
     return out;
   }
-  // Rows of pairs [pairs, each], zero as far as the list has pairs; entries: their number, on the device.
+  // Rows of pairs [pairs, each], zero as far as the list has pairs; entries: four times their number, on the device.
   Tensor rows(int64_t pairs, int64_t each, const int32_t* entries) {
     Tensor out = empty(like_, {pairs, each});
     spans_.push_back({out.data_ptr(), out.numel() * scalar(), entries, each * scalar()});
