@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import math
 import time
@@ -106,6 +107,8 @@ class Pilots:
         if not (isinstance(value, Tensor) and value.numel() == 1):
             got = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             fail("quantity", "a function that returns a scalar tensor", got)
+        if not value.is_floating_point():
+            fail("quantity", "a function that returns a floating scalar", f"{value.dtype}")
         if not bool(torch.isfinite(value)):
             fail("quantity", "a finite value after the first step", float(value))
         if self.wrt is None:
@@ -346,7 +349,14 @@ def converted(value: Any, **to: Any) -> Any:
         return value.to(**{name: kind for name, kind in to.items() if floats or name != "dtype"})
     if isinstance(value, dict):
         return {name: converted(part, **to) for name, part in value.items()}
-    return (lambda t: converted(value(t), **to)) if callable(value) else value
+    if not callable(value):
+        return value
+
+    @functools.wraps(value)  # with its arguments, by which policies are told from functions of time
+    def made(*at: Any) -> Any:
+        return converted(value(*at), **to)
+
+    return made
 
 
 def relative(a: Tensor, b: Tensor, least: float = 0.0) -> float:

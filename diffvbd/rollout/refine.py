@@ -52,6 +52,8 @@ class Refinement:
         )
         if self.survives:
             return text
+        if not math.isfinite(self.loss):
+            return f"{text}: the loss itself is not finite"
         finer = {"more sweeps": self.more_sweeps, "smaller steps": self.smaller_steps}
         needed = [name for name, value in finer.items() if not self._keeps(value)] or list(finer)
         return f"{text}: optimise on with {' and '.join(needed)}"
@@ -80,7 +82,8 @@ def refine(
         tolerance: See ``before``; in (0, 1).
 
     Raises:
-        ValueError, TypeError: ``loss`` runs no rollout or does not return a scalar; ``before`` is not above the loss.
+        ValueError, TypeError: ``loss`` runs no rollout or does not return a scalar; ``before`` is not finite or not
+            above the loss.
         NotImplementedError: ``loss`` calls step or solve, which are not refined, continues a BDF2 history that is not
             its own, asks for estimate_errors, or prescribes positions of stages.
     """
@@ -90,6 +93,8 @@ def refine(
     if share >= 1:
         fail("tolerance", "a share in (0, 1)", repr(tolerance))
     began = None if before is None else _scalar("before", before)
+    if began is not None and not math.isfinite(began):
+        fail("before", "a finite loss", began)
     found = []
     for steps, sweeps in ((1, 1), (1, 2), (2, 1), (2, 2)):
         ran: list[int] = []

@@ -203,6 +203,8 @@ def test_a_bounce_that_steps_resolve() -> None:
     [
         (lambda x, v: x, False, r"scalar tensor, got shape \[28, 3\]"),
         (lambda x, v: 1.0, False, "scalar tensor, got float"),
+        (lambda x, v: (x > 0).sum(), False, "floating scalar, got torch.int64"),
+        (lambda x, v: (x > 0).any(), False, "floating scalar, got torch.bool"),
         (lambda x, v: math.nan * x.sum(), False, "finite value after the first step, got nan"),
         (lambda x, v: x.detach().sum(), True, "beside gradient=True, got one without a graph"),
         (lambda x, v: torch.ones((), requires_grad=True), True, "beside gradient=True, got one without a graph"),
@@ -219,6 +221,14 @@ def test_a_quantity_that_cannot_be_judged_is_named(quantity, gradient: bool, got
             dv.advise(model, x, v, **given)
         else:
             dv.error_budget(model, x, v, time_step=0.01, sweeps=2, **given)
+
+
+@pytest.mark.parametrize("device", [None, "cpu"])
+def test_a_policy_is_refused_on_any_device(device: str | None) -> None:
+    model, material = cantilever(1e5)
+    x = model.rest_points
+    with pytest.raises(TypeError, match="force: expected a function of the time"):
+        dv.advise(model, x, 0 * x, duration=0.1, device=device, force=lambda step, x, v: 0 * x, **material)
 
 
 def test_advice_needs_values_and_graphs() -> None:

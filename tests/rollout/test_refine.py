@@ -218,6 +218,8 @@ def loss_of(**given: Any) -> Any:
         (lambda: dv.refine(loss_of(), tolerance=1.5), ValueError, "tolerance: expected a share"),
         (lambda: dv.refine(loss_of(), tolerance=0), ValueError, "tolerance: expected"),
         (lambda: dv.refine(loss_of(), before=-1e9), ValueError, "before: expected a loss above"),
+        (lambda: dv.refine(loss_of(), before=float("inf")), ValueError, "before: expected a finite"),
+        (lambda: dv.refine(loss_of(), before=torch.tensor(float("inf"))), ValueError, "before: expected a finite"),
         (lambda: dv.refine(loss_of(estimate_errors=True)), NotImplementedError, "estimate_errors"),
         (lambda: dv.refine(loss_of(steps=-1)), ValueError, "steps: expected"),
         (lambda: dv.refine(loss_of(sweeps=1.5)), TypeError, "sweeps: expected"),
@@ -233,3 +235,9 @@ def loss_of(**given: Any) -> Any:
 def test_bad_input(call: Any, error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         call()
+
+
+def test_a_loss_that_is_not_finite_is_called_that() -> None:
+    loss = loss_of()
+    told = dv.refine(lambda: float("nan") * loss())
+    assert not told.survives and str(told).endswith("the loss itself is not finite")
