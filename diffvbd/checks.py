@@ -95,23 +95,24 @@ def check_count(name: str, value: Any, minimum: int = 0, maximum: int | None = N
     return value
 
 
-def check_number(name: str, value: Any) -> float:
-    """A finite number >= 0."""
+def check_number(name: str, value: Any, wanted: str = "a finite number >= 0") -> float:
+    """A finite number >= 0; `wanted` for the message."""
     if isinstance(value, Tensor) and value.numel() == 1:
         value = value.detach().item()
     if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
     value = to_float(name, value)
     if not (math.isfinite(value) and value >= 0):
-        fail(name, "a finite number >= 0", value)
+        fail(name, wanted, value)
     return float(value)
 
 
 def check_positive(name: str, value: Any, unit: str = "") -> float:
     """A finite number > 0, its unit for the message."""
-    number = check_number(name, value)
+    wanted = f"a finite number > 0 {unit}".rstrip()
+    number = check_number(name, value, wanted)
     if number == 0:
-        fail(name, f"a finite number > 0 {unit}".rstrip(), value)
+        fail(name, wanted, value)
     return number
 
 

@@ -305,7 +305,7 @@ BAD = [
     ({"assembled": "yes"}, TypeError, "assembled: expected a bool, got str"),
     ({"tolerance": 0}, ValueError, "tolerance: expected a finite number > 0"),
     ({"tolerance": 1.0}, ValueError, r"tolerance: expected a number in \(0, 1\), got 1.0"),
-    ({"tolerance": float("nan")}, ValueError, "tolerance: expected a finite number >= 0, got nan"),
+    ({"tolerance": float("nan")}, ValueError, "tolerance: expected a finite number > 0, got nan"),
     ({"max_iterations": 0}, ValueError, "max_iterations: expected an integer >= 1, got 0"),
     ({"max_iterations": 2.5}, TypeError, "max_iterations: expected an integer, got float"),
     ({"on_failure": "ignore"}, ValueError, 'on_failure: expected "raise" or "warn", got \'ignore\''),
