@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 import diffvbd as dv
-from diffvbd import cli_mesh, cli_view
+from diffvbd import cli_mesh, cli_scene, cli_view
 from diffvbd.mesh.series import EXTENSIONS, check_extension
 from diffvbd.rollout.search import ERROR, PATIENCE
 from diffvbd.said import PAGES
@@ -21,7 +21,7 @@ from diffvbd.tasks import TASKS, Problem, Settings, identify, solve, table
 from diffvbd.tasks.problem import Result, check_device
 from diffvbd.tasks.progress import Row, versions
 from diffvbd.tasks.ranks import joined
-from diffvbd.tasks.scene import INTEGRATORS, MOST_STEPS, Observation, Scene, side
+from diffvbd.tasks.scene import MOST_STEPS, Observation, Scene
 
 DESCRIPTION = "Differentiable soft-body simulation by Vertex Block Descent. Units: m, kg, s, Pa; y points up."
 EXAMPLES = """examples:
@@ -44,6 +44,7 @@ EXAMPLES = """examples:
 where it stalled, and warns wherever it did not converge; `advise` where the error cannot be had. An interrupted `run`
 or `identify` continues where it stopped when the same command is given again.
 """
+ADVISED = ("time_step", "sweeps", "relaxation", "integrator", "coarse")  # what advise chooses
 TARGET_KEYS = """keys of TARGET.npz (only x is required; an option given here replaces the file's value):
   x          observed positions [m], shape [N, V, 3], or [V, 3] for one final shape
   steps      time steps after which each was observed, shape [N]; default 0, 1, 2, ...; where the file has a time_step,
@@ -115,8 +116,8 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("--stride", type=int, default=1, help="write every n-th frame (default 1)")
     simulate.add_argument("--device", default="cpu", help="torch device (default cpu)")
     simulate.add_argument("--save-target", type=Path, metavar="FILE.npz", help="also write what `identify` reads")
-    _add_material(simulate)
-    _add_scene_options(simulate)
+    cli_scene.add_material(simulate)
+    cli_scene.add_options(simulate)
     simulate.set_defaults(command=_simulate)
 
     advice = commands.add_parser("advise", help="find time step, sweeps and the like that keep a wanted error")
@@ -126,8 +127,8 @@ def _parser() -> argparse.ArgumentParser:
     advice.add_argument("--gradient", action="store_true", help="keep it for gradients, too")
     advice.add_argument("--patience", type=float, default=PATIENCE, help=f"pilots may run so long [s] ({PATIENCE:g})")
     advice.add_argument("--device", default="cpu", help="torch device (default cpu)")
-    _add_material(advice)
-    _add_scene_options(advice)
+    cli_scene.add_material(advice)
+    cli_scene.add_options(advice, ADVISED)
     advice.set_defaults(command=_advise)
 
     identification = commands.add_parser(
@@ -147,7 +148,7 @@ def _parser() -> argparse.ArgumentParser:
     identification.add_argument("--fixed-lam", action="store_true", help="keep lam at its first guess")
     identification.add_argument("--iterations", type=int, default=100, help="at most so many (default 100)")
     identification.add_argument("--steps", type=int, help="time steps that led to the shape, if x is one shape")
-    _add_scene_options(identification)
+    cli_scene.add_options(identification)
     _add_run_options(identification, "runs/identify")
     identification.set_defaults(command=_identify)
 
@@ -160,42 +161,6 @@ def _add_run_options(parser: argparse.ArgumentParser, directory: str) -> None:
     parser.add_argument("--device", default="cpu", help="torch device (default cpu)")
     parser.add_argument("--seed", type=int, default=0, help="seed of torch's generators (default 0)")
     parser.add_argument("--out", type=Path, metavar="DIR", help=f"for log and picture (default {directory})")
-
-
-def _add_material(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--velocity", type=float, nargs=3, metavar=("VX", "VY", "VZ"), help="initial velocity [m/s]")
-    material = parser.add_argument_group("material (default: mu = lam = 1e5 Pa)")
-    for name, text in (("mu", "shear modulus [Pa]"), ("lam", "first Lame parameter [Pa]")):
-        material.add_argument(f"--{name}", type=float, help=text)
-    material.add_argument("--young", type=float, help="Young's modulus [Pa], together with --poisson")
-    material.add_argument("--poisson", type=float, help="Poisson's ratio, below 0.5")
-
-
-def _add_scene_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--scale", type=float, default=1.0, help="metres per unit of the file, 0.001 for mm (default 1)"
-    )
-    # No defaults: identify must know which options were given, and Scene has the defaults.
-    scene = parser.add_argument_group("scene")
-    scene.add_argument("--time-step", type=float, help=f"[s] (default {Scene.time_step:.4g})")
-    scene.add_argument("--sweeps", type=int, help=f"sweeps per step (default {Scene.sweeps})")
-    scene.add_argument("--density", type=float, help=f"[kg/m^3] (default {Scene.density:g})")
-    scene.add_argument("--gravity", type=float, nargs=3, metavar=("GX", "GY", "GZ"), help="[m/s^2] (default 0 -9.81 0)")
-    scene.add_argument("--floor", type=float, metavar="HEIGHT", help="height of a floor [m] (default: none)")
-    scene.add_argument("--kappa", type=float, help=f"stiffness of the floor's barrier (default {Scene.kappa:g})")
-    scene.add_argument("--dhat", type=float, help=f"distance where the barrier begins [m] (default {Scene.dhat:g})")
-    scene.add_argument("--friction", type=float, help="coefficient of friction on the floor (default: none)")
-    scene.add_argument("--relaxation", type=float, help="1.5 to 1.7 needs fewer sweeps (default 1; not with friction)")
-    scene.add_argument("--coarse", action="store_const", const=True, help="coarse corrections between the sweeps, for "
-                       "what is stiff, long, thin or finely meshed")  # fmt: skip
-    scene.add_argument("--integrator", choices=[*INTEGRATORS], help=f"of time (default {Scene.integrator})")
-    scene.add_argument(
-        "--pin",
-        action="append",
-        metavar="SIDE[:FRACTION]",
-        help="hold the vertices at a side of the bounding box: x-, x+, y-, y+, z- or z+; up to this fraction of its "
-        "extent (default 0.001), for example y+:0.05 for a round body; may be repeated",
-    )
 
 
 def _run(options: argparse.Namespace) -> None:
@@ -231,8 +196,8 @@ def _simulate(options: argparse.Namespace) -> None:
     _check_steps(options.steps)
     check_device(options.device)
     mesh = _mesh(options)
-    mu, lam = _material(options)
-    scene = _scene(options, mesh)
+    mu, lam = cli_scene.material(options)
+    scene = cli_scene.scene(options, mesh)
     _make_place(options)
     with torch.no_grad():
         model, progress = scene.model(options.device), sys.stderr.isatty()
@@ -258,21 +223,14 @@ def _simulate(options: argparse.Namespace) -> None:
         print(f"wrote {options.save_target}")
 
 
-def _scene(options: argparse.Namespace, mesh: dv.TetMesh) -> Scene:
-    v0 = np.broadcast_to(np.asarray(options.velocity or (0.0, 0.0, 0.0)), mesh.points.shape)
-    given = _given_scene_options(options, mesh)
-    pinned = given.pop("pinned", np.zeros(mesh.num_vertices, dtype=bool))
-    return Scene(mesh, mesh.points, np.where(pinned[:, None], 0.0, v0), pinned, **given)
-
-
 def _advise(options: argparse.Namespace) -> int:
-    for name in ("time_step", "sweeps", "relaxation", "integrator", "coarse"):
+    for name in ADVISED:
         if getattr(options, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')}: expected none, since it is what advise chooses")
     check_device(options.device)
     mesh = _mesh(options)
-    mu, lam = _material(options)
-    scene = _scene(options, mesh)
+    mu, lam = cli_scene.material(options)
+    scene = cli_scene.scene(options, mesh)
     model = scene.model(options.device)
     x, v = (torch.tensor(a, dtype=model.dtype, device=model.device) for a in (scene.x0, scene.v0))
     settings = dv.advise(model, x, v, duration=options.duration, error=options.error, gradient=options.gradient,
@@ -335,7 +293,7 @@ def _identify(options: argparse.Namespace) -> int:
     start = _start(options)
     check_device(options.device)
     mesh = _mesh(options)
-    given = _given_scene_options(options, mesh) | {"steps": options.steps}
+    given = cli_scene.given(options, mesh) | {"steps": options.steps}
     observation = Observation.load(options.target, mesh, **given)
     settings = Settings(options.out or Path("runs/identify"), options.device, options.seed)
     problem = identify.problem(observation, settings, start, options.fixed_lam, options.iterations)
@@ -371,25 +329,3 @@ def _task_options() -> dict[str, list[str]]:
 
 def _task_list() -> str:
     return "\n".join(f"{name:16} {task.summary}" for name, task in sorted(TASKS.items()))
-
-
-def _material(options: argparse.Namespace) -> tuple[float, float]:
-    """mu and lam [Pa] from either pair of options."""
-    young, poisson = options.young, options.poisson
-    if young is None and poisson is None:
-        return (1e5 if options.mu is None else options.mu), (1e5 if options.lam is None else options.lam)
-    if young is None or poisson is None or options.mu is not None or options.lam is not None:
-        raise ValueError("material: give --mu and --lam, or --young and --poisson")
-    try:
-        return dv.lame(young, poisson)
-    except ValueError as error:
-        raise ValueError(f"--{error}") from None
-
-
-def _given_scene_options(options: argparse.Namespace, mesh: dv.TetMesh) -> dict[str, Any]:
-    names = ("time_step", "sweeps", "density", "gravity", "floor", "kappa", "dhat", "friction", "relaxation",
-             "integrator", "coarse")  # fmt: skip
-    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    if options.pin:
-        given["pinned"] = np.logical_or.reduce([side(mesh.points, text) for text in options.pin])
-    return given

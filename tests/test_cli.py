@@ -2,7 +2,6 @@
 
 import io
 import json
-import re
 import subprocess
 import sys
 import warnings
@@ -153,7 +152,7 @@ def test_identify_from_one_final_shape(mesh_file: Path, tmp_path: Path) -> None:
         (["simulate", "MESH", "--out", "a.pvd", "--device", "bogus"], "device: expected one of this machine"),
         (["simulate", "MESH", "--out", "a.pvd", "--steps", str(2**62)], "--steps: expected an integer from 0 to"),
         (["simulate", "MESH", "--out", "a.pvd", "--steps", "-1"], "--steps"),
-        (["simulate", "MESH", "--out", "a.pvd", "--friction", "0.5"], "FloorBarrier"),
+        (["simulate", "MESH", "--out", "a.pvd", "--friction", "0.5"], "--friction: expected --floor beside it"),
         (["simulate", "MESH", "--out", "a.pvd", "--relaxation", "2"], "relaxation"),
         (["simulate", "MESH", "--out", "there.pvd"], "there.pvd would be overwritten; give --force"),
         (["simulate", "MESH", "--out", "frames.pvd"], "frames_0003.vtu would be overwritten; give --force"),
@@ -366,17 +365,3 @@ def test_a_warning_is_one_line_without_a_place(mesh_file: Path, monkeypatch: pyt
     )
     assert run("simulate", mesh_file, "--out", "part.pvd") == 0
     assert said == ["warning: sweeps: few\n"] and warnings.formatwarning is shown
-
-
-def test_advise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "part.msh"
-    dv.mesh.save(path, dv.mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1)))
-    common = ["advise", str(path), "--pin", "x-", "--duration", "0.1", "--error", "0.1"]
-    assert main(common) == 0
-    told = capsys.readouterr().out
-    made = re.search(r"in Python: settings=(dv\.Settings\(.*\))", told)
-    assert made is not None and "pilot runs took" in told
-    settings = eval(made[1])
-    assert isinstance(settings, dv.Settings) and 0 < settings.time_step <= 0.1
-    assert main([*common, "--sweeps", "3"]) == 2
-    assert "--sweeps: expected none" in capsys.readouterr().err

@@ -98,7 +98,7 @@ def test_simulate_writes_gltf_and_says_early_what_usd_needs(
     assert run(*common, "--out", tmp_path / "part.glb") == 0
     assert (tmp_path / "part.glb").read_bytes()[:4] == b"glTF"
     monkeypatch.setitem(sys.modules, "pxr", None)
-    monkeypatch.setattr("diffvbd.cli._scene", lambda *_: pytest.fail("simulated first"))
+    monkeypatch.setattr("diffvbd.cli_scene.scene", lambda *_: pytest.fail("simulated first"))
     assert run(*common, "--out", tmp_path / "part.usdc") == 2
     assert "pip install 'diffvbd[exchange]'" in capsys.readouterr().err
     assert run(*common, "--out", tmp_path / "part.avi") == 2

@@ -3,7 +3,9 @@
 //     way_i = mean + e_i,    e_i = (r_i - Q (r_i - c (d_i - mean))) / c,    Q = polar(sum m r (r - c (d - mean))^T)
 // with d the ways h v, r from the center of mass, and c the chord: how far back along its way a vertex is taken to have
 // been. With c = 1 that is the state before an implicit Euler step, whose velocities are chords of the turn: a body
-// that only turns keeps its shape to rounding (docs/method.md, section 14). With the adjoint.
+// that only turns keeps its shape to rounding (docs/method.md, section 14). Velocities that a scene begins with are
+// rather those of a rigid body, w x r, tangents of its turn, where c is 0; those of a body that takes implicit Euler in
+// a step of another scheme have c = 1. Ways that fit one of these better than `chord` have that. With the adjoint.
 //
 // A View is a body: size(), mass(i), position(i) and way(i) of its i-th vertex.
 #pragma once
@@ -63,24 +65,48 @@ DIFFVBD_FN bool turn_of(const Matrix& b, double chord, Matrix& turned) {
   return turns;
 }
 
+// Of a chord: sum m r^2, sum m |d - mean|^2 and sum m e^2.
+struct Squares {
+  double size, beside, left;
+};
+template <class View, class Team>
+DIFFVBD_FN Squares take_chord(const View& view, const Team& team, double chord, Coasting& out) {
+  // squares of distances inside the body, and of ways beside one of it
+  const Vector about = view.position(0), with = view.way(0);
+  double sum[18];
+  team.template sum<18>(view.size(), sum, [&](int32_t i, double* to) {
+    const double m = view.mass(i);
+    const Vector way = view.way(i) - with, at = view.position(i) - about, x = m * at, before = at - chord * way;
+    to[0] += m, to[1] += dot(x, at), to[2] += m * dot(way, way);
+    add(to + 3, x), add(to + 6, m * way), add_outer(to + 9, x, before);
+  });
+  out = {}, out.mass = sum[0], out.chord = chord;
+  if (!(sum[0] > 0)) return {};
+  const Vector at = 1 / sum[0] * Vector{sum[3], sum[4], sum[5]}, along = 1 / sum[0] * Vector{sum[6], sum[7], sum[8]};
+  out.mean = with + along, out.center = about + at;
+  out.b = rows_of(sum + 9) + (-sum[0]) * outer(at, at - chord * along);
+  out.turns = turn_of(out.b, chord, out.turned);
+  const double beside = sum[2] - sum[0] * dot(along, along);
+  return {sum[1] - sum[0] * dot(at, at), beside, beside - 2 / (chord * chord) * inner(out.turned, out.b)};
+}
+
 template <class View, class Team>
 DIFFVBD_FN Coasting coasting_of(const View& view, const Team& team, double chord) {
-  double sum[16];
-  const Vector about = view.size() > 0 ? view.position(0) : Vector{};  // squares of distances inside the body
-  team.template sum<16>(view.size(), sum, [&](int32_t i, double* to) {
-    const double m = view.mass(i);
-    const Vector way = view.way(i), at = view.position(i) - about, x = m * at, before = at - chord * way;
-    to[0] += m;
-    add(to + 1, x), add(to + 4, m * way), add_outer(to + 7, x, before);
-  });
+  constexpr double kChord = 1, kTangent = 0.01,  // by one of 0 no turn could be measured
+      kFits = 0.25,     // of the squares that `chord` leaves: what one that fits better leaves at most
+      kTurns = 0.15,    // of the squares of all ways: what a wrong chord may leave of a turn alone
+      kStretch = 1e-8;  // squared stretch of a step below which all chords are the same
   Coasting out{};
-  out.mass = sum[0], out.chord = chord;
-  if (!(sum[0] > 0)) return out;
-  const Vector at = 1 / sum[0] * Vector{sum[1], sum[2], sum[3]};
-  out.mean = 1 / sum[0] * Vector{sum[4], sum[5], sum[6]};
-  out.center = about + at;
-  out.b = rows_of(sum + 7) + (-sum[0]) * outer(at, at - chord * out.mean);
-  out.turns = turn_of(out.b, chord, out.turned);
+  if (view.size() == 0) return out;
+  double left = 0;
+  for (int k = 0; k < 4; ++k) {  // a loop, so that the code is there once: registers bound what calls this
+    const Squares of = take_chord(view, team, k == 1 ? kTangent : k == 2 ? kChord : chord, out);
+    const bool fits = out.turns && of.left < kFits * left;
+    if (k > 0 && fits) break;
+    if (k > 0) continue;
+    left = of.left;
+    if (!(out.turns && left > kStretch * of.size && left < kTurns * of.beside)) break;
+  }
   return out;
 }
 

@@ -17,6 +17,10 @@ from .scene import Scene
 ITERATIONS, HALVINGS = 8, 30
 ETA = 0.9  # largest fraction of the way to where a barrier begins that a start may close
 MOST_TURN = 0.7  # [rad] in a step, which the start leaves out
+BETTER = (0.01, 1.0)  # chords of ways that are tangents of a turn, and of implicit Euler's
+FITS = 0.25  # of the squares that one chord leaves: what one that fits better leaves at most
+TURNS = 0.15  # of the squares of all ways: what a wrong chord may leave of a turn alone
+STRETCH = 1e-8  # squared stretch of a step below which all chords are the same
 LEAST_SHARE = 0.1  # of its gap that a vertex keeps in one step
 DAMPING = 1e-9  # of the inertia
 ARRIVED = 1e-24  # squared step over squared radius of gyration from which on two more steps are taken
@@ -184,10 +188,22 @@ def bent(mass: Tensor, x: Tensor, way: Tensor, chord: float) -> tuple[Tensor, Te
     total = mass.sum(-1, keepdim=True)
     center, mean = ((mass * a).sum(-1, keepdim=True) / total for a in (x, way))
     r, beside = x - center, way - mean
+    change, left, turns = _straightened(mass, r, beside, chord)
+    size, all_ways = ((mass * a * a).detach().sum((-2, -1), keepdim=True) for a in (r, beside))
+    undecided = turns & (left > STRETCH * size) & (left < TURNS * all_ways)
+    for better in BETTER:
+        other, less, also = _straightened(mass, r, beside, better)
+        fits = undecided & also & (less < FITS * left)
+        change, undecided = torch.where(fits, other, change), undecided & ~fits
+    return mean + change, r + change, r + beside
+
+
+def _straightened(mass: Tensor, r: Tensor, beside: Tensor, chord: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The ways of a body beside that of its center, without its turn; their squares, by mass; whether it turns."""
     before = r - chord * beside
     turn, turns = _turn_or_none((mass * r) @ before.transpose(-1, -2), chord)
     change = torch.where(turns, (r - turn @ before) / chord, beside)
-    return mean + change, r + change, r + beside
+    return change, (mass * change * change).detach().sum((-2, -1), keepdim=True), turns
 
 
 def _turn_or_none(b: Tensor, chord: float) -> tuple[Tensor, Tensor]:

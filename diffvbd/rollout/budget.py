@@ -186,7 +186,10 @@ class _Budget:
         if p.model.dtype == torch.float64:
             return
         given = converted(p.given, dtype=torch.float64)
-        double = replace(p, model=p.model.to(dtype=torch.float64), x=p.x.double(), v=p.v.double(), given=given)
+        own = p.quantity
+        quantity = None if own is None else lambda x, v: own(x.to(p.model.dtype), v.to(p.model.dtype))
+        double = replace(p, model=p.model.to(dtype=torch.float64), x=p.x.double(), v=p.v.double(), given=given,
+                         quantity=quantity)  # fmt: skip
         done, seconds = self._other(double, self.own)
         assert run.x is not None
         single = replace(run, x=run.x.double(), gradient=tuple(g.double() for g in run.gradient),
@@ -261,6 +264,8 @@ class _Budget:
         assert half.x is not None and fine.x is not None
         left = self.pilots.apart(half.x, fine.x)
         note += f", itself off by some {left:.0e}" if left > 0.3 * share.motion else ""
+        if unseen := self.pilots.swinging(FINER * self.steps):
+            note += f", whose steps do not see how {unseen} swings"
         self.shares.append(replace(share, seconds=self.pilots.spent - began, note=note))
         return fine
 

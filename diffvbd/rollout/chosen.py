@@ -9,6 +9,7 @@ import torch
 
 from ..adjoint.routes import ReverseSweep
 from ..checks import check_count, check_positive, fail
+from ..model.warnings import was_run
 from ..step.arguments import check_state
 from ..step.met import outcomes
 from .pilots import GIVEN, of_time, pilots_of
@@ -41,6 +42,8 @@ def rollout_with(rollout: Callable[..., Trajectory], *, settings: Any, duration:
         time_step = duration / steps
     chosen = {"model": settings.applied(given["model"]), "steps": steps, "time_step": time_step,
               "sweeps": settings.sweeps, "integrator": settings.integrator}  # fmt: skip
+    if settings.predicted is not None:
+        was_run(chosen["model"])
     if given["adjoint"] is None:
         chosen["adjoint"] = ReverseSweep(settings.tape)
     if given["checkpoint_every"] == "auto":

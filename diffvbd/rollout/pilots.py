@@ -20,6 +20,7 @@ from ..model.model import Model
 from ..model.warnings import silent
 from ..scopes import refined, refuse_transforms
 from ..step.arguments import GRAVITY, Prepared, prepare
+from .between import SWINGS, unseen
 from .energy_check import mechanical_energy
 from .settings import Settings
 from .trajectory import PerStep, Trajectory
@@ -140,6 +141,9 @@ class Pilots:
         x, v = traj.x.detach(), traj.v.detach()
         if not bool(torch.isfinite(x[-1]).all()):
             return Pilot(settings, steps, None, None, seconds, failure=f"{settings}: positions that are not finite")
+        if value is not None and not bool(torch.isfinite(value)):
+            failure = f"{settings}: quantity is {float(value)} after {part} steps"
+            return Pilot(settings, steps, None, None, seconds, failure=failure)
         return Pilot(settings, steps, x, v, seconds * steps / part, value, gradient)
 
     def _rollout(self, settings: Settings, model: Model, x: Tensor, v: Tensor, steps: int, began: float, frames: int,
@@ -199,6 +203,16 @@ class Pilots:
             else:
                 out[name] = timed(function, 0.5 if name in LOADS else 1.0)
         return out
+
+    def swinging(self, steps: int) -> str:
+        """The name of what swings within steps, so that they do not see it; "" if nothing does."""
+        parameters = self.given.get("parameters")
+        named = {f'parameters["{k}"]': v for k, v in parameters.items()} if isinstance(parameters, dict) else {}
+        for name, value in {**self.given, **named}.items():
+            share = 0.5 if name in LOADS else 1.0
+            if of_time(value) and unseen(value, share, steps, self.duration, name in MOVING) > SWINGS:
+                return name
+        return ""
 
     # --- comparing ----------------------------------------------------------------------------------------------------
 

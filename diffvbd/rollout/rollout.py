@@ -24,6 +24,7 @@ from ..step.integrators import (
     check_history,
     check_integrator,
     check_staged,
+    growth_of,
     solves_of,
     take,
 )
@@ -158,7 +159,8 @@ def rollout(
     anew = any(_changes(value) for value in (*(options[k] for k in _STATIC), *own.values()))
     fixed = None if anew else prepare(model, lead, **chosen, **_to_prepare(options, own, 0, x, v))
     if fixed is not None and looks_at(fixed.mu) and looks_at(fixed.lam):
-        warn_of_material(model, fixed.mu, fixed.lam, *fixed.time_step_and_sweeps)
+        warn_of_material(model, fixed.mu, fixed.lam, *fixed.time_step_and_sweeps,
+                         growth_of(scheme))  # fmt: skip
     for value in _tensors(options["prescribed"]):
         check_prescribed(model, value, x)
     if check_start and steps:

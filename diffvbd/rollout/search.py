@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ..energies import StableNeoHookean
@@ -107,7 +108,7 @@ class _Search:
         self.most = error if self.smooth else SAFE * error  # that a run may show
         self.clean = self.smooth  # whether the last two runs can be extrapolated
         self.ladder: list[Pilot] = []
-        self.estimates: list[float] = []  # of each level from the third on, of what is asked for
+        self.estimates: list[tuple[float, Pilot]] = []  # of levels from the third on: what is asked for, and the run
         self.proven: list[Candidate] = []
         self.predicted: list[Candidate] = []
 
@@ -120,8 +121,8 @@ class _Search:
             best = next(c for c in self.proven if c.error <= self.most)
             why = self._reason()
         else:
-            error = self.estimates[-1] if self.estimates else math.inf
-            now = self.ladder[-1] if self.ladder else None
+            least = (math.inf, self.ladder[-1] if self.ladder else None)
+            error, now = min(self.estimates, key=lambda e: e[0], default=least)
             settings = start_of(self.pilots).on(FRAMES, self.pilots.duration) if now is None else now.settings
             best = Candidate(settings, error, math.inf if now is None else now.seconds, now is not None)
         tried = {str(c.settings) for c in self.proven}
@@ -132,9 +133,11 @@ class _Search:
         return replace(best.settings, dtype=p.model.dtype, predicted=told)
 
     def _reason(self) -> str:
+        last, before = (run.settings for run in self.ladder[:-3:-1])
+        limit = f"the limit of {before} and {last}" if self.clean else f"{last}"
         why = (
-            f"the fastest of the runs below that keep the error; their errors are distances to "
-            f"{self.ladder[-1].settings}, and {self.uncertain:.1g} by which that may be off"
+            f"the fastest of the runs below that keep the error; their errors are distances to {limit}, "
+            f"and {self.uncertain:.1g} by which that may be off"
         )
         if self.pilots.spent > 0.9 * self.patience:
             why += f"; {self.patience:g} s of pilot runs (patience) ended the search for faster ones"
@@ -163,8 +166,12 @@ class _Search:
                 apart.append(self._distance(self.ladder[-2], now))
             if len(apart) > 1:
                 self._see_order(apart)
-                self.estimates.append(max(self._remaining(apart), self._unresolved()))
-                if self.estimates[-1] <= 0.5 * self.error:
+                error = max(self._remaining(apart), self._unresolved())
+                unseen = p.swinging(steps) if error <= 0.5 * self.error else ""
+                self.estimates.append((math.inf if unseen else error, now))
+                if unseen and 2 * steps > MOST_STEPS:
+                    return False, f"{unseen} swings within each of {steps} steps, which do not see it"
+                if error <= 0.5 * self.error and not unseen:
                     more = self._with_more_sweeps(settings)
                     if more is None:
                         return True, ""
@@ -172,7 +179,10 @@ class _Search:
                     self.ladder[-2:] = [more]
                     apart[-2:] = [self._distance(self.ladder[-2], more)]
                     continue
-                if self._is_stuck(apart):
+                if self._is_rounding():
+                    return False, (f"shorter steps than those of {min(self.estimates, key=lambda e: e[0])[1].settings} "
+                                   f"make it worse, as rounding does in {p.model.dtype}")  # fmt: skip
+                if not unseen and self._is_stuck(apart):
                     return False, self._why(apart[-1])
             steps *= 2
 
@@ -210,6 +220,12 @@ class _Search:
         if more.x is None or self._distance(before, more) <= 0.25 * self.error:
             return None
         return more
+
+    def _is_rounding(self) -> bool:
+        """Whether the last runs are further from one another than longer steps were."""
+        errors = [error for error, _ in self.estimates]
+        single = self.pilots.model.dtype == torch.float32
+        return single and self.smooth and len(errors) > 2 and min(errors[-2:]) > 2 * min(errors[:-2])
 
     @staticmethod
     def _is_stuck(apart: list[float]) -> bool:
@@ -249,7 +265,7 @@ class _Search:
     def _rank(self) -> None:
         p, last = self.pilots, self.ladder[-1]
         reference = self.reference
-        uncertain = (0.5 if self.clean else 1.0) * self.estimates[-1]
+        uncertain = (0.5 if self.clean else 1.0) * self.estimates[-1][0]
         self.aim = AIM * (self.error - uncertain)
         for run in self.ladder:
             error = self._distance(run, reference) + uncertain

@@ -147,6 +147,7 @@ class Settings:
 
     def on(self, steps: int, duration: float) -> Settings:
         """The same with ``steps`` steps over ``duration`` [s], without a prediction."""
+        steps, duration = check_count("steps", steps, minimum=1), check_positive("duration", duration, "s")
         return replace(self, time_step=duration / steps, predicted=None)
 
     def __str__(self) -> str:

@@ -23,6 +23,7 @@ from .integrators import (
     check_history,
     check_integrator,
     check_staged,
+    growth_of,
     take,
 )
 
@@ -150,6 +151,7 @@ def step(
     for value in prescribed if isinstance(prescribed, tuple) else (prescribed,):
         check_prescribed(model, value, x)
     if looks_at(prepared.mu) and looks_at(prepared.lam):
-        warn_of_material(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps)
+        warn_of_material(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps,
+                         growth_of(scheme))  # fmt: skip
     taken = take(scheme, model, x, v, history, prepared, given, partial(advance, adjoint=adjoint))
     return (taken.x, taken.v) if taken.history is None else (taken.x, taken.v, taken.history)

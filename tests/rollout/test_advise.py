@@ -91,6 +91,43 @@ def test_an_error_that_cannot_be_had_is_said() -> None:
     assert "patience" in told.why and "cannot be had" in str(settings)
 
 
+def test_in_single_precision_the_best_run_is_returned_and_rounding_blamed() -> None:
+    model, material = cantilever(1e6)
+    model = model.to(dtype=torch.float32)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    settings = dv.advise(model, x, v, duration=DURATION, error=1e-7, **material)
+    told = settings.predicted
+    assert told is not None and not told.reached
+    assert "as rounding does in torch.float32" in told.why and "patience" not in told.why
+    assert f"than those of {dataclasses.replace(settings, predicted=None)} make it worse" in told.why
+
+
+def test_a_quantity_that_is_not_finite_later_ends_the_search() -> None:
+    model, material = cantilever(1e6)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    fails = lambda x, v: (1e-4 + x[-1, 1] - model.rest_points[-1, 1]).sqrt()  # noqa: E731
+    told = dv.advise(model, x, v, duration=DURATION, error=0.1, quantity=fails, **material).predicted
+    assert told is not None and not told.reached
+    assert "quantity is nan after" in told.why and told.spent < 20
+
+
+def test_a_quantity_of_single_precision_in_a_budget() -> None:
+    model, material = cantilever(1e6)
+    model = model.to(dtype=torch.float32)
+    x, weights = model.rest_points, torch.ones(3, dtype=torch.float32)
+    seen = set()
+
+    def quantity(x: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+        seen.add(x.dtype)
+        return (x @ weights).square().mean()
+
+    budget = dv.error_budget(model, x, 0 * x, duration=0.04, time_step=0.01, sweeps=5, quantity=quantity,
+                             gradient=True, **material)  # fmt: skip
+    (share,) = (s for s in budget.shares if s.cause == "precision")
+    assert seen == {torch.float32} and share.quantity is not None and share.gradient is not None
+    assert share.gradient < 1e-2
+
+
 def test_auto_in_a_rollout() -> None:
     model, material = cantilever(2e4)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)

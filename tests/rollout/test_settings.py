@@ -146,3 +146,10 @@ def test_a_model_knows_what_contact_did_in_its_rollouts_with_settings() -> None:
     assert other is not model and other.surface_of_contact.capacity == 1000
     dv.contact.reserve(model, 2000)
     assert settings.applied(model) is other and other.surface_of_contact.capacity == 2000
+
+
+def test_steps_over_a_duration() -> None:
+    assert dv.Settings(0.01, 5).on(4, 0.1).time_step == 0.1 / 4
+    for steps, duration, said in ((0, 0.1, "steps: expected an integer >= 1"), (4, 0.0, "duration: expected")):
+        with pytest.raises(ValueError, match=said):
+            dv.Settings(0.01, 5).on(steps, duration)

@@ -1,0 +1,88 @@
+"""Claim: where few over-relaxed sweeps let vibrations of a stiff body grow, the first step says so, and what it says to
+take does not grow."""
+
+import re
+import warnings
+from typing import Any
+
+import pytest
+import torch
+
+import diffvbd as dv
+
+STILL, GROWN = 1.0, 1e3  # speeds [m/s] of a bar that sags under its weight, and of one that grows from that
+BODY = dv.mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1))
+
+
+def end(integrator: Any, sweeps: int, relaxation: float, modulus: float = 1e8, coarse: Any = None, pinned: bool = True
+        ) -> tuple[float, list[str]]:  # fmt: skip
+    """The largest speed [m/s] after three seconds, and what was said."""
+    model = dv.Model(BODY, pinned=torch.tensor(BODY.points[:, 0] < 1e-9) if pinned else None, relaxation=relaxation,
+                     coarse=coarse)  # fmt: skip
+    x = model.rest_points.clone()
+    v = torch.zeros_like(x)
+    if not pinned:
+        v[:, 1] = 0.3 * torch.sin(7 * x[:, 0])
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            out = dv.rollout(model, x, v, steps=300, mu=modulus, lam=modulus, time_step=0.01, sweeps=sweeps,
+                             integrator=integrator, save="last", check_energy=False,
+                             gravity=(0.0, -9.81 if pinned else 0.0, 0.0))  # fmt: skip
+            speed = float(out.v[-1].norm(dim=-1).max())
+        except ValueError:  # positions that are not finite
+            speed = float("inf")
+    return speed, [str(w.message) for w in said]
+
+
+EULER, BDF2, SDIRK2 = dv.ImplicitEuler(), dv.BDF2(), dv.SDIRK2()
+
+
+@pytest.mark.parametrize(
+    ("integrator", "sweeps", "relaxation", "options"),
+    [
+        (EULER, 1, 1.5, {}),
+        (EULER, 2, 1.7, {}),
+        (BDF2, 2, 1.5, {}),
+        (BDF2, 4, 1.7, {}),
+        (BDF2, 2, 1.5, {"coarse": "auto"}),
+        (BDF2, 3, 1.7, {"pinned": False}),
+        (SDIRK2, 1, 1.0, {}),
+        (SDIRK2, 1, 1.0, {"coarse": "auto"}),
+        (SDIRK2, 3, 1.5, {"pinned": False}),
+        (SDIRK2, 5, 1.5, {}),
+        (SDIRK2, 3, 1.5, {"coarse": "auto"}),
+    ],
+)
+def test_what_grows_is_said_and_what_is_said_helps(integrator: Any, sweeps: int, relaxation: float,
+                                                   options: dict[str, Any]) -> None:  # fmt: skip
+    speed, (said,) = end(integrator, sweeps, relaxation, **options)
+    assert speed > GROWN
+    assert said.startswith(f"sweeps: {sweeps} with {type(integrator).__name__}() and relaxation={relaxation:g}")
+    found = re.search(r"take (\d+) sweeps(?:, relaxation=([\d.]+))?", said)
+    assert found is not None
+    speed, said = end(integrator, int(found[1]), relaxation, **options)
+    assert speed < STILL and not said
+    if found[2]:
+        speed, said = end(integrator, sweeps, float(found[2]), **options)
+        assert speed < GROWN and not said
+
+
+def test_nothing_is_said_of_soft_bodies_plain_sweeps_and_enough_of_them() -> None:
+    for options in ({"sweeps": 2, "relaxation": 1.5, "modulus": 3e3}, {"sweeps": 2, "relaxation": 1.0},
+                    {"sweeps": 10, "relaxation": 1.5}, {"sweeps": 1, "relaxation": 1.5, "coarse": "auto"}):  # fmt: skip
+        speed, said = end(BDF2, **options)  # type: ignore[arg-type]
+        assert not said and 0 < speed < 10
+
+
+def test_settings_of_pilot_runs_are_not_doubted() -> None:
+    model = dv.Model(BODY, pinned=torch.tensor(BODY.points[:, 0] < 1e-9))
+    x, stiff = model.rest_points, {"mu": 1e8, "lam": 1e8}
+    few = dv.Settings(0.01, 2, BDF2, relaxation=1.5)
+    told = dv.Prediction(0.01, 0.01, 1.0, 0.03, True, "", (), 1.0, 1)
+    proven = dv.Settings(0.01, 2, BDF2, relaxation=1.4, predicted=told)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dv.rollout(model, x, 0 * x, duration=0.03, settings=proven, **stiff)
+    with pytest.warns(UserWarning, match=r"sweeps: 2 with BDF2\(\)"):
+        dv.rollout(model, x, 0 * x, duration=0.03, settings=few, **stiff)
