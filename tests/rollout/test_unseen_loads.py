@@ -57,7 +57,7 @@ def test_a_budget_says_so() -> None:
         (lambda t: torch.tensor(3.0), 4, False, True),  # does not change
         (lambda t: 9.81 + 0.1 * math.sin(1e4 * t), 8, False, True),  # a ripple on what does not
         (lambda t: torch.tensor([5.0 + t, math.nan]), 8, True, True),  # moves evenly; others are not read
-        (lambda t: torch.tensor([5.0 + 1e-3 * math.sin(1e4 * t)]), 8, True, False),  # far away, and shakes there
+        (lambda t: torch.tensor([5.0 + 0.001 * math.sin(1e4 * t)]), 8, True, False),  # far away, and shakes there
         (lambda t: torch.tensor(float(t > 0.05)), 64, False, True),  # switched on
         (lambda t: torch.zeros(3), 8, False, True),
         (lambda t: torch.tensor(t), 1, False, True),
