@@ -36,7 +36,7 @@ def test_advice_looks_between_the_steps() -> None:
                           force=lambda k, x, v: force((k + 0.5) * h)).x[-1] - x  # fmt: skip
 
     exact, few = end(1024), end(16)
-    assert float(few.norm()) < 0.001 * float(exact.norm())  # which sixteen steps do not see at all
+    assert float(few.norm()) < 0.01 * float(exact.norm())  # which sixteen steps do not see at all
     assert float((end(settings.steps(DURATION)) - exact).norm()) < 0.2 * float(exact.norm())
 
 
