@@ -248,7 +248,9 @@ __global__ void __launch_bounds__(kThreads)
       }
     }
     if (!__syncthreads_or(changes)) break;  // nor will the next round
-    each(n, [&](int32_t i) { label[i] = unsettled ? 0 : root_of(label, i); });
+    each(n, [&](int32_t i) {
+      shared_label(label, i).store(unsettled ? 0 : root_of(label, i), ::cuda::std::memory_order_relaxed);
+    });
   }
   sum(), sweep(), sum();
   each(n, [&](int32_t i) { island[first + i] = work.islands[first + label[i]].blocked ? -1 : label[i]; });

@@ -2,13 +2,22 @@
 #pragma once
 
 #include <cstdint>
+#include <cuda/atomic>
 
 namespace diffvbd::cuda {
 
+// Labels are read and shortened while others join them: whatever is read is an item of the same set.
+__device__ inline ::cuda::atomic_ref<int32_t, ::cuda::thread_scope_device> shared_label(const int32_t* label,
+                                                                                        int32_t i) {
+  return ::cuda::atomic_ref<int32_t, ::cuda::thread_scope_device>(const_cast<int32_t*>(label)[i]);
+}
+
 __device__ inline int32_t root_of(const int32_t* label, int32_t i) {
-  const volatile int32_t* parent = label;
-  while (parent[i] != i) i = parent[i];
-  return i;
+  for (;;) {
+    const int32_t parent = shared_label(label, i).load(::cuda::std::memory_order_relaxed);
+    if (parent == i) return i;
+    i = parent;
+  }
 }
 
 // Hangs the larger of two roots under the smaller.

@@ -1,0 +1,147 @@
+"""NVIDIA's compute-sanitizer over every regime, with and without contact: steps and their gradients.
+
+Each tool runs the same small scenes in a process of its own: memcheck (addresses), racecheck (shared memory), initcheck
+(memory that nobody has written) and synccheck (barriers).
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from bench.common import markdown_table
+from diffvbd import mesh
+
+DEVICE = "cuda"
+TOOLS = ("memcheck", "racecheck", "initcheck", "synccheck")
+SUMMARY = re.compile(r"(?:ERROR SUMMARY: (\d+) error|RACECHECK SUMMARY: (\d+) hazard)")
+LONGEST = 1500  # [s] of a tool
+Scene = Callable[[], tuple[dv.Model, Tensor, dict[str, Any]]]
+
+
+def _free(regime: str | None, energies: tuple[Any, ...] = (), **options: Any) -> Scene:
+    """Scenes without pairs: a beam that is held at one end, bent by its weight, and one that flies."""
+
+    def scene() -> tuple[dv.Model, Tensor, dict[str, Any]]:
+        body = mesh.beam(4, 2, 2, size=(0.3, 0.1, 0.1))
+        both = mesh.join([body, body.translate((0.0, 0.3, 0.0))])
+        held = torch.tensor((both.points[:, 0] < 1e-9) & (both.body == 0))
+        model = dv.Model(both, pinned=held, energies=(dv.StableNeoHookean(), *energies), device=DEVICE, **options)
+        return model, _moving(model, 3), {"regime": regime}
+
+    return scene
+
+
+def _touching(scenes: int, *energies: Any, size: int = 3, colliders: tuple[Any, ...] = (), **options: Any) -> Scene:
+    """Three cubes that fly into one another, on what else there is."""
+
+    def scene() -> tuple[dv.Model, Tensor, dict[str, Any]]:
+        cube = mesh.box(size, 0.1)
+        bodies = mesh.join([cube.translate((0.104 * k, 0.103 * (k == 2) + 0.004, 0.01 * k)) for k in range(3)])
+        model = dv.Model(bodies, energies=(dv.StableNeoHookean(), dv.PairBarrier(kappa=1e4, dhat=2e-3), *energies),
+                         colliders=colliders, device=DEVICE, **options)  # fmt: skip
+        return model, _moving(model, scenes), {"regime": None}
+
+    return scene
+
+
+def _moving(model: dv.Model, scenes: int) -> Tensor:
+    """Velocities of each scene [B, V, 3]: toward the middle, each body turning."""
+    x = model.rest_points
+    v = 3.0 * (x.mean(0) - x) / x.std()
+    spin = torch.linalg.cross(x.new_tensor([1.0, 2.0, 3.0]).expand_as(x), x - x.mean(0))
+    return (v + spin) * torch.linspace(0.5, 1.0, scenes, dtype=x.dtype, device=x.device)[:, None, None]
+
+
+FLOOR, FRICTION = dv.FloorBarrier(height=-0.003, kappa=1e4, dhat=2e-3), dv.Friction(0.5)
+PLANE = dv.colliders.Plane((0.0, -0.003, 0.0))
+SCENES: dict[str, Scene] = {
+    "thread": _free("thread"),
+    "block": _free("block"),
+    "grid": _free("grid"),
+    "color": _free("color"),
+    "floor, float32": _free("block", (FLOOR,), dtype=torch.float32),
+    "floor, thread": _free("thread", (FLOOR,)),
+    "floor and friction": _free("color", (FLOOR, FRICTION)),
+    "coarse": _free(None, coarse="auto", relaxation=1.5),
+    "Anderson": _free(None, acceleration=dv.Anderson(2)),
+    "pairs": _touching(1),
+    "pairs, friction, a collider": _touching(2, FRICTION, colliders=(PLANE,)),
+    "pairs, floor, float32": _touching(2, FLOOR, dtype=torch.float32),
+    "pairs, coarse": _touching(1, coarse="auto"),
+    "pairs, many scenes": _touching(70),
+    "pairs, a larger scene": _touching(1, size=12),
+}
+
+
+def step_of(scene: Scene) -> None:
+    """Two steps and their gradients with respect to state and material, with each tape."""
+    model, v, options = scene()
+    x = model.rest_points.expand_as(v).clone()
+    tapes = ("full",) if model.touches else ("full", "compact", "recompute")
+    for tape in tapes:
+        leaves = [t.clone().requires_grad_() for t in (x, v, x.new_full((1, model.num_tets), 1e5))]
+        now, speed, mu = leaves
+        with dv.regime(options["regime"]):
+            for _ in range(2):
+                now, speed = dv.step(model, now, speed, mu=mu, lam=1e5, time_step=0.005, sweeps=3,
+                                     adjoint=dv.ReverseSweep(tape))  # fmt: skip
+            gradients = torch.autograd.grad((now - x).square().sum(), leaves)
+        assert all(bool(g.abs().max() > 0) for g in gradients)
+
+
+def run(quick: bool, device: str = DEVICE, only: str = "") -> dict[str, Any]:
+    began = time.perf_counter()
+    tools = [tool for tool in TOOLS if not only or tool in only.split(",")]
+    names = list(SCENES)[:1] if quick else list(SCENES)
+    # side by side: a tool keeps one core and little of the device busy
+    running = {tool: _started(tool, names, device) for tool in tools}
+    rows = []
+    for tool, process in running.items():
+        text, _ = process.communicate(timeout=LONGEST)
+        found = SUMMARY.findall(text)
+        if process.returncode not in (0, 9) or not found:
+            raise RuntimeError(f"{tool}: expected a summary, got status {process.returncode}:\n{text[-2000:]}")
+        done = [name for name in names if f"done {name}\n" in text]
+        rows.append({"tool": tool, "scenes": len(done), "found": sum(int(a or b) for a, b in found),
+                     "first": _first(text)})  # fmt: skip
+    return {"rows": rows, "scenes": names, "seconds": time.perf_counter() - began}
+
+
+def _started(tool: str, names: list[str], device: str) -> subprocess.Popen[str]:
+    command = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", sys.executable, "-m", "bench.sanitize",
+               device, *names]  # fmt: skip
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def _first(text: str) -> str:
+    """What a tool says of the first thing that it finds."""
+    lines = [line.removeprefix("========= ") for line in text.splitlines() if line.startswith("========= ")]
+    return " | ".join(line.strip() for line in lines[1:4] if "SUMMARY" not in line)
+
+
+def markdown(results: dict[str, Any]) -> str:
+    header = ("tool", "scenes", "found", "the first")
+    rows = ([row["tool"], row["scenes"], row["found"], row["first"] or "-"] for row in results["rows"])
+    return "## compute-sanitizer\n\n" + markdown_table(header, rows) + "\nScenes: " + ", ".join(results["scenes"]) + "."
+
+
+def main(arguments: list[str]) -> None:
+    """The scenes themselves, inside a tool."""
+    global DEVICE
+    DEVICE = arguments[0]
+    for name in arguments[1:]:
+        step_of(SCENES[name])
+        print(f"done {name}", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
