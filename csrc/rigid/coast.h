@@ -93,14 +93,16 @@ DIFFVBD_FN Squares take_chord(const View& view, const Team& team, double chord, 
 template <class View, class Team>
 DIFFVBD_FN Coasting coasting_of(const View& view, const Team& team, double chord) {
   constexpr double kChord = 1, kTangent = 0.01,  // by one of 0 no turn could be measured
+      kAfterTangents = -0.74,                    // of BDF2, after a step of SDIRK2 from tangents
       kFits = 0.25,     // of the squares that `chord` leaves: what one that fits better leaves at most
       kTurns = 0.15,    // of the squares of all ways: what a wrong chord may leave of a turn alone
       kStretch = 1e-8;  // squared stretch of a step below which all chords are the same
   Coasting out{};
   if (view.size() == 0) return out;
   double left = 0;
-  for (int k = 0; k < 4; ++k) {  // a loop, so that the code is there once: registers bound what calls this
-    const Squares of = take_chord(view, team, k == 1 ? kTangent : k == 2 ? kChord : chord, out);
+  const double others[] = {chord, kTangent, kChord, chord < 0 ? kAfterTangents : chord, chord};
+  for (int k = 0; k < 5; ++k) {  // a loop, so that the code is there once: registers bound what calls this
+    const Squares of = take_chord(view, team, others[k], out);
     const bool fits = out.turns && of.left < kFits * left;
     if (k > 0 && fits) break;
     if (k > 0) continue;

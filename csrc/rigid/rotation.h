@@ -82,19 +82,29 @@ DIFFVBD_FN bool definite(const Sym3<double>& a) {
 DIFFVBD_FN Vector solve_definite(const Sym3<double>& a, const Vector& b) { return solve(factor<double>(a, 0.0), b); }
 
 // The rotation R for which tr(R^T b) is largest, by Newton's method from the identity. False where b determines none
-// (a body collapsed to a line, or turned inside out): then R is left alone.
+// (a body collapsed to a line, or turned inside out): then R is left alone. Far from it the stiffness of a slender
+// body, of which one moment is much the largest, is indefinite or nearly so: with the norm of b in its diagonal steps
+// are shorter.
 DIFFVBD_FN bool polar_rotation(const Matrix& b, Matrix& rotation) {
-  constexpr int kMost = 30;
+  constexpr int kMost = 40;
   constexpr double kArrived = 1e-30;  // squared angle: the next step would be below rounding
+  constexpr double kFar = 0.25;       // the same, beyond which the stiffness has to be trusted less
   Matrix r = identity();
   for (int k = 0; k < kMost; ++k) {
     const Matrix m = transposed(r) * b;
-    const Sym3<double> stiffness = turning_stiffness(m);
-    if (!definite(stiffness)) return false;
-    const Vector w = solve_definite(stiffness, axial(m));
-    if (!(dot(w, w) < 1)) return false;  // farther than the step can be trusted, or not a number
+    Sym3<double> stiffness = turning_stiffness(m);
+    const bool holds = definite(stiffness);
+    Vector w = solve_definite(stiffness, axial(m));
+    if (!holds || !(dot(w, w) < kFar)) {
+      if (!(dot(b.x, cross(b.y, b.z)) > 0)) return false;  // turned inside out, or not a number
+      const double shift = std::sqrt(inner(b, b));
+      stiffness.xx += shift, stiffness.yy += shift, stiffness.zz += shift;
+      w = solve_definite(stiffness, axial(m));
+    }
+    if (!(dot(w, w) < 1)) return false;  // farther than the step can be trusted
     r = r + r * turned_by(w);
     if (dot(w, w) < kArrived) {
+      if (!holds) return false;
       rotation = r;
       return true;
     }

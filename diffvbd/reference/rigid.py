@@ -17,7 +17,8 @@ from .scene import Scene
 ITERATIONS, HALVINGS = 8, 30
 ETA = 0.9  # largest fraction of the way to where a barrier begins that a start may close
 MOST_TURN = 0.7  # [rad] in a step, which the start leaves out
-BETTER = (0.01, 1.0)  # chords of ways that are tangents of a turn, and of implicit Euler's
+# chords of ways that are tangents of a turn, of implicit Euler's, and of BDF2's after a step from tangents
+BETTER = (0.01, 1.0, -0.74)
 FITS = 0.25  # of the squares that one chord leaves: what one that fits better leaves at most
 TURNS = 0.15  # of the squares of all ways: what a wrong chord may leave of a turn alone
 STRETCH = 1e-8  # squared stretch of a step below which all chords are the same
@@ -26,6 +27,7 @@ DAMPING = 1e-9  # of the inertia
 ARRIVED = 1e-24  # squared step over squared radius of gyration from which on two more steps are taken
 ARRIVALS = 2
 ROUNDING = 1e-13  # relative rise of the energies that is rounding
+FAR = 0.25  # squared angle of a Newton step to the nearest rotation, beyond which steps are shortened
 DEFINITE = 1e-10  # least eigenvalue of a turning stiffness over its trace
 GUARD = 8  # ulps of the gap's own terms below which a gap counts as closed
 
@@ -191,7 +193,7 @@ def bent(mass: Tensor, x: Tensor, way: Tensor, chord: float) -> tuple[Tensor, Te
     change, left, turns = _straightened(mass, r, beside, chord)
     size, all_ways = ((mass * a * a).detach().sum((-2, -1), keepdim=True) for a in (r, beside))
     undecided = turns & (left > STRETCH * size) & (left < TURNS * all_ways)
-    for better in BETTER:
+    for better in BETTER if chord < 0 else BETTER[:2]:
         other, less, also = _straightened(mass, r, beside, better)
         fits = undecided & also & (less < FITS * left)
         change, undecided = torch.where(fits, other, change), undecided & ~fits
@@ -277,6 +279,11 @@ def _polar(b: Tensor) -> Tensor:
     return _polar_or_none(b)[0]
 
 
+def _definite(stiffness: Tensor) -> Tensor:
+    trace = stiffness.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return (torch.linalg.eigvalsh(stiffness)[..., 0] > DEFINITE * trace)[..., None, None]
+
+
 def _polar_or_none(b: Tensor) -> tuple[Tensor, Tensor]:
     """The rotation closest to b [..., 3, 3]: by Newton steps from the identity, the last of which carries
     the derivative. The identity where b determines none, or one that is too far; and where it does not
@@ -284,15 +291,19 @@ def _polar_or_none(b: Tensor) -> tuple[Tensor, Tensor]:
     one = torch.eye(3, dtype=b.dtype, device=b.device)
     with torch.no_grad():
         found, good = one.expand_as(b), torch.ones_like(b[..., :1, :1], dtype=torch.bool)
-        for _ in range(30):
+        # of a slender body, far from its rotation, the stiffness need not be definite
+        proper, shift = torch.linalg.det(b) > 0, torch.linalg.matrix_norm(b)[..., None, None] * one
+        for _ in range(40):
             m = found.transpose(-1, -2) @ b
             stiffness = turning_stiffness(m)
-            definite = torch.linalg.eigvalsh(stiffness)[..., 0] > DEFINITE * stiffness.diagonal(dim1=-2, dim2=-1).sum(
-                -1
-            )
-            w = torch.linalg.solve(torch.where(definite[..., None, None], stiffness, one), axial(m))
-            good = good & (definite & ((w * w).sum(-1) < 1))[..., None, None]
+            definite = _definite(stiffness)
+            w = torch.linalg.solve(torch.where(definite, stiffness, one), axial(m))
+            near = definite[..., 0, 0] & ((w * w).sum(-1) < FAR)
+            shifted = torch.where(proper[..., None, None], stiffness + shift, one)
+            w = torch.where(near[..., None], w, torch.linalg.solve(shifted, axial(m)))
+            good = good & ((near | proper) & ((w * w).sum(-1) < 1))[..., None, None]
             found = found + torch.where(good, found @ _turned_by(w), 0.0)
+        good = good & _definite(turning_stiffness(found.transpose(-1, -2) @ b))
     m = found.transpose(-1, -2) @ b
     stiffness = torch.where(good, turning_stiffness(m), torch.eye(3, dtype=b.dtype, device=b.device))
     w = torch.linalg.solve(stiffness, torch.where(good[..., 0], axial(m), 0.0))

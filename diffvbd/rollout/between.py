@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -9,8 +10,9 @@ import torch
 from torch import Tensor
 
 SWINGS = 0.5  # of its size: a value that differs by more from a line through its samples is not seen by them
-BETWEEN = (0.382, 0.724)  # of a step after a sample, so uneven that no swing vanishes at all of them
-MOST_SAMPLES = 512  # steps that are looked at, evenly spread
+LOOKS = 3  # at a step, at other places of each: nothing that repeats with the steps hides between them
+GOLDEN = (math.sqrt(5) - 1) / 2  # whose multiples are spread evenly over [0, 1)
+MOST_STEPS = 64  # that are looked at, evenly spread
 
 
 def unseen(function: Callable[[float], Any], share: float, steps: int, duration: float, moves: bool) -> float:
@@ -21,12 +23,13 @@ def unseen(function: Callable[[float], Any], share: float, steps: int, duration:
         share: Of each step at which it is asked.
         moves: Whether it is a position, whose size is how far it goes from its first value.
     """
-    h, stride = duration / steps, max(1, steps // MOST_SAMPLES)
+    h, stride = duration / steps, max(1, -(-steps // MOST_STEPS))
     lines: list[Tensor] = []
     values: list[Tensor] = []
     for k in range(0, steps - 1, stride):
         before, after = (_value(function, (k + i + share) * h) for i in (0, 1))
-        for part in BETWEEN:
+        for _ in range(LOOKS):
+            part = GOLDEN * (len(values) + 1) % 1.0
             values.append(_value(function, (k + share + part) * h))
             lines.append(before + part * (after - before))
     if not values:
@@ -37,5 +40,6 @@ def unseen(function: Callable[[float], Any], share: float, steps: int, duration:
 
 
 def _value(function: Callable[[float], Any], time: float) -> Tensor:
-    value = torch.as_tensor(function(time)).detach().double()
+    given = function(time)
+    value = torch.as_tensor(0.0 if given is None else given).detach().double()
     return torch.where(torch.isfinite(value), value, 0.0)  # prescribed positions of what is not pinned may be NaN

@@ -210,7 +210,12 @@ class Pilots:
         named = {f'parameters["{k}"]': v for k, v in parameters.items()} if isinstance(parameters, dict) else {}
         for name, value in {**self.given, **named}.items():
             share = 0.5 if name in LOADS else 1.0
-            if of_time(value) and unseen(value, share, steps, self.duration, name in MOVING) > SWINGS:
+            if not of_time(value):
+                continue
+            clock = time.perf_counter()
+            apart = unseen(value, share, steps, self.duration, name in MOVING)
+            self.spent += time.perf_counter() - clock
+            if apart > SWINGS:
                 return name
         return ""
 

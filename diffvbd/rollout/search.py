@@ -24,7 +24,7 @@ from ..model.anderson import Anderson
 from ..model.model import Model
 from ..model.warnings import is_nearly_incompressible
 from ..step.integrators import BDF2, SDIRK2, ImplicitEuler, Integrator
-from .pilots import FRAMES, Pilot, Pilots, relative
+from .pilots import FRAMES, Pilot, Pilots, changes, relative
 from .settings import Candidate, Prediction, Settings
 
 LONGEST = 0.1  # [s] of the first time step of the ladder
@@ -150,7 +150,10 @@ class _Search:
         p, settings = self.pilots, start_of(self.pilots)
         steps = FRAMES * max(1, math.ceil(p.duration / (FRAMES * LONGEST)))
         apart: list[float] = []
+        unseen = "what changes in time" if changes(p.given) else ""
         while True:
+            if steps > MOST_STEPS and unseen and self.ladder:
+                return False, f"{unseen} swings within each of {MOST_STEPS} steps, which do not see it"
             if steps > MOST_STEPS:
                 return False, f"{MOST_STEPS} steps are not enough"
             if p.spent > self.patience:
@@ -161,17 +164,20 @@ class _Search:
                 continue
             if now.x is None:
                 return False, f"a run failed: {now.failure}"
+            if unseen:
+                unseen, apart = p.swinging(steps), []
+                self.ladder = [now] if unseen else []  # runs that do not see it tell nothing of others
+                if unseen:
+                    steps *= 2
+                    continue
             self.ladder.append(now)
             if len(self.ladder) > 1:
                 apart.append(self._distance(self.ladder[-2], now))
             if len(apart) > 1:
                 self._see_order(apart)
                 error = max(self._remaining(apart), self._unresolved())
-                unseen = p.swinging(steps) if error <= 0.5 * self.error else ""
-                self.estimates.append((math.inf if unseen else error, now))
-                if unseen and 2 * steps > MOST_STEPS:
-                    return False, f"{unseen} swings within each of {steps} steps, which do not see it"
-                if error <= 0.5 * self.error and not unseen:
+                self.estimates.append((error, now))
+                if error <= 0.5 * self.error:
                     more = self._with_more_sweeps(settings)
                     if more is None:
                         return True, ""
@@ -182,7 +188,7 @@ class _Search:
                 if self._is_rounding():
                     return False, (f"shorter steps than those of {min(self.estimates, key=lambda e: e[0])[1].settings} "
                                    f"make it worse, as rounding does in {p.model.dtype}")  # fmt: skip
-                if not unseen and self._is_stuck(apart):
+                if self._is_stuck(apart):
                     return False, self._why(apart[-1])
             steps *= 2
 
