@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import warnings
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from torch import Tensor
@@ -14,6 +13,8 @@ from torch import Tensor
 from ..energies import StableNeoHookean
 from ..mesh import TetMesh
 from ..said import page, warn
+from .growth import GROWS, STEPS_SEEN, warn_of_growth
+from .tet_shapes import shapes_of_tets
 
 if TYPE_CHECKING:
     from .model import Model
@@ -22,13 +23,11 @@ INCOMPRESSIBLE = 60.0  # lam / mu (nu = 0.492) above which over-relaxed rollouts
 STABLE_RELAXATION = 1.7  # largest omega that never grew in the rollouts of docs/numerics.md
 HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
 THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
-SAMPLED = 10_000  # tets that are looked at: a sheet's are all alike
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 
-LONG_STEP = 3.0  # elements that a pressure wave crosses in a step: beyond, some vibrations are far shorter than it
-
 # of a Model's _derived: what is said once, or ever more seldom
-ONCE = THIN_SEEN, OVER_RELAXED, GROWS = "thin", "over-relaxed", "grows"
+THIN_SEEN, OVER_RELAXED = "thin", "over-relaxed"
+ONCE = (THIN_SEEN, OVER_RELAXED, GROWS, STEPS_SEEN)
 
 
 def warn_of(model: Model) -> None:
@@ -55,34 +54,21 @@ def warn_of(model: Model) -> None:
         )
 
 
-class Growth(NamedTuple):
-    """With how many sweeps vibrations far shorter than a step do not grow from one to the next.
-
-    Attributes:
-        scheme: Name of the integrator.
-        sweeps: That it takes at least.
-        leaves: Largest share (omega - 1)^n of an error that n over-relaxed sweeps may leave, where all are.
-        leaves_but_last: The same, where the last of them is not over-relaxed and does not count.
-    """
-
-    scheme: str
-    sweeps: int
-    leaves: float
-    leaves_but_last: float
-
-
-def warn_of_material(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int, growth: Growth) -> None:
+def warn_of_material(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int, scheme: str) -> None:
     """Warns, once for each Model, of moduli that its settings do not suit.
 
     Args:
         mu, lam: [Pa], [1 | B, 1 | T]; on CUDA they are not looked at outside debug_checks().
-        time_step, sweeps, growth: Of the step and its integrator.
+        time_step, sweeps: Of the step.
+        scheme: Name of its integrator.
     """
     if sweeps == 0 or not model.mesh.num_tets:
         return
     _warn_of_thin_tets(model, mu, lam, time_step, sweeps)
     _warn_of_over_relaxation(model, mu, lam)
-    _warn_of_growth(model, mu, lam, time_step, sweeps, growth)
+    if model._derived.get(OVER_RELAXED) == 0:  # it has warned, of the same
+        return
+    warn_of_growth(model, mu, lam, time_step, sweeps, scheme)
 
 
 @contextlib.contextmanager
@@ -103,11 +89,6 @@ def silent(model: Model) -> Iterator[None]:
 def _with_settings(model: Model) -> list[Model]:
     """A Model and those that run in its place with settings."""
     return [model, *(m for m in model._derived.values() if isinstance(m, type(model)))]
-
-
-def was_run(model: Model) -> None:
-    """Its settings are those of a pilot run that has ended: nothing grows with them, whatever few sweeps may do."""
-    model._derived[GROWS] = True
 
 
 def is_nearly_incompressible(mu: Tensor, lam: Tensor) -> bool:
@@ -132,35 +113,6 @@ def _warn_of_over_relaxation(model: Model, mu: Tensor, lam: Tensor) -> None:
         )
 
 
-def _warn_of_growth(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int, growth: Growth) -> None:
-    """Too few sweeps for a relaxation and an integrator.
-
-    Vibrations far shorter than the step are left with the errors of the sweeps, of which (omega - 1)^n are left after n
-    of them, with either sign; what a scheme extrapolates from these may be larger. (docs/numerics.md, "Relaxation")
-    """
-    if GROWS in model._derived:
-        return
-    last_counts = not (model.corrects or model.coarse is not None)
-    over, most = model.relaxation - 1, growth.leaves if last_counts else growth.leaves_but_last
-    many = sweeps - (not last_counts)  # that are over-relaxed
-    needed, largest = growth.sweeps, 1.0
-    if over > 0 and many > 0:
-        needed = max(needed, math.ceil(math.log(most) / math.log(over)) + (not last_counts))
-        largest += most ** (1 / many)
-    if sweeps >= needed:
-        return
-    _, height = _shape_of_tets(model)
-    if _crossed(model, mu, lam, time_step, height) < LONG_STEP:
-        return
-    model._derived[GROWS] = True
-    less = f", relaxation={math.floor(100 * largest) / 100:g}" if sweeps >= growth.sweeps and over > 0 else ""
-    warn(
-        f"sweeps: {sweeps} with {growth.scheme}() and relaxation={model.relaxation:g} were seen to let vibrations of "
-        f"stiff bodies grow without bound where steps are far longer than these, as they are here; take {needed} "
-        f"sweeps{less} or a shorter time step; " + page("numerics.md"),
-    )
-
-
 def _warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int) -> None:
     """Tets so thin that few sweeps leave a sheet without stiffness.
 
@@ -171,7 +123,7 @@ def _warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, 
     if THIN_SEEN in model._derived or model.coarse is not None:
         return
     model._derived[THIN_SEEN] = True
-    aspect, height = _shape_of_tets(model)
+    aspect, height = (float(np.median(value)) for value in shapes_of_tets(model))
     if aspect < THIN:
         return
     needed = min(aspect, _crossed(model, mu, lam, time_step, height)) ** 2 * (2 - model.relaxation) / model.relaxation
@@ -182,19 +134,6 @@ def _warn_of_thin_tets(model: Model, mu: Tensor, lam: Tensor, time_step: float, 
             f"shorter time step, more sweeps with relaxation up to {STABLE_RELAXATION}, or a thicker body of softer "
             "material. Linear tets this thin are also much too stiff in bending; " + page("numerics.md"),
         )
-
-
-def _shape_of_tets(model: Model) -> tuple[float, float]:
-    """Medians of the longest edge over the shortest height of a tet [-], and of that height [m]."""
-    tets = model.mesh.tets[:: max(1, model.mesh.num_tets // SAMPLED)]
-    corners = model.mesh.points[tets]
-    edges = corners[:, 1:] - corners[:, :1]
-    normals = np.stack([np.cross(edges[:, i], edges[:, j]) for i, j in ((1, 2), (2, 0), (0, 1))], 1)
-    volume = np.abs((edges[:, 0] * normals[:, 0]).sum(-1))
-    normals = np.concatenate([normals, -normals.sum(1, keepdims=True)], 1)
-    height = volume / np.linalg.norm(normals, axis=-1).max(1)  # the shortest of a tet's four
-    sides = np.linalg.norm(corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]], axis=-1)
-    return float(np.median(sides.max(1) / height)), float(np.median(height))
 
 
 def _crossed(model: Model, mu: Tensor, lam: Tensor, time_step: float, height: float) -> float:

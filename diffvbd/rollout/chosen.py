@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import torch
 
 from ..adjoint.routes import ReverseSweep
 from ..checks import check_count, check_positive, fail
-from ..model.warnings import was_run
+from ..model.growth import proven
 from ..step.arguments import check_state
 from ..step.met import outcomes
 from .pilots import GIVEN, of_time, pilots_of
@@ -42,14 +43,15 @@ def rollout_with(rollout: Callable[..., Trajectory], *, settings: Any, duration:
         time_step = duration / steps
     chosen = {"model": settings.applied(given["model"]), "steps": steps, "time_step": time_step,
               "sweeps": settings.sweeps, "integrator": settings.integrator}  # fmt: skip
-    if settings.predicted is not None:
-        was_run(chosen["model"])
     if given["adjoint"] is None:
         chosen["adjoint"] = ReverseSweep(settings.tape)
     if given["checkpoint_every"] == "auto":
         chosen["checkpoint_every"] = settings.checkpoint_every
+    sure = settings.predicted is not None and settings.predicted.reached
+    pilots = proven(chosen["model"], type(settings.integrator).__name__, settings.sweeps) if sure else nullcontext()
     try:
-        return rollout(**given | chosen)
+        with pilots:
+            return rollout(**given | chosen)
     finally:  # the caller asks his own Model for the status of its steps
         if (outcome := outcomes.get(chosen["model"])) is not None:
             outcomes[given["model"]] = outcome

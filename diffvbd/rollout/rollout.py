@@ -24,7 +24,6 @@ from ..step.integrators import (
     check_history,
     check_integrator,
     check_staged,
-    growth_of,
     solves_of,
     take,
 )
@@ -160,7 +159,7 @@ def rollout(
     fixed = None if anew else prepare(model, lead, **chosen, **_to_prepare(options, own, 0, x, v))
     if fixed is not None and looks_at(fixed.mu) and looks_at(fixed.lam):
         warn_of_material(model, fixed.mu, fixed.lam, *fixed.time_step_and_sweeps,
-                         growth_of(scheme))  # fmt: skip
+                         type(scheme).__name__)  # fmt: skip
     for value in _tensors(options["prescribed"]):
         check_prescribed(model, value, x)
     if check_start and steps:

@@ -22,7 +22,6 @@ from torch import Tensor
 
 from ..checks import check_tensor, fail
 from ..model.model import Model
-from ..model.warnings import Growth
 from ..ops import TET_READS_X_PREV
 from ..scopes import looks_at, recorders, refuse_transforms
 from ..tuples import replaced
@@ -72,14 +71,6 @@ class BDF2:
 Integrator = ImplicitEuler | SDIRK2 | BDF2
 
 
-# From runs of bars and cubes, free and pinned, at relaxations from 1 to 1.9 (docs/numerics.md, "Relaxation")
-_GROWTH = (
-    Growth("ImplicitEuler", sweeps=1, leaves=0.25, leaves_but_last=0.5),
-    Growth("SDIRK2", sweeps=2, leaves=1e-3, leaves_but_last=0.15),
-    Growth("BDF2", sweeps=1, leaves=0.07, leaves_but_last=0.26),
-)
-
-
 class History(NamedTuple):
     """What :class:`BDF2` knows of the step before a state: by how much it moved every vertex [m], the velocity before
     it [m/s], both [..., V, 3], whether it is smooth, bool [..., V]: False where contact made a body take implicit
@@ -118,10 +109,6 @@ def check_integrator(integrator: Any) -> Integrator:
     if not isinstance(integrator, Integrator):
         raise TypeError(f"integrator: expected ImplicitEuler(), SDIRK2() or BDF2(), got {type(integrator).__name__}")
     return integrator
-
-
-def growth_of(integrator: Integrator) -> Growth:
-    return next(growth for growth in _GROWTH if growth.scheme == type(integrator).__name__)
 
 
 def check_history(integrator: Integrator, history: Any, x: Tensor, time_step: Any) -> None:

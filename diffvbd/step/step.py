@@ -23,7 +23,6 @@ from .integrators import (
     check_history,
     check_integrator,
     check_staged,
-    growth_of,
     take,
 )
 
@@ -152,6 +151,6 @@ def step(
         check_prescribed(model, value, x)
     if looks_at(prepared.mu) and looks_at(prepared.lam):
         warn_of_material(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps,
-                         growth_of(scheme))  # fmt: skip
+                         type(scheme).__name__)  # fmt: skip
     taken = take(scheme, model, x, v, history, prepared, given, partial(advance, adjoint=adjoint))
     return (taken.x, taken.v) if taken.history is None else (taken.x, taken.v, taken.history)

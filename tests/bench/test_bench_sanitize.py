@@ -20,5 +20,6 @@ def test_summaries() -> None:
     }
     for text, count in texts.items():
         assert sum(int(a or b) for a, b in sanitize.SUMMARY.findall(text)) == count
-    text = "========= COMPUTE-SANITIZER\n========= Invalid read\n=========     at f(int)\n========= ERROR SUMMARY: 1 error\n"
+    lines = ("COMPUTE-SANITIZER", "Invalid read", "    at f(int)", "ERROR SUMMARY: 1 error")
+    text = "".join(f"========= {line}\n" for line in lines)
     assert sanitize._first(text) == "Invalid read | at f(int)"

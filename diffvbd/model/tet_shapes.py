@@ -1,0 +1,28 @@
+"""How thin the tets of a mesh are, of large meshes a sample of them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from .model import Model
+
+SAMPLED = 10_000  # tets that are looked at: a sheet's are all alike
+
+
+def looked_at(model: Model) -> slice:
+    return slice(None, None, max(1, model.mesh.num_tets // SAMPLED))
+
+
+def shapes_of_tets(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Longest edge over shortest height [-], and that height [m], of the tets that are looked at."""
+    corners = model.mesh.points[model.mesh.tets[looked_at(model)]]
+    edges = corners[:, 1:] - corners[:, :1]
+    normals = np.stack([np.cross(edges[:, i], edges[:, j]) for i, j in ((1, 2), (2, 0), (0, 1))], 1)
+    volume = np.abs((edges[:, 0] * normals[:, 0]).sum(-1))
+    normals = np.concatenate([normals, -normals.sum(1, keepdims=True)], 1)
+    height = volume / np.linalg.norm(normals, axis=-1).max(1)  # the shortest of a tet's four
+    sides = np.linalg.norm(corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]], axis=-1)
+    return sides.max(1) / height, height
