@@ -134,6 +134,8 @@ def _stiffest(model: Model, mu: Tensor, lam: Tensor, time_step: float) -> tuple[
     density = model._density[rows].to(height).clamp(min=TINY)
     crossed = time_step * ((first + 2 * shear).clamp(min=0) / density).sqrt() / height
     ratio = (first / shear.clamp(min=TINY)).expand_as(crossed)
+    if crossed.numel() == 0:
+        return 0.0, 0.0
     most = float(crossed.max())
     if math.isnan(most):
         return math.nan, math.nan
