@@ -84,13 +84,10 @@ def warn_of_growth(model: Model, mu: Tensor, lam: Tensor, time_step: float, swee
     if sweeps >= least_sweeps(tables, scheme, relaxation, RATIOS[-1]):
         return
     said: frozenset[tuple[str, int]] = model._derived.get(GROWS, frozenset())
-    seen = model._derived.get(STEPS_SEEN, 0) + 1
-    model._derived[STEPS_SEEN] = seen
-    if (
-        seen & (seen - 1)
-        or (scheme, sweeps) in said
-        or not any(isinstance(e, StableNeoHookean) for e in model.energies)
-    ):
+    model._derived[STEPS_SEEN] = seen = model._derived.get(STEPS_SEEN, 0) + 1
+    if seen & (seen - 1) or (scheme, sweeps) in said:
+        return
+    if not any(isinstance(e, StableNeoHookean) for e in model.energies):
         return
     crossed, ratio = _stiffest(model, mu, lam, time_step)
     if not (math.isfinite(crossed) and math.isfinite(ratio)):  # which the step will refuse
@@ -122,9 +119,7 @@ def _tables_of(model: Model) -> tuple[dict[str, Table], ...]:
 def _needed(tables: tuple[dict[str, Table], ...], scheme: str, relaxation: float, ratio: float, crossed: float) -> int:
     """Sweeps of a step in which a pressure wave crosses so many elements: of few, inertia takes a share of the work."""
     least = least_sweeps(tables, scheme, relaxation, ratio)
-    return (
-        least if least >= MANY and crossed >= LONG_STEP else math.ceil(1 + (least - 1) * min(1.0, crossed / LONG_STEP))
-    )
+    return math.ceil(1 + (least - 1) * min(1.0, crossed / LONG_STEP))
 
 
 def _stiffest(model: Model, mu: Tensor, lam: Tensor, time_step: float) -> tuple[float, float]:
