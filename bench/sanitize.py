@@ -144,9 +144,9 @@ def _first(text: str) -> str:
 
 def markdown(results: dict[str, Any]) -> str:
     header = ("tool", "scenes", "found", "the first", "not done in time")
-    rows = ([row["tool"], row["scenes"], row["found"], row["first"] or "-", ", ".join(row["not done"]) or "-"]
+    rows = ([row["tool"], row["scenes"], row["found"], row["first"] or "-", "; ".join(row["not done"]) or "-"]
             for row in results["rows"])  # fmt: skip
-    return "## compute-sanitizer\n\n" + markdown_table(header, rows) + "\nScenes: " + ", ".join(results["scenes"]) + "."
+    return "## compute-sanitizer\n\n" + markdown_table(header, rows) + "\nScenes: " + "; ".join(results["scenes"]) + "."
 
 
 def main(arguments: list[str]) -> None:
