@@ -71,22 +71,21 @@ struct Squares {
 };
 template <class View, class Team>
 DIFFVBD_FN Squares take_chord(const View& view, const Team& team, double chord, Coasting& out) {
-  // squares of distances inside the body, and of ways beside one of it
-  const Vector about = view.position(0), with = view.way(0);
+  const Vector about = view.position(0);  // squares of distances inside the body
   double sum[18];
   team.template sum<18>(view.size(), sum, [&](int32_t i, double* to) {
     const double m = view.mass(i);
-    const Vector way = view.way(i) - with, at = view.position(i) - about, x = m * at, before = at - chord * way;
+    const Vector way = view.way(i), at = view.position(i) - about, x = m * at, before = at - chord * way;
     to[0] += m, to[1] += dot(x, at), to[2] += m * dot(way, way);
     add(to + 3, x), add(to + 6, m * way), add_outer(to + 9, x, before);
   });
   out = {}, out.mass = sum[0], out.chord = chord;
   if (!(sum[0] > 0)) return {};
-  const Vector at = 1 / sum[0] * Vector{sum[3], sum[4], sum[5]}, along = 1 / sum[0] * Vector{sum[6], sum[7], sum[8]};
-  out.mean = with + along, out.center = about + at;
-  out.b = rows_of(sum + 9) + (-sum[0]) * outer(at, at - chord * along);
+  const Vector at = 1 / sum[0] * Vector{sum[3], sum[4], sum[5]}, mean = 1 / sum[0] * Vector{sum[6], sum[7], sum[8]};
+  out.mean = mean, out.center = about + at;
+  out.b = rows_of(sum + 9) + (-sum[0]) * outer(at, at - chord * mean);
   out.turns = turn_of(out.b, chord, out.turned);
-  const double beside = sum[2] - sum[0] * dot(along, along);
+  const double beside = sum[2] - sum[0] * dot(mean, mean);
   return {sum[1] - sum[0] * dot(at, at), beside, beside - 2 / (chord * chord) * inner(out.turned, out.b)};
 }
 
