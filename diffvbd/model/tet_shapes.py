@@ -18,6 +18,10 @@ def looked_at(model: Model) -> slice:
 
 def shapes_of_tets(model: Model) -> tuple[np.ndarray, np.ndarray]:
     """Longest edge over shortest height [-], and that height [m], of the tets that are looked at."""
+    return model.derived("shapes of tets", lambda: _shapes_of_tets(model))
+
+
+def _shapes_of_tets(model: Model) -> tuple[np.ndarray, np.ndarray]:
     corners = model.mesh.points[model.mesh.tets[looked_at(model)]]
     edges = corners[:, 1:] - corners[:, :1]
     normals = np.stack([np.cross(edges[:, i], edges[:, j]) for i, j in ((1, 2), (2, 0), (0, 1))], 1)

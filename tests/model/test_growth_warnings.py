@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import diffvbd as dv
-from diffvbd.model.growth import ALL, BUT_LAST, COARSE, FREE, least_sweeps
+from diffvbd.model.growth import ALL, BUT_LAST, COARSE, FREE, MANY, least_sweeps
 
 STILL, GROWN = 5.0, 1e3  # speeds [m/s] of a bar that sags under its weight, and of one that grows from that
 BODY = dv.mesh.beam(7, 2, 2, size=(0.6, 0.1, 0.1))
@@ -111,6 +111,23 @@ def test_the_tables_are_those_that_were_measured() -> None:
     least = json.loads((Path(__file__).parents[2] / "bench/results/stability.json").read_text())["results"]["least"]
     for kind, table in (("all", ALL), ("but_last", BUT_LAST), ("free", FREE), ("coarse", COARSE)):
         assert {scheme: [list(row) for row in rows] for scheme, rows in table.items()} == least[kind]
+
+
+def test_the_table_of_the_page_is_that_of_the_code() -> None:
+    text = (Path(__file__).parents[2] / "docs/numerics.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (0\.\d+) \| (1|1\.5) \| (.*) \|$", text.split("**Few sweeps of stiff bodies**")[1], re.M)
+    assert len(rows) == 8
+    schemes = ("ImplicitEuler", "BDF2", "SDIRK2")
+    for poisson, relaxation, cells in rows:
+        ratio = 2 * float(poisson) / (1 - 2 * float(poisson))
+
+        def least(*tables: Any, name: str, omega: float = float(relaxation), ratio: float = ratio) -> list[str]:
+            found = (least_sweeps((table,), name, omega, min(ratio, 20.0)) for table in tables)
+            return [str(n) if n < MANY else f"over {MANY - 1}" for n in found]
+
+        expected = [", ".join(least(ALL, FREE, name=name)) for name in schemes]
+        expected.append(", ".join(least(COARSE, name=name)[0] for name in schemes))
+        assert cells.split(" | ") == expected
 
 
 def test_a_computed_ratio_is_that_of_the_table() -> None:
