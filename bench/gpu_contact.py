@@ -10,7 +10,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from bench.common import cell, markdown_table
-from bench.gpu_measure import Card, Row, attempt, milliseconds
+from bench.gpu_measure import Card, Row, Work, attempt, milliseconds
 from bench.tradeoff_scenes import gripper
 from diffvbd.tasks import cover_the_spot
 from diffvbd.tasks.problem import Settings
@@ -45,7 +45,30 @@ def _cover(card: Card) -> list[Row]:
     return _timed(card, about, fall.version.steps, forward, both, (0.25, 0.6))
 
 
+def landed_step(card: Card) -> Work:
+    """A step and its gradients where disks lie on the floor and on one another."""
+    fall = cover_the_spot.Fall(Settings(Path("unused"), str(card.device)), cover_the_spot.RADIUS, cover_the_spot.FULL)
+    given: dict[str, Any] = {"mu": cover_the_spot.MU, "lam": cover_the_spot.LAM, "time_step": cover_the_spot.TIME_STEP,
+                             "sweeps": cover_the_spot.SWEEPS}  # fmt: skip
+    x, v = fall.model.rest_points, fall.velocity[:, None].expand(-1, fall.disk.num_vertices, -1).flatten(0, 1)
+    with torch.no_grad():
+        end = dv.rollout(fall.model, x, v, steps=fall.version.steps, save="last", **given)
+    leaves = tuple(t[-1].detach().requires_grad_() for t in (end.x, end.v))
+    return lambda: torch.autograd.grad(sum(t.sum() for t in dv.step(fall.model, *leaves, **given)), leaves)
+
+
 def _grippers(card: Card, scenes: int) -> list[Row]:
+    about, forward, both = grippers(card, scenes, STEPS)
+    many = scenes >= 1024
+    rows = _timed(card, about, STEPS, forward, both, (None, None))
+    for row, target in zip(rows, (1e5, 3.5e4), strict=True):
+        row["scene_steps_per_s"] = 1e3 * scenes / (row["ms"] or row["eager_ms"])
+        row["target_rate"] = target if many else None
+    return rows
+
+
+def grippers(card: Card, scenes: int, steps: int) -> tuple[Row, Work, Work]:
+    """Scenes in which clamps hold a bar: what they are, some steps of them, and these with their gradients."""
     scene = gripper(5, (3, 5, 5), detections=DETECTIONS, reach=REACH)
     model, clamps = scene.model.to(card.device), scene.given["prescribed"]
     rest = model.rest_points
@@ -59,7 +82,7 @@ def _grippers(card: Card, scenes: int) -> list[Row]:
     def step(at: Tensor, speed: Tensor, k: int) -> tuple[Tensor, Tensor]:
         return dv.step(model, at, speed, mu=1e5, lam=2e5, time_step=TIME_STEP, sweeps=SWEEPS, prescribed=ends_of[k])
 
-    ends_of = [ends(k + 1) for k in range(CLOSING + STEPS)]
+    ends_of = [ends(k + 1) for k in range(CLOSING + steps)]
     with torch.no_grad():
         for k in range(CLOSING):
             x, v = step(x, v, k)
@@ -67,7 +90,7 @@ def _grippers(card: Card, scenes: int) -> list[Row]:
 
     def moved() -> Tensor:
         at, speed = leaves
-        for k in range(CLOSING, CLOSING + STEPS):
+        for k in range(CLOSING, CLOSING + steps):
             at, speed = step(at, speed, k)
         return at
 
@@ -81,12 +104,7 @@ def _grippers(card: Card, scenes: int) -> list[Row]:
     forward()
     about: dict[str, Any] = {"vertices": model.num_vertices, "scenes": scenes, "sweeps": SWEEPS,
                              "pairs_per_scene": dv.contact.status(model).pairs / scenes}  # fmt: skip
-    many = scenes >= 1024
-    rows = _timed(card, about, STEPS, forward, both, (None, None))
-    for row, target in zip(rows, (1e5, 3.5e4), strict=True):
-        row["scene_steps_per_s"] = 1e3 * scenes / (row["ms"] or row["eager_ms"])
-        row["target_rate"] = target if many else None
-    return rows
+    return about, forward, both
 
 
 def _timed(card: Card, about: dict[str, Any], steps: int, forward: Any, both: Any,

@@ -161,16 +161,22 @@ def _rows(values: Any) -> int:
     return values.shape[0]
 
 
+# torch 2.13 has another name for it
+_gather: Any = getattr(dist, "all_gather_single", getattr(dist, "all_gather_into_tensor", None))
+
+
 class _Gathered(Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, count: int) -> Tensor:
         ctx.count = count
         sizes = [part.stop - part.start for part in (_share(count, rank) for rank in range(_ranks()))]
-        # gloo wants the same shape of all
-        filled = pad(values, (0, 0) * (values.dim() - 1) + (0, max(sizes) - values.shape[0])).contiguous()
-        found = [torch.empty_like(filled) for _ in sizes]
-        dist.all_gather(found, filled)
-        return torch.cat([rows[:size] for rows, size in zip(found, sizes, strict=True)])
+        most = max(sizes)  # all send as many rows
+        filled = values if values.shape[0] == most else pad(values, (0, 0) * (values.dim() - 1) + (0, 1))
+        found = values.new_empty((len(sizes) * most, *values.shape[1:]))
+        _gather(found, filled.contiguous())
+        if min(sizes) == most:
+            return found
+        return torch.cat([rows[:size] for rows, size in zip(found.split(most), sizes, strict=True)])
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:

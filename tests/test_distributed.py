@@ -23,7 +23,7 @@ import diffvbd as dv
 from diffvbd import distributed
 from diffvbd.cli import main
 from diffvbd.tasks import Problem, Settings, solve
-from diffvbd.tasks.million_cubes import QUICK, Cubes, launch_pad, rows_near
+from diffvbd.tasks.million_cubes import QUICK, Cubes, is_near, launch_pad
 from diffvbd.testing import relative_error, tolerance
 
 ENVIRONMENT = {"TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}  # what docs/guides/scale-out.md tells users to set
@@ -116,12 +116,25 @@ def forces(out: Path) -> dict[str, Any]:
         found["forces"].append(cubes.all_of(force.detach().view(-1, 8, 3)))
         found["gradients"].append(cubes.all_of(gradient.view(-1, 8, 3)))
         if dist.is_initialized():
-            near = len(rows_near(cubes.own(places), places))
+            near = int(is_near(cubes.own(places), places).sum())
             assert near == cubes.bodies if scale[0] == 1 else near > cubes.bodies
+            _check_room(cubes, cubes.own(places), near)
     broken = places.index_fill(0, torch.tensor([40]), math.nan)  # of one rank; all have to say so
     with pytest.raises(ValueError, match="expected finite values, got nan") as error:
         cubes.push(0, cubes.own(broken)[:, None].expand(-1, 8, -1).reshape(cubes.shape), x)
     return found | {"error": str(error.value)}
+
+
+def _check_room(cubes: Cubes, mine: torch.Tensor, near: int) -> None:
+    """In a CUDA graph bodies nearby have a fixed room, which is larger than they need; if it is not, all is NaN."""
+    found = []
+    for captured in (False, True):
+        leaf = mine.clone().requires_grad_()
+        force = cubes.penalty_by_all(leaf, captured)
+        found.append((force, *torch.autograd.grad((force * mine.sin()).sum(), leaf)))
+    assert cubes.room > near and all(torch.equal(*same) for same in zip(*found, strict=True))
+    cubes.room = near - 1
+    assert cubes.penalty_by_all(mine, True).isnan().all()
 
 
 def launch(out: Path) -> dict[str, Any]:

@@ -47,6 +47,10 @@ struct ContactInputs {
   T friction_eps = T(0);            // motion in a step below which friction is smoothed [m]
 
   DIFFVBD_FN Vec3<T> center_of(int64_t scene, int v) const { return point_at(center, scene * num_vertices + v); }
+  // The entries of a vertex among the lagged pairs.
+  DIFFVBD_FN PairList::Entries lags_of(int64_t scene, int v) const {
+    return lag ? lagged.of(scene * corners + v) : PairList::Entries{nullptr, 0};
+  }
 };
 
 // Where pairs leave what they add; zero at first. Slot 4 pair + i belongs to corner i, its only writer.
@@ -174,24 +178,32 @@ DIFFVBD_FN void add_barrier_of(const Source<T, Positions>& s, int64_t entry, int
               PairConstants<T>(in.constants + kConstants * pair), in.kappa.data[s.scene * in.kappa.scene], h * h, g, H);
 }
 
-// Sums what rubs into g and H: lagged pairs of vertex v, every `stride`-th from `first` on, and floors.
+// What the lagged pair of an entry of vertex v adds to g and H.
 template <class T, class Positions>
-DIFFVBD_FN void add_lags(const Source<T, Positions>& s, int v, int first, int stride, T h, Vec3<T>& g, Sym3<T>& H) {
+DIFFVBD_FN void add_lag_of(const Source<T, Positions>& s, int64_t entry, int v, T h, Vec3<T>& g, Sym3<T>& H) {
   const ContactInputs<T>& in = s.in;
-  if (in.lag) {
-    const PairList::Entries lagged = in.lagged.of(s.scene * in.corners + v);
-    for (int e = first; e < lagged.count; e += stride) {
-      const int entry = lagged.first[e], pair = entry >> 2;
-      const Lag<T> lag(in.lag + int64_t{kLagScalars} * pair);
-      if (!lag.active()) continue;
-      const int32_t* record = in.lagged.pairs + int64_t{kPairRow} * pair;
-      add_lagged(lag, entry & 3, s.together(record, v), s.motion(record, lag), h, in.friction_eps, g, H);
-    }
-  }
-  for (int k = first; k < in.planes; k += stride) {
+  const int64_t pair = entry >> 2;
+  const Lag<T> lag(in.lag + kLagScalars * pair);
+  if (!lag.active()) return;
+  const int32_t* record = in.lagged.pairs + kPairRow * pair;
+  const int own = static_cast<int>(entry & 3);
+  add_lagged(lag, own, s.together(record, v), s.motion(record, lag), h, in.friction_eps, g, H);
+}
+// And the floor's planes, every `stride`-th from `first` on.
+template <class T, class Positions>
+DIFFVBD_FN void add_floor_lags(const Source<T, Positions>& s, int v, int first, int stride, T h, Vec3<T>& g,
+                               Sym3<T>& H) {
+  for (int k = first; k < s.in.planes; k += stride) {
     const Lag<T> lag = floor_lag(s, v, k);
-    if (lag.active()) add_lagged(lag, 0, T(1), s.x(v) - s.x_prev(v), h, in.friction_eps, g, H);
+    if (lag.active()) add_lagged(lag, 0, T(1), s.x(v) - s.x_prev(v), h, s.in.friction_eps, g, H);
   }
+}
+// All of them, of one thread.
+template <class T, class Positions>
+DIFFVBD_FN void add_lags(const Source<T, Positions>& s, int v, T h, Vec3<T>& g, Sym3<T>& H) {
+  const PairList::Entries lagged = s.in.lags_of(s.scene, v);
+  for (int e = 0; e < lagged.count; ++e) add_lag_of(s, lagged.first[e], v, h, g, H);
+  add_floor_lags(s, v, 0, 1, h, g, H);
 }
 
 // The exponent of the limit of vertex v, whose update goes from where it was by d: of its room.
@@ -288,31 +300,32 @@ DIFFVBD_FN void reverse_barrier_of(const Source<T, Positions>& s, const ContactA
   out.kappa[entry] += bar.kappa;
 }
 
-// And of what add_lags summed: also toward v itself where it is alone.
+// And of what add_lag_of() added.
 template <class T, class Positions>
-DIFFVBD_FN void reverse_lags(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int v, int first, int stride,
-                             T h, const Vec3<T>& p, const Vec3<T>& d_raw, Vec3<T>& own) {
+DIFFVBD_FN void reverse_lag_of(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int64_t entry, int v, T h,
+                               const Vec3<T>& p, const Vec3<T>& d_raw) {
   const ContactInputs<T>& in = s.in;
-  if (in.lag) {
-    const PairList::Entries lagged = in.lagged.of(s.scene * in.corners + v);
-    for (int e = first; e < lagged.count; e += stride) {
-      const int64_t entry = lagged.first[e], pair = entry >> 2;
-      const Lag<T> lag(in.lag + kLagScalars * pair);
-      const int32_t* record = in.lagged.pairs + kPairRow * pair;
-      const Vec3<T> m = s.motion(record, lag);
-      Lag<T> bar;
-      const Vec3<T> m_bar =
-          reverse_lagged(lag, static_cast<int>(entry & 3), s.together(record, v), m, h, in.friction_eps, p, d_raw, bar);
-      T by_lag[kLagScalars] = {bar.friction, bar.damping, bar.n.x, bar.n.y, bar.n.z}, rows[12];
-      for (int k = 0; k < 4; ++k) {
-        by_lag[5 + k] = bar.w[k] + dot(m_bar, s.x(record[k]) - s.x_prev(record[k]));
-        const Vec3<T> row = lag.w[k] * m_bar;
-        rows[3 * k] = row.x, rows[3 * k + 1] = row.y, rows[3 * k + 2] = row.z;
-      }
-      add_at(out.lag + kLagScalars * entry, by_lag);
-      add_at(out.lag_rows + 12 * entry, rows);
-    }
+  const int64_t pair = entry >> 2;
+  const Lag<T> lag(in.lag + kLagScalars * pair);
+  const int32_t* record = in.lagged.pairs + kPairRow * pair;
+  const Vec3<T> m = s.motion(record, lag);
+  Lag<T> bar;
+  const Vec3<T> m_bar =
+      reverse_lagged(lag, static_cast<int>(entry & 3), s.together(record, v), m, h, in.friction_eps, p, d_raw, bar);
+  T by_lag[kLagScalars] = {bar.friction, bar.damping, bar.n.x, bar.n.y, bar.n.z}, rows[12];
+  for (int k = 0; k < 4; ++k) {
+    by_lag[5 + k] = bar.w[k] + dot(m_bar, s.x(record[k]) - s.x_prev(record[k]));
+    const Vec3<T> row = lag.w[k] * m_bar;
+    rows[3 * k] = row.x, rows[3 * k + 1] = row.y, rows[3 * k + 2] = row.z;
   }
+  add_at(out.lag + kLagScalars * entry, by_lag);
+  add_at(out.lag_rows + 12 * entry, rows);
+}
+// Of what the floor's planes added; toward v itself, which is alone there.
+template <class T, class Positions>
+DIFFVBD_FN void reverse_floor_lags(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int v, int first,
+                                   int stride, T h, const Vec3<T>& p, const Vec3<T>& d_raw, Vec3<T>& own) {
+  const ContactInputs<T>& in = s.in;
   for (int k = first; k < in.planes; k += stride) {
     Lag<T> bar;
     const Vec3<T> m_bar =
@@ -323,16 +336,31 @@ DIFFVBD_FN void reverse_lags(const Source<T, Positions>& s, const ContactAdjoint
     own += m_bar;
   }
 }
+// All of them, of one thread.
+template <class T, class Positions>
+DIFFVBD_FN void reverse_lags(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int v, T h, const Vec3<T>& p,
+                             const Vec3<T>& d_raw, Vec3<T>& own) {
+  const PairList::Entries lagged = s.in.lags_of(s.scene, v);
+  for (int e = 0; e < lagged.count; ++e) reverse_lag_of(s, out, lagged.first[e], v, h, p, d_raw);
+  reverse_floor_lags(s, out, v, 0, 1, h, p, d_raw, own);
+}
 
-// Adds up what the slots of all corners of a pair hold for that of an entry, as far as `holds` says.
+// The flags of an entry, one byte for each corner, as one word.
 template <class T>
-DIFFVBD_FN Vec3<T> held_for(const T* rows, int64_t entry, const bool (&holds)[4], Vec3<T> sum) {
+DIFFVBD_FN uint32_t& flags_of(const ContactAdjoints<T>& out, int64_t entry) {
+  return *reinterpret_cast<uint32_t*>(out.sent + 4 * entry);
+}
+
+// Adds up what the slots of all corners of a pair hold for that of an entry, as far as the bytes of `holds` say.
+constexpr uint32_t kAllHold = 0x01010101;
+template <class T>
+DIFFVBD_FN Vec3<T> held_for(const T* rows, int64_t entry, uint32_t holds, Vec3<T> sum) {
   Vec3<T> own[4];
   for (int i = 0; i < 4; ++i) {
-    own[i] = holds[i] ? vector_at(rows + (16 * (entry >> 2) + 4 * i + (entry & 3)) * 3) : zero3<T>();
+    own[i] = holds >> 8 * i & 1 ? vector_at(rows + (16 * (entry >> 2) + 4 * i + (entry & 3)) * 3) : zero3<T>();
   }
   for (int i = 0; i < 4; ++i) {
-    if (holds[i]) sum += own[i];
+    if (holds >> 8 * i & 1) sum += own[i];
   }
   return sum;
 }
@@ -343,20 +371,25 @@ DIFFVBD_FN void take_pairs(const ContactInputs<T>& in, const ContactAdjoints<T>&
                            int stride, Vec3<T>& now, Vec3<T>& prev) {
   const int64_t row = scene * in.corners + v;
   const PairList::Entries listed = in.listed.of(row);
-  for (int e = first; e < listed.count; e += stride) {
-    const int64_t entry = listed.first[e];
-    uint8_t* flags = out.sent + 4 * entry;
-    const bool holds[4] = {flags[0] != 0, flags[1] != 0, flags[2] != 0, flags[3] != 0};
-    if (!(holds[0] || holds[1] || holds[2] || holds[3])) continue;
-    now = held_for(out.rows, entry, holds, now);
-    flags[0] = flags[1] = flags[2] = flags[3] = 0;
+  constexpr int kAhead = 4;  // read before any is written: a device waits for memory once
+  for (int e = first; e < listed.count; e += kAhead * stride) {
+    int64_t entry[kAhead];
+    uint32_t holds[kAhead];
+    for (int a = 0; a < kAhead; ++a) {
+      entry[a] = e + a * stride < listed.count ? listed.first[e + a * stride] : -1;
+    }
+    for (int a = 0; a < kAhead; ++a) holds[a] = entry[a] < 0 ? 0 : flags_of(out, entry[a]);
+    for (int a = 0; a < kAhead; ++a) {
+      if (holds[a] == 0) continue;
+      now = held_for(out.rows, entry[a], holds[a], now);
+      flags_of(out, entry[a]) = 0;
+    }
   }
-  if (!in.lag) return;
   Vec3<T> moved = zero3<T>();
-  const PairList::Entries lagged = in.lagged.of(row);
+  const PairList::Entries lagged = in.lags_of(scene, v);
   for (int e = first; e < lagged.count; e += stride) {
     const int64_t entry = lagged.first[e];
-    moved = held_for(out.lag_rows, entry, {true, true, true, true}, moved);
+    moved = held_for(out.lag_rows, entry, kAllHold, moved);
     for (int i = 0; i < 4; ++i) {
       T* slot = out.lag_rows + (16 * (entry >> 2) + 4 * i + (entry & 3)) * 3;
       slot[0] = slot[1] = slot[2] = T(0);

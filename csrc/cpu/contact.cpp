@@ -179,7 +179,7 @@ void ContactScene<T>::assemble(int64_t begin, int64_t end) const {
     const auto at = [&](int i) { return to[i * kLanes]; };
     Vec3<T> g{at(0), at(1), at(2)};
     Sym3<T> H{at(3), at(4), at(5), at(6), at(7), at(8)};
-    add_lags(source_, v, 0, 1, h_, g, H);
+    add_lags(source_, v, h_, g, H);
     const T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
     for (int i = 0; i < kContactScalars; ++i) to[i * kLanes] = values[i];
   });
@@ -226,7 +226,7 @@ void ContactScene<T>::reverse(int64_t begin, int64_t end) const {
     const auto at = [&](int i) { return turn[i * kLanes]; };
     const Vec3<T> p{at(0), at(1), at(2)}, d_raw{at(3), at(4), at(5)};
     Vec3<T> own = zero3<T>();
-    reverse_lags(source_, *reverse_, v, 0, 1, h_, p, d_raw, own);
+    reverse_lags(source_, *reverse_, v, h_, p, d_raw, own);
     add_at(s_.x_bar + 4 * (block * kLanes + lane), own);
     add_at(reverse_->prev + 3 * (scene_ * in_.corners + v), -own);
   });

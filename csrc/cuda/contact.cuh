@@ -24,11 +24,6 @@ template <int share, class T>
 __device__ __forceinline__ void sum_share(Vec3<T>& a) {
   sum_share<share>(a.x), sum_share<share>(a.y), sum_share<share>(a.z);
 }
-template <int share, class T>
-__device__ __forceinline__ void sum_share(Sym3<T>& a) {
-  sum_share<share>(a.xx), sum_share<share>(a.xy), sum_share<share>(a.xz), sum_share<share>(a.yy);
-  sum_share<share>(a.yz), sum_share<share>(a.zz);
-}
 
 // Which of `share` threads of which vertex of the blocks [begin, end) a thread is.
 template <int share, class T>
@@ -53,7 +48,10 @@ struct Member {
               (in.lag && __ldg(in.lagged.ptr + row) < __ldg(in.lagged.ptr + row + 1));
   }
   __device__ __forceinline__ contact::PairList::Entries listed(const ContactInputs<T>& in) const {
-    return in.listed.of(scene * in.corners + vertex);
+    return vertex < 0 ? contact::PairList::Entries{nullptr, 0} : in.listed.of(scene * in.corners + vertex);
+  }
+  __device__ __forceinline__ contact::PairList::Entries lagged(const ContactInputs<T>& in) const {
+    return vertex < 0 ? contact::PairList::Entries{nullptr, 0} : in.lags_of(scene, vertex);
   }
   __device__ __forceinline__ int64_t row(const StepView<T>& s) const { return local * s.positions + position; }
   __device__ __forceinline__ SweepRows<T> rows(const StepView<T>& s) const {
@@ -61,34 +59,82 @@ struct Member {
   }
 };
 
-// Calls f(entry) for the entries of a vertex that are near(entry), in the share of `lane`. A whole warp first finds 32
-// of them, so that few of its threads wait for others.
+// The entries that threads of a warp have found, for vertices of theirs: 32 at a time are worked on, so that few threads
+// wait for others.
+struct Found {
+  int entry, thread;  // of the warp, that found it; entry < 0: none
+  __device__ __forceinline__ bool there() const { return entry >= 0; }
+  // What that thread has; the whole warp asks.
+  template <class U>
+  __device__ __forceinline__ U of(U own) const {
+    return __shfl_sync(kWholeWarp, own, thread);
+  }
+  template <class T>
+  __device__ __forceinline__ Vec3<T> of(const Vec3<T>& own) const {
+    return {of(own.x), of(own.y), of(own.z)};
+  }
+};
+
+// Calls f(Found) for the entries of the vertices of a warp that are near(entry); `lane`: which of the `share` threads of
+// its vertex a thread is. The whole warp calls f together.
 template <int share, class Near, class F>
 __device__ __forceinline__ void each_near(const contact::PairList::Entries& all, int lane, const Near& near,
                                           const F& f) {
-  if constexpr (share == kWide) {
-    __shared__ int found[kContactThreads / kWide][2 * kWide];
-    int* own = found[threadIdx.x / kWide];
-    int count = 0;
-    for (int first = 0; first < all.count; first += kWide) {
-      const int entry = first + lane < all.count ? all.first[first + lane] : -1;
-      const bool is_near = entry >= 0 && near(entry);
-      const unsigned lanes = __ballot_sync(kWholeWarp, is_near);
-      if (is_near) own[count + __popc(lanes & ((1u << lane) - 1))] = entry;
-      count += __popc(lanes);
-      __syncwarp();
-      if (count < kWide) continue;
-      count -= kWide;
-      f(own[count + lane]);
-      __syncwarp();
+  __shared__ Found found[kContactThreads / kSlice][2 * kSlice];
+  Found* own = found[threadIdx.x / kSlice];
+  const auto thread = static_cast<int>(threadIdx.x % kSlice);
+  int count = 0;
+  for (int first = 0; __any_sync(kWholeWarp, first < all.count); first += share) {
+    const int entry = first + lane < all.count ? all.first[first + lane] : -1;
+    const bool is_near = entry >= 0 && near(entry);
+    const unsigned threads = __ballot_sync(kWholeWarp, is_near);
+    if (is_near) own[count + __popc(threads & ((1u << thread) - 1))] = {entry, thread};
+    count += __popc(threads);
+    __syncwarp();
+    if (count < kSlice) continue;
+    count -= kSlice;
+    f(own[count + thread]);
+    __syncwarp();
+  }
+  if (count > 0) f(thread < count ? own[thread] : Found{-1, thread});
+  __syncwarp();
+}
+
+// Sums of the gradients and Hessians that the threads of a warp work out for each other's vertices. Of its vertex, which
+// `share` threads have, each keeps some of the numbers.
+template <int share, class T>
+struct BlockSums {
+  T (*slots)[kContactScalars];  // [32] of the warp, in shared memory
+  static constexpr int kOwn = (kContactScalars + share - 1) / share;
+  T own[kOwn] = {};
+  // Adds what the threads have for the vertices of others; `from`: whose vertex it is. In the order of threads.
+  __device__ __forceinline__ void add(const Vec3<T>& g, const Sym3<T>& H, int from) {
+    const int thread = threadIdx.x % kSlice, lane = thread % share;
+    const T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
+    for (int k = 0; k < kContactScalars; ++k) slots[thread][k] = values[k];
+    unsigned mine = 0;
+    for (int first = 0; first < kSlice; first += share) {
+      const unsigned threads = __ballot_sync(kWholeWarp, from / share * share == first);
+      if (thread - lane == first) mine = threads;
     }
-    if (lane < count) f(own[lane]);
-  } else {
-    for (int e = lane; e < all.count; e += share) {
-      if (near(all.first[e])) f(all.first[e]);
+    __syncwarp();
+    for (; mine; mine &= mine - 1) {
+      const T* slot = slots[__ffs(static_cast<int>(mine)) - 1];
+#pragma unroll
+      for (int i = 0; i < kOwn; ++i) {
+        if (lane + i * share < kContactScalars) own[i] += slot[lane + i * share];
+      }
+    }
+    __syncwarp();
+  }
+  __device__ __forceinline__ void store(T* to) const {
+    const int lane = threadIdx.x % share;
+#pragma unroll
+    for (int i = 0; i < kOwn; ++i) {
+      if (lane + i * share < kContactScalars) to[lane + i * share] = own[i];
     }
   }
-}
+};
 
 template <class T>
 __global__ void load_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in) {
@@ -104,49 +150,81 @@ __global__ void load_contact(const __grid_constant__ StepView<T> s, const __grid
 template <int share, class T>
 __global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
                                  int64_t begin, int64_t end) {
+  __shared__ T slots[kContactThreads / kSlice][kSlice][kContactScalars];
   const Member<share, T> at(s, in, begin, end);
   if (s.w.before && at.vertex >= 0 && at.lane == 0) store_row(s.w.before, at.row(s), load_row(s.w.x, at.row(s)));
   if (!__any_sync(kWholeWarp, at.touches)) return;
+  const SweepRows<T> rows = at.rows(s);
+  const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
+  const T h = s.parameters.time_step;
+  BlockSums<share, T> sums{slots[threadIdx.x / kSlice]};
   Vec3<T> g = zero3<T>();
   Sym3<T> H = diagonal(T(0));
-  if (at.touches) {
-    const SweepRows<T> rows = at.rows(s);
-    const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
-    const T h = s.parameters.time_step;
+  // A warp of one vertex adds up in its threads first.
+  const auto add = [&](const Found& found, const auto& f) {
+    const int vertex = found.of(at.vertex);
+    if constexpr (share == kSlice) {
+      if (found.there()) f(vertex, g, H);
+    } else {
+      Vec3<T> g_of = zero3<T>();
+      Sym3<T> H_of = diagonal(T(0));
+      if (found.there()) f(vertex, g_of, H_of);
+      sums.add(g_of, H_of, found.thread);
+    }
+  };
+  each_near<share>(
+      at.listed(in), at.lane, [&](int entry) { return contact::is_near(source, entry); },
+      [&](const Found& found) {
+        add(found, [&](int v, Vec3<T>& g_of, Sym3<T>& H_of) {
+          contact::add_barrier_of(source, found.entry, v, h, g_of, H_of);
+        });
+      });
+  if (in.lag) {
     each_near<share>(
-        at.listed(in), at.lane, [&](int64_t entry) { return contact::is_near(source, entry); },
-        [&](int64_t entry) { contact::add_barrier_of(source, entry, at.vertex, h, g, H); });
-    contact::add_lags(source, at.vertex, at.lane, share, h, g, H);
+        at.lagged(in), at.lane, [](int) { return true; },
+        [&](const Found& found) {
+          add(found, [&](int v, Vec3<T>& g_of, Sym3<T>& H_of) {
+            contact::add_lag_of(source, found.entry, v, h, g_of, H_of);
+          });
+        });
   }
-  sum_share<share>(g), sum_share<share>(H);
-  if (!at.touches || at.lane != 0) return;
-  const T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
-  for (int k = 0; k < kContactScalars; ++k) s.w.contact[at.row(s) * kContactScalars + k] = values[k];
+  if (at.touches) contact::add_floor_lags(source, at.vertex, at.lane, share, h, g, H);
+  if (share == kSlice || in.planes > 0) sums.add(g, H, threadIdx.x % kSlice);
+  if (at.touches) sums.store(s.w.contact + at.row(s) * kContactScalars);
 }
 
-// The threads of a vertex look at its pairs; the least that any of them lets pass is the limit.
+// The threads of a warp look at the pairs of its vertices; the least that any of them lets pass is the limit.
 template <int share, class T>
 __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
                               uint8_t* cut, int sweep, int64_t begin, int64_t end) {
+  __shared__ int exponents[kContactThreads / share];  // of the vertices of the block
   const Member<share, T> at(s, in, begin, end);
   const bool there = at.vertex >= 0;
-  int exponent = 0;
+  const RowsBefore<T> rows{at.rows(s), s.w.before + at.local * s.positions * kRow};
+  const contact::Source<T, RowsBefore<T>> source{in, at.scene, rows};
+  int exponent = 0, &limit = exponents[threadIdx.x / share];
   Vec3<T> from = zero3<T>(), d = zero3<T>();
+  T length = T(0), guard = T(0);
   if (there) {
-    const RowsBefore<T> rows{at.rows(s), s.w.before + at.local * s.positions * kRow};
-    const contact::Source<T, RowsBefore<T>> source{in, at.scene, rows};
     from = load_row(s.w.before, at.row(s)), d = load_row(s.w.x, at.row(s)) - from;
     exponent = contact::limit_by_room(source, at.vertex, from, d);
-    const T length = contact::length_of(d), guard = contact::guard_of(source, at.vertex);
-    const int least = exponent;
-    each_near<share>(
-        at.listed(in), at.lane, [&](int64_t entry) { return contact::may_limit(source, entry, length, guard, least); },
-        [&](int entry) { exponent = contact::limit_by_pair(source, entry, d, length, guard, exponent); });
+    length = contact::length_of(d), guard = contact::guard_of(source, at.vertex);
   }
-#pragma unroll
-  for (int offset = share / 2; offset > 0; offset /= 2) {
-    exponent = max(exponent, __shfl_xor_sync(kWholeWarp, exponent, offset));
-  }
+  if (at.lane == 0) limit = exponent;
+  __syncwarp();
+  const int least = exponent;
+  each_near<share>(
+      at.listed(in), at.lane, [&](int entry) { return contact::may_limit(source, entry, length, guard, least); },
+      [&](const Found& found) {
+        const Vec3<T> d_of = found.of(d);
+        const T length_of = found.of(length), guard_of = found.of(guard);
+        const int before = found.of(exponent), place = found.of(static_cast<int>(threadIdx.x)) / share;
+        if (found.there()) {
+          atomicMax(exponents + place, contact::limit_by_pair(source, found.entry, d_of, length_of, guard_of, before));
+        }
+        __syncwarp();
+        exponent = limit;
+      });
   if (!there || at.lane != 0) return;
   cut[(at.scene * s.sweeps + sweep) * in.num_vertices + at.vertex] = static_cast<uint8_t>(exponent);
   if (exponent > 0) store_row(s.w.x, at.row(s), from + contact::limit_of<T>(exponent) * d);
@@ -178,23 +256,43 @@ __global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __g
 }
 
 template <int share, class T>
-__global__ void reverse_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
+__global__ void __launch_bounds__(kContactThreads, 3)
+    reverse_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
                                 const __grid_constant__ ContactAdjoints<T> slots, int64_t begin, int64_t end) {
   const Member<share, T> at(s, in, begin, end);
   if (!__any_sync(kWholeWarp, at.touches)) return;
-  Vec3<T> own = zero3<T>();
+  const SweepRows<T> rows = at.rows(s);
+  const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
+  const T h = s.parameters.time_step;
+  Vec3<T> own = zero3<T>(), p = zero3<T>(), d_raw = zero3<T>();
   if (at.touches) {
     const T* turn = s.w.turn + 6 * at.row(s);
-    const SweepRows<T> rows = at.rows(s);
-    const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
-    const T h = s.parameters.time_step;
-    const Vec3<T> p = contact::vector_at(turn), d_raw = contact::vector_at(turn + 3);
+    p = contact::vector_at(turn), d_raw = contact::vector_at(turn + 3);
+  }
+  // f(vertex, p, d_raw) of whose entry has been found
+  const auto reverse = [&](const Found& found, const auto& f) {
+    const int vertex = found.of(at.vertex);
+    const Vec3<T> p_of = found.of(p), d_of = found.of(d_raw);
+    if (found.there()) f(vertex, p_of, d_of);
+  };
+  each_near<share>(
+      at.listed(in), at.lane, [&](int entry) { return contact::is_near(source, entry); },
+      [&](const Found& found) {
+        reverse(found, [&](int v, const Vec3<T>& p_of, const Vec3<T>& d_of) {
+          contact::reverse_barrier_of(source, slots, found.entry, v, h, p_of, d_of);
+        });
+      });
+  if (in.lag) {
     each_near<share>(
-        at.listed(in), at.lane, [&](int64_t entry) { return contact::is_near(source, entry); },
-        [&](int64_t entry) { contact::reverse_barrier_of(source, slots, entry, at.vertex, h, p, d_raw); });
-    contact::reverse_lags(source, slots, at.vertex, at.lane, share, h, p, d_raw, own);
+        at.lagged(in), at.lane, [](int) { return true; },
+        [&](const Found& found) {
+          reverse(found, [&](int v, const Vec3<T>& p_of, const Vec3<T>& d_of) {
+            contact::reverse_lag_of(source, slots, found.entry, v, h, p_of, d_of);
+          });
+        });
   }
   if (in.planes == 0) return;
+  if (at.touches) contact::reverse_floor_lags(source, slots, at.vertex, at.lane, share, h, p, d_raw, own);
   sum_share<share>(own);
   if (!at.touches || at.lane != 0) return;
   add_row(s.w.x_bar, at.row(s), own);

@@ -193,7 +193,7 @@ __global__ void finish_kernel(const IslandInputs<T> in, Workspace<T> work, int32
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     scene_sync_kernel(const IslandInputs<T> in, Workspace<T> work, int32_t* island) {
-  __shared__ int32_t unsettled, changes, label[kFewBodies];
+  __shared__ int32_t label[kFewBodies];
   // of islands; then what bodies sweep
   constexpr size_t kBytes = kThreads * sizeof(BodySum<T>), kBoxes = kFewBodies * sizeof(Bounds<T>);
   __shared__ __align__(16) unsigned char memory[kBytes < kBoxes ? kBoxes : kBytes];
@@ -223,34 +223,43 @@ __global__ void __launch_bounds__(kThreads)
     }
     __syncthreads();
   };
+  bool changes = false, unsettled = false;  // as a thread sees it
   const auto sweep = [&] {
     each(n, [&](int32_t i) {
       const bool stayed = work.stays[first + i];
       sweep_body(in, work, first + i, label[i]);
-      if (work.stays[first + i] != stayed) changes = 1;
+      changes = changes || work.stays[first + i] != stayed;
     });
   };
-  if (threadIdx.x == 0) unsettled = 0;
   each(n, [&](int32_t i) { label[i] = i, work.stays[first + i] = false; });
   for (int round = 0; round <= kJoins; ++round) {
-    if (threadIdx.x == 0) changes = 0;
+    changes = false;
     sum(), sweep();
     each(n, [&](int32_t i) { boxes[i] = work.boxes[first + i]; });
     for (auto i = static_cast<int32_t>(threadIdx.x / kWarp); i < n; i += kThreads / kWarp) {
       for (int32_t j = i + 1 + static_cast<int32_t>(threadIdx.x % kWarp); j < n; j += kWarp) {
         if (!overlap(boxes[i], boxes[j]) || root_of(label, i) == root_of(label, j)) continue;
-        changes = 1;
+        changes = true;
         if (round < kJoins) {
           unite(label, i, j);
         } else {
-          unsettled = 1;
+          unsettled = true;
         }
       }
     }
     if (!__syncthreads_or(changes)) break;  // nor will the next round
-    each(n, [&](int32_t i) {
-      shared_label(label, i).store(unsettled ? 0 : root_of(label, i), ::cuda::std::memory_order_relaxed);
-    });
+    const bool one = __syncthreads_or(unsettled);
+    int32_t root[kFewBodies / kThreads];  // all are read before any is written
+    for (int k = 0; k < kFewBodies / kThreads; ++k) {
+      const auto i = static_cast<int32_t>(threadIdx.x) + k * kThreads;
+      root[k] = one || n <= i ? 0 : root_of(label, i);
+    }
+    __syncthreads();
+    for (int k = 0; k < kFewBodies / kThreads; ++k) {
+      const auto i = static_cast<int32_t>(threadIdx.x) + k * kThreads;
+      if (i < n) label[i] = root[k];
+    }
+    __syncthreads();
   }
   sum(), sweep(), sum();
   each(n, [&](int32_t i) { island[first + i] = work.islands[first + label[i]].blocked ? -1 : label[i]; });

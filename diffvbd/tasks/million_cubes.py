@@ -37,6 +37,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, viz
+from diffvbd.scopes import is_captured
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
 
@@ -56,6 +57,8 @@ HEIGHT = 1.77  # of the middle of the ring [m]
 RADIUS, STIFFNESS = math.sqrt(3) * EDGE, 3e-3  # [m], [N/m]
 GROUP, QUICK_GROUP = 64, 16  # most bodies in a scene on the CPU
 PAIRS = 2  # room for pairs, for each body
+ROOM = 1.125  # in a CUDA graph of a rank: times the bodies that were near it, times its share of the room for pairs
+DEPTH = -1e3  # below the pad, where no body comes [m]
 MIXED = 8  # bodies whose places are mixed
 LAUNCH = 3.0  # first guess, upwards [m/s]
 STAGES = ("without contact", "with contact")
@@ -106,7 +109,7 @@ def problem(
                 learning_rate=rate,
                 before=partial(cubes.begin, touching=touching),
                 criterion="mean_error",
-                capturable=not dist.is_initialized(),  # what ranks exchange is not captured
+                capturable=not dist.is_initialized() or dist.get_backend() == "nccl",
                 name=name,
             )
             for name, count, rate, touching in zip(STAGES, version.counts, version.rates, (False, True), strict=True)
@@ -169,6 +172,7 @@ class Cubes:
         self.mine = dv.contact.Bodies(labels, self.mass.repeat(self.bodies))
         # on each rank room for the pairs of all: where one rank has enough, many have
         self.contact, self.max_pairs = False, PAIRS * bodies + 256
+        self.room = 0  # in a CUDA graph, for bodies near those of this rank: more than steps outside of it have found
 
         self.velocity = torch.tensor([0.0, version.launch, 0.0], **like).repeat(bodies, 1).requires_grad_()
         self.material = torch.zeros(bodies, **like, requires_grad=True)
@@ -181,25 +185,45 @@ class Cubes:
         if step >= self.version.target_step:
             return None
         centers = self.mine.centers(x.reshape(1, -1, 3))[0]
-        force = self.penalty(centers) if self.bodies == self.version.bodies else self.penalty_by_all(centers)
+        alone = self.bodies == self.version.bodies
+        force = self.penalty(centers, self.max_pairs) if alone else self.penalty_by_all(centers, is_captured(x))
         return self.mine.forces(force[None]).view_as(x)
 
-    def penalty(self, centers: Tensor) -> Tensor:
-        """Forces between some bodies [N]. All see each other: they are one scene."""
-        return dv.contact.center_of_mass_penalty(centers, None, RADIUS, STIFFNESS, max_pairs=self.max_pairs)
+    def penalty(self, centers: Tensor, most: int) -> Tensor:
+        """Forces between some bodies [N]. All see each other: they are one scene. most: Room for pairs."""
+        return dv.contact.center_of_mass_penalty(centers, None, RADIUS, STIFFNESS, max_pairs=most)
 
-    def penalty_by_all(self, mine: Tensor) -> Tensor:
+    def penalty_by_all(self, mine: Tensor, captured: bool) -> Tensor:
         """Forces on the bodies of this rank by those of all ranks [N], with the bits of one rank.
 
         The penalty is that of the bodies of this rank and of those of others that are near them. All pairs of a body of
-        this rank are among them, in the order that they have among all bodies, so its sums are the same.
+        this rank are among them, in the order that they have among all bodies, so its sums are the same. A CUDA graph
+        has `room` for so many; what it has not, are points far from all and from each other. Where it has too little,
+        forces are NaN.
         """
-        centers = self.all_of(mine)
-        near = rows_near(mine.detach(), centers.detach())
-        force = self.penalty(centers.index_select(0, near))
+        centers, most = self.all_of(mine), self.max_pairs
+        near = is_near(mine.detach(), centers.detach())
+        if captured:
+            rows = torch.nonzero_static(near, size=self.room, fill_value=len(centers))[:, 0]
+            points = centers.index_select(0, rows.clamp(max=len(centers) - 1))
+            points = torch.where((rows < len(centers))[:, None], points, self.far())
+            most = min(most, int(ROOM * most * self.room / len(centers)) + 256)
+        else:
+            rows = near.nonzero()[:, 0]
+            points = centers.index_select(0, rows)
+            self.room = max(self.room, int(ROOM * len(rows)) + 256)
+        force = self.penalty(points, most)
+        whole = force.new_zeros((len(centers) + 1, 3)).index_copy(0, rows, force)[:-1]
+        if captured:
+            whole = whole * torch.where(near.sum() > self.room, torch.nan, 1.0).to(whole.dtype)
         # Forces on bodies of other ranks lack pairs here, and nobody reads them. But these forces depend on the bodies
         # of this rank, too: the backward of `own` brings the gradient of each, and the penalty's goes on from there.
-        return self.own(force.new_zeros(centers.shape).index_copy(0, near, force))
+        return self.own(whole)
+
+    def far(self) -> Tensor:
+        """Points that no body comes near [m], each twice RADIUS from the next, shape [room, 3]."""
+        along = 2 * RADIUS * torch.arange(self.room, device=self.target.device, dtype=self.target.dtype)
+        return torch.stack([along, torch.full_like(along, DEPTH), torch.zeros_like(along)], 1)
 
     def own(self, values: Tensor) -> Tensor:
         """Of all bodies [N, ...] -> of those of this rank."""
@@ -257,15 +281,15 @@ class Cubes:
         viz.cloud_animation(path, self.frames(every=4), 4 * TIME_STEP)
 
 
-def rows_near(points: Tensor, others: Tensor) -> Tensor:
-    """Which of others [M, 3] may be closer to one of the points than RADIUS: indices, ascending.
+def is_near(points: Tensor, others: Tensor) -> Tensor:
+    """Whether others [M, 3] may be closer to one of the points than RADIUS, bool [M].
 
     All, where a number is not finite: then the search for pairs raises on every rank, as it does on one.
     """
     low, high = points.aminmax(dim=0)
     apart = (others - others.clamp(low, high)).abs().amax(1)  # from the box around the points
     far = (apart > 1.01 * RADIUS) & others.isfinite().all()  # by more than what rounding can move
-    return (~far).nonzero()[:, 0]
+    return ~far
 
 
 def protocol(cube: dv.TetMesh, version: Version) -> dict[str, Any]:
