@@ -134,7 +134,7 @@ def _check_room(cubes: Cubes, mine: torch.Tensor, near: int) -> None:
         found.append((force, *torch.autograd.grad((force * mine.sin()).sum(), leaf)))
     assert cubes.room > near and all(torch.equal(*same) for same in zip(*found, strict=True))
     cubes.room = near - 1
-    assert cubes.penalty_by_all(mine, True).isnan().all()
+    assert cubes.penalty_by_all(mine, True).isnan().any()
 
 
 def launch(out: Path) -> dict[str, Any]:

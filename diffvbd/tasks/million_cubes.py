@@ -57,7 +57,7 @@ HEIGHT = 1.77  # of the middle of the ring [m]
 RADIUS, STIFFNESS = math.sqrt(3) * EDGE, 3e-3  # [m], [N/m]
 GROUP, QUICK_GROUP = 64, 16  # most bodies in a scene on the CPU
 PAIRS = 2  # room for pairs, for each body
-ROOM = 1.125  # in a CUDA graph of a rank: times the bodies that were near it, times its share of the room for pairs
+ROOM = 1.05  # in a CUDA graph of a rank, times the most bodies that were near those of the rank
 DEPTH = -1e3  # below the pad, where no body comes [m]
 MIXED = 8  # bodies whose places are mixed
 LAUNCH = 3.0  # first guess, upwards [m/s]
@@ -198,7 +198,7 @@ class Cubes:
 
         The penalty is that of the bodies of this rank and of those of others that are near them. All pairs of a body of
         this rank are among them, in the order that they have among all bodies, so its sums are the same. A CUDA graph
-        has `room` for so many; what it has not, are points far from all and from each other. Where it has too little,
+        has `room` for so many, of which the unused are points far from all and from each other; where there are more,
         forces are NaN.
         """
         centers, most = self.all_of(mine), self.max_pairs
@@ -207,18 +207,17 @@ class Cubes:
             rows = torch.nonzero_static(near, size=self.room, fill_value=len(centers))[:, 0]
             points = centers.index_select(0, rows.clamp(max=len(centers) - 1))
             points = torch.where((rows < len(centers))[:, None], points, self.far())
-            most = min(most, int(ROOM * most * self.room / len(centers)) + 256)
+            most = min(most, most * self.room // len(centers) + 256)
         else:
             rows = near.nonzero()[:, 0]
             points = centers.index_select(0, rows)
             self.room = max(self.room, int(ROOM * len(rows)) + 256)
         force = self.penalty(points, most)
-        whole = force.new_zeros((len(centers) + 1, 3)).index_copy(0, rows, force)[:-1]
         if captured:
-            whole = whole * torch.where(near.sum() > self.room, torch.nan, 1.0).to(whole.dtype)
+            force = force * torch.where(near.sum() > self.room, torch.nan, 1.0).to(force.dtype)
         # Forces on bodies of other ranks lack pairs here, and nobody reads them. But these forces depend on the bodies
         # of this rank, too: the backward of `own` brings the gradient of each, and the penalty's goes on from there.
-        return self.own(whole)
+        return self.own(force.new_zeros((len(centers) + 1, 3)).index_copy(0, rows, force)[:-1])
 
     def far(self) -> Tensor:
         """Points that no body comes near [m], each twice RADIUS from the next, shape [room, 3]."""
