@@ -142,7 +142,8 @@ def _rows(scene: str, launches: list[dict[str, str]]) -> list[Row]:
 
 def _named(text: str) -> str:
     """A kernel's name; with what it is given where that is all that tells two apart."""
-    found = re.search(r"(\w+)(<[^(]*>)?\((?:[\w:]*::)?(\w+)?", text)
+    plain = re.sub(r"\((?:int|bool|long|unsigned int)\)", "", text)  # of template arguments
+    found = re.search(r"(\w+)(<[^(]*>)?\((?:[\w:]*::)?(\w+)?", plain)
     if not found:
         return text
     name, _, first = found.groups()
