@@ -1,16 +1,20 @@
 """What bounds each kernel on a GPU: NVIDIA's ncu over a step and its reverse, of scenes of each kind.
 
-A scene is a process of its own, which warms up and then makes one step and its gradients under ncu. Of scenes with
-contact, which make hundreds of launches, every tenth launch of a kernel is looked at. Of each kernel that takes more
-than a small share of the time that was looked at there is a row: its time, how it fills the device, and which share of
-the device's rates it reaches. ncu fixes the clock at its base, below what other benchmarks run at.
+Each scene is a process of its own, which warms up and then makes one step and its gradients, twice: once for the time
+and launches of each kernel, by torch's profiler, and once under ncu, which tells how a kernel fills the device and what
+share of the device's rates it reaches. Of scenes with contact, which make hundreds of launches, ncu looks at every
+tenth launch of a kernel. A kernel that takes more than a small share of the time has a row. ncu fixes the clock at its
+base, below what the times are taken at, and leaves the caches as they are.
 """
 
 from __future__ import annotations
 
 import csv
+import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -18,6 +22,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
+from torch.profiler import ProfilerActivity, profile
 
 import diffvbd as dv
 from bench import gpu_contact
@@ -25,10 +30,10 @@ from bench.common import markdown_table
 from bench.gpu_measure import Card, Work, forward_reverse, model_of, scene_of
 
 DEVICE = "cuda"
-LEAST = 0.03  # share of the time of a step's kernels from which a kernel has a row
+LEAST = 0.03  # share of the time of all kernels from which one has a row
 MOST = 0.6  # of a rate of the device, from which it is what bounds a kernel
 LONGEST = 120  # [s] of a scene
-SECONDS, BLOCKS, REGISTERS = "gpu__time_duration.sum", "launch__grid_size", "launch__registers_per_thread"
+BLOCKS, REGISTERS, CYCLES = "launch__grid_size", "launch__registers_per_thread", "sm__cycles_elapsed.max"
 RATES = {
     "memory": "dram__throughput.avg.pct_of_peak_sustained_elapsed",
     "L2 cache": "lts__throughput.avg.pct_of_peak_sustained_elapsed",
@@ -48,7 +53,6 @@ STALLS = {
     "branch_resolving": "branches",
     "no_instruction": "fetch of instructions",
 }
-UNITS = {"nsecond": 1e-9, "usecond": 1e-6, "msecond": 1e-3, "second": 1.0, "ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 Row = dict[str, Any]
 
 
@@ -82,58 +86,76 @@ def run(quick: bool, device: str = DEVICE, only: str = "") -> dict[str, Any]:
     if shutil.which("ncu") is None:
         raise SystemExit("ncu: expected NVIDIA Nsight Compute on the path, and it is not there")
     names = [name for name in only.split(";") if name] or list(SCENES)[: 1 if quick else None]
+    if unknown := [name for name in names if name not in SCENES]:
+        raise SystemExit(f"only: expected names among {'; '.join(SCENES)}, got {'; '.join(unknown)}")
     rows: list[Row] = []
+    failed: dict[str, str] = {}
     for name in names:
         began = time.perf_counter()
         try:
-            rows += _rows(name, list(_launches(name, device)))
+            rows += _rows(name, _times(name, device), list(_launches(name, device)))
         except (subprocess.TimeoutExpired, RuntimeError) as error:  # the others still come
-            print(f"{name}: {error}", file=sys.stderr, flush=True)
-        print(f"{name}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
-    return {"rows": rows}
+            failed[name] = str(error).strip()[-300:]
+        print(f"{name}: {time.perf_counter() - began:.0f} s {failed.get(name, '')}", file=sys.stderr, flush=True)
+    if not rows:
+        raise SystemExit(f"no scene ended: {failed}")
+    return {"rows": rows, "failed": failed}
+
+
+def _process(command: list[str], name: str) -> str:
+    """What a process writes; with it end all that it has begun."""
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                          start_new_session=True) as process:  # fmt: skip
+        try:
+            out, err = process.communicate(timeout=LONGEST)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            raise
+    if process.returncode:
+        raise RuntimeError(f"{name}: expected status 0, got {process.returncode}:\n{(out + err)[-2000:]}")
+    return out
+
+
+def _times(name: str, device: str) -> dict[str, tuple[int, float]]:
+    """Launches and seconds of each kernel of a scene."""
+    out = _process([sys.executable, "-m", "bench.kernels", device, name, "times"], name)
+    return {kernel: tuple(found) for kernel, found in json.loads(out.splitlines()[-1]).items()}
 
 
 def _launches(name: str, device: str) -> Iterator[dict[str, str]]:
-    """What ncu says of each launch of a scene, with units as a prefix where it gives any."""
-    metrics = ",".join((SECONDS, BLOCKS, REGISTERS, *RATES.values(), WARPS, ISSUES, THREADS,
+    """What ncu says of launches of a scene."""
+    metrics = ",".join((BLOCKS, REGISTERS, CYCLES, *RATES.values(), WARPS, ISSUES, THREADS,
                         *(STALL.format(s) for s in STALLS)))  # fmt: skip
-    command = ["ncu", "--profile-from-start", "off", *SCENES[name][1], "--metrics", metrics, "--csv", "--page", "raw"]
-    command += [sys.executable, "-m", "bench.kernels", device, name]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST, check=False)
-    lines = [line for line in done.stdout.splitlines() if line.startswith('"')]
-    if done.returncode or len(lines) < 3:
-        text = (done.stdout + done.stderr)[-2000:]
-        raise RuntimeError(f"{name}: expected launches, got status {done.returncode}:\n{text}")
-    header, units, *rows = csv.reader(lines)
+    command = ["ncu", "--profile-from-start", "off", "--cache-control", "none", *SCENES[name][1], "--metrics", metrics,
+               "--csv", "--page", "raw", sys.executable, "-m", "bench.kernels", device, name]  # fmt: skip
+    lines = [line for line in _process(command, name).splitlines() if line.startswith('"')]
+    if len(lines) < 3:
+        raise RuntimeError(f"{name}: expected launches, got none")
+    header, _, *rows = csv.reader(lines)
     for row in rows:
-        yield {key: f"{unit} {value}" if key == SECONDS else value
-               for key, unit, value in zip(header, units, row, strict=True)}  # fmt: skip
+        yield dict(zip(header, row, strict=True))
 
 
-def _rows(scene: str, launches: list[dict[str, str]]) -> list[Row]:
-    def number(launch: dict[str, str], name: str) -> float:
-        return float(launch[name].replace(",", ""))
-
-    def seconds(launch: dict[str, str]) -> float:
-        unit, value = launch[SECONDS].split()
-        return UNITS[unit] * float(value.replace(",", ""))
-
-    total, of = sum(map(seconds, launches)), {}
+def _rows(scene: str, times: dict[str, tuple[int, float]], launches: list[dict[str, str]]) -> list[Row]:
+    of: dict[str, list[dict[str, str]]] = {}
     for launch in launches:
         of.setdefault(_named(launch["Kernel Name"]), []).append(launch)
-    rows = []
-    for kernel, own in of.items():
-        span = sum(map(seconds, own))
-        if span < LEAST * total:
+    total, rows = sum(seconds for _, seconds in times.values()), []
+    for kernel, (count, seconds) in times.items():
+        if seconds < LEAST * total or kernel not in of:
             continue
 
-        def mean(name: str, own: list[dict[str, str]] = own, span: float = span) -> float:
-            return sum(seconds(launch) * number(launch, name) for launch in own) / span
+        def each(name: str, own: list[dict[str, str]] = of[kernel]) -> list[float]:
+            return [float(launch[name].replace(",", "")) for launch in own]
 
-        row: Row = {"scene": scene, "kernel": kernel, "launches": len(own), "share": span / total,
-                    "seconds": span / len(own), "blocks": max(number(a, BLOCKS) for a in own),
-                    "registers": max(number(a, REGISTERS) for a in own), "warps": mean(WARPS) / 100,
-                    "issues": mean(ISSUES) / 100, "threads": mean(THREADS)}  # fmt: skip
+        def mean(name: str, each: Callable[[str], list[float]] = each) -> float:  # by time
+            weights = each(CYCLES)
+            return sum(w * value for w, value in zip(weights, each(name), strict=True)) / sum(weights)
+
+        row: Row = {"scene": scene, "kernel": kernel, "launches": count, "share": seconds / total,
+                    "seconds": seconds / count, "looked at": len(of[kernel]), "blocks": max(each(BLOCKS)),
+                    "registers": max(each(REGISTERS)), "warps": mean(WARPS) / 100, "issues": mean(ISSUES) / 100,
+                    "threads": mean(THREADS)}  # fmt: skip
         row |= {f"rate of {name}": mean(metric) / 100 for name, metric in RATES.items()}
         row |= {f"stalled by {stall}": mean(STALL.format(stall)) for stall in STALLS}
         rows.append(row | {"bound": _bound(row)})
@@ -165,14 +187,28 @@ def markdown(results: dict[str, Any]) -> str:
     rows = [(r["scene"], f"`{r['kernel']}`", percent(r["share"]), r["launches"], f"{1e6 * r['seconds']:.3g}",
              int(r["blocks"]), int(r["registers"]), percent(r["warps"]), percent(r["issues"]), f"{r['threads']:.0f}",
              *(percent(r[f"rate of {name}"]) for name in RATES), r["bound"]) for r in results["rows"]]  # fmt: skip
-    return "## What bounds each kernel\n\n" + markdown_table(header, rows)
+    failed = "".join(f"\nNot measured: {name}.\n" for name in results["failed"])
+    return "## What bounds each kernel\n\n" + markdown_table(header, rows) + failed
 
 
 def main(arguments: list[str]) -> None:
-    """The scenes themselves, inside ncu."""
-    work = SCENES[arguments[1]][0](Card(torch.device(arguments[0]), False))
+    """The scenes themselves, inside ncu; or, with "times", inside torch's profiler, printed as JSON."""
+    device, name, *times = arguments
+    work = SCENES[name][0](Card(torch.device(device), False))
     work()
     torch.cuda.synchronize()
+    if times:
+        with profile(activities=[ProfilerActivity.CUDA]) as profiled:
+            work()
+            torch.cuda.synchronize()
+        found: dict[str, list[float]] = {}
+        for event in profiled.events() or ():
+            if event.device_type.name == "CUDA" and "(" in event.name and not event.name.startswith("Mem"):
+                entry = found.setdefault(_named(event.name), [0, 0.0])
+                entry[0] += 1
+                entry[1] += 1e-6 * event.self_device_time_total
+        print(json.dumps(found))
+        return
     torch.cuda.profiler.start()
     work()
     torch.cuda.synchronize()

@@ -118,23 +118,32 @@ def forces(out: Path) -> dict[str, Any]:
         if dist.is_initialized():
             near = int(is_near(cubes.own(places), places).sum())
             assert near == cubes.bodies if scale[0] == 1 else near > cubes.bodies
-            _check_room(cubes, cubes.own(places), near)
+            _check_room(cubes, places)
     broken = places.index_fill(0, torch.tensor([40]), math.nan)  # of one rank; all have to say so
     with pytest.raises(ValueError, match="expected finite values, got nan") as error:
         cubes.push(0, cubes.own(broken)[:, None].expand(-1, 8, -1).reshape(cubes.shape), x)
     return found | {"error": str(error.value)}
 
 
-def _check_room(cubes: Cubes, mine: torch.Tensor, near: int) -> None:
-    """In a CUDA graph bodies nearby have a fixed room, which is larger than they need; if it is not, all is NaN."""
-    found = []
-    for captured in (False, True):
-        leaf = mine.clone().requires_grad_()
-        force = cubes.penalty_by_all(leaf, captured)
-        found.append((force, *torch.autograd.grad((force * mine.sin()).sum(), leaf)))
-    assert cubes.room > near and all(torch.equal(*same) for same in zip(*found, strict=True))
-    cubes.room = near - 1
-    assert cubes.penalty_by_all(mine, True).isnan().any()
+def _check_room(cubes: Cubes, places: Tensor) -> None:
+    """In a CUDA graph bodies nearby have a fixed room, of which some may be left; where it is too small all is NaN, and
+    the next graph has more."""
+    near = is_near(cubes.own(places), places)
+    whole, some = (places.clone().requires_grad_() for _ in range(2))
+    rows, force = cubes.penalty_in_graph(whole, near)
+    used = rows < len(places)
+    assert torch.equal(rows[used], near.nonzero()[:, 0]) and not force[~used].any()
+    alone = cubes.penalty(some[near], cubes.max_pairs)
+    assert torch.equal(force[used], alone)
+    gradients = [
+        torch.autograd.grad((f * f.detach().sin()).sum(), leaf)[0] for f, leaf in ((force, whole), (alone, some))
+    ]
+    assert torch.equal(*gradients)
+    cubes.room = int(near.sum()) - 1
+    assert cubes.penalty_in_graph(whole, near)[1].isnan().all()
+    before = cubes.multiple
+    cubes.make_room(int(near.sum()))
+    assert cubes.room >= int(near.sum()) and cubes.multiple == 2 * before
 
 
 def launch(out: Path) -> dict[str, Any]:

@@ -189,7 +189,7 @@ DIFFVBD_FN void add_lag_of(const Source<T, Positions>& s, int64_t entry, int v, 
   const int own = static_cast<int>(entry & 3);
   add_lagged(lag, own, s.together(record, v), s.motion(record, lag), h, in.friction_eps, g, H);
 }
-// And the floor's planes, every `stride`-th from `first` on.
+// And friction on the floor's planes: every `stride`-th plane from `first` on.
 template <class T, class Positions>
 DIFFVBD_FN void add_floor_lags(const Source<T, Positions>& s, int v, int first, int stride, T h, Vec3<T>& g,
                                Sym3<T>& H) {
@@ -198,7 +198,7 @@ DIFFVBD_FN void add_floor_lags(const Source<T, Positions>& s, int v, int first, 
     if (lag.active()) add_lagged(lag, 0, T(1), s.x(v) - s.x_prev(v), h, s.in.friction_eps, g, H);
   }
 }
-// All of them, of one thread.
+// Adds all of what rubs at vertex v.
 template <class T, class Positions>
 DIFFVBD_FN void add_lags(const Source<T, Positions>& s, int v, T h, Vec3<T>& g, Sym3<T>& H) {
   const PairList::Entries lagged = s.in.lags_of(s.scene, v);
@@ -300,7 +300,7 @@ DIFFVBD_FN void reverse_barrier_of(const Source<T, Positions>& s, const ContactA
   out.kappa[entry] += bar.kappa;
 }
 
-// And of what add_lag_of() added.
+// The adjoint of what add_lag_of() added.
 template <class T, class Positions>
 DIFFVBD_FN void reverse_lag_of(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int64_t entry, int v, T h,
                                const Vec3<T>& p, const Vec3<T>& d_raw) {
@@ -321,7 +321,7 @@ DIFFVBD_FN void reverse_lag_of(const Source<T, Positions>& s, const ContactAdjoi
   add_at(out.lag + kLagScalars * entry, by_lag);
   add_at(out.lag_rows + 12 * entry, rows);
 }
-// Of what the floor's planes added; toward v itself, which is alone there.
+// The adjoint of what add_floor_lags() added, and what of it goes to v itself.
 template <class T, class Positions>
 DIFFVBD_FN void reverse_floor_lags(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int v, int first,
                                    int stride, T h, const Vec3<T>& p, const Vec3<T>& d_raw, Vec3<T>& own) {
@@ -336,7 +336,7 @@ DIFFVBD_FN void reverse_floor_lags(const Source<T, Positions>& s, const ContactA
     own += m_bar;
   }
 }
-// All of them, of one thread.
+// The adjoint of add_lags().
 template <class T, class Positions>
 DIFFVBD_FN void reverse_lags(const Source<T, Positions>& s, const ContactAdjoints<T>& out, int v, T h, const Vec3<T>& p,
                              const Vec3<T>& d_raw, Vec3<T>& own) {
@@ -375,9 +375,7 @@ DIFFVBD_FN void take_pairs(const ContactInputs<T>& in, const ContactAdjoints<T>&
   for (int e = first; e < listed.count; e += kAhead * stride) {
     int64_t entry[kAhead];
     uint32_t holds[kAhead];
-    for (int a = 0; a < kAhead; ++a) {
-      entry[a] = e + a * stride < listed.count ? listed.first[e + a * stride] : -1;
-    }
+    for (int a = 0; a < kAhead; ++a) entry[a] = e + a * stride < listed.count ? listed.first[e + a * stride] : -1;
     for (int a = 0; a < kAhead; ++a) holds[a] = entry[a] < 0 ? 0 : flags_of(out, entry[a]);
     for (int a = 0; a < kAhead; ++a) {
       if (holds[a] == 0) continue;

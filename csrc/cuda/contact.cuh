@@ -1,7 +1,7 @@
 // Kernels of contact: several threads for each vertex of a color, kShare for each corner point, or one for each pair.
 #pragma once
 
-#include "contact.h"
+#include "contact_near.cuh"
 #include "contact_rows.cuh"
 
 namespace diffvbd::cuda {
@@ -10,7 +10,7 @@ namespace {
 using contact::ContactAdjoints;
 using contact::ContactInputs;
 
-constexpr int kShare = 8, kContactThreads = 128;
+constexpr int kShare = 8;
 // Threads for a vertex where its color has few, which do not fill the device: its pairs are waited for one by one.
 constexpr int kWide = 32;
 constexpr int64_t kFewVertices = 2048;  // of a color, in all scenes
@@ -56,83 +56,6 @@ struct Member {
   __device__ __forceinline__ int64_t row(const StepView<T>& s) const { return local * s.positions + position; }
   __device__ __forceinline__ SweepRows<T> rows(const StepView<T>& s) const {
     return {s.w.x + local * s.positions * kRow, s.w.position, first, last};
-  }
-};
-
-// The entries that threads of a warp have found, for vertices of theirs: 32 at a time are worked on, so that few threads
-// wait for others.
-struct Found {
-  int entry, thread;  // of the warp, that found it; entry < 0: none
-  __device__ __forceinline__ bool there() const { return entry >= 0; }
-  // What that thread has; the whole warp asks.
-  template <class U>
-  __device__ __forceinline__ U of(U own) const {
-    return __shfl_sync(kWholeWarp, own, thread);
-  }
-  template <class T>
-  __device__ __forceinline__ Vec3<T> of(const Vec3<T>& own) const {
-    return {of(own.x), of(own.y), of(own.z)};
-  }
-};
-
-// Calls f(Found) for the entries of the vertices of a warp that are near(entry); `lane`: which of the `share` threads of
-// its vertex a thread is. The whole warp calls f together.
-template <int share, class Near, class F>
-__device__ __forceinline__ void each_near(const contact::PairList::Entries& all, int lane, const Near& near,
-                                          const F& f) {
-  __shared__ Found found[kContactThreads / kSlice][2 * kSlice];
-  Found* own = found[threadIdx.x / kSlice];
-  const auto thread = static_cast<int>(threadIdx.x % kSlice);
-  int count = 0;
-  for (int first = 0; __any_sync(kWholeWarp, first < all.count); first += share) {
-    const int entry = first + lane < all.count ? all.first[first + lane] : -1;
-    const bool is_near = entry >= 0 && near(entry);
-    const unsigned threads = __ballot_sync(kWholeWarp, is_near);
-    if (is_near) own[count + __popc(threads & ((1u << thread) - 1))] = {entry, thread};
-    count += __popc(threads);
-    __syncwarp();
-    if (count < kSlice) continue;
-    count -= kSlice;
-    f(own[count + thread]);
-    __syncwarp();
-  }
-  if (count > 0) f(thread < count ? own[thread] : Found{-1, thread});
-  __syncwarp();
-}
-
-// Sums of the gradients and Hessians that the threads of a warp work out for each other's vertices. Of its vertex, which
-// `share` threads have, each keeps some of the numbers.
-template <int share, class T>
-struct BlockSums {
-  T (*slots)[kContactScalars];  // [32] of the warp, in shared memory
-  static constexpr int kOwn = (kContactScalars + share - 1) / share;
-  T own[kOwn] = {};
-  // Adds what the threads have for the vertices of others; `from`: whose vertex it is. In the order of threads.
-  __device__ __forceinline__ void add(const Vec3<T>& g, const Sym3<T>& H, int from) {
-    const int thread = threadIdx.x % kSlice, lane = thread % share;
-    const T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
-    for (int k = 0; k < kContactScalars; ++k) slots[thread][k] = values[k];
-    unsigned mine = 0;
-    for (int first = 0; first < kSlice; first += share) {
-      const unsigned threads = __ballot_sync(kWholeWarp, from / share * share == first);
-      if (thread - lane == first) mine = threads;
-    }
-    __syncwarp();
-    for (; mine; mine &= mine - 1) {
-      const T* slot = slots[__ffs(static_cast<int>(mine)) - 1];
-#pragma unroll
-      for (int i = 0; i < kOwn; ++i) {
-        if (lane + i * share < kContactScalars) own[i] += slot[lane + i * share];
-      }
-    }
-    __syncwarp();
-  }
-  __device__ __forceinline__ void store(T* to) const {
-    const int lane = threadIdx.x % share;
-#pragma unroll
-    for (int i = 0; i < kOwn; ++i) {
-      if (lane + i * share < kContactScalars) to[lane + i * share] = own[i];
-    }
   }
 };
 
@@ -183,9 +106,8 @@ __global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __
     each_near<share>(
         at.lagged(in), at.lane, [](int) { return true; },
         [&](const Found& found) {
-          add(found, [&](int v, Vec3<T>& g_of, Sym3<T>& H_of) {
-            contact::add_lag_of(source, found.entry, v, h, g_of, H_of);
-          });
+          add(found,
+              [&](int v, Vec3<T>& g_of, Sym3<T>& H_of) { contact::add_lag_of(source, found.entry, v, h, g_of, H_of); });
         });
   }
   if (at.touches) contact::add_floor_lags(source, at.vertex, at.lane, share, h, g, H);
@@ -258,7 +180,7 @@ __global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __g
 template <int share, class T>
 __global__ void __launch_bounds__(kContactThreads, 3)
     reverse_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
-                                const __grid_constant__ ContactAdjoints<T> slots, int64_t begin, int64_t end) {
+                    const __grid_constant__ ContactAdjoints<T> slots, int64_t begin, int64_t end) {
   const Member<share, T> at(s, in, begin, end);
   if (!__any_sync(kWholeWarp, at.touches)) return;
   const SweepRows<T> rows = at.rows(s);

@@ -249,6 +249,7 @@ __global__ void __launch_bounds__(kThreads)
     }
     if (!__syncthreads_or(changes)) break;  // nor will the next round
     const bool one = __syncthreads_or(unsettled);
+    static_assert(kFewBodies % kThreads == 0);
     int32_t root[kFewBodies / kThreads];  // all are read before any is written
     for (int k = 0; k < kFewBodies / kThreads; ++k) {
       const auto i = static_cast<int32_t>(threadIdx.x) + k * kThreads;

@@ -37,7 +37,6 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import losses, viz
-from diffvbd.scopes import is_captured
 from diffvbd.tasks.problem import Problem, Settings, Stage
 from diffvbd.tasks.progress import Row
 
@@ -170,9 +169,11 @@ class Cubes:
         self.x = (pad[:, None] + torch.tensor([1.0, SQUEEZE, 1.0], **like) * corners).reshape(self.shape)
         labels = torch.arange(self.bodies, device=device).repeat_interleave(cube.num_vertices)
         self.mine = dv.contact.Bodies(labels, self.mass.repeat(self.bodies))
-        # on each rank room for the pairs of all: where one rank has enough, many have
         self.contact, self.max_pairs = False, PAIRS * bodies + 256
-        self.room = 0  # in a CUDA graph, for bodies near those of this rank: more than steps outside of it have found
+        # Of several ranks each has room for the pairs of all: where one rank has enough, many have. In a CUDA graph
+        # that would cost time. There it has room for some bodies, more than steps outside of it have found, and for
+        # their share of all pairs, or a multiple of it after a graph that had too little.
+        self.room, self.multiple, self.captured = 0, 1, False
 
         self.velocity = torch.tensor([0.0, version.launch, 0.0], **like).repeat(bodies, 1).requires_grad_()
         self.material = torch.zeros(bodies, **like, requires_grad=True)
@@ -186,43 +187,52 @@ class Cubes:
             return None
         centers = self.mine.centers(x.reshape(1, -1, 3))[0]
         alone = self.bodies == self.version.bodies
-        force = self.penalty(centers, self.max_pairs) if alone else self.penalty_by_all(centers, is_captured(x))
+        force = self.penalty(centers, self.max_pairs) if alone else self.penalty_by_all(centers)
         return self.mine.forces(force[None]).view_as(x)
 
     def penalty(self, centers: Tensor, most: int) -> Tensor:
         """Forces between some bodies [N]. All see each other: they are one scene. most: Room for pairs."""
         return dv.contact.center_of_mass_penalty(centers, None, RADIUS, STIFFNESS, max_pairs=most)
 
-    def penalty_by_all(self, mine: Tensor, captured: bool) -> Tensor:
+    def penalty_by_all(self, mine: Tensor) -> Tensor:
         """Forces on the bodies of this rank by those of all ranks [N], with the bits of one rank.
 
         The penalty is that of the bodies of this rank and of those of others that are near them. All pairs of a body of
-        this rank are among them, in the order that they have among all bodies, so its sums are the same. A CUDA graph
-        has `room` for so many, of which the unused are points far from all and from each other; where there are more,
-        forces are NaN.
+        this rank are among them, in the order that they have among all bodies, so its sums are the same.
         """
-        centers, most = self.all_of(mine), self.max_pairs
+        centers = self.all_of(mine)
         near = is_near(mine.detach(), centers.detach())
-        if captured:
-            rows = torch.nonzero_static(near, size=self.room, fill_value=len(centers))[:, 0]
-            points = centers.index_select(0, rows.clamp(max=len(centers) - 1))
-            points = torch.where((rows < len(centers))[:, None], points, self.far())
-            most = min(most, most * self.room // len(centers) + 256)
+        if mine.is_cuda and torch.cuda.is_current_stream_capturing():
+            rows, force = self.penalty_in_graph(centers, near)
         else:
+            self.make_room(int(near.sum()))
             rows = near.nonzero()[:, 0]
-            points = centers.index_select(0, rows)
-            self.room = max(self.room, int(ROOM * len(rows)) + 256)
-        force = self.penalty(points, most)
-        if captured:
-            force = force * torch.where(near.sum() > self.room, torch.nan, 1.0).to(force.dtype)
+            force = self.penalty(centers.index_select(0, rows), self.max_pairs)
         # Forces on bodies of other ranks lack pairs here, and nobody reads them. But these forces depend on the bodies
         # of this rank, too: the backward of `own` brings the gradient of each, and the penalty's goes on from there.
         return self.own(force.new_zeros((len(centers) + 1, 3)).index_copy(0, rows, force)[:-1])
 
-    def far(self) -> Tensor:
-        """Points that no body comes near [m], each twice RADIUS from the next, shape [room, 3]."""
-        along = 2 * RADIUS * torch.arange(self.room, device=self.target.device, dtype=self.target.dtype)
-        return torch.stack([along, torch.full_like(along, DEPTH), torch.zeros_like(along)], 1)
+    def make_room(self, near: int) -> None:
+        """For the next CUDA graph, outside of which as many bodies were near."""
+        self.room = min(self.version.bodies, max(self.room, int(ROOM * near) + 256))
+        if self.captured:  # and yet here: bodies, pairs or numbers that are not finite
+            self.captured, self.multiple = False, 2 * self.multiple
+
+    def penalty_in_graph(self, centers: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+        """Rows of all bodies [room], and the forces on them; NaN where more are near than there is room for.
+
+        Unused rows are beyond the last body, and their points far from all.
+        """
+        self.captured, bodies = True, len(centers)
+        rows = torch.nonzero_static(near, size=self.room, fill_value=bodies)[:, 0]
+        place = torch.arange(self.room, device=rows.device)
+        far = (2 * RADIUS * place).to(centers.dtype)  # each twice RADIUS from the next
+        far = torch.stack([far, torch.full_like(far, DEPTH), torch.zeros_like(far)], 1)
+        there = rows < bodies
+        points = centers.index_select(0, torch.where(there, rows, place))
+        most = min(self.max_pairs, self.multiple * (self.max_pairs * self.room // bodies + 256))
+        force = self.penalty(torch.where(there[:, None], points, far), most)
+        return rows, force * torch.where(near.sum() > self.room, torch.nan, 1.0).to(force.dtype)
 
     def own(self, values: Tensor) -> Tensor:
         """Of all bodies [N, ...] -> of those of this rank."""

@@ -17,6 +17,7 @@ def test_two_ranks_have_the_bits_of_one(tmp_path: Path) -> None:
     assert [row["ranks"] for row in rows] == [1, 1, 2, 2, 1, 2]
     assert all(len(row["peak_bytes"]) == row["ranks"] and min(row["peak_bytes"]) > 0 for row in rows)
     assert [row["same_bits"] for row in rows] == [None, None, True, None, None, True]
+    assert all(row["repeats"] for row in rows)
     assert "times one rank" in (tmp_path / "scale.md").read_text()
 
 

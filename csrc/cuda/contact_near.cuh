@@ -1,0 +1,94 @@
+// The near pairs of the vertices of a warp, shared by its threads: few listed pairs are near, and threads that work on
+// their own vertex's alone would wait for each other.
+#pragma once
+
+#include "contact.h"
+#include "group.cuh"
+
+namespace diffvbd::cuda {
+namespace {
+
+constexpr int kContactThreads = 128;
+
+// An entry of the list, and the thread of the warp that has found it.
+struct Found {
+  int entry, thread;  // entry < 0: none
+  __device__ __forceinline__ bool there() const { return entry >= 0; }
+  // The value that this thread has. All threads of the warp must call it.
+  template <class U>
+  __device__ __forceinline__ U of(U own) const {
+    return __shfl_sync(kWholeWarp, own, thread);
+  }
+  template <class T>
+  __device__ __forceinline__ Vec3<T> of(const Vec3<T>& own) const {
+    return {of(own.x), of(own.y), of(own.z)};
+  }
+};
+
+// Calls f(Found) for the entries of the warp's vertices that are near(entry), 32 at a time, those of a vertex in the
+// order of its list. `share` threads have one vertex, `lane` says which of them this one is. All threads of the warp
+// must call it, and call f together.
+template <int share, class Near, class F>
+__device__ __forceinline__ void each_near(const contact::PairList::Entries& all, int lane, const Near& near,
+                                          const F& f) {
+  __shared__ Found found[kContactThreads / kSlice][2 * kSlice];
+  Found* own = found[threadIdx.x / kSlice];
+  const auto thread = static_cast<int>(threadIdx.x % kSlice);
+  int count = 0;
+  for (int first = 0; __any_sync(kWholeWarp, first < all.count); first += share) {
+    const int entry = first + lane < all.count ? all.first[first + lane] : -1;
+    const bool is_near = entry >= 0 && near(entry);
+    const unsigned threads = __ballot_sync(kWholeWarp, is_near);
+    if (is_near) own[count + __popc(threads & ((1u << thread) - 1))] = {entry, thread};
+    count += __popc(threads);
+    __syncwarp();
+    if (count < kSlice) continue;
+    f(own[thread]);
+    count -= kSlice;
+    const Found left = own[kSlice + thread];
+    __syncwarp();
+    if (thread < count) own[thread] = left;
+    __syncwarp();
+  }
+  if (count > 0) f(thread < count ? own[thread] : Found{-1, thread});
+  __syncwarp();
+}
+
+// Adds up gradients and Hessians of the warp's vertices that any of its threads have worked out, in the order of the
+// threads. The `share` threads of a vertex keep its sum together, each some of the numbers.
+template <int share, class T>
+struct BlockSums {
+  static constexpr int kOwn = (kContactScalars + share - 1) / share;
+  T (*slots)[kContactScalars];  // [32] of the warp, in shared memory
+  T own[kOwn] = {};
+  // from: a thread of the vertex that g and H belong to. All threads of the warp must call it.
+  __device__ __forceinline__ void add(const Vec3<T>& g, const Sym3<T>& H, int from) {
+    const int thread = threadIdx.x % kSlice, lane = thread % share;
+    const T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
+    for (int k = 0; k < kContactScalars; ++k) slots[thread][k] = values[k];
+    unsigned mine = 0;  // threads with something for the vertex of this one
+    for (int first = 0; first < kSlice; first += share) {
+      const unsigned threads = __ballot_sync(kWholeWarp, from / share * share == first);
+      if (thread - lane == first) mine = threads;
+    }
+    __syncwarp();
+    for (; mine; mine &= mine - 1) {
+      const T* slot = slots[__ffs(static_cast<int>(mine)) - 1];
+#pragma unroll
+      for (int i = 0; i < kOwn; ++i) {
+        if (lane + i * share < kContactScalars) own[i] += slot[lane + i * share];
+      }
+    }
+    __syncwarp();
+  }
+  __device__ __forceinline__ void store(T* to) const {
+    const int lane = threadIdx.x % share;
+#pragma unroll
+    for (int i = 0; i < kOwn; ++i) {
+      if (lane + i * share < kContactScalars) to[lane + i * share] = own[i];
+    }
+  }
+};
+
+}  // namespace
+}  // namespace diffvbd::cuda
