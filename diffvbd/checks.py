@@ -15,7 +15,9 @@ def fail(name: str, expected: str, got: Any) -> NoReturn:
     raise ValueError(f"{name}: expected {expected}, got {got}")
 
 
-def check_tensor(name: str, value: Any, like: Tensor, what: str = "a tensor", owner: str = "the Model's") -> Tensor:
+def check_tensor(
+    name: str, value: Any, like: Tensor, what: str = "a number or a tensor", owner: str = "the Model's"
+) -> Tensor:
     """``value`` as a tensor of like's dtype and device; python numbers are converted, other tensors must match."""
     if not isinstance(value, Tensor):
         if isinstance(value, (int, float, np.floating, np.integer)) and not isinstance(value, bool):
@@ -95,8 +97,23 @@ def check_count(name: str, value: Any, minimum: int = 0, maximum: int | None = N
     return value
 
 
+def refuse_gradient(name: str, value: Any, instead: str = "") -> None:
+    """Raises for a tensor that requires grad where numbers are copied, which would lose its gradient without a word."""
+    if isinstance(value, Tensor) and value.requires_grad:
+        hint = f" here: {instead}" if instead else ""
+        raise TypeError(f"{name}: expected a number, got a tensor that requires grad: it is not differentiable{hint}")
+
+
+def refuse_gradients(energy: Any) -> None:
+    """Raises where a parameter of an energy is a tensor that requires grad: it is copied, a step takes it elsewhere."""
+    for key in energy.parameters:
+        instead = f'pass parameters={{"{energy.name}.{key}": ...}} to a step or a rollout'
+        refuse_gradient(key, getattr(energy, key), instead)
+
+
 def check_number(name: str, value: Any, wanted: str = "a finite number >= 0") -> float:
     """A finite number >= 0; `wanted` for the message."""
+    refuse_gradient(name, value)
     if isinstance(value, Tensor) and value.numel() == 1:
         value = value.detach().item()
     if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
@@ -118,8 +135,6 @@ def check_positive(name: str, value: Any, unit: str = "") -> float:
 
 def check_time_step(value: Any, dtype: torch.dtype) -> float:
     """h [s] > 0, with an h^2 that dtype can hold: with less, forces and masses would vanish from a step."""
-    if isinstance(value, Tensor) and value.requires_grad:
-        raise TypeError("time_step: expected a number, got a tensor that requires grad: it is not differentiable")
     h, limits = check_positive("time_step", value, "s"), torch.finfo(dtype)
     if not limits.tiny <= h * h <= limits.max:
         fail("time_step", f"a number of seconds whose square lies between {limits.tiny:.1e} and {limits.max:.1e}", h)
@@ -153,6 +168,9 @@ def vertex_mask(given: Any, num_vertices: int, name: str = "pinned") -> Tensor:
             fail(name, f"a mask of shape [{num_vertices}] or indices", f"a mask of shape {list(given.shape)}")
         return given.clone()
     index = given.to(torch.int64).reshape(-1)
+    if index.numel() == num_vertices > 2 and int(index.max()) <= 1 and int(index.min()) >= 0:
+        raise TypeError(f"{name}: expected a bool mask or indices, got {num_vertices} integers that are 0 or 1, which "
+                        "may mean either: use .astype(bool) or .bool() for a mask")  # fmt: skip
     if index.numel() and (int(index.min()) < 0 or int(index.max()) >= num_vertices):
         fail(name, f"indices in [0, {num_vertices})", f"{int(index.min())}..{int(index.max())}")
     return torch.zeros(num_vertices, dtype=torch.bool, device="cpu").index_fill(0, index, True)

@@ -82,6 +82,7 @@ def _one_line(message: Warning | str, *where: Any, **line: Any) -> str:
 def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("diffvbd", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=raw)
+    parser.add_argument("--version", action="version", version=f"diffvbd {dv.__version__}")
     parser.set_defaults(command=lambda options: parser.print_help() or 2)  # where no command is given
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .checks import check_number, check_positive, check_readable, fail, mask_or_indices, vertex_mask
+from .checks import check_number, check_positive, check_readable, fail, mask_or_indices, refuse_gradients, vertex_mask
 from .mask import EXACT_BLOCK, FIRST_VERTEX_BIT, PAPER_BLOCK
 
 MAX_PLANES = 8
@@ -171,6 +171,7 @@ class FloorBarrier(VertexEnergy):
     damping: float = 0.0
 
     def __post_init__(self) -> None:
+        refuse_gradients(self)
         normal, height = _numbers("normal", self.normal), _numbers("height", self.height).reshape(-1)
         normal = normal[None] if normal.dim() == 1 else normal
         if height.shape[0] == 0:
@@ -281,6 +282,7 @@ class Anchor(VertexEnergy):
     vertices: Tensor | None = None
 
     def __post_init__(self) -> None:
+        refuse_gradients(self)
         if self.vertices is not None:
             object.__setattr__(self, "vertices", mask_or_indices("vertices", self.vertices))
         object.__setattr__(self, "stiffness", _numbers("stiffness", self.stiffness))

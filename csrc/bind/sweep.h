@@ -132,9 +132,11 @@ SweepBars make_bars(const Tensor& x, const SweepFields& f, const In& in, int64_t
 template <class Out, class In, class T = typename Out::Scalar>
 void set_bars(Out& out, const SweepBars& bars, const In& in) {
   set_body_bars(out, bars, in);
-  const bool follows = bars.corners_prev.numel() > 0 && (in.energies & kElastic);
-  for (int i = 0; follows && i < kPrevScalars; ++i) {
-    out.material[kMaterialScalars + i] = data<T>(bars.corners_prev) + i * bars.corners_prev.numel() / kPrevScalars;
+  if constexpr (kPrevScalars > 0) {
+    const bool follows = bars.corners_prev.numel() > 0 && (in.energies & kElastic);
+    for (int i = 0; follows && i < kPrevScalars; ++i) {
+      out.material[kMaterialScalars + i] = data<T>(bars.corners_prev) + i * bars.corners_prev.numel() / kPrevScalars;
+    }
   }
   out.x_start = data<T>(bars.x_start), out.x_prev = data<T>(bars.x_prev), out.y = data<T>(bars.y);
   out.data = bars.energy_data.numel() > 0 ? data<T>(bars.energy_data) : nullptr;

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from ..checks import check_count, check_number, check_positive, fail
+from ..checks import check_count, check_number, check_positive, fail, refuse_gradients
 from ..mask import CONTACT
 
 MOST_REACH = 1e6  # [m]; its square must be a number in float32
@@ -72,6 +72,7 @@ class PairBarrier:
     capacity: int | None = None
 
     def __post_init__(self) -> None:
+        refuse_gradients(self)
         object.__setattr__(self, "kappa", check_number("kappa", self.kappa))
         object.__setattr__(self, "dhat", check_positive("dhat", self.dhat, "m"))
         object.__setattr__(self, "damping", check_number("damping", self.damping))
@@ -119,6 +120,7 @@ class Friction:
     velocity: float = 1e-3
 
     def __post_init__(self) -> None:
+        refuse_gradients(self)
         object.__setattr__(self, "coefficient", check_number("coefficient", self.coefficient))
         object.__setattr__(self, "velocity", check_positive("velocity", self.velocity, "m/s"))
         if self.velocity < LEAST_VELOCITY:

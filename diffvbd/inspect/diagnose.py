@@ -20,6 +20,7 @@ from ..said import warn as say
 from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare, refuse_non_finite
 from ..step.balance import (
     UNBALANCED_FRICTION,
+    Norm,
     contact_of_step,
     friction_left_over,
     left_over,
@@ -59,9 +60,9 @@ class Diagnosis:
             computes about a point of each body, but stores positions as they are given.
         courant: Largest number of elements that a pressure wave crosses in one step [-].
         stiffness: Largest ratio of the elastic to the inertial part of a vertex block [-].
-        unbalanced: Left-over force of the step, |dG/dx| / h^2, over its inertial and all other forces (2-norms) [-].
-        residuals: The same for each body of ``model.body``, shape [..., bodies]; zero where no more is left than
-            rounding leaves.
+        unbalanced: Left-over force of the step, |dG/dx| / h^2, over its inertial and all other forces (2-norms) [-];
+            zero where no more is left than rounding leaves.
+        residuals: The same for each body of ``model.body``, shape [..., bodies].
         friction_residuals: Of a Model with Friction, the share of the friction on each body that is not balanced [-],
             shape [..., bodies]: the left-over force across the contact over the friction forces, where friction acts.
         errors: Estimate for each body, shapes [..., bodies], where ``sweeps`` was given.
@@ -277,12 +278,16 @@ def _balance(
         begun = begin(double, x0, v0, prepared, force, acceleration_of(gravity, x0), prescribed)
         contact = contact_of_step(double, begun, prepared, (given.before, given.colliders) if model.touches else None)
         at = potential_of_step(double, x.detach().double().reshape(begun.y.shape), begun, prepared, contact)
-        left, whole = left_over(at, norm)
-        left = torch.where(left <= rounding(at, norm, torch.finfo(model.dtype).eps), 0, left)
-        bodies = share(left, whole)
+        eps = torch.finfo(model.dtype).eps
+
+        def left_of(norm: Norm) -> Tensor:
+            left, whole = left_over(at, norm)
+            return share(torch.where(left <= rounding(at, norm, eps), 0, left), whole)
+
+        bodies = left_of(norm)
         shape = (*lead, *bodies.shape[1:])
         friction = None if model.friction is None else friction_left_over(at).reshape(shape)
-        return _largest(share(*left_over(at, of_scenes))), bodies.reshape(shape), friction
+        return _largest(left_of(of_scenes)), bodies.reshape(shape), friction
 
 
 def _as(value: Any, like: Tensor) -> Tensor:

@@ -159,11 +159,11 @@ def center_of_mass_penalty(
     """
     bodies = _bodies_of(model_or_bodies)
     lead = _check_centers(x) if bodies is None else _check_positions(x, bodies)
-    radius = _constant("radius", radius, "m")
+    radius = check_positive("radius", radius, "m")
     stiffness = _check_stiffness(stiffness, x)
     reach = radius
     if sharpness is not None:
-        sharpness = _constant("sharpness", sharpness, "1/m")
+        sharpness = check_positive("sharpness", sharpness, "1/m")
         reach = radius - math.log(torch.finfo(x.dtype).eps) / sharpness
     scenes = math.prod(lead)
     if max_pairs is None:
@@ -239,13 +239,6 @@ def _check_stiffness(stiffness: Any, x: Tensor) -> Tensor:
     if looks_at(stiffness) and not 0 <= float(stiffness.detach()) < math.inf:
         fail("stiffness", "a finite number >= 0 N/m", float(stiffness.detach()))
     return stiffness
-
-
-def _constant(name: str, value: Any, unit: str) -> float:
-    """A positive number; a tensor that wants a gradient would silently get none."""
-    if isinstance(value, Tensor) and value.requires_grad:
-        raise TypeError(f"{name}: expected a number, got a tensor that requires grad: it is not differentiable")
-    return check_positive(name, value, unit)
 
 
 def _kind(value: Any) -> str:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import check_positive, check_readable, fail, to_float
+from ..checks import check_positive, check_readable, fail, refuse_gradient, to_float
 from ..contact.barrier import Friction, PairBarrier
 from ..energies import VERTEX_ENERGIES, StableNeoHookean, VertexEnergy
 from .anderson import Anderson
@@ -68,6 +68,7 @@ def per_tet_density(density: Any, num_tets: int) -> Tensor:
     if isinstance(density, bool) or not (isinstance(density, (int, float)) or hasattr(density, "__array__")):
         raise TypeError(f"density: expected a number or shape [{num_tets}], got {type(density).__name__}")
     if isinstance(density, Tensor):
+        refuse_gradient("density", density, "pass density= to a step or a rollout")
         check_readable("density", density)
     elif isinstance(density, int):
         density = to_float("density", density)

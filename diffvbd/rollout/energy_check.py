@@ -22,6 +22,7 @@ from ..step.predict import energy_data
 
 GAIN = 0.05  # of the energy that a scene had and that gravity gave it, which a rollout may gain without a word
 GAIN_PRESSED = 1.0  # the same where barriers push at the start: what they hold comes in
+MANY = 100.0  # times as much as there was: then the gain is said in J, since there may have been next to nothing
 WARNED = "warned_of_energy"  # of a Model's _derived: one warning is enough for all of its rollouts
 ENDED = "ended"  # the same, on CUDA: whether its latest rollouts ended finite, on the way to the host
 LOOKS, LOOKS_ON_FLOOR, LOOKS_TOUCHING = 6, 12, 64  # at a rollout, unasked
@@ -127,14 +128,19 @@ class EnergyLook:
             return
         self.model._derived[WARNED] = True
         look, scene = divmod(int(past.argmax()), gain.shape[-1])
-        most = float(gain[look, scene])
+        most, all_of = float(gain[look, scene]), float((begun + room + fallen.abs().amax(0))[scene])
+        size = f"{percent(most)} of the energy that it had and that gravity gave it"
+        if most > MANY:
+            size = f"{most * all_of:.3g} J, where it had and gravity gave it {all_of:.3g} J"
         of = f"scene {scene}" if gain.shape[-1] > 1 else "the scene"
         faster = "" if self.model.coarse is not None else ', coarse="auto"'
-        pressed = ", unless bodies were pressed together at the start" if bool(self.pressed[scene]) else ""
+        pressed = ""
+        if bool(self.pressed[scene]):
+            pressed = ", unless bodies were closer than dhat at the start, where barriers push them apart: start them "
+            pressed += "farther apart, or take a smaller dhat"
         warn(
-            f"sweeps: after step {list(self.found)[look]} {of} has gained {percent(most)} of the energy that it had "
-            f"and that gravity gave it: the sweeps have not converged{pressed}; take more sweeps{faster} or a smaller "
-            "time_step; " + page("numerics.md"),
+            f"sweeps: after step {list(self.found)[look]} {of} has gained {size}: the sweeps have not converged"
+            f"{pressed}; take more sweeps{faster} or a smaller time_step; " + page("numerics.md"),
         )
 
 

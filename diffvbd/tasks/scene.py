@@ -262,9 +262,12 @@ def _checked(path: str | Path, name: str, values: Any, shape: tuple[int, int], l
     if values.dtype.kind not in "iuf":
         raise ValueError(f"{path}: {name}: expected numbers, got dtype {values.dtype}")
     values = values.astype(np.float64)
-    if values.shape[-2:] != shape or values.ndim > (3 if leading else 2) or not np.isfinite(values).all():
+    if values.shape[-2:] != shape or values.ndim > (3 if leading else 2):
         expected = f"[{leading}{shape[0]}, {shape[1]}]"
-        raise ValueError(f"{path}: {name}: expected finite values of shape {expected}, got shape {list(values.shape)}")
+        raise ValueError(f"{path}: {name}: expected shape {expected}, got {list(values.shape)}")
+    if not np.isfinite(values).all():
+        at = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
+        raise ValueError(f"{path}: {name}: expected finite values, got {values[at]:g} at {list(at)}")
     return values
 
 

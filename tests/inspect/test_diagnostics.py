@@ -114,6 +114,16 @@ def test_leftover_force_falls_with_sweeps_and_knows_every_energy() -> None:
         diagnose(over, end, previous=(x, v), **stiff)
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_free_fall_leaves_no_force(dtype: torch.dtype) -> None:
+    model = dv.Model(dv.mesh.cube(3, size=0.1), dtype=dtype)
+    given = {"mu": 1e5, "lam": 1e5, "time_step": 0.01}
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    motion = dv.rollout(model, x, v, steps=20, sweeps=10, **given)
+    found = dv.diagnose(model, motion.x[-1], previous=(motion.x[-2], motion.v[-2]), warn=False, **given)
+    assert (motion.x[-1] - x)[:, 1].max() < -0.1 and found.unbalanced == 0.0 and found.ok
+
+
 def test_pinned_reactions_are_no_residual() -> None:
     model = cube()
     x, v = model.rest_points, torch.zeros_like(model.rest_points)

@@ -38,6 +38,9 @@ MODELS: list[tuple[str, dict[str, Any], str]] = [
     ("density", {"density": torch.ones(6, device="meta")}, "meta"),
     ("density", {"density": torch.ones(6).to_sparse()}, "sparse"),
     *((name, {name: 10**400}, "1329 bits") for name in ("density", "saturation", "regularization", "relaxation")),
+    ("density", {"density": ones().requires_grad_()}, r"requires grad.* density= to a step"),
+    ("relaxation", {"relaxation": ones().requires_grad_()}, "requires grad"),
+    ("pinned", {"pinned": (MESH.points[:, 0] == 0).astype(int)}, "8 integers that are 0 or 1"),
     ("saturation", {"saturation": 0.0}, "0"),
     ("saturation", {"saturation": -0.1}, "-0.1"),
     ("saturation", {"saturation": NAN}, "nan"),
@@ -95,6 +98,16 @@ ENERGIES: list[tuple[str, Callable[[], Any], str]] = [
     *((n, lambda n=n: dv.FloorBarrier(**{n: 10**400}), "float|bits") for n in ("kappa", "dhat", "damping", "height")),
     *((n, lambda n=n: dv.PairBarrier(**{n: 10**400}), "bits") for n in ("kappa", "dhat", "damping", "reach")),
     *((n, lambda n=n: dv.Friction(**{n: 10**400}), "bits") for n in ("coefficient", "velocity")),
+    *(
+        (n, lambda n=n: dv.FloorBarrier(**{n: ones().requires_grad_()}), f"requires grad.*floor_barrier.{n}")
+        for n in ("kappa", "dhat", "damping", "height", "normal")
+    ),
+    *((n, lambda n=n: dv.PairBarrier(**{n: ones().requires_grad_()}), "requires grad") for n in ("kappa", "dhat")),
+    ("coefficient", lambda: dv.Friction(ones().requires_grad_()), "requires grad.*friction.coefficient"),
+    *(
+        (n, lambda n=n: dv.Anchor(**{n: ones(8, 3).requires_grad_()}), f"requires grad.*anchor.{n}")
+        for n in ("stiffness", "points")
+    ),
     ("vertices", lambda: dv.Model(MESH, energies=(dv.Anchor(1.0, vertices=torch.zeros(7, dtype=torch.bool)),)), "7"),
     ("tape", lambda: dv.ReverseSweep("half"), "half"),
     ("dtype", lambda: dv.Model(MESH).to(dtype=torch.int64), "int64"),
