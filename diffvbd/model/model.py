@@ -42,7 +42,8 @@ def _copy(name: str, text: str) -> Any:
 class Model:
     """A mesh with its masses, pins, energies and safeguards, colored and laid out for the sweeps.
 
-    A Model holds detached constants; what is differentiated is an argument of :func:`diffvbd.step`.
+    A Model holds constants and refuses tensors that require grad; what is differentiated is an argument of
+    :func:`diffvbd.step`. A mesh is data: its points are copied without their gradient.
 
     Args:
         mesh: Tetrahedra with positive rest volume.

@@ -10,7 +10,16 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import check_broadcast, check_positive, check_tensor, check_time_step, fail, name_value, vertex_mask
+from ..checks import (
+    check_broadcast,
+    check_positive,
+    check_tensor,
+    check_time_step,
+    fail,
+    name_value,
+    refuse_gradient,
+    vertex_mask,
+)
 from ..lasting import lasting_tensors
 from ..mesh import TetMesh
 from ..model.arguments import checked_device
@@ -20,7 +29,7 @@ from ..step.arguments import GRAVITY, acceleration_of
 class ParticleSolver:
     """Particles: rest positions (if known), masses and pins.
 
-    What is given here are detached constants; what is differentiated is an argument of a step.
+    What is given here are constants, no tensors that require grad; what is differentiated is an argument of a step.
 
     Args:
         points: Rest positions [m], shape [V, 3], or the number of particles V.
@@ -140,7 +149,8 @@ def check_finite(**values: Any) -> None:
 
 
 def numbers(name: str, value: Any, dtype: torch.dtype, device: torch.device | str) -> Tensor:
-    """Constants of a solver as a detached tensor."""
+    """Constants of a solver as a tensor of its own."""
+    refuse_gradient(name, value, "a step takes what is differentiated")
     try:
         if not isinstance(value, Tensor):
             value = torch.from_numpy(np.array(value, dtype=np.float64))  # a copy, of what may be write-protected

@@ -146,7 +146,8 @@ class LocalGlobal(BlockUpdate):
 class ProjectiveDynamics(ParticleSolver):
     """Particles with springs and tets, solved by K local-global iterations per step.
 
-    What is given here are detached constants; what is differentiated is an argument of :meth:`step` or :meth:`factor`.
+    What is given here are constants, no tensors that require grad; what is differentiated is an argument of
+    :meth:`step` or :meth:`factor`.
 
     Args:
         points: Rest positions [m], shape [V, 3]; the number of particles V is enough without tets.

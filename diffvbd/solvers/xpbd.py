@@ -101,7 +101,8 @@ class DistanceProjection(BlockUpdate):
 class XPBD(ParticleSolver):
     """Particles and distance constraints, solved by K sweeps of projections per step.
 
-    What is given here are detached constants; what is differentiated is an argument of :meth:`step`.
+    What is given here are constants, no tensors that require grad; what is differentiated is an argument of
+    :meth:`step`.
 
     Args:
         points: Rest positions [m], shape [V, 3], or the number of particles V (steps then need ``rest_length``).

@@ -168,21 +168,12 @@ def test_copies_of_a_model_compute_the_same(device: str, copied: Any) -> None:
     assert_same(gradients(twin, inputs), gradients(model, inputs), 0.0)
 
 
-def test_model_of_tensors_that_require_grad_survives_two_backwards_and_copies(device: str) -> None:
+def test_model_of_a_mesh_that_requires_grad_survives_two_backwards_and_copies(device: str) -> None:
     mesh = dv.mesh.cube()
-    density = torch.full((mesh.num_tets,), 2.0, dtype=torch.float64, requires_grad=True)
-    stiffness = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
-    kappa = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
     points = torch.from_numpy(mesh.points.copy()).requires_grad_()
-    # Each is the result of an operation: a kept graph would fail in the second backward and in deepcopy.
-    energies = (
-        dv.StableNeoHookean(),
-        dv.FloorBarrier(height=-0.2, kappa=kappa * 1, dhat=0.5),
-        dv.Anchor(stiffness * 1, points * 1),
-    )
-    model = dv.Model(
-        dv.TetMesh(points * 1, mesh.tets), density=density * 1, pinned=[0], energies=energies, device=device
-    )
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.2, kappa=2.0, dhat=0.5), dv.Anchor(0.7))
+    # The result of an operation: a kept graph would fail in the second backward and in deepcopy.
+    model = dv.Model(dv.TetMesh(points * 1, mesh.tets), density=2.0, pinned=[0], energies=energies, device=device)
     twin = pickle.loads(pickle.dumps(copy.deepcopy(model)))
     assert repr(twin) == repr(model)
     x = (model.rest_points + 0.01).requires_grad_()
@@ -191,7 +182,7 @@ def test_model_of_tensors_that_require_grad_survives_two_backwards_and_copies(de
         out = dv.step(model, x, torch.zeros_like(x), mu=3.0, lam=2.0, **STEP)
         slopes += torch.autograd.grad(scalar(*out), x)
     assert torch.equal(slopes[0], slopes[1])
-    assert all(t.grad is None for t in (density, stiffness, kappa, points))
+    assert points.grad is None
 
 
 # --- raw operators ----------------------------------------------------------------------------------------------------
