@@ -205,8 +205,8 @@ class Cubes:
         if mine.is_cuda and torch.cuda.is_current_stream_capturing():
             rows, force = self.penalty_in_graph(centers, near)
         else:
-            self.make_room(int(near.sum()))
             rows = near.nonzero()[:, 0]
+            self.make_room(len(rows))
             force = self.penalty(centers.index_select(0, rows), self.max_pairs)
         # Forces on bodies of other ranks lack pairs here, and nobody reads them. But these forces depend on the bodies
         # of this rank, too: the backward of `own` brings the gradient of each, and the penalty's goes on from there.

@@ -1,6 +1,7 @@
 """A run over the ranks that torchrun has started: all work alike, the first one alone keeps files."""
 
 import contextlib
+import gc
 import os
 import tempfile
 from collections.abc import Iterator
@@ -39,6 +40,7 @@ def joined(device: str, splits: bool) -> Iterator[None]:
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     dist.init_process_group("nccl" if cuda else "gloo")
     yield
+    gc.collect()  # CUDA graphs that hold what is destroyed now
     dist.destroy_process_group()  # not after an error: other ranks may wait for this one, and torchrun ends them
 
 
