@@ -133,7 +133,7 @@ def _check_room(cubes: Cubes, places: Tensor) -> None:
     rows, force = cubes.penalty_in_graph(whole, near)
     used = rows < len(places)
     assert torch.equal(rows[used], near.nonzero()[:, 0]) and not force[~used].any()
-    alone = cubes.penalty(some[near], cubes.max_pairs)
+    alone = cubes.penalty(some[near])
     assert torch.equal(force[used], alone)
     gradients = [
         torch.autograd.grad((f * f.detach().sin()).sum(), leaf)[0] for f, leaf in ((force, whole), (alone, some))
@@ -141,9 +141,10 @@ def _check_room(cubes: Cubes, places: Tensor) -> None:
     assert torch.equal(*gradients)
     cubes.room = int(near.sum()) - 1
     assert cubes.penalty_in_graph(whole, near)[1].isnan().all()
-    before = cubes.multiple
-    cubes.make_room(int(near.sum()))
-    assert cubes.room >= int(near.sum()) and cubes.multiple == 2 * before
+    cubes.captured, before = True, cubes.multiple
+    x = cubes.own(places)[:, None].expand(-1, 8, -1).reshape(cubes.shape)
+    cubes.push(0, x, x)  # outside of a graph
+    assert cubes.room >= int(near.sum()) and cubes.multiple == 2 * before and not cubes.captured
 
 
 def launch(out: Path) -> dict[str, Any]:

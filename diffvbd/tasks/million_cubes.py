@@ -55,7 +55,7 @@ LAYERS = 16
 HEIGHT = 1.77  # of the middle of the ring [m]
 RADIUS, STIFFNESS = math.sqrt(3) * EDGE, 3e-3  # [m], [N/m]
 GROUP, QUICK_GROUP = 64, 16  # most bodies in a scene on the CPU
-PAIRS = 2  # room for pairs, for each body
+PAIRS, MOST_PAIRS = 2, 16  # room for pairs, for each body: in a CUDA graph, where room costs time; outside of one
 ROOM = 1.05  # in a CUDA graph of a rank, times the most bodies that were near those of the rank
 DEPTH = -1e3  # below the pad, where no body comes [m]
 MIXED = 8  # bodies whose places are mixed
@@ -169,10 +169,9 @@ class Cubes:
         self.x = (pad[:, None] + torch.tensor([1.0, SQUEEZE, 1.0], **like) * corners).reshape(self.shape)
         labels = torch.arange(self.bodies, device=device).repeat_interleave(cube.num_vertices)
         self.mine = dv.contact.Bodies(labels, self.mass.repeat(self.bodies))
-        self.contact, self.max_pairs = False, PAIRS * bodies + 256
-        # Of several ranks each has room for the pairs of all: where one rank has enough, many have. In a CUDA graph
-        # that would cost time. There it has room for some bodies, more than steps outside of it have found, and for
-        # their share of all pairs, or a multiple of it after a graph that had too little.
+        self.contact = False
+        # In a CUDA graph there is room for more bodies near those of this rank than steps outside of it have found, and
+        # for PAIRS of each, or a multiple after a graph that had too little.
         self.room, self.multiple, self.captured = 0, 1, False
 
         self.velocity = torch.tensor([0.0, version.launch, 0.0], **like).repeat(bodies, 1).requires_grad_()
@@ -186,13 +185,17 @@ class Cubes:
         if step >= self.version.target_step:
             return None
         centers = self.mine.centers(x.reshape(1, -1, 3))[0]
-        alone = self.bodies == self.version.bodies
-        force = self.penalty(centers, self.max_pairs) if alone else self.penalty_by_all(centers)
+        captures = x.is_cuda and torch.cuda.is_current_stream_capturing()
+        if self.captured and not captures:  # the graph had too little room for bodies or pairs, or all is not finite
+            self.multiple *= 2
+        self.captured = captures
+        force = self.penalty(centers) if self.bodies == self.version.bodies else self.penalty_by_all(centers)
         return self.mine.forces(force[None]).view_as(x)
 
-    def penalty(self, centers: Tensor, most: int) -> Tensor:
-        """Forces between some bodies [N]. All see each other: they are one scene. most: Room for pairs."""
-        return dv.contact.center_of_mass_penalty(centers, None, RADIUS, STIFFNESS, max_pairs=most)
+    def penalty(self, centers: Tensor) -> Tensor:
+        """Forces between some bodies [N]. All see each other: they are one scene."""
+        each = min(MOST_PAIRS, self.multiple * PAIRS) if self.captured else MOST_PAIRS
+        return dv.contact.center_of_mass_penalty(centers, None, RADIUS, STIFFNESS, max_pairs=each * len(centers) + 256)
 
     def penalty_by_all(self, mine: Tensor) -> Tensor:
         """Forces on the bodies of this rank by those of all ranks [N], with the bits of one rank.
@@ -202,36 +205,29 @@ class Cubes:
         """
         centers = self.all_of(mine)
         near = is_near(mine.detach(), centers.detach())
-        if mine.is_cuda and torch.cuda.is_current_stream_capturing():
+        if self.captured:
             rows, force = self.penalty_in_graph(centers, near)
         else:
             rows = near.nonzero()[:, 0]
-            self.make_room(len(rows))
-            force = self.penalty(centers.index_select(0, rows), self.max_pairs)
+            self.room = min(len(centers), max(self.room, int(ROOM * len(rows)) + 256))
+            force = self.penalty(centers.index_select(0, rows))
         # Forces on bodies of other ranks lack pairs here, and nobody reads them. But these forces depend on the bodies
         # of this rank, too: the backward of `own` brings the gradient of each, and the penalty's goes on from there.
         return self.own(force.new_zeros((len(centers) + 1, 3)).index_copy(0, rows, force)[:-1])
-
-    def make_room(self, near: int) -> None:
-        """For the next CUDA graph, outside of which as many bodies were near."""
-        self.room = min(self.version.bodies, max(self.room, int(ROOM * near) + 256))
-        if self.captured:  # and yet here: bodies, pairs or numbers that are not finite
-            self.captured, self.multiple = False, 2 * self.multiple
 
     def penalty_in_graph(self, centers: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
         """Rows of all bodies [room], and the forces on them; NaN where more are near than there is room for.
 
         Unused rows are beyond the last body, and their points far from all.
         """
-        self.captured, bodies = True, len(centers)
+        bodies = len(centers)
         rows = torch.nonzero_static(near, size=self.room, fill_value=bodies)[:, 0]
         place = torch.arange(self.room, device=rows.device)
         far = (2 * RADIUS * place).to(centers.dtype)  # each twice RADIUS from the next
         far = torch.stack([far, torch.full_like(far, DEPTH), torch.zeros_like(far)], 1)
         there = rows < bodies
         points = centers.index_select(0, torch.where(there, rows, place))
-        most = min(self.max_pairs, self.multiple * (self.max_pairs * self.room // bodies + 256))
-        force = self.penalty(torch.where(there[:, None], points, far), most)
+        force = self.penalty(torch.where(there[:, None], points, far))
         return rows, force * torch.where(near.sum() > self.room, torch.nan, 1.0).to(force.dtype)
 
     def own(self, values: Tensor) -> Tensor:
