@@ -142,7 +142,12 @@ def _rows(scene: str, times: dict[str, tuple[int, float]], launches: list[dict[s
         of.setdefault(_named(launch["Kernel Name"]), []).append(launch)
     total, rows = sum(seconds for _, seconds in times.values()), []
     for kernel, (count, seconds) in times.items():
-        if seconds < LEAST * total or kernel not in of:
+        if seconds < LEAST * total:
+            continue
+        row: Row = {"scene": scene, "kernel": kernel, "launches": count, "share": seconds / total,
+                    "seconds": seconds / count, "looked at": len(of.get(kernel, ())), "bound": None}  # fmt: skip
+        rows.append(row)
+        if kernel not in of:
             continue
 
         def each(name: str, own: list[dict[str, str]] = of[kernel]) -> list[float]:
@@ -152,13 +157,11 @@ def _rows(scene: str, times: dict[str, tuple[int, float]], launches: list[dict[s
             weights = each(CYCLES)
             return sum(w * value for w, value in zip(weights, each(name), strict=True)) / sum(weights)
 
-        row: Row = {"scene": scene, "kernel": kernel, "launches": count, "share": seconds / total,
-                    "seconds": seconds / count, "looked at": len(of[kernel]), "blocks": max(each(BLOCKS)),
-                    "registers": max(each(REGISTERS)), "warps": mean(WARPS) / 100, "issues": mean(ISSUES) / 100,
-                    "threads": mean(THREADS)}  # fmt: skip
+        row |= {"blocks": max(each(BLOCKS)), "registers": max(each(REGISTERS)), "warps": mean(WARPS) / 100,
+                "issues": mean(ISSUES) / 100, "threads": mean(THREADS)}  # fmt: skip
         row |= {f"rate of {name}": mean(metric) / 100 for name, metric in RATES.items()}
         row |= {f"stalled by {stall}": mean(STALL.format(stall)) for stall in STALLS}
-        rows.append(row | {"bound": _bound(row)})
+        row["bound"] = _bound(row)
     return sorted(rows, key=lambda row: -row["share"])
 
 
@@ -183,10 +186,14 @@ def _bound(row: Row) -> str:
 def markdown(results: dict[str, Any]) -> str:
     header = ("scene", "kernel", "of the time", "launches", "us each", "blocks", "registers", "warps active",
               "issue active", "threads of 32", "memory", "L2", "float64", "bound by")  # fmt: skip
-    percent = "{:.0%}".format
-    rows = [(r["scene"], f"`{r['kernel']}`", percent(r["share"]), r["launches"], f"{1e6 * r['seconds']:.3g}",
-             int(r["blocks"]), int(r["registers"]), percent(r["warps"]), percent(r["issues"]), f"{r['threads']:.0f}",
-             *(percent(r[f"rate of {name}"]) for name in RATES), r["bound"]) for r in results["rows"]]  # fmt: skip
+
+    def shown(row: Row, name: str, form: str = "{:.0%}") -> str:
+        return form.format(row[name]) if name in row else "-"
+
+    rows = [(r["scene"], f"`{r['kernel']}`", shown(r, "share"), r["launches"], f"{1e6 * r['seconds']:.3g}",
+             *(shown(r, name, "{:.0f}") for name in ("blocks", "registers")), shown(r, "warps"), shown(r, "issues"),
+             shown(r, "threads", "{:.0f}"), *(shown(r, f"rate of {name}") for name in RATES),
+             r["bound"] or "not looked at") for r in results["rows"]]  # fmt: skip
     failed = "".join(f"\nNot measured: {name}.\n" for name in results["failed"])
     return "## What bounds each kernel\n\n" + markdown_table(header, rows) + failed
 

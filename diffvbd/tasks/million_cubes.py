@@ -186,7 +186,7 @@ class Cubes:
             return None
         centers = self.mine.centers(x.reshape(1, -1, 3))[0]
         captures = x.is_cuda and torch.cuda.is_current_stream_capturing()
-        if self.captured and not captures:  # the graph had too little room for bodies or pairs, or all is not finite
+        if self.captured and not captures:  # a graph is made anew: it had too little room, or a number was not finite
             self.multiple *= 2
         self.captured = captures
         force = self.penalty(centers) if self.bodies == self.version.bodies else self.penalty_by_all(centers)

@@ -1,4 +1,4 @@
-"""Claim: `bench kernels` reads ncu's table right: times in any unit, means by time, and what a kernel is bound by."""
+"""Claim: `bench kernels` reads ncu's table right: means by time, what a kernel is bound by, none that is left out."""
 
 import csv
 import io
@@ -40,16 +40,18 @@ def test_rows(monkeypatch: pytest.MonkeyPatch) -> None:
         {"Kernel Name": advance, kernels.CYCLES: "500", barrier: "7"},
         {"Kernel Name": "fill(int)", kernels.CYCLES: "1"},  # too short for a row
     )
-    times = {"sweep_forward": (20, 0.08), NAME: (1, 0.019), "fill": (1, 0.001)}
+    times = {"sweep_forward": (20, 0.08), NAME: (1, 0.019), "fill": (1, 0.001), "missed": (1, 0.01)}
     monkeypatch.setattr(kernels, "_process", lambda *_: text)
     name = next(iter(kernels.SCENES))
-    first, second = kernels._rows(name, times, list(kernels._launches(name, "cuda")))
+    first, second, third = kernels._rows(name, times, list(kernels._launches(name, "cuda")))
     assert (first["kernel"], first["launches"], first["looked at"]) == ("sweep_forward", 20, 2)
     assert (first["blocks"], first["bound"]) == (1024, "memory")
     assert first["seconds"] == pytest.approx(4e-3) and first["rate of memory"] == pytest.approx(0.75)
-    assert first["share"] == pytest.approx(0.8)
+    assert first["share"] == pytest.approx(0.08 / 0.11)
     assert (second["kernel"], second["bound"]) == (NAME, "barriers")
-    assert NAME in kernels.markdown({"rows": [first, second], "failed": {}})
+    assert (third["kernel"], third["looked at"], third["bound"]) == ("missed", 0, None)
+    text = kernels.markdown({"rows": [first, second, third], "failed": {}})
+    assert NAME in text and "missed" in text
 
 
 def test_a_failed_process_says_what_it_said() -> None:
