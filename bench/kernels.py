@@ -42,6 +42,8 @@ RATES = {
 WARPS = "sm__warps_active.avg.pct_of_peak_sustained_active"
 ISSUES = "smsp__issue_active.avg.pct_of_peak_sustained_active"
 THREADS = "smsp__thread_inst_executed_per_inst_executed.ratio"
+# Kernels that do many things
+TOLD_APART = ("scene_kernel", "each_body", "small_bodies", "medium_bodies", "large_bodies", "vertex_kernel", "body_kernel")
 STALL = "smsp__average_warps_issue_stalled_{}_per_issue_active.ratio"
 STALLS = {
     "long_scoreboard": "latency of memory",
@@ -166,13 +168,16 @@ def _rows(scene: str, times: dict[str, tuple[int, float]], launches: list[dict[s
 
 
 def _named(text: str) -> str:
-    """A kernel's name; with what it is given where that is all that tells two apart."""
-    plain = re.sub(r"\((?:int|bool|long|unsigned int)\)", "", text)  # of template arguments
-    found = re.search(r"(\w+)(<[^(]*>)?\((?:[\w:]*::)?(\w+)?", plain)
+    """A kernel's name; with what it does or is given where that is all that tells two apart."""
+    plain = re.sub(r"\((?:int|bool|long|unsigned int|anonymous namespace)\)|<?unnamed>", "", text)
+    plain = re.sub(r"\w*::", "", plain)  # namespaces
+    found = re.search(r"(\w+)(?:<(.*)>)?\((\w+)?", plain)
     if not found:
         return text
-    name, _, first = found.groups()
-    return f"{name}, {first}" if name in ("scene_kernel", "each_body") and first else name
+    name, given, first = found.groups()
+    if name != "scene_kernel":
+        first = next((word for word in re.findall(r"\w+", given or "") if word[0].isupper()), None)
+    return f"{name}, {first}" if first and name in TOLD_APART else name
 
 
 def _bound(row: Row) -> str:

@@ -48,17 +48,18 @@ struct GridTeam {
 };
 // A cluster, on a scene of its own.
 struct SceneTeam {
+  Cluster cluster;
   Answers& answers;
   int turn = 0;
   template <class F>
   __device__ void each(const Range& items, const F& f) const {
-    for (int64_t i = items.begin + Cluster::rank() * kThreads + static_cast<int64_t>(threadIdx.x); i < items.end;
-         i += Cluster::size() * kThreads) {
+    for (int64_t i = items.begin + cluster.rank * kThreads + static_cast<int64_t>(threadIdx.x); i < items.end;
+         i += cluster.size * kThreads) {
       f(i);
     }
   }
-  __device__ void sync() const { Cluster::meet(); }
-  __device__ bool any(bool own) { return any_of_cluster(answers, turn, own); }
+  __device__ void sync() const { cluster.meet(); }
+  __device__ bool any(bool own) { return any_of_cluster(cluster, answers, turn, own); }
 };
 
 // All listed pairs, as the grid looks at them.
@@ -80,6 +81,7 @@ struct AllPairs {
 // warp waits for a few of its threads.
 template <class T>
 struct NearPairs {
+  Cluster cluster;
   Range pairs;
   int32_t* near;        // as long as the list
   PairPlane<T>* plane;  // in the order of `near`
@@ -88,7 +90,7 @@ struct NearPairs {
 
   // Where the block has its i-th pair, and keeps the i-th of those that may matter.
   __device__ int64_t place(int i) const {
-    return pairs.begin + int64_t{i / kThreads * Cluster::size() + Cluster::rank()} * kThreads + i % kThreads;
+    return pairs.begin + int64_t{i / kThreads * cluster.size + cluster.rank} * kThreads + i % kThreads;
   }
   __device__ void begin_move(const SceneTeam&, const AdvanceInputs<T>& in, const AdvanceState<T>& s) const {
     if (threadIdx.x == 0) *count = *slows = 0;
@@ -199,11 +201,13 @@ __global__ void __launch_bounds__(kThreads, 2)
   __shared__ int32_t slow[2 * kThreads];
   __shared__ int count, slows;
   __shared__ Answers answers;
-  const int64_t scene = blockIdx.x / Cluster::size();
+  Cluster cluster = Cluster::all();
+  const int64_t scene = blockIdx.x / cluster.size;
   const auto first = [&](int64_t of) { return int64_t{in.listed.ptr[of * in.corners] / 4}; };
   const Range own = {first(scene), first(scene + 1)};
-  const NearPairs<T> pairs{own, near, planes, &count, &slows, slow};
-  advance_scenes(SceneTeam{answers}, in, s, motions, {scene, scene + 1}, pairs, stuck);
+  if (cluster.leaves(in.vertices + own.end - own.begin)) return;
+  const NearPairs<T> pairs{cluster, own, near, planes, &count, &slows, slow};
+  advance_scenes(SceneTeam{cluster, answers}, in, s, motions, {scene, scene + 1}, pairs, stuck);
 }
 
 template <class T>

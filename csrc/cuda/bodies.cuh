@@ -10,10 +10,12 @@
 namespace diffvbd::cuda {
 
 constexpr int kTile = 8, kTileThreads = 128;
+constexpr int kTinyTile = 4;               // of 8 vertices: all lanes find the rotation, so fewer do it less often
 constexpr int64_t kEnoughThreads = 16384;  // tiny bodies of all scenes that fill the device with a thread each
 constexpr int kThreads = 256, kWarps = kThreads / 32;
 constexpr int kMostSums = 1 + 6 + rigid::kSix;  // numbers that a team adds up at once
-constexpr int64_t kEnoughBlocks = 48;           // large bodies of all scenes that fill the device with a block each
+constexpr int kFewSums = 4;                     // that every thread of a block adds up from its warps
+constexpr int64_t kBegun = 450, kFaster = 85;   // of work on a large body, as measured on an H100
 
 template <int n, class F>
 __device__ __forceinline__ void own_sum(int32_t first, int32_t count, int32_t stride, double* out, const F& f) {
@@ -30,6 +32,20 @@ __device__ __forceinline__ void butterfly(unsigned mask, double* out) {
 #pragma unroll
     for (int d = width / 2; d > 0; d /= 2) out[k] += __shfl_xor_sync(mask, out[k], d, width);
   }
+}
+
+// Sums of 32 numbers over the lanes of a warp, each to the lane of its number: half of them go at each exchange. The
+// same bits as by a butterfly.
+template <int half = 16>
+__device__ __forceinline__ double sums_by_lane(double* of) {
+  const bool upper = threadIdx.x & half;
+#pragma unroll
+  for (int k = 0; k < half; ++k) {
+    const double kept = upper ? of[k + half] : of[k], sent = upper ? of[k] : of[k + half];
+    of[k] = kept + __shfl_xor_sync(0xffffffffu, sent, half);
+  }
+  if constexpr (half > 1) return sums_by_lane<half / 2>(of);
+  return of[0];
 }
 
 // The least of the lanes of a part of a warp.
@@ -125,17 +141,30 @@ struct BlockTeam {
   }
   template <int n>
   __device__ void reduce(double* out) const {
-    butterfly<n, 32>(0xffffffffu, out);
-    if (threadIdx.x % 32 == 0) {
-      for (int k = 0; k < n; ++k) part[threadIdx.x / 32][k] = out[k];
+    const int warp = static_cast<int>(threadIdx.x / 32), lane = static_cast<int>(threadIdx.x % 32);
+    if constexpr (n <= kFewSums) {
+      butterfly<n, 32>(0xffffffffu, out);
+      for (int k = 0; k < n && lane == 0; ++k) part[warp][k] = out[k];
+      __syncthreads();
+      for (int k = 0; k < n; ++k) out[k] = of_warps(k);
+    } else {  // a thread for each number
+      double all[32];
+#pragma unroll
+      for (int k = 0; k < 32; ++k) all[k] = k < n ? out[k] : 0;
+      const double own = sums_by_lane(all);
+      if (lane < n) part[warp][lane] = own;
+      __syncthreads();
+      if (threadIdx.x < n) part[0][lane] = of_warps(lane);
+      __syncthreads();
+#pragma unroll
+      for (int k = 0; k < n; ++k) out[k] = part[0][k];
     }
     __syncthreads();
-    for (int k = 0; k < n; ++k) {
-      double sum = part[0][k];
-      for (int w = 1; w < kWarps; ++w) sum += part[w][k];
-      out[k] = sum;
-    }
-    __syncthreads();
+  }
+  __device__ double of_warps(int k) const {
+    double sum = part[0][k];
+    for (int w = 1; w < kWarps; ++w) sum += part[w][k];
+    return sum;
   }
 };
 
@@ -262,8 +291,13 @@ inline int multiprocessors() {
   return count;
 }
 
-// Whether large bodies take a block each: there are enough of them.
-inline bool by_block(const BodyGroups& groups, int64_t scenes) { return scenes * groups.large >= kEnoughBlocks; }
+// Whether large bodies take a block each, side by side: the whole device takes one after another, each in the time in
+// which a block gets through kBegun vertices, and 1 / kFaster of the rest.
+inline bool by_block(const BodyGroups& groups, int64_t scenes, int64_t vertices) {
+  if (groups.large == 0) return false;
+  const int64_t size = vertices / groups.large;  // on average, at most
+  return scenes * groups.large * (kBegun + size / kFaster) >= size;
+}
 
 // Calls act(body, team, record) for all bodies of all scenes.
 template <class T, class Act>
@@ -274,11 +308,11 @@ cudaError_t run_bodies(const rigid::Inputs<T>& in, BodyGroups groups, const Act&
   if (Act::computes && in.scenes * groups.tiny >= kEnoughThreads) {
     launch_small<1>(in, act, 0, groups.tiny, stream);
   } else if (groups.tiny > 0) {
-    launch_small<kTile>(in, act, 0, groups.tiny, stream);
+    launch_small<Act::computes ? kTile : kTinyTile>(in, act, 0, groups.tiny, stream);
   }
   const int32_t medium = groups.tiny + groups.small;
   if (groups.small > 0) launch_small<kTile>(in, act, groups.tiny, groups.small, stream);
-  if (by_block(groups, in.scenes)) groups.medium += groups.large, groups.large = 0;
+  if (by_block(groups, in.scenes, in.vertices)) groups.medium += groups.large, groups.large = 0;
   if (groups.medium > 0) {
     medium_bodies<T>
         <<<static_cast<unsigned>(in.scenes * groups.medium), kThreads, 0, stream>>>(in, act, medium, groups.medium);

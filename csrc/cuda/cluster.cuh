@@ -12,13 +12,25 @@ constexpr int kMostBlocks = 8;           // of a cluster, on every device that h
 constexpr int64_t kPairsOfBlock = 1024;  // worth a block of their own
 constexpr int64_t kBlocksAtOnce = 128;   // of all scenes: more do not run side by side
 
+constexpr int64_t kItemsAlone = 1536;  // vertices and pairs that one block is done with before several have met
+
 struct Cluster {
+  int rank, size;
+  // Whether this block has nothing to do: a scene of few items is left to the first one, which no longer meets others.
+  // What lists have room for decides about blocks, and there may be much less.
+  __device__ bool leaves(int64_t items) {
+    if (items > kItemsAlone) return false;
+    size = 1;
+    return rank > 0;
+  }
 #if __CUDA_ARCH__ >= 900
-  __device__ static int rank() { return static_cast<int>(cooperative_groups::this_cluster().block_rank()); }
-  __device__ static int size() { return static_cast<int>(cooperative_groups::this_cluster().num_blocks()); }
+  __device__ static Cluster all() {
+    const auto cluster = cooperative_groups::this_cluster();
+    return {static_cast<int>(cluster.block_rank()), static_cast<int>(cluster.num_blocks())};
+  }
   // What blocks have written before is seen by all after.
-  __device__ static void meet() {
-    if (size() == 1) {
+  __device__ void meet() const {
+    if (size == 1) {
       __syncthreads();
     } else {
       cooperative_groups::this_cluster().sync();
@@ -30,9 +42,8 @@ struct Cluster {
     return cooperative_groups::this_cluster().map_shared_rank(own, block);
   }
 #else
-  __device__ static int rank() { return 0; }
-  __device__ static int size() { return 1; }
-  __device__ static void meet() { __syncthreads(); }
+  __device__ static Cluster all() { return {0, 1}; }
+  __device__ void meet() const { __syncthreads(); }
   template <class U>
   __device__ static U* of(U* own, int) {
     return own;
@@ -45,12 +56,12 @@ struct Answers {
   int of[2][kMostBlocks];
 };
 // Whether any thread of the cluster says yes, once all have come here. turn: 0 at first, the same for all threads.
-__device__ inline bool any_of_cluster(Answers& answers, int& turn, bool own) {
-  const int here = __syncthreads_or(own), size = Cluster::size();
+__device__ inline bool any_of_cluster(const Cluster& cluster, Answers& answers, int& turn, bool own) {
+  const int here = __syncthreads_or(own), size = cluster.size;
   if (size == 1) return here != 0;
   const auto block = static_cast<int>(threadIdx.x);
-  if (block < size) Cluster::of(&answers, block)->of[turn][Cluster::rank()] = here;
-  Cluster::meet();
+  if (block < size) Cluster::of(&answers, block)->of[turn][cluster.rank] = here;
+  cluster.meet();
   bool out = false;
   for (int b = 0; b < size; ++b) out = out || answers.of[turn][b] != 0;
   turn = 1 - turn;

@@ -60,20 +60,25 @@ struct System {
       for (int i = j; i < kUnknowns; ++i) out[kUnknowns + rigid::at6(i, j)] += dot(a.map(side, i, c), pressed);
     }
   }
+  // The one of n numbers that a thread is to put somewhere. Chosen by comparison, as in PairPress.
+  template <int n>
+  __device__ static double own_of(const double* total) {
+    double out = 0;
+#pragma unroll
+    for (int k = 0; k < n; ++k) out = threadIdx.x == k ? total[k] : out;
+    return out;
+  }
   // Adds the sums of all threads.
   __device__ void put_own(const double* total, int32_t b, double* to, double* gradients) const {
-    if (threadIdx.x == 0) {
-#pragma unroll
-      for (int i = 0; i < kUnknowns; ++i) {
-        gradients[kUnknowns * b + i] += total[i];
-#pragma unroll
-        for (int j = 0; j <= i; ++j) {
-          const double value = total[kUnknowns + rigid::at6(i, j)];
-          at(to, b, i, b, j) += value;
-          if (j < i) at(to, b, j, b, i) += value;
-        }
-      }
-    }
+    const double value = own_of<kOwn>(total);
+    const int entry = static_cast<int>(threadIdx.x) - kUnknowns;
+    if (entry < 0) gradients[kUnknowns * b + threadIdx.x] += value;
+    if (entry < 0 || rigid::kSix <= entry) return;
+    int i = 0;
+    while (rigid::at6(i + 1, 0) <= entry) ++i;
+    const int j = entry - rigid::at6(i, 0);
+    at(to, b, i, b, j) += value;
+    if (j < i) at(to, b, j, b, i) += value;
   }
   // And to the part between two bodies, half of its rows at a time.
   template <class Presses>
@@ -97,16 +102,10 @@ struct System {
               for (int i = 0; i < 3; ++i) out[kUnknowns * i + j] += dot(a.map(side, 3 * half + i, c), pressed);
             }
           });
-          if (threadIdx.x == 0) {
-#pragma unroll
-            for (int i = 0; i < 3; ++i) {
-#pragma unroll
-              for (int j = 0; j < kUnknowns; ++j) {
-                const double value = total[kUnknowns * i + j];
-                at(to, b, 3 * half + i, other, j) += value, at(to, other, j, b, 3 * half + i) += value;
-              }
-            }
-          }
+          const double value = own_of<kHalf>(total);
+          if (threadIdx.x >= kHalf) continue;
+          const int i = 3 * half + static_cast<int>(threadIdx.x) / kUnknowns, j = threadIdx.x % kUnknowns;
+          at(to, b, i, other, j) += value, at(to, other, j, b, i) += value;
         }
       }
     }

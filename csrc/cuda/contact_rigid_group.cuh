@@ -18,19 +18,6 @@ constexpr int kStatic = 16 << 10;  // bytes of shared memory that are not for th
 
 using Warp = Tile<32>;
 
-// Sums of 32 numbers over the lanes of a warp, each to the lane of its number: half of them go at each exchange.
-template <int half = 16>
-__device__ __forceinline__ double sums_by_lane(double* of) {
-  const bool upper = Warp().lane & half;
-#pragma unroll
-  for (int k = 0; k < half; ++k) {
-    const double kept = upper ? of[k + half] : of[k], sent = upper ? of[k] : of[k + half];
-    of[k] = kept + __shfl_xor_sync(kAll, sent, half);
-  }
-  if constexpr (half > 1) return sums_by_lane<half / 2>(of);
-  return of[0];
-}
-
 // The system of a group.
 template <class T>
 struct GroupSystem {

@@ -83,8 +83,9 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 __global__ void __launch_bounds__(kOne)
     decide_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ Tried<T> t, int attempt) {
+  __shared__ Ballot ballot;
   if (t.done[blockIdx.x]) return;
-  const bool done = decide(in, t, blockIdx.x, attempt);
+  const bool done = decide(in, t, blockIdx.x, attempt, ballot);
   __syncthreads();  // everyone has asked whether it is done
   if (done && threadIdx.x == 0) t.done[blockIdx.x] = 1;
 }
@@ -98,17 +99,11 @@ __global__ void __launch_bounds__(kOne) end_kernel(const __grid_constant__ Rigid
 // A block of those that share a scene.
 struct BlockOfScene {
   BlockTeam block;
-  int rank = Cluster::rank(), size = Cluster::size();
-  __device__ int32_t first() const { return static_cast<int32_t>(kThreads * rank + threadIdx.x); }
+  Cluster cluster;
+  __device__ int32_t first() const { return static_cast<int32_t>(kThreads * cluster.rank + threadIdx.x); }
   template <class F>
   __device__ void each(int32_t count, const F& f) const {
-    for (int32_t i = first(); i < count; i += kThreads * size) f(i);
-  }
-  // Its part of a sum.
-  template <int n, class F>
-  __device__ void sum(int32_t count, double* out, const F& f) const {
-    own_sum<n>(first(), count, kThreads * size, out, f);
-    block.reduce<n>(out);
+    for (int32_t i = first(); i < count; i += kThreads * cluster.size) f(i);
   }
 };
 
@@ -120,10 +115,17 @@ __global__ void __launch_bounds__(kThreads)
   // potentials: parts of those of few bodies, whose last bits depend on the number of blocks; decisions allow for that
   __shared__ double part[kWarps][kMostSums], potentials[kMostBlocks][kWarps];
   __shared__ Answers answers;
-  const BlockOfScene team{{part}};
-  const int64_t scene = blockIdx.x / team.size, first = scene * in.scene.vertices, unit = scene * in.bodies();
+  __shared__ Ballot ballot;
+  Cluster cluster = Cluster::all();
+  const int64_t scene = blockIdx.x / cluster.size;
+  const int64_t repelling = in.first_listed(scene), rubbing = in.first_lagged(scene);
+  const auto repels = static_cast<int32_t>(in.first_listed(scene + 1) - repelling);
+  const auto rubs = static_cast<int32_t>(in.first_lagged(scene + 1) - rubbing);
+  if (cluster.leaves(in.scene.vertices + repels + rubs)) return;
+  const BlockOfScene team{{part}, cluster};
+  const int64_t first = scene * in.scene.vertices, unit = scene * in.bodies();
   const auto vertices = static_cast<int32_t>(in.scene.vertices), warp = static_cast<int32_t>(threadIdx.x / 32);
-  const bool few = in.bodies() < kWarps, leads = team.rank == 0;
+  const bool few = in.bodies() <= kWarps, leads = cluster.rank == 0;
   int turn = 0;
   bool moves = false;
   const double* motions = t.motion + kUnknowns * unit;
@@ -131,51 +133,56 @@ __global__ void __launch_bounds__(kThreads)
   moves = __syncthreads_or(moves);
   team.each(in.bodies(), [&](int32_t k) { begin_body(in, t, unit + k); });
   if (leads && threadIdx.x == 0) t.touches[scene] = t.nears[scene] = 0;
-  Cluster::meet();
+  cluster.meet();
   if (!moves) {  // a captured step makes all of its corrections, most of which move nothing
     team.each(vertices, [&](int32_t v) { displace(in, t, first + v, x); });
     if (leads) end_scene(in, t.motion, out, scene);
     return;
   }
-  const int64_t repelling = in.first_listed(scene), rubbing = in.first_lagged(scene);
-  const auto repels = static_cast<int32_t>(in.first_listed(scene + 1) - repelling);
-  const auto rubs = static_cast<int32_t>(in.first_lagged(scene + 1) - rubbing);
   team.each(vertices, [&](int32_t v) { find_way(in, t, first + v); });
-  Cluster::meet();
+  cluster.meet();
   team.each(repels + rubs,
             [&](int32_t i) { join_pair(in, t, i < repels ? repelling + i : rubbing + i - repels, i < repels); });
-  Cluster::meet();
+  cluster.meet();
   const int32_t near = t.nears[scene];
   for (int attempt = -1; attempt < kTries; ++attempt) {  // -1: where they are
     const bool moved = 0 <= attempt;
     double* const to = (moved ? t.after : t.before) + unit;
     if (moved) {
       team.each(vertices, [&](int32_t v) { displace(in, t, first + v, static_cast<T*>(nullptr)); });
-      Cluster::meet();
+      cluster.meet();
     }
     team.each(vertices, [&](int32_t v) { try_vertex(in, t, first + v, moved); });
     team.each(near + rubs, [&](int32_t i) {
       const int64_t pair = i < near ? t.near[repelling + i] : rubbing + i - near;
       try_pair_of(in, t, pair, i < near, t.press[i < near ? pair : listed + pair], moved);
     });
-    Cluster::meet();
-    for (int32_t k = few ? 0 : kWarps * team.rank + warp; k < in.bodies(); k += few ? 1 : kWarps * team.size) {
-      if (!in.free[k] || t.decided[unit + k]) continue;
-      const double value =
-          few ? potential_of(in, t, team, scene, k, listed) : potential_of(in, t, Tile<32>(), scene, k, listed);
-      if (few && threadIdx.x == 0) Cluster::of(&potentials[team.rank][k], 0)[0] = value;
-      if (!few && threadIdx.x % 32 == 0) to[k] = value;
+    cluster.meet();
+    if (few) {
+      double sums[kWarps];
+      own_potentials(in, t, scene, team.first(), kThreads * cluster.size, listed, sums);
+      team.block.template reduce<kWarps>(sums);
+      double* const all = cluster.size == 1 ? to : Cluster::of(potentials[cluster.rank], 0);
+#pragma unroll
+      for (int k = 0; k < kWarps; ++k) {
+        if (threadIdx.x == k && k < in.bodies()) all[k] = sums[k];
+      }
+    } else {
+      for (int32_t k = kWarps * cluster.rank + warp; k < in.bodies(); k += kWarps * cluster.size) {
+        if (!in.free[k] || t.decided[unit + k]) continue;
+        const double value = potential_of(in, t, Tile<32>(), scene, k, listed);
+        if (threadIdx.x % 32 == 0) to[k] = value;
+      }
     }
-    Cluster::meet();
-    if (few && leads) {
+    cluster.meet();
+    if (few && cluster.size > 1 && leads) {
       team.block.each(in.bodies(), [&](int32_t k) {
-        if (!in.free[k] || t.decided[unit + k]) return;
         to[k] = 0;
-        for (int b = 0; b < team.size; ++b) to[k] += potentials[b][k];
+        for (int b = 0; b < cluster.size; ++b) to[k] += potentials[b][k];
       });
       __syncthreads();
     }
-    if (moved && any_of_cluster(answers, turn, leads && decide(in, t, scene, attempt))) break;
+    if (moved && any_of_cluster(cluster, answers, turn, leads && decide(in, t, scene, attempt, ballot))) break;
   }
   team.each(vertices, [&](int32_t v) { displace(in, t, first + v, x); });
   if (leads) end_scene(in, t.motion, out, scene);  // which changes no share of what moves
@@ -187,7 +194,7 @@ template <class T>
 int64_t rigid_move_bytes(const RigidInputs<T>& in, const PairRoom& room) {
   const int64_t scenes = in.scene.scenes, units = scenes * in.bodies();
   return 9 * aligned(units * sizeof(double)) + aligned(scenes * in.scene.vertices * sizeof(double)) +
-         aligned(room.rows() * sizeof(double)) + aligned(units * sizeof(int32_t)) +
+         aligned(room.rows() * sizeof(double)) + 2 * aligned(units * sizeof(int32_t)) +
          aligned(room.listed * 2 * sizeof(int32_t)) + aligned(room.listed * sizeof(int32_t)) +
          2 * aligned(scenes * sizeof(int32_t)) + 2 * aligned(units * sizeof(T)) + 4 * aligned(units) + aligned(scenes) +
          aligned(scenes * in.scene.vertices * sizeof(Motion<T>));
@@ -213,7 +220,7 @@ cudaError_t rigid_move(const RigidInputs<T>& in, const PairRoom& room, const dou
   t.before = numbers(units), t.after = numbers(units);
   t.largest = counts(units), t.rise = counts(units), t.whole = counts(units);
   t.value = numbers(rows), t.press = numbers(room.rows());
-  t.lead = whole(units), t.touching = whole(2 * room.listed), t.touches = whole(scenes);
+  t.lead = whole(units), t.together = whole(units), t.touching = whole(2 * room.listed), t.touches = whole(scenes);
   t.near = whole(room.listed), t.nears = whole(scenes);
   t.state.share = reinterpret_cast<T*>(take(units * sizeof(T)));
   t.state.now = reinterpret_cast<T*>(take(units * sizeof(T)));

@@ -24,7 +24,7 @@ struct Tried {
   double *before, *after;                   // [B, bodies] potentials
   double *value, *press;                    // [B, V], [rows] what vertices and pairs have of them
   Count *largest, *rise, *whole;            // [B, bodies] of bodies that decide together, by their first
-  int32_t* lead;                            // [B, bodies] who they are
+  int32_t *lead, *together;                 // [B, bodies] who they are, as sets and by their first
   int32_t *touching, *touches;  // [listed, 2] bodies that press each other, scene after scene; [B] how many pairs
   int32_t *near, *nears;        // [listed] pairs that may press, scene after scene, in any order; [B] how many
   AdvanceState<T> state;
@@ -83,12 +83,7 @@ __device__ void join_pair(const RigidInputs<T>& in, const Tried<T>& t, int64_t p
     return;
   }
   const int32_t a = moving_body(in, record[0]), b = moving_body(in, record[sides(record[4])]);
-  if (a < 0 || b < 0) return;
-  unite(t.lead + first, a, b);
-  PairPress press;
-  if (!repels || !barrier_press(in, pair, CornerPoints<T>{in, false}, press)) return;
-  int32_t* to = t.touching + 2 * (in.first_listed(scene) + atomicAdd(t.touches + scene, 1));
-  to[0] = a, to[1] = b;
+  if (0 <= a && 0 <= b) unite(t.lead + first, a, b);
 }
 
 template <class T>
@@ -117,7 +112,8 @@ __device__ void try_vertex(const RigidInputs<T>& in, const Tried<T>& t, int64_t 
   if (!admitted(in, body, at.v)) mark(t.state.blocked + at.unit);
 }
 
-// And a pair, of those that it moves with: a near one, or a lagged one.
+// And a pair, of those that it moves with: a near one, or a lagged one. Where nothing has moved, also notes who presses
+// whom.
 template <class T>
 __device__ void try_pair_of(const RigidInputs<T>& in, const Tried<T>& t, int64_t pair, bool repels, double& value,
                             bool moved) {
@@ -129,6 +125,10 @@ __device__ void try_pair_of(const RigidInputs<T>& in, const Tried<T>& t, int64_t
   const bool acts = repels ? barrier_press(in, pair, at, a) : lagged_press(in, pair, at, Slid{}, a, -1);
   value = acts ? a.value : 0;
   if (moved && repels) try_pair(in.gate, t.state, pair, 0);
+  if (moved || !repels || !acts || a.body[0] < 0 || a.body[1] < 0) return;
+  const int64_t scene = record[5];
+  int32_t* to = t.touching + 2 * (in.first_listed(scene) + atomicAdd(t.touches + scene, 1));
+  to[0] = a.body[0], to[1] = a.body[1];
 }
 
 // The potential of a body, with that of the pairs that count for it.
@@ -157,63 +157,121 @@ __device__ double potential_of(const RigidInputs<T>& in, const Tried<T>& t, cons
   return sum[0];
 }
 
+// Those of up to kWarps bodies of a scene at once: what a thread has of each, of the items first, first + stride, ...
+// of its vertices, listed and lagged pairs. listed: of all scenes.
+template <class T>
+__device__ void own_potentials(const RigidInputs<T>& in, const Tried<T>& t, int64_t scene, int32_t first,
+                               int32_t stride, int64_t listed, double (&out)[kWarps]) {
+  const int64_t repelling = in.first_listed(scene), rubbing = in.first_lagged(scene);
+  const auto vertices = static_cast<int32_t>(in.scene.vertices);
+  const auto repels = static_cast<int32_t>(in.first_listed(scene + 1) - repelling);
+  const auto rubs = static_cast<int32_t>(in.first_lagged(scene + 1) - rubbing);
+#pragma unroll
+  for (int k = 0; k < kWarps; ++k) out[k] = 0;
+  const auto add = [&](int32_t body, const double* value) {
+    if (body < 0 || body >= in.bodies() || !in.free[body] || t.decided[scene * in.bodies() + body]) return;
+#pragma unroll
+    for (int k = 0; k < kWarps; ++k) out[k] += body == k ? *value : 0;
+  };
+  for (int32_t v = first; v < vertices; v += stride) add(in.gate.body[v], t.value + scene * vertices + v);
+  for (int32_t i = first; i < repels; i += stride) {
+    const int64_t pair = repelling + i;
+    if (t.press[pair] != 0) add(owner_of(in, in.gate.listed.pairs + kPairRow * pair), t.press + pair);  // few
+  }
+  for (int32_t i = first; i < rubs; i += stride) {
+    const int64_t pair = rubbing + i;
+    add(owner_of(in, in.lagged.pairs + kPairRow * pair), t.press + listed + pair);
+  }
+}
+
+// What the bodies of a scene decide by.
+struct Votes {
+  double *before, *after, *low, *next;
+  Count *largest, *rise, *whole;  // of bodies that decide together, by their first
+  int32_t* lead;                  // which that is; -1: decided, or nothing to decide
+  uint8_t *blocked, *stopped;
+};
+// Where there are few, in shared memory: one question follows another, and each waits for what was answered.
+constexpr int kHeld = 64;
+struct Ballot {
+  double before[kHeld], after[kHeld], low[kHeld], next[kHeld];
+  Count largest[kHeld], rise[kHeld], whole[kHeld];
+  int32_t lead[kHeld];
+  uint8_t blocked[kHeld], stopped[kHeld];
+  __device__ Votes votes() { return {before, after, low, next, largest, rise, whole, lead, blocked, stopped}; }
+};
+
 // Whether bodies may go as they have tried, by the block that works on their scene; if not, what each tries next.
 // Returns whether all have decided. Sums are of whole numbers, which do not depend on their order.
 template <class T>
-__device__ bool decide(const RigidInputs<T>& in, const Tried<T>& t, int64_t scene, int attempt) {
+__device__ bool decide(const RigidInputs<T>& in, const Tried<T>& t, int64_t scene, int attempt, Ballot& ballot) {
   const int64_t n = in.bodies(), first = scene * n;
+  const bool held = n <= kHeld;
+  const Votes own =
+      held ? ballot.votes()
+           : Votes{t.before + first, t.after + first, t.low + first,      t.next + first,          t.largest + first,
+                   t.rise + first,   t.whole + first, t.together + first, t.state.blocked + first, t.stopped + first};
   const auto each = [&](int64_t count, const auto& f) {
     for (int64_t i = threadIdx.x; i < count; i += blockDim.x) f(i);
   };
   const auto each_open = [&](const auto& f) {  // f(its number, that of the first of those it decides with)
     each(n, [&](int64_t k) {
-      if (in.free[k] && !t.decided[first + k]) f(first + k, first + root_of(t.lead + first, static_cast<int32_t>(k)));
+      if (own.lead[k] >= 0) f(k, own.lead[k]);
     });
   };
-  each(n, [&](int64_t k) { t.largest[first + k] = t.rise[first + k] = t.whole[first + k] = t.stopped[first + k] = 0; });
-  __syncthreads();
-  each_open([&](int64_t k, int64_t of) {
-    const double own = fmax(fabs(t.before[k]), fabs(t.after[k]));
-    raise(t.largest + of, bits_of(isfinite(t.before[k]) && isfinite(t.after[k]) ? own : CUDART_INF));
-    if (t.state.blocked[k]) mark(t.stopped + of);
+  each(n, [&](int64_t k) {
+    const bool open = in.free[k] && !t.decided[first + k];
+    own.lead[k] = open ? root_of(t.lead + first, static_cast<int32_t>(k)) : -1;
+    own.largest[k] = own.rise[k] = own.whole[k] = own.stopped[k] = 0;
+    if (!held) return;
+    own.before[k] = t.before[first + k], own.after[k] = t.after[first + k];
+    own.blocked[k] = t.state.blocked[first + k];
   });
   __syncthreads();
   each_open([&](int64_t k, int64_t of) {
-    const double parts = kParts / __longlong_as_double(static_cast<long long>(t.largest[of]));
+    const double size = fmax(fabs(own.before[k]), fabs(own.after[k]));
+    raise(own.largest + of, bits_of(isfinite(own.before[k]) && isfinite(own.after[k]) ? size : CUDART_INF));
+    if (own.blocked[k]) mark(own.stopped + of);
+  });
+  __syncthreads();
+  each_open([&](int64_t k, int64_t of) {
+    const double parts = kParts / __longlong_as_double(static_cast<long long>(own.largest[of]));
     if (!(0 < parts && parts < CUDART_INF)) return;
-    atomicAdd(t.rise + of, static_cast<Count>(__double2ll_rn(parts * (t.after[k] - t.before[k]))));
-    atomicAdd(t.whole + of, static_cast<Count>(__double2ll_rn(parts * t.before[k])));
+    atomicAdd(own.rise + of, static_cast<Count>(__double2ll_rn(parts * (own.after[k] - own.before[k]))));
+    atomicAdd(own.whole + of, static_cast<Count>(__double2ll_rn(parts * own.before[k])));
   });
   __syncthreads();
   bool open = false;
   const bool last = attempt + 1 == kTries;
   each_open([&](int64_t k, int64_t of) {
-    const bool fits = !t.stopped[of], finite = t.largest[of] < bits_of(CUDART_INF);
-    const auto before = static_cast<long long>(t.whole[of]), rise = static_cast<long long>(t.rise[of]);
+    const bool fits = !own.stopped[of], finite = own.largest[of] < bits_of(CUDART_INF);
+    const auto before = static_cast<long long>(own.whole[of]), rise = static_cast<long long>(own.rise[of]);
     if (finite && is_safe(static_cast<double>(before), static_cast<double>(before + rise), fits)) {
-      t.decided[k] = 1;
+      t.decided[first + k] = 1;
+      own.lead[k] = -1;
     } else {
-      t.low[k] = last ? 0.0 : shortened(t.state.blocked[k], fits, attempt);
-      t.state.blocked[k] = 0;
+      own.low[k] = last ? 0.0 : shortened(own.blocked[k], fits, attempt);
+      t.state.blocked[first + k] = 0;
       open = true;
     }
   });
   if (!__syncthreads_or(open)) return true;
   const int32_t* touching = t.touching + 2 * in.first_listed(scene);
-  for (int spread = 0; spread < kSpreads && !last; ++spread) {
-    each_open([&](int64_t k, int64_t) { t.next[k] = t.low[k]; });
+  const int32_t touches = last ? 0 : t.touches[scene];
+  for (int spread = 0; spread < kSpreads && touches > 0; ++spread) {
+    each_open([&](int64_t k, int64_t) { own.next[k] = own.low[k]; });
     __syncthreads();
-    each(t.touches[scene], [&](int64_t i) {
-      const int64_t a = first + touching[2 * i], b = first + touching[2 * i + 1];
-      if (t.decided[a]) return;  // both have
-      const Count both = bits_of(fmin(t.low[a], t.low[b]));
-      for (const int64_t k : {a, b}) lower(reinterpret_cast<Count*>(t.next + k), both);
+    each(touches, [&](int64_t i) {
+      const int32_t a = touching[2 * i], b = touching[2 * i + 1];
+      if (own.lead[a] < 0) return;  // both have decided
+      const Count both = bits_of(fmin(own.low[a], own.low[b]));
+      for (const int32_t k : {a, b}) lower(reinterpret_cast<Count*>(own.next + k), both);
     });
     __syncthreads();
-    each_open([&](int64_t k, int64_t) { t.low[k] = t.next[k]; });
+    each_open([&](int64_t k, int64_t) { own.low[k] = own.next[k]; });
     __syncthreads();
   }
-  each_open([&](int64_t k, int64_t) { t.share[k] *= t.low[k]; });
+  each_open([&](int64_t k, int64_t) { t.share[first + k] *= own.low[k]; });
   return false;
 }
 

@@ -1,4 +1,4 @@
-#include "detect_search.cuh"
+#include "detect_scan.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -88,10 +88,16 @@ cudaError_t detect(const Surfaces<T>& in, const Detected<T>& out, void* memory, 
   Workspace<T> work(in, out.capacity, memory);
   const int64_t rows = in.scenes * in.corners, capacity = out.capacity;
   const int64_t most = rows > capacity ? rows : capacity;
+  work.forest.sorted = !is_scanned(in);
   start_kernel<<<blocks_for((most > in.scenes ? most : in.scenes) + 1), kThreads, 0, stream>>>(in, work, capacity);
   if (auto error = build_forest(in, work.forest, work.sort, work.sort_bytes, stream)) return error;
-  launch_search<T, false>(in, work, capacity, stream);
-  launch_search<T, true>(in, work, capacity, stream);
+  if (work.forest.sorted) {
+    launch_search<T, false>(in, work, capacity, stream);
+    launch_search<T, true>(in, work, capacity, stream);
+  } else {
+    launch_scan<T, false>(in, work, capacity, stream);
+    launch_scan<T, true>(in, work, capacity, stream);
+  }
   if (capacity > 0) {
     settle_kernel<<<blocks_for(kCandidates * capacity), kThreads, 0, stream>>>(in, work, capacity);
     size_t bytes = work.sort_bytes;

@@ -134,7 +134,10 @@ struct Search {
     if (is_listed(in, c, gap, constants.dhat)) append(work.listed, work.keys, capacity, key);
   }
 
-  // What query q looks for: those of points come first, in the order of their Morton codes.
+  // Of a point that is not finite: it counts as touching, so that nobody takes the scene for a good one.
+  __device__ void meet_nothing() const { atomicAdd(&work.touching[0], 1ULL); }
+
+  // What query q looks for: those of points come first, in the order of the forest.
   struct Query {
     Box box;
     int64_t scene;
@@ -146,8 +149,8 @@ struct Search {
     const int64_t point_queries = in.scenes * in.num_points;
     if (q < point_queries) {
       const int64_t scene = q / in.num_points;
-      return {box_of(in, 2, scene, forest.sorted_items[forest.first(2) + q], reference_point(in, scene)), scene,
-              kPointTriangle, 0};
+      const int32_t item = forest.item(2, scene, static_cast<int32_t>(q - scene * in.num_points));
+      return {box_of(in, 2, scene, item, reference_point(in, scene)), scene, kPointTriangle, 0};
     }
     const int64_t scene = (q - point_queries) / in.num_edges;
     const auto leaf = static_cast<int32_t>(q - point_queries - scene * in.num_edges) + forest.leaves[1];
@@ -156,6 +159,14 @@ struct Search {
 
   __device__ void examine_leaf(int64_t scene, int kind, int32_t item, int32_t leaf) const {
     examine(candidate(in, scene, kind, item, work.forest.tree(kind, scene)[leaf].item));
+  }
+
+  // The planes of colliders, as one of `share` threads.
+  __device__ void examine_planes(const Query& q, int lane, int share) const {
+    if (q.box.group == in.mesh_bodies) return;
+    for (int32_t p = lane; p < in.num_planes; p += share) {
+      examine(candidate(in, q.scene, kPointPlane, q.box.item, p));
+    }
   }
 
   // Nodes from..end of the tree, leaves from `first` on.
@@ -204,13 +215,10 @@ __global__ void __launch_bounds__(kThreads)
   const auto q = search.query(i < queries ? i : queries - 1);
   bool walks = i < queries;
   if (walks && is_empty(q.box)) {
-    // A point that is not finite meets nothing: it counts as touching, so that nobody takes the scene for a good one.
-    if (!listing && q.kind == kPointTriangle) atomicAdd(&work.touching[0], 1ULL);
+    if (!listing && q.kind == kPointTriangle) search.meet_nothing();
     walks = false;
   }
-  if (walks && q.kind == kPointTriangle && q.box.group != in.mesh_bodies) {
-    for (int32_t p = 0; p < in.num_planes; ++p) search.examine(candidate(in, q.scene, kPointPlane, q.box.item, p));
-  }
+  if (walks && q.kind == kPointTriangle) search.examine_planes(q, 0, 1);
   // Each pair of edges once: an edge looks to the right of it in the tree.
   int32_t node = q.kind == kEdgeEdge ? next_node(q.leaf) : kRoot;
   walks = walks && !(q.kind == kEdgeEdge && node == kRoot);

@@ -39,8 +39,8 @@ __global__ void __launch_bounds__(kVertexThreads)
 
 }  // namespace
 
-int64_t bodies_workspace(const BodyGroups& groups, int64_t scenes) {
-  if (groups.large == 0 || by_block(groups, scenes)) return 0;
+int64_t bodies_workspace(const BodyGroups& groups, int64_t scenes, int64_t vertices) {
+  if (groups.large == 0 || by_block(groups, scenes, vertices)) return 0;
   return int64_t{2} * multiprocessors() * kMostSums;
 }
 

@@ -29,6 +29,7 @@ struct Forest {
   int axis_bits;
   uint64_t *keys, *sorted_keys;
   int32_t *items, *sorted_items;  // index of a primitive in its scene
+  bool sorted = true;             // false: leaves are in the order of their primitives, without a tree over them
   contact::Box* nodes[2];         // [scenes, 2 leaves]
   unsigned (*bounds)[6];          // of each scene, as ordered bits
 
@@ -58,6 +59,10 @@ struct Forest {
     return scenes * ((kind > 0 ? int64_t{count[0]} : 0) + (kind > 1 ? int64_t{count[1]} : 0));
   }
   DIFFVBD_FN int64_t size() const { return first(2) + scenes * count[2]; }
+  // The k-th primitive of a kind in a scene.
+  DIFFVBD_FN int32_t item(int kind, int64_t scene, int32_t k) const {
+    return sorted ? sorted_items[first(kind) + scene * count[kind] + k] : k;
+  }
   DIFFVBD_FN contact::Box* tree(int kind, int64_t scene) const { return nodes[kind] + scene * 2 * leaves[kind]; }
   int key_bits() const { return 3 * axis_bits + bits_of(static_cast<uint64_t>(3 * scenes)); }
 };
@@ -126,11 +131,11 @@ template <class T>
 __global__ void leaves_kernel(const contact::Surfaces<T> in, Forest forest, int kind) {
   const int64_t i = own_item(), leaves = forest.leaves[kind];
   if (i >= in.scenes * leaves) return;
-  const int64_t scene = i / leaves, leaf = i - scene * leaves;
+  const int64_t scene = i / leaves;
+  const auto leaf = static_cast<int32_t>(i - scene * leaves);
   contact::Box box = contact::empty_box();
   if (leaf < forest.count[kind]) {
-    const int32_t item = forest.sorted_items[forest.first(kind) + scene * forest.count[kind] + leaf];
-    box = box_of(in, kind, scene, item, reference_point(in, scene));
+    box = box_of(in, kind, scene, forest.item(kind, scene, leaf), reference_point(in, scene));
   }
   forest.tree(kind, scene)[leaves + leaf] = box;
 }
@@ -159,11 +164,11 @@ static __global__ void fold_kernel(Forest forest, int kind, int32_t width, int s
 template <class T>
 cudaError_t build_forest(const contact::Surfaces<T>& in, const Forest& forest, void* sort, size_t sort_bytes,
                          cudaStream_t stream) {
-  if (in.scenes * in.num_points > 0) {
+  if (forest.sorted && in.scenes * in.num_points > 0) {
     bounds_kernel<<<blocks_for(in.scenes * in.num_points), kThreads, 0, stream>>>(in, forest);
   }
   const int64_t n = forest.size();
-  if (n > 0) {
+  if (forest.sorted && n > 0) {
     codes_kernel<<<blocks_for(n), kThreads, 0, stream>>>(in, forest);
     if (auto error = cub::DeviceRadixSort::SortPairs(sort, sort_bytes, forest.keys, forest.sorted_keys, forest.items,
                                                      forest.sorted_items, n, 0, forest.key_bits(), stream))
@@ -171,7 +176,7 @@ cudaError_t build_forest(const contact::Surfaces<T>& in, const Forest& forest, v
   }
   for (int kind = 0; kind < 2 && in.scenes > 0; ++kind) {
     leaves_kernel<<<blocks_for(in.scenes * forest.leaves[kind]), kThreads, 0, stream>>>(in, forest, kind);
-    for (int32_t width = forest.leaves[kind]; width > 1;) {
+    for (int32_t width = forest.leaves[kind]; forest.sorted && width > 1;) {
       int steps = 0;
       while (steps < 9 && width >> steps > 1) ++steps;
       fold_kernel<<<blocks_for(in.scenes * width / 2), kThreads, 0, stream>>>(forest, kind, width, steps);

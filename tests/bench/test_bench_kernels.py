@@ -15,6 +15,12 @@ NAMES = {
     "void unnamed>::scene_kernel<double>(diffvbd::contact::RigidInputs<T1>, long)": "scene_kernel, RigidInputs",
     "void diffvbd::cuda::<unnamed>::sweep_reverse<double, (int)13, (int)0>(StepView<T1>, Range)": "sweep_reverse",
     "void diffvbd::(anonymous namespace)::scene_kernel<double>(diffvbd::AdvanceInputs<double>)": NAME,
+    "void diffvbd::cuda::<unnamed>::small_bodies<(int)8, double, diffvbd::cuda::<unnamed>::Begin<double, (bool)0>>"
+    "(diffvbd::rigid::Inputs<T2>, T3, int, int)": "small_bodies, Begin",
+    "void diffvbd::cuda::(anonymous namespace)::small_bodies<8, double, diffvbd::cuda::(anonymous namespace)::"
+    "ReverseBegin<double, false> >(diffvbd::rigid::Inputs<double>, int, int)": "small_bodies, ReverseBegin",
+    "void at::native::vectorized_elementwise_kernel<2, at::native::CUDAFunctor_add<double>, std::array<char*, 3ul> >"
+    "(int, at::native::CUDAFunctor_add<double>, std::array<char*, 3ul>)": "vectorized_elementwise_kernel",
 }
 
 

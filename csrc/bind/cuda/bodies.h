@@ -18,7 +18,7 @@ inline BodyGroups groups_of(const std::vector<int64_t>& groups, int64_t bodies) 
 }
 
 inline Tensor workspace_of(const BodyGroups& groups, const Tensor& x) {
-  return empty(x, {bodies_workspace(groups, x.size(0))}, ScalarType::Double);
+  return empty(x, {bodies_workspace(groups, x.size(0), x.size(1))}, ScalarType::Double);
 }
 
 }  // namespace diffvbd::cuda
