@@ -3,6 +3,7 @@
 
 #include "contact_near.cuh"
 #include "contact_rows.cuh"
+#include "follow.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -75,6 +76,7 @@ __global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __
                                  int64_t begin, int64_t end) {
   __shared__ T slots[kContactThreads / kSlice][kSlice][kContactScalars];
   const Member<share, T> at(s, in, begin, end);
+  wait_for_previous();
   if (s.w.before && at.vertex >= 0 && at.lane == 0) store_row(s.w.before, at.row(s), load_row(s.w.x, at.row(s)));
   if (!__any_sync(kWholeWarp, at.touches)) return;
   const SweepRows<T> rows = at.rows(s);
@@ -121,6 +123,7 @@ __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __gri
                               uint8_t* cut, int sweep, int64_t begin, int64_t end) {
   __shared__ int exponents[kContactThreads / share];  // of the vertices of the block
   const Member<share, T> at(s, in, begin, end);
+  wait_for_previous();
   const bool there = at.vertex >= 0;
   const RowsBefore<T> rows{at.rows(s), s.w.before + at.local * s.positions * kRow};
   const contact::Source<T, RowsBefore<T>> source{in, at.scene, rows};
@@ -162,6 +165,7 @@ __global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __g
                                 const __grid_constant__ ContactAdjoints<T> slots, int sweep, int rows_of_tape,
                                 int64_t begin, int64_t end) {
   const Member<share, T> at(s, in, begin, end);
+  wait_for_previous();
   if (at.vertex >= 0 && at.lane == 0) {
     const int64_t active = s.plan.num_active;
     const int rank = __ldg(s.plan.block_rank + at.position / kSlice) + static_cast<int>(at.position % kSlice);
@@ -182,6 +186,7 @@ __global__ void __launch_bounds__(kContactThreads, 3)
     reverse_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
                     const __grid_constant__ ContactAdjoints<T> slots, int64_t begin, int64_t end) {
   const Member<share, T> at(s, in, begin, end);
+  wait_for_previous();
   if (!__any_sync(kWholeWarp, at.touches)) return;
   const SweepRows<T> rows = at.rows(s);
   const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
@@ -298,12 +303,15 @@ __global__ void sum_lag_slots(const int32_t* entries, const T* slots, int64_t it
 }
 
 template <class... P, class... A>
-cudaError_t launch_contact(void (*kernel)(P...), int64_t items, cudaStream_t stream, A... arguments) {
+cudaError_t launch_pass(void (*kernel)(P...), int64_t items, cudaStream_t stream, bool follows, A... arguments) {
   if (items == 0) return cudaSuccess;
   void* pointers[] = {&arguments...};
   const unsigned blocks = static_cast<unsigned>((items + kContactThreads - 1) / kContactThreads);
-  return cudaLaunchKernel(reinterpret_cast<const void*>(kernel), dim3(blocks), dim3(kContactThreads), pointers, 0,
-                          stream);
+  return launch(reinterpret_cast<const void*>(kernel), blocks, dim3(kContactThreads), pointers, 0, stream, follows);
+}
+template <class... P, class... A>
+cudaError_t launch_contact(void (*kernel)(P...), int64_t items, cudaStream_t stream, A... arguments) {
+  return launch_pass(kernel, items, stream, false, arguments...);
 }
 
 // For the vertices of the blocks [begin, end): with as many threads for each as the whole batch says, so that a scene
@@ -313,8 +321,8 @@ cudaError_t launch_color(void (*kernel)(P...), void (*wide)(P...), const Contact
                          int64_t end, A... arguments) {
   const int64_t vertices = (end - begin) * kSlice;
   const bool few = passes.scenes * vertices <= kFewVertices;
-  return launch_contact(few ? wide : kernel, passes.s.scenes * vertices * (few ? kWide : kShare), passes.stream,
-                        arguments...);
+  return launch_pass(few ? wide : kernel, passes.s.scenes * vertices * (few ? kWide : kShare), passes.stream,
+                     passes.follows, arguments...);
 }
 
 }  // namespace

@@ -15,6 +15,7 @@ struct ContactPasses {
   uint8_t* cut;                // null in the reverse
   int64_t scenes;              // of the batch
   cudaStream_t stream;
+  bool follows = false;  // the passes over a color wait for the kernel before them by themselves (follow.cuh)
 
   // No pairs yet; where vertices are within their rooms.
   cudaError_t load() const;

@@ -1,5 +1,5 @@
-// Kernels of friction and damping as they are at the start of a step (contact/lag.h): a thread for each pair, or for
-// each corner point.
+// Kernels of friction and damping as they are at the start of a step (contact/lag.h): a thread for each pair, or
+// a warp for each corner point.
 #pragma once
 
 #include "../contact/lag.h"
@@ -52,16 +52,19 @@ __global__ void lag_reverse(const __grid_constant__ ContactInputs<T> in, const T
   }
 }
 
-// By corner point: what its pairs' corners have received.
+// By corner point, with a warp: what its pairs' corners have received.
 template <class T>
 __global__ void lag_collect(const __grid_constant__ ContactInputs<T> in, int64_t scenes, const T* slots, T* x_bar,
                             T* collider_bar) {
-  const int64_t row = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x, row = i / kSlice;
   if (row >= scenes * in.corners) return;
+  const auto lane = static_cast<int>(i % kSlice);
   Vec3<T> sum = zero3<T>();
-  for (int e = in.listed.ptr[row]; e < in.listed.ptr[row + 1]; ++e) {
+  for (int e = in.listed.ptr[row] + lane; e < in.listed.ptr[row + 1]; e += kSlice) {
     sum += contact::vector_at(slots + int64_t{4} * in.listed.entry[e]);
   }
+  sum_share<kSlice>(sum);
+  if (lane != 0) return;
   const int64_t scene = row / in.corners, corner = row - scene * in.corners, colliders = in.corners - in.num_vertices;
   T* to = corner < in.num_vertices ? x_bar + 3 * (scene * in.num_vertices + corner)
                                    : collider_bar + 3 * (scene * colliders + corner - in.num_vertices);
@@ -81,8 +84,10 @@ cudaError_t pair_lag_backward(const ContactInputs<T>& in, const T* x, int64_t sc
                               T* slots, T* x_bar, T* collider_bar, T* kappa_bar, cudaStream_t stream) {
   if (auto error = launch_contact(lag_reverse<T>, pairs, stream, in, x, scenes, pairs, bar, slots)) return error;
   const T* from = slots;
-  if (auto error = launch_contact(lag_collect<T>, scenes * in.corners, stream, in, scenes, from, x_bar, collider_bar))
+  if (auto error =
+          launch_contact(lag_collect<T>, scenes * in.corners * kSlice, stream, in, scenes, from, x_bar, collider_bar)) {
     return error;
+  }
   return launch_sum(scenes, stream, in, int64_t{0}, from + 3, 4, kappa_bar);
 }
 

@@ -64,6 +64,7 @@ __global__ void __maxnreg__((forward_registers<T, EnergySet<mask>>()))
     sweep_forward(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range) {
   using Set = EnergySet<mask>;
   T* const shared = memory_of_warp<T, lanes>(s, false);
+  wait_for_previous();
   each_color<T, lanes>(s, range, false, [&](int64_t scene, int sweep, int block, int part) {
     const Turn turn{scene, sweep, block, part};
     if (!update<Usual<Set>, T, lanes>(s, shared, turn)) rare_update<Set, T, lanes>(s, shared, turn);

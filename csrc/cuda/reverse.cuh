@@ -118,6 +118,7 @@ __global__ void __maxnreg__((reverse_registers<T, EnergySet<mask>>()))
     sweep_reverse(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range) {
   using Set = EnergySet<mask>;
   T* const shared = memory_of_warp<T, lanes>(s, true);
+  wait_for_previous();
   each_color<T, lanes>(s, range, true, [&](int64_t scene, int number, int block, int part) {
     const Turn turn{scene, number, block, part};
     if (!reverse_update<Usual<Set>, wanted, T, lanes>(s, shared, turn)) {

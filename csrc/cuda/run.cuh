@@ -5,6 +5,7 @@
 
 #include "coarse.h"
 #include "contact.h"
+#include "follow.cuh"
 #include "frame.cuh"
 #include "scene_kernels.h"
 
@@ -166,7 +167,9 @@ struct Runner {
     return in.contact ? passes().load() : cudaSuccess;
   }
 
-  ContactPasses<T> passes() const { return {s, *in.contact, adjoints, cut, in.scenes, stream}; }
+  ContactPasses<T> passes(bool follow = false) const {
+    return {s, *in.contact, adjoints, cut, in.scenes, stream, follow};
+  }
 
   int64_t blocks_of(int color) const { return host.color_block[color + 1] - host.color_block[color]; }
 
@@ -194,15 +197,16 @@ struct Runner {
       const int64_t needed = own ? s.scenes : (parts * s.scenes + warps - 1) / warps;
       return spills ? std::min<int64_t>(needed, choice.multiprocessors) : needed;
     };
-    const auto launch = [&](int64_t blocks) {
-      return cudaLaunchKernel(function, dim3(static_cast<unsigned>(blocks)), threads, arguments, shared, stream);
+    const bool may_follow = choice.regime == kColor && can_follow(function);
+    const auto start = [&](int64_t blocks, bool follows = false) {
+      return launch(function, static_cast<unsigned>(blocks), threads, arguments, shared, stream, follows && may_follow);
     };
     const auto run = [&](int begin, int end) {  // counted from the last in the reverse
       range.first_sweep = begin, range.end_sweep = end;
       range.first_color = 0, range.end_color = colors;
       if (begin == end) return cudaSuccess;
-      if (own) return launch(blocks_for(most));
-      if (choice.regime == kColor) return color_by_color(range, backward, lanes, blocks_for, launch);
+      if (own) return start(blocks_for(most));
+      if (choice.regime == kColor) return color_by_color(range, backward, lanes, may_follow, blocks_for, start);
       int resident = 0;
       const int size = static_cast<int>(threads.x);
       if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, function, size, shared)) return error;
@@ -231,8 +235,11 @@ struct Runner {
     return backward ? corrections.matrix_bars() : cudaSuccess;
   }
 
-  template <class Blocks, class Launch>
-  cudaError_t color_by_color(Range& range, bool backward, int lanes, const Blocks& blocks_for, const Launch& launch) {
+  // All but the first launch follow the one before.
+  template <class Blocks, class Start>
+  cudaError_t color_by_color(Range& range, bool backward, int lanes, bool may_follow, const Blocks& blocks_for,
+                             const Start& start) {
+    bool follows = false;
     const int colors = host.plan.colors, first = range.first_sweep, last = range.end_sweep;
     for (int k = first; k < last; ++k) {
       for (int c = 0; c < colors; ++c) {
@@ -242,14 +249,18 @@ struct Runner {
         if (blocks_of(color) == 0) continue;
         const int64_t begin = host.color_block[color], end = host.color_block[color + 1];
         if (in.contact && backward) {
-          if (auto error = passes().prepare(in.sweeps - 1 - k, begin, end)) return error;
+          if (auto error = passes(follows).prepare(in.sweeps - 1 - k, begin, end)) return error;
+          follows = may_follow;
         }
         if (in.contact && !(backward && in.tape_policy == kFullTape)) {
-          if (auto error = passes().assemble(begin, end)) return error;
+          if (auto error = passes(follows).assemble(begin, end)) return error;
+          follows = may_follow;
         }
-        if (auto error = launch(blocks_for(blocks_of(color) * threads_of(lanes)))) return error;
+        if (auto error = start(blocks_for(blocks_of(color) * threads_of(lanes)), follows)) return error;
+        follows = may_follow;
         if (in.contact) {
-          if (auto error = backward ? passes().reverse(begin, end) : passes().limit(k, begin, end)) return error;
+          const auto pass = passes(follows);
+          if (auto error = backward ? pass.reverse(begin, end) : pass.limit(k, begin, end)) return error;
         }
       }
     }

@@ -1,6 +1,7 @@
 // Who visits which vertices when: the loops over sweeps and colors inside a launch, and the barriers between colors.
 #pragma once
 
+#include "follow.cuh"
 #include "group.cuh"
 
 namespace diffvbd::cuda {

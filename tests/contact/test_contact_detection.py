@@ -116,6 +116,26 @@ def test_random_triangles(device: str, triangles: int) -> None:
     check(Scene.of([soup(generator("soup", triangles), triangles)]), device)
 
 
+def test_a_fine_surface_far_away_changes_nothing(device: str) -> None:
+    """CUDA compares the boxes of small scenes with one another, and walks through trees where a scene has more edges."""
+    fine = soup(generator("fine"), 700)
+    fine.points = fine.points + 50.0
+    near = generator("near")
+    for bodies, colliders, scenes in (
+        ([soup(near, 150)], [], 1),
+        ([soup(near, 25), solid(dv.mesh.box(2, (0.5, 0.3, 0.3)))], [capsule((0.1, 0.8, 0.2), (0.9, 0.7, 0.5), 0.1),
+                                                                   plane((0, 0, 0), (0, 0, 1), (1, 0, 0.1))], 3),
+    ):  # fmt: skip
+        small, large = Scene.of(bodies, colliders, scenes), Scene.of(bodies, [*colliders, fine], scenes)
+        assert len(small.edges) < 2048 < len(large.edges)
+        alone, beside = detect(small, device), detect(large, device)
+        count, corners = int(alone.counts[0]), alone.near_values.shape[1]
+        assert count > 300 and torch.equal(alone.counts[:2], beside.counts[:2])
+        assert torch.equal(alone.pairs[:count], beside.pairs[:count])
+        assert torch.equal(alone.constants[:count], beside.constants[:count])
+        assert torch.equal(alone.near_values, beside.near_values[:, :corners])
+
+
 @pytest.mark.parametrize("numbers", [(0.01, 0.2), (0.2, 0.1), (0.05, 0.0)])
 def test_other_numbers(device: str, numbers: tuple[float, ...]) -> None:
     check(mixed_scene(**dict(zip(("dhat", "room"), numbers, strict=True))), device)
