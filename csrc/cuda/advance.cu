@@ -9,7 +9,7 @@ namespace {
 
 using namespace contact;
 
-constexpr int kThreads = 256;
+constexpr int kThreads = 256, kWarp = 32;
 constexpr int64_t kManyPairs = 1 << 19;  // worth more than one block a multiprocessor: more blocks wait longer
 constexpr int kFlags = kMoves * (2 * kRounds + 1);  // one for each question that the whole grid is asked
 
@@ -88,9 +88,10 @@ struct NearPairs {
   int *count, *slows;   // of the block
   int32_t* slow;        // [2 kThreads]
 
-  // Where the block has its i-th pair, and keeps the i-th of those that may matter.
+  // Where the block has its i-th pair, and keeps the i-th of those that may matter. These lie side by side: each block
+  // has some of every part of the list.
   __device__ int64_t place(int i) const {
-    return pairs.begin + int64_t{i / kThreads * cluster.size + cluster.rank} * kThreads + i % kThreads;
+    return pairs.begin + int64_t{i / kWarp * cluster.size + cluster.rank} * kWarp + i % kWarp;
   }
   __device__ void begin_move(const SceneTeam&, const AdvanceInputs<T>& in, const AdvanceState<T>& s) const {
     if (threadIdx.x == 0) *count = *slows = 0;

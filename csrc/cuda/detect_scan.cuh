@@ -7,7 +7,7 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int64_t kMostCompared = int64_t{1} << 30;  // boxes, of all scenes
+constexpr int64_t kMostCompared = int64_t{1} << 23;  // boxes, of all scenes
 constexpr int32_t kMostScanned = 2048;               // that one query is compared with
 
 template <class T>

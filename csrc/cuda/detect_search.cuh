@@ -190,7 +190,8 @@ struct Search {
           box(q.box),
           reach(squared_reach(search.in, q.scene, q.box.group)) {}
     __device__ bool operator()(const Box& node) const {
-      return distance2(node, box) <= reach.to(node.group) && !in.ignores(box.group, node.group);
+      const float square = distance2(node, box);  // most are out of any reach
+      return square <= reach.any && square <= reach.to(node.group) && !in.ignores(box.group, node.group);
     }
   };
 };
