@@ -62,16 +62,31 @@ DIFFVBD_FN void measure_across(Distance<R>& out, const Corners<R>& c, const Vec3
   out.n = (sign * scale) * normal;
 }
 
-// Keeps the closer of a candidate and what was found before.
+// The feature whose points are closest, of one pair at a time: kInside, where they lie inside a face or inside both
+// edges, or else an end: a corner of one side, and two of the other, between which the closest point lies.
+constexpr int kInside = 0;
+struct End {
+  int point, from, to;
+};
+DIFFVBD_FN End end_of(int kind, int feature) {
+  if (kind == kPointTriangle) return {0, feature, feature % 3 + 1};
+  const int from = feature <= 2 ? 2 : 0;
+  return {feature - 1, from, from + 1};
+}
+
+// Keeps the closer of a candidate and what was found before. feature: if not null, receives its number.
 template <class R>
-DIFFVBD_FN void keep_closer(Distance<R>& best, R& best2, const Corners<R>& c, const R& w0, const R& w1, const R& w2,
-                            const R& w3) {
+DIFFVBD_FN void keep_closer(Distance<R>& best, R& best2, int* feature, int number, const Corners<R>& c, const R& w0,
+                            const R& w1, const R& w2, const R& w3) {
   const R w[4] = {w0, w1, w2, w3};
   const Vec3<R> r = weighted(w, c);
   const R r2 = dot(r, r);
   const auto closer = r2 < best2;
   best2 = select(closer, r2, best2);
   for (int k = 0; k < 4; ++k) best.w[k] = select(closer, w[k], best.w[k]);
+  if constexpr (std::is_same_v<decltype(r2 < best2), bool>) {
+    if (feature != nullptr && closer) *feature = number;
+  }
 }
 
 template <class M, class R>
@@ -84,51 +99,89 @@ DIFFVBD_FN Distance<R> chosen(const M& condition, const Distance<R>& a, const Di
 // Below this squared sine two directions count as parallel.
 DIFFVBD_FN constexpr double parallel() { return 1e-16; }
 
+// Where the closest points of a point and a triangle are, if that is inside its face.
+template <class R>
+struct InFace {
+  Vec3<R> normal;
+  R size2, bound, u, v, w;
+  DIFFVBD_FN explicit InFace(const Corners<R>& c) {
+    const Vec3<R>&p = c.x[0], &a = c.x[1], &b = c.x[2], &e = c.x[3];
+    const Vec3<R> ab = b - a, ac = e - a, ap = p - a;
+    normal = cross(ab, ac);
+    size2 = dot(normal, normal), bound = dot(ab, ab) * dot(ac, ac);
+    const R inverse = R(1) / size2;
+    v = inverse * dot(cross(ap, ac), normal), w = inverse * dot(cross(ab, ap), normal), u = R(1) - v - w;
+  }
+  DIFFVBD_FN auto holds() const {
+    return both(R(parallel()) * bound < size2, both(R(0) < u, both(R(0) < v, R(0) < w)));
+  }
+  DIFFVBD_FN Distance<R> measured(const Corners<R>& c) const {
+    Distance<R> out{};
+    out.w[0] = R(1), out.w[1] = -u, out.w[2] = -v, out.w[3] = -w;
+    measure_across(out, c, normal, size2);
+    return out;
+  }
+};
+// And those of two edges, if they are inside both.
+template <class R>
+struct InEdges {
+  Vec3<R> normal;
+  R size2, bound, s, t;
+  DIFFVBD_FN explicit InEdges(const Corners<R>& c) {
+    const Vec3<R> u = c.x[1] - c.x[0], v = c.x[3] - c.x[2], r = c.x[0] - c.x[2];
+    normal = cross(u, v);
+    size2 = dot(normal, normal), bound = dot(u, u) * dot(v, v);
+    const R inverse = R(1) / size2;
+    s = inverse * dot(cross(v, r), normal), t = inverse * dot(cross(u, r), normal);
+  }
+  DIFFVBD_FN auto holds() const {
+    return both(R(parallel()) * bound < size2, both(both(R(0) < s, s < R(1)), both(R(0) < t, t < R(1))));
+  }
+  DIFFVBD_FN Distance<R> measured(const Corners<R>& c) const {
+    Distance<R> out{};
+    out.w[0] = R(1) - s, out.w[1] = s, out.w[2] = t - R(1), out.w[3] = -t;
+    measure_across(out, c, normal, size2);
+    return out;
+  }
+};
+
 // corners: the point, then the triangle
 template <class R>
-DIFFVBD_FN Distance<R> point_triangle(const Corners<R>& c) {
+DIFFVBD_FN Distance<R> point_triangle(const Corners<R>& c, int* feature = nullptr) {
   const Vec3<R>&p = c.x[0], &a = c.x[1], &b = c.x[2], &e = c.x[3];
-  const Vec3<R> ab = b - a, ac = e - a, ap = p - a, normal = cross(ab, ac);
-  const R size2 = dot(normal, normal), bound = dot(ab, ab) * dot(ac, ac);
-  const R inverse = R(1) / size2;
-  const R v = inverse * dot(cross(ap, ac), normal), w = inverse * dot(cross(ab, ap), normal), u = R(1) - v - w;
-  const auto inside = both(R(parallel()) * bound < size2, both(R(0) < u, both(R(0) < v, R(0) < w)));
+  const InFace<R> in(c);
+  const auto inside = in.holds();
   Distance<R> face{}, out{};
   if (any(inside)) {
-    face.w[0] = R(1), face.w[1] = -u, face.w[2] = -v, face.w[3] = -w;
-    measure_across(face, c, normal, size2);
+    face = in.measured(c);
     if (all(inside)) return face;
   }
   R best2 = R(std::numeric_limits<float>::infinity());
   const R s = closest_on_segment(p, a, b), t = closest_on_segment(p, b, e), q = closest_on_segment(p, e, a);
-  keep_closer(out, best2, c, R(1), s - R(1), -s, R(0));
-  keep_closer(out, best2, c, R(1), R(0), t - R(1), -t);
-  keep_closer(out, best2, c, R(1), -q, R(0), q - R(1));
+  keep_closer(out, best2, feature, 1, c, R(1), s - R(1), -s, R(0));
+  keep_closer(out, best2, feature, 2, c, R(1), R(0), t - R(1), -t);
+  keep_closer(out, best2, feature, 3, c, R(1), -q, R(0), q - R(1));
   measure_along(out, c);
   return chosen(inside, face, out);
 }
 
 // corners: the ends of the first edge, then of the second
 template <class R>
-DIFFVBD_FN Distance<R> edge_edge(const Corners<R>& c) {
-  const Vec3<R> u = c.x[1] - c.x[0], v = c.x[3] - c.x[2], r = c.x[0] - c.x[2], normal = cross(u, v);
-  const R size2 = dot(normal, normal), bound = dot(u, u) * dot(v, v);
-  const R inverse = R(1) / size2;
-  const R s = inverse * dot(cross(v, r), normal), t = inverse * dot(cross(u, r), normal);
-  const auto inside = both(R(parallel()) * bound < size2, both(both(R(0) < s, s < R(1)), both(R(0) < t, t < R(1))));
+DIFFVBD_FN Distance<R> edge_edge(const Corners<R>& c, int* feature = nullptr) {
+  const InEdges<R> in(c);
+  const auto inside = in.holds();
   Distance<R> across{}, out{};
   if (any(inside)) {
-    across.w[0] = R(1) - s, across.w[1] = s, across.w[2] = t - R(1), across.w[3] = -t;
-    measure_across(across, c, normal, size2);
+    across = in.measured(c);
     if (all(inside)) return across;
   }
   R best2 = R(std::numeric_limits<float>::infinity());
   const R a = closest_on_segment(c.x[0], c.x[2], c.x[3]), b = closest_on_segment(c.x[1], c.x[2], c.x[3]);
   const R d = closest_on_segment(c.x[2], c.x[0], c.x[1]), e = closest_on_segment(c.x[3], c.x[0], c.x[1]);
-  keep_closer(out, best2, c, R(1), R(0), a - R(1), -a);
-  keep_closer(out, best2, c, R(0), R(1), b - R(1), -b);
-  keep_closer(out, best2, c, R(1) - d, d, R(-1), R(0));
-  keep_closer(out, best2, c, R(1) - e, e, R(0), R(-1));
+  keep_closer(out, best2, feature, 1, c, R(1), R(0), a - R(1), -a);
+  keep_closer(out, best2, feature, 2, c, R(0), R(1), b - R(1), -b);
+  keep_closer(out, best2, feature, 3, c, R(1) - d, d, R(-1), R(0));
+  keep_closer(out, best2, feature, 4, c, R(1) - e, e, R(0), R(-1));
   measure_along(out, c);
   return chosen(inside, across, out);
 }
@@ -146,9 +199,46 @@ DIFFVBD_FN Distance<R> point_plane(const Corners<R>& c) {
   return out;
 }
 
+// feature: if not null, receives the feature whose points are closest, of one pair.
 template <class R>
-DIFFVBD_FN Distance<R> distance(int kind, const Corners<R>& c) {
-  return kind == kPointTriangle ? point_triangle(c) : kind == kEdgeEdge ? edge_edge(c) : point_plane(c);
+DIFFVBD_FN Distance<R> distance(int kind, const Corners<R>& c, int* feature = nullptr) {
+  if (feature != nullptr) *feature = kInside;
+  return kind == kPointTriangle ? point_triangle(c, feature)
+         : kind == kEdgeEdge    ? edge_edge(c, feature)
+                                : point_plane(c);
+}
+
+// Where the closest points are those of an end.
+template <class R>
+DIFFVBD_FN Distance<R> at_end(int kind, const End& end, const Corners<R>& c) {
+  const auto corner = [&](int i) {  // chosen by comparison: an index would move the corners from registers to memory
+    Vec3<R> out = c.x[0];
+    for (int k = 1; k < 4; ++k) {
+      out = {select(i == k, c.x[k].x, out.x), select(i == k, c.x[k].y, out.y), select(i == k, c.x[k].z, out.z)};
+    }
+    return out;
+  };
+  const R s = closest_on_segment(corner(end.point), corner(end.from), corner(end.to));
+  const R sign = R(kind == kPointTriangle || end.point < 2 ? 1 : -1), from = sign * (s - R(1)), to = -sign * s;
+  Distance<R> out{};
+  for (int k = 0; k < 4; ++k) {
+    out.w[k] = select(k == end.point, sign, select(k == end.from, from, select(k == end.to, to, R(0))));
+  }
+  measure_along(out, c);
+  return out;
+}
+
+// distance() of a pair whose closest feature is known, to be derived: values have chosen it. Packs of lanes choose
+// anew.
+template <class R>
+DIFFVBD_FN Distance<Dual<R>> distance_by(int kind, int feature, const Corners<Dual<R>>& c) {
+  if constexpr (!std::is_arithmetic_v<R>) {
+    return distance(kind, c);
+  } else {
+    if (kind == kPointPlane) return point_plane(c);
+    if (feature != kInside) return at_end(kind, end_of(kind, feature), c);
+    return kind == kPointTriangle ? InFace<Dual<R>>(c).measured(c) : InEdges<Dual<R>>(c).measured(c);
+  }
 }
 
 // e(s) = s (2 - s) of s = |u x v|^2 / threshold below 1, else 1, with u and v along the edges: it takes the kink out of

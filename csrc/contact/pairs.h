@@ -77,7 +77,8 @@ DIFFVBD_FN auto reverse_barrier(int kind, const Corners<R>& c, const Index& i, c
                                 const PairConstants<R>& a, const R& kappa, const R& h2, const Vec3<R>& p,
                                 const Vec3<R>& d, PairAdjoint<R>& out) {
   const Vec3<R> d_raw = together * d;
-  const Distance<R> at = distance(kind, c);
+  int feature = kInside;
+  const Distance<R> at = distance(kind, c, &feature);
   const R gap = at.d - a.offset;
   const auto active = gap < a.dhat;
   if (!any(active)) return active;
@@ -97,7 +98,7 @@ DIFFVBD_FN auto reverse_barrier(int kind, const Corners<R>& c, const Index& i, c
   phi = phi + e * by_e;
   by_gap = by_gap + e * (b.second * s + b.third * s * t);
   const Vec3<R> z = (e * (b.first + b.second * t)) * p + (e * b.second * s) * d_raw;
-  const Distance<Dual<R>> turned = distance(kind, moved_along(c, i, z));
+  const Distance<Dual<R>> turned = distance_by(kind, feature, moved_along(c, i, z));
   for (int k = 0; k < 4; ++k) {
     const Vec3<Dual<R>> row = turned.w[k] * turned.n;
     out.x[k] = (-kappa) * ((by_gap * at.w[k]) * at.n + derivative(row));

@@ -1,4 +1,5 @@
-// Work on bodies: a team of threads for each, 8 lanes of a warp, a block, or, one body after another, the whole device.
+// Work on bodies: a team of threads for each, 4 or 8 lanes of a warp, a block, or, one body after another, the whole
+// device.
 #pragma once
 
 #include <cooperative_groups.h>

@@ -34,24 +34,25 @@ __device__ __forceinline__ void each_near(const contact::PairList::Entries& all,
   __shared__ Found found[kContactThreads / kSlice][2 * kSlice];
   Found* own = found[threadIdx.x / kSlice];
   const auto thread = static_cast<int>(threadIdx.x % kSlice);
-  int count = 0;
-  for (int first = 0; __any_sync(kWholeWarp, first < all.count); first += share) {
-    const int entry = first + lane < all.count ? all.first[first + lane] : -1;
-    const bool is_near = entry >= 0 && near(entry);
-    const unsigned threads = __ballot_sync(kWholeWarp, is_near);
-    if (is_near) own[count + __popc(threads & ((1u << thread) - 1))] = {entry, thread};
-    count += __popc(threads);
-    __syncwarp();
-    if (count < kSlice) continue;
-    f(own[thread]);
-    count -= kSlice;
+  int count = 0, first = 0;
+  for (bool more = true; more || count > 0;) {
+    more = __any_sync(kWholeWarp, first < all.count);
+    if (more) {
+      const int entry = first + lane < all.count ? all.first[first + lane] : -1;
+      const bool is_near = entry >= 0 && near(entry);
+      const unsigned threads = __ballot_sync(kWholeWarp, is_near);
+      if (is_near) own[count + __popc(threads & ((1u << thread) - 1))] = {entry, thread};
+      count += __popc(threads), first += share;
+      __syncwarp();
+    }
+    if (count == 0 || (more && count < kSlice)) continue;
+    f(thread < count ? own[thread] : Found{-1, thread});  // here alone: what it does is long
+    count = count < kSlice ? 0 : count - kSlice;
     const Found left = own[kSlice + thread];
     __syncwarp();
     if (thread < count) own[thread] = left;
     __syncwarp();
   }
-  if (count > 0) f(thread < count ? own[thread] : Found{-1, thread});
-  __syncwarp();
 }
 
 // Adds up gradients and Hessians of the warp's vertices that any of its threads have worked out, in the order of the

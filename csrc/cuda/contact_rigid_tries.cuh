@@ -223,14 +223,14 @@ __device__ bool decide(const RigidInputs<T>& in, const Tried<T>& t, int64_t scen
     const bool open = in.free[k] && !t.decided[first + k];
     own.lead[k] = open ? root_of(t.lead + first, static_cast<int32_t>(k)) : -1;
     own.largest[k] = own.rise[k] = own.whole[k] = own.stopped[k] = 0;
-    if (!held) return;
+    if (!held || !open) return;
     own.before[k] = t.before[first + k], own.after[k] = t.after[first + k];
     own.blocked[k] = t.state.blocked[first + k];
   });
   __syncthreads();
   each_open([&](int64_t k, int64_t of) {
     const double size = fmax(fabs(own.before[k]), fabs(own.after[k]));
-    raise(own.largest + of, bits_of(isfinite(own.before[k]) && isfinite(own.after[k]) ? size : CUDART_INF));
+    atomicMax(own.largest + of, bits_of(isfinite(own.before[k]) && isfinite(own.after[k]) ? size : CUDART_INF));
     if (own.blocked[k]) mark(own.stopped + of);
   });
   __syncthreads();
@@ -265,7 +265,7 @@ __device__ bool decide(const RigidInputs<T>& in, const Tried<T>& t, int64_t scen
       const int32_t a = touching[2 * i], b = touching[2 * i + 1];
       if (own.lead[a] < 0) return;  // both have decided
       const Count both = bits_of(fmin(own.low[a], own.low[b]));
-      for (const int32_t k : {a, b}) lower(reinterpret_cast<Count*>(own.next + k), both);
+      for (const int32_t k : {a, b}) atomicMin(reinterpret_cast<Count*>(own.next + k), both);
     });
     __syncthreads();
     each_open([&](int64_t k, int64_t) { own.low[k] = own.next[k]; });

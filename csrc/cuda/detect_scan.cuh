@@ -12,9 +12,9 @@ constexpr int32_t kMostScanned = 2048;               // that one query is compar
 
 template <class T>
 bool is_scanned(const Surfaces<T>& in) {
-  const int64_t edges = in.num_edges, triangles = in.num_triangles;
+  const int64_t edges = in.num_edges, triangles = in.num_triangles, points = in.num_points;
   return edges <= kMostScanned && triangles <= kMostScanned &&
-         in.scenes * (in.num_points * triangles + edges * edges / 2) <= kMostCompared;
+         in.scenes * (points * (triangles + kWarp) + edges * (edges / 2 + kWarp)) <= kMostCompared;  // a warp at least
 }
 
 // A warp for each query: it looks at what it finds as soon as there is some for each of its threads.

@@ -15,10 +15,14 @@ __device__ __forceinline__ void wait_for_previous() {
 #endif
 }
 
-// Whether a kernel that calls it may follow another: it does where it was compiled for such a device.
+// Whether a kernel that calls it may follow another: it waits where it was compiled for such a device, as are then all
+// kernels that were compiled with it. Older drivers cannot capture such launches.
 inline bool can_follow(const void* kernel) {
+  constexpr int kCaptured = 12030;  // CUDA 12.3
   cudaFuncAttributes of{};
-  return cudaFuncGetAttributes(&of, kernel) == cudaSuccess && of.ptxVersion >= 90;
+  int driver = 0;
+  return cudaFuncGetAttributes(&of, kernel) == cudaSuccess && of.ptxVersion >= 90 &&
+         cudaDriverGetVersion(&driver) == cudaSuccess && driver >= kCaptured;
 }
 
 inline cudaError_t launch(const void* kernel, unsigned blocks, dim3 threads, void** arguments, size_t shared,

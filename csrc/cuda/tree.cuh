@@ -1,5 +1,5 @@
 // Bounding-volume trees of all scenes on the device (contact/tree.h): triangles, edges and points of every scene sorted
-// along its Morton curve by one radix sort, then boxes from the leaves up.
+// along its Morton curve by one radix sort, then boxes from the leaves up. Of small scenes the leaves alone.
 #pragma once
 
 #include <cub/device/device_radix_sort.cuh>
@@ -22,7 +22,7 @@ inline int bits_of(uint64_t most) {
   return bits;
 }
 
-// The order of primitives in the sort: triangles of all scenes, their edges, their points.
+// The order of primitives in the sort, if there is one: triangles of all scenes, their edges, their points.
 struct Forest {
   int64_t scenes;
   int32_t count[3], leaves[2];  // primitives of a scene; leaves of its trees of triangles and of edges

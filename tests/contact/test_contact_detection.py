@@ -116,24 +116,28 @@ def test_random_triangles(device: str, triangles: int) -> None:
     check(Scene.of([soup(generator("soup", triangles), triangles)]), device)
 
 
-def test_a_fine_surface_far_away_changes_nothing(device: str) -> None:
-    """CUDA compares the boxes of small scenes with one another, and walks through trees where a scene has more edges."""
+def fine_surface() -> Surface:
+    """Far away, with more edges than CUDA compares with one another: there it walks through trees."""
     fine = soup(generator("fine"), 700)
-    fine.points = fine.points + 50.0
+    return replace(fine, points=fine.points + 50.0)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_fine_surface_far_away_changes_nothing(device: str, dtype: torch.dtype) -> None:
     near = generator("near")
-    for bodies, colliders, scenes in (
-        ([soup(near, 150)], [], 1),
-        ([soup(near, 25), solid(dv.mesh.box(2, (0.5, 0.3, 0.3)))], [capsule((0.1, 0.8, 0.2), (0.9, 0.7, 0.5), 0.1),
-                                                                   plane((0, 0, 0), (0, 0, 1), (1, 0, 0.1))], 3),
-    ):  # fmt: skip
-        small, large = Scene.of(bodies, colliders, scenes), Scene.of(bodies, [*colliders, fine], scenes)
+    others = [capsule((0.1, 0.8, 0.2), (0.9, 0.7, 0.5), 0.1), plane((0, 0, 0), (0, 0, 1), (1, 0, 0.1))]
+    boxes = [soup(near, 25), solid(dv.mesh.box(2, (0.5, 0.3, 0.3)))]
+    for bodies, colliders, scenes in (([soup(near, 150)], [], 1), (boxes, others, 3)):
+        small, large = Scene.of(bodies, colliders, scenes), Scene.of(bodies, [*colliders, fine_surface()], scenes)
         assert len(small.edges) < 2048 < len(large.edges)
-        alone, beside = detect(small, device), detect(large, device)
+        alone, beside = detect(small, device, dtype), detect(large, device, dtype)
         count, corners = int(alone.counts[0]), alone.near_values.shape[1]
         assert count > 300 and torch.equal(alone.counts[:2], beside.counts[:2])
         assert torch.equal(alone.pairs[:count], beside.pairs[:count])
         assert torch.equal(alone.constants[:count], beside.constants[:count])
         assert torch.equal(alone.near_values, beside.near_values[:, :corners])
+        assert torch.equal(alone.near_corners, beside.near_corners[:, :corners])
+        assert torch.equal(alone.smallest, beside.smallest)
 
 
 @pytest.mark.parametrize("numbers", [(0.01, 0.2), (0.2, 0.1), (0.05, 0.0)])
@@ -240,10 +244,12 @@ def test_positions_that_are_not_finite(device: str, bad: float) -> None:
     assert int(detect(s, device).counts[1]) >= s.x.shape[1]
 
 
-def test_capacity_that_does_not_suffice(device: str) -> None:
-    s = mixed_scene(scenes=2)
+@pytest.mark.parametrize("fine", [False, True])
+def test_capacity_that_does_not_suffice(device: str, fine: bool) -> None:
+    s = Scene.of([soup(generator("crowded"), 60)], [fine_surface()], 2) if fine else mixed_scene(scenes=2)
     full = detect(s, device)
     needed = int(full.counts[0])
+    assert needed > 100
     rows = {tuple(r) for r in full.pairs[:needed].tolist()}
     for capacity in (0, 1, needed - 1, needed):
         got = detect(s, device, capacity=capacity)
