@@ -24,7 +24,7 @@ from diffvbd import mesh
 DEVICE = "cuda"
 TOOLS = ("memcheck", "racecheck", "initcheck", "synccheck")
 SUMMARY = re.compile(r"(?:ERROR SUMMARY: (\d+) error|RACECHECK SUMMARY: (\d+) hazard)")
-LONGEST = 300  # [s] of a tool and a scene
+LONGEST = 230  # [s] of a tool and a scene
 WORKERS = 14  # processes side by side: each keeps one core and little of the device busy
 Scene = Callable[[], tuple[dv.Model, Tensor, dict[str, Any]]]
 
