@@ -63,6 +63,14 @@ STALLS = {
     "branch_resolving": "branches",
     "no_instruction": "fetch of instructions",
 }
+ABOUT = """\
+Of a step and its reverse, kernels with at least 3 % of the time: how many launches, of what length, by torch's
+profiler; the rest by NVIDIA's ncu at its base clock, means of the launches that it looked at. *Warps active* is of those
+that a multiprocessor has room for, *issue active* of the cycles in which a scheduler could issue an instruction,
+*threads of 32* those that an instruction is for, and *memory*, *L2* and *float64* are of the device's rates. A kernel
+is bound by a rate of which it reaches 60 %, or else by what its warps wait for most. Kernels that overlap the next one
+count their wait too.
+"""
 Row = dict[str, Any]
 
 
@@ -208,7 +216,7 @@ def markdown(results: dict[str, Any]) -> str:
              shown(r, "threads", "{:.0f}"), *(shown(r, f"rate of {name}") for name in RATES),
              r["bound"] or "not looked at") for r in results["rows"]]  # fmt: skip
     failed = "".join(f"\nNot measured: {name}.\n" for name in results["failed"])
-    return "## What bounds each kernel\n\n" + markdown_table(header, rows) + failed
+    return f"### What bounds each kernel\n\n{ABOUT}\n" + markdown_table(header, rows) + failed
 
 
 def main(arguments: list[str]) -> None:

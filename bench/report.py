@@ -21,7 +21,7 @@ RESULTS_PAGES = ROOT / "docs" / "results"
 CHOOSING_PAGE = ROOT / "docs" / "guides" / "choose-settings.md"
 GALLERY_PAGE = ROOT / "docs" / "gallery.md"
 TASKS_PAGE = ROOT / "docs" / "tasks.md"
-BENCHMARKS = ("cpu", "gpu")  # whose figures docs/performance.md shows, in this order
+BENCHMARKS = ("cpu", "gpu", "kernels")  # whose figures docs/performance.md shows, in this order
 ORDER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's come first, the others by name
 BEGIN, END = "<!-- figures: begin, written by python -m bench report -->", "<!-- figures: end -->"
 # Files of bench/results that `report` would refuse, and why they stand all the same; run again, they come off the list.
