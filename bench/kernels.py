@@ -65,11 +65,11 @@ STALLS = {
 }
 ABOUT = """\
 Of a step and its reverse, kernels with at least 3 % of the time: how many launches, of what length, by torch's
-profiler; the rest by NVIDIA's ncu at its base clock, means of the launches that it looked at. *Warps active* is of those
-that a multiprocessor has room for, *issue active* of the cycles in which a scheduler could issue an instruction,
-*threads of 32* those that an instruction is for, and *memory*, *L2* and *float64* are of the device's rates. A kernel
-is bound by a rate of which it reaches 60 %, or else by what its warps wait for most. Kernels that overlap the next one
-count their wait too.
+profiler; the rest by NVIDIA's ncu at its base clock, means of the launches that it looked at. *Warps active* is of
+those that a multiprocessor has room for, *issue active* of the cycles in which a scheduler could issue an
+instruction, *threads of 32* those that an instruction is for, and *memory*, *L2* and *float64* are of the device's
+rates. A kernel is bound by a rate of which it reaches 60 %, or else by what its warps wait for most. Kernels of the
+regime `"color"` count the time in which they wait for the one before.
 """
 Row = dict[str, Any]
 
