@@ -16,7 +16,9 @@ constexpr int64_t kEnoughThreads = 16384;  // tiny bodies of all scenes that fil
 constexpr int kThreads = 256, kWarps = kThreads / 32;
 constexpr int kMostSums = 1 + 6 + rigid::kSix;  // numbers that a team adds up at once
 constexpr int kFewSums = 4;                     // that every thread of a block adds up from its warps
-constexpr int64_t kBegun = 450, kFaster = 85;   // of work on a large body, as measured on an H100
+// Of work on a large body: worked out from times on an H100, 0.27 ms of a block for 9,261 vertices, and of the whole
+// device 15 us for 17,576 and 80 us for 195,112.
+constexpr int64_t kBegun = 450, kFaster = 85;
 
 template <int n, class F>
 __device__ __forceinline__ void own_sum(int32_t first, int32_t count, int32_t stride, double* out, const F& f) {

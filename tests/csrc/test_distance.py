@@ -1,22 +1,18 @@
 """Claim: the derivative of a distance by the feature that values have chosen has the bits of one that chooses anew."""
 
-import os
-import shutil
 import subprocess
 from pathlib import Path
 
-import pytest
-from helpers.paths import CSRC
+from helpers.compiler import cxx
+from helpers.paths import CSRC, needs_csrc
 
 
+@needs_csrc
 def test_the_derivative_of_the_closest_feature(tmp_path: Path) -> None:
-    compiler = os.environ.get("CXX") or shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
-    if compiler is None:
-        pytest.skip("no C++ compiler: set CXX, or install g++ or clang++")
     program = tmp_path / "distance"
     source = Path(__file__).with_name("distance.cpp")
     flags = ["-std=c++17", "-O1", "-ffp-contract=off", "-w", f"-I{CSRC}"]
-    subprocess.run([*compiler.split(), *flags, str(source), "-o", str(program)], check=True)
+    subprocess.run([*cxx(), *flags, str(source), "-o", str(program)], check=True)
     *features, different, moving = map(
         int, subprocess.run([program], capture_output=True, text=True, check=True).stdout.split()
     )

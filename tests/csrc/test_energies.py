@@ -8,7 +8,6 @@ behind rounding, nor rounding pass for a wrong formula.
 import hashlib
 import importlib.util
 import os
-import shutil
 import subprocess
 import sysconfig
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.compiler import cxx
 from helpers.paths import CSRC
 
 import diffvbd as dv
@@ -29,9 +29,7 @@ SOURCE = Path(__file__).with_name("headers.cpp")
 @pytest.fixture(scope="module")
 def headers(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """headers.cpp as a module; built once for each state of the headers."""
-    compiler = os.environ.get("CXX") or shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
-    if compiler is None:
-        pytest.skip("no C++ compiler: set CXX, or install g++ or clang++")
+    compiler = cxx()
     import pybind11
 
     sources = [SOURCE, *sorted(CSRC.rglob("*.h"))]
@@ -44,7 +42,7 @@ def headers(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         built = target.with_suffix(f".{os.getpid()}")
         include = [CSRC, pybind11.get_include(), sysconfig.get_paths()["include"]]
         flags = ["-std=c++17", "-O1", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-fPIC", "-w"]
-        command = [*compiler.split(), *flags, *(f"-I{i}" for i in include), str(SOURCE), "-o", str(built)]
+        command = [*compiler, *flags, *(f"-I{i}" for i in include), str(SOURCE), "-o", str(built)]
         result = subprocess.run(command, capture_output=True, text=True)
         assert result.returncode == 0, result.stderr
         built.rename(target)
