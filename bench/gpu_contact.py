@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from diffvbd.tasks.problem import Settings
 
 TIME_STEP, SWEEPS, DETECTIONS, REACH = 0.01, 10, 2, 4e-3  # of grippers; reach: about 1,000 pairs a scene
 CLOSING, STEPS = 12, 5  # steps until grippers hold; steps timed
+SPARE = 1.25  # of the pairs that there are then, what lists have room for
 
 
 def small_contact(card: Card, rate: float) -> list[Row]:
@@ -102,8 +104,10 @@ def grippers(card: Card, scenes: int, steps: int) -> tuple[Row, Work, Work]:
         return torch.autograd.grad(moved().sum(), leaves)
 
     forward()
+    pairs = dv.contact.status(model).pairs / scenes
+    dv.contact.reserve(model, math.ceil(SPARE * pairs))
     about: dict[str, Any] = {"vertices": model.num_vertices, "scenes": scenes, "sweeps": SWEEPS,
-                             "pairs_per_scene": dv.contact.status(model).pairs / scenes}  # fmt: skip
+                             "pairs_per_scene": pairs}  # fmt: skip
     return about, forward, both
 
 

@@ -19,13 +19,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch.profiler import ProfilerActivity, profile
 
 import diffvbd as dv
-from bench import gpu_contact
+from bench import common, gpu_contact
 from bench.common import markdown_table
 from bench.gpu_measure import Card, Work, forward_reverse, model_of, scene_of
 
@@ -99,25 +100,27 @@ SCENES: dict[str, tuple[Callable[[Card], Work], tuple[str, ...]]] = {
 }
 
 
-def run(quick: bool, device: str = DEVICE, only: str = "") -> dict[str, Any]:
-    """``only``: scenes, split by semicolons, since their names have commas."""
+def run(quick: bool, device: str = DEVICE, only: str = "", out: Path | None = None) -> dict[str, Any]:
+    """``only``: scenes, split by semicolons, since their names have commas; beside what earlier runs on the same device
+    have left of the others."""
     if shutil.which("ncu") is None:
         raise SystemExit("ncu: expected NVIDIA Nsight Compute on the path, and it is not there")
     names = [name for name in only.split(";") if name] or list(SCENES)[: 1 if quick else None]
     if unknown := [name for name in names if name not in SCENES]:
         raise SystemExit(f"only: expected names among {'; '.join(SCENES)}, got {'; '.join(unknown)}")
-    rows: list[Row] = []
-    failed: dict[str, str] = {}
+    card = common.environment(device)["device"]
+    results = common.earlier(None if out is None else out / "kernels.json", quick, card)
     for name in names:
-        began = time.perf_counter()
+        began, failed, rows = time.perf_counter(), "", []
         try:
-            rows += _rows(name, _times(name, device), list(_launches(name, device)))
+            rows = _rows(name, _times(name, device), list(_launches(name, device)))
         except (subprocess.TimeoutExpired, RuntimeError) as error:  # the others still come
-            failed[name] = str(error).strip()[-300:]
-        print(f"{name}: {time.perf_counter() - began:.0f} s {failed.get(name, '')}", file=sys.stderr, flush=True)
-    if not rows:
-        raise SystemExit(f"no scene ended: {failed}")
-    return {"rows": rows, "failed": failed}
+            failed = str(error).strip()[-300:]
+        results[name] = {"rows": rows, "failed": failed, **common.stamp(common.environment(device))}
+        print(f"{name}: {time.perf_counter() - began:.0f} s {failed}", file=sys.stderr, flush=True)
+    if not any(results[name]["rows"] for name in names):
+        raise SystemExit(f"no scene ended: {[results[name]['failed'] for name in names]}")
+    return results
 
 
 def _process(command: list[str], name: str) -> str:
@@ -211,12 +214,14 @@ def markdown(results: dict[str, Any]) -> str:
     def shown(row: Row, name: str, form: str = "{:.0%}") -> str:
         return form.format(row[name]) if name in row else "-"
 
+    given = [row for name in SCENES if name in results for row in results[name]["rows"]]
     rows = [(r["scene"], f"`{r['kernel']}`", shown(r, "share"), r["launches"], f"{1e6 * r['seconds']:.3g}",
              *(shown(r, name, "{:.0f}") for name in ("blocks", "registers")), shown(r, "warps"), shown(r, "issues"),
              shown(r, "threads", "{:.0f}"), *(shown(r, f"rate of {name}") for name in RATES),
-             r["bound"] or "not looked at") for r in results["rows"]]  # fmt: skip
-    failed = "".join(f"\nNot measured: {name}.\n" for name in results["failed"])
-    return f"### What bounds each kernel\n\n{ABOUT}\n" + markdown_table(header, rows) + failed
+             r["bound"] or "not looked at") for r in given]  # fmt: skip
+    failed = "".join(f"\nNot measured: {name}.\n" for name, group in results.items() if group["failed"])
+    table = markdown_table(header, rows)
+    return f"### What bounds each kernel\n\n{ABOUT}\n{table}{failed}\n{common.of_several_runs(results)}"
 
 
 def main(arguments: list[str]) -> None:

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 
+#include "../contact/sent.h"
 #include "pair_batches.h"
 
 namespace diffvbd {

@@ -118,6 +118,7 @@ struct LaneStar {
   DIFFVBD_FN void rewind() const {}
   DIFFVBD_FN void adopt(const LaneStar&) const {}
   DIFFVBD_FN const Vec3<Lanes<T>>& predictor(const Block<Lanes<T>>& b) const { return b.y; }
+  DIFFVBD_FN const ContactTerm<Lanes<T>>& contact(const Block<Lanes<T>>& b) const { return b.contact; }
 
   DIFFVBD_FN TetPair<Lanes<T>> pair(int e) const {
     const int64_t slot = first + e;

@@ -123,7 +123,7 @@ __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 80 : 128)
   each_vertex<lanes>(s, [&](const Place<lanes>& at) {
     GroupStar<T, lanes> star(s, at, shared);
     if (s.has_tets) star.fetch_neighbours(true);
-    const Block<T> b = load_block<Set>(s, at, true);
+    const Block<T> b = load_block<Set>(s, at, true, s.w.x);
     const System<Set, T> system = assemble<Set>(b, star, s.parameters);
     const int64_t row = at.scene * s.positions + int64_t{at.block} * kSlice + at.v;
     if (at.lane == 0) store_row(w.gradient, row, system.axes.from(system.g));
@@ -141,7 +141,7 @@ __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 128 : 168)
     const bool writes = at.lane == 0 && __ldg(s.plan.order + position) >= 0;
     WayStar<T, lanes> star(s, at, shared);
     if (s.has_tets) star.fetch_neighbours(true), star.fetch_ways(w.way, shared);
-    const Block<T> b = load_block<Set>(s, at, true);
+    const Block<T> b = load_block<Set>(s, at, true, s.w.x);
     const Vec3<T> way = load_row(w.way, row, true);
     const BlockAdjoint<T> out = reverse_gradient<Set, wanted>(
         b, star, way, s.parameters, s.w.data_bar != nullptr, [&](int k, int d, const T& value) {

@@ -1,158 +1,74 @@
-// Kernels of contact: several threads for each vertex of a color, kShare for each corner point, or one for each pair.
+// Kernels of contact around the updates of a color: several threads for each of its vertices, for each corner point, or
+// one for each pair.
 #pragma once
 
-#include "contact_near.cuh"
-#include "contact_rows.cuh"
+#include "contact_sweep.cuh"
 #include "follow.cuh"
 
 namespace diffvbd::cuda {
 namespace {
 
-using contact::ContactAdjoints;
-using contact::ContactInputs;
+constexpr int kContactThreads = kWarpsPerBlock * kSlice;
+// Threads for a vertex: of a color, of a color with few vertices, and for a corner point.
+constexpr int kShare = 8, kWide = 32, kCornerShare = 8;
 
-constexpr int kShare = 8;
-// Threads for a vertex where its color has few, which do not fill the device: its pairs are waited for one by one.
-constexpr int kWide = 32;
-constexpr int64_t kFewVertices = 2048;  // of a color, in all scenes
-
-template <int share, class T>
-__device__ __forceinline__ void sum_share(T& a) {
-#pragma unroll
-  for (int offset = share / 2; offset > 0; offset /= 2) a += __shfl_xor_sync(kWholeWarp, a, offset);
-}
-template <int share, class T>
-__device__ __forceinline__ void sum_share(Vec3<T>& a) {
-  sum_share<share>(a.x), sum_share<share>(a.y), sum_share<share>(a.z);
-}
-
-// Which of `share` threads of which vertex of the blocks [begin, end) a thread is.
-template <int share, class T>
-struct Member {
-  int lane, vertex = -1;  // -1: a phantom, or beyond the end
-  int64_t local = 0, scene = 0, position = 0;
-  bool touches = false;
-  int64_t first, last;  // positions of the blocks
-  __device__ __forceinline__ Member(const StepView<T>& s, const ContactInputs<T>& in, int64_t begin, int64_t end)
-      : first(begin * kSlice), last(end * kSlice) {
-    const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x, item = i / share;
-    const int64_t size = (end - begin) * kSlice;
-    lane = static_cast<int>(i % share);
-    local = item / size;
-    if (local >= s.scenes) return;
-    position = begin * kSlice + (item - local * size);
-    scene = s.base + local;
-    vertex = __ldg(s.plan.order + position);
-    if (vertex < 0) return;
-    const int64_t row = scene * in.corners + vertex;
-    touches = __ldg(in.listed.ptr + row) < __ldg(in.listed.ptr + row + 1) || in.planes > 0 ||
-              (in.lag && __ldg(in.lagged.ptr + row) < __ldg(in.lagged.ptr + row + 1));
+// Which vertices of the blocks [begin, end) a warp has, where it is one of `roles` for them.
+template <int share>
+struct Part {
+  int64_t scene;
+  int block, part, role;
+  bool there;
+  template <class T>
+  __device__ __forceinline__ Part(const StepView<T>& s, int64_t begin, int64_t end, int roles = 1) {
+    int64_t i = (static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x) / kSlice;
+    const int64_t parts = (end - begin) * share;
+    role = roles > 1 ? static_cast<int>(i % roles) : kAllPairs;
+    i /= roles;
+    scene = i / parts, i -= scene * parts;
+    block = static_cast<int>(begin + i / share), part = static_cast<int>(i % share);
+    there = scene < s.scenes;
   }
-  __device__ __forceinline__ contact::PairList::Entries listed(const ContactInputs<T>& in) const {
-    return vertex < 0 ? contact::PairList::Entries{nullptr, 0} : in.listed.of(scene * in.corners + vertex);
-  }
-  __device__ __forceinline__ contact::PairList::Entries lagged(const ContactInputs<T>& in) const {
-    return vertex < 0 ? contact::PairList::Entries{nullptr, 0} : in.lags_of(scene, vertex);
-  }
-  __device__ __forceinline__ int64_t row(const StepView<T>& s) const { return local * s.positions + position; }
-  __device__ __forceinline__ SweepRows<T> rows(const StepView<T>& s) const {
-    return {s.w.x + local * s.positions * kRow, s.w.position, first, last};
+  __device__ __forceinline__ Place<share> place() const { return {scene, block, part}; }
+  template <class T>
+  __device__ __forceinline__ int64_t row(const StepView<T>& s, const Place<share>& at) const {
+    return scene * s.positions + static_cast<int64_t>(block) * kSlice + at.v;
   }
 };
 
-template <class T>
-__global__ void load_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (i >= s.scenes * s.positions) return;
-  const int64_t local = i / s.positions, position = i - local * s.positions;
-  const int own = __ldg(s.plan.order + position);
-  for (int k = 0; k < kContactScalars; ++k) s.w.contact[i * kContactScalars + k] = T(0);
-  if (own < 0) return;
-  if (local == 0) s.w.position[own] = static_cast<int32_t>(position);
-}
-
+// sweep: in the reverse, in which positions of the color are those of the tape; else negative.
 template <int share, class T>
-__global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
-                                 int64_t begin, int64_t end) {
-  __shared__ T slots[kContactThreads / kSlice][kSlice][kContactScalars];
-  const Member<share, T> at(s, in, begin, end);
+__global__ void assemble_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactView<T> c,
+                                 int sweep, int64_t begin, int64_t end) {
+  const Part<share> part(s, begin, end);
   wait_for_previous();
-  if (s.w.before && at.vertex >= 0 && at.lane == 0) store_row(s.w.before, at.row(s), load_row(s.w.x, at.row(s)));
-  if (!__any_sync(kWholeWarp, at.touches)) return;
-  const SweepRows<T> rows = at.rows(s);
-  const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
-  const T h = s.parameters.time_step;
-  BlockSums<share, T> sums{slots[threadIdx.x / kSlice]};
-  Vec3<T> g = zero3<T>();
-  Sym3<T> H = diagonal(T(0));
-  // A warp of one vertex adds up in its threads first.
-  const auto add = [&](const Found& found, const auto& f) {
-    const int vertex = found.of(at.vertex);
-    if constexpr (share == kSlice) {
-      if (found.there()) f(vertex, g, H);
-    } else {
-      Vec3<T> g_of = zero3<T>();
-      Sym3<T> H_of = diagonal(T(0));
-      if (found.there()) f(vertex, g_of, H_of);
-      sums.add(g_of, H_of, found.thread);
-    }
+  if (!part.there) return;
+  const Place<share> at = part.place();
+  T* to = s.w.contact + part.row(s, at) * kContactScalars;
+  const auto gather = [&](const auto& rows) {
+    PairsOf<T, share, std::decay_t<decltype(rows)>>(s, c.in, at, rows).gather(to);
   };
-  each_near<share>(
-      at.listed(in), at.lane, [&](int entry) { return contact::is_near(source, entry); },
-      [&](const Found& found) {
-        add(found, [&](int v, Vec3<T>& g_of, Sym3<T>& H_of) {
-          contact::add_barrier_of(source, found.entry, v, h, g_of, H_of);
-        });
-      });
-  if (in.lag) {
-    each_near<share>(
-        at.lagged(in), at.lane, [](int) { return true; },
-        [&](const Found& found) {
-          add(found,
-              [&](int v, Vec3<T>& g_of, Sym3<T>& H_of) { contact::add_lag_of(source, found.entry, v, h, g_of, H_of); });
-        });
+  if (sweep < 0) {
+    gather(sweep_rows(s, at.scene, begin, end, MovingRows<T>{s.w.x, s.w.moved}));
+  } else {
+    gather(tape_rows_of(s, at.scene, sweep, begin, end));
   }
-  if (at.touches) contact::add_floor_lags(source, at.vertex, at.lane, share, h, g, H);
-  if (share == kSlice || in.planes > 0) sums.add(g, H, threadIdx.x % kSlice);
-  if (at.touches) sums.store(s.w.contact + at.row(s) * kContactScalars);
 }
 
-// The threads of a warp look at the pairs of its vertices; the least that any of them lets pass is the limit.
 template <int share, class T>
-__global__ void limit_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
-                              uint8_t* cut, int sweep, int64_t begin, int64_t end) {
-  __shared__ int exponents[kContactThreads / share];  // of the vertices of the block
-  const Member<share, T> at(s, in, begin, end);
+__global__ void limit_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactView<T> c,
+                              int sweep, int64_t begin, int64_t end) {
+  const Part<share> part(s, begin, end);
   wait_for_previous();
-  const bool there = at.vertex >= 0;
-  const RowsBefore<T> rows{at.rows(s), s.w.before + at.local * s.positions * kRow};
-  const contact::Source<T, RowsBefore<T>> source{in, at.scene, rows};
-  int exponent = 0, &limit = exponents[threadIdx.x / share];
-  Vec3<T> from = zero3<T>(), d = zero3<T>();
-  T length = T(0), guard = T(0);
-  if (there) {
-    from = load_row(s.w.before, at.row(s)), d = load_row(s.w.x, at.row(s)) - from;
-    exponent = contact::limit_by_room(source, at.vertex, from, d);
-    length = contact::length_of(d), guard = contact::guard_of(source, at.vertex);
-  }
-  if (at.lane == 0) limit = exponent;
-  __syncwarp();
-  const int least = exponent;
-  each_near<share>(
-      at.listed(in), at.lane, [&](int entry) { return contact::may_limit(source, entry, length, guard, least); },
-      [&](const Found& found) {
-        const Vec3<T> d_of = found.of(d);
-        const T length_of = found.of(length), guard_of = found.of(guard);
-        const int before = found.of(exponent), place = found.of(static_cast<int>(threadIdx.x)) / share;
-        if (found.there()) {
-          atomicMax(exponents + place, contact::limit_by_pair(source, found.entry, d_of, length_of, guard_of, before));
-        }
-        __syncwarp();
-        exponent = limit;
-      });
-  if (!there || at.lane != 0) return;
-  cut[(at.scene * s.sweeps + sweep) * in.num_vertices + at.vertex] = static_cast<uint8_t>(exponent);
-  if (exponent > 0) store_row(s.w.x, at.row(s), from + contact::limit_of<T>(exponent) * d);
+  if (!part.there) return;
+  const Place<share> at = part.place();
+  const int64_t row = part.row(s, at);
+  const MovingRows<T> moving{s.w.x, s.w.moved};
+  PairsOf<T, share, SweepRows<T>> pairs(s, c.in, at, sweep_rows(s, at.scene, begin, end, moving));
+  const Vec3<T> from = load_row(s.w.x, row), d = load_row(s.w.moved, row) - from;
+  const int exponent = pairs.limit(from, d);
+  if (pairs.vertex < 0 || at.lane != 0) return;
+  c.cut[((s.base + at.scene) * s.sweeps + sweep) * c.in.num_vertices + pairs.vertex] = static_cast<uint8_t>(exponent);
+  if (exponent > 0) store_row(s.w.moved, row, from + contact::limit_of<T>(exponent) * d);
 }
 
 template <class T>
@@ -161,83 +77,51 @@ __device__ __forceinline__ void add_row(T* rows, int64_t row, const Vec3<T>& a) 
 }
 
 template <int share, class T>
-__global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
-                                const __grid_constant__ ContactAdjoints<T> slots, int sweep, int rows_of_tape,
+__global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactView<T> c,
                                 int64_t begin, int64_t end) {
-  const Member<share, T> at(s, in, begin, end);
+  const Part<share> part(s, begin, end);
   wait_for_previous();
-  if (at.vertex >= 0 && at.lane == 0) {
-    const int64_t active = s.plan.num_active;
-    const int rank = __ldg(s.plan.block_rank + at.position / kSlice) + static_cast<int>(at.position % kSlice);
-    const T* from = s.tape + (at.local * s.sweeps + sweep) * rows_of_tape * active + rank;
-    store_row(s.w.x, at.row(s), Vec3<T>{from[0], from[active], from[2 * active]});
-  }
-  if (!__any_sync(kWholeWarp, at.touches)) return;
-  Vec3<T> now = zero3<T>(), prev = zero3<T>();
-  if (at.touches) contact::take_pairs(in, slots, at.scene, at.vertex, at.lane, share, now, prev);
-  sum_share<share>(now), sum_share<share>(prev);
-  if (!at.touches || at.lane != 0) return;
-  add_row(s.w.x_bar, at.row(s), now);
-  contact::add_at(slots.prev + 3 * (at.scene * in.corners + at.vertex), prev);
+  if (!part.there) return;
+  const Place<share> at = part.place();
+  const PairsOf<T, share, SweepRows<T>> pairs(s, c.in, at, settled_rows(s, at.scene, begin, end));
+  if (!__any_sync(kWholeWarp, pairs.touches())) return;
+  T now[3];
+  take_sent(c, pairs, now);
+  if (pairs.touches() && at.lane == 0) add_row(s.w.x_bar, part.row(s, at), contact::vector_at(now));
 }
 
 template <int share, class T>
 __global__ void __launch_bounds__(kContactThreads, 3)
-    reverse_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
-                    const __grid_constant__ ContactAdjoints<T> slots, int64_t begin, int64_t end) {
-  const Member<share, T> at(s, in, begin, end);
+    reverse_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactView<T> c, int roles,
+                    int64_t begin, int64_t end) {
+  const Part<share> part(s, begin, end, roles);
   wait_for_previous();
-  if (!__any_sync(kWholeWarp, at.touches)) return;
-  const SweepRows<T> rows = at.rows(s);
-  const contact::Source<T, SweepRows<T>> source{in, at.scene, rows};
-  const T h = s.parameters.time_step;
-  Vec3<T> own = zero3<T>(), p = zero3<T>(), d_raw = zero3<T>();
-  if (at.touches) {
-    const T* turn = s.w.turn + 6 * at.row(s);
-    p = contact::vector_at(turn), d_raw = contact::vector_at(turn + 3);
-  }
-  // f(vertex, p, d_raw) of whose entry has been found
-  const auto reverse = [&](const Found& found, const auto& f) {
-    const int vertex = found.of(at.vertex);
-    const Vec3<T> p_of = found.of(p), d_of = found.of(d_raw);
-    if (found.there()) f(vertex, p_of, d_of);
+  if (!part.there) return;
+  send_pairs(s, c, part.place(), part.role, begin, end);
+}
+
+template <int share, class T>
+__device__ __forceinline__ void sum_share(Vec3<T>& a) {
+  const auto sum = [](T& of) {
+#pragma unroll
+    for (int offset = share / 2; offset > 0; offset /= 2) of += __shfl_xor_sync(kWholeWarp, of, offset);
   };
-  each_near<share>(
-      at.listed(in), at.lane, [&](int entry) { return contact::is_near(source, entry); },
-      [&](const Found& found) {
-        reverse(found, [&](int v, const Vec3<T>& p_of, const Vec3<T>& d_of) {
-          contact::reverse_barrier_of(source, slots, found.entry, v, h, p_of, d_of);
-        });
-      });
-  if (in.lag) {
-    each_near<share>(
-        at.lagged(in), at.lane, [](int) { return true; },
-        [&](const Found& found) {
-          reverse(found, [&](int v, const Vec3<T>& p_of, const Vec3<T>& d_of) {
-            contact::reverse_lag_of(source, slots, found.entry, v, h, p_of, d_of);
-          });
-        });
-  }
-  if (in.planes == 0) return;
-  if (at.touches) contact::reverse_floor_lags(source, slots, at.vertex, at.lane, share, h, p, d_raw, own);
-  sum_share<share>(own);
-  if (!at.touches || at.lane != 0) return;
-  add_row(s.w.x_bar, at.row(s), own);
-  contact::add_at(slots.prev + 3 * (at.scene * in.corners + at.vertex), -own);
+  sum(a.x), sum(a.y), sum(a.z);
 }
 
 template <class T>
 __global__ void collect_contact(const __grid_constant__ StepView<T> s, const __grid_constant__ ContactInputs<T> in,
                                 const __grid_constant__ ContactAdjoints<T> slots, T* collider_bar) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x, item = i / kShare;
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x, item = i / kCornerShare;
   const int64_t local = item / in.corners, corner = item - local * in.corners, scene = s.base + local;
   const bool there = local < s.scenes;
   Vec3<T> now = zero3<T>(), prev = zero3<T>();
   if (there) {
-    contact::take_pairs(in, slots, scene, static_cast<int>(corner), static_cast<int>(i % kShare), kShare, now, prev);
+    contact::take_pairs(in, slots, scene, static_cast<int>(corner), static_cast<int>(i % kCornerShare), kCornerShare,
+                        now, prev);
   }
-  sum_share<kShare>(now), sum_share<kShare>(prev);
-  if (!there || i % kShare != 0) return;
+  sum_share<kCornerShare>(now), sum_share<kCornerShare>(prev);
+  if (!there || i % kCornerShare != 0) return;
   if (corner < in.num_vertices) {
     add_row(s.w.x_bar, local * s.positions + s.w.position[corner], now);
   } else {
@@ -314,52 +198,42 @@ cudaError_t launch_contact(void (*kernel)(P...), int64_t items, cudaStream_t str
   return launch_pass(kernel, items, stream, false, arguments...);
 }
 
-// For the vertices of the blocks [begin, end): with as many threads for each as the whole batch says, so that a scene
-// has the same bits in any chunk of it.
-template <class T, class... P, class... A>
-cudaError_t launch_color(void (*kernel)(P...), void (*wide)(P...), const ContactPasses<T>& passes, int64_t begin,
-                         int64_t end, A... arguments) {
-  const int64_t vertices = (end - begin) * kSlice;
-  const bool few = passes.scenes * vertices <= kFewVertices;
-  return launch_pass(few ? wide : kernel, passes.s.scenes * vertices * (few ? kWide : kShare), passes.stream,
-                     passes.follows, arguments...);
-}
-
 }  // namespace
 
 template <class T>
-cudaError_t ContactPasses<T>::load() const {
-  return launch_contact(load_contact<T>, s.scenes * s.positions, stream, s, in);
+template <class... P, class... A>
+cudaError_t ContactPasses<T>::over(void (*kernel)(P...), int64_t begin, int64_t end, int warps, bool follows,
+                                   A... arguments) const {
+  return launch_pass(kernel, s.scenes * (end - begin) * warps * kSlice, stream, follows, s, c, arguments..., begin,
+                     end);
 }
 template <class T>
-cudaError_t ContactPasses<T>::assemble(int64_t begin, int64_t end) const {
-  return launch_color<T>(assemble_contact<kShare, T>, assemble_contact<kWide, T>, *this, begin, end, s, in, begin, end);
+cudaError_t ContactPasses<T>::assemble(int sweep, int64_t begin, int64_t end, bool follows) const {
+  return over(assemble_contact<kShare, T>, begin, end, kShare, follows, sweep);
 }
 template <class T>
-cudaError_t ContactPasses<T>::limit(int sweep, int64_t begin, int64_t end) const {
-  return launch_color<T>(limit_contact<kShare, T>, limit_contact<kWide, T>, *this, begin, end, s, in, cut, sweep, begin,
-                         end);
+cudaError_t ContactPasses<T>::limit(int sweep, int64_t begin, int64_t end, bool follows) const {
+  return over(limit_contact<kShare, T>, begin, end, kShare, follows, sweep);
 }
 template <class T>
-cudaError_t ContactPasses<T>::prepare(int sweep, int64_t begin, int64_t end) const {
-  return launch_color<T>(prepare_contact<kShare, T>, prepare_contact<kWide, T>, *this, begin, end, s, in, *out->contact,
-                         sweep, tape_rows(s.tape_policy, true), begin, end);
+cudaError_t ContactPasses<T>::prepare(int64_t begin, int64_t end, bool follows) const {
+  return over(prepare_contact<kShare, T>, begin, end, kShare, follows);
 }
 template <class T>
-cudaError_t ContactPasses<T>::reverse(int64_t begin, int64_t end) const {
-  return launch_color<T>(reverse_contact<kShare, T>, reverse_contact<kWide, T>, *this, begin, end, s, in, *out->contact,
-                         begin, end);
+cudaError_t ContactPasses<T>::reverse(bool few, int64_t begin, int64_t end, bool follows) const {
+  if (few) return over(reverse_contact<kWide, T>, begin, end, kWide * kRoles, follows, kRoles);
+  return over(reverse_contact<kShare, T>, begin, end, kShare, follows, 1);
 }
 template <class T>
-cudaError_t ContactPasses<T>::collect() const {
-  return launch_contact(collect_contact<T>, s.scenes * in.corners * kShare, stream, s, in, *out->contact,
-                        out->collider);
+cudaError_t ContactPasses<T>::collect(const StepAdjoints<T>& out) const {
+  return launch_contact(collect_contact<T>, s.scenes * c.in.corners * kCornerShare, stream, s, c.in, c.slots,
+                        out.collider);
 }
 template <class T>
-cudaError_t ContactPasses<T>::store() const {
-  const T *prev = out->contact->prev, *slots = out->contact->kappa;
-  if (auto error = launch_contact(store_contact<T>, s.scenes * in.corners, stream, s, in, *out, prev)) return error;
-  return launch_sum(s.scenes, stream, in, s.base, slots, 1, out->kappa);
+cudaError_t ContactPasses<T>::store(const StepAdjoints<T>& out) const {
+  const T *prev = c.slots.prev, *slots = c.slots.kappa;
+  if (auto error = launch_contact(store_contact<T>, s.scenes * c.in.corners, stream, s, c.in, out, prev)) return error;
+  return launch_sum(s.scenes, stream, c.in, s.base, slots, 1, out.kappa);
 }
 
 template <class T>

@@ -6,31 +6,31 @@
 
 namespace diffvbd::cuda {
 
-// In the order of a step; each returns after its launches. `begin`, `end`: blocks of a color.
+// Of the blocks [begin, end) of a color, whose kernel may wait for the one before by itself (`follows`, follow.cuh).
+// Each returns after its launches. Where warps share a vertex, all but reverse() are part of the sweep's kernel; where
+// that has all sweeps, reverse() too.
 template <class T>
 struct ContactPasses {
   const StepView<T>& s;
-  const contact::ContactInputs<T>& in;
-  const StepAdjoints<T>* out;  // null in the forward
-  uint8_t* cut;                // null in the reverse
-  int64_t scenes;              // of the batch
+  const ContactView<T>& c;
   cudaStream_t stream;
-  bool follows = false;  // the passes over a color wait for the kernel before them by themselves (follow.cuh)
 
-  // No pairs yet; where vertices are within their rooms.
-  cudaError_t load() const;
-  // The pairs' part of the blocks; in the forward remembers where the color is.
-  cudaError_t assemble(int64_t begin, int64_t end) const;
-  // After the update of a color: takes back what planes do not let pass of its motion.
-  cudaError_t limit(int sweep, int64_t begin, int64_t end) const;
-  // Reverse, before a color's turn: positions before its update from the tape, and what pairs have sent.
-  cudaError_t prepare(int sweep, int64_t begin, int64_t end) const;
-  // Reverse, after the turn: the adjoint of assemble().
-  cudaError_t reverse(int64_t begin, int64_t end) const;
+  // Before their turn: the pairs' part of the blocks; sweep: in the reverse, else negative.
+  cudaError_t assemble(int sweep, int64_t begin, int64_t end, bool follows) const;
+  // After it: takes back what planes do not let pass of the motion.
+  cudaError_t limit(int sweep, int64_t begin, int64_t end, bool follows) const;
+  // In the reverse, before their turn: what pairs have sent.
+  cudaError_t prepare(int64_t begin, int64_t end, bool follows) const;
+  // And after it: the adjoint of assemble(). few: a warp for each kind of pair of a vertex.
+  cudaError_t reverse(bool few, int64_t begin, int64_t end, bool follows) const;
   // After the last turn, before the adjoints are stored: what is left for vertices and colliders.
-  cudaError_t collect() const;
+  cudaError_t collect(const StepAdjoints<T>& out) const;
   // After the adjoints are stored: those of the start of the step, of kappa.
-  cudaError_t store() const;
+  cudaError_t store(const StepAdjoints<T>& out) const;
+
+ private:
+  template <class... P, class... A>
+  cudaError_t over(void (*kernel)(P...), int64_t begin, int64_t end, int warps, bool follows, A... arguments) const;
 };
 
 // After all scenes: the slots of the corners of each lagged pair added up; zero where there is none.

@@ -3,6 +3,7 @@
 #pragma once
 
 #include "../contact/lag.h"
+#include "clear_rows.cuh"
 #include "contact.cuh"
 
 namespace diffvbd::cuda {
@@ -28,12 +29,10 @@ template <class T>
 __global__ void lag_forward(const __grid_constant__ ContactInputs<T> in, const T* x, int64_t scenes, int64_t pairs,
                             T* values) {
   const int64_t pair = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (pair >= pairs) return;
+  const int64_t count = in.listed.ptr[scenes * in.corners] / 4;
+  clear_rows(values, contact::kLagScalars, count, pairs);
+  if (pair >= count) return;
   T* to = values + contact::kLagScalars * pair;
-  if (4 * pair >= in.listed.ptr[scenes * in.corners]) {
-    for (int k = 0; k < contact::kLagScalars; ++k) to[k] = T(0);
-    return;
-  }
   const LagPair<T> at(in, x, pair);
   contact::store_lag(contact::lag_state(at.record[4], at.corners, at.constants, at.kappa), to);
 }

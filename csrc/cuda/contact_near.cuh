@@ -8,8 +8,6 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int kContactThreads = 128;
-
 // An entry of the list, and the thread of the warp that has found it.
 struct Found {
   int entry, thread;  // entry < 0: none
@@ -24,15 +22,14 @@ struct Found {
     return {of(own.x), of(own.y), of(own.z)};
   }
 };
+constexpr int kFound = 2 * kSlice;  // that a warp collects before it works on them
 
 // Calls f(Found) for the entries of the warp's vertices that are near(entry), 32 at a time, those of a vertex in the
 // order of its list. `share` threads have one vertex, `lane` says which of them this one is. All threads of the warp
-// must call it, and call f together.
+// must call it, and call f together. `collected` [kFound] is the warp's, in shared memory.
 template <int share, class Near, class F>
-__device__ __forceinline__ void each_near(const contact::PairList::Entries& all, int lane, const Near& near,
-                                          const F& f) {
-  __shared__ Found found[kContactThreads / kSlice][2 * kSlice];
-  Found* own = found[threadIdx.x / kSlice];
+__device__ __forceinline__ void each_near(const contact::PairList::Entries& all, int lane, Found* collected,
+                                          const Near& near, const F& f) {
   const auto thread = static_cast<int>(threadIdx.x % kSlice);
   int count = 0, first = 0;
   for (bool more = true; more || count > 0;) {
@@ -41,52 +38,53 @@ __device__ __forceinline__ void each_near(const contact::PairList::Entries& all,
       const int entry = first + lane < all.count ? all.first[first + lane] : -1;
       const bool is_near = entry >= 0 && near(entry);
       const unsigned threads = __ballot_sync(kWholeWarp, is_near);
-      if (is_near) own[count + __popc(threads & ((1u << thread) - 1))] = {entry, thread};
+      if (is_near) collected[count + __popc(threads & ((1u << thread) - 1))] = {entry, thread};
       count += __popc(threads), first += share;
       __syncwarp();
     }
     if (count == 0 || (more && count < kSlice)) continue;
-    f(thread < count ? own[thread] : Found{-1, thread});  // here alone: what it does is long
+    f(thread < count ? collected[thread] : Found{-1, thread});  // here alone: what it does is long
     count = count < kSlice ? 0 : count - kSlice;
-    const Found left = own[kSlice + thread];
+    const Found left = collected[kSlice + thread];
     __syncwarp();
-    if (thread < count) own[thread] = left;
+    if (thread < count) collected[thread] = left;
     __syncwarp();
   }
 }
 
 // Adds up gradients and Hessians of the warp's vertices that any of its threads have worked out, in the order of the
-// threads. The `share` threads of a vertex keep its sum together, each some of the numbers.
-template <int share, class T>
+// threads. The threads of a vertex (Place<lanes>) keep its sum together, each some of the numbers.
+template <int lanes, class T>
 struct BlockSums {
-  static constexpr int kOwn = (kContactScalars + share - 1) / share;
+  static constexpr int kGroups = kSlice / lanes, kOwn = (kContactScalars + lanes - 1) / lanes;
   T (*slots)[kContactScalars];  // [32] of the warp, in shared memory
   T own[kOwn] = {};
   // from: a thread of the vertex that g and H belong to. All threads of the warp must call it.
   __device__ __forceinline__ void add(const Vec3<T>& g, const Sym3<T>& H, int from) {
-    const int thread = threadIdx.x % kSlice, lane = thread % share;
+    const int thread = threadIdx.x % kSlice, group = thread % kGroups, lane = thread / kGroups;
     const T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
     for (int k = 0; k < kContactScalars; ++k) slots[thread][k] = values[k];
     unsigned mine = 0;  // threads with something for the vertex of this one
-    for (int first = 0; first < kSlice; first += share) {
-      const unsigned threads = __ballot_sync(kWholeWarp, from / share * share == first);
-      if (thread - lane == first) mine = threads;
+    for (int g_of = 0; g_of < kGroups; ++g_of) {
+      const unsigned threads = __ballot_sync(kWholeWarp, from % kGroups == g_of);
+      if (group == g_of) mine = threads;
     }
     __syncwarp();
     for (; mine; mine &= mine - 1) {
       const T* slot = slots[__ffs(static_cast<int>(mine)) - 1];
 #pragma unroll
       for (int i = 0; i < kOwn; ++i) {
-        if (lane + i * share < kContactScalars) own[i] += slot[lane + i * share];
+        if (lane + i * lanes < kContactScalars) own[i] += slot[lane + i * lanes];
       }
     }
     __syncwarp();
   }
+  // Of the vertex of this thread.
   __device__ __forceinline__ void store(T* to) const {
-    const int lane = threadIdx.x % share;
+    const int lane = threadIdx.x % kSlice / kGroups;
 #pragma unroll
     for (int i = 0; i < kOwn; ++i) {
-      if (lane + i * share < kContactScalars) to[lane + i * share] = own[i];
+      if (lane + i * lanes < kContactScalars) to[lane + i * lanes] = own[i];
     }
   }
 };

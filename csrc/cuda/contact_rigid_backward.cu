@@ -1,6 +1,7 @@
 #include <algorithm>
 
 #include "../contact/rigid_reverse.h"
+#include "clear_rows.cuh"
 #include "contact_rigid.cuh"
 
 namespace diffvbd::cuda {
@@ -38,13 +39,11 @@ __global__ void __launch_bounds__(kOne)
 template <class T>
 __global__ void __launch_bounds__(kOne)
     friction_kernel(const __grid_constant__ RigidInputs<T> in, VirtualMotions<T> given, RigidWork<T> out) {
-  const int64_t row = own_item();
-  if (row >= out.lagged) return;
+  const int64_t row = own_item(), count = in.first_lagged(in.scene.scenes);
+  // nobody reads the rows of what is not there: most of what a list has room for
+  clear_rows(out.lag_bar, kLagScalars, count, out.lagged);
+  if (row >= count) return;
   T *rows = out.friction + 4 * kWorkScalars * row, *lag_bar = out.lag_bar + kLagScalars * row;
-  if (row >= in.first_lagged(in.scene.scenes)) {  // most: nobody reads their rows
-    for (int i = 0; i < kLagScalars; ++i) lag_bar[i] = T(0);
-    return;
-  }
   const LaggedWork<T> work(in, given, row);
   work.acts ? work.store(rows, lag_bar) : work.store_none(rows, lag_bar);
 }

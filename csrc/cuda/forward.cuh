@@ -3,6 +3,7 @@
 
 #include <utility>
 
+#include "contact_sweep.cuh"
 #include "schedule.cuh"
 
 namespace diffvbd::cuda {
@@ -12,17 +13,34 @@ namespace {
 struct Turn {
   int64_t scene;
   int sweep, block, part;
+  int begin, end;      // blocks of the color
+  bool apart = false;  // whether sweeps of this launch have left all vertices in the rows of those that have moved
+  template <class T>
+  __device__ __forceinline__ MovingRows<T> rows(const StepView<T>& s) const {
+    return apart ? MovingRows<T>{s.w.moved, s.w.x} : MovingRows<T>{s.w.x, s.w.moved};
+  }
+  __device__ __forceinline__ int64_t first() const { return int64_t{begin} * kSlice; }
 };
 
-// Updates a warp's vertices; false, and nothing is done, where a usual set finds a block that it does not suit.
+// From where to where an update goes.
+template <class T>
+struct Way {
+  Vec3<T> from, to;
+};
+
+// Updates a warp's vertices; false, and nothing is done, where a usual set finds a block that it does not suit. A set
+// with contact leaves it to the caller to move them.
 template <class Set, class T, int lanes>
-__device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Turn& turn) {
+__device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T>& pairs,
+                                       Way<T>& way) {
   const Place<lanes> at(turn.scene, turn.block, turn.part);
   const int rank = __ldg(s.plan.block_rank + at.block) + at.v, end_rank = __ldg(s.plan.block_rank + at.block + 1);
   if (rank - at.group >= end_rank) return true;  // the whole warp: phantoms alone
   GroupStar<T, lanes> star(s, at, shared);
-  if (s.has_tets) star.fetch_neighbours(s.own);
-  const Block<T> b = load_block<Set>(s, at, s.own);
+  star.pairs = &pairs;
+  const MovingRows<T> rows = Set::contact ? turn.rows(s) : MovingRows<T>{s.w.x, s.w.x};
+  if (s.has_tets) star.template fetch_neighbours<Set::contact>(s.own, rows, turn.first());
+  const Block<T> b = load_block<Set>(s, at, s.own, rows.x);
   if constexpr (Set::usual && Set::filters) {
     if (star.any(is_oblique<Set>(b, b.state.x))) return false;
   }
@@ -33,10 +51,11 @@ __device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Tu
   }
   const Update<T> u = safeguarded<Set>(b, newton.d_raw, q);
   const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
-  if (at.lane == 0) store_row(s.w.x, at.scene * s.positions + position, moved<Set>(b.state.x, u));
+  way = {b.state.x, moved<Set>(b.state.x, u)};
+  if (!Set::contact && at.lane == 0) store_row(s.w.x, at.scene * s.positions + position, way.to);
   if (s.tape_policy != kNoTape && at.lane == 0 && rank < end_rank) {
-    const int rows = tape_rows(s.tape_policy, Set::keeps_positions);
-    T* to = s.tape + (at.scene * s.sweeps + turn.sweep) * rows * s.plan.num_active + rank;
+    const int scalars = tape_rows(s.tape_policy, Set::keeps_positions);
+    T* to = s.tape + (at.scene * s.sweeps + turn.sweep) * scalars * s.plan.num_active + rank;
     const auto put = [&](const T& value) {
       *to = value;
       to += s.plan.num_active;
@@ -48,15 +67,63 @@ __device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Tu
 
 // Out of line, so that what few vertices need takes no registers from the others.
 template <class Set, class T, int lanes>
-__device__ __noinline__ void rare_update(const StepView<T>& s, T* shared, Turn turn) {
-  update<Set, T, lanes>(s, shared, turn);
+__device__ __noinline__ Way<T> rare_update(const StepView<T>& s, T* shared, Turn turn, PairTerm<T> pairs) {
+  Way<T> way{};
+  update<Set, T, lanes>(s, shared, turn, pairs, way);
+  return way;
+}
+
+template <class Set, class T, int lanes>
+__device__ __forceinline__ Way<T> update_any(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T> pairs) {
+  Way<T> way{};
+  if (!update<Usual<Set>, T, lanes>(s, shared, turn, pairs, way)) {
+    way = rare_update<Set, T, lanes>(s, shared, turn, pairs);
+  }
+  return way;
+}
+
+// Of a set with contact, a block for a vertex: the first warp updates it, the others look at its pairs.
+template <class Set, class T>
+__device__ __forceinline__ void update_among(const StepView<T>& s, const ContactView<T>& c, T* shared,
+                                             const Turn& turn) {
+  const Place<kManyLanes> at(turn.scene, turn.block, turn.part);
+  const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
+  const int vertex = __ldg(s.plan.order + position), role = static_cast<int>(threadIdx.x / kSlice) - 1;
+  if (vertex < 0) return;
+  Among<T>& told = among_memory<T>();
+  if (role >= 0) {
+    PairsOf<T, kManyLanes, SweepRows<T>> pairs(s, c.in, at, sweep_rows(s, at.scene, turn.begin, turn.end, turn.rows(s)),
+                                               role);
+    pairs.gather(told.term[role]);
+    meet_among();  // what pairs add is there
+    meet_among();  // where the update goes is there
+    if (role != kLagged) {
+      const Vec3<T> from = contact::vector_at(told.from);
+      const int exponent = pairs.limit(from, contact::vector_at(told.to) - from);
+      if (at.lane == 0) told.exponents[role] = exponent;
+    }
+    meet_among();  // how far it may go is there
+    return;
+  }
+  Way<T> way = update_any<Set, T, kManyLanes>(s, shared, turn, {told.term[0], kRoles, nullptr, true});
+  if (at.lane == 0) {
+    told.from[0] = way.from.x, told.from[1] = way.from.y, told.from[2] = way.from.z;
+    told.to[0] = way.to.x, told.to[1] = way.to.y, told.to[2] = way.to.z;
+  }
+  meet_among();
+  meet_among();
+  if (at.lane != 0) return;
+  const int exponent = max(told.exponents[kPoints], told.exponents[kEdges]);
+  if (exponent > 0) way.to = way.from + contact::limit_of<T>(exponent) * (way.to - way.from);
+  store_row(turn.rows(s).moved, at.scene * s.positions + position, way.to);
+  c.cut[((s.base + at.scene) * s.sweeps + turn.sweep) * c.in.num_vertices + vertex] = static_cast<uint8_t>(exponent);
 }
 
 // What the usual blocks take: the rare ones must do with as many.
 template <class T, class Set>
 constexpr int forward_registers() {
   if (sizeof(T) == sizeof(float)) return Set::contact ? 96 : 80;
-  return Set::contact ? 160 : Set::filters ? 144 : 128;
+  return Set::contact ? 168 : Set::filters ? 144 : 128;
 }
 
 template <class T, int mask, int lanes>
@@ -65,29 +132,65 @@ __global__ void __maxnreg__((forward_registers<T, EnergySet<mask>>()))
   using Set = EnergySet<mask>;
   T* const shared = memory_of_warp<T, lanes>(s, false);
   wait_for_previous();
-  each_color<T, lanes>(s, range, false, [&](int64_t scene, int sweep, int block, int part) {
-    const Turn turn{scene, sweep, block, part};
-    if (!update<Usual<Set>, T, lanes>(s, shared, turn)) rare_update<Set, T, lanes>(s, shared, turn);
+  each_color<T, lanes>(s, range, false, [&](int64_t scene, int sweep, int block, int part, int begin, int end) {
+    update_any<Set, T, lanes>(s, shared, Turn{scene, sweep, block, part, begin, end}, {});
     __syncwarp();
   });
 }
+// Of a set with contact: the pairs' part has been summed up, and planes have yet to let the vertices pass.
+template <class T, int mask, int lanes>
+__global__ void __maxnreg__((forward_registers<T, EnergySet<mask>>()))
+    sweep_between(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range,
+                  const __grid_constant__ ContactView<T> c) {
+  T* const shared = memory_of_warp<T, lanes>(s, false);
+  wait_for_previous();
+  each_color<T, lanes>(s, range, false, [&](int64_t scene, int sweep, int block, int part, int begin, int end) {
+    const Place<lanes> at(scene, block, part);
+    const int64_t row = scene * s.positions + static_cast<int64_t>(block) * kSlice + at.v;
+    const PairTerm<T> pairs{s.w.contact + row * kContactScalars, 1};
+    const Way<T> way = update_any<EnergySet<mask>, T, lanes>(s, shared, {scene, sweep, block, part, begin, end}, pairs);
+    const bool real = __ldg(s.plan.order + static_cast<int64_t>(block) * kSlice + at.v) >= 0;
+    if (at.lane == 0 && real) store_row(s.w.moved, row, way.to);
+    __syncwarp();
+  });
+}
+// A block for each vertex, in one launch for all sweeps or for each color.
+template <class T, int mask>
+__global__ void __maxnreg__((forward_registers<T, EnergySet<mask>>()))
+    sweep_among(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range,
+                const __grid_constant__ ContactView<T> c) {
+  T* const shared = memory_of_warp<T, kManyLanes>(s, false);  // of the first warp
+  wait_for_previous();
+  const auto visit = [&](int64_t scene, int sweep, int block, int part, int begin, int end) {
+    const bool apart = (sweep - range.first_sweep) % 2 != 0;
+    update_among<EnergySet<mask>>(s, c, shared, Turn{scene, sweep, block, part, begin, end, apart});
+  };
+  each_color_by_blocks(s, range, false, visit, nullptr);
+}
 
 template <class T, int mask, int lanes>
-constexpr SweepKernel<T> forward_variant() {
-  if constexpr (is_built(mask, lanes)) return sweep_forward<T, mask, lanes>;
-  return nullptr;
+SweepKernel forward_variant() {
+  if constexpr (!is_built(mask, lanes)) {
+    return nullptr;
+  } else if constexpr (EnergySet<mask>::contact && lanes == kManyLanes) {
+    return reinterpret_cast<SweepKernel>(&sweep_among<T, mask>);
+  } else if constexpr (EnergySet<mask>::contact) {
+    return reinterpret_cast<SweepKernel>(&sweep_between<T, mask, lanes>);
+  } else {
+    return reinterpret_cast<SweepKernel>(&sweep_forward<T, mask, lanes>);
+  }
 }
 
 template <class T, int lanes, int... n>
-SweepKernel<T> pick_forward(int index, std::integer_sequence<int, n...>) {
-  static constexpr SweepKernel<T> table[kEnergySets] = {forward_variant<T, energy_mask(n), lanes>()...};
+SweepKernel pick_forward(int index, std::integer_sequence<int, n...>) {
+  static SweepKernel const table[kEnergySets] = {forward_variant<T, energy_mask(n), lanes>()...};
   return table[index];
 }
 
 }  // namespace
 
 template <class T>
-SweepKernel<T> forward_kernel(int energies, int lanes) {
+SweepKernel forward_kernel(int energies, int lanes) {
   constexpr auto sets = std::make_integer_sequence<int, kEnergySets>{};
   const int index = energy_index(energies);
   switch (lanes) {
@@ -104,5 +207,4 @@ SweepKernel<T> forward_kernel(int energies, int lanes) {
 
 }  // namespace diffvbd::cuda
 
-#define DIFFVBD_INSTANTIATE_FORWARD(T) \
-  template diffvbd::cuda::SweepKernel<T> diffvbd::cuda::forward_kernel<T>(int, int);
+#define DIFFVBD_INSTANTIATE_FORWARD(T) template diffvbd::cuda::SweepKernel diffvbd::cuda::forward_kernel<T>(int, int);

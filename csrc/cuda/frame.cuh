@@ -50,6 +50,7 @@ __global__ void load_vertices(const __grid_constant__ StepInputs<T> in, const __
   const Vec3<T> y = in.fused ? predict(in, scene, vertex, pinned) : load_user(in.y, scene, vertex);
   store3(s.w.y + vectors, block, v, y);
   const int64_t own = scene * s.plan.num_vertices + vertex;
+  if (s.w.position && local == 0 && !phantom) s.w.position[vertex] = static_cast<int32_t>(position);
   if (ends) {
     store_row(s.w.x, i, Vec3<T>{ends[3 * own], ends[3 * own + 1], ends[3 * own + 2]});
     Vec3<T> bar = zero3<T>();
@@ -60,7 +61,9 @@ __global__ void load_vertices(const __grid_constant__ StepInputs<T> in, const __
     }
     store_row(s.w.x_bar, i, phantom ? zero3<T>() : bar);
   } else {
-    store_row(s.w.x, i, in.fused ? y : load_user(in.x_start, scene, vertex));
+    const Vec3<T> x = in.fused ? y : load_user(in.x_start, scene, vertex);
+    store_row(s.w.x, i, x);
+    if (s.w.moved) store_row(s.w.moved, i, x);  // what is pinned stays there
   }
   if (s.w.x_prev) store3(s.w.x_prev + vectors, block, v, load_user(in.x_prev, scene, vertex));
   if (s.w.origin) store3(s.w.origin + vectors, block, v, load_user(in.origin, scene, vertex));

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "../sweep/vertex.h"
+#include "pair_term.cuh"
 #include "step.h"
 
 namespace diffvbd::cuda {
@@ -144,10 +145,13 @@ struct GroupStar {
     if (s.has_tets) fetch(0);
   }
 
-  // Several loads are under way at once: what is beyond the last neighbour repeats it, and is not stored.
-  __device__ __forceinline__ void fetch_neighbours(bool own) {
+  __device__ __forceinline__ void fetch_neighbours(bool own) { fetch_neighbours<false>(own, {s.w.x, s.w.x}, 0); }
+  // Several loads are under way at once: what is beyond the last neighbour repeats it, and is not stored. Where colors
+  // move into other rows (`apart`), those of positions below `first` have.
+  template <bool apart>
+  __device__ __forceinline__ void fetch_neighbours(bool own, const MovingRows<T>& rows, int64_t first) {
     constexpr int batch = lanes >= 32 ? 1 : lanes >= 8 ? 3 : 4;
-    const T* x = s.w.x + at.scene * s.positions * kRow;
+    const T *x = rows.x + at.scene * s.positions * kRow, *moved = rows.moved + at.scene * s.positions * kRow;
     const int32_t* adjacent = s.plan.adjacent + static_cast<int64_t>(first_edge) * kSlice + at.v;
     for (int start = at.lane; start < degree; start += batch * lanes) {
       int32_t index[batch];
@@ -155,7 +159,7 @@ struct GroupStar {
 #pragma unroll
       for (int u = 0; u < batch; ++u) index[u] = __ldg(adjacent + min(start + u * lanes, degree - 1) * kSlice);
 #pragma unroll
-      for (int u = 0; u < batch; ++u) n[u] = load_row(x, index[u], own);
+      for (int u = 0; u < batch; ++u) n[u] = load_row(apart && index[u] < first ? moved : x, index[u], own);
 #pragma unroll
       for (int u = 0; u < batch; ++u) {
         if (start + u * lanes >= degree) continue;
@@ -249,6 +253,8 @@ struct GroupStar {
     for (int i = 0; i < kTetScalars; ++i) material_bar[i] = a.material_bar[i];
   }
   __device__ __forceinline__ const Vec3<T>& predictor(const Block<T>& b) const { return b.y; }
+  PairTerm<T>* pairs = nullptr;
+  __device__ __forceinline__ ContactTerm<T> contact(const Block<T>&) const { return pairs->sum(); }
 
   __device__ __forceinline__ void put(int row, const Vec3<T>& v) const {
     T* to = sums + row * 3 * P::groups;
@@ -360,12 +366,13 @@ __device__ __forceinline__ Vec3<T> pull_rows(const StepView<T>& s, const Place<l
   return sum;
 }
 
+// x: rows in which the vertices of the color are.
 template <class Set, class T, int lanes>
-__device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const Place<lanes>& at, bool own) {
+__device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const Place<lanes>& at, bool own, const T* x) {
   Block<T> out;
   const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
   const int64_t vectors = at.scene * s.positions * 3;
-  out.state.x = load_row(s.w.x, at.scene * s.positions + position, own);
+  out.state.x = load_row(x, at.scene * s.positions + position, own);
   out.state.x_prev = zero3<T>();
   out.state.origin = zero3<T>();
   if constexpr (Set::reads_x_prev) out.state.x_prev = load3(s.w.x_prev + vectors, at.block, at.v);
@@ -383,10 +390,6 @@ __device__ __forceinline__ Block<T> load_block(const StepView<T>& s, const Place
       out.data_count[k] = E::per_vertex ? E::stride : s.data_count[k];
       out.data[k] = data + s.data_start[k] + (E::per_vertex ? static_cast<int64_t>(vertex) * E::stride : 0);
     });
-  }
-  if constexpr (Set::contact) {
-    const T* a = s.w.contact + (at.scene * s.positions + position) * kContactScalars;
-    out.contact = {{a[0], a[1], a[2]}, {a[3], a[4], a[5], a[6], a[7], a[8]}};
   }
   return out;
 }

@@ -3,6 +3,7 @@
 
 #include <utility>
 
+#include "contact_sweep.cuh"
 #include "schedule.cuh"
 
 namespace diffvbd::cuda {
@@ -23,7 +24,7 @@ struct Turn {
 // Reverses the updates of a warp's vertices; false, and nothing is done, where a usual set finds a block that it does
 // not suit.
 template <class Set, int wanted, class T, int lanes>
-__device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, const Turn& turn) {
+__device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T>& pairs) {
   const int rows = tape_rows(s.tape_policy, Set::keeps_positions);
   const Place<lanes> at(turn.scene, turn.block, turn.part);
   const int64_t scene = at.scene, position = static_cast<int64_t>(at.block) * kSlice + at.v,
@@ -43,8 +44,9 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   Recalled<T> r = recall<Set, T>(full, get);
   const Vec3<T> y_bar = load_own3(s.w.y_bar + scene * s.positions * 3, at.block, at.v);
   GroupStar<T, lanes> star(s, at, shared);
+  star.pairs = &pairs;
   star.repeats = !full;
-  Block<T> b = load_block<Set>(s, at, false);
+  Block<T> b = load_block<Set>(s, at, false, s.w.x);
   if constexpr (Set::usual) {
     if constexpr (Set::filters) {
       if (star.any(is_oblique<Set>(b, r.x_old, s.w.data_bar != nullptr))) return false;
@@ -56,7 +58,8 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
     }
   }
   if (s.has_tets) star.clear_sums(shared);
-  const Vec3<T> end_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
+  Vec3<T> end_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
+  if constexpr (Set::contact) end_bar += pairs.sent();
   Vec3<T> x_bar = end_bar;
   if constexpr (Set::contact) {
     const int64_t sweep = s.sweeps - 1 - turn.number, step = ((s.base + scene) * s.sweeps + sweep);
@@ -109,8 +112,46 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
 
 // Out of line, so that what few vertices need takes no registers from the others.
 template <class Set, int wanted, class T, int lanes>
-__device__ __noinline__ void reverse_rare_update(const StepView<T>& s, T* shared, Turn turn) {
-  reverse_update<Set, wanted, T, lanes>(s, shared, turn);
+__device__ __noinline__ void reverse_rare_update(const StepView<T>& s, T* shared, Turn turn, PairTerm<T> pairs) {
+  reverse_update<Set, wanted, T, lanes>(s, shared, turn, pairs);
+}
+
+template <class Set, int wanted, class T, int lanes>
+__device__ __forceinline__ void reverse_any(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T> pairs) {
+  if (!reverse_update<Usual<Set>, wanted, T, lanes>(s, shared, turn, pairs)) {
+    reverse_rare_update<Set, wanted, T, lanes>(s, shared, turn, pairs);
+  }
+}
+
+// Of a set with contact, a block for a vertex: the first warp reverses its update, the others take what pairs have sent
+// to it and, where no tape has the block, work out their part of that.
+template <class Set, int wanted, class T>
+__device__ __forceinline__ void reverse_update_among(const StepView<T>& s, const ContactView<T>& c, T* shared,
+                                                     const Turn& turn, int begin, int end) {
+  const Place<kManyLanes> at(turn.scene, turn.block, turn.part);
+  const int vertex = __ldg(s.plan.order + static_cast<int64_t>(at.block) * kSlice + at.v);
+  const int role = static_cast<int>(threadIdx.x / kSlice) - 1;
+  if (vertex < 0) return;
+  Among<T>& told = among_memory<T>();
+  const bool full = s.tape_policy == kFullTape;
+  if (role >= 0) {
+    PairsOf<T, kManyLanes, TapeRows<T>> pairs(s, c.in, at,
+                                              tape_rows_of(s, at.scene, s.sweeps - 1 - turn.number, begin, end), role);
+    if (role == kLagged) take_sent(c, pairs, told.bar);
+    if (!full) pairs.gather(told.term[role]);
+    meet_among();  // both are there
+  } else {
+    reverse_any<Set, wanted, T, kManyLanes>(s, shared, turn, {told.term[0], full ? 0 : kRoles, told.bar, true});
+  }
+  meet_among();  // and have been read
+}
+
+// Out of line: it is the same for all sets.
+template <class T>
+__device__ __noinline__ void send_among(const StepView<T>& s, const ContactView<T>& c, int64_t scene, int block,
+                                        int part, int begin, int end) {
+  const int role = static_cast<int>(threadIdx.x / kSlice) - 1;
+  if (role >= 0) send_pairs(s, c, Place<kManyLanes>(scene, block, part), role, begin, end);
 }
 
 template <class T, int mask, int wanted, int lanes>
@@ -119,31 +160,53 @@ __global__ void __maxnreg__((reverse_registers<T, EnergySet<mask>>()))
   using Set = EnergySet<mask>;
   T* const shared = memory_of_warp<T, lanes>(s, true);
   wait_for_previous();
-  each_color<T, lanes>(s, range, true, [&](int64_t scene, int number, int block, int part) {
-    const Turn turn{scene, number, block, part};
-    if (!reverse_update<Usual<Set>, wanted, T, lanes>(s, shared, turn)) {
-      reverse_rare_update<Set, wanted, T, lanes>(s, shared, turn);
-    }
+  each_color<T, lanes>(s, range, true, [&](int64_t scene, int number, int block, int part, int, int) {
+    const Place<lanes> at(scene, block, part);
+    const int64_t row = scene * s.positions + static_cast<int64_t>(block) * kSlice + at.v;
+    PairTerm<T> pairs;
+    if (Set::contact) pairs.at = s.w.contact + row * kContactScalars, pairs.count = s.tape_policy != kFullTape;
+    reverse_any<Set, wanted, T, lanes>(s, shared, Turn{scene, number, block, part}, pairs);
     __syncwarp();
   });
 }
+// Of a set with contact, a block for each vertex, in one launch for all sweeps; or for each color, but for what it
+// sends to its pairs.
+template <class T, int mask, int wanted>
+__global__ void __maxnreg__((reverse_registers<T, EnergySet<mask>>()))
+    reverse_among(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range,
+                  const __grid_constant__ ContactView<T> c) {
+  T* const shared = memory_of_warp<T, kManyLanes>(s, true);  // of the first warp
+  wait_for_previous();
+  const auto visit = [&](int64_t scene, int number, int block, int part, int begin, int end) {
+    reverse_update_among<EnergySet<mask>, wanted>(s, c, shared, Turn{scene, number, block, part}, begin, end);
+  };
+  const auto send = [&](int64_t scene, int, int block, int part, int begin, int end) {
+    send_among(s, c, scene, block, part, begin, end);
+  };
+  each_color_by_blocks(s, range, true, visit, send);
+}
 
 template <class T, int mask, int wanted, int lanes>
-constexpr SweepKernel<T> reverse_variant() {
-  if constexpr (is_built(mask, lanes)) return sweep_reverse<T, mask, wanted, lanes>;
-  return nullptr;
+SweepKernel reverse_variant() {
+  if constexpr (!is_built(mask, lanes)) {
+    return nullptr;
+  } else if constexpr (EnergySet<mask>::contact && lanes == kManyLanes) {
+    return reinterpret_cast<SweepKernel>(&reverse_among<T, mask, wanted>);
+  } else {
+    return reinterpret_cast<SweepKernel>(&sweep_reverse<T, mask, wanted, lanes>);
+  }
 }
 
 template <class T, int wanted, int lanes, int... n>
-SweepKernel<T> pick_reverse(int index, std::integer_sequence<int, n...>) {
-  static constexpr SweepKernel<T> table[kEnergySets] = {reverse_variant<T, energy_mask(n), wanted, lanes>()...};
+SweepKernel pick_reverse(int index, std::integer_sequence<int, n...>) {
+  static SweepKernel const table[kEnergySets] = {reverse_variant<T, energy_mask(n), wanted, lanes>()...};
   return table[index];
 }
 
 }  // namespace
 
 template <class T, int wanted, int lanes>
-SweepKernel<T> reverse_kernel(int energies) {
+SweepKernel reverse_kernel(int energies) {
   return pick_reverse<T, wanted, lanes>(energy_index(energies), std::make_integer_sequence<int, kEnergySets>{});
 }
 
@@ -151,4 +214,4 @@ SweepKernel<T> reverse_kernel(int energies) {
 
 // Few threads a vertex and many are compiled apart: these are the files that take longest.
 #define DIFFVBD_INSTANTIATE_REVERSE(T, wanted, lanes) \
-  template diffvbd::cuda::SweepKernel<T> diffvbd::cuda::reverse_kernel<T, (wanted), diffvbd::cuda::lanes>(int);
+  template diffvbd::cuda::SweepKernel diffvbd::cuda::reverse_kernel<T, (wanted), diffvbd::cuda::lanes>(int);

@@ -69,8 +69,10 @@ Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjo
   w.origin = take(in.origin.data != nullptr, n * 3 * positions);
   w.mass = take(true, (in.mass.scene != 0 ? n : 1) * positions);
   w.material = take(elastic && !one, (one_for_scenes(in.material) ? 1 : n) * kTetScalars * pairs);
-  w.contact = take(in.contact != nullptr, n * kContactScalars * positions);
-  w.before = take(!reverse && in.contact, n * kRow * positions);
+  const bool among =
+      possible_lanes<T>(host, choice, choice.lanes, reverse) == kManyLanes;  // blocks keep it to themselves
+  w.contact = take(in.contact && !among, n * kContactScalars * positions);
+  w.moved = take(!reverse && in.contact, n * kRow * positions);
   w.turn = take(reverse && in.contact, n * 6 * positions);
   w.position = reinterpret_cast<int32_t*>(take(in.contact != nullptr, plan.num_vertices));
   *spill = nullptr;
@@ -91,12 +93,12 @@ struct Runner {
   const Choice& choice;
   cudaStream_t stream;
   unsigned* barrier;
-  uint8_t* cut = nullptr;  // of the forward
   StepView<T> s{};
   int64_t zeroed = 0;
   T* first = nullptr;
   bool material_is_shared;
   CoarseWork<T> coarse{};
+  ContactView<T> contact{};
 
   Runner(const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints, const Choice& choice,
          void* workspace, cudaStream_t stream)
@@ -120,6 +122,8 @@ struct Runner {
     s.has_tets = (in.energies & kElastic) != 0;
     s.one_material = one_for_items(in.material);
     s.mass = {s.w.mass, in.mass.scene != 0 ? s.positions : 0, 1};
+    if (in.contact) contact.in = *in.contact;
+    if (in.contact && adjoints) contact.slots = *adjoints->contact;
     material_is_shared = one_for_scenes(in.material);
     s.material_scene = material_is_shared ? 0 : int64_t{host.plan.slots} * kSlice * kTetScalars;
     int64_t start = 0;
@@ -164,55 +168,58 @@ struct Runner {
     if (auto error = per_item(load_vertices<T>, s.scenes * s.positions, in, s, base, ends, x_bar, v_bar, barrier)) {
       return error;
     }
-    return in.contact ? passes().load() : cudaSuccess;
+    return cudaSuccess;
   }
 
-  ContactPasses<T> passes(bool follow = false) const {
-    return {s, *in.contact, adjoints, cut, in.scenes, stream, follow};
-  }
+  ContactPasses<T> passes() const { return {s, contact, stream}; }
 
   int64_t blocks_of(int color) const { return host.color_block[color + 1] - host.color_block[color]; }
 
-  cudaError_t sweep(SweepKernel<T> kernel, int lanes, bool backward) {
+  cudaError_t sweep(SweepKernel function, int lanes, bool backward) {
     const int colors = host.plan.colors;
     if (colors == 0) return cudaSuccess;
     int64_t most = 1;
     for (int c = 0; c < colors; ++c) most = std::max(most, blocks_of(c) * threads_of(lanes));
-    const bool own = choice.regime == kBlock, spills = lanes == kSpillLanes;
+    const bool among = in.contact && lanes == kManyLanes;  // a block for each vertex, of whose warps one has a star
+    const int regime = in.contact && !among ? kColor : choice.regime;
+    const bool own = regime == kBlock, spills = lanes == kSpillLanes;
     const size_t shared_of_warp = spills ? 0 : shared_scalars(host.degree, host.valence, lanes, backward) * sizeof(T);
     int64_t warps = own && !spills ? std::min<int64_t>(kMaxThreads / kSlice, most) : kWarpsPerBlock;
-    if (shared_of_warp > 0) warps = std::min<int64_t>(warps, choice.shared / shared_of_warp);
+    const size_t room = choice.shared - choice.by_pairs;
+    if (shared_of_warp > 0) warps = std::min<int64_t>(warps, room / shared_of_warp);
+    if (among) warps = 1;
     const size_t shared = shared_of_warp * warps;
-    const void* function = reinterpret_cast<const void*>(kernel);
-    if (shared > 48 * 1024) {
+    if (shared + choice.by_pairs > 48 * 1024) {
       const auto attribute = cudaFuncAttributeMaxDynamicSharedMemorySize;
       // the same limit always: another thread may be about to launch the same kernel
-      if (auto error = cudaFuncSetAttribute(function, attribute, static_cast<int>(choice.shared))) return error;
+      if (auto error = cudaFuncSetAttribute(function, attribute, static_cast<int>(room))) return error;
     }
-    const dim3 threads(static_cast<unsigned>(warps * kSlice));
-    Range range{choice.regime, 0, 0, 0, colors, barrier};
-    void* arguments[] = {&s, &range};
+    const dim3 threads(static_cast<unsigned>((among ? kAmongWarps : warps) * kSlice));
+    Range range{regime, 0, 0, 0, colors, barrier};
+    void* arguments[] = {&s, &range, &contact};
     // with spilled stars no more blocks than have memory of their own
     const auto blocks_for = [&](int64_t parts) {
       const int64_t needed = own ? s.scenes : (parts * s.scenes + warps - 1) / warps;
       return spills ? std::min<int64_t>(needed, choice.multiprocessors) : needed;
     };
-    const bool may_follow = choice.regime == kColor && can_follow(function);
+    const bool may_follow = regime == kColor && can_follow(function);
     const auto start = [&](int64_t blocks, bool follows = false) {
-      return launch(function, static_cast<unsigned>(blocks), threads, arguments, shared, stream, follows && may_follow);
+      return launch(function, static_cast<unsigned>(blocks), threads, arguments, shared, stream, follows);
     };
     const auto run = [&](int begin, int end) {  // counted from the last in the reverse
       range.first_sweep = begin, range.end_sweep = end;
       range.first_color = 0, range.end_color = colors;
       if (begin == end) return cudaSuccess;
       if (own) return start(blocks_for(most));
-      if (choice.regime == kColor) return color_by_color(range, backward, lanes, may_follow, blocks_for, start);
+      if (regime == kColor) return color_by_color(range, backward, lanes, may_follow, blocks_for, start);
       int resident = 0;
       const int size = static_cast<int>(threads.x);
       if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, function, size, shared)) return error;
       const int64_t blocks = std::min<int64_t>(int64_t{resident} * choice.multiprocessors, blocks_for(most));
-      return cudaLaunchCooperativeKernel(function, dim3(static_cast<unsigned>(blocks)), threads, arguments, shared,
-                                         stream);
+      const auto error = cudaLaunchCooperativeKernel(function, dim3(static_cast<unsigned>(blocks)), threads, arguments,
+                                                     shared, stream);
+      if (in.contact && !backward && (end - begin) % 2 != 0) std::swap(s.w.x, s.w.moved);
+      return error;
     };
     return in.coarse ? corrected(run, backward) : run(0, in.sweeps);
   }
@@ -240,6 +247,9 @@ struct Runner {
   cudaError_t color_by_color(Range& range, bool backward, int lanes, bool may_follow, const Blocks& blocks_for,
                              const Start& start) {
     bool follows = false;
+    cudaError_t error = cudaSuccess;
+    const bool apart = in.contact && lanes != kManyLanes;  // passes of their own before and after the updates
+    const bool full = backward && in.tape_policy == kFullTape;
     const int colors = host.plan.colors, first = range.first_sweep, last = range.end_sweep;
     for (int k = first; k < last; ++k) {
       for (int c = 0; c < colors; ++c) {
@@ -248,28 +258,27 @@ struct Runner {
         const int color = backward ? colors - 1 - c : c;
         if (blocks_of(color) == 0) continue;
         const int64_t begin = host.color_block[color], end = host.color_block[color + 1];
-        if (in.contact && backward) {
-          if (auto error = passes(follows).prepare(in.sweeps - 1 - k, begin, end)) return error;
+        const auto pass = [&](bool wanted, const auto& launched) {
+          if (!wanted || error != cudaSuccess) return;
+          error = launched();
           follows = may_follow;
-        }
-        if (in.contact && !(backward && in.tape_policy == kFullTape)) {
-          if (auto error = passes(follows).assemble(begin, end)) return error;
-          follows = may_follow;
-        }
-        if (auto error = start(blocks_for(blocks_of(color) * threads_of(lanes)), follows)) return error;
-        follows = may_follow;
-        if (in.contact) {
-          const auto pass = passes(follows);
-          if (auto error = backward ? pass.reverse(begin, end) : pass.limit(k, begin, end)) return error;
-        }
+        };
+        const int sweep = backward ? in.sweeps - 1 - k : -1;
+        pass(apart && backward, [&] { return passes().prepare(begin, end, follows); });
+        pass(apart && !full, [&] { return passes().assemble(sweep, begin, end, follows); });
+        pass(true, [&] { return start(blocks_for(blocks_of(color) * threads_of(lanes)), follows); });
+        pass(apart && !backward, [&] { return passes().limit(k, begin, end, follows); });
+        pass(in.contact && backward, [&] { return passes().reverse(!apart, begin, end, follows); });
+        if (error != cudaSuccess) return error;
       }
+      if (in.contact && !backward) std::swap(s.w.x, s.w.moved);
     }
     return cudaSuccess;
   }
 
   cudaError_t store(int64_t base, const StepAdjoints<T>& out) {
     if (in.contact) {
-      if (auto error = passes().collect()) return error;
+      if (auto error = passes().collect(out)) return error;
     }
     if (auto error = per_item(store_adjoints<T>, s.scenes * s.positions, in, s, base, out)) return error;
     const bool material = out.material[0] != nullptr, per_tet = material && !s.one_material;
@@ -291,7 +300,7 @@ struct Runner {
         if (auto error = sum(from, s.data_scalars * s.positions, 1, s.scenes, to, in.data_size)) return error;
       }
     }
-    return in.contact ? passes().store() : cudaSuccess;
+    return in.contact ? passes().store(out) : cudaSuccess;
   }
 
   cudaError_t sum(const T* values, int64_t stride, int64_t step, int64_t rows, T* out, int64_t out_stride) {
@@ -303,7 +312,7 @@ struct Runner {
 };
 
 template <class T, int wanted>
-SweepKernel<T> reverse_kernel_for(int energies, int lanes) {
+SweepKernel reverse_kernel_for(int energies, int lanes) {
   switch (lanes) {
     case kFewLanes:
       return reverse_kernel<T, wanted, kFewLanes>(energies);
@@ -316,7 +325,7 @@ SweepKernel<T> reverse_kernel_for(int energies, int lanes) {
   }
 }
 template <class T>
-SweepKernel<T> reverse_kernel_for(int energies, int wanted, int lanes) {
+SweepKernel reverse_kernel_for(int energies, int wanted, int lanes) {
   if (wanted & kRest) return reverse_kernel_for<T, kMaterial | kRest>(energies, lanes);
   if (wanted & kMaterial) return reverse_kernel_for<T, kMaterial>(energies, lanes);
   return reverse_kernel_for<T, kState>(energies, lanes);
@@ -342,7 +351,7 @@ cudaError_t run_forward(const HostPlan& host, const StepInputs<T>& in, const Ste
   if (choice.regime == kThread)
     return run_scene_forward(host, in, out, choice, static_cast<uint8_t*>(workspace), stream);
   Runner<T> run(host, in, nullptr, choice, workspace, stream);
-  run.cut = out.cut;
+  run.contact.cut = out.cut;
   const int lanes = possible_lanes<T>(host, choice, choice.lanes, false);
   for (int64_t base = 0; base < in.scenes; base += choice.chunk) {
     run.choose(base, std::min(choice.chunk, in.scenes - base), out.tape);

@@ -1,6 +1,9 @@
 // Who visits which vertices when: the loops over sweeps and colors inside a launch, and the barriers between colors.
 #pragma once
 
+#include <cstddef>
+#include <type_traits>
+
 #include "follow.cuh"
 #include "group.cuh"
 
@@ -22,7 +25,8 @@ __device__ __forceinline__ void grid_barrier(unsigned* counter, unsigned& turn) 
   __syncthreads();
 }
 
-// Calls visit(scene, block, part) for the warps' share of each color, with barriers between colors.
+// Calls visit(scene, sweep, block, part, begin, end) for the warps' share of each color, whose blocks are [begin, end),
+// with barriers between colors.
 template <class T, int lanes_, class Visit>
 __device__ __forceinline__ void each_color(const StepView<T>& s, const Range& range, bool backward, Visit&& visit) {
   constexpr int lanes = threads_of(lanes_);
@@ -40,13 +44,43 @@ __device__ __forceinline__ void each_color(const StepView<T>& s, const Range& ra
         const unsigned parts = static_cast<unsigned>(end - begin) * lanes;
         for (unsigned i = first; i < parts * static_cast<unsigned>(scenes_at_once); i += stride) {
           const unsigned scene = scenes_at_once == 1 ? 0 : i / parts, part = i - scene * parts;
-          visit(own_scene + scene, k, begin + static_cast<int>(part / lanes), static_cast<int>(part % lanes));
+          visit(own_scene + scene, k, begin + static_cast<int>(part / lanes), static_cast<int>(part % lanes), begin,
+                end);
         }
         if (own) {
           __syncthreads();
         } else if (range.regime == kGrid) {
           grid_barrier(range.barrier, turn);
         }
+      }
+    }
+  }
+}
+
+// The same where a block has a vertex at a time: visit(scene, sweep, block, part, begin, end) of all of a color, and
+// then(...) of all. All threads of a block call them together. Where launches have a color each, then() has one to
+// itself.
+template <class T, class Visit, class Then>
+__device__ __forceinline__ void each_color_by_blocks(const StepView<T>& s, const Range& range, bool backward,
+                                                     const Visit& visit, const Then& then) {
+  unsigned turn = 0;
+  for (int k = range.first_sweep; k < range.end_sweep; ++k) {
+    for (int c = range.first_color; c < range.end_color; ++c) {
+      const int color = backward ? s.plan.colors - 1 - c : c;
+      const int begin = __ldg(s.plan.color_block + color), end = __ldg(s.plan.color_block + color + 1);
+      const unsigned parts = static_cast<unsigned>(end - begin) * kSlice;
+      const auto each = [&](const auto& f) {
+        for (unsigned i = blockIdx.x; i < parts * static_cast<unsigned>(s.scenes); i += gridDim.x) {
+          const unsigned scene = i / parts, part = i - scene * parts;
+          f(scene, k, begin + static_cast<int>(part / kSlice), static_cast<int>(part % kSlice), begin, end);
+        }
+      };
+      each(visit);
+      if (range.regime != kGrid) continue;
+      grid_barrier(range.barrier, turn);
+      if constexpr (!std::is_same_v<Then, std::nullptr_t>) {
+        each(then);
+        grid_barrier(range.barrier, turn);
       }
     }
   }

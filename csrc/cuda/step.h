@@ -78,9 +78,15 @@ struct Workspace {
   T* data_bar;        // [scalars, positions]
   // with contact:
   T* contact;         // [positions, kContactScalars]: the pairs' part of the block
-  T* before;          // [positions, 4]: where the vertices of a color were before it moved
+  T* moved;           // [positions, 4]: where vertices are that have moved in a sweep; after it, x of the next one
   T* turn;            // [positions, 6]: p and d_raw of the latest reversed update
   int32_t* position;  // [V]: where a vertex stands in sweep order
+};
+
+// Rows of vertices that have yet to move in a sweep, and of those that have.
+template <class T>
+struct MovingRows {
+  T *x, *moved;
 };
 
 // Everything a sweep's kernels read and write; a chunk of scenes.
@@ -116,8 +122,16 @@ struct Range {
   unsigned* barrier;  // kGrid: zero before the launch
 };
 
+// What the kernels of sets with contact get beside these.
 template <class T>
-using SweepKernel = void (*)(StepView<T>, Range);
+struct ContactView {
+  contact::ContactInputs<T> in;
+  contact::ContactAdjoints<T> slots;  // in the reverse
+  uint8_t* cut;                       // in the forward
+};
+
+// A kernel that takes a StepView and a Range, and a ContactView where the set has contact.
+using SweepKernel = const void*;
 
 // Threads that share a vertex: few where there are vertices enough to fill the device, many to finish a small color
 // soon. The last is for stars too large for shared memory: a whole warp, working in device memory.
@@ -129,9 +143,9 @@ DIFFVBD_FN constexpr bool gathers(int lanes) { return lanes > kFewLanes; }
 
 // The kernels of a scene's energies for `lanes` threads per vertex.
 template <class T>
-SweepKernel<T> forward_kernel(int energies, int lanes);
+SweepKernel forward_kernel(int energies, int lanes);
 template <class T, int wanted, int lanes>
-SweepKernel<T> reverse_kernel(int energies);
+SweepKernel reverse_kernel(int energies);
 
 // scalars of shared memory that a warp needs, for stars of up to `degree` neighbours and `valence` pairs
 DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int lanes, bool reverse) {
@@ -140,7 +154,7 @@ DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int lanes, bool
   return groups * (3 * degree + (reverse ? contributions : 0));
 }
 
-// Contact launches color by color, where few threads per vertex gain little: one variant less to build.
+// With contact a vertex has many threads or some: one variant less to build.
 constexpr bool is_built(int mask, int lanes) { return (mask & kContact) == 0 || lanes != kFewLanes; }
 
 // A plan with what the host must know of it.
@@ -155,19 +169,21 @@ struct Choice {
   int regime, lanes, wanted;
   int64_t chunk;  // scenes that are worked on at once
   int multiprocessors;
-  size_t shared;  // bytes of shared memory that a block can have
+  size_t shared;        // bytes of shared memory that a block can have
+  size_t by_pairs = 0;  // and of them what pairs need in a sweep
 };
 
-constexpr int kWarpsPerBlock = 4;  // of the grid and color regimes
+constexpr int kWarpsPerBlock = 4;         // of the grid and color regimes
+constexpr size_t kPairBytes = 14 * 1024;  // of a block's shared memory that pairs need, beside stars
 // Threads per vertex: so many, or so many more that shared memory holds the stars of several warps.
 template <class T>
 int possible_lanes(const HostPlan& host, const Choice& choice, int least, bool reverse) {
   constexpr size_t warps = 6;  // fewer leave a multiprocessor waiting for memory
   const auto needed = [&](int lanes) { return shared_scalars(host.degree, host.valence, lanes, reverse) * sizeof(T); };
   for (const int lanes : {kFewLanes, kSomeLanes, kManyLanes}) {
-    if (lanes >= least && needed(lanes) * warps <= choice.shared) return lanes;
+    if (lanes >= least && needed(lanes) * warps <= choice.shared - choice.by_pairs) return lanes;
   }
-  return needed(kManyLanes) <= choice.shared ? kManyLanes : kSpillLanes;
+  return needed(kManyLanes) <= choice.shared - choice.by_pairs ? kManyLanes : kSpillLanes;
 }
 
 template <class T>

@@ -16,7 +16,7 @@ struct Block {
   R mass;                          // [kg]
   const R* data[kVertexEnergies];  // of each energy that is present
   int data_count[kVertexEnergies];
-  ContactTerm<R> contact;  // where the set has contact
+  ContactTerm<R> contact;  // where the set has contact, unless the star has it
 };
 
 // The axes in which a set's blocks are factored.
@@ -108,8 +108,9 @@ DIFFVBD_FN System<Set, R> assemble(const Block<R>& b, const Star& star, const St
     if constexpr (!E::has_filter) E::block(b.state, b.data[k], b.data_count[k], out.g, out.H);
   });
   if constexpr (Set::contact) {
-    out.g += b.contact.g;
-    out.H += b.contact.H;
+    const ContactTerm<R> contact = star.contact(b);
+    out.g += contact.g;
+    out.H += contact.H;
   }
   if constexpr (Set::filters) {
     out.axes = axes_of<T, Set>(b);

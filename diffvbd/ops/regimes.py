@@ -26,6 +26,7 @@ GRID_VERTICES = 50_000  # vertices of all scenes: above, launches cost less than
 MANY_SCENES = 64  # of a scene per block: from here on they fill a multiprocessor with few threads per vertex
 # Vertices of all scenes in a color up to which that many threads of each find room, in the sweeps and in their reverse.
 MANY_LANES_VERTICES = 1_500
+CONTACT_VERTICES = 256  # and up to which, with contact, all sweeps are one launch, in which each has a block
 SOME_LANES_VERTICES = (16_000, 4_000)
 
 _forced: str | None = None
@@ -38,8 +39,9 @@ def regime(name: Regime | None) -> Iterator[None]:
     Args:
         name: ``"thread"``: a scene per thread (meshes of at most 64 vertices); ``"block"``: a scene per thread block, a
             step per launch; ``"grid"``: all scenes by one cooperative grid, a step per launch; ``"color"``: a launch
-            per color. Each is reproducible to the bit; they differ from each other by rounding. No effect on the CPU.
-            The setting is of the process: threads share it.
+            per color. Each is reproducible to the bit; they differ from each other by rounding. With contact
+            everything but ``"grid"`` runs as ``"color"``, and ``"grid"`` too above 1,500 vertices in a color on
+            average. No effect on the CPU. The setting is of the process: threads share it.
 
     Raises:
         ValueError: For another name; in a step, where the regime cannot run the scene.
@@ -56,13 +58,14 @@ def regime(name: Regime | None) -> Iterator[None]:
 
 def choose(vertices: int, colors: int, scenes: int, contact: bool = False, corrects: bool = False
            ) -> tuple[int, int, int]:  # fmt: skip
-    """Regime, and threads per vertex of the sweeps and of their reverse, for SweepSettings.launch. Pairs are summed
-    between the launches of colors: a scene with contact has one regime. Coarse corrections are launches between sweeps,
-    so a scene that has them is not left to one thread."""
+    """Regime, and threads per vertex of the sweeps and of their reverse, for SweepSettings.launch. Coarse corrections
+    are launches between sweeps, so a scene that has them is not left to one thread."""
     at_once = vertices * scenes / max(1, colors)
     if contact:
-        lanes = MANY_LANES if at_once <= MANY_LANES_VERTICES else SOME_LANES
-        return COLOR, lanes, lanes
+        if at_once > MANY_LANES_VERTICES:  # pairs are summed up in launches of their own
+            return COLOR, SOME_LANES, SOME_LANES
+        grid = at_once <= CONTACT_VERTICES if _forced is None else _forced == "grid"
+        return GRID if grid else COLOR, MANY_LANES, MANY_LANES
     code = CODES[_forced] if _forced else _automatic(vertices, scenes)
     if code == THREAD and corrects:
         code = BLOCK

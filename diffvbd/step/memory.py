@@ -50,7 +50,8 @@ WORKSPACE_BUDGET = 2 << 30  # bytes; twin of kWorkspaceBudget in csrc/bind/cuda/
 def cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = True, rest: bool = False) -> int:
     """Bytes of workspace of one step on CUDA, as carved in csrc/cuda/run.cuh (a material per tet)."""
     corrects = model.coarse is not None
-    if regimes.choose(model.num_vertices, model.num_colors, scenes, model.touches, corrects)[0] == regimes.THREAD:
+    launch = regimes.choose(model.num_vertices, model.num_colors, scenes, model.touches, corrects)
+    if launch[0] == regimes.THREAD:
         return 0
     _, _, slots, _, _, blocks, edge_slots, *_ = model._sizes
     lanes = ops.LANES["cuda"]
@@ -60,6 +61,8 @@ def cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = T
     if reverse:
         one += 4 * (edge_slots * lanes + 1) + 8 * positions
         one += (2 * pairs if material or rest else 0) + (4 * pairs if rest else 0)
+    if model.touches:
+        one += ((6 if reverse else 4) + (0 if launch[1] == regimes.MANY_LANES else 9)) * positions
     if corrects:
         sizes = model._coarse_plan.sizes
         one += 8 * positions + 3 * sizes.functions + (0 if reverse else 6 * sizes.parts)

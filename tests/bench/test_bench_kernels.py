@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from bench import kernels
+from bench import common, kernels
 
 NAME = "scene_kernel, AdvanceInputs"
 NAMES = {
@@ -56,7 +56,7 @@ def test_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert first["share"] == pytest.approx(0.08 / 0.11)
     assert (second["kernel"], second["bound"]) == (NAME, "barriers")
     assert (third["kernel"], third["looked at"], third["bound"]) == ("missed", 0, None)
-    text = kernels.markdown({"rows": [first, second, third], "failed": {}})
+    text = kernels.markdown({name: {"rows": [first, second, third], "failed": "", **common.stamp({})}})
     assert NAME in text and "missed" in text
 
 

@@ -63,8 +63,10 @@ std::vector<int64_t> corrections_shape(const Given<T>& given) {
 template <class T>
 cuda::Choice choose(const cuda::StepInputs<T>& in, const Tensor& x, const SweepSettings& q, bool reverse,
                     int wanted = 0) {
-  const cuda::Choice out = cuda::choose(x, q.launch, reverse, wanted);
-  require(!in.contact || (out.regime == cuda::kColor && out.lanes != cuda::kFewLanes),
+  cuda::Choice out = cuda::choose(x, q.launch, reverse, wanted);
+  if (in.contact) out.by_pairs = cuda::kPairBytes;
+  require(!in.contact || (out.regime == cuda::kColor && out.lanes != cuda::kFewLanes) ||
+              (out.regime == cuda::kGrid && out.lanes == cuda::kManyLanes),
           "diffvbd::sweep: bad launch for contact");
   require(!in.coarse || out.regime != cuda::kThread, "diffvbd::sweep: bad launch for coarse corrections");
   return out;
