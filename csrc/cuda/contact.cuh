@@ -62,8 +62,8 @@ __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __gri
   if (!part.there) return;
   const Place<share> at = part.place();
   const int64_t row = part.row(s, at);
-  const MovingRows<T> moving{s.w.x, s.w.moved};
-  PairsOf<T, share, SweepRows<T>> pairs(s, c.in, at, sweep_rows(s, at.scene, begin, end, moving));
+  const SweepRows<T> rows = sweep_rows(s, at.scene, begin, end, MovingRows<T>{s.w.x, s.w.moved});
+  PairsOf<T, share, SweepRows<T>> pairs(s, c.in, at, rows);
   const Vec3<T> from = load_row(s.w.x, row), d = load_row(s.w.moved, row) - from;
   const int exponent = pairs.limit(from, d);
   if (pairs.vertex < 0 || at.lane != 0) return;
@@ -83,7 +83,8 @@ __global__ void prepare_contact(const __grid_constant__ StepView<T> s, const __g
   wait_for_previous();
   if (!part.there) return;
   const Place<share> at = part.place();
-  const PairsOf<T, share, SweepRows<T>> pairs(s, c.in, at, settled_rows(s, at.scene, begin, end));
+  const SweepRows<T> rows = settled_rows(s, at.scene, begin, end);
+  const PairsOf<T, share, SweepRows<T>> pairs(s, c.in, at, rows);
   if (!__any_sync(kWholeWarp, pairs.touches())) return;
   T now[3];
   take_sent(c, pairs, now);

@@ -67,7 +67,6 @@ struct PairsOf {
   static constexpr bool remembers = lanes == kManyLanes;
   const ContactInputs<T>& in;
   const Place<lanes>& at;
-  const Rows rows;  // that `source` refers to
   const contact::Source<T, Rows> source;
   const int vertex, role;  // vertex -1: a phantom
   const T h;
@@ -77,10 +76,9 @@ struct PairsOf {
   T clear = T(0);        // the least gap of the others that this thread has seen
 
   __device__ __forceinline__ PairsOf(const StepView<T>& s, const ContactInputs<T>& in, const Place<lanes>& at,
-                                     const Rows& given, int role = kAllPairs)
+                                     const Rows& rows, int role = kAllPairs)
       : in(in),
         at(at),
-        rows(given),
         source{in, s.base + at.scene, rows},
         vertex(__ldg(s.plan.order + static_cast<int64_t>(at.block) * kSlice + at.v)),
         role(role),
@@ -90,7 +88,8 @@ struct PairsOf {
     listed = in.listed.of(source.scene * in.corners + vertex);
     lagged = in.lags_of(source.scene, vertex);
   }
-  PairsOf(const PairsOf&) = delete;
+  // It refers to the rows, which its caller keeps: a copy of its own would have all of it leave the registers.
+  PairsOf(const StepView<T>&, const ContactInputs<T>&, const Place<lanes>&, Rows&&, int = kAllPairs) = delete;
   __device__ __forceinline__ bool takes(int entry) const {  // of the listed
     if (role == kAllPairs) return true;
     const int kind = __ldg(in.listed.pairs + contact::kPairRow * int64_t{entry >> 2} + 4);
@@ -218,7 +217,8 @@ __device__ __forceinline__ void send_pairs(const StepView<T>& s, const ContactVi
                                            int role, int64_t begin, int64_t end) {
   constexpr int share = threads_of(lanes);
   const ContactInputs<T>& in = c.in;
-  const PairsOf<T, lanes, SweepRows<T>> pairs(s, in, at, settled_rows(s, at.scene, begin, end), role);
+  const SweepRows<T> rows = settled_rows(s, at.scene, begin, end);
+  const PairsOf<T, lanes, SweepRows<T>> pairs(s, in, at, rows, role);
   const bool touches = pairs.touches();
   if (!__any_sync(kWholeWarp, touches)) return;
   const int64_t row = at.scene * s.positions + static_cast<int64_t>(at.block) * kSlice + at.v;

@@ -92,8 +92,8 @@ __device__ __forceinline__ void update_among(const StepView<T>& s, const Contact
   if (vertex < 0) return;
   Among<T>& told = among_memory<T>();
   if (role >= 0) {
-    PairsOf<T, kManyLanes, SweepRows<T>> pairs(s, c.in, at, sweep_rows(s, at.scene, turn.begin, turn.end, turn.rows(s)),
-                                               role);
+    const SweepRows<T> rows = sweep_rows(s, at.scene, turn.begin, turn.end, turn.rows(s));
+    PairsOf<T, kManyLanes, SweepRows<T>> pairs(s, c.in, at, rows, role);
     pairs.gather(told.term[role]);
     meet_among();  // what pairs add is there
     meet_among();  // where the update goes is there

@@ -135,8 +135,8 @@ __device__ __forceinline__ void reverse_update_among(const StepView<T>& s, const
   Among<T>& told = among_memory<T>();
   const bool full = s.tape_policy == kFullTape;
   if (role >= 0) {
-    PairsOf<T, kManyLanes, TapeRows<T>> pairs(s, c.in, at,
-                                              tape_rows_of(s, at.scene, s.sweeps - 1 - turn.number, begin, end), role);
+    const TapeRows<T> rows = tape_rows_of(s, at.scene, s.sweeps - 1 - turn.number, begin, end);
+    PairsOf<T, kManyLanes, TapeRows<T>> pairs(s, c.in, at, rows, role);
     if (role == kLagged) take_sent(c, pairs, told.bar);
     if (!full) pairs.gather(told.term[role]);
     meet_among();  // both are there
