@@ -1,10 +1,12 @@
-"""How thin the tets of a mesh are, of large meshes a sample of them."""
+"""How thin the tets of a mesh are, of large meshes a sample of them; and which tets of a state are inside out."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+from torch import Tensor
 
 if TYPE_CHECKING:
     from .model import Model
@@ -30,3 +32,10 @@ def _shapes_of_tets(model: Model) -> tuple[np.ndarray, np.ndarray]:
     height = volume / np.linalg.norm(normals, axis=-1).max(1)  # the shortest of a tet's four
     sides = np.linalg.norm(corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]], axis=-1)
     return sides.max(1) / height, height
+
+
+def inside_out(tets: Tensor, x: Tensor) -> Tensor:
+    """Which tets [T, 4] of states [..., V, 3] have a volume of 0 or less, bool [..., T]."""
+    corners = x.detach()[..., tets, :]
+    a, b, c = (corners[..., 1:, :] - corners[..., :1, :]).unbind(-2)
+    return (torch.linalg.cross(a, b) * c).sum(-1) <= 0

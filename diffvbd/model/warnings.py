@@ -8,13 +8,14 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..energies import StableNeoHookean
 from ..mesh import TetMesh
 from ..said import page, warn
 from .growth import GROWS, STEPS_SEEN, warn_of_growth
-from .tet_shapes import shapes_of_tets
+from .tet_shapes import inside_out, shapes_of_tets
 
 if TYPE_CHECKING:
     from .model import Model
@@ -52,6 +53,34 @@ def warn_of(model: Model) -> None:
             f"regularization: {model.regularization:g} kg is {model.regularization / float(active.min()):.2g} of the "
             "lightest vertex; the sweeps converge that much more slowly"
         )
+
+
+def warn_of_inverted_bodies(model: Model, x: Tensor) -> None:
+    """Warns where all tets of a body are inside out at the start x [..., V, 3], as where positions are mirrored."""
+    if not any(isinstance(e, StableNeoHookean) for e in model.energies) or model.num_tets == 0 or x.numel() == 0:
+        return
+    states, tets = x.detach().reshape(-1, *x.shape[-2:]), model._topology[0]
+    names, first, of = model.derived("bodies of tets", lambda: _bodies_of(model.body[tets[:, 0]]))
+    if not inside_out(tets[first], states).any():  # as nearly always: a tet of each body is enough to see
+        return
+    upright = torch.zeros((len(states), len(names)), dtype=torch.int64, device=x.device)
+    upright.index_add_(1, of, (~inside_out(tets, states)).long())
+    whole = (upright == 0).nonzero()
+    if len(whole):
+        scene, body = int(whole[0, 0]), int(names[whole[0, 1]])
+        others = f" and {len(whole) - 1} more" if len(whole) > 1 else ""
+        warn(
+            f"x: all tets of body {body} in scene {scene}{others} are inverted (J <= 0) at the start, as where "
+            "positions are mirrored: it will turn itself inside out. Positions of another mesh need a Model of that "
+            "mesh; check_start=False starts without a word"
+        )
+
+
+def _bodies_of(labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Bodies [N] among the labels of tets [T], a tet of each [N], and which of them each tet is of [T]."""
+    found = np.unique(labels.cpu(), return_index=True, return_inverse=True)
+    names, first, of = (torch.as_tensor(a, device=labels.device) for a in found)
+    return names, first, of
 
 
 def warn_of_material(model: Model, mu: Tensor, lam: Tensor, time_step: float, sweeps: int, scheme: str) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..adjoint.routes import Adjoint, check_adjoint
 from ..checks import check_count, fail
 from ..model.model import Model
-from ..model.warnings import warn_of_material
+from ..model.warnings import warn_of_inverted_bodies, warn_of_material
 from ..scopes import looks_at, recorders, refinement
 from ..step.advance import advance
 from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
@@ -118,7 +118,8 @@ def rollout(
         check_start: With a PairBarrier, raise where surfaces intersect at the start: edges through triangles, or
             vertices behind a Plane. Contact keeps apart what is apart, and no step notices what is not. It costs
             half of one detection and, on CUDA, waits for the device once. Under torch.compile, and while a CUDA graph
-            is captured, nothing is checked: run the rollout once before the capture.
+            is captured, nothing is checked: run the rollout once before the capture. On the CPU it also warns
+            (UserWarning) where all tets of a body are inverted.
 
     Raises:
         ValueError, TypeError: As step; also where a per_step value has another number of steps, or surfaces intersect.
@@ -164,6 +165,8 @@ def rollout(
         check_prescribed(model, value, x)
     if check_start and steps:
         refuse_start(model, x, options["colliders"], colliders_before, _changes(options["colliders"]))
+        if looks_at(x):
+            warn_of_inverted_bodies(model, x)
 
     scenes = x.numel() // max(1, 3 * model.num_vertices)
     every, adjoint = choose_schedule(checkpoint_every, adjoint, model, scenes, steps, solves_of(scheme) * sweeps)

@@ -19,6 +19,7 @@ from ..contact.start import PartStart, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
 from ..energies import damped_share
 from ..model.model import Model
+from ..model.tet_shapes import inside_out
 from ..ops import SweepSettings, broadcast
 from ..ops import contact_start as ops_start
 from ..ops.motion import RoomsOfBodies
@@ -235,9 +236,7 @@ class ContactStep:
 
     def _inverted(self, x: Tensor) -> Tensor:
         """Which scenes have a tet that is inside out, bool [B]."""
-        corners = (x.detach() if self.begun.origin is None else x.detach() + self.origin)[:, self.model.tets]
-        a, b, c = (corners[:, :, 1:] - corners[:, :, :1]).unbind(2)
-        return (torch.linalg.cross(a, b) * c).sum(-1).le(0).any(-1)
+        return inside_out(self.model.tets, x if self.begun.origin is None else x.detach() + self.origin).any(-1)
 
     def _raises(self, x: Tensor, to: Tensor) -> Tensor:
         """Which vertices are of a body whose own potential is higher at ``to`` than at x [B, V], bool."""
