@@ -315,8 +315,8 @@ def test_regimes_and_plans_agree() -> None:
     (listed,) = re.findall(r"enum Regime \{([^}]*)\}", code_of(CSRC / "cuda" / "step.h"))
     codes = {name.lower(): int(number) for name, number in re.findall(r"\bk(\w+) = (\d+)", listed)}
     assert codes == regimes.CODES
-    lanes = [constant("cuda/step.h", f"k{name}Lanes") for name in ("Few", "Some", "Many")]
-    assert lanes == [regimes.FEW_LANES, regimes.SOME_LANES, regimes.MANY_LANES]
+    lanes = [constant("cuda/step.h", f"k{name}Lanes") for name in ("Few", "Some", "SomeReverse", "Many")]
+    assert lanes == [regimes.FEW_LANES, regimes.SOME_LANES, regimes.SOME_REVERSE_LANES, regimes.MANY_LANES]
     assert regimes.SMALL_MESH == constant("core/views.h", "kSmallMesh") >= regimes.TINY_VERTICES
     # the host gets a plan's header in an order of its own, with active vertices, tets and slots first
     (order,) = re.findall(r"order\[kPlanHeader\] = \{([^}]*)\}", code_of(CSRC / "bind" / "cuda" / "sweep.h"))

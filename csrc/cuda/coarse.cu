@@ -207,7 +207,7 @@ __global__ void __launch_bounds__(kRowThreads)
   while (at.block >= __ldg(s.plan.color_block + color + 1)) ++color;
   const int below = __ldg(s.plan.block_edge + __ldg(s.plan.color_block + color)) * kSlice;
   Vec3<T> sum = load_row(s.w.x_bar, row, true);
-  if (below > 0) sum += pull_rows<false>(s, at, below);
+  if (below > 0) sum += pull_rows<false>(s, at, span_of(s.plan.block_incoming, at.block), below);
   store_row(total, row, sum);
 }
 
@@ -293,7 +293,7 @@ cudaError_t Corrections<T>::gradients(int wanted) const {
   const int64_t active = host.color_block[host.plan.colors];
   const int least = s.scenes * active * kSlice > kManyVertices ? kFewLanes : kManyLanes;
   int lanes = possible_lanes<T>(host, choice, least, reverse);
-  if (lanes == kSomeLanes) lanes = kManyLanes;
+  if (lanes != kFewLanes && lanes != kSpillLanes) lanes = kManyLanes;
   const bool spills = lanes == kSpillLanes;
   const size_t of_warp = spills ? 0 : gradient_scalars(host.degree, lanes, reverse) * sizeof(T);
   int64_t warps = kWarpsPerBlock;

@@ -16,7 +16,8 @@ struct WayStar : GroupStar<T, lanes> {
   using Base = GroupStar<T, lanes>;
   using typename Base::P;
   const T* ways;
-  __device__ __forceinline__ WayStar(const StepView<T>& s, const P& at, T* shared) : Base(s, at, shared) {}
+  __device__ __forceinline__ WayStar(const StepView<T>& s, const P& at, const StarSpans& spans, T* shared)
+      : Base(s, at, spans, shared) {}
 
   __device__ __forceinline__ void fetch_ways(const T* of, T* shared) {
     T* to = shared + this->s.degree * 3 * P::groups + this->at.group;
@@ -121,9 +122,9 @@ __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 80 : 128)
   using Set = EnergySet<mask>;
   T* const shared = memory_of_gradients<T, lanes>(s, false);
   each_vertex<lanes>(s, [&](const Place<lanes>& at) {
-    GroupStar<T, lanes> star(s, at, shared);
-    if (s.has_tets) star.fetch_neighbours(true);
+    GroupStar<T, lanes> star(s, at, spans_of(s.plan, at.block), shared);
     const Block<T> b = load_block<Set>(s, at, true, s.w.x);
+    if (s.has_tets) star.fetch_neighbours(true);
     const System<Set, T> system = assemble<Set>(b, star, s.parameters);
     const int64_t row = at.scene * s.positions + int64_t{at.block} * kSlice + at.v;
     if (at.lane == 0) store_row(w.gradient, row, system.axes.from(system.g));
@@ -139,7 +140,7 @@ __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 128 : 168)
   each_vertex<lanes>(s, [&](const Place<lanes>& at) {
     const int64_t position = int64_t{at.block} * kSlice + at.v, row = at.scene * s.positions + position;
     const bool writes = at.lane == 0 && __ldg(s.plan.order + position) >= 0;
-    WayStar<T, lanes> star(s, at, shared);
+    WayStar<T, lanes> star(s, at, spans_of(s.plan, at.block), shared);
     if (s.has_tets) star.fetch_neighbours(true), star.fetch_ways(w.way, shared);
     const Block<T> b = load_block<Set>(s, at, true, s.w.x);
     const Vec3<T> way = load_row(w.way, row, true);

@@ -34,13 +34,15 @@ template <class Set, class T, int lanes>
 __device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T>& pairs,
                                        Way<T>& way) {
   const Place<lanes> at(turn.scene, turn.block, turn.part);
-  const int rank = __ldg(s.plan.block_rank + at.block) + at.v, end_rank = __ldg(s.plan.block_rank + at.block + 1);
+  const Span ranks = span_of(s.plan.block_rank, at.block);
+  const StarSpans spans = spans_of(s.plan, at.block);
+  const int rank = ranks.begin + at.v, end_rank = ranks.end;
   if (rank - at.group >= end_rank) return true;  // the whole warp: phantoms alone
-  GroupStar<T, lanes> star(s, at, shared);
+  GroupStar<T, lanes> star(s, at, spans, shared);
   star.pairs = &pairs;
   const MovingRows<T> rows = Set::contact ? turn.rows(s) : MovingRows<T>{s.w.x, s.w.x};
-  if (s.has_tets) star.template fetch_neighbours<Set::contact>(s.own, rows, turn.first());
   const Block<T> b = load_block<Set>(s, at, s.own, rows.x);
+  if (s.has_tets) star.template fetch_neighbours<Set::contact>(s.own, rows, turn.first());
   if constexpr (Set::usual && Set::filters) {
     if (star.any(is_oblique<Set>(b, b.state.x))) return false;
   }
@@ -120,14 +122,15 @@ __device__ __forceinline__ void update_among(const StepView<T>& s, const Contact
 }
 
 // What the usual blocks take: the rare ones must do with as many.
-template <class T, class Set>
+template <class T, class Set, int lanes>
 constexpr int forward_registers() {
   if (sizeof(T) == sizeof(float)) return Set::contact ? 96 : 80;
+  if (lanes >= kManyLanes) return 168;  // of whose warps there are never many
   return Set::contact ? 168 : Set::filters ? 144 : 128;
 }
 
 template <class T, int mask, int lanes>
-__global__ void __maxnreg__((forward_registers<T, EnergySet<mask>>()))
+__global__ void __maxnreg__((forward_registers<T, EnergySet<mask>, lanes>()))
     sweep_forward(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range) {
   using Set = EnergySet<mask>;
   T* const shared = memory_of_warp<T, lanes>(s, false);
@@ -139,7 +142,7 @@ __global__ void __maxnreg__((forward_registers<T, EnergySet<mask>>()))
 }
 // Of a set with contact: the pairs' part has been summed up, and planes have yet to let the vertices pass.
 template <class T, int mask, int lanes>
-__global__ void __maxnreg__((forward_registers<T, EnergySet<mask>>()))
+__global__ void __maxnreg__((forward_registers<T, EnergySet<mask>, lanes>()))
     sweep_between(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range,
                   const __grid_constant__ ContactView<T> c) {
   T* const shared = memory_of_warp<T, lanes>(s, false);
@@ -156,7 +159,7 @@ __global__ void __maxnreg__((forward_registers<T, EnergySet<mask>>()))
 }
 // A block for each vertex, in one launch for all sweeps or for each color.
 template <class T, int mask>
-__global__ void __maxnreg__((forward_registers<T, EnergySet<mask>>()))
+__global__ void __maxnreg__((forward_registers<T, EnergySet<mask>, kManyLanes>()))
     sweep_among(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range,
                 const __grid_constant__ ContactView<T> c) {
   T* const shared = memory_of_warp<T, kManyLanes>(s, false);  // of the first warp

@@ -110,10 +110,11 @@ template <class T>
 __device__ __forceinline__ Vec3<T> rows_left(const StepView<T>& s, int64_t scene, int block, int v, bool pinned) {
   Place<1> at(scene, block, 0);
   at.v = v;
-  if (pinned) return pull_rows<true>(s, at);
+  if (pinned) return pull_rows<true>(s, at, span_of(s.plan.block_incoming, block));
   int color = 0;
   while (block >= __ldg(s.plan.color_block + color + 1)) ++color;
-  return pull_rows<false>(s, at, __ldg(s.plan.block_edge + __ldg(s.plan.color_block + color)) * kSlice);
+  return pull_rows<false>(s, at, span_of(s.plan.block_incoming, block),
+                          __ldg(s.plan.block_edge + __ldg(s.plan.color_block + color)) * kSlice);
 }
 
 template <class T>

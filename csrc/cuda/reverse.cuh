@@ -9,10 +9,11 @@
 namespace diffvbd::cuda {
 namespace {
 
-// Three warps of each scheduler fit; in float32, without gaps, four.
+// Two warps of each scheduler fit, about as many as their stars leave shared memory for, and usual blocks do not spill:
+// local memory costs more than a third warp brings. In float32, without floors or contact, four fit.
 template <class T, class Set>
 constexpr int reverse_registers() {
-  return sizeof(T) == sizeof(float) && !Set::keeps_positions ? 128 : 168;
+  return sizeof(T) == sizeof(float) && !Set::keeps_positions ? 128 : 240;
 }
 
 // What the threads of a warp do at one turn, counted from the last sweep.
@@ -30,8 +31,9 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   const int64_t scene = at.scene, position = static_cast<int64_t>(at.block) * kSlice + at.v,
                 row = scene * s.positions + position;
   // What the tape and the accumulators hold is asked for first: it comes from farthest away.
-  const int rank = __ldg(s.plan.block_rank + at.block) + at.v;
-  const int end_rank = __ldg(s.plan.block_rank + at.block + 1);
+  const Span ranks = span_of(s.plan.block_rank, at.block), incoming = span_of(s.plan.block_incoming, at.block);
+  const StarSpans spans = spans_of(s.plan, at.block);
+  const int rank = ranks.begin + at.v, end_rank = ranks.end;
   if (rank - at.group >= end_rank) return true;  // the whole warp: phantoms alone
   const bool real = rank < end_rank, full = s.tape_policy == kFullTape;
   const T* from =
@@ -43,10 +45,20 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   };
   Recalled<T> r = recall<Set, T>(full, get);
   const Vec3<T> y_bar = load_own3(s.w.y_bar + scene * s.positions * 3, at.block, at.v);
-  GroupStar<T, lanes> star(s, at, shared);
+  const bool writes = at.lane == 0 && real;
+  T material_bar[kTetScalars];  // of all updates until now
+  if constexpr ((wanted & kMaterial) != 0) {
+    if (s.one_material && writes) {
+#pragma unroll
+      for (int i = 0; i < kTetScalars; ++i) material_bar[i] = s.w.material_bar[row * kTetScalars + i];
+    }
+  }
+  GroupStar<T, lanes, true> star(s, at, spans, shared);
   star.pairs = &pairs;
   star.repeats = !full;
   Block<T> b = load_block<Set>(s, at, false, s.w.x);
+  Vec3<T> end_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at, incoming);
+  if (s.has_tets) star.fetch_neighbours(false);
   if constexpr (Set::usual) {
     if constexpr (Set::filters) {
       if (star.any(is_oblique<Set>(b, r.x_old, s.w.data_bar != nullptr))) return false;
@@ -58,7 +70,6 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
     }
   }
   if (s.has_tets) star.clear_sums(shared);
-  Vec3<T> end_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at);
   if constexpr (Set::contact) end_bar += pairs.sent();
   Vec3<T> x_bar = end_bar;
   if constexpr (Set::contact) {
@@ -66,30 +77,27 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
     const int exponent = real ? __ldg(s.limits + step * s.plan.num_vertices + __ldg(s.plan.order + position)) : 0;
     x_bar = contact::limit_of<T>(exponent) * end_bar;
   }
-  if (s.has_tets) star.fetch_neighbours(false);
   const StepParameters<T> q = of_sweep(s.parameters, turn.number == 0);
   const Update<T> u = replayed<Set>(b, star, r, full, q);
   if constexpr (Set::usual) {
     if (!full && is_rare<Set>(b, star, r.H)) return false;
   }
   star.repeats = false;
-  const bool writes = at.lane == 0 && real;
   BlockAdjoint<T> out =
       reverse_vertex<Set, wanted>(b, star, u, r, x_bar, q, s.w.data_bar != nullptr, [&](int k, int i, const T& value) {
         if (writes) s.w.data_bar[(scene * s.data_scalars + s.data_row[k] + i) * s.positions + position] += value;
       });
   if (s.has_tets) {
-    star.send_rows(__ldg(s.plan.color_block + s.plan.colors) * kSlice);
     if constexpr ((wanted & kMaterial) != 0) {
       if (s.one_material) {
-        T* to = s.w.material_bar + row * kTetScalars;
 #pragma unroll
         for (int i = 0; i < kTetScalars; ++i) {
           star.total(star.material_bar[i]);
-          if (writes) to[i] += star.material_bar[i];
+          if (writes) s.w.material_bar[row * kTetScalars + i] = material_bar[i] + star.material_bar[i];
         }
       }
     }
+    star.send_rows();
   }
   if constexpr (Set::contact) out.x += end_bar - x_bar;  // what a limit holds back stays where it was
   if (writes) {

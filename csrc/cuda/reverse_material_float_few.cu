@@ -1,4 +1,4 @@
 #include "reverse.cuh"
 
 DIFFVBD_INSTANTIATE_REVERSE(float, diffvbd::kMaterial, kFewLanes)
-DIFFVBD_INSTANTIATE_REVERSE(float, diffvbd::kMaterial, kSomeLanes)
+DIFFVBD_INSTANTIATE_REVERSE(float, diffvbd::kMaterial, kSomeReverseLanes)

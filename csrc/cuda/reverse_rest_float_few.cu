@@ -1,4 +1,4 @@
 #include "reverse.cuh"
 
 DIFFVBD_INSTANTIATE_REVERSE(float, diffvbd::kMaterial | diffvbd::kRest, kFewLanes)
-DIFFVBD_INSTANTIATE_REVERSE(float, diffvbd::kMaterial | diffvbd::kRest, kSomeLanes)
+DIFFVBD_INSTANTIATE_REVERSE(float, diffvbd::kMaterial | diffvbd::kRest, kSomeReverseLanes)

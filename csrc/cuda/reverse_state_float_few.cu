@@ -1,4 +1,4 @@
 #include "reverse.cuh"
 
 DIFFVBD_INSTANTIATE_REVERSE(float, diffvbd::kState, kFewLanes)
-DIFFVBD_INSTANTIATE_REVERSE(float, diffvbd::kState, kSomeLanes)
+DIFFVBD_INSTANTIATE_REVERSE(float, diffvbd::kState, kSomeReverseLanes)

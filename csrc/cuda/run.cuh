@@ -1,4 +1,4 @@
-// Host side of a step: carves the workspace, launches. Included once for each scalar.
+// Host side of a step: what is launched. Included once for each scalar.
 #pragma once
 
 #include <algorithm>
@@ -8,82 +8,10 @@
 #include "follow.cuh"
 #include "frame.cuh"
 #include "scene_kernels.h"
+#include "workspace.cuh"
 
 namespace diffvbd::cuda {
 namespace {
-
-constexpr size_t kBarrierBytes = 256;
-// Hands out the parts of a workspace; without one it only counts.
-template <class T>
-struct Carver {
-  T* base;
-  int64_t used = 0;
-  T* operator()(bool wanted, int64_t scalars) {
-    if (!wanted) return nullptr;
-    T* here = base + used;
-    used += (scalars + 3) / 4 * 4;  // rows stay aligned
-    return here;
-  }
-};
-
-// scenes: that are worked on at once
-template <class T>
-CoarseWork<T> carve_coarse(const coarse::Inputs<T>& in, int64_t positions, int64_t scenes, bool reverse,
-                           Carver<T>& take) {
-  const coarse::Plan& p = in.plan;
-  const auto bytes = [](int64_t count, size_t size) { return static_cast<int64_t>(count * size / sizeof(T) + 1); };
-  CoarseWork<T> w{};
-  w.gradient = take(true, scenes * kRow * positions);
-  w.way = take(true, scenes * kRow * positions);
-  w.restricted = take(true, scenes * 3 * p.functions);
-  w.solved = take(reverse, scenes * in.corrections * 3 * p.functions);
-  w.sums = reinterpret_cast<double*>(take(!reverse, bytes(scenes * p.parts * coarse::kDegree, sizeof(double))));
-  w.failures = reinterpret_cast<int32_t*>(take(!reverse, bytes(scenes * p.bodies, sizeof(int32_t))));
-  return w;
-}
-
-// Arrays that start from zero come first. Returns their scalars through `zeroed`.
-template <class T>
-Workspace<T> carve(const HostPlan& host, const StepInputs<T>& in, const StepAdjoints<T>* adjoints, const Choice& choice,
-                   Carver<T>& take, int64_t* zeroed, T** spill, CoarseWork<T>& coarse) {
-  const GroupPlan& plan = host.plan;
-  const int64_t n = choice.chunk, positions = int64_t{plan.blocks} * kSlice, pairs = int64_t{plan.slots} * kSlice;
-  const bool elastic = (in.energies & kElastic) != 0, reverse = adjoints != nullptr;
-  const bool lagged = any_x_prev(in.energies, VertexEnergies{});
-  const bool one = one_for_items(in.material);
-  int scalars = 0;
-  for (int k = 0; k < kVertexEnergies; ++k) scalars += in.data_count[k];
-  Workspace<T> w{};
-  w.rows = take(reverse, n * (int64_t{plan.edge_slots} * kSlice + 1) * kRow);
-  w.y_bar = take(reverse, n * 3 * positions);
-  w.x_prev_bar = take(reverse && lagged, n * 3 * positions);
-  w.mass_bar = take(reverse && adjoints->mass, n * positions);
-  w.material_bar = take(elastic && (choice.wanted & kMaterial), n * kTetScalars * (one ? positions : pairs));
-  w.rest_bar = take(elastic && (choice.wanted & kRest), n * kPairRest * pairs);
-  w.data_bar = take(reverse && adjoints->data, n * scalars * positions);
-  *zeroed = take.used;
-  w.x = take(true, n * kRow * positions);
-  w.x_bar = take(reverse, n * kRow * positions);
-  w.y = take(true, n * 3 * positions);
-  w.x_prev = take(lagged, n * 3 * positions);
-  w.origin = take(in.origin.data != nullptr, n * 3 * positions);
-  w.mass = take(true, (in.mass.scene != 0 ? n : 1) * positions);
-  w.material = take(elastic && !one, (one_for_scenes(in.material) ? 1 : n) * kTetScalars * pairs);
-  const bool among =
-      possible_lanes<T>(host, choice, choice.lanes, reverse) == kManyLanes;  // blocks keep it to themselves
-  w.contact = take(in.contact && !among, n * kContactScalars * positions);
-  w.moved = take(!reverse && in.contact, n * kRow * positions);
-  w.turn = take(reverse && in.contact, n * 6 * positions);
-  w.position = reinterpret_cast<int32_t*>(take(in.contact != nullptr, plan.num_vertices));
-  *spill = nullptr;
-  if (possible_lanes<T>(host, choice, choice.lanes, reverse) == kSpillLanes) {
-    const int64_t warps = int64_t{choice.multiprocessors} * kWarpsPerBlock;
-    *spill = take(true, warps * shared_scalars(host.degree, host.valence, kSpillLanes, reverse));
-  }
-  coarse = {};
-  if (in.coarse) coarse = carve_coarse(*in.coarse, positions, n, reverse, take);
-  return w;
-}
 
 template <class T>
 struct Runner {
@@ -183,13 +111,17 @@ struct Runner {
     const bool among = in.contact && lanes == kManyLanes;  // a block for each vertex, of whose warps one has a star
     const int regime = in.contact && !among ? kColor : choice.regime;
     const bool own = regime == kBlock, spills = lanes == kSpillLanes;
-    const size_t shared_of_warp = spills ? 0 : shared_scalars(host.degree, host.valence, lanes, backward) * sizeof(T);
+    const auto shared_of_warp = [&](int stages) -> size_t {
+      return spills ? 0 : shared_scalars<T>(host.degree, host.valence, stages, lanes, backward) * sizeof(T);
+    };
+    s.stages = has_stages(lanes, backward) ? kFewStages : 0;
     int64_t warps = own && !spills ? std::min<int64_t>(kMaxThreads / kSlice, most) : kWarpsPerBlock;
     const size_t room = choice.shared - choice.by_pairs;
-    if (shared_of_warp > 0) warps = std::min<int64_t>(warps, room / shared_of_warp);
+    if (const size_t one = shared_of_warp(s.stages)) warps = std::min<int64_t>(warps, room / one);
     if (among) warps = 1;
-    const size_t shared = shared_of_warp * warps;
-    if (shared + choice.by_pairs > 48 * 1024) {
+    size_t shared = shared_of_warp(s.stages) * warps;
+    const size_t with_many_stages = s.stages > 0 ? shared_of_warp(kManyStages) * warps : 0;
+    if (std::max(shared, with_many_stages) + choice.by_pairs > 48 * 1024) {
       const auto attribute = cudaFuncAttributeMaxDynamicSharedMemorySize;
       // the same limit always: another thread may be about to launch the same kernel
       if (auto error = cudaFuncSetAttribute(function, attribute, static_cast<int>(room))) return error;
@@ -202,6 +134,20 @@ struct Runner {
       const int64_t needed = own ? s.scenes : (parts * s.scenes + warps - 1) / warps;
       return spills ? std::min<int64_t>(needed, choice.multiprocessors) : needed;
     };
+    int resident = 0;
+    const auto occupancy = [&](size_t bytes) {
+      const int size = static_cast<int>(threads.x);
+      return cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, function, size, bytes);
+    };
+    if (s.stages > 0 && s.one_material && with_many_stages <= room) {  // materials of tets want the L1 cache
+      const int64_t each = (blocks_for(most) + choice.multiprocessors - 1) / choice.multiprocessors;
+      if (auto error = occupancy(shared)) return error;
+      const int64_t with_few = std::min<int64_t>(resident, each);
+      if (auto error = occupancy(with_many_stages)) return error;
+      const int64_t with_many = std::min<int64_t>(resident, each);
+      const bool leaves_cache = with_many * with_many_stages <= choice.shared / 8 * 7;
+      if (with_many == with_few && leaves_cache) s.stages = kManyStages, shared = with_many_stages;
+    }
     const bool may_follow = regime == kColor && can_follow(function);
     const auto start = [&](int64_t blocks, bool follows = false) {
       return launch(function, static_cast<unsigned>(blocks), threads, arguments, shared, stream, follows);
@@ -212,9 +158,7 @@ struct Runner {
       if (begin == end) return cudaSuccess;
       if (own) return start(blocks_for(most));
       if (regime == kColor) return color_by_color(range, backward, lanes, may_follow, blocks_for, start);
-      int resident = 0;
-      const int size = static_cast<int>(threads.x);
-      if (auto error = cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, function, size, shared)) return error;
+      if (auto error = occupancy(shared)) return error;
       const int64_t blocks = std::min<int64_t>(int64_t{resident} * choice.multiprocessors, blocks_for(most));
       const auto error = cudaLaunchCooperativeKernel(function, dim3(static_cast<unsigned>(blocks)), threads, arguments,
                                                      shared, stream);
@@ -316,8 +260,8 @@ SweepKernel reverse_kernel_for(int energies, int lanes) {
   switch (lanes) {
     case kFewLanes:
       return reverse_kernel<T, wanted, kFewLanes>(energies);
-    case kSomeLanes:
-      return reverse_kernel<T, wanted, kSomeLanes>(energies);
+    case kSomeReverseLanes:
+      return reverse_kernel<T, wanted, kSomeReverseLanes>(energies);
     case kManyLanes:
       return reverse_kernel<T, wanted, kManyLanes>(energies);
     default:

@@ -32,7 +32,7 @@ __device__ __forceinline__ void each_color(const StepView<T>& s, const Range& ra
   constexpr int lanes = threads_of(lanes_);
   const bool own = range.regime == kBlock;
   const int64_t scenes_at_once = own ? 1 : s.scenes;
-  const unsigned warp = threadIdx.x / kSlice, warps_of_block = blockDim.x / kSlice;
+  const unsigned warp = static_cast<unsigned>(warp_of_block()), warps_of_block = blockDim.x / kSlice;
   const unsigned first = own ? warp : blockIdx.x * warps_of_block + warp;
   const unsigned stride = own ? warps_of_block : gridDim.x * warps_of_block;
   unsigned turn = 0;

@@ -96,6 +96,7 @@ struct StepView {
   int64_t scenes, positions;
   int64_t base;         // the first scene of the chunk
   int degree, valence;  // largest number of neighbours and of pairs
+  int stages;           // of records in shared memory: 0, kFewStages or kManyStages
   StepParameters<T> parameters;
   int sweeps, tape_policy;
   bool one_material;  // `material` below; else w.material
@@ -135,11 +136,11 @@ using SweepKernel = const void*;
 
 // Threads that share a vertex: few where there are vertices enough to fill the device, many to finish a small color
 // soon. The last is for stars too large for shared memory: a whole warp, working in device memory.
-constexpr int kFewLanes = 2, kSomeLanes = 8, kManyLanes = 32, kSpillLanes = 64;
+constexpr int kFewLanes = 2, kSomeLanes = 8, kSomeReverseLanes = 4, kManyLanes = 32, kSpillLanes = 64;
 DIFFVBD_FN constexpr int threads_of(int lanes) { return lanes == kSpillLanes ? kSlice : lanes; }
-// Few threads each add up their own share of what a reversed update sends to a neighbour; more of them leave single
+// Few threads each add up their own share of what a reversed update sends to a neighbour; many leave single
 // contributions, which are then gathered edge by edge.
-DIFFVBD_FN constexpr bool gathers(int lanes) { return lanes > kFewLanes; }
+DIFFVBD_FN constexpr bool gathers(int lanes) { return lanes >= kManyLanes; }
 
 // The kernels of a scene's energies for `lanes` threads per vertex.
 template <class T>
@@ -147,11 +148,21 @@ SweepKernel forward_kernel(int energies, int lanes);
 template <class T, int wanted, int lanes>
 SweepKernel reverse_kernel(int energies);
 
+// In the reverse, where a thread has several pairs, their records wait in shared memory (records.cuh): one that is read
+// and some that are on their way.
+constexpr int kFewStages = 2, kManyStages = 4;  // powers of two
+DIFFVBD_FN constexpr bool has_stages(int lanes, bool reverse) { return reverse && lanes < kManyLanes; }
+template <class T>
+DIFFVBD_FN constexpr int stage_scalars() {
+  return kSlice * (kRestRow + kTetScalars) + kSlice * static_cast<int>(sizeof(int32_t)) / static_cast<int>(sizeof(T));
+}
+
 // scalars of shared memory that a warp needs, for stars of up to `degree` neighbours and `valence` pairs
-DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int lanes, bool reverse) {
+template <class T>
+DIFFVBD_FN constexpr int shared_scalars(int degree, int valence, int stages, int lanes, bool reverse) {
   const int groups = kSlice / threads_of(lanes);
   const int contributions = gathers(lanes) ? 3 * (3 * valence + 1) : 3 * degree * lanes;
-  return groups * (3 * degree + (reverse ? contributions : 0));
+  return stages * stage_scalars<T>() + groups * (3 * degree + (reverse ? contributions : 0));
 }
 
 // With contact a vertex has many threads or some: one variant less to build.
@@ -178,12 +189,15 @@ constexpr size_t kPairBytes = 14 * 1024;  // of a block's shared memory that pai
 // Threads per vertex: so many, or so many more that shared memory holds the stars of several warps.
 template <class T>
 int possible_lanes(const HostPlan& host, const Choice& choice, int least, bool reverse) {
-  constexpr size_t warps = 6;  // fewer leave a multiprocessor waiting for memory
-  const auto needed = [&](int lanes) { return shared_scalars(host.degree, host.valence, lanes, reverse) * sizeof(T); };
-  for (const int lanes : {kFewLanes, kSomeLanes, kManyLanes}) {
-    if (lanes >= least && needed(lanes) * warps <= choice.shared - choice.by_pairs) return lanes;
-  }
-  return needed(kManyLanes) <= choice.shared - choice.by_pairs ? kManyLanes : kSpillLanes;
+  const size_t room = choice.shared - choice.by_pairs;
+  const auto needed = [&](int lanes) {
+    const int stages = has_stages(lanes, reverse) ? kFewStages : 0;
+    return shared_scalars<T>(host.degree, host.valence, stages, lanes, reverse) * sizeof(T);
+  };
+  const int some = reverse ? kSomeReverseLanes : kSomeLanes;
+  if (least <= kFewLanes && 6 * needed(kFewLanes) <= room) return kFewLanes;  // fewer warps would wait for memory
+  if (least <= some && 4 * needed(some) <= room) return some;                 // those of a block
+  return needed(kManyLanes) <= room ? kManyLanes : kSpillLanes;
 }
 
 template <class T>

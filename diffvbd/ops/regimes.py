@@ -11,10 +11,11 @@ from . import THREAD
 
 Regime = Literal["thread", "block", "grid", "color"]
 
-# twins of Regime, kFewLanes, kSomeLanes and kManyLanes in csrc/cuda/step.h, of kSmallMesh in csrc/core/views.h
+# twins of Regime, kFewLanes, kSomeLanes, kSomeReverseLanes and kManyLanes in csrc/cuda/step.h, of kSmallMesh in
+# csrc/core/views.h
 BLOCK, GRID, COLOR = 2, 3, 4
 CODES: dict[str, int] = {"thread": THREAD, "block": BLOCK, "grid": GRID, "color": COLOR}
-FEW_LANES, SOME_LANES, MANY_LANES = 2, 8, 32
+FEW_LANES, SOME_LANES, SOME_REVERSE_LANES, MANY_LANES = 2, 8, 4, 32
 SMALL_MESH = 64
 
 # Where one regime overtakes another on an H100: the table "regimes" of docs/performance.md.
@@ -25,9 +26,9 @@ BLOCK_VERTICES = 1_000  # above, a block has too few threads for a scene
 GRID_VERTICES = 50_000  # vertices of all scenes: above, launches cost less than a cooperative grid's barriers
 MANY_SCENES = 64  # of a scene per block: from here on they fill a multiprocessor with few threads per vertex
 # Vertices of all scenes in a color up to which that many threads of each find room, in the sweeps and in their reverse.
-MANY_LANES_VERTICES = 1_500
+MANY_LANES_VERTICES = (1_500, 1_000)
+SOME_LANES_VERTICES = (16_000, 8_000)
 CONTACT_VERTICES = 256  # and up to which, with contact, all sweeps are one launch, in which each has a block
-SOME_LANES_VERTICES = (16_000, 4_000)
 
 _forced: str | None = None
 
@@ -62,8 +63,8 @@ def choose(vertices: int, colors: int, scenes: int, contact: bool = False, corre
     are launches between sweeps, so a scene that has them is not left to one thread."""
     at_once = vertices * scenes / max(1, colors)
     if contact:
-        if at_once > MANY_LANES_VERTICES:  # pairs are summed up in launches of their own
-            return COLOR, SOME_LANES, SOME_LANES
+        if at_once > MANY_LANES_VERTICES[0]:  # pairs are summed up in launches of their own
+            return COLOR, SOME_LANES, SOME_REVERSE_LANES
         grid = at_once <= CONTACT_VERTICES if _forced is None else _forced == "grid"
         return GRID if grid else COLOR, MANY_LANES, MANY_LANES
     code = CODES[_forced] if _forced else _automatic(vertices, scenes)
@@ -72,11 +73,12 @@ def choose(vertices: int, colors: int, scenes: int, contact: bool = False, corre
     if code == THREAD and vertices > SMALL_MESH:
         fail("regime", f"a mesh of at most {SMALL_MESH} vertices for a scene per thread", f"{vertices} vertices")
     if code == BLOCK:  # scenes enough fill a multiprocessor; one alone wants its threads
-        lanes = SOME_LANES if scenes < MANY_SCENES else FEW_LANES
-        return code, lanes, lanes
-    if at_once <= MANY_LANES_VERTICES:
-        return code, MANY_LANES, MANY_LANES
-    forward, reverse = (SOME_LANES if at_once <= limit else FEW_LANES for limit in SOME_LANES_VERTICES)
+        return (code, SOME_LANES, SOME_REVERSE_LANES) if scenes < MANY_SCENES else (code, FEW_LANES, FEW_LANES)
+    some, limits = (SOME_LANES, SOME_REVERSE_LANES), zip(MANY_LANES_VERTICES, SOME_LANES_VERTICES, strict=True)
+    forward, reverse = (
+        MANY_LANES if at_once <= up_to_many else lanes if at_once <= up_to_some else FEW_LANES
+        for lanes, (up_to_many, up_to_some) in zip(some, limits, strict=True)
+    )
     return code, forward, reverse
 
 

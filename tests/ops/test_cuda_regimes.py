@@ -15,6 +15,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import testing
+from diffvbd.ops import regimes
 from diffvbd.testing import (
     CASES,
     KINDS,
@@ -144,7 +145,11 @@ def odd_scene(name: str, scenes: tuple[int, ...]) -> tuple[dv.Model, dict[str, A
 @pytest.mark.parametrize("scenes", ((), (5,)), ids=("one", "batch"))
 @pytest.mark.parametrize(("name", "regime"), [(name, r) for name, entry in ODD.items() for r in entry[2]])
 def test_odd_scenes_equal_the_cpu(name: str, regime: str, scenes: tuple[int, ...], sweeps: int) -> None:
-    model, inputs = odd_scene(name, scenes)
+    assert_equal_to_the_cpu(*odd_scene(name, scenes), sweeps, regime)
+
+
+def assert_equal_to_the_cpu(model: dv.Model, inputs: dict[str, Any], sweeps: int, regime: str) -> None:
+    """State and all gradients, under each tape."""
     for tape in TAPES:
         expected = evaluated(model, inputs, sweeps, tape)
         with forced(regime):
@@ -156,6 +161,35 @@ def test_odd_scenes_equal_the_cpu(name: str, regime: str, scenes: tuple[int, ...
                 # masses of a body that falls freely hardly matter: what is left of their gradient is small differences
                 moved = 0.0 if error <= tolerance("adjoint") else sensitivity(model, inputs, sweeps)[key]
                 assert error <= testing.bar(moved), (key, tape)
+
+
+ALL = (10**9, 10**9)
+THREADS = {"few": ((0, 0), (0, 0)), "some": ((0, 0), ALL), "many": (ALL, ALL)}  # vertices of a color up to which
+
+
+@pytest.mark.parametrize("what", ("plain", "floor", "uneven"))
+@pytest.mark.parametrize("material", ((), (3, 1), (3, 320)), ids=("one", "of scenes", "of tets"))
+@pytest.mark.parametrize("threads", THREADS)
+def test_any_number_of_threads_per_vertex(
+    threads: str, material: tuple[int, ...], what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of vertices with 1, 8 and 32 tets: a thread has as few as one and as many as 16."""
+    many, some = THREADS[threads]
+    monkeypatch.setattr(regimes, "MANY_LANES_VERTICES", many)
+    monkeypatch.setattr(regimes, "SOME_LANES_VERTICES", some)
+    mesh = dv.mesh.cube(5, split="five")
+    energies = (BODY, dv.FloorBarrier(height=-0.2, kappa=2e3, dhat=0.5)) if what == "floor" else (BODY,)
+    model = dv.Model(mesh, energies=energies, pinned=mesh.points[:, 1] > 0.9)
+    rng = generator("threads", len(material))
+
+    def noise(*shape: int, size: float) -> Tensor:
+        return torch.as_tensor(size * rng.uniform(-1, 1, shape))
+
+    x = model.rest_points + noise(3, model.num_vertices, 3, size=0.02)
+    inputs = {"x": x, "v": noise(*x.shape, size=1.0), "mu": 1e4 * (1 + noise(*material, size=0.5)),
+              "lam": (1e8 if what == "uneven" else 2e4) * (1 + noise(*material, size=0.5)),
+              "time_step": 0.02}  # fmt: skip
+    assert_equal_to_the_cpu(model, inputs, 6, "color")
 
 
 def test_the_fans_have_the_degree_they_promise() -> None:

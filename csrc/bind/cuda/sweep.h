@@ -34,7 +34,8 @@ inline HostPlan plan_of(const Tensor& buffer, const Tensor& x, const std::vector
 inline Choice choose(const Tensor& x, const std::vector<int64_t>& launch, bool reverse, int wanted = 0) {
   require(launch.size() == 3 && launch[0] >= kThread && launch[0] <= kColor, "diffvbd: bad launch");
   const int64_t lanes = launch[reverse ? 2 : 1];
-  require(lanes == kFewLanes || lanes == kSomeLanes || lanes == kManyLanes, "diffvbd: bad launch");
+  const int some = reverse ? kSomeReverseLanes : kSomeLanes;
+  require(lanes == kFewLanes || lanes == some || lanes == kManyLanes, "diffvbd: bad launch");
   Choice out{};
   out.regime = static_cast<int>(launch[0]);
   out.lanes = static_cast<int>(lanes);

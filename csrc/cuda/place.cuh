@@ -1,0 +1,134 @@
+// Loads and stores of a thread, and which of the threads of a vertex it is.
+#pragma once
+
+#include "../core/vec.h"
+#include "step.h"
+
+namespace diffvbd::cuda {
+
+// 16 bytes: the widest load of a thread
+template <class T>
+struct alignas(16) Pack {
+  static constexpr int size = 16 / sizeof(T);
+  T v[size];
+};
+
+// The vector type of a Pack, by whose name the loads go: a Pack that is one in disguise would live on the stack.
+template <class T>
+using Wide = std::conditional_t<sizeof(T) == sizeof(double), double2, float4>;
+__device__ __forceinline__ Pack<double> pack(const double2& a) { return {a.x, a.y}; }
+__device__ __forceinline__ Pack<float> pack(const float4& a) { return {a.x, a.y, a.z, a.w}; }
+
+// Values that other multiprocessors may write during the launch come from the L2 cache; a block that has its scene to
+// itself (`own`) can use the nearer one.
+template <class T>
+__device__ __forceinline__ Pack<T> load_state(const T* p, bool own) {
+  const auto* from = reinterpret_cast<const Wide<T>*>(p);
+  return own ? pack(*from) : pack(__ldcg(from));
+}
+template <class T>
+__device__ __forceinline__ Pack<T> load_constant(const T* p) {
+  return pack(__ldg(reinterpret_cast<const Wide<T>*>(p)));
+}
+__device__ __forceinline__ void store(double* p, const Pack<double>& a) {
+  *reinterpret_cast<double2*>(p) = {a.v[0], a.v[1]};
+}
+__device__ __forceinline__ void store(float* p, const Pack<float>& a) {
+  *reinterpret_cast<float4*>(p) = {a.v[0], a.v[1], a.v[2], a.v[3]};
+}
+
+// rows of x, y, z and one unused
+template <class T>
+__device__ __forceinline__ Vec3<T> load_row(const T* rows, int64_t row, bool own = false) {
+  const T* p = rows + kRow * row;
+  const Pack<T> a = load_state(p, own);
+  if constexpr (Pack<T>::size == 4) {
+    return {a.v[0], a.v[1], a.v[2]};
+  } else {
+    return {a.v[0], a.v[1], load_state(p + 2, own).v[0]};
+  }
+}
+template <class T>
+__device__ __forceinline__ void store_row(T* rows, int64_t row, const Vec3<T>& a) {
+  T* p = rows + kRow * row;
+  if constexpr (Pack<T>::size == 4) {
+    store(p, Pack<T>{a.x, a.y, a.z, T(0)});
+  } else {
+    store(p, Pack<T>{a.x, a.y});
+    store(p + 2, Pack<T>{a.z, T(0)});
+  }
+}
+// packed vectors [blocks, 3, kSlice]
+template <class T>
+__device__ __forceinline__ Vec3<T> load3(const T* p, int block, int v) {
+  const T* a = p + static_cast<int64_t>(block) * 3 * kSlice + v;
+  return {__ldg(a), __ldg(a + kSlice), __ldg(a + 2 * kSlice)};
+}
+template <class T>
+__device__ __forceinline__ void store3(T* p, int block, int v, const Vec3<T>& b) {
+  T* a = p + static_cast<int64_t>(block) * 3 * kSlice + v;
+  a[0] = b.x;
+  a[kSlice] = b.y;
+  a[2 * kSlice] = b.z;
+}
+// one that this thread alone writes, so that it may change during the launch
+template <class T>
+__device__ __forceinline__ Vec3<T> load_own3(const T* p, int block, int v) {
+  const T* a = p + static_cast<int64_t>(block) * 3 * kSlice + v;
+  return {a[0], a[kSlice], a[2 * kSlice]};
+}
+
+constexpr unsigned kWholeWarp = 0xffffffffu;
+
+// Which warp of its block a thread is in. The first thread tells the others, so that the compiler knows that all have
+// the same and keeps it, and what follows from it, once for the warp.
+__device__ __forceinline__ int warp_of_block() {
+  return __shfl_sync(kWholeWarp, static_cast<int>(threadIdx.x) / kSlice, 0);
+}
+
+// Where something of a block begins and ends. Asked for at once, whatever it is needed for later: volatile, or the
+// compiler would put each load off, and every one takes its time.
+struct Span {
+  int begin, end;
+};
+__device__ __forceinline__ Span span_of(const int32_t* starts, int block) {
+  Span out;
+  asm volatile("ld.global.nc.s32 %0, [%1];" : "=r"(out.begin) : "l"(starts + block));
+  asm volatile("ld.global.nc.s32 %0, [%1];" : "=r"(out.end) : "l"(starts + block + 1));
+  return out;
+}
+// Of a block's vertices: slots of their pairs, edges to their neighbours.
+struct StarSpans {
+  Span slots, edges;
+};
+__device__ __forceinline__ StarSpans spans_of(const GroupPlan& plan, int block) {
+  return {span_of(plan.block_slot, block), span_of(plan.block_edge, block)};
+}
+
+// Where a thread stands: vertex `v` of a block, and which of the `lanes` threads of that vertex it is. Neighbouring
+// threads have neighbouring vertices, so that their loads lie side by side.
+template <int lanes_>
+struct Place {
+  static constexpr int lanes = threads_of(lanes_), groups = kSlice / lanes;  // vertices of a warp
+  int64_t scene;
+  int block, v, group, lane;
+  __device__ __forceinline__ Place(int64_t scene, int block, int part)
+      : scene(scene), block(block), group(threadIdx.x % groups), lane(threadIdx.x % kSlice / groups) {
+    v = part * groups + group;
+  }
+  template <class R>
+  __device__ __forceinline__ static void sum(R& a) {
+#pragma unroll
+    for (int offset = groups; offset < kSlice; offset *= 2) a = a + __shfl_xor_sync(kWholeWarp, a, offset);
+  }
+  template <class R>
+  __device__ __forceinline__ static void sum(Vec3<R>& a) {
+    sum(a.x), sum(a.y), sum(a.z);
+  }
+  template <class R>
+  __device__ __forceinline__ static void sum(Sym3<R>& a) {
+    sum(a.xx), sum(a.xy), sum(a.xz), sum(a.yy), sum(a.yz), sum(a.zz);
+  }
+};
+
+}  // namespace diffvbd::cuda
