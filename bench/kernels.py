@@ -102,8 +102,8 @@ SCENES: dict[str, tuple[Callable[[Card], Work], tuple[str, ...]]] = {
 
 
 def run(quick: bool, device: str = DEVICE, only: str = "", out: Path | None = None) -> dict[str, Any]:
-    """``only``: scenes, split by semicolons, since their names have commas; beside what earlier runs on the same device
-    have left of the others."""
+    """``only``: scenes, split by semicolons, since their names have commas. Each is written as it ends, beside what
+    earlier runs on the same device have left of the others."""
     if shutil.which("ncu") is None:
         raise SystemExit("ncu: expected NVIDIA Nsight Compute on the path, and it is not there")
     names = [name for name in only.split(";") if name] or list(SCENES)[: 1 if quick else None]
@@ -119,6 +119,8 @@ def run(quick: bool, device: str = DEVICE, only: str = "", out: Path | None = No
             failed = str(error).strip()[-300:]
         results[name] = {"rows": rows, "failed": failed, **common.stamp(common.environment(device))}
         print(f"{name}: {time.perf_counter() - began:.0f} s {failed}", file=sys.stderr, flush=True)
+        if rows and out is not None:
+            common.write("kernels", results, out, quick=quick, device=device)
     if not any(results[name]["rows"] for name in names):
         raise SystemExit(f"no scene ended: {[results[name]['failed'] for name in names]}")
     return results

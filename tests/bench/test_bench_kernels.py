@@ -2,8 +2,10 @@
 
 import csv
 import io
+import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -74,3 +76,20 @@ def test_processes_end_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("text", NAMES)
 def test_names(text: str) -> None:
     assert kernels._named(text) == NAMES[text]
+
+
+def test_each_scene_is_written_as_it_ends(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    first, second = list(kernels.SCENES)[:2]
+
+    def times(name: str, device: str) -> dict[str, tuple[int, float]]:
+        if name == second:
+            raise KeyboardInterrupt
+        return {"fill": (2, 0.5)}
+
+    monkeypatch.setattr(kernels.shutil, "which", lambda name: name)
+    monkeypatch.setattr(kernels, "_times", times)
+    monkeypatch.setattr(kernels, "_launches", lambda name, device: iter(()))
+    with pytest.raises(KeyboardInterrupt):
+        kernels.run(False, "cpu", f"{first};{second}", tmp_path)
+    written = json.loads((tmp_path / "kernels.json").read_text(encoding="utf-8"))["results"]
+    assert list(written) == [first] and written[first]["rows"][0]["seconds"] == 0.25
