@@ -83,8 +83,6 @@ here, states the protocol. Figures in the tables come from the logs in `bench/re
 `python -m bench tasks` writes and `python -m bench report` turns into this page; those of the paper are in
 `bench/paper.py`.
 
-The logs of cover-the-spot with the seeds 1 and 2 were made before its gradient was clipped.
-
 Times are those of the optimisation, without pictures. Runs are repeatable: on one device the same seed gives the same
 numbers, bit by bit. Only parts that run for a given time, such as CMA-ES in learn-controller, depend on the speed of
 the machine.
