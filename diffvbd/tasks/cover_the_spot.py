@@ -218,13 +218,15 @@ def smooth_uncovered(rims: Tensor, points: Tensor, sharpness: Tensor) -> Tensor:
     """Mean over points of the product over disks of sigmoid(-sharpness distance), distance to the outline from inside.
 
     Args:
-        rims: Outlines [m], shape [disks, n, 3], convex, in the order of `outline`.
+        rims: Outlines [m], shape [disks, n, 3], convex, in the order of `outline` or against it.
         points: (x, z) [m], shape [N, 2].
         sharpness: Scalar [1/m].
     """
     start = rims[..., ::2]
     edge = start.roll(-1, 1) - start
-    inward = torch.stack([-edge[..., 1], edge[..., 0]], -1) / edge.norm(dim=-1, keepdim=True)
+    # a disk that has landed upside down is gone round the other way
+    turns = (start[..., 0] * edge[..., 1] - start[..., 1] * edge[..., 0]).sum(-1).sign()
+    inward = turns[:, None, None] * torch.stack([-edge[..., 1], edge[..., 0]], -1) / edge.norm(dim=-1, keepdim=True)
     # the outline is convex: a point is as deep inside as it is behind the nearest line
     depth = ((points[:, None, None] - start) * inward).sum(-1).amin(-1)
     # a sum of logarithms: the derivative of a product waits for the device

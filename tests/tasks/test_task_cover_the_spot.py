@@ -68,6 +68,8 @@ def test_smooth_share_tends_to_the_share_and_pulls_disks_in() -> None:
     disks = rest + offsets[:, None]
     sharp = smooth_uncovered(disks[:, rim], points, torch.tensor(1e4)).item()
     assert sharp == pytest.approx(uncovered(disks[:, faces], points).item(), abs=tolerance("sampled_area"))
+    turned = smooth_uncovered(disks[:, rim].flip(1), points, torch.tensor(1e4)).item()  # upside down
+    assert turned == pytest.approx(sharp, rel=tolerance("adjoint"))
     smooth_uncovered(disks[:, rim], points, torch.tensor(10.0)).backward()
     assert (offsets.grad * offsets.detach()).sum(1).min().item() > 0.0
     assert offsets.grad[:, 1].abs().max().item() == 0.0
