@@ -84,8 +84,9 @@ def problem(settings: Settings, radius: float = RADIUS) -> Problem:
             Stage(
                 loss=fall.loss,
                 iterations=version.iterations,
-                learning_rate=0.03,
+                learning_rate=0.06,
                 clip=CLIP,
+                rough=True,
                 before=fall.anneal,
                 criterion="uncovered",
                 capturable=True,

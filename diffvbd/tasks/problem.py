@@ -59,6 +59,8 @@ class Stage:
         criterion: Key of the history by whose lowest value the best iteration is chosen, and by the loss among equals;
             for losses that change on the way.
         clip: Longest gradient, over all parameters together; longer ones are scaled down to it. None: no limit.
+        rough: The loss has cliffs, as where bodies bounce off one another: Adam averages over more steps, and goes back
+            to the lowest loss so far, at a lower rate, once a loss is more than twice as high.
         capturable: On a CUDA device loss and gradient may be captured in one CUDA graph, which is replayed: the loss
             reads nothing but tensors that stay where they are, and never waits for the device.
         name: For the log.
@@ -74,6 +76,7 @@ class Stage:
     before: Callable[[int], object] | None = None
     criterion: str = "loss"
     clip: float | None = None
+    rough: bool = False
     capturable: bool = False
     name: str = ""
     refinable: bool = True
@@ -157,6 +160,8 @@ def check(problem: Problem) -> None:
             value = getattr(stage, key)
             if not (callable(value) or (value is None and key != "loss")):
                 raise TypeError(f"{where}.{key}: expected a function, got {value!r}")
+        if stage.rough and stage.optimizer is not None:
+            raise ValueError(f"{where}.rough: expected False beside an optimizer of its own, got {stage.rough!r}")
         for key in ("learning_rate", "clip"):
             value = getattr(stage, key)
             if not (_is_number(value) and value > 0 or (value is None and key == "clip")):

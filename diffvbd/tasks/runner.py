@@ -16,6 +16,7 @@ from torch import Tensor
 
 from diffvbd.tasks.capture import captured
 from diffvbd.tasks.folder import STATE, alone_in, prepare, put_aside, remove_results, replace
+from diffvbd.tasks.optimizer import optimizer_of
 from diffvbd.tasks.problem import (
     OWN_KEYS,
     Problem,
@@ -165,7 +166,7 @@ class _Run:
         self.still: list[float] = []  # losses of the last step, if it moved no parameter
         if stage >= len(self.problem.stages):
             return
-        self.optimizer, self.schedule = _optimizer(self.stage, list(self.moved.values()))
+        self.optimizer, self.schedule = optimizer_of(self.stage, list(self.moved.values()))
 
     @property
     def stage(self) -> Stage:
@@ -285,10 +286,10 @@ class _Run:
 
     def _fingerprint(self) -> str:
         """What must be the same for a run to be continued, besides the first loss."""
-        kept = ("name", "iterations", "moves", "tolerance", "gradient_tolerance", "criterion", "clip")
+        kept = ("name", "iterations", "moves", "tolerance", "gradient_tolerance", "criterion", "clip", "rough")
         stages = []
         for stage in self.problem.stages:
-            optimizer, _ = _optimizer(stage, list(_moved(self.problem, stage).values()))
+            optimizer, _ = optimizer_of(stage, list(_moved(self.problem, stage).values()))
             groups = [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
             stages.append([[getattr(stage, key) for key in kept], type(optimizer).__name__, groups])
         tensors = {name: [str(p.dtype), *p.shape] for name, p in self.problem.parameters.items()}
@@ -386,14 +387,3 @@ def _plain(value: Any) -> Any:
 
 def _moved(problem: Problem, stage: Stage) -> dict[str, Tensor]:
     return {name: p for name, p in problem.parameters.items() if stage.moves is None or name in stage.moves}
-
-
-def _optimizer(
-    stage: Stage, parameters: list[Tensor]
-) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler | None]:
-    if stage.optimizer:
-        return stage.optimizer(parameters), None
-    # A few parameters and gradients without noise need no long average, and overshoot less without it. Losses in m^2
-    # can be tiny: the default eps would exceed their gradients.
-    optimizer = torch.optim.Adam(parameters, stage.learning_rate, betas=(0.7, 0.9), eps=1e-20)
-    return optimizer, torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, stage.iterations)
