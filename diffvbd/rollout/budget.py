@@ -15,8 +15,9 @@ from ..mesh import subdivide
 from ..model.model import Model
 from ..said import percent
 from ..step.arguments import check_state, prepare
+from ..step.held_up import cut_share
 from ..step.integrators import SAME_TIME_STEP, SDIRK2, ImplicitEuler, Integrator, check_integrator
-from .contact_check import cut_share, unbalanced_friction
+from .contact_check import unbalanced_friction
 from .pilots import FRAMES, Pilot, Pilots, Quantity, changes, converted, of_time, pilots_of, relative
 from .rollout import rollout
 from .search import start_of

@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 
 from ..model.model import Model
+from ..model.warnings import HELD_UP
 from ..said import page, percent, warn
 from ..scopes import is_captured, looks_at
 from ..step.arguments import Prepared, acceleration_of, collider_state
 from ..step.balance import UNBALANCED_FRICTION, contact_of_step, friction_left_over, potential_of_step
 from ..step.contact_cycles import CUT
-from ..step.met import outcomes
+from ..step.held_up import what_helps
 from ..step.predict import begin
 
-WARNED = "warned_of_contact"  # of a Model's _derived: unasked, one warning is enough for all of its rollouts
 LEAST_STEPS = 10  # of a rollout that is looked at unasked: the look costs about as much as a step
 
 
@@ -29,16 +29,7 @@ def checks_contact(asked: bool | None, model: Model, x: Tensor, steps: int) -> b
         return False
     if asked:
         return not is_captured(x)
-    return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and WARNED not in model._derived
-
-
-def cut_share(model: Model) -> Tensor:
-    """Share of the vertices that pairs held up in the Model's latest step [-], of the worst scene; a number on the
-    Model's device, which is not waited for."""
-    outcome = outcomes.get(model)
-    if outcome is None or outcome.cut.numel() == 0 or model.num_active == 0:
-        return torch.zeros((), device=model.device)
-    return outcome.cut.sum(-1).amax() / model.num_active
+    return not x.is_cuda and looks_at(x) and steps >= LEAST_STEPS and HELD_UP not in model._derived
 
 
 def unbalanced_friction(model: Model, before: tuple[Tensor, Tensor], x: Tensor, prepared: Prepared,
@@ -74,15 +65,12 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
     cut = max(shares)
     left = unbalanced_friction(model, before, x, prepared, given)
     if cut > CUT or left > UNBALANCED_FRICTION:
-        model._derived[WARNED] = True
+        model._derived[HELD_UP] = True
     if cut > CUT:
-        numbered = model.contact is not None and model.contact.detections is not None
-        remedy = ", or leave out its number of detections" if numbered else ""
         warn(
             f"pair_barrier: pairs held up {percent(cut)} of the vertices in step {shares.index(cut)}, which lost "
             f"velocity and momentum (in {sum(s > CUT for s in shares)} of {len(shares)} steps more than "
-            f"{percent(CUT)}); take a smaller time_step or a larger reach of the PairBarrier{remedy}; "
-            + page("contact.md"),
+            f"{percent(CUT)}); " + what_helps(model),
         )
     if left > UNBALANCED_FRICTION:
         faster = ', coarse="auto"' if model.coarse is None else ""

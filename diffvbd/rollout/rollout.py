@@ -18,6 +18,7 @@ from ..scopes import looks_at, recorders, refinement
 from ..step.advance import advance
 from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
 from ..step.estimate import ErrorEstimate, check_estimable, error_of, of_steps
+from ..step.held_up import cut_share
 from ..step.integrators import (
     History,
     Integrator,
@@ -30,7 +31,7 @@ from ..step.integrators import (
 from ..step.intersections import check_start as refuse_start
 from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
 from .chosen import rollout_with
-from .contact_check import checks_contact, cut_share, warn_of_contact
+from .contact_check import checks_contact, warn_of_contact
 from .energy_check import look_at_energy, warn_of_end, warn_of_last_end
 from .finer import rollout_finer
 from .settings import Settings

@@ -14,6 +14,7 @@ from ..model.warnings import warn_of_material
 from ..scopes import looks_at, refuse_refinement
 from .advance import advance
 from .arguments import GRAVITY, check_prescribed, check_state, prepare
+from .held_up import notice_step
 from .integrators import (
     BDF2,
     SDIRK2,
@@ -153,4 +154,5 @@ def step(
         warn_of_material(model, prepared.mu, prepared.lam, *prepared.time_step_and_sweeps,
                          type(scheme).__name__)  # fmt: skip
     taken = take(scheme, model, x, v, history, prepared, given, partial(advance, adjoint=adjoint))
+    notice_step(model, taken.x)
     return (taken.x, taken.v) if taken.history is None else (taken.x, taken.v, taken.history)

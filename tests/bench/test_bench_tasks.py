@@ -50,11 +50,7 @@ def test_options_are_part_of_the_name_and_do_not_count_for_the_bar(tmp_path: Pat
             main([*run, "million-cubes", "--options", options])
 
 
-# Strict: once the runs meet the bar, this must go.
-MISSED = {"cover-the-spot": pytest.mark.xfail(strict=True, reason="seed 2 leaves 0.1 % uncovered, as the page says")}
-
-
-@pytest.mark.parametrize("name", [pytest.param(name, marks=MISSED.get(name, ())) for name in PAPER])
+@pytest.mark.parametrize("name", list(PAPER))
 def test_every_bar_is_met_by_the_logs(name: str) -> None:
     logs = [json.loads(path.read_text(encoding="utf-8")) for path in (tasks.RESULTS / "tasks").glob(f"{name}*.json")]
     runs = [log for log in logs if log["task"] == name and not log["options"]]

@@ -10,6 +10,8 @@ from helpers.two_boxes import two_boxes
 import diffvbd as dv
 from diffvbd.mesh import box
 from diffvbd.rollout import contact_check
+from diffvbd.step.contact_cycles import CUT
+from diffvbd.step.held_up import SEVERAL, cut_share
 
 FAST: dict[str, Any] = {"mu": 2e4, "lam": 4e4, "time_step": 0.002, "sweeps": 3}
 
@@ -43,7 +45,7 @@ def test_motion_that_pairs_held_up_is_warned_of() -> None:
         dv.rollout(model, x, v, steps=1, check_contact=True, **FAST)
     assert found[0].filename == __file__
     assert sum("pairs held up" in str(w.message) for w in found) == 1
-    assert contact_check.cut_share(model) > contact_check.CUT
+    assert cut_share(model) > CUT
 
 
 def test_motion_that_pairs_held_up_in_any_step_is_warned_of() -> None:
@@ -57,8 +59,8 @@ def test_motion_that_pairs_held_up_in_any_step_is_warned_of() -> None:
     shares, end = [], (x, v)
     for _ in range(10):
         end = dv.step(model, *end, **options)
-        shares.append(float(contact_check.cut_share(model)))
-    assert max(shares) > contact_check.CUT > shares[-1]
+        shares.append(float(cut_share(model)))
+    assert max(shares) > CUT > shares[-1]
     (text,) = messages(lambda: dv.rollout(model, x, v, steps=10, **options))
     assert f"in step {shares.index(max(shares))}, which lost velocity and momentum" in text
 
@@ -104,3 +106,24 @@ def test_bad_input() -> None:
     model, x, v = thrown()
     with pytest.raises(TypeError, match="check_contact: expected a bool or None, got str"):
         dv.rollout(model, x, v, steps=1, check_contact="yes", **FAST)  # pyright: ignore[reportArgumentType]
+
+
+def test_steps_made_one_by_one_are_warned_of_once_pairs_have_held_up_several() -> None:
+    """Prescribed motion of 6 mm a step, where a body may go 2 mm beside another."""
+    lower, upper = box(2, 0.1), box(2, 0.1).translate((0.0, 0.103, 0.0))
+    barrier = dv.PairBarrier(kappa=1e3, dhat=2e-3, detections=1, reach=6e-3)
+    mesh = dv.mesh.join([lower, upper])
+    held = torch.from_numpy(mesh.points[:, 1] < 0.05)
+    model = dv.Model(mesh, pinned=held, energies=(dv.StableNeoHookean(), barrier))
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    shares, said = [], []
+    for k in range(SEVERAL + 6):
+        goal = torch.where(held[:, None], model.rest_points + torch.tensor([0.0, 6e-3 * (k + 1), 0.0]), torch.nan)
+        after: list[tuple[torch.Tensor, torch.Tensor]] = []
+        said.append(messages(lambda: after.append(dv.step(model, x, v, prescribed=goal, **FAST))))  # noqa: B023
+        x, v = after[0]
+        shares.append(float(cut_share(model)) > CUT)
+    assert sum(shares) >= SEVERAL
+    late = [k for k in range(len(shares)) if sum(shares[: k + 1]) == SEVERAL][0]
+    assert [bool(texts) for texts in said] == [k == late for k in range(len(said))]
+    assert f"more than 1 % in {SEVERAL} steps so far" in said[late][0] and "larger reach" in said[late][0]
