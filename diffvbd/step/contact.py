@@ -110,10 +110,13 @@ class ContactStep:
             return broadcast(value[:, None], force.shape) if value.shape[0] == 1 else of_scene(value, listed)[:, None]
 
         zero = force.new_zeros((1,))
-        coefficient = self._parameter("friction.coefficient", zero)
-        damping = self._parameter("pair_barrier.damping", zero)
-        share = damped_share(force, of_pair(self.kappa), dhat)
-        lag = torch.cat([of_pair(coefficient) * force, of_pair(damping) * share, rest], -1)
+        rubs = drags = torch.zeros_like(force)
+        if friction is not None:
+            rubs = of_pair(self._parameter("friction.coefficient", zero)) * force
+        if damped:
+            share = damped_share(force, of_pair(self.kappa), dhat)
+            drags = of_pair(self._parameter("pair_barrier.damping", zero)) * share
+        lag = torch.cat([rubs, drags, rest], -1)
         listed, rows = some_of(listed, (active[:, 0] != 0).contiguous())
         self.lagged, self.lag = listed, rows_of(lag, rows)
 

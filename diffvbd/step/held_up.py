@@ -37,7 +37,7 @@ def notice_step(model: Model, x: Tensor) -> None:
     For steps that are made one by one: a rollout looks at its own. Values on CUDA, which would have to be waited for,
     and those of compiled, transformed or captured steps are not looked at.
     """
-    if not model.touches or x.is_cuda or HELD_UP in model._derived or not looks_at(x):
+    if not looks_at(x) or x.is_cuda or not model.touches or HELD_UP in model._derived:
         return
     share = float(cut_share(model))
     if share <= CUT:
