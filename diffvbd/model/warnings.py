@@ -27,8 +27,9 @@ THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 
 # of a Model's _derived: what is said once, or ever more seldom
-THIN_SEEN, OVER_RELAXED, HELD_UP, HELD_UP_SEEN = "thin", "over-relaxed", "held up", "steps held up"
-ONCE = (THIN_SEEN, OVER_RELAXED, GROWS, STEPS_SEEN, HELD_UP, HELD_UP_SEEN)
+THIN_SEEN, OVER_RELAXED, CONTACT_SEEN = "thin", "over-relaxed", "contact of rollouts"
+HELD_UP, HELD_UP_SEEN = "held up", "steps held up"
+ONCE = (THIN_SEEN, OVER_RELAXED, GROWS, STEPS_SEEN, CONTACT_SEEN, HELD_UP, HELD_UP_SEEN)
 
 
 def warn_of(model: Model) -> None:

@@ -73,18 +73,18 @@ class ContactStep:
         self.any_direction = oblique or "floor_barrier.normal" in prepared.parameters
         self.parts: int | None = None if self.barrier is None else self.barrier.detections  # None: not decided yet
         like = begun.x_prev
-        self.kappa = self._parameter("pair_barrier.kappa", like.new_zeros((1,)))
+        self.kappa = like.new_zeros((1,)) if self.barrier is None else self._parameter("pair_barrier.kappa")
         self.lagged, self.lag = no_pairs(like, 0), like.new_zeros((0, 9))
         self.floor_lag = self._floor_lag()
         self.factor = factor_of(model, prepared.coarse, self.x_prev, prepared.settings.numbers.time_step)
 
-    def _parameter(self, name: str, default: Tensor) -> Tensor:
-        """A parameter [1 | B]."""
+    def _parameter(self, name: str) -> Tensor:
+        """A parameter of an energy that the Model has [1 | B]."""
         if name in self.prepared.parameters:
             return self.prepared.parameters[name]
         owner, key = name.split(".")
-        energy = next((e for e in self.model.parametric_energies if e.name == owner), None)
-        return default if energy is None else self.model.constants(energy)[key][None]
+        energy = next(e for e in self.model.parametric_energies if e.name == owner)
+        return self.model.constants(energy)[key][None]
 
     def _floor_lag(self) -> Tensor:
         """Friction coefficient times normal force of the floor's planes, and their normals, at the start."""
@@ -92,7 +92,7 @@ class ContactStep:
         if floor is None or self.floor_data is None or self.model.friction is None:
             return x.new_zeros((0,))
         force, normal = floor.normal_force(x, self.floor_data, self.begun.origin)
-        size = self._parameter("friction.coefficient", x)[:, None, None] * force
+        size = self._parameter("friction.coefficient")[:, None, None] * force
         normal = broadcast(normal[:, None], (*size.shape, 3))
         return torch.cat([size[..., None], normal], -1)
 
@@ -109,13 +109,11 @@ class ContactStep:
         def of_pair(value: Tensor) -> Tensor:
             return broadcast(value[:, None], force.shape) if value.shape[0] == 1 else of_scene(value, listed)[:, None]
 
-        zero = force.new_zeros((1,))
         rubs = drags = torch.zeros_like(force)
         if friction is not None:
-            rubs = of_pair(self._parameter("friction.coefficient", zero)) * force
+            rubs = of_pair(self._parameter("friction.coefficient")) * force
         if damped:
-            share = damped_share(force, of_pair(self.kappa), dhat)
-            drags = of_pair(self._parameter("pair_barrier.damping", zero)) * share
+            drags = of_pair(self._parameter("pair_barrier.damping")) * damped_share(force, of_pair(self.kappa), dhat)
         lag = torch.cat([rubs, drags, rest], -1)
         listed, rows = some_of(listed, (active[:, 0] != 0).contiguous())
         self.lagged, self.lag = listed, rows_of(lag, rows)

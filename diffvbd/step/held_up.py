@@ -12,7 +12,7 @@ from ..scopes import looks_at
 from .contact_cycles import CUT
 from .met import outcomes
 
-SEVERAL = 10  # steps, made one by one, that are held up before it is said; an impact is over in fewer
+SEVERAL = 10  # steps in a row, made one by one, that are held up before it is said; an impact is over in fewer
 
 
 def cut_share(model: Model) -> Tensor:
@@ -32,7 +32,8 @@ def what_helps(model: Model) -> str:
 
 
 def notice_step(model: Model, x: Tensor) -> None:
-    """Warns (UserWarning), once for each Model, when pairs have held up more than CUT of the vertices in SEVERAL steps.
+    """Warns (UserWarning), once for each Model, when pairs have held up more than CUT of the vertices in SEVERAL steps
+    in a row.
 
     For steps that are made one by one: a rollout looks at its own. Values on CUDA, which would have to be waited for,
     and those of compiled, transformed or captured steps are not looked at.
@@ -40,14 +41,11 @@ def notice_step(model: Model, x: Tensor) -> None:
     if not looks_at(x) or x.is_cuda or not model.touches or HELD_UP in model._derived:
         return
     share = float(cut_share(model))
-    if share <= CUT:
-        return
-    seen = model._derived.get(HELD_UP_SEEN, 0) + 1
-    model._derived[HELD_UP_SEEN] = seen
+    model._derived[HELD_UP_SEEN] = seen = model._derived.get(HELD_UP_SEEN, 0) + 1 if share > CUT else 0
     if seen < SEVERAL:
         return
     model._derived[HELD_UP] = True
     warn(
         f"pair_barrier: pairs held up {percent(share)} of the vertices in this step, and more than {percent(CUT)} in "
-        f"{seen} steps so far; they lose velocity and momentum; " + what_helps(model)
+        f"each of the last {seen}; they lose velocity and momentum; " + what_helps(model)
     )

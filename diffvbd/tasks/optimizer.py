@@ -33,33 +33,45 @@ def optimizer_of(
 class RetreatingAdam(torch.optim.Adam):
     """Adam that goes back to the parameters of the lowest loss so far once a loss is more than RISE times that one.
 
-    From there it goes on without momentum, at SLOWER times the learning rate. Where a small change of a throw decides
-    whether a body bounces off another, the loss has cliffs that no gradient shows, and Adam alone does not come back
-    over one that it has passed. ``step`` needs a closure. Losses must not be negative.
+    From there it goes on without momentum, at SLOWER times the learning rate; what the loss is there now is then the
+    lowest. Where a small change of a throw decides whether a body bounces off another, the loss has cliffs that no
+    gradient shows, and Adam alone does not come back over one that it has passed.
     """
 
     def __init__(self, params: list[Tensor], lr: float, **given: Any) -> None:
         super().__init__(params, lr, **given)
-        for group in self.param_groups:
-            group.update(lowest=math.inf, waited=0, best=[])
+        (self.group,) = self.param_groups
+        self.group.update(lowest=math.inf, waited=0, best=[])
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        (self.group,) = self.param_groups
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float]) -> float:  # type: ignore[override]
+        """A step; ``closure`` evaluates the loss, not negative, and leaves its gradient in the parameters.
+
+        Raises:
+            ValueError: The loss is negative: no multiple of it says what a rise is.
+        """
         with torch.enable_grad():
             loss = float(closure())
-        for group in self.param_groups:
-            group["waited"] += 1
-            if loss <= group["lowest"]:
-                group.update(lowest=loss, best=[p.clone() for p in group["params"]])
-        if all(loss > RISE * group["lowest"] and group["waited"] >= PATIENCE for group in self.param_groups):
+        if loss < 0:
+            raise ValueError(f"rough: expected a loss that is not negative, got {loss:g}")
+        group = self.group
+        if loss <= group["lowest"] or group["waited"] == 0:
+            group.update(lowest=loss, best=[p.clone() for p in group["params"]])
+        group["waited"] += 1
+        if loss > RISE * group["lowest"] and group["waited"] >= PATIENCE:
             self._retreat()
         else:
             super().step()
         return loss
 
     def _retreat(self) -> None:
-        for group in self.param_groups:
-            for p, best in zip(group["params"], group["best"], strict=True):
-                p.copy_(best)
+        group = self.group
+        for p, best in zip(group["params"], group["best"], strict=True):
+            p.copy_(best)
+            if "exp_avg" in self.state[p]:  # what never had a gradient has none
                 self.state[p]["exp_avg"].zero_()
-            group.update(waited=0, lr=SLOWER * group["lr"])
+        group.update(waited=0, lr=SLOWER * group["lr"])

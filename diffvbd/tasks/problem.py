@@ -60,7 +60,8 @@ class Stage:
             for losses that change on the way.
         clip: Longest gradient, over all parameters together; longer ones are scaled down to it. None: no limit.
         rough: The loss has cliffs, as where bodies bounce off one another: Adam averages over more steps, and goes back
-            to the lowest loss so far, at a lower rate, once a loss is more than twice as high.
+            to the lowest loss so far, at a lower rate, once a loss is more than twice as high. The loss must not be
+            negative, and where it changes on the way it should not rise much at the same parameters.
         capturable: On a CUDA device loss and gradient may be captured in one CUDA graph, which is replayed: the loss
             reads nothing but tensors that stay where they are, and never waits for the device.
         name: For the log.
@@ -160,6 +161,8 @@ def check(problem: Problem) -> None:
             value = getattr(stage, key)
             if not (callable(value) or (value is None and key != "loss")):
                 raise TypeError(f"{where}.{key}: expected a function, got {value!r}")
+        if not isinstance(stage.rough, bool):
+            raise TypeError(f"{where}.rough: expected a bool, got {stage.rough!r}")
         if stage.rough and stage.optimizer is not None:
             raise ValueError(f"{where}.rough: expected False beside an optimizer of its own, got {stage.rough!r}")
         for key in ("learning_rate", "clip"):

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.two_boxes import STEP, two_boxes
 
 import diffvbd as dv
 from diffvbd.testing import relative_error, tolerance
@@ -47,6 +48,30 @@ def test_a_barrier_that_is_none_damps_nothing_and_has_a_gradient(support: str, n
     assert torch.equal(damped, free)
     slopes = [torch.autograd.grad(end[:, 1].square().sum(), kappa)[0] for end in (damped, free)]
     assert torch.equal(*slopes) and slopes[0] != 0
+
+
+@pytest.mark.parametrize("name", ("pair_barrier.damping", "friction.coefficient"))
+def test_none_is_as_much_as_zero(name: str) -> None:
+    """Of damping or of friction, beside the other."""
+
+    def ends(*, rubs: bool, damping: float, **options: Any) -> tuple[torch.Tensor, ...]:
+        model = two_boxes(damping=damping, detections=1)
+        if not rubs:
+            model = dv.Model(model.mesh, energies=[e for e in model.energies if not isinstance(e, dv.Friction)])
+        v = torch.zeros_like(model.rest_points)
+        v[8:] = torch.tensor([0.3, -0.4, 0.1])
+        v.requires_grad_()
+        end = dv.step(model, model.rest_points, v, **STEP, **options)[0]
+        return end, torch.autograd.grad(end.square().sum(), v)[0]
+
+    damps = name == "friction.coefficient"
+    none = ends(rubs=not damps, damping=5.0 if damps else 0.0)
+    zero = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    given = ends(rubs=True, damping=5.0 if damps else 0.0, parameters={name: zero})
+    for a, b in zip(none, given, strict=True):
+        assert relative_error(a, b) <= tolerance("contact_forward")
+    both = ends(rubs=True, damping=5.0)
+    assert relative_error(none[0], both[0]) > 1e-6
 
 
 def bounced(speed: float, mass: float, kappa: float, damping: float, seconds: float) -> float:
