@@ -40,12 +40,7 @@ class RetreatingAdam(torch.optim.Adam):
 
     def __init__(self, params: list[Tensor], lr: float, **given: Any) -> None:
         super().__init__(params, lr, **given)
-        (self.group,) = self.param_groups
-        self.group.update(lowest=math.inf, waited=0, best=[])
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        super().load_state_dict(state_dict)
-        (self.group,) = self.param_groups
+        self.param_groups[0].update(lowest=math.inf, waited=0, best=[])
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float]) -> float:  # type: ignore[override]
@@ -58,7 +53,7 @@ class RetreatingAdam(torch.optim.Adam):
             loss = float(closure())
         if loss < 0:
             raise ValueError(f"rough: expected a loss that is not negative, got {loss:g}")
-        group = self.group
+        group = self.param_groups[0]
         if loss <= group["lowest"] or group["waited"] == 0:
             group.update(lowest=loss, best=[p.clone() for p in group["params"]])
         group["waited"] += 1
@@ -69,7 +64,7 @@ class RetreatingAdam(torch.optim.Adam):
         return loss
 
     def _retreat(self) -> None:
-        group = self.group
+        group = self.param_groups[0]
         for p, best in zip(group["params"], group["best"], strict=True):
             p.copy_(best)
             if "exp_avg" in self.state[p]:  # what never had a gradient has none

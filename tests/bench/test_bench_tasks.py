@@ -50,7 +50,7 @@ def test_options_are_part_of_the_name_and_do_not_count_for_the_bar(tmp_path: Pat
             main([*run, "million-cubes", "--options", options])
 
 
-@pytest.mark.parametrize("name", list(PAPER))
+@pytest.mark.parametrize("name", PAPER)
 def test_every_bar_is_met_by_the_logs(name: str) -> None:
     logs = [json.loads(path.read_text(encoding="utf-8")) for path in (tasks.RESULTS / "tasks").glob(f"{name}*.json")]
     runs = [log for log in logs if log["task"] == name and not log["options"]]
