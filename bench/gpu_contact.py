@@ -132,5 +132,6 @@ def table(rows: list[Row]) -> str:
     header = ("scene with contact", "part", "vertices", "K", "pairs a scene", "vertices held up", "graph [ms a step]",
               "target", "eager [ms a step]", "scene-steps/s", "target")  # fmt: skip
     return markdown_table(header, [
-        (r["name"], r["part"], r["vertices"], r["sweeps"], cell(r.get("pairs_per_scene")), cell(r.get("held_up")), r["ms"], r["target_ms"],
-         r["eager_ms"], cell(r.get("scene_steps_per_s")), cell(r.get("target_rate"))) for r in rows])  # fmt: skip
+        (r["name"], r["part"], r["vertices"], r["sweeps"], cell(r.get("pairs_per_scene")), cell(r.get("held_up")),
+         r["ms"], r["target_ms"], r["eager_ms"], cell(r.get("scene_steps_per_s")),
+         cell(r.get("target_rate"))) for r in rows])  # fmt: skip
