@@ -324,20 +324,32 @@ DIFFVBD_FN T total(T done, T now) {
   return now == T(1) ? T(1) : done + now * (T(1) - done);
 }
 
-// Marks a vertex that leaves its rooms by what it tries; returns whether it stays. Rounds as of try_pair().
+// Whether a vertex is within its rooms after a share of its way.
 template <class T>
-DIFFVBD_FN bool stay(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t scene, int32_t v, int round) {
-  const int64_t row = scene * in.vertices + v, unit = in.unit(scene, v);
-  if (in.held[v] || (round > 0 && s.stamp[unit] != round) || s.now[unit] == T(0)) return true;
-  const Vec3<T> x = vector_at(in.x + 3 * row);
-  const Vec3<T> end = x + total(s.share[unit], s.now[unit]) * way_of(in, scene, v);
+DIFFVBD_FN bool is_within_rooms(const AdvanceInputs<T>& in, int64_t scene, int32_t v, T share) {
+  const int64_t row = scene * in.vertices + v;
+  const Vec3<T> end = vector_at(in.x + 3 * row) + share * way_of(in, scene, v);
   const auto within = [&](const T* center, const T* room) {
     const Vec3<T> off = end - vector_at(center + 3 * row);
     return dot(off, off) <= room[row] * room[row];
   };
-  if (within(in.center, in.room) && (!in.own_room || within(in.own_center, in.own_room))) return true;
+  return within(in.center, in.room) && (!in.own_room || within(in.own_center, in.own_room));
+}
+
+// Marks the body of a vertex that leaves its rooms by what it tries; returns whether it stays. Rounds as of try_pair().
+// A vertex on its own tries no more than its rooms let it: begin_move().
+template <class T>
+DIFFVBD_FN bool stay(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t scene, int32_t v, int round) {
+  const int64_t unit = in.unit(scene, v);
+  if (in.held[v] || (round > 0 && s.stamp[unit] != round) || s.now[unit] == T(0)) return true;
+  if (is_within_rooms(in, scene, v, total(s.share[unit], s.now[unit]))) return true;
   mark(s.blocked + unit);
   return false;
+}
+
+template <class T>
+DIFFVBD_FN T less_than(T now) {
+  return T(kLeastTry) < now ? T(0.5) * now : T(0);
 }
 
 // After a round: what is blocked tries less.
@@ -346,14 +358,20 @@ DIFFVBD_FN bool retreat(const AdvanceState<T>& s, int64_t unit, int round) {
   if (!s.blocked[unit]) return false;
   s.blocked[unit] = 0;
   s.stamp[unit] = static_cast<uint8_t>(round + 1);
-  s.now[unit] = round < kPatience && T(kLeastTry) < s.now[unit] ? T(0.5) * s.now[unit] : T(0);
+  s.now[unit] = round < kPatience ? less_than(s.now[unit]) : T(0);
   return true;
 }
 
 template <class T>
-DIFFVBD_FN void begin_move(const AdvanceState<T>& s, int64_t unit) {
+DIFFVBD_FN void begin_move(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t unit) {
   if (s.first) s.share[unit] = T(0);
-  s.now[unit] = T(1), s.blocked[unit] = s.stamp[unit] = 0;
+  T now = T(1);
+  if (!in.whole) {  // rooms are balls: what is within them at some share is so at any smaller one
+    const int64_t scene = in.scene_of_unit(unit);
+    const auto v = static_cast<int32_t>(unit - scene * in.vertices);
+    while (!in.held[v] && T(0) < now && !is_within_rooms(in, scene, v, total(s.share[unit], now))) now = less_than(now);
+  }
+  s.now[unit] = now, s.blocked[unit] = s.stamp[unit] = 0;
 }
 // A scene that has found no way stays where it is in this move.
 template <class T>

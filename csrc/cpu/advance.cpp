@@ -85,7 +85,9 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
     std::fill(far.begin(), far.end(), 0);
     std::fill(failed.begin(), failed.end(), 0);
     bool clean = false;  // everything passes as it wants to: only the first round looks at all pairs
-    for (int64_t i = 0; i < units; ++i) begin_move(s, i);
+    torch::stable::parallel_for(0, units, kGrain, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) begin_move(in, s, i);
+    });
     for (int round = 0; round < kRounds; ++round) {
       const bool begins = round == 0, last = round + 1 == kRounds;
       const auto fails = [&](int64_t scene, bool passes) {
@@ -111,7 +113,7 @@ int64_t advance(const AdvanceInputs<T>& in, T* share) {
       } else {
         found = failing([&](int64_t row) { return stamp[unit(row)] == round; }, passes);
       }
-      const int64_t left = count(rows, kGrain, [&](int64_t i) {
+      const int64_t left = count(in.whole ? rows : 0, kGrain, [&](int64_t i) {
         return fails(i / in.vertices, stay(in, s, i / in.vertices, vertex(i), last ? 0 : round));
       });
       clean = round == 0 && found + left == 0;

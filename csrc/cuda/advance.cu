@@ -145,7 +145,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
   for (int move = 0; move < kMoves; ++move) {
     s.first = move == 0;
     team.each(scenes, [&](int64_t i) { s.failed[i] = 0; });
-    team.each(units, [&](int64_t i) { begin_move(s, i); });
+    team.each(units, [&](int64_t i) { begin_move(in, s, i); });
     team.sync();
     look(0);
     pairs.begin_move(team, in, s);
@@ -159,7 +159,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
       };
       if (round > 0) look(round);
       pairs.each_failing(team, in, s, last ? 0 : round, [&](int64_t i) { note(in.listed.pairs[kPairRow * i + 5]); });
-      team.each(rows, [&](int64_t i) {
+      team.each(in.whole ? rows : Range{}, [&](int64_t i) {
         const int64_t scene = i / in.vertices;
         if (!stay(in, s, scene, static_cast<int32_t>(i - scene * in.vertices), last ? 0 : round)) note(scene);
       });
