@@ -277,7 +277,7 @@ DIFFVBD_FN void reverse_share(const Leaving<T>& body, const Team& team, const Co
 template <bool energies, class T, class Team>
 DIFFVBD_FN void reverse_body(const Inputs<T>& in, const Body<T>& b, const Team& team, rigid::Iteration* record, T* x,
                              T* y, const Adjoints<T>& a) {
-  if (in.alone != nullptr && in.alone[b.scene * in.bodies.bodies + b.body] != 0) {
+  if (energies && in.alone != nullptr && in.alone[b.scene * in.bodies.bodies + b.body] != 0) {  // planes hold it back
     team.each(b.size(), [&](int32_t i) {
       reverse_alone(in, a, b.scene, b.vertex(i), true);
       a.mass[b.row(b.vertex(i))] = T(0);
