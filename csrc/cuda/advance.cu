@@ -1,6 +1,7 @@
 #include <algorithm>
 
 #include "advance.h"
+#include "clear.h"
 #include "cluster.cuh"
 #include "small_scenes.h"
 
@@ -235,7 +236,7 @@ int64_t advance_workspace_bytes(const AdvanceInputs<T>& in, int64_t capacity) {
 template <class T>
 cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* stuck, void* workspace,
                     int multiprocessors, cudaStream_t stream) {
-  if (auto error = cudaMemsetAsync(stuck, 0, sizeof(*stuck), stream)) return error;
+  if (auto error = clear({{stuck, sizeof(*stuck)}}, stream)) return error;
   const int64_t rows = in.scenes * in.vertices;
   if (rows == 0) return cudaSuccess;
   auto* at = static_cast<uint8_t*>(workspace);
@@ -257,7 +258,7 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
                            found);
   }
   auto* flags = reinterpret_cast<unsigned*>(take(kFlags * sizeof(unsigned)));
-  if (auto error = cudaMemsetAsync(flags, 0, kFlags * sizeof(unsigned), stream)) return error;
+  if (auto error = clear({{flags, kFlags * sizeof(unsigned)}}, stream)) return error;
   AdvanceInputs<T> inputs = in;
   const void* kernel = reinterpret_cast<const void*>(advance_kernel<T>);
   int resident = 0;

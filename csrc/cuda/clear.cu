@@ -22,6 +22,7 @@ __global__ void __launch_bounds__(kThreads) clear_kernel(const __grid_constant__
   for (int64_t i = first; i < wide; i += step) static_cast<uint4*>(own.data)[i] = uint4{};
   const int64_t words = bytes / static_cast<int64_t>(sizeof(uint32_t));
   for (int64_t i = 4 * wide + first; i < words; i += step) static_cast<uint32_t*>(own.data)[i] = 0;
+  for (int64_t i = 4 * words + first; i < bytes; i += step) static_cast<uint8_t*>(own.data)[i] = 0;
 }
 
 }  // namespace

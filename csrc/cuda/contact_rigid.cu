@@ -1,39 +1,18 @@
 // The rigid correction of bodies that touch: what pairs press, which bodies are solved for together, and their motions.
 #include "../contact/rigid_rub.h"
 #include "beside.h"
-#include "contact_rigid.cuh"
+#include "clear.h"
+#include "contact_rigid_rows.cuh"
+#include "small_scenes.h"
 
 namespace diffvbd::cuda {
 namespace {
 
-// The place of a body of a row's scene.
 template <class T>
-__device__ int64_t unit_of(const RigidInputs<T>& in, const PairRoom& room, int64_t row, int32_t body) {
-  const int64_t scene = row < room.listed ? in.gate.listed.pairs[kPairRow * row + 5]
-                                          : in.lagged.pairs[kPairRow * (row - room.listed) + 5];
-  return scene * in.bodies() + body;
-}
-
-// What listed pairs press, the sides of all, and how many each body has.
-template <class T>
-__global__ void __launch_bounds__(kOne) press_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room,
-                                                     int32_t* sides, double* press, int32_t* counts) {
+__global__ void __launch_bounds__(kOne)
+    press_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const __grid_constant__ GroupMemory memory) {
   const int64_t row = own_item();
-  if (!is_row(in, room, row)) return;
-  const CornerPoints<T> at{in, false};
-  PairPress a;
-  bool acts = false;
-  if (row < room.listed) {
-    acts = barrier_press(in, row, at, a);
-    if (acts) store_press(a, press + kPressDoubles * row);
-  } else {
-    acts = lagged_press(in, row - room.listed, at, Slid{}, a, -1);
-  }
-  for (int side = 0; side < 2; ++side) {
-    const int32_t body = acts ? a.body[side] : -1;
-    sides[2 * row + side] = body;
-    if (body >= 0) atomicAdd(counts + 2 * unit_of(in, room, row, body) + (row < room.listed ? 0 : 1), 1);
-  }
+  if (is_row(in, room, row)) press_row(in, room, memory, row);
 }
 
 // Shares memory out for the rows of groups.
@@ -61,15 +40,7 @@ template <class T>
 __global__ void __launch_bounds__(kOne)
     fill_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const __grid_constant__ GroupMemory memory) {
   const int64_t row = own_item();
-  if (!is_row(in, room, row)) return;
-  for (int side = 0; side < 2; ++side) {
-    const int32_t body = memory.sides[2 * row + side];
-    if (body < 0) continue;
-    const int64_t unit = unit_of(in, room, row, body);
-    const int which = row < room.listed ? 0 : 1;
-    const int32_t at = memory.begins[unit] + which * memory.counts[2 * unit];
-    memory.found[at + atomicAdd(memory.filled + 2 * unit + which, 1)] = static_cast<int32_t>(2 * row) + side;
-  }
+  if (is_row(in, room, row)) fill_row(in, room, memory, row);
 }
 
 // Whether groups of more than kFew bodies may move.
@@ -122,9 +93,12 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
   memory.counts = static_cast<int32_t*>(take(counters(bodies) * sizeof(int32_t)));
   memory.filled = memory.counts + 2 * bodies, memory.begins = memory.filled + 2 * bodies;
   memory.taken = memory.begins + bodies;
-  if (auto error = cudaMemsetAsync(memory.counts, 0, counters(bodies) * sizeof(int32_t), stream)) return error;
+  if (in.together() && has_block_each(in.scene.vertices, scenes, rows)) {
+    return solve_few(in, room, memory, true, center, motion, factor, stream);
+  }
+  if (auto error = clear({{memory.counts, counters(bodies) * int64_t{sizeof(int32_t)}}}, stream)) return error;
   const unsigned blocks = blocks_for(rows);
-  if (rows > 0) press_kernel<T><<<blocks, kOne, 0, stream>>>(in, room, memory.sides, memory.press, memory.counts);
+  if (rows > 0) press_kernel<T><<<blocks, kOne, 0, stream>>>(in, room, memory);
   if (!in.together()) {
     void* work = take(groups_bytes(scenes, in.bodies()));
     if (auto error = find_groups(in, room, memory.sides, groups, work, stream)) return error;
@@ -133,7 +107,7 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
     share_kernel<T><<<blocks_for(bodies), kOne, 0, stream>>>(in, memory);
     fill_kernel<T><<<blocks, kOne, 0, stream>>>(in, room, memory);
   }
-  if (!has_many(in)) return solve_few(in, room, memory, center, motion, factor, stream);
+  if (!has_many(in)) return solve_few(in, room, memory, false, center, motion, factor, stream);
   memory.bases = static_cast<double*>(take(scenes * in.matrix_size() * sizeof(double)));
   memory.rubbing = static_cast<double*>(take(room.lagged * kRubScalars * sizeof(double)));
   memory.floors = static_cast<int32_t*>(take(floors_of(in) * sizeof(int32_t)));
@@ -142,7 +116,7 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
   Beside* beside = nullptr;
   if (auto error = Beside::of_device(&beside)) return error;
   if (auto error = beside->fork(stream)) return error;
-  const cudaError_t few = solve_few(in, room, memory, center, motion, factor, beside->stream());
+  const cudaError_t few = solve_few(in, room, memory, false, center, motion, factor, beside->stream());
   const cudaError_t many = solve_groups_of_many(in, room, memory, groups, center, motion, factor, stream);
   const cudaError_t joined = beside->join(stream);  // whatever the errors: memory is given back to `stream`
   return few ? few : many ? many : joined;

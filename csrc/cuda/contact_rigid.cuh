@@ -53,10 +53,10 @@ __device__ bool is_row(const RigidInputs<T>& in, const PairRoom& room, int64_t r
 }
 
 // Motions of bodies and factors of groups: of those with up to kFew bodies, and of larger ones, which are put into the
-// order of their elimination first.
+// order of their elimination first. lists: whether scenes are one group each, whose rows are yet to be listed.
 template <class T>
-cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, double* center,
-                      double* motion, double* factors, cudaStream_t stream);
+cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, bool lists,
+                      double* center, double* motion, double* factors, cudaStream_t stream);
 template <class T>
 cudaError_t solve_groups_of_many(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory,
                                  int32_t* ordered, double* center, double* motion, double* factors,

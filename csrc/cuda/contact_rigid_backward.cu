@@ -1,6 +1,7 @@
 #include <algorithm>
 
 #include "../contact/rigid_reverse.h"
+#include "clear.h"
 #include "clear_rows.cuh"
 #include "contact_rigid.cuh"
 
@@ -12,15 +13,26 @@ static_assert(kWorkParts <= kPartsApart);
 
 constexpr int64_t kBlocksOfPushing = 2048;  // which share the pairs that push, whose number only the device knows
 
-// The listed pairs that push, few of them: how many, and which, in any order.
+// The first row of blocks: the listed pairs that push, few of them: how many, and which, in any order. The second: the
+// lagged pairs.
 template <class T>
-__global__ void __launch_bounds__(kOne) pushing_kernel(const __grid_constant__ RigidInputs<T> in,
-                                                       VirtualMotions<T> given, RigidWork<T> out, int32_t* pushing) {
+__global__ void __launch_bounds__(kOne) rows_kernel(const __grid_constant__ RigidInputs<T> in, VirtualMotions<T> given,
+                                                    RigidWork<T> out, int32_t* pushing) {
   const int64_t row = own_item();
-  if (row >= out.listed) return;
-  const bool pushes = BarrierWork<T>::pushes(in, given, row);
-  out.pushes[row] = pushes, out.by_kappa[row] = T(0);
-  if (pushes) pushing[1 + atomicAdd(pushing, 1)] = static_cast<int32_t>(row);
+  if (blockIdx.y == 0) {
+    if (row >= out.listed) return;
+    const bool pushes = BarrierWork<T>::pushes(in, given, row);
+    out.pushes[row] = pushes, out.by_kappa[row] = T(0);
+    if (pushes) pushing[1 + atomicAdd(pushing, 1)] = static_cast<int32_t>(row);
+    return;
+  }
+  const int64_t count = in.first_lagged(in.scene.scenes);
+  // nobody reads the rows of what is not there: most of what a list has room for
+  clear_rows(out.lag_bar, kLagScalars, count, out.lagged);
+  if (row >= count) return;
+  T *rows = out.friction + 4 * kWorkScalars * row, *lag_bar = out.lag_bar + kLagScalars * row;
+  const LaggedWork<T> work(in, given, row);
+  work.acts ? work.store(rows, lag_bar) : work.store_none(rows, lag_bar);
 }
 
 template <class T>
@@ -34,18 +46,6 @@ __global__ void __launch_bounds__(kOne)
     const BarrierWork<T> work(in, given, row, true);
     work.store(part, out.barrier + 4 * kWorkScalars * row, out.by_kappa + row);
   }
-}
-
-template <class T>
-__global__ void __launch_bounds__(kOne)
-    friction_kernel(const __grid_constant__ RigidInputs<T> in, VirtualMotions<T> given, RigidWork<T> out) {
-  const int64_t row = own_item(), count = in.first_lagged(in.scene.scenes);
-  // nobody reads the rows of what is not there: most of what a list has room for
-  clear_rows(out.lag_bar, kLagScalars, count, out.lagged);
-  if (row >= count) return;
-  T *rows = out.friction + 4 * kWorkScalars * row, *lag_bar = out.lag_bar + kLagScalars * row;
-  const LaggedWork<T> work(in, given, row);
-  work.acts ? work.store(rows, lag_bar) : work.store_none(rows, lag_bar);
 }
 
 // A warp for each corner point.
@@ -121,14 +121,14 @@ cudaError_t rigid_vertices_backward(const RigidInputs<T>& in, const double* moti
 template <class T>
 cudaError_t rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out,
                            const PointWork<T>& sums, int32_t* pushing, cudaStream_t stream) {
+  if (auto error = clear({{pushing, sizeof(*pushing)}}, stream)) return error;
+  const dim3 rows(blocks_for(std::max(out.listed, out.lagged)), out.lagged > 0 ? 2 : 1);
+  if (rows.x > 0) rows_kernel<T><<<rows, kOne, 0, stream>>>(in, given, out, pushing);
   if (out.listed > 0) {
-    if (auto error = cudaMemsetAsync(pushing, 0, sizeof(*pushing), stream)) return error;
-    pushing_kernel<T><<<blocks_for(out.listed), kOne, 0, stream>>>(in, given, out, pushing);
     const auto blocks =
         static_cast<unsigned>(std::min<int64_t>(blocks_for(kPartsApart * out.listed), kBlocksOfPushing));
     barrier_kernel<T><<<blocks, kOne, 0, stream>>>(in, given, out, pushing);
   }
-  if (out.lagged > 0) friction_kernel<T><<<blocks_for(out.lagged), kOne, 0, stream>>>(in, given, out);
   const int64_t points = in.scene.scenes * in.gate.corners;
   if (points > 0) point_kernel<T><<<blocks_for(32 * points), kOne, 0, stream>>>(in, out, sums);
   return cudaGetLastError();

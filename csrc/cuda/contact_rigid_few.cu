@@ -3,6 +3,7 @@
 #include "../contact/rigid_slip.h"
 #include "cholesky.cuh"
 #include "contact_rigid_presses.cuh"
+#include "contact_rigid_rows.cuh"
 
 namespace diffvbd::cuda {
 namespace {
@@ -270,7 +271,7 @@ struct System {
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     few_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const __grid_constant__ GroupMemory memory,
-               double* center, double* motion, double* factors) {
+               bool lists, double* center, double* motion, double* factors) {
   __shared__ double part[kWarps][kMostSums];
   __shared__ uint8_t touching[kFew * kFew];
   __shared__ Pivots pivots;
@@ -304,14 +305,16 @@ __global__ void __launch_bounds__(kThreads)
                          slots};
   team.each(size, [&](int32_t i) { system.unknown(system.motion, i) = 0; });
   if (!in.moves(scene, groups, first)) {
-    for (int32_t b = 0; b < count; ++b) {
-      const Whole whole = whole_of(system.body(b), team);
-      if (threadIdx.x == 0) rigid::put(system.center + 3 * system.member(b), whole.center);
+    for (auto b = static_cast<int32_t>(threadIdx.x / 32); b < count; b += kWarps) {
+      const Tile<32> warp;
+      const Whole whole = whole_of(system.body(b), warp);
+      if (warp.leads()) rigid::put(system.center + 3 * system.member(b), whole.center);
     }
     if (threadIdx.x == 0) *factor = CUDART_NAN;  // which makes no number of all that is solved with it
     return;
   }
   team.each(count * count, [&](int32_t i) { touching[i] = 0; });
+  if (lists) list_rows(in, room, memory, team, scene);
   team.meet();
   const Barriers<T> barriers{memory.sides, memory.press};
   const Rubs<T> rubs{in, room.listed, {system.center, system.motion}};
@@ -333,16 +336,16 @@ __global__ void __launch_bounds__(kThreads)
 }  // namespace
 
 template <class T>
-cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, double* center,
-                      double* motion, double* factors, cudaStream_t stream) {
+cudaError_t solve_few(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, bool lists,
+                      double* center, double* motion, double* factors, cudaStream_t stream) {
   const auto blocks = static_cast<unsigned>(in.scene.scenes * (in.together() ? 1 : in.bodies()));
-  few_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room, memory, center, motion, factors);
+  few_kernel<T><<<blocks, kThreads, 0, stream>>>(in, room, memory, lists, center, motion, factors);
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                    \
-  template cudaError_t solve_few<T>(const RigidInputs<T>&, const PairRoom&, const GroupMemory&, double*, double*, \
-                                    double*, cudaStream_t);
+#define DIFFVBD_INSTANTIATE(T)                                                                                 \
+  template cudaError_t solve_few<T>(const RigidInputs<T>&, const PairRoom&, const GroupMemory&, bool, double*, \
+                                    double*, double*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

@@ -117,28 +117,30 @@ __global__ void __launch_bounds__(kThreads)
   __shared__ Answers answers;
   __shared__ Ballot ballot;
   Cluster cluster = Cluster::all();
-  const int64_t scene = blockIdx.x / cluster.size;
+  const int64_t scene = blockIdx.x / cluster.size, first = scene * in.scene.vertices, unit = scene * in.bodies();
+  const auto vertices = static_cast<int32_t>(in.scene.vertices);
+  bool moves = false;
+  const double* motions = t.motion + kUnknowns * unit;
+  BlockTeam{part}.each(kUnknowns * in.bodies(), [&](int32_t i) { moves = moves || motions[i] != 0; });
+  if (!__syncthreads_or(moves)) {  // a captured step makes all of its corrections, most of which move nothing
+    const int32_t scalars = 3 * vertices;
+    BlockOfScene{{part}, cluster}.each(scalars, [&](int32_t i) { x[3 * first + i] = in.scene.x[3 * first + i]; });
+    if (cluster.rank > 0) return;
+    BlockTeam{part}.each(in.bodies(), [&](int32_t k) { t.share[unit + k] = 1; });
+    __syncthreads();
+    return end_scene(in, t.motion, out, scene);
+  }
   const int64_t repelling = in.first_listed(scene), rubbing = in.first_lagged(scene);
   const auto repels = static_cast<int32_t>(in.first_listed(scene + 1) - repelling);
   const auto rubs = static_cast<int32_t>(in.first_lagged(scene + 1) - rubbing);
   if (cluster.leaves(in.scene.vertices + repels + rubs)) return;
   const BlockOfScene team{{part}, cluster};
-  const int64_t first = scene * in.scene.vertices, unit = scene * in.bodies();
-  const auto vertices = static_cast<int32_t>(in.scene.vertices), warp = static_cast<int32_t>(threadIdx.x / 32);
+  const auto warp = static_cast<int32_t>(threadIdx.x / 32);
   const bool few = in.bodies() <= kWarps, leads = cluster.rank == 0;
   int turn = 0;
-  bool moves = false;
-  const double* motions = t.motion + kUnknowns * unit;
-  team.block.each(kUnknowns * in.bodies(), [&](int32_t i) { moves = moves || motions[i] != 0; });
-  moves = __syncthreads_or(moves);
   team.each(in.bodies(), [&](int32_t k) { begin_body(in, t, unit + k); });
   if (leads && threadIdx.x == 0) t.touches[scene] = t.nears[scene] = 0;
   cluster.meet();
-  if (!moves) {  // a captured step makes all of its corrections, most of which move nothing
-    team.each(vertices, [&](int32_t v) { displace(in, t, first + v, x); });
-    if (leads) end_scene(in, t.motion, out, scene);
-    return;
-  }
   team.each(vertices, [&](int32_t v) { find_way(in, t, first + v); });
   cluster.meet();
   team.each(repels + rubs,

@@ -1,3 +1,6 @@
+#include <algorithm>
+
+#include "detect_list.cuh"
 #include "detect_scan.cuh"
 
 namespace diffvbd::cuda {
@@ -38,6 +41,15 @@ __global__ void list_kernel(const Surfaces<T> in, Workspace<T> work, Detected<T>
   }
 }
 
+// The near pair of a corner point, and the smallest gap of its scene.
+template <class T>
+__device__ void store_corner(const Surfaces<T>& in, const Workspace<T>& work, const Detected<T>& out, int64_t point) {
+  const int64_t scene = point / in.corners;
+  store_near_pair(in, scene, static_cast<int32_t>(point - scene * in.corners), work.near_key[point],
+                  out.near_corners + kNearRow * point, out.near_values + kNearValues * point);
+  lower(work.smallest + scene, work.near_gap[point]);
+}
+
 // ptr, by bisection of the sorted corner points; near pairs; smallest gaps.
 template <class T>
 __global__ void corner_kernel(const Surfaces<T> in, Workspace<T> work, Detected<T> out) {
@@ -53,11 +65,16 @@ __global__ void corner_kernel(const Surfaces<T> in, Workspace<T> work, Detected<
     }
   }
   out.ptr[i] = static_cast<int32_t>(from);
-  if (i == rows) return;
-  const int64_t scene = i / in.corners;
-  store_near_pair(in, scene, static_cast<int32_t>(i - scene * in.corners), work.near_key[i],
-                  out.near_corners + kNearRow * i, out.near_values + kNearValues * i);
-  lower(work.smallest + scene, work.near_gap[i]);
+  if (i < rows) store_corner(in, work, out, i);
+}
+
+// The same and the entries of few pairs, a warp for each corner point.
+template <class T>
+__global__ void __launch_bounds__(kThreads) entry_kernel(const Surfaces<T> in, Workspace<T> work, Detected<T> out) {
+  const int64_t i = own_item() / kWarp, rows = in.scenes * in.corners;
+  if (i > rows) return;
+  list_entries(in, out, i, pairs_of(work, out));
+  if (i < rows && threadIdx.x % kWarp == 0) store_corner(in, work, out, i);
 }
 
 // What a pair's neighbourhood suggests, once the near pairs are there.
@@ -74,6 +91,26 @@ __global__ void finish_kernel(int64_t scenes, Workspace<T> work, Detected<T> out
   if (i != 0) return;
   out.counts[0] = static_cast<int64_t>(*work.listed), out.counts[1] = static_cast<int64_t>(work.touching[0]);
   out.counts[2] = static_cast<int64_t>(work.touching[1]), out.counts[3] = 0;  // kNoKey is -1
+}
+
+// Rows and entries of many pairs, sorted; what each corner point has.
+template <class T>
+cudaError_t sort_list(const Surfaces<T>& in, const Workspace<T>& work, const Detected<T>& out, cudaStream_t stream) {
+  const int64_t rows = in.scenes * in.corners, capacity = out.capacity;
+  if (capacity > 0) {
+    size_t bytes = work.sort_bytes;
+    if (auto error = cub::DeviceRadixSort::SortKeys(work.sort, bytes, work.keys, work.sorted_keys, capacity, 0,
+                                                    bits_of(in.keys()), stream))
+      return error;
+    list_kernel<<<blocks_for(capacity), kThreads, 0, stream>>>(in, work, out);
+    bytes = work.sort_bytes;
+    if (auto error =
+            cub::DeviceRadixSort::SortPairs(work.sort, bytes, work.points, work.sorted_points, work.entries, out.entry,
+                                            4 * capacity, 0, bits_of(static_cast<uint64_t>(rows)), stream))
+      return error;
+  }
+  corner_kernel<<<blocks_for(rows + 1), kThreads, 0, stream>>>(in, work, out);
+  return cudaSuccess;
 }
 
 }  // namespace
@@ -98,20 +135,14 @@ cudaError_t detect(const Surfaces<T>& in, const Detected<T>& out, void* memory, 
     launch_scan<T, false>(in, work, capacity, stream);
     launch_scan<T, true>(in, work, capacity, stream);
   }
-  if (capacity > 0) {
-    settle_kernel<<<blocks_for(kCandidates * capacity), kThreads, 0, stream>>>(in, work, capacity);
-    size_t bytes = work.sort_bytes;
-    if (auto error = cub::DeviceRadixSort::SortKeys(work.sort, bytes, work.keys, work.sorted_keys, capacity, 0,
-                                                    bits_of(in.keys()), stream))
-      return error;
-    list_kernel<<<blocks_for(capacity), kThreads, 0, stream>>>(in, work, out);
-    bytes = work.sort_bytes;
-    if (auto error =
-            cub::DeviceRadixSort::SortPairs(work.sort, bytes, work.points, work.sorted_points, work.entries, out.entry,
-                                            4 * capacity, 0, bits_of(static_cast<uint64_t>(rows)), stream))
-      return error;
+  if (capacity > 0) settle_kernel<<<blocks_for(kCandidates * capacity), kThreads, 0, stream>>>(in, work, capacity);
+  if (is_counted(in, capacity)) {
+    const unsigned blocks = std::min(kRankBlocks, static_cast<unsigned>(blocks_for(kWarp * capacity)));
+    rank_kernel<<<blocks, kThreads, 0, stream>>>(in, work, out);
+    entry_kernel<<<blocks_for(kWarp * (rows + 1)), kThreads, 0, stream>>>(in, work, out);
+  } else {
+    if (auto error = sort_list(in, work, out, stream)) return error;
   }
-  corner_kernel<<<blocks_for(rows + 1), kThreads, 0, stream>>>(in, work, out);
   if (capacity > 0) hint_kernel<<<blocks_for(capacity), kThreads, 0, stream>>>(in, out);
   finish_kernel<<<blocks_for(in.scenes + 1), kThreads, 0, stream>>>(in.scenes, work, out);
   return cudaGetLastError();

@@ -68,7 +68,7 @@ def test_several_adjoints_of_one_fused_step() -> None:
 
     together = torch.func.vmap(one)(weights)
     apart = torch.stack([one(w) for w in weights])
-    assert apart.any() and torch.equal(together, apart)
+    assert apart.any() and relative_error(together, apart) <= tolerance("adjoint")
 
 
 @pytest.mark.parametrize("regime", ("thread", "block", "grid", "color"))

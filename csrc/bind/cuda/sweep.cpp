@@ -92,7 +92,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> sweep(DIFFVBD_PARAMETERS(SWEEP) const
     const cudaStream_t stream = current_stream(from);
     Tensor x = empty(from, {in.scenes, v, 3}), tape = empty(from, cuda::tape_shape(host, in, launch));
     const Tensor cut = empty(from, diffvbd::cut_shape(in, v), ScalarType::Byte);
-    if (cut.numel()) check(cudaMemsetAsync(cut.data_ptr(), 0, cut.numel(), stream), "memset");
+    check(cuda::clear({{cut.data_ptr(), cut.numel()}}, stream), "memory");
     const Tensor corrections = empty(from, corrections_shape(given));
     given.coarse.tape = data<T>(corrections);
     const Tensor work = cuda::workspace<T>(from, host, in, nullptr, choice);

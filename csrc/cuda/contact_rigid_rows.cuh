@@ -1,0 +1,78 @@
+// Which rows of pairs the groups of a rigid correction have: what each presses, and its place in the list of its
+// bodies.
+#pragma once
+
+#include "../contact/rigid_rub.h"
+#include "contact_rigid.cuh"
+
+namespace diffvbd::cuda {
+namespace {
+
+// The place of a body of a row's scene.
+template <class T>
+__device__ int64_t unit_of(const RigidInputs<T>& in, const PairRoom& room, int64_t row, int32_t body) {
+  const int64_t scene = row < room.listed ? in.gate.listed.pairs[kPairRow * row + 5]
+                                          : in.lagged.pairs[kPairRow * (row - room.listed) + 5];
+  return scene * in.bodies() + body;
+}
+
+// What a listed pair presses, the sides of a row, and that its bodies have one more.
+template <class T>
+__device__ void press_row(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, int64_t row) {
+  const CornerPoints<T> at{in, false};
+  PairPress a;
+  bool acts = false;
+  if (row < room.listed) {
+    acts = barrier_press(in, row, at, a);
+    if (acts) store_press(a, memory.press + kPressDoubles * row);
+  } else {
+    acts = lagged_press(in, row - room.listed, at, Slid{}, a, -1);
+  }
+  for (int side = 0; side < 2; ++side) {
+    const int32_t body = acts ? a.body[side] : -1;
+    memory.sides[2 * row + side] = body;
+    if (body >= 0) atomicAdd(memory.counts + 2 * unit_of(in, room, row, body) + (row < room.listed ? 0 : 1), 1);
+  }
+}
+
+// Puts a row where its bodies have theirs.
+template <class T>
+__device__ void fill_row(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, int64_t row) {
+  for (int side = 0; side < 2; ++side) {
+    const int32_t body = memory.sides[2 * row + side];
+    if (body < 0) continue;
+    const int64_t unit = unit_of(in, room, row, body);
+    const int which = row < room.listed ? 0 : 1;
+    const int32_t at = memory.begins[unit] + which * memory.counts[2 * unit];
+    memory.found[at + atomicAdd(memory.filled + 2 * unit + which, 1)] = static_cast<int32_t>(2 * row) + side;
+  }
+}
+
+// Both, for a scene that is one group, by its block.
+template <class T, class Team>
+__device__ void list_rows(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, const Team& team,
+                          int64_t scene) {
+  const int32_t n = in.bodies();
+  const int64_t unit = scene * n, listed = in.first_listed(scene), lagged = in.first_lagged(scene);
+  const auto repels = static_cast<int32_t>(in.first_listed(scene + 1) - listed);
+  const auto rubs = static_cast<int32_t>(in.first_lagged(scene + 1) - lagged);
+  const auto each = [&](const auto& f) {
+    team.each(repels + rubs, [&](int32_t i) { f(i < repels ? listed + i : room.listed + lagged + i - repels); });
+    team.meet();
+  };
+  team.each(2 * n, [&](int32_t i) { memory.counts[2 * unit + i] = memory.filled[2 * unit + i] = 0; });
+  team.meet();
+  each([&](int64_t row) { press_row(in, room, memory, row); });
+  if (team.leads()) {
+    auto at = static_cast<int32_t>(2 * (listed + lagged));  // of each row a scene has two entries at most
+    for (int32_t b = 0; b < n; ++b) {
+      memory.begins[unit + b] = at;
+      at += memory.counts[2 * (unit + b)] + memory.counts[2 * (unit + b) + 1];
+    }
+  }
+  team.meet();
+  each([&](int64_t row) { fill_row(in, room, memory, row); });
+}
+
+}  // namespace
+}  // namespace diffvbd::cuda
