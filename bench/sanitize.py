@@ -24,6 +24,8 @@ from diffvbd import mesh
 DEVICE = "cuda"
 TOOLS = ("memcheck", "racecheck", "initcheck", "synccheck")
 SUMMARY = re.compile(r"(?:ERROR SUMMARY: (\d+) error|RACECHECK SUMMARY: (\d+) hazard)")
+STEPS, SWEEPS = 2, 3
+LESS = {"racecheck": (1, 2)}  # steps and sweeps of a tool that takes minutes for more
 LONGEST = 230  # [s] of a tool and a scene
 WORKERS = 14  # processes side by side: each keeps one core and little of the device busy
 Scene = Callable[[], tuple[dv.Model, Tensor, dict[str, Any]]]
@@ -84,8 +86,8 @@ SCENES: dict[str, Scene] = {
 }
 
 
-def step_of(scene: Scene) -> None:
-    """Two steps and their gradients with respect to state and material, with each tape."""
+def step_of(scene: Scene, steps: int, sweeps: int) -> None:
+    """Some steps and their gradients with respect to state and material, with each tape."""
     model, v, options = scene()
     x = model.rest_points.expand_as(v).clone()
     tapes = ("full",) if model.touches else ("full", "compact", "recompute")
@@ -93,8 +95,8 @@ def step_of(scene: Scene) -> None:
         leaves = [t.clone().requires_grad_() for t in (x, v, x.new_full((1, model.num_tets), 1e5))]
         now, speed, mu = leaves
         with dv.regime(options["regime"]):
-            for _ in range(2):
-                now, speed = dv.step(model, now, speed, mu=mu, lam=1e5, time_step=0.005, sweeps=3,
+            for _ in range(steps):
+                now, speed = dv.step(model, now, speed, mu=mu, lam=1e5, time_step=0.005, sweeps=sweeps,
                                      adjoint=dv.ReverseSweep(tape))  # fmt: skip
             gradients = torch.autograd.grad((now - x).square().sum(), leaves)
         assert all(bool(g.abs().max() > 0) for g in gradients)
@@ -120,8 +122,9 @@ def run(quick: bool, device: str = DEVICE, only: str = "") -> dict[str, Any]:
 
 def _of_process(tool: str, name: str, device: str) -> dict[str, Any]:
     """What a tool finds in a scene; None: it takes too long."""
+    counts = [str(count) for count in LESS.get(tool, (STEPS, SWEEPS))]
     command = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", sys.executable, "-m", "bench.sanitize",
-               device, name]  # fmt: skip
+               device, *counts, name]  # fmt: skip
     try:
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=LONGEST,
                               check=False)  # fmt: skip
@@ -152,9 +155,9 @@ def markdown(results: dict[str, Any]) -> str:
 def main(arguments: list[str]) -> None:
     """The scenes themselves, inside a tool."""
     global DEVICE
-    DEVICE = arguments[0]
-    for name in arguments[1:]:
-        step_of(SCENES[name])
+    DEVICE, steps, sweeps = arguments[0], *map(int, arguments[1:3])
+    for name in arguments[3:]:
+        step_of(SCENES[name], steps, sweeps)
         print(f"done {name}", flush=True)
 
 

@@ -347,8 +347,9 @@ DIFFVBD_FN bool stay(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64
   return false;
 }
 
+// What is tried next where `now` of what is left does not pass.
 template <class T>
-DIFFVBD_FN T less_than(T now) {
+DIFFVBD_FN T next_try(T now) {
   return T(kLeastTry) < now ? T(0.5) * now : T(0);
 }
 
@@ -358,7 +359,7 @@ DIFFVBD_FN bool retreat(const AdvanceState<T>& s, int64_t unit, int round) {
   if (!s.blocked[unit]) return false;
   s.blocked[unit] = 0;
   s.stamp[unit] = static_cast<uint8_t>(round + 1);
-  s.now[unit] = round < kPatience ? less_than(s.now[unit]) : T(0);
+  s.now[unit] = round < kPatience ? next_try(s.now[unit]) : T(0);
   return true;
 }
 
@@ -366,10 +367,10 @@ template <class T>
 DIFFVBD_FN void begin_move(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t unit) {
   if (s.first) s.share[unit] = T(0);
   T now = T(1);
-  if (!in.whole) {  // rooms are balls: what is within them at some share is so at any smaller one
+  if (!in.whole) {  // rooms are balls: at smaller shares it is no farther out than at this one or now
     const int64_t scene = in.scene_of_unit(unit);
     const auto v = static_cast<int32_t>(unit - scene * in.vertices);
-    while (!in.held[v] && T(0) < now && !is_within_rooms(in, scene, v, total(s.share[unit], now))) now = less_than(now);
+    while (!in.held[v] && T(0) < now && !is_within_rooms(in, scene, v, total(s.share[unit], now))) now = next_try(now);
   }
   s.now[unit] = now, s.blocked[unit] = s.stamp[unit] = 0;
 }

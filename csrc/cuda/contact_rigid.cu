@@ -1,18 +1,18 @@
 // The rigid correction of bodies that touch: what pairs press, which bodies are solved for together, and their motions.
-#include "../contact/rigid_rub.h"
 #include "beside.h"
 #include "clear.h"
 #include "contact_rigid_rows.cuh"
-#include "small_scenes.h"
 
 namespace diffvbd::cuda {
 namespace {
 
 template <class T>
-__global__ void __launch_bounds__(kOne)
-    press_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const __grid_constant__ GroupMemory memory) {
+__global__ void __launch_bounds__(kOne) press_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room,
+                                                     const __grid_constant__ GroupMemory memory, bool counts) {
   const int64_t row = own_item();
-  if (is_row(in, room, row)) press_row(in, room, memory, row);
+  if (!is_row(in, room, row)) return;
+  press_row(in, room, memory, row);
+  if (counts) count_row(in, room, memory, row);
 }
 
 // Shares memory out for the rows of groups.
@@ -48,6 +48,8 @@ template <class T>
 bool has_many(const RigidInputs<T>& in) {
   return !in.together() && in.room > kFew;
 }
+
+constexpr int64_t kRowsOfBlock = 16384;  // of a scene whose block lists them
 
 // Numbers that are counted up from zero, of so many bodies.
 int64_t counters(int64_t bodies) { return 5 * bodies + 1; }
@@ -93,12 +95,13 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
   memory.counts = static_cast<int32_t*>(take(counters(bodies) * sizeof(int32_t)));
   memory.filled = memory.counts + 2 * bodies, memory.begins = memory.filled + 2 * bodies;
   memory.taken = memory.begins + bodies;
-  if (in.together() && has_block_each(in.scene.vertices, scenes, rows)) {
-    return solve_few(in, room, memory, true, center, motion, factor, stream);
+  const bool lists = in.together() && rows <= kRowsOfBlock * scenes;  // a block of each scene does
+  if (!lists) {
+    if (auto error = clear({{memory.counts, counters(bodies) * int64_t{sizeof(int32_t)}}}, stream)) return error;
   }
-  if (auto error = clear({{memory.counts, counters(bodies) * int64_t{sizeof(int32_t)}}}, stream)) return error;
   const unsigned blocks = blocks_for(rows);
-  if (rows > 0) press_kernel<T><<<blocks, kOne, 0, stream>>>(in, room, memory);
+  if (rows > 0) press_kernel<T><<<blocks, kOne, 0, stream>>>(in, room, memory, !lists);
+  if (lists) return solve_few(in, room, memory, true, center, motion, factor, stream);
   if (!in.together()) {
     void* work = take(groups_bytes(scenes, in.bodies()));
     if (auto error = find_groups(in, room, memory.sides, groups, work, stream)) return error;

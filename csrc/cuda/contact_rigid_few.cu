@@ -4,6 +4,7 @@
 #include "cholesky.cuh"
 #include "contact_rigid_presses.cuh"
 #include "contact_rigid_rows.cuh"
+#include "small_scenes.h"
 
 namespace diffvbd::cuda {
 namespace {
@@ -305,10 +306,14 @@ __global__ void __launch_bounds__(kThreads)
                          slots};
   team.each(size, [&](int32_t i) { system.unknown(system.motion, i) = 0; });
   if (!in.moves(scene, groups, first)) {
-    for (auto b = static_cast<int32_t>(threadIdx.x / 32); b < count; b += kWarps) {
-      const Tile<32> warp;
-      const Whole whole = whole_of(system.body(b), warp);
-      if (warp.leads()) rigid::put(system.center + 3 * system.member(b), whole.center);
+    const auto find_center = [&](int32_t b, const auto& by) {
+      const Whole whole = whole_of(system.body(b), by);
+      if (by.leads()) rigid::put(system.center + 3 * system.member(b), whole.center);
+    };
+    if (in.scene.vertices <= kSmallScene) {
+      for (auto b = static_cast<int32_t>(threadIdx.x / 32); b < count; b += kWarps) find_center(b, Tile<32>());
+    } else {
+      for (int32_t b = 0; b < count; ++b) find_center(b, team);
     }
     if (threadIdx.x == 0) *factor = CUDART_NAN;  // which makes no number of all that is solved with it
     return;

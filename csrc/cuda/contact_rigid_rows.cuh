@@ -16,7 +16,17 @@ __device__ int64_t unit_of(const RigidInputs<T>& in, const PairRoom& room, int64
   return scene * in.bodies() + body;
 }
 
-// What a listed pair presses, the sides of a row, and that its bodies have one more.
+// Calls f(side, place of the body) for the bodies that a row acts on.
+template <class T, class F>
+__device__ void each_side(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, int64_t row,
+                          const F& f) {
+  for (int side = 0; side < 2; ++side) {
+    const int32_t body = memory.sides[2 * row + side];
+    if (body >= 0) f(side, unit_of(in, room, row, body));
+  }
+}
+
+// What a listed pair presses, and the sides of a row.
 template <class T>
 __device__ void press_row(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, int64_t row) {
   const CornerPoints<T> at{in, false};
@@ -28,27 +38,27 @@ __device__ void press_row(const RigidInputs<T>& in, const PairRoom& room, const 
   } else {
     acts = lagged_press(in, row - room.listed, at, Slid{}, a, -1);
   }
-  for (int side = 0; side < 2; ++side) {
-    const int32_t body = acts ? a.body[side] : -1;
-    memory.sides[2 * row + side] = body;
-    if (body >= 0) atomicAdd(memory.counts + 2 * unit_of(in, room, row, body) + (row < room.listed ? 0 : 1), 1);
-  }
+  for (int side = 0; side < 2; ++side) memory.sides[2 * row + side] = acts ? a.body[side] : -1;
+}
+
+// That the bodies of a row have one more.
+template <class T>
+__device__ void count_row(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, int64_t row) {
+  each_side(in, room, memory, row,
+            [&](int, int64_t unit) { atomicAdd(memory.counts + 2 * unit + (row < room.listed ? 0 : 1), 1); });
 }
 
 // Puts a row where its bodies have theirs.
 template <class T>
 __device__ void fill_row(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, int64_t row) {
-  for (int side = 0; side < 2; ++side) {
-    const int32_t body = memory.sides[2 * row + side];
-    if (body < 0) continue;
-    const int64_t unit = unit_of(in, room, row, body);
+  each_side(in, room, memory, row, [&](int side, int64_t unit) {
     const int which = row < room.listed ? 0 : 1;
     const int32_t at = memory.begins[unit] + which * memory.counts[2 * unit];
     memory.found[at + atomicAdd(memory.filled + 2 * unit + which, 1)] = static_cast<int32_t>(2 * row) + side;
-  }
+  });
 }
 
-// Both, for a scene that is one group, by its block.
+// count_row() and fill_row() for all rows of a scene that is one group, by its block.
 template <class T, class Team>
 __device__ void list_rows(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, const Team& team,
                           int64_t scene) {
@@ -62,7 +72,7 @@ __device__ void list_rows(const RigidInputs<T>& in, const PairRoom& room, const 
   };
   team.each(2 * n, [&](int32_t i) { memory.counts[2 * unit + i] = memory.filled[2 * unit + i] = 0; });
   team.meet();
-  each([&](int64_t row) { press_row(in, room, memory, row); });
+  each([&](int64_t row) { count_row(in, room, memory, row); });
   if (team.leads()) {
     auto at = static_cast<int32_t>(2 * (listed + lagged));  // of each row a scene has two entries at most
     for (int32_t b = 0; b < n; ++b) {

@@ -68,7 +68,7 @@ __global__ void corner_kernel(const Surfaces<T> in, Workspace<T> work, Detected<
   if (i < rows) store_corner(in, work, out, i);
 }
 
-// The same and the entries of few pairs, a warp for each corner point.
+// Of few pairs: what corner_kernel() does, and the entries, by a warp for each corner point.
 template <class T>
 __global__ void __launch_bounds__(kThreads) entry_kernel(const Surfaces<T> in, Workspace<T> work, Detected<T> out) {
   const int64_t i = own_item() / kWarp, rows = in.scenes * in.corners;
@@ -140,8 +140,8 @@ cudaError_t detect(const Surfaces<T>& in, const Detected<T>& out, void* memory, 
     const unsigned blocks = std::min(kRankBlocks, static_cast<unsigned>(blocks_for(kWarp * capacity)));
     rank_kernel<<<blocks, kThreads, 0, stream>>>(in, work, out);
     entry_kernel<<<blocks_for(kWarp * (rows + 1)), kThreads, 0, stream>>>(in, work, out);
-  } else {
-    if (auto error = sort_list(in, work, out, stream)) return error;
+  } else if (auto error = sort_list(in, work, out, stream)) {
+    return error;
   }
   if (capacity > 0) hint_kernel<<<blocks_for(capacity), kThreads, 0, stream>>>(in, out);
   finish_kernel<<<blocks_for(in.scenes + 1), kThreads, 0, stream>>>(in.scenes, work, out);

@@ -63,7 +63,7 @@ __device__ void list_entries(const Surfaces<T>& in, const Detected<T>& out, int6
     for (int k = 0; k < 4; ++k) before += 0 <= points[k] && points[k] < point ? 1 : 0;
   });
   before = __reduce_add_sync(kWholeWarp, before);
-  const unsigned lane = threadIdx.x % kWarp, lower = (1u << lane) - 1;
+  const unsigned lane = threadIdx.x % kWarp, lanes_before = (1u << lane) - 1;
   if (lane == 0) out.ptr[point] = static_cast<int32_t>(before);
   if (point == in.scenes * in.corners) return;
   int32_t* to = out.entry + before;
@@ -71,7 +71,7 @@ __device__ void list_entries(const Surfaces<T>& in, const Detected<T>& out, int6
     int place = 0, found = 0;
     for (int k = 0; k < 4; ++k) {
       const unsigned has = __ballot_sync(kWholeWarp, points[k] == point);
-      place += __popc(has & lower), found += __popc(has);
+      place += __popc(has & lanes_before), found += __popc(has);
     }
     for (int k = 0; k < 4; ++k) {
       if (points[k] == point) to[place++] = 4 * pair + k;

@@ -19,7 +19,7 @@ FEW_LANES, SOME_LANES, SOME_REVERSE_LANES, MANY_LANES = 2, 8, 4, 32
 SMALL_MESH = 64
 
 # Where one regime overtakes another on an H100: the table "regimes" of docs/performance.md.
-FEWEST_VERTICES = 8  # up to here a scene per thread beats all others, however few scenes there are
+THREAD_VERTICES = 8  # up to here a scene per thread is the fastest or within 5 % of it, however few scenes there are
 THREAD_SCENES = 4096  # of larger scenes: below, a scene per thread leaves most of the device idle
 TINY_VERTICES = 32  # up to here a scene per thread or, of fewer scenes, per block beats whatever spreads a scene out
 BLOCK_SCENES = 256  # of larger scenes: below, a scene per block leaves multiprocessors idle
@@ -85,7 +85,7 @@ def choose(vertices: int, colors: int, scenes: int, contact: bool = False, corre
 
 def _automatic(vertices: int, scenes: int) -> int:
     if vertices <= TINY_VERTICES:
-        return THREAD if vertices <= FEWEST_VERTICES or scenes >= THREAD_SCENES else BLOCK
+        return THREAD if vertices <= THREAD_VERTICES or scenes >= THREAD_SCENES else BLOCK
     if vertices <= BLOCK_VERTICES and scenes >= BLOCK_SCENES:
         return BLOCK
     return GRID if vertices * scenes <= GRID_VERTICES else COLOR

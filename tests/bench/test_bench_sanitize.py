@@ -5,10 +5,11 @@ import pytest
 from bench import sanitize
 
 
+@pytest.mark.parametrize("counts", [(sanitize.STEPS, sanitize.SWEEPS), *sanitize.LESS.values()])
 @pytest.mark.parametrize("name", sanitize.SCENES)
-def test_scenes(name: str, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scenes(name: str, counts: tuple[int, int], device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sanitize, "DEVICE", device)
-    sanitize.step_of(sanitize.SCENES[name])
+    sanitize.step_of(sanitize.SCENES[name], *counts)
 
 
 def test_summaries() -> None:

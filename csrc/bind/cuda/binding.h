@@ -91,7 +91,7 @@ class Zeroed {
     spans_.push_back({out.data_ptr(), out.numel() * scalar(), entries, each * scalar()});
     return out;
   }
-  // The same of bytes, a multiple of four each.
+  // The same of bytes.
   Tensor bytes(int64_t pairs, int64_t each, const int32_t* entries) {
     Tensor out = empty(like_, {pairs, each}, ScalarType::Byte);
     spans_.push_back({out.data_ptr(), out.numel(), entries, each});
