@@ -299,7 +299,7 @@ def test_constants_agree_across_languages() -> None:
     floor, anchor = (CSRC / "energies" / f"{name}.h" for name in ("floor_barrier", "anchor"))
     strides = [int(re.findall(r"stride = (\d+);", p.read_text(encoding="utf-8"))[0]) for p in (floor, anchor)]
     assert dv.FloorBarrier(normal=[(0, 1, 0)] * 3).count() == 3 * strides[0]
-    fade = float(*re.findall(r"kFade = ([\d.]+);", code_of(floor)))
+    fade = float(*re.findall(r"kFade = ([\d.]+);", code_of(CSRC / "energies" / "log_barrier.h")))
     assert fade == energies.FADE == reference.energies.FADE
     assert dv.Anchor(1.0).count() == strides[1]
     assert energies.MAX_PLANES * strides[0] + strides[1] <= constant("energies/energies.h", "kMaxEnergyData")

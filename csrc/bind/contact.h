@@ -1,6 +1,7 @@
 // The tensors of contact, as the operators of all backends take them.
 #pragma once
 
+#include "../contact/lag.h"
 #include "../contact/lowest.h"
 #include "../contact/passes.h"
 #include "arguments.h"
@@ -67,6 +68,21 @@ contact::ContactInputs<T> lag_inputs(const Tensor& x, const Tensor& origin, cons
   require_like("constants", constants, x, pairs.size(0) * contact::kConstants);
   in.constants = data<const T>(constants);
   return in;
+}
+
+// friction, damping [1 | B], or empty.
+template <class T>
+contact::LagCoefficients<T> lag_coefficients(const Tensor& friction, const Tensor& damping, const Tensor& x) {
+  return {batched_or_null<T>("friction", friction, x, x.size(0), 1),
+          batched_or_null<T>("damping", damping, x, x.size(0), 1)};
+}
+
+template <class T>
+contact::RubbingBars<T> rubbing_bars(const Tensor& lag, const Tensor& push, const Tensor& x, int64_t corners,
+                                     int64_t pairs) {
+  if (lag.numel()) require_like("lag_bar", lag, x, pairs * contact::kLagScalars);
+  if (push.numel()) require_like("push_bar", push, x, x.size(0) * corners * 3);
+  return {lag.numel() ? data<const T>(lag) : nullptr, push.numel() ? data<const T>(push) : nullptr, corners};
 }
 
 template <class T>

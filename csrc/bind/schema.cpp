@@ -105,13 +105,23 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
       "frames, Tensor share, Tensor last_share, Tensor planes, Tensor origin, Tensor held, Tensor held_bodies, "
       "Tensor body, Tensor body_order, Tensor body_ptr, float filter_eta, bool wants_planes) -> (Tensor x, "
       "Tensor move, Tensor fall, Tensor u, Tensor left, Tensor planes)");
-  // Normal force, 1 where active, normal and weights of each pair [pairs, 9], and the adjoint of x, collider and kappa
+  // Normal force, 1 where active, normal and weights of each pair [pairs, 9], and the adjoint of where corner points
+  // are [B, N, 3] and of kappa
   m.def(
       "contact_lag(Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor constants, Tensor ptr, "
       "Tensor entry) -> Tensor");
   m.def(
       "contact_lag_backward(Tensor bar, Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor pairs, Tensor "
-      "constants, Tensor ptr, Tensor entry) -> (Tensor x, Tensor collider, Tensor kappa)");
+      "constants, Tensor ptr, Tensor entry) -> (Tensor points, Tensor kappa)");
+  // Friction, damping, normal and weights of each pair [pairs, 9], by the coefficients of its scene, which may be
+  // empty, and the forces of pairs on corner points [B, N, 3]; the adjoint, of which either bar may be empty
+  m.def(
+      "contact_rubbing(Tensor x, Tensor origin, Tensor collider, Tensor kappa, Tensor friction, Tensor damping, Tensor "
+      "pairs, Tensor constants, Tensor ptr, Tensor entry) -> (Tensor lag, Tensor push)");
+  m.def(
+      "contact_rubbing_backward(Tensor lag_bar, Tensor push_bar, Tensor x, Tensor origin, Tensor collider, Tensor "
+      "kappa, Tensor friction, Tensor damping, Tensor pairs, Tensor constants, Tensor ptr, Tensor entry) -> (Tensor "
+      "points, Tensor kappa, Tensor friction, Tensor damping)");
   // What is left of lift once forces have borne their part of each body's acceleration, see contact/unsupported.h;
   // origin and planes may be empty. The adjoint: of x, empty without planes, lift, force and mass, and of planes by
   // body [scenes, bodies, 7 planes] where wanted.

@@ -1,6 +1,7 @@
 // What friction and damping of a step take from its start: normal force, normal and weights of a pair, and the adjoint.
 #pragma once
 
+#include "../core/views.h"
 #include "pairs.h"
 
 namespace diffvbd::contact {
@@ -35,6 +36,33 @@ DIFFVBD_FN void store_lag(const LagState<T>& a, T* to) {
   for (int i = 0; i < kLagScalars; ++i) to[i] = values[i];
 }
 
+// What share of its damping a pair has by its normal force (diffvbd/energies.py, damped_share), and its derivatives.
+template <class T>
+struct DampedShare {
+  T value = T(0), by_force = T(0), by_kappa = T(0);
+  DIFFVBD_FN DampedShare(T force, T kappa, T dhat) {
+    const T half = T(fade()) * dhat, whole = force + half * kappa;
+    if (!(T(0) < whole)) return;  // without a barrier there is no damping
+    value = force / whole, by_force = half * kappa / (whole * whole), by_kappa = -force * half / (whole * whole);
+  }
+};
+
+// Coefficients of friction and damping of each scene; null without.
+template <class T>
+struct LagCoefficients {
+  Batched<const T> friction, damping;  // [B]
+  DIFFVBD_FN T friction_of(int64_t scene) const { return friction.data ? friction.data[scene * friction.scene] : T(0); }
+  DIFFVBD_FN T damping_of(int64_t scene) const { return damping.data ? damping.data[scene * damping.scene] : T(0); }
+};
+
+// What Lag reads of a pair: friction and damping by their coefficients, its normal and weights.
+template <class T>
+DIFFVBD_FN void store_rubbing(const LagState<T>& a, T friction, T damping, T kappa, T dhat, T* to) {
+  const LagState<T> rubs{
+      friction * a.force, damping * DampedShare<T>(a.force, kappa, dhat).value, a.n, {a.w[0], a.w[1], a.w[2], a.w[3]}};
+  store_lag(rubs, to);
+}
+
 // bar: adjoint of what store_lag wrote. Twelve Dual evaluations, once a step.
 template <class T>
 DIFFVBD_FN void reverse_lag(int kind, const Corners<T>& c, const PairConstants<T>& a, T kappa, const T* bar,
@@ -58,5 +86,51 @@ DIFFVBD_FN void reverse_lag(int kind, const Corners<T>& c, const PairConstants<T
     }
   }
 }
+
+// By what a pair's scene has as coefficients, too.
+template <class T>
+struct RubbingAdjoint {
+  PairAdjoint<T> pair;
+  T friction = T(0), damping = T(0);
+};
+
+// bar: adjoint of what store_rubbing() wrote. push: of the pair's force on each corner.
+template <class T>
+DIFFVBD_FN void reverse_rubbing(int kind, const Corners<T>& c, const PairConstants<T>& a, T kappa, T friction,
+                                T damping, const T* bar, const Vec3<T> (&push)[4], RubbingAdjoint<T>& out) {
+  const LagState<T> now = lag_state(kind, c, a, kappa);
+  const DampedShare<T> share(now.force, kappa, a.dhat);
+  T own[kLagScalars] = {friction * bar[0] + damping * bar[1] * share.by_force, T(0)};
+  for (int i = 2; i < kLagScalars; ++i) own[i] = bar[i];
+  for (int k = 0; k < 4; ++k) {
+    const T along = dot(now.n, push[k]);
+    const Vec3<T> by_n = now.force * now.w[k] * push[k];
+    own[0] += now.w[k] * along, own[5 + k] += now.force * along;
+    own[2] += by_n.x, own[3] += by_n.y, own[4] += by_n.z;
+  }
+  reverse_lag(kind, c, a, kappa, own, out.pair);
+  if (!(now.active > T(0))) return;
+  out.pair.kappa += damping * bar[1] * share.by_kappa;
+  out.friction = bar[0] * now.force, out.damping = bar[1] * share.value;
+}
+
+// Those adjoints of all pairs; null where there are none.
+template <class T>
+struct RubbingBars {
+  const T *lag, *push;  // [pairs, 9], [B, corners, 3]
+  int64_t corners;
+  DIFFVBD_FN void reverse(const LagCoefficients<T>& by, int64_t pair, const int32_t* record, const Corners<T>& c,
+                          const PairConstants<T>& a, T kappa, RubbingAdjoint<T>& out) const {
+    const int64_t scene = record[5];
+    T bar[kLagScalars] = {};
+    Vec3<T> push_bar[4] = {};
+    for (int i = 0; i < kLagScalars && lag; ++i) bar[i] = lag[kLagScalars * pair + i];
+    for (int k = 0; k < 4 && push; ++k) {
+      const T* own = push + 3 * (scene * corners + record[k]);
+      push_bar[k] = {own[0], own[1], own[2]};
+    }
+    reverse_rubbing(record[4], c, a, kappa, by.friction_of(scene), by.damping_of(scene), bar, push_bar, out);
+  }
+};
 
 }  // namespace diffvbd::contact

@@ -149,17 +149,16 @@ __global__ void store_contact(const __grid_constant__ StepView<T> s, const __gri
 
 constexpr int kSumThreads = 1024;
 
-// One scalar of the slots of each scene's pairs, one block a scene, in an order fixed by the number of pairs.
+// One scalar of the slots of each scene's pairs, so many of a pair, one block a scene, in an order fixed by the number
+// of pairs.
 template <class T>
-__global__ void __launch_bounds__(kSumThreads)
-    sum_by_scene(const __grid_constant__ ContactInputs<T> in, int64_t base, const T* slots, int stride, T* out) {
+__global__ void __launch_bounds__(kSumThreads) sum_by_scene(const __grid_constant__ ContactInputs<T> in, int64_t base,
+                                                            const T* slots, int each, int stride, T* out) {
   __shared__ T part[kSumThreads];
   const int64_t scene = base + blockIdx.x;
   T sum = T(0);
-  for (int64_t i = in.listed.ptr[scene * in.corners] + static_cast<int64_t>(threadIdx.x);
-       i < in.listed.ptr[(scene + 1) * in.corners]; i += kSumThreads) {
-    sum += slots[i * stride];
-  }
+  const auto first = [&](int64_t of) { return int64_t{in.listed.ptr[of * in.corners]} / 4 * each; };
+  for (int64_t i = first(scene) + threadIdx.x; i < first(scene + 1); i += kSumThreads) sum += slots[i * stride];
   part[threadIdx.x] = sum;
   for (int half = kSumThreads / 2; half > 0; half /= 2) {
     __syncthreads();
@@ -170,9 +169,9 @@ __global__ void __launch_bounds__(kSumThreads)
 
 template <class T>
 cudaError_t launch_sum(int64_t scenes, cudaStream_t stream, const ContactInputs<T>& in, int64_t base, const T* slots,
-                       int stride, T* out) {
+                       int each, int stride, T* out) {
   if (scenes > 0) {
-    sum_by_scene<T><<<static_cast<unsigned>(scenes), kSumThreads, 0, stream>>>(in, base, slots, stride, out);
+    sum_by_scene<T><<<static_cast<unsigned>(scenes), kSumThreads, 0, stream>>>(in, base, slots, each, stride, out);
   }
   return cudaGetLastError();
 }
@@ -234,7 +233,7 @@ template <class T>
 cudaError_t ContactPasses<T>::store(const StepAdjoints<T>& out) const {
   const T *prev = c.slots.prev, *slots = c.slots.kappa;
   if (auto error = launch_contact(store_contact<T>, s.scenes * c.in.corners, stream, s, c.in, out, prev)) return error;
-  return launch_sum(s.scenes, stream, c.in, s.base, slots, 1, out.kappa);
+  return launch_sum(s.scenes, stream, c.in, s.base, slots, 4, 1, out.kappa);
 }
 
 template <class T>

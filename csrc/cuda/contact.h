@@ -1,6 +1,7 @@
 // Contact on the device: launchers of the passes of contact/passes.h, for a chunk of scenes.
 #pragma once
 
+#include "../contact/lag.h"
 #include "../contact/passes.h"
 #include "step.h"
 
@@ -39,12 +40,21 @@ cudaError_t sum_lag(const contact::ContactInputs<T>& in, int64_t scenes, const c
                     int64_t pairs, T* lag, cudaStream_t stream);
 
 // contact_lag and its adjoint; `pairs` that the list has room for, `count` on the device at ptr[scenes corners]. The
-// reverse writes `slots` [4 pairs, 4] (x, y, z and kappa of each corner) and then adds them up by corner point.
+// reverse writes `slots` [pairs, kLagSlots], for each corner three scalars and one of the pair, and adds them up.
+constexpr int kLagSlots = 16;
 template <class T>
 cudaError_t pair_lag(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs, T* values,
                      cudaStream_t stream);
 template <class T>
 cudaError_t pair_lag_backward(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs,
-                              const T* bar, T* slots, T* x_bar, T* collider_bar, T* kappa_bar, cudaStream_t stream);
+                              const T* bar, T* slots, T* points, T* kappa, cudaStream_t stream);
+// As cpu/contact_lag.cpp's contact_rubbing; friction and damping may be null.
+template <class T>
+cudaError_t rubbing(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by, const T* x,
+                    int64_t scenes, int64_t pairs, T* values, T* slots, T* push, cudaStream_t stream);
+template <class T>
+cudaError_t rubbing_backward(const contact::ContactInputs<T>& in, const contact::LagCoefficients<T>& by,
+                             const contact::RubbingBars<T>& given, const T* x, int64_t scenes, int64_t pairs, T* slots,
+                             T* points, T* kappa, T* friction, T* damping, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -119,9 +119,8 @@ struct FloorBarrier {
   };
   template <class R>
   DIFFVBD_FN static Share<R> share(const Plane<R>& plane, const R& gap) {
-    constexpr double kFade = 0.1;  // twin of FADE in diffvbd/energies.py; device code has no address of a member
     const LogBarrier<R> b(gap, plane.dhat, R(1));
-    const R half = R(kFade) * plane.dhat, inv = R(1) / (half - b.first);
+    const R half = R(fade()) * plane.dhat, inv = R(1) / (half - b.first);
     const auto acts = R(0) < plane.kappa;
     return {select(acts, -b.first * inv, R(0)), select(acts, -b.second * inv * (half * inv), R(0))};
   }

@@ -5,6 +5,13 @@
 
 namespace diffvbd {
 
+// Of kappa dhat: the normal force from which a contact has half of its damping. A function, as device code has no
+// address of a constant.
+DIFFVBD_FN constexpr double fade() {
+  constexpr double kFade = 0.1;  // twin of FADE in diffvbd/energies.py
+  return kFade;
+}
+
 // b(d) = -kappa (d - dhat)^2 log(d / dhat) and its derivatives, zero for d >= dhat
 template <class R>
 struct LogBarrier {

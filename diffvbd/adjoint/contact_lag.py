@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
+from ..ops import Backward, Direct, not_batched
 from ..ops import contact_lag as ops_lag
 from ..ops import contact_start as ops_start
 from ..ops import detect as ops_contact
@@ -38,31 +39,6 @@ def some_of(listed: Pairs, keep: Tensor) -> tuple[Pairs, Tensor]:
     return Pairs(*kept), rows
 
 
-class _RowsOf(Function):
-    """Rows of values [n, c] by number, none of them twice, and zeros for -1. Indexing does the same, but its backward
-    adds up rows one after another that come more than once, as all for -1 would."""
-
-    @staticmethod
-    def forward(values: Tensor, rows: Tensor) -> Tensor:
-        if not len(values):
-            return values
-        return torch.where((rows >= 0)[:, None], values[rows.clamp(min=0)], 0.0)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        ctx.count, ctx.rows = len(inputs[0]), inputs[1]
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple:
-        out = grads[0].new_zeros((ctx.count + 1, *grads[0].shape[1:]))  # the first is for -1
-        return (out.index_copy(0, ctx.rows.long() + 1, grads[0])[1:] if ctx.count else grads[0]), None
-
-
-def rows_of(values: Tensor, rows: Tensor) -> Tensor:
-    """Rows of values [n, c] by number, none of them twice; zeros for -1. Differentiable."""
-    return _RowsOf.apply(values, rows)
-
-
 class _Lag(Function):
     """Normal force, activity, normal and weights of pairs at the start of a step [pairs, 9]."""
 
@@ -78,9 +54,47 @@ class _Lag(Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:
         x, origin, collider, kappa = ctx.saved_tensors
-        bars = ops_lag.lag_backward(grads[0].contiguous(), x, origin, collider, kappa, *ctx.listed)
-        given = (x, collider, kappa)
-        return (*(ops.sum_to(b, t.shape) for b, t in zip(bars, given, strict=True)), None, None)
+        points, by_kappa = ops_lag.lag_backward(grads[0].contiguous(), x, origin, collider, kappa, *ctx.listed)
+        return (*_of_points(points, x, collider), ops.sum_to(by_kappa, kappa.shape), None, None)
+
+
+def _of_points(points: Tensor, x: Tensor, collider: Tensor) -> tuple[Tensor, Tensor]:
+    """The adjoints of vertices and of colliders."""
+    vertices = x.shape[1]
+    return points[:, :vertices], ops.sum_to(points[:, vertices:], collider.shape)
+
+
+class _Rubbing(Direct):
+    """Friction and damping of pairs [pairs, 9], and the forces of pairs on corner points [B, N, 3]."""
+
+    @staticmethod
+    def forward(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor, damping: Tensor, origin: Tensor,
+                listed: Pairs) -> tuple[Tensor, Tensor]:  # fmt: skip
+        return ops_lag.rubbing(x, origin, collider, kappa, friction, damping, *listed)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
+        *tensors, ctx.listed = inputs
+        ctx.save_for_backward(*tensors)
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple:
+        saved = ctx.saved_tensors  # once: a checkpoint gives them once
+        for bar in grads:
+            if bar is not None:
+                not_batched(bar)
+        bars = (saved[0].new_empty((0,)) if bar is None else bar for bar in grads)
+        return (*_RubbingBackward.apply(*bars, *saved, ctx.listed), None, None)
+
+
+class _RubbingBackward(Backward):
+    @staticmethod
+    def forward(lag_bar, push_bar, x, collider, kappa, friction, damping, origin, listed):
+        points, *of_scenes = ops_lag.rubbing_backward(lag_bar.contiguous(), push_bar.contiguous(), x, origin, collider,
+                                                      kappa, friction, damping, *listed)  # fmt: skip
+        sums = (ops.sum_to(b, t.shape) for b, t in zip(of_scenes, (kappa, friction, damping), strict=True))
+        return (*_of_points(points, x, collider), *sums)
 
 
 class _AtCorners(Function):
@@ -166,4 +180,17 @@ def pair_lag(x: Tensor, collider: Tensor, kappa: Tensor, origin: Tensor, listed:
     return _Lag.apply(x.contiguous(), collider.contiguous(), kappa.contiguous(), origin, listed)
 
 
-ops.ready_signature(_Lag, _RowsOf, _OfScene, _AtCorners, _SumAtCorners)
+def rubbing(x: Tensor, collider: Tensor, kappa: Tensor, friction: Tensor, damping: Tensor, origin: Tensor,
+            listed: Pairs) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """[pairs, 9]: friction coefficient times normal force [N], damping [N s/m] (energies.damped_share), normal (3),
+    weights (4); and the forces of pairs on corner points [B, N, 3] [N]. Differentiable in the first five.
+
+    Args:
+        x: [B, V, 3] [m].  collider: [B, Vc, 3] [m].  kappa: [1 | B] [N/m].  friction, damping: [1 | B], or empty.
+        origin: [B, V, 3] or empty.
+    """
+    given = (t.contiguous() for t in (x, collider, kappa, friction, damping))
+    return _Rubbing.apply(*given, origin, listed)
+
+
+ops.ready_signature(_Lag, _OfScene, _AtCorners, _SumAtCorners)

@@ -11,13 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..adjoint.contact_lag import Pairs, no_pairs, of_scene, pair_lag, rows_of, some_of
+from ..adjoint.contact_lag import Pairs, no_pairs, rubbing, some_of
 from ..adjoint.rise import RiseParts, rise_parts, rises
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
 from ..contact.start import PartStart, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
-from ..energies import damped_share
 from ..model.model import Model
 from ..model.tet_shapes import inside_out
 from ..ops import SweepSettings, broadcast
@@ -96,27 +95,19 @@ class ContactStep:
         normal = broadcast(normal[:, None], (*size.shape, 3))
         return torch.cat([size[..., None], normal], -1)
 
-    def _set_lag(self, listed: Pairs, collider: Tensor) -> None:
-        """Friction and damping of the pairs at the start of the step."""
-        barrier, friction = self.barrier, self.model.friction
-        damped = "pair_barrier.damping" in self.prepared.parameters or (barrier is not None and barrier.damping > 0)
-        if barrier is None or not (damped or friction is not None):
-            return
-        state = pair_lag(self.begun.x_prev, collider, self.kappa, self.origin, listed)
-        force, active, rest = state.split((1, 1, 7), -1)
-        dhat = listed.constants[:, :1]
-
-        def of_pair(value: Tensor) -> Tensor:
-            return broadcast(value[:, None], force.shape) if value.shape[0] == 1 else of_scene(value, listed)[:, None]
-
-        rubs = drags = torch.zeros_like(force)
-        if friction is not None:
-            rubs = of_pair(self._parameter("friction.coefficient")) * force
-        if damped:
-            drags = of_pair(self._parameter("pair_barrier.damping")) * damped_share(force, of_pair(self.kappa), dhat)
-        lag = torch.cat([rubs, drags, rest], -1)
-        listed, rows = some_of(listed, (active[:, 0] != 0).contiguous())
-        self.lagged, self.lag = listed, rows_of(lag, rows)
+    def _set_lag(self, listed: Pairs, collider: Tensor) -> Tensor:
+        """Friction and damping of the pairs at the start of the step; returns the forces of these on corner points
+        [B, N, 3] [N]."""
+        damped = "pair_barrier.damping" in self.prepared.parameters or (
+            self.barrier is not None and self.barrier.damping > 0
+        )
+        none = self.kappa.new_empty((0,))
+        friction = none if self.model.friction is None else self._parameter("friction.coefficient")
+        damping = self._parameter("pair_barrier.damping") if damped else none
+        lag, push = rubbing(self.begun.x_prev, collider, self.kappa, friction, damping, self.origin, listed)
+        if damped or self.model.friction is not None:
+            self.lagged, self.lag = listed, lag
+        return push
 
     @staticmethod
     def _reads(x: Tensor) -> bool:
@@ -124,9 +115,7 @@ class ContactStep:
         return not x.is_cuda
 
     def _pushing(self, listed: Pairs) -> Pairs:
-        """The pairs that may push where the list was made, if that may be read: the same of a scene in any batch."""
-        if not self._reads(self.x_prev):
-            return listed
+        """The pairs that may push where the list was made: the same of a scene in any batch."""
         return some_of(listed, (listed.constants[:, -1] < (1 + CLOSE) * listed.constants[:, 0]).contiguous())[0]
 
     def _narrowed(self, listed: Pairs, x: Tensor, collider: Tensor, room: Tensor) -> tuple[Pairs, Tensor | None]:
@@ -174,9 +163,9 @@ class ContactStep:
                 self._check(r, met.counts[r].tolist(), met)
             if r == 0:
                 pushing = self._pushing(detection.listed)
-                self._set_lag(pushing, was)
-                fall = lift = unsupported(self.model, x, self.origin, was, self.kappa, self.fields.mass, lift,
-                                          self.floor_data, pushing, settings.numbers.time_step)  # fmt: skip
+                push = self._set_lag(pushing, was)
+                fall = lift = unsupported(self.model, x, self.origin, push, self.fields.mass, lift, self.floor_data,
+                                          settings.numbers.time_step)  # fmt: skip
             falls, resting = r == 0 and self.model.starts_from == "predictor", None
             if falls and pins and self.model.start == "auto":
                 resting = rests(self.model, (self.x_prev + way).detach(), lift.detach(), self._raises)

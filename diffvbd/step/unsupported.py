@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..adjoint.contact_lag import Pairs, pair_lag, sum_at_corners
 from ..model.model import Model
 from ..ops import Backward, Direct, not_batched
 from ..ops import unsupported as ops_unsupported
@@ -59,27 +58,23 @@ class _UnsupportedBackward(Backward):
         return x_bar, lift_bar, force_bar, mass_bar, planes_bar
 
 
-def unsupported(model: Model, x: Tensor, origin: Tensor, collider: Tensor, kappa: Tensor, mass: Tensor, lift: Tensor,
-                floor_data: Tensor | None, listed: Pairs, time_step: float) -> Tensor:  # fmt: skip
+def unsupported(model: Model, x: Tensor, origin: Tensor, push: Tensor, mass: Tensor, lift: Tensor,
+                floor_data: Tensor | None, time_step: float) -> Tensor:  # fmt: skip
     """What is left of ``lift`` = h^2 a [1 | B, V, 3] once the contact forces at the start of the step have borne their
     part of each body's acceleration: for a body at rest nothing, in flight all of it. Differentiable.
 
     Without it every step would push a supported body into its support, and the sweeps would have to take it back.
 
     Args:
-        x, origin: As the sweeps take them.  collider: [B, Vc, 3] [m].  kappa: [1 | B] [N/m].  mass: [1 | B, V] [kg].
-        floor_data: Of the FloorBarrier [1 | B, 7 planes], or None.  listed: Of the detection at x.
-        time_step: [s].
+        x, origin: As the sweeps take them.  push: Forces of pairs on corner points at x [B, N, 3] [N].
+        mass: [1 | B, V] [kg].  floor_data: Of the FloorBarrier [1 | B, 7 planes], or None.  time_step: [s].
     """
     surface = model.surface_of_contact
     assert surface is not None
-    force, _, n, w = pair_lag(x, collider, kappa, origin, listed).split((1, 1, 3, 4), -1)
-    points = x.shape[1] + collider.shape[1]
-    total = sum_at_corners((force * w)[..., None] * n[:, None], listed, x.shape[0], points)
     planes = x.new_empty((0,)) if floor_data is None else floor_data
     constants = (surface.held_bodies, surface.body_order, surface.body_ptr, time_step)
     at = x.detach() if floor_data is None else x  # without a floor only forces know where vertices are
-    given = (t.contiguous() for t in (at, lift, total, mass, planes))
+    given = (t.contiguous() for t in (at, lift, push, mass, planes))
     return _Unsupported.apply(*given, origin, constants)
 
 

@@ -15,7 +15,6 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd import reference
-from diffvbd.adjoint.contact_lag import rows_of
 from diffvbd.energies import _barrier_slope
 from diffvbd.mesh import box, join
 from diffvbd.testing import relative_error, tolerance
@@ -257,16 +256,3 @@ def test_a_moving_support_drags(support: str) -> None:
     assert int(feet.sum()) == 4
     assert float((v[feet, 0] - speed).abs().max()) < CREEP
     assert 0 < speed * steps * h - float(block.mean(x - block.x)) < 2 * speed**2 / (0.5 * GRAVITY) + CREEP * steps * h
-
-
-def test_rows_pass_their_gradient_on_as_indexing_does() -> None:
-    values = torch.randn(5, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    rows = torch.tensor([-1, 3, -1, 0, -1, 4], dtype=torch.int32)
-    weight = torch.arange(54, dtype=torch.float64).reshape(6, 9)
-    found = rows_of(values, rows)
-    expected = torch.where((rows >= 0)[:, None], values[rows.clamp(min=0)], 0.0)
-    assert torch.equal(found, expected)
-    grads = [torch.autograd.grad((out * weight).sum(), values)[0] for out in (found, expected)]
-    assert torch.equal(*grads) and (grads[0][[0, 3, 4]] != 0).all() and not grads[0][[1, 2]].any()
-    none = torch.zeros((0, 9), dtype=torch.float64, requires_grad=True)
-    assert rows_of(none, rows[:0]).shape == (0, 9)

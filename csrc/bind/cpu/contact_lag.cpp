@@ -4,7 +4,6 @@
 #include <tuple>
 #include <vector>
 
-#include "../../contact/lag.h"
 #include "sweep.h"
 
 namespace {
@@ -34,6 +33,15 @@ void each_pair(const contact::ContactInputs<T>& in, const Tensor& x, const F& f)
   }
 }
 
+// Adds what the corners of a pair receive to points [B, N, 3].
+template <class T>
+void add_at_corners(const contact::ContactInputs<T>& in, const int32_t* record, const diffvbd::Vec3<T> (&values)[4],
+                    Tensor& points) {
+  for (int k = 0; k < 4; ++k) {
+    contact::add_at(data<T>(points) + 3 * (record[5] * in.corners + record[k]), values[k]);
+  }
+}
+
 Tensor contact_lag(const Tensor& x, const Tensor& origin, const Tensor& collider, const Tensor& kappa,
                    const Tensor& pairs, const Tensor& constants, const Tensor& ptr, const Tensor& entry) {
   return dispatch_float(x, [&](auto scalar) {
@@ -48,28 +56,70 @@ Tensor contact_lag(const Tensor& x, const Tensor& origin, const Tensor& collider
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor> contact_lag_backward(const Tensor& bar, const Tensor& x, const Tensor& origin,
-                                                        const Tensor& collider, const Tensor& kappa,
-                                                        const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
-                                                        const Tensor& entry) {
+std::tuple<Tensor, Tensor> contact_lag_backward(const Tensor& bar, const Tensor& x, const Tensor& origin,
+                                                const Tensor& collider, const Tensor& kappa, const Tensor& pairs,
+                                                const Tensor& constants, const Tensor& ptr, const Tensor& entry) {
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
     diffvbd::require_like("bar", bar, x, pairs.size(0) * contact::kLagScalars);
-    const int64_t b = x.size(0), v = x.size(1), colliders = in.corners - v;
-    Tensor x_bar = zeros(x, {b, v, 3}), collider_bar = zeros(x, {b, colliders, 3}), kappa_bar = zeros(x, {b});
+    const int64_t b = x.size(0);
+    Tensor points = zeros(x, {b, in.corners, 3}), kappa_bar = zeros(x, {b});
     each_pair(in, x, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
       contact::PairAdjoint<T> out;
       contact::reverse_lag(record[4], corners, a, stiffness, data<const T>(bar) + contact::kLagScalars * pair, out);
-      const int64_t scene = record[5];
-      for (int k = 0; k < 4; ++k) {
-        T* to = record[k] < v ? data<T>(x_bar) + 3 * (scene * v + record[k])
-                              : data<T>(collider_bar) + 3 * (scene * colliders + record[k] - v);
-        contact::add_at(to, out.x[k]);
-      }
-      data<T>(kappa_bar)[scene] += out.kappa;
+      add_at_corners(in, record, out.x, points);
+      data<T>(kappa_bar)[record[5]] += out.kappa;
     });
-    return std::make_tuple(x_bar, collider_bar, kappa_bar);
+    return std::make_tuple(points, kappa_bar);
+  });
+}
+
+std::tuple<Tensor, Tensor> contact_rubbing(const Tensor& x, const Tensor& origin, const Tensor& collider,
+                                           const Tensor& kappa, const Tensor& friction, const Tensor& damping,
+                                           const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
+                                           const Tensor& entry) {
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
+    const auto by = diffvbd::lag_coefficients<T>(friction, damping, x);
+    Tensor lag = zeros(x, {pairs.size(0), contact::kLagScalars}), push = zeros(x, {x.size(0), in.corners, 3});
+    each_pair(in, x, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
+      const auto state = contact::lag_state(record[4], corners, a, stiffness);
+      contact::store_rubbing(state, by.friction_of(record[5]), by.damping_of(record[5]), stiffness, a.dhat,
+                             data<T>(lag) + contact::kLagScalars * pair);
+      diffvbd::Vec3<T> force[4];
+      for (int k = 0; k < 4; ++k) force[k] = state.force * state.w[k] * state.n;
+      add_at_corners(in, record, force, push);
+    });
+    return std::make_tuple(lag, push);
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rubbing_backward(const Tensor& lag_bar, const Tensor& push_bar,
+                                                                    const Tensor& x, const Tensor& origin,
+                                                                    const Tensor& collider, const Tensor& kappa,
+                                                                    const Tensor& friction, const Tensor& damping,
+                                                                    const Tensor& pairs, const Tensor& constants,
+                                                                    const Tensor& ptr, const Tensor& entry) {
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
+    const auto by = diffvbd::lag_coefficients<T>(friction, damping, x);
+    const auto given = diffvbd::rubbing_bars<T>(lag_bar, push_bar, x, in.corners, pairs.size(0));
+    const int64_t b = x.size(0);
+    Tensor points = zeros(x, {b, in.corners, 3}), kappa_bar = zeros(x, {b});
+    Tensor friction_bar = zeros(x, {friction.numel() ? b : 0}), damping_bar = zeros(x, {damping.numel() ? b : 0});
+    each_pair(in, x, [&](int64_t pair, const int32_t* record, const auto& corners, const auto& a, T stiffness) {
+      const int64_t scene = record[5];
+      contact::RubbingAdjoint<T> out;
+      given.reverse(by, pair, record, corners, a, stiffness, out);
+      add_at_corners(in, record, out.pair.x, points);
+      data<T>(kappa_bar)[scene] += out.pair.kappa;
+      if (friction.numel()) data<T>(friction_bar)[scene] += out.friction;
+      if (damping.numel()) data<T>(damping_bar)[scene] += out.damping;
+    });
+    return std::make_tuple(points, kappa_bar, friction_bar, damping_bar);
   });
 }
 
@@ -106,5 +156,7 @@ Tensor contact_lowest(const Tensor& x, const Tensor& origin, const Tensor& plane
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
   m.impl("contact_lag", TORCH_BOX(&contact_lag));
   m.impl("contact_lag_backward", TORCH_BOX(&contact_lag_backward));
+  m.impl("contact_rubbing", TORCH_BOX(&contact_rubbing));
+  m.impl("contact_rubbing_backward", TORCH_BOX(&contact_rubbing_backward));
   m.impl("contact_lowest", TORCH_BOX(&contact_lowest));
 }

@@ -30,22 +30,63 @@ Tensor contact_lag(const Tensor& x, const Tensor& origin, const Tensor& collider
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor> contact_lag_backward(const Tensor& bar, const Tensor& x, const Tensor& origin,
-                                                        const Tensor& collider, const Tensor& kappa,
-                                                        const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
-                                                        const Tensor& entry) {
+std::tuple<Tensor, Tensor> contact_lag_backward(const Tensor& bar, const Tensor& x, const Tensor& origin,
+                                                const Tensor& collider, const Tensor& kappa, const Tensor& pairs,
+                                                const Tensor& constants, const Tensor& ptr, const Tensor& entry) {
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
     diffvbd::require_like("bar", bar, x, pairs.size(0) * contact::kLagScalars);
-    const int64_t b = x.size(0), v = x.size(1);
-    Tensor x_bar = empty(x, {b, v, 3}), collider_bar = empty(x, {b, in.corners - v, 3}), kappa_bar = empty(x, {b});
-    const Tensor slots = empty(x, {pairs.size(0), 16});
+    const int64_t b = x.size(0);
+    Tensor points = empty(x, {b, in.corners, 3}), kappa_bar = empty(x, {b});
+    const Tensor slots = empty(x, {pairs.size(0), cuda::kLagSlots});
     check(cuda::pair_lag_backward<T>(in, data<const T>(x), b, pairs.size(0), data<const T>(bar), data<T>(slots),
-                                     data<T>(x_bar), data<T>(collider_bar), data<T>(kappa_bar), current_stream(x)),
+                                     data<T>(points), data<T>(kappa_bar), current_stream(x)),
           "the lag of pairs");
-    return std::make_tuple(x_bar, collider_bar, kappa_bar);
+    return std::make_tuple(points, kappa_bar);
+  });
+}
+
+std::tuple<Tensor, Tensor> contact_rubbing(const Tensor& x, const Tensor& origin, const Tensor& collider,
+                                           const Tensor& kappa, const Tensor& friction, const Tensor& damping,
+                                           const Tensor& pairs, const Tensor& constants, const Tensor& ptr,
+                                           const Tensor& entry) {
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
+    const auto by = diffvbd::lag_coefficients<T>(friction, damping, x);
+    Tensor lag = empty(x, {pairs.size(0), contact::kLagScalars}), push = empty(x, {x.size(0), in.corners, 3});
+    const Tensor slots = empty(x, {pairs.size(0), cuda::kLagSlots});
+    check(cuda::rubbing<T>(in, by, data<const T>(x), x.size(0), pairs.size(0), data<T>(lag), data<T>(slots),
+                           data<T>(push), current_stream(x)),
+          "the lag of pairs");
+    return std::make_tuple(lag, push);
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> contact_rubbing_backward(const Tensor& lag_bar, const Tensor& push_bar,
+                                                                    const Tensor& x, const Tensor& origin,
+                                                                    const Tensor& collider, const Tensor& kappa,
+                                                                    const Tensor& friction, const Tensor& damping,
+                                                                    const Tensor& pairs, const Tensor& constants,
+                                                                    const Tensor& ptr, const Tensor& entry) {
+  const DeviceGuard guard(x.get_device_index());
+  return dispatch_float(x, [&](auto scalar) {
+    using T = decltype(scalar);
+    const auto in = diffvbd::lag_inputs<T>(x, origin, collider, kappa, pairs, constants, ptr, entry);
+    const auto by = diffvbd::lag_coefficients<T>(friction, damping, x);
+    const auto given = diffvbd::rubbing_bars<T>(lag_bar, push_bar, x, in.corners, pairs.size(0));
+    const int64_t b = x.size(0);
+    Tensor points = empty(x, {b, in.corners, 3}), kappa_bar = empty(x, {b});
+    Tensor friction_bar = empty(x, {friction.numel() ? b : 0}), damping_bar = empty(x, {damping.numel() ? b : 0});
+    const auto wanted = [](Tensor& t) { return t.numel() ? data<T>(t) : nullptr; };
+    const Tensor slots = empty(x, {pairs.size(0), cuda::kLagSlots});
+    check(cuda::rubbing_backward<T>(in, by, given, data<const T>(x), b, pairs.size(0), data<T>(slots), data<T>(points),
+                                    data<T>(kappa_bar), wanted(friction_bar), wanted(damping_bar), current_stream(x)),
+          "the lag of pairs");
+    return std::make_tuple(points, kappa_bar, friction_bar, damping_bar);
   });
 }
 
@@ -69,5 +110,7 @@ Tensor contact_lowest(const Tensor& x, const Tensor& origin, const Tensor& plane
 STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_lag", TORCH_BOX(&contact_lag));
   m.impl("contact_lag_backward", TORCH_BOX(&contact_lag_backward));
+  m.impl("contact_rubbing", TORCH_BOX(&contact_rubbing));
+  m.impl("contact_rubbing_backward", TORCH_BOX(&contact_rubbing_backward));
   m.impl("contact_lowest", TORCH_BOX(&contact_lowest));
 }
