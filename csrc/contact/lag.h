@@ -43,7 +43,8 @@ struct DampedShare {
   DIFFVBD_FN DampedShare(T force, T kappa, T dhat) {
     const T half = T(fade()) * dhat, whole = force + half * kappa;
     if (!(T(0) < whole)) return;  // without a barrier there is no damping
-    value = force / whole, by_force = half * kappa / (whole * whole), by_kappa = -force * half / (whole * whole);
+    value = force / whole;        // squares of `whole` would vanish in single precision
+    by_force = half * kappa / whole / whole, by_kappa = -value * (half / whole);
   }
 };
 

@@ -224,7 +224,7 @@ struct LaggedWork {
       : acts(pair < in.first_lagged(in.scene.scenes)), m{}, d{}, h(in.scene.time_step), eps(in.friction_eps) {
     if (!acts) return;
     const int32_t* record = in.lagged.pairs + kPairRow * pair;
-    // also of pairs without a force, which a coefficient of zero has made so
+    // also of pairs without a force: above dhat, or by a coefficient of zero
     acts =
         (moving_body(in, record[0]) >= 0 || moving_body(in, record[sides(record[4])]) >= 0) && works(in, given, record);
     if (!acts) return;

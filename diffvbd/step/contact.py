@@ -98,16 +98,24 @@ class ContactStep:
     def _set_lag(self, listed: Pairs, collider: Tensor) -> Tensor:
         """Friction and damping of the pairs at the start of the step; returns the forces of these on corner points
         [B, N, 3] [N]."""
-        damped = "pair_barrier.damping" in self.prepared.parameters or (
-            self.barrier is not None and self.barrier.damping > 0
-        )
-        none = self.kappa.new_empty((0,))
-        friction = none if self.model.friction is None else self._parameter("friction.coefficient")
-        damping = self._parameter("pair_barrier.damping") if damped else none
+        none = self.kappa.new_empty
+        friction = self._parameter("friction.coefficient") if self.model.friction is not None else none((0,))
+        damping = self._parameter("pair_barrier.damping") if self._damps else none((0,))
         lag, push = rubbing(self.begun.x_prev, collider, self.kappa, friction, damping, self.origin, listed)
-        if damped or self.model.friction is not None:
+        if self._rubs:
             self.lagged, self.lag = listed, lag
         return push
+
+    @property
+    def _damps(self) -> bool:
+        """Whether pairs damp motion."""
+        barrier = self.barrier
+        return barrier is not None and (barrier.damping > 0 or "pair_barrier.damping" in self.prepared.parameters)
+
+    @property
+    def _rubs(self) -> bool:
+        """Whether sweeps need what pairs were at the start of the step."""
+        return self.model.friction is not None or self._damps
 
     @staticmethod
     def _reads(x: Tensor) -> bool:
@@ -115,7 +123,10 @@ class ContactStep:
         return not x.is_cuda
 
     def _pushing(self, listed: Pairs) -> Pairs:
-        """The pairs that may push where the list was made: the same of a scene in any batch."""
+        """The pairs that may push where the list was made: the same of a scene in any batch. On CUDA they are found if
+        sweeps go through them, too."""
+        if not (self._rubs or self._reads(self.x_prev)):
+            return listed
         return some_of(listed, (listed.constants[:, -1] < (1 + CLOSE) * listed.constants[:, 0]).contiguous())[0]
 
     def _narrowed(self, listed: Pairs, x: Tensor, collider: Tensor, room: Tensor) -> tuple[Pairs, Tensor | None]:

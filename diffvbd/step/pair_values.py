@@ -37,7 +37,7 @@ def _barrier_values(s: Scenes, x: Tensor, listed: Pairs, state: Tensor, near: Te
 
 
 def lagged_values(s: Scenes, x: Tensor) -> Tensor:
-    """Of friction and damping of each pair that acted at the start of the step, likewise."""
+    """Of friction and damping of each pair that was close at the start of the step, likewise."""
     f, h = s.fields, s.time_step
     load, rate, n, w = f.lag.split((1, 1, 3, 4), -1)
     scene, corners = corners_of(s.lagged)
