@@ -296,18 +296,19 @@ class ContactStep:
             lowest = search.lowest(x, self.origin, self.floor_data.detach(), island, surface)
         return Detection(Pairs(*index), corners, values, counts, smallest, island, lowest, room, own_room)
 
-    def _record(self, met: Met) -> None:
-        smallest = torch.stack([d.smallest for d in met.found])
-        outcomes[self.model] = Outcome(torch.stack(met.counts), self.capacity, met.cut, smallest)
+    def _record(self, met: Met) -> Tensor:
+        """Notes what became of the step; its counts [parts, 4]."""
+        smallest, table = torch.stack([d.smallest for d in met.found]), torch.stack(met.counts)
+        outcomes[self.model] = Outcome(table, self.capacity, met.cut, smallest)
+        return table
 
     def _judged(self, x: Tensor, met: Met) -> Tensor:
         """x, or NaN where a captured step, which cannot raise, must not be trusted."""
-        self._record(met)
+        table = self._record(met)
         record_parts(self.model, x, met.swept)
-        table, capacity = torch.stack(met.counts), self.capacity
         if is_captured(x):
-            good = (table[:, :2] <= torch.stack([table.new_full((), capacity), table.new_zeros(())])).all()
-            good = good & (table[:, 3] == 0).all()
+            needed, touching, _, hindered = table.unbind(1)
+            good = ((needed <= self.capacity) & (touching + hindered == 0)).all()
             return torch.where(good, x, torch.nan)
         if x.is_cuda:
             for r, row in enumerate(table.tolist()):
