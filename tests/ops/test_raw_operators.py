@@ -13,12 +13,14 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import diffvbd as dv
 from diffvbd import ops
+from diffvbd.adjoint.contact_lag import Pairs, pair_lag
 
 CONTACT = (
     "contact_motion",
     "contact_translation",
     "contact_above_floor",
     "contact_start",
+    "contact_lag",
     "contact_rubbing",
     "contact_unsupported",
 )
@@ -107,6 +109,10 @@ def recorded() -> Iterator[Callable[[str, str], dict[str, dict[str, Any]]]]:
                 rest = model.rest_points.clone().requires_grad_()
                 out = dv.step(model, x, torch.zeros_like(x), mu=2e4, lam=4e4, rest_points=rest, density=1e3, **STEP)
                 (out[0].sum() + out[1].sum()).backward()
+                if "contact_rubbing" in calls.seen:  # what steps call only where potentials are compared
+                    near = calls.seen["contact_rubbing"]
+                    points, listed = near["x"].detach().requires_grad_(), Pairs(*(near[key] for key in Pairs._fields))
+                    pair_lag(points, near["collider"], near["kappa"], near["origin"], listed).sum().backward()
             known[scene, device] = calls.seen
         return known[scene, device]
 
