@@ -16,8 +16,8 @@ pytestmark = pytest.mark.cuda
 OPTIONS = {"lam": 2e4, "time_step": 0.01}
 
 
-def small(scenes: int = 5) -> tuple[dv.Model, Tensor, Tensor]:
-    model = dv.Model(dv.mesh.cube(), pinned=[0], device="cuda")
+def small(scenes: int = 5, start: str = "auto") -> tuple[dv.Model, Tensor, Tensor]:
+    model = dv.Model(dv.mesh.cube(), pinned=[0], start=start, device="cuda")
     noise = torch.randn((scenes, 8, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     return model, model.rest_points + 0.05 * noise.to("cuda"), 0.3 * noise.to("cuda")
 
@@ -57,8 +57,9 @@ def test_jacobians_in_every_regime(regime: str) -> None:
     assert relative_error(jacobian, torch.stack(rows)) <= tolerance("adjoint")
 
 
-def test_several_adjoints_of_one_step() -> None:
-    model, x, v = small(2)
+@pytest.mark.parametrize("start", ("auto", "predictor"))  # of which the latter is one operator
+def test_several_adjoints_of_one_step(start: str) -> None:
+    model, x, v = small(2, start)
     leaf = x.clone().requires_grad_()
     end, _ = dv.step(model, leaf, v, mu=1e4, sweeps=3, **OPTIONS)  # type: ignore[arg-type]
     weights = torch.randn((3, *end.shape), dtype=torch.float64, device="cuda")
