@@ -310,7 +310,11 @@ DIFFVBD_FN void add_floor_friction(const RigidInputs<T>& in, const rigid::Body<T
   }
 }
 
-// The potential of a vertex where it is, or would go.
+// Roundings of a position, by which vertices may come away from their targets without that their potential rises. In
+// flight it is nothing but such roundings.
+constexpr double kValueUlps = 8;
+
+// The potential of a vertex where it is, or where it would go, less what rounding may have added on the way.
 template <class T>
 DIFFVBD_FN double vertex_value(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, bool moved) {
   const Vector x = CornerPoints<T>{in, moved}.relative(b.scene, v), off = x - b.target(v);
@@ -323,7 +327,8 @@ DIFFVBD_FN double vertex_value(const RigidInputs<T>& in, const rigid::Body<T>& b
     const FloorSlip a = floor_slip(in, b, v, k, x - b.position(v));
     value += a.size * slip_value(square_root(dot(a.slip, a.slip)), in.friction_eps);
   }
-  return value;
+  const double rounding = kValueUlps * std::numeric_limits<T>::epsilon() * size_of(x);
+  return moved ? value - b.mass(v) * rounding * rounding : value;
 }
 
 // How far a turn and a shift take a point at r from the center.

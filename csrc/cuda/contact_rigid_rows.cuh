@@ -8,12 +8,15 @@
 namespace diffvbd::cuda {
 namespace {
 
+template <class T>
+__device__ int64_t scene_of_row(const RigidInputs<T>& in, const PairRoom& room, int64_t row) {
+  return row < room.listed ? in.gate.listed.pairs[kPairRow * row + 5]
+                           : in.lagged.pairs[kPairRow * (row - room.listed) + 5];
+}
 // The place of a body of a row's scene.
 template <class T>
 __device__ int64_t unit_of(const RigidInputs<T>& in, const PairRoom& room, int64_t row, int32_t body) {
-  const int64_t scene = row < room.listed ? in.gate.listed.pairs[kPairRow * row + 5]
-                                          : in.lagged.pairs[kPairRow * (row - room.listed) + 5];
-  return scene * in.bodies() + body;
+  return scene_of_row(in, room, row) * in.bodies() + body;
 }
 
 // Calls f(side, place of the body) for the bodies that a row acts on.
@@ -31,8 +34,11 @@ template <class T>
 __device__ void press_row(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, int64_t row) {
   const CornerPoints<T> at{in, false};
   PairPress a;
+  const int64_t scene = scene_of_row(in, room, row);
   bool acts = false;
-  if (row < room.listed) {
+  if (in.together() && !in.moves(scene, in.groups_of(scene), 0)) {
+    // nobody is solved for: a captured step makes all of its corrections, of which most move nothing
+  } else if (row < room.listed) {
     acts = barrier_press(in, row, at, a);
     if (acts) store_press(a, memory.press + kPressDoubles * row);
   } else {

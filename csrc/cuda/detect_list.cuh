@@ -7,7 +7,7 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int64_t kMostCounted = 8192;  // pairs that fit
+constexpr int64_t kMostCounted = 32768;  // pairs that fit; there may be half as many
 constexpr int64_t kMostPoints = 2048;   // corner points of all scenes
 constexpr unsigned kRankBlocks = 264;
 

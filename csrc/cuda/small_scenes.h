@@ -7,7 +7,7 @@
 namespace diffvbd::cuda {
 
 constexpr int64_t kSmallScene = 4096;  // vertices of a scene
-constexpr int64_t kFewPairs = 32768;   // pairs that each scene has room for, unless there are
+constexpr int64_t kFewPairs = 131072;  // pairs that each scene has room for, most of it unused, unless there are
 constexpr int64_t kManyScenes = 64;    // scenes enough to fill the device
 
 inline bool has_block_each(int64_t vertices, int64_t scenes, int64_t pairs) {
