@@ -166,23 +166,7 @@ struct RigidWorkTensors {
   }
 };
 
-// What contact_rigid_vertices_backward adds to; x and mass as contact_rigid_end_backward returns them.
-template <class T>
-contact::SentBack<T> sent_back(const contact::RigidInputs<T>& in, const Tensor& x_bar, const Tensor& mass_bar,
-                               const Tensor& by_x, const Tensor& by_p, const Tensor& by_q, const Tensor& since,
-                               const Tensor& x) {
-  require_like("x_bar", x_bar, x, 3 * in.scene.scenes * in.scene.vertices);
-  require_like("mass_bar", mass_bar, x, in.scene.scenes * in.scene.vertices);
-  const int64_t size = 3 * in.scene.scenes * in.gate.corners;
-  require_like("by_x", by_x, x, size);
-  require_like("by_p", by_p, x, size);
-  require_like("by_q", by_q, x, size);
-  if (since.numel() > 0) require_like("since", since, x, size);
-  return {data<const T>(x_bar), data<const T>(mass_bar), data<const T>(by_x),
-          data<const T>(by_p),  data<const T>(by_q),     since.numel() > 0 ? data<const T>(since) : nullptr};
-}
-
-// What contact_rigid_end_backward returns, but for the solution; zeros(sizes) makes what is zero at first.
+// What contact_rigid_reverse works in: zeros(sizes) makes what is zero at first.
 struct RigidEndTensors {
   Tensor p, q, x, mass;
   template <class T, class Zeros>
@@ -193,7 +177,7 @@ struct RigidEndTensors {
         mass(zeros({in.scene.scenes, in.scene.vertices})) {}
 };
 
-// What contact_rigid_vertices_backward returns; make(sizes, zeroed).
+// What it returns of vertices; make(sizes, zeroed).
 struct RigidVertexTensors {
   RigidBars bars;
   Tensor floor_lag, none;
@@ -211,9 +195,6 @@ struct RigidVertexTensors {
   T* floor() const {
     return floor_lag.numel() > 0 ? data<T>(floor_lag) : nullptr;
   }
-  std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> all() const {
-    return {bars.x, bars.x_prev, bars.y, bars.mass, bars.shared, bars.own, floor_lag};
-  }
 };
 
 // What a reverse solves with, of a forward with these groups; `in` learns how it is stored.
@@ -223,6 +204,29 @@ void require_factor(contact::RigidInputs<T>& in, const Tensor& factor, const Ten
   require(is_beside(factor, x, ScalarType::Double) && factor.numel() == in.scene.scenes * in.matrix_size() &&
               (in.scene.scenes == 0 || in.together() == (in.groups == nullptr)),
           "diffvbd::contact_rigid: expected factor and groups as contact_rigid_system returns them");
+}
+
+// The same of all arguments of contact_rigid_reverse. none: empty.
+template <class T>
+contact::RigidInputs<T> reversed_inputs(const TouchingFields& f, const std::vector<int64_t>& data_count,
+                                        double time_step, double friction_eps, const Tensor& motion,
+                                        const Tensor& share, const Tensor& factor, const Tensor& groups,
+                                        const Tensor& x_bar, const Tensor& none) {
+  auto in = touching_inputs<T>(f, data_count, time_step, friction_eps, none, groups);
+  require_factor(in, factor, f.x);
+  require_of_bodies(in, motion, f.x, contact::kUnknowns);
+  require_of_bodies(in, share, f.x, 1);
+  require_like("x_bar", x_bar, f.x, 3 * in.scene.scenes * in.scene.vertices);
+  return in;
+}
+
+// What it returns: of vertices x, x_prev, y, mass, data (two) and floor_lag, then of pairs by_x, since, by_kappa and
+// lag_bar.
+using RigidAdjoints =
+    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+inline RigidAdjoints rigid_adjoints(const RigidVertexTensors& out, const RigidWorkTensors& pairs) {
+  return {out.bars.x,    out.bars.x_prev, out.bars.y,  out.bars.mass,  out.bars.shared, out.bars.own,
+          out.floor_lag, pairs.by_x,      pairs.since, pairs.by_kappa, pairs.lag_bar};
 }
 
 }  // namespace diffvbd

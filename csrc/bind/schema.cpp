@@ -167,17 +167,13 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   define(m, "contact_rigid_backward", DIFFVBD_ARGUMENTS(TOUCHING),
          "Tensor p, Tensor q, Tensor groups, int[] data_count, float time_step, float friction_eps",
          "Tensor by_x, Tensor by_p, Tensor by_q, Tensor since, Tensor by_kappa, Tensor lag_bar, ");
-  // The rest of that adjoint. Of x_bar [scenes, V, 3] the solution for the adjoint of the motion [scenes, bodies, 6],
-  // how all corner points move by it and by the motion, and what goes back to x and mass by the way itself; then, with
-  // these and what pairs have, the adjoints of vertices; of data as of rigid_backward()
-  define(m, "contact_rigid_end_backward", DIFFVBD_ARGUMENTS(TOUCHING),
+  // The adjoint of a correction, of that of where it led, x_bar [scenes, V, 3]: of x, x_prev, y and mass, of data as of
+  // rigid_backward(), of floor_lag, and of pairs by_x, since, by_kappa and lag_bar as of contact_rigid_backward()
+  define(m, "contact_rigid_reverse", DIFFVBD_ARGUMENTS(TOUCHING),
          "Tensor motion, Tensor share, Tensor factor, Tensor groups, Tensor x_bar, int[] data_count, float time_step, "
-         "float friction_eps",
-         "Tensor solution, Tensor p, Tensor q, Tensor x, Tensor mass, ");
-  define(m, "contact_rigid_vertices_backward", DIFFVBD_ARGUMENTS(TOUCHING),
-         "Tensor motion, Tensor solution, Tensor x_bar, Tensor mass_bar, Tensor by_x, Tensor by_p, Tensor by_q, Tensor "
-         "since, int[] data_count, float time_step, float friction_eps, bool wants_data",
-         "Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own, Tensor floor_lag, ");
+         "float friction_eps, bool wants_data",
+         "Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own, Tensor floor_lag, Tensor by_x, "
+         "Tensor since, Tensor by_kappa, Tensor lag_bar, ");
   // Predictor and start of the sweeps. chord: as in rigid/coast.h. start: of the bodies that are not corrected, 0 x + h
   // v, 1 y, 2 the lower potential of the two; falls [scenes, other bodies]: 1 where that is y; alone [scenes, bodies]:
   // with parts, 1 where the vertices of a body that is corrected start each by itself

@@ -1,7 +1,6 @@
 // Groups of bodies whose rigid motions are solved for together, in scenes of many (contact/groups.h), and the solutions
 // of their systems.
-#include "cholesky.cuh"
-#include "contact_rigid.cuh"
+#include "contact_rigid_backward.cuh"
 #include "union.cuh"
 
 namespace diffvbd::cuda {
@@ -108,36 +107,9 @@ __global__ void __launch_bounds__(kThreads)
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     solve_groups_kernel(const __grid_constant__ RigidInputs<T> in, const double* factor, double* x) {
-  __shared__ double own[kUnknowns * kMostCoupled], diagonal[kUnknowns * kMostCoupled];
-  __shared__ double blocks[kUnknowns * kUnknowns * kMostCoupled];
-  const int32_t n = in.bodies(), places = in.together() ? 1 : n;
-  const int64_t scene = blockIdx.x / places;
-  const auto first = static_cast<int32_t>(blockIdx.x % places);
-  const Groups groups = in.groups_of(scene);
-  const int32_t count = groups.count(first), size = kUnknowns * count;
-  if (count == 0) return;
-  double* all = x + kUnknowns * n * scene;
-  if (count > in.room) {  // it did not move
-    for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads) {
-      all[kUnknowns * groups.member(first + i / kUnknowns) + i % kUnknowns] = 0;
-    }
-    return;
-  }
-  const auto at = [&](int32_t i) -> double& {
-    return all[kUnknowns * groups.member(first + i / kUnknowns) + i % kUnknowns];
-  };
-  bool any = false;
-  for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads) own[i] = at(i), any = any || own[i] != 0;
-  if (!__syncthreads_or(any)) return;
-  const double* own_factor = factor + in.matrix_size() * scene + groups.matrix(first);
-  for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads)
-    diagonal[i] = 1 / own_factor[(size + 1) * i];
-  __syncthreads();
-  const Inverses inverses{blocks, kUnknowns * kUnknowns, kUnknowns, diagonal};
-  invert_pivots<kThreads>(count, own_factor, inverses);
-  solve_forward<kThreads>(count, own_factor, inverses, own);
-  solve_backward<kThreads>(count, own_factor, inverses, own);
-  for (auto i = static_cast<int32_t>(threadIdx.x); i < size; i += kThreads) at(i) = own[i];
+  __shared__ GroupSolve<kMostCoupled> memory;
+  const int32_t places = in.together() ? 1 : in.bodies();
+  solve_group(in, blockIdx.x / places, static_cast<int32_t>(blockIdx.x % places), factor, x, memory);
 }
 
 }  // namespace

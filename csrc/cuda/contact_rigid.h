@@ -29,21 +29,31 @@ cudaError_t rigid_move(const contact::RigidInputs<T>& in, const PairRoom& room, 
                        const double* motion, T* move, const contact::RigidOutcome<T>& out, T* x, void* workspace,
                        cudaStream_t stream);
 
-// pushing: memory of 1 + listed numbers.
+// pushing: memory of one number and a number for each listed pair.
 template <class T>
 cudaError_t rigid_backward(const contact::RigidInputs<T>& in, const contact::VirtualMotions<T>& given,
                            const contact::RigidWork<T>& out, const contact::PointWork<T>& sums, int32_t* pushing,
                            cudaStream_t stream);
 
-// solutions [B, bodies, 6]: memory, too, for what is solved for; x, mass, p, q as of reverse_end() and
-// virtual_motion().
+// The adjoint of a correction.
 template <class T>
-cudaError_t rigid_end_backward(const contact::RigidInputs<T>& in, const double* motions, const double* shares,
-                               const T* end_bar, const double* factor, double* solutions, T* x, T* mass, T* p, T* q,
-                               cudaStream_t stream);
+struct RigidReverse {
+  const double *motions, *shares, *factor;
+  const T* end_bar;     // [B, V, 3]
+  double* solutions;    // [B, bodies, 6]  memory, of what is solved for
+  T *p, *q, *x, *mass;  // memory, zero at first: as of virtual_motion() and reverse_end()
+  contact::RigidWork<T> work;
+  contact::PointWork<T> sums;
+  int32_t* pushing;        // memory: a number for each scene and for each listed pair
+  rigid::Adjoints<T> out;  // those of data, and floor_lag, are zero at first
+  T* floor_lag;
+};
 template <class T>
-cudaError_t rigid_vertices_backward(const contact::RigidInputs<T>& in, const double* motions, const double* solutions,
-                                    const contact::SentBack<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag,
-                                    cudaStream_t stream);
+cudaError_t rigid_reverse(const contact::RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream);
+// Its parts before and after rigid_backward(), kernel by kernel.
+template <class T>
+cudaError_t rigid_end_backward(const contact::RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream);
+template <class T>
+cudaError_t rigid_vertices_backward(const contact::RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream);
 
 }  // namespace diffvbd::cuda

@@ -1,38 +1,28 @@
+// The adjoint of a rigid correction, kernel by kernel: of scenes of any size.
 #include <algorithm>
 
-#include "../contact/rigid_reverse.h"
 #include "clear.h"
 #include "clear_rows.cuh"
-#include "contact_rigid.cuh"
+#include "contact_rigid_backward.cuh"
 
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int kPartsApart = 16;  // threads of a pair: one for each part of its work, in a half of a warp
-static_assert(kWorkParts <= kPartsApart);
-
 constexpr int64_t kBlocksOfPushing = 2048;  // which share the pairs that push, whose number only the device knows
 
-// The first row of blocks: the listed pairs that push, few of them: how many, and which, in any order. The second: the
-// lagged pairs.
+// The first row of blocks: the listed pairs; pushing: how many push, and which. The second: the lagged pairs.
 template <class T>
 __global__ void __launch_bounds__(kOne) rows_kernel(const __grid_constant__ RigidInputs<T> in, VirtualMotions<T> given,
                                                     RigidWork<T> out, int32_t* pushing) {
   const int64_t row = own_item();
   if (blockIdx.y == 0) {
-    if (row >= out.listed) return;
-    const bool pushes = BarrierWork<T>::pushes(in, given, row);
-    out.pushes[row] = pushes, out.by_kappa[row] = T(0);
-    if (pushes) pushing[1 + atomicAdd(pushing, 1)] = static_cast<int32_t>(row);
+    if (row < out.listed) find_pushing(in, given, out, row, pushing, pushing + 1);
     return;
   }
   const int64_t count = in.first_lagged(in.scene.scenes);
   // nobody reads the rows of what is not there: most of what a list has room for
   clear_rows(out.lag_bar, kLagScalars, count, out.lagged);
-  if (row >= count) return;
-  T *rows = out.friction + 4 * kWorkScalars * row, *lag_bar = out.lag_bar + kLagScalars * row;
-  const LaggedWork<T> work(in, given, row);
-  work.acts ? work.store(rows, lag_bar) : work.store_none(rows, lag_bar);
+  if (row < count) store_lagged(in, given, out, row);
 }
 
 template <class T>
@@ -42,9 +32,7 @@ __global__ void __launch_bounds__(kOne)
   const int part = static_cast<int>(threadIdx.x % kPartsApart);
   const int64_t count = *pushing, stride = static_cast<int64_t>(gridDim.x) * (kOne / kPartsApart);
   for (int64_t i = own_item() / kPartsApart; part < kWorkParts && i < count; i += stride) {
-    const int64_t row = pushing[1 + i];
-    const BarrierWork<T> work(in, given, row, true);
-    work.store(part, out.barrier + 4 * kWorkScalars * row, out.by_kappa + row);
+    store_barrier(in, given, out, pushing[1 + i], part);
   }
 }
 
@@ -53,12 +41,7 @@ template <class T>
 __global__ void __launch_bounds__(kOne)
     point_kernel(const __grid_constant__ RigidInputs<T> in, RigidWork<T> work, PointWork<T> out) {
   const int64_t point = own_item() / 32;
-  const int lane = static_cast<int>(threadIdx.x % 32);
-  if (point >= in.scene.scenes * in.gate.corners) return;
-  double sum[kPointScalars] = {};
-  add_at_point(in, work, point, lane, 32, sum);
-  butterfly<kPointScalars, 32>(0xffffffffu, sum);
-  if (lane == 0) store_at_point(sum, point, out);
+  if (point < in.scene.scenes * in.gate.corners) sum_at_point(in, work, out, point);
 }
 
 // A block for each body of each scene.
@@ -99,22 +82,19 @@ unsigned blocks_of_bodies(const RigidInputs<T>& in) {
 }  // namespace
 
 template <class T>
-cudaError_t rigid_end_backward(const RigidInputs<T>& in, const double* motions, const double* shares, const T* end_bar,
-                               const double* factor, double* solutions, T* x, T* mass, T* p, T* q,
-                               cudaStream_t stream) {
-  if (blocks_of_bodies(in) == 0) return cudaSuccess;
-  end_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, motions, shares, end_bar, solutions, x, mass);
-  if (auto error = solve_groups(in, factor, solutions, stream)) return error;
-  motion_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, motions, solutions, p, q);
+cudaError_t rigid_end_backward(const RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream) {
+  end_kernel<T>
+      <<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r.motions, r.shares, r.end_bar, r.solutions, r.x, r.mass);
+  if (auto error = solve_groups(in, r.factor, r.solutions, stream)) return error;
+  motion_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r.motions, r.solutions, r.p, r.q);
   return cudaGetLastError();
 }
 
 template <class T>
-cudaError_t rigid_vertices_backward(const RigidInputs<T>& in, const double* motions, const double* solutions,
-                                    const SentBack<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag,
-                                    cudaStream_t stream) {
-  if (blocks_of_bodies(in) == 0) return cudaSuccess;
-  vertices_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, motions, solutions, sent, out, floor_lag);
+cudaError_t rigid_vertices_backward(const RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream) {
+  const SentBack<T> sent{r.x, r.mass, r.sums.x, r.sums.p, r.sums.q, r.sums.since};
+  vertices_kernel<T>
+      <<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r.motions, r.solutions, sent, r.out, r.floor_lag);
   return cudaGetLastError();
 }
 
@@ -134,12 +114,10 @@ cudaError_t rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& gi
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                      \
-  template cudaError_t rigid_end_backward<T>(const RigidInputs<T>&, const double*, const double*, const T*,         \
-                                             const double*, double*, T*, T*, T*, T*, cudaStream_t);                 \
-  template cudaError_t rigid_vertices_backward<T>(const RigidInputs<T>&, const double*, const double*,              \
-                                                  const SentBack<T>&, const rigid::Adjoints<T>&, T*, cudaStream_t); \
-  template cudaError_t rigid_backward<T>(const RigidInputs<T>&, const VirtualMotions<T>&, const RigidWork<T>&,      \
+#define DIFFVBD_INSTANTIATE(T)                                                                                  \
+  template cudaError_t rigid_end_backward<T>(const RigidInputs<T>&, const RigidReverse<T>&, cudaStream_t);      \
+  template cudaError_t rigid_vertices_backward<T>(const RigidInputs<T>&, const RigidReverse<T>&, cudaStream_t); \
+  template cudaError_t rigid_backward<T>(const RigidInputs<T>&, const VirtualMotions<T>&, const RigidWork<T>&,  \
                                          const PointWork<T>&, int32_t*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

@@ -7,8 +7,8 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int64_t kMostCounted = 32768;  // pairs that fit; there may be half as many
-constexpr int64_t kMostPoints = 2048;   // corner points of all scenes
+constexpr int64_t kMostCounted = 32768;  // pairs that fit, mostly twice as many as there are
+constexpr int64_t kMostPoints = 2048;    // corner points of all scenes
 constexpr unsigned kRankBlocks = 264;
 
 template <class T>

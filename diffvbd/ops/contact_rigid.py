@@ -80,26 +80,8 @@ def rigid_backward(fields: TouchingFields, p: Tensor, q: Tensor, groups: Tensor,
                                                 friction_eps))  # fmt: skip
 
 
-class EndAdjoint(NamedTuple):
-    """What :func:`rigid_end_backward` finds."""
-
-    solution: Tensor  # [B, bodies, 6] float64, for the adjoint of the motion; zero where nothing moved
-    p: Tensor  # [B, N, 3]: how corner points move by it,
-    q: Tensor  # and by the motion
-    x: Tensor  # [B, V, 3]: what goes back by the way itself
-    mass: Tensor  # [B, V]
-
-
-def rigid_end_backward(fields: TouchingFields, motion: Tensor, share: Tensor, factor: Tensor, groups: Tensor,
-                       x_bar: Tensor, data_count: Sequence[int], time_step: float, friction_eps: float
-                       ) -> EndAdjoint:  # fmt: skip
-    """The first part of the adjoint of a correction, of that of where it led [B, V, 3]."""
-    return EndAdjoint(*raw.contact_rigid_end_backward(*fields, motion, share, factor, groups, x_bar.contiguous(),
-                                                      data_count, time_step, friction_eps))  # fmt: skip
-
-
-class VertexAdjoints(NamedTuple):
-    """What :func:`rigid_vertices_backward` finds, of each scene."""
+class RigidAdjoints(NamedTuple):
+    """What :func:`rigid_reverse` finds, of each scene and pair."""
 
     x: Tensor  # [B, V, 3], as are the next two
     x_prev: Tensor
@@ -107,18 +89,22 @@ class VertexAdjoints(NamedTuple):
     mass: Tensor  # [B, V]
     energy_data: Tensor  # [B, n], or empty
     floor_lag: Tensor  # [B, V, planes, 4], or empty
+    by_x: Tensor  # as PairWork: colliders have the adjoint less this
+    since: Tensor  # and before the step this
+    by_kappa: Tensor
+    lag_bar: Tensor
 
 
-def rigid_vertices_backward(fields: TouchingFields, motion: Tensor, end: EndAdjoint, pairs: PairWork,
-                            data_count: Sequence[int], time_step: float, friction_eps: float, wants_data: bool
-                            ) -> VertexAdjoints:  # fmt: skip
-    """The adjoints of vertices: of -p . (gradient + matrix q), p and q being the motions of ``end``, with what pairs
-    have in it, and of the way itself."""
-    x, x_prev, y, mass, shared, own, floor_lag = raw.contact_rigid_vertices_backward(
-        *fields, motion, end.solution, end.x, end.mass, *pairs[:4], data_count, time_step, friction_eps, wants_data
+def rigid_reverse(fields: TouchingFields, motion: Tensor, share: Tensor, factor: Tensor, groups: Tensor, x_bar: Tensor,
+                  data_count: Sequence[int], time_step: float, friction_eps: float, wants_data: bool
+                  ) -> RigidAdjoints:  # fmt: skip
+    """The adjoint of a correction, of that of where it led, x_bar [B, V, 3]: of the way itself, and of
+    -p . (gradient + matrix q), p and q being how points move by the adjoint of the motion and by the motion."""
+    x, x_prev, y, mass, shared, own, *rest = raw.contact_rigid_reverse(
+        *fields, motion, share, factor, groups, x_bar.contiguous(), data_count, time_step, friction_eps, wants_data
     )
     data = join_data(shared, own, data_count) if wants_data else shared
-    return VertexAdjoints(x, x_prev, y, mass, data, floor_lag)
+    return RigidAdjoints(x, x_prev, y, mass, data, *rest)
 
 
 @shapes_of("contact_rigid_system")
@@ -142,22 +128,17 @@ def _(*arguments):
 
 @shapes_of("contact_rigid_backward")
 def _(*arguments):
-    f = TouchingFields(*arguments[:_FIELDS])
+    return _of_pairs(TouchingFields(*arguments[:_FIELDS]))
+
+
+def _of_pairs(f: TouchingFields) -> tuple[Tensor, ...]:
     listed, lagged = f.pairs.shape[0], f.lag_pairs.shape[0] if f.lag.numel() else 0
     b, n = f.x.shape[0], f.body.shape[0]
     since = (b if lagged else 0, n, 3)
     return tuple(f.x.new_empty(shape) for shape in (*[(b, n, 3)] * 3, since, (listed,), (lagged, 9)))
 
 
-@shapes_of("contact_rigid_end_backward")
-def _(*arguments):
-    f = TouchingFields(*arguments[:_FIELDS])
-    points = (f.x.shape[0], f.body.shape[0], 3)
-    motion = f.x.new_empty((f.x.shape[0], f.free.shape[0], UNKNOWNS), dtype=torch.float64)
-    return motion, f.x.new_empty(points), f.x.new_empty(points), torch.empty_like(f.x), f.x.new_empty(f.x.shape[:2])
-
-
-@shapes_of("contact_rigid_vertices_backward")
+@shapes_of("contact_rigid_reverse")
 def _(*arguments):
     f, wants_data = TouchingFields(*arguments[:_FIELDS]), arguments[-1]
     b, v = f.x.shape[:2]
@@ -165,9 +146,10 @@ def _(*arguments):
     shared, own = scalars_of_data(arguments[-4])
     data = ((b, f.free.shape[0] if wants_data else 0, shared), (b, v if wants_data else 0, own))
     sizes = ((b, v), *data, (b if planes else 0, v, planes, 4))
-    return (*(torch.empty_like(f.x) for _ in range(3)), *(f.x.new_empty(size) for size in sizes))
+    by_x, _, _, since, by_kappa, lag_bar = _of_pairs(f)
+    of_vertices = (*(torch.empty_like(f.x) for _ in range(3)), *(f.x.new_empty(size) for size in sizes))
+    return (*of_vertices, by_x, since, by_kappa, lag_bar)
 
 
-for _name in ("contact_rigid_system", "contact_rigid_move", "contact_rigid_backward",
-              "contact_rigid_end_backward", "contact_rigid_vertices_backward"):  # fmt: skip
+for _name in ("contact_rigid_system", "contact_rigid_move", "contact_rigid_backward", "contact_rigid_reverse"):
     torch.library.register_autograd(f"diffvbd::{_name}", raw_backward)

@@ -117,20 +117,18 @@ def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: T
     of d: a sum over vertices and pairs."""
     f, (scenes, vertices) = s.fields, s.fields.x.shape[:2]
     wants = dict(zip(ops.TouchingFields._fields, needs, strict=True))
-    options = s.model._data_count, s.time_step, s.friction_eps
-    end = ops_rigid.rigid_end_backward(f, motion, share, factor, groups, x_bar, *options)
-    pairs = ops_rigid.rigid_backward(f, end.p, end.q, groups, *options)
-    own = ops_rigid.rigid_vertices_backward(f, motion, end, pairs, *options, wants["energy_data"])
+    own = ops_rigid.rigid_reverse(f, motion, share, factor, groups, x_bar, s.model._data_count, s.time_step,
+                                  s.friction_eps, wants["energy_data"])  # fmt: skip
     out: dict[str, Callable[[], Tensor]] = {  # few are wanted, and each is a launch
         "x": lambda: own.x,
         "x_prev": lambda: own.x_prev,
         "y": lambda: own.y,
         "mass": lambda: own.mass,
         "energy_data": lambda: own.energy_data,
-        "collider": lambda: -pairs.by_x[:, vertices:],
-        "collider_prev": lambda: pairs.since[:, vertices:] if len(pairs.since) else torch.zeros_like(f.collider),
-        "kappa": lambda: -sum_of_scenes(pairs.by_kappa, s.listed, scenes),
-        "lag": lambda: pairs.lag_bar,
+        "collider": lambda: -own.by_x[:, vertices:],
+        "collider_prev": lambda: own.since[:, vertices:] if len(own.since) else torch.zeros_like(f.collider),
+        "kappa": lambda: -sum_of_scenes(own.by_kappa, s.listed, scenes),
+        "lag": lambda: own.lag_bar,
         "floor_lag": lambda: own.floor_lag,
     }
     bars = []

@@ -74,46 +74,33 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_backwar
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_end_backward(
-    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& share, const Tensor& factor, const Tensor& groups,
-    const Tensor& x_bar, std::vector<int64_t> data_count, double time_step, double friction_eps) {
+diffvbd::RigidAdjoints contact_rigid_reverse(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& share,
+                                             const Tensor& factor, const Tensor& groups, const Tensor& x_bar,
+                                             std::vector<int64_t> data_count, double time_step, double friction_eps,
+                                             bool wants_data) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
-    diffvbd::require_factor(in, factor, x);
-    diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
-    diffvbd::require_of_bodies(in, share, x, 1);
-    diffvbd::require_like("x_bar", x_bar, x, 3 * in.scene.scenes * in.scene.vertices);
-    const diffvbd::RigidEndTensors out(in, [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
-    Tensor solution = doubles({in.scene.scenes, in.bodies(), contact::kUnknowns});
-    auto* l = data<double>(solution);
-    diffvbd::rigid_end_backward<T>(in, data<const double>(motion), data<const double>(share), data<const T>(x_bar), l,
-                                   data<T>(out.x), data<T>(out.mass));
-    diffvbd::rigid_solve<T>(in, data<const double>(factor), l);
-    diffvbd::rigid_virtual_motions<T>(in, data<const double>(motion), l, data<T>(out.p), data<T>(out.q));
-    return std::make_tuple(solution, out.p, out.q, out.x, out.mass);
-  });
-}
-
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_vertices_backward(
-    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& solution, const Tensor& x_bar,
-    const Tensor& mass_bar, const Tensor& by_x, const Tensor& by_p, const Tensor& by_q, const Tensor& since,
-    std::vector<int64_t> data_count, double time_step, double friction_eps, bool wants_data) {
-  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
-  return dispatch_float(x, [&](auto scalar) {
-    using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), empty(x, {0}));
-    diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
-    diffvbd::require_of_bodies(in, solution, x, contact::kUnknowns);
-    const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed) {
+    const auto in = diffvbd::reversed_inputs<T>(f, data_count, time_step, friction_eps, motion, share, factor, groups,
+                                                x_bar, empty(x, {0}));
+    const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed = false) {
       return zeroed ? zeros(x, sizes) : empty(x, sizes);
     };
+    const diffvbd::RigidEndTensors end(in, [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
+    const diffvbd::RigidWorkTensors pairs(f, torch::stable::empty({f.pairs.size(0)}, ScalarType::Byte), make);
     const diffvbd::RigidVertexTensors out(in, data_count, wants_data, make);
-    diffvbd::rigid_vertices_backward<T>(in, data<const double>(motion), data<const double>(solution),
-                                        diffvbd::sent_back(in, x_bar, mass_bar, by_x, by_p, by_q, since, x),
+    const auto *motions = data<const double>(motion), *shares = data<const double>(share);
+    const Tensor solution = doubles({in.scene.scenes, in.bodies(), contact::kUnknowns});
+    auto* l = data<double>(solution);
+    T *p = data<T>(end.p), *q = data<T>(end.q), *x_end = data<T>(end.x), *mass_end = data<T>(end.mass);
+    diffvbd::rigid_end_backward<T>(in, motions, shares, data<const T>(x_bar), l, x_end, mass_end);
+    diffvbd::rigid_solve<T>(in, data<const double>(factor), l);
+    diffvbd::rigid_virtual_motions<T>(in, motions, l, p, q);
+    const auto sums = pairs.sums<T>();
+    diffvbd::rigid_backward<T>(in, {p, q}, pairs.view<T>(), sums);
+    diffvbd::rigid_vertices_backward<T>(in, motions, l, {x_end, mass_end, sums.x, sums.p, sums.q, sums.since},
                                         out.pointers<T>(), out.floor<T>());
-    return out.all();
+    return diffvbd::rigid_adjoints(out, pairs);
   });
 }
 
@@ -123,6 +110,5 @@ STABLE_TORCH_LIBRARY_IMPL(diffvbd, CPU, m) {
   m.impl("contact_rigid_system", TORCH_BOX(&contact_rigid_system));
   m.impl("contact_rigid_move", TORCH_BOX(&contact_rigid_move));
   m.impl("contact_rigid_backward", TORCH_BOX(&contact_rigid_backward));
-  m.impl("contact_rigid_end_backward", TORCH_BOX(&contact_rigid_end_backward));
-  m.impl("contact_rigid_vertices_backward", TORCH_BOX(&contact_rigid_vertices_backward));
+  m.impl("contact_rigid_reverse", TORCH_BOX(&contact_rigid_reverse));
 }

@@ -89,52 +89,42 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_backwar
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_end_backward(
-    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& share, const Tensor& factor, const Tensor& groups,
-    const Tensor& x_bar, std::vector<int64_t> data_count, double time_step, double friction_eps) {
+diffvbd::RigidAdjoints contact_rigid_reverse(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& share,
+                                             const Tensor& factor, const Tensor& groups, const Tensor& x_bar,
+                                             std::vector<int64_t> data_count, double time_step, double friction_eps,
+                                             bool wants_data) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
-    diffvbd::require_factor(in, factor, x);
-    diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
-    diffvbd::require_of_bodies(in, share, x, 1);
-    diffvbd::require_like("x_bar", x_bar, x, 3 * in.scene.scenes * in.scene.vertices);
+    const auto in = diffvbd::reversed_inputs<T>(f, data_count, time_step, friction_eps, motion, share, factor, groups,
+                                                x_bar, empty(x, {0}));
     Zeroed zeros(x);
-    const diffvbd::RigidEndTensors out(in, zeros);
-    zeros.clear();
-    Tensor solution = empty(x, {in.scene.scenes, in.bodies(), contact::kUnknowns}, ScalarType::Double);
-    check(cuda::rigid_end_backward<T>(in, data<const double>(motion), data<const double>(share), data<const T>(x_bar),
-                                      data<const double>(factor), data<double>(solution), data<T>(out.x),
-                                      data<T>(out.mass), data<T>(out.p), data<T>(out.q), current_stream(x)),
-          "the adjoint of rigid motions");
-    return std::make_tuple(solution, out.p, out.q, out.x, out.mass);
-  });
-}
-
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_vertices_backward(
-    DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& solution, const Tensor& x_bar,
-    const Tensor& mass_bar, const Tensor& by_x, const Tensor& by_p, const Tensor& by_q, const Tensor& since,
-    std::vector<int64_t> data_count, double time_step, double friction_eps, bool wants_data) {
-  const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
-  const DeviceGuard guard(x.get_device_index());
-  return dispatch_float(x, [&](auto scalar) {
-    using T = decltype(scalar);
-    const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), empty(x, {0}));
-    diffvbd::require_of_bodies(in, motion, x, contact::kUnknowns);
-    diffvbd::require_of_bodies(in, solution, x, contact::kUnknowns);
-    Zeroed zeros(x);
-    const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed) {
+    const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed = false) {
       return zeroed ? zeros(sizes) : empty(x, sizes);
     };
+    const diffvbd::RigidEndTensors end(in, zeros);
+    const diffvbd::RigidWorkTensors pairs(f, empty(x, {f.pairs.size(0)}, ScalarType::Byte), make);
     const diffvbd::RigidVertexTensors out(in, data_count, wants_data, make);
     zeros.clear();
-    check(cuda::rigid_vertices_backward<T>(in, data<const double>(motion), data<const double>(solution),
-                                           diffvbd::sent_back(in, x_bar, mass_bar, by_x, by_p, by_q, since, x),
-                                           out.pointers<T>(), out.floor<T>(), current_stream(x)),
-          "the adjoint of rigid motions");
-    return out.all();
+    const Tensor solution = empty(x, {in.scene.scenes, in.bodies(), contact::kUnknowns}, ScalarType::Double);
+    const Tensor pushing = empty(x, {in.scene.scenes + f.pairs.size(0)}, ScalarType::Int);
+    const cuda::RigidReverse<T> all{data<const double>(motion),
+                                    data<const double>(share),
+                                    data<const double>(factor),
+                                    data<const T>(x_bar),
+                                    data<double>(solution),
+                                    data<T>(end.p),
+                                    data<T>(end.q),
+                                    data<T>(end.x),
+                                    data<T>(end.mass),
+                                    pairs.view<T>(),
+                                    pairs.sums<T>(),
+                                    data<int32_t>(pushing),
+                                    out.pointers<T>(),
+                                    out.floor<T>()};
+    check(cuda::rigid_reverse<T>(in, all, current_stream(x)), "the adjoint of rigid motions");
+    return diffvbd::rigid_adjoints(out, pairs);
   });
 }
 
@@ -144,6 +134,5 @@ STABLE_TORCH_LIBRARY_IMPL(diffvbd, CUDA, m) {
   m.impl("contact_rigid_system", TORCH_BOX(&contact_rigid_system));
   m.impl("contact_rigid_move", TORCH_BOX(&contact_rigid_move));
   m.impl("contact_rigid_backward", TORCH_BOX(&contact_rigid_backward));
-  m.impl("contact_rigid_end_backward", TORCH_BOX(&contact_rigid_end_backward));
-  m.impl("contact_rigid_vertices_backward", TORCH_BOX(&contact_rigid_vertices_backward));
+  m.impl("contact_rigid_reverse", TORCH_BOX(&contact_rigid_reverse));
 }
