@@ -1,4 +1,6 @@
 // The rigid correction of bodies that touch: what pairs press, which bodies are solved for together, and their motions.
+#include <algorithm>
+
 #include "beside.h"
 #include "clear.h"
 #include "contact_rigid_rows.cuh"
@@ -35,12 +37,15 @@ __global__ void __launch_bounds__(kOne)
     at += rows_of(b)[0] + rows_of(b)[1];
   }
 }
-// And puts them there.
+// And puts them there. Scenes that are one group need no kernel that shares memory out.
 template <class T>
 __global__ void __launch_bounds__(kOne)
     fill_kernel(const __grid_constant__ RigidInputs<T> in, PairRoom room, const __grid_constant__ GroupMemory memory) {
-  const int64_t row = own_item();
-  if (is_row(in, room, row)) fill_row(in, room, memory, row);
+  const int64_t i = own_item();
+  if (in.together() && i < in.scene.scenes * in.bodies()) memory.begins[i] = begin_in_scene(in, memory, i);
+  if (!is_row(in, room, i)) return;
+  fill_row(in, room, memory, i,
+           [&](int64_t unit) { return in.together() ? begin_in_scene(in, memory, unit) : memory.begins[unit]; });
 }
 
 // Whether groups of more than kFew bodies may move.
@@ -107,8 +112,8 @@ cudaError_t rigid_system(const RigidInputs<T>& in, const PairRoom& room, double*
     if (auto error = find_groups(in, room, memory.sides, groups, work, stream)) return error;
   }
   if (rows > 0) {
-    share_kernel<T><<<blocks_for(bodies), kOne, 0, stream>>>(in, memory);
-    fill_kernel<T><<<blocks, kOne, 0, stream>>>(in, room, memory);
+    if (!in.together()) share_kernel<T><<<blocks_for(bodies), kOne, 0, stream>>>(in, memory);
+    fill_kernel<T><<<blocks_for(std::max(rows, bodies)), kOne, 0, stream>>>(in, room, memory);
   }
   if (!has_many(in)) return solve_few(in, room, memory, false, center, motion, factor, stream);
   memory.bases = static_cast<double*>(take(scenes * in.matrix_size() * sizeof(double)));

@@ -54,12 +54,24 @@ __device__ void count_row(const RigidInputs<T>& in, const PairRoom& room, const 
             [&](int, int64_t unit) { atomicAdd(memory.counts + 2 * unit + (row < room.listed ? 0 : 1), 1); });
 }
 
-// Puts a row where its bodies have theirs.
+// Where the rows of a body begin in a scene that is one group: of each row a scene has two entries at most.
 template <class T>
-__device__ void fill_row(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, int64_t row) {
+__device__ int32_t begin_in_scene(const RigidInputs<T>& in, const GroupMemory& memory, int64_t unit) {
+  const int64_t scene = unit / in.bodies();
+  auto at = static_cast<int32_t>(2 * (in.first_listed(scene) + in.first_lagged(scene)));
+  for (int64_t other = scene * in.bodies(); other < unit; ++other) {
+    at += memory.counts[2 * other] + memory.counts[2 * other + 1];
+  }
+  return at;
+}
+
+// Puts a row where its bodies have theirs. begin_of(place of a body).
+template <class T, class F>
+__device__ void fill_row(const RigidInputs<T>& in, const PairRoom& room, const GroupMemory& memory, int64_t row,
+                         const F& begin_of) {
   each_side(in, room, memory, row, [&](int side, int64_t unit) {
     const int which = row < room.listed ? 0 : 1;
-    const int32_t at = memory.begins[unit] + which * memory.counts[2 * unit];
+    const int32_t at = begin_of(unit) + which * memory.counts[2 * unit];
     memory.found[at + atomicAdd(memory.filled + 2 * unit + which, 1)] = static_cast<int32_t>(2 * row) + side;
   });
 }
@@ -79,15 +91,9 @@ __device__ void list_rows(const RigidInputs<T>& in, const PairRoom& room, const 
   team.each(2 * n, [&](int32_t i) { memory.counts[2 * unit + i] = memory.filled[2 * unit + i] = 0; });
   team.meet();
   each([&](int64_t row) { count_row(in, room, memory, row); });
-  if (team.leads()) {
-    auto at = static_cast<int32_t>(2 * (listed + lagged));  // of each row a scene has two entries at most
-    for (int32_t b = 0; b < n; ++b) {
-      memory.begins[unit + b] = at;
-      at += memory.counts[2 * (unit + b)] + memory.counts[2 * (unit + b) + 1];
-    }
-  }
+  team.each(n, [&](int32_t b) { memory.begins[unit + b] = begin_in_scene(in, memory, unit + b); });
   team.meet();
-  each([&](int64_t row) { fill_row(in, room, memory, row); });
+  each([&](int64_t row) { fill_row(in, room, memory, row, [&](int64_t of) { return memory.begins[of]; }); });
 }
 
 }  // namespace

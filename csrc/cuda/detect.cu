@@ -68,13 +68,12 @@ __global__ void corner_kernel(const Surfaces<T> in, Workspace<T> work, Detected<
   if (i < rows) store_corner(in, work, out, i);
 }
 
-// Of few pairs: what corner_kernel() does, and the entries, by a warp for each corner point.
+// Of few pairs: what corner_kernel() does, and the entries, by a block for each corner point.
 template <class T>
 __global__ void __launch_bounds__(kThreads) entry_kernel(const Surfaces<T> in, Workspace<T> work, Detected<T> out) {
-  const int64_t i = own_item() / kWarp, rows = in.scenes * in.corners;
-  if (i > rows) return;
+  const int64_t i = blockIdx.x;  // up to the number of points, which belongs to none
   list_entries(in, out, i, pairs_of(work, out));
-  if (i < rows && threadIdx.x % kWarp == 0) store_corner(in, work, out, i);
+  if (i < in.scenes * in.corners && threadIdx.x == 0) store_corner(in, work, out, i);
 }
 
 // What a pair's neighbourhood suggests, once the near pairs are there.
@@ -139,7 +138,7 @@ cudaError_t detect(const Surfaces<T>& in, const Detected<T>& out, void* memory, 
   if (is_counted(in, capacity)) {
     const unsigned blocks = std::min(kRankBlocks, static_cast<unsigned>(blocks_for(kWarp * capacity)));
     rank_kernel<<<blocks, kThreads, 0, stream>>>(in, work, out);
-    entry_kernel<<<blocks_for(kWarp * (rows + 1)), kThreads, 0, stream>>>(in, work, out);
+    entry_kernel<<<static_cast<unsigned>(rows + 1), kThreads, 0, stream>>>(in, work, out);
   } else if (auto error = sort_list(in, work, out, stream)) {
     return error;
   }

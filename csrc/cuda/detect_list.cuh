@@ -41,33 +41,46 @@ __global__ void __launch_bounds__(kThreads) rank_kernel(const Surfaces<T> in, Wo
   }
 }
 
-// Calls f(pair, its four corner points among those of all scenes) for all pairs, one for each lane of a warp; the
-// points are -1 where a lane has none.
+// Calls f(pair, its four corner points among those of all scenes) for the pairs [first, last), one for each lane of a
+// warp; the points are -1 where a lane has none.
 template <class T, class F>
-__device__ void each_pair(const Surfaces<T>& in, const Detected<T>& out, int32_t count, const F& f) {
+__device__ void each_pair(const Surfaces<T>& in, const Detected<T>& out, int32_t first, int32_t last, const F& f) {
   const int32_t lane = threadIdx.x % kWarp;
-  for (int32_t first = 0; first < count; first += kWarp) {
+  for (; first < last; first += kWarp) {
     const int32_t pair = first + lane;
     const int32_t* row = out.pairs + kPairRow * pair;
     int64_t points[4] = {-1, -1, -1, -1};
-    for (int k = 0; k < 4 && pair < count; ++k) points[k] = row[kPairRow - 1] * int64_t{in.corners} + row[k];
+    for (int k = 0; k < 4 && pair < last; ++k) points[k] = row[kPairRow - 1] * int64_t{in.corners} + row[k];
     f(pair, points);
   }
 }
 
-// ptr and entries of a corner point, a warp for each: how many entries those before it have, and its own.
+// ptr and entries of a corner point, by a block, each warp of which looks at a part of the list: how many entries those
+// before it have, and its own.
 template <class T>
 __device__ void list_entries(const Surfaces<T>& in, const Detected<T>& out, int64_t point, int32_t count) {
-  unsigned before = 0;
-  each_pair(in, out, count, [&](int32_t, const int64_t* points) {
-    for (int k = 0; k < 4; ++k) before += 0 <= points[k] && points[k] < point ? 1 : 0;
+  constexpr int warps = kThreads / kWarp;
+  __shared__ unsigned before[warps], own[warps];
+  const int warp = static_cast<int>(threadIdx.x) / kWarp;
+  const int32_t part = (count + kThreads - 1) / kThreads * kWarp;
+  const int32_t first = part * warp, end = first + part, last = end < count ? end : count;
+  unsigned less = 0, equal = 0;
+  each_pair(in, out, first, last, [&](int32_t, const int64_t* points) {
+    for (int k = 0; k < 4; ++k) {
+      less += 0 <= points[k] && points[k] < point ? 1 : 0;
+      equal += points[k] == point ? 1 : 0;
+    }
   });
-  before = __reduce_add_sync(kWholeWarp, before);
+  less = __reduce_add_sync(kWholeWarp, less), equal = __reduce_add_sync(kWholeWarp, equal);
   const unsigned lane = threadIdx.x % kWarp, lanes_before = (1u << lane) - 1;
-  if (lane == 0) out.ptr[point] = static_cast<int32_t>(before);
-  if (point == in.scenes * in.corners) return;
-  int32_t* to = out.entry + before;
-  each_pair(in, out, count, [&](int32_t pair, const int64_t* points) {
+  if (lane == 0) before[warp] = less, own[warp] = equal;
+  __syncthreads();
+  unsigned begin = 0, skipped = 0;
+  for (int w = 0; w < warps; ++w) begin += before[w], skipped += w < warp ? own[w] : 0;
+  if (threadIdx.x == 0) out.ptr[point] = static_cast<int32_t>(begin);
+  if (equal == 0) return;
+  int32_t* to = out.entry + begin + skipped;
+  each_pair(in, out, first, last, [&](int32_t pair, const int64_t* points) {
     int place = 0, found = 0;
     for (int k = 0; k < 4; ++k) {
       const unsigned has = __ballot_sync(kWholeWarp, points[k] == point);
