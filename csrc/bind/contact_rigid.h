@@ -138,20 +138,20 @@ struct RigidOutcomeTensors {
   std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> all() const { return {x, share, moved, held, left}; }
 };
 
-// What contact_rigid_backward returns, and the rows of pairs, made by `make`(sizes); pushes: bytes.
+// What contact_rigid_backward returns, and the rows of pairs; make(sizes, zeroed). pushes: bytes.
 struct RigidWorkTensors {
   Tensor barrier, pushes, friction, by_x, by_p, by_q, since, by_kappa, lag_bar;
   template <class Make>
-  RigidWorkTensors(const TouchingFields& f, const Tensor& pushes, const Make& make)
-      : barrier(make({f.pairs.size(0), 4, contact::kWorkScalars})),
+  RigidWorkTensors(const TouchingFields& f, const Tensor& pushes, Make&& make)
+      : barrier(make({f.pairs.size(0), 4, contact::kWorkScalars}, false)),
         pushes(pushes),
-        friction(make({f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0, 4, contact::kWorkScalars})),
-        by_x(make({f.x.size(0), f.body.size(0), 3})),
-        by_p(make({f.x.size(0), f.body.size(0), 3})),
-        by_q(make({f.x.size(0), f.body.size(0), 3})),
-        since(make({friction.size(0) > 0 ? f.x.size(0) : 0, f.body.size(0), 3})),
-        by_kappa(make({f.pairs.size(0)})),
-        lag_bar(make({friction.size(0), contact::kLagScalars})) {}
+        friction(make({f.lag.numel() > 0 ? f.lag_pairs.size(0) : 0, 4, contact::kWorkScalars}, false)),
+        by_x(make({f.x.size(0), f.body.size(0), 3}, false)),
+        by_p(make({f.x.size(0), f.body.size(0), 3}, false)),
+        by_q(make({f.x.size(0), f.body.size(0), 3}, false)),
+        since(make({friction.size(0) > 0 ? f.x.size(0) : 0, f.body.size(0), 3}, false)),
+        by_kappa(make({f.pairs.size(0)}, true)),
+        lag_bar(make({friction.size(0), contact::kLagScalars}, true)) {}
   template <class T>
   contact::RigidWork<T> view() const {
     return {data<T>(barrier), data<T>(by_kappa), data<uint8_t>(pushes), data<T>(friction),
@@ -166,34 +166,39 @@ struct RigidWorkTensors {
   }
 };
 
-// What contact_rigid_reverse works in: zeros(sizes) makes what is zero at first.
-struct RigidEndTensors {
-  Tensor p, q, x, mass;
-  template <class T, class Zeros>
-  RigidEndTensors(const contact::RigidInputs<T>& in, Zeros&& zeros)
-      : p(zeros({in.scene.scenes, in.gate.corners, 3})),
-        q(zeros({in.scene.scenes, in.gate.corners, 3})),
-        x(zeros({in.scene.scenes, in.scene.vertices, 3})),
-        mass(zeros({in.scene.scenes, in.scene.vertices})) {}
-};
-
-// What it returns of vertices; make(sizes, zeroed).
-struct RigidVertexTensors {
+// What contact_rigid_reverse returns, and the memory that it works in; make(sizes, zeroed).
+struct RigidReverseTensors {
+  RigidWorkTensors pairs;
+  Tensor p, q, way;
   RigidBars bars;
-  Tensor floor_lag, none;
+  Tensor floor_lag, collider, collider_prev;
   template <class T, class Make>
-  RigidVertexTensors(const contact::RigidInputs<T>& in, const std::vector<int64_t>& data_count, bool wants_data,
-                     const Make& make)
-      : bars(in.scene, data_count, true, wants_data, make),
+  RigidReverseTensors(const TouchingFields& f, const contact::RigidInputs<T>& in,
+                      const std::vector<int64_t>& data_count, bool wants_data, const Tensor& pushes, Make&& make)
+      : pairs(f, pushes, make),
+        p(make({in.scene.scenes, in.gate.corners, 3}, true)),
+        q(make({in.scene.scenes, in.gate.corners, 3}, true)),
+        way(make({in.scene.scenes, in.scene.vertices, 3}, false)),
+        bars(in.scene, data_count, true, wants_data,
+             [&](const std::vector<int64_t>& sizes, bool) { return make(sizes, true); }),
         floor_lag(make({in.planes > 0 ? in.scene.scenes : 0, in.scene.vertices, in.planes, contact::kFloorLag}, true)),
-        none(make({0}, false)) {}
+        collider(make({in.scene.scenes, in.gate.corners - in.gate.vertices, 3}, true)),
+        collider_prev(make({in.scene.scenes, in.gate.corners - in.gate.vertices, 3}, true)) {}
   template <class T>
-  rigid::Adjoints<T> pointers() const {
-    return bars.pointers<T>(bars.x, none);
+  contact::CorrectionAdjoints<T> out() const {
+    return {
+        {nullptr, nullptr, data<T>(bars.x), data<T>(bars.x_prev), data<T>(bars.y), data<T>(bars.mass),
+         bars.shared.numel() > 0 ? data<T>(bars.shared) : nullptr, bars.own.numel() > 0 ? data<T>(bars.own) : nullptr,
+         static_cast<int32_t>(bars.shared.size(2)), static_cast<int32_t>(bars.own.size(2))},
+        floor_lag.numel() > 0 ? data<T>(floor_lag) : nullptr,
+        data<T>(collider),
+        data<T>(collider_prev)};
   }
-  template <class T>
-  T* floor() const {
-    return floor_lag.numel() > 0 ? data<T>(floor_lag) : nullptr;
+  // Of vertices x, x_prev, y, mass, data (two) and floor_lag, of colliders at the end and before, and of pairs by_kappa
+  // and lag_bar.
+  std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> all() const {
+    return {bars.x,    bars.x_prev, bars.y,        bars.mass,      bars.shared,  bars.own,
+            floor_lag, collider,    collider_prev, pairs.by_kappa, pairs.lag_bar};
   }
 };
 
@@ -206,27 +211,29 @@ void require_factor(contact::RigidInputs<T>& in, const Tensor& factor, const Ten
           "diffvbd::contact_rigid: expected factor and groups as contact_rigid_system returns them");
 }
 
-// The same of all arguments of contact_rigid_reverse. none: empty.
-template <class T>
-contact::RigidInputs<T> reversed_inputs(const TouchingFields& f, const std::vector<int64_t>& data_count,
-                                        double time_step, double friction_eps, const Tensor& motion,
-                                        const Tensor& share, const Tensor& factor, const Tensor& groups,
-                                        const Tensor& x_bar, const Tensor& none) {
-  auto in = touching_inputs<T>(f, data_count, time_step, friction_eps, none, groups);
-  require_factor(in, factor, f.x);
-  require_of_bodies(in, motion, f.x, contact::kUnknowns);
-  require_of_bodies(in, share, f.x, 1);
-  require_like("x_bar", x_bar, f.x, 3 * in.scene.scenes * in.scene.vertices);
-  return in;
-}
+// The corrections of which contact_rigid_reverse is the adjoint, the first one first.
+struct Corrections {
+  const std::vector<Tensor>&x, &motion, &share, &factor, &groups;
 
-// What it returns: of vertices x, x_prev, y, mass, data (two) and floor_lag, then of pairs by_x, since, by_kappa and
-// lag_bar.
-using RigidAdjoints =
-    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
-inline RigidAdjoints rigid_adjoints(const RigidVertexTensors& out, const RigidWorkTensors& pairs) {
-  return {out.bars.x,    out.bars.x_prev, out.bars.y,  out.bars.mass,  out.bars.shared, out.bars.own,
-          out.floor_lag, pairs.by_x,      pairs.since, pairs.by_kappa, pairs.lag_bar};
-}
+  int64_t count() const { return static_cast<int64_t>(x.size()); }
+  void require_equal() const {
+    for (const auto* each : {&motion, &share, &factor, &groups}) {
+      require(each->size() == x.size() && !x.empty(),
+              "diffvbd::contact_rigid_reverse: expected as many x, motion, share, factor and groups, one at least");
+    }
+  }
+  // Inputs of the k-th. none: empty.
+  template <class T>
+  contact::RigidInputs<T> inputs(int64_t k, TouchingFields f, const std::vector<int64_t>& data_count, double time_step,
+                                 double friction_eps, const Tensor& none) const {
+    require_like("x", x[k], f.x, f.x.numel());
+    auto in = touching_inputs<T>(f, data_count, time_step, friction_eps, none, groups[k]);
+    in.scene.x = in.gate.x = data<const T>(x[k]);
+    require_factor(in, factor[k], f.x);
+    require_of_bodies(in, motion[k], f.x, contact::kUnknowns);
+    require_of_bodies(in, share[k], f.x, 1);
+    return in;
+  }
+};
 
 }  // namespace diffvbd

@@ -178,14 +178,18 @@ DIFFVBD_FN bool stays_apart(const Gate<T>& g, const Vec3<T> (&d)[4], bool carefu
   const T half = T(1 - kBothShare) * wide, most = least < half ? half : least;
   const T part = wide < T(kTight) * least ? T(1) : T(1 - 2 * kStartLeast);
   const T keeps = !careful ? half : part * wide < most ? part * wide : most;
+  const auto gap_at = [&](T time) {
+    Corners<T> moved = g.corners;
+    for (int k = 0; k < 4; ++k) moved.x[k] += time * relative[k];
+    return distance(g.kind, moved).d - g.constants.offset - g.guard;
+  };
+  if (T(0) < total && gap_at(T(1)) < keeps) return false;  // as do most that the steps below cannot prove safe
   T time = T(0), now = wide;
   for (int i = 0; i < kAdvances; ++i) {
     if (!(keeps < now)) return total * (T(1) - time) <= T(0);
     time = time + (now - keeps) / total;
     if (!(time < T(1))) return true;
-    Corners<T> moved = g.corners;
-    for (int k = 0; k < 4; ++k) moved.x[k] += time * relative[k];
-    now = distance(g.kind, moved).d - g.constants.offset - g.guard;
+    now = gap_at(time);
   }
   return false;
 }

@@ -19,7 +19,7 @@ struct VirtualMotions {
   const T *p, *q;
 };
 
-// Derivatives of the virtual work of all pairs, of lists with so many rows.
+// Derivatives of the virtual work of all pairs, of lists with so many rows. by_kappa and lag_bar are added to.
 template <class T>
 struct RigidWork {
   T *barrier, *by_kappa;  // [listed, 4, 9], [listed]
@@ -192,7 +192,7 @@ struct BarrierWork {
            barrier_press(in, pair, CornerPoints<T>{in, false}, press);
   }
 
-  // Of the rows of the corners [4, 9] and the derivative by kappa, where the pair pushes.
+  // Of the rows of the corners [4, 9], and adds the derivative by kappa, where the pair pushes.
   DIFFVBD_FN void store(int part, T* rows, T* by_kappa) const {
     if (part < kDirections) {
       const int k = part / 3, i = part % 3;
@@ -201,7 +201,7 @@ struct BarrierWork {
       rows[kWorkScalars * k + i] = T(virtual_work(terms, m).derivative);
       return;
     }
-    *by_kappa = T(virtual_work(barrier_terms(kind, c, a, h2), m));
+    *by_kappa += T(virtual_work(barrier_terms(kind, c, a, h2), m));
     add_by_motions(barrier_terms(kind, c, a, h2 * kappa), m, rows);
   }
 };
@@ -242,7 +242,7 @@ struct LaggedWork {
     }
   }
 
-  // Of the rows of the corners [4, 9] and lag_bar [9].
+  // Of the rows of the corners [4, 9], and adds to lag_bar [9].
   DIFFVBD_FN void store(T* rows, T* lag_bar) const {
     const double along = dot(n, d), approach = along < 0 ? along : 0, A = h * damping, L = h * h * load;
     double by_along = 0, by_load = 0, by_damping = 0, by_w[4] = {0, 0, 0, 0};
@@ -270,13 +270,12 @@ struct LaggedWork {
     }
     by_d += by_along * n, by_n += by_along * d;
     for (int k = 0; k < 4; ++k) rigid::put(rows + kWorkScalars * k, w[k] * by_d);
-    lag_bar[0] = T(-h * h * by_load), lag_bar[1] = T(-h * by_damping);
-    rigid::put(lag_bar + 2, -by_n);
-    for (int k = 0; k < 4; ++k) lag_bar[5 + k] = T(-by_w[k] - dot(by_d, since[k]));
+    lag_bar[0] -= T(h * h * by_load), lag_bar[1] -= T(h * by_damping);
+    rigid::add_to(lag_bar + 2, -by_n);
+    for (int k = 0; k < 4; ++k) lag_bar[5 + k] -= T(by_w[k] + dot(by_d, since[k]));
   }
-  DIFFVBD_FN static void store_none(T* rows, T* lag_bar) {
+  DIFFVBD_FN static void store_none(T* rows) {
     for (int i = 0; i < 4 * kWorkScalars; ++i) rows[i] = T(0);
-    for (int i = 0; i < kLagScalars; ++i) lag_bar[i] = T(0);
   }
 };
 

@@ -66,7 +66,8 @@ struct VertexAdjoint {
   double mass;
 };
 
-// by_p, by_q: what pairs send to P and Q. floor_lag: what becomes of a scene's floor_lag at this vertex, or null.
+// by_p, by_q: what pairs send to P and Q. floor_lag: the adjoint of a scene's floor_lag at this vertex, which is added
+// to, or null.
 template <class T>
 DIFFVBD_FN VertexAdjoint vertex_adjoint(const RigidInputs<T>& in, const rigid::Body<T>& b, int32_t v, const Vector& r,
                                         const double* p, const double* q, const Vector& by_p, const Vector& by_q,
@@ -88,7 +89,7 @@ DIFFVBD_FN VertexAdjoint vertex_adjoint(const RigidInputs<T>& in, const rigid::B
     for (int i = 0; i < kFloorLag; ++i) lag[i] = given[i];
     const Vector by_travel = slip_adjoint(lag, x - s.x_prev, P, Q, h * h, in.friction_eps, by_lag);
     out.x -= by_travel, out.x_prev += by_travel;
-    for (int i = 0; floor_lag && i < kFloorLag; ++i) floor_lag[kFloorLag * k + i] = T(-by_lag[i]);
+    for (int i = 0; floor_lag && i < kFloorLag; ++i) floor_lag[kFloorLag * k + i] -= T(by_lag[i]);
   }
   const Vector turn_p = {p[0], p[1], p[2]}, turn_q = {q[0], q[1], q[2]};
   const double turns = dot(turn_p, turn_q), shifts = p[3] * q[3] + p[4] * q[4] + p[5] * q[5];
@@ -162,9 +163,9 @@ DIFFVBD_FN void reverse_end(const rigid::Body<T>& b, const Team& team, const dou
   send_center(b, team, whole, Vector{sum[0], sum[1], sum[2]}, x, mass);
 }
 
-// How corner points [B, N, 3] move by the solution for that adjoint, and by the motion; zero at first. The solution of
-// a body that did not move becomes zero: of a matrix that was not positive definite no motion came, and nothing goes
-// back through it.
+// How corner points [B, N, 3] move by the solution for that adjoint, and by the motion; those of no body are zero. The
+// solution of a body that did not move becomes zero: of a matrix that was not positive definite no motion came, and
+// nothing goes back through it.
 template <class T, class Team>
 DIFFVBD_FN void virtual_motion(const RigidInputs<T>& in, const rigid::Body<T>& b, const Team& team,
                                const double* motion, double* solution, T* p, T* q) {
@@ -175,7 +176,13 @@ DIFFVBD_FN void virtual_motion(const RigidInputs<T>& in, const rigid::Body<T>& b
     moves = moves && absolute(l[i]) < std::numeric_limits<double>::infinity();
     any = any || l[i] != 0 || motion[i] != 0;
   }
-  if (!any) return;
+  if (!any) {
+    team.each(b.size(), [&](int32_t i) {
+      const int64_t to = 3 * (b.scene * in.gate.corners + b.vertex(i));
+      rigid::put(p + to, Vector{}), rigid::put(q + to, Vector{});
+    });
+    return;
+  }
   for (int i = 0; i < kUnknowns && !moves; ++i) l[i] = 0;
   const Whole whole = whole_of(b, team);  // after which all have read
   for (int i = 0; i < kUnknowns && team.leads(); ++i) solution[i] = l[i];
@@ -188,27 +195,26 @@ DIFFVBD_FN void virtual_motion(const RigidInputs<T>& in, const rigid::Body<T>& b
   });
 }
 
-// What the adjoints of a body's vertices are made of besides: what goes back by the way itself [B, V, 3] and [B, V],
-// and what pairs have at all corner points [B, N, 3].
+// The adjoints of a correction. All are added to, but x, which is written.
 template <class T>
-struct SentBack {
-  const T *x, *mass;
-  const T *by_x, *by_p, *by_q, *since;  // as PointWork
+struct CorrectionAdjoints {
+  rigid::Adjoints<T> of;        // of vertices and of data
+  T* floor_lag;                 // [B, V, planes, 4], or null
+  T *collider, *collider_prev;  // [B, Vc, 3]
 };
 
-// Writes x, x_prev, y and mass of a body's vertices, and where it moves those of data and floor_lag [B, V, planes, 4],
-// or null: these are zero at first.
+// Of a body's vertices. way [B, V, 3]: what goes back by the way itself. sent: what pairs have at corner points.
 template <class T, class Team>
 DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>& b, const Team& team,
-                                 const double* motion, const double* solution, const SentBack<T>& sent,
-                                 const rigid::Adjoints<T>& out, T* floor_lag) {
+                                 const double* motion, const double* solution, const T* way, const PointWork<T>& sent,
+                                 const CorrectionAdjoints<T>& bars) {
+  const rigid::Adjoints<T>& out = bars.of;
+  T* floor_lag = bars.floor_lag;
   team.each(b.size(), [&](int32_t i) {
     const int32_t v = b.vertex(i);
     const int64_t row = b.row(v), corner = 3 * (b.scene * in.gate.corners + v);
-    rigid::put(out.x + 3 * row, rigid::Body<T>::at(sent.x + 3 * row) - rigid::Body<T>::at(sent.by_x + corner));
-    rigid::put(out.x_prev + 3 * row, sent.since ? rigid::Body<T>::at(sent.since + corner) : Vector{});
-    rigid::put(out.y + 3 * row, Vector{});
-    out.mass[row] = sent.mass[row];
+    rigid::put(out.x + 3 * row, rigid::Body<T>::at(way + 3 * row) - rigid::Body<T>::at(sent.x + corner));
+    if (sent.since) rigid::add_to(out.x_prev + 3 * row, rigid::Body<T>::at(sent.since + corner));
   });
   bool moves = false;
   for (int i = 0; i < kUnknowns; ++i) moves = moves || solution[i] != 0;
@@ -218,12 +224,12 @@ DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>&
   team.template sum<3>(b.size(), sum, [&](int32_t i, double* to) {
     const int32_t v = b.vertex(i);
     const int64_t row = b.row(v), corner = 3 * (b.scene * in.gate.corners + v);
-    const VertexAdjoint bar = vertex_adjoint(
-        in, b, v, b.position(v) - whole.center, solution, motion, rigid::Body<T>::at(sent.by_p + corner),
-        rigid::Body<T>::at(sent.by_q + corner), floor_lag ? floor_lag + row * in.planes * kFloorLag : nullptr);
+    const VertexAdjoint bar = vertex_adjoint(in, b, v, b.position(v) - whole.center, solution, motion,
+                                             rigid::Body<T>::at(sent.p + corner), rigid::Body<T>::at(sent.q + corner),
+                                             floor_lag ? floor_lag + row * in.planes * kFloorLag : nullptr);
     rigid::add_to(out.x + 3 * row, bar.x + bar.arm);
     rigid::add_to(out.x_prev + 3 * row, bar.x_prev);
-    rigid::put(out.y + 3 * row, bar.y);
+    rigid::add_to(out.y + 3 * row, bar.y);
     out.mass[row] += T(bar.mass);
     to[0] -= bar.arm.x, to[1] -= bar.arm.y, to[2] -= bar.arm.z;
   });
@@ -233,6 +239,15 @@ DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>&
     const Vector x = b.position(v), r = x - whole.center;
     return rigid::VertexMotions{x, moved_by(solution, r), moved_by(motion, r)};
   });
+}
+// And of a point of a collider.
+template <class T>
+DIFFVBD_FN void reverse_collider(const RigidInputs<T>& in, int64_t scene, int32_t point, const PointWork<T>& sent,
+                                 const CorrectionAdjoints<T>& bars) {
+  const int64_t corner = 3 * (scene * in.gate.corners + in.gate.vertices + point);
+  const int64_t to = 3 * (scene * (in.gate.corners - in.gate.vertices) + point);
+  rigid::add_to(bars.collider + to, -rigid::Body<T>::at(sent.x + corner));
+  if (sent.since) rigid::add_to(bars.collider_prev + to, rigid::Body<T>::at(sent.since + corner));
 }
 
 }  // namespace diffvbd::contact

@@ -57,6 +57,7 @@ template <class T>
 void rigid_virtual_motions(const contact::RigidInputs<T>& in, const double* motions, double* solutions, T* p, T* q);
 template <class T>
 void rigid_vertices_backward(const contact::RigidInputs<T>& in, const double* motions, const double* solutions,
-                             const contact::SentBack<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag);
+                             const T* way, const contact::PointWork<T>& sent,
+                             const contact::CorrectionAdjoints<T>& out);
 
 }  // namespace diffvbd

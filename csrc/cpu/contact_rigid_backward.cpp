@@ -13,7 +13,7 @@ void rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& given, co
   torch::stable::parallel_for(0, out.listed, 64, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       const BarrierWork<T> work(in, given, i);
-      out.pushes[i] = work.acts, out.by_kappa[i] = T(0);
+      out.pushes[i] = work.acts;
       for (int part = 0; work.acts && part < kWorkParts; ++part) {
         work.store(part, out.barrier + 4 * kWorkScalars * i, out.by_kappa + i);
       }
@@ -23,7 +23,7 @@ void rigid_backward(const RigidInputs<T>& in, const VirtualMotions<T>& given, co
     for (int64_t i = begin; i < end; ++i) {
       const LaggedWork<T> work(in, given, i);
       T *rows = out.friction + 4 * kWorkScalars * i, *lag_bar = out.lag_bar + kLagScalars * i;
-      work.acts ? work.store(rows, lag_bar) : work.store_none(rows, lag_bar);
+      work.acts ? work.store(rows, lag_bar) : work.store_none(rows);
     }
   });
   torch::stable::parallel_for(0, in.scene.scenes * in.gate.corners, 256, [&](int64_t begin, int64_t end) {

@@ -25,19 +25,22 @@ void rigid_virtual_motions(const RigidInputs<T>& in, const double* motions, doub
 }
 
 template <class T>
-void rigid_vertices_backward(const RigidInputs<T>& in, const double* motions, const double* solutions,
-                             const SentBack<T>& sent, const rigid::Adjoints<T>& out, T* floor_lag) {
+void rigid_vertices_backward(const RigidInputs<T>& in, const double* motions, const double* solutions, const T* way,
+                             const PointWork<T>& sent, const CorrectionAdjoints<T>& out) {
   for_bodies(in.scene, [&](const Body<T>& b, const Threads& team) {
     const int64_t at = kUnknowns * (b.scene * in.bodies() + b.body);
-    reverse_vertices(in, b, team, motions + at, solutions + at, sent, out, floor_lag);
+    reverse_vertices(in, b, team, motions + at, solutions + at, way, sent, out);
   });
+  for (int64_t s = 0; s < in.scene.scenes; ++s) {
+    for (int32_t j = 0; j < in.gate.corners - in.gate.vertices; ++j) reverse_collider(in, s, j, sent, out);
+  }
 }
 
 #define DIFFVBD_INSTANTIATE(T)                                                                                         \
   template void rigid_end_backward<T>(const RigidInputs<T>&, const double*, const double*, const T*, double*, T*, T*); \
   template void rigid_virtual_motions<T>(const RigidInputs<T>&, const double*, double*, T*, T*);                       \
-  template void rigid_vertices_backward<T>(const RigidInputs<T>&, const double*, const double*, const SentBack<T>&,    \
-                                           const rigid::Adjoints<T>&, T*);
+  template void rigid_vertices_backward<T>(const RigidInputs<T>&, const double*, const double*, const T*,              \
+                                           const PointWork<T>&, const CorrectionAdjoints<T>&);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)
 #undef DIFFVBD_INSTANTIATE

@@ -39,14 +39,13 @@ cudaError_t rigid_backward(const contact::RigidInputs<T>& in, const contact::Vir
 template <class T>
 struct RigidReverse {
   const double *motions, *shares, *factor;
-  const T* end_bar;     // [B, V, 3]
-  double* solutions;    // [B, bodies, 6]  memory, of what is solved for
-  T *p, *q, *x, *mass;  // memory, zero at first: as of virtual_motion() and reverse_end()
+  const T* end_bar;   // [B, V, 3]; may be out.of.x
+  double* solutions;  // [B, bodies, 6]  memory, as the rest
+  T *p, *q, *way;     // as of virtual_motion() and reverse_end()
   contact::RigidWork<T> work;
   contact::PointWork<T> sums;
-  int32_t* pushing;        // memory: a number for each scene and for each listed pair
-  rigid::Adjoints<T> out;  // those of data, and floor_lag, are zero at first
-  T* floor_lag;
+  int32_t* pushing;  // a number for each scene and for each listed pair
+  contact::CorrectionAdjoints<T> out;
 };
 template <class T>
 cudaError_t rigid_reverse(const contact::RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream);

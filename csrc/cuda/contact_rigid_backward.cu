@@ -2,7 +2,6 @@
 #include <algorithm>
 
 #include "clear.h"
-#include "clear_rows.cuh"
 #include "contact_rigid_backward.cuh"
 
 namespace diffvbd::cuda {
@@ -19,10 +18,8 @@ __global__ void __launch_bounds__(kOne) rows_kernel(const __grid_constant__ Rigi
     if (row < out.listed) find_pushing(in, given, out, row, pushing, pushing + 1);
     return;
   }
-  const int64_t count = in.first_lagged(in.scene.scenes);
   // nobody reads the rows of what is not there: most of what a list has room for
-  clear_rows(out.lag_bar, kLagScalars, count, out.lagged);
-  if (row < count) store_lagged(in, given, out, row);
+  if (row < in.first_lagged(in.scene.scenes)) store_lagged(in, given, out, row);
 }
 
 template <class T>
@@ -44,34 +41,40 @@ __global__ void __launch_bounds__(kOne)
   if (point < in.scene.scenes * in.gate.corners) sum_at_point(in, work, out, point);
 }
 
-// A block for each body of each scene.
+// The body of a block, and its place.
+template <class T>
+struct Own {
+  int64_t unit;
+  Body<T> body;
+  __device__ explicit Own(const RigidInputs<T>& in)
+      : unit(blockIdx.x), body{in.scene, unit / in.bodies(), static_cast<int32_t>(unit % in.bodies())} {}
+};
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    end_kernel(const __grid_constant__ RigidInputs<T> in, const double* motions, const double* shares, const T* end_bar,
-               double* motion_bar, T* x, T* mass) {
+    end_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ RigidReverse<T> r) {
   __shared__ double part[kWarps][kMostSums];
-  const int64_t item = blockIdx.x, at = kUnknowns * item;
-  const Body<T> body{in.scene, item / in.bodies(), static_cast<int32_t>(item % in.bodies())};
-  reverse_end(body, BlockTeam{part}, motions + at, shares[item], end_bar, motion_bar + at, x, mass);
+  const Own<T> own(in);
+  end_of_body(r, own.body, own.unit, BlockTeam{part});
 }
-
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    motion_kernel(const __grid_constant__ RigidInputs<T> in, const double* motions, double* solutions, T* p, T* q) {
+    motion_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ RigidReverse<T> r) {
   __shared__ double part[kWarps][kMostSums];
-  const int64_t item = blockIdx.x, at = kUnknowns * item;
-  const Body<T> body{in.scene, item / in.bodies(), static_cast<int32_t>(item % in.bodies())};
-  virtual_motion(in, body, BlockTeam{part}, motions + at, solutions + at, p, q);
+  const Own<T> own(in);
+  motion_of_body(in, r, own.body, own.unit, BlockTeam{part});
 }
-
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    vertices_kernel(const __grid_constant__ RigidInputs<T> in, const double* motions, const double* solutions,
-                    SentBack<T> sent, const __grid_constant__ rigid::Adjoints<T> out, T* floor_lag) {
+    vertices_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ RigidReverse<T> r) {
   __shared__ double part[kWarps][kMostSums];
-  const int64_t item = blockIdx.x, at = kUnknowns * item;
-  const Body<T> body{in.scene, item / in.bodies(), static_cast<int32_t>(item % in.bodies())};
-  reverse_vertices(in, body, BlockTeam{part}, motions + at, solutions + at, sent, out, floor_lag);
+  const Own<T> own(in);
+  vertices_of_body(in, r, own.body, own.unit, BlockTeam{part});
+}
+template <class T>
+__global__ void __launch_bounds__(kOne)
+    colliders_kernel(const __grid_constant__ RigidInputs<T> in, const __grid_constant__ RigidReverse<T> r) {
+  const int64_t i = own_item(), points = in.gate.corners - in.gate.vertices;
+  if (i < in.scene.scenes * points) reverse_collider(in, i / points, static_cast<int32_t>(i % points), r.sums, r.out);
 }
 
 template <class T>
@@ -83,18 +86,17 @@ unsigned blocks_of_bodies(const RigidInputs<T>& in) {
 
 template <class T>
 cudaError_t rigid_end_backward(const RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream) {
-  end_kernel<T>
-      <<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r.motions, r.shares, r.end_bar, r.solutions, r.x, r.mass);
+  end_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
   if (auto error = solve_groups(in, r.factor, r.solutions, stream)) return error;
-  motion_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r.motions, r.solutions, r.p, r.q);
+  motion_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
   return cudaGetLastError();
 }
 
 template <class T>
 cudaError_t rigid_vertices_backward(const RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream) {
-  const SentBack<T> sent{r.x, r.mass, r.sums.x, r.sums.p, r.sums.q, r.sums.since};
-  vertices_kernel<T>
-      <<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r.motions, r.solutions, sent, r.out, r.floor_lag);
+  vertices_kernel<T><<<blocks_of_bodies(in), kThreads, 0, stream>>>(in, r);
+  const int64_t points = in.scene.scenes * (in.gate.corners - in.gate.vertices);
+  if (points > 0) colliders_kernel<T><<<blocks_for(points), kOne, 0, stream>>>(in, r);
   return cudaGetLastError();
 }
 

@@ -16,7 +16,7 @@ template <class T>
 __device__ void find_pushing(const RigidInputs<T>& in, const VirtualMotions<T>& given, const RigidWork<T>& out,
                              int64_t row, int32_t* count, int32_t* pushing) {
   const bool pushes = BarrierWork<T>::pushes(in, given, row);
-  out.pushes[row] = pushes, out.by_kappa[row] = T(0);
+  out.pushes[row] = pushes;
   if (pushes) pushing[atomicAdd(count, 1)] = static_cast<int32_t>(row);
 }
 // A part of the work of one that does.
@@ -31,7 +31,7 @@ __device__ void store_lagged(const RigidInputs<T>& in, const VirtualMotions<T>& 
                              int64_t row) {
   T *rows = out.friction + 4 * kWorkScalars * row, *lag_bar = out.lag_bar + kLagScalars * row;
   const LaggedWork<T> work(in, given, row);
-  work.acts ? work.store(rows, lag_bar) : work.store_none(rows, lag_bar);
+  work.acts ? work.store(rows, lag_bar) : work.store_none(rows);
 }
 
 // A corner point, by a warp.
@@ -43,6 +43,25 @@ __device__ void sum_at_point(const RigidInputs<T>& in, const RigidWork<T>& work,
   add_at_point(in, work, point, lane, 32, sum);
   butterfly<kPointScalars, 32>(0xffffffffu, sum);
   if (lane == 0) store_at_point(sum, point, out);
+}
+
+// What a team does for a body, of that place: of the end of a correction, of its motion, and of its vertices.
+template <class T, class Team>
+__device__ void end_of_body(const RigidReverse<T>& r, const Body<T>& body, int64_t unit, const Team& team) {
+  const int64_t at = kUnknowns * unit;
+  reverse_end(body, team, r.motions + at, r.shares[unit], r.end_bar, r.solutions + at, r.way, r.out.of.mass);
+}
+template <class T, class Team>
+__device__ void motion_of_body(const RigidInputs<T>& in, const RigidReverse<T>& r, const Body<T>& body, int64_t unit,
+                               const Team& team) {
+  const int64_t at = kUnknowns * unit;
+  virtual_motion(in, body, team, r.motions + at, r.solutions + at, r.p, r.q);
+}
+template <class T, class Team>
+__device__ void vertices_of_body(const RigidInputs<T>& in, const RigidReverse<T>& r, const Body<T>& body, int64_t unit,
+                                 const Team& team) {
+  const int64_t at = kUnknowns * unit;
+  reverse_vertices(in, body, team, r.motions + at, r.solutions + at, r.way, r.sums, r.out);
 }
 
 // Memory of a block that solves for a group of so many bodies.

@@ -17,7 +17,7 @@ __global__ void __launch_bounds__(kThreads)
   const Cluster cluster = Cluster::all();
   const int64_t scene = blockIdx.x / cluster.size, scenes = in.scene.scenes, unit = scene * in.bodies();
   const BlockTeam block{part};
-  const auto own = static_cast<int64_t>(kThreads * cluster.rank + threadIdx.x);
+  const int64_t own = kThreads * cluster.rank + static_cast<int64_t>(threadIdx.x);
   const int64_t threads = kThreads * cluster.size;
   const auto each = [&](int64_t from, int64_t to, const auto& f) {
     for (int64_t i = from + own; i < to; i += threads) f(i);
@@ -26,47 +26,25 @@ __global__ void __launch_bounds__(kThreads)
     for (int32_t b = cluster.rank; b < in.bodies(); b += cluster.size) f(Body<T>{in.scene, scene, b}, unit + b);
     cluster.meet();
   };
-  const int64_t listed = in.first_listed(scene), listed_end = in.first_listed(scene + 1);
-  const int64_t lagged = in.first_lagged(scene), lagged_end = in.first_lagged(scene + 1);
-  const bool last = scene + 1 == scenes;  // which has the rows that are not there, too
-  if (last) {
-    each(listed_end, r.work.listed, [&](int64_t row) { r.work.by_kappa[row] = T(0); });
-    each(lagged_end * kLagScalars, r.work.lagged * kLagScalars, [&](int64_t i) { r.work.lag_bar[i] = T(0); });
-  }
   bool went = false;
   block.each(in.bodies(), [&](int32_t b) {
     went = went || r.shares[unit + b] != 0;
     for (int i = 0; i < kUnknowns; ++i) went = went || r.motions[kUnknowns * (unit + b) + i] != 0;
   });
-  const int64_t rows = scene * in.scene.vertices, corners = scene * in.gate.corners;
   if (!__syncthreads_or(went)) {  // a captured step makes all of its corrections, most of which move nothing
-    each(3 * rows, 3 * (rows + in.scene.vertices), [&](int64_t i) {
-      r.out.x[i] = r.end_bar[i];
-      if (r.out.x_prev) r.out.x_prev[i] = T(0);
-      r.out.y[i] = T(0);
-    });
-    each(rows, rows + in.scene.vertices, [&](int64_t row) { r.out.mass[row] = T(0); });
-    each(3 * corners, 3 * (corners + in.gate.corners), [&](int64_t i) {
-      r.sums.x[i] = T(0);
-      if (r.sums.since) r.sums.since[i] = T(0);
-    });
-    each(listed, listed_end, [&](int64_t row) { r.work.by_kappa[row] = T(0); });
-    if (r.work.lagged > 0) {
-      each(lagged * kLagScalars, lagged_end * kLagScalars, [&](int64_t i) { r.work.lag_bar[i] = T(0); });
-    }
-    return;
+    const int64_t first = 3 * scene * in.scene.vertices;
+    if (r.end_bar == r.out.of.x) return;
+    return each(first, first + 3 * in.scene.vertices, [&](int64_t i) { r.out.of.x[i] = r.end_bar[i]; });
   }
+  const int64_t listed = in.first_listed(scene), listed_end = in.first_listed(scene + 1);
+  const int64_t lagged = in.first_lagged(scene), lagged_end = in.first_lagged(scene + 1);
+  const int64_t corners = scene * in.gate.corners, points = in.gate.corners - in.gate.vertices;
   int32_t *count = r.pushing + scene, *pushing = r.pushing + scenes + listed;
   if (own == 0) *count = 0;
-  each_body([&](const Body<T>& body, int64_t at) {
-    reverse_end(body, block, r.motions + kUnknowns * at, r.shares[at], r.end_bar, r.solutions + kUnknowns * at, r.x,
-                r.mass);
-  });
+  each_body([&](const Body<T>& body, int64_t of) { end_of_body(r, body, of, block); });
   if (cluster.rank == 0) solve_group(in, scene, 0, r.factor, r.solutions, memory);
   cluster.meet();
-  each_body([&](const Body<T>& body, int64_t at) {
-    virtual_motion(in, body, block, r.motions + kUnknowns * at, r.solutions + kUnknowns * at, r.p, r.q);
-  });
+  each_body([&](const Body<T>& body, int64_t of) { motion_of_body(in, r, body, of, block); });
   const VirtualMotions<T> given{r.p, r.q};
   each(listed, listed_end, [&](int64_t row) { find_pushing(in, given, r.work, row, count, pushing); });
   if (r.work.lagged > 0) each(lagged, lagged_end, [&](int64_t row) { store_lagged(in, given, r.work, row); });
@@ -78,11 +56,8 @@ __global__ void __launch_bounds__(kThreads)
   cluster.meet();
   for (int64_t k = own / 32; k < in.gate.corners; k += threads / 32) sum_at_point(in, r.work, r.sums, corners + k);
   cluster.meet();
-  const SentBack<T> sent{r.x, r.mass, r.sums.x, r.sums.p, r.sums.q, r.sums.since};
-  each_body([&](const Body<T>& body, int64_t at) {
-    reverse_vertices(in, body, block, r.motions + kUnknowns * at, r.solutions + kUnknowns * at, sent, r.out,
-                     r.floor_lag);
-  });
+  each_body([&](const Body<T>& body, int64_t of) { vertices_of_body(in, r, body, of, block); });
+  each(0, points, [&](int64_t j) { reverse_collider(in, scene, static_cast<int32_t>(j), r.sums, r.out); });
 }
 
 }  // namespace

@@ -80,6 +80,16 @@ def rigid_backward(fields: TouchingFields, p: Tensor, q: Tensor, groups: Tensor,
                                                 friction_eps))  # fmt: skip
 
 
+class Made(NamedTuple):
+    """Corrections one after another, the first one first."""
+
+    x: Sequence[Tensor]  # where each began [B, V, 3]
+    motion: Sequence[Tensor]
+    share: Sequence[Tensor]
+    factor: Sequence[Tensor]
+    groups: Sequence[Tensor]
+
+
 class RigidAdjoints(NamedTuple):
     """What :func:`rigid_reverse` finds, of each scene and pair."""
 
@@ -89,19 +99,19 @@ class RigidAdjoints(NamedTuple):
     mass: Tensor  # [B, V]
     energy_data: Tensor  # [B, n], or empty
     floor_lag: Tensor  # [B, V, planes, 4], or empty
-    by_x: Tensor  # as PairWork: colliders have the adjoint less this
-    since: Tensor  # and before the step this
-    by_kappa: Tensor
-    lag_bar: Tensor
+    collider: Tensor  # [B, Vc, 3]
+    collider_prev: Tensor
+    by_kappa: Tensor  # [pairs], less that of each listed pair
+    lag: Tensor  # [lagged, 9]
 
 
-def rigid_reverse(fields: TouchingFields, motion: Tensor, share: Tensor, factor: Tensor, groups: Tensor, x_bar: Tensor,
-                  data_count: Sequence[int], time_step: float, friction_eps: float, wants_data: bool
-                  ) -> RigidAdjoints:  # fmt: skip
-    """The adjoint of a correction, of that of where it led, x_bar [B, V, 3]: of the way itself, and of
-    -p . (gradient + matrix q), p and q being how points move by the adjoint of the motion and by the motion."""
+def rigid_reverse(fields: TouchingFields, made: Made, x_bar: Tensor, data_count: Sequence[int], time_step: float,
+                  friction_eps: float, wants_data: bool) -> RigidAdjoints:  # fmt: skip
+    """The adjoint of corrections, of that of where the last one led, x_bar [B, V, 3]: of their ways, and of
+    -p . (gradient + matrix q), p and q being how points move by the adjoint of a motion and by the motion. fields: Of
+    all of them, but for x."""
     x, x_prev, y, mass, shared, own, *rest = raw.contact_rigid_reverse(
-        *fields, motion, share, factor, groups, x_bar.contiguous(), data_count, time_step, friction_eps, wants_data
+        *fields, *(list(each) for each in made), x_bar.contiguous(), data_count, time_step, friction_eps, wants_data
     )
     data = join_data(shared, own, data_count) if wants_data else shared
     return RigidAdjoints(x, x_prev, y, mass, data, *rest)
@@ -128,14 +138,15 @@ def _(*arguments):
 
 @shapes_of("contact_rigid_backward")
 def _(*arguments):
-    return _of_pairs(TouchingFields(*arguments[:_FIELDS]))
-
-
-def _of_pairs(f: TouchingFields) -> tuple[Tensor, ...]:
-    listed, lagged = f.pairs.shape[0], f.lag_pairs.shape[0] if f.lag.numel() else 0
+    f = TouchingFields(*arguments[:_FIELDS])
+    listed, lagged = _rows(f)
     b, n = f.x.shape[0], f.body.shape[0]
     since = (b if lagged else 0, n, 3)
     return tuple(f.x.new_empty(shape) for shape in (*[(b, n, 3)] * 3, since, (listed,), (lagged, 9)))
+
+
+def _rows(f: TouchingFields) -> tuple[int, int]:
+    return f.pairs.shape[0], f.lag_pairs.shape[0] if f.lag.numel() else 0
 
 
 @shapes_of("contact_rigid_reverse")
@@ -143,12 +154,12 @@ def _(*arguments):
     f, wants_data = TouchingFields(*arguments[:_FIELDS]), arguments[-1]
     b, v = f.x.shape[:2]
     planes = f.floor_lag.numel() // max(1, f.floor_lag.shape[0] * v * 4)
+    listed, lagged = _rows(f)
     shared, own = scalars_of_data(arguments[-4])
     data = ((b, f.free.shape[0] if wants_data else 0, shared), (b, v if wants_data else 0, own))
-    sizes = ((b, v), *data, (b if planes else 0, v, planes, 4))
-    by_x, _, _, since, by_kappa, lag_bar = _of_pairs(f)
-    of_vertices = (*(torch.empty_like(f.x) for _ in range(3)), *(f.x.new_empty(size) for size in sizes))
-    return (*of_vertices, by_x, since, by_kappa, lag_bar)
+    colliders = (b, f.body.shape[0] - v, 3)
+    sizes = ((b, v), *data, (b if planes else 0, v, planes, 4), colliders, colliders, (listed,), (lagged, 9))
+    return (*(torch.empty_like(f.x) for _ in range(3)), *(f.x.new_empty(size) for size in sizes))
 
 
 for _name in ("contact_rigid_system", "contact_rigid_move", "contact_rigid_backward", "contact_rigid_reverse"):

@@ -190,13 +190,13 @@ class ContactStep:
             if self._reads(x):
                 self._check(r, met.counts[r].tolist(), met)
             begin = x
-            x, first, *_ = corrected(self, start.x, now, start, detection.listed)
+            x, taken, _ = corrected(self, start.x, now, start, detection.listed)
             if start.own:
                 start = replaced(start, own=(start.own[0] + (x - start.x).detach(), start.own[1]))
             room = rooms_of_sweeps(motion, surface, barrier, start, x, begin)
             near, kept = self._narrowed(detection.listed, x, now, room)
             swept_from = replaced(start, center=x.detach(), room=room)
-            taken, limits, combined, lengths, held, cut = [first], None, None, None, start.short, start.short
+            limits, combined, lengths, held, cut = None, None, None, start.short, start.short
             if sweeps:
                 part = replaced(settings, sweeps=sweeps)
                 swept = swept_part(self, x, swept_from, now, near, part, policy, debug_step)
@@ -255,7 +255,7 @@ class ContactStep:
         if self.prepared.settings.sweeps:
             settings = self.prepared.settings
             swept = swept_part(self, x, start, self.colliders, none, settings, policy, debug_step)
-            x, *_ = corrected_after(self, swept.x, self.colliders, start, none, True)
+            x = corrected_after(self, swept.x, self.colliders, start, none, True).x
             record_parts(self.model, x, [swept])
         return x
 

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..ops.contact_rigid import left_alone, most_grouped
+from ..ops.contact_rigid import Moved, left_alone, most_grouped
 from ..scopes import is_captured
-from .rigid_contact import Corrected, bodies_of, correct
+from .rigid_contact import Corrected, More, Which, bodies_of, correct
 
 if TYPE_CHECKING:
     from ..adjoint.contact_lag import Pairs
@@ -29,11 +29,11 @@ HELD = 0.01  # of its way in the step and of dhat: by more than that a body has 
 
 
 def corrected(of: ContactStep, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs,
-              moving: Tensor | None = None, alone: bool = False) -> Corrected:  # fmt: skip
-    """After the rigid correction of all free bodies, or of the groups of some."""
+              more: More = lambda *_: None) -> Corrected:  # fmt: skip
+    """After the rigid correction of all free bodies, and more of them, as of rigid_contact.correct."""
     numbers = of.prepared.settings.numbers
     eps = 0.0 if of.model.friction is None else numbers.friction_eps
-    return correct(of.model, touching(of, x, collider, start, listed), numbers.time_step, eps, moving, alone)
+    return correct(of.model, touching(of, x, collider, start, listed), numbers.time_step, eps, more)
 
 
 def touching(of: ContactStep, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs) -> ops.TouchingFields:
@@ -46,43 +46,32 @@ def touching(of: ContactStep, x: Tensor, collider: Tensor, start: PartStart, lis
 
 
 def corrected_after(of: ContactStep, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs, last: bool
-                    ) -> tuple[Tensor, list[Tensor], Tensor]:  # fmt: skip
-    """Positions after the corrections that follow the sweeps of a part; the shares that bodies took of each; and how
-    much of its last shift each did not take, [B, bodies] [m]. Index data but for the first.
-
-    Args:
-        last: Whether these are the last sweeps.
-    """
+                    ) -> Corrected:  # fmt: skip
+    """After the corrections that follow the sweeps of a part. last: Whether these are the last sweeps."""
     # coarse sweeps leave a stiff body turned, and one Newton step leaves so much of that that a free body gained spin
     least = 1 if of.prepared.coarse is None else 2
-    at = corrected(of, x, collider, start, listed)
-    shares = [at.share]
-    for _ in range(1, least):
-        at = corrected(of, at.x, collider, start, listed)
-        shares.append(at.share)
-    back = at.left
-    if not last or of.barrier is None:
-        return at.x, shares, back
     bodies = of.model.mesh.num_bodies
-    grouped = bodies <= most_grouped(bodies)
-    for k in range(least, HELD_CORRECTIONS if grouped else LEFT_CORRECTIONS):
-        alone = k >= HELD_CORRECTIONS
-        left = None if grouped else left_alone(at.groups)
-        if not is_captured(x):
-            some_held = not alone and bool(at.held.any())
+    grouped, captured = bodies <= most_grouped(bodies), is_captured(x)
+
+    def more(count: int, end: Moved, groups: Tensor) -> Which | None:
+        if count < least:
+            return Which()
+        if not last or of.barrier is None or count >= (HELD_CORRECTIONS if grouped else LEFT_CORRECTIONS):
+            return None
+        alone = count >= HELD_CORRECTIONS
+        left = None if grouped else left_alone(groups)
+        if not captured:
+            some_held = not alone and bool(end.held.any())
             if not some_held and (left is None or not bool(left.any())):
-                break
+                return None
             alone = not some_held
-        moving = at.held if left is None else left if alone else at.held | left
-        at = corrected(of, at.x, collider, start, listed, moving, alone)
-        shares.append(at.share)
-        back = torch.where(at.moved, at.left, back)
-    return at.x, shares, back
+        return Which(end.held if left is None else left if alone else end.held | left, alone)
+
+    return corrected(of, x, collider, start, listed, more)
 
 
 def is_cut(of: ContactStep, x: Tensor, back: Tensor) -> Tensor:
-    """The vertices [B, V] of bodies that were held up at the end, at x [B, V, 3], by ``back`` as it comes from
-    corrected_after."""
+    """The vertices [B, V] of bodies that were held up at the end, at x [B, V, 3]; back: of Corrected."""
     assert of.barrier is not None
     way = (x.detach() - of.x_prev.detach()).norm(dim=-1)
     return back[:, of.model.body] > HELD * (way + of.barrier.dhat)

@@ -28,24 +28,36 @@ _FIELDS = len(ops.TouchingFields._fields)
 
 
 class Corrected(NamedTuple):
-    """What a correction returns; all but x is index data."""
+    """Where corrections led; all but x is index data."""
 
     x: Tensor  # [B, V, 3]
-    share: Tensor  # of its motion that each body took [B, bodies]; the next as ops.contact_rigid.Moved has them
-    moved: Tensor
-    held: Tensor
-    left: Tensor
-    groups: Tensor  # as ops.contact_rigid has them
+    shares: list[Tensor]  # of its motion that each body took of each [B, bodies]
+    back: Tensor  # how much of its last shift each did not take [B, bodies] [m]
+
+
+class Which(NamedTuple):
+    """Which bodies a correction is to move, as of ops.contact_rigid.rigid_system."""
+
+    moving: Tensor | None = None  # bool [B, bodies]; None: all
+    alone: bool = False
+
+
+# After so many corrections, with what came of the last and its groups: which the next one moves; None: no more.
+More = Callable[[int, ops_rigid.Moved, Tensor], Which | None]
 
 
 def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction_eps: float,
-            moving: Tensor | None = None, alone: bool = False) -> Corrected:  # fmt: skip
-    """After every free body has been moved, as far as pairs, floors and the potential let it. friction_eps: [m], 0
-    without friction. moving, alone: As for ops.contact_rigid.rigid_system. Differentiable in ops.TOUCHING_ADJOINTS."""
+            more: More = lambda *_: None) -> Corrected:  # fmt: skip
+    """After every free body has been moved, as far as pairs, floors and the potential let it, and then again as ``more``
+    says. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
-    out = _Correct.apply(*fields, model, time_step, friction_eps, moving, alone)
-    x, share, _, _, groups, moved, held, left = out
-    return Corrected(x, share.to(x.dtype), moved, held, left, groups)
+    x, back, *made = _Correct.apply(*fields, model, time_step, friction_eps, more)
+    return Corrected(x, [share.to(x.dtype) for share in _made(fields.x, made).share], back)
+
+
+def _made(x: Tensor, flat: Sequence[Tensor]) -> ops_rigid.Made:
+    """Of what begins at x: flat are motion, share, factor and groups of each, and where all but the first began."""
+    return ops_rigid.Made([x, *flat[4::5]], *(flat[k::5] for k in range(4)))
 
 
 def bodies_of(model: Model) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -68,30 +80,38 @@ class _Correct(Direct):
     @staticmethod
     def forward(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider, collider_prev, kappa,
                 pairs, constants, pair_ptr, pair_entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room,
-                model, time_step, friction_eps, moving, alone):  # fmt: skip
+                model, time_step, friction_eps, more):  # fmt: skip
         fields = ops.TouchingFields(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider,
                                     collider_prev, kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs,
                                     lag_ptr, lag_entry, floor_lag, center, room)  # fmt: skip
-        counts = model._data_count
-        centers, motion, factor, groups = ops_rigid.rigid_system(fields, counts, time_step, friction_eps, moving, alone)
-        end = ops_rigid.rigid_move(fields, centers, motion, counts, time_step, friction_eps, moving)
-        return end.x, end.share, motion, factor, groups, end.moved, end.held, end.left
+        counts, which, made, count, back = model._data_count, Which(), [], 0, x
+        while which is not None:
+            made.extend([fields.x] if made else [])
+            centers, motion, factor, groups = ops_rigid.rigid_system(fields, counts, time_step, friction_eps, *which)
+            end = ops_rigid.rigid_move(fields, centers, motion, counts, time_step, friction_eps, which.moving)
+            made.extend([motion, end.share, factor, groups])
+            count, fields = count + 1, fields._replace(x=end.x)
+            back = end.left if which.moving is None else torch.where(end.moved, end.left, back)
+            which = more(count, end, groups)
+        return fields.x, back, *made
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        ctx.save_for_backward(*inputs[:_FIELDS], *output[1:5])
-        ctx.options = inputs[_FIELDS:-2]
+        ctx.save_for_backward(*inputs[:_FIELDS], *output[2:])
+        ctx.options = inputs[_FIELDS:-1]
         ctx.mark_non_differentiable(*output[1:])
         ctx.set_materialize_grads(False)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple:
         if grads[0] is None:
-            return (None,) * (_FIELDS + 5)
+            return (None,) * (_FIELDS + 4)
         ops.not_batched(grads[0])
         needs = ctx.needs_input_grad[:_FIELDS]
-        out = _CorrectBackward.apply(grads[0], *ctx.saved_tensors, *ctx.options, needs)
-        return of_inputs(out if isinstance(out, tuple) else (out,), needs, 5)
+        saved = ctx.saved_tensors
+        made = _made(saved[0], saved[_FIELDS:])
+        out = _CorrectBackward.apply(grads[0], *saved[:_FIELDS], made, *ctx.options, needs)
+        return of_inputs(out if isinstance(out, tuple) else (out,), needs, 4)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> Any:
@@ -102,38 +122,28 @@ class _CorrectBackward(Backward):
     @staticmethod
     def forward(x_bar, x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider, collider_prev,
                 kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center,
-                room, share, motion, factor, groups, model, time_step, friction_eps, needs):  # fmt: skip
+                room, made, model, time_step, friction_eps, needs):  # fmt: skip
         # torch.compile counts these arguments: *args would get the context as well
         fields = ops.TouchingFields(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider,
                                     collider_prev, kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs,
                                     lag_ptr, lag_entry, floor_lag, center, room)  # fmt: skip
         s = Scenes(model, fields, time_step, friction_eps or 1.0)  # which loads that are zero do not read
-        return _adjoints(s, x_bar, share, motion, factor, groups, needs)
+        return _adjoints(s, x_bar, made, needs)
 
 
-def _adjoints(s: Scenes, x_bar: Tensor, share: Tensor, motion: Tensor, factor: Tensor, groups: Tensor,
-              needs: Sequence[bool]) -> tuple[Tensor, ...]:  # fmt: skip
+def _adjoints(s: Scenes, x_bar: Tensor, made: ops_rigid.Made, needs: Sequence[bool]) -> tuple[Tensor, ...]:
     """Of the fields that need one. With H d = -g, the adjoint of d is that of -l . (g + H d), where H l is the adjoint
     of d: a sum over vertices and pairs."""
-    f, (scenes, vertices) = s.fields, s.fields.x.shape[:2]
+    f = s.fields
     wants = dict(zip(ops.TouchingFields._fields, needs, strict=True))
-    own = ops_rigid.rigid_reverse(f, motion, share, factor, groups, x_bar, s.model._data_count, s.time_step,
-                                  s.friction_eps, wants["energy_data"])  # fmt: skip
-    out: dict[str, Callable[[], Tensor]] = {  # few are wanted, and each is a launch
-        "x": lambda: own.x,
-        "x_prev": lambda: own.x_prev,
-        "y": lambda: own.y,
-        "mass": lambda: own.mass,
-        "energy_data": lambda: own.energy_data,
-        "collider": lambda: -own.by_x[:, vertices:],
-        "collider_prev": lambda: own.since[:, vertices:] if len(own.since) else torch.zeros_like(f.collider),
-        "kappa": lambda: -sum_of_scenes(own.by_kappa, s.listed, scenes),
-        "lag": lambda: own.lag_bar,
-        "floor_lag": lambda: own.floor_lag,
-    }
+    own = ops_rigid.rigid_reverse(f, made, x_bar, s.model._data_count, s.time_step, s.friction_eps,
+                                  wants["energy_data"])._asdict()  # fmt: skip
+    by_kappa = own.pop("by_kappa")
+    if wants["kappa"]:
+        own["kappa"] = -sum_of_scenes(by_kappa, s.listed, f.x.shape[0])
     bars = []
     for name, t in zip(f._fields, f, strict=True):
         if wants[name]:
-            bar = out[name]() if name in out else t.new_empty((0,))
+            bar = own.get(name, t[:0])
             bars.append(ops.sum_to(bar, t.shape) if bar.numel() else torch.zeros_like(t))
     return tuple(bars)

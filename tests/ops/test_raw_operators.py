@@ -43,6 +43,7 @@ CASES += [
     ("contact", "contact_rooms"),
     ("contact", "contact_rigid_system"),
     ("contact", "contact_rigid_move"),
+    ("contact", "contact_rigid_reverse"),
     ("floor", "pack_rest"),
     ("floor", "star_sum"),
     ("floor", "tet_gather"),
@@ -179,6 +180,18 @@ def test_tensors_of_another_kind_or_place(device: str, recorded: Any, scene: str
             wrong += attempt(name, given, key, value.to("meta"))
             wrong += attempt(name, given, key, value.cpu()) if value.is_cuda else []
     assert not wrong
+
+
+def test_corrections_of_which_some_is_missing(device: str, recorded: Any) -> None:
+    given = recorded("contact", device)["contact_rigid_reverse"]
+    lists = {key: value for key, value in given.items() if isinstance(value, list) and isinstance(value[0], Tensor)}
+    assert set(lists) == {"at", "motion", "share", "factor", "groups"}
+    refused("contact_rigid_reverse", given, **dict.fromkeys(lists, []))
+    for key, value in lists.items():
+        refused("contact_rigid_reverse", given, **{key: [*value, value[0]]})
+        if value[0].numel():
+            refused("contact_rigid_reverse", given, **{key: [t.reshape(-1)[:-1].clone() for t in value]})
+            refused("contact_rigid_reverse", given, **{key: [t.to(torch.float16) for t in value]})
 
 
 @pytest.mark.parametrize("end", ["", "_backward"])

@@ -23,9 +23,10 @@ rigid_contact = importlib.import_module("diffvbd.step.rigid_contact")
 ELASTIC = dv.StableNeoHookean()
 
 
-def pile(*energies: Any, heights: Sequence[int] = (2,), anchored: bool = False, scenes: int = 1,
+def pile(*energies: Any, heights: Sequence[int] = (2,), anchored: bool = False, scenes: int = 1, closing: float = 0.0,
          dtype: torch.dtype = torch.float64) -> tuple[dv.Model, Tensor, Tensor]:  # fmt: skip
-    """Boxes one above the other over a floor at -5 mm that the lowest touch; x and v [scenes, V, 3]."""
+    """Boxes one above the other over a floor at -5 mm that the lowest touch; x and v [scenes, V, 3]. closing: At which
+    the first and the third come toward the second [m/s]."""
     box = mesh.box(2, 0.1)
     places = [[0.5 * n + 0.013 * (k % 4), 0.105 * k, 0.017 * (k % 4)] for n, high in enumerate(heights)
               for k in range(high)]  # fmt: skip
@@ -37,7 +38,9 @@ def pile(*energies: Any, heights: Sequence[int] = (2,), anchored: bool = False, 
     model = dv.Model(tets, energies=(ELASTIC, *energies)).to(dtype=dtype)
     shape = (scenes, *model.rest_points.shape)
     x = model.rest_points + noise("pile", shape=shape, size=5e-4).to(dtype)
-    return model, x, noise("pile", "v", shape=shape, size=0.3).to(dtype)
+    v = noise("pile", "v", shape=shape, size=0.3).to(dtype)
+    v[..., 1] += closing * (1 - model.body.to(dtype))
+    return model, x, v
 
 
 FLOOR = dv.FloorBarrier([-0.005, -0.3], [(0.0, 1.0, 0.0), (0.3, 1.0, 0.1)], kappa=1e3, dhat=0.01, damping=3.0)
@@ -50,6 +53,7 @@ CASES = {
     # more than sixty-four: groups of three and two, and those of a stack that is too high, each alone
     "many": ((PAIRS, dv.Friction(0.4, 0.05)), {"heights": (3, ops_rigid.MOST_COUPLED + 1, 2, 1), "scenes": 2}),
     "single": ((FLOOR, PAIRS, dv.Friction(0.4)), {"dtype": torch.float32}),
+    "held": ((FLOOR, PAIRS, dv.Friction(0.4)), {"heights": (3,), "closing": 4.0}),
 }
 
 
@@ -167,18 +171,29 @@ def derived(s: Scenes, needs: Sequence[bool], *given: Tensor) -> tuple[Tensor, .
         return by_autograd(s._replace(fields=ops.TouchingFields(*leaves)), *given, needs)
 
 
+def of_all(s: Scenes, needs: Sequence[bool], x_bar: Tensor, made: ops_rigid.Made) -> list[Tensor]:
+    """The same of corrections one after another: what x has goes on to the one before, the rest adds up."""
+    total: list[Tensor] = []
+    for x, motion, share, factor, groups in reversed(list(zip(*made, strict=True))):
+        bars = derived(s._replace(fields=s.fields._replace(x=x)), needs, x_bar, share, motion, factor, groups)
+        assert needs[0]
+        x_bar = bars[0]
+        total = [x_bar, *(a + b for a, b in zip(total[1:], bars[1:], strict=True))] if total else list(bars)
+    return total
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_compiled_adjoint_is_that_of_autograd(name: str, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     energies, options = CASES[name]
     model, x, v = pile(*energies, **options)
     model, x, v = model.to(device), x.to(device), v.to(device)
-    compiled, seen = rigid_contact._adjoints, {}
+    compiled, seen, longest = rigid_contact._adjoints, {}, []
 
-    def both(s: Scenes, x_bar: Tensor, *given: Any) -> Any:
-        *tensors, needs = given
-        found = compiled(s, x_bar, *given)
-        expected = derived(s, needs, x_bar, *tensors)
+    def both(s: Scenes, x_bar: Tensor, made: ops_rigid.Made, needs: Sequence[bool]) -> Any:
+        found = compiled(s, x_bar, made, needs)
         names = [field for field, need in zip(ops.TouchingFields._fields, needs, strict=True) if need]
+        longest.append(len(made.x))
+        expected = of_all(s, needs, x_bar, made)
         for field, own, other in zip(names, found, expected, strict=True):
             size = float(other.norm())
             seen[field] = max(seen.get(field, 0.0), size)
@@ -198,6 +213,7 @@ def test_compiled_adjoint_is_that_of_autograd(name: str, device: str, monkeypatc
     end = dv.step(model, leaves["x"], leaves["v"], mu=1e5, lam=1e5, time_step=0.01, sweeps=2, density=leaves["density"],
                   parameters=values)  # fmt: skip
     sum(((t * noise(name, shape=t.shape, size=1.0).to(t)).sum() for t in end), x.new_zeros(())).backward()
+    assert (max(longest) > 1) == (name in ("many", "held"))
     wanted = {"x", "x_prev", "y", "mass"} | ({"lag"} if "pair_barrier.kappa" in values else {"floor_lag"})
     assert all(seen[field] > 0 for field in wanted), seen
     assert all(

@@ -67,40 +67,52 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_backwar
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
-    const auto make = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes); };
+    const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed) {
+      return zeroed ? zeros(x, sizes) : empty(x, sizes);
+    };
     const diffvbd::RigidWorkTensors out(f, torch::stable::empty({f.pairs.size(0)}, ScalarType::Byte), make);
     diffvbd::rigid_backward<T>(in, diffvbd::virtual_motions(in, p, q, x), out.view<T>(), out.sums<T>());
     return out.all();
   });
 }
 
-diffvbd::RigidAdjoints contact_rigid_reverse(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& share,
-                                             const Tensor& factor, const Tensor& groups, const Tensor& x_bar,
-                                             std::vector<int64_t> data_count, double time_step, double friction_eps,
-                                             bool wants_data) {
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>
+contact_rigid_reverse(DIFFVBD_PARAMETERS(TOUCHING) std::vector<Tensor> at, std::vector<Tensor> motion,
+                      std::vector<Tensor> share, std::vector<Tensor> factor, std::vector<Tensor> groups,
+                      const Tensor& x_bar, std::vector<int64_t> data_count, double time_step, double friction_eps,
+                      bool wants_data) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::reversed_inputs<T>(f, data_count, time_step, friction_eps, motion, share, factor, groups,
-                                                x_bar, empty(x, {0}));
-    const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed = false) {
+    const diffvbd::Corrections all{at, motion, share, factor, groups};
+    all.require_equal();
+    const auto inputs = [&](int64_t k) {
+      return all.inputs<T>(k, f, data_count, time_step, friction_eps, empty(x, {0}));
+    };
+    const auto last = inputs(all.count() - 1);
+    diffvbd::require_like("x_bar", x_bar, x, 3 * last.scene.scenes * last.scene.vertices);
+    const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed) {
       return zeroed ? zeros(x, sizes) : empty(x, sizes);
     };
-    const diffvbd::RigidEndTensors end(in, [&](const std::vector<int64_t>& sizes) { return zeros(x, sizes); });
-    const diffvbd::RigidWorkTensors pairs(f, torch::stable::empty({f.pairs.size(0)}, ScalarType::Byte), make);
-    const diffvbd::RigidVertexTensors out(in, data_count, wants_data, make);
-    const auto *motions = data<const double>(motion), *shares = data<const double>(share);
-    const Tensor solution = doubles({in.scene.scenes, in.bodies(), contact::kUnknowns});
+    const diffvbd::RigidReverseTensors t(f, last, data_count, wants_data,
+                                         torch::stable::empty({f.pairs.size(0)}, ScalarType::Byte), make);
+    const Tensor solution = doubles({last.scene.scenes, last.bodies(), contact::kUnknowns});
     auto* l = data<double>(solution);
-    T *p = data<T>(end.p), *q = data<T>(end.q), *x_end = data<T>(end.x), *mass_end = data<T>(end.mass);
-    diffvbd::rigid_end_backward<T>(in, motions, shares, data<const T>(x_bar), l, x_end, mass_end);
-    diffvbd::rigid_solve<T>(in, data<const double>(factor), l);
-    diffvbd::rigid_virtual_motions<T>(in, motions, l, p, q);
-    const auto sums = pairs.sums<T>();
-    diffvbd::rigid_backward<T>(in, {p, q}, pairs.view<T>(), sums);
-    diffvbd::rigid_vertices_backward<T>(in, motions, l, {x_end, mass_end, sums.x, sums.p, sums.q, sums.since},
-                                        out.pointers<T>(), out.floor<T>());
-    return diffvbd::rigid_adjoints(out, pairs);
+    T *p = data<T>(t.p), *q = data<T>(t.q), *way = data<T>(t.way);
+    const auto out = t.out<T>();
+    const auto sums = t.pairs.sums<T>();
+    const T* end_bar = data<const T>(x_bar);
+    for (int64_t k = all.count() - 1; k >= 0; --k) {
+      const auto in = inputs(k);
+      const auto* motions = data<const double>(motion[k]);
+      diffvbd::rigid_end_backward<T>(in, motions, data<const double>(share[k]), end_bar, l, way, out.of.mass);
+      diffvbd::rigid_solve<T>(in, data<const double>(factor[k]), l);
+      diffvbd::rigid_virtual_motions<T>(in, motions, l, p, q);
+      diffvbd::rigid_backward<T>(in, {p, q}, t.pairs.view<T>(), sums);
+      diffvbd::rigid_vertices_backward<T>(in, motions, l, way, sums, out);
+      end_bar = out.of.x;
+    }
+    return t.all();
   });
 }
 

@@ -79,8 +79,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_backwar
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const auto in = diffvbd::touching_inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}), groups);
-    const auto make = [&](const std::vector<int64_t>& sizes) { return empty(x, sizes); };
+    Zeroed zeros(x);
+    const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed) {
+      return zeroed ? zeros(sizes) : empty(x, sizes);
+    };
     const diffvbd::RigidWorkTensors out(f, empty(x, {f.pairs.size(0)}, ScalarType::Byte), make);
+    zeros.clear();
     const Tensor pushing = empty(x, {1 + f.pairs.size(0)}, ScalarType::Int);
     check(cuda::rigid_backward<T>(in, diffvbd::virtual_motions(in, p, q, x), out.view<T>(), out.sums<T>(),
                                   data<int32_t>(pushing), current_stream(x)),
@@ -89,42 +93,50 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> contact_rigid_backwar
   });
 }
 
-diffvbd::RigidAdjoints contact_rigid_reverse(DIFFVBD_PARAMETERS(TOUCHING) const Tensor& motion, const Tensor& share,
-                                             const Tensor& factor, const Tensor& groups, const Tensor& x_bar,
-                                             std::vector<int64_t> data_count, double time_step, double friction_eps,
-                                             bool wants_data) {
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>
+contact_rigid_reverse(DIFFVBD_PARAMETERS(TOUCHING) std::vector<Tensor> at, std::vector<Tensor> motion,
+                      std::vector<Tensor> share, std::vector<Tensor> factor, std::vector<Tensor> groups,
+                      const Tensor& x_bar, std::vector<int64_t> data_count, double time_step, double friction_eps,
+                      bool wants_data) {
   const TouchingFields f{DIFFVBD_ITEMS(TOUCHING)};
   const DeviceGuard guard(x.get_device_index());
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
-    const auto in = diffvbd::reversed_inputs<T>(f, data_count, time_step, friction_eps, motion, share, factor, groups,
-                                                x_bar, empty(x, {0}));
+    const diffvbd::Corrections all{at, motion, share, factor, groups};
+    all.require_equal();
+    const auto inputs = [&](int64_t k) {
+      return all.inputs<T>(k, f, data_count, time_step, friction_eps, empty(x, {0}));
+    };
+    const auto last = inputs(all.count() - 1);
+    const int64_t scenes = last.scene.scenes;
+    diffvbd::require_like("x_bar", x_bar, x, 3 * scenes * last.scene.vertices);
     Zeroed zeros(x);
-    const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed = false) {
+    const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed) {
       return zeroed ? zeros(sizes) : empty(x, sizes);
     };
-    const diffvbd::RigidEndTensors end(in, zeros);
-    const diffvbd::RigidWorkTensors pairs(f, empty(x, {f.pairs.size(0)}, ScalarType::Byte), make);
-    const diffvbd::RigidVertexTensors out(in, data_count, wants_data, make);
+    const diffvbd::RigidReverseTensors t(f, last, data_count, wants_data, empty(x, {f.pairs.size(0)}, ScalarType::Byte),
+                                         make);
     zeros.clear();
-    const Tensor solution = empty(x, {in.scene.scenes, in.bodies(), contact::kUnknowns}, ScalarType::Double);
-    const Tensor pushing = empty(x, {in.scene.scenes + f.pairs.size(0)}, ScalarType::Int);
-    const cuda::RigidReverse<T> all{data<const double>(motion),
-                                    data<const double>(share),
-                                    data<const double>(factor),
-                                    data<const T>(x_bar),
-                                    data<double>(solution),
-                                    data<T>(end.p),
-                                    data<T>(end.q),
-                                    data<T>(end.x),
-                                    data<T>(end.mass),
-                                    pairs.view<T>(),
-                                    pairs.sums<T>(),
-                                    data<int32_t>(pushing),
-                                    out.pointers<T>(),
-                                    out.floor<T>()};
-    check(cuda::rigid_reverse<T>(in, all, current_stream(x)), "the adjoint of rigid motions");
-    return diffvbd::rigid_adjoints(out, pairs);
+    const Tensor solution = empty(x, {scenes, last.bodies(), contact::kUnknowns}, ScalarType::Double);
+    const Tensor pushing = empty(x, {scenes + f.pairs.size(0)}, ScalarType::Int);
+    const T* end_bar = data<const T>(x_bar);
+    for (int64_t k = all.count() - 1; k >= 0; --k) {
+      const cuda::RigidReverse<T> own{data<const double>(motion[k]),
+                                      data<const double>(share[k]),
+                                      data<const double>(factor[k]),
+                                      end_bar,
+                                      data<double>(solution),
+                                      data<T>(t.p),
+                                      data<T>(t.q),
+                                      data<T>(t.way),
+                                      t.pairs.view<T>(),
+                                      t.pairs.sums<T>(),
+                                      data<int32_t>(pushing),
+                                      t.out<T>()};
+      check(cuda::rigid_reverse<T>(inputs(k), own, current_stream(x)), "the adjoint of rigid motions");
+      end_bar = own.out.of.x;
+    }
+    return t.all();
   });
 }
 
