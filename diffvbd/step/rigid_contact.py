@@ -48,8 +48,8 @@ More = Callable[[int, ops_rigid.Moved, Tensor], Which | None]
 
 def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction_eps: float,
             more: More = lambda *_: None) -> Corrected:  # fmt: skip
-    """After every free body has been moved, as far as pairs, floors and the potential let it, and then again as ``more``
-    says. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
+    """After every free body has been moved, as far as pairs, floors and the potential let it, and then again as
+    ``more`` says. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
     x, back, *made = _Correct.apply(*fields, model, time_step, friction_eps, more)
     return Corrected(x, [share.to(x.dtype) for share in _made(fields.x, made).share], back)
@@ -84,14 +84,16 @@ class _Correct(Direct):
         fields = ops.TouchingFields(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider,
                                     collider_prev, kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs,
                                     lag_ptr, lag_entry, floor_lag, center, room)  # fmt: skip
-        counts, which, made, count, back = model._data_count, Which(), [], 0, x
+        options, made, count, back = (model._data_count, time_step, friction_eps), [], 0, x
+        which: Which | None = Which()
         while which is not None:
-            made.extend([fields.x] if made else [])
-            centers, motion, factor, groups = ops_rigid.rigid_system(fields, counts, time_step, friction_eps, *which)
-            end = ops_rigid.rigid_move(fields, centers, motion, counts, time_step, friction_eps, which.moving)
+            if count:
+                made.append(fields.x)
+            centers, motion, factor, groups = ops_rigid.rigid_system(fields, *options, which.moving, which.alone)
+            end = ops_rigid.rigid_move(fields, centers, motion, *options, which.moving)
             made.extend([motion, end.share, factor, groups])
-            count, fields = count + 1, fields._replace(x=end.x)
             back = end.left if which.moving is None else torch.where(end.moved, end.left, back)
+            count, fields = count + 1, fields._replace(x=end.x)
             which = more(count, end, groups)
         return fields.x, back, *made
 

@@ -250,12 +250,13 @@ def start_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     points_of = torch.cat([move, torch.zeros_like(points)], 1)
     centers, motion, factor, groups = torch.ops.diffvbd.contact_rigid_system(*touching, *numbers, *everyone)
     share_of = torch.ops.diffvbd.contact_rigid_move(*touching, centers, motion, *numbers, everyone[0])[1]
+    made = [[t] for t in (x, motion, share_of, factor, groups)]
     assert motion.abs().max() > 0 and share_of.max() > 0 and torch.isfinite(factor).all()
     return {
         "contact_rigid_system": (*touching, *numbers, *everyone),
         "contact_rigid_move": (*touching, centers, motion, *numbers, everyone[0]),
         "contact_rigid_backward": (*touching, points_of, points_of, groups, *numbers),
-        "contact_rigid_reverse": (*touching, *([t] for t in (x, motion, share_of, factor, groups)), move, *numbers, True),
+        "contact_rigid_reverse": (*touching, *made, move, *numbers, True),
         "contact_above_floor": floor,
         "contact_above_floor_backward": (move, *floor, True),
         "contact_frames": (x, move, u, move, move, frames, room, room, *bodies),
