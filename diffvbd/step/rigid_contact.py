@@ -22,6 +22,7 @@ from ..adjoint.contact_lag import sum_of_scenes
 from ..model.model import Model
 from ..ops import Backward, Direct, no_transforms, of_inputs
 from ..ops import contact_rigid as ops_rigid
+from ..tuples import replaced
 from .rigid_terms import Scenes
 
 _FIELDS = len(ops.TouchingFields._fields)
@@ -93,7 +94,7 @@ class _Correct(Direct):
             end = ops_rigid.rigid_move(fields, centers, motion, *options, which.moving)
             made.extend([motion, end.share, factor, groups])
             back = end.left if which.moving is None else torch.where(end.moved, end.left, back)
-            count, fields = count + 1, fields._replace(x=end.x)
+            count, fields = count + 1, replaced(fields, x=end.x)
             which = more(count, end, groups)
         return fields.x, back, *made
 
