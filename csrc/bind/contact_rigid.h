@@ -55,7 +55,7 @@ contact::RigidInputs<T> touching_inputs(const TouchingFields& t, const std::vect
     in.lag = data<const T>(t.lag);
   }
   in.kappa = batched<T>("kappa", t.kappa, t.x, b, 1);
-  if (t.floor_lag.numel() > 0) {
+  if (t.floor_lag.numel() > 0 && v > 0) {
     in.planes = static_cast<int32_t>(t.floor_lag.numel() / t.floor_lag.size(0) / (v * contact::kFloorLag));
     in.floor_lag = batched<T>("floor_lag", t.floor_lag, t.x, b, v * in.planes * contact::kFloorLag);
   }
@@ -215,18 +215,24 @@ void require_factor(contact::RigidInputs<T>& in, const Tensor& factor, const Ten
 struct Corrections {
   const std::vector<Tensor>&x, &motion, &share, &factor, &groups;
 
-  int64_t count() const { return static_cast<int64_t>(x.size()); }
-  void require_equal() const {
+  // Inputs of each. none: empty.
+  template <class T>
+  std::vector<contact::RigidInputs<T>> inputs(const TouchingFields& f, const std::vector<int64_t>& data_count,
+                                              double time_step, double friction_eps, const Tensor& none) const {
     for (const auto* each : {&motion, &share, &factor, &groups}) {
       require(each->size() == x.size() && !x.empty(),
-              "diffvbd::contact_rigid_reverse: expected as many x, motion, share, factor and groups, one at least");
+              "diffvbd::contact_rigid_reverse: expected as many at, motion, share, factor and groups, one at least");
     }
+    std::vector<contact::RigidInputs<T>> out;
+    for (size_t k = 0; k < x.size(); ++k) out.push_back(of<T>(k, f, data_count, time_step, friction_eps, none));
+    return out;
   }
-  // Inputs of the k-th. none: empty.
+
+ private:
   template <class T>
-  contact::RigidInputs<T> inputs(int64_t k, TouchingFields f, const std::vector<int64_t>& data_count, double time_step,
-                                 double friction_eps, const Tensor& none) const {
-    require_like("x", x[k], f.x, f.x.numel());
+  contact::RigidInputs<T> of(size_t k, const TouchingFields& f, const std::vector<int64_t>& data_count,
+                             double time_step, double friction_eps, const Tensor& none) const {
+    require_like("at", x[k], f.x, f.x.numel());
     auto in = touching_inputs<T>(f, data_count, time_step, friction_eps, none, groups[k]);
     in.scene.x = in.gate.x = data<const T>(x[k]);
     require_factor(in, factor[k], f.x);

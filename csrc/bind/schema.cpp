@@ -163,14 +163,15 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "Tensor x, Tensor share, Tensor moved, Tensor held, Tensor left, ");
   // Of the virtual work of two motions p and q of all corner points [scenes, N, 3] that pairs do: its derivatives by
   // where these points are, by p and by q [scenes, N, 3] each; since [scenes, N, 3]: the first of lagged pairs alone,
-  // or empty; by kappa for each listed pair; and less those by what is lagged [lagged, 9]
+  // or empty; by kappa for each listed pair; and less those by what is lagged [lagged, 9]. This part of
+  // contact_rigid_reverse can so be tested by itself
   define(m, "contact_rigid_backward", DIFFVBD_ARGUMENTS(TOUCHING),
          "Tensor p, Tensor q, Tensor groups, int[] data_count, float time_step, float friction_eps",
          "Tensor by_x, Tensor by_p, Tensor by_q, Tensor since, Tensor by_kappa, Tensor lag_bar, ");
   // The adjoint of corrections one after another, each from `at` [scenes, V, 3], by its motion, share, factor and
   // groups, of that of where the last one led, x_bar [scenes, V, 3]: of the first `at`, x_prev, y and mass, of data as
-  // of rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, by kappa for each listed
-  // pair, and of lag
+  // of rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus what each listed
+  // pair adds to that of kappa, and of lag
   define(
       m, "contact_rigid_reverse", DIFFVBD_ARGUMENTS(TOUCHING),
       "Tensor[] at, Tensor[] motion, Tensor[] share, Tensor[] factor, Tensor[] groups, Tensor x_bar, int[] data_count, "

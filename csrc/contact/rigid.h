@@ -310,8 +310,8 @@ DIFFVBD_FN void add_floor_friction(const RigidInputs<T>& in, const rigid::Body<T
   }
 }
 
-// Roundings of a position, by which vertices may come away from their targets without that their potential rises. In
-// flight it is nothing but such roundings.
+// How many roundings of its position a vertex may come away from its target before its potential has risen. In flight
+// the potential is nothing but such roundings.
 constexpr double kValueUlps = 8;
 
 // The potential of a vertex where it is, or where it would go, less what rounding may have added on the way.

@@ -198,7 +198,7 @@ DIFFVBD_FN void virtual_motion(const RigidInputs<T>& in, const rigid::Body<T>& b
 // The adjoints of a correction. All are added to, but x, which is written.
 template <class T>
 struct CorrectionAdjoints {
-  rigid::Adjoints<T> of;        // of vertices and of data
+  rigid::Adjoints<T> vertices;  // of vertices and of data
   T* floor_lag;                 // [B, V, planes, 4], or null
   T *collider, *collider_prev;  // [B, Vc, 3]
 };
@@ -208,7 +208,7 @@ template <class T, class Team>
 DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>& b, const Team& team,
                                  const double* motion, const double* solution, const T* way, const PointWork<T>& sent,
                                  const CorrectionAdjoints<T>& bars) {
-  const rigid::Adjoints<T>& out = bars.of;
+  const rigid::Adjoints<T>& out = bars.vertices;
   T* floor_lag = bars.floor_lag;
   team.each(b.size(), [&](int32_t i) {
     const int32_t v = b.vertex(i);
@@ -240,6 +240,7 @@ DIFFVBD_FN void reverse_vertices(const RigidInputs<T>& in, const rigid::Body<T>&
     return rigid::VertexMotions{x, moved_by(solution, r), moved_by(motion, r)};
   });
 }
+
 // And of a point of a collider.
 template <class T>
 DIFFVBD_FN void reverse_collider(const RigidInputs<T>& in, int64_t scene, int32_t point, const PointWork<T>& sent,

@@ -134,7 +134,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
   const Range rows = {scenes.begin * in.vertices, scenes.end * in.vertices};
   const Range units = {scenes.begin * of_scene, scenes.end * of_scene};
   s.motion = motions;
-  // works out the motions of what tries less in a round; in round 0 of all
+  // works out the motions of what tries less in a round; in round 0 of all. Vertices by themselves do when they retreat
   const auto look = [&](int round) {
     team.each(rows, [&](int64_t i) {
       const int64_t scene = i / in.vertices;
@@ -158,7 +158,7 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
         if (last) mark(s.failed + scene);
         found = true;
       };
-      if (round > 0) look(round);
+      if (round > 0 && in.whole) look(round);
       pairs.each_failing(team, in, s, last ? 0 : round, [&](int64_t i) { note(in.listed.pairs[kPairRow * i + 5]); });
       team.each(in.whole ? rows : Range{}, [&](int64_t i) {
         const int64_t scene = i / in.vertices;
@@ -167,7 +167,11 @@ __device__ void advance_scenes(Team team, const AdvanceInputs<T>& in, AdvanceSta
       const bool passed = !team.any(found);
       clean = round == 0 && passed;
       if (passed || last) break;
-      team.each(units, [&](int64_t i) { less = retreat(s, i, round) || less; });
+      team.each(units, [&](int64_t i) {
+        if (!retreat(s, i, round)) return;
+        less = true;
+        if (!in.whole) motions[i] = motion_of(in, s, i / in.vertices, static_cast<int32_t>(i % in.vertices));
+      });
       if (!team.any(less)) break;
     }
     team.each(units, [&](int64_t i) { give_up(in, s, i); });

@@ -149,8 +149,8 @@ __global__ void store_contact(const __grid_constant__ StepView<T> s, const __gri
 
 constexpr int kSumThreads = 1024;
 
-// One scalar of the slots of each scene's pairs, so many of a pair, one block a scene, in an order fixed by the number
-// of pairs.
+// Adds up a scalar of the slots of each scene's pairs, one block a scene, in an order fixed by the number of pairs.
+// each: slots of a pair; stride: scalars from one slot to the next.
 template <class T>
 __global__ void __launch_bounds__(kSumThreads) sum_by_scene(const __grid_constant__ ContactInputs<T> in, int64_t base,
                                                             const T* slots, int each, int stride, T* out) {

@@ -39,7 +39,7 @@ cudaError_t rigid_backward(const contact::RigidInputs<T>& in, const contact::Vir
 template <class T>
 struct RigidReverse {
   const double *motions, *shares, *factor;
-  const T* end_bar;   // [B, V, 3]; may be out.of.x
+  const T* end_bar;   // [B, V, 3]; may be out.vertices.x
   double* solutions;  // [B, bodies, 6]  memory, as the rest
   T *p, *q, *way;     // as of virtual_motion() and reverse_end()
   contact::RigidWork<T> work;

@@ -49,7 +49,7 @@ __device__ void sum_at_point(const RigidInputs<T>& in, const RigidWork<T>& work,
 template <class T, class Team>
 __device__ void end_of_body(const RigidReverse<T>& r, const Body<T>& body, int64_t unit, const Team& team) {
   const int64_t at = kUnknowns * unit;
-  reverse_end(body, team, r.motions + at, r.shares[unit], r.end_bar, r.solutions + at, r.way, r.out.of.mass);
+  reverse_end(body, team, r.motions + at, r.shares[unit], r.end_bar, r.solutions + at, r.way, r.out.vertices.mass);
 }
 template <class T, class Team>
 __device__ void motion_of_body(const RigidInputs<T>& in, const RigidReverse<T>& r, const Body<T>& body, int64_t unit,

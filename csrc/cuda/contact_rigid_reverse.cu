@@ -27,14 +27,11 @@ __global__ void __launch_bounds__(kThreads)
     cluster.meet();
   };
   bool went = false;
-  block.each(in.bodies(), [&](int32_t b) {
-    went = went || r.shares[unit + b] != 0;
-    for (int i = 0; i < kUnknowns; ++i) went = went || r.motions[kUnknowns * (unit + b) + i] != 0;
-  });
+  block.each(in.bodies(), [&](int32_t b) { went = went || r.shares[unit + b] != 0; });
   if (!__syncthreads_or(went)) {  // a captured step makes all of its corrections, most of which move nothing
     const int64_t first = 3 * scene * in.scene.vertices;
-    if (r.end_bar == r.out.of.x) return;
-    return each(first, first + 3 * in.scene.vertices, [&](int64_t i) { r.out.of.x[i] = r.end_bar[i]; });
+    if (r.end_bar == r.out.vertices.x) return;
+    return each(first, first + 3 * in.scene.vertices, [&](int64_t i) { r.out.vertices.x[i] = r.end_bar[i]; });
   }
   const int64_t listed = in.first_listed(scene), listed_end = in.first_listed(scene + 1);
   const int64_t lagged = in.first_lagged(scene), lagged_end = in.first_lagged(scene + 1);
@@ -66,7 +63,7 @@ template <class T>
 cudaError_t rigid_reverse(const RigidInputs<T>& in, const RigidReverse<T>& r, cudaStream_t stream) {
   const int64_t scenes = in.scene.scenes, rows = r.work.listed + r.work.lagged;
   if (scenes == 0 || in.bodies() == 0) return cudaSuccess;
-  if (in.together() && scenes < kManyScenes && has_block_each(in.scene.vertices, scenes, rows)) {
+  if (in.together() && scenes < kManyScenes && has_block_each(in.gate.corners, scenes, rows)) {
     const int64_t pairs = std::max(rows, kPairsOfBlock * scenes * in.bodies());  // a block for each body at least
     return launch_clusters(scene_kernel<T>, scenes, pairs, kThreads, stream, in, r);
   }

@@ -7,7 +7,7 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int64_t kMostCounted = 32768;  // pairs that fit, mostly twice as many as there are
+constexpr int64_t kMostCounted = 20480;  // pairs that fit, mostly twice as many as there are
 constexpr int64_t kMostPoints = 2048;    // corner points of all scenes
 constexpr unsigned kRankBlocks = 264;
 
@@ -31,6 +31,7 @@ __global__ void __launch_bounds__(kThreads) rank_kernel(const Surfaces<T> in, Wo
   for (int32_t i = first / kWarp; i < count; i += threads / kWarp) {
     const unsigned long long key = work.keys[i];
     unsigned rank = 0;
+#pragma unroll 8
     for (int32_t other = lane; other < count; other += kWarp) rank += work.keys[other] < key ? 1 : 0;
     rank = __reduce_add_sync(kWholeWarp, rank);
     if (lane == 0) store_listed_pair(in, key, out.pairs + kPairRow * rank, out.constants + kConstants * rank);

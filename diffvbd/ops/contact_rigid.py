@@ -101,7 +101,7 @@ class RigidAdjoints(NamedTuple):
     floor_lag: Tensor  # [B, V, planes, 4], or empty
     collider: Tensor  # [B, Vc, 3]
     collider_prev: Tensor
-    by_kappa: Tensor  # [pairs], less that of each listed pair
+    by_kappa: Tensor  # [pairs]: minus what each listed pair adds to the adjoint of kappa
     lag: Tensor  # [lagged, 9]
 
 

@@ -41,7 +41,8 @@ def shapes_of(name: str) -> Callable[[Callable], Callable]:
 
     def register(shapes: Callable) -> Callable:
         def checked(*arguments: Any) -> Any:
-            devices = {a.device for a in arguments if isinstance(a, Tensor)}
+            given = (t for a in arguments for t in (a if isinstance(a, list) else (a,)))
+            devices = {t.device for t in given if isinstance(t, Tensor)}
             if len(devices) > 1:
                 names = sorted(str(device) for device in devices)
                 raise ValueError(f"diffvbd::{name}: expected tensors on one device, got {', '.join(names)}")

@@ -95,9 +95,9 @@ class ContactStep:
         normal = broadcast(normal[:, None], (*size.shape, 3))
         return torch.cat([size[..., None], normal], -1)
 
-    def _set_lag(self, listed: Pairs, collider: Tensor) -> Tensor:
-        """Friction and damping of the pairs at the start of the step; returns the forces of these on corner points
-        [B, N, 3] [N]."""
+    def _rub(self, listed: Pairs, collider: Tensor) -> Tensor:
+        """Notes friction and damping of the pairs at the start of the step, where there are any; returns the forces of
+        pairs on corner points [B, N, 3] [N]."""
         none = self.kappa.new_empty
         friction = self._parameter("friction.coefficient") if self.model.friction is not None else none((0,))
         damping = self._parameter("pair_barrier.damping") if self._damps else none((0,))
@@ -174,7 +174,7 @@ class ContactStep:
                 self._check(r, met.counts[r].tolist(), met)
             if r == 0:
                 pushing = self._pushing(detection.listed)
-                push = self._set_lag(pushing, was)
+                push = self._rub(pushing, was)
                 fall = lift = unsupported(self.model, x, self.origin, push, self.fields.mass, lift, self.floor_data,
                                           settings.numbers.time_step)  # fmt: skip
             falls, resting = r == 0 and self.model.starts_from == "predictor", None

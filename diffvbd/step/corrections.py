@@ -29,7 +29,7 @@ HELD = 0.01  # of its way in the step and of dhat: by more than that a body has 
 
 def corrected(of: ContactStep, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs,
               more: More = lambda *_: None) -> Corrected:  # fmt: skip
-    """After the rigid correction of all free bodies, and more of them, as of rigid_contact.correct."""
+    """After the rigid correction of all free bodies, and after others, as ``more`` says."""
     numbers = of.prepared.settings.numbers
     eps = 0.0 if of.model.friction is None else numbers.friction_eps
     return correct(of.model, touching(of, x, collider, start, listed), numbers.time_step, eps, more)

@@ -43,7 +43,8 @@ class Which(NamedTuple):
     alone: bool = False
 
 
-# After so many corrections, with what came of the last and its groups: which the next one moves; None: no more.
+# more(count, moved, groups): which bodies the next correction moves, after `count` of them, by what the last one
+# returned; None ends them.
 More = Callable[[int, ops_rigid.Moved, Tensor], Which | None]
 
 
@@ -52,12 +53,15 @@ def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction
     """After every free body has been moved, as far as pairs, floors and the potential let it, and then again as
     ``more`` says. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
-    x, back, *made = _Correct.apply(*fields, model, time_step, friction_eps, more)
-    return Corrected(x, [share.to(x.dtype) for share in _made(fields.x, made).share], back)
+    kept = torch.is_grad_enabled() and any(t.requires_grad for t in fields)
+    x, back, *rest = _Correct.apply(*fields, model, time_step, friction_eps, more, kept)
+    shares = _made(fields.x, rest).share if kept else rest
+    return Corrected(x, [share.to(x.dtype) for share in shares], back)
 
 
 def _made(x: Tensor, flat: Sequence[Tensor]) -> ops_rigid.Made:
-    """Of what begins at x: flat are motion, share, factor and groups of each, and where all but the first began."""
+    """Takes apart what _Correct keeps: motion, share, factor and groups of each correction, and between two of them
+    where the second began. x: Where the first did."""
     return ops_rigid.Made([x, *flat[4::5]], *(flat[k::5] for k in range(4)))
 
 
@@ -81,18 +85,18 @@ class _Correct(Direct):
     @staticmethod
     def forward(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider, collider_prev, kappa,
                 pairs, constants, pair_ptr, pair_entry, lag, lag_pairs, lag_ptr, lag_entry, floor_lag, center, room,
-                model, time_step, friction_eps, more):  # fmt: skip
+                model, time_step, friction_eps, more, kept):  # fmt: skip
         fields = ops.TouchingFields(x, x_prev, y, mass, energy_data, origin, order, ptr, free, held, body, collider,
                                     collider_prev, kappa, pairs, constants, pair_ptr, pair_entry, lag, lag_pairs,
                                     lag_ptr, lag_entry, floor_lag, center, room)  # fmt: skip
         options, made, count, back = (model._data_count, time_step, friction_eps), [], 0, x
         which: Which | None = Which()
         while which is not None:
-            if count:
+            if count and kept:
                 made.append(fields.x)
             centers, motion, factor, groups = ops_rigid.rigid_system(fields, *options, which.moving, which.alone)
             end = ops_rigid.rigid_move(fields, centers, motion, *options, which.moving)
-            made.extend([motion, end.share, factor, groups])
+            made.extend([motion, end.share, factor, groups] if kept else [end.share])
             back = end.left if which.moving is None else torch.where(end.moved, end.left, back)
             count, fields = count + 1, replaced(fields, x=end.x)
             which = more(count, end, groups)
@@ -101,20 +105,20 @@ class _Correct(Direct):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
         ctx.save_for_backward(*inputs[:_FIELDS], *output[2:])
-        ctx.options = inputs[_FIELDS:-1]
+        ctx.options = inputs[_FIELDS:-2]
         ctx.mark_non_differentiable(*output[1:])
         ctx.set_materialize_grads(False)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple:
         if grads[0] is None:
-            return (None,) * (_FIELDS + 4)
+            return (None,) * (_FIELDS + 5)
         ops.not_batched(grads[0])
         needs = ctx.needs_input_grad[:_FIELDS]
         saved = ctx.saved_tensors
         made = _made(saved[0], saved[_FIELDS:])
         out = _CorrectBackward.apply(grads[0], *saved[:_FIELDS], made, *ctx.options, needs)
-        return of_inputs(out if isinstance(out, tuple) else (out,), needs, 4)
+        return of_inputs(out if isinstance(out, tuple) else (out,), needs, 5)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> Any:

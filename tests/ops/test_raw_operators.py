@@ -192,6 +192,9 @@ def test_corrections_of_which_some_is_missing(device: str, recorded: Any) -> Non
         if value[0].numel():
             refused("contact_rigid_reverse", given, **{key: [t.reshape(-1)[:-1].clone() for t in value]})
             refused("contact_rigid_reverse", given, **{key: [t.to(torch.float16) for t in value]})
+            refused("contact_rigid_reverse", given, **{key: [t.to("meta") for t in value]})
+            if device != "cpu":
+                refused("contact_rigid_reverse", given, **{key: [t.cpu() for t in value]})
 
 
 @pytest.mark.parametrize("end", ["", "_backward"])

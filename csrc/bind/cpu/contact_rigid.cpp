@@ -85,11 +85,8 @@ contact_rigid_reverse(DIFFVBD_PARAMETERS(TOUCHING) std::vector<Tensor> at, std::
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const diffvbd::Corrections all{at, motion, share, factor, groups};
-    all.require_equal();
-    const auto inputs = [&](int64_t k) {
-      return all.inputs<T>(k, f, data_count, time_step, friction_eps, empty(x, {0}));
-    };
-    const auto last = inputs(all.count() - 1);
+    const auto inputs = all.inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    const auto& last = inputs.back();
     diffvbd::require_like("x_bar", x_bar, x, 3 * last.scene.scenes * last.scene.vertices);
     const auto make = [&](const std::vector<int64_t>& sizes, bool zeroed) {
       return zeroed ? zeros(x, sizes) : empty(x, sizes);
@@ -102,15 +99,15 @@ contact_rigid_reverse(DIFFVBD_PARAMETERS(TOUCHING) std::vector<Tensor> at, std::
     const auto out = t.out<T>();
     const auto sums = t.pairs.sums<T>();
     const T* end_bar = data<const T>(x_bar);
-    for (int64_t k = all.count() - 1; k >= 0; --k) {
-      const auto in = inputs(k);
+    for (size_t k = inputs.size(); k-- > 0;) {
+      const auto& in = inputs[k];
       const auto* motions = data<const double>(motion[k]);
-      diffvbd::rigid_end_backward<T>(in, motions, data<const double>(share[k]), end_bar, l, way, out.of.mass);
+      diffvbd::rigid_end_backward<T>(in, motions, data<const double>(share[k]), end_bar, l, way, out.vertices.mass);
       diffvbd::rigid_solve<T>(in, data<const double>(factor[k]), l);
       diffvbd::rigid_virtual_motions<T>(in, motions, l, p, q);
       diffvbd::rigid_backward<T>(in, {p, q}, t.pairs.view<T>(), sums);
       diffvbd::rigid_vertices_backward<T>(in, motions, l, way, sums, out);
-      end_bar = out.of.x;
+      end_bar = out.vertices.x;
     }
     return t.all();
   });

@@ -103,11 +103,8 @@ contact_rigid_reverse(DIFFVBD_PARAMETERS(TOUCHING) std::vector<Tensor> at, std::
   return dispatch_float(x, [&](auto scalar) {
     using T = decltype(scalar);
     const diffvbd::Corrections all{at, motion, share, factor, groups};
-    all.require_equal();
-    const auto inputs = [&](int64_t k) {
-      return all.inputs<T>(k, f, data_count, time_step, friction_eps, empty(x, {0}));
-    };
-    const auto last = inputs(all.count() - 1);
+    const auto inputs = all.inputs<T>(f, data_count, time_step, friction_eps, empty(x, {0}));
+    const auto& last = inputs.back();
     const int64_t scenes = last.scene.scenes;
     diffvbd::require_like("x_bar", x_bar, x, 3 * scenes * last.scene.vertices);
     Zeroed zeros(x);
@@ -120,7 +117,7 @@ contact_rigid_reverse(DIFFVBD_PARAMETERS(TOUCHING) std::vector<Tensor> at, std::
     const Tensor solution = empty(x, {scenes, last.bodies(), contact::kUnknowns}, ScalarType::Double);
     const Tensor pushing = empty(x, {scenes + f.pairs.size(0)}, ScalarType::Int);
     const T* end_bar = data<const T>(x_bar);
-    for (int64_t k = all.count() - 1; k >= 0; --k) {
+    for (size_t k = inputs.size(); k-- > 0;) {
       const cuda::RigidReverse<T> own{data<const double>(motion[k]),
                                       data<const double>(share[k]),
                                       data<const double>(factor[k]),
@@ -133,8 +130,8 @@ contact_rigid_reverse(DIFFVBD_PARAMETERS(TOUCHING) std::vector<Tensor> at, std::
                                       t.pairs.sums<T>(),
                                       data<int32_t>(pushing),
                                       t.out<T>()};
-      check(cuda::rigid_reverse<T>(inputs(k), own, current_stream(x)), "the adjoint of rigid motions");
-      end_bar = own.out.of.x;
+      check(cuda::rigid_reverse<T>(inputs[k], own, current_stream(x)), "the adjoint of rigid motions");
+      end_bar = own.out.vertices.x;
     }
     return t.all();
   });
