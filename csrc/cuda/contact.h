@@ -40,8 +40,8 @@ cudaError_t sum_lag(const contact::ContactInputs<T>& in, int64_t scenes, const c
                     int64_t pairs, T* lag, cudaStream_t stream);
 
 // contact_lag and its adjoint; `pairs` that the list has room for, `count` on the device at ptr[scenes corners]. The
-// reverse writes `slots` [pairs, kLagSlots], three scalars for each corner and after each of the first three corners one
-// of the pair, and adds them up.
+// reverse writes `slots` [pairs, kLagSlots], three scalars for each corner and after each of the first three corners
+// one of the pair, and adds them up.
 constexpr int kLagSlots = 16;
 template <class T>
 cudaError_t pair_lag(const contact::ContactInputs<T>& in, const T* x, int64_t scenes, int64_t pairs, T* values,
