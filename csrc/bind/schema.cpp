@@ -172,12 +172,11 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
   // groups, of that of where the last one led, x_bar [scenes, V, 3]: of the first `at`, x_prev, y and mass, of data as
   // of rigid_backward(), of floor_lag, of colliders at the end and at the start of the step, minus what each listed
   // pair adds to that of kappa, and of lag
-  define(
-      m, "contact_rigid_reverse", DIFFVBD_ARGUMENTS(TOUCHING),
-      "Tensor[] at, Tensor[] motion, Tensor[] share, Tensor[] factor, Tensor[] groups, Tensor x_bar, int[] data_count, "
-      "float time_step, float friction_eps, bool wants_data",
-      "Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own, Tensor floor_lag, Tensor collider, "
-      "Tensor collider_prev, Tensor by_kappa, Tensor lag_bar, ");
+  define(m, "contact_rigid_reverse", DIFFVBD_ARGUMENTS(TOUCHING),
+         "Tensor[] at, Tensor[] motion, Tensor[] share, Tensor[] factor, Tensor[] groups, Tensor x_bar, int[] "
+         "data_count, float time_step, float friction_eps, bool wants_data",
+         "Tensor x, Tensor x_prev, Tensor y, Tensor mass, Tensor shared, Tensor own, Tensor floor_lag, Tensor "
+         "collider, Tensor collider_prev, Tensor by_kappa, Tensor lag_bar, ");
   // Predictor and start of the sweeps. chord: as in rigid/coast.h. start: of the bodies that are not corrected, 0 x + h
   // v, 1 y, 2 the lower potential of the two; falls [scenes, other bodies]: 1 where that is y; alone [scenes, bodies]:
   // with parts, 1 where the vertices of a body that is corrected start each by itself
