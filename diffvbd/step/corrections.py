@@ -10,7 +10,7 @@ from torch import Tensor
 from .. import ops
 from ..ops.contact_rigid import Moved, left_alone, most_grouped
 from ..scopes import is_captured
-from .rigid_contact import Corrected, More, Which, bodies_of, correct
+from .rigid_contact import Corrected, More, Which, bodies_of, correct, once
 
 if TYPE_CHECKING:
     from ..adjoint.contact_lag import Pairs
@@ -28,7 +28,7 @@ HELD = 0.01  # of its way in the step and of dhat: by more than that a body has 
 
 
 def corrected(of: ContactStep, x: Tensor, collider: Tensor, start: PartStart, listed: Pairs,
-              more: More = lambda *_: None) -> Corrected:  # fmt: skip
+              more: More = once) -> Corrected:  # fmt: skip
     """After the rigid correction of all free bodies, and after others, as ``more`` says."""
     numbers = of.prepared.settings.numbers
     eps = 0.0 if of.model.friction is None else numbers.friction_eps

@@ -48,8 +48,12 @@ class Which(NamedTuple):
 More = Callable[[int, ops_rigid.Moved, Tensor], Which | None]
 
 
+def once(*_: Any) -> None:
+    """One correction, and no more."""
+
+
 def correct(model: Model, fields: ops.TouchingFields, time_step: float, friction_eps: float,
-            more: More = lambda *_: None) -> Corrected:  # fmt: skip
+            more: More = once) -> Corrected:  # fmt: skip
     """After every free body has been moved, as far as pairs, floors and the potential let it, and then again as
     ``more`` says. friction_eps: [m], 0 without friction. Differentiable in ops.TOUCHING_ADJOINTS."""
     fields = ops.TouchingFields(*(t.contiguous() for t in fields))
