@@ -66,6 +66,22 @@ __device__ __forceinline__ double own_least(int32_t first, int32_t count, int32_
   return out;
 }
 
+template <int n, class F>
+__device__ __forceinline__ void own_most(int32_t first, int32_t count, int32_t stride, double* out, const F& f) {
+  for (int k = 0; k < n; ++k) out[k] = 0;
+  for (int32_t i = first; i < count; i += stride) {
+    double own[n];
+    f(i, own);
+    for (int k = 0; k < n; ++k) out[k] = larger(out[k], own[k]);
+  }
+}
+template <int n, int width>
+__device__ __forceinline__ void butterfly_most(unsigned mask, double* out) {
+  for (int k = 0; k < n; ++k) {
+    for (int d = width / 2; d > 0; d /= 2) out[k] = larger(out[k], __shfl_xor_sync(mask, out[k], d, width));
+  }
+}
+
 // `width` lanes of a warp.
 template <int width>
 struct Tile {
@@ -74,6 +90,7 @@ struct Tile {
   __device__ Tile()
       : lane(threadIdx.x % width), mask(width == 1 ? 0 : (~0u >> (32 - width)) << (threadIdx.x % 32 / width * width)) {}
   __device__ bool leads() const { return lane == 0; }
+  __device__ int number() const { return lane; }
   template <int n, class F>
   __device__ void sum(int32_t count, double* out, const F& f) const {
     own_sum<n>(lane, count, width, out, f);
@@ -87,6 +104,13 @@ struct Tile {
     if constexpr (width > 1) return butterfly_least<width>(mask, own);
     return own;
   }
+  // As of a BlockTeam.
+  template <int n, class F>
+  __device__ void most(int32_t count, double* out, const F& f) const {
+    own_most<n>(lane, count, width, out, f);
+    meet();
+    if constexpr (width > 1) butterfly_most<n, width>(mask, out);
+  }
   __device__ void meet() const {
     if constexpr (width > 1) __syncwarp(mask);
   }
@@ -99,6 +123,7 @@ struct Tile {
 struct BlockTeam {
   double (*part)[kMostSums];  // [kWarps], shared
   __device__ bool leads() const { return threadIdx.x == 0; }
+  __device__ static int number() { return static_cast<int>(threadIdx.x); }
   template <int n, class F>
   __device__ void sum(int32_t count, double* out, const F& f) const {
     static_assert(n <= kMostSums);
@@ -113,16 +138,9 @@ struct BlockTeam {
   template <int n, class F>
   __device__ void most(int32_t count, double* out, const F& f) const {
     static_assert(n <= kMostSums);
-    for (int k = 0; k < n; ++k) out[k] = 0;
-    for (int32_t i = static_cast<int32_t>(threadIdx.x); i < count; i += kThreads) {
-      double own[n];
-      f(i, own);
-      for (int k = 0; k < n; ++k) out[k] = larger(out[k], own[k]);
-    }
-    for (int k = 0; k < n; ++k) {
-      for (int d = 16; d > 0; d /= 2) out[k] = larger(out[k], __shfl_xor_sync(0xffffffffu, out[k], d));
-      if (threadIdx.x % 32 == 0) part[threadIdx.x / 32][k] = out[k];
-    }
+    own_most<n>(static_cast<int32_t>(threadIdx.x), count, kThreads, out, f);
+    butterfly_most<n, 32>(0xffffffffu, out);
+    for (int k = 0; k < n && threadIdx.x % 32 == 0; ++k) part[threadIdx.x / 32][k] = out[k];
     __syncthreads();
     for (int k = 0; k < n; ++k) {
       for (int w = 0; w < kWarps; ++w) out[k] = larger(out[k], part[w][k]);

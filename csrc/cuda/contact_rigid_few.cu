@@ -13,6 +13,16 @@ constexpr int kSlots = 2, kLineDoubles = 6;  // slips that a thread keeps while 
 constexpr int kOwn = kUnknowns + rigid::kSix, kHalf = 3 * kUnknowns;
 constexpr int kSmall = kUnknowns * kFew;  // unknowns of systems that fit into shared memory
 
+// Calls f(body of a group, who works on it): a warp for each body of a small scene, for each of a large one the block.
+template <class T, class F>
+__device__ __forceinline__ void each_body(const RigidInputs<T>& in, const BlockTeam& team, int32_t count, const F& f) {
+  if (in.scene.vertices <= kSmallScene) {
+    for (auto b = static_cast<int32_t>(threadIdx.x / 32); b < count; b += kWarps) f(b, Tile<32>());
+  } else {
+    for (int32_t b = 0; b < count; ++b) f(b, team);
+  }
+}
+
 // The system of a group.
 template <class T>
 struct System {
@@ -24,7 +34,8 @@ struct System {
   double *center, *motion, *steps;  // of the scene's bodies
   double *base, *matrix, *gradient, *step;
   const GroupRows<T>& rows;
-  uint8_t* touching;  // [count, count]
+  const int32_t (*ranges)[3];  // [count] where the rows of a body begin, those that rub among them, and where they end
+  uint8_t* touching;           // [count, count]
   Pivots& pivots;
   double (*slots)[kLineDoubles][kThreads];
 
@@ -43,8 +54,8 @@ struct System {
   // The rows of body b of those that press: from where, and how many.
   template <class Presses>
   __device__ int2 rows_of(const Presses&, int32_t b) const {
-    const int32_t own = member(b), from = Presses::rubs ? rows.lagged(own) : rows.begin(own);
-    return {from, (Presses::rubs ? rows.end(own) : rows.lagged(own)) - from};
+    const int32_t from = ranges[b][Presses::rubs ? 1 : 0];
+    return {from, ranges[b][Presses::rubs ? 2 : 1] - from};
   }
 
   // What a row adds to the gradient of its body b and to that body's own part of the matrix.
@@ -64,17 +75,18 @@ struct System {
   }
   // The one of n numbers that a thread is to put somewhere. Chosen by comparison, as in PairPress.
   template <int n>
-  __device__ static double own_of(const double* total) {
+  __device__ static double own_of(const double* total, int thread = static_cast<int>(threadIdx.x)) {
     double out = 0;
 #pragma unroll
-    for (int k = 0; k < n; ++k) out = threadIdx.x == k ? total[k] : out;
+    for (int k = 0; k < n; ++k) out = thread == k ? total[k] : out;
     return out;
   }
   // Adds the sums of all threads.
-  __device__ void put_own(const double* total, int32_t b, double* to, double* gradients) const {
-    const double value = own_of<kOwn>(total);
-    const int entry = static_cast<int>(threadIdx.x) - kUnknowns;
-    if (entry < 0) gradients[kUnknowns * b + threadIdx.x] += value;
+  __device__ void put_own(const double* total, int32_t b, double* to, double* gradients,
+                          int thread = static_cast<int>(threadIdx.x)) const {
+    const double value = own_of<kOwn>(total, thread);
+    const int entry = thread - kUnknowns;
+    if (entry < 0) gradients[kUnknowns * b + thread] += value;
     if (entry < 0 || rigid::kSix <= entry) return;
     int i = 0;
     while (rigid::at6(i + 1, 0) <= entry) ++i;
@@ -113,33 +125,42 @@ struct System {
     }
   }
 
+  // What acts on the vertices of a body alone but for friction, and what keeps its part of the matrix regular.
+  template <class By>
+  __device__ void add_vertices(int32_t b, const By& by) const {
+    const Body<T> own = body(b);
+    const Whole whole = whole_of(own, by);
+    if (by.leads()) rigid::put(center + 3 * own.body, whole.center);
+    const bool free = in.free[own.body] && 0 < whole.mass;
+    double total[kOwn + 1];  // and the sum of m r^2
+    by.template sum<kOwn + 1>(free ? own.size() : 0, total, [&](int32_t i, double* out) {
+      const int32_t v = own.vertex(i);
+      Vector g;
+      Sym3<double> H;
+      vertex_press(in, own, v, g, H);
+      const Vector arm = own.position(v) - whole.center;
+      rigid::add_vertex(arm, g, H, out, out + kUnknowns);
+      out[kOwn] += own.mass(v) * dot(arm, arm);
+    });
+#pragma unroll
+    for (int i = 0; i < kUnknowns; ++i) {
+      total[kUnknowns + rigid::at6(i, i)] += free ? kLeastInertia * (i < 3 ? total[kOwn] : whole.mass) : 1;
+    }
+    put_own(total, b, base, gradient, by.number());
+  }
   // What does not change as bodies move: all but friction and damping.
   __device__ void assemble(const Barriers<T>& barriers) const {
     team.each(size() * size(), [&](int32_t i) { base[i] = 0; });
     team.each(size(), [&](int32_t i) { gradient[i] = 0; });
+    team.meet();
+    each_body(in, team, count, [&](int32_t b, const auto& by) { add_vertices(b, by); });
+    team.meet();
     for (int32_t b = 0; b < count; ++b) {
-      const Body<T> own = body(b);
-      const Whole whole = whole_of(own, team);
-      const Vector c = whole.center;
-      if (threadIdx.x == 0) rigid::put(center + 3 * own.body, c);
-      team.meet();
-      const bool free = in.free[own.body] && 0 < whole.mass;
-      double total[kOwn + 1];  // and the sum of m r^2
       const int2 range = rows_of(barriers, b);
-      team.template sum<kOwn + 1>(free ? own.size() + range.y : 0, total, [&](int32_t item, double* out) {
-        if (item >= own.size()) return add_own(barriers, b, rows.memory.rows[range.x + item - own.size()], out);
-        const int32_t v = own.vertex(item);
-        Vector g;
-        Sym3<double> H;
-        vertex_press(in, own, v, g, H);
-        const Vector arm = own.position(v) - c;
-        rigid::add_vertex(arm, g, H, out, out + kUnknowns);
-        out[kOwn] += own.mass(v) * dot(arm, arm);
-      });
-#pragma unroll
-      for (int i = 0; i < kUnknowns; ++i) {
-        total[kUnknowns + rigid::at6(i, i)] += free ? kLeastInertia * (i < 3 ? total[kOwn] : whole.mass) : 1;
-      }
+      if (range.y == 0 || !in.free[member(b)]) continue;
+      double total[kOwn];
+      team.template sum<kOwn>(
+          range.y, total, [&](int32_t e, double* out) { add_own(barriers, b, rows.memory.rows[range.x + e], out); });
       put_own(total, b, base, gradient);
     }
     team.meet();
@@ -156,6 +177,7 @@ struct System {
       double total[kOwn];
       const int2 range = rows_of(rubs, b);
       const int32_t borne = in.planes > 0 ? own.size() : 0;
+      if (borne + range.y == 0) continue;
       team.template sum<kOwn>(borne + range.y, total, [&](int32_t item, double* out) {
         if (item >= borne) return add_own(rubs, b, rows.memory.rows[range.x + item - borne], out);
         const int32_t v = own.vertex(item);
@@ -275,6 +297,7 @@ __global__ void __launch_bounds__(kThreads)
                bool lists, double* center, double* motion, double* factors) {
   __shared__ double part[kWarps][kMostSums];
   __shared__ uint8_t touching[kFew * kFew];
+  __shared__ int32_t ranges[kFew][3];
   __shared__ Pivots pivots;
   __shared__ double slots[kSlots][kLineDoubles][kThreads];
   __shared__ double matrices[2][kSmall * kSmall], vectors[2][kSmall];
@@ -301,6 +324,7 @@ __global__ void __launch_bounds__(kThreads)
                          vectors[0],
                          vectors[1],
                          rows,
+                         ranges,
                          touching,
                          pivots,
                          slots};
@@ -310,11 +334,7 @@ __global__ void __launch_bounds__(kThreads)
       const Whole whole = whole_of(system.body(b), by);
       if (by.leads()) rigid::put(system.center + 3 * system.member(b), whole.center);
     };
-    if (in.scene.vertices <= kSmallScene) {
-      for (auto b = static_cast<int32_t>(threadIdx.x / 32); b < count; b += kWarps) find_center(b, Tile<32>());
-    } else {
-      for (int32_t b = 0; b < count; ++b) find_center(b, team);
-    }
+    each_body(in, team, count, find_center);
     if (threadIdx.x == 0) *factor = CUDART_NAN;  // which makes no number of all that is solved with it
     return;
   }
@@ -325,6 +345,10 @@ __global__ void __launch_bounds__(kThreads)
   const Rubs<T> rubs{in, room.listed, {system.center, system.motion}};
   rows.template sort<kThreads>([&](int32_t body, int32_t other) {
     if (groups.first(other) == first) touching[count * groups.rank(body) + groups.rank(other)] = 1;
+  });
+  team.each(3 * count, [&](int32_t i) {
+    const int32_t body = groups.member(first + i / 3);
+    ranges[i / 3][i % 3] = i % 3 == 0 ? rows.begin(body) : i % 3 == 1 ? rows.lagged(body) : rows.end(body);
   });
   team.meet();
   system.assemble(barriers);

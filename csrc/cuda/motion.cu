@@ -1,11 +1,11 @@
-#include "bodies.cuh"
-#include "islands.h"
+#include "islands.cuh"
 #include "motion.h"
+#include "small_scenes.h"
 
 namespace diffvbd::cuda {
 namespace {
 
-using namespace contact;
+constexpr int64_t kOfWarp = 256;  // vertices of a body, on average, up to which a warp works on it
 
 // A block for each body of each scene.
 template <class T, class Act>
@@ -88,6 +88,51 @@ __global__ void __launch_bounds__(kThreads)
   room_among_others(in, work, place / bodies, static_cast<int32_t>(place % bodies), true);
 }
 
+// All of it for a small scene: a block, and a warp for each of its bodies in turn. What rooms do not change is not done
+// again.
+template <class T>
+__global__ void __launch_bounds__(kThreads)
+    rooms_of_scene(const __grid_constant__ RoomInputs<T> in, const __grid_constant__ RoomWork<T> work,
+                   const __grid_constant__ IslandWork<T> of_islands) {
+  __shared__ double part[kWarps][kMostSums];
+  const SceneIslands<T> islands{in.islands, of_islands, blockIdx.x, islands_memory<T>()};
+  const BlockTeam team{part};
+  const int64_t scene = blockIdx.x;
+  const auto warp = static_cast<int32_t>(threadIdx.x / 32);
+  const auto each_body = [&](const auto& f) {
+    for (int32_t b = warp; b < in.motion.bodies; b += kWarps) f(MovingBody<T>{in.motion, scene, b}, Tile<32>());
+    __syncthreads();
+  };
+  const auto room = [&](int32_t body) { return room_at(in, work.room, scene, body); };
+  prepare_scene(in, scene, team, work);
+  __syncthreads();
+  each_body([&](const MovingBody<T>& b, const Tile<32>& by) { wish_of_body(in, b, by, work); });
+  islands.bound();
+  bool changes = true;
+  for (int round = -1;; ++round) {  // -1: from what they wish for to what they have among others
+    if (changes) islands.find(work.island);
+    if (round == kRoomRounds) break;
+    changes = false;
+    if (round < 0) {
+      islands.each(in.motion.bodies, [&](int32_t body) {
+        const T before = room(body);
+        room_among_others(in, work, scene, body, true);
+        changes = changes || !(room(body) == before);
+      });
+    } else {
+      each_body([&](const MovingBody<T>& b, const Tile<32>& by) {
+        const T before = room(b.body);
+        by.meet();  // all have read it
+        room_beside_island(in, b, by, work);
+        if (by.leads()) changes = changes || !(room(b.body) == before);
+      });
+    }
+    changes = __syncthreads_or(changes);
+    if (0 <= round && !changes) break;
+  }
+  largest_of_scene(in, scene, team, work);
+}
+
 }  // namespace
 
 template <class T>
@@ -116,6 +161,12 @@ cudaError_t find_rooms(RoomInputs<T> in, const RoomWork<T>& work, void* islands,
   const int64_t bodies = in.motion.scenes * in.motion.bodies;
   if (scenes == 0) return cudaSuccess;
   in.islands.room = work.room;
+  const int64_t vertices = in.motion.vertices, of_scene = in.motion.bodies;
+  if (0 < of_scene && of_scene <= kFewBodies && vertices <= kSmallScene && vertices <= kOfWarp * of_scene &&
+      in.islands.colliders() <= kSmallScene) {
+    rooms_of_scene<T><<<scenes, kThreads, 0, stream>>>(in, work, IslandWork<T>(in.islands, islands));
+    return cudaGetLastError();
+  }
   each_scene<T, true><<<scenes, kThreads, 0, stream>>>(in, work);
   if (bodies > 0) {
     if (const auto error = for_bodies(in.motion, Wish<T>{in, work}, stream)) return error;

@@ -58,11 +58,11 @@ __device__ __forceinline__ void each_color(const StepView<T>& s, const Range& ra
 }
 
 // The same where a block has a vertex at a time: visit(scene, sweep, block, part, begin, end) of all of a color, and
-// then(...) of all. All threads of a block call them together. Where launches have a color each, then() has one to
-// itself.
+// then(...) of all, unless `twice` is false. All threads of a block call them together. Where launches have a color
+// each, then() has one to itself.
 template <class T, class Visit, class Then>
 __device__ __forceinline__ void each_color_by_blocks(const StepView<T>& s, const Range& range, bool backward,
-                                                     const Visit& visit, const Then& then) {
+                                                     const Visit& visit, const Then& then, bool twice = true) {
   unsigned turn = 0;
   for (int k = range.first_sweep; k < range.end_sweep; ++k) {
     for (int c = range.first_color; c < range.end_color; ++c) {
@@ -79,6 +79,7 @@ __device__ __forceinline__ void each_color_by_blocks(const StepView<T>& s, const
       if (range.regime != kGrid) continue;
       grid_barrier(range.barrier, turn);
       if constexpr (!std::is_same_v<Then, std::nullptr_t>) {
+        if (!twice) continue;
         each(then);
         grid_barrier(range.barrier, turn);
       }

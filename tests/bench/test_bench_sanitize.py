@@ -5,7 +5,9 @@ import pytest
 from bench import sanitize
 
 
-@pytest.mark.parametrize("counts", [(sanitize.STEPS, sanitize.SWEEPS), *sanitize.LESS.values()])
+@pytest.mark.parametrize(
+    "counts", [(sanitize.STEPS, sanitize.SWEEPS), *sanitize.LESS.values(), *sanitize.LEAST.values()]
+)
 @pytest.mark.parametrize("name", sanitize.SCENES)
 def test_scenes(name: str, counts: tuple[int, int], device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sanitize, "DEVICE", device)
@@ -24,3 +26,20 @@ def test_summaries() -> None:
     lines = ("COMPUTE-SANITIZER", "Invalid read", "    at f(int)", "ERROR SUMMARY: 1 error")
     text = "".join(f"========= {line}\n" for line in lines)
     assert sanitize._first(text) == "Invalid read | at f(int)"
+
+
+@pytest.mark.parametrize(("counts", "found", "once"), [([0], 0, ""), ([2, 1, 1], 1, ""), ([2, 0], 0, "a read"),
+                                                       ([2, 1, 0], 0, "a read"), ([None], None, ""),
+                                                       ([1, None], None, "")])  # fmt: skip
+def test_only_what_is_found_in_each_of_three_runs_counts(
+    monkeypatch: pytest.MonkeyPatch, counts: list[int | None], found: int | None, once: str
+) -> None:
+    left = list(counts)
+
+    def run(tool: str, name: str, device: str) -> dict[str, object]:
+        count = left.pop(0)
+        return {"scene": name, "found": count, "first": "a read" if count else ""}
+
+    monkeypatch.setattr(sanitize, "_of_process", run)
+    result = sanitize._of_processes("initcheck", "pairs", "cuda")
+    assert (result["found"], result["once"], left) == (found, once, [])
