@@ -14,6 +14,7 @@ constexpr int kTile = 8, kTileThreads = 128;
 constexpr int kTinyTile = 4;               // of 8 vertices: all lanes find the rotation, so fewer do it less often
 constexpr int64_t kEnoughThreads = 16384;  // tiny bodies of all scenes that fill the device with a thread each
 constexpr int kThreads = 256, kWarps = kThreads / 32;
+constexpr int32_t kOfWarp = 256;                // vertices of a body up to which a warp of a block has it to itself
 constexpr int kMostSums = 1 + 6 + rigid::kSix;  // numbers that a team adds up at once
 constexpr int kFewSums = 4;                     // that every thread of a block adds up from its warps
 // Of work on a large body: worked out from times on an H100, 0.27 ms of a block for 9,261 vertices, and of the whole
@@ -104,7 +105,7 @@ struct Tile {
     if constexpr (width > 1) return butterfly_least<width>(mask, own);
     return own;
   }
-  // As of a BlockTeam.
+  // As in BlockTeam.
   template <int n, class F>
   __device__ void most(int32_t count, double* out, const F& f) const {
     own_most<n>(lane, count, width, out, f);
@@ -188,6 +189,17 @@ struct BlockTeam {
     return sum;
   }
 };
+
+// Calls f(b, who works on it) for so many bodies, of size(b) vertices: a warp each, or the block where they are large.
+template <class Size, class F>
+__device__ __forceinline__ void each_body_of(int32_t count, const BlockTeam& block, const Size& size, const F& f) {
+  for (auto b = static_cast<int32_t>(threadIdx.x / 32); b < count; b += kWarps) {
+    if (size(b) <= kOfWarp) f(b, Tile<32>());
+  }
+  for (int32_t b = 0; b < count; ++b) {
+    if (size(b) > kOfWarp) f(b, block);
+  }
+}
 
 struct DeviceTeam {
   BlockTeam block;

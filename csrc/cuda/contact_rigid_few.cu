@@ -13,16 +13,6 @@ constexpr int kSlots = 2, kLineDoubles = 6;  // slips that a thread keeps while 
 constexpr int kOwn = kUnknowns + rigid::kSix, kHalf = 3 * kUnknowns;
 constexpr int kSmall = kUnknowns * kFew;  // unknowns of systems that fit into shared memory
 
-// Calls f(body of a group, who works on it): a warp for each body of a small scene, for each of a large one the block.
-template <class T, class F>
-__device__ __forceinline__ void each_body(const RigidInputs<T>& in, const BlockTeam& team, int32_t count, const F& f) {
-  if (in.scene.vertices <= kSmallScene) {
-    for (auto b = static_cast<int32_t>(threadIdx.x / 32); b < count; b += kWarps) f(b, Tile<32>());
-  } else {
-    for (int32_t b = 0; b < count; ++b) f(b, team);
-  }
-}
-
 // The system of a group.
 template <class T>
 struct System {
@@ -42,6 +32,10 @@ struct System {
   __device__ int32_t member(int32_t b) const { return groups.member(first + b); }
   __device__ Body<T> body(int32_t b) const { return {in.scene, scene, member(b)}; }
   __device__ int32_t size() const { return kUnknowns * count; }
+  template <class F>
+  __device__ void each_body(const F& f) const {
+    each_body_of(count, team, [&](int32_t b) { return body(b).size(); }, f);
+  }
   __device__ Vector center_of(int32_t b) const { return vector_of(center + 3 * member(b)); }
   __device__ double* motion_of(int32_t b) const { return motion + kUnknowns * member(b); }
   __device__ double& unknown(double* of, int32_t i) const {  // of the scene's bodies
@@ -81,7 +75,7 @@ struct System {
     for (int k = 0; k < n; ++k) out = thread == k ? total[k] : out;
     return out;
   }
-  // Adds the sums of all threads.
+  // Adds the sums of a team, a number by each of its first threads.
   __device__ void put_own(const double* total, int32_t b, double* to, double* gradients,
                           int thread = static_cast<int>(threadIdx.x)) const {
     const double value = own_of<kOwn>(total, thread);
@@ -125,7 +119,8 @@ struct System {
     }
   }
 
-  // What acts on the vertices of a body alone but for friction, and what keeps its part of the matrix regular.
+  // The center of a body, what acts on its vertices alone but for friction, and what keeps its part of the matrix
+  // regular.
   template <class By>
   __device__ void add_vertices(int32_t b, const By& by) const {
     const Body<T> own = body(b);
@@ -153,11 +148,11 @@ struct System {
     team.each(size() * size(), [&](int32_t i) { base[i] = 0; });
     team.each(size(), [&](int32_t i) { gradient[i] = 0; });
     team.meet();
-    each_body(in, team, count, [&](int32_t b, const auto& by) { add_vertices(b, by); });
+    each_body([&](int32_t b, const auto& by) { add_vertices(b, by); });
     team.meet();
     for (int32_t b = 0; b < count; ++b) {
       const int2 range = rows_of(barriers, b);
-      if (range.y == 0 || !in.free[member(b)]) continue;
+      if (range.y == 0) continue;
       double total[kOwn];
       team.template sum<kOwn>(
           range.y, total, [&](int32_t e, double* out) { add_own(barriers, b, rows.memory.rows[range.x + e], out); });
@@ -334,7 +329,7 @@ __global__ void __launch_bounds__(kThreads)
       const Whole whole = whole_of(system.body(b), by);
       if (by.leads()) rigid::put(system.center + 3 * system.member(b), whole.center);
     };
-    each_body(in, team, count, find_center);
+    system.each_body(find_center);
     if (threadIdx.x == 0) *factor = CUDART_NAN;  // which makes no number of all that is solved with it
     return;
   }

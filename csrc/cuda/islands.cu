@@ -1,6 +1,5 @@
 #include <algorithm>
 
-#include "block_sum.cuh"
 #include "islands.cuh"
 
 namespace diffvbd::cuda {
@@ -123,7 +122,8 @@ __global__ void finish_kernel(const IslandInputs<T> in, IslandWork<T> work, int3
 // All of it for a scene of few bodies: a block.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
-    scene_sync_kernel(const IslandInputs<T> in, IslandWork<T> work, int32_t* island) {
+    scene_sync_kernel(const __grid_constant__ IslandInputs<T> in, const __grid_constant__ IslandWork<T> work,
+                      int32_t* island) {
   SceneIslands<T>{in, work, blockIdx.x, islands_memory<T>()}.find(island);
 }
 

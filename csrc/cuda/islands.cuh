@@ -3,6 +3,7 @@
 
 #include <type_traits>
 
+#include "block_sum.cuh"
 #include "bodies.cuh"
 #include "islands.h"
 #include "ordered.cuh"
@@ -14,8 +15,8 @@ namespace {
 using namespace contact;
 
 constexpr int32_t kFewBodies = 512;  // of a scene, up to which a block finds all its islands
-
 constexpr size_t kAlignment = 256;
+
 // Views of the workspace; without memory, its size.
 template <class T>
 struct IslandWork {
@@ -123,22 +124,35 @@ struct SceneIslands {
     }
     return *all;
   }
-  // What of bodies and colliders does not depend on rooms: a warp for each body.
+  // What of bodies and colliders does not depend on rooms: a warp for each body, or the block where they are large.
   __device__ void bound() const {
     each(in.colliders(), [&](int32_t j) { bound_nothing(work, scene * in.colliders() + j); });
     if (threadIdx.x == 0) work.objects[scene] = 0;
     __syncthreads();
     each(in.colliders(), [&](int32_t j) { bound_collider(in, work, scene, j); });
     each(in.num_planes, [&](int32_t k) { unbound_plane(in, work, scene, k); });
+    const auto size = [&](int32_t b) { return in.body_ptr[b + 1] - in.body_ptr[b]; };
+    const auto share = [&](int32_t b, int32_t from, int32_t stride) {
+      BodySum<T> own = nothing<T>();
+      for (int32_t k = from; k < size(b); k += stride) {
+        own.add(vertex_share(in, scene, in.body_order[in.body_ptr[b] + k]));
+      }
+      return own;
+    };
     const auto lane = static_cast<int32_t>(threadIdx.x % 32);
     for (auto b = static_cast<int32_t>(threadIdx.x / 32); b < in.mesh_bodies; b += kWarps) {
-      BodySum<T> own = nothing<T>();
-      for (int32_t k = in.body_ptr[b] + lane; k < in.body_ptr[b + 1]; k += 32) {
-        own.add(vertex_share(in, scene, in.body_order[k]));
-      }
-      const BodySum<T> sum = sum_of_warp(own);
+      if (size(b) > kOfWarp) continue;
+      const BodySum<T> sum = sum_of_warp(share(b, lane, 32));
       if (lane == 0) work.bodies[first() + b] = sum;
       __syncwarp();
+    }
+    __syncthreads();
+    for (int32_t b = 0; b < in.mesh_bodies; ++b) {
+      if (size(b) <= kOfWarp) continue;
+      const BodySum<T> own = share(b, static_cast<int32_t>(threadIdx.x), kThreads);
+      const BodySum<T> sum = block_sum(own, part(), [](BodySum<T>& to, const BodySum<T>& of) { to.add(of); });
+      if (threadIdx.x == 0) work.bodies[first() + b] = sum;
+      __syncthreads();
     }
     __syncthreads();
   }

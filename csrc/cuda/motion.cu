@@ -5,7 +5,7 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr int64_t kOfWarp = 256;  // vertices of a body, on average, up to which a warp works on it
+constexpr int32_t kMostOfBlock = 16;  // bodies of a scene, up to which one block has them all
 
 // A block for each body of each scene.
 template <class T, class Act>
@@ -88,8 +88,8 @@ __global__ void __launch_bounds__(kThreads)
   room_among_others(in, work, place / bodies, static_cast<int32_t>(place % bodies), true);
 }
 
-// All of it for a small scene: a block, and a warp for each of its bodies in turn. What rooms do not change is not done
-// again.
+// All of it for a small scene: a block, and a warp for each of its bodies in turn. It ends once no room changes:
+// another round would change nothing.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     rooms_of_scene(const __grid_constant__ RoomInputs<T> in, const __grid_constant__ RoomWork<T> work,
@@ -98,18 +98,20 @@ __global__ void __launch_bounds__(kThreads)
   const SceneIslands<T> islands{in.islands, of_islands, blockIdx.x, islands_memory<T>()};
   const BlockTeam team{part};
   const int64_t scene = blockIdx.x;
-  const auto warp = static_cast<int32_t>(threadIdx.x / 32);
-  const auto each_body = [&](const auto& f) {
-    for (int32_t b = warp; b < in.motion.bodies; b += kWarps) f(MovingBody<T>{in.motion, scene, b}, Tile<32>());
+  const auto for_each_body = [&](const auto& f) {
+    const auto body = [&](int32_t b) { return MovingBody<T>{in.motion, scene, b}; };
+    each_body_of(
+        in.motion.bodies, team, [&](int32_t b) { return body(b).size(); },
+        [&](int32_t b, const auto& by) { f(body(b), by); });
     __syncthreads();
   };
   const auto room = [&](int32_t body) { return room_at(in, work.room, scene, body); };
   prepare_scene(in, scene, team, work);
   __syncthreads();
-  each_body([&](const MovingBody<T>& b, const Tile<32>& by) { wish_of_body(in, b, by, work); });
+  for_each_body([&](const MovingBody<T>& b, const auto& by) { wish_of_body(in, b, by, work); });
   islands.bound();
   bool changes = true;
-  for (int round = -1;; ++round) {  // -1: from what they wish for to what they have among others
+  for (int round = -1;; ++round) {  // -1: to the rooms that they have among others; then to those beside islands
     if (changes) islands.find(work.island);
     if (round == kRoomRounds) break;
     changes = false;
@@ -120,9 +122,8 @@ __global__ void __launch_bounds__(kThreads)
         changes = changes || !(room(body) == before);
       });
     } else {
-      each_body([&](const MovingBody<T>& b, const Tile<32>& by) {
-        const T before = room(b.body);
-        by.meet();  // all have read it
+      for_each_body([&](const MovingBody<T>& b, const auto& by) {
+        const T before = by.leads() ? room(b.body) : T(0);  // of which the leader is the only writer
         room_beside_island(in, b, by, work);
         if (by.leads()) changes = changes || !(room(b.body) == before);
       });
@@ -161,8 +162,8 @@ cudaError_t find_rooms(RoomInputs<T> in, const RoomWork<T>& work, void* islands,
   const int64_t bodies = in.motion.scenes * in.motion.bodies;
   if (scenes == 0) return cudaSuccess;
   in.islands.room = work.room;
-  const int64_t vertices = in.motion.vertices, of_scene = in.motion.bodies;
-  if (0 < of_scene && of_scene <= kFewBodies && vertices <= kSmallScene && vertices <= kOfWarp * of_scene &&
+  const int64_t of_scene = in.motion.bodies;
+  if (0 < of_scene && of_scene <= kMostOfBlock && in.motion.vertices <= kSmallScene &&
       in.islands.colliders() <= kSmallScene) {
     rooms_of_scene<T><<<scenes, kThreads, 0, stream>>>(in, work, IslandWork<T>(in.islands, islands));
     return cudaGetLastError();

@@ -191,12 +191,13 @@ __global__ void __maxnreg__((reverse_registers<T, EnergySet<mask>>()))
   const auto send = [&](int64_t scene, int, int block, int part, int begin, int end) {
     send_among(s, c, scene, block, part, begin, end);
   };
-  // Where no pair is listed, nobody has anything to send.
+  // Without pairs and friction on planes nobody has anything to send.
   const auto any_of = [&](const contact::PairList& list) {
     const int64_t first = s.base * c.in.corners, end = (s.base + s.scenes) * c.in.corners;
     return __ldg(list.ptr + first) < __ldg(list.ptr + end);
   };
-  const bool sends = c.in.planes > 0 || any_of(c.in.listed) || (c.in.lag && any_of(c.in.lagged));
+  const bool sends =
+      range.regime == kGrid && (c.in.planes > 0 || any_of(c.in.listed) || (c.in.lag && any_of(c.in.lagged)));
   each_color_by_blocks(s, range, true, visit, send, sends);
 }
 

@@ -28,11 +28,20 @@ def test_summaries() -> None:
     assert sanitize._first(text) == "Invalid read | at f(int)"
 
 
-@pytest.mark.parametrize(("counts", "found", "once"), [([0], 0, ""), ([2, 1, 1], 1, ""), ([2, 0], 0, "a read"),
-                                                       ([2, 1, 0], 0, "a read"), ([None], None, ""),
-                                                       ([1, None], None, "")])  # fmt: skip
-def test_only_what_is_found_in_each_of_three_runs_counts(
-    monkeypatch: pytest.MonkeyPatch, counts: list[int | None], found: int | None, once: str
+@pytest.mark.parametrize(
+    ("tool", "counts", "found", "once"),
+    [
+        ("initcheck", [0], 0, ""),
+        ("initcheck", [2, 1, 1], 1, ""),
+        ("initcheck", [2, 0], 0, "a read"),
+        ("initcheck", [2, 1, 0], 0, "a read"),
+        ("initcheck", [None], None, ""),
+        ("initcheck", [2, None, 1], 1, ""),
+        ("memcheck", [2], 2, ""),
+    ],
+)
+def test_initcheck_counts_what_it_finds_in_each_of_three_runs(
+    monkeypatch: pytest.MonkeyPatch, tool: str, counts: list[int | None], found: int | None, once: str
 ) -> None:
     left = list(counts)
 
@@ -41,5 +50,5 @@ def test_only_what_is_found_in_each_of_three_runs_counts(
         return {"scene": name, "found": count, "first": "a read" if count else ""}
 
     monkeypatch.setattr(sanitize, "_of_process", run)
-    result = sanitize._of_processes("initcheck", "pairs", "cuda")
+    result = sanitize._of_processes(tool, "pairs", "cuda")
     assert (result["found"], result["once"], left) == (found, once, [])

@@ -42,11 +42,11 @@ class Given(NamedTuple):
 
 
 def given(device: str, *, speed: float, pinned: bool, plane: bool, self_contact: bool, floor: bool = True,
-          apart: float = 1.3) -> Given:  # fmt: skip
-    """Two scenes of four boxes beside each other, each with a motion of its own."""
+          apart: float = 1.3, bodies: int = 4, cells: int = 2) -> Given:  # fmt: skip
+    """Two scenes of boxes beside each other, each with a motion of its own."""
     rng = generator("rooms", speed, pinned, plane)
-    box = dv.mesh.box(2, 1.0)
-    mesh = dv.mesh.join([box.translate([apart * k, 0.3 + 0.1 * k, 0]) for k in range(4)])
+    box = dv.mesh.box(cells, 1.0)
+    mesh = dv.mesh.join([box.translate([apart * k, 0.3 + 0.1 * k, 0]) for k in range(bodies)])
     things = (dv.colliders.Plane(point=(0, -0.1, 0), normal=(0, 1, 0)),) if plane else ()
     things = (*things, dv.colliders.Sphere((-2.0, 0.5, 0), 0.3))
     energies = (dv.StableNeoHookean(), dv.PairBarrier(1e3, DHAT, self_contact=self_contact))
@@ -56,9 +56,9 @@ def given(device: str, *, speed: float, pinned: bool, plane: bool, self_contact:
     assert surface is not None and barrier is not None
     x = model.rest_points.expand(2, -1, -1).contiguous()
     body = model.body
-    of_body = torch.as_tensor(rng.standard_normal((2, 4, 3)), dtype=x.dtype, device=device)
+    of_body = torch.as_tensor(rng.standard_normal((2, bodies, 3)), dtype=x.dtype, device=device)
     own = torch.as_tensor(rng.standard_normal(x.shape), dtype=x.dtype, device=device)
-    turn = torch.as_tensor(rng.standard_normal((2, 4, 3)), dtype=x.dtype, device=device)
+    turn = torch.as_tensor(rng.standard_normal((2, bodies, 3)), dtype=x.dtype, device=device)
     move = speed * (of_body[:, body] + torch.linalg.cross(turn[:, body], x) + 0.1 * own)
     was = surface.collider_points.expand(2, -1, -1).contiguous()
     fall = torch.zeros_like(x) - 0.1 * speed * x.new_tensor([0.0, 1.0, 0.0])
@@ -153,12 +153,7 @@ def by_torch(g: Given) -> RoomsOfBodies:
     return RoomsOfBodies(islands(room), last(room), last(own), over)
 
 
-@pytest.mark.parametrize("speed", [1e-4, 0.03, 0.5, 3.0])
-@pytest.mark.parametrize("pinned", [False, True])
-@pytest.mark.parametrize("plane", [False, True])
-@pytest.mark.parametrize("self_contact", [False, True])
-def test_as_plain_torch_says(device: str, speed: float, pinned: bool, plane: bool, self_contact: bool) -> None:
-    g = given(device, speed=speed, pinned=pinned, plane=plane, self_contact=self_contact)
+def check(g: Given) -> None:
     got, again = g.found(), g.found()
     for name, one, expected, same in zip(got._fields, got, by_torch(g), again, strict=True):
         if name == "over":  # up to 1 it makes no difference, and the CPU does not look whether a body is alone
@@ -166,7 +161,22 @@ def test_as_plain_torch_says(device: str, speed: float, pinned: bool, plane: boo
         torch.testing.assert_close(one, expected, rtol=tolerance("sums_of_bodies"), atol=0.0,
                                    msg=lambda text, name=name: f"{name}: {text}")  # fmt: skip
         assert torch.equal(one, same)
-    assert (got.room > 0).all() and bool((got.own_room > 0).all()) == self_contact
+    assert (got.room > 0).all() and bool((got.own_room > 0).all()) == g.barrier.self_contact
+
+
+@pytest.mark.parametrize("speed", [1e-4, 0.03, 0.5, 3.0])
+@pytest.mark.parametrize("pinned", [False, True])
+@pytest.mark.parametrize("plane", [False, True])
+@pytest.mark.parametrize("self_contact", [False, True])
+def test_as_plain_torch_says(device: str, speed: float, pinned: bool, plane: bool, self_contact: bool) -> None:
+    check(given(device, speed=speed, pinned=pinned, plane=plane, self_contact=self_contact))
+
+
+# one body; more than a CUDA block has warps, and more than it takes; bodies larger than a warp takes, and scenes larger
+# than a block does
+@pytest.mark.parametrize(("bodies", "cells"), [(1, 2), (12, 2), (40, 2), (2, 7), (2, 14)])
+def test_in_scenes_of_other_sizes(device: str, bodies: int, cells: int) -> None:
+    check(given(device, speed=0.5, pinned=True, plane=True, self_contact=True, bodies=bodies, cells=cells))
 
 
 def test_bodies_far_from_others_get_the_room_of_one_alone(device: str) -> None:
