@@ -55,7 +55,7 @@ try-wheels:
 
 $(ENVIRONMENT): .ci/bootstrap.py pyproject.toml
 	$(PYTHON) .ci/bootstrap.py $(VENV)
-	@echo "building diffvbd and installing its tools (minutes)"
+	@echo "building diffvbd and installing its tools (some 3 minutes on 2 cores)"
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation -e ".[dev]"
 	@touch $@
 

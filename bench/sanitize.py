@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -26,6 +27,7 @@ from bench.common import markdown_table
 from diffvbd import mesh
 
 DEVICE = "cuda"
+SANITIZER = "compute-sanitizer"
 TOOLS = ("memcheck", "racecheck", "initcheck", "synccheck")
 SUMMARY = re.compile(r"(?:ERROR SUMMARY: (\d+) error|RACECHECK SUMMARY: (\d+) hazard)")
 STEPS, SWEEPS = 2, 3
@@ -114,6 +116,10 @@ def step_of(scene: Scene, steps: int, sweeps: int) -> None:
 def run(quick: bool, device: str = DEVICE, only: str = "") -> dict[str, Any]:
     """``only``: tools or scenes, split by semicolons, since names of scenes have commas."""
     began, wanted = time.perf_counter(), [name for name in only.split(";") if name]
+    if unknown := [name for name in wanted if name not in (*TOOLS, *SCENES)]:
+        raise SystemExit(f"only: expected names among {'; '.join((*TOOLS, *SCENES))}, got {'; '.join(unknown)}")
+    if shutil.which(SANITIZER) is None:
+        raise SystemExit(f"sanitize: expected NVIDIA's {SANITIZER} on the PATH, and found none")
     tools = [tool for tool in TOOLS if tool in wanted] or list(TOOLS)
     names = [name for name in SCENES if name in wanted] or list(SCENES)[: 1 if quick else None]
     work = [(tool, name) for name in reversed(names) for tool in tools]  # those that take long first
@@ -145,7 +151,7 @@ def _of_processes(tool: str, name: str, device: str) -> dict[str, Any]:
 def _of_process(tool: str, name: str, device: str) -> dict[str, Any]:
     """What a tool finds in a scene; None: it takes too long."""
     counts = [str(count) for count in LEAST.get((tool, name), LESS.get(tool, (STEPS, SWEEPS)))]
-    command = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", sys.executable, "-m", "bench.sanitize",
+    command = [SANITIZER, "--tool", tool, "--error-exitcode", "9", sys.executable, "-m", "bench.sanitize",
                device, *counts, name]  # fmt: skip
     try:
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=LONGEST,

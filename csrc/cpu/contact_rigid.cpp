@@ -285,6 +285,8 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, double* center, double
     s.state = kDone;
     factors[groups.matrix(s.first)] = std::numeric_limits<double>::quiet_NaN();
   }
+  // Lists are of all scenes, but what a scene does must not depend on others.
+  const bool rubs = in.rubs() && (in.planes > 0 || in.first_lagged(scene) < in.first_lagged(scene + 1));
   for (int iteration = 0; iteration < kSlipIterations && !systems.all_done(); ++iteration) {
     for (const auto& s : systems.all) {
       if (s.state == kDone) continue;
@@ -302,7 +304,7 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, double* center, double
       for (int64_t i = 0; i < s.size(); i += kUnknowns) keep_finite(own.data() + i);
       systems.each_unknown(s, [&](int i, int64_t k) { step[k] = own[i]; });
     }
-    if (!in.rubs()) {
+    if (!rubs) {
       for (const auto& s : systems.all) {
         if (s.state != kDone) systems.each_unknown(s, [&](int, int64_t k) { motion[k] = step[k]; });
       }

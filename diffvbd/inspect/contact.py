@@ -41,7 +41,8 @@ class Status:
 
     Attributes:
         pairs: The most pairs of one detection, of all scenes.
-        capacity: Pairs that fit, of all scenes; with more, an eager step has raised, a captured one returned NaN.
+        capacity: Pairs that fit, of all scenes; with more, an eager step has raised, a captured one returned NaN. On
+            the CPU, without a ``capacity`` of the PairBarrier, lists are as long as they must be, up to so many.
         touching: Pairs without a gap that detections found (the step has raised or returned NaN).
         hindered: Pairs that prescribed vertices and moving colliders would bring too close (likewise).
         cut: Vertices that pairs held up in the last sweep, or without sweeps at the start, and those of bodies that
@@ -68,8 +69,7 @@ def status(model: Model) -> Status:
     Raises:
         ValueError: If the Model has taken no step with contact yet.
     """
-    if not isinstance(model, Model):
-        raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
+    _check_model(model)
     outcome = outcomes.get(model)
     if outcome is None:
         fail("model", "one that has taken a step with a PairBarrier", "none so far")
@@ -92,8 +92,7 @@ def reserve(model: Model, pairs: int) -> None:
     Raises:
         ValueError, TypeError: If the Model has no PairBarrier, or for a number < 1.
     """
-    if not isinstance(model, Model):
-        raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
+    _check_model(model)
     surface = model.surface_of_contact
     if surface is None or model.contact is None:
         fail("model", "a PairBarrier among its energies", "none")
@@ -133,8 +132,9 @@ def intersections(model: Model, x: Tensor) -> Tensor:
 
     Raises:
         ValueError: For another shape, or positions that are not finite.
-        TypeError: For anything but a dense tensor of real numbers.
+        TypeError: For no Model, and for anything but a dense tensor of real numbers.
     """
+    _check_model(model)
     if not isinstance(x, Tensor):
         raise TypeError(f"x: expected a tensor, got {type(x).__name__}")
     check_readable("x", x)
@@ -155,3 +155,8 @@ def intersections(model: Model, x: Tensor) -> Tensor:
     if count > len(found.pairs):
         found = search(capacity=count)
     return found.pairs[:count].long().cpu()
+
+
+def _check_model(model: Model) -> None:
+    if not isinstance(model, Model):
+        raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")

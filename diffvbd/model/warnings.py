@@ -23,13 +23,14 @@ if TYPE_CHECKING:
 INCOMPRESSIBLE = 60.0  # lam / mu (nu = 0.492) above which over-relaxed rollouts grew; 49 did not
 STABLE_RELAXATION = 1.7  # largest omega that never grew in the rollouts of docs/numerics.md
 HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
+ERRATIC_SWEEPS = 20  # from which on accelerated plain sweeps converge far enough for their gradients to be erratic
 THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 
 # of a Model's _derived: what is said once, or ever more seldom
 THIN_SEEN, OVER_RELAXED, CONTACT_SEEN = "thin", "over-relaxed", "contact of rollouts"
-HELD_UP, HELD_UP_SEEN = "held up", "steps held up"
-ONCE = (THIN_SEEN, OVER_RELAXED, GROWS, STEPS_SEEN, CONTACT_SEEN, HELD_UP, HELD_UP_SEEN)
+HELD_UP, HELD_UP_SEEN, ERRATIC = "held up", "steps held up", "erratic gradients"
+ONCE = (THIN_SEEN, OVER_RELAXED, GROWS, STEPS_SEEN, CONTACT_SEEN, HELD_UP, HELD_UP_SEEN, ERRATIC)
 
 
 def warn_of(model: Model) -> None:
@@ -54,6 +55,19 @@ def warn_of(model: Model) -> None:
             f"regularization: {model.regularization:g} kg is {model.regularization / float(active.min()):.2g} of the "
             "lightest vertex; the sweeps converge that much more slowly"
         )
+
+
+def warn_of_erratic_gradients(model: Model, sweeps: int) -> None:
+    """Warns, once, of gradients through sweeps that are accelerated without coarse corrections. To be called where a
+    step of so many sweeps is differentiated."""
+    if model.acceleration is None or model.coarse is not None or sweeps < ERRATIC_SWEEPS or ERRATIC in model._derived:
+        return
+    model._derived[ERRATIC] = True
+    warn(
+        "acceleration: gradients through accelerated plain sweeps are exact for what ran, but may depend erratically "
+        "on the input and be wrong by orders of magnitude where positions are right; for gradients add "
+        'coarse="auto" to the Model, or take plain sweeps and more of them; ' + page("numerics.md")
+    )
 
 
 def warn_of_inverted_bodies(model: Model, x: Tensor) -> None:

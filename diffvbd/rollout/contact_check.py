@@ -74,10 +74,9 @@ def warn_of_contact(model: Model, cuts: list[Tensor], before: tuple[Tensor, Tens
             f"{percent(CUT)}); " + what_helps(model),
         )
     if left > UNBALANCED_FRICTION:
-        faster = ', coarse="auto"' if model.coarse is None else ""
-        faster += ", acceleration=dv.Anderson(5)" if model.acceleration is None else ""
+        faster = ' a Model with coarse="auto",' if model.coarse is None else ""
         warn(
             f"friction: {percent(left)} of it is not balanced in the last step: the sweeps have not converged, and "
-            f"the motion may be far off; take more sweeps, a smaller time_step{faster} or a larger "
-            "Friction(velocity=); " + page("contact.md"),
+            f"the motion may be far off; take more sweeps (100 are cheap in a small scene),{faster} a smaller "
+            "time_step or a larger Friction(velocity=); " + page("contact.md"),
         )

@@ -19,6 +19,7 @@ from ..adjoint.implicit import global_sweep
 from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
 from ..adjoint.sweep import fused_step
 from ..model.model import Model
+from ..model.warnings import warn_of_erratic_gradients
 from ..scopes import checking, recorders
 from ..tuples import replaced
 from .arguments import (
@@ -87,6 +88,8 @@ def swept(
         fields = with_corrections(model, prepared.coarse, fields, settings.numbers.time_step)
     more = (*(colliders or ()), *prepared.parameters.values())
     policy = _tape_policy(model, (*fields, *more), settings, adjoint)
+    if isinstance(adjoint, ReverseSweep) and not torch.compiler.is_compiling() and _is_differentiated((*fields, *more)):
+        warn_of_erratic_gradients(model, settings.sweeps)
     debug_step = index if checking() else -1
     try:
         if colliders is not None:
@@ -148,10 +151,12 @@ def _fused(
     return x_end.reshape(shape), v_end.reshape(shape)
 
 
+def _is_differentiated(tensors: Sequence[Tensor | None]) -> bool:
+    return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+
+
 def _tape_policy(model: Model, tensors: Sequence[Tensor | None], settings: ops.SweepSettings, adjoint: Adjoint) -> int:
-    if not isinstance(adjoint, ReverseSweep):
-        return ops.NO_TAPE
-    if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)):
+    if not (isinstance(adjoint, ReverseSweep) and _is_differentiated(tensors)):
         return ops.NO_TAPE
     x = tensors[0]
     assert x is not None

@@ -203,6 +203,7 @@ def test_rollout_and_contact_functions() -> None:
     raises(lambda: rollout(dv.per_step(points.expand(3, 2, 3).contiguous())), "colliders", r"\[2, 3\]")
     raises(lambda: dv.contact.status("model"), "model", "str")
     raises(lambda: dv.contact.reserve("model", 5), "model", "str")
+    raises(lambda: dv.contact.intersections(None, model.rest_points), "model", "NoneType")
     raises(lambda: dv.contact.reserve(dv.Model(box(2)), 5), "model", "none")
     raises(lambda: dv.contact.reserve(model, 0), "pairs", "0")
     raises(lambda: dv.contact.reserve(model, 1.5), "pairs", "float")

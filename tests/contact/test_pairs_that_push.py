@@ -50,3 +50,24 @@ def test_a_scene_alone_has_the_bits_that_it_has_in_a_batch() -> None:
     alone, batch = end(1), end(8)
     assert not torch.equal(alone[0], model.rest_points)
     assert torch.equal(batch, alone.expand_as(batch))
+
+
+def test_a_scene_without_pairs_has_the_same_bits_beside_one_with_pairs() -> None:
+    """Friction is looked for in a scene of its own: whether another scene has any must not matter."""
+    cube = dv.mesh.cube(2, size=0.1)
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(1e4, 0.01, detections=1), dv.Friction(0.3))
+    model = dv.Model(dv.mesh.join([cube, cube.translate((0.115, 0.004, -0.003))]), energies=energies)
+    apart = model.rest_points
+    near = apart.clone()
+    near[model.body == 1, 0] -= 0.01
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(10):
+        v = 0.1 * torch.randn(apart.shape, generator=generator, dtype=apart.dtype)
+        ends = []
+        for x, speed in ((apart, v), (torch.stack([apart, near]), torch.stack([v, torch.zeros_like(v)]))):
+            leaves = [t.clone().requires_grad_() for t in (x, speed)]
+            end = dv.step(model, *leaves, mu=1e5, lam=1e5, time_step=0.01, sweeps=2)[0]
+            bars = torch.autograd.grad(end.square().sum(), leaves)
+            ends.append([t.reshape(-1, *apart.shape)[0] for t in (end, *bars)])
+        for alone, beside in zip(*ends, strict=True):
+            assert alone.abs().max() > 0 and torch.equal(alone, beside)

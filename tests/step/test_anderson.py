@@ -1,6 +1,7 @@
 """Claim: Anderson acceleration brings steps nearer to converged ones in as many sweeps, raises no potential, mixes no
 bodies and scenes, leaves short steps as they are, and is refused where it is not known to be right."""
 
+import warnings
 from typing import Any
 
 import pytest
@@ -283,3 +284,27 @@ def test_combinations_end_where_differences_are_rounding(dtype: torch.dtype) -> 
     assert taken[1] < 20 and (taken[0] > 0 or dtype == torch.float32)
     bar = "float32_gradient" if dtype == torch.float32 else "global_converged"
     assert relative_error(grads[1], grads[0]) <= tolerance(bar)
+
+
+@pytest.mark.parametrize(
+    ("options", "sweeps", "wanted", "warns"),
+    [
+        ({"acceleration": dv.Anderson(5)}, 20, True, True),
+        ({"acceleration": dv.Anderson(5)}, 20, False, False),
+        ({"acceleration": dv.Anderson(5)}, 4, True, False),
+        ({"acceleration": dv.Anderson(2), "coarse": "auto"}, 20, True, False),
+        ({}, 20, True, False),
+    ],
+)
+def test_gradients_through_accelerated_plain_sweeps_warn_once(
+    options: dict[str, Any], sweeps: int, wanted: bool, warns: bool
+) -> None:
+    model, given = contrast(**options)
+    x = model.rest_points.clone().requires_grad_(wanted)
+    said: list[bool] = []
+    for _ in range(2):
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            dv.step(model, x, torch.zeros_like(x), sweeps=sweeps, **given)
+        said.append(any("acceleration: gradients" in str(w.message) for w in found))
+    assert said == [warns, False]
