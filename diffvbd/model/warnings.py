@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 INCOMPRESSIBLE = 60.0  # lam / mu (nu = 0.492) above which over-relaxed rollouts grew; 49 did not
 STABLE_RELAXATION = 1.7  # largest omega that never grew in the rollouts of docs/numerics.md
 HEAVY_REGULARIZATION = 0.1  # of the lightest vertex
-ERRATIC_SWEEPS = 20  # from which on accelerated plain sweeps converge far enough for their gradients to be erratic
+# of accelerated plain sweeps, from which on gradients are erratic: that of docs/contact.md was a third off at 15, had
+# the wrong sign at 20 and at 40 was 7e5 times too large
+ERRATIC_SWEEPS = 20
 THIN = 10.0  # longest edge over shortest height; those of a cube have 2.4
 LARGE_BODY, SMALL_BODY = 100.0, 1e-4  # [m]; beyond, a file in other units is likelier than such a body
 

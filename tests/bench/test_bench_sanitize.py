@@ -52,3 +52,9 @@ def test_initcheck_counts_what_it_finds_in_each_of_three_runs(
     monkeypatch.setattr(sanitize, "_of_process", run)
     result = sanitize._of_processes(tool, "pairs", "cuda")
     assert (result["found"], result["once"], left) == (found, once, [])
+
+
+@pytest.mark.parametrize("only", ["nonsense", "initcheck;typo", "pairs;typo"])
+def test_unknown_names_are_refused(only: str) -> None:
+    with pytest.raises(SystemExit, match=f"only: expected names among .*got {only.rpartition(';')[2]}"):
+        sanitize.run(False, only=only)

@@ -42,10 +42,10 @@ class Given(NamedTuple):
 
 
 def given(device: str, *, speed: float, pinned: bool, plane: bool, self_contact: bool, floor: bool = True,
-          apart: float = 1.3, bodies: int = 4, cells: int = 2) -> Given:  # fmt: skip
+          apart: float = 1.3, bodies: int = 4, points: int = 2) -> Given:  # fmt: skip
     """Two scenes of boxes beside each other, each with a motion of its own."""
     rng = generator("rooms", speed, pinned, plane)
-    box = dv.mesh.box(cells, 1.0)
+    box = dv.mesh.box(points, 1.0)
     mesh = dv.mesh.join([box.translate([apart * k, 0.3 + 0.1 * k, 0]) for k in range(bodies)])
     things = (dv.colliders.Plane(point=(0, -0.1, 0), normal=(0, 1, 0)),) if plane else ()
     things = (*things, dv.colliders.Sphere((-2.0, 0.5, 0), 0.3))
@@ -174,9 +174,9 @@ def test_as_plain_torch_says(device: str, speed: float, pinned: bool, plane: boo
 
 # one body; more than a CUDA block has warps, and more than it takes; bodies larger than a warp takes, and scenes larger
 # than a block does
-@pytest.mark.parametrize(("bodies", "cells"), [(1, 2), (12, 2), (40, 2), (2, 7), (2, 14)])
-def test_in_scenes_of_other_sizes(device: str, bodies: int, cells: int) -> None:
-    check(given(device, speed=0.5, pinned=True, plane=True, self_contact=True, bodies=bodies, cells=cells))
+@pytest.mark.parametrize(("bodies", "points"), [(1, 2), (12, 2), (40, 2), (2, 7), (2, 14)])
+def test_in_scenes_of_other_sizes(device: str, bodies: int, points: int) -> None:
+    check(given(device, speed=0.5, pinned=True, plane=True, self_contact=True, bodies=bodies, points=points))
 
 
 def test_bodies_far_from_others_get_the_room_of_one_alone(device: str) -> None:
