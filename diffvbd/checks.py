@@ -15,6 +15,12 @@ def fail(name: str, expected: str, got: Any) -> NoReturn:
     raise ValueError(f"{name}: expected {expected}, got {got}")
 
 
+def check_kind(name: str, value: Any, kind: type) -> None:
+    """Raises unless ``value`` is of a public class of diffvbd."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name}: expected a diffvbd.{kind.__name__}, got {kind_of(value)}")
+
+
 def check_tensor(
     name: str, value: Any, like: Tensor, what: str = "a number or a tensor", owner: str = "the Model's"
 ) -> Tensor:

@@ -157,6 +157,11 @@ class FloorBarrier(VertexEnergy):
     Differentiable as ``floor_barrier.kappa``, ``.dhat``, ``.damping`` (scalars), ``.height`` [planes] and ``.normal``
     [planes, 3].
 
+    Raises:
+        ValueError: kappa or damping < 0, dhat <= 0, a normal of zeros or of another shape, other numbers of heights and
+            normals, more than 8 planes, what is not finite.
+        TypeError: What is no number, or a tensor that requires grad.
+
     Source: Li et al. (2020); paper, appendix on implementation details; docs/method.md, section 6.
     """
 
@@ -271,6 +276,10 @@ class Anchor(VertexEnergy):
         vertices: Which vertices, a bool mask [V] or indices; None anchors all.
 
     Differentiable as ``anchor.stiffness`` (scalar or [V]) and ``anchor.points`` [V, 3].
+
+    Raises:
+        ValueError: A stiffness < 0, what is not finite; in the Model, shapes or indices that do not fit its mesh.
+        TypeError: What is no number, a tensor that requires grad, vertices that are neither a mask nor indices.
     """
 
     name: ClassVar[str] = "anchor"

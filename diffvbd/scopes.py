@@ -59,8 +59,9 @@ def refuse_transforms(name: str) -> None:
 def refuse_forward_mode() -> None:
     """Raises inside torch.func.jvp, jacfwd and hessian, before torch asks for what no user can write."""
     if transformed():
-        level = torch._C._functorch.peek_interpreter_stack()  # pyright: ignore[reportAttributeAccessIssue]
-        if level.key() == torch._C._functorch.TransformType.Jvp:  # pyright: ignore[reportAttributeAccessIssue]
+        known = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
+        # any level: hessian differentiates forward what it has differentiated in reverse
+        if any(level.key() == known.TransformType.Jvp for level in known.get_interpreter_stack()):
             raise NotImplementedError(
                 "diffvbd: derivatives in forward mode (torch.func.jvp, jacfwd, hessian) are not supported; take "
                 "reverse mode: torch.autograd.grad or backward()"

@@ -31,7 +31,10 @@ struct RigidInputs {
   bool has_friction;
 
   DIFFVBD_FN int32_t bodies() const { return scene.bodies; }
-  DIFFVBD_FN bool rubs() const { return (lag || planes > 0) && has_friction; }
+  // Lists are of all scenes, but what a scene does must not depend on others.
+  DIFFVBD_FN bool rubs(int64_t s) const {
+    return has_friction && (planes > 0 || first_lagged(s) < first_lagged(s + 1));
+  }
   // Whether all bodies of a scene are one group.
   DIFFVBD_FN bool together() const { return scene.bodies <= kFew; }
   DIFFVBD_FN Groups groups_of(int64_t s) const {

@@ -285,8 +285,7 @@ void solve_scene(const RigidInputs<T>& in, int64_t scene, double* center, double
     s.state = kDone;
     factors[groups.matrix(s.first)] = std::numeric_limits<double>::quiet_NaN();
   }
-  // Lists are of all scenes, but what a scene does must not depend on others.
-  const bool rubs = in.rubs() && (in.planes > 0 || in.first_lagged(scene) < in.first_lagged(scene + 1));
+  const bool rubs = in.rubs(scene);
   for (int iteration = 0; iteration < kSlipIterations && !systems.all_done(); ++iteration) {
     for (const auto& s : systems.all) {
       if (s.state == kDone) continue;

@@ -257,6 +257,7 @@ struct System {
 
   __device__ void solve(const Rubs<T>& rubs) const {
     Settling state = kOnItsWay;  // the same for all threads
+    const bool slips = in.rubs(scene);
     for (int iteration = 0; iteration < kSlipIterations && state != kDone; ++iteration) {
       team.each(size() * size(), [&](int32_t i) { matrix[i] = base[i]; });
       team.each(size(), [&](int32_t i) { step[i] = gradient[i]; });
@@ -277,8 +278,8 @@ struct System {
       team.each(size(), [&](int32_t i) { unknown(steps, i) = step[i]; });
       team.meet();
       double of[2] = {0, 0};
-      if (in.rubs()) energies(of);
-      const double taken = settle(state, in.rubs(), of[0], of[1], [&](double fall) { return share(rubs, fall); });
+      if (slips) energies(of);
+      const double taken = settle(state, slips, of[0], of[1], [&](double fall) { return share(rubs, fall); });
       team.each(size(), [&](int32_t i) { unknown(motion, i) += taken * step[i]; });
       team.meet();
     }

@@ -355,6 +355,7 @@ struct GroupSystem {
 
   __device__ void solve(Pivots& pivots) const {
     Settling state = kOnItsWay;  // the same for all threads
+    const bool slips = in.rubs(scene);
     for (int iteration = 0; iteration < kSlipIterations && state != kDone; ++iteration) {
       each_body([&](int32_t b) { copy_column(b); });
       each(size(), [&](int32_t i) { step[i] = gradient[i]; });
@@ -372,8 +373,8 @@ struct GroupSystem {
       each(size(), [&](int32_t i) { unknown(steps, i) = step[i]; });
       __syncthreads();
       double of[2] = {0, 0};
-      if (in.rubs()) energies(of);
-      const double taken = settle(state, in.rubs(), of[0], of[1], [&](double fall) { return share(fall); });
+      if (slips) energies(of);
+      const double taken = settle(state, slips, of[0], of[1], [&](double fall) { return share(fall); });
       each(size(), [&](int32_t i) { unknown(motion, i) = own[i] += taken * step[i]; });
       __syncthreads();
     }

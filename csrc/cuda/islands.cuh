@@ -124,6 +124,10 @@ struct SceneIslands {
     }
     return *all;
   }
+  __device__ BodySum<T> sum_of(const Tile<32>&, const BodySum<T>& own) const { return sum_of_warp(own); }
+  __device__ BodySum<T> sum_of(const BlockTeam&, const BodySum<T>& own) const {
+    return block_sum(own, part(), [](BodySum<T>& to, const BodySum<T>& of) { to.add(of); });
+  }
   // What of bodies and colliders does not depend on rooms: a warp for each body, or the block where they are large.
   __device__ void bound() const {
     each(in.colliders(), [&](int32_t j) { bound_nothing(work, scene * in.colliders() + j); });
@@ -132,28 +136,13 @@ struct SceneIslands {
     each(in.colliders(), [&](int32_t j) { bound_collider(in, work, scene, j); });
     each(in.num_planes, [&](int32_t k) { unbound_plane(in, work, scene, k); });
     const auto size = [&](int32_t b) { return in.body_ptr[b + 1] - in.body_ptr[b]; };
-    const auto share = [&](int32_t b, int32_t from, int32_t stride) {
+    each_body_of(in.mesh_bodies, BlockTeam{nullptr}, size, [&](int32_t b, const auto& by) {
       BodySum<T> own = nothing<T>();
-      for (int32_t k = from; k < size(b); k += stride) {
-        own.add(vertex_share(in, scene, in.body_order[in.body_ptr[b] + k]));
-      }
-      return own;
-    };
-    const auto lane = static_cast<int32_t>(threadIdx.x % 32);
-    for (auto b = static_cast<int32_t>(threadIdx.x / 32); b < in.mesh_bodies; b += kWarps) {
-      if (size(b) > kOfWarp) continue;
-      const BodySum<T> sum = sum_of_warp(share(b, lane, 32));
-      if (lane == 0) work.bodies[first() + b] = sum;
-      __syncwarp();
-    }
-    __syncthreads();
-    for (int32_t b = 0; b < in.mesh_bodies; ++b) {
-      if (size(b) <= kOfWarp) continue;
-      const BodySum<T> own = share(b, static_cast<int32_t>(threadIdx.x), kThreads);
-      const BodySum<T> sum = block_sum(own, part(), [](BodySum<T>& to, const BodySum<T>& of) { to.add(of); });
-      if (threadIdx.x == 0) work.bodies[first() + b] = sum;
-      __syncthreads();
-    }
+      by.each(size(b), [&](int32_t k) { own.add(vertex_share(in, scene, in.body_order[in.body_ptr[b] + k])); });
+      const BodySum<T> sum = sum_of(by, own);
+      if (by.leads()) work.bodies[first() + b] = sum;
+      by.meet();
+    });
     __syncthreads();
   }
   __device__ void sum() const {  // a warp for each island

@@ -21,7 +21,7 @@ from torch.autograd import Function
 
 from .. import ops
 from ..model.model import Model
-from ..ops import no_second_derivative, of_inputs
+from ..ops import is_batched, no_second_derivative, of_inputs
 from ..said import warn
 from ..scopes import is_captured
 from .anderson import run_sweeps
@@ -58,6 +58,9 @@ class _GlobalSweep(Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:
+        if is_batched(grads[0]):  # the solve looks at values
+            raise NotImplementedError("adjoint: expected ReverseSweep or Unrolled for batched gradients "
+                                      "(is_grads_batched), got GlobalAdjoint, which takes one at a time")  # fmt: skip
         needs = ctx.needs_input_grad[:_DIFFERENTIABLE]
         out = _GlobalBackward.apply(grads[0], *ctx.saved_tensors, ctx.model, ctx.h, ctx.adjoint, needs)
         return of_inputs(out, needs, 7)

@@ -87,7 +87,8 @@ class GlobalAdjoint:
     Raises:
         RuntimeError: In the backward, for a solve that fails, for adjoints that are not finite, and while a CUDA graph
             is captured.
-        NotImplementedError: In the backward, for second derivatives.
+        NotImplementedError: Inside ``torch.func`` transforms; in the backward, for second derivatives and for batched
+            gradients (``is_grads_batched``).
 
     Source: paper, eq. 5 (right) and section 6.3; docs/adjoints.md.
     """

@@ -109,6 +109,10 @@ class Friction:
 
     Differentiable as ``friction.coefficient`` (scalar).
 
+    Raises:
+        ValueError: A coefficient < 0 or not finite, a velocity below 1e-12 m/s.
+        TypeError: What is no number, or a tensor that requires grad.
+
     Source: Li et al. (2020), section 5; docs/method.md, section 12.
     """
 

@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ..checks import check_count, check_readable, fail
+from ..checks import check_count, check_kind, check_readable, fail
 from ..contact.barrier import PairBarrier
 from ..contact.detection import intersections as find
 from ..contact.surface import build_surface
@@ -69,7 +69,7 @@ def status(model: Model) -> Status:
     Raises:
         ValueError: If the Model has taken no step with contact yet.
     """
-    _check_model(model)
+    check_kind("model", model, Model)
     outcome = outcomes.get(model)
     if outcome is None:
         fail("model", "one that has taken a step with a PairBarrier", "none so far")
@@ -92,7 +92,7 @@ def reserve(model: Model, pairs: int) -> None:
     Raises:
         ValueError, TypeError: If the Model has no PairBarrier, or for a number < 1.
     """
-    _check_model(model)
+    check_kind("model", model, Model)
     surface = model.surface_of_contact
     if surface is None or model.contact is None:
         fail("model", "a PairBarrier among its energies", "none")
@@ -134,7 +134,7 @@ def intersections(model: Model, x: Tensor) -> Tensor:
         ValueError: For another shape, or positions that are not finite.
         TypeError: For no Model, and for anything but a dense tensor of real numbers.
     """
-    _check_model(model)
+    check_kind("model", model, Model)
     if not isinstance(x, Tensor):
         raise TypeError(f"x: expected a tensor, got {type(x).__name__}")
     check_readable("x", x)
@@ -155,8 +155,3 @@ def intersections(model: Model, x: Tensor) -> Tensor:
     if count > len(found.pairs):
         found = search(capacity=count)
     return found.pairs[:count].long().cpu()
-
-
-def _check_model(model: Model) -> None:
-    if not isinstance(model, Model):
-        raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")

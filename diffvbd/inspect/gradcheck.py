@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -89,6 +90,8 @@ def check_gradients(
             difference = float(ahead - behind) / (2 * eps)
             size = max(abs(adjoint), abs(difference))
             error = abs(adjoint - difference) / size if size > 0 else 0.0
+            if not (math.isfinite(adjoint) and math.isfinite(difference)):  # of which comparisons say nothing
+                error = math.inf
             best = min(best, (error, difference))
         rows.append((name, float(grad.norm()), adjoint, best[1], best[0]))
     result = GradientCheck(rows, tolerance)

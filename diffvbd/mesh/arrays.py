@@ -20,6 +20,11 @@ def to_numpy(array: Any) -> NDArray[Any]:
 
 def float_array(name: str, array: Any, shape: tuple[int | None, ...]) -> FloatArray:
     """A finite float64 copy of `array`; None in `shape` stands for any length."""
+    if getattr(array, "requires_grad", False):
+        raise TypeError(
+            f"{name}: expected numbers, got a tensor that requires grad, which a copy would not pass on: detach it, "
+            "and give what is differentiated, as rest_points or colliders, to a step or a rollout"
+        )
     values = to_numpy(array)
     if values.size and values.dtype.kind not in "fiu":
         raise TypeError(f"{name}: expected real numbers, got dtype {values.dtype}")

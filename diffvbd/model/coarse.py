@@ -45,6 +45,10 @@ class CoarseSpace:
         every: Sweeps after each correction. A step is: one sweep, then a correction and up to ``every`` sweeps, again
             until ``sweeps`` are done; without sweeps it is one correction, beside pairs and friction none.
 
+    Raises:
+        ValueError: Numbers out of range.
+        TypeError: What is neither an integer nor, for the first three, ``"auto"``.
+
     Source: docs/method.md, section 15.
     """
 

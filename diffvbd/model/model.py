@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import check_number, check_positive, fail, vertex_mask
+from ..checks import check_kind, check_number, check_positive, fail, vertex_mask
 from ..contact.barrier import Friction, PairBarrier
 from ..contact.colliders import Collider
 from ..contact.surface import ContactSurface, build_surface, check_colliders
@@ -105,8 +105,7 @@ class Model:
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
-        if not isinstance(mesh, TetMesh):
-            raise TypeError(f"mesh: expected a diffvbd.TetMesh, got {type(mesh).__name__}")
+        check_kind("mesh", mesh, TetMesh)
         if dtype not in (torch.float64, torch.float32):
             raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
         self.mesh = mesh
@@ -302,7 +301,7 @@ class Model:
 
     @lasting_tensors()
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Model:
-        """A new Model on another device or of another dtype (float64 or float32); this one is untouched."""
+        """A new Model on another device or of another dtype, float64 or float32 (else it raises); this one stays."""
         dtype = dtype or self.dtype
         if dtype not in (torch.float64, torch.float32):
             raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
@@ -390,7 +389,8 @@ class Model:
         return ops.SweepSettings(self._sizes, self.energy_mask, self._data_count, numbers, sweeps, launch, coarse)
 
     def memory(self, *, sweeps: int, **options: Any) -> dict[str, int]:
-        """Predicted bytes of a step or rollout of this Model; see :func:`diffvbd.rollout.memory.predict`."""
+        """Predicted bytes of a rollout, by name. options: steps, scenes, tape, checkpoint_every, save, material, rest,
+        integrator; :func:`diffvbd.rollout.memory.predict` says what they are, what it returns and what raises."""
         from ..rollout.memory import predict
 
         return predict(self, sweeps=sweeps, **options)

@@ -18,7 +18,10 @@ def raw_backward(ctx: Any, *grads: Tensor) -> NoReturn:
 
 
 def no_second_derivative() -> NoReturn:
-    raise NotImplementedError("diffvbd: second derivatives of a step are not supported (create_graph, hessian)")
+    raise NotImplementedError(
+        "diffvbd: second derivatives of a step are not supported (create_graph, hessian), nor first ones that "
+        "differentiate a backward (torch.autograd.functional.jvp): take torch.autograd.grad or backward() once"
+    )
 
 
 def no_transforms() -> NoReturn:
@@ -28,10 +31,15 @@ def no_transforms() -> NoReturn:
     )
 
 
-def not_batched(grad: Tensor) -> None:
-    """Raises for the gradients of torch.func.vmap and of is_grads_batched, which no vmap of a Function sees."""
+def is_batched(grad: Tensor) -> bool:
+    """Whether these are the gradients of torch.func.vmap or of is_grads_batched, which no vmap of a Function sees."""
     known = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
-    if not torch.compiler.is_compiling() and (known.is_batchedtensor(grad) or known.is_legacy_batchedtensor(grad)):
+    return not torch.compiler.is_compiling() and (known.is_batchedtensor(grad) or known.is_legacy_batchedtensor(grad))
+
+
+def not_batched(grad: Tensor) -> None:
+    """Raises for batched gradients of a step with contact."""
+    if is_batched(grad):
         no_transforms()
 
 

@@ -15,7 +15,7 @@ from .. import ops
 from ..adjoint.routes import Adjoint, ReverseSweep, Unrolled
 from ..checks import check_count, fail
 from ..model.model import Model
-from ..scopes import Scope
+from ..scopes import Scope, transformed
 
 MAX_REPEATS = 64  # of a step under BinomialCheckpoints: each is a nested checkpoint, and a run of the step
 TAPE_BUDGET = 2 * 2**30  # bytes of tape that "auto" lets a rollout keep
@@ -27,6 +27,13 @@ class BinomialCheckpoints:
     """Binomial (treeverse) checkpointing: at most ``snapshots`` states and the tape of one step are kept.
 
     ``steps`` steps cost at most t extra forward runs of a step, t the least number with C(snapshots + t, t) >= steps.
+
+    Args:
+        snapshots: How many states, at least 1.
+
+    Raises:
+        ValueError: snapshots < 1; in the rollout, so few that t would be more than 64.
+        TypeError: What is no integer.
 
     Source: Griewank and Walther (2000), Algorithm 799.
     """
@@ -72,6 +79,10 @@ def choose_schedule(
 ) -> tuple[int | BinomialCheckpoints | None, Adjoint]:
     """Resolves ``"auto"`` for schedule and tape from the bytes they would keep."""
     checkpoint_every = checked_schedule(checkpoint_every)
+    whole = transformed()  # whose tensors torch's checkpoints cannot hold
+    if whole and torch.is_grad_enabled() and checkpoint_every not in (None, "auto"):
+        raise NotImplementedError(f'checkpoint_every: expected None or "auto", which both keep all tapes inside '
+                                  f"torch.func transforms, got {checkpoint_every}")  # fmt: skip
     if isinstance(checkpoint_every, BinomialCheckpoints):
         snapshots = checkpoint_every.snapshots
         while _repeats(steps, snapshots) > MAX_REPEATS:
@@ -89,11 +100,13 @@ def choose_schedule(
     row = scenes * check_count("sweeps", sweeps) * model.num_active * model._mass.element_size()
     if not isinstance(adjoint, ReverseSweep):  # a step of GlobalAdjoint keeps a few states and no tape
         kept = UNROLLED_SCALARS * row if isinstance(adjoint, Unrolled) else 0
-        return None if steps * kept <= TAPE_BUDGET else max(1, math.isqrt(steps)), adjoint
+        return None if whole or steps * kept <= TAPE_BUDGET else max(1, math.isqrt(steps)), adjoint
     candidates = ("full", "compact") if adjoint.tape == "auto" else (adjoint.tape,)
     for tape in candidates:
         if steps * row * ops.tape_rows(ReverseSweep(tape).policy(0, 0, 0), model.energy_mask) <= TAPE_BUDGET:
             return None, ReverseSweep(tape)
+    if whole:
+        return None, ReverseSweep(candidates[-1])
     return max(1, math.isqrt(steps)), adjoint
 
 

@@ -55,6 +55,9 @@ def predict(
                 BinomialCheckpoints with frames saved: an upper estimate;
             scratch: of one backward step, in scenes that run side by side on as many threads;
             total: kept + scratch.
+
+    Raises:
+        ValueError, TypeError: For what ReverseSweep or rollout would refuse; it names the argument.
     """
     item = model._mass.element_size()
     steps, scenes = check_count("steps", steps), check_count("scenes", scenes)

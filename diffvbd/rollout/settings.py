@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 
 from ..adjoint.routes import ReverseSweep
-from ..checks import check_count, check_positive, fail
+from ..checks import check_count, check_kind, check_positive, fail
 from ..energies import StableNeoHookean
 from ..model.anderson import Anderson
 from ..model.arguments import checked_acceleration, checked_coarse, checked_relaxation
@@ -89,6 +89,10 @@ class Settings:
         tape: Of :class:`diffvbd.ReverseSweep`.
         checkpoint_every: As in :func:`diffvbd.rollout`.
         predicted: Of settings that :func:`diffvbd.advise` returns; else None.
+
+    Raises:
+        ValueError, TypeError: For what the step, the Model or the rollout would refuse; it names the argument. Also
+            from ``applied`` for what is no Model, or one of another dtype, and from ``steps`` for a duration <= 0.
     """
 
     time_step: float
@@ -126,8 +130,7 @@ class Settings:
     def applied(self, model: Model) -> Model:
         """The Model that runs: ``model`` with relaxation, coarse, acceleration and block of these settings. It is
         made once for each Model and kept with it."""
-        if not isinstance(model, Model):
-            raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
+        check_kind("model", model, Model)
         if self.dtype is not None and self.dtype != model.dtype:
             fail("settings", f"those of a Model of {model.dtype}", f"of {self.dtype}: take model.to(dtype=...)")
         changes: dict[str, Any] = {

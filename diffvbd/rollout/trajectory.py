@@ -21,7 +21,12 @@ class PerStep:
 
 
 def per_step(values: Tensor) -> PerStep:
-    """Marks a tensor whose leading dimension counts the steps of a rollout, shape [steps, ...]."""
+    """Marks a tensor whose leading dimension counts the steps of a rollout, shape [steps, ...].
+
+    Raises:
+        TypeError: What is no tensor, or has no dimension. Another number of steps than that of the rollout raises
+            ValueError there.
+    """
     if not isinstance(values, Tensor) or values.dim() == 0:
         got = "shape []" if isinstance(values, Tensor) else type(values).__name__
         raise TypeError(f"values: expected a tensor of shape [steps, ...], got {got}")

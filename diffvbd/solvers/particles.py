@@ -12,6 +12,7 @@ from torch import Tensor
 from .. import ops
 from ..checks import (
     check_broadcast,
+    check_kind,
     check_positive,
     check_tensor,
     check_time_step,
@@ -193,8 +194,7 @@ def mesh_mass(mesh: TetMesh, density: float) -> np.ndarray:
 
 
 def checked_mesh(mesh: Any) -> TetMesh:
-    if not isinstance(mesh, TetMesh):
-        raise TypeError(f"mesh: expected a diffvbd.TetMesh, got {type(mesh).__name__}")
+    check_kind("mesh", mesh, TetMesh)
     return mesh
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import check_broadcast, check_tensor, check_time_step, fail, name_value
+from ..checks import check_broadcast, check_kind, check_tensor, check_time_step, fail, name_value
 from ..energies import StableNeoHookean
 from ..model.model import Model
 from ..model.rest import rest_metric
@@ -277,8 +277,7 @@ def _check_values(model: Model, x: Tensor, y: Tensor, mu: Tensor, lam: Tensor, m
 
 def elastic_energy(model: Model) -> StableNeoHookean:
     """The one energy that VertexBlock knows; raises where there are others."""
-    if not isinstance(model, Model):
-        raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
+    check_kind("model", model, Model)
     energies = model.energies
     if len(energies) != 1 or not isinstance(energies[0], StableNeoHookean):
         names = [type(e).__name__ for e in energies]

@@ -13,15 +13,25 @@ import torch
 from torch import Tensor
 
 from .. import ops, reference
-from ..adjoint.routes import Adjoint, ReverseSweep, Unrolled
-from ..checks import check_broadcast, check_count, check_tensor, check_time_step, fail, kind_of, name_value, to_float
+from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, Unrolled
+from ..checks import (
+    check_broadcast,
+    check_count,
+    check_kind,
+    check_tensor,
+    check_time_step,
+    fail,
+    kind_of,
+    name_value,
+    to_float,
+)
 from ..contact.barrier import Friction, PairBarrier
 from ..contact.colliders import MOST_LENGTH, Plane
 from ..energies import VERTEX_ENERGIES
 from ..model.model import Model
 from ..model.moduli import moduli_of
 from ..model.rest import lumped_mass, rest_metric
-from ..scopes import checking, looks_at, refuse_forward_mode
+from ..scopes import checking, looks_at, refuse_forward_mode, transformed
 from .coarse import CoarseParts, coarse_parts
 
 GRAVITY = (0.0, -9.81, 0.0)  # [m/s^2]
@@ -46,6 +56,12 @@ class Prepared(NamedTuple):
     # of a time step, sweeps and a chord, the reference's step, where autograd unrolls it
     unrolled: Callable[[float, int, float], Callable[..., tuple[Tensor, Tensor]]] | None = None
     chord: float = CHORD  # how far back along its way h v a vertex is taken to have been (csrc/rigid/coast.h)
+    euler: Tensor | None = None  # bool [B, V]: who takes implicit Euler in a step of another scheme, and its chord
+
+    def ways(self, of: Callable[[float], Tensor]) -> Tensor:
+        """of(chord) [B, V, 3], each vertex by the chord of its scheme."""
+        own = of(self.chord)
+        return own if self.euler is None else torch.where(self.euler[..., None], of(CHORD), own)
 
     @property
     def time_step_and_sweeps(self) -> tuple[float, int]:
@@ -54,8 +70,7 @@ class Prepared(NamedTuple):
 
 def check_state(model: Model, x: Tensor, v: Tensor) -> tuple[int, ...]:
     """Raises where x or v does not fit the Model; returns the leading (scene) shape."""
-    if not isinstance(model, Model):
-        raise TypeError(f"model: expected a diffvbd.Model, got {type(model).__name__}")
+    check_kind("model", model, Model)
     for name, value in (("x", x), ("v", v)):
         if not isinstance(value, Tensor):
             raise TypeError(f"{name}: expected a tensor of shape [..., {model.num_vertices}, 3], got {kind_of(value)}")
@@ -105,6 +120,9 @@ def prepare(
 ) -> Prepared:
     """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
     refuse_forward_mode()
+    if isinstance(adjoint, GlobalAdjoint) and transformed():
+        raise NotImplementedError("adjoint: expected ReverseSweep or Unrolled inside torch.func transforms, got "
+                                  "GlobalAdjoint, whose solve looks at values")  # fmt: skip
     like, tets = model._mass, (model.num_tets,)
     if settings is None:
         settings = step_settings(model, lead, time_step, sweeps)

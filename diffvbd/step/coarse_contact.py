@@ -113,7 +113,7 @@ class Corrections:
         for terms in pair_terms(s):
             scene, corners = corners_of(terms.listed)
             moves = corners < vertices
-            rows = torch.where(moves, vertices * scene + corners, 0)
+            rows = vertices * scene + torch.where(moves, corners, 0)  # what does not move is of its scene, too
             weights = torch.where(moves, terms.weights, 0.0)
             pulled = terms.weights[..., None] * terms.force[:, None]
             if terms.at_corners is not None:

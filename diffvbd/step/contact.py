@@ -28,7 +28,7 @@ from .coarse import factor_of
 from .contact_cycles import CUT, MOST_DETECTIONS, of_going, parts_of, record_parts, sweeps_of_part, swept_part
 from .corrections import corrected, corrected_after, is_cut
 from .floor_start import start_on_floor
-from .intersections import refuse_intersections
+from .intersections import advice_to_part, refuse_intersections
 from .met import Detection, Met, Outcome, outcomes
 from .motion import Motion, coasting, motion_of
 from .rooms import ROOM, rooms, rooms_of_sweeps
@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 FREE = 1e15  # [m] room that nothing fills
 CLOSE = 1e-3  # of dhat: pairs whose gap is so much wider do not push, however it is rounded
 MOST_CAPACITY = 2**26
-LOST = ("x: positions became non-finite {}: look with diffvbd.debug_checks(), use a smaller time_step or softer "
-        "materials")  # fmt: skip
+LOST = ("x: positions became non-finite {}: check that v, forces and materials are in SI units, use a smaller "
+        "time_step or softer materials, or look with diffvbd.debug_checks()")  # fmt: skip
 
 
 class TooManyPairs(RuntimeError):
@@ -151,8 +151,8 @@ class ContactStep:
         lift = broadcast(self.begun.lift, self.begun.y.shape)
         lift = torch.where(pinned, 0.0, lift) if pins else lift
         x = self.x_prev
-        way = coasting(x, self.fields.mass, self.begun.y - x - lift, surface.held, surface.held_bodies,
-                       surface.body_order, surface.body_ptr, self.prepared.chord)  # fmt: skip
+        bodies = surface.held, surface.held_bodies, surface.body_order, surface.body_ptr
+        way = self.prepared.ways(functools.partial(coasting, x, self.fields.mass, self.begun.y - x - lift, *bodies))
         left, met = way, Met(x)
         stages, r = self.parts or 1, 0  # of what is prescribed
         planned, going = self.parts, None
@@ -247,7 +247,7 @@ class ContactStep:
 
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
         """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
-        x = start_on_floor(self.model, self.begun, self.floor_data, self.fields.mass, self.prepared.chord)
+        x = start_on_floor(self.model, self.begun, self.floor_data, self.fields.mass, self.prepared)
         room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
         start = PartStart(x, x.detach(), room, (), None, room > 0, none.ptr[:1].long(),
                           x.new_ones((2, *room.shape)))  # fmt: skip
@@ -359,7 +359,7 @@ class ContactStep:
                 + (
                     "move colliders less, or use more detections or a smaller time_step"
                     if moved
-                    else f"move them apart, best by about dhat, {self.barrier.dhat:g} m"
+                    else advice_to_part(self.x_prev, self.origin, self.barrier.dhat)
                 )
             )
         if hindered:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
 from ..contact.above_floor import above_floor
 from ..model.model import Model
 from ..ops import broadcast
+from .arguments import Prepared
 from .motion import coasting
 from .predict import Begun
 from .rigid_contact import bodies_of
@@ -15,18 +18,19 @@ from .rigid_contact import bodies_of
 PLANE, DHAT = 7, 5  # numbers of a plane of a FloorBarrier, and which of them is dhat
 
 
-def start_on_floor(model: Model, begun: Begun, floor: Tensor | None, mass: Tensor, chord: float) -> Tensor:
+def start_on_floor(model: Model, begun: Begun, floor: Tensor | None, mass: Tensor, prepared: Prepared
+                   ) -> Tensor:  # fmt: skip
     """Positions [B, V, 3] [m]: free bodies go as wholes, above the floor. If each vertex went as far as the floor lets
     it by itself, the start would press a body that hits the floor. Differentiable.
 
-    floor: Data of the FloorBarrier [1 | B, 7 planes], or None.  mass: [1 | B, V] [kg].  chord: As for coasting().
+    floor: Data of the FloorBarrier [1 | B, 7 planes], or None.  mass: [1 | B, V] [kg].
     """
     x, start = begun.x_prev, begun.x_start
     if floor is None:
         return start
     order, ptr, free, held, body = bodies_of(model)
     body, lift = body[: x.shape[1]].long(), broadcast(begun.lift, x.shape)
-    way = coasting(x, mass, begun.y - x - lift, held, ~free, order, ptr, chord)
+    way = prepared.ways(partial(coasting, x, mass, begun.y - x - lift, held, ~free, order, ptr))
     if model.starts_from != "inertia":
         way = way + _borne(floor, x if begun.origin is None else x + begun.origin, lift, body, len(free))
     none = x.new_empty((0,))

@@ -285,8 +285,9 @@ def _of_euler(model: Model, prepared: Prepared, given: dict[str, Any], x: Tensor
             if name in parameters or energy.damping > 0:
                 parameters[name] = share * value
     gravity = acceleration_of(given["gravity"], x) / factor[..., None]
-    return (replaced(prepared, mass=mass, settings=settings, coarse=coarse, parameters=parameters),
-            {**given, "gravity": gravity})  # fmt: skip
+    own = replaced(prepared, mass=mass, settings=settings, coarse=coarse, parameters=parameters,
+                   euler=euler.reshape(-1, euler.shape[-1]))  # fmt: skip
+    return own, {**given, "gravity": gravity}
 
 
 def _at_end(given: dict[str, Any]) -> dict[str, Any]:

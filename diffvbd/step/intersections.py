@@ -33,6 +33,16 @@ def check_start(model: Model, x: Tensor, colliders: Any, colliders_before: Tenso
                              "; check_start=False starts all the same")  # fmt: skip
 
 
+def advice_to_part(x: Tensor, origin: Tensor, dhat: float) -> str:
+    """What to do about surfaces that touch. x: [B, V, 3] [m], relative to origin [B, V, 3] or empty."""
+    far = max(float(t.abs().max()) for t in (x, origin) if t.numel())
+    rounded = far * torch.finfo(x.dtype).eps
+    if rounded > dhat / 2:
+        return (f"positions of up to {far:.3g} m are rounded by {rounded:.3g} m as {x.dtype}, dhat is {dhat:g} m: "
+                "give x in metres, near the origin")  # fmt: skip
+    return f"move them apart, best by about dhat, {dhat:g} m"
+
+
 def refuse_intersections(model: Model, x: Tensor, origin: Tensor, colliders: Tensor, otherwise: str = "") -> None:
     """Raises where an edge of the surfaces passes through a triangle, or a point lies behind a plane.
 

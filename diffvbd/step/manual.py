@@ -60,6 +60,10 @@ def step_forward(
     Returns:
         Positions, velocities (both detached) and the tape, which with BDF2() has the history for the next step: its
         ``moved`` is x' - x and its ``v`` is v.
+
+    Raises:
+        ValueError, TypeError: As step; also for a name in ``wrt`` that is no given tensor.
+        NotImplementedError: Inside torch.func.grad, vmap and the like.
     """
     wrt = (wrt,) if isinstance(wrt, str) else wrt
     if not isinstance(wrt, Sequence) or not all(isinstance(name, str) for name in wrt):
@@ -113,6 +117,11 @@ def step_backward(tape: Tape, grad_x: Tensor | None = None, grad_v: Tensor | Non
 
     Returns:
         A dict keyed by argument, each of the argument's shape.
+
+    Raises:
+        TypeError: Another thing than a Tape; an adjoint that is no tensor, or of another dtype.
+        ValueError: An adjoint of another shape or device.
+        RuntimeError: A tape without the graph of its step.
     """
     if not isinstance(tape, Tape):
         raise TypeError(f"tape: expected a diffvbd.Tape of step_forward, got {type(tape).__name__}")

@@ -14,9 +14,33 @@ from .contact_cycles import Combined, SweptPart
 
 
 class Detection(NamedTuple):
-    """One search: which pairs are listed (``listed.pairs`` [capacity, 6]: four corner points, kind, scene), the nearest
-    pair of each corner point (``near_corners`` [B, N, 5], ``near_values`` [B, N, 8]: weights, normal, gap [m]), which
-    bodies move together (``island`` [B, bodies]). Index data; the step differentiates the values anew."""
+    """One search for pairs, and what its part of the step has decided. Index data; the step differentiates the values
+    anew. N corner points: vertices, then those of colliders.
+
+    Attributes:
+        listed: The pairs that may matter: ``pairs`` [capacity, 6], four corner points, kind (0 point and triangle, 1
+            two edges, 2 point and plane) and scene, or -1; ``constants`` [capacity, 8]; those of each corner point by
+            ``ptr`` [B N + 1] and ``entry`` [4 capacity].
+        near_corners: Corner points and kind of the nearest pair of each corner point, int [B, N, 5]; -1: none.
+        near_values: Its weights, normal and gap [m], [B, N, 8].
+        counts: int64 [4]: pairs that the list needs, pairs that touch, key of one of those or -1, 0.
+        smallest: Smallest gap of each scene, or how far was looked [m], [B].
+        island: Smallest body of those that each body moves with, int [B, bodies]; -1: it stays, being held or near a
+            collider.
+        lowest: Lowest vertex of each body's island above each plane of the floor, int [B, bodies, planes]; else empty.
+        room: How far the vertices of each body may go beside its island, and the largest [m], [B, bodies + 1].
+        own_room: The same beside the rigid motion of the body [m].
+        shares: How much of its two ways each vertex begins the part with, [2, B, V].
+        corrections: Shares of the rigid corrections before and after the sweeps, [1 to 3, B, bodies].
+        limits: By how often each update was halved, uint8 [B, K, V]; 8: it was not made.
+        frames: Share of the rigid motion that each body begins the part with, [B, bodies].
+        combined: Which combinations of iterates were taken (:class:`diffvbd.Anderson`); None: there are none.
+        lengths: Of the coarse corrections, [corrections, B, bodies of the coarse space]; None: there are none.
+        kept: Rows of the listed pairs that sweeps can reach; None where that would have to be read, as on CUDA.
+        sweeps: How many sweeps the part has.
+        going: Scenes that go on in a part beyond those that were planned, bool [B, 1, 1]; None: all, as planned.
+        resting: Vertices of held bodies that begin without gravity's fall, bool [B, V]; None: none.
+    """
 
     listed: Pairs
     near_corners: Tensor
@@ -24,21 +48,20 @@ class Detection(NamedTuple):
     counts: Tensor
     smallest: Tensor
     island: Tensor
-    lowest: Tensor  # of a Model with a floor, else empty
-    room: Tensor  # [B, bodies + 1] [m]: how far the vertices of each body may go beside its island, and the largest
-    own_room: Tensor  # [B, bodies + 1] [m]: and beside the rigid motion of the body
-    # what the part has decided: the shares of the two ways of its start [2, B, V], of the corrections before and after
-    # its sweeps [1 to 3, B, bodies], and the exponents of limits [B, K, V]
+    lowest: Tensor
+    room: Tensor
+    own_room: Tensor
+    # what the part has decided
     shares: Tensor | None = None
     corrections: Tensor | None = None
     limits: Tensor | None = None
-    frames: Tensor | None = None  # and of the rigid motions of its start [B, bodies]
-    combined: Combined | None = None  # which combinations of its iterates were taken; None where there are none
-    lengths: Tensor | None = None  # of its coarse corrections [corrections, B, bodies of the coarse space]
-    kept: Tensor | None = None  # rows of listed pairs that its sweeps can reach; all where that would have to be read
+    frames: Tensor | None = None
+    combined: Combined | None = None
+    lengths: Tensor | None = None
+    kept: Tensor | None = None
     sweeps: int = 0
-    going: Tensor | None = None  # bool [B, 1, 1]: scenes that go on in a part beyond those that were planned
-    resting: Tensor | None = None  # bool [B, V]: vertices of held bodies that begin without gravity's fall; None: none
+    going: Tensor | None = None
+    resting: Tensor | None = None
 
 
 class Outcome(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -12,7 +13,7 @@ from .. import ops
 from ..mask import ELASTIC
 from ..model.model import Model
 from ..tuples import replaced
-from .arguments import Prepared, broadcastable
+from .arguments import CHORD, Prepared, broadcastable
 from .rigid import correct
 from .start import begin as start_of
 
@@ -109,9 +110,12 @@ def begin(
     rest = None
     if (model.starts_from == "auto" or parts) and model.energy_mask & ELASTIC:
         rest = model.rest_scalars if prepared.rest is None else prepared.rest
-    x_start, y = start_of(
-        start, velocity, acceleration, prescribed, prepared.mass, data, origin, prepared.mu, prepared.lam, rest,
-        model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
-        prepared.chord, start=model.starts_from, filters=filters, parts=parts,
+    begins = partial(
+        start_of, start, velocity, acceleration, prescribed, prepared.mass, data, origin, prepared.mu, prepared.lam,
+        rest, model._pinned, model._bodies, model._other_bodies, prepared.settings.data_count, h,
+        start=model.starts_from, filters=filters, parts=parts,
     )  # fmt: skip
+    x_start, y = begins(chord=prepared.chord)
+    if prepared.euler is not None:
+        x_start = torch.where(prepared.euler[..., None], begins(chord=CHORD)[0], x_start)
     return Begun(x_start, start, y, data, origin, (h * h) * acceleration)

@@ -94,6 +94,9 @@ def test_friction(name: str, value: Any, got: str) -> None:
         (lambda: colliders.Capsule(a=(0.0, 0.0, INF)), "a", "Inf"),
         (lambda: colliders.Capsule((1.0, -1.0, 0.0), (2.0, -5.0, 0.0), 1e100), "radius", r"1e\+100"),
         (lambda: colliders.Sphere(radius=2e9), "radius", r"2e\+09"),
+        (lambda: colliders.Sphere(torch.zeros(3, requires_grad=True)), "center", "requires grad"),
+        (lambda: colliders.Plane(normal=torch.ones(3, requires_grad=True)), "normal", "requires grad"),
+        (lambda: colliders.Obstacle(torch.eye(3, requires_grad=True), [[0, 1, 2]]), "points", "requires grad"),
         (lambda: colliders.Sphere((0.0, -1e38, 0.0)), "center", r"-1e\+38"),
         (lambda: colliders.Plane((0.0, 1e10, 0.0)), "point", r"1e\+10"),
         (lambda: colliders.Capsule(b=(1e300, 0.0, 0.0)), "b", r"1e\+300"),
@@ -322,6 +325,28 @@ def test_motion_that_overflows_raises(speed: float) -> None:
     x = model.rest_points
     with pytest.raises(RuntimeError, match="x: positions became non-finite (in|before part 1 of) the step"):
         dv.step(model, x, torch.full_like(x, speed), **STEP)
+
+
+@pytest.mark.parametrize(("far", "advice"), ((1e50, "near the origin"), (0.0, "by about dhat")))
+def test_surfaces_that_touch_as_they_are_rounded_are_not_to_be_moved_apart(far: float, advice: str) -> None:
+    model = two_boxes()
+    x = torch.full_like(model.rest_points, far)  # all in one point, as all are at 1e50 m
+    with pytest.raises(ValueError, match=f"x: expected surfaces that do not touch, .*{advice}"):
+        dv.step(model, x, torch.zeros_like(x), **STEP)
+
+
+def test_changing_where_colliders_were_before_a_checkpointed_backward_raises() -> None:
+    ball = colliders.Sphere((0.1, -0.115, 0.1), 0.1)
+    pairs = dv.PairBarrier(kappa=1e4, dhat=0.02, self_contact=False)
+    model = dv.Model(box(3), energies=(dv.StableNeoHookean(), pairs), colliders=[ball])
+    x, before = model.rest_points, model.collider_points.clone()
+    v = torch.zeros_like(x).requires_grad_()
+    path = dv.per_step(before.expand(4, -1, -1).clone())
+    end = dv.rollout(model, x, v, steps=4, checkpoint_every=2, colliders=path, colliders_before=before,
+                     check_start=False, **STEP).x[-1]  # fmt: skip
+    before.add_(-1e-4)
+    with pytest.raises(RuntimeError, match="colliders_before: changed in place"):
+        end.sum().backward()
 
 
 @pytest.mark.parametrize("coarse", (None, "auto"))

@@ -161,6 +161,28 @@ def test_float32_is_near_float64() -> None:
     assert ends[1].dtype == torch.float32 and relative_error(*ends[::-1]) <= tolerance("float32_forward")
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_scenes_of_a_batch_do_not_mix(device: str) -> None:
+    """Beside a collider, whose corners come first in some pairs and are no vertices of any scene."""
+    generator = torch.Generator().manual_seed(0)
+    cube = dv.mesh.cube(3, size=0.1).translate((0.0, 0.06, 0.0))
+    pairs = dv.PairBarrier(kappa=1e3, dhat=0.04, self_contact=False, detections=1)
+    ball = dv.colliders.Sphere((0.03, 0.0, 0.04), 0.05)
+    model = dv.Model(cube, energies=(dv.StableNeoHookean(), pairs), colliders=[ball], coarse="auto", device=device)
+    x = model.rest_points.expand(3, -1, -1)
+    v = 0.05 * torch.randn(x.shape, generator=generator, dtype=x.dtype) - torch.tensor([0.0, 0.5, 0.0], dtype=x.dtype)
+    weights, v = torch.randn(x.shape, generator=generator, dtype=x.dtype).to(device), v.to(device).requires_grad_()
+    given: dict[str, Any] = {"mu": 1e5, "lam": 1e4, "time_step": 0.01, "sweeps": 6}
+    together = dv.step(model, x, v, **given)[0]
+    (grad,) = torch.autograd.grad((weights * together).sum(), v)
+    for k in range(3):
+        alone = dv.step(model, x[k], v[k], **given)[0]
+        (own,) = torch.autograd.grad((weights[k] * alone).sum(), v)
+        assert own[k].abs().max() > 0
+        assert relative_error(together[k], alone) <= tolerance("coarse_forward")
+        assert relative_error(grad[k], own[k]) <= tolerance("contact_adjoint")
+
+
 def test_checkpoints_and_threads_change_no_bit() -> None:
     model, given = stack(coarse="auto", acceleration=dv.Anderson(2))
     x, found, threads = model.rest_points, [], torch.get_num_threads()

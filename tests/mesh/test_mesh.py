@@ -242,9 +242,11 @@ def test_repr_and_empty_mesh():
 
 def test_tensors_are_accepted():
     torch = pytest.importorskip("torch")
-    points = torch.tensor(UNIT_POINTS, dtype=torch.float32, requires_grad=True)
+    points = torch.tensor(UNIT_POINTS, dtype=torch.float32)
     mesh = TetMesh(points, torch.tensor(UNIT_TET))
     assert mesh.points.dtype == np.float64 and mesh.volume[0] == pytest.approx(1 / 6)
+    with pytest.raises(TypeError, match="points: expected numbers, got a tensor that requires grad"):
+        TetMesh(points.requires_grad_(), torch.tensor(UNIT_TET))
 
 
 def test_translate_and_transform():
@@ -287,6 +289,7 @@ def test_flatness_is_relative_to_size_so_slivers_and_small_meshes_pass():
         (UNIT_POINTS, [[0, 1, 2, 4]], None, ValueError, r"tets: .* from 0 to 3, got \[0, 1, 2, 4\] .*1 tet: 0"),
         (UNIT_POINTS, [[0, 1, 2, -1]], None, ValueError, "tets: expected vertex indices from 0 to 3"),
         (UNIT_POINTS, [[0, 1, 2, 2]], None, ValueError, "tets: expected four different vertices.*1 tet: 0"),
+        (UNIT_POINTS, [[0, 1, 2, 3], [1, 2, 0, 3]], None, ValueError, r"each tet once, .*\[1, 2, 0, 3\] .*1 tet: 1"),
         (UNIT_POINTS, UNIT_TET, [0, 0, 0], ValueError, r"body: expected shape \[4\], got \[3\]"),
         (UNIT_POINTS, UNIT_TET, [0.0] * 4, TypeError, "body: expected integers"),
         (UNIT_POINTS, UNIT_TET, [0, 0, 0, 1], ValueError, "body: expected one label per tet"),

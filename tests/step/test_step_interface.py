@@ -293,6 +293,21 @@ class WrongBackward(torch.autograd.Function):
         return 1.01 * grads[0]
 
 
+class NoNumber(WrongBackward):
+    """The identity with a gradient that is no number."""
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        return float("nan") * grads[0]
+
+
+def test_check_gradients_of_what_is_no_number_fails() -> None:
+    given = {"a": torch.ones(3, dtype=torch.float64)}
+    assert dv.check_gradients(lambda a: a.sum(), given, verbose=False).ok
+    assert not dv.check_gradients(lambda a: NoNumber.apply(a).sum(), given, verbose=False).ok
+    assert not dv.check_gradients(lambda a: a.sum() + float("nan"), given, verbose=False).ok
+
+
 def test_check_gradients_tells_right_from_wrong(device: str, capsys: pytest.CaptureFixture[str]) -> None:
     scene = build_scene("anchored")
     model, inputs = scene.model(device), scene.inputs(device=device)
