@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import operator
 from typing import Any, NoReturn
@@ -9,6 +10,8 @@ from typing import Any, NoReturn
 import numpy as np
 import torch
 from torch import Tensor
+
+NUMBERS = (int, float, np.floating, np.integer)  # bool, which python counts among them, is checked apart
 
 
 def fail(name: str, expected: str, got: Any) -> NoReturn:
@@ -21,13 +24,46 @@ def check_kind(name: str, value: Any, kind: type) -> None:
         raise TypeError(f"{name}: expected a diffvbd.{kind.__name__}, got {kind_of(value)}")
 
 
+def is_word(value: Any, *words: str) -> bool:
+    """Whether a value is one of some words. An array is none: == would compare its numbers, one by one."""
+    return isinstance(value, str) and value in words
+
+
+def check_dtype(value: Any) -> None:
+    """Raises unless ``value`` is a dtype that kernels compute in."""
+    if not isinstance(value, torch.dtype) or value not in (torch.float64, torch.float32):
+        raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {value}")
+
+
+def check_function(name: str, function: Any, *arguments: str) -> None:
+    """Raises unless ``function`` can be called with these arguments, by position; they are named in the error."""
+    if not callable(function):
+        raise TypeError(f"{name}: expected a function of {', '.join(arguments)}, got {type(function).__name__}")
+    if torch.compiler.is_compiling():
+        return
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # of a builtin: calling it will tell
+        return
+    try:
+        signature.bind(*arguments)
+    except TypeError as error:
+        raise TypeError(f"{name}: expected a function of {', '.join(arguments)}: {error}") from None
+
+
 def check_tensor(
     name: str, value: Any, like: Tensor, what: str = "a number or a tensor", owner: str = "the Model's"
 ) -> Tensor:
     """``value`` as a tensor of like's dtype and device; python numbers are converted, other tensors must match."""
     if not isinstance(value, Tensor):
-        if isinstance(value, (int, float, np.floating, np.integer)) and not isinstance(value, bool):
-            return torch.full((), to_float(name, value), dtype=like.dtype, device=like.device)
+        if isinstance(value, NUMBERS) and not isinstance(value, bool):
+            number = to_float(name, value)
+            try:
+                return torch.full((), number, dtype=like.dtype, device=like.device)
+            except RuntimeError:
+                if abs(number) <= torch.finfo(like.dtype).max:
+                    raise
+                fail(name, f"a number that {like.dtype} can hold ({owner})", number)
         raise TypeError(f"{name}: expected {what}, got {kind_of(value)}")
     check_dense(name, value)
     if value.dtype != like.dtype:
@@ -122,7 +158,7 @@ def check_number(name: str, value: Any, wanted: str = "a finite number >= 0") ->
     refuse_gradient(name, value)
     if isinstance(value, Tensor) and value.numel() == 1:
         value = value.detach().item()
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
+    if isinstance(value, bool) or not isinstance(value, NUMBERS):
         raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
     value = to_float(name, value)
     if not (math.isfinite(value) and value >= 0):

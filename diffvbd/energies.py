@@ -15,7 +15,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .checks import check_number, check_positive, check_readable, fail, mask_or_indices, refuse_gradients, vertex_mask
+from .checks import (
+    check_number,
+    check_positive,
+    check_readable,
+    fail,
+    is_word,
+    mask_or_indices,
+    refuse_gradients,
+    vertex_mask,
+)
 from .mask import EXACT_BLOCK, FIRST_VERTEX_BIT, PAPER_BLOCK
 
 MAX_PLANES = 8
@@ -54,7 +63,7 @@ class StableNeoHookean:
     block: str = "exact"
 
     def __post_init__(self) -> None:
-        if self.block not in ("exact", "paper"):
+        if not is_word(self.block, "exact", "paper"):
             fail("block", '"exact" or "paper"', self.block)
 
     @property

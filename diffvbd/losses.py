@@ -1,7 +1,11 @@
 """Losses on positions: plain torch functions, differentiable in every tensor argument."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
+
+from .checks import check_positive, fail, kind_of
 
 
 def vertex_distance(x: Tensor, target: Tensor) -> Tensor:
@@ -15,15 +19,10 @@ def vertex_distance(x: Tensor, target: Tensor) -> Tensor:
         Scalar [m^2].
 
     Raises:
+        TypeError: x or target is no tensor.
         ValueError: a target that does not broadcast to x.
     """
-    try:
-        target = target.expand_as(x)
-    except RuntimeError:
-        raise ValueError(
-            f"target: expected a shape that broadcasts to {list(x.shape)}, got {list(target.shape)}"
-        ) from None
-    return (x - target).square().sum(-1).mean()
+    return _apart(x, target).square().sum(-1).mean()
 
 
 def center_of_mass(x: Tensor, mass: Tensor) -> Tensor:
@@ -35,7 +34,15 @@ def center_of_mass(x: Tensor, mass: Tensor) -> Tensor:
 
     Returns:
         Positions [m], shape [..., 3].
+
+    Raises:
+        TypeError: x or mass is no tensor.
+        ValueError: masses of another number than x has vertices.
     """
+    _check_tensor("x", x)
+    _check_tensor("mass", mass)
+    if mass.shape != x.shape[-2:-1]:
+        fail("mass", f"shape {list(x.shape[-2:-1])}, a mass for each vertex of x", f"shape {list(mass.shape)}")
     return (mass.unsqueeze(-1) * x).sum(-2) / mass.sum()
 
 
@@ -53,13 +60,29 @@ def huber(x: Tensor, target: Tensor, delta: float) -> Tensor:
         Scalar [m^2].
 
     Raises:
-        ValueError: delta <= 0.
+        TypeError: x or target is no tensor, delta is no number.
+        ValueError: a target that does not broadcast to x, delta <= 0.
 
     Source: Huber, Robust estimation of a location parameter (1964).
     """
-    if not delta > 0:
-        raise ValueError(f"delta: expected a positive distance, got {delta}")
-    squared = (x - target).square().sum(-1)
+    delta = check_positive("delta", delta, "m")
+    squared = _apart(x, target).square().sum(-1)
     # The square root is taken of clamped values only: its derivative at r = 0 is infinite.
     linear = delta * (squared.clamp(min=delta**2).sqrt() - 0.5 * delta)
     return torch.where(squared < delta**2, 0.5 * squared, linear).mean()
+
+
+def _apart(x: Tensor, target: Tensor) -> Tensor:
+    """x - target, of x's shape."""
+    _check_tensor("x", x)
+    _check_tensor("target", target)
+    try:
+        target = target.expand_as(x)
+    except RuntimeError:
+        fail("target", f"a shape that broadcasts to {list(x.shape)}", list(target.shape))
+    return x - target
+
+
+def _check_tensor(name: str, value: Any) -> None:
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name}: expected a tensor, got {kind_of(value)}")

@@ -7,6 +7,7 @@
 
 #include "../rigid/body.h"
 #include "bodies.h"
+#include "exchange.cuh"
 
 namespace diffvbd::cuda {
 
@@ -31,10 +32,18 @@ __device__ __forceinline__ void own_sum(int32_t first, int32_t count, int32_t st
 // Sums by a butterfly, after which every lane holds the same bits.
 template <int n, int width>
 __device__ __forceinline__ void butterfly(unsigned mask, double* out) {
+  constexpr int kAtOnce = 8;  // more would take registers, and gain nothing
+  if constexpr (n > kAtOnce) {
+    butterfly<kAtOnce, width>(mask, out);
+    butterfly<n - kAtOnce, width>(mask, out + kAtOnce);
+  } else {
+    double own[n];
 #pragma unroll
-  for (int k = 0; k < n; ++k) {
+    for (int k = 0; k < n; ++k) own[k] = out[k];
 #pragma unroll
-    for (int d = width / 2; d > 0; d /= 2) out[k] += __shfl_xor_sync(mask, out[k], d, width);
+    for (int d = width / 2; d > 0; d /= 2) add_from(own, d, mask);
+#pragma unroll
+    for (int k = 0; k < n; ++k) out[k] = own[k];
   }
 }
 
@@ -78,8 +87,13 @@ __device__ __forceinline__ void own_most(int32_t first, int32_t count, int32_t s
 }
 template <int n, int width>
 __device__ __forceinline__ void butterfly_most(unsigned mask, double* out) {
-  for (int k = 0; k < n; ++k) {
-    for (int d = width / 2; d > 0; d /= 2) out[k] = larger(out[k], __shfl_xor_sync(mask, out[k], d, width));
+#pragma unroll
+  for (int d = width / 2; d > 0; d /= 2) {
+    double other[n];
+#pragma unroll
+    for (int k = 0; k < n; ++k) other[k] = __shfl_xor_sync(mask, out[k], d, width);
+#pragma unroll
+    for (int k = 0; k < n; ++k) out[k] = larger(out[k], other[k]);
   }
 }
 

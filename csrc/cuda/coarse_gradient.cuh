@@ -158,8 +158,8 @@ __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 128 : 168)
       send_to_pinned<typename Set::Elastic>(s, at.scene, at.block, at.v, b.state.x, way, -(h * h));
     }
     if constexpr ((wanted & kMaterial) != 0) {
+      if (s.one_material) star.total(star.material_bar);
       for (int m = 0; s.one_material && m < kTetScalars; ++m) {
-        star.total(star.material_bar[m]);
         if (writes) s.w.material_bar[row * kTetScalars + m] += star.material_bar[m];
       }
     }

@@ -101,13 +101,16 @@ __global__ void __launch_bounds__(kContactThreads, 3)
   send_pairs(s, c, part.place(), part.role, begin, end);
 }
 
-template <int share, class T>
-__device__ __forceinline__ void sum_share(Vec3<T>& a) {
-  const auto sum = [](T& of) {
+// Over the threads of a share, which may come out of loops of their own.
+template <int share, class T, class... R>
+__device__ __forceinline__ void sum_share(R&... values) {
+  __syncwarp();
+  change_numbers<T>(
+      [](auto& all) {
 #pragma unroll
-    for (int offset = share / 2; offset > 0; offset /= 2) of += __shfl_xor_sync(kWholeWarp, of, offset);
-  };
-  sum(a.x), sum(a.y), sum(a.z);
+        for (int offset = share / 2; offset > 0; offset /= 2) add_from(all, offset);
+      },
+      values...);
 }
 
 template <class T>
@@ -121,7 +124,7 @@ __global__ void collect_contact(const __grid_constant__ StepView<T> s, const __g
     contact::take_pairs(in, slots, scene, static_cast<int>(corner), static_cast<int>(i % kCornerShare), kCornerShare,
                         now, prev);
   }
-  sum_share<kCornerShare>(now), sum_share<kCornerShare>(prev);
+  sum_share<kCornerShare, T>(now, prev);
   if (!there || i % kCornerShare != 0) return;
   if (corner < in.num_vertices) {
     add_row(s.w.x_bar, local * s.positions + s.w.position[corner], now);

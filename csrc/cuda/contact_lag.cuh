@@ -104,7 +104,7 @@ __global__ void lag_collect(const __grid_constant__ ContactInputs<T> in, int64_t
   for (int e = in.listed.ptr[row] + lane; e < in.listed.ptr[row + 1]; e += kSlice) {
     sum += contact::vector_at(slots + int64_t{4} * in.listed.entry[e]);
   }
-  sum_share<kSlice>(sum);
+  sum_share<kSlice, T>(sum);
   if (lane != 0) return;
   T* to = out + 3 * row;
   to[0] = sum.x, to[1] = sum.y, to[2] = sum.z;

@@ -52,8 +52,8 @@ __device__ __forceinline__ void each_near(const contact::PairList::Entries& all,
   }
 }
 
-// Adds up gradients and Hessians of the warp's vertices that any of its threads have worked out, in the order of the
-// threads. The threads of a vertex (Place<lanes>) keep its sum together, each some of the numbers.
+// Adds up gradients and Hessians of the warp's vertices that any of its threads have worked out, always in the same
+// order. The threads of a vertex (Place<lanes>) keep its sum together, each some of the numbers.
 template <int lanes, class T>
 struct BlockSums {
   static constexpr int kGroups = kSlice / lanes, kOwn = (kContactScalars + lanes - 1) / lanes;
@@ -62,7 +62,14 @@ struct BlockSums {
   // from: a thread of the vertex that g and H belong to. All threads of the warp must call it.
   __device__ __forceinline__ void add(const Vec3<T>& g, const Sym3<T>& H, int from) {
     const int thread = threadIdx.x % kSlice, group = thread % kGroups, lane = thread / kGroups;
-    const T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
+    T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
+    if constexpr (lanes == kSlice) {  // all belong to one vertex
+#pragma unroll
+      for (int offset = 1; offset < kSlice; offset *= 2) add_from(values, offset);
+#pragma unroll
+      for (int k = 0; k < kContactScalars; ++k) own[0] += lane == k ? values[k] : T(0);
+      return;
+    }
     for (int k = 0; k < kContactScalars; ++k) slots[thread][k] = values[k];
     unsigned mine = 0;  // threads with something for the vertex of this one
     for (int g_of = 0; g_of < kGroups; ++g_of) {
@@ -70,11 +77,21 @@ struct BlockSums {
       if (group == g_of) mine = threads;
     }
     __syncwarp();
-    for (; mine; mine &= mine - 1) {
-      const T* slot = slots[__ffs(static_cast<int>(mine)) - 1];
+    constexpr int kAhead = 4;  // slots that are read at once
+    while (mine) {
+      T part[kAhead][kOwn] = {};
 #pragma unroll
-      for (int i = 0; i < kOwn; ++i) {
-        if (lane + i * lanes < kContactScalars) own[i] += slot[lane + i * lanes];
+      for (int u = 0; u < kAhead; ++u, mine &= mine - 1) {
+        const T* slot = slots[max(__ffs(static_cast<int>(mine)) - 1, 0)];
+#pragma unroll
+        for (int i = 0; i < kOwn; ++i) {
+          if (mine && lane + i * lanes < kContactScalars) part[u][i] = slot[lane + i * lanes];
+        }
+      }
+#pragma unroll
+      for (int u = 0; u < kAhead; ++u) {
+#pragma unroll
+        for (int i = 0; i < kOwn; ++i) own[i] += part[u][i];
       }
     }
     __syncwarp();

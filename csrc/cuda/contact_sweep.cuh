@@ -205,7 +205,8 @@ __device__ __forceinline__ void take_sent(const ContactView<T>& c, const PairsOf
   if (pairs.touches()) {
     contact::take_pairs(c.in, c.slots, scene, pairs.vertex, pairs.at.lane, pairs.share, now, prev);
   }
-  pairs.at.sum(now), pairs.at.sum(prev);
+  __syncwarp();
+  pairs.at.template sum<T>(now, prev);
   if (pairs.vertex < 0 || pairs.at.lane != 0) return;
   bar[0] = now.x, bar[1] = now.y, bar[2] = now.z;
   if (pairs.touches()) contact::add_at(c.slots.prev + 3 * (scene * c.in.corners + pairs.vertex), prev);
@@ -257,7 +258,8 @@ __device__ __forceinline__ void send_pairs(const StepView<T>& s, const ContactVi
   if (in.planes == 0) return;
   Vec3<T> own = zero3<T>();
   if (touches) contact::reverse_floor_lags(pairs.source, c.slots, pairs.vertex, at.lane, share, h, p, d_raw, own);
-  at.sum(own);
+  __syncwarp();
+  at.template sum<T>(own);
   if (!touches || at.lane != 0) return;
   contact::add_at(s.w.x_bar + kRow * row, own);
   contact::add_at(c.slots.prev + 3 * (pairs.source.scene * in.corners + pairs.vertex), -own);

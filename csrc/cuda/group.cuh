@@ -126,7 +126,7 @@ struct GroupStar : Records<T, lanes_, reverse> {
   }
   template <class... R>
   __device__ __forceinline__ void total(R&... values) const {
-    if constexpr (lanes > 1) (P::sum(values), ...);
+    if constexpr (lanes > 1) P::template sum<T>(values...);
   }
 
   // the threads of a warp visit stars together, so one that must go the longer way takes all along
@@ -205,10 +205,19 @@ struct GroupStar : Records<T, lanes_, reverse> {
       Vec3<T> sum = zero3<T>();
       if constexpr (gather) {
         const int end = __ldg(s.plan.edge_entry + first_edge + a + 1);
-#pragma unroll 4
-        for (int i = __ldg(s.plan.edge_entry + first_edge + a); i < end; ++i) {
-          const T* p = sums + __ldg(s.plan.entry + static_cast<int64_t>(i) * kSlice + at.v) * 3 * P::groups;
-          sum += Vec3<T>{p[0], p[P::groups], p[2 * P::groups]};
+        constexpr int kAhead = 4;  // entries that are asked for at once
+        for (int i = __ldg(s.plan.edge_entry + first_edge + a); i < end; i += kAhead) {
+          int entries[kAhead];
+#pragma unroll
+          for (int u = 0; u < kAhead; ++u) {
+            entries[u] = __ldg(s.plan.entry + static_cast<int64_t>(min(i + u, end - 1)) * kSlice + at.v);
+          }
+#pragma unroll
+          for (int u = 0; u < kAhead; ++u) {
+            if (i + u >= end) break;
+            const T* p = sums + entries[u] * 3 * P::groups;
+            sum += Vec3<T>{p[0], p[P::groups], p[2 * P::groups]};
+          }
         }
       } else {
         const T* from = sums - at.lane * P::groups + a * 3 * kSlice;
@@ -247,7 +256,8 @@ __device__ __forceinline__ Vec3<T> pull_rows(const StepView<T>& s, const Place<l
 #pragma unroll
     for (int u = 0; u < batch; ++u) sum += part[u];
   }
-  if constexpr (lanes > 1) Place<lanes_>::sum(sum);
+  __syncwarp();  // threads leave the loop one by one, and shuffles of some of a warp take longer
+  if constexpr (lanes > 1) Place<lanes_>::template sum<T>(sum);
   return sum;
 }
 

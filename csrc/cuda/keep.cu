@@ -21,15 +21,27 @@ __global__ void __launch_bounds__(kThreads) flag_pairs(const __grid_constant__ K
 // many there are.
 template <class T, class F>
 __device__ int32_t each_kept(const KeepInputs<T>& in, const int32_t* kept, int64_t corner, const F& f) {
+  constexpr int kAhead = 8;  // entries of a thread that are read at once: a corner of a collider may have thousands
   const unsigned lane = threadIdx.x % kWarp;
+  const int32_t end = in.ptr[corner + 1];
   int32_t count = 0;
-  for (int32_t first = in.ptr[corner]; first < in.ptr[corner + 1]; first += kWarp) {
-    const int32_t own = first + static_cast<int32_t>(lane);
-    const int32_t entry = own < in.ptr[corner + 1] ? in.entry[own] : -1;
-    const bool stay = entry >= 0 && in.keep[entry >> 2];
-    const unsigned found = __ballot_sync(0xffffffffu, stay);
-    if (stay) f(4 * kept[entry >> 2] + (entry & 3), count + __popc(found & ((1u << lane) - 1)));
-    count += __popc(found);
+  for (int32_t first = in.ptr[corner]; first < end; first += kAhead * kWarp) {
+    int32_t entries[kAhead], places[kAhead];
+#pragma unroll
+    for (int u = 0; u < kAhead; ++u) {
+      const int32_t own = first + u * kWarp + static_cast<int32_t>(lane);
+      entries[u] = own < end ? in.entry[own] : -1;
+    }
+#pragma unroll
+    for (int u = 0; u < kAhead; ++u) {
+      places[u] = entries[u] >= 0 && in.keep[entries[u] >> 2] ? 4 * kept[entries[u] >> 2] + (entries[u] & 3) : -1;
+    }
+#pragma unroll
+    for (int u = 0; u < kAhead; ++u) {
+      const unsigned found = __ballot_sync(0xffffffffu, places[u] >= 0);
+      if (places[u] >= 0) f(places[u], count + __popc(found & ((1u << lane) - 1)));
+      count += __popc(found);
+    }
   }
   return count;
 }

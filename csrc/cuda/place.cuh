@@ -2,6 +2,7 @@
 #pragma once
 
 #include "../core/vec.h"
+#include "exchange.cuh"
 #include "step.h"
 
 namespace diffvbd::cuda {
@@ -78,7 +79,33 @@ __device__ __forceinline__ Vec3<T> load_own3(const T* p, int block, int v) {
   return {a[0], a[kSlice], a[2 * kSlice]};
 }
 
-constexpr unsigned kWholeWarp = 0xffffffffu;
+// Calls f(number) for the numbers of a value.
+template <class T, class F>
+__device__ __forceinline__ void each_number(T& a, const F& f) {
+  f(a);
+}
+template <class T, class F>
+__device__ __forceinline__ void each_number(Vec3<T>& a, const F& f) {
+  f(a.x), f(a.y), f(a.z);
+}
+template <class T, class F>
+__device__ __forceinline__ void each_number(Sym3<T>& a, const F& f) {
+  f(a.xx), f(a.xy), f(a.xz), f(a.yy), f(a.yz), f(a.zz);
+}
+template <class T, int n, class F>
+__device__ __forceinline__ void each_number(T (&a)[n], const F& f) {
+  for (int k = 0; k < n; ++k) f(a[k]);
+}
+// Calls f(array) with the numbers of type T of some values, which then have what f has made of them.
+template <class T, class F, class... R>
+__device__ __forceinline__ void change_numbers(const F& f, R&... values) {
+  T all[(sizeof(R) + ...) / sizeof(T)];
+  int k = 0;
+  (each_number(values, [&](T& a) { all[k++] = a; }), ...);
+  f(all);
+  k = 0;
+  (each_number(values, [&](T& a) { a = all[k++]; }), ...);
+}
 
 // Which warp of its block a thread is in. The first thread tells the others, so that the compiler knows that all have
 // the same and keeps it, and what follows from it, once for the warp.
@@ -116,18 +143,15 @@ struct Place {
       : scene(scene), block(block), group(threadIdx.x % groups), lane(threadIdx.x % kSlice / groups) {
     v = part * groups + group;
   }
-  template <class R>
-  __device__ __forceinline__ static void sum(R& a) {
+  // Sums of numbers of type T, vectors, matrices and arrays of such over the threads of a vertex.
+  template <class T, class... R>
+  __device__ __forceinline__ static void sum(R&... values) {
+    change_numbers<T>(
+        [](auto& all) {
 #pragma unroll
-    for (int offset = groups; offset < kSlice; offset *= 2) a = a + __shfl_xor_sync(kWholeWarp, a, offset);
-  }
-  template <class R>
-  __device__ __forceinline__ static void sum(Vec3<R>& a) {
-    sum(a.x), sum(a.y), sum(a.z);
-  }
-  template <class R>
-  __device__ __forceinline__ static void sum(Sym3<R>& a) {
-    sum(a.xx), sum(a.xy), sum(a.xz), sum(a.yy), sum(a.yz), sum(a.zz);
+          for (int offset = groups; offset < kSlice; offset *= 2) add_from(all, offset);
+        },
+        values...);
   }
 };
 

@@ -90,9 +90,9 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   if (s.has_tets) {
     if constexpr ((wanted & kMaterial) != 0) {
       if (s.one_material) {
+        star.total(star.material_bar);
 #pragma unroll
         for (int i = 0; i < kTetScalars; ++i) {
-          star.total(star.material_bar[i]);
           if (writes) s.w.material_bar[row * kTetScalars + i] = material_bar[i] + star.material_bar[i];
         }
       }

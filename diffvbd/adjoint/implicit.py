@@ -59,8 +59,8 @@ class _GlobalSweep(Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple:
         if is_batched(grads[0]):  # the solve looks at values
-            raise NotImplementedError("adjoint: expected ReverseSweep or Unrolled for batched gradients "
-                                      "(is_grads_batched), got GlobalAdjoint, which takes one at a time")  # fmt: skip
+            raise NotImplementedError("adjoint: expected ReverseSweep for batched gradients (is_grads_batched), got "
+                                      "GlobalAdjoint, which takes one at a time")  # fmt: skip
         needs = ctx.needs_input_grad[:_DIFFERENTIABLE]
         out = _GlobalBackward.apply(grads[0], *ctx.saved_tensors, ctx.model, ctx.h, ctx.adjoint, needs)
         return of_inputs(out, needs, 7)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from .. import ops
-from ..checks import check_count, check_positive, fail
+from ..checks import check_count, check_positive, fail, is_word
 
 FULL_TAPE_LIMIT = 256 * 2**20  # bytes of full tape per step up to which "auto" keeps it
 
@@ -30,7 +30,7 @@ class ReverseSweep:
     tape: Literal["auto", "full", "compact", "recompute"] = "auto"
 
     def __post_init__(self) -> None:
-        if self.tape not in ("auto", "full", "compact", "recompute"):
+        if not is_word(self.tape, "auto", "full", "compact", "recompute"):
             fail("tape", '"auto", "full", "compact" or "recompute"', repr(self.tape))
 
     def policy(self, scalars_per_row: int, itemsize: int, energies: int) -> int:
@@ -106,7 +106,7 @@ class GlobalAdjoint:
             fail("tolerance", "a number in (0, 1)", self.tolerance)
         if self.max_iterations is not None:
             check_count("max_iterations", self.max_iterations, 1)
-        if self.on_failure not in ("raise", "warn"):
+        if not is_word(self.on_failure, "raise", "warn"):
             fail("on_failure", '"raise" or "warn"', repr(self.on_failure))
         if self.report is not None and not callable(self.report):
             raise TypeError(f"report: expected a function of a LinearSolve, got {type(self.report).__name__}")

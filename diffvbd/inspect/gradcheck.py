@@ -58,7 +58,7 @@ def check_gradients(
         A :class:`GradientCheck`; ``ok`` says whether every argument agrees within the tolerance.
 
     Raises:
-        ValueError: If an argument is not float64 or the loss is not a scalar.
+        ValueError: If an argument is not float64, or the loss is not a scalar or has no graph.
         TypeError: If the loss does not take the arguments by these names, or returns no tensor.
     """
     if not isinstance(arguments, dict):
@@ -73,6 +73,8 @@ def check_gradients(
         raise TypeError(f"loss: expected a function that returns a scalar tensor, got {type(value).__name__}")
     if value.numel() != 1:
         fail("loss", "a scalar", f"shape {list(value.shape)}")
+    if not value.requires_grad:
+        fail("loss", "a scalar with the graph of its arguments", "one that depends on none, or is detached")
     grads = torch.autograd.grad(value, list(leaves.values()), allow_unused=True, materialize_grads=True)
     generator = torch.Generator("cpu").manual_seed(seed)
     rows = []

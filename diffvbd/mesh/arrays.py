@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,11 +13,29 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
-def to_numpy(array: Any) -> NDArray[Any]:
+def check_mesh(mesh: Any) -> None:
+    """Raises unless `mesh` has what a TetMesh has, whose own file imports from those that ask here."""
+    if not all(hasattr(mesh, name) for name in ("points", "tets", "body")):
+        raise TypeError(f"mesh: expected a diffvbd.TetMesh, got {type(mesh).__name__}")
+
+
+def to_path(name: str, path: Any) -> Path:
+    """A file that a user names."""
+    if not isinstance(path, (str, PathLike)):
+        raise TypeError(f"{name}: expected a path, got {type(path).__name__}")
+    return Path(path)
+
+
+def to_numpy(name: str, array: Any) -> NDArray[Any]:
     """`array` as a numpy array; torch tensors are detached and brought to the CPU first (torch is not imported)."""
     if hasattr(array, "detach"):
         array = array.detach().cpu()
-    return np.asarray(array)
+    try:
+        return np.asarray(array)
+    except ValueError as failure:
+        if "inhomogeneous" not in str(failure):
+            raise
+        raise ValueError(f"{name}: expected an array, or lists of equal lengths, got lists of several") from None
 
 
 def float_array(name: str, array: Any, shape: tuple[int | None, ...]) -> FloatArray:
@@ -25,7 +45,7 @@ def float_array(name: str, array: Any, shape: tuple[int | None, ...]) -> FloatAr
             f"{name}: expected numbers, got a tensor that requires grad, which a copy would not pass on: detach it, "
             "and give what is differentiated, as rest_points or colliders, to a step or a rollout"
         )
-    values = to_numpy(array)
+    values = to_numpy(name, array)
     if values.size and values.dtype.kind not in "fiu":
         raise TypeError(f"{name}: expected real numbers, got dtype {values.dtype}")
     _check_shape(name, values, shape)
@@ -40,7 +60,7 @@ def float_array(name: str, array: Any, shape: tuple[int | None, ...]) -> FloatAr
 
 def int_array(name: str, array: Any, shape: tuple[int | None, ...]) -> IntArray:
     """An int64 copy of `array`; floats are refused, even whole ones."""
-    values = to_numpy(array)
+    values = to_numpy(name, array)
     if values.size and values.dtype.kind not in "iu":
         raise TypeError(f"{name}: expected integers, got dtype {values.dtype}")
     _check_shape(name, values, shape)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from diffvbd.mesh.arrays import IntArray, float_array
+from diffvbd.mesh.arrays import IntArray, check_mesh, float_array
 from diffvbd.mesh.tet_mesh import TetMesh
 
 # Edges of a tet; edge k has its midpoint at slot 4 + k of the ten-node tet below.
@@ -36,8 +36,9 @@ def subdivide(mesh: TetMesh, levels: int = 1) -> TetMesh:
         levels: How often, 0 or more.
 
     Raises:
-        TypeError, ValueError: levels is not an integer or negative.
+        TypeError, ValueError: no TetMesh; levels is not an integer or negative.
     """
+    check_mesh(mesh)
     if isinstance(levels, bool) or not isinstance(levels, (int, np.integer)):
         raise TypeError(f"levels: expected an integer, got {levels!r}")
     if levels < 0:
@@ -73,8 +74,10 @@ def join(meshes: Iterable[TetMesh]) -> TetMesh:
     labels), then those of the second, and so on.
 
     Raises:
-        TypeError: something that is not a TetMesh.
+        TypeError: something that is not a TetMesh, or no sequence of them.
     """
+    if not isinstance(meshes, Iterable):
+        raise TypeError(f"meshes: expected TetMesh objects, as in a list, got {type(meshes).__name__}")
     meshes = list(meshes)
     for k, mesh in enumerate(meshes):
         if not isinstance(mesh, TetMesh):
@@ -100,8 +103,9 @@ def replicate(mesh: TetMesh, offsets: Any) -> TetMesh:
         offsets: Translation of each copy [m], shape [N, 3].
 
     Raises:
-        TypeError, ValueError: offsets of wrong shape or dtype, NaN or Inf.
+        TypeError, ValueError: no TetMesh; offsets of wrong shape or dtype, NaN or Inf.
     """
+    check_mesh(mesh)
     moves = float_array("offsets", offsets, (None, 3))
     copies = np.arange(len(moves))[:, None]
     rank, bodies = _ranked(mesh)

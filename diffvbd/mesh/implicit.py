@@ -25,6 +25,7 @@ _EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 # In a lattice tet the edges 0-1 and 2-3 are long, the other four short.
 _LONG_PARTNER = np.array([1, 0, 3, 2])
 _BISECTIONS = 48
+_MOST_CELLS = 1e9  # of the lattice, whose points and tets take some hundred bytes for each
 
 
 def fill(function: ImplicitFunction, low: Any, high: Any, spacing: float) -> TetMesh:
@@ -41,12 +42,18 @@ def fill(function: ImplicitFunction, low: Any, high: Any, spacing: float) -> Tet
 
     Raises:
         TypeError, ValueError: bad arguments; the body is empty, reaches out of the box, or is so thin against
-            `spacing` that the surface would touch itself.
+            `spacing` that nothing of it is left or the surface would touch itself.
     """
+    if not callable(function):
+        raise TypeError(f"function: expected a function of points [N, 3], got {type(function).__name__}")
     bottom, top, step = float_array("low", low, (3,)), float_array("high", high, (3,)), positive("spacing", spacing)
     if (top <= bottom).any():
         raise ValueError(f"high: expected more than low = {bottom.tolist()}, got {top.tolist()}")
-    cells = np.ceil((top - bottom) / step).astype(int) + 2
+    with np.errstate(over="ignore"):
+        size = np.ceil((top - bottom) / step) + 2
+    if size.prod() > _MOST_CELLS:
+        raise ValueError(f"spacing: expected at most {_MOST_CELLS:g} cells in the box, got {step:.6g}: try more")
+    cells = size.astype(int)
     points, lattice, outermost = _lattice((bottom + top) / 2 - step * cells / 2, cells, step)
     inside = -_evaluate(function, points)
     if (inside[outermost] > 0).any():
@@ -65,6 +72,8 @@ def fill(function: ImplicitFunction, low: Any, high: Any, spacing: float) -> Tet
     inside[on_surface] = 0
 
     tets = _stencils(lattice, inside, edges, len(points))
+    if len(tets) == 0:
+        raise ValueError(f"spacing: the body is thinner than the lattice at spacing {step:.6g}; try a smaller one")
     # Orientation is read off the undeformed lattice, so that a tet inverted by the moves cannot pass unseen.
     undeformed = np.concatenate([points, points[ends].mean(axis=1)])
     tets = _largest_piece(oriented(undeformed, tets))

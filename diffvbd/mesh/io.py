@@ -10,7 +10,7 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.mesh.arrays import IntArray, float_array
+from diffvbd.mesh.arrays import IntArray, float_array, to_path
 from diffvbd.mesh.tet_mesh import TetMesh, oriented
 from diffvbd.mesh.write import PREFERRED_FORMAT, quiet
 
@@ -41,11 +41,12 @@ def load(
         return_vertices: Also return the index in the file of each vertex of the mesh, shape [V].
 
     Raises:
+        TypeError: no path.
         FileNotFoundError: no such file.
         ValueError: unreadable or truncated file, unknown format, no tets in it, or tets that TetMesh refuses.
         ImportError: the format needs a package that is not installed.
     """
-    _, mesh, vertices, _ = _tets_of(Path(path), orient)
+    _, mesh, vertices, _ = _tets_of(to_path("path", path), orient)
     return (mesh, vertices) if return_vertices else mesh
 
 
@@ -70,10 +71,10 @@ def load_fields(path: str | PathLike[str], *, orient: bool = True) -> Fields:
         `Fields`: the mesh, point_data of shape [V] or [V, C] and cell_data of shape [T] or [T, C], by name.
 
     Raises:
-        FileNotFoundError, ImportError: As `load`.
+        TypeError, FileNotFoundError, ImportError: As `load`.
         ValueError: As `load`, and for values of another number of rows, or that are no numbers.
     """
-    path = Path(path)
+    path = to_path("path", path)
     content, mesh, vertices, blocks = _tets_of(path, orient)
     points: dict[str, NDArray[Any]] = {}
     for name, values in content.point_data.items():

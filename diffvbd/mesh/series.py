@@ -11,12 +11,12 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.mesh.arrays import FloatArray, float_array
+from diffvbd.mesh.arrays import FloatArray, check_mesh, float_array, to_path
 from diffvbd.mesh.gltf import write_gltf
 from diffvbd.mesh.parts import parts_of
 from diffvbd.mesh.tet_mesh import TetMesh
 from diffvbd.mesh.usd import require_usd, write_usd
-from diffvbd.mesh.write import checked_fields, content_of, quiet
+from diffvbd.mesh.write import checked_fields, content_of, quiet, vtu_names
 
 USD = (".usd", ".usda", ".usdc")
 GLTF = (".glb", ".gltf")
@@ -59,7 +59,8 @@ def write_series(
 
     Source: OpenUSD's schema UsdGeomMesh; Khronos, "glTF 2.0 Specification", 2021, section 3.7.2.2, morph targets.
     """
-    path = Path(path)
+    path = to_path("path", path)
+    check_mesh(mesh)
     extension = check_extension(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"directory {path.parent} does not exist")
@@ -110,7 +111,9 @@ def _write_pvd(
     entries = []
     for k, (time, points) in enumerate(zip(times, positions, strict=True)):
         name = f"{path.stem}_{k:0{digits}d}.vtu"
-        of_vertices, of_tets = ({key: all[k] for key, all in data.items()} for data in (point_data, cell_data))
+        of_vertices, of_tets = (
+            vtu_names({key: all[k] for key, all in data.items()}) for data in (point_data, cell_data)
+        )
         content = content_of(mesh, points, of_vertices, of_tets)
         target = path.with_name(name)
         quiet(lambda content=content, target=target: content.write(target), f"write {target}")

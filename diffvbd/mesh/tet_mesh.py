@@ -93,11 +93,14 @@ class TetMesh:
             first few.
 
     An empty mesh and vertices without tets are legal here. That different tets do not overlap is not checked.
+
+    torch.compile makes an array writable that compiled code reads (steps and rollouts read none): read arrays outside.
     """
 
     def __init__(self, points: Any, tets: Any, body: Any = None, *, orient: bool = False) -> None:
-        self._points = float_array("points", points if np.size(to_numpy(points)) else np.empty((0, 3)), (None, 3))
-        self._tets = int_array("tets", tets if np.size(to_numpy(tets)) else np.empty((0, 4)), (None, 4))
+        points = points if to_numpy("points", points).size else np.empty((0, 3))
+        tets = tets if to_numpy("tets", tets).size else np.empty((0, 4))
+        self._points, self._tets = float_array("points", points, (None, 3)), int_array("tets", tets, (None, 4))
         self._check_indices()
         if orient:
             self._tets = oriented(self._points, self._tets)

@@ -6,14 +6,14 @@ import io
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+from xml.sax.saxutils import escape
 
 import meshio
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.mesh.arrays import FloatArray, listed, to_numpy
+from diffvbd.mesh.arrays import FloatArray, check_mesh, listed, to_numpy, to_path
 
 if TYPE_CHECKING:
     from diffvbd.mesh.tet_mesh import TetMesh
@@ -52,13 +52,15 @@ def save(
         cell_data: The same for tets, shape [T] or [T, C].
 
     Raises:
-        TypeError: values that are no real numbers, or have no names.
+        TypeError: no path or no TetMesh; values that are no real numbers, or have no names.
         ValueError: a mesh without tets, an unknown extension, a format that holds no tets or no values, values of
-            another shape, NaN or Inf among them, an empty name, cell data `body` beside labels, or meshio fails.
+            another shape, NaN or Inf among them, a name that is empty, not printable or none in this format (in .vtk
+            with spaces, in .msh with quotes), cell data `body` beside labels, or meshio fails.
         ImportError: the format needs a package that is not installed (h5py for .xdmf and .med).
         FileNotFoundError: the directory does not exist.
     """
-    path = Path(path)
+    path = to_path("path", path)
+    check_mesh(mesh)
     extension = path.suffix.lower()
     if extension in _NO_TETS:
         raise ValueError(f"cannot write {path}: {path.suffix} files hold no tets; use .vtu, .msh, ...")
@@ -73,6 +75,10 @@ def save(
             raise ValueError(f"{kind}: expected none, because {extension} files hold no values; use .vtu, .msh, ...")
         if extension == ".vtk" and (spaced := [name for name in values if name.split() != [name]]):
             raise ValueError(f"{kind}: expected names without spaces in a .vtk file, got {spaced[0]!r}")
+        if extension == ".msh" and (quoted := [name for name in values if '"' in name]):
+            raise ValueError(f"{kind}: expected names without quotes in a .msh file, got {quoted[0]!r}")
+        if extension == ".vtu":
+            fields[kind] = vtu_names(values)
     content = content_of(mesh, mesh.points, **fields)
     quiet(lambda: content.write(path, file_format=PREFERRED_FORMAT.get(extension)), f"write {path}")
 
@@ -94,6 +100,11 @@ def content_of(
     return meshio.Mesh(points, [("tetra", mesh.tets)], point_data=dict(point_data or {}), cell_data=of_tets)
 
 
+def vtu_names(fields: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Values by names as they stand in a .vtu file, into whose XML meshio writes them unescaped."""
+    return {escape(name, {'"': "&quot;"}): values for name, values in fields.items()}
+
+
 def checked_fields(
     kind: str, fields: Mapping[str, Any] | None, leading: tuple[int, ...], widths: tuple[int, ...] | None = None
 ) -> dict[str, NDArray[Any]]:
@@ -103,9 +114,9 @@ def checked_fields(
     found = {}
     for name, given in (fields or {}).items():
         label = f"{kind}[{name!r}]"
-        if not isinstance(name, str) or not name.strip():
-            raise ValueError(f"{kind}: expected names of values, got {name!r}")
-        values = to_numpy(given)
+        if not isinstance(name, str) or not name.strip() or not name.isprintable():
+            raise ValueError(f"{kind}: expected printable names of values, got {name!r}")
+        values = to_numpy(label, given)
         if values.dtype.kind not in "biuf":
             raise TypeError(f"{label}: expected real numbers, got dtype {values.dtype}")
         rows, columns = values.shape[: len(leading)], values.shape[len(leading) :]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import check_positive, check_readable, fail, refuse_gradient, to_float
+from ..checks import check_positive, check_readable, fail, is_word, refuse_gradient, to_float
 from ..contact.barrier import Friction, PairBarrier
 from ..energies import VERTEX_ENERGIES, StableNeoHookean, VertexEnergy
 from .anderson import Anderson
@@ -103,7 +103,7 @@ def checked_relaxation(relaxation: Any) -> float:
 def checked_correction(rigid: Any, start: Any, energies: tuple[Energy, ...]) -> tuple[bool, str]:
     """Whether free bodies are corrected, and where the sweeps of the others start."""
     touches = any(isinstance(e, (PairBarrier, Friction)) for e in energies)
-    if start not in ("auto", "predictor", "inertia"):
+    if not is_word(start, "auto", "predictor", "inertia"):
         fail("start", '"auto", "predictor" or "inertia"', repr(start))
     if start == "inertia" and any(isinstance(e, PairBarrier) for e in energies):
         fail("start", '"auto" or "predictor" beside a PairBarrier, whose steps go to y in parts', '"inertia"')
@@ -120,7 +120,7 @@ def checked_coarse(coarse: Any, energies: tuple[Energy, ...], saturation: float 
     """The coarse space, where it is one that the other arguments allow."""
     if coarse is None:
         return None
-    if coarse == "auto":
+    if is_word(coarse, "auto"):
         coarse = CoarseSpace()
     if not isinstance(coarse, CoarseSpace):
         raise TypeError(f'coarse: expected a diffvbd.CoarseSpace, "auto" or None, got {coarse!r}')

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from .. import ops
-from ..checks import check_count
+from ..checks import check_count, is_word
 
 FEWEST, MOST = 32, 128  # functions of a body under "auto"
 MOST_FUNCTIONS, MOST_OF_ANY = 4096, 2**20  # that a CoarseSpace may ask for
@@ -59,9 +59,9 @@ class CoarseSpace:
 
     def __post_init__(self) -> None:
         for name, most in (("functions", MOST_FUNCTIONS), ("groups", MOST_OF_ANY)):
-            if getattr(self, name) != "auto":
+            if not is_word(getattr(self, name), "auto"):
                 object.__setattr__(self, name, check_count(name, getattr(self, name), 1, maximum=most))
-        if self.degree != "auto":
+        if not is_word(self.degree, "auto"):
             object.__setattr__(self, "degree", check_count("degree", self.degree, 1, maximum=3))
         object.__setattr__(self, "every", check_count("every", self.every, 1, maximum=MOST_OF_ANY))
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import check_kind, check_number, check_positive, fail, vertex_mask
+from ..checks import check_dtype, check_kind, check_number, check_positive, fail, vertex_mask
 from ..contact.barrier import Friction, PairBarrier
 from ..contact.colliders import Collider
 from ..contact.surface import ContactSurface, build_surface, check_colliders
@@ -43,7 +43,7 @@ class Model:
     """A mesh with its masses, pins, energies and safeguards, colored and laid out for the sweeps.
 
     A Model holds constants and refuses tensors that require grad; what is differentiated is an argument of
-    :func:`diffvbd.step`. A mesh is data: its points are copied without their gradient.
+    :func:`diffvbd.step`, the rest shape too.
 
     Args:
         mesh: Tetrahedra with positive rest volume.
@@ -106,8 +106,7 @@ class Model:
         device: torch.device | str = "cpu",
     ) -> None:
         check_kind("mesh", mesh, TetMesh)
-        if dtype not in (torch.float64, torch.float32):
-            raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
+        check_dtype(dtype)
         self.mesh = mesh
         self._derived: dict[str, Any] = {}
         self.saturation = None if saturation is None else check_positive("saturation", saturation, "m")
@@ -302,9 +301,8 @@ class Model:
     @lasting_tensors()
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Model:
         """A new Model on another device or of another dtype, float64 or float32 (else it raises); this one stays."""
-        dtype = dtype or self.dtype
-        if dtype not in (torch.float64, torch.float32):
-            raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
+        dtype = self.dtype if dtype is None else dtype
+        check_dtype(dtype)
         device = self.device if device is None else checked_device(device)
         out = object.__new__(type(self))
         out.__dict__.update(self.__dict__)
@@ -357,13 +355,14 @@ class Model:
         """Outward triangles of the boundary, shape [F, 3]."""
         return torch.from_numpy(self.mesh.surface.copy()).to(self.device)
 
+    # Of tensors: torch.compile would make the arrays of the mesh writable, were they looked at in a step.
     @property
     def num_vertices(self) -> int:
-        return self.mesh.num_vertices
+        return self._rest_points.shape[0]
 
     @property
     def num_tets(self) -> int:
-        return self.mesh.num_tets
+        return self._topology[0].shape[0]
 
     @property
     def num_active(self) -> int:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
+import torch
 from torch import Tensor
 
-from ..checks import check_broadcast, check_dense, check_tensor, fail, name_value, to_float
+from ..checks import NUMBERS, check_broadcast, check_dense, check_tensor, fail, name_value, to_float
 from ..scopes import looks_at
 from .model import Model
 
@@ -29,7 +29,7 @@ def lame(young: float | Tensor, poisson: float | Tensor) -> tuple[Any, Any]:
         ValueError, TypeError: Naming the argument, what was expected and what came. Values of tensors on CUDA are
             looked at only inside debug_checks().
     """
-    young, poisson = _value("young", young), _value("poisson", poisson)
+    young, poisson = _values(young=young, poisson=poisson)
     _check("young", young, "finite numbers >= 0 Pa", young >= 0)
     _check("poisson", poisson, "numbers between -1 and 0.5", (poisson > -1) & (poisson < 0.5))
     mu = young / (2 * (1 + poisson))
@@ -51,7 +51,7 @@ def young_poisson(mu: float | Tensor, lam: float | Tensor) -> tuple[Any, Any]:
     Raises:
         ValueError, TypeError: As :func:`lame`.
     """
-    mu, lam = _value("mu", mu), _value("lam", lam)
+    mu, lam = _values(mu=mu, lam=lam)
     _check("mu", mu, "finite numbers >= 0 Pa", mu >= 0)
     total = lam + mu
     _check("lam", total, "mu + lam > 0 Pa, finite", total > 0)
@@ -80,6 +80,18 @@ def moduli_of(model: Model, lead: tuple[int, ...], mu: Any, lam: Any, young: Any
     return lame(pair["young"], pair["poisson"])
 
 
+def _values(**given: Any) -> list[Any]:
+    """Two values that broadcast together."""
+    values = [_value(name, value) for name, value in given.items()]
+    if all(isinstance(value, Tensor) for value in values):
+        try:
+            torch.broadcast_shapes(*(value.shape for value in values))
+        except RuntimeError:
+            (first, one), (name, other) = zip(given, values, strict=True)
+            fail(name, f"a shape that broadcasts with {list(one.shape)}, that of {first}", f"shape {list(other.shape)}")
+    return values
+
+
 def _value(name: str, value: Any) -> Any:
     """A number as a float, a tensor as it is."""
     if isinstance(value, Tensor):
@@ -87,7 +99,7 @@ def _value(name: str, value: Any) -> Any:
         if not value.is_floating_point():
             raise TypeError(f"{name}: expected a number or a tensor of floating point, got {value.dtype}")
         return value
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
+    if isinstance(value, bool) or not isinstance(value, NUMBERS):
         raise TypeError(f"{name}: expected a number or a tensor, got {type(value).__name__}")
     return to_float(name, value)
 

@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 
 from .. import ops
 from ..adjoint.routes import Adjoint, ReverseSweep, Unrolled
-from ..checks import check_count, fail
+from ..checks import check_count, fail, is_word
 from ..model.model import Model
 from ..scopes import Scope, transformed
 
@@ -62,7 +62,7 @@ Run = Callable[..., Segment]  # of the first step, the one after the last, and a
 
 def checked_schedule(given: Any) -> Any:
     """A schedule whose kind and numbers are right."""
-    if given is None or given == "auto" or isinstance(given, BinomialCheckpoints):
+    if given is None or is_word(given, "auto") or isinstance(given, BinomialCheckpoints):
         return given
     if isinstance(given, str):
         fail("checkpoint_every", '"auto", None, an integer > 0 or BinomialCheckpoints(snapshots)', repr(given))

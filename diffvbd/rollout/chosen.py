@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from ..adjoint.routes import ReverseSweep
-from ..checks import check_count, check_positive, fail
+from ..checks import check_count, check_positive, fail, is_word
 from ..model.growth import proven
 from ..step.arguments import check_state
 from ..step.met import outcomes
@@ -29,7 +29,7 @@ def rollout_with(rollout: Callable[..., Trajectory], *, settings: Any, duration:
             raise TypeError(f"{name}: expected None beside settings, which have it, got {given[name]!r}")
     if (given["steps"] is None) == (duration is None):
         raise TypeError("duration: expected either duration or steps beside settings")
-    if settings == "auto":
+    if is_word(settings, "auto"):
         if duration is None:
             raise TypeError('duration: expected it beside settings="auto", which chooses the steps')
         settings = _found(rollout, check_positive("duration", duration, "s"), given)
@@ -45,7 +45,7 @@ def rollout_with(rollout: Callable[..., Trajectory], *, settings: Any, duration:
               "sweeps": settings.sweeps, "integrator": settings.integrator}  # fmt: skip
     if given["adjoint"] is None:
         chosen["adjoint"] = ReverseSweep(settings.tape)
-    if given["checkpoint_every"] == "auto":
+    if is_word(given["checkpoint_every"], "auto"):
         chosen["checkpoint_every"] = settings.checkpoint_every
     sure = settings.predicted is not None and settings.predicted.reached
     pilots = proven(chosen["model"], type(settings.integrator).__name__, settings.sweeps) if sure else nullcontext()

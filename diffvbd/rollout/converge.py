@@ -12,13 +12,22 @@ from torch import Tensor
 
 from ..adjoint.implicit import global_sweep
 from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, check_adjoint
-from ..checks import check_count, check_positive, fail
+from ..checks import check_count, check_positive, fail, is_word
 from ..model.model import Model
 from ..ops import SweepSettings
 from ..said import warn
 from ..scopes import refuse_refinement, refuse_transforms
 from ..step.advance import advance, swept
-from ..step.arguments import GRAVITY, Prepared, acceleration_of, check_prescribed, check_state, collider_state, prepare
+from ..step.arguments import (
+    GRAVITY,
+    Prepared,
+    acceleration_of,
+    check_prescribed,
+    check_state,
+    collider_state,
+    prepare,
+    refuse_non_finite,
+)
 from ..step.balance import contact_of_step, left_over, of_bodies, of_scenes, potential_of_step, rounding, share
 from ..step.integrators import History, Integrator, check_history, check_integrator, check_staged, take
 from ..step.met import outcomes
@@ -116,7 +125,7 @@ def solve(
     if check_positive("tolerance", tolerance) >= 1:
         fail("tolerance", "a number in (0, 1)", tolerance)
     max_sweeps, check_every = check_count("max_sweeps", max_sweeps), check_count("check_every", check_every, 1)
-    if on_failure not in ("raise", "warn"):
+    if not is_word(on_failure, "raise", "warn"):
         fail("on_failure", '"raise" or "warn"', repr(on_failure))
     options: dict[str, Any] = {"mu": mu, "lam": lam, "young": young, "poisson": poisson, "time_step": time_step,
                                "rest_points": rest_points, "density": density, "parameters": parameters}  # fmt: skip
@@ -150,6 +159,8 @@ class _Converging:
             swept_only = replaced(prepared, unrolled=None)
             done = _Sweeping(model, begun.detached(), swept_only, {"x": x, "v": v, **loads}, where, self.tolerance)
             done.run(*self.most)
+            if not math.isfinite(done.residual):
+                refuse_non_finite(model, {"x": x, "v": v, **loads})
         _judge(done, self.tolerance, self.on_failure)
         if isinstance(self.adjoint, GlobalAdjoint):
             # the converged state is the end of no further sweeps; where pinned it is the predictor, with its graph

@@ -11,7 +11,7 @@ from torch import Tensor
 from .. import ops
 from ..adjoint.anderson import combinations_of, cycles_of
 from ..adjoint.routes import ReverseSweep
-from ..checks import check_count
+from ..checks import check_count, is_word
 from ..mask import KEEPS_POSITIONS
 from ..model.model import Model
 from ..step.contact_cycles import sweeps_of_parts
@@ -78,7 +78,7 @@ def predict(
     per_step = solves * per_step + (2 * state if isinstance(scheme, BDF2) else 0)
     # of the state before a step, which a step alone is given: v, and x where the sweeps before did not end at it
     between = state * (2 if model.corrects and not local else 1)
-    if save in ("all", "last"):
+    if is_word(save, "all", "last"):
         frames = steps + 1 if save == "all" else 1
     else:
         frames = steps // check_count("save", save, 1) + 2

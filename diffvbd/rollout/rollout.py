@@ -7,11 +7,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..adjoint.routes import Adjoint, check_adjoint
-from ..checks import check_count, fail
+from ..checks import check_count, check_function, fail, is_word
 from ..model.model import Model
 from ..model.warnings import warn_of_inverted_bodies, warn_of_material
 from ..scopes import looks_at, recorders, refinement
@@ -99,7 +100,8 @@ def rollout(
             backward: n keeps steps / n states and the tapes of n steps. ``None`` keeps all tapes.
             :class:`diffvbd.BinomialCheckpoints` keeps a given number of states and one tape. ``"auto"`` keeps all tapes
             while they fit diffvbd.rollout.checkpoints.TAPE_BUDGET, else takes n near sqrt(steps). See
-            ``model.memory``.
+            ``model.memory``. Inside torch.func transforms, where torch has no checkpoints, ``"auto"`` and ``None`` keep
+            all tapes.
         save: Which frames the trajectory holds: ``"all"`` (steps + 1 frames, from the initial state), every n-th and
             the last, or only the ``"last"``.
         observe: Called after each step as observe(x, v, step) with step = 1 ... steps; its results (a tensor, or a
@@ -124,7 +126,8 @@ def rollout(
 
     Raises:
         ValueError, TypeError: As step; also where a per_step value has another number of steps, or surfaces intersect.
-        NotImplementedError: ``estimate_errors`` with contact or friction.
+        NotImplementedError: ``estimate_errors`` with contact or friction; another ``checkpoint_every`` than ``"auto"``
+            and ``None`` inside torch.func transforms.
     """
     if settings is not None:
         return rollout_with(rollout, **locals())
@@ -135,13 +138,13 @@ def rollout(
     if (factors := refinement()) is not None:  # inside dv.refine
         return rollout_finer(rollout, **locals())
     steps = check_count("steps", steps)
-    _check_save(save)
+    save = _checked_save(save)
     _check_estimates(estimate_errors, model)
     for name, asked in (("check_contact", check_contact), ("check_energy", check_energy)):
         if not isinstance(asked, bool | None):
             raise TypeError(f"{name}: expected a bool or None, got {type(asked).__name__}")
-    if observe is not None and not callable(observe):
-        raise TypeError(f"observe: expected a function of x, v and the step or None, got {type(observe).__name__}")
+    if observe is not None:
+        check_function("observe", observe, "x", "v", "step")
     if not isinstance(check_start, bool):
         raise TypeError(f"check_start: expected a bool, got {type(check_start).__name__}")
     lead, adjoint, scheme = check_state(model, x, v), check_adjoint(adjoint), check_integrator(integrator)
@@ -239,9 +242,12 @@ def rollout(
 # --- values of each step ----------------------------------------------------------------------------------------------
 
 
-def _check_save(save: Any) -> None:
-    if not (save in ("all", "last") or (isinstance(save, int) and not isinstance(save, bool) and save > 0)):
+def _checked_save(save: Any) -> Any:
+    if is_word(save, "all", "last"):
+        return save
+    if not isinstance(save, (int, np.integer)) or isinstance(save, bool) or save <= 0:
         fail("save", '"all", "last" or an integer > 0', repr(save))
+    return int(save)
 
 
 def _check_estimates(asked: Any, model: Any) -> None:
@@ -265,6 +271,8 @@ def _check_values(
     for name, value in {**options, **_named(parameters or {})}.items():
         if isinstance(value, PerStep) and value.values.shape[0] != steps:
             fail(name, f"{steps} steps in per_step", f"shape {list(value.values.shape)}")
+        if _changes(value):
+            check_function(name, value, "step", "x", "v")
 
 
 def _to_prepare(options: dict[str, Any], parameters: dict[str, Any], k: int, x: Tensor, v: Tensor) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 
 from ..adjoint.routes import ReverseSweep
-from ..checks import check_count, check_kind, check_positive, fail
+from ..checks import check_count, check_kind, check_positive, fail, is_word
 from ..energies import StableNeoHookean
 from ..model.anderson import Anderson
 from ..model.arguments import checked_acceleration, checked_coarse, checked_relaxation
@@ -116,9 +116,9 @@ class Settings:
         checked_acceleration(self.acceleration, (), None)
         ReverseSweep(self.tape)
         checked_schedule(self.checkpoint_every)
-        if self.block not in (None, "exact", "paper"):
+        if self.block is not None and not is_word(self.block, "exact", "paper"):
             fail("block", '"exact", "paper" or None', repr(self.block))
-        if self.dtype not in (None, torch.float64, torch.float32):
+        if not isinstance(self.dtype, torch.dtype | None) or self.dtype not in (None, torch.float64, torch.float32):
             fail("dtype", "torch.float64, torch.float32 or None", repr(self.dtype))
         if not isinstance(self.predicted, Prediction | None):
             raise TypeError(f"predicted: expected a diffvbd.Prediction or None, got {type(self.predicted).__name__}")

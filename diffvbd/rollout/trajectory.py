@@ -59,18 +59,39 @@ class Trajectory:
 
 def stacked(observed: list[Any]) -> Any:
     """The results of ``observe`` over steps."""
-    if not observed or observed[0] is None:
+    if not observed:
         return None
     first = observed[0]
+    for step, value in enumerate(observed, start=1):
+        if not _alike(first, value):
+            fail("observe", f"{_described(first)} after each step, as after the first",
+                 f"{_described(value)} after step {step}")  # fmt: skip
+    if first is None:
+        return None
     if isinstance(first, dict):
         return {k: stacked([o[k] for o in observed]) for k in first}
     if isinstance(first, (tuple, list)):
         return tuple(stacked([o[i] for o in observed]) for i in range(len(first)))
     if not isinstance(first, Tensor):
         raise TypeError(f"observe: expected tensors, or tuples or dicts of them, got {type(first).__name__}")
-    for step, value in enumerate(observed, start=1):
-        if not isinstance(value, Tensor) or value.shape != first.shape:
-            got = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
-            fail("observe", f"a tensor of shape {list(first.shape)} after each step, as after the first",
-                 f"{got} after step {step}")  # fmt: skip
     return torch.stack(observed)
+
+
+def _alike(first: Any, value: Any) -> bool:
+    if isinstance(first, dict):
+        return isinstance(value, dict) and value.keys() == first.keys()
+    if isinstance(first, (tuple, list)):
+        return isinstance(value, (tuple, list)) and len(value) == len(first)
+    if isinstance(first, Tensor):
+        return isinstance(value, Tensor) and value.shape == first.shape
+    return type(value) is type(first)
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"a dict with the keys {list(value)}"
+    if isinstance(value, (tuple, list)):
+        return f"a tuple of {len(value)}"
+    if isinstance(value, Tensor):
+        return f"a tensor of shape {list(value.shape)}"
+    return "None" if value is None else type(value).__name__

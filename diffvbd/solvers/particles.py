@@ -12,6 +12,7 @@ from torch import Tensor
 from .. import ops
 from ..checks import (
     check_broadcast,
+    check_dtype,
     check_kind,
     check_positive,
     check_tensor,
@@ -55,8 +56,7 @@ class ParticleSolver:
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
-        if dtype not in (torch.float64, torch.float32):
-            raise TypeError(f"dtype: expected torch.float64 or torch.float32, got {dtype}")
+        check_dtype(dtype)
         device = checked_device(device)
         self.rest_points: Tensor | None = None
         if isinstance(points, bool) or not isinstance(points, (int, np.integer)):

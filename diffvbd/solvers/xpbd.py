@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import check_time_step, fail
+from ..checks import check_time_step, fail, is_word
 from ..lasting import lasting_tensors
 from ..mesh import TetMesh
 from .compose import Bars, BlockUpdate, Solver, Tensors, compose
@@ -137,7 +137,7 @@ class XPBD(ParticleSolver):
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(points, mass, pinned, dtype=dtype, device=device)
-        if order not in ("sequential", "colored"):
+        if not is_word(order, "sequential", "colored"):
             fail("order", '"sequential" or "colored"', repr(order))
         self.edges = checked_edges(edges, self.num_points, device)
         self.rest_length: Tensor | None = None

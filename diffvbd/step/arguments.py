@@ -15,6 +15,7 @@ from torch import Tensor
 from .. import ops, reference
 from ..adjoint.routes import Adjoint, GlobalAdjoint, ReverseSweep, Unrolled
 from ..checks import (
+    NUMBERS,
     check_broadcast,
     check_count,
     check_kind,
@@ -121,8 +122,8 @@ def prepare(
     """Checks and shapes everything of a step that does not depend on the state. ``settings``: chosen before."""
     refuse_forward_mode()
     if isinstance(adjoint, GlobalAdjoint) and transformed():
-        raise NotImplementedError("adjoint: expected ReverseSweep or Unrolled inside torch.func transforms, got "
-                                  "GlobalAdjoint, whose solve looks at values")  # fmt: skip
+        raise NotImplementedError("adjoint: expected ReverseSweep inside torch.func transforms, got GlobalAdjoint, "
+                                  "whose solve looks at values")  # fmt: skip
     like, tets = model._mass, (model.num_tets,)
     if settings is None:
         settings = step_settings(model, lead, time_step, sweeps)
@@ -273,8 +274,10 @@ def name_argument(model: Model, error: ValueError, arguments: dict[str, Any]) ->
 
 
 def refuse_non_finite(model: Model, arguments: dict[str, Any]) -> None:
-    """Raises for the first tensor among arguments of a step that holds a value that is not finite."""
+    """Raises for the first tensor or number among arguments of a step that is, or holds, what is not finite."""
     for name, value in arguments.items():
+        if isinstance(value, NUMBERS) and not math.isfinite(value):
+            fail(name, "finite values", value)
         if isinstance(value, Tensor):
             good = torch.isfinite(value)
             if name.startswith("prescribed"):  # read only where pinned

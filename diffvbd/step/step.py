@@ -135,7 +135,8 @@ def step(
         ValueError, TypeError: Naming the argument, what was expected and what came, before any work. With contact also
             for surfaces that touch at the start, and for prescribed motion that leaves bodies no way.
         RuntimeError: Where more pairs are near than the PairBarrier has capacity for.
-        NotImplementedError: In the backward, for second derivatives and forward mode (which Unrolled has).
+        NotImplementedError: For forward mode; with GlobalAdjoint inside torch.func transforms; in the backward for
+            second derivatives (which Unrolled has).
 
     Source: paper, eqs. 1-3 and section 3; docs/method.md.
     """

@@ -297,8 +297,16 @@ def test_second_derivatives_raise(device: str) -> None:
 def test_function_transforms_raise(device: str) -> None:
     model, inputs = scene_on(device, "plain")
     x = inputs.pop("x")
-    with pytest.raises(RuntimeError, match="setup_context|functorch"):
-        torch.func.grad(lambda a: dv.step(model, a, sweeps=2, adjoint=dv.GlobalAdjoint(), **inputs)[0].sum())(x)
+
+    def end(x: torch.Tensor) -> torch.Tensor:
+        return dv.step(model, x, sweeps=2, adjoint=dv.GlobalAdjoint(), **inputs)[0]
+
+    for run in (torch.func.grad(lambda x: end(x).sum()), lambda x: torch.func.vmap(end)(x[None])):
+        with pytest.raises(NotImplementedError, match=r"^adjoint: expected ReverseSweep inside torch\.func transforms"):
+            run(x)
+    out = end(x.requires_grad_())
+    with pytest.raises(NotImplementedError, match="^adjoint: expected ReverseSweep for batched gradients"):
+        torch.autograd.grad(out, x, out.detach().expand(2, *out.shape), is_grads_batched=True)
 
 
 BAD = [

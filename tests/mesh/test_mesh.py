@@ -31,6 +31,12 @@ SHAPES = {
     "subdivided bunny": (lambda: dm.subdivide(dm.bunny()), None, 8 * 1155),
     "two bodies": (lambda: dm.join([dm.cube(), dm.capsule()]), None, None),
 }
+
+
+def unit_ball(points: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(points, axis=1) - 1
+
+
 THIN = {"sheet", "flag", "disk of one ring", "dress", "fine dress"}
 
 
@@ -284,6 +290,8 @@ def test_flatness_is_relative_to_size_so_slivers_and_small_meshes_pass():
         (np.full((4, 3), "a"), UNIT_TET, None, TypeError, "points: expected real numbers"),
         (UNIT_POINTS * [[1], [1], [1], [np.nan]], UNIT_TET, None, ValueError, "points: .*NaN or Inf in 1 row: 3"),
         (np.full((4, 3), np.inf), UNIT_TET, None, ValueError, "points: .*4 rows: 0, 1, 2, 3"),
+        ([[0, 0, 0], [1, 0]], UNIT_TET, None, ValueError, "points: expected an array, or lists of equal lengths"),
+        (UNIT_POINTS, [[0, 1, 2, 3], [1]], None, ValueError, "tets: expected an array, or lists of equal lengths"),
         (UNIT_POINTS, UNIT_TET[:, :3], None, ValueError, r"tets: expected shape \[\*, 4\], got \[1, 3\]"),
         (UNIT_POINTS, UNIT_TET * 1.0, None, TypeError, "tets: expected integers, got dtype float64"),
         (UNIT_POINTS, [[0, 1, 2, 4]], None, ValueError, r"tets: .* from 0 to 3, got \[0, 1, 2, 4\] .*1 tet: 0"),
@@ -317,9 +325,28 @@ def test_bad_meshes_are_named(points, tets, body, error, says):
         (lambda: dm.shell(UNIT_POINTS, [[0, 1, 9]], 0.1), ValueError, "triangles: expected vertex indices from 0 to 3"),
         (lambda: dm.shell(UNIT_POINTS, [[0, 1, 2]], 0.1), ValueError, "triangles: expected a normal at every vertex"),
         (lambda: dm.replicate(dm.cube(), [0, 0, 0]), ValueError, "offsets: expected shape"),
+        (lambda: dm.replicate(3, [[0, 0, 0]]), TypeError, "mesh: expected a diffvbd.TetMesh, got int"),
+        (lambda: dm.subdivide(UNIT_POINTS), TypeError, "mesh: expected a diffvbd.TetMesh, got ndarray"),
+        (lambda: dm.join(dm.cube()), TypeError, "meshes: expected TetMesh objects, as in a list, got TetMesh"),
+        (lambda: dm.join([3]), TypeError, "meshes: expected TetMesh objects, got int at 0"),
         (lambda: dm.fill(lambda p: p[:, 0], (-1,) * 3, (1,) * 3, 0.5), ValueError, "expected a box around the body"),
         (lambda: dm.fill(lambda p: p[:, 0] + 9, (-1,) * 3, (1,) * 3, 0.5), ValueError, "found no point of it"),
         (lambda: dm.fill(lambda p: p, (-1,) * 3, (1,) * 3, 0.5), ValueError, "function: expected shape"),
+        (lambda: dm.fill(3, (-1,) * 3, (1,) * 3, 0.5), TypeError, r"function: expected a function of .* got int"),
+        (
+            lambda: dm.fill(unit_ball, (-1.1,) * 3, (1.1,) * 3, 3.0),
+            ValueError,
+            "spacing: the body is thinner .* spacing 3;",
+        ),
+        (lambda: dm.fill(unit_ball, (-1.1,) * 3, (1.1,) * 3, 1e9), ValueError, "spacing: the body is thinner"),
+        *(
+            (
+                lambda h=h: dm.fill(unit_ball, (-1.1,) * 3, (1.1,) * 3, h),
+                ValueError,
+                "spacing: expected at most 1e\\+09 cells",
+            )
+            for h in (1e-4, 1e-320)
+        ),
         (lambda: dm.fill(lambda p: p[:, 0], (1,) * 3, (1,) * 3, 0.5), ValueError, "high: expected more than low"),
     ],
 )

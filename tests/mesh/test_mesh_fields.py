@@ -112,7 +112,13 @@ def test_series_has_values_of_tets(tmp_path: Path) -> None:
         ("a.vtu", {"cell_data": {"F": np.zeros((T, 3, 3))}}, rf"got \[{T}, 3, 3\]"),
         ("a.vtu", {"point_data": {"s": np.full(V, np.nan)}}, r"point_data\['s'\]: expected finite numbers, got NaN"),
         ("a.vtu", {"cell_data": {"body": np.zeros(T)}}, "cell_data: expected another name than 'body'"),
-        ("a.vtu", {"point_data": {" ": np.zeros(V)}}, "point_data: expected names of values"),
+        ("a.vtu", {"point_data": {" ": np.zeros(V)}}, "point_data: expected printable names of values"),
+        (
+            "a.vtu",
+            {"point_data": {"a\nb": np.zeros(V)}},
+            r"point_data: expected printable names of values, got 'a\\nb'",
+        ),
+        ("a.msh", {"cell_data": {'a"b': np.zeros(T)}}, "cell_data: expected names without quotes in a .msh file"),
         ("a.vtk", {"point_data": {"a b": np.zeros(V)}}, "expected names without spaces in a .vtk file, got 'a b'"),
         ("a.msh", {"point_data": {"uv": np.zeros((V, 2))}}, r"point_data\['uv'\]: expected 1 or 3 or 9 columns, got 2"),
         ("a.vtk", {"point_data": {"uv": np.zeros((V, 2))}}, r"point_data\['uv'\]: expected 1 or 3 or 4 .* got 2"),
@@ -122,6 +128,17 @@ def test_values_that_would_be_lost_are_refused(tmp_path: Path, name: str, data: 
     with pytest.raises(ValueError, match=says):
         dm.save(tmp_path / name, MESH, **data)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a&b", "a<b>", 'a"b', "a'b", "a&amp;b", "Größe"])
+def test_names_with_signs_of_xml_come_back(tmp_path: Path, name: str) -> None:
+    dm.save(tmp_path / "a.vtu", MESH, {name: np.ones(V)}, {name: np.ones(T)})
+    frames = MESH.points[None]
+    dm.write_series(tmp_path / "b.pvd", MESH, frames, point_data={name: np.ones((1, V))},
+                    cell_data={name: np.ones((1, T))})  # fmt: skip
+    for file in ("a.vtu", "b_0000.vtu"):
+        found = dm.load_fields(tmp_path / file)
+        assert list(found.point_data) == list(found.cell_data) == [name]
 
 
 def test_values_are_real_numbers(tmp_path: Path) -> None:

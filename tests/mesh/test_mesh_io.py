@@ -81,6 +81,22 @@ def test_missing_directory_and_tetless_files(tmp_path):
         TetMesh([], []).save(tmp_path / "empty.vtu")
 
 
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: dm.load(None), "path: expected a path, got NoneType"),
+        (lambda: dm.load_fields(3), "path: expected a path, got int"),
+        (lambda: dm.save(None, dm.cube()), "path: expected a path, got NoneType"),
+        (lambda: dm.save("a.vtu", 3), "mesh: expected a diffvbd.TetMesh, got int"),
+        (lambda: dm.write_series(b"a.pvd", dm.cube(), []), "path: expected a path, got bytes"),
+        (lambda: dm.write_series("a.pvd", "cube", []), "mesh: expected a diffvbd.TetMesh, got str"),
+    ],
+)
+def test_what_is_no_path_or_no_mesh_is_named(call, says):
+    with pytest.raises(TypeError, match=says):
+        call()
+
+
 @pytest.mark.parametrize("extension", ["msh", "vtu", "vtk", "mesh"])
 def test_truncated_file_gives_one_line(tmp_path, extension, capfd):
     path = tmp_path / f"cube.{extension}"

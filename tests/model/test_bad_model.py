@@ -62,6 +62,8 @@ MODELS: list[tuple[str, dict[str, Any], str]] = [
     ("energies", {"energies": (dv.FloorBarrier(), dv.FloorBarrier(1.0))}, "two"),
     ("dtype", {"dtype": torch.float16}, "float16"),
     ("dtype", {"dtype": "float32"}, "float32"),
+    # arrays, of which == makes arrays
+    *((name, {name: np.arange(2)}, r"\[0,? 1\]|ndarray") for name in ("dtype", "device", "start", "rigid", "coarse")),
 ]
 
 

@@ -63,6 +63,7 @@ BAD: list[tuple[Any, Any, str]] = [
     ("soft", NU, "young: .* got str"),
     (True, NU, "young: .* got bool"),
     (E, None, "poisson: .* got None"),
+    (torch.ones(2), torch.zeros(3), r"poisson: .* broadcasts with \[2\], that of young, got shape \[3\]"),
 ]
 
 
@@ -75,7 +76,7 @@ def test_bad_values(young: Any, poisson: Any, message: str) -> None:
 @pytest.mark.parametrize(
     ("mu", "lam", "message"),
     [(-1.0, 5.0, "mu: .* got -1"), (0.0, 0.0, "lam: .* got 0"), (1.0, -2.0, "lam: .* got -1"),
-     (1.0, "a", "lam: .* str")],
+     (1.0, "a", "lam: .* str"), (torch.ones(3), torch.ones(2), r"lam: .* \[3\], that of mu, got shape \[2\]")],
 )  # fmt: skip
 def test_bad_lame_parameters(mu: Any, lam: Any, message: str) -> None:
     with pytest.raises((ValueError, TypeError), match=message):

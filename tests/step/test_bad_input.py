@@ -78,6 +78,7 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
     ("sweeps", 10**400, "10000"),
     # not finite
     *((name, spoiled(bad, 3, 1), str(bad)) for name in ("x", "v", "force") for bad in (NAN, INF)),
+    *((name, bad, str(bad)) for name in ("force", "prescribed") for bad in (NAN, INF, np.float32(NAN))),
     ("x", spoiled(NAN, 0, 0), "nan"),
     ("gravity", (0.0, NAN, 0.0), "nan"),
     ("gravity", doubles(0.0, INF, 0.0), "inf"),
@@ -204,6 +205,15 @@ def test_numbers_of_numpy_are_numbers(device: str) -> None:
     expected = step_with(model_of(device), "mu", 1e4)[0]
     for number in (np.float64(1e4), np.float32(1e4), np.int64(10_000)):
         assert torch.equal(step_with(model_of(device), "mu", number)[0], expected)
+
+
+@pytest.mark.parametrize("name", ["mu", "lam", "density", "force", "prescribed", "floor_barrier.kappa"])
+@pytest.mark.parametrize("number", [1e39, 10**39])
+def test_numbers_that_float32_cannot_hold(device: str, name: str, number: float) -> None:
+    model = model_of(device, dtype=torch.float32)
+    x = model.rest_points
+    given = STEP | ({"parameters": {name: number}} if "." in name else {name: number})
+    raises(lambda: dv.step(model, x, 0 * x, **given), name, r"torch.float32 can hold .* got 1e\+39")
 
 
 def test_the_smallest_time_steps_of_float32(device: str) -> None:

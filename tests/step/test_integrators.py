@@ -273,16 +273,12 @@ def test_a_scene_is_the_same_alone_in_steps_and_in_checkpoints(integrator: Any) 
 @pytest.mark.parametrize("integrator", SECOND, ids=str)
 def test_a_scene_that_touches_is_the_same_beside_one_that_does_not(integrator: Any) -> None:
     """All of it takes implicit Euler: alone in one solve, beside others as a part of theirs, with the same chord."""
-    cube = dv.mesh.cube(2, size=0.1)
-    pairs = dv.PairBarrier(kappa=1e3, dhat=0.04, self_contact=False, detections=1)
-    model = dv.Model(dv.mesh.join([cube, cube.translate((0.01, 0.115, 0.005))]),
-                     energies=(dv.StableNeoHookean(), pairs))  # fmt: skip
-    x = torch.stack([model.rest_points, model.rest_points])
-    x[1, 8:, 1] += 1.0
-    v = 0.3 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
-    v[:, 8:, 1] -= 1.0
-    options: Any = {"steps": 3, "time_step": 0.01, "sweeps": 5, "lam": 1e5, "save": "last", "integrator": integrator}
-    found = []
+    cube, pairs = dv.mesh.cube(2, size=0.1), dv.PairBarrier(kappa=1e3, dhat=0.04, self_contact=False, detections=1)
+    mesh = dv.mesh.join([cube, cube.translate((0.01, 0.115, 0.005))])
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), pairs))
+    x, v = model.rest_points.repeat(2, 1, 1), torch.from_numpy(generator("beside").normal(0, 0.3, (2, 16, 3)))
+    x[1, 8:, 1], v[:, 8:, 1] = x[1, 8:, 1] + 1, v[:, 8:, 1] - 1
+    found, options = [], {"steps": 3, "time_step": 0.01, "sweeps": 5, "lam": 1e5, "integrator": integrator}
     for scenes in (2, 1):
         own, mu = v[:scenes].clone().requires_grad_(), torch.tensor(1e5, dtype=x.dtype, requires_grad=True)
         end = dv.rollout(model, x[:scenes], own, mu=mu, **options).x[-1][0]

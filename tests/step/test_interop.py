@@ -115,6 +115,8 @@ def test_compile_of_a_rollout(device: str, fresh_compiler: None, every: Any) -> 
         leaves = {k: t.clone().requires_grad_() for k, t in values.items()}
         results.append(dict(zip(values, torch.autograd.grad(function(**leaves), list(leaves.values())), strict=True)))
     assert_same(results[1], results[0])
+    arrays = (getattr(model.mesh, name) for name in ("points", "tets", "body", "volume"))
+    assert not any(array.flags.writeable for array in arrays)  # as torch.compile makes those it meets
 
 
 # --- checkpoint, autocast, copies -------------------------------------------------------------------------------------
@@ -168,12 +170,9 @@ def test_copies_of_a_model_compute_the_same(device: str, copied: Any) -> None:
     assert_same(gradients(twin, inputs), gradients(model, inputs), 0.0)
 
 
-def test_model_of_a_mesh_that_requires_grad_survives_two_backwards_and_copies(device: str) -> None:
-    mesh = dv.mesh.cube()
-    points = torch.from_numpy(mesh.points.copy()).requires_grad_()
+def test_a_model_survives_two_backwards_and_copies(device: str) -> None:
     energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.2, kappa=2.0, dhat=0.5), dv.Anchor(0.7))
-    # The result of an operation: a kept graph would fail in the second backward and in deepcopy.
-    model = dv.Model(dv.TetMesh(points * 1, mesh.tets), density=2.0, pinned=[0], energies=energies, device=device)
+    model = dv.Model(dv.mesh.cube(), density=2.0, pinned=[0], energies=energies, device=device)
     twin = pickle.loads(pickle.dumps(copy.deepcopy(model)))
     assert repr(twin) == repr(model)
     x = (model.rest_points + 0.01).requires_grad_()
@@ -181,8 +180,7 @@ def test_model_of_a_mesh_that_requires_grad_survives_two_backwards_and_copies(de
     for _ in range(2):
         out = dv.step(model, x, torch.zeros_like(x), mu=3.0, lam=2.0, **STEP)
         slopes += torch.autograd.grad(scalar(*out), x)
-    assert torch.equal(slopes[0], slopes[1])
-    assert points.grad is None
+    assert slopes[0].abs().max() > 0 and torch.equal(slopes[0], slopes[1])
 
 
 # --- raw operators ----------------------------------------------------------------------------------------------------

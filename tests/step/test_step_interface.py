@@ -279,6 +279,11 @@ def test_check_gradients_names_what_the_loss_must_take_and_return() -> None:
         dv.check_gradients(lambda m: m, given)
     with pytest.raises(TypeError, match="loss: expected a function that returns a scalar tensor, got float"):
         dv.check_gradients(lambda mu: mu.item(), given)
+    for loss in (lambda mu: torch.ones(()), lambda mu: mu.detach(), lambda mu: (mu > 0).sum()):
+        with pytest.raises(ValueError, match="loss: expected a scalar with the graph of its arguments, got one that"):
+            dv.check_gradients(loss, given)
+    with pytest.raises(ValueError, match="loss: expected a scalar with the graph of its arguments, got one that"):
+        dv.check_gradients(lambda: torch.ones(()), {})
 
 
 class WrongBackward(torch.autograd.Function):

@@ -1,8 +1,10 @@
 """The shipped inverse problems find what they look for, with the gradient they claim, and survive an interruption."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from helpers.task_checks import check_gradient, quick, timeless
@@ -106,7 +108,7 @@ def test_huber_is_quadratic_then_linear_with_a_finite_gradient() -> None:
     loss.backward()
     expected = torch.tensor([[0.0, 0.0, 0.0], [0.3, 0.0, 0.4], [0.6, 0.8, 0.0]], dtype=torch.float64) / 3
     torch.testing.assert_close(x.grad, expected)
-    with pytest.raises(ValueError, match="delta: expected a positive distance, got 0"):
+    with pytest.raises(ValueError, match="delta: expected a finite number > 0 m, got 0"):
         losses.huber(x, x, 0.0)
 
 
@@ -115,6 +117,24 @@ def test_center_of_mass_weighs_by_mass() -> None:
     center = losses.center_of_mass(x, torch.tensor([3.0, 1.0], dtype=torch.float64))
     assert center.tolist() == [[1.0, 0.0, 2.0]]
     assert losses.vertex_distance(center, torch.zeros(3)).item() == 5.0
+
+
+@pytest.mark.parametrize(
+    ("loss", "kind", "says"),
+    [
+        (lambda x: losses.huber(x, x[:3], 0.1), ValueError, r"target: .* broadcasts to \[4, 3\], got \[3, 3\]"),
+        (lambda x: losses.huber(x[:1], x, 0.1), ValueError, r"target: .* broadcasts to \[1, 3\], got \[4, 3\]"),
+        (lambda x: losses.huber(x, x, "far"), TypeError, "delta: expected a number, got str"),
+        (lambda x: losses.vertex_distance(x, x.numpy()), TypeError, "target: expected a tensor, got ndarray"),
+        (lambda x: losses.vertex_distance([0.0], x), TypeError, "x: expected a tensor, got list"),
+        (lambda x: losses.center_of_mass(x, torch.ones(3)), ValueError, r"mass: expected shape \[4\], .* shape \[3\]"),
+        (lambda x: losses.center_of_mass(x, torch.ones(1)), ValueError, r"mass: expected shape \[4\], .* shape \[1\]"),
+        (lambda x: losses.center_of_mass(x, np.ones(4)), TypeError, "mass: expected a tensor, got ndarray"),
+    ],
+)
+def test_losses_name_what_does_not_fit(loss: Callable[[torch.Tensor], object], kind: type, says: str) -> None:
+    with pytest.raises(kind, match=says):
+        loss(torch.zeros(4, 3))
 
 
 @pytest.mark.slow
