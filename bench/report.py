@@ -24,11 +24,6 @@ TASKS_PAGE = ROOT / "docs" / "tasks.md"
 BENCHMARKS = ("cpu", "gpu", "kernels")  # whose figures docs/performance.md shows, in this order
 ORDER = ("exactness", "ablation", "cost", "fd", "generality")  # the paper's come first, the others by name
 BEGIN, END = "<!-- figures: begin, written by python -m bench report -->", "<!-- figures: end -->"
-# Files of bench/results that `report` would refuse, and why they stand all the same; run again, they come off the list.
-KNOWN = {
-    "gpu.json": "The groups grid and newton were measured at 77dba6f90b beside changes that were not committed, on an "
-    "H100; to be run again.",
-}
 EMPTY = "No figures yet: run `python -m bench cpu` or `python -m bench gpu`, then `python -m bench report`.\n"
 
 INTRODUCTION = """\
@@ -71,22 +66,14 @@ def main(out: Path | None = None) -> int:
 # --- provenance -------------------------------------------------------------------------------------------------------
 
 
-def refused(
-    results: Path, known: Mapping[str, str] = KNOWN, is_ancestor: Callable[[str], bool] = is_ancestor
-) -> list[str]:
-    """A line for each result that cannot be measured again: its file, its commit, and what is wrong with that. Files
-    in `known` are let through; one that needs it no longer is an error, too."""
-    lines, wrong = [], set()
+def refused(results: Path, is_ancestor: Callable[[str], bool] = is_ancestor) -> list[str]:
+    """A line for each result that cannot be measured again: its file, its commit, and what is wrong with that."""
+    lines = []
     paths = {path.relative_to(results).as_posix(): path for path in results.glob("**/*.json")}
     for name, path in sorted(paths.items()):
         for group, origin in origins(json.loads(path.read_text(encoding="utf-8"))).items():
             if reason := why_refused(origin, is_ancestor):
-                wrong.add(name)
-                if name not in known:
-                    lines.append(f"{name}{group}: commit {commit(origin)}: {reason}")
-    for name in sorted(known.keys() - wrong):
-        what = "nothing is wrong with it; take it off KNOWN" if name in paths else "KNOWN names it, and it is not there"
-        lines.append(f"{name}: {what}")
+                lines.append(f"{name}{group}: commit {commit(origin)}: {reason}")
     return lines
 
 

@@ -50,27 +50,17 @@ def write(results: Path, **environments: dict[str, Any]) -> None:
 def test_a_refusal_names_file_commit_and_reason(tmp_path: Path) -> None:
     clean = {"commit": HERE, "dirty": False}
     write(tmp_path, good=clean, changed={**clean, "dirty": True}, tasks__lost={"commit": ELSEWHERE, "dirty": None})
-    changed, lost = report.refused(tmp_path, {}, of_here)
+    changed, lost = report.refused(tmp_path, of_here)
     assert changed.startswith(f"changed.json: commit {HERE[:10]} with changes: expected a clean commit")
     assert lost.startswith(f"tasks/lost.json: commit {ELSEWHERE[:10]}: expected an ancestor of HEAD")
-    assert report.refused(tmp_path, {"changed.json": "Why.", "tasks/lost.json": "Why."}, of_here) == []
 
 
 def test_groups_that_were_measured_by_themselves_count(tmp_path: Path) -> None:
     clean = {"commit": HERE, "dirty": None}
     results = {"steps": {**clean, "dirty": True, "rows": []}, "regimes": {**clean, "rows": []}, "rate": 3.0}
     (tmp_path / "gpu.json").write_text(json.dumps({"environment": clean, "results": results}))
-    (line,) = report.refused(tmp_path, {}, of_here)
+    (line,) = report.refused(tmp_path, of_here)
     assert line.startswith(f"gpu.json, steps: commit {HERE[:10]} with changes: expected a clean commit")
-    assert report.refused(tmp_path, {"gpu.json": "Why."}, of_here) == []
-
-
-def test_the_list_of_known_ones_shrinks(tmp_path: Path) -> None:
-    write(tmp_path, good={"commit": HERE, "dirty": False})
-    assert report.refused(tmp_path, {"good.json": "Why.", "gone.json": "Why."}, of_here) == [
-        "gone.json: KNOWN names it, and it is not there",
-        "good.json: nothing is wrong with it; take it off KNOWN",
-    ]
 
 
 def test_nothing_is_written_after_a_refusal(
@@ -85,11 +75,9 @@ def test_nothing_is_written_after_a_refusal(
     assert not list(tmp_path.glob("*.md"))
 
 
-def test_results_of_this_repository_have_clean_commits_or_are_known() -> None:
+def test_results_of_this_repository_have_clean_commits() -> None:
     # without a look at git, which a copy of the tree may lack
-    unknown = [line for line in report.refused(report.RESULTS, is_ancestor=lambda commit: True) if "KNOWN" not in line]
-    assert unknown == []
-    assert all(reason.endswith(".") for reason in report.KNOWN.values())
+    assert report.refused(report.RESULTS, is_ancestor=lambda commit: True) == []
 
 
 @pytest.mark.parametrize(
