@@ -42,7 +42,7 @@ def check_function(name: str, function: Any, *arguments: str) -> None:
     if torch.compiler.is_compiling():
         return
     try:
-        signature = inspect.signature(function)
+        signature = inspect.signature(function, follow_wrapped=False)  # of what is called, not of what it wraps
     except (TypeError, ValueError):  # of a builtin: calling it will tell
         return
     try:

@@ -7,6 +7,7 @@ constexpr unsigned kWholeWarp = 0xffffffffu;
 
 // Adds to each of n numbers that of the lane whose number differs in one bit, `offset`. All at once: shuffles stay in
 // the order in which they are written, and with one number after another each round would wait for the one before.
+// `mask` has, with each lane, the one that it adds from.
 template <int n, class T>
 __device__ __forceinline__ void add_from(T (&a)[n], int offset, unsigned mask = kWholeWarp) {
   T other[n];

@@ -256,8 +256,10 @@ __device__ __forceinline__ Vec3<T> pull_rows(const StepView<T>& s, const Place<l
 #pragma unroll
     for (int u = 0; u < batch; ++u) sum += part[u];
   }
-  __syncwarp();  // threads leave the loop one by one, and shuffles of some of a warp take longer
-  if constexpr (lanes > 1) Place<lanes_>::template sum<T>(sum);
+  if constexpr (lanes > 1) {
+    __syncwarp();  // threads leave the loop one by one, and shuffles of some of a warp take longer
+    Place<lanes_>::template sum<T>(sum);
+  }
   return sum;
 }
 

@@ -104,7 +104,7 @@ def check_gradients(
 
 def _check_names(loss: Callable[..., Tensor], arguments: dict[str, Tensor]) -> None:
     try:
-        signature = inspect.signature(loss)
+        signature = inspect.signature(loss, follow_wrapped=False)
     except (TypeError, ValueError):  # of a builtin, or no function: calling it will tell
         return
     try:

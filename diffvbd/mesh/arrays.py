@@ -14,7 +14,7 @@ IntArray = NDArray[np.int64]
 
 
 def check_mesh(mesh: Any) -> None:
-    """Raises unless `mesh` has what a TetMesh has, whose own file imports from those that ask here."""
+    """Raises unless `mesh` looks like a TetMesh. Not by isinstance: tet_mesh.py imports write.py, which calls this."""
     if not all(hasattr(mesh, name) for name in ("points", "tets", "body")):
         raise TypeError(f"mesh: expected a diffvbd.TetMesh, got {type(mesh).__name__}")
 

@@ -52,7 +52,9 @@ def fill(function: ImplicitFunction, low: Any, high: Any, spacing: float) -> Tet
     with np.errstate(over="ignore"):
         size = np.ceil((top - bottom) / step) + 2
     if size.prod() > _MOST_CELLS:
-        raise ValueError(f"spacing: expected at most {_MOST_CELLS:g} cells in the box, got {step:.6g}: try more")
+        raise ValueError(
+            f"spacing: expected one with at most {_MOST_CELLS:g} cells in the box, got {step:.6g}: try a larger one"
+        )
     cells = size.astype(int)
     points, lattice, outermost = _lattice((bottom + top) / 2 - step * cells / 2, cells, step)
     inside = -_evaluate(function, points)

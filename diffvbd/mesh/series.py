@@ -11,7 +11,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from diffvbd.mesh.arrays import FloatArray, check_mesh, float_array, to_path
+from diffvbd.mesh.arrays import FloatArray, check_mesh, float_array, to_numpy, to_path
 from diffvbd.mesh.gltf import write_gltf
 from diffvbd.mesh.parts import parts_of
 from diffvbd.mesh.tet_mesh import TetMesh
@@ -66,7 +66,8 @@ def write_series(
         raise FileNotFoundError(f"directory {path.parent} does not exist")
     if mesh.num_tets == 0:
         raise ValueError("mesh: expected at least one tet to write, got none")
-    positions = float_array("frames", frames, (None, mesh.num_vertices, 3))
+    # a file has no gradients: those of frames are let go
+    positions = float_array("frames", to_numpy("frames", frames), (None, mesh.num_vertices, 3))
     moments = np.arange(len(positions)) if times is None else float_array("times", times, (len(positions),))
     if (np.diff(moments) < 0).any():
         raise ValueError("times: expected times that never decrease")

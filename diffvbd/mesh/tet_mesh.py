@@ -147,7 +147,10 @@ class TetMesh:
         again = np.flatnonzero(first[found.reshape(-1)] != np.arange(self.num_tets))
         if len(again):
             row = self._tets[again[0]].tolist()
-            raise ValueError(f"tets: expected each tet once, got the vertices {row} again in {listed(again, 'tet')}")
+            raise ValueError(
+                f"tets: expected each tet once, got the vertices {row} again in {listed(again, 'tet')}: leave them "
+                "out (a Gmsh file may list a tet once for each of its groups)"
+            )
 
     def _checked_volume(self, orient: bool) -> FloatArray:
         volume, product = signed_volume(self._points, self._tets)

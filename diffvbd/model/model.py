@@ -300,7 +300,7 @@ class Model:
 
     @lasting_tensors()
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Model:
-        """A new Model on another device or of another dtype, float64 or float32 (else it raises); this one stays."""
+        """A new Model on another device or of another dtype; raises TypeError unless that is float64 or float32."""
         dtype = self.dtype if dtype is None else dtype
         check_dtype(dtype)
         device = self.device if device is None else checked_device(device)
@@ -355,7 +355,7 @@ class Model:
         """Outward triangles of the boundary, shape [F, 3]."""
         return torch.from_numpy(self.mesh.surface.copy()).to(self.device)
 
-    # Of tensors: torch.compile would make the arrays of the mesh writable, were they looked at in a step.
+    # From tensors: torch.compile makes arrays of numpy writable that compiled code reads.
     @property
     def num_vertices(self) -> int:
         return self._rest_points.shape[0]

@@ -19,8 +19,8 @@ def raw_backward(ctx: Any, *grads: Tensor) -> NoReturn:
 
 def no_second_derivative() -> NoReturn:
     raise NotImplementedError(
-        "diffvbd: second derivatives of a step are not supported (create_graph, hessian), nor first ones that "
-        "differentiate a backward (torch.autograd.functional.jvp): take torch.autograd.grad or backward() once"
+        "diffvbd: second derivatives of a step are not supported (create_graph, hessian), nor is "
+        "torch.autograd.functional.jvp, which differentiates a backward: take torch.autograd.grad or backward() once"
     )
 
 

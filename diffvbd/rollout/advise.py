@@ -34,9 +34,8 @@ def advise(
 
     Time step, integrator, sweeps, relaxation, coarse corrections and acceleration are chosen; mesh, energies, dtype and
     tapes stay as they are. Pass the result on: ``dv.rollout(model, x, v, duration=..., settings=s, ...)``. Print it:
-    it says what it promises, what the runners-up take and what the advice has cost. In the benchmark (advice.json) that
-    is the time of 8.6 of the advised rollouts in the median, and of 134 at most, where a quick pilot run turned out to
-    do.
+    it says what it promises, what the runners-up take and what the advice has cost: in the benchmark mostly about ten
+    of the rollouts that it advises, and more than a hundred where a quick pilot run turned out to do.
 
     The error is one of time: of the motion of this mesh with these energies, contact included, against the limit of
     small steps and many sweeps. That of the mesh is not in it (:func:`diffvbd.error_budget` has it). What chaos leaves

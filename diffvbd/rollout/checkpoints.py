@@ -79,8 +79,8 @@ def choose_schedule(
 ) -> tuple[int | BinomialCheckpoints | None, Adjoint]:
     """Resolves ``"auto"`` for schedule and tape from the bytes they would keep."""
     checkpoint_every = checked_schedule(checkpoint_every)
-    whole = transformed()  # whose tensors torch's checkpoints cannot hold
-    if whole and torch.is_grad_enabled() and checkpoint_every not in (None, "auto"):
+    inside = transformed()  # torch's checkpoints cannot hold tensors of a transform
+    if inside and torch.is_grad_enabled() and checkpoint_every not in (None, "auto"):
         raise NotImplementedError(f'checkpoint_every: expected None or "auto", which both keep all tapes inside '
                                   f"torch.func transforms, got {checkpoint_every}")  # fmt: skip
     if isinstance(checkpoint_every, BinomialCheckpoints):
@@ -93,19 +93,17 @@ def choose_schedule(
                 f"BinomialCheckpoints of at least {snapshots} snapshots for {steps} steps",
                 checkpoint_every,
             )
-    if checkpoint_every is None or isinstance(checkpoint_every, BinomialCheckpoints):
-        return checkpoint_every, adjoint
     if checkpoint_every != "auto":
         return checkpoint_every, adjoint
     row = scenes * check_count("sweeps", sweeps) * model.num_active * model._mass.element_size()
     if not isinstance(adjoint, ReverseSweep):  # a step of GlobalAdjoint keeps a few states and no tape
         kept = UNROLLED_SCALARS * row if isinstance(adjoint, Unrolled) else 0
-        return None if whole or steps * kept <= TAPE_BUDGET else max(1, math.isqrt(steps)), adjoint
+        return None if inside or steps * kept <= TAPE_BUDGET else max(1, math.isqrt(steps)), adjoint
     candidates = ("full", "compact") if adjoint.tape == "auto" else (adjoint.tape,)
     for tape in candidates:
         if steps * row * ops.tape_rows(ReverseSweep(tape).policy(0, 0, 0), model.energy_mask) <= TAPE_BUDGET:
             return None, ReverseSweep(tape)
-    if whole:
+    if inside:
         return None, ReverseSweep(candidates[-1])
     return max(1, math.isqrt(steps)), adjoint
 

@@ -343,7 +343,7 @@ def test_bad_meshes_are_named(points, tets, body, error, says):
             (
                 lambda h=h: dm.fill(unit_ball, (-1.1,) * 3, (1.1,) * 3, h),
                 ValueError,
-                "spacing: expected at most 1e\\+09 cells",
+                "spacing: expected one with at most 1e\\+09 cells",
             )
             for h in (1e-4, 1e-320)
         ),

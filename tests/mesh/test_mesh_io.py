@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ElementTree
 import meshio
 import numpy as np
 import pytest
+import torch
 
 from diffvbd import mesh as dm
 from diffvbd.mesh import TetMesh
@@ -126,8 +127,9 @@ def test_series_lists_frames_that_can_be_read_back(tmp_path):
     mesh = dm.join([dm.cube(), dm.cube()])
     frames = mesh.points + np.linspace(0, 1, 3)[:, None, None]
     speed = np.arange(3 * 16).reshape(3, 16)
+    differentiated = torch.from_numpy(frames).requires_grad_()  # as the frames of a rollout are
     dm.write_series(
-        tmp_path / "fall & rise.pvd", mesh, frames, times=[0, 0.1, 0.2], point_data={"v": frames, "s": speed}
+        tmp_path / "fall & rise.pvd", mesh, differentiated, times=[0, 0.1, 0.2], point_data={"v": frames, "s": speed}
     )
     entries = ElementTree.parse(tmp_path / "fall & rise.pvd").getroot().findall("Collection/DataSet")
     assert [float(entry.attrib["timestep"]) for entry in entries] == [0, 0.1, 0.2]

@@ -240,8 +240,6 @@ def test_observations_are_stacked_and_differentiable(device: str, schedule: Any)
 
 def test_observing_something_else_raises() -> None:
     scene = build_scene("plain")
-    with pytest.raises(TypeError, match="observe: expected a function .* got int"):
-        dv.rollout(scene.model(), **scene.inputs(), steps=2, sweeps=1, observe=3)
     with pytest.raises(TypeError, match=r"values: expected a tensor of shape \[steps, ...\], got shape \[\]"):
         dv.per_step(torch.ones(()))
     with pytest.raises(TypeError, match="observe.*float"):

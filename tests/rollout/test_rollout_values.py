@@ -1,11 +1,13 @@
 """Claim: what cannot be the value of a step is refused in words that help. A Trajectory prints in one line."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.testing import build_scene
@@ -64,6 +66,21 @@ def test_a_function_of_other_arguments_raises(name: str, function: Callable[...,
     value = {"anchor.stiffness": function} if name == "parameters" else function
     with pytest.raises(TypeError, match=rf"{name}.*: expected a function of step, x, v: too many positional"):
         dv.rollout(scene.model(), **(scene.inputs() | {name: value}), steps=STEPS, sweeps=SWEEPS)
+
+
+def test_a_function_is_asked_for_its_own_arguments_not_for_those_of_what_it_wraps() -> None:
+    scene = build_scene("anchored")
+
+    def by_step(k: int) -> float:
+        return 1e4 + k
+
+    @functools.wraps(by_step)
+    def adapted(k: int, x: Tensor, v: Tensor) -> float:
+        return by_step(k)
+
+    given = {**scene.inputs(), "steps": 2, "sweeps": 1}
+    ends = [dv.rollout(scene.model(), **(given | {"mu": mu})).x[-1] for mu in (adapted, lambda k, x, v: 1e4 + k)]
+    assert torch.equal(*ends)
 
 
 @pytest.mark.parametrize(

@@ -253,6 +253,13 @@ def test_values_that_are_not_read_are_not_checked(device: str, value_checks: Non
     assert (slope[model.pinned] != 0).all() and (slope[~model.pinned] == 0).all()
 
 
+def test_an_argument_that_is_not_read_is_not_blamed() -> None:
+    model = dv.Model(dv.mesh.cube())  # nothing is pinned
+    x = model.rest_points
+    raises(lambda: dv.step(model, x, x + 1e300, mu=1.0, lam=1.0, time_step=1e10, sweeps=1, prescribed=NAN),
+           "predictor", "inf|nan")  # fmt: skip
+
+
 def test_a_model_of_another_class_or_mesh() -> None:
     raises(lambda: step_with(MESH, "mu", 1.0), "model", "TetMesh")
     other = dv.Model(dv.mesh.cube(3))

@@ -193,7 +193,7 @@ def test_second_order_raises(device: str, name: str) -> None:
         torch.func.hessian(one)(inputs[name])
     with pytest.raises(NotImplementedError, match="second derivatives"):
         torch.autograd.functional.hessian(one, inputs[name])
-    with pytest.raises(NotImplementedError, match=r"first ones that differentiate a backward \(.*functional.jvp\)"):
+    with pytest.raises(NotImplementedError, match=r"nor is torch\.autograd\.functional\.jvp"):
         torch.autograd.functional.jvp(one, inputs[name], inputs[name])
 
 
@@ -236,10 +236,7 @@ def test_what_has_no_transforms_says_so(device: str, integrator: Any) -> None:
             torch.func.grad(lambda mu, end=end: end(mu).sum())(mu[0])
 
 
-@pytest.mark.parametrize("schedule", [2, dv.BinomialCheckpoints(2)], ids=str)
-def test_rollouts_have_no_checkpoints_inside_transforms(
-    device: str, monkeypatch: pytest.MonkeyPatch, schedule: Any
-) -> None:
+def test_rollouts_have_no_checkpoints_inside_transforms(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """torch has none there: "auto" keeps all tapes, however large, and another schedule says so."""
     model = small_model(device)
     inputs = small_inputs(model)
@@ -251,10 +248,12 @@ def test_rollouts_have_no_checkpoints_inside_transforms(
         found = dv.rollout(model, **state, **given, parameters=parameters, steps=5, **STEP)
         return scalar(found.x[-1], found.v[-1])
 
-    with pytest.raises(NotImplementedError, match=r'^checkpoint_every: expected None or "auto".*inside torch\.func'):
-        torch.func.grad(one)(inputs["mu"], schedule)
-    with pytest.raises(NotImplementedError, match=r'^checkpoint_every: expected None or "auto".*inside torch\.func'):
-        torch.func.vmap(one, (0, None))(inputs["mu"][None], schedule)
+    says = r'^checkpoint_every: expected None or "auto".*inside torch\.func'
+    for schedule in (2, dv.BinomialCheckpoints(2)):
+        with pytest.raises(NotImplementedError, match=says):
+            torch.func.grad(one)(inputs["mu"], schedule)
+        with pytest.raises(NotImplementedError, match=says):
+            torch.func.vmap(one, (0, None))(inputs["mu"][None], schedule)
     whole = torch.func.grad(one)(inputs["mu"], None)
     monkeypatch.setattr(checkpoints, "TAPE_BUDGET", 0)
     leaf = inputs["mu"].clone().requires_grad_()
