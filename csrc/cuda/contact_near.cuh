@@ -61,15 +61,33 @@ struct BlockSums {
   T own[kOwn] = {};
   // from: a thread of the vertex that g and H belong to. All threads of the warp must call it.
   __device__ __forceinline__ void add(const Vec3<T>& g, const Sym3<T>& H, int from) {
-    const int thread = threadIdx.x % kSlice, group = thread % kGroups, lane = thread / kGroups;
     T values[] = {g.x, g.y, g.z, H.xx, H.xy, H.xz, H.yy, H.yz, H.zz};
-    if constexpr (lanes == kSlice) {  // all belong to one vertex
-#pragma unroll
-      for (int offset = 1; offset < kSlice; offset *= 2) add_from(values, offset);
-#pragma unroll
-      for (int k = 0; k < kContactScalars; ++k) own[0] += lane == k ? values[k] : T(0);
-      return;
+    if constexpr (lanes == kSlice) {
+      add_of_one(values);
+    } else {
+      add_of_several(values, from);
     }
+  }
+  // Of the vertex of this thread.
+  __device__ __forceinline__ void store(T* to) const {
+    const int lane = threadIdx.x % kSlice / kGroups;
+#pragma unroll
+    for (int i = 0; i < kOwn; ++i) {
+      if (lane + i * lanes < kContactScalars) to[lane + i * lanes] = own[i];
+    }
+  }
+
+ private:
+  // A warp with one vertex.
+  __device__ __forceinline__ void add_of_one(T (&values)[kContactScalars]) {
+    const int lane = threadIdx.x % kSlice;
+#pragma unroll
+    for (int offset = 1; offset < kSlice; offset *= 2) add_from(values, offset);
+#pragma unroll
+    for (int k = 0; k < kContactScalars; ++k) own[0] += lane == k ? values[k] : T(0);
+  }
+  __device__ __forceinline__ void add_of_several(const T (&values)[kContactScalars], int from) {
+    const int thread = threadIdx.x % kSlice, group = thread % kGroups, lane = thread / kGroups;
     for (int k = 0; k < kContactScalars; ++k) slots[thread][k] = values[k];
     unsigned mine = 0;  // threads with something for the vertex of this one
     for (int g_of = 0; g_of < kGroups; ++g_of) {
@@ -95,14 +113,6 @@ struct BlockSums {
       }
     }
     __syncwarp();
-  }
-  // Of the vertex of this thread.
-  __device__ __forceinline__ void store(T* to) const {
-    const int lane = threadIdx.x % kSlice / kGroups;
-#pragma unroll
-    for (int i = 0; i < kOwn; ++i) {
-      if (lane + i * lanes < kContactScalars) to[lane + i * lanes] = own[i];
-    }
   }
 };
 
