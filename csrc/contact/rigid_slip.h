@@ -8,7 +8,7 @@
 namespace diffvbd::contact {
 
 constexpr int kSlipIterations = 200;  // of Newton's method at most: mostly it settles within 10 to 30
-constexpr int kHalvings = 10;         // in the search for the length of a step, at most
+constexpr int kHalvings = 40;         // in the search for the length of a step, at most: down to eps over a long way
 constexpr double kOvershoot = 0.1;    // slope at the end of a step over that at its start, that is small
 constexpr double kSettled = 1e-9;     // of the whole, a step after which there is but one more
 

@@ -12,7 +12,7 @@ from .friction import FloorFriction
 from .scene import Scene
 
 LEAST_INERTIA = 1e-11  # of its mass and sum of m r^2, that keeps the system of a body definite
-ITERATIONS, HALVINGS = 200, 20  # at most, of Newton's method, and of its steps
+ITERATIONS, HALVINGS = 200, 40  # at most, of Newton's method, and of its steps
 SETTLED = 1e-9  # a step over the whole motion, which the next one squares
 
 

@@ -207,7 +207,8 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
         smooth = torch.ones_like(x[..., 0], dtype=torch.bool) if touching is None else ~touching
         return History(x_end - x, v, smooth, time_step)
 
-    if euler is not None and looks_at(euler) and bool(euler.all()):
+    # not with a regularization, which a solve over a share of the step takes for a larger part of the mass
+    if euler is not None and looks_at(euler) and not model.regularization and bool(euler.all()):
         x_end, v_end, last = solve(x, v, whole, end)
         return Taken(x_end, v_end, remembered(x_end), last)
 
@@ -270,7 +271,7 @@ def _touching(model: Model, x: Tensor, v: Tensor, prepared: Prepared, given: dic
 def _of_euler(model: Model, prepared: Prepared, given: dict[str, Any], x: Tensor, euler: Tensor, share: float
               ) -> tuple[Prepared, dict[str, Any]]:  # fmt: skip
     """Arguments of a solve over a share of the step in which some bodies take all of it. ``euler``: bool [..., V]."""
-    factor = torch.where(euler, share * share, 1.0).to(x.dtype)
+    factor = torch.ones_like(x[..., 0]).masked_fill(euler, share * share)
     mass = prepared.mass * factor.reshape(-1, factor.shape[-1])
     numbers = prepared.settings.numbers
     settings = replaced(prepared.settings, numbers=replaced(numbers, friction_eps=numbers.friction_eps / share))
