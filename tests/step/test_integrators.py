@@ -270,12 +270,12 @@ def test_a_scene_is_the_same_alone_in_steps_and_in_checkpoints(integrator: Any) 
     assert torch.equal(rest.x[-1], whole.x[-1])
 
 
-@pytest.mark.parametrize("integrator", SECOND, ids=str)
-def test_a_scene_that_touches_is_the_same_beside_one_that_does_not(integrator: Any) -> None:
+@pytest.mark.parametrize(("integrator", "tau"), [(i, tau) for i in SECOND for tau in (0.0, 1e-3)], ids=str)
+def test_a_scene_that_touches_is_the_same_beside_one_that_does_not(integrator: Any, tau: float) -> None:
     """All of it takes implicit Euler: alone in one solve, beside others as a part of theirs, with the same chord."""
     cube, pairs = dv.mesh.cube(2, size=0.1), dv.PairBarrier(kappa=1e3, dhat=0.04, self_contact=False, detections=1)
     mesh = dv.mesh.join([cube, cube.translate((0.01, 0.115, 0.005))])
-    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), pairs))
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), pairs), regularization=tau)
     x, v = model.rest_points.repeat(2, 1, 1), torch.from_numpy(generator("beside").normal(0, 0.3, (2, 16, 3)))
     x[1, 8:, 1], v[:, 8:, 1] = x[1, 8:, 1] + 1, v[:, 8:, 1] - 1
     found, options = [], {"steps": 3, "time_step": 0.01, "sweeps": 5, "lam": 1e5, "integrator": integrator}
