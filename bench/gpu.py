@@ -20,7 +20,7 @@ from bench.gpu_contact import table as contact_table
 from bench.gpu_grid import REGIMES, grid, memory, regimes
 from bench.gpu_measure import Card, Row
 from bench.gpu_scenes import batches, bunny, cost, cubes, steps
-from diffvbd.adjoint.routes import FULL_TAPE_LIMIT
+from diffvbd.adjoint.routes import FULL_TAPE_LIMIT, FULL_TAPE_SHARE
 
 DEVICE = "cuda"
 
@@ -146,8 +146,8 @@ def _grid_table(rows: list[Row]) -> str:
         (r["vertices"], r["sweeps"], r["ms"], r.get("taped_ms"), r.get("reverse_ms"), r.get("ratio"),
          f"{cell(r['eager_ms'])} + {cell(r.get('reverse_eager_ms'))}", r["steps"], _millions(r.get("rollout_peak")),
          _millions(r.get("full_peak")), r.get("full_peak_bytes_per_vertex_sweep_step")) for r in rows])  # fmt: skip
-    limit = FULL_TAPE_LIMIT >> 20
-    text += f'\nTimes with tape="auto": beyond {limit} MiB a step the tape is compact, and the reverse takes longer.\n'
+    limit = f"{FULL_TAPE_LIMIT >> 20} MiB a step, or 1/{1 / FULL_TAPE_SHARE:.0f} of the device's memory if that is more"
+    text += f'\nTimes with tape="auto": beyond {limit}, the tape is compact, and the reverse takes longer.\n'
     each = [float(r["full_peak_bytes_per_vertex_sweep_step"]) for r in rows if r.get("full_peak")]
     if each:
         spread = (max(each) - min(each)) / (max(each) + min(each))

@@ -13,7 +13,7 @@ namespace {
 // sizes: active vertices, tets, slots of the plan; on CUDA also the rest of its header and color_block (plan_sizes in
 // diffvbd/ops/fields.py)
 // data_count: scalars per scene, or per vertex, of each energy of one vertex
-// launch: on CUDA the regime and the threads per vertex of the sweeps and of their reverse, else empty
+// launch: on CUDA the regime of the sweeps, that of their reverse, the threads per vertex of both; else empty
 // coarse: sizes of the plan of a coarse space, and 1 where the first sweep of the step comes before these; else empty
 #define DIFFVBD_SETTINGS                                                                                  \
   "Tensor plan, int[] sizes, int energies, int[] data_count, float[] numbers, int sweeps, int[] launch, " \

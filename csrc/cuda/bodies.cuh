@@ -55,7 +55,7 @@ __device__ __forceinline__ double sums_by_lane(double* of) {
 #pragma unroll
   for (int k = 0; k < half; ++k) {
     const double kept = upper ? of[k + half] : of[k], sent = upper ? of[k] : of[k + half];
-    of[k] = kept + __shfl_xor_sync(0xffffffffu, sent, half);
+    of[k] = kept + __shfl_xor_sync(kWholeWarp, sent, half);
   }
   if constexpr (half > 1) return sums_by_lane<half / 2>(of);
   return of[0];
@@ -154,7 +154,7 @@ struct BlockTeam {
   __device__ void most(int32_t count, double* out, const F& f) const {
     static_assert(n <= kMostSums);
     own_most<n>(static_cast<int32_t>(threadIdx.x), count, kThreads, out, f);
-    butterfly_most<n, 32>(0xffffffffu, out);
+    butterfly_most<n, 32>(kWholeWarp, out);
     for (int k = 0; k < n && threadIdx.x % 32 == 0; ++k) part[threadIdx.x / 32][k] = out[k];
     __syncthreads();
     for (int k = 0; k < n; ++k) {
@@ -168,7 +168,7 @@ struct BlockTeam {
     for (int32_t i = static_cast<int32_t>(threadIdx.x); i < count; i += kThreads) f(i);
   }
   __device__ double reduce_least(double own) const {
-    own = butterfly_least<32>(0xffffffffu, own);
+    own = butterfly_least<32>(kWholeWarp, own);
     if (threadIdx.x % 32 == 0) part[threadIdx.x / 32][0] = own;
     __syncthreads();
     for (int w = 0; w < kWarps; ++w) own = fmin(own, part[w][0]);
@@ -179,7 +179,7 @@ struct BlockTeam {
   __device__ void reduce(double* out) const {
     const int warp = static_cast<int>(threadIdx.x / 32), lane = static_cast<int>(threadIdx.x % 32);
     if constexpr (n <= kFewSums) {
-      butterfly<n, 32>(0xffffffffu, out);
+      butterfly<n, 32>(kWholeWarp, out);
       for (int k = 0; k < n && lane == 0; ++k) part[warp][k] = out[k];
       __syncthreads();
       for (int k = 0; k < n; ++k) out[k] = of_warps(k);

@@ -30,7 +30,7 @@ struct BodyBlock {
   template <int n, class F>
   __device__ void sum(int32_t count, double* out, const F& f) const {
     own_sum<n>(first(), count, stride(), out, f);
-    butterfly<n, kWarp>(0xffffffffu, out);
+    butterfly<n, kWarp>(kWholeWarp, out);
     share<n>(out);
     for (int k = 0; k < n; ++k) {
       double total = 0;
@@ -41,7 +41,7 @@ struct BodyBlock {
   }
   template <class F>
   __device__ double least(int32_t count, const F& f) const {
-    double own = butterfly_least<kWarp>(0xffffffffu, own_least(first(), count, stride(), f));
+    double own = butterfly_least<kWarp>(kWholeWarp, own_least(first(), count, stride(), f));
     share<1>(&own);
     for (int w = 0; w < stride() / kWarp; ++w) own = fmin(own, part[w][0]);
     __syncthreads();

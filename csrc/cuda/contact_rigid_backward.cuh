@@ -41,7 +41,7 @@ __device__ void sum_at_point(const RigidInputs<T>& in, const RigidWork<T>& work,
   const int lane = static_cast<int>(threadIdx.x % 32);
   double sum[kPointScalars] = {};
   add_at_point(in, work, point, lane, 32, sum);
-  butterfly<kPointScalars, 32>(0xffffffffu, sum);
+  butterfly<kPointScalars, 32>(kWholeWarp, sum);
   if (lane == 0) store_at_point(sum, point, out);
 }
 

@@ -8,7 +8,6 @@
 namespace diffvbd::cuda {
 namespace {
 
-constexpr unsigned kAll = 0xffffffffu;
 constexpr int kTeam = 256, kTeamWarps = kTeam / 32;
 constexpr int kOwn = kUnknowns + rigid::kSix;
 constexpr int kLines = 4;  // slips that a thread keeps while a step looks for its length
@@ -62,7 +61,7 @@ struct GroupSystem {
   }
   template <int n>
   __device__ void reduce(double* total) const {
-    butterfly<n, 32>(kAll, total);
+    butterfly<n, 32>(kWholeWarp, total);
     __syncthreads();
     for (int k = 0; threadIdx.x % 32 == 0 && k < n; ++k) part[threadIdx.x / 32][k] = total[k];
     __syncthreads();
@@ -109,7 +108,7 @@ struct GroupSystem {
       total[kOwn] += own.mass(v) * dot(arm, arm);
       rigid::add_vertex(arm, g, H, total, total + kUnknowns);
     }
-    const double mine = sums_by_lane(total), turning = __shfl_sync(kAll, mine, kOwn);
+    const double mine = sums_by_lane(total), turning = __shfl_sync(kWholeWarp, mine, kOwn);
     put_own(mine, b, base, gradient);
     __syncwarp();
     if (warp.lane < kUnknowns) {
@@ -121,7 +120,7 @@ struct GroupSystem {
     for (int32_t from = 0; from < places; from += 32) {
       const int32_t i = from + warp.lane;
       const bool bearing = i < places && bears(in, own, own.vertex(i / in.planes), i % in.planes);
-      const unsigned all = __ballot_sync(kAll, bearing);
+      const unsigned all = __ballot_sync(kWholeWarp, bearing);
       if (bearing) floors_of(own)[found + __popc(all & ((1u << warp.lane) - 1))] = i;
       found += __popc(all);
     }
@@ -183,7 +182,7 @@ struct GroupSystem {
       }
       const double mine = sums_by_lane(most);
       at(of, b, lane / kUnknowns, other, lane % kUnknowns) += mine;
-      butterfly<kUnknowns * kUnknowns - 32, 32>(kAll, rest);
+      butterfly<kUnknowns * kUnknowns - 32, 32>(kWholeWarp, rest);
 #pragma unroll
       for (int k = 32; k < kUnknowns * kUnknowns; ++k) {
         if (lane == k - 32) at(of, b, k / kUnknowns, other, k % kUnknowns) += rest[k - 32];

@@ -25,10 +25,10 @@ __device__ void find_order(int32_t count, Lists& lists) {
       const int k = lane + 32 * h;
       if (left >> k & 1) least = min(least, static_cast<unsigned>(64 * __popcll(own[h] & left) + k));
     }
-    for (int d = 16; d > 0; d /= 2) least = min(least, __shfl_xor_sync(kAll, least, d));
+    for (int d = 16; d > 0; d /= 2) least = min(least, __shfl_xor_sync(kWholeWarp, least, d));
     const int next = static_cast<int>(least % 64);
     left &= ~(uint64_t{1} << next);
-    const uint64_t rest = left & __shfl_sync(kAll, next < 32 ? own[0] : own[1], next % 32);
+    const uint64_t rest = left & __shfl_sync(kWholeWarp, next < 32 ? own[0] : own[1], next % 32);
     for (int h = 0; h < 2; ++h) {
       const int k = lane + 32 * h;
       if (rest >> k & 1) own[h] |= rest & ~(uint64_t{1} << k);

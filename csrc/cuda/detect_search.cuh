@@ -4,6 +4,7 @@
 #include <type_traits>
 
 #include "detect.h"
+#include "exchange.cuh"
 #include "tree.cuh"
 
 namespace diffvbd::cuda {
@@ -13,7 +14,6 @@ using namespace contact;
 
 constexpr size_t kAlignment = 256;
 constexpr int kWarp = 32;
-constexpr unsigned kWholeWarp = 0xffffffff;
 // Leaves that one thread finds for a query; a block takes over from there. Few queries leave threads idle.
 constexpr int kMostHits = 96, kMostHitsOfFew = 12;
 constexpr int64_t kFewQueries = 65536;

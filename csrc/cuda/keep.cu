@@ -1,5 +1,6 @@
 #include <cub/device/device_scan.cuh>
 
+#include "exchange.cuh"
 #include "keep.h"
 
 namespace diffvbd::cuda {
@@ -38,7 +39,7 @@ __device__ int32_t each_kept(const KeepInputs<T>& in, const int32_t* kept, int64
     }
 #pragma unroll
     for (int u = 0; u < kAhead; ++u) {
-      const unsigned found = __ballot_sync(0xffffffffu, places[u] >= 0);
+      const unsigned found = __ballot_sync(kWholeWarp, places[u] >= 0);
       if (places[u] >= 0) f(places[u], count + __popc(found & ((1u << lane) - 1)));
       count += __popc(found);
     }

@@ -94,6 +94,7 @@ __device__ __forceinline__ void each_number(Sym3<T>& a, const F& f) {
 }
 template <class T, int n, class F>
 __device__ __forceinline__ void each_number(T (&a)[n], const F& f) {
+#pragma unroll
   for (int k = 0; k < n; ++k) f(a[k]);
 }
 // Calls f(array) with the numbers of type T of some values, which then have what f has made of them.

@@ -1,4 +1,5 @@
 #include "block_sum.cuh"
+#include "exchange.cuh"
 #include "segments.h"
 
 namespace diffvbd::cuda {
@@ -90,7 +91,7 @@ __global__ void __launch_bounds__(kThreads)
     } else {
       sum = own.part(lane, kWarp);
     }
-    for (int half = kWarp / 2; half > 0; half /= 2) sum += __shfl_down_sync(0xffffffffu, sum, half);
+    for (int half = kWarp / 2; half > 0; half /= 2) sum += __shfl_down_sync(kWholeWarp, sum, half);
     if (lane == 0) out[row * c + k] = sum;
   }
 }

@@ -6,10 +6,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+import torch
+
 from .. import ops
 from ..checks import check_count, check_positive, fail, is_word
 
-FULL_TAPE_LIMIT = 256 * 2**20  # bytes of full tape per step up to which "auto" keeps it
+# Up to which bytes of a step's full tape "auto" keeps it: these, or on CUDA this share of the device's memory if that
+# is more.
+FULL_TAPE_LIMIT, FULL_TAPE_SHARE = 256 * 2**20, 1 / 256
+
+
+def full_tape_limit(device: torch.device) -> int:
+    """Bytes of a step's full tape up to which ``tape="auto"`` keeps it."""
+    if device.type != "cuda":
+        return FULL_TAPE_LIMIT
+    return max(FULL_TAPE_LIMIT, int(FULL_TAPE_SHARE * torch.cuda.get_device_properties(device).total_memory))
 
 
 @dataclass(frozen=True)
@@ -21,8 +32,8 @@ class ReverseSweep:
             ``"full"`` 72 bytes, raw update and factored block (96 with a floor, whose gaps must come back to the bit);
             ``"compact"`` 24 bytes, raw update, or with a floor the old position; blocks are assembled again;
             ``"recompute"`` nothing; the backward runs the step again;
-            ``"auto"`` full while a step's full tape fits 256 MiB, compact beyond; a rollout that keeps all its tapes
-            decides by their sum against 2 GiB.
+            ``"auto"`` full while a step's full tape fits 256 MiB, or on CUDA 1/256 of the device's memory if that is
+            more, compact beyond; a rollout that keeps all its tapes decides by their sum against 2 GiB.
 
     Source: paper, section 3; docs/method.md, sections 3 and 7.
     """
@@ -33,11 +44,11 @@ class ReverseSweep:
         if not is_word(self.tape, "auto", "full", "compact", "recompute"):
             fail("tape", '"auto", "full", "compact" or "recompute"', repr(self.tape))
 
-    def policy(self, scalars_per_row: int, itemsize: int, energies: int) -> int:
+    def policy(self, scalars_per_row: int, itemsize: int, energies: int, device: torch.device) -> int:
         """The tape policy of ops.fields for a step of scalars_per_row = scenes x sweeps x active vertices."""
         if self.tape == "auto":
             full = scalars_per_row * itemsize * ops.tape_rows(ops.FULL_TAPE, energies)
-            return ops.FULL_TAPE if full <= FULL_TAPE_LIMIT else ops.COMPACT_TAPE
+            return ops.FULL_TAPE if full <= full_tape_limit(device) else ops.COMPACT_TAPE
         return {"full": ops.FULL_TAPE, "compact": ops.COMPACT_TAPE, "recompute": ops.NO_TAPE}[self.tape]
 
 

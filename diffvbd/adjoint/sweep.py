@@ -47,7 +47,9 @@ def backward_memory(x: Tensor, settings: ops.SweepSettings, tape_policy: int) ->
 
 def _scenes_first(settings: ops.SweepSettings) -> ops.SweepSettings:
     """The same sweeps with a tape that can be split and repeated by scenes, for vmap."""
-    return replaced(settings, launch=(BLOCK, FEW_LANES, FEW_LANES)) if settings.launch[:1] == (THREAD,) else settings
+    if settings.launch[:1] != (THREAD,):
+        return settings
+    return replaced(settings, launch=(BLOCK, BLOCK, FEW_LANES, FEW_LANES))
 
 
 _FIELDS = len(ops.SweepFields._fields)

@@ -224,7 +224,7 @@ class SweepSettings(NamedTuple):
     data_count: tuple[int, ...]  # scalars per scene, or per vertex, of each energy of one vertex
     numbers: StepNumbers
     sweeps: int
-    launch: tuple[int, ...] = ()  # on CUDA: regime and threads per vertex of sweeps and reverse, see regimes.py
+    launch: tuple[int, ...] = ()  # on CUDA: regimes and threads per vertex, see regimes.py
     coarse: CoarseSizes | tuple[()] = ()  # with coarse corrections
 
 

@@ -18,13 +18,15 @@ CODES: dict[str, int] = {"thread": THREAD, "block": BLOCK, "grid": GRID, "color"
 FEW_LANES, SOME_LANES, SOME_REVERSE_LANES, MANY_LANES = 2, 8, 4, 32
 SMALL_MESH = 64
 
-# Where one regime overtakes another on an H100: the table "regimes" of docs/performance.md.
+# Where one regime overtakes another on an H100 and an H200: the table "regimes" of docs/performance.md.
 THREAD_VERTICES = 8  # up to here a scene per thread is the fastest or within 5 % of it, however few scenes there are
 THREAD_SCENES = 4096  # of larger scenes: below, a scene per thread leaves most of the device idle
 TINY_VERTICES = 32  # up to here a scene per thread or, of fewer scenes, per block beats whatever spreads a scene out
 BLOCK_SCENES = 256  # of larger scenes: below, a scene per block leaves multiprocessors idle
 BLOCK_VERTICES = 1_000  # above, a block has too few threads for a scene
-GRID_VERTICES = 50_000  # vertices of all scenes: above, launches cost less than a cooperative grid's barriers
+# Vertices of all scenes up to which a cooperative grid's barriers cost less than launches, in the sweeps and in their
+# reverse; where there are BLOCK_SCENES, also for scenes of so many vertices each.
+GRID_VERTICES, GRID_SCENE_VERTICES = (100_000, 50_000), 10_000
 MANY_SCENES = 64  # of a scene per block: from here on they fill a multiprocessor with few threads per vertex
 # Vertices of all scenes in a color up to which that many threads of each find room, in the sweeps and in their reverse.
 MANY_LANES_VERTICES = (1_500, 1_000)
@@ -59,33 +61,39 @@ def regime(name: Regime | None) -> Iterator[None]:
 
 
 def choose(vertices: int, colors: int, scenes: int, contact: bool = False, corrects: bool = False
-           ) -> tuple[int, int, int]:  # fmt: skip
-    """Regime, and threads per vertex of the sweeps and of their reverse, for SweepSettings.launch. Coarse corrections
-    are launches between sweeps, so a scene that has them is not left to one thread."""
+           ) -> tuple[int, int, int, int]:  # fmt: skip
+    """Regimes of the sweeps and of their reverse, and threads per vertex of both, for SweepSettings.launch. Coarse
+    corrections are launches between sweeps, so a scene that has them is not left to one thread."""
     at_once = vertices * scenes / max(1, colors)
     if contact:
         if at_once > MANY_LANES_VERTICES[0]:  # pairs are summed up in launches of their own
-            return COLOR, SOME_LANES, SOME_REVERSE_LANES
+            return COLOR, COLOR, SOME_LANES, SOME_REVERSE_LANES
         grid = at_once <= CONTACT_VERTICES if _forced is None else _forced == "grid"
-        return GRID if grid else COLOR, MANY_LANES, MANY_LANES
-    code = CODES[_forced] if _forced else _automatic(vertices, scenes)
+        code = GRID if grid else COLOR
+        return code, code, MANY_LANES, MANY_LANES
+    code, back = (CODES[_forced],) * 2 if _forced else _automatic(vertices, scenes)
     if code == THREAD and corrects:
-        code = BLOCK
+        code = back = BLOCK
     if code == THREAD and vertices > SMALL_MESH:
         fail("regime", f"a mesh of at most {SMALL_MESH} vertices for a scene per thread", f"{vertices} vertices")
     if code == BLOCK:  # scenes enough fill a multiprocessor; one alone wants its threads
-        return (code, SOME_LANES, SOME_REVERSE_LANES) if scenes < MANY_SCENES else (code, FEW_LANES, FEW_LANES)
+        lone = scenes < MANY_SCENES
+        return code, back, SOME_LANES if lone else FEW_LANES, SOME_REVERSE_LANES if lone else FEW_LANES
     some, limits = (SOME_LANES, SOME_REVERSE_LANES), zip(MANY_LANES_VERTICES, SOME_LANES_VERTICES, strict=True)
     forward, reverse = (
         MANY_LANES if at_once <= up_to_many else lanes if at_once <= up_to_some else FEW_LANES
         for lanes, (up_to_many, up_to_some) in zip(some, limits, strict=True)
     )
-    return code, forward, reverse
+    return code, back, forward, reverse
 
 
-def _automatic(vertices: int, scenes: int) -> int:
+def _automatic(vertices: int, scenes: int) -> tuple[int, int]:
+    """Of the sweeps, and of their reverse; a scene per thread of both or of neither, as its tape is its own."""
     if vertices <= TINY_VERTICES:
-        return THREAD if vertices <= THREAD_VERTICES or scenes >= THREAD_SCENES else BLOCK
-    if vertices <= BLOCK_VERTICES and scenes >= BLOCK_SCENES:
-        return BLOCK
-    return GRID if vertices * scenes <= GRID_VERTICES else COLOR
+        code = THREAD if vertices <= THREAD_VERTICES or scenes >= THREAD_SCENES else BLOCK
+        return code, code
+    if scenes >= BLOCK_SCENES and vertices <= GRID_SCENE_VERTICES:
+        code = BLOCK if vertices <= BLOCK_VERTICES else GRID
+        return code, code
+    forward, reverse = (GRID if vertices * scenes <= up_to else COLOR for up_to in GRID_VERTICES)
+    return forward, reverse

@@ -101,7 +101,8 @@ def choose_schedule(
         return None if inside or steps * kept <= TAPE_BUDGET else max(1, math.isqrt(steps)), adjoint
     candidates = ("full", "compact") if adjoint.tape == "auto" else (adjoint.tape,)
     for tape in candidates:
-        if steps * row * ops.tape_rows(ReverseSweep(tape).policy(0, 0, 0), model.energy_mask) <= TAPE_BUDGET:
+        policy = ReverseSweep(tape).policy(0, 0, 0, model.device)
+        if steps * row * ops.tape_rows(policy, model.energy_mask) <= TAPE_BUDGET:
             return None, ReverseSweep(tape)
     if inside:
         return None, ReverseSweep(candidates[-1])

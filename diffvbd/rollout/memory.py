@@ -66,7 +66,7 @@ def predict(
     schedule, adjoint = choose_schedule(checkpoint_every, ReverseSweep(tape), model, scenes, steps, solves * sweeps)  # type: ignore[arg-type]
     assert isinstance(adjoint, ReverseSweep)
     scalars = scenes * sweeps * model.num_active
-    policy = adjoint.policy(scalars, item, model.energy_mask)
+    policy = adjoint.policy(scalars, item, model.energy_mask, model.device)
     tape_bytes = scalars * ops.tape_rows(policy, model.energy_mask) * item
     state = scenes * model.num_vertices * 3 * item
     local = model.dtype == torch.float32  # positions about an origin, which the result does not share

@@ -160,4 +160,5 @@ def _tape_policy(model: Model, tensors: Sequence[Tensor | None], settings: ops.S
         return ops.NO_TAPE
     x = tensors[0]
     assert x is not None
-    return adjoint.policy(x.shape[0] * settings.sweeps * model.num_active, x.element_size(), model.energy_mask)
+    scalars = x.shape[0] * settings.sweeps * model.num_active
+    return adjoint.policy(scalars, x.element_size(), model.energy_mask, x.device)

@@ -62,7 +62,7 @@ def cuda_scratch(model: Model, scenes: int, *, reverse: bool, material: bool = T
         one += 4 * (edge_slots * lanes + 1) + 8 * positions
         one += (2 * pairs if material or rest else 0) + (4 * pairs if rest else 0)
     if model.touches:
-        one += ((6 if reverse else 4) + (0 if launch[1] == regimes.MANY_LANES else 9)) * positions
+        one += ((6 if reverse else 4) + (0 if launch[2] == regimes.MANY_LANES else 9)) * positions
     if corrects:
         sizes = model._coarse_plan.sizes
         one += 8 * positions + 3 * sizes.functions + (0 if reverse else 6 * sizes.parts)

@@ -52,17 +52,20 @@ def test_a_scene_alone_has_the_bits_that_it_has_in_a_batch() -> None:
     assert torch.equal(batch, alone.expand_as(batch))
 
 
-def test_a_scene_without_pairs_has_the_same_bits_beside_one_with_pairs() -> None:
+@pytest.mark.usefixtures("one_regime")
+@pytest.mark.parametrize("bodies", [2, 5])  # of up to three bodies a scene is one group
+def test_a_scene_without_pairs_has_the_same_bits_beside_one_with_pairs(bodies: int, device: str) -> None:
     """Friction is looked for in a scene of its own: whether another scene has any must not matter."""
     cube = dv.mesh.cube(2, size=0.1)
     energies = (dv.StableNeoHookean(), dv.PairBarrier(1e4, 0.01, detections=1), dv.Friction(0.3))
-    model = dv.Model(dv.mesh.join([cube, cube.translate((0.115, 0.004, -0.003))]), energies=energies)
+    mesh = dv.mesh.join([cube.translate((0.115 * k, 0.004 * k, -0.003 * k)) for k in range(bodies)])
+    model = dv.Model(mesh, energies=energies, device=device)
     apart = model.rest_points
     near = apart.clone()
     near[model.body == 1, 0] -= 0.01
     generator = torch.Generator().manual_seed(1)
     for _ in range(10):
-        v = 0.1 * torch.randn(apart.shape, generator=generator, dtype=apart.dtype)
+        v = (0.1 * torch.randn(apart.shape, generator=generator, dtype=apart.dtype)).to(device)
         ends = []
         for x, speed in ((apart, v), (torch.stack([apart, near]), torch.stack([v, torch.zeros_like(v)]))):
             leaves = [t.clone().requires_grad_() for t in (x, speed)]

@@ -71,8 +71,8 @@ def test_more_vertices_than_blocks(tape: str) -> None:
 def test_some_threads_a_vertex(tape: str) -> None:
     model, given = cubes(400)
     launch = model.settings(0.01, 5, 400).launch
-    assert launch == (regimes.COLOR, regimes.SOME_LANES, regimes.SOME_REVERSE_LANES)
-    assert model.settings(0.01, 5, 1).launch == (regimes.GRID, regimes.MANY_LANES, regimes.MANY_LANES)
+    assert launch == (regimes.COLOR, regimes.COLOR, regimes.SOME_LANES, regimes.SOME_REVERSE_LANES)
+    assert model.settings(0.01, 5, 1).launch == (regimes.GRID, regimes.GRID, regimes.MANY_LANES, regimes.MANY_LANES)
     many, one = evaluated(model, given, tape), evaluated(model, given, tape, 1)
     for key, value in one.items():
         assert value.any(), key

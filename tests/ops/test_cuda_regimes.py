@@ -308,7 +308,23 @@ def test_the_automatic_choice_is_one_of_the_regimes(cells: int, lead: tuple[int,
     assert any(matches)
 
 
-@pytest.mark.parametrize(("cells", "lead"), ((1, (20_000,)), (4, (256,)), (10, ()), (31, ())))
+@pytest.mark.parametrize("tape", TAPES)
+def test_the_reverse_may_take_another_regime_than_the_sweeps(tape: str) -> None:
+    model, inputs = large_inputs(9, 80)
+    inputs.pop("rest_points")
+    assert model.settings(0.01, 3, 80).launch[:2] == (regimes.GRID, regimes.COLOR)
+    chosen = evaluated(model, inputs, 3, tape)
+    with forced("grid"):
+        forward = evaluated(model, inputs, 3, tape)
+    with forced("color"):
+        reverse = evaluated(model, inputs, 3, tape)
+    assert all(torch.equal(chosen[k], forward[k]) for k in ("x", "v"))
+    limit = tolerance("property_factor") * tolerance("adjoint")
+    for key, value in reverse.items():
+        assert value.any() and (key == "v" or relative_error(chosen[key], value) <= limit), key
+
+
+@pytest.mark.parametrize(("cells", "lead"), ((1, (20_000,)), (4, (256,)), (9, (80,)), (10, ()), (31, ())))
 def test_the_choice_does_not_depend_on_what_is_differentiated(cells: int, lead: tuple[int, ...]) -> None:
     """A step of an inference run equals the step of a training run to the bit, whatever the tape."""
     model, inputs = large_inputs(cells, *lead)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 import diffvbd as dv
+from diffvbd.adjoint.routes import FULL_TAPE_LIMIT, full_tape_limit
 from diffvbd.testing import tolerance
 
 SWEEPS = 20
@@ -149,6 +150,16 @@ def test_auto_chooses_by_size() -> None:
     assert large["tape"] == 60_000 * model.num_active * 24
     long = model.memory(sweeps=20, steps=100_000)
     assert long["kept"] < 0.05 * model.memory(sweeps=20, steps=100_000, checkpoint_every=None)["kept"]
+
+
+def test_the_tape_of_a_step_is_full_up_to_a_share_of_the_memory_of_a_device(device: str) -> None:
+    model = beam_model().to(device)
+    limit = full_tape_limit(model.device)
+    assert limit == FULL_TAPE_LIMIT if device == "cpu" else limit >= FULL_TAPE_LIMIT
+    most = limit // (model.num_active * 72)
+    small, large = (model.memory(sweeps=k, tape="auto", checkpoint_every=None) for k in (most, most + 1))
+    assert small["tape"] == most * model.num_active * 72 > 0
+    assert large["tape"] == (most + 1) * model.num_active * 24
 
 
 ROLLOUTS = [

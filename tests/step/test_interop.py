@@ -191,7 +191,7 @@ def raw_arguments(device: str, policy: int) -> dict[str, tuple[Any, ...]]:
     model = small_model(device)
     inputs = small_inputs(model)
     settings = model.settings(0.3, 2, scenes=1)  # sizes, energies, data_count, numbers, sweeps, launch
-    assert len(settings.launch) == (3 if device == "cuda" else 0)
+    assert len(settings.launch) == (4 if device == "cuda" else 0)
     x, y = inputs["x"][None], (inputs["x"] + 0.1 * inputs["v"])[None]
     given = ops.SweepFields(x, x, y, inputs["mu"][None], inputs["lam"][None], model.mass[None], model._packed_rest,
                             model._energy_data)  # fmt: skip

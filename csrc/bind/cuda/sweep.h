@@ -30,14 +30,16 @@ inline HostPlan plan_of(const Tensor& buffer, const Tensor& x, const std::vector
   return {plan, sizes.data() + kHostSizes, static_cast<int>(sizes[9]), static_cast<int>(sizes[10])};
 }
 
-// The regime and threads per vertex that Python chose, and what the device adds.
+// The regime and threads per vertex that Python chose for one direction, and what the device adds. A tape of one regime
+// is that of any other, but for a scene per thread.
 inline Choice choose(const Tensor& x, const std::vector<int64_t>& launch, bool reverse, int wanted = 0) {
-  require(launch.size() == 3 && launch[0] >= kThread && launch[0] <= kColor, "diffvbd: bad launch");
-  const int64_t lanes = launch[reverse ? 2 : 1];
+  require(launch.size() == 4 && (launch[0] == kThread) == (launch[1] == kThread), "diffvbd: bad launch");
+  const int64_t regime = launch[reverse ? 1 : 0], lanes = launch[reverse ? 3 : 2];
   const int some = reverse ? kSomeReverseLanes : kSomeLanes;
+  require(regime >= kThread && regime <= kColor, "diffvbd: bad launch");
   require(lanes == kFewLanes || lanes == some || lanes == kManyLanes, "diffvbd: bad launch");
   Choice out{};
-  out.regime = static_cast<int>(launch[0]);
+  out.regime = static_cast<int>(regime);
   out.lanes = static_cast<int>(lanes);
   out.wanted = wanted;
   int shared = 0;
