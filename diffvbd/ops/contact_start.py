@@ -54,6 +54,13 @@ def narrow(x: Tensor, origin: Tensor, collider: Tensor, room: Tensor, pairs: Ten
     return raw.contact_narrow(x, origin, collider, room, pairs, constants, ptr)
 
 
+def gaps(x: Tensor, origin: Tensor, collider: Tensor, pairs: Tensor, constants: Tensor, ptr: Tensor) -> Tensor:
+    """Those of listed pairs at x, where detection has those of planes as they will be. [pairs] [m]. Not
+    differentiable."""
+    room = torch.full_like(x[..., 0], torch.inf)  # all can come within reach
+    return narrow(x.detach(), origin, collider.detach(), room, pairs, constants, ptr)[:, -1]
+
+
 def keep(rows: Tensor, listed: Sequence[Tensor], exact: bool) -> tuple[Tensor, ...]:
     """The pairs of a list (pairs, constants, ptr, entry of :func:`contact_detect`) that ``rows`` names, bool [pairs]:
     their indices, int64, and their list. exact: as long as they are many, which the CPU alone can say; else in room for

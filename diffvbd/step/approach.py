@@ -8,7 +8,8 @@ from torch import Tensor
 
 from ..energies import barrier_curvature
 from ..model.model import Model
-from ..reference.distance import EDGE_EDGE
+from ..ops.contact_start import gaps
+from ..reference.distance import EDGE_EDGE, POINT_PLANE
 from .arguments import Prepared
 from .contact import ContactStep
 from .motion import motion_of
@@ -74,25 +75,41 @@ def _near_pairs(model: Model, begun: Begun, prepared: Prepared, way: Tensor, bef
     ways = torch.cat([way, after - before], 1)
     *corner, kind, scene = found.listed.pairs.long().unbind(-1)
     rows = torch.arange(len(kind), device=way.device)
-    w = [ways[scene, c] for c in corner]
-    edges = kind == EDGE_EDGE
-    most = way.new_zeros(len(kind))
-    for i, j, of in ((0, 1, ~edges), (0, 2, None), (0, 3, None), (1, 2, edges), (1, 3, edges)):  # across the sides
-        square = (w[i] - w[j]).square().sum(-1)
-        most = torch.maximum(most, square if of is None else torch.where(of, square, 0))
-    constants = found.listed.constants
-    near = constants[:, -1] - MARGIN * most.sqrt() < (1 + LEAST) * constants[:, 0]
+    at = torch.cat([step.x_prev if begun.origin is None else step.x_prev + step.origin, before], 1)
+    most = _way_between(kind, [ways[scene, c] for c in corner], [at[scene, c] for c in corner])
+    gap, dhat = found.listed.constants[:, -1], found.listed.constants[:, 0]
+    if before is not after:
+        gap = gaps(step.x_prev, step.origin, step.before, *found.listed[:3])
+    near = gap - MARGIN * most < (1 + LEAST) * dhat
     near = near & (rows < found.listed.ptr[-1] // 4)  # that pairs fill
     if _extrapolates(model, prepared):
         # colliders do not give way: their masses count as infinite
         mass = torch.cat([prepared.mass.expand(way.shape[:2]), torch.full_like(after[..., 0], torch.inf)], 1)
         lightest = torch.stack([mass[scene, c] for c in corner]).amin(0)
         kappa, h = step.kappa.expand(way.shape[0])[scene], prepared.settings.numbers.time_step
-        resolved = _resolved(constants[:, -1], kappa, constants[:, 0], most.sqrt(), lightest, h)
-        near = near & ~resolved
+        near = near & ~_resolved(gap, kappa, dhat, most, lightest, h)
     total = ways.shape[0] * ways.shape[1]
     out = near.new_zeros(total + len(kind))
     for c in corner:  # a row that is not near has a place of its own
         out[torch.where(near, scene * ways.shape[1] + c, total + rows)] = True
     too_many = found.counts[0] > step.capacity  # of which some are not listed
     return out[:total].reshape(ways.shape[:2])[:, : way.shape[1]] | too_many
+
+
+def _way_between(kind: Tensor, way: list[Tensor], at: list[Tensor]) -> Tensor:
+    """How far the sides of pairs move against each other [m]: of the ways of corners across them the longest, or of a
+    plane, which may turn about points far away, that of its point below the other corner."""
+    edges = kind == EDGE_EDGE
+    square = way[0].new_zeros(len(kind))
+    for i, j, of in ((0, 1, ~edges), (0, 2, None), (0, 3, None), (1, 2, edges), (1, 3, edges)):
+        across = (way[i] - way[j]).square().sum(-1)
+        square = torch.maximum(square, across if of is None else torch.where(of, across, 0))
+    p, a, b, c = at
+    first, second, own = b - a, c - a, p - a
+    products = [(s * t).sum(-1) for s, t in ((first, first), (first, second), (second, second))]
+    along = [(s * own).sum(-1) for s in (first, second)]
+    inverse = 1 / (products[0] * products[2] - products[1].square())
+    share = [(products[2] * along[0] - products[1] * along[1]) * inverse,
+             (products[0] * along[1] - products[1] * along[0]) * inverse]  # fmt: skip
+    below = way[1] + share[0][:, None] * (way[2] - way[1]) + share[1][:, None] * (way[3] - way[1])
+    return torch.where(kind == POINT_PLANE, (way[0] - below).square().sum(-1), square).sqrt()

@@ -123,11 +123,14 @@ class ContactStep:
         return not x.is_cuda
 
     def _pushing(self, listed: Pairs) -> Pairs:
-        """The pairs that may push where the list was made: the same of a scene in any batch. On CUDA they are found if
-        sweeps go through them, too."""
+        """The pairs that may push at the start: the same of a scene in any batch. On CUDA they are found if sweeps go
+        through them, too."""
         if not (self._rubs or self._reads(self.x_prev)):
             return listed
-        return some_of(listed, (listed.constants[:, -1] < (1 + CLOSE) * listed.constants[:, 0]).contiguous())[0]
+        gap = listed.constants[:, -1]
+        if self.colliders is not self.before:
+            gap = ops_start.gaps(self.x_prev, self.origin, self.before, *listed[:3])
+        return some_of(listed, (gap < (1 + CLOSE) * listed.constants[:, 0]).contiguous())[0]
 
     def _narrowed(self, listed: Pairs, x: Tensor, collider: Tensor, room: Tensor) -> tuple[Pairs, Tensor | None]:
         """The pairs that can matter as long as no vertex goes farther than its room [B, V] from x, with their gaps

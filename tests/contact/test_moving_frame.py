@@ -1,0 +1,48 @@
+"""Claim: what a body does on a collider that moves with it is what it does on one at rest: barrier, friction and damping
+are those of the start of a step, wherever the collider goes in it."""
+
+import pytest
+import torch
+
+import diffvbd as dv
+from diffvbd.testing import tolerance
+
+TIME_STEP, DHAT = 0.005, 0.004
+SPEEDS = ((0.0, -5.0, 0.0), (0.0, -0.4, 0.0), (0.7, 0.3, -0.5))  # [m/s], the first 25 mm a step
+
+
+def block_below() -> dv.colliders.Obstacle:
+    below = dv.mesh.cube(2, size=1.0).translate((-0.4, -1.0, -0.4))
+    return dv.colliders.Obstacle(below.points, below.surface)
+
+
+@pytest.mark.parametrize("shape", ["plane", "obstacle"])
+@pytest.mark.parametrize("part", ["friction", "damping", "both"])
+def test_friction_and_damping_do_not_depend_on_the_frame(part: str, shape: str, device: str) -> None:
+    collider = dv.colliders.Plane() if shape == "plane" else block_below()
+    damping = 0.0 if part == "friction" else 20.0
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(1e4, DHAT, self_contact=False, detections=1, damping=damping),
+                *(() if part == "damping" else (dv.Friction(0.4),)))  # fmt: skip
+    mesh = dv.mesh.cube(2, size=0.1).translate((0.0, 0.8 * DHAT, 0.0))
+    model = dv.Model(mesh, energies=energies, colliders=[collider], device=device)
+    x, at = model.rest_points, model.collider_points
+    own = x.new_tensor((0.3, -0.05, 0.1))
+
+    def end(frame: torch.Tensor, steps: int = 3) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where the body is in the frame, and the gradient of a sum of that by its velocity."""
+        times = TIME_STEP * torch.arange(1, steps + 1, dtype=x.dtype, device=device)
+        v = (own + frame).expand_as(x).clone().requires_grad_()
+        motion = dv.rollout(model, x, v, steps=steps, mu=1e5, lam=1e5, time_step=TIME_STEP, sweeps=150,
+                            colliders=dv.per_step(at + times[:, None, None] * frame), colliders_before=at,
+                            save="last")  # fmt: skip
+        found = motion.x[-1] - times[-1] * frame
+        weights = torch.linspace(-1, 1, found.numel(), dtype=x.dtype, device=device).view_as(found)
+        return found.detach(), torch.autograd.grad((weights * found).sum(), v)[0]
+
+    still, still_bar = end(torch.zeros_like(own))
+    free = x + 3 * TIME_STEP * own
+    assert (still - free)[:, 0].mean() < -1e-5 or part == "damping", "friction slows it down"
+    for speed in SPEEDS:
+        moved, moved_bar = end(x.new_tensor(speed))
+        assert (moved - still).abs().max() <= tolerance("property_subset")
+        assert still_bar.abs().max() > 0 and (moved_bar - still_bar).abs().max() <= tolerance("property_subset")

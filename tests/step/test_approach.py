@@ -1,0 +1,76 @@
+"""Claim: which bodies take implicit Euler in a step of SDIRK2 or BDF2 follows from how things move against each other:
+it is the same however fast all of them move together, and planes that turn count where a body is."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd.testing import tolerance
+
+GRAVITY = (0.0, 0.0, 0.0)
+TIME_STEP = 0.01
+SECOND = (dv.SDIRK2(), dv.BDF2())
+BLOCK = dv.mesh.cube(2, size=0.4).translate((-0.15, -0.4, -0.15))
+SHAPES = {
+    "plane": dv.colliders.Plane(),
+    "sphere": dv.colliders.Sphere((0.05, -0.2, 0.05), 0.2),
+    "obstacle": dv.colliders.Obstacle(BLOCK.points, BLOCK.surface),
+}
+
+
+def model_above(shape: str, gap: float, device: str, **options: Any) -> dv.Model:
+    cube = dv.mesh.cube(2, size=0.1).translate((0.0, gap, 0.0))
+    pairs = dv.PairBarrier(kappa=1e4, dhat=0.01, self_contact=False, detections=1)
+    return dv.Model(cube, energies=(dv.StableNeoHookean(), pairs), colliders=[SHAPES[shape]], device=device, **options)
+
+
+def run(model: dv.Model, v: Tensor, ways: Tensor, integrator: Any) -> tuple[list[Tensor], dv.Trajectory]:
+    """A rollout whose colliders go by `ways` [steps, ..., 3]: who took implicit Euler, and the motion."""
+    at = model.collider_points
+    with dv.integrators.record() as euler:
+        motion = dv.rollout(model, model.rest_points, v, steps=len(ways), mu=1e5, lam=1e5, time_step=TIME_STEP,
+                            sweeps=200, gravity=GRAVITY, integrator=integrator, colliders=dv.per_step(at + ways),
+                            colliders_before=at)  # fmt: skip
+    return list(euler), motion
+
+
+@pytest.mark.parametrize("integrator", SECOND, ids=str)
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(("gap", "toward"), [(0.02, -1.5), (0.016, -0.1), (0.012, -0.6)])
+def test_a_frame_that_moves_changes_nothing(shape: str, gap: float, toward: float, integrator: Any, device: str
+                                            ) -> None:  # fmt: skip
+    model, steps = model_above(shape, gap, device), 3
+    found = []
+    for speed in (0.0, -2.0, 0.5):
+        v = torch.zeros_like(model.rest_points)
+        v[:, 1] = toward + speed
+        times = TIME_STEP * torch.arange(1, steps + 1, dtype=v.dtype, device=device)
+        ways = torch.zeros((steps, 1, 3), dtype=v.dtype, device=device)
+        ways[:, 0, 1] = speed * times
+        euler, motion = run(model, v, ways, integrator)
+        moved = motion.x[1:].clone()
+        moved[..., 1] -= speed * times[:, None]
+        found.append((euler, moved))
+    for euler, moved in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(euler, found[0][0], strict=True))
+        assert (moved - found[0][1]).abs().max() <= tolerance("property_subset")
+    assert bool(found[0][0][0].any()) == (toward < -0.1)
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_a_plane_that_turns_counts_where_the_body_is(turns: bool, device: str) -> None:
+    """Three meters from the points of a plane, which hardly move, it rises by 30 mm."""
+    model = model_above("plane", 0.035, device)
+    x = model.rest_points
+    away = torch.tensor([3.0, 0.0, 0.0], dtype=x.dtype, device=device)
+    model = dv.Model(dv.mesh.cube(2, size=0.1).translate((3.0, 0.035, 0.0)), energies=model.energies,
+                     colliders=[SHAPES["plane"]], device=device)  # fmt: skip
+    at = model.collider_points
+    assert (at.abs() < 2).all() and (model.rest_points - x - away).abs().max() < 1e-12
+    ways = torch.zeros_like(at)
+    ways[:, 1] = 0.01 * at[:, 0] if turns else 0.0
+    euler, _ = run(model, torch.zeros_like(x), ways[None], dv.SDIRK2())
+    assert bool(euler[0].any()) == turns
