@@ -31,7 +31,7 @@ def lame(young: float | Tensor, poisson: float | Tensor) -> tuple[Any, Any]:
     """
     young, poisson = _values(young=young, poisson=poisson)
     _check("young", young, "finite numbers >= 0 Pa", young >= 0)
-    _check("poisson", poisson, "numbers between -1 and 0.5", (poisson > -1) & (poisson < 0.5))
+    _check("poisson", poisson, "numbers above -1 and below 0.5", (poisson > -1) & (poisson < 0.5))
     mu = young / (2 * (1 + poisson))
     return mu, 2 * mu * poisson / (1 - 2 * poisson)
 

@@ -321,7 +321,7 @@ def pilots_of(rollout: Callable[..., Trajectory], model: Model, x: Tensor, v: Te
     if quantity is not None and not callable(quantity):
         raise TypeError(f"quantity: expected a function of x and v, got {type(quantity).__name__}")
     if quantity is not None and not _takes(quantity, 2):
-        raise TypeError("quantity: expected a function of x and v, the last of a motion, got one of other arguments")
+        raise TypeError("quantity: expected a function of the last state, lambda x, v: ..., got one of other arguments")
     if x.numel() == 0:
         fail("x", "a scene with a vertex, whose motion can be judged", f"shape {list(x.shape)}")
     x, v = x.detach(), v.detach()

@@ -125,11 +125,16 @@ class _Search:
             error, now = min(self.estimates, key=lambda e: e[0], default=least)
             settings = start_of(self.pilots).on(FRAMES, self.pilots.duration) if now is None else now.settings
             best = Candidate(settings, error, math.inf if now is None else now.seconds, now is not None)
-        tried = {str(c.settings) for c in self.proven}
-        rest = [c for c in self.proven if c is not best] + [c for c in self.predicted if str(c.settings) not in tried]
+            self.proven = [Candidate(r.settings, e, r.seconds, True) for e, r in self.estimates if r is not now]
+        once = {str(c.settings): c for c in sorted(self.proven, key=lambda c: -c.seconds)}  # of two runs the faster
+        once.pop(str(best.settings), None)
+        tried = {str(best.settings), *once}
+        rest = [*once.values(), *(c for c in self.predicted if str(c.settings) not in tried)]
         others = tuple(sorted(rest, key=lambda c: c.seconds))
         p = self.pilots
-        told = Prediction(self.error, best.error, best.seconds, p.duration, reached, why, others, p.spent, p.runs)
+        compared = ["motion", *(["quantity"] if p.quantity else []), *(["gradient"] if p.wrt is not None else [])]
+        of = "the motion" if len(compared) == 1 else f"the worst of {', '.join(compared)}"
+        told = Prediction(self.error, best.error, best.seconds, p.duration, reached, why, others, p.spent, p.runs, of)
         return replace(best.settings, dtype=p.model.dtype, predicted=told)
 
     def _reason(self) -> str:

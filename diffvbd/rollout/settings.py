@@ -49,9 +49,10 @@ class Prediction:
         duration: [s], of motion.
         reached: Whether ``error`` is at most ``asked``.
         why: One line: why these, or why the error cannot be had.
-        others: The runners-up, fastest first.
+        others: The runners-up, fastest first; if the error cannot be had, the other runs whose error could be told.
         spent: What all pilot runs took [s].
         runs: How many there were.
+        of: What ``error`` is an error of, in words.
     """
 
     asked: float
@@ -63,6 +64,7 @@ class Prediction:
     others: tuple[Candidate, ...]
     spent: float
     runs: int
+    of: str = "the motion"
 
     @property
     def seconds_per_second(self) -> float:
@@ -185,11 +187,17 @@ def _status(candidate: Candidate, told: Prediction) -> str:
 
 def _told(line: str, told: Prediction) -> str:
     """The lines below the settings: what they promise, why, and the runners-up."""
-    verdict = f"error {told.error:.2g} of the motion" + ("" if told.reached else f": {told.asked:g} cannot be had")
+    verdict = f"error {told.error:.2g} of {told.of}"
+    if not told.reached:
+        doubtful = f"too close to {told.asked:g} to be sure of it"
+        verdict += f": {told.asked:g} cannot be had" if told.error > told.asked else f": {doubtful}"
     rows = [(line, f"{told.error:.1e}", f"{told.seconds / told.duration:.3g}", "measured")]
     rows += [(str(c.settings), f"{c.error:.1e}", f"{c.seconds / told.duration:.3g}", _status(c, told))
              for c in told.others]  # fmt: skip
     header = ("settings", "error", "s per s of motion", "")
     cost = f"{told.runs} pilot runs took {told.spent:.2g} s, {told.cost:.1f} rollouts of these settings"
     first = f"{verdict}, {told.seconds_per_second:.3g} s per second of motion"
-    return "\n".join([first, told.why, cost, "", *aligned([header, *rows])])
+    lines = [first, told.why, cost, "", *aligned([header, *rows])]
+    if told.reached and any(not c.proven and c.seconds < told.seconds for c in told.others):
+        lines.append("What is predicted has not been run to the end, and may miss the error.")
+    return "\n".join(lines)

@@ -1,5 +1,5 @@
-"""Claim: what a body does on a collider that moves with it is what it does on one at rest: barrier, friction and damping
-are those of the start of a step, wherever the collider goes in it."""
+"""Claim: on a collider that moves with it a body does what it does on one at rest: friction and damping have the forces
+at the start of a step, wherever the collider goes in it."""
 
 import pytest
 import torch
@@ -41,7 +41,7 @@ def test_friction_and_damping_do_not_depend_on_the_frame(part: str, shape: str, 
 
     still, still_bar = end(torch.zeros_like(own))
     free = x + 3 * TIME_STEP * own
-    assert (still - free)[:, 0].mean() < -1e-5 or part == "damping", "friction slows it down"
+    assert (still - free)[:, 0].mean() < -0.01 * DHAT or part == "damping", "friction slows it down"
     for speed in SPEEDS:
         moved, moved_bar = end(x.new_tensor(speed))
         assert (moved - still).abs().max() <= tolerance("property_subset")

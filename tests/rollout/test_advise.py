@@ -91,6 +91,35 @@ def test_an_error_that_cannot_be_had_is_said() -> None:
     assert "patience" in told.why and "cannot be had" in str(settings)
 
 
+def test_runs_whose_error_is_known_are_shown_where_it_is_too_large() -> None:
+    model, material = cantilever(1e6)
+    model = model.to(dtype=torch.float32)  # whose rounding ends the search
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    told = dv.advise(model, x, v, duration=DURATION, error=1e-7, **material).predicted
+    assert told is not None and not told.reached and len(told.others) > 1
+    assert all(c.proven and c.error >= told.error for c in told.others)
+    assert [c.seconds for c in told.others] == sorted(c.seconds for c in told.others)
+
+
+def test_it_is_said_what_the_error_is_of() -> None:
+    told = dv.Prediction(0.1, 0.08, 1.0, 0.5, False, "", (), 3.0, 7, "the worst of motion, quantity, gradient")
+    text = str(dv.Settings(0.01, 5, predicted=told))
+    assert text.splitlines()[1].startswith(
+        "error 0.08 of the worst of motion, quantity, gradient: too close to 0.1 to be sure"
+    )
+    model, material = cantilever(1e5)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+
+    def height(x: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+        return x[:, 1].mean()
+
+    for given, of in (({}, "the motion"), ({"quantity": height}, "the worst of motion, quantity")):
+        asked = dv.advise(model, x, v, duration=0.1, error=0.1, **material, **given).predicted
+        assert asked is not None and asked.reached and asked.of == of
+        names = [str(c.settings) for c in asked.others]
+        assert len(set(names)) == len(names)
+
+
 def test_in_single_precision_the_best_run_is_returned_and_rounding_blamed() -> None:
     model, material = cantilever(1e6)
     model = model.to(dtype=torch.float32)
@@ -148,7 +177,7 @@ def test_auto_in_a_rollout() -> None:
         ({"duration": 1e-300}, ValueError, "duration: expected a number of seconds of which 0.001 is a time step"),
         ({"gradient": 1}, TypeError, "gradient: expected a bool"),
         ({"quantity": 3}, TypeError, "quantity: expected a function"),
-        ({"quantity": lambda motion: 0.0}, TypeError, "quantity: expected a function of x and v, the last"),
+        ({"quantity": lambda motion: 0.0}, TypeError, "quantity: expected a function of the last state, lambda x, v"),
         ({"force": lambda step, x, v: None}, TypeError, r"force: expected a function of the time \[s\] alone"),
         ({"quantity": lambda x, v: x}, ValueError, "quantity: expected a function that returns a scalar"),
         ({"patience": 0}, ValueError, "patience: expected"),
@@ -331,7 +360,8 @@ def test_runs_that_miss_the_error_are_marked() -> None:
     quick, slow = dv.Settings(0.02, 5), dv.Settings(0.005, 5)
     others = (Candidate(quick, 0.05, 0.1, True), Candidate(quick, 0.006, 0.2, False), Candidate(slow, 0.001, 2.0, True))
     told = dv.Prediction(0.01, 0.008, 1.0, 0.5, True, "", others, 3.0, 7)
-    rows = str(dataclasses.replace(quick, time_step=0.01, predicted=told)).splitlines()[-4:]
+    *rows, last = str(dataclasses.replace(quick, time_step=0.01, predicted=told)).splitlines()[-5:]
+    assert "has not been run to the end" in last
     assert [row.rpartition("  ")[2] for row in rows] == [
         "measured",
         "measured, misses the error",
