@@ -157,10 +157,12 @@ class Scene:
                                    for k in ("x", "v", "mu", "lam")))  # fmt: skip
 
 
-def model_of(mesh: dv.TetMesh, card: Card, dtype: torch.dtype = torch.float64, pinned: bool = True) -> dv.Model:
+def model_of(
+    mesh: dv.TetMesh, card: Card, dtype: torch.dtype = torch.float64, pinned: bool = True, **options: Any
+) -> dv.Model:
     """A Model at 1000 kg/m^3, held by the face at y = 0."""
     mask = torch.from_numpy(mesh.points[:, 1] < 1e-9) if pinned else None
-    return dv.Model(mesh, pinned=mask, dtype=dtype, device=card.device)
+    return dv.Model(mesh, pinned=mask, dtype=dtype, device=card.device, **options)
 
 
 def scene_of(model: dv.Model, scenes: int | None = None, material: str = "scalar", noise: float = 1e-3) -> Scene:
