@@ -51,7 +51,10 @@ class Refinement:
             f"{self.more_sweeps:.3g}, with h/2 {self.smaller_steps:.3g}, with both {self.both:.3g}"
         )
         if self.survives:
-            return text
+            better = self.loss - min(self.more_sweeps, self.smaller_steps, self.both)
+            if self.before is None or better <= self.tolerance * (self.before - self.loss):
+                return text
+            return f"{text}: what was gained is kept, but the settings are too coarse to say how much it is"
         if not math.isfinite(self.loss):
             return f"{text}: the loss itself is not finite"
         finer = {"more sweeps": self.more_sweeps, "smaller steps": self.smaller_steps}

@@ -180,7 +180,9 @@ def test_a_result_that_few_sweeps_invented_does_not_survive() -> None:
     assert "optimise on with more sweeps" in str(invented)
     gain = dv.refine(loss_with(60, 1e7), before=0.2)
     assert gain.survives and str(gain).startswith("survives") and "began at 0.2" in str(gain)
-    assert "optimise" not in str(gain)
+    assert "optimise" not in str(gain) and "too coarse" not in str(gain)
+    larger = dv.Refinement(-0.046, -0.05, -0.078, -0.08, 0.0, 0.1)
+    assert larger.survives and str(larger).endswith("too coarse to say how much it is")
     strict = tolerance("minimum")
     assert not dv.refine(loss_with(60, 1e7), before=0.2, tolerance=strict).survives
 
