@@ -14,7 +14,8 @@ constexpr double kBothShare = 0.45;        // of a gap that an update may close 
 constexpr double kShare = 2 * kBothShare;  // and where the other one rests
 constexpr double kStartLeast = 0.05;       // of any gap that what does not minimise the barrier may close
 constexpr double kStartPart = 0.5;         // of dhat: such motion brings no pair closer
-constexpr double kTight = 0.125;           // of that: such motion closes such gaps no further
+constexpr double kTight = 0.125;           // of that: such motion closes such gaps no further,
+constexpr double kTightest = 1e-6;         // but for rounding: of a gap, what a way along it may close
 constexpr double kGuardUlps = 32;          // roundings of a position, which a gap is not trusted to
 
 template <class T>
@@ -113,7 +114,7 @@ DIFFVBD_FN bool holds_along(int kind, const Vec3<T>& m, const Separation<T>& s, 
     T room = share[k] * wide;
     if (bounded) {
       const bool tight = careful && wide < T(kTight) * least;
-      const T outside = share[k] * (wide - least), some = tight ? T(0) : T(kStartLeast) * wide;
+      const T outside = share[k] * (wide - least), some = T(tight ? kTightest : kStartLeast) * wide;
       room = some < outside ? outside : some;
     }
     if (!(toward <= s.slack[k] + room)) return false;

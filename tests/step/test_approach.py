@@ -74,3 +74,24 @@ def test_a_plane_that_turns_counts_where_the_body_is(turns: bool, device: str) -
     ways[:, 1] = 0.01 * at[:, 0] if turns else 0.0
     euler, _ = run(model, torch.zeros_like(x), ways[None], dv.SDIRK2())
     assert bool(euler[0].any()) == turns
+
+
+@pytest.mark.parametrize("integrator", SECOND, ids=str)
+def test_a_body_above_a_floor_moves_as_it_does_alone(integrator: Any, device: str) -> None:
+    """Whether another one that it cannot meet takes implicit Euler does not matter, however few sweeps there are."""
+    cube = dv.mesh.cube(2, size=0.2)
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(height=-0.005, kappa=400.0, dhat=0.01))
+
+    def end(mesh: dv.TetMesh) -> Tensor:
+        model = dv.Model(mesh, density=500.0, energies=energies, relaxation=0.7, device=device)
+        x, v = model.rest_points, torch.zeros_like(model.rest_points)
+        v[:8, 0], v[:8, 1], v[8:, 1] = 3.0 * x[:8, 1], -0.5, 0.1
+        with dv.integrators.record() as euler:
+            motion = dv.rollout(model, x, v, steps=10, mu=2e4, lam=2e4, time_step=0.01, sweeps=1, integrator=integrator,
+                                save="last", check_energy=False)  # fmt: skip
+        if len(x) > 8:
+            assert any(bool(of[..., :8].any() != of[..., 8:].any()) for of in euler)
+        return motion.x[-1, :8] - x[:8]
+
+    alone, beside = end(cube), end(dv.mesh.join([cube, cube.translate((1.0, 0.0, 0.0))]))
+    assert alone.abs().max() > 0.02 and (alone - beside).abs().max() <= tolerance("property_subset")
