@@ -157,8 +157,10 @@ def markdown(results: dict[str, Any]) -> str:
     names = {"with_ms": "step", "with_reverse_ms": "forward + backward", "detection_ms": "detection"}
     lines = [(names[k], v["start_ms"], v["ns_per_pair"], v["explained"]) for k, v in results["lines"].items()]
     text += "\n" + markdown_table(("time over pairs", "at none [ms]", "ns per pair", "variance explained"), lines)
-    text += (f"\nA crowd, all touching, with the reach that a PairBarrier has by default, and with one of "
-             f"{1e3 * SHORT:g} mm, enough for bodies that hardly move; a frame lasts {FRAME:.1f} ms:\n\n")  # fmt: skip
-    text += markdown_table(header, [cells(results[name]) for name in ("crowd", "slow crowd") if name in results])
+    crowds = [results[name] for name in ("crowd", "slow crowd") if name in results]
+    text += f"\nA crowd, all touching; a frame lasts {FRAME:.1f} ms. "
+    if len(crowds) > 1:
+        text += f"Then the same with a reach of {1e3 * SHORT:g} mm, enough for bodies that hardly move. "
+    text = text.rstrip() + "\n\n" + markdown_table(header, map(cells, crowds))
     called = {k: ", ".join(names) or "no operator of contact" for k, names in results["contact_operators"].items()}
     return text + f"\nA Model with a PairBarrier calls {called['with']}; one without {called['without']}.\n"

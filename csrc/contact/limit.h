@@ -14,8 +14,8 @@ constexpr double kBothShare = 0.45;        // of a gap that an update may close 
 constexpr double kShare = 2 * kBothShare;  // and where the other one rests
 constexpr double kStartLeast = 0.05;       // of any gap that what does not minimise the barrier may close
 constexpr double kStartPart = 0.5;         // of dhat: such motion brings no pair closer
-constexpr double kTight = 0.125;           // of that: such motion closes such gaps no further,
-constexpr double kTightest = 1e-6;         // but for rounding: of a gap, what a way along it may close
+constexpr double kTight = 0.125;           // of that: a gap below it such motion closes no further,
+constexpr double kTightest = 1e-6;         // or by so much of itself: what rounding makes of a way along it, in double
 constexpr double kGuardUlps = 32;          // roundings of a position, which a gap is not trusted to
 
 template <class T>

@@ -33,7 +33,8 @@ class ReverseSweep:
             ``"compact"`` 24 bytes, raw update, or with a floor the old position; blocks are assembled again;
             ``"recompute"`` nothing; the backward runs the step again;
             ``"auto"`` full while a step's full tape fits 256 MiB, or on CUDA 1/256 of the device's memory if that is
-            more, compact beyond; a rollout that keeps all its tapes decides by their sum against 2 GiB.
+            more, compact beyond; a rollout that keeps all its tapes decides by their sum against 2 GiB, one with
+            checkpoints keeps the tapes of some steps at a time.
 
     Source: paper, section 3; docs/method.md, sections 3 and 7.
     """

@@ -55,8 +55,8 @@ def narrow(x: Tensor, origin: Tensor, collider: Tensor, room: Tensor, pairs: Ten
 
 
 def gaps(x: Tensor, origin: Tensor, collider: Tensor, pairs: Tensor, constants: Tensor, ptr: Tensor) -> Tensor:
-    """Those of listed pairs at x, where detection has those of planes as they will be. [pairs] [m]. Not
-    differentiable."""
+    """Gaps of listed pairs with vertices at x and colliders at ``collider`` [pairs] [m]. Detection's own gaps of planes
+    are those at the end of the step. Not differentiable."""
     room = torch.full_like(x[..., 0], torch.inf)  # all can come within reach
     return narrow(x.detach(), origin, collider.detach(), room, pairs, constants, ptr)[:, -1]
 

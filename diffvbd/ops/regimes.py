@@ -25,7 +25,7 @@ TINY_VERTICES = 32  # up to here a scene per thread or, of fewer scenes, per blo
 BLOCK_SCENES = 256  # of larger scenes: below, a scene per block leaves multiprocessors idle
 BLOCK_VERTICES = 1_000  # above, a block has too few threads for a scene
 # Vertices of all scenes up to which a cooperative grid's barriers cost less than launches, in the sweeps and in their
-# reverse; where there are BLOCK_SCENES, also for scenes of so many vertices each.
+# reverse; where there are BLOCK_SCENES, also scenes of up to so many vertices each.
 GRID_VERTICES, GRID_SCENE_VERTICES = (100_000, 50_000), 10_000
 MANY_SCENES = 64  # of a scene per block: from here on they fill a multiprocessor with few threads per vertex
 # Vertices of all scenes in a color up to which that many threads of each find room, in the sweeps and in their reverse.

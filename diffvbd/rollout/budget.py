@@ -117,7 +117,7 @@ def error_budget(
 
     Args:
         model, x, v: As in :func:`diffvbd.rollout`.
-        duration, time_step, sweeps, integrator: Of the rollout that is judged; pilots take the nearest multiple of four
+        duration, time_step, sweeps, integrator: Of the rollout that is judged; pilots take a multiple of four
             steps.
         part: The share of the duration that pilots run, from its start, in (0, 1]. Errors mostly grow with time: a part
             says which is largest sooner than how large it will be.

@@ -111,6 +111,8 @@ class _Search:
         self.estimates: list[tuple[float, Pilot]] = []  # of levels from the third on: what is asked for, and the run
         self.proven: list[Candidate] = []
         self.predicted: list[Candidate] = []
+        others = ", quantity and gradient" if pilots.wrt is not None else " and quantity" if pilots.quantity else ""
+        self.of = f"(the largest of motion{others})" if others else "of the motion"
 
     def run(self) -> Settings:
         reached, why = self._climb()
@@ -132,9 +134,9 @@ class _Search:
         rest = [*once.values(), *(c for c in self.predicted if str(c.settings) not in tried)]
         others = tuple(sorted(rest, key=lambda c: c.seconds))
         p = self.pilots
-        compared = ["motion", *(["quantity"] if p.quantity else []), *(["gradient"] if p.wrt is not None else [])]
-        of = "the motion" if len(compared) == 1 else f"the worst of {', '.join(compared)}"
-        told = Prediction(self.error, best.error, best.seconds, p.duration, reached, why, others, p.spent, p.runs, of)
+        told = Prediction(
+            self.error, best.error, best.seconds, p.duration, reached, why, others, p.spent, p.runs, self.of
+        )
         return replace(best.settings, dtype=p.model.dtype, predicted=told)
 
     def _reason(self) -> str:
@@ -187,6 +189,7 @@ class _Search:
                     if more is None:
                         return True, ""
                     settings = more.settings
+                    self.estimates.pop()  # more sweeps moved it: it was none
                     self.ladder[-2:] = [more]
                     apart[-2:] = [self._distance(self.ladder[-2], more)]
                     continue
@@ -247,7 +250,7 @@ class _Search:
         cause = "it holds vibrations down to the shortest that the mesh can carry"
         if not self.smooth:
             cause = "what touches when, and what sticks, depends on ever smaller differences"
-        return f"runs of h and h/2 stay {apart:.2g} of the motion apart however small h is: {cause}"
+        return f"runs of h and h/2 stay {apart:.2g} {self.of} apart however small h is: {cause}"
 
     def _distance(self, a: Pilot, b: Pilot) -> float:
         """Of motion, quantity and gradient, the largest."""

@@ -47,12 +47,12 @@ class Prediction:
             motion of the mesh, over that of the motion itself; with a quantity or gradients the largest of theirs.
         seconds: Time of one rollout over ``duration`` [s], with its backward if gradients were asked for.
         duration: [s], of motion.
-        reached: Whether ``error`` is at most ``asked``.
+        reached: Whether ``error`` is known to be at most ``asked``.
         why: One line: why these, or why the error cannot be had.
-        others: The runners-up, fastest first; if the error cannot be had, the other runs whose error could be told.
+        others: The runners-up, fastest first; if the error cannot be had, the other runs with an estimate.
         spent: What all pilot runs took [s].
         runs: How many there were.
-        of: What ``error`` is an error of, in words.
+        of: What ``error`` is an error of, in words that follow its number.
     """
 
     asked: float
@@ -64,7 +64,7 @@ class Prediction:
     others: tuple[Candidate, ...]
     spent: float
     runs: int
-    of: str = "the motion"
+    of: str = "of the motion"
 
     @property
     def seconds_per_second(self) -> float:
@@ -187,10 +187,9 @@ def _status(candidate: Candidate, told: Prediction) -> str:
 
 def _told(line: str, told: Prediction) -> str:
     """The lines below the settings: what they promise, why, and the runners-up."""
-    verdict = f"error {told.error:.2g} of {told.of}"
+    verdict = f"error {told.error:.2g} {told.of}"
     if not told.reached:
-        doubtful = f"too close to {told.asked:g} to be sure of it"
-        verdict += f": {told.asked:g} cannot be had" if told.error > told.asked else f": {doubtful}"
+        verdict += ", not confirmed" if told.error <= told.asked else f": {told.asked:g} cannot be had"
     rows = [(line, f"{told.error:.1e}", f"{told.seconds / told.duration:.3g}", "measured")]
     rows += [(str(c.settings), f"{c.error:.1e}", f"{c.seconds / told.duration:.3g}", _status(c, told))
              for c in told.others]  # fmt: skip

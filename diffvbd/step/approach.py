@@ -97,8 +97,8 @@ def _near_pairs(model: Model, begun: Begun, prepared: Prepared, way: Tensor, bef
 
 
 def _way_between(kind: Tensor, way: list[Tensor], at: list[Tensor]) -> Tensor:
-    """How far the sides of pairs move against each other [m]: of the ways of corners across them the longest, or of a
-    plane, which may turn about points far away, that of its point below the other corner."""
+    """How far the sides of pairs move against each other [m]: of the ways of corners across them the longest; for a
+    plane, which may turn about points far away, the way of the vertex relative to the plane's point below it."""
     edges = kind == EDGE_EDGE
     square = way[0].new_zeros(len(kind))
     for i, j, of in ((0, 1, ~edges), (0, 2, None), (0, 3, None), (1, 2, edges), (1, 3, edges)):

@@ -232,9 +232,9 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
     first, second = CHORDS_OF_SDIRK2
     x1, v1, _ = solve(x, v, _over(whole, GAMMA, first), _at_share(given, x, GAMMA))
     feasible, carried = x1, math.sqrt(2) * v1
-    if euler is not None:
-        # x1 keeps bodies apart that all are there; beside one that is still at x, all begin at x that might meet it
-        mixed = euler[..., None] if model.contact is None else euler.any(-1)[..., None, None]
+    if euler is not None and model.contact is not None:
+        # x1 keeps bodies apart that all are there; beside one that is still at x, which others may meet, all begin at x
+        mixed = euler.any(-1)[..., None, None]
         feasible = torch.where(mixed, x, x1)
         carried = torch.where(mixed, carried + (x1 - x) / (GAMMA * time_step), carried)
     return last_solve(feasible, v + (1 + math.sqrt(2)) * (v1 - v), carried, GAMMA, second, x1)

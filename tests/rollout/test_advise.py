@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import warnings
+from typing import Any
 
 import pytest
 import torch
@@ -102,18 +103,21 @@ def test_runs_whose_error_is_known_are_shown_where_it_is_too_large() -> None:
 
 
 def test_it_is_said_what_the_error_is_of() -> None:
-    told = dv.Prediction(0.1, 0.08, 1.0, 0.5, False, "", (), 3.0, 7, "the worst of motion, quantity, gradient")
+    told = dv.Prediction(0.1, 0.08, 1.0, 0.5, False, "", (), 3.0, 7, "(the largest of motion and quantity)")
     text = str(dv.Settings(0.01, 5, predicted=told))
-    assert text.splitlines()[1].startswith(
-        "error 0.08 of the worst of motion, quantity, gradient: too close to 0.1 to be sure"
-    )
+    assert text.splitlines()[1].startswith("error 0.08 (the largest of motion and quantity), not confirmed")
     model, material = cantilever(1e5)
     x, v = model.rest_points, torch.zeros_like(model.rest_points)
 
     def height(x: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
         return x[:, 1].mean()
 
-    for given, of in (({}, "the motion"), ({"quantity": height}, "the worst of motion, quantity")):
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({}, "of the motion"),
+        ({"quantity": height}, "(the largest of motion and quantity)"),
+        ({"gradient": True}, "(the largest of motion, quantity and gradient)"),
+    ]
+    for given, of in cases:
         asked = dv.advise(model, x, v, duration=0.1, error=0.1, **material, **given).predicted
         assert asked is not None and asked.reached and asked.of == of
         names = [str(c.settings) for c in asked.others]
