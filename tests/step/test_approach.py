@@ -21,10 +21,10 @@ SHAPES = {
 }
 
 
-def model_above(shape: str, gap: float, device: str, **options: Any) -> dv.Model:
+def model_above(shape: str, gap: float, device: str) -> dv.Model:
     cube = dv.mesh.cube(2, size=0.1).translate((0.0, gap, 0.0))
     pairs = dv.PairBarrier(kappa=1e4, dhat=0.01, self_contact=False, detections=1)
-    return dv.Model(cube, energies=(dv.StableNeoHookean(), pairs), colliders=[SHAPES[shape]], device=device, **options)
+    return dv.Model(cube, energies=(dv.StableNeoHookean(), pairs), colliders=[SHAPES[shape]], device=device)
 
 
 def run(model: dv.Model, v: Tensor, ways: Tensor, integrator: Any) -> tuple[list[Tensor], dv.Trajectory]:
