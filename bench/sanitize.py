@@ -35,7 +35,7 @@ STEPS, SWEEPS = 2, 3
 LESS = {"racecheck": (1, 2)}
 LEAST = {("racecheck", "pairs, many scenes"): (1, 1)}
 AGAIN = {"initcheck": 2}  # more runs, at most, of a scene in which a tool has found something
-LONGEST = 230  # [s] of a tool and a scene
+LONGEST = 330  # [s] of a tool and a scene
 # torch gives tensors memory that others have written, with room at their ends; so each has its own
 UNCACHED = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
 WORKERS = 14  # processes side by side: each keeps one core and little of the device busy

@@ -190,19 +190,19 @@ template <class T>
 struct PairPlane {
   Vec3<T> n;
   Separation<T> separation;
-  T wide, least;
+  T guard, least;
   DIFFVBD_FN PairPlane(const AdvanceInputs<T>& in, const AdvanceState<T>& s, int64_t pair) {
     const int32_t* record = in.listed.pairs + kPairRow * pair;
     const PairConstants<T> constants(in.constants + kConstants * pair);
     const PairPlace<T> at = place_of(in, s, record);
     n = distance(record[4], at.corners).n;
     separation = Separation<T>(record[4], at.corners, n, constants.offset);
-    wide = separation.gap - at.guard, least = least_of(constants.dhat);
+    guard = at.guard, least = least_of(constants.dhat);
   }
   DIFFVBD_FN void forget() { least = T(-1); }
   DIFFVBD_FN bool is_known() const { return T(0) <= least; }
   DIFFVBD_FN bool holds(int kind, const Ways<T>& a) const {
-    return !a.moves || holds_along(kind, n, separation, wide, least, a.way, a.shares, a.careful, a.careful);
+    return !a.moves || holds_along(kind, n, separation, guard, least, a.way, a.shares, a.careful, a.careful);
   }
 };
 

@@ -220,17 +220,21 @@ DIFFVBD_FN bool is_considered(const Surfaces<T>& in, const Candidate& c) {
   return !held && !in.ignores(in.group(c.v[0]), in.group(c.v[second]));
 }
 
-// Corner positions relative to the first corner.
+// Corner positions relative to the first corner, with those of colliders given.
 template <class T>
-DIFFVBD_FN Corners<T> corners_of(const Surfaces<T>& in, const Candidate& c) {
+DIFFVBD_FN Corners<T> corners_with(const Surfaces<T>& in, const Candidate& c, const T* collider) {
   const Place<T> first = place(in, in.collider, c.scene, c.v[0]);
   Corners<T> out;
   out.x[0] = zero3<T>();
   for (int k = 1; k < 4; ++k) {
-    const Place<T> p = place(in, c.kind == kPointPlane ? in.collider_next : in.collider, c.scene, c.v[k]);
+    const Place<T> p = place(in, collider, c.scene, c.v[k]);
     out.x[k] = (p.x - first.x) + (p.o - first.o);
   }
   return out;
+}
+template <class T>
+DIFFVBD_FN Corners<T> corners_of(const Surfaces<T>& in, const Candidate& c) {
+  return corners_with(in, c, c.kind == kPointPlane ? in.collider_next : in.collider);
 }
 template <class T>
 DIFFVBD_FN Corners<T> corners_at_rest(const Surfaces<T>& in, const Candidate& c) {
@@ -280,7 +284,21 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   return out;
 }
 
-// Whether a pair with this gap, whose barrier reaches as far as dhat, may become active before the next detection.
+template <class T>
+DIFFVBD_FN T gap_of(const Surfaces<T>& in, const Candidate& c) {
+  return separation(c.kind, corners_of(in, c)) - offset_of(in, c);
+}
+
+// The smallest gap of a pair, whose own is this one: a plane that moves away pushes and rubs where it comes from.
+template <class T>
+DIFFVBD_FN T least_gap_of(const Surfaces<T>& in, const Candidate& c, T gap) {
+  if (c.kind != kPointPlane || in.collider == in.collider_next) return gap;
+  const T before = separation(c.kind, corners_with(in, c, in.collider)) - offset_of(in, c);
+  return before < gap ? before : gap;
+}
+
+// Whether a pair whose smallest gap is this, and whose barrier reaches as far as dhat, may become active before the
+// next detection, or was at this one.
 template <class T>
 DIFFVBD_FN bool is_listed(const Surfaces<T>& in, const Candidate& c, T gap, T dhat) {
   const int32_t first = in.body[c.v[0]], second = in.body[c.v[c.second()]];
@@ -342,7 +360,7 @@ DIFFVBD_FN void store_hints(const Surfaces<T>& in, const Detected<T>& out, const
   const T sign = first == (nearest < c.second()) ? T(1) : T(-1);
   for (int i = 0; i < 3; ++i) constants[3 + i] = sign * values[4 + i];
   constants[6] = gap(nearest);
-  constants[7] = separation(c.kind, corners_of(in, c)) - offset_of(in, c);
+  constants[7] = gap_of(in, c);
 }
 
 }  // namespace diffvbd::contact

@@ -9,14 +9,15 @@
 
 namespace diffvbd::contact {
 
-constexpr int kNoMove = 8;                 // the exponent that stands for a limit of 0
-constexpr double kBothShare = 0.45;        // of a gap that an update may close where both sides move
-constexpr double kShare = 2 * kBothShare;  // and where the other one rests
-constexpr double kStartLeast = 0.05;       // of any gap that what does not minimise the barrier may close
-constexpr double kStartPart = 0.5;         // of dhat: such motion brings no pair closer
-constexpr double kTight = 0.125;           // of that: a gap below it such motion closes no further,
-constexpr double kTightest = 1e-6;         // or by so much of itself: what rounding makes of a way along it, in double
-constexpr double kGuardUlps = 32;          // roundings of a position, which a gap is not trusted to
+constexpr int kNoMove = 8;                   // the exponent that stands for a limit of 0
+constexpr double kBothShare = 0.45;          // of a gap that an update may close where both sides move
+constexpr double kShare = 2 * kBothShare;    // and where the other one rests
+constexpr double kStartLeast = 0.05;         // of any gap that what does not minimise the barrier may close
+constexpr double kStartPart = 0.5;           // of dhat: such motion brings no pair closer
+constexpr double kTight = 0.125;             // of that: a gap below it such motion closes no further,
+constexpr double kTightest = 1e-6;           // or by so much of itself: rounding makes as much of a way along it
+constexpr double kGuardUlps = 32;            // roundings of a position, which a gap is not trusted to
+constexpr double kClosedGuards = 1.0 / 128;  // of these: as much, too, where that is more
 
 template <class T>
 DIFFVBD_FN T least_of(T dhat) {
@@ -104,17 +105,20 @@ DIFFVBD_FN Vec3<T> across(int kind, const Corners<T>& c) {
 }
 
 // Whether corners that move by d[k], each as far as its share of the gap lets it, keep the sides apart along m, where
-// these lie as s says. wide: their gap less the guard; bounded: no closer than `least`, or by but a little.
+// these lie as s says. guard: of their gap; bounded: no closer than `least`, or by but a little.
 template <class T>
-DIFFVBD_FN bool holds_along(int kind, const Vec3<T>& m, const Separation<T>& s, T wide, T least, const Vec3<T> (&d)[4],
+DIFFVBD_FN bool holds_along(int kind, const Vec3<T>& m, const Separation<T>& s, T guard, T least, const Vec3<T> (&d)[4],
                             const T (&share)[4], bool bounded, bool careful) {
+  const T wide = s.gap - guard;
   if (!(T(0) < wide)) return false;
+  const T most = T(kStartLeast) * wide, relative = T(kTightest) * wide, absolute = T(kClosedGuards) * guard;
+  const T rounded = relative < absolute ? absolute : relative;
+  const T some = careful && wide < T(kTight) * least && rounded < most ? rounded : most;
   for (int k = 0; k < 4; ++k) {
     const T toward = k < sides(kind) ? -dot(m, d[k]) : dot(m, d[k]);
     T room = share[k] * wide;
     if (bounded) {
-      const bool tight = careful && wide < T(kTight) * least;
-      const T outside = share[k] * (wide - least), some = T(tight ? kTightest : kStartLeast) * wide;
+      const T outside = share[k] * (wide - least);
       room = some < outside ? outside : some;
     }
     if (!(toward <= s.slack[k] + room)) return false;
@@ -149,7 +153,7 @@ struct Gate {
     // other directions than that of the closest points must keep what is near
     const T near = hints.nearest < least() ? hints.nearest : least();
     if (!own && !(T(0.5) * near < wide)) return false;
-    return holds_along(kind, m, s, wide, least(), d, share, careful || !own, careful);
+    return holds_along(kind, m, s, guard, least(), d, share, careful || !own, careful);
   }
   DIFFVBD_FN bool holds(const Vec3<T> (&d)[4], const T (&share)[4], bool careful) const {
     if (holds(n, d, share, careful, true)) return true;

@@ -135,15 +135,15 @@ class SceneDetection {
 
   void examine(const Candidate& c, Finds<T>& finds) {
     if (!is_considered(in_, c)) return;
-    const T gap = separation(c.kind, corners_of(in_, c)) - offset_of(in_, c);
-    if (gap >= reach_ || (gap > T(0) && !is_listed(in_, c, gap, in_.dhat))) return;
+    const T gap = gap_of(in_, c), least = least_gap_of(in_, c, gap);
+    if (least >= reach_ || (gap > T(0) && !is_listed(in_, c, least, in_.dhat))) return;
     const Constants<T> constants = constants_of(in_, c);
     if (!constants.admitted) return;
     const uint64_t key = contact::key_of(in_, c);
     if (!(gap > T(0))) ++finds.touching, finds.first_touching = std::min(finds.first_touching, key);
     if (std::isnan(gap)) return;
     for (const int32_t v : c.v) offer(near_[v], v, gap, key);
-    if (is_listed(in_, c, gap, constants.dhat)) finds.pairs.push_back(key);
+    if (is_listed(in_, c, least, constants.dhat)) finds.pairs.push_back(key);
   }
 
   static void offer(Near<T>& near, int32_t v, T gap, uint64_t key) {

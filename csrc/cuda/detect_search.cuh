@@ -100,14 +100,12 @@ struct Search {
     lower(&work.touching[1], static_cast<unsigned long long>(key));
   }
 
-  __device__ T gap_of(const Candidate& c) const { return separation(c.kind, corners_of(in, c)) - offset_of(in, c); }
-
   __device__ void examine(const Candidate& c) const {
     if (!is_considered(in, c)) return;
-    const T gap = gap_of(c);
-    if (gap >= reach_of(in, c.scene) || (gap > T(0) && !is_listed(in, c, gap, in.dhat))) return;
+    const T gap = gap_of(in, c), least = least_gap_of(in, c, gap);
+    if (least >= reach_of(in, c.scene) || (gap > T(0) && !is_listed(in, c, least, in.dhat))) return;
     if constexpr (listing) {
-      settle(c, gap);
+      settle(c, gap, least);
     } else {
       append(work.found, work.candidates, kCandidates * capacity, key_of(in, c));
       const Ordered<T> bits = ordered(gap);
@@ -120,7 +118,7 @@ struct Search {
   }
 
   // Of a pair that may be listed.
-  __device__ void settle(const Candidate& c, T gap) const {
+  __device__ void settle(const Candidate& c, T gap, T least) const {
     const Constants<T> constants = constants_of(in, c);
     if (!constants.admitted) return;
     const uint64_t key = key_of(in, c);
@@ -131,7 +129,7 @@ struct Search {
       const int64_t row = c.scene * in.corners + c.v[k];
       if (work.near_gap[row] == bits) lower(work.near_key + row, static_cast<unsigned long long>(key));
     }
-    if (is_listed(in, c, gap, constants.dhat)) append(work.listed, work.keys, capacity, key);
+    if (is_listed(in, c, least, constants.dhat)) append(work.listed, work.keys, capacity, key);
   }
 
   // Of a point that is not finite: it counts as touching, so that nobody takes the scene for a good one.
@@ -284,7 +282,8 @@ __global__ void settle_kernel(const Surfaces<T> in, Workspace<T> work, int64_t c
   if (!kept_all(work, capacity) || i >= static_cast<int64_t>(*work.found)) return;
   const Search<T, true> search{in, work, capacity};
   const Candidate c = candidate_of_key(in, work.candidates[i]);
-  search.settle(c, search.gap_of(c));
+  const T gap = gap_of(in, c);
+  search.settle(c, gap, least_gap_of(in, c, gap));
 }
 
 template <class T, bool listing>

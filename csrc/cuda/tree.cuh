@@ -5,6 +5,7 @@
 #include <cub/device/device_radix_sort.cuh>
 
 #include "../contact/candidates.h"
+#include "exchange.cuh"
 #include "ordered.cuh"
 
 namespace diffvbd::cuda {
@@ -91,12 +92,11 @@ __global__ void bounds_kernel(const contact::Surfaces<T> in, Forest forest) {
   if (i < all) box = box_of(in, 2, scene, static_cast<int32_t>(i - scene * in.num_points), reference_point(in, scene));
   unsigned lo[3] = {ordered(box.lo.x), ordered(box.lo.y), ordered(box.lo.z)};
   unsigned hi[3] = {ordered(box.hi.x), ordered(box.hi.y), ordered(box.hi.z)};
-  constexpr unsigned all_lanes = 0xffffffff;
   bool writes = !contact::is_empty(box);
-  if (__all_sync(all_lanes, scene == __shfl_sync(all_lanes, scene, 0))) {
+  if (__all_sync(kWholeWarp, scene == __shfl_sync(kWholeWarp, scene, 0))) {
     for (int k = 0; k < 3; ++k) {
-      lo[k] = __reduce_min_sync(all_lanes, lo[k]);
-      hi[k] = __reduce_max_sync(all_lanes, hi[k]);
+      lo[k] = __reduce_min_sync(kWholeWarp, lo[k]);
+      hi[k] = __reduce_max_sync(kWholeWarp, hi[k]);
     }
     writes = threadIdx.x % 32 == 0;
   }

@@ -1,6 +1,8 @@
 """Claim: on a collider that moves with it a body does what it does on one at rest: friction and damping have the forces
 at the start of a step, wherever the collider goes in it."""
 
+import math
+
 import pytest
 import torch
 
@@ -9,6 +11,30 @@ from diffvbd.testing import tolerance
 
 TIME_STEP, DHAT = 0.005, 0.004
 SPEEDS = ((0.0, -5.0, 0.0), (0.0, -0.4, 0.0), (0.7, 0.3, -0.5))  # [m/s], the first 25 mm a step
+
+
+def turned(points: torch.Tensor, angle: float) -> torch.Tensor:
+    """Points that have turned about the z axis."""
+    c, s = math.cos(angle), math.sin(angle)
+    return points @ points.new_tensor(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
+
+
+def test_a_plane_that_turns_away_rubs_as_where_its_points_are(device: str) -> None:
+    """It goes down by 60 mm a step where the body is, three meters from the axis, and its points are there or at it."""
+    energies = (dv.StableNeoHookean(), dv.PairBarrier(1e4, DHAT, self_contact=False, detections=1), dv.Friction(0.4))
+    mesh = dv.mesh.cube(2, size=0.1).translate((3.0, 0.8 * DHAT, 0.0))
+
+    def way(of_points: float) -> torch.Tensor:
+        """Of the body beside its free flight."""
+        model = dv.Model(mesh, energies=energies, colliders=[dv.colliders.Plane((of_points, 0.0, 0.0))], device=device)
+        x, at = model.rest_points, model.collider_points
+        v = x.new_tensor((0.3, -0.05, 0.1)).expand_as(x)
+        end, _ = dv.step(model, x, v, mu=1e5, lam=1e5, time_step=TIME_STEP, sweeps=150, gravity=(0.0, 0.0, 0.0),
+                         colliders=turned(at, -0.02), colliders_before=at)  # fmt: skip
+        return end - x - TIME_STEP * v
+
+    near, far = way(3.0), way(0.0)
+    assert near.abs().max() > 0.01 * DHAT and (far - near).abs().max() <= tolerance("property_subset")
 
 
 def block_below() -> dv.colliders.Obstacle:

@@ -253,6 +253,7 @@ def all_pairs(s: Scene, b: int) -> Pairs:
         i, j, corners, one, other = (a[admitted] for a in (i, j, corners, one, other))
         place = np.where(np.arange(4)[:, None] > 0, later[corners], now[corners]) if kind == 2 else now[corners]
         d, weights = closest(kind, place)
+        least = np.minimum(d, closest(kind, now[corners])[0])  # of a plane, at either end of its way
         offset = s.radius[corners[:, 0]] + s.radius[corners[:, second]]
         rest = s.rest[corners]
         at_rest = closest(kind, rest)[0] if kind != POINT_PLANE else np.full(len(d), np.inf)
@@ -262,15 +263,15 @@ def all_pairs(s: Scene, b: int) -> Pairs:
         dhat = np.where(at_rest < s.dhat, 0.9 * at_rest, s.dhat)
         rooms = np.append(s.rooms, 0)[np.minimum(np.stack([one, other], 1), s.mesh_bodies)].sum(1)
         rooms = np.where(one == other, s.own_share * rooms, rooms)
-        keep = (d - offset < s.dhat + rooms) & (at_rest > 1e-9 * np.maximum(*edges[1:3]))
-        columns = (np.full(len(d), kind), corners, d - offset, weights, np.stack([dhat, offset, threshold], -1),
-                   ((b * 3 + kind) * base + i) * base + j)  # fmt: skip
+        keep = (least - offset < s.dhat + rooms) & (at_rest > 1e-9 * np.maximum(*edges[1:3]))
+        columns = (np.full(len(d), kind), corners, d - offset, least - offset, weights,
+                   np.stack([dhat, offset, threshold], -1), ((b * 3 + kind) * base + i) * base + j)  # fmt: skip
         found.append([a[keep] for a in columns])
-    kind, corners, gap, weights, constants, key = (np.concatenate(a) for a in zip(*found, strict=True))
+    kind, corners, gap, least, weights, constants, key = (np.concatenate(a) for a in zip(*found, strict=True))
     near = np.full(len(s.body), s.reach)
     np.minimum.at(near, corners, gap[:, None])
     room = np.where(s.body < s.mesh_bodies, np.append(s.rooms, 0)[np.minimum(s.body, s.mesh_bodies)], 0.0)
     second = corners[np.arange(len(kind)), np.where(kind == EDGE_EDGE, 2, 1)]
     own = np.where(s.body[corners[:, 0]] == s.body[second], s.own_share, 1.0)
-    margin = constants[:, 0] - (gap - own * (room[corners[:, 0]] + room[second]))
+    margin = constants[:, 0] - (least - own * (room[corners[:, 0]] + room[second]))
     return Pairs(kind, corners, gap, weights, constants, key, margin, near)

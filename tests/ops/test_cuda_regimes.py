@@ -12,6 +12,7 @@ from helpers.exactness import BATCHED, check, check_shapes
 from helpers.regimes import ANY_SIZE, REGIMES, forced, large_inputs
 from helpers.results import TAPES, assert_same_bits, evaluated
 from torch import Tensor
+from torch.profiler import ProfilerActivity, profile
 
 import diffvbd as dv
 from diffvbd import testing
@@ -308,6 +309,17 @@ def test_the_automatic_choice_is_one_of_the_regimes(cells: int, lead: tuple[int,
     assert any(matches)
 
 
+def launches(model: dv.Model, inputs: dict[str, Any], tape: str) -> tuple[int, int]:
+    """Of sweeps and of reverse sweeps in one step: of each color where that is the regime."""
+    with profile(activities=[ProfilerActivity.CUDA]) as seen:
+        evaluated(model, inputs, 3, tape)
+        torch.cuda.synchronize()
+    of = {
+        name: sum(e.count for e in seen.key_averages() if name in e.key) for name in ("sweep_forward", "sweep_reverse")
+    }
+    return of["sweep_forward"], of["sweep_reverse"]
+
+
 @pytest.mark.parametrize("tape", TAPES)
 def test_the_reverse_may_take_another_regime_than_the_sweeps(tape: str) -> None:
     model, inputs = large_inputs(9, 80)
@@ -316,9 +328,13 @@ def test_the_reverse_may_take_another_regime_than_the_sweeps(tape: str) -> None:
     chosen = evaluated(model, inputs, 3, tape)
     with forced("grid"):
         forward = evaluated(model, inputs, 3, tape)
+        few = launches(model, inputs, tape)
     with forced("color"):
         reverse = evaluated(model, inputs, 3, tape)
+        many = launches(model, inputs, tape)
     assert all(torch.equal(chosen[k], forward[k]) for k in ("x", "v"))
+    assert few[0] < many[0] and few[1] < many[1]
+    assert launches(model, inputs, tape) == (few[0], many[1])
     limit = tolerance("property_factor") * tolerance("adjoint")
     for key, value in reverse.items():
         assert value.any() and (key == "v" or relative_error(chosen[key], value) <= limit), key
