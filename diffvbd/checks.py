@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+MODEL = "the Model's"
+HELD = "numbers that {} can hold ({})"  # dtype, and whose it is
 NUMBERS = (int, float, np.floating, np.integer)  # bool, which python counts among them, is checked apart
 
 
@@ -51,9 +53,7 @@ def check_function(name: str, function: Any, *arguments: str) -> None:
         raise TypeError(f"{name}: expected a function of {', '.join(arguments)}: {error}") from None
 
 
-def check_tensor(
-    name: str, value: Any, like: Tensor, what: str = "a number or a tensor", owner: str = "the Model's"
-) -> Tensor:
+def check_tensor(name: str, value: Any, like: Tensor, what: str = "a number or a tensor", owner: str = MODEL) -> Tensor:
     """``value`` as a tensor of like's dtype and device; python numbers are converted, other tensors must match."""
     if not isinstance(value, Tensor):
         if isinstance(value, NUMBERS) and not isinstance(value, bool):
@@ -63,7 +63,7 @@ def check_tensor(
             except RuntimeError:
                 if abs(number) <= torch.finfo(like.dtype).max:
                     raise
-                fail(name, f"a number that {like.dtype} can hold ({owner})", number)
+                fail(name, HELD.format(like.dtype, owner), number)
         raise TypeError(f"{name}: expected {what}, got {kind_of(value)}")
     check_dense(name, value)
     if value.dtype != like.dtype:
@@ -153,8 +153,10 @@ def refuse_gradients(energy: Any) -> None:
         refuse_gradient(key, getattr(energy, key), instead)
 
 
-def check_number(name: str, value: Any, wanted: str = "a finite number >= 0") -> float:
-    """A finite number >= 0; `wanted` for the message."""
+def check_number(
+    name: str, value: Any, wanted: str = "a finite number >= 0", dtype: torch.dtype = torch.float64
+) -> float:
+    """A finite number >= 0, in a Model's dtype, too; `wanted` for the message."""
     refuse_gradient(name, value)
     if isinstance(value, Tensor) and value.numel() == 1:
         value = value.detach().item()
@@ -163,16 +165,26 @@ def check_number(name: str, value: Any, wanted: str = "a finite number >= 0") ->
     value = to_float(name, value)
     if not (math.isfinite(value) and value >= 0):
         fail(name, wanted, value)
+    if value > torch.finfo(dtype).max:
+        fail(name, HELD.format(dtype, MODEL), value)
     return float(value)
 
 
-def check_positive(name: str, value: Any, unit: str = "") -> float:
-    """A finite number > 0, its unit for the message."""
+def check_positive(name: str, value: Any, unit: str = "", dtype: torch.dtype = torch.float64) -> float:
+    """A finite number > 0, in a Model's dtype, too; its unit for the message."""
     wanted = f"a finite number > 0 {unit}".rstrip()
-    number = check_number(name, value, wanted)
+    number = check_number(name, value, wanted, dtype)
     if number == 0:
         fail(name, wanted, value)
     return number
+
+
+def check_held(values: dict[str, Tensor], given: Any) -> dict[str, Tensor]:
+    """`values` of attributes of `given`, where they are still finite in the Model's dtype."""
+    for name, value in values.items():
+        if not bool(torch.isfinite(value).all()):
+            fail(name, HELD.format(value.dtype, MODEL), getattr(given, name))
+    return values
 
 
 def check_time_step(value: Any, dtype: torch.dtype) -> float:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from ..checks import check_dtype, check_kind, check_number, check_positive, fail, vertex_mask
+from ..checks import check_dtype, check_held, check_kind, check_number, check_positive, fail, vertex_mask
 from ..contact.barrier import Friction, PairBarrier
 from ..contact.colliders import Collider
 from ..contact.surface import ContactSurface, build_surface, check_colliders
@@ -109,8 +109,8 @@ class Model:
         check_dtype(dtype)
         self.mesh = mesh
         self._derived: dict[str, Any] = {}
-        self.saturation = None if saturation is None else check_positive("saturation", saturation, "m")
-        self.regularization = check_number("regularization", regularization)
+        self.saturation = None if saturation is None else check_positive("saturation", saturation, "m", dtype)
+        self.regularization = check_number("regularization", regularization, dtype=dtype)
         self._set_energies(checked_energies(energies, mesh.num_vertices))
         self.energy_mask = 0
         for energy in self.energies:
@@ -233,7 +233,7 @@ class Model:
     def constants(self, energy: VertexEnergy | PairBarrier | Friction) -> dict[str, Tensor]:
         """The parameters of one of the Model's energies, as tensors of its dtype and device."""
         if energy.name not in self._constants:
-            self._constants[energy.name] = energy.constants(self._rest_points)
+            self._constants[energy.name] = check_held(energy.constants(self._rest_points), energy)
         return self._constants[energy.name]
 
     def _arrange(self, points: Tensor, tets: Tensor, device: torch.device) -> None:

@@ -44,6 +44,16 @@ MODELS: list[tuple[str, dict[str, Any], str]] = [
     ("saturation", {"saturation": 0.0}, "0"),
     ("saturation", {"saturation": -0.1}, "-0.1"),
     ("saturation", {"saturation": NAN}, "nan"),
+    *((name, {name: 1e39, "dtype": torch.float32}, r"1e\+39") for name in ("saturation", "regularization")),
+    *(
+        (name, {"energies": energy, "dtype": torch.float32}, r"1e\+39")
+        for name, energy in (
+            ("kappa", dv.FloorBarrier(kappa=1e39)),
+            ("kappa", dv.PairBarrier(kappa=1e39)),
+            ("coefficient", (dv.FloorBarrier(), dv.Friction(1e39))),
+            ("stiffness", dv.Anchor(1e39)),
+        )
+    ),
     ("saturation", {"saturation": "some"}, "str"),
     ("saturation", {"saturation": True}, "bool"),
     ("regularization", {"regularization": -1e-6}, "-1e-06"),
