@@ -233,10 +233,6 @@ DIFFVBD_FN Corners<T> corners_with(const Surfaces<T>& in, const Candidate& c, co
   return out;
 }
 template <class T>
-DIFFVBD_FN Corners<T> corners_of(const Surfaces<T>& in, const Candidate& c) {
-  return corners_with(in, c, c.kind == kPointPlane ? in.collider_next : in.collider);
-}
-template <class T>
 DIFFVBD_FN Corners<T> corners_at_rest(const Surfaces<T>& in, const Candidate& c) {
   const Vec3<T> first = point_at(in.rest, c.v[0]);
   Corners<T> out;
@@ -284,17 +280,21 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   return out;
 }
 
+// The gap of a pair, its smallest on the way of its collider, and where that is for the gap. A plane is taken where it
+// ends, or where it begins if it ends or begins behind the point: the start lets both go. Where it moves away it has
+// pushed and rubbed where it came from.
 template <class T>
-DIFFVBD_FN T gap_of(const Surfaces<T>& in, const Candidate& c) {
-  return separation(c.kind, corners_of(in, c)) - offset_of(in, c);
-}
-
-// The smallest gap of a pair, whose own is this one: a plane that moves away pushes and rubs where it comes from.
+struct PairGap {
+  T gap, least;
+  const T* collider;
+};
 template <class T>
-DIFFVBD_FN T least_gap_of(const Surfaces<T>& in, const Candidate& c, T gap) {
-  if (c.kind != kPointPlane || in.collider == in.collider_next) return gap;
-  const T before = separation(c.kind, corners_with(in, c, in.collider)) - offset_of(in, c);
-  return before < gap ? before : gap;
+DIFFVBD_FN PairGap<T> gap_of(const Surfaces<T>& in, const Candidate& c) {
+  const T offset = offset_of(in, c), now = separation(c.kind, corners_with(in, c, in.collider)) - offset;
+  if (c.kind != kPointPlane || in.collider == in.collider_next) return {now, now, in.collider};
+  const T next = separation(c.kind, corners_with(in, c, in.collider_next)) - offset;
+  const bool behind = !(T(0) < now && T(0) < next);
+  return {behind && next == next ? now : next, now < next ? now : next, behind ? in.collider : in.collider_next};
 }
 
 // Whether a pair whose smallest gap is this, and whose barrier reaches as far as dhat, may become active before the
@@ -321,7 +321,7 @@ DIFFVBD_FN void store_near_pair(const Surfaces<T>& in, int64_t scene, int32_t i,
     return;
   }
   const Candidate c = candidate_of_key(in, key);
-  const Distance<T> at = distance(c.kind, corners_of(in, c));
+  const Distance<T> at = distance(c.kind, corners_with(in, c, gap_of(in, c).collider));
   for (int k = 0; k < 4; ++k) corners[k] = c.v[k], values[k] = at.w[k];
   corners[4] = c.kind;
   values[4] = at.n.x, values[5] = at.n.y, values[6] = at.n.z;
@@ -360,7 +360,7 @@ DIFFVBD_FN void store_hints(const Surfaces<T>& in, const Detected<T>& out, const
   const T sign = first == (nearest < c.second()) ? T(1) : T(-1);
   for (int i = 0; i < 3; ++i) constants[3 + i] = sign * values[4 + i];
   constants[6] = gap(nearest);
-  constants[7] = gap_of(in, c);
+  constants[7] = gap_of(in, c).gap;
 }
 
 }  // namespace diffvbd::contact

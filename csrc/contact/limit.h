@@ -15,9 +15,10 @@ constexpr double kShare = 2 * kBothShare;    // and where the other one rests
 constexpr double kStartLeast = 0.05;         // of any gap that what does not minimise the barrier may close
 constexpr double kStartPart = 0.5;           // of dhat: such motion brings no pair closer
 constexpr double kTight = 0.125;             // of that: a gap below it such motion closes no further,
-constexpr double kTightest = 1e-6;           // or by so much of itself: rounding makes as much of a way along it
+constexpr double kTightest = 1e-6;           // or by so much of itself
 constexpr double kGuardUlps = 32;            // roundings of a position, which a gap is not trusted to
-constexpr double kClosedGuards = 1.0 / 128;  // of these: as much, too, where that is more
+constexpr double kClosedGuards = 1.0 / 128;  // of these, that a way along a gap may seem to close
+constexpr double kTrusted = 0.25;            // of these, below which nothing goes; up to them, what does not close it
 
 template <class T>
 DIFFVBD_FN T least_of(T dhat) {
@@ -109,11 +110,9 @@ DIFFVBD_FN Vec3<T> across(int kind, const Corners<T>& c) {
 template <class T>
 DIFFVBD_FN bool holds_along(int kind, const Vec3<T>& m, const Separation<T>& s, T guard, T least, const Vec3<T> (&d)[4],
                             const T (&share)[4], bool bounded, bool careful) {
-  const T wide = s.gap - guard;
-  if (!(T(0) < wide)) return false;
-  const T most = T(kStartLeast) * wide, relative = T(kTightest) * wide, absolute = T(kClosedGuards) * guard;
-  const T rounded = relative < absolute ? absolute : relative;
-  const T some = careful && wide < T(kTight) * least && rounded < most ? rounded : most;
+  if (!(T(kTrusted) * guard < s.gap)) return false;
+  const T wide = guard < s.gap ? s.gap - guard : T(0), rounded = T(kClosedGuards) * guard;
+  const T some = T(careful && wide < T(kTight) * least ? kTightest : kStartLeast) * wide;
   for (int k = 0; k < 4; ++k) {
     const T toward = k < sides(kind) ? -dot(m, d[k]) : dot(m, d[k]);
     T room = share[k] * wide;
@@ -121,7 +120,7 @@ DIFFVBD_FN bool holds_along(int kind, const Vec3<T>& m, const Separation<T>& s, 
       const T outside = share[k] * (wide - least);
       room = some < outside ? outside : some;
     }
-    if (!(toward <= s.slack[k] + room)) return false;
+    if (!(toward <= s.slack[k] + (room + rounded))) return false;
   }
   return true;
 }

@@ -165,12 +165,14 @@ DIFFVBD_FN void room_beside_island(const RoomInputs<T>& in, const MovingBody<T>&
   room_at(in, work.own_room, b.scene, b.body) = own_room;
 }
 
-// The last column of both rooms.
+// The end: no collider can push what belongs to an island that none comes near. Then the last column of both rooms.
 template <class T, class Team>
-DIFFVBD_FN void largest_of_scene(const RoomInputs<T>& in, int64_t scene, const Team& team, const RoomWork<T>& work) {
+DIFFVBD_FN void end_rooms(const RoomInputs<T>& in, int64_t scene, const Team& team, const RoomWork<T>& work) {
   double most[2];
   team.template most<2>(in.motion.bodies, most, [&](int32_t k, double* of) {
-    of[0] = room_at(in, work.room, scene, k), of[1] = room_at(in, work.own_room, scene, k);
+    T& room = room_at(in, work.room, scene, k);
+    if (0 <= work.island[scene * in.motion.bodies + k]) room -= work.pushed[scene];
+    of[0] = room, of[1] = room_at(in, work.own_room, scene, k);
   });
   if (!team.leads()) return;
   room_at(in, work.room, scene, in.motion.bodies) = T(most[0]);

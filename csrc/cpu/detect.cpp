@@ -135,7 +135,7 @@ class SceneDetection {
 
   void examine(const Candidate& c, Finds<T>& finds) {
     if (!is_considered(in_, c)) return;
-    const T gap = gap_of(in_, c), least = least_gap_of(in_, c, gap);
+    const auto [gap, least, at] = gap_of(in_, c);
     if (least >= reach_ || (gap > T(0) && !is_listed(in_, c, least, in_.dhat))) return;
     const Constants<T> constants = constants_of(in_, c);
     if (!constants.admitted) return;

@@ -53,7 +53,7 @@ void find_rooms(RoomInputs<T> in, const RoomWork<T>& work) {
                            [&](const MovingBody<T>& b, const Threads& team) { room_beside_island(in, b, team, work); });
     find_islands(in.islands, work.island);
   }
-  for (int64_t scene = 0; scene < scenes; ++scene) largest_of_scene(in, scene, one, work);
+  for (int64_t scene = 0; scene < scenes; ++scene) end_rooms(in, scene, one, work);
 }
 
 #define DIFFVBD_INSTANTIATE(T)                                                              \

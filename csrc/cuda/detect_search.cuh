@@ -102,10 +102,11 @@ struct Search {
 
   __device__ void examine(const Candidate& c) const {
     if (!is_considered(in, c)) return;
-    const T gap = gap_of(in, c), least = least_gap_of(in, c, gap);
-    if (least >= reach_of(in, c.scene) || (gap > T(0) && !is_listed(in, c, least, in.dhat))) return;
+    const PairGap<T> at = gap_of(in, c);
+    const T gap = at.gap;
+    if (at.least >= reach_of(in, c.scene) || (gap > T(0) && !is_listed(in, c, at.least, in.dhat))) return;
     if constexpr (listing) {
-      settle(c, gap, least);
+      settle(c, at);
     } else {
       append(work.found, work.candidates, kCandidates * capacity, key_of(in, c));
       const Ordered<T> bits = ordered(gap);
@@ -118,7 +119,8 @@ struct Search {
   }
 
   // Of a pair that may be listed.
-  __device__ void settle(const Candidate& c, T gap, T least) const {
+  __device__ void settle(const Candidate& c, const PairGap<T>& at) const {
+    const T gap = at.gap;
     const Constants<T> constants = constants_of(in, c);
     if (!constants.admitted) return;
     const uint64_t key = key_of(in, c);
@@ -129,7 +131,7 @@ struct Search {
       const int64_t row = c.scene * in.corners + c.v[k];
       if (work.near_gap[row] == bits) lower(work.near_key + row, static_cast<unsigned long long>(key));
     }
-    if (is_listed(in, c, least, constants.dhat)) append(work.listed, work.keys, capacity, key);
+    if (is_listed(in, c, at.least, constants.dhat)) append(work.listed, work.keys, capacity, key);
   }
 
   // Of a point that is not finite: it counts as touching, so that nobody takes the scene for a good one.
@@ -282,8 +284,7 @@ __global__ void settle_kernel(const Surfaces<T> in, Workspace<T> work, int64_t c
   if (!kept_all(work, capacity) || i >= static_cast<int64_t>(*work.found)) return;
   const Search<T, true> search{in, work, capacity};
   const Candidate c = candidate_of_key(in, work.candidates[i]);
-  const T gap = gap_of(in, c);
-  search.settle(c, gap, least_gap_of(in, c, gap));
+  search.settle(c, gap_of(in, c));
 }
 
 template <class T, bool listing>

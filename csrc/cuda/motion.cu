@@ -75,7 +75,7 @@ __global__ void __launch_bounds__(kThreads)
   if constexpr (first) {
     prepare_scene(in, blockIdx.x, BlockTeam{part}, work);
   } else {
-    largest_of_scene(in, blockIdx.x, BlockTeam{part}, work);
+    end_rooms(in, blockIdx.x, BlockTeam{part}, work);
   }
 }
 
@@ -131,7 +131,7 @@ __global__ void __launch_bounds__(kThreads)
     changes = __syncthreads_or(changes);
     if (0 <= round && !changes) break;
   }
-  largest_of_scene(in, scene, team, work);
+  end_rooms(in, scene, team, work);
 }
 
 }  // namespace

@@ -35,6 +35,7 @@ from .chosen import rollout_with
 from .contact_check import checks_contact, warn_of_contact
 from .energy_check import look_at_energy, warn_of_end, warn_of_last_end
 from .finer import rollout_finer
+from .repeated import repeated
 from .settings import Settings
 from .trajectory import PerStep, Trajectory, stacked
 
@@ -93,9 +94,10 @@ def rollout(
         mu, lam, young, poisson, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in
             time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step
             (None only for a step without ``force``).
-            A callable may close over tensors and modules that require grad: they get gradients under every schedule. It
-            must be deterministic, because a checkpointed segment calls it again in the backward. ``prescribed`` may
-            also have the initial x where a vertex is not pinned.
+            A callable may close over tensors and modules that require grad: they get gradients under every schedule. A
+            checkpointed segment calls it again in the backward, where it must return the same: no state that it keeps
+            from call to call, nothing that has changed in place since. ``prescribed`` may also have the initial x where
+            a vertex is not pinned.
         checkpoint_every: Between checkpoints of n steps only states are kept, and the segment is run again in the
             backward: n keeps steps / n states and the tapes of n steps. ``None`` keeps all tapes.
             :class:`diffvbd.BinomialCheckpoints` keeps a given number of states and one tape. ``"auto"`` keeps all tapes
@@ -126,6 +128,8 @@ def rollout(
 
     Raises:
         ValueError, TypeError: As step; also where a per_step value has another number of steps, or surfaces intersect.
+        RuntimeError: In the backward, under checkpoints, where an argument has changed in place, or a callable returns
+            another value than before (on CUDA the gradient is NaN then).
         NotImplementedError: ``estimate_errors`` with contact or friction; another ``checkpoint_every`` than ``"auto"``
             and ``None`` inside torch.func transforms.
     """
@@ -176,7 +180,11 @@ def rollout(
     every, adjoint = choose_schedule(checkpoint_every, adjoint, model, scenes, steps, solves_of(scheme) * sweeps)
     # A segment that runs again reads these anew: autograd cannot see that they were changed in between.
     read = {**options, "colliders_before": colliders_before}
-    versions = [] if every is None or torch.compiler.is_compiling() else _versions(read, own)
+    again = every is not None and torch.is_grad_enabled() and not torch.compiler.is_compiling()
+    versions = _versions(read, own) if again else []
+    if again:
+        options = {name: repeated(name, value) for name, value in options.items()}
+        own = {name: repeated(f'parameters["{name}"]', value) for name, value in own.items()}
     bar = _Progress(steps) if progress else None
     errors: dict[int, ErrorEstimate] = {}  # by step: a segment that runs again finds them
     last: list[Any] = []  # what the last step went from, and to
@@ -197,7 +205,10 @@ def rollout(
             given = _to_advance(model, options, k, x, v, outer, colliders_before)
             check_staged(scheme, given)
             run = partial(advance, adjoint=adjoint, index=k)
-            x, v, past, solve = take(scheme, model, x, v, past, now, given, run)
+            try:
+                x, v, past, solve = take(scheme, model, x, v, past, now, given, run)
+            except (ValueError, TypeError) as error:
+                raise _in_step(error, k) from error
             if estimate_errors and k not in errors:
                 loads = {name: solve.given[name] for name in _LOADS}
                 errors[k] = error_of(model, solve.x, solve.v, solve.prepared, **loads)
@@ -282,13 +293,18 @@ def _to_prepare(options: dict[str, Any], parameters: dict[str, Any], k: int, x: 
 
 
 def _prepared(model: Model, lead: Any, chosen: dict[str, Any], values: dict[str, Any], k: int) -> Any:
-    """prepare() of step k; an error says which step it was."""
+    """prepare() of step k."""
     try:
         return prepare(model, lead, **chosen, **values)
     except (ValueError, TypeError) as error:
-        if type(error) not in (ValueError, TypeError):  # another one may take other arguments
-            raise
-        raise type(error)(f"{error}, in step {k}") from None
+        raise _in_step(error, k) from error
+
+
+def _in_step(error: Exception, k: int) -> Exception:
+    """An error that says which step it was."""
+    if type(error) not in (ValueError, TypeError):  # another one may take other arguments
+        return error
+    return type(error)(f"{error}, in step {k}")
 
 
 def _to_advance(model: Model, options: dict[str, Any], k: int, x: Tensor, v: Tensor, start: Tensor,

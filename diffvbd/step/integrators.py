@@ -213,7 +213,7 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
         return Taken(x_end, v_end, remembered(x_end), last)
 
     def last_solve(feasible: Tensor, reference: Tensor, carried: Tensor, share: float, chord: float,
-                   begun: Tensor | None = None) -> Taken:  # fmt: skip
+                   end: dict[str, Any] = end, begun: Tensor | None = None) -> Taken:  # fmt: skip
         """From a feasible state, about a velocity w and a position that is h_solve times ``carried`` away from it."""
         start, weights = reference + carried, _over(whole, share, chord)
         if euler is not None:
@@ -230,14 +230,19 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
         carried = history.moved / (2 * time_step)
         return last_solve(x, v + (v - history.v) / 3, carried, 2 / 3, CHORD_OF_BDF2)
     first, second = CHORDS_OF_SDIRK2
-    x1, v1, _ = solve(x, v, _over(whole, GAMMA, first), _at_share(given, x, GAMMA))
-    feasible, carried = x1, math.sqrt(2) * v1
+    on_the_way = _at_share(given, x, GAMMA)
+    x1, v1, _ = solve(x, v, _over(whole, GAMMA, first), on_the_way)
+    feasible, carried, before = x1, math.sqrt(2) * v1, on_the_way["colliders"]
     if euler is not None and model.contact is not None:
         # x1 keeps bodies apart that all are there; beside one that is still at x, which others may meet, all begin at x
         mixed = euler.any(-1)[..., None, None]
         feasible = torch.where(mixed, x, x1)
         carried = torch.where(mixed, carried + (x1 - x) / (GAMMA * time_step), carried)
-    return last_solve(feasible, v + (1 + math.sqrt(2)) * (v1 - v), carried, GAMMA, second, x1)
+        if isinstance(given["colliders_before"], Tensor):
+            before = torch.where(mixed, given["colliders_before"], before)
+    if given["colliders_before"] is not None:
+        end = {**end, "colliders_before": before}
+    return last_solve(feasible, v + (1 + math.sqrt(2)) * (v1 - v), carried, GAMMA, second, end, x1)
 
 
 def _named(history: History | None, given: dict[str, Any]) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from helpers.detection_scenes import (
-    POINT_PLANE,
     Pairs,
     Scene,
     Surface,
@@ -84,7 +83,7 @@ def check_near(s: Scene, b: int, e: Pairs, got: Any, index: dict, tol: float) ->
             continue
         pair = index[(row[4], *row[:4])]
         assert i in row[:4] and e.gap[pair] - e.near[i] < tol
-        c = np.concatenate([s.x[b], s.collider_next[b] if row[4] == POINT_PLANE else s.collider[b]])[row[:4]]
+        c = np.concatenate([s.x[b], s.collider_next[b] if e.ends[pair] else s.collider[b]])[row[:4]]
         d, offset = values[i, 7] + e.constants[pair, 1], values[i, :4] @ (c - c[0])
         assert abs(np.linalg.norm(values[i, 4:7]) - 1) < 10 * tol and abs(values[i, :4].sum()) < tol
         assert abs(values[i, 4:7] @ offset - d) < 10 * tol

@@ -10,7 +10,7 @@ import diffvbd as dv
 from diffvbd.testing import tolerance
 
 TIME_STEP, DHAT = 0.005, 0.004
-SPEEDS = ((0.0, -5.0, 0.0), (0.0, -0.4, 0.0), (0.7, 0.3, -0.5))  # [m/s], the first 25 mm a step
+SPEEDS = ((0.0, -5.0, 0.0), (0.0, 5.0, 0.0), (0.0, -0.4, 0.0), (0.7, 0.3, -0.5))  # [m/s], of the first 25 mm a step
 
 
 def turned(points: torch.Tensor, angle: float) -> torch.Tensor:
@@ -35,6 +35,27 @@ def test_a_plane_that_turns_away_rubs_as_where_its_points_are(device: str) -> No
 
     near, far = way(3.0), way(0.0)
     assert near.abs().max() > 0.01 * DHAT and (far - near).abs().max() <= tolerance("property_subset")
+
+
+def test_a_plane_that_leaves_no_way_raises(device: str) -> None:
+    """It comes from below a body that stays, or begins above its lowest vertices."""
+    mesh = dv.mesh.cube(2, size=0.1).translate((0.0, 0.8 * DHAT, 0.0))
+    model = dv.Model(mesh, energies=(dv.StableNeoHookean(), dv.PairBarrier(1e4, DHAT, self_contact=False)),
+                     colliders=[dv.colliders.Plane()], device=device)  # fmt: skip
+    x, at = model.rest_points, model.collider_points
+    up = at.new_tensor((0.0, 2 * DHAT, 0.0))
+    given = {"mu": 1e5, "lam": 1e5, "time_step": TIME_STEP, "sweeps": 5}
+    with pytest.raises(ValueError, match=r"colliders: expected motion that leaves bodies a way"):
+        dv.step(model, x, torch.zeros_like(x), colliders=at + up, colliders_before=at, **given)
+    for end in (at, at + up, at - up):
+        with pytest.raises(ValueError, match=r"colliders: expected surfaces that do not touch"):
+            dv.step(model, x, torch.zeros_like(x), colliders=end, colliders_before=at + 0.5 * up, **given)
+    model = model.replace(colliders=[dv.colliders.Plane((2.0, 0.0, 0.0))])
+    end = turned(model.collider_points, 0.01)
+    v = up.expand_as(x) / TIME_STEP
+    rising = {"colliders": end, "colliders_before": model.collider_points}
+    step, _ = dv.step(model, x + up.new_tensor((3.0, 0.0, 0.0)), 4 * v, **rising, **given)  # goes ahead of it
+    assert torch.isfinite(step).all()
 
 
 def block_below() -> dv.colliders.Obstacle:

@@ -150,7 +150,9 @@ def by_torch(g: Given) -> RoomsOfBodies:
     if g.barrier.self_contact:
         own = torch.minimum((ROOM + 1) * (bent + way["stretched"]) + falls, s.most_own_room)
         own = torch.maximum(torch.maximum(own, torch.minimum(room, s.least_own_room)), way["driven"])
-    return RoomsOfBodies(islands(room), last(room), last(own), over)
+    island = islands(room)
+    room = torch.where(island >= 0, room - pushed, room)  # which no collider comes near
+    return RoomsOfBodies(island, last(room), last(own), over)
 
 
 def check(g: Given) -> None:
@@ -188,6 +190,15 @@ def test_bodies_far_from_others_get_the_room_of_one_alone(device: str) -> None:
     assert (alone.room[:, 1:4] > s.most_room[1:]).all()
     assert (near.found().island == -1).all()
     assert (near.found().room[:, 1:4] < alone.room[:, 1:4]).all()
+
+
+def test_a_collider_far_away_gives_no_room(device: str) -> None:
+    """However far it goes in a step: such rooms would fill lists of pairs."""
+    g = given(device, speed=0.03, pinned=False, plane=False, self_contact=False, floor=False, bodies=2)
+    far = g.was + 100.0
+    still, moved = (g._replace(was=far, now=far + way).found() for way in (0.0, 1.0))
+    assert (still.island >= 0).all() and torch.equal(still.island, moved.island)
+    torch.testing.assert_close(moved.room, still.room, rtol=tolerance("sums_of_bodies"), atol=0.0)
 
 
 def test_what_is_not_finite_does_not_pass_for_a_room(device: str) -> None:

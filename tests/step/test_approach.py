@@ -60,6 +60,33 @@ def test_a_frame_that_moves_changes_nothing(shape: str, gap: float, toward: floa
     assert bool(found[0][0][0].any()) == (toward < -0.1)
 
 
+@pytest.mark.parametrize("integrator", SECOND, ids=str)
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(("gap", "toward", "friction"), [(0.018, 0.0, 0.4), (0.0085, -0.1, None)])
+def test_colliders_go_on_from_where_the_first_solve_has_left_them(
+    shape: str, gap: float, toward: float, friction: float | None, integrator: Any, device: str
+) -> None:
+    """What glides above a collider that goes with it is not rubbed; what comes down on one lands on it."""
+    model, steps = model_above(shape, gap, device), 3
+    if friction is not None:
+        model = model.replace(energies=(*model.energies, dv.Friction(friction)))
+    found = []
+    for speed in (0.0, -2.0, -4.0, 4.0):
+        v = torch.zeros_like(model.rest_points)
+        v[:, 0], v[:, 1] = 0.1, toward + speed
+        times = TIME_STEP * torch.arange(1, steps + 1, dtype=v.dtype, device=device)
+        ways = torch.zeros((steps, 1, 3), dtype=v.dtype, device=device)
+        ways[:, 0, 1] = speed * times
+        _, motion = run(model, v, ways, integrator)
+        moved = motion.x[1:].clone()
+        moved[..., 1] -= speed * times[:, None]
+        found.append(moved)
+    free = model.rest_points + TIME_STEP * found[0].new_tensor((0.1, toward, 0.0))
+    assert bool((found[0][0] - free).abs().max() > tolerance("property_subset")) == (friction is None)
+    for moved in found[1:]:
+        assert (moved - found[0]).abs().max() <= tolerance("property_subset")
+
+
 @pytest.mark.parametrize(("gap", "rises", "touches"), [(0.035, 0.0, False), (0.035, 0.03, True), (0.009, -0.06, True)])
 def test_a_plane_that_turns_counts_where_the_body_is(gap: float, rises: float, touches: bool, device: str) -> None:
     """Three meters from the points of a plane, which hardly move, it goes up or down."""
