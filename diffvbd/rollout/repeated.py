@@ -26,15 +26,17 @@ def repeated(name: str, value: Any) -> Any:
 
     def called(step: int, x: Tensor, v: Tensor) -> Any:
         found = value(step, x, v)
-        is_tensor = isinstance(found, Tensor)
-        if is_tensor and is_captured(found):
+        if not isinstance(found, Tensor):
+            same = _are_equal(seen.setdefault(step, found), found)
+        elif is_captured(found):
             return found
-        now = _sums(found) if is_tensor else found
-        before = seen.setdefault(step, now)
-        same = _are_close(before, now, found) if is_tensor else _are_equal(before, now)
-        if is_tensor and found.is_cuda:  # the same operations in each run
-            return found * torch.where(same, 1.0, torch.nan).to(found.dtype)
-        if not bool(same):
+        else:
+            now = _sums(found)
+            close = _are_close(seen.setdefault(step, now), now, found)
+            if found.is_cuda:  # the same operations in each run
+                return found * torch.where(close, 1.0, torch.nan).to(found.dtype)
+            same = bool(close)
+        if not same:
             raise RuntimeError(CHANGED.format(name, step))
         return found
 
@@ -50,7 +52,7 @@ def _sums(value: Tensor) -> Tensor:
 def _are_close(before: Any, now: Tensor, value: Tensor) -> Tensor:
     """Whether sums differ by no more than what rounding of the values makes of them."""
     if not isinstance(before, Tensor) or before is now:
-        return torch.tensor(before is now, device=now.device)
+        return now.new_full((), before is now, dtype=torch.bool)
     share = torch.finfo(value.dtype if value.is_floating_point() else torch.float64).eps ** 0.5
     scale = torch.stack([(value.numel() * now[1]).sqrt(), now[1]])
     return ((now - before).abs() <= share * scale).all()

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from ..energies import barrier_curvature
 from ..model.model import Model
-from ..ops.contact_start import gaps
 from ..reference.distance import EDGE_EDGE, POINT_PLANE
 from .arguments import Prepared
 from .contact import ContactStep
@@ -77,9 +76,7 @@ def _near_pairs(model: Model, begun: Begun, prepared: Prepared, way: Tensor, bef
     rows = torch.arange(len(kind), device=way.device)
     at = torch.cat([step.x_prev if begun.origin is None else step.x_prev + step.origin, before], 1)
     most = _way_between(kind, [ways[scene, c] for c in corner], [at[scene, c] for c in corner])
-    gap, dhat = found.listed.constants[:, -1], found.listed.constants[:, 0]
-    if before is not after:
-        gap = gaps(step.x_prev, step.origin, step.before, *found.listed[:3])
+    gap, dhat = step.gaps_before(found.listed), found.listed.constants[:, 0]
     near = gap - MARGIN * most < (1 + LEAST) * dhat
     near = near & (rows < found.listed.ptr[-1] // 4)  # that pairs fill
     if _extrapolates(model, prepared):

@@ -122,14 +122,18 @@ class ContactStep:
         """Whether values may decide sizes: on CUDA that would wait."""
         return not x.is_cuda
 
+    def gaps_before(self, listed: Pairs) -> Tensor:
+        """Gaps of pairs at the start of the step [n] [m]."""
+        if self.colliders is self.before:
+            return listed.constants[:, -1]
+        return ops_start.gaps(self.x_prev, self.origin, self.before, *listed[:3])
+
     def _pushing(self, listed: Pairs) -> Pairs:
         """The pairs that may push at the start: the same of a scene in any batch. On CUDA they are found if sweeps go
         through them, too."""
         if not (self._rubs or self._reads(self.x_prev)):
             return listed
-        gap = listed.constants[:, -1]
-        if self.colliders is not self.before:
-            gap = ops_start.gaps(self.x_prev, self.origin, self.before, *listed[:3])
+        gap = self.gaps_before(listed)
         return some_of(listed, (gap < (1 + CLOSE) * listed.constants[:, 0]).contiguous())[0]
 
     def _narrowed(self, listed: Pairs, x: Tensor, collider: Tensor, room: Tensor) -> tuple[Pairs, Tensor | None]:
@@ -353,17 +357,12 @@ class ContactStep:
             scene, corners = surface.corners_of(pair)
             vertices = self.x_prev.shape[1]
             named = "x or colliders" if any(corner >= vertices for corner in corners) else "x"
-            moved = named != "x" and self.colliders is not self.before  # through something, it may be
             owners = surface.owners_of(corners[0], corners[3])
             raise ValueError(
                 f"{named}: expected surfaces that do not touch, got {touching} pairs without a gap "
                 + (f"in part {r} of the step" if r else "at the start of the step")
                 + f", one of the corner points {corners} of {owners} in scene {scene}: "
-                + (
-                    "move colliders less, or use more detections or a smaller time_step"
-                    if moved
-                    else advice_to_part(self.x_prev, self.origin, self.barrier.dhat)
-                )
+                + advice_to_part(self.x_prev, self.origin, self.barrier.dhat)
             )
         if hindered:
             raise ValueError(
