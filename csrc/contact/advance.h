@@ -77,20 +77,16 @@ struct Ways {
   }
 };
 
-// A point that its plane would pass: at least the way of the plane, and what is left of the gap from before, it has to
-// go itself. Apart, since it is rare.
+// The gap of a point above a plane that has yet to move. Apart, since it is seldom asked for.
 template <class T>
-DIFFVBD_APART void add_way_of_plane(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair, T offset,
-                                    Separation<T>& to) {
-  Corners<T> before;
-  Vec3<T> at[4];
-  for (int k = 1; k < 4; ++k) at[k] = vector_at(in.collider + row_of_collider(in, pair, k));
+DIFFVBD_APART T gap_before(const AdvanceInputs<T>& in, const AdvanceState<T>& s, const int32_t* pair, T offset) {
   const Trial<T> t = trial(in, s, pair[5], pair[0]);
-  before.x[0] = zero3<T>();
-  for (int k = 1; k < 4; ++k) before.x[k] = (at[k] - t.at) - t.from;
-  const T gap = distance(kPointPlane, before).d - offset;
-  if (!(T(0) < gap)) return;
-  to.slack[0] = to.gap - gap, to.gap = gap;
+  Corners<T> corners;
+  corners.x[0] = zero3<T>();
+  for (int k = 1; k < 4; ++k) {
+    corners.x[k] = (vector_at(in.collider + row_of_collider(in, pair, k)) - t.at) - t.from;
+  }
+  return distance(kPointPlane, corners).d - offset;
 }
 
 // What keeps a pair apart along the direction of its closest points in a move: all but the ways that it tries.
@@ -106,8 +102,11 @@ struct PairPlane {
     n = distance(record[4], at.corners).n;
     separation = Separation<T>(record[4], at.corners, n, constants.offset);
     guard = at.guard, least = least_of(constants.dhat);
-    const bool behind = record[4] == kPointPlane && s.first && !(guard < separation.gap);
-    if (behind && in.collider != in.collider_next) add_way_of_plane(in, s, record, constants.offset, separation);
+    // a plane that would pass the point: this has to go as far as that comes
+    if (record[4] == kPointPlane && s.first && !(guard < separation.gap) && in.collider != in.collider_next) {
+      const T before = gap_before(in, s, record, constants.offset);
+      if (T(0) < before) separation.slack[0] = separation.gap - before, separation.gap = before;
+    }
   }
   DIFFVBD_FN void forget() { least = T(-1); }
   DIFFVBD_FN bool is_known() const { return T(0) <= least; }

@@ -280,6 +280,12 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   return out;
 }
 
+// The gap of a pair with its collider at these points.
+template <class T>
+DIFFVBD_FN T gap_at(const Surfaces<T>& in, const Candidate& c, const T* collider) {
+  return separation(c.kind, corners_with(in, c, collider)) - offset_of(in, c);
+}
+
 // The gap of a pair, its smallest on the way of its collider, and where that is for the gap. A plane is taken where it
 // ends, or where it begins if it ends or begins behind the point: the start lets both go. Where it moves away it has
 // pushed and rubbed where it came from.
@@ -289,12 +295,18 @@ struct PairGap {
   const T* collider;
 };
 template <class T>
-DIFFVBD_FN PairGap<T> gap_of(const Surfaces<T>& in, const Candidate& c) {
-  const T offset = offset_of(in, c), now = separation(c.kind, corners_with(in, c, in.collider)) - offset;
-  if (c.kind != kPointPlane || in.collider == in.collider_next) return {now, now, in.collider};
-  const T next = separation(c.kind, corners_with(in, c, in.collider_next)) - offset;
+DIFFVBD_FN PairGap<T> gap_of_plane(const Surfaces<T>& in, const Candidate& c) {
+  const T now = gap_at(in, c, in.collider);
+  if (in.collider == in.collider_next) return {now, now, in.collider};
+  const T next = gap_at(in, c, in.collider_next);
   const bool behind = !(T(0) < now && T(0) < next);
   return {behind && next == next ? now : next, now < next ? now : next, behind ? in.collider : in.collider_next};
+}
+template <class T>
+DIFFVBD_FN PairGap<T> gap_of(const Surfaces<T>& in, const Candidate& c) {
+  if (c.kind == kPointPlane) return gap_of_plane(in, c);
+  const T gap = gap_at(in, c, in.collider);
+  return {gap, gap, in.collider};
 }
 
 // Whether a pair whose smallest gap is this, and whose barrier reaches as far as dhat, may become active before the
@@ -321,7 +333,8 @@ DIFFVBD_FN void store_near_pair(const Surfaces<T>& in, int64_t scene, int32_t i,
     return;
   }
   const Candidate c = candidate_of_key(in, key);
-  const Distance<T> at = distance(c.kind, corners_with(in, c, gap_of(in, c).collider));
+  const T* collider = c.kind == kPointPlane ? gap_of_plane(in, c).collider : in.collider;
+  const Distance<T> at = distance(c.kind, corners_with(in, c, collider));
   for (int k = 0; k < 4; ++k) corners[k] = c.v[k], values[k] = at.w[k];
   corners[4] = c.kind;
   values[4] = at.n.x, values[5] = at.n.y, values[6] = at.n.z;

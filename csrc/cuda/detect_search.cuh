@@ -100,13 +100,11 @@ struct Search {
     lower(&work.touching[1], static_cast<unsigned long long>(key));
   }
 
-  __device__ void examine(const Candidate& c) const {
-    if (!is_considered(in, c)) return;
-    const PairGap<T> at = gap_of(in, c);
-    const T gap = at.gap;
-    if (at.least >= reach_of(in, c.scene) || (gap > T(0) && !is_listed(in, c, at.least, in.dhat))) return;
+  // Of a pair with its gap and the smallest on the way of its collider.
+  __device__ void look_at(const Candidate& c, T gap, T least) const {
+    if (least >= reach_of(in, c.scene) || (gap > T(0) && !is_listed(in, c, least, in.dhat))) return;
     if constexpr (listing) {
-      settle(c, at);
+      settle(c, gap, least);
     } else {
       append(work.found, work.candidates, kCandidates * capacity, key_of(in, c));
       const Ordered<T> bits = ordered(gap);
@@ -119,8 +117,7 @@ struct Search {
   }
 
   // Of a pair that may be listed.
-  __device__ void settle(const Candidate& c, const PairGap<T>& at) const {
-    const T gap = at.gap;
+  __device__ void settle(const Candidate& c, T gap, T least) const {
     const Constants<T> constants = constants_of(in, c);
     if (!constants.admitted) return;
     const uint64_t key = key_of(in, c);
@@ -131,7 +128,7 @@ struct Search {
       const int64_t row = c.scene * in.corners + c.v[k];
       if (work.near_gap[row] == bits) lower(work.near_key + row, static_cast<unsigned long long>(key));
     }
-    if (is_listed(in, c, at.least, constants.dhat)) append(work.listed, work.keys, capacity, key);
+    if (is_listed(in, c, least, constants.dhat)) append(work.listed, work.keys, capacity, key);
   }
 
   // Of a point that is not finite: it counts as touching, so that nobody takes the scene for a good one.
@@ -158,14 +155,20 @@ struct Search {
   }
 
   __device__ void examine_leaf(int64_t scene, int kind, int32_t item, int32_t leaf) const {
-    examine(candidate(in, scene, kind, item, work.forest.tree(kind, scene)[leaf].item));
+    const Candidate c = candidate(in, scene, kind, item, work.forest.tree(kind, scene)[leaf].item);
+    if (!is_considered(in, c)) return;
+    const T gap = gap_at(in, c, in.collider);
+    look_at(c, gap, gap);
   }
 
   // The planes of colliders, as one of `share` threads.
   __device__ void examine_planes(const Query& q, int lane, int share) const {
     if (q.box.group == in.mesh_bodies) return;
     for (int32_t p = lane; p < in.num_planes; p += share) {
-      examine(candidate(in, q.scene, kPointPlane, q.box.item, p));
+      const Candidate c = candidate(in, q.scene, kPointPlane, q.box.item, p);
+      if (!is_considered(in, c)) continue;
+      const PairGap<T> at = gap_of_plane(in, c);
+      look_at(c, at.gap, at.least);
     }
   }
 
@@ -284,7 +287,8 @@ __global__ void settle_kernel(const Surfaces<T> in, Workspace<T> work, int64_t c
   if (!kept_all(work, capacity) || i >= static_cast<int64_t>(*work.found)) return;
   const Search<T, true> search{in, work, capacity};
   const Candidate c = candidate_of_key(in, work.candidates[i]);
-  search.settle(c, gap_of(in, c));
+  const PairGap<T> at = gap_of(in, c);
+  search.settle(c, at.gap, at.least);
 }
 
 template <class T, bool listing>
