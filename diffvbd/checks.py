@@ -51,6 +51,9 @@ def check_function(name: str, function: Any, *arguments: str) -> None:
         signature.bind(*arguments)
     except TypeError as error:
         raise TypeError(f"{name}: expected a function of {', '.join(arguments)}: {error}") from None
+    taken = list(signature.parameters)[: len(arguments)]
+    if any(own in arguments and own != wanted for own, wanted in zip(taken, arguments, strict=False)):
+        raise TypeError(f"{name}: expected a function of {', '.join(arguments)} in this order, got {', '.join(taken)}")
 
 
 def check_tensor(name: str, value: Any, like: Tensor, what: str = "a number or a tensor", owner: str = MODEL) -> Tensor:

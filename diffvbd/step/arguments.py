@@ -9,6 +9,7 @@ from functools import partial
 from inspect import signature
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -294,6 +295,8 @@ def acceleration_of(gravity: Any, like: Tensor) -> Tensor:
 
 
 def _three_numbers(name: str, value: Any, like: Tensor) -> Tensor:
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
     if not isinstance(value, (tuple, list)) or not all(isinstance(a, (int, float)) for a in value):
         raise TypeError(f"{name}: expected 3 numbers or a tensor, got {value!r}")
     if len(value) != 3:

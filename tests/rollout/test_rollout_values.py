@@ -87,6 +87,7 @@ def test_a_function_is_asked_for_its_own_arguments_not_for_those_of_what_it_wrap
     ("observe", "says"),
     [
         (lambda x, v: x, "expected a function of x, v, step: too many positional"),
+        (lambda step, x, v: x, "expected a function of x, v, step in this order, got step, x, v"),
         (3, "expected a function of x, v, step, got int"),
         (lambda x, v, k: {str(k): x}, r"with the keys \['1'\] after each .* keys \['2'\] after step 2"),
         (lambda x, v, k: (x,) * (5 - k), "expected a tuple of 4 after each .* got a tuple of 3 after step 2"),

@@ -33,6 +33,7 @@ ARGUMENTS: list[tuple[str, Any, str]] = [
     ("force", ones(2, 8, 3), r"\[2, 8, 3\]"),
     ("gravity", ones(2), r"\[2\]"),
     ("gravity", (0.0, 1.0), "2 numbers"),
+    ("gravity", np.zeros(4), "4 numbers"),
     ("prescribed", ones(3, 3), r"\[3, 3\]"),
     ("rest_points", ones(4, 3), r"\[4, 3\]"),
     ("floor_barrier.height", ones(3), r"\[3\]"),
