@@ -115,7 +115,7 @@ def test_python_numbers_mean_constant_tensors(device: str) -> None:
     numbers = {"mu": 1e4, "lam": 2e4, "density": 900.0}
     tensors = {k: torch.tensor(a, dtype=torch.float64, device=device) for k, a in numbers.items()}
     kappa = {"floor_barrier.kappa": 1e4}
-    actual = dv.step(model, x, v, **numbers, gravity=[0, -5, 1], parameters=kappa, **STEP)
+    actual = dv.step(model, x, v, **numbers, gravity=np.array([0.0, -5.0, 1.0]), parameters=kappa, **STEP)
     kappa = {"floor_barrier.kappa": torch.tensor(1e4, dtype=torch.float64, device=device)}
     gravity = torch.tensor([0.0, -5.0, 1.0], dtype=torch.float64, device=device)
     expected = dv.step(model, x, v, **tensors, gravity=gravity, parameters=kappa, **STEP)
