@@ -280,33 +280,34 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   return out;
 }
 
-// The gap of a pair with its collider at these points.
+// The same of a point and a plane, in few registers.
 template <class T>
-DIFFVBD_FN T gap_at(const Surfaces<T>& in, const Candidate& c, const T* collider) {
-  return separation(c.kind, corners_with(in, c, collider)) - offset_of(in, c);
+DIFFVBD_APART T height(const Corners<T>& c) {
+  return point_plane(c).d;
 }
 
-// The gap of a pair, its smallest on the way of its collider, and where that is for the gap. A plane is taken where it
-// ends, or where it begins if it ends or begins behind the point: the start lets both go. Where it moves away it has
-// pushed and rubbed where it came from.
+// The gap of a pair, where its collider begins, and its smallest. A plane is taken where it ends, or where it begins if
+// it ends behind the point: the start lets both go. Where it moves away it has pushed and rubbed where it came from.
 template <class T>
 struct PairGap {
-  T gap, least;
-  const T* collider;
+  T gap, begins, least;
 };
 template <class T>
 DIFFVBD_FN PairGap<T> gap_of_plane(const Surfaces<T>& in, const Candidate& c) {
-  const T now = gap_at(in, c, in.collider);
-  if (in.collider == in.collider_next) return {now, now, in.collider};
-  const T next = gap_at(in, c, in.collider_next);
-  const bool behind = !(T(0) < now && T(0) < next);
-  return {behind && next == next ? now : next, now < next ? now : next, behind ? in.collider : in.collider_next};
+  const T offset = offset_of(in, c), begins = height(corners_with(in, c, in.collider)) - offset;
+  if (in.collider == in.collider_next) return {begins, begins, begins};
+  const T ends = height(corners_with(in, c, in.collider_next)) - offset;
+  return {ends <= T(0) ? begins : ends, begins, begins < ends ? begins : ends};
+}
+template <class T>
+DIFFVBD_FN T gap_of_surfaces(const Surfaces<T>& in, const Candidate& c) {
+  return separation(c.kind, corners_with(in, c, in.collider)) - offset_of(in, c);
 }
 template <class T>
 DIFFVBD_FN PairGap<T> gap_of(const Surfaces<T>& in, const Candidate& c) {
   if (c.kind == kPointPlane) return gap_of_plane(in, c);
-  const T gap = gap_at(in, c, in.collider);
-  return {gap, gap, in.collider};
+  const T gap = gap_of_surfaces(in, c);
+  return {gap, gap, gap};
 }
 
 // Whether a pair whose smallest gap is this, and whose barrier reaches as far as dhat, may become active before the
@@ -333,8 +334,9 @@ DIFFVBD_FN void store_near_pair(const Surfaces<T>& in, int64_t scene, int32_t i,
     return;
   }
   const Candidate c = candidate_of_key(in, key);
-  const T* collider = c.kind == kPointPlane ? gap_of_plane(in, c).collider : in.collider;
-  const Distance<T> at = distance(c.kind, corners_with(in, c, collider));
+  const bool plane = c.kind == kPointPlane;
+  Distance<T> at = distance(c.kind, corners_with(in, c, plane ? in.collider_next : in.collider));
+  if (plane && at.d - offset_of(in, c) <= T(0)) at = point_plane(corners_with(in, c, in.collider));
   for (int k = 0; k < 4; ++k) corners[k] = c.v[k], values[k] = at.w[k];
   corners[4] = c.kind;
   values[4] = at.n.x, values[5] = at.n.y, values[6] = at.n.z;

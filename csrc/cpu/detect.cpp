@@ -135,12 +135,12 @@ class SceneDetection {
 
   void examine(const Candidate& c, Finds<T>& finds) {
     if (!is_considered(in_, c)) return;
-    const auto [gap, least, at] = gap_of(in_, c);
+    const auto [gap, begins, least] = gap_of(in_, c);
     if (least >= reach_ || (gap > T(0) && !is_listed(in_, c, least, in_.dhat))) return;
     const Constants<T> constants = constants_of(in_, c);
     if (!constants.admitted) return;
     const uint64_t key = contact::key_of(in_, c);
-    if (!(gap > T(0))) ++finds.touching, finds.first_touching = std::min(finds.first_touching, key);
+    if (!(gap > T(0) && begins > T(0))) ++finds.touching, finds.first_touching = std::min(finds.first_touching, key);
     if (std::isnan(gap)) return;
     for (const int32_t v : c.v) offer(near_[v], v, gap, key);
     if (is_listed(in_, c, least, constants.dhat)) finds.pairs.push_back(key);

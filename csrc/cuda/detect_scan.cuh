@@ -33,7 +33,6 @@ __global__ void __launch_bounds__(kThreads)
     if (!listing && q.kind == kPointTriangle && lane == 0) search.meet_nothing();
     return;
   }
-  if (q.kind == kPointTriangle) search.examine_planes(q, lane, kWarp);
   const typename Search<T, listing>::Near near(search, q);
   const int32_t leaves = work.forest.leaves[q.kind], end = leaves + work.forest.count[q.kind];
   const auto examine = [&](int32_t leaf) { search.examine_leaf(q.scene, q.kind, q.box.item, leaf); };
@@ -58,6 +57,7 @@ void launch_scan(const Surfaces<T>& in, const Workspace<T>& work, int64_t capaci
   const int64_t queries = in.scenes * (int64_t{in.num_points} + in.num_edges);
   if (queries == 0) return;
   scan_kernel<T, listing><<<blocks_for(kWarp * queries), kThreads, 0, stream>>>(in, work, capacity, queries);
+  launch_planes<T, listing>(in, work, capacity, stream);
 }
 
 }  // namespace

@@ -100,11 +100,11 @@ struct Search {
     lower(&work.touching[1], static_cast<unsigned long long>(key));
   }
 
-  // Of a pair with its gap and the smallest on the way of its collider.
-  __device__ void look_at(const Candidate& c, T gap, T least) const {
+  __device__ void look_at(const Candidate& c, const PairGap<T>& of) const {
+    const auto [gap, begins, least] = of;
     if (least >= reach_of(in, c.scene) || (gap > T(0) && !is_listed(in, c, least, in.dhat))) return;
     if constexpr (listing) {
-      settle(c, gap, least);
+      settle(c, of);
     } else {
       append(work.found, work.candidates, kCandidates * capacity, key_of(in, c));
       const Ordered<T> bits = ordered(gap);
@@ -117,11 +117,12 @@ struct Search {
   }
 
   // Of a pair that may be listed.
-  __device__ void settle(const Candidate& c, T gap, T least) const {
+  __device__ void settle(const Candidate& c, const PairGap<T>& of) const {
+    const auto [gap, begins, least] = of;
     const Constants<T> constants = constants_of(in, c);
     if (!constants.admitted) return;
     const uint64_t key = key_of(in, c);
-    if (!(gap > T(0))) touch(key);
+    if (!(gap > T(0) && begins > T(0))) touch(key);
     if (gap != gap) return;
     const Ordered<T> bits = ordered(gap);
     for (int k = 0; k < 4; ++k) {
@@ -157,18 +158,17 @@ struct Search {
   __device__ void examine_leaf(int64_t scene, int kind, int32_t item, int32_t leaf) const {
     const Candidate c = candidate(in, scene, kind, item, work.forest.tree(kind, scene)[leaf].item);
     if (!is_considered(in, c)) return;
-    const T gap = gap_at(in, c, in.collider);
-    look_at(c, gap, gap);
+    const T gap = gap_of_surfaces(in, c);
+    look_at(c, {gap, gap, gap});
   }
 
-  // The planes of colliders, as one of `share` threads.
-  __device__ void examine_planes(const Query& q, int lane, int share) const {
+  // The planes of colliders.
+  __device__ void examine_planes(const Query& q) const {
     if (q.box.group == in.mesh_bodies) return;
-    for (int32_t p = lane; p < in.num_planes; p += share) {
+    for (int32_t p = 0; p < in.num_planes; ++p) {
       const Candidate c = candidate(in, q.scene, kPointPlane, q.box.item, p);
       if (!is_considered(in, c)) continue;
-      const PairGap<T> at = gap_of_plane(in, c);
-      look_at(c, at.gap, at.least);
+      look_at(c, gap_of_plane(in, c));
     }
   }
 
@@ -222,7 +222,6 @@ __global__ void __launch_bounds__(kThreads)
     if (!listing && q.kind == kPointTriangle) search.meet_nothing();
     walks = false;
   }
-  if (walks && q.kind == kPointTriangle) search.examine_planes(q, 0, 1);
   // Each pair of edges once: an edge looks to the right of it in the tree.
   int32_t node = q.kind == kEdgeEdge ? next_node(q.leaf) : kRoot;
   walks = walks && !(q.kind == kEdgeEdge && node == kRoot);
@@ -280,6 +279,24 @@ __global__ void heavy_kernel(const Surfaces<T> in, Workspace<T> work, int64_t ca
   }
 }
 
+// Points and planes, a thread for each point. Apart from the other searches, which would take more registers with it.
+template <class T, bool listing>
+__global__ void __launch_bounds__(kThreads)
+    planes_kernel(const Surfaces<T> in, Workspace<T> work, int64_t capacity, int64_t points) {
+  const int64_t i = own_item();
+  if (i >= points || (listing && kept_all(work, capacity))) return;
+  const Search<T, listing> search{in, work, capacity};
+  const auto q = search.query(i);
+  if (!is_empty(q.box)) search.examine_planes(q);
+}
+
+template <class T, bool listing>
+void launch_planes(const Surfaces<T>& in, const Workspace<T>& work, int64_t capacity, cudaStream_t stream) {
+  const int64_t points = in.scenes * int64_t{in.num_points};
+  if (points == 0 || in.num_planes == 0) return;
+  planes_kernel<T, listing><<<blocks_for(points), kThreads, 0, stream>>>(in, work, capacity, points);
+}
+
 // The second search where the first has kept all candidates.
 template <class T>
 __global__ void settle_kernel(const Surfaces<T> in, Workspace<T> work, int64_t capacity) {
@@ -287,8 +304,7 @@ __global__ void settle_kernel(const Surfaces<T> in, Workspace<T> work, int64_t c
   if (!kept_all(work, capacity) || i >= static_cast<int64_t>(*work.found)) return;
   const Search<T, true> search{in, work, capacity};
   const Candidate c = candidate_of_key(in, work.candidates[i]);
-  const PairGap<T> at = gap_of(in, c);
-  search.settle(c, at.gap, at.least);
+  search.settle(c, gap_of(in, c));
 }
 
 template <class T, bool listing>
@@ -298,6 +314,7 @@ void launch_search(const Surfaces<T>& in, const Workspace<T>& work, int64_t capa
   const int most_hits = queries < kFewQueries ? kMostHitsOfFew : kMostHits;
   search_kernel<T, listing><<<blocks_for(queries), kThreads, 0, stream>>>(in, work, capacity, queries, most_hits);
   heavy_kernel<T, listing><<<kHeavyBlocks, kThreads, 0, stream>>>(in, work, capacity);
+  launch_planes<T, listing>(in, work, capacity, stream);
 }
 
 }  // namespace

@@ -63,7 +63,7 @@ def check(s: Scene, device: str = "cpu", dtype: torch.dtype = torch.float64) -> 
         np.testing.assert_allclose(constants[:, 7], e.gap[picked], atol=tol)
         check_near(s, b, e, got, index, tol)
         assert abs(float(got.smallest[b]) - min([s.reach, *e.gap])) < tol
-    touching = [(e.gap <= 0, e.key) for e in expected]
+    touching = [(e.begins <= 0, e.key) for e in expected]
     assert int(got.counts[1]) == sum(int(t.sum()) for t, _ in touching)
     first = [int(k[t].min()) for t, k in touching if t.any()]
     assert int(got.counts[2]) == min(first, default=-1)
@@ -220,7 +220,7 @@ def test_touching_pairs_are_counted(device: str) -> None:
     s = Scene.of([Surface.of(triangle, faces), Surface.of(upper, faces)], room=0.13)
     got = detect(s, device)
     expected = all_pairs(s, 0)
-    touching = expected.gap <= 0
+    touching = expected.begins <= 0
     assert 0 < touching.sum() == int(got.counts[1]) and int(got.counts[2]) == expected.key[touching].min()
     assert float(got.smallest) == 0.0
     below = Scene.of([Surface.of(triangle, faces)], [plane((0, 3, 0), (0, 3, 1), (1, 3, 0))])

@@ -229,6 +229,7 @@ class Pairs:
     margin: np.ndarray  # how far inside the list [m]; listed where > 0
     near: np.ndarray  # smallest gap of each corner point, or the reach
     ends: np.ndarray  # bool: of a plane where it ends
+    begins: np.ndarray  # gap where a plane begins, or the gap
 
 
 def all_pairs(s: Scene, b: int) -> Pairs:
@@ -254,10 +255,10 @@ def all_pairs(s: Scene, b: int) -> Pairs:
         i, j, corners, one, other = (a[admitted] for a in (i, j, corners, one, other))
         offset = s.radius[corners[:, 0]] + s.radius[corners[:, second]]
         d, weights = closest(kind, now[corners])
-        least, takes = d, np.zeros(len(d), dtype=bool)
-        if kind == POINT_PLANE:  # where it ends, unless it is there or before behind the point
+        least, begins, takes = d, d, np.zeros(len(d), dtype=bool)
+        if kind == POINT_PLANE:  # where it ends, unless it is behind the point there
             end, of_end = closest(kind, np.where(np.arange(4)[:, None] > 0, later[corners], now[corners]))
-            takes, least = (d > offset) & (end > offset), np.minimum(d, end)
+            takes, least, begins = end > offset, np.minimum(d, end), d
             d, weights = np.where(takes, end, d), np.where(takes[:, None], of_end, weights)
         rest = s.rest[corners]
         at_rest = closest(kind, rest)[0] if kind != POINT_PLANE else np.full(len(d), np.inf)
@@ -269,13 +270,16 @@ def all_pairs(s: Scene, b: int) -> Pairs:
         rooms = np.where(one == other, s.own_share * rooms, rooms)
         keep = (least - offset < s.dhat + rooms) & (at_rest > 1e-9 * np.maximum(*edges[1:3]))
         columns = (np.full(len(d), kind), corners, d - offset, least - offset, weights,
-                   np.stack([dhat, offset, threshold], -1), ((b * 3 + kind) * base + i) * base + j, takes)  # fmt: skip
+                   np.stack([dhat, offset, threshold], -1), ((b * 3 + kind) * base + i) * base + j, takes,
+                   begins - offset)  # fmt: skip
         found.append([a[keep] for a in columns])
-    kind, corners, gap, least, weights, constants, key, ends = (np.concatenate(a) for a in zip(*found, strict=True))
+    kind, corners, gap, least, weights, constants, key, ends, begins = (
+        np.concatenate(a) for a in zip(*found, strict=True)
+    )
     near = np.full(len(s.body), s.reach)
     np.minimum.at(near, corners, gap[:, None])
     room = np.where(s.body < s.mesh_bodies, np.append(s.rooms, 0)[np.minimum(s.body, s.mesh_bodies)], 0.0)
     second = corners[np.arange(len(kind)), np.where(kind == EDGE_EDGE, 2, 1)]
     own = np.where(s.body[corners[:, 0]] == s.body[second], s.own_share, 1.0)
     margin = constants[:, 0] - (least - own * (room[corners[:, 0]] + room[second]))
-    return Pairs(kind, corners, gap, weights, constants, key, margin, near, ends)
+    return Pairs(kind, corners, gap, weights, constants, key, margin, near, ends, begins)
