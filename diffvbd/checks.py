@@ -51,7 +51,8 @@ def check_function(name: str, function: Any, *arguments: str) -> None:
         signature.bind(*arguments)
     except TypeError as error:
         raise TypeError(f"{name}: expected a function of {', '.join(arguments)}: {error}") from None
-    taken = list(signature.parameters)[: len(arguments)]
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    taken = [own for own, of in signature.parameters.items() if of.kind in kinds]
     if any(own in arguments and own != wanted for own, wanted in zip(taken, arguments, strict=False)):
         raise TypeError(f"{name}: expected a function of {', '.join(arguments)} in this order, got {', '.join(taken)}")
 

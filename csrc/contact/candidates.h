@@ -247,6 +247,12 @@ DIFFVBD_APART T separation(int kind, const Corners<T>& c) {
   return distance(kind, c).d;
 }
 
+// The same of a point and a plane, in few registers.
+template <class T>
+DIFFVBD_APART T height(const Corners<T>& c) {
+  return point_plane(c).d;
+}
+
 template <class T>
 struct Constants {
   T dhat, offset, threshold;  // reach of the barrier and sum of the radii [m], of the mollifier [m^4]
@@ -278,12 +284,6 @@ DIFFVBD_FN Constants<T> constants_of(const Surfaces<T>& in, const Candidate& c) 
   out.admitted = at_rest > T(kSamePlace) * square_root(longest);
   if (at_rest < in.dhat) out.dhat = T(kRestPart) * at_rest;
   return out;
-}
-
-// The same of a point and a plane, in few registers.
-template <class T>
-DIFFVBD_APART T height(const Corners<T>& c) {
-  return point_plane(c).d;
 }
 
 // The gap of a pair, where its collider begins, and its smallest. A plane is taken where it ends, or where it begins if

@@ -50,8 +50,8 @@ def contact_detect(x: Tensor, origin: Tensor, collider: Tensor, collider_next: T
 
     Args:
         x: [B, V, 3] positions [m], relative to ``origin`` [B, V, 3], one point for each body; or empty.
-        collider, collider_next: [B, Vc, 3] [m] now, and during the sweeps that follow; gaps of planes are those at the
-            latter, and what is near them now is listed, too.
+        collider, collider_next: [B, Vc, 3] [m] now, and during the sweeps that follow. Gaps of planes are those at the
+            latter, or now where they end behind the point; what is near them now is listed, too.
         rest, radius: [N, 3] [m], [N] [m], the latter 0 for vertices.
         triangles, edges, points: [F, 3], [E, 2], [P] corner points of surfaces, unique.
         planes: [L, 3] collider points that span each plane, counterclockwise seen from the free side.

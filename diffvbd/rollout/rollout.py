@@ -129,7 +129,7 @@ def rollout(
     Raises:
         ValueError, TypeError: As step; also where a per_step value has another number of steps, or surfaces intersect.
         RuntimeError: In the backward, under checkpoints, where an argument has changed in place, or a callable returns
-            another value than before (on CUDA the gradient is NaN then).
+            another value than before (for a tensor on CUDA the gradient is NaN).
         NotImplementedError: ``estimate_errors`` with contact or friction; another ``checkpoint_every`` than ``"auto"``
             and ``None`` inside torch.func transforms.
     """
@@ -201,14 +201,16 @@ def rollout(
         frames, observed = [], []
         past = History(before[0], before[1], before[2], h) if before else None
         for k in range(first, end):
-            now = _prepared(model, lead, chosen, _to_prepare(options, own, k, x, v), k) if fixed is None else fixed
-            given = _to_advance(model, options, k, x, v, outer, colliders_before)
-            check_staged(scheme, given)
             run = partial(advance, adjoint=adjoint, index=k)
             try:
+                now = prepare(model, lead, **chosen, **_to_prepare(options, own, k, x, v)) if fixed is None else fixed
+                given = _to_advance(model, options, k, x, v, outer, colliders_before)
+                check_staged(scheme, given)
                 x, v, past, solve = take(scheme, model, x, v, past, now, given, run)
             except (ValueError, TypeError) as error:
-                raise _in_step(error, k) from error
+                if type(error) not in (ValueError, TypeError):  # another one may take other arguments
+                    raise
+                raise type(error)(f"{error} (in step {k})") from error
             if estimate_errors and k not in errors:
                 loads = {name: solve.given[name] for name in _LOADS}
                 errors[k] = error_of(model, solve.x, solve.v, solve.prepared, **loads)
@@ -292,21 +294,6 @@ def _to_prepare(options: dict[str, Any], parameters: dict[str, Any], k: int, x: 
     return now | {"parameters": {name: _at(name, value, k, x, v) for name, value in parameters.items()}}
 
 
-def _prepared(model: Model, lead: Any, chosen: dict[str, Any], values: dict[str, Any], k: int) -> Any:
-    """prepare() of step k."""
-    try:
-        return prepare(model, lead, **chosen, **values)
-    except (ValueError, TypeError) as error:
-        raise _in_step(error, k) from error
-
-
-def _in_step(error: Exception, k: int) -> Exception:
-    """An error that says which step it was."""
-    if type(error) not in (ValueError, TypeError):  # another one may take other arguments
-        return error
-    return type(error)(f"{error}, in step {k}")
-
-
 def _to_advance(model: Model, options: dict[str, Any], k: int, x: Tensor, v: Tensor, start: Tensor,
                 colliders_before: Tensor | None) -> dict[str, Any]:  # fmt: skip
     """What enters step k through advance(); ``start``: x before the first step."""
@@ -365,7 +352,7 @@ def _at(name: str, value: Any, k: int, x: Tensor, v: Tensor) -> Any:
         return value
     found = value(k, x, v)
     if found is None and name != "force":  # a forgotten return: None would stand for the default
-        raise TypeError(f"{name}: expected a function that returns the value for a step, got None at step {k}")
+        raise TypeError(f"{name}: expected a function that returns the value for a step, got None")
     return found
 
 

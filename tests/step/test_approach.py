@@ -87,6 +87,16 @@ def test_colliders_go_on_from_where_the_first_solve_has_left_them(
         assert (moved - found[0]).abs().max() <= tolerance("property_subset")
 
 
+@pytest.mark.parametrize("integrator", SECOND, ids=str)
+def test_colliders_end_at_those_of_the_model_unless_they_are_given(integrator: Any, device: str) -> None:
+    model = model_above("plane", 0.011, device)
+    x, at = model.rest_points, model.collider_points
+    given = {"mu": 1e5, "lam": 1e5, "time_step": TIME_STEP, "sweeps": 5, "integrator": integrator,
+             "colliders_before": at - 1e-3}  # fmt: skip
+    own, same = (dv.step(model, x, torch.zeros_like(x), **given, **more)[0] for more in ({}, {"colliders": at}))
+    assert torch.equal(own, same) and (own - x).abs().max() > 0
+
+
 @pytest.mark.parametrize(("gap", "rises", "touches"), [(0.035, 0.0, False), (0.035, 0.03, True), (0.009, -0.06, True)])
 def test_a_plane_that_turns_counts_where_the_body_is(gap: float, rises: float, touches: bool, device: str) -> None:
     """Three meters from the points of a plane, which hardly move, it goes up or down."""
