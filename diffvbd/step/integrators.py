@@ -161,7 +161,7 @@ def take(integrator: Integrator, model: Model, x: Tensor, v: Tensor, history: Hi
         given: force, gravity, prescribed, colliders, colliders_before, as of step().
         run: A solve: advance(), or one that sweeps until it has converged.
     """
-    if given["colliders"] is None and given["colliders_before"] is not None:
+    if given["colliders"] is None and given["colliders_before"] is not None and len(model.collider_points):
         given = {**given, "colliders": model.collider_points}
     end = _at_end(given)
 
