@@ -37,23 +37,26 @@ def run(model: dv.Model, v: Tensor, ways: Tensor, integrator: Any) -> tuple[list
     return list(euler), motion
 
 
+def in_frame(model: dv.Model, own: tuple[float, float, float], speed: float, integrator: Any
+             ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
+    """Who took implicit Euler, and the motion [3, V, 3], of a body with a velocity of its own, seen from its collider;
+    both go up at ``speed`` [m/s]."""
+    v = torch.zeros_like(model.rest_points) + model.rest_points.new_tensor(own)
+    v[:, 1] += speed
+    times = TIME_STEP * torch.arange(1, 4, dtype=v.dtype, device=v.device)
+    ways = v.new_zeros((3, 1, 3))
+    ways[:, 0, 1] = speed * times
+    euler, motion = run(model, v, ways, integrator)
+    return euler, motion.x[1:] - ways
+
+
 @pytest.mark.parametrize("integrator", SECOND, ids=str)
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(("gap", "toward"), [(0.02, -1.5), (0.016, -0.1), (0.012, -0.6)])
 def test_a_frame_that_moves_changes_nothing(shape: str, gap: float, toward: float, integrator: Any, device: str
                                             ) -> None:  # fmt: skip
-    model, steps = model_above(shape, gap, device), 3
-    found = []
-    for speed in (0.0, -2.0, 0.5):
-        v = torch.zeros_like(model.rest_points)
-        v[:, 1] = toward + speed
-        times = TIME_STEP * torch.arange(1, steps + 1, dtype=v.dtype, device=device)
-        ways = torch.zeros((steps, 1, 3), dtype=v.dtype, device=device)
-        ways[:, 0, 1] = speed * times
-        euler, motion = run(model, v, ways, integrator)
-        moved = motion.x[1:].clone()
-        moved[..., 1] -= speed * times[:, None]
-        found.append((euler, moved))
+    model = model_above(shape, gap, device)
+    found = [in_frame(model, (0.0, toward, 0.0), speed, integrator) for speed in (0.0, -2.0, 0.5)]
     for euler, moved in found[1:]:
         assert all(torch.equal(a, b) for a, b in zip(euler, found[0][0], strict=True))
         assert (moved - found[0][1]).abs().max() <= tolerance("property_subset")
@@ -67,21 +70,12 @@ def test_colliders_go_on_from_where_the_first_solve_has_left_them(
     shape: str, gap: float, toward: float, friction: float | None, integrator: Any, device: str
 ) -> None:
     """What glides above a collider that goes with it is not rubbed; what comes down on one lands on it."""
-    model, steps = model_above(shape, gap, device), 3
+    model = model_above(shape, gap, device)
     if friction is not None:
         model = model.replace(energies=(*model.energies, dv.Friction(friction)))
-    found = []
-    for speed in (0.0, -2.0, -4.0, 4.0):
-        v = torch.zeros_like(model.rest_points)
-        v[:, 0], v[:, 1] = 0.1, toward + speed
-        times = TIME_STEP * torch.arange(1, steps + 1, dtype=v.dtype, device=device)
-        ways = torch.zeros((steps, 1, 3), dtype=v.dtype, device=device)
-        ways[:, 0, 1] = speed * times
-        _, motion = run(model, v, ways, integrator)
-        moved = motion.x[1:].clone()
-        moved[..., 1] -= speed * times[:, None]
-        found.append(moved)
-    free = model.rest_points + TIME_STEP * found[0].new_tensor((0.1, toward, 0.0))
+    own = (0.1, toward, 0.0)
+    found = [in_frame(model, own, speed, integrator)[1] for speed in (0.0, -2.0, -4.0, 4.0)]
+    free = model.rest_points + TIME_STEP * found[0].new_tensor(own)
     assert bool((found[0][0] - free).abs().max() > tolerance("property_subset")) == (friction is None)
     for moved in found[1:]:
         assert (moved - found[0]).abs().max() <= tolerance("property_subset")
