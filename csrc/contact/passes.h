@@ -229,18 +229,22 @@ DIFFVBD_FN void add_lags(const Source<T, Positions>& s, int v, T h, Vec3<T>& g, 
   add_floor_lags(s, v, 0, 1, h, g, H);
 }
 
-// The exponent of the limit of vertex v, whose update goes from where it was by d: of its room.
-template <class T, class Positions>
-DIFFVBD_FN int limit_by_room(const Source<T, Positions>& s, int v, const Vec3<T>& from, const Vec3<T>& d) {
-  return limit_by_room(from - s.in.center_of(s.scene, v), d, s.in.room[s.scene * s.in.num_vertices + v]);
-}
-
-// What rounding may make of a height of vertex v [m].
-template <class T, class Positions>
-DIFFVBD_FN T guard_of(const Source<T, Positions>& s, int v) {
-  const Vec3<T> at = s.x(v) + s.origin(v);
-  return T(kGuardUlps) * std::numeric_limits<T>::epsilon() * (absolute(at.x) + absolute(at.y) + absolute(at.z));
-}
+// What limits a vertex besides its pairs, and what rounding may make of its height. It does not depend on the update.
+template <class T>
+struct OwnRoom {
+  Vec3<T> center, origin;
+  T size;  // [m]
+  OwnRoom() = default;
+  template <class Positions>
+  DIFFVBD_FN OwnRoom(const Source<T, Positions>& s, int v)
+      : center(s.in.center_of(s.scene, v)), origin(s.origin(v)), size(s.in.room[s.scene * s.in.num_vertices + v]) {}
+  // The exponent of the limit of an update that goes by d from where the vertex was.
+  DIFFVBD_FN int limit(const Vec3<T>& from, const Vec3<T>& d) const { return limit_by_room(from - center, d, size); }
+  DIFFVBD_FN T guard(const Vec3<T>& from) const {
+    const Vec3<T> at = from + origin;
+    return T(kGuardUlps) * std::numeric_limits<T>::epsilon() * (absolute(at.x) + absolute(at.y) + absolute(at.z));
+  }
+};
 
 // Whether a pair may take more from the update of one of its corners than `exponent` does, by the length of d.
 template <class T, class Positions>

@@ -45,11 +45,12 @@ void ContactScene<T>::propose(int64_t first, int64_t last, int64_t begin, int64_
     const int32_t v = plan_.order[at];
     if (v < 0) continue;
     const Vec3<T> from = vector_at(before_.get() + 4 * at), d = vector_at(s_.x + 4 * at) - from;
-    const int exponent = limit_by_room(source, v, from, d);
+    const OwnRoom<T> room(source, v);
+    const int exponent = room.limit(from, d);
     limits[v] = static_cast<uint8_t>(exponent);
     if (!near_.has_pairs(v)) continue;
     const Vec3<T> motion = source.moved(v), way = limit_of<T>(exponent) * d;
-    near_.go(v, motion, motion + way, length_of(way) / T(kBothShare) + guard_of(source, v));
+    near_.go(v, motion, motion + way, length_of(way) / T(kBothShare) + room.guard(from));
   }
 }
 
@@ -132,7 +133,7 @@ void ContactScene<T>::each_pair(int32_t v, const F& look) const {
 // closer only where that does not settle it.
 template <class T>
 int ContactScene<T>::limit_by_near(const Source<T, Before>& source, int32_t v, const Vec3<T>& d, int exponent) const {
-  const T length = length_of(d), guard = guard_of(source, v);
+  const T length = length_of(d), guard = OwnRoom<T>(source, v).guard(source.x(v));
   const int64_t begin = 4 * source.positions.first, end = 4 * source.positions.last;
   const auto all = near_.of(v);
   for (int64_t e = all.first; e < all.first + all.count; ++e) {

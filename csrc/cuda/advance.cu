@@ -199,7 +199,7 @@ __global__ void __launch_bounds__(kThreads)
   advance_scenes(GridTeam{flags}, in, s, motions, {0, in.scenes}, pairs, stuck);
 }
 
-// A cluster for each small scene. near, planes: memory for all listed pairs.
+// A cluster for each small scene. near, planes: memory for all listed pairs. stuck: with several scenes zero at first.
 template <class T>
 __global__ void __launch_bounds__(kThreads, 2)
     scene_kernel(const __grid_constant__ AdvanceInputs<T> in, AdvanceState<T> s, Motion<T>* motions, int32_t* near,
@@ -209,6 +209,7 @@ __global__ void __launch_bounds__(kThreads, 2)
   __shared__ Answers answers;
   Cluster cluster = Cluster::all();
   const int64_t scene = blockIdx.x / cluster.size;
+  if (in.scenes == 1 && blockIdx.x == 0 && threadIdx.x == 0) *stuck = 0;  // before the first meeting
   const auto first = [&](int64_t of) { return int64_t{in.listed.ptr[of * in.corners] / 4}; };
   const Range own = {first(scene), first(scene + 1)};
   if (cluster.leaves(in.vertices + own.end - own.begin)) return;
@@ -240,9 +241,10 @@ int64_t advance_workspace_bytes(const AdvanceInputs<T>& in, int64_t capacity) {
 template <class T>
 cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int64_t* stuck, void* workspace,
                     int multiprocessors, cudaStream_t stream) {
-  if (auto error = clear({{stuck, sizeof(*stuck)}}, stream)) return error;
   const int64_t rows = in.scenes * in.vertices;
-  if (rows == 0) return cudaSuccess;
+  const bool clusters = has_block_each(in.vertices, in.scenes, capacity);
+  std::vector<Span> zeros{{stuck, sizeof(*stuck)}};
+  if (rows == 0) return clear(zeros, stream);
   auto* at = static_cast<uint8_t*>(workspace);
   const auto take = [&](int64_t bytes) {
     uint8_t* here = at;
@@ -255,14 +257,18 @@ cudaError_t advance(const AdvanceInputs<T>& in, int64_t capacity, T* share, int6
   auto* motions = reinterpret_cast<Motion<T>*>(take(rows * sizeof(Motion<T>)));
   AdvanceState<T> state{share, now, blocked, stamp, failed, true};
   auto* found = reinterpret_cast<unsigned long long*>(stuck);
-  if (has_block_each(in.vertices, in.scenes, capacity)) {
+  if (clusters) {
+    if (in.scenes > 1) {  // a single one clears it by itself
+      if (auto error = clear(zeros, stream)) return error;
+    }
     auto* near = reinterpret_cast<int32_t*>(take(capacity * sizeof(int32_t)));
     auto* planes = reinterpret_cast<PairPlane<T>*>(take(capacity * sizeof(PairPlane<T>)));
     return launch_clusters(scene_kernel<T>, in.scenes, capacity, kThreads, stream, in, state, motions, near, planes,
                            found);
   }
   auto* flags = reinterpret_cast<unsigned*>(take(kFlags * sizeof(unsigned)));
-  if (auto error = clear({{flags, kFlags * sizeof(unsigned)}}, stream)) return error;
+  zeros.push_back({flags, kFlags * sizeof(unsigned)});
+  if (auto error = clear(zeros, stream)) return error;
   AdvanceInputs<T> inputs = in;
   const void* kernel = reinterpret_cast<const void*>(advance_kernel<T>);
   int resident = 0;

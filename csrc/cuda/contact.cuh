@@ -65,7 +65,7 @@ __global__ void limit_contact(const __grid_constant__ StepView<T> s, const __gri
   const SweepRows<T> rows = sweep_rows(s, at.scene, begin, end, MovingRows<T>{s.w.x, s.w.moved});
   PairsOf<T, share, SweepRows<T>> pairs(s, c.in, at, rows);
   const Vec3<T> from = load_row(s.w.x, row), d = load_row(s.w.moved, row) - from;
-  const int exponent = pairs.limit(from, d);
+  const int exponent = pairs.limit(pairs.room(), from, d);
   if (pairs.vertex < 0 || at.lane != 0) return;
   c.cut[((s.base + at.scene) * s.sweeps + sweep) * c.in.num_vertices + pairs.vertex] = static_cast<uint8_t>(exponent);
   if (exponent > 0) store_row(s.w.moved, row, from + contact::limit_of<T>(exponent) * d);

@@ -108,14 +108,14 @@ struct PairsOf {
     sums.store(to);
   }
 
+  __device__ __forceinline__ contact::OwnRoom<T> room() const {
+    return vertex < 0 ? contact::OwnRoom<T>{} : contact::OwnRoom<T>(source, vertex);
+  }
   // The exponent of the limit of an update that goes from where the vertex was by d.
-  __device__ __forceinline__ int limit(const Vec3<T>& from, const Vec3<T>& d) {
+  __device__ __forceinline__ int limit(const contact::OwnRoom<T>& room, const Vec3<T>& from, const Vec3<T>& d) {
     int exponent = 0;
     T length = T(0), guard = T(0);
-    if (vertex >= 0) {
-      exponent = contact::limit_by_room(source, vertex, from, d);
-      length = contact::length_of(d), guard = contact::guard_of(source, vertex);
-    }
+    if (vertex >= 0) exponent = room.limit(from, d), length = contact::length_of(d), guard = room.guard(from);
     if (!__any_sync(kWholeWarp, listed.count > 0)) return exponent;
     if (at.lane == 0) memory.exponents[at.group] = exponent;
     __syncwarp();

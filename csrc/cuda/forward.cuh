@@ -96,12 +96,13 @@ __device__ __forceinline__ void update_among(const StepView<T>& s, const Contact
   if (role >= 0) {
     const SweepRows<T> rows = sweep_rows(s, at.scene, turn.begin, turn.end, turn.rows(s));
     PairsOf<T, kManyLanes, SweepRows<T>> pairs(s, c.in, at, rows, role);
+    const contact::OwnRoom<T> room = pairs.room();  // asked for long before it is needed
     pairs.gather(told.term[role]);
     meet_among();  // what pairs add is there
     meet_among();  // where the update goes is there
     if (role != kLagged) {
       const Vec3<T> from = contact::vector_at(told.from);
-      const int exponent = pairs.limit(from, contact::vector_at(told.to) - from);
+      const int exponent = pairs.limit(room, from, contact::vector_at(told.to) - from);
       if (at.lane == 0) told.exponents[role] = exponent;
     }
     meet_among();  // how far it may go is there

@@ -198,38 +198,52 @@ struct GroupStar : Records<T, lanes_, reverse> {
   __device__ __forceinline__ void send_rows() const {
     __syncwarp();
     T* rows = s.w.rows + at.scene * (static_cast<int64_t>(s.plan.edge_slots) * kSlice + 1) * kRow;
-    for (int a = at.lane; a < degree; a += lanes) {
-      const int64_t edge = static_cast<int64_t>(first_edge + a) * kSlice + at.v;
-      const bool adds = a / lanes < kSlice ? (leads_to_pinned >> a / lanes & 1) != 0
-                                           : __ldg(s.plan.adjacent + edge) >= first_pinned();
-      Vec3<T> sum = zero3<T>();
-      if constexpr (gather) {
-        const int end = __ldg(s.plan.edge_entry + first_edge + a + 1);
-        constexpr int kAhead = 4;  // entries that are asked for at once
-        for (int i = __ldg(s.plan.edge_entry + first_edge + a); i < end; i += kAhead) {
-          int entries[kAhead];
-#pragma unroll
-          for (int u = 0; u < kAhead; ++u) {
-            entries[u] = __ldg(s.plan.entry + static_cast<int64_t>(min(i + u, end - 1)) * kSlice + at.v);
-          }
-#pragma unroll
-          for (int u = 0; u < kAhead; ++u) {
-            if (i + u >= end) break;
-            const T* p = sums + entries[u] * 3 * P::groups;
-            sum += Vec3<T>{p[0], p[P::groups], p[2 * P::groups]};
-          }
-        }
-      } else {
+    if constexpr (gather) {
+      for (int a = at.lane; a - at.lane < degree; a += lanes) {  // the warp stays together: it has one vertex
+        const Vec3<T> sum = gathered(first_edge + min(a, degree - 1), a < degree);
+        if (a < degree) send_row(rows, a, sum);
+      }
+    } else {
+      for (int a = at.lane; a < degree; a += lanes) {
         const T* from = sums - at.lane * P::groups + a * 3 * kSlice;
+        Vec3<T> sum = zero3<T>();
 #pragma unroll
         for (int l = 0; l < lanes; ++l) {
           const T* p = from + l * P::groups;
           sum += Vec3<T>{p[0], p[kSlice], p[2 * kSlice]};
         }
+        send_row(rows, a, sum);
       }
-      if (adds) sum += load_row(rows, edge);
-      store_row(rows, edge, sum);
     }
+  }
+
+ private:
+  __device__ __forceinline__ void send_row(T* rows, int a, Vec3<T> sum) const {
+    const int64_t edge = static_cast<int64_t>(first_edge + a) * kSlice + at.v;
+    const bool adds =
+        a / lanes < kSlice ? (leads_to_pinned >> a / lanes & 1) != 0 : __ldg(s.plan.adjacent + edge) >= first_pinned();
+    if (adds) sum += load_row(rows, edge);
+    store_row(rows, edge, sum);
+  }
+  // What the threads of a warp have put for an edge, in the order of its entries. All of them must call it.
+  __device__ __forceinline__ Vec3<T> gathered(int edge, bool there) const {
+    constexpr int kAhead = 4;  // entries that are asked for at once
+    const int begin = __ldg(s.plan.edge_entry + edge), end = __ldg(s.plan.edge_entry + edge + 1);
+    const int most = __reduce_max_sync(kWholeWarp, there ? end - begin : 0);
+    Vec3<T> sum = zero3<T>();
+    for (int i = begin; i < begin + most; i += kAhead) {
+      int entries[kAhead];
+#pragma unroll
+      for (int u = 0; u < kAhead; ++u) {
+        entries[u] = __ldg(s.plan.entry + static_cast<int64_t>(min(i + u, end - 1)) * kSlice + at.v);
+      }
+#pragma unroll
+      for (int u = 0; u < kAhead; ++u) {
+        const T* p = sums + entries[u] * 3 * P::groups;
+        sum += select(i + u < end, Vec3<T>{p[0], p[P::groups], p[2 * P::groups]}, zero3<T>());
+      }
+    }
+    return sum;
   }
 };
 
@@ -242,12 +256,14 @@ __device__ __forceinline__ Vec3<T> pull_rows(const StepView<T>& s, const Place<l
   const int none = s.plan.edge_slots * kSlice;  // the row that stays zero
   const T* rows = s.w.rows + at.scene * (static_cast<int64_t>(none) + 1) * kRow;
   Vec3<T> sum = zero3<T>();
-  for (int start = incoming.begin + at.lane; start < incoming.end; start += batch * lanes) {
+  // A warp that has one vertex stays together in the loop: where threads leave it one by one, the sum below waits long.
+  const int own = lanes == kSlice ? 0 : at.lane, after = at.lane - own;
+  for (int start = incoming.begin + own; start < incoming.end; start += batch * lanes) {
     int row[batch];
     Vec3<T> part[batch];
 #pragma unroll
     for (int u = 0; u < batch; ++u) {
-      const int e = start + u * lanes;
+      const int e = start + after + u * lanes;
       row[u] = e < incoming.end ? __ldg(s.plan.incoming + static_cast<int64_t>(e) * kSlice + at.v) : none;
       if (!all && row[u] >= below) row[u] = none;
     }

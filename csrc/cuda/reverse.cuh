@@ -15,6 +15,7 @@ template <class T, class Set>
 constexpr int reverse_registers() {
   return sizeof(T) == sizeof(float) && !Set::keeps_positions ? 128 : 240;
 }
+constexpr int kAmongRegisters = 255;  // where a block has a vertex: of its warps there are never many
 
 // What the threads of a warp do at one turn, counted from the last sweep.
 struct Turn {
@@ -57,6 +58,11 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   star.pairs = &pairs;
   star.repeats = !full;
   Block<T> b = load_block<Set>(s, at, false, s.w.x);
+  int exponent = 0;  // of its limit
+  if constexpr (Set::contact) {
+    const int64_t step = (s.base + scene) * s.sweeps + s.sweeps - 1 - turn.number;
+    if (real) exponent = __ldg(s.limits + step * s.plan.num_vertices + __ldg(s.plan.order + position));
+  }
   Vec3<T> end_bar = load_row(s.w.x_bar, row) + pull_rows<true>(s, at, incoming);
   if (s.has_tets) star.fetch_neighbours(false);
   if constexpr (Set::usual) {
@@ -72,11 +78,7 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   if (s.has_tets) star.clear_sums(shared);
   if constexpr (Set::contact) end_bar += pairs.sent();
   Vec3<T> x_bar = end_bar;
-  if constexpr (Set::contact) {
-    const int64_t sweep = s.sweeps - 1 - turn.number, step = ((s.base + scene) * s.sweeps + sweep);
-    const int exponent = real ? __ldg(s.limits + step * s.plan.num_vertices + __ldg(s.plan.order + position)) : 0;
-    x_bar = contact::limit_of<T>(exponent) * end_bar;
-  }
+  if constexpr (Set::contact) x_bar = contact::limit_of<T>(exponent) * end_bar;
   const StepParameters<T> q = of_sweep(s.parameters, turn.number == 0);
   const Update<T> u = replayed<Set>(b, star, r, full, q);
   if constexpr (Set::usual) {
@@ -180,7 +182,7 @@ __global__ void __maxnreg__((reverse_registers<T, EnergySet<mask>>()))
 // Of a set with contact, a block for each vertex, in one launch for all sweeps; or for each color, but for what it
 // sends to its pairs.
 template <class T, int mask, int wanted>
-__global__ void __maxnreg__((reverse_registers<T, EnergySet<mask>>()))
+__global__ void __maxnreg__(kAmongRegisters)
     reverse_among(const __grid_constant__ StepView<T> s, const __grid_constant__ Range range,
                   const __grid_constant__ ContactView<T> c) {
   T* const shared = memory_of_warp<T, kManyLanes>(s, true);  // of the first warp

@@ -261,6 +261,7 @@ struct FloorBarrier {
       const R change = dot(plane.n, step);
       const R a = filter_fraction(plane.gap(s.x), change, q);
       const auto binds = a < binding;
+      if (!any(binds)) continue;
       const R rate = R(1) / select(binds, -change, R(1));
       const R by_x = select(binds, R(q.filter_eta) * rate, R(0)), by_step = select(binds, a * rate, R(0));
       dx = {select(binds, by_x * plane.n.x, dx.x), select(binds, by_x * plane.n.y, dx.y),
