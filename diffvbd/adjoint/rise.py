@@ -29,8 +29,18 @@ class RiseParts(NamedTuple):
         return self.model._moving
 
     def admits(self, x: Tensor, to: Tensor) -> Tensor:
-        """Whether the potential of each body lets it go from x to ``to``, bool [B, bodies]."""
-        return ~rises(self, x, to)
+        """Whether the potential of each body lets it go from x to ``to`` [B, V, 3]: it does not rise by more than
+        rounding, is a number, and ``to`` is not too near a plane; bool [B, bodies]."""
+        rise, size = rise_of_bodies(self, x, to).unbind(-1)
+        return rise <= ROUNDINGS * torch.finfo(x.dtype).eps * size  # false of what is no number
+
+    def raises(self, x: Tensor, to: Tensor) -> Tensor:
+        """Which vertices are of a body whose potential does not let it go from x to ``to``, bool [B, V]."""
+        admitted, bodies = self.admits(x, to), self.bodies
+        if bodies.number == 0:
+            return admitted.new_zeros(x.shape[:2])
+        moves, of = self.model.derived("moving_body", lambda: (bodies.of < bodies.number, bodies.of % bodies.number))
+        return moves > admitted[:, of]
 
 
 def rise_parts(model: Model, fields: ops.SweepFields, time_step: float) -> RiseParts:
@@ -46,13 +56,6 @@ def rise_parts(model: Model, fields: ops.SweepFields, time_step: float) -> RiseP
         material[:, :, i] = modulus[..., None] if modulus.shape[1] == 1 else modulus[:, moving.tet]
     rest = moving.rest if fields.rest is None else fields.rest[:, moving.tet].transpose(-1, -2).contiguous()
     return RiseParts(model, fields, material, rest, time_step)
-
-
-def rises(parts: RiseParts, x: Tensor, to: Tensor) -> Tensor:
-    """Whether each body's potential at ``to`` is above that at x by more than rounding, or no number, or ``to`` is
-    too near a plane, bool [B, bodies]; x, to [B, V, 3]."""
-    rise, size = rise_of_bodies(parts, x, to).unbind(-1)
-    return ~(rise <= ROUNDINGS * torch.finfo(x.dtype).eps * size)  # true of what is no number
 
 
 def rise_of_bodies(parts: RiseParts, x: Tensor, to: Tensor) -> Tensor:

@@ -29,8 +29,7 @@ def detect(x: Tensor, origin: Tensor, was: Tensor, now: Tensor, surface: Contact
         (pairs needed, pairs without a gap, key of one, 0); smallest gap [B].
     """
     s = surface
-    nowhere = x.new_zeros((x.shape[0], s.bodies + 1))
-    room, own_room = (nowhere if r is None else r for r in (room, own_room))
+    room, own_room = (x.new_zeros((x.shape[0], s.bodies + 1)) if r is None else r for r in (room, own_room))
     return ops_contact.contact_detect(
         x, origin, was, now, s.rest, s.radius, s.triangles, s.edges, s.points, s.planes, s.body, s.held, room,
         own_room, s.bodies, barrier.self_contact, barrier.between_bodies, barrier.dhat, capacity,

@@ -107,7 +107,7 @@ class PartStart(NamedTuple):
     frames: Tensor | None  # [B, bodies]: share that pairs let each body go of its rigid motion above the floor
     short: Tensor  # [B, V] bool: pairs have held up more than a hundredth of its way
     stuck: Tensor  # [1] int64: pairs that hinder what is prescribed
-    shares: Tensor  # [2, B, V]: of the two ways, that vertices went
+    shares: tuple[Tensor, Tensor]  # of the two ways, that vertices went [B, V]
 
 
 def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,
@@ -179,4 +179,4 @@ def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, wa
         shares = share, advance(at, way, still, center, own=own) if falls else torch.ones_like(share)
     decided = Decided(frames, shares, stopped, origin, bodies)
     start, short = _Start.apply(x, move, fall, u, left, floor, decided)
-    return PartStart(start, center, room, own, frames, short, sum(stuck[1:], stuck[0]), torch.stack(shares))
+    return PartStart(start, center, room, own, frames, short, sum(stuck[1:], stuck[0]), shares)

@@ -17,7 +17,7 @@ from ..model.model import Model
 from ..model.warnings import warn_of_inverted_bodies, warn_of_material
 from ..scopes import looks_at, recorders, refinement
 from ..step.advance import advance
-from ..step.arguments import GRAVITY, check_prescribed, check_state, prepare, step_settings
+from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare, step_settings
 from ..step.estimate import ErrorEstimate, check_estimable, error_of, of_steps
 from ..step.held_up import cut_share
 from ..step.integrators import (
@@ -160,6 +160,8 @@ def rollout(
     # What a checkpointed segment reads again must not change in between: lists and dicts are copied. Plain dicts and
     # functions of them: torch.compile takes no object of ours along.
     options, own = ({k: _frozen(v) for k, v in given.items()} for given in (options, parameters or {}))
+    if not isinstance(options["gravity"], Tensor) and not _changes(options["gravity"]):
+        options["gravity"] = acceleration_of(options["gravity"], x)  # once, not in each step
     # once: what a checkpoint runs again must run as it did, whatever dv.regime says by then
     execution = step_settings(model, lead, time_step, sweeps)
     h = execution.numbers.time_step

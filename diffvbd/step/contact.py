@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..adjoint.contact_lag import Pairs, no_pairs, rubbing, some_of
-from ..adjoint.rise import RiseParts, rise_parts, rises
+from ..adjoint.rise import RiseParts, rise_parts
 from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
 from ..contact.start import PartStart, start_between_planes
@@ -29,7 +29,7 @@ from .contact_cycles import CUT, MOST_DETECTIONS, of_going, parts_of, record_par
 from .corrections import corrected, corrected_after, is_cut
 from .floor_start import start_on_floor
 from .intersections import advice_to_part, refuse_intersections
-from .met import Detection, Met, Outcome, outcomes
+from .met import Detection, Met, outcomes
 from .motion import Motion, coasting, motion_of
 from .rooms import ROOM, rooms, rooms_of_sweeps
 from .unsupported import rests, unsupported
@@ -73,7 +73,7 @@ class ContactStep:
         self.parts: int | None = None if self.barrier is None else self.barrier.detections  # None: not decided yet
         like = begun.x_prev
         self.kappa = like.new_zeros((1,)) if self.barrier is None else self._parameter("pair_barrier.kappa")
-        self.lagged, self.lag = no_pairs(like, 0), like.new_zeros((0, 9))
+        self.lagged, self.lag = model.derived("no_lag", lambda: (no_pairs(like, 0), like.new_zeros((0, 9))))
         self.floor_lag = self._floor_lag()
         self.factor = factor_of(model, prepared.coarse, self.x_prev, prepared.settings.numbers.time_step)
 
@@ -160,7 +160,7 @@ class ContactStep:
         x = self.x_prev
         bodies = surface.held, surface.held_bodies, surface.body_order, surface.body_ptr
         way = self.prepared.ways(functools.partial(coasting, x, self.fields.mass, self.begun.y - x - lift, *bodies))
-        left, met = way, Met(x)
+        left, met = way, Met()
         stages, r = self.parts or 1, 0  # of what is prescribed
         planned, going = self.parts, None
         while r < (self.parts or 1):
@@ -217,10 +217,11 @@ class ContactStep:
             if going is not None:  # what it does not help stays as it is; others, too: the same bits in any batch
                 going = going & ~self._inverted(x)[:, None, None]
                 met.swept[-1] = of_going(met.swept[-1], going)
+                assert met.cut is not None
                 x, cut = torch.where(going, x, begin), torch.where(going[..., 0], cut, met.cut)
                 held = held & going[..., 0]
             met.cut = cut
-            met.found[r] = replaced(detection, shares=start.shares, corrections=torch.stack(taken), limits=limits,
+            met.found[r] = replaced(detection, shares=start.shares, corrections=tuple(taken), limits=limits,
                                     kept=kept, frames=start.frames, combined=combined, lengths=lengths,
                                     sweeps=sweeps, going=going, resting=resting)  # fmt: skip
             r += 1
@@ -248,16 +249,14 @@ class ContactStep:
 
     def _raises(self, x: Tensor, to: Tensor) -> Tensor:
         """Which vertices are of a body whose own potential is higher at ``to`` than at x [B, V], bool."""
-        rising = rises(self.potential_parts, x.detach().contiguous(), to.detach())
-        none = rising.new_zeros((len(rising), 1))
-        return torch.cat([rising, none], 1)[:, self.model._moving.of]
+        return self.potential_parts.raises(x.detach().contiguous(), to.detach())
 
     def _run_on_floor(self, policy: int, debug_step: int) -> Tensor:
         """Friction on a floor alone: no pairs, and nothing but the floor limits motion."""
         x = start_on_floor(self.model, self.begun, self.floor_data, self.fields.mass, self.prepared)
         room, none = torch.full_like(x[..., 0], FREE), no_pairs(x, x.shape[0] * x.shape[1])
-        start = PartStart(x, x.detach(), room, (), None, room > 0, none.ptr[:1].long(),
-                          x.new_ones((2, *room.shape)))  # fmt: skip
+        whole = torch.ones_like(room)
+        start = PartStart(x, x.detach(), room, (), None, room > 0, none.ptr[:1].long(), (whole, whole))
         x = corrected(self, x, self.colliders, start, none).x
         if self.prepared.settings.sweeps:
             settings = self.prepared.settings
@@ -305,9 +304,8 @@ class ContactStep:
 
     def _record(self, met: Met) -> Tensor:
         """Notes what became of the step; its counts [parts, 4]."""
-        smallest, table = torch.stack([d.smallest for d in met.found]), torch.stack(met.counts)
-        outcomes[self.model] = Outcome(table, self.capacity, met.cut, smallest)
-        return table
+        outcomes[self.model] = outcome = met.outcome(self.capacity, self.x_prev)
+        return outcome.counts
 
     def _judged(self, x: Tensor, met: Met) -> Tensor:
         """x, or NaN where a captured step, which cannot raise, must not be trusted."""

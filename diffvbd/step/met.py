@@ -30,8 +30,8 @@ class Detection(NamedTuple):
         lowest: Lowest vertex of each body's island above each plane of the floor, int [B, bodies, planes]; else empty.
         room: How far the vertices of each body may go beside its island, and the largest [m], [B, bodies + 1].
         own_room: The same beside the rigid motion of the body [m].
-        shares: How much of its two ways each vertex begins the part with, [2, B, V].
-        corrections: Shares of the rigid corrections before and after the sweeps, [1 to 3, B, bodies].
+        shares: How much of its two ways each vertex begins the part with, [B, V] each.
+        corrections: Shares of the rigid corrections before and after the sweeps, [B, bodies] each.
         limits: By how often each update was halved, uint8 [B, K, V]; 8: it was not made.
         frames: Share of the rigid motion that each body begins the part with, [B, bodies].
         combined: Which combinations of iterates were taken (:class:`diffvbd.Anderson`); None: there are none.
@@ -52,8 +52,8 @@ class Detection(NamedTuple):
     room: Tensor
     own_room: Tensor
     # what the part has decided
-    shares: Tensor | None = None
-    corrections: Tensor | None = None
+    shares: tuple[Tensor, ...] | None = None
+    corrections: tuple[Tensor, ...] | None = None
     limits: Tensor | None = None
     frames: Tensor | None = None
     combined: Combined | None = None
@@ -76,11 +76,21 @@ class Outcome(NamedTuple):
 class Met:
     """What the parts of a step meet one after another."""
 
-    def __init__(self, x: Tensor) -> None:
+    def __init__(self) -> None:
         self.found: list[Detection] = []
         self.counts: list[Tensor] = []
         self.swept: list[SweptPart] = []
-        self.cut = torch.zeros_like(x[..., 0], dtype=torch.bool)
+        self.cut: Tensor | None = None  # before the first part is over
+
+    def outcome(self, capacity: int, x: Tensor) -> Outcome:
+        """capacity: Pairs of all scenes that fit.  x: [B, V, 3] at the start of the step."""
+        smallest, counts = _stack([d.smallest for d in self.found]), _stack(self.counts)
+        cut = torch.zeros_like(x[..., 0], dtype=torch.bool) if self.cut is None else self.cut
+        return Outcome(counts, capacity, cut, smallest)
+
+
+def _stack(parts: list[Tensor]) -> Tensor:
+    return parts[0][None] if len(parts) == 1 else torch.stack(parts)  # one is not copied: on CUDA that is a launch
 
 
 outcomes: weakref.WeakKeyDictionary[Model, Outcome] = weakref.WeakKeyDictionary()

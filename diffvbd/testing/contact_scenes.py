@@ -203,8 +203,8 @@ def part_of(detection: Any) -> reference.Part:
         rows = constants[:, -1] < constants[:, 0]
         rows[detection.kept] = True
         pairs, constants = pairs[rows], constants[rows]
-    return reference.Part(pairs, constants, detection.island.cpu().long(), detection.shares.cpu(),
-                          detection.corrections.cpu(), limits,
+    return reference.Part(pairs, constants, detection.island.cpu().long(), torch.stack(detection.shares).cpu(),
+                          torch.stack(detection.corrections).cpu(), limits,
                           None if detection.frames is None else detection.frames.cpu(), lowest=lowest,
                           lengths=None if detection.lengths is None else detection.lengths.cpu(),
                           combined=None if detection.combined is None else tuple(t.cpu() for t in detection.combined),
