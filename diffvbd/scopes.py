@@ -40,7 +40,7 @@ def looks_at(value: Tensor) -> bool:
 
 def is_captured(value: Tensor) -> bool:
     """Whether work on it is being captured into a CUDA graph, which can neither read a value nor raise."""
-    return value.is_cuda and torch.cuda.is_current_stream_capturing()
+    return value.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
 
 
 def transformed() -> bool:

@@ -20,6 +20,7 @@ from ..mask import CONTACT, ELASTIC
 from ..mesh import TetMesh
 from ..ops import regimes
 from ..safeguards import FILTER_ETA, SATURATION_EPS
+from ..scopes import is_captured
 from .anderson import Anderson, moving_bodies
 from .arguments import Energy, check_isolated, checked_device, checked_energies, checked_steps, per_tet_density
 from .bodies import find_bodies, first_of_body
@@ -64,8 +65,7 @@ class Model:
         coarse: Corrections between the sweeps, for what is stiff, long, thin or finely meshed: None, a
             :class:`diffvbd.CoarseSpace`, or ``"auto"``, which is ``CoarseSpace()``.
         acceleration: None, or a :class:`diffvbd.Anderson`, which combines the iterates of each step.
-        colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier among the
-            energies.
+        colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); needs a PairBarrier.
         dtype: torch.float64 or torch.float32.
         device: Where the tensors live.
 
@@ -340,10 +340,12 @@ class Model:
 
     def derived(self, name: str, build: Callable[[], Any]) -> Any:
         """Something that follows from the Model alone, built at its first use and kept."""
-        if name not in self._derived:
+        # what is captured into a graph has no values until that is replayed
+        kept = self._derived if name in self._derived or not is_captured(self._mass) else {}
+        if name not in kept:
             with torch.inference_mode(False), torch.no_grad():  # later steps may be differentiated
-                self._derived[name] = build()
-        return self._derived[name]
+                kept[name] = build()
+        return kept[name]
 
     @property
     def tets(self) -> Tensor:

@@ -73,5 +73,5 @@ def is_cut(of: ContactStep, x: Tensor, back: Tensor) -> Tensor:
     """The vertices [B, V] of bodies that were held up at the end, at x [B, V, 3]; back: of Corrected."""
     assert of.barrier is not None
     way = (x.detach() - of.x_prev.detach()).norm(dim=-1)
-    body = of.model.derived("body", lambda: of.model.body)
+    body = of.model.derived("labels", lambda: of.model.body)
     return back[:, body] > HELD * (way + of.barrier.dhat)
