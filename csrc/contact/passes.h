@@ -229,7 +229,7 @@ DIFFVBD_FN void add_lags(const Source<T, Positions>& s, int v, T h, Vec3<T>& g, 
   add_floor_lags(s, v, 0, 1, h, g, H);
 }
 
-// What limits a vertex besides its pairs, and what rounding may make of its height. It does not depend on the update.
+// What limits the updates of a vertex besides its pairs. It does not depend on the update.
 template <class T>
 struct OwnRoom {
   Vec3<T> center, origin;
@@ -240,6 +240,7 @@ struct OwnRoom {
       : center(s.in.center_of(s.scene, v)), origin(s.origin(v)), size(s.in.room[s.scene * s.in.num_vertices + v]) {}
   // The exponent of the limit of an update that goes by d from where the vertex was.
   DIFFVBD_FN int limit(const Vec3<T>& from, const Vec3<T>& d) const { return limit_by_room(from - center, d, size); }
+  // What rounding may make of its height [m].
   DIFFVBD_FN T guard(const Vec3<T>& from) const {
     const Vec3<T> at = from + origin;
     return T(kGuardUlps) * std::numeric_limits<T>::epsilon() * (absolute(at.x) + absolute(at.y) + absolute(at.z));

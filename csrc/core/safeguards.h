@@ -48,7 +48,7 @@ DIFFVBD_FN Vec3<R> saturate_vjp(const Vec3<R>& d_raw, const Vec3<R>& d_bar, cons
 template <class R, class T>
 DIFFVBD_FN R filter_fraction(const R& gap, const R& change, const StepParameters<T>& q) {
   const R most = R(q.filter_eta) * gap;
-  if (!any(most < -change)) return R(1);  // nearly always, and a division takes long
+  if (!any(most < -change)) return R(1);  // nearly always; a division is slow
   const auto closing = change < R(0);
   const R alpha = most / select(closing, -change, R(1));
   return select(closing, select(alpha < R(1), alpha, R(1)), R(1));

@@ -112,10 +112,10 @@ struct PairsOf {
     return vertex < 0 ? contact::OwnRoom<T>{} : contact::OwnRoom<T>(source, vertex);
   }
   // The exponent of the limit of an update that goes from where the vertex was by d.
-  __device__ __forceinline__ int limit(const contact::OwnRoom<T>& room, const Vec3<T>& from, const Vec3<T>& d) {
+  __device__ __forceinline__ int limit(const contact::OwnRoom<T>& own, const Vec3<T>& from, const Vec3<T>& d) {
     int exponent = 0;
     T length = T(0), guard = T(0);
-    if (vertex >= 0) exponent = room.limit(from, d), length = contact::length_of(d), guard = room.guard(from);
+    if (vertex >= 0) exponent = own.limit(from, d), length = contact::length_of(d), guard = own.guard(from);
     if (!__any_sync(kWholeWarp, listed.count > 0)) return exponent;
     if (at.lane == 0) memory.exponents[at.group] = exponent;
     __syncwarp();

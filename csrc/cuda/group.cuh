@@ -225,7 +225,8 @@ struct GroupStar : Records<T, lanes_, reverse> {
     if (adds) sum += load_row(rows, edge);
     store_row(rows, edge, sum);
   }
-  // What the threads of a warp have put for an edge, in the order of its entries. All of them must call it.
+  // The sum of what the threads have put for an edge, in the order of its entries. All threads of the warp must call
+  // it.
   __device__ __forceinline__ Vec3<T> gathered(int edge, bool there) const {
     constexpr int kAhead = 4;  // entries that are asked for at once
     const int begin = __ldg(s.plan.edge_entry + edge), end = __ldg(s.plan.edge_entry + edge + 1);
@@ -256,7 +257,7 @@ __device__ __forceinline__ Vec3<T> pull_rows(const StepView<T>& s, const Place<l
   const int none = s.plan.edge_slots * kSlice;  // the row that stays zero
   const T* rows = s.w.rows + at.scene * (static_cast<int64_t>(none) + 1) * kRow;
   Vec3<T> sum = zero3<T>();
-  // A warp that has one vertex stays together in the loop: where threads leave it one by one, the sum below waits long.
+  // A warp that has one vertex stays together in the loop: the sum below would wait for the last thread to leave it.
   const int own = lanes == kSlice ? 0 : at.lane, after = at.lane - own;
   for (int start = incoming.begin + own; start < incoming.end; start += batch * lanes) {
     int row[batch];
@@ -273,7 +274,7 @@ __device__ __forceinline__ Vec3<T> pull_rows(const StepView<T>& s, const Place<l
     for (int u = 0; u < batch; ++u) sum += part[u];
   }
   if constexpr (lanes > 1) {
-    __syncwarp();  // threads leave the loop one by one, and shuffles of some of a warp take longer
+    __syncwarp();  // threads of several vertices leave the loop one by one, and shuffles of some of a warp take longer
     Place<lanes_>::template sum<T>(sum);
   }
   return sum;

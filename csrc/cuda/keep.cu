@@ -18,28 +18,29 @@ __global__ void __launch_bounds__(kThreads) flag_pairs(const __grid_constant__ K
   const int64_t i = own_item();
   if (i <= in.count) kept[i] = i < in.count && stays(in, i) ? 1 : 0;
 }
-// Calls f(entry, its place in the shorter list) for the pairs of a corner point that stay; a warp for each. Returns how
-// many there are.
-template <class T, class F>
-__device__ int32_t each_kept(const KeepInputs<T>& in, int64_t corner, const F& f) {
+// Calls f(number(entry), its place in the shorter list) for the entries of a corner point whose pairs stay; a warp for
+// each. Returns how many there are.
+template <class T, class Number, class F>
+__device__ int32_t each_kept(const KeepInputs<T>& in, int64_t corner, const Number& number, const F& f) {
   constexpr int kAhead = 8;  // entries of a thread that are read at once: a corner of a collider may have thousands
   const unsigned lane = threadIdx.x % kWarp;
   const int32_t end = in.ptr[corner + 1];
   int32_t count = 0;
   for (int32_t first = in.ptr[corner]; first < end; first += kAhead * kWarp) {
-    int32_t entries[kAhead];
-    bool stay[kAhead];
+    int32_t entries[kAhead], numbers[kAhead];  // -1: there is none that stays
 #pragma unroll
     for (int u = 0; u < kAhead; ++u) {
       const int32_t own = first + u * kWarp + static_cast<int32_t>(lane);
       entries[u] = own < end ? in.entry[own] : -1;
     }
 #pragma unroll
-    for (int u = 0; u < kAhead; ++u) stay[u] = entries[u] >= 0 && in.keep[entries[u] >> 2];
+    for (int u = 0; u < kAhead; ++u) {
+      numbers[u] = entries[u] >= 0 && in.keep[entries[u] >> 2] ? number(entries[u]) : -1;
+    }
 #pragma unroll
     for (int u = 0; u < kAhead; ++u) {
-      const unsigned found = __ballot_sync(kWholeWarp, stay[u]);
-      if (stay[u]) f(entries[u], count + __popc(found & ((1u << lane) - 1)));
+      const unsigned found = __ballot_sync(kWholeWarp, numbers[u] >= 0);
+      if (numbers[u] >= 0) f(numbers[u], count + __popc(found & ((1u << lane) - 1)));
       count += __popc(found);
     }
   }
@@ -48,14 +49,17 @@ __device__ int32_t each_kept(const KeepInputs<T>& in, int64_t corner, const F& f
 template <class T>
 __device__ void count_entries_of(const KeepInputs<T>& in, int64_t corner, int32_t* counts) {
   if (corner > in.corners) return;
-  const int32_t count = corner < in.corners ? each_kept(in, corner, [](int32_t, int32_t) {}) : 0;
+  const int32_t count =
+      corner < in.corners ? each_kept(in, corner, [](int32_t entry) { return entry; }, [](int32_t, int32_t) {}) : 0;
   if (threadIdx.x % kWarp == 0) counts[corner] = count;
 }
 template <class T>
 __device__ void copy_entries_of(const KeepInputs<T>& in, const int32_t* kept, int64_t corner, int32_t first,
                                 const Kept<T>& out) {
-  each_kept(in, corner,
-            [&](int32_t entry, int32_t place) { out.entry[first + place] = 4 * kept[entry >> 2] + (entry & 3); });
+  int32_t* to = out.entry + first;
+  each_kept(
+      in, corner, [&](int32_t entry) { return 4 * kept[entry >> 2] + (entry & 3); },
+      [&](int32_t entry, int32_t place) { to[place] = entry; });
 }
 
 template <class T>
@@ -78,17 +82,17 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 // Where lists are short, each block adds up by itself what comes before its own: two launches in place of eight.
-constexpr int64_t kFewPairs = 1 << 15, kFewCorners = 1 << 14;
+constexpr int64_t kFewPairs = 1 << 15, kFewCorners = 1 << 12;
 
 template <class T>
 bool are_few(const KeepInputs<T>& in) {
   return in.count <= kFewPairs && in.corners <= kFewCorners;
 }
 
-// The sums over the threads of a block; all must call it.
 struct Sums {
   int before, all;
 };
+// The sums over the threads of a block; all must call it.
 __device__ Sums sums_of_block(Sums own) {
   __shared__ int before[kThreads / kWarp], all[kThreads / kWarp];
   const unsigned warp = threadIdx.x / kWarp;
@@ -99,7 +103,7 @@ __device__ Sums sums_of_block(Sums own) {
   for (int i = 0; i < kThreads / kWarp; ++i) sum.before += before[i], sum.all += all[i];
   return sum;
 }
-// Of value(i) for i in [0, end), and of those below `first`.
+// The sum of value(i) over i in [0, end), and over those below `first`.
 template <class Value>
 __device__ Sums sums_before(int64_t first, int64_t end, const Value& value) {
   Sums own{0, 0};

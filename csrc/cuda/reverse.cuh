@@ -58,7 +58,7 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   star.pairs = &pairs;
   star.repeats = !full;
   Block<T> b = load_block<Set>(s, at, false, s.w.x);
-  int exponent = 0;  // of its limit
+  int exponent = 0;  // of the update's limit
   if constexpr (Set::contact) {
     const int64_t step = (s.base + scene) * s.sweeps + s.sweeps - 1 - turn.number;
     if (real) exponent = __ldg(s.limits + step * s.plan.num_vertices + __ldg(s.plan.order + position));

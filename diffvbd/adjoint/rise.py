@@ -32,7 +32,7 @@ class RiseParts(NamedTuple):
         """Whether the potential of each body lets it go from x to ``to`` [B, V, 3]: it does not rise by more than
         rounding, is a number, and ``to`` is not too near a plane; bool [B, bodies]."""
         rise, size = rise_of_bodies(self, x, to).unbind(-1)
-        return rise <= ROUNDINGS * torch.finfo(x.dtype).eps * size  # false of what is no number
+        return rise <= ROUNDINGS * torch.finfo(x.dtype).eps * size  # False where it is not a number
 
     def raises(self, x: Tensor, to: Tensor) -> Tensor:
         """Which vertices are of a body whose potential does not let it go from x to ``to``, bool [B, V]."""
@@ -40,7 +40,7 @@ class RiseParts(NamedTuple):
         if bodies.number == 0:
             return admitted.new_zeros(x.shape[:2])
         moves, of = self.model.derived("moving_body", lambda: (bodies.of < bodies.number, bodies.of % bodies.number))
-        return moves > admitted[:, of]
+        return moves > admitted[:, of]  # moves and not admitted, in one launch
 
 
 def rise_parts(model: Model, fields: ops.SweepFields, time_step: float) -> RiseParts:

@@ -107,7 +107,7 @@ class PartStart(NamedTuple):
     frames: Tensor | None  # [B, bodies]: share that pairs let each body go of its rigid motion above the floor
     short: Tensor  # [B, V] bool: pairs have held up more than a hundredth of its way
     stuck: Tensor  # [1] int64: pairs that hinder what is prescribed
-    shares: tuple[Tensor, Tensor]  # of the two ways, that vertices went [B, V]
+    shares: tuple[Tensor, Tensor]  # how much of each of its two ways a vertex went, [B, V] each
 
 
 def start_between_planes(x: Tensor, move: Tensor, fall: Tensor, mass: Tensor, was: Tensor, now: Tensor,

@@ -65,9 +65,8 @@ class Model:
         coarse: Corrections between the sweeps, for what is stiff, long, thin or finely meshed: None, a
             :class:`diffvbd.CoarseSpace`, or ``"auto"``, which is ``CoarseSpace()``.
         acceleration: None, or a :class:`diffvbd.Anderson`, which combines the iterates of each step.
-        colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); needs a PairBarrier.
-        dtype: torch.float64 or torch.float32.
-        device: Where the tensors live.
+        colliders: What the bodies touch and do not move (:mod:`diffvbd.colliders`); they need a PairBarrier.
+        dtype, device: torch.float64 or torch.float32; where the tensors live.
 
     Attributes (torch tensors in the user's numbering, a copy at each access):
         rest_points [V, 3] [m]; tets [T, 4]; density [T]; mass [V] [kg]; pinned [V] bool; surface [F, 3];
@@ -340,12 +339,13 @@ class Model:
 
     def derived(self, name: str, build: Callable[[], Any]) -> Any:
         """Something that follows from the Model alone, built at its first use and kept."""
-        # what is captured into a graph has no values until that is replayed
-        kept = self._derived if name in self._derived or not is_captured(self._mass) else {}
-        if name not in kept:
+        if name not in self._derived:
             with torch.inference_mode(False), torch.no_grad():  # later steps may be differentiated
-                kept[name] = build()
-        return kept[name]
+                value = build()
+            if is_captured(self._mass):  # what is captured has no values until it is replayed
+                return value
+            self._derived[name] = value
+        return self._derived[name]
 
     @property
     def tets(self) -> Tensor:

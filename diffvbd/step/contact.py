@@ -73,7 +73,7 @@ class ContactStep:
         self.parts: int | None = None if self.barrier is None else self.barrier.detections  # None: not decided yet
         like = begun.x_prev
         self.kappa = like.new_zeros((1,)) if self.barrier is None else self._parameter("pair_barrier.kappa")
-        self.lagged, self.lag = model.derived("no_lag", lambda: (no_pairs(like, 0), like.new_zeros((0, 9))))
+        self.lagged, self.lag = no_pairs(like, 0), like.new_zeros((0, 9))
         self.floor_lag = self._floor_lag()
         self.factor = factor_of(model, prepared.coarse, self.x_prev, prepared.settings.numbers.time_step)
 
