@@ -37,6 +37,7 @@ class ContactSurface:
     body: Tensor  # [N] int32: those of the mesh, then one for each collider
     held: Tensor  # [N] bool: pinned, or of a collider
     held_bodies: Tensor  # [bodies] bool: a vertex of it is pinned
+    partly_held: Tensor | None  # [V] bool: of a body of which a vertex is pinned and another not; None: there is none
     plane_points: Tensor  # [N] bool: spans a plane
     body_order: Tensor  # [V] int32: vertices by body
     body_ptr: Tensor  # [bodies + 1] int32
@@ -107,7 +108,9 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
     edge = torch.from_numpy(total / np.maximum(number, 1))
     held_vertices = np.bincount(label, weights=pinned.cpu().numpy(), minlength=bodies)
     held_bodies = torch.from_numpy(held_vertices > 0)
-    alone = (held_vertices < np.bincount(label, minlength=bodies)).sum() <= 1 or not barrier.between_bodies
+    moving_bodies = held_vertices < np.bincount(label, minlength=bodies)
+    partly_held = torch.from_numpy(((held_vertices > 0) & moving_bodies)[label])
+    alone = moving_bodies.sum() <= 1 or not barrier.between_bodies
     own = torch.where(torch.from_numpy(np.bincount(label[surface[:, 0]], minlength=bodies)) <= COARSE_TRIANGLES,
                       MOST_EDGES_COARSE, MOST_EDGES_OWN)  # fmt: skip
     most_room_alone = MOST_EDGES * edge
@@ -131,6 +134,7 @@ def build_surface(mesh: TetMesh, pinned: Tensor, barrier: PairBarrier, colliders
         body=torch.from_numpy(np.concatenate(body).astype(np.int32)),
         held=held,
         held_bodies=held_bodies,
+        partly_held=partly_held if partly_held.any() else None,
         plane_points=torch.from_numpy(np.concatenate(flat)),
         body_order=torch.from_numpy(order.astype(np.int32)),
         body_ptr=torch.from_numpy(np.searchsorted(label[order], np.arange(bodies + 1)).astype(np.int32)),

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from .. import ops
@@ -87,15 +86,6 @@ def rests(model: Model, x: Tensor, lift: Tensor, raises: Callable[[Tensor, Tenso
         x: Where vertices are without the fall, [B, V, 3] [m].  lift: As :func:`unsupported` returns it.
         raises: As for :func:`diffvbd.contact.start.start_between_planes`.
     """
-    held = model.derived("partly_held", lambda: _partly_held(model))
+    assert model.surface_of_contact is not None
+    held = model.surface_of_contact.partly_held
     return None if held is None else raises(x, x + lift) & held
-
-
-def _partly_held(model: Model) -> Tensor | None:
-    """The vertices of bodies of which some are pinned and some not, bool [V]."""
-    pinned, body = model._pinned.cpu(), model.body.cpu()
-    count = int(body.max()) + 1
-    none = body.new_zeros((count,))
-    some, whole = (none.index_add(0, body, p.to(body)) for p in (pinned, torch.ones_like(pinned)))
-    found = ((0 < some) & (some < whole))[body]
-    return found.to(model.device) if bool(found.any()) else None
