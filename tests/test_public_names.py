@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -38,6 +39,14 @@ def test_public_modules_are_imported_and_what_is_not_there_is_noticed() -> None:
     command = [sys.executable, "-W", "error", "-c", SCRIPT, *SPELLINGS, absent]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.stdout.splitlines()[-1:] == [repr([absent])], done.stdout + done.stderr
+
+
+def test_a_folder_of_the_same_name_does_not_hide_the_package(tmp_path: Path) -> None:
+    """As beside a clone of the repository: a script there imports what is installed, from sources in place, too."""
+    (tmp_path / "diffvbd").mkdir()
+    script = "import importlib.util as util; print(util.find_spec('diffvbd').origin)"
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert Path(done.stdout.strip()).name == "__init__.py", done.stdout + done.stderr
 
 
 def test_an_unknown_name_is_named() -> None:

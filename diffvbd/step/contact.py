@@ -365,8 +365,8 @@ class ContactStep:
         if hindered:
             raise ValueError(
                 f"prescribed or colliders: expected motion that leaves bodies a way, got {hindered} pairs in part {r} "
-                f"of {self.parts} that it would bring too close: give PairBarrier a larger number of detections or "
-                "use a smaller time_step"
+                f"of {self.parts} that it would bring too close: spread a long way over more steps (per_step), give "
+                "PairBarrier a larger number of detections, or use a smaller time_step"
             )
 
     def _refuse_what_is_not_finite(self) -> None:
