@@ -61,7 +61,7 @@ def _matched(found: Any, before: Any, now: Any, changed: str) -> Any:
         parts = [_matched(*part, changed) for part in zip(found, before, now, strict=True)]
         return tuple(parts) if isinstance(found, tuple) else parts
     else:
-        same = type(before) is type(now) and before == now
+        same = type(before) is type(now) and (before == now or (before != before and now != now))  # NaN is itself
     if not same:
         raise RuntimeError(changed)
     return found

@@ -160,7 +160,7 @@ def rollout(
     # What a checkpointed segment reads again must not change in between: lists and dicts are copied. Plain dicts and
     # functions of them: torch.compile takes no object of ours along.
     options, own = ({k: _frozen(v) for k, v in given.items()} for given in (options, parameters or {}))
-    if not isinstance(options["gravity"], Tensor) and not _changes(options["gravity"]):
+    if not _changes(options["gravity"]):
         options["gravity"] = acceleration_of(options["gravity"], x)  # once, not in each step
     # once: what a checkpoint runs again must run as it did, whatever dv.regime says by then
     execution = step_settings(model, lead, time_step, sweeps)

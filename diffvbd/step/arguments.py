@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from inspect import signature
 from typing import Any, NamedTuple
@@ -271,7 +272,8 @@ def _refuse_lines(model: Model, name: str, points: Tensor) -> None:
 def name_argument(model: Model, error: ValueError, arguments: dict[str, Any]) -> None:
     """Raises an error that names the argument, where the operator could name only what was made of several."""
     if str(error).startswith(("predictor", "start")):
-        refuse_non_finite(model, arguments)
+        with suppress(RuntimeError):  # under vmap values cannot be looked at
+            refuse_non_finite(model, arguments)
 
 
 def refuse_non_finite(model: Model, arguments: dict[str, Any]) -> None:
@@ -297,14 +299,15 @@ def acceleration_of(gravity: Any, like: Tensor) -> Tensor:
 def _three_numbers(name: str, value: Any, like: Tensor) -> Tensor:
     if isinstance(value, np.ndarray):
         value = value.tolist()
-    if not isinstance(value, (tuple, list)) or not all(isinstance(a, (int, float)) for a in value):
+    numbers = isinstance(value, (tuple, list)) and all(isinstance(a, NUMBERS) for a in value)
+    if not numbers or any(isinstance(a, bool) for a in value):
         raise TypeError(f"{name}: expected 3 numbers or a tensor, got {value!r}")
     if len(value) != 3:
         fail(name, "3 numbers or a tensor", f"{len(value)} numbers")
-    numbers = [to_float(name, a) for a in value]
+    floats = [to_float(name, a) for a in value]
     if like.is_cuda:  # kernels fill it: a copy from the host would wait for the device and break a graph's capture
-        return torch.stack([torch.full((), a, dtype=like.dtype, device=like.device) for a in numbers])
-    return torch.tensor(numbers, dtype=like.dtype, device=like.device)
+        return torch.stack([torch.full((), a, dtype=like.dtype, device=like.device) for a in floats])
+    return torch.tensor(floats, dtype=like.dtype, device=like.device)
 
 
 def broadcastable(name: str, value: Any, x: Tensor) -> Tensor:

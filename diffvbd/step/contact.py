@@ -27,9 +27,9 @@ from ..tuples import replaced
 from .coarse import factor_of
 from .contact_cycles import CUT, MOST_DETECTIONS, of_going, parts_of, record_parts, sweeps_of_part, swept_part
 from .corrections import corrected, corrected_after, is_cut
-from .floor_start import start_on_floor
+from .floor_start import refuse_below_floor, start_on_floor
 from .intersections import advice_to_part, refuse_intersections
-from .met import Detection, Met, outcomes
+from .met import Detection, Met, TooManyPairs, outcomes
 from .motion import Motion, coasting, motion_of
 from .rooms import ROOM, rooms, rooms_of_sweeps
 from .unsupported import rests, unsupported
@@ -43,14 +43,6 @@ CLOSE = 1e-3  # of dhat: pairs whose gap is so much wider do not push, however i
 MOST_CAPACITY = 2**26
 LOST = ("x: positions became non-finite {}: check that v, forces and materials are in SI units, use a smaller "
         "time_step or softer materials, or look with diffvbd.debug_checks()")  # fmt: skip
-
-
-class TooManyPairs(RuntimeError):
-    """More pairs than fit; ``needed`` per scene."""
-
-    def __init__(self, needed: int, message: str) -> None:
-        super().__init__(message)
-        self.needed = needed
 
 
 class ContactStep:
@@ -67,6 +59,8 @@ class ContactStep:
         self.origin = begun.x_prev.new_empty((0,)) if begun.origin is None else begun.origin
         self.surface, self.barrier = model.surface_of_contact, model.contact
         self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()].contiguous()
+        if prepared.settings.sweeps == 0 and self._reads(self.x_prev):  # else the sweeps do
+            refuse_below_floor(model, begun, self.floor_data)
         floor = model.floor
         oblique = floor is not None and bool((np.count_nonzero(floor.normal, axis=-1) > 1).any())
         self.any_direction = oblique or "floor_barrier.normal" in prepared.parameters
@@ -263,7 +257,7 @@ class ContactStep:
             swept = swept_part(self, x, start, self.colliders, none, settings, policy, debug_step)
             x = corrected_after(self, swept.x, self.colliders, start, none, True).x
             record_parts(self.model, x, [swept])
-        return x
+        return self._finite(x)
 
     def _colliders_at(self, share: float) -> Tensor:
         if self.colliders is self.before:
@@ -318,7 +312,11 @@ class ContactStep:
         if x.is_cuda:
             for r, row in enumerate(table.tolist()):
                 self._check(r, row, met)
-        elif not bool(torch.isfinite(x).all()):
+        return self._finite(x)
+
+    def _finite(self, x: Tensor) -> Tensor:
+        """x; raises where it holds what is not finite, if that may be read."""
+        if self._reads(x) and not bool(torch.isfinite(x).all()):
             self._refuse_what_is_not_finite()
             raise RuntimeError(LOST.format("in the step"))
         return x

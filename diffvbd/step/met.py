@@ -73,6 +73,14 @@ class Outcome(NamedTuple):
     smallest: Tensor  # [R, B] [m]
 
 
+class TooManyPairs(RuntimeError):
+    """More pairs than fit; ``needed`` per scene."""
+
+    def __init__(self, needed: int, message: str) -> None:
+        super().__init__(message)
+        self.needed = needed
+
+
 class Met:
     """What the parts of a step meet one after another."""
 

@@ -83,7 +83,7 @@ def begin(
     h = prepared.settings.numbers.time_step
     shape, flat = x.shape, (math.prod(x.shape[:-2]), *x.shape[-2:])
     start, velocity = x.reshape(flat), v.reshape(flat)
-    if gravity.dim() == 1 and force is None:
+    if gravity.shape == (3,) and force is None:
         acceleration = gravity[None, None]
     else:
         acceleration = ops.broadcast(gravity, shape).reshape(flat)

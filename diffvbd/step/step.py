@@ -102,7 +102,8 @@ def step(
 
     Args:
         model: The scene; x, v and the other tensors must have its dtype and device.
-        x: Positions [m], shape [..., V, 3]; leading dimensions are scenes over one mesh, which never mix.
+        x: Positions [m], shape [..., V, 3]; leading dimensions are scenes over one mesh, which do not mix. (A
+            PairBarrier without a number of detections has the same number for all scenes of a step.)
         v: Velocities [m/s], shape of x.
         mu: Shear modulus [Pa], broadcasts to x.shape[:-2] + (T,); a value per scene is [B, 1].
         lam: First Lame parameter [Pa], likewise. mu >= 0 and mu + lam >= 0 (lam >= 0 with block="paper").
