@@ -17,6 +17,7 @@ from ..adjoint.sweep import no_transforms, sweep
 from ..contact import detection as search
 from ..contact.start import PartStart, start_between_planes
 from ..contact.surface import LEAST_CAPACITY
+from ..mask import CONTACT
 from ..model.model import Model
 from ..model.tet_shapes import inside_out
 from ..ops import SweepSettings, broadcast
@@ -27,7 +28,7 @@ from ..tuples import replaced
 from .coarse import factor_of
 from .contact_cycles import CUT, MOST_DETECTIONS, of_going, parts_of, record_parts, sweeps_of_part, swept_part
 from .corrections import corrected, corrected_after, is_cut
-from .floor_start import refuse_below_floor, start_on_floor
+from .floor_start import start_on_floor
 from .intersections import advice_to_part, refuse_intersections
 from .met import Detection, Met, TooManyPairs, outcomes
 from .motion import Motion, coasting, motion_of
@@ -59,8 +60,10 @@ class ContactStep:
         self.origin = begun.x_prev.new_empty((0,)) if begun.origin is None else begun.origin
         self.surface, self.barrier = model.surface_of_contact, model.contact
         self.floor_data = None if model.floor is None else begun.data[:, : model.floor.count()].contiguous()
-        if prepared.settings.sweeps == 0 and self._reads(self.x_prev):  # else the sweeps do
-            refuse_below_floor(model, begun, self.floor_data)
+        if prepared.settings.sweeps == 0 and self._reads(self.x_prev):  # for what sweeps raise
+            plain = replaced(prepared.settings, energies=prepared.settings.energies & ~CONTACT, coarse=())
+            with torch.no_grad():
+                sweep(self.fields, model._packed_rest, model._plan, plain, tape_policy=0)
         floor = model.floor
         oblique = floor is not None and bool((np.count_nonzero(floor.normal, axis=-1) > 1).any())
         self.any_direction = oblique or "floor_barrier.normal" in prepared.parameters

@@ -39,22 +39,6 @@ def start_on_floor(model: Model, begun: Begun, floor: Tensor | None, mass: Tenso
     return torch.where(free[body, None], x + left, start)
 
 
-def refuse_below_floor(model: Model, begun: Begun, floor: Tensor | None) -> None:
-    """Raises, as sweeps do, where an unpinned vertex starts the step on or below a plane. floor: As above."""
-    if model.floor is None or floor is None:
-        return
-    gap = model.floor.gaps(begun.x_prev.detach(), floor.detach(), begun.origin)[0]
-    below = ~(gap > 0) & ~model._pinned[:, None]
-    if bool(below.any()):
-        scene, plane = (int(k) for k in below.any(1).nonzero()[0])
-        found = below[scene, :, plane].nonzero()[:, 0].tolist()
-        named = ", ".join(map(str, found[:5])) + (", ..." if len(found) > 5 else "")
-        raise ValueError(
-            f"x: expected every unpinned vertex above floor plane {plane}, got {len(found)} on or below it in scene "
-            f"{scene}: vertices {named}"
-        )
-
-
 def _borne(floor: Tensor, x: Tensor, lift: Tensor, body: Tensor, bodies: int) -> Tensor:
     """``lift`` = h^2 a [B, V, 3] without what pushes a body into a plane within dhat, which bears it. Of a body at rest
     nothing is left, on a slope what draws it down the slope."""
