@@ -7,5 +7,6 @@ EXACT_BLOCK, PAPER_BLOCK = 1, 2  # of the elastic block
 ELASTIC = EXACT_BLOCK | PAPER_BLOCK
 CONTACT = 4
 FIRST_VERTEX_BIT = 3  # shift of the first energy of energies.VERTEX_ENERGIES
-# Contact and the one energy with a step filter, FloorBarrier: their gaps must come back to the bit.
-KEEPS_POSITIONS = CONTACT | 1 << FIRST_VERTEX_BIT
+FILTERS = 1 << FIRST_VERTEX_BIT  # the one energy with a step filter, FloorBarrier
+KEEPS_POSITIONS = CONTACT | FILTERS  # gaps must come back to the bit
+VERTEX_ENERGIES = -1 << FIRST_VERTEX_BIT

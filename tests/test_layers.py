@@ -340,13 +340,6 @@ def test_tape_rows_and_policies_agree() -> None:
     (policies,) = re.findall(r"enum TapePolicy \{([^}]*)\}", text)
     values = {name: int(number) for name, number in re.findall(r"(\w+) = (\d+)", policies)}
     assert values == {"kNoTape": ops.NO_TAPE, "kCompactTape": ops.COMPACT_TAPE, "kFullTape": ops.FULL_TAPE}
-    pattern = r"policy == kFullTape \? \(keeps_positions \? (\d+) : (\d+)\) : policy == kCompactTape \? (\d+)"
-    (rows,) = re.findall(pattern, text)
-    floor = dv.FloorBarrier.bit
-    for bit in (floor, dv.PairBarrier.bit):
-        kinds = ((ops.FULL_TAPE, bit), (ops.FULL_TAPE, 0), (ops.COMPACT_TAPE, bit))
-        assert [int(n) for n in rows] == [ops.tape_rows(*kind) for kind in kinds]
-    assert ops.tape_rows(ops.NO_TAPE, floor) == 0
 
 
 @needs_csrc

@@ -191,9 +191,10 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "time_step, float filter_eta, float chord, int start, bool filters, bool[] wants",
          "Tensor x, Tensor v, Tensor acceleration, Tensor prescribed, Tensor mass, Tensor shared, Tensor own, Tensor "
          "planes, ");
-  // The Cholesky factors (CUDA: inverses) of the matrices of all bodies, one after the other; adjoints of x_prev,
-  // stiffness and mass from that of the matrices
-  define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "int[] sizes, float time_step", "Tensor factor, ");
+  // The matrices of all bodies, one after the other, or if factored their Cholesky factors (CUDA: inverses); adjoints of
+  // x_prev, stiffness and mass from that of the matrices
+  define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "int[] sizes, float time_step, bool factored",
+         "Tensor factor, ");
   define(m, "coarse_matrix_backward", DIFFVBD_ARGUMENTS(COARSE), "Tensor bar, int[] sizes, float time_step",
          DIFFVBD_RETURNS(COARSE));
   // Of what these are made, see coarse/sums.h; adjoints of the moduli [scenes, tets], and, where wanted, of the rest

@@ -4,17 +4,14 @@
 #include <cmath>
 #include <limits>
 
+#include "../core/safeguards.h"
 #include "../energies/tet.h"
 
 namespace diffvbd::coarse {
 
-constexpr int kLengths = 8;  // 1, 1/2, ... 1/128; then 0
 constexpr int kDegree = TetLayout::line_degree;
 constexpr double kDecrease = 1e-4;  // share of what the slope promises
-constexpr double kRounding = 8;     // ulps of the terms that a sum may lose
-constexpr int kFailures = 2;        // lengths of 0 after which a body's corrections are over
-
-DIFFVBD_FN double length_of(int trial) { return 1.0 / (1 << trial); }
+constexpr int kFailures = 2;  // lengths of 0 after which a body's corrections are over
 
 // The smooth part of the change of the potential, c[0] s + ... + c[5] s^6, and the sum of its terms' sizes.
 struct Change {
@@ -37,8 +34,8 @@ struct Change {
 template <class T, class More>
 DIFFVBD_FN double length(const Change& change, double slope, const More& more) {
   if (!(slope <= 0)) return 0;  // at rest it is 0: the whole correction is taken, for its derivative
-  for (int trial = 0; trial < kLengths; ++trial) {
-    const double s = length_of(trial);
+  for (int trial = 0; trial < kFractions; ++trial) {
+    const double s = fraction_of(trial);
     double size = change.size(s);
     const double rise = change.at(s) + more(s, size);
     if (rise <= kDecrease * s * slope + kRounding * double(std::numeric_limits<T>::epsilon()) * size) return s;

@@ -32,37 +32,64 @@ struct Line {
     return mass * dot(at(x + row(i)) - at(in.y.data + scene * in.y.scene + 3 * v), at(way + row(i)));
   }
 
+  DIFFVBD_FN VertexState<double> state(int32_t i) const {
+    const int64_t v = vertex(i);
+    VertexState<double> out{at(x + row(i)),
+                            at(in.x_prev.data + scene * in.x_prev.scene + 3 * v),
+                            {0, 0, 0},
+                            double(in.parameters.time_step)};
+    if (in.origin.data) out.origin = at(in.origin.data + scene * in.origin.scene + 3 * v);
+    return out;
+  }
+  // calls f(energy, its data for vertex i, their count) for the energies that are present
+  template <class F>
+  DIFFVBD_FN void each_energy(int32_t i, F&& f) const {
+    rigid::each_energy(
+        [&](auto energy, int k) {
+          const int count = in.data_count[k];
+          if (count == 0) return;
+          const T* own = in.data.data + scene * in.data.scene + data_start[k] +
+                         (decltype(energy)::per_vertex ? int64_t{vertex(i)} * count : 0);
+          double data[kMaxEnergyData];
+          for (int d = 0; d < count; ++d) data[d] = own[d];
+          f(energy, data, count);
+        },
+        VertexEnergies{});
+  }
+
   // By how much the energies of vertex i alone rise: infinite where one of them does not admit the motion. Adds their
   // sizes to `size`.
   DIFFVBD_FN double energies(int32_t i, double s, double& size) const {
-    const int64_t v = vertex(i);
-    const Vector before = at(x + row(i)), after = before + s * at(way + row(i));
-    VertexState<double> state{
-        before, at(in.x_prev.data + scene * in.x_prev.scene + 3 * v), {0, 0, 0}, double(in.parameters.time_step)};
-    if (in.origin.data) state.origin = at(in.origin.data + scene * in.origin.scene + 3 * v);
+    const VertexState<double> before = state(i);
+    VertexState<double> after = before;
+    after.x += s * at(way + row(i));
     double rise = 0;
     bool admitted = true;
-    rigid::each_energy(
-        [&](auto energy, int k) {
-          using E = decltype(energy);
-          const int count = in.data_count[k];
-          if (count == 0) return;
-          const T* own = in.data.data + scene * in.data.scene + data_start[k] + (E::per_vertex ? v * count : 0);
-          double data[kMaxEnergyData];
-          for (int d = 0; d < count; ++d) data[d] = own[d];
-          VertexState<double> there = state;
-          there.x = after;
-          if constexpr (E::has_filter) {
-            admitted = admitted && E::template admits<T>(there, before, data, count, rigid::kLeastShare);
-          }
-          const double now = E::value(state, data, count), then = E::value(there, data, count);
-          rise += then - now;
-          size += std::abs(now) + std::abs(then);
-        },
-        VertexEnergies{});
+    each_energy(i, [&](auto energy, const double* data, int count) {
+      using E = decltype(energy);
+      if constexpr (E::has_filter) {
+        admitted = admitted && E::template admits<T>(after, before.x, data, count, rigid::kLeastShare);
+      }
+      const double now = E::value(before, data, count), then = E::value(after, data, count);
+      rise += then - now;
+      size += std::abs(now) + std::abs(then);
+    });
     return admitted ? rise : std::numeric_limits<double>::infinity();
   }
+
+  // What they add to the block of vertex i.
+  DIFFVBD_FN Sym3<double> block(int32_t i) const {
+    const VertexState<double> now = state(i);
+    Vector g{};
+    Sym3<double> H{};
+    each_energy(i, [&](auto energy, const double* data, int count) {
+      decltype(energy)::block(now, data, count, g, H);
+    });
+    return H;
+  }
 };
+
+DIFFVBD_FN bool acts(const Sym3<double>& H) { return H.xx + H.yy + H.zz > 0; }  // of a semidefinite block
 
 // The length of a correction a, where `restricted` is what it was solved from; tets [parts, kDegree]: coefficients of
 // the tets' energy along it, by part.

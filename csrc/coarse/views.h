@@ -87,13 +87,14 @@ struct Inputs {
   Plan plan;
   const T *weight, *row_weight;  // [entries] each, by position and by function
   Batched<const T> rest;         // [B, tet_blocks, kRestScalars, kLanes]
-  Batched<const T> factor;       // [B, 9 cells]  L of A = L L^T of each body, n x n; on CUDA the inverse
+  Batched<const T> factor;       // [B, 9 cells]  L of A = L L^T of each body, n x n; on CUDA the inverse; if pressed A
   Batched<const T> mass;         // [B, mass_ptr[bodies]]
   int corrections;
   T* tape;        // [B, corrections, tape_size()]
   T* matrix_bar;  // [B, 9 mass_ptr[bodies]], reverse only; null where not wanted
 
   bool keeps_positions;
+  bool pressed;  // whether energies of vertices act: each correction then adds their blocks to A
 
   // of a correction: the coarse vector, the length of each body and, where gaps must come back to the bit, what it read
   DIFFVBD_FN int64_t tape_size() const {

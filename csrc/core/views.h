@@ -39,10 +39,9 @@ DIFFVBD_FN bool one_for_scenes(const Batched<T> (&tensors)[n]) {
 enum TapePolicy { kNoTape = 0, kCompactTape = 1, kFullTape = 2 };
 
 // Scalars per active vertex and sweep. Full: d_raw and the factored H. Compact: d_raw. A scene with a step filter or
-// contact keeps the old position, in a compact tape instead of d_raw: a gap must come back to the bit, and an undo by
-// subtraction is an ulp off at times.
-DIFFVBD_FN constexpr int tape_rows(int policy, bool keeps_positions) {
-  return policy == kFullTape ? (keeps_positions ? 12 : 9) : policy == kCompactTape ? 3 : 0;
+// contact keeps `kept` more (kept_scalars() in energies.h), in a compact tape instead of d_raw.
+DIFFVBD_FN constexpr int tape_rows(int policy, int kept) {
+  return policy == kFullTape ? 9 + kept : policy == kCompactTape ? (kept > 0 ? kept : 3) : 0;
 }
 
 // The other three vertices of a tet, a = 0, 1, 2, in the order (j, k, l) that makes (j, i, k, l) an even permutation.

@@ -28,14 +28,18 @@ CoarseScene<T>::CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t s
       s_(s),
       kernels_(coarse_kernels<T>(in.energies)),
       failures_(c_.plan.bodies, 0),
+      plain_(c_.plan.bodies, 0),
       gradient_(size_t(plan.blocks) * kLanes * 4, true),
       way_(size_t(plan.blocks) * kLanes * 4, true),
+      wanted_(size_t(plan.blocks) * kLanes * 4, true),
       material_(size_t(c_.plan.tet_blocks) * kTetScalars * kLanes),
       coarse_(size_t(c_.plan.functions) * 4, true),
       rows_(size_t(c_.plan.functions) * 7, true),
-      turns_(size_t(c_.matrix_bar ? c_.corrections : 1) * c_.plan.functions * 3, true) {
+      turns_(size_t(c_.matrix_bar ? c_.corrections : 1) * c_.plan.functions * 3, true),
+      matrix_(c_.pressed ? size_t(9) * c_.plan.cells : 0) {
   s.gradient = gradient_.get();
   s.way = way_.get();
+  s.wanted = wanted_.get();
   const coarse::Plan& p = c_.plan;
   sums_ = Buffer<double>(size_t(p.parts) * coarse::kDegree);
   if (!(in.energies & kElastic)) return;
@@ -49,11 +53,50 @@ CoarseScene<T>::CoarseScene(const Plan& plan, const StepInputs<T>& in, int64_t s
   }
 }
 
+template <class T>
+void CoarseScene<T>::press(Team::Member& member) {
+  if (!c_.pressed) return;
+  const coarse::Plan& p = c_.plan;
+  member.each(0, p.bodies, [&](int64_t begin, int64_t end) {
+    std::vector<T> work;
+    for (int64_t b = begin; b < end; ++b) {
+      const coarse::Line<T, StepInputs<T>> line{in_, c_, s_.data_start, scene_, static_cast<int32_t>(b), s_.x, s_.way};
+      const int32_t first = p.function_ptr[b];
+      const int64_t n = int64_t{3} * (p.function_ptr[b + 1] - first), own = int64_t{9} * p.mass_ptr[b];
+      T* to = matrix_.get() + own;
+      std::vector<std::pair<int32_t, Sym3<double>>> blocks;
+      for (int32_t i = 0; i < line.size(); ++i) {
+        const Sym3<double> H = line.block(i);
+        if (coarse::acts(H)) blocks.emplace_back(i, H);
+      }
+      if (blocks.empty() && plain_[b]) continue;
+      plain_[b] = blocks.empty();
+      std::copy_n(c_.factor.data + scene_ * c_.factor.scene + own, n * n, to);
+      for (const auto& [i, H] : blocks) {
+        const double rows[3][3] = {{H.xx, H.xy, H.xz}, {H.xy, H.yy, H.yz}, {H.xz, H.yz, H.zz}};
+        const int32_t position = p.list_position[p.list_ptr[b] + i];
+        for (int32_t e = p.position_ptr[position]; e < p.position_ptr[position + 1]; ++e) {
+          for (int32_t f = p.position_ptr[position]; f < p.position_ptr[position + 1]; ++f) {
+            T* block = to + 3 * ((p.function[e] - first) * n + p.function[f] - first);
+            const double weight = double(c_.weight[e]) * double(c_.weight[f]);
+            for (int r = 0; r < 3; ++r) {
+              for (int c = 0; c < 3; ++c) block[r * n + c] += T(weight * rows[r][c]);
+            }
+          }
+        }
+      }
+      work.resize(n * kLanes);
+      kernels_.factor(n, work.data(), to);
+    }
+  });
+  member.barrier();
+}
+
 // x := A^-1 x body by body, three scalars a function
 template <class T>
 void CoarseScene<T>::solve(T* x, Team::Member& member) const {
   const coarse::Plan& p = c_.plan;
-  const T* factor = c_.factor.data + scene_ * c_.factor.scene;
+  const T* factor = c_.pressed ? matrix_.get() : c_.factor.data + scene_ * c_.factor.scene;
   member.each(0, p.bodies, [&](int64_t begin, int64_t end) {
     for (int64_t b = begin; b < end; ++b) {
       const int64_t first = int64_t{3} * p.function_ptr[b], n = int64_t{3} * p.function_ptr[b + 1] - first;
@@ -82,6 +125,7 @@ void CoarseScene<T>::correct(int k, Team::Member& member) {
     }
   });
   member.barrier();
+  press(member);
   solve(a, member);
   member.each(0, p.functions, [&](int64_t begin, int64_t end) {
     for (int64_t f = begin; f < end; ++f) {
@@ -180,6 +224,29 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
   if (std::all_of(lengths, lengths + p.bodies, [](T s) { return s == 0; })) return;
   T *q = turn(k), *coarse = coarse_.get();
   flush(member);
+  // back to where the correction began: x -= s (-P a)
+  member.each(0, p.functions, [&](int64_t begin, int64_t end) {
+    for (int64_t f = begin; f < end; ++f) {
+      for (int i = 0; i < 3; ++i) coarse[4 * f + i] = -a[3 * f + i];
+    }
+  });
+  member.barrier();
+  member.each(0, p.positions, [&](int64_t begin, int64_t end) {
+    kernels_.gather(p.position_ptr, p.function, c_.weight, coarse, s_.wanted, begin, end);
+    for (int64_t i = begin; i < end; ++i) {
+      if (p.position_body[i] < 0) continue;
+      const T length = lengths[p.position_body[i]];
+      for (int c = 0; c < 3; ++c) {
+        if (c_.keeps_positions) {
+          s_.x[4 * i + c] = before[3 * i + c];
+        } else if (length > 0) {
+          s_.x[4 * i + c] -= length * s_.wanted[4 * i + c];
+        }
+      }
+    }
+  });
+  member.barrier();
+  press(member);
   // u = P' x_bar, q = -s A^-1 u
   member.each(0, p.functions, [&](int64_t begin, int64_t end) {
     kernels_.gather(p.row_ptr, p.row, c_.row_weight, s_.x_bar, rows_.get(), begin, end);
@@ -194,28 +261,6 @@ void CoarseScene<T>::reverse(int k, Team::Member& member) {
   member.each(0, p.bodies, [&](int64_t begin, int64_t end) {
     for (int64_t b = begin; b < end; ++b) {
       if (!(lengths[b] > 0)) std::fill(q + 3 * p.function_ptr[b], q + 3 * p.function_ptr[b + 1], T(0));
-    }
-  });
-  member.barrier();
-  // back to where the correction began: x -= s (-P a)
-  member.each(0, p.functions, [&](int64_t begin, int64_t end) {
-    for (int64_t f = begin; f < end; ++f) {
-      for (int i = 0; i < 3; ++i) coarse[4 * f + i] = a[3 * f + i];
-    }
-  });
-  member.barrier();
-  member.each(0, p.positions, [&](int64_t begin, int64_t end) {
-    if (!c_.keeps_positions) kernels_.gather(p.position_ptr, p.function, c_.weight, coarse, s_.way, begin, end);
-    for (int64_t i = begin; i < end; ++i) {
-      if (p.position_body[i] < 0) continue;
-      const T length = lengths[p.position_body[i]];
-      for (int c = 0; c < 3; ++c) {
-        if (c_.keeps_positions) {
-          s_.x[4 * i + c] = before[3 * i + c];
-        } else if (length > 0) {
-          s_.x[4 * i + c] += length * s_.way[4 * i + c];
-        }
-      }
     }
   });
   member.barrier();

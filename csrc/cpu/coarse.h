@@ -25,6 +25,8 @@ class CoarseScene {
 
  private:
   T* tape(int k) const { return c_.tape + (scene_ * c_.corrections + k) * c_.tape_size(); }
+  // The matrices with the blocks of vertex energies at s.x, factored.
+  void press(Team::Member& member);
   void solve(T* x, Team::Member& member) const;
   // q of the correction of number k
   T* turn(int k) const { return turns_.get() + (c_.matrix_bar ? k : 0) * int64_t{3} * c_.plan.functions; }
@@ -40,7 +42,8 @@ class CoarseScene {
   SceneView<T>& s_;
   const CoarseKernels<T> kernels_;
   std::vector<int> failures_;
-  Buffer<T> gradient_, way_, material_, coarse_, rows_, turns_;
+  std::vector<char> plain_;  // bodies on whose vertices no energy acts, and whose matrix is factored
+  Buffer<T> gradient_, way_, wanted_, material_, coarse_, rows_, turns_, matrix_;
   Buffer<double> sums_;
   bool over_ = false;
 };

@@ -188,8 +188,7 @@ void ContactScene<T>::assemble(int64_t begin, int64_t end) const {
 }
 
 template <class T>
-void ContactScene<T>::prepare(int sweep, int tape_policy, int64_t begin, int64_t end, const uint8_t* limits) const {
-  const int64_t rows = tape_rows(tape_policy, true);
+void ContactScene<T>::prepare(int sweep, int64_t rows, int64_t begin, int64_t end, const uint8_t* limits) const {
   for (int64_t block = begin; block < end; ++block) {
     const int count = plan_.block_rank[block + 1] - plan_.block_rank[block];
     const T* at = s_.tape + sweep * rows * plan_.num_active + plan_.block_rank[block];

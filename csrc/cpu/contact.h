@@ -26,9 +26,10 @@ class ContactScene {
   void limit(int64_t first, int64_t last, int64_t begin, int64_t end, uint8_t* limits) const;
   // After the first sweep, which goes farthest: what is near by the ways that are left.
   void settle(Team::Member& member) const;
-  // Reverse, before a color's turn: its vertices go back to the positions before their update, which `tape` names, and
+  // Reverse, before a color's turn: its vertices go back to the positions before their update, which the tape of `rows`
+  // scalars for each vertex has, and
   // collect what pairs have sent them since their last turn.
-  void prepare(int sweep, int tape_policy, int64_t begin, int64_t end, const uint8_t* limits) const;
+  void prepare(int sweep, int64_t rows, int64_t begin, int64_t end, const uint8_t* limits) const;
   // Reverse, after the turn: the adjoint of assemble().
   void reverse(int64_t begin, int64_t end) const;
   // After the last turn: what is left for vertices, into the rows of x_bar, and for colliders [Vc, 3].

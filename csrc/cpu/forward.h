@@ -13,12 +13,13 @@ __attribute__((flatten)) void forward_color(const Plan& plan, const SceneView<T>
                                             int sweep, int tape, int64_t begin, int64_t end) {
   using R = Lanes<T>;
   using Set = EnergySet<mask>;
-  const int rows = tape_rows(tape, Set::keeps_positions);
+  const int rows = tape_rows(tape, Set::kept_scalars);
   for (int64_t block = begin; block < end; ++block) {
     R values[kMaxEnergyData];
     const Block<R> b = load_block<Set>(plan, s, block, q, values);
-    const NewtonStep<R> newton = newton_step<Set>(b, LaneStar<T>(plan, s, block), q);
-    const Update<R> u = safeguarded<Set>(b, newton.d_raw, q);
+    const LaneStar<T> star(plan, s, block);
+    const NewtonStep<R> newton = newton_step<Set>(b, star, q);
+    const Update<R> u = update_of<Set>(b, star, newton.d_raw, q);
     store_rows(s.x, block, moved<Set>(b.state.x, u));
     if (tape == kNoTape) continue;
     const int count = plan.block_rank[block + 1] - plan.block_rank[block];
@@ -27,7 +28,7 @@ __attribute__((flatten)) void forward_color(const Plan& plan, const SceneView<T>
       value.store(at, count);
       at += plan.num_active;
     };
-    record<Set>(tape == kFullTape, b, newton, put);
+    record<Set>(tape == kFullTape, b, newton, u, put);
   }
 }
 

@@ -13,7 +13,7 @@ __attribute__((flatten)) void reverse_color(const Plan& plan, const SceneView<T>
                                             int sweep, int tape, int64_t begin, int64_t end) {
   using R = Lanes<T>;
   using Set = EnergySet<mask>;
-  const int rows = tape_rows(tape, Set::keeps_positions);
+  const int rows = tape_rows(tape, Set::kept_scalars);
   for (int64_t block = begin; block < end; ++block) {
     const int count = plan.block_rank[block + 1] - plan.block_rank[block];
     const T* at = s.tape + static_cast<int64_t>(sweep) * rows * plan.num_active + plan.block_rank[block];

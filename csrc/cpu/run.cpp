@@ -182,7 +182,7 @@ template <class T>
 void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* cut) {
   const auto kernel = forward_kernel<T>(in.energies);
   const int64_t tape_size =
-      int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
+      int64_t{in.sweeps} * tape_rows(in.tape_policy, kept_scalars(in.energies)) * plan.num_active;
   const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
   const int every = in.coarse ? in.coarse->plan.every : 0, begun = in.coarse ? in.coarse->plan.begun : 0;
   // a message thrown inside a parallel region would be lost
@@ -241,8 +241,8 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
                  const uint8_t* limits, const StepAdjoints<T>& out) {
   const bool wants_material = out.material[0] != nullptr;
   const auto kernel = reverse_kernel<T>(in.energies);
-  const int64_t tape_size =
-      int64_t{in.sweeps} * tape_rows(in.tape_policy, keeps_positions(in.energies)) * plan.num_active;
+  const int64_t rows_of_tape = tape_rows(in.tape_policy, kept_scalars(in.energies));
+  const int64_t tape_size = in.sweeps * rows_of_tape * plan.num_active;
   const int64_t n = plan.num_vertices, tets = plan.num_tets, lanes = int64_t{plan.blocks} * kLanes;
   const int64_t pairs = int64_t{plan.slots} * kLanes;
   const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
@@ -282,7 +282,7 @@ void run_reverse(const Plan& plan, const StepInputs<T>& in, const T* x, const T*
         const int64_t first = plan.color_block[c], last = plan.color_block[c + 1];
         if (contact) {
           member.each(first, last, [&](int64_t begin, int64_t end) {
-            contact->prepare(k, in.tape_policy, begin, end, limits + (b * in.sweeps + k) * n);
+            contact->prepare(k, rows_of_tape, begin, end, limits + (b * in.sweeps + k) * n);
           });
           member.barrier();
           member.each(first, last, [&](int64_t begin, int64_t end) { contact->search(begin, end); });

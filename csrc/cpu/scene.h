@@ -45,7 +45,8 @@ struct SceneView {
   T* tape;      // [sweeps, rows, active]
   T* contact;   // [blocks, kContactScalars, kLanes] or null: what contact adds to the blocks
   T* gradient;  // [blocks kLanes, 4] of the potential, for a coarse correction
-  T* way;       // [blocks kLanes, 4] along which one goes; in the reverse what the gradient is multiplied with
+  T* way;       // [blocks kLanes, 4] along which one goes; in the reverse what the gradient is multiplied with,
+  T* wanted;    // and along which one wanted to go
 
   // reverse only
   T* x_bar;         // [blocks kLanes, 4]

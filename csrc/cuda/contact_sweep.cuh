@@ -54,7 +54,7 @@ __device__ __forceinline__ SweepRows<T> settled_rows(const StepView<T>& s, int64
 template <class T>
 __device__ __forceinline__ TapeRows<T> tape_rows_of(const StepView<T>& s, int64_t scene, int sweep, int64_t begin,
                                                     int64_t end) {
-  const int64_t rows = (scene * s.sweeps + sweep) * tape_rows(s.tape_policy, true);
+  const int64_t rows = (scene * s.sweeps + sweep) * s.tape_rows;
   return {settled_rows(s, scene, begin, end), s.tape + rows * s.plan.num_active, s.plan.block_rank, s.plan.num_active};
 }
 

@@ -51,18 +51,17 @@ __device__ __forceinline__ bool update(const StepView<T>& s, T* shared, const Tu
   if constexpr (Set::usual) {
     if (is_rare<Set>(b, star, newton.H)) return false;
   }
-  const Update<T> u = safeguarded<Set>(b, newton.d_raw, q);
+  const Update<T> u = update_of<Set>(b, star, newton.d_raw, q);
   const int64_t position = static_cast<int64_t>(at.block) * kSlice + at.v;
   way = {b.state.x, moved<Set>(b.state.x, u)};
   if (!Set::contact && at.lane == 0) store_row(s.w.x, at.scene * s.positions + position, way.to);
   if (s.tape_policy != kNoTape && at.lane == 0 && rank < end_rank) {
-    const int scalars = tape_rows(s.tape_policy, Set::keeps_positions);
-    T* to = s.tape + (at.scene * s.sweeps + turn.sweep) * scalars * s.plan.num_active + rank;
+    T* to = s.tape + (at.scene * s.sweeps + turn.sweep) * s.tape_rows * s.plan.num_active + rank;
     const auto put = [&](const T& value) {
       *to = value;
       to += s.plan.num_active;
     };
-    record<Set>(s.tape_policy == kFullTape, b, newton, put);
+    record<Set>(s.tape_policy == kFullTape, b, newton, u, put);
   }
   return true;
 }

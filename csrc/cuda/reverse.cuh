@@ -27,7 +27,6 @@ struct Turn {
 // not suit.
 template <class Set, int wanted, class T, int lanes>
 __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, const Turn& turn, PairTerm<T>& pairs) {
-  const int rows = tape_rows(s.tape_policy, Set::keeps_positions);
   const Place<lanes> at(turn.scene, turn.block, turn.part);
   const int64_t scene = at.scene, position = static_cast<int64_t>(at.block) * kSlice + at.v,
                 row = scene * s.positions + position;
@@ -38,7 +37,7 @@ __device__ __forceinline__ bool reverse_update(const StepView<T>& s, T* shared, 
   if (rank - at.group >= end_rank) return true;  // the whole warp: phantoms alone
   const bool real = rank < end_rank, full = s.tape_policy == kFullTape;
   const T* from =
-      s.tape + (scene * s.sweeps + (s.sweeps - 1 - turn.number)) * rows * s.plan.num_active + (real ? rank : 0);
+      s.tape + (scene * s.sweeps + (s.sweeps - 1 - turn.number)) * s.tape_rows * s.plan.num_active + (real ? rank : 0);
   const auto get = [&] {
     const T value = __ldg(from);
     from += s.plan.num_active;

@@ -47,6 +47,7 @@ struct Runner {
     s.parameters = in.parameters;
     s.sweeps = in.sweeps;
     s.tape_policy = in.tape_policy;
+    s.tape_rows = tape_rows(in.tape_policy, kept_scalars(in.energies));
     s.has_tets = (in.energies & kElastic) != 0;
     s.one_material = one_for_items(in.material);
     s.mass = {s.w.mass, in.mass.scene != 0 ? s.positions : 0, 1};
@@ -74,8 +75,7 @@ struct Runner {
     s.rest = at(in.rest);
     for (int m = 0; m < kTetScalars; ++m) s.material[m] = at(in.material[m]);
     s.data = at(in.data);
-    const int rows = tape_rows(in.tape_policy, keeps_positions(in.energies));
-    s.tape = tape + base * in.sweeps * rows * host.plan.num_active;
+    s.tape = tape + base * in.sweeps * s.tape_rows * host.plan.num_active;
   }
 
   template <class... P, class... A>

@@ -23,16 +23,16 @@ __device__ __forceinline__ bool visit(const StepInputs<T>& in, const StepOutputs
   if constexpr (Set::usual) {
     if (is_rare<Set>(b, star, newton.H)) return false;
   }
-  const Update<T> u = safeguarded<Set>(b, newton.d_raw, q);
+  const Update<T> u = update_of<Set>(b, star, newton.d_raw, q);
   set_column3(x, vertex, moved<Set>(b.state.x, u));
   if (in.tape_policy == kNoTape) return true;
-  const int rows = tape_rows(in.tape_policy, Set::keeps_positions);
+  const int rows = tape_rows(in.tape_policy, Set::kept_scalars);
   T* to = out.tape + ((static_cast<int64_t>(k) * rows) * plan.num_active + r) * in.scenes + scene;
   const auto put = [&](const T& value) {
     *to = value;
     to += plan.num_active * in.scenes;
   };
-  record<Set>(in.tape_policy == kFullTape, b, newton, put);
+  record<Set>(in.tape_policy == kFullTape, b, newton, u, put);
   return true;
 }
 

@@ -43,7 +43,7 @@ struct ReverseVisits {
         star(in, &out, plan, list, columns.x, columns.x_bar, scene) {}
 
   __device__ __forceinline__ Recalled<T> read(int k, int r) const {
-    const int rows = tape_rows(in.tape_policy, Set::keeps_positions);
+    const int rows = tape_rows(in.tape_policy, Set::kept_scalars);
     const T* from = tape + ((static_cast<int64_t>(k) * rows) * plan.num_active + r) * in.scenes + scene;
     const auto get = [&] {
       const T value = __ldg(from);

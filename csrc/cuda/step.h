@@ -98,7 +98,7 @@ struct StepView {
   int degree, valence;  // largest number of neighbours and of pairs
   int stages;           // of records in shared memory: 0, kFewStages or kManyStages
   StepParameters<T> parameters;
-  int sweeps, tape_policy;
+  int sweeps, tape_policy, tape_rows;  // tape_rows: scalars of a vertex and sweep
   bool one_material;  // `material` below; else w.material
   bool has_tets;      // whether they have an energy
   bool own;           // whether a block has its scene to itself

@@ -69,6 +69,7 @@ struct Update {
   Vec3<R> d_raw;  // Newton step before the safeguards
   Vec3<R> step;   // relaxed and saturated, before the step filter
   R alpha;        // step filter
+  R fraction;     // of what is left, 1, 1/2, ...: as much as does not raise the vertex's own potential
 };
 
 template <class... E>
@@ -92,8 +93,12 @@ constexpr bool any_filter(int mask, EnergyList<E...>) {
   int k = kFirstVertexBit;
   return ((((mask >> k++) & 1) && E::has_filter) || ...);
 }
-// Whether a vertex must come back to its old position exactly in the reverse: gaps depend on it to the bit.
+// Whether a vertex must come back to its old position exactly in the reverse: gaps depend on it to the bit, and an undo
+// by subtraction is an ulp off at times.
 constexpr bool keeps_positions(int mask) { return (mask & kContact) != 0 || any_filter(mask, VertexEnergies{}); }
+// What a tape keeps for that: the old position and, with a step filter, the fraction of the update (sweep/descent.h).
+constexpr int kept_scalars(int mask) { return any_filter(mask, VertexEnergies{}) ? 4 : keeps_positions(mask) ? 3 : 0; }
+constexpr bool has_vertex_energy(int mask) { return (mask >> kFirstVertexBit) != 0; }
 template <class... E>
 constexpr bool any_x_prev(int mask, EnergyList<E...>) {
   int k = kFirstVertexBit;
@@ -104,7 +109,7 @@ template <int mask>
 struct EnergySet {
   static constexpr bool usual = false;
   static constexpr bool contact = (mask & kContact) != 0;
-  static constexpr bool of_vertices = (mask >> kFirstVertexBit) != 0;
+  static constexpr bool of_vertices = has_vertex_energy(mask);
   using Elastic = StableNeoHookean<(mask & kExactBlock) != 0>;
 
   // calls f(energy, its position in the list) for each energy of one vertex that is present
@@ -114,6 +119,7 @@ struct EnergySet {
   }
   static constexpr bool filters = any_filter(mask, VertexEnergies{});
   static constexpr bool keeps_positions = diffvbd::keeps_positions(mask);
+  static constexpr int kept_scalars = diffvbd::kept_scalars(mask);
   static constexpr bool reads_x_prev = any_x_prev(mask, VertexEnergies{});
 
  private:

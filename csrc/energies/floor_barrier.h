@@ -71,12 +71,13 @@ struct FloorBarrier {
       second = select(near, second - plane.n.y * plane.n.y, second);
     }
   }
+  // Above 0 where a plane acts.
   template <class R>
-  DIFFVBD_FN static bool is_near(const VertexState<R>& s, const R* data, int count) {
-    bool out = false;
+  DIFFVBD_FN static R near(const VertexState<R>& s, const R* data, int count) {
+    R out = R(0);
     for (int k = 0; k < count; k += stride) {
       const Plane<R> plane(data + k, s);
-      out = out || any(plane.gap(s.x) < plane.dhat);
+      out = select(plane.gap(s.x) < plane.dhat, R(1), out);
     }
     return out;
   }

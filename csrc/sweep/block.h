@@ -83,7 +83,7 @@ DIFFVBD_FN bool is_oblique(const Block<R>& b, const Vec3<R>& x, bool or_near = f
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
     if constexpr (E::has_filter) {
-      out = or_near ? E::is_near(s, b.data[k], b.data_count[k]) : E::is_oblique(s, b.data[k], b.data_count[k]);
+      out = or_near ? any(R(0) < E::near(s, b.data[k], b.data_count[k])) : E::is_oblique(s, b.data[k], b.data_count[k]);
     }
   });
   return out;
@@ -140,6 +140,7 @@ template <class R>
 struct Recalled {
   Vec3<R> x_old, d;  // d_raw, and H, in the axes of the block: there a small n . d keeps its digits
   Factor<R> H;
+  R fraction;  // with a step filter, see Update
 };
 
 }  // namespace diffvbd

@@ -4,6 +4,7 @@
 #pragma once
 
 #include "../core/safeguards.h"
+#include "descent.h"
 #include "uneven.h"
 
 namespace diffvbd {
@@ -42,7 +43,7 @@ DIFFVBD_FN Vec3<R> relaxed(const Vec3<R>& d_raw, const StepParameters<T>& q) {
 // From the Newton step to the executed one.
 template <class Set, class R, class T>
 DIFFVBD_FN Update<R> safeguarded(const Block<R>& b, const Vec3<R>& d_raw, const StepParameters<T>& q) {
-  Update<R> out{d_raw, relaxed(d_raw, q), R(1)};
+  Update<R> out{d_raw, relaxed(d_raw, q), R(1), R(1)};
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
     if constexpr (E::has_filter) {
@@ -53,9 +54,17 @@ DIFFVBD_FN Update<R> safeguarded(const Block<R>& b, const Vec3<R>& d_raw, const 
   return out;
 }
 
+// Whole, from the system of a vertex.
+template <class Set, class R, class T, class Star>
+DIFFVBD_FN Update<R> update_of(const Block<R>& b, const Star& star, const Vec3<R>& d_raw, const StepParameters<T>& q) {
+  Update<R> out = safeguarded<Set>(b, d_raw, q);
+  out.fraction = descending_fraction<Set>(b, star, q, out);
+  return out;
+}
+
 template <class Set, class R>
 DIFFVBD_FN Vec3<R> moved(const Vec3<R>& x, const Update<R>& u) {
-  if constexpr (Set::filters) return x + u.alpha * u.step;
+  if constexpr (Set::filters) return x + (u.fraction * u.alpha) * u.step;
   return x + u.step;
 }
 
@@ -75,6 +84,7 @@ DIFFVBD_FN Update<R> replayed(Block<R>& b, const Star& star, Recalled<R>& r, boo
     if (Set::keeps_positions) r.d = step.d;
   }
   if constexpr (Set::keeps_positions) u = safeguarded<Set>(b, axes_of<T, Set>(b).from(r.d), q);
+  if constexpr (Set::filters) u.fraction = r.fraction;
   return u;
 }
 
@@ -85,15 +95,17 @@ DIFFVBD_FN Recalled<R> recall(bool full, Get&& get) {
   if (Set::keeps_positions) r.x_old = {get(), get(), get()};
   if (full || !Set::keeps_positions) r.d = {get(), get(), get()};
   if (full) r.H = {get(), get(), get(), get(), get(), get()};
+  if (Set::filters) r.fraction = get();
   return r;
 }
 template <class Set, class R, class Put>
-DIFFVBD_FN void record(bool full, const Block<R>& before, const NewtonStep<R>& step, Put&& put) {
+DIFFVBD_FN void record(bool full, const Block<R>& before, const NewtonStep<R>& step, const Update<R>& u, Put&& put) {
   const Vec3<R>& d = step.d;
   const Factor<R>& H = step.H;
   if (Set::keeps_positions) put(before.state.x.x), put(before.state.x.y), put(before.state.x.z);
   if (full || !Set::keeps_positions) put(d.x), put(d.y), put(d.z);
   if (full) put(H.l21), put(H.l31), put(H.l32), put(H.inv1), put(H.inv2), put(H.inv3);
+  if (Set::filters) put(u.fraction);
 }
 
 // Adjoints of what one update read, except those of its star, which go through star.add().
@@ -115,8 +127,9 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   Vec3<R> step_bar = x_bar;
   R alpha_bar = R(0);
   if constexpr (Set::filters) {
-    alpha_bar = dot(u.step, x_bar);
-    step_bar = u.alpha * x_bar;
+    step_bar = u.fraction * x_bar;
+    alpha_bar = dot(u.step, step_bar);
+    step_bar = u.alpha * step_bar;
     Set::for_each([&](auto energy, int k) {
       using E = decltype(energy);
       if constexpr (E::has_filter) {
@@ -158,7 +171,7 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
       }
     };
     if constexpr (E::has_filter) {
-      reverse(p_axes, Update<R>{r.d, u.step, u.alpha}, plane_step(axes, d_low));
+      reverse(p_axes, Update<R>{r.d, u.step, u.alpha, u.fraction}, plane_step(axes, d_low));
     } else {
       reverse(p, u, NoFrame<R>{});
     }
@@ -171,11 +184,12 @@ DIFFVBD_FN BlockAdjoint<R> reverse_vertex(const Block<R>& b, const Star& star, c
   return out;
 }
 
-// Adjoint of w . g, with g the gradient of the potential, at one vertex: out.x is the vertex's part of the Hessian
-// times w, with the neighbours' w from the star; the rest is what its own g depends on. What a step without a Newton
-// part leaves of reverse_vertex(). A pinned vertex has w = 0, and of its neighbours' g only tets reach it.
+// Adjoint of w . (g + E d) at one vertex, with g the gradient of the potential and E the blocks of the vertex energies:
+// out.x is the vertex's part of the Hessian times w, with the neighbours' w from the star; the rest is what its own g
+// and E depend on. d: how the coarse correction wanted to move the vertex. A pinned vertex has w = 0, and of its
+// neighbours' g only tets reach it.
 template <class Set, int wanted, class R, class T, class Star, class AddData>
-DIFFVBD_FN BlockAdjoint<R> reverse_gradient(const Block<R>& b, const Star& star, const Vec3<R>& w,
+DIFFVBD_FN BlockAdjoint<R> reverse_gradient(const Block<R>& b, const Star& star, const Vec3<R>& w, const Vec3<R>& d,
                                             const StepParameters<T>& q, bool wants_data, AddData&& add_data) {
   const R h = R(q.time_step), minus_h2 = -(h * h);
   const Vec3<R> p = -w, none = zero3<R>();
@@ -183,9 +197,9 @@ DIFFVBD_FN BlockAdjoint<R> reverse_gradient(const Block<R>& b, const Star& star,
   out.x = -out.y;
   Set::for_each([&](auto energy, int k) {
     using E = decltype(energy);
-    vertex_energy_vjp<E>(b.state, b.data[k], b.data_count[k], p, none, out.x, out.x_prev);
+    vertex_energy_vjp<E>(b.state, b.data[k], b.data_count[k], p, d, out.x, out.x_prev);
     if (wants_data) {
-      const Update<R> still{none, none, R(1)};
+      const Update<R> still{d, none, R(1), R(1)};
       vertex_energy_data_vjp<E>(b.state, b.data[k], b.data_count[k], p, still, q, R(0),
                                 [&](int i, const R& value) { add_data(k, i, value); });
     }

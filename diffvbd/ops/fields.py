@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from ..mask import KEEPS_POSITIONS
+from ..mask import FILTERS, KEEPS_POSITIONS
 
 NO_TAPE, COMPACT_TAPE, FULL_TAPE = 0, 1, 2
 REST_SCALARS = 7  # k01 k02 k03 k12 k13 k23 c6 of a tet
@@ -49,7 +49,8 @@ class SweepFields(NamedTuple):
     room: Tensor | None = None  # [B, V] as far as this [m]
     corners_prev: Tensor | None = None  # x_prev of the tets' corners, [12, B, T], where their law reads it
     # coarse corrections; see model.coarse_plan for the constants
-    coarse_factor: Tensor | None = None  # [B, 9 cells]  Cholesky factors (CUDA: inverses); its adjoint is the matrix's
+    # [B, 9 cells]  Cholesky factors (CUDA: inverses), with vertex energies the matrices; its adjoint is the matrix's
+    coarse_factor: Tensor | None = None
     coarse_mass: Tensor | None = None  # [1 | B, cells] [kg]
     coarse_plan: Tensor | None = None
     coarse_weights: Tensor | None = None
@@ -248,7 +249,8 @@ def plan_sizes(plan: Tensor, device: str) -> tuple[int, ...]:
 
 def tape_rows(policy: int, energies: int) -> int:
     """Scalars of tape per active vertex and sweep; twin of tape_rows in csrc/core/views.h."""
-    return {NO_TAPE: 0, COMPACT_TAPE: 3, FULL_TAPE: 12 if energies & KEEPS_POSITIONS else 9}[policy]
+    kept = 4 if energies & FILTERS else 3 if energies & KEEPS_POSITIONS else 0
+    return {NO_TAPE: 0, COMPACT_TAPE: kept or 3, FULL_TAPE: 9 + kept}[policy]
 
 
 def corrections_of(sweeps: int, every: int, begun: int = 0) -> int:

@@ -1,10 +1,11 @@
 """The coarse correction of a step, in plain torch: one Newton step in fixed functions of each body, and its length.
 
-    (W^T M W + h^2 sum over groups of R_g (W^T K_g W) R_g^T) a = W^T dG,        z <- z - s_b W a
+    (W^T (M + H) W + h^2 sum over groups of R_g (W^T K_g W) R_g^T) a = W^T dG,        z <- z - s_b W a
 
-W [V, F] holds the functions, K_g the stiffness of a group of tets at rest, R_g their mean rotation at the start of the
-step. The length s_b of each body is the first of 1, 1/2, ... that lowers the incremental potential G enough; it counts
-as a constant. Everything else is differentiated by autograd. Rows of a system are ordered by function, then component.
+W [V, F] holds the functions, H the blocks of the energies of vertices at z, K_g the stiffness of a group of tets at
+rest, R_g their mean rotation at the start of the step. The length s_b of each body is the first of 1, 1/2, ... that
+lowers the incremental potential G enough; it counts as a constant. Everything else is differentiated by autograd. Rows
+of a system are ordered by function, then component.
 """
 
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .energies import StableNeoHookean
 from .layout import dot
 from .rigid import admits, axial, cross_matrix, turning_stiffness
 from .scene import Scene, shape_functions
@@ -25,14 +27,16 @@ LEAST_LAM = -2 / 3  # of mu: below it the stiffness of a tet at rest is not posi
 
 
 class Coarse:
-    """The coarse correction of a run; ``energies``: the reference formulas, all of them.
+    """The coarse correction of a run; ``energies``: the reference formulas, all of them; ``forces``: of pairs, whose
+    part of the matrix the caller adds.
 
     ``scene.model.coarse_geometry`` says which functions and groups there are.
     """
 
-    def __init__(self, scene: Scene, energies: list[Any]) -> None:
+    def __init__(self, scene: Scene, energies: list[Any], forces: list[Any] | tuple = ()) -> None:
         geometry, tets = scene.model.coarse_geometry, scene.layout.tets
-        self.scene, self.energies = scene, energies
+        self.scene, self.energies = scene, [*energies, *forces]
+        self.of_vertices = [e for e in energies if not isinstance(e, StableNeoHookean)]
 
         def index(values: Any) -> Tensor:
             return torch.as_tensor(values, dtype=torch.int64, device=scene.like.device)
@@ -117,7 +121,7 @@ class Coarse:
         [..., bodies]: those that get s = 0 without a search.
         """
         rows = torch.einsum("vf,...iv->...fi", self.weight, self._gradient(state, y, x_prev)).flatten(-2)
-        a = torch.linalg.solve(matrix, rows.unsqueeze(-1)).squeeze(-1)
+        a = torch.linalg.solve(matrix + self._pressed(state, x_prev), rows.unsqueeze(-1)).squeeze(-1)
         p = -torch.einsum("vf,...fi->...iv", self.weight, a.unflatten(-1, (-1, 3)))
         if steps is None:
             with torch.no_grad():
@@ -127,6 +131,18 @@ class Coarse:
                 steps = self._search(state, p, y, x_prev, slope, skipped)
         lengths = self._of_vertices(steps)
         return torch.where(lengths > 0, state + lengths * p, state), steps
+
+    def _pressed(self, state: Tensor, x_prev: Tensor) -> Tensor:
+        """What the energies of vertices add to the matrix [..., 3F, 3F]: W^T H W of their blocks."""
+        total = torch.zeros_like(state).repeat_interleave(3, -2)  # [..., 9, V]
+        for k, color in enumerate(self.scene.layout.colors):
+            for energy in self.of_vertices:
+                block = getattr(energy, "exact_block", energy.block)(k, state, x_prev)
+                total = total.index_add(-1, color.vertices, block)
+        xx, xy, xz, yy, yz, zz = total[..., 3:, :].unbind(-2)
+        rows = [torch.stack(r, -2) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
+        out = torch.einsum("vf,...ijv,vg->...figj", self.weight, torch.stack(rows, -3), self.weight)
+        return out.flatten(-4, -3).flatten(-2, -1)
 
     def _gradient(self, state: Tensor, y: Tensor, x_prev: Tensor) -> Tensor:
         """dG [..., 3, V], by the formulas that sweeps use; zero at pinned vertices that are where they belong."""

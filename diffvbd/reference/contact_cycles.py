@@ -9,7 +9,6 @@ from torch import Tensor
 
 from .anderson import Anderson
 from .coarse import Coarse
-from .energies import StableNeoHookean
 from .scene import Scene
 
 
@@ -64,8 +63,7 @@ class Corrections:
     """Coarse corrections of all bodies of a scene together, against which pairs, friction and vertex energies press."""
 
     def __init__(self, scene: Scene, energies: list[Any], forces: list[Any], y: Tensor, x_prev: Tensor) -> None:
-        self.coarse = Coarse(scene, [*energies, *forces])
-        self.single = [e for e in energies if not isinstance(e, StableNeoHookean)]
+        self.coarse = Coarse(scene, energies, forces)
         self.forces, self.y, self.x_prev = forces, y, x_prev
         self.matrix = self.coarse.begin(x_prev)
 
@@ -74,18 +72,9 @@ class Corrections:
         return self.coarse.correct(state, self.y, self.x_prev, matrix, lengths.to(state))[0]
 
     def _pressed(self, state: Tensor) -> Tensor:
-        """What presses back against the functions [..., 3F, 3F]."""
-        weight, scene = self.coarse.weight, self.coarse.scene
-        total = torch.zeros_like(state).repeat_interleave(3, -2)  # [..., 9, V]
-        for k, color in enumerate(scene.layout.colors):
-            for energy in self.single:
-                total = total.index_add(
-                    -1, color.vertices, getattr(energy, "exact_block", energy.block)(k, state, self.x_prev)
-                )
-        xx, xy, xz, yy, yz, zz = total[..., 3:, :].unbind(-2)
-        rows = [torch.stack(r, -2) for r in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
-        out = torch.einsum("vf,...ijv,vg->...figj", weight, torch.stack(rows, -3), weight)
-        out = out.reshape(-1, *out.shape[-4:])
+        """What pairs press back with against the functions [..., 3F, 3F]."""
+        weight = self.coarse.weight
+        out = weight.new_zeros((state.shape[:-2].numel(), weight.shape[1], 3, weight.shape[1], 3))
         for force in self.forces:
             pairs, (_, stiffness) = force.pairs, force.on_corners(state)
             mesh = pairs.corners < len(weight)

@@ -36,7 +36,7 @@ class StableNeoHookean:
 
     def __init__(self, energy: Any, scene: Scene) -> None:
         self.scene = scene
-        exact = energy.block == "exact"
+        self.exact = exact = energy.block == "exact"
         weight = scene.time_step**2 * scene.volume
         lb = scene.mu + scene.lam
         per_tet = torch.stack(torch.broadcast_tensors(weight * scene.mu, weight * lb, weight * scene.lam), -2)

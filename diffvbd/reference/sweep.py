@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from .anderson import Anderson
-from .coarse import REFUSALS, Coarse
+from .coarse import HALVINGS, REFUSALS, ROUNDING, Coarse
 from .energies import StableNeoHookean, build_energies
 from .friction import floor_friction
 from .layout import Layout, build_layout, dot, put, solve6, take
@@ -361,9 +361,52 @@ def _update_color(
     if factor != 1.0:
         update = factor * update
     update = filtered(energies, x, update)
+    if all(getattr(e, "exact", True) for e in energies) and any(hasattr(e, "limit") for e in energies):
+        update = _descending(scene, energies, k, mass, y, state, x_prev, update).unsqueeze(-2) * update
     if limit is not None:
         update = take(limit, vertices) * update
     return put(state, vertices, x + update)
+
+
+@torch.no_grad()
+def _descending(
+    scene: Scene,
+    energies: list[Any],
+    k: int,
+    mass: Tensor,
+    y: Tensor,
+    state: Tensor,
+    x_prev: Tensor,
+    update: Tensor,
+) -> Tensor:
+    """The largest of 1, 1/2, ... 1/128, or 0, for which no update of color k raises its vertex's own potential; 1 where
+    no barrier acts. What has no barrier is quadratic in one vertex. [..., n]"""
+    vertices = scene.layout.colors[k].vertices
+    x = take(state, vertices)
+    barriers = [energy for energy in energies if hasattr(energy, "limit")]
+    others = [energy.block(k, state, x_prev) for energy in energies if energy not in barriers]
+    gradient, hessian = sum(others, torch.zeros_like(x).repeat_interleave(3, -2)).split((3, 6), -2)
+    xx, xy, xz, yy, yz, zz = hessian.unbind(-2)
+    rows = [torch.stack(row, -2) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
+    curvature = mass.squeeze(-2) * dot(update, update) + sum(update[..., i, :] * dot(rows[i], update) for i in range(3))
+    slope = dot(mass * (x - y) + gradient, update)
+
+    def own(z: Tensor) -> Tensor:
+        total = torch.zeros_like(z[..., 0, :])
+        for barrier in barriers:
+            terms, vertex = barrier.terms(z, x_prev)
+            total = total.index_add(-1, vertex, terms.expand(*total.shape[:-1], -1))
+        return total[..., vertices]
+
+    before, fraction, found = own(state), torch.ones_like(slope), torch.zeros_like(slope, dtype=torch.bool)
+    for _ in range(HALVINGS):
+        after, quadratic = own(put(state, vertices, x + fraction * update)), fraction**2 / 2 * curvature
+        size = (fraction * slope).abs() + quadratic + before + after
+        rise = fraction * slope + quadratic + (after - before)
+        found = found | ~(rise > ROUNDING * torch.finfo(x.dtype).eps * size)
+        fraction = torch.where(found, fraction, fraction / 2)
+    near = torch.stack([((b.gap(x) < b.dhat) | (b.gap(x + update) < b.dhat)).any(-2) for b in barriers]).any(0)
+    return torch.where(near, torch.where(found, fraction, 0.0), 1.0)
 
 
 def _saturation(update: Tensor, limit: float) -> Tensor:

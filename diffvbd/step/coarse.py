@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from .. import ops
+from ..mask import VERTEX_ENERGIES
 from ..model.model import Model
 from ..model.rest import shape_gradients
 from ..ops import coarse as _shapes  # noqa: F401  (registers what torch asks of them)
@@ -64,34 +65,34 @@ def _shapes_of(model: Model) -> tuple[Tensor, Tensor]:
     return shape_gradients(model._rest_points[model._topology[0]][None])
 
 
-class _Factor(Function):
-    """Cholesky factors of the matrices. What comes back for them is the adjoint of the matrices themselves: no other
-    operator reads a factor, and the matrices need not be kept."""
+class _Matrix(Function):
+    """The matrices, or their Cholesky factors. What comes back for these is the adjoint of the matrices themselves: no
+    other operator reads a factor, and the matrices need not be kept."""
 
     @staticmethod
-    def forward(x_prev, stiffness, mass, plan, moments, volume, sizes, time_step):
-        return ops.raw.coarse_matrix(x_prev, stiffness, mass, plan, moments, volume, sizes, time_step)
+    def forward(x_prev, stiffness, mass, plan, moments, volume, sizes, time_step, factored):
+        return ops.raw.coarse_matrix(x_prev, stiffness, mass, plan, moments, volume, sizes, time_step, factored)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
         ctx.save_for_backward(*inputs[:_FIELDS])
-        ctx.sizes, ctx.time_step = inputs[_FIELDS:]
+        ctx.sizes, ctx.time_step, _ = inputs[_FIELDS:]
         ctx.set_materialize_grads(False)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple:
         if grads[0] is None:
-            return (None,) * (_FIELDS + 2)
+            return (None,) * (_FIELDS + 3)
         needs = ctx.needs_input_grad[:_TENSORS]
-        out = _FactorBackward.apply(grads[0], *ctx.saved_tensors, ctx.sizes, ctx.time_step, needs)
-        return of_inputs(out, needs, _FIELDS + 2 - _TENSORS)
+        out = _MatrixBackward.apply(grads[0], *ctx.saved_tensors, ctx.sizes, ctx.time_step, needs)
+        return of_inputs(out, needs, _FIELDS + 3 - _TENSORS)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> NoReturn:
         raise NotImplementedError("diffvbd: torch.func.vmap of coarse corrections is not supported")
 
 
-class _FactorBackward(Function):
+class _MatrixBackward(Function):
     @staticmethod
     def forward(bar, x_prev, stiffness, mass, plan, moments, volume, sizes, time_step, needs):
         fields = (x_prev, stiffness, mass, plan, moments, volume)
@@ -109,23 +110,21 @@ class _FactorBackward(Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         """Several adjoints, one after another."""
-        return one_by_one(_FactorBackward, info.batch_size, in_dims, args)
+        return one_by_one(_MatrixBackward, info.batch_size, in_dims, args)
 
 
 def with_corrections(model: Model, parts: CoarseParts, fields: ops.SweepFields, time_step: float) -> ops.SweepFields:
     """What the sweeps read, with the corrections between them."""
     plan = model._coarse_plan
-    factor = factor_of(model, parts, fields.x_prev, time_step)
-    return replaced(fields, coarse_factor=factor, coarse_mass=parts.mass.detach(), coarse_plan=plan.plan,
+    matrix = matrix_of(model, parts, fields.x_prev, time_step, factored=not model.energy_mask & VERTEX_ENERGIES)
+    return replaced(fields, coarse_factor=matrix, coarse_mass=parts.mass.detach(), coarse_plan=plan.plan,
                            coarse_weights=plan.weights, coarse_rest=parts.rest)  # fmt: skip
 
 
-def factor_of(model: Model, parts: CoarseParts | None, x_prev: Tensor, time_step: float) -> Tensor | None:
-    """The factors of the matrices of a step from x_prev, None without corrections; see SweepFields.coarse_factor."""
-    if parts is None:
-        return None
+def matrix_of(model: Model, parts: CoarseParts, x_prev: Tensor, time_step: float, factored: bool) -> Tensor:
+    """The matrices of a step from x_prev, or their factors; see SweepFields.coarse_factor."""
     plan, tensors = model._coarse_plan, distinct(x_prev, parts.stiffness.contiguous(), parts.mass)
-    return _Factor.apply(*tensors, plan.plan, plan.moments, plan.volume, plan.sizes, time_step)
+    return _Matrix.apply(*tensors, plan.plan, plan.moments, plan.volume, plan.sizes, time_step, factored)
 
 
 def lengths_of(model: Model, corrections: Tensor) -> Tensor:
@@ -134,4 +133,4 @@ def lengths_of(model: Model, corrections: Tensor) -> Tensor:
     return corrections.detach().narrow(-1, 3 * geometry.functions, geometry.bodies).clone()
 
 
-ops.ready_signature(_Factor, _FactorBackward)
+ops.ready_signature(_Matrix, _MatrixBackward)

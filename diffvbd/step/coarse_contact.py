@@ -69,15 +69,15 @@ def _space(model: Model) -> Space:
 
 
 class Corrections:
-    """The coarse corrections of one part of a step; ``factor``: fields.coarse_factor, differentiable."""
+    """The coarse corrections of one part of a step; ``packed``: the matrices of all bodies, differentiable."""
 
-    def __init__(self, trials: Trials, fields: ops.SweepFields, factor: Tensor, scenes: Scenes) -> None:
-        self.trials, self.fields, self.factor, self.scenes = trials, fields, factor, scenes
+    def __init__(self, trials: Trials, fields: ops.SweepFields, packed: Tensor, scenes: Scenes) -> None:
+        self.trials, self.fields, self.packed, self.scenes = trials, fields, packed, scenes
         self.constants = replaced(fields, **{k: None if t is None else t.detach() for k, t in fields._asdict().items()})
         if fields.rest is None:  # made on first use, which must not be in a backward that is being compiled
             self.constants = replaced(self.constants, rest=scenes.model.rest_scalars)
         self.space = space_of(scenes.model)
-        self.matrix = _dense(factor.detach(), self.space)
+        self.matrix = _dense(packed.detach(), self.space)
         self.refused = torch.zeros_like(trials.bodies.ptr[:-1])[None]
         self.set_of = trials.bodies.of_body[:, self.space.body]  # of each function [B, F]
 
@@ -148,7 +148,7 @@ class Corrections:
         """a with its derivatives: one more step, r - A a being zero, with the matrix as it was. It has no length, even
         where it would have one, because the matrix is nearly singular: what was judged is what is done."""
         vertices = self.scenes.fields.x_prev.shape[1]
-        pushed = _Product.apply(self.factor, a, self.space)
+        pushed = _Product.apply(self.packed, a, self.space)
         way = self.space.prolonged(a, vertices)
         for press in presses:
             pushed = pushed + self.space.restricted(press.product(way))
@@ -195,29 +195,25 @@ def _at_vertices(blocks: Tensor) -> _Press:
     return _Press(rows[:, None], torch.ones_like(flat[:, :1, 0]), flat)
 
 
-def _dense(factor: Tensor, space: Space) -> Tensor:
-    """The matrices of all bodies as one [B, 3F, 3F], from their factors (on CUDA their inverses)."""
+def _dense(packed: Tensor, space: Space) -> Tensor:
+    """The matrices of all bodies as one [B, 3F, 3F]."""
     unknowns = 3 * space.functions
-    out = factor.new_zeros((len(factor), unknowns * unknowns))
-    out[:, space.dense] = factor
-    out = out.reshape(-1, unknowns, unknowns)
-    if factor.is_cuda:
-        return torch.linalg.inv_ex(out)[0]
-    lower = out.tril()
-    return lower @ lower.mT
+    out = packed.new_zeros((len(packed), unknowns * unknowns))
+    out[:, space.dense] = packed
+    return out.reshape(-1, unknowns, unknowns)
 
 
 class _Product(Function):
-    """A a [B, F, 3] of the matrices without presses, whose factors pass on the adjoint of the matrices themselves."""
+    """A a [B, F, 3] of the matrices without presses."""
 
     @staticmethod
-    def forward(factor: Tensor, a: Tensor, space: Space) -> Tensor:
-        return (_dense(factor, space) @ a.reshape(len(a), -1, 1)).reshape(a.shape)
+    def forward(packed: Tensor, a: Tensor, space: Space) -> Tensor:
+        return (_dense(packed, space) @ a.reshape(len(a), -1, 1)).reshape(a.shape)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
-        factor, a, ctx.space = inputs
-        ctx.shape = factor.shape
+        packed, a, ctx.space = inputs
+        ctx.shape = packed.shape
         ctx.save_for_backward(a)
 
     @staticmethod

@@ -25,7 +25,7 @@ from ..ops import contact_start as ops_start
 from ..ops.motion import RoomsOfBodies
 from ..scopes import checking, is_captured, not_compiled, recorders
 from ..tuples import replaced
-from .coarse import factor_of
+from .coarse import matrix_of
 from .contact_cycles import CUT, MOST_DETECTIONS, of_going, parts_of, record_parts, sweeps_of_part, swept_part
 from .corrections import corrected, corrected_after, is_cut
 from .floor_start import start_on_floor
@@ -72,7 +72,10 @@ class ContactStep:
         self.kappa = like.new_zeros((1,)) if self.barrier is None else self._parameter("pair_barrier.kappa")
         self.lagged, self.lag = no_pairs(like, 0), like.new_zeros((0, 9))
         self.floor_lag = self._floor_lag()
-        self.factor = factor_of(model, prepared.coarse, self.x_prev, prepared.settings.numbers.time_step)
+        self.coarse_matrix = None
+        if prepared.coarse is not None:
+            h = prepared.settings.numbers.time_step
+            self.coarse_matrix = matrix_of(model, prepared.coarse, self.x_prev, h, factored=False)
 
     def _parameter(self, name: str) -> Tensor:
         """A parameter of an energy that the Model has [1 | B]."""

@@ -80,8 +80,8 @@ def swept_part(of: ContactStep, x: Tensor, start: PartStart, collider: Tensor, l
     if len(cycles) <= 1:
         return SweptPart(*sweep(x, settings))
     judge, corrections = _trials(of, start, collider, listed), None
-    if of.factor is not None:
-        corrections = Corrections(judge, of.fields, of.factor, _scenes(of, start, collider, listed))
+    if of.coarse_matrix is not None:
+        corrections = Corrections(judge, of.fields, of.coarse_matrix, _scenes(of, start, collider, listed))
     numbers = settings.numbers
     within = replaced(settings, numbers=replaced(numbers, last_relaxation=numbers.relaxation))
     iterates = _Iterates(model, judge, broadcast(mass, x.shape[:2]).reshape(1, -1), len(cycles))

@@ -196,7 +196,7 @@ Values vertex_vjp(const Values& in) {
   vertex_energy_vjp<E>(s, &a[kVertexInputs], count, p, d_raw, x_bar, x_prev_bar);
   R data_bar[kMaxEnergyData];
   const auto q = parameters_of<R>(in[18], 1);
-  Update<R> u{d_raw, vec(&a[15]), R(1)};
+  Update<R> u{d_raw, vec(&a[15]), R(1), R(1)};
   if constexpr (E::has_filter) u.alpha = E::filter(s, &a[kVertexInputs], count, u.step, q);
   vertex_energy_data_vjp<E>(s, &a[kVertexInputs], count, p, u, q, a[19],
                             [&](int i, const R& value) { data_bar[i] = value; });
@@ -385,6 +385,7 @@ PYBIND11_MODULE(headers, m) {
   m.def("vertex_energies", [] { return listed(VertexEnergies{}); });
   m.def("tape_rows", &tape_rows);
   m.def("keeps_positions", &keeps_positions);
+  m.def("kept_scalars", &kept_scalars);
   m.def("variant_masks", [] {
     std::vector<std::vector<int>> out(2);  // of all variants, and of those without contact; each must be its own place
     for (int n = 0; n < kEnergySets; ++n) out[0].push_back(energy_index(energy_mask(n)) == n ? energy_mask(n) : -1);

@@ -344,7 +344,7 @@ def test_python_tape_is_the_compiled_one(headers: Any) -> None:
         filters = any(mask & bit and has_filter for bit, _, _, has_filter in headers.vertex_energies().values())
         assert headers.keeps_positions(mask) == (filters or bool(mask & CONTACT))
         for policy in (ops.NO_TAPE, ops.COMPACT_TAPE, ops.FULL_TAPE):
-            assert ops.tape_rows(policy, mask) == headers.tape_rows(policy, headers.keeps_positions(mask))
+            assert ops.tape_rows(policy, mask) == headers.tape_rows(policy, headers.kept_scalars(mask))
 
 
 def masks() -> int:

@@ -279,8 +279,8 @@ def coarse_arguments(device: str) -> dict[str, tuple[Any, ...]]:
     parts = coarse_parts(model, moduli, moduli, None, None, None)
     given = (x, parts.stiffness, parts.mass, plan.plan, plan.moments, plan.volume)
     last = (plan.sizes, 0.3)
-    factor = torch.ops.diffvbd.coarse_matrix(*given, *last)
-    out = {"coarse_matrix": (*given, *last), "coarse_matrix_backward": (*given, torch.ones_like(factor), *last)}
+    factor = torch.ops.diffvbd.coarse_matrix(*given, *last, True)
+    out = {"coarse_matrix": (*given, *last, True), "coarse_matrix_backward": (*given, torch.ones_like(factor), *last)}
     tets = shape_gradients(model.rest_points[model.tets][None])
     sums = (moduli.expand(-1, model.num_tets).contiguous(), moduli, *tets, plan.plan, plan.weights)
     rest = (plan.plan, plan.weights, plan.sizes)

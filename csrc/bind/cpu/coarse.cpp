@@ -25,7 +25,7 @@ void for_bodies(int64_t scenes, int64_t bodies, const F& f) {
   });
 }
 
-Tensor matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t> sizes, double time_step) {
+Tensor matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t> sizes, double time_step, bool factored) {
   const CoarseFields f{DIFFVBD_ITEMS(COARSE)};
   return dispatch_float(x_prev, [&](auto scalar) {
     using T = decltype(scalar);
@@ -38,7 +38,7 @@ Tensor matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t> sizes, double time
       const int64_t n = 3 * int64_t{in.plan.function_ptr[body + 1] - in.plan.function_ptr[body]};
       std::vector<T> work(std::max<int64_t>(9 * in.plan.width, n * diffvbd::kLanes));
       coarse::assemble(in, scene, body, kernels.rotate, work.data(), data<T>(out) + scene * size);
-      kernels.factor(n, work.data(), data<T>(out) + at);
+      if (factored) kernels.factor(n, work.data(), data<T>(out) + at);
     });
     return out;
   });

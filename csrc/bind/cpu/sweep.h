@@ -30,7 +30,7 @@ inline Plan plan_of(const Tensor& buffer, const std::vector<int64_t>& sizes) {
 
 template <class T>
 std::vector<int64_t> tape_shape(const Plan& plan, const StepInputs<T>& in) {
-  return {in.scenes, in.sweeps, tape_rows(in.tape_policy, keeps_positions(in.energies)), plan.num_active};
+  return {in.scenes, in.sweeps, tape_rows(in.tape_policy, kept_scalars(in.energies)), plan.num_active};
 }
 
 template <class T>

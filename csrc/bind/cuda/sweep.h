@@ -68,7 +68,7 @@ Tensor workspace(const Tensor& x, const HostPlan& host, const StepInputs<T>& in,
 // Scenes first, but last where each thread has a scene: who mixes up the two is told so by the shape.
 template <class T>
 std::vector<int64_t> tape_shape(const HostPlan& host, const StepInputs<T>& in, const std::vector<int64_t>& launch) {
-  const int64_t rows = tape_rows(in.tape_policy, keeps_positions(in.energies));
+  const int64_t rows = tape_rows(in.tape_policy, kept_scalars(in.energies));
   const int64_t active = host.plan.num_active;
   if (launch[0] == kThread) return {in.sweeps, rows, active, in.scenes};
   return {in.scenes, in.sweeps, rows, active};
