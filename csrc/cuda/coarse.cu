@@ -78,8 +78,9 @@ __global__ void __launch_bounds__(kRowThreads) solve_rows(const __grid_constant_
   const int64_t scene = exists ? item / unknowns : 0, row = exists ? item - scene * unknowns : 0;
   const int body = __ldg(p.function_body + row / 3), first = 3 * __ldg(p.function_ptr + body);
   const int n = 3 * __ldg(p.function_ptr + body + 1) - first;
-  const T* inverse = a.c.factor.data + (a.s.base + scene) * a.c.factor.scene + int64_t{9} * __ldg(p.mass_ptr + body) +
-                     (row - first) * n;
+  const T* inverse = a.w.inverse ? a.w.inverse + 9 * scene * p.cells
+                                 : a.c.factor.data + (a.s.base + scene) * a.c.factor.scene;
+  inverse += int64_t{9} * __ldg(p.mass_ptr + body) + (row - first) * n;
   const T* from = a.w.restricted + scene * unknowns + first;
   double sum = 0;
   for (int j = threadIdx.x % threads; j < n; j += threads) sum += double(__ldg(inverse + j)) * double(from[j]);
@@ -101,12 +102,31 @@ __device__ __forceinline__ Vec3<T> prolonged(const coarse::Inputs<T>& c, int64_t
   return sum;
 }
 
-template <class T>
+// The way of a correction, or that of its transpose.
+template <class T, bool reverse>
 __global__ void __launch_bounds__(kRowThreads) prolong(const __grid_constant__ View<T> a, int k) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
   if (i >= a.s.scenes * a.s.positions) return;
   const int64_t scene = i / a.s.positions;
-  store_row(a.w.way, i, -prolonged(a.c, i - scene * a.s.positions, a.tape(scene, k)));
+  const Vec3<T> way = prolonged(a.c, i - scene * a.s.positions, reverse ? a.solved(scene, k) : a.tape(scene, k));
+  store_row(a.w.way, i, reverse ? way : -way);
+}
+
+// What the energies of a vertex add to its block.
+template <class T>
+__global__ void __launch_bounds__(kRowThreads)
+    press_rows(const __grid_constant__ View<T> a, const __grid_constant__ StepInputs<T> in) {
+  const coarse::Plan& p = a.c.plan;
+  const int64_t item = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
+  if (item >= a.s.scenes * p.listed) return;
+  const int64_t scene = item / p.listed;
+  const int i = static_cast<int>(item - scene * p.listed), position = __ldg(p.list_position + i);
+  const int body = __ldg(p.position_body + position);
+  const coarse::Line<T, StepInputs<T>> line{in,   a.c, a.s.data_start, a.s.base + scene,
+                                            body, a.s.w.x + scene * a.s.positions * kRow, a.w.way};
+  const Sym3<double> H = line.block(i - __ldg(p.list_ptr + body));
+  double* to = a.w.press + (scene * a.s.positions + position) * 6;
+  to[0] = H.xx, to[1] = H.xy, to[2] = H.xz, to[3] = H.yy, to[4] = H.yz, to[5] = H.zz;
 }
 
 // A block for each part of each scene: how the energy of its tets changes along the way.
@@ -211,23 +231,24 @@ __global__ void __launch_bounds__(kRowThreads)
   store_row(total, row, sum);
 }
 
-// Back to where the correction began, and the way of its transpose.
+// Back to where the correction began.
 template <class T>
 __global__ void __launch_bounds__(kRowThreads) move_back(const __grid_constant__ View<T> a, int k, unsigned* barrier) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kRowThreads + threadIdx.x;
   if (i == 0) *barrier = 0;
   if (i >= a.s.scenes * a.s.positions) return;
   const int64_t scene = i / a.s.positions, position = i - scene * a.s.positions;
-  store_row(a.w.way, i, prolonged(a.c, position, a.solved(scene, k)));
   const int body = __ldg(a.c.plan.position_body + position);
+  const T length = body < 0 ? T(0) : a.lengths(scene, k)[body];
+  Vec3<T> wanted = zero3<T>();  // a way that was refused may be no number
+  if (length > 0) wanted = -prolonged(a.c, position, a.tape(scene, k));
+  if (a.w.wanted) store_row(a.w.wanted, i, wanted);
   if (body < 0) return;
-  const T length = a.lengths(scene, k)[body];
   if (a.c.keeps_positions) {
     const T* before = a.lengths(scene, k) + a.c.plan.bodies + 3 * position;
     store_row(a.s.w.x, i, Vec3<T>{before[0], before[1], before[2]});
   } else if (length > 0) {
-    const Vec3<T> x = load_row(a.s.w.x, i, true);
-    store_row(a.s.w.x, i, x + length * prolonged(a.c, position, a.tape(scene, k)));
+    store_row(a.s.w.x, i, load_row(a.s.w.x, i, true) - length * wanted);
   }
 }
 
@@ -323,8 +344,9 @@ cudaError_t Corrections<T>::correct(int k) const {
   const int64_t positions = s.scenes * s.positions, parts = s.scenes * p.parts * kSumThreads;
   if (auto error = gradients(kForward)) return error;
   if (auto error = restricted<false>(a, k, stream)) return error;
+  if (auto error = press()) return error;
   if (auto error = solve<false>(a, k, stream)) return error;
-  if (auto error = launch(prolong<T>, positions, kRowThreads, stream, a, k)) return error;
+  if (auto error = launch(prolong<T, false>, positions, kRowThreads, stream, a, k)) return error;
   if (auto error = launch(line_of_parts<T>, parts, kSumThreads, stream, a, in)) return error;
   if (auto error = launch(decide_lengths<T>, s.scenes * p.bodies * kThreads, kThreads, stream, a, in, k)) return error;
   return launch(move_bodies<T>, positions, kRowThreads, stream, a, k, barrier);
@@ -336,9 +358,19 @@ cudaError_t Corrections<T>::reverse(int k, int wanted) const {
   const int64_t positions = s.scenes * s.positions, active = host.color_block[host.plan.colors] * kSlice;
   if (auto error = launch(sum_adjoints<T>, s.scenes * active, kRowThreads, stream, s, w.gradient)) return error;
   if (auto error = restricted<true>(a, k, stream)) return error;
-  if (auto error = solve<true>(a, k, stream)) return error;
   if (auto error = launch(move_back<T>, positions, kRowThreads, stream, a, k, barrier)) return error;
+  if (auto error = press()) return error;
+  if (auto error = solve<true>(a, k, stream)) return error;
+  if (auto error = launch(prolong<T, true>, positions, kRowThreads, stream, a, k)) return error;
   return gradients(wanted);
+}
+
+template <class T>
+cudaError_t Corrections<T>::press() const {
+  const View<T> a{s, *in.coarse, w};
+  if (!a.c.pressed) return cudaSuccess;
+  if (auto error = launch(press_rows<T>, s.scenes * a.c.plan.listed, kRowThreads, stream, a, in)) return error;
+  return pressed_inverse(a.c, s.base, s.scenes, s.positions, w.press, w.matrix, w.inverse, stream);
 }
 
 template <class T>

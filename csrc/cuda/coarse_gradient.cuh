@@ -143,9 +143,9 @@ __global__ void __maxnreg__(sizeof(T) == sizeof(float) ? 128 : 168)
     WayStar<T, lanes> star(s, at, spans_of(s.plan, at.block), shared);
     if (s.has_tets) star.fetch_neighbours(true), star.fetch_ways(w.way, shared);
     const Block<T> b = load_block<Set>(s, at, true, s.w.x);
-    const Vec3<T> way = load_row(w.way, row, true);
+    const Vec3<T> way = load_row(w.way, row, true), move = w.wanted ? load_row(w.wanted, row, true) : zero3<T>();
     const BlockAdjoint<T> out = reverse_gradient<Set, wanted>(
-        b, star, way, s.parameters, s.w.data_bar != nullptr, [&](int k, int d, const T& value) {
+        b, star, way, move, s.parameters, s.w.data_bar != nullptr, [&](int k, int d, const T& value) {
           if (writes) s.w.data_bar[(at.scene * s.data_scalars + s.data_row[k] + d) * s.positions + position] += value;
         });
     bool touches = false;

@@ -1,4 +1,5 @@
 // The matrices of a step and their inverses, body by body, and the transpose.
+#include "../coarse/line.h"
 #include "bodies.cuh"
 #include "coarse.h"
 
@@ -357,18 +358,79 @@ void invert(const MatrixInputs<T>& in, const MatrixWork& work, int first, int co
   }
 }
 
+template <class T>
+void invert_all(const MatrixInputs<T>& in, const MatrixWork& work, T* inverse, cudaStream_t stream) {
+  const Plan& p = in.plan;
+  invert(in, work, 0, p.bodies - p.large, 1, inverse, stream);
+  invert(in, work, p.bodies - p.large, p.large, (3 * p.most + kEdge - 1) / kEdge, inverse, stream);
+}
+
+template <class T>
+__global__ void __launch_bounds__(kPairThreads)
+    store_matrices(const double* __restrict__ matrix, int64_t count, T* __restrict__ out) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  if (i < count) out[i] = T(matrix[i]);
+}
+
+// A thread for each two functions of a body: their block of A + P' H P. press: H of each position.
+template <class T>
+__global__ void __launch_bounds__(kPairThreads)
+    add_presses(const __grid_constant__ coarse::Inputs<T> c, int64_t base, int64_t scenes, int64_t positions,
+                const double* __restrict__ press, double* __restrict__ matrix) {
+  const Plan& p = c.plan;
+  const int64_t item = static_cast<int64_t>(blockIdx.x) * kPairThreads + threadIdx.x;
+  if (item >= scenes * p.cells) return;
+  const int64_t scene = item / p.cells;
+  const Cell at(p, static_cast<int>(item - scene * p.cells));
+  if (at.j > at.i) return;
+  const int first = __ldg(p.function_ptr + at.body), i = first + at.i, j = first + at.j;
+  const int64_t n = 3 * at.count, own = int64_t{9} * __ldg(p.mass_ptr + at.body);
+  Matrix sum = coarse::block_at(c.factor.data + (base + scene) * c.factor.scene + own + 3 * at.i * n + 3 * at.j, n);
+  for (int e = __ldg(p.row_ptr + i); e < __ldg(p.row_ptr + i + 1); ++e) {
+    const int position = __ldg(p.row + e);
+    const double* H = press + (scene * positions + position) * 6;
+    const Sym3<double> block{H[0], H[1], H[2], H[3], H[4], H[5]};
+    if (!coarse::acts(block)) continue;
+    for (int f = __ldg(p.position_ptr + position); f < __ldg(p.position_ptr + position + 1); ++f) {
+      if (__ldg(p.function + f) != j) continue;
+      const double weight = double(__ldg(c.row_weight + e)) * double(__ldg(c.weight + f));
+      sum = sum + weight * Matrix{{H[0], H[1], H[2]}, {H[1], H[3], H[4]}, {H[2], H[4], H[5]}};
+    }
+  }
+  double* to = matrix + 9 * scene * p.cells + own;
+  store_matrix(to + 3 * at.i * n + 3 * at.j, sum, n);
+  if (at.i != at.j) store_matrix(to + 3 * at.j * n + 3 * at.i, transposed(sum), n);
+}
+
 }  // namespace
 
 template <class T>
-cudaError_t coarse_inverse(const MatrixInputs<T>& in, const MatrixWork& work, T* inverse, cudaStream_t stream) {
+cudaError_t coarse_inverse(const MatrixInputs<T>& in, const MatrixWork& work, T* inverse, bool inverts,
+                           cudaStream_t stream) {
   const Plan& p = in.plan;
   if (in.scenes * p.bodies == 0) return cudaSuccess;
   if (p.groups > 0) {
     turn_groups<<<static_cast<unsigned>(in.scenes * p.groups), kThreads, 0, stream>>>(in, work.turn);
   }
   assemble_pairs<<<blocks_for(in.scenes * p.cells), kPairThreads, 0, stream>>>(in, work.turn, work.matrix);
-  invert(in, work, 0, p.bodies - p.large, 1, inverse, stream);
-  invert(in, work, p.bodies - p.large, p.large, (3 * p.most + kEdge - 1) / kEdge, inverse, stream);
+  if (inverts) {
+    invert_all(in, work, inverse, stream);
+  } else if (p.cells > 0) {
+    const int64_t count = in.scenes * 9 * p.cells;
+    store_matrices<<<blocks_for(count), kPairThreads, 0, stream>>>(work.matrix, count, inverse);
+  }
+  return cudaGetLastError();
+}
+
+template <class T>
+cudaError_t pressed_inverse(const coarse::Inputs<T>& c, int64_t base, int64_t scenes, int64_t positions,
+                            const double* press, const MatrixWork& work, T* inverse, cudaStream_t stream) {
+  if (scenes * c.plan.cells == 0) return cudaSuccess;
+  add_presses<<<blocks_for(scenes * c.plan.cells), kPairThreads, 0, stream>>>(c, base, scenes, positions, press,
+                                                                              work.matrix);
+  MatrixInputs<T> in{};
+  in.plan = c.plan, in.scenes = scenes;
+  invert_all(in, work, inverse, stream);
   return cudaGetLastError();
 }
 
@@ -389,8 +451,10 @@ cudaError_t coarse_inverse_vjp(const MatrixInputs<T>& in, const T* bar, double* 
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                         \
-  template cudaError_t coarse_inverse<T>(const MatrixInputs<T>&, const MatrixWork&, T*, cudaStream_t); \
+#define DIFFVBD_INSTANTIATE(T)                                                                                    \
+  template cudaError_t coarse_inverse<T>(const MatrixInputs<T>&, const MatrixWork&, T*, bool, cudaStream_t);      \
+  template cudaError_t pressed_inverse<T>(const coarse::Inputs<T>&, int64_t, int64_t, int64_t, const double*,     \
+                                          const MatrixWork&, T*, cudaStream_t);                                   \
   template cudaError_t coarse_inverse_vjp<T>(const MatrixInputs<T>&, const T*, double*, T*, T*, T*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

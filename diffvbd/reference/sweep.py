@@ -395,12 +395,14 @@ def _descending(
         total = torch.zeros_like(z[..., 0, :])
         for barrier in barriers:
             terms, vertex = barrier.terms(z, x_prev)
-            total = total.index_add(-1, vertex, terms.expand(*total.shape[:-1], -1))
+            total = total + total.new_zeros(*terms.shape[:-1], total.shape[-1]).index_add(-1, vertex, terms)
         return total[..., vertices]
 
-    before, fraction, found = own(state), torch.ones_like(slope), torch.zeros_like(slope, dtype=torch.bool)
+    before = own(state)
+    fraction, found = torch.ones_like(before + slope), torch.zeros_like(before + slope, dtype=torch.bool)
     for _ in range(HALVINGS):
-        after, quadratic = own(put(state, vertices, x + fraction * update)), fraction**2 / 2 * curvature
+        after = own(put(state, vertices, x + fraction.unsqueeze(-2) * update))
+        quadratic = fraction**2 / 2 * curvature
         size = (fraction * slope).abs() + quadratic + before + after
         rise = fraction * slope + quadratic + (after - before)
         found = found | ~(rise > ROUNDING * torch.finfo(x.dtype).eps * size)

@@ -69,6 +69,7 @@ def test_step_and_rollout(device: str, case: str, kind: str, space: int, sweeps:
 
 def test_lengths_below_one_and_zero_occur(device: str) -> None:
     """What the comparison above is worth: shortened and refused corrections are among its steps."""
-    found = torch.cat([check(device, case, "structured", SPACES[0], 8, 2, "full")[0].reshape(-1)
-                       for case in ("inverted", "violent", "floor_filtered", "huge_strain")])  # fmt: skip
+    found = torch.cat([lengths.reshape(-1)
+                       for case in ("inverted", "violent", "floor_filtered", "huge_strain")
+                       for lengths in check(device, case, "structured", SPACES[0], 8, 2, "full")])  # fmt: skip
     assert (found == 1).any() and ((found > 0) & (found < 1)).any() and (found == 0).any(), found

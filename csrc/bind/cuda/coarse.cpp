@@ -21,7 +21,7 @@ using torch::stable::Tensor;
 using torch::stable::accelerator::DeviceGuard;
 
 // The inverses: a product with one is many small sums at once, where factors are solved row after row.
-Tensor matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t> sizes, double time_step) {
+Tensor matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t> sizes, double time_step, bool factored) {
   const CoarseFields f{DIFFVBD_ITEMS(COARSE)};
   const DeviceGuard guard(x_prev.get_device_index());
   return dispatch_float(x_prev, [&](auto scalar) {
@@ -35,7 +35,7 @@ Tensor matrix(DIFFVBD_PARAMETERS(COARSE) std::vector<int64_t> sizes, double time
                  panel = doubles(b * 6 * p.functions * edge), block = doubles(b * p.bodies * edge * edge);
     check(
         cuda::coarse_inverse<T>(in, {data<double>(turn), data<double>(sums), data<double>(panel), data<double>(block)},
-                                data<T>(inverse), current_stream(x_prev)),
+                                data<T>(inverse), factored, current_stream(x_prev)),
         "the matrices of a coarse space");
     return inverse;
   });
