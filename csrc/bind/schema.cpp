@@ -191,8 +191,8 @@ STABLE_TORCH_LIBRARY(diffvbd, m) {
          "time_step, float filter_eta, float chord, int start, bool filters, bool[] wants",
          "Tensor x, Tensor v, Tensor acceleration, Tensor prescribed, Tensor mass, Tensor shared, Tensor own, Tensor "
          "planes, ");
-  // The matrices of all bodies, one after the other, or if factored their Cholesky factors (CUDA: inverses); adjoints of
-  // x_prev, stiffness and mass from that of the matrices
+  // The matrices of all bodies, one after the other, or if factored their Cholesky factors (CUDA: inverses); adjoints
+  // of x_prev, stiffness and mass from that of the matrices
   define(m, "coarse_matrix", DIFFVBD_ARGUMENTS(COARSE), "int[] sizes, float time_step, bool factored",
          "Tensor factor, ");
   define(m, "coarse_matrix_backward", DIFFVBD_ARGUMENTS(COARSE), "Tensor bar, int[] sizes, float time_step",

@@ -11,7 +11,7 @@ namespace diffvbd::coarse {
 
 constexpr int kDegree = TetLayout::line_degree;
 constexpr double kDecrease = 1e-4;  // share of what the slope promises
-constexpr int kFailures = 2;  // lengths of 0 after which a body's corrections are over
+constexpr int kFailures = 2;        // lengths of 0 after which a body's corrections are over
 
 // The smooth part of the change of the potential, c[0] s + ... + c[5] s^6, and the sum of its terms' sizes.
 struct Change {

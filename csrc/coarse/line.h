@@ -70,9 +70,7 @@ struct Line {
       if constexpr (E::has_filter) {
         admitted = admitted && E::template admits<T>(after, before.x, data, count, rigid::kLeastShare);
       }
-      const double now = E::value(before, data, count), then = E::value(after, data, count);
-      rise += then - now;
-      size += std::abs(now) + std::abs(then);
+      rise += E::change(before, s * at(way + row(i)), data, count, size);
     });
     return admitted ? rise : std::numeric_limits<double>::infinity();
   }
@@ -82,9 +80,8 @@ struct Line {
     const VertexState<double> now = state(i);
     Vector g{};
     Sym3<double> H{};
-    each_energy(i, [&](auto energy, const double* data, int count) {
-      decltype(energy)::block(now, data, count, g, H);
-    });
+    each_energy(i,
+                [&](auto energy, const double* data, int count) { decltype(energy)::block(now, data, count, g, H); });
     return H;
   }
 };

@@ -38,7 +38,8 @@ __attribute__((flatten, optimize("no-tree-slp-vectorize"))) void reverse_gradien
     R values[kMaxEnergyData];
     const Block<R> b = load_block<Set>(plan, s, block, q, values);
     const BlockAdjoint<R> out = reverse_gradient<Set, kMaterial | kRest>(
-        b, star, load_rows(s.way, block), load_rows(s.wanted, block), q, s.data_bar != nullptr, [&](int k, int i, const R& value) {
+        b, star, load_rows(s.way, block), load_rows(s.wanted, block), q, s.data_bar != nullptr,
+        [&](int k, int i, const R& value) {
           const int64_t row = b.data[k] - values + i;
           LaneStar<T>::accumulate(s.data_bar + (row * plan.blocks + block) * kLanes, value);
         });

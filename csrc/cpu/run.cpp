@@ -181,8 +181,7 @@ void look_for_nonfinite(const Plan& plan, const SceneView<T>& s, int64_t step, i
 template <class T>
 void run_forward(const Plan& plan, const StepInputs<T>& in, T* x, T* tape, uint8_t* cut) {
   const auto kernel = forward_kernel<T>(in.energies);
-  const int64_t tape_size =
-      int64_t{in.sweeps} * tape_rows(in.tape_policy, kept_scalars(in.energies)) * plan.num_active;
+  const int64_t tape_size = int64_t{in.sweeps} * tape_rows(in.tape_policy, kept_scalars(in.energies)) * plan.num_active;
   const std::vector<int32_t> position = in.contact ? positions_of(plan) : std::vector<int32_t>{};
   const int every = in.coarse ? in.coarse->plan.every : 0, begun = in.coarse ? in.coarse->plan.begun : 0;
   // a message thrown inside a parallel region would be lost

@@ -78,8 +78,8 @@ __global__ void __launch_bounds__(kRowThreads) solve_rows(const __grid_constant_
   const int64_t scene = exists ? item / unknowns : 0, row = exists ? item - scene * unknowns : 0;
   const int body = __ldg(p.function_body + row / 3), first = 3 * __ldg(p.function_ptr + body);
   const int n = 3 * __ldg(p.function_ptr + body + 1) - first;
-  const T* inverse = a.w.inverse ? a.w.inverse + 9 * scene * p.cells
-                                 : a.c.factor.data + (a.s.base + scene) * a.c.factor.scene;
+  const T* inverse =
+      a.w.inverse ? a.w.inverse + 9 * scene * p.cells : a.c.factor.data + (a.s.base + scene) * a.c.factor.scene;
   inverse += int64_t{9} * __ldg(p.mass_ptr + body) + (row - first) * n;
   const T* from = a.w.restricted + scene * unknowns + first;
   double sum = 0;
@@ -122,8 +122,8 @@ __global__ void __launch_bounds__(kRowThreads)
   const int64_t scene = item / p.listed;
   const int i = static_cast<int>(item - scene * p.listed), position = __ldg(p.list_position + i);
   const int body = __ldg(p.position_body + position);
-  const coarse::Line<T, StepInputs<T>> line{in,   a.c, a.s.data_start, a.s.base + scene,
-                                            body, a.s.w.x + scene * a.s.positions * kRow, a.w.way};
+  const coarse::Line<T, StepInputs<T>> line{
+      in, a.c, a.s.data_start, a.s.base + scene, body, a.s.w.x + scene * a.s.positions * kRow, a.w.way};
   const Sym3<double> H = line.block(i - __ldg(p.list_ptr + body));
   double* to = a.w.press + (scene * a.s.positions + position) * 6;
   to[0] = H.xx, to[1] = H.xy, to[2] = H.xz, to[3] = H.yy, to[4] = H.yz, to[5] = H.zz;

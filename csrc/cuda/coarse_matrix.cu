@@ -451,10 +451,10 @@ cudaError_t coarse_inverse_vjp(const MatrixInputs<T>& in, const T* bar, double* 
   return cudaGetLastError();
 }
 
-#define DIFFVBD_INSTANTIATE(T)                                                                                    \
-  template cudaError_t coarse_inverse<T>(const MatrixInputs<T>&, const MatrixWork&, T*, bool, cudaStream_t);      \
-  template cudaError_t pressed_inverse<T>(const coarse::Inputs<T>&, int64_t, int64_t, int64_t, const double*,     \
-                                          const MatrixWork&, T*, cudaStream_t);                                   \
+#define DIFFVBD_INSTANTIATE(T)                                                                                \
+  template cudaError_t coarse_inverse<T>(const MatrixInputs<T>&, const MatrixWork&, T*, bool, cudaStream_t);  \
+  template cudaError_t pressed_inverse<T>(const coarse::Inputs<T>&, int64_t, int64_t, int64_t, const double*, \
+                                          const MatrixWork&, T*, cudaStream_t);                               \
   template cudaError_t coarse_inverse_vjp<T>(const MatrixInputs<T>&, const T*, double*, T*, T*, T*, cudaStream_t);
 DIFFVBD_INSTANTIATE(float)
 DIFFVBD_INSTANTIATE(double)

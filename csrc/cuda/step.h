@@ -99,9 +99,9 @@ struct StepView {
   int stages;           // of records in shared memory: 0, kFewStages or kManyStages
   StepParameters<T> parameters;
   int sweeps, tape_policy, tape_rows;  // tape_rows: scalars of a vertex and sweep
-  bool one_material;  // `material` below; else w.material
-  bool has_tets;      // whether they have an energy
-  bool own;           // whether a block has its scene to itself
+  bool one_material;                   // `material` below; else w.material
+  bool has_tets;                       // whether they have an energy
+  bool own;                            // whether a block has its scene to itself
   Batched<const T> mass, rest, data, material[kTetScalars];
   int64_t material_scene;
   int64_t data_start[kVertexEnergies];

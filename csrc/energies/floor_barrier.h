@@ -177,14 +177,34 @@ struct FloorBarrier {
     R sum = R(0);
     for (int k = 0; k < count; k += stride) {
       const Plane<R> plane(data + k, s);
-      const R d = plane.gap(s.x);
-      if (any(d < plane.dhat)) sum = sum + s.h * s.h * LogBarrier<R>(d, plane.dhat, plane.kappa).value;
-      const R before = plane.gap(s.x_prev), travel = dot(plane.n, s.x - s.x_prev);
-      if (!damps(plane.damping) || !any(before < plane.dhat)) continue;
-      const R approach = select(travel < R(0), travel, R(0));
-      sum = sum + R(0.5) * plane.damping * s.h * share(plane, before).value * approach * approach;
+      sum = sum + potential(s, plane, plane.gap(s.x), dot(plane.n, s.x - s.x_prev));
     }
     return sum;
+  }
+  // By how much it changes along a step; its terms' sizes are added to `size`. The gap after the step comes from the
+  // gap before: the difference of two positions would round by far more than a small step changes.
+  template <class R>
+  DIFFVBD_FN static R change(const VertexState<R>& s, const Vec3<R>& step, const R* data, int count, R& size) {
+    R sum = R(0);
+    for (int k = 0; k < count; k += stride) {
+      const Plane<R> plane(data + k, s);
+      const R d = plane.gap(s.x), travel = dot(plane.n, s.x - s.x_prev), move = dot(plane.n, step), after = d + move;
+      const R one = potential(s, plane, d, travel), two = potential(s, plane, after, travel + move);
+      sum = sum + (two - one);
+      size = size + one + two - s.h * s.h * LogBarrier<R>(after, plane.dhat, plane.kappa).first * after;
+    }
+    return sum;
+  }
+
+  // Of one plane, at a gap and after a travel away from it within the step.
+  template <class R>
+  DIFFVBD_FN static R potential(const VertexState<R>& s, const Plane<R>& plane, const R& gap, const R& travel) {
+    R out = R(0);
+    if (any(gap < plane.dhat)) out = s.h * s.h * LogBarrier<R>(gap, plane.dhat, plane.kappa).value;
+    const R before = plane.gap(s.x_prev);
+    if (!damps(plane.damping) || !any(before < plane.dhat)) return out;
+    const R approach = select(travel < R(0), travel, R(0));
+    return out + R(0.5) * plane.damping * s.h * share(plane, before).value * approach * approach;
   }
 
   // Whether a move from `before` to s.x leaves every plane at least `share` of the gap there was, and more than

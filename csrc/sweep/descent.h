@@ -1,5 +1,5 @@
-// How much of an update is executed where a barrier acts. A barrier is no quadratic: a Newton step into it may raise the
-// potential many times over, which later updates then have to take back. The fraction comes from a finite set, is
+// How much of an update is executed where a barrier acts. A barrier is no quadratic: a Newton step into it may raise
+// the potential many times over, which later updates then have to take back. The fraction comes from a finite set, is
 // recorded and counts as a constant.
 #pragma once
 
@@ -29,31 +29,26 @@ DIFFVBD_COLD R searched_fraction(const Block<R>& b, const Star& star, const Step
   star.rewind();
   TetSums<R> tets = sum_tets<typename Set::Elastic>(star, b.state.x);
   star.total(tets.g, tets.h_diagonal, tets.h_outer);
-  const R h2 = R(q.time_step) * R(q.time_step), square = dot(step, step);
-  R slope = b.mass * dot(b.state.x - b.y, step) + h2 * dot(tets.g, step);
-  R curvature = (b.mass + h2 * tets.h_diagonal) * square + h2 * dot(step, tets.h_outer * step);
+  const R h2 = R(q.time_step) * R(q.time_step);
+  const Vec3<R> inertia = b.mass * (b.state.x - b.y), elastic = h2 * tets.g;
+  R slope = dot(inertia, step) + dot(elastic, step), size = sizes(inertia, step) + sizes(elastic, step);
+  R curvature = (b.mass + h2 * tets.h_diagonal) * dot(step, step) + h2 * dot(step, tets.h_outer * step);
   if constexpr (Set::contact) {
     const ContactTerm<R> contact = star.contact(b);
     slope = slope + dot(contact.g, step);
+    size = size + sizes(contact.g, step);
     curvature = curvature + dot(step, contact.H * step);
   }
-  const auto energies = [&](const VertexState<R>& s) {
-    R sum = R(0);
-    Set::for_each([&](auto energy, int k) {
-      if (b.data_count[k] > 0) sum = sum + decltype(energy)::value(s, b.data[k], b.data_count[k]);
-    });
-    return sum;
-  };
-  const R before = energies(b.state), rounding = R(kRounding * std::numeric_limits<T>::epsilon());
+  const R rounding = R(kRounding * std::numeric_limits<T>::epsilon());
   R out = R(0);
   for (int trial = 0; trial < kFractions && any(out < R(fraction_of(kFractions))); ++trial) {
-    const R s = R(fraction_of(trial));
-    VertexState<R> after = b.state;
-    after.x += s * step;
-    const R there = energies(after), quadratic = R(0.5) * s * s * curvature;
-    const R rise = s * slope + quadratic + (there - before);
-    const R size = s * absolute(slope) + quadratic + there + before;
-    out = select(R(0) < out, out, select(rounding * size < rise, R(0), s));
+    const R s = R(fraction_of(trial)), quadratic = R(0.5) * s * s * curvature;
+    R rise = s * slope + quadratic, terms = s * size + quadratic;
+    Set::for_each([&](auto energy, int k) {
+      using E = decltype(energy);
+      if (b.data_count[k] > 0) rise = rise + E::change(b.state, s * step, b.data[k], b.data_count[k], terms);
+    });
+    out = select(R(0) < out, out, select(rounding * terms < rise, R(0), s));
   }
   return out;
 }

@@ -151,17 +151,31 @@ class FloorBarrier:
         return self.terms(x, x_prev)[0].sum(-1)
 
     def terms(self, x: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
-        h = self.scene.time_step
         free = ~self.scene.model.pinned
-        gap = self.gap(x[..., free])
-        active = gap < self.dhat
-        d = torch.where(active, gap, 1.0)
-        total = h**2 * torch.where(active, -self.kappa * (d - self.dhat) ** 2 * torch.log(d / self.dhat), 0.0)
-        total = torch.where(gap > 0, total, torch.inf)
+        total = self._barrier(self.gap(x[..., free]))
         if self.damped:
             approach, rate = self._approach(x[..., free], x_prev[..., free])
             total = total + rate / 2 * approach**2
         return total.flatten(-2), free.nonzero()[:, 0].repeat(total.shape[-2])
+
+    def _barrier(self, gap: Tensor) -> Tensor:
+        active = gap < self.dhat
+        d = torch.where(active, gap, 1.0)
+        total = torch.where(active, -self.kappa * (d - self.dhat) ** 2 * torch.log(d / self.dhat), 0.0)
+        return self.scene.time_step**2 * torch.where(gap > 0, total, torch.inf)
+
+    def change(self, x: Tensor, step: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
+        """By how much the energy of each vertex changes along a step from x, all [..., 3, n], and its terms' sizes."""
+        gap = self.gap(x)
+        after = gap + dot(self.normal, step.unsqueeze(-3))
+        before, there = self._barrier(gap), self._barrier(after)
+        slope = log_barrier(after, self.kappa, self.dhat)[1]
+        change, size = there - before, there + before - self.scene.time_step**2 * slope * after
+        if self.damped:
+            (one, rate), (two, _) = self._approach(x, x_prev), self._approach(x + step, x_prev)
+            change = change + rate / 2 * (two**2 - one**2)
+            size = size + rate / 2 * (two**2 + one**2)
+        return change.sum(-2), size.sum(-2)
 
     def limit(self, x: Tensor, step: Tensor) -> Tensor:
         gap, travel = self.gap(x), dot(self.normal, step.unsqueeze(-3))

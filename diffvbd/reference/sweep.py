@@ -391,23 +391,18 @@ def _descending(
     curvature = mass.squeeze(-2) * dot(update, update) + sum(update[..., i, :] * dot(rows[i], update) for i in range(3))
     slope = dot(mass * (x - y) + gradient, update)
 
-    def own(z: Tensor) -> Tensor:
-        total = torch.zeros_like(z[..., 0, :])
-        for barrier in barriers:
-            terms, vertex = barrier.terms(z, x_prev)
-            total = total + total.new_zeros(*terms.shape[:-1], total.shape[-1]).index_add(-1, vertex, terms)
-        return total[..., vertices]
+    terms = (mass * (x - y) * update).abs().sum(-2) + (gradient * update).abs().sum(-2)
 
-    before = own(state)
-    fraction, found = torch.ones_like(before + slope), torch.zeros_like(before + slope, dtype=torch.bool)
+    near = sum(((b.gap(x) < b.dhat) | (b.gap(x + update) < b.dhat)).any(-2) for b in barriers) > 0
+    fraction, found = torch.ones_like(near + slope), torch.zeros_like(near + slope, dtype=torch.bool)
     for _ in range(HALVINGS):
-        after = own(put(state, vertices, x + fraction.unsqueeze(-2) * update))
-        quadratic = fraction**2 / 2 * curvature
-        size = (fraction * slope).abs() + quadratic + before + after
-        rise = fraction * slope + quadratic + (after - before)
+        rise = fraction * slope + fraction**2 / 2 * curvature
+        size = fraction * terms + fraction**2 / 2 * curvature
+        for barrier in barriers:
+            change, of_terms = barrier.change(x, fraction.unsqueeze(-2) * update, take(x_prev, vertices))
+            rise, size = rise + change, size + of_terms
         found = found | ~(rise > ROUNDING * torch.finfo(x.dtype).eps * size)
         fraction = torch.where(found, fraction, fraction / 2)
-    near = torch.stack([((b.gap(x) < b.dhat) | (b.gap(x + update) < b.dhat)).any(-2) for b in barriers]).any(0)
     return torch.where(near, torch.where(found, fraction, 0.0), 1.0)
 
 

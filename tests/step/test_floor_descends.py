@@ -1,0 +1,103 @@
+"""Claim: steps on a floor converge, with and without coarse corrections: no update and no correction raises the
+incremental potential, so that few sweeps rebound and press as converged ones do."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.spreads import assert_near_reference
+from scipy.spatial import Delaunay
+from torch import Tensor
+
+import diffvbd as dv
+from diffvbd import testing
+from diffvbd.reference import sweep as reference
+from diffvbd.reference.potential import incremental_potential
+from diffvbd.testing import build_scene, evaluate
+
+RADIUS, DHAT, MODULI = 0.1, 5e-3, {"young": 1e5, "poisson": 0.3}
+
+
+def ball(gap: float, **options: Any) -> dv.Model:
+    """A ball of some 200 vertices above a floor at y = 0."""
+    rng = np.random.default_rng(0)
+    inner = rng.uniform(-RADIUS, RADIUS, (400, 3))
+    inner = inner[np.linalg.norm(inner, axis=1) < 0.8 * RADIUS][:100]
+    k = np.arange(100) + 0.5
+    polar, turn = np.arccos(1 - k / 50), np.pi * (1 + 5**0.5) * k
+    shell = RADIUS * np.stack([np.cos(turn) * np.sin(polar), np.cos(polar), np.sin(turn) * np.sin(polar)], -1)
+    points = np.concatenate([inner, shell])
+    tets = Delaunay(points).simplices
+    edges = points[tets[:, 1:]] - points[tets[:, :1]]
+    good = np.abs(np.linalg.det(edges)) > 0.01 * np.linalg.norm(edges, axis=-1).max(1) ** 3
+    points[:, 1] += gap - points[:, 1].min()
+    mesh = dv.mesh.TetMesh(points, tets[good], orient=True)
+    energies = (dv.StableNeoHookean(), dv.FloorBarrier(kappa=2e5, dhat=DHAT))
+    pinned = points[:, 1] > 1.6 * RADIUS if options.pop("held", False) else None
+    return dv.Model(mesh, energies=energies, pinned=pinned, **options)
+
+
+def rebound(coarse: Any, sweeps: int) -> float:
+    model = ball(gap=8e-3, coarse=coarse)
+    x, v = model.rest_points, torch.zeros_like(model.rest_points)
+    v[:, 1] = -2.0
+    end = dv.rollout(model, x, v, steps=60, time_step=2e-3, sweeps=sweeps, gravity=(0, 0, 0), save="last", **MODULI)
+    return float((model.mass * end.v[-1, :, 1]).sum() / model.mass.sum()) / 2.0
+
+
+def test_a_ball_rebounds_as_with_converged_steps() -> None:
+    converged = rebound(None, 100)
+    assert 0.6 < converged < 0.9
+    for coarse, sweeps in (("auto", 8), ("auto", 20), (None, 20)):
+        assert rebound(coarse, sweeps) == pytest.approx(converged, rel=0.01), (coarse, sweeps)
+
+
+@pytest.mark.parametrize("coarse", (None, "auto"))
+def test_the_potential_never_rises(coarse: Any) -> None:
+    """After one sweep, two and so on of a step in which the ball hits the floor."""
+    for time_step, gap, speed in ((2e-3, 6e-3, 2.0), (5e-3, 1e-2, 3.0)):
+        model = ball(gap, coarse=coarse, rigid=False)
+        x, v = model.rest_points, torch.zeros_like(model.rest_points)
+        v[:, 1] = -speed
+        moduli = dict(zip(("mu", "lam"), dv.lame(**MODULI), strict=True))
+        values = []
+        for sweeps in range(1, 13):
+            end, _ = dv.step(model, x, v, time_step=time_step, sweeps=sweeps, gravity=(0, 0, 0), **moduli)
+            y = x + time_step * v
+            values.append(float(incremental_potential(model, end, y, **moduli, time_step=time_step, x_prev=x)))
+        assert (np.diff(values) <= 1e-12 * max(values)).all(), values
+        assert values[-1] < 0.99 * values[0]
+
+
+def test_a_pressed_ball_bears_what_its_cap_presses_with() -> None:
+    """20 mm in five steps: the floor's force is that of 400 plain sweeps, and the reactions at the cap."""
+    forces = []
+    for coarse, sweeps in ((None, 400), ("auto", 20), ("auto", 8)):
+        model = ball(gap=DHAT, coarse=coarse, held=True)
+        x, v = model.rest_points, torch.zeros_like(model.rest_points)
+        down = torch.where(model.pinned[:, None], torch.tensor([0.0, -4e-3, 0.0]), 0.0).to(x.dtype)
+        for _ in range(5):
+            x, v = dv.step(model, x, v, time_step=0.02, sweeps=sweeps, prescribed=x + down, gravity=(0, 0, 0), **MODULI)
+        gap = x[:, 1]
+        first = -2 * (gap - DHAT) * torch.log(gap / DHAT) - (gap - DHAT) ** 2 / gap
+        push = -float(torch.where((gap < DHAT) & ~model.pinned, 2e5 * first, 0.0).sum())
+        forces += [push, -float(dv.reactions(model, x, gravity=(0, 0, 0), **MODULI)[..., 1].sum())]
+    assert forces[0] > 50
+    assert np.allclose(forces, forces[0], rtol=0.02), forces
+
+
+def test_fractions_occur_in_the_comparison_with_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whole updates, parts and none are among those whose gradients equal the twin's."""
+    fractions, own = [], reference._descending
+    monkeypatch.setattr(reference, "_descending", lambda *a: fractions.append(own(*a)) or fractions[-1])
+    scene = build_scene("floor_filtered", testing.KINDS[0], "small")
+    for tape in ("full", "compact"):
+        model, inputs = scene.model("cpu"), scene.inputs(device="cpu")
+
+        def run(model: dv.Model = model, tape: str = tape, **options: Any) -> tuple[Tensor, Tensor]:
+            return dv.step(model, sweeps=5, adjoint=dv.ReverseSweep(tape=tape), **options)
+
+        assert_near_reference(model, inputs, 5, 1, evaluate(run, inputs), None)
+    found = torch.cat([f.reshape(-1) for f in fractions])
+    assert (found == 1).any() and ((found > 0) & (found < 1)).any(), found
