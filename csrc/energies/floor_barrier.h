@@ -181,9 +181,10 @@ struct FloorBarrier {
     }
     return sum;
   }
-  // By how much it changes along a step; its terms' sizes are added to `size`. The gap after the step comes from the
-  // gap before: the difference of two positions would round by far more than a small step changes.
-  template <class R>
+  // By how much it changes along a step, or by how much more than its part of g and H says; the sizes of the terms are
+  // added to `size`. The gap after the step comes from the gap before: the difference of two positions would round by
+  // far more than a small step changes.
+  template <bool beyond_quadratic = false, class R>
   DIFFVBD_FN static R change(const VertexState<R>& s, const Vec3<R>& step, const R* data, int count, R& size) {
     R sum = R(0);
     for (int k = 0; k < count; k += stride) {
@@ -192,10 +193,15 @@ struct FloorBarrier {
       const R one = potential(s, plane, d, travel), two = potential(s, plane, after, travel + move);
       sum = sum + (two - one);
       size = size + one + two - s.h * s.h * LogBarrier<R>(after, plane.dhat, plane.kappa).first * after;
+      if constexpr (beyond_quadratic) {
+        const Push<R> f = push(s, data + k, Frame<R>::none());
+        const R first = f.slope * move, second = R(0.5) * f.curvature * move * move;
+        sum = sum - (first + second);
+        size = size + absolute(first) + second;
+      }
     }
     return sum;
   }
-
   // Of one plane, at a gap and after a travel away from it within the step.
   template <class R>
   DIFFVBD_FN static R potential(const VertexState<R>& s, const Plane<R>& plane, const R& gap, const R& travel) {

@@ -54,11 +54,10 @@ DIFFVBD_FN Update<R> safeguarded(const Block<R>& b, const Vec3<R>& d_raw, const 
   return out;
 }
 
-// Whole, from the system of a vertex.
-template <class Set, class R, class T, class Star>
-DIFFVBD_FN Update<R> update_of(const Block<R>& b, const Star& star, const Vec3<R>& d_raw, const StepParameters<T>& q) {
-  Update<R> out = safeguarded<Set>(b, d_raw, q);
-  out.fraction = descending_fraction<Set>(b, star, q, out);
+template <class Set, class R, class T>
+DIFFVBD_FN Update<R> update_of(const Block<R>& b, const NewtonStep<R>& newton, const StepParameters<T>& q) {
+  Update<R> out = safeguarded<Set>(b, newton.d_raw, q);
+  out.fraction = descending_fraction<Set>(b, q, newton.H, newton.d, out);
   return out;
 }
 

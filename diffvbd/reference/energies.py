@@ -165,17 +165,21 @@ class FloorBarrier:
         return self.scene.time_step**2 * torch.where(gap > 0, total, torch.inf)
 
     def change(self, x: Tensor, step: Tensor, x_prev: Tensor) -> tuple[Tensor, Tensor]:
-        """By how much the energy of each vertex changes along a step from x, all [..., 3, n], and its terms' sizes."""
-        gap = self.gap(x)
-        after = gap + dot(self.normal, step.unsqueeze(-3))
-        before, there = self._barrier(gap), self._barrier(after)
-        slope = log_barrier(after, self.kappa, self.dhat)[1]
-        change, size = there - before, there + before - self.scene.time_step**2 * slope * after
+        """By how much more the energy of each vertex changes along a step from x, all [..., 3, n], than its part of
+        block() says, and the sizes of the terms."""
+        h, gap, move = self.scene.time_step, self.gap(x), dot(self.normal, step.unsqueeze(-3))
+        one, two = self._barrier(gap), self._barrier(gap + move)
+        _, first, second = log_barrier(gap, self.kappa, self.dhat)
+        there = log_barrier(gap + move, self.kappa, self.dhat)[1]
+        first, second = h**2 * first, h**2 * second
+        change, size = two - one, one + two - h**2 * there * (gap + move)
         if self.damped:
-            (one, rate), (two, _) = self._approach(x, x_prev), self._approach(x + step, x_prev)
-            change = change + rate / 2 * (two**2 - one**2)
-            size = size + rate / 2 * (two**2 + one**2)
-        return change.sum(-2), size.sum(-2)
+            (before, rate), (after, _) = self._approach(x, x_prev), self._approach(x + step, x_prev)
+            first, second = first + rate * before, second + rate
+            change = change + rate / 2 * (after**2 - before**2)
+            size = size + rate / 2 * (after**2 + before**2)
+        first, second = first * move, second / 2 * move**2
+        return (change - first - second).sum(-2), (size + first.abs() + second).sum(-2)
 
     def limit(self, x: Tensor, step: Tensor) -> Tensor:
         gap, travel = self.gap(x), dot(self.normal, step.unsqueeze(-3))

@@ -354,7 +354,7 @@ def _update_color(
     for energy in energies:
         system = system + energy.block(k, state, x_prev)
     gradient, hessian = system.split((3, 6), -2)
-    update = -solve6(hessian, gradient)
+    update = raw = -solve6(hessian, gradient)
     if model.saturation is not None:
         update = update * _saturation(update, model.saturation).unsqueeze(-2)
     factor = model.relaxation if relaxation is None else relaxation
@@ -362,48 +362,40 @@ def _update_color(
         update = factor * update
     update = filtered(energies, x, update)
     if all(getattr(e, "exact", True) for e in energies) and any(hasattr(e, "limit") for e in energies):
-        update = _descending(scene, energies, k, mass, y, state, x_prev, update).unsqueeze(-2) * update
+        fraction = _descending(energies, hessian, raw, update, x, take(x_prev, vertices), model.regularization)
+        update = fraction.unsqueeze(-2) * update
     if limit is not None:
         update = take(limit, vertices) * update
     return put(state, vertices, x + update)
 
 
 @torch.no_grad()
-def _descending(
-    scene: Scene,
-    energies: list[Any],
-    k: int,
-    mass: Tensor,
-    y: Tensor,
-    state: Tensor,
-    x_prev: Tensor,
-    update: Tensor,
-) -> Tensor:
-    """The largest of 1, 1/2, ... 1/128, or 0, for which no update of color k raises its vertex's own potential; 1 where
-    no barrier acts. What has no barrier is quadratic in one vertex. [..., n]"""
-    vertices = scene.layout.colors[k].vertices
-    x = take(state, vertices)
+def _descending(energies: list[Any], hessian: Tensor, raw: Tensor, update: Tensor, x: Tensor, x_prev: Tensor, tau: float
+                ) -> Tensor:  # fmt: skip
+    """The largest of 1, 1/2, ... 1/128, or 0, for which no update of a color raises its vertex's own potential; 1 where
+    no barrier acts, [..., n]. The update is t raw, which solves H raw = -g: what has no barrier is quadratic in one
+    vertex. x, x_prev: of the color."""
     barriers = [energy for energy in energies if hasattr(energy, "limit")]
-    others = [energy.block(k, state, x_prev) for energy in energies if energy not in barriers]
-    gradient, hessian = sum(others, torch.zeros_like(x).repeat_interleave(3, -2)).split((3, 6), -2)
-    xx, xy, xz, yy, yz, zz = hessian.unbind(-2)
-    rows = [torch.stack(row, -2) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
-    curvature = mass.squeeze(-2) * dot(update, update) + sum(update[..., i, :] * dot(rows[i], update) for i in range(3))
-    slope = dot(mass * (x - y) + gradient, update)
-
-    terms = (mass * (x - y) * update).abs().sum(-2) + (gradient * update).abs().sum(-2)
-
+    whole, square = _square(hessian, raw), dot(raw, raw)
+    own, ratio = whole - tau * square, dot(raw, update) / torch.where(square > 0, square, 1.0)
     near = sum(((b.gap(x) < b.dhat) | (b.gap(x + update) < b.dhat)).any(-2) for b in barriers) > 0
-    fraction, found = torch.ones_like(near + slope), torch.zeros_like(near + slope, dtype=torch.bool)
+    fraction, found = torch.ones_like(near + whole), torch.zeros_like(near + whole, dtype=torch.bool)
     for _ in range(HALVINGS):
-        rise = fraction * slope + fraction**2 / 2 * curvature
-        size = fraction * terms + fraction**2 / 2 * curvature
+        t, step = fraction * ratio, fraction.unsqueeze(-2) * update
+        rise, size = t**2 / 2 * own - t * whole, t**2 / 2 * own + t * whole
         for barrier in barriers:
-            change, of_terms = barrier.change(x, fraction.unsqueeze(-2) * update, take(x_prev, vertices))
+            change, of_terms = barrier.change(x, step, x_prev)
             rise, size = rise + change, size + of_terms
         found = found | ~(rise > ROUNDING * torch.finfo(x.dtype).eps * size)
         fraction = torch.where(found, fraction, fraction / 2)
     return torch.where(near, torch.where(found, fraction, 0.0), 1.0)
+
+
+def _square(hessian: Tensor, d: Tensor) -> Tensor:
+    """d . H d, H as xx, xy, xz, yy, yz, zz [..., 6, n]."""
+    xx, xy, xz, yy, yz, zz = hessian.unbind(-2)
+    rows = [torch.stack(row, -2) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))]
+    return sum(d[..., i, :] * dot(rows[i], d) for i in range(3))  # pyright: ignore[reportReturnType]
 
 
 def _saturation(update: Tensor, limit: float) -> Tensor:
