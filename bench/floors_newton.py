@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 Array = NDArray[np.float64]
 TOLERANCE = 1e-9  # of the sums of the gradient's parts
@@ -111,8 +111,8 @@ class Body:
             reach, (slip, length, full) = h * self.eps_v, self._slip(x, start)
             rate = np.where(length < reach, (2 - length / reach) / reach, 1 / np.maximum(length, reach))
             floor[:, [0, 2]] = (full * rate)[:, None] * slip
-        parts = [self.mass[:, None] * (x - y), h * h * inner, h * h * floor]
-        return sum(parts)[self.free].ravel(), sum(float(np.linalg.norm(p[self.free])) for p in parts)
+        parts = np.stack([self.mass[:, None] * (x - y), h * h * inner, h * h * floor])[:, self.free]
+        return parts.sum(0).ravel(), float(np.linalg.norm(parts.reshape(3, -1), axis=1).sum())
 
     def hessian(self, x: Array, start: Array, convex: bool) -> Array:
         """d2G/dx2 [n, n]; convex: of the tets only what is positive semidefinite."""
@@ -130,7 +130,7 @@ class Body:
             whole = (vector * np.maximum(value, 0)[:, None]) @ vector.swapaxes(1, 2)
             block = whole.reshape(-1, 4, 3, 4, 3).swapaxes(2, 3)
         h2 = self.time_step**2
-        out = h2 * np.bincount(self.where, block[self.kept], self.size**2).reshape(self.size, self.size)
+        out: Any = h2 * np.bincount(self.where, block[self.kept], self.size**2).reshape(self.size, self.size)
         own = np.zeros((len(x), 3, 3))
         own[:, [0, 1, 2], [0, 1, 2]] = self.mass[:, None]
         own[:, 1, 1] += h2 * self.barrier(x)[2]
@@ -147,11 +147,11 @@ class Body:
         return out
 
     def _direction(self, x: Array, start: Array, g: Array) -> Array:
-        for convex in (False, True):
-            factor, info = lapack.dpotrf(self.hessian(x, start, convex), lower=1, overwrite_a=1, clean=0)
-            if info == 0:
-                break
-        return lapack.dpotrs(factor, -g, lower=1)[0]
+        try:
+            factor = cho_factor(self.hessian(x, start, False), lower=True, overwrite_a=True, check_finite=False)
+        except LinAlgError:
+            factor = cho_factor(self.hessian(x, start, True), lower=True, overwrite_a=True, check_finite=False)
+        return np.asarray(cho_solve(factor, -g, check_finite=False), dtype=np.float64)
 
     def step(self, x: Array, v: Array, prescribed: Array | None = None) -> tuple[Array, Array]:
         """One step of implicit Euler, to convergence: the new positions and velocities.
