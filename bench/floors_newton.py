@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 Array = NDArray[np.float64]
 TOLERANCE = 1e-9  # of the sums of the gradient's parts
@@ -147,6 +146,8 @@ class Body:
         return out
 
     def _direction(self, x: Array, start: Array, g: Array) -> Array:
+        from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
         try:
             factor = cho_factor(self.hessian(x, start, False), lower=True, overwrite_a=True, check_finite=False)
         except LinAlgError:

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay
-from scipy.spatial.transform import Rotation
 
 import diffvbd as dv
 from bench.floors_newton import Body
@@ -63,6 +61,8 @@ class Scene:
 
 def ball(radius: float, spacing: float, seed: int = 0) -> dv.TetMesh:
     """Delaunay tets of points in a ball about the origin: even ones on its surface, random ones inside."""
+    from scipy.spatial import Delaunay
+
     rng, golden = np.random.default_rng(seed), np.pi * (3 - 5**0.5)
     outside = round(4 * np.pi * (radius / spacing) ** 2 * 2 / 3**0.5)
     height = 1 - 2 * (np.arange(outside) + 0.5) / outside
@@ -102,6 +102,8 @@ def pressed_ball() -> Scene:
 
 
 def _shape(rng: np.random.Generator) -> tuple[str, dv.TetMesh]:
+    from scipy.spatial.transform import Rotation
+
     kind, size = ("ball", "cube", "taper")[rng.integers(3)], float(rng.uniform(0.05, 0.3))
     if kind == "ball":
         return kind, ball(size / 2, size * float(rng.uniform(0.19, 0.3)), int(rng.integers(1000)))
