@@ -29,8 +29,8 @@ class ReverseSweep:
 
     Args:
         tape: What a step keeps for its backward, per active vertex and sweep (float64):
-            ``"full"`` 72 bytes, raw update and factored block (96 with a floor, whose gaps must come back to the bit);
-            ``"compact"`` 24 bytes, raw update, or with a floor the old position; blocks are assembled again;
+            ``"full"`` 72 bytes, raw update and factored block (104 with a floor, whose gaps must come back to the bit);
+            ``"compact"`` 24 bytes, raw update, or with a floor 32, the old position; blocks are assembled again;
             ``"recompute"`` nothing; the backward runs the step again;
             ``"auto"`` full while a step's full tape fits 256 MiB, or on CUDA 1/256 of the device's memory if that is
             more, compact beyond; a rollout that keeps all its tapes decides by their sum against 2 GiB, one with
