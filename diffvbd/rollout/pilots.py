@@ -18,10 +18,11 @@ from ..adjoint.routes import ReverseSweep
 from ..checks import check_positive, fail
 from ..model.model import Model
 from ..model.warnings import silent
-from ..scopes import refined, refuse_transforms
+from ..scopes import record_to, refined, refuse_transforms
 from ..step.arguments import GRAVITY, Prepared, prepare
 from .between import SWINGS, unseen
 from .energy_check import mechanical_energy
+from .reference import unbalanced
 from .settings import Settings
 from .trajectory import PerStep, Trajectory
 
@@ -70,6 +71,7 @@ class Pilots:
     spent: float = 0.0  # [s]
     runs: int = 0
     _ready: set[str] = field(default_factory=set)
+    _solves: list[Any] = field(default_factory=list)  # of the last run
 
     def __post_init__(self) -> None:
         self.duration = check_positive("duration", self.duration, "s")
@@ -159,13 +161,15 @@ class Pilots:
             with torch.enable_grad():
                 v = torch.where(model.pinned[:, None], v, v + leaves[0])
         given = self.at_steps(given, settings.time_step, steps, began)
+        self._solves = []
         with torch.set_grad_enabled(differentiate):
-            out = self.execute(
-                model, x, v, steps=steps, time_step=settings.time_step, sweeps=settings.sweeps,
-                integrator=settings.integrator, adjoint=ReverseSweep(settings.tape),
-                checkpoint_every=settings.checkpoint_every, save=max(1, steps // frames), check_contact=False,
-                check_energy=False, check_start=False, **given,
-            )  # fmt: skip
+            with record_to(self._solves, "solve"):
+                out = self.execute(
+                    model, x, v, steps=steps, time_step=settings.time_step, sweeps=settings.sweeps,
+                    integrator=settings.integrator, adjoint=ReverseSweep(settings.tape),
+                    checkpoint_every=settings.checkpoint_every, save=max(1, steps // frames), check_contact=False,
+                    check_energy=False, check_start=False, **given,
+                )  # fmt: skip
             value = None if self.quantity is None else self.quantity(out.x[-1], out.v[-1])
             gradient = torch.autograd.grad(value, leaves) if leaves else ()  # type: ignore[arg-type]
         return out, None if value is None else value.detach(), gradient
@@ -218,6 +222,13 @@ class Pilots:
             if apart > SWINGS:
                 return name
         return ""
+
+    def left(self) -> float:
+        """The force that the last run left over, over its forces [-]."""
+        clock = time.perf_counter()
+        out = unbalanced(self._solves)
+        self.spent += time.perf_counter() - clock
+        return out
 
     # --- comparing ----------------------------------------------------------------------------------------------------
 

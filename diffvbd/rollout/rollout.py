@@ -35,6 +35,7 @@ from .chosen import rollout_with
 from .contact_check import checks_contact, warn_of_contact
 from .energy_check import look_at_energy, warn_of_end, warn_of_last_end
 from .finer import rollout_finer
+from .reference import LOOKS
 from .repeated import repeated
 from .settings import Settings
 from .trajectory import PerStep, Trajectory, stacked
@@ -195,6 +196,8 @@ def rollout(
     driven = any(options[k] is not None for k in ("force", "prescribed", "colliders")) or _changes(options["gravity"])
     energy = None if driven else look_at_energy(check_energy, model, x, v, steps, fixed, options["gravity"])
     warn_of_last_end(model, x)
+    asked = () if torch.compiler.is_compiling() else recorders("solve")
+    solves: dict[int, Any] = {}  # by step, of a few: a segment that runs again finds them
 
     outer = x
 
@@ -216,6 +219,8 @@ def rollout(
             if estimate_errors and k not in errors:
                 loads = {name: solve.given[name] for name in _LOADS}
                 errors[k] = error_of(model, solve.x, solve.v, solve.prepared, **loads)
+            if asked and k % -(-steps // LOOKS) == 0 and k not in solves:
+                solves[k] = (model, solve._replace(x=solve.x.detach(), v=solve.v.detach()), x.detach())
             if energy is not None:
                 energy.see(k + 1, x, v)
             if looks and not last:  # not in a segment that runs again
@@ -239,6 +244,8 @@ def rollout(
     if energy is not None:
         energy.warn()
     warn_of_end(model, *done.end[:2])
+    for found in asked:
+        found.extend(solves.values())
     frames = ([] if save == "last" and steps > 0 else [(0, x, v)]) + done.frames
     trajectory = Trajectory(
         x=torch.stack([f[1] for f in frames]),

@@ -25,6 +25,7 @@ from ..model.model import Model
 from ..model.warnings import is_nearly_incompressible
 from ..step.integrators import BDF2, SDIRK2, ImplicitEuler, Integrator
 from .pilots import FRAMES, Pilot, Pilots, changes, relative
+from .reference import MOST_SWEEPS, is_balanced, unreached, with_more_sweeps
 from .settings import Candidate, Prediction, Settings
 
 LONGEST = 0.1  # [s] of the first time step of the ladder
@@ -157,6 +158,7 @@ class _Search:
         p, settings = self.pilots, start_of(self.pilots)
         steps = FRAMES * max(1, math.ceil(p.duration / (FRAMES * LONGEST)))
         apart: list[float] = []
+        left = math.inf  # of forces, by the run that was last taken for the reference
         unseen = "what changes in time" if changes(p.given) else ""
         while True:
             if steps > MOST_STEPS and unseen and self.ladder:
@@ -185,9 +187,14 @@ class _Search:
                 error = max(self._remaining(apart), self._unresolved())
                 self.estimates.append((error, now))
                 if error <= 0.5 * self.error:
-                    more = self._with_more_sweeps(settings)
+                    left, before = p.left(), left
+                    if settings.sweeps > MOST_SWEEPS and not is_balanced(left):
+                        return False, unreached(now.settings, left)
+                    more = self._with_more_sweeps(settings, left, before)
                     if more is None:
                         return True, ""
+                    if more.x is None:
+                        return False, f"a run failed: {more.failure}"
                     settings = more.settings
                     self.estimates.pop()  # more sweeps moved it: it was none
                     self.ladder[-2:] = [more]
@@ -226,12 +233,13 @@ class _Search:
         now, first = (p.lost(run, 0.5 * p.duration) for run in (last, self.ladder[0]))
         return 0.0 if now < WHOLE * first else now
 
-    def _with_more_sweeps(self, settings: Settings) -> Pilot | None:
+    def _with_more_sweeps(self, settings: Settings, left: float, before: float) -> Pilot | None:
         """The run before the last once more with twice the sweeps, if those move it by more than a quarter of the
-        error. With the sweeps of the ladder it might come close to a limit of its own."""
-        before = self.ladder[-2]
-        more = self.pilots.run(replace(settings, sweeps=2 * settings.sweeps + 1), before.steps)
-        if more.x is None or self._distance(before, more) <= 0.25 * self.error:
+        error: with the sweeps of the ladder it might come close to a limit of its own. Or if the last run left forces
+        over; then with plain sweeps where more of them with corrections have left as much."""
+        last = self.ladder[-2]
+        more = self.pilots.run(with_more_sweeps(settings, left, before), last.steps)
+        if is_balanced(left) and (more.x is None or self._distance(last, more) <= 0.25 * self.error):
             return None
         return more
 
