@@ -11,14 +11,13 @@ from torch import Tensor
 
 from ..checks import check_number, check_positive, check_time_step, fail
 from ..contact.barrier import PairBarrier
-from ..energies import Anchor
-from ..mesh import subdivide
 from ..model.model import Model
 from ..said import percent
 from ..step.arguments import check_state, prepare
 from ..step.held_up import cut_share
 from ..step.integrators import SAME_TIME_STEP, SDIRK2, ImplicitEuler, Integrator, check_integrator
 from .contact_check import unbalanced_friction
+from .halved import halved, of_parts
 from .pilots import FRAMES, Pilot, Pilots, Quantity, changes, converted, of_time, pilots_of, relative
 from .reference import MOST_SWEEPS, is_balanced, unreached, with_more_sweeps
 from .rollout import rollout
@@ -303,28 +302,17 @@ class _Budget:
 
 
 def _of_parts(value: Any, tets: int) -> Any:
-    """A value of each tet, or a function of time that returns one, for its eight parts."""
-    if of_time(value):
-        return lambda t: _of_parts(value(t), tets)
-    each = isinstance(value, Tensor) and value.dim() and value.shape[-1] == tets
-    return value.repeat_interleave(8, -1) if each else value
+    """A value of each tet, or a function of time that returns one, for its parts."""
+    return (lambda t: of_parts(value(t), tets)) if of_time(value) else of_parts(value, tets)
 
 
 def finer_mesh(p: Pilots) -> Pilots:
     """Pilot runs on the subdivided mesh, whose first vertices are those of the mesh."""
-    model, given = p.model, dict(p.given)
+    given = dict(p.given)
     for name in ("force", "prescribed", "rest_points", "parameters"):
         if given.get(name) is not None:
             fail(name, "None beside mesh=True, which has other vertices", type(given[name]).__name__)
-    if any(isinstance(e, Anchor) for e in model.energies):
-        fail("mesh", "False beside an Anchor, which holds single vertices", "True")
-    tets, pinned = model.tets.cpu(), model.pinned.cpu()
-    ends = torch.cat([tets[:, [i, j]] for i in range(4) for j in range(i)]).sort(1).values.unique(dim=0)
-    options = {"pinned": torch.cat([pinned, pinned[ends].all(1)]), "energies": model.energies,
-               "saturation": model.saturation, "regularization": model.regularization,
-               "colliders": model.colliders, "dtype": model.dtype, "device": model.device}  # fmt: skip
-    fine = Model(subdivide(model.mesh), density=model.density.cpu().repeat_interleave(8), **options)
-    x, v = (torch.cat([t, t[..., ends.to(t.device), :].mean(-2)], -2) for t in (p.x, p.v))
+    fine = halved(p.model)
     for name in ("mu", "lam", "young", "poisson", "density"):
-        given[name] = _of_parts(given.get(name), model.num_tets)
-    return replace(p, model=fine, x=x, v=v, given=given, quantity=None, wrt=None)
+        given[name] = _of_parts(given.get(name), p.model.num_tets)
+    return replace(p, model=fine.model, x=fine.between(p.x), v=fine.between(p.v), given=given, quantity=None, wrt=None)

@@ -8,6 +8,8 @@ from typing import Any
 
 import torch
 
+from ..energies import StableNeoHookean
+from ..model.model import Model
 from ..said import percent
 from ..step.balance import UNBALANCED, left_of_solve, share
 from .settings import Settings
@@ -33,6 +35,20 @@ def unbalanced(seen: list[Any]) -> float:
 def is_balanced(left: float) -> bool:
     """Whether the steps of a run leave so little over that others may be held against it."""
     return left <= UNBALANCED
+
+
+def takes_corrections(model: Model) -> bool:
+    """Whether coarse corrections and acceleration are defined."""
+    elastic = next((e for e in model.energies if isinstance(e, StableNeoHookean)), None)
+    return elastic is not None and elastic.block == "exact" and model.saturation is None
+
+
+def with_other_sweeps(model: Model) -> Model:
+    """With plain sweeps in place of corrections, or with corrections, where these are cheap, in place of plain sweeps."""
+    if model.coarse is None and (model.touches or not takes_corrections(model)):
+        return model
+    coarse = "auto" if model.coarse is None else None
+    return Settings(1.0, 1, coarse=coarse, acceleration=model.acceleration).applied(model)
 
 
 def with_more_sweeps(settings: Settings, left: float, before: float) -> Settings:

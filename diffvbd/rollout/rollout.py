@@ -140,7 +140,7 @@ def rollout(
         raise TypeError("duration: expected it beside settings only; without them give steps and time_step")
     if time_step is None or sweeps is None:
         raise TypeError(f"{'time_step' if time_step is None else 'sweeps'}: expected a number, or settings, got None")
-    if (factors := refinement()) is not None:  # inside dv.refine
+    if (finer := refinement()) is not None:  # inside dv.refine
         return rollout_finer(rollout, **locals())
     steps = check_count("steps", steps)
     save = _checked_save(save)
