@@ -26,11 +26,12 @@ class GradientCheck:
 
     Attributes:
         finer: From that of each finer run, by name.
-        differences: From central differences of 1 % and 10 % of the parameter, along the gradient; empty where it is 0.
+        differences: From central differences of 1 % and 10 % of the parameter, along the gradient, by that share;
+            without those that could not be had, as of a parameter that is 0, or where the loss raises ValueError.
     """
 
     finer: dict[str, float]
-    differences: tuple[float, ...]
+    differences: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class Refinement:
             out = list(finer)
         if self.mesh is not None and not self._keeps(self.mesh, self.both):
             out.append("mesh")
-        worst = max((max((*check.finer.values(), *check.differences)) for check in self.gradients), default=0.0)
+        worst = max((max((*check.finer.values(), *check.differences.values())) for check in self.gradients), default=0.0)
         return out if worst <= self.tolerance else [*out, "gradient"]
 
     def _keeps(self, finer: float, coarser: float) -> bool:
@@ -104,10 +105,9 @@ class Refinement:
         )
         text += "" if self.mesh is None else f", and eight tets for each {self.mesh:.3g}"
         for number, check in enumerate(self.gradients):
-            own = (f"{100 * s:g} %" for s in STEPS)
-            shares = check.finer | dict(zip(own, check.differences, strict=False))
-            off = ", ".join(f"{name} {percent(share)}" for name, share in shares.items())
-            text += f"; gradient[{number}] is off by: {off}" + ("" if check.differences else " (the parameter is 0)")
+            off = [f"{name} {percent(share)}" for name, share in check.finer.items()]
+            off += [f"a difference of {name} {percent(share)}" for name, share in check.differences.items()]
+            text += f"; gradient[{number}] is off from {', '.join(off)}"
         if self.survives:
             better = self.loss - min(self.more_sweeps, self.smaller_steps, self.both)
             if self.before is None or better <= self.tolerance * (self.before - self.loss):
@@ -237,10 +237,13 @@ class _Runs:
         scaled = unit * own
         largest = scaled.abs().max()
         way = scaled / largest if largest > 0 else torch.ones_like(scaled)  # at most one unit of each element
-        along, steepest, slopes = float((scaled * way).sum()), 0.0, []
+        along, steepest, slopes = float((scaled * way).sum()), 0.0, {}
         for step in STEPS if kept.any() else ():
-            ahead, behind = (self._moved(parameter, kept + sign * step * unit * way) for sign in (1, -1))
-            slopes.append((ahead - behind) / (2 * step))
+            try:
+                ahead, behind = (self._moved(parameter, kept + sign * step * unit * way) for sign in (1, -1))
+            except ValueError:  # beyond what the loss can have, as of Poisson's ratio near 0.5
+                continue
+            slopes[f"{100 * step:g} %"] = (ahead - behind) / (2 * step)
             steepest = max(steepest, abs(ahead - loss) / step, abs(loss - behind) / step)
 
         def share(off: float, size: float) -> float:
@@ -252,7 +255,7 @@ class _Runs:
                 better = unit * gradients[number]
                 off, size = float((better - scaled).norm()), float(better.norm())
                 finer[name] = share(off, max(size, steepest / float(way.norm())))
-        return GradientCheck(finer, tuple(share(abs(slope - along), steepest) for slope in slopes))
+        return GradientCheck(finer, {name: share(abs(slope - along), steepest) for name, slope in slopes.items()})
 
     def _moved(self, parameter: Tensor, value: Tensor) -> float:
         """The loss with another value of a parameter."""
