@@ -113,9 +113,9 @@ def error_budget(
 ) -> ErrorBudget:
     """Splits the error of a rollout by cause, by pilot runs that have less of one error at a time.
 
-    sweeps: the same steps with sweeps until more change nothing and their forces balance. time step: those against SDIRK2 with four times the
-    steps. precision: the same run in double precision. contact: the converged steps with more detections in each, where
-    pairs have held up motion.
+    sweeps: the same steps with sweeps until more change nothing and their forces balance. time step: those against
+    SDIRK2 with four times the steps. precision: the same run in double precision. contact: the converged steps with
+    more detections in each, where pairs have held up motion.
     mesh: the converged run on a mesh of eight tets for each. Look at the largest: nothing else is worth improving.
 
     Args:

@@ -28,7 +28,7 @@ def unbalanced(seen: list[Any]) -> float:
     if not seen:
         return 0.0
     found = [left_of_solve(model, (s.x, s.v), end, s.prepared, s.given) for model, s, end in seen]
-    left, whole = (sum(parts[1:], parts[0]) for parts in zip(*found, strict=True))
+    left, whole = (torch.stack(parts).sum(0) for parts in zip(*found, strict=True))
     return float(torch.nan_to_num(share(left, whole), nan=math.inf).max()) if left.numel() else 0.0
 
 
@@ -44,7 +44,7 @@ def takes_corrections(model: Model) -> bool:
 
 
 def with_other_sweeps(model: Model) -> Model:
-    """With plain sweeps in place of corrections, or with corrections, where these are cheap, in place of plain sweeps."""
+    """With plain sweeps in place of corrections, or with corrections, where they are cheap, in place of plain ones."""
     if model.coarse is None and (model.touches or not takes_corrections(model)):
         return model
     coarse = "auto" if model.coarse is None else None

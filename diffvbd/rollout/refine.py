@@ -17,12 +17,14 @@ from .reference import STALLED, is_balanced
 
 MOST = 16  # times the sweeps, until the forces of the finest run balance
 STEPS = (0.01, 0.1)  # of a parameter, of central differences
+HELPS = {"K": "more sweeps", "2 K": "more sweeps", "h": "smaller steps", "h/2": "smaller steps",
+         "mesh": "a finer mesh"}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class GradientCheck:
-    """How far the gradient with respect to a parameter is from what it should be, see :func:`refine`. Each is a share of
-    the gradient, or of the largest slope of the loss within a tenth of the parameter, if that is larger [-].
+    """How far the gradient with respect to a parameter is from what it should be, see :func:`refine`: shares of the
+    gradient, or of the largest slope of the loss within a tenth of the parameter, if that is larger [-].
 
     Attributes:
         finer: From that of each finer run, by name.
@@ -87,7 +89,9 @@ class Refinement:
             out = list(finer)
         if self.mesh is not None and not self._keeps(self.mesh, self.both):
             out.append("mesh")
-        worst = max((max((*check.finer.values(), *check.differences.values())) for check in self.gradients), default=0.0)
+        worst = max(
+            (max((*check.finer.values(), *check.differences.values())) for check in self.gradients), default=0.0
+        )
         return out if worst <= self.tolerance else [*out, "gradient"]
 
     def _keeps(self, finer: float, coarser: float) -> bool:
@@ -109,18 +113,32 @@ class Refinement:
             off += [f"a difference of {name} {percent(share)}" for name, share in check.differences.items()]
             text += f"; gradient[{number}] is off from {', '.join(off)}"
         if self.survives:
-            better = self.loss - min(self.more_sweeps, self.smaller_steps, self.both)
+            finer = (self.more_sweeps, self.smaller_steps, self.both, self.loss if self.mesh is None else self.mesh)
+            better = self.loss - min(finer)
             if self.before is None or better <= self.tolerance * (self.before - self.loss):
                 return text
             return f"{text}: what was gained is kept, but the settings are too coarse to say how much it is"
         if not math.isfinite(self.loss):
             return f"{text}: the loss itself is not finite"
-        helps = {"K": "more sweeps", "h": "smaller steps", "mesh": "a finer mesh"}
-        needed = [helps[name] for name in self._unstable if name in helps]
+        needed = [what for what in dict.fromkeys(HELPS.values()) if what in self._helps]
         if not is_balanced(self.left):
-            text += f": no reference could be reached, {self.sweeps} K leave {percent(self.left)} of the forces unbalanced"
-            needed = needed or [helps["K"]]
-        return f"{text}: optimise on with {' and '.join(needed)}" if needed else f"{text}: do not trust its gradient"
+            text += (
+                f": no reference could be reached, {self.sweeps} K leave {percent(self.left)} of the forces unbalanced"
+            )
+            needed = needed or [HELPS["K"]]
+        return (
+            f"{text}: optimise on with {' and '.join(needed)}"
+            if needed
+            else f"{text}: the loss has kinks or jumps here"
+        )
+
+    @property
+    def _helps(self) -> set[str]:
+        """What changes the loss, or its gradient; of the latter the mesh only where the finest run on the mesh of the
+        loss does not."""
+        off = {name for check in self.gradients for name, share in check.finer.items() if not share <= self.tolerance}
+        off -= {"mesh"} if "both" in off else set()
+        return {HELPS[name] for name in {*self._unstable, *off} if name in HELPS}
 
 
 def refine(
@@ -131,8 +149,8 @@ def refine(
     gradient: Tensor | Sequence[Tensor] | None = None,
     mesh: bool = False,
 ) -> Refinement:
-    """Evaluates an optimised result once more with twice the sweeps and half the time step, and if asked on a finer mesh
-    and with its gradient.
+    """Evaluates an optimised result once more with twice the sweeps and half the time step, and if asked on a finer
+    mesh and with its gradient.
 
     An optimiser may find what only coarse settings reward. Such a result loses what it gained when its motion is
     simulated better: do not trust it, and optimise with smaller steps, more sweeps or smaller tets.
