@@ -23,6 +23,7 @@ from .reference import MOST_SWEEPS, is_balanced, unreached, with_more_sweeps
 from .rollout import rollout
 from .search import start_of
 from .settings import Settings, aligned
+from .trajectory import StepAverage
 
 FINER = 4  # times the steps of the finest run
 ENOUGH = 0.1  # of what more sweeps have changed so far: below it they have converged
@@ -303,6 +304,8 @@ class _Budget:
 
 def _of_parts(value: Any, tets: int) -> Any:
     """A value of each tet, or a function of time that returns one, for its parts."""
+    if isinstance(value, StepAverage):
+        return value.then(lambda found: of_parts(found, tets))
     return (lambda t: of_parts(value(t), tets)) if of_time(value) else of_parts(value, tets)
 
 

@@ -14,7 +14,7 @@ from ..scopes import Finer, record_to, refined
 from ..step.integrators import History, is_step_of
 from .halved import halved, on_halved
 from .reference import unbalanced, with_other_sweeps
-from .trajectory import PerStep, Trajectory, stacked
+from .trajectory import PerStep, StepAverage, Trajectory, stacked
 
 # given at the steps of the caller and held over the smaller ones; `prescribed` and `colliders` move in between
 _HELD = ("mu", "lam", "young", "poisson", "force", "gravity", "rest_points", "density")
@@ -95,6 +95,8 @@ def _kept(value: Callable[[int, Tensor, Tensor], Any], parts: int) -> Callable[[
 def _held(value: Any, parts: int) -> Any:
     if isinstance(value, PerStep):
         return PerStep(value.values.repeat_interleave(parts, 0))
+    if isinstance(value, StepAverage):  # over the smaller steps
+        return value
     return _kept(value, parts) if callable(value) and not isinstance(value, Tensor) else value
 
 

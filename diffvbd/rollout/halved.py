@@ -13,7 +13,7 @@ from ..energies import Anchor
 from ..mesh import subdivide
 from ..model.model import Model
 from ..model.replaced import replaced_arguments
-from .trajectory import PerStep
+from .trajectory import PerStep, StepAverage
 
 TETS = 8  # of each
 
@@ -61,6 +61,8 @@ def on_halved(given: dict[str, Any], fine: Halved) -> dict[str, Any]:
         value = given[name]
         if isinstance(value, PerStep):  # [steps] is a number for each
             return value if value.values.dim() == 1 else PerStep(change(value.values))
+        if isinstance(value, StepAverage):
+            return value.then(change)
         if callable(value) and not isinstance(value, Tensor):
             return lambda k, x, v: change(value(k, x[..., :count, :], v[..., :count, :]))
         return change(value)

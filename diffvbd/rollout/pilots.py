@@ -24,7 +24,7 @@ from .between import SWINGS, unseen
 from .energy_check import mechanical_energy
 from .reference import unbalanced
 from .settings import Settings
-from .trajectory import PerStep, Trajectory
+from .trajectory import PerStep, StepAverage, Trajectory, refuse_average
 
 SHORTEST = 1e-3  # of the duration: the step that is taken to see whether arguments are good
 FRAMES = 4  # at which two runs are compared, equally spaced over the duration
@@ -81,6 +81,8 @@ class Pilots:
         parameters = self.given.get("parameters")
         named = {f'parameters["{k}"]': v for k, v in parameters.items()} if isinstance(parameters, dict) else {}
         for name, value in {**self.given, **named}.items():
+            if name in MOVING:
+                refuse_average(name, value)
             if isinstance(value, PerStep):
                 fail(name, "a value or a function of the time [s], since time steps vary", "per_step")
             if of_time(value) and not _takes(value, 1):
@@ -162,14 +164,13 @@ class Pilots:
                 v = torch.where(model.pinned[:, None], v, v + leaves[0])
         given = self.at_steps(given, settings.time_step, steps, began)
         self._solves = []
-        with torch.set_grad_enabled(differentiate):
-            with record_to(self._solves, "solve"):
-                out = self.execute(
-                    model, x, v, steps=steps, time_step=settings.time_step, sweeps=settings.sweeps,
-                    integrator=settings.integrator, adjoint=ReverseSweep(settings.tape),
-                    checkpoint_every=settings.checkpoint_every, save=max(1, steps // frames), check_contact=False,
-                    check_energy=False, check_start=False, **given,
-                )  # fmt: skip
+        with torch.set_grad_enabled(differentiate), record_to(self._solves, "solve"):
+            out = self.execute(
+                model, x, v, steps=steps, time_step=settings.time_step, sweeps=settings.sweeps,
+                integrator=settings.integrator, adjoint=ReverseSweep(settings.tape),
+                checkpoint_every=settings.checkpoint_every, save=max(1, steps // frames), check_contact=False,
+                check_energy=False, check_start=False, **given,
+            )  # fmt: skip
             value = None if self.quantity is None else self.quantity(out.x[-1], out.v[-1])
             gradient = torch.autograd.grad(value, leaves) if leaves else ()  # type: ignore[arg-type]
         return out, None if value is None else value.detach(), gradient
@@ -191,6 +192,8 @@ class Pilots:
         """Functions of time as the rollout takes them."""
 
         def timed(function: Callable[[float], Any], share: float) -> Callable[[int, Tensor, Tensor], Any]:
+            if isinstance(function, StepAverage):
+                return function.over(h, began)
             return lambda step, x, v: function(began + (step + share) * h)
 
         out = {name: value for name, value in given.items() if value is not None}
@@ -225,10 +228,7 @@ class Pilots:
 
     def left(self) -> float:
         """The force that the last run left over, over its forces [-]."""
-        clock = time.perf_counter()
-        out = unbalanced(self._solves)
-        self.spent += time.perf_counter() - clock
-        return out
+        return unbalanced(self._solves)
 
     # --- comparing ----------------------------------------------------------------------------------------------------
 
@@ -379,6 +379,8 @@ def converted(value: Any, **to: Any) -> Any:
         return value.to(**{name: kind for name, kind in to.items() if floats or name != "dtype"})
     if isinstance(value, dict):
         return {name: converted(part, **to) for name, part in value.items()}
+    if isinstance(value, StepAverage):
+        return value.then(lambda found: converted(found, **to))
     if not callable(value):
         return value
 
