@@ -52,13 +52,13 @@ def with_other_sweeps(model: Model) -> Model:
 
 
 def with_more_sweeps(settings: Settings, left: float, before: float) -> Settings:
-    """Those of the next attempt: twice the sweeps, and plain ones where more with corrections have not helped.
+    """Those of the next attempt: twice the sweeps, or plain ones where more with corrections have not helped.
 
     left, before: unbalanced() of the last two runs.
     """
-    stalls = not is_balanced(left) and left > STALLED * before
-    plain = {"coarse": None, "relaxation": 1.0} if stalls and settings.coarse is not None else {}
-    return replace(settings, sweeps=2 * settings.sweeps + 1, **plain)
+    if settings.coarse is not None and not is_balanced(left) and left > STALLED * before:
+        return replace(settings, coarse=None, relaxation=1.0)
+    return replace(settings, sweeps=2 * settings.sweeps + 1)
 
 
 def unreached(settings: Settings, left: float) -> str:
