@@ -104,8 +104,7 @@ def _moving(value: Any, parts: int, model: Model) -> Any:
     """Where pinned vertices are at the end of each smaller step."""
     if value is None:
         return None
-    asked = callable(value) and not isinstance(value, (Tensor, PerStep))
-    ends = _kept(value, parts) if asked else None
+    ends = _kept(value, parts) if callable(value) and not isinstance(value, (Tensor, PerStep)) else None
     begun = _kept(lambda step, x, v: x, parts)
     pinned = model.pinned[:, None]
 

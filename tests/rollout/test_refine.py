@@ -255,7 +255,7 @@ def test_the_finer_mesh_is_that_of_a_subdivided_model() -> None:
     assert torch.allclose(got.x, want.x[::2, : len(x)], rtol=0, atol=tolerance("forward"))
 
 
-def pushed(shape: Callable[[Tensor], Tensor], start: float, mask: float = 1.0) -> Any:
+def pushed(shape: Callable[[Tensor], Tensor], start: float) -> Any:
     """A loss of a parameter that a cube is pushed by, and the parameter."""
     model = dv.Model(dv.mesh.cube(2, size=0.1))
     x, p = model.rest_points, torch.tensor([start], dtype=torch.float64, requires_grad=True)

@@ -117,7 +117,8 @@ def test_who_chooses_steps_takes_the_mean_over_them() -> None:
         asked.add(round(t, 9))
         return torch.full_like(x, 0.01)
 
-    force, given = dv.step_average(push, samples=2), {"mu": 1e5, "lam": 1e5}
+    force = dv.step_average(push, samples=2)
+    given: dict[str, Any] = {"mu": 1e5, "lam": 1e5}
     loss = lambda: dv.rollout(model, x, 0 * x, steps=2, time_step=0.04, sweeps=9, force=force, **given).x[-1].sum()  # noqa: E731
     constant = dv.rollout(model, x, 0 * x, steps=2, time_step=0.04, sweeps=9, force=push(0.01), **given).x[-1].sum()
     assert float(loss()) == pytest.approx(float(constant), rel=tolerance("sum"))
