@@ -30,7 +30,7 @@ from .rollout.converge import Solution, solve
 from .rollout.refine import Refinement, refine
 from .rollout.rollout import rollout
 from .rollout.settings import Candidate, Prediction, Settings
-from .rollout.trajectory import Trajectory, per_step
+from .rollout.trajectory import Trajectory, per_step, step_average
 from .step.estimate import ErrorEstimate
 from .step.integrators import BDF2, SDIRK2, History, ImplicitEuler
 from .step.manual import Tape, step_backward, step_forward
@@ -89,6 +89,7 @@ __all__ = [
     "solve",
     "solvers",
     "step",
+    "step_average",
     "step_backward",
     "step_forward",
     "stress",

@@ -10,7 +10,7 @@ import contextlib
 import threading
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,7 +19,19 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 _checking: ContextVar[bool] = ContextVar("diffvbd.debug_checks", default=False)
 _recording: ContextVar[tuple[tuple[str, list[Any]], ...]] = ContextVar("diffvbd.record", default=())
-_refining: ContextVar[tuple[int, int, list[int]] | None] = ContextVar("diffvbd.refine", default=None)
+
+
+class Finer(NamedTuple):
+    """How rollouts run inside dv.refine."""
+
+    steps: int  # times as many, of a time step so much shorter
+    sweeps: int  # times as many
+    ran: list[tuple[int, float]]  # of each rollout: its steps before that, and the share of forces left over
+    others: bool = False  # plain sweeps in place of coarse corrections, or the other way round
+    mesh: bool = False  # of eight tets for each
+
+
+_refining: ContextVar[Finer | None] = ContextVar("diffvbd.refine", default=None)
 _lock = threading.Lock()
 _checked_by = 0  # threads and tasks inside debug_checks()
 _any_checking = False
@@ -83,8 +95,8 @@ def recorders(kind: str = "contact") -> tuple[list[Any], ...]:
     return tuple(found for of, found in given if of == kind)
 
 
-def refinement() -> tuple[int, int, list[int]] | None:
-    """Inside dv.refine: the factors of steps and of sweeps, and a list of what rollouts ran. It compiles nothing."""
+def refinement() -> Finer | None:
+    """Inside dv.refine: how rollouts run. It compiles nothing."""
     return None if torch.compiler.is_compiling() else _refining.get()
 
 
@@ -132,9 +144,9 @@ def record_to(found: list[Any], kind: str = "contact") -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def refined(factors: tuple[int, int, list[int]] | None) -> Iterator[None]:
-    """Inside, refinement() is ``factors``; None: a refined rollout runs as it stands."""
-    token = _refining.set(factors)
+def refined(finer: Finer | None) -> Iterator[None]:
+    """Inside, refinement() is ``finer``; None: a refined rollout runs as it stands."""
+    token = _refining.set(finer)
     try:
         yield
     finally:

@@ -19,6 +19,7 @@ from ..said import percent
 from ..said import warn as say
 from ..step.arguments import GRAVITY, acceleration_of, check_prescribed, check_state, prepare, refuse_non_finite
 from ..step.balance import (
+    UNBALANCED,
     UNBALANCED_FRICTION,
     Norm,
     contact_of_step,
@@ -39,7 +40,6 @@ SATURATION_TOO_LARGE = 1.0  # c over the mean edge: one update may then turn a t
 SATURATION_TOO_SMALL = 0.01  # c over the mean edge: 20 sweeps no longer reach a large deformation
 RESOLUTION = 1e-5  # rounding of a position over the shortest edge; a gradient's error is 6 to 22 times that
 LARGE_STRAIN = 100.0  # Green strain; a gradient keeps 11 digits there and loses them with a power of the strain
-UNBALANCED = 0.01  # left-over force over the forces of the step; at 0.014 a hanging bar rests 1.5 to 11 % off
 INACCURATE = 0.01  # estimated error of a body over its motion in the step
 NEGLIGIBLE = 1e-5  # error over the mean edge, below which it is none: a body at rest has motions as small as its errors
 

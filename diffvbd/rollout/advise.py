@@ -54,8 +54,9 @@ def advise(
         patience: How long pilots may run [s]; the search ends with the one that exceeds it.
         given: mu and lam or young and poisson, force, gravity, prescribed, colliders, rest_points, density, parameters,
             as in rollout, constant or a function of the time [s], of parameters each of them: loads at the middle of
-            each step, all else at its end. What swings within steps has these made shorter; a single push that is
-            shorter than they are may go unseen.
+            each step, all else at its end, and what is marked by :func:`diffvbd.step_average` over all of it. What
+            swings within steps has these made shorter; a single push that is shorter than they are may go unseen
+            unless it is averaged.
 
     Returns:
         Settings with a :class:`diffvbd.Prediction`.

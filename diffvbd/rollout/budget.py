@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,21 +11,21 @@ from torch import Tensor
 
 from ..checks import check_number, check_positive, check_time_step, fail
 from ..contact.barrier import PairBarrier
-from ..energies import Anchor
-from ..mesh import subdivide
 from ..model.model import Model
 from ..said import percent
 from ..step.arguments import check_state, prepare
 from ..step.held_up import cut_share
 from ..step.integrators import SAME_TIME_STEP, SDIRK2, ImplicitEuler, Integrator, check_integrator
 from .contact_check import unbalanced_friction
+from .halved import halved, of_parts
 from .pilots import FRAMES, Pilot, Pilots, Quantity, changes, converted, of_time, pilots_of, relative
+from .reference import MOST_SWEEPS, is_balanced, unreached, with_more_sweeps
 from .rollout import rollout
 from .search import start_of
 from .settings import Settings, aligned
+from .trajectory import StepAverage
 
 FINER = 4  # times the steps of the finest run
-MOST_SWEEPS = 1300
 ENOUGH = 0.1  # of what more sweeps have changed so far: below it they have converged
 DETECTIONS = 8  # in each step of the run that is held up least
 
@@ -60,6 +61,8 @@ class ErrorBudget:
         duration: Of the motion that was looked at [s].
         cut: The largest share of vertices that pairs held up in a step [-]; None without pairs.
         friction: The share of the friction that the last step left unbalanced [-]; None without friction.
+        reached: Whether all runs that others are compared with have steps that balance their forces, to 1 %. Where one
+            has not, its note says so, and what is compared with it says little.
     """
 
     settings: Settings
@@ -67,6 +70,7 @@ class ErrorBudget:
     duration: float
     cut: float | None
     friction: float | None
+    reached: bool = True
 
     @property
     def largest(self) -> Share:
@@ -110,9 +114,9 @@ def error_budget(
 ) -> ErrorBudget:
     """Splits the error of a rollout by cause, by pilot runs that have less of one error at a time.
 
-    sweeps: the same steps with sweeps until more change nothing. time step: those against SDIRK2 with four times the
-    steps. precision: the same run in double precision. contact: the converged steps with more detections in each, where
-    pairs have held up motion.
+    sweeps: the same steps with sweeps until more change nothing and their forces balance. time step: those against
+    SDIRK2 with four times the steps. precision: the same run in double precision. contact: the converged steps with
+    more detections in each, where pairs have held up motion.
     mesh: the converged run on a mesh of eight tets for each. Look at the largest: nothing else is worth improving.
 
     Args:
@@ -148,10 +152,11 @@ class _Budget:
     def __init__(self, pilots: Pilots, own: Settings, steps: int) -> None:
         self.pilots, self.own, self.steps = pilots, own, steps
         self.shares: list[Share] = []
+        self.failed: dict[str, str] = {}  # by cause: why its reference is none
 
     def run(self, mesh: bool) -> ErrorBudget:
         p = self.pilots
-        run = self._run(self.own, self.steps)
+        run = self._run(p, self.own, self.steps)
         cut, friction = self._contact_of()
         self._precision(run)
         converged = self._sweeps(run)
@@ -161,13 +166,28 @@ class _Budget:
             self._mesh(converged)
         shares = sorted(self.shares, key=lambda s: -s.motion)
         whole = self._share("all but mesh", run, best, 0.0, f"{best.settings}")
-        return ErrorBudget(self.own, (*shares, whole), p.duration, cut, friction)
+        return ErrorBudget(self.own, (*shares, whole), p.duration, cut, friction, not self.failed)
 
-    def _run(self, settings: Settings, steps: int) -> Pilot:
-        done = self.pilots.run(settings, steps)
+    @staticmethod
+    def _run(pilots: Pilots, settings: Settings, steps: int) -> Pilot:
+        done = pilots.run(settings, steps)
         if done.x is None:
             raise RuntimeError(f"error_budget: expected a rollout that runs to its end; {done.failure}")
         return done
+
+    def _settled(self, pilots: Pilots, settings: Settings, steps: int, cause: str) -> tuple[Pilot, str]:
+        """A run with sweeps until its steps balance their forces, and a note: its settings, or why that failed."""
+        left, before = math.inf, math.inf
+        while True:
+            done = self._run(pilots, settings, steps)
+            left, before = pilots.left(), left
+            if is_balanced(left):
+                self.failed.pop(cause, None)
+                return done, f"{done.settings}"
+            if settings.sweeps > MOST_SWEEPS:
+                self.failed[cause] = unreached(done.settings, left)
+                return done, self.failed[cause]
+            settings = with_more_sweeps(settings, left, before)
 
     def _share(self, cause: str, a: Pilot, b: Pilot, seconds: float, note: str) -> Share:
         assert a.x is not None and b.x is not None
@@ -176,12 +196,11 @@ class _Budget:
         motion = self.pilots.apart(a.x, b.x)
         return Share(cause, motion, quantity, max(gradients) if gradients else None, seconds, note)
 
-    def _other(self, pilots: Pilots, settings: Settings) -> tuple[Pilot, float]:
-        """A rollout by other pilot runs, and the time it took [s]."""
-        before = pilots.spent
-        done = _Budget(pilots, settings, self.steps)._run(settings, self.steps)
-        self.pilots.spent, self.pilots.runs = pilots.spent, pilots.runs
-        return done, pilots.spent - before
+    def _counted(self, others: Pilots) -> float:
+        """Adds what other pilot runs, which began as copies of these, have taken, and returns it [s]."""
+        seconds = others.spent - self.pilots.spent
+        self.pilots.spent, self.pilots.runs = others.spent, others.runs
+        return seconds
 
     def _precision(self, run: Pilot) -> None:
         p = self.pilots
@@ -192,7 +211,8 @@ class _Budget:
         quantity = None if own is None else lambda x, v: own(x.to(p.model.dtype), v.to(p.model.dtype))
         double = replace(p, model=p.model.to(dtype=torch.float64), x=p.x.double(), v=p.v.double(), given=given,
                          quantity=quantity)  # fmt: skip
-        done, seconds = self._other(double, self.own)
+        done = self._run(double, self.own, self.steps)
+        seconds = self._counted(double)
         assert run.x is not None
         single = replace(run, x=run.x.double(), gradient=tuple(g.double() for g in run.gradient),
                          quantity=None if run.quantity is None else run.quantity.double())  # fmt: skip
@@ -206,8 +226,9 @@ class _Budget:
         if cut > 0:
             energies = [replace(e, detections=DETECTIONS) if isinstance(e, PairBarrier) else e for e in model.energies]
             others = replace(self.pilots, model=model.replace(energies=energies))
-            done, seconds = self._other(others, converged.settings)
-            note = f"{done.settings}, detections={DETECTIONS}"
+            done, note = self._settled(others, converged.settings, self.steps, "contact")
+            seconds = self._counted(others)
+            note += f", detections={DETECTIONS}"
         self.shares.append(self._share("contact", converged, done, seconds, note))
 
     def _contact_of(self) -> tuple[float | None, float | None]:
@@ -242,16 +263,17 @@ class _Budget:
         """The same steps with sweeps enough that more change little."""
         began = self.pilots.spent
         settings = replace(start_of(self.pilots), integrator=self.own.integrator)
-        settings = replace(settings, sweeps=max(17, 2 * self.own.sweeps))
-        now = self._run(settings, self.steps)
+        now, note = self._settled(self.pilots, replace(settings, sweeps=max(17, 2 * self.own.sweeps)), self.steps,
+                                  "sweeps")  # fmt: skip
         while True:
-            settings = replace(settings, sweeps=2 * settings.sweeps + 1)
-            before, now = now, self._run(settings, self.steps)
+            settings = replace(now.settings, sweeps=2 * now.settings.sweeps + 1)
+            before, (now, note) = now, self._settled(self.pilots, settings, self.steps, "sweeps")
             assert before.x is not None and now.x is not None and run.x is not None
             left = self.pilots.apart(before.x, now.x)
-            if left <= ENOUGH * self.pilots.apart(run.x, now.x) or left < 1e-9 or settings.sweeps > MOST_SWEEPS:
+            moves = left > max(ENOUGH * self.pilots.apart(run.x, now.x), 1e-9)
+            if not moves or now.settings.sweeps > MOST_SWEEPS:
                 break
-        note = f"{now.settings}" + ("" if settings.sweeps <= MOST_SWEEPS else f", which still move it by {left:.1e}")
+        note += f", which still move it by {left:.1e}" if moves else ""
         self.shares.append(self._share("sweeps", run, now, self.pilots.spent - began, note))
         return now
 
@@ -259,10 +281,9 @@ class _Budget:
         """SDIRK2 with more steps; their sweeps are as many as converge here."""
         began = self.pilots.spent
         settings = replace(converged.settings, integrator=SDIRK2())
-        fine = self._run(settings, FINER * self.steps)
+        fine, note = self._settled(self.pilots, settings, FINER * self.steps, "time step")
         share = self._share("time step", converged, fine, 0.0, "")
-        note = f"SDIRK2, h = {fine.settings.time_step:.3g} s"
-        half = self._run(settings, FINER // 2 * self.steps)
+        half = self._run(self.pilots, fine.settings, FINER // 2 * self.steps)
         assert half.x is not None and fine.x is not None
         left = self.pilots.apart(half.x, fine.x)
         note += f", itself off by some {left:.0e}" if left > 0.3 * share.motion else ""
@@ -274,38 +295,27 @@ class _Budget:
     def _mesh(self, converged: Pilot) -> None:
         p, vertices = self.pilots, self.pilots.model.num_vertices
         finer = finer_mesh(p)
-        before = finer.spent
-        fine = _Budget(finer, self.own, self.steps)._run(converged.settings, self.steps)
-        p.spent, p.runs = finer.spent, finer.runs
+        fine, note = self._settled(finer, converged.settings, self.steps, "mesh")
         assert fine.x is not None
         cut = replace(fine, x=fine.x[..., :vertices, :], gradient=(), quantity=None)
-        note = f"{finer.model.num_tets} tets"
-        self.shares.append(self._share("mesh", replace(converged, gradient=()), cut, finer.spent - before, note))
+        note = f"{finer.model.num_tets} tets, {note}"
+        self.shares.append(self._share("mesh", replace(converged, gradient=()), cut, self._counted(finer), note))
 
 
 def _of_parts(value: Any, tets: int) -> Any:
-    """A value of each tet, or a function of time that returns one, for its eight parts."""
-    if of_time(value):
-        return lambda t: _of_parts(value(t), tets)
-    each = isinstance(value, Tensor) and value.dim() and value.shape[-1] == tets
-    return value.repeat_interleave(8, -1) if each else value
+    """A value of each tet, or a function of time that returns one, for its parts."""
+    if isinstance(value, StepAverage):
+        return value.then(lambda found: of_parts(found, tets))
+    return (lambda t: of_parts(value(t), tets)) if of_time(value) else of_parts(value, tets)
 
 
 def finer_mesh(p: Pilots) -> Pilots:
     """Pilot runs on the subdivided mesh, whose first vertices are those of the mesh."""
-    model, given = p.model, dict(p.given)
+    given = dict(p.given)
     for name in ("force", "prescribed", "rest_points", "parameters"):
         if given.get(name) is not None:
             fail(name, "None beside mesh=True, which has other vertices", type(given[name]).__name__)
-    if any(isinstance(e, Anchor) for e in model.energies):
-        fail("mesh", "False beside an Anchor, which holds single vertices", "True")
-    tets, pinned = model.tets.cpu(), model.pinned.cpu()
-    ends = torch.cat([tets[:, [i, j]] for i in range(4) for j in range(i)]).sort(1).values.unique(dim=0)
-    options = {"pinned": torch.cat([pinned, pinned[ends].all(1)]), "energies": model.energies,
-               "saturation": model.saturation, "regularization": model.regularization,
-               "colliders": model.colliders, "dtype": model.dtype, "device": model.device}  # fmt: skip
-    fine = Model(subdivide(model.mesh), density=model.density.cpu().repeat_interleave(8), **options)
-    x, v = (torch.cat([t, t[..., ends.to(t.device), :].mean(-2)], -2) for t in (p.x, p.v))
+    fine = halved(p.model)
     for name in ("mu", "lam", "young", "poisson", "density"):
-        given[name] = _of_parts(given.get(name), model.num_tets)
-    return replace(p, model=fine, x=x, v=v, given=given, quantity=None, wrt=None)
+        given[name] = _of_parts(given.get(name), p.model.num_tets)
+    return replace(p, model=fine.model, x=fine.between(p.x), v=fine.between(p.v), given=given, quantity=None, wrt=None)

@@ -229,6 +229,8 @@ class _Sweeping:
     @property
     def remedy(self) -> str:
         """What else may help where the sweeps do not converge."""
+        if self.where is None and self.model.coarse is not None:
+            return "plain sweeps (a Model with coarse=None), in case the corrections stall"
         if self.where is None:
             return "with the exact block a relaxation between 1.5 and 1.7"
         outcome = outcomes.get(self.model)

@@ -18,12 +18,13 @@ from ..adjoint.routes import ReverseSweep
 from ..checks import check_positive, fail
 from ..model.model import Model
 from ..model.warnings import silent
-from ..scopes import refined, refuse_transforms
+from ..scopes import record_to, refined, refuse_transforms
 from ..step.arguments import GRAVITY, Prepared, prepare
 from .between import SWINGS, unseen
 from .energy_check import mechanical_energy
+from .reference import unbalanced
 from .settings import Settings
-from .trajectory import PerStep, Trajectory
+from .trajectory import PerStep, StepAverage, Trajectory, refuse_average
 
 SHORTEST = 1e-3  # of the duration: the step that is taken to see whether arguments are good
 FRAMES = 4  # at which two runs are compared, equally spaced over the duration
@@ -70,6 +71,7 @@ class Pilots:
     spent: float = 0.0  # [s]
     runs: int = 0
     _ready: set[str] = field(default_factory=set)
+    _solves: list[Any] = field(default_factory=list)  # of the last run
 
     def __post_init__(self) -> None:
         self.duration = check_positive("duration", self.duration, "s")
@@ -79,6 +81,8 @@ class Pilots:
         parameters = self.given.get("parameters")
         named = {f'parameters["{k}"]': v for k, v in parameters.items()} if isinstance(parameters, dict) else {}
         for name, value in {**self.given, **named}.items():
+            if name in MOVING:
+                refuse_average(name, value)
             if isinstance(value, PerStep):
                 fail(name, "a value or a function of the time [s], since time steps vary", "per_step")
             if of_time(value) and not _takes(value, 1):
@@ -159,7 +163,8 @@ class Pilots:
             with torch.enable_grad():
                 v = torch.where(model.pinned[:, None], v, v + leaves[0])
         given = self.at_steps(given, settings.time_step, steps, began)
-        with torch.set_grad_enabled(differentiate):
+        self._solves = []
+        with torch.set_grad_enabled(differentiate), record_to(self._solves, "solve"):
             out = self.execute(
                 model, x, v, steps=steps, time_step=settings.time_step, sweeps=settings.sweeps,
                 integrator=settings.integrator, adjoint=ReverseSweep(settings.tape),
@@ -187,6 +192,8 @@ class Pilots:
         """Functions of time as the rollout takes them."""
 
         def timed(function: Callable[[float], Any], share: float) -> Callable[[int, Tensor, Tensor], Any]:
+            if isinstance(function, StepAverage):
+                return function.over(h, began)
             return lambda step, x, v: function(began + (step + share) * h)
 
         out = {name: value for name, value in given.items() if value is not None}
@@ -218,6 +225,10 @@ class Pilots:
             if apart > SWINGS:
                 return name
         return ""
+
+    def left(self) -> float:
+        """The force that the last run left over, over its forces [-]."""
+        return unbalanced(self._solves)
 
     # --- comparing ----------------------------------------------------------------------------------------------------
 
@@ -368,6 +379,8 @@ def converted(value: Any, **to: Any) -> Any:
         return value.to(**{name: kind for name, kind in to.items() if floats or name != "dtype"})
     if isinstance(value, dict):
         return {name: converted(part, **to) for name, part in value.items()}
+    if isinstance(value, StepAverage):
+        return value.then(lambda found: converted(found, **to))
     if not callable(value):
         return value
 

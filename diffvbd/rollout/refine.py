@@ -1,16 +1,39 @@
-"""Whether what an optimisation found holds with smaller steps and more sweeps."""
+"""Whether what an optimisation found holds with smaller steps, more sweeps and a finer mesh, and so its gradient."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..checks import check_positive, fail, to_float
-from ..scopes import refined
+from ..said import percent
+from ..scopes import Finer, refined
+from .reference import STALLED, is_balanced
+
+MOST = 16  # times the sweeps, until the forces of the finest run balance
+STEPS = (0.01, 0.1)  # of a parameter, of central differences
+HELPS = {"K": "more sweeps", "2 K": "more sweeps", "h": "smaller steps", "h/2": "smaller steps",
+         "mesh": "a finer mesh"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class GradientCheck:
+    """How far the gradient with respect to a parameter is from what it should be, see :func:`refine`: shares of the
+    gradient, or of the largest slope of the loss within a tenth of the parameter, if that is larger [-].
+
+    Attributes:
+        finer: From that of each finer run, by name.
+        differences: From central differences of 1 % and 10 % of the parameter, along the gradient, by that share;
+            without those that could not be had, as of a parameter that is 0, or where the loss raises ValueError.
+    """
+
+    finer: dict[str, float]
+    differences: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -21,10 +44,14 @@ class Refinement:
         loss: With the settings that the loss has.
         more_sweeps: With twice the sweeps.
         smaller_steps: With half the time step.
-        both: With both.
+        both: With both, and with up to 16 times the sweeps until the forces of its steps balance.
         before: The loss where the optimisation began, or None.
-        tolerance: The share of the gain, or without ``before`` of the loss, that may be lost.
-        survives: Whether none of the three loses more.
+        tolerance: The share of the gain, or without ``before`` of the loss, that may be lost; and of a gradient.
+        mesh: As both, on the mesh of eight tets for each; None where that was not asked for.
+        gradients: A check for each parameter of ``gradient``.
+        left: Share of the forces that the steps of ``both`` and ``mesh`` left over [-].
+        sweeps: How many times the sweeps they took.
+        survives: Whether none of the finer ones loses more, the forces of their steps balance, and the gradients hold.
     """
 
     loss: float
@@ -33,48 +60,107 @@ class Refinement:
     both: float
     before: float | None
     tolerance: float
+    mesh: float | None = None
+    gradients: tuple[GradientCheck, ...] = ()
+    left: float = 0.0
+    sweeps: int = 2
 
     @property
     def survives(self) -> bool:
-        return all(map(self._keeps, (self.more_sweeps, self.smaller_steps, self.both)))
+        return not self._unstable and is_balanced(self.left)
 
-    def _keeps(self, finer: float) -> bool:
+    @property
+    def tested(self) -> str:
+        """What was tested, and what came of it: "K, h: stable; gradient, mesh: not tested"."""
+        tests = ["K", "h"] + ["mesh"] * (self.mesh is not None) + ["gradient"] * bool(self.gradients)
+        unstable = self._unstable
+        found = {
+            "stable": [name for name in tests if name not in unstable],
+            "not stable": unstable,
+            "not tested": [name for name in ("mesh", "gradient") if name not in tests],
+        }
+        return "; ".join(f"{', '.join(names)}: {what}" for what, names in found.items() if names)
+
+    @property
+    def _unstable(self) -> list[str]:
+        finer = {"K": self.more_sweeps, "h": self.smaller_steps}
+        out = [name for name, value in finer.items() if not self._keeps(value, self.loss)]
+        if not out and not self._keeps(self.both, self.loss):
+            out = list(finer)
+        if self.mesh is not None and not self._keeps(self.mesh, self.both):
+            out.append("mesh")
+        worst = max(
+            (max((*check.finer.values(), *check.differences.values())) for check in self.gradients), default=0.0
+        )
+        return out if worst <= self.tolerance else [*out, "gradient"]
+
+    def _keeps(self, finer: float, coarser: float) -> bool:
         """Whether a loss with finer settings has lost no more than may be."""
         scale = abs(self.loss) if self.before is None else self.before - self.loss
-        lost = finer - self.loss if self.before is not None else abs(finer - self.loss)
+        lost = finer - coarser if self.before is not None else abs(finer - coarser)
         return math.isfinite(lost) and lost <= self.tolerance * scale
 
     def __str__(self) -> str:
         began = "" if self.before is None else f" (it began at {self.before:.3g})"
+        both = "both" if self.sweeps == 2 else f"h/2 and {self.sweeps} K"
         text = (
-            f"{'survives' if self.survives else 'does not survive'} refinement: loss {self.loss:.3g}{began}; with 2 K "
-            f"{self.more_sweeps:.3g}, with h/2 {self.smaller_steps:.3g}, with both {self.both:.3g}"
+            f"{'survives' if self.survives else 'does not survive'} refinement ({self.tested}): loss {self.loss:.3g}"
+            f"{began}; with 2 K {self.more_sweeps:.3g}, with h/2 {self.smaller_steps:.3g}, with {both} {self.both:.3g}"
         )
+        text += "" if self.mesh is None else f", and eight tets for each {self.mesh:.3g}"
+        for number, check in enumerate(self.gradients):
+            off = [f"{name} {percent(share)}" for name, share in check.finer.items()]
+            off += [f"a difference of {name} {percent(share)}" for name, share in check.differences.items()]
+            text += f"; gradient[{number}] is off from {', '.join(off)}"
         if self.survives:
-            better = self.loss - min(self.more_sweeps, self.smaller_steps, self.both)
+            finer = (self.more_sweeps, self.smaller_steps, self.both, self.loss if self.mesh is None else self.mesh)
+            better = self.loss - min(finer)
             if self.before is None or better <= self.tolerance * (self.before - self.loss):
                 return text
             return f"{text}: what was gained is kept, but the settings are too coarse to say how much it is"
         if not math.isfinite(self.loss):
             return f"{text}: the loss itself is not finite"
-        finer = {"more sweeps": self.more_sweeps, "smaller steps": self.smaller_steps}
-        needed = [name for name, value in finer.items() if not self._keeps(value)] or list(finer)
-        return f"{text}: optimise on with {' and '.join(needed)}"
+        needed = [what for what in dict.fromkeys(HELPS.values()) if what in self._helps]
+        if not is_balanced(self.left):
+            text += (
+                f": no reference could be reached, {self.sweeps} K leave {percent(self.left)} of the forces unbalanced"
+            )
+            needed = needed or [HELPS["K"]]
+        return (
+            f"{text}: optimise on with {' and '.join(needed)}"
+            if needed
+            else f"{text}: the loss has kinks or jumps here"
+        )
+
+    @property
+    def _helps(self) -> set[str]:
+        """What changes the loss, or its gradient; of the latter the mesh only where the finest run on the mesh of the
+        loss does not."""
+        off = {name for check in self.gradients for name, share in check.finer.items() if not share <= self.tolerance}
+        off -= {"mesh"} if "both" in off else set()
+        return {HELPS[name] for name in {*self._unstable, *off} if name in HELPS}
 
 
-@torch.no_grad()
 def refine(
-    loss: Callable[[], Tensor | float], *, before: Tensor | float | None = None, tolerance: float = 0.1
+    loss: Callable[[], Tensor | float],
+    *,
+    before: Tensor | float | None = None,
+    tolerance: float = 0.1,
+    gradient: Tensor | Sequence[Tensor] | None = None,
+    mesh: bool = False,
 ) -> Refinement:
-    """Evaluates an optimised result once more with twice the sweeps and half the time step.
+    """Evaluates an optimised result once more with twice the sweeps and half the time step, and if asked on a finer
+    mesh and with its gradient.
 
     An optimiser may find what only coarse settings reward. Such a result loses what it gained when its motion is
-    simulated better: do not trust it, and optimise with smaller steps or more sweeps.
+    simulated better: do not trust it, and optimise with smaller steps, more sweeps or smaller tets.
 
     ``loss`` is called four times, without gradients. Every :func:`diffvbd.rollout` in it runs over the same time and
     returns frames and observations of the same times, so that the loss itself need not change. What it gives per step,
     or by a callable, is asked at its own steps and held in between; prescribed vertices and colliders go in straight
-    lines between their ends.
+    lines between their ends. The finest run is a reference once its steps leave at most 1 % of their forces
+    unbalanced: until then it is called again with 4, 8 and 16 times the sweeps, and where twice as many leave more than
+    half of it with plain sweeps in place of coarse corrections, or the other way round.
 
     Args:
         loss: A function without arguments that returns a scalar, such as the closure of an optimiser, with the
@@ -82,11 +168,18 @@ def refine(
         before: The loss where the optimisation began, a scalar: a number or a tensor of shape []. With it, the result
             survives if it keeps 1 - ``tolerance`` of what it gained; without it, if the loss changes by at most
             ``tolerance`` of itself.
-        tolerance: See ``before``; in (0, 1).
+        tolerance: See ``before``; in (0, 1). With ``gradient`` also the share of the gradient, or of the largest slope
+            of the loss within a tenth of the parameter, by which the gradient may differ.
+        gradient: A parameter, or several: leaf tensors that require grad, which ``loss`` reads and does not
+            differentiate itself. Each gradient is compared with those of the finer runs, and with central differences
+            of 1 % and 10 % of the parameter (of each of its elements at most, along the gradient), which show a kink or
+            a trend that the derivative does not follow: four more calls for each.
+        mesh: Whether to call the loss once more on subdivided meshes, which takes sixteen times a run and more. Forces
+            stay at the vertices of the mesh; a rollout that continues another begins from what that returned.
 
     Raises:
         ValueError, TypeError: ``loss`` runs no rollout or does not return a scalar; ``before`` is not finite or not
-            above the loss.
+            above the loss; ``gradient`` has what is no parameter of the loss; ``mesh`` beside an Anchor.
         NotImplementedError: ``loss`` calls step or solve, which are not refined, continues a BDF2 history that is not
             its own, asks for estimate_errors, or prescribes positions of stages.
     """
@@ -98,25 +191,117 @@ def refine(
     began = None if before is None else _scalar("before", before)
     if began is not None and not math.isfinite(began):
         fail("before", "a finite loss", began)
-    found = []
-    for steps, sweeps in ((1, 1), (1, 2), (2, 1), (2, 2)):
-        ran: list[int] = []
-        # what is compiled runs as it is written, or it would be compiled for each of the four
-        with torch.compiler.set_stance("force_eager"), refined((steps, sweeps, ran)):
-            found.append(_scalar("loss", loss()))
-        if not sum(ran):
-            fail("loss", "a function that runs dv.rollout, which is what is refined", "one that ran no step of one")
-        if began is not None and not began > found[0]:
-            fail("before", f"a loss above that of the result, {found[0]:.3g}", f"{began:.3g}")
-    once, more_sweeps, smaller_steps, both = found
-    return Refinement(once, more_sweeps, smaller_steps, both, began, share)
+    if not isinstance(mesh, bool):
+        raise TypeError(f"mesh: expected a bool, got {type(mesh).__name__}")
+    runs = _Runs(loss, _parameters(gradient))
+    once = runs.run("own", Finer(1, 1, []))
+    if began is not None and not began > once:
+        fail("before", f"a loss above that of the result, {once:.3g}", f"{began:.3g}")
+    more_sweeps, smaller_steps = runs.run("2 K", Finer(1, 2, [])), runs.run("h/2", Finer(2, 1, []))
+    both = runs.balanced("both", mesh=False)
+    finest = runs.balanced("mesh", mesh=True) if mesh else None
+    checks = tuple(runs.check(number, once) for number in range(len(runs.parameters)))
+    return Refinement(once, more_sweeps, smaller_steps, both, began, share, finest, checks, runs.left, runs.sweeps)
+
+
+class _Runs:
+    """Calls of a loss with finer settings, with its gradients where there are parameters."""
+
+    def __init__(self, loss: Callable[[], Any], parameters: list[Tensor]) -> None:
+        self.loss, self.parameters = loss, parameters
+        self.gradients: dict[str, tuple[Tensor, ...]] = {}  # by the name of a run
+        self.left, self.sweeps, self.others = 0.0, 2, False
+
+    def run(self, name: str, finer: Finer) -> float:
+        """The loss; its gradients are kept by ``name``, none for ""."""
+        differentiates = bool(self.parameters and name)
+        # what is compiled runs as it is written, or it would be compiled for each of the runs
+        with torch.compiler.set_stance("force_eager"), refined(finer), torch.set_grad_enabled(differentiates):
+            value = self.loss()
+            found = _scalar("loss", value)
+            if not sum(steps for steps, _ in finer.ran):
+                fail("loss", "a function that runs dv.rollout, which is what is refined", "one that ran no step of one")
+            if differentiates:
+                self.gradients[name] = self._differentiated(value)
+        return found
+
+    def _differentiated(self, value: Any) -> tuple[Tensor, ...]:
+        if not isinstance(value, Tensor) or not value.requires_grad:
+            fail("loss", "a scalar with a graph, beside gradient", "one without")
+        found = torch.autograd.grad(value.sum(), self.parameters, allow_unused=True)
+        for number, gradient in enumerate(found):
+            if gradient is None:
+                fail(f"gradient[{number}]", "a parameter of the loss", "one on which it does not depend")
+        return found  # type: ignore[return-value]
+
+    def balanced(self, name: str, mesh: bool) -> float:
+        """The loss with half the step and with sweeps until the forces of its steps balance."""
+        left = math.inf
+        while True:
+            finer = Finer(2, self.sweeps, [], self.others, mesh)
+            found = self.run(name, finer)
+            left, before = max(share for _, share in finer.ran), left
+            if is_balanced(left) or self.sweeps >= MOST:
+                self.left = max(self.left, left)
+                return found
+            self.sweeps *= 2
+            self.others ^= left > STALLED * before
+
+    def check(self, number: int, loss: float) -> GradientCheck:
+        """The gradient with respect to a parameter, in units of its elements."""
+        parameter = self.parameters[number]
+        kept, own = parameter.detach().clone(), self.gradients["own"][number]
+        unit = kept.abs() if kept.any() else torch.ones_like(kept)
+        scaled = unit * own
+        largest = scaled.abs().max()
+        way = scaled / largest if largest > 0 else torch.ones_like(scaled)  # at most one unit of each element
+        along, steepest, slopes = float((scaled * way).sum()), 0.0, {}
+        for step in STEPS if kept.any() else ():
+            try:
+                ahead, behind = (self._moved(parameter, kept + sign * step * unit * way) for sign in (1, -1))
+            except ValueError:  # beyond what the loss can have, as of Poisson's ratio near 0.5
+                continue
+            slopes[f"{100 * step:g} %"] = (ahead - behind) / (2 * step)
+            steepest = max(steepest, abs(ahead - loss) / step, abs(loss - behind) / step)
+
+        def share(off: float, size: float) -> float:
+            return 0.0 if off == 0 else off / size if size > 0 and math.isfinite(off) else math.inf
+
+        finer = {}
+        for name, gradients in self.gradients.items():
+            if name != "own":
+                better = unit * gradients[number]
+                off, size = float((better - scaled).norm()), float(better.norm())
+                finer[name] = share(off, max(size, steepest / float(way.norm())))
+        return GradientCheck(finer, {name: share(abs(slope - along), steepest) for name, slope in slopes.items()})
+
+    def _moved(self, parameter: Tensor, value: Tensor) -> float:
+        """The loss with another value of a parameter."""
+        kept = parameter.detach().clone()
+        try:
+            parameter.data.copy_(value)  # .data: no graph of the caller's shall see a new version
+            return self.run("", Finer(1, 1, []))
+        finally:
+            parameter.data.copy_(kept)
+
+
+def _parameters(given: Any) -> list[Tensor]:
+    parameters = [given] if isinstance(given, Tensor) else [] if given is None else given
+    if not isinstance(parameters, Sequence) or isinstance(parameters, str):
+        raise TypeError(f"gradient: expected a tensor or a list of tensors, got {type(given).__name__}")
+    for number, parameter in enumerate(parameters):
+        good = isinstance(parameter, Tensor) and parameter.is_leaf and parameter.requires_grad and parameter.numel() > 0
+        if not good:
+            got = "another tensor" if isinstance(parameter, Tensor) else type(parameter).__name__
+            raise TypeError(f"gradient[{number}]: expected a leaf tensor that requires grad, got {got}")
+    return list(parameters)
 
 
 def _scalar(name: str, value: Tensor | float) -> float:
     if isinstance(value, Tensor):
         if value.numel() != 1:
             fail(name, "a scalar", f"shape {list(value.shape)}")
-        return float(value)
+        return float(value.detach())
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"{name}: expected a scalar, got {type(value).__name__}")
     return to_float(name, value)

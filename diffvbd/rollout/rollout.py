@@ -30,14 +30,16 @@ from ..step.integrators import (
     take,
 )
 from ..step.intersections import check_start as refuse_start
+from ..tuples import replaced
 from .checkpoints import BinomialCheckpoints, Segment, choose_schedule, run_segments
 from .chosen import rollout_with
 from .contact_check import checks_contact, warn_of_contact
 from .energy_check import look_at_energy, warn_of_end, warn_of_last_end
 from .finer import rollout_finer
+from .reference import LOOKS
 from .repeated import repeated
 from .settings import Settings
-from .trajectory import PerStep, Trajectory, stacked
+from .trajectory import PerStep, StepAverage, Trajectory, refuse_average, stacked
 
 # these enter through prepare(), the others through advance()
 _STATIC = ("mu", "lam", "young", "poisson", "rest_points", "density")
@@ -92,8 +94,8 @@ def rollout(
             they are at the end of each step.
         colliders_before: Where per_step colliders are at the start; None: the Model's collider_points.
         mu, lam, young, poisson, force, gravity, prescribed, rest_points, density, parameters: As in step, constant in
-            time; or wrapped in :func:`per_step`; or a callable of (step, x, v) that returns the value for that step
-            (None only for a step without ``force``).
+            time; or wrapped in :func:`per_step` or :func:`step_average`; or a callable of (step, x, v) that returns the
+            value for that step (None only for a step without ``force``).
             A callable may close over tensors and modules that require grad: they get gradients under every schedule. A
             checkpointed segment calls it again in the backward, where it must return the same: no state that it keeps
             from call to call, nothing that has changed in place since. ``prescribed`` may also have the initial x where
@@ -139,7 +141,7 @@ def rollout(
         raise TypeError("duration: expected it beside settings only; without them give steps and time_step")
     if time_step is None or sweeps is None:
         raise TypeError(f"{'time_step' if time_step is None else 'sweeps'}: expected a number, or settings, got None")
-    if (factors := refinement()) is not None:  # inside dv.refine
+    if (finer := refinement()) is not None:  # inside dv.refine
         return rollout_finer(rollout, **locals())
     steps = check_count("steps", steps)
     save = _checked_save(save)
@@ -157,9 +159,11 @@ def rollout(
                "density": density, "force": force, "gravity": gravity, "prescribed": prescribed,
                "colliders": colliders}  # fmt: skip
     _check_values(options, parameters, colliders_before, steps)
+    options, parameters = ({name: value.over(time_step) if isinstance(value, StepAverage) else value
+                            for name, value in given.items()} for given in (options, parameters or {}))  # fmt: skip
     # What a checkpointed segment reads again must not change in between: lists and dicts are copied. Plain dicts and
     # functions of them: torch.compile takes no object of ours along.
-    options, own = ({k: _frozen(v) for k, v in given.items()} for given in (options, parameters or {}))
+    options, own = ({k: _frozen(v) for k, v in given.items()} for given in (options, parameters))
     if not _changes(options["gravity"]):
         options["gravity"] = acceleration_of(options["gravity"], x)  # once, not in each step
     # once: what a checkpoint runs again must run as it did, whatever dv.regime says by then
@@ -195,6 +199,8 @@ def rollout(
     driven = any(options[k] is not None for k in ("force", "prescribed", "colliders")) or _changes(options["gravity"])
     energy = None if driven else look_at_energy(check_energy, model, x, v, steps, fixed, options["gravity"])
     warn_of_last_end(model, x)
+    asked = () if torch.compiler.is_compiling() else recorders("solve")
+    solves: dict[int, Any] = {}  # by step, of a few: a segment that runs again finds them
 
     outer = x
 
@@ -216,6 +222,8 @@ def rollout(
             if estimate_errors and k not in errors:
                 loads = {name: solve.given[name] for name in _LOADS}
                 errors[k] = error_of(model, solve.x, solve.v, solve.prepared, **loads)
+            if asked and k % -(-steps // LOOKS) == 0 and k not in solves:
+                solves[k] = (model, replaced(solve, x=solve.x.detach(), v=solve.v.detach()), x.detach())
             if energy is not None:
                 energy.see(k + 1, x, v)
             if looks and not last:  # not in a segment that runs again
@@ -239,6 +247,8 @@ def rollout(
     if energy is not None:
         energy.warn()
     warn_of_end(model, *done.end[:2])
+    for found in asked:
+        found.extend(solves.values())
     frames = ([] if save == "last" and steps > 0 else [(0, x, v)]) + done.frames
     trajectory = Trajectory(
         x=torch.stack([f[1] for f in frames]),
@@ -277,6 +287,8 @@ def _check_values(
 ) -> None:
     """Raises for values that cannot be those of so many steps."""
     colliders = options["colliders"]
+    for name in ("prescribed", "colliders"):
+        refuse_average(name, options[name])
     if _changes(colliders) and not isinstance(colliders, PerStep):
         raise TypeError("colliders: expected a tensor or per_step, got a callable: a step needs where they come from")
     if colliders_before is not None and not isinstance(colliders, PerStep):
@@ -286,7 +298,7 @@ def _check_values(
     for name, value in {**options, **_named(parameters or {})}.items():
         if isinstance(value, PerStep) and value.values.shape[0] != steps:
             fail(name, f"{steps} steps in per_step", f"shape {list(value.values.shape)}")
-        if _changes(value):
+        if _changes(value) and not isinstance(value, StepAverage):
             check_function(name, value, "step", "x", "v")
 
 

@@ -19,12 +19,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..energies import StableNeoHookean
 from ..model.anderson import Anderson
-from ..model.model import Model
 from ..model.warnings import is_nearly_incompressible
 from ..step.integrators import BDF2, SDIRK2, ImplicitEuler, Integrator
 from .pilots import FRAMES, Pilot, Pilots, changes, relative
+from .reference import MOST_SWEEPS, is_balanced, takes_corrections, unreached, with_more_sweeps
 from .settings import Candidate, Prediction, Settings
 
 LONGEST = 0.1  # [s] of the first time step of the ladder
@@ -55,7 +54,7 @@ def found(pilots: Pilots, error: float, patience: float) -> Settings:
 def start_of(pilots: Pilots) -> Settings:
     """What the ladder runs with: well converged and never far from the fastest."""
     model = pilots.model
-    if not _exact(model):
+    if not takes_corrections(model):
         return Settings(1.0, 40, SDIRK2())
     if model.contact is not None or model.friction is not None:
         return Settings(1.0, 20, SDIRK2())
@@ -66,7 +65,7 @@ def candidates_of(pilots: Pilots) -> list[Settings]:
     """What might be faster than the ladder's settings, the likeliest first."""
     model, sdirk, bdf, euler = pilots.model, SDIRK2(), BDF2(), ImplicitEuler()
     touches = model.contact is not None or model.friction is not None
-    free = not touches and _exact(model) and _may_over_relax(pilots)
+    free = not touches and takes_corrections(model) and _may_over_relax(pilots)
     over, over_coarse = (1.6, 1.5) if free else (1.0, 1.0)
 
     def plain(scheme: Integrator, *sweeps: int) -> list[Settings]:
@@ -76,11 +75,11 @@ def candidates_of(pilots: Pilots) -> list[Settings]:
         return [Settings(1.0, k, scheme, relaxation=over_coarse, coarse="auto") for k in sweeps]
 
     out = []
-    if _exact(model) and not touches:
+    if takes_corrections(model) and not touches:
         out += [*coarse(sdirk, 2), *coarse(euler, 2), *coarse(bdf, 2), *coarse(sdirk, 5)]
     out += [*plain(sdirk, 10), *plain(euler, 5), *plain(bdf, 5), *plain(sdirk, 5, 20), *plain(bdf, 10, 20),
             *plain(euler, 10, 20)]  # fmt: skip
-    if _exact(model) and touches:
+    if takes_corrections(model) and touches:
         out += [Settings(1.0, 20, euler, acceleration=Anderson(5))]
     return out
 
@@ -91,12 +90,6 @@ def _may_over_relax(pilots: Pilots) -> bool:
         return True
     times = [pilots.duration * k / FRAMES for k in range(FRAMES + 1)] if pilots.material_changes else [0.0]
     return not any(is_nearly_incompressible(p.mu, p.lam) for p in map(pilots.prepared_at, times))
-
-
-def _exact(model: Model) -> bool:
-    """Whether coarse corrections and acceleration are defined."""
-    elastic = next((e for e in model.energies if isinstance(e, StableNeoHookean)), None)
-    return elastic is not None and elastic.block == "exact" and model.saturation is None
 
 
 class _Search:
@@ -157,6 +150,7 @@ class _Search:
         p, settings = self.pilots, start_of(self.pilots)
         steps = FRAMES * max(1, math.ceil(p.duration / (FRAMES * LONGEST)))
         apart: list[float] = []
+        left = math.inf  # of forces, by the run that was last taken for the reference
         unseen = "what changes in time" if changes(p.given) else ""
         while True:
             if steps > MOST_STEPS and unseen and self.ladder:
@@ -185,9 +179,14 @@ class _Search:
                 error = max(self._remaining(apart), self._unresolved())
                 self.estimates.append((error, now))
                 if error <= 0.5 * self.error:
-                    more = self._with_more_sweeps(settings)
+                    left, before = p.left(), left
+                    if settings.sweeps > MOST_SWEEPS and not is_balanced(left):
+                        return False, unreached(now.settings, left)
+                    more = self._with_more_sweeps(settings, left, before)
                     if more is None:
                         return True, ""
+                    if more.x is None:
+                        return False, f"a run failed: {more.failure}"
                     settings = more.settings
                     self.estimates.pop()  # more sweeps moved it: it was none
                     self.ladder[-2:] = [more]
@@ -226,12 +225,13 @@ class _Search:
         now, first = (p.lost(run, 0.5 * p.duration) for run in (last, self.ladder[0]))
         return 0.0 if now < WHOLE * first else now
 
-    def _with_more_sweeps(self, settings: Settings) -> Pilot | None:
+    def _with_more_sweeps(self, settings: Settings, left: float, before: float) -> Pilot | None:
         """The run before the last once more with twice the sweeps, if those move it by more than a quarter of the
-        error. With the sweeps of the ladder it might come close to a limit of its own."""
-        before = self.ladder[-2]
-        more = self.pilots.run(replace(settings, sweeps=2 * settings.sweeps + 1), before.steps)
-        if more.x is None or self._distance(before, more) <= 0.25 * self.error:
+        error: with the sweeps of the ladder it might come close to a limit of its own. Or if the last run left forces
+        over; then with plain sweeps where more of them with corrections have left as much."""
+        last = self.ladder[-2]
+        more = self.pilots.run(with_more_sweeps(settings, left, before), last.steps)
+        if is_balanced(left) and (more.x is None or self._distance(last, more) <= 0.25 * self.error):
             return None
         return more
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..checks import fail
+from ..checks import check_count, fail
 from ..step.estimate import ErrorEstimate
 from ..step.integrators import History
 
@@ -31,6 +32,60 @@ def per_step(values: Tensor) -> PerStep:
         got = "shape []" if isinstance(values, Tensor) else type(values).__name__
         raise TypeError(f"values: expected a tensor of shape [steps, ...], got {got}")
     return PerStep(values)
+
+
+@dataclass(frozen=True)
+class StepAverage:
+    """A function of the time [s] whose mean over each step is taken, see :func:`step_average`."""
+
+    function: Callable[[float], Any]
+    samples: int
+
+    def __call__(self, time: float) -> Any:
+        return self.function(time)
+
+    def over(self, time_step: float, began: float = 0.0) -> Callable[[int, Tensor, Tensor], Any]:
+        """The mean as a function of the step, as rollouts take one. began: the time at step 0 [s]."""
+
+        def mean(step: int, x: Tensor, v: Tensor) -> Tensor:
+            total: Any = 0.0
+            for sample in range(self.samples):
+                value = self.function(began + (step + (sample + 0.5) / self.samples) * time_step)
+                total = total + (value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=x.dtype).to(x))
+            return total / self.samples
+
+        return mean
+
+    def then(self, change: Callable[[Any], Any]) -> StepAverage:
+        """That of ``change`` of what the function returns."""
+        return StepAverage(lambda time: change(self.function(time)), self.samples)
+
+
+def step_average(function: Callable[[float], Any], samples: int = 32) -> StepAverage:
+    """Marks a function of the time [s] since the start of the rollout, whose mean over each step is the value of that
+    step: for loads that begin, end or swing within a step. No impulse is lost, and times in the function, such as that
+    of a release, keep their gradient, which values at the middle of each step lose.
+
+    An edge should last some h / ``samples``. For sharper ones divide the differences of the integral by h, and pass
+    them on in :func:`per_step`.
+
+    Args:
+        function: Returns what rollout takes for the argument: a tensor, a number or a sequence. It may close over
+            tensors that require grad.
+        samples: How many times of a step it is asked at, in the middles of equal parts.
+
+    Raises:
+        ValueError, TypeError: What is no function; samples < 1. In a rollout, beside ``prescribed`` and ``colliders``,
+            which are positions at the end of a step.
+    """
+    if not callable(function) or isinstance(function, Tensor):
+        raise TypeError(f"function: expected a function of the time [s], got {type(function).__name__}")
+    return StepAverage(function, check_count("samples", samples, minimum=1))
+
+
+def refuse_average(name: str, value: Any) -> None:
+    if isinstance(value, StepAverage):
+        raise TypeError(f"{name}: expected positions at the end of each step, got step_average")
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,11 +11,12 @@ from torch import Tensor
 from ..adjoint.contact_potential import ContactPotential, StepContact
 from ..adjoint.potential import IncrementalPotential
 from ..model.model import Model
-from .arguments import Prepared
-from .predict import Begun
+from .arguments import Prepared, acceleration_of, collider_state
+from .predict import Begun, begin
 
 ROUNDINGS = 0.25  # of block times position, below which a residual counts as zero: sweeps stall at 0.03 to 0.08, a
 # corrected start in free fall at 0.15
+UNBALANCED = 0.01  # left-over force over the forces of the step; at 0.014 a hanging bar rests 1.5 to 11 % off
 UNBALANCED_FRICTION = 0.05  # share of friction; a grip with 0.1 bears 1.3 times its load, with 0.004 1.02 times
 LEAST_FRICTION = 0.01  # of the normal forces, to which friction is compared where it is less: what rests needs none
 
@@ -64,6 +66,27 @@ def left_over(at: IncrementalPotential, norm: Norm) -> tuple[Tensor, Tensor]:
     the vertices that are not pinned; both [B, groups]."""
     inertia, forces = at.free * at.inertia(), at.free * at.forces()
     return norm(inertia + forces), norm(inertia) + norm(forces)
+
+
+def left_of_solve(model: Model, before: tuple[Tensor, Tensor], end: Tensor, prepared: Prepared, given: dict[str, Any]
+                  ) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """The same of a solve that was executed, 0 left where that is no more than rounding leaves: of each scene, with
+    contact of each body.
+
+    Args:
+        before: State (x, v) [..., V, 3] before it.  end: Positions after it.  given: Its arguments, as of advance().
+    """
+    with torch.no_grad(), torch.autocast(end.device.type, enabled=False):
+        x, v = (t.detach() for t in before)
+        acceleration = acceleration_of(given["gravity"], x)
+        begun = begin(model, x, v, prepared, given["force"], acceleration, given["prescribed"]).detached()
+        where = collider_state(model, x, given["colliders"], given["colliders_before"])
+        end = end.detach().reshape(begun.y.shape)
+        end = end if begun.origin is None else end - begun.origin
+        at = potential_of_step(model, end, begun, prepared, contact_of_step(model, begun, prepared, where))
+        norm = of_scenes if where is None else of_bodies(model)
+        left, whole = left_over(at, norm)
+        return torch.where(left <= rounding(at, norm), 0, left), whole
 
 
 def rounding(at: IncrementalPotential, norm: Norm, eps: float | None = None) -> Tensor:

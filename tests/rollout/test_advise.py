@@ -10,6 +10,7 @@ import torch
 
 import diffvbd as dv
 from diffvbd import mesh
+from diffvbd.rollout import search
 from diffvbd.rollout.pilots import Pilots
 from diffvbd.rollout.settings import Candidate
 from diffvbd.testing.tolerances import tolerance
@@ -234,6 +235,28 @@ def test_an_impact_that_long_steps_lose_is_not_taken_for_motion() -> None:
     a = runs.run(settings, settings.steps(0.04))
     b = runs.run(settings, 4 * max(64, settings.steps(0.04)))
     assert a.x is not None and b.x is not None and runs.apart(a.x, b.x) <= 0.2
+
+
+def test_runs_that_leave_forces_over_are_no_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each has more sweeps than the one before, and plain ones once corrections stall."""
+    tried: list[dv.Settings] = []
+    run = Pilots.run
+
+    def seen(self: Pilots, settings: dv.Settings, *args: Any, **options: Any) -> Any:
+        tried.append(settings)
+        return run(self, settings, *args, **options)
+
+    model, material = cantilever(1e5)
+    monkeypatch.setattr(Pilots, "run", seen)
+    monkeypatch.setattr(Pilots, "left", lambda self: 0.5)
+    monkeypatch.setattr(search, "MOST_SWEEPS", 50)
+    told = dv.advise(model, model.rest_points, 0 * model.rest_points, duration=0.1, error=0.5, **material).predicted
+    assert told is not None and not told.reached
+    assert told.why.startswith("no reference could be reached: ") and told.why.endswith(
+        "leaves 50 % of its forces unbalanced"
+    )
+    kinds = list(dict.fromkeys((s.sweeps, s.coarse is None) for s in tried))
+    assert kinds == [(8, False), (17, False), (17, True), (35, True), (71, True)]
 
 
 def test_auto_inside_refine() -> None:

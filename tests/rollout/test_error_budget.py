@@ -2,9 +2,11 @@
 
 import pytest
 import torch
+from helpers.tilted_box import SOFT, tilted_box
 
 import diffvbd as dv
 from diffvbd import mesh
+from diffvbd.rollout import budget as budgets
 from diffvbd.testing.tolerances import tolerance
 
 
@@ -30,6 +32,17 @@ def test_few_sweeps_are_the_cause() -> None:
     expected = (own.x - true.x).square().sum(-1)[1:].mean().sqrt() / (true.x - x).square().sum(-1)[1:].mean().sqrt()
     assert budget.largest.motion == pytest.approx(float(expected), rel=tolerance("cause_of_error"))
     assert budget.cut is None and budget.friction is None and budget.duration == pytest.approx(0.2)
+
+
+def test_converged_steps_on_a_floor_are_held_against_converged_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Corrections may leave such steps far from converged however many sweeps they have: no reference, then."""
+    scene = {"duration": 0.016, "time_step": 2e-3, "sweeps": 50, **SOFT}
+    budget = dv.error_budget(*tilted_box(), **scene)
+    assert shares(budget)["sweeps"].motion < tolerance("closed_form") and budget.reached
+    monkeypatch.setattr(budgets, "MOST_SWEEPS", 1)
+    none = dv.error_budget(*tilted_box(), **scene | {"young": 1e9, "sweeps": 0})
+    assert not none.reached and "no reference could be reached: " in str(none)
+    assert "of its forces unbalanced" in shares(none)["sweeps"].note
 
 
 def test_long_steps_are_the_cause() -> None:

@@ -1,7 +1,9 @@
-"""Claim: what swings within the steps of pilot runs, so that they do not see it, is not taken for rest."""
+"""Claim: what swings within the steps of pilot runs, so that they do not see it, is not taken for rest, and the mean of
+a load over each step loses no impulse."""
 
 import math
 from collections.abc import Callable
+from typing import Any, cast
 
 import pytest
 import torch
@@ -9,6 +11,7 @@ from torch import Tensor
 
 import diffvbd as dv
 from diffvbd.rollout.between import SWINGS, unseen
+from diffvbd.testing.tolerances import tolerance
 
 DURATION = 0.1
 FREQUENCY = 160.0  # [Hz]: with 4 * 2**k steps over 0.1 s the middle of each is a zero, up to k = 2
@@ -65,3 +68,78 @@ def test_a_budget_says_so() -> None:
 )
 def test_what_samples_see(function: Callable[[float], Tensor], steps: int, moves: bool, is_seen: bool) -> None:
     assert (unseen(function, 0.5, steps, DURATION, moves) <= SWINGS) == is_seen
+
+
+RELEASED, EDGE = 0.103, 5e-4  # [s]: after it the push fades within some 2 ms
+LONG: dict[str, Any] = {"mu": 1e5, "lam": 1e5, "gravity": (0.0, 0.0, 0.0), "sweeps": 5, "save": "last"}
+
+
+def released(push: Callable[[Tensor, Tensor], Any], steps: int = 20, **given: Any) -> tuple[Tensor, Tensor]:
+    """How far a cube has come that is pushed until a time, over the closed form [-]; and the same of its derivative."""
+    model = dv.Model(dv.mesh.cube(2, size=0.1))
+    x = model.rest_points
+    time = torch.tensor(RELEASED, dtype=torch.float64, requires_grad=True)
+    force = torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64).expand_as(x)
+    options = {**LONG, "steps": steps, "time_step": 0.4 / steps, "integrator": dv.SDIRK2(), **given}
+    way = (dv.rollout(model, x, 0 * x, force=push(time, force), **options).x[-1] - x)[:, 0].mean()
+    (slope,) = torch.autograd.grad(way, time)
+    whole = 8 * 0.1 / float(model.mass.sum())
+    return way.detach() / (whole * RELEASED * (0.4 - RELEASED / 2)), slope / (whole * (0.4 - RELEASED))
+
+
+def until(time: Tensor, force: Tensor) -> Callable[[float], Tensor]:
+    return lambda t: torch.sigmoid((time - t) / EDGE) * force
+
+
+@pytest.mark.parametrize("given", [{}, {"integrator": dv.BDF2()}, {"checkpoint_every": 3}], ids=str)
+def test_the_mean_over_each_step_keeps_impulse_and_derivative(given: dict[str, Any]) -> None:
+    way, slope = released(lambda time, force: dv.step_average(until(time, force)), **given)
+    assert 0.9 < float(way) < 1.1 and 0.9 < float(slope) < 1.1
+    _, lost = released(lambda time, force: lambda k, x, v: until(time, force)((k + 0.5) * 0.02), **given)
+    assert abs(float(lost)) < 0.01  # the middle of a step sees no edge
+
+
+def test_an_integral_does_the_same_for_an_edge_of_no_length() -> None:
+    def impulses(time: Tensor, force: Tensor) -> object:
+        times = torch.arange(21, dtype=torch.float64) * 0.02
+        return dv.per_step((torch.minimum(times, time)[:, None, None] * force).diff(dim=0) / 0.02)
+
+    for share in released(impulses):
+        assert float(share) == pytest.approx(1.0, rel=tolerance("contact_motion"))
+
+
+def test_who_chooses_steps_takes_the_mean_over_them() -> None:
+    """In dv.refine, error_budget and advise the mean is that over the steps they take."""
+    model, x, _ = beam()
+    asked: set[float] = set()
+
+    def push(t: float) -> Tensor:
+        asked.add(round(t, 9))
+        return torch.full_like(x, 0.01)
+
+    force = dv.step_average(push, samples=2)
+    given: dict[str, Any] = {"mu": 1e5, "lam": 1e5}
+    loss = lambda: dv.rollout(model, x, 0 * x, steps=2, time_step=0.04, sweeps=9, force=force, **given).x[-1].sum()  # noqa: E731
+    constant = dv.rollout(model, x, 0 * x, steps=2, time_step=0.04, sweeps=9, force=push(0.01), **given).x[-1].sum()
+    assert float(loss()) == pytest.approx(float(constant), rel=tolerance("sum"))
+    assert asked == {0.01, 0.03, 0.05, 0.07}
+    dv.refine(loss)
+    assert asked == {0.01, 0.03, 0.05, 0.07, 0.005, 0.015, 0.025, 0.035, 0.045, 0.055, 0.065, 0.075}
+    budget = dv.error_budget(model, x, 0 * x, duration=0.08, time_step=0.02, sweeps=5, force=force, **given)
+    assert 0.00125 in asked and 0 < budget.total < 1  # a quarter of a step of its finest run
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: dv.step_average(cast(Any, 1.0)), TypeError, "function: expected a function of the time"),
+        (lambda: dv.step_average(lambda t: t, samples=0), ValueError, "samples: expected"),
+        (lambda: dv.rollout(*beam()[:2], 0 * beam()[1], steps=1, time_step=0.01, sweeps=1, mu=1.0, lam=1.0,
+                            prescribed=dv.step_average(lambda t: t)), TypeError, "prescribed: expected positions"),
+        (lambda: dv.error_budget(*beam()[:2], 0 * beam()[1], duration=0.1, time_step=0.01, sweeps=1, mu=1.0, lam=1.0,
+                                 colliders=dv.step_average(lambda t: t)), TypeError, "colliders: expected positions"),
+    ],
+)  # fmt: skip
+def test_bad_input_of_a_mean(call: Callable[[], object], error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        call()
