@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .. import ops
 from ..checks import NUMBERS, check_broadcast, check_dense, check_tensor, fail, name_value, to_float
 from ..scopes import looks_at
 from .model import Model
@@ -77,6 +78,9 @@ def moduli_of(model: Model, lead: tuple[int, ...], mu: Any, lam: Any, young: Any
             check_broadcast(name, value, (*lead, model.num_tets), len(lead))
     if isinstance(young, Tensor) != isinstance(poisson, Tensor):
         pair = {name: check_tensor(name, value, model._mass) for name, value in pair.items()}
+    if all(isinstance(value, Tensor) for value in pair.values()):  # gradients are summed in a fixed order
+        shape = torch.broadcast_shapes(*(value.shape for value in pair.values()))
+        pair = {name: ops.broadcast(value, shape) for name, value in pair.items()}
     return lame(pair["young"], pair["poisson"])
 
 

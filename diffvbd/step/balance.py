@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from .. import ops
 from ..adjoint.contact_potential import ContactPotential, StepContact
 from ..adjoint.potential import IncrementalPotential
 from ..model.model import Model
@@ -44,7 +45,7 @@ def potential_of_step(
 
 def of_scenes(values: Tensor) -> Tensor:
     """2-norms over a scene, [B, V, n] -> [B, 1]."""
-    return values.square().sum((-2, -1)).sqrt()[:, None]
+    return ops.sum_to(values.square(), (len(values), 1, 1))[..., 0].sqrt()
 
 
 def of_bodies(model: Model) -> Norm:
