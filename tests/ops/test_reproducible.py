@@ -163,7 +163,7 @@ OF_SHEETS = """
 import torch
 import diffvbd as dv
 from diffvbd import testing
-sheet = dv.mesh.sheet(8, 6, size=(0.2, 0.15), thickness=0.005)
+sheet = dv.mesh.sheet(13, 10, size=(0.32, 0.24), thickness=0.005)
 mesh = dv.mesh.join([sheet, sheet.translate((0.011, 0.015, 0.007))])
 barrier = dv.PairBarrier(kappa=1e4, dhat=0.012, self_contact=False, detections=1)
 floor = dv.FloorBarrier(height=-0.01, kappa=1e3, dhat=0.02)
